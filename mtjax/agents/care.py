@@ -1,0 +1,99 @@
+"""CARE: contextual attention over a mixture of encoders."""
+
+import dataclasses
+from typing import Literal
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from mtjax.agents.sac import SAC, Conditioning
+from mtjax.names import nearest_error
+from mtjax.networks import MLP, join
+from mtjax.types import Array, InputError
+
+
+class Experts(nn.Module):
+    """K encoders of the same shape, each an MLP with a linear output, evaluated as batched products."""
+
+    num_experts: int
+    widths: tuple[int, ...]
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        """Map inputs (..., O) to encodings (..., K, D)."""
+        x = jnp.broadcast_to(x[..., None, :], (*x.shape[:-1], self.num_experts, x.shape[-1]))
+        init = nn.initializers.lecun_normal(batch_axis=0)
+        for i, width in enumerate(self.widths):
+            kernel = self.param(f"kernel_{i}", init, (self.num_experts, x.shape[-1], width))
+            bias = self.param(f"bias_{i}", nn.initializers.zeros, (self.num_experts, width))
+            x = jnp.einsum("...ki,kio->...ko", x, kernel) + bias
+            x = nn.relu(x) if i + 1 < len(self.widths) else x
+        return x
+
+
+class Mixture(nn.Module):
+    """Encode an observation as a context-dependent mixture, and the rest of the network on top of it."""
+
+    num_experts: int
+    expert_widths: tuple[int, ...]
+    variant: str
+    hidden: tuple[int, ...]
+    layer_norm: bool
+
+    @nn.compact
+    def __call__(self, obs: Array, features: Array, *action: Array) -> Array:
+        size = self.expert_widths[-1]
+        context = nn.Dense(size, name="context_out")(MLP(self.expert_widths, name="context")(features))  # (D,)
+        encodings = Experts(self.num_experts, self.expert_widths, name="experts")(obs)  # (..., K, D)
+        if self.variant == "paper":
+            scores = encodings @ jax.lax.stop_gradient(context)  # (..., K)
+        else:
+            scores = nn.Dense(self.num_experts, name="gate_out")(MLP((size, size), name="gate")(context))  # (K,)
+        attention = jnp.broadcast_to(jax.nn.softmax(scores), (*obs.shape[:-1], self.num_experts))
+        self.sow("intermediates", "attention", attention)
+        encoding = jnp.einsum("...k,...kd->...d", attention, encodings)
+        if self.variant == "paper":
+            encoding = MLP((size, size), name="after")(encoding)
+        return MLP(self.hidden, self.layer_norm, name="trunk")(join(encoding, *action, task=context))
+
+
+@dataclasses.dataclass(frozen=True)
+class CARE(SAC):
+    """Contextual attention-based representation learning (Sodhani, Zhang and Pineau 2021).
+
+    For a task with context features c and K encoders E_j of the observation s:
+        z_context = C(c)                                   (context encoder)
+        a_j = softmax_j <E_j(s), sg(z_context)>            (attention; no gradient into the context here)
+        z = MLP(sum_j a_j E_j(s))                          (mixture)
+    and SAC's actor and critics work on [z, z_context], through which alone the context encoder learns.
+
+    ``variant="mtrl"`` is what the authors' MTRL code computes: the weights are softmax(MLP(z_context)), the same in
+    every state, gradients flow through them, and no MLP follows the mixture.
+
+    Differs from the paper: the context comes from the task's conditioning (by default its physical parameters) where
+    the paper embeds a sentence, which conditioning=vectors also allows; actor and critics each own a mixture, so that
+    every parameter is trained by its own loss (MTRL ties some of the actor's to the critic's and leaves others at
+    their initial values).
+    """
+
+    conditioning: Conditioning = "parameters"
+    """What the context encoder is told of the task: one-hot, embedding, parameters, or vectors (rows of a file)."""
+    num_experts: int = 6
+    """Encoders in the mixture."""
+    expert_widths: tuple[int, ...] = (64, 64)
+    """Widths of each encoder's layers and of the context encoder; the last is the size of the encoding."""
+    variant: Literal["paper", "mtrl"] = "paper"
+    """Attention as in the paper, or the gate of the authors' code."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.variant not in ("paper", "mtrl"):
+            raise nearest_error("variant", self.variant, ("paper", "mtrl"))
+        if self.conditioning == "none":
+            raise InputError("care attends by the task's context, so conditioning cannot be none; use parameters")
+        if self.num_experts < 1 or not self.expert_widths:
+            raise InputError("care needs at least one expert with at least one layer")
+
+    def body(self, layer_norm: bool) -> nn.Module:
+        return Mixture(self.num_experts, self.expert_widths, self.variant, self.hidden, layer_norm)

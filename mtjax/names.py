@@ -1,0 +1,14 @@
+"""Errors about names: what was given, what is allowed, and the nearest match."""
+
+import difflib
+from collections.abc import Iterable
+
+from mtjax.types import InputError
+
+
+def nearest_error(kind: str, given: str, allowed: Iterable[str]) -> InputError:
+    """Return an error for a name that is not among the allowed ones."""
+    allowed = list(allowed)
+    near = difflib.get_close_matches(given, allowed, n=1, cutoff=0.5)
+    hint = f"did you mean {near[0]!r}? " if near else ""
+    return InputError(f"unknown {kind} {given!r}; {hint}choose from: {', '.join(allowed)}")

@@ -1,0 +1,42 @@
+"""Running mean and variance of observations (Welford; parallel form by Chan et al. 1979)."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from mtjax.types import Array
+
+_MIN_STD = 1e-3
+
+
+class Moments(NamedTuple):
+    """What has been seen so far."""
+
+    count: Array  # ()
+    mean: Array  # (O,)
+    deviation: Array  # (O,) sum of squared deviations from the mean
+
+
+def init(size: int) -> Moments:
+    """Return moments of nothing; they normalise to the identity."""
+    return Moments(jnp.float32(0), jnp.zeros(size), jnp.zeros(size))
+
+
+def update(moments: Moments, batch: Array) -> Moments:
+    """Add a batch (..., O)."""
+    batch = batch.reshape(-1, batch.shape[-1])
+    count, mean = moments.count + len(batch), jnp.mean(batch, axis=0)
+    shift = mean - moments.mean
+    return Moments(
+        count=count,
+        mean=moments.mean + shift * len(batch) / count,
+        deviation=moments.deviation
+        + jnp.sum(jnp.square(batch - mean), axis=0)
+        + jnp.square(shift) * moments.count * len(batch) / count,
+    )
+
+
+def apply(moments: Moments, x: Array) -> Array:
+    """Scale x (..., O) to zero mean and unit variance."""
+    variance = jnp.where(moments.count > 0, moments.deviation / jnp.maximum(moments.count, 1), 1.0)
+    return (x - moments.mean) / jnp.maximum(jnp.sqrt(variance), _MIN_STD)
