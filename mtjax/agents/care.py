@@ -21,13 +21,13 @@ class Experts(nn.Module):
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
-        """Map inputs (..., O) to encodings (..., K, D)."""
-        x = jnp.broadcast_to(x[..., None, :], (*x.shape[:-1], self.num_experts, x.shape[-1]))
+        """Map inputs (..., O) to encodings (K, ..., D)."""
+        x = jnp.broadcast_to(x, (self.num_experts, *x.shape))
         init = nn.initializers.lecun_normal(batch_axis=0)
         for i, width in enumerate(self.widths):
             kernel = self.param(f"kernel_{i}", init, (self.num_experts, x.shape[-1], width))
             bias = self.param(f"bias_{i}", nn.initializers.zeros, (self.num_experts, width))
-            x = jnp.einsum("...ki,kio->...ko", x, kernel) + bias
+            x = jax.vmap(lambda x, kernel, bias: x @ kernel + bias)(x, kernel, bias)
             x = nn.relu(x) if i + 1 < len(self.widths) else x
         return x
 
@@ -45,14 +45,15 @@ class Mixture(nn.Module):
     def __call__(self, obs: Array, features: Array, *action: Array) -> Array:
         size = self.expert_widths[-1]
         context = nn.Dense(size, name="context_out")(MLP(self.expert_widths, name="context")(features))  # (D,)
-        encodings = Experts(self.num_experts, self.expert_widths, name="experts")(obs)  # (..., K, D)
+        encodings = Experts(self.num_experts, self.expert_widths, name="experts")(obs)  # (K, ..., D)
         if self.variant == "paper":
-            scores = encodings @ jax.lax.stop_gradient(context)  # (..., K)
+            scores = encodings @ jax.lax.stop_gradient(context)  # (K, ...)
         else:
-            scores = nn.Dense(self.num_experts, name="gate_out")(MLP((size, size), name="gate")(context))  # (K,)
-        attention = jnp.broadcast_to(jax.nn.softmax(scores), (*obs.shape[:-1], self.num_experts))
+            gate = nn.Dense(self.num_experts, name="gate_out")(MLP((size, size), name="gate")(context))
+            scores = gate.reshape(-1, *[1] * (obs.ndim - 1))  # (K, 1...), the same in every state
+        attention = jnp.broadcast_to(jax.nn.softmax(scores, axis=0), (self.num_experts, *obs.shape[:-1]))
         self.sow("intermediates", "attention", attention)
-        encoding = jnp.einsum("...k,...kd->...d", attention, encodings)
+        encoding = jnp.sum(attention[..., None] * encodings, axis=0)
         if self.variant == "paper":
             encoding = MLP((size, size), name="after")(encoding)
         return MLP(self.hidden, self.layer_norm, name="trunk")(join(encoding, *action, task=context))

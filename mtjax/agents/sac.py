@@ -30,7 +30,7 @@ class SACState(NamedTuple):
     optimizers: tuple[Any, Any, Any]  # of actor, critic, temperature
     moments: normalize.Moments
     contexts: Array  # (T, C) of the training tasks, among which an unseen task finds its nearest
-    vectors: Array  # (T, V) given task vectors
+    vectors: Array | None  # (T, V) given task vectors, if conditioned on them
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,7 +128,7 @@ class SAC:
     def init(self, spec: Spec, tasks: Task, key: Key) -> SACState:
         """Initialise for the training ``tasks`` (T, ...)."""
         num_tasks = len(tasks.id)
-        vectors = load_vectors(self.vectors, num_tasks) if self.vectors else jnp.zeros((num_tasks, 0))
+        vectors = load_vectors(self.vectors, num_tasks) if self.vectors else None
         obs, action = jnp.zeros(spec.obs_size), jnp.zeros(spec.action_size)
         features = self._features(num_tasks, jnp.int32(0), tasks.context[0], vectors)
         actor_key, critic_key = jax.random.split(key)
@@ -152,12 +152,21 @@ class SAC:
 
     # Which task it is.
 
+    @property
+    def unseen(self) -> str:
+        """What stands for a task that was not trained on; empty if its own parameters, or nothing, do."""
+        parts = ["head"] if self.heads == "per-task" else []
+        parts += [{"one-hot": "number"}.get(self.conditioning, self.conditioning.removesuffix("s"))] * (
+            self.conditioning in ("one-hot", "embedding", "vectors")
+        )
+        return f"each uses the {' and '.join(parts)} of the nearest training task" if parts else ""
+
     def known_task(self, state: SACState, task: Task) -> Array:
         """The training task () int32 whose head, embedding or number stands for ``task``: itself, or the nearest."""
         nearest = jnp.argmin(jnp.sum(jnp.square(state.contexts - task.context), axis=-1)).astype(jnp.int32)
         return jnp.where(task.id < len(state.contexts), task.id, nearest)
 
-    def _features(self, num_tasks: int, index: Array, context: Array, vectors: Array) -> Array:
+    def _features(self, num_tasks: int, index: Array, context: Array, vectors: Array | None) -> Array:
         """What the networks see of a task (Z,); a learned embedding is added by the network that owns it."""
         match self.conditioning:
             case "one-hot":
@@ -165,6 +174,7 @@ class SAC:
             case "parameters":
                 return context
             case "vectors":
+                assert vectors is not None
                 return vectors[index]
         return jnp.zeros(0)
 

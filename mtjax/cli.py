@@ -1,0 +1,225 @@
+"""The command line: names first, then typed overrides of what the names stand for; and its record as JSON."""
+
+import contextlib
+import dataclasses
+import io
+import itertools
+import json
+import re
+import sys
+import tomllib
+from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import tyro
+
+from mtjax.agents import AGENTS, SAC, agent
+from mtjax.envs import ENVS, Family, make
+from mtjax.loop import Settings
+from mtjax.names import nearest_error
+from mtjax.run import Plan
+from mtjax.types import InputError
+
+PRESETS = ("auto", "cpu", "gpu")
+P = TypeVar("P")
+
+
+@dataclasses.dataclass(frozen=True)
+class Program:
+    """Train a multi-task agent: ``python -m mtjax.train --env=NAME --agent=NAME``."""
+
+    env: str = "finger-spin-vary-size"
+    """Name of the environment family; --list shows all."""
+    agent: str = "sac-conditioned"
+    """Name of the agent; --list shows all."""
+    preset: Literal["auto", "cpu", "gpu"] = "auto"
+    """Tuned defaults of the flags below for a kind of device; auto chooses by the device that JAX runs on."""
+    runs: str = "runs"
+    """Folder in which the run's own folder is made."""
+    resume: str = ""
+    """A run's folder to go on with; only --steps may be given beside it."""
+    list: bool = False
+    """Print the families and agents, and stop."""
+    plan: Annotated[Plan, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Plan)
+    training: Annotated[Settings, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Settings)
+    family: Annotated[Family, tyro.conf.arg(name="env")] = dataclasses.field(
+        default_factory=lambda: make("finger-spin")
+    )
+    learner: Annotated[SAC, tyro.conf.arg(name="agent")] = dataclasses.field(default_factory=SAC)
+
+
+def parse(argv: Sequence[str]) -> Program:
+    """Read a command line: the names choose the defaults, the other flags change them.
+
+    Raises:
+        InputError: a name, flag or value cannot be used.
+    """
+    env_name = _peel(argv, "env", Program.env)
+    agent_name = _peel(argv, "agent", Program.agent)
+    preset_name = _peel(argv, "preset", Program.preset)
+    if preset_name not in PRESETS:
+        raise nearest_error("preset", preset_name, PRESETS)
+    default = with_preset(env_name, agent_name, preset_name)
+    _check_flags(argv, default)
+    return parse_with_tyro(Program, argv, default, "python -m mtjax.train")
+
+
+def with_preset(env_name: str, agent_name: str, preset_name: str = "auto") -> Program:
+    """Return the program that a family, an agent and a preset stand for.
+
+    Raises:
+        InputError: a name is unknown.
+    """
+    family = make(env_name)
+    if agent_name not in AGENTS:
+        raise nearest_error("agent", agent_name, AGENTS)
+    preset = load_preset(env_name, _device_preset() if preset_name == "auto" else preset_name)
+    fields = AGENTS[agent_name].__dataclass_fields__
+    common, special = preset.get("agent", {}), preset.get(agent_name, {})
+    settings = {k: _tuples(v) for k, v in (common | special).items() if k in fields}
+    return Program(
+        env=env_name,
+        agent=agent_name,
+        preset=preset_name,  # type: ignore
+        plan=Plan(**preset.get("plan", {})),
+        training=Settings(**preset.get("training", {})),
+        family=family,
+        learner=agent(agent_name, **settings),
+    )
+
+
+def load_preset(env_name: str, name: str) -> dict[str, Any]:
+    """Read the tables of a preset: the family's own file, or the domain's, or the default one."""
+    folder = resources.files("mtjax") / "configs"
+    words = env_name.split("-")
+    names = ["-".join(words[:n]) for n in range(len(words), 0, -1)]
+    file = next((f for n in [*names, "default"] if (f := folder / f"{n}.toml").is_file()), None)
+    assert file is not None, "the package lacks configs/default.toml"
+    return tomllib.loads(file.read_text())[name]
+
+
+def _device_preset() -> str:
+    import jax
+
+    return "cpu" if jax.default_backend() == "cpu" else "gpu"
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _peel(argv: Sequence[str], name: str, default: str) -> str:
+    """Find --name=VALUE or --name VALUE; the last one counts."""
+    value = default
+    for i, word in enumerate(argv):
+        if word.startswith(f"--{name}="):
+            value = word.split("=", 1)[1]
+        elif word == f"--{name}":
+            if i + 1 == len(argv):
+                raise InputError(f"--{name} needs a value")
+            value = argv[i + 1]
+    return value
+
+
+def flags(program: Any, prefix: str = "--") -> list[str]:
+    """Every flag of a program."""
+    names = []
+    for field in dataclasses.fields(program):
+        value, name = getattr(program, field.name), field.name.replace("_", "-")
+        group = {"plan": "--", "training": "--", "family": "--env.", "learner": "--agent."}.get(field.name)
+        if group is not None:
+            names += flags(value, group)
+        else:
+            names.append(f"--{name}" if name in ("split", "engine") else f"{prefix}{name}")
+    return names
+
+
+def _check_flags(argv: Sequence[str], program: Program) -> None:
+    known = flags(program)
+    known += [flag.replace("--", "--no-", 1) for flag in known]
+    known += ["".join((*flag.rpartition(".")[:2], "no-", flag.rpartition(".")[2])) for flag in known if "." in flag]
+    for word in argv:
+        flag = word.split("=", 1)[0].replace("_", "-")
+        if flag.startswith("--") and flag not in (*known, "--help"):
+            error = nearest_error("flag", flag, known)
+            raise InputError(str(error).split("choose from")[0] + "--help lists the flags")
+
+
+def parse_with_tyro(cls: type[P], argv: Sequence[str], default: P, name: str) -> P:
+    """Parse with tyro, whose framed error becomes one line.
+
+    Raises:
+        InputError: tyro refused the command line.
+    """
+    output = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(output):
+            return tyro.cli(cls, args=list(argv), default=default, prog=name)
+    except SystemExit as stop:
+        if stop.code in (0, None):
+            raise
+        lines = [line.strip(" │") for line in output.getvalue().splitlines() if line.startswith("│")]
+        message = " ".join(itertools.takewhile(lambda line: line and not line.startswith(("--", "─")), lines))
+        message = re.sub(r"^Error parsing (plan|training|family|learner): ", "", message)
+        raise InputError(message or "the command line cannot be read; --help lists the flags") from None
+
+
+# The record of a run.
+
+
+def to_json(program: Program, extra: dict[str, Any]) -> str:
+    """Write everything a run is made of."""
+    return json.dumps({**dataclasses.asdict(program), **extra}, indent=2) + "\n"
+
+
+def from_json(path: Path) -> Program:
+    """Read the program of a run from its config.json.
+
+    Raises:
+        InputError: there is no such file, or it does not describe a run.
+    """
+    if not path.is_file():
+        raise InputError(f"{str(path.parent)!r} is not a run: it has no config.json")
+    try:
+        record = json.loads(path.read_text())
+        rebuilt = lambda part: {k: _tuples(v) for k, v in record[part].items()}
+        return Program(
+            env=record["env"],
+            agent=record["agent"],
+            preset=record["preset"],
+            runs=record["runs"],
+            plan=Plan(**record["plan"]),
+            training=Settings(**record["training"]),
+            family=make(record["env"], **rebuilt("family")),
+            learner=agent(record["agent"], **rebuilt("learner")),
+        )
+    except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{str(path)!r} does not describe a run: {type(error).__name__}: {error}") from None
+
+
+def catalogue() -> str:
+    """List families and agents with the first sentence of their documentation."""
+    first = lambda cls: (cls.__doc__ or "").split(".")[0].split(" (")[0].replace("\n", " ").split("  ")[0]
+    lines = ["environments:"]
+    for name, (family, settings) in ENVS.items():
+        tasks = settings.get("num_tasks", 1)
+        lines.append(f"  {name:30} {tasks:3} task{'s' if tasks > 1 else ' '}  {first(family)}")
+    lines.append("agents:")
+    return "\n".join(lines + [f"  {name:30} {first(cls)}" for name, cls in AGENTS.items()])
+
+
+def main(run: Any) -> None:
+    """Run a program's entry point; what the user got wrong becomes a line and exit code 2."""
+    try:
+        run(sys.argv[1:])
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except FloatingPointError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(1)
+    except OSError as error:
+        print(f"error: {error.strerror or error}: {error.filename or ''}".rstrip(": "), file=sys.stderr)
+        sys.exit(2)

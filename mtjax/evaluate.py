@@ -1,0 +1,154 @@
+"""``python -m mtjax.evaluate --run=DIR``: score a trained run on every task of every split, plot it, film it."""
+
+import contextlib
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from mtjax import cli
+from mtjax.evaluation import Evaluations, evaluate, record
+from mtjax.log import append_rows, number
+from mtjax.names import nearest_error
+from mtjax.policy import Policy, load
+from mtjax.run import SPLITS, enable_compile_cache
+from mtjax.stats import mean_interval
+from mtjax.types import InputError
+
+_FIRST_NUMBER = 1_000_000  # far from the numbers of a run's own evaluations, so that the episodes are new
+
+
+@dataclasses.dataclass(frozen=True)
+class Request:
+    """Evaluate a trained run: ``python -m mtjax.evaluate --run=DIR``."""
+
+    run: str = ""
+    """The run's folder."""
+    episodes: int = 10
+    """Episodes of each task and seed."""
+    seed: int = 0
+    """Chooses the starting states."""
+    video: bool = False
+    """Film one episode of each task (mp4 if ffmpeg is installed, else gif)."""
+
+
+def main(argv: Sequence[str]) -> None:
+    """Score the run, print the table, and leave table, plot and films in a new folder inside the run's."""
+    request = _parse(argv)
+    enable_compile_cache()
+    policy = load(request.run)
+    episodes = score(policy, request.episodes, request.seed)
+    directory = _new_folder(Path(request.run))
+    print(task_table(policy, episodes))
+    if policy.agent.unseen:  # type: ignore
+        print(f"unseen tasks: {policy.agent.unseen}")  # type: ignore
+    _write(policy, episodes, directory)
+    if request.video:
+        _film(policy, directory, request.seed)
+    print(f"written to {directory}")
+
+
+def _parse(argv: Sequence[str]) -> Request:
+    known = [f"--{f.name}" for f in dataclasses.fields(Request)] + ["--no-video", "--help", "-h"]
+    for word in argv:
+        if word.startswith("-") and word.split("=")[0] not in known:
+            raise nearest_error("flag", word.split("=")[0], known)
+    request = cli.parse_with_tyro(Request, argv, Request(), "python -m mtjax.evaluate")
+    if not request.run:
+        raise InputError("say which run to evaluate: --run=DIR")
+    if request.episodes < 1 or request.seed < 0:
+        raise InputError("episodes must be at least 1 and seed at least 0")
+    return request
+
+
+def score(policy: Policy, episodes: int, seed: int = 0) -> dict[str, np.ndarray]:
+    """Return the returns (S, T, episodes) of each split, in episodes that no training run has seen."""
+    env, program = policy.env, jnp.int32(_FIRST_NUMBER + seed)
+    returns = np.asarray(evaluate(env, policy.agent, episodes, policy.states, env.tasks("all"), policy.seeds, program))
+    return {split: returns[:, np.asarray(env.tasks(split).id)] for split in SPLITS}
+
+
+def _new_folder(run: Path) -> Path:
+    for attempt in range(1, 10_000):
+        with contextlib.suppress(FileExistsError):
+            (run / f"evaluation-{attempt}").mkdir()
+            return run / f"evaluation-{attempt}"
+    raise InputError(f"{str(run)!r} is full of evaluations; move some away")
+
+
+def _value_of(policy: Policy, split: str) -> tuple[str, np.ndarray]:
+    """The varying parameter's name and its values (T,) in a split."""
+    (name, values), *_ = policy.env.tasks(split).params.items()
+    return name, np.asarray(values)
+
+
+def _interval(scores: np.ndarray) -> str:
+    """Mean of scores (S, T) with its 95% interval over seeds, if there are several."""
+    point, low, high = mean_interval(scores)
+    return f"{point:6.0f}" + (f"  [{low:.0f}, {high:.0f}]" if scores.shape[0] > 1 else "")
+
+
+def split_table(evaluations: Evaluations) -> str:
+    """Lay out the last evaluation of a run: mean return by split, and the worst task's."""
+    lines = [f"{'split':15} {'tasks':>5} {'return':>7}  worst task"]
+    for split, returns in evaluations.returns.items():
+        if returns.size:
+            scores = returns[:, -1].mean(axis=-1)  # (S, T)
+            lines.append(f"{split:15} {scores.shape[1]:5} {_interval(scores):>7}  {scores.mean(axis=0).min():.0f}")
+    return "\n".join(lines)
+
+
+def task_table(policy: Policy, episodes: dict[str, np.ndarray]) -> str:
+    """Lay out returns (S, T, episodes) by split and task."""
+    lines = [f"{'split':15} {_value_of(policy, 'train')[0]:>10} {'return':>7}   episodes from, to"]
+    for split, returns in episodes.items():
+        if not returns.size:
+            continue
+        for value, task in zip(_value_of(policy, split)[1], np.moveaxis(returns, 1, 0), strict=True):
+            mean = _interval(task.mean(axis=-1, keepdims=True))
+            lines.append(f"{split:15} {value:10.4g} {mean:>7}   {task.min():.0f}, {task.max():.0f}")
+        lines.append(f"{split:15} {'all':>10} {_interval(returns.mean(axis=-1)):>7}")
+    return "\n".join(lines)
+
+
+def _write(policy: Policy, episodes: dict[str, np.ndarray], directory: Path) -> None:
+    from mtjax import plot
+
+    name, _ = _value_of(policy, "train")
+    rows = [
+        {"split": split, name: number(value), "seed": int(seed), "episode": e, "return": number(x)}
+        for split, returns in episodes.items()
+        for seed, of_seed in zip(policy.seeds, returns, strict=True)
+        for value, of_task in zip(_value_of(policy, split)[1], of_seed, strict=True)
+        for e, x in enumerate(of_task)
+    ]
+    append_rows(directory / "returns.csv", rows)
+    values = {split: _value_of(policy, split)[1] for split in episodes}
+    unit = policy.env.parameters[name].unit  # type: ignore
+    plot.return_by_parameter(directory / f"return_by_{name.replace('-', '_')}.png", name, unit, values, episodes)
+
+
+def _film(policy: Policy, directory: Path, seed: int) -> None:
+    """Film one episode of every task, as fast as it happens."""
+    from mtjax import render
+
+    env = policy.env
+    render.choose_backend()
+    returns, states = record(env, policy.agent, policy.state, env.tasks("all"), jnp.int32(seed))
+    for split in SPLITS:
+        name, values = _value_of(policy, split)
+        for row, value in zip(np.asarray(env.tasks(split).id), values, strict=True):
+            frames = render.film(env, int(row), np.asarray(states.qpos[row, ::2]))
+            path = render.write_video(directory / f"{split}-{name}-{value:.4g}", frames, fps=25)
+            print(f"filmed {path.name}: return {float(returns[row]):.0f}", flush=True)
+
+
+def run() -> None:
+    """Entry point of the command line."""
+    cli.main(main)
+
+
+if __name__ == "__main__":
+    run()

@@ -1,0 +1,91 @@
+"""What a run writes while it goes: a line of metrics a chunk, on the terminal and in a file."""
+
+import csv
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+def append_rows(path: Path, rows: list[dict[str, Any]]) -> None:
+    """Append rows to a CSV file, with a header if it is new."""
+    is_new = not path.exists()
+    with path.open("a", newline="") as file:
+        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
+        if is_new:
+            writer.writeheader()
+        writer.writerows(rows)
+
+
+def truncate_rows(path: Path, iteration: int) -> None:
+    """Drop the rows of a CSV file that lie after an iteration, as a resumed run will write them again."""
+    if not path.exists():
+        return
+    with path.open(newline="") as file:
+        reader = csv.DictReader(file)
+        kept = [row for row in reader if int(row["iteration"]) <= iteration]
+        names = reader.fieldnames or []
+    replacement = path.with_suffix(".new")
+    with replacement.open("w", newline="") as file:
+        writer = csv.DictWriter(file, fieldnames=names)
+        writer.writeheader()
+        writer.writerows(kept)
+    os.replace(replacement, path)
+
+
+def metric_rows(metrics: dict[str, np.ndarray], seeds: np.ndarray, common: dict[str, Any]) -> list[dict[str, Any]]:
+    """Lay out one chunk's metrics (S, T) or (S,) as one row a seed: means over tasks, and each task's return."""
+    rows = []
+    for s, seed in enumerate(seeds):
+        row = {"seed": int(seed), **common, "return": number(_mean(metrics["return"][s]))}
+        row |= {name: number(np.mean(x[s])) for name, x in metrics.items() if name not in ("return", "bad_step")}
+        row |= {f"return_{t}": number(x) for t, x in enumerate(metrics["return"][s])}
+        rows.append(row)
+    return rows
+
+
+def _mean(x: np.ndarray) -> float:
+    """Mean of what is there, NaN of nothing."""
+    return float(np.mean(x[np.isfinite(x)])) if np.any(np.isfinite(x)) else np.nan
+
+
+def number(x: Any) -> str:
+    """Format a number for a file: seven digits, nothing for NaN."""
+    return "" if np.isnan(x) else f"{float(x):.7g}"
+
+
+class Console:
+    """Live progress: a bar on a terminal, plain lines elsewhere. Silent if asked to be."""
+
+    def __init__(self, total_steps: int, quiet: bool = False):
+        self.total, self.quiet, self.bar = total_steps, quiet, None
+        if quiet or not sys.stdout.isatty():
+            return
+        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+        self.bar = Progress(BarColumn(24), TextColumn("{task.description}"), TimeRemainingColumn(), transient=False)
+        self.task = self.bar.add_task("compiling", total=total_steps)
+        self.bar.start()
+
+    def say(self, text: str) -> None:
+        """Print a line."""
+        if self.bar is not None:
+            self.bar.console.print(text, highlight=False, markup=False)
+        elif not self.quiet:
+            print(text, flush=True)
+
+    def progress(self, steps: int, seconds: float, rate: float, returns: np.ndarray) -> None:
+        """Show where training is; ``returns`` (S, T) of this chunk's episodes, NaN where none ended."""
+        known = returns[np.isfinite(returns)]
+        score = f"return {known.mean():.0f} ({known.min():.0f} to {known.max():.0f})" if known.size else "return -"
+        text = f"{steps:,} of {self.total:,} steps  {seconds:.1f} s  {rate:,.0f} steps/s  {score}"
+        if self.bar is not None:
+            self.bar.update(self.task, completed=steps, description=text)
+        else:
+            self.say(text)
+
+    def close(self) -> None:
+        if self.bar is not None:
+            self.bar.stop()

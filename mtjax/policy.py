@@ -1,0 +1,45 @@
+"""Trained policies, read back from the folder of a run."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from mtjax import checkpoint, cli, loop
+from mtjax.types import Agent, Array, Env, Key, Task
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Policy:
+    """What a run learned: ``action = policy(obs, task)``, for single observations (O,); map it for many."""
+
+    env: Env
+    agent: Agent
+    state: Any  # of one seed
+    states: Any  # of every seed, leading S
+    seeds: Array  # (S,)
+
+    def __call__(self, obs: Array, task: Task, key: Key | None = None) -> Array:
+        """Return the mean action (A,), or a random one if a key is given."""
+        return self.agent.act(self.state, obs, task, key)
+
+
+def load(directory: str | Path, seed: int = 0) -> Policy:
+    """Read the policy that a run learned.
+
+    Args:
+        directory: the run's folder.
+        seed: which of the run's seeds, counted from 0.
+
+    Raises:
+        InputError: the folder is not a run, or its checkpoint is missing or damaged.
+    """
+    directory = Path(directory)
+    program = cli.from_json(directory / "config.json")
+    env, agent = program.family, program.learner
+    seeds = program.plan.seed + jnp.arange(program.plan.seeds)
+    shapes = jax.eval_shape(lambda: loop.init(env, agent, program.training, env.tasks("train"), seeds))
+    states = checkpoint.load_agent(directory / "checkpoints", shapes)
+    return Policy(env, agent, jax.tree.map(lambda x: x[seed], states), states, seeds)

@@ -1,0 +1,137 @@
+"""Videos of one task, drawn without a display."""
+
+import importlib
+import math
+import os
+import platform
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from PIL import Image
+
+from mtjax.envs.family import Family
+from mtjax.types import InputError
+
+_ELEVATION = -math.degrees(math.atan(0.5))  # dm_control's cam0 of the finger: xyaxes="1 0 0 0 1 2"
+_DISTANCES = 2.0  # from camera to centre, in extents of the model; cam0 of the finger is 1.7 away
+_GIF_FPS = 50  # browsers slow down frames that are shorter than 0.02 s
+_FIX = (
+    "cannot draw without a display with MUJOCO_GL={}; on Debian or Ubuntu run `apt install libegl1 libgl1-mesa-dri` "
+    "for MUJOCO_GL=egl, or `apt install libosmesa6` for MUJOCO_GL=osmesa"
+)
+
+
+def choose_backend() -> str:
+    """Make MuJoCo draw with the OpenGL backend in ``MUJOCO_GL``, on Linux "egl" where it is unset; return its name.
+
+    It may be called after MuJoCo was imported. Raises whatever the backend raises where its libraries are missing.
+    """
+    if platform.system() == "Linux":
+        os.environ.setdefault("MUJOCO_GL", "egl")
+    # MuJoCo reads the variable only when it is imported, and its Renderer finds the context through this module.
+    importlib.reload(importlib.import_module("mujoco.rendering.classic.gl_context"))
+    return os.environ.get("MUJOCO_GL", "")
+
+
+def film(env: Family, task_row: int, qpos: np.ndarray, width: int = 320, height: int = 240) -> np.ndarray:
+    """Draw the task in row ``task_row`` of ``env.table`` in each of the positions (H, nq).
+
+    The camera looks along +y and down, as cam0 of dm_control's finger does. It stands in one place for every task of
+    the family, so that their sizes can be compared, and does not follow a model that travels.
+
+    Returns:
+        Frames (H, height, width, 3) uint8.
+
+    Raises:
+        InputError: there is no such row, or no OpenGL backend works; then it names what to install.
+    """
+    values = np.asarray(env.table.tasks.params[env.vary])
+    if not 0 <= task_row < len(values):
+        raise InputError(f"there is no task {task_row}; this family has tasks 0 to {len(values) - 1}")
+    model = _lit_model(env, float(values[task_row]), width, height)
+    data, camera = mujoco.MjData(model), _camera(env)
+    frames = np.empty((len(qpos), height, width, 3), np.uint8)
+    with _open_renderer(model, width, height) as renderer:
+        for frame, position in zip(frames, np.asarray(qpos), strict=True):
+            data.qpos[:] = position
+            mujoco.mj_forward(model, data)
+            renderer.update_scene(data, camera)
+            renderer.render(out=frame)
+    return frames
+
+
+def write_video(path_stem: str | Path, frames: np.ndarray, fps: float) -> Path:
+    """Write frames (H, height, width, 3) uint8 to ``path_stem`` plus .mp4, or .gif where mediapy or ffmpeg is missing.
+
+    A GIF keeps its speed, to 0.01 s a frame, by leaving out frames above 50 a second. Returns the file's path.
+
+    Raises:
+        InputError: the file exists already, or there are no frames.
+    """
+    mediapy = _mediapy_with_ffmpeg()
+    path = Path(f"{path_stem}.{'mp4' if mediapy else 'gif'}")
+    if path.exists():
+        raise InputError(f"{path} exists already; give another name or remove it")
+    if not len(frames):
+        raise InputError("there are no frames to write")
+    if mediapy:
+        mediapy.write_video(path, frames, fps=fps)
+    else:
+        _write_gif(path, frames, fps)
+    return path
+
+
+def _lit_model(env: Family, value: float, width: int, height: int) -> mujoco.MjModel:
+    spec = env.compile_spec(value)
+    spec.worldbody.add_light(pos=[0, -1, 3], dir=[0, 0.3, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=[0.4, 0.6, 0.8],
+        rgb2=[0.9, 0.95, 1],
+        width=64,
+        height=64,
+    )
+    spec.visual.global_.offwidth = width
+    spec.visual.global_.offheight = height
+    return spec.compile()
+
+
+def _camera(env: Family) -> mujoco.MjvCamera:
+    largest = max(env.table.models, key=lambda model: model.stat.extent)
+    # The model's own centre depends on how its limbs hang at rest; what they hang from stays put.
+    roots = np.flatnonzero(largest.body_parentid == 0)[1:]
+    camera = mujoco.MjvCamera()
+    camera.lookat[:] = largest.body_pos[roots].mean(axis=0)
+    camera.distance = _DISTANCES * largest.stat.extent
+    camera.azimuth, camera.elevation = 90, _ELEVATION
+    return camera
+
+
+def _open_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Renderer:
+    unset = {"MUJOCO_GL", "PYOPENGL_PLATFORM"}.difference(os.environ)
+    try:
+        choose_backend()
+        return mujoco.Renderer(model, height, width)
+    except Exception as error:  # every backend fails with a type of its own
+        message = _FIX.format(os.environ.get("MUJOCO_GL", "unset"))
+        # A child process that inherited a backend without libraries would fail at `import mujoco`.
+        for name in unset:
+            os.environ.pop(name, None)
+        raise InputError(message) from error
+
+
+def _mediapy_with_ffmpeg():
+    try:
+        mediapy = importlib.import_module("mediapy")
+    except ImportError:
+        return None
+    return mediapy if mediapy.video_is_available() else None
+
+
+def _write_gif(path: Path, frames: np.ndarray, fps: float) -> None:
+    stride = math.ceil(fps / _GIF_FPS)
+    images = [Image.fromarray(frame) for frame in frames[::stride]]
+    images[0].save(path, save_all=True, append_images=images[1:], duration=1000 * stride / fps, loop=0)

@@ -1,0 +1,312 @@
+"""The host loop around the jitted one: log, evaluate, checkpoint, stop cleanly, and go on where a run stopped."""
+
+import contextlib
+import dataclasses
+import math
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mtjax import checkpoint, log
+from mtjax.evaluation import Evaluations, evaluate
+from mtjax.loop import Settings, TrainState, init, run_chunk
+from mtjax.types import Agent, Env, InputError
+
+SPLITS = ("train", "interpolation", "extrapolation")
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """How long a run lasts, over which seeds, and when it is evaluated."""
+
+    steps: int = 1_000_000
+    """Environment steps of each seed, summed over tasks; rounded up to whole chunks."""
+    seed: int = 0
+    """The first seed."""
+    seeds: int = 1
+    """Seeds to run at once, in one program."""
+    eval_every: int = 0
+    """Environment steps between evaluations, rounded up to whole chunks; 0 evaluates ten times in the run."""
+    eval_episodes: int = 10
+    """Episodes of each task in an evaluation."""
+
+    def __post_init__(self):
+        for field, least in (("steps", 1), ("seeds", 1), ("seed", 0), ("eval_every", 0), ("eval_episodes", 1)):
+            if getattr(self, field) < least:
+                raise InputError(f"{field.replace('_', '-')} must be at least {least}, not {getattr(self, field)}")
+
+
+class Result(NamedTuple):
+    """What a run gives back."""
+
+    state: TrainState
+    evaluations: Evaluations
+    rows: list[dict[str, Any]]  # the lines of metrics.csv
+    seconds: float  # spent training, without compiling and evaluating
+    finished: bool  # False if a signal stopped it
+    directory: Path | None
+
+
+class Programs(NamedTuple):
+    """The compiled programs of a run."""
+
+    chunk: Callable
+    evaluate: Callable
+
+
+def train(
+    env: Env,
+    agent: Agent,
+    *,
+    steps: int = Plan.steps,
+    seeds: int = Plan.seeds,
+    seed: int = Plan.seed,
+    eval_every: int = Plan.eval_every,
+    eval_episodes: int = Plan.eval_episodes,
+    settings: Settings | None = None,
+    directory: str | Path | None = None,
+    resume: bool = False,
+    quiet: bool = True,
+    on_chunk: Callable[[dict[str, Any]], None] | None = None,
+) -> Result:
+    """Train an agent on a family of tasks.
+
+    Args:
+        env: the family; it trains on ``env.tasks("train")``.
+        agent: the learner.
+        steps: environment steps of each seed, summed over tasks; rounded up to whole chunks.
+        seeds: how many seeds to run at once; seed: the first of them.
+        eval_every: environment steps between evaluations (0: ten in the run), of ``eval_episodes`` episodes a task.
+        settings: how to collect and learn; by default ``Settings()``.
+        directory: an existing folder for metrics, evaluations and checkpoints; None writes nothing.
+        resume: go on from the newest checkpoint in ``directory``.
+        quiet: print nothing.
+        on_chunk: called with each chunk's first row of metrics.
+
+    Raises:
+        InputError: an argument cannot be used.
+        FloatingPointError: numbers stopped being finite; the message names task and step.
+    """
+    plan = Plan(steps, seed, seeds, eval_every, eval_episodes)
+    directory = None if directory is None else Path(directory)
+    started = time.monotonic()
+    tasks = env.tasks("train")
+    settings = fit_chunk(settings or Settings(), len(tasks.id), steps)
+    run = _Run(env, agent, settings, plan, directory, log.Console(plan.steps, quiet))
+    try:
+        programs, state = run.begin(resume)
+        run.console.say(f"compiled in {time.monotonic() - started:.1f} s")
+        return run.drive(programs, state, started, on_chunk)
+    finally:
+        run.console.close()
+
+
+def fit_chunk(settings: Settings, num_tasks: int, steps: int) -> Settings:
+    """Shorten chunks that are longer than the whole run."""
+    whole_run = math.ceil(steps / (num_tasks * settings.num_envs))
+    return dataclasses.replace(settings, chunk_steps=min(settings.chunk_steps, whole_run))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Run:
+    """The fixed parts of one run."""
+
+    env: Env
+    agent: Agent
+    settings: Settings
+    plan: Plan
+    directory: Path | None
+    console: log.Console
+
+    @property
+    def seeds(self) -> jax.Array:
+        return self.plan.seed + jnp.arange(self.plan.seeds)
+
+    @property
+    def chunk_env_steps(self) -> int:
+        """Environment steps of one chunk, summed over tasks."""
+        return len(self.env.tasks("train").id) * self.settings.num_envs * self.settings.chunk_steps
+
+    @property
+    def num_chunks(self) -> int:
+        return math.ceil(self.plan.steps / self.chunk_env_steps)
+
+    @property
+    def chunks_per_evaluation(self) -> int:
+        every = self.plan.eval_every or self.plan.steps / 10
+        return min(max(1, math.ceil(every / self.chunk_env_steps)), self.num_chunks)
+
+    def begin(self, resume: bool) -> tuple[Programs, TrainState]:
+        """Compile every program at the same time, and make or restore the state."""
+        env, agent, settings = self.env, self.agent, self.settings
+        tasks, everything = env.tasks("train"), env.tasks("all")
+        fresh = init.lower(env, agent, settings, tasks, self.seeds)
+        shapes = fresh.out_info
+        self._describe(shapes)
+        with ThreadPoolExecutor(3) as pool:
+            make = pool.submit(fresh.compile)
+            lowered = run_chunk.lower(env, agent, settings, tasks, shapes)
+            chunk = pool.submit(lowered.compile)
+            number = jnp.int32(0)
+            lowered = evaluate.lower(env, agent, self.plan.eval_episodes, shapes.agent, everything, self.seeds, number)
+            score = pool.submit(lowered.compile)
+            state = self._restore(shapes) if resume else make.result()(tasks, self.seeds)
+            return Programs(chunk.result(), score.result()), state
+
+    def _describe(self, shapes: TrainState) -> None:
+        replay = checkpoint.size_of(shapes.replay) / 1e6
+        self.console.say(
+            f"memory: {checkpoint.size_of(shapes) / 1e6:,.0f} MB of state, of which {replay:,.0f} MB replay "
+            f"({self.settings.capacity:,} transitions a task)"
+        )
+        if self.directory is not None:
+            checkpoint.require_space(self.directory, shapes)
+
+    def _restore(self, shapes: TrainState) -> TrainState:
+        assert self.directory is not None
+        state = checkpoint.load(self.directory / "checkpoints", shapes)
+        log.truncate_rows(self.directory / "metrics.csv", int(state.iteration[0]))
+        return state
+
+    def drive(self, programs: Programs, state: TrainState, started: float, on_chunk) -> Result:
+        """Run chunks until the plan is done or a signal asks to stop."""
+        tasks = self.env.tasks("train")
+        evaluations = self._earlier_evaluations(int(state.iteration[0]))
+        rows, seconds = [], 0.0
+        with stop_signals() as stopping:
+            for chunk in range(int(state.iteration[0]) // self.settings.chunk_steps, self.num_chunks):
+                before = time.monotonic()
+                state, metrics = programs.chunk(tasks, state)
+                metrics = jax.device_get(metrics)
+                seconds += time.monotonic() - before
+                _require_finite(metrics["bad_step"], self.settings.chunk_steps * chunk)
+                common = {
+                    "iteration": self.settings.chunk_steps * (chunk + 1),
+                    "steps": self.chunk_env_steps * (chunk + 1),
+                    "seconds": f"{seconds:.3f}",
+                    "wall_seconds": f"{time.monotonic() - started:.3f}",
+                }
+                new = log.metric_rows(metrics, np.asarray(self.seeds), common)
+                rows += new
+                self._write(new)
+                rate = self.chunk_env_steps * self.plan.seeds / (time.monotonic() - before)
+                self.console.progress(common["steps"], seconds, rate, metrics["return"])
+                if (chunk + 1) % self.chunks_per_evaluation == 0 or chunk + 1 == self.num_chunks:
+                    evaluations = self._evaluate(programs.evaluate, state, evaluations, common["steps"])
+                    self._save(state)
+                if on_chunk is not None:
+                    on_chunk(new[0])
+                if stopping:
+                    self._save(state)
+                    break
+        finished = int(state.iteration[0]) >= self.num_chunks * self.settings.chunk_steps
+        return Result(state, evaluations, rows, seconds, finished, self.directory)
+
+    def _write(self, rows: list[dict[str, Any]]) -> None:
+        if self.directory is not None:
+            log.append_rows(self.directory / "metrics.csv", rows)
+
+    def _save(self, state: TrainState) -> None:
+        if self.directory is not None:
+            checkpoint.save(self.directory / "checkpoints", state)
+
+    def _evaluate(self, program: Callable, state: TrainState, past: Evaluations, steps: int) -> Evaluations:
+        """Evaluate on all splits, and add the result to the run's evaluations."""
+        number = jnp.int32(len(past.steps))
+        returns = np.asarray(program(state.agent, self.env.tasks("all"), self.seeds, number))
+        grown = {}
+        for split, old in past.returns.items():
+            rows = np.asarray(self.env.tasks(split).id)
+            grown[split] = np.concatenate([old, returns[:, None, rows]], axis=1)
+        evaluations = Evaluations(np.append(past.steps, steps), grown, past.values)
+        if self.directory is not None:
+            save_evaluations(self.directory / "evaluations.npz", evaluations)
+        means = ", ".join(f"{s} {x[:, -1].mean():.0f}" for s, x in grown.items() if x.size)
+        self.console.say(f"evaluation at {steps:,} steps: {means}")
+        return evaluations
+
+    def _earlier_evaluations(self, iteration: int) -> Evaluations:
+        """The evaluations up to an iteration: those on disk if the run is resumed, else none."""
+        steps = iteration * self.chunk_env_steps // self.settings.chunk_steps
+        file = None if self.directory is None else self.directory / "evaluations.npz"
+        if iteration and file is not None and file.exists():
+            past = load_evaluations(file)
+            kept = past.steps <= steps
+            return Evaluations(past.steps[kept], {s: x[:, kept] for s, x in past.returns.items()}, past.values)
+        tables = {split: self.env.tasks(split) for split in SPLITS}
+        empty = lambda table: np.zeros((self.plan.seeds, 0, len(table.id), self.plan.eval_episodes), np.float32)
+        value = lambda table: np.asarray(next(iter(table.params.values()), table.id))
+        return Evaluations(
+            steps=np.zeros(0, np.int64),
+            returns={split: empty(table) for split, table in tables.items()},
+            values={split: value(table) for split, table in tables.items()},
+        )
+
+
+def _require_finite(bad_step: np.ndarray, first_step: int) -> None:
+    """Stop a run whose numbers are not finite, naming task and step."""
+    if np.all(bad_step < 0):
+        return
+    step = int(np.min(bad_step[bad_step >= 0]))
+    seed, task = (int(i) for i in np.argwhere(bad_step == step)[0])
+    raise FloatingPointError(
+        f"numbers stopped being finite at step {first_step + step} of task {task} (seed {seed} of the run); "
+        "the last checkpoint is from before it. Try lower learning rates or max-gradient-norm"
+    )
+
+
+def save_evaluations(path: Path, evaluations: Evaluations) -> None:
+    """Write every episode's return: ``steps`` (V,), and per split returns (S, V, T, episodes) and values (T,)."""
+    values = {f"{split}_values": x for split, x in evaluations.values.items()}
+    new = path.with_suffix(".new.npz")
+    np.savez(new, steps=evaluations.steps, **evaluations.returns, **values)  # type: ignore
+    os.replace(new, path)
+
+
+def load_evaluations(path: Path) -> Evaluations:
+    """Read what ``save_evaluations`` wrote."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            returns = {split: file[split] for split in SPLITS}
+            return Evaluations(file["steps"], returns, {s: file[f"{s}_values"] for s in SPLITS})
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(f"cannot read evaluations from {str(path)!r}: {error}") from None
+
+
+@contextlib.contextmanager
+def stop_signals() -> Iterator[list[int]]:
+    """Collect Ctrl-C and SIGTERM instead of dying of them; a second Ctrl-C does what it always does."""
+    received: list[int] = []
+
+    def note(number, _frame) -> None:
+        received.append(number)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    try:
+        before = [signal.signal(number, note) for number in numbers]
+    except ValueError:  # not in the main thread, where Python keeps signals
+        yield received
+        return
+    try:
+        yield received
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+
+
+def enable_compile_cache() -> None:
+    """Keep compiled programs between runs, in ~/.cache/mtjax or $MTJAX_CACHE; MTJAX_CACHE=0 does not."""
+    place = os.environ.get("MTJAX_CACHE", "~/.cache/mtjax/xla")
+    if place == "0":
+        return
+    jax.config.update("jax_compilation_cache_dir", str(Path(place).expanduser()))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)

@@ -1,0 +1,170 @@
+"""``python -m mtjax.train``: train an agent on a family of tasks, and keep all there is to know of it in a folder."""
+
+import dataclasses
+import itertools
+import platform
+import shlex
+import sys
+import time
+import types
+from collections.abc import Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from mtjax import cli
+from mtjax.cli import Program
+from mtjax.run import Result, enable_compile_cache, train
+from mtjax.types import InputError
+
+_PACKAGES = ("mtjax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
+
+
+def main(argv: Sequence[str]) -> None:
+    """Parse the command line, train, and say where the run is and how each split scored."""
+    program = cli.parse(argv)
+    if program.list:
+        print(cli.catalogue())
+        return
+    resume = bool(program.resume)
+    directory = Path(program.resume) if resume else None
+    if directory is not None:
+        program = _resumed(program, directory, argv)
+    enable_compile_cache()
+    _check(program)
+    if directory is None:
+        directory = new_directory(Path(program.runs), f"{program.env}-{program.agent}")
+        (directory / "config.json").write_text(cli.to_json(program, _circumstances(program)))
+    print(f"{program.agent} on {program.env}: {_summary(program)}\nrun: {directory}", flush=True)
+    plan = dataclasses.asdict(program.plan)
+    result = train(
+        program.family,
+        program.learner,
+        **plan,
+        settings=program.training,
+        directory=directory,
+        resume=resume,
+        quiet=False,
+    )
+    _conclude(program, result, directory)
+
+
+def _resumed(program: Program, directory: Path, argv: Sequence[str]) -> Program:
+    """The program of the run to go on with; ``--steps`` may extend it, and nothing else may change."""
+    given = {word.split("=", 1)[0] for word in argv if word.startswith("--")}
+    if given - {"--resume", "--steps"}:
+        other = ", ".join(sorted(given - {"--resume", "--steps"}))
+        raise InputError(f"--resume goes on with a run as it was; only --steps may change, not {other}")
+    recorded = cli.from_json(directory / "config.json")
+    steps = program.plan.steps if "--steps" in given else recorded.plan.steps
+    return dataclasses.replace(recorded, plan=dataclasses.replace(recorded.plan, steps=steps))
+
+
+def _check(program: Program) -> None:
+    """Meet whatever the family's and the agent's constructors could not check before a run's folder is made."""
+    from mtjax.agents.sac import load_vectors
+    from mtjax.envs.physics import choose_engine
+
+    choose_engine(program.family.engine)
+    if program.learner.vectors:
+        load_vectors(program.learner.vectors, len(program.family.tasks("train").id))
+
+
+def new_directory(root: Path, name: str) -> Path:
+    """Make a folder that did not exist before."""
+    stamp = time.strftime("%Y%m%d-%H%M%S")
+    root.mkdir(parents=True, exist_ok=True)
+    for attempt in range(1000):
+        directory = root / (f"{name}-{stamp}" + (f"-{attempt}" if attempt else ""))
+        try:
+            directory.mkdir()
+            return directory
+        except FileExistsError:
+            continue
+    raise InputError(f"cannot find a new name for a run in {str(root)!r}")
+
+
+def _circumstances(program: Program) -> dict:
+    """What else decides a run's numbers: versions, device, engine; and the command that repeats it."""
+    import jax
+
+    from mtjax.envs.physics import choose_engine
+
+    versions = {}
+    for package in _PACKAGES:
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            versions[package] = "not installed"
+    return {
+        "engine": choose_engine(program.family.engine),
+        "device": str(jax.devices()[0].device_kind),
+        "python": platform.python_version(),
+        "versions": versions,
+        "command": shlex.join(["python", "-m", "mtjax.train", *repeat(program)]),
+    }
+
+
+def repeat(program: Program) -> list[str]:
+    """Every flag of this program, so that the command means the same whatever the presets become."""
+    words = [f"--env={program.env}", f"--agent={program.agent}"]
+    for part, prefix in (("plan", "--"), ("training", "--"), ("family", "--env."), ("learner", "--agent.")):
+        settings = dataclasses.asdict(getattr(program, part)).items()
+        words += itertools.chain(*(_flag(prefix, name.replace("_", "-"), value) for name, value in settings))
+    return words
+
+
+def _flag(prefix: str, name: str, value: object) -> list[str]:
+    prefix = "--" if name in ("split", "engine") else prefix
+    match value:
+        case bool():
+            return [f"{prefix}{name}" if value else f"{prefix}no-{name}"]
+        case tuple():
+            return [f"{prefix}{name}", *map(str, value)] if value else []
+    return [f"{prefix}{name}={value}"] if value != "" else []
+
+
+def _summary(program: Program) -> str:
+    from mtjax.envs.physics import choose_engine
+
+    family, plan = program.family, program.plan
+    values = family.listed_values
+    return (
+        f"{len(family.tasks('train').id)} training tasks, {family.vary} {values[0]:g} to {values[-1]:g}, "
+        f"split {family.split}, engine {choose_engine(family.engine)}, seeds {plan.seed} to {plan.seed + plan.seeds - 1}"
+    )
+
+
+def _conclude(program: Program, result: Result, directory: Path) -> None:
+    from mtjax import plot
+    from mtjax.evaluate import split_table
+
+    if not result.finished:
+        print(
+            f"stopped; the state is saved. Go on with:\n  python -m mtjax.train --resume={shlex.quote(str(directory))}"
+        )
+        return
+    if len(result.evaluations.steps):
+        title = f"{program.agent} on {program.env}"
+        plot.learning_curve(directory / "curve.png", result.evaluations.steps, result.evaluations.returns, title)
+        print(split_table(result.evaluations))
+        if program.learner.unseen:
+            print(f"unseen tasks: {program.learner.unseen}")
+    print(f"trained in {result.seconds:.1f} s; run: {directory}")
+
+
+class _CallableModule(types.ModuleType):
+    """Lets ``mtjax.train(...)`` stay a function after ``import mtjax.train`` has put this module in its place."""
+
+    def __call__(self, *args, **kwargs) -> Result:
+        return train(*args, **kwargs)
+
+
+def run() -> None:
+    """Entry point of the command line."""
+    cli.main(main)
+
+
+sys.modules[__name__].__class__ = _CallableModule
+
+if __name__ == "__main__":
+    run()
