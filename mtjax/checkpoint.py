@@ -19,9 +19,9 @@ def save(directory: Path, state: TrainState) -> None:
 
     iteration = int(state.iteration[0])
     with ocp.training.Checkpointer(
-        directory.absolute(),
-        save_decision_policy=ocp.training.save_decision_policies.FixedIntervalPolicy(1),
-        preservation_policy=ocp.training.preservation_policies.LatestN(_KEPT),
+        str(directory.absolute()),
+        save_decision_policy=ocp.training.save_decision_policies.FixedIntervalPolicy(1),  # type: ignore
+        preservation_policy=ocp.training.preservation_policies.LatestN(_KEPT),  # type: ignore
     ) as checkpointer:
         known = checkpointer.latest
         if known is None or known.step != iteration:
@@ -47,7 +47,7 @@ def _load(directory: Path, like: dict[str, Any]) -> dict[str, Any]:
     if not directory.is_dir():
         raise InputError(f"{str(directory)!r} holds no checkpoint; the run stopped before its first one")
     try:
-        with ocp.training.Checkpointer(directory.absolute()) as checkpointer:
+        with ocp.training.Checkpointer(str(directory.absolute())) as checkpointer:
             newest = checkpointer.latest
             if newest is None:
                 raise InputError(f"{str(directory)!r} holds no checkpoint; the run stopped before its first one")

@@ -42,8 +42,8 @@ def main(argv: Sequence[str]) -> None:
     episodes = score(policy, request.episodes, request.seed)
     directory = _new_folder(Path(request.run))
     print(task_table(policy, episodes))
-    if policy.agent.unseen:  # type: ignore
-        print(f"unseen tasks: {policy.agent.unseen}")  # type: ignore
+    if policy.agent.unseen:
+        print(f"unseen tasks: {policy.agent.unseen}")
     _write(policy, episodes, directory)
     if request.video:
         _film(policy, directory, request.seed)
@@ -126,7 +126,7 @@ def _write(policy: Policy, episodes: dict[str, np.ndarray], directory: Path) -> 
     ]
     append_rows(directory / "returns.csv", rows)
     values = {split: _value_of(policy, split)[1] for split in episodes}
-    unit = policy.env.parameters[name].unit  # type: ignore
+    unit = policy.env.parameters[name].unit
     plot.return_by_parameter(directory / f"return_by_{name.replace('-', '_')}.png", name, unit, values, episodes)
 
 

@@ -19,10 +19,14 @@ def append_rows(path: Path, rows: list[dict[str, Any]]) -> None:
         writer.writerows(rows)
 
 
-def truncate_rows(path: Path, iteration: int) -> None:
-    """Drop the rows of a CSV file that lie after an iteration, as a resumed run will write them again."""
+def truncate_rows(path: Path, iteration: int) -> float:
+    """Drop the rows of metrics that lie after an iteration, as a resumed run will write them again.
+
+    Returns:
+        the seconds of training up to there.
+    """
     if not path.exists():
-        return
+        return 0.0
     with path.open(newline="") as file:
         reader = csv.DictReader(file)
         kept = [row for row in reader if int(row["iteration"]) <= iteration]
@@ -33,6 +37,7 @@ def truncate_rows(path: Path, iteration: int) -> None:
         writer.writeheader()
         writer.writerows(kept)
     os.replace(replacement, path)
+    return max((float(row["seconds"]) for row in kept), default=0.0)
 
 
 def metric_rows(metrics: dict[str, np.ndarray], seeds: np.ndarray, common: dict[str, Any]) -> list[dict[str, Any]]:

@@ -8,15 +8,17 @@ import jax
 import jax.numpy as jnp
 
 from mtjax import checkpoint, cli, loop
-from mtjax.types import Agent, Array, Env, Key, Task
+from mtjax.agents import SAC
+from mtjax.envs import Family
+from mtjax.types import Array, Key, Task
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Policy:
     """What a run learned: ``action = policy(obs, task)``, for single observations (O,); map it for many."""
 
-    env: Env
-    agent: Agent
+    env: Family
+    agent: SAC
     state: Any  # of one seed
     states: Any  # of every seed, leading S
     seeds: Array  # (S,)

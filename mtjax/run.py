@@ -131,18 +131,13 @@ class _Run:
         return self.plan.seed + jnp.arange(self.plan.seeds)
 
     @property
-    def chunk_env_steps(self) -> int:
-        """Environment steps of one chunk, summed over tasks."""
-        return len(self.env.tasks("train").id) * self.settings.num_envs * self.settings.chunk_steps
+    def steps_per_iteration(self) -> int:
+        """Environment steps that one step of every environment makes, summed over tasks."""
+        return len(self.env.tasks("train").id) * self.settings.num_envs
 
     @property
-    def num_chunks(self) -> int:
-        return math.ceil(self.plan.steps / self.chunk_env_steps)
-
-    @property
-    def chunks_per_evaluation(self) -> int:
-        every = self.plan.eval_every or self.plan.steps / 10
-        return min(max(1, math.ceil(every / self.chunk_env_steps)), self.num_chunks)
+    def eval_every(self) -> int:
+        return self.plan.eval_every or math.ceil(self.plan.steps / 10)
 
     def begin(self, resume: bool) -> tuple[Programs, TrainState]:
         """Compile every program at the same time, and make or restore the state."""
@@ -172,43 +167,48 @@ class _Run:
 
     def _restore(self, shapes: TrainState) -> TrainState:
         assert self.directory is not None
-        state = checkpoint.load(self.directory / "checkpoints", shapes)
-        log.truncate_rows(self.directory / "metrics.csv", int(state.iteration[0]))
-        return state
+        return checkpoint.load(self.directory / "checkpoints", shapes)
+
+    def _earlier_seconds(self, iteration: int) -> float:
+        """Seconds of training that a resumed run has behind it; its later lines of metrics are dropped."""
+        if self.directory is None:
+            return 0.0
+        return log.truncate_rows(self.directory / "metrics.csv", iteration)
 
     def drive(self, programs: Programs, state: TrainState, started: float, on_chunk) -> Result:
         """Run chunks until the plan is done or a signal asks to stop."""
         tasks = self.env.tasks("train")
-        evaluations = self._earlier_evaluations(int(state.iteration[0]))
-        rows, seconds = [], 0.0
+        steps = int(state.iteration[0]) * self.steps_per_iteration
+        evaluations = self._earlier_evaluations(steps)
+        rows, seconds = [], self._earlier_seconds(int(state.iteration[0]))
         with stop_signals() as stopping:
-            for chunk in range(int(state.iteration[0]) // self.settings.chunk_steps, self.num_chunks):
-                before = time.monotonic()
+            while steps < self.plan.steps and not stopping:
+                before, steps_before = time.monotonic(), steps
                 state, metrics = programs.chunk(tasks, state)
                 metrics = jax.device_get(metrics)
-                seconds += time.monotonic() - before
-                _require_finite(metrics["bad_step"], self.settings.chunk_steps * chunk)
+                elapsed = time.monotonic() - before
+                seconds += elapsed
+                _require_finite(metrics["bad_step"], steps_before // self.steps_per_iteration)
+                steps += self.settings.chunk_steps * self.steps_per_iteration
                 common = {
-                    "iteration": self.settings.chunk_steps * (chunk + 1),
-                    "steps": self.chunk_env_steps * (chunk + 1),
+                    "iteration": steps // self.steps_per_iteration,
+                    "steps": steps,
                     "seconds": f"{seconds:.3f}",
                     "wall_seconds": f"{time.monotonic() - started:.3f}",
                 }
                 new = log.metric_rows(metrics, np.asarray(self.seeds), common)
                 rows += new
                 self._write(new)
-                rate = self.chunk_env_steps * self.plan.seeds / (time.monotonic() - before)
-                self.console.progress(common["steps"], seconds, rate, metrics["return"])
-                if (chunk + 1) % self.chunks_per_evaluation == 0 or chunk + 1 == self.num_chunks:
-                    evaluations = self._evaluate(programs.evaluate, state, evaluations, common["steps"])
-                    self._save(state)
+                rate = (steps - steps_before) * self.plan.seeds / elapsed
+                self.console.progress(steps, seconds, rate, metrics["return"])
                 if on_chunk is not None:
                     on_chunk(new[0])
-                if stopping:
+                due = steps // self.eval_every > steps_before // self.eval_every
+                if due or steps >= self.plan.steps:
+                    evaluations = self._evaluate(programs.evaluate, state, evaluations, steps)
+                if due or stopping or steps >= self.plan.steps:
                     self._save(state)
-                    break
-        finished = int(state.iteration[0]) >= self.num_chunks * self.settings.chunk_steps
-        return Result(state, evaluations, rows, seconds, finished, self.directory)
+        return Result(state, evaluations, rows, seconds, steps >= self.plan.steps, self.directory)
 
     def _write(self, rows: list[dict[str, Any]]) -> None:
         if self.directory is not None:
@@ -233,11 +233,10 @@ class _Run:
         self.console.say(f"evaluation at {steps:,} steps: {means}")
         return evaluations
 
-    def _earlier_evaluations(self, iteration: int) -> Evaluations:
-        """The evaluations up to an iteration: those on disk if the run is resumed, else none."""
-        steps = iteration * self.chunk_env_steps // self.settings.chunk_steps
+    def _earlier_evaluations(self, steps: int) -> Evaluations:
+        """The evaluations up to a step: those on disk if the run is resumed, else none."""
         file = None if self.directory is None else self.directory / "evaluations.npz"
-        if iteration and file is not None and file.exists():
+        if steps and file is not None and file.exists():
             past = load_evaluations(file)
             kept = past.steps <= steps
             return Evaluations(past.steps[kept], {s: x[:, kept] for s, x in past.returns.items()}, past.values)

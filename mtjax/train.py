@@ -127,10 +127,10 @@ def _summary(program: Program) -> str:
     from mtjax.envs.physics import choose_engine
 
     family, plan = program.family, program.plan
-    values = family.listed_values
+    values, engine = family.listed_values, choose_engine(family.engine)
     return (
         f"{len(family.tasks('train').id)} training tasks, {family.vary} {values[0]:g} to {values[-1]:g}, "
-        f"split {family.split}, engine {choose_engine(family.engine)}, seeds {plan.seed} to {plan.seed + plan.seeds - 1}"
+        f"split {family.split}, engine {engine}, seeds {plan.seed} to {plan.seed + plan.seeds - 1}"
     )
 
 

@@ -68,7 +68,7 @@ class Family:
     parameters: ClassVar[Mapping[str, Parameter]]
     model_file: ClassVar[str]
     num_substeps: ClassVar[int]
-    episode_length: ClassVar[int]
+    episode_steps: ClassVar[int]
     default_iterations: ClassVar[int]
     starts_untouched: ClassVar[bool] = False  # no force sensor feels anything when an episode begins
 
@@ -135,9 +135,18 @@ class Family:
         del state  # a world is its physical state and what follows from it
         return self.simulator.forward(task, jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32))
 
-    @cached_property
+    @property
+    def episode_length(self) -> int:
+        """Steps after which an episode is cut off."""
+        return self.episode_steps
+
+    @property
     def spec(self) -> Spec:
         """Sizes of observation, action and context."""
+        return self._spec
+
+    @cached_property
+    def _spec(self) -> Spec:
         task = jax.tree.map(lambda x: x[0], self.table.tasks)
         step = jax.eval_shape(self.reset, task, jax.eval_shape(jax.random.key, 0))
         return Spec(step.obs.shape[0], self.table.models[0].nu, task.context.shape[0])

@@ -67,7 +67,7 @@ class FingerSpin(Family):
     )
     model_file: ClassVar[str] = "finger.xml"
     num_substeps: ClassVar[int] = 2
-    episode_length: ClassVar[int] = 1000
+    episode_steps: ClassVar[int] = 1000
     default_iterations: ClassVar[int] = 2
     starts_untouched: ClassVar[bool] = True
 
