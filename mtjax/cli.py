@@ -78,7 +78,7 @@ def with_preset(env_name: str, agent_name: str, preset_name: str = "auto") -> Pr
     preset = load_preset(env_name, _device_preset() if preset_name == "auto" else preset_name)
     fields = AGENTS[agent_name].__dataclass_fields__
     common, special = preset.get("agent", {}), preset.get(agent_name, {})
-    settings = {k: _tuples(v) for k, v in (common | special).items() if k in fields}
+    settings = {name: value for name, value in (common | special).items() if name in fields}
     return Program(
         env=env_name,
         agent=agent_name,
@@ -104,10 +104,6 @@ def _device_preset() -> str:
     import jax
 
     return "cpu" if jax.default_backend() == "cpu" else "gpu"
-
-
-def _tuples(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value
 
 
 def _peel(argv: Sequence[str], name: str, default: str) -> str:
@@ -184,7 +180,6 @@ def from_json(path: Path) -> Program:
         raise InputError(f"{str(path.parent)!r} is not a run: it has no config.json")
     try:
         record = json.loads(path.read_text())
-        rebuilt = lambda part: {k: _tuples(v) for k, v in record[part].items()}
         return Program(
             env=record["env"],
             agent=record["agent"],
@@ -192,8 +187,8 @@ def from_json(path: Path) -> Program:
             runs=record["runs"],
             plan=Plan(**record["plan"]),
             training=Settings(**record["training"]),
-            family=make(record["env"], **rebuilt("family")),
-            learner=agent(record["agent"], **rebuilt("learner")),
+            family=make(record["env"], **record["family"]),
+            learner=agent(record["agent"], **record["learner"]),
         )
     except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{str(path)!r} does not describe a run: {type(error).__name__}: {error}") from None

@@ -1,7 +1,8 @@
-"""Errors about names: what was given, what is allowed, and the nearest match."""
+"""Settings by name: errors that say what was given, what is allowed and the nearest match; lists made hashable."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 from mtjax.types import InputError
 
@@ -12,3 +13,8 @@ def nearest_error(kind: str, given: str, allowed: Iterable[str]) -> InputError:
     near = difflib.get_close_matches(given, allowed, n=1, cutoff=0.5)
     hint = f"did you mean {near[0]!r}? " if near else ""
     return InputError(f"unknown {kind} {given!r}; {hint}choose from: {', '.join(allowed)}")
+
+
+def frozen(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings whose lists are tuples, as what is static under ``jit`` must be hashable."""
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()}

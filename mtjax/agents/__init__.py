@@ -5,7 +5,7 @@ from mtjax.agents.conditioned import ConditionedSAC
 from mtjax.agents.multi_head import MultiHead
 from mtjax.agents.pcgrad import PCGrad
 from mtjax.agents.sac import SAC
-from mtjax.names import nearest_error
+from mtjax.names import frozen, nearest_error
 
 AGENTS: dict[str, type[SAC]] = {
     "sac": SAC,
@@ -28,4 +28,4 @@ def agent(name: str, **settings) -> SAC:
     unknown = next((s for s in settings if s not in cls.__dataclass_fields__), None)
     if unknown is not None:
         raise nearest_error(f"setting of {name}", unknown, cls.__dataclass_fields__)
-    return cls(**settings)
+    return cls(**frozen(settings))

@@ -2,7 +2,7 @@
 
 from mtjax.envs.family import Family
 from mtjax.envs.finger import FingerSpin
-from mtjax.names import nearest_error
+from mtjax.names import frozen, nearest_error
 
 ENVS: dict[str, tuple[type[Family], dict]] = {
     "finger-spin": (FingerSpin, {}),
@@ -23,4 +23,4 @@ def make(name: str, **settings) -> Family:
     unknown = next((s for s in settings if s not in family.__dataclass_fields__), None)
     if unknown is not None:
         raise nearest_error(f"setting of {name}", unknown, family.__dataclass_fields__)
-    return family(**{**defaults, **settings})
+    return family(**{**defaults, **frozen(settings)})

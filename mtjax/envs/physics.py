@@ -7,6 +7,7 @@ dm_control does; force sensors (touch) stay those of the last substep. Worlds ar
 import contextlib
 import dataclasses
 import io
+import threading
 from collections.abc import Callable, Sequence
 from functools import cached_property, lru_cache, partial
 from typing import Any, NamedTuple, Protocol
@@ -141,6 +142,7 @@ class MujocoC:
     models: Sequence[mujoco.MjModel]
     num_substeps: int
     _batches: dict[int, tuple[Any, np.ndarray]] = dataclasses.field(default_factory=dict)
+    _lock: Any = dataclasses.field(default_factory=threading.Lock)
 
     def forward(self, task: Task, qpos: Array, qvel: Array) -> World:
         """Put a world in a state without controls, and solve for the forces in it."""
@@ -169,13 +171,14 @@ class MujocoC:
     def _host(self, act: Callable, shapes: Any, task_id: Array, world: World, ctrl: Array) -> Any:
         """Write the worlds into the batch, act, and read what ``shapes`` asks for."""
         ids = np.asarray(task_id)
-        worlds = self._batch(ids.reshape(-1))
         rows = {"qpos": world.qpos, "qvel": world.qvel, "qacc_warmstart": world.warmstart, "ctrl": ctrl}
-        for name, value in rows.items():
-            target = worlds.bind(name)
-            target[:] = np.asarray(value).reshape(target.shape)
-        result = act(worlds)
-        return jax.tree.map(lambda x, s: x.astype(s.dtype).reshape(ids.shape + s.shape), result, shapes)
+        with self._lock:  # a batch serves one call at a time, and MuJoCo lets other threads run while it steps
+            worlds = self._batch(ids.reshape(-1))
+            for name, value in rows.items():
+                target = worlds.bind(name)
+                target[:] = np.asarray(value).reshape(target.shape)
+            result = act(worlds)
+            return jax.tree.map(lambda x, s: x.astype(s.dtype).reshape(ids.shape + s.shape), result, shapes)
 
     def _batch(self, ids: np.ndarray) -> Any:
         """The batch for these worlds, told of its models only when they change."""

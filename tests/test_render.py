@@ -1,0 +1,113 @@
+import os
+import sys
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+from PIL import Image
+
+from mtjax import render
+from mtjax.envs.finger import FingerSpin
+from mtjax.types import InputError
+
+FINGER = FingerSpin(vary="size", low=0.8, high=1.4, num_tasks=2)
+POSES = np.array([[0.0, 0.0, 0.0], [1.5, 0.5, 1.0]])
+
+
+def moving_square(count):
+    frames = np.zeros((count, 16, 16, 3), np.uint8)
+    for index in range(count):
+        frames[index, :4, index % 12 : index % 12 + 4] = 255
+    return frames
+
+
+def warm_pixels(frame):
+    """Only finger and spinner are brown; sky, floor and hinges are blue."""
+    return np.sum(frame[..., 0].astype(int) > frame[..., 2])
+
+
+def test_film_shows_the_task_or_names_what_to_install():
+    try:
+        small, large = (render.film(FINGER, row, POSES, width=160, height=120) for row in (0, 1))
+    except InputError as error:
+        assert "apt install libegl1 libgl1-mesa-dri" in str(error) and "\n" not in str(error)
+        return
+    assert small.shape == large.shape == (2, 120, 160, 3) and small.dtype == np.uint8
+    assert small.std() > 10
+    assert np.mean(np.any(small[0] != small[1], axis=-1)) > 0.01
+    for pose in range(2):
+        assert warm_pixels(large[pose]) > 1.2 * warm_pixels(small[pose]) > 100
+
+
+def test_missing_driver_names_the_fix_and_leaves_the_environment_alone(monkeypatch):
+    def fail(*_):
+        raise ImportError("Cannot initialize a EGL device display.")
+
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.setattr(mujoco, "Renderer", fail)
+    with pytest.raises(InputError, match=r"MUJOCO_GL=.*apt install libegl1 libgl1-mesa-dri.*apt install libosmesa6"):
+        render.film(FINGER, 0, POSES)
+    assert "MUJOCO_GL" not in os.environ
+
+
+def test_backend_that_the_user_chose_is_kept(monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "disable")
+    assert render.choose_backend() == "disable"
+    monkeypatch.setenv("MUJOCO_GL", "nonsense")
+    with pytest.raises(InputError, match="MUJOCO_GL=nonsense"):
+        render.film(FINGER, 0, POSES)
+
+
+def test_camera_and_size_limits_do_not_depend_on_the_row():
+    cameras = [render._camera(FINGER) for _ in range(2)]
+    np.testing.assert_array_equal(cameras[0].lookat, [0, 0, 0.4])
+    model = render._lit_model(FINGER, 1.0, 1920, 1080)
+    assert (model.vis.global_.offwidth, model.vis.global_.offheight, model.nlight) == (1920, 1080, 1)
+
+
+@pytest.mark.parametrize("row", [-1, 99])
+def test_unknown_row_is_an_input_error(row):
+    with pytest.raises(InputError, match=f"no task {row}"):
+        render.film(FINGER, row, POSES)
+
+
+@pytest.mark.parametrize("missing", ["ffmpeg", "mediapy"])
+def test_gif_where_ffmpeg_or_mediapy_is_missing(missing, monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    if missing == "mediapy":
+        monkeypatch.setitem(sys.modules, "mediapy", None)
+    path = render.write_video(tmp_path / "size-1.4", moving_square(6), fps=25)
+    assert path == tmp_path / "size-1.4.gif"
+    with Image.open(path) as image:
+        assert (image.format, image.size, image.n_frames, image.info["duration"]) == ("GIF", (16, 16), 6, 40)
+
+
+def test_gif_of_many_frames_a_second_keeps_its_speed(monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    path = render.write_video(tmp_path / "video", moving_square(10), fps=100)
+    with Image.open(path) as image:
+        assert (image.n_frames, image.info["duration"]) == (5, 20)
+
+
+def test_mp4_where_ffmpeg_is_present(monkeypatch, tmp_path):
+    calls = []
+    stub = SimpleNamespace(
+        video_is_available=lambda: True, write_video=lambda path, frames, fps: calls.append((path, len(frames), fps))
+    )
+    monkeypatch.setitem(sys.modules, "mediapy", stub)
+    assert render.write_video(tmp_path / "size-1.4", moving_square(6), fps=50) == tmp_path / "size-1.4.mp4"
+    assert calls == [(tmp_path / "size-1.4.mp4", 6, 50)]
+
+
+def test_never_overwrites(tmp_path):
+    path = render.write_video(tmp_path / "video", moving_square(3), fps=50)
+    content = path.read_bytes()
+    with pytest.raises(InputError, match="exists already"):
+        render.write_video(tmp_path / "video", moving_square(6), fps=50)
+    assert path.read_bytes() == content
+
+
+def test_no_frames_is_an_input_error(tmp_path):
+    with pytest.raises(InputError, match="no frames"):
+        render.write_video(tmp_path / "video", moving_square(0), fps=50)
