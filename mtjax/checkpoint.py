@@ -17,7 +17,7 @@ def save(directory: Path, state: TrainState) -> None:
     """Write the state under its iteration; the last two checkpoints are kept."""
     from orbax.checkpoint import v1 as ocp
 
-    iteration = int(state.iteration[0])
+    iteration = int(state.iteration)
     with ocp.training.Checkpointer(
         str(directory.absolute()),
         save_decision_policy=ocp.training.save_decision_policies.FixedIntervalPolicy(1),  # type: ignore

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.loop import over_envs
+from mtjax.loop import over_learners, over_worlds, spread
 from mtjax.types import Agent, Array, Env, Task
 
 
@@ -30,22 +30,21 @@ def evaluate(env: Env, agent: Agent, episodes: int, state: Any, tasks: Task, see
         number: () which evaluation of the run it is; each has fresh keys, whatever training drew.
     """
 
-    def one_seed(state: Any, seed: Array) -> Array:
-        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), 0x7E57), number)
-        start = over_envs(env.reset)(tasks, jax.random.split(key, (len(tasks.id), episodes)))
-        act = over_envs(lambda task, obs: agent.act(state, obs, task, None))
+    shape = (len(seeds), len(tasks.id), episodes)
+    fresh = lambda seed: jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), 0x7E57), number)
+    keys = jax.vmap(lambda seed: jax.random.split(fresh(seed), shape[1:]))(seeds)
+    worlds = spread(tasks, shape)
+    start = over_worlds(env.reset)(worlds, keys)
+    act = over_learners(lambda learner, task, obs: agent.act(learner, obs, task, None))
 
-        def step(carry, _):
-            env_state, obs, total, alive = carry
-            after = over_envs(env.step)(tasks, env_state, act(tasks, obs))
-            total = total + alive * after.reward
-            return (after.state, after.obs, total, alive & ~after.terminated), None
+    def step(carry, _):
+        env_state, obs, total, alive = carry
+        after = over_worlds(env.step)(worlds, env_state, act(state, tasks, obs))
+        total = total + alive * after.reward
+        return (after.state, after.obs, total, alive & ~after.terminated), None
 
-        zeros = jnp.zeros(start.reward.shape)
-        carry = (start.state, start.obs, zeros, zeros == 0)
-        return jax.lax.scan(step, carry, length=env.episode_length)[0][2]
-
-    return jax.vmap(one_seed)(state, seeds)
+    carry = (start.state, start.obs, jnp.zeros(shape), jnp.ones(shape, bool))
+    return jax.lax.scan(step, carry, length=env.episode_length)[0][2]
 
 
 @partial(jax.jit, static_argnums=(0, 1))

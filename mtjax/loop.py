@@ -1,10 +1,12 @@
 """The learning loop as a pure function: ``init`` makes a training state, ``run_chunk`` advances it.
 
 A chunk is one jitted, donated ``lax.scan`` of (collect on all tasks and environments, store, update), for all seeds at
-once. Seeds are a ``vmap`` axis named "seeds", so that decisions which all seeds share stay branches.
+once. Learners are mapped over seeds; worlds of all seeds, tasks and environments are one flat batch, which traces and
+compiles faster than nested maps and keeps decisions that all seeds share as branches.
 """
 
 import dataclasses
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -13,7 +15,7 @@ import jax.numpy as jnp
 
 from mtjax import replay as rings
 from mtjax.replay import Replay
-from mtjax.types import Agent, Array, Env, InputError, Key, Metrics, Spec, Step, Task, Transition
+from mtjax.types import Agent, Array, Env, InputError, Key, Metrics, Spec, Task, Transition
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,6 +32,8 @@ class Settings:
     """Transitions each task's replay holds."""
     warmup_steps: int = 100
     """Steps of every environment under random actions before learning starts."""
+    warmup_hold: int = 10
+    """Steps for which each of those random actions is held; actions that last find more than ones that jitter."""
     chunk_steps: int = 1000
     """Steps of every environment between two lines of metrics; also the grain of evaluation and checkpoints."""
 
@@ -49,39 +53,40 @@ class Settings:
 
 
 class TrainState(NamedTuple):
-    """All that is needed to go on bit for bit; with a leading ``S`` on every leaf."""
+    """All that is needed to go on bit for bit."""
 
-    agent: Any
-    env: Any  # leaves (T, E, ...), the environments' states
-    obs: Array  # (T, E, O)
-    age: Array  # (T, E) int32, steps since the last reset
-    total: Array  # (T, E) return of the episode so far
-    replay: Replay
+    agent: Any  # leaves (S, ...)
+    env: Any  # leaves (S, T, E, ...), the environments' states
+    obs: Array  # (S, T, E, O)
+    age: Array  # (S, T, E) int32, steps since the last reset
+    total: Array  # (S, T, E) return of the episode so far
+    replay: Replay  # rows (S, T, capacity, ...)
     iteration: Array  # () int32, steps taken by every environment
-    key: Key
+    key: Key  # (S,)
+    warmup_key: Key  # (S,) fixed, so that an action drawn from it can be held
+
+
+_REPLAY = Replay(rows=0, position=None, size=None)  # type: ignore  # its axes under a map over seeds
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
 def init(env: Env, agent: Agent, settings: Settings, tasks: Task, seeds: Array) -> TrainState:
-    """Return fresh training states for ``seeds`` (S,) on training ``tasks`` (T, ...)."""
-    return jax.vmap(partial(_init_one, env, agent, settings, tasks))(seeds)
-
-
-def _init_one(env: Env, agent: Agent, settings: Settings, tasks: Task, seed: Array) -> TrainState:
-    key, agent_key, reset_key = jax.random.split(jax.random.key(seed), 3)
+    """Return a fresh training state for ``seeds`` (S,) on training ``tasks`` (T, ...)."""
     num_tasks = len(tasks.id)
-    start = _reset_all(env, settings, tasks, reset_key)
-    clock = jnp.zeros((num_tasks, settings.num_envs), jnp.int32)
-    rows = rings.init(_blank_transition(env.spec), num_tasks, settings.capacity)
+    shape = (len(seeds), num_tasks, settings.num_envs)
+    key, agent_key, reset_key, warmup_key = _split(jax.vmap(jax.random.key)(seeds), 4)
+    start = over_worlds(env.reset)(spread(tasks, shape), _world_keys(reset_key, shape))
+    blank = lambda _: rings.init(_blank_transition(env.spec), num_tasks, settings.capacity)
     return TrainState(
-        agent=agent.init(env.spec, tasks, agent_key),
+        agent=jax.vmap(lambda key: agent.init(env.spec, tasks, key))(agent_key),
         env=start.state,
         obs=start.obs,
-        age=clock,
-        total=jnp.zeros(clock.shape),
-        replay=rows,
+        age=jnp.zeros(shape, jnp.int32),
+        total=jnp.zeros(shape),
+        replay=jax.vmap(blank, out_axes=_REPLAY)(seeds),
         iteration=jnp.int32(0),
         key=key,
+        warmup_key=warmup_key,
     )
 
 
@@ -90,19 +95,42 @@ def _blank_transition(spec: Spec) -> Transition:
     return Transition(obs, jnp.zeros(spec.action_size), scalar, scalar, obs)
 
 
-def over_envs(function):
-    """Map a function of (task, per-environment arguments...) over tasks and over each task's environments."""
+def _split(keys: Key, count: int) -> tuple[Key, ...]:
+    """Split each seed's key (S,) into ``count`` keys (S,)."""
+    return tuple(jax.vmap(lambda key: jax.random.split(key, count), out_axes=1)(keys))
 
-    def mapped(tasks: Task, *arguments):
-        inner = jax.vmap(function, (None, *[0] * len(arguments)))
-        return jax.vmap(inner)(tasks, *arguments)
+
+def _world_keys(keys: Key, shape: tuple[int, ...]) -> Key:
+    """One key for every world (S, T, E) from one a seed (S,)."""
+    return jax.vmap(lambda key: jax.random.split(key, shape[1:]))(keys)
+
+
+def spread(tasks: Task, shape: tuple[int, ...]) -> Task:
+    """Repeat tasks (T, ...) for all worlds of shape (S, T, E)."""
+    return jax.tree.map(lambda x: jnp.broadcast_to(x[None, :, None], shape + x.shape[1:]), tasks)
+
+
+def over_worlds(function: Callable) -> Callable:
+    """Map a function of single worlds over arguments with leaves (S, T, E, ...), as one flat batch."""
+
+    def mapped(*arguments):
+        shape = jax.tree.leaves(arguments)[0].shape[:3]
+        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[3:]), arguments)
+        return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), jax.vmap(function)(*flat))
 
     return mapped
 
 
-def _reset_all(env: Env, settings: Settings, tasks: Task, key: Key) -> Step:
-    keys = jax.random.split(key, (len(tasks.id), settings.num_envs))
-    return over_envs(env.reset)(tasks, keys)
+def over_learners(function: Callable) -> Callable:
+    """Map ``function(agent state, task, per-world arguments...)`` over seeds, tasks and environments."""
+
+    def mapped(states: Any, tasks: Task, *arguments):
+        world = [0] * len(arguments)
+        of_task = jax.vmap(function, (None, None, *world))
+        of_seed = jax.vmap(of_task, (None, 0, *world))
+        return jax.vmap(of_seed, (0, None, *world))(states, tasks, *arguments)
+
+    return mapped
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2), donate_argnums=4)
@@ -113,14 +141,12 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
         the new state, and metrics: "return" and "episodes" (S, T) of episodes that ended; the agent's own, as means
         (S, T) or (S,); "bad_step" (S, T), the first step whose numbers were not finite, or -1.
     """
-    return jax.vmap(partial(_run_one, env, agent, settings, tasks), axis_name="seeds")(state)
+    worlds = spread(tasks, state.age.shape)
 
-
-def _run_one(env: Env, agent: Agent, settings: Settings, tasks: Task, state: TrainState) -> tuple[TrainState, Metrics]:
     def iterate(state: TrainState, _) -> tuple[TrainState, Metrics]:
-        key, collect_key, reset_key, learn_key = jax.random.split(state.key, 4)
+        key, act_key, reset_key, learn_key = _split(state.key, 4)
         warming = state.iteration < settings.warmup_steps
-        state, seen = _collect(env, agent, settings, tasks, state, warming, collect_key, reset_key)
+        state, seen = _collect(env, agent, settings, tasks, worlds, state, warming, act_key, reset_key)
         learned, losses = _learn(agent, settings, tasks, state, warming, learn_key)
         state = state._replace(agent=learned, iteration=state.iteration + 1, key=key)
         return state, seen | {"losses": losses, "learning": 1.0 - warming}
@@ -129,72 +155,72 @@ def _run_one(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tra
     return state, _summarise(history)
 
 
-def _everywhere(flag: Array) -> Array:
-    """Whether a flag is set in any seed, as one value that does not depend on the seed."""
-    return jax.lax.pmax(jnp.any(flag).astype(jnp.int32), "seeds") > 0
-
-
-def _collect(env, agent, settings, tasks, state: TrainState, warming, key: Key, reset_key: Key):
+def _collect(env, agent, settings, tasks, worlds, state: TrainState, warming, key: Key, reset_key: Key):
     """Step every environment once, store what happened, and begin new episodes where old ones ended."""
-    noise_key, random_key = jax.random.split(key)
     shape = state.age.shape
-    act = lambda task, obs, key: agent.act(state.agent, obs, task, key)
-    chosen = over_envs(act)(tasks, state.obs, jax.random.split(noise_key, shape))
-    action = jnp.where(warming, jax.random.uniform(random_key, chosen.shape, minval=-1.0), chosen)
-    step = over_envs(env.step)(tasks, state.env, action)
-    discount = 1.0 - step.terminated
-    transition = Transition(state.obs, action, step.reward, discount, step.obs)
+    act = lambda learner, task, obs, key: agent.act(learner, obs, task, key)
+    chosen = over_learners(act)(state.agent, tasks, state.obs, _world_keys(key, shape))
+    action = jnp.where(warming, _held_actions(settings, state, chosen.shape[1:]), chosen)
+    step = over_worlds(env.step)(worlds, state.env, action)
+    transition = Transition(state.obs, action, step.reward, 1.0 - step.terminated, step.obs)
 
     age, total = state.age + 1, state.total + step.reward
     ended = step.terminated | (age >= env.episode_length)
 
     def restart(_):
-        fresh = _reset_all(env, settings, tasks, reset_key)
-        choose = lambda new, old: jnp.where(ended.reshape(shape + (1,) * (new.ndim - 2)), new, old)
+        fresh = over_worlds(env.reset)(worlds, _world_keys(reset_key, shape))
+        choose = lambda new, old: jnp.where(ended.reshape(shape + (1,) * (new.ndim - 3)), new, old)
         return jax.tree.map(choose, (fresh.state, fresh.obs), (step.state, step.obs))
 
-    env_state, obs = jax.lax.cond(_everywhere(ended), restart, lambda _: (step.state, step.obs), None)
-    finite = jnp.all(jnp.isfinite(step.obs), axis=(1, 2)) & jnp.all(jnp.isfinite(step.reward), axis=1)
-    seen = {"finished": jnp.sum(ended, axis=1), "total": jnp.sum(ended * total, axis=1), "finite": finite}
+    env_state, obs = jax.lax.cond(jnp.any(ended), restart, lambda _: (step.state, step.obs), None)
+    finite = jnp.all(jnp.isfinite(step.obs), axis=(2, 3)) & jnp.all(jnp.isfinite(step.reward), axis=2)
+    seen = {"finished": jnp.sum(ended, axis=2), "total": jnp.sum(ended * total, axis=2), "finite": finite}
     state = state._replace(
         env=env_state,
         obs=obs,
         age=jnp.where(ended, 0, age),
         total=jnp.where(ended, 0.0, total),
-        replay=rings.add(state.replay, transition),
+        replay=jax.vmap(rings.add, (_REPLAY, 0), _REPLAY)(state.replay, transition),
     )
     return state, seen
 
 
-def _learn(agent, settings: Settings, tasks: Task, state: TrainState, warming: Array, key: Key) -> tuple[Any, Metrics]:
-    """Update the agent on fresh batches; all of a step's batches are drawn together, as one gather is cheaper."""
-    num_updates, batch_size = settings.updates_per_step, settings.batch_size
-    batch_key, update_key = jax.random.split(key)
+def _held_actions(settings: Settings, state: TrainState, shape: tuple[int, ...]) -> Array:
+    """Uniform actions (S, T, E, A) that change every ``warmup_hold`` steps."""
+    draw = lambda key: jax.random.fold_in(key, state.iteration // settings.warmup_hold)
+    return jax.vmap(lambda key: jax.random.uniform(draw(key), shape, minval=-1.0))(state.warmup_key)
 
-    def learn(learner):
-        rows = rings.sample(state.replay, batch_key, num_updates * batch_size)
+
+def _learn(agent, settings: Settings, tasks: Task, state: TrainState, warming: Array, keys: Key) -> tuple[Any, Metrics]:
+    """Update the agents on fresh batches; all of a step's batches are drawn together, as one gather is cheaper."""
+    num_updates, batch_size = settings.updates_per_step, settings.batch_size
+    if not num_updates:
+        return state.agent, {}
+
+    def learn_one(learner, replay: Replay, key: Key) -> tuple[Any, Metrics]:
+        batch_key, update_key = jax.random.split(key)
+        rows = rings.sample(replay, batch_key, num_updates * batch_size)
         split = lambda x: jnp.moveaxis(x.reshape(x.shape[0], num_updates, batch_size, *x.shape[2:]), 1, 0)
         batches = jax.tree.map(split, rows)  # (U, T, B, ...)
         update = lambda learner, x: agent.update(learner, x[0], tasks, x[1])
         learner, metrics = jax.lax.scan(update, learner, (batches, jax.random.split(update_key, num_updates)))
         return learner, jax.tree.map(lambda x: jnp.mean(x, axis=0), metrics)
 
-    if not num_updates:
-        return state.agent, {}
+    learn = lambda learners: jax.vmap(learn_one, (0, _REPLAY, 0))(learners, state.replay, keys)
     shapes = jax.eval_shape(learn, state.agent)[1]
-    rest = lambda learner: (learner, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes))
-    return jax.lax.cond(_everywhere(warming), rest, learn, state.agent)
+    rest = lambda learners: (learners, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes))
+    return jax.lax.cond(warming, rest, learn, state.agent)
 
 
 def _summarise(history: dict) -> Metrics:
-    """Reduce what was seen at each of H steps to one line of metrics."""
+    """Reduce what was seen at each of H steps (H, S, ...) to one line of metrics."""
     learning = history["learning"]
     mean = lambda x: jnp.sum(x, axis=0) / jnp.maximum(jnp.sum(learning), 1)
     losses = jax.tree.map(mean, history["losses"])
     episodes = jnp.sum(history["finished"], axis=0)
     bad = ~history["finite"]
     for loss in history["losses"].values():
-        bad |= ~jnp.isfinite(loss).reshape(len(loss), -1)
+        bad |= ~jnp.isfinite(loss).reshape(*loss.shape[:2], -1)
     return losses | {
         "episodes": episodes,
         "return": jnp.sum(history["total"], axis=0) / episodes,

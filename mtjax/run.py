@@ -178,9 +178,9 @@ class _Run:
     def drive(self, programs: Programs, state: TrainState, started: float, on_chunk) -> Result:
         """Run chunks until the plan is done or a signal asks to stop."""
         tasks = self.env.tasks("train")
-        steps = int(state.iteration[0]) * self.steps_per_iteration
+        steps = int(state.iteration) * self.steps_per_iteration
         evaluations = self._earlier_evaluations(steps)
-        rows, seconds = [], self._earlier_seconds(int(state.iteration[0]))
+        rows, seconds = [], self._earlier_seconds(int(state.iteration))
         with stop_signals() as stopping:
             while steps < self.plan.steps and not stopping:
                 before, steps_before = time.monotonic(), steps

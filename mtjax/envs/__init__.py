@@ -6,7 +6,7 @@ from mtjax.names import frozen, nearest_error
 
 ENVS: dict[str, tuple[type[Family], dict]] = {
     "finger-spin": (FingerSpin, {}),
-    "finger-spin-vary-size": (FingerSpin, {"low": 0.95, "high": 1.4, "num_tasks": 10}),
+    "finger-spin-vary-size": (FingerSpin, {"low": 0.95, "high": 1.13, "num_tasks": 10}),
     "finger-spin-vary-touch-size": (FingerSpin, {"vary": "touch-size", "low": 0.025, "high": 0.25, "num_tasks": 10}),
 }
 

@@ -38,7 +38,7 @@ class Parameter(NamedTuple):
 class Table(NamedTuple):
     """Every task of a family: training tasks first, then interpolation, then extrapolation."""
 
-    tasks: Task  # leading axis: all rows
+    tasks: Task  # leading axis: all rows; on the host
     rows: Mapping[str, np.ndarray]  # split -> row numbers
     models: tuple[mujoco.MjModel, ...]  # one a row
 
@@ -112,12 +112,10 @@ class Family:
 
     def tasks(self, split: str = "train") -> Task:
         """Return the tasks of a split: "train", "interpolation", "extrapolation", or "all" rows of the table."""
-        rows = self.table.rows
-        if split == "all":
-            return self.table.tasks
+        rows = {**self.table.rows, "all": slice(None)}
         if split not in rows:
-            raise InputError(f"unknown split {split!r}; choose from {', '.join(rows)}, all")
-        return jax.tree.map(lambda x: x[rows[split]], self.table.tasks)
+            raise InputError(f"unknown split {split!r}; choose from {', '.join(rows)}")
+        return jax.tree.map(lambda x: jnp.asarray(x[rows[split]]), self.table.tasks)
 
     def reset(self, task: Task, key: Key) -> Step:
         """Begin an episode of ``task`` in a fresh random state."""
@@ -163,14 +161,13 @@ class Family:
         values = split_values(self.split, self.listed_values, parameter.minimum)
         everything = np.concatenate([values[s] for s in SPLITS])
         models = tuple(self._compile(value) for value in everything)
-        with jax.ensure_compile_time_eval():
-            tasks = Task(
-                id=jnp.arange(len(everything), dtype=jnp.int32),
-                context=jnp.asarray(scale(everything, values["train"])[:, None], jnp.float32),
-                params={self.vary: jnp.asarray(everything, jnp.float32)},
-                model={k: jnp.asarray(v, jnp.float32) for k, v in stack_differing(models).items()},
-                goal={},
-            )
+        tasks = Task(
+            id=np.arange(len(everything), dtype=np.int32),
+            context=np.float32(scale(everything, values["train"])[:, None]),
+            params={self.vary: np.float32(everything)},
+            model={name: np.float32(leaf) for name, leaf in stack_differing(models).items()},
+            goal={},
+        )
         ends = np.cumsum([len(values[s]) for s in SPLITS])
         rows = {s: np.arange(end - len(values[s]), end) for s, end in zip(SPLITS, ends, strict=True)}
         return Table(tasks, rows, models)
