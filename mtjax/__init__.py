@@ -1,6 +1,7 @@
 """Multi-task reinforcement learning in JAX: tasks as data, physics and learning in one compiled loop."""
 
 from mtjax.agents import AGENTS, agent
+from mtjax.cli import with_preset as preset
 from mtjax.envs import ENVS, make
 from mtjax.loop import Settings
 from mtjax.policy import load
@@ -19,6 +20,7 @@ __all__ = [
     "agent",
     "load",
     "make",
+    "preset",
     "train",
 ]
 __version__ = "0.1.0"
