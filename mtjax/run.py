@@ -140,21 +140,23 @@ class _Run:
         return self.plan.eval_every or math.ceil(self.plan.steps / 10)
 
     def begin(self, resume: bool) -> tuple[Programs, TrainState]:
-        """Compile every program at the same time, and make or restore the state."""
+        """Compile every program at the same time, and make or restore the state; evaluation may be ready later."""
         env, agent, settings = self.env, self.agent, self.settings
-        tasks, everything = env.tasks("train"), env.tasks("all")
+        tasks, pool = env.tasks("train"), ThreadPoolExecutor(2)
         fresh = init.lower(env, agent, settings, tasks, self.seeds)
         shapes = fresh.out_info
         self._describe(shapes)
-        with ThreadPoolExecutor(3) as pool:
-            make = pool.submit(fresh.compile)
-            lowered = run_chunk.lower(env, agent, settings, tasks, shapes)
-            chunk = pool.submit(lowered.compile)
-            number = jnp.int32(0)
-            lowered = evaluate.lower(env, agent, self.plan.eval_episodes, shapes.agent, everything, self.seeds, number)
-            score = pool.submit(lowered.compile)
-            state = self._restore(shapes) if resume else make.result()(tasks, self.seeds)
-            return Programs(chunk.result(), score.result()), state
+        make = pool.submit(fresh.compile)
+        chunk = run_chunk.lower(env, agent, settings, tasks, shapes)
+        score = pool.submit(self._compile_evaluation, shapes)
+        pool.shutdown(wait=False)
+        programs = Programs(chunk.compile(), lambda *arguments: score.result()(*arguments))
+        return programs, self._restore(shapes) if resume else make.result()(tasks, self.seeds)
+
+    def _compile_evaluation(self, shapes: TrainState) -> Callable:
+        everything, number = self.env.tasks("all"), jnp.int32(0)
+        episodes = self.plan.eval_episodes
+        return evaluate.lower(self.env, self.agent, episodes, shapes.agent, everything, self.seeds, number).compile()
 
     def _describe(self, shapes: TrainState) -> None:
         replay = checkpoint.size_of(shapes.replay) / 1e6

@@ -1,11 +1,18 @@
 """What several test files share. Compiled programs live for the whole session: an MJX step costs ten seconds."""
 
+import dataclasses
+import shutil
 from functools import lru_cache
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+
+import mtjax.train
+from mtjax.envs import ENVS
+from mtjax.envs.finger import FingerSpin
 
 
 class Worlds(NamedTuple):
@@ -61,3 +68,42 @@ def worlds(suite_finger) -> Worlds:
     states = np.float32(touching[:50] + free[:50])
     states[::2, 1, 2] = random.uniform(-40, 25, 50)
     return Worlds(states[:, 0], states[:, 1], np.float32(random.uniform(-1, 1, (100, 2))))
+
+
+@dataclasses.dataclass(frozen=True)
+class ShortFinger(FingerSpin):
+    """Short episodes whose returns tell any two of them apart, as the rare rewards of the real family do not."""
+
+    episode_steps: ClassVar[int] = 20
+
+    def reward(self, task, world, action):
+        return 1 + jnp.cos(world.qpos[2]) + 0.1 * jnp.mean(action)
+
+
+SHORT_RUN = (
+    "--env=finger-short --agent=sac-conditioned --steps=600 --seeds=2 --eval-every=200 --eval-episodes=1 --num-envs=2 "
+    "--batch-size=4 --replay-size=200 --warmup-steps=5 --chunk-steps=25 --agent.hidden 8 8"
+).split()
+
+
+@pytest.fixture(scope="session")
+def short_family():
+    """Makes ``finger-short`` a name like any other, and keeps compiled programs out of the user's cache."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(ENVS, "finger-short", (ShortFinger, {"high": 1.2, "num_tasks": 2, "engine": "c"}))
+        patch.setenv("MTJAX_CACHE", "0")
+        yield
+
+
+@pytest.fixture(scope="session")
+def finished_run(short_family, tmp_path_factory):
+    """The folder of a run of ``SHORT_RUN`` by the program. Only to be read; what writes takes ``copied_run``."""
+    runs = tmp_path_factory.mktemp("runs")
+    mtjax.train.main([*SHORT_RUN, f"--runs={runs}"])
+    (directory,) = runs.iterdir()
+    return directory
+
+
+@pytest.fixture
+def copied_run(finished_run, tmp_path):
+    return shutil.copytree(finished_run, tmp_path / "run")

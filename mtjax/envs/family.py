@@ -8,7 +8,7 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from importlib import resources
-from typing import Annotated, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -161,16 +161,16 @@ class Family:
         values = split_values(self.split, self.listed_values, parameter.minimum)
         everything = np.concatenate([values[s] for s in SPLITS])
         models = tuple(self._compile(value) for value in everything)
-        tasks = Task(
-            id=np.arange(len(everything), dtype=np.int32),
-            context=np.float32(scale(everything, values["train"])[:, None]),
-            params={self.vary: np.float32(everything)},
-            model={name: np.float32(leaf) for name, leaf in stack_differing(models).items()},
-            goal={},
-        )
+        leaves: dict[str, Any] = {
+            "id": np.arange(len(everything), dtype=np.int32),
+            "context": np.float32(scale(everything, values["train"])[:, None]),
+            "params": {self.vary: np.float32(everything)},
+            "model": {name: np.float32(leaf) for name, leaf in stack_differing(models).items()},
+            "goal": {},
+        }
         ends = np.cumsum([len(values[s]) for s in SPLITS])
         rows = {s: np.arange(end - len(values[s]), end) for s, end in zip(SPLITS, ends, strict=True)}
-        return Table(tasks, rows, models)
+        return Table(Task(**leaves), rows, models)
 
     def compile_spec(self, value: float) -> mujoco.MjSpec:
         """Return the editable model of the task with this parameter value."""
