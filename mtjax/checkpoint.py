@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from mtjax.loop import TrainState
 from mtjax.types import InputError
 
 _KEPT = 2
+_SIZES = "sizes.json"  # of a checkpoint's files, to know a damaged one before orbax meets it
 
 
 def save(directory: Path, state: TrainState) -> None:
@@ -26,6 +28,8 @@ def save(directory: Path, state: TrainState) -> None:
         known = checkpointer.latest
         if known is None or known.step != iteration:
             checkpointer.save_checkpointables(iteration, {"agent": state.agent, "loop": state._replace(agent=None)})
+    folder = directory / str(iteration)
+    (folder / _SIZES).write_text(json.dumps(_sizes(folder)))
 
 
 def load(directory: Path, like: TrainState) -> TrainState:
@@ -39,22 +43,47 @@ def load_agent(directory: Path, like: TrainState) -> Any:
     return _load(directory, {"agent": like.agent})["agent"]
 
 
+def _sizes(folder: Path) -> dict[str, int]:
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != _SIZES)
+    return {str(path.relative_to(folder)): path.stat().st_size for path in files}
+
+
+def _newest(directory: Path) -> Path:
+    """The folder of the newest checkpoint; those still being written have longer names."""
+    folders = [path for path in directory.glob("*") if path.name.isdigit()]
+    if not folders:
+        raise InputError(f"{str(directory)!r} holds no checkpoint; the run stopped before its first one")
+    return max(folders, key=lambda path: int(path.name))
+
+
+def _require_whole(folder: Path, parts: Iterable[str]) -> None:
+    """Refuse a damaged checkpoint, as orbax would answer it with pages of its threads' tracebacks."""
+    if not (folder / _SIZES).exists():  # the run was killed just before it wrote them
+        return
+    try:
+        expected, found = json.loads((folder / _SIZES).read_text()), _sizes(folder)
+        needed = [name for name in expected if "/" not in name or name.split("/")[0] in parts]
+        damaged = next((name for name in needed if found.get(name) != expected[name]), None)
+    except (ValueError, AttributeError):
+        damaged = _SIZES
+    if damaged is not None:
+        raise InputError(
+            f"the checkpoint {str(folder)!r} is damaged: {damaged} is missing or has changed; "
+            "without this folder, the one before it is the newest"
+        )
+
+
 def _load(directory: Path, like: dict[str, Any]) -> dict[str, Any]:
     from orbax.checkpoint import v1 as ocp
 
     device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
     like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=device), like)
-    if not directory.is_dir():
-        raise InputError(f"{str(directory)!r} holds no checkpoint; the run stopped before its first one")
+    newest = _newest(directory)
+    _require_whole(newest, like)
     try:
         with ocp.training.Checkpointer(str(directory.absolute())) as checkpointer:
-            newest = checkpointer.latest
-            if newest is None:
-                raise InputError(f"{str(directory)!r} holds no checkpoint; the run stopped before its first one")
-            return checkpointer.load_checkpointables(newest.step, like)
+            return checkpointer.load_checkpointables(int(newest.name), like)
     except (ValueError, KeyError, OSError, json.JSONDecodeError) as error:
-        if isinstance(error, InputError):
-            raise
         reason = str(error).strip().splitlines()[0][:150]
         raise InputError(f"the checkpoint in {str(directory)!r} cannot be read: {reason}") from None
 

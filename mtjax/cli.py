@@ -156,10 +156,16 @@ def parse_with_tyro(cls: type[P], argv: Sequence[str], default: P, name: str) ->
     except SystemExit as stop:
         if stop.code in (0, None):
             raise
-        lines = [line.strip(" │") for line in output.getvalue().splitlines() if line.startswith("│")]
-        message = " ".join(itertools.takewhile(lambda line: line and not line.startswith(("--", "─")), lines))
-        message = re.sub(r"^Error parsing (plan|training|family|learner): ", "", message)
+        message = re.sub(r"^Error parsing ((plan|training|family|learner): )?", "", _unframed(output.getvalue()))
         raise InputError(message or "the command line cannot be read; --help lists the flags") from None
+
+
+def _unframed(text: str) -> str:
+    """The lines between the first two rules of tyro's frame, which has no corners where output is not UTF-8."""
+    is_rule = lambda line: line.startswith("╭") or not line.strip(" │─╰╯-")
+    below = itertools.dropwhile(lambda line: not is_rule(line), text.splitlines())
+    next(below, None)
+    return " ".join(line.strip(" │") for line in itertools.takewhile(lambda line: not is_rule(line), below))
 
 
 # The record of a run.
@@ -190,7 +196,7 @@ def from_json(path: Path) -> Program:
             family=make(record["env"], **record["family"]),
             learner=agent(record["agent"], **record["learner"]),
         )
-    except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
+    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{str(path)!r} does not describe a run: {type(error).__name__}: {error}") from None
 
 
@@ -212,6 +218,9 @@ def main(run: Any) -> None:
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        sys.exit(130)
     except FloatingPointError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(1)

@@ -1,6 +1,7 @@
 """What a run writes while it goes: a line of metrics a chunk, on the terminal and in a file."""
 
 import csv
+import itertools
 import os
 import sys
 from pathlib import Path
@@ -29,7 +30,7 @@ def truncate_rows(path: Path, iteration: int) -> float:
         return 0.0
     with path.open(newline="") as file:
         reader = csv.DictReader(file)
-        kept = [row for row in reader if int(row["iteration"]) <= iteration]
+        kept = list(itertools.takewhile(lambda row: _is_whole(row) and int(row["iteration"]) <= iteration, reader))
         names = reader.fieldnames or []
     replacement = path.with_suffix(".new")
     with replacement.open("w", newline="") as file:
@@ -38,6 +39,11 @@ def truncate_rows(path: Path, iteration: int) -> float:
         writer.writerows(kept)
     os.replace(replacement, path)
     return max((float(row["seconds"]) for row in kept), default=0.0)
+
+
+def _is_whole(row: dict[str, str | None]) -> bool:
+    """Whether a line was written to its end: a process that is killed may leave half of one."""
+    return None not in row.values() and row["iteration"].isdigit()  # type: ignore
 
 
 def metric_rows(metrics: dict[str, np.ndarray], seeds: np.ndarray, common: dict[str, Any]) -> list[dict[str, Any]]:

@@ -219,8 +219,10 @@ def _summarise(history: dict) -> Metrics:
     losses = jax.tree.map(mean, history["losses"])
     episodes = jnp.sum(history["finished"], axis=0)
     bad = ~history["finite"]
+    # One task's experience spoils the losses of all who share its networks; then it alone is to blame.
+    blameless = ~jnp.any(bad, axis=2, keepdims=True)
     for loss in history["losses"].values():
-        bad |= ~jnp.isfinite(loss).reshape(*loss.shape[:2], -1)
+        bad |= blameless & ~jnp.isfinite(loss).reshape(*loss.shape[:2], -1)
     return losses | {
         "episodes": episodes,
         "return": jnp.sum(history["total"], axis=0) / episodes,

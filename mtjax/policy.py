@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from mtjax import checkpoint, cli, loop
 from mtjax.agents import SAC
 from mtjax.envs import Family
-from mtjax.types import Array, Key, Task
+from mtjax.types import Array, InputError, Key, Task
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -36,11 +36,13 @@ def load(directory: str | Path, seed: int = 0) -> Policy:
         seed: which of the run's seeds, counted from 0.
 
     Raises:
-        InputError: the folder is not a run, or its checkpoint is missing or damaged.
+        InputError: the folder is not a run, it has no such seed, or its checkpoint is missing or damaged.
     """
     directory = Path(directory)
     program = cli.from_json(directory / "config.json")
     env, agent = program.family, program.learner
+    if not 0 <= seed < program.plan.seeds:
+        raise InputError(f"seed must be from 0 to {program.plan.seeds - 1}, counted from the run's first, not {seed}")
     seeds = program.plan.seed + jnp.arange(program.plan.seeds)
     shapes = jax.eval_shape(lambda: loop.init(env, agent, program.training, env.tasks("train"), seeds))
     states = checkpoint.load_agent(directory / "checkpoints", shapes)

@@ -42,6 +42,8 @@ class Plan:
         for field, least in (("steps", 1), ("seeds", 1), ("seed", 0), ("eval_every", 0), ("eval_episodes", 1)):
             if getattr(self, field) < least:
                 raise InputError(f"{field.replace('_', '-')} must be at least {least}, not {getattr(self, field)}")
+        if self.seed + self.seeds > 2**31:
+            raise InputError(f"seed must be less than 2^31, as it is a 32-bit number, not {self.seed}")
 
 
 class Result(NamedTuple):
@@ -259,8 +261,8 @@ def _require_finite(bad_step: np.ndarray, first_step: int) -> None:
     step = int(np.min(bad_step[bad_step >= 0]))
     seed, task = (int(i) for i in np.argwhere(bad_step == step)[0])
     raise FloatingPointError(
-        f"numbers stopped being finite at step {first_step + step} of task {task} (seed {seed} of the run); "
-        "the last checkpoint is from before it. Try lower learning rates or max-gradient-norm"
+        f"numbers stopped being finite at step {first_step + step} of task {task} (number {seed} of the run's seeds); "
+        "a checkpoint, if there is one, is from before it. Try lower learning rates or max-gradient-norm"
     )
 
 

@@ -2,6 +2,8 @@
 
 import dataclasses
 import itertools
+import json
+import os
 import platform
 import shlex
 import sys
@@ -11,12 +13,12 @@ from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from mtjax import cli
+from mtjax import __version__, cli
 from mtjax.cli import Program
 from mtjax.run import Result, enable_compile_cache, train
 from mtjax.types import InputError
 
-_PACKAGES = ("mtjax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
+_PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
 
 
 def main(argv: Sequence[str]) -> None:
@@ -25,13 +27,15 @@ def main(argv: Sequence[str]) -> None:
     if program.list:
         print(cli.catalogue())
         return
-    resume = bool(program.resume)
+    resume = any(word.split("=", 1)[0] == "--resume" for word in argv)
     directory = Path(program.resume) if resume else None
     if directory is not None:
         program = _resumed(program, directory, argv)
     enable_compile_cache()
     _check(program)
-    if directory is None:
+    if directory is not None:
+        _record_steps(directory / "config.json", program.plan.steps)
+    else:
         directory = new_directory(Path(program.runs), f"{program.env}-{program.agent}")
         (directory / "config.json").write_text(cli.to_json(program, _circumstances(program)))
     print(f"{program.agent} on {program.env}: {_summary(program)}\nrun: {directory}", flush=True)
@@ -57,6 +61,18 @@ def _resumed(program: Program, directory: Path, argv: Sequence[str]) -> Program:
     recorded = cli.from_json(directory / "config.json")
     steps = program.plan.steps if "--steps" in given else recorded.plan.steps
     return dataclasses.replace(recorded, plan=dataclasses.replace(recorded.plan, steps=steps))
+
+
+def _record_steps(file: Path, steps: int) -> None:
+    """Write how far a run goes now, so that resuming it once more goes as far."""
+    record = json.loads(file.read_text())
+    if record["plan"]["steps"] == steps:
+        return
+    record["command"] = record["command"].replace(f" --steps={record['plan']['steps']} ", f" --steps={steps} ")
+    record["plan"]["steps"] = steps
+    new = file.with_suffix(".new")
+    new.write_text(json.dumps(record, indent=2) + "\n")
+    os.replace(new, file)
 
 
 def _check(program: Program) -> None:
@@ -89,7 +105,7 @@ def _circumstances(program: Program) -> dict:
 
     from mtjax.envs.physics import choose_engine
 
-    versions = {}
+    versions = {"mtjax": __version__}
     for package in _PACKAGES:
         try:
             versions[package] = version(package)

@@ -47,7 +47,7 @@ class Mixture(nn.Module):
         context = nn.Dense(size, name="context_out")(MLP(self.expert_widths, name="context")(features))  # (D,)
         encodings = Experts(self.num_experts, self.expert_widths, name="experts")(obs)  # (K, ..., D)
         if self.variant == "paper":
-            scores = encodings @ jax.lax.stop_gradient(context)  # (K, ...)
+            scores = jnp.sum(encodings * jax.lax.stop_gradient(context), axis=-1)  # (K, ...)
         else:
             gate = nn.Dense(self.num_experts, name="gate_out")(MLP((size, size), name="gate")(context))
             scores = gate.reshape(-1, *[1] * (obs.ndim - 1))  # (K, 1...), the same in every state
@@ -93,8 +93,8 @@ class CARE(SAC):
             raise nearest_error("variant", self.variant, ("paper", "mtrl"))
         if self.conditioning == "none":
             raise InputError("care attends by the task's context, so conditioning cannot be none; use parameters")
-        if self.num_experts < 1 or not self.expert_widths:
-            raise InputError("care needs at least one expert with at least one layer")
+        if self.num_experts < 1 or not self.expert_widths or min(self.expert_widths) < 1:
+            raise InputError("care needs at least one expert with at least one layer of at least one unit")
 
     def body(self, layer_norm: bool) -> nn.Module:
         return Mixture(self.num_experts, self.expert_widths, self.variant, self.hidden, layer_norm)

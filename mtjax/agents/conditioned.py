@@ -11,5 +11,5 @@ class ConditionedSAC(SAC):
     al. 2015). By default these are the task's physical parameters, which unseen tasks have too."""
 
     conditioning: Conditioning = "parameters"
-    """What the networks are told of the task: none, one-hot, embedding (learned), parameters (the task's context), or
-    vectors (rows of a file). For one-hot, embedding and vectors an unseen task is taken for the nearest training one."""
+    """What the networks are told of the task: none, one-hot, embedding (learned), parameters (the task's context) or
+    vectors (rows of a file). For one-hot, embedding and vectors, an unseen task is taken for its nearest neighbour."""

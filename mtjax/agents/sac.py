@@ -77,8 +77,8 @@ class SAC:
     actor_layer_norm: bool = False
     """Layer normalisation in the actor."""
     conditioning: Conditioning = "none"
-    """What the networks are told of the task: none, one-hot, embedding (learned), parameters (the task's context), or
-    vectors (rows of a file). For one-hot, embedding and vectors an unseen task is taken for the nearest training one."""
+    """What the networks are told of the task: none, one-hot, embedding (learned), parameters (the task's context) or
+    vectors (rows of a file). For one-hot, embedding and vectors, an unseen task is taken for its nearest neighbour."""
     embedding_size: int = 16
     """Width of learned task embeddings."""
     vectors: str = ""
@@ -100,10 +100,18 @@ class SAC:
         for field in ("actor_lr", "critic_lr", "temperature_lr", "num_critics", "initial_temperature"):
             if not getattr(self, field) > 0:
                 raise InputError(f"{field.replace('_', '-')} must be greater than 0, not {getattr(self, field)}")
+        if not self.max_gradient_norm >= 0:
+            raise InputError(f"max-gradient-norm must be at least 0 (0 does not clip), not {self.max_gradient_norm}")
+        if self.conditioning == "embedding" and self.embedding_size < 1:
+            raise InputError(f"embedding-size must be at least 1, not {self.embedding_size}")
         if not self.hidden or min(self.hidden) < 1:
             raise InputError(f"hidden needs at least one layer of at least one unit, not {self.hidden}")
         if not 0 <= self.gamma <= 1 or not 0 < self.tau <= 1:
             raise InputError(f"gamma must be in [0, 1] and tau in (0, 1], not {self.gamma} and {self.tau}")
+        if not self.max_gradient_norm >= 0:
+            raise InputError(f"max-gradient-norm must be at least 0, not {self.max_gradient_norm}")
+        if self.embedding_size < 1:
+            raise InputError(f"embedding-size must be at least 1, not {self.embedding_size}")
         if (self.conditioning == "vectors") != bool(self.vectors):
             raise InputError("conditioning=vectors and vectors=FILE.npy go together; give both or neither")
 
@@ -283,9 +291,12 @@ def load_vectors(file: str, num_tasks: int) -> Array:
         InputError: the file cannot be read, or does not hold one finite row for every training task.
     """
     try:
-        vectors = np.load(file, allow_pickle=False)
-    except (OSError, ValueError) as error:
+        with open(file, "rb") as opened:
+            vectors = np.asarray(np.load(opened, allow_pickle=False), np.float32)  # neither an archive nor words
+    except (OSError, EOFError, TypeError, ValueError) as error:
         raise InputError(f"cannot read task vectors from {file!r}: {error}") from None
     if vectors.ndim != 2 or len(vectors) != num_tasks or not np.all(np.isfinite(vectors)):
-        raise InputError(f"{file!r} must hold {num_tasks} finite rows, one a training task; its shape is {vectors.shape}")
-    return jnp.asarray(vectors, jnp.float32)
+        raise InputError(
+            f"{file!r} must hold {num_tasks} finite rows, one a training task; its shape is {vectors.shape}"
+        )
+    return jnp.asarray(vectors)

@@ -51,9 +51,10 @@ class FingerSpin(Family):
         size: scale of both finger links about the finger's base: lengths, radii, masses by density (so mass grows with
             size^3), the distal body, and the mounting points of the touch sensors. The sensors' own size, the motors
             and the joints' damping stay. Below 0.92 the finger cannot reach the spinner's thin side, so that some
-            starts cannot be won; from there to 1.4 every start can.
-        touch-size: first radius [m] of the ellipsoids in which the touch sensors feel, which is all that differs between
-            the ten tasks MTEnv calls "finger-spin, vary size": they share one dynamics and one reward.
+            starts cannot be won; above 1.3 or so its growing mass makes the task hard for the same motors. Trained
+            agents master every size from 0.95 to 1.13 (benchmarks/RESULTS.md).
+        touch-size: first radius [m] of the ellipsoids in which the touch sensors feel, which is all that differs
+            between the ten tasks MTEnv calls "finger-spin, vary size": they share one dynamics and one reward.
 
     Differs from dm_control in: the floor never collides (at nominal size it is out of reach; above size 1.07 the
     fingertip passes it), and under MJX the constraint solver stops after ``solver_iterations``.

@@ -1,0 +1,280 @@
+"""Every agent with every way to tell it the task: shapes, determinism, and what its settings do and refuse."""
+
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from probes import learner, pick, random_batch, tasks_of, tiny
+
+from mtjax import normalize
+from mtjax.agents import AGENTS, agent
+from mtjax.agents.sac import CONDITIONINGS, load_vectors
+from mtjax.networks import Params
+from mtjax.types import InputError, Spec
+
+SPEC, BATCH, ENVS = Spec(3, 2, 1), 4, 2
+TASKS = tasks_of("one-step", (1.0, -0.5, 0.3))
+KEY = jax.random.key(2)
+SAC_METRICS = {"critic_loss", "value", "actor_loss", "entropy", "temperature"}
+CONFLICTS = {f"{who}_{what}" for who in ("actor", "critic") for what in ("cosine", "conflict")}
+
+VALID = [(name, told) for name in AGENTS for told in CONDITIONINGS if (name, told) != ("care", "none")]
+# Each tells tasks apart in its own way, and pcgrad must compose with every network that an agent brings.
+TRACED = [(*combination, "mean") for combination in VALID]
+TRACED += [(name, "embedding" if name == "sac" else "parameters", "pcgrad") for name in AGENTS]
+# Those that are also run, as compiling takes seconds: every agent, and every way to tell the task.
+RUN = [
+    ("sac", {}),
+    ("sac-conditioned", {}),
+    ("sac-conditioned", {"conditioning": "one-hot"}),
+    ("sac-conditioned", {"conditioning": "embedding"}),
+    ("sac-conditioned", {"conditioning": "vectors"}),
+    ("multi-head", {}),
+    ("multi-head", {"gradients": "pcgrad", "conditioning": "embedding"}),
+    ("care", {}),
+    ("care", {"variant": "mtrl"}),
+    ("pcgrad", {}),
+]
+
+
+@pytest.fixture(scope="session")
+def vectors(tmp_path_factory):
+    """A file of task vectors (T, 5)."""
+    file = tmp_path_factory.mktemp("vectors") / "tasks.npy"
+    np.save(file, np.random.default_rng(0).normal(size=(3, 5)))
+    return str(file)
+
+
+def make(name, settings, vectors):
+    told = {"vectors": vectors} if settings.get("conditioning") == "vectors" else {}
+    return tiny(name, **settings, **told)
+
+
+def observations():
+    return jnp.float32(np.random.default_rng(1).normal(size=(3, ENVS, SPEC.obs_size)))
+
+
+def act(agent, state, obs, keys):
+    """Actions (T, E, A) under the maps over tasks and environments; no keys: the mean ones."""
+    if keys is None:
+        of_task = jax.vmap(lambda task, obs: agent.act(state, obs, task, None), (None, 0))
+        return jax.vmap(of_task)(TASKS, obs)
+    of_task = jax.vmap(lambda task, obs, key: agent.act(state, obs, task, key), (None, 0, 0))
+    return jax.vmap(of_task)(TASKS, obs, keys)
+
+
+def shapes(tree):
+    return jax.tree.map(lambda x: (x.shape, str(x.dtype)), tree)
+
+
+@pytest.mark.parametrize(("name", "told", "gradients"), TRACED)
+def test_every_combination_has_the_right_shapes(name, told, gradients, vectors):
+    """Traced, not run: an update keeps the state's shapes and types, and acting gives an action for each world."""
+    agent = make(name, {"conditioning": told, "gradients": gradients}, vectors)
+    state = jax.eval_shape(lambda: agent.init(SPEC, TASKS, KEY))
+    batch = random_batch(0, 3, BATCH, SPEC)
+    after, metrics = jax.eval_shape(lambda state: agent.update(state, batch, TASKS, KEY), state)
+    assert shapes(after) == shapes(state)
+    assert set(metrics) == SAC_METRICS | (CONFLICTS if gradients == "pcgrad" else set())
+    assert all(metrics[k].shape == (3,) for k in SAC_METRICS)
+    assert all(metrics[k].shape == () for k in set(metrics) - SAC_METRICS)
+    for keys in (None, jax.random.split(KEY, (3, ENVS))):
+        actions = jax.eval_shape(lambda state, keys=keys: act(agent, state, observations(), keys), state)
+        assert (actions.shape, actions.dtype) == ((3, ENVS, 2), jnp.float32)
+
+
+@pytest.mark.parametrize(("name", "settings"), RUN, ids=lambda x: "-".join(x.values()) if isinstance(x, dict) else x)
+def test_agents_act_and_learn(name, settings, vectors):
+    """Finite, the same for the same keys and different for others; acting in a batch is acting one at a time."""
+    agent, keys, obs = make(name, settings, vectors), jax.random.split(KEY, (3, ENVS)), observations()
+    init, update = learner(agent, TASKS, BATCH, SPEC)
+    state, batch = init(TASKS, KEY), random_batch(0, 3, BATCH, SPEC)
+    after, metrics = update(state, batch, TASKS, KEY)
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves((after, metrics)))
+    assert all(metrics[k].shape == (3,) for k in SAC_METRICS)
+
+    again, _ = update(init(TASKS, KEY), batch, TASKS, KEY)
+    other, _ = update(state, batch, TASKS, jax.random.key(3))
+    leaves = [jax.tree.leaves(x.actor) for x in (after, again, other)]
+    assert all(np.array_equal(a, b) for a, b in zip(leaves[0], leaves[1], strict=True))
+    assert not all(np.array_equal(a, b) for a, b in zip(leaves[0], leaves[2], strict=True))
+
+    noisy, mean = act(agent, after, obs, keys), act(agent, after, obs, None)
+    assert noisy.shape == mean.shape == (3, ENVS, 2)
+    assert np.all(np.abs(noisy) <= 1) and not np.allclose(noisy, mean)
+    for t, e in ((0, 0), (2, 1)):
+        np.testing.assert_allclose(agent.act(after, obs[t, e], pick(TASKS, t), keys[t, e]), noisy[t, e], atol=1e-5)
+        np.testing.assert_allclose(agent.act(after, obs[t, e], pick(TASKS, t), None), mean[t, e], atol=1e-5)
+
+
+@pytest.mark.parametrize("told", CONDITIONINGS)
+def test_what_the_networks_see_of_a_task(told, vectors):
+    """Features (Z,) of the second task."""
+    agent = make("sac", {"conditioning": told}, vectors)
+    state = jax.eval_shape(lambda: agent.init(SPEC, TASKS, KEY))._replace(contexts=TASKS.context, vectors=None)
+    state = state._replace(vectors=load_vectors(vectors, 3) if told == "vectors" else None)
+    expected = {"one-hot": [0, 1, 0], "parameters": [-0.5], "vectors": np.load(vectors)[1]}.get(told, [])
+    np.testing.assert_allclose(agent.features(state, pick(TASKS, 1)), np.float32(expected))
+
+
+def test_an_agent_that_is_told_nothing_acts_alike_in_all_tasks():
+    """And one that is told does not."""
+    obs = jnp.ones((3, 1, 3))
+    for name in ("sac", "sac-conditioned"):
+        state = learner(tiny(name), TASKS, BATCH, SPEC)[0](TASKS, KEY)
+        actions = act(tiny(name), state, obs, None)[:, 0]
+        assert (len(np.unique(np.asarray(actions), axis=0)) == 1) == (name == "sac")
+
+
+def test_observations_are_normalised_by_what_was_learned_from():
+    """Only an update fits the moments, and acting uses them as they are."""
+    agent = tiny("sac", normalize_observations=True)
+    init, update = learner(agent, TASKS, BATCH, SPEC)
+    state, batch = init(TASKS, KEY), random_batch(0, 3, BATCH, SPEC)
+    batch = batch._replace(obs=batch.obs * 3 + 10, next_obs=batch.next_obs - 1000)
+    after, metrics = update(state, batch, TASKS, KEY)
+    assert (state.moments.count, after.moments.count) == (0, 3 * BATCH)
+    np.testing.assert_allclose(after.moments.mean, batch.obs.mean(axis=(0, 1)), rtol=1e-5)
+    obs = observations()
+    scaled = normalize.apply(after.moments, obs)
+    np.testing.assert_allclose(act(agent, after, obs, None), act(tiny("sac"), after, scaled, None), atol=1e-6)
+    assert not np.allclose(act(agent, after, obs, None), act(agent, after, scaled, None), atol=1e-3)
+
+    # The update itself learns from observations and next observations scaled by the new moments.
+    plain_update = learner(tiny("sac"), TASKS, BATCH, SPEC)[1]
+    see = lambda x: normalize.apply(after.moments, x)
+    _, expected = plain_update(state, batch._replace(obs=see(batch.obs), next_obs=see(batch.next_obs)), TASKS, KEY)
+    np.testing.assert_allclose(metrics["critic_loss"], expected["critic_loss"], rtol=1e-3)
+    np.testing.assert_allclose(metrics["actor_loss"], expected["actor_loss"], rtol=1e-3, atol=1e-4)
+
+
+def test_without_normalisation_moments_stay_empty():
+    """Nothing is fitted that nobody asked for."""
+    init, update = learner(tiny("sac"), TASKS, BATCH, SPEC)
+    after, _ = update(init(TASKS, KEY), random_batch(0, 3, BATCH, SPEC), TASKS, KEY)
+    assert after.moments.count == 0
+
+
+def test_gradients_are_clipped_to_their_norm():
+    """Actor's and critics' each by its own global norm, and not at all by default; the direction stays."""
+    batch, recorded = random_batch(0, 3, BATCH, SPEC), {}
+    for limit in (0.0, 0.01):
+        init, update = learner(tiny("sac", max_gradient_norm=limit), TASKS, BATCH, SPEC)
+        after, _ = update(init(TASKS, KEY), batch, TASKS, KEY)
+        memories = [optax.tree_utils.tree_get(memory, "mu") for memory in after.optimizers]
+        recorded[limit] = [jax.flatten_util.ravel_pytree(mu)[0] * 10 for mu in memories]  # a tenth, after one step
+    for free, clipped, is_network in zip(recorded[0.0], recorded[0.01], (True, True, False), strict=True):
+        norm = np.linalg.norm(free)
+        assert norm > 0.02
+        if is_network:
+            np.testing.assert_allclose(np.linalg.norm(clipped), 0.01, rtol=1e-3)
+            assert free @ clipped > 0.9 * norm * 0.01
+        else:
+            assert np.linalg.norm(clipped) > 0.02
+
+
+def test_critics_and_heads_begin_apart():
+    """Critics that began alike would stay alike, and their least would be no safeguard."""
+    state = learner(tiny("multi-head"), TASKS, BATCH, SPEC)[0](TASKS, KEY)
+    kernel = state.critic.own["head"]["kernel"]
+    assert isinstance(state.critic, Params) and kernel.shape == (3, 2, 16, 1)
+    flat = np.asarray(kernel).reshape(6, 16)
+    assert len(np.unique(flat, axis=0)) == 6
+
+
+# Files of task vectors.
+
+
+def test_vectors_are_read_in_the_order_of_tasks(vectors):
+    """As float32, whatever the file's type."""
+    found = load_vectors(vectors, 3)
+    assert found.dtype == jnp.float32
+    np.testing.assert_array_equal(found, np.float32(np.load(vectors)))
+
+
+def write(path, kind):
+    """Write a file that is no table of three rows."""
+    array = {
+        "two rows": np.ones((2, 5)),
+        "one axis": np.ones(3),
+        "three axes": np.ones((3, 2, 2)),
+        "not a number": np.array([[1.0], [np.nan], [2.0]]),
+        "objects": np.array([[{}], [{}], [{}]]),
+        "words": np.array([["a"], ["b"], ["c"]]),
+    }.get(kind)
+    if array is not None:
+        np.save(path, array)
+    elif kind == "archive":
+        with open(path, "wb") as file:
+            np.savez(file, np.ones((3, 5)))
+    elif kind != "missing":
+        path.write_text({"text": "not an array", "empty": ""}[kind])
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("missing", "cannot read task vectors from .*No such file"),
+        ("text", "cannot read task vectors from"),
+        ("objects", "cannot read task vectors from"),
+        ("empty", "cannot read task vectors from"),
+        ("two rows", r"must hold 3 finite rows.*\(2, 5\)"),
+        ("one axis", r"must hold 3 finite rows.*\(3,\)"),
+        ("three axes", r"must hold 3 finite rows.*\(3, 2, 2\)"),
+        ("not a number", "must hold 3 finite rows"),
+        ("words", "vectors.npy"),
+        ("archive", "vectors.npy"),
+    ],
+)
+def test_files_that_hold_no_vectors_are_refused(kind, message, tmp_path):
+    """With the file's name, and what is wrong with it."""
+    path = tmp_path / "vectors.npy"
+    write(path, kind)
+    with pytest.raises(InputError, match=message) as raised:
+        load_vectors(str(path), 3)
+    assert "vectors.npy" in str(raised.value)
+
+
+# Settings that make no sense.
+
+REFUSED = [
+    ("sac", {"conditioning": "onehot"}, r"unknown conditioning 'onehot'; did you mean 'one-hot'\?"),
+    ("sac", {"heads": "own"}, "unknown heads 'own'; .*shared, per-task"),
+    ("sac", {"gradients": "pc-grad"}, "unknown gradients 'pc-grad'; did you mean 'pcgrad'"),
+    ("sac", {"hiden": (8,)}, "unknown setting of sac 'hiden'; did you mean 'hidden'"),
+    ("sac", {"actor_lr": 0.0}, "actor-lr must be greater than 0, not 0.0"),
+    ("sac", {"critic_lr": -1.0}, "critic-lr must be greater than 0, not -1.0"),
+    ("sac", {"temperature_lr": float("nan")}, "temperature-lr must be greater than 0, not nan"),
+    ("sac", {"initial_temperature": 0.0}, "initial-temperature must be greater than 0"),
+    ("sac", {"num_critics": 0}, "num-critics must be greater than 0, not 0"),
+    ("sac", {"hidden": ()}, r"hidden needs at least one layer .*not \(\)"),
+    ("sac", {"hidden": (8, 0)}, r"at least one unit, not \(8, 0\)"),
+    ("sac", {"gamma": 1.1}, r"gamma must be in \[0, 1\] .*1.1"),
+    ("sac", {"tau": 0.0}, r"tau in \(0, 1\], not .*0.0"),
+    ("sac", {"tau": float("nan")}, r"tau in \(0, 1\], not .*nan"),
+    ("sac", {"max_gradient_norm": -1.0}, "max-gradient-norm"),
+    ("sac", {"conditioning": "embedding", "embedding_size": 0}, "embedding-size"),
+    ("sac", {"conditioning": "vectors"}, "conditioning=vectors and vectors=FILE.npy go together"),
+    ("sac", {"vectors": "x.npy"}, "conditioning=vectors and vectors=FILE.npy go together"),
+    ("care", {"conditioning": "none"}, "conditioning cannot be none; use parameters"),
+    ("care", {"variant": "papers"}, "unknown variant 'papers'; did you mean 'paper'"),
+    ("care", {"num_experts": 0}, "at least one expert"),
+    ("care", {"expert_widths": ()}, "at least one layer"),
+    ("cares", {}, "unknown agent 'cares'; did you mean 'care'.*multi-head"),
+]
+
+
+@pytest.mark.parametrize(("name", "settings", "message"), REFUSED)
+def test_settings_that_make_no_sense_are_refused(name, settings, message):
+    """Before anything compiles, with what was given and what is allowed."""
+    with pytest.raises(InputError, match=message):
+        agent(name, **settings)
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_agents_are_static_under_jit(name):
+    """Two agents with the same settings are one program."""
+    assert hash(tiny(name)) == hash(tiny(name)) and tiny(name) == tiny(name)
+    assert tiny(name) != tiny(name, gamma=0.5)

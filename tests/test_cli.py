@@ -1,0 +1,402 @@
+"""The command line: what it accepts, what it records, and how it says what is wrong."""
+
+import contextlib
+import dataclasses
+import io
+import itertools
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+import tomllib
+from importlib import resources
+
+import numpy as np
+import pytest
+from conftest import SHORT_RUN
+
+import mtjax.evaluate
+import mtjax.train
+from mtjax import cli
+from mtjax.agents import AGENTS
+from mtjax.envs import ENVS
+from mtjax.loop import Settings
+from mtjax.run import Plan
+from mtjax.types import InputError
+
+COMMANDS = {"train": mtjax.train.main, "evaluate": mtjax.evaluate.main}
+PRESET_FILES = [file for file in (resources.files("mtjax") / "configs").iterdir() if file.name.endswith(".toml")]
+
+
+@pytest.fixture
+def complaint(monkeypatch, capsys, tmp_path, short_family):
+    """Run a program that must refuse its command line; returns what it said."""
+    monkeypatch.chdir(tmp_path)
+
+    def complaint(command, *words):
+        monkeypatch.setattr("sys.argv", [command, *map(str, words)])
+        with pytest.raises(SystemExit) as stop:
+            cli.main(COMMANDS[command])
+        said = capsys.readouterr().err
+        assert stop.value.code == 2 and said.startswith("error: ") and said.count("\n") == 1
+        assert len(said) < 400
+        return said
+
+    return complaint
+
+
+def words_of(text):
+    """The words of a help text, whose lines are framed and wrapped."""
+    return " ".join(re.sub("[│╭╮╰╯─]", " ", text).split())
+
+
+# Names and settings.
+
+
+def test_names_choose_the_defaults():
+    """What is given changes them, and nothing else."""
+    program = cli.parse(["--env=finger-spin-vary-size", "--agent=care", "--agent.num-experts=3", "--preset=gpu"])
+    named = cli.with_preset("finger-spin-vary-size", "care", "gpu")
+    assert program == dataclasses.replace(named, learner=dataclasses.replace(named.learner, num_experts=3))
+    assert program.family == mtjax.make("finger-spin-vary-size") and program.learner.num_experts == 3
+    assert named != cli.with_preset("finger-spin-vary-size", "care", "cpu")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--env=finger-spin", "--num-envs=3", "--agent.actor-lr=0.5", "--agent.shared-temperature"],
+        ["--env", "finger-spin", "--num-envs", "3", "--agent.actor-lr", "0.5", "--agent.shared-temperature"],
+        ["--env=finger-spin", "--num_envs=3", "--agent.actor_lr=0.5", "--agent.shared_temperature"],
+    ],
+)
+def test_flags_may_be_written_in_three_ways(words):
+    """With an equals sign, with a space, and with underscores."""
+    program = cli.parse(words)
+    assert (program.env, program.training.num_envs, program.learner.actor_lr) == ("finger-spin", 3, 0.5)
+    assert program.learner.shared_temperature
+
+
+def test_last_of_a_repeated_name_counts():
+    """As it does for every other flag."""
+    program = cli.parse(["--agent=care", "--steps=1", "--agent", "multi-head", "--steps=2"])
+    assert (program.agent, type(program.learner), program.plan.steps) == ("multi-head", AGENTS["multi-head"], 2)
+
+
+@pytest.mark.parametrize("agent", AGENTS)
+@pytest.mark.parametrize("env", ENVS)
+def test_a_record_is_read_back_as_it_was(env, agent, tmp_path):
+    """For every family and agent, with settings that no default has."""
+    program = cli.parse([f"--env={env}", f"--agent={agent}", "--agent.hidden", "7", "5", "3", "--env.values", "1", "2"])
+    (tmp_path / "config.json").write_text(cli.to_json(program, {"command": "x"}))
+    assert cli.from_json(tmp_path / "config.json") == program
+
+
+SETTINGS = [
+    "",
+    "--steps=123 --seed=4 --seeds=2 --eval-every=7 --eval-episodes=3",
+    "--agent.hidden 5 6 7 --agent.actor-lr=1e-05 --agent.target-entropy=-0.25",
+    "--agent.shared-temperature --agent.no-critic-layer-norm --agent.normalize-observations",
+    "--env.values 0.95 1 1.05 1.1 1.15 1.2 1.25 1.3 1.35 1.4 --split=hip-bmdp --engine=c --env.solver-iterations=3",
+    "--env.vary=touch-size --env.low=0.1 --env.high=0.3 --env.num-tasks=3 --engine mjx",
+    "--agent.conditioning=one-hot --agent.heads=per-task --agent.gradients=pcgrad --preset=gpu --num-envs=2",
+]
+
+
+@pytest.mark.parametrize("settings", SETTINGS)
+@pytest.mark.parametrize("agent", AGENTS)
+def test_repeating_flags_give_the_same_program(agent, settings):
+    """The command in config.json, word for word, and whatever the presets are by then."""
+    program = cli.parse([f"--agent={agent}", *settings.split()])
+    words = shlex.split(shlex.join(["python", "-m", "mtjax.train", *mtjax.train.repeat(program)]))[3:]
+    again = cli.parse([*words, "--preset=cpu"])
+    assert dataclasses.replace(again, preset=program.preset) == program
+
+
+def test_repeating_flags_name_the_file_of_vectors(tmp_path):
+    """Also where its name has spaces."""
+    file = tmp_path / "my vectors.npy"
+    program = cli.parse(["--agent=care", "--agent.conditioning=vectors", f"--agent.vectors={file}"])
+    words = shlex.split(shlex.join(mtjax.train.repeat(program)))
+    assert cli.parse(words) == program and program.learner.vectors == str(file)
+
+
+@pytest.mark.parametrize("file", PRESET_FILES, ids=lambda file: file.name)
+def test_presets_name_only_what_there_is(file):
+    """A word that is misspelt in a preset would otherwise be left out without a sign."""
+    preset = tomllib.loads(file.read_text())
+    assert set(preset) == {"cpu", "gpu"}
+    fields = lambda cls: {field.name for field in dataclasses.fields(cls)}
+    known = {"plan": fields(Plan), "training": fields(Settings)}
+    known["agent"] = set().union(*(fields(cls) for cls in AGENTS.values()))
+    known |= {name: fields(cls) for name, cls in AGENTS.items()}
+    for tables in preset.values():
+        for table, settings in tables.items():
+            assert set(settings) <= known[table], table
+
+
+def test_preset_files_are_of_families_that_exist():
+    """Each is named after a family, its first words, or all families."""
+    words = [name.split("-") for name in ENVS]
+    names = {"-".join(w[:n]) for w in words for n in range(1, len(w) + 1)} | {"default"}
+    assert {file.name.removesuffix(".toml") for file in PRESET_FILES} <= names
+
+
+@pytest.mark.parametrize("env, agent, preset", itertools.product(ENVS, AGENTS, ("cpu", "gpu")))
+def test_every_preset_makes_a_program(env, agent, preset):
+    """Its settings are allowed, and arrive."""
+    program = cli.with_preset(env, agent, preset)
+    expected = cli.load_preset(env, preset)
+    assert dataclasses.asdict(program.training) == dataclasses.asdict(Settings(**expected["training"]))
+    settings = expected["agent"] | expected.get(agent, {})
+    for name, value in settings.items():
+        if hasattr(program.learner, name):
+            assert getattr(program.learner, name) == (tuple(value) if isinstance(value, list) else value)
+
+
+def test_auto_preset_is_that_of_the_device(monkeypatch):
+    """A GPU takes the gpu preset."""
+    assert cli.parse([]).training == cli.with_preset("finger-spin", "sac", "cpu").training
+    monkeypatch.setattr("jax.default_backend", lambda: "gpu")
+    assert cli.parse([]).training == cli.with_preset("finger-spin", "sac", "gpu").training
+
+
+# Help.
+
+
+@pytest.fixture(scope="module")
+def help_text():
+    with contextlib.redirect_stdout(io.StringIO()) as out, pytest.raises(SystemExit) as stop:
+        cli.parse(["--agent=care", "--help"])
+    assert not stop.value.code
+    return words_of(out.getvalue())
+
+
+def test_help_mentions_every_flag_with_its_default(help_text):
+    """Of the agent and family that were named, as the preset leaves them."""
+    program = cli.parse(["--agent=care"])
+    for flag in cli.flags(program):
+        assert re.search(rf"{re.escape(flag)}[ ,]", help_text), flag
+    assert help_text.count("(default: ") == len(cli.flags(program))
+    learner = program.learner
+    for default in (program.plan.steps, learner.actor_lr, learner.conditioning, learner.variant):
+        assert f"(default: {default})" in help_text
+    for widths in (learner.hidden, learner.expert_widths):
+        assert f"(default: {' '.join(map(str, widths))})" in help_text
+
+
+@pytest.mark.parametrize("words", [["--help"], ["-h"]])
+def test_evaluate_has_help(words, capsys):
+    """It names its few flags."""
+    with pytest.raises(SystemExit) as stop:
+        mtjax.evaluate.main(words)
+    assert not stop.value.code
+    text = capsys.readouterr().out
+    assert all(flag in text for flag in ("--run", "--episodes", "--seed", "--video"))
+
+
+def test_list_names_every_family_and_agent(capsys):
+    """With a line of documentation each."""
+    mtjax.train.main(["--list"])
+    lines = capsys.readouterr().out.splitlines()
+    names = {line.split()[0] for line in lines if line.startswith("  ")}
+    assert names == {*ENVS, *AGENTS}
+    assert all(len(line.split()) > 3 for line in lines if line.startswith("  "))
+
+
+# What is wrong.
+
+
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        ("--env=finger-spn", "unknown environment 'finger-spn'; did you mean 'finger-spin'?"),
+        ("--agent carr", "unknown agent 'carr'; did you mean 'care'?"),
+        ("--preset=gpus", "unknown preset 'gpus'; did you mean 'gpu'?"),
+        ("--num-env=3", "unknown flag '--num-env'; did you mean '--num-envs'?"),
+        ("--agent.num-experts=3 --agent=sac", "unknown flag '--agent.num-experts'"),
+        ("--split=dens", "unknown split 'dens'; choose from dense, hip-bmdp"),
+        ("--engine=cpp", "unknown engine 'cpp'; choose from auto, mjx, c"),
+        ("--env.vary=mass", "unknown parameter 'mass'; this domain can vary size, touch-size"),
+        ("--steps=many", "many"),
+        ("--steps=1e6", "1e6"),
+        ("--steps", "--steps"),
+        ("--env", "--env needs a value"),
+        ("--no-steps", "--no-steps"),
+        ("finger-spin", "finger-spin"),
+        ("-x", "-x"),
+        ("--agent.hidden wide", "wide"),
+        ("--agent.hidden", "at least one layer"),
+        ("--agent.conditioning=onehot", "onehot"),
+        ("--agent.shared-temperature=yes", "yes"),
+        ("--seed=-1", "seed must be at least 0"),
+        ("--seed=3000000000", "seed must be less than 2^31"),
+        ("--steps=0", "steps must be at least 1"),
+        ("--num-envs=0", "num-envs must be at least 1"),
+        ("--replay-size=3", "must hold one step of num-envs"),
+        ("--agent.gamma=1.5", "gamma must be in [0, 1]"),
+        ("--agent.actor-lr=nan", "actor-lr must be greater than 0"),
+        ("--agent.max-gradient-norm=-1", "max-gradient-norm must be"),
+        ("--agent.conditioning=embedding --agent.embedding-size=0", "embedding-size must be"),
+        ("--agent=care --agent.expert-widths 8 0", "expert"),
+        ("--env.low=2", "must be less than high"),
+        ("--env.values 1 1", "must increase"),
+        ("--env=finger-spin-vary-size --env.num-tasks=4 --split=hip-bmdp", "has 4; use --split=dense"),
+        ("--agent=care --agent.conditioning=none", "conditioning cannot be none"),
+        ("--agent.conditioning=vectors", "go together"),
+        ("--agent.vectors=x.npy", "go together"),
+        ("--agent.conditioning=vectors --agent.vectors=missing.npy", "cannot read task vectors from 'missing.npy'"),
+        ("--resume=nowhere", "'nowhere' is not a run"),
+        ("--resume=", "not a run"),
+        ("--resume nowhere --num-envs=3", "only --steps may change, not --num-envs"),
+        ("--resume=nowhere --env finger-spin --seed=1", "not --env, --seed"),
+    ],
+)
+def test_train_says_what_is_wrong(complaint, monkeypatch, tmp_path, words, said):
+    """In one line, with exit code 2, and before anything is made."""
+    monkeypatch.setattr(mtjax.train, "train", lambda *_, **__: pytest.fail("it trains"))
+    assert said in complaint("train", *words.split())
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
+def test_messages_do_not_depend_on_the_terminal(complaint, monkeypatch, encoding):
+    """Tyro frames its errors in ASCII where standard output is not UTF-8."""
+    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(io.BytesIO(), encoding=encoding))
+    assert "--steps: invalid literal for int() with base 10: 'many'" in complaint("train", "--steps=many")
+
+
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        ("", "say which run to evaluate: --run=DIR"),
+        ("--run=nowhere", "'nowhere' is not a run"),
+        ("--runs=x", "unknown flag '--runs'; did you mean '--run'?"),
+        ("--run=x --episodes=0", "episodes must be at least 1"),
+        ("--run=x --episodes=some", "some"),
+    ],
+)
+def test_evaluate_says_what_is_wrong(complaint, words, said):
+    """In one line, with exit code 2."""
+    assert said in complaint("evaluate", *words.split())
+
+
+def test_vectors_of_another_number_of_tasks_are_refused(complaint, tmp_path):
+    """Before the run's folder is made."""
+    np.save(tmp_path / "v.npy", np.zeros((3, 4)))
+    said = complaint("train", "--agent.conditioning=vectors", "--agent.vectors=v.npy")
+    assert "must hold 10 finite rows" in said and not (tmp_path / "runs").exists()
+
+
+def test_c_engine_is_for_the_cpu(complaint, monkeypatch):
+    """There it is accepted; elsewhere it is refused before the run's folder is made."""
+    assert cli.parse(["--engine=c"]).family.engine == "c"
+    monkeypatch.setattr("jax.default_backend", lambda: "gpu")
+    assert "use --engine=mjx" in complaint("train", "--engine=c")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"{", b"[]", b"{}", b'{"env": "finger-spin"}', b"\xff\xfe\x00", b'{"env": "x", "agent": "sac", "preset": 1}'],
+)
+def test_damaged_record_is_refused(complaint, tmp_path, content):
+    """The message names the file."""
+    (tmp_path / "config.json").write_bytes(content)
+    for command, flag in (("train", "--resume"), ("evaluate", "--run")):
+        assert "config.json' does not describe a run" in complaint(command, f"{flag}={tmp_path}")
+
+
+def test_record_of_a_family_that_is_gone_is_refused(complaint, finished_run, tmp_path):
+    """As a name is refused on the command line."""
+    text = (finished_run / "config.json").read_text()
+    (tmp_path / "config.json").write_text(text.replace('"finger-short"', '"finger-shirt"'))
+    assert "unknown environment 'finger-shirt'" in complaint("train", f"--resume={tmp_path}")
+
+
+def test_damaged_checkpoint_is_refused(complaint, copied_run):
+    """By both programs; the folder stays as it is."""
+    for file in (copied_run / "checkpoints" / "150").rglob("*"):
+        if file.is_file():
+            file.write_bytes(b"")
+    before = sorted(copied_run.rglob("*"))
+    assert "checkpoint" in complaint("train", f"--resume={copied_run}")
+    assert "checkpoint" in complaint("evaluate", f"--run={copied_run}")
+    assert sorted(copied_run.rglob("*")) == before
+
+
+def test_place_that_cannot_be_written_is_refused(complaint, tmp_path):
+    """A file where the folder of runs should be."""
+    (tmp_path / "taken").write_text("")
+    assert "taken" in complaint("train", *SHORT_RUN, f"--runs={tmp_path / 'taken'}")
+
+
+def test_full_disk_is_refused(complaint, tmp_path, monkeypatch):
+    """A run that cannot be kept is not begun."""
+    usage = shutil.disk_usage(tmp_path)._replace(free=0)
+    monkeypatch.setattr("shutil.disk_usage", lambda _: usage)
+    assert "MB free" in complaint("train", *SHORT_RUN, "--runs=runs")
+    assert not list(tmp_path.glob("runs/*/metrics.csv"))
+
+
+@pytest.mark.parametrize(
+    "error, code, said",
+    [
+        (FloatingPointError("numbers stopped being finite"), 1, "error: numbers stopped being finite\n"),
+        (OSError(28, "No space left on device", "metrics.csv"), 2, "error: No space left on device: metrics.csv\n"),
+        (KeyboardInterrupt(), 130, "interrupted\n"),
+    ],
+)
+def test_errors_of_a_run_are_one_line(capsys, error, code, said):
+    """With a code that tells what the user got wrong from what the run met."""
+
+    def fails(_):
+        raise error
+
+    with pytest.raises((SystemExit, KeyboardInterrupt)) as stop:  # an interrupt let through would end pytest
+        cli.main(fails)
+    assert getattr(stop.value, "code", None) == code and capsys.readouterr().err == said
+
+
+def test_errors_of_ours_are_not_hidden():
+    """A mistake in the package keeps its traceback."""
+
+    def fails(_):
+        raise KeyError("ours")
+
+    with pytest.raises(KeyError):
+        cli.main(fails)
+
+
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        (["mtjax.train", "--env=finger-spn"], "did you mean 'finger-spin'?"),
+        (["mtjax.train", "--num-env=3"], "did you mean '--num-envs'?"),
+        (["mtjax.evaluate", "--run=nowhere"], "'nowhere' is not a run"),
+    ],
+)
+def test_errors_come_fast_and_without_traceback(tmp_path, words, said):
+    """As a user meets them, in a process of their own."""
+    root = os.path.dirname(os.path.dirname(mtjax.__file__))
+    environment = {**os.environ, "PYTHONPATH": root}
+    started = time.monotonic()
+    done = subprocess.run(
+        [sys.executable, "-m", *words], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60
+    )
+    seconds = time.monotonic() - started
+    assert done.returncode == 2 and said in done.stderr and done.stdout == ""
+    assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
+    assert seconds < 8  # two on an idle machine
+    assert not list(tmp_path.iterdir())
+
+
+def test_unusable_names_are_input_errors_in_the_library():
+    """Which are values that cannot be used."""
+    assert issubclass(InputError, ValueError)
+    with pytest.raises(InputError, match="unknown agent 'sacc'; did you mean 'sac'"):
+        mtjax.agent("sacc")
+    with pytest.raises(InputError, match="unknown setting of sac 'hiden'; did you mean 'hidden'"):
+        mtjax.agent("sac", hiden=(3,))

@@ -1,0 +1,213 @@
+"""Which loss moves which parameters, for every agent: all that should learn does, and nothing else moves."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from probes import learner, pick, random_batch, tasks_of, tiny
+
+from mtjax.agents import AGENTS
+from mtjax.agents.care import Mixture
+from mtjax.types import Spec
+
+SPEC, BATCH = Spec(3, 2, 1), 4
+SCALES = (1.0, -0.5, 0.3)
+TASKS = tasks_of("one-step", SCALES)
+
+TRUNK = {"shared/body/MLP_0", "shared/head"}
+CARE = {f"shared/body/{part}" for part in ("context", "context_out", "experts", "trunk")} | {"shared/head"}
+# The parts of actor and critic, each of which its loss must move.
+PARTS = {
+    "sac": ("sac", {}, TRUNK),
+    "sac-conditioned": ("sac-conditioned", {}, TRUNK),
+    "sac-embedding": ("sac-conditioned", {"conditioning": "embedding"}, TRUNK | {"own/embedding"}),
+    "multi-head": ("multi-head", {}, {"shared/body/MLP_0", "own/head"}),
+    "care": ("care", {}, CARE | {"shared/body/after"}),
+    "care-mtrl": ("care", {"variant": "mtrl"}, CARE | {"shared/body/gate", "shared/body/gate_out"}),
+    "pcgrad": ("pcgrad", {}, TRUNK),
+}
+EVERY_AGENT = pytest.mark.parametrize("case", PARTS)
+
+
+def start(case, seed=0):
+    """The agent's state and its compiled update."""
+    name, settings, _ = PARTS[case]
+    init, update = learner(tiny(name, **settings), TASKS, BATCH, SPEC)
+    return init(TASKS, jax.random.key(seed)), update
+
+
+def leaves_of(params):
+    """Arrays by path, with flax's own level left out."""
+    found = jax.tree_util.tree_leaves_with_path(params)
+    name = lambda path: "/".join(str(getattr(p, "key", getattr(p, "name", p))) for p in path)
+    return {name(path).replace("/params/", "/"): np.asarray(leaf) for path, leaf in found}
+
+
+def slices(path, leaf, is_critic):
+    """A leaf by all that owns a part of it: tasks, then critics, then experts."""
+    axes = path.startswith("own/") + is_critic + ("/experts/" in path)
+    return leaf.reshape(-1, *leaf.shape[axes:]) if axes else leaf[None]
+
+
+def test_every_agent_is_in_the_table():
+    """An agent that joins ``AGENTS`` must say here what its losses move."""
+    assert {name for name, _, _ in PARTS.values()} == set(AGENTS)
+
+
+@EVERY_AGENT
+def test_everything_that_should_learn_does(case):
+    """After ten updates no leaf is where it began: no task's, no critic's and no expert's part of it."""
+    before, update = start(case)
+    after = before
+    for i in range(10):
+        after, _ = update(after, random_batch(i, 3, BATCH, SPEC), TASKS, jax.random.key(i))
+    for network in ("actor", "critic", "target"):
+        old, new = leaves_of(getattr(before, network)), leaves_of(getattr(after, network))
+        assert {"/".join(path.split("/")[: 3 if "/body/" in path else 2]) for path in old} == PARTS[case][2]
+        for path in old:
+            parts = (slices(path, leaves[path], network != "actor") for leaves in (old, new))
+            for i, (a, b) in enumerate(zip(*parts, strict=True)):
+                assert not np.array_equal(a, b), f"{network} {path}[{i}] stayed"
+    assert np.all(before.log_temperature != after.log_temperature)
+
+
+# With discount 0 the critic's target is the reward. What each input must leave alone, bit for bit, and what it moves.
+FLOW = {
+    "actor": (("critic", "target"), ("log_temperature",)),
+    "critic": (("log_temperature",), ("actor",)),
+    "target": (("actor", "critic", "log_temperature"), ()),
+    "log_temperature": (("critic", "target"), ("actor",)),
+    "reward": (("log_temperature",), ("actor", "critic", "target")),
+}
+
+
+OPTIMIZERS = {"actor": 0, "critic": 1, "log_temperature": 2}
+
+
+def learned(state, part):
+    """Parameters, and what their optimiser remembers of gradients: Adam's first step alone is little but a sign."""
+    return getattr(state, part), state.optimizers[OPTIMIZERS[part]] if part in OPTIMIZERS else ()
+
+
+def same(a, b):
+    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+
+
+@EVERY_AGENT
+def test_losses_reach_their_own_parameters_alone(case):
+    """Change one input of an update: if a loss leaked into foreign parameters, these would move too."""
+    state, update = start(case)
+    batch, key = random_batch(0, 3, BATCH, SPEC)._replace(discount=jnp.zeros((3, BATCH))), jax.random.key(1)
+    plain, _ = update(state, batch, TASKS, key)
+    nudge = lambda tree: jax.tree.map(lambda x: x * 1.5 + 0.05, tree)
+    for changed, (untouched, moved) in FLOW.items():
+        if changed == "reward":
+            after, _ = update(state, batch._replace(reward=nudge(batch.reward)), TASKS, key)
+        else:
+            after, _ = update(state._replace(**{changed: nudge(getattr(state, changed))}), batch, TASKS, key)
+        for part in untouched:
+            assert same(learned(after, part), learned(plain, part)), f"{changed} reached {part}"
+        for part in moved:
+            assert not same(learned(after, part), learned(plain, part)), f"{changed} did not reach {part}"
+
+
+@EVERY_AGENT
+def test_the_slow_critic_is_what_bootstraps(case):
+    """With discount 1 it moves the critic; its own step is a share of the new critic and nothing else."""
+    state, update = start(case)
+    batch, key = random_batch(0, 3, BATCH, SPEC)._replace(discount=jnp.ones((3, BATCH))), jax.random.key(1)
+    slow = jax.tree.map(lambda x: x * 1.5 + 0.05, state.target)
+    plain, other = update(state, batch, TASKS, key)[0], update(state._replace(target=slow), batch, TASKS, key)[0]
+    assert not same(plain.critic, other.critic)
+    tau = tiny("sac").tau
+    expected = jax.tree.map(lambda old, new: (1 - tau) * old + tau * new, slow, other.critic)
+    for a, b in zip(jax.tree.leaves(expected), jax.tree.leaves(other.target), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7)
+
+
+# What CARE detaches.
+
+OBS = jnp.float32(np.random.default_rng(0).normal(size=(4, 3)))
+FEATURES = jnp.float32([0.3, -0.7])
+
+
+def mixture(variant):
+    module = Mixture(3, (6, 4), variant, (7,), layer_norm=False)
+    params = jax.eval_shape(module.init, jax.random.key(0), OBS, FEATURES)
+    random = np.random.default_rng(1)
+    return module, jax.tree.map(lambda x: jnp.float32(random.normal(size=x.shape)), params)
+
+
+def size_of_slope(function, params):
+    """The largest absolute slope of a scalar function by part of the network."""
+    slopes = jax.jit(jax.grad(function))(params)["params"]
+    return {part: max(float(jnp.abs(x).max()) for x in jax.tree.leaves(tree)) for part, tree in slopes.items()}
+
+
+@pytest.mark.parametrize("variant", ["paper", "mtrl"])
+def test_attention_teaches_the_context_encoder_in_mtrl_alone(variant):
+    """In the paper's variant scores move the experts; in MTRL's they move the gate and, through it, the context."""
+    module, params = mixture(variant)
+
+    def attention(params):
+        _, seen = module.apply(params, OBS, FEATURES, mutable="intermediates")
+        (weights,) = seen["intermediates"]["attention"]
+        np.testing.assert_equal(weights.shape, (3, 4))
+        return jnp.sum(weights[0] ** 2)
+
+    slope = size_of_slope(attention, params)
+    moved = {part for part, size in slope.items() if size > 0}
+    assert moved == ({"experts"} if variant == "paper" else {"context", "context_out", "gate", "gate_out"})
+
+
+@pytest.mark.parametrize("variant", ["paper", "mtrl"])
+def test_context_learns_through_the_trunk_in_the_paper(variant):
+    """With the trunk's weights on the context cut, the paper's context encoder receives exactly nothing."""
+    module, params = mixture(variant)
+    kernel = params["params"]["trunk"]["Dense_0"]["kernel"]
+    total = lambda params: jnp.sum(module.apply(params, OBS, FEATURES) ** 2)
+    whole = size_of_slope(total, params)
+    params["params"]["trunk"]["Dense_0"]["kernel"] = kernel.at[-4:].set(0.0)
+    cut = size_of_slope(total, params)
+    assert whole["context"] > 0 and whole["context_out"] > 0
+    assert (cut["context"] == cut["context_out"] == 0) == (variant == "paper")
+    assert cut["experts"] > 0
+
+
+# Which parameters stand for a task.
+
+
+def test_training_tasks_are_themselves_and_others_the_nearest():
+    """By number if they were trained on, whatever their context; else by the distance of contexts."""
+    agent, state = tiny("multi-head"), start("multi-head")[0]
+    known = lambda task: agent.known_task(state, task)
+    np.testing.assert_array_equal(jax.vmap(known)(TASKS), [0, 1, 2])
+    moved = TASKS._replace(context=TASKS.context[::-1])
+    np.testing.assert_array_equal(jax.vmap(known)(moved), [0, 1, 2])
+    unseen = tasks_of("one-step", [0.9, 0.2, -3.0, 0.64, 0.66])
+    unseen = unseen._replace(id=jnp.arange(3, 8, dtype=jnp.int32))
+    np.testing.assert_array_equal(jax.vmap(known)(unseen), [0, 2, 1, 2, 0])
+
+
+@pytest.mark.parametrize("case", ["multi-head", "sac-embedding", "sac-conditioned"])
+def test_an_unseen_task_acts_as_its_nearest_or_by_its_own_parameters(case):
+    """Head and embedding are borrowed; physical parameters are the task's own."""
+    name, settings, _ = PARTS[case]
+    agent, state = tiny(name, **settings), start(case)[0]
+    unseen = pick(tasks_of("one-step", [0.2]), 0)._replace(id=jnp.int32(7))
+    act = lambda task: np.asarray(agent.act(state, OBS[0], task, None))
+    actions = np.stack([act(pick(TASKS, i)) for i in range(3)])
+    assert len(np.unique(actions, axis=0)) == 3
+    assert np.array_equal(act(unseen), actions[2]) == (case != "sac-conditioned")
+
+
+def test_a_head_or_embedding_moves_the_action_of_its_task_alone():
+    """The actor looks up the parameters of the task that it is asked about."""
+    for case, part in (("multi-head", "head"), ("sac-embedding", "embedding")):
+        name, settings, _ = PARTS[case]
+        agent, state = tiny(name, **settings), start(case)[0]
+        own = jax.tree.map(lambda x: x.at[1].add(0.5), state.actor.own)
+        assert set(own) == {part}
+        changed = state._replace(actor=state.actor._replace(own=own))
+        acts = [np.stack([agent.act(s, OBS[0], pick(TASKS, i), None) for i in range(3)]) for s in (state, changed)]
+        np.testing.assert_array_equal(np.any(acts[0] != acts[1], axis=1), [False, True, False])

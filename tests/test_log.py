@@ -1,0 +1,102 @@
+"""Lines of metrics, in the file and on the terminal."""
+
+import csv
+import io
+
+import numpy as np
+import pytest
+
+from mtjax import log
+
+
+def read(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_header_is_written_once(tmp_path):
+    """Rows are appended below those that are there."""
+    path = tmp_path / "metrics.csv"
+    log.append_rows(path, [{"iteration": 1, "x": 2}])
+    log.append_rows(path, [{"iteration": 2, "x": 3}, {"iteration": 3, "x": 4}])
+    assert path.read_text().split() == ["iteration,x", "1,2", "2,3", "3,4"]
+
+
+def test_truncation_keeps_an_iteration_and_what_is_before_it(tmp_path):
+    """And tells the seconds of training up to there."""
+    path = tmp_path / "metrics.csv"
+    rows = [{"seed": s, "iteration": i, "seconds": f"{i / 10}", "x": ""} for i in (10, 20, 30) for s in (0, 1)]
+    log.append_rows(path, rows)
+    assert log.truncate_rows(path, 20) == 2.0
+    assert read(path) == [{k: str(v) for k, v in row.items()} for row in rows[:4]]
+    assert log.truncate_rows(path, 5) == 0.0 and read(path) == []
+    log.append_rows(path, rows[:1])
+    assert len(read(path)) == 1 and list(tmp_path.iterdir()) == [path]
+
+
+def test_truncation_of_no_file_is_nothing(tmp_path):
+    """A run that was resumed before its first row."""
+    assert log.truncate_rows(tmp_path / "metrics.csv", 3) == 0.0 and not list(tmp_path.iterdir())
+
+
+def test_rows_are_means_over_tasks_and_each_tasks_return():
+    """A task without an episode is left empty, and left out of the mean; losses without tasks are as they are."""
+    metrics = {
+        "return": np.array([[1.0, np.nan], [np.nan, np.nan]]),
+        "loss": np.array([[1.0, 3.0], [5.0, 7.0]]),
+        "cosine": np.array([0.25, 0.123456789]),
+        "bad_step": np.array([[-1, -1], [-1, -1]]),
+    }
+    rows = log.metric_rows(metrics, np.array([7, 8]), {"steps": 100})
+    assert rows == [
+        {"seed": 7, "steps": 100, "return": "1", "loss": "2", "cosine": "0.25", "return_0": "1", "return_1": ""},
+        {"seed": 8, "steps": 100, "return": "", "loss": "6", "cosine": "0.1234568", "return_0": "", "return_1": ""},
+    ]
+
+
+@pytest.mark.parametrize(
+    "given, text", [(np.float32(0.1), "0.1"), (np.nan, ""), (123456789.0, "1.234568e+08"), (np.inf, "inf")]
+)
+def test_numbers_have_seven_digits(given, text):
+    """What is not a number is left empty; what is infinite is not."""
+    assert log.number(given) == text
+
+
+def test_console_prints_a_line_a_chunk(capsys):
+    """Returns that are not there yet are a dash, not a number."""
+    console = log.Console(2000)
+    console.progress(1000, 2.0, 512.3, np.array([[np.nan, np.nan]]))
+    console.progress(2000, 4.0, 512.3, np.array([[np.nan, 10.0], [20.0, 60.4]]))
+    console.close()
+    assert capsys.readouterr().out.splitlines() == [
+        "1,000 of 2,000 steps  2.0 s  512 steps/s  return -",
+        "2,000 of 2,000 steps  4.0 s  512 steps/s  return 30 (10 to 60)",
+    ]
+
+
+def test_quiet_console_is_quiet(capsys):
+    """Nothing on either stream."""
+    console = log.Console(10, quiet=True)
+    console.say("text")
+    console.progress(5, 1.0, 5.0, np.zeros((1, 1)))
+    console.close()
+    assert capsys.readouterr() == ("", "")
+
+
+def test_console_draws_a_bar_on_a_terminal(monkeypatch):
+    """Lines still come out whole, and closing leaves the terminal as it was."""
+
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    monkeypatch.setattr("sys.stdout", terminal := Terminal())
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "120")
+    console = log.Console(2000)
+    console.say("a [line] with brackets")
+    console.progress(2000, 4.0, 512.3, np.array([[30.0]]))
+    console.close()
+    text = terminal.getvalue()
+    assert "a [line] with brackets\n" in text and "2,000 of 2,000 steps" in text and "━" in text
+    assert text.count("\x1b[?25l") == text.count("\x1b[?25h") == 1

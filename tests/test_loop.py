@@ -1,0 +1,297 @@
+"""The loop by what it stores and reports, mostly with an agent that learns nothing and writes down what it is given."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from probes import Broken, Probe, Walk, tasks_of, tiny, train
+
+from mtjax import loop
+from mtjax.loop import Settings, over_learners, over_worlds, spread
+from mtjax.types import InputError, Spec
+
+ENVS, BATCH, WARMUP, HOLD, CHUNK, UPDATES = 4, 8, 8, 3, 13, 2
+SETTINGS = Settings(
+    num_envs=ENVS,
+    updates_per_step=UPDATES,
+    batch_size=BATCH,
+    replay_size=200,
+    warmup_steps=WARMUP,
+    warmup_hold=HOLD,
+    chunk_steps=CHUNK,
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Recorder:
+    """Acts 2 + task's number, which no random action is; counts updates, and those given the batch before once more."""
+
+    nan_update: int = -1
+
+    def init(self, spec, tasks, key):
+        last = jnp.zeros((len(tasks.id), BATCH, spec.obs_size))
+        return {"updates": jnp.int32(0), "repeats": jnp.int32(0), "last": last}
+
+    def act(self, state, obs, task, key):
+        return jnp.full(1, 2.0) + task.id
+
+    def update(self, state, batch, tasks, key):
+        count = state["updates"] + 1
+        repeats = state["repeats"] + jnp.all(batch.obs == state["last"])
+        wrong = (count == self.nan_update) & (tasks.id == 0)
+        metrics = {"count": jnp.float32(count), "loss": jnp.where(wrong, jnp.nan, jnp.float32(tasks.id))}
+        return {"updates": count, "repeats": repeats, "last": batch.obs}, metrics
+
+
+@pytest.fixture(scope="module")
+def walk():
+    """Two seeds of three chunks on walks: states and metrics."""
+    return train(Walk(), Recorder(), SETTINGS, seeds=(0, 1), chunks=3)
+
+
+def stored(state):
+    """What the replay of each seed holds, as (S, T, E, H, ...) in the order of time."""
+    steps = 3 * CHUNK
+    shape = lambda x: np.moveaxis(np.asarray(x)[:, :, : steps * ENVS].reshape(2, 2, steps, ENVS, *x.shape[3:]), 2, 3)
+    return jax.tree.map(shape, state.replay.rows)
+
+
+def ends(rows):
+    """Whether each stored step ended its episode, by termination or by the limit of five."""
+    age = np.floor(rows.obs[..., 0])
+    return (rows.discount == 0) | (age == 4)
+
+
+def test_a_time_limit_is_stored_as_a_step_like_any_other(walk):
+    """Discount 1, and the observation that the limit cut off, which no episode begins with."""
+    rows = stored(walk[0])
+    age, fraction = np.floor(rows.obs[..., 0]), rows.obs[..., 0] % 1
+    cut = age == 4
+    assert cut.sum() > 20
+    assert np.all(rows.discount[cut] == 1)
+    np.testing.assert_allclose(rows.next_obs, rows.obs + 1, rtol=1e-6)
+    np.testing.assert_array_equal(rows.discount == 0, (fraction < 0.5) & (age == 2))
+
+
+def test_an_episode_goes_on_until_it_ends_and_the_next_begins_anew(walk):
+    """Environments end at different times: each is reset exactly when its own episode ends."""
+    rows = stored(walk[0])
+    ended = ends(rows)[..., :-1]
+    assert 0.1 < ended.mean() < 0.5
+    following, next_obs = rows.obs[..., 1:, 0], rows.next_obs[..., :-1, 0]
+    np.testing.assert_array_equal(following[~ended], next_obs[~ended])
+    assert np.all(following[ended] < 1)
+    state = walk[0]
+    np.testing.assert_array_equal(state.obs[..., 0] // 1, state.age)
+
+
+def test_every_episode_begins_somewhere_else(walk):
+    """Over seeds, tasks, environments and episodes."""
+    rows = stored(walk[0])
+    starts = rows.obs[..., 0][np.floor(rows.obs[..., 0]) == 0]
+    assert len(starts) > 100 and len(np.unique(starts)) == len(starts)
+    assert 0.4 < starts.mean() < 0.6
+
+
+def test_reported_returns_are_those_of_the_episodes(walk):
+    """Summed by hand from what was stored, and counted in the chunk in which an episode ended."""
+    state, history = walk
+    rows, scales = stored(state), (1.0, -0.5)
+    ended, spanning = ends(rows), 0
+    for seed, task in np.ndindex(2, 2):
+        found = [[] for _ in history]
+        for env in range(ENVS):
+            total = begun = 0
+            for step in range(3 * CHUNK):
+                total += rows.reward[seed, task, env, step]
+                if ended[seed, task, env, step]:
+                    found[step // CHUNK].append(total)
+                    spanning += begun // CHUNK < step // CHUNK
+                    total, begun = 0, step + 1
+        for returns, metrics in zip(found, history, strict=True):
+            assert metrics["episodes"][seed, task] == len(returns)
+            np.testing.assert_allclose(metrics["return"][seed, task], np.mean(returns), rtol=1e-5)
+    assert spanning > 4
+    expected = np.reshape(scales, (2, 1, 1)) * rows.obs[..., 0]
+    np.testing.assert_allclose(rows.reward, expected, rtol=1e-6)
+
+
+def test_warmup_acts_at_random_and_then_the_agent_does(walk):
+    """For exactly as many steps as asked, in uniform actions held as long as asked; then each task by its own."""
+    actions = stored(walk[0]).action[..., 0]
+    random, chosen = actions[..., :WARMUP], actions[..., WARMUP:]
+    held = random[..., ::HOLD]
+    np.testing.assert_array_equal(random, np.repeat(held, HOLD, axis=-1)[..., :WARMUP])
+    assert np.all(np.abs(held) <= 1) and len(np.unique(held)) == held.size
+    assert abs(held.mean()) < 0.3 and abs(held.var() - 1 / 3) < 0.15
+    np.testing.assert_array_equal(chosen[:, 0], 2.0)
+    np.testing.assert_array_equal(chosen[:, 1], 3.0)
+
+
+def test_updates_begin_after_the_warmup_and_each_has_its_own_batch(walk):
+    """So many a step, and losses are averaged over the updates that took place."""
+    state, history = walk
+    first = UPDATES * (CHUNK - WARMUP)
+    np.testing.assert_array_equal(state.agent["updates"], first + 2 * UPDATES * CHUNK)
+    np.testing.assert_array_equal(state.agent["repeats"], 0)
+    np.testing.assert_allclose(history[0]["count"], (1 + first) / 2)
+    np.testing.assert_allclose(history[1]["count"], first + (1 + UPDATES * CHUNK) / 2)
+    np.testing.assert_allclose(history[1]["loss"], [[0, 1], [0, 1]])
+    np.testing.assert_array_equal(state.iteration, 3 * CHUNK)
+    np.testing.assert_array_equal(state.replay.size, 3 * CHUNK * ENVS)
+
+
+def test_finite_numbers_report_no_bad_step(walk):
+    """-1 for every seed and task."""
+    for metrics in walk[1]:
+        np.testing.assert_array_equal(metrics["bad_step"], -np.ones((2, 2)))
+
+
+def test_a_bad_step_names_its_task():
+    """A loss in the first task, by its update; a reward in the second, by its step, and at its first time."""
+    env, update = Broken(), 7
+    state, (metrics,) = train(env, Recorder(nan_update=update), SETTINGS)
+    in_loss = WARMUP + (update - 1) // UPDATES
+    np.testing.assert_array_equal(metrics["bad_step"], [[in_loss, env.broken_age]])
+    assert np.isnan(state.replay.rows.reward[0, 1]).any() and not np.isnan(state.replay.rows.reward[0, 0]).any()
+
+
+def test_a_bad_reward_is_not_blamed_on_the_tasks_that_share_the_networks():
+    """Learned from in the step in which it occurs, it spoils all losses; the first bad step is its own task's."""
+    env, settings = Broken(), dataclasses.replace(SMALL, replay_size=2, warmup_steps=1, chunk_steps=6)
+    _, (metrics,) = train(env, tiny("sac-conditioned", hidden=(8,)), settings)
+    first, second = metrics["bad_step"][0]
+    assert second == env.broken_age < first
+
+
+# With an agent that learns.
+
+SMALL = Settings(num_envs=2, batch_size=4, replay_size=12, warmup_steps=4, chunk_steps=4)  # one chunk of warm-up
+
+
+def learn(seeds, chunks=2):
+    return train(Walk(), tiny("sac-conditioned", hidden=(8,)), SMALL, seeds=seeds, chunks=chunks)
+
+
+def leaves_of(state):
+    """Every array, with keys as numbers."""
+    raw = lambda x: jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x
+    return [np.asarray(raw(x)) for x in jax.tree.leaves(state)]
+
+
+def test_seeds_do_not_touch_each_other():
+    """Two in one program are each one alone, up to the rounding of products of other shapes."""
+    both, _ = learn((3, 5))
+    each = lambda state: leaves_of(state._replace(replay=state.replay.rows, iteration=None))
+    for i, seed in enumerate((3, 5)):
+        alone, _ = learn((seed,))
+        for a, b in zip(each(both), each(alone), strict=True):
+            np.testing.assert_allclose(a[i], b[0], rtol=1e-3, atol=1e-5)
+    kernel = both.agent.actor.shared["head"]["kernel"]
+    assert not np.allclose(kernel[0], kernel[1])
+
+
+def test_the_same_seed_gives_the_same_bytes():
+    """State and metrics; another seed gives others."""
+    first, second, other = (learn((seed,)) for seed in (3, 3, 4))
+    assert [x.tobytes() for x in leaves_of(first)] == [x.tobytes() for x in leaves_of(second)]
+    differs = [a.tobytes() != b.tobytes() for a, b in zip(leaves_of(first), leaves_of(other), strict=True)]
+    assert sum(differs) > 10
+
+
+def test_the_agent_rests_through_the_warmup():
+    """Its state is what it began with, to the bit, until learning starts."""
+    start, _ = learn((3,), chunks=0)
+    warm, (metrics,) = learn((3,), chunks=1)
+    after, _ = learn((3,), chunks=2)
+    bytes_of = lambda state: [x.tobytes() for x in leaves_of(state.agent)]
+    assert bytes_of(start) == bytes_of(warm) != bytes_of(after)
+    assert np.all(metrics["critic_loss"] == 0) and np.all(metrics["bad_step"] == -1)
+    np.testing.assert_array_equal(after.agent.optimizers[0][1][0].count, SMALL.chunk_steps)
+
+
+@dataclasses.dataclass(frozen=True)
+class Counted(Walk):
+    """A walk that notes whenever it is traced."""
+
+    traces = []  # noqa: RUF012
+
+    def rules(self, task, state, action):
+        self.traces.append(1)
+        return super().rules(task, state, action)
+
+
+def test_chunks_compile_once_and_take_over_the_memory_of_the_state():
+    """However many there are; the state that was given is gone."""
+    env, agent, tasks = Counted(), Recorder(), Walk().tasks()
+    state, counts = loop.init(env, agent, SETTINGS, tasks, jnp.uint32([0])), []
+    for _ in range(3):
+        given = state
+        state, _ = loop.run_chunk(env, agent, SETTINGS, tasks, state)
+        counts.append(len(env.traces))
+        assert all(x.is_deleted() for x in (given.replay.rows.obs, given.obs, given.agent["updates"], given.key))
+    assert counts[0] == counts[1] == counts[2] > 0
+    assert state.iteration == 3 * CHUNK
+
+
+def test_collecting_without_learning_is_allowed():
+    """No updates: no losses, and the agent stays."""
+    settings = dataclasses.replace(SETTINGS, updates_per_step=0)
+    state, (metrics,) = train(Walk(), Recorder(), settings)
+    assert set(metrics) == {"return", "episodes", "bad_step"}
+    assert state.agent["updates"] == 0 and state.iteration == CHUNK
+
+
+# The parts.
+
+
+def test_spread_repeats_tasks_along_seeds_and_environments():
+    """Every leaf (T, ...) becomes (S, T, E, ...)."""
+    worlds = spread(tasks_of("one-step", (1.0, 2.0, 3.0)), (2, 3, 4))
+    assert worlds.context.shape == (2, 3, 4, 1) and worlds.id.shape == (2, 3, 4)
+    np.testing.assert_array_equal(worlds.goal["scale"], np.broadcast_to(np.float32([[1], [2], [3]]), (2, 3, 4)))
+
+
+def test_over_worlds_maps_single_worlds_in_place():
+    """The function sees one world of each argument; results lie where the arguments did."""
+    scale, pairs = np.arange(24.0).reshape(2, 3, 4), np.arange(48.0).reshape(2, 3, 4, 2)
+    total, doubled = over_worlds(lambda scale, pair: (scale * 100 + pair[0] + pair[1], 2 * pair))(scale, pairs)
+    np.testing.assert_array_equal(total, scale * 100 + pairs.sum(axis=-1))
+    np.testing.assert_array_equal(doubled, 2 * pairs)
+
+
+def test_over_learners_gives_each_world_its_seeds_learner_and_its_task():
+    """Learners along the first axis, tasks along the second, and arguments a world each."""
+    learners, tasks, x = np.float32([7, 8]), tasks_of("one-step", (1.0, 2.0, 3.0)), np.arange(24.0).reshape(2, 3, 4)
+    code = lambda learner, task, x: learner * 10_000 + task.goal["scale"] * 100 + x
+    expected = np.reshape([70_000, 80_000], (2, 1, 1)) + np.reshape([100, 200, 300], (3, 1)) + x
+    np.testing.assert_array_equal(over_learners(code)(learners, tasks, x), expected)
+
+
+def test_capacity_is_a_whole_number_of_steps():
+    """Rounded down, so that the ring wraps between steps; what is stored is as large."""
+    settings = dataclasses.replace(SMALL, num_envs=3, replay_size=17)
+    assert settings.capacity == 15 and SMALL.capacity == 12
+    start = jax.eval_shape(lambda: loop.init(Probe(), Recorder(), settings, Probe().tasks(), jnp.uint32([0])))
+    assert start.replay.rows.obs.shape == (1, 2, 15, 1) and start.obs.shape == (1, 2, 3, 1)
+    assert Probe().spec == Spec(1, 1, 1)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"num_envs": 0}, "num-envs must be at least 1, not 0"),
+        ({"batch_size": -3}, "batch-size must be at least 1, not -3"),
+        ({"updates_per_step": -1}, "updates-per-step must be at least 0, not -1"),
+        ({"warmup_steps": 0}, "warmup-steps must be at least 1, not 0"),
+        ({"warmup_hold": 0}, "warmup-hold must be at least 1, not 0"),
+        ({"chunk_steps": 0}, "chunk-steps must be at least 1"),
+        ({"num_envs": 32, "replay_size": 31}, r"replay-size \(31\) must hold one step of num-envs \(32\)"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(settings, message):
+    """With the flag, what was given and what is allowed."""
+    with pytest.raises(InputError, match=message):
+        Settings(**settings)

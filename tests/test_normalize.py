@@ -1,0 +1,60 @@
+"""Running moments against NumPy's of everything at once."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mtjax import normalize
+
+
+def fitted(*batches):
+    moments = normalize.init(batches[0].shape[-1])
+    for batch in batches:
+        moments = normalize.update(moments, jnp.float32(batch))
+    return moments
+
+
+def random_batches(*sizes, offset=0.0, scale=1.0):
+    random = np.random.default_rng(0)
+    return [offset + scale * random.normal(size=(size, 3)) for size in sizes]
+
+
+def test_moments_of_nothing_normalise_to_the_identity():
+    """An agent that has not learned yet sees what there is."""
+    x = jnp.float32([[1.0, -2.0, 300.0]])
+    np.testing.assert_array_equal(normalize.apply(normalize.init(3), x), x)
+
+
+@pytest.mark.parametrize(("offset", "scale"), [(0.0, 1.0), (5.0, 0.1), (-1000.0, 1.0), (0.0, 1e4)])
+def test_batches_of_any_size_add_up_to_the_moments_of_all(offset, scale):
+    """Also far from zero, where a mean of squares less the square of the mean would cancel."""
+    batches = random_batches(1, 7, 64, 2, 300, offset=offset, scale=scale)
+    everything = np.float32(np.concatenate(batches)).astype(np.float64)
+    moments = fitted(*batches)
+    assert moments.count == len(everything)
+    np.testing.assert_allclose(moments.mean, everything.mean(axis=0), rtol=1e-6, atol=1e-6 * scale)
+    np.testing.assert_allclose(moments.deviation / moments.count, everything.var(axis=0), rtol=1e-3)
+
+
+def test_leading_axes_are_all_samples():
+    """A batch (T, B, O) counts as T B observations."""
+    (batch,) = random_batches(24)
+    shaped, flat = fitted(batch.reshape(4, 6, 3)), fitted(batch)
+    for a, b in zip(shaped, flat, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-6)
+
+
+def test_fitted_data_have_zero_mean_and_unit_variance():
+    """Dimension by dimension, whatever their units."""
+    (batch,) = random_batches(500)
+    batch = batch * [0.1, 1.0, 50.0] + [3.0, 0.0, -100.0]
+    x = normalize.apply(fitted(batch), jnp.float32(batch))
+    np.testing.assert_allclose(x.mean(axis=0), 0, atol=1e-4)
+    np.testing.assert_allclose(x.std(axis=0), 1, rtol=1e-3)
+
+
+def test_a_constant_dimension_stays_finite():
+    """It is centred and scaled by no more than the inverse of the least deviation."""
+    moments = fitted(np.full((10, 3), 7.0))
+    np.testing.assert_allclose(normalize.apply(moments, jnp.full(3, 7.0)), 0, atol=1e-3)
+    np.testing.assert_allclose(normalize.apply(moments, jnp.full(3, 7.5)), 500, rtol=1e-3)

@@ -1,0 +1,77 @@
+"""Learning on problems of which every Q-value is known, through the whole loop."""
+
+import numpy as np
+import pytest
+from probes import EITHER_SIGN, Probe, mean_actions, only_seed, tasks_of, tiny, train, values
+
+from mtjax.agents import AGENTS
+from mtjax.loop import Settings
+
+GAMMA = 0.9
+SCALES = (1.0, -0.5)
+SETTINGS = Settings(
+    num_envs=8,
+    updates_per_step=4,
+    batch_size=32,
+    replay_size=8000,
+    warmup_steps=150,
+    warmup_hold=1,
+    chunk_steps=300,
+)
+# The temperature stays negligible, so that the soft Q-value is the plain one.
+PLAIN = {"gamma": GAMMA, "initial_temperature": 1e-6, "temperature_lr": 1e-9}
+RATES = {"tau": 0.3, "actor_lr": 1e-2, "critic_lr": 1e-2}
+
+# Q(scale, obs, action), and how far a critic may be from it: at least half as far again as the worst of five seeds.
+ENDLESS = lambda scale, obs, action: scale * np.where(obs > 0.5, 1, GAMMA) / (1 - GAMMA)
+EXPECTED = {
+    "one-step": (lambda scale, obs, action: scale + 0 * obs, 0.05),
+    "by-observation": (lambda scale, obs, action: scale * obs, 0.08),
+    "delayed": (lambda scale, obs, action: scale * np.where(obs > 0.5, 1, GAMMA), 0.08),
+    "by-action": (lambda scale, obs, action: -np.square(action - scale), 0.15),
+    "by-both": (lambda scale, obs, action: -np.square(action - scale * obs), 0.3),
+    "endless": (ENDLESS, 0.15),
+}
+
+
+def learned(name, kind, scales=SCALES):
+    """Train, and return the agent, its state and the tasks."""
+    agent, tasks = tiny(name, **PLAIN, **RATES), tasks_of(kind, scales)
+    state, _ = train(Probe(), agent, SETTINGS, tasks=tasks, chunks=1 + (kind == "by-both"))
+    return agent, only_seed(state.agent), tasks
+
+
+def places(kind):
+    """Observations (B,) of the probe, each with three actions (B,)."""
+    seen = {"delayed": (0.0, 1.0), "endless": (0.0, 1.0)}.get(kind, (-1.0, 1.0) if kind in EITHER_SIGN else (0.0,))
+    return np.repeat(seen, 3), np.tile([-0.8, 0.0, 0.8], len(seen))
+
+
+def assert_known_values(agent, state, tasks, kind, scales=SCALES):
+    (expected, tolerance), (obs, action) = EXPECTED[kind], places(kind)
+    for found, scale in zip(values(agent, state, tasks, obs, action), scales, strict=True):
+        for critic in found:
+            np.testing.assert_allclose(critic, expected(scale, obs, action), rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("kind", EXPECTED)
+def test_every_critic_learns_the_known_value_of_every_task(kind):
+    """Both critics, on every task, at on-policy and off-policy actions."""
+    assert_known_values(*learned("sac-conditioned", kind), kind)
+
+
+def test_the_policy_finds_the_best_action_of_each_task():
+    """The best action is the scale, whose sign the tasks differ in."""
+    actions = mean_actions(*learned("sac-conditioned", "by-action"), [0.0])
+    np.testing.assert_allclose(actions[1], -0.5, atol=0.35)
+    assert actions[0] > 0.85  # 1 is the edge of what tanh reaches
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_every_agent_learns_values_and_actions(name):
+    """On the probe that needs observation, action and task; an agent that is not told its task gets two alike."""
+    scales = (0.7, 0.7) if name == "sac" else SCALES
+    agent, state, tasks = learned(name, "by-both", scales)
+    assert_known_values(agent, state, tasks, "by-both", scales)
+    best = np.outer(scales, [-1.0, 1.0])
+    np.testing.assert_allclose(mean_actions(agent, state, tasks, [-1.0, 1.0]), best, atol=0.35)

@@ -1,0 +1,367 @@
+"""The host loop: what a run leaves behind, that it repeats to the bit, and that it stops and goes on cleanly."""
+
+import csv
+import dataclasses
+import json
+import os
+import shlex
+import shutil
+import signal
+import threading
+import types
+
+import jax
+import jax.numpy as jnp
+import matplotlib.image
+import numpy as np
+import pytest
+from conftest import SHORT_RUN
+
+import mtjax
+import mtjax.train
+from mtjax import checkpoint, cli, loop
+from mtjax.loop import Settings
+from mtjax.run import Plan, enable_compile_cache, fit_chunk, load_evaluations, stop_signals, train
+from mtjax.types import InputError
+
+CLOCKS = {"seconds", "wall_seconds"}
+CHUNK = 100  # environment steps of a seed in a chunk of SHORT_RUN
+
+
+@pytest.fixture(scope="module")
+def play(short_family):
+    """Train as SHORT_RUN does, apart from what is given."""
+
+    def play(directory=None, settings=None, **changes):
+        program = cli.parse(SHORT_RUN)
+        settings = settings or program.training
+        if directory is not None:
+            directory.mkdir(exist_ok=True)
+        return train(
+            program.family,
+            program.learner,
+            settings=settings,
+            directory=directory,
+            **{**dataclasses.asdict(program.plan), **changes},
+        )
+
+    return play
+
+
+@pytest.fixture(scope="module")
+def whole(play, tmp_path_factory):
+    """A run that nothing interrupted."""
+    return play(tmp_path_factory.mktemp("whole"))
+
+
+def rows_of(directory):
+    with (directory / "metrics.csv").open(newline="") as file:
+        return [{k: v for k, v in row.items() if k not in CLOCKS} for row in csv.DictReader(file)]
+
+
+def bytes_of(state):
+    """Every leaf of a state by its path, typed keys too."""
+    plain = lambda x: jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x
+    return {jax.tree_util.keystr(k): np.asarray(plain(x)).tobytes() for k, x in jax.tree.leaves_with_path(state)}
+
+
+def assert_same_run(result, whole):
+    assert rows_of(result.directory) == rows_of(whole.directory)
+    assert bytes_of(result.state) == bytes_of(whole.state)
+    assert_same_evaluations(result.evaluations, whole.evaluations)
+    on_disk = load_evaluations(result.directory / "evaluations.npz")
+    assert_same_evaluations(on_disk, whole.evaluations)
+
+
+def assert_same_evaluations(some, others):
+    for x, y in zip(jax.tree.leaves(some), jax.tree.leaves(others), strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+def after(chunks, act):
+    """A function for on_chunk that acts once a number of chunks are done."""
+    return lambda row: act() if row["steps"] == chunks * CHUNK else None
+
+
+# What a run leaves behind.
+
+
+def test_folder_holds_all_there_is_to_know(finished_run):
+    """Nothing else either: no half-written file stays."""
+    files = {"config.json", "metrics.csv", "evaluations.npz", "checkpoints", "curve.png"}
+    assert {path.name for path in finished_run.iterdir()} == files
+    assert finished_run.name.startswith("finger-short-sac-conditioned-2")
+    assert matplotlib.image.imread(finished_run / "curve.png").std() > 0
+
+
+def test_config_records_settings_and_circumstances(finished_run):
+    """Names, settings, versions, engine, device and command."""
+    config = json.loads((finished_run / "config.json").read_text())
+    assert (config["env"], config["agent"], config["engine"], config["device"]) == (
+        "finger-short",
+        "sac-conditioned",
+        "c",
+        jax.devices()[0].device_kind,
+    )
+    assert config["versions"]["jax"] == jax.__version__
+    assert config["versions"]["mtjax"] == mtjax.__version__
+    assert {"mujoco", "mujoco-mjx", "flax", "optax", "numpy", "orbax-checkpoint"} <= set(config["versions"])
+    assert config["training"]["chunk_steps"] == 25 and config["learner"]["hidden"] == [8, 8]
+    assert config["command"].startswith("python -m mtjax.train --env=finger-short ")
+
+
+def test_recorded_command_repeats_the_program(finished_run):
+    """The words after ``python -m mtjax.train`` parse to what the file records."""
+    words = shlex.split(json.loads((finished_run / "config.json").read_text())["command"])
+    recorded = cli.from_json(finished_run / "config.json")
+    assert cli.parse([*words[3:], f"--runs={recorded.runs}"]) == recorded
+
+
+def test_metrics_have_a_row_a_seed_a_chunk(finished_run):
+    """Steps count every task and environment of one seed; returns are of finished episodes."""
+    rows = rows_of(finished_run)
+    assert [(r["seed"], r["iteration"], r["steps"]) for r in rows] == [
+        (str(seed), str(25 * chunk), str(CHUNK * chunk)) for chunk in range(1, 7) for seed in (0, 1)
+    ]
+    learned = {"actor_loss", "critic_loss", "entropy", "temperature", "value"}
+    assert set(rows[0]) == {"seed", "iteration", "steps", "return", "episodes", "return_0", "return_1"} | learned
+    for row in rows:
+        assert float(row["return"]) == pytest.approx((float(row["return_0"]) + float(row["return_1"])) / 2, rel=1e-5)
+        assert 0 < float(row["return"]) < 45
+
+
+def test_seconds_of_metrics_grow(finished_run):
+    """Training seconds never exceed seconds since the start."""
+    with (finished_run / "metrics.csv").open(newline="") as file:
+        clocks = np.array([[float(row["seconds"]), float(row["wall_seconds"])] for row in csv.DictReader(file)])
+    assert np.all(np.diff(clocks[::2], axis=0) > 0) and np.all(clocks[:, 0] <= clocks[:, 1] + 1e-3)
+
+
+def test_evaluations_are_whole(finished_run):
+    """Arrays (S, V, T, episodes) of each split with the steps and the parameter's values."""
+    with np.load(finished_run / "evaluations.npz") as file:
+        assert file["steps"].tolist() == [200, 400, 600]
+        shapes = {split: file[split].shape for split in ("train", "interpolation", "extrapolation")}
+        values = {split: file[f"{split}_values"] for split in shapes}
+        assert len(np.unique(np.concatenate([file[s].reshape(-1) for s in shapes]))) == 6 * 7
+    assert shapes == {"train": (2, 3, 2, 1), "interpolation": (2, 3, 1, 1), "extrapolation": (2, 3, 4, 1)}
+    np.testing.assert_allclose(values["train"], [1.0, 1.2], rtol=1e-6)
+    np.testing.assert_allclose(values["interpolation"], [1.1], rtol=1e-6)
+    np.testing.assert_allclose(values["extrapolation"], [0.6, 0.8, 1.4, 1.6], rtol=1e-6)
+
+
+def test_two_newest_checkpoints_stay(finished_run):
+    """A checkpoint an evaluation, under its iteration."""
+    assert {path.name for path in (finished_run / "checkpoints").iterdir()} == {"100", "150"}
+
+
+def test_runs_of_one_second_have_folders_of_their_own(tmp_path, monkeypatch):
+    """Folders that exist are left as they are."""
+    monkeypatch.setattr("time.strftime", lambda _: "20260101-000000")
+    first = mtjax.train.new_directory(tmp_path / "runs", "name")
+    (first / "config.json").write_text("mine")
+    names = [mtjax.train.new_directory(tmp_path / "runs", "name").name for _ in range(2)]
+    assert [first.name, *names] == [f"name-20260101-000000{end}" for end in ("", "-1", "-2")]
+    assert (first / "config.json").read_text() == "mine"
+
+
+def test_no_directory_writes_nothing_and_prints_nothing(play, tmp_path, monkeypatch, capsys):
+    """The library does not surprise: a chunk's first row goes to on_chunk alone."""
+    monkeypatch.chdir(tmp_path)
+    seen = []
+    result = play(None, steps=200, on_chunk=seen.append)
+    assert not list(tmp_path.iterdir()) and capsys.readouterr() == ("", "")
+    assert seen == result.rows[::2] and [row["seed"] for row in result.rows] == [0, 1, 0, 1]
+    assert result.finished and result.directory is None and result.evaluations.steps.tolist() == [200]
+
+
+# Repeating.
+
+
+def test_same_seed_gives_the_same_bytes(finished_run, whole):
+    """The program and the function, run twice, agree on every number."""
+    shapes = jax.eval_shape(lambda: whole.state)
+    again = checkpoint.load(finished_run / "checkpoints", shapes)
+    assert bytes_of(again) == bytes_of(whole.state)
+    assert rows_of(finished_run) == rows_of(whole.directory)
+    assert_same_evaluations(load_evaluations(finished_run / "evaluations.npz"), whole.evaluations)
+
+
+def test_seeds_differ(whole):
+    """Networks, worlds and keys: nothing that chance touches is shared."""
+    chance = {
+        path: data
+        for path, data in bytes_of(whole.state).items()
+        if "kernel" in path or path in (".key", ".warmup_key", ".obs", ".env.qpos", ".replay.rows.action")
+    }
+    assert len(chance) > 10
+    assert not [path for path, data in chance.items() if data[: len(data) // 2] == data[len(data) // 2 :]]
+
+
+def test_a_seed_among_many_is_that_seed_alone(short_family, whole):
+    """Up to rounding: the same draws, so the first chunk is the same."""
+    program = cli.parse(SHORT_RUN)
+    fixed = (program.family, program.learner, program.training, program.family.tasks("train"))
+    _, metrics = loop.run_chunk(*fixed, loop.init(*fixed, jnp.array([1])))
+    row = whole.rows[1]
+    assert row["seed"] == 1
+    for name in ("return", "critic_loss", "actor_loss", "entropy"):
+        assert float(jnp.mean(metrics[name])) == pytest.approx(float(row[name]), rel=1e-3), name
+
+
+# Stopping and going on.
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_stopped_run_goes_on_to_the_bit(play, whole, tmp_path, number):
+    """A signal ends the run after its chunk, with a checkpoint; resumed, nothing tells it from an unbroken one."""
+    before = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
+    stopped = play(tmp_path, on_chunk=after(3, lambda: os.kill(os.getpid(), number)))
+    assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] == before
+    assert not stopped.finished and len(rows_of(tmp_path)) == 6
+    assert (tmp_path / "checkpoints" / "75").is_dir()
+    resumed = play(tmp_path, resume=True)
+    assert resumed.finished and [row["steps"] for row in resumed.rows] == [400, 400, 500, 500, 600, 600]
+    assert_same_run(resumed, whole)
+
+
+def test_broken_run_goes_on_from_its_last_checkpoint(play, whole, tmp_path):
+    """Rows that the checkpoint does not know are dropped and written again."""
+
+    def breaks():
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        play(tmp_path, on_chunk=after(5, breaks))
+    assert len(rows_of(tmp_path)) == 10 and (tmp_path / "checkpoints" / "100").is_dir()
+    assert_same_run(play(tmp_path, resume=True), whole)
+
+
+def test_evaluations_after_the_checkpoint_are_dropped(play, whole, tmp_path):
+    """A run that died between an evaluation and its checkpoint evaluates again, under the same number."""
+    shutil.copytree(whole.directory, tmp_path, dirs_exist_ok=True)
+    shutil.rmtree(tmp_path / "checkpoints" / "150")
+    assert_same_run(play(tmp_path, resume=True), whole)
+
+
+def test_finished_run_can_be_extended(play, whole, tmp_path):
+    """More steps go on as if they had been asked for at once."""
+    assert play(tmp_path, steps=400).finished
+    assert_same_run(play(tmp_path, resume=True), whole)
+
+
+def test_finished_run_has_nothing_to_resume(play, whole, tmp_path):
+    """Resuming it changes nothing."""
+    shutil.copytree(whole.directory, tmp_path, dirs_exist_ok=True)
+    result = play(tmp_path, resume=True)
+    assert result.finished and result.rows == []
+    assert_same_run(result, whole)
+
+
+@pytest.mark.parametrize("torn", ["0,", "0,1", "0,75,300,0.5\n", "0,nonsense,1\n"])
+def test_torn_metrics_do_not_stop_a_resumed_run(play, whole, tmp_path, torn):
+    """What a killed process left of its last line is no row."""
+    shutil.copytree(whole.directory, tmp_path, dirs_exist_ok=True)
+    shutil.rmtree(tmp_path / "checkpoints" / "150")
+    with (tmp_path / "metrics.csv").open("a") as file:
+        file.write(torn)
+    assert_same_run(play(tmp_path, resume=True), whole)
+
+
+def test_second_interrupt_is_pythons_own():
+    """Who insists gets out; the handlers from before come back all the same."""
+    before = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
+    with pytest.raises(KeyboardInterrupt), stop_signals() as received:
+        os.kill(os.getpid(), signal.SIGINT)
+        assert received == [signal.SIGINT]
+        os.kill(os.getpid(), signal.SIGINT)
+    assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+def test_signals_are_left_alone_outside_the_main_thread():
+    """Training in a thread works, without the clean stop."""
+    seen = []
+
+    def work():
+        with stop_signals() as received:
+            seen.append((received, signal.getsignal(signal.SIGINT)))
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert seen == [([], signal.getsignal(signal.SIGINT))]
+
+
+# Numbers that are not finite.
+
+
+def lost_world(state):
+    """An observation of seed 1, task 1 that is not a number."""
+    return state._replace(obs=state.obs.at[1, 1, 0, 3].set(jnp.nan))
+
+
+def diverged_critic(state):
+    """Values in seed 1 whose square is beyond 32 bits; every task meets them at once."""
+    critic = jax.tree.map(lambda x: x.at[1].multiply(1e10), state.agent.critic)
+    return state._replace(agent=state.agent._replace(critic=critic))
+
+
+@pytest.mark.parametrize("poison, task", [(lost_world, 1), (diverged_critic, 0)])
+def test_not_finite_numbers_stop_the_run_and_spare_the_checkpoint(play, whole, tmp_path, monkeypatch, poison, task):
+    """The message names step, task and seed; no row or checkpoint is written of the chunk."""
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its warnings into the working directory
+    directory = tmp_path / "run"
+    shutil.copytree(whole.directory, directory)
+    load, before = checkpoint.load, rows_of(directory)
+    monkeypatch.setattr(checkpoint, "load", lambda *arguments: poison(load(*arguments)))
+    with pytest.raises(FloatingPointError, match=rf"finite at step 150 of task {task} \(seed 1 of the run\)"):
+        play(directory, resume=True, steps=800)
+    assert rows_of(directory) == before
+    monkeypatch.undo()
+    assert bytes_of(checkpoint.load(directory / "checkpoints", whole.state)) == bytes_of(whole.state)
+
+
+# Arguments.
+
+
+@pytest.mark.parametrize("field", ["steps", "seeds", "seed", "eval_every", "eval_episodes"])
+def test_plan_refuses_numbers_that_mean_nothing(field):
+    """The message names the flag."""
+    with pytest.raises(InputError, match=f"{field.replace('_', '-')} must be at least"):
+        Plan(**{field: -1})
+
+
+def test_chunks_are_no_longer_than_the_run():
+    """Whole iterations, at least as many as the steps need."""
+    assert fit_chunk(Settings(num_envs=2, chunk_steps=1000), 3, 601).chunk_steps == 101
+    assert fit_chunk(Settings(num_envs=2, chunk_steps=10), 3, 601).chunk_steps == 10
+
+
+def test_steps_are_rounded_up_to_whole_chunks(play):
+    """A run never falls short of what was asked."""
+    assert [row["steps"] for row in play(None, steps=101).rows] == [100, 100, 200, 200]
+
+
+def test_full_disk_is_met_before_training(play, tmp_path, monkeypatch):
+    """The check comes before compiling, and says what would help."""
+    monkeypatch.setattr("shutil.disk_usage", lambda _: types.SimpleNamespace(free=1000))
+    with pytest.raises(InputError, match=r"checkpoints need \d+ MB .* has 0 MB free; lower --replay-size"):
+        play(tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_damaged_evaluations_are_an_input_error(tmp_path):
+    """The message names the file."""
+    (tmp_path / "evaluations.npz").write_bytes(b"PK not a zip file")
+    with pytest.raises(InputError, match=r"cannot read evaluations from .*evaluations\.npz"):
+        load_evaluations(tmp_path / "evaluations.npz")
+
+
+@pytest.mark.parametrize("place, folder", [("0", None), ("/some/where", "/some/where")])
+def test_compile_cache_follows_the_environment(monkeypatch, place, folder):
+    """MTJAX_CACHE names the folder, and 0 keeps none."""
+    updates = {}
+    monkeypatch.setattr(jax.config, "update", updates.__setitem__)
+    monkeypatch.setenv("MTJAX_CACHE", place)
+    enable_compile_cache()
+    assert updates.get("jax_compilation_cache_dir") == folder
