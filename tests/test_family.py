@@ -18,7 +18,7 @@ UNREAD = ".stat"  # statistics for viewers, which no step reads
 
 @pytest.fixture(scope="module")
 def sizes():
-    return envs.make("finger-spin-vary-size")
+    return envs.make("finger-spin-vary-size", low=0.95, high=1.4)
 
 
 @pytest.fixture(scope="module")
@@ -28,6 +28,13 @@ def touch_sizes():
 
 def values_of(env, split):
     return np.asarray(env.tasks(split).params[env.vary])
+
+
+def test_registered_sizes_are_those_that_agents_master():
+    """The family as registered: ten sizes of the range that benchmarks/RESULTS.md shows to be solved."""
+    np.testing.assert_allclose(
+        values_of(envs.make("finger-spin-vary-size"), "train"), np.linspace(0.95, 1.13, 10), rtol=1e-6
+    )
 
 
 def test_dense_split_trains_on_all_and_tests_between_and_beyond(sizes):
@@ -56,7 +63,7 @@ def test_dense_steps_take_each_ends_own_spacing():
 
 def test_hip_bmdp_split_follows_mtrl():
     """Of ten values: train 3, 4, 7, 8; interpolation 5, 6; extrapolation 2, 9, as MTRL's configuration counts them."""
-    env = envs.make("finger-spin-vary-size", split="hip-bmdp")
+    env = envs.make("finger-spin-vary-size", low=0.95, high=1.4, split="hip-bmdp")
     splits = (("train", [3, 4, 7, 8], range(4)), ("interpolation", [5, 6], (4, 5)), ("extrapolation", [2, 9], (6, 7)))
     for split, indices, ids in splits:
         np.testing.assert_allclose(values_of(env, split), SIZES[indices], rtol=1e-6)
@@ -209,8 +216,8 @@ def test_friction_of_zero_never_reaches_mjx():
         ("finger-spin", {"values": (1.0, np.inf)}, "size must be"),
         ("finger-spin", {"values": (1.0, 1.2), "split": "hip-bmdp"}, "numbers ten tasks, and this family has 2"),
         ("finger-spin-vary-size", {"num_tasks": 9, "split": "hip-bmdp"}, "this family has 9"),
-        ("finger-spin-vary-size", {"low": 1.4}, r"low \(1.4\) must be less than high \(1.4\)"),
-        ("finger-spin-vary-size", {"low": 1.5}, r"low \(1.5\) must be less than high \(1.4\)"),
+        ("finger-spin-vary-size", {"low": 1.13}, r"low \(1.13\) must be less than high \(1.13\)"),
+        ("finger-spin-vary-size", {"low": 1.5}, r"low \(1.5\) must be less than high \(1.13\)"),
         ("finger-spin", {"num_tasks": 0}, "num-tasks must be at least 1"),
         ("finger-spin", {"solver_iterations": -1}, "solver-iterations at least 0"),
     ],

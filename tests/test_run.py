@@ -314,7 +314,7 @@ def test_not_finite_numbers_stop_the_run_and_spare_the_checkpoint(play, whole, t
     shutil.copytree(whole.directory, directory)
     load, before = checkpoint.load, rows_of(directory)
     monkeypatch.setattr(checkpoint, "load", lambda *arguments: poison(load(*arguments)))
-    with pytest.raises(FloatingPointError, match=rf"finite at step 150 of task {task} \(seed 1 of the run\)"):
+    with pytest.raises(FloatingPointError, match=rf"finite at step 150 of task {task} \(number 1 of the run's seeds\)"):
         play(directory, resume=True, steps=800)
     assert rows_of(directory) == before
     monkeypatch.undo()
