@@ -38,6 +38,7 @@ class Mixture(nn.Module):
     num_experts: int
     expert_widths: tuple[int, ...]
     variant: str
+    temperature: float
     hidden: tuple[int, ...]
     layer_norm: bool
 
@@ -47,7 +48,7 @@ class Mixture(nn.Module):
         context = nn.Dense(size, name="context_out")(MLP(self.expert_widths, name="context")(features))  # (D,)
         encodings = Experts(self.num_experts, self.expert_widths, name="experts")(obs)  # (K, ..., D)
         if self.variant == "paper":
-            scores = jnp.sum(encodings * jax.lax.stop_gradient(context), axis=-1)  # (K, ...)
+            scores = jnp.sum(encodings * jax.lax.stop_gradient(context), axis=-1) / self.temperature  # (K, ...)
         else:
             gate = nn.Dense(self.num_experts, name="gate_out")(MLP((size, size), name="gate")(context))
             scores = gate.reshape(-1, *[1] * (obs.ndim - 1))  # (K, 1...), the same in every state
@@ -86,6 +87,8 @@ class CARE(SAC):
     """Widths of each encoder's layers and of the context encoder; the last is the size of the encoding."""
     variant: Literal["paper", "mtrl"] = "paper"
     """Attention as in the paper, or the gate of the authors' code."""
+    attention_temperature: float = 0.0
+    """Divides the paper's inner products; 0 is the square root of the encoding's size, 1 the paper's formula."""
 
     def __post_init__(self):
         super().__post_init__()
@@ -97,4 +100,5 @@ class CARE(SAC):
             raise InputError("care needs at least one expert with at least one layer of at least one unit")
 
     def body(self, layer_norm: bool) -> nn.Module:
-        return Mixture(self.num_experts, self.expert_widths, self.variant, self.hidden, layer_norm)
+        temperature = self.attention_temperature or self.expert_widths[-1] ** 0.5
+        return Mixture(self.num_experts, self.expert_widths, self.variant, temperature, self.hidden, layer_norm)
