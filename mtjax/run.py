@@ -18,9 +18,7 @@ import numpy as np
 from mtjax import checkpoint, log
 from mtjax.evaluation import Evaluations, evaluate
 from mtjax.loop import Settings, TrainState, init, run_chunk
-from mtjax.types import Agent, Env, InputError
-
-SPLITS = ("train", "interpolation", "extrapolation")
+from mtjax.types import SPLITS, Agent, Env, InputError
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,6 +12,8 @@ Array = jax.Array
 Key = jax.Array
 Metrics = dict[str, Array]
 
+SPLITS = ("train", "interpolation", "extrapolation")
+
 
 class Task(NamedTuple):
     """One task as data; a table of tasks has a leading ``T`` on every leaf."""

@@ -132,7 +132,7 @@ FEATURES = jnp.float32([0.3, -0.7])
 
 
 def mixture(variant):
-    module = Mixture(3, (6, 4), variant, (7,), layer_norm=False)
+    module = Mixture(3, (6, 4), variant, 2.0, (7,), layer_norm=False)
     params = jax.eval_shape(module.init, jax.random.key(0), OBS, FEATURES)
     random = np.random.default_rng(1)
     return module, jax.tree.map(lambda x: jnp.float32(random.normal(size=x.shape)), params)

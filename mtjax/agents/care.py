@@ -66,14 +66,16 @@ class CARE(SAC):
 
     For a task with context features c and K encoders E_j of the observation s:
         z_context = C(c)                                   (context encoder)
-        a_j = softmax_j <E_j(s), sg(z_context)>            (attention; no gradient into the context here)
+        a_j = softmax_j <E_j(s), sg(z_context)> / tau      (attention; no gradient into the context here)
         z = MLP(sum_j a_j E_j(s))                          (mixture)
     and SAC's actor and critics work on [z, z_context], through which alone the context encoder learns.
 
     ``variant="mtrl"`` is what the authors' MTRL code computes: the weights are softmax(MLP(z_context)), the same in
     every state, gradients flow through them, and no MLP follows the mixture.
 
-    Differs from the paper: the context comes from the task's conditioning (by default its physical parameters) where
+    Differs from the paper: the inner products are divided by tau, the square root of the encoding's size, without which
+    the attention is nearly hard from the start and learning slow (``attention_temperature=1`` is the paper's); the
+    context comes from the task's conditioning (by default its physical parameters) where
     the paper embeds a sentence, which conditioning=vectors also allows; actor and critics each own a mixture, so that
     every parameter is trained by its own loss (MTRL ties some of the actor's to the critic's and leaves others at
     their initial values).
@@ -96,6 +98,8 @@ class CARE(SAC):
             raise nearest_error("variant", self.variant, ("paper", "mtrl"))
         if self.conditioning == "none":
             raise InputError("care attends by the task's context, so conditioning cannot be none; use parameters")
+        if not self.attention_temperature >= 0:
+            raise InputError(f"attention-temperature must be at least 0, not {self.attention_temperature}")
         if self.num_experts < 1 or not self.expert_widths or min(self.expert_widths) < 1:
             raise InputError("care needs at least one expert with at least one layer of at least one unit")
 

@@ -17,9 +17,8 @@ import numpy as np
 import tyro
 
 from mtjax.envs.physics import ENGINES, Engine, Mjx, MujocoC, World, choose_engine, mjx_module
-from mtjax.types import Array, InputError, Key, Spec, Step, Task
+from mtjax.types import SPLITS, Array, InputError, Key, Spec, Step, Task
 
-SPLITS = ("train", "interpolation", "extrapolation")
 SCHEMES = ("dense", "hip-bmdp")
 _HIP_BMDP = {"train": (3, 4, 7, 8), "interpolation": (5, 6), "extrapolation": (2, 9)}
 # Fields of the model that never reach the dynamics: statistics, and what only a renderer reads.
