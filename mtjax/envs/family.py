@@ -4,6 +4,7 @@ Tasks are built on the host by editing an ``MjSpec`` and compiling it, so that e
 then only the leaves that differ between tasks are stacked. Nothing here loops over tasks once a program runs.
 """
 
+import abc
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
@@ -43,7 +44,7 @@ class Table(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Family:
+class Family(abc.ABC):
     """Tasks that differ in one parameter of one MuJoCo model. Subclasses give the model, observation and reward."""
 
     vary: str = "size"
@@ -92,20 +93,20 @@ class Family:
 
     # What a domain gives.
 
-    def prepare(self, spec: mujoco.MjSpec) -> None:
+    def prepare(self, spec: mujoco.MjSpec) -> None:  # noqa: B027 - most domains share nothing more
         """Edit the model in the way that all tasks share."""
 
+    @abc.abstractmethod
     def start(self, task: Task, key: Key) -> tuple[Array, Array]:
         """Draw the positions (nq,) and velocities (nv,) in which an episode begins."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def observe(self, task: Task, world: World) -> Array:
         """Return the observation (O,) of a world."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def reward(self, task: Task, world: World, action: Array) -> Array:
         """Return the reward () of having arrived in a world."""
-        raise NotImplementedError
 
     # What every domain does.
 
