@@ -19,7 +19,7 @@ import mtjax
 from mtjax import plot
 from mtjax.log import append_rows
 from mtjax.run import Result, enable_compile_cache
-from mtjax.stats import mean_interval
+from mtjax.stats import seed_interval
 from mtjax.types import InputError
 
 MARKS = (700, 800, 900, 950)
@@ -111,7 +111,7 @@ def row(name: str, result: Result, wall: float) -> str:
     scores = {split: x[:, -1].mean(axis=-1) for split, x in result.evaluations.returns.items() if x.size}  # (S, T)
     cells = [name]
     for split in ("train", "interpolation", "extrapolation"):
-        point, low, high = mean_interval(scores[split].mean(axis=1, keepdims=True))
+        point, low, high = seed_interval(scores[split])
         cells.append(f"{point:.0f} [{low:.0f}, {high:.0f}]")
     cells.append(f"{scores['train'].mean(axis=0).min():.0f}")
     cells += [seconds_to(result, mark) for mark in MARKS]

@@ -13,9 +13,9 @@ from mtjax.evaluation import Evaluations, evaluate, record
 from mtjax.log import append_rows, number
 from mtjax.names import nearest_error
 from mtjax.policy import Policy, load
-from mtjax.run import SPLITS, enable_compile_cache
-from mtjax.stats import mean_interval
-from mtjax.types import InputError
+from mtjax.run import enable_compile_cache
+from mtjax.stats import seed_interval
+from mtjax.types import SPLITS, InputError
 
 _FIRST_NUMBER = 1_000_000  # far from the numbers of a run's own evaluations, so that the episodes are new
 
@@ -86,7 +86,7 @@ def _value_of(policy: Policy, split: str) -> tuple[str, np.ndarray]:
 
 def _interval(scores: np.ndarray) -> str:
     """Mean of scores (S, T) with its 95% interval over seeds, if there are several."""
-    point, low, high = mean_interval(scores)
+    point, low, high = seed_interval(scores)
     return f"{point:6.0f}" + (f"  [{low:.0f}, {high:.0f}]" if scores.shape[0] > 1 else "")
 
 

@@ -54,3 +54,8 @@ def mean_interval(
 ) -> tuple[float, float, float]:
     """Return the mean of scores (S, T) and its interval, as ``stratified_bootstrap`` does: (point, low, high)."""
     return stratified_bootstrap(scores, np.mean, resamples, confidence, seed)
+
+
+def seed_interval(scores: np.ndarray) -> tuple[float, float, float]:
+    """Return the mean of scores (S, T) and its interval over whole seeds, as one agent learned all tasks of a seed."""
+    return mean_interval(np.mean(scores, axis=1, keepdims=True))

@@ -3,7 +3,7 @@ import time
 import numpy as np
 import pytest
 
-from mtjax.stats import iqm, mean_interval, stratified_bootstrap
+from mtjax.stats import iqm, mean_interval, seed_interval, stratified_bootstrap
 
 
 def random_scores(num_seeds, num_tasks=10):
@@ -93,3 +93,9 @@ def test_fast_enough_to_call_for_every_evaluation():
     began = time.perf_counter()
     stratified_bootstrap(random_scores(10))
     assert time.perf_counter() - began < 0.5  # 0.005 s on an idle core
+
+
+def test_seed_interval_resamples_whole_seeds():
+    """Tasks that one agent learned rise and fall together, so twenty of them say no more than one."""
+    same = np.tile(np.arange(5.0)[:, None], (1, 20))
+    assert seed_interval(same) == mean_interval(same[:, :1])
