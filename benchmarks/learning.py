@@ -9,7 +9,6 @@ training policy's mean return over tasks (and seeds) first reaches 900.
 """
 
 import argparse
-import dataclasses
 import time
 from pathlib import Path
 
@@ -35,7 +34,7 @@ def main() -> None:
     parser.add_argument("--preset", default="auto")
     parser.add_argument("--eval-every", type=int, default=0)
     parser.add_argument("--eval-episodes", type=int, default=10)
-    parser.add_argument("--num-tasks", type=int, help="by default the family's")
+    parser.add_argument("--vary", nargs="*", default=[], metavar="NAME=VALUES", help="besides what the family varies")
     parser.add_argument("--out", type=Path, default=Path("runs") / f"learning-{time.strftime('%Y%m%d-%H%M%S')}")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True)
@@ -59,13 +58,11 @@ def main() -> None:
 
 def learn(arguments: argparse.Namespace, name: str) -> tuple[Result, float]:
     """Train one agent with its preset; returns the result and the seconds it took in all."""
-    program = mtjax.preset(arguments.env, name, arguments.preset)
-    env = program.family
-    if arguments.num_tasks:
-        env = dataclasses.replace(env, num_tasks=arguments.num_tasks)
+    vary = dict(pair.split("=", 1) for pair in arguments.vary)
+    program = mtjax.preset(arguments.env, name, arguments.preset, vary=vary)
     before = time.monotonic()
     result = mtjax.train(
-        env,
+        program.family,
         program.learner,
         steps=arguments.steps or program.plan.steps,
         seeds=arguments.seeds,

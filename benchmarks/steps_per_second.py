@@ -1,111 +1,276 @@
-"""How many steps a second: the environments alone, and the whole training loop, on this machine.
+"""How many steps a second: environments on every engine beside MuJoCo Playground, and the whole training loop.
 
-    python benchmarks/steps_per_second.py [--env NAME] [--agent NAME] [--engines c mjx] [--json FILE]
+    python benchmarks/steps_per_second.py [--domains finger cheetah ...] [--worlds N] [--json FILE]
 
-Every figure is the median of several timed calls of an already compiled program; compile time is reported apart.
+All contestants of a domain are compiled first and then timed in turn, round after round, in this one process, so that
+what else the machine does falls on all of them; figures are medians over the rounds, and ratios are medians of each
+round's ratio. Ten tasks, random actions, fresh random starts every 1000 steps; "no resets" is the same program whose
+episodes never end. Playground 0.2 (pip install playground==0.2.0) runs one task, in its own wrapper for training, whose
+automatic reset returns to one stored state. Compile time is reported apart.
 """
 
 import argparse
-import dataclasses
 import json
 import os
 import platform
 import statistics
 import subprocess
 import time
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
+import numpy as np
 
 import mtjax
 from mtjax import cli, loop
-from mtjax.types import Agent, Env, InputError
+from mtjax.envs import Domain
+from mtjax.types import InputError
+
+# Ours (with ten values of a physical parameter), and Playground's of the same task.
+DOMAINS = {
+    "finger": ("finger-spin-vary-size", {}, "FingerSpin"),
+    "cheetah": ("cheetah-run-vary-torso-length", {}, "CheetahRun"),
+    "walker": ("walker-walk-vary-friction", {}, "WalkerWalk"),
+    "hopper": ("hopper-hop", {"gear": "0.8:1.2:10"}, "HopperHop"),
+    "cartpole": ("cartpole-swingup-vary-pole-mass", {}, "CartpoleSwingup"),
+}
+# Where Playground integrates by Euler, with one solver iteration, what dm_control does by Runge and Kutta.
+_EULER = ("cartpole",)
+_ON_CPU = jax.default_backend() == "cpu"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--env", default="finger-spin-vary-size")
-    parser.add_argument("--agent", default="sac-conditioned")
-    parser.add_argument("--engines", nargs="+", default=["c", "mjx"] if jax.default_backend() == "cpu" else ["mjx"])
-    parser.add_argument("--envs-per-task", type=int, nargs="+", default=[8, 26, 102])
-    parser.add_argument("--steps", type=int, default=100, help="steps of every environment in a timed call")
-    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--domains", nargs="+", default=list(DOMAINS), choices=DOMAINS)
+    parser.add_argument("--engines", nargs="+", default=["c", "mjx"] if _ON_CPU else ["mjx", "warp"])
+    parser.add_argument("--worlds", type=int, default=256 if _ON_CPU else 8192, help="environments, over all tasks")
+    parser.add_argument("--steps", type=int, default=1000, help="steps of every environment in a timed call")
+    parser.add_argument("--repeats", type=int, default=3, help="rounds")
+    parser.add_argument("--resets-only", action="store_true", help="leave out the rows without resets")
+    parser.add_argument("--no-playground", action="store_true", help="leave Playground out")
+    parser.add_argument("--agent", default="sac-conditioned", help="the agent of the training loop; none leaves it out")
     parser.add_argument("--json", help="write the figures to this file too")
     arguments = parser.parse_args()
     rows = []
-    for engine in arguments.engines:
-        rows += [environment_rate(arguments, engine, count) for count in arguments.envs_per_task]
-    rows.append(training_rate(arguments))
-    print(table(rows))
-    report = {"machine": machine(), "rows": rows}
+    for domain in arguments.domains:
+        rows += compare(domain, arguments)
+        print(table(rows[-8:], domain), flush=True)
+    if arguments.agent != "none":
+        rows.append(training_rate(arguments))
+        print(f"training {arguments.agent}: {rows[-1]['steps_per_second']:,.0f} env-steps/s", flush=True)
+    report = {"machine": machine(), "settings": vars(arguments), "rows": rows}
     print(json.dumps(report))
     if arguments.json:
         with open(arguments.json, "x") as file:
             json.dump(report, file, indent=2)
 
 
-def environment_rate(arguments: argparse.Namespace, engine: str, num_envs: int) -> dict:
-    """Time random actions in every environment of every task, fresh starts included where episodes end."""
-    env = mtjax.make(arguments.env, engine=engine)
-    settings = loop.Settings(num_envs=num_envs, updates_per_step=0, replay_size=num_envs, warmup_steps=10**9)
-    settings = dataclasses.replace(settings, chunk_steps=arguments.steps)
-    return {"what": "environment", "engine": engine} | _time(env, mtjax.agent("sac", hidden=(8,)), settings, arguments)
+class Contestant:
+    """A compiled program that takes ``steps`` steps of ``worlds`` worlds at each call."""
+
+    def __init__(self, name: str, worlds: int, steps: int, make: Callable[[], Callable[[], Any]]):
+        self.name, self.worlds, self.steps = name, worlds, steps
+        self.rates: list[float] = []
+        before = time.perf_counter()
+        self.run = make()
+        jax.block_until_ready(self.run())
+        self.first_call_seconds = time.perf_counter() - before
+
+    def time(self) -> None:
+        before = time.perf_counter()
+        jax.block_until_ready(self.run())
+        self.rates.append(self.worlds * self.steps / (time.perf_counter() - before))
+
+
+def compare(domain: str, arguments: argparse.Namespace) -> list[dict]:
+    """Time every contestant of a domain, in turn."""
+    name, vary, other = DOMAINS[domain]
+    contestants = []
+
+    def enter(label: str, worlds: int, steps: int, make: Callable[[], Callable[[], Any]]) -> None:
+        try:
+            contestants.append(Contestant(label, worlds, steps, make))
+        except (InputError, ImportError) as error:
+            print(f"{domain}: {label} left out: {error}", flush=True)
+
+    per_task = -(-arguments.worlds // 10)
+    for engine in arguments.engines:
+        settings = {"vary": vary, "engine": engine}
+        kinds = [("", settings, True)] + [(", no resets", settings, False)] * (not arguments.resets_only)
+        if domain in _EULER and engine != "c":
+            kinds.append((", euler/1", {**settings, "integrator": "euler", "solver_iterations": 1}, True))
+        for suffix, chosen, resets in kinds:
+            make = lambda chosen=chosen, resets=resets: ours(name, chosen, per_task, arguments.steps, resets)
+            enter(f"mtjax {engine}{suffix}", 10 * per_task, arguments.steps, make)
+    short = max(arguments.steps // 5, 1)
+    if _ON_CPU:
+        enter("mujoco.batch alone", 10 * per_task, short, lambda: batch_alone(name, vary, per_task, short))
+    for impl in () if arguments.no_playground else ("jax",) if _ON_CPU else ("jax", "warp"):
+        make = lambda impl=impl: playground(other, impl, arguments.worlds, short)
+        enter(f"playground {impl}", arguments.worlds, short, make)
+    for _ in range(arguments.repeats):
+        for contestant in contestants:
+            contestant.time()
+    against = [c for c in contestants if c.name.startswith("playground")]
+    best = max(against, key=lambda c: statistics.median(c.rates)) if against else None
+    return [_row(domain, c, best) for c in contestants]
+
+
+def _row(domain: str, contestant: Contestant, best: Contestant | None) -> dict:
+    ratio = (
+        None if best is None else statistics.median(a / b for a, b in zip(contestant.rates, best.rates, strict=True))
+    )
+    return {
+        "domain": domain,
+        "contestant": contestant.name,
+        "worlds": contestant.worlds,
+        "steps_per_second": statistics.median(contestant.rates),
+        "slowest": min(contestant.rates),
+        "fastest": max(contestant.rates),
+        "over_playground": ratio,
+        "first_call_seconds": contestant.first_call_seconds,
+    }
+
+
+def ours(name: str, settings: dict, per_task: int, steps: int, resets: bool) -> Callable[[], Any]:
+    """Random actions in a scan, as the training loop steps: one flat batch, fresh starts behind one branch."""
+    env = mtjax.make(name, **settings)
+    tasks = env.tasks()
+    shape = (1, len(tasks.id), per_task)
+
+    def play(tasks, carry):
+        worlds = loop.spread(tasks, shape)
+
+        def step(carry, _):
+            state, age, key = carry
+            key, act_key, reset_key = jax.random.split(key, 3)
+            action = jax.random.uniform(act_key, (*shape, env.spec.action_size), minval=-1.0)
+            after = loop.over_worlds(env.step)(worlds, state, action)
+            seen = jnp.sum(after.reward) + jnp.sum(after.obs)
+            age = age + 1
+            if not resets:
+                return (after.state, age, key), seen
+            fresh = lambda _: loop.begin(env, tasks, jax.random.split(reset_key, shape))[1].state
+            ended = age >= env.episode_length
+            return (jax.lax.cond(ended, fresh, lambda _: after.state, None), jnp.where(ended, 0, age), key), seen
+
+        carry, seen = jax.lax.scan(step, carry, length=steps)
+        return carry, jnp.sum(seen)
+
+    start = jax.jit(lambda tasks, key: loop.begin(env, tasks, jax.random.split(key, shape))[1].state)
+    program = jax.jit(play, donate_argnums=1)
+    held = [(start(tasks, jax.random.key(0)), jnp.int32(0), jax.random.key(1))]
+
+    def run():
+        held[0], seen = program(tasks, held[0])
+        return seen
+
+    return run
+
+
+def batch_alone(name: str, vary: dict, per_task: int, steps: int) -> Callable[[], Any]:
+    """MuJoCo's own threaded batch, with the same models and substeps, and nothing around it."""
+    from mujoco import batch
+
+    env = mtjax.make(name, vary, engine="c")
+    assert isinstance(env, Domain)
+    models = [env.models[row] for row in env.table.rows["train"] for _ in range(per_task)]
+    worlds = batch.Batch(models[0], len(models))
+    worlds.set_models(models)
+    control, random = worlds.bind("ctrl"), np.random.default_rng(0)
+
+    def run():
+        for _ in range(steps):
+            control[:] = random.uniform(-1, 1, control.shape)
+            worlds.step(nstep=env.num_substeps, stage=mujoco.mjtStage.mjSTAGE_VEL)
+        return ()
+
+    return run
+
+
+def playground(name: str, impl: str, worlds: int, steps: int) -> Callable[[], Any]:
+    """Playground's environment in its own wrapper for training, with its default configuration but for the engine."""
+    from mujoco_playground import registry, wrapper
+
+    env = registry.load(name, config_overrides={"impl": impl})
+    env = wrapper.wrap_for_brax_training(env, episode_length=1000, action_repeat=1)
+
+    def play(carry):
+        def step(carry, _):
+            state, key = carry
+            key, act_key = jax.random.split(key)
+            state = env.step(state, jax.random.uniform(act_key, (worlds, env.action_size), minval=-1.0))
+            return (state, key), jnp.sum(state.reward) + jnp.sum(state.obs)  # type: ignore
+
+        carry, seen = jax.lax.scan(step, carry, length=steps)
+        return carry, jnp.sum(seen)
+
+    program = jax.jit(play, donate_argnums=0)
+    held = [(jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(0), worlds)), jax.random.PRNGKey(1))]
+    held[0] = jax.tree.map(jnp.copy, held[0])  # its state holds some arrays twice, which cannot be donated twice
+
+    def run():
+        held[0], seen = program(held[0])
+        return seen
+
+    return run
 
 
 def training_rate(arguments: argparse.Namespace) -> dict:
     """Time the whole loop as ``mtjax.train`` runs it with the preset of this device."""
-    program = cli.with_preset(arguments.env, arguments.agent)
-    settings = dataclasses.replace(program.training, chunk_steps=arguments.steps, warmup_steps=1)
-    timed = _time(program.family, program.learner, settings, arguments)
-    updates = timed["steps_per_second"] / timed["environments"] * settings.updates_per_step
-    return {"what": f"training {arguments.agent}", "engine": "auto", **timed, "updates_per_second": updates}
-
-
-def _time(env: Env, agent: Agent, settings: loop.Settings, arguments: argparse.Namespace) -> dict:
-    tasks, seeds = env.tasks("train"), jnp.arange(1)
+    program = cli.with_preset("finger-spin-vary-size", arguments.agent)
+    settings, env, agent = program.training, program.family, program.learner
+    tasks = env.tasks()
     before = time.perf_counter()
-    state = jax.block_until_ready(loop.init(env, agent, settings, tasks, seeds))
-    chunk = loop.run_chunk.lower(env, agent, settings, tasks, state).compile()
-    compiled = time.perf_counter() - before
-    state, _ = jax.block_until_ready(chunk(tasks, state))
-    seconds = []
+    state = loop.init(env, agent, settings, tasks, jnp.arange(1))
+    state, _ = jax.block_until_ready(loop.run_chunk(env, agent, settings, tasks, state))
+    first, rates = time.perf_counter() - before, []
+    steps = len(tasks.id) * settings.num_envs * settings.chunk_steps
+    while int(state.iteration) < settings.warmup_steps:
+        state, _ = loop.run_chunk(env, agent, settings, tasks, state)
     for _ in range(arguments.repeats):
         before = time.perf_counter()
-        state, _ = jax.block_until_ready(chunk(tasks, state))
-        seconds.append(time.perf_counter() - before)
-    environments = len(tasks.id) * settings.num_envs
-    rate = lambda s: environments * settings.chunk_steps / s
+        state, _ = jax.block_until_ready(loop.run_chunk(env, agent, settings, tasks, state))
+        rates.append(steps / (time.perf_counter() - before))
     return {
-        "environments": environments,
-        "steps_per_second": rate(statistics.median(seconds)),
-        "slowest": rate(max(seconds)),
-        "fastest": rate(min(seconds)),
-        "compile_seconds": compiled,
+        "domain": "finger-spin-vary-size",
+        "contestant": f"training {arguments.agent}",
+        "worlds": len(tasks.id) * settings.num_envs,
+        "steps_per_second": statistics.median(rates),
+        "slowest": min(rates),
+        "fastest": max(rates),
+        "updates_per_second": statistics.median(rates) / len(tasks.id) / settings.num_envs * settings.updates_per_step,
+        "first_call_seconds": first,
     }
 
 
 def machine() -> dict:
     """Where the figures come from."""
     commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=os.path.dirname(__file__)
+        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=os.path.dirname(__file__) or "."
     )
     return {
         "device": jax.devices()[0].device_kind,
         "cores": os.cpu_count(),
         "python": platform.python_version(),
         "jax": jax.__version__,
+        "mujoco": mujoco.__version__,
         "mtjax": mtjax.__version__,
         "commit": commit.stdout.strip() or None,
     }
 
 
-def table(rows: list[dict]) -> str:
-    lines = [f"{'what':28} {'engine':7} {'envs':>6} {'steps/s':>12} {'range':>25} {'compile':>9}"]
-    for row in rows:
+def table(rows: list[dict], domain: str) -> str:
+    lines = [f"{domain:28} {'worlds':>6} {'steps/s':>12} {'range':>25} {'over Playground':>16} {'first call':>11}"]
+    for row in (row for row in rows if row["domain"] == domain):
         span = f"{row['slowest']:,.0f} to {row['fastest']:,.0f}"
+        ratio = f"{row['over_playground']:.2f}" if row["over_playground"] else "-"
         lines.append(
-            f"{row['what']:28} {row['engine']:7} {row['environments']:6} {row['steps_per_second']:12,.0f} {span:>25} "
-            f"{row['compile_seconds']:7.1f} s"
+            f"  {row['contestant']:26} {row['worlds']:6} {row['steps_per_second']:12,.0f} {span:>25} {ratio:>16} "
+            f"{row['first_call_seconds']:9.1f} s"
         )
     return "\n".join(lines)
 

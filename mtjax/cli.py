@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import importlib.util
 import io
 import itertools
 import json
@@ -23,6 +24,8 @@ from mtjax.run import Plan
 from mtjax.types import InputError
 
 PRESETS = ("auto", "cpu", "gpu")
+_VARY = "--env.vary."
+_FAMILY_FLAGS = {"combine": "env.combine", "split": "split"}  # they decide which values are allowed
 P = TypeVar("P")
 
 
@@ -31,7 +34,7 @@ class Program:
     """Train a multi-task agent: ``python -m mtjax.train --env=NAME --agent=NAME``."""
 
     env: str = "finger-spin-vary-size"
-    """Name of the environment family; --list shows all."""
+    """Name of the environment family; --list shows all. --import=FILE.py makes those known that a file registers."""
     agent: str = "sac-conditioned"
     """Name of the agent; --list shows all."""
     preset: Literal["auto", "cpu", "gpu"] = "auto"
@@ -56,23 +59,26 @@ def parse(argv: Sequence[str]) -> Program:
     Raises:
         InputError: a name, flag or value cannot be used.
     """
+    argv = import_files(argv)
     env_name = _peel(argv, "env", Program.env)
     agent_name = _peel(argv, "agent", Program.agent)
     preset_name = _peel(argv, "preset", Program.preset)
     if preset_name not in PRESETS:
         raise nearest_error("preset", preset_name, PRESETS)
-    default = with_preset(env_name, agent_name, preset_name)
+    vary, argv = _peel_vary(argv)
+    settings = {name: value for name in ("combine", "split") if (value := _peel(argv, _FAMILY_FLAGS[name], ""))}
+    default = with_preset(env_name, agent_name, preset_name, vary=vary, **settings)
     _check_flags(argv, default)
     return parse_with_tyro(Program, argv, default, "python -m mtjax.train")
 
 
-def with_preset(env_name: str, agent_name: str, preset_name: str = "auto") -> Program:
-    """Return the program that a family, an agent and a preset stand for.
+def with_preset(env_name: str, agent_name: str, preset_name: str = "auto", **family_settings: Any) -> Program:
+    """Return the program that a family (with any settings of ``make``), an agent and a preset stand for.
 
     Raises:
-        InputError: a name is unknown.
+        InputError: a name or setting is unknown.
     """
-    family = make(env_name)
+    family = make(env_name, **family_settings)
     if agent_name not in AGENTS:
         raise nearest_error("agent", agent_name, AGENTS)
     preset = load_preset(env_name, _device_preset() if preset_name == "auto" else preset_name)
@@ -119,11 +125,60 @@ def _peel(argv: Sequence[str], name: str, default: str) -> str:
     return value
 
 
+def import_files(argv: Sequence[str]) -> list[str]:
+    """Run the FILE.py of every --import=FILE.py, which may register families; returns the other words.
+
+    Raises:
+        InputError: there is no such file.
+    """
+    for word in argv:
+        if word.startswith("--import="):
+            _import(Path(word.split("=", 1)[1]))
+    return [word for word in argv if not word.startswith("--import=")]
+
+
+def _import(path: Path) -> None:
+    if not path.is_file() or path.suffix != ".py":
+        raise InputError(f"--import needs a Python file, and {str(path)!r} is none")
+    known = (getattr(module, "__file__", None) for module in list(sys.modules.values()))
+    if any(file and Path(file).resolve() == path.resolve() for file in known):
+        return
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None and spec.loader is not None
+    sys.modules[path.stem] = module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+
+
+def import_flag(family: Family) -> list[str]:
+    """The flag that makes a family of the user's own known to another program; none for those of this package."""
+    module = type(family).__module__
+    file = getattr(sys.modules.get(module), "__file__", None)
+    return [] if module.split(".")[0] == "mtjax" or file is None else [f"--import={Path(file).resolve()}"]
+
+
+def _peel_vary(argv: Sequence[str]) -> tuple[dict[str, str], list[str]]:
+    """Take --env.vary.NAME=VALUES out of a command line: which names there are is the family's to say."""
+    given, rest, words = {}, [], iter(argv)
+    for word in words:
+        flag, equals, value = word.partition("=")
+        if not flag.startswith(_VARY):
+            rest.append(word)
+            continue
+        if not equals:
+            value = next(words, "")
+        if not value:
+            raise InputError(f"{flag} needs values; give lo:hi:n, lo:hi or a list a,b,c")
+        given[flag.removeprefix(_VARY)] = value
+    return given, rest
+
+
 def flags(program: Any, prefix: str = "--") -> list[str]:
     """Every flag of a program."""
     names = []
     for field in dataclasses.fields(program):
         value, name = getattr(program, field.name), field.name.replace("_", "-")
+        if name == "vary":  # a flag for each parameter, taken out before
+            continue
         group = {"plan": "--", "training": "--", "family": "--env.", "learner": "--agent."}.get(field.name)
         if group is not None:
             names += flags(value, group)
@@ -204,17 +259,17 @@ def catalogue() -> str:
     """List families and agents with the first sentence of their documentation."""
     first = lambda cls: (cls.__doc__ or "").split(".")[0].split(" (")[0].replace("\n", " ").split("  ")[0]
     lines = ["environments:"]
-    for name, (family, settings) in ENVS.items():
-        tasks = settings.get("num_tasks", 1)
-        lines.append(f"  {name:30} {tasks:3} task{'s' if tasks > 1 else ' '}  {first(family)}")
+    for name, (family, _) in ENVS.items():
+        tasks = make(name).train_count
+        lines.append(f"  {name:36} {tasks:3} task{'s' if tasks > 1 else ' '}  {first(family)}")
     lines.append("agents:")
-    return "\n".join(lines + [f"  {name:30} {first(cls)}" for name, cls in AGENTS.items()])
+    return "\n".join(lines + [f"  {name:36} {first(cls)}" for name, cls in AGENTS.items()])
 
 
 def main(run: Any) -> None:
     """Run a program's entry point; what the user got wrong becomes a line and exit code 2."""
     try:
-        run(sys.argv[1:])
+        run(import_files(sys.argv[1:]))
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)

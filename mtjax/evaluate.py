@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mtjax import cli
+from mtjax.envs import Domain
 from mtjax.evaluation import Evaluations, evaluate, record
 from mtjax.log import append_rows, number
 from mtjax.names import nearest_error
@@ -18,6 +19,7 @@ from mtjax.stats import seed_interval
 from mtjax.types import SPLITS, InputError
 
 _FIRST_NUMBER = 1_000_000  # far from the numbers of a run's own evaluations, so that the episodes are new
+_FILM_FPS, _FILM_SECONDS = 25, 10
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,6 +41,8 @@ def main(argv: Sequence[str]) -> None:
     request = _parse(argv)
     enable_compile_cache()
     policy = load(request.run)
+    if request.video and not isinstance(policy.env, Domain):
+        raise InputError("only MuJoCo families can be filmed; leave out --video")
     episodes = score(policy, request.episodes, request.seed)
     directory = _new_folder(Path(request.run))
     print(task_table(policy, episodes))
@@ -67,7 +71,7 @@ def score(policy: Policy, episodes: int, seed: int = 0) -> dict[str, np.ndarray]
     """Return the returns (S, T, episodes) of each split, in episodes that no training run has seen."""
     env, program = policy.env, jnp.int32(_FIRST_NUMBER + seed)
     returns = np.asarray(evaluate(env, policy.agent, episodes, policy.states, env.tasks("all"), policy.seeds, program))
-    return {split: returns[:, np.asarray(env.tasks(split).id)] for split in SPLITS}
+    return {split: returns[:, env.table.rows[split]] for split in SPLITS}
 
 
 def _new_folder(run: Path) -> Path:
@@ -76,12 +80,6 @@ def _new_folder(run: Path) -> Path:
             (run / f"evaluation-{attempt}").mkdir()
             return run / f"evaluation-{attempt}"
     raise InputError(f"{str(run)!r} is full of evaluations; move some away")
-
-
-def _value_of(policy: Policy, split: str) -> tuple[str, np.ndarray]:
-    """The varying parameter's name and its values (T,) in a split."""
-    (name, values), *_ = policy.env.tasks(split).params.items()
-    return name, np.asarray(values)
 
 
 def _interval(scores: np.ndarray) -> str:
@@ -102,11 +100,11 @@ def split_table(evaluations: Evaluations) -> str:
 
 def task_table(policy: Policy, episodes: dict[str, np.ndarray]) -> str:
     """Lay out returns (S, T, episodes) by split and task."""
-    lines = [f"{'split':15} {_value_of(policy, 'train')[0]:>10} {'return':>7}   episodes from, to"]
+    lines = [f"{'split':15} {policy.env.task_axis[0]:>10} {'return':>7}   episodes from, to"]
     for split, returns in episodes.items():
         if not returns.size:
             continue
-        for value, task in zip(_value_of(policy, split)[1], np.moveaxis(returns, 1, 0), strict=True):
+        for value, task in zip(policy.env.task_values(split), np.moveaxis(returns, 1, 0), strict=True):
             mean = _interval(task.mean(axis=-1, keepdims=True))
             lines.append(f"{split:15} {value:10.4g} {mean:>7}   {task.min():.0f}, {task.max():.0f}")
         lines.append(f"{split:15} {'all':>10} {_interval(returns.mean(axis=-1)):>7}")
@@ -116,17 +114,16 @@ def task_table(policy: Policy, episodes: dict[str, np.ndarray]) -> str:
 def _write(policy: Policy, episodes: dict[str, np.ndarray], directory: Path) -> None:
     from mtjax import plot
 
-    name, _ = _value_of(policy, "train")
+    name, unit = policy.env.task_axis
     rows = [
         {"split": split, name: number(value), "seed": int(seed), "episode": e, "return": number(x)}
         for split, returns in episodes.items()
         for seed, of_seed in zip(policy.seeds, returns, strict=True)
-        for value, of_task in zip(_value_of(policy, split)[1], of_seed, strict=True)
+        for value, of_task in zip(policy.env.task_values(split), of_seed, strict=True)
         for e, x in enumerate(of_task)
     ]
     append_rows(directory / "returns.csv", rows)
-    values = {split: _value_of(policy, split)[1] for split in episodes}
-    unit = policy.env.parameters[name].unit
+    values = {split: policy.env.task_values(split) for split in episodes}
     plot.return_by_parameter(directory / f"return_by_{name.replace('-', '_')}.png", name, unit, values, episodes)
 
 
@@ -135,14 +132,17 @@ def _film(policy: Policy, directory: Path, seed: int) -> None:
     from mtjax import render
 
     env = policy.env
+    assert isinstance(env, Domain)
     render.choose_backend()
-    returns, states = record(env, policy.agent, policy.state, env.tasks("all"), jnp.int32(seed))
+    returns, played, states = record(env, policy.agent, policy.state, env.tasks("all"), jnp.int32(seed))
+    stride = max(round(1 / (_FILM_FPS * env.seconds_per_step)), 1)
+    shown, fps = slice(0, round(_FILM_SECONDS / env.seconds_per_step), stride), 1 / (stride * env.seconds_per_step)
     for split in SPLITS:
-        name, values = _value_of(policy, split)
-        for row, value in zip(np.asarray(env.tasks(split).id), values, strict=True):
-            frames = render.film(env, int(row), np.asarray(states.qpos[row, :500:2]))
-            path = render.write_video(directory / f"{split}-{name}-{value:.4g}", frames, fps=25)
-            print(f"filmed {path.name}: return {float(returns[row]):.0f}", flush=True)
+        for i in env.table.rows[split]:
+            row = int(played[i])  # where ranges are continuous, an episode's own
+            frames = render.film(env, row, np.asarray(states.qpos[i, shown]))
+            path = render.write_video(directory / f"{split}-{env.describe(row)}".replace("=", "-"), frames, fps)
+            print(f"filmed {path.name}: return {float(returns[i]):.0f}", flush=True)
 
 
 def run() -> None:

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.loop import over_learners, over_worlds, spread
+from mtjax.loop import actions, begin, over_worlds
+from mtjax.tasks import episode_task
 from mtjax.types import Agent, Array, Env, Task
 
 
@@ -33,14 +34,12 @@ def evaluate(env: Env, agent: Agent, episodes: int, state: Any, tasks: Task, see
     shape = (len(seeds), len(tasks.id), episodes)
     fresh = lambda seed: jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), 0x7E57), number)
     keys = jax.vmap(lambda seed: jax.random.split(fresh(seed), shape[1:]))(seeds)
-    worlds = spread(tasks, shape)
-    start = over_worlds(env.reset)(worlds, keys)
-    act = over_learners(lambda learner, task, obs: agent.act(learner, obs, task, None))
+    worlds, start = begin(env, tasks, keys)
 
     def step(carry, _):
         env_state, obs, total, alive = carry
-        after = over_worlds(env.step)(worlds, env_state, act(state, tasks, obs))
-        total = total + alive * after.reward
+        after = over_worlds(env.step)(worlds, env_state, actions(agent, state, tasks, worlds, obs, None))
+        total = total + jnp.where(alive, after.reward, 0.0)  # what follows an episode's end may not be finite
         return (after.state, after.obs, total, alive & ~after.terminated), None
 
     carry = (start.state, start.obs, jnp.zeros(shape), jnp.ones(shape, bool))
@@ -48,15 +47,18 @@ def evaluate(env: Env, agent: Agent, episodes: int, state: Any, tasks: Task, see
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def record(env: Env, agent: Agent, state: Any, tasks: Task, seed: Array) -> tuple[Array, Any]:
+def record(env: Env, agent: Agent, state: Any, tasks: Task, seed: Array) -> tuple[Array, Array, Any]:
     """Play one episode of each task under the mean action; ``state`` has no leading axis.
 
     Returns:
-        returns (T,), and the environments' states at each step, leaves (T, H, ...).
+        returns (T,), the rows (T,) of the tasks that were played, and the environments' states at each step, leaves
+        (T, H, ...).
     """
     keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), 0xF11), len(tasks.id))
 
-    def one_task(task: Task, key: Array) -> tuple[Array, Any]:
+    def one_task(task: Task, key: Array) -> tuple[Array, Array, Any]:
+        task_key, key = jax.random.split(key)
+        task = episode_task(task, task_key)
         start = env.reset(task, key)
 
         def step(carry, _):
@@ -64,6 +66,6 @@ def record(env: Env, agent: Agent, state: Any, tasks: Task, seed: Array) -> tupl
             return (after.state, after.obs), (after.reward, after.state)
 
         rewards, states = jax.lax.scan(step, (start.state, start.obs), length=env.episode_length)[1]
-        return jnp.sum(rewards), states
+        return jnp.sum(rewards), task.row, states
 
     return jax.vmap(one_task)(tasks, keys)

@@ -6,6 +6,7 @@ compiles faster than nested maps and keeps decisions that all seeds share as bra
 """
 
 import dataclasses
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -15,7 +16,8 @@ import jax.numpy as jnp
 
 from mtjax import replay as rings
 from mtjax.replay import Replay
-from mtjax.types import Agent, Array, Env, InputError, Key, Metrics, Spec, Task, Transition
+from mtjax.tasks import episode_task
+from mtjax.types import Agent, Array, Env, InputError, Key, Metrics, Spec, Step, Task, Transition
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,6 +59,7 @@ class TrainState(NamedTuple):
 
     agent: Any  # leaves (S, ...)
     env: Any  # leaves (S, T, E, ...), the environments' states
+    task: Task | None  # leaves (S, T, E, ...), the episodes' own tasks where episodes draw theirs
     obs: Array  # (S, T, E, O)
     age: Array  # (S, T, E) int32, steps since the last reset
     total: Array  # (S, T, E) return of the episode so far
@@ -75,11 +78,12 @@ def init(env: Env, agent: Agent, settings: Settings, tasks: Task, seeds: Array) 
     num_tasks = len(tasks.id)
     shape = (len(seeds), num_tasks, settings.num_envs)
     key, agent_key, reset_key, warmup_key = _split(jax.vmap(jax.random.key)(seeds), 4)
-    start = over_worlds(env.reset)(spread(tasks, shape), _world_keys(reset_key, shape))
-    blank = lambda _: rings.init(_blank_transition(env.spec), num_tasks, settings.capacity)
+    worlds, start = begin(env, tasks, _world_keys(reset_key, shape))
+    blank = lambda _: rings.init(_blank_transition(env.spec, tasks), num_tasks, settings.capacity)
     return TrainState(
         agent=jax.vmap(lambda key: agent.init(env.spec, tasks, key))(agent_key),
         env=start.state,
+        task=None if tasks.draws is None else worlds,
         obs=start.obs,
         age=jnp.zeros(shape, jnp.int32),
         total=jnp.zeros(shape),
@@ -90,9 +94,10 @@ def init(env: Env, agent: Agent, settings: Settings, tasks: Task, seeds: Array) 
     )
 
 
-def _blank_transition(spec: Spec) -> Transition:
+def _blank_transition(spec: Spec, tasks: Task) -> Transition:
     obs, scalar = jnp.zeros(spec.obs_size), jnp.float32(0)
-    return Transition(obs, jnp.zeros(spec.action_size), scalar, scalar, obs)
+    context = None if tasks.draws is None else jnp.zeros(spec.context_size)
+    return Transition(obs, jnp.zeros(spec.action_size), scalar, scalar, obs, context)
 
 
 def _split(keys: Key, count: int) -> tuple[Key, ...]:
@@ -107,7 +112,29 @@ def _world_keys(keys: Key, shape: tuple[int, ...]) -> Key:
 
 def spread(tasks: Task, shape: tuple[int, ...]) -> Task:
     """Repeat tasks (T, ...) for all worlds of shape (S, T, E)."""
-    return jax.tree.map(lambda x: jnp.broadcast_to(x[None, :, None], shape + x.shape[1:]), tasks)
+    single = tasks._replace(draws=None)
+    return jax.tree.map(lambda x: jnp.broadcast_to(x[None, :, None], shape + x.shape[1:]), single)
+
+
+def begin(env: Env, tasks: Task, keys: Key) -> tuple[Task, Step]:
+    """Begin an episode in every world: its task and its first step, leaves (S, T, E, ...), from keys (S, T, E)."""
+    if tasks.draws is None:
+        worlds = spread(tasks, keys.shape)
+    else:
+        task_keys, keys = jnp.moveaxis(jax.vmap(jax.vmap(jax.vmap(jax.random.split)))(keys), -1, 0)
+        of_task = jax.vmap(episode_task, (None, 0))
+        worlds = jax.vmap(jax.vmap(of_task), (None, 0))(tasks, task_keys)
+    return worlds, over_worlds(env.reset)(worlds, keys)
+
+
+def actions(agent: Agent, state: Any, tasks: Task, worlds: Task, obs: Array, keys: Key | None) -> Array:
+    """Actions (S, T, E, A) of agents for observations (S, T, E, O); no keys: the mean actions."""
+    noise = () if keys is None else (keys,)
+    if tasks.draws is None:  # all worlds of a task see the same of it
+        act = lambda learner, task, obs, *key: agent.act(learner, obs, task, *(key or (None,)))
+        return over_learners(act)(state, tasks, obs, *noise)
+    act = lambda learner, _, task, obs, *key: agent.act(learner, obs, task, *(key or (None,)))
+    return over_learners(act)(state, tasks.id, worlds, obs, *noise)
 
 
 def over_seeds(function: Callable, *axes: Any) -> Callable:
@@ -134,7 +161,7 @@ def over_worlds(function: Callable) -> Callable:
 
     def mapped(*arguments):
         shape = jax.tree.leaves(arguments)[0].shape[:3]
-        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[3:]), arguments)
+        flat = jax.tree.map(lambda x: x.reshape(math.prod(shape), *x.shape[3:]), arguments)
         return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), jax.vmap(function)(*flat))
 
     return mapped
@@ -160,12 +187,11 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
         the new state, and metrics: "return" and "episodes" (S, T) of episodes that ended; the agent's own, as means
         (S, T) or (S,); "bad_step" (S, T), the first step whose numbers were not finite, or -1.
     """
-    worlds = spread(tasks, state.age.shape)
 
     def iterate(state: TrainState, _) -> tuple[TrainState, Metrics]:
         key, act_key, reset_key, learn_key = _split(state.key, 4)
         warming = state.iteration < settings.warmup_steps
-        state, seen = _collect(env, agent, settings, tasks, worlds, state, warming, act_key, reset_key)
+        state, seen = _collect(env, agent, settings, tasks, state, warming, act_key, reset_key)
         learned, losses = _learn(agent, settings, tasks, state, warming, learn_key)
         state = state._replace(agent=learned, iteration=state.iteration + 1, key=key)
         return state, seen | {"losses": losses, "learning": 1.0 - warming}
@@ -174,28 +200,32 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
     return state, _summarise(history)
 
 
-def _collect(env, agent, settings, tasks, worlds, state: TrainState, warming, key: Key, reset_key: Key):
+def _collect(env, agent, settings, tasks, state: TrainState, warming, key: Key, reset_key: Key):
     """Step every environment once, store what happened, and begin new episodes where old ones ended."""
     shape = state.age.shape
-    act = lambda learner, task, obs, key: agent.act(learner, obs, task, key)
-    chosen = over_learners(act)(state.agent, tasks, state.obs, _world_keys(key, shape))
+    worlds = spread(tasks, shape) if state.task is None else state.task
+    chosen = actions(agent, state.agent, tasks, worlds, state.obs, _world_keys(key, shape))
     action = jnp.where(warming, _held_actions(settings, state, chosen.shape[1:]), chosen)
     step = over_worlds(env.step)(worlds, state.env, action)
-    transition = Transition(state.obs, action, step.reward, 1.0 - step.terminated, step.obs)
+    context = None if state.task is None else state.task.context
+    transition = Transition(state.obs, action, step.reward, 1.0 - step.terminated, step.obs, context)
 
     age, total = state.age + 1, state.total + step.reward
     ended = step.terminated | (age >= env.episode_length)
 
     def restart(_):
-        fresh = over_worlds(env.reset)(worlds, _world_keys(reset_key, shape))
+        task, fresh = begin(env, tasks, _world_keys(reset_key, shape))
+        new = (fresh.state, fresh.obs, None if state.task is None else task)
         choose = lambda new, old: jnp.where(ended.reshape(shape + (1,) * (new.ndim - 3)), new, old)
-        return jax.tree.map(choose, (fresh.state, fresh.obs), (step.state, step.obs))
+        return jax.tree.map(choose, new, going_on)
 
-    env_state, obs = jax.lax.cond(jnp.any(ended), restart, lambda _: (step.state, step.obs), None)
+    going_on = (step.state, step.obs, state.task)
+    env_state, obs, task = jax.lax.cond(jnp.any(ended), restart, lambda _: going_on, None)
     finite = jnp.all(jnp.isfinite(step.obs), axis=(2, 3)) & jnp.all(jnp.isfinite(step.reward), axis=2)
     seen = {"finished": jnp.sum(ended, axis=2), "total": jnp.sum(ended * total, axis=2), "finite": finite}
     state = state._replace(
         env=env_state,
+        task=task,
         obs=obs,
         age=jnp.where(ended, 0, age),
         total=jnp.where(ended, 0.0, total),

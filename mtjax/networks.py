@@ -48,7 +48,7 @@ class Trunk(nn.Module):
 
 
 def join(*inputs: Array, task: Array) -> Array:
-    """Concatenate per-sample inputs (..., x) and one vector of the task (Z,), repeated for every sample."""
+    """Concatenate per-sample inputs (..., x) and what is known of the task: (..., Z), or (Z,) for every sample."""
     task = jnp.broadcast_to(task, (*inputs[0].shape[:-1], task.shape[-1]))
     return jnp.concatenate([*inputs, task], axis=-1)
 

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from PIL import Image
 
-from mtjax.envs.family import Family
+from mtjax.envs.domain import Domain
 from mtjax.types import InputError
 
 _ELEVATION = -math.degrees(math.atan(0.5))  # dm_control's cam0 of the finger: xyaxes="1 0 0 0 1 2"
@@ -34,7 +34,7 @@ def choose_backend() -> str:
     return os.environ.get("MUJOCO_GL", "")
 
 
-def film(env: Family, task_row: int, qpos: np.ndarray, width: int = 320, height: int = 240) -> np.ndarray:
+def film(env: Domain, task_row: int, qpos: np.ndarray, width: int = 320, height: int = 240) -> np.ndarray:
     """Draw the task in row ``task_row`` of ``env.table`` in each of the positions (H, nq).
 
     The camera looks along +y and down, as cam0 of dm_control's finger does. It stands in one place for every task of
@@ -46,10 +46,9 @@ def film(env: Family, task_row: int, qpos: np.ndarray, width: int = 320, height:
     Raises:
         InputError: there is no such row, or no OpenGL backend works; then it names what to install.
     """
-    values = np.asarray(env.table.tasks.params[env.vary])
-    if not 0 <= task_row < len(values):
-        raise InputError(f"there is no task {task_row}; this family has tasks 0 to {len(values) - 1}")
-    model = _lit_model(env, float(values[task_row]), width, height)
+    if not 0 <= task_row < env.count:
+        raise InputError(f"there is no task {task_row}; this family has tasks 0 to {env.count - 1}")
+    model = _lit_model(env, task_row, width, height)
     data, camera = mujoco.MjData(model), _camera(env)
     frames = np.empty((len(qpos), height, width, 3), np.uint8)
     with _open_renderer(model, width, height) as renderer:
@@ -82,8 +81,8 @@ def write_video(path_stem: str | Path, frames: np.ndarray, fps: float) -> Path:
     return path
 
 
-def _lit_model(env: Family, value: float, width: int, height: int) -> mujoco.MjModel:
-    spec = env.compile_spec(value)
+def _lit_model(env: Domain, task_row: int, width: int, height: int) -> mujoco.MjModel:
+    spec = env.compile_spec({name: values[task_row] for name, values in env.values.items()})
     spec.worldbody.add_light(pos=[0, -1, 3], dir=[0, 0.3, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
     spec.add_texture(
         name="sky",
@@ -99,8 +98,8 @@ def _lit_model(env: Family, value: float, width: int, height: int) -> mujoco.MjM
     return spec.compile()
 
 
-def _camera(env: Family) -> mujoco.MjvCamera:
-    largest = max(env.table.models, key=lambda model: model.stat.extent)
+def _camera(env: Domain) -> mujoco.MjvCamera:
+    largest = max(env.models, key=lambda model: model.stat.extent)
     # The model's own centre depends on how its limbs hang at rest; what they hang from stays put.
     roots = np.flatnonzero(largest.body_parentid == 0)[1:]
     camera = mujoco.MjvCamera()

@@ -8,6 +8,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -130,7 +131,7 @@ class _Run:
     def seeds(self) -> jax.Array:
         return self.plan.seed + jnp.arange(self.plan.seeds)
 
-    @property
+    @cached_property
     def steps_per_iteration(self) -> int:
         """Environment steps that one step of every environment makes, summed over tasks."""
         return len(self.env.tasks("train").id) * self.settings.num_envs
@@ -244,11 +245,10 @@ class _Run:
             return Evaluations(past.steps[kept], {s: x[:, kept] for s, x in past.returns.items()}, past.values)
         tables = {split: self.env.tasks(split) for split in SPLITS}
         empty = lambda table: np.zeros((self.plan.seeds, 0, len(table.id), self.plan.eval_episodes), np.float32)
-        value = lambda table: np.asarray(next(iter(table.params.values()), table.id))
         return Evaluations(
             steps=np.zeros(0, np.int64),
             returns={split: empty(table) for split, table in tables.items()},
-            values={split: value(table) for split, table in tables.items()},
+            values={split: self.env.task_values(split) for split in SPLITS},
         )
 
 

@@ -78,9 +78,8 @@ def _record_steps(file: Path, steps: int) -> None:
 def _check(program: Program) -> None:
     """Meet whatever the family's and the agent's constructors could not check before a run's folder is made."""
     from mtjax.agents.sac import load_vectors
-    from mtjax.envs.physics import choose_engine
 
-    choose_engine(program.family.engine)
+    _ = program.family.engine_name, program.family.table
     if program.learner.vectors:
         load_vectors(program.learner.vectors, len(program.family.tasks("train").id))
 
@@ -103,8 +102,6 @@ def _circumstances(program: Program) -> dict:
     """What else decides a run's numbers: versions, device, engine; and the command that repeats it."""
     import jax
 
-    from mtjax.envs.physics import choose_engine
-
     versions = {"mtjax": __version__}
     for package in _PACKAGES:
         try:
@@ -112,7 +109,7 @@ def _circumstances(program: Program) -> dict:
         except PackageNotFoundError:
             versions[package] = "not installed"
     return {
-        "engine": choose_engine(program.family.engine),
+        "engine": program.family.engine_name,
         "device": str(jax.devices()[0].device_kind),
         "python": platform.python_version(),
         "versions": versions,
@@ -122,7 +119,7 @@ def _circumstances(program: Program) -> dict:
 
 def repeat(program: Program) -> list[str]:
     """Every flag of this program, so that the command means the same whatever the presets become."""
-    words = [f"--env={program.env}", f"--agent={program.agent}"]
+    words = [f"--env={program.env}", f"--agent={program.agent}", *cli.import_flag(program.family)]
     for part, prefix in (("plan", "--"), ("training", "--"), ("family", "--env."), ("learner", "--agent.")):
         settings = dataclasses.asdict(getattr(program, part)).items()
         words += itertools.chain(*(_flag(prefix, name.replace("_", "-"), value) for name, value in settings))
@@ -130,6 +127,8 @@ def repeat(program: Program) -> list[str]:
 
 
 def _flag(prefix: str, name: str, value: object) -> list[str]:
+    if name == "vary":
+        return [f"{prefix}vary.{parameter}={values}" for parameter, values in value]  # type: ignore
     prefix = "--" if name in ("split", "engine") else prefix
     match value:
         case bool():
@@ -140,13 +139,17 @@ def _flag(prefix: str, name: str, value: object) -> list[str]:
 
 
 def _summary(program: Program) -> str:
-    from mtjax.envs.physics import choose_engine
-
     family, plan = program.family, program.plan
-    values, engine = family.listed_values, choose_engine(family.engine)
+    found = family.variation
+    ends = ", ".join(
+        f"{name} {low:g} to {high:g}"
+        for name, low, high in zip(found.names, found.low, found.high, strict=True)
+        if low < high
+    )
+    count = len(family.tasks("train").id)
     return (
-        f"{len(family.tasks('train').id)} training tasks, {family.vary} {values[0]:g} to {values[-1]:g}, "
-        f"split {family.split}, engine {engine}, seeds {plan.seed} to {plan.seed + plan.seeds - 1}"
+        f"{count} training task{'s' * (count > 1)}{', ' * bool(ends)}{ends}, "
+        f"split {family.split}, engine {family.engine_name}, seeds {plan.seed} to {plan.seed + plan.seeds - 1}"
     )
 
 
@@ -155,9 +158,8 @@ def _conclude(program: Program, result: Result, directory: Path) -> None:
     from mtjax.evaluate import split_table
 
     if not result.finished:
-        print(
-            f"stopped; the state is saved. Go on with:\n  python -m mtjax.train --resume={shlex.quote(str(directory))}"
-        )
+        words = [f"--resume={directory}", *cli.import_flag(program.family)]
+        print(f"stopped; the state is saved. Go on with:\n  python -m mtjax.train {shlex.join(words)}")
         return
     if len(result.evaluations.steps):
         title = f"{program.agent} on {program.env}"

@@ -18,11 +18,13 @@ SPLITS = ("train", "interpolation", "extrapolation")
 class Task(NamedTuple):
     """One task as data; a table of tasks has a leading ``T`` on every leaf."""
 
-    id: Array  # () int32, row of the family's table
+    id: Array  # () int32, its number among the family's tasks: who it is to an agent
+    row: Array  # () int32, row of the family's table: what it is to the physics
     context: Array  # (C,) parameters scaled so that the training range is [-1, 1]
     params: dict[str, Array]  # raw values in SI units, for logs and rewards
     model: dict[str, Array]  # the model leaves that differ between tasks, nothing else
     goal: dict[str, Array]  # reward and reset parameters
+    draws: Any = None  # a Task with leaves (P, ...) of which each episode takes one; None: every episode is this task
 
 
 class Step(NamedTuple):
@@ -42,6 +44,7 @@ class Transition(NamedTuple):
     reward: Array  # ()
     discount: Array  # () = 1 - terminated
     next_obs: Array  # (O,) from before any reset
+    context: Array | None = None  # (C,) of the episode's own task where episodes draw theirs
 
 
 class Spec(NamedTuple):
@@ -60,6 +63,7 @@ class Env(Protocol):
     @property
     def episode_length(self) -> int: ...
     def tasks(self, split: str = "train") -> Task: ...
+    def task_values(self, split: str) -> Any: ...
     def reset(self, task: Task, key: Key) -> Step: ...
     def step(self, task: Task, state: Any, action: Array) -> Step: ...
 

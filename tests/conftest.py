@@ -90,7 +90,7 @@ SHORT_RUN = (
 def short_family():
     """Makes ``finger-short`` a name like any other, and keeps compiled programs out of the user's cache."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(ENVS, "finger-short", (ShortFinger, {"high": 1.2, "num_tasks": 2, "engine": "c"}))
+        patch.setitem(ENVS, "finger-short", (ShortFinger, {"vary": {"size": "1:1.2:2"}, "engine": "c"}))
         patch.setenv("MTJAX_CACHE", "0")
         yield
 

@@ -89,7 +89,8 @@ def tasks_of(kind: str, scales=(1.0, -0.5)) -> Task:
         "kind": same(list(RULES).index(kind), jnp.int32),
         "either_sign": same(kind in EITHER_SIGN, bool),
     }
-    return Task(jnp.arange(len(scales), dtype=jnp.int32), scales[:, None], {"scale": scales}, {}, goal)
+    row = jnp.arange(len(scales), dtype=jnp.int32)
+    return Task(row, row, scales[:, None], {"scale": scales}, {}, goal)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,6 +106,9 @@ class Probe:
 
     def tasks(self, split: str = "train") -> Task:
         return tasks_of(self.kind)
+
+    def task_values(self, split: str) -> np.ndarray:
+        return np.asarray(self.tasks(split).params["scale"])
 
     def reset(self, task: Task, key: Key) -> Step:
         state = World(self.start(task, key), jnp.int32(0))

@@ -35,7 +35,7 @@ def multi_head_run(short_family, tmp_path_factory):
     """Ten values split as in the HiP-BMDP paper, with a head for each of the four that train."""
     runs = tmp_path_factory.mktemp("runs")
     settings = (
-        "--env=finger-short --agent=multi-head --split=hip-bmdp --env.low=0.95 --env.high=1.4 --env.num-tasks=10 "
+        "--env=finger-short --agent=multi-head --split=hip-bmdp --env.vary.size=0.95:1.4:10 "
         "--steps=40 --eval-episodes=1 --num-envs=1 --batch-size=2 --replay-size=50 --warmup-steps=1 --agent.hidden 4"
     )
     mtjax.train.main([*settings.split(), f"--runs={runs}"])

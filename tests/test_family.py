@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from mtjax import envs
-from mtjax.envs.family import SPLITS, stack_differing
+from mtjax.envs.domain import stack_differing
 from mtjax.envs.physics import mjx_module
-from mtjax.types import InputError
+from mtjax.tasks import episode_task
+from mtjax.types import SPLITS, InputError
 
 SIZES = np.linspace(0.95, 1.4, 10)
 UNREAD = ".stat"  # statistics for viewers, which no step reads
@@ -18,7 +19,7 @@ UNREAD = ".stat"  # statistics for viewers, which no step reads
 
 @pytest.fixture(scope="module")
 def sizes():
-    return envs.make("finger-spin-vary-size", low=0.95, high=1.4)
+    return envs.make("finger-spin", {"size": "0.95:1.4:10"})
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +28,7 @@ def touch_sizes():
 
 
 def values_of(env, split):
-    return np.asarray(env.tasks(split).params[env.vary])
+    return np.asarray(env.tasks(split).params[env.varied[0]])
 
 
 def test_registered_sizes_are_those_that_agents_master():
@@ -56,14 +57,14 @@ def test_dense_steps_that_leave_the_range_are_dropped(touch_sizes):
 
 def test_dense_steps_take_each_ends_own_spacing():
     """Uneven values extrapolate by the gap at that end."""
-    env = envs.make("finger-spin", values=(0.9, 1.0, 1.3))
+    env = envs.make("finger-spin", {"size": [0.9, 1.0, 1.3]})
     np.testing.assert_allclose(values_of(env, "interpolation"), [0.95, 1.15], rtol=1e-6)
     np.testing.assert_allclose(values_of(env, "extrapolation"), [0.7, 0.8, 1.6, 1.9], rtol=1e-6)
 
 
 def test_hip_bmdp_split_follows_mtrl():
     """Of ten values: train 3, 4, 7, 8; interpolation 5, 6; extrapolation 2, 9, as MTRL's configuration counts them."""
-    env = envs.make("finger-spin-vary-size", low=0.95, high=1.4, split="hip-bmdp")
+    env = envs.make("finger-spin", {"size": "0.95:1.4:10"}, split="hip-bmdp")
     splits = (("train", [3, 4, 7, 8], range(4)), ("interpolation", [5, 6], (4, 5)), ("extrapolation", [2, 9], (6, 7)))
     for split, indices, ids in splits:
         np.testing.assert_allclose(values_of(env, split), SIZES[indices], rtol=1e-6)
@@ -89,7 +90,7 @@ def test_context_is_scaled_by_the_training_range(sizes):
 def test_rows_of_the_table_name_their_own_models(sizes):
     """Every row's values, stacked leaves and compiled model belong to one task, in every split."""
     table = sizes.table
-    for row, model in enumerate(table.models):
+    for row, model in enumerate(sizes.models):
         size = float(table.tasks.params["size"][row])
         np.testing.assert_allclose(model.body("distal").pos[2], -0.18 * size, rtol=1e-6)
         np.testing.assert_allclose(table.tasks.model["geom_size"][row], model.geom_size, rtol=1e-6)
@@ -97,13 +98,13 @@ def test_rows_of_the_table_name_their_own_models(sizes):
 
 def test_size_scales_every_length_of_the_finger_and_nothing_else(sizes):
     """Radii, lengths, mounting points and the distal body go with size; the spinner, its tip and the base stay."""
-    nominal = sizes.table.models[1]
+    nominal = sizes.models[1]
     finger = [nominal.geom(n).id for n in ("proximal_decoration", "proximal", "distal", "fingertip")]
     links = [nominal.body(n).id for n in ("proximal", "distal")]
     touch = [nominal.site(n).id for n in ("touchtop", "touchbottom")]
     scaled = {"geom_size": finger, "geom_pos": finger, "site_pos": touch, "body_pos": links[1:], "body_ipos": links}
     fixed = ("site_size", "dof_damping", "dof_frictionloss", "dof_armature", "actuator_gear", "jnt_range", "jnt_pos")
-    for size, model in zip(SIZES, sizes.table.models, strict=False):
+    for size, model in zip(SIZES, sizes.models, strict=False):
         for field, ids in scaled.items():
             expected = getattr(nominal, field).copy()
             expected[ids] *= size
@@ -114,14 +115,14 @@ def test_size_scales_every_length_of_the_finger_and_nothing_else(sizes):
 
 def test_mass_goes_with_the_cube_of_size_and_inertia_with_the_fifth_power(sizes):
     """Density is kept, so that both follow from geometry, for both links; the spinner keeps its own."""
-    nominal = sizes.table.models[1]
-    for size, model in zip(SIZES, sizes.table.models, strict=False):
+    nominal = sizes.models[1]
+    for size, model in zip(SIZES, sizes.models, strict=False):
         for body in ("proximal", "distal"):
             np.testing.assert_allclose(model.body(body).mass, nominal.body(body).mass * size**3, rtol=1e-9)
             np.testing.assert_allclose(model.body(body).inertia, nominal.body(body).inertia * size**5, rtol=1e-9)
         np.testing.assert_array_equal(model.body("spinner").mass, nominal.body("spinner").mass)
         np.testing.assert_array_equal(model.body("spinner").inertia, nominal.body("spinner").inertia)
-    ratio = sizes.table.models[9].body_mass[1] / nominal.body_mass[1]
+    ratio = sizes.models[9].body_mass[1] / nominal.body_mass[1]
     assert ratio == pytest.approx(1.4**3)
 
 
@@ -134,9 +135,9 @@ def leaves_by_name(model):
 @pytest.mark.parametrize("name", ["finger-spin-vary-size", "finger-spin-vary-touch-size"])
 def test_stacked_leaves_turn_the_first_model_into_every_other(name):
     """MJX of the first model with a task's leaves put in equals MJX of that task's own model, leaf for leaf."""
-    table, mjx = envs.make(name).table, mjx_module()
-    base = mjx.put_model(table.models[0], impl="jax")
-    for row, model in enumerate(table.models):
+    env, mjx = envs.make(name), mjx_module()
+    table, base = env.table, mjx.put_model(env.models[0], impl="jax")
+    for row, model in enumerate(env.models):
         leaves = {k: v[row] for k, v in table.tasks.model.items() if k != "site_size"}
         ours, own = leaves_by_name(base.tree_replace(leaves)), leaves_by_name(mjx.put_model(model, impl="jax"))
         assert ours.keys() == own.keys() and len(own) > 100
@@ -158,7 +159,7 @@ def test_only_what_differs_is_stacked(sizes, touch_sizes):
 
 def compiled(edit):
     """The nominal model, and one with an edit."""
-    spec = envs.make("finger-spin").compile_spec(1.0)
+    spec = envs.make("finger-spin").compile_spec()
     first = spec.compile()
     edit(spec)
     return first, spec.compile()
@@ -207,19 +208,25 @@ def test_friction_of_zero_never_reaches_mjx():
     [
         ("finger-spn", {}, "unknown environment 'finger-spn'; did you mean 'finger-spin'"),
         ("finger-spin", {"engin": "c"}, "unknown setting of finger-spin 'engin'; did you mean 'engine'"),
-        ("finger-spin", {"vary": "colour"}, "unknown parameter 'colour'; this domain can vary size, touch-size"),
-        ("finger-spin", {"split": "sparse"}, "unknown split 'sparse'; choose from dense, hip-bmdp"),
-        ("finger-spin", {"engine": "warp"}, "unknown engine 'warp'; choose from auto, mjx, c"),
-        ("finger-spin", {"values": (1.0, 0.9)}, "must increase"),
-        ("finger-spin", {"values": (1.0, 1.0)}, "must increase"),
-        ("finger-spin", {"values": (0.0, 1.0)}, "size must be greater than 0.0, not 0.0"),
-        ("finger-spin", {"values": (1.0, np.inf)}, "size must be"),
-        ("finger-spin", {"values": (1.0, 1.2), "split": "hip-bmdp"}, "numbers ten tasks, and this family has 2"),
-        ("finger-spin-vary-size", {"num_tasks": 9, "split": "hip-bmdp"}, "this family has 9"),
-        ("finger-spin-vary-size", {"low": 1.13}, r"low \(1.13\) must be less than high \(1.13\)"),
-        ("finger-spin-vary-size", {"low": 1.5}, r"low \(1.5\) must be less than high \(1.13\)"),
-        ("finger-spin", {"num_tasks": 0}, "num-tasks must be at least 1"),
-        ("finger-spin", {"solver_iterations": -1}, "solver-iterations at least 0"),
+        ("finger-spin", {"vary": {"sise": "1"}}, "unknown parameter 'sise'; did you mean 'size'"),
+        ("finger-spin", {"split": "sparse"}, "unknown split 'sparse'; choose from: dense, hip-bmdp, none"),
+        ("finger-spin", {"combine": "pair"}, "unknown combine 'pair'; did you mean 'paired'"),
+        ("finger-spin", {"engine": "cc"}, "unknown engine 'cc'"),
+        ("finger-spin", {"vary": {"size": [1.0, 0.9, 1.1]}}, "must increase"),
+        ("finger-spin", {"vary": {"size": [1.0, 1.0]}}, "must increase"),
+        ("finger-spin", {"vary": {"size": [0.0, 1.0]}}, "size must be greater than 0, not 0"),
+        ("finger-spin", {"vary": {"size": [1.0, np.inf]}}, "size must be"),
+        ("finger-spin", {"vary": {"size": "1:x:3"}}, "cannot read the values '1:x:3' of size; give lo:hi:n"),
+        ("finger-spin", {"vary": {"size": "1.2:1:3"}}, "the range of size must go from low to high, not 1.2:1:3"),
+        ("finger-spin", {"vary": {"size": "1:1.2:0"}}, "size has no values"),
+        (
+            "finger-spin",
+            {"vary": {"size": [1.0, 1.2]}, "split": "hip-bmdp"},
+            "numbers ten tasks, and this family has 2",
+        ),
+        ("finger-spin-vary-size", {"vary": {"size": "1:1.1:9"}, "split": "hip-bmdp"}, "this family has 9"),
+        ("finger-spin", {"num_tasks": 0}, "num-tasks and num-draws must be at least 1"),
+        ("finger-spin", {"solver_iterations": -1}, "solver-iterations must be at least 0"),
     ],
 )
 def test_wrong_settings_are_refused(name, settings, message):
@@ -234,10 +241,40 @@ def test_an_unknown_split_of_tasks_is_refused(sizes):
         sizes.tasks("test")
 
 
-def test_listed_values_replace_the_range():
-    """A family trains on the values it is given, whatever low, high and num-tasks say."""
-    env = envs.make("finger-spin-vary-size", values=(0.9, 1.1))
+def test_given_values_replace_the_familys_own():
+    """A family trains on the values it is given; one value fixes a parameter."""
+    env = envs.make("finger-spin-vary-size", {"size": (0.9, 1.1)})
     np.testing.assert_allclose(values_of(env, "train"), [0.9, 1.1], rtol=1e-6)
+    fixed = envs.make("finger-spin-vary-size", {"size": 1.1, "touch-size": "0.02:0.04:3"})
+    assert fixed.varied == ("touch-size",) and fixed.describe(1) == "touch-size=0.03"
+    np.testing.assert_allclose(fixed.tasks().params["size"], 1.1)
+
+
+def test_a_continuous_range_gives_every_episode_a_task_of_its_own():
+    """Draws fill the range without gaps, each with its own model and context, under the identity of their task."""
+    env = envs.make("finger-spin", {"size": "0.95:1.15", "touch-size": [0.03, 0.05]}, num_draws=20)
+    tasks = env.tasks()
+    assert tasks.draws.params["size"].shape == (2, 20) and tasks.draws.context.shape == (2, 20, 2)
+    parts = np.sort((np.asarray(tasks.draws.params["size"]) - 0.95) / 0.2 * 20, axis=1)
+    np.testing.assert_array_equal(np.floor(parts), np.tile(np.arange(20), (2, 1)))
+    drawn = jax.vmap(episode_task, (None, 0))(
+        jax.tree.map(lambda x: x[1], tasks), jax.random.split(jax.random.key(0), 200)
+    )
+    assert set(np.asarray(drawn.id)) == {1} and len(set(np.asarray(drawn.row))) == 20
+    np.testing.assert_allclose(drawn.params["touch-size"], 0.05)
+    np.testing.assert_allclose(drawn.context[:, 0], (drawn.params["size"] - 1.05) / 0.1, atol=1e-5)
+    for i in range(3):
+        np.testing.assert_allclose(drawn.model["geom_size"][i], env.models[int(drawn.row[i])].geom_size, rtol=1e-6)
+
+
+def test_held_out_tasks_of_a_continuous_range_stay_what_they_are():
+    """Inside it five values, beyond each end one and two tenths; their draws are copies."""
+    env = envs.make("finger-spin", {"size": "0.9:1.2"}, num_draws=3)
+    np.testing.assert_allclose(values_of(env, "interpolation"), [0.95, 1.0, 1.05, 1.1, 1.15], rtol=1e-6)
+    np.testing.assert_allclose(values_of(env, "extrapolation"), [0.84, 0.87, 1.23, 1.26], rtol=1e-6)
+    held = env.tasks("extrapolation")
+    np.testing.assert_array_equal(held.draws.params["size"], np.tile(held.params["size"][:, None], 3))
+    assert env.tasks("all").draws.id.shape == (10, 3)
 
 
 def test_environments_are_equal_when_their_settings_are():
@@ -249,8 +286,8 @@ def test_environments_are_equal_when_their_settings_are():
     for env in (one, two):
         count(env)
     assert len(traces) == 1
-    others = {"vary": "touch-size", "low": 0.9, "high": 1.5, "num_tasks": 9, "values": (1.0,)}
-    others |= {"split": "hip-bmdp", "engine": "mjx", "solver_iterations": 3}
+    others = {"vary": {"touch-size": "1"}, "combine": "paired", "num_tasks": 9, "num_draws": 9, "task_seed": 1}
+    others |= {"split": "hip-bmdp", "engine": "mjx", "solver_iterations": 3, "integrator": "euler"}
     assert others.keys() == {f.name for f in dataclasses.fields(one)}
     for name, value in others.items():
         assert dataclasses.replace(one, **{name: value}) != one

@@ -8,6 +8,7 @@ import pytest
 from dm_control.suite import finger as suite_module
 
 from mtjax import envs
+from mtjax.envs.finger import FingerSpin, FingerTurn, FingerTurnTarget
 
 NOMINAL = 1  # the row of finger-spin-vary-size whose size is 1
 DYNAMICS = ("body_", "jnt_", "dof_", "geom_", "actuator_", "qpos")
@@ -40,7 +41,7 @@ def same(ours, theirs, name):
 
 @pytest.fixture(scope="module")
 def sizes():
-    return envs.make("finger-spin-vary-size", low=0.95, high=1.4, engine="c")
+    return envs.make("finger-spin-vary-size", {"size": "0.95:1.4:10"}, engine="c")
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +63,7 @@ def starts(sizes, programs):
 
 def test_model_has_every_dynamics_field_of_dm_control(suite_finger):
     """Bodies, joints, geoms, motors and options are dm_control's bit for bit, the hinge's damping of 0.03 included."""
-    ours, theirs = envs.make("finger-spin").table.models[0], suite_finger.physics.model.ptr
+    ours, theirs = envs.make("finger-spin").models[0], suite_finger.physics.model.ptr
     fields = [f for f in dir(ours) if f.startswith(DYNAMICS) and not any(word in f for word in NOT_DYNAMICS)]
     options = [f for f in dir(ours.opt) if not f.startswith("_")]
     assert len(fields) > 90 and len(options) > 20
@@ -73,12 +74,12 @@ def test_model_has_every_dynamics_field_of_dm_control(suite_finger):
 
 def test_model_has_the_sites_and_sensors_of_dm_control(suite_finger):
     """Every site and sensor we have is dm_control's of the same name: place, size, shape and what it reads."""
-    ours, theirs = envs.make("finger-spin").table.models[0], suite_finger.physics.model.ptr
+    ours, theirs = envs.make("finger-spin").models[0], suite_finger.physics.model.ptr
     for i in range(ours.nsite):
         a, b = ours.site(i), theirs.site(ours.site(i).name)
         for field in ("bodyid", "pos", "quat", "size", "type"):
             assert same(a, b, field), (a.name, field)
-    assert ours.nsensor == 9
+    assert ours.nsensor == 2
     for i in range(ours.nsensor):
         a, b = ours.sensor(i), theirs.sensor(ours.sensor(i).name)
         assert a.type == b.type and a.cutoff == b.cutoff
@@ -88,7 +89,7 @@ def test_model_has_the_sites_and_sensors_of_dm_control(suite_finger):
 
 def test_what_can_touch_is_what_touches_in_dm_control(suite_finger, sizes):
     """Over uniformly random positions our model finds dm_control's contacts: nothing it disables is ever in reach."""
-    model, random = sizes.table.models[NOMINAL], np.random.RandomState(0)
+    model, random = sizes.models[NOMINAL], np.random.RandomState(0)
     data, contacts = mujoco.MjData(model), []
     for _ in range(1000):
         qpos = random.uniform([-1.92, -1.92, -np.pi], [1.92, 1.92, np.pi])
@@ -170,7 +171,7 @@ def size_starts(sizes, programs):
     """Reset of all ten sizes, 300 starts each, in both engines from the same keys."""
     keys, ids = jax.random.split(jax.random.key(1), 3000), np.repeat(np.arange(10), 300)
     return {
-        engine: programs(envs.make("finger-spin-vary-size", low=0.95, high=1.4, engine=engine)).reset(
+        engine: programs(envs.make("finger-spin-vary-size", {"size": "0.95:1.4:10"}, engine=engine)).reset(
             rows(sizes, ids), keys
         )
         for engine in ENGINES
@@ -189,7 +190,7 @@ def test_nothing_touches_at_any_start(sizes, size_starts):
     """MuJoCo finds no contact at 300 starts of each size, though it does at a good part of unrejected draws."""
     draws = np.random.RandomState(0).uniform([-1.9, -1.9, -np.pi], [1.9, 1.9, np.pi], (300, 3))
     starts = np.asarray(size_starts["c"].state.qpos).reshape(10, 300, 3)
-    for model, start in zip(sizes.table.models, starts, strict=False):
+    for model, start in zip(sizes.models, starts, strict=False):
         assert not np.any(contact_counts(model, start))
         assert np.sum(contact_counts(model, draws) > 0) >= 10
 
@@ -211,5 +212,56 @@ def test_keys_decide_starts(sizes, programs, starts):
 def test_sizes_of_the_interface(sizes):
     """Nine observations, two actions, one context; a thousand steps, or 20 seconds, an episode."""
     assert sizes.spec == (9, 2, 1)
-    seconds = sizes.episode_length * sizes.num_substeps * sizes.table.models[0].opt.timestep
+    seconds = sizes.episode_length * sizes.num_substeps * sizes.models[0].opt.timestep
     assert sizes.episode_length == 1000 and seconds == pytest.approx(20)
+
+
+@pytest.fixture(scope="module")
+def turns():
+    """FingerTurn's nominal task at 500 starts."""
+    env = FingerTurn(engine="c")
+    tasks = rows(env, [0] * 500)
+    return env, tasks, jax.jit(jax.vmap(env.reset))(tasks, jax.random.split(jax.random.key(0), 500))
+
+
+def test_targets_of_turn_are_anywhere_on_the_circle_and_stay(turns):
+    """Each episode has a target of its own, 0.13 m from the hinge, which the observation shows and steps keep."""
+    env, tasks, step = turns
+    target = np.asarray(step.state.extra)
+    np.testing.assert_allclose(np.linalg.norm(target, axis=1), 0.13, rtol=1e-6)
+    assert ks_distance(np.arctan2(target[:, 0], target[:, 1]), np.linspace(-np.pi, np.pi, 500)) < 0.1
+    after = jax.jit(jax.vmap(env.step))(tasks, step.state, jnp.zeros((500, 2)))
+    np.testing.assert_array_equal(after.state.extra, target)
+    for obs in (step.obs, after.obs):
+        np.testing.assert_array_equal(obs[:, 9:11], target)
+        np.testing.assert_allclose(obs[:, 11], np.linalg.norm(obs[:, 2:4] - target, axis=1) - 0.07, atol=1e-6)
+    np.testing.assert_array_equal(after.reward, after.obs[:, 11] <= 0)
+    assert 0.05 < np.mean(after.reward) < 0.4
+
+
+def test_a_target_can_be_the_task(turns):
+    """The target is at the angle asked for, 0 up and positive towards x; what the agent sees does not give it away."""
+    _, _, step = turns
+    env = FingerTurnTarget(
+        vary={"target-angle": [0, np.pi / 2], "target-size": [0.05, 0.09]}, combine="paired", engine="c"
+    )
+    targets = jax.vmap(env.reset, (0, None))(env.tasks(), jax.random.key(0))
+    np.testing.assert_allclose(targets.state.extra, [[0, 0.13], [0.13, 0]], atol=1e-7)
+    assert targets.obs.shape == (2, 9)
+    world = jax.tree.map(lambda x: x[0], step.state)
+    tip = step.obs[0, 2:4]
+    rewards = jax.vmap(lambda task, x: env.reward(task, world._replace(extra=tip + x), jnp.zeros(2)), (None, 0))
+    offsets = jnp.array([[0.045, 0], [0, 0.055], [0.085, 0], [0.095, 0]])
+    expected = [[1, 0, 0, 0], [1, 1, 1, 0]]
+    for i in range(2):
+        np.testing.assert_array_equal(rewards(jax.tree.map(lambda x, i=i: x[i], env.tasks()), offsets), expected[i])
+
+
+def test_only_spin_frees_the_hinge():
+    """The hinge's own damping of 0.5 stays in turn; either can be given another, and another dry friction."""
+    hinge = lambda family, **vary: family(vary=vary).models[0]
+    assert hinge(FingerSpin).dof_damping[2] == 0.03 and hinge(FingerTurn).dof_damping[2] == 0.5
+    for family in (FingerSpin, FingerTurn):
+        changed = hinge(family, **{"spinner-damping": [0.2], "spinner-frictionloss": [0.3], "damping": [2.0]})
+        np.testing.assert_allclose(changed.dof_damping, [5, 5, 0.4])
+        assert changed.dof_frictionloss[2] == 0.3

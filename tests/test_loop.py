@@ -295,3 +295,35 @@ def test_settings_that_make_no_sense_are_refused(settings, message):
     """With the flag, what was given and what is allowed."""
     with pytest.raises(InputError, match=message):
         Settings(**settings)
+
+
+@dataclasses.dataclass(frozen=True)
+class Drifting(Walk):
+    """Walks whose episodes draw a scale of their own, which is also their reward."""
+
+    def tasks(self, split="train"):
+        tasks = super().tasks(split)
+        scales = jnp.linspace(1.0, 2.0, 50)[None] + 10 * jnp.arange(len(tasks.id))[:, None]
+        draws = jax.tree.map(lambda x: jnp.broadcast_to(x[:, None], (*x.shape[:1], 50, *x.shape[1:])), tasks)
+        return tasks._replace(draws=draws._replace(context=scales[..., None], goal=draws.goal | {"scale": scales}))
+
+
+class Sees(Recorder):
+    """Acts by what it is shown of the task."""
+
+    def act(self, state, obs, task, key):
+        return task.context + 100 * task.id
+
+
+def test_episodes_draw_their_tasks_where_those_are_continuous():
+    """Each episode has one draw of its own task from start to end, stored and acted on; the next has another."""
+    state, _ = train(Drifting(), Sees(), SETTINGS, seeds=(0, 1), chunks=3)
+    rows = stored(state)
+    context = rows.context[..., 0]
+    assert np.all((context - 10 * np.arange(2)[:, None, None] >= 1) & (context - 10 * np.arange(2)[:, None, None] <= 2))
+    goes_on = ~ends(rows)[..., :-1]
+    assert np.all((context[..., 1:] == context[..., :-1])[goes_on])
+    assert np.mean((context[..., 1:] != context[..., :-1])[~goes_on]) > 0.9
+    learned = np.arange(3 * CHUNK) >= WARMUP
+    acted = rows.action[..., 0] - 100 * np.arange(2)[:, None, None]
+    np.testing.assert_allclose(acted[..., learned], context[..., learned], rtol=1e-6)

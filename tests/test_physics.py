@@ -25,7 +25,7 @@ ENGINES = {"c": {"engine": "c"}, "mjx": {"engine": "mjx", "solver_iterations": 2
 
 def make(name, engine):
     """A family; sizes over a wider range than the registered one, with the nominal size as its second."""
-    wide = {"low": 0.95, "high": 1.4} if name == SIZE else {}
+    wide = {"vary": {"size": "0.95:1.4:10"}} if name == SIZE else {}
     return envs.make(name, **wide, **ENGINES[engine])
 
 
@@ -52,7 +52,7 @@ def assert_same(a, b):
 
 def begin(env, worlds):
     """The 100 shared states in the nominal task; from C, whose first state is dm_control's, for both engines."""
-    tasks = rows(env, [NOMINAL if env.vary == "size" else 0] * 100)
+    tasks = rows(env, [NOMINAL if "size" in env.varied else 0] * 100)
     c = envs.make("finger-spin", engine="c")
     return tasks, jax.vmap(lambda t, q, v: c.set_physics(t, None, q, v))(rows(c, [0] * 100), worlds.qpos, worlds.qvel)
 
@@ -305,14 +305,13 @@ def test_touch_sizes_feel_the_same_in_both_engines(touch_contacts, programs):
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_set_physics_returns_the_given_state(engine, worlds, programs):
-    """Positions and velocities come back as given, in the world and in what its sensors read."""
+    """Positions and velocities come back as given, and sensors feel the contacts there."""
     env = make(TOUCH, engine)
     tasks = rows(env, [0] * 100)
     world = programs(env).put(tasks, worlds.qpos, worlds.qvel)
     np.testing.assert_array_equal(world.qpos, worlds.qpos)
     np.testing.assert_array_equal(world.qvel, worlds.qvel)
-    np.testing.assert_allclose(world.sensors[:, :2], worlds.qpos[:, :2], atol=1e-6)
-    np.testing.assert_allclose(world.sensors[:, 8:11], worlds.qvel, atol=1e-6)
+    assert np.any(world.sensors[:50] > 0) and not np.any(world.sensors[50:])
     assert not np.any(world.warmstart)
 
 

@@ -11,7 +11,7 @@ from mtjax import render
 from mtjax.envs.finger import FingerSpin
 from mtjax.types import InputError
 
-FINGER = FingerSpin(vary="size", low=0.8, high=1.4, num_tasks=2)
+FINGER = FingerSpin(vary={"size": [0.8, 1.4]})
 POSES = np.array([[0.0, 0.0, 0.0], [1.5, 0.5, 1.0]])
 
 
@@ -62,7 +62,7 @@ def test_backend_that_the_user_chose_is_kept(monkeypatch):
 def test_camera_and_size_limits_do_not_depend_on_the_row():
     cameras = [render._camera(FINGER) for _ in range(2)]
     np.testing.assert_array_equal(cameras[0].lookat, [0, 0, 0.4])
-    model = render._lit_model(FINGER, 1.0, 1920, 1080)
+    model = render._lit_model(FINGER, 0, 1920, 1080)
     assert (model.vis.global_.offwidth, model.vis.global_.offheight, model.nlight) == (1920, 1080, 1)
 
 

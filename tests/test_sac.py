@@ -146,7 +146,7 @@ def plain_update(agent, state: SACState, batch: Transition, context):
 
     d_critic, d_critic_bias = np.zeros_like(critic), np.zeros_like(critic_bias)
     for t, b in np.ndindex(num_tasks, BATCH):
-        obs, action, reward, discount, next_obs = (np.asarray(x[t, b]) for x in batch)
+        obs, action, reward, discount, next_obs = (np.asarray(x[t, b]) for x in batch[:5])
         next_action, log_prob = act(next_obs, t)
         _, slow = estimates(target, target_bias, next_obs, next_action, t)
         y = reward + agent.gamma * discount * (min(slow) - temperature[t] * log_prob)
@@ -217,3 +217,15 @@ def test_temperature_and_target_begin_as_set():
     np.testing.assert_array_equal(kernel, state.target.shared["head"]["kernel"])
     assert kernel.unsafe_buffer_pointer() != state.target.shared["head"]["kernel"].unsafe_buffer_pointer()
     assert not np.allclose(kernel[0], kernel[1])
+
+
+def test_each_transition_is_seen_with_its_own_episodes_context(linear):
+    """Contexts stored beside transitions take the place of the tasks' own, sample by sample."""
+    tasks, key = tasks_of("one-step", [0.4, -0.8]), jax.random.key(1)
+    agent, batch = LinearSAC(**RATES), random_batch(3, 2, BATCH, SPEC)
+    before = start(agent, tasks)
+    alike = batch._replace(context=jnp.broadcast_to(tasks.context[:, None], (2, BATCH, 1)))
+    other = alike._replace(context=alike.context.at[0, 0].add(1.0))
+    plain, same, moved = (agent.update(before, x, tasks, key)[1]["critic_loss"] for x in (batch, alike, other))
+    np.testing.assert_allclose(plain, same, rtol=1e-5)
+    assert abs(plain[0] - moved[0]) > 1e-3 and abs(plain[1] - moved[1]) < 1e-5

@@ -45,14 +45,15 @@ class Mixture(nn.Module):
     @nn.compact
     def __call__(self, obs: Array, features: Array, *action: Array) -> Array:
         size = self.expert_widths[-1]
-        context = nn.Dense(size, name="context_out")(MLP(self.expert_widths, name="context")(features))  # (D,)
+        context = nn.Dense(size, name="context_out")(MLP(self.expert_widths, name="context")(features))  # (..., D)
         encodings = Experts(self.num_experts, self.expert_widths, name="experts")(obs)  # (K, ..., D)
         if self.variant == "paper":
             scores = jnp.sum(encodings * jax.lax.stop_gradient(context), axis=-1) / self.temperature  # (K, ...)
         else:
             gate = nn.Dense(self.num_experts, name="gate_out")(MLP((size, size), name="gate")(context))
-            scores = gate.reshape(-1, *[1] * (obs.ndim - 1))  # (K, 1...), the same in every state
-        attention = jnp.broadcast_to(jax.nn.softmax(scores, axis=0), (self.num_experts, *obs.shape[:-1]))
+            gate = jnp.broadcast_to(gate, (*obs.shape[:-1], self.num_experts))  # the same in every state of a task
+            scores = jnp.moveaxis(gate, -1, 0)
+        attention = jax.nn.softmax(scores, axis=0)  # (K, ...)
         self.sow("intermediates", "attention", attention)
         encoding = jnp.sum(attention[..., None] * encodings, axis=0)
         if self.variant == "paper":

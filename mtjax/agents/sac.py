@@ -202,7 +202,7 @@ class SAC:
     def _see(self, moments: normalize.Moments, obs: Array) -> Array:
         return normalize.apply(moments, obs) if self.normalize_observations else obs
 
-    # Losses, each on the data of one task: observations (B, O), features (Z,), temperature ().
+    # Losses, each on the data of one task: observations (B, O), features (Z,) or (B, Z), temperature ().
 
     def values(self, critic: Params, features: Array, obs: Array, action: Array) -> Array:
         """Every critic's estimate (N, B)."""
@@ -239,6 +239,8 @@ class SAC:
         moments = normalize.update(state.moments, batch.obs) if self.normalize_observations else state.moments
         batch = batch._replace(obs=self._see(moments, batch.obs), next_obs=self._see(moments, batch.next_obs))
         features = jax.vmap(partial(self.features, state))(tasks)
+        if batch.context is not None and self.conditioning == "parameters":
+            features = batch.context  # (T, B, C), as every episode has parameters of its own
         temperature = jnp.broadcast_to(jnp.exp(state.log_temperature), num_tasks)
 
         over_tasks = Params(shared=None, own=0)  # type: ignore

@@ -1,18 +1,136 @@
-"""Environment families by name. To add one: a file for its domain, and a line here."""
+"""Environment families by name. To add one: a file for its domain, and a line here; or ``register`` your own."""
 
+from collections.abc import Mapping
+from typing import Any
+
+from mtjax.envs.acrobot import AcrobotSwingup
+from mtjax.envs.ball_in_cup import BallInCup
+from mtjax.envs.brax import NAMES, Brax, BraxAntDirection, BraxHalfcheetahSpeed
+from mtjax.envs.cartpole import CartpoleBalance, CartpoleSwingup
+from mtjax.envs.cheetah import CheetahDirection, CheetahRun, CheetahSpeed
+from mtjax.envs.control import Acrobot, CartPole
+from mtjax.envs.domain import Domain
 from mtjax.envs.family import Family
-from mtjax.envs.finger import FingerSpin
+from mtjax.envs.finger import FingerSpin, FingerTurn, FingerTurnTarget
+from mtjax.envs.hopper import HopperHop, HopperStand
+from mtjax.envs.maze import TwoGoalMaze
+from mtjax.envs.parameters import Parameter
+from mtjax.envs.pendulum import PendulumSwingup
+from mtjax.envs.physics import World
+from mtjax.envs.point_mass import PointMass, PointMassNavigate
+from mtjax.envs.reacher import Reacher, ReacherTarget
+from mtjax.envs.tabular import Bandit, TabularMDP
+from mtjax.envs.walker import WalkerRun, WalkerSpeed, WalkerStand, WalkerWalk
 from mtjax.names import frozen, nearest_error
+from mtjax.types import InputError
 
-ENVS: dict[str, tuple[type[Family], dict]] = {
+__all__ = ["ENVS", "Domain", "Family", "Parameter", "World", "make", "register"]
+
+Entry = tuple[type[Family], dict[str, Any]]
+
+# dm_control's tasks (Tassa et al. 2018), with whatever parameters are asked for.
+_DOMAINS: dict[str, Entry] = {
+    "acrobot-swingup": (AcrobotSwingup, {}),
+    "acrobot-swingup-sparse": (AcrobotSwingup, {"sparse": True}),
+    "ball-in-cup-catch": (BallInCup, {}),
+    "cartpole-balance": (CartpoleBalance, {}),
+    "cartpole-balance-sparse": (CartpoleBalance, {"sparse": True}),
+    "cartpole-swingup": (CartpoleSwingup, {}),
+    "cartpole-swingup-sparse": (CartpoleSwingup, {"sparse": True}),
+    "cheetah-run": (CheetahRun, {}),
     "finger-spin": (FingerSpin, {}),
-    "finger-spin-vary-size": (FingerSpin, {"low": 0.95, "high": 1.13, "num_tasks": 10}),
-    "finger-spin-vary-touch-size": (FingerSpin, {"vary": "touch-size", "low": 0.025, "high": 0.25, "num_tasks": 10}),
+    "finger-turn-easy": (FingerTurn, {}),
+    "finger-turn-hard": (FingerTurn, {"vary": {"target-size": "0.03"}}),
+    "hopper-hop": (HopperHop, {}),
+    "hopper-stand": (HopperStand, {}),
+    "pendulum-swingup": (PendulumSwingup, {}),
+    "point-mass-easy": (PointMass, {}),
+    "reacher-easy": (Reacher, {}),
+    "reacher-hard": (Reacher, {"vary": {"target-size": "0.015"}}),
+    "walker-run": (WalkerRun, {}),
+    "walker-stand": (WalkerStand, {}),
+    "walker-walk": (WalkerWalk, {}),
 }
 
+# HiP-BMDP's families (Zhang et al. 2021) with the values of MTEnv's models; `--split=hip-bmdp` for its held-out tasks.
+_HIP_BMDP: dict[str, Entry] = {
+    "cartpole-swingup-vary-cart-mass": (CartpoleSwingup, {"vary": {"cart-mass": "1:5.5:10"}}),
+    "cartpole-swingup-vary-pole-mass": (CartpoleSwingup, {"vary": {"pole-mass": "0.1:0.55:10"}}),
+    "cheetah-run-vary-back-foot-length": (CheetahRun, {"vary": {"back-foot-length": "0.094:0.184:10"}}),
+    "cheetah-run-vary-foot-position": (
+        CheetahRun,
+        {"vary": {"foot-position": "0.5,0.48,0.46,0.44,0.42,0.4,0.38,0.36,0.34,0.32"}},
+    ),
+    "cheetah-run-vary-foot-size": (
+        CheetahRun,
+        {"vary": {"foot-size": "0.046,0.0552,0.0598,0.0644,0.069,0.0736,0.0782,0.0828,0.0874,0.092"}},
+    ),
+    "cheetah-run-vary-torso-length": (CheetahRun, {"vary": {"torso-length": "0.5:1.4:10"}}),
+    "finger-spin-vary-size": (FingerSpin, {"vary": {"size": "0.95:1.13:10"}}),
+    "finger-spin-vary-touch-size": (FingerSpin, {"vary": {"touch-size": "0.025:0.25:10"}}),
+    "walker-run-vary-foot-length": (WalkerRun, {"vary": {"foot-length": "0.08:0.17:10"}}),
+    "walker-run-vary-friction": (WalkerRun, {"vary": {"friction": "0.7:1.6:10"}}),
+    "walker-walk-vary-foot-length": (WalkerWalk, {"vary": {"foot-length": "0.08:0.17:10"}}),
+    "walker-walk-vary-friction": (WalkerWalk, {"vary": {"friction": "0.7:1.6:10"}}),
+}
 
-def make(name: str, **settings) -> Family:
+_GOALS: dict[str, Entry] = {
+    "cheetah-run-vary-speed": (CheetahSpeed, {"vary": {"speed": "1:5.5:10"}}),
+    "cheetah-vary-direction": (CheetahDirection, {"vary": {"direction": "-1,1"}, "split": "none"}),
+    "finger-turn-vary-target": (FingerTurnTarget, {"vary": {"target-angle": "-2:2:10"}}),
+    "point-mass-vary-goal": (
+        PointMassNavigate,
+        {"vary": {"goal-x": "-0.2:0.2", "goal-y": "-0.2:0.2"}, "combine": "random"},
+    ),
+    "reacher-vary-goal": (ReacherTarget, {"vary": {"target-angle": "-2:2:10"}}),
+    "walker-vary-speed": (WalkerSpeed, {"vary": {"speed": "0.5:5:10"}}),
+}
+
+_MTENV: dict[str, Entry] = {
+    "bandit": (Bandit, {}),
+    "control-acrobot": (
+        Acrobot,
+        {
+            "vary": {
+                **dict.fromkeys(("link-length-1", "link-length-2", "link-mass-1", "link-mass-2"), "0.5:1.5"),
+                "torque-sign": "-1:1",
+            },
+            "combine": "random",
+        },
+    ),
+    "control-cartpole": (
+        CartPole,
+        {
+            "vary": {
+                "gravity": "4.8:14.8",
+                "cart-mass": "0.5:1.5",
+                "pole-mass": "0.01:0.19",
+                "pole-length": "0.2:0.8",
+                "force": "-10:10",
+            },
+            "combine": "random",
+        },
+    ),
+    "tabular-mdp": (TabularMDP, {}),
+    "two-goal-maze": (TwoGoalMaze, {"vary": {"goal-box": "0,1"}, "split": "none"}),
+    "two-goal-maze-seen": (TwoGoalMaze, {"vary": {"goal-box": "0,1"}, "split": "none", "observe_boxes": True}),
+}
+
+_BRAX: dict[str, Entry] = {
+    **{f"brax-{name.replace('_', '-')}": (Brax, {"environment": name}) for name in NAMES},
+    "brax-ant-vary-direction": (BraxAntDirection, {"vary": {"direction": "-2:2:10"}}),
+    "brax-halfcheetah-vary-speed": (BraxHalfcheetahSpeed, {"vary": {"speed": "0.3:3:10"}}),
+}
+
+ENVS: dict[str, Entry] = {**_DOMAINS, **_HIP_BMDP, **_GOALS, **_MTENV, **_BRAX}
+
+
+def make(name: str, vary: Mapping[str, Any] | tuple = (), **settings: Any) -> Family:
     """Return the family called ``name``, with any of its fields replaced.
+
+    Args:
+        vary: values of parameters, {"mass": "0.5:1.5:10"}, beside those that the family varies by itself; a parameter
+            given a single value no longer varies.
 
     Raises:
         InputError: no family has that name, no field has one of the given names, or a value is out of range.
@@ -20,7 +138,30 @@ def make(name: str, **settings) -> Family:
     if name not in ENVS:
         raise nearest_error("environment", name, ENVS)
     family, defaults = ENVS[name]
-    unknown = next((s for s in settings if s not in family.__dataclass_fields__), None)
+    fields = family.__dataclass_fields__
+    unknown = next((s for s in (*settings, *defaults) if s not in fields), None)
     if unknown is not None:
-        raise nearest_error(f"setting of {name}", unknown, family.__dataclass_fields__)
-    return family(**{**defaults, **frozen(settings)})
+        raise nearest_error(f"setting of {name}", unknown, fields)
+    settings = defaults | frozen(settings)
+    return family(**{**settings, "vary": dict(defaults.get("vary", {})) | dict(vary)})
+
+
+def register(name: str, family: type[Family], **settings: Any) -> None:
+    """Give a family of your own a name, under which ``make``, the command line and notebooks know it.
+
+    Args:
+        family: a frozen dataclass, a subclass of ``Domain`` (an MJCF file, parameters, observation and reward) or of
+            ``Family`` (anything that steps in JAX).
+        settings: values of its fields, such as ``vary={"mass": "0.5:2:10"}``.
+
+    Raises:
+        InputError: the name is taken, or a value is out of range.
+    """
+    if name in ENVS:
+        raise InputError(f"there is an environment {name!r} already; choose another name")
+    ENVS[name] = (family, settings)
+    try:
+        make(name)
+    except InputError:
+        del ENVS[name]
+        raise

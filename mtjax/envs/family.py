@@ -1,137 +1,182 @@
-"""A family of MuJoCo tasks: one model, one varying parameter, and a table with a row for every task.
+"""A family of tasks: parameters that differ between them, and a table with a row for every task.
 
-Tasks are built on the host by editing an ``MjSpec`` and compiling it, so that every derived field is MuJoCo's own;
-then only the leaves that differ between tasks are stacked. Nothing here loops over tasks once a program runs.
+Tables are built on the host; nothing here loops over tasks once a program runs.
 """
 
 import abc
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from functools import cached_property
-from importlib import resources
 from typing import Annotated, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import tyro
 
-from mtjax.envs.physics import ENGINES, Engine, Mjx, MujocoC, World, choose_engine, mjx_module
+from mtjax.envs import variation
+from mtjax.envs.parameters import Parameter
 from mtjax.types import SPLITS, Array, InputError, Key, Spec, Step, Task
 
-SCHEMES = ("dense", "hip-bmdp")
-_HIP_BMDP = {"train": (3, 4, 7, 8), "interpolation": (5, 6), "extrapolation": (2, 9)}
-# Fields of the model that never reach the dynamics: statistics, and what only a renderer reads.
-_UNUSED = ("stat", "cam_", "light_", "mat_", "tex_", "name", "_", "signature", "geom_rgba")
-
-
-class Parameter(NamedTuple):
-    """A physical quantity that may differ between tasks."""
-
-    unit: str
-    nominal: float  # the value in the unedited model
-    minimum: float  # values must be greater than this
-    edit: Callable[[mujoco.MjSpec, float], None]  # writes the value into a spec, before it is compiled
+Values = Mapping[str, np.ndarray]  # parameter -> (R,) its value in every row
 
 
 class Table(NamedTuple):
-    """Every task of a family: training tasks first, then interpolation, then extrapolation."""
+    """Every task of a family: training tasks first, then interpolation, then extrapolation, then what they draw."""
 
     tasks: Task  # leading axis: all rows; on the host
     rows: Mapping[str, np.ndarray]  # split -> row numbers
-    models: tuple[mujoco.MjModel, ...]  # one a row
+    draws: np.ndarray | None  # (rows of all splits, P) row numbers of the tasks that episodes draw
 
 
 @dataclasses.dataclass(frozen=True)
 class Family(abc.ABC):
-    """Tasks that differ in one parameter of one MuJoCo model. Subclasses give the model, observation and reward."""
+    """Tasks that differ in named parameters. Subclasses give the parameters, ``reset`` and ``step``."""
 
-    vary: str = "size"
-    """The parameter that differs between tasks."""
-    low: float = 1.0
-    """Its value in the first training task."""
-    high: float = 1.0
-    """Its value in the last training task."""
-    num_tasks: int = 1
-    """Training tasks, evenly spaced from low to high."""
-    values: tuple[float, ...] = ()
-    """The parameter's values, increasing, instead of low, high and num-tasks."""
+    vary: Annotated[Any, tyro.conf.Suppress] = ()
+    """The parameters that differ between tasks, and their values: {"name": "lo:hi:n", "lo:hi", "a,b,c" or numbers}. A
+    range without a number is continuous: each episode has a value of its own. ``--env.vary.NAME=...`` on a command
+    line."""
+    combine: str = "grid"
+    """How the values of several --env.vary.NAME=VALUES combine: grid (all combinations), paired (first with first and
+    so on) or random (num-tasks draws between each one's least and greatest value). VALUES are lo:hi:n, a list a,b,c, or
+    lo:hi, from which every episode draws anew."""
+    num_tasks: int = 10
+    """Training tasks of combine=random, and of families whose tasks are drawn."""
+    num_draws: int = 256
+    """Values that stand for continuous ranges, for each task."""
+    task_seed: int = 0
+    """Chooses the random tasks and the values of continuous ranges, whatever the run's seeds."""
     split: Annotated[str, tyro.conf.arg(name="split", prefix_name=False)] = "dense"
-    """Which tasks train and which are held out: dense (train on all values; test between and beyond them) or hip-bmdp
-    (of ten values train on numbers 3, 4, 7 and 8 counted from 0; interpolation 5, 6; extrapolation 2, 9)."""
-    engine: Annotated[str, tyro.conf.arg(name="engine", prefix_name=False)] = "auto"
-    """Physics engine: auto, mjx (any device) or c (MuJoCo's C engine, threaded; CPU only). Auto is c on a CPU."""
-    solver_iterations: int = 0
-    """Constraint solver iterations of MJX, and twice as many line-search steps; 0 is the domain's own choice."""
+    """Which tasks train and which are held out: dense (train on all values; test between and beyond them), hip-bmdp
+    (of ten values train on numbers 3, 4, 7 and 8 counted from 0; interpolation 5, 6; extrapolation 2, 9) or none."""
 
     parameters: ClassVar[Mapping[str, Parameter]]
-    model_file: ClassVar[str]
-    num_substeps: ClassVar[int]
+    action_size: ClassVar[int]
     episode_steps: ClassVar[int]
-    default_iterations: ClassVar[int]
-    starts_untouched: ClassVar[bool] = False  # no force sensor feels anything when an episode begins
 
     def __post_init__(self):
-        if self.vary not in self.parameters:
-            raise InputError(f"unknown parameter {self.vary!r}; this domain can vary {', '.join(self.parameters)}")
-        if self.split not in SCHEMES:
-            raise InputError(f"unknown split {self.split!r}; choose from {', '.join(SCHEMES)}")
-        if self.engine not in ENGINES:
-            raise InputError(f"unknown engine {self.engine!r}; choose from {', '.join(ENGINES)}")
-        if self.num_tasks < 1 or self.solver_iterations < 0:
-            raise InputError("num-tasks must be at least 1 and solver-iterations at least 0")
-        if not self.values and self.num_tasks > 1 and not self.low < self.high:
-            raise InputError(f"low ({self.low}) must be less than high ({self.high}) where there are several tasks")
-        values = self.listed_values
-        if values[0] <= self.parameters[self.vary].minimum or not np.all(np.isfinite(values)):
-            raise InputError(f"{self.vary} must be greater than {self.parameters[self.vary].minimum}, not {values[0]}")
-        if np.any(np.diff(values) <= 0):
-            raise InputError(f"the values of {self.vary} must increase, and these do not: {self.values}")
-        if self.split == "hip-bmdp" and len(values) != 10:
-            raise InputError(f"split hip-bmdp numbers ten tasks, and this family has {len(values)}; use --split=dense")
+        pairs = self.vary.items() if isinstance(self.vary, Mapping) else self.vary
+        object.__setattr__(self, "vary", tuple((str(n), variation.write_values(v)) for n, v in pairs))
+        if self.num_draws < 1 or self.num_tasks < 1:
+            raise InputError("num-tasks and num-draws must be at least 1")
+        _ = self.variation
 
-    # What a domain gives.
-
-    def prepare(self, spec: mujoco.MjSpec) -> None:  # noqa: B027 - most domains share nothing more
-        """Edit the model in the way that all tasks share."""
+    # What a family gives.
 
     @abc.abstractmethod
-    def start(self, task: Task, key: Key) -> tuple[Array, Array]:
-        """Draw the positions (nq,) and velocities (nv,) in which an episode begins."""
-
-    @abc.abstractmethod
-    def observe(self, task: Task, world: World) -> Array:
-        """Return the observation (O,) of a world."""
-
-    @abc.abstractmethod
-    def reward(self, task: Task, world: World, action: Array) -> Array:
-        """Return the reward () of having arrived in a world."""
-
-    # What every domain does.
-
-    def tasks(self, split: str = "train") -> Task:
-        """Return the tasks of a split: "train", "interpolation", "extrapolation", or "all" rows of the table."""
-        rows = {**self.table.rows, "all": slice(None)}
-        if split not in rows:
-            raise InputError(f"unknown split {split!r}; choose from {', '.join(rows)}")
-        return jax.tree.map(lambda x: jnp.asarray(x[rows[split]]), self.table.tasks)
-
     def reset(self, task: Task, key: Key) -> Step:
         """Begin an episode of ``task`` in a fresh random state."""
-        put = self.simulator.place if self.starts_untouched else self.simulator.forward
-        world = put(task, *self.start(task, key))
-        return Step(world, self.observe(task, world), jnp.float32(0), jnp.bool_(False))
 
-    def step(self, task: Task, state: World, action: Array) -> Step:
-        """Advance one control step under ``action`` (A,) in [-1, 1]; observation and reward are those after it."""
-        world = self.simulator.step(task, state, action)
-        return Step(world, self.observe(task, world), self.reward(task, world, action), jnp.bool_(False))
+    @abc.abstractmethod
+    def step(self, task: Task, state: Any, action: Array) -> Step:
+        """Advance one step under ``action`` (A,) in [-1, 1]; observation and reward are those after it."""
 
-    def set_physics(self, task: Task, state: World, qpos: Array, qvel: Array) -> World:
-        """Return the same state with the given positions (nq,) and velocities (nv,)."""
-        del state  # a world is its physical state and what follows from it
-        return self.simulator.forward(task, jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32))
+    def build(self) -> dict[str, dict[str, Any]]:
+        """Return the "model" and "goal" leaves (R, ...) of every row of the table."""
+        return {"model": {}, "goal": self.goals()}
+
+    # What every family does.
+
+    @cached_property
+    def variation(self) -> variation.Variation:
+        """The values of every task of every split."""
+        return variation.vary(
+            dict(self.vary),
+            self.parameters,
+            self.combine,
+            self.num_tasks,
+            self.split,
+            self.num_draws,
+            self.task_seed,
+        )
+
+    def goals(self) -> dict[str, np.ndarray]:
+        """The goal parameters (R,) of every row: varied, or nominal."""
+        goals = {name: p.nominal for name, p in self.parameters.items() if p.edit is None}
+        full = lambda x: np.array(np.broadcast_to(x, self.count), np.float32)
+        return {name: full(self.values.get(name, nominal)) for name, nominal in goals.items()}
+
+    @cached_property
+    def values(self) -> Values:
+        """The values (R,) of each varied parameter in every row of the table, in float64."""
+        found = self.variation
+        parts = [found.rows[split] for split in SPLITS]
+        if found.draws is not None:
+            parts.append(found.draws.reshape(-1, len(found.names)))
+        return dict(zip(found.names, np.concatenate(parts).T, strict=True))
+
+    @property
+    def train_count(self) -> int:
+        """Training tasks."""
+        return len(self.variation.rows["train"])
+
+    @cached_property
+    def count(self) -> int:
+        """Rows of the table."""
+        listed = sum(len(rows) for rows in self.variation.rows.values())
+        return listed if self.variation.draws is None else listed + self.train_count * self.num_draws
+
+    @cached_property
+    def table(self) -> Table:
+        """Every task of every split, and the tasks that episodes draw where ranges are continuous."""
+        sizes = [len(self.variation.rows[split]) for split in SPLITS]
+        listed, draws = sum(sizes), None
+        if self.count > listed:  # held-out tasks stay what they are
+            draws = np.repeat(np.arange(listed)[:, None], self.num_draws, axis=1)
+            draws[: self.train_count] = np.arange(listed, self.count).reshape(-1, self.num_draws)
+        leaves: dict[str, Any] = {
+            "id": np.arange(self.count, dtype=np.int32),
+            "row": np.arange(self.count, dtype=np.int32),
+            "context": self._context(),
+            "params": {name: np.float32(x) for name, x in self.values.items()},
+            **self.build(),
+        }
+        rows: dict[str, np.ndarray] = dict(zip(SPLITS, np.split(np.arange(listed), np.cumsum(sizes)[:-1]), strict=True))
+        return Table(Task(**leaves), rows, draws)
+
+    def _context(self) -> np.ndarray:
+        """What differs between tasks (R, C), scaled; a single task has one constant number, as networks need some."""
+        if not self.varied:
+            return np.zeros((self.count, 1), np.float32)
+        found, everything = self.variation, np.stack(list(self.values.values()), axis=1)
+        scaled = variation.scale(everything, found.low, found.high)
+        return scaled[:, found.low < found.high].astype(np.float32)
+
+    def tasks(self, split: str = "train") -> Task:
+        """Return the tasks of a split: "train", "interpolation", "extrapolation", or "all" of them in this order."""
+        table = self.table
+        splits = {**table.rows, "all": np.concatenate(list(table.rows.values()))}
+        if split not in splits:
+            raise InputError(f"unknown split {split!r}; choose from {', '.join(splits)}")
+        take = lambda rows: jax.tree.map(lambda x: jnp.asarray(x[rows]), table.tasks)
+        tasks = take(splits[split])
+        return tasks if table.draws is None else tasks._replace(draws=take(table.draws[splits[split]]))
+
+    @property
+    def varied(self) -> tuple[str, ...]:
+        """The parameters that differ between training tasks or episodes."""
+        return self.variation.varied
+
+    def task_values(self, split: str) -> np.ndarray:
+        """What tells the tasks of a split apart (T,): the one parameter that varies, or else their numbers."""
+        tasks = self.tasks(split)
+        return np.asarray(tasks.params[self.varied[0]] if len(self.varied) == 1 else tasks.id)
+
+    @property
+    def task_axis(self) -> tuple[str, str]:
+        """Name and unit of ``task_values``."""
+        return (self.varied[0], self.parameters[self.varied[0]].unit) if len(self.varied) == 1 else ("task", "number")
+
+    def describe(self, row: int) -> str:
+        """Name a task by what makes it different, such as "size=0.95"."""
+        params = self.table.tasks.params
+        return ",".join(f"{name}={params[name][row]:.4g}" for name in self.varied) or f"task={row}"
+
+    @property
+    def engine_name(self) -> str:
+        """What steps its worlds: "jax", or the name of a physics engine."""
+        return "jax"
 
     @property
     def episode_length(self) -> int:
@@ -147,112 +192,4 @@ class Family(abc.ABC):
     def _spec(self) -> Spec:
         task = jax.tree.map(lambda x: x[0], self.table.tasks)
         step = jax.eval_shape(self.reset, task, jax.eval_shape(jax.random.key, 0))
-        return Spec(step.obs.shape[0], self.table.models[0].nu, task.context.shape[0])
-
-    @cached_property
-    def listed_values(self) -> np.ndarray:
-        """The parameter's values as listed, before the split decides which of them train."""
-        return np.asarray(self.values or np.linspace(self.low, self.high, self.num_tasks), np.float64)
-
-    @cached_property
-    def table(self) -> Table:
-        """Compile every task of every split."""
-        parameter = self.parameters[self.vary]
-        values = split_values(self.split, self.listed_values, parameter.minimum)
-        everything = np.concatenate([values[s] for s in SPLITS])
-        models = tuple(self._compile(value) for value in everything)
-        leaves: dict[str, Any] = {
-            "id": np.arange(len(everything), dtype=np.int32),
-            "context": np.float32(scale(everything, values["train"])[:, None]),
-            "params": {self.vary: np.float32(everything)},
-            "model": {name: np.float32(leaf) for name, leaf in stack_differing(models).items()},
-            "goal": {},
-        }
-        ends = np.cumsum([len(values[s]) for s in SPLITS])
-        rows = {s: np.arange(end - len(values[s]), end) for s, end in zip(SPLITS, ends, strict=True)}
-        return Table(Task(**leaves), rows, models)
-
-    def compile_spec(self, value: float) -> mujoco.MjSpec:
-        """Return the editable model of the task with this parameter value."""
-        file = resources.files("mtjax.envs") / "models" / self.model_file
-        spec = mujoco.MjSpec.from_string(file.read_text())
-        self.prepare(spec)
-        self.parameters[self.vary].edit(spec, float(value))
-        return spec
-
-    def _compile(self, value: float) -> mujoco.MjModel:
-        return self.compile_spec(value).compile()
-
-    @cached_property
-    def simulator(self) -> Engine:
-        """The engine that runs this family; MuJoCo C keeps the model's own solver settings."""
-        if choose_engine(self.engine) == "c":
-            return MujocoC(self.table.models, self.num_substeps)
-        return self.mjx
-
-    @cached_property
-    def mjx(self) -> Mjx:
-        """The MJX engine of this family, which also answers questions of geometry for the other one."""
-        base = self._compile(self.listed_values[0])
-        base.opt.iterations = self.solver_iterations or self.default_iterations
-        base.opt.ls_iterations = 2 * base.opt.iterations
-        return Mjx(base, self.num_substeps)
-
-
-def scale(values: np.ndarray, train: np.ndarray) -> np.ndarray:
-    """Map values so that the training range becomes [-1, 1]; a range of one value becomes 0."""
-    centre, half = (train[0] + train[-1]) / 2, (train[-1] - train[0]) / 2
-    return (values - centre) / half if half else values - centre
-
-
-def split_values(scheme: str, values: np.ndarray, minimum: float) -> dict[str, np.ndarray]:
-    """Choose the parameter values of each split.
-
-    ``dense``: train on all values; interpolation is the midpoints between neighbours; extrapolation one and two steps
-    beyond each end, where a step is that end's spacing. Steps that leave the parameter's range are left out.
-    ``hip-bmdp`` (Zhang et al. 2021, by the indices of MTRL's configuration): of ten values.
-    """
-    if scheme == "hip-bmdp":
-        return {name: values[list(indices)] for name, indices in _HIP_BMDP.items()}
-    gaps = np.diff(values)
-    beyond = np.zeros(0)
-    if len(gaps):
-        first, last = gaps[0], gaps[-1]
-        beyond = np.array([values[0] - 2 * first, values[0] - first, values[-1] + last, values[-1] + 2 * last])
-        beyond = beyond[beyond > minimum + 1e-9]
-    return {"train": values, "interpolation": values[:-1] + gaps / 2, "extrapolation": beyond}
-
-
-def stack_differing(models: Sequence[mujoco.MjModel]) -> dict[str, np.ndarray]:
-    """Stack the fields that differ between compiled models into arrays (T, ...), by MJX name ("opt.gravity").
-
-    Raises:
-        InputError: a field differs that one program cannot hold in several versions; it names field and task.
-    """
-    mjx = mjx_module()
-    differing = {}
-    for owner, prefix, read in ((mjx.Model, "", lambda m: m), (mjx.Option, "opt.", lambda m: m.opt)):
-        for field in dataclasses.fields(owner):
-            if not hasattr(read(models[0]), field.name) or field.name.startswith(_UNUSED) or field.name == "opt":
-                continue
-            column = [np.asarray(getattr(read(m), field.name)) for m in models]
-            odd = next((i for i, x in enumerate(column) if not np.array_equal(x, column[0])), None)
-            if odd is None:
-                continue
-            # MJX keeps site sizes out of its traced leaves but reads them as values only (touch sensors).
-            if "Array" not in str(field.type) and field.name != "site_size":
-                raise InputError(f"task {odd} changes {prefix}{field.name}, which must be the same in every task")
-            differing[prefix + field.name] = np.stack(column)
-    loss = differing.get("dof_frictionloss")
-    if loss is not None:  # MJX solves a friction row of exactly 0 as a rigid joint
-        differing["dof_frictionloss"] = np.where(np.any(loss > 0, axis=0), np.maximum(loss, 1e-8), loss)
-    return differing
-
-
-def start_joints(model: mujoco.MjModel, key: Key) -> Array:
-    """Draw joint positions as dm_control does: limited joints in their range, free hinges in [-pi, pi] (nq,)."""
-    limited = model.jnt_limited.astype(bool)
-    hinge = model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
-    default = np.stack([model.qpos0, model.qpos0], axis=-1)
-    ends = np.where(limited[:, None], model.jnt_range, np.where(hinge[:, None], [-np.pi, np.pi], default))
-    return jax.random.uniform(key, (model.nq,), jnp.float32, *jnp.asarray(ends.T, jnp.float32))
+        return Spec(step.obs.shape[0], self.action_size, task.context.shape[0])

@@ -1,6 +1,7 @@
-"""The finger domain of dm_control: a two-link finger must keep a free spinner turning."""
+"""The finger domain of dm_control: a two-link finger turns a free spinner."""
 
 import dataclasses
+import math
 from types import MappingProxyType
 from typing import ClassVar
 
@@ -8,12 +9,12 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from mtjax.envs.family import Family, Parameter, start_joints
+from mtjax.envs.domain import Domain, start_joints
+from mtjax.envs.parameters import DAMPING, FRICTION, GEAR, MASS, Parameter
 from mtjax.envs.physics import World
 from mtjax.types import Array, Key, Task
 
 _SPIN_VELOCITY = 15.0  # [rad/s]
-_MAX_DRAWS = 1000
 
 
 def _scale_links(spec: mujoco.MjSpec, size: float) -> None:
@@ -34,8 +35,16 @@ def _widen_touch(spec: mujoco.MjSpec, size: float) -> None:
         site.size = [size, *site.size[1:]]
 
 
+def _set_spinner_frictionloss(spec: mujoco.MjSpec, value: float) -> None:
+    spec.joint("hinge").frictionloss = value
+
+
+def _set_spinner_damping(spec: mujoco.MjSpec, value: float) -> None:
+    spec.joint("hinge").damping[0] = value
+
+
 @dataclasses.dataclass(frozen=True)
-class FingerSpin(Family):
+class FingerSpin(Domain):
     """Spin: keep the spinner turning at 15 rad/s or more.
 
     Observation (9,), all after the step: angles of the proximal and distal joint [rad]; x and z of the spinner's tip
@@ -55,6 +64,9 @@ class FingerSpin(Family):
             agents master every size from 0.95 to 1.13 (benchmarks/RESULTS.md).
         touch-size: first radius [m] of the ellipsoids in which the touch sensors feel, which is all that differs
             between the ten tasks MTEnv calls "finger-spin, vary size": they share one dynamics and one reward.
+        spinner-frictionloss, spinner-damping: dry friction [N m] and damping [N m s/rad] of the hinge, 0.1 and 0.03.
+        mass, friction, damping, gear: scale of all masses, of the sliding friction of all geoms, of the damping of all
+            joints, of the strength of both motors. There is no gravity.
 
     Differs from dm_control in: the floor never collides (at nominal size it is out of reach; above size 1.07 the
     fingertip passes it), and under MJX the constraint solver stops after ``solver_iterations``.
@@ -62,37 +74,109 @@ class FingerSpin(Family):
 
     parameters: ClassVar = MappingProxyType(
         {
-            "size": Parameter("1", 1.0, 0.0, _scale_links),
-            "touch-size": Parameter("m", 0.025, 0.0, _widen_touch),
+            "size": Parameter("1", 1.0, _scale_links),
+            "touch-size": Parameter("m", 0.025, _widen_touch),
+            "spinner-frictionloss": Parameter("N m", 0.1, _set_spinner_frictionloss),
+            "spinner-damping": Parameter("N m s/rad", 0.03, _set_spinner_damping),
+            "mass": MASS,
+            "friction": FRICTION,
+            "damping": DAMPING,
+            "gear": GEAR,
         }
     )
     model_file: ClassVar[str] = "finger.xml"
     num_substeps: ClassVar[int] = 2
     episode_steps: ClassVar[int] = 1000
     default_iterations: ClassVar[int] = 2
+    warp_iterations: ClassVar[int] = 4
     starts_untouched: ClassVar[bool] = True
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
-        spec.joint("hinge").damping[0] = 0.03
+        _set_spinner_damping(spec, 0.03)
 
-    def start(self, task: Task, key: Key) -> tuple[Array, Array]:
-        model = self.table.models[0]
-
-        def draw(carry):
-            key, _, draws = carry
-            key, joint_key = jax.random.split(key)
-            return key, start_joints(model, joint_key), draws + 1
-
-        def rejected(carry):
-            _, qpos, draws = carry
-            return self.simulator.touching(task, qpos) & (draws < _MAX_DRAWS)
-
-        _, qpos, _ = jax.lax.while_loop(rejected, draw, draw((key, None, 0)))
-        return qpos, jnp.zeros(model.nv)
+    def start(self, task: Task, key: Key) -> tuple[Array, ...]:
+        model = self.models[0]
+        return self.start_apart(task, key, lambda key: start_joints(model, key)), jnp.zeros(model.nv)
 
     def observe(self, task: Task, world: World) -> Array:
-        joints, tip, hinge, velocities, touch = jnp.split(world.sensors, (2, 5, 8, 11))
-        return jnp.concatenate([joints, (tip - hinge)[jnp.array([0, 2])], velocities, jnp.log1p(touch)])
+        model = self.models[0]
+        point = self.leaf(task, "site_pos")[model.site("tip").id]
+        tip = self.planar(task, world).offset(model.body("spinner").id, point)
+        return jnp.concatenate([world.qpos[:2], tip, world.qvel, jnp.log1p(world.sensors)])
 
     def reward(self, task: Task, world: World, action: Array) -> Array:
         return (world.qvel[2] <= -_SPIN_VELOCITY).astype(jnp.float32)
+
+
+@dataclasses.dataclass(frozen=True)
+class FingerTurn(FingerSpin):
+    """Turn: bring the spinner's tip into a target on the circle that it runs on.
+
+    Observation (12,): FingerSpin's, then x and z of the target relative to the hinge [m], and the distance from the tip
+        to the target's surface, negative inside [m].
+    Action (2,): as FingerSpin.
+    Reward: 1 while the tip is inside the target, else 0; returns lie in [0, 1000].
+    Start: as FingerSpin, with the target at an angle uniform in [-pi, pi].
+    Episode: as FingerSpin.
+
+    Parameters that can vary: FingerSpin's, where the hinge's damping is 0.5 N m s/rad, and
+        target-size: radius [m] of the target; dm_control's turn-easy has 0.07 and turn-hard 0.03.
+
+    Differs from dm_control as FingerSpin does.
+    """
+
+    parameters: ClassVar = MappingProxyType(
+        {
+            **FingerSpin.parameters,
+            "spinner-damping": Parameter("N m s/rad", 0.5, _set_spinner_damping),
+            "target-size": Parameter("m", 0.07),
+        }
+    )
+
+    def prepare(self, spec: mujoco.MjSpec) -> None:
+        pass  # the model's own damping is this task's
+
+    def start(self, task: Task, key: Key) -> tuple[Array, ...]:
+        target_key, joint_key = jax.random.split(key)
+        return *super().start(task, joint_key), self.target(task, self.target_angle(task, target_key))
+
+    def target_angle(self, task: Task, key: Key) -> Array:
+        """The target's angle () [rad] in an episode: 0 is up, positive towards x."""
+        return jax.random.uniform(key, minval=-math.pi, maxval=math.pi)
+
+    def target(self, task: Task, angle: Array) -> Array:
+        """Where the target is (2,): x and z [m] from the hinge, as far as the spinner's first capsule is long."""
+        radius = jnp.sum(self.leaf(task, "geom_size")[self.models[0].geom("cap1").id])
+        return radius * jnp.stack([jnp.sin(angle), jnp.cos(angle)])
+
+    def distance(self, task: Task, world: World) -> Array:
+        """From the tip to the surface of the target, () [m], negative inside."""
+        tip = super().observe(task, world)[2:4]
+        return jnp.linalg.norm(world.extra - tip) - task.goal["target-size"]
+
+    def observe(self, task: Task, world: World) -> Array:
+        return jnp.concatenate([super().observe(task, world), world.extra, self.distance(task, world)[None]])
+
+    def reward(self, task: Task, world: World, action: Array) -> Array:
+        return (self.distance(task, world) <= 0).astype(jnp.float32)
+
+
+@dataclasses.dataclass(frozen=True)
+class FingerTurnTarget(FingerTurn):
+    """Turn to the task's target: FingerTurn with the target always at the task's angle.
+
+    As FingerTurn, but for the observation (9,), which is FingerSpin's: where the target is, only the task's context
+    shows.
+
+    Further parameter: target-angle [rad], 0 up and positive towards x.
+    """
+
+    parameters: ClassVar = MappingProxyType(
+        {**FingerTurn.parameters, "target-angle": Parameter("rad", 0.0, minimum=-math.inf)}
+    )
+
+    def target_angle(self, task: Task, key: Key) -> Array:
+        return task.goal["target-angle"]
+
+    def observe(self, task: Task, world: World) -> Array:
+        return FingerSpin.observe(self, task, world)

@@ -1,0 +1,259 @@
+"""Families of one MuJoCo model: parameters become models, and models become the leaves that differ.
+
+Tasks are built on the host by editing an ``MjSpec`` and compiling it, so that every derived field is MuJoCo's own;
+then only the leaves that differ between tasks are stacked.
+"""
+
+import abc
+import copy
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property, partial
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import tyro
+
+from mtjax.envs.family import Family
+from mtjax.envs.physics import ENGINES, Engine, Mjx, MujocoC, World, choose_engine, mjx_module
+from mtjax.envs.planar import Planar, is_planar, locate
+from mtjax.names import nearest_error
+from mtjax.types import Array, InputError, Key, Step, Task
+
+# Fields of the model that never reach the dynamics: statistics, and what only a renderer reads.
+_UNUSED = ("stat", "cam_", "light_", "mat_", "tex_", "name", "_", "signature", "geom_rgba")
+_MAX_DRAWS = 1000
+INTEGRATORS = ("model", "euler")
+
+
+@dataclasses.dataclass(frozen=True)
+class Domain(Family):
+    """Tasks of one MuJoCo model. Subclasses give the model, the start of an episode, observation and reward."""
+
+    engine: Annotated[str, tyro.conf.arg(name="engine", prefix_name=False)] = "auto"
+    """Physics engine: auto, mjx (any device), warp (NVIDIA GPUs) or c (MuJoCo's C engine, threaded; CPU only). Auto is
+    c on a CPU, warp on an NVIDIA GPU where it is installed and faster, and mjx elsewhere."""
+    solver_iterations: int = 0
+    """Constraint solver iterations of MJX and Warp, and twice as many line-search steps; 0 is the domain's own choice
+    for the engine."""
+    integrator: str = "model"
+    """How MJX and Warp integrate: as the model says (cartpole and acrobot: rk4), or euler, faster and less exact."""
+
+    model_file: ClassVar[str]  # a file in mtjax/envs/models, a path, or the MJCF itself
+    num_substeps: ClassVar[int]
+    default_iterations: ClassVar[int]  # of MJX, where each costs about as much as the rest of a step
+    warp_iterations: ClassVar[int] = 10  # of Warp, where they are cheap
+    gpu_engine: ClassVar[str] = "warp"  # what "auto" is on an NVIDIA GPU, as measured: mjx or warp
+    starts_untouched: ClassVar[bool] = False  # no force sensor feels anything when an episode begins
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.engine not in ENGINES:
+            raise nearest_error("engine", self.engine, ENGINES)
+        if self.integrator not in INTEGRATORS:
+            raise nearest_error("integrator", self.integrator, INTEGRATORS)
+        if self.solver_iterations < 0:
+            raise InputError(f"solver-iterations must be at least 0, not {self.solver_iterations}")
+
+    # What a domain gives.
+
+    def prepare(self, spec: mujoco.MjSpec) -> None:
+        """Edit the model in the way that all tasks share, before the parameters do."""
+
+    def starts(self, models: Sequence[mujoco.MjModel], random: np.random.Generator) -> np.ndarray | None:
+        """States (R, P, nq + nv) in which episodes of each model begin, if ``start`` cannot draw them itself."""
+
+    @abc.abstractmethod
+    def start(self, task: Task, key: Key) -> tuple[Array, ...]:
+        """Draw the positions (nq,) and velocities (nv,) in which an episode begins; and what else a world carries."""
+
+    @abc.abstractmethod
+    def observe(self, task: Task, world: World) -> Array:
+        """Return the observation (O,) of a world."""
+
+    @abc.abstractmethod
+    def reward(self, task: Task, world: World, action: Array) -> Array:
+        """Return the reward () of having arrived in a world."""
+
+    # What every domain does.
+
+    def reset(self, task: Task, key: Key) -> Step:
+        """Begin an episode of ``task`` in a fresh random state."""
+        put = self.simulator.place if self.starts_untouched else self.simulator.forward
+        world = put(task, *self.start(task, key))
+        return Step(world, self.observe(task, world), jnp.float32(0), jnp.bool_(False))
+
+    def step(self, task: Task, state: World, action: Array) -> Step:
+        """Advance one control step under ``action`` (A,) in [-1, 1]; observation and reward are those after it."""
+        world = self.simulator.step(task, state, action)
+        return Step(world, self.observe(task, world), self.reward(task, world, action), jnp.bool_(False))
+
+    def set_physics(self, task: Task, state: World, qpos: Array, qvel: Array) -> World:
+        """Return the same state with the given positions (nq,) and velocities (nv,)."""
+        as_float = lambda x: jnp.asarray(x, jnp.float32)
+        return self.simulator.forward(task, as_float(qpos), as_float(qvel), None if state is None else state.extra)
+
+    def leaf(self, task: Task, name: str) -> Array:
+        """A field of the task's compiled model, by its name in MJX, such as "geom_size" (ngeom, 3)."""
+        if name in task.model:
+            return task.model[name]
+        return jnp.asarray(getattr(self.models[0], name), jnp.float32)
+
+    def planar(self, task: Task, world: World) -> Planar:
+        """Where all bodies are and how fast they move, of a model that moves in the x-z plane."""
+        if not is_planar(self.models[0]):
+            raise InputError(f"the model of {type(self).__name__} leaves the x-z plane; declare sensors instead")
+        return locate(self.models[0], partial(self.leaf, task), world.qpos, world.qvel)
+
+    def forward_velocity(self, task: Task, world: World) -> Array:
+        """Velocity along x of the centre of mass of everything, () [m/s]."""
+        mass = self.leaf(task, "body_mass")
+        return jnp.dot(mass, self.planar(task, world).velocity[:, 0], precision="highest") / jnp.sum(mass)
+
+    def start_apart(self, task: Task, key: Key, draw: Callable[[Key], Array]) -> Array:
+        """Draw positions (nq,) until nothing touches, as often as dm_control does."""
+
+        def again(carry):
+            key, _, draws = carry
+            key, draw_key = jax.random.split(key)
+            return key, draw(draw_key), draws + 1
+
+        def rejected(carry):
+            _, qpos, draws = carry
+            return self.simulator.touching(task, qpos) & (draws < _MAX_DRAWS)
+
+        return jax.lax.while_loop(rejected, again, again((key, None, 0)))[1]
+
+    # Models.
+
+    def _read_model(self) -> mujoco.MjSpec:
+        if self.model_file.lstrip().startswith("<"):
+            return mujoco.MjSpec.from_string(self.model_file)
+        path = Path(str(resources.files("mtjax.envs") / "models")) / self.model_file  # an absolute path stands alone
+        if not path.is_file():
+            raise InputError(f"there is no model file {str(path)!r}")
+        return mujoco.MjSpec.from_file(str(path))
+
+    def compile_spec(self, values: Mapping[str, float] | None = None) -> mujoco.MjSpec:
+        """Return the editable model of the task with these parameter values; other parameters keep the model's own."""
+        spec = self._read_model()
+        self.prepare(spec)
+        given = values or {}
+        for name, parameter in self.parameters.items():
+            if parameter.edit is not None and name in given:
+                parameter.edit(spec, float(given[name]))
+        return spec
+
+    @cached_property
+    def models(self) -> tuple[mujoco.MjModel, ...]:
+        """The compiled model of every row of the table; rows that differ in goals alone share one."""
+        names = [name for name in self.values if self.parameters[name].edit is not None]
+        rows = list(zip(*(self.values[name].tolist() for name in names), strict=True))
+        compiled = {row: self.compile_spec(dict(zip(names, row, strict=True))).compile() for row in dict.fromkeys(rows)}
+        if not names:
+            return (self.compile_spec().compile(),) * self.count
+        return tuple(compiled[row] for row in rows)
+
+    def build(self) -> dict[str, dict[str, Any]]:
+        """Return the "model" and "goal" leaves (R, ...) of every row of the table."""
+        leaves = {name: np.float32(leaf) for name, leaf in stack_differing(self.models).items()}
+        goal, starts = self.goals(), self.starts(self.models, np.random.default_rng(self.task_seed))
+        return {"model": leaves, "goal": goal if starts is None else goal | {"starts": np.float32(starts)}}
+
+    @property
+    def action_size(self) -> int:  # type: ignore
+        """Motors of the model."""
+        return self.models[0].nu
+
+    @property
+    def seconds_per_step(self) -> float:
+        """How long a control step lasts [s]."""
+        return self.models[0].opt.timestep * self.num_substeps
+
+    @property
+    def engine_name(self) -> str:
+        """The engine that runs this family on this device."""
+        sized = "site_size" in self.table.tasks.model  # which Warp cannot vary
+        return choose_engine(self.engine, "mjx" if sized else self.gpu_engine)
+
+    @cached_property
+    def simulator(self) -> Engine:
+        """The engine that runs this family; MuJoCo C keeps the model's own solver settings."""
+        if self.engine_name == "c":
+            return MujocoC(self.models, self.num_substeps)
+        if self.engine_name == "warp":
+            from mtjax.envs.warp import Warp
+
+            return Warp(self._base(self.warp_iterations), self.num_substeps)
+        return self.mjx
+
+    @cached_property
+    def mjx(self) -> Mjx:
+        """The MJX engine of this family."""
+        return Mjx(self._base(self.default_iterations), self.num_substeps)
+
+    def _base(self, iterations: int) -> mujoco.MjModel:
+        """The first task's model with the settings of an engine that stops early."""
+        base = copy.copy(self.models[0])
+        base.opt.iterations = self.solver_iterations or iterations
+        base.opt.ls_iterations = 2 * base.opt.iterations
+        if self.integrator == "euler":
+            base.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
+        return base
+
+
+def stack_differing(models: Sequence[mujoco.MjModel]) -> dict[str, np.ndarray]:
+    """Stack the fields that differ between compiled models into arrays (R, ...), by MJX name ("opt.gravity").
+
+    Raises:
+        InputError: a field differs that one program cannot hold in several versions; it names field and task.
+    """
+    mjx = mjx_module()
+    first = {}  # model -> the first task that has it; many tasks may share one
+    for task, model in enumerate(models):
+        first.setdefault(id(model), task)
+    unique = [models[task] for task in first.values()]
+    place = {identity: i for i, identity in enumerate(first)}
+    places = [place[id(model)] for model in models]
+    differing = {}
+    for owner, prefix, read in ((mjx.Model, "", lambda m: m), (mjx.Option, "opt.", lambda m: m.opt)):
+        for field in dataclasses.fields(owner):
+            if not hasattr(read(models[0]), field.name) or field.name.startswith(_UNUSED) or field.name == "opt":
+                continue
+            column = [getattr(read(m), field.name) for m in unique]
+            odd = _first_unlike(column)
+            if odd is None:
+                continue
+            # MJX keeps site sizes out of its traced leaves but reads them as values only (touch sensors).
+            if "Array" not in str(field.type) and field.name != "site_size":
+                task = first[id(unique[odd])]
+                raise InputError(f"task {task} changes {prefix}{field.name}, which must be the same in every task")
+            differing[prefix + field.name] = np.stack(column)[places]
+    loss = differing.get("dof_frictionloss")
+    if loss is not None:  # MJX solves a friction row of exactly 0 as a rigid joint
+        differing["dof_frictionloss"] = np.where(np.any(loss > 0, axis=0), np.maximum(loss, 1e-8), loss)
+    return differing
+
+
+def _first_unlike(column: Sequence[Any]) -> int | None:
+    """The first of several values or arrays that is not equal to the first one."""
+    if not isinstance(column[0], np.ndarray):
+        return next((i for i, x in enumerate(column) if x != column[0]), None)
+    if any(x.shape != column[0].shape for x in column):
+        return next(i for i, x in enumerate(column) if x.shape != column[0].shape)
+    unlike = np.any((np.stack(column) != column[0]).reshape(len(column), -1), axis=1)
+    return int(np.argmax(unlike)) if np.any(unlike) else None
+
+
+def start_joints(model: mujoco.MjModel, key: Key) -> Array:
+    """Draw joint positions as dm_control does: limited joints in their range, free hinges in [-pi, pi] (nq,)."""
+    limited = model.jnt_limited.astype(bool)
+    hinge = model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
+    default = np.stack([model.qpos0, model.qpos0], axis=-1)
+    ends = np.where(limited[:, None], model.jnt_range, np.where(hinge[:, None], [-np.pi, np.pi], default))
+    return jax.random.uniform(key, (model.nq,), jnp.float32, *jnp.asarray(ends.T, jnp.float32))

@@ -1,0 +1,70 @@
+"""Quantities that may differ between tasks, and the ones that every MuJoCo model has."""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import mujoco
+
+
+class Parameter(NamedTuple):
+    """A quantity that may differ between tasks: physical if it edits the model, otherwise a goal."""
+
+    unit: str
+    nominal: float  # the value in the unedited model, or of a goal that does not vary
+    edit: Callable[[mujoco.MjSpec, float], None] | None = None  # writes the value into a spec; None: ``Task.goal``
+    minimum: float = 0.0  # values must be greater than this
+    maximum: float = math.inf  # and not greater than this
+
+
+def _scale_geom(geom: mujoco.MjsGeom, scale: float) -> None:
+    """Scale mass and inertia together, however the model gives them."""
+    if math.isnan(geom.mass):
+        geom.density *= scale
+    else:
+        geom.mass *= scale
+
+
+def _scale_body(body: mujoco.MjsBody, scale: float) -> None:
+    for geom in body.geoms:
+        _scale_geom(geom, scale)
+    if body.explicitinertial:
+        body.mass *= scale
+        body.inertia = body.inertia * scale
+        body.fullinertia = body.fullinertia * scale
+
+
+def _scale_mass(spec: mujoco.MjSpec, scale: float) -> None:
+    for body in spec.bodies:
+        _scale_body(body, scale)
+
+
+def _set_gravity(spec: mujoco.MjSpec, value: float) -> None:
+    spec.option.gravity = [0, 0, -value]
+
+
+def _scale_friction(spec: mujoco.MjSpec, scale: float) -> None:
+    for geom in spec.geoms:
+        geom.friction = [geom.friction[0] * scale, *geom.friction[1:]]
+
+
+def _scale_damping(spec: mujoco.MjSpec, scale: float) -> None:
+    for joint in spec.joints:
+        joint.damping = joint.damping * scale
+
+
+def _scale_gear(spec: mujoco.MjSpec, scale: float) -> None:
+    for actuator in spec.actuators:
+        actuator.gear = actuator.gear * scale
+
+
+def body_mass(name: str) -> Parameter:
+    """Scale of the mass and inertia of one body."""
+    return Parameter("1", 1.0, lambda spec, scale: _scale_body(spec.body(name), scale))
+
+
+MASS = Parameter("1", 1.0, _scale_mass)  # scale of all masses and inertias
+GRAVITY = Parameter("m/s^2", 9.81, _set_gravity)
+FRICTION = Parameter("1", 1.0, _scale_friction)  # scale of the sliding friction of all geoms
+DAMPING = Parameter("1", 1.0, _scale_damping)  # scale of the damping of all joints
+GEAR = Parameter("1", 1.0, _scale_gear)  # scale of the strength of all actuators

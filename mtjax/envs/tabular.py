@@ -1,0 +1,199 @@
+"""MTEnv's tabular tasks, drawn at random: Markov decision processes of a few states, and bandits."""
+
+import abc
+import dataclasses
+from collections.abc import Mapping
+from functools import cached_property
+from types import MappingProxyType
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mtjax.envs.family import Family, Table
+from mtjax.envs.parameters import Parameter
+from mtjax.types import SPLITS, Array, InputError, Key, Step, Task
+
+_MOST_HELD_OUT = 10
+
+
+@dataclasses.dataclass(frozen=True)
+class DrawnTasks(Family):
+    """Tasks that are tables of numbers in [0, 1], drawn at random; the context is all of them, from -1 to 1.
+
+    Task number i of a split depends on ``task_seed`` and i alone, so that more tasks keep the first ones. The split
+    "dense" holds out up to ten further draws as its interpolation tasks; "none" holds out nothing.
+    """
+
+    parameters: ClassVar[Mapping[str, Parameter]] = MappingProxyType({})
+
+    @property
+    @abc.abstractmethod
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """The tables of a task, and their shapes."""
+
+    @abc.abstractmethod
+    def draw(self, random: np.random.Generator) -> dict[str, np.ndarray]:
+        """Draw the tables of one task."""
+
+    def task_of(self, tables: Mapping[str, np.ndarray], row: int = 0) -> Task:
+        """Return the task (no leading axis) that these tables make, under the id of a row.
+
+        Raises:
+            InputError: a table is missing or superfluous, or has another shape.
+        """
+        return jax.tree.map(jnp.asarray, self._host_task(tables, row))
+
+    def _host_task(self, tables: Mapping[str, np.ndarray], row: int) -> Task:
+        goal = {name: np.asarray(table, np.float32) for name, table in tables.items()}
+        if {name: table.shape for name, table in goal.items()} != self.shapes:
+            given = {name: table.shape for name, table in goal.items()}
+            raise InputError(f"the tables of a task have the shapes {self.shapes}, not {given}")
+        numbers = np.concatenate([goal[name].ravel() for name in self.shapes])
+        leaves: dict[str, Any] = {"id": np.int32(row), "row": np.int32(row), "context": 2 * numbers - 1, "goal": goal}
+        return Task(**leaves, params={}, model={})
+
+    @property
+    def train_count(self) -> int:
+        """Training tasks."""
+        return self.num_tasks
+
+    @cached_property
+    def count(self) -> int:
+        """Rows of the table."""
+        return len(self.table.tasks.id)
+
+    @cached_property
+    def table(self) -> Table:
+        """Every task of every split."""
+        held_out = min(self.num_tasks, _MOST_HELD_OUT) if self.split == "dense" else 0
+        counts = dict(zip(SPLITS, (self.num_tasks, held_out, 0), strict=True))
+        seeds = [(self.task_seed, kind, i) for kind, count in enumerate(counts.values()) for i in range(count)]
+        tasks = [self._host_task(self.draw(np.random.default_rng(seed)), row) for row, seed in enumerate(seeds)]
+        ends = np.cumsum(list(counts.values()))
+        rows = {s: np.arange(end - counts[s], end) for s, end in zip(SPLITS, ends, strict=True)}
+        return Table(jax.tree.map(lambda *leaves: np.stack(leaves), *tasks), rows, None)
+
+
+class TabularState(NamedTuple):
+    """The state of a tabular MDP."""
+
+    cell: Array  # () int32
+    key: Key  # of the chances to come
+
+
+@dataclasses.dataclass(frozen=True)
+class TabularMDP(DrawnTasks):
+    """Tabular MDP: collect rewards in a process of a few states, whose chances differ between tasks.
+
+    Observation (num_states + 1,): the state as one-hot; the last reward, 0 at first.
+    Action (num_actions,): a score for each action in [-1, 1]; the highest is taken, of equal ones the first.
+    Reward: 1 with the probability that the task gives to this action in this state, else 0.
+    Start: any state, all as likely.
+    Episode: 100 steps; it never terminates.
+
+    A task is two tables. ``rewards`` (num_states, num_actions) holds the probabilities of a reward, uniform in [0, 1];
+        ``transitions`` (num_states, num_actions, num_states) those of the next state, the softmax of standard normal
+        numbers over its last axis. The context is both tables, flattened one after the other, as 2 x - 1.
+
+    Differs from MTEnv in: the action is a vector of scores; episodes are cut off after 100 steps, where its own have no
+    end; there are ``num_tasks`` tasks, where every reset of its task state draws a new one.
+    """
+
+    num_states: int = 4
+    """States of each process."""
+    num_actions: int = 5
+    """Actions in every state."""
+
+    episode_steps: ClassVar[int] = 100
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.num_states < 1 or self.num_actions < 1:
+            raise InputError("num-states and num-actions must be at least 1")
+
+    @property
+    def action_size(self) -> int:  # type: ignore[override]
+        """Scores, one an action."""
+        return self.num_actions
+
+    @property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        states, actions = self.num_states, self.num_actions
+        return {"rewards": (states, actions), "transitions": (states, actions, states)}
+
+    def draw(self, random: np.random.Generator) -> dict[str, np.ndarray]:
+        weights = np.exp(random.standard_normal(self.shapes["transitions"]))
+        rewards = random.uniform(size=self.shapes["rewards"])
+        return {"rewards": rewards, "transitions": weights / weights.sum(axis=-1, keepdims=True)}
+
+    def reset(self, task: Task, key: Key) -> Step:
+        start_key, key = jax.random.split(key)
+        cell = jax.random.randint(start_key, (), 0, self.num_states)
+        return self._step(TabularState(cell, key), jnp.float32(0))
+
+    def step(self, task: Task, state: TabularState, action: Array) -> Step:
+        reward_key, move_key, key = jax.random.split(state.key, 3)
+        chosen = jnp.argmax(action)
+        reward = jax.random.bernoulli(reward_key, task.goal["rewards"][state.cell, chosen]).astype(jnp.float32)
+        chances = task.goal["transitions"][state.cell, chosen]
+        cell = jax.random.categorical(move_key, jnp.log(chances))
+        return self._step(TabularState(cell.astype(jnp.int32), key), reward)
+
+    def _step(self, state: TabularState, reward: Array) -> Step:
+        obs = jnp.append(jax.nn.one_hot(state.cell, self.num_states), reward)
+        return Step(state, obs, reward, jnp.bool_(False))
+
+
+class BanditState(NamedTuple):
+    """The state of a bandit."""
+
+    key: Key  # of the chances to come
+
+
+@dataclasses.dataclass(frozen=True)
+class Bandit(DrawnTasks):
+    """Bandit: pull the arm that pays most often; which one that is differs between tasks.
+
+    Observation (1,): always 0.
+    Action (num_arms,): a score for each arm in [-1, 1]; the highest is pulled, of equal ones the first.
+    Reward: 1 with the probability that the task gives to this arm, else 0.
+    Episode: 100 pulls; it never terminates.
+
+    A task is one table: ``rewards`` (num_arms,) holds the probabilities of a reward, uniform in [0, 1]. The context is
+        that table, as 2 x - 1.
+
+    Differs from the multi-task bandits of MTEnv's examples in: the action is a vector of scores; episodes are cut off
+    after 100 pulls, where theirs have no end. As in its finite one, there are ``num_tasks`` tasks.
+    """
+
+    num_arms: int = 5
+    """Arms of each bandit."""
+
+    episode_steps: ClassVar[int] = 100
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.num_arms < 1:
+            raise InputError(f"num-arms must be at least 1, not {self.num_arms}")
+
+    @property
+    def action_size(self) -> int:  # type: ignore[override]
+        """Scores, one an arm."""
+        return self.num_arms
+
+    @property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        return {"rewards": (self.num_arms,)}
+
+    def draw(self, random: np.random.Generator) -> dict[str, np.ndarray]:
+        return {"rewards": random.uniform(size=self.num_arms)}
+
+    def reset(self, task: Task, key: Key) -> Step:
+        return Step(BanditState(key), jnp.zeros(1), jnp.float32(0), jnp.bool_(False))
+
+    def step(self, task: Task, state: BanditState, action: Array) -> Step:
+        pull_key, key = jax.random.split(state.key)
+        reward = jax.random.bernoulli(pull_key, task.goal["rewards"][jnp.argmax(action)]).astype(jnp.float32)
+        return Step(BanditState(key), jnp.zeros(1), reward, jnp.bool_(False))

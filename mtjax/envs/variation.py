@@ -1,0 +1,243 @@
+"""Which values the parameters of a family take in which task, and which tasks are held out."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mtjax.envs.parameters import Parameter
+from mtjax.names import nearest_error
+from mtjax.types import InputError
+
+COMBINATIONS = ("grid", "paired", "random")
+SCHEMES = ("dense", "hip-bmdp", "none")
+_HIP_BMDP = {"train": (3, 4, 7, 8), "interpolation": (5, 6), "extrapolation": (2, 9)}
+_FORMS = "lo:hi:n (n even steps), lo:hi (a new value each episode) or a list a,b,c"
+
+
+class Axis(NamedTuple):
+    """The values of one parameter: points for tasks to take, or a range in which every episode draws anew."""
+
+    points: np.ndarray  # (n,), or the two ends of a range
+    continuous: bool
+
+
+class Variation(NamedTuple):
+    """The values of all varied parameters, by split, in rows: a row is a task, a column a parameter."""
+
+    names: tuple[str, ...]
+    rows: Mapping[str, np.ndarray]  # split -> (R, names)
+    draws: np.ndarray | None  # (T, P, names) values of which each episode of a training task takes one
+    low: np.ndarray  # (names,) ends of the training range
+    high: np.ndarray
+
+    @property
+    def varied(self) -> tuple[str, ...]:
+        """The parameters that differ between training tasks or episodes."""
+        return tuple(name for name, low, high in zip(self.names, self.low, self.high, strict=True) if low < high)
+
+
+def write_values(given: str | float | Sequence[float]) -> str:
+    """Return a parameter's values as the command line spells them."""
+    if isinstance(given, str):
+        return given
+    points = np.atleast_1d(np.asarray(given, np.float64))
+    return ",".join(repr(float(x)) for x in points)
+
+
+def read_axis(name: str, text: str, parameter: Parameter) -> Axis:
+    """Read "lo:hi:n", "lo:hi" or "a,b,c".
+
+    Raises:
+        InputError: the text is none of these, or a value is outside the parameter's range.
+    """
+    try:
+        parts = text.split(":")
+        if len(parts) == 1:
+            axis = Axis(np.array([float(x) for x in text.split(",")]), False)
+        elif len(parts) == 2:
+            axis = Axis(np.array([float(x) for x in parts]), True)
+        else:
+            low, high, count = parts
+            axis = Axis(np.linspace(float(low), float(high), int(count)), False)
+            if int(count) == 1:
+                raise InputError(f"{text} asks for one value of {name}; give it alone, or a range of at least two")
+    except ValueError:
+        raise InputError(f"cannot read the values {text!r} of {name}; give {_FORMS}") from None
+    if not axis.points.size:
+        raise InputError(f"{name} has no values; give {_FORMS}")
+    if len(parts) > 1 and float(parts[1]) <= float(parts[0]) and axis.points.size > 1:
+        raise InputError(f"the range of {name} must go from low to high, not {text}")
+    wrong = next((x for x in axis.points if not np.isfinite(x) or not _allowed(x, parameter)), None)
+    if wrong is not None:
+        limit = "" if np.isinf(parameter.maximum) else f" and at most {parameter.maximum:g}"
+        raise InputError(f"{name} must be greater than {parameter.minimum:g}{limit}, not {wrong:g}")
+    return axis
+
+
+def _allowed(value: Any, parameter: Parameter) -> bool:
+    return parameter.minimum + 1e-9 < value <= parameter.maximum + 1e-9
+
+
+def vary(
+    given: Mapping[str, str],
+    parameters: Mapping[str, Parameter],
+    combine: str,
+    num_tasks: int,
+    split: str,
+    num_draws: int,
+    seed: int,
+) -> Variation:
+    """Choose the values of every task of every split.
+
+    Args:
+        given: the values of each varied parameter, as ``read_axis`` reads them.
+        combine: how several parameters combine: every combination ("grid"), value by value ("paired"), or
+            ``num_tasks`` tasks drawn uniformly between each one's least and greatest value ("random").
+        split: "dense" trains on all; interpolation is between neighbouring training values, extrapolation one and two
+            steps beyond each end of each parameter, where a step is that end's spacing (in a grid, of a continuous
+            range a tenth); steps that leave a parameter's range are left out. "hip-bmdp" (Zhang et al. 2021, by the
+            indices of MTRL's configuration): of ten tasks. "none" holds nothing out.
+        num_draws: values that stand for the continuous ranges of one task.
+        seed: of random tasks and draws.
+
+    Raises:
+        InputError: a name is unknown, or the values do not fit each other or the split.
+    """
+    for kind, value, allowed in (("combine", combine, COMBINATIONS), ("split", split, SCHEMES)):
+        if value not in allowed:
+            raise nearest_error(kind, value, allowed)
+    for name in given:
+        if not parameters:
+            raise InputError(f"unknown parameter {name!r}; this family has none")
+        if name not in parameters:
+            raise nearest_error("parameter", name, parameters)
+    names = tuple(given)
+    axes = {name: read_axis(name, text, parameters[name]) for name, text in given.items()}
+    limits = [parameters[name] for name in names]
+    random = np.random.default_rng(seed)
+    if combine == "random":
+        rows = _random_rows(axes, limits, num_tasks, split, random)
+    else:
+        rows = _listed_rows(axes, limits, combine, split)
+    low, high = _ends(list(axes.values()), rows["train"], combine)
+    continuous = [i for i, axis in enumerate(axes.values()) if axis.continuous and combine != "random"]
+    draws = _draw(rows["train"], continuous, low, high, num_draws, random) if continuous else None
+    return Variation(names, rows, draws, low, high)
+
+
+def _ends(axes: list[Axis], train: np.ndarray, combine: str) -> tuple[np.ndarray, np.ndarray]:
+    """Least and greatest value (names,) of each parameter in training: of ranges their ends, whatever is drawn."""
+    ranged = [axis.continuous or combine == "random" for axis in axes]
+    values = [axis.points if whole else column for axis, whole, column in zip(axes, ranged, train.T, strict=True)]
+    return np.array([np.min(x) for x in values]), np.array([np.max(x) for x in values])
+
+
+def _draw(train: np.ndarray, columns: list[int], low, high, count: int, random: np.random.Generator) -> np.ndarray:
+    """Values (T, P, names) for the episodes of training tasks (T, names), of which some columns are ranges."""
+    draws = np.repeat(train[:, None], count, axis=1)
+    for i in columns:
+        # One draw in each of P equal parts of the range: no gaps, whatever the seed.
+        parts = random.permuted(np.tile(np.arange(count), (len(train), 1)), axis=1)
+        draws[:, :, i] = low[i] + (parts + random.uniform(size=parts.shape)) / count * (high[i] - low[i])
+    return draws
+
+
+def _random_rows(axes, limits, num_tasks: int, split: str, random: np.random.Generator) -> dict[str, np.ndarray]:
+    if num_tasks < 1:
+        raise InputError(f"combine=random needs num-tasks of at least 1, not {num_tasks}")
+    if split == "hip-bmdp":
+        raise InputError("split hip-bmdp numbers listed tasks; with combine=random use --split=dense or none")
+    low, high = (np.array([end(axis.points) for axis in axes.values()]) for end in (np.min, np.max))
+    if not np.any(high > low):
+        raise InputError("combine=random needs a parameter with more than one value; use --env.combine=grid")
+    train = random.uniform(low, high, (num_tasks, len(low)))
+    held = min(num_tasks, 10) if split == "dense" else 0
+    inside, beyond = random.uniform(low, high, (held, len(low))), random.uniform(low, high, (held, len(low)))
+    wide = np.flatnonzero(high > low)
+    kept = []
+    for row in beyond if len(wide) else []:
+        i = random.choice(wide)
+        step = random.uniform(0, 0.2) * (high[i] - low[i])
+        ends = [x for x in (low[i] - step, high[i] + step) if _allowed(x, limits[i])]
+        if ends:
+            row[i] = random.choice(ends)
+            kept.append(row)
+    return {"train": train, "interpolation": inside, "extrapolation": _stack(kept, len(low))}
+
+
+def _listed_rows(axes: Mapping[str, Axis], limits, combine: str, split: str) -> dict[str, np.ndarray]:
+    train = _combine([np.mean(a.points, keepdims=True) if a.continuous else a.points for a in axes.values()], combine)
+    if split == "hip-bmdp":
+        if len(train) != 10:
+            raise InputError(f"split hip-bmdp numbers ten tasks, and this family has {len(train)}; use --split=dense")
+        return {name: train[list(indices)] for name, indices in _HIP_BMDP.items()}
+    if split == "none":
+        return {"train": train, "interpolation": train[:0], "extrapolation": train[:0]}
+    between = _between_rows(train) if combine == "paired" else _between_grid(list(axes.values()))
+    beyond = _beyond_rows(train) if combine == "paired" else _beyond_grid(list(axes.values()))
+    beyond = [row for row in beyond if all(_allowed(x, limit) for x, limit in zip(row, limits, strict=True))]
+    width = train.shape[1]
+    return {"train": train, "interpolation": _stack(between, width), "extrapolation": _stack(beyond, width)}
+
+
+def _stack(rows, width: int) -> np.ndarray:
+    return np.reshape(np.array(rows, np.float64), (len(rows), width))
+
+
+def _combine(points: list[np.ndarray], combine: str) -> np.ndarray:
+    if combine == "paired":
+        counts = {len(p) for p in points if len(p) > 1} or {1}
+        if len(counts) > 1:
+            raise InputError(f"combine=paired needs as many values of each parameter, not {sorted(counts)}")
+        rows = np.stack([np.broadcast_to(p, max(counts)) for p in points], axis=1) if points else np.zeros((1, 0))
+    else:
+        if any(np.any(np.diff(p) <= 0) and np.any(np.diff(p) >= 0) for p in points):
+            raise InputError("the values of a parameter must increase (or decrease), and these do not")
+        rows = (
+            np.stack([x.ravel() for x in np.meshgrid(*points, indexing="ij")], axis=1) if points else np.zeros((1, 0))
+        )
+    if len(np.unique(rows, axis=0)) < len(rows):
+        raise InputError("two tasks have the same values")
+    return rows
+
+
+def _between_rows(train: np.ndarray) -> np.ndarray:
+    return (train[:-1] + train[1:]) / 2
+
+
+def _beyond_rows(train: np.ndarray) -> list[np.ndarray]:
+    if len(train) < 2:
+        return []
+    first, last = train[1] - train[0], train[-1] - train[-2]
+    return [train[0] - 2 * first, train[0] - first, train[-1] + last, train[-1] + 2 * last]
+
+
+def _between_grid(axes: list[Axis]) -> np.ndarray:
+    """Midpoints of every cell of the grid; of a continuous range five values inside it."""
+    if not any(len(axis.points) > 1 for axis in axes):
+        return np.zeros((0, len(axes)))
+    return np.stack([x.ravel() for x in np.meshgrid(*map(_inside, axes), indexing="ij")], axis=1)
+
+
+def _inside(axis: Axis) -> np.ndarray:
+    if axis.continuous:
+        return np.linspace(axis.points[0], axis.points[1], 7)[1:-1]
+    return _between_rows(axis.points) if len(axis.points) > 1 else axis.points
+
+
+def _beyond_grid(axes: list[Axis]) -> list[np.ndarray]:
+    """One parameter at a time beyond its ends, the others at their middle value."""
+    middle = np.array([np.mean(a.points) if a.continuous else a.points[(len(a.points) - 1) // 2] for a in axes])
+    rows = []
+    for i, axis in enumerate(axes):
+        steps = np.linspace(axis.points[0], axis.points[1], 11) if axis.continuous else axis.points
+        for value in _beyond_rows(steps):
+            rows.append(np.where(np.arange(len(axes)) == i, value, middle))
+    return rows
+
+
+def scale(values: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Map values (..., names) so that the training range becomes [-1, 1]; a range of one value becomes 0."""
+    half = (high - low) / 2
+    return (values - (low + high) / 2) / np.where(half > 0, half, 1.0)

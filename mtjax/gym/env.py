@@ -1,0 +1,176 @@
+"""One world of one family as a Gymnasium environment with MTEnv's interface."""
+
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import gymnasium
+import jax
+import numpy as np
+from gymnasium import spaces
+
+from mtjax import envs, render
+from mtjax.envs.domain import Domain
+from mtjax.gym.tasks import TaskStream, TaskTable, read_options
+from mtjax.names import nearest_error
+from mtjax.types import Array, Env, InputError, Step, Task
+
+MTENV_IDS = {
+    "MT-CartPole-v0": "control-cartpole",
+    "MT-Acrobat-v0": "control-acrobot",  # MTEnv spells it so
+    "MT-TabularMDP-v0": "tabular-mdp",
+    "MT-TwoGoalMaze-v0": "two-goal-maze",
+    "MT-HiPBMDP-Finger-Spin-vary-size-v0": "finger-spin-vary-touch-size",
+    "MT-HiPBMDP-Cheetah-Run-vary-torso-length-v0": "cheetah-run-vary-torso-length",
+    "MT-HiPBMDP-Walker-Walk-vary-friction-v0": "walker-walk-vary-friction",
+    "MT-HiPBMDP-Walker-Walk-vary-len-v0": "walker-walk-vary-foot-length",
+}
+_METAWORLD = "MT-MetaWorld-"
+
+
+class Programs(NamedTuple):
+    """A family's functions, compiled once for all environments of the family."""
+
+    reset: Any  # task, seed (2,) uint32 -> Step
+    step: Any  # task, state, action -> Step
+
+
+def begin(family: Env, task: Task, seed: Array) -> Step:
+    """Begin an episode with the key made of ``seed`` (2,) uint32."""
+    return family.reset(task, jax.random.wrap_key_data(seed, impl="threefry2x32"))
+
+
+@lru_cache
+def _programs(family: Env) -> Programs:
+    return Programs(jax.jit(lambda task, seed: begin(family, task, seed)), jax.jit(family.step))
+
+
+def draw_seeds(random: np.random.Generator, *shape: int) -> np.ndarray:
+    """Draw the seeds (..., 2) of episodes."""
+    return random.integers(2**32, size=(*shape, 2), dtype=np.uint32)
+
+
+def spaces_of(family: Env, table: TaskTable) -> tuple[spaces.Dict, spaces.Box]:
+    """The observations and actions of one world."""
+    obs = spaces.Box(-np.inf, np.inf, (family.spec.obs_size,), np.float32)
+    action = spaces.Box(-1.0, 1.0, (family.spec.action_size,), np.float32)
+    return spaces.Dict({"env_obs": obs, "task_obs": table.space}), action
+
+
+def read_action(action: Any, space: spaces.Space) -> np.ndarray:
+    """Return actions as float32, or raise InputError if their shape is not that of the space."""
+    action = np.asarray(action, np.float32)
+    if action.shape != space.shape:
+        raise InputError(f"an action has the shape {space.shape}, not {action.shape}")
+    return action
+
+
+def family_named(name: str, settings: dict[str, Any]) -> Env:
+    """The family with this name, or the one that MTEnv registers under it."""
+    if name.startswith(_METAWORLD):
+        raise InputError(f"{name}: the Meta-World families are not part of mtjax yet")
+    if name.startswith("MT-") and name not in MTENV_IDS:
+        raise nearest_error("environment of MTEnv", name, MTENV_IDS)
+    return envs.make(MTENV_IDS.get(name, name), **settings)
+
+
+def make(
+    name: str, *, tasks: str = "train", task_obs: str = "context", render_mode: str | None = None, **settings: Any
+) -> "FamilyEnv":
+    """Return the family ``name``, or MTEnv's ``name``, as a Gymnasium environment.
+
+    Args:
+        name: as ``mtjax.make`` knows it, or one of ``MTENV_IDS``.
+        tasks: the split that is sampled: train, interpolation, extrapolation or all.
+        task_obs: what is seen of the task: its context, its id, or none.
+        render_mode: "rgb_array" for families that MuJoCo simulates, or None.
+        settings: fields of the family.
+
+    Raises:
+        InputError: a name or a value is not one of these.
+    """
+    return FamilyEnv(family_named(name, settings), tasks, task_obs, render_mode)
+
+
+class FamilyEnv(TaskStream, gymnasium.Env):
+    """A family with MTEnv's interface: ``reset`` begins an episode of the present task and never changes the task.
+
+    Observation: ``env_obs`` (O,), what a single-task environment returns; ``task_obs``, what may be seen of the task:
+        its context (C,), its number among all tasks of the family, or nothing (0,).
+    Action: (A,) in [-1, 1]. A time limit truncates.
+    Task state: an int, which with the family's settings is all that is needed to enter the task again. The first task
+        of the split is entered at the start; a new task needs a reset before it can be stepped.
+    Streams: ``reset(seed=...)`` seeds the environment's, ``seed_task(seed)`` or ``reset(options={"task_seed": seed})``
+        the tasks'; unseeded they start from fresh entropy.
+    Info: ``task_id``, the task's number, and ``params``, its parameters in SI units.
+    """
+
+    def __init__(self, family: Env, tasks: str = "train", task_obs: str = "context", render_mode: str | None = None):
+        self.family, self.render_mode, self._programs = family, render_mode, _programs(family)
+        self.metadata = _metadata(family)
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise InputError(
+                f"render_mode must be one of {[None, *self.metadata['render_modes']]}, not {render_mode!r}"
+            )
+        self._table = TaskTable(family, tasks, task_obs)
+        self.observation_space, self.action_space = spaces_of(family, self._table)
+        self._elapsed = 0
+        self.set_task_state(self._table.first)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
+        """Begin an episode of the present task. The one option is ``task_seed``."""
+        super().reset(seed=seed)
+        options = read_options(options, ("task_seed",))
+        if "task_seed" in options:
+            self.seed_task(options["task_seed"])
+        self._step, self._elapsed = self._programs.reset(self._task, draw_seeds(self.np_random)), 0
+        return self._observe(), self._table.describe(self._row)
+
+    def step(self, action: np.ndarray) -> tuple[dict, float, bool, bool, dict]:
+        """Advance one step under ``action`` (A,)."""
+        if self._step is None:
+            raise gymnasium.error.ResetNeeded("call reset() first, and after each change of the task")
+        step = self._programs.step(self._task, self._step.state, read_action(action, self.action_space))
+        self._step, self._elapsed = step, self._elapsed + 1
+        truncated = self._elapsed >= self.family.episode_length
+        info = self._table.describe(self._row)
+        return self._observe(), float(step.reward), bool(step.terminated), truncated, info
+
+    def render(self) -> np.ndarray | None:
+        """Draw the world as it is now (height, width, 3) uint8."""
+        if self.render_mode is None or self._step is None:
+            raise InputError("to draw, give render_mode='rgb_array' to make, and reset first")
+        return render.film(self.family, int(self._task.row), np.asarray(self._step.state.qpos)[None])[0]  # type: ignore
+
+    def get_task_obs(self) -> Any:
+        """What may be seen of the present task."""
+        return self._table.observe(self._row)
+
+    def get_task_state(self) -> int:
+        """All that is needed to enter the present task again."""
+        return self._row
+
+    def set_task_state(self, task_state: int) -> None:
+        """Enter a task. The episode of the former one is over: reset next."""
+        self._row = self._table.check(task_state)
+        self._task = self._table.enter(self._row)
+        self._step: Step | None = None
+
+    def sample_task_state(self) -> int:
+        """Draw a task from the tasks' stream, without entering it."""
+        return self._table.sample(self.np_random_task, 1)[0]
+
+    def reset_task_state(self) -> None:
+        """Draw a task and enter it."""
+        self.set_task_state(self.sample_task_state())
+
+    def _observe(self) -> dict[str, Any]:
+        return {"env_obs": np.array(self._step.obs), "task_obs": self.get_task_obs()}  # type: ignore
+
+
+def _metadata(family: Env) -> dict[str, Any]:
+    if not isinstance(family, Domain):
+        return {"render_modes": []}
+    return {
+        "render_modes": ["rgb_array"],
+        "render_fps": round(1 / family.seconds_per_step),
+    }

@@ -1,0 +1,50 @@
+"""Choosing tasks inside a program: pure functions on tables of tasks, as MTEnv's wrappers are on its environments.
+
+``mtjax.gym`` has the same as wrappers of Gymnasium environments.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from mtjax.types import Env, InputError, Key, Task
+
+
+def n_tasks(env: Env, n: int, key: Key, split: str = "train") -> Task:
+    """Draw a fixed bag of ``n`` tasks of a split, with leading axis ``n``.
+
+    They are different tasks of the table; where parameters are continuous, ``n`` fresh draws of them.
+
+    Raises:
+        InputError: the split has fewer than ``n`` tasks, or none.
+    """
+    table = env.tasks(split)
+    count, endless = len(table.id), table.draws is not None
+    if n < 1 or not count or (n > count and not endless):
+        raise InputError(f"cannot draw {n} different tasks from the {count} of split {split!r}")
+    row_key, draw_key = jax.random.split(key)
+    rows = jax.random.choice(row_key, count, (n,), replace=endless)
+    bag = jax.tree.map(lambda x: x[rows], table)
+    return jax.vmap(episode_task)(bag, jax.random.split(draw_key, n))
+
+
+def with_ids(tasks: Task) -> Task:
+    """Number the tasks of a bag (n,) from 0, for agents that see the number; each keeps its physics."""
+    return tasks._replace(id=jnp.arange(len(tasks.id), dtype=jnp.int32))
+
+
+def sample_random_task(tasks: Task, key: Key) -> Task:
+    """Draw one task from a table (T,), where parameters are continuous with fresh values; at each reset, say."""
+    row_key, draw_key = jax.random.split(key)
+    row = jax.random.randint(row_key, (), 0, len(tasks.id))
+    return episode_task(jax.tree.map(lambda x: x[row], tasks), draw_key)
+
+
+def episode_task(task: Task, key: Key) -> Task:
+    """The task of one episode: ``task`` itself, or where its parameters are continuous a fresh draw.
+
+    A draw keeps the identity of the task it is drawn for, and has parameters and a context of its own.
+    """
+    if task.draws is None:
+        return task
+    choice = jax.random.randint(key, (), 0, len(task.draws.id))
+    return jax.tree.map(lambda x: x[choice], task.draws)._replace(id=task.id)

@@ -1,0 +1,260 @@
+"""Every MuJoCo domain in every engine: one step from the same states under the same actions.
+
+States are those of random play with MuJoCo C. Half of the worlds have one model and half another, so that a step which
+takes its model from the wrong row is off in every world.
+"""
+
+import importlib.util
+from functools import lru_cache
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from mtjax import envs
+from mtjax.envs import physics
+from mtjax.envs.domain import Domain
+from mtjax.envs.physics import Mjx, MujocoC, World
+from mtjax.types import InputError, Task
+
+COUNT = 64  # worlds
+PLAYED = 60  # control steps before the one that is compared
+# Each domain, and what differs between its two tasks. Cartpole and acrobot are integrated by Runge-Kutta.
+VARIED = {
+    "acrobot-swingup": {"gravity": "8,11"},
+    "ball-in-cup-catch": {"mass": "0.8,1.2"},
+    "cartpole-swingup": {"pole-length": "0.9,1.2"},
+    "cheetah-run": {"torso-length": "0.5,0.6"},
+    "finger-spin": {"size": "0.95,1.05"},
+    "finger-turn-easy": {"size": "0.95,1.05"},
+    "hopper-hop": {"foot-length": "0.9,1.1"},
+    "pendulum-swingup": {"length": "0.4,0.6"},
+    "point-mass-easy": {"mass": "0.8,1.2"},
+    "reacher-easy": {"mass": "0.8,1.2"},
+    "walker-walk": {"foot-length": "0.08,0.12"},
+}
+DOMAINS = list(VARIED)
+# Bounds on each world's largest error in velocity, by quantile, relative to the domain's fastest velocity. MJX and Warp
+# count in float32, whose relative rounding of 6e-8 ten substeps and the mass matrix's condition amplify up to tenfold;
+# in contact the solver stops where float32 sees no more progress, which is a hundred times sooner in elliptic cones.
+FREE = {0.5: 1e-6, 1: 1e-5}
+TOUCHING = {0.5: 3e-5, 0.9: 3e-4, 1: 1e-2}
+
+
+class Play(NamedTuple):
+    """Worlds that random play has reached, and the step that is compared."""
+
+    tasks: Task
+    world: World
+    action: np.ndarray
+    step: object  # C's
+
+
+def family(name, **settings):
+    return envs.make(name, vary=VARIED[name], split="none", **settings)
+
+
+@lru_cache
+def played(name):
+    env = family(name, engine="c")
+    tasks = jax.tree.map(lambda x: x[np.arange(COUNT) % 2], env.tasks())
+    world = jax.jit(jax.vmap(env.reset))(tasks, jax.random.split(jax.random.key(0), COUNT)).state
+    actions = np.random.RandomState(1).uniform(-1, 1, (PLAYED // 5 + 1, COUNT, env.spec.action_size))
+    actions = np.repeat(np.float32(actions), 5, axis=0)[: PLAYED + 1]
+    step = jax.jit(jax.vmap(env.step))
+    for action in actions[:-1]:
+        world = step(tasks, world, action).state
+    return Play(tasks, world, actions[-1], step(tasks, world, actions[-1]))
+
+
+def compiled(function, *arguments):
+    """Compile for few steps of few worlds: most of the time, without the optimisations of many."""
+    return jax.jit(function).lower(*arguments).compile(compiler_options={"xla_backend_optimization_level": 0})
+
+
+def alone(engine, task, world, action):
+    """One world's step by plain MuJoCo calls: the state that is handed on, and what is sensed in it."""
+    model = engine.models[int(task.row)]
+    data = mujoco.MjData(model)
+    state = np.concatenate([world.qpos, world.qvel, world.warmstart])
+    data.qpos[:], data.qvel[:], data.qacc_warmstart[:], data.ctrl[:] = *world[:3], action
+    for _ in range(engine.num_substeps):
+        mujoco.mj_step(model, data)
+    state = np.float32(np.concatenate([data.qpos, data.qvel, data.qacc_warmstart]))
+    data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = np.split(state, (model.nq, model.nq + model.nv))
+    mujoco.mj_step1(model, data)
+    return state, np.float32(data.sensordata)
+
+
+@pytest.mark.parametrize("name", DOMAINS)
+def test_c_steps_as_plain_mujoco_does(name):
+    """Bit for bit in every world, for three steps of which the later ones go on from the batch's own state."""
+    tasks, world, action, _ = played(name)
+    engine = family(name, engine="c").simulator
+    step = jax.jit(jax.vmap(engine.step))
+    for _ in range(3):
+        new = step(tasks, world, action)
+        state = np.concatenate(new[:3], axis=1)
+        for i in range(0, COUNT, 3):
+            take = lambda tree, i=i: jax.tree.map(lambda x: np.asarray(x)[i], tree)
+            expected, sensed = alone(engine, take(tasks), take(world), action[i])
+            np.testing.assert_array_equal(state[i], expected)
+            np.testing.assert_array_equal([] if new.sensors is None else new.sensors[i], sensed)
+        world = new
+
+
+def errors(play, new):
+    """The largest error in velocity of each world (COUNT,), relative to the fastest velocity of all."""
+    exact = np.asarray(play.step.state.qvel)
+    return np.max(np.abs(exact - new.qvel), axis=1) / np.max(np.abs(exact))
+
+
+def assert_agreement(name, new):
+    """Hold the worlds of an engine to C's; as C with the other task's model would not be."""
+    play, engine = played(name), family(name, engine="c").simulator
+    touching = [jax.vmap(engine.touching)(play.tasks, world.qpos) for world in (play.world, play.step.state)]
+    touching = np.any(touching, axis=0)
+    found = errors(play, new)
+    for bounds, worlds in ((FREE, ~touching), (TOUCHING, touching)):
+        measured = {q: float(np.quantile(found[worlds], q)) for q in bounds if np.any(worlds)}
+        assert all(measured[q] <= bounds[q] for q in measured), (name, measured, int(worlds.sum()))
+    if new.sensors is not None:
+        sensed = np.max(np.abs(play.step.state.sensors - new.sensors), axis=1)
+        assert np.quantile(sensed, 0.5) <= 1e-6 * max(1, np.max(np.abs(new.sensors)))
+    other = play.tasks._replace(row=1 - play.tasks.row)
+    wrong = jax.vmap(engine.step)(other, play.world, play.action)
+    assert np.median(errors(play, wrong)) > 10 * np.median(found)
+
+
+@pytest.mark.parametrize("name", DOMAINS)
+def test_mjx_steps_as_c_does(name):
+    """With solver iterations to spare: it stops by itself where the solution no longer improves."""
+    play, engine = played(name), family(name, engine="mjx", solver_iterations=50).simulator
+    step = compiled(jax.vmap(engine.step), play.tasks, play.world, play.action)
+    assert_agreement(name, step(play.tasks, play.world, play.action))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", DOMAINS)
+def test_warp_steps_as_c_does(name):
+    """Under a map of a map, which picks every world's own model."""
+    pytest.importorskip("warp")
+    from mtjax.envs.warp import Warp
+
+    play, mjx = played(name), family(name, engine="mjx", solver_iterations=50).mjx
+    engine = Warp(mjx.base, mjx.num_substeps)
+    nested = jax.tree.map(lambda x: jnp.reshape(x, (4, COUNT // 4, *x.shape[1:])), play[:3])
+    new = compiled(jax.vmap(jax.vmap(engine.step)), *nested)(*nested)
+    assert_agreement(name, jax.tree.map(lambda x: np.reshape(x, (COUNT, *x.shape[2:])), new))
+
+
+def test_every_domain_is_tested():
+    """A MuJoCo domain that has a name has a line here."""
+    files = {cls.model_file for cls, _ in envs.ENVS.values() if issubclass(cls, Domain)}
+    assert {envs.ENVS[name][0].model_file for name in DOMAINS} >= files
+
+
+def test_c_results_do_not_depend_on_what_the_batch_did_before():
+    """After a start, a question of contact, other worlds or other tasks, a step is that of a fresh engine."""
+    play = played("finger-spin")
+    env = family("finger-spin", engine="c")
+    tasks, world, action, _ = play
+    used, mapped = MujocoC(env.models, env.num_substeps), jax.vmap
+    turned = jax.tree.map(lambda x: x[::-1], (tasks, world, action))
+    half = world._replace(qpos=jnp.where(np.arange(COUNT)[:, None] % 2, world.qpos, world.qpos[::-1]))
+    other = tasks._replace(row=1 - tasks.row)
+    calls = [
+        lambda e: mapped(e.step)(tasks, world, action),
+        lambda e: mapped(e.step)(tasks, mapped(e.step)(tasks, world, action), -action),
+        lambda e: mapped(e.step)(other, mapped(e.step)(tasks, world, action), action),
+        lambda e: mapped(e.forward)(tasks, world.qpos, world.qvel),
+        lambda e: mapped(e.step)(tasks, mapped(e.forward)(tasks, world.qpos, world.qvel), action),
+        lambda e: mapped(e.step)(tasks, half, action),
+        lambda e: mapped(e.touching)(tasks, world.qpos),
+        lambda e: mapped(e.step)(tasks, world._replace(warmstart=0 * world.warmstart), action),
+        lambda e: mapped(e.step)(*turned),
+    ]
+    for i in np.random.RandomState(0).randint(len(calls), size=30):
+        fresh = MujocoC(env.models, env.num_substeps)
+        jax.tree.map(np.testing.assert_array_equal, calls[i](used), calls[i](fresh))
+
+
+def test_extra_is_carried_along():
+    """What a domain remembers passes through every method of an engine untouched, or is None."""
+    env, mjx = family("finger-spin", engine="c"), family("finger-spin", engine="mjx").mjx
+    task = jax.tree.map(lambda x: x[0], env.tasks())
+    qpos, qvel, extra = jnp.zeros(3), jnp.zeros(3), {"goal": jnp.arange(2.0), "key": jax.random.key(0)}
+    for engine in (env.simulator, mjx):
+        run = lambda extra, engine=engine: engine.step(task, engine.place(task, qpos, qvel, extra), jnp.zeros(2))
+        assert jax.tree.structure(jax.eval_shape(run, extra).extra) == jax.tree.structure(extra)
+    world = env.simulator.forward(task, qpos, qvel, extra)
+    assert env.simulator.step(task, world, jnp.zeros(2)).extra == extra
+    assert env.simulator.forward(task, qpos, qvel).extra is None
+
+
+ROD = """<mujoco><worldbody><body><joint name="j" axis="0 1 0" damping="0.1"/><site name="s" pos="1 0 0"/>
+<geom type="capsule" fromto="0 0 0 1 0 0" size="0.05"/></body></worldbody>
+<tendon><fixed name="t"><joint joint="j" coef="2"/></fixed></tendon>
+<actuator><motor name="m" joint="j" gear="3"/></actuator><sensor>%s</sensor></mujoco>"""
+INVOLVED = """<tendonpos tendon="t"/><tendonvel tendon="t"/><actuatorpos actuator="m"/><actuatorvel actuator="m"/>
+<accelerometer site="s"/>"""
+
+
+def test_rare_sensors_read_as_in_c():
+    """Those of motors and tendons after the step, and those of forces, before which MJX stops without constraints."""
+    base = mujoco.MjModel.from_xml_string(ROD % INVOLVED)
+    zero = np.int32(0)
+    task = Task(zero, zero, np.zeros(1, np.float32), {}, {}, {})
+
+    def run(engine):
+        world = engine.forward(task, jnp.ones(1), jnp.ones(1))
+        return world, engine.step(task, world, jnp.ones(1))
+
+    exact, found = (jax.jit(lambda engine=engine: run(engine))() for engine in (MujocoC([base], 2), Mjx(base, 2)))
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-5), exact, found)
+    new = found[1]
+    np.testing.assert_allclose(new.sensors[:2], [2 * new.qpos[0], 2 * new.qvel[0]], rtol=1e-6)
+    assert np.linalg.norm(new.sensors[4:]) > 1
+
+
+def test_a_model_with_a_state_of_its_own_is_refused():
+    """A clock would read differently in the same state."""
+    base = mujoco.MjModel.from_xml_string(ROD % "<clock/>")
+    for engine in (Mjx, lambda base, count: MujocoC([base], count)):
+        with pytest.raises(InputError, match="no state but positions and velocities"):
+            engine(base, 1)
+
+
+def test_warp_is_refused_where_it_cannot_run(monkeypatch):
+    """It says what to install, or which engine to take instead."""
+    installed = lambda yes: monkeypatch.setattr(importlib.util, "find_spec", lambda name: yes or None)
+    installed(False)
+    with pytest.raises(InputError, match=r"pip install 'mtjax\[warp\]'"):
+        physics.choose_engine("warp")
+    installed(True)
+    assert physics.choose_engine("warp") == "warp" and physics.choose_engine("auto", preferred="warp") == "c"
+    for platform, engine in (("PJRT C API rocm 6", "mjx"), ("PJRT C API cuda 13", "warp")):
+        client = type("Client", (), {"platform_version": platform})
+        monkeypatch.setattr(jax, "devices", lambda client=client: [type("Device", (), {"client": client})])
+        monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+        assert physics.choose_engine("auto", preferred="warp") == engine
+        assert physics.choose_engine("auto") == "mjx"
+    monkeypatch.setattr(jax, "default_backend", lambda: "tpu")
+    with pytest.raises(InputError, match="needs an NVIDIA GPU"):
+        physics.choose_engine("warp")
+
+
+def test_warp_refuses_tasks_that_differ_in_the_size_of_sites():
+    """Warp holds one value of it for all worlds."""
+    pytest.importorskip("warp")
+    from mtjax.envs.warp import Warp
+
+    env = envs.make("finger-spin-vary-touch-size", engine="mjx")
+    engine = Warp(env.mjx.base, env.num_substeps)
+    task = jax.tree.map(lambda x: x[0], env.tasks())
+    world = World(*(jnp.zeros(3),) * 3, jnp.zeros(13))
+    with pytest.raises(InputError, match="cannot vary site_size between tasks; use --engine=mjx"):
+        jax.eval_shape(engine.step, task, world, jnp.zeros(2))

@@ -1,0 +1,105 @@
+"""Every registered family, whatever runs it: it starts, steps, stays finite, repeats itself and names its tasks."""
+
+import json
+import shlex
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mtjax
+import mtjax.evaluate
+import mtjax.train
+from mtjax.envs import ENVS, register
+from mtjax.tasks import episode_task
+from mtjax.types import SPLITS, InputError
+
+STEPS = 200
+NAMES = [pytest.param(name, marks=[pytest.mark.slow] if name.startswith("brax-") else []) for name in ENVS]
+
+
+def ends(env):
+    """The first and last task of each split, twice: the ends of the range, and beyond."""
+    tasks, rows = env.tasks("all"), [env.table.rows[split] for split in SPLITS]
+    chosen = np.repeat([end for row in rows if len(row) for end in (row[0], row[-1])], 2)
+    return jax.tree.map(lambda x: x[chosen], tasks)
+
+
+@partial(jax.jit, static_argnums=0)
+def play(env, tasks, keys):
+    """Random actions for 200 steps in every world: first observations, and all that followed."""
+    tasks = jax.vmap(episode_task)(tasks, keys)
+    start = jax.vmap(env.reset)(tasks, keys)
+
+    def step(state, i):
+        draw = lambda key: jax.random.uniform(jax.random.fold_in(key, i), (env.spec.action_size,), minval=-1.0)
+        after = jax.vmap(env.step)(tasks, state, jax.vmap(draw)(keys))
+        return after.state, (after.obs, after.reward, after.terminated)
+
+    return start, *jax.lax.scan(step, start.state, jnp.arange(STEPS))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_family_steps_at_the_ends_of_its_range(name):
+    """200 random steps: sizes as declared, all finite until an episode ends, starts that differ, and the same again."""
+    env = mtjax.make(name)
+    tasks = ends(env)
+    keys = jax.random.split(jax.random.key(0), len(tasks.id))
+    start, state, (obs, reward, terminated) = play(env, tasks, keys)
+    count = len(tasks.id)
+    assert obs.shape == (STEPS, count, env.spec.obs_size) and obs.dtype == reward.dtype == jnp.float32
+    assert tasks.context.shape == (count, env.spec.context_size) and env.episode_length >= 1
+    alive = np.cumsum(terminated, axis=0) - np.asarray(terminated) == 0
+    assert np.all(np.isfinite(np.asarray(obs)[alive])) and np.all(np.isfinite(np.asarray(reward)[alive]))
+    assert max(np.ptp(np.asarray(x), axis=0).max() for x in (obs, reward)) > 0
+    again = play(env, tasks, keys)
+    for one, other in zip(
+        jax.tree.leaves((start, state, obs)), jax.tree.leaves((*again[:2], again[2][0])), strict=True
+    ):
+        assert jnp.all(one == other)
+
+
+@pytest.mark.parametrize("name", ENVS)
+def test_family_round_trips_its_tasks(name):
+    """A task is found again by its number, has its own name, and is unlike every other of its family."""
+    env = mtjax.make(name)
+    tasks = env.tasks("all")
+    np.testing.assert_array_equal(tasks.id, np.arange(len(tasks.id)))
+    parts = [env.tasks(split) for split in SPLITS]
+    for leaf, *pieces in zip(*map(jax.tree.leaves, (tasks, *parts)), strict=True):
+        np.testing.assert_array_equal(leaf, np.concatenate([np.asarray(x) for x in pieces]))
+    assert len({env.describe(row) for row in range(len(tasks.id))}) == len(tasks.id)
+    assert len(np.unique(np.asarray(tasks.context), axis=0)) == len(tasks.id)
+    assert np.all(np.abs(np.asarray(env.tasks().context)) <= 1 + 1e-5)
+
+
+def test_a_family_of_ones_own_is_trained_and_evaluated(tmp_path, monkeypatch, capsys):
+    """The worked example, by the commands that are printed; and it is under 60 lines."""
+    file = Path(__file__).parents[1] / "examples" / "own_environment.py"
+    assert len(file.read_text().splitlines()) < 60
+    monkeypatch.setenv("MTJAX_CACHE", "0")
+    small = (
+        "--steps=480 --num-envs=2 --batch-size=2 --replay-size=50 --warmup-steps=1 --chunk-steps=20 --agent.hidden 4"
+    )
+    words = [f"--import={file}", "--env=spring", "--eval-episodes=1", f"--runs={tmp_path}", *small.split()]
+    mtjax.train.main(words)
+    (run,) = tmp_path.iterdir()
+    command = shlex.split(json.loads((run / "config.json").read_text())["command"])
+    assert f"--import={file}" in command
+    env = mtjax.make("spring")
+    assert env.varied == ("stiffness", "goal") and [m.jnt_stiffness[0] for m in env.models[:12:3]] == [5, 10, 15, 20]
+    capsys.readouterr()
+    mtjax.evaluate.main([f"--run={run}", "--episodes=1"])
+    assert "extrapolation" in capsys.readouterr().out
+    monkeypatch.delitem(ENVS, "spring")
+
+
+def test_names_are_given_once_and_with_settings_that_exist():
+    with pytest.raises(InputError, match="already"):
+        register("finger-spin", ENVS["finger-spin"][0])
+    with pytest.raises(InputError, match="unknown setting of mine 'varry'"):
+        register("mine", ENVS["finger-spin"][0], varry={})
+    assert "mine" not in ENVS
