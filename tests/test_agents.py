@@ -11,6 +11,7 @@ from probes import learner, pick, random_batch, tasks_of, tiny
 from mtjax import normalize
 from mtjax.agents import AGENTS, agent
 from mtjax.agents.sac import CONDITIONINGS, load_vectors
+from mtjax.agents.surgery import RULES
 from mtjax.networks import Params
 from mtjax.types import InputError, Spec
 
@@ -24,6 +25,7 @@ VALID = [(name, told) for name in AGENTS for told in CONDITIONINGS if (name, tol
 # Each tells tasks apart in its own way, and pcgrad must compose with every network that an agent brings.
 TRACED = [(*combination, "mean") for combination in VALID]
 TRACED += [(name, "embedding" if name == "sac" else "parameters", "pcgrad") for name in AGENTS]
+TRACED += [("sac-conditioned", "parameters", rule) for rule in RULES if rule not in ("mean", "pcgrad")]
 # Those that are also run, as compiling takes seconds: every agent, and every way to tell the task.
 RUN = [
     ("sac", {}),
@@ -77,7 +79,7 @@ def test_every_combination_has_the_right_shapes(name, told, gradients, vectors):
     batch = random_batch(0, 3, BATCH, SPEC)
     after, metrics = jax.eval_shape(lambda state: agent.update(state, batch, TASKS, KEY), state)
     assert shapes(after) == shapes(state)
-    assert set(metrics) == SAC_METRICS | (CONFLICTS if gradients == "pcgrad" else set())
+    assert set(metrics) == SAC_METRICS | (CONFLICTS if gradients != "mean" else set())
     assert all(metrics[k].shape == (3,) for k in SAC_METRICS)
     assert all(metrics[k].shape == () for k in set(metrics) - SAC_METRICS)
     for keys in (None, jax.random.split(KEY, (3, ENVS))):

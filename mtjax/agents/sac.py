@@ -85,7 +85,7 @@ class SAC:
     """A .npy file of task vectors (T, V), a row for every training task, for conditioning on vectors."""
     heads: Literal["shared", "per-task"] = "shared"
     """Output layers of actor and critics: one for all tasks, or one for each."""
-    gradients: Literal["mean", "pcgrad"] = "mean"
+    gradients: surgery.RuleName = "mean"
     """How the tasks' gradients combine on the parameters that tasks share, in the actor and in the critics."""
 
     def __post_init__(self):

@@ -1,50 +1,31 @@
 """Gradient surgery: how the gradients of several tasks become one update of the parameters they share.
 
 Per-task gradients J (leading T) give a Gram matrix G = J J^T (T, T); a rule turns it into weights w (T,); the update is
-w^T J. Rules differ only in G -> w. A task's own parameters receive that task's gradient / T, as under plain averaging.
+w^T J. Rules (``rules.py``) differ only in G -> w. A task's own parameters receive that task's gradient / T, as under
+plain averaging.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 
+from mtjax.agents import rules
 from mtjax.networks import Params
 from mtjax.types import Array, Key, Metrics
 
-Rule = Callable[[Array, Key], Array]
-
-
-def pcgrad(gram: Array, key: Key) -> Array:
-    """Project away conflicts between tasks (Yu et al. 2020, algorithm 1), exactly, on T-vectors.
-
-    Each task's gradient is c^T J with c = e_i; in a fresh random order over the other tasks j, where the two conflict,
-    c_j loses (c . G[:, j]) / G[j, j]. The result is the mean over tasks.
-
-    Args:
-        gram: (T, T) inner products of the tasks' gradients.
-        key: the random orders.
-
-    Returns:
-        weights (T,).
-    """
-    num_tasks = len(gram)
-    orders = jax.vmap(lambda k: jax.random.permutation(k, num_tasks))(jax.random.split(key, num_tasks))
-    norms = jnp.diagonal(gram)
-
-    def project(task: Array, order: Array) -> Array:
-        def against(c: Array, other: Array) -> tuple[Array, None]:
-            conflict = jnp.minimum(jnp.sum(c * gram[:, other]), 0.0)
-            share = jnp.where((other == task) | (norms[other] == 0), 0.0, conflict / norms[other])
-            return c - share * jax.nn.one_hot(other, num_tasks), None
-
-        return jax.lax.scan(against, jax.nn.one_hot(task, num_tasks), order, unroll=min(num_tasks, 10))[0]
-
-    return jnp.mean(jax.vmap(project)(jnp.arange(num_tasks), orders), axis=0)
-
-
-RULES: dict[str, Rule | None] = {"mean": None, "pcgrad": pcgrad}
+RuleName = Literal["mean", "pcgrad", "cagrad", "mgda", "imtl-g", "nash-mtl", "aligned-mtl", "upgrad"]
+RULES: dict[str, rules.Rule | None] = {
+    "mean": None,
+    "pcgrad": rules.pcgrad,
+    "cagrad": rules.cagrad,
+    "mgda": rules.mgda,
+    "imtl-g": rules.imtl_g,
+    "nash-mtl": rules.nash_mtl,
+    "aligned-mtl": rules.aligned_mtl,
+    "upgrad": rules.upgrad,
+}
 
 
 def gradient(rule: str, loss: Callable, params: Params, data: Any, key: Key) -> tuple[Params, Any, Metrics]:
