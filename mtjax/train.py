@@ -55,8 +55,9 @@ def main(argv: Sequence[str]) -> None:
 def _resumed(program: Program, directory: Path, argv: Sequence[str]) -> Program:
     """The program of the run to go on with; ``--steps`` may extend it, and nothing else may change."""
     given = {word.split("=", 1)[0] for word in argv if word.startswith("--")}
-    if given - {"--resume", "--steps"}:
-        other = ", ".join(sorted(given - {"--resume", "--steps"}))
+    allowed = {"--resume", "--steps", "--import"}
+    if given - allowed:
+        other = ", ".join(sorted(given - allowed))
         raise InputError(f"--resume goes on with a run as it was; only --steps may change, not {other}")
     recorded = cli.from_json(directory / "config.json")
     steps = program.plan.steps if "--steps" in given else recorded.plan.steps

@@ -2,7 +2,7 @@
 
 import dataclasses
 import shutil
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import ClassVar, NamedTuple
 
 import jax
@@ -34,7 +34,15 @@ class Programs(NamedTuple):
 @lru_cache
 def compiled(env) -> Programs:
     put = jax.vmap(lambda task, qpos, qvel: env.set_physics(task, None, qpos, qvel))
-    return Programs(jax.jit(jax.vmap(env.reset)), jax.jit(put), jax.jit(jax.vmap(env.step)))
+    quick = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})  # much is compiled, little run
+    return Programs(quick(jax.vmap(env.reset)), quick(put), quick(jax.vmap(env.step)))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def forget_programs():
+    """Drop a file's compiled programs after it: a process has room for some thousands, and dies of more."""
+    yield
+    jax.clear_caches()
 
 
 @pytest.fixture(scope="session")

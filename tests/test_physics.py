@@ -344,7 +344,7 @@ def test_c_serves_two_threads_at_once(worlds):
     """Two threads that step the same family at the same batch size do not mix their worlds."""
     env = envs.make("finger-spin", engine="c")
     tasks = jax.tree.map(lambda x: np.repeat(x, 100, axis=0), env.tasks())
-    states = [physics.World(worlds.qpos, worlds.qvel, 0 * worlds.qvel, np.zeros((100, 13), np.float32))] * 2
+    states = [physics.World(worlds.qpos, worlds.qvel, 0 * worlds.qvel, np.zeros((100, 2), np.float32))] * 2
     actions = [worlds.action, -worlds.action]
     step = jax.vmap(env.step)
     many = jax.jit(lambda w, a: jax.lax.fori_loop(0, 200, lambda _, w: step(tasks, w, a).state, w))

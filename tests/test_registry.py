@@ -28,7 +28,8 @@ def ends(env):
     return jax.tree.map(lambda x: x[chosen], tasks)
 
 
-@partial(jax.jit, static_argnums=0)
+# Much is compiled here and little run.
+@partial(jax.jit, static_argnums=0, compiler_options={"xla_backend_optimization_level": 0})
 def play(env, tasks, keys):
     """Random actions for 200 steps in every world: first observations, and all that followed."""
     tasks = jax.vmap(episode_task)(tasks, keys)
@@ -54,12 +55,12 @@ def test_family_steps_at_the_ends_of_its_range(name):
     assert tasks.context.shape == (count, env.spec.context_size) and env.episode_length >= 1
     alive = np.cumsum(terminated, axis=0) - np.asarray(terminated) == 0
     assert np.all(np.isfinite(np.asarray(obs)[alive])) and np.all(np.isfinite(np.asarray(reward)[alive]))
-    assert max(np.ptp(np.asarray(x), axis=0).max() for x in (obs, reward)) > 0
+    assert max(np.ptp(np.asarray(x)[alive], axis=0).max() for x in (obs, reward)) > 0
     again = play(env, tasks, keys)
     for one, other in zip(
         jax.tree.leaves((start, state, obs)), jax.tree.leaves((*again[:2], again[2][0])), strict=True
     ):
-        assert jnp.all(one == other)
+        assert jnp.all((one == other) | ((one != one) & (other != other)))  # after its end a world may be anything
 
 
 @pytest.mark.parametrize("name", ENVS)
