@@ -193,7 +193,7 @@ def batch_alone(name: str, vary: dict, per_task: int, steps: int) -> Callable[[]
 
 def playground(name: str, impl: str, worlds: int, steps: int) -> Callable[[], Any]:
     """Playground's environment in its own wrapper for training, with its default configuration but for the engine."""
-    from mujoco_playground import registry, wrapper
+    from mujoco_playground import registry, wrapper  # type: ignore  # not a dependency of this package
 
     env = registry.load(name, config_overrides={"impl": impl})
     env = wrapper.wrap_for_brax_training(env, episode_length=1000, action_repeat=1)
