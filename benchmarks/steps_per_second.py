@@ -61,7 +61,8 @@ def main() -> None:
     if arguments.agent != "none":
         rows.append(training_rate(arguments))
         print(f"training {arguments.agent}: {rows[-1]['steps_per_second']:,.0f} env-steps/s", flush=True)
-    report = {"machine": machine(), "settings": vars(arguments), "rows": rows}
+    settings = {name: value for name, value in vars(arguments).items() if name != "json"}
+    report = {"machine": machine(), "settings": settings, "rows": rows}
     print(json.dumps(report))
     if arguments.json:
         with open(arguments.json, "x") as file:

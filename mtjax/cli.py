@@ -269,7 +269,7 @@ def catalogue() -> str:
 def main(run: Any) -> None:
     """Run a program's entry point; what the user got wrong becomes a line and exit code 2."""
     try:
-        run(import_files(sys.argv[1:]))
+        run(sys.argv[1:])
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)

@@ -55,6 +55,7 @@ def main(argv: Sequence[str]) -> None:
 
 
 def _parse(argv: Sequence[str]) -> Request:
+    argv = cli.import_files(argv)
     known = [f"--{f.name}" for f in dataclasses.fields(Request)] + ["--no-video", "--help", "-h"]
     for word in argv:
         if word.startswith("-") and word.split("=")[0] not in known:

@@ -82,7 +82,7 @@ def _check(program: Program) -> None:
 
     _ = program.family.engine_name, program.family.table
     if program.learner.vectors:
-        load_vectors(program.learner.vectors, len(program.family.tasks("train").id))
+        load_vectors(program.learner.vectors, program.family.train_count)
 
 
 def new_directory(root: Path, name: str) -> Path:
@@ -147,7 +147,7 @@ def _summary(program: Program) -> str:
         for name, low, high in zip(found.names, found.low, found.high, strict=True)
         if low < high
     )
-    count = len(family.tasks("train").id)
+    count = family.train_count
     return (
         f"{count} training task{'s' * (count > 1)}{', ' * bool(ends)}{ends}, "
         f"split {family.split}, engine {family.engine_name}, seeds {plan.seed} to {plan.seed + plan.seeds - 1}"

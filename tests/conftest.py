@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from probes import QUICK
 
 import mtjax.train
 from mtjax.envs import ENVS
@@ -34,7 +35,7 @@ class Programs(NamedTuple):
 @lru_cache
 def compiled(env) -> Programs:
     put = jax.vmap(lambda task, qpos, qvel: env.set_physics(task, None, qpos, qvel))
-    quick = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})  # much is compiled, little run
+    quick = partial(jax.jit, compiler_options=QUICK)
     return Programs(quick(jax.vmap(env.reset)), quick(put), quick(jax.vmap(env.step)))
 
 

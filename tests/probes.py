@@ -20,7 +20,7 @@ AFTER = 5.0  # seen only once an episode has terminated, when its value must not
 LIMIT = 2  # steps after which an episode is cut off
 
 # Tests compile much and run little; without LLVM's optimisations they take half as long.
-_QUICK = {"xla_backend_optimization_level": 0}
+QUICK = {"xla_backend_optimization_level": 0}
 _SPEC = Spec(obs_size=1, action_size=1, context_size=1)
 
 
@@ -171,9 +171,9 @@ def tiny(name: str, **settings):
 @lru_cache
 def _programs(env, agent, settings: loop.Settings, num_seeds: int):
     tasks, seeds = env.tasks(), jnp.zeros(num_seeds, jnp.uint32)
-    init = loop.init.lower(env, agent, settings, tasks, seeds).compile(_QUICK)
+    init = loop.init.lower(env, agent, settings, tasks, seeds).compile(QUICK)
     state = jax.eval_shape(lambda: loop.init(env, agent, settings, tasks, seeds))
-    return init, loop.run_chunk.lower(env, agent, settings, tasks, state).compile(_QUICK)
+    return init, loop.run_chunk.lower(env, agent, settings, tasks, state).compile(QUICK)
 
 
 def train(env, agent, settings: loop.Settings, *, tasks: Task | None = None, seeds=(0,), chunks: int = 1):
@@ -189,7 +189,7 @@ def train(env, agent, settings: loop.Settings, *, tasks: Task | None = None, see
 
 def quick(function, *arguments):
     """Compile a function for arguments of these shapes."""
-    return jax.jit(function).lower(*arguments).compile(_QUICK)
+    return jax.jit(function).lower(*arguments).compile(QUICK)
 
 
 @lru_cache

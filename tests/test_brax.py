@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from probes import QUICK
 
 import mtjax.envs.brax as adapter
 from mtjax.envs.brax import BACKENDS, NAMES, Brax, BraxAntDirection, BraxHalfcheetahSpeed
@@ -25,7 +26,7 @@ STEPS = 20
 FOUR = {"mass": "1,3,1,1", "gravity": "9.81,9.81,3,9.81", "friction": "1,1,1,0.1"}
 CONTROL_STEP = 0.05  # [s] of ant and half-cheetah
 
-QUICK = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})  # much is compiled, little run
+quick = partial(jax.jit, compiler_options=QUICK)
 
 
 @lru_cache
@@ -33,7 +34,7 @@ def programs(env):
     """Reset, placement and step of an environment, mapped over a flat batch."""
     place = lambda task, qpos, qvel: env.set_physics(task, None, qpos, qvel)
     functions = {"reset": env.reset, "place": place, "step": env.step}
-    return SimpleNamespace(**{name: QUICK(jax.vmap(function)) for name, function in functions.items()})
+    return SimpleNamespace(**{name: quick(jax.vmap(function)) for name, function in functions.items()})
 
 
 def actions(size):
@@ -74,8 +75,8 @@ def brax_rollout(name, backend, count):
     """The same by Brax alone, in a batch as large: rounding depends on its size, and contacts amplify it."""
     with adapter._without_remarks():
         theirs = adapter.brax_module().envs.get_environment(name, backend=backend)
-    step = QUICK(jax.vmap(theirs.step))
-    states = [QUICK(jax.vmap(theirs.reset))(repeat(jax.random.key(7), count))]
+    step = quick(jax.vmap(theirs.step))
+    states = [quick(jax.vmap(theirs.reset))(repeat(jax.random.key(7), count))]
     for action in actions(theirs.action_size):
         states.append(step(states[-1], repeat(action, count)))
     kept = [first((s.obs, s.reward, s.done, s.metrics, s.pipeline_state.x.pos)) for s in states]

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from probes import quick
 
 from mtjax import envs
 from mtjax.envs import physics
@@ -68,11 +69,6 @@ def played(name):
     for action in actions[:-1]:
         world = step(tasks, world, action).state
     return Play(tasks, world, actions[-1], step(tasks, world, actions[-1]))
-
-
-def compiled(function, *arguments):
-    """Compile for few steps of few worlds: most of the time, without the optimisations of many."""
-    return jax.jit(function).lower(*arguments).compile(compiler_options={"xla_backend_optimization_level": 0})
 
 
 def alone(engine, task, world, action):
@@ -133,7 +129,7 @@ def assert_agreement(name, new):
 def test_mjx_steps_as_c_does(name):
     """With solver iterations to spare: it stops by itself where the solution no longer improves."""
     play, engine = played(name), family(name, engine="mjx", solver_iterations=50).simulator
-    step = compiled(jax.vmap(engine.step), play.tasks, play.world, play.action)
+    step = quick(jax.vmap(engine.step), play.tasks, play.world, play.action)
     assert_agreement(name, step(play.tasks, play.world, play.action))
 
 
@@ -147,7 +143,7 @@ def test_warp_steps_as_c_does(name):
     play, mjx = played(name), family(name, engine="mjx", solver_iterations=50).mjx
     engine = Warp(mjx.base, mjx.num_substeps)
     nested = jax.tree.map(lambda x: jnp.reshape(x, (4, COUNT // 4, *x.shape[1:])), play[:3])
-    new = compiled(jax.vmap(jax.vmap(engine.step)), *nested)(*nested)
+    new = quick(jax.vmap(jax.vmap(engine.step)), *nested)(*nested)
     assert_agreement(name, jax.tree.map(lambda x: np.reshape(x, (COUNT, *x.shape[2:])), new))
 
 

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from probes import QUICK
 
 import mtjax
 import mtjax.evaluate
@@ -28,8 +29,7 @@ def ends(env):
     return jax.tree.map(lambda x: x[chosen], tasks)
 
 
-# Much is compiled here and little run.
-@partial(jax.jit, static_argnums=0, compiler_options={"xla_backend_optimization_level": 0})
+@partial(jax.jit, static_argnums=0, compiler_options=QUICK)
 def play(env, tasks, keys):
     """Random actions for 200 steps in every world: first observations, and all that followed."""
     tasks = jax.vmap(episode_task)(tasks, keys)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from probes import QUICK
 from scipy.optimize import minimize, nnls
 
 from mtjax.agents import rules, surgery
@@ -134,8 +135,7 @@ def plain_weigh(rule, jacobian):
     return surgery.RULES[rule](surgery.gram_matrix(jacobian), KEY)
 
 
-# Much is compiled here and little run.
-weigh = jax.jit(plain_weigh, static_argnums=0, compiler_options={"xla_backend_optimization_level": 0})
+weigh = jax.jit(plain_weigh, static_argnums=0, compiler_options=QUICK)
 
 
 def update_of(rule, jacobian):

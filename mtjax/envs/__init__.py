@@ -8,7 +8,7 @@ from mtjax.envs.ball_in_cup import BallInCup
 from mtjax.envs.brax import NAMES, Brax, BraxAntDirection, BraxHalfcheetahSpeed
 from mtjax.envs.cartpole import CartpoleBalance, CartpoleSwingup
 from mtjax.envs.cheetah import CheetahDirection, CheetahRun, CheetahSpeed
-from mtjax.envs.control import Acrobot, CartPole
+from mtjax.envs.control import ACROBOT_RANGES, CARTPOLE_RANGES, Acrobot, CartPole
 from mtjax.envs.domain import Domain
 from mtjax.envs.family import Family
 from mtjax.envs.finger import FingerSpin, FingerTurn, FingerTurnTarget
@@ -88,29 +88,8 @@ _GOALS: dict[str, Entry] = {
 
 _MTENV: dict[str, Entry] = {
     "bandit": (Bandit, {}),
-    "control-acrobot": (
-        Acrobot,
-        {
-            "vary": {
-                **dict.fromkeys(("link-length-1", "link-length-2", "link-mass-1", "link-mass-2"), "0.5:1.5"),
-                "torque-sign": "-1:1",
-            },
-            "combine": "random",
-        },
-    ),
-    "control-cartpole": (
-        CartPole,
-        {
-            "vary": {
-                "gravity": "4.8:14.8",
-                "cart-mass": "0.5:1.5",
-                "pole-mass": "0.01:0.19",
-                "pole-length": "0.2:0.8",
-                "force": "-10:10",
-            },
-            "combine": "random",
-        },
-    ),
+    "control-acrobot": (Acrobot, {"vary": ACROBOT_RANGES, "combine": "random"}),
+    "control-cartpole": (CartPole, {"vary": CARTPOLE_RANGES, "combine": "random"}),
     "tabular-mdp": (TabularMDP, {}),
     "two-goal-maze": (TwoGoalMaze, {"vary": {"goal-box": "0,1"}, "split": "none"}),
     "two-goal-maze-seen": (TwoGoalMaze, {"vary": {"goal-box": "0,1"}, "split": "none", "observe_boxes": True}),

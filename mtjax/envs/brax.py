@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
 from importlib.util import find_spec
+from operator import attrgetter
 from types import MappingProxyType
 from typing import Any, ClassVar
 
@@ -288,7 +289,7 @@ def _scale_mass(system: Any, task: Task) -> dict[str, Array]:
         "link.invweight": bodies[1:, 0],
         "dof.invweight": dofs,
     }
-    return {name: task.params["mass"] * read(system, name) for name in own} | weights
+    return {name: task.params["mass"] * attrgetter(name)(system) for name in own} | weights
 
 
 def _set_gravity(system: Any, task: Task) -> dict[str, Array]:
@@ -305,10 +306,3 @@ _EDITS: dict[str, Callable[[Any, Task], dict[str, Array]]] = {
     "gravity": _set_gravity,
     "friction": _scale_friction,
 }
-
-
-def read(tree: Any, path: str) -> Any:
-    """The attribute at a dotted path."""
-    for name in path.split("."):
-        tree = getattr(tree, name)
-    return tree

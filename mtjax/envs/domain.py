@@ -19,7 +19,7 @@ import mujoco
 import numpy as np
 import tyro
 
-from mtjax.envs.family import Family
+from mtjax.envs.family import Family, draw_until
 from mtjax.envs.physics import ENGINES, Engine, Mjx, MujocoC, World, choose_engine, mjx_module
 from mtjax.envs.planar import Planar, is_planar, locate
 from mtjax.names import nearest_error
@@ -27,7 +27,6 @@ from mtjax.types import Array, InputError, Key, Step, Task
 
 # Fields of the model that never reach the dynamics: statistics, and what only a renderer reads.
 _UNUSED = ("stat", "cam_", "light_", "mat_", "tex_", "name", "_", "signature", "geom_rgba")
-_MAX_DRAWS = 1000
 INTEGRATORS = ("model", "euler")
 
 
@@ -116,18 +115,8 @@ class Domain(Family):
         return jnp.dot(mass, self.planar(task, world).velocity[:, 0], precision="highest") / jnp.sum(mass)
 
     def start_apart(self, task: Task, key: Key, draw: Callable[[Key], Array]) -> Array:
-        """Draw positions (nq,) until nothing touches, as often as dm_control does."""
-
-        def again(carry):
-            key, _, draws = carry
-            key, draw_key = jax.random.split(key)
-            return key, draw(draw_key), draws + 1
-
-        def rejected(carry):
-            _, qpos, draws = carry
-            return self.simulator.touching(task, qpos) & (draws < _MAX_DRAWS)
-
-        return jax.lax.while_loop(rejected, again, again((key, None, 0)))[1]
+        """Draw positions (nq,) until nothing touches."""
+        return draw_until(lambda qpos: ~self.simulator.touching(task, qpos), draw, key)
 
     # Models.
 
@@ -244,8 +233,9 @@ def _first_unlike(column: Sequence[Any]) -> int | None:
     """The first of several values or arrays that is not equal to the first one."""
     if not isinstance(column[0], np.ndarray):
         return next((i for i, x in enumerate(column) if x != column[0]), None)
-    if any(x.shape != column[0].shape for x in column):
-        return next(i for i, x in enumerate(column) if x.shape != column[0].shape)
+    reshaped = next((i for i, x in enumerate(column) if x.shape != column[0].shape), None)
+    if reshaped is not None:
+        return reshaped
     unlike = np.any((np.stack(column) != column[0]).reshape(len(column), -1), axis=1)
     return int(np.argmax(unlike)) if np.any(unlike) else None
 

@@ -5,7 +5,7 @@ Tables are built on the host; nothing here loops over tasks once a program runs.
 
 import abc
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Annotated, Any, ClassVar, NamedTuple
 
@@ -18,6 +18,7 @@ from mtjax.envs import variation
 from mtjax.envs.parameters import Parameter
 from mtjax.types import SPLITS, Array, InputError, Key, Spec, Step, Task
 
+_MAX_DRAWS = 1000
 Values = Mapping[str, np.ndarray]  # parameter -> (R,) its value in every row
 
 
@@ -193,3 +194,18 @@ class Family(abc.ABC):
         task = jax.tree.map(lambda x: x[0], self.table.tasks)
         step = jax.eval_shape(self.reset, task, jax.eval_shape(jax.random.key, 0))
         return Spec(step.obs.shape[0], self.action_size, task.context.shape[0])
+
+
+def draw_until(accepted: Callable[[Array], Array], draw: Callable[[Key], Array], key: Key) -> Array:
+    """Draw until the draw is accepted, at most as often as dm_control does."""
+
+    def again(carry):
+        key, _, draws = carry
+        key, draw_key = jax.random.split(key)
+        return key, draw(draw_key), draws + 1
+
+    def rejected(carry):
+        _, drawn, draws = carry
+        return ~accepted(drawn) & (draws < _MAX_DRAWS)
+
+    return jax.lax.while_loop(rejected, again, again((key, None, 0)))[1]

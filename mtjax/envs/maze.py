@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.envs.family import Family
+from mtjax.envs.family import Family, draw_until
 from mtjax.envs.parameters import Parameter
 from mtjax.types import Array, InputError, Key, Step, Task
 
@@ -22,7 +22,6 @@ _FORWARD = 0.51  # [m]
 _TURN = math.pi / 4
 _REACHED = 2.0  # [m] between centres
 _SIGN_SEEN = (-1.7, -1.5)  # headings [rad] under which the task's sign shows
-_MAX_DRAWS = 1000
 
 # A quarter of the walls, each from corner to corner (4, 2, 2): the plan is its own mirror image along both axes.
 _FAR = _HALF_WIDTH + _ALCOVE
@@ -141,15 +140,5 @@ def _wall_distance(place: Array) -> Array:
 
 def _draw_place(key: Key, radius: float, accepted: Callable[[Array], Array]) -> Array:
     """Draw a place (2,) in the room for a circle of that radius, again and again until it is accepted."""
-
-    def again(carry):
-        key, _, draws = carry
-        key, place_key = jax.random.split(key)
-        end = _HALF_WIDTH - radius
-        return key, jax.random.uniform(place_key, (2,), jnp.float32, -end, end), draws + 1
-
-    def rejected(carry):
-        _, place, draws = carry
-        return ~accepted(place) & (draws < _MAX_DRAWS)
-
-    return jax.lax.while_loop(rejected, again, again((key, None, 0)))[1]
+    end = _HALF_WIDTH - radius
+    return draw_until(accepted, lambda key: jax.random.uniform(key, (2,), jnp.float32, -end, end), key)

@@ -98,7 +98,6 @@ class PointMassNavigate(PointMass):
 
     num_substeps: ClassVar[int] = 5
     episode_steps: ClassVar[int] = 100
-    gpu_engine: ClassVar[str] = "mjx"
 
     def start(self, task: Task, key: Key) -> tuple[Array, Array]:
         return jnp.zeros(2), jnp.zeros(2)

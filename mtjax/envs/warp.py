@@ -3,6 +3,7 @@
 import dataclasses
 import importlib
 from functools import cached_property, lru_cache, partial
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import jax
@@ -116,7 +117,7 @@ class Warp:
 
         def one(data: Any, flat: _Flat) -> tuple[Array, ...]:
             model = self._model
-            leaves = {name: leaf.reshape(_leaf(model, name).shape) for name, leaf in flat.leaves.items()}
+            leaves = {name: leaf.reshape(attrgetter(name)(model).shape) for name, leaf in flat.leaves.items()}
             model = model.tree_replace(leaves)
             data = data.replace(qpos=flat.qpos, qvel=flat.qvel, qacc_warmstart=flat.warmstart, ctrl=flat.ctrl)
             data = jax.lax.fori_loop(0, self.num_substeps, lambda _, data: step(model, data), data)
@@ -133,9 +134,3 @@ class Warp:
             return jax.tree.map(lambda x: x.reshape(count, len(x) // count, *x.shape[1:]), new), (True,) * 4
 
         return advance
-
-
-def _leaf(model: Any, name: str) -> Any:
-    for part in name.split("."):
-        model = getattr(model, part)
-    return model
