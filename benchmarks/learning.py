@@ -1,15 +1,23 @@
-"""How well and how fast agents learn a family: every agent, many seeds in one program each.
+"""How well and how fast agents learn families of tasks: every agent on every family, many seeds in one program each.
 
-    python benchmarks/learning.py [--env NAME] [--agents NAME ...] [--seeds 10] [--steps N] [--out DIR]
+    python benchmarks/learning.py [--envs NAME ...] [--agents NAME ...] [--seeds 10] [--steps N] [--split hip-bmdp]
+                                  [--out DIR]
 
-Writes, into a new folder: ``metrics.csv`` (training returns over steps and seconds, a line a chunk and seed),
-``evaluations.csv`` (each evaluation by split, a line a seed), ``learning.png`` and ``table.md``. Intervals
-are 95% bootstrap intervals over seeds. "Seconds to 900" is training time, without compiling and evaluating, until the
-training policy's mean return over tasks (and seeds) first reaches 900.
+Every pair of family and agent leaves ``DIR/ENV/AGENT.csv`` (training returns over steps and seconds, a line a chunk and
+seed) and ``AGENT.npz`` (every episode of every evaluation); pairs that are there already are not run again, so a long
+table may be made in parts, by several processes. From all that is in DIR come ``table.md``, ``evaluations.csv`` and a
+figure for each family.
+
+Scores are interquartile means over seeds and tasks of the last evaluation (never the best one) under the mean action,
+with 95% stratified bootstrap intervals (Agarwal et al. 2021). "s to 900" is the seconds of training, without compiling
+and evaluating, after which the training policy's mean return over tasks and seeds first reached 900.
 """
 
 import argparse
+import csv
+import dataclasses
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,116 +25,131 @@ import numpy as np
 import mtjax
 from mtjax import plot
 from mtjax.log import append_rows
-from mtjax.run import Result, enable_compile_cache
-from mtjax.stats import seed_interval
-from mtjax.types import InputError
+from mtjax.run import Result, enable_compile_cache, load_evaluations, save_evaluations
+from mtjax.stats import stratified_bootstrap
+from mtjax.types import SPLITS, InputError
 
-MARKS = (700, 800, 900, 950)
+FAMILIES = (
+    "finger-spin-vary-size",
+    "cheetah-run-vary-torso-length",
+    "walker-walk-vary-friction",
+    "walker-walk-vary-foot-length",
+)
+_KEPT = ("seed", "steps", "seconds", "wall_seconds", "return")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--env", default="finger-spin-vary-size")
-    parser.add_argument("--agents", nargs="+", default=list(mtjax.AGENTS))
+    parser.add_argument("--envs", nargs="*", default=FAMILIES, metavar="NAME")
+    parser.add_argument("--agents", nargs="*", default=list(mtjax.AGENTS), choices=list(mtjax.AGENTS), metavar="NAME")
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", type=int, help="by default the preset's")
     parser.add_argument("--preset", default="auto")
-    parser.add_argument("--eval-every", type=int, default=0)
+    parser.add_argument("--split", help="by default the family's")
+    parser.add_argument("--evaluations", type=int, default=4)
     parser.add_argument("--eval-episodes", type=int, default=10)
     parser.add_argument("--vary", nargs="*", default=[], metavar="NAME=VALUES", help="besides what the family varies")
+    parser.add_argument("--training", nargs="*", default=[], metavar="NAME=N", help="such as num_envs=64")
+    parser.add_argument("--mark", type=float, default=900.0, help="the return whose time is told")
     parser.add_argument("--out", type=Path, default=Path("runs") / f"learning-{time.strftime('%Y%m%d-%H%M%S')}")
     arguments = parser.parse_args()
-    arguments.out.mkdir(parents=True)
     enable_compile_cache()
-    lines = [heading()]
-    curves = {}
-    for name in arguments.agents:
-        result, wall = learn(arguments, name)
-        curves[name] = (result.evaluations.steps, result.evaluations.returns["train"])
-        lines.append(row(name, result, wall))
-        print(lines[-1], flush=True)
-        save(arguments.out, name, result)
-        plot.compare(arguments.out / f"after-{name}.png", curves)
-    table = "\n".join(lines)
-    (arguments.out / "table.md").write_text(table + "\n")
-    (arguments.out / f"after-{arguments.agents[-1]}.png").rename(arguments.out / "learning.png")
-    for path in arguments.out.glob("after-*.png"):
-        path.unlink()
-    print(table)
+    for env in arguments.envs:
+        for agent in arguments.agents:
+            if not (arguments.out / env / f"{agent}.npz").exists():
+                learn(arguments, env, agent)
+    tabulate(arguments.out, arguments.mark)
 
 
-def learn(arguments: argparse.Namespace, name: str) -> tuple[Result, float]:
-    """Train one agent with its preset; returns the result and the seconds it took in all."""
-    vary = dict(pair.split("=", 1) for pair in arguments.vary)
-    program = mtjax.preset(arguments.env, name, arguments.preset, vary=vary)
-    before = time.monotonic()
+def learn(arguments: argparse.Namespace, env: str, agent: str) -> None:
+    """Train one agent on one family with its preset, and keep what it did."""
+    print(f"{agent} on {env}", flush=True)
+    settings = {"vary": dict(pair.split("=", 1) for pair in arguments.vary)}
+    settings |= {"split": arguments.split} if arguments.split else {}
+    program = mtjax.preset(env, agent, arguments.preset, **settings)
+    steps = arguments.steps or program.plan.steps
+    training = {name: int(value) for name, value in (pair.split("=", 1) for pair in arguments.training)}
     result = mtjax.train(
         program.family,
         program.learner,
-        steps=arguments.steps or program.plan.steps,
+        steps=steps,
         seeds=arguments.seeds,
         seed=arguments.seed,
-        eval_every=arguments.eval_every,
+        eval_every=-(-steps // arguments.evaluations),
         eval_episodes=arguments.eval_episodes,
-        settings=program.training,
+        settings=dataclasses.replace(program.training, **training),
         quiet=False,
     )
-    return result, time.monotonic() - before
+    save(arguments.out / env, agent, result)
 
 
-def save(folder: Path, name: str, result: Result) -> None:
-    """Append the curves of one agent to the folder's files."""
-    kept = ("seed", "steps", "seconds", "wall_seconds", "return")
-    append_rows(folder / "metrics.csv", [{"agent": name} | {k: r[k] for k in kept} for r in result.rows])
+def save(folder: Path, agent: str, result: Result) -> None:
+    """Keep one run: the evaluations last, as they say that it is whole."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"{agent}.csv").unlink(missing_ok=True)
+    append_rows(folder / f"{agent}.csv", [{name: row[name] for name in _KEPT} for row in result.rows])
+    save_evaluations(folder / f"{agent}.npz", result.evaluations)
+
+
+def tabulate(out: Path, mark: float) -> None:
+    """Make tables and figures of all runs in a folder."""
+    cells = ["family", "agent", *(f"{split}, IQM" for split in SPLITS), "worst task", f"s to {mark:.0f}"]
+    cells += ["training s", "wall s", "steps/s, all seeds"]
+    lines = ["| " + " | ".join(cells) + " |", "|" + "---|" * len(cells)]
     rows = []
-    for split, returns in result.evaluations.returns.items():
-        for s, of_seed in enumerate(returns.mean(axis=(-1, -2)) if returns.size else []):
-            for steps, score in zip(result.evaluations.steps, of_seed, strict=True):
-                rows.append({"agent": name, "seed": s, "split": split, "steps": int(steps), "return": f"{score:.2f}"})
-    append_rows(folder / "evaluations.csv", rows)
+    for env in sorted({path.parent.name for path in out.glob("*/*.npz")}):
+        curves = {}
+        for agent, curve, evaluations in runs(out / env):
+            known = curve[np.all(np.isfinite(curve[:, :, -1]), axis=1)]  # chunks in which episodes ended
+            if len(known):
+                curves[agent] = (known[:, 0, 1], known[:, :, -1].T[:, :, None, None])
+            lines.append(row(env, agent, curve, evaluations, mark))
+            rows += evaluation_rows(env, agent, evaluations)
+        if curves:
+            plot.compare(out / f"{env}.png", curves, f"return on training tasks of {env}")
+    (out / "table.md").write_text("\n".join(lines) + "\n")
+    (out / "evaluations.csv").unlink(missing_ok=True)
+    append_rows(out / "evaluations.csv", rows)
+    print("\n".join(lines))
 
 
-def heading() -> str:
-    marks = [f"s to {mark}" for mark in MARKS]
-    cells = [
-        "agent",
-        "train",
-        "interpolation",
-        "extrapolation",
-        "worst task",
-        *marks,
-        "training s",
-        "wall s",
-        "steps/s",
-    ]
-    return "| " + " | ".join(cells) + " |\n|" + "---|" * len(cells)
+def runs(folder: Path) -> Iterator[tuple]:
+    """The runs of a family: the agent, its curve (lines (V, S) of ``_KEPT``), its evaluations."""
+    known = list(mtjax.AGENTS)
+    order = lambda path: known.index(path.stem) if path.stem in known else len(known)
+    for path in sorted(folder.glob("*.npz"), key=order):
+        with path.with_suffix(".csv").open(newline="") as file:
+            lines = [[float(line[name] or "nan") for name in _KEPT] for line in csv.DictReader(file)]
+        curve = np.array(lines)
+        seeds = len(np.unique(curve[:, 0]))
+        yield path.stem, curve.reshape(-1, seeds, len(_KEPT)), load_evaluations(path)
 
 
-def row(name: str, result: Result, wall: float) -> str:
-    """One agent's line: last evaluation by split, times, rate."""
-    scores = {split: x[:, -1].mean(axis=-1) for split, x in result.evaluations.returns.items() if x.size}  # (S, T)
-    cells = [name]
-    for split in ("train", "interpolation", "extrapolation"):
-        point, low, high = seed_interval(scores[split])
-        cells.append(f"{point:.0f} [{low:.0f}, {high:.0f}]")
+def row(env: str, agent: str, curve: np.ndarray, evaluations, mark: float) -> str:
+    """One run's line: last evaluation by split, times, rate."""
+    scores = {split: x[:, -1].mean(axis=-1) for split, x in evaluations.returns.items() if x.size}  # (S, T)
+    cells = [env, agent]
+    for split in SPLITS:
+        point, low, high = stratified_bootstrap(scores[split]) if split in scores else (np.nan,) * 3
+        cells.append(f"{point:.0f} [{low:.0f}, {high:.0f}]" if split in scores else "-")
     cells.append(f"{scores['train'].mean(axis=0).min():.0f}")
-    cells += [seconds_to(result, mark) for mark in MARKS]
-    steps = int(result.rows[-1]["steps"]) * len(scores["train"])
-    return "| " + " | ".join([*cells, f"{result.seconds:.1f}", f"{wall:.0f}", f"{steps / result.seconds:,.0f}"]) + " |"
+    steps, seconds, wall, returns = np.moveaxis(curve[:, :, 1:], -1, 0).mean(axis=-1)
+    reached = np.flatnonzero(returns >= mark)
+    cells.append(f"{seconds[reached[0]]:.1f}" if len(reached) else "-")
+    rate = steps[-1] * curve.shape[1] / seconds[-1]
+    return "| " + " | ".join([*cells, f"{seconds[-1]:.1f}", f"{wall[-1]:.0f}", f"{rate:,.0f}"]) + " |"
 
 
-def seconds_to(result: Result, mark: float) -> str:
-    """Training seconds until the mean over tasks and seeds of the training return first reached a mark."""
-    by_step: dict[int, list[tuple[float, float]]] = {}
-    for line in result.rows:
-        if line["return"] != "":
-            by_step.setdefault(int(line["steps"]), []).append((float(line["seconds"]), float(line["return"])))
-    for points in by_step.values():
-        seconds, returns = np.mean(points, axis=0)
-        if returns >= mark:
-            return f"{seconds:.1f}"
-    return "-"
+def evaluation_rows(env: str, agent: str, evaluations) -> list[dict]:
+    """A line for each split, evaluation, seed and task: the mean over episodes."""
+    return [
+        {"env": env, "agent": agent, "split": split, "steps": int(steps), "seed": s, "task": t, "return": f"{x:.1f}"}
+        for split, returns in evaluations.returns.items()
+        for s, of_seed in enumerate(returns.mean(axis=-1))
+        for steps, of_step in zip(evaluations.steps, of_seed, strict=True)
+        for t, x in enumerate(of_step)
+    ]
 
 
 if __name__ == "__main__":

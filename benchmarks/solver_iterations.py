@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from mujoco import batch
-from steps_per_second import machine
+from report import machine
 
 import mtjax
 from mtjax.envs import ENVS, Domain

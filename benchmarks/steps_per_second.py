@@ -10,11 +10,7 @@ automatic reset returns to one stored state. Compile time is reported apart.
 """
 
 import argparse
-import json
-import os
-import platform
 import statistics
-import subprocess
 import time
 from collections.abc import Callable
 from typing import Any
@@ -23,10 +19,12 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from report import publish
 
 import mtjax
 from mtjax import cli, loop
 from mtjax.envs import Domain
+from mtjax.history import remember
 from mtjax.types import InputError
 
 # Ours (with ten values of a physical parameter), and Playground's of the same task.
@@ -61,12 +59,7 @@ def main() -> None:
     if arguments.agent != "none":
         rows.append(training_rate(arguments))
         print(f"training {arguments.agent}: {rows[-1]['steps_per_second']:,.0f} env-steps/s", flush=True)
-    settings = {name: value for name, value in vars(arguments).items() if name != "json"}
-    report = {"machine": machine(), "settings": settings, "rows": rows}
-    print(json.dumps(report))
-    if arguments.json:
-        with open(arguments.json, "x") as file:
-            json.dump(report, file, indent=2)
+    publish(arguments, rows)
 
 
 class Contestant:
@@ -223,7 +216,8 @@ def playground(name: str, impl: str, worlds: int, steps: int) -> Callable[[], An
 def training_rate(arguments: argparse.Namespace) -> dict:
     """Time the whole loop as ``mtjax.train`` runs it with the preset of this device."""
     program = cli.with_preset("finger-spin-vary-size", arguments.agent)
-    settings, env, agent = program.training, program.family, program.learner
+    settings, agent = program.training, program.learner
+    env = remember(program.family, agent.history)
     tasks = env.tasks()
     before = time.perf_counter()
     state = loop.init(env, agent, settings, tasks, jnp.arange(1))
@@ -245,22 +239,6 @@ def training_rate(arguments: argparse.Namespace) -> dict:
         "fastest": max(rates),
         "updates_per_second": statistics.median(rates) / len(tasks.id) / settings.num_envs * settings.updates_per_step,
         "first_call_seconds": first,
-    }
-
-
-def machine() -> dict:
-    """Where the figures come from."""
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=os.path.dirname(__file__) or "."
-    )
-    return {
-        "device": jax.devices()[0].device_kind,
-        "cores": os.cpu_count(),
-        "python": platform.python_version(),
-        "jax": jax.__version__,
-        "mujoco": mujoco.__version__,
-        "mtjax": mtjax.__version__,
-        "commit": commit.stdout.strip() or None,
     }
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 
 from mtjax.loop import TrainState
+from mtjax.replay import Replay
 from mtjax.types import InputError
 
 _KEPT = 2
@@ -43,6 +44,11 @@ def load_agent(directory: Path, like: TrainState) -> Any:
     return _load(directory, {"agent": like.agent})["agent"]
 
 
+def load_replay(directory: Path, like: TrainState) -> Replay:
+    """Read only the replay, without the worlds and the agent."""
+    return _load(directory, {"loop": {"replay": like.replay}}, partial=True)["loop"]["replay"]
+
+
 def _sizes(folder: Path) -> dict[str, int]:
     files = (path for path in folder.rglob("*") if path.is_file() and path.name != _SIZES)
     return {str(path.relative_to(folder)): path.stat().st_size for path in files}
@@ -73,15 +79,17 @@ def _require_whole(folder: Path, parts: Iterable[str]) -> None:
         )
 
 
-def _load(directory: Path, like: dict[str, Any]) -> dict[str, Any]:
+def _load(directory: Path, like: dict[str, Any], partial: bool = False) -> dict[str, Any]:
     from orbax.checkpoint import v1 as ocp
 
     device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
     like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=device), like)
     newest = _newest(directory)
     _require_whole(newest, like)
+    context = ocp.Context()
+    context.pytree.loading.partial_load = partial
     try:
-        with ocp.training.Checkpointer(str(directory.absolute())) as checkpointer:
+        with context, ocp.training.Checkpointer(str(directory.absolute())) as checkpointer:
             return checkpointer.load_checkpointables(int(newest.name), like)
     except (ValueError, KeyError, OSError, json.JSONDecodeError) as error:
         reason = str(error).strip().splitlines()[0][:150]

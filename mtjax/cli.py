@@ -9,14 +9,15 @@ import json
 import re
 import sys
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, Literal, TypeVar
 
 import tyro
 
-from mtjax.agents import AGENTS, SAC, agent
+from mtjax.agents import AGENTS, PARTS, SAC, agent, settings
 from mtjax.envs import ENVS, Family, make
 from mtjax.loop import Settings
 from mtjax.names import nearest_error
@@ -26,6 +27,7 @@ from mtjax.types import InputError
 PRESETS = ("auto", "cpu", "gpu")
 _VARY = "--env.vary."
 _FAMILY_FLAGS = {"combine": "env.combine", "split": "split"}  # they decide which values are allowed
+_DECIDING = ("conditioning", "vectors", "heads")  # which parts go together with the rest of an agent
 P = TypeVar("P")
 
 
@@ -36,13 +38,18 @@ class Program:
     env: str = "finger-spin-vary-size"
     """Name of the environment family; --list shows all. --import=FILE.py makes those known that a file registers."""
     agent: str = "sac-conditioned"
-    """Name of the agent; --list shows all."""
+    """Name of the agent; --list shows all. Its parts: --agent.encoder, --agent.gradients, --agent.value,
+    --agent.scaling and --agent.sampler, each by name and with flags of its own."""
     preset: Literal["auto", "cpu", "gpu"] = "auto"
     """Tuned defaults of the flags below for a kind of device; auto chooses by the device that JAX runs on."""
     runs: str = "runs"
     """Folder in which the run's own folder is made."""
     resume: str = ""
     """A run's folder to go on with; only --steps may be given beside it."""
+    start: Annotated[str, tyro.conf.arg(name="from")] = ""
+    """A run's folder whose agent to fine-tune on this environment's tasks. Agent and networks are the run's; rates of
+    learning and --tune may be given. What every task has for itself begins as that of the run's nearest training task,
+    and seeds beyond the run's begin with its first ones again."""
     list: bool = False
     """Print the families and agents, and stop."""
     plan: Annotated[Plan, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Plan)
@@ -61,30 +68,48 @@ def parse(argv: Sequence[str]) -> Program:
     """
     argv = import_files(argv)
     env_name = _peel(argv, "env", Program.env)
-    agent_name = _peel(argv, "agent", Program.agent)
+    start = _peel(argv, "from", "")
+    begun = from_json(Path(start) / "config.json") if start or "--from=" in argv else None
+    agent_name = _peel(argv, "agent", Program.agent if begun is None else begun.agent)
     preset_name = _peel(argv, "preset", Program.preset)
     if preset_name not in PRESETS:
         raise nearest_error("preset", preset_name, PRESETS)
     vary, argv = _peel_vary(argv)
-    settings = {name: value for name in ("combine", "split") if (value := _peel(argv, _FAMILY_FLAGS[name], ""))}
-    default = with_preset(env_name, agent_name, preset_name, vary=vary, **settings)
+    chosen, argv = _peel_parts(argv)
+    of_family = {name: value for name in ("combine", "split") if (value := _peel(argv, _FAMILY_FLAGS[name], ""))}
+    told = {name: value for name in _DECIDING if (value := _peel(argv, f"agent.{name}", ""))}
+    default = with_preset(env_name, agent_name, preset_name, {**chosen, **told}, vary=vary, **of_family)
+    if begun is not None:
+        default = _fine_tuning(default, begun, start, chosen)
     _check_flags(argv, default)
     return parse_with_tyro(Program, argv, default, "python -m mtjax.train")
 
 
-def with_preset(env_name: str, agent_name: str, preset_name: str = "auto", **family_settings: Any) -> Program:
-    """Return the program that a family (with any settings of ``make``), an agent and a preset stand for.
+def _fine_tuning(program: Program, begun: Program, start: str, chosen: Mapping[str, str]) -> Program:
+    """A program with the agent of a run, and tasks whose context is written as the run's."""
+    had = {"agent": begun.agent, **settings(begun.learner)}
+    for name, given in {"agent": program.agent, **chosen}.items():
+        if given != had[name]:
+            raise InputError(f"--from goes on with the run's {name}, {had[name]}, not with {given}; leave it out")
+    learner, family = dataclasses.replace(begun.learner, tune="all"), program.family.scaled_as(begun.family)
+    return dataclasses.replace(program, start=start, learner=learner, family=family)
+
+
+def with_preset(
+    env_name: str,
+    agent_name: str,
+    preset_name: str = "auto",
+    agent_settings: Mapping[str, str] = MappingProxyType({}),
+    **family_settings: Any,
+) -> Program:
+    """Return the program that a family and an agent, each with any settings of its own, and a preset stand for.
 
     Raises:
         InputError: a name or setting is unknown.
     """
     family = make(env_name, **family_settings)
-    if agent_name not in AGENTS:
-        raise nearest_error("agent", agent_name, AGENTS)
     preset = load_preset(env_name, _device_preset() if preset_name == "auto" else preset_name)
-    fields = AGENTS[agent_name].__dataclass_fields__
-    common, special = preset.get("agent", {}), preset.get(agent_name, {})
-    settings = {name: value for name, value in (common | special).items() if name in fields}
+    of_agent = preset.get("agent", {}) | preset.get(agent_name, {})
     return Program(
         env=env_name,
         agent=agent_name,
@@ -92,7 +117,7 @@ def with_preset(env_name: str, agent_name: str, preset_name: str = "auto", **fam
         plan=Plan(**preset.get("plan", {})),
         training=Settings(**preset.get("training", {})),
         family=family,
-        learner=agent(agent_name, **settings),
+        learner=agent(agent_name, **{**of_agent, **agent_settings}),
     )
 
 
@@ -172,17 +197,35 @@ def _peel_vary(argv: Sequence[str]) -> tuple[dict[str, str], list[str]]:
     return given, rest
 
 
+def _peel_parts(argv: Sequence[str]) -> tuple[dict[str, str], list[str]]:
+    """Take --agent.KIND=NAME out of a command line: the part decides which other flags there are."""
+    chosen = {kind: name for kind in PARTS if (name := _peel(argv, f"agent.{kind}", ""))}
+    rest, words = [], iter(argv)
+    for word in words:
+        flag, equals, _ = word.partition("=")
+        if flag.removeprefix("--agent.") not in PARTS or not flag.startswith("--agent."):
+            rest.append(word)
+        elif not equals:
+            next(words)
+    return chosen, rest
+
+
 def flags(program: Any, prefix: str = "--") -> list[str]:
     """Every flag of a program."""
     names = []
     for field in dataclasses.fields(program):
         value, name = getattr(program, field.name), field.name.replace("_", "-")
-        if name == "vary":  # a flag for each parameter, taken out before
+        if name in ("vary", "context-ranges"):  # a flag for each parameter, taken out before; and no flag
             continue
-        group = {"plan": "--", "training": "--", "family": "--env.", "learner": "--agent."}.get(field.name)
+        if name == "learner":
+            names += [f"--agent.{setting.replace('_', '-')}" for setting in settings(value) if setting != "tune"]
+            names.append("--tune")
+            continue
+        group = {"plan": "--", "training": "--", "family": "--env."}.get(field.name)
         if group is not None:
             names += flags(value, group)
         else:
+            name = "from" if name == "start" else name
             names.append(f"--{name}" if name in ("split", "engine") else f"{prefix}{name}")
     return names
 
@@ -228,7 +271,8 @@ def _unframed(text: str) -> str:
 
 def to_json(program: Program, extra: dict[str, Any]) -> str:
     """Write everything a run is made of."""
-    return json.dumps({**dataclasses.asdict(program), **extra}, indent=2) + "\n"
+    record = {**dataclasses.asdict(program), "learner": settings(program.learner)}
+    return json.dumps({**record, **extra}, indent=2) + "\n"
 
 
 def from_json(path: Path) -> Program:
@@ -246,6 +290,7 @@ def from_json(path: Path) -> Program:
             agent=record["agent"],
             preset=record["preset"],
             runs=record["runs"],
+            start=record.get("start", ""),
             plan=Plan(**record["plan"]),
             training=Settings(**record["training"]),
             family=make(record["env"], **record["family"]),
@@ -263,7 +308,7 @@ def catalogue() -> str:
         tasks = make(name).train_count
         lines.append(f"  {name:36} {tasks:3} task{'s' if tasks > 1 else ' '}  {first(family)}")
     lines.append("agents:")
-    return "\n".join(lines + [f"  {name:36} {first(cls)}" for name, cls in AGENTS.items()])
+    return "\n".join(lines + [f"  {name:36} {preset.says}" for name, preset in AGENTS.items()])
 
 
 def main(run: Any) -> None:

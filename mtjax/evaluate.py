@@ -8,12 +8,12 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax import cli
+from mtjax import cli, diagnostics
 from mtjax.envs import Domain
 from mtjax.evaluation import Evaluations, evaluate, record
 from mtjax.log import append_rows, number
 from mtjax.names import nearest_error
-from mtjax.policy import Policy, load
+from mtjax.policy import Policy, load, load_experience
 from mtjax.run import enable_compile_cache
 from mtjax.stats import seed_interval
 from mtjax.types import SPLITS, InputError
@@ -34,6 +34,8 @@ class Request:
     """Chooses the starting states."""
     video: bool = False
     """Film the first ten seconds of an episode of each task (mp4 if ffmpeg is installed, else gif)."""
+    diagnostics: bool = False
+    """Measure how the training tasks' gradients agree and how much of the networks is in use, from the run's replay."""
 
 
 def main(argv: Sequence[str]) -> None:
@@ -41,14 +43,18 @@ def main(argv: Sequence[str]) -> None:
     request = _parse(argv)
     enable_compile_cache()
     policy = load(request.run)
-    if request.video and not isinstance(policy.env, Domain):
+    if request.video and not isinstance(policy.family, Domain):
         raise InputError("only MuJoCo families can be filmed; leave out --video")
+    found = diagnostics.diagnose(policy, *load_experience(request.run)) if request.diagnostics else None
     episodes = score(policy, request.episodes, request.seed)
     directory = _new_folder(Path(request.run))
     print(task_table(policy, episodes))
     if policy.agent.unseen:
         print(f"unseen tasks: {policy.agent.unseen}")
     _write(policy, episodes, directory)
+    if found is not None:
+        print(diagnostics.table(policy, found))
+        diagnostics.write(policy, found, directory)
     if request.video:
         _film(policy, directory, request.seed)
     print(f"written to {directory}")
@@ -56,7 +62,7 @@ def main(argv: Sequence[str]) -> None:
 
 def _parse(argv: Sequence[str]) -> Request:
     argv = cli.import_files(argv)
-    known = [f"--{f.name}" for f in dataclasses.fields(Request)] + ["--no-video", "--help", "-h"]
+    known = [f"--{f.name}" for f in dataclasses.fields(Request)] + ["--no-video", "--no-diagnostics", "--help", "-h"]
     for word in argv:
         if word.startswith("-") and word.split("=")[0] not in known:
             raise nearest_error("flag", word.split("=")[0], known)
@@ -132,16 +138,17 @@ def _film(policy: Policy, directory: Path, seed: int) -> None:
     """Film the beginning of one episode of every task, at the speed at which it happens."""
     from mtjax import render
 
-    env = policy.env
+    env = policy.family
     assert isinstance(env, Domain)
     render.choose_backend()
-    returns, played, states = record(env, policy.agent, policy.state, env.tasks("all"), jnp.int32(seed))
+    returns, played, states = record(policy.env, policy.agent, policy.state, env.tasks("all"), jnp.int32(seed))
+    worlds = states.world if policy.agent.history else states
     stride = max(round(1 / (_FILM_FPS * env.seconds_per_step)), 1)
     shown, fps = slice(0, round(_FILM_SECONDS / env.seconds_per_step), stride), 1 / (stride * env.seconds_per_step)
     for split in SPLITS:
         for i in env.table.rows[split]:
             row = int(played[i])  # where ranges are continuous, an episode's own
-            frames = render.film(env, row, np.asarray(states.qpos[i, shown]))
+            frames = render.film(env, row, np.asarray(worlds.qpos[i, shown]))
             path = render.write_video(directory / f"{split}-{env.describe(row)}".replace("=", "-"), frames, fps)
             print(f"filmed {path.name}: return {float(returns[i]):.0f}", flush=True)
 

@@ -9,15 +9,23 @@ from typing import Any
 
 import numpy as np
 
+_OF_EACH_TASK = ("td_error", "critic_gradient_norm", "actor_gradient_norm")  # beside the return
+
 
 def append_rows(path: Path, rows: list[dict[str, Any]]) -> None:
-    """Append rows to a CSV file, with a header if it is new."""
-    is_new = not path.exists()
+    """Append rows to a CSV file, with a header if it is new; an old one keeps its columns."""
+    is_new = not path.exists() or not path.stat().st_size
+    names = list(rows[0]) if is_new else _columns(path)
     with path.open("a", newline="") as file:
-        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
+        writer = csv.DictWriter(file, fieldnames=names, extrasaction="ignore")
         if is_new:
             writer.writeheader()
         writer.writerows(rows)
+
+
+def _columns(path: Path) -> list[str]:
+    with path.open(newline="") as file:
+        return next(csv.reader(file))
 
 
 def truncate_rows(path: Path, iteration: int) -> float:
@@ -47,12 +55,13 @@ def _is_whole(row: dict[str, str | None]) -> bool:
 
 
 def metric_rows(metrics: dict[str, np.ndarray], seeds: np.ndarray, common: dict[str, Any]) -> list[dict[str, Any]]:
-    """Lay out one chunk's metrics (S, T) or (S,) as one row a seed: means over tasks, and each task's return."""
+    """Lay out one chunk's metrics (S, T) or (S,) as one row a seed: means over tasks, and a few for each task."""
     rows = []
     for s, seed in enumerate(seeds):
         row = {"seed": int(seed), **common, "return": number(_mean(metrics["return"][s]))}
         row |= {name: number(np.mean(x[s])) for name, x in metrics.items() if name not in ("return", "bad_step")}
-        row |= {f"return_{t}": number(x) for t, x in enumerate(metrics["return"][s])}
+        for name in (*_OF_EACH_TASK, "return"):
+            row |= {f"{name}_{t}": number(x) for t, x in enumerate(metrics[name][s] if name in metrics else ())}
         rows.append(row)
     return rows
 

@@ -14,10 +14,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from mtjax import hindsight
 from mtjax import replay as rings
 from mtjax.replay import Replay
 from mtjax.tasks import episode_task
-from mtjax.types import Agent, Array, Env, InputError, Key, Metrics, Spec, Step, Task, Transition
+from mtjax.types import Agent, Array, Env, InputError, Key, Metrics, Outcome, Spec, Step, Task, Transition
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,12 +37,19 @@ class Settings:
     """Steps of every environment under random actions before learning starts."""
     warmup_hold: int = 10
     """Steps for which each of those random actions is held; actions that last find more than ones that jitter."""
+    reset_every: int = 0
+    """Steps of every environment after which networks and optimisers begin anew, replay kept; 0 never."""
     chunk_steps: int = 1000
     """Steps of every environment between two lines of metrics; also the grain of evaluation and checkpoints."""
+    hindsight: float = 0.0
+    """Share of each batch that is taken from other tasks and replayed with this task's goal; only for families whose
+    tasks differ in their goals alone."""
 
     def __post_init__(self):
+        if not 0 <= self.hindsight <= 1:
+            raise InputError(f"hindsight is a share from 0 to 1, not {self.hindsight}")
         for field in dataclasses.fields(self):
-            least = 0 if field.name == "updates_per_step" else 1
+            least = 0 if field.name in ("updates_per_step", "reset_every", "hindsight") else 1
             if getattr(self, field.name) < least:
                 flag = field.name.replace("_", "-")
                 raise InputError(f"{flag} must be at least {least}, not {getattr(self, field.name)}")
@@ -63,6 +71,7 @@ class TrainState(NamedTuple):
     obs: Array  # (S, T, E, O)
     age: Array  # (S, T, E) int32, steps since the last reset
     total: Array  # (S, T, E) return of the episode so far
+    discounted: Array  # (S, T, E) the same, each reward discounted once more at every later step
     replay: Replay  # rows (S, T, capacity, ...)
     iteration: Array  # () int32, steps taken by every environment
     key: Key  # (S,)
@@ -75,6 +84,8 @@ _REPLAY = Replay(rows=0, position=None, size=None)  # type: ignore  # its axes u
 @partial(jax.jit, static_argnums=(0, 1, 2))
 def init(env: Env, agent: Agent, settings: Settings, tasks: Task, seeds: Array) -> TrainState:
     """Return a fresh training state for ``seeds`` (S,) on training ``tasks`` (T, ...)."""
+    if settings.hindsight:
+        hindsight.require(env)
     num_tasks = len(tasks.id)
     shape = (len(seeds), num_tasks, settings.num_envs)
     key, agent_key, reset_key, warmup_key = _split(jax.vmap(jax.random.key)(seeds), 4)
@@ -87,6 +98,7 @@ def init(env: Env, agent: Agent, settings: Settings, tasks: Task, seeds: Array) 
         obs=start.obs,
         age=jnp.zeros(shape, jnp.int32),
         total=jnp.zeros(shape),
+        discounted=jnp.zeros(shape),
         replay=jax.vmap(blank, out_axes=_REPLAY)(seeds),
         iteration=jnp.int32(0),
         key=key,
@@ -189,15 +201,26 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
     """
 
     def iterate(state: TrainState, _) -> tuple[TrainState, Metrics]:
-        key, act_key, reset_key, learn_key = _split(state.key, 4)
+        key, act_key, reset_key, learn_key, renew_key = _split(state.key, 5)
         warming = state.iteration < settings.warmup_steps
+        state = state._replace(agent=_renew(env, agent, settings, tasks, state, renew_key))
         state, seen = _collect(env, agent, settings, tasks, state, warming, act_key, reset_key)
-        learned, losses = _learn(agent, settings, tasks, state, warming, learn_key)
+        learned, losses = _learn(env, agent, settings, tasks, state, warming, learn_key)
         state = state._replace(agent=learned, iteration=state.iteration + 1, key=key)
         return state, seen | {"losses": losses, "learning": 1.0 - warming}
 
     state, history = jax.lax.scan(iterate, state, length=settings.chunk_steps)
     return state, _summarise(history)
+
+
+def _renew(env, agent, settings: Settings, tasks: Task, state: TrainState, keys: Key) -> Any:
+    """Let the networks begin anew where that is due, which is so for all seeds at once and thus stays a branch."""
+    if not settings.reset_every:
+        return state.agent
+    due = (state.iteration > settings.warmup_steps) & (state.iteration % settings.reset_every == 0)
+    one = lambda learner, key: agent.reset(learner, env.spec, tasks, key)
+    renewed = lambda learners: over_seeds(one, 0, 0)(learners, keys)
+    return jax.lax.cond(due, renewed, lambda learners: learners, state.agent)
 
 
 def _collect(env, agent, settings, tasks, state: TrainState, warming, key: Key, reset_key: Key):
@@ -211,6 +234,7 @@ def _collect(env, agent, settings, tasks, state: TrainState, warming, key: Key, 
     transition = Transition(state.obs, action, step.reward, 1.0 - step.terminated, step.obs, context)
 
     age, total = state.age + 1, state.total + step.reward
+    discounted = agent.gamma * state.discounted + step.reward
     ended = step.terminated | (age >= env.episode_length)
 
     def restart(_):
@@ -223,12 +247,18 @@ def _collect(env, agent, settings, tasks, state: TrainState, warming, key: Key, 
     env_state, obs, task = jax.lax.cond(jnp.any(ended), restart, lambda _: going_on, None)
     finite = jnp.all(jnp.isfinite(step.obs), axis=(2, 3)) & jnp.all(jnp.isfinite(step.reward), axis=2)
     seen = {"finished": jnp.sum(ended, axis=2), "total": jnp.sum(ended * total, axis=2), "finite": finite}
+    learner = state.agent
+    if agent.watches:
+        outcome = Outcome(step.reward, discounted, total, ended, step.terminated, age)
+        learner = over_seeds(agent.observe, 0, 0)(learner, outcome)
     state = state._replace(
+        agent=learner,
         env=env_state,
         task=task,
         obs=obs,
         age=jnp.where(ended, 0, age),
         total=jnp.where(ended, 0.0, total),
+        discounted=jnp.where(ended, 0.0, discounted),
         replay=jax.vmap(rings.add, (_REPLAY, 0), _REPLAY)(state.replay, transition),
     )
     return state, seen
@@ -240,25 +270,34 @@ def _held_actions(settings: Settings, state: TrainState, shape: tuple[int, ...])
     return jax.vmap(lambda key: jax.random.uniform(draw(key), shape, minval=-1.0))(state.warmup_key)
 
 
-def _learn(agent, settings: Settings, tasks: Task, state: TrainState, warming: Array, keys: Key) -> tuple[Any, Metrics]:
+def _learn(env, agent, settings: Settings, tasks, state: TrainState, warming: Array, keys: Key) -> tuple[Any, Metrics]:
     """Update the agents on fresh batches; all of a step's batches are drawn together, as one gather is cheaper."""
-    num_updates, batch_size = settings.updates_per_step, settings.batch_size
-    if not num_updates:
+    if not settings.updates_per_step:
         return state.agent, {}
 
     def learn_one(learner, replay: Replay, key: Key) -> tuple[Any, Metrics]:
         batch_key, update_key = jax.random.split(key)
-        rows = rings.sample(replay, batch_key, num_updates * batch_size)
-        split = lambda x: jnp.moveaxis(x.reshape(x.shape[0], num_updates, batch_size, *x.shape[2:]), 1, 0)
-        batches = jax.tree.map(split, rows)  # (U, T, B, ...)
+        batches = draw(env, settings, tasks, replay, batch_key)
+        keys = jax.random.split(update_key, settings.updates_per_step)
         update = lambda learner, x: agent.update(learner, x[0], tasks, x[1])
-        learner, metrics = jax.lax.scan(update, learner, (batches, jax.random.split(update_key, num_updates)))
+        learner, metrics = jax.lax.scan(update, learner, (batches, keys))
         return learner, jax.tree.map(lambda x: jnp.mean(x, axis=0), metrics)
 
     learn = lambda learners: over_seeds(learn_one, 0, _REPLAY, 0)(learners, state.replay, keys)
     shapes = jax.eval_shape(learn, state.agent)[1]
     rest = lambda learners: (learners, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes))
     return jax.lax.cond(warming, rest, learn, state.agent)
+
+
+def draw(env: Env, settings: Settings, tasks: Task, replay: Replay, key: Key) -> Transition:
+    """Draw the batches (U, T, B, ...) of one step's updates of one agent."""
+    shape = (len(tasks.id), settings.updates_per_step, settings.batch_size)
+    if settings.hindsight:
+        rows = hindsight.sample(env, tasks, settings.hindsight, replay, key, shape)
+    else:
+        rows = rings.sample(replay, key, math.prod(shape[1:]))
+        rows = jax.tree.map(lambda x: x.reshape(*shape, *x.shape[2:]), rows)
+    return jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), rows)
 
 
 def _summarise(history: dict) -> Metrics:

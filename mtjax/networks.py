@@ -22,6 +22,13 @@ class Params(NamedTuple):
     own: Any  # leaves (T, ...): each task's own, such as its head or its embedding
 
 
+class ReLU(nn.Module):
+    """max(x, 0), as a module, so that diagnostics see the activity of a layer's units."""
+
+    def __call__(self, x: Array) -> Array:
+        return nn.relu(x)
+
+
 class MLP(nn.Module):
     """Dense layers with ReLU, and layer normalisation before it if asked for."""
 
@@ -32,7 +39,7 @@ class MLP(nn.Module):
     def __call__(self, x: Array) -> Array:
         for width in self.widths:
             x = nn.Dense(width)(x)
-            x = nn.relu(nn.LayerNorm()(x) if self.layer_norm else x)
+            x = ReLU()(nn.LayerNorm()(x) if self.layer_norm else x)
         return x
 
 
@@ -55,33 +62,62 @@ def join(*inputs: Array, task: Array) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class Network:
-    """A body, and a linear head that is shared or each task's own."""
+    """A body and a linear head, each shared by all tasks or every task's own."""
 
     body: nn.Module
-    own_heads: bool = False
-    embedding_size: int = 0
+    own: tuple[str, ...] = ()  # which of "trajectory", "body" and "head" every task has for itself
+    embedding_size: int = 0  # of a learned vector a task, in place of features; 0 for none
+    unit_embedding: bool = False  # scale those vectors to length 1
+    front: nn.Module | None = None  # maps observations before the body; every task's own
+    trajectory: nn.Module | None = None  # makes features of what is seen, which is then a ``history.Seen``
 
     def init(self, key: Key, num_tasks: int, out: int, features: Array, *inputs: Array) -> Params:
         """Initialise for ``num_tasks`` tasks, ``out`` outputs, and inputs of the given shapes."""
-        body_key, head_key, embedding_key = jax.random.split(key, 3)
-        shared, own = {}, {}
+        body_key, head_key, embedding_key, front_key = jax.random.split(key, 4)
+        params, parts = Params({}, {}), {}
         if self.embedding_size:
-            own["embedding"] = jax.random.normal(embedding_key, (num_tasks, self.embedding_size))
-            features = own["embedding"][0]
-        shared["body"] = self.body.init(body_key, inputs[0], features, *inputs[1:])
-        width = self.body.apply(shared["body"], inputs[0], features, *inputs[1:]).shape[-1]  # type: ignore
-        if self.own_heads:
-            own["head"] = jax.vmap(lambda k: _init_linear(k, width, out))(jax.random.split(head_key, num_tasks))
-        else:
-            shared["head"] = _init_linear(head_key, width, out)
-        return Params(shared, own)
+            params.own["embedding"] = jax.random.normal(embedding_key, (num_tasks, self.embedding_size))
+            features = params.own["embedding"][0]
+        if self.trajectory is not None:
+            parts["trajectory"] = (self.trajectory.init, jax.random.fold_in(key, 4), inputs[0])
+            features = self.trajectory.init_with_output(key, inputs[0])[0]  # type: ignore
+            inputs = (inputs[0].obs, *inputs[1:])  # type: ignore
+        if self.front is not None:
+            params.own["front"] = self.for_each_task(self.front.init, front_key, num_tasks, inputs[0])
+            first = jax.tree.map(lambda x: x[0], params.own["front"])
+            inputs = (jnp.asarray(self.front.apply(first, inputs[0])), *inputs[1:])
+        data = (inputs[0], features, *inputs[1:])
+        width = jax.eval_shape(lambda: self.body.init_with_output(body_key, *data)[0]).shape[-1]
+        parts["body"] = (self.body.init, body_key, *data)
+        parts["head"] = (lambda key: _init_linear(key, width, out), head_key)
+        for name, (init, part_key, *arguments) in parts.items():
+            if name in self.own:
+                params.own[name] = self.for_each_task(init, part_key, num_tasks, *arguments)
+            else:
+                params.shared[name] = init(part_key, *arguments)
+        return params
+
+    @staticmethod
+    def for_each_task(init, key: Key, num_tasks: int, *arguments: Any):
+        """Initialise a part anew for every task, leaves (T, ...)."""
+        return jax.vmap(lambda k: init(k, *arguments))(jax.random.split(key, num_tasks))
 
     def apply(self, params: Params, features: Array, *inputs: Array) -> Array:
         """Map one task's inputs (..., O), (..., A) to outputs (..., out); ``params.own`` holds that task's alone."""
-        features = params.own.get("embedding", features)
-        hidden: Any = self.body.apply(params.shared["body"], inputs[0], features, *inputs[1:])
-        head = params.own["head"] if self.own_heads else params.shared["head"]
-        return hidden @ head["kernel"] + head["bias"]
+        head = {**params.shared, **params.own}["head"]
+        return self.hidden(params, features, *inputs) @ head["kernel"] + head["bias"]
+
+    def hidden(self, params: Params, features: Array, *inputs: Array) -> Array:
+        """The hidden layer (..., width) on which the head stands."""
+        parts = {**params.shared, **params.own}
+        if "embedding" in parts:
+            features = parts["embedding"]
+            features = features / jnp.linalg.norm(features) if self.unit_embedding else features
+        if self.trajectory is not None:
+            features = self.trajectory.apply(parts["trajectory"], inputs[0])  # type: ignore
+            inputs = (inputs[0].obs, *inputs[1:])  # type: ignore
+        obs: Any = inputs[0] if self.front is None else self.front.apply(parts["front"], inputs[0])
+        return self.body.apply(parts["body"], obs, features, *inputs[1:])  # type: ignore
 
 
 def _init_linear(key: Key, width: int, out: int) -> dict[str, Array]:
@@ -98,13 +134,38 @@ def tanh_normal(outputs: Array, key: Key | None) -> tuple[Array, Array]:
     Returns:
         actions (..., A) in (-1, 1) and their log-probabilities (...,); 0 for the mean action.
     """
-    mean, log_std = jnp.split(outputs, 2, axis=-1)
     if key is None:
+        mean, _ = jnp.split(outputs, 2, axis=-1)
         return jnp.tanh(mean), jnp.zeros(mean.shape[:-1])
-    low, high = _LOG_STD_RANGE
-    log_std = low + 0.5 * (high - low) * (jnp.tanh(log_std) + 1)
+    raw, log_prob = sample_raw(outputs, key)
+    return jnp.tanh(raw), log_prob
+
+
+def sample_raw(outputs: Array, key: Key) -> tuple[Array, Array]:
+    """Sample as ``tanh_normal``, but return actions (..., A) from before the tanh, with the same log-probabilities."""
+    mean, log_std = _moments(outputs)
     noise = jax.random.normal(key, mean.shape)
     raw = mean + jnp.exp(log_std) * noise
+    return raw, _log_density(noise, log_std, raw)
+
+
+def log_density(outputs: Array, raw: Array) -> Array:
+    """Log-probability (...,) of the actions tanh(raw) under a tanh-squashed Gaussian with ``outputs`` (..., 2A).
+
+    It takes actions from before the tanh, which no rounding has brought to 1.
+    """
+    mean, log_std = _moments(outputs)
+    return _log_density((raw - mean) * jnp.exp(-log_std), log_std, raw)
+
+
+def _moments(outputs: Array) -> tuple[Array, Array]:
+    """Means (..., A) and bounded log standard deviations (..., A)."""
+    mean, log_std = jnp.split(outputs, 2, axis=-1)
+    low, high = _LOG_STD_RANGE
+    return mean, low + 0.5 * (high - low) * (jnp.tanh(log_std) + 1)
+
+
+def _log_density(noise: Array, log_std: Array, raw: Array) -> Array:
     log_normal = -0.5 * jnp.square(noise) - log_std - 0.5 * jnp.log(2 * jnp.pi)
     log_slope = 2 * (jnp.log(2.0) - raw - jax.nn.softplus(-2 * raw))
-    return jnp.tanh(raw), jnp.sum(log_normal - log_slope, axis=-1)
+    return jnp.sum(log_normal - log_slope, axis=-1)

@@ -41,6 +41,12 @@ def sample(replay: Replay, key: Key, batch_size: int) -> Any:
     return jax.tree.map(lambda rows: jax.vmap(lambda ring, i: ring[i])(rows, index), replay.rows)
 
 
+def sample_from(replay: Replay, key: Key, ring: Array) -> Any:
+    """Draw a row from each ring that ``ring`` names by the number of its task; leaves (*ring.shape, ...)."""
+    index = jax.random.randint(key, ring.shape, 0, replay.size)
+    return jax.tree.map(lambda rows: rows[ring, index], replay.rows)
+
+
 def capacity_of(replay: Replay) -> int:
     """Return how many rows each ring holds when full."""
     return jax.tree.leaves(replay.rows)[0].shape[1]

@@ -10,16 +10,20 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax import checkpoint, log
+from mtjax import checkpoint, finetune, log
 from mtjax.evaluation import Evaluations, evaluate
+from mtjax.history import remember
 from mtjax.loop import Settings, TrainState, init, run_chunk
 from mtjax.types import SPLITS, Agent, Env, InputError
+
+if TYPE_CHECKING:
+    from mtjax.policy import Policy
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,6 +77,7 @@ def train(
     eval_every: int = Plan.eval_every,
     eval_episodes: int = Plan.eval_episodes,
     settings: Settings | None = None,
+    start: "Policy | None" = None,
     directory: str | Path | None = None,
     resume: bool = False,
     quiet: bool = True,
@@ -87,6 +92,8 @@ def train(
         seeds: how many seeds to run at once; seed: the first of them.
         eval_every: environment steps between evaluations (0: ten in the run), of ``eval_episodes`` episodes a task.
         settings: how to collect and learn; by default ``Settings()``.
+        start: fine-tune what a run learned, from ``mtjax.load``: ``env`` is ``new.scaled_as(start.env)`` and ``agent``
+            is ``start.agent``, of which rates and ``tune`` may be replaced (``finetune.adopt`` says what is kept).
         directory: an existing folder for metrics, evaluations and checkpoints; None writes nothing.
         resume: go on from the newest checkpoint in ``directory``.
         quiet: print nothing.
@@ -97,13 +104,17 @@ def train(
         FloatingPointError: numbers stopped being finite; the message names task and step.
     """
     plan = Plan(steps, seed, seeds, eval_every, eval_episodes)
+    if start is not None:
+        finetune.require_fit(start, env, agent)  # type: ignore
     directory = None if directory is None else Path(directory)
     started = time.monotonic()
-    tasks = env.tasks("train")
+    tasks, env = env.tasks("train"), remember(env, agent.history)
     settings = fit_chunk(settings or Settings(), len(tasks.id), steps)
     run = _Run(env, agent, settings, plan, directory, log.Console(plan.steps, quiet))
     try:
         programs, state = run.begin(resume)
+        if start is not None and not resume:
+            state = state._replace(agent=finetune.adopt(start, agent, tasks, state.agent))  # type: ignore
         run.console.say(f"compiled in {time.monotonic() - started:.1f} s")
         return run.drive(programs, state, started, on_chunk)
     finally:

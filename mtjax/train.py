@@ -13,8 +13,11 @@ from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from mtjax import __version__, cli
+from mtjax import __version__, cli, hindsight
+from mtjax.agents import settings
 from mtjax.cli import Program
+from mtjax.finetune import require_fit
+from mtjax.policy import Policy, load
 from mtjax.run import Result, enable_compile_cache, train
 from mtjax.types import InputError
 
@@ -33,18 +36,20 @@ def main(argv: Sequence[str]) -> None:
         program = _resumed(program, directory, argv)
     enable_compile_cache()
     _check(program)
+    start = _start(program) if directory is None else None
     if directory is not None:
         _record_steps(directory / "config.json", program.plan.steps)
     else:
         directory = new_directory(Path(program.runs), f"{program.env}-{program.agent}")
         (directory / "config.json").write_text(cli.to_json(program, _circumstances(program)))
-    print(f"{program.agent} on {program.env}: {_summary(program)}\nrun: {directory}", flush=True)
+    print(f"{program.agent} on {program.env}: {_summary(program)}\n{_origin(program)}run: {directory}", flush=True)
     plan = dataclasses.asdict(program.plan)
     result = train(
         program.family,
         program.learner,
         **plan,
         settings=program.training,
+        start=start,
         directory=directory,
         resume=resume,
         quiet=False,
@@ -81,8 +86,34 @@ def _check(program: Program) -> None:
     from mtjax.agents.sac import load_vectors
 
     _ = program.family.engine_name, program.family.table
+    if program.training.hindsight:
+        hindsight.require(program.family)
     if program.learner.vectors:
         load_vectors(program.learner.vectors, program.family.train_count)
+    tune = program.learner.tune
+    if tune != "all" and not program.start:
+        raise InputError(f"--tune={tune} leaves the rest as a run left it; say which run: --from=RUN")
+    if program.start and program.training.reset_every:
+        raise InputError("--reset-every throws away what --from takes from a run; give one of them")
+
+
+def _start(program: Program) -> Policy | None:
+    """What the run learned that is to be fine-tuned, if one is."""
+    if not program.start:
+        return None
+    start = load(program.start)
+    require_fit(start, program.family, program.learner)
+    return start
+
+
+def _origin(program: Program) -> str:
+    """A line on what is fine-tuned, if something is."""
+    if not program.start:
+        return ""
+    family, told = program.family, program.learner.conditioning == "parameters"
+    unseen = set(family.varied) - {name for name, _, _ in family.ranges} if told else ()
+    blind = f"; its networks cannot be told {', '.join(sorted(unseen))}" if unseen else ""
+    return f"from {program.start}: {program.learner.tune} of its parameters learn{blind}\n"
 
 
 def new_directory(root: Path, name: str) -> Path:
@@ -121,16 +152,20 @@ def _circumstances(program: Program) -> dict:
 def repeat(program: Program) -> list[str]:
     """Every flag of this program, so that the command means the same whatever the presets become."""
     words = [f"--env={program.env}", f"--agent={program.agent}", *cli.import_flag(program.family)]
+    words += [f"--from={program.start}"] if program.start else []
     for part, prefix in (("plan", "--"), ("training", "--"), ("family", "--env."), ("learner", "--agent.")):
-        settings = dataclasses.asdict(getattr(program, part)).items()
-        words += itertools.chain(*(_flag(prefix, name.replace("_", "-"), value) for name, value in settings))
+        value = getattr(program, part)
+        items = (settings(value) if part == "learner" else dataclasses.asdict(value)).items()
+        words += itertools.chain(*(_flag(prefix, name.replace("_", "-"), value) for name, value in items))
     return words
 
 
 def _flag(prefix: str, name: str, value: object) -> list[str]:
+    if name == "context-ranges":  # the run's of --from
+        return []
     if name == "vary":
         return [f"{prefix}vary.{parameter}={values}" for parameter, values in value]  # type: ignore
-    prefix = "--" if name in ("split", "engine") else prefix
+    prefix = "--" if name in ("split", "engine", "tune") else prefix
     match value:
         case bool():
             return [f"{prefix}{name}" if value else f"{prefix}no-{name}"]

@@ -47,12 +47,24 @@ class Transition(NamedTuple):
     context: Array | None = None  # (C,) of the episode's own task where episodes draw theirs
 
 
+class Outcome(NamedTuple):
+    """What one step of every environment brought; leaves (T, E)."""
+
+    reward: Array
+    discounted: Array  # sum of the episode's rewards so far, each discounted once more at every later step
+    total: Array  # sum of the episode's rewards so far
+    ended: Array  # bool: the episode is over, by whatever cause
+    terminated: Array  # bool: it is over for good, and not by its time limit
+    age: Array  # int32, steps of the episode so far
+
+
 class Spec(NamedTuple):
     """The sizes an agent must know before it can build its networks."""
 
     obs_size: int
     action_size: int
     context_size: int
+    history: int = 0  # past steps that each observation shows as well (mtjax.history)
 
 
 class Env(Protocol):
@@ -71,9 +83,17 @@ class Env(Protocol):
 class Agent(Protocol):
     """A learner. A frozen dataclass whose fields are its hyper-parameters and its command-line flags."""
 
+    @property
+    def gamma(self) -> float: ...
+    @property
+    def watches(self) -> bool: ...  # whether ``observe`` wants to be called
+    @property
+    def history(self) -> int: ...  # past steps that observations must show
     def init(self, spec: Spec, tasks: Task, key: Key) -> Any: ...
     def act(self, state: Any, obs: Array, task: Task, key: Key | None) -> Array: ...
     def update(self, state: Any, batch: Transition, tasks: Task, key: Key) -> tuple[Any, Metrics]: ...
+    def observe(self, state: Any, outcome: Outcome) -> Any: ...
+    def reset(self, state: Any, spec: Spec, tasks: Task, key: Key) -> Any: ...  # networks begin anew
 
 
 class InputError(ValueError):

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mtjax import agents, loop
+from mtjax.history import remember, widen
 from mtjax.networks import Params
 from mtjax.types import Array, Key, Spec, Step, Task, Transition
 
@@ -160,12 +161,23 @@ class Broken(Walk):
 # Agents, and running them.
 
 
+SMALL = {  # of parts that have such settings
+    "num_experts": 2,
+    "expert_widths": (8,),
+    "encoder_widths": (8,),
+    "module_width": 8,
+    "routing_widths": (8,),
+    "hypernetwork_widths": (8, 4),
+    "latent_widths": (8, 8),
+    "model_widths": (8,),
+}
+
+
 def tiny(name: str, **settings):
     """Return the agent called ``name``, small enough to compile in a few seconds."""
-    small = {"hidden": (16,), "embedding_size": 4}
-    if name == "care":
-        small |= {"num_experts": 2, "expert_widths": (8,)}
-    return agents.agent(name, **{**small, **settings})
+    made = agents.agent(name, **{"hidden": (16,), "embedding_size": 4, **settings})
+    small = {k: v for k, v in SMALL.items() if k in agents.settings(made) and k not in settings}
+    return agents.agent(name, **{**agents.settings(made), **small})
 
 
 @lru_cache
@@ -178,7 +190,7 @@ def _programs(env, agent, settings: loop.Settings, num_seeds: int):
 
 def train(env, agent, settings: loop.Settings, *, tasks: Task | None = None, seeds=(0,), chunks: int = 1):
     """Return the training state after ``chunks`` chunks, and the metrics of each."""
-    tasks, history = env.tasks() if tasks is None else tasks, []
+    tasks, history, env = env.tasks() if tasks is None else tasks, [], remember(env, agent.history)
     init, run_chunk = _programs(env, agent, settings, len(seeds))
     state = init(tasks, jnp.asarray(seeds, jnp.uint32))
     for _ in range(chunks):
@@ -195,6 +207,7 @@ def quick(function, *arguments):
 @lru_cache
 def _agent_programs(agent, spec: Spec, num_tasks: int, batch_size: int):
     tasks, key = tasks_of("one-step", np.ones(num_tasks)), jax.random.key(0)
+    spec = widen(spec, agent.history)
     init = lambda tasks, key: agent.init(spec, tasks, key)
     batch = random_batch(0, num_tasks, batch_size, spec)
     return quick(init, tasks, key), quick(agent.update, jax.eval_shape(init, tasks, key), batch, tasks, key)

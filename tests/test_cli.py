@@ -20,7 +20,8 @@ from conftest import SHORT_RUN
 import mtjax.evaluate
 import mtjax.train
 from mtjax import cli
-from mtjax.agents import AGENTS
+from mtjax.agents import AGENTS, PARTS
+from mtjax.agents import settings as settings_of
 from mtjax.envs import ENVS
 from mtjax.loop import Settings
 from mtjax.run import Plan
@@ -59,8 +60,9 @@ def test_names_choose_the_defaults():
     """What is given changes them, and nothing else."""
     program = cli.parse(["--env=finger-spin-vary-size", "--agent=care", "--agent.num-experts=3", "--preset=gpu"])
     named = cli.with_preset("finger-spin-vary-size", "care", "gpu")
-    assert program == dataclasses.replace(named, learner=dataclasses.replace(named.learner, num_experts=3))
-    assert program.family == mtjax.make("finger-spin-vary-size") and program.learner.num_experts == 3
+    encoder = dataclasses.replace(named.learner.encoder, num_experts=3)
+    assert program == dataclasses.replace(named, learner=dataclasses.replace(named.learner, encoder=encoder))
+    assert program.family == mtjax.make("finger-spin-vary-size")
     assert named != cli.with_preset("finger-spin-vary-size", "care", "cpu")
 
 
@@ -82,7 +84,7 @@ def test_flags_may_be_written_in_three_ways(words):
 def test_last_of_a_repeated_name_counts():
     """As it does for every other flag."""
     program = cli.parse(["--agent=care", "--steps=1", "--agent", "multi-head", "--steps=2"])
-    assert (program.agent, type(program.learner), program.plan.steps) == ("multi-head", AGENTS["multi-head"], 2)
+    assert (program.agent, program.learner.heads, program.plan.steps) == ("multi-head", "per-task", 2)
 
 
 PAIRS = [(env, "sac") for env in ENVS] + [("finger-spin", agent) for agent in AGENTS]
@@ -95,7 +97,7 @@ def test_a_record_is_read_back_as_it_was(env, agent, tmp_path):
     names = [] if env == "brax-fast" else list(family.parameters)[:1]  # which has nothing that could vary
     given = {name: str(family.parameters[name].nominal) for name in names}
     vary = [f"--env.vary.{name}={values}" for name, values in given.items()]
-    words = [f"--env={env}", f"--agent={agent}", "--agent.hidden", "7", "5", "3", "--split=none", *vary]
+    words = [f"--env={env}", f"--agent={agent}", "--agent.hidden", "7", "7", "--split=none", *vary]
     program = cli.parse(words)
     assert given.items() <= dict(program.family.vary).items()
     (tmp_path / "config.json").write_text(cli.to_json(program, {"command": "x"}))
@@ -105,12 +107,12 @@ def test_a_record_is_read_back_as_it_was(env, agent, tmp_path):
 SETTINGS = [
     "",
     "--steps=123 --seed=4 --seeds=2 --eval-every=7 --eval-episodes=3",
-    "--agent.hidden 5 6 7 --agent.actor-lr=1e-05 --agent.target-entropy=-0.25",
+    "--agent.hidden 6 6 6 --agent.actor-lr=1e-05 --agent.target-entropy=-0.25",
     "--agent.shared-temperature --agent.no-critic-layer-norm --agent.normalize-observations",
     "--env.vary.size=.95,1,1.05,1.1,1.15,1.2,1.25,1.3,1.35,1.4 --split=hip-bmdp --engine=c --env.solver-iterations=3",
     "--env.vary.touch-size 0.1:0.3:3 --env.vary.size=1:1.1 --env.num-draws=5 --engine mjx",
     "--env.vary.touch-size=0.1,0.3 --env.vary.size=1:1.1 --env.combine=random --env.num-tasks=3 --env.task-seed=1",
-    "--agent.conditioning=one-hot --agent.heads=per-task --agent.gradients=pcgrad --preset=gpu --num-envs=2",
+    "--agent.conditioning=one-hot --agent.encoder=film --agent.film=scalar --agent.scaling=reward --preset=gpu",
 ]
 
 
@@ -139,8 +141,8 @@ def test_presets_name_only_what_there_is(file):
     assert set(preset) == {"cpu", "gpu"}
     fields = lambda cls: {field.name for field in dataclasses.fields(cls)}
     known = {"plan": fields(Plan), "training": fields(Settings)}
-    known["agent"] = set().union(*(fields(cls) for cls in AGENTS.values()))
-    known |= {name: fields(cls) for name, cls in AGENTS.items()}
+    known["agent"] = set(settings_of(mtjax.agent("sac")))
+    known |= {name: set(settings_of(mtjax.agent(name))) for name in AGENTS}
     for tables in preset.values():
         for table, settings in tables.items():
             assert set(settings) <= known[table], table
@@ -189,11 +191,11 @@ def test_help_mentions_every_flag_with_its_default(help_text):
     program = cli.parse(["--agent=care"])
     for flag in cli.flags(program):
         assert re.search(rf"{re.escape(flag)}[ ,]", help_text), flag
-    assert help_text.count("(default: ") == len(cli.flags(program))
+    assert help_text.count("(default: ") == len(cli.flags(program)) - len(PARTS)  # which are read before
     learner = program.learner
-    for default in (program.plan.steps, learner.actor_lr, learner.conditioning, learner.variant):
+    for default in (program.plan.steps, learner.actor_lr, learner.conditioning, learner.encoder.variant):
         assert f"(default: {default})" in help_text
-    for widths in (learner.hidden, learner.expert_widths):
+    for widths in (learner.hidden, learner.encoder.expert_widths):
         assert f"(default: {' '.join(map(str, widths))})" in help_text
 
 

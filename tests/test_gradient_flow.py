@@ -7,7 +7,9 @@ import pytest
 from probes import learner, pick, random_batch, tasks_of, tiny
 
 from mtjax.agents import AGENTS
-from mtjax.agents.care import Mixture
+from mtjax.agents.encoders.care import Mixture
+from mtjax.history import widen
+from mtjax.networks import Params
 from mtjax.types import Spec
 
 SPEC, BATCH = Spec(3, 2, 1), 4
@@ -15,16 +17,44 @@ SCALES = (1.0, -0.5, 0.3)
 TASKS = tasks_of("one-step", SCALES)
 
 TRUNK = {"shared/body/MLP_0", "shared/head"}
+OWN = {"own/body", "own/head"}
 CARE = {f"shared/body/{part}" for part in ("context", "context_out", "experts", "trunk")} | {"shared/head"}
-# The parts of actor and critic, each of which its loss must move.
+BRONET = {f"shared/body/{kind}_{i}" for kind in ("Dense", "LayerNorm") for i in range(3)}
+MODELS = {"shared/transition", "shared/reward"}
+LATENT = {"actor": TRUNK, "critic": TRUNK | {"shared/latent"} | MODELS, "target": TRUNK | {"shared/latent"}}
+WITH_THETA = {**LATENT, **{who: LATENT[who] | {"own/embedding"} for who in ("critic", "target")}}
+body = lambda *parts: {f"shared/body/{part}" for part in parts} | {"shared/head"}
+# The parts of actor and critics, or of each, all of which their losses must move.
 PARTS = {
     "sac": ("sac", {}, TRUNK),
     "sac-conditioned": ("sac-conditioned", {}, TRUNK),
     "sac-embedding": ("sac-conditioned", {"conditioning": "embedding"}, TRUNK | {"own/embedding"}),
+    "sac-inferred": ("sac", {"conditioning": "inferred", "inferred_from": 2}, TRUNK | {"shared/trajectory"}),
+    "sac-input-map": ("sac-conditioned", {"encoder": "input-map"}, TRUNK | {"own/front"}),
+    "sac-hypernetwork": ("sac-conditioned", {"encoder": "hypernetwork"}, body("hypernetwork", "code", "trunk")),
     "multi-head": ("multi-head", {}, {"shared/body/MLP_0", "own/head"}),
+    "disjoint": ("disjoint", {}, OWN),
+    "distral": ("distral", {}, {"actor": OWN | {"shared/distilled"}, "critic": OWN, "target": OWN}),
     "care": ("care", {}, CARE | {"shared/body/after"}),
     "care-mtrl": ("care", {"variant": "mtrl"}, CARE | {"shared/body/gate", "shared/body/gate_out"}),
+    "moe": ("moe", {}, body("experts", "gate", "trunk")),
+    "moe-ensemble": ("moe", {"mode": "ensemble"}, body("experts", "trunk")),
+    "film": ("film", {}, body("generator", "modulation", "trunk")),
+    "film-scalar": ("film", {"film": "scalar"}, body("generator", "modulation", "trunk")),
+    "moore": ("moore", {}, {"shared/body/experts", "shared/body/weights", "own/head"}),
+    "soft-modularization": (
+        "soft-modularization",
+        {"num_layers": 3},
+        body("base_out", "modules_0", "modules_1", "routing", "task"),
+    ),
+    "paco": ("paco", {}, body("trunk", "weights")),
+    "brc": ("brc", {"value": "hl-gauss"}, BRONET | {"shared/head", "own/embedding"}),
+    "deepmdp": ("deepmdp", {}, LATENT),
+    "hip-bmdp": ("hip-bmdp", {}, WITH_THETA),
     "pcgrad": ("pcgrad", {}, TRUNK),
+    "cagrad": ("cagrad", {}, TRUNK),
+    "gradnorm": ("gradnorm", {}, TRUNK),
+    "famo": ("famo", {}, TRUNK),
 }
 EVERY_AGENT = pytest.mark.parametrize("case", PARTS)
 
@@ -36,6 +66,12 @@ def start(case, seed=0):
     return init(TASKS, jax.random.key(seed)), update
 
 
+def batch_of(case, seed, spec=SPEC):
+    """A random batch of what the agent sees."""
+    name, settings, _ = PARTS[case]
+    return random_batch(seed, 3, BATCH, widen(spec, tiny(name, **settings).history))
+
+
 def leaves_of(params):
     """Arrays by path, with flax's own level left out."""
     found = jax.tree_util.tree_leaves_with_path(params)
@@ -43,9 +79,19 @@ def leaves_of(params):
     return {name(path).replace("/params/", "/"): np.asarray(leaf) for path, leaf in found}
 
 
-def slices(path, leaf, is_critic):
+def parts_of(case, network):
+    """What a network is made of."""
+    parts = PARTS[case][2]
+    return parts[network] if isinstance(parts, dict) else parts
+
+
+ONE_OF_A_KIND = {"shared/latent", "shared/transition", "shared/reward"}  # of which critics have one together
+
+
+def slices(case, path, leaf, is_critic):
     """A leaf by all that owns a part of it: tasks, then critics, then experts."""
-    axes = path.startswith("own/") + is_critic + ("/experts/" in path)
+    theirs = "/".join(path.split("/")[:2]) not in ONE_OF_A_KIND and not case.startswith("hip-bmdp")
+    axes = path.startswith("own/") + (is_critic and theirs) + ("/experts/" in path)
     return leaf.reshape(-1, *leaf.shape[axes:]) if axes else leaf[None]
 
 
@@ -60,12 +106,13 @@ def test_everything_that_should_learn_does(case):
     before, update = start(case)
     after = before
     for i in range(10):
-        after, _ = update(after, random_batch(i, 3, BATCH, SPEC), TASKS, jax.random.key(i))
+        after, _ = update(after, batch_of(case, i), TASKS, jax.random.key(i))
     for network in ("actor", "critic", "target"):
         old, new = leaves_of(getattr(before, network)), leaves_of(getattr(after, network))
-        assert {"/".join(path.split("/")[: 3 if "/body/" in path else 2]) for path in old} == PARTS[case][2]
+        deep = lambda path: path.startswith("shared/body/")
+        assert {"/".join(path.split("/")[: 3 if deep(path) else 2]) for path in old} == parts_of(case, network)
         for path in old:
-            parts = (slices(path, leaves[path], network != "actor") for leaves in (old, new))
+            parts = (slices(case, path, leaves[path], network != "actor") for leaves in (old, new))
             for i, (a, b) in enumerate(zip(*parts, strict=True)):
                 assert not np.array_equal(a, b), f"{network} {path}[{i}] stayed"
     assert np.all(before.log_temperature != after.log_temperature)
@@ -80,6 +127,11 @@ FLOW = {
     "reward": (("log_temperature",), ("actor", "critic", "target")),
 }
 
+
+# Where the actor stands on the critic's representation, all that moves this moves the policy's entropy; and what the
+# slow encoder sees is what models foretell. BRC scales rewards by what entropy pays.
+_ON_LATENT = {"critic": ((), ("actor",)), "target": ((), ("critic",)), "reward": ((), ("actor", "critic", "target"))}
+FLOW_OF = {"deepmdp": _ON_LATENT, "hip-bmdp": _ON_LATENT, "brc": {"log_temperature": ((), ("actor",))}}
 
 OPTIMIZERS = {"actor": 0, "critic": 1, "log_temperature": 2}
 
@@ -97,10 +149,10 @@ def same(a, b):
 def test_losses_reach_their_own_parameters_alone(case):
     """Change one input of an update: if a loss leaked into foreign parameters, these would move too."""
     state, update = start(case)
-    batch, key = random_batch(0, 3, BATCH, SPEC)._replace(discount=jnp.zeros((3, BATCH))), jax.random.key(1)
+    batch, key = batch_of(case, 0)._replace(discount=jnp.zeros((3, BATCH))), jax.random.key(1)
     plain, _ = update(state, batch, TASKS, key)
     nudge = lambda tree: jax.tree.map(lambda x: x * 1.5 + 0.05, tree)
-    for changed, (untouched, moved) in FLOW.items():
+    for changed, (untouched, moved) in {**FLOW, **FLOW_OF.get(case, {})}.items():
         if changed == "reward":
             after, _ = update(state, batch._replace(reward=nudge(batch.reward)), TASKS, key)
         else:
@@ -111,16 +163,26 @@ def test_losses_reach_their_own_parameters_alone(case):
             assert not same(learned(after, part), learned(plain, part)), f"{changed} did not reach {part}"
 
 
+def tau_of(agent, part):
+    """How fast the slow copy of a part follows."""
+    return agent.tau if part in ("body", "head") else getattr(agent, "encoder_tau", agent.tau)
+
+
 @EVERY_AGENT
 def test_the_slow_critic_is_what_bootstraps(case):
     """With discount 1 it moves the critic; its own step is a share of the new critic and nothing else."""
     state, update = start(case)
-    batch, key = random_batch(0, 3, BATCH, SPEC)._replace(discount=jnp.ones((3, BATCH))), jax.random.key(1)
+    batch, key = batch_of(case, 0)._replace(discount=jnp.ones((3, BATCH))), jax.random.key(1)
     slow = jax.tree.map(lambda x: x * 1.5 + 0.05, state.target)
     plain, other = update(state, batch, TASKS, key)[0], update(state._replace(target=slow), batch, TASKS, key)[0]
     assert not same(plain.critic, other.critic)
-    tau = tiny("sac").tau
-    expected = jax.tree.map(lambda old, new: (1 - tau) * old + tau * new, slow, other.critic)
+    name, settings, _ = PARTS[case]
+    agent = tiny(name, **settings)
+    kept = lambda new, old: {part: new[part] for part in old}  # models of the future have no slow copy
+    new = Params(*map(kept, other.critic, slow))
+    taus = Params(*({part: tau_of(agent, part) for part in parts} for parts in slow))
+    mix = lambda tau, old, new: jax.tree.map(lambda a, b: (1 - tau) * a + tau * b, old, new)
+    expected = jax.tree.map(mix, taus, slow, new, is_leaf=lambda x: isinstance(x, float))
     for a, b in zip(jax.tree.leaves(expected), jax.tree.leaves(other.target), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7)
 

@@ -29,6 +29,9 @@ class Recorder:
     """Acts 2 + task's number, which no random action is; counts updates, and those given the batch before once more."""
 
     nan_update: int = -1
+    gamma: float = 0.5
+    watches: bool = False
+    history: int = 0
 
     def init(self, spec, tasks, key):
         last = jnp.zeros((len(tasks.id), BATCH, spec.obs_size))

@@ -10,7 +10,7 @@ from probes import tiny
 
 from mtjax import loop
 from mtjax.envs.maze import MazeState, TwoGoalMaze
-from mtjax.types import InputError
+from mtjax.types import InputError, Spec
 
 MAZE = TwoGoalMaze(vary={"goal-box": "0,1"}, split="none")
 SEEING = TwoGoalMaze(vary={"goal-box": "0,1"}, split="none", observe_boxes=True)
@@ -183,7 +183,7 @@ def test_episodes_start_apart():
 def test_both_tasks_and_nothing_between():
     """Blue is context -1 and red 1; what is neither is refused."""
     np.testing.assert_array_equal(MAZE.tasks().context, [[-1], [1]])
-    assert MAZE.spec == (4, 3, 1) and SEEING.spec == (8, 3, 1)
+    assert MAZE.spec == Spec(4, 3, 1) and SEEING.spec == Spec(8, 3, 1)
     assert [len(MAZE.tasks(split).id) for split in ("train", "interpolation", "extrapolation")] == [2, 0, 0]
     np.testing.assert_array_equal(TwoGoalMaze().tasks().goal["goal-box"], [0])
     for vary in ({"goal-box": "0,1"}, {"goal-box": "0.5"}, {"goal-box": "0:1"}):

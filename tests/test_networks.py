@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mtjax.agents.care import Experts, Mixture
+from mtjax.agents.encoders.care import Experts, Mixture
 from mtjax.networks import MLP, Network, Params, Trunk, join, tanh_normal
 
 TASKS, BATCH, OBS, ACTION, CONTEXT, OUT = 3, 4, 2, 1, 2, 5
@@ -64,7 +64,7 @@ def test_a_task_uses_the_shared_body_and_its_own_head_alone(data, own_heads):
     """The network mapped over tasks against one task at a time in NumPy."""
     obs, action, _ = data
     features = np.float32(np.random.default_rng(2).normal(size=(TASKS, CONTEXT)))
-    network = Network(Trunk((6,)), own_heads)
+    network = Network(Trunk((6,)), ("head",) if own_heads else ())
     params = jiggle(network.init(jax.random.key(0), TASKS, OUT, features[0], obs[0], action[0]))
     mapped = jax.vmap(network.apply, (Params(None, 0), 0, None, None))(params, features, obs, action)
     for i in range(TASKS):
@@ -76,7 +76,7 @@ def test_a_task_uses_the_shared_body_and_its_own_head_alone(data, own_heads):
 
 def test_heads_begin_differently_and_do_not_touch_each_other(data):
     """One task's head does nothing to another task's output."""
-    network = Network(Trunk((6,)), own_heads=True)
+    network = Network(Trunk((6,)), own=("head",))
     params = network.init(jax.random.key(0), TASKS, OUT, data[2], data[0])
     kernel = params.own["head"]["kernel"]
     assert not np.allclose(kernel[0], kernel[1]) and kernel.shape == (TASKS, 6, OUT)

@@ -30,9 +30,9 @@ def drawn(monkeypatch):
     """The axes of every figure, which are also written."""
     all_axes, save = [], plot._save
 
-    def record(figure, axes, path):
+    def record(figure, axes, path, **settings):
         all_axes.append(axes)
-        save(figure, axes, path)
+        save(figure, axes, path, **settings)
 
     monkeypatch.setattr(plot, "_save", record)
     return all_axes

@@ -20,6 +20,8 @@ SETTINGS = Settings(
 )
 # The temperature stays negligible, so that the soft Q-value is the plain one.
 PLAIN = {"gamma": GAMMA, "initial_temperature": 1e-6, "temperature_lr": 1e-9}
+# Values are compared in the units of rewards; and two experts are too few for four signs of observation and scale.
+OF_AGENT = {"brc": {"scaling": "none"}, "moe": {"num_experts": 4}}
 RATES = {"tau": 0.3, "actor_lr": 1e-2, "critic_lr": 1e-2}
 
 # Q(scale, obs, action), and how far a critic may be from it: at least half as far again as the worst of five seeds.
@@ -36,7 +38,7 @@ EXPECTED = {
 
 def learned(name, kind, scales=SCALES):
     """Train, and return the agent, its state and the tasks."""
-    agent, tasks = tiny(name, **PLAIN, **RATES), tasks_of(kind, scales)
+    agent, tasks = tiny(name, **{**PLAIN, **RATES, **OF_AGENT.get(name, {})}), tasks_of(kind, scales)
     state, _ = train(Probe(), agent, SETTINGS, tasks=tasks, chunks=1 + (kind == "by-both"))
     return agent, only_seed(state.agent), tasks
 

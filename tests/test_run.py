@@ -123,7 +123,7 @@ def test_metrics_have_a_row_a_seed_a_chunk(finished_run):
     assert [(r["seed"], r["iteration"], r["steps"]) for r in rows] == [
         (str(seed), str(25 * chunk), str(CHUNK * chunk)) for chunk in range(1, 7) for seed in (0, 1)
     ]
-    learned = {"actor_loss", "critic_loss", "entropy", "temperature", "value"}
+    learned = {"actor_loss", "critic_loss", "entropy", "temperature", "value", "td_error", "td_error_0", "td_error_1"}
     assert set(rows[0]) == {"seed", "iteration", "steps", "return", "episodes", "return_0", "return_1"} | learned
     for row in rows:
         assert float(row["return"]) == pytest.approx((float(row["return_0"]) + float(row["return_1"])) / 2, rel=1e-5)

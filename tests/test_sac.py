@@ -10,6 +10,7 @@ import optax
 import pytest
 from probes import quick, random_batch, tasks_of
 
+from mtjax.agents.encoders import Identity
 from mtjax.agents.sac import SAC, SACState
 from mtjax.networks import Params, join
 from mtjax.types import Spec, Transition
@@ -23,12 +24,15 @@ class Inputs(nn.Module):
         return join(obs, *action, task=features)
 
 
+class Bare(Identity):
+    def body(self, hidden, layer_norm):
+        return Inputs()
+
+
 @dataclasses.dataclass(frozen=True)
 class LinearSAC(SAC):
     conditioning: str = "parameters"
-
-    def body(self, layer_norm):
-        return Inputs()
+    encoder: Identity = dataclasses.field(default_factory=Bare)
 
 
 def linear_policy(outputs, key):
@@ -63,14 +67,14 @@ def test_critic_target(linear, discount, expected):
     """From s' = 3: a' = 6, log pi = -1.5, Q = 6 and 4; y = 1 + 0.9 d (4 + 0.2 1.5)."""
     batch = rows([0.0], [0.0], [1.0], [discount], [3.0])
     agent = LinearSAC(gamma=0.9)
-    target = agent.critic_target(ACTOR, CRITICS, FEATURES, 0.2, batch, jax.random.key(0))
+    target = agent.critic_target(ACTOR, CRITICS, CRITICS, FEATURES, 0.2, batch, jax.random.key(0))
     np.testing.assert_allclose(target, [expected], rtol=1e-6)
 
 
 def test_critic_target_believes_the_least_critic_at_each_transition(linear):
     """From s' = 3 the least is the second critic's 4, and from s' = -3 the first's -6."""
     batch = rows([0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [1.0, 1.0], [3.0, -3.0])
-    target = LinearSAC(gamma=1.0).critic_target(ACTOR, CRITICS, FEATURES, 0.0, batch, jax.random.key(0))
+    target = LinearSAC(gamma=1.0).critic_target(ACTOR, CRITICS, CRITICS, FEATURES, 0.0, batch, jax.random.key(0))
     np.testing.assert_allclose(target, [4.0, -6.0], rtol=1e-6)
 
 

@@ -1,113 +1,44 @@
-"""Gradient surgery on Gram matrices against the algorithm as written, in the space of parameters."""
+"""Gradients of several tasks combined, for both kinds of parameters: against slopes worked out by hand."""
 
-from itertools import permutations
-from typing import get_args
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import QUICK
-from scipy.optimize import minimize, nnls
+from probes import QUICK, learner, random_batch, tasks_of, tiny
 
-from mtjax.agents import rules, surgery
+from mtjax.agents import surgery
+from mtjax.agents.surgery import RULES
 from mtjax.networks import Params
+from mtjax.types import Spec
 
 KEY = jax.random.key(4)
+SURGICAL = sorted(name for name, rule in RULES.items() if rule.needs == "gradients")
+surgical = pytest.mark.parametrize("name", SURGICAL)
+LAYERED = [("pcgrad", True), ("gradnorm", True)]
+every_rule = pytest.mark.parametrize("name", RULES)
 
 
-def random_jacobian(num_tasks, num_params=8, seed=0):
-    """Gradients (T, P) of which many pairs conflict."""
-    return np.random.default_rng(seed).normal(size=(num_tasks, num_params)).astype(np.float32)
-
-
-def orders_of(key, num_tasks):
-    """The orders (T, T) in which each task meets the others: a permutation a task, itself included and skipped."""
-    return np.asarray(_orders(jax.random.split(key, num_tasks)))
-
-
-@jax.jit
-def _orders(keys):
-    return jax.vmap(lambda k: jax.random.permutation(k, len(keys)))(keys)
-
-
-def naive_pcgrad(jacobian, orders):
-    """Algorithm 1 of Yu et al. (2020), projecting whole gradients; the mean where they sum."""
-    jacobian = np.float64(jacobian)
-    projected = jacobian.copy()
-    for i, order in enumerate(orders):
-        for j in order:
-            inner = projected[i] @ jacobian[j]
-            if j != i and inner < 0:
-                projected[i] -= inner / (jacobian[j] @ jacobian[j]) * jacobian[j]
-    return projected.mean(axis=0)
-
-
-@jax.jit
-def weights_of(jacobian, key=KEY):
-    gram = surgery.gram_matrix(jnp.asarray(jacobian))
-    return rules.pcgrad(gram, key)
-
-
-@pytest.mark.parametrize("num_tasks", [1, 2, 3, 5, 11])
-def test_pcgrad_on_the_gram_matrix_is_pcgrad_on_gradients(num_tasks):
-    """With the same orders, for several draws of gradients and keys; 11 tasks are more than are unrolled."""
-    for seed in range(4):
-        jacobian, key = random_jacobian(num_tasks, seed=seed), jax.random.key(seed)
-        expected = naive_pcgrad(jacobian, orders_of(key, num_tasks))
-        np.testing.assert_allclose(weights_of(jacobian, key) @ jacobian, expected, rtol=1e-4, atol=1e-5)
-
-
-def test_two_conflicting_gradients_by_hand():
-    """(1, 0) and (-1, 1): each loses its part along the other; (1/2, 1/2) and (0, 1), whose mean is (1/4, 3/4)."""
-    jacobian = np.float32([[1.0, 0.0], [-1.0, 1.0]])
-    np.testing.assert_allclose(weights_of(jacobian) @ jacobian, [0.25, 0.75], rtol=1e-6)
-
-
-def test_gradients_without_conflict_are_averaged():
-    """Exactly, orthogonal ones included."""
-    jacobian = np.abs(random_jacobian(4))
-    jacobian[0] = 0
-    jacobian[0, 0] = 1
-    jacobian[1, 0] = 0
-    np.testing.assert_allclose(weights_of(jacobian), np.full(4, 0.25), rtol=1e-6)
-
-
-def test_a_zero_gradient_changes_nothing():
-    """A task that has nothing to say neither divides by zero nor moves the others."""
-    pair = np.float32([[1.0, 0.0], [-1.0, 1.0]])
-    with_zero = np.insert(pair, 1, 0, axis=0)
-    # Sums, as the zero counts in the mean.
-    np.testing.assert_allclose(3 * weights_of(with_zero) @ with_zero, 2 * weights_of(pair) @ pair, rtol=1e-5)
-    np.testing.assert_allclose(weights_of(np.zeros((3, 5), np.float32)), np.full(3, 1 / 3), rtol=1e-6)
-
-
-@pytest.mark.parametrize("scale", [2.0**-20, 2.0**20])
-def test_pcgrad_does_not_depend_on_the_scale_of_the_loss(scale):
-    """The weights stay, so that the update scales with the gradients."""
-    jacobian = random_jacobian(5)
-    np.testing.assert_array_equal(weights_of(jacobian), weights_of(jacobian * np.float32(scale)))
-
-
-def test_orders_are_uniform_and_tasks_may_be_renamed():
-    """The mean over keys is the mean over all orders, and permuting the tasks permutes it."""
-    jacobian, swap = np.float32([[1, 0], [-0.6, 1], [-0.5, -0.9]]), np.array([2, 0, 1])
-    many = jax.jit(lambda gram: jax.vmap(lambda k: rules.pcgrad(gram, k))(jax.random.split(KEY, 20_000)))
-    weights = np.asarray(many(surgery.gram_matrix(jnp.asarray(jacobian))))
-    error = 5 * (weights @ jacobian).std(axis=0) / np.sqrt(len(weights)) + 1e-5
-    exact = np.mean([naive_pcgrad(jacobian, [order] * 3) for order in permutations(range(3))], axis=0)
-    assert np.all(error > 1e-4)  # the order matters for these gradients
-    assert np.all(np.abs((weights @ jacobian).mean(axis=0) - exact) < error)
-    renamed = np.asarray(many(surgery.gram_matrix(jnp.asarray(jacobian[swap]))))
-    np.testing.assert_allclose(renamed.mean(axis=0), weights.mean(axis=0)[swap], atol=0.01)
-
-
-def test_gram_matrix_is_of_all_leaves():
-    """J J^T of the flattened gradients, whatever the shapes of the leaves."""
+@pytest.mark.parametrize("small", [0, 6, 100])
+def test_gram_matrix_is_of_all_leaves(small, monkeypatch):
+    """J J^T of the flattened gradients, whatever the shapes of the leaves and how many are put side by side."""
+    monkeypatch.setattr(surgery, "SMALL", small)
     random = np.random.default_rng(0)
     leaves = {"a": random.normal(size=(3, 4, 2)), "b": [random.normal(size=3), random.normal(size=(3, 5))]}
     flat = np.concatenate([x.reshape(3, -1) for x in (leaves["a"], *leaves["b"])], axis=1)
     np.testing.assert_allclose(surgery.gram_matrix(jax.tree.map(jnp.float32, leaves)), flat @ flat.T, rtol=1e-4)
+
+
+@pytest.mark.parametrize("small", [0, 6, 100])
+def test_weighted_sums_are_of_each_leaf(small, monkeypatch):
+    """In their order and shapes."""
+    monkeypatch.setattr(surgery, "SMALL", small)
+    random = np.random.default_rng(0)
+    weights, leaves = random.normal(size=3), [random.normal(size=(3, *shape)) for shape in ((4, 2), (), (5,), (2, 4))]
+    found = surgery.weighted_sums(jnp.float32(weights), [jnp.float32(leaf) for leaf in leaves])
+    for total, leaf in zip(found, leaves, strict=True):
+        np.testing.assert_allclose(total, np.tensordot(weights, leaf, 1), rtol=1e-4, atol=1e-6)
 
 
 def test_conflicts_by_hand():
@@ -115,6 +46,7 @@ def test_conflicts_by_hand():
     jacobian = jnp.float32([[1, 0], [0, 2], [-3, 0]])
     found = surgery.conflicts(surgery.gram_matrix(jacobian))
     np.testing.assert_allclose((found["cosine"], found["conflict"]), (-1 / 3, 1 / 3), rtol=1e-6)
+    np.testing.assert_allclose(found["gradient_norm"], (1, 2, 3), rtol=1e-6)
 
 
 @pytest.mark.parametrize("jacobian", [np.ones((1, 2)), np.zeros((3, 2))], ids=["one task", "zero gradients"])
@@ -124,323 +56,278 @@ def test_conflicts_of_nothing_are_zero(jacobian):
     assert found["cosine"] == found["conflict"] == 0
 
 
-# Rules of the Gram matrix alone, against their papers' problems solved in float64 on whole gradients.
-
-C = rules.CAGRAD_RADIUS
-DETERMINISTIC = sorted(set(surgery.RULES) - {"mean", "pcgrad"})
-deterministic = pytest.mark.parametrize("rule", DETERMINISTIC)
-
-
-def plain_weigh(rule, jacobian):
-    return surgery.RULES[rule](surgery.gram_matrix(jacobian), KEY)
-
-
-weigh = jax.jit(plain_weigh, static_argnums=0, compiler_options=QUICK)
-
-
-def update_of(rule, jacobian):
-    """The update (P,) of gradients (T, P), summed in float64."""
-    return np.float64(weigh(rule, jnp.float32(jacobian))) @ np.float64(jacobian)
-
-
-def reference_cagrad(jacobian):
-    """max_d min_i g_i . d within c |g_0| of g_0, over t = (d - g_0) / (c |g_0|) and the level."""
-    mean = jacobian.mean(axis=0)
-    radius = C * np.linalg.norm(mean)
-    move = lambda point: mean + radius * point[:-1]
-    constraints = (
-        {"type": "ineq", "fun": lambda point: jacobian @ move(point) - point[-1]},
-        {"type": "ineq", "fun": lambda point: 1 - point[:-1] @ point[:-1]},
-    )
-    start = np.append(np.zeros_like(mean), (jacobian @ mean).min())
-    found = minimize(lambda point: -point[-1], start, constraints=constraints, options={"ftol": 1e-14, "maxiter": 1000})
-    assert found.status in (0, 8)  # 8: no further descent in float64
-    return move(found.x) / (1 + C**2)
-
-
-def reference_mgda(jacobian):
-    """The shortest vector of the convex hull: with the least squares sum w = 1 beside J^T w = 0, up to a factor."""
-    weights, _ = nnls(np.vstack([jacobian.T, np.ones(len(jacobian))]), np.append(np.zeros(jacobian.shape[1]), 1.0))
-    return weights / weights.sum() @ jacobian
-
-
-def reference_imtl_g(jacobian):
-    """The paper's closed form: w_2..T = g_1 U^T (D U^T)^-1 of differences of gradients D and of directions U.
-
-    Then the bound: magnitudes of ten in all where the update is longer, or turned against the tasks.
-    """
-    units = jacobian / np.linalg.norm(jacobian, axis=1, keepdims=True)
-    across = (units[0] - units[1:]).T
-    others = jacobian[0] @ across @ np.linalg.inv((jacobian[0] - jacobian[1:]) @ across)
-    weights = np.append(1 - others.sum(), others)
-    gain = units[0] @ (weights @ jacobian)
-    size = np.abs(weights).sum() / 10
-    return weights @ jacobian / (max(1, size) if gain > 0 else -size)
-
-
-def reference_nash_mtl(jacobian):
-    """G a = 1 / a, where a^T G a / 2 - sum log a is stationary in log a."""
-    gram = jacobian @ jacobian.T
-    scaled = lambda x: np.exp(x)[:, None] * gram * np.exp(x)
-    found = minimize(
-        lambda x: scaled(x).sum() / 2 - x.sum(),
-        -np.log(np.diag(gram)) / 2,
-        jac=lambda x: scaled(x).sum(axis=1) - 1,
-        hess=lambda x: scaled(x) + np.diag(scaled(x).sum(axis=1)),
-        method="trust-exact",
-        options={"gtol": 1e-10},
-    )
-    np.testing.assert_allclose(scaled(found.x).sum(axis=1), 1, atol=1e-7)
-    return np.exp(found.x) / np.exp(found.x).sum() @ jacobian
-
-
-def reference_aligned_mtl(jacobian):
-    """With J = P S Q^T, the mean row of s_min P Q^T."""
-    left, stretch, right = np.linalg.svd(jacobian, full_matrices=False)
-    return stretch.min() * (left @ right).mean(axis=0)
-
-
-def reference_upgrad(jacobian):
-    """The mean of projections onto the cone, each by non-negative least squares."""
-    return np.mean([g + nnls(jacobian.T, -g, maxiter=1000)[0] @ jacobian for g in jacobian], axis=0)
-
-
-def test_every_rule_has_a_name():
-    """The names that the command line offers are the rules there are."""
-    assert get_args(surgery.RuleName) == tuple(surgery.RULES)
-
-
-ROOT = np.sqrt(2)
-
-
-@pytest.mark.parametrize(
-    "rule, weights",
-    [
-        ("cagrad", (0.6, 0.4)),  # d = (1/4, 1/2) / 1.25: with g_0 = (0, 1/2) and |d - g_0| = 1/4, both gain 1/4
-        ("mgda", (0.6, 0.4)),  # (1 - 2 w_2)^2 + w_2^2 is least where 10 w_2 = 4
-        ("imtl-g", (2 - ROOT, ROOT - 1)),  # the angle's bisector: w ~ 1 / |g|
-        ("nash-mtl", (2 - ROOT, ROOT - 1)),  # the bisector too, as two tasks have one cosine
-        ("aligned-mtl", (1 - 1 / np.sqrt(5)) * np.array([1, 0.75])),  # G^(-1/2) = ((3, 1), (1, 2)) / sqrt 5
-        ("upgrad", (1, 0.75)),  # the projections (1/2, 1/2) = g_1 + g_2 / 2 and (0, 1) = g_1 + g_2
-    ],
-)
-def test_two_conflicting_gradients_of_unequal_length_by_hand(rule, weights):
-    """(1, 0) and (-1, 1)."""
-    tolerance = 1e-3 if rule == "cagrad" else 1e-4  # the second task is only just held back: between grid points
-    np.testing.assert_allclose(weigh(rule, jnp.float32([[1, 0], [-1, 1]])), weights, atol=tolerance)
-
-
-@deterministic
-@pytest.mark.parametrize("shift", [0.0, 0.5, 1.0], ids=["conflict", "some conflict", "little conflict"])
-@pytest.mark.parametrize("shape", [(3, 4), (8, 12)])
-def test_rules_solve_their_problems(rule, shape, shift):
-    """Against solvers that know nothing of Gram matrices; to 1e-3 for CAGrad, which interpolates, else to 4e-4."""
-    solve = globals()[f"reference_{rule.replace('-', '_')}"]
-    for seed in range(4):
-        jacobian = np.float64(random_jacobian(*shape, seed) + np.float32(shift))
-        jacobian *= np.linspace(0.3, 2, len(jacobian))[:, None]
-        expected = solve(jacobian)
-        error = np.linalg.norm(update_of(rule, jacobian) - expected) / np.linalg.norm(expected)
-        assert error < (1e-3 if rule == "cagrad" else 4e-4), seed
-
-
-@pytest.mark.parametrize("spread", [0, 2], ids=["equal lengths", "lengths from 0.01 to 100"])
-@pytest.mark.parametrize("num_params", [4, 200], ids=["no way to improve", "a way to improve"])
-def test_rules_are_certain_of_fifty_tasks(num_params, spread):
-    """What each promises, in float64: duality gaps and conditions of optimality, relative to the gradients involved."""
-    jacobian = np.float64(random_jacobian(50, num_params))
-    jacobian *= 10 ** np.random.default_rng(1).uniform(-spread, spread, size=(50, 1))
-    lengths, mean = np.linalg.norm(jacobian, axis=1), jacobian.mean(axis=0)
-
-    weights = np.float64(weigh("cagrad", jnp.float32(jacobian))) * (1 + C**2)
-    move, radius = weights @ jacobian - mean, C * np.linalg.norm(mean)
-    assert np.linalg.norm(move) < radius * (1 + 1e-4)
-    simplex = np.maximum(weights - 1 / 50, 0) / np.maximum(weights - 1 / 50, 0).sum()
-    bound = simplex @ jacobian @ mean + radius * np.linalg.norm(simplex @ jacobian)  # no d improves all by more
-    assert bound - (jacobian @ (mean + move)).min() < 1e-3 * np.linalg.norm(mean) * (simplex @ lengths)
-
-    weights = np.float64(weigh("mgda", jnp.float32(jacobian)))
-    shortest = weights @ jacobian
-    assert shortest @ shortest - (jacobian @ shortest).min() < 5e-3 * (weights @ lengths) ** 2
-    assert abs(weights.sum() - 1) < 1e-5 and weights.min() > 0
-
-    cone = update_of("upgrad", jacobian)
-    assert np.all(jacobian @ cone > -1e-4 * lengths * lengths.mean())
-    np.testing.assert_allclose(cone, reference_upgrad(jacobian), atol=1e-4 * lengths.mean())
-
-    weights = np.float64(weigh("nash-mtl", jnp.float32(jacobian))) * lengths
-    cosines = jacobian @ jacobian.T / np.outer(lengths, lengths) + 50 * rules.RIDGE * np.eye(50)
-    gains = weights * (cosines @ weights)
-    assert np.ptp(gains) < (0.2 if num_params < 50 else 1e-4) * gains.mean() and weights.min() > 0
-
-
-@deterministic
-def test_all_zero_gradients_are_averaged(rule):
-    """Exactly."""
-    np.testing.assert_array_equal(weigh(rule, jnp.zeros((3, 5))), np.full(3, np.float32(1 / 3)))
-
-
-@deterministic
-def test_a_task_without_gradient_has_no_say(rule):
-    """The others' update stays: as it is where weights sum to one, and times T where tasks are averaged."""
-    jacobian = random_jacobian(3)
-    with_zero = np.insert(jacobian, 1, 0, axis=0)
-    ratio = 1 if rule in ("mgda", "imtl-g", "nash-mtl") else 3 / 4
-    np.testing.assert_allclose(update_of(rule, with_zero), ratio * update_of(rule, jacobian), rtol=1e-3, atol=1e-4)
-
-
-@deterministic
-def test_rules_do_not_depend_on_scale_or_order(rule):
-    """Weights stay when all losses are scaled, and are renamed with the tasks."""
-    jacobian, swap = random_jacobian(5), np.array([2, 0, 4, 1, 3])
-    weights = weigh(rule, jacobian)
-    for scale in (1e-5, 1e5):
-        np.testing.assert_allclose(weigh(rule, jacobian * np.float32(scale)), weights, atol=2e-4)
-    np.testing.assert_allclose(weigh(rule, jacobian[swap]), weights[swap], atol=2e-4)
-
-
-@pytest.mark.parametrize("rule", ["imtl-g", "nash-mtl"])
-def test_the_scale_of_one_loss_does_not_turn_the_update(rule):
-    """For the rules that promise it; averaging would turn it by 45 degrees."""
-    jacobian = random_jacobian(3)
-    turned = update_of(rule, jacobian * np.float32([[1], [100], [0.01]]))
-    plain = update_of(rule, jacobian)
-    assert turned @ plain > (1 - 1e-5) * np.linalg.norm(turned) * np.linalg.norm(plain)
-
-
-@deterministic
-def test_rules_agree_without_conflict(rule):
-    """Orthogonal gradients of one length and identical ones are averaged; CAGrad goes on by c, then rescales."""
-    ratio = (1 + C) / (1 + C**2) if rule == "cagrad" else 1
-    for jacobian in (np.eye(4, 6), np.tile(random_jacobian(1), (4, 1))):
-        np.testing.assert_allclose(update_of(rule, jacobian), ratio * jacobian.mean(axis=0), rtol=2e-4, atol=2e-5)
-
-
-def test_upgrad_averages_wherever_nothing_conflicts():
-    """Of unequal lengths and angles, orthogonal pairs included."""
-    jacobian = np.abs(random_jacobian(4))
-    jacobian[0] = np.eye(8)[0]
-    jacobian[1, 0] = 0
-    np.testing.assert_allclose(weigh("upgrad", jacobian), np.full(4, 0.25), atol=1e-4)
-
-
-HARD = {
-    "one task": np.ones((1, 3)),
-    "opposite": np.array([[1.0, 0], [-1, 0]]),
-    "opposite, unequal": np.array([[2.0, 0], [-1, 0]]),
-    "repeated and opposite": np.array([[1.0, 2], [1, 2], [1, 2], [-1, -2], [0, 1]]),
-    "nearly repeated": np.array([[1.0, 0], [1, 1e-4], [1, -1e-4]]),
-    "fifty in a plane": random_jacobian(50, 2),
-    "fifty identical": np.ones((50, 3)),
-    "lengths from 1e-6 to 1e6": random_jacobian(7) * np.logspace(-6, 6, 7, dtype=np.float32)[:, None],
-    "one of 1e-15": np.array([[1.0, 0], [0, 1e-15], [-1, 1]]),
-}
-
-
-@deterministic
-@pytest.mark.parametrize("name", HARD)
-def test_hard_gradients_give_finite_updates(rule, name):
-    """No longer than the longest gradient by more than rounding; UPGrad adds projections up to T times."""
-    jacobian = np.float64(HARD[name])
-    longest = np.linalg.norm(jacobian, axis=1).max()
-    assert np.all(np.isfinite(weigh(rule, jnp.float32(jacobian))))
-    assert np.linalg.norm(update_of(rule, jacobian)) < longest * (1.2 + 1e-3)
-
-
-@deterministic
-def test_opposite_gradients_stop(rule):
-    """Of equal length: no rule prefers one of two tasks."""
-    np.testing.assert_allclose(update_of(rule, [[1.0, 2.0], [-1.0, -2.0]]), 0, atol=1e-3)
-
-
-def test_cagrad_gives_way_no_further_than_it_may_where_none_can_improve():
-    """(2, 0) and (-1, 0): with g_0 = (1/2, 0), the second task loses least at d = (1 - c) g_0."""
-    np.testing.assert_allclose(update_of("cagrad", [[2.0, 0], [-1, 0]]), [(1 - C) / 2 / (1 + C**2), 0], atol=1e-3)
-
-
-def test_imtl_g_does_not_turn_against_tasks_that_agree():
-    """As the paper's weights do, by summing to one, where the short gradient of three has a negative weight."""
-    lengths = np.array([[0.01], [1], [1]])
-    units = np.array([[1, 0, 0], [0.8, 0.56, np.sqrt(0.0464)], [0.8, -0.56, np.sqrt(0.0464)]])
-    weights = np.linalg.solve(units @ units.T, np.ones(3)) / lengths[:, 0]
-    assert weights.sum() < 0
-    jacobian = lengths * units
-    weights = np.float64(weigh("imtl-g", jnp.float32(jacobian)))
-    assert abs(np.abs(weights).sum() - 10) < 1e-3 and np.all(jacobian @ (weights @ jacobian) > 0)
-
-
-@deterministic
-def test_rules_under_vmap(rule):
-    """Seeds side by side receive what each would alone."""
-    jacobians = np.stack([random_jacobian(4, seed=seed) for seed in range(3)])
-    together = jax.jit(jax.vmap(lambda jacobian: plain_weigh(rule, jacobian)))(jacobians)
-    np.testing.assert_allclose(together, [weigh(rule, jacobian) for jacobian in jacobians], rtol=1e-3, atol=2e-4)
-
-
-# The gradient of losses of both kinds of parameter.
+# Losses of both kinds of parameter.
 
 TASKS = 3
-DATA = {"goal": np.float32([[1.0, -1.0], [-2.0, 0.5], [0.3, 3.0]]), "offset": np.float32([0.5, -1.0, 2.0])}
-PARAMS = Params(shared={"x": jnp.float32([0.2, -0.4])}, own={"y": jnp.float32([[1.0], [2.0], [-0.5]])})
+DATA = {
+    "goal": np.float32([[1.0, -1.0], [-2.0, 0.5], [0.3, 3.0]]),
+    "slope": np.float32([[0.3, -2.0, 1.0], [1.5, 0.4, -0.7], [-1.0, 0.6, 0.8]]),
+    "offset": np.float32([0.5, -1.0, 2.0]),
+}
+PARAMS = Params(
+    shared={
+        "first": {"bias": jnp.float32([0.2, -0.4])},
+        "second": {"bias": jnp.float32([0.1]), "kernel": jnp.float32([0.7, -0.2])},
+    },
+    own={"y": jnp.float32([[1.0], [2.0], [-0.5]])},
+)
 
 
 def quadratic(params, data):
-    """|x - goal|^2 + (x_0 y - offset)^2, in which shared and own parameters meet."""
-    fit = params.shared["x"][0] * params.own["y"][0] - data["offset"]
-    loss = jnp.sum(jnp.square(params.shared["x"] - data["goal"])) + jnp.square(fit)
+    """|a - goal|^2 + (b - slope)^2 / 2 + (a_0 y - offset)^2, in which shared and own parameters meet."""
+    first, second, y = params.shared["first"]["bias"], params.shared["second"], params.own["y"][0]
+    fit = first[0] * y - data["offset"]
+    rest = jnp.concatenate([second["bias"], second["kernel"]]) - data["slope"]
+    loss = jnp.sum(jnp.square(first - data["goal"])) + jnp.sum(jnp.square(rest)) / 2 + jnp.square(fit)
     return loss, {"fit": fit}
 
 
 def by_hand():
-    """Shared gradients (T, 2) and own gradients (T, 1) of each task's loss."""
-    x, y = np.asarray(PARAMS.shared["x"]), np.asarray(PARAMS.own["y"])[:, 0]
-    fit = x[0] * y - DATA["offset"]
-    shared = 2 * (x - DATA["goal"])
-    shared[:, 0] += 2 * fit * y
-    return shared, (2 * fit * x[0])[:, None], fit
+    """Losses (T,), gradients (T, 2) and (T, 3) of the shared layers and own gradients (T, 1), in float64."""
+    a, y = np.float64(PARAMS.shared["first"]["bias"]), np.float64(PARAMS.own["y"])[:, 0]
+    second = PARAMS.shared["second"]
+    fit = a[0] * y - DATA["offset"]
+    rest = np.concatenate([second["bias"], second["kernel"]]) - np.float64(DATA["slope"])
+    losses = np.sum((a - DATA["goal"]) ** 2, axis=1) + np.sum(rest**2, axis=1) / 2 + fit**2
+    first = 2 * (a - DATA["goal"])
+    first[:, 0] += 2 * fit * y
+    return losses, (first, rest), (2 * fit * a[0])[:, None], fit
+
+
+def flat(shared):
+    """The shared layers' gradients (2,) and (3,)."""
+    second = shared["second"]
+    return np.asarray(shared["first"]["bias"]), np.concatenate([second["bias"], second["kernel"]])
+
+
+@partial(jax.jit, static_argnums=(0, 5), compiler_options=QUICK)
+def combine(rule, params, data, memory, importance=None, per_layer=False):
+    return surgery.gradient(rule, quadratic, params, data, memory, KEY, importance, per_layer)
+
+
+def combined(name, params=PARAMS, data=DATA, importance=None, per_layer=False):
+    """What a rule makes of the tasks' gradients at the first update."""
+    rule = RULES[name]()
+    memory = surgery.init(rule, params, TASKS, per_layer)
+    return combine(rule, params, data, memory, importance, per_layer)
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=QUICK)
+def weights_of(rule, gram, losses, key):
+    return rule.weigh(rule.init(TASKS), gram, losses, key)[0]
+
+
+def expected_weights(name, gradients, losses, layer=0, num_layers=1):
+    """A rule's first weights (T,) for gradients (T, P)."""
+    key = jax.random.split(KEY, num_layers)[layer]
+    gram = jnp.float32(gradients @ gradients.T)
+    return np.float64(weights_of(RULES[name](), gram, jnp.float32(losses), key))
 
 
 def test_mean_is_the_gradient_of_the_mean_loss():
-    """For shared and own parameters, against the slopes worked out by hand and against a mean of vmap(grad)."""
-    gradients, aux, metrics = surgery.gradient("mean", quadratic, PARAMS, DATA, KEY)
-    shared, own, fit = by_hand()
-    np.testing.assert_allclose(gradients.shared["x"], shared.mean(axis=0), rtol=1e-5)
-    np.testing.assert_allclose(gradients.own["y"], own / TASKS, rtol=1e-5)
-    np.testing.assert_allclose(aux["fit"], fit, rtol=1e-5)
-    assert metrics == {}
-    alone = lambda own, data: jax.grad(lambda shared: quadratic(Params(shared, own), data)[0])(PARAMS.shared)
-    each = jax.vmap(alone)(PARAMS.own, DATA)
-    np.testing.assert_allclose(gradients.shared["x"], each["x"].mean(axis=0), rtol=1e-5)
+    """For shared and own parameters, against the slopes worked out by hand."""
+    found = combined("mean")
+    losses, shared, own, fit = by_hand()
+    for total, gradients in zip(flat(found.gradients.shared), shared, strict=True):
+        np.testing.assert_allclose(total, gradients.mean(axis=0), rtol=1e-5)
+    np.testing.assert_allclose(found.gradients.own["y"], own / TASKS, rtol=1e-5)
+    np.testing.assert_allclose(found.losses, losses, rtol=1e-5)
+    np.testing.assert_allclose(found.aux["fit"], fit, rtol=1e-5)
+    assert found.metrics == {} and found.memory is None
 
 
-def test_pcgrad_projects_shared_parameters_alone():
-    """Shared ones as in the naive algorithm, whose conflicts own parameters do not decide; own ones are averaged."""
-    gradients, aux, metrics = surgery.gradient("pcgrad", quadratic, PARAMS, DATA, KEY)
-    shared, own, fit = by_hand()
-    expected = naive_pcgrad(shared, orders_of(KEY, TASKS))
-    assert not np.allclose(expected, shared.mean(axis=0), rtol=0.05)
-    np.testing.assert_allclose(gradients.shared["x"], expected, rtol=1e-4)
-    np.testing.assert_allclose(gradients.own["y"], own / TASKS, rtol=1e-5)
-    np.testing.assert_allclose(aux["fit"], fit, rtol=1e-5)
-    assert set(metrics) == {"cosine", "conflict"} and metrics["conflict"] > 0
+@surgical
+def test_rules_weigh_shared_parameters_alone(name):
+    """Shared ones by the rule's weights, which own ones do not enter; own ones are averaged."""
+    found = combined(name)
+    losses, shared, own, fit = by_hand()
+    weights = expected_weights(name, np.concatenate(shared, axis=1), losses)
+    for total, gradients in zip(flat(found.gradients.shared), shared, strict=True):
+        np.testing.assert_allclose(total, weights @ gradients, rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(found.gradients.own["y"], own / TASKS, rtol=1e-5)
+    np.testing.assert_allclose(found.losses, losses, rtol=1e-5)
+    np.testing.assert_allclose(found.aux["fit"], fit, rtol=1e-5)
+    assert set(found.metrics) == {"cosine", "conflict", "gradient_norm"} and found.metrics["conflict"] > 0
 
 
-@deterministic
-def test_rules_weigh_shared_parameters_alone(rule):
-    """Shared ones by the rule, own ones averaged."""
-    gradients, _, metrics = surgery.gradient(rule, quadratic, PARAMS, DATA, KEY)
-    shared, own, _ = by_hand()
-    np.testing.assert_allclose(gradients.shared["x"], update_of(rule, shared), rtol=1e-3, atol=1e-4)
-    np.testing.assert_allclose(gradients.own["y"], own / TASKS, rtol=1e-5)
-    assert set(metrics) == {"cosine", "conflict"}
+def test_famo_weighs_without_gradients():
+    """Shared parameters by weights inverse to the losses; own ones are averaged, as if they were not weighed."""
+    found = combined("famo")
+    losses, shared, own, _ = by_hand()
+    weights = 1 / losses / np.sum(1 / losses)
+    for total, gradients in zip(flat(found.gradients.shared), shared, strict=True):
+        np.testing.assert_allclose(total, weights @ gradients, rtol=1e-4)
+    np.testing.assert_allclose(found.gradients.own["y"], own / TASKS, rtol=1e-4)
+    np.testing.assert_allclose(found.losses, losses, rtol=1e-5)
+    assert found.metrics == {}
 
 
-def test_rules_agree_where_tasks_do():
-    """The same data for every task: nothing conflicts, and projecting is averaging."""
+def test_surgery_differs_from_the_mean():
+    """Or all of the above would show little."""
+    mean = np.concatenate(flat(combined("mean").gradients.shared))
+    for name in set(RULES) - {"mean", "gradnorm"}:  # whose first weights are the mean's
+        update = np.concatenate(flat(combined(name).gradients.shared))
+        assert np.linalg.norm(update - mean) > 0.05 * np.linalg.norm(mean), name
+
+
+@pytest.mark.parametrize("name", ["pcgrad", "upgrad", "gradnorm"])
+def test_each_layer_by_itself(name):
+    """Kernel and bias of a layer together, by the weights that its gradients have alone; metrics are of all."""
+    found, whole = combined(name, per_layer=True), combined(name)
+    losses, shared, own, _ = by_hand()
+    for layer, (total, gradients) in enumerate(zip(flat(found.gradients.shared), shared, strict=True)):
+        weights = expected_weights(name, gradients, losses, layer, 2)
+        np.testing.assert_allclose(total, weights @ gradients, rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(found.gradients.own["y"], own / TASKS, rtol=1e-5)
+    for metric, value in whole.metrics.items():
+        np.testing.assert_allclose(found.metrics[metric], value, rtol=1e-5)
+
+
+def test_layers_differ_from_all_at_once():
+    """For these gradients, so that the test of each layer has something to find."""
+    updates = [np.concatenate(flat(combined("upgrad", per_layer=p).gradients.shared)) for p in (True, False)]
+    assert np.linalg.norm(updates[0] - updates[1]) > 0.05 * np.linalg.norm(updates[1])
+
+
+@pytest.mark.parametrize("per_layer", [True, False])
+def test_a_rule_remembers_by_layer(per_layer):
+    """GradNorm over three updates of each layer, or of all: as the rule does on that layer's Gram matrix alone."""
+    rule = RULES["gradnorm"]()
+    losses, shared, _, _ = by_hand()
+    blocks = shared if per_layer else [np.concatenate(shared, axis=1)]
+    memory, alone = surgery.init(rule, PARAMS, TASKS, per_layer), [rule.init(TASKS) for _ in blocks]
+    update = jax.jit(lambda memory, gram: rule.weigh(memory, gram, jnp.float32(losses), KEY), compiler_options=QUICK)
+    for _ in range(3):
+        found = combine(rule, PARAMS, DATA, memory, None, per_layer)
+        weights, alone = zip(
+            *(update(m, jnp.float32(b @ b.T)) for m, b in zip(alone, blocks, strict=True)), strict=True
+        )
+        memory = found.memory
+    of_layer = weights if per_layer else [weights[0], weights[0]]
+    for total, gradients, w in zip(flat(found.gradients.shared), shared, of_layer, strict=True):
+        np.testing.assert_allclose(total, np.float64(w) @ gradients, rtol=1e-4)
+    np.testing.assert_allclose(memory.weights, np.stack([m.weights for m in alone]), rtol=1e-5)
+    assert memory.weights.shape == (len(blocks), TASKS) and np.ptp(memory.weights) > 0.05
+
+
+@pytest.mark.parametrize(("name", "per_layer"), [*((name, False) for name in RULES), *LAYERED])
+def test_memories_keep_their_shapes(name, per_layer):
+    """Under a scan and a map over seeds, and stay finite."""
+    rule = RULES[name]()
+
+    def update(carry, _):
+        params, memory = carry
+        found = surgery.gradient(rule, quadratic, params, DATA, memory, KEY, None, per_layer)
+        params = jax.tree.map(lambda p, g: p - 0.05 * g, params, found.gradients)
+        return (params, surgery.look_again(rule, quadratic, params, DATA, found)), jnp.mean(found.losses)
+
+    run = lambda params: jax.lax.scan(update, (params, surgery.init(rule, params, TASKS, per_layer)), length=4)
+    seeds = jax.tree.map(lambda x: jnp.stack([x, x + 0.1]), PARAMS)
+    (params, memory), losses = jax.jit(jax.vmap(run), compiler_options=QUICK)(seeds)
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves((params, memory, losses)))
+    if name not in ("mgda", "imtl-g"):  # which may stop where tasks disagree
+        assert np.all(losses[:, -1] < losses[:, 0])
+
+
+@every_rule
+def test_twice_the_importance_is_twice_the_loss(name):
+    """For every rule, in gradients of shared and own parameters; what is reported is the loss as it is."""
+
+    def doubled(params, data):
+        loss, aux = quadratic(params, data)
+        return data["factor"] * loss, aux
+
+    rule, factors = RULES[name](), jnp.float32([1, 2, 1])
+    memory = surgery.init(rule, PARAMS, TASKS)
+    found = combined(name, importance=factors)
+    twice = jax.jit(lambda data: surgery.gradient(rule, doubled, PARAMS, data, memory, KEY), compiler_options=QUICK)
+    expected = twice({**DATA, "factor": factors})
+    for a, b in zip(jax.tree.leaves(found.gradients), jax.tree.leaves(expected.gradients), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(found.losses, by_hand()[0], rtol=1e-5)
+    plain = combined(name)
+    np.testing.assert_allclose(found.gradients.own["y"], plain.gradients.own["y"] * factors[:, None], rtol=1e-4)
+    if name != "famo":  # which evens out the scales of losses
+        assert not np.allclose(flat(found.gradients.shared)[0], flat(plain.gradients.shared)[0], rtol=1e-3)
+
+
+@every_rule
+def test_rules_agree_where_tasks_do(name):
+    """The same data for every task: nothing conflicts, and all rules average; CAGrad goes further by its radius."""
     same = {k: np.repeat(v[:1], TASKS, axis=0) for k, v in DATA.items()}
     params = PARAMS._replace(own={"y": jnp.ones((TASKS, 1))})
-    mean, _, _ = surgery.gradient("mean", quadratic, params, same, KEY)
-    projected, _, metrics = surgery.gradient("pcgrad", quadratic, params, same, KEY)
-    for a, b in zip(jax.tree.leaves(mean), jax.tree.leaves(projected), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-5)
-    np.testing.assert_allclose((metrics["cosine"], metrics["conflict"]), (1, 0), atol=1e-6)
+    mean, found = combined("mean", params, same), combined(name, params, same)
+    ratio = 1.5 / 1.25 if name == "cagrad" else 1
+    for a, b in zip(flat(mean.gradients.shared), flat(found.gradients.shared), strict=True):
+        np.testing.assert_allclose(ratio * a, b, rtol=1e-3)
+    np.testing.assert_allclose(mean.gradients.own["y"], found.gradients.own["y"], rtol=1e-5)
+    if found.metrics:
+        np.testing.assert_allclose((found.metrics["cosine"], found.metrics["conflict"]), (1, 0), atol=1e-6)
+
+
+@every_rule
+def test_an_absent_task_leaves_the_others_alone(name):
+    """Of importance 0, so that loss and gradient are zero: the update's direction is the others' own."""
+    found = combined(name, importance=jnp.float32([1, 0, 1]))
+    update = np.concatenate(flat(found.gradients.shared))
+    assert np.all(np.isfinite(update)) and np.all(np.isfinite(found.gradients.own["y"]))
+    losses, shared, own, _ = by_hand()
+    np.testing.assert_allclose(found.gradients.own["y"], own * [[1], [0], [1]] / TASKS, rtol=1e-4)
+    pair, rule = [0, 2], RULES[name]()
+    gradients = np.concatenate(shared, axis=1)[pair]
+    gram, losses = jnp.float32(gradients @ gradients.T), jnp.float32(losses[pair])
+    weights = jax.jit(lambda: rule.weigh(rule.init(2), gram, losses, KEY)[0], compiler_options=QUICK)()
+    expected = np.float64(weights) @ gradients
+    cosine = update @ expected / np.linalg.norm(update) / np.linalg.norm(expected)
+    np.testing.assert_allclose(cosine, 1, atol=1e-4)
+
+
+@every_rule
+def test_nothing_to_learn_is_finite(name):
+    """Losses and gradients of zero give an update of zero."""
+    found = combined(name, importance=jnp.zeros(TASKS))
+    assert all(np.array_equal(x, np.zeros_like(x)) for x in jax.tree.leaves(found.gradients))
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves((found.memory, found.metrics)))
+
+
+# The second look.
+
+
+def test_the_second_look_is_at_the_new_losses():
+    """FAMO's logits move by what the step did to each task's loss on the same data; the task that fell least gains."""
+    rule = RULES["famo"]()
+    before = combined("famo")
+    moved = jax.tree.map(lambda p, g: p - 0.02 * g, PARAMS, before.gradients)
+    memory = jax.jit(lambda: surgery.look_again(rule, quadratic, moved, DATA, before), compiler_options=QUICK)()
+    after = np.asarray(combined("mean", moved).losses)
+    expected = rule.adapt(before.memory, before.losses, jnp.asarray(after))
+    np.testing.assert_allclose(memory.logits, expected.logits, rtol=1e-4)
+    gain = np.log(np.asarray(before.losses) / after)
+    assert memory.logits[np.argmin(gain)] > 0 > memory.logits[np.argmax(gain)]
+
+
+def test_other_rules_do_not_look_again():
+    """Their loss is not even traced."""
+
+    def never(params, data):
+        raise AssertionError
+
+    for name in set(RULES) - {"famo"}:
+        before = combined(name)
+        assert surgery.look_again(RULES[name](), never, PARAMS, DATA, before) is before.memory
+
+
+@pytest.mark.parametrize("name", ["gradnorm", "famo"])
+def test_agents_remember_their_weights(name):
+    """What a rule learned of the critic is in the agent's state: nothing at first, and other after each update."""
+    tasks, spec = tasks_of("one-step", (1.0, -0.5, 0.3)), Spec(3, 2, 1)
+    init, update = learner(tiny(name), tasks, 4, spec)
+    state = init(tasks, KEY)
+    seen = []
+    for i in range(3):
+        seen.append(np.ravel(state.surgery[0][0]))
+        state, _ = update(state, random_batch(i, 3, 4, spec), tasks, jax.random.key(i))
+    np.testing.assert_array_equal(seen[0], np.float32(name == "gradnorm"))
+    assert not np.allclose(seen[0], seen[1]) and not np.allclose(seen[1], seen[2])
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves((state.surgery, state.critic)))
+    assert (state.surgery[1] is None) == (name == "famo")

@@ -8,7 +8,7 @@ from probes import tiny
 
 from mtjax import loop
 from mtjax.envs.tabular import Bandit, TabularMDP
-from mtjax.types import InputError
+from mtjax.types import InputError, Spec
 
 MDP, BANDIT = TabularMDP(num_tasks=3), Bandit(num_tasks=3)
 ENVS = pytest.mark.parametrize("env", [MDP, BANDIT], ids=["tabular-mdp", "bandit"])
@@ -169,7 +169,7 @@ def test_held_out_tasks_are_further_draws(env):
 def test_the_context_is_the_whole_task():
     """MTEnv's 100 numbers, rewards then transitions, as 2 x - 1."""
     tasks = MDP.tasks()
-    assert MDP.spec == (5, 5, 100) and BANDIT.spec == (1, 5, 5)
+    assert MDP.spec == Spec(5, 5, 100) and BANDIT.spec == Spec(1, 5, 5)
     numbers = (np.asarray(tasks.context) + 1) / 2
     np.testing.assert_allclose(numbers[:, :20].reshape(3, 4, 5), tasks.goal["rewards"], atol=1e-6)
     np.testing.assert_allclose(numbers[:, 20:].reshape(3, 4, 5, 4), tasks.goal["transitions"], atol=1e-6)

@@ -1,31 +1,89 @@
-"""Agents by name. To add one: a file, and a line here."""
+"""Agents by name: presets of parts, and the few that are more. To add one: a line here, and a file if it is more."""
 
-from mtjax.agents.care import CARE
-from mtjax.agents.conditioned import ConditionedSAC
-from mtjax.agents.multi_head import MultiHead
-from mtjax.agents.pcgrad import PCGrad
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from mtjax.agents.deepmdp import DeepMDP
+from mtjax.agents.distral import Distral
+from mtjax.agents.hip_bmdp import HiPBMDP
+from mtjax.agents.hyperparameters import PARTS, Hyperparameters, build, settings
 from mtjax.agents.sac import SAC
-from mtjax.names import frozen, nearest_error
+from mtjax.names import nearest_error
 
-AGENTS: dict[str, type[SAC]] = {
-    "sac": SAC,
-    "sac-conditioned": ConditionedSAC,
-    "multi-head": MultiHead,
-    "care": CARE,
-    "pcgrad": PCGrad,
+
+class Preset(NamedTuple):
+    """A class of agent with some settings of its own."""
+
+    says: str  # what it is, in a line
+    defaults: Mapping[str, Any] = {}
+    cls: type[SAC] = SAC
+
+
+_TOLD = {"conditioning": "parameters"}
+# Differs from its authors' code: actor and critics are of one size, by ``hidden`` (there, critics have two blocks of
+# 4096 and the actor one of 256); each network owns its embeddings (there, critics share theirs and lend it the actor);
+# the temperature's Adam has a first decay of 0.9 (there, 0.5).
+_BRC = {
+    "encoder": "bronet",
+    "value": "c51",
+    "scaling": "return",
+    "conditioning": "embedding",
+    "embedding_size": 32,
+    "unit_embedding": True,
+    "believe": "mean",
+    "shared_temperature": True,
+    "weight_decay": 1e-4,
+    "actor_lr": 3e-4,
+    "critic_lr": 3e-4,
+    "temperature_lr": 3e-4,
+}
+
+AGENTS: dict[str, Preset] = {
+    "sac": Preset("Soft actor-critic that is not told its task (Haarnoja et al. 2018)"),
+    "sac-conditioned": Preset("SAC that sees the task's parameters (Schaul et al. 2015)", _TOLD),
+    "multi-head": Preset("SAC with an output layer for every task (Yu et al. 2020)", {"heads": "per-task"}),
+    "disjoint": Preset("One SAC for every task, all in one program: the upper bound", {"heads": "disjoint"}),
+    "distral": Preset("A policy for every task, held together by a distilled one (Teh et al. 2017)", {}, Distral),
+    "care": Preset("Attention over a mixture of encoders (Sodhani et al. 2021)", {"encoder": "care", **_TOLD}),
+    "moe": Preset("Soft mixture of encoders (Sodhani et al. 2021, MTRL)", {"encoder": "moe", **_TOLD}),
+    "film": Preset("Layers scaled and shifted by the task (Perez et al. 2018)", {"encoder": "film", **_TOLD}),
+    "moore": Preset(
+        "Mixture of orthogonal experts (Hendawy et al. 2024)", {"encoder": "moore", "heads": "per-task", **_TOLD}
+    ),
+    "soft-modularization": Preset("Modules routed by task (Yang et al. 2020)", {"encoder": "soft-modules", **_TOLD}),
+    "paco": Preset("Parameters composed for each task (Sun et al. 2022)", {"encoder": "paco", **_TOLD}),
+    "brc": Preset("Bigger, regularised, categorical critics (Nauman et al. 2025)", _BRC),
+    "deepmdp": Preset("SAC on a latent model of the task (Gelada et al. 2019)", _TOLD, DeepMDP),
+    "hip-bmdp": Preset(
+        "DeepMDP with learned hidden parameters (Zhang et al. 2021)",
+        {"conditioning": "embedding", "embedding_size": 50},
+        HiPBMDP,
+    ),
+    "pcgrad": Preset("Conflicting gradients projected (Yu et al. 2020)", {"gradients": "pcgrad", **_TOLD}),
+    "cagrad": Preset("Conflict-averse gradients (Liu et al. 2021)", {"gradients": "cagrad", **_TOLD}),
+    "gradnorm": Preset("Weights that even out learning rates (Chen et al. 2018)", {"gradients": "gradnorm", **_TOLD}),
+    "famo": Preset("Weights that even out losses' decrease (Liu et al. 2023)", {"gradients": "famo", **_TOLD}),
 }
 
 
-def agent(name: str, **settings) -> SAC:
-    """Return the agent called ``name``, with any of its hyper-parameters replaced.
+def agent(name: str, **given: Any) -> SAC:
+    """Return the agent called ``name``, with any of its settings, or those of its parts, replaced.
 
     Raises:
-        InputError: no agent has that name, no hyper-parameter has one of the given names, or a value is not allowed.
+        InputError: no agent has that name, no setting has one of the given names, or a value is not allowed.
     """
+    preset = preset_of(name)
+    defaults = dict(preset.defaults)
+    if "encoder" in given:  # another encoder knows nothing of this one's settings
+        defaults = {k: v for k, v in defaults.items() if k in preset.cls.__dataclass_fields__}
+    return build(name, preset.cls, {**defaults, **given})  # type: ignore
+
+
+def preset_of(name: str) -> Preset:
+    """Return what ``name`` stands for."""
     if name not in AGENTS:
         raise nearest_error("agent", name, AGENTS)
-    cls = AGENTS[name]
-    unknown = next((s for s in settings if s not in cls.__dataclass_fields__), None)
-    if unknown is not None:
-        raise nearest_error(f"setting of {name}", unknown, cls.__dataclass_fields__)
-    return cls(**frozen(settings))
+    return AGENTS[name]
+
+
+__all__ = ["AGENTS", "PARTS", "SAC", "Hyperparameters", "Preset", "agent", "preset_of", "settings"]

@@ -1,10 +1,10 @@
 """Soft actor-critic over many tasks at once, and the parts in which its variants differ."""
 
 import dataclasses
+from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,12 +12,11 @@ import optax
 
 from mtjax import normalize
 from mtjax.agents import surgery
-from mtjax.names import nearest_error
-from mtjax.networks import Network, Params, Trunk, tanh_normal
-from mtjax.types import Array, InputError, Key, Metrics, Spec, Task, Transition
-
-Conditioning = Literal["none", "one-hot", "embedding", "parameters", "vectors"]
-CONDITIONINGS = ("none", "one-hot", "embedding", "parameters", "vectors")
+from mtjax.agents.hyperparameters import Hyperparameters
+from mtjax.agents.trajectory import TrajectoryEncoder
+from mtjax.history import Seen, plain_obs_size, unpack
+from mtjax.networks import Network, Params, tanh_normal
+from mtjax.types import Array, InputError, Key, Metrics, Outcome, Spec, Task, Transition
 
 
 class SACState(NamedTuple):
@@ -31,10 +30,13 @@ class SACState(NamedTuple):
     moments: normalize.Moments
     contexts: Array  # (T, C) of the training tasks, among which an unseen task finds its nearest
     vectors: Array | None  # (T, V) given task vectors, if conditioned on them
+    surgery: tuple[Any, Any]  # what the rules of gradient surgery remember: critic's, actor's
+    scales: Any  # what the scaling of rewards remembers
+    progress: Any  # what the sampler of tasks remembers
 
 
 @dataclasses.dataclass(frozen=True)
-class SAC:
+class SAC(Hyperparameters):
     """Multi-task soft actor-critic that is not told which task it is in (Haarnoja et al. 2018; "MT-SAC").
 
     Per transition of task i, with temperature a_i, N critics and their slow copies:
@@ -48,131 +50,108 @@ class SAC:
     Differs from the paper: layer-normalised critics; by default a target entropy H of -A/2 and one temperature a task.
     """
 
-    hidden: tuple[int, ...] = (256, 256)
-    """Widths of the hidden layers of actor and critics."""
-    actor_lr: float = 1e-3
-    """Adam's learning rate of the actor."""
-    critic_lr: float = 1e-3
-    """Adam's learning rate of the critics."""
-    temperature_lr: float = 1e-3
-    """Adam's learning rate of the temperatures."""
-    gamma: float = 0.99
-    """Discount of future reward per step."""
-    tau: float = 0.005
-    """Share of the new critic that its slow copy takes at each update."""
-    num_critics: int = 2
-    """Critics, of which the least is believed."""
-    initial_temperature: float = 0.1
-    """Temperature at the start."""
-    target_entropy: float = -0.5
-    """Entropy that the temperature aims at, per action dimension."""
-    shared_temperature: bool = False
-    """One temperature for all tasks instead of one a task."""
-    normalize_observations: bool = False
-    """Scale observations by their running mean and variance, fitted on training data alone."""
-    max_gradient_norm: float = 0.0
-    """Clip the global norm of actor and critic gradients to this; 0 does not clip."""
-    critic_layer_norm: bool = True
-    """Layer normalisation in the critics."""
-    actor_layer_norm: bool = False
-    """Layer normalisation in the actor."""
-    conditioning: Conditioning = "none"
-    """What the networks are told of the task: none, one-hot, embedding (learned), parameters (the task's context) or
-    vectors (rows of a file). For one-hot, embedding and vectors, an unseen task is taken for its nearest neighbour."""
-    embedding_size: int = 16
-    """Width of learned task embeddings."""
-    vectors: str = ""
-    """A .npy file of task vectors (T, V), a row for every training task, for conditioning on vectors."""
-    heads: Literal["shared", "per-task"] = "shared"
-    """Output layers of actor and critics: one for all tasks, or one for each."""
-    gradients: surgery.RuleName = "mean"
-    """How the tasks' gradients combine on the parameters that tasks share, in the actor and in the critics."""
-
-    def __post_init__(self):
-        choices = (
-            ("conditioning", CONDITIONINGS),
-            ("heads", ("shared", "per-task")),
-            ("gradients", tuple(surgery.RULES)),
-        )
-        for field, allowed in choices:
-            if getattr(self, field) not in allowed:
-                raise nearest_error(field, getattr(self, field), allowed)
-        for field in ("actor_lr", "critic_lr", "temperature_lr", "num_critics", "initial_temperature"):
-            if not getattr(self, field) > 0:
-                raise InputError(f"{field.replace('_', '-')} must be greater than 0, not {getattr(self, field)}")
-        if not self.max_gradient_norm >= 0:
-            raise InputError(f"max-gradient-norm must be at least 0 (0 does not clip), not {self.max_gradient_norm}")
-        if self.conditioning == "embedding" and self.embedding_size < 1:
-            raise InputError(f"embedding-size must be at least 1, not {self.embedding_size}")
-        if not self.hidden or min(self.hidden) < 1:
-            raise InputError(f"hidden needs at least one layer of at least one unit, not {self.hidden}")
-        if not 0 <= self.gamma <= 1 or not 0 < self.tau <= 1:
-            raise InputError(f"gamma must be in [0, 1] and tau in (0, 1], not {self.gamma} and {self.tau}")
-        if not self.max_gradient_norm >= 0:
-            raise InputError(f"max-gradient-norm must be at least 0, not {self.max_gradient_norm}")
-        if self.embedding_size < 1:
-            raise InputError(f"embedding-size must be at least 1, not {self.embedding_size}")
-        if (self.conditioning == "vectors") != bool(self.vectors):
-            raise InputError("conditioning=vectors and vectors=FILE.npy go together; give both or neither")
-
     # Networks.
-
-    def body(self, layer_norm: bool) -> nn.Module:
-        """The layers between the inputs and the head; what most variants replace."""
-        return Trunk(self.hidden, layer_norm)
 
     @property
     def actor(self) -> Network:
-        return Network(self.body(self.actor_layer_norm), self.heads == "per-task", self._embedding)
+        return self._network(self.actor_layer_norm)
 
     @property
     def critic(self) -> Network:
-        return Network(self.body(self.critic_layer_norm), self.heads == "per-task", self._embedding)
+        return self._network(self.critic_layer_norm)
 
-    @property
-    def _embedding(self) -> int:
-        return self.embedding_size if self.conditioning == "embedding" else 0
+    def _network(self, layer_norm: bool) -> Network:
+        own = {"shared": (), "per-task": ("head",), "disjoint": ("trajectory", "body", "head")}[self.heads]
+        embedding = self.embedding_size if self.conditioning == "embedding" else 0
+        body = self.encoder.body(self.hidden, layer_norm)
+        trajectory = TrajectoryEncoder(self.embedding_size, layer_norm=layer_norm) if self.history else None
+        return Network(body, own, embedding, self.unit_embedding, self.encoder.front(), trajectory)
 
     def init(self, spec: Spec, tasks: Task, key: Key) -> SACState:
         """Initialise for the training ``tasks`` (T, ...)."""
         num_tasks = len(tasks.id)
         vectors = load_vectors(self.vectors, num_tasks) if self.vectors else None
-        obs, action = jnp.zeros(spec.obs_size), jnp.zeros(spec.action_size)
+        if self.history not in (0, spec.history):
+            raise InputError(
+                f"conditioning=inferred needs observations that show the last {self.history} steps, and these show "
+                f"{spec.history}; give the family as mtjax.history.remember(env, agent.history)"
+            )
+        moments = normalize.init(plain_obs_size(spec) if self.history else spec.obs_size)
+        obs, action = self._see(moments, jnp.zeros(spec.obs_size)), jnp.zeros(spec.action_size)
         features = self._features(num_tasks, jnp.int32(0), tasks.context[0], vectors)
-        actor_key, critic_key = jax.random.split(key)
-        actor = self.actor.init(actor_key, num_tasks, 2 * spec.action_size, features, obs)
-        init_critic = lambda k: self.critic.init(k, num_tasks, 1, features, obs, action)
-        keys = jax.random.split(critic_key, self.num_critics)
-        critic = jax.vmap(init_critic, out_axes=Params(shared=0, own=1))(keys)  # type: ignore
+        actor, critic = self.networks(num_tasks, features, obs, action, key)
         log_temperature = jnp.full(1 if self.shared_temperature else num_tasks, np.log(self.initial_temperature))
         log_temperature = log_temperature.astype(jnp.float32)
         parameters = (actor, critic, log_temperature)
-        optimizers = tuple(o.init(p) for o, p in zip(self._optimizers, parameters, strict=True))
-        moments = normalize.init(spec.obs_size)
-        copy = jax.tree.map(jnp.copy, critic)
-        return SACState(actor, critic, copy, log_temperature, optimizers, moments, tasks.context, vectors)  # type: ignore
+        memory = lambda rule, params: surgery.init(rule, params, num_tasks, self.gradient_scope == "per-layer")
+        return SACState(
+            actor=actor,
+            critic=critic,
+            target=jax.tree.map(jnp.copy, critic),
+            log_temperature=log_temperature,
+            optimizers=tuple(o.init(p) for o, p in zip(self._optimizers, parameters, strict=True)),  # type: ignore
+            moments=moments,
+            contexts=tasks.context,
+            vectors=vectors,
+            surgery=(memory(self.gradients, critic), memory(self.gradients.for_actor, actor)),
+            scales=self.scaling.init(num_tasks),
+            progress=self.sampler.init(num_tasks),
+        )
+
+    def networks(self, num_tasks: int, features: Array, obs: Any, action: Array, key: Key) -> tuple[Params, Params]:
+        """Initialise actor and critics for inputs of the given shapes, (Z,), (O,) and (A,)."""
+        actor_key, critic_key = jax.random.split(key)
+        actor = self.actor.init(actor_key, num_tasks, 2 * len(action), features, obs)
+        init_critic = lambda k: self.critic.init(k, num_tasks, self.value.outputs, features, obs, action)
+        keys = jax.random.split(critic_key, self.num_critics)
+        return actor, jax.vmap(init_critic, out_axes=Params(shared=0, own=1))(keys)  # type: ignore
 
     @property
     def _optimizers(self) -> tuple[optax.GradientTransformation, ...]:
         clip = optax.clip_by_global_norm(self.max_gradient_norm) if self.max_gradient_norm else optax.identity()
-        adam = lambda lr: optax.chain(clip, optax.adam(lr))
-        return adam(self.actor_lr), adam(self.critic_lr), optax.adam(self.temperature_lr)
+        decay = self.weight_decay
+        adam = lambda lr: optax.chain(clip, optax.adamw(lr, weight_decay=decay) if decay else optax.adam(lr))
+        some = lambda learn: optax.partition({True: learn, False: optax.set_to_zero()}, self._learns)
+        chosen = adam if self.tune == "all" else lambda lr: some(adam(lr))
+        return chosen(self.actor_lr), chosen(self.critic_lr), optax.adam(self.temperature_lr)
+
+    def _learns(self, params: Params) -> Any:
+        """Which leaves of actor or critic learn where not all do: those of heads, or learned embeddings."""
+        part = {"heads": "head", "embedding": "embedding"}[self.tune]
+
+        def learns(path, _) -> bool:
+            names = [getattr(step, "key", None) for step in path]
+            return part in names and "body" not in names[: names.index(part)]
+
+        return jax.tree_util.tree_map_with_path(learns, params)
 
     # Which task it is.
 
     @property
-    def unseen(self) -> str:
-        """What stands for a task that was not trained on; empty if its own parameters, or nothing, do."""
-        parts = ["head"] if self.heads == "per-task" else []
+    def borrowed(self) -> list[str]:
+        """What a task that was not trained on has of its nearest training task."""
+        parts = {"shared": [], "per-task": ["head"], "disjoint": ["networks"]}[self.heads]
+        parts += ["input layer"] * (self.encoder.front() is not None)
         parts += [{"one-hot": "number"}.get(self.conditioning, self.conditioning.removesuffix("s"))] * (
             self.conditioning in ("one-hot", "embedding", "vectors")
         )
+        return parts
+
+    @property
+    def unseen(self) -> str:
+        """What stands for a task that was not trained on; empty if its own parameters, or nothing, do."""
+        parts = self.borrowed
         return f"each uses the {' and '.join(parts)} of the nearest training task" if parts else ""
 
     def known_task(self, state: SACState, task: Task) -> Array:
         """The training task () int32 whose head, embedding or number stands for ``task``: itself, or the nearest."""
         nearest = jnp.argmin(jnp.sum(jnp.square(state.contexts - task.context), axis=-1)).astype(jnp.int32)
         return jnp.where(task.id < len(state.contexts), task.id, nearest)
+
+    def nearest_tasks(self, state: SACState, tasks: Task) -> Array:
+        """The training tasks (T,) that are nearest to ``tasks`` (T, ...), whoever these are."""
+        strangers = tasks._replace(id=jnp.full_like(tasks.id, len(state.contexts)))
+        return jax.vmap(partial(self.known_task, state))(strangers)
 
     def _features(self, num_tasks: int, index: Array, context: Array, vectors: Array | None) -> Array:
         """What the networks see of a task (Z,); a learned embedding is added by the network that owns it."""
@@ -194,90 +173,188 @@ class SAC:
 
     def act(self, state: SACState, obs: Array, task: Task, key: Key | None) -> Array:
         """Choose an action (A,) for one observation (O,) of one task; no key: the mean action."""
-        index = self.known_task(state, task)
-        actor = Params(state.actor.shared, jax.tree.map(lambda x: x[index], state.actor.own))
-        outputs = self.actor.apply(actor, self.features(state, task), self._see(state.moments, obs))
-        return tanh_normal(outputs, key)[0]
+        actor, critic = self.parameters(state, task)
+        trained = task.id < len(state.contexts)
+        obs = self._see(state.moments, obs)
+        return tanh_normal(self.behaviour(trained, actor, critic, self.features(state, task), obs), key)[0]
 
-    def _see(self, moments: normalize.Moments, obs: Array) -> Array:
-        return normalize.apply(moments, obs) if self.normalize_observations else obs
+    def parameters(self, state: SACState, task: Task) -> tuple[Params, Params]:
+        """Actor and critics as one task uses them."""
+        index = self.known_task(state, task)
+        of_task = lambda params: Params(params.shared, jax.tree.map(lambda x: x[index], params.own))
+        return of_task(state.actor), of_task(state.critic)
+
+    def behaviour(self, trained: Array, actor: Params, critic: Params, features: Array, obs: Array) -> Array:
+        """Outputs of the policy that acts, in a task that was ``trained`` on () or in another."""
+        return self.policy(actor, critic, features, obs)
+
+    def _see(self, moments: normalize.Moments, obs: Array) -> Any:
+        """Observations (..., O) as the networks take them: normalised, and apart from the past if they show it."""
+        scaled = partial(normalize.apply, moments) if self.normalize_observations else lambda obs: obs
+        if not self.history:
+            return scaled(obs)
+        seen = unpack(obs, len(moments.mean), self.history)
+        return Seen(scaled(seen.obs), seen.past._replace(obs=scaled(seen.past.obs)))
 
     # Losses, each on the data of one task: observations (B, O), features (Z,) or (B, Z), temperature ().
 
+    def policy(self, actor: Params, critic: Params, features: Array, obs: Array) -> Array:
+        """The policy's outputs (..., 2A); agents whose actor stands on the critic's representation use ``critic``."""
+        return self.actor.apply(actor, features, obs)
+
+    def sample(self, actor, critic, features, obs, key: Key) -> tuple[Array, Array, Array]:
+        """Actions (B, A), their log-probabilities (B,), and what the temperature makes the policy pay for (B,)."""
+        action, log_prob = tanh_normal(self.policy(actor, critic, features, obs), key)
+        return action, log_prob, log_prob
+
+    def outputs(self, critic: Params, features: Array, obs: Array, action: Array) -> Array:
+        """Every critic's outputs (N, B, outputs)."""
+        return self.of_critics(self.critic.apply, critic, features, obs, action)
+
+    def of_critics(self, apply: Callable, critic: Params, features: Array, obs: Array, action: Array) -> Any:
+        """What ``apply``, as ``Network.apply`` takes its inputs, makes of every critic (N, ...)."""
+        return jax.vmap(apply, (0, None, None, None))(critic, features, obs, action)
+
     def values(self, critic: Params, features: Array, obs: Array, action: Array) -> Array:
         """Every critic's estimate (N, B)."""
-        return jax.vmap(self.critic.apply, (0, None, None, None))(critic, features, obs, action)[..., 0]
+        return self.value.mean(self.outputs(critic, features, obs, action))
 
-    def critic_target(self, actor, target, features, temperature, batch: Transition, key: Key) -> Array:
-        """Soft Bellman target (B,)."""
-        action, log_prob = tanh_normal(self.actor.apply(actor, features, batch.next_obs), key)
-        next_value = jnp.min(self.values(target, features, batch.next_obs, action), axis=0) - temperature * log_prob
-        return batch.reward + self.gamma * batch.discount * next_value
+    def critic_target(self, actor, critic, target, features, temperature, batch: Transition, key: Key) -> Array:
+        """Soft Bellman target (B, ...), in the form that ``value.loss`` takes."""
+        action, _, cost = self.sample(actor, critic, features, batch.next_obs, key)
+        outputs = self.outputs(target, features, batch.next_obs, action)
+        discount, bonus = self.gamma * batch.discount, -temperature * cost
+        return self.value.target(outputs, self.believe == "least", batch.reward, discount, bonus)
 
     def critic_loss(self, critic: Params, data) -> tuple[Array, Metrics]:
         batch, features, target = data
-        values = self.values(critic, features, batch.obs, batch.action)
-        loss = jnp.mean(jnp.sum(jnp.square(values - target), axis=0))
-        return loss, {"critic_loss": loss, "value": jnp.mean(values)}
+        outputs = self.outputs(critic, features, batch.obs, batch.action)
+        loss = jnp.mean(jnp.sum(self.value.loss(outputs, target), axis=0))
+        values = self.value.mean(outputs)
+        td_error = jnp.mean(jnp.abs(values - self.value.expected(target)))
+        seen = {"critic_loss": loss, "value": jnp.mean(values), "td_error": td_error}
+        return loss, seen | {"target": self.value.expected(target)}  # which ``update`` takes for the scaling
 
     def actor_loss(self, actor: Params, data) -> tuple[Array, Metrics]:
         batch, features, critic, temperature, key = data
-        action, log_prob = tanh_normal(self.actor.apply(actor, features, batch.obs), key)
-        value = jnp.min(self.values(critic, features, batch.obs, action), axis=0)
-        loss = jnp.mean(temperature * log_prob - value)
+        action, log_prob, cost = self.sample(actor, critic, features, batch.obs, key)
+        values = self.values(critic, features, batch.obs, action)
+        value = least(values) if self.believe == "least" else jnp.mean(values, axis=0)
+        loss = jnp.mean(temperature * cost - value)
         return loss, {"actor_loss": loss, "entropy": -jnp.mean(log_prob)}
 
     def temperature_loss(self, log_temperature: Array, entropy: Array, action_size: int) -> Array:
         return jnp.mean(jnp.exp(log_temperature) * (entropy - self.target_entropy * action_size))
+
+    # Watching.
+
+    @property
+    def watches(self) -> bool:
+        """Whether the agent wants to see the stream of outcomes."""
+        return self.scaling.watches or self.sampler.watches
+
+    def observe(self, state: SACState, outcome: Outcome) -> SACState:
+        """Take note of what one step of every environment brought, leaves (T, E)."""
+        scales = self.scaling.observe(state.scales, outcome)
+        return state._replace(scales=scales, progress=self.sampler.observe(state.progress, outcome))
+
+    def reset(self, state: SACState, spec: Spec, tasks: Task, key: Key) -> SACState:
+        """Begin anew with networks, optimisers, temperatures and surgery; what was learned of the data stays."""
+        return self.init(spec, tasks, key)._replace(
+            moments=state.moments,
+            contexts=state.contexts,
+            vectors=state.vectors,
+            scales=self.scaling.reset(state.scales),
+            progress=state.progress,
+        )
 
     # Update.
 
     def update(self, state: SACState, batch: Transition, tasks: Task, key: Key) -> tuple[SACState, Metrics]:
         """Take one gradient step on a batch (T, B, ...) of the training tasks; metrics are (T,)."""
         target_key, actor_key, critic_order, actor_order = jax.random.split(key, 4)
-        num_tasks = len(tasks.id)
-        moments = normalize.update(state.moments, batch.obs) if self.normalize_observations else state.moments
-        batch = batch._replace(obs=self._see(moments, batch.obs), next_obs=self._see(moments, batch.next_obs))
-        features = jax.vmap(partial(self.features, state))(tasks)
-        if batch.context is not None and self.conditioning == "parameters":
-            features = batch.context  # (T, B, C), as every episode has parameters of its own
-        temperature = jnp.broadcast_to(jnp.exp(state.log_temperature), num_tasks)
-
-        over_tasks = Params(shared=None, own=0)  # type: ignore
-        bootstrap = jax.vmap(self.critic_target, (over_tasks, over_tasks, 0, 0, 0, 0))
-        keys = jax.random.split(target_key, num_tasks)
-        target = bootstrap(state.actor, state.target, features, temperature, batch, keys)
-        gradients, seen, critic_conflicts = surgery.gradient(
-            self.gradients, self.critic_loss, state.critic, (batch, features, target), critic_order
-        )
+        state, batch, features, temperature = self.prepare(state, batch, tasks)
+        importance = self.sampler.weights(state.progress, temperature)
+        combine = partial(surgery.gradient, importance=importance, per_layer=self.gradient_scope == "per-layer")
         actor_optimizer, critic_optimizer, temperature_optimizer = self._optimizers
-        critic, critic_memory = descend(critic_optimizer, gradients, state.optimizers[1], state.critic)
 
-        def actor_loss(actor: Params, data) -> tuple[Array, Metrics]:
-            batch, features, own_critic, temperature, key = data
-            task_critic = Params(critic.shared, own_critic)
-            return self.actor_loss(actor, (batch, features, task_critic, temperature, key))
+        loss, data = self.critic_problem(state, batch, features, temperature, target_key)
+        seen = combine(self.gradients, loss, state.critic, data, state.surgery[0], critic_order)
+        critic, critic_memory = descend(critic_optimizer, seen.gradients, state.optimizers[1], state.critic)
+        critic_weighing = surgery.look_again(self.gradients, loss, critic, data, seen)
 
-        data = (batch, features, critic.own, temperature, jax.random.split(actor_key, num_tasks))
-        gradients, done, actor_conflicts = surgery.gradient(self.gradients, actor_loss, state.actor, data, actor_order)
-        actor, actor_memory = descend(actor_optimizer, gradients, state.optimizers[0], state.actor)
+        loss, data = self.actor_problem(critic, batch, features, temperature, actor_key)
+        done = combine(self.gradients.for_actor, loss, state.actor, data, state.surgery[1], actor_order)
+        actor, actor_memory = descend(actor_optimizer, done.gradients, state.optimizers[0], state.actor)
 
         action_size = batch.action.shape[-1]
-        slope = jax.grad(self.temperature_loss)(state.log_temperature, done["entropy"], action_size)
+        slope = jax.grad(self.temperature_loss)(state.log_temperature, done.aux["entropy"], action_size)
         log_temperature, temperature_memory = descend(
             temperature_optimizer, slope, state.optimizers[2], state.log_temperature
         )
+        metrics = {**seen.aux, **done.aux, "temperature": temperature}
+        slow = self.follow(critic, state.target)
+        scales, (critic, slow) = self.scaling.renew(state.scales, metrics.pop("target"), (critic, slow))
         state = state._replace(
             actor=actor,
             critic=critic,
-            target=optax.incremental_update(critic, state.target, self.tau),
+            target=slow,
             log_temperature=log_temperature,
             optimizers=(actor_memory, critic_memory, temperature_memory),
-            moments=moments,
+            surgery=(critic_weighing, done.memory),
+            scales=scales,
         )
-        metrics = {**seen, **done, "temperature": temperature}
-        named = (("critic", critic_conflicts), ("actor", actor_conflicts))
+        named = (("critic", seen.metrics), ("actor", done.metrics))
         return state, metrics | {f"{who}_{k}": v for who, found in named for k, v in found.items()}
+
+    def prepare(self, state: SACState, batch: Transition, tasks: Task) -> tuple[SACState, Transition, Array, Array]:
+        """Fit the normalisers to a batch (T, B, ...) and apply them to it.
+
+        Returns:
+            the new state, the batch, what the networks see of the tasks (T, Z) or (T, B, Z), and temperatures (T,).
+        """
+        if self.normalize_observations:
+            state = state._replace(moments=normalize.update(state.moments, batch.obs[..., : len(state.moments.mean)]))
+        features = jax.vmap(partial(self.features, state))(tasks)
+        if batch.context is not None and self.conditioning == "parameters":
+            features = batch.context  # (T, B, C), as every episode has parameters of its own
+        bonus = jnp.exp(state.log_temperature) * abs(self.target_entropy) * batch.action.shape[-1] / 2
+        batch = batch._replace(
+            obs=self._see(state.moments, batch.obs),
+            next_obs=self._see(state.moments, batch.next_obs),
+            reward=self.scaling.rewards(state.scales, batch, self.gamma, bonus),
+        )
+        return state, batch, features, jnp.broadcast_to(jnp.exp(state.log_temperature), len(tasks.id))
+
+    def follow(self, critic: Params, target: Params) -> Params:
+        """The slow critic's step towards the new critic."""
+        return optax.incremental_update(critic, target, self.tau)  # type: ignore
+
+    def critic_problem(self, state: SACState, batch, features, temperature, key: Key) -> tuple[Callable, Any]:
+        """The critic's loss for one task, and the data of all (T, ...): what ``surgery.gradient`` differentiates."""
+        over_tasks = Params(shared=None, own=0)  # type: ignore
+        bootstrap = jax.vmap(self.critic_target, (over_tasks, over_tasks, over_tasks, 0, 0, 0, 0))
+        keys = jax.random.split(key, len(temperature))
+        target = bootstrap(state.actor, state.critic, state.target, features, temperature, batch, keys)
+        return self.critic_loss, (batch, features, target)
+
+    def actor_problem(self, critic: Params, batch, features, temperature, key: Key) -> tuple[Callable, Any]:
+        """The actor's loss for one task under a critic, and the data of all tasks (T, ...)."""
+
+        def loss(actor: Params, data) -> tuple[Array, Metrics]:
+            batch, features, own_critic, temperature, key = data
+            return self.actor_loss(actor, (batch, features, Params(critic.shared, own_critic), temperature, key))
+
+        return loss, (batch, features, critic.own, temperature, jax.random.split(key, len(temperature)))
+
+
+def least(values: Array) -> Array:
+    """The least of values (N, B), differentiably.
+
+    The slope of ``jnp.min`` looks for values that equal the least, finds none where XLA computes them twice and rounds
+    them otherwise, and is then 0 / 0.
+    """
+    return jnp.take_along_axis(values, jnp.argmin(values, axis=0, keepdims=True), axis=0)[0]
 
 
 def descend(optimizer: optax.GradientTransformation, gradients: Any, memory: Any, params: Any) -> tuple[Any, Any]:

@@ -109,6 +109,7 @@ class CheetahRun(Domain):
     default_iterations: ClassVar[int] = 4
     warp_iterations: ClassVar[int] = 4
     starts_untouched: ClassVar[bool] = True  # it has no force sensors
+    relabels: ClassVar[tuple[str, ...]] = ("speed", "direction")
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
         _weigh(spec)
@@ -126,6 +127,10 @@ class CheetahRun(Domain):
 
     def observe(self, task: Task, world: World) -> Array:
         return jnp.concatenate([world.qpos[1:], world.qvel])
+
+    def recall(self, task: Task, obs: Array) -> World:
+        qvel = obs[self.models[0].nq - 1 :]
+        return World(jnp.pad(obs[: -len(qvel)], (1, 0)), qvel, jnp.zeros_like(qvel), None)  # wherever along x
 
     def reward(self, task: Task, world: World, action: Array) -> Array:
         speed = task.goal["speed"]

@@ -23,7 +23,7 @@ from mtjax.envs.family import Family, draw_until
 from mtjax.envs.physics import ENGINES, Engine, Mjx, MujocoC, World, choose_engine, mjx_module
 from mtjax.envs.planar import Planar, is_planar, locate
 from mtjax.names import nearest_error
-from mtjax.types import Array, InputError, Key, Step, Task
+from mtjax.types import Array, InputError, Key, Step, Task, Transition
 
 # Fields of the model that never reach the dynamics: statistics, and what only a renderer reads.
 _UNUSED = ("stat", "cam_", "light_", "mat_", "tex_", "name", "_", "signature", "geom_rgba")
@@ -79,6 +79,10 @@ class Domain(Family):
     def reward(self, task: Task, world: World, action: Array) -> Array:
         """Return the reward () of having arrived in a world."""
 
+    def recall(self, task: Task, obs: Array) -> World:
+        """Return a world that looks like ``obs``, right in all that the reward depends on; for ``relabel``."""
+        raise NotImplementedError(f"{type(self).__name__} does not say which world an observation shows")
+
     # What every domain does.
 
     def reset(self, task: Task, key: Key) -> Step:
@@ -91,6 +95,11 @@ class Domain(Family):
         """Advance one control step under ``action`` (A,) in [-1, 1]; observation and reward are those after it."""
         world = self.simulator.step(task, state, action)
         return Step(world, self.observe(task, world), self.reward(task, world, action), jnp.bool_(False))
+
+    def relabel(self, task: Task, transition: Transition, key: Key) -> Transition:
+        """Return a transition of another task as ``task`` would have had it, if observations show no goal."""
+        world = self.recall(task, transition.next_obs)
+        return transition._replace(reward=self.reward(task, world, transition.action))
 
     def set_physics(self, task: Task, state: World, qpos: Array, qvel: Array) -> World:
         """Return the same state with the given positions (nq,) and velocities (nv,)."""

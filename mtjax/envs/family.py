@@ -7,7 +7,7 @@ import abc
 import dataclasses
 from collections.abc import Callable, Mapping
 from functools import cached_property
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ import tyro
 
 from mtjax.envs import variation
 from mtjax.envs.parameters import Parameter
-from mtjax.types import SPLITS, Array, InputError, Key, Spec, Step, Task
+from mtjax.types import SPLITS, Array, InputError, Key, Spec, Step, Task, Transition
 
 _MAX_DRAWS = 1000
 Values = Mapping[str, np.ndarray]  # parameter -> (R,) its value in every row
@@ -52,13 +52,22 @@ class Family(abc.ABC):
     """Which tasks train and which are held out: dense (train on all values; test between and beyond them), hip-bmdp
     (of ten values train on numbers 3, 4, 7 and 8 counted from 0; interpolation 5, 6; extrapolation 2, 9) or none."""
 
+    context_ranges: Annotated[Any, tyro.conf.Suppress] = None
+    """Parameters of the context and the ranges that become [-1, 1], ((name, low, high), ...), where they are another
+    family's: see ``scaled_as``. None: those that vary in training."""
+
     parameters: ClassVar[Mapping[str, Parameter]]
     action_size: ClassVar[int]
     episode_steps: ClassVar[int]
+    relabels: ClassVar[tuple[str, ...]] = ()  # the parameters, goals all of them, that ``relabel`` can exchange
+    fresh_goals: ClassVar[bool] = False  # every episode draws a goal of its own, whatever its task
 
     def __post_init__(self):
         pairs = self.vary.items() if isinstance(self.vary, Mapping) else self.vary
         object.__setattr__(self, "vary", tuple((str(n), variation.write_values(v)) for n, v in pairs))
+        if self.context_ranges is not None:
+            ranges = tuple((str(name), float(low), float(high)) for name, low, high in self.context_ranges)
+            object.__setattr__(self, "context_ranges", ranges)
         if self.num_draws < 1 or self.num_tasks < 1:
             raise InputError("num-tasks and num-draws must be at least 1")
         _ = self.variation
@@ -72,6 +81,14 @@ class Family(abc.ABC):
     @abc.abstractmethod
     def step(self, task: Task, state: Any, action: Array) -> Step:
         """Advance one step under ``action`` (A,) in [-1, 1]; observation and reward are those after it."""
+
+    def relabel(self, task: Task, transition: Transition, key: Key) -> Transition:
+        """Return a transition of another task as ``task`` would have had it, if they differ in ``relabels`` alone.
+
+        The reward, and what the observations show of the goal, are those of a step of ``task`` from the same state; the
+        key draws the goal where every episode has one of its own.
+        """
+        raise NotImplementedError(f"{type(self).__name__} declares no parameters that it relabels")
 
     def build(self) -> dict[str, dict[str, Any]]:
         """Return the "model" and "goal" leaves (R, ...) of every row of the table."""
@@ -138,11 +155,34 @@ class Family(abc.ABC):
 
     def _context(self) -> np.ndarray:
         """What differs between tasks (R, C), scaled; a single task has one constant number, as networks need some."""
-        if not self.varied:
+        if not self.ranges:
             return np.zeros((self.count, 1), np.float32)
-        found, everything = self.variation, np.stack(list(self.values.values()), axis=1)
-        scaled = variation.scale(everything, found.low, found.high)
-        return scaled[:, found.low < found.high].astype(np.float32)
+        _, low, high = zip(*self.ranges, strict=True)
+        columns = [self._column(*of_one) for of_one in self.ranges]
+        return variation.scale(np.stack(columns, axis=1), np.array(low), np.array(high)).astype(np.float32)
+
+    def _column(self, name: str, low: float, high: float) -> np.ndarray:
+        """The values (R,) of a parameter that may not vary here, or not be known."""
+        known = self.parameters[name].nominal if name in self.parameters else (low + high) / 2
+        return self.values.get(name, np.full(self.count, known))
+
+    @property
+    def ranges(self) -> tuple[tuple[str, float, float], ...]:
+        """Parameters of the context, and the ranges that become [-1, 1] in it."""
+        if self.context_ranges is not None:
+            return self.context_ranges
+        found = self.variation
+        ends = zip(found.names, found.low.tolist(), found.high.tolist(), strict=True)
+        return tuple((name, low, high) for name, low, high in ends if low < high)
+
+    def scaled_as(self, other: "Family") -> Self:
+        """These tasks with the other family's context: its parameters, by its ranges.
+
+        A network that was trained on the other family so reads contexts as it has learned to. What does not vary here
+        has its one value, what these tasks do not know the middle of its range (0 in the context), and what varies here
+        alone is not in the context.
+        """
+        return dataclasses.replace(self, context_ranges=other.ranges)
 
     def tasks(self, split: str = "train") -> Task:
         """Return the tasks of a split: "train", "interpolation", "extrapolation", or "all" of them in this order."""

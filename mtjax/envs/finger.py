@@ -12,7 +12,7 @@ import mujoco
 from mtjax.envs.domain import Domain, start_joints
 from mtjax.envs.parameters import DAMPING, FRICTION, GEAR, MASS, Parameter
 from mtjax.envs.physics import World
-from mtjax.types import Array, Key, Task
+from mtjax.types import Array, Key, Task, Transition
 
 _SPIN_VELOCITY = 15.0  # [rad/s]
 
@@ -132,6 +132,8 @@ class FingerTurn(FingerSpin):
             "target-size": Parameter("m", 0.07),
         }
     )
+    relabels: ClassVar[tuple[str, ...]] = ("target-size", "target-angle")
+    fresh_goals: ClassVar[bool] = True
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
         pass  # the model's own damping is this task's
@@ -149,16 +151,32 @@ class FingerTurn(FingerSpin):
         radius = jnp.sum(self.leaf(task, "geom_size")[self.models[0].geom("cap1").id])
         return radius * jnp.stack([jnp.sin(angle), jnp.cos(angle)])
 
-    def distance(self, task: Task, world: World) -> Array:
-        """From the tip to the surface of the target, () [m], negative inside."""
-        tip = super().observe(task, world)[2:4]
-        return jnp.linalg.norm(world.extra - tip) - task.goal["target-size"]
+    def distance(self, task: Task, seen: Array, target: Array) -> Array:
+        """From the tip to the surface of the target, () [m], negative inside, where FingerSpin sees ``seen`` (9,)."""
+        return jnp.linalg.norm(target - seen[2:4]) - task.goal["target-size"]
+
+    def show(self, task: Task, seen: Array, target: Array) -> Array:
+        """The observation where FingerSpin sees ``seen`` (9,)."""
+        return jnp.concatenate([seen, target, self.distance(task, seen, target)[None]])
+
+    def pay(self, task: Task, seen: Array, target: Array) -> Array:
+        """The reward () where FingerSpin sees ``seen`` (9,)."""
+        return (self.distance(task, seen, target) <= 0).astype(jnp.float32)
 
     def observe(self, task: Task, world: World) -> Array:
-        return jnp.concatenate([super().observe(task, world), world.extra, self.distance(task, world)[None]])
+        return self.show(task, super().observe(task, world), world.extra)
 
     def reward(self, task: Task, world: World, action: Array) -> Array:
-        return (self.distance(task, world) <= 0).astype(jnp.float32)
+        return self.pay(task, super().observe(task, world), world.extra)
+
+    def relabel(self, task: Task, transition: Transition, key: Key) -> Transition:
+        target = self.target(task, self.target_angle(task, key))
+        before, after = transition.obs[:9], transition.next_obs[:9]
+        return transition._replace(
+            obs=self.show(task, before, target),
+            reward=self.pay(task, after, target),
+            next_obs=self.show(task, after, target),
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -174,9 +192,10 @@ class FingerTurnTarget(FingerTurn):
     parameters: ClassVar = MappingProxyType(
         {**FingerTurn.parameters, "target-angle": Parameter("rad", 0.0, minimum=-math.inf)}
     )
+    fresh_goals: ClassVar[bool] = False
 
     def target_angle(self, task: Task, key: Key) -> Array:
         return task.goal["target-angle"]
 
-    def observe(self, task: Task, world: World) -> Array:
-        return FingerSpin.observe(self, task, world)
+    def show(self, task: Task, seen: Array, target: Array) -> Array:
+        return seen

@@ -12,7 +12,7 @@ import numpy as np
 
 from mtjax.envs.family import Family, draw_until
 from mtjax.envs.parameters import Parameter
-from mtjax.types import Array, InputError, Key, Step, Task
+from mtjax.types import Array, InputError, Key, Step, Task, Transition
 
 _HALF_WIDTH = 3.0  # [m] of the room
 _ALCOVE = 1.0  # [m] depth of the strips beyond its four sides
@@ -106,10 +106,21 @@ class TwoGoalMaze(Family):
         ahead = state.position + _FORWARD * _facing(state.turns)
         walks = (chosen == 2) & (_wall_distance(ahead) >= _WALKER_RADIUS)
         state = MazeState(jnp.where(walks, ahead, state.position), turns, state.boxes)
-        goal = (task.goal["goal-box"] > 0.5).astype(jnp.int32)
-        near = _distance(state.position, state.boxes) < _REACHED
-        reward = jnp.where(near[1 - goal], -1.0, jnp.where(near[goal], 1.0, 0.0))
-        return Step(state, self._observe(state, 2.0 * goal - 1), reward, jnp.any(near))
+        ended = jnp.any(_distance(state.position, state.boxes) < _REACHED)
+        reward = _pay(task, state.position, state.boxes)
+        return Step(state, self._observe(state, 2.0 * _goal(task) - 1), reward, ended)
+
+    @property
+    def relabels(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Only who sees the boxes knows which of them was reached."""
+        return ("goal-box",) if self.observe_boxes else ()
+
+    def relabel(self, task: Task, transition: Transition, key: Key) -> Transition:
+        places = (transition.next_obs[jnp.array([0, 1, 4, 5, 6, 7])].reshape(3, 2) + 1) / 2.1 * _HALF_WIDTH
+        sign = 2.0 * _goal(task) - 1
+        show = lambda obs: obs.at[3].multiply(sign * obs[3])  # 0 stays 0
+        reward = _pay(task, places[0], places[1:])
+        return transition._replace(obs=show(transition.obs), reward=reward, next_obs=show(transition.next_obs))
 
     def _observe(self, state: MazeState, sign: Array) -> Array:
         scaled = lambda places: places / _HALF_WIDTH * 2.1 - 1
@@ -117,6 +128,17 @@ class TwoGoalMaze(Family):
         seen = (heading > _SIGN_SEEN[0]) & (heading < _SIGN_SEEN[1])
         obs = jnp.append(scaled(state.position), jnp.stack([heading, jnp.where(seen, sign, 0.0)]))
         return jnp.append(obs, scaled(state.boxes).ravel()) if self.observe_boxes else obs
+
+
+def _goal(task: Task) -> Array:
+    """Which box to reach, () int32: 0 the blue one, 1 the red one."""
+    return (task.goal["goal-box"] > 0.5).astype(jnp.int32)
+
+
+def _pay(task: Task, position: Array, boxes: Array) -> Array:
+    """The reward () of being at ``position`` (2,)."""
+    near, goal = _distance(position, boxes) < _REACHED, _goal(task)
+    return jnp.where(near[1 - goal], -1.0, jnp.where(near[goal], 1.0, 0.0))
 
 
 def _facing(turns: Array) -> Array:

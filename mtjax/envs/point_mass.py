@@ -64,12 +64,16 @@ class PointMass(Domain):
     gpu_engine: ClassVar[str] = "mjx"
     default_iterations: ClassVar[int] = 2
     starts_untouched: ClassVar[bool] = True
+    relabels: ClassVar[tuple[str, ...]] = ("goal-x", "goal-y")
 
     def start(self, task: Task, key: Key) -> tuple[Array, Array]:
         return start_joints(self.models[0], key), jnp.zeros(2)
 
     def observe(self, task: Task, world: World) -> Array:
         return jnp.concatenate([world.qpos, world.qvel])
+
+    def recall(self, task: Task, obs: Array) -> World:
+        return World(obs[:2], obs[2:], jnp.zeros(2), None)
 
     def reward(self, task: Task, world: World, action: Array) -> Array:
         distance, radius = self._target(task, world)

@@ -13,7 +13,7 @@ from mtjax.envs.domain import Domain, start_joints
 from mtjax.envs.parameters import DAMPING, GEAR, MASS, Parameter
 from mtjax.envs.physics import World
 from mtjax.envs.rewards import tolerance
-from mtjax.types import Array, Key, Task
+from mtjax.types import Array, Key, Task, Transition
 
 _NEAREST, _FARTHEST = 0.05, 0.2  # [m] of the target from the shoulder
 
@@ -58,13 +58,13 @@ class Reacher(Domain):
     gpu_engine: ClassVar[str] = "mjx"
     default_iterations: ClassVar[int] = 2
     starts_untouched: ClassVar[bool] = True
+    relabels: ClassVar[tuple[str, ...]] = ("target-size", "target-angle", "target-radius")
+    fresh_goals: ClassVar[bool] = True
 
     def start(self, task: Task, key: Key) -> tuple[Array, Array, Array]:
         """Draw positions and velocities of the joints, and where the target is (2,) [m]."""
         joint_key, target_key = jax.random.split(key)
-        angle, radius = self.polar_target(task, target_key)
-        target = radius * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
-        return start_joints(self.models[0], joint_key), jnp.zeros(2), target
+        return start_joints(self.models[0], joint_key), jnp.zeros(2), self.target(task, target_key)
 
     def observe(self, task: Task, world: World) -> Array:
         return jnp.concatenate([world.qpos, world.extra - self.finger(task, world), world.qvel])
@@ -73,6 +73,21 @@ class Reacher(Domain):
         geoms = jnp.array([self.models[0].geom(name).id for name in ("target", "finger")])
         reach = jnp.sum(self.leaf(task, "geom_size")[geoms, 0])
         return tolerance(jnp.linalg.norm(world.extra - self.finger(task, world)), 0.0, reach)
+
+    def relabel(self, task: Task, transition: Transition, key: Key) -> Transition:
+        target = self.target(task, key)
+        recall = lambda obs: World(obs[:2], obs[4:], jnp.zeros(2), None, target)
+        before, after = recall(transition.obs), recall(transition.next_obs)
+        return transition._replace(
+            obs=self.observe(task, before),
+            reward=self.reward(task, after, transition.action),
+            next_obs=self.observe(task, after),
+        )
+
+    def target(self, task: Task, key: Key) -> Array:
+        """Where the target is (2,) [m] in an episode."""
+        angle, radius = self.polar_target(task, key)
+        return radius * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
 
     def polar_target(self, task: Task, key: Key) -> tuple[Array, Array]:
         """Direction () [rad] and distance () [m] of the target from the shoulder in one episode."""
@@ -108,6 +123,7 @@ class ReacherTarget(Reacher):
             "target-radius": Parameter("m", 0.15, maximum=0.24),
         }
     )
+    fresh_goals: ClassVar[bool] = False
 
     def observe(self, task: Task, world: World) -> Array:
         return jnp.concatenate([world.qpos, self.finger(task, world), world.qvel])

@@ -77,6 +77,14 @@ class WalkerStand(Domain):
         axes = jnp.stack([jnp.cos(places.angle), jnp.sin(places.angle)], axis=1)[1:]
         return jnp.concatenate([axes.ravel(), places.position[1:2, 1], world.qvel])
 
+    def recall(self, task: Task, obs: Array) -> World:
+        model = self.models[0]
+        cosines, sines = obs[:14].reshape(7, 2).T
+        pitch = jnp.pad(jnp.arctan2(sines, cosines), (1, 0))  # the world's is 0
+        bends = model.jnt_axis[2:, 1] * (pitch[1:] - pitch[model.body_parentid[1:]])
+        height = obs[14] - self.leaf(task, "body_pos")[1, 2]
+        return World(jnp.concatenate([jnp.stack([height, 0.0]), bends]), obs[15:], jnp.zeros(model.nv), None)
+
     def reward(self, task: Task, world: World, action: Array) -> Array:
         places = self.planar(task, world)
         standing = tolerance(places.position[1, 1], _STAND_HEIGHT, jnp.inf, _STAND_HEIGHT / 2)
@@ -95,6 +103,7 @@ class WalkerWalk(WalkerStand):
     """
 
     parameters: ClassVar = MappingProxyType({**WalkerStand.parameters, "speed": Parameter("m/s", 1.0)})
+    relabels: ClassVar[tuple[str, ...]] = ("speed",)
 
     def reward(self, task: Task, world: World, action: Array) -> Array:
         return super().reward(task, world, action) * (5 * self.move(task, world) + 1) / 6

@@ -1,35 +1,17 @@
 """CARE: contextual attention over a mixture of encoders."""
 
 import dataclasses
-from typing import Literal
+from typing import ClassVar, Literal
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from mtjax.agents.sac import SAC, Conditioning
+from mtjax.agents.encoders.base import Identity
+from mtjax.agents.encoders.mixture import Experts, check_experts
 from mtjax.names import nearest_error
 from mtjax.networks import MLP, join
 from mtjax.types import Array, InputError
-
-
-class Experts(nn.Module):
-    """K encoders of the same shape, each an MLP with a linear output, evaluated as batched products."""
-
-    num_experts: int
-    widths: tuple[int, ...]
-
-    @nn.compact
-    def __call__(self, x: Array) -> Array:
-        """Map inputs (..., O) to encodings (K, ..., D)."""
-        x = jnp.broadcast_to(x, (self.num_experts, *x.shape))
-        init = nn.initializers.lecun_normal(batch_axis=0)
-        for i, width in enumerate(self.widths):
-            kernel = self.param(f"kernel_{i}", init, (self.num_experts, x.shape[-1], width))
-            bias = self.param(f"bias_{i}", nn.initializers.zeros, (self.num_experts, width))
-            x = jax.vmap(lambda x, kernel, bias: x @ kernel + bias)(x, kernel, bias)
-            x = nn.relu(x) if i + 1 < len(self.widths) else x
-        return x
 
 
 class Mixture(nn.Module):
@@ -62,7 +44,7 @@ class Mixture(nn.Module):
 
 
 @dataclasses.dataclass(frozen=True)
-class CARE(SAC):
+class CARE(Identity):
     """Contextual attention-based representation learning (Sodhani, Zhang and Pineau 2021).
 
     For a task with context features c and K encoders E_j of the observation s:
@@ -82,8 +64,7 @@ class CARE(SAC):
     their initial values).
     """
 
-    conditioning: Conditioning = "parameters"
-    """What the context encoder is told of the task: one-hot, embedding, parameters, or vectors (rows of a file)."""
+    needs_features: ClassVar[bool] = True
     num_experts: int = 6
     """Encoders in the mixture."""
     expert_widths: tuple[int, ...] = (64, 64)
@@ -94,16 +75,12 @@ class CARE(SAC):
     """Divides the paper's inner products; 0 is the square root of the encoding's size, 1 the paper's formula."""
 
     def __post_init__(self):
-        super().__post_init__()
         if self.variant not in ("paper", "mtrl"):
             raise nearest_error("variant", self.variant, ("paper", "mtrl"))
-        if self.conditioning == "none":
-            raise InputError("care attends by the task's context, so conditioning cannot be none; use parameters")
         if not self.attention_temperature >= 0:
             raise InputError(f"attention-temperature must be at least 0, not {self.attention_temperature}")
-        if self.num_experts < 1 or not self.expert_widths or min(self.expert_widths) < 1:
-            raise InputError("care needs at least one expert with at least one layer of at least one unit")
+        check_experts(self.num_experts, self.expert_widths)
 
-    def body(self, layer_norm: bool) -> nn.Module:
+    def body(self, hidden: tuple[int, ...], layer_norm: bool) -> nn.Module:
         temperature = self.attention_temperature or self.expert_widths[-1] ** 0.5
-        return Mixture(self.num_experts, self.expert_widths, self.variant, temperature, self.hidden, layer_norm)
+        return Mixture(self.num_experts, self.expert_widths, self.variant, temperature, hidden, layer_norm)

@@ -1,0 +1,39 @@
+"""What every benchmark says of where and how its figures came about."""
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+from typing import Any
+
+import jax
+import mujoco
+
+import mtjax
+
+
+def machine() -> dict[str, Any]:
+    """Where the figures come from."""
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=os.path.dirname(__file__) or "."
+    )
+    return {
+        "device": jax.devices()[0].device_kind,
+        "cores": os.cpu_count(),
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+        "mujoco": mujoco.__version__,
+        "mtjax": mtjax.__version__,
+        "commit": commit.stdout.strip() or None,
+    }
+
+
+def publish(arguments: argparse.Namespace, rows: list[dict]) -> None:
+    """Print the figures as JSON, and write them to ``--json`` if that was given."""
+    settings = {name: value for name, value in vars(arguments).items() if name != "json"}
+    report = {"machine": machine(), "settings": settings, "rows": rows}
+    print(json.dumps(report))
+    if arguments.json:
+        with open(arguments.json, "x") as file:
+            json.dump(report, file, indent=2)

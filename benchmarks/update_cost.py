@@ -1,0 +1,144 @@
+"""What an update of every agent costs beside plain SAC's.
+
+    python benchmarks/update_cost.py [--agents NAME ...] [--tasks 10 50] [--seeds 1 10] [--json FILE]
+
+One update: 10 tasks, 128 transitions a task, hidden layers of 3 x 400 in actor and critics, on the observations of the
+finger (9 numbers, 2 actions); the same for all. Updates run in a scan, as they do in training. All agents of a setting
+are compiled first and then timed in turn, round after round, so that what else the machine does falls on all of them:
+times are medians over rounds, ratios medians of each round's ratio to ``sac``.
+"""
+
+import argparse
+import statistics
+import time
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from report import publish
+
+import mtjax
+from mtjax.history import widen
+from mtjax.types import InputError, Spec, Task, Transition
+
+SPEC = Spec(obs_size=9, action_size=2, context_size=1)
+_ON_CPU = jax.default_backend() == "cpu"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--agents", nargs="+", default=list(mtjax.AGENTS), choices=list(mtjax.AGENTS))
+    parser.add_argument("--tasks", type=int, nargs="+", default=[10])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1])
+    parser.add_argument("--batch", type=int, default=128, help="transitions a task")
+    parser.add_argument("--hidden", type=int, nargs="+", default=[400, 400, 400])
+    parser.add_argument("--updates", type=int, default=3 if _ON_CPU else 100, help="in a timed call")
+    parser.add_argument("--repeats", type=int, default=7, help="rounds")
+    parser.add_argument("--json", help="write the figures to this file too")
+    arguments = parser.parse_args()
+    rows = []
+    for num_tasks in arguments.tasks:
+        for num_seeds in arguments.seeds:
+            rows += compare(arguments, num_tasks, num_seeds)
+    print(table(rows), flush=True)
+    publish(arguments, rows)
+
+
+def compare(arguments: argparse.Namespace, num_tasks: int, num_seeds: int) -> list[dict]:
+    """Time all agents in turn."""
+    names = ["sac", *(name for name in arguments.agents if name != "sac")]
+    contestants = [Contestant(name, arguments, num_tasks, num_seeds) for name in names]
+    for _ in range(arguments.repeats):
+        for contestant in contestants:
+            contestant.time()
+    plain = contestants[0]
+    return [contestant.row(plain) for contestant in contestants]
+
+
+class Contestant:
+    """One agent's compiled updates, and the seconds that an update took in each round."""
+
+    def __init__(self, name: str, arguments: argparse.Namespace, num_tasks: int, num_seeds: int):
+        self.name, self.updates, self.seconds = name, arguments.updates, []
+        self.num_tasks, self.num_seeds = num_tasks, num_seeds
+        agent = make(name, tuple(arguments.hidden))
+        spec = widen(SPEC, agent.history)
+        tasks, keys = tasks_of(num_tasks), jax.random.split(jax.random.key(0), num_seeds)
+        batch = random_batch(spec, num_tasks, arguments.batch)
+        self.state = jax.jit(jax.vmap(lambda key: agent.init(spec, tasks, key)))(keys)
+        self.num_parameters = size_of((self.state.actor, self.state.critic)) // num_seeds
+
+        def learn(state: Any, keys: jax.Array) -> Any:
+            update = lambda state, key: agent.update(state, batch, tasks, key)
+            return jax.lax.scan(update, state, jax.random.split(keys, arguments.updates))[0]
+
+        over_seeds = jax.vmap(learn) if num_seeds > 1 else one_seed(learn)
+        before = time.perf_counter()
+        self.run = jax.jit(over_seeds, donate_argnums=0).lower(self.state, keys).compile()
+        self.compile_seconds, self.keys = time.perf_counter() - before, keys
+        self.time(count=False)
+
+    def time(self, count: bool = True) -> None:
+        before = time.perf_counter()
+        self.state = jax.block_until_ready(self.run(self.state, self.keys))
+        if count:
+            self.seconds.append((time.perf_counter() - before) / self.updates)
+
+    def row(self, plain: "Contestant") -> dict:
+        ratios = [own / other for own, other in zip(self.seconds, plain.seconds, strict=True)]
+        return {
+            "agent": self.name,
+            "tasks": self.num_tasks,
+            "seeds": self.num_seeds,
+            "milliseconds": round(1e3 * statistics.median(self.seconds), 4),
+            "fastest": round(1e3 * min(self.seconds), 4),
+            "slowest": round(1e3 * max(self.seconds), 4),
+            "over_sac": round(statistics.median(ratios), 3),
+            "parameters": self.num_parameters,
+            "compile_seconds": round(self.compile_seconds, 1),
+        }
+
+
+def one_seed(function):
+    """As the training loop does: a single seed is not mapped."""
+    return lambda *trees: jax.tree.map(lambda x: x[None], function(*jax.tree.map(lambda x: x[0], trees)))
+
+
+def make(name: str, hidden: tuple[int, ...]):
+    """The agent with these hidden layers, whatever else its preset says."""
+    return mtjax.agent(name, hidden=hidden)
+
+
+def tasks_of(num_tasks: int) -> Task:
+    row = jnp.arange(num_tasks, dtype=jnp.int32)
+    return Task(row, row, jnp.linspace(-1, 1, num_tasks)[:, None], {}, {}, {})
+
+
+def random_batch(spec: Spec, num_tasks: int, batch_size: int) -> Transition:
+    random = np.random.default_rng(0)
+    normal = lambda *shape: jnp.float32(random.normal(size=(num_tasks, batch_size, *shape)))
+    obs, action, next_obs = normal(spec.obs_size), jnp.tanh(normal(spec.action_size)), normal(spec.obs_size)
+    return Transition(obs, action, normal(), jnp.ones((num_tasks, batch_size)), next_obs)
+
+
+def size_of(tree: Any) -> int:
+    return sum(leaf.size for leaf in jax.tree.leaves(tree))
+
+
+def table(rows: list[dict]) -> str:
+    lines = ["| agent | tasks | seeds | ms an update | range | over sac | parameters | compiled in |", "|" + "---|" * 8]
+    for row in rows:
+        span = f"{row['fastest']:.3g} to {row['slowest']:.3g}"
+        lines.append(
+            f"| {row['agent']} | {row['tasks']} | {row['seeds']} | {row['milliseconds']:.3g} | {span} "
+            f"| {row['over_sac']:.2f} | {row['parameters']:,} | {row['compile_seconds']:.1f} s |"
+        )
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except InputError as error:
+        raise SystemExit(f"error: {error}") from None

@@ -1,0 +1,108 @@
+"""Distral: every task its own policy, held together by one that is distilled from them all."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from mtjax.agents import parts
+from mtjax.agents.hyperparameters import PARTS, Heads
+from mtjax.agents.sac import SAC
+from mtjax.networks import Network, Params, log_density, sample_raw
+from mtjax.types import Array, InputError, Key, Metrics
+
+
+@dataclasses.dataclass(frozen=True)
+class Policies(Network):
+    """A network for every task and, beside it, one of the same shape that is shared by all: the distilled policy."""
+
+    def init(self, key: Key, num_tasks: int, out: int, features: Array, *inputs: Array) -> Params:
+        """Initialise the distilled policy, and every task's as a copy of it: random ones would be worlds apart."""
+        distilled = self._distilled.init(key, num_tasks, out, features, *inputs)
+        own = jax.tree.map(lambda x: jnp.repeat(x[None], num_tasks, axis=0), distilled.shared)
+        again = jax.tree.map(jnp.copy, distilled.own)
+        return Params({"distilled": distilled.shared}, {**own, **distilled.own, "distilled": again})
+
+    def apply_distilled(self, params: Params, features: Array, *inputs: Array) -> Array:
+        """Map one task's inputs to the distilled policy's outputs (..., out)."""
+        distilled = Params(params.shared["distilled"], params.own["distilled"])
+        return self._distilled.apply(distilled, features, *inputs)
+
+    @property
+    def _distilled(self) -> Network:
+        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(Network)}
+        return Network(**{**fields, "own": ()})
+
+
+@dataclasses.dataclass(frozen=True)
+class Distral(SAC):
+    """Distill and transfer (Teh et al. 2017, "KL + ent 1 col"), on soft actor-critic.
+
+    Task i has a policy pi_i and critics of its own, and all share a distilled policy pi_0. The paper's equation 1,
+        J = sum_i E_{pi_i} sum_t gamma^t (r_i - c_KL log(pi_i / pi_0) - c_Ent log pi_i),
+    is with alpha = c_KL / (c_KL + c_Ent) and 1 / beta = c_KL + c_Ent
+        J = sum_i E_{pi_i} sum_t gamma^t (r_i + alpha / beta log pi_0 - 1 / beta log pi_i)          (equation 2)
+    in which SAC's temperature a_i takes the place of 1 / beta:
+        y = r + discount gamma (min_n Qbar_n(s', a') - a_i (log pi_i(a'|s') - alpha log pi_0(a'|s')))   (critic target)
+        L_pi_i = a_i (log pi_i(a|s) - alpha log pi_0(a|s)) - min_n Q_n(s, a),  a ~ pi_i(s)              (actor loss)
+        L_pi_0 = -log pi_0(a|s),  a ~ pi_i(s), summed over tasks                                        (distillation)
+    each on the data of task i alone. The actor loss reaches pi_i also by the action in log pi_0, but not pi_0's
+    parameters; distillation reaches these alone, and minimises KL(pi_i || pi_0) over them. Temperatures are tuned as
+    SAC's, on the entropy of pi_i, so that c_KL = alpha a_i and c_Ent = (1 - alpha) a_i; alpha = 0 is one SAC for every
+    task, watched by pi_0. ``kl`` in the metrics is the mean of log pi_i - log pi_0.
+
+    Training tasks are played by their own policies, others by the distilled one. As in the paper no policy is told its
+    task; with another conditioning all are, pi_0 too.
+
+    Differs from the paper: all policies begin as one, where their divergence is zero; off-policy, with critics in place
+    of returns and temperatures that are tuned. The paper's distillation is weighed by c_KL, which Adam forgets, and
+    discounts late steps. Its two-column policies, of which pi_0 is one column, are not here.
+    """
+
+    heads: Heads = "disjoint"
+    distral_alpha: float = 0.5
+    """Share of the distilled policy in what a policy pays for: 0 is none, 1 leaves no entropy bonus."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        if not 0 <= self.distral_alpha <= 1:
+            raise InputError(f"distral-alpha must be in [0, 1], not {self.distral_alpha}")
+
+    def _check_combination(self) -> None:
+        if self.heads != "disjoint":
+            raise InputError(f"distral gives every task a policy of its own: heads is disjoint, not {self.heads}")
+        rule = parts.name_of(PARTS["gradients"], self.gradients)
+        if rule != "mean":
+            raise InputError(
+                f"distral's tasks share only what is distilled from them, which has no conflicts for gradients={rule} "
+                "to settle; use mean"
+            )
+        super()._check_combination()
+
+    @property
+    def unseen(self) -> str:
+        """What plays a task that was not trained on."""
+        rest = [part for part in self.borrowed if part != "networks"]
+        return "the distilled policy plays them" + (f", by the {' and '.join(rest)} of the nearest" if rest else "")
+
+    @property
+    def actor(self) -> Policies:
+        network = super().actor
+        return Policies(**{field.name: getattr(network, field.name) for field in dataclasses.fields(network)})
+
+    def behaviour(self, trained: Array, actor: Params, critic: Params, features: Array, obs: Array) -> Array:
+        own = self.policy(actor, critic, features, obs)
+        return jnp.where(trained, own, self.actor.apply_distilled(actor, features, obs))
+
+    def sample(self, actor, critic, features, obs, key: Key) -> tuple[Array, Array, Array]:
+        raw, log_prob = sample_raw(self.policy(actor, critic, features, obs), key)
+        prior = log_density(self.actor.apply_distilled(jax.lax.stop_gradient(actor), features, obs), raw)
+        return jnp.tanh(raw), log_prob, log_prob - self.distral_alpha * prior
+
+    def actor_loss(self, actor: Params, data) -> tuple[Array, Metrics]:
+        loss, metrics = super().actor_loss(actor, data)
+        batch, features, critic, _, key = data
+        raw, _ = sample_raw(self.policy(actor, critic, features, batch.obs), key)  # the actions of that loss
+        outputs = self.actor.apply_distilled(actor, features, batch.obs)
+        fit = jnp.mean(log_density(outputs, jax.lax.stop_gradient(raw)))
+        return loss - fit, {**metrics, "kl": -metrics["entropy"] - fit}

@@ -1,0 +1,176 @@
+"""Samplers of tasks: how much each counts in an update.
+
+Every task brings the same number of transitions to a batch, as shapes are fixed; that a task is sampled twice as often
+is a weight of two on its losses, which is the same in expectation and less noisy.
+"""
+
+import dataclasses
+from typing import Any, ClassVar, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from mtjax.names import nearest_error
+from mtjax.types import Array, InputError, Outcome
+
+
+@dataclasses.dataclass(frozen=True)
+class Uniform:
+    """All tasks alike. Every sampler is a class like this one."""
+
+    watches: ClassVar[bool] = False  # the stream of outcomes
+
+    def init(self, num_tasks: int) -> Any:
+        """A memory of nothing."""
+        return None
+
+    def observe(self, memory: Any, outcome: Outcome) -> Any:
+        """Take note of what one step of every environment brought, leaves (T, E)."""
+        return memory
+
+    def weights(self, memory: Any, temperature: Array) -> Array | None:
+        """What each task's losses count (T,), 1 on average; None for 1. ``temperature`` (T,) is SAC's."""
+        return None
+
+
+@dataclasses.dataclass(frozen=True)
+class _Unequal(Uniform):
+    """Samplers of which each task keeps a part of its share."""
+
+    least_weight: float = 0.1
+    """Weight that every task has whatever happens; the rest is shared out. 1 weighs all tasks alike."""
+
+    def __post_init__(self):
+        if not 0 <= self.least_weight <= 1:
+            raise InputError(f"least-weight must be in [0, 1], not {self.least_weight}")
+
+    def share_out(self, shares: Array) -> Array:
+        """Weights (T,) of mean 1 and at least ``least_weight`` from shares (T,) that sum to one."""
+        return self.least_weight + (1 - self.least_weight) * len(shares) * shares
+
+
+class Returns(NamedTuple):
+    """Moving means (T,) of episodes' returns; those of a task that has ended none are nothing yet."""
+
+    known: Array  # (T,) bool
+    fast: Array
+    slow: Array
+
+
+def _follow(memory: Returns, outcome: Outcome, fast: float, slow: float) -> Returns:
+    """Take in the episodes that ended, at rates per episode; a task's first ones are what its means begin at."""
+    count = jnp.sum(outcome.ended, axis=1)
+    mean = jnp.sum(jnp.where(outcome.ended, outcome.total, 0.0), axis=1) / jnp.maximum(count, 1)
+
+    def moved(old: Array, rate: float) -> Array:
+        return jnp.where(memory.known, old + (1 - (1 - rate) ** count) * (mean - old), mean)
+
+    return Returns(memory.known | (count > 0), moved(memory.fast, fast), moved(memory.slow, slow))
+
+
+@dataclasses.dataclass(frozen=True)
+class Progress(_Unequal):
+    """Tasks of which the return moves, up or down, count more (learning progress; Matiisen et al. 2017).
+
+    Progress is |fast - slow| / max(|fast|, |slow|), for two moving means of the task's returns at different rates, and
+    the shares are proportional to it. A task that has ended no episode counts as the mean of those that have.
+
+    Differs from the paper, where the slope of returns decides which single task is trained next. (The scheduler of T3S,
+    Yu et al. 2023, works the other way: it favours tasks that progress slowly.)
+    """
+
+    watches = True
+    progress_fast: float = 0.1
+    """Share of a new episode in the fast mean of returns."""
+    progress_slow: float = 0.01
+    """Share of a new episode in the slow mean of returns."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        if not 0 < self.progress_slow < self.progress_fast <= 1:
+            raise InputError(
+                "progress-slow must be below progress-fast, both in (0, 1], "
+                f"not {self.progress_slow} and {self.progress_fast}"
+            )
+
+    def init(self, num_tasks: int) -> Returns:
+        return Returns(jnp.zeros(num_tasks, bool), jnp.zeros(num_tasks), jnp.zeros(num_tasks))
+
+    def observe(self, memory: Returns, outcome: Outcome) -> Returns:
+        return _follow(memory, outcome, self.progress_fast, self.progress_slow)
+
+    def weights(self, memory: Returns, temperature: Array) -> Array:
+        size = jnp.maximum(jnp.abs(memory.fast), jnp.abs(memory.slow))
+        progress = jnp.abs(memory.fast - memory.slow) / jnp.where(size > 0, size, 1.0)
+        average = jnp.sum(progress * memory.known) / jnp.maximum(jnp.sum(memory.known), 1)
+        progress = jnp.where(memory.known, progress, average)
+        total = jnp.sum(progress)
+        return self.share_out(jnp.where(total > 0, progress / jnp.where(total > 0, total, 1.0), 1 / len(progress)))
+
+
+@dataclasses.dataclass(frozen=True)
+class Hardest(_Unequal):
+    """Tasks with low returns count more: shares softmax(-hardness z), z the standardised returns.
+
+    z is a moving mean of each task's returns minus the tasks' mean, over their standard deviation; 0 for a task that
+    has ended no episode. It compares returns between tasks, and so suits families in which all tasks pay alike.
+    """
+
+    watches = True
+    hardness: float = 1.0
+    """How much a task counts for its return being low; 0 weighs all tasks alike."""
+    return_rate: float = 0.1
+    """Share of a new episode in the moving mean of returns."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        if not self.hardness >= 0 or not 0 < self.return_rate <= 1:
+            raise InputError(
+                f"hardness must be at least 0 and return-rate in (0, 1], not {self.hardness} and {self.return_rate}"
+            )
+
+    def init(self, num_tasks: int) -> Returns:
+        return Returns(jnp.zeros(num_tasks, bool), jnp.zeros(num_tasks), jnp.zeros(num_tasks))
+
+    def observe(self, memory: Returns, outcome: Outcome) -> Returns:
+        return _follow(memory, outcome, self.return_rate, self.return_rate)
+
+    def weights(self, memory: Returns, temperature: Array) -> Array:
+        count = jnp.maximum(jnp.sum(memory.known), 1)
+        from_mean = jnp.where(memory.known, memory.slow - jnp.sum(memory.slow * memory.known) / count, 0.0)
+        std = jnp.sqrt(jnp.sum(jnp.square(from_mean)) / count)
+        return self.share_out(jax.nn.softmax(-self.hardness * from_mean / jnp.where(std > 0, std, 1.0)))
+
+
+@dataclasses.dataclass(frozen=True)
+class ByTemperature(_Unequal):
+    """Tasks whose policies have become certain count more (soft modularization; Yang et al. 2020).
+
+    With a_i the tasks' temperatures, shares are softmax(-log a), that is (1 / a_i) / sum_j (1 / a_j): what the authors'
+    code does, and MTRL's. Their paper writes softmax(-a), which temperatures below 1 leave nearly even;
+    ``certainty="temperature"`` is that.
+
+    Differs from the paper: a part of the weight is everyone's, as temperatures differ by orders of magnitude;
+    ``least_weight=0`` has no such part.
+    """
+
+    certainty: Literal["log-temperature", "temperature"] = "log-temperature"
+    """Softmax of minus the temperatures' logarithms, as in the authors' code, or of minus themselves (their paper)."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.certainty not in (allowed := ("log-temperature", "temperature")):
+            raise nearest_error("certainty", self.certainty, allowed)
+
+    def weights(self, memory: Any, temperature: Array) -> Array:
+        score = temperature if self.certainty == "temperature" else jnp.log(temperature)
+        return self.share_out(jax.nn.softmax(-score))
+
+
+Sampler = Uniform
+SAMPLERS: dict[str, type[Sampler]] = {
+    "uniform": Uniform,
+    "progress": Progress,
+    "hardest": Hardest,
+    "temperature": ByTemperature,
+}

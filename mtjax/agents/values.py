@@ -1,0 +1,148 @@
+"""What a critic's outputs mean: a number, or a distribution over returns."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mtjax.types import Array, InputError
+
+
+@dataclasses.dataclass(frozen=True)
+class Scalar:
+    """A critic that outputs the value itself, fitted by the squared error (Haarnoja et al. 2018).
+
+    Every kind of value is a class like this one. Critics' outputs have a leading N.
+    """
+
+    @property
+    def outputs(self) -> int:
+        """Outputs of a critic."""
+        return 1
+
+    def mean(self, outputs: Array) -> Array:
+        """The value (...,) that outputs (..., outputs) stand for."""
+        return outputs[..., 0]
+
+    def target(self, next_outputs: Array, pessimistic: bool, reward: Array, discount: Array, bonus: Array) -> Array:
+        """What to fit (B, ...): reward + discount (value + bonus), by the least critic or by the mean of all.
+
+        Args:
+            next_outputs: (N, B, outputs) of the slow critics; reward, discount and bonus are (B,).
+        """
+        values = self.mean(next_outputs)
+        value = jnp.min(values, axis=0) if pessimistic else jnp.mean(values, axis=0)
+        return reward + discount * (value + bonus)
+
+    def loss(self, outputs: Array, target: Array) -> Array:
+        """Each critic's loss (N, B) for outputs (N, B, outputs) and what ``target`` gave."""
+        return jnp.square(self.mean(outputs) - target)
+
+    def expected(self, target: Array) -> Array:
+        """The value (B,) at which what ``target`` gave aims."""
+        return target
+
+
+@dataclasses.dataclass(frozen=True)
+class C51(Scalar):
+    """A distribution over returns: the logits of K atoms z_k, evenly spaced over a range (Bellemare et al. 2017).
+
+    The next return's distribution p, shifted to the atoms reward + discount (z_k + bonus) and clipped to the range, is
+    projected back onto the z_j (their equation 7):
+        m_j = sum_k p_k max(0, 1 - |clip(reward + discount (z_k + bonus)) - z_j| / spacing)
+    and fitted by the cross-entropy -sum_j m_j log p_j. The projection keeps the mean of what is inside the range. With
+    several critics p is the distribution with the least mean, sample by sample, or the mean of all distributions.
+
+    Differs from the paper: a soft value's bonus shifts the atoms, and the policy is the actor's, as in BRC (Nauman et
+    al. 2025), whose range is the default; it suits returns scaled to it.
+    """
+
+    num_bins: int = 101
+    """Atoms or bins of the distribution over returns."""
+    value_low: float = -10.0
+    """Lowest return the distribution reaches; lower ones are taken for it."""
+    value_high: float = 10.0
+    """Highest return the distribution reaches; higher ones are taken for it. Choose it to fit, or scaling=return."""
+
+    def __post_init__(self):
+        if self.num_bins < 2:
+            raise InputError(f"num-bins must be at least 2, not {self.num_bins}")
+        if not -np.inf < self.value_low < self.value_high < np.inf:
+            raise InputError(f"value-low must be below value-high, not {self.value_low} and {self.value_high}")
+
+    @property
+    def outputs(self) -> int:
+        return self.num_bins
+
+    @property
+    def atoms(self) -> Array:
+        """The return (K,) for which each output stands."""
+        return jnp.linspace(self.value_low, self.value_high, self.num_bins)
+
+    def mean(self, outputs: Array) -> Array:
+        return jnp.sum(jax.nn.softmax(outputs) * self.atoms, axis=-1)
+
+    def target(self, next_outputs: Array, pessimistic: bool, reward: Array, discount: Array, bonus: Array) -> Array:
+        p = jax.nn.softmax(next_outputs)  # (N, B, K)
+        if pessimistic:
+            least = jnp.argmin(self.mean(next_outputs), axis=0)
+            p = jnp.take_along_axis(p, least[None, :, None], axis=0)
+        shifted = reward[:, None] + discount[:, None] * (self.atoms + bonus[:, None])
+        return self.project(jnp.mean(p, axis=0), shifted)
+
+    def project(self, p: Array, places: Array) -> Array:
+        """Share probabilities p (B, K) at places (B, K) out between the atoms on either side of each: (B, K)."""
+        spacing = (self.value_high - self.value_low) / (self.num_bins - 1)
+        position = (jnp.clip(places, self.value_low, self.value_high) - self.value_low) / spacing
+        distance = jnp.abs(position[:, None, :] - jnp.arange(self.num_bins)[:, None])
+        return jnp.sum(p[:, None, :] * jnp.maximum(1 - distance, 0.0), axis=-1)  # one fused loop, unlike a scatter
+
+    def loss(self, outputs: Array, target: Array) -> Array:
+        return -jnp.sum(target * jax.nn.log_softmax(outputs), axis=-1)
+
+    def expected(self, target: Array) -> Array:
+        return jnp.sum(target * self.atoms, axis=-1)
+
+
+@dataclasses.dataclass(frozen=True)
+class HLGauss(C51):
+    """A histogram fitted to a normal distribution around the scalar target (Imani & White 2018, "HL-Gauss").
+
+    With y the target of a scalar critic, clipped to the range, and K bins between edges e_0 ... e_K that fill it,
+        m_j proportional to Phi((e_j - y) / sigma) - Phi((e_(j-1) - y) / sigma)
+    summing to one, fitted by the cross-entropy; the value is the mean of the bins' centres. Sigma is 0.75 bin widths,
+    as in Farebrother et al. (2024). Within two bin widths of the range's ends the truncated normal's mean, and so the
+    value, falls short of y.
+    """
+
+    bin_sigma: float = 0.75
+    """Standard deviation of the target's distribution, in widths of a bin."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        if not self.bin_sigma > 0:
+            raise InputError(f"bin-sigma must be greater than 0, not {self.bin_sigma}")
+
+    @property
+    def width(self) -> float:
+        """The width of a bin."""
+        return (self.value_high - self.value_low) / self.num_bins
+
+    @property
+    def atoms(self) -> Array:
+        return jnp.linspace(self.value_low + self.width / 2, self.value_high - self.width / 2, self.num_bins)
+
+    def target(self, next_outputs: Array, pessimistic: bool, reward: Array, discount: Array, bonus: Array) -> Array:
+        return self.smooth(Scalar.target(self, next_outputs, pessimistic, reward, discount, bonus))
+
+    def smooth(self, values: Array) -> Array:
+        """Bins' probabilities (B, K) for values (B,)."""
+        edges = jnp.linspace(self.value_low, self.value_high, self.num_bins + 1)
+        values = jnp.clip(values, self.value_low, self.value_high)
+        below = jax.scipy.stats.norm.cdf((edges - values[:, None]) / (self.bin_sigma * self.width))
+        return jnp.diff(below) / (below[:, -1:] - below[:, :1])
+
+
+Value = Scalar
+VALUES: dict[str, type[Value]] = {"scalar": Scalar, "c51": C51, "hl-gauss": HLGauss}

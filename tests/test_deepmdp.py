@@ -1,0 +1,439 @@
+"""DeepMDP and HiP-BMDP: their losses in plain NumPy, which parameters each moves, and what they learn."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from probes import QUICK, Probe, learner, of_task, only_seed, pick, random_batch, tasks_of, tiny, train
+from probes import values as values_of
+
+from mtjax.agents.deepmdp import SIGHT, Targets, only
+from mtjax.history import Past, Seen, remember, widen
+from mtjax.loop import Settings
+from mtjax.networks import Params
+from mtjax.types import InputError, Spec
+
+SPEC, BATCH = Spec(3, 2, 1), 4
+TASKS = tasks_of("one-step", (1.0, -0.5, 0.3))
+KEY = jax.random.key(2)
+SMALL = {"latent_widths": (8, 6), "model_widths": (8,)}
+INFERRED = {"unseen_theta": "inferred", "inferred_from": 2}
+jit = partial(jax.jit, compiler_options=QUICK)
+
+
+def make(name, **settings):
+    return tiny(name, **{**SMALL, **settings})
+
+
+def spec_of(agent):
+    return widen(SPEC, agent.history)
+
+
+def start(agent):
+    """A fresh state, a batch and the compiled update."""
+    init, update = learner(agent, TASKS, BATCH, spec_of(agent))
+    return init(TASKS, KEY), random_batch(0, 3, BATCH, spec_of(agent)), update
+
+
+def random_params(agent, task=0):
+    """Actor and critics of one task, all random, so that no bias is zero."""
+    state = jax.eval_shape(lambda: agent.init(spec_of(agent), TASKS, KEY))
+    random = np.random.default_rng(4)
+    draw = lambda tree: jax.tree.map(lambda x: jnp.float32(random.normal(size=x.shape)), tree)
+    return tuple(of_task(draw(params), task) for params in (state.actor, state.critic))
+
+
+def one_task(agent):
+    """A batch of one task, as the losses see it, its features, and targets that are random."""
+    batch, random = pick(random_batch(1, 3, BATCH, spec_of(agent)), 1), np.random.default_rng(6)
+    see = lambda obs: agent._see(agent_moments(agent), obs)
+    batch = batch._replace(obs=see(batch.obs), next_obs=see(batch.next_obs))
+    normal = lambda *shape: jnp.float32(random.normal(size=shape))
+    width = {"parameters": 1, "one-hot": 3}.get(agent.conditioning, 0)
+    noise = normal(BATCH, 6) if agent.transition == "probabilistic" else jnp.float32(0)
+    return batch, normal(width), Targets(normal(BATCH), normal(BATCH, 6), noise, normal(agent.embedding_size))
+
+
+def agent_moments(agent):
+    return jax.eval_shape(lambda: agent.init(spec_of(agent), TASKS, KEY)).moments
+
+
+# Plain NumPy: networks from their parameters.
+
+
+def dense(params, x):
+    return x @ np.asarray(params["kernel"]) + np.asarray(params["bias"])
+
+
+def norm(params, x):
+    x = (x - x.mean(axis=-1, keepdims=True)) / np.sqrt(x.var(axis=-1, keepdims=True) + 1e-6)
+    return x * np.asarray(params["scale"]) + np.asarray(params["bias"])
+
+
+def plain_latent(params, obs):
+    params = params["params"]
+    hidden = np.maximum(dense(params["MLP_0"]["Dense_0"], obs), 0)
+    return np.tanh(norm(params["LayerNorm_0"], dense(params["Dense_0"], hidden)))
+
+
+def plain_model(params, *inputs):
+    params = params["params"]
+    inner = params["Trunk_0"]["MLP_0"]
+    x = np.concatenate([np.broadcast_to(x, (BATCH, x.shape[-1])) for x in inputs], axis=-1)
+    return dense(params["Dense_0"], np.maximum(norm(inner["LayerNorm_0"], dense(inner["Dense_0"], x)), 0))
+
+
+def plain_transition(agent, critic, told, batch):
+    """Mean and deviation of the next latent state."""
+    latent = plain_latent(critic.shared["latent"], np.asarray(batch.obs))
+    outputs = plain_model(critic.shared["transition"], latent, np.asarray(batch.action), told)
+    if agent.transition == "deterministic":
+        return outputs, np.ones_like(outputs)
+    mean, raw = np.split(outputs, 2, axis=-1)
+    return mean, 0.01 + 0.99 / (1 + np.exp(-raw))
+
+
+@pytest.mark.parametrize("transition", ["deterministic", "probabilistic"])
+@pytest.mark.parametrize("name", ["deepmdp", "hip-bmdp"])
+def test_model_losses(name, transition):
+    """The likelihood of the slow encoder's next state, and the reward told from the state that is drawn."""
+    agent = make(name, transition=transition)
+    _, critic = random_params(agent)
+    batch, features, targets = one_task(agent)
+    told = np.asarray(critic.own["embedding"] if name == "hip-bmdp" else features)
+    mean, deviation = plain_transition(agent, critic, told, batch)
+    likelihood = 0.5 * ((mean - targets.latent) / deviation) ** 2 + np.log(deviation)
+    reward = plain_model(critic.shared["reward"], mean + deviation * np.asarray(targets.noise), told)[:, 0]
+    _, metrics = jit(agent.critic_loss)(critic, (batch, features, targets))
+    np.testing.assert_allclose(metrics["transition_loss"], likelihood.mean(), rtol=1e-4)
+    np.testing.assert_allclose(metrics["reward_loss"], np.mean((reward - batch.reward) ** 2), rtol=1e-4)
+
+
+def test_the_losses_add_up():
+    """Critics' loss, both models' by their coefficient, and theta's and the guess's."""
+    agent = make("hip-bmdp", model_coefficient=0.5, theta_coefficient=0.3, **INFERRED)
+    _, critic = random_params(agent)
+    loss, found = jit(agent.critic_loss)(critic, one_task(agent))
+    models = 0.5 * (found["transition_loss"] + found["reward_loss"])
+    expected = found["critic_loss"] + models + 0.3 * found["theta_loss"] + found["guess_loss"]
+    np.testing.assert_allclose(loss, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("transition", ["deterministic", "probabilistic"])
+def test_theta_loss(transition):
+    """Per sample: the distance of two vectors against that of the two predictions, in mean and deviation."""
+    agent = make("hip-bmdp", transition=transition)
+    _, critic = random_params(agent)
+    batch, features, targets = one_task(agent)
+    theta, rival = np.asarray(critic.own["embedding"]), np.asarray(targets.rival)
+    ours, theirs = (np.stack(plain_transition(agent, critic, x, batch)) for x in (theta, rival))
+    moved = np.sqrt(((ours - theirs) ** 2).sum(axis=(0, 2)))
+    loss = jit(agent.theta_loss)(critic, features, batch.obs, batch.action, rival)
+    np.testing.assert_allclose(loss, (np.linalg.norm(theta - rival) - moved) ** 2, rtol=1e-4)
+
+
+def test_theta_loss_of_three_tasks_by_hand(monkeypatch):
+    """Thetas 3, 4 and 5 apart, and a state s that moves predictions by s theta: (d - |s| d)^2 for each sample."""
+    agent = make("hip-bmdp", embedding_size=2)
+    monkeypatch.setattr(type(agent), "foretell", lambda self, p, latent, told, a: (latent * told, 0 * latent * told))
+    monkeypatch.setattr(type(agent), "see", lambda self, p, features, obs: (obs, p.own["embedding"]))
+    thetas = np.array([[0, 0], [3, 0], [3, 4]], np.float32)
+    obs = jnp.float32([[0.0], [1.0], [-3.0]])
+    for i, j, apart in ((0, 1, 3), (1, 2, 4), (2, 0, 5), (0, 0, 0)):
+        critic = Params({}, {"embedding": jnp.asarray(thetas[i])})
+        loss = agent.theta_loss(critic, jnp.zeros(0), obs, jnp.zeros((3, 1)), jnp.asarray(thetas[j]))
+        np.testing.assert_allclose(loss, np.square([apart, 0.0, 2 * apart]), rtol=1e-5, atol=1e-5)
+
+
+def test_a_rival_is_always_another_task():
+    """Over many keys every other task has its turn; one that is alone is its own, and learns nothing of it."""
+    agent = make("hip-bmdp")
+    state, batch, _ = start(agent)
+    features, temperature = jnp.zeros((3, 0)), jnp.ones(3)
+    rivals = jit(lambda key: agent.critic_problem(state, batch, features, temperature, key)[1][2].rival)
+    thetas, turns = np.asarray(state.critic.own["embedding"]), set()
+    for seed in range(12):
+        found = np.asarray(rivals(jax.random.key(seed)))
+        turns.add(tuple(int(np.flatnonzero((thetas == x).all(axis=1))[0]) for x in found))
+    assert turns == {(1, 2, 0), (2, 0, 1)}
+
+    first = lambda tree: jax.tree.map(lambda x: x[:1], tree)
+    state = state._replace(critic=Params(state.critic.shared, first(state.critic.own)))
+    state = state._replace(target=Params(state.target.shared, first(state.target.own)))
+    batch, features, temperature = first((batch, features, temperature))
+    loss, data = agent.critic_problem(state, batch, features, temperature, KEY)
+    theta_loss = lambda critic: loss(critic, jax.tree.map(lambda x: x[0], data))[1]["theta_loss"]
+    value, slope = jit(jax.value_and_grad(theta_loss))(of_task(state.critic, 0))
+    np.testing.assert_allclose(value, 0, atol=1e-10)
+    assert not any(np.any(x) for x in jax.tree.leaves(slope))
+
+
+# Which loss reaches which parameters.
+
+BASE = {"latent", "embedding"}
+REACHES = {
+    "critic_loss": BASE | {"body", "head"},
+    "transition_loss": BASE | {"transition"},
+    "reward_loss": BASE | {"transition", "reward"},
+    "theta_loss": {"embedding"},
+    "guess_loss": {"guess"},
+}
+
+
+def reached(slopes):
+    """Parts of a network of which some leaf has a slope."""
+    parts = {**slopes.shared, **slopes.own}
+    return {name for name, part in parts.items() if any(np.any(x) for x in jax.tree.leaves(part))}
+
+
+def test_each_loss_reaches_its_own_parameters_alone():
+    """Encoder and theta learn from critics and models, theta alone from its loss, and the guess by itself."""
+    agent = make("hip-bmdp", transition="probabilistic", **INFERRED)
+    _, critic = random_params(agent)
+    data = one_task(agent)
+    jacobian = jit(jax.jacrev(lambda critic: {k: agent.critic_loss(critic, data)[1][k] for k in REACHES}))(critic)
+    for loss, expected in REACHES.items():
+        assert reached(jacobian[loss]) == expected, loss
+
+
+def test_what_is_detached_stays():
+    """The next state, the rival's theta, and whatever the actor stands on."""
+    agent = make("hip-bmdp", transition="probabilistic", **INFERRED)
+    actor, critic = random_params(agent)
+    batch, features, targets = one_task(agent)
+    model = lambda x: agent.critic_loss(critic, (batch, features, targets._replace(**x)))[0]
+    slopes = jit(jax.grad(model))({"latent": targets.latent, "rival": targets.rival})
+    assert not any(np.any(x) for x in jax.tree.leaves(slopes))
+    acted = lambda actor, critic: jnp.sum(agent.policy(actor, critic, features, batch.obs) ** 2)
+    of_actor, of_critic = jit(jax.grad(acted, argnums=(0, 1)))(actor, critic)
+    assert reached(of_actor) == {"body", "head"} and reached(of_critic) == set()
+
+
+def test_the_actor_does_not_move_the_critics_parameters():
+    """With discount 0 another actor and other temperatures leave critics, encoder, models and theta bit for bit."""
+    state, batch, update = start(make("hip-bmdp"))
+    batch = batch._replace(discount=jnp.zeros((3, BATCH)))
+    other = state._replace(actor=jax.tree.map(lambda x: x * 1.5 + 0.05, state.actor), log_temperature=jnp.ones(3))
+    plain, moved = (update(x, batch, TASKS, KEY)[0] for x in (state, other))
+    for a, b in zip(jax.tree.leaves(plain.critic), jax.tree.leaves(moved.critic), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("deepmdp", {}),
+        ("deepmdp", {"conditioning": "inferred", "inferred_from": 2}),
+        ("hip-bmdp", {"transition": "probabilistic", **INFERRED}),
+        ("hip-bmdp", {"heads": "disjoint", "value": "c51"}),
+    ],
+)
+def test_everything_that_should_learn_does(name, settings):
+    """After ten updates no leaf is where it began, nor any task's part of it, and shapes are as they were."""
+    agent = make(name, **settings)
+    before, _, update = start(agent)
+    after = before
+    for i in range(10):
+        after, metrics = update(after, random_batch(i, 3, BATCH, spec_of(agent)), TASKS, jax.random.key(i))
+    assert jax.tree.map(jnp.shape, after) == jax.tree.map(jnp.shape, before)
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves((after, metrics)))
+    for network in ("actor", "critic", "target"):
+        old, new = (jax.tree_util.tree_leaves_with_path(getattr(x, network)) for x in (before, after))
+        for (path, a), (_, b) in zip(old, new, strict=True):
+            rows = range(3) if path[0].name == "own" else (slice(None),)
+            for i in rows:
+                assert not np.array_equal(a[i], b[i]), f"{network}{jax.tree_util.keystr(path)} stayed"
+
+
+def test_the_slow_encoder_follows_at_its_own_rate():
+    """And so does theta; body and head take ``tau``. Models have no slow copy."""
+    agent = make("hip-bmdp")
+    state, batch, update = start(agent)
+    slow = state._replace(target=jax.tree.map(lambda x: x * 1.5 + 0.05, state.target))
+    after, _ = update(slow, batch, TASKS, KEY)
+    assert set(after.target.shared) == {"body", "head", "latent"} and set(after.target.own) == {"embedding"}
+    for old, new, target in zip(slow.target, after.critic, after.target, strict=True):
+        for part, found in target.items():
+            rate = 0.05 if part in SIGHT else 0.005
+            mixed = jax.tree.map(lambda a, b, rate=rate: (1 - rate) * a + rate * b, old[part], new[part])
+            jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), found, mixed)
+
+
+def test_the_target_is_the_slow_encoders():
+    """Next latent states come from the slow copy; the slow critics stand on it, too."""
+    agent = make("deepmdp")
+    actor, critic = random_params(agent)
+    batch, features, _ = one_task(agent)
+    slow = only(jax.tree.map(lambda x: x * 1.5 + 0.05, critic), ("body", "head", *SIGHT))
+    target = jit(agent.critic_target)(actor, critic, slow, features, 0.1, batch, KEY)
+    expected = plain_latent(slow.shared["latent"], np.asarray(batch.next_obs))
+    np.testing.assert_allclose(target.latent, expected, rtol=1e-4, atol=1e-5)
+    latent, told = agent.see(slow, features, batch.obs)
+    plain = jax.vmap(agent.critic.apply, (0, None, None, None))(
+        only(slow, ("body", "head")), told, latent, batch.action
+    )
+    np.testing.assert_allclose(agent.values(slow, features, batch.obs, batch.action), plain[..., 0], rtol=1e-5)
+
+
+# Tasks that were not trained on.
+
+STRANGER = pick(tasks_of("one-step", [0.2]), 0)._replace(id=jnp.int32(7))
+
+
+@pytest.mark.parametrize("strategy", ["nearest", "zero", "mean"])
+def test_theta_of_an_unseen_task(strategy):
+    """It acts as a training task that had that theta would; training tasks keep their own."""
+    agent, plain = make("hip-bmdp", unseen_theta=strategy), make("hip-bmdp")
+    state, _, _ = start(plain)
+    thetas, obs = state.critic.own["embedding"], jnp.ones(3)
+    act = jit(lambda state, task: agent.act(state, obs, task, None))
+    stand_in = {"nearest": thetas[2], "zero": jnp.zeros(4), "mean": np.mean(thetas, axis=0)}[strategy]
+    given = state._replace(critic=state.critic._replace(own={"embedding": thetas.at[0].set(stand_in)}))
+    np.testing.assert_allclose(act(state, STRANGER), act(given, pick(TASKS, 0)), atol=1e-6)
+    for i in range(3):
+        expected = plain.act(state, obs, pick(TASKS, i), None)
+        np.testing.assert_allclose(act(state, pick(TASKS, i)), expected, atol=1e-6)
+    assert (
+        agent.unseen
+        == {
+            "nearest": "each uses the theta of the nearest training task",
+            "zero": "each has zeros for theta",
+            "mean": "each has the mean of the training tasks' thetas",
+        }[strategy]
+    )
+
+
+def test_theta_of_an_unseen_task_is_inferred_from_its_last_steps():
+    """The guess takes theta's place there, follows the steps, and leaves training tasks alone."""
+    agent = make("hip-bmdp", **INFERRED)
+    state, batch, _ = start(agent)
+    act = jit(lambda state, obs, task: agent.act(state, obs, task, None))
+    obs = batch.obs[0, 0]
+    guess = agent.apply(state.critic, "guess", agent._see(state.moments, obs))
+    thetas = state.critic.own["embedding"]
+    given = state._replace(critic=state.critic._replace(own={"embedding": thetas.at[0].set(guess)}))
+    np.testing.assert_allclose(act(state, obs, STRANGER), act(given, obs, pick(TASKS, 0)), atol=1e-6)
+    other = obs.at[3:].add(1.0)
+    assert not np.allclose(act(state, obs, STRANGER), act(state, other, STRANGER))
+    np.testing.assert_array_equal(act(state, obs, pick(TASKS, 0)), act(state, other, pick(TASKS, 0)))
+    assert agent.unseen == "each has a theta inferred from its last steps"
+
+
+def test_the_guess_finds_the_theta_of_the_task_that_steps_were_taken_in():
+    """Rewards of a step tell the task; after training each task's guess is near its own theta."""
+    agent = make("hip-bmdp", critic_lr=1e-2, **INFERRED)
+    env = remember(Probe("endless", episode_length=4), agent.history)
+    state, history = train(env, agent, Settings(4, 2, 16, 2000, 20, 1, 300))
+    assert history[0]["guess_loss"].shape == (1, 2)
+    state = only_seed(state.agent)
+    thetas = state.critic.own["embedding"]
+    reward = jnp.float32([1.0, -0.5])[:, None]  # of a step taken from 1, which comes second
+    ones = jnp.ones((2, 2))
+    past = Past(jnp.float32([[[0.0], [1.0]]] * 2), jnp.zeros((2, 2, 1)), jnp.concatenate([0 * reward, reward], 1), ones)
+    guess = agent.apply(state.critic, "guess", Seen(jnp.ones((2, 1)), past))
+    distances = np.linalg.norm(guess[:, None] - thetas, axis=-1)
+    assert np.all(np.diagonal(distances) < 0.3 * np.linalg.norm(thetas[0] - thetas[1]))
+
+
+# Learning.
+
+
+def test_the_transition_model_learns_linear_dynamics():
+    """s' = M s + N a in another way for each task: the error of what is foretold all but vanishes."""
+    agent = make("hip-bmdp", latent_widths=(32, 8), model_widths=(64,), critic_lr=3e-3, gamma=0.0)
+    turn = jnp.float32([[0.9, 0.3, 0.0], [-0.3, 0.9, 0.0], [0.0, 0.0, 0.5]])
+    push = jnp.float32([1.0, -1.0, 0.2])[:, None, None] * jnp.float32([[0.5, 0.0, 0.0], [0.0, 0.5, 0.5]])
+
+    def experience(key):
+        obs_key, action_key = jax.random.split(key)
+        obs = jax.random.normal(obs_key, (3, 32, 3))
+        action = jax.random.uniform(action_key, (3, 32, 2), minval=-1.0)
+        then = obs @ turn + action @ push
+        return random_batch(0, 3, 32, SPEC)._replace(obs=obs, action=action, next_obs=then, reward=then[..., 0])
+
+    def learn(state, key):
+        return agent.update(state, experience(key), TASKS, key)
+
+    state = agent.init(SPEC, TASKS, KEY)
+    state, history = jit(lambda state: jax.lax.scan(learn, state, jax.random.split(KEY, 1500)))(state)
+    first, last = (np.mean(history["transition_loss"][part], axis=0) for part in (slice(0, 5), slice(-50, None)))
+    assert np.all(last < 0.02 * first), (first, last)
+    assert np.all(np.mean(history["reward_loss"][-50:], axis=0) < 0.02)
+
+    def foretold(critic: Params, batch):
+        """The next latent states of one task, as foretold and as they are."""
+        told = critic.own["embedding"]
+        latent, then = (agent.apply(critic, "latent", x) for x in (batch.obs, batch.next_obs))
+        return agent.foretell(critic, latent, told, batch.action)[0], then
+
+    fresh = experience(jax.random.key(9))
+    mean, then = jit(jax.vmap(foretold, (Params(None, 0), 0)))(state.critic, fresh)
+    error, spread = np.mean((mean - then) ** 2, axis=(1, 2)), np.mean(np.var(then, axis=1), axis=-1)
+    # Not because all states look alike. Bounds are half as far again as the worst of three seeds, or further.
+    assert np.all(spread > 0.01) and np.all(error < 0.2 * spread), (error, spread)
+
+
+def test_values_are_learned_through_the_slow_encoder():
+    """Two steps of which the last earns the scale: Q(1) = scale and Q(0) = gamma scale, whatever the action."""
+    rates = {"tau": 0.3, "encoder_tau": 0.3, "actor_lr": 1e-2, "critic_lr": 1e-2}
+    agent = make("hip-bmdp", gamma=0.9, initial_temperature=1e-6, temperature_lr=1e-9, **rates)
+    tasks = tasks_of("delayed", (0.7, -0.5))
+    state, _ = train(Probe("delayed"), agent, Settings(8, 4, 32, 8000, 150, 1, 300), tasks=tasks)
+    obs, action = np.repeat([0.0, 1.0], 3), np.tile([-0.8, 0.0, 0.8], 2)
+    for found, scale in zip(values_of(agent, only_seed(state.agent), tasks, obs, action), (0.7, -0.5), strict=True):
+        np.testing.assert_allclose(found, [scale * np.where(obs > 0.5, 1, 0.9)] * 2, atol=0.08)
+
+
+# Combinations.
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        *({"conditioning": told} for told in ("one-hot", "embedding", "parameters", "inferred")),
+        {"conditioning": "embedding", "unit_embedding": True, "unseen_theta": "zero"},
+        {"conditioning": "inferred", **INFERRED},
+        {"encoder": "care"},
+        {"value": "hl-gauss"},
+        {"heads": "per-task", "gradients": "pcgrad", "gradient_scope": "per-layer"},
+        {"heads": "disjoint", "transition": "probabilistic"},
+    ],
+    ids=lambda x: "-".join(map(str, x.values())),
+)
+@pytest.mark.parametrize("name", ["deepmdp", "hip-bmdp"])
+def test_parts_combine(name, settings):
+    """Traced over two seeds, not run: an update keeps shapes and types, and there is an action for each world."""
+    settings = {k: v for k, v in settings.items() if name == "hip-bmdp" or k != "unseen_theta"}
+    agent, keys = make(name, **settings), jax.random.split(KEY, 2)
+    spec = spec_of(agent)
+    batch = jax.tree.map(lambda x: jnp.stack([x, x]), random_batch(0, 3, BATCH, spec))
+    state = jax.eval_shape(jax.vmap(lambda key: agent.init(spec, TASKS, key)), keys)
+    update = jax.vmap(lambda state, batch, key: agent.update(state, batch, TASKS, key))
+    after, metrics = jax.eval_shape(update, state, batch, keys)
+    types = lambda tree: jax.tree.map(lambda x: (x.shape, x.dtype), tree)
+    assert types(after) == types(state)
+    assert all(metrics[k].shape == (2, 3) for k in ("critic_loss", "transition_loss", "reward_loss", "actor_loss"))
+    act = jax.vmap(lambda state, obs: agent.act(state, obs, STRANGER, None))
+    assert jax.eval_shape(act, state, batch.obs[:, 0, 0]).shape == (2, 2)
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "message"),
+    [
+        ("deepmdp", {"transition": "gaussian"}, "unknown transition 'gaussian'.*probabilistic"),
+        ("deepmdp", {"latent_widths": ()}, r"latent-widths needs at least one layer .*not \(\)"),
+        ("deepmdp", {"model_widths": (8, 0)}, r"model-widths .*at least one unit, not \(8, 0\)"),
+        ("deepmdp", {"encoder_tau": 0.0}, r"encoder-tau must be in \(0, 1\], not 0.0"),
+        ("deepmdp", {"model_coefficient": 0.0}, "model-coefficient must be greater than 0, not 0.0"),
+        ("deepmdp", {"encoder": "input-map"}, "input-map maps observations"),
+        ("deepmdp", {"unseen_theta": "zero"}, "unknown setting of deepmdp 'unseen_theta'"),
+        ("hip-bmdp", {"unseen_theta": "mean-train"}, "unknown unseen-theta 'mean-train'; did you mean 'mean'"),
+        ("hip-bmdp", {"theta_coefficient": -1.0}, "theta-coefficient must be at least 0, not -1.0"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(name, settings, message):
+    """With what was given and what is allowed."""
+    with pytest.raises(InputError, match=message):
+        make(name, **settings)

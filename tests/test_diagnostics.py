@@ -1,0 +1,423 @@
+"""Diagnostics of interference: gradients, units and ranks in closed form, and the files that the program writes."""
+
+import csv
+import dataclasses
+import json
+import shutil
+from functools import partial
+
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+import matplotlib.image
+import numpy as np
+import pytest
+from probes import QUICK, learner, of_task, pick, random_batch, tasks_of, tiny
+
+import mtjax
+import mtjax.evaluate
+from mtjax import checkpoint, cli, diagnostics, log, loop, plot
+from mtjax.agents import AGENTS
+from mtjax.agents.encoders import ENCODERS
+from mtjax.diagnostics import Activity, activity, compare_gradients, dormant_share, effective_ranks, utilisation
+from mtjax.history import widen
+from mtjax.networks import Params, tanh_normal
+from mtjax.policy import load_experience
+from mtjax.types import InputError, Spec
+
+TASKS, BATCH, KEY = tasks_of("one-step", (1.0, -0.5, 0.3)), 8, jax.random.key(5)
+SPEC = Spec(3, 2, 1)
+
+
+def started(agent):
+    return jax.jit(partial(agent.init, SPEC), compiler_options=QUICK)(TASKS, jax.random.key(1))
+
+
+def shapes_of(agent, spec=SPEC):
+    return jax.eval_shape(partial(agent.init, spec), TASKS, KEY)
+
+
+def compare(agent, state, batch, tasks=TASKS):
+    measure = jax.jit(partial(compare_gradients, agent), compiler_options=QUICK)
+    return jax.device_get(measure(state, batch, tasks, KEY))
+
+
+def ended(seed=0):
+    """A batch in which every step is its episode's last, so that the critics' targets are the rewards."""
+    batch = random_batch(seed, 3, BATCH, SPEC)
+    return batch._replace(discount=jnp.zeros_like(batch.discount))
+
+
+def distance_to_reward(agent, state, batch):
+    """Mean distance (T,) of all critics' estimates from the rewards."""
+    distances = []
+    for i in range(3):
+        one, features = pick(batch, i), agent.features(state, pick(TASKS, i))
+        estimates = agent.values(of_task(state.critic, i), features, one.obs, one.action)
+        distances.append(np.mean(np.abs(estimates - one.reward)))
+    return distances
+
+
+# Gradients.
+
+
+def gradients_by_hand(agent, state, batch):
+    """Each task's gradients of critics and actor (T, P) on shared parameters or, without any, on its own."""
+    keys = jax.random.split(jax.random.split(KEY)[1], 3)
+
+    def critic_loss(critic, one, features):
+        estimates = agent.values(critic, features, one.obs, one.action)
+        return jnp.mean(jnp.sum((estimates - one.reward) ** 2, axis=0))
+
+    def actor_loss(actor, critic, one, features, log_temperature, key):
+        action, log_prob = tanh_normal(agent.actor.apply(actor, features, one.obs), key)
+        estimates = agent.values(critic, features, one.obs, action)
+        return jnp.mean(jnp.exp(log_temperature) * log_prob - jnp.min(estimates, axis=0))
+
+    @partial(jax.jit, compiler_options=QUICK)
+    def slopes(actor, critic, one, task, log_temperature, key):
+        features = agent.features(state, task)
+        of_critic = jax.grad(critic_loss)(critic, one, features)
+        of_actor = jax.grad(actor_loss)(actor, critic, one, features, log_temperature, key)
+        return [jax.flatten_util.ravel_pytree(slope.shared or slope.own)[0] for slope in (of_critic, of_actor)]
+
+    rows = []
+    for i in range(3):
+        one, task, temperature = pick((batch, TASKS, state.log_temperature), i)
+        rows.append(slopes(of_task(state.actor, i), of_task(state.critic, i), one, task, temperature, keys[i]))
+    return [np.float64(np.stack(x)) for x in zip(*rows, strict=True)]
+
+
+@pytest.mark.parametrize("name", ["sac-conditioned", "multi-head", "disjoint"])
+def test_gradients_are_those_of_each_task_alone(name):
+    """Gram matrix, cosines, conflict and lengths of both networks; without shared parameters lengths alone."""
+    agent = tiny(name, hidden=(4,))
+    state, batch = started(agent), ended()
+    found = compare(agent, state, batch)
+    for network, gradients in zip(("critic", "actor"), gradients_by_hand(agent, state, batch), strict=True):
+        lengths, x = np.linalg.norm(gradients, axis=1), found[network]
+        np.testing.assert_allclose(x["gradient_norm"], lengths, rtol=1e-4)
+        if name == "disjoint":
+            assert (x["gram"], x["cosine"], x["conflict"]) == (None, None, None)
+            continue
+        gram = gradients @ gradients.T
+        np.testing.assert_allclose(x["gram"], gram, rtol=1e-3, atol=1e-4 * gram.max())
+        np.testing.assert_allclose(x["cosine"], gram / lengths[:, None] / lengths, atol=1e-4)
+        assert x["conflict"] == pytest.approx(np.sum(gram < 0) / 6)
+    np.testing.assert_allclose(found["td_error"], distance_to_reward(agent, state, batch), rtol=1e-5)
+
+
+def test_training_reports_what_diagnostics_do():
+    """An update by PCGrad on the same batch sees the same; lengths and TD errors have columns for each task."""
+    agent = tiny("pcgrad", hidden=(4,))
+    init, update = learner(agent, TASKS, BATCH, SPEC)
+    state, batch = init(TASKS, jax.random.key(1)), ended(3)
+    metrics, found = update(state, batch, TASKS, KEY)[1], compare(agent, state, batch)
+    np.testing.assert_allclose(metrics["td_error"], found["td_error"], rtol=1e-5)
+    np.testing.assert_allclose(metrics["critic_gradient_norm"], found["critic"]["gradient_norm"], rtol=1e-4)
+    np.testing.assert_allclose(metrics["critic_cosine"], diagnostics.mean_cosine(found["critic"]["cosine"]), atol=1e-5)
+    assert metrics["critic_conflict"] == found["critic"]["conflict"]
+    of_run = {name: np.asarray(x)[None] for name, x in metrics.items()} | {"return": np.zeros((1, 3))}
+    row = log.metric_rows(of_run, np.array([0]), {})[0]
+    for name in ("td_error", "critic_gradient_norm", "actor_gradient_norm"):
+        np.testing.assert_allclose([float(row[f"{name}_{t}"]) for t in range(3)], metrics[name], rtol=1e-6)
+
+
+def test_tasks_that_want_opposite_values_conflict():
+    """Same steps, rewards of 100 and of -100, told nothing: cosines near 1 within a camp and near -1 between them."""
+    batch = jax.tree.map(lambda x: jnp.broadcast_to(x[:1], x.shape), ended())
+    batch = batch._replace(reward=jnp.full((3, BATCH), 100.0) * jnp.array([[1.0], [1.0], [-1.0]]))
+    agent = tiny("sac", hidden=(4,))
+    found = compare(agent, started(agent), batch)["critic"]
+    np.testing.assert_allclose(found["cosine"], [[1, 1, -1], [1, 1, -1], [-1, -1, 1]], atol=0.05)
+    assert found["conflict"] == pytest.approx(4 / 6)
+
+
+@pytest.mark.parametrize("value", ["c51", "hl-gauss"])
+def test_td_error_of_categorical_critics_is_in_units_of_reward(value):
+    """|mean of the distribution - the reward| where every step is its episode's last."""
+    agent = tiny("sac", hidden=(4,), value=value, num_bins=201)
+    state, batch = started(agent), ended()
+    found = compare(agent, state, batch)["td_error"]
+    np.testing.assert_allclose(found, distance_to_reward(agent, state, batch), rtol=2e-3)
+
+
+# Units.
+
+
+def watched(agent, state, batch, tasks=TASKS):
+    return jax.device_get(jax.jit(partial(activity, agent), compiler_options=QUICK)(state, batch, tasks))
+
+
+def constant_layers(params: Params, *levels):
+    """A body of two layers whose units put out these constants, whatever they are given."""
+    layers = params.shared["body"]["params"]["MLP_0"]
+    fixed = {}
+    for (name, layer), level in zip(sorted(layers.items()), levels, strict=True):
+        bias = jnp.broadcast_to(jnp.float32(level), layer["bias"].shape)
+        fixed[name] = {"kernel": jnp.zeros_like(layer["kernel"]), "bias": bias}
+    shared = {**params.shared, "body": {"params": {"MLP_0": fixed}}}
+    return params._replace(shared=shared)
+
+
+def test_dead_units_are_counted():
+    """Three of eight units in one layer of two are dead in all critics, one of four in the actor's last layer."""
+    agent = tiny("sac-conditioned", hidden=(8, 8), critic_layer_norm=False)
+    state = started(agent)
+    critic = constant_layers(state.critic, 1.0, [-1, 1, 2, 0, 1, 3, -2, 1])
+    actor = constant_layers(state.actor, [1, 1, 1, 1, 1, 1, 0, -1], 2.0)
+    seen = watched(agent, state._replace(critic=critic, actor=actor), random_batch(0, 3, BATCH, SPEC))
+    found = utilisation(agent.critic, critic, seen["critic"])
+    names = ["Trunk/MLP_0/ReLU_0", "Trunk/MLP_0/ReLU_1"]
+    assert found["dormant_by_layer"] == {names[0]: 0, names[1]: 3 / 8} and found["dormant"] == 3 / 16
+    assert (found["rank"], found["width"]) == (1, 8)  # the same features in every state
+    assert found["entropy_rank"] == pytest.approx(1, abs=1e-3)
+    found = utilisation(agent.actor, actor, seen["actor"])
+    assert found["dormant_by_layer"] == {names[0]: 2 / 8, names[1]: 0} and found["dormant"] == 2 / 16
+
+
+def test_threshold_is_a_share_of_the_layers_mean():
+    """Whatever the layer's scale; a layer without any activity is dormant altogether."""
+    levels = np.array([0.024, 0.026, 1.975, 1.975])  # of mean 1
+    assert dormant_share(levels) == dormant_share(1000 * levels) == 0.25
+    assert dormant_share(np.array([levels, np.ones(4)])) == 0.125
+    assert dormant_share(np.zeros(7)) == 1
+
+
+def test_unit_that_one_task_uses_is_not_dormant_if_it_is_shared():
+    """Two tasks that each use one of two units: all are in use, but half of what tasks have for themselves."""
+    seen = Activity({"Trunk/ReLU_0": np.float32([[[1, 0]], [[0, 1]]])}, np.ones((2, 5, 1, 2), np.float32))
+    for heads, share in (("shared", 0), ("per-task", 0), ("disjoint", 0.5)):
+        agent = tiny("sac", heads=heads)
+        assert utilisation(agent.actor, shapes_of(agent).actor, seen)["dormant"] == share
+
+
+def test_ranks_are_of_all_tasks_together_if_they_share_a_body():
+    """Two tasks whose features each lie on a line of their own: rank 2 together, 1 alone."""
+    hidden = np.zeros((2, 5, 1, 3), np.float32)
+    hidden[0, :, 0, 0] = hidden[1, :, 0, 1] = 1
+    for heads, rank in (("shared", 2), ("disjoint", 1)):
+        agent = tiny("sac", heads=heads)
+        found = utilisation(agent.actor, shapes_of(agent).actor, Activity({}, hidden))
+        assert found["rank"] == rank and found["entropy_rank"] == pytest.approx(rank)
+        assert np.isnan(found["dormant"])
+
+
+@pytest.mark.parametrize(
+    "values, rank, entropy_rank",
+    [
+        ([1.0] * 10, 10, 10.0),
+        ([2.0] * 100, 99, 100.0),
+        ([1.0, 0, 0, 0], 1, 1.0),
+        ([90.0, 9.0, 0.9, 0.1], 2, np.exp(-sum(p * np.log(p) for p in (0.9, 0.09, 0.009, 0.001)))),
+        ([90.0, 8.0, 1.0, 1.0], 3, np.exp(-sum(p * np.log(p) for p in (0.9, 0.08, 0.01, 0.01)))),
+        ([0.0, 0.0], 0, 0.0),
+    ],
+)
+def test_effective_ranks_of_known_singular_values(values, rank, entropy_rank):
+    """Of a rotated matrix with these singular values."""
+    random, size = np.random.default_rng(0), len(values)
+    left = np.linalg.qr(random.normal(size=(2 * size, size)))[0]
+    right = np.linalg.qr(random.normal(size=(size, size)))[0]
+    found = effective_ranks((left * values) @ right)
+    assert found[0] == rank and found[1] == pytest.approx(entropy_rank, rel=1e-9, abs=1e-12)
+
+
+def test_activity_is_that_of_the_networks():
+    """Mean activity and hidden layers of every critic and of the actor are what the networks compute for each task."""
+    agent = tiny("multi-head", hidden=(8, 4), normalize_observations=True)
+    state, batch = started(agent), random_batch(1, 3, BATCH, SPEC)
+    seen, (_, batch, features, _) = watched(agent, state, batch), agent.prepare(state, batch, TASKS)
+    for i in range(3):
+        hidden = agent.actor.hidden(of_task(state.actor, i), features[i], batch.obs[i])
+        np.testing.assert_allclose(seen["actor"].hidden[i, :, 0], hidden, rtol=1e-4, atol=1e-5)
+        level = seen["actor"].layers["Trunk/MLP_0/ReLU_1"][i, 0]
+        np.testing.assert_allclose(level, np.mean(hidden, axis=0), rtol=1e-4, atol=1e-5)
+        for n in range(2):
+            params = pick(of_task(state.critic, i), n)
+            hidden = agent.critic.hidden(params, features[i], batch.obs[i], batch.action[i])
+            np.testing.assert_allclose(seen["critic"].hidden[i, :, n], hidden, rtol=1e-4, atol=1e-5)
+
+
+def trace(agent):
+    """What diagnostics of an agent would be: shapes alone."""
+    spec = widen(SPEC, agent.history)
+    state = shapes_of(agent, spec)
+    batch = jax.eval_shape(lambda: random_batch(0, 3, BATCH, spec))
+    gradients = jax.eval_shape(partial(compare_gradients, agent), state, batch, TASKS, KEY)
+    seen = jax.eval_shape(partial(activity, agent), state, batch, TASKS)
+    return state, gradients, seen
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_every_agent_has_diagnostics(name):
+    """Matrices unless it is disjoint, TD errors for each task, and layers of both networks."""
+    agent = tiny(name)
+    state, gradients, seen = trace(agent)
+    for network in ("critic", "actor"):
+        matrix, params = gradients[network]["cosine"], getattr(state, network)
+        assert matrix is None if not jax.tree.leaves(params.shared) else matrix.shape == (3, 3)
+        assert gradients[network]["gradient_norm"].shape == (3,)
+        assert seen[network].hidden.shape[:2] == (3, BATCH)
+    assert gradients["td_error"].shape == (3,)
+
+
+@pytest.mark.parametrize("encoder", ENCODERS)
+def test_units_of_every_encoder_are_seen(encoder):
+    """Layers of the right number of networks, all of ReLUs."""
+    agent = tiny("sac", encoder=encoder, conditioning="one-hot", hidden=(16, 16))
+    _, _, seen = trace(agent)
+    for network, count in (("critic", 2), ("actor", 1)):
+        layers = seen[network].layers
+        assert layers and all(x.shape[:2] == (3, count) and x.ndim == 3 for x in layers.values())
+
+
+# Metrics of training.
+
+
+def test_rows_have_columns_for_tasks_where_the_task_matters():
+    """TD errors and lengths, before the returns; what is not there has no columns."""
+    each = np.array([[1.0, 3.0]])
+    row = log.metric_rows({"return": each, "td_error": 2 * each, "value": each}, np.array([0]), {})[0]
+    assert list(row.items())[1:] == [
+        ("return", "2"),
+        ("td_error", "4"),
+        ("value", "2"),
+        ("td_error_0", "2"),
+        ("td_error_1", "6"),
+        ("return_0", "1"),
+        ("return_1", "3"),
+    ]
+    row = log.metric_rows({"return": each, "critic_gradient_norm": each}, np.array([0]), {})[0]
+    assert (row["critic_gradient_norm_1"], "td_error_0" in row) == ("3", False)
+
+
+def test_old_file_keeps_its_columns(tmp_path):
+    """A run that an earlier version began goes on under the columns that it has."""
+    path = tmp_path / "metrics.csv"
+    log.append_rows(path, [{"iteration": 1, "return": 2, "gone": 3}])
+    log.append_rows(path, [{"iteration": 2, "td_error": 5, "return": 4}])
+    assert path.read_text().split() == ["iteration,return,gone", "1,2,3", "2,4,"]
+    path.write_text("")  # the process was killed before the header
+    log.append_rows(path, [{"iteration": 2, "td_error": 5}])
+    assert path.read_text().split() == ["iteration,td_error", "2,5"]
+
+
+# The program.
+
+
+@pytest.mark.parametrize("count", [1, 3, 40])
+def test_figure_of_any_number_of_tasks(count, tmp_path):
+    """Also where one network shares nothing; equal to itself, a task has no colour."""
+    cosines = {"critic": np.random.default_rng(0).uniform(-1, 1, (count, count)), "actor": None}
+    plot.interference(tmp_path / "a.png", "size", "m", np.arange(count), cosines, {"error": np.ones(count)})
+    cosines["critic"] += 5 * np.eye(count)
+    plot.interference(tmp_path / "b.png", "size", "m", np.arange(count), cosines, {"error": np.ones(count)})
+    first, second = (matplotlib.image.imread(tmp_path / f"{name}.png") for name in "ab")
+    np.testing.assert_array_equal(first, second)
+    assert first.std() > 0
+
+
+@pytest.fixture
+def run_of(copied_run):
+    """Makes the finished run one of another agent, untrained, with the same experience."""
+
+    def remake(name):
+        program = cli.from_json(copied_run / "config.json")
+        learner = mtjax.agent(name, hidden=program.learner.hidden)
+        tasks, seeds, checkpoints = program.family.tasks("train"), jnp.arange(2), copied_run / "checkpoints"
+        shapes = jax.eval_shape(lambda: loop.init(program.family, program.learner, program.training, tasks, seeds))
+        state = checkpoint.load(checkpoints, shapes)
+        init = jax.vmap(lambda key: learner.init(program.family.spec, tasks, key))
+        fresh = jax.jit(init, compiler_options=QUICK)(jax.random.split(KEY, 2))
+        shutil.rmtree(checkpoints)
+        checkpoint.save(checkpoints, state._replace(agent=fresh))
+        program = dataclasses.replace(program, agent=name, learner=learner)
+        (copied_run / "config.json").write_text(cli.to_json(program, {}))
+
+    return remake
+
+
+@pytest.fixture
+def no_episodes(monkeypatch):
+    """Leaves out what an evaluation does besides, which compiles for ten seconds."""
+    empty = lambda policy, episodes, seed: {"train": np.zeros((len(policy.seeds), 2, 1))}
+    monkeypatch.setattr(mtjax.evaluate, "score", empty)
+
+
+@pytest.mark.parametrize("name", ["sac-conditioned", "pcgrad", "disjoint"])
+def test_program_writes_and_prints_diagnostics(name, copied_run, run_of, no_episodes, capsys):
+    """For a trained agent, for one by whose rule gradients combine, and for one that shares nothing."""
+    if name != "sac-conditioned":
+        run_of(name)
+    capsys.readouterr()
+    mtjax.evaluate.main([f"--run={copied_run}", "--diagnostics"])
+    out, folder = capsys.readouterr().out, copied_run / "evaluation-1"
+    assert {"diagnostics.json", "diagnostics.png"} < {path.name for path in folder.iterdir()}
+    assert matplotlib.image.imread(folder / "diagnostics.png").std() > 0
+
+    found, shared = json.loads((folder / "diagnostics.json").read_text()), name != "disjoint"
+    assert (found["parameter"], found["values"]) == ("size", pytest.approx([1.0, 1.2]))
+    assert np.shape(found["td_error"]) == (2,) and np.all(np.array(found["td_error"]) > 0)
+    assert ("tasks share no parameters of the critic" in out) != shared
+    for network in ("critic", "actor"):
+        x = found[network]
+        assert 0 <= x["dormant"] <= 1 and 0 < x["rank"] <= x["width"] and np.all(np.array(x["gradient_norm"]) > 0)
+        if shared:
+            np.testing.assert_allclose(np.diagonal(x["cosine"]), 1, rtol=1e-4)
+            assert x["cosine"][0][1] == x["cosine"][1][0] and f"{x['cosine'][0][1]:.2f}" in out
+        else:
+            assert x["cosine"] is x["gram"] is x["conflict"] is None
+    (line,) = (line.split() for line in out.splitlines() if line.startswith("       1.2 "))
+    assert line[1:3] == [f"{found['td_error'][1]:.3g}", f"{found['critic']['gradient_norm'][1]:.3g}"]
+
+
+def test_seeds_are_averaged(finished_run):
+    """By the same keys for every seed, whichever others are there."""
+    policy, (replay, batch_size) = mtjax.load(finished_run), load_experience(finished_run)
+    both, alone = diagnostics.diagnose(policy, replay, batch_size), []
+    for s in (0, 1):
+        states, rows, seeds = jax.tree.map(lambda x, s=s: x[s : s + 1], (policy.states, replay.rows, policy.seeds))
+        of_seed = dataclasses.replace(policy, states=states, seeds=seeds)
+        alone.append(diagnostics.diagnose(of_seed, replay._replace(rows=rows), batch_size))
+    assert both.seeds == 2 and not np.array_equal(alone[0].td_error, alone[1].td_error)
+    means = jax.tree.map(lambda *x: np.mean(x, axis=0), *alone)
+    for network in ("critic", "actor"):
+        jax.tree.map(np.testing.assert_allclose, getattr(both, network), getattr(means, network))
+    np.testing.assert_allclose(both.td_error, means.td_error)
+
+
+def test_columns_of_a_run(finished_run):
+    """TD errors of each task; lengths of gradients only where a rule looks at them."""
+    with (finished_run / "metrics.csv").open(newline="") as file:
+        row = list(csv.DictReader(file))[-1]
+    each = [float(row[f"td_error_{t}"]) for t in (0, 1)]
+    assert float(row["td_error"]) == pytest.approx(np.mean(each), rel=1e-5) and each[0] != each[1]
+    assert not any("gradient_norm" in name for name in row)
+
+
+def test_replay_is_read_without_the_rest(copied_run):
+    """And is that of the whole state."""
+    program = cli.from_json(copied_run / "config.json")
+    fixed = (program.family, program.learner, program.training, program.family.tasks("train"), jnp.arange(2))
+    whole = checkpoint.load(copied_run / "checkpoints", jax.eval_shape(lambda: loop.init(*fixed)))
+    shutil.rmtree(copied_run / "checkpoints" / "150" / "agent")
+    replay, batch_size = load_experience(copied_run)
+    jax.tree.map(np.testing.assert_array_equal, replay, whole.replay)
+    assert batch_size == 4 and int(replay.size) == 200
+
+
+@pytest.mark.parametrize("lost, message", [("150/loop", "is damaged"), (".", "holds no checkpoint")])
+def test_run_without_replay_is_refused(copied_run, lost, message):
+    """In a line, and no folder is left in it."""
+    shutil.rmtree(copied_run / "checkpoints" / lost)
+    with pytest.raises(InputError, match=message):
+        mtjax.evaluate.main([f"--run={copied_run}", "--diagnostics"])
+    assert not list(copied_run.glob("evaluation-*"))
+
+
+def test_empty_replay_is_refused(finished_run):
+    """As nothing can be drawn from it."""
+    replay, batch_size = load_experience(finished_run)
+    with pytest.raises(InputError, match="replay of this run is empty"):
+        diagnostics.diagnose(mtjax.load(finished_run), replay._replace(size=jnp.int32(0)), batch_size)

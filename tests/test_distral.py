@@ -1,0 +1,341 @@
+"""Distral against sums worked out in NumPy, and against the one optimum that a bandit has."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+import scipy.optimize
+from probes import QUICK, learner, of_task, pick, random_batch, tasks_of, tiny
+
+from mtjax.agents import agent
+from mtjax.agents.distral import Distral
+from mtjax.agents.sac import SAC, descend
+from mtjax.networks import Params, log_density, sample_raw, tanh_normal
+from mtjax.types import InputError, Spec
+
+SPEC, BATCH = Spec(3, 2, 1), 4
+TASKS = tasks_of("one-step", (1.0, -0.5, 0.3))
+KEY, FEATURES = jax.random.key(5), jnp.zeros(0)
+
+
+def scattered(tree, size=0.5):
+    """Random values everywhere."""
+    random = np.random.default_rng(4)
+    return jax.tree.map(lambda x: jnp.float32(size * random.normal(size=x.shape)), tree)
+
+
+@pytest.fixture(scope="module")
+def state():
+    """Policies, critics and the distilled policy far apart."""
+    fresh = learner(tiny("distral"), TASKS, BATCH, SPEC)[0](TASKS, KEY)
+    networks = scattered((fresh.actor, fresh.critic, fresh.target))
+    return fresh._replace(**dict(zip(("actor", "critic", "target"), networks, strict=True)))
+
+
+@pytest.fixture(scope="module")
+def batch():
+    return random_batch(0, 3, BATCH, SPEC)
+
+
+def leaves(tree):
+    return [np.asarray(x) for x in jax.tree.leaves(tree)]
+
+
+def same(a, b):
+    return all(np.array_equal(x, y) for x, y in zip(leaves(a), leaves(b), strict=True))
+
+
+# The density of a given action.
+
+
+def plain_log_density(outputs, raw):
+    """The log-density of tanh(raw) in float64: the normal one, and the slope of tanh."""
+    mean, log_std = np.split(np.asarray(outputs, np.float64), 2, axis=-1)
+    log_std = -5 + 3.5 * (np.tanh(log_std) + 1)
+    raw = np.asarray(raw, np.float64)
+    normal = -0.5 * ((raw - mean) / np.exp(log_std)) ** 2 - log_std - 0.5 * np.log(2 * np.pi)
+    return np.sum(normal + 2 * np.log(np.cosh(raw)), axis=-1)  # log cosh^-2 is that of the slope
+
+
+def test_density_of_a_given_action():
+    """Of any action under any policy."""
+    random = np.random.default_rng(0)
+    outputs, raw = jnp.float32(random.normal(size=(50, 6))), jnp.float32(2 * random.normal(size=(50, 3)))
+    np.testing.assert_allclose(log_density(outputs, raw), plain_log_density(outputs, raw), rtol=1e-4, atol=1e-4)
+
+
+def test_density_of_a_policys_own_actions():
+    """It is what sampling says of them; and ``tanh_normal`` says the same of their squashed form."""
+    outputs = jnp.float32(np.random.default_rng(1).normal(size=(50, 6)))
+    raw, log_prob = sample_raw(outputs, KEY)
+    np.testing.assert_allclose(log_density(outputs, raw), log_prob, rtol=1e-4, atol=1e-4)
+    action, again = tanh_normal(outputs, KEY)
+    np.testing.assert_array_equal(action, jnp.tanh(raw))
+    np.testing.assert_array_equal(again, log_prob)
+
+
+def test_density_and_its_slopes_are_finite_where_tanh_is_one():
+    """In float32 tanh(15) is 1, of which the inverse is infinite."""
+    raw = jnp.float32([[15.0], [-40.0]])
+    outputs = jnp.float32([[14.0, 0.3], [-38.0, -1.0]])
+    np.testing.assert_allclose(log_density(outputs, raw), plain_log_density(outputs, raw), rtol=1e-4)
+    slopes = jax.grad(lambda *x: jnp.sum(log_density(*x)), argnums=(0, 1))(outputs, raw)
+    assert all(np.all(np.isfinite(x)) and np.all(x != 0) for x in slopes)
+
+
+# Losses of one task.
+
+ALPHA, TEMPERATURE = 0.3, 0.2
+
+
+def problem(state, task=1):
+    """A task's actor, critic, slow critic."""
+    return (of_task(x, task) for x in (state.actor, state.critic, state.target))
+
+
+def charged(made, actor, obs):
+    """Actions before the tanh, and log pi_i - alpha log pi_0 of them in NumPy."""
+    own = made.policy(actor, actor, FEATURES, obs)
+    raw, _ = sample_raw(own, KEY)
+    common = made.actor.apply_distilled(actor, FEATURES, obs)
+    densities = plain_log_density(own, raw), plain_log_density(common, raw)
+    return raw, densities[0] - made.distral_alpha * densities[1], densities
+
+
+def test_critic_target(state, batch):
+    """y = r + discount gamma (min Q - a (log pi_i - alpha log pi_0))."""
+    made, rows = tiny("distral", distral_alpha=ALPHA, gamma=0.9), pick(batch, 1)
+    actor, critic, target = problem(state)
+    raw, cost, _ = charged(made, actor, rows.next_obs)
+    values = np.min(made.values(target, FEATURES, rows.next_obs, jnp.tanh(raw)), axis=0)
+    expected = np.asarray(rows.reward) + 0.9 * np.asarray(rows.discount) * (values - TEMPERATURE * cost)
+    found = made.critic_target(actor, critic, target, FEATURES, TEMPERATURE, rows, KEY)
+    np.testing.assert_allclose(found, expected, rtol=1e-4)
+    plain = SAC.sample(made, actor, critic, FEATURES, rows.next_obs, KEY)[1]
+    assert np.all(np.abs(cost - plain) > 0.1)  # that the distilled policy has a say here
+
+
+def test_actor_loss(state, batch):
+    """a (log pi_i - alpha log pi_0) - min Q of each policy, less log pi_0 of the distilled one."""
+    made, rows = tiny("distral", distral_alpha=ALPHA), pick(batch, 1)
+    actor, critic, _ = problem(state)
+    raw, cost, (own, common) = charged(made, actor, rows.obs)
+    values = np.min(made.values(critic, FEATURES, rows.obs, jnp.tanh(raw)), axis=0)
+    loss, metrics = made.actor_loss(actor, (rows, FEATURES, critic, TEMPERATURE, KEY))
+    policy_loss = np.mean(TEMPERATURE * cost - values)
+    np.testing.assert_allclose(loss, policy_loss - np.mean(common), rtol=1e-4)
+    np.testing.assert_allclose(metrics["actor_loss"], policy_loss, rtol=1e-4)
+    np.testing.assert_allclose(metrics["entropy"], -np.mean(own), rtol=1e-4)
+    np.testing.assert_allclose(metrics["kl"], np.mean(own - common), rtol=1e-4)
+
+
+def slopes(made, actor, data, loss):
+    """Gradients of a loss by what they are of: the task's policy, the distilled policy."""
+    found = jax.grad(lambda actor: loss(made, actor, data)[0])(actor)
+    own = {name: found.own[name] for name in ("body", "head")}
+    return own, found.shared["distilled"]
+
+
+def test_each_loss_reaches_its_own_policy_alone(state, batch):
+    """The policy's never the distilled parameters, and distillation these alone, by its actions too."""
+    made, rows = tiny("distral", distral_alpha=ALPHA), pick(batch, 1)
+    actor, critic, _ = problem(state)
+    data = (rows, FEATURES, critic, TEMPERATURE, KEY)
+    own, distilled = slopes(made, actor, data, SAC.actor_loss)
+    both_own, both_distilled = slopes(made, actor, data, Distral.actor_loss)
+    assert all(np.all(x == 0) for x in leaves(distilled))
+    assert all(np.any(x != 0) for x in leaves((own, both_distilled)))
+    assert same(own, both_own)
+
+    raw, _, _ = charged(made, actor, rows.obs)
+
+    def fit(shared):
+        outputs = made.actor.apply_distilled(Params({"distilled": shared}, actor.own), FEATURES, rows.obs)
+        return -jnp.mean(log_density(outputs, raw))
+
+    for found, expected in zip(leaves(both_distilled), leaves(jax.grad(fit)(actor.shared["distilled"])), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
+
+
+def test_the_action_carries_the_distilled_policys_slope(state, batch):
+    """Numeric slopes in NumPy, under critics that say nothing, along the biases of mean and deviation."""
+    made, rows = tiny("distral", distral_alpha=ALPHA), pick(batch, 1)
+    actor, critic, _ = problem(state)
+    mute = jax.tree.map(jnp.zeros_like, critic)
+    own, _ = slopes(made, actor, (rows, FEATURES, mute, TEMPERATURE, KEY), Distral.actor_loss)
+    outputs = np.asarray(made.policy(actor, actor, FEATURES, rows.obs), np.float64)
+    common = made.actor.apply_distilled(actor, FEATURES, rows.obs)
+    noise = np.asarray(jax.random.normal(KEY, (BATCH, 2)), np.float64)
+
+    def loss(bias):
+        mean, log_std = np.split(outputs + bias, 2, axis=-1)
+        raw = mean + np.exp(-5 + 3.5 * (np.tanh(log_std) + 1)) * noise
+        cost = plain_log_density(outputs + bias, raw) - ALPHA * plain_log_density(common, raw)
+        return TEMPERATURE * np.mean(cost)
+
+    expected = [(loss(1e-5 * e) - loss(-1e-5 * e)) / 2e-5 for e in np.eye(4)]
+    np.testing.assert_allclose(own["head"]["bias"], expected, rtol=2e-3, atol=1e-4)
+
+
+# Updates.
+
+
+def test_all_policies_begin_as_one(batch):
+    """Where their divergence is zero."""
+    init, update = learner(tiny("distral"), TASKS, BATCH, SPEC)
+    fresh = init(TASKS, KEY)
+    for i in range(3):
+        own = {name: pick(fresh.actor.own[name], i) for name in ("body", "head")}
+        assert same(own, fresh.actor.shared["distilled"])
+    _, metrics = update(fresh, batch, TASKS, KEY)
+    np.testing.assert_allclose(metrics["kl"], 0, atol=1e-3)
+
+
+def test_without_alpha_it_is_one_sac_for_every_task(state):
+    """Policies, critics, slow critics and temperatures of agent ``disjoint``, update by update."""
+    distral = learner(tiny("distral", distral_alpha=0.0), TASKS, BATCH, SPEC)[1]
+    init, disjoint = learner(tiny("disjoint"), TASKS, BATCH, SPEC)
+    mine, theirs = state, init(TASKS, KEY)
+    own = lambda params: {name: params.own[name] for name in ("body", "head")}
+    theirs = theirs._replace(actor=Params({}, own(state.actor)), critic=state.critic, target=state.target)
+    for i in range(5):
+        rows = random_batch(i, 3, BATCH, SPEC)
+        mine, metrics = distral(mine, rows, TASKS, jax.random.key(i))
+        theirs, expected = disjoint(theirs, rows, TASKS, jax.random.key(i))
+        for name in expected:
+            np.testing.assert_allclose(metrics[name], expected[name], rtol=1e-3, atol=1e-4)
+    for part in (lambda x: own(x.actor), lambda x: (x.critic, x.target, x.log_temperature)):
+        for found, wanted in zip(leaves(part(mine)), leaves(part(theirs)), strict=True):
+            np.testing.assert_allclose(found, wanted, rtol=1e-3, atol=1e-4)
+    assert not same(mine.actor.shared, state.actor.shared)  # the distilled policy looks on, and learns
+
+
+def test_a_task_learns_from_its_own_data_alone(state, batch):
+    """Other data of task 1 move what is its own, and what is distilled, and nothing of the other tasks."""
+    _, update = learner(tiny("distral"), TASKS, BATCH, SPEC)
+    other = jax.tree.map(lambda x: x.at[1].multiply(0.5), batch)
+    (plain, _), (moved, _) = (update(state, rows, TASKS, KEY) for rows in (batch, other))
+    learned = lambda x, i: pick((x.actor.own, x.critic.own, x.log_temperature, x.optimizers[1][1][0].mu.own), i)
+    for i in range(3):
+        assert same(learned(plain, i), learned(moved, i)) == (i != 1)
+    assert not same(plain.actor.shared, moved.actor.shared)
+
+
+# A bandit: one step, rewards -sharpness (action - goal)^2 with goals to both sides of 0.
+
+GOAL, SHARPNESS, HEAT = 0.4, 1.0, 0.2
+
+
+@dataclasses.dataclass(frozen=True)
+class KnownCritic(Distral):
+    """Its critics are a goal, about which they are right."""
+
+    def values(self, critic, features, obs, action):
+        return -SHARPNESS * jnp.square(action[None, :, 0] - critic.own)
+
+
+def optimum(alpha):
+    """Mean and deviation (before the tanh) of the first task's policy; the second's mirrors it.
+
+    Policies minimise their loss by quadrature; the normal that fits both best has their moments: 0 and m^2 + s^2.
+    """
+    nodes, weights = np.polynomial.hermite_e.hermegauss(40)
+    weights = weights / weights.sum()
+    log_normal = lambda raw, mean, std: -0.5 * ((raw - mean) / std) ** 2 - np.log(std) - 0.5 * np.log(2 * np.pi)
+
+    def loss(x, common_std):
+        mean, std = x[0], np.exp(x[1])
+        raw = mean + std * nodes
+        squash = 2 * np.log(np.cosh(raw))
+        cost = log_normal(raw, mean, std) + squash - alpha * (log_normal(raw, 0.0, common_std) + squash)
+        return weights @ (HEAT * cost + SHARPNESS * (np.tanh(raw) - GOAL) ** 2)
+
+    x = np.array([GOAL, -1.0])
+    for _ in range(200):
+        common_std = np.hypot(x[0], np.exp(x[1]))
+        x = scipy.optimize.minimize(loss, x, (common_std,), tol=1e-9).x
+    return x[0], np.exp(x[1])
+
+
+@pytest.mark.parametrize("alpha", [0.0, 0.5, 0.9])
+def test_a_bandits_optimum(alpha):
+    """The more the distilled policy counts, the nearer it draws the tasks' policies, and exactly so far."""
+    made, optimizer = KnownCritic(hidden=(8,), distral_alpha=alpha), optax.adam(3e-3)
+    rows = jax.tree.map(jnp.zeros_like, random_batch(0, 2, 256, Spec(1, 1, 1)))
+    goals, temperature = jnp.float32([GOAL, -GOAL]), jnp.full(2, HEAT)
+    of_tasks = jax.vmap(made.actor_loss, (Params(None, 0), (0, None, Params(None, 0), 0, 0)))
+
+    def learn(carry, key):
+        actor, memory = carry
+        data = (rows, FEATURES, Params({}, goals), temperature, jax.random.split(key, 2))
+        slope = jax.grad(lambda actor: jnp.mean(of_tasks(actor, data)[0]))(actor)
+        actor, memory = descend(optimizer, slope, memory, actor)
+        outputs = jax.vmap(lambda own: made.policy(Params({}, own), actor, FEATURES, jnp.zeros(1)))(actor.own)
+        return (actor, memory), outputs
+
+    actor = made.actor.init(KEY, 2, 2, FEATURES, jnp.zeros(1))
+    run = partial(jax.jit, compiler_options=QUICK)(
+        lambda *start: jax.lax.scan(learn, start, jax.random.split(KEY, 1500))
+    )
+    outputs = run(actor, optimizer.init(actor))[1]
+    mean, log_std = np.split(np.mean(outputs[-500:], axis=0), 2, axis=-1)
+    expected_mean, expected_std = optimum(alpha)
+    np.testing.assert_allclose(mean[:, 0], [expected_mean, -expected_mean], atol=0.03)
+    np.testing.assert_allclose(np.exp(-5 + 3.5 * (np.tanh(log_std) + 1)), expected_std, rtol=0.06)
+
+
+def test_optima_differ():
+    """Or the test above would show nothing."""
+    means = [optimum(alpha)[0] for alpha in (0.0, 0.5, 0.9)]
+    assert means[0] > means[1] + 0.06 > means[2] + 0.12
+
+
+# Acting.
+
+
+def test_training_tasks_play_their_own_policies_and_others_the_distilled_one(state):
+    """Whatever their contexts."""
+    made, obs = tiny("distral"), jnp.float32([0.3, -1.0, 0.5])
+    act = lambda task: np.asarray(made.act(state, obs, task, None))
+    mean = lambda outputs: np.tanh(np.asarray(outputs)[:2])
+    own = [made.policy(of_task(state.actor, i), of_task(state.critic, i), FEATURES, obs) for i in range(3)]
+    common = made.actor.apply_distilled(of_task(state.actor, 0), FEATURES, obs)
+    for i in range(3):
+        np.testing.assert_allclose(act(pick(TASKS, i)), mean(own[i]), rtol=1e-5)
+    for number, context in ((3, 1.0), (9, -7.0)):
+        unseen = pick(TASKS, 0)._replace(id=jnp.int32(number), context=jnp.float32([context]))
+        np.testing.assert_allclose(act(unseen), mean(common), rtol=1e-5)
+    assert len(np.unique(np.stack([mean(x) for x in (*own, common)]), axis=0)) == 4
+    assert made.unseen == "the distilled policy plays them"
+
+
+@pytest.mark.parametrize("told", ["parameters", "one-hot", "embedding"])
+def test_a_distilled_policy_may_be_told_the_task(told):
+    """As the others are; it then acts differently in different tasks."""
+    made = tiny("distral", conditioning=told)
+    fresh = learner(made, TASKS, BATCH, SPEC)[0](TASKS, KEY)
+    played = [np.asarray(made.act(fresh, jnp.ones(3), pick(TASKS, i)._replace(id=jnp.int32(7)), None)) for i in (0, 1)]
+    assert not np.allclose(played[0], played[1], atol=1e-3)
+    assert ("nearest" in made.unseen) == (told != "parameters")
+
+
+# What makes no sense.
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"distral_alpha": 1.1}, r"distral-alpha must be in \[0, 1\], not 1.1"),
+        ({"distral_alpha": float("nan")}, "distral-alpha must be"),
+        ({"heads": "per-task"}, "a policy of its own: heads is disjoint, not per-task"),
+        ({"gradients": "pcgrad"}, "no conflicts for gradients=pcgrad to settle; use mean"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(settings, message):
+    """With what is allowed."""
+    with pytest.raises(InputError, match=message):
+        agent("distral", **settings)

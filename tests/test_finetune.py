@@ -1,0 +1,318 @@
+"""Fine-tuning: what of a run goes on in another, for which tasks, what stays as it was, and what is refused."""
+
+import dataclasses
+import json
+from typing import ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mtjax.train
+from mtjax import cli, finetune, run
+from mtjax.agents import agent
+from mtjax.envs import ENVS
+from mtjax.envs.family import Family
+from mtjax.envs.parameters import Parameter
+from mtjax.finetune import adopt
+from mtjax.types import InputError, Step
+
+
+class State(NamedTuple):
+    obs: jax.Array
+
+
+@dataclasses.dataclass(frozen=True)
+class Aim(Family):
+    """Earns most for the action that the task's goal names; nothing else happens."""
+
+    parameters: ClassVar = {
+        "goal": Parameter("1", 0.0, minimum=-10),
+        "drift": Parameter("1", 0.25, minimum=-10),
+    }
+    action_size: ClassVar[int] = 1
+    episode_steps: ClassVar[int] = 4
+
+    def reset(self, task, key):
+        obs = jax.random.normal(key, (2,))
+        return Step(State(obs), obs, jnp.float32(0), jnp.bool_(False))
+
+    def step(self, task, state, action):
+        obs = state.obs * 0.9 + task.goal["drift"]
+        return Step(State(obs), obs, -jnp.square(action[0] - task.goal["goal"]), jnp.bool_(False))
+
+
+@dataclasses.dataclass(frozen=True)
+class WideAim(Aim):
+    """Acts with two numbers."""
+
+    action_size: ClassVar[int] = 2
+
+
+NEW = "--env=aim --env.vary.goal=0.9,-0.8 --split=none".split()  # nearest to the last and the first of the run's
+NEAREST = [2, 0]
+SHORT = (
+    "--steps=240 --eval-every=1000 --eval-episodes=1 --num-envs=2 --batch-size=4 --replay-size=100 --warmup-steps=2 "
+    "--chunk-steps=20"
+).split()
+BASE = (
+    "--env=aim --env.vary.goal=-1:1:3 --split=none --agent=multi-head --agent.conditioning=embedding --seeds=2 "
+    "--agent.embedding-size=3 --agent.normalize-observations --agent.hidden 8"
+).split()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def aims():
+    """Families by name; and programs that compile fast, out of the user's cache."""
+    quick = jax.config.read("jax_disable_most_optimizations")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(ENVS, "aim", (Aim, {"vary": {"goal": "-1:1:3"}, "split": "none"}))
+        patch.setitem(ENVS, "aim-wide", (WideAim, {"vary": {"goal": "-1:1:3"}, "split": "none"}))
+        patch.setenv("MTJAX_CACHE", "0")
+        jax.config.update("jax_disable_most_optimizations", True)
+        yield
+        jax.config.update("jax_disable_most_optimizations", quick)
+
+
+def train(runs, *words):
+    """Train by the program; returns the run's folder."""
+    before = set(runs.iterdir())
+    mtjax.train.main([*words, *SHORT, f"--runs={runs}"])
+    (directory,) = set(runs.iterdir()) - before
+    return directory
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory):
+    """The folder of a run."""
+    return train(tmp_path_factory.mktemp("runs"), *BASE)
+
+
+@pytest.fixture(scope="module")
+def learned(base):
+    return mtjax.load(base)
+
+
+def named(tree):
+    """Arrays by path."""
+    return {jax.tree_util.keystr(path): np.asarray(x) for path, x in jax.tree.leaves_with_path(tree)}
+
+
+def inherited(states, seeds, nearest=NEAREST):
+    """Actor and critics of new tasks as a run's states (S, ...) leave them."""
+    leaves = {**named({"actor": states.actor}), **named({"critic": states.critic})}
+    picked = {path: x[np.asarray(seeds)] for path, x in leaves.items()}
+    return {path: x[:, nearest] if ".own" in path else x for path, x in picked.items()}
+
+
+# End to end.
+
+MOVES = {"all": "", "heads": "['head']", "embedding": "['embedding']"}
+
+
+@pytest.fixture(scope="module")
+def tuned(base, tmp_path_factory):
+    """Fine-tune the run's agent, once for each choice of parameters; three seeds from the run's two."""
+    done = {}
+
+    def tuned(tune):
+        if tune not in done:
+            runs = tmp_path_factory.mktemp("tuned")
+            done[tune] = train(runs, *NEW, f"--from={base}", f"--tune={tune}", "--agent.actor-lr=0.01", "--seeds=3")
+        return done[tune]
+
+    return tuned
+
+
+@pytest.mark.parametrize("tune", MOVES)
+def test_what_is_tuned_moves_and_all_else_stays_to_the_bit(learned, tuned, tune):
+    """From the networks of the run's seeds, and of the nearest tasks."""
+    expected = inherited(learned.states, [0, 1, 0])
+    after = mtjax.load(tuned(tune)).states
+    found = {**named({"actor": after.actor}), **named({"critic": after.critic})}
+    assert found.keys() == expected.keys() and any(MOVES[tune] in path for path in found)
+    for path, leaf in found.items():
+        for seed in range(3):
+            moved = not np.array_equal(leaf[seed], expected[path][seed])
+            assert moved == (MOVES[tune] in path), path
+
+
+def test_a_run_records_where_it_comes_from(base, tuned):
+    """Its agent is the run's but for what was given; its contexts are written as the run's."""
+    directory = tuned("heads")
+    record, program = json.loads((directory / "config.json").read_text()), cli.from_json(directory / "config.json")
+    assert (record["start"], record["agent"], record["learner"]["tune"]) == (str(base), "multi-head", "heads")
+    begun = cli.from_json(base / "config.json").learner
+    assert program.learner == dataclasses.replace(begun, tune="heads", actor_lr=0.01)
+    assert program.family.ranges == (("goal", -1.0, 1.0),)
+    np.testing.assert_allclose(program.family.tasks().context, [[0.9], [-0.8]], rtol=1e-6)
+
+
+def test_recorded_command_repeats_the_program(tuned):
+    """The run of --from included."""
+    program = cli.from_json(tuned("heads") / "config.json")
+    again = cli.parse([*mtjax.train.repeat(program), f"--runs={program.runs}", f"--preset={program.preset}"])
+    assert again == program
+
+
+def test_a_fine_tuned_run_goes_on(learned, tuned, capsys):
+    """From its own checkpoint, with what stays still staying."""
+    directory = tuned("heads")
+    before = named(mtjax.load(directory).states.actor)
+    mtjax.train.main([f"--resume={directory}", "--steps=320"])
+    assert f"from {cli.from_json(directory / 'config.json').start}: heads" in capsys.readouterr().out
+    for path, leaf in named(mtjax.load(directory).states.actor).items():
+        assert np.array_equal(leaf, before[path]) == ("head" not in path), path
+
+
+def test_training_takes_a_policy(learned):
+    """In Python; without updates, what was learned is all there is."""
+    env = mtjax.make("aim", {"goal": "0.9,-0.8"}).scaled_as(learned.env)
+    settings = mtjax.Settings(num_envs=1, updates_per_step=0, chunk_steps=5, replay_size=10)
+    result = run.train(env, learned.agent, start=learned, steps=10, eval_episodes=1, settings=settings)
+    found = {**named({"actor": result.state.agent.actor}), **named({"critic": result.state.agent.critic})}
+    for path, leaf in inherited(learned.states, [0]).items():
+        np.testing.assert_array_equal(found[path], leaf)
+
+
+# What goes on.
+
+
+@pytest.fixture(scope="module")
+def adopted(learned):
+    """Fresh states of three seeds on two new tasks, and those with the run in them."""
+    env = mtjax.make("aim", {"goal": "0.9,-0.8"}).scaled_as(learned.env)
+    tasks, keys = env.tasks(), jax.random.split(jax.random.key(0), 3)
+    fresh = jax.jit(jax.vmap(lambda key: learned.agent.init(env.spec, tasks, key)))(keys)
+    return tasks, fresh, adopt(learned, learned.agent, tasks, fresh)
+
+
+def test_networks_temperatures_and_moments_go_on(learned, adopted):
+    """Those of the nearest task; seeds of the run are taken in turn."""
+    _, _, state = adopted
+    was = learned.states
+    for path, leaf in inherited(was, [0, 1, 0]).items():
+        np.testing.assert_array_equal({**named({"actor": state.actor}), **named({"critic": state.critic})}[path], leaf)
+    np.testing.assert_array_equal(state.log_temperature, was.log_temperature[jnp.array([0, 1, 0])][:, NEAREST])
+    np.testing.assert_array_equal(state.moments.mean, was.moments.mean[jnp.array([0, 1, 0])])
+    slow = named(was.target)[".own['head']['kernel']"]
+    np.testing.assert_array_equal(state.target.own["head"]["kernel"], slow[[0, 1, 0]][:, NEAREST])
+    assert len(np.unique(np.asarray(was.log_temperature))) == 6  # or nothing was shown
+
+
+def test_the_rest_is_fresh(adopted):
+    """Optimisers, and the contexts among which the nearest is found from now on."""
+    tasks, fresh, state = adopted
+    for one, other in zip(jax.tree.leaves(state.optimizers), jax.tree.leaves(fresh.optimizers), strict=True):
+        np.testing.assert_array_equal(one, other)
+    np.testing.assert_array_equal(state.contexts, np.broadcast_to(tasks.context, (3, 2, 1)))
+
+
+def test_one_temperature_for_all_stays_one():
+    """Also where there are as many tasks as temperatures."""
+    made, old = agent("sac", shared_temperature=True, hidden=(4,)), mtjax.make("aim")
+    env = mtjax.make("aim", {"goal": "0.5"}).scaled_as(old)
+
+    def blank(env):
+        shapes = jax.eval_shape(lambda: made.init(env.spec, env.tasks(), jax.random.key(0)))
+        return jax.tree.map(lambda x: jnp.zeros((1, *x.shape), x.dtype), shapes)
+
+    states = blank(old)._replace(log_temperature=jnp.float32([[0.7]]))
+    state = adopt(mtjax.policy.Policy(old, made, None, states, jnp.arange(1)), made, env.tasks(), blank(env))
+    np.testing.assert_array_equal(state.log_temperature, states.log_temperature)
+
+
+# Contexts.
+
+
+def test_contexts_are_written_as_the_others():
+    """In its ranges and its order; what does not vary here, at its value; what is unknown here, at 0."""
+    old = mtjax.make("aim", {"drift": "0:1:2", "goal": "-1:1:3"})
+    env = mtjax.make("aim", {"goal": "1,3"}).scaled_as(old)
+    assert [name for name, _, _ in old.ranges] == ["goal", "drift"]
+    np.testing.assert_allclose(env.tasks().context, [[1, -0.5], [3, -0.5]], rtol=1e-6)
+    assert env.spec.context_size == old.spec.context_size == 2
+    set_apart = mtjax.make("aim", {"goal": "1,3", "drift": "1"}).scaled_as(old)
+    np.testing.assert_allclose(set_apart.tasks().context, [[1, 1], [3, 1]], rtol=1e-6)
+    stranger = mtjax.make("aim", {"goal": "1,3"}, context_ranges=(("size", 3, 4), ("goal", 0, 2)))
+    np.testing.assert_allclose(stranger.tasks().context, [[0, 0], [0, 2]], rtol=1e-6)
+
+
+def test_contexts_of_single_tasks_and_of_drawn_ones():
+    """A run of one task has one constant number; draws are written as their tasks are."""
+    one, many = mtjax.make("aim", {"goal": "0.5"}), mtjax.make("aim", {"goal": "0:1"}, num_draws=4)
+    np.testing.assert_array_equal(many.scaled_as(one).tasks().context, [[0.0]])
+    np.testing.assert_array_equal(one.scaled_as(many).tasks().context, [[0.0]])
+    wide = many.scaled_as(mtjax.make("aim", {"goal": "-2:2:3"}))
+    np.testing.assert_allclose(wide.tasks().draws.context[0], wide.tasks().draws.params["goal"].T / 2, rtol=1e-6)
+
+
+def test_a_family_written_as_itself_is_the_same():
+    """To the bit; and once more after a record was read back."""
+    env = mtjax.make("finger-spin-vary-size")
+    again = env.scaled_as(env)
+    np.testing.assert_array_equal(env._context(), again._context())
+    assert mtjax.make("finger-spin-vary-size", **json.loads(json.dumps(dataclasses.asdict(again)))) == again
+
+
+# What is refused.
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("--agent=sac", "goes on with the run's agent, multi-head, not with sac"),
+        ("--agent.encoder=mlp", "goes on with the run's encoder, identity, not with mlp"),
+        ("--agent.hidden 4", r"hidden is the run's, \(8,\), and cannot be \(4,\); what may change is actor-lr"),
+        ("--agent.embedding-size=4", "embedding-size is the run's, 3"),
+        ("--env=aim-wide", "map 2 observed numbers to 1 actions; the new tasks have 2 and 2"),
+        ("--tune=head", "head"),
+        ("--reset-every=5", "throws away what --from takes"),
+    ],
+)
+def test_what_does_not_fit_the_run_is_refused(base, tmp_path, words, said):
+    """Before a folder is made."""
+    given = [*NEW, f"--from={base}", *SHORT, f"--runs={tmp_path / 'runs'}", *words.split()]
+    with pytest.raises(InputError, match=said):
+        mtjax.train.main(given)
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("--from=nowhere", "'nowhere' is not a run"),
+        ("--from=", "is not a run"),
+        ("--tune=heads", "say which run: --from=RUN"),
+        ("--tune=embedding", "tune=embedding needs conditioning=embedding, not none"),
+    ],
+)
+def test_flags_that_mean_nothing_are_refused(tmp_path, monkeypatch, words, said):
+    """Before anything is made."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=said):
+        mtjax.train.main(["--env=aim", "--agent=sac", *words.split()])
+    assert not list(tmp_path.iterdir())
+
+
+def test_contexts_of_another_scale_are_refused(learned):
+    """In Python, where the family is the caller's."""
+    env = mtjax.make("aim", {"goal": "-2:2:3"})
+    with pytest.raises(InputError, match=r"give env\.scaled_as"):
+        run.train(env, learned.agent, start=learned)
+    finetune.require_fit(learned, env.scaled_as(learned.env), learned.agent)
+
+
+@pytest.mark.parametrize(("goals", "fits"), [("-0.9,0.1,1.1", True), ("1,0,-1", False), ("0,1", False)])
+def test_networks_that_know_tasks_by_number_keep_them(goals, fits):
+    """Task i must be nearest to the run's task i."""
+    made, old = agent("sac", conditioning="one-hot", hidden=(4,)), mtjax.make("aim")
+    state = jax.jit(lambda: made.init(old.spec, old.tasks(), jax.random.key(0)))()
+    start = mtjax.policy.Policy(old, made, state, jax.tree.map(lambda x: x[None], state), jnp.arange(1))
+    env = mtjax.make("aim", {"goal": goals}).scaled_as(old)
+    if fits:
+        finetune.require_fit(start, env, made)
+        return
+    with pytest.raises(InputError, match="know its 3 tasks by number"):
+        finetune.require_fit(start, env, made)

@@ -1,0 +1,392 @@
+"""Scales of reward: their statistics by hand, what they preserve, when they change; and networks that begin anew."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from probes import QUICK, Probe, Walk, learner, only_seed, random_batch, tasks_of, tiny, train, values
+
+from mtjax import normalize
+from mtjax.agents import agent
+from mtjax.agents.scaling import SCALINGS, AdaptiveScaling, NoScaling, PopArt, ReturnScaling, RewardScaling
+from mtjax.loop import Settings
+from mtjax.networks import Params
+from mtjax.types import InputError, Outcome, Spec, Transition
+
+SPEC, BATCH = Spec(3, 2, 1), 4
+TASKS = tasks_of("one-step", (1.0, -0.5, 0.3))
+KEY = jax.random.key(0)
+NO_BONUS = jnp.zeros(1)
+
+
+def stream(rewards, *, ends=(), cuts=(), gamma=0.5):
+    """Outcomes of rewards (H, T, E) whose episodes all terminate after some steps and are cut off after others."""
+    rewards = np.float32(rewards)
+    discounted = total = age = np.zeros(rewards.shape[1:], np.float32)
+    for step, reward in enumerate(rewards):
+        discounted, total, age = gamma * discounted + reward, total + reward, age + 1
+        over = step in (*ends, *cuts)
+        everywhere = lambda flag: jnp.full(rewards.shape[1:], flag)
+        outcome = (reward, discounted, total, everywhere(over), everywhere(step in ends), np.int32(age))
+        yield Outcome(*map(jnp.asarray, outcome))
+        if over:
+            discounted = total = age = np.zeros(rewards.shape[1:], np.float32)
+
+
+def watch(scaling, outcomes, num_tasks=2):
+    memory = scaling.init(num_tasks)
+    for outcome in outcomes:
+        memory = scaling.observe(memory, outcome)
+    return memory
+
+
+def units(scaling, memory, gamma=0.5, bonus=NO_BONUS):
+    return np.stack(scaling.units(memory, gamma, bonus))
+
+
+def random_rewards(steps, num_envs):
+    """Rewards (H, T, E) of two tasks that pay in different coin."""
+    return np.random.default_rng(0).normal(size=(steps, 2, num_envs)) * [[1.0], [30.0]] + [[0.5], [-4.0]]
+
+
+def test_rewards_are_divided_by_their_moving_standard_deviation():
+    """One environment: MTEnv's estimate, written as it is there."""
+    rewards = random_rewards(200, 1)
+    memory = watch(RewardScaling(variance_rate=0.01), stream(rewards))
+    mean, variance = np.zeros(2), np.ones(2)
+    for reward in rewards[..., 0]:
+        mean = 0.99 * mean + 0.01 * reward
+        variance = 0.99 * variance + 0.01 * (reward - mean) ** 2
+    assert variance[1] > 100 * variance[0]
+    factor, offset = units(RewardScaling(), memory)
+    np.testing.assert_allclose(factor, 1 / np.sqrt(variance), rtol=1e-4)
+    np.testing.assert_array_equal(offset, 0)
+
+
+def test_the_rewards_of_a_step_count_as_often_as_there_are():
+    """Four equal ones in one step and in four: the mean is the same, and so is the variance without a shift."""
+    four, one = np.ones((1, 2, 4)), np.ones((4, 2, 1))
+    together, apart = (watch(RewardScaling(variance_rate=0.1), stream(x)) for x in (four, one))
+    np.testing.assert_allclose(together.mean, apart.mean, rtol=1e-6)
+    np.testing.assert_allclose(together.mean, 1 - 0.9**4, rtol=1e-6)
+    np.testing.assert_allclose(together.variance, 0.9**4 + (1 - 0.9**4) * 0.9**8, rtol=1e-6)
+
+
+def test_returns_are_scaled_to_their_range():
+    """The largest discounted sum, of either sign: 3 + 1 / 2 and 8 / 4 - 6; never smaller once it was larger."""
+    rewards = np.array([[[1.0], [8.0]], [[3.0], [0.0]], [[-1.0], [-6.0]], [[0.1], [0.1]]])
+    rewards = np.concatenate([rewards, np.zeros_like(rewards)], axis=-1)
+    memory = watch(ReturnScaling(), stream(rewards, ends=(2,)))
+    np.testing.assert_allclose(units(ReturnScaling(), memory), [[10 / 3.5, 10 / 8], [0, 0]], rtol=1e-6)
+    flipped = watch(ReturnScaling(), stream(-rewards, ends=(2,)))
+    np.testing.assert_allclose(units(ReturnScaling(), flipped), units(ReturnScaling(), memory))
+
+
+def test_what_lies_beyond_a_time_limit_counts_and_beyond_an_end_does_not():
+    """Two steps of reward 1 go on for ever if they were cut off: 1 / (1 - gamma) with gamma 0.9, against 1.9."""
+    rewards, scaling = np.ones((2, 2, 1)), ReturnScaling(return_range=2.0)
+    for over, largest in (({"cuts": (1,)}, 10.0), ({"ends": (1,)}, 1.9)):
+        memory = watch(scaling, stream(rewards, gamma=0.9, **over))
+        np.testing.assert_allclose(units(scaling, memory, gamma=0.9)[0], 2 / largest, rtol=1e-5)
+
+
+def test_the_bonus_of_entropy_has_room_in_the_range():
+    """2 for the rewards, and 0.3 a step for 1 / (1 - gamma) = 2 steps."""
+    memory = watch(ReturnScaling(), stream(np.full((1, 2, 1), 2.0)))
+    np.testing.assert_allclose(units(ReturnScaling(), memory, bonus=jnp.float32([0.3, 0.0]))[0], [10 / 2.6, 5])
+
+
+def test_an_update_tells_the_scaling_what_entropy_is_worth():
+    """Temperature 0.2, a target of -0.5 for each of two dimensions: half of 0.2 in a step, for two steps."""
+    learner_ = agent("sac", scaling="return", gamma=0.5, initial_temperature=0.2, hidden=(4,))
+    state = jax.jit(lambda: learner_.init(SPEC, TASKS, KEY), compiler_options=QUICK)()
+    state = learner_.observe(state, next(stream(np.full((1, 3, 2), 4.0))))
+    batch = random_batch(0, 3, BATCH, SPEC)
+    seen = learner_.prepare(state, batch, TASKS)[1]
+    np.testing.assert_allclose(seen.reward, batch.reward * 10 / (4 + 2 * 0.1), rtol=1e-5)
+
+
+def test_nothing_observed_scales_nothing():
+    """Factor 1 and offset 0, for every scaling."""
+    batch = random_batch(0, 2, BATCH, SPEC)
+    for scaling in (cls() for cls in SCALINGS.values()):
+        rewards = scaling.rewards(scaling.init(2), batch, 0.9, jnp.full(1, 0.5))
+        np.testing.assert_allclose(rewards, batch.reward, rtol=1e-6)
+
+
+# ARS.
+
+
+def test_ars_brings_all_tasks_to_the_best_mean_reward():
+    """Means of 4, 1 and -2 give 1, 4 and 4 / 0.01."""
+    rewards = np.array([[[3.0, 5.0], [2.0, 0.0], [0.0, 0.0]], [[4.0, 4.0], [0.0, 2.0], [-4.0, -4.0]]])
+    memory = watch(AdaptiveScaling(), stream(rewards), 3)
+    np.testing.assert_allclose(memory.mean, [4, 1, -2])
+    np.testing.assert_allclose(units(AdaptiveScaling(), memory)[0], [1, 4, 400], rtol=1e-5)
+    np.testing.assert_allclose(units(AdaptiveScaling(), watch(AdaptiveScaling(), stream(-abs(rewards)), 3))[0], 1)
+
+
+def test_ars_keeps_its_factors_from_the_first_update_to_the_next_reset():
+    """Whatever is seen between."""
+    scaling, rewards = AdaptiveScaling(), np.array([[[4.0], [1.0]], [[4.0], [7.0]]])
+    first, second = stream(rewards)
+    memory = scaling.observe(scaling.init(2), first)
+    np.testing.assert_allclose(units(scaling, memory)[0], [1, 4])
+    memory, critics = scaling.renew(memory, jnp.zeros((2, 3)), (Params({}, {}),))
+    assert critics == (Params({}, {}),)
+    memory = scaling.observe(memory, second)
+    memory, _ = scaling.renew(memory, jnp.ones((2, 3)), ())
+    np.testing.assert_allclose(memory.mean, 4)
+    np.testing.assert_allclose(units(scaling, memory)[0], [1, 4])
+    np.testing.assert_allclose(units(scaling, scaling.reset(memory))[0], 1)
+
+
+# Pop-Art.
+
+
+def critic(seed):
+    """A critic of two tasks and three heads each, on four features."""
+    random = np.random.default_rng(seed)
+    head = {"kernel": jnp.float32(random.normal(size=(2, 3, 4, 1))), "bias": jnp.float32(random.normal(size=(2, 3, 1)))}
+    return Params({"body": jnp.ones(3)}, {"head": head, "embedding": jnp.ones((2, 5))})
+
+
+def says(params, scaling, memory):
+    """Values (T, N, Z) in reward, of random features."""
+    features = np.random.default_rng(9).normal(size=(7, 4))
+    head, (factor, offset) = params.own["head"], units(scaling, memory)[..., None, None]
+    scaled = np.einsum("zd,tndo->tnz", features, head["kernel"]) + head["bias"]
+    return scaled / factor + offset
+
+
+def test_popart_preserves_what_critics_say_while_its_statistics_move():
+    """The critic's values and the slow critic's, of tasks on scales of 0.01 and of 1000; all else is left alone."""
+    scaling, critics = PopArt(target_rate=0.1), (critic(0), critic(1))
+    memory = scaling.init(2)
+    before = [says(params, scaling, memory) for params in critics]
+    renew = jax.jit(scaling.renew, compiler_options=QUICK)
+    random = np.random.default_rng(2)
+    mean, square = np.zeros(2), np.ones(2)  # as in the papers, of first and second moment
+    for _ in range(50):
+        raw = random.normal(size=(2, 16)) * [[0.01], [1000.0]] + [[0.02], [5000.0]]
+        factor, offset = units(scaling, memory)
+        memory, critics = renew(memory, jnp.float32((raw - offset[:, None]) * factor[:, None]), critics)
+        mean = 0.9 * mean + 0.1 * raw.mean(axis=1)
+        square = 0.9 * square + 0.1 * (raw**2).mean(axis=1)
+    factor, offset = units(scaling, memory)
+    for params, values_before, seed in zip(critics, before, (0, 1), strict=True):
+        for found, wanted, shift in zip(says(params, scaling, memory), values_before, offset, strict=True):
+            largest = max(np.abs(wanted).max(), abs(shift))  # of what is summed, rounded once a step
+            np.testing.assert_allclose(found, wanted, rtol=0, atol=50 * np.finfo(np.float32).eps * largest)
+        assert not np.allclose(params.own["head"]["kernel"], critic(seed).own["head"]["kernel"], rtol=0.1)
+        np.testing.assert_array_equal(params.own["embedding"], 1)
+        np.testing.assert_array_equal(params.shared["body"], 1)
+    np.testing.assert_allclose(offset, mean, rtol=1e-4)
+    np.testing.assert_allclose(1 / factor, np.sqrt(square - mean**2), rtol=1e-3)
+
+
+def test_targets_in_a_tasks_units_are_its_targets_in_reward():
+    """(r + d v' - m) / s, for v' = m + s next and any bonus, which is worth s in reward; ends included."""
+    scaling, batch = PopArt(), random_batch(0, 2, 6, SPEC)
+    memory = scaling.init(2)._replace(mean=jnp.float32([3.0, -100.0]), variance=jnp.float32([4.0, 900.0]))
+    mean, std = np.array([[3.0], [-100.0]]), np.array([[2.0], [30.0]])
+    next_value, discount = np.float32(np.random.default_rng(1).normal(size=(2, 6))), 0.9 * np.asarray(batch.discount)
+    found = scaling.rewards(memory, batch, 0.9, NO_BONUS) + discount * next_value
+    expected = (batch.reward + discount * (mean + std * next_value) - mean) / std
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+    assert 0 in discount
+
+
+def test_popart_stays_finite_where_targets_do_not_vary():
+    """Its standard deviation has a floor."""
+    scaling, critics = PopArt(target_rate=0.5), (critic(0),)
+    memory = scaling.init(2)
+    for _ in range(100):
+        factor, offset = units(scaling, memory)
+        memory, critics = scaling.renew(memory, jnp.float32((7.0 - offset) * factor)[:, None].repeat(3, 1), critics)
+    np.testing.assert_allclose(units(scaling, memory), [[1e4, 1e4], [7, 7]], rtol=1e-3)
+    assert np.all(np.isfinite(critics[0].own["head"]["kernel"]))
+
+
+# In an agent.
+
+
+def test_an_update_rescales_critic_and_target_beside_its_own_step():
+    """The update of an agent without Pop-Art, with heads brought to the new units after it."""
+    plain, scaled = (tiny("multi-head", scaling=name) for name in ("none", "popart"))
+    (init, update), (_, plain_update) = learner(scaled, TASKS, BATCH, SPEC), learner(plain, TASKS, BATCH, SPEC)
+    state, batch = init(TASKS, KEY), random_batch(0, 3, BATCH, SPEC)
+    after, metrics = update(state, batch, TASKS, KEY)
+    expected, _ = plain_update(state._replace(scales=None), batch, TASKS, KEY)
+    assert not np.allclose(after.scales.mean, state.scales.mean, atol=1e-6)
+    assert "target" not in metrics
+    factor, offset = units(scaled.scaling, after.scales)
+    for network in ("critic", "target"):
+        found, wanted = (getattr(x, network).own["head"] for x in (after, expected))
+        np.testing.assert_allclose(found["kernel"], wanted["kernel"] * factor[:, None, None, None], rtol=1e-5)
+        biases = (wanted["bias"] - offset[:, None, None]) * factor[:, None, None]
+        np.testing.assert_allclose(found["bias"], biases, rtol=1e-4, atol=1e-6)
+    np.testing.assert_array_equal(after.actor.own["head"]["kernel"], expected.actor.own["head"]["kernel"])
+
+
+@pytest.mark.parametrize("name", ["reward", "return"])
+def test_statistics_change_by_what_is_observed_alone(name):
+    """Not by learning and not by acting; and they decide what an update sees."""
+    scaled = tiny("sac", scaling=name)
+    assert scaled.watches
+    init, update = learner(scaled, TASKS, BATCH, SPEC)
+    state, batch = init(TASKS, KEY), random_batch(0, 3, BATCH, SPEC)
+    seen = scaled.observe(state, next(stream(np.full((1, 3, 2), [[5.0], [1.0], [90.0]]))))
+    same = lambda a, b: all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+    assert not same(seen.scales, state.scales)
+    assert same(seen._replace(scales=None), state._replace(scales=None))
+    (before, first), (after, second) = update(state, batch, TASKS, KEY), update(seen, batch, TASKS, KEY)
+    assert same(before.scales, state.scales) and same(after.scales, seen.scales)
+    assert not np.allclose(first["critic_loss"], second["critic_loss"])
+
+
+def test_agents_without_statistics_do_not_watch():
+    """The loop saves itself the trouble."""
+    assert not tiny("sac").watches and not tiny("multi-head", scaling="popart").watches
+    assert NoScaling().init(3) is None
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"scaling": "popart"}, "use value=scalar and heads=per-task or disjoint, not scalar and shared"),
+        ({"scaling": "popart", "heads": "per-task", "value": "c51"}, "not c51 and per-task"),
+        ({"scaling": "return", "gamma": 1.0}, "use gamma below 1"),
+        ({"scaling": "return", "return_range": 0.0}, "return-range must be greater than 0"),
+        ({"scaling": "reward", "variance_rate": 0.0}, r"variance-rate must be in \(0, 1\], not 0.0"),
+        ({"scaling": "popart", "heads": "per-task", "target_rate": 1.5}, "target-rate must be"),
+        ({"scaling": "ars", "least_mean_reward": 0.0}, "least-mean-reward must be greater than 0"),
+        ({"scaling": "pop-art"}, "unknown scaling 'pop-art'; did you mean 'popart'"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(settings, message):
+    """With what was given."""
+    with pytest.raises(InputError, match=message):
+        agent("sac", **settings)
+
+
+LEARNING = Settings(
+    num_envs=8, updates_per_step=4, batch_size=32, replay_size=8000, warmup_steps=150, warmup_hold=1, chunk_steps=300
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("multi-head", {"scaling": "popart", "target_rate": 0.02}),
+        ("sac-conditioned", {"scaling": "return", "value": "c51", "num_bins": 41, "return_range": 8.0}),
+        ("sac-conditioned", {"scaling": "reward"}),
+    ],
+    ids=["popart", "return", "reward"],
+)
+def test_values_are_known_in_reward_whatever_their_scale(name, settings):
+    """Two steps, of which the second earns 200 or -0.5; errors are relative to the task's own scale."""
+    rates = {"gamma": 0.9, "initial_temperature": 1e-6, "temperature_lr": 1e-9, "tau": 0.3}
+    scaled = tiny(name, **rates, **settings, actor_lr=1e-2, critic_lr=1e-2, conditioning="one-hot")
+    scales = (200.0, -0.5)
+    tasks = tasks_of("delayed", scales)
+    state, history = train(Probe("delayed"), scaled, LEARNING, tasks=tasks)
+    state = only_seed(state.agent)
+    factor, offset = units(scaled.scaling, state.scales, gamma=0.9)
+    found = values(scaled, state, tasks, [0.0, 1.0], [0.1, -0.6]) / factor[:, None, None] + offset[:, None, None]
+    for estimates, scale in zip(found, scales, strict=True):
+        np.testing.assert_allclose(estimates / scale, np.tile([0.9, 1.0], (2, 1)), atol=0.1)
+    np.testing.assert_allclose(history[0]["return"], [scales], rtol=1e-5)
+
+
+# Networks that begin anew.
+
+BRIEF = Settings(num_envs=2, batch_size=4, replay_size=40, warmup_steps=4, chunk_steps=10)
+
+
+@dataclasses.dataclass(frozen=True)
+class Diary:
+    """Notes as bits in which of the steps it was reset, and how many updates it has taken since."""
+
+    gamma: float = 0.9
+    watches: bool = True
+
+    def init(self, spec, tasks, key):
+        return {"step": jnp.int32(0), "resets": jnp.int32(0), "updates": jnp.int32(0), "noise": jnp.float32(0)}
+
+    def act(self, state, obs, task, key):
+        return jnp.zeros(1)
+
+    def observe(self, state, outcome):
+        return state | {"step": state["step"] + 1}
+
+    def update(self, state, batch, tasks, key):
+        return state | {"updates": state["updates"] + 1}, {"updates": jnp.float32(state["updates"])}
+
+    def reset(self, state, spec, tasks, key):
+        assert spec.obs_size == 1 and len(tasks.id) == 2
+        resets = state["resets"] | (1 << state["step"])
+        return state | {"resets": resets, "updates": jnp.int32(0), "noise": jax.random.normal(key)}
+
+
+@pytest.mark.parametrize("seeds", [(3,), (3, 5)])
+@pytest.mark.parametrize(("every", "expected"), [(0, ()), (3, (6, 9, 12, 15, 18)), (4, (8, 12, 16)), (11, (11,))])
+def test_resets_come_at_multiples_of_their_period_after_the_warmup(every, expected, seeds):
+    """In all seeds alike, across chunks, before the step is learned from; each seed with a key of its own."""
+    settings = dataclasses.replace(BRIEF, reset_every=every)
+    state, _ = train(Walk(), Diary(), settings, seeds=seeds, chunks=2)
+    for seed in range(len(seeds)):
+        assert [i for i in range(31) if state.agent["resets"][seed] >> i & 1] == list(expected)
+        assert state.agent["updates"][seed] == 20 - max(expected, default=BRIEF.warmup_steps)
+        assert (state.agent["noise"][seed] != 0) == bool(expected)
+    assert len(np.unique(state.agent["noise"])) == (len(seeds) if expected else 1)
+
+
+def test_a_reset_renews_all_that_learns_and_nothing_else():
+    """What it renews is as if just initialised; statistics of the data, and who the tasks are, stay."""
+    scaled = tiny("sac-conditioned", scaling="ars", sampler="hardest", normalize_observations=True)
+    init, update = learner(scaled, TASKS, BATCH, SPEC)
+    state = init(TASKS, KEY)
+    rewards = np.full((3, 3, 2), [[5.0], [1.0], [90.0]])
+    for i, outcome in enumerate(stream(rewards, ends=(1,))):
+        state = scaled.observe(state, outcome)
+        state, _ = update(state, random_batch(i, 3, BATCH, SPEC), TASKS, jax.random.key(i))
+    key = jax.random.key(7)
+    fresh, anew = init(TASKS, key), jax.jit(partial(scaled.reset, spec=SPEC, tasks=TASKS, key=key))(state)
+    kept = ("moments", "contexts", "progress")
+    for field in state._fields:
+        given = getattr(state if field in kept else fresh, field)
+        given = scaled.scaling.reset(state.scales) if field == "scales" else given
+        assert jax.tree.structure(given) == jax.tree.structure(getattr(anew, field))
+        for a, b in zip(jax.tree.leaves(given), jax.tree.leaves(getattr(anew, field)), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-6, err_msg=field)
+    assert anew.moments.count == 3 * 3 * BATCH and np.all(anew.progress.known)
+    assert np.all(state.scales.factor > 0) and np.all(anew.scales.factor == 0) and np.all(anew.scales.count == 6)
+    assert normalize.init(3).count == 0
+
+
+def test_resets_work_in_the_loop_with_seeds():
+    """ARS under two seeds: the factors of the last reset, from the mean rewards of that time."""
+    settings = dataclasses.replace(BRIEF, reset_every=8, warmup_steps=2)
+    state, _ = train(Probe("one-step"), tiny("sac", scaling="ars", hidden=(8,)), settings, seeds=(3, 5))
+    np.testing.assert_allclose(state.agent.scales.mean, np.tile([1.0, -0.5], (2, 1)), rtol=1e-5)
+    np.testing.assert_allclose(state.agent.scales.factor, np.tile([1.0, 100.0], (2, 1)), rtol=1e-5)
+    np.testing.assert_array_equal(state.agent.optimizers[0][1][0].count, 2)  # updates since step 8 of 10
+
+
+def test_a_negative_period_is_refused():
+    """As other settings of the loop are."""
+    with pytest.raises(InputError, match="reset-every must be at least 0, not -1"):
+        Settings(reset_every=-1)
+
+
+def test_a_batch_is_scaled_and_nothing_else_of_it():
+    """Rewards alone: times the task's factor."""
+    scaling, batch = RewardScaling(), random_batch(0, 2, BATCH, SPEC)
+    memory = scaling.init(2)._replace(variance=jnp.float32([4.0, 25.0]))
+    assert isinstance(batch, Transition)
+    expected = batch.reward / np.array([[2.0], [5.0]])
+    np.testing.assert_allclose(scaling.rewards(memory, batch, 0.9, NO_BONUS), expected, rtol=1e-5)
