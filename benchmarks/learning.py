@@ -81,6 +81,8 @@ def learn(arguments: argparse.Namespace, env: str, agent: str) -> None:
         settings=dataclasses.replace(program.training, **training),
         quiet=False,
     )
+    if not result.finished:
+        raise SystemExit(f"stopped before {agent} on {env} was finished; the same command goes on with it")
     save(arguments.out / env, agent, result)
 
 

@@ -8,6 +8,7 @@ from typing import ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import probes
 import pytest
 from probes import QUICK
 
@@ -43,6 +44,8 @@ def compiled(env) -> Programs:
 def forget_programs():
     """Drop a file's compiled programs after it: a process has room for some thousands, and dies of more."""
     yield
+    for cached in (compiled, probes._programs, probes._agent_programs):
+        cached.cache_clear()
     jax.clear_caches()
 
 

@@ -131,7 +131,7 @@ def test_agents_act_and_learn(name, settings, vectors):
     noisy, mean = act(agent, after, obs, keys), act(agent, after, obs, None)
     assert noisy.shape == mean.shape == (3, ENVS, 2)
     assert np.all(np.abs(noisy) <= 1) and not np.allclose(noisy, mean)
-    for t, e in ((0, 0), (2, 1)):
+    for t, e in ((0, 0), (1, 1), (2, 0)):
         np.testing.assert_allclose(agent.act(after, obs[t, e], pick(TASKS, t), keys[t, e]), noisy[t, e], atol=1e-5)
         np.testing.assert_allclose(agent.act(after, obs[t, e], pick(TASKS, t), None), mean[t, e], atol=1e-5)
 

@@ -27,7 +27,7 @@ class Mixture(nn.Module):
     @nn.compact
     def __call__(self, obs: Array, features: Array, *action: Array) -> Array:
         size = self.expert_widths[-1]
-        context = nn.Dense(size, name="context_out")(MLP(self.expert_widths, name="context")(features))  # (..., D)
+        context = nn.Dense(size, name="context_out")(MLP(self.expert_widths[:-1], name="context")(features))  # (..., D)
         encodings = Experts(self.num_experts, self.expert_widths, name="experts")(obs)  # (K, ..., D)
         if self.variant == "paper":
             scores = jnp.sum(encodings * jax.lax.stop_gradient(context), axis=-1) / self.temperature  # (K, ...)
@@ -39,7 +39,7 @@ class Mixture(nn.Module):
         self.sow("intermediates", "attention", attention)
         encoding = jnp.sum(attention[..., None] * encodings, axis=0)
         if self.variant == "paper":
-            encoding = MLP((size, size), name="after")(encoding)
+            encoding = MLP((size,), name="after")(encoding)
         return MLP(self.hidden, self.layer_norm, name="trunk")(join(encoding, *action, task=context))
 
 

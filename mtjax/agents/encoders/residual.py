@@ -8,7 +8,6 @@ from mtjax.agents.encoders.base import Identity
 from mtjax.networks import ReLU, join
 from mtjax.types import Array, InputError
 
-_orthogonal = nn.initializers.orthogonal
 _he = nn.initializers.he_normal()
 
 
@@ -20,7 +19,7 @@ class BroNetTrunk(nn.Module):
 
     @nn.compact
     def __call__(self, obs: Array, features: Array, *action: Array) -> Array:
-        dense = lambda x: nn.LayerNorm()(nn.Dense(self.width, kernel_init=_orthogonal(2**0.5))(x))
+        dense = lambda x: nn.LayerNorm()(nn.Dense(self.width, kernel_init=_he)(x))
         x = ReLU()(dense(join(obs, *action, task=features)))
         for _ in range(self.num_blocks):
             x = x + dense(ReLU()(dense(x)))
@@ -36,7 +35,7 @@ class SimBaTrunk(nn.Module):
 
     @nn.compact
     def __call__(self, obs: Array, features: Array, *action: Array) -> Array:
-        x = nn.Dense(self.width, kernel_init=_orthogonal(1.0))(join(obs, *action, task=features))
+        x = nn.Dense(self.width)(join(obs, *action, task=features))
         for _ in range(self.num_blocks):
             inner = ReLU()(nn.Dense(self.expansion * self.width, kernel_init=_he)(nn.LayerNorm()(x)))
             x = x + nn.Dense(self.width, kernel_init=_he)(inner)
@@ -59,8 +58,9 @@ class BroNet(Identity):
     """BroNet (Nauman et al. 2024, "Bigger, Regularized, Optimistic"), with a block for each width of ``hidden``.
 
         x = relu(LN(Dense(inputs)));   x <- x + LN(Dense(relu(LN(Dense(x)))))   in each block
-    Kernels start orthogonal, times sqrt 2. Norms are the body's own: critic-layer-norm and actor-layer-norm say nothing
-    here. The paper: 2 blocks of 512 in critics, 1 of 256 in the actor; actor and critics are of one size here.
+    Kernels start by He's initialisation, where the authors' are orthogonal times sqrt 2, which is of the same size and
+    takes a QR decomposition each. Norms are the body's own: critic-layer-norm and actor-layer-norm say nothing here.
+    The paper: 2 blocks of 512 in critics, 1 of 256 in the actor; actor and critics are of one size here.
     """
 
     def body(self, hidden: tuple[int, ...], layer_norm: bool) -> nn.Module:
@@ -72,7 +72,7 @@ class SimBa(Identity):
     """SimBa (Lee et al. 2024, "Simplicity Bias for Scaling Up Parameters"), with a block for each width of ``hidden``.
 
         x = Dense(inputs);   x <- x + Dense(relu(Dense_4w(LN(x))))   in each block;   LN(x)
-    Kernels start orthogonal in the first layer and by He's initialisation in blocks. Norms are the body's own:
+    Kernels start by He's initialisation in blocks; the authors' first layer is orthogonal. Norms are the body's own:
     critic-layer-norm and actor-layer-norm say nothing here. The paper scales observations by their running statistics
     too, which is normalize-observations, and decays weights; it has 2 blocks of 512 in critics and 1 of 128 in the
     actor; actor and critics are of one size here.
