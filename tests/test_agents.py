@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from probes import learner, pick, random_batch, tasks_of, tiny
+from probes import learner, pick, quick, random_batch, tasks_of, tiny
 
 from mtjax import normalize
 from mtjax.agents import AGENTS, agent
@@ -18,6 +18,7 @@ from mtjax.agents.scaling import SCALINGS
 from mtjax.agents.surgery import RULES
 from mtjax.agents.values import VALUES
 from mtjax.history import widen
+from mtjax.loop import actions
 from mtjax.networks import Params
 from mtjax.types import InputError, Spec
 
@@ -134,6 +135,32 @@ def test_agents_act_and_learn(name, settings, vectors):
     for t, e in ((0, 0), (1, 1), (2, 0)):
         np.testing.assert_allclose(agent.act(after, obs[t, e], pick(TASKS, t), keys[t, e]), noisy[t, e], atol=1e-5)
         np.testing.assert_allclose(agent.act(after, obs[t, e], pick(TASKS, t), None), mean[t, e], atol=1e-5)
+
+
+MIXED = ("care", "moe", "hip-bmdp")
+
+
+@pytest.mark.parametrize("name", [pytest.param(x, marks=[] if x in MIXED else pytest.mark.nightly) for x in AGENTS])
+def test_a_world_among_many_is_that_world_alone(name):
+    """Seeds x tasks x environments as an evaluation has them, on whatever device tests run: no row is another's."""
+    agent, shape = tiny(name), (10, 8, 5)
+    spec, worlds = widen(SPEC, agent.history), tasks_of("one-step", np.linspace(-1, 1, 8))
+    init = lambda key: agent.init(spec, TASKS, key)
+    states = quick(jax.vmap(init), jax.random.split(KEY, 10))(jax.random.split(KEY, 10))
+    shake = lambda x: x + 0.2 * np.random.default_rng(0).normal(size=x.shape).astype(x.dtype) if x.dtype == "f" else x
+    states = states._replace(actor=jax.tree.map(shake, states.actor), critic=jax.tree.map(shake, states.critic))
+    obs = jnp.float32(np.random.default_rng(1).normal(size=(*shape, spec.obs_size)))
+    places = jnp.stack(jnp.meshgrid(*map(jnp.arange, shape), indexing="ij"), axis=-1).reshape(-1, 3)
+
+    def alone(states, obs):
+        pick = lambda tree, i: jax.tree.map(lambda x: x[i], tree)
+        one = lambda at: agent.act(pick(states, at[0]), obs[tuple(at)], pick(worlds, at[1]), None)
+        return jax.lax.map(one, places).reshape(*shape, -1)
+
+    many = lambda states, obs: actions(agent, states, worlds, worlds, obs, None)
+    together, apart = (quick(f, states, obs)(states, obs) for f in (many, alone))
+    assert np.ptp(np.asarray(apart), axis=(0, 2)).min() > 0.01
+    np.testing.assert_allclose(together, apart, atol=1e-5 if jax.default_backend() == "cpu" else 0.02)
 
 
 @pytest.mark.parametrize("told", CONDITIONINGS)
