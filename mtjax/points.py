@@ -128,5 +128,5 @@ def spread(points: Sequence[Point], seeds: Array) -> tuple[Array, dict[str, Arra
     """The seed of each number of S, and the values (S,) by name; without points, the seeds (S,) alone."""
     if not points:
         return seeds, None
-    column = lambda name: np.repeat(np.float32([point[name] for point in points]), len(seeds))
+    column = lambda name: np.repeat(np.asarray([point[name] for point in points], np.float32), len(seeds))
     return jnp.tile(seeds, len(points)), {name: jnp.asarray(column(name)) for name in points[0]}

@@ -232,12 +232,27 @@ def carry_on(folder: Path) -> None:
                 words = shlex.join([f"--resume={folder}", *cli.import_flag(program.family)])
                 print(f"stopped; the state is saved. Go on with:\n  python -m mtjax.train {words}")
                 return
+            _draw(program, run)
         except FloatingPointError as error:
             print(f"{label}: {error}", flush=True)
             (run / _DIVERGED).write_text(f"{error}\n")
         (folder / "sweep.csv").unlink(missing_ok=True)
         append_rows(folder / "sweep.csv", rows(runs))
     print(f"{table(rows(runs))}\nsweep: {folder}")
+
+
+def _draw(program: Program, run: Path) -> None:
+    """Draw the return on training tasks over steps, a line for each setting of which no seed diverged."""
+    from mtjax import plot
+
+    evaluations, count = load_evaluations(run / "evaluations.npz"), program.plan.seeds
+    curves = {}
+    for p, point in enumerate(program.points or ({},)):
+        returns = evaluations.returns["train"][p * count : (p + 1) * count]
+        if np.isfinite(returns).all():
+            curves[", ".join(f"{name} {value}" for name, value in _values(program, point).items())] = returns
+    if curves:
+        plot.learning_curve(run / "curve.png", evaluations.steps, curves, f"{program.agent} on {program.env}")
 
 
 def last(program: Program, run: Path) -> Evaluations | None:

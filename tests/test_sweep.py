@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import SHORT_RUN
-from probes import QUICK, Walk, learner, random_batch, tasks_of, tiny
+from probes import QUICK, Walk, random_batch, tasks_of, tiny
 
 import mtjax
 import mtjax.evaluate
@@ -18,9 +18,10 @@ import mtjax.train
 from mtjax import cli, loop, points, sweep
 from mtjax.agents import PARTS
 from mtjax.agents import settings as settings_of
+from mtjax.log import Console
 from mtjax.loop import Settings
 from mtjax.points import Varied
-from mtjax.run import train
+from mtjax.run import Plan, _Run, train
 from mtjax.types import InputError, Outcome, Spec
 
 SMALL = Settings(num_envs=4, batch_size=8, replay_size=200, warmup_steps=5, chunk_steps=20)
@@ -113,14 +114,17 @@ def _run(env, agent, seeds, knobs=None, chunks=2):
     return state, metrics
 
 
+_NAMES = ("actor_lr", "critic_lr", "temperature_lr", "gamma", "tau", "initial_temperature", "target_entropy")
+_NAMES = (*_NAMES, "weight_decay", "max_gradient_norm", "return_range")
 POINTS = (
-    {"actor_lr": 1e-3, "gamma": 0.9, "initial_temperature": 0.1, "weight_decay": 0.0, "max_gradient_norm": 0.0},
-    {"actor_lr": 1e-2, "gamma": 0.5, "initial_temperature": 1.0, "weight_decay": 0.1, "max_gradient_norm": 0.1},
+    dict(zip(_NAMES, (1e-3, 2e-3, 1e-3, 0.9, 0.01, 0.1, -0.5, 0.0, 0.0, 10.0), strict=True)),
+    dict(zip(_NAMES, (1e-2, 1e-3, 3e-3, 0.5, 0.1, 1.0, 0.5, 0.1, 0.1, 5.0), strict=True)),
 )
 
 
 def test_a_point_trains_as_the_run_with_its_values():
     """Both seeds of two points, one with clipping and decay and one without, against plain runs of the same seeds."""
+    assert set(_NAMES) == set(points.numbers(tiny("sac", scaling="return")))
     env, agent, seeds = Walk(), tiny("sac", scaling="return"), jnp.arange(2, dtype=jnp.uint32)
     state, metrics = _run(env, Varied(agent), *points.spread(POINTS, seeds))
     learned = jax.device_get(state.agent.learner)
@@ -136,28 +140,6 @@ def test_a_point_trains_as_the_run_with_its_values():
     first, second = (plain[p][0].agent.critic for p in range(2))
     apart = jax.tree.map(lambda x, y: float(jnp.max(jnp.abs(x - y))), first, second)
     assert max(jax.tree.leaves(apart)) > 0.02  # the values matter by far more than the tolerance
-
-
-@pytest.mark.parametrize("name", ["actor_lr", "critic_lr", "temperature_lr", "gamma", "tau", "target_entropy"])
-def test_each_number_of_an_update_reaches_it(name):
-    """One update at two values of it alone, against those of agents that have them."""
-    agent, tasks = tiny("sac"), tasks_of("one-step")
-    init, update = learner(agent, tasks, 8)
-    state, batch, key = init(tasks, jax.random.key(1)), random_batch(0, 2, 8), jax.random.key(2)
-    state = state._replace(target=jax.tree.map(lambda x: x + 0.1, state.target))
-    value = {"gamma": 0.5, "target_entropy": 1.0}.get(name, 0.1)
-    varied = jax.jit(Varied(agent).update, compiler_options=QUICK)
-    for x in (points.numbers(agent)[name], value):
-        plain = jax.jit(points.at(agent, {name: x}).update, compiler_options=QUICK)
-        expected, _ = plain(state, batch, tasks, key)
-        found, _ = varied(points.Swept(state, {name: jnp.float32(x)}), batch, tasks, key)
-        assert found.knobs[name] == np.float32(x)
-        for ours, theirs in zip(jax.tree.leaves(found.learner), jax.tree.leaves(expected), strict=True):
-            np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-5)
-    before, _ = update(state, batch, tasks, key)
-    parts = (before.actor, before.critic, before.target, before.log_temperature)
-    after = (expected.actor, expected.critic, expected.target, expected.log_temperature)
-    assert not all(np.allclose(x, y, atol=1e-3) for x, y in zip(*map(jax.tree.leaves, (parts, after)), strict=True))
 
 
 def test_one_point_that_diverges_does_not_end_the_others():
@@ -313,7 +295,10 @@ def test_a_sweep_leaves_a_table_of_all_settings(swept):
     for p, row in enumerate(rows[:2]):
         assert float(row["train"]) == pytest.approx(returns[2 * p : 2 * p + 2].mean(), rel=1e-5)
         assert float(row["train_low"]) <= float(row["train"]) <= float(row["train_high"])
-    assert rows[2]["train"] == ""
+    assert rows[2]["train"] == "" and (swept / "run-2" / "diverged.txt").exists()
+    assert (swept / "run-1" / "curve.png").exists()
+    header = (swept / "run-1" / "metrics.csv").read_text().splitlines()[0]
+    assert header.startswith("seed,actor_lr,iteration,")
     text = sweep.table(sweep.rows(sweep._runs(swept)))
     assert "2 of 2 seeds diverged" in text and "highest on training tasks" in text and len(text.splitlines()) == 5
 
@@ -343,6 +328,21 @@ def test_a_run_of_several_points_is_not_fine_tuned_by_name(swept):
     """Which of them would be a guess."""
     with pytest.raises(InputError, match="holds 2 of a sweep"):
         cli.parse([f"--from={swept / 'run-1'}", "--env=finger-short"])
+
+
+def test_fine_tuning_begins_every_point_with_the_same_seeds(swept):
+    """Three seeds of each of two points, from a run of two seeds: 0, 1, 0 and again 0, 1, 0."""
+    start = mtjax.load(swept / "run-1", seed=0)
+    found, tasks = ({"tau": 0.1}, {"tau": 0.2}), start.env.tasks("train")
+    run = _Run(start.env, Varied(start.agent), SMALL, Plan(seeds=3), None, Console(1, quiet=True), found)
+    shapes = jax.eval_shape(lambda: loop.init(start.env, run.agent, SMALL, tasks, *run.spread)).agent
+    fresh = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)._replace(knobs=run.spread[1])
+    state = run.adopt(start, tasks, fresh)
+    np.testing.assert_array_equal(state.knobs["tau"], np.float32([0.1] * 3 + [0.2] * 3))
+    began = np.asarray(start.states.log_temperature)
+    np.testing.assert_array_equal(state.learner.log_temperature, began[[0, 1, 0, 0, 1, 0]])
+    assert np.any(began[0] != began[1])
+    assert jax.tree.structure(state) == jax.tree.structure(fresh)
 
 
 def test_evaluation_is_of_one_point(swept, tmp_path, capsys):
