@@ -335,8 +335,9 @@ def test_fine_tuning_begins_every_point_with_the_same_seeds(swept):
     start = mtjax.load(swept / "run-1", seed=0)
     found, tasks = ({"tau": 0.1}, {"tau": 0.2}), start.env.tasks("train")
     run = _Run(start.env, Varied(start.agent), SMALL, Plan(seeds=3), None, Console(1, quiet=True), found)
-    shapes = jax.eval_shape(lambda: loop.init(start.env, run.agent, SMALL, tasks, *run.spread)).agent
-    fresh = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)._replace(knobs=run.spread[1])
+    seeds, knobs = run.spread
+    shapes = jax.eval_shape(lambda: loop.init(start.env, run.agent, SMALL, tasks, seeds, knobs)).agent
+    fresh = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)._replace(knobs=knobs)
     state = run.adopt(start, tasks, fresh)
     np.testing.assert_array_equal(state.knobs["tau"], np.float32([0.1] * 3 + [0.2] * 3))
     began = np.asarray(start.states.log_temperature)
