@@ -50,6 +50,11 @@ class Program:
     """A run's folder whose agent to fine-tune on this environment's tasks. Agent and networks are the run's; rates of
     learning and --tune may be given. What every task has for itself begins as that of the run's nearest training task,
     and seeds beyond the run's begin with its first ones again."""
+    sweep: tuple[str, ...] = ()
+    """Train once for every combination of values: agent.actor-lr=1e-4,1e-3 agent.num-experts=2,4 and so on, flags
+    without their dashes. The agent's numbers vary inside one program, beside the seeds; whatever else varies is one
+    program after another. A table of all settings lies in the sweep's folder, whose name --resume takes too."""
+    points: Annotated[tuple[dict[str, float], ...], tyro.conf.Suppress] = ()
     list: bool = False
     """Print the families and agents, and stop."""
     plan: Annotated[Plan, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Plan)
@@ -70,6 +75,8 @@ def parse(argv: Sequence[str]) -> Program:
     env_name = _peel(argv, "env", Program.env)
     start = _peel(argv, "from", "")
     begun = from_json(Path(start) / "config.json") if start or "--from=" in argv else None
+    if begun is not None and begun.points:
+        raise InputError(f"--from takes a run of one setting, and {start!r} holds {len(begun.points)} of a sweep")
     agent_name = _peel(argv, "agent", Program.agent if begun is None else begun.agent)
     preset_name = _peel(argv, "preset", Program.preset)
     if preset_name not in PRESETS:
@@ -215,7 +222,7 @@ def flags(program: Any, prefix: str = "--") -> list[str]:
     names = []
     for field in dataclasses.fields(program):
         value, name = getattr(program, field.name), field.name.replace("_", "-")
-        if name in ("vary", "context-ranges"):  # a flag for each parameter, taken out before; and no flag
+        if name in ("vary", "context-ranges", "points"):  # a flag for each parameter, taken out before; and no flags
             continue
         if name == "learner":
             names += [f"--agent.{setting.replace('_', '-')}" for setting in settings(value) if setting != "tune"]
@@ -291,6 +298,8 @@ def from_json(path: Path) -> Program:
             preset=record["preset"],
             runs=record["runs"],
             start=record.get("start", ""),
+            sweep=tuple(record.get("sweep", ())),
+            points=tuple(record.get("points", ())),
             plan=Plan(**record["plan"]),
             training=Settings(**record["training"]),
             family=make(record["env"], **record["family"]),

@@ -28,6 +28,8 @@ class Request:
 
     run: str = ""
     """The run's folder."""
+    point: int = 0
+    """Which setting of a run that holds several of a sweep: its number in sweep.csv."""
     episodes: int = 10
     """Episodes of each task and seed."""
     seed: int = 0
@@ -42,10 +44,11 @@ def main(argv: Sequence[str]) -> None:
     """Score the run, print the table, and leave table, plot and films in a new folder inside the run's."""
     request = _parse(argv)
     enable_compile_cache()
-    policy = load(request.run)
+    seed = _first_seed(request)
+    policy = load(request.run, seed)
     if request.video and not isinstance(policy.family, Domain):
         raise InputError("only MuJoCo families can be filmed; leave out --video")
-    found = diagnostics.diagnose(policy, *load_experience(request.run)) if request.diagnostics else None
+    found = diagnostics.diagnose(policy, *load_experience(request.run, seed)) if request.diagnostics else None
     episodes = score(policy, request.episodes, request.seed)
     directory = _new_folder(Path(request.run))
     print(task_table(policy, episodes))
@@ -72,6 +75,14 @@ def _parse(argv: Sequence[str]) -> Request:
     if request.episodes < 1 or request.seed < 0:
         raise InputError("episodes must be at least 1 and seed at least 0")
     return request
+
+
+def _first_seed(request: Request) -> int:
+    """The first number of a setting's seeds."""
+    program = cli.from_json(Path(request.run) / "config.json")
+    if not 0 <= request.point < max(len(program.points), 1):
+        raise InputError(f"point must be from 0 to {max(len(program.points), 1) - 1}, not {request.point}")
+    return request.point * program.plan.seeds
 
 
 def score(policy: Policy, episodes: int, seed: int = 0) -> dict[str, np.ndarray]:

@@ -79,8 +79,8 @@ def number(x: Any) -> str:
 class Console:
     """Live progress: a bar on a terminal, plain lines elsewhere. Silent if asked to be."""
 
-    def __init__(self, total_steps: int, quiet: bool = False):
-        self.total, self.quiet, self.bar = total_steps, quiet, None
+    def __init__(self, total_steps: int, quiet: bool = False, label: str = ""):
+        self.total, self.quiet, self.bar, self.label = total_steps, quiet, None, f"{label}  " if label else ""
         if quiet or not sys.stdout.isatty():
             return
         from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -100,7 +100,7 @@ class Console:
         """Show where training is; ``returns`` (S, T) of this chunk's episodes, NaN where none ended."""
         known = returns[np.isfinite(returns)]
         score = f"return {known.mean():.0f} ({known.min():.0f} to {known.max():.0f})" if known.size else "return -"
-        text = f"{steps:,} of {self.total:,} steps  {seconds:.1f} s  {rate:,.0f} steps/s  {score}"
+        text = f"{self.label}{steps:,} of {self.total:,} steps  {seconds:.1f} s  {rate:,.0f} steps/s  {score}"
         if self.bar is not None:
             self.bar.update(self.task, completed=steps, description=text)
         else:

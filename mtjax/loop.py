@@ -16,6 +16,7 @@ import jax.numpy as jnp
 
 from mtjax import hindsight
 from mtjax import replay as rings
+from mtjax.points import Varied
 from mtjax.replay import Replay
 from mtjax.tasks import episode_task
 from mtjax.types import Agent, Array, Env, InputError, Key, Metrics, Outcome, Spec, Step, Task, Transition
@@ -82,17 +83,24 @@ _REPLAY = Replay(rows=0, position=None, size=None)  # type: ignore  # its axes u
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
-def init(env: Env, agent: Agent, settings: Settings, tasks: Task, seeds: Array) -> TrainState:
-    """Return a fresh training state for ``seeds`` (S,) on training ``tasks`` (T, ...)."""
+def init(
+    env: Env, agent: Agent, settings: Settings, tasks: Task, seeds: Array, knobs: dict[str, Array] | None = None
+) -> TrainState:
+    """Return a fresh training state for ``seeds`` (S,) on training ``tasks`` (T, ...).
+
+    Args:
+        knobs: values (S,) of an agent's numbers that vary between seeds, if it is a ``Varied``.
+    """
     if settings.hindsight:
         hindsight.require(env)
     num_tasks = len(tasks.id)
     shape = (len(seeds), num_tasks, settings.num_envs)
     key, agent_key, reset_key, warmup_key = _split(jax.vmap(jax.random.key)(seeds), 4)
     worlds, start = begin(env, tasks, _world_keys(reset_key, shape))
+    point = () if knobs is None else (knobs,)
     blank = lambda _: rings.init(_blank_transition(env.spec, tasks), num_tasks, settings.capacity)
     return TrainState(
-        agent=jax.vmap(lambda key: agent.init(env.spec, tasks, key))(agent_key),
+        agent=jax.vmap(lambda key, *point: agent.init(env.spec, tasks, key, *point))(agent_key, *point),
         env=start.state,
         task=None if tasks.draws is None else worlds,
         obs=start.obs,
@@ -234,7 +242,8 @@ def _collect(env, agent, settings, tasks, state: TrainState, warming, key: Key, 
     transition = Transition(state.obs, action, step.reward, 1.0 - step.terminated, step.obs, context)
 
     age, total = state.age + 1, state.total + step.reward
-    discounted = agent.gamma * state.discounted + step.reward
+    gamma = agent.discounts(state.agent) if isinstance(agent, Varied) else agent.gamma
+    discounted = gamma * state.discounted + step.reward
     ended = step.terminated | (age >= env.episode_length)
 
     def restart(_):

@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mtjax import checkpoint, cli, loop
+from mtjax import checkpoint, cli, loop, points
 from mtjax.agents import SAC
 from mtjax.envs import Family
 from mtjax.history import History, forget, remember
@@ -22,7 +22,7 @@ class Policy:
     env: Family | History  # what the agent acts in: the family, showing past steps if the agent looks at any
     agent: SAC
     state: Any  # of one seed
-    states: Any  # of every seed, leading S
+    states: Any  # of every seed, leading S; of a sweep, those of one point
     seeds: Array  # (S,)
 
     def __call__(self, obs: Array, task: Task, key: Key | None = None) -> Array:
@@ -40,33 +40,51 @@ def load(directory: str | Path, seed: int = 0) -> Policy:
 
     Args:
         directory: the run's folder.
-        seed: which of the run's seeds, counted from 0.
+        seed: which of the run's seeds, counted from 0. A run of a sweep has all its seeds for each of its points:
+            number ``k`` is seed ``k % seeds`` of point ``k // seeds``, and the policy's agent is the one at that point.
 
     Raises:
         InputError: the folder is not a run, it has no such seed, or its checkpoint is missing or damaged.
     """
     directory = Path(directory)
     program = cli.from_json(directory / "config.json")
-    if not 0 <= seed < program.plan.seeds:
-        raise InputError(f"seed must be from 0 to {program.plan.seeds - 1}, counted from the run's first, not {seed}")
-    seeds = program.plan.seed + jnp.arange(program.plan.seeds)
-    states = checkpoint.load_agent(directory / "checkpoints", _shapes(program, seeds))
-    env = remember(program.family, program.learner.history)
-    return Policy(env, program.learner, jax.tree.map(lambda x: x[seed], states), states, seeds)
+    count = program.plan.seeds
+    last = count * max(len(program.points), 1) - 1
+    if not 0 <= seed <= last:
+        raise InputError(f"seed must be from 0 to {last}, counted from the run's first, not {seed}")
+    states = checkpoint.load_agent(directory / "checkpoints", shapes(program))
+    agent = program.learner
+    if program.points:
+        rows = _of_point(program, seed)
+        agent = points.at(agent, program.points[seed // count])
+        states = jax.tree.map(lambda x: x[rows], states.learner)
+    env, seeds = remember(program.family, agent.history), program.plan.seed + jnp.arange(count)
+    return Policy(env, agent, jax.tree.map(lambda x: x[seed % count], states), states, seeds)
 
 
-def load_experience(directory: str | Path) -> tuple[Replay, int]:
+def _of_point(program: cli.Program, seed: int) -> slice:
+    """The rows of S that belong to one number's point."""
+    first = seed - seed % program.plan.seeds
+    return slice(first, first + program.plan.seeds)
+
+
+def load_experience(directory: str | Path, seed: int = 0) -> tuple[Replay, int]:
     """Read what a run learned from: the replay of its last checkpoint, and the size of its batches.
+
+    Of a run of a sweep it is what the seeds of one point learned from, by ``seed`` as for ``load``.
 
     Raises:
         InputError: as for ``load``.
     """
     program = cli.from_json(Path(directory) / "config.json")
-    seeds = program.plan.seed + jnp.arange(program.plan.seeds)
-    replay = checkpoint.load_replay(Path(directory) / "checkpoints", _shapes(program, seeds))
-    return replay, program.training.batch_size
+    replay = checkpoint.load_replay(Path(directory) / "checkpoints", shapes(program))
+    rows = _of_point(program, seed)
+    return replay._replace(rows=jax.tree.map(lambda x: x[rows], replay.rows)), program.training.batch_size
 
 
-def _shapes(program: cli.Program, seeds: Array) -> loop.TrainState:
+def shapes(program: cli.Program) -> loop.TrainState:
+    """The shapes of a run's training state."""
     env = remember(program.family, program.learner.history)
-    return jax.eval_shape(lambda: loop.init(env, program.learner, program.training, env.tasks("train"), seeds))
+    agent = points.Varied(program.learner) if program.points else program.learner
+    spread = points.spread(program.points, program.plan.seed + jnp.arange(program.plan.seeds))
+    return jax.eval_shape(lambda: loop.init(env, agent, program.training, env.tasks("train"), *spread))  # type: ignore

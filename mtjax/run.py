@@ -8,7 +8,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,10 +16,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax import checkpoint, finetune, log
+from mtjax import checkpoint, finetune, log, points
 from mtjax.evaluation import Evaluations, evaluate
 from mtjax.history import remember
 from mtjax.loop import Settings, TrainState, init, run_chunk
+from mtjax.points import Point, Sweep, Varied
 from mtjax.types import SPLITS, Agent, Env, InputError
 
 if TYPE_CHECKING:
@@ -58,6 +59,7 @@ class Result(NamedTuple):
     seconds: float  # spent training, without compiling and evaluating
     finished: bool  # False if a signal stopped it
     directory: Path | None
+    points: tuple[Point, ...] = ()  # of a sweep: number k of S is seed k % seeds of point k // seeds
 
 
 class Programs(NamedTuple):
@@ -78,9 +80,11 @@ def train(
     eval_episodes: int = Plan.eval_episodes,
     settings: Settings | None = None,
     start: "Policy | None" = None,
+    sweep: Sweep = (),
     directory: str | Path | None = None,
     resume: bool = False,
     quiet: bool = True,
+    label: str = "",
     on_chunk: Callable[[dict[str, Any]], None] | None = None,
 ) -> Result:
     """Train an agent on a family of tasks.
@@ -94,27 +98,35 @@ def train(
         settings: how to collect and learn; by default ``Settings()``.
         start: fine-tune what a run learned, from ``mtjax.load``: ``env`` is ``new.scaled_as(start.env)`` and ``agent``
             is ``start.agent``, of which rates and ``tune`` may be replaced (``finetune.adopt`` says what is kept).
+        sweep: numbers of the agent that vary, all in one program, ``{"actor_lr": [1e-4, 1e-3], "gamma": [0.98, 0.99]}``
+            for every combination or a list of points ``{"actor_lr": 1e-4, "gamma": 0.98}``. Every point has all seeds,
+            and the S axis of whatever comes back holds them point by point. A seed whose numbers stop being finite is
+            given up, its returns being NaN, and the others go on.
         directory: an existing folder for metrics, evaluations and checkpoints; None writes nothing.
         resume: go on from the newest checkpoint in ``directory``.
         quiet: print nothing.
+        label: what lines of progress begin with.
         on_chunk: called with each chunk's first row of metrics.
 
     Raises:
         InputError: an argument cannot be used.
-        FloatingPointError: numbers stopped being finite; the message names task and step.
+        FloatingPointError: numbers stopped being finite (in a sweep, of all seeds); the message names task and step.
     """
     plan = Plan(steps, seed, seeds, eval_every, eval_episodes)
-    if start is not None:
-        finetune.require_fit(start, env, agent)  # type: ignore
+    found = points.grid(sweep)
+    for learner in [points.at(agent, point) for point in found] or [agent]:  # type: ignore
+        if start is not None:
+            finetune.require_fit(start, env, learner)  # type: ignore
     directory = None if directory is None else Path(directory)
     started = time.monotonic()
     tasks, env = env.tasks("train"), remember(env, agent.history)
     settings = fit_chunk(settings or Settings(), len(tasks.id), steps)
-    run = _Run(env, agent, settings, plan, directory, log.Console(plan.steps, quiet))
+    learner = Varied(agent) if found else agent  # type: ignore
+    run = _Run(env, learner, settings, plan, directory, log.Console(plan.steps, quiet, label), found)
     try:
         programs, state = run.begin(resume)
         if start is not None and not resume:
-            state = state._replace(agent=finetune.adopt(start, agent, tasks, state.agent))  # type: ignore
+            state = state._replace(agent=run.adopt(start, tasks, state.agent))
         run.console.say(f"compiled in {time.monotonic() - started:.1f} s")
         return run.drive(programs, state, started, on_chunk)
     finally:
@@ -137,10 +149,30 @@ class _Run:
     plan: Plan
     directory: Path | None
     console: log.Console
+    points: tuple[Point, ...] = ()
+
+    @cached_property
+    def spread(self) -> tuple[jax.Array, dict[str, jax.Array] | None]:
+        """Seeds (S,) of all points, and the values (S,) that vary between them."""
+        return points.spread(self.points, self.plan.seed + jnp.arange(self.plan.seeds))
 
     @property
     def seeds(self) -> jax.Array:
-        return self.plan.seed + jnp.arange(self.plan.seeds)
+        return self.spread[0]
+
+    def point(self, number: int) -> Point:
+        """The values of one of S that vary."""
+        return self.points[number // self.plan.seeds] if self.points else {}
+
+    def adopt(self, start: "Policy", tasks: Any, fresh: Any) -> Any:
+        """The agent's state, fine-tuning what a run learned; every point begins with the same seeds of it."""
+        if not isinstance(self.agent, Varied):
+            return finetune.adopt(start, self.agent, tasks, fresh)  # type: ignore
+        apart = lambda x: x.reshape(len(self.points), self.plan.seeds, *x.shape[1:])
+        together = lambda x: x.reshape(-1, *x.shape[2:])
+        adopt = partial(finetune.adopt, start, self.agent.agent, tasks)
+        learner = jax.tree.map(together, jax.vmap(adopt)(jax.tree.map(apart, fresh.learner)))
+        return fresh._replace(learner=learner)
 
     @cached_property
     def steps_per_iteration(self) -> int:
@@ -155,7 +187,7 @@ class _Run:
         """Compile every program at the same time, and make or restore the state; evaluation may be ready later."""
         env, agent, settings = self.env, self.agent, self.settings
         tasks, pool = env.tasks("train"), ThreadPoolExecutor(2)
-        fresh = init.lower(env, agent, settings, tasks, self.seeds)
+        fresh = init.lower(env, agent, settings, tasks, *self.spread)
         shapes = fresh.out_info
         self._describe(shapes)
         make = pool.submit(fresh.compile)
@@ -163,7 +195,7 @@ class _Run:
         score = pool.submit(self._compile_evaluation, shapes)
         pool.shutdown(wait=False)
         programs = Programs(chunk.compile(), lambda *arguments: score.result()(*arguments))
-        return programs, self._restore(shapes) if resume else make.result()(tasks, self.seeds)
+        return programs, self._restore(shapes) if resume else make.result()(tasks, *self.spread)
 
     def _compile_evaluation(self, shapes: TrainState) -> Callable:
         everything, number = self.env.tasks("all"), jnp.int32(0)
@@ -195,6 +227,7 @@ class _Run:
         steps = int(state.iteration) * self.steps_per_iteration
         evaluations = self._earlier_evaluations(steps)
         rows, seconds = [], self._earlier_seconds(int(state.iteration))
+        lost = np.zeros(len(self.seeds), bool)
         with stop_signals() as stopping:
             while steps < self.plan.steps and not stopping:
                 before, steps_before = time.monotonic(), steps
@@ -202,7 +235,7 @@ class _Run:
                 metrics = jax.device_get(metrics)
                 elapsed = time.monotonic() - before
                 seconds += elapsed
-                _require_finite(metrics["bad_step"], steps_before // self.steps_per_iteration)
+                lost |= self._lose(metrics["bad_step"], steps_before // self.steps_per_iteration, lost)
                 steps += self.settings.chunk_steps * self.steps_per_iteration
                 common = {
                     "iteration": steps // self.steps_per_iteration,
@@ -210,19 +243,30 @@ class _Run:
                     "seconds": f"{seconds:.3f}",
                     "wall_seconds": f"{time.monotonic() - started:.3f}",
                 }
-                new = log.metric_rows(metrics, np.asarray(self.seeds), common)
+                lines = log.metric_rows(metrics, np.asarray(self.seeds), common)
+                new = [{"seed": row["seed"], **self.point(k), **row} for k, row in enumerate(lines)]
                 rows += new
                 self._write(new)
-                rate = (steps - steps_before) * self.plan.seeds / elapsed
+                rate = (steps - steps_before) * len(self.seeds) / elapsed
                 self.console.progress(steps, seconds, rate, metrics["return"])
                 if on_chunk is not None:
                     on_chunk(new[0])
                 due = steps // self.eval_every > steps_before // self.eval_every
                 if due or steps >= self.plan.steps:
-                    evaluations = self._evaluate(programs.evaluate, state, evaluations, steps)
+                    evaluations = self._evaluate(programs.evaluate, state, evaluations, steps, lost)
                 if due or stopping or steps >= self.plan.steps:
                     self._save(state)
-        return Result(state, evaluations, rows, seconds, steps >= self.plan.steps, self.directory)
+        return Result(state, evaluations, rows, seconds, steps >= self.plan.steps, self.directory, self.points)
+
+    def _lose(self, bad_step: np.ndarray, first_step: int, lost: np.ndarray) -> np.ndarray:
+        """Which seeds (S,) are not finite any more; one that diverged must not end a sweep of many."""
+        broken = np.any(bad_step >= 0, axis=1)
+        if not self.points or np.all(broken | lost):
+            _require_finite(bad_step, first_step)
+        for k in np.flatnonzero(broken & ~lost):
+            values = ", ".join(f"{name}={value:g}" for name, value in self.point(int(k)).items())
+            self.console.say(f"seed {self.seeds[k]} of {values} diverged and is given up")
+        return broken
 
     def _write(self, rows: list[dict[str, Any]]) -> None:
         if self.directory is not None:
@@ -232,10 +276,11 @@ class _Run:
         if self.directory is not None:
             checkpoint.save(self.directory / "checkpoints", state)
 
-    def _evaluate(self, program: Callable, state: TrainState, past: Evaluations, steps: int) -> Evaluations:
+    def _evaluate(self, program: Callable, state: TrainState, past: Evaluations, steps: int, lost) -> Evaluations:
         """Evaluate on all splits, and add the result to the run's evaluations."""
         number = jnp.int32(len(past.steps))
-        returns = np.asarray(program(state.agent, self.env.tasks("all"), self.seeds, number))
+        returns = np.array(program(state.agent, self.env.tasks("all"), self.seeds, number))
+        returns[lost] = np.nan
         grown = {}
         for split, old in past.returns.items():
             rows = np.asarray(self.env.tasks(split).id)
@@ -243,7 +288,7 @@ class _Run:
         evaluations = Evaluations(np.append(past.steps, steps), grown, past.values)
         if self.directory is not None:
             save_evaluations(self.directory / "evaluations.npz", evaluations)
-        means = ", ".join(f"{s} {x[:, -1].mean():.0f}" for s, x in grown.items() if x.size)
+        means = ", ".join(f"{s} {x[~lost, -1].mean():.0f}" for s, x in grown.items() if x.size)
         self.console.say(f"evaluation at {steps:,} steps: {means}")
         return evaluations
 
@@ -255,7 +300,7 @@ class _Run:
             kept = past.steps <= steps
             return Evaluations(past.steps[kept], {s: x[:, kept] for s, x in past.returns.items()}, past.values)
         tables = {split: self.env.tasks(split) for split in SPLITS}
-        empty = lambda table: np.zeros((self.plan.seeds, 0, len(table.id), self.plan.eval_episodes), np.float32)
+        empty = lambda table: np.zeros((len(self.seeds), 0, len(table.id), self.plan.eval_episodes), np.float32)
         return Evaluations(
             steps=np.zeros(0, np.int64),
             returns={split: empty(table) for split, table in tables.items()},

@@ -26,6 +26,11 @@ _PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-ch
 
 def main(argv: Sequence[str]) -> None:
     """Parse the command line, train, and say where the run is and how each split scored."""
+    from mtjax import sweep
+
+    argv = cli.import_files(argv)
+    if sweep.wanted(argv):
+        return sweep.main(argv)
     program = cli.parse(argv)
     if program.list:
         print(cli.catalogue())
@@ -33,31 +38,39 @@ def main(argv: Sequence[str]) -> None:
     resume = any(word.split("=", 1)[0] == "--resume" for word in argv)
     directory = Path(program.resume) if resume else None
     if directory is not None:
-        program = _resumed(program, directory, argv)
+        program = recorded(program, directory, argv)
     enable_compile_cache()
-    _check(program)
-    start = _start(program) if directory is None else None
+    check(program)
+    start = starting(program) if directory is None else None
     if directory is not None:
-        _record_steps(directory / "config.json", program.plan.steps)
+        record_steps(directory / "config.json", program.plan.steps)
     else:
         directory = new_directory(Path(program.runs), f"{program.env}-{program.agent}")
-        (directory / "config.json").write_text(cli.to_json(program, _circumstances(program)))
-    print(f"{program.agent} on {program.env}: {_summary(program)}\n{_origin(program)}run: {directory}", flush=True)
+        (directory / "config.json").write_text(cli.to_json(program, circumstances(program)))
+    _conclude(program, launch(program, directory, start, resume), directory)
+
+
+def launch(program: Program, directory: Path, start: Policy | None, resume: bool, label: str = "") -> Result:
+    """Run a program in its folder, from the start or from its newest checkpoint, and say what it is."""
+    said = f"{label}: {' '.join(program.sweep)}\n" if program.sweep else ""
+    origin = f"{_origin(program)}run: {directory}"
+    print(f"{said}{program.agent} on {program.env}: {_summary(program)}\n{origin}", flush=True)
     plan = dataclasses.asdict(program.plan)
-    result = train(
+    return train(
         program.family,
         program.learner,
         **plan,
         settings=program.training,
         start=start,
+        sweep=program.points,
         directory=directory,
         resume=resume,
+        label=label,
         quiet=False,
     )
-    _conclude(program, result, directory)
 
 
-def _resumed(program: Program, directory: Path, argv: Sequence[str]) -> Program:
+def recorded(program: Program, directory: Path, argv: Sequence[str]) -> Program:
     """The program of the run to go on with; ``--steps`` may extend it, and nothing else may change."""
     given = {word.split("=", 1)[0] for word in argv if word.startswith("--")}
     allowed = {"--resume", "--steps", "--import"}
@@ -69,7 +82,7 @@ def _resumed(program: Program, directory: Path, argv: Sequence[str]) -> Program:
     return dataclasses.replace(recorded, plan=dataclasses.replace(recorded.plan, steps=steps))
 
 
-def _record_steps(file: Path, steps: int) -> None:
+def record_steps(file: Path, steps: int) -> None:
     """Write how far a run goes now, so that resuming it once more goes as far."""
     record = json.loads(file.read_text())
     if record["plan"]["steps"] == steps:
@@ -81,7 +94,7 @@ def _record_steps(file: Path, steps: int) -> None:
     os.replace(new, file)
 
 
-def _check(program: Program) -> None:
+def check(program: Program) -> None:
     """Meet whatever the family's and the agent's constructors could not check before a run's folder is made."""
     from mtjax.agents.sac import load_vectors
 
@@ -97,7 +110,7 @@ def _check(program: Program) -> None:
         raise InputError("--reset-every throws away what --from takes from a run; give one of them")
 
 
-def _start(program: Program) -> Policy | None:
+def starting(program: Program) -> Policy | None:
     """What the run learned that is to be fine-tuned, if one is."""
     if not program.start:
         return None
@@ -130,7 +143,7 @@ def new_directory(root: Path, name: str) -> Path:
     raise InputError(f"cannot find a new name for a run in {str(root)!r}")
 
 
-def _circumstances(program: Program) -> dict:
+def circumstances(program: Program) -> dict:
     """What else decides a run's numbers: versions, device, engine; and the command that repeats it."""
     import jax
 
@@ -157,7 +170,7 @@ def repeat(program: Program) -> list[str]:
         value = getattr(program, part)
         items = (settings(value) if part == "learner" else dataclasses.asdict(value)).items()
         words += itertools.chain(*(_flag(prefix, name.replace("_", "-"), value) for name, value in items))
-    return words
+    return words + (["--sweep", *program.sweep] if program.sweep else [])
 
 
 def _flag(prefix: str, name: str, value: object) -> list[str]:

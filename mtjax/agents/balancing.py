@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from mtjax.agents import parts
 from mtjax.agents.rules import Mean
 from mtjax.types import Array, InputError, Key
 
@@ -103,7 +104,7 @@ class GradNorm(_Learned):
 
     @property
     def for_actor(self) -> Mean:
-        return dataclasses.replace(self, gradnorm_asymmetry=0.0)
+        return parts.put(self, gradnorm_asymmetry=0.0)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -4,9 +4,12 @@ An agent has one part of each kind. Their fields lie beside the agent's on the c
 no two kinds may use a field's name.
 """
 
+import copy
 import dataclasses
 from collections.abc import Mapping
 from typing import Any, TypeVar
+
+import jax
 
 from mtjax.names import frozen, nearest_error
 
@@ -40,3 +43,16 @@ def take(settings: dict[str, Any], part: P) -> P:
     """Return the part with those of the settings that are its own, which leave ``settings``."""
     own = {field.name for field in dataclasses.fields(part)} & set(settings)  # type: ignore
     return dataclasses.replace(part, **frozen({name: settings.pop(name) for name in own}))  # type: ignore
+
+
+def put(part: P, **values: Any) -> P:
+    """Return a copy of a frozen dataclass with other values, which may be traced and are not checked."""
+    changed = copy.copy(part)
+    for name, value in values.items():
+        object.__setattr__(changed, name, value)
+    return changed
+
+
+def is_zero(value: Any) -> bool:
+    """Whether a number is zero for good, and what it switches on needs no program; a traced one may be anything."""
+    return not isinstance(value, jax.Array) and value == 0

@@ -11,7 +11,7 @@ import numpy as np
 import optax
 
 from mtjax import normalize
-from mtjax.agents import surgery
+from mtjax.agents import parts, surgery
 from mtjax.agents.hyperparameters import Hyperparameters
 from mtjax.agents.trajectory import TrajectoryEncoder
 from mtjax.history import Seen, plain_obs_size, unpack
@@ -80,7 +80,8 @@ class SAC(Hyperparameters):
         obs, action = self._see(moments, jnp.zeros(spec.obs_size)), jnp.zeros(spec.action_size)
         features = self._features(num_tasks, jnp.int32(0), tasks.context[0], vectors)
         actor, critic = self.networks(num_tasks, features, obs, action, key)
-        log_temperature = jnp.full(1 if self.shared_temperature else num_tasks, np.log(self.initial_temperature))
+        log = jnp.log if isinstance(self.initial_temperature, Array) else np.log
+        log_temperature = jnp.full(1 if self.shared_temperature else num_tasks, log(self.initial_temperature))
         log_temperature = log_temperature.astype(jnp.float32)
         parameters = (actor, critic, log_temperature)
         memory = lambda rule, params: surgery.init(rule, params, num_tasks, self.gradient_scope == "per-layer")
@@ -108,9 +109,9 @@ class SAC(Hyperparameters):
 
     @property
     def _optimizers(self) -> tuple[optax.GradientTransformation, ...]:
-        clip = optax.clip_by_global_norm(self.max_gradient_norm) if self.max_gradient_norm else optax.identity()
-        decay = self.weight_decay
-        adam = lambda lr: optax.chain(clip, optax.adamw(lr, weight_decay=decay) if decay else optax.adam(lr))
+        clip = optax.identity() if parts.is_zero(self.max_gradient_norm) else clip_to(self.max_gradient_norm)
+        decay, plain = self.weight_decay, parts.is_zero(self.weight_decay)
+        adam = lambda lr: optax.chain(clip, optax.adam(lr) if plain else optax.adamw(lr, weight_decay=decay))
         some = lambda learn: optax.partition({True: learn, False: optax.set_to_zero()}, self._learns)
         chosen = adam if self.tune == "all" else lambda lr: some(adam(lr))
         return chosen(self.actor_lr), chosen(self.critic_lr), optax.adam(self.temperature_lr)
@@ -355,6 +356,11 @@ def least(values: Array) -> Array:
     them otherwise, and is then 0 / 0.
     """
     return jnp.take_along_axis(values, jnp.argmin(values, axis=0, keepdims=True), axis=0)[0]
+
+
+def clip_to(norm: Any) -> optax.GradientTransformation:
+    """Clip gradients to a global norm; a traced one may be 0, which does not clip."""
+    return optax.clip_by_global_norm(jnp.where(norm > 0, norm, jnp.inf) if isinstance(norm, Array) else norm)
 
 
 def descend(optimizer: optax.GradientTransformation, gradients: Any, memory: Any, params: Any) -> tuple[Any, Any]:

@@ -1,0 +1,355 @@
+"""Sweeps: a point of one program is the run with those values, and one command lays out all of them."""
+
+import csv
+import dataclasses
+import itertools
+import shutil
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import SHORT_RUN
+from probes import QUICK, Walk, random_batch, tasks_of, tiny
+
+import mtjax
+import mtjax.evaluate
+import mtjax.train
+from mtjax import cli, loop, points, sweep
+from mtjax.agents import PARTS
+from mtjax.agents import settings as settings_of
+from mtjax.log import Console
+from mtjax.loop import Settings
+from mtjax.points import Varied
+from mtjax.run import Plan, _Run, train
+from mtjax.types import InputError, Outcome, Spec
+
+SMALL = Settings(num_envs=4, batch_size=8, replay_size=200, warmup_steps=5, chunk_steps=20)
+
+
+# Points.
+
+
+def test_points_are_every_combination_in_order():
+    """The last name's values change fastest; a list of points is taken as it is."""
+    found = points.grid({"actor_lr": [1e-4, 1e-3], "gamma": [0.9, 0.99]})
+    assert [tuple(point.values()) for point in found] == [(1e-4, 0.9), (1e-4, 0.99), (1e-3, 0.9), (1e-3, 0.99)]
+    assert points.grid([{"tau": 1}, {"tau": 0.5}]) == ({"tau": 1.0}, {"tau": 0.5})
+    assert points.grid({}) == points.grid(()) == ()
+
+
+def test_seeds_lie_side_by_side_in_each_point():
+    """Number k is seed k % seeds of point k // seeds."""
+    seeds, knobs = points.spread(points.grid({"tau": [0.1, 0.2]}), jnp.arange(3) + 7)
+    np.testing.assert_array_equal(seeds, [7, 8, 9, 7, 8, 9])
+    np.testing.assert_array_equal(knobs["tau"], np.float32([0.1, 0.1, 0.1, 0.2, 0.2, 0.2]))
+    seeds, knobs = points.spread((), jnp.arange(2))
+    assert len(seeds) == 2 and knobs is None
+
+
+@pytest.mark.parametrize(
+    "given, said",
+    [
+        ({"actor_lr": [1e-3, -1.0]}, "actor-lr must be greater than 0, not -1.0"),
+        ({"gamma": [0.9, 1.5]}, "gamma must be in [0, 1]"),
+        ({"num_critics": [1, 2]}, "unknown number of this agent 'num_critics'"),
+        ({"actor_l": [1e-3]}, "did you mean 'actor_lr'?"),
+        ({"cagrad_radius": [0.5, 2.0]}, "cagrad-radius must be in (0, 1), not 2.0"),
+        ({"tau": []}, "no values to tau"),
+        ([{"tau": 0.1}, {"gamma": 0.9}], "the same names"),
+    ],
+)
+def test_values_are_refused_by_name_before_anything_compiles(given, said):
+    """By the constructors that refuse them when they are given plainly."""
+    with pytest.raises(InputError) as error:
+        train(Walk(), tiny("cagrad"), steps=100, sweep=given)
+    assert said in str(error.value)
+
+
+def test_a_point_is_the_agent_with_its_values():
+    """Those of parts too; whatever is not named stays."""
+    agent = tiny("cagrad", tau=0.1)
+    found = points.at(agent, {"cagrad_radius": 0.25, "gamma": 0.5})
+    assert found == tiny("cagrad", tau=0.1, cagrad_radius=0.25, gamma=0.5)
+    assert agent == tiny("cagrad", tau=0.1)
+
+
+def _variants():
+    """Agents that have every part between them, and every class of agent."""
+    kinds = {kind: [n for n in table if n not in ("popart", "input-map")] for kind, table in PARTS.items()}
+    columns = [kinds[kind] for kind in ("gradients", "value", "scaling", "sampler")]
+    for row in zip(*(itertools.islice(itertools.cycle(c), max(map(len, columns))) for c in columns), strict=True):
+        yield "sac", dict(zip(("gradients", "value", "scaling", "sampler"), row, strict=True))
+    yield "sac", {"scaling": "popart", "heads": "per-task", "weight_decay": 0.1, "max_gradient_norm": 1.0}
+    yield from ((name, {}) for name in ("distral", "brc", "deepmdp", "hip-bmdp"))
+
+
+@pytest.mark.parametrize("name, settings", _variants())
+def test_every_number_can_vary(name, settings):
+    """All at once, in every method: none decides what is compiled, and none is left out of what is."""
+    agent = tiny(name, **settings)
+    tasks, spec = tasks_of("one-step"), Spec(obs_size=1, action_size=1, context_size=1)
+    values = points.numbers(agent)
+    assert set(values) <= set(settings_of(agent)) and {"actor_lr", "gamma"} <= set(values)
+
+    def everything(knobs):
+        varied, key = Varied(agent), jax.random.key(0)
+        state = varied.init(spec, tasks, key, knobs)
+        state, _ = varied.update(state, random_batch(0, 2, 4), tasks, key)
+        one = jnp.ones((2, 3))
+        state = varied.observe(state, Outcome(one, one, one, one > 0, one < 0, jnp.int32(one)))
+        state = varied.reset(state, spec, tasks, key)
+        return varied.act(state, jnp.zeros(1), jax.tree.map(lambda x: x[0], tasks), key)
+
+    assert jax.eval_shape(everything, {name: jnp.float32(x) for name, x in values.items()}).shape == (1,)
+
+
+def _run(env, agent, seeds, knobs=None, chunks=2):
+    tasks = env.tasks()
+    init = loop.init.lower(env, agent, SMALL, tasks, seeds, knobs).compile(QUICK)
+    state = init(tasks, seeds, knobs)
+    run_chunk = loop.run_chunk.lower(env, agent, SMALL, tasks, state).compile(QUICK)
+    for _ in range(chunks):
+        state, metrics = run_chunk(tasks, state)
+    return state, metrics
+
+
+_NAMES = ("actor_lr", "critic_lr", "temperature_lr", "gamma", "tau", "initial_temperature", "target_entropy")
+_NAMES = (*_NAMES, "weight_decay", "max_gradient_norm", "return_range")
+POINTS = (
+    dict(zip(_NAMES, (1e-3, 2e-3, 1e-3, 0.9, 0.01, 0.1, -0.5, 0.0, 0.0, 10.0), strict=True)),
+    dict(zip(_NAMES, (1e-2, 1e-3, 3e-3, 0.5, 0.1, 1.0, 0.5, 0.1, 0.1, 5.0), strict=True)),
+)
+
+
+def test_a_point_trains_as_the_run_with_its_values():
+    """Both seeds of two points, one with clipping and decay and one without, against plain runs of the same seeds."""
+    assert set(_NAMES) == set(points.numbers(tiny("sac", scaling="return")))
+    env, agent, seeds = Walk(), tiny("sac", scaling="return"), jnp.arange(2, dtype=jnp.uint32)
+    state, metrics = _run(env, Varied(agent), *points.spread(POINTS, seeds))
+    learned = jax.device_get(state.agent.learner)
+    plain = [_run(env, points.at(agent, point), seeds) for point in POINTS]
+    for p, (alone, its_metrics) in enumerate(plain):
+        rows = slice(2 * p, 2 * p + 2)
+        for part in ("actor", "critic", "target", "log_temperature", "scales"):
+            ours, theirs = getattr(learned, part), getattr(alone.agent, part)
+            same = lambda x, y, rows=rows: np.testing.assert_allclose(x[rows], y, rtol=2e-3, atol=2e-4)
+            jax.tree.map(same, ours, theirs)
+        np.testing.assert_allclose(state.discounted[rows], alone.discounted, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(metrics["return"][rows], its_metrics["return"], rtol=1e-4)
+    first, second = (plain[p][0].agent.critic for p in range(2))
+    apart = jax.tree.map(lambda x, y: float(jnp.max(jnp.abs(x - y))), first, second)
+    assert max(jax.tree.leaves(apart)) > 0.02  # the values matter by far more than the tolerance
+
+
+def test_one_point_that_diverges_does_not_end_the_others():
+    """Its returns are none; those of the others, whose numbers are apart, are there. Rows say which point they are."""
+    settings = dataclasses.replace(SMALL, chunk_steps=15)
+    result = train(
+        Walk(), tiny("sac"), steps=240, seeds=2, eval_episodes=2, settings=settings, sweep={"actor_lr": [1e-3, 1e38]}
+    )
+    assert result.finished and result.points == ({"actor_lr": 1e-3}, {"actor_lr": 1e38})
+    assert [(row["seed"], row["actor_lr"]) for row in result.rows[:4]] == [(0, 1e-3), (1, 1e-3), (0, 1e38), (1, 1e38)]
+    returns = result.evaluations.returns["train"]
+    assert returns.shape[0] == 4
+    assert np.isfinite(returns[:2]).all() and np.isnan(returns[2:, -1]).all()
+
+
+# The command line.
+
+
+@pytest.mark.parametrize(
+    "words, found, rest",
+    [
+        (["--sweep", "agent.tau=0.1,1", "--seeds=2"], [("agent.tau", ("0.1", "1"))], ["--seeds=2"]),
+        (["--sweep=num_envs=2,4"], [("num-envs", ("2", "4"))], []),
+        (
+            ["--seeds", "2", "--sweep", "agent.hidden=8 8,16", "agent=sac,care", "--env=x"],
+            [("agent.hidden", ("8 8", "16")), ("agent", ("sac", "care"))],
+            ["--seeds", "2", "--env=x"],
+        ),
+    ],
+)
+def test_sweeps_are_read_out_of_a_command_line(words, found, rest):
+    """Until the next flag."""
+    axes, others = sweep.read(words)
+    assert [tuple(axis) for axis in axes] == found and others == rest
+
+
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        (["--sweep"], "--sweep needs flags and values"),
+        (["--sweep", "agent.tau"], "--sweep needs values, not 'agent.tau'"),
+        (["--sweep", "agent.tau=0.1,"], "--sweep needs values"),
+        (["--sweep", "agent.tau=0.1,0.1"], "a value of agent.tau twice"),
+        (["--sweep", "agent.tau=0.1", "agent.tau=0.2"], "gives agent.tau twice"),
+        (["--sweep", "seed=0,1"], "cannot vary seed"),
+        (["--sweep", "agent.tau=0.1,big"], "agent.tau is a number, and 'big' is none"),
+        (["--sweep", "agent.tau=0.1,2"], "tau in (0, 1]"),
+        (["--sweep", "agent.num-critics=1,0"], "num-critics must be greater than 0, not 0"),
+        (["--sweep", "agent.cagrad-radius=0.1,0.2"], "unknown number of this agent 'cagrad_radius'"),
+        (["--sweep", "agent.nonsense=1,2"], "unknown flag"),
+        (["--sweep", "agent.encoder=film,flim"], "did you mean 'film'?"),
+        (["--sweep", "agent.tau=0.1", "--resume=x"], "leave out --sweep"),
+    ],
+)
+def test_wrong_sweeps_are_refused(words, said, monkeypatch, tmp_path):
+    """Before any folder is made."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError) as error:
+        mtjax.train.main(words)
+    assert said in str(error.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_numbers_vary_inside_a_program_and_the_rest_between_programs():
+    """Switches, names of parts and widths too; a part's own setting may come with the part."""
+    axes = ["agent.gradients=mean,cagrad", "agent.tau=0.1,1", "agent.critic-layer-norm=true,false", "agent.gamma=0.5"]
+    found = sweep.programs(["--agent=sac", "--sweep", *axes, "--agent.hidden", "8"])
+    told = [(type(p.learner.gradients).__name__, p.learner.critic_layer_norm) for p in found]
+    assert told == [("Mean", True), ("Mean", False), ("CAGrad", True), ("CAGrad", False)]
+    for program in found:
+        assert program.points == ({"tau": 0.1, "gamma": 0.5}, {"tau": 1.0, "gamma": 0.5})
+        assert program.learner.hidden == (8,) and program.learner.tau != 0.1
+    assert found[1].sweep == (
+        "agent.gradients=mean",
+        "agent.critic-layer-norm=false",
+        "agent.tau=0.1,1",
+        "agent.gamma=0.5",
+    )
+    widths = sweep.programs(["--agent=sac", "--sweep", "agent.hidden=8 8,16"])
+    assert [p.learner.hidden for p in widths] == [(8, 8), (16,)] and not widths[0].points
+
+
+def test_the_command_of_a_run_repeats_its_part_of_the_sweep(tmp_path):
+    """And its record is read back as it was."""
+    (program,) = sweep.programs(["--sweep", "agent.tau=0.1,1", "agent.num-critics=3"])
+    (again,) = sweep.programs(mtjax.train.repeat(program))
+    assert again == program
+    (tmp_path / "config.json").write_text(cli.to_json(program, {}))
+    assert cli.from_json(tmp_path / "config.json") == program
+
+
+def test_points_that_do_not_fit_into_memory_are_run_in_rounds(monkeypatch):
+    """As even as can be; a single point is tried whatever it takes. $MTJAX_MEMORY is in GB."""
+    (program,) = sweep.programs(["--sweep", "agent.tau=0.1,0.2,0.3,0.4,0.5", "--seeds=2", "--replay-size=1000"])
+    one, two = (
+        sweep._needed(dataclasses.replace(program, plan=dataclasses.replace(program.plan, seeds=n))) for n in (1, 2)
+    )
+    assert 1.9 < two / one < 2.1
+    count = lambda limit: [len(part.points) for part in sweep.rounds(program, limit)]
+    assert count(1e15) == [5] and count(2.5 * two / 0.9) == [2, 2, 1] and count(1.0) == [1] * 5
+    assert sum((part.points for part in sweep.rounds(program, 1.0)), ()) == program.points
+    monkeypatch.setenv("MTJAX_MEMORY", "0.5")
+    assert sweep.memory() == 0.5e9
+    monkeypatch.setenv("MTJAX_MEMORY", "much")
+    with pytest.raises(InputError, match="a number of GB, not 'much'"):
+        sweep.memory()
+    monkeypatch.delenv("MTJAX_MEMORY")
+    assert sweep.memory() > 1e8
+
+
+@pytest.fixture(scope="module")
+def swept(short_family, tmp_path_factory):
+    """A sweep of two rounds, stopped before its second and gone on with: its folder, and what was said of the rest."""
+    root = tmp_path_factory.mktemp("sweep")
+    words = [
+        *SHORT_RUN,
+        f"--runs={root}",
+        "--steps=200",
+        "--sweep",
+        "agent.actor-lr=1e-3,1e-4,1e38",
+        "agent.num-critics=1",
+    ]
+    (program,) = sweep.programs(words)
+    real = mtjax.train.launch
+
+    def launch(program, directory, *rest):
+        if directory.name == "run-2":
+            raise KeyboardInterrupt
+        return real(program, directory, *rest)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MTJAX_MEMORY", f"{2.5 * sweep._needed(program) / 0.9 / 1e9:.12f}")
+        patch.setattr(mtjax.train, "launch", launch)
+        with pytest.raises(KeyboardInterrupt):
+            mtjax.train.main(words)
+    (folder,) = root.iterdir()
+    mtjax.train.main([f"--resume={folder}"])
+    return folder
+
+
+def test_a_sweep_leaves_a_table_of_all_settings(swept):
+    """A row for each, of all its runs, with its values and its last evaluation."""
+    with (swept / "sweep.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(r["run"], r["number"], r["actor-lr"], r["num-critics"]) for r in rows] == [
+        ("run-1", "0", "0.001", "1"),
+        ("run-1", "1", "0.0001", "1"),
+        ("run-2", "0", "1e+38", "1"),
+    ]
+    assert [r["diverged"] for r in rows] == ["0", "0", "2"]
+    with np.load(swept / "run-1" / "evaluations.npz") as file:
+        returns = file["train"][:, -1]
+    for p, row in enumerate(rows[:2]):
+        assert float(row["train"]) == pytest.approx(returns[2 * p : 2 * p + 2].mean(), rel=1e-5)
+        assert float(row["train_low"]) <= float(row["train"]) <= float(row["train_high"])
+    assert rows[2]["train"] == "" and (swept / "run-2" / "diverged.txt").exists()
+    assert (swept / "run-1" / "curve.png").exists()
+    header = (swept / "run-1" / "metrics.csv").read_text().splitlines()[0]
+    assert header.startswith("seed,actor_lr,iteration,")
+    text = sweep.table(sweep.rows(sweep._runs(swept)))
+    assert "2 of 2 seeds diverged" in text and "highest on training tasks" in text and len(text.splitlines()) == 5
+
+
+def test_a_finished_sweep_has_nothing_left_to_do(swept, capsys):
+    """Going on with it lays out its table again."""
+    mtjax.train.main([f"--resume={swept}"])
+    said = capsys.readouterr().out
+    assert "compiled" not in said and "actor-lr" in said
+
+
+def test_policies_are_those_of_a_point(swept):
+    """The agent has its values, and the states are of its seeds."""
+    first, third = mtjax.load(swept / "run-1", seed=1), mtjax.load(swept / "run-1", seed=2)
+    assert first.agent.actor_lr == 1e-3 and third.agent.actor_lr == 1e-4 and third.agent.num_critics == 1
+    assert len(first.states.log_temperature) == 2 and list(third.seeds) == [0, 1]
+    leaf = lambda tree: np.asarray(jax.tree.leaves(tree.actor)[0])
+    np.testing.assert_array_equal(leaf(first.state), leaf(first.states)[1])
+    assert np.any(leaf(first.states) != leaf(third.states))
+    action = third(jnp.zeros(third.env.spec.obs_size), jax.tree.map(lambda x: x[0], third.env.tasks("train")))
+    assert np.isfinite(action).all()
+    with pytest.raises(InputError, match="seed must be from 0 to 3"):
+        mtjax.load(swept / "run-1", seed=4)
+
+
+def test_a_run_of_several_points_is_not_fine_tuned_by_name(swept):
+    """Which of them would be a guess."""
+    with pytest.raises(InputError, match="holds 2 of a sweep"):
+        cli.parse([f"--from={swept / 'run-1'}", "--env=finger-short"])
+
+
+def test_fine_tuning_begins_every_point_with_the_same_seeds(swept):
+    """Three seeds of each of two points, from a run of two seeds: 0, 1, 0 and again 0, 1, 0."""
+    start = mtjax.load(swept / "run-1", seed=0)
+    found, tasks = ({"tau": 0.1}, {"tau": 0.2}), start.env.tasks("train")
+    run = _Run(start.env, Varied(start.agent), SMALL, Plan(seeds=3), None, Console(1, quiet=True), found)
+    seeds, knobs = run.spread
+    shapes = jax.eval_shape(lambda: loop.init(start.env, run.agent, SMALL, tasks, seeds, knobs)).agent
+    fresh = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)._replace(knobs=knobs)
+    state = run.adopt(start, tasks, fresh)
+    np.testing.assert_array_equal(state.knobs["tau"], np.float32([0.1] * 3 + [0.2] * 3))
+    began = np.asarray(start.states.log_temperature)
+    np.testing.assert_array_equal(state.learner.log_temperature, began[[0, 1, 0, 0, 1, 0]])
+    assert np.any(began[0] != began[1])
+    assert jax.tree.structure(state) == jax.tree.structure(fresh)
+
+
+def test_evaluation_is_of_one_point(swept, tmp_path, capsys):
+    """By its number."""
+    run = shutil.copytree(swept / "run-1", tmp_path / "run")
+    with pytest.raises(InputError, match="point must be from 0 to 1, not 2"):
+        mtjax.evaluate.main([f"--run={run}", "--point=2"])
+    mtjax.evaluate.main([f"--run={run}", "--point=1", "--episodes=1"])
+    assert "train" in capsys.readouterr().out and (run / "evaluation-1" / "returns.csv").exists()
