@@ -50,6 +50,12 @@ class Program:
     """A run's folder whose agent to fine-tune on this environment's tasks. Agent and networks are the run's; rates of
     learning and --tune may be given. What every task has for itself begins as that of the run's nearest training task,
     and seeds beyond the run's begin with its first ones again."""
+    profile: bool = False
+    """Leave a trace of one warm chunk, by JAX's profiler, in the run's folder."""
+    distributed: bool = False
+    """Run as one of several processes, each on devices of its own, that share the seeds. All are started with the same
+    command: by SLURM's srun, Open MPI or Kubernetes, or with JAX_COORDINATOR_ADDRESS (host:port of process 0),
+    JAX_NUM_PROCESSES and JAX_PROCESS_ID in the environment. They share the folder of --runs."""
     list: bool = False
     """Print the families and agents, and stop."""
     plan: Annotated[Plan, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Plan)

@@ -10,10 +10,11 @@ import sys
 import time
 import types
 from collections.abc import Sequence
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from mtjax import __version__, cli, hindsight
+from mtjax import __version__, cli, devices, hindsight
 from mtjax.agents import settings
 from mtjax.cli import Program
 from mtjax.finetune import require_fit
@@ -26,6 +27,8 @@ _PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-ch
 
 def main(argv: Sequence[str]) -> None:
     """Parse the command line, train, and say where the run is and how each split scored."""
+    if "--distributed" in argv:
+        devices.initialise()  # before anything asks which devices there are
     program = cli.parse(argv)
     if program.list:
         print(cli.catalogue())
@@ -37,12 +40,9 @@ def main(argv: Sequence[str]) -> None:
     enable_compile_cache()
     _check(program)
     start = _start(program) if directory is None else None
-    if directory is not None:
-        _record_steps(directory / "config.json", program.plan.steps)
-    else:
-        directory = new_directory(Path(program.runs), f"{program.env}-{program.agent}")
-        (directory / "config.json").write_text(cli.to_json(program, _circumstances(program)))
-    print(f"{program.agent} on {program.env}: {_summary(program)}\n{_origin(program)}run: {directory}", flush=True)
+    directory = devices.agreed(partial(_prepare, program, directory))
+    if devices.is_first():
+        print(f"{program.agent} on {program.env}: {_summary(program)}\n{_origin(program)}run: {directory}", flush=True)
     plan = dataclasses.asdict(program.plan)
     result = train(
         program.family,
@@ -52,21 +52,34 @@ def main(argv: Sequence[str]) -> None:
         start=start,
         directory=directory,
         resume=resume,
+        profile=program.profile,
         quiet=False,
     )
-    _conclude(program, result, directory)
+    if devices.is_first():
+        _conclude(program, result, directory)
+
+
+def _prepare(program: Program, directory: Path | None) -> Path:
+    """Make the run's folder with the record of it, or bring that of a run to go on with up to date."""
+    if directory is not None:
+        _record_steps(directory / "config.json", program.plan.steps)
+        return directory
+    directory = new_directory(Path(program.runs), f"{program.env}-{program.agent}")
+    (directory / "config.json").write_text(cli.to_json(program, _circumstances(program)))
+    return directory
 
 
 def _resumed(program: Program, directory: Path, argv: Sequence[str]) -> Program:
-    """The program of the run to go on with; ``--steps`` may extend it, and nothing else may change."""
+    """The program of the run to go on with; ``--steps`` may extend it, and nothing else that it computes may change."""
     given = {word.split("=", 1)[0] for word in argv if word.startswith("--")}
-    allowed = {"--resume", "--steps", "--import"}
+    allowed = {"--resume", "--steps", "--import", "--distributed", "--profile"}
     if given - allowed:
         other = ", ".join(sorted(given - allowed))
         raise InputError(f"--resume goes on with a run as it was; only --steps may change, not {other}")
     recorded = cli.from_json(directory / "config.json")
     steps = program.plan.steps if "--steps" in given else recorded.plan.steps
-    return dataclasses.replace(recorded, plan=dataclasses.replace(recorded.plan, steps=steps))
+    now = {"plan": dataclasses.replace(recorded.plan, steps=steps)}
+    return dataclasses.replace(recorded, **now, profile=program.profile, distributed=program.distributed)
 
 
 def _record_steps(file: Path, steps: int) -> None:
@@ -203,7 +216,7 @@ def _conclude(program: Program, result: Result, directory: Path) -> None:
         print(split_table(result.evaluations))
         if program.learner.unseen:
             print(f"unseen tasks: {program.learner.unseen}")
-    print(f"trained in {result.seconds:.1f} s; run: {directory}")
+    print(f"trained in {result.seconds:.1f} s (compiled in {result.compile_seconds:.1f} s); run: {directory}")
 
 
 class _CallableModule(types.ModuleType):
