@@ -98,7 +98,7 @@ def _check(program: Program) -> None:
     """Meet whatever the family's and the agent's constructors could not check before a run's folder is made."""
     from mtjax.agents.sac import load_vectors
 
-    _ = program.family.engine_name, program.family.table
+    _ = program.family.engine_name, program.family.table, devices.mesh_for(program.plan.seeds)
     if program.training.hindsight:
         hindsight.require(program.family)
     if program.learner.vectors:
