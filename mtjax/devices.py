@@ -27,6 +27,7 @@ _STATE = TrainState(*[_SEEDS] * len(TrainState._fields))._replace(replay=Replay(
 _VARIABLES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
 _LAUNCHERS = ("SLURM_JOB_ID", "OMPI_MCA_orte_hnp_uri", "TPU_WORKER_ID", "KUBERNETES_SERVICE_HOST")  # that JAX reads
 _LONGEST_PATH = 4096
+_PATIENCE = 60  # seconds for which a process that ends, or fails, waits for the others before it ends them as well
 
 
 class Programs(NamedTuple):
@@ -141,7 +142,7 @@ def initialise() -> None:
     address, count, index = (given.get(name) for name in _VARIABLES)
     try:
         number = lambda text: None if text is None else int(text)
-        jax.distributed.initialize(address, number(count), number(index))
+        jax.distributed.initialize(address, number(count), number(index), shutdown_timeout_seconds=_PATIENCE)
     except (ValueError, RuntimeError) as error:
         reason = str(error).strip().splitlines()[0][:150]
         raise InputError(f"--distributed cannot join the other processes: {reason}") from None
@@ -150,6 +151,12 @@ def initialise() -> None:
 def is_first() -> bool:
     """Whether this is the process that writes and prints: the only one, or number 0."""
     return jax.process_index() == 0
+
+
+def wait() -> None:
+    """Go on once every process is here, so that none times how long another compiles."""
+    if jax.process_count() > 1:
+        multihost_utils.sync_global_devices("mtjax")
 
 
 def gather(tree: Any) -> Any:

@@ -126,6 +126,7 @@ def train(
         if start is not None and not resume:
             begun = finetune.adopt(start, agent, tasks, devices.gather(state.agent))  # type: ignore
             state = state._replace(agent=devices.by_seed(run.mesh, begun))
+        devices.wait()
         compile_seconds = time.monotonic() - started
         run.console.say(f"compiled in {compile_seconds:.1f} s")
         return run.drive(programs, state, started, on_chunk)._replace(compile_seconds=compile_seconds)
