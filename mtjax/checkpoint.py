@@ -30,11 +30,15 @@ def save(directory: Path, state: TrainState) -> None:
         if known is None or known.step != iteration:
             checkpointer.save_checkpointables(iteration, {"agent": state.agent, "loop": state._replace(agent=None)})
     folder = directory / str(iteration)
-    (folder / _SIZES).write_text(json.dumps(_sizes(folder)))
+    if jax.process_index() == 0:
+        (folder / _SIZES).write_text(json.dumps(_sizes(folder)))
 
 
 def load(directory: Path, like: TrainState) -> TrainState:
-    """Read the newest checkpoint into the structure of ``like`` (shapes alone suffice)."""
+    """Read the newest checkpoint into the structure of ``like`` (shapes alone suffice), onto the devices it names.
+
+    Those need not be as many as saved it; where none are named, the first one is meant.
+    """
     found = _load(directory, {"agent": like.agent, "loop": like._replace(agent=None)})
     return found["loop"]._replace(agent=found["agent"])
 
@@ -82,8 +86,9 @@ def _require_whole(folder: Path, parts: Iterable[str]) -> None:
 def _load(directory: Path, like: dict[str, Any], partial: bool = False) -> dict[str, Any]:
     from orbax.checkpoint import v1 as ocp
 
-    device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
-    like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=device), like)
+    first = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+    place = lambda x: getattr(x, "sharding", None) or first
+    like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place(x)), like)
     newest = _newest(directory)
     _require_whole(newest, like)
     context = ocp.Context()

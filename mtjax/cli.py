@@ -55,6 +55,12 @@ class Program:
     without their dashes. The agent's numbers vary inside one program, beside the seeds; whatever else varies is one
     program after another. A table of all settings lies in the sweep's folder, whose name --resume takes too."""
     points: Annotated[tuple[dict[str, float], ...], tyro.conf.Suppress] = ()
+    profile: bool = False
+    """Leave a trace of one warm chunk, by JAX's profiler, in the run's folder."""
+    distributed: bool = False
+    """Run as one of several processes, each on devices of its own, that share the seeds. All are started with the same
+    command: by SLURM's srun, Open MPI or Kubernetes, or with JAX_COORDINATOR_ADDRESS (host:port of process 0),
+    JAX_NUM_PROCESSES and JAX_PROCESS_ID in the environment. They share the folder of --runs."""
     list: bool = False
     """Print the families and agents, and stop."""
     plan: Annotated[Plan, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Plan)

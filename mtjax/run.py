@@ -15,11 +15,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
-from mtjax import checkpoint, finetune, log, points
-from mtjax.evaluation import Evaluations, evaluate
+from mtjax import checkpoint, devices, finetune, log, points
+from mtjax.evaluation import Evaluations
 from mtjax.history import remember
-from mtjax.loop import Settings, TrainState, init, run_chunk
+from mtjax.loop import Settings, TrainState
 from mtjax.points import Point, Sweep, Varied
 from mtjax.types import SPLITS, Agent, Env, InputError
 
@@ -57,6 +58,7 @@ class Result(NamedTuple):
     evaluations: Evaluations
     rows: list[dict[str, Any]]  # the lines of metrics.csv
     seconds: float  # spent training, without compiling and evaluating
+    compile_seconds: float  # from the start until the first chunk could begin
     finished: bool  # False if a signal stopped it
     directory: Path | None
     points: tuple[Point, ...] = ()  # of a sweep: number k of S is seed k % seeds of point k // seeds
@@ -65,8 +67,8 @@ class Result(NamedTuple):
 class Programs(NamedTuple):
     """The compiled programs of a run."""
 
-    chunk: Callable
-    evaluate: Callable
+    chunk: Callable  # state -> state, metrics
+    evaluate: Callable  # agents' state, number of the evaluation -> returns
 
 
 def train(
@@ -83,11 +85,15 @@ def train(
     sweep: Sweep = (),
     directory: str | Path | None = None,
     resume: bool = False,
+    profile: bool = False,
     quiet: bool = True,
     label: str = "",
     on_chunk: Callable[[dict[str, Any]], None] | None = None,
 ) -> Result:
-    """Train an agent on a family of tasks.
+    """Train an agent on a family of tasks, on as many devices as divide the seeds.
+
+    Under ``jax.distributed`` every process calls this alike; the first one writes and prints, and all return the same
+    but for ``Result.state``, whose leaves are spread over all of them.
 
     Args:
         env: the family; it trains on ``env.tasks("train")``.
@@ -103,7 +109,8 @@ def train(
             and the S axis of whatever comes back holds them point by point. A seed whose numbers stop being finite is
             given up, its returns being NaN, and the others go on.
         directory: an existing folder for metrics, evaluations and checkpoints; None writes nothing.
-        resume: go on from the newest checkpoint in ``directory``.
+        resume: go on from the newest checkpoint in ``directory``, on however many devices there are now.
+        profile: leave a trace of one chunk, by ``jax.profiler``, in ``directory``/profile.
         quiet: print nothing.
         label: what lines of progress begin with.
         on_chunk: called with each chunk's first row of metrics.
@@ -118,17 +125,24 @@ def train(
         if start is not None:
             finetune.require_fit(start, env, learner)  # type: ignore
     directory = None if directory is None else Path(directory)
+    if profile and directory is None:
+        raise InputError("profile writes into the run's folder; give directory as well")
     started = time.monotonic()
     tasks, env = env.tasks("train"), remember(env, agent.history)
     settings = fit_chunk(settings or Settings(), len(tasks.id), steps)
     learner = Varied(agent) if found else agent  # type: ignore
-    run = _Run(env, learner, settings, plan, directory, log.Console(plan.steps, quiet, label), found)
+    console = log.Console(plan.steps, quiet or not devices.is_first(), label)
+    mesh = devices.mesh_for(seeds * max(len(found), 1))
+    run = _Run(env, learner, settings, plan, directory, console, mesh, profile, found)
     try:
         programs, state = run.begin(resume)
         if start is not None and not resume:
-            state = state._replace(agent=run.adopt(start, tasks, state.agent))
-        run.console.say(f"compiled in {time.monotonic() - started:.1f} s")
-        return run.drive(programs, state, started, on_chunk)
+            begun = run.adopt(start, tasks, devices.gather(state.agent))
+            state = state._replace(agent=devices.by_seed(mesh, begun))
+        devices.wait()
+        compile_seconds = time.monotonic() - started
+        run.console.say(f"compiled in {compile_seconds:.1f} s")
+        return run.drive(programs, state, started, on_chunk)._replace(compile_seconds=compile_seconds)
     finally:
         run.console.close()
 
@@ -149,6 +163,8 @@ class _Run:
     plan: Plan
     directory: Path | None
     console: log.Console
+    mesh: Mesh | None
+    profile: bool
     points: tuple[Point, ...] = ()
 
     @cached_property
@@ -174,6 +190,10 @@ class _Run:
         learner = jax.tree.map(together, jax.vmap(adopt)(jax.tree.map(apart, fresh.learner)))
         return fresh._replace(learner=learner)
 
+    @property
+    def writes(self) -> bool:
+        return self.directory is not None and devices.is_first()
+
     @cached_property
     def steps_per_iteration(self) -> int:
         """Environment steps that one step of every environment makes, summed over tasks."""
@@ -185,22 +205,20 @@ class _Run:
 
     def begin(self, resume: bool) -> tuple[Programs, TrainState]:
         """Compile every program at the same time, and make or restore the state; evaluation may be ready later."""
-        env, agent, settings = self.env, self.agent, self.settings
-        tasks, pool = env.tasks("train"), ThreadPoolExecutor(2)
-        fresh = init.lower(env, agent, settings, tasks, *self.spread)
-        shapes = fresh.out_info
+        env, agent, settings, lazy = self.env, self.agent, self.settings, devices.programs(self.mesh)
+        tasks, everything = (devices.everywhere(self.mesh, env.tasks(split)) for split in ("train", "all"))
+        (seeds, knobs), pool = devices.by_seed(self.mesh, self.spread), ThreadPoolExecutor(2)
+        fresh = lazy.init.lower(env, agent, settings, tasks, seeds, knobs)
+        shapes = devices.sharded(self.mesh, fresh.out_info)
         self._describe(shapes)
         make = pool.submit(fresh.compile)
-        chunk = run_chunk.lower(env, agent, settings, tasks, shapes)
-        score = pool.submit(self._compile_evaluation, shapes)
+        chunk = lazy.chunk.lower(env, agent, settings, tasks, shapes)
+        lower = partial(lazy.evaluate.lower, env, agent, self.plan.eval_episodes, shapes.agent, everything, seeds)
+        score = pool.submit(lambda: lower(np.int32(0)).compile())
         pool.shutdown(wait=False)
-        programs = Programs(chunk.compile(), lambda *arguments: score.result()(*arguments))
-        return programs, self._restore(shapes) if resume else make.result()(tasks, *self.spread)
-
-    def _compile_evaluation(self, shapes: TrainState) -> Callable:
-        everything, number = self.env.tasks("all"), jnp.int32(0)
-        episodes = self.plan.eval_episodes
-        return evaluate.lower(self.env, self.agent, episodes, shapes.agent, everything, self.seeds, number).compile()
+        evaluate = lambda agents, number: score.result()(agents, everything, seeds, np.int32(number))
+        programs = Programs(partial(chunk.compile(), tasks), evaluate)
+        return programs, self._restore(shapes) if resume else make.result()(tasks, seeds, knobs)
 
     def _describe(self, shapes: TrainState) -> None:
         replay = checkpoint.size_of(shapes.replay) / 1e6
@@ -208,6 +226,8 @@ class _Run:
             f"memory: {checkpoint.size_of(shapes) / 1e6:,.0f} MB of state, of which {replay:,.0f} MB replay "
             f"({self.settings.capacity:,} transitions a task)"
         )
+        if spread := devices.describe(self.mesh, len(self.seeds)):
+            self.console.say(spread)
         if self.directory is not None:
             checkpoint.require_space(self.directory, shapes)
 
@@ -217,23 +237,25 @@ class _Run:
 
     def _earlier_seconds(self, iteration: int) -> float:
         """Seconds of training that a resumed run has behind it; its later lines of metrics are dropped."""
-        if self.directory is None:
+        if not self.writes:
             return 0.0
+        assert self.directory is not None
         return log.truncate_rows(self.directory / "metrics.csv", iteration)
 
     def drive(self, programs: Programs, state: TrainState, started: float, on_chunk) -> Result:
         """Run chunks until the plan is done or a signal asks to stop."""
-        tasks = self.env.tasks("train")
         steps = int(state.iteration) * self.steps_per_iteration
         evaluations = self._earlier_evaluations(steps)
-        rows, seconds = [], self._earlier_seconds(int(state.iteration))
+        rows, seconds, stop = [], self._earlier_seconds(int(state.iteration)), False
         lost = np.zeros(len(self.seeds), bool)
-        with stop_signals() as stopping:
-            while steps < self.plan.steps and not stopping:
-                before, steps_before = time.monotonic(), steps
-                state, metrics = programs.chunk(tasks, state)
-                metrics = jax.device_get(metrics)
-                elapsed = time.monotonic() - before
+        with stop_signals() as received:
+            while steps < self.plan.steps and not stop:
+                steps_before = steps
+                with self._watch(len(rows), steps):
+                    before = time.monotonic()
+                    state, metrics = programs.chunk(state)
+                    metrics = devices.gather(metrics)
+                    elapsed = time.monotonic() - before
                 seconds += elapsed
                 lost |= self._lose(metrics["bad_step"], steps_before // self.steps_per_iteration, lost)
                 steps += self.settings.chunk_steps * self.steps_per_iteration
@@ -254,9 +276,22 @@ class _Run:
                 due = steps // self.eval_every > steps_before // self.eval_every
                 if due or steps >= self.plan.steps:
                     evaluations = self._evaluate(programs.evaluate, state, evaluations, steps, lost)
-                if due or stopping or steps >= self.plan.steps:
+                stop = devices.anywhere(bool(received))
+                if due or stop or steps >= self.plan.steps:
                     self._save(state)
-        return Result(state, evaluations, rows, seconds, steps >= self.plan.steps, self.directory, self.points)
+        return Result(state, evaluations, rows, seconds, 0.0, steps >= self.plan.steps, self.directory, self.points)
+
+    @contextlib.contextmanager
+    def _watch(self, rows: int, steps: int) -> Iterator[None]:
+        """Trace the run's second chunk, by when all is warm, or its only one, if that is asked for."""
+        only = steps + self.settings.chunk_steps * self.steps_per_iteration >= self.plan.steps
+        if not (self.profile and self.writes and (rows == len(self.seeds) or (only and not rows))):
+            yield
+            return
+        place = self.directory / "profile"  # type: ignore
+        with jax.profiler.trace(place):
+            yield
+        self.console.say(f"profile of one chunk: {place} (xprof --logdir={place}, or its *.trace.json.gz in Perfetto)")
 
     def _lose(self, bad_step: np.ndarray, first_step: int, lost: np.ndarray) -> np.ndarray:
         """Which seeds (S,) are not finite any more; one that diverged must not end a sweep of many."""
@@ -269,7 +304,8 @@ class _Run:
         return broken
 
     def _write(self, rows: list[dict[str, Any]]) -> None:
-        if self.directory is not None:
+        if self.writes:
+            assert self.directory is not None
             log.append_rows(self.directory / "metrics.csv", rows)
 
     def _save(self, state: TrainState) -> None:
@@ -278,15 +314,15 @@ class _Run:
 
     def _evaluate(self, program: Callable, state: TrainState, past: Evaluations, steps: int, lost) -> Evaluations:
         """Evaluate on all splits, and add the result to the run's evaluations."""
-        number = jnp.int32(len(past.steps))
-        returns = np.array(program(state.agent, self.env.tasks("all"), self.seeds, number))
+        returns = np.array(devices.gather(program(state.agent, len(past.steps))))
         returns[lost] = np.nan
         grown = {}
         for split, old in past.returns.items():
             rows = np.asarray(self.env.tasks(split).id)
             grown[split] = np.concatenate([old, returns[:, None, rows]], axis=1)
         evaluations = Evaluations(np.append(past.steps, steps), grown, past.values)
-        if self.directory is not None:
+        if self.writes:
+            assert self.directory is not None
             save_evaluations(self.directory / "evaluations.npz", evaluations)
         means = ", ".join(f"{s} {x[~lost, -1].mean():.0f}" for s, x in grown.items() if x.size)
         self.console.say(f"evaluation at {steps:,} steps: {means}")

@@ -10,10 +10,11 @@ import sys
 import time
 import types
 from collections.abc import Sequence
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from mtjax import __version__, cli, hindsight
+from mtjax import __version__, cli, devices, hindsight
 from mtjax.agents import settings
 from mtjax.cli import Program
 from mtjax.finetune import require_fit
@@ -28,8 +29,12 @@ def main(argv: Sequence[str]) -> None:
     """Parse the command line, train, and say where the run is and how each split scored."""
     from mtjax import sweep
 
+    if "--distributed" in argv:
+        devices.initialise()  # before anything asks which devices there are
     argv = cli.import_files(argv)
     if sweep.wanted(argv):
+        if "--distributed" in argv:
+            raise InputError("a sweep runs in one process; leave out --distributed")
         return sweep.main(argv)
     program = cli.parse(argv)
     if program.list:
@@ -42,19 +47,28 @@ def main(argv: Sequence[str]) -> None:
     enable_compile_cache()
     check(program)
     start = starting(program) if directory is None else None
+    directory = devices.agreed(partial(_prepare, program, directory))
+    result = launch(program, directory, start, resume)
+    if devices.is_first():
+        _conclude(program, result, directory)
+
+
+def _prepare(program: Program, directory: Path | None) -> Path:
+    """Make the run's folder with the record of it, or bring that of a run to go on with up to date."""
     if directory is not None:
         record_steps(directory / "config.json", program.plan.steps)
-    else:
-        directory = new_directory(Path(program.runs), f"{program.env}-{program.agent}")
-        (directory / "config.json").write_text(cli.to_json(program, circumstances(program)))
-    _conclude(program, launch(program, directory, start, resume), directory)
+        return directory
+    directory = new_directory(Path(program.runs), f"{program.env}-{program.agent}")
+    (directory / "config.json").write_text(cli.to_json(program, circumstances(program)))
+    return directory
 
 
 def launch(program: Program, directory: Path, start: Policy | None, resume: bool, label: str = "") -> Result:
     """Run a program in its folder, from the start or from its newest checkpoint, and say what it is."""
     said = f"{label}: {' '.join(program.sweep)}\n" if program.sweep else ""
     origin = f"{_origin(program)}run: {directory}"
-    print(f"{said}{program.agent} on {program.env}: {_summary(program)}\n{origin}", flush=True)
+    if devices.is_first():
+        print(f"{said}{program.agent} on {program.env}: {_summary(program)}\n{origin}", flush=True)
     plan = dataclasses.asdict(program.plan)
     return train(
         program.family,
@@ -65,21 +79,23 @@ def launch(program: Program, directory: Path, start: Policy | None, resume: bool
         sweep=program.points,
         directory=directory,
         resume=resume,
+        profile=program.profile,
         label=label,
         quiet=False,
     )
 
 
 def recorded(program: Program, directory: Path, argv: Sequence[str]) -> Program:
-    """The program of the run to go on with; ``--steps`` may extend it, and nothing else may change."""
+    """The program of the run to go on with; ``--steps`` may extend it, and nothing else that it computes may change."""
     given = {word.split("=", 1)[0] for word in argv if word.startswith("--")}
-    allowed = {"--resume", "--steps", "--import"}
+    allowed = {"--resume", "--steps", "--import", "--distributed", "--profile"}
     if given - allowed:
         other = ", ".join(sorted(given - allowed))
         raise InputError(f"--resume goes on with a run as it was; only --steps may change, not {other}")
     recorded = cli.from_json(directory / "config.json")
     steps = program.plan.steps if "--steps" in given else recorded.plan.steps
-    return dataclasses.replace(recorded, plan=dataclasses.replace(recorded.plan, steps=steps))
+    now = {"plan": dataclasses.replace(recorded.plan, steps=steps)}
+    return dataclasses.replace(recorded, **now, profile=program.profile, distributed=program.distributed)
 
 
 def record_steps(file: Path, steps: int) -> None:
@@ -98,7 +114,7 @@ def check(program: Program) -> None:
     """Meet whatever the family's and the agent's constructors could not check before a run's folder is made."""
     from mtjax.agents.sac import load_vectors
 
-    _ = program.family.engine_name, program.family.table
+    _ = program.family.engine_name, program.family.table, devices.mesh_for(program.plan.seeds)
     if program.training.hindsight:
         hindsight.require(program.family)
     if program.learner.vectors:
@@ -216,7 +232,7 @@ def _conclude(program: Program, result: Result, directory: Path) -> None:
         print(split_table(result.evaluations))
         if program.learner.unseen:
             print(f"unseen tasks: {program.learner.unseen}")
-    print(f"trained in {result.seconds:.1f} s; run: {directory}")
+    print(f"trained in {result.seconds:.1f} s (compiled in {result.compile_seconds:.1f} s); run: {directory}")
 
 
 class _CallableModule(types.ModuleType):

@@ -114,7 +114,8 @@ class Mjx:
     def _constants(self) -> tuple[Any, Any]:
         mjx = mjx_module()
         with jax.ensure_compile_time_eval():
-            return mjx.put_model(self.base, impl="jax"), mjx.make_data(self.base, impl="jax")
+            own = jax.local_devices()[0]  # the first of all may be another process's
+            return mjx.put_model(self.base, own, "jax"), mjx.make_data(self.base, own, "jax")
 
     @cached_property
     def _feels(self) -> bool:

@@ -1,0 +1,173 @@
+"""Many devices and processes: how they are shared out, and that no result depends on them."""
+
+import csv
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import types
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import mtjax
+import mtjax.train
+from mtjax import devices
+from mtjax.run import load_evaluations
+from mtjax.types import InputError
+
+HERE = Path(__file__).parent
+QUICK_FLAG = "--xla_backend_optimization_level=0"
+TINY_RUN = (
+    "--env=pendulum-swingup --env.vary.mass=1,1.5 --split=none --engine=mjx --agent=sac-conditioned --seeds=2 "
+    "--eval-every=80 --eval-episodes=1 --num-envs=2 --batch-size=4 --replay-size=40 --warmup-steps=4 "
+    "--chunk-steps=10 --agent.hidden 8 8"
+).split()
+
+
+@pytest.fixture
+def hosts(monkeypatch):
+    """Make JAX see processes with so many devices each."""
+
+    def see(*counts):
+        found = [types.SimpleNamespace(process_index=i, number=n) for i, c in enumerate(counts) for n in range(c)]
+        monkeypatch.setattr(jax, "process_count", lambda: len(counts))
+        monkeypatch.setattr(jax, "devices", lambda: found)
+        monkeypatch.setattr(jax, "device_count", lambda: len(found))
+        monkeypatch.setattr(devices, "Mesh", lambda x, _: types.SimpleNamespace(size=x.size, devices=x))
+
+    return see
+
+
+@pytest.mark.parametrize(
+    "counts, seeds, used",
+    [((4,), 4, 4), ((4,), 8, 4), ((4,), 6, 3), ((4,), 2, 2), ((8,), 10, 5), ((2, 2), 8, 4), ((4, 2), 6, 2)],
+)
+def test_most_devices_that_divide_the_seeds_are_used(hosts, counts, seeds, used):
+    """Of every process as many, so that each has seeds of its own."""
+    hosts(*counts)
+    mesh = devices.mesh_for(seeds)
+    assert mesh.size == used
+    owners = [device.process_index for device in mesh.devices]
+    assert owners == sorted(owners) and {owners.count(i) for i in range(len(counts))} == {used // len(counts)}
+    assert f"devices: {used} of {sum(counts)}" in devices.describe(mesh, seeds)
+
+
+@pytest.mark.parametrize("counts, seeds", [((1,), 1), ((1,), 10), ((4,), 1), ((2,), 5)])
+def test_one_device_needs_no_mesh(hosts, counts, seeds):
+    """Then the programs are the loop's own, and arrays stay where they are."""
+    hosts(*counts)
+    assert devices.mesh_for(seeds) is None
+    assert devices.programs(None) == (mtjax.loop.init, mtjax.loop.run_chunk, mtjax.evaluation.evaluate)
+    state = object()
+    assert devices.everywhere(None, state) is devices.by_seed(None, state) is devices.sharded(None, state) is state
+    assert bool(devices.describe(None, seeds)) == (sum(counts) > 1)
+
+
+def test_processes_must_share_seeds_evenly(hosts):
+    """A process without a seed could not take part."""
+    hosts(1, 1)
+    with pytest.raises(InputError, match=r"2 processes cannot share 3 seeds evenly; --seeds must be a multiple"):
+        devices.mesh_for(3)
+
+
+@pytest.mark.parametrize("given", [(), ("JAX_NUM_PROCESSES",), ("JAX_COORDINATOR_ADDRESS", "JAX_PROCESS_ID")])
+def test_missing_variables_are_named(monkeypatch, given):
+    """Before anything waits for processes that will not come."""
+    for name in (*devices._VARIABLES, *devices._LAUNCHERS):
+        monkeypatch.delenv(name, raising=False)
+    for name in given:
+        monkeypatch.setenv(name, "1")
+    with pytest.raises(InputError, match="--distributed needs a launcher") as caught:
+        devices.initialise()
+    assert {name for name in devices._VARIABLES if name in str(caught.value)} == set(devices._VARIABLES) - set(given)
+
+
+@pytest.mark.parametrize("count, index", [("two", "0"), ("2", "2")])
+def test_variables_that_mean_nothing_are_refused(monkeypatch, count, index):
+    """A count that is no number, a process beyond the count."""
+    for name, value in zip(devices._VARIABLES, ("localhost:1", count, index), strict=True):
+        monkeypatch.setenv(name, value)
+    with pytest.raises(InputError, match="--distributed cannot join the other processes"):
+        devices.initialise()
+
+
+def python(*words, **variables):
+    """Start a Python process of its own, on CPUs."""
+    root, path = str(HERE.parent), os.environ.get("PYTHONPATH", "")
+    common = {"JAX_PLATFORMS": "cpu", "MTJAX_CACHE": "0", "XLA_FLAGS": QUICK_FLAG, "PYTHONPATH": f"{root}:{path}"}
+    environment = {**os.environ, **common, **variables}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    return subprocess.Popen([sys.executable, *words], env=environment, cwd=HERE, **pipes)
+
+
+@pytest.mark.slow
+def test_four_devices():
+    """The tests of ``four_devices.py``, where JAX shows four devices of this CPU."""
+    flags = f"{QUICK_FLAG} --xla_force_host_platform_device_count=4"
+    assert "skipped" not in finish("-m", "pytest", "-q", "-p", "no:cacheprovider", "four_devices.py", XLA_FLAGS=flags)
+
+
+def finish(*words, **variables):
+    """Run Python to its end; returns what it said."""
+    process = python(*words, **variables)
+    said = process.communicate(timeout=600)[0]
+    assert process.returncode == 0, said[-5000:]
+    return said
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("localhost", 0))
+        return probe.getsockname()[1]
+
+
+def rows_of(directory):
+    with (directory / "metrics.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.mark.slow
+def test_two_processes_are_one_run(tmp_path):
+    """Each has a seed; the first writes both, a signal to the second stops both, and one process alone goes on."""
+    cache = {"MTJAX_CACHE": str(tmp_path / "cache")}
+    found = {"JAX_COORDINATOR_ADDRESS": f"localhost:{free_port()}", "JAX_NUM_PROCESSES": "2", **cache}
+    words = ["-m", "mtjax.train", "--distributed", *TINY_RUN, "--steps=100000000", f"--runs={tmp_path / 'two'}"]
+    both = [python(*words, **found, JAX_PROCESS_ID=str(i)) for i in range(2)]
+    try:
+        deadline = time.monotonic() + 400
+        while not list(tmp_path.glob("two/*/metrics.csv")):
+            assert time.monotonic() < deadline and all(p.poll() is None for p in both), "they do not train"
+            time.sleep(0.2)
+        both[1].send_signal(signal.SIGTERM)
+        said = [process.communicate(timeout=120)[0] for process in both]
+    finally:
+        for process in both:
+            process.kill()
+            process.stdout.close()
+            process.wait()
+    assert [process.returncode for process in both] == [0, 0], said
+    assert "devices: 2 of 2 in 2 processes, 1 seed on each" in said[0] and "stopped; the state is saved" in said[0]
+    assert "run:" not in said[1] and "compiled" not in said[1]
+
+    (directory,) = (tmp_path / "two").iterdir()
+    steps = int(rows_of(directory)[-1]["steps"])
+    finish("-m", "mtjax.train", f"--resume={directory}", f"--steps={steps + 40}", **cache)
+    rows = rows_of(directory)
+    assert [(row["seed"], int(row["steps"])) for row in rows] == [
+        (seed, steps) for steps in range(40, steps + 41, 40) for seed in "01"
+    ]
+
+    finish("-m", "mtjax.train", *TINY_RUN, "--steps=80", f"--runs={tmp_path / 'one'}", **cache)
+    (alone,) = (tmp_path / "one").iterdir()
+    for row, expected in zip(rows[:4], rows_of(alone), strict=True):  # later, rounding has grown
+        for name in row.keys() - {"seconds", "wall_seconds"}:
+            number = lambda x: float(x or "nan")
+            assert number(row[name]) == pytest.approx(number(expected[name]), rel=1e-3, abs=1e-4, nan_ok=True), name
+    returns = [load_evaluations(folder / "evaluations.npz").returns["train"][:, :1] for folder in (directory, alone)]
+    assert returns[0].shape == (2, 1, 2, 1)
+    np.testing.assert_allclose(*returns, rtol=0.05)
