@@ -175,6 +175,25 @@ def test_no_directory_writes_nothing_and_prints_nothing(play, tmp_path, monkeypa
     assert result.finished and result.directory is None and result.evaluations.steps.tolist() == [200]
 
 
+def test_profile_is_of_one_warm_chunk(play, tmp_path, capsys):
+    """The trace is in the run's folder, and the line says where; compiling is timed apart from running."""
+    result = play(tmp_path, steps=300, profile=True, quiet=False)
+    (trace,) = tmp_path.glob("profile/plugins/profile/*/*.trace.json.gz")
+    lines = capsys.readouterr().out.splitlines()
+    said = [i for i, line in enumerate(lines) if f"profile of one chunk: {tmp_path / 'profile'} " in line]
+    chunks = [i for i, line in enumerate(lines) if "of 300 steps" in line]
+    assert trace.stat().st_size and len(said) == 1 and chunks[0] < said[0] < chunks[1]
+    compiled = next(line for line in lines if line.startswith("compiled in "))
+    assert compiled == f"compiled in {result.compile_seconds:.1f} s" and result.compile_seconds > 0
+    assert result.seconds == pytest.approx(float(result.rows[-1]["seconds"]), abs=1e-3)
+
+
+def test_profile_needs_a_folder(play):
+    """It is refused before anything compiles."""
+    with pytest.raises(InputError, match="profile writes into the run's folder"):
+        play(None, profile=True)
+
+
 # Repeating.
 
 
