@@ -133,7 +133,7 @@ def train(
     learner = Varied(agent) if found else agent  # type: ignore
     console = log.Console(plan.steps, quiet or not devices.is_first(), label)
     mesh = devices.mesh_for(seeds * max(len(found), 1))
-    run = _Run(env, learner, settings, plan, directory, console, mesh, profile, found)
+    run = _Run(env, learner, settings, plan, directory, console, found, mesh, profile)
     try:
         programs, state = run.begin(resume)
         if start is not None and not resume:
@@ -163,9 +163,9 @@ class _Run:
     plan: Plan
     directory: Path | None
     console: log.Console
-    mesh: Mesh | None
-    profile: bool
     points: tuple[Point, ...] = ()
+    mesh: Mesh | None = None
+    profile: bool = False
 
     @cached_property
     def spread(self) -> tuple[jax.Array, dict[str, jax.Array] | None]:

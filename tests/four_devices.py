@@ -86,7 +86,7 @@ def test_donated_state_is_gone(tmp_path):
     mesh = devices.mesh_for(4)
     programs, env = devices.programs(mesh), Walk()
     tasks, seeds = devices.everywhere(mesh, env.tasks()), devices.by_seed(mesh, jnp.arange(4))
-    state = programs.init(env, AGENT, SETTINGS, tasks, seeds)
+    state = programs.init(env, AGENT, SETTINGS, tasks, seeds, None)
     after, metrics = programs.chunk(env, AGENT, SETTINGS, tasks, state)
     assert state.replay.rows.obs.is_deleted() and int(after.iteration) == 10
     assert metrics["return"].shape == (4, 2) and len(metrics["return"].sharding.device_set) == 4
