@@ -207,7 +207,7 @@ def quick(function, *arguments):
 @lru_cache
 def _agent_programs(agent, spec: Spec, num_tasks: int, batch_size: int):
     tasks, key = tasks_of("one-step", np.ones(num_tasks)), jax.random.key(0)
-    spec = widen(spec, agent.history)
+    spec = spec if spec.history else widen(spec, agent.history)
     init = lambda tasks, key: agent.init(spec, tasks, key)
     batch = random_batch(0, num_tasks, batch_size, spec)
     return quick(init, tasks, key), quick(agent.update, jax.eval_shape(init, tasks, key), batch, tasks, key)

@@ -313,6 +313,7 @@ class Diary:
 
     gamma: float = 0.9
     watches: bool = True
+    history: int = 0
 
     def init(self, spec, tasks, key):
         return {"step": jnp.int32(0), "resets": jnp.int32(0), "updates": jnp.int32(0), "noise": jnp.float32(0)}
