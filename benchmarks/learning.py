@@ -24,8 +24,9 @@ import numpy as np
 
 import mtjax
 from mtjax import plot
+from mtjax.evaluation import load_evaluations, save_evaluations
 from mtjax.log import append_rows
-from mtjax.run import Result, enable_compile_cache, load_evaluations, save_evaluations
+from mtjax.run import Result, enable_compile_cache
 from mtjax.stats import stratified_bootstrap
 from mtjax.types import SPLITS, InputError
 

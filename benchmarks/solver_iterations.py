@@ -9,7 +9,6 @@ whose error exceeds ``--tolerance``. The smallest setting after which neither fa
 
 import argparse
 import copy
-import json
 import statistics
 import time
 from functools import partial
@@ -20,7 +19,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from mujoco import batch
-from report import machine
+from report import publish
 
 import mtjax
 from mtjax.envs import ENVS, Domain
@@ -60,10 +59,7 @@ def main() -> None:
         for row in measure(name, engines, arguments):
             print(line(row), flush=True)
             rows.append(row)
-    report = {"machine": machine(), "worlds": arguments.worlds, "tolerance": arguments.tolerance, "rows": rows}
-    if arguments.json:
-        with open(arguments.json, "x") as file:
-            json.dump(report, file, indent=2)
+    publish(arguments, rows)
 
 
 def domains() -> list[str]:

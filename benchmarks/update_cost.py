@@ -19,6 +19,7 @@ import numpy as np
 from report import publish
 
 import mtjax
+from mtjax import loop
 from mtjax.history import widen
 from mtjax.types import InputError, Spec, Task, Transition
 
@@ -62,7 +63,7 @@ class Contestant:
     def __init__(self, name: str, arguments: argparse.Namespace, num_tasks: int, num_seeds: int):
         self.name, self.updates, self.seconds = name, arguments.updates, []
         self.num_tasks, self.num_seeds = num_tasks, num_seeds
-        agent = make(name, tuple(arguments.hidden))
+        agent = mtjax.agent(name, hidden=arguments.hidden)
         spec = widen(SPEC, agent.history)
         tasks, keys = tasks_of(num_tasks), jax.random.split(jax.random.key(0), num_seeds)
         batch = random_batch(spec, num_tasks, arguments.batch)
@@ -73,9 +74,8 @@ class Contestant:
             update = lambda state, key: agent.update(state, batch, tasks, key)
             return jax.lax.scan(update, state, jax.random.split(keys, arguments.updates))[0]
 
-        over_seeds = jax.vmap(learn) if num_seeds > 1 else one_seed(learn)
         before = time.perf_counter()
-        self.run = jax.jit(over_seeds, donate_argnums=0).lower(self.state, keys).compile()
+        self.run = jax.jit(loop.over_seeds(learn, 0, 0), donate_argnums=0).lower(self.state, keys).compile()
         self.compile_seconds, self.keys = time.perf_counter() - before, keys
         self.time(count=False)
 
@@ -98,16 +98,6 @@ class Contestant:
             "parameters": self.num_parameters,
             "compile_seconds": round(self.compile_seconds, 1),
         }
-
-
-def one_seed(function):
-    """As the training loop does: a single seed is not mapped."""
-    return lambda *trees: jax.tree.map(lambda x: x[None], function(*jax.tree.map(lambda x: x[0], trees)))
-
-
-def make(name: str, hidden: tuple[int, ...]):
-    """The agent with these hidden layers, whatever else its preset says."""
-    return mtjax.agent(name, hidden=hidden)
 
 
 def tasks_of(num_tasks: int) -> Task:

@@ -9,7 +9,7 @@ import json
 import re
 import sys
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from types import MappingProxyType
@@ -196,31 +196,29 @@ def import_flag(family: Family) -> list[str]:
 
 def _peel_vary(argv: Sequence[str]) -> tuple[dict[str, str], list[str]]:
     """Take --env.vary.NAME=VALUES out of a command line: which names there are is the family's to say."""
-    given, rest, words = {}, [], iter(argv)
-    for word in words:
-        flag, equals, value = word.partition("=")
-        if not flag.startswith(_VARY):
-            rest.append(word)
-            continue
-        if not equals:
-            value = next(words, "")
-        if not value:
-            raise InputError(f"{flag} needs values; give lo:hi:n, lo:hi or a list a,b,c")
-        given[flag.removeprefix(_VARY)] = value
-    return given, rest
+    given, rest = _take(argv, lambda flag: flag.startswith(_VARY), "values; give lo:hi:n, lo:hi or a list a,b,c")
+    return {flag.removeprefix(_VARY): value for flag, value in given.items()}, rest
 
 
 def _peel_parts(argv: Sequence[str]) -> tuple[dict[str, str], list[str]]:
     """Take --agent.KIND=NAME out of a command line: the part decides which other flags there are."""
-    chosen = {kind: name for kind in PARTS if (name := _peel(argv, f"agent.{kind}", ""))}
-    rest, words = [], iter(argv)
+    kinds = {f"--agent.{kind}": kind for kind in PARTS}
+    given, rest = _take(argv, kinds.__contains__, "a value")
+    return {kinds[flag]: name for flag, name in given.items()}, rest
+
+
+def _take(argv: Sequence[str], mine: Callable[[str], bool], needed: str) -> tuple[dict[str, str], list[str]]:
+    """Part the flags that are ``mine``, with their values, from the other words of a command line."""
+    given, rest, words = {}, [], iter(argv)
     for word in words:
-        flag, equals, _ = word.partition("=")
-        if flag.removeprefix("--agent.") not in PARTS or not flag.startswith("--agent."):
+        flag, equals, value = word.partition("=")
+        if not mine(flag):
             rest.append(word)
-        elif not equals:
-            next(words)
-    return chosen, rest
+            continue
+        given[flag] = value if equals else next(words, "")
+        if not given[flag]:
+            raise InputError(f"{flag} needs {needed}")
+    return given, rest
 
 
 def flags(program: Any, prefix: str = "--") -> list[str]:

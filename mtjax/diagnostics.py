@@ -120,15 +120,11 @@ def _compare(params: Params, loss: Callable, data: Any) -> tuple[dict[str, Any],
     one_task = lambda shared, own, data: loss(Params(shared, own), data)
     differentiate = jax.vmap(jax.grad(one_task, argnums=(0, 1), has_aux=True), (None, 0, 0))
     (shared, own), aux = differentiate(params.shared, params.own, data)
-    if not jax.tree.leaves(shared):
-        lengths = jnp.sqrt(jnp.diagonal(surgery.gram_matrix(own)))
-        return {"gram": None, "cosine": None, "conflict": None, "gradient_norm": lengths}, aux
-    gram = surgery.gram_matrix(shared)
-    lengths = jnp.sqrt(jnp.diagonal(gram))
-    cosine = gram / jnp.maximum(lengths[:, None] * lengths, 1e-30)
-    num_pairs = max(len(gram) * (len(gram) - 1), 1)
-    apart = jnp.sum((cosine < 0) & ~jnp.eye(len(gram), dtype=bool)) / num_pairs
-    return {"gram": gram, "cosine": cosine, "conflict": apart, "gradient_norm": lengths}, aux
+    share = bool(jax.tree.leaves(shared))
+    gram = surgery.gram_matrix(shared if share else own)
+    found = {"gram": gram, "cosine": surgery.cosines(gram)[0], "conflict": surgery.conflicts(gram)["conflict"]}
+    found = found if share else dict.fromkeys(found)
+    return {**found, "gradient_norm": surgery.cosines(gram)[1]}, aux
 
 
 # Units.

@@ -1,6 +1,8 @@
 """Evaluation: whole episodes under the mean action, on any tasks, with keys of its own."""
 
+import os
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -9,7 +11,7 @@ import numpy as np
 
 from mtjax.loop import actions, begin, over_worlds
 from mtjax.tasks import episode_task
-from mtjax.types import Agent, Array, Env, Task
+from mtjax.types import SPLITS, Agent, Array, Env, InputError, Task
 
 
 class Evaluations(NamedTuple):
@@ -18,6 +20,24 @@ class Evaluations(NamedTuple):
     steps: np.ndarray  # (V,) environment steps, summed over tasks, after which each evaluation took place
     returns: dict[str, np.ndarray]  # split -> (S, V, T, episodes)
     values: dict[str, np.ndarray]  # split -> (T,) value of the varying parameter
+
+
+def save_evaluations(path: Path, evaluations: Evaluations) -> None:
+    """Write every episode's return: ``steps`` (V,), and per split returns (S, V, T, episodes) and values (T,)."""
+    values = {f"{split}_values": x for split, x in evaluations.values.items()}
+    new = path.with_suffix(".new.npz")
+    np.savez(new, steps=evaluations.steps, **evaluations.returns, **values)  # type: ignore
+    os.replace(new, path)
+
+
+def load_evaluations(path: Path) -> Evaluations:
+    """Read what ``save_evaluations`` wrote."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            returns = {split: file[split] for split in SPLITS}
+            return Evaluations(file["steps"], returns, {s: file[f"{s}_values"] for s in SPLITS})
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(f"cannot read evaluations from {str(path)!r}: {error}") from None
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))

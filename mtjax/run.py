@@ -18,7 +18,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from mtjax import checkpoint, devices, finetune, log, points
-from mtjax.evaluation import Evaluations
+from mtjax.evaluation import Evaluations, load_evaluations, save_evaluations
 from mtjax.history import remember
 from mtjax.loop import Settings, TrainState
 from mtjax.points import Point, Sweep, Varied
@@ -354,24 +354,6 @@ def _require_finite(bad_step: np.ndarray, first_step: int) -> None:
         f"numbers stopped being finite at step {first_step + step} of task {task} (number {seed} of the run's seeds); "
         "a checkpoint, if there is one, is from before it. Try lower learning rates or max-gradient-norm"
     )
-
-
-def save_evaluations(path: Path, evaluations: Evaluations) -> None:
-    """Write every episode's return: ``steps`` (V,), and per split returns (S, V, T, episodes) and values (T,)."""
-    values = {f"{split}_values": x for split, x in evaluations.values.items()}
-    new = path.with_suffix(".new.npz")
-    np.savez(new, steps=evaluations.steps, **evaluations.returns, **values)  # type: ignore
-    os.replace(new, path)
-
-
-def load_evaluations(path: Path) -> Evaluations:
-    """Read what ``save_evaluations`` wrote."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            returns = {split: file[split] for split in SPLITS}
-            return Evaluations(file["steps"], returns, {s: file[f"{s}_values"] for s in SPLITS})
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(f"cannot read evaluations from {str(path)!r}: {error}") from None
 
 
 @contextlib.contextmanager

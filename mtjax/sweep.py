@@ -20,10 +20,10 @@ import numpy as np
 from mtjax import checkpoint, cli, points
 from mtjax.agents import AGENTS, PARTS
 from mtjax.cli import Program
-from mtjax.evaluation import Evaluations
+from mtjax.evaluation import Evaluations, load_evaluations
 from mtjax.log import append_rows, number
 from mtjax.policy import shapes
-from mtjax.run import enable_compile_cache, load_evaluations
+from mtjax.run import enable_compile_cache
 from mtjax.stats import seed_interval
 from mtjax.types import SPLITS, InputError
 

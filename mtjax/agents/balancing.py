@@ -9,7 +9,7 @@ import optax
 
 from mtjax.agents import parts
 from mtjax.agents.rules import Mean
-from mtjax.types import Array, InputError, Key
+from mtjax.types import Array, Key
 
 LEAST_WEIGHT = 1e-6
 """What GradNorm leaves to a task, as a step may cross zero."""
@@ -40,8 +40,7 @@ class _Learned(Mean):
     """Adam's learning rate of the tasks' weights."""
 
     def __post_init__(self):
-        if not self.weight_lr > 0:
-            raise InputError(f"weight-lr must be greater than 0, not {self.weight_lr}")
+        parts.require_positive(self, "weight_lr")
 
     @property
     def optimizer(self) -> optax.GradientTransformation:
@@ -74,8 +73,7 @@ class GradNorm(_Learned):
 
     def __post_init__(self):
         super().__post_init__()
-        if not self.gradnorm_asymmetry >= 0:
-            raise InputError(f"gradnorm-asymmetry must be at least 0, not {self.gradnorm_asymmetry}")
+        parts.require_not_negative(self, "gradnorm_asymmetry")
 
     def init(self, num_tasks: int) -> Balance:
         weights = jnp.ones(num_tasks)
@@ -126,8 +124,7 @@ class FAMO(_Learned):
 
     def __post_init__(self):
         super().__post_init__()
-        if not self.famo_decay >= 0:
-            raise InputError(f"famo-decay must be at least 0, not {self.famo_decay}")
+        parts.require_not_negative(self, "famo_decay")
 
     def init(self, num_tasks: int) -> Logits:
         logits = jnp.zeros(num_tasks)

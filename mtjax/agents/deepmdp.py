@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from mtjax.agents import parts
 from mtjax.agents.sac import SAC, SACState
 from mtjax.agents.trajectory import TrajectoryEncoder
 from mtjax.history import Seen
-from mtjax.names import nearest_error
 from mtjax.networks import MLP, Network, Params, Trunk, join
 from mtjax.types import Array, InputError, Key, Metrics, Spec, Task, Transition
 
@@ -88,16 +88,9 @@ class DeepMDP(SAC):
 
     def __post_init__(self):
         super().__post_init__()
-        if self.transition not in ("deterministic", "probabilistic"):
-            raise nearest_error("transition", self.transition, ("deterministic", "probabilistic"))
-        for field in ("latent_widths", "model_widths"):
-            if not getattr(self, field) or min(getattr(self, field)) < 1:
-                flag = field.replace("_", "-")
-                raise InputError(f"{flag} needs at least one layer of at least one unit, not {getattr(self, field)}")
-        if not 0 < self.encoder_tau <= 1:
-            raise InputError(f"encoder-tau must be in (0, 1], not {self.encoder_tau}")
-        if not self.model_coefficient > 0:
-            raise InputError(f"model-coefficient must be greater than 0, not {self.model_coefficient}")
+        parts.require_layers(self, "latent_widths", "model_widths")
+        parts.require_rates(self, "encoder_tau")
+        parts.require_positive(self, "model_coefficient")
         if self.encoder.front() is not None:
             raise InputError(
                 "encoder=input-map maps observations, and here networks see a latent state; choose another"

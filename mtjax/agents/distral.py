@@ -65,8 +65,7 @@ class Distral(SAC):
 
     def __post_init__(self):
         super().__post_init__()
-        if not 0 <= self.distral_alpha <= 1:
-            raise InputError(f"distral-alpha must be in [0, 1], not {self.distral_alpha}")
+        parts.require_shares(self, "distral_alpha")
 
     def _check_combination(self) -> None:
         if self.heads != "disjoint":

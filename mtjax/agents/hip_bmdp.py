@@ -8,11 +8,11 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from mtjax.agents import parts
 from mtjax.agents.deepmdp import DeepMDP
 from mtjax.agents.sac import SACState
-from mtjax.names import nearest_error
 from mtjax.networks import Params
-from mtjax.types import Array, InputError, Key, Metrics, Task
+from mtjax.types import Array, Key, Metrics, Task
 
 STAND_INS = {
     "nearest": "",
@@ -55,10 +55,7 @@ class HiPBMDP(DeepMDP):
 
     def __post_init__(self):
         super().__post_init__()
-        if self.unseen_theta not in STAND_INS:
-            raise nearest_error("unseen-theta", self.unseen_theta, STAND_INS)
-        if not self.theta_coefficient >= 0:
-            raise InputError(f"theta-coefficient must be at least 0, not {self.theta_coefficient}")
+        parts.require_not_negative(self, "theta_coefficient")
 
     @property
     def has_theta(self) -> bool:

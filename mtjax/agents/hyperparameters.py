@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
@@ -15,12 +15,9 @@ from mtjax.names import frozen, nearest_error
 from mtjax.types import InputError
 
 Conditioning = Literal["none", "one-hot", "embedding", "parameters", "vectors", "inferred"]
-CONDITIONINGS = ("none", "one-hot", "embedding", "parameters", "vectors", "inferred")
+CONDITIONINGS = get_args(Conditioning)
 Heads = Literal["shared", "per-task", "disjoint"]
-HEADS = ("shared", "per-task", "disjoint")
-SCOPES = ("shared", "per-layer")
 Tune = Literal["all", "heads", "embedding"]
-TUNES = ("all", "heads", "embedding")
 
 PARTS: dict[str, Mapping[str, type]] = {
     "encoder": ENCODERS,
@@ -96,29 +93,17 @@ class Hyperparameters:
     def __post_init__(self):
         for kind, table in PARTS.items():
             object.__setattr__(self, kind, parts.choose(kind, table, getattr(self, kind)))
-        choices = (
-            ("conditioning", CONDITIONINGS),
-            ("heads", HEADS),
-            ("gradient_scope", SCOPES),
-            ("tune", TUNES),
-            ("believe", ("least", "mean")),
-        )
-        for field, allowed in choices:
-            if getattr(self, field) not in allowed:
-                raise nearest_error(field.replace("_", "-"), getattr(self, field), allowed)
+        parts.require_choices(self)
         self._check_numbers()
         self._check_combination()
 
     def _check_numbers(self) -> None:
-        for field in ("actor_lr", "critic_lr", "temperature_lr", "num_critics", "initial_temperature"):
-            if not getattr(self, field) > 0:
-                raise InputError(f"{field.replace('_', '-')} must be greater than 0, not {getattr(self, field)}")
+        rates = ("actor_lr", "critic_lr", "temperature_lr")
+        parts.require_positive(self, *rates, "num_critics", "initial_temperature")
         if not self.max_gradient_norm >= 0:
             raise InputError(f"max-gradient-norm must be at least 0 (0 does not clip), not {self.max_gradient_norm}")
-        if not self.weight_decay >= 0:
-            raise InputError(f"weight-decay must be at least 0, not {self.weight_decay}")
-        if not self.hidden or min(self.hidden) < 1:
-            raise InputError(f"hidden needs at least one layer of at least one unit, not {self.hidden}")
+        parts.require_not_negative(self, "weight_decay")
+        parts.require_layers(self, "hidden")
         if not 0 <= self.gamma <= 1 or not 0 < self.tau <= 1:
             raise InputError(f"gamma must be in [0, 1] and tau in (0, 1], not {self.gamma} and {self.tau}")
         for field in ("embedding_size", "inferred_from"):

@@ -7,13 +7,29 @@ no two kinds may use a field's name.
 import copy
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar, get_args, get_origin
 
 import jax
 
 from mtjax.names import frozen, nearest_error
+from mtjax.types import InputError, Outcome
 
 P = TypeVar("P")
+
+
+@dataclasses.dataclass(frozen=True)
+class Watcher:
+    """A part that may remember what it sees of the stream of outcomes."""
+
+    watches: ClassVar[bool] = False  # the stream
+
+    def init(self, num_tasks: int) -> Any:
+        """A memory of nothing."""
+        return None
+
+    def observe(self, memory: Any, outcome: Outcome) -> Any:
+        """Take note of what one step of every environment brought, leaves (T, E)."""
+        return memory
 
 
 def choose(kind: str, table: Mapping[str, type[P]], given: Any) -> P:
@@ -56,3 +72,54 @@ def put(part: P, **values: Any) -> P:
 def is_zero(value: Any) -> bool:
     """Whether a number is zero for good, and what it switches on needs no program; a traced one may be anything."""
     return not isinstance(value, jax.Array) and value == 0
+
+
+# Checks of settings. Each raises an InputError that names the setting, its value and what is allowed.
+
+
+def require_choices(holder: Any) -> None:
+    """Every setting of ``Literal`` type is one of its choices."""
+    for field in dataclasses.fields(holder):
+        allowed = get_args(field.type) if get_origin(field.type) is Literal else ()
+        if allowed and getattr(holder, field.name) not in allowed:
+            raise nearest_error(_flag(field.name), getattr(holder, field.name), allowed)
+
+
+def require_positive(holder: Any, *names: str) -> None:
+    """Numbers are greater than 0."""
+    for name in names:
+        _require(getattr(holder, name) > 0, holder, name, "must be greater than 0")
+
+
+def require_not_negative(holder: Any, *names: str) -> None:
+    """Numbers are at least 0."""
+    for name in names:
+        _require(getattr(holder, name) >= 0, holder, name, "must be at least 0")
+
+
+def require_rates(holder: Any, *names: str) -> None:
+    """Numbers are in (0, 1]."""
+    for name in names:
+        _require(0 < getattr(holder, name) <= 1, holder, name, "must be in (0, 1]")
+
+
+def require_shares(holder: Any, *names: str) -> None:
+    """Numbers are in [0, 1]."""
+    for name in names:
+        _require(0 <= getattr(holder, name) <= 1, holder, name, "must be in [0, 1]")
+
+
+def require_layers(holder: Any, *names: str) -> None:
+    """Widths are of at least one layer of at least one unit."""
+    for name in names:
+        widths = getattr(holder, name)
+        _require(widths and min(widths) >= 1, holder, name, "needs at least one layer of at least one unit")
+
+
+def _require(met: Any, holder: Any, name: str, rule: str) -> None:
+    if not met:
+        raise InputError(f"{_flag(name)} {rule}, not {getattr(holder, name)}")
+
+
+def _flag(name: str) -> str:
+    return name.replace("_", "-")

@@ -231,10 +231,10 @@ class SAC(Hyperparameters):
         batch, features, target = data
         outputs = self.outputs(critic, features, batch.obs, batch.action)
         loss = jnp.mean(jnp.sum(self.value.loss(outputs, target), axis=0))
-        values = self.value.mean(outputs)
-        td_error = jnp.mean(jnp.abs(values - self.value.expected(target)))
+        values, expected = self.value.mean(outputs), self.value.expected(target)
+        td_error = jnp.mean(jnp.abs(values - expected))
         seen = {"critic_loss": loss, "value": jnp.mean(values), "td_error": td_error}
-        return loss, seen | {"target": self.value.expected(target)}  # which ``update`` takes for the scaling
+        return loss, seen | {"target": expected}  # which ``update`` takes for the scaling
 
     def actor_loss(self, actor: Params, data) -> tuple[Array, Metrics]:
         batch, features, critic, temperature, key = data

@@ -5,28 +5,18 @@ is a weight of two on its losses, which is the same in expectation and less nois
 """
 
 import dataclasses
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from mtjax.names import nearest_error
+from mtjax.agents import parts
 from mtjax.types import Array, InputError, Outcome
 
 
 @dataclasses.dataclass(frozen=True)
-class Uniform:
+class Uniform(parts.Watcher):
     """All tasks alike. Every sampler is a class like this one."""
-
-    watches: ClassVar[bool] = False  # the stream of outcomes
-
-    def init(self, num_tasks: int) -> Any:
-        """A memory of nothing."""
-        return None
-
-    def observe(self, memory: Any, outcome: Outcome) -> Any:
-        """Take note of what one step of every environment brought, leaves (T, E)."""
-        return memory
 
     def weights(self, memory: Any, temperature: Array) -> Array | None:
         """What each task's losses count (T,), 1 on average; None for 1. ``temperature`` (T,) is SAC's."""
@@ -41,8 +31,8 @@ class _Unequal(Uniform):
     """Weight that every task has whatever happens; the rest is shared out. 1 weighs all tasks alike."""
 
     def __post_init__(self):
-        if not 0 <= self.least_weight <= 1:
-            raise InputError(f"least-weight must be in [0, 1], not {self.least_weight}")
+        parts.require_choices(self)
+        parts.require_shares(self, "least_weight")
 
     def share_out(self, shares: Array) -> Array:
         """Weights (T,) of mean 1 and at least ``least_weight`` from shares (T,) that sum to one."""
@@ -156,11 +146,6 @@ class ByTemperature(_Unequal):
 
     certainty: Literal["log-temperature", "temperature"] = "log-temperature"
     """Softmax of minus the temperatures' logarithms, as in the authors' code, or of minus themselves (their paper)."""
-
-    def __post_init__(self):
-        super().__post_init__()
-        if self.certainty not in (allowed := ("log-temperature", "temperature")):
-            raise nearest_error("certainty", self.certainty, allowed)
 
     def weights(self, memory: Any, temperature: Array) -> Array:
         score = temperature if self.certainty == "temperature" else jnp.log(temperature)

@@ -7,27 +7,18 @@ Replayed rewards are raw and scaled when they are learned from, all by the lates
 """
 
 import dataclasses
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
+from mtjax.agents import parts
 from mtjax.networks import Params
-from mtjax.types import Array, InputError, Outcome, Transition
+from mtjax.types import Array, Outcome, Transition
 
 
 @dataclasses.dataclass(frozen=True)
-class NoScaling:
+class NoScaling(parts.Watcher):
     """Rewards as they are. Every scaling is a class like this one."""
-
-    watches: ClassVar[bool] = False  # the stream of outcomes
-
-    def init(self, num_tasks: int) -> Any:
-        """A memory of nothing."""
-        return None
-
-    def observe(self, memory: Any, outcome: Outcome) -> Any:
-        """Take note of what one step of every environment brought, leaves (T, E)."""
-        return memory
 
     def units(self, memory: Any, gamma: float, bonus: Array) -> tuple[Array, Array] | None:
         """Each task's factor and offset (T,); None for 1 and 0.
@@ -54,9 +45,15 @@ class NoScaling:
         return memory
 
 
-class RewardMoments(NamedTuple):
+class Moments(NamedTuple):
+    """Of rewards or of targets, from 0 and 1."""
+
     mean: Array  # (T,)
     variance: Array  # (T,)
+
+    @staticmethod
+    def begin(num_tasks: int) -> "Moments":
+        return Moments(jnp.zeros(num_tasks), jnp.ones(num_tasks))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,18 +72,18 @@ class RewardScaling(NoScaling):
     """Share of a new reward in the moving estimate of the rewards' variance."""
 
     def __post_init__(self):
-        _check_rate("variance-rate", self.variance_rate)
+        parts.require_rates(self, "variance_rate")
 
-    def init(self, num_tasks: int) -> RewardMoments:
-        return RewardMoments(jnp.zeros(num_tasks), jnp.ones(num_tasks))
+    def init(self, num_tasks: int) -> Moments:
+        return Moments.begin(num_tasks)
 
-    def observe(self, memory: RewardMoments, outcome: Outcome) -> RewardMoments:
+    def observe(self, memory: Moments, outcome: Outcome) -> Moments:
         rate = 1 - (1 - self.variance_rate) ** outcome.reward.shape[1]
         mean = memory.mean + rate * (jnp.mean(outcome.reward, axis=1) - memory.mean)
         spread = jnp.mean(jnp.square(outcome.reward - mean[:, None]), axis=1)
-        return RewardMoments(mean, memory.variance + rate * (spread - memory.variance))
+        return Moments(mean, memory.variance + rate * (spread - memory.variance))
 
-    def units(self, memory: RewardMoments, gamma: float, bonus: Array) -> tuple[Array, Array]:
+    def units(self, memory: Moments, gamma: float, bonus: Array) -> tuple[Array, Array]:
         return 1 / (jnp.sqrt(memory.variance) + 1e-8), jnp.zeros_like(memory.mean)
 
 
@@ -113,8 +110,7 @@ class ReturnScaling(NoScaling):
     """Largest size of a discounted return once scaled; with value=c51 or hl-gauss, the range of their bins."""
 
     def __post_init__(self):
-        if not self.return_range > 0:
-            raise InputError(f"return-range must be greater than 0, not {self.return_range}")
+        parts.require_positive(self, "return_range")
 
     def init(self, num_tasks: int) -> LargestReturns:
         return LargestReturns(jnp.zeros(num_tasks), jnp.zeros(num_tasks))
@@ -131,11 +127,6 @@ class ReturnScaling(NoScaling):
         known = largest > 0
         factor = self.return_range / jnp.where(known, largest + horizon * bonus, 1.0)
         return jnp.where(known, factor, 1.0), jnp.zeros_like(largest)
-
-
-class TargetMoments(NamedTuple):
-    mean: Array  # (T,)
-    variance: Array  # (T,)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,25 +150,25 @@ class PopArt(NoScaling):
     """Share of a new batch in the moving estimates of targets' mean and variance."""
 
     def __post_init__(self):
-        _check_rate("target-rate", self.target_rate)
+        parts.require_rates(self, "target_rate")
 
-    def init(self, num_tasks: int) -> TargetMoments:
-        return TargetMoments(jnp.zeros(num_tasks), jnp.ones(num_tasks))
+    def init(self, num_tasks: int) -> Moments:
+        return Moments.begin(num_tasks)
 
     @staticmethod
-    def std(memory: TargetMoments) -> Array:
+    def std(memory: Moments) -> Array:
         """The standard deviation (T,) by which targets are divided."""
         return jnp.clip(jnp.sqrt(memory.variance), 1e-4, 1e6)
 
-    def units(self, memory: TargetMoments, gamma: float, bonus: Array) -> tuple[Array, Array]:
+    def units(self, memory: Moments, gamma: float, bonus: Array) -> tuple[Array, Array]:
         return 1 / self.std(memory), memory.mean
 
-    def renew(self, memory: TargetMoments, target: Array, critics: tuple[Params, ...]):
+    def renew(self, memory: Moments, target: Array, critics: tuple[Params, ...]):
         rate, std = self.target_rate, self.std(memory)
         ahead = std * jnp.mean(target, axis=1)  # of the old mean, in reward
         spread = jnp.square(std) * jnp.var(target, axis=1)
         variance = (1 - rate) * memory.variance + rate * spread + rate * (1 - rate) * jnp.square(ahead)
-        new = TargetMoments(memory.mean + rate * ahead, variance)
+        new = Moments(memory.mean + rate * ahead, variance)
         ratio = std / self.std(new)
         shift = (new.mean - memory.mean) / self.std(new)  # by as much as the mean moved, rounding included
 
@@ -214,8 +205,7 @@ class AdaptiveScaling(NoScaling):
     """Mean rewards below this are taken for it, which bounds how much a task's rewards are scaled up."""
 
     def __post_init__(self):
-        if not self.least_mean_reward > 0:
-            raise InputError(f"least-mean-reward must be greater than 0, not {self.least_mean_reward}")
+        parts.require_positive(self, "least_mean_reward")
 
     def init(self, num_tasks: int) -> MeanRewards:
         return MeanRewards(jnp.zeros(num_tasks), jnp.zeros(num_tasks), jnp.zeros(num_tasks))
@@ -239,11 +229,6 @@ class AdaptiveScaling(NoScaling):
 
     def reset(self, memory: MeanRewards) -> MeanRewards:
         return memory._replace(factor=jnp.zeros_like(memory.factor))
-
-
-def _check_rate(name: str, rate: float) -> None:
-    if not 0 < rate <= 1:
-        raise InputError(f"{name} must be in (0, 1], not {rate}")
 
 
 Scaling = NoScaling

@@ -155,10 +155,15 @@ def weighted_sums(weights: Array, leaves: list[Array]) -> list[Array]:
     return [next(rest).reshape(leaf.shape[1:]) if _is_small(leaf) else whole(leaf) for leaf in leaves]
 
 
+def cosines(gram: Array) -> tuple[Array, Array]:
+    """Cosines (T, T) between the tasks' gradients, 0 of those that are 0, and their lengths (T,)."""
+    norms = jnp.sqrt(jnp.diagonal(gram))
+    return gram / jnp.maximum(norms[:, None] * norms, 1e-30), norms
+
+
 def conflicts(gram: Array) -> Metrics:
     """Mean cosine between different tasks' gradients, the share of pairs that point apart, and lengths (T,)."""
-    norms = jnp.sqrt(jnp.diagonal(gram))
-    cosine = gram / jnp.maximum(norms[:, None] * norms, 1e-30)
+    cosine, norms = cosines(gram)
     pairs = ~jnp.eye(len(gram), dtype=bool)
     count = jnp.maximum(jnp.sum(pairs), 1)
     found = {"cosine": jnp.sum(cosine * pairs) / count, "conflict": jnp.sum((cosine < 0) & pairs) / count}

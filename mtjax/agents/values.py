@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mtjax.agents import parts
 from mtjax.types import Array, InputError
 
 
@@ -121,8 +122,7 @@ class HLGauss(C51):
 
     def __post_init__(self):
         super().__post_init__()
-        if not self.bin_sigma > 0:
-            raise InputError(f"bin-sigma must be greater than 0, not {self.bin_sigma}")
+        parts.require_positive(self, "bin_sigma")
 
     @property
     def width(self) -> float:

@@ -5,6 +5,7 @@ from typing import ClassVar
 
 import flax.linen as nn
 
+from mtjax.agents import parts
 from mtjax.networks import MLP, Trunk, join
 from mtjax.types import Array
 
@@ -18,6 +19,9 @@ class Identity:
     """
 
     needs_features: ClassVar[bool] = False  # of the task; then an agent that is told nothing is refused
+
+    def __post_init__(self):
+        parts.require_choices(self)
 
     def refuses(self, conditioning: str) -> str:
         """Why it cannot work with what the networks are told of the task; empty if it can."""

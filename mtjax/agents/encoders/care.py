@@ -7,11 +7,11 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from mtjax.agents import parts
 from mtjax.agents.encoders.base import Identity
 from mtjax.agents.encoders.mixture import Experts, check_experts
-from mtjax.names import nearest_error
 from mtjax.networks import MLP, join
-from mtjax.types import Array, InputError
+from mtjax.types import Array
 
 
 class Mixture(nn.Module):
@@ -75,10 +75,8 @@ class CARE(Identity):
     """Divides the paper's inner products; 0 is the square root of the encoding's size, 1 the paper's formula."""
 
     def __post_init__(self):
-        if self.variant not in ("paper", "mtrl"):
-            raise nearest_error("variant", self.variant, ("paper", "mtrl"))
-        if not self.attention_temperature >= 0:
-            raise InputError(f"attention-temperature must be at least 0, not {self.attention_temperature}")
+        super().__post_init__()
+        parts.require_not_negative(self, "attention_temperature")
         check_experts(self.num_experts, self.expert_widths)
 
     def body(self, hidden: tuple[int, ...], layer_norm: bool) -> nn.Module:

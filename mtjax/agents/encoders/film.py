@@ -8,11 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from mtjax.agents.encoders.base import Identity
-from mtjax.names import nearest_error
 from mtjax.networks import MLP, ReLU
 from mtjax.types import Array, InputError
-
-_FORMS = ("channel", "scalar")
 
 
 class ModulatedMLP(nn.Module):
@@ -74,8 +71,7 @@ class FiLM(Identity):
     """Widths of the hidden layers of the network that gives scales and shifts; none makes it linear."""
 
     def __post_init__(self):
-        if self.film not in _FORMS:
-            raise nearest_error("film", self.film, _FORMS)
+        super().__post_init__()
         if any(width < 1 for width in self.film_widths):
             raise InputError(f"film-widths must be of at least one unit each, not {self.film_widths}")
 

@@ -8,12 +8,10 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents.encoders.base import Identity
-from mtjax.names import nearest_error
 from mtjax.networks import MLP, ReLU, join
 from mtjax.types import Array, InputError
 
 _BY_NUMBER = ("identity", "cluster")
-_MODES = ("attention", "top-k", "ensemble", *_BY_NUMBER)
 
 
 class Experts(nn.Module):
@@ -128,8 +126,7 @@ class MoE(Identity):
     """The expert of every training task, numbered from 0, for mode=cluster."""
 
     def __post_init__(self):
-        if self.mode not in _MODES:
-            raise nearest_error("mode", self.mode, _MODES)
+        super().__post_init__()
         check_experts(self.num_experts, self.expert_widths)
         if self.mode == "top-k" and not 2 <= self.top_k <= self.num_experts:
             raise InputError(f"top-k must be from 2 to num-experts={self.num_experts}, not {self.top_k}")

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents.encoders.base import Identity
-from mtjax.names import nearest_error
 from mtjax.networks import MLP, ReLU
 from mtjax.types import Array, InputError
 
@@ -119,8 +118,7 @@ class SoftModules(Identity):
     """Widths of the layers that embed the routing's input in the official variant."""
 
     def __post_init__(self):
-        if self.variant not in ("paper", "official"):
-            raise nearest_error("variant", self.variant, ("paper", "official"))
+        super().__post_init__()
         if self.num_layers < 2:
             raise InputError(f"num-layers must be at least 2, as weights lie between layers, not {self.num_layers}")
         if min(self.num_modules, self.module_width, *self.routing_widths) < 1:
