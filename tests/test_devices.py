@@ -17,7 +17,7 @@ import pytest
 import mtjax
 import mtjax.train
 from mtjax import devices
-from mtjax.run import load_evaluations
+from mtjax.evaluation import load_evaluations
 from mtjax.types import InputError
 
 HERE = Path(__file__).parent

@@ -18,8 +18,7 @@ import mtjax
 import mtjax.evaluate
 import mtjax.train
 from mtjax import checkpoint, cli, loop, render
-from mtjax.evaluation import Evaluations, evaluate
-from mtjax.run import load_evaluations
+from mtjax.evaluation import Evaluations, evaluate, load_evaluations
 from mtjax.types import InputError
 
 VALUES = {"train": [1.0, 1.2], "interpolation": [1.1], "extrapolation": [0.6, 0.8, 1.4, 1.6]}

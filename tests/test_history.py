@@ -90,6 +90,7 @@ class Idle:
 
     gamma: float = 0.9
     watches: bool = False
+    history: int = 3
 
     def init(self, spec, tasks, key):
         return jnp.zeros(1)

@@ -22,7 +22,7 @@ SETTINGS = Settings(
 PLAIN = {"gamma": GAMMA, "initial_temperature": 1e-6, "temperature_lr": 1e-9}
 # Values are compared in the units of rewards; and two experts are too few for four signs of observation and scale.
 OF_AGENT = {"brc": {"scaling": "none"}, "moe": {"num_experts": 4}}
-RATES = {"tau": 0.3, "actor_lr": 1e-2, "critic_lr": 1e-2}
+RATES = {"tau": 0.3, "actor_lr": 3e-3, "critic_lr": 1e-2}
 
 # Q(scale, obs, action), and how far a critic may be from it: at least half as far again as the worst of five seeds.
 ENDLESS = lambda scale, obs, action: scale * np.where(obs > 0.5, 1, GAMMA) / (1 - GAMMA)

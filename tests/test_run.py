@@ -20,8 +20,9 @@ from conftest import SHORT_RUN
 import mtjax
 import mtjax.train
 from mtjax import checkpoint, cli, loop
+from mtjax.evaluation import load_evaluations
 from mtjax.loop import Settings
-from mtjax.run import Plan, enable_compile_cache, fit_chunk, load_evaluations, stop_signals, train
+from mtjax.run import Plan, enable_compile_cache, fit_chunk, stop_signals, train
 from mtjax.types import InputError
 
 CLOCKS = {"seconds", "wall_seconds"}
