@@ -5,6 +5,7 @@ import json
 import os
 import platform
 import subprocess
+import sys
 from typing import Any
 
 import jax
@@ -32,8 +33,8 @@ def machine() -> dict[str, Any]:
 def publish(arguments: argparse.Namespace, rows: list[dict]) -> None:
     """Print the figures as JSON, and write them to ``--json`` if that was given."""
     settings = {name: value for name, value in vars(arguments).items() if name != "json"}
-    report = {"machine": machine(), "settings": settings, "rows": rows}
-    print(json.dumps(report))
+    report = {"benchmark": os.path.basename(sys.argv[0]), "machine": machine(), "settings": settings, "rows": rows}
+    print(json.dumps(report, default=str))
     if arguments.json:
         with open(arguments.json, "x") as file:
-            json.dump(report, file, indent=2)
+            json.dump(report, file, indent=2, default=str)

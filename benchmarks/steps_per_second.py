@@ -20,11 +20,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from report import publish
+from training import Training
 
 import mtjax
-from mtjax import cli, loop
+from mtjax import loop
 from mtjax.envs import Domain
-from mtjax.history import remember
 from mtjax.types import InputError
 
 # Ours (with ten values of a physical parameter), and Playground's of the same task.
@@ -215,30 +215,19 @@ def playground(name: str, impl: str, worlds: int, steps: int) -> Callable[[], An
 
 def training_rate(arguments: argparse.Namespace) -> dict:
     """Time the whole loop as ``mtjax.train`` runs it with the preset of this device."""
-    program = cli.with_preset("finger-spin-vary-size", arguments.agent)
-    settings, agent = program.training, program.learner
-    env = remember(program.family, agent.history)
-    tasks = env.tasks()
-    before = time.perf_counter()
-    state = loop.init(env, agent, settings, tasks, jnp.arange(1))
-    state, _ = jax.block_until_ready(loop.run_chunk(env, agent, settings, tasks, state))
-    first, rates = time.perf_counter() - before, []
-    steps = len(tasks.id) * settings.num_envs * settings.chunk_steps
-    while int(state.iteration) < settings.warmup_steps:
-        state, _ = loop.run_chunk(env, agent, settings, tasks, state)
+    program = mtjax.preset("finger-spin-vary-size", arguments.agent)
+    training = Training(program.family, program.learner, program.training, most_devices=1)
     for _ in range(arguments.repeats):
-        before = time.perf_counter()
-        state, _ = jax.block_until_ready(loop.run_chunk(env, agent, settings, tasks, state))
-        rates.append(steps / (time.perf_counter() - before))
+        training.time()
     return {
         "domain": "finger-spin-vary-size",
         "contestant": f"training {arguments.agent}",
-        "worlds": len(tasks.id) * settings.num_envs,
-        "steps_per_second": statistics.median(rates),
-        "slowest": min(rates),
-        "fastest": max(rates),
-        "updates_per_second": statistics.median(rates) / len(tasks.id) / settings.num_envs * settings.updates_per_step,
-        "first_call_seconds": first,
+        "worlds": training.worlds,
+        "steps_per_second": statistics.median(training.rates),
+        "slowest": min(training.rates),
+        "fastest": max(training.rates),
+        "updates_per_second": training.updates / statistics.median(training.seconds),
+        "first_call_seconds": training.compile_seconds,
     }
 
 

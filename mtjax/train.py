@@ -112,7 +112,7 @@ def record_steps(file: Path, steps: int) -> None:
 
 def check(program: Program) -> None:
     """Meet whatever the family's and the agent's constructors could not check before a run's folder is made."""
-    from mtjax.agents.sac import load_vectors
+    from mtjax.agents.conditioning import load_vectors
 
     _ = program.family.engine_name, program.family.table, devices.mesh_for(program.plan.seeds)
     if program.training.hindsight:

@@ -10,9 +10,9 @@ from probes import learner, pick, quick, random_batch, tasks_of, tiny
 
 from mtjax import normalize
 from mtjax.agents import AGENTS, agent
+from mtjax.agents.conditioning import load_vectors
 from mtjax.agents.encoders import ENCODERS
 from mtjax.agents.hyperparameters import CONDITIONINGS
-from mtjax.agents.sac import load_vectors
 from mtjax.agents.samplers import SAMPLERS
 from mtjax.agents.scaling import SCALINGS
 from mtjax.agents.surgery import RULES
@@ -305,6 +305,7 @@ REFUSED = [
     ("sac", {"initial_temperature": 0.0}, "initial-temperature must be greater than 0"),
     ("sac", {"num_critics": 0}, "num-critics must be greater than 0, not 0"),
     ("sac", {"hidden": ()}, r"hidden needs at least one layer .*not \(\)"),
+    ("sac", {"encoder": "mlp", "encoder_widths": ()}, r"encoder-widths needs at least one layer .*not \(\)"),
     ("sac", {"hidden": (8, 0)}, r"at least one unit, not \(8, 0\)"),
     ("sac", {"gamma": 1.1}, r"gamma must be in \[0, 1\] .*1.1"),
     ("sac", {"tau": 0.0}, r"tau in \(0, 1\], not .*0.0"),

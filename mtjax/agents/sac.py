@@ -11,7 +11,7 @@ import numpy as np
 import optax
 
 from mtjax import normalize
-from mtjax.agents import parts, surgery
+from mtjax.agents import conditioning, descent, surgery
 from mtjax.agents.hyperparameters import Hyperparameters
 from mtjax.agents.trajectory import TrajectoryEncoder
 from mtjax.history import Seen, plain_obs_size, unpack
@@ -70,7 +70,7 @@ class SAC(Hyperparameters):
     def init(self, spec: Spec, tasks: Task, key: Key) -> SACState:
         """Initialise for the training ``tasks`` (T, ...)."""
         num_tasks = len(tasks.id)
-        vectors = load_vectors(self.vectors, num_tasks) if self.vectors else None
+        vectors = conditioning.load_vectors(self.vectors, num_tasks) if self.vectors else None
         if self.history not in (0, spec.history):
             raise InputError(
                 f"conditioning=inferred needs observations that show the last {self.history} steps, and these show "
@@ -78,7 +78,7 @@ class SAC(Hyperparameters):
             )
         moments = normalize.init(plain_obs_size(spec) if self.history else spec.obs_size)
         obs, action = self._see(moments, jnp.zeros(spec.obs_size)), jnp.zeros(spec.action_size)
-        features = self._features(num_tasks, jnp.int32(0), tasks.context[0], vectors)
+        features = conditioning.features(self.conditioning, num_tasks, jnp.int32(0), tasks.context[0], vectors)
         actor, critic = self.networks(num_tasks, features, obs, action, key)
         log = jnp.log if isinstance(self.initial_temperature, Array) else np.log
         log_temperature = jnp.full(1 if self.shared_temperature else num_tasks, log(self.initial_temperature))
@@ -109,22 +109,8 @@ class SAC(Hyperparameters):
 
     @property
     def _optimizers(self) -> tuple[optax.GradientTransformation, ...]:
-        clip = optax.identity() if parts.is_zero(self.max_gradient_norm) else clip_to(self.max_gradient_norm)
-        decay, plain = self.weight_decay, parts.is_zero(self.weight_decay)
-        adam = lambda lr: optax.chain(clip, optax.adam(lr) if plain else optax.adamw(lr, weight_decay=decay))
-        some = lambda learn: optax.partition({True: learn, False: optax.set_to_zero()}, self._learns)
-        chosen = adam if self.tune == "all" else lambda lr: some(adam(lr))
+        chosen = partial(descent.adam, weight_decay=self.weight_decay, max_norm=self.max_gradient_norm, tune=self.tune)
         return chosen(self.actor_lr), chosen(self.critic_lr), optax.adam(self.temperature_lr)
-
-    def _learns(self, params: Params) -> Any:
-        """Which leaves of actor or critic learn where not all do: those of heads, or learned embeddings."""
-        part = {"heads": "head", "embedding": "embedding"}[self.tune]
-
-        def learns(path, _) -> bool:
-            names = [getattr(step, "key", None) for step in path]
-            return part in names and "body" not in names[: names.index(part)]
-
-        return jax.tree_util.tree_map_with_path(learns, params)
 
     # Which task it is.
 
@@ -133,10 +119,7 @@ class SAC(Hyperparameters):
         """What a task that was not trained on has of its nearest training task."""
         parts = {"shared": [], "per-task": ["head"], "disjoint": ["networks"]}[self.heads]
         parts += ["input layer"] * (self.encoder.front() is not None)
-        parts += [{"one-hot": "number"}.get(self.conditioning, self.conditioning.removesuffix("s"))] * (
-            self.conditioning in ("one-hot", "embedding", "vectors")
-        )
-        return parts
+        return parts + conditioning.BORROWED.get(self.conditioning, [])
 
     @property
     def unseen(self) -> str:
@@ -154,21 +137,10 @@ class SAC(Hyperparameters):
         strangers = tasks._replace(id=jnp.full_like(tasks.id, len(state.contexts)))
         return jax.vmap(partial(self.known_task, state))(strangers)
 
-    def _features(self, num_tasks: int, index: Array, context: Array, vectors: Array | None) -> Array:
-        """What the networks see of a task (Z,); a learned embedding is added by the network that owns it."""
-        match self.conditioning:
-            case "one-hot":
-                return jax.nn.one_hot(index, num_tasks)
-            case "parameters":
-                return context
-            case "vectors":
-                assert vectors is not None
-                return vectors[index]
-        return jnp.zeros(0)
-
     def features(self, state: SACState, task: Task) -> Array:
         """What the networks see of one task (Z,)."""
-        return self._features(len(state.contexts), self.known_task(state, task), task.context, state.vectors)
+        known = self.known_task(state, task)
+        return conditioning.features(self.conditioning, len(state.contexts), known, task.context, state.vectors)
 
     # Acting.
 
@@ -281,16 +253,16 @@ class SAC(Hyperparameters):
 
         loss, data = self.critic_problem(state, batch, features, temperature, target_key)
         seen = combine(self.gradients, loss, state.critic, data, state.surgery[0], critic_order)
-        critic, critic_memory = descend(critic_optimizer, seen.gradients, state.optimizers[1], state.critic)
+        critic, critic_memory = descent.descend(critic_optimizer, seen.gradients, state.optimizers[1], state.critic)
         critic_weighing = surgery.look_again(self.gradients, loss, critic, data, seen)
 
         loss, data = self.actor_problem(critic, batch, features, temperature, actor_key)
         done = combine(self.gradients.for_actor, loss, state.actor, data, state.surgery[1], actor_order)
-        actor, actor_memory = descend(actor_optimizer, done.gradients, state.optimizers[0], state.actor)
+        actor, actor_memory = descent.descend(actor_optimizer, done.gradients, state.optimizers[0], state.actor)
 
         action_size = batch.action.shape[-1]
         slope = jax.grad(self.temperature_loss)(state.log_temperature, done.aux["entropy"], action_size)
-        log_temperature, temperature_memory = descend(
+        log_temperature, temperature_memory = descent.descend(
             temperature_optimizer, slope, state.optimizers[2], state.log_temperature
         )
         metrics = {**seen.aux, **done.aux, "temperature": temperature}
@@ -356,32 +328,3 @@ def least(values: Array) -> Array:
     them otherwise, and is then 0 / 0.
     """
     return jnp.take_along_axis(values, jnp.argmin(values, axis=0, keepdims=True), axis=0)[0]
-
-
-def clip_to(norm: Any) -> optax.GradientTransformation:
-    """Clip gradients to a global norm; a traced one may be 0, which does not clip."""
-    return optax.clip_by_global_norm(jnp.where(norm > 0, norm, jnp.inf) if isinstance(norm, Array) else norm)
-
-
-def descend(optimizer: optax.GradientTransformation, gradients: Any, memory: Any, params: Any) -> tuple[Any, Any]:
-    """Apply one optimiser step; returns parameters and the optimiser's state."""
-    updates, memory = optimizer.update(gradients, memory, params)
-    return optax.apply_updates(params, updates), memory
-
-
-def load_vectors(file: str, num_tasks: int) -> Array:
-    """Read task vectors (T, V) from a .npy file.
-
-    Raises:
-        InputError: the file cannot be read, or does not hold one finite row for every training task.
-    """
-    try:
-        with open(file, "rb") as opened:
-            vectors = np.asarray(np.load(opened, allow_pickle=False), np.float32)  # neither an archive nor words
-    except (OSError, EOFError, TypeError, ValueError) as error:
-        raise InputError(f"cannot read task vectors from {file!r}: {error}") from None
-    if vectors.ndim != 2 or len(vectors) != num_tasks or not np.all(np.isfinite(vectors)):
-        raise InputError(
-            f"{file!r} must hold {num_tasks} finite rows, one a training task; its shape is {vectors.shape}"
-        )
-    return jnp.asarray(vectors)

@@ -58,5 +58,9 @@ class MLPEncoder(Identity):
     encoder_widths: tuple[int, ...] = (64, 64)
     """Widths of the encoder's layers; the last is the size of the encoding."""
 
+    def __post_init__(self):
+        super().__post_init__()
+        parts.require_layers(self, "encoder_widths")
+
     def body(self, hidden: tuple[int, ...], layer_norm: bool) -> nn.Module:
         return EncodedTrunk(self.encoder_widths, hidden, layer_norm)

@@ -1,0 +1,56 @@
+"""The training loop as something to time: compiled and warmed up once, then run chunk by chunk."""
+
+import time
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from mtjax import devices
+from mtjax.agents import SAC
+from mtjax.envs import Family
+from mtjax.history import remember
+from mtjax.loop import Settings
+
+
+class Training:
+    """The loop of ``mtjax.train`` without evaluations, logs and checkpoints.
+
+    Args:
+        family, agent, settings: what is trained; learning is under way by the time it is first timed.
+        seeds: how many at once.
+        most_devices: of those there are, how many it may use.
+    """
+
+    def __init__(self, family: Family, agent: SAC, settings: Settings, seeds: int = 1, most_devices: int | None = None):
+        env, mesh = remember(family, agent.history), devices.mesh_for(seeds, most=most_devices)
+        programs, numbers = devices.programs(mesh), devices.by_seed(mesh, jnp.arange(seeds))
+        tasks = devices.everywhere(mesh, env.tasks())
+        self.num_devices = 1 if mesh is None else mesh.size
+        self.worlds = len(tasks.id) * settings.num_envs
+        self.steps, self.updates = (seeds * settings.chunk_steps * n for n in (self.worlds, settings.updates_per_step))
+        self.seconds: list[float] = []
+        before = time.perf_counter()
+        self.state = programs.init(env, agent, settings, tasks, numbers, None)
+        chunk = programs.chunk.lower(env, agent, settings, tasks, self.state).compile()
+        self.compile_seconds = time.perf_counter() - before
+        self.run = lambda state: chunk(tasks, state)
+        while int(self.state.iteration) <= settings.warmup_steps:
+            self.time(count=False)
+
+    def time(self, count: bool = True) -> None:
+        """Run one chunk."""
+        before = time.perf_counter()
+        self.state, _ = jax.block_until_ready(self.run(self.state))
+        if count:
+            self.seconds.append(time.perf_counter() - before)
+
+    @property
+    def rates(self) -> list[float]:
+        """Environment steps a second of all seeds, of every chunk timed."""
+        return [self.steps / seconds for seconds in self.seconds]
+
+    def memory(self) -> int | None:
+        """Bytes of the device's memory that were in use at most, by whatever ran so far; None on a CPU."""
+        found: Any = jax.local_devices()[0].memory_stats() or {}
+        return found.get("peak_bytes_in_use")

@@ -1,0 +1,43 @@
+"""Gradient descent on the parameters of actor and critics."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from mtjax.agents import parts
+from mtjax.networks import Params
+from mtjax.types import Array
+
+
+def adam(rate: Any, weight_decay: Any, max_norm: Any, tune: str) -> optax.GradientTransformation:
+    """Adam or AdamW on clipped gradients, of which only the parameters that ``tune`` names learn."""
+    clip = optax.identity() if parts.is_zero(max_norm) else clip_to(max_norm)
+    step = optax.adam(rate) if parts.is_zero(weight_decay) else optax.adamw(rate, weight_decay=weight_decay)
+    learn = optax.chain(clip, step)
+    if tune == "all":
+        return learn
+    return optax.partition({True: learn, False: optax.set_to_zero()}, lambda params: _learning(tune, params))
+
+
+def _learning(tune: str, params: Params) -> Any:
+    """Which leaves of actor or critic learn where not all do: those of heads, or learned embeddings."""
+    part = {"heads": "head", "embedding": "embedding"}[tune]
+
+    def learns(path, _) -> bool:
+        names = [getattr(step, "key", None) for step in path]
+        return part in names and "body" not in names[: names.index(part)]
+
+    return jax.tree_util.tree_map_with_path(learns, params)
+
+
+def clip_to(norm: Any) -> optax.GradientTransformation:
+    """Clip gradients to a global norm; a traced one may be 0, which does not clip."""
+    return optax.clip_by_global_norm(jnp.where(norm > 0, norm, jnp.inf) if isinstance(norm, Array) else norm)
+
+
+def descend(optimizer: optax.GradientTransformation, gradients: Any, memory: Any, params: Any) -> tuple[Any, Any]:
+    """Apply one optimiser step; returns parameters and the optimiser's state."""
+    updates, memory = optimizer.update(gradients, memory, params)
+    return optax.apply_updates(params, updates), memory
