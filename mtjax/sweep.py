@@ -1,36 +1,30 @@
 """``python -m mtjax.train --sweep ...``: every combination of settings, and one table of them.
 
 The agent's numbers are points of one program (``points.py``); each combination of other settings is a program of its
-own, and one whose points do not fit into memory together is run in rounds. Every program and round is a run like any
-other, in a folder of the sweep's: ``run-1``, ``run-2`` and so on.
+own, and one that does not fit into memory is run in rounds (``rounds.py``). Every program and round is a run like any
+other, in a folder of the sweep's: ``run-1``, ``run-2`` and so on. A run in rounds is a sweep of one setting.
 """
 
 import dataclasses
 import itertools
-import math
-import os
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
-from mtjax import checkpoint, cli, points
+from mtjax import cli, points, rounds
 from mtjax.agents import AGENTS, PARTS
 from mtjax.cli import Program
 from mtjax.evaluation import Evaluations, load_evaluations
 from mtjax.log import append_rows, number
-from mtjax.policy import shapes
 from mtjax.run import enable_compile_cache
 from mtjax.stats import seed_interval
 from mtjax.types import SPLITS, InputError
 
 _FIXED = ("seed", "seeds", "runs", "resume", "list", "import", "sweep", "from", "preset")
 _DIVERGED = "diverged.txt"  # beside a run of which no seed is finite any more: what stopped it
-_SHARE = 0.9  # of the memory there is that a program may take
-_COPIES = 3  # of an agent that learning needs beside its state: gradients, steps, and the new one
 
 
 class Axis(NamedTuple):
@@ -141,39 +135,12 @@ def _number(axis: Axis, text: str) -> float:
         raise InputError(f"{axis.flag} is a number, and {text!r} is none") from None
 
 
-def rounds(program: Program, limit: float) -> list[Program]:
-    """The program, or parts of it with fewer points each, such that each should fit into ``limit`` bytes."""
-    if not program.points:
-        return [program]
-    fitting = max(math.floor(limit * _SHARE / _needed(program)), 1)
-    parts = np.array_split(np.arange(len(program.points)), math.ceil(len(program.points) / fitting))
-    return [dataclasses.replace(program, points=tuple(program.points[i] for i in part)) for part in parts]
-
-
-def _needed(program: Program) -> int:
-    """Bytes that one point takes, roughly: its state, and what an update needs beside it."""
-    state = shapes(dataclasses.replace(program, points=program.points[:1]))
-    return checkpoint.size_of(state) + _COPIES * checkpoint.size_of(state.agent)
-
-
-def memory() -> float:
-    """Bytes of the device's memory, or of the machine's; $MTJAX_MEMORY, in GB, says otherwise."""
-    given = os.environ.get("MTJAX_MEMORY", "")
-    try:
-        if given:
-            return float(given) * 1e9
-    except ValueError:
-        raise InputError(f"MTJAX_MEMORY is a number of GB, not {given!r}") from None
-    known = jax.devices()[0].memory_stats() or {}
-    return known.get("bytes_limit") or os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-
-
 # Running it.
 
 
 def main(argv: Sequence[str]) -> None:
-    """Make a folder with a run for every program and round, or find those of a sweep to go on with, and run them."""
-    from mtjax.train import check, circumstances, new_directory, record_steps, recorded, starting
+    """Run what a command line with ``--sweep`` asks for, or go on with what ``--resume`` names."""
+    from mtjax.train import check, record_steps, recorded, starting
 
     enable_compile_cache()
     resume = next((Path(word.split("=", 1)[1]) for word in argv if word.startswith("--resume=")), None)
@@ -186,26 +153,22 @@ def main(argv: Sequence[str]) -> None:
     for program in found:
         check(program)
         starting(program)
-    limit = memory()
-    split = [rounds(program, limit) for program in found]
-    name = f"{found[0].env}-{found[0].agent}-sweep"
-    folder = new_directory(Path(found[0].runs), name)
+    begin(found, "sweep")
+
+
+def begin(found: Sequence[Program], kind: str) -> None:
+    """Make a folder with a run for every program and round, and run them."""
+    from mtjax.train import circumstances, new_directory
+
+    limit = rounds.memory()
+    split = [rounds.split(program, limit) for program in found]
+    folder = new_directory(Path(found[0].runs), f"{found[0].env}-{found[0].agent}-{kind}")
     for i, program in enumerate(itertools.chain(*split)):
         (folder / f"run-{i + 1}").mkdir()
         (folder / f"run-{i + 1}" / "config.json").write_text(cli.to_json(program, circumstances(program)))
     for program, parts in zip(found, split, strict=True):
-        print(_plan(program, len(parts), limit), flush=True)
+        print(rounds.describe(program, len(parts), limit), flush=True)
     carry_on(folder)
-
-
-def _plan(program: Program, count: int, limit: float) -> str:
-    """A line on what one program holds, and what it takes."""
-    settings = max(len(program.points), 1)
-    size = _needed(program) / 1e6
-    return (
-        f"program {' '.join(program.sweep)}: {settings} setting{'s' * (settings > 1)} of about {size:,.0f} MB, "
-        f"{limit * _SHARE / 1e6:,.0f} MB to use: {count} round{'s' * (count > 1)}"
-    )
 
 
 def _runs(folder: Path) -> list[Path]:
@@ -267,21 +230,41 @@ def last(program: Program, run: Path) -> Evaluations | None:
 
 
 def rows(runs: Sequence[Path]) -> list[dict[str, Any]]:
-    """A row for each setting: its run, its values, seeds that diverged, and the last evaluation of each split."""
-    found = []
+    """A row for each setting: its runs, its values, seeds that diverged, and the last evaluation of each split."""
+    found: dict[tuple, list[_Part]] = {}
     for run in runs:
         program = cli.from_json(run / "config.json")
         evaluations, count = last(program, run), program.plan.seeds
         for p, point in enumerate(program.points or ({},)):
-            row = {"run": run.name, "number": p, **_values(program, point), "seeds": count}
-            if (run / _DIVERGED).exists():
-                row["diverged"] = count
-            elif evaluations is not None:
-                mine = slice(p * count, (p + 1) * count)
-                row |= _scores({split: x[mine, -1] for split, x in evaluations.returns.items() if x.size})
-            found.append(row)
-    columns = dict.fromkeys(name for row in found for name in row)
-    return [{name: row.get(name, "") for name in columns} for row in found]
+            mine = slice(p * count, (p + 1) * count)
+            returns = evaluations and {split: x[mine, -1] for split, x in evaluations.returns.items() if x.size}
+            part = _Part(run.name, p, count, (run / _DIVERGED).exists(), returns)
+            found.setdefault(tuple(_values(program, point).items()), []).append(part)
+    made = [_row(dict(values), parts) for values, parts in found.items()]
+    columns = dict.fromkeys(name for row in made for name in row)
+    return [{name: row.get(name, "") for name in columns} for row in made]
+
+
+class _Part(NamedTuple):
+    """What one run holds of one setting: all of its seeds, or those of a round."""
+
+    run: str
+    number: int
+    seeds: int
+    diverged: bool
+    returns: dict[str, np.ndarray] | None  # split -> (S, T, episodes) of the last evaluation
+
+
+def _row(values: dict[str, str], parts: list[_Part]) -> dict[str, Any]:
+    row = {"run": " ".join(part.run for part in parts), "number": parts[0].number, **values}
+    row["seeds"] = sum(part.seeds for part in parts)
+    known = [part.returns for part in parts if part.returns is not None]
+    lost = sum(part.seeds for part in parts if part.diverged)
+    if lost:
+        return row | {"diverged": lost}
+    if len(known) < len(parts):
+        return row
+    return row | _scores({split: np.concatenate([x[split] for x in known]) for split in known[0]})
 
 
 def _values(program: Program, point: Mapping[str, float]) -> dict[str, str]:

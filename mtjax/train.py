@@ -27,7 +27,7 @@ _PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-ch
 
 def main(argv: Sequence[str]) -> None:
     """Parse the command line, train, and say where the run is and how each split scored."""
-    from mtjax import sweep
+    from mtjax import rounds, sweep
 
     if "--distributed" in argv:
         devices.initialise()  # before anything asks which devices there are
@@ -47,6 +47,8 @@ def main(argv: Sequence[str]) -> None:
     enable_compile_cache()
     check(program)
     start = starting(program) if directory is None else None
+    if directory is None and rounds.too_many_seeds(program):
+        return sweep.begin([program], "rounds")
     directory = devices.agreed(partial(_prepare, program, directory))
     result = launch(program, directory, start, resume)
     if devices.is_first():

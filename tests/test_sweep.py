@@ -15,9 +15,10 @@ from probes import QUICK, Walk, random_batch, tasks_of, tiny
 import mtjax
 import mtjax.evaluate
 import mtjax.train
-from mtjax import cli, loop, points, sweep
+from mtjax import cli, loop, points, rounds, sweep
 from mtjax.agents import PARTS
 from mtjax.agents import settings as settings_of
+from mtjax.evaluation import load_evaluations
 from mtjax.log import Console
 from mtjax.loop import Settings
 from mtjax.points import Varied
@@ -232,22 +233,64 @@ def test_the_command_of_a_run_repeats_its_part_of_the_sweep(tmp_path):
 
 
 def test_points_that_do_not_fit_into_memory_are_run_in_rounds(monkeypatch):
-    """As even as can be; a single point is tried whatever it takes. $MTJAX_MEMORY is in GB."""
+    """As even as can be. $MTJAX_MEMORY is in GB."""
     (program,) = sweep.programs(["--sweep", "agent.tau=0.1,0.2,0.3,0.4,0.5", "--seeds=2", "--replay-size=1000"])
-    one, two = (
-        sweep._needed(dataclasses.replace(program, plan=dataclasses.replace(program.plan, seeds=n))) for n in (1, 2)
-    )
+    one, two = (rounds.needed(with_seeds(program, n)) for n in (1, 2))
     assert 1.9 < two / one < 2.1
-    count = lambda limit: [len(part.points) for part in sweep.rounds(program, limit)]
-    assert count(1e15) == [5] and count(2.5 * two / 0.9) == [2, 2, 1] and count(1.0) == [1] * 5
-    assert sum((part.points for part in sweep.rounds(program, 1.0)), ()) == program.points
+    count = lambda limit: [len(part.points) for part in rounds.split(program, limit)]
+    assert count(1e15) == [5] and count(2.5 * two / 0.9) == [2, 2, 1] and count(1.1 * two / 0.9) == [1] * 5
+    assert sum((part.points for part in rounds.split(program, 2.5 * two)), ()) == program.points
     monkeypatch.setenv("MTJAX_MEMORY", "0.5")
-    assert sweep.memory() == 0.5e9
+    assert rounds.memory() == 0.5e9
     monkeypatch.setenv("MTJAX_MEMORY", "much")
     with pytest.raises(InputError, match="a number of GB, not 'much'"):
-        sweep.memory()
+        rounds.memory()
     monkeypatch.delenv("MTJAX_MEMORY")
-    assert sweep.memory() > 1e8
+    assert rounds.memory() > 1e8
+
+
+def test_seeds_that_do_not_fit_into_memory_are_run_in_rounds(monkeypatch):
+    """Those of each point by themselves; a single seed is tried whatever it takes."""
+    (program,) = sweep.programs(["--sweep", "agent.tau=0.1,0.2", "--seeds=5", "--seed=3", "--replay-size=1000"])
+    one = rounds.needed(program) / 5
+    parts = lambda program, limit: [
+        (part.points, part.plan.seed, part.plan.seeds) for part in rounds.split(program, limit)
+    ]
+    first, second = (({"tau": tau},) for tau in (0.1, 0.2))
+    assert parts(program, 2.5 * one / 0.9) == [
+        *((first, seed, count) for seed, count in ((3, 2), (5, 2), (7, 1))),
+        *((second, seed, count) for seed, count in ((3, 2), (5, 2), (7, 1))),
+    ]
+    alone = dataclasses.replace(program, points=())
+    assert parts(alone, 1.0) == [((), seed, 1) for seed in range(3, 8)]
+    for limit, too_many in ((5.5 * one / 0.9, False), (4.5 * one / 0.9, True)):
+        monkeypatch.setenv("MTJAX_MEMORY", f"{limit / 1e9:.12f}")
+        assert rounds.too_many_seeds(alone) == too_many
+    monkeypatch.setenv("MTJAX_MEMORY", "1e-9")
+    assert not rounds.too_many_seeds(with_seeds(alone, 1))
+
+
+def with_seeds(program, count):
+    return dataclasses.replace(program, plan=dataclasses.replace(program.plan, seeds=count))
+
+
+def test_a_run_of_too_many_seeds_is_run_in_rounds(tmp_path, monkeypatch, capsys):
+    """By the same command, with a table of all seeds, and gone on with by its folder."""
+    small = "--num-envs=2 --batch-size=2 --replay-size=20 --warmup-steps=1 --eval-episodes=1 --agent.hidden 4".split()
+    words = ["--env=bandit", "--agent=sac-conditioned", "--seeds=3", "--steps=40", f"--runs={tmp_path}", *small]
+    program = cli.parse(words)
+    monkeypatch.setenv("MTJAX_MEMORY", f"{2.5 * rounds.needed(program) / 3 / 0.9 / 1e9:.12f}")
+    mtjax.train.main(words)
+    (folder,) = tmp_path.iterdir()
+    assert "2 rounds" in capsys.readouterr().out and "-rounds-" in folder.name
+    runs = sweep._runs(folder)
+    assert [cli.from_json(run / "config.json").plan.seeds for run in runs] == [2, 1]
+    (row,) = sweep.rows(runs)
+    returns = [load_evaluations(run / "evaluations.npz").returns["train"][:, -1] for run in runs]
+    assert row["run"] == "run-1 run-2" and row["seeds"] == 3 and row["diverged"] == 0
+    assert float(row["train"]) == pytest.approx(np.concatenate(returns).mean(), rel=1e-5)
+    mtjax.train.main([f"--resume={folder}"])
+    assert "compiled" not in capsys.readouterr().out
 
 
 @pytest.fixture(scope="module")
@@ -271,7 +314,7 @@ def swept(short_family, tmp_path_factory):
         return real(program, directory, *rest)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("MTJAX_MEMORY", f"{2.5 * sweep._needed(program) / 0.9 / 1e9:.12f}")
+        patch.setenv("MTJAX_MEMORY", f"{2.5 * rounds.needed(program) / 0.9 / 1e9:.12f}")
         patch.setattr(mtjax.train, "launch", launch)
         with pytest.raises(KeyboardInterrupt):
             mtjax.train.main(words)
