@@ -80,14 +80,10 @@ def describe(mesh: Mesh | None, seeds: int, num_envs: int) -> str:
     if found == 1:
         return ""
     hosts = f" in {jax.process_count()} processes" if jax.process_count() > 1 else ""
-    line = (
-        f"devices: {used} of {found}{hosts}, {own} seed{'s' * (own > 1)} on {'each' if each == 1 else f'every {each}'}"
-    )
-    if each > 1:
-        line += f", {num_envs // each} of each task's {num_envs} environments on each"
-    if used < found:
-        line += "; the others would need more seeds or environments, or a number of them that divides evenly"
-    return line
+    split = "each" if each == 1 else f"every {each}, {num_envs // each} of each task's {num_envs} environments on each"
+    needed = "; the others would need more seeds or environments, or a number of them that divides evenly"
+    rest = "" if used == found else needed
+    return f"devices: {used} of {found}{hosts}, {own} seed{'s' * (own > 1)} on {split}{rest}"
 
 
 def programs(mesh: Mesh | None) -> Programs:
