@@ -1,8 +1,9 @@
 """Many devices: each runs seeds of its own, on one host or, by ``jax.distributed``, on several.
 
-Seeds share nothing, so ``jax.shard_map`` splits every program along their axis ``S`` and no device waits for another;
-within a device all is as on one: its programs see a training state with fewer seeds. With a single device to use there
-is no mesh and nothing is wrapped.
+Seeds share nothing, so ``jax.shard_map`` splits every program along their axis ``S`` and no device waits for another.
+Devices that are left over share the environments of a seed, along ``E``: there ``shares`` brings together what a batch
+is made of. Within a device all is as on one: its programs see a training state with fewer seeds and environments. With
+a single device to use there is no mesh and nothing is wrapped.
 """
 
 import os
@@ -16,13 +17,23 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from mtjax import shares
 from mtjax.evaluation import evaluate
 from mtjax.loop import TrainState, init, run_chunk
 from mtjax.replay import Replay
 from mtjax.types import InputError
 
-_SEEDS, _SAME = PartitionSpec("seeds"), PartitionSpec()  # leaves with a leading S; what every device has whole
-_STATE = TrainState(*[_SEEDS] * len(TrainState._fields))._replace(replay=Replay(_SEEDS, _SAME, _SAME), iteration=_SAME)  # type: ignore
+_SAME, _SEEDS = PartitionSpec(), PartitionSpec("seeds")  # what every device has whole; leaves with a leading S
+_WORLDS = PartitionSpec("seeds", None, shares.AXIS)  # leaves (S, T, E, ...)
+_STATE = TrainState(*[_WORLDS] * len(TrainState._fields))._replace(  # type: ignore
+    agent=_SEEDS,
+    replay=Replay(PartitionSpec("seeds", None, None, shares.AXIS), _SAME, _SAME),  # type: ignore
+    iteration=_SAME,  # type: ignore
+    key=_SEEDS,  # type: ignore
+    warmup_key=_SEEDS,  # type: ignore
+)
+LEAST_WORLDS = 2048
+"""Worlds that a device keeps, at the least, when a seed's environments are shared out: fewer do not fill a GPU."""
 
 _VARIABLES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
 _LAUNCHERS = ("SLURM_JOB_ID", "OMPI_MCA_orte_hnp_uri", "TPU_WORKER_ID", "KUBERNETES_SERVICE_HOST")  # that JAX reads
@@ -38,8 +49,11 @@ class Programs(NamedTuple):
     evaluate: Any
 
 
-def mesh_for(seeds: int) -> Mesh | None:
-    """The devices that share ``seeds`` evenly: of each process as many as divide its seeds; None if that is one.
+def mesh_for(seeds: int, num_tasks: int, num_envs: int) -> Mesh | None:
+    """The devices that share ``seeds`` evenly, and each seed's environments where devices are left over.
+
+    Of each process these are as many as divide its seeds, times as many as divide the environments of a task and leave
+    each device ``LEAST_WORLDS``. None if it is one device.
 
     Raises:
         InputError: there are several processes, and their number does not divide the seeds.
@@ -49,21 +63,27 @@ def mesh_for(seeds: int) -> Mesh | None:
         raise InputError(f"{processes} processes cannot share {seeds} seeds evenly; --seeds must be a multiple")
     owned = [[device for device in jax.devices() if device.process_index == i] for i in range(processes)]
     share, most = seeds // processes, min(map(len, owned))
-    used = max(n for n in range(1, most + 1) if share % n == 0)
-    if processes * used == 1:
+    groups = max(n for n in range(1, most + 1) if share % n == 0)
+    worlds = share // groups * num_tasks * num_envs
+    fits = lambda n: n == 1 or (num_envs % n == 0 and worlds // n >= LEAST_WORLDS)
+    each = max(n for n in range(1, most // groups + 1) if fits(n))
+    if processes * groups * each == 1:
         return None
-    return Mesh(np.array([device for devices in owned for device in devices[:used]]), ("seeds",))
+    used = np.array([device for devices in owned for device in devices[: groups * each]])
+    return Mesh(used.reshape(-1, each), ("seeds", shares.AXIS))
 
 
-def describe(mesh: Mesh | None, seeds: int) -> str:
-    """A line on how many devices share the seeds; empty if there is but one."""
-    used, found = 1 if mesh is None else mesh.size, jax.device_count()
+def describe(mesh: Mesh | None, seeds: int, num_envs: int) -> str:
+    """A line on how many devices share the seeds, and their environments; empty if there is but one."""
+    groups, each = (1, 1) if mesh is None else mesh.devices.shape
+    used, found, own = groups * each, jax.device_count(), seeds // groups
     if found == 1:
         return ""
-    each = seeds // used
     hosts = f" in {jax.process_count()} processes" if jax.process_count() > 1 else ""
-    rest = "" if used == found else "; the others would need more seeds, or a number of them that divides evenly"
-    return f"devices: {used} of {found}{hosts}, {each} seed{'s' * (each > 1)} on each{rest}"
+    split = "each" if each == 1 else f"every {each}, {num_envs // each} of each task's {num_envs} environments on each"
+    needed = "; the others would need more seeds or environments, or a number of them that divides evenly"
+    rest = "" if used == found else needed
+    return f"devices: {used} of {found}{hosts}, {own} seed{'s' * (own > 1)} on {split}{rest}"
 
 
 def programs(mesh: Mesh | None) -> Programs:
@@ -78,7 +98,7 @@ def programs(mesh: Mesh | None) -> Programs:
 
 
 def _split(mesh: Mesh, program: Callable, inputs: tuple, outputs: Any, donated: tuple[int, ...] = ()) -> Any:
-    """A program of three static arguments and ``inputs``, of which each device computes its seeds' part alone."""
+    """A program of three static arguments and ``inputs``, of which each device computes its own part."""
 
     def split(env, agent, setting, *arguments):
         own = partial(program, env, agent, setting)

@@ -61,7 +61,7 @@ def diagnose(policy: Policy, replay: Replay, batch_size: int) -> Diagnostics:
     """Look at every seed of a run, and average.
 
     Args:
-        replay: rows (S, T, capacity, ...).
+        replay: rows (S, T, H, E, ...).
         batch_size: transitions of a task in each batch; the run's own makes norms those of training.
 
     Raises:

@@ -2,7 +2,8 @@
 
 A chunk is one jitted, donated ``lax.scan`` of (collect on all tasks and environments, store, update), for all seeds at
 once. Learners are mapped over seeds; worlds of all seeds, tasks and environments are one flat batch, which traces and
-compiles faster than nested maps and keeps decisions that all seeds share as branches.
+compiles faster than nested maps and keeps decisions that all seeds share as branches. Where devices share a seed's
+environments, E is a device's own part of them, and random numbers are drawn for all before each takes its own.
 """
 
 import dataclasses
@@ -14,7 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mtjax import hindsight
+from mtjax import hindsight, shares
 from mtjax import replay as rings
 from mtjax.points import Varied
 from mtjax.replay import Replay
@@ -58,9 +59,14 @@ class Settings:
             raise InputError(f"replay-size ({self.replay_size}) must hold one step of num-envs ({self.num_envs})")
 
     @property
+    def num_slots(self) -> int:
+        """Steps of every environment that each ring holds."""
+        return self.replay_size // self.num_envs
+
+    @property
     def capacity(self) -> int:
-        """Rows of each ring: the replay size, rounded down to a multiple of the environments."""
-        return self.replay_size - self.replay_size % self.num_envs
+        """Transitions that each ring holds: the replay size, rounded down to a multiple of the environments."""
+        return self.num_slots * self.num_envs
 
 
 class TrainState(NamedTuple):
@@ -73,7 +79,7 @@ class TrainState(NamedTuple):
     age: Array  # (S, T, E) int32, steps since the last reset
     total: Array  # (S, T, E) return of the episode so far
     discounted: Array  # (S, T, E) the same, each reward discounted once more at every later step
-    replay: Replay  # rows (S, T, capacity, ...)
+    replay: Replay  # rows (S, T, H, E, ...)
     iteration: Array  # () int32, steps taken by every environment
     key: Key  # (S,)
     warmup_key: Key  # (S,) fixed, so that an action drawn from it can be held
@@ -94,11 +100,11 @@ def init(
     if settings.hindsight:
         hindsight.require(env)
     num_tasks = len(tasks.id)
-    shape = (len(seeds), num_tasks, settings.num_envs)
+    shape = (len(seeds), num_tasks, settings.num_envs // shares.count())
     key, agent_key, reset_key, warmup_key = _split(jax.vmap(jax.random.key)(seeds), 4)
     worlds, start = begin(env, tasks, _world_keys(reset_key, shape))
     point = () if knobs is None else (knobs,)
-    blank = lambda _: rings.init(_blank_transition(env.spec, tasks), num_tasks, settings.capacity)
+    blank = lambda _: rings.init(_blank_transition(env.spec, tasks), num_tasks, settings.num_slots, shape[2])
     return TrainState(
         agent=jax.vmap(lambda key, *point: agent.init(env.spec, tasks, key, *point))(agent_key, *point),
         env=start.state,
@@ -127,7 +133,8 @@ def _split(keys: Key, count: int) -> tuple[Key, ...]:
 
 def _world_keys(keys: Key, shape: tuple[int, ...]) -> Key:
     """One key for every world (S, T, E) from one a seed (S,)."""
-    return jax.vmap(lambda key: jax.random.split(key, shape[1:]))(keys)
+    everywhere = (shape[1], shape[2] * shares.count())
+    return shares.own(jax.vmap(lambda key: jax.random.split(key, everywhere))(keys), axis=2)
 
 
 def spread(tasks: Task, shape: tuple[int, ...]) -> Task:
@@ -218,7 +225,7 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
         return state, seen | {"losses": losses, "learning": 1.0 - warming}
 
     state, history = jax.lax.scan(iterate, state, length=settings.chunk_steps)
-    return state, _summarise(history)
+    return state._replace(agent=shares.agreed(state.agent)), _summarise(history)
 
 
 def _renew(env, agent, settings: Settings, tasks: Task, state: TrainState, keys: Key) -> Any:
@@ -236,7 +243,7 @@ def _collect(env, agent, settings, tasks, state: TrainState, warming, key: Key, 
     shape = state.age.shape
     worlds = spread(tasks, shape) if state.task is None else state.task
     chosen = actions(agent, state.agent, tasks, worlds, state.obs, _world_keys(key, shape))
-    action = jnp.where(warming, _held_actions(settings, state, chosen.shape[1:]), chosen)
+    action = jnp.where(warming, _held_actions(settings, state, chosen.shape), chosen)
     step = over_worlds(env.step)(worlds, state.env, action)
     context = None if state.task is None else state.task.context
     transition = Transition(state.obs, action, step.reward, 1.0 - step.terminated, step.obs, context)
@@ -258,7 +265,7 @@ def _collect(env, agent, settings, tasks, state: TrainState, warming, key: Key, 
     seen = {"finished": jnp.sum(ended, axis=2), "total": jnp.sum(ended * total, axis=2), "finite": finite}
     learner = state.agent
     if agent.watches:
-        outcome = Outcome(step.reward, discounted, total, ended, step.terminated, age)
+        outcome = shares.whole(Outcome(step.reward, discounted, total, ended, step.terminated, age), axis=2)
         learner = over_seeds(agent.observe, 0, 0)(learner, outcome)
     state = state._replace(
         agent=learner,
@@ -274,9 +281,11 @@ def _collect(env, agent, settings, tasks, state: TrainState, warming, key: Key, 
 
 
 def _held_actions(settings: Settings, state: TrainState, shape: tuple[int, ...]) -> Array:
-    """Uniform actions (S, T, E, A) that change every ``warmup_hold`` steps."""
+    """Uniform actions of ``shape`` (S, T, E, A) that change every ``warmup_hold`` steps."""
+    everywhere = (shape[1], shape[2] * shares.count(), shape[3])
     draw = lambda key: jax.random.fold_in(key, state.iteration // settings.warmup_hold)
-    return jax.vmap(lambda key: jax.random.uniform(draw(key), shape, minval=-1.0))(state.warmup_key)
+    drawn = jax.vmap(lambda key: jax.random.uniform(draw(key), everywhere, minval=-1.0))(state.warmup_key)
+    return shares.own(drawn, axis=2)
 
 
 def _learn(env, agent, settings: Settings, tasks, state: TrainState, warming: Array, keys: Key) -> tuple[Any, Metrics]:
@@ -314,14 +323,15 @@ def _summarise(history: dict) -> Metrics:
     learning = history["learning"]
     mean = lambda x: jnp.sum(x, axis=0) / jnp.maximum(jnp.sum(learning), 1)
     losses = jax.tree.map(mean, history["losses"])
-    episodes = jnp.sum(history["finished"], axis=0)
-    bad = ~history["finite"]
+    finished, total = (jnp.sum(history[name], axis=0) for name in ("finished", "total"))
+    episodes, total, bad = shares.total((finished, total, jnp.int32(~history["finite"])))
+    bad = bad > 0
     # One task's experience spoils the losses of all who share its networks; then it alone is to blame.
     blameless = ~jnp.any(bad, axis=2, keepdims=True)
     for loss in history["losses"].values():
         bad |= blameless & ~jnp.isfinite(loss).reshape(*loss.shape[:2], -1)
     return losses | {
         "episodes": episodes,
-        "return": jnp.sum(history["total"], axis=0) / episodes,
+        "return": total / episodes,
         "bad_step": jnp.where(jnp.any(bad, axis=0), jnp.argmax(bad, axis=0), -1),
     }

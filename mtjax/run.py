@@ -90,7 +90,7 @@ def train(
     label: str = "",
     on_chunk: Callable[[dict[str, Any]], None] | None = None,
 ) -> Result:
-    """Train an agent on a family of tasks, on as many devices as divide the seeds.
+    """Train an agent on a family of tasks, on as many devices as divide the seeds, and then their environments.
 
     Under ``jax.distributed`` every process calls this alike; the first one writes and prints, and all return the same
     but for ``Result.state``, whose leaves are spread over all of them.
@@ -132,7 +132,7 @@ def train(
     settings = fit_chunk(settings or Settings(), len(tasks.id), steps)
     learner = Varied(agent) if found else agent  # type: ignore
     console = log.Console(plan.steps, quiet or not devices.is_first(), label)
-    mesh = devices.mesh_for(seeds * max(len(found), 1))
+    mesh = devices.mesh_for(seeds * max(len(found), 1), len(tasks.id), settings.num_envs)
     run = _Run(env, learner, settings, plan, directory, console, found, mesh, profile)
     try:
         programs, state = run.begin(resume)
@@ -226,7 +226,7 @@ class _Run:
             f"memory: {checkpoint.size_of(shapes) / 1e6:,.0f} MB of state, of which {replay:,.0f} MB replay "
             f"({self.settings.capacity:,} transitions a task)"
         )
-        if spread := devices.describe(self.mesh, len(self.seeds)):
+        if spread := devices.describe(self.mesh, len(self.seeds), self.settings.num_envs):
             self.console.say(spread)
         if self.directory is not None:
             checkpoint.require_space(self.directory, shapes)

@@ -116,11 +116,13 @@ def check(program: Program) -> None:
     """Meet whatever the family's and the agent's constructors could not check before a run's folder is made."""
     from mtjax.agents.conditioning import load_vectors
 
-    _ = program.family.engine_name, program.family.table, devices.mesh_for(program.plan.seeds)
+    family = program.family
+    _ = family.engine_name, family.table
+    devices.mesh_for(program.plan.seeds, family.train_count, program.training.num_envs)
     if program.training.hindsight:
-        hindsight.require(program.family)
+        hindsight.require(family)
     if program.learner.vectors:
-        load_vectors(program.learner.vectors, program.family.train_count)
+        load_vectors(program.learner.vectors, family.train_count)
     tune = program.learner.tune
     if tune != "all" and not program.start:
         raise InputError(f"--tune={tune} leaves the rest as a run left it; say which run: --from=RUN")

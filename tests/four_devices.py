@@ -6,20 +6,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import Walk, tiny
+from jax.sharding import PartitionSpec
+from probes import Goals, Walk, tiny
 
-from mtjax import devices, envs, run
+from mtjax import devices, envs, run, shares
 from mtjax.loop import Settings
 
 SETTINGS = Settings(num_envs=2, batch_size=4, replay_size=40, warmup_steps=4, chunk_steps=10)
-CHUNK = 2 * 2 * 10  # environment steps of a seed
+WIDE = Settings(num_envs=4, batch_size=4, replay_size=100, warmup_steps=4, chunk_steps=10)  # half full in two chunks
 AGENT = tiny("sac-conditioned", hidden=(8,))
 
 
-def play(directory, env, chunks, **changes):
+def play(directory, env, chunks, agent=AGENT, settings=SETTINGS, **changes):
     directory.mkdir(exist_ok=True)
-    steps = {"steps": chunks * CHUNK, "eval_every": 2 * CHUNK, "eval_episodes": 2}
-    return run.train(env, AGENT, settings=SETTINGS, directory=directory, **{"seeds": 4, **steps, **changes})
+    chunk = len(env.tasks().id) * settings.num_envs * settings.chunk_steps  # environment steps of a seed
+    steps = {"steps": chunks * chunk, "eval_every": 2 * chunk, "eval_episodes": 2}
+    return run.train(env, agent, settings=settings, directory=directory, **{"seeds": 4, **steps, **changes})
 
 
 @pytest.fixture
@@ -33,7 +35,7 @@ def use(monkeypatch):
 def alone(tmp_path_factory):
     """Four seeds on a single device, by the path that knows of no other."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(devices, "mesh_for", lambda seeds: None)
+        patch.setattr(devices, "mesh_for", lambda *_: None)
         return play(tmp_path_factory.mktemp("alone"), Walk(), 4)
 
 
@@ -65,7 +67,7 @@ def assert_same(result, other, chunks=4, rtol=1e-4):
         for name in row.keys() - set(clocks):
             number = lambda x: float(x) if x != "" else np.nan
             assert number(row[name]) == pytest.approx(number(expected[name]), rel=rtol, abs=rtol, nan_ok=True), name
-    assert len(other.rows) == 4 * chunks
+    assert len(other.rows) == len(other.state.obs) * chunks
     np.testing.assert_array_equal(result.evaluations.steps, other.evaluations.steps)
     for split, returns in result.evaluations.returns.items():
         np.testing.assert_allclose(returns, other.evaluations.returns[split], rtol=rtol, atol=rtol)
@@ -83,7 +85,7 @@ def test_four_devices_change_no_seed(alone, tmp_path, capfd):
 
 def test_donated_state_is_gone(tmp_path):
     """A chunk's replay takes the place of the one before it, on every device."""
-    mesh = devices.mesh_for(4)
+    mesh = devices.mesh_for(4, 2, 2)
     programs, env = devices.programs(mesh), Walk()
     tasks, seeds = devices.everywhere(mesh, env.tasks()), devices.by_seed(mesh, jnp.arange(4))
     state = programs.init(env, AGENT, SETTINGS, tasks, seeds, None)
@@ -120,3 +122,146 @@ def test_host_engine_serves_every_device(short_family, tmp_path, use):
     assert devices_of(result) == 4
     use(1)
     assert_same(result, play(tmp_path / "one", env, 1, eval_episodes=1), chunks=1, rtol=1e-2)
+
+
+# Environments of a seed on several devices.
+
+
+@pytest.fixture
+def crowd(monkeypatch):
+    """Let a device be content with few worlds."""
+    monkeypatch.setattr(devices, "LEAST_WORLDS", 1)
+
+
+def wide(directory, chunks=4, **changes):
+    return play(directory, Walk(), chunks, settings=WIDE, **{"seeds": 1, **changes})
+
+
+def parts_of(x):
+    """Shapes of the parts of an array that devices hold, and how many of these differ in their place."""
+    parts = x.addressable_shards
+    return {part.data.shape for part in parts}, len({str(part.index) for part in parts})
+
+
+@pytest.fixture(scope="module")
+def wide_alone(tmp_path_factory):
+    """One seed with four environments on a single device."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(devices, "mesh_for", lambda *_: None)
+        return wide(tmp_path_factory.mktemp("alone"))
+
+
+def test_devices_that_share_a_seed_learn_what_one_does(wide_alone, tmp_path, crowd, capfd):
+    """Each has an environment of every task and what it brought, and the whole agent."""
+    result = wide(tmp_path / "run", quiet=False)
+    assert "devices: 4 of 4, 1 seed on every 4, 1 of each task's 4 environments on each" in capfd.readouterr().out
+    assert parts_of(result.state.obs) == ({(1, 2, 1, 1)}, 4)
+    assert parts_of(result.state.replay.rows.obs) == ({(1, 2, 25, 1, 1)}, 4)
+    assert all(x.is_fully_replicated for x in jax.tree.leaves((result.state.agent, result.state.key)))
+    assert_same(result, wide_alone)
+
+
+def test_two_seeds_on_two_devices_each(tmp_path, use, crowd):
+    """With parts that watch all outcomes, hindsight, and episodes that draw their tasks."""
+    agent = tiny("sac-conditioned", hidden=(8,), scaling="reward", sampler="progress", actor_lr=1e-5)
+    settings = Settings(**{**vars(WIDE), "hindsight": 0.5})
+    share = lambda name: play(tmp_path / name, Goals(drawn=True), 2, agent, settings, seeds=2)
+    result = share("four")
+    assert parts_of(result.state.obs) == ({(1, 4, 2, 1)}, 4)
+    use(1)
+    assert_same(result, share("one"), chunks=2)
+
+
+@pytest.mark.parametrize("before, after", [(4, 1), (1, 4)])
+def test_checkpoint_goes_on_with_other_shares(wide_alone, tmp_path, use, crowd, before, after):
+    """While the ring is half full, which it is in every part alike."""
+    use(before)
+    halfway = wide(tmp_path, 2)
+    assert devices_of(halfway) == before and int(halfway.state.replay.size) == 20
+    use(after)
+    result = wide(tmp_path, resume=True)
+    assert devices_of(result) == after
+    assert_same(result, wide_alone)
+
+
+def test_devices_of_a_seed_agree_by_themselves(crowd, monkeypatch):
+    """They make the same updates to the bit, where sums are made in the same order."""
+    monkeypatch.setattr(shares, "agreed", lambda tree: tree)
+    programs, env = devices.programs(mesh := devices.mesh_for(1, 2, 4)), Walk()
+    tasks, seeds = devices.everywhere(mesh, env.tasks()), devices.by_seed(mesh, jnp.arange(1))
+    settings = Settings(**{**vars(WIDE), "chunk_steps": 12})  # so that no program of before is taken
+    start = programs.init(env, AGENT, settings, tasks, seeds, None)
+    first = jax.tree.map(np.asarray, start.agent.critic)
+    after, _ = programs.chunk(env, AGENT, settings, tasks, start)
+    assert not jax.tree.all(jax.tree.map(np.array_equal, first, after.agent.critic))
+    for x in jax.tree.leaves((after.agent, after.replay.size, after.iteration)):
+        assert len({np.asarray(part.data).tobytes() for part in x.addressable_shards}) == 1
+
+
+def test_host_engine_serves_shares_of_a_seed(short_family, tmp_path, use, crowd):
+    """Each device calls back with its own worlds."""
+    env = envs.make("finger-short")
+    result = play(tmp_path / "four", env, 1, settings=WIDE, seeds=1, eval_episodes=1)
+    assert parts_of(result.state.env.qpos) == ({(1, 2, 1, 3)}, 4)
+    use(1)
+    alone = play(tmp_path / "one", env, 1, settings=WIDE, seeds=1, eval_episodes=1)
+    assert_same(result, alone, chunks=1, rtol=1e-2)
+
+
+WHOLE, PART, SEEDS = PartitionSpec(), PartitionSpec(None, shares.AXIS), PartitionSpec("seeds")
+
+
+def mesh_of(groups):
+    return jax.make_mesh((groups, 4 // groups), ("seeds", shares.AXIS), axis_types=(jax.sharding.AxisType.Auto,) * 2)
+
+
+def shared(function, groups, inputs, outputs=WHOLE):
+    """A function of arrays by the devices of each of so many seeds."""
+    return jax.jit(jax.shard_map(function, mesh=mesh_of(groups), in_specs=inputs, out_specs=outputs, check_vma=False))
+
+
+def test_devices_are_counted_where_a_program_is_split():
+    """One function, compiled anew for every way; not where a mesh leaves it to the compiler to split."""
+    count = jax.jit(lambda x: x + shares.count())
+    split = lambda groups: shared(count, groups, WHOLE)(np.float32(0))
+    assert [split(1), split(2), split(4), count(np.float32(0)), split(2)] == [4, 2, 1, 1, 2]
+    with jax.set_mesh(mesh_of(1)):
+        assert count(np.float32(0)) == 1
+
+
+@pytest.mark.parametrize("groups", [1, 2])
+def test_parts_of_what_all_have_make_the_whole_again(groups):
+    """Keys too, in the order of the devices."""
+    x, keys = np.arange(24.0).reshape(2, 4, 3), jax.random.split(jax.random.key(0), (2, 4))
+    np.testing.assert_array_equal(shared(lambda x: shares.own(x, 1), groups, WHOLE, PART)(x), x)
+    assert (shared(lambda x: shares.own(x, 1), groups, WHOLE, PART)(keys) == keys).all()
+    found = shared(lambda x: shares.whole({"x": x, "odd": x % 2 > 0}, 1), groups, PART)(x)
+    np.testing.assert_array_equal(found["x"], x)
+    np.testing.assert_array_equal(found["odd"], x % 2 > 0)
+
+
+@pytest.mark.parametrize("groups", [1, 2])
+def test_sums_and_picks_are_among_the_devices_of_a_seed(groups):
+    """A row comes from the device that is named, even if others hold what is no number."""
+    each = 4 // groups
+    x = np.arange(8.0).reshape(2, 4)
+    parts = x.reshape(2, each, -1)
+    np.testing.assert_array_equal(shared(shares.total, groups, PART)(x), parts.sum(axis=1))
+    holder = np.int32([each - 1, 0])
+    pick = shared(lambda x: shares.pick({"x": x[:, :1]}, holder), groups, PART)
+    np.testing.assert_array_equal(pick(x)["x"][:, 0], [parts[0, -1, 0], parts[1, 0, 0]])
+    x[0, 0] = x[1, -1] = np.nan
+    found = shared(lambda x: shares.pick(x[:, -1:], holder), groups, PART)(x)
+    np.testing.assert_array_equal(found[:, 0], [parts[0, -1, -1], parts[1, 0, -1]])
+
+
+def test_what_differs_is_made_the_first_devices():
+    """Of each seed; counts are left alone, as they cannot round."""
+
+    def drift(x):
+        number = jax.lax.axis_index(shares.AXIS)
+        return shares.whole(shares.agreed((x + 0.1 * number, jnp.int32(x) + number)), 0)
+
+    floats, counts = shared(drift, 2, SEEDS, SEEDS)(np.float32([1, 2]))
+    np.testing.assert_array_equal(floats, [1, 1, 2, 2])
+    np.testing.assert_array_equal(counts, [1, 2, 2, 3])

@@ -158,6 +158,28 @@ class Broken(Walk):
         return jnp.where(wrong, jnp.nan, 1.0), state.obs[0] + 1, False
 
 
+@dataclasses.dataclass(frozen=True)
+class Goals(Walk):
+    """Walks whose reward is the task's scale times the observation; of goals that the key draws, plus its bits."""
+
+    fresh_goals: bool = False
+    drawn: bool = False
+    relabels = ("scale",)
+    parameters = ("scale",)
+    varied = ("scale",)
+
+    def tasks(self, split="train"):
+        tasks = tasks_of("one-step", (1.0, 2.0, 3.0, 4.0))
+        if not self.drawn:
+            return tasks
+        scales = jnp.linspace(0.1, 0.9, 50) + 10 * tasks.goal["scale"][:, None]
+        draws = jax.tree.map(lambda x: jnp.broadcast_to(x[:, None], (4, 50, *x.shape[1:])), tasks)
+        return tasks._replace(draws=draws._replace(context=scales[..., None], goal=draws.goal | {"scale": scales}))
+
+    def relabel(self, task, transition, key):
+        return transition._replace(reward=task.goal["scale"] * transition.obs[0])
+
+
 # Agents, and running them.
 
 

@@ -50,29 +50,70 @@ def hosts(monkeypatch):
 def test_most_devices_that_divide_the_seeds_are_used(hosts, counts, seeds, used):
     """Of every process as many, so that each has seeds of its own."""
     hosts(*counts)
-    mesh = devices.mesh_for(seeds)
-    assert mesh.size == used
-    owners = [device.process_index for device in mesh.devices]
+    mesh = devices.mesh_for(seeds, 10, 16)
+    assert mesh.devices.shape == (used, 1)
+    owners = [device.process_index for device in mesh.devices[:, 0]]
     assert owners == sorted(owners) and {owners.count(i) for i in range(len(counts))} == {used // len(counts)}
-    assert f"devices: {used} of {sum(counts)}" in devices.describe(mesh, seeds)
+    line = devices.describe(mesh, seeds, 16)
+    assert f"devices: {used} of {sum(counts)}" in line and "environments on each" not in line
+
+
+@pytest.mark.parametrize(
+    "counts, seeds, tasks, envs, shape",
+    [
+        ((4,), 1, 8, 1024, (1, 4)),  # 2048 worlds on each
+        ((4,), 1, 8, 1023, (1, 3)),  # which four do not divide
+        ((4,), 1, 8, 512, (1, 2)),  # four would have too few
+        ((4,), 2, 4, 1024, (2, 2)),
+        ((4,), 3, 8, 4096, (3, 1)),  # seeds first
+        ((8,), 3, 8, 4096, (3, 2)),
+        ((4,), 5, 2, 1000, (1, 4)),  # one device has a part of every seed
+        ((4, 4), 2, 8, 1024, (2, 4)),
+        ((3, 4), 2, 8, 1024, (2, 2)),
+        ((2, 2), 4, 64, 4096, (4, 1)),
+    ],
+)
+def test_devices_left_over_share_the_environments_of_a_seed(hosts, counts, seeds, tasks, envs, shape):
+    """Evenly, of one process alone, and only as many as still have enough worlds."""
+    hosts(*counts)
+    mesh = devices.mesh_for(seeds, tasks, envs)
+    assert mesh.devices.shape == shape
+    owners = [{device.process_index for device in group} for group in mesh.devices]
+    assert owners == [{i} for i in range(len(counts)) for _ in range(shape[0] // len(counts))]
+    assert len({(device.process_index, device.number) for device in mesh.devices.flat}) == shape[0] * shape[1]
+
+
+@pytest.mark.parametrize(
+    "counts, seeds, envs, line",
+    [
+        ((4,), 1, 1024, "devices: 4 of 4, 1 seed on every 4, 256 of each task's 1024 environments on each"),
+        ((4, 4), 4, 1024, "8 of 8 in 2 processes, 1 seed on every 2, 512 of each task's 1024 environments on each"),
+        ((4,), 6, 1024, "3 of 4, 2 seeds on each; the others would need more seeds or environments, or a number of"),
+        ((4,), 1, 100, "1 of 4, 1 seed on each; the others would need more seeds or environments, or a number of"),
+    ],
+)
+def test_the_line_says_who_has_what(hosts, counts, seeds, envs, line):
+    """And, where devices are left, what they would need."""
+    hosts(*counts)
+    assert line in devices.describe(devices.mesh_for(seeds, 8, envs), seeds, envs)
 
 
 @pytest.mark.parametrize("counts, seeds", [((1,), 1), ((1,), 10), ((4,), 1), ((2,), 5)])
 def test_one_device_needs_no_mesh(hosts, counts, seeds):
     """Then the programs are the loop's own, and arrays stay where they are."""
     hosts(*counts)
-    assert devices.mesh_for(seeds) is None
+    assert devices.mesh_for(seeds, 10, 16) is None
     assert devices.programs(None) == (mtjax.loop.init, mtjax.loop.run_chunk, mtjax.evaluation.evaluate)
     state = object()
     assert devices.everywhere(None, state) is devices.by_seed(None, state) is devices.sharded(None, state) is state
-    assert bool(devices.describe(None, seeds)) == (sum(counts) > 1)
+    assert bool(devices.describe(None, seeds, 16)) == (sum(counts) > 1)
 
 
 def test_processes_must_share_seeds_evenly(hosts):
     """A process without a seed could not take part."""
     hosts(1, 1)
     with pytest.raises(InputError, match=r"2 processes cannot share 3 seeds evenly; --seeds must be a multiple"):
-        devices.mesh_for(3)
+        devices.mesh_for(3, 10, 16)
 
 
 @pytest.mark.parametrize("given", [(), ("JAX_NUM_PROCESSES",), ("JAX_COORDINATOR_ADDRESS", "JAX_PROCESS_ID")])

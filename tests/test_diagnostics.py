@@ -404,7 +404,7 @@ def test_replay_is_read_without_the_rest(copied_run):
     shutil.rmtree(copied_run / "checkpoints" / "150" / "agent")
     replay, batch_size = load_experience(copied_run)
     jax.tree.map(np.testing.assert_array_equal, replay, whole.replay)
-    assert batch_size == 4 and int(replay.size) == 200
+    assert batch_size == 4 and int(replay.size) == 100
 
 
 @pytest.mark.parametrize("lost, message", [("150/loop", "is damaged"), (".", "holds no checkpoint")])

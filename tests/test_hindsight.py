@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import compiled
-from probes import QUICK, Walk, pick, quick, tasks_of, train
+from probes import QUICK, Goals, pick, quick, train
 
 import mtjax.train
 from mtjax import hindsight, loop
@@ -122,38 +122,17 @@ def test_a_relabelled_history_is_that_of_the_other_task(name):
 # Batches.
 
 
-@dataclasses.dataclass(frozen=True)
-class Goals(Walk):
-    """Walks whose reward is the task's scale times the observation; of goals that the key draws, plus its bits."""
-
-    fresh_goals: bool = False
-    drawn: bool = False
-    relabels = ("scale",)
-    parameters = ("scale",)
-    varied = ("scale",)
-
-    def tasks(self, split="train"):
-        tasks = tasks_of("one-step", (1.0, 2.0, 3.0, 4.0))
-        if not self.drawn:
-            return tasks
-        scales = jnp.linspace(0.1, 0.9, 50) + 10 * tasks.goal["scale"][:, None]
-        draws = jax.tree.map(lambda x: jnp.broadcast_to(x[:, None], (4, 50, *x.shape[1:])), tasks)
-        return tasks._replace(draws=draws._replace(context=scales[..., None], goal=draws.goal | {"scale": scales}))
-
-    def relabel(self, task, transition, key):
-        return transition._replace(reward=task.goal["scale"] * transition.obs[0])
-
-
 TASKS, BATCHES, BATCH = 4, 3, 400
 
 
 def filled(with_context=False):
-    """Rings of 100 rows of each task: observation (task, row), reward -1."""
+    """Rings of 25 steps of 4 environments, 100 rows of each task: observation (task, row), reward -1."""
     task, row = np.meshgrid(np.arange(TASKS), np.arange(100), indexing="ij")
     obs = np.float32(np.stack([task, row], axis=-1)) + 1
     number = np.full((TASKS, 100), -1, np.float32)
     context = obs[..., :1] - 100 if with_context else None
-    return Replay(Transition(obs, obs[..., :1], number, number, obs, context), np.int32(0), np.int32(100))
+    rows = Transition(obs, obs[..., :1], number, number, obs, context)
+    return Replay(jax.tree.map(lambda x: x.reshape(TASKS, 25, 4, *x.shape[2:]), rows), np.int32(0), np.int32(25))
 
 
 def batches(env, share):

@@ -103,8 +103,7 @@ def test_the_loop_stores_what_was_seen():
     """Every row remembers as many steps as its episode has had, at most all; these are the rows stored before it."""
     settings = Settings(num_envs=2, updates_per_step=0, replay_size=60, warmup_steps=1, chunk_steps=20)
     state, _ = train(History(Walk(), 3), Idle(), settings, seeds=(0, 1))
-    of_worlds = lambda x: np.moveaxis(x[:, :, :40].reshape(2, 2, 20, 2, *x.shape[3:]), 2, 3)  # (S, T, E, H, ...)
-    rows = jax.tree.map(lambda x: of_worlds(np.asarray(x)), state.replay.rows)
+    rows = jax.tree.map(lambda x: np.moveaxis(np.asarray(x)[:, :, :20], 2, 3), state.replay.rows)  # (S, T, E, H, ...)
     now, then = (jax.tree.map(np.asarray, unpack(x, 1, 3)) for x in (rows.obs, rows.next_obs))
     age = np.floor(now.obs[..., 0])
     np.testing.assert_array_equal(now.past.known.sum(axis=-1), np.minimum(age, 3))

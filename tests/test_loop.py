@@ -56,9 +56,7 @@ def walk():
 
 def stored(state):
     """What the replay of each seed holds, as (S, T, E, H, ...) in the order of time."""
-    steps = 3 * CHUNK
-    shape = lambda x: np.moveaxis(np.asarray(x)[:, :, : steps * ENVS].reshape(2, 2, steps, ENVS, *x.shape[3:]), 2, 3)
-    return jax.tree.map(shape, state.replay.rows)
+    return jax.tree.map(lambda x: np.moveaxis(np.asarray(x)[:, :, : 3 * CHUNK], 2, 3), state.replay.rows)
 
 
 def ends(rows):
@@ -143,7 +141,7 @@ def test_updates_begin_after_the_warmup_and_each_has_its_own_batch(walk):
     np.testing.assert_allclose(history[1]["count"], first + (1 + UPDATES * CHUNK) / 2)
     np.testing.assert_allclose(history[1]["loss"], [[0, 1], [0, 1]])
     np.testing.assert_array_equal(state.iteration, 3 * CHUNK)
-    np.testing.assert_array_equal(state.replay.size, 3 * CHUNK * ENVS)
+    np.testing.assert_array_equal(state.replay.size, 3 * CHUNK)
 
 
 def test_finite_numbers_report_no_bad_step(walk):
@@ -274,11 +272,11 @@ def test_over_learners_gives_each_world_its_seeds_learner_and_its_task():
 
 
 def test_capacity_is_a_whole_number_of_steps():
-    """Rounded down, so that the ring wraps between steps; what is stored is as large."""
+    """Rounded down, as a slot of the ring holds a step of all environments; what is stored is as large."""
     settings = dataclasses.replace(SMALL, num_envs=3, replay_size=17)
     assert settings.capacity == 15 and SMALL.capacity == 12
     start = jax.eval_shape(lambda: loop.init(Probe(), Recorder(), settings, Probe().tasks(), jnp.uint32([0])))
-    assert start.replay.rows.obs.shape == (1, 2, 15, 1) and start.obs.shape == (1, 2, 3, 1)
+    assert start.replay.rows.obs.shape == (1, 2, 5, 3, 1) and start.obs.shape == (1, 2, 3, 1)
     assert Probe().spec == Spec(1, 1, 1)
 
 

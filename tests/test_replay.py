@@ -8,7 +8,7 @@ import pytest
 from mtjax import replay as rings
 from mtjax.types import Transition
 
-TASKS, ENVS, CAPACITY = 3, 2, 8  # the ring holds four steps
+TASKS, ENVS, SLOTS = 3, 2, 4
 
 
 def step_of_all(step):
@@ -19,8 +19,8 @@ def step_of_all(step):
     return Transition(code, -code[..., :2], number, code[..., 2] % 2, code + 0.5)
 
 
-def filled(num_steps, capacity=CAPACITY):
-    replay = rings.init(jax.tree.map(lambda x: jnp.asarray(x[0, 0]), step_of_all(0)), TASKS, capacity)
+def filled(num_steps, num_slots=SLOTS):
+    replay = rings.init(jax.tree.map(lambda x: jnp.asarray(x[0, 0]), step_of_all(0)), TASKS, num_slots, ENVS)
     for step in range(1, num_steps + 1):
         replay = rings.add(replay, step_of_all(step))
     return replay
@@ -42,25 +42,26 @@ def test_fields_of_a_row_belong_together():
 @pytest.mark.parametrize("num_steps", [1, 3, 4, 5, 8, 11])
 def test_the_ring_holds_the_last_steps_of_each_task_and_nothing_else(num_steps):
     """Before, at and after wrapping around: no unwritten row, no forgotten row, and no row of another task."""
-    steps = range(max(1, num_steps - CAPACITY // ENVS + 1), num_steps + 1)
+    steps = range(max(1, num_steps - SLOTS + 1), num_steps + 1)
     rows = drawn(filled(num_steps), 500)
     for task in range(TASKS):
         expected = {(task, env, step) for env in range(ENVS) for step in steps}
         assert {tuple(code) for code in rows.obs[task]} == expected
 
 
-@pytest.mark.parametrize(("num_steps", "size", "position"), [(0, 0, 0), (3, 6, 6), (4, 8, 0), (9, 8, 2)])
-def test_size_stops_at_the_capacity_and_position_wraps(num_steps, size, position):
-    """Both count rows, of which a step writes one for each environment."""
+@pytest.mark.parametrize(("num_steps", "size", "position"), [(0, 0, 0), (3, 3, 3), (4, 4, 0), (9, 4, 1)])
+def test_size_stops_at_the_last_slot_and_position_wraps(num_steps, size, position):
+    """Both count slots, of which a step of all environments fills one."""
     replay = filled(num_steps)
-    assert (int(replay.size), int(replay.position), rings.capacity_of(replay)) == (size, position, CAPACITY)
+    assert (int(replay.size), int(replay.position)) == (size, position)
+    assert replay.rows.obs.shape == (TASKS, SLOTS, ENVS, 3) and replay.rows.reward.shape == (TASKS, SLOTS, ENVS)
 
 
 @pytest.mark.parametrize("num_steps", [9, 30], ids=["part full", "full"])
 def test_rows_are_drawn_uniformly(num_steps):
     """Chi-square over rows, whose mean is the degrees of freedom and whose variance is twice that."""
     draws = 20_000
-    rows = drawn(filled(num_steps, capacity=20 * ENVS), draws)
+    rows = drawn(filled(num_steps, num_slots=20), draws)
     num_rows = min(num_steps, 20) * ENVS
     for task in range(TASKS):
         _, counts = np.unique(rows.reward[task], return_counts=True)
@@ -71,7 +72,7 @@ def test_rows_are_drawn_uniformly(num_steps):
 
 def test_tasks_draw_different_rows():
     """Tasks are not in step: one that draws a row does not make the others draw theirs of the same moment."""
-    rows = drawn(filled(30, capacity=20 * ENVS), 2000)
+    rows = drawn(filled(30, num_slots=20), 2000)
     same = np.mean(np.all(rows.obs[0, :, 1:] == rows.obs[1, :, 1:], axis=-1))
     assert same < 3 / (20 * ENVS)
 
@@ -83,7 +84,10 @@ def test_a_key_decides_what_is_drawn():
     assert not np.array_equal(drawn(replay, 50).obs, drawn(replay, 50, seed=1).obs)
 
 
-def test_a_capacity_that_splits_a_step_is_refused():
-    """Else the last rows of the ring would be written out of place."""
-    with pytest.raises(AssertionError, match="capacity 7 is not a multiple of 2 environments"):
-        filled(1, capacity=7)
+def test_each_row_may_be_drawn_from_a_ring_of_its_own():
+    """By the number of the ring, in whatever shape these are given."""
+    ring = np.arange(600).reshape(2, 300) % TASKS
+    rows = jax.tree.map(np.asarray, rings.sample_from(filled(7), jax.random.key(0), jnp.asarray(ring)))
+    np.testing.assert_array_equal(rows.obs[..., 0], ring)
+    np.testing.assert_array_equal(rows.reward, rows.obs @ np.float32([10_000, 100, 1]))
+    assert len(np.unique(rows.reward)) == TASKS * SLOTS * ENVS

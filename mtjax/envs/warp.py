@@ -28,6 +28,11 @@ class _Flat(NamedTuple):
     ctrl: Array
 
 
+def _own_device() -> Any:
+    """A device of this process; MJX would take the first of all, which may be another's."""
+    return jax.local_devices()[0]
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Warp:
     """Steps by MJX-Warp; start states, contacts and the sensors of positions and velocities by MJX-JAX.
@@ -86,7 +91,7 @@ class Warp:
         from mujoco.mjx.third_party.mujoco_warp import OverflowType
 
         with jax.ensure_compile_time_eval():
-            model = mjx_module().put_model(self.base, impl="warp")
+            model = mjx_module().put_model(self.base, _own_device(), "warp")
         options = model.opt._impl
         # To stop after the iterations that are asked for is no fault to print; to run out of room would be.
         warned = options.warn_overflow & ~(OverflowType.ITERATIONS | OverflowType.LS_ITERATIONS)
@@ -96,7 +101,7 @@ class Warp:
     def _make_data(self) -> Any:
         """Data (by ``lru_cache``) for so many worlds, with room for every contact that they can have."""
         mjx = mjx_module()
-        like = jax.eval_shape(partial(mjx.make_data, self.base, impl="jax"))._impl
+        like = jax.eval_shape(partial(mjx.make_data, self.base, _own_device(), "jax"))._impl
 
         @lru_cache(maxsize=8)
         def make(count: int) -> Any:
@@ -106,7 +111,9 @@ class Warp:
             doubled = min(slots, _DOUBLED)
             contacts, rows = slots + doubled, like.efc_J.shape[0] + 4 * doubled
             with jax.ensure_compile_time_eval():
-                return mjx.make_data(self.base, impl="warp", naconmax=max(count * contacts, 1), njmax=max(rows, 1))
+                return mjx.make_data(
+                    self.base, _own_device(), "warp", naconmax=max(count * contacts, 1), njmax=max(rows, 1)
+                )
 
         return make
 
