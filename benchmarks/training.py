@@ -23,11 +23,12 @@ class Training:
     """
 
     def __init__(self, family: Family, agent: SAC, settings: Settings, seeds: int = 1, most_devices: int | None = None):
-        env, mesh = remember(family, agent.history), devices.mesh_for(seeds, most=most_devices)
+        env, num_tasks = remember(family, agent.history), family.train_count
+        mesh = devices.mesh_for(seeds, num_tasks, settings.num_envs, most_devices)
         programs, numbers = devices.programs(mesh), devices.by_seed(mesh, jnp.arange(seeds))
         tasks = devices.everywhere(mesh, env.tasks())
         self.num_devices = 1 if mesh is None else mesh.size
-        self.worlds = len(tasks.id) * settings.num_envs
+        self.worlds = num_tasks * settings.num_envs
         self.steps, self.updates = (seeds * settings.chunk_steps * n for n in (self.worlds, settings.updates_per_step))
         self.seconds: list[float] = []
         before = time.perf_counter()

@@ -49,11 +49,11 @@ class Programs(NamedTuple):
     evaluate: Any
 
 
-def mesh_for(seeds: int, num_tasks: int, num_envs: int) -> Mesh | None:
+def mesh_for(seeds: int, num_tasks: int, num_envs: int, most: int | None = None) -> Mesh | None:
     """The devices that share ``seeds`` evenly, and each seed's environments where devices are left over.
 
     Of each process these are as many as divide its seeds, times as many as divide the environments of a task and leave
-    each device ``LEAST_WORLDS``. None if it is one device.
+    each device ``LEAST_WORLDS``; ``most`` of them at most. None if it is one device.
 
     Raises:
         InputError: there are several processes, and their number does not divide the seeds.
@@ -62,11 +62,12 @@ def mesh_for(seeds: int, num_tasks: int, num_envs: int) -> Mesh | None:
     if seeds % processes:
         raise InputError(f"{processes} processes cannot share {seeds} seeds evenly; --seeds must be a multiple")
     owned = [[device for device in jax.devices() if device.process_index == i] for i in range(processes)]
-    share, most = seeds // processes, min(map(len, owned))
-    groups = max(n for n in range(1, most + 1) if share % n == 0)
+    share, fewest = seeds // processes, min(map(len, owned))
+    usable = fewest if most is None else min(most, fewest)
+    groups = max(n for n in range(1, usable + 1) if share % n == 0)
     worlds = share // groups * num_tasks * num_envs
     fits = lambda n: n == 1 or (num_envs % n == 0 and worlds // n >= LEAST_WORLDS)
-    each = max(n for n in range(1, most // groups + 1) if fits(n))
+    each = max(n for n in range(1, usable // groups + 1) if fits(n))
     if processes * groups * each == 1:
         return None
     used = np.array([device for devices in owned for device in devices[: groups * each]])

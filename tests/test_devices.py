@@ -54,6 +54,7 @@ def test_most_devices_that_divide_the_seeds_are_used(hosts, counts, seeds, used)
     assert mesh.devices.shape == (used, 1)
     owners = [device.process_index for device in mesh.devices[:, 0]]
     assert owners == sorted(owners) and {owners.count(i) for i in range(len(counts))} == {used // len(counts)}
+    assert devices.mesh_for(seeds, 10, 16, most=1) is None or len(counts) > 1
     line = devices.describe(mesh, seeds, 16)
     assert f"devices: {used} of {sum(counts)}" in line and "environments on each" not in line
 
