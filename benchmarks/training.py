@@ -11,6 +11,7 @@ from mtjax.agents import SAC
 from mtjax.envs import Family
 from mtjax.history import remember
 from mtjax.loop import Settings
+from mtjax.run import compiled
 
 
 class Training:
@@ -31,9 +32,11 @@ class Training:
         self.worlds = num_tasks * settings.num_envs
         self.steps, self.updates = (seeds * settings.chunk_steps * n for n in (self.worlds, settings.updates_per_step))
         self.seconds: list[float] = []
+        jax.clear_caches()  # of the programs of others, which may be the same
         before = time.perf_counter()
-        self.state = programs.init(env, agent, settings, tasks, numbers, None)
-        chunk = programs.chunk.lower(env, agent, settings, tasks, self.state).compile()
+        init = compiled(programs.init.lower(env, agent, settings, tasks, numbers, None), once=True)
+        self.state = init(tasks, numbers, None)
+        chunk = compiled(programs.chunk.lower(env, agent, settings, tasks, self.state))
         self.compile_seconds = time.perf_counter() - before
         self.run = lambda state: chunk(tasks, state)
         while int(self.state.iteration) <= settings.warmup_steps:
