@@ -142,7 +142,7 @@ def ours(name: str, settings: dict, per_task: int, steps: int, resets: bool) -> 
             state, age, key = carry
             key, act_key, reset_key = jax.random.split(key, 3)
             action = jax.random.uniform(act_key, (*shape, env.spec.action_size), minval=-1.0)
-            after = loop.over_worlds(env.step)(worlds, state, action)
+            after = loop.play(env, worlds, state, action)
             seen = jnp.sum(after.reward) + jnp.sum(after.obs)
             age = age + 1
             if not resets:

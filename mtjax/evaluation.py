@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.loop import actions, begin, over_worlds
+from mtjax.loop import actions, begin, play
 from mtjax.tasks import episode_task
 from mtjax.types import SPLITS, Agent, Array, Env, InputError, Task
 
@@ -58,7 +58,7 @@ def evaluate(env: Env, agent: Agent, episodes: int, state: Any, tasks: Task, see
 
     def step(carry, _):
         env_state, obs, total, alive = carry
-        after = over_worlds(env.step)(worlds, env_state, actions(agent, state, tasks, worlds, obs, None))
+        after = play(env, worlds, env_state, actions(agent, state, tasks, worlds, obs, None))
         total = total + jnp.where(alive, after.reward, 0.0)  # what follows an episode's end may not be finite
         return (after.state, after.obs, total, alive & ~after.terminated), None
 

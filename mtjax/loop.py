@@ -151,7 +151,22 @@ def begin(env: Env, tasks: Task, keys: Key) -> tuple[Task, Step]:
         task_keys, keys = jnp.moveaxis(jax.vmap(jax.vmap(jax.vmap(jax.random.split)))(keys), -1, 0)
         of_task = jax.vmap(episode_task, (None, 0))
         worlds = jax.vmap(jax.vmap(of_task), (None, 0))(tasks, task_keys)
-    return worlds, over_worlds(env.reset)(worlds, keys)
+    return worlds, over_worlds(partial(_reset, env))(worlds, keys)
+
+
+def play(env: Env, worlds: Task, state: Any, action: Array) -> Step:
+    """Step every world, leaves (S, T, E, ...), by its action (S, T, E, A)."""
+    return over_worlds(partial(_step, env))(worlds, state, action)
+
+
+@partial(jax.jit, static_argnums=0)  # physics takes seconds to trace: once for all programs, whatever their batches
+def _reset(env: Env, task: Task, key: Key) -> Step:
+    return env.reset(task, key)
+
+
+@partial(jax.jit, static_argnums=0)
+def _step(env: Env, task: Task, state: Any, action: Array) -> Step:
+    return env.step(task, state, action)
 
 
 def actions(agent: Agent, state: Any, tasks: Task, worlds: Task, obs: Array, keys: Key | None) -> Array:
@@ -244,7 +259,7 @@ def _collect(env, agent, settings, tasks, state: TrainState, warming, key: Key, 
     worlds = spread(tasks, shape) if state.task is None else state.task
     chosen = actions(agent, state.agent, tasks, worlds, state.obs, _world_keys(key, shape))
     action = jnp.where(warming, _held_actions(settings, state, chosen.shape), chosen)
-    step = over_worlds(env.step)(worlds, state.env, action)
+    step = play(env, worlds, state.env, action)
     context = None if state.task is None else state.task.context
     transition = Transition(state.obs, action, step.reward, 1.0 - step.terminated, step.obs, context)
 
@@ -293,6 +308,14 @@ def _learn(env, agent, settings: Settings, tasks, state: TrainState, warming: Ar
     if not settings.updates_per_step:
         return state.agent, {}
 
+    learn = lambda learners: _learn_all(env, agent, settings, tasks, learners, state.replay, keys)
+    shapes = jax.eval_shape(learn, state.agent)[1]
+    rest = lambda learners: (learners, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes))
+    return jax.lax.cond(warming, rest, learn, state.agent)
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def _learn_all(env, agent, settings: Settings, tasks, learners, replay: Replay, keys: Key) -> tuple[Any, Metrics]:
     def learn_one(learner, replay: Replay, key: Key) -> tuple[Any, Metrics]:
         batch_key, update_key = jax.random.split(key)
         batches = draw(env, settings, tasks, replay, batch_key)
@@ -301,10 +324,7 @@ def _learn(env, agent, settings: Settings, tasks, state: TrainState, warming: Ar
         learner, metrics = jax.lax.scan(update, learner, (batches, keys))
         return learner, jax.tree.map(lambda x: jnp.mean(x, axis=0), metrics)
 
-    learn = lambda learners: over_seeds(learn_one, 0, _REPLAY, 0)(learners, state.replay, keys)
-    shapes = jax.eval_shape(learn, state.agent)[1]
-    rest = lambda learners: (learners, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes))
-    return jax.lax.cond(warming, rest, learn, state.agent)
+    return over_seeds(learn_one, 0, _REPLAY, 0)(learners, replay, keys)
 
 
 def draw(env: Env, settings: Settings, tasks: Task, replay: Replay, key: Key) -> Transition:
