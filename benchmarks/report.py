@@ -32,7 +32,7 @@ def machine() -> dict[str, Any]:
 
 def publish(arguments: argparse.Namespace, rows: list[dict]) -> None:
     """Print the figures as JSON, and write them to ``--json`` if that was given."""
-    settings = {name: value for name, value in vars(arguments).items() if name != "json"}
+    settings = {name: value for name, value in vars(arguments).items() if name not in ("json", "plots")}
     report = {"benchmark": os.path.basename(sys.argv[0]), "machine": machine(), "settings": settings, "rows": rows}
     print(json.dumps(report, default=str))
     if arguments.json:

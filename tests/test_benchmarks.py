@@ -1,0 +1,85 @@
+"""What benchmarks make of their figures; what they measure is no matter of tests."""
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).parent.parent / "benchmarks"
+
+
+@pytest.fixture
+def script(monkeypatch):
+    """A benchmark as a module."""
+    monkeypatch.syspath_prepend(str(FOLDER))
+
+    def load(name):
+        spec = importlib.util.spec_from_file_location(f"benchmark_{name}", FOLDER / f"{name}.py")
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        return module
+
+    yield load
+    for name in ("report", "training"):
+        sys.modules.pop(name, None)
+
+
+def rows(*milliseconds, rate=100):
+    return [
+        {"agent": name, "tasks": 10, "milliseconds": ms, "steps_per_second": rate, "slowest": 1}
+        for name, ms in zip("abc", milliseconds, strict=False)
+    ]
+
+
+@pytest.mark.parametrize(
+    "new, absolute, slower",
+    [
+        (rows(1, 2, 3), True, []),
+        (rows(1.1, 2.2, 3.3), True, []),
+        (rows(2, 4, 6), False, []),  # as a slower machine is
+        (rows(2, 4, 6), True, ["a", "b", "c"]),
+        (rows(1, 3, 3), False, ["b"]),
+        (rows(2, 2, 6), False, []),  # b is faster beside the others
+    ],
+)
+def test_what_is_slower_is_flagged(script, new, absolute, slower):
+    """By the ratio to what was recorded, and beside the others unless the machine is the same and quiet."""
+    lines, failed = script("compare").judge(rows(1, 2, 3), new, 1.15, absolute)
+    assert [line.split("agent=")[1][0] for line in lines if line.startswith("SLOWER")] == slower
+    assert failed == bool(slower) and len(lines) == 6
+
+
+def test_a_rate_that_falls_is_slower(script):
+    """And what is missing is no better."""
+    judge = script("compare").judge
+    assert "SLOWER   agent=a tasks=10: steps_per_second 2.00 x" in judge(rows(1), rows(1, rate=50), 1.15, True)[0]
+    lines, failed = judge(rows(1, 2), rows(1), 1.15, False)
+    assert failed and lines[0] == "MISSING  agent=b tasks=10"
+    lines, failed = judge(rows(1), [{"agent": "a", "tasks": 10, "milliseconds": 1}], 1.15, False)
+    assert failed and "MISSING  agent=a tasks=10: steps_per_second" in lines
+
+
+@pytest.mark.parametrize("name", ["update-cost-cpu", "scaling-cpu", "time-to-return-cpu", "brax-sac-cpu"])
+def test_a_recorded_report_is_as_fast_as_itself(script, name, capsys, monkeypatch):
+    """And its settings are flags of the benchmark that wrote it."""
+    compare, path = script("compare"), FOLDER / "results" / f"{name}.json"
+    monkeypatch.setattr(sys, "argv", ["compare.py", str(path), str(path)])
+    with pytest.raises(SystemExit) as end:
+        compare.main()
+    assert end.value.code == 0 and "same" in capsys.readouterr().out
+    report = json.loads(path.read_text())
+    source = (FOLDER / report["benchmark"]).read_text()
+    flags = [word.split("=")[0] for word in compare.words(dict(report["settings"])) if word.startswith("--")]
+    assert flags and all(f'"{flag}"' in source for flag in flags if flag != "--")
+
+
+def test_returns_are_those_of_whole_chunks(script, tmp_path):
+    """A chunk that is half written is none; one in which no episode ended has no return."""
+    (tmp_path / "run").mkdir()
+    lines = ["seed,steps,seconds,return", "0,10,1.0,", "1,10,1.0,", "0,20,2.0,5", "1,20,2.0,7", "0,30,3.0,9"]
+    (tmp_path / "run" / "metrics.csv").write_text("\n".join(lines) + "\n")
+    chunks = script("time_to_return").chunks
+    assert chunks(tmp_path, 2) == [(10, 1.0, None), (20, 2.0, 6.0)]
+    assert chunks(tmp_path / "none", 2) == []
