@@ -22,6 +22,7 @@ QUICK = {
     "gamma": 0.95,
     "normalize_observations": True,
 }
+LONGER = {"distral": 2500}  # whose tasks share no experience
 USUAL = ("sac-conditioned", "multi-head", "soft-modularization", "hip-bmdp")
 TOLD = [name for name in AGENTS if name != "sac"]
 EVERY = [pytest.param(name, marks=[] if name in USUAL else pytest.mark.nightly) for name in TOLD]
@@ -33,9 +34,9 @@ def env():
 
 
 def returns_of(name, **settings):
-    """The last evaluation (T,), of at most 100 an episode, after 1500 steps of 16 environments a goal."""
+    """The last evaluation (T,), of at most 100 an episode, after 1500 steps or more of 16 environments a goal."""
     agent = mtjax.agent(name, **{**QUICK, **settings})
-    steps = 1500 * 16 * 3
+    steps = LONGER.get(name, 1500) * 16 * 3
     result = mtjax.train(env(), agent, steps=steps, eval_every=steps, eval_episodes=1, settings=SETTINGS)
     return result.evaluations.returns["train"][0, -1].mean(axis=-1)
 
