@@ -153,8 +153,9 @@ def compiled(program: Any, once: bool = False) -> Any:
     Args:
         once: it runs a single time, for a moment, so that compiling it is all that counts.
     """
-    on_cpu = jax.default_backend() == "cpu"
-    return program.compile({"xla_backend_optimization_level": 0 if once else 1} if on_cpu else None)
+    flag = "xla_backend_optimization_level"
+    chosen = jax.default_backend() != "cpu" or flag in os.environ.get("XLA_FLAGS", "")
+    return program.compile(None if chosen else {flag: 0 if once else 1})
 
 
 def fit_chunk(settings: Settings, num_tasks: int, steps: int) -> Settings:

@@ -104,6 +104,7 @@ def test_checkpoint_goes_on_with_other_devices(alone, halfway, tmp_path, use, co
     assert_same(result, alone)
 
 
+@pytest.mark.nightly
 def test_checkpoint_of_one_device_goes_on_with_four(alone, tmp_path, use):
     """The other way round."""
     use(1)
@@ -114,6 +115,7 @@ def test_checkpoint_of_one_device_goes_on_with_four(alone, tmp_path, use):
     assert_same(result, alone)
 
 
+@pytest.mark.nightly
 def test_host_engine_serves_every_device(short_family, tmp_path, use):
     """MuJoCo C is called back from each device, and steps the worlds that it is given."""
     env = envs.make("finger-short")

@@ -148,10 +148,12 @@ def python(*words, **variables):
 
 
 @pytest.mark.slow
-def test_four_devices():
+@pytest.mark.parametrize("which", ["not nightly", pytest.param("nightly", marks=pytest.mark.nightly)])
+def test_four_devices(which):
     """The tests of ``four_devices.py``, where JAX shows four devices of this CPU."""
+    words = ("-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", which, "four_devices.py")
     flags = f"{QUICK_FLAG} --xla_force_host_platform_device_count=4"
-    assert "skipped" not in finish("-m", "pytest", "-q", "-p", "no:cacheprovider", "four_devices.py", XLA_FLAGS=flags)
+    assert "skipped" not in finish(*words, XLA_FLAGS=flags)
 
 
 def finish(*words, **variables):
