@@ -71,7 +71,8 @@ def describe(program: Program, count: int, limit: float) -> str:
     """A line on what one program holds, what it takes, and in how many rounds it runs."""
     settings, seeds = max(len(program.points), 1), program.plan.seeds
     held = f"{settings} setting{'s' * (settings > 1)} of {seeds} seed{'s' * (seeds > 1)}, about"
+    name = " ".join(program.sweep) or f"{program.agent} on {program.env}"
     return (
-        f"program {' '.join(program.sweep)}: {held} {needed(program) / 1e6:,.0f} MB each, "
+        f"{name}: {held} {needed(program) / 1e6:,.0f} MB each, "
         f"{limit * _SHARE / 1e6:,.0f} MB to use: {count} round{'s' * (count > 1)}"
     )
