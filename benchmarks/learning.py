@@ -21,6 +21,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from report import markdown
 
 import mtjax
 from mtjax import plot
@@ -97,10 +98,9 @@ def save(folder: Path, agent: str, result: Result) -> None:
 
 def tabulate(out: Path, mark: float) -> None:
     """Make tables and figures of all runs in a folder."""
-    cells = ["family", "agent", *(f"{split}, IQM" for split in SPLITS), "worst task", f"s to {mark:.0f}"]
-    cells += ["training s", "wall s", "steps/s, all seeds"]
-    lines = ["| " + " | ".join(cells) + " |", "|" + "---|" * len(cells)]
-    rows = []
+    head = ["family", "agent", *(f"{split}, IQM" for split in SPLITS), "worst task", f"s to {mark:.0f}"]
+    head += ["training s", "wall s", "steps/s, all seeds"]
+    lines, rows = [], []
     for env in sorted({path.parent.name for path in out.glob("*/*.npz")}):
         curves = {}
         for agent, curve, evaluations in runs(out / env):
@@ -111,10 +111,11 @@ def tabulate(out: Path, mark: float) -> None:
             rows += evaluation_rows(env, agent, evaluations)
         if curves:
             plot.compare(out / f"{env}.png", curves, f"return on training tasks of {env}")
-    (out / "table.md").write_text("\n".join(lines) + "\n")
+    table = markdown(head, lines)
+    (out / "table.md").write_text(table + "\n")
     (out / "evaluations.csv").unlink(missing_ok=True)
     append_rows(out / "evaluations.csv", rows)
-    print("\n".join(lines))
+    print(table)
 
 
 def runs(folder: Path) -> Iterator[tuple]:
@@ -129,8 +130,8 @@ def runs(folder: Path) -> Iterator[tuple]:
         yield path.stem, curve.reshape(-1, seeds, len(_KEPT)), load_evaluations(path)
 
 
-def row(env: str, agent: str, curve: np.ndarray, evaluations, mark: float) -> str:
-    """One run's line: last evaluation by split, times, rate."""
+def row(env: str, agent: str, curve: np.ndarray, evaluations, mark: float) -> list[str]:
+    """The cells of one run's line: last evaluation by split, times, rate."""
     scores = {split: x[:, -1].mean(axis=-1) for split, x in evaluations.returns.items() if x.size}  # (S, T)
     cells = [env, agent]
     for split in SPLITS:
@@ -141,7 +142,7 @@ def row(env: str, agent: str, curve: np.ndarray, evaluations, mark: float) -> st
     reached = np.flatnonzero(returns >= mark)
     cells.append(f"{seconds[reached[0]]:.1f}" if len(reached) else "-")
     rate = steps[-1] * curve.shape[1] / seconds[-1]
-    return "| " + " | ".join([*cells, f"{seconds[-1]:.1f}", f"{wall[-1]:.0f}", f"{rate:,.0f}"]) + " |"
+    return [*cells, f"{seconds[-1]:.1f}", f"{wall[-1]:.0f}", f"{rate:,.0f}"]
 
 
 def evaluation_rows(env: str, agent: str, evaluations) -> list[dict]:

@@ -6,6 +6,7 @@ import os
 import platform
 import subprocess
 import sys
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -28,6 +29,12 @@ def machine() -> dict[str, Any]:
         "mtjax": mtjax.__version__,
         "commit": commit.stdout.strip() or None,
     }
+
+
+def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table in Markdown."""
+    line = lambda cells: "| " + " | ".join(cells) + " |"
+    return "\n".join([line(head), "|" + "---|" * len(head), *map(line, rows)])
 
 
 def publish(arguments: argparse.Namespace, rows: list[dict]) -> None:

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import jax
 from matplotlib.figure import Figure
-from report import publish
+from report import markdown, publish
 from training import Training
 
 import mtjax
@@ -122,15 +122,15 @@ def row(axis: str, value: int, training: Training, base: Training) -> dict:
 
 
 def table(rows: list[dict]) -> str:
-    cells = ["", "worlds of a seed", "env-steps/s, all seeds", "range", "updates/s", "cost", "compiled in"]
-    lines = ["| " + " | ".join([rows[0]["axis"], *cells[1:]]) + " |", "|" + "---|" * len(cells)]
-    for row in rows:
-        span = f"{row['slowest']:,} to {row['fastest']:,}"
-        lines.append(
-            f"| {row['value']:,} | {row['worlds']:,} | {row['steps_per_second']:,} | {span} "
-            f"| {row['updates_per_second']:,.0f} | {row['cost']:.2f} | {row['compile_seconds']:.1f} s |"
-        )
-    return "\n".join(lines)
+    head = ["worlds of a seed", "env-steps/s, all seeds", "range", "updates/s", "cost", "compiled in"]
+    cells = lambda row: [
+        *(f"{row[name]:,}" for name in ("value", "worlds", "steps_per_second")),
+        f"{row['slowest']:,} to {row['fastest']:,}",
+        f"{row['updates_per_second']:,.0f}",
+        f"{row['cost']:.2f}",
+        f"{row['compile_seconds']:.1f} s",
+    ]
+    return markdown([rows[0]["axis"], *head], [cells(row) for row in rows])
 
 
 def draw(path: Path, axis: str, rows: list[dict]) -> None:

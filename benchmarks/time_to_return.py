@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from report import publish
+from report import markdown, publish
 
 _ON_CPU = jax.default_backend() == "cpu"
 # Tasks that are many have few environments and small batches each, so that the whole stays the same.
@@ -125,14 +125,11 @@ def _mean(rows: list[dict]) -> float:
 
 
 def table(rows: list[dict], mark: float) -> str:
-    cells = ["agent", "tasks", "seeds", "cache", "first metrics s", f"training s to {mark:g}", f"process s to {mark:g}"]
-    cells += ["best return", "env-steps/s, all seeds"]
-    lines = ["| " + " | ".join(cells) + " |", "|" + "---|" * len(cells)]
+    settings = ("agent", "tasks", "seeds", "cache")
+    head = [*settings, "first metrics s", f"training s to {mark:g}", f"process s to {mark:g}"]
     show = lambda x: "-" if x is None else f"{x:,}"
-    for row in rows:
-        settings = [row["agent"], f"{row['tasks']}", f"{row['seeds']}", row["cache"]]
-        lines.append("| " + " | ".join([*settings, *(show(row[name]) for name in FIGURES)]) + " |")
-    return "\n".join(lines)
+    cells = lambda row: [*(str(row[name]) for name in settings), *(show(row[name]) for name in FIGURES)]
+    return markdown([*head, "best return", "env-steps/s, all seeds"], [cells(row) for row in rows])
 
 
 if __name__ == "__main__":

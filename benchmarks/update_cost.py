@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from report import publish
+from report import markdown, publish
 
 import mtjax
 from mtjax import loop
@@ -117,14 +117,16 @@ def size_of(tree: Any) -> int:
 
 
 def table(rows: list[dict]) -> str:
-    lines = ["| agent | tasks | seeds | ms an update | range | over sac | parameters | compiled in |", "|" + "---|" * 8]
-    for row in rows:
-        span = f"{row['fastest']:.3g} to {row['slowest']:.3g}"
-        lines.append(
-            f"| {row['agent']} | {row['tasks']} | {row['seeds']} | {row['milliseconds']:.3g} | {span} "
-            f"| {row['over_sac']:.2f} | {row['parameters']:,} | {row['compile_seconds']:.1f} s |"
-        )
-    return "\n".join(lines)
+    head = ["agent", "tasks", "seeds", "ms an update", "range", "over sac", "parameters", "compiled in"]
+    cells = lambda row: [
+        *(str(row[name]) for name in ("agent", "tasks", "seeds")),
+        f"{row['milliseconds']:.3g}",
+        f"{row['fastest']:.3g} to {row['slowest']:.3g}",
+        f"{row['over_sac']:.2f}",
+        f"{row['parameters']:,}",
+        f"{row['compile_seconds']:.1f} s",
+    ]
+    return markdown(head, [cells(row) for row in rows])
 
 
 if __name__ == "__main__":

@@ -122,9 +122,9 @@ def _compare(params: Params, loss: Callable, data: Any) -> tuple[dict[str, Any],
     (shared, own), aux = differentiate(params.shared, params.own, data)
     share = bool(jax.tree.leaves(shared))
     gram = surgery.gram_matrix(shared if share else own)
-    found = {"gram": gram, "cosine": surgery.cosines(gram)[0], "conflict": surgery.conflicts(gram)["conflict"]}
-    found = found if share else dict.fromkeys(found)
-    return {**found, "gradient_norm": surgery.cosines(gram)[1]}, aux
+    cosine, lengths = surgery.cosines(gram)
+    found = {"gram": gram, "cosine": cosine, "conflict": surgery.conflicts(gram)["conflict"]}
+    return {**(found if share else dict.fromkeys(found)), "gradient_norm": lengths}, aux
 
 
 # Units.
