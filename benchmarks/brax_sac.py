@@ -20,7 +20,7 @@ from report import publish
 from training import Training
 
 import mtjax
-from mtjax.cli import Program
+from mtjax.config import RunConfig
 from mtjax.types import InputError
 
 
@@ -49,7 +49,7 @@ def main() -> None:
     publish(arguments, rows)
 
 
-def brax_rates(program: Program, worlds: int, arguments: argparse.Namespace) -> list[float]:
+def brax_rates(program: RunConfig, worlds: int, arguments: argparse.Namespace) -> list[float]:
     """Brax's own figure, environment steps a second, of every epoch but the first, which compiles."""
     from brax.training.agents.sac import networks
     from brax.training.agents.sac import train as sac

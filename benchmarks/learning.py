@@ -24,11 +24,12 @@ import numpy as np
 from report import markdown
 
 import mtjax
-from mtjax import plot
 from mtjax.evaluation import load_evaluations, save_evaluations
-from mtjax.log import append_rows
-from mtjax.run import Result, enable_compile_cache
-from mtjax.stats import stratified_bootstrap
+from mtjax.report import figures as plot
+from mtjax.report.stats import stratified_bootstrap
+from mtjax.training.log import append_rows
+from mtjax.training.programs import enable_compile_cache
+from mtjax.training.run import Result
 from mtjax.types import SPLITS, InputError
 
 FAMILIES = (

@@ -24,7 +24,7 @@ from report import markdown, publish
 from training import Training
 
 import mtjax
-from mtjax.cli import Program
+from mtjax.config import RunConfig
 from mtjax.types import InputError
 
 _ON_CPU = jax.default_backend() == "cpu"
@@ -97,7 +97,7 @@ def contestant(axis: str, value: int, arguments: argparse.Namespace) -> Training
     return Training(program.family, program.learner, settings, seeds, value if axis == "devices" else 1)
 
 
-def preset(num_tasks: int, arguments: argparse.Namespace) -> Program:
+def preset(num_tasks: int, arguments: argparse.Namespace) -> RunConfig:
     name, span = arguments.parameter.split("=", 1)
     middle = sum(map(float, span.split(":"))) / 2
     values = f"{span}:{num_tasks}" if num_tasks > 1 else f"{middle:g}"

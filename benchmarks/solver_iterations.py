@@ -23,7 +23,9 @@ from report import publish
 
 import mtjax
 from mtjax.envs import ENVS, Domain
-from mtjax.envs.physics import Engine, Mjx, MujocoC, World
+from mtjax.envs.engines.base import Engine, World
+from mtjax.envs.engines.c import MujocoC
+from mtjax.envs.engines.mjx import Mjx
 from mtjax.types import InputError, Task
 
 SETTINGS = ("1/2", "1/4", "2/4", "2/8", "3/6", "4/8", "6/12", "10/20")
@@ -88,7 +90,7 @@ def build(env: Domain, kind: str, setting: str) -> Engine:
     base.opt.iterations, base.opt.ls_iterations = map(int, setting.split("/"))
     if kind == "mjx":
         return Mjx(base, env.num_substeps)
-    from mtjax.envs.warp import Warp
+    from mtjax.envs.engines.warp import Warp
 
     return Warp(base, env.num_substeps)
 

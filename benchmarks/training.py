@@ -6,12 +6,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mtjax import devices
 from mtjax.agents import SAC
 from mtjax.envs import Family
 from mtjax.history import remember
 from mtjax.loop import Settings
-from mtjax.run import compiled
+from mtjax.parallel import mesh as meshes
+from mtjax.training.programs import jitted
+from mtjax.training.run import compiled
 
 
 class Training:
@@ -25,9 +26,9 @@ class Training:
 
     def __init__(self, family: Family, agent: SAC, settings: Settings, seeds: int = 1, most_devices: int | None = None):
         env, num_tasks = remember(family, agent.history), family.train_count
-        mesh = devices.mesh_for(seeds, num_tasks, settings.num_envs, most_devices)
-        programs, numbers = devices.programs(mesh), devices.by_seed(mesh, jnp.arange(seeds))
-        tasks = devices.everywhere(mesh, env.tasks())
+        mesh = meshes.mesh_for(seeds, num_tasks, settings.num_envs, most_devices)
+        programs, numbers = jitted(mesh), meshes.by_seed(mesh, jnp.arange(seeds))
+        tasks = meshes.everywhere(mesh, env.tasks())
         self.num_devices = 1 if mesh is None else mesh.size
         self.worlds = num_tasks * settings.num_envs
         self.steps, self.updates = (seeds * settings.chunk_steps * n for n in (self.worlds, settings.updates_per_step))

@@ -5,86 +5,40 @@ import dataclasses
 import importlib.util
 import io
 import itertools
-import json
 import re
 import sys
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
-from importlib import resources
 from pathlib import Path
-from types import MappingProxyType
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import tyro
 
-from mtjax.agents import AGENTS, PARTS, SAC, agent, settings
-from mtjax.envs import ENVS, Family, make
-from mtjax.loop import Settings
+from mtjax.agents import AGENTS, PARTS, settings
+from mtjax.config import PRESETS, RunConfig, from_json, with_preset
+from mtjax.envs import ENVS, make
 from mtjax.names import nearest_error
-from mtjax.run import Plan
 from mtjax.types import InputError
 
-PRESETS = ("auto", "cpu", "gpu")
 _VARY = "--env.vary."
 _FAMILY_FLAGS = {"combine": "env.combine", "split": "split"}  # they decide which values are allowed
 _DECIDING = ("conditioning", "vectors", "heads")  # which parts go together with the rest of an agent
 P = TypeVar("P")
 
 
-@dataclasses.dataclass(frozen=True)
-class Program:
-    """Train a multi-task agent: ``python -m mtjax.train --env=NAME --agent=NAME``."""
-
-    env: str = "finger-spin-vary-size"
-    """Name of the environment family; --list shows all. --import=FILE.py makes those known that a file registers."""
-    agent: str = "sac-conditioned"
-    """Name of the agent; --list shows all. Its parts: --agent.encoder, --agent.gradients, --agent.value,
-    --agent.scaling and --agent.sampler, each by name and with flags of its own."""
-    preset: Literal["auto", "cpu", "gpu"] = "auto"
-    """Tuned defaults of the flags below for a kind of device; auto chooses by the device that JAX runs on."""
-    runs: str = "runs"
-    """Folder in which the run's own folder is made."""
-    resume: str = ""
-    """A run's folder to go on with; only --steps may be given beside it."""
-    start: Annotated[str, tyro.conf.arg(name="from")] = ""
-    """A run's folder whose agent to fine-tune on this environment's tasks. Agent and networks are the run's; rates of
-    learning and --tune may be given. What every task has for itself begins as that of the run's nearest training task,
-    and seeds beyond the run's begin with its first ones again."""
-    sweep: tuple[str, ...] = ()
-    """Train once for every combination of values: agent.actor-lr=1e-4,1e-3 agent.num-experts=2,4 and so on, flags
-    without their dashes. The agent's numbers vary inside one program, beside the seeds; whatever else varies is one
-    program after another. A table of all settings lies in the sweep's folder, whose name --resume takes too."""
-    points: Annotated[tuple[dict[str, float], ...], tyro.conf.Suppress] = ()
-    profile: bool = False
-    """Leave a trace of one warm chunk, by JAX's profiler, in the run's folder."""
-    distributed: bool = False
-    """Run as one of several processes, each on devices of its own, that share the seeds. All are started with the same
-    command: by SLURM's srun, Open MPI or Kubernetes, or with JAX_COORDINATOR_ADDRESS (host:port of process 0),
-    JAX_NUM_PROCESSES and JAX_PROCESS_ID in the environment. They share the folder of --runs."""
-    list: bool = False
-    """Print the families and agents, and stop."""
-    plan: Annotated[Plan, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Plan)
-    training: Annotated[Settings, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Settings)
-    family: Annotated[Family, tyro.conf.arg(name="env")] = dataclasses.field(
-        default_factory=lambda: make("finger-spin")
-    )
-    learner: Annotated[SAC, tyro.conf.arg(name="agent")] = dataclasses.field(default_factory=SAC)
-
-
-def parse(argv: Sequence[str]) -> Program:
+def parse(argv: Sequence[str]) -> RunConfig:
     """Read a command line: the names choose the defaults, the other flags change them.
 
     Raises:
         InputError: a name, flag or value cannot be used.
     """
     argv = import_files(argv)
-    env_name = _peel(argv, "env", Program.env)
+    env_name = _peel(argv, "env", RunConfig.env)
     start = _peel(argv, "from", "")
     begun = from_json(Path(start) / "config.json") if start or "--from=" in argv else None
     if begun is not None and begun.points:
         raise InputError(f"--from takes a run of one setting, and {start!r} holds {len(begun.points)} of a sweep")
-    agent_name = _peel(argv, "agent", Program.agent if begun is None else begun.agent)
-    preset_name = _peel(argv, "preset", Program.preset)
+    agent_name = _peel(argv, "agent", RunConfig.agent if begun is None else begun.agent)
+    preset_name = _peel(argv, "preset", RunConfig.preset)
     if preset_name not in PRESETS:
         raise nearest_error("preset", preset_name, PRESETS)
     vary, argv = _peel_vary(argv)
@@ -95,59 +49,17 @@ def parse(argv: Sequence[str]) -> Program:
     if begun is not None:
         default = _fine_tuning(default, begun, start, chosen)
     _check_flags(argv, default)
-    return parse_with_tyro(Program, argv, default, "python -m mtjax.train")
+    return parse_with_tyro(RunConfig, argv, default, "python -m mtjax.train")
 
 
-def _fine_tuning(program: Program, begun: Program, start: str, chosen: Mapping[str, str]) -> Program:
+def _fine_tuning(config: RunConfig, begun: RunConfig, start: str, chosen: Mapping[str, str]) -> RunConfig:
     """A program with the agent of a run, and tasks whose context is written as the run's."""
     had = {"agent": begun.agent, **settings(begun.learner)}
-    for name, given in {"agent": program.agent, **chosen}.items():
+    for name, given in {"agent": config.agent, **chosen}.items():
         if given != had[name]:
             raise InputError(f"--from goes on with the run's {name}, {had[name]}, not with {given}; leave it out")
-    learner, family = dataclasses.replace(begun.learner, tune="all"), program.family.scaled_as(begun.family)
-    return dataclasses.replace(program, start=start, learner=learner, family=family)
-
-
-def with_preset(
-    env_name: str,
-    agent_name: str,
-    preset_name: str = "auto",
-    agent_settings: Mapping[str, str] = MappingProxyType({}),
-    **family_settings: Any,
-) -> Program:
-    """Return the program that a family and an agent, each with any settings of its own, and a preset stand for.
-
-    Raises:
-        InputError: a name or setting is unknown.
-    """
-    family = make(env_name, **family_settings)
-    preset = load_preset(env_name, _device_preset() if preset_name == "auto" else preset_name)
-    of_agent = preset.get("agent", {}) | preset.get(agent_name, {})
-    return Program(
-        env=env_name,
-        agent=agent_name,
-        preset=preset_name,  # type: ignore
-        plan=Plan(**preset.get("plan", {})),
-        training=Settings(**preset.get("training", {})),
-        family=family,
-        learner=agent(agent_name, **{**of_agent, **agent_settings}),
-    )
-
-
-def load_preset(env_name: str, name: str) -> dict[str, Any]:
-    """Read the tables of a preset: the family's own file, or the domain's, or the default one."""
-    folder = resources.files("mtjax") / "configs"
-    words = env_name.split("-")
-    names = ["-".join(words[:n]) for n in range(len(words), 0, -1)]
-    file = next((f for n in [*names, "default"] if (f := folder / f"{n}.toml").is_file()), None)
-    assert file is not None, "the package lacks configs/default.toml"
-    return tomllib.loads(file.read_text())[name]
-
-
-def _device_preset() -> str:
-    import jax
-
-    return "cpu" if jax.default_backend() == "cpu" else "gpu"
+    learner, family = dataclasses.replace(begun.learner, tune="all"), config.family.scaled_as(begun.family)
+    return dataclasses.replace(config, start=start, learner=learner, family=family)
 
 
 def _peel(argv: Sequence[str], name: str, default: str) -> str:
@@ -187,13 +99,6 @@ def _import(path: Path) -> None:
     spec.loader.exec_module(module)
 
 
-def import_flag(family: Family) -> list[str]:
-    """The flag that makes a family of the user's own known to another program; none for those of this package."""
-    module = type(family).__module__
-    file = getattr(sys.modules.get(module), "__file__", None)
-    return [] if module.split(".")[0] == "mtjax" or file is None else [f"--import={Path(file).resolve()}"]
-
-
 def _peel_vary(argv: Sequence[str]) -> tuple[dict[str, str], list[str]]:
     """Take --env.vary.NAME=VALUES out of a command line: which names there are is the family's to say."""
     given, rest = _take(argv, lambda flag: flag.startswith(_VARY), "values; give lo:hi:n, lo:hi or a list a,b,c")
@@ -221,11 +126,11 @@ def _take(argv: Sequence[str], mine: Callable[[str], bool], needed: str) -> tupl
     return given, rest
 
 
-def flags(program: Any, prefix: str = "--") -> list[str]:
+def flags(config: Any, prefix: str = "--") -> list[str]:
     """Every flag of a program."""
     names = []
-    for field in dataclasses.fields(program):
-        value, name = getattr(program, field.name), field.name.replace("_", "-")
+    for field in dataclasses.fields(config):
+        value, name = getattr(config, field.name), field.name.replace("_", "-")
         if name in ("vary", "context-ranges", "points"):  # a flag for each parameter, taken out before; and no flags
             continue
         if name == "learner":
@@ -241,8 +146,8 @@ def flags(program: Any, prefix: str = "--") -> list[str]:
     return names
 
 
-def _check_flags(argv: Sequence[str], program: Program) -> None:
-    known = flags(program)
+def _check_flags(argv: Sequence[str], config: RunConfig) -> None:
+    known = flags(config)
     known += [flag.replace("--", "--no-", 1) for flag in known]
     known += ["".join((*flag.rpartition(".")[:2], "no-", flag.rpartition(".")[2])) for flag in known if "." in flag]
     for word in argv:
@@ -275,42 +180,6 @@ def _unframed(text: str) -> str:
     below = itertools.dropwhile(lambda line: not is_rule(line), text.splitlines())
     next(below, None)
     return " ".join(line.strip(" │") for line in itertools.takewhile(lambda line: not is_rule(line), below))
-
-
-# The record of a run.
-
-
-def to_json(program: Program, extra: dict[str, Any]) -> str:
-    """Write everything a run is made of."""
-    record = {**dataclasses.asdict(program), "learner": settings(program.learner)}
-    return json.dumps({**record, **extra}, indent=2) + "\n"
-
-
-def from_json(path: Path) -> Program:
-    """Read the program of a run from its config.json.
-
-    Raises:
-        InputError: there is no such file, or it does not describe a run.
-    """
-    if not path.is_file():
-        raise InputError(f"{str(path.parent)!r} is not a run: it has no config.json")
-    try:
-        record = json.loads(path.read_text())
-        return Program(
-            env=record["env"],
-            agent=record["agent"],
-            preset=record["preset"],
-            runs=record["runs"],
-            start=record.get("start", ""),
-            sweep=tuple(record.get("sweep", ())),
-            points=tuple(record.get("points", ())),
-            plan=Plan(**record["plan"]),
-            training=Settings(**record["training"]),
-            family=make(record["env"], **record["family"]),
-            learner=agent(record["agent"], **record["learner"]),
-        )
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{str(path)!r} does not describe a run: {type(error).__name__}: {error}") from None
 
 
 def catalogue() -> str:

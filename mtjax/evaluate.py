@@ -8,14 +8,16 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax import cli, diagnostics
+from mtjax import cli
+from mtjax.config import from_json
 from mtjax.envs import Domain
-from mtjax.evaluation import Evaluations, evaluate, record
-from mtjax.log import append_rows, number
+from mtjax.evaluation import evaluate, record
 from mtjax.names import nearest_error
-from mtjax.policy import Policy, load, load_experience
-from mtjax.run import enable_compile_cache
-from mtjax.stats import seed_interval
+from mtjax.report import diagnostics, figures, render
+from mtjax.report.tables import task_table
+from mtjax.training.log import append_rows, number
+from mtjax.training.policy import Policy, load, load_experience
+from mtjax.training.programs import enable_compile_cache
 from mtjax.types import SPLITS, InputError
 
 _FIRST_NUMBER = 1_000_000  # far from the numbers of a run's own evaluations, so that the episodes are new
@@ -79,16 +81,16 @@ def _parse(argv: Sequence[str]) -> Request:
 
 def _first_seed(request: Request) -> int:
     """The first number of a setting's seeds."""
-    program = cli.from_json(Path(request.run) / "config.json")
-    if not 0 <= request.point < max(len(program.points), 1):
-        raise InputError(f"point must be from 0 to {max(len(program.points), 1) - 1}, not {request.point}")
-    return request.point * program.plan.seeds
+    config = from_json(Path(request.run) / "config.json")
+    if not 0 <= request.point < max(len(config.points), 1):
+        raise InputError(f"point must be from 0 to {max(len(config.points), 1) - 1}, not {request.point}")
+    return request.point * config.plan.seeds
 
 
 def score(policy: Policy, episodes: int, seed: int = 0) -> dict[str, np.ndarray]:
     """Return the returns (S, T, episodes) of each split, in episodes that no training run has seen."""
-    env, program = policy.env, jnp.int32(_FIRST_NUMBER + seed)
-    returns = np.asarray(evaluate(env, policy.agent, episodes, policy.states, env.tasks("all"), policy.seeds, program))
+    env, config = policy.env, jnp.int32(_FIRST_NUMBER + seed)
+    returns = np.asarray(evaluate(env, policy.agent, episodes, policy.states, env.tasks("all"), policy.seeds, config))
     return {split: returns[:, env.table.rows[split]] for split in SPLITS}
 
 
@@ -100,38 +102,7 @@ def _new_folder(run: Path) -> Path:
     raise InputError(f"{str(run)!r} is full of evaluations; move some away")
 
 
-def _interval(scores: np.ndarray) -> str:
-    """Mean of scores (S, T) with its 95% interval over seeds, if there are several."""
-    point, low, high = seed_interval(scores)
-    return f"{point:6.0f}" + (f"  [{low:.0f}, {high:.0f}]" if scores.shape[0] > 1 else "")
-
-
-def split_table(evaluations: Evaluations) -> str:
-    """Lay out the last evaluation of a run: mean return by split, and the worst task's."""
-    lines = [f"{'split':15} {'tasks':>5} {'return':>7}  worst task"]
-    for split, returns in evaluations.returns.items():
-        if returns.size:
-            scores = returns[:, -1].mean(axis=-1)  # (S, T)
-            lines.append(f"{split:15} {scores.shape[1]:5} {_interval(scores):>7}  {scores.mean(axis=0).min():.0f}")
-    return "\n".join(lines)
-
-
-def task_table(policy: Policy, episodes: dict[str, np.ndarray]) -> str:
-    """Lay out returns (S, T, episodes) by split and task."""
-    lines = [f"{'split':15} {policy.env.task_axis[0]:>10} {'return':>7}   episodes from, to"]
-    for split, returns in episodes.items():
-        if not returns.size:
-            continue
-        for value, task in zip(policy.env.task_values(split), np.moveaxis(returns, 1, 0), strict=True):
-            mean = _interval(task.mean(axis=-1, keepdims=True))
-            lines.append(f"{split:15} {value:10.4g} {mean:>7}   {task.min():.0f}, {task.max():.0f}")
-        lines.append(f"{split:15} {'all':>10} {_interval(returns.mean(axis=-1)):>7}")
-    return "\n".join(lines)
-
-
 def _write(policy: Policy, episodes: dict[str, np.ndarray], directory: Path) -> None:
-    from mtjax import plot
-
     name, unit = policy.env.task_axis
     rows = [
         {"split": split, name: number(value), "seed": int(seed), "episode": e, "return": number(x)}
@@ -142,13 +113,11 @@ def _write(policy: Policy, episodes: dict[str, np.ndarray], directory: Path) -> 
     ]
     append_rows(directory / "returns.csv", rows)
     values = {split: policy.env.task_values(split) for split in episodes}
-    plot.return_by_parameter(directory / f"return_by_{name.replace('-', '_')}.png", name, unit, values, episodes)
+    figures.return_by_parameter(directory / f"return_by_{name.replace('-', '_')}.png", name, unit, values, episodes)
 
 
 def _film(policy: Policy, directory: Path, seed: int) -> None:
     """Film the beginning of one episode of every task, at the speed at which it happens."""
-    from mtjax import render
-
     env = policy.family
     assert isinstance(env, Domain)
     render.choose_backend()

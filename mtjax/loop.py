@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mtjax import hindsight, shares
-from mtjax import replay as rings
-from mtjax.points import Varied
-from mtjax.replay import Replay
+from mtjax.experience import hindsight
+from mtjax.experience import replay as rings
+from mtjax.experience.replay import Replay
+from mtjax.parallel import collectives as shares
 from mtjax.tasks import episode_task
 from mtjax.types import Agent, Array, Env, InputError, Key, Metrics, Outcome, Spec, Step, Task, Transition
 
@@ -264,7 +264,7 @@ def _collect(env, agent, settings, tasks, state: TrainState, warming, key: Key, 
     transition = Transition(state.obs, action, step.reward, 1.0 - step.terminated, step.obs, context)
 
     age, total = state.age + 1, state.total + step.reward
-    gamma = agent.discounts(state.agent) if isinstance(agent, Varied) else agent.gamma
+    gamma = agent.discounts(state.agent) if hasattr(agent, "discounts") else agent.gamma
     discounted = gamma * state.discounted + step.reward
     ended = step.terminated | (age >= env.episode_length)
 

@@ -14,7 +14,7 @@ from probes import QUICK
 
 import mtjax.train
 from mtjax.envs import ENVS
-from mtjax.envs.finger import FingerSpin
+from mtjax.envs.dm_control.finger import FingerSpin
 
 
 class Worlds(NamedTuple):

@@ -9,8 +9,12 @@ import pytest
 from jax.sharding import PartitionSpec
 from probes import Goals, Walk, tiny
 
-from mtjax import devices, envs, run, shares
+from mtjax import envs
 from mtjax.loop import Settings
+from mtjax.parallel import collectives as shares
+from mtjax.parallel import mesh as meshes
+from mtjax.training import run
+from mtjax.training.programs import jitted
 
 SETTINGS = Settings(num_envs=2, batch_size=4, replay_size=40, warmup_steps=4, chunk_steps=10)
 WIDE = Settings(num_envs=4, batch_size=4, replay_size=100, warmup_steps=4, chunk_steps=10)  # half full in two chunks
@@ -35,7 +39,7 @@ def use(monkeypatch):
 def alone(tmp_path_factory):
     """Four seeds on a single device, by the path that knows of no other."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(devices, "mesh_for", lambda *_: None)
+        patch.setattr(meshes, "mesh_for", lambda *_: None)
         return play(tmp_path_factory.mktemp("alone"), Walk(), 4)
 
 
@@ -85,9 +89,9 @@ def test_four_devices_change_no_seed(alone, tmp_path, capfd):
 
 def test_donated_state_is_gone(tmp_path):
     """A chunk's replay takes the place of the one before it, on every device."""
-    mesh = devices.mesh_for(4, 2, 2)
-    programs, env = devices.programs(mesh), Walk()
-    tasks, seeds = devices.everywhere(mesh, env.tasks()), devices.by_seed(mesh, jnp.arange(4))
+    mesh = meshes.mesh_for(4, 2, 2)
+    programs, env = jitted(mesh), Walk()
+    tasks, seeds = meshes.everywhere(mesh, env.tasks()), meshes.by_seed(mesh, jnp.arange(4))
     state = programs.init(env, AGENT, SETTINGS, tasks, seeds, None)
     after, metrics = programs.chunk(env, AGENT, SETTINGS, tasks, state)
     assert state.replay.rows.obs.is_deleted() and int(after.iteration) == 10
@@ -132,7 +136,7 @@ def test_host_engine_serves_every_device(short_family, tmp_path, use):
 @pytest.fixture
 def crowd(monkeypatch):
     """Let a device be content with few worlds."""
-    monkeypatch.setattr(devices, "LEAST_WORLDS", 1)
+    monkeypatch.setattr(meshes, "LEAST_WORLDS", 1)
 
 
 def wide(directory, chunks=4, **changes):
@@ -149,7 +153,7 @@ def parts_of(x):
 def wide_alone(tmp_path_factory):
     """One seed with four environments on a single device."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(devices, "mesh_for", lambda *_: None)
+        patch.setattr(meshes, "mesh_for", lambda *_: None)
         return wide(tmp_path_factory.mktemp("alone"))
 
 
@@ -189,8 +193,8 @@ def test_checkpoint_goes_on_with_other_shares(wide_alone, tmp_path, use, crowd, 
 def test_devices_of_a_seed_agree_by_themselves(crowd, monkeypatch):
     """They make the same updates to the bit, where sums are made in the same order."""
     monkeypatch.setattr(shares, "agreed", lambda tree: tree)
-    programs, env = devices.programs(mesh := devices.mesh_for(1, 2, 4)), Walk()
-    tasks, seeds = devices.everywhere(mesh, env.tasks()), devices.by_seed(mesh, jnp.arange(1))
+    programs, env = jitted(mesh := meshes.mesh_for(1, 2, 4)), Walk()
+    tasks, seeds = meshes.everywhere(mesh, env.tasks()), meshes.by_seed(mesh, jnp.arange(1))
     settings = Settings(**{**vars(WIDE), "chunk_steps": 12})  # so that no program of before is taken
     start = programs.init(env, AGENT, settings, tasks, seeds, None)
     first = jax.tree.map(np.asarray, start.agent.critic)

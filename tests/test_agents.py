@@ -10,13 +10,13 @@ from probes import learner, pick, quick, random_batch, tasks_of, tiny
 
 from mtjax import normalize
 from mtjax.agents import AGENTS, agent
-from mtjax.agents.conditioning import load_vectors
-from mtjax.agents.encoders import ENCODERS
 from mtjax.agents.hyperparameters import CONDITIONINGS
-from mtjax.agents.samplers import SAMPLERS
-from mtjax.agents.scaling import SCALINGS
-from mtjax.agents.surgery import RULES
-from mtjax.agents.values import VALUES
+from mtjax.agents.parts.conditioning import load_vectors
+from mtjax.agents.parts.encoders import ENCODERS
+from mtjax.agents.parts.gradients.surgery import RULES
+from mtjax.agents.parts.samplers import SAMPLERS
+from mtjax.agents.parts.scaling import SCALINGS
+from mtjax.agents.parts.values import VALUES
 from mtjax.history import widen
 from mtjax.loop import actions
 from mtjax.networks import Params

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from probes import QUICK
 
-from mtjax.agents.balancing import FAMO, Balance, GradNorm
-from mtjax.agents.rules import Mean
+from mtjax.agents.parts.gradients.balancing import FAMO, Balance, GradNorm
+from mtjax.agents.parts.gradients.rules import Mean
 from mtjax.types import InputError
 
 KEY = jax.random.key(0)

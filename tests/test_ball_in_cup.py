@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mtjax.envs.ball_in_cup import BallInCup
+from mtjax.envs.dm_control.ball_in_cup import BallInCup
 from mtjax.types import InputError
 
 

@@ -8,13 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mtjax import checkpoint, cli, loop
+from mtjax import loop
+from mtjax.config import from_json
+from mtjax.training import checkpoint
 from mtjax.types import InputError
 
 
 @pytest.fixture(scope="module")
 def shapes(finished_run):
-    program = cli.from_json(finished_run / "config.json")
+    program = from_json(finished_run / "config.json")
     tasks, seeds = program.family.tasks("train"), jnp.arange(2)
     return jax.eval_shape(lambda: loop.init(program.family, program.learner, program.training, tasks, seeds))
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from dm_control import suite
 
-from mtjax.envs import cheetah
-from mtjax.envs.cheetah import CheetahDirection, CheetahRun, CheetahSpeed
+from mtjax.envs.dm_control import cheetah
+from mtjax.envs.dm_control.cheetah import CheetahDirection, CheetahRun, CheetahSpeed
 
 
 def rewards(env, speeds):

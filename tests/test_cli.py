@@ -22,9 +22,12 @@ import mtjax.train
 from mtjax import cli
 from mtjax.agents import AGENTS, PARTS
 from mtjax.agents import settings as settings_of
+from mtjax.config import from_json, load_preset, to_json, with_preset
 from mtjax.envs import ENVS
 from mtjax.loop import Settings
-from mtjax.run import Plan
+from mtjax.training import launch
+from mtjax.training.folder import repeat
+from mtjax.training.run import Plan
 from mtjax.types import InputError
 
 COMMANDS = {"train": mtjax.train.main, "evaluate": mtjax.evaluate.main}
@@ -59,11 +62,11 @@ def words_of(text):
 def test_names_choose_the_defaults():
     """What is given changes them, and nothing else."""
     program = cli.parse(["--env=finger-spin-vary-size", "--agent=care", "--agent.num-experts=3", "--preset=gpu"])
-    named = cli.with_preset("finger-spin-vary-size", "care", "gpu")
+    named = with_preset("finger-spin-vary-size", "care", "gpu")
     encoder = dataclasses.replace(named.learner.encoder, num_experts=3)
     assert program == dataclasses.replace(named, learner=dataclasses.replace(named.learner, encoder=encoder))
     assert program.family == mtjax.make("finger-spin-vary-size")
-    assert named != cli.with_preset("finger-spin-vary-size", "care", "cpu")
+    assert named != with_preset("finger-spin-vary-size", "care", "cpu")
 
 
 @pytest.mark.parametrize(
@@ -100,8 +103,8 @@ def test_a_record_is_read_back_as_it_was(env, agent, tmp_path):
     words = [f"--env={env}", f"--agent={agent}", "--agent.hidden", "7", "7", "--split=none", *vary]
     program = cli.parse(words)
     assert given.items() <= dict(program.family.vary).items()
-    (tmp_path / "config.json").write_text(cli.to_json(program, {"command": "x"}))
-    assert cli.from_json(tmp_path / "config.json") == program
+    (tmp_path / "config.json").write_text(to_json(program, {"command": "x"}))
+    assert from_json(tmp_path / "config.json") == program
 
 
 SETTINGS = [
@@ -121,7 +124,7 @@ SETTINGS = [
 def test_repeating_flags_give_the_same_program(agent, settings):
     """The command in config.json, word for word, and whatever the presets are by then."""
     program = cli.parse([f"--agent={agent}", *settings.split()])
-    words = shlex.split(shlex.join(["python", "-m", "mtjax.train", *mtjax.train.repeat(program)]))[3:]
+    words = shlex.split(shlex.join(["python", "-m", "mtjax.train", *repeat(program)]))[3:]
     again = cli.parse([*words, "--preset=cpu"])
     assert dataclasses.replace(again, preset=program.preset) == program
 
@@ -130,7 +133,7 @@ def test_repeating_flags_name_the_file_of_vectors(tmp_path):
     """Also where its name has spaces."""
     file = tmp_path / "my vectors.npy"
     program = cli.parse(["--agent=care", "--agent.conditioning=vectors", f"--agent.vectors={file}"])
-    words = shlex.split(shlex.join(mtjax.train.repeat(program)))
+    words = shlex.split(shlex.join(repeat(program)))
     assert cli.parse(words) == program and program.learner.vectors == str(file)
 
 
@@ -159,8 +162,8 @@ def test_preset_files_are_of_families_that_exist():
 @pytest.mark.parametrize("env, agent", PAIRS)
 def test_every_preset_makes_a_program(env, agent, preset):
     """Its settings are allowed, and arrive."""
-    program = cli.with_preset(env, agent, preset)
-    expected = cli.load_preset(env, preset)
+    program = with_preset(env, agent, preset)
+    expected = load_preset(env, preset)
     assert dataclasses.asdict(program.training) == dataclasses.asdict(Settings(**expected["training"]))
     settings = expected["agent"] | expected.get(agent, {})
     for name, value in settings.items():
@@ -170,9 +173,9 @@ def test_every_preset_makes_a_program(env, agent, preset):
 
 def test_auto_preset_is_that_of_the_device(monkeypatch):
     """A GPU takes the gpu preset."""
-    assert cli.parse([]).training == cli.with_preset("finger-spin", "sac", "cpu").training
+    assert cli.parse([]).training == with_preset("finger-spin", "sac", "cpu").training
     monkeypatch.setattr("jax.default_backend", lambda: "gpu")
-    assert cli.parse([]).training == cli.with_preset("finger-spin", "sac", "gpu").training
+    assert cli.parse([]).training == with_preset("finger-spin", "sac", "gpu").training
 
 
 # Help.
@@ -271,7 +274,7 @@ def test_list_names_every_family_and_agent(capsys):
 )
 def test_train_says_what_is_wrong(complaint, monkeypatch, tmp_path, words, said):
     """In one line, with exit code 2, and before anything is made."""
-    monkeypatch.setattr(mtjax.train, "train", lambda *_, **__: pytest.fail("it trains"))
+    monkeypatch.setattr(launch, "train", lambda *_, **__: pytest.fail("it trains"))
     assert said in complaint("train", *words.split())
     assert not list(tmp_path.iterdir())
 

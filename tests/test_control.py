@@ -10,7 +10,7 @@ import pytest
 from probes import tiny
 
 from mtjax import loop
-from mtjax.envs.control import (
+from mtjax.envs.mtenv.control import (
     Acrobot,
     AcrobotState,
     CartPole,

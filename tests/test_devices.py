@@ -16,8 +16,10 @@ import pytest
 
 import mtjax
 import mtjax.train
-from mtjax import devices
 from mtjax.evaluation import load_evaluations
+from mtjax.parallel import hosts as processes
+from mtjax.parallel import mesh as meshes
+from mtjax.training.programs import jitted, sharded
 from mtjax.types import InputError
 
 HERE = Path(__file__).parent
@@ -38,7 +40,7 @@ def hosts(monkeypatch):
         monkeypatch.setattr(jax, "process_count", lambda: len(counts))
         monkeypatch.setattr(jax, "devices", lambda: found)
         monkeypatch.setattr(jax, "device_count", lambda: len(found))
-        monkeypatch.setattr(devices, "Mesh", lambda x, _: types.SimpleNamespace(size=x.size, devices=x))
+        monkeypatch.setattr(meshes, "Mesh", lambda x, _: types.SimpleNamespace(size=x.size, devices=x))
 
     return see
 
@@ -50,12 +52,12 @@ def hosts(monkeypatch):
 def test_most_devices_that_divide_the_seeds_are_used(hosts, counts, seeds, used):
     """Of every process as many, so that each has seeds of its own."""
     hosts(*counts)
-    mesh = devices.mesh_for(seeds, 10, 16)
+    mesh = meshes.mesh_for(seeds, 10, 16)
     assert mesh.devices.shape == (used, 1)
     owners = [device.process_index for device in mesh.devices[:, 0]]
     assert owners == sorted(owners) and {owners.count(i) for i in range(len(counts))} == {used // len(counts)}
-    assert devices.mesh_for(seeds, 10, 16, most=1) is None or len(counts) > 1
-    line = devices.describe(mesh, seeds, 16)
+    assert meshes.mesh_for(seeds, 10, 16, most=1) is None or len(counts) > 1
+    line = meshes.describe(mesh, seeds, 16)
     assert f"devices: {used} of {sum(counts)}" in line and "environments on each" not in line
 
 
@@ -77,7 +79,7 @@ def test_most_devices_that_divide_the_seeds_are_used(hosts, counts, seeds, used)
 def test_devices_left_over_share_the_environments_of_a_seed(hosts, counts, seeds, tasks, envs, shape):
     """Evenly, of one process alone, and only as many as still have enough worlds."""
     hosts(*counts)
-    mesh = devices.mesh_for(seeds, tasks, envs)
+    mesh = meshes.mesh_for(seeds, tasks, envs)
     assert mesh.devices.shape == shape
     owners = [{device.process_index for device in group} for group in mesh.devices]
     assert owners == [{i} for i in range(len(counts)) for _ in range(shape[0] // len(counts))]
@@ -96,46 +98,48 @@ def test_devices_left_over_share_the_environments_of_a_seed(hosts, counts, seeds
 def test_the_line_says_who_has_what(hosts, counts, seeds, envs, line):
     """And, where devices are left, what they would need."""
     hosts(*counts)
-    assert line in devices.describe(devices.mesh_for(seeds, 8, envs), seeds, envs)
+    assert line in meshes.describe(meshes.mesh_for(seeds, 8, envs), seeds, envs)
 
 
 @pytest.mark.parametrize("counts, seeds", [((1,), 1), ((1,), 10), ((4,), 1), ((2,), 5)])
 def test_one_device_needs_no_mesh(hosts, counts, seeds):
     """Then the programs are the loop's own, and arrays stay where they are."""
     hosts(*counts)
-    assert devices.mesh_for(seeds, 10, 16) is None
-    assert devices.programs(None) == (mtjax.loop.init, mtjax.loop.run_chunk, mtjax.evaluation.evaluate)
+    assert meshes.mesh_for(seeds, 10, 16) is None
+    assert jitted(None) == (mtjax.loop.init, mtjax.loop.run_chunk, mtjax.evaluation.evaluate)
     state = object()
-    assert devices.everywhere(None, state) is devices.by_seed(None, state) is devices.sharded(None, state) is state
-    assert bool(devices.describe(None, seeds, 16)) == (sum(counts) > 1)
+    assert meshes.everywhere(None, state) is meshes.by_seed(None, state) is sharded(None, state) is state
+    assert bool(meshes.describe(None, seeds, 16)) == (sum(counts) > 1)
 
 
 def test_processes_must_share_seeds_evenly(hosts):
     """A process without a seed could not take part."""
     hosts(1, 1)
     with pytest.raises(InputError, match=r"2 processes cannot share 3 seeds evenly; --seeds must be a multiple"):
-        devices.mesh_for(3, 10, 16)
+        meshes.mesh_for(3, 10, 16)
 
 
 @pytest.mark.parametrize("given", [(), ("JAX_NUM_PROCESSES",), ("JAX_COORDINATOR_ADDRESS", "JAX_PROCESS_ID")])
 def test_missing_variables_are_named(monkeypatch, given):
     """Before anything waits for processes that will not come."""
-    for name in (*devices._VARIABLES, *devices._LAUNCHERS):
+    for name in (*processes._VARIABLES, *processes._LAUNCHERS):
         monkeypatch.delenv(name, raising=False)
     for name in given:
         monkeypatch.setenv(name, "1")
     with pytest.raises(InputError, match="--distributed needs a launcher") as caught:
-        devices.initialise()
-    assert {name for name in devices._VARIABLES if name in str(caught.value)} == set(devices._VARIABLES) - set(given)
+        processes.initialise()
+    assert {name for name in processes._VARIABLES if name in str(caught.value)} == set(processes._VARIABLES) - set(
+        given
+    )
 
 
 @pytest.mark.parametrize("count, index", [("two", "0"), ("2", "2")])
 def test_variables_that_mean_nothing_are_refused(monkeypatch, count, index):
     """A count that is no number, a process beyond the count."""
-    for name, value in zip(devices._VARIABLES, ("localhost:1", count, index), strict=True):
+    for name, value in zip(processes._VARIABLES, ("localhost:1", count, index), strict=True):
         monkeypatch.setenv(name, value)
     with pytest.raises(InputError, match="--distributed cannot join the other processes"):
-        devices.initialise()
+        processes.initialise()
 
 
 def python(*words, **variables):

@@ -16,13 +16,17 @@ from probes import QUICK, learner, of_task, pick, random_batch, tasks_of, tiny
 
 import mtjax
 import mtjax.evaluate
-from mtjax import checkpoint, cli, diagnostics, log, loop, plot
+from mtjax import loop
 from mtjax.agents import AGENTS
-from mtjax.agents.encoders import ENCODERS
-from mtjax.diagnostics import Activity, activity, compare_gradients, dormant_share, effective_ranks, utilisation
+from mtjax.agents.parts.encoders import ENCODERS
+from mtjax.config import from_json, to_json
 from mtjax.history import widen
 from mtjax.networks import Params, tanh_normal
-from mtjax.policy import load_experience
+from mtjax.report import diagnostics
+from mtjax.report import figures as plot
+from mtjax.report.diagnostics import Activity, activity, compare_gradients, dormant_share, effective_ranks, utilisation
+from mtjax.training import checkpoint, log
+from mtjax.training.policy import load_experience
 from mtjax.types import InputError, Spec
 
 TASKS, BATCH, KEY = tasks_of("one-step", (1.0, -0.5, 0.3)), 8, jax.random.key(5)
@@ -323,7 +327,7 @@ def run_of(copied_run):
     """Makes the finished run one of another agent, untrained, with the same experience."""
 
     def remake(name):
-        program = cli.from_json(copied_run / "config.json")
+        program = from_json(copied_run / "config.json")
         learner = mtjax.agent(name, hidden=program.learner.hidden)
         tasks, seeds, checkpoints = program.family.tasks("train"), jnp.arange(2), copied_run / "checkpoints"
         shapes = jax.eval_shape(lambda: loop.init(program.family, program.learner, program.training, tasks, seeds))
@@ -333,7 +337,7 @@ def run_of(copied_run):
         shutil.rmtree(checkpoints)
         checkpoint.save(checkpoints, state._replace(agent=fresh))
         program = dataclasses.replace(program, agent=name, learner=learner)
-        (copied_run / "config.json").write_text(cli.to_json(program, {}))
+        (copied_run / "config.json").write_text(to_json(program, {}))
 
     return remake
 
@@ -398,7 +402,7 @@ def test_columns_of_a_run(finished_run):
 
 def test_replay_is_read_without_the_rest(copied_run):
     """And is that of the whole state."""
-    program = cli.from_json(copied_run / "config.json")
+    program = from_json(copied_run / "config.json")
     fixed = (program.family, program.learner, program.training, program.family.tasks("train"), jnp.arange(2))
     whole = checkpoint.load(copied_run / "checkpoints", jax.eval_shape(lambda: loop.init(*fixed)))
     shutil.rmtree(copied_run / "checkpoints" / "150" / "agent")

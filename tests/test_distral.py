@@ -12,8 +12,8 @@ import scipy.optimize
 from probes import QUICK, learner, of_task, pick, random_batch, tasks_of, tiny
 
 from mtjax.agents import agent
-from mtjax.agents.descent import descend
 from mtjax.agents.distral import Distral
+from mtjax.agents.parts.gradients.descent import descend
 from mtjax.agents.sac import SAC
 from mtjax.networks import Params, log_density, sample_raw, tanh_normal
 from mtjax.types import InputError, Spec

@@ -12,7 +12,7 @@ from dm_control import suite
 
 from mtjax import envs
 from mtjax.envs.domain import Domain
-from mtjax.envs.physics import World
+from mtjax.envs.engines.base import World
 
 TASKS = {
     "acrobot": ("swingup", "swingup_sparse"),

@@ -7,9 +7,9 @@ import pytest
 from probes import learner, quick, random_batch, tasks_of, tiny
 
 from mtjax.agents import agent
-from mtjax.agents.encoders import ENCODERS
-from mtjax.agents.encoders.mixture import Experts, top_k_softmax
-from mtjax.agents.encoders.moore import orthonormal
+from mtjax.agents.parts.encoders import ENCODERS
+from mtjax.agents.parts.encoders.mixture import Experts, top_k_softmax
+from mtjax.agents.parts.encoders.moore import orthonormal
 from mtjax.networks import Network, Params
 from mtjax.types import InputError, Spec
 

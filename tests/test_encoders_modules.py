@@ -9,9 +9,9 @@ import pytest
 from probes import QUICK
 
 from mtjax import agents
-from mtjax.agents.encoders.composed import Composed, Hypernetwork, HyperTrunk, PaCo, PaCoTrunk
-from mtjax.agents.encoders.residual import BroNet, BroNetTrunk, SimBa, SimBaTrunk
-from mtjax.agents.encoders.soft_modules import Modules, SoftModules
+from mtjax.agents.parts.encoders.composed import Composed, Hypernetwork, HyperTrunk, PaCo, PaCoTrunk
+from mtjax.agents.parts.encoders.residual import BroNet, BroNetTrunk, SimBa, SimBaTrunk
+from mtjax.agents.parts.encoders.soft_modules import Modules, SoftModules
 from mtjax.types import InputError
 
 BATCH, OBS, ACTION, CONTEXT = 4, 3, 2, 2

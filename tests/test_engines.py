@@ -16,9 +16,11 @@ import pytest
 from probes import quick
 
 from mtjax import envs
-from mtjax.envs import physics
 from mtjax.envs.domain import Domain
-from mtjax.envs.physics import Mjx, MujocoC, World
+from mtjax.envs.engines import base as physics
+from mtjax.envs.engines.base import World
+from mtjax.envs.engines.c import MujocoC
+from mtjax.envs.engines.mjx import Mjx
 from mtjax.types import InputError, Task
 
 COUNT = 64  # worlds
@@ -138,7 +140,7 @@ def test_mjx_steps_as_c_does(name):
 def test_warp_steps_as_c_does(name):
     """Under a map of a map, which picks every world's own model."""
     pytest.importorskip("warp")
-    from mtjax.envs.warp import Warp
+    from mtjax.envs.engines.warp import Warp
 
     play, mjx = played(name), family(name, engine="mjx", solver_iterations=50).mjx
     engine = Warp(mjx.base, mjx.num_substeps)
@@ -246,7 +248,7 @@ def test_warp_is_refused_where_it_cannot_run(monkeypatch):
 def test_warp_refuses_tasks_that_differ_in_the_size_of_sites():
     """Warp holds one value of it for all worlds."""
     pytest.importorskip("warp")
-    from mtjax.envs.warp import Warp
+    from mtjax.envs.engines.warp import Warp
 
     env = envs.make("finger-spin-vary-touch-size", engine="mjx")
     engine = Warp(env.mjx.base, env.num_substeps)

@@ -17,8 +17,12 @@ from conftest import SHORT_RUN
 import mtjax
 import mtjax.evaluate
 import mtjax.train
-from mtjax import checkpoint, cli, loop, render
+from mtjax import loop
+from mtjax.config import from_json
 from mtjax.evaluation import Evaluations, evaluate, load_evaluations
+from mtjax.report import render
+from mtjax.report.tables import split_table
+from mtjax.training import checkpoint, launch
 from mtjax.types import InputError
 
 VALUES = {"train": [1.0, 1.2], "interpolation": [1.1], "extrapolation": [0.6, 0.8, 1.4, 1.6]}
@@ -62,7 +66,7 @@ def test_policy_acts_as_the_checkpoint_does(finished_run):
     task = jax.tree.map(lambda x: x[1], policy.env.tasks("train"))
     action = policy(obs := jnp.linspace(-1, 1, 9), task)
 
-    program = cli.from_json(finished_run / "config.json")
+    program = from_json(finished_run / "config.json")
     fixed = (program.family, program.learner, program.training, program.family.tasks("train"), jnp.arange(2))
     state = checkpoint.load(finished_run / "checkpoints", jax.eval_shape(lambda: loop.init(*fixed)))
     for seed, chosen in ((0, policy), (1, mtjax.load(finished_run, seed=1))):
@@ -183,10 +187,10 @@ def test_table_of_a_run_shows_splits_and_the_worst_task():
     """With intervals over seeds only where there are several; a split without tasks is left out."""
     returns = {"train": np.zeros((1, 2, 2, 3)), "interpolation": np.zeros((1, 2, 0, 3))}
     returns["train"][0, -1] = [[10, 20, 30], [100, 200, 300]]
-    one = mtjax.evaluate.split_table(Evaluations(np.arange(2), returns, {}))
+    one = split_table(Evaluations(np.arange(2), returns, {}))
     assert [line.split() for line in one.splitlines()[1:]] == [["train", "2", "110", "20"]]
     two = {"train": np.concatenate([returns["train"], returns["train"] + 10])}
-    assert "115  [110, 120]" in mtjax.evaluate.split_table(Evaluations(np.arange(2), two, {}))
+    assert "115  [110, 120]" in split_table(Evaluations(np.arange(2), two, {}))
 
 
 # Training by the program.
@@ -209,12 +213,12 @@ def test_train_prints_where_the_run_is_and_how_it_scored(short_family, tmp_path,
 
 def test_resume_extends_and_the_hint_goes_on(finished_run, copied_run, capsys, monkeypatch):
     """A run that is extended and stopped says how to go on, and the command that it prints does so."""
-    train = mtjax.train.train
+    train = launch.train
 
     def stops(*arguments, **settings):
         return train(*arguments, **settings, on_chunk=lambda _: os.kill(os.getpid(), signal.SIGINT))
 
-    monkeypatch.setattr(mtjax.train, "train", stops)
+    monkeypatch.setattr(launch, "train", stops)
     mtjax.train.main(["--resume", str(copied_run), "--steps=1000"])
     hint = capsys.readouterr().out.splitlines()[-1]
     assert hint.startswith("  python -m mtjax.train ")
@@ -223,8 +227,8 @@ def test_resume_extends_and_the_hint_goes_on(finished_run, copied_run, capsys, m
     rows = rows_of(copied_run / "metrics.csv")
     assert rows[-1]["steps"] == "1000" and len(rows) == 20
     assert rows[:12] == rows_of(finished_run / "metrics.csv")
-    recorded = cli.from_json(copied_run / "config.json")
-    assert recorded.plan == dataclasses.replace(cli.from_json(finished_run / "config.json").plan, steps=1000)
+    recorded = from_json(copied_run / "config.json")
+    assert recorded.plan == dataclasses.replace(from_json(finished_run / "config.json").plan, steps=1000)
 
 
 # Public names.

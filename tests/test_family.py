@@ -9,7 +9,7 @@ import pytest
 
 from mtjax import envs
 from mtjax.envs.domain import stack_differing
-from mtjax.envs.physics import mjx_module
+from mtjax.envs.engines.base import mjx_module
 from mtjax.tasks import episode_task
 from mtjax.types import SPLITS, InputError
 

@@ -10,12 +10,15 @@ import numpy as np
 import pytest
 
 import mtjax.train
-from mtjax import cli, finetune, run
+from mtjax import cli
 from mtjax.agents import agent
+from mtjax.config import from_json
 from mtjax.envs import ENVS
 from mtjax.envs.family import Family
 from mtjax.envs.parameters import Parameter
-from mtjax.finetune import adopt
+from mtjax.training import finetune, run
+from mtjax.training.finetune import adopt
+from mtjax.training.folder import repeat
 from mtjax.types import InputError, Step
 
 
@@ -141,9 +144,9 @@ def test_what_is_tuned_moves_and_all_else_stays_to_the_bit(learned, tuned, tune)
 def test_a_run_records_where_it_comes_from(base, tuned):
     """Its agent is the run's but for what was given; its contexts are written as the run's."""
     directory = tuned("heads")
-    record, program = json.loads((directory / "config.json").read_text()), cli.from_json(directory / "config.json")
+    record, program = json.loads((directory / "config.json").read_text()), from_json(directory / "config.json")
     assert (record["start"], record["agent"], record["learner"]["tune"]) == (str(base), "multi-head", "heads")
-    begun = cli.from_json(base / "config.json").learner
+    begun = from_json(base / "config.json").learner
     assert program.learner == dataclasses.replace(begun, tune="heads", actor_lr=0.01)
     assert program.family.ranges == (("goal", -1.0, 1.0),)
     np.testing.assert_allclose(program.family.tasks().context, [[0.9], [-0.8]], rtol=1e-6)
@@ -151,8 +154,8 @@ def test_a_run_records_where_it_comes_from(base, tuned):
 
 def test_recorded_command_repeats_the_program(tuned):
     """The run of --from included."""
-    program = cli.from_json(tuned("heads") / "config.json")
-    again = cli.parse([*mtjax.train.repeat(program), f"--runs={program.runs}", f"--preset={program.preset}"])
+    program = from_json(tuned("heads") / "config.json")
+    again = cli.parse([*repeat(program), f"--runs={program.runs}", f"--preset={program.preset}"])
     assert again == program
 
 
@@ -161,7 +164,7 @@ def test_a_fine_tuned_run_goes_on(learned, tuned, capsys):
     directory = tuned("heads")
     before = named(mtjax.load(directory).states.actor)
     mtjax.train.main([f"--resume={directory}", "--steps=320"])
-    assert f"from {cli.from_json(directory / 'config.json').start}: heads" in capsys.readouterr().out
+    assert f"from {from_json(directory / 'config.json').start}: heads" in capsys.readouterr().out
     for path, leaf in named(mtjax.load(directory).states.actor).items():
         assert np.array_equal(leaf, before[path]) == ("head" not in path), path
 
@@ -219,7 +222,7 @@ def test_one_temperature_for_all_stays_one():
         return jax.tree.map(lambda x: jnp.zeros((1, *x.shape), x.dtype), shapes)
 
     states = blank(old)._replace(log_temperature=jnp.float32([[0.7]]))
-    state = adopt(mtjax.policy.Policy(old, made, None, states, jnp.arange(1)), made, env.tasks(), blank(env))
+    state = adopt(mtjax.training.policy.Policy(old, made, None, states, jnp.arange(1)), made, env.tasks(), blank(env))
     np.testing.assert_array_equal(state.log_temperature, states.log_temperature)
 
 
@@ -309,7 +312,7 @@ def test_networks_that_know_tasks_by_number_keep_them(goals, fits):
     """Task i must be nearest to the run's task i."""
     made, old = agent("sac", conditioning="one-hot", hidden=(4,)), mtjax.make("aim")
     state = jax.jit(lambda: made.init(old.spec, old.tasks(), jax.random.key(0)))()
-    start = mtjax.policy.Policy(old, made, state, jax.tree.map(lambda x: x[None], state), jnp.arange(1))
+    start = mtjax.training.policy.Policy(old, made, state, jax.tree.map(lambda x: x[None], state), jnp.arange(1))
     env = mtjax.make("aim", {"goal": goals}).scaled_as(old)
     if fits:
         finetune.require_fit(start, env, made)

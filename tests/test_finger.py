@@ -8,7 +8,7 @@ import pytest
 from dm_control.suite import finger as suite_module
 
 from mtjax import envs
-from mtjax.envs.finger import FingerSpin, FingerTurn, FingerTurnTarget
+from mtjax.envs.dm_control.finger import FingerSpin, FingerTurn, FingerTurnTarget
 from mtjax.types import Spec
 
 NOMINAL = 1  # the row of finger-spin-vary-size whose size is 1

@@ -7,7 +7,7 @@ import pytest
 from probes import learner, pick, random_batch, tasks_of, tiny
 
 from mtjax.agents import AGENTS
-from mtjax.agents.encoders.care import Mixture
+from mtjax.agents.parts.encoders.care import Mixture
 from mtjax.history import widen
 from mtjax.networks import Params
 from mtjax.types import Spec

@@ -20,8 +20,8 @@ from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 
 import mtjax.gym
 from mtjax import tasks as choose
-from mtjax.envs.control import CartPole
-from mtjax.envs.tabular import Bandit, TabularMDP
+from mtjax.envs.mtenv.control import CartPole
+from mtjax.envs.mtenv.tabular import Bandit, TabularMDP
 from mtjax.gym import EnvToMTEnv, FamilyEnv, FamilyVectorEnv, NTasks, NTasksId, SampleRandomTask
 from mtjax.gym.env import draw_seeds
 from mtjax.types import InputError

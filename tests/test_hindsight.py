@@ -11,12 +11,13 @@ from conftest import compiled
 from probes import QUICK, Goals, pick, quick, train
 
 import mtjax.train
-from mtjax import hindsight, loop
-from mtjax import replay as rings
+from mtjax import loop
 from mtjax.envs import make
+from mtjax.experience import hindsight
+from mtjax.experience import replay as rings
+from mtjax.experience.replay import Replay
 from mtjax.history import History
 from mtjax.loop import Settings
-from mtjax.replay import Replay
 from mtjax.types import InputError, Transition
 
 WORLDS = 256

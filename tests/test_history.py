@@ -12,7 +12,7 @@ from probes import Probe, Walk, learner, only_seed, pick, quick, random_batch, t
 import mtjax
 import mtjax.train
 from mtjax import evaluation, history
-from mtjax.agents.trajectory import TrajectoryEncoder
+from mtjax.agents.parts.trajectory import TrajectoryEncoder
 from mtjax.history import History, Past, Seen, remember, unpack, widen
 from mtjax.loop import Settings
 from mtjax.types import InputError, Spec

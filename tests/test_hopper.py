@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mtjax.envs.hopper import HopperHop, HopperStand
+from mtjax.envs.dm_control.hopper import HopperHop, HopperStand
 from mtjax.envs.planar import Planar
 
 

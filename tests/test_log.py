@@ -6,7 +6,7 @@ import io
 import numpy as np
 import pytest
 
-from mtjax import log
+from mtjax.training import log
 
 
 def read(path):

@@ -9,7 +9,7 @@ import pytest
 from probes import tiny
 
 from mtjax import loop
-from mtjax.envs.maze import MazeState, TwoGoalMaze
+from mtjax.envs.mtenv.maze import MazeState, TwoGoalMaze
 from mtjax.types import InputError, Spec
 
 MAZE = TwoGoalMaze(vary={"goal-box": "0,1"}, split="none")

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mtjax.agents.encoders.care import Experts, Mixture
+from mtjax.agents.parts.encoders.care import Experts, Mixture
 from mtjax.networks import MLP, Network, Params, Trunk, join, tanh_normal
 
 TASKS, BATCH, OBS, ACTION, CONTEXT, OUT = 3, 4, 2, 1, 2, 5

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from mtjax import envs
-from mtjax.envs import physics
+from mtjax.envs.engines import base as physics
 from mtjax.types import InputError
 
 STEPS = 50

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mtjax import plot
+from mtjax.report import figures as plot
 from mtjax.types import InputError
 
 STEPS = np.array([0, 500, 1000])

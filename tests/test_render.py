@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mtjax import render
-from mtjax.envs.finger import FingerSpin
+from mtjax.envs.dm_control.finger import FingerSpin
+from mtjax.report import render
 from mtjax.types import InputError
 
 FINGER = FingerSpin(vary={"size": [0.8, 1.4]})

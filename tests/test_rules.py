@@ -11,9 +11,9 @@ import pytest
 from probes import QUICK
 from scipy.optimize import minimize, nnls
 
-from mtjax.agents import rules
-from mtjax.agents.quadratic import RIDGE
-from mtjax.agents.surgery import RULES, gram_matrix
+from mtjax.agents.parts.gradients import rules
+from mtjax.agents.parts.gradients.quadratic import RIDGE
+from mtjax.agents.parts.gradients.surgery import RULES, gram_matrix
 from mtjax.types import InputError
 
 KEY = jax.random.key(4)

@@ -19,10 +19,14 @@ from conftest import SHORT_RUN
 
 import mtjax
 import mtjax.train
-from mtjax import checkpoint, cli, loop
+from mtjax import cli, loop
+from mtjax.config import Plan, from_json
 from mtjax.evaluation import load_evaluations
 from mtjax.loop import Settings
-from mtjax.run import Plan, enable_compile_cache, fit_chunk, stop_signals, train
+from mtjax.training import checkpoint
+from mtjax.training.folder import new_directory
+from mtjax.training.programs import enable_compile_cache
+from mtjax.training.run import fit_chunk, stop_signals, train
 from mtjax.types import InputError
 
 CLOCKS = {"seconds", "wall_seconds"}
@@ -114,7 +118,7 @@ def test_config_records_settings_and_circumstances(finished_run):
 def test_recorded_command_repeats_the_program(finished_run):
     """The words after ``python -m mtjax.train`` parse to what the file records."""
     words = shlex.split(json.loads((finished_run / "config.json").read_text())["command"])
-    recorded = cli.from_json(finished_run / "config.json")
+    recorded = from_json(finished_run / "config.json")
     assert cli.parse([*words[3:], f"--runs={recorded.runs}"]) == recorded
 
 
@@ -159,9 +163,9 @@ def test_two_newest_checkpoints_stay(finished_run):
 def test_runs_of_one_second_have_folders_of_their_own(tmp_path, monkeypatch):
     """Folders that exist are left as they are."""
     monkeypatch.setattr("time.strftime", lambda _: "20260101-000000")
-    first = mtjax.train.new_directory(tmp_path / "runs", "name")
+    first = new_directory(tmp_path / "runs", "name")
     (first / "config.json").write_text("mine")
-    names = [mtjax.train.new_directory(tmp_path / "runs", "name").name for _ in range(2)]
+    names = [new_directory(tmp_path / "runs", "name").name for _ in range(2)]
     assert [first.name, *names] == [f"name-20260101-000000{end}" for end in ("", "-1", "-2")]
     assert (first / "config.json").read_text() == "mine"
 

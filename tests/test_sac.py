@@ -10,7 +10,7 @@ import optax
 import pytest
 from probes import quick, random_batch, tasks_of
 
-from mtjax.agents.encoders import Identity
+from mtjax.agents.parts.encoders import Identity
 from mtjax.agents.sac import SAC, SACState
 from mtjax.networks import Params, join
 from mtjax.types import Spec, Transition

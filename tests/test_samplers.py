@@ -7,7 +7,7 @@ import pytest
 from probes import QUICK, learner, random_batch, tasks_of, tiny
 
 from mtjax.agents import agent
-from mtjax.agents.samplers import SAMPLERS, ByTemperature, Hardest, Progress, Uniform
+from mtjax.agents.parts.samplers import SAMPLERS, ByTemperature, Hardest, Progress, Uniform
 from mtjax.types import InputError, Outcome, Spec
 
 ALIKE = jnp.full(3, 0.1)

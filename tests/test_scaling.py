@@ -11,7 +11,7 @@ from probes import QUICK, Probe, Walk, learner, only_seed, random_batch, tasks_o
 
 from mtjax import normalize
 from mtjax.agents import agent
-from mtjax.agents.scaling import SCALINGS, AdaptiveScaling, NoScaling, PopArt, ReturnScaling, RewardScaling
+from mtjax.agents.parts.scaling import SCALINGS, AdaptiveScaling, NoScaling, PopArt, ReturnScaling, RewardScaling
 from mtjax.loop import Settings
 from mtjax.networks import Params
 from mtjax.types import InputError, Outcome, Spec, Transition

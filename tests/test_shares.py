@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from mtjax import shares
+from mtjax.parallel import collectives as shares
 
 
 def test_a_device_alone_has_all():

@@ -3,7 +3,7 @@ import time
 import numpy as np
 import pytest
 
-from mtjax.stats import iqm, mean_interval, seed_interval, stratified_bootstrap
+from mtjax.report.stats import iqm, mean_interval, seed_interval, stratified_bootstrap
 
 
 def random_scores(num_seeds, num_tasks=10):

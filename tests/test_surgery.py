@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from probes import QUICK, learner, random_batch, tasks_of, tiny
 
-from mtjax.agents import surgery
-from mtjax.agents.surgery import RULES
+from mtjax.agents.parts.gradients import surgery
+from mtjax.agents.parts.gradients.surgery import RULES
 from mtjax.networks import Params
 from mtjax.types import Spec
 

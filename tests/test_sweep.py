@@ -15,14 +15,17 @@ from probes import QUICK, Walk, random_batch, tasks_of, tiny
 import mtjax
 import mtjax.evaluate
 import mtjax.train
-from mtjax import cli, loop, points, rounds, sweep
+from mtjax import cli, loop
 from mtjax.agents import PARTS
 from mtjax.agents import settings as settings_of
+from mtjax.config import from_json, to_json
 from mtjax.evaluation import load_evaluations
-from mtjax.log import Console
 from mtjax.loop import Settings
-from mtjax.points import Varied
-from mtjax.run import Plan, _Run, train
+from mtjax.training import memory, points, sweep
+from mtjax.training.folder import repeat
+from mtjax.training.log import Console
+from mtjax.training.points import Varied
+from mtjax.training.run import Plan, _Run, train
 from mtjax.types import InputError, Outcome, Spec
 
 SMALL = Settings(num_envs=4, batch_size=8, replay_size=200, warmup_steps=5, chunk_steps=20)
@@ -207,7 +210,7 @@ def test_wrong_sweeps_are_refused(words, said, monkeypatch, tmp_path):
 def test_numbers_vary_inside_a_program_and_the_rest_between_programs():
     """Switches, names of parts and widths too; a part's own setting may come with the part."""
     axes = ["agent.gradients=mean,cagrad", "agent.tau=0.1,1", "agent.critic-layer-norm=true,false", "agent.gamma=0.5"]
-    found = sweep.programs(["--agent=sac", "--sweep", *axes, "--agent.hidden", "8"])
+    found = sweep.configurations(["--agent=sac", "--sweep", *axes, "--agent.hidden", "8"], cli.parse)
     told = [(type(p.learner.gradients).__name__, p.learner.critic_layer_norm) for p in found]
     assert told == [("Mean", True), ("Mean", False), ("CAGrad", True), ("CAGrad", False)]
     for program in found:
@@ -219,42 +222,46 @@ def test_numbers_vary_inside_a_program_and_the_rest_between_programs():
         "agent.tau=0.1,1",
         "agent.gamma=0.5",
     )
-    widths = sweep.programs(["--agent=sac", "--sweep", "agent.hidden=8 8,16"])
+    widths = sweep.configurations(["--agent=sac", "--sweep", "agent.hidden=8 8,16"], cli.parse)
     assert [p.learner.hidden for p in widths] == [(8, 8), (16,)] and not widths[0].points
 
 
 def test_the_command_of_a_run_repeats_its_part_of_the_sweep(tmp_path):
     """And its record is read back as it was."""
-    (program,) = sweep.programs(["--sweep", "agent.tau=0.1,1", "agent.num-critics=3"])
-    (again,) = sweep.programs(mtjax.train.repeat(program))
+    (program,) = sweep.configurations(["--sweep", "agent.tau=0.1,1", "agent.num-critics=3"], cli.parse)
+    (again,) = sweep.configurations(repeat(program), cli.parse)
     assert again == program
-    (tmp_path / "config.json").write_text(cli.to_json(program, {}))
-    assert cli.from_json(tmp_path / "config.json") == program
+    (tmp_path / "config.json").write_text(to_json(program, {}))
+    assert from_json(tmp_path / "config.json") == program
 
 
 def test_points_that_do_not_fit_into_memory_are_run_in_rounds(monkeypatch):
     """As even as can be. $MTJAX_MEMORY is in GB."""
-    (program,) = sweep.programs(["--sweep", "agent.tau=0.1,0.2,0.3,0.4,0.5", "--seeds=2", "--replay-size=1000"])
-    one, two = (rounds.needed(with_seeds(program, n)) for n in (1, 2))
+    (program,) = sweep.configurations(
+        ["--sweep", "agent.tau=0.1,0.2,0.3,0.4,0.5", "--seeds=2", "--replay-size=1000"], cli.parse
+    )
+    one, two = (memory.needed(with_seeds(program, n)) for n in (1, 2))
     assert 1.9 < two / one < 2.1
-    count = lambda limit: [len(part.points) for part in rounds.split(program, limit)]
+    count = lambda limit: [len(part.points) for part in memory.split(program, limit)]
     assert count(1e15) == [5] and count(2.5 * two / 0.9) == [2, 2, 1] and count(1.1 * two / 0.9) == [1] * 5
-    assert sum((part.points for part in rounds.split(program, 2.5 * two)), ()) == program.points
+    assert sum((part.points for part in memory.split(program, 2.5 * two)), ()) == program.points
     monkeypatch.setenv("MTJAX_MEMORY", "0.5")
-    assert rounds.memory() == 0.5e9
+    assert memory.memory() == 0.5e9
     monkeypatch.setenv("MTJAX_MEMORY", "much")
     with pytest.raises(InputError, match="a number of GB, not 'much'"):
-        rounds.memory()
+        memory.memory()
     monkeypatch.delenv("MTJAX_MEMORY")
-    assert rounds.memory() > 1e8
+    assert memory.memory() > 1e8
 
 
 def test_seeds_that_do_not_fit_into_memory_are_run_in_rounds(monkeypatch):
     """Those of each point by themselves; a single seed is tried whatever it takes."""
-    (program,) = sweep.programs(["--sweep", "agent.tau=0.1,0.2", "--seeds=5", "--seed=3", "--replay-size=1000"])
-    one = rounds.needed(program) / 5
+    (program,) = sweep.configurations(
+        ["--sweep", "agent.tau=0.1,0.2", "--seeds=5", "--seed=3", "--replay-size=1000"], cli.parse
+    )
+    one = memory.needed(program) / 5
     parts = lambda program, limit: [
-        (part.points, part.plan.seed, part.plan.seeds) for part in rounds.split(program, limit)
+        (part.points, part.plan.seed, part.plan.seeds) for part in memory.split(program, limit)
     ]
     first, second = (({"tau": tau},) for tau in (0.1, 0.2))
     assert parts(program, 2.5 * one / 0.9) == [
@@ -265,9 +272,9 @@ def test_seeds_that_do_not_fit_into_memory_are_run_in_rounds(monkeypatch):
     assert parts(alone, 1.0) == [((), seed, 1) for seed in range(3, 8)]
     for limit, too_many in ((5.5 * one / 0.9, False), (4.5 * one / 0.9, True)):
         monkeypatch.setenv("MTJAX_MEMORY", f"{limit / 1e9:.12f}")
-        assert rounds.too_many_seeds(alone) == too_many
+        assert memory.too_many_seeds(alone) == too_many
     monkeypatch.setenv("MTJAX_MEMORY", "1e-9")
-    assert not rounds.too_many_seeds(with_seeds(alone, 1))
+    assert not memory.too_many_seeds(with_seeds(alone, 1))
 
 
 def with_seeds(program, count):
@@ -279,12 +286,12 @@ def test_a_run_of_too_many_seeds_is_run_in_rounds(tmp_path, monkeypatch, capsys)
     small = "--num-envs=2 --batch-size=2 --replay-size=20 --warmup-steps=1 --eval-episodes=1 --agent.hidden 4".split()
     words = ["--env=bandit", "--agent=sac-conditioned", "--seeds=3", "--steps=40", f"--runs={tmp_path}", *small]
     program = cli.parse(words)
-    monkeypatch.setenv("MTJAX_MEMORY", f"{2.5 * rounds.needed(program) / 3 / 0.9 / 1e9:.12f}")
+    monkeypatch.setenv("MTJAX_MEMORY", f"{2.5 * memory.needed(program) / 3 / 0.9 / 1e9:.12f}")
     mtjax.train.main(words)
     (folder,) = tmp_path.iterdir()
     assert "2 rounds" in capsys.readouterr().out and "-rounds-" in folder.name
     runs = sweep._runs(folder)
-    assert [cli.from_json(run / "config.json").plan.seeds for run in runs] == [2, 1]
+    assert [from_json(run / "config.json").plan.seeds for run in runs] == [2, 1]
     (row,) = sweep.rows(runs)
     returns = [load_evaluations(run / "evaluations.npz").returns["train"][:, -1] for run in runs]
     assert row["run"] == "run-1 run-2" and row["seeds"] == 3 and row["diverged"] == 0
@@ -305,17 +312,17 @@ def swept(short_family, tmp_path_factory):
         "agent.actor-lr=1e-3,1e-4,1e38",
         "agent.num-critics=1",
     ]
-    (program,) = sweep.programs(words)
-    real = mtjax.train.launch
+    (program,) = sweep.configurations(words, cli.parse)
+    real = sweep.launch
 
-    def launch(program, directory, *rest):
+    def stop(program, directory, *rest):
         if directory.name == "run-2":
             raise KeyboardInterrupt
         return real(program, directory, *rest)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("MTJAX_MEMORY", f"{2.5 * rounds.needed(program) / 0.9 / 1e9:.12f}")
-        patch.setattr(mtjax.train, "launch", launch)
+        patch.setenv("MTJAX_MEMORY", f"{2.5 * memory.needed(program) / 0.9 / 1e9:.12f}")
+        patch.setattr(sweep, "launch", stop)
         with pytest.raises(KeyboardInterrupt):
             mtjax.train.main(words)
     (folder,) = root.iterdir()

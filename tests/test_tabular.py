@@ -7,7 +7,7 @@ import pytest
 from probes import tiny
 
 from mtjax import loop
-from mtjax.envs.tabular import Bandit, TabularMDP
+from mtjax.envs.mtenv.tabular import Bandit, TabularMDP
 from mtjax.types import InputError, Spec
 
 MDP, BANDIT = TabularMDP(num_tasks=3), Bandit(num_tasks=3)

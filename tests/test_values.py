@@ -9,7 +9,7 @@ import pytest
 from probes import Probe, only_seed, tasks_of, tiny, train, values
 
 from mtjax.agents import agent
-from mtjax.agents.values import C51, VALUES, HLGauss, Scalar
+from mtjax.agents.parts.values import C51, VALUES, HLGauss, Scalar
 from mtjax.loop import Settings
 from mtjax.types import InputError
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mtjax.envs.walker import WalkerRun, WalkerSpeed, WalkerStand, WalkerWalk
+from mtjax.envs.dm_control.walker import WalkerRun, WalkerSpeed, WalkerStand, WalkerWalk
 
 
 def first(env):

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import optax
 
 from mtjax.agents import parts
+from mtjax.agents.parts.trajectory import TrajectoryEncoder
 from mtjax.agents.sac import SAC, SACState
-from mtjax.agents.trajectory import TrajectoryEncoder
 from mtjax.history import Seen
 from mtjax.networks import MLP, Network, Params, Trunk, join
 from mtjax.types import Array, InputError, Key, Metrics, Spec, Task, Transition

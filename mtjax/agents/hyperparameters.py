@@ -6,11 +6,12 @@ from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
-from mtjax.agents import parts, surgery
-from mtjax.agents.encoders import ENCODERS, Encoder
-from mtjax.agents.samplers import SAMPLERS, Sampler
-from mtjax.agents.scaling import SCALINGS, Scaling
-from mtjax.agents.values import VALUES, Value
+from mtjax.agents import parts
+from mtjax.agents.parts.encoders import ENCODERS, Encoder
+from mtjax.agents.parts.gradients import surgery
+from mtjax.agents.parts.samplers import SAMPLERS, Sampler
+from mtjax.agents.parts.scaling import SCALINGS, Scaling
+from mtjax.agents.parts.values import VALUES, Value
 from mtjax.names import frozen, nearest_error
 from mtjax.types import InputError
 

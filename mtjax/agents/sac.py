@@ -11,9 +11,10 @@ import numpy as np
 import optax
 
 from mtjax import normalize
-from mtjax.agents import conditioning, descent, surgery
 from mtjax.agents.hyperparameters import Hyperparameters
-from mtjax.agents.trajectory import TrajectoryEncoder
+from mtjax.agents.parts import conditioning
+from mtjax.agents.parts.gradients import descent, surgery
+from mtjax.agents.parts.trajectory import TrajectoryEncoder
 from mtjax.history import Seen, plain_obs_size, unpack
 from mtjax.networks import Network, Params, tanh_normal
 from mtjax.types import Array, InputError, Key, Metrics, Outcome, Spec, Task, Transition

@@ -3,24 +3,24 @@
 from collections.abc import Mapping
 from typing import Any
 
-from mtjax.envs.acrobot import AcrobotSwingup
-from mtjax.envs.ball_in_cup import BallInCup
 from mtjax.envs.brax import NAMES, Brax, BraxAntDirection, BraxHalfcheetahSpeed
-from mtjax.envs.cartpole import CartpoleBalance, CartpoleSwingup
-from mtjax.envs.cheetah import CheetahDirection, CheetahRun, CheetahSpeed
-from mtjax.envs.control import ACROBOT_RANGES, CARTPOLE_RANGES, Acrobot, CartPole
+from mtjax.envs.dm_control.acrobot import AcrobotSwingup
+from mtjax.envs.dm_control.ball_in_cup import BallInCup
+from mtjax.envs.dm_control.cartpole import CartpoleBalance, CartpoleSwingup
+from mtjax.envs.dm_control.cheetah import CheetahDirection, CheetahRun, CheetahSpeed
+from mtjax.envs.dm_control.finger import FingerSpin, FingerTurn, FingerTurnTarget
+from mtjax.envs.dm_control.hopper import HopperHop, HopperStand
+from mtjax.envs.dm_control.pendulum import PendulumSwingup
+from mtjax.envs.dm_control.point_mass import PointMass, PointMassNavigate
+from mtjax.envs.dm_control.reacher import Reacher, ReacherTarget
+from mtjax.envs.dm_control.walker import WalkerRun, WalkerSpeed, WalkerStand, WalkerWalk
 from mtjax.envs.domain import Domain
+from mtjax.envs.engines.base import World
 from mtjax.envs.family import Family
-from mtjax.envs.finger import FingerSpin, FingerTurn, FingerTurnTarget
-from mtjax.envs.hopper import HopperHop, HopperStand
-from mtjax.envs.maze import TwoGoalMaze
+from mtjax.envs.mtenv.control import ACROBOT_RANGES, CARTPOLE_RANGES, Acrobot, CartPole
+from mtjax.envs.mtenv.maze import TwoGoalMaze
+from mtjax.envs.mtenv.tabular import Bandit, TabularMDP
 from mtjax.envs.parameters import Parameter
-from mtjax.envs.pendulum import PendulumSwingup
-from mtjax.envs.physics import World
-from mtjax.envs.point_mass import PointMass, PointMassNavigate
-from mtjax.envs.reacher import Reacher, ReacherTarget
-from mtjax.envs.tabular import Bandit, TabularMDP
-from mtjax.envs.walker import WalkerRun, WalkerSpeed, WalkerStand, WalkerWalk
 from mtjax.names import frozen, nearest_error
 from mtjax.types import InputError
 

@@ -19,9 +19,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from mtjax.envs.engines.base import mjx_module
 from mtjax.envs.family import Family
 from mtjax.envs.parameters import Parameter
-from mtjax.envs.physics import mjx_module
 from mtjax.names import nearest_error
 from mtjax.types import Array, InputError, Key, Step, Task
 

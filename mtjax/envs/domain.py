@@ -19,8 +19,11 @@ import mujoco
 import numpy as np
 import tyro
 
+from mtjax.envs.engines.base import ENGINES, Engine, World, choose_engine, mjx_module
+from mtjax.envs.engines.c import MujocoC
+from mtjax.envs.engines.mjx import Mjx
+from mtjax.envs.engines.warp import Warp
 from mtjax.envs.family import Family, draw_until
-from mtjax.envs.physics import ENGINES, Engine, Mjx, MujocoC, World, choose_engine, mjx_module
 from mtjax.envs.planar import Planar, is_planar, locate
 from mtjax.names import nearest_error
 from mtjax.types import Array, InputError, Key, Step, Task, Transition
@@ -185,8 +188,6 @@ class Domain(Family):
         if self.engine_name == "c":
             return MujocoC(self.models, self.num_substeps)
         if self.engine_name == "warp":
-            from mtjax.envs.warp import Warp
-
             return Warp(self._base(self.warp_iterations), self.num_substeps)
         return self.mjx
 

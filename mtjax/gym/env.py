@@ -8,10 +8,11 @@ import jax
 import numpy as np
 from gymnasium import spaces
 
-from mtjax import envs, render
+from mtjax import envs
 from mtjax.envs.domain import Domain
 from mtjax.gym.tasks import TaskStream, TaskTable, read_options
 from mtjax.names import nearest_error
+from mtjax.report import render
 from mtjax.types import Array, Env, InputError, Step, Task
 
 MTENV_IDS = {

@@ -1,0 +1,84 @@
+"""CARE: contextual attention over a mixture of encoders."""
+
+import dataclasses
+from typing import ClassVar, Literal
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from mtjax.agents import parts
+from mtjax.agents.parts.encoders.base import Identity
+from mtjax.agents.parts.encoders.mixture import Experts, check_experts
+from mtjax.networks import MLP, join
+from mtjax.types import Array
+
+
+class Mixture(nn.Module):
+    """Encode an observation as a context-dependent mixture, and the rest of the network on top of it."""
+
+    num_experts: int
+    expert_widths: tuple[int, ...]
+    variant: str
+    temperature: float
+    hidden: tuple[int, ...]
+    layer_norm: bool
+
+    @nn.compact
+    def __call__(self, obs: Array, features: Array, *action: Array) -> Array:
+        size = self.expert_widths[-1]
+        context = nn.Dense(size, name="context_out")(MLP(self.expert_widths[:-1], name="context")(features))  # (..., D)
+        encodings = Experts(self.num_experts, self.expert_widths, name="experts")(obs)  # (K, ..., D)
+        if self.variant == "paper":
+            scores = jnp.sum(encodings * jax.lax.stop_gradient(context), axis=-1) / self.temperature  # (K, ...)
+        else:
+            gate = nn.Dense(self.num_experts, name="gate_out")(MLP((size, size), name="gate")(context))
+            gate = jnp.broadcast_to(gate, (*obs.shape[:-1], self.num_experts))  # the same in every state of a task
+            scores = jnp.moveaxis(gate, -1, 0)
+        attention = jax.nn.softmax(scores, axis=0)  # (K, ...)
+        self.sow("intermediates", "attention", attention)
+        encoding = jnp.sum(attention[..., None] * encodings, axis=0)
+        if self.variant == "paper":
+            encoding = MLP((size,), name="after")(encoding)
+        return MLP(self.hidden, self.layer_norm, name="trunk")(join(encoding, *action, task=context))
+
+
+@dataclasses.dataclass(frozen=True)
+class CARE(Identity):
+    """Contextual attention-based representation learning (Sodhani, Zhang and Pineau 2021).
+
+    For a task with context features c and K encoders E_j of the observation s:
+        z_context = C(c)                                   (context encoder)
+        a_j = softmax_j <E_j(s), sg(z_context)> / tau      (attention; no gradient into the context here)
+        z = MLP(sum_j a_j E_j(s))                          (mixture)
+    and SAC's actor and critics work on [z, z_context], through which alone the context encoder learns.
+
+    ``variant="mtrl"`` is what the authors' MTRL code computes: the weights are softmax(MLP(z_context)), the same in
+    every state, gradients flow through them, and no MLP follows the mixture.
+
+    Differs from the paper: the inner products are divided by tau, the square root of the encoding's size, without which
+    the attention is nearly hard from the start and learning slow (``attention_temperature=1`` is the paper's); the
+    context comes from the task's conditioning (by default its physical parameters) where
+    the paper embeds a sentence, which conditioning=vectors also allows; actor and critics each own a mixture, so that
+    every parameter is trained by its own loss (MTRL ties some of the actor's to the critic's and leaves others at
+    their initial values).
+    """
+
+    needs_features: ClassVar[bool] = True
+    num_experts: int = 6
+    """Encoders in the mixture."""
+    expert_widths: tuple[int, ...] = (64, 64)
+    """Widths of each encoder's layers and of the context encoder; the last is the size of the encoding."""
+    variant: Literal["paper", "mtrl"] = "paper"
+    """Attention as in the paper, or the gate of the authors' code."""
+    attention_temperature: float = 0.0
+    """Divides the paper's inner products; 0 is the square root of the encoding's size, 1 the paper's formula."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        parts.require_not_negative(self, "attention_temperature")
+        check_experts(self.num_experts, self.expert_widths)
+
+    def body(self, hidden: tuple[int, ...], layer_norm: bool) -> nn.Module:
+        temperature = self.attention_temperature or self.expert_widths[-1] ** 0.5
+        return Mixture(self.num_experts, self.expert_widths, self.variant, temperature, hidden, layer_norm)

@@ -1,0 +1,154 @@
+"""Mixtures of experts: several encoders of the observation, and how a task chooses among them."""
+
+import dataclasses
+from typing import ClassVar, Literal
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from mtjax.agents.parts.encoders.base import Identity
+from mtjax.networks import MLP, ReLU, join
+from mtjax.types import Array, InputError
+
+_BY_NUMBER = ("identity", "cluster")
+
+
+class Experts(nn.Module):
+    """K networks of the same shape, each an MLP with a linear output, evaluated as batched products."""
+
+    num_experts: int
+    widths: tuple[int, ...]
+    layer_norm: bool = False  # before each ReLU
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        """Map inputs (..., O) to outputs (K, ..., D)."""
+        init = nn.initializers.lecun_normal(batch_axis=0)
+        for i, width in enumerate(self.widths):
+            kernel = self.param(f"kernel_{i}", init, (self.num_experts, x.shape[-1], width))
+            bias = self.param(f"bias_{i}", nn.initializers.zeros, (self.num_experts, width))
+            inputs = 0 if i else None  # all experts read the same input, so the first layer is a single product
+            x = jax.vmap(lambda x, kernel, bias: x @ kernel + bias, (inputs, 0, 0))(x, kernel, bias)
+            if i + 1 < len(self.widths):
+                x = nn.LayerNorm(feature_axes=(0, -1), name=f"norm_{i}")(x) if self.layer_norm else x
+                x = ReLU()(x)
+        return x
+
+
+def mix(weights: Array, encodings: Array) -> Array:
+    """Sum encodings (K, ..., D) by weights (..., K), or (K,) for every sample, to (..., D)."""
+    weights = jnp.moveaxis(weights, -1, 0)
+    # Not a matrix product, which for a handful of terms is slower on a GPU than a sum fused with what made them.
+    return jnp.sum(weights.reshape(*weights.shape, *[1] * (encodings.ndim - weights.ndim)) * encodings, axis=0)
+
+
+def top_k_softmax(scores: Array, k: int) -> Array:
+    """Weights (..., K) of which exactly k are not 0: the softmax of the k highest scores (..., K)."""
+    highest, chosen = jax.lax.top_k(scores, k)
+    return jnp.einsum("...j,...jk->...k", nn.softmax(highest), jax.nn.one_hot(chosen, scores.shape[-1]))
+
+
+def check_experts(num_experts: int, expert_widths: tuple[int, ...]) -> None:
+    """Raise an InputError unless there are experts, of at least one layer each."""
+    if num_experts < 1 or not expert_widths or min(expert_widths) < 1:
+        raise InputError(
+            "there must be at least one expert with at least one layer of at least one unit, "
+            f"not num-experts={num_experts} and expert-widths={expert_widths}"
+        )
+
+
+class Gate(nn.Module):
+    """An MLP from what is known of a task to scores (..., K) of the experts."""
+
+    num_experts: int
+    widths: tuple[int, ...]
+
+    @nn.compact
+    def __call__(self, features: Array) -> Array:
+        return nn.Dense(self.num_experts, name="scores")(MLP(self.widths)(features))
+
+
+class MixtureTrunk(nn.Module):
+    """Encode an observation by a task's mixture of experts, and an MLP on the encoding and everything else."""
+
+    spec: "MoE"
+    hidden: tuple[int, ...]
+    layer_norm: bool
+
+    @nn.compact
+    def __call__(self, obs: Array, features: Array, *action: Array) -> Array:
+        spec = self.spec
+        encodings = Experts(spec.num_experts, spec.expert_widths, name="experts")(obs)  # (K, ..., D)
+        match spec.mode:
+            case "ensemble":
+                weights = jnp.full(spec.num_experts, 1 / spec.num_experts)
+            case "identity" | "cluster":
+                weights = spec.weights_by_number(features)
+            case _:
+                scores = Gate(spec.num_experts, spec.expert_widths, name="gate")(features)
+                weights = nn.softmax(scores) if spec.mode == "attention" else top_k_softmax(scores, spec.top_k)
+        encoding = mix(weights, encodings)
+        return MLP(self.hidden, self.layer_norm, name="trunk")(join(encoding, *action, task=features))
+
+
+@dataclasses.dataclass(frozen=True)
+class MoE(Identity):
+    """A mixture of experts on the observation, and SAC's networks on top of it (MTRL's ``moe`` encoder).
+
+    With K encoders E_k of the observation s, a task of features c and number i is given
+        z = sum_k w_k E_k(s)
+    and actor and critics work on [z, c]. How a task weighs the experts is the ``mode``:
+        attention   w = softmax(g(c)), with an MLP g
+        top-k       the softmax of the k highest scores g(c), and 0 elsewhere (Shazeer et al. 2017, without noise)
+        ensemble    w_k = 1 / K
+        cluster     the one expert that ``clusters`` gives for task i
+        identity    expert i
+
+    Differs from MTRL: what a task does not choose has weight 0 and nothing is divided by a count, where MTRL's keyword
+    clusters leave tasks with none of 0 experts, which is not a number; and top-k lets gradients flow through the
+    weights that it keeps, where MTRL detaches the gate, which then stays as it was initialised. For the same reason
+    top-k=1 is refused: a single weight is always 1 and teaches the gate nothing. No loss balances the experts: one that
+    no task keeps does not learn. All experts are evaluated for every task, in one product, whatever their weights.
+    """
+
+    needs_features: ClassVar[bool] = True
+    num_experts: int = 4
+    """Encoders in the mixture."""
+    expert_widths: tuple[int, ...] = (64, 64)
+    """Widths of each encoder's layers and of the gate's; the last is the size of the encoding."""
+    mode: Literal["attention", "top-k", "ensemble", "cluster", "identity"] = "attention"
+    """How a task weighs the experts: by a soft gate, by the gate's highest scores alone, all alike, by a table, or
+    each task its own expert."""
+    top_k: int = 2
+    """Experts that a task uses under mode=top-k."""
+    clusters: tuple[int, ...] = ()
+    """The expert of every training task, numbered from 0, for mode=cluster."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        check_experts(self.num_experts, self.expert_widths)
+        if self.mode == "top-k" and not 2 <= self.top_k <= self.num_experts:
+            raise InputError(f"top-k must be from 2 to num-experts={self.num_experts}, not {self.top_k}")
+        if (self.mode == "cluster") != bool(self.clusters):
+            raise InputError("mode=cluster and clusters=TABLE go together; give both or neither")
+        if self.clusters and set(self.clusters) != set(range(self.num_experts)):
+            last = self.num_experts - 1
+            raise InputError(f"clusters must use every expert from 0 to {last} and no other, not {self.clusters}")
+
+    def refuses(self, conditioning: str) -> str:
+        if self.mode in _BY_NUMBER and conditioning != "one-hot":
+            return f"picks experts by the task's number under mode={self.mode}; use conditioning=one-hot"
+        return "" if self.mode == "ensemble" else super().refuses(conditioning)
+
+    def weights_by_number(self, features: Array) -> Array:
+        """Weights (..., K) from one-hot task numbers (..., T)."""
+        table = self.clusters or tuple(range(self.num_experts))
+        if len(table) != features.shape[-1]:
+            given = f"clusters={table}" if self.clusters else f"num-experts={self.num_experts}"
+            fits = f"fits {len(table)} training tasks, but there are {features.shape[-1]}"
+            raise InputError(f"mode={self.mode} with {given} {fits}")
+        return features @ jax.nn.one_hot(jnp.array(table), self.num_experts)
+
+    def body(self, hidden: tuple[int, ...], layer_norm: bool) -> nn.Module:
+        return MixtureTrunk(self, hidden, layer_norm)

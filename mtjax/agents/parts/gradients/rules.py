@@ -1,0 +1,246 @@
+"""Rules of gradient surgery: from the Gram matrix G (T, T) of the tasks' gradients J to weights w (T,) of their sum.
+
+Conventions, for every rule. Weights stand beside the mean's 1 / T, so that an update scales as the gradients do and a
+learning rate or a clipped norm means the same under each. Where all gradients are zero, weights are the mean's. A task
+whose gradient is zero (it is absent from the batch) has no say: it neither constrains the others nor divides by zero.
+Under Adam, which forgets the length of an update, rules differ in its direction alone.
+
+Most rules solve their problem for unit gradients, on the matrix of cosines, as tasks' gradients differ in length by
+orders of magnitude. Iterations are fixed in number, as all runs under one jit and vmap.
+"""
+
+import dataclasses
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+
+from mtjax.agents.parts.gradients.quadratic import RIDGE, cosines, minimise
+from mtjax.types import Array, InputError, Key
+
+NEWTON_STEPS = 25
+"""Newton steps to Nash's bargain: 20 bring 50 tasks to rounding, opposite gradients and unequal lengths included."""
+CAGRAD_GRID = 16
+"""Points at which CAGrad brackets its multiplier, twice."""
+PCGRAD_BLOCK = 10
+"""Projections that PCGrad writes out in one piece."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Mean:
+    """The mean of all tasks' gradients. Every rule is a class like this one; its fields are hyper-parameters."""
+
+    needs: ClassVar[str] = ""  # "gradients": of every task; "losses": those before and after each update; "": neither
+
+    def init(self, num_tasks: int) -> Any:
+        """What the rule remembers from one update to the next."""
+        return None
+
+    def weigh(self, memory: Any, gram: Array, losses: Array, key: Key) -> tuple[Array, Any]:
+        """Choose the weights of an update.
+
+        Args:
+            memory: what ``init`` or the last update gave.
+            gram: (T, T) inner products of the tasks' gradients; None to rules that do not need gradients.
+            losses: (T,).
+            key: for rules that draw.
+
+        Returns:
+            weights (T,) and the new memory.
+        """
+        return jnp.full(len(losses), 1 / len(losses)), memory
+
+    def adapt(self, memory: Any, before: Array, after: Array) -> Any:
+        """The new memory, from the losses (T,) of one batch before and after the update, for rules that need losses."""
+        return memory
+
+    @property
+    def for_actor(self) -> "Mean":
+        """The rule by which the actor's gradients combine, whose losses may be negative."""
+        return self
+
+
+class OfGram(Mean):
+    """A rule of the Gram matrix alone: in full float32, and plain averaging where no task has a gradient."""
+
+    needs = "gradients"
+
+    def weights(self, gram: Array) -> Array:
+        """Weights (T,) for a Gram matrix (T, T) whose largest entry is 1."""
+        raise NotImplementedError
+
+    def weigh(self, memory: Any, gram: Array, losses: Array, key: Key) -> tuple[Array, Any]:
+        with jax.default_matmul_precision("highest"):
+            largest = jnp.max(jnp.diagonal(gram))
+            weights = self.weights(gram / jnp.where(largest > 0, largest, 1.0))
+        return jnp.where(largest > 0, weights, 1 / len(gram)), memory
+
+
+@dataclasses.dataclass(frozen=True)
+class PCGrad(Mean):
+    """Project away conflicts between tasks (Yu et al. 2020, algorithm 1), exactly, on T-vectors.
+
+    Each task's gradient is c^T J with c = e_i; in a fresh random order over the other tasks j, where the two conflict,
+    c_j loses (c . G[:, j]) / G[j, j]. The result is the mean over tasks; their sum in the paper.
+
+    In a plain loop, T tasks are T steps one after the other, each so small that a GPU takes longer to launch it than to
+    run it. A block of steps needs c alone at its start: the shares that its others take follow one from the other, as
+    in a triangular solve but for the minimum. Written out, they compile to one or a few kernels a block.
+    """
+
+    needs = "gradients"
+
+    def weigh(self, memory: Any, gram: Array, losses: Array, key: Key) -> tuple[Array, Any]:
+        num_tasks, block = len(gram), min(len(gram), PCGRAD_BLOCK)
+        squares = jnp.diagonal(gram)
+        along = gram / jnp.where(squares > 0, squares, jnp.inf)  # of each gradient along each other, in its lengths
+        along = jnp.pad(along, (0, -num_tasks % block)).T  # to whole blocks, by tasks that are absent
+        size = len(along)
+
+        def against(c: Array, others: Array) -> tuple[Array, None]:
+            """Project every task's gradient (T, T) against the next of its others (T, block)."""
+            parts = jnp.sum(c[:, None] * along[others], axis=-1)
+            between = along[others[:, None], others[:, :, None]]
+            counts = others != jnp.arange(size)[:, None]
+            shares = []
+            for k in range(block):
+                left = parts[:, k] - sum(share * between[:, i, k] for i, share in enumerate(shares))
+                shares.append(jnp.where(counts[:, k], jnp.minimum(left, 0.0), 0.0))
+            return c - sum(x[:, None] * jax.nn.one_hot(others[:, k], size) for k, x in enumerate(shares)), None
+
+        blocks = jnp.moveaxis(orders(key, size).reshape(size, -1, block), 1, 0)
+        c, _ = jax.lax.scan(against, jnp.eye(size), blocks, unroll=min(len(blocks), 8))
+        return jnp.sum(c, axis=0)[:num_tasks] / num_tasks, memory
+
+
+def orders(key: Key, num_tasks: int) -> Array:
+    """A random order of all tasks for each of them (T, T)."""
+    return jnp.argsort(jax.random.bits(key, (num_tasks, num_tasks)))
+
+
+@dataclasses.dataclass(frozen=True)
+class CAGrad(OfGram):
+    """Improve the worst-off task near the mean gradient (Liu et al. 2021a, "CAGrad").
+
+    With the mean g_0, the update d solves max_d min_i g_i . d under |d - g_0| <= c |g_0|. It is d = g_0 + J^T x, where
+    for some multiplier t > 0 the vector t x minimises t g_0 . g_y + |g_y|^2 / 2 over y in the simplex (g_y = y^T J) and
+    |J^T x| = c |g_0|; or less, where no d helps every task. |J^T x| falls with t, so that two grids of quadratic
+    problems bracket t, and x is interpolated between the last two (exactly, if they hold the same tasks back): to 1e-3
+    of c |g_0|. As in the authors' code, the result is d / (1 + c^2), which scales with the gradients.
+    """
+
+    cagrad_radius: float = 0.5
+    """How far CAGrad's update may leave the mean, in lengths of the mean (c). Its authors: 0.5 (MT50), 0.9 (MT10)."""
+
+    def __post_init__(self):
+        if not 0 < self.cagrad_radius < 1:
+            raise InputError(f"cagrad-radius must be in (0, 1), not {self.cagrad_radius}")
+
+    def weights(self, gram: Array) -> Array:
+        radius = self.cagrad_radius
+        matrix, norms, present = cosines(gram)
+        along = jnp.mean(gram, axis=1)
+        length = jnp.sqrt(jnp.maximum(jnp.mean(along), 0.0))  # |g_0|
+        slope = jnp.clip(along / norms / jnp.where(length > 0, length, 1.0), -1.0, 1.0)
+        lengths = jnp.where(present, norms, jnp.max(norms))
+        shortest = jnp.min(lengths)
+        budget = present * shortest / norms
+
+        def at(multiplier: Array) -> tuple[Array, Array]:
+            x = minimise(matrix, slope, multiplier * budget)
+            return x, jnp.sqrt(x @ matrix @ x)
+
+        def narrow(bracket: Array) -> tuple[Array, Array, Array]:
+            multipliers = jnp.geomspace(bracket[0], bracket[1], CAGRAD_GRID)
+            x, reach = jax.vmap(at)(multipliers)
+            high = jnp.clip(jnp.sum(reach > radius), 1, CAGRAD_GRID - 1)
+            pair = jnp.stack([high - 1, high])
+            return multipliers[pair], x[pair], reach[pair]
+
+        widest = jnp.stack([jnp.float32(1e-3), jnp.max(lengths) / shortest]) / radius
+        _, x, reach = narrow(narrow(widest)[0])
+        share = jnp.clip((reach[0] - radius) / jnp.maximum(reach[0] - reach[1], 1e-12), 0.0, 1.0)
+        x = (1 - share) * x[0] + share * x[1]
+        return (1 / len(gram) + length * present * x / norms) / (1 + radius**2)
+
+
+@dataclasses.dataclass(frozen=True)
+class MGDA(OfGram):
+    """The shortest convex combination of gradients (Désidéri 2012; Sener & Koltun 2018): min w^T G w on the simplex.
+
+    No task's loss rises along it; it is zero where no direction helps every task. Weights sum to one.
+    """
+
+    def weights(self, gram: Array) -> Array:
+        matrix, norms, present = cosines(gram)
+        inverse = present * jnp.min(jnp.where(present, norms, jnp.inf)) / norms
+        weights = inverse * minimise(matrix, jnp.zeros(len(gram)), inverse)
+        return weights / jnp.sum(weights)
+
+
+@dataclasses.dataclass(frozen=True)
+class IMTLG(OfGram):
+    """Equal projections onto every task's direction (Liu et al. 2021b, "IMTL-G"): d . g_i / |g_i| the same for all i.
+
+    With the matrix C of cosines, w_i = y_i / |g_i| where C y = 1. Weights sum to one, as in the paper, and may be
+    negative. Differs from it where they cancel: magnitudes sum to ten at most, and the update never turns against all
+    tasks, which the paper's does for gradients that agree but differ in length.
+    """
+
+    def weights(self, gram: Array) -> Array:
+        matrix, norms, present = cosines(gram)
+        weights = present * jnp.linalg.solve(matrix, 1.0 * present) / norms
+        return weights / jnp.maximum(jnp.sum(weights), 0.1 * jnp.sum(jnp.abs(weights)))
+
+
+@dataclasses.dataclass(frozen=True)
+class NashMTL(OfGram):
+    """The tasks' bargain (Navon et al. 2022, "Nash-MTL"): w > 0 with G w proportional to 1 / w.
+
+    The paper's G a = 1 / a makes every update as long as sqrt(T), however small the gradients; here weights sum to one.
+    With the matrix C of cosines and y = a |g|, C y = 1 / y minimises y^T C y / 2 - sum log y; Newton's steps r in log y
+    are shortened to r / (1 + max |r|), which always descends and tends to the full step.
+    """
+
+    def weights(self, gram: Array) -> Array:
+        matrix, norms, present = cosines(gram)
+
+        def newton(y: Array, _) -> tuple[Array, None]:
+            scaled = y[:, None] * matrix * y
+            step = jnp.linalg.solve(scaled + jnp.eye(len(y)), 1 - jnp.sum(scaled, axis=1))
+            return y * (1 + step / (1 + jnp.max(jnp.abs(step)))), None
+
+        y, _ = jax.lax.scan(newton, jnp.ones(len(gram)), length=NEWTON_STEPS)
+        weights = present * y / norms
+        return weights / jnp.sum(weights)
+
+
+@dataclasses.dataclass(frozen=True)
+class AlignedMTL(OfGram):
+    """Gradients made orthogonal and equally long (Senushkin et al. 2023, "Aligned-MTL"), then averaged.
+
+    With G = V diag(s) V^T and s_r its least eigenvalue above rounding, w = sqrt(s_r) V diag(s)^(-1/2) V^T 1 / T, over
+    the eigenvalues from s_r up. Lengths are part of G here, and gradients a thousand times shorter than the longest are
+    lost to rounding.
+    """
+
+    def weights(self, gram: Array) -> Array:
+        values, vectors = jnp.linalg.eigh(gram)
+        kept = values > RIDGE * len(gram) * jnp.max(values)
+        least = jnp.min(jnp.where(kept, values, jnp.inf))
+        stretch = jnp.where(kept, jnp.sqrt(least / jnp.where(kept, values, 1.0)), 0.0)
+        return vectors @ (stretch * jnp.mean(vectors, axis=0))
+
+
+@dataclasses.dataclass(frozen=True)
+class UPGrad(OfGram):
+    """Project each gradient onto the directions that raise no loss, then average (Quinton & Rey 2024, "UPGrad").
+
+    The nearest d to g_i with J d >= 0 is J^T (e_i + v_i), v_i minimising (e_i + v)^T G (e_i + v) over v >= 0; the
+    weights are the mean of e_i + v_i. Without conflict that is the mean.
+    """
+
+    def weights(self, gram: Array) -> Array:
+        matrix, norms, present = cosines(gram)
+        unit = jax.vmap(lambda row: minimise(matrix, row, jnp.zeros(len(gram))))(matrix)
+        return jnp.mean(jnp.eye(len(gram)) + norms[:, None] * unit * present / norms, axis=0)

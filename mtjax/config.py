@@ -1,0 +1,167 @@
+"""What a run is made of: its names, presets and settings, and their record as JSON."""
+
+import dataclasses
+import json
+import sys
+import tomllib
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from types import MappingProxyType
+from typing import Annotated, Any, Literal
+
+import jax
+import tyro
+
+from mtjax.agents import SAC, agent, settings
+from mtjax.envs import Family, make
+from mtjax.loop import Settings
+from mtjax.types import InputError
+
+PRESETS = ("auto", "cpu", "gpu")
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """How long a run lasts, over which seeds, and when it is evaluated."""
+
+    steps: int = 1_000_000
+    """Environment steps of each seed, summed over tasks; rounded up to whole chunks."""
+    seed: int = 0
+    """The first seed."""
+    seeds: int = 1
+    """Seeds to run at once, in one program."""
+    eval_every: int = 0
+    """Environment steps between evaluations, rounded up to whole chunks; 0 evaluates ten times in the run."""
+    eval_episodes: int = 10
+    """Episodes of each task in an evaluation."""
+
+    def __post_init__(self):
+        for field, least in (("steps", 1), ("seeds", 1), ("seed", 0), ("eval_every", 0), ("eval_episodes", 1)):
+            if getattr(self, field) < least:
+                raise InputError(f"{field.replace('_', '-')} must be at least {least}, not {getattr(self, field)}")
+        if self.seed + self.seeds > 2**31:
+            raise InputError(f"seed must be less than 2^31, as it is a 32-bit number, not {self.seed}")
+
+
+@dataclasses.dataclass(frozen=True)
+class RunConfig:
+    """Train a multi-task agent: ``python -m mtjax.train --env=NAME --agent=NAME``."""
+
+    env: str = "finger-spin-vary-size"
+    """Name of the environment family; --list shows all. --import=FILE.py makes those known that a file registers."""
+    agent: str = "sac-conditioned"
+    """Name of the agent; --list shows all. Its parts: --agent.encoder, --agent.gradients, --agent.value,
+    --agent.scaling and --agent.sampler, each by name and with flags of its own."""
+    preset: Literal["auto", "cpu", "gpu"] = "auto"
+    """Tuned defaults of the flags below for a kind of device; auto chooses by the device that JAX runs on."""
+    runs: str = "runs"
+    """Folder in which the run's own folder is made."""
+    resume: str = ""
+    """A run's folder to go on with; only --steps may be given beside it."""
+    start: Annotated[str, tyro.conf.arg(name="from")] = ""
+    """A run's folder whose agent to fine-tune on this environment's tasks. Agent and networks are the run's; rates of
+    learning and --tune may be given. What every task has for itself begins as that of the run's nearest training task,
+    and seeds beyond the run's begin with its first ones again."""
+    sweep: tuple[str, ...] = ()
+    """Train once for every combination of values: agent.actor-lr=1e-4,1e-3 agent.num-experts=2,4 and so on, flags
+    without their dashes. The agent's numbers vary inside one program, beside the seeds; whatever else varies is one
+    program after another. A table of all settings lies in the sweep's folder, whose name --resume takes too."""
+    points: Annotated[tuple[dict[str, float], ...], tyro.conf.Suppress] = ()
+    profile: bool = False
+    """Leave a trace of one warm chunk, by JAX's profiler, in the run's folder."""
+    distributed: bool = False
+    """Run as one of several processes, each on devices of its own, that share the seeds. All are started with the same
+    command: by SLURM's srun, Open MPI or Kubernetes, or with JAX_COORDINATOR_ADDRESS (host:port of process 0),
+    JAX_NUM_PROCESSES and JAX_PROCESS_ID in the environment. They share the folder of --runs."""
+    list: bool = False
+    """Print the families and agents, and stop."""
+    plan: Annotated[Plan, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Plan)
+    training: Annotated[Settings, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Settings)
+    family: Annotated[Family, tyro.conf.arg(name="env")] = dataclasses.field(
+        default_factory=lambda: make("finger-spin")
+    )
+    learner: Annotated[SAC, tyro.conf.arg(name="agent")] = dataclasses.field(default_factory=SAC)
+
+
+def with_preset(
+    env_name: str,
+    agent_name: str,
+    preset_name: str = "auto",
+    agent_settings: Mapping[str, str] = MappingProxyType({}),
+    **family_settings: Any,
+) -> RunConfig:
+    """Return the program that a family and an agent, each with any settings of its own, and a preset stand for.
+
+    Raises:
+        InputError: a name or setting is unknown.
+    """
+    family = make(env_name, **family_settings)
+    preset = load_preset(env_name, _device_preset() if preset_name == "auto" else preset_name)
+    of_agent = preset.get("agent", {}) | preset.get(agent_name, {})
+    return RunConfig(
+        env=env_name,
+        agent=agent_name,
+        preset=preset_name,  # type: ignore
+        plan=Plan(**preset.get("plan", {})),
+        training=Settings(**preset.get("training", {})),
+        family=family,
+        learner=agent(agent_name, **{**of_agent, **agent_settings}),
+    )
+
+
+def load_preset(env_name: str, name: str) -> dict[str, Any]:
+    """Read the tables of a preset: the family's own file, or the domain's, or the default one."""
+    folder = resources.files("mtjax") / "configs"
+    words = env_name.split("-")
+    names = ["-".join(words[:n]) for n in range(len(words), 0, -1)]
+    file = next((f for n in [*names, "default"] if (f := folder / f"{n}.toml").is_file()), None)
+    assert file is not None, "the package lacks configs/default.toml"
+    return tomllib.loads(file.read_text())[name]
+
+
+def _device_preset() -> str:
+    return "cpu" if jax.default_backend() == "cpu" else "gpu"
+
+
+def import_flag(family: Family) -> list[str]:
+    """The flag that makes a family of the user's own known to another program; none for those of this package."""
+    module = type(family).__module__
+    file = getattr(sys.modules.get(module), "__file__", None)
+    return [] if module.split(".")[0] == "mtjax" or file is None else [f"--import={Path(file).resolve()}"]
+
+
+# The record of a run.
+
+
+def to_json(config: RunConfig, extra: dict[str, Any]) -> str:
+    """Write everything a run is made of."""
+    record = {**dataclasses.asdict(config), "learner": settings(config.learner)}
+    return json.dumps({**record, **extra}, indent=2) + "\n"
+
+
+def from_json(path: Path) -> RunConfig:
+    """Read the program of a run from its config.json.
+
+    Raises:
+        InputError: there is no such file, or it does not describe a run.
+    """
+    if not path.is_file():
+        raise InputError(f"{str(path.parent)!r} is not a run: it has no config.json")
+    try:
+        record = json.loads(path.read_text())
+        return RunConfig(
+            env=record["env"],
+            agent=record["agent"],
+            preset=record["preset"],
+            runs=record["runs"],
+            start=record.get("start", ""),
+            sweep=tuple(record.get("sweep", ())),
+            points=tuple(record.get("points", ())),
+            plan=Plan(**record["plan"]),
+            training=Settings(**record["training"]),
+            family=make(record["env"], **record["family"]),
+            learner=agent(record["agent"], **record["learner"]),
+        )
+    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{str(path)!r} does not describe a run: {type(error).__name__}: {error}") from None

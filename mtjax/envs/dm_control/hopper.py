@@ -1,0 +1,103 @@
+"""The hopper domain of dm_control: a planar body on one leg."""
+
+import dataclasses
+from types import MappingProxyType
+from typing import ClassVar
+
+import jax.numpy as jnp
+import mujoco
+
+from mtjax.envs.dm_control.rewards import tolerance
+from mtjax.envs.domain import Domain, start_joints
+from mtjax.envs.engines.base import World
+from mtjax.envs.parameters import DAMPING, FRICTION, GEAR, GRAVITY, MASS, Parameter, body_mass
+from mtjax.types import Array, Key, Task
+
+_HEIGHTS = (0.6, 2.0)  # [m]
+
+
+def _scale_foot(spec: mujoco.MjSpec, scale: float) -> None:
+    foot = spec.body("foot")
+    foot.geoms[0].fromto = foot.geoms[0].fromto * scale
+    for site in foot.sites:
+        site.pos = site.pos * scale
+
+
+@dataclasses.dataclass(frozen=True)
+class HopperStand(Domain):
+    """Stand: hold the torso high over the foot with little effort.
+
+    Observation (15,), all after the step: height of the torso relative to its initial 1 m [m], its pitch [rad], the
+        angles of waist, hip, knee and ankle [rad]; velocities of the torso along x and z [m/s] and about y, and of the
+        four joints [rad/s]; log(1 + force) of the touch sensors at toe and heel [log N].
+    Action (4,): motor commands of waist, hip, knee and ankle in [-1, 1]; gears of 30, 40, 30 and 10 N m.
+    Reward: 0 unless the torso's centre of mass is between 0.6 and 2 m above the foot's, and there 1 less a fifth of the
+        mean square of the action; returns lie in [0, 1000].
+    Start: the torso at its height of 1 m and at rest, with its pitch uniform in [-pi, pi] and all joints uniform in
+        their range; limbs may begin inside the floor.
+    Episode: 1000 steps of 0.02 s (four substeps of 0.005 s); it never terminates.
+
+    Parameters that can vary:
+        foot-length: scale of the foot's length about the ankle, its mass by density; the touch sensors stay at its ends
+            and keep their size.
+        torso-mass: scale of the mass of torso and nose.
+        mass, friction, damping, gear: scale of all masses, of the sliding friction of all geoms, of the damping of all
+            joints, of the strength of all motors. gravity [m/s^2].
+
+    Differs from dm_control in: under MJX the constraint solver stops after ``solver_iterations``, an episode's first
+    observation shows no touch (three starts in a thousand have some), and limbs whose axes cross (one start in a
+    hundred) push each other apart in an arbitrary direction, where MuJoCo C lets them pass.
+    """
+
+    parameters: ClassVar = MappingProxyType(
+        {
+            "foot-length": Parameter("1", 1.0, _scale_foot),
+            "torso-mass": body_mass("torso"),
+            "mass": MASS,
+            "gravity": GRAVITY,
+            "friction": FRICTION,
+            "damping": DAMPING,
+            "gear": GEAR,
+        }
+    )
+    model_file: ClassVar[str] = "hopper.xml"
+    num_substeps: ClassVar[int] = 4
+    episode_steps: ClassVar[int] = 1000
+    default_iterations: ClassVar[int] = 4
+    starts_untouched: ClassVar[bool] = True  # nearly: to solve for the rest costs MJX half a step's compilation more
+
+    def start(self, task: Task, key: Key) -> tuple[Array, Array]:
+        return start_joints(self.models[0], key), jnp.zeros(self.models[0].nv)
+
+    def observe(self, task: Task, world: World) -> Array:
+        return jnp.concatenate([world.qpos[1:], world.qvel, jnp.log1p(world.sensors)])
+
+    def reward(self, task: Task, world: World, action: Array) -> Array:
+        effort = tolerance(action, 0.0, 0.0, 1.0, "quadratic", value_at_margin=0)
+        return self.standing(task, world) * (4 + jnp.mean(effort)) / 5
+
+    def standing(self, task: Task, world: World) -> Array:
+        """Whether the torso is high enough over the foot, ()."""
+        height = self.planar(task, world).centre[:, 1]
+        torso, foot = (self.models[0].body(name).id for name in ("torso", "foot"))
+        return tolerance(height[torso] - height[foot], *_HEIGHTS)
+
+
+@dataclasses.dataclass(frozen=True)
+class HopperHop(HopperStand):
+    """Hop: move forwards at 2 m/s or faster, the torso high over the foot.
+
+    As HopperStand, but for the reward: 0 unless the torso is as high as there, and then 1 where the forward velocity of
+    the centre of mass is ``speed`` or more, falling linearly to 0 at rest.
+
+    Further parameter: speed [m/s].
+    """
+
+    parameters: ClassVar = MappingProxyType({**HopperStand.parameters, "speed": Parameter("m/s", 2.0)})
+
+    def reward(self, task: Task, world: World, action: Array) -> Array:
+        speed = task.goal["speed"]
+        hopping = tolerance(
+            self.forward_velocity(task, world), speed, jnp.inf, speed / 2, "linear", value_at_margin=0.5
+        )
+        return self.standing(task, world) * hopping

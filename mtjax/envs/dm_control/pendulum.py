@@ -1,0 +1,71 @@
+"""The pendulum domain of dm_control: a weak motor swings a pole up and holds it there."""
+
+import dataclasses
+import math
+from types import MappingProxyType
+from typing import ClassVar
+
+import jax.numpy as jnp
+import mujoco
+
+from mtjax.envs.domain import Domain, start_joints
+from mtjax.envs.engines.base import World
+from mtjax.envs.parameters import DAMPING, GEAR, GRAVITY, Parameter
+from mtjax.types import Array, Key, Task
+
+_UPRIGHT = math.cos(math.radians(8))
+
+
+def _set_mass(spec: mujoco.MjSpec, mass: float) -> None:
+    spec.geom("mass").mass = mass
+
+
+def _set_length(spec: mujoco.MjSpec, length: float) -> None:
+    spec.geom("pole").fromto = [0, 0, 0, 0, 0, length]
+    spec.geom("mass").pos = [0, 0, length]
+
+
+@dataclasses.dataclass(frozen=True)
+class PendulumSwingup(Domain):
+    """Swing-up: swing the pole up and hold it upright.
+
+    Observation (3,), all after the step: cosine and sine of the pole's angle from upright; its velocity [rad/s].
+    Action (1,): torque in [-1, 1]; a gear of 1 N m, a fifth of what holds the pole level.
+    Reward: 1 while the pole is within 8 degrees of upright, else 0; returns lie in [0, 1000].
+    Start: the pole uniform in [-pi, pi], at rest.
+    Episode: 1000 steps of 0.02 s; it never terminates.
+
+    Parameters that can vary:
+        mass: of the ball at the pole's end [kg]; the pole has none.
+        length: from the hinge to the middle of the ball [m].
+        gravity: [m/s^2].
+        damping: scale of the hinge's damping.
+        gear: scale of the motor's torque.
+
+    Differs from dm_control in: nothing.
+    """
+
+    parameters: ClassVar = MappingProxyType(
+        {
+            "mass": Parameter("kg", 1.0, _set_mass),
+            "length": Parameter("m", 0.5, _set_length),
+            "gravity": GRAVITY,
+            "damping": DAMPING,
+            "gear": GEAR,
+        }
+    )
+    model_file: ClassVar[str] = "pendulum.xml"
+    num_substeps: ClassVar[int] = 1
+    episode_steps: ClassVar[int] = 1000
+    gpu_engine: ClassVar[str] = "mjx"
+    default_iterations: ClassVar[int] = 1
+    starts_untouched: ClassVar[bool] = True
+
+    def start(self, task: Task, key: Key) -> tuple[Array, Array]:
+        return start_joints(self.models[0], key), jnp.zeros(1)
+
+    def observe(self, task: Task, world: World) -> Array:
+        return jnp.concatenate([jnp.cos(world.qpos), jnp.sin(world.qpos), world.qvel])
+
+    def reward(self, task: Task, world: World, action: Array) -> Array:
+        return (jnp.cos(world.qpos[0]) >= _UPRIGHT).astype(jnp.float32)

@@ -1,0 +1,135 @@
+"""The walker domain of dm_control: a planar biped."""
+
+import dataclasses
+from types import MappingProxyType
+from typing import ClassVar
+
+import jax.numpy as jnp
+import mujoco
+
+from mtjax.envs.dm_control.rewards import tolerance
+from mtjax.envs.domain import Domain, start_joints
+from mtjax.envs.engines.base import World
+from mtjax.envs.parameters import DAMPING, GEAR, GRAVITY, MASS, Parameter, body_mass
+from mtjax.types import Array, Key, Task
+
+_STAND_HEIGHT = 1.2  # [m]
+
+
+def _set_friction(spec: mujoco.MjSpec, value: float) -> None:
+    for geom in spec.geoms:
+        geom.friction = [value, *geom.friction[1:]]
+
+
+def _set_foot_length(spec: mujoco.MjSpec, length: float) -> None:
+    foot = spec.geom("left_foot")
+    foot.size = [foot.size[0], length, 0]
+
+
+@dataclasses.dataclass(frozen=True)
+class WalkerStand(Domain):
+    """Stand: hold the torso high and upright.
+
+    Observation (24,), all after the step: of torso, right thigh, leg and foot, and left thigh, leg and foot, the cosine
+        and sine of the pitch; the height of the torso [m]; velocities of the torso along z and x [m/s] and about y, and
+        of right hip, knee and ankle, and left hip, knee and ankle [rad/s].
+    Action (6,): motor commands of right hip, knee and ankle, and left hip, knee and ankle in [-1, 1]; gears of 100, 50
+        and 20 N m.
+    Reward: (3 * height + upright) / 4 in [0, 1], where height is 1 with the torso at 1.2 m or more and falls as a
+        Gaussian to 0.1 at 0.6 m, and upright goes from 0 (head down) to 1; returns lie in [0, 1000].
+    Start: the torso at its height of 1.3 m and at rest, with its pitch uniform in [-pi, pi] and all joints uniform in
+        their range; limbs may begin inside the floor.
+    Episode: 1000 steps of 0.025 s (ten substeps of 0.0025 s); it never terminates.
+
+    Parameters that can vary:
+        friction: sliding friction of all geoms, the floor's included; HiP-BMDP's ten tasks have 0.7, 0.8, ..., 1.6.
+        foot-length: half-length [m] of the left foot, its mass by density; HiP-BMDP's 0.08, 0.09, ..., 0.17. The right
+            foot keeps 0.1.
+        torso-mass: scale of the torso's mass.
+        mass, damping, gear: scale of all masses, of the damping of all joints, of the strength of all motors.
+            gravity [m/s^2].
+
+    Differs from dm_control in: under MJX the constraint solver stops after ``solver_iterations``.
+    """
+
+    parameters: ClassVar = MappingProxyType(
+        {
+            "friction": Parameter("1", 0.7, _set_friction),
+            "foot-length": Parameter("m", 0.1, _set_foot_length),
+            "torso-mass": body_mass("torso"),
+            "mass": MASS,
+            "gravity": GRAVITY,
+            "damping": DAMPING,
+            "gear": GEAR,
+        }
+    )
+    model_file: ClassVar[str] = "walker.xml"
+    num_substeps: ClassVar[int] = 10
+    episode_steps: ClassVar[int] = 1000
+    default_iterations: ClassVar[int] = 8
+    starts_untouched: ClassVar[bool] = True  # it has no force sensors
+
+    def start(self, task: Task, key: Key) -> tuple[Array, Array]:
+        return start_joints(self.models[0], key), jnp.zeros(self.models[0].nv)
+
+    def observe(self, task: Task, world: World) -> Array:
+        places = self.planar(task, world)
+        axes = jnp.stack([jnp.cos(places.angle), jnp.sin(places.angle)], axis=1)[1:]
+        return jnp.concatenate([axes.ravel(), places.position[1:2, 1], world.qvel])
+
+    def recall(self, task: Task, obs: Array) -> World:
+        model = self.models[0]
+        cosines, sines = obs[:14].reshape(7, 2).T
+        pitch = jnp.pad(jnp.arctan2(sines, cosines), (1, 0))  # the world's is 0
+        bends = model.jnt_axis[2:, 1] * (pitch[1:] - pitch[model.body_parentid[1:]])
+        height = obs[14] - self.leaf(task, "body_pos")[1, 2]
+        return World(jnp.concatenate([jnp.stack([height, 0.0]), bends]), obs[15:], jnp.zeros(model.nv), None)
+
+    def reward(self, task: Task, world: World, action: Array) -> Array:
+        places = self.planar(task, world)
+        standing = tolerance(places.position[1, 1], _STAND_HEIGHT, jnp.inf, _STAND_HEIGHT / 2)
+        upright = (1 + jnp.cos(places.angle[1])) / 2
+        return (3 * standing + upright) / 4
+
+
+@dataclasses.dataclass(frozen=True)
+class WalkerWalk(WalkerStand):
+    """Walk: move forwards at 1 m/s or faster, upright.
+
+    As WalkerStand, but for the reward, which is WalkerStand's times (5 * move + 1) / 6: move is 1 where the forward
+    velocity of the centre of mass is ``speed`` or more, and falls linearly to 0 at rest.
+
+    Further parameter: speed [m/s].
+    """
+
+    parameters: ClassVar = MappingProxyType({**WalkerStand.parameters, "speed": Parameter("m/s", 1.0)})
+    relabels: ClassVar[tuple[str, ...]] = ("speed",)
+
+    def reward(self, task: Task, world: World, action: Array) -> Array:
+        return super().reward(task, world, action) * (5 * self.move(task, world) + 1) / 6
+
+    def move(self, task: Task, world: World) -> Array:
+        """How well the walker moves, () in [0, 1]."""
+        speed = task.goal["speed"]
+        return tolerance(self.forward_velocity(task, world), speed, jnp.inf, speed / 2, "linear", value_at_margin=0.5)
+
+
+@dataclasses.dataclass(frozen=True)
+class WalkerRun(WalkerWalk):
+    """Run: WalkerWalk at 8 m/s."""
+
+    parameters: ClassVar = MappingProxyType({**WalkerStand.parameters, "speed": Parameter("m/s", 8.0)})
+
+
+@dataclasses.dataclass(frozen=True)
+class WalkerSpeed(WalkerWalk):
+    """Speed: move forwards at the task's velocity, neither slower nor faster.
+
+    As WalkerWalk, but move falls linearly on both sides of ``speed``: to 0 at rest and at twice that velocity. (With
+    WalkerWalk's own, whoever masters the fastest task has mastered them all.) The observation does not show the
+    velocity asked for: the task's context does.
+    """
+
+    def move(self, task: Task, world: World) -> Array:
+        speed = task.goal["speed"]
+        return tolerance(self.forward_velocity(task, world), speed, speed, speed / 2, "linear", value_at_margin=0.5)

@@ -1,0 +1,91 @@
+"""What an engine is, and which one runs: MJX-JAX anywhere, MuJoCo C on the CPU, and MJX-Warp on NVIDIA's GPUs.
+
+All advance a world by ``num_substeps`` and then bring the position and velocity sensors up to the new state, as
+dm_control does; force sensors (touch) stay those of the last substep. Worlds are single: the caller maps.
+"""
+
+import contextlib
+import importlib.util
+import io
+from functools import lru_cache
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import mujoco
+
+from mtjax.types import Array, InputError, Task
+
+ENGINES = ("auto", "mjx", "warp", "c")
+
+
+class World(NamedTuple):
+    """The physical state of one simulated world, and what its sensors read in it."""
+
+    qpos: Array  # (nq,) [m or rad]
+    qvel: Array  # (nv,) [m/s or rad/s]
+    warmstart: Array  # (nv,) last constrained acceleration, where the next solve starts
+    sensors: Any  # (nsensordata,); None where the model has none
+    extra: Any = None  # what the domain itself remembers of the episode; no engine touches it
+
+
+class Engine(Protocol):
+    """Physics of every task of one family. ``task`` selects the model; worlds are not batched."""
+
+    def forward(self, task: Task, qpos: Array, qvel: Array, extra: Any = None) -> World: ...
+    def place(self, task: Task, qpos: Array, qvel: Array, extra: Any = None) -> World: ...
+    def step(self, task: Task, world: World, ctrl: Array) -> World: ...
+    def touching(self, task: Task, qpos: Array) -> Array: ...
+
+
+def choose_engine(engine: str, preferred: str = "mjx") -> str:
+    """Return the engine that runs for ``engine``: where that is "auto", MuJoCo C on a CPU.
+
+    Args:
+        preferred: what "auto" is elsewhere, "mjx" or "warp"; MJX where Warp cannot run.
+
+    Raises:
+        InputError: the engine that is asked for cannot run on this device, or Warp is not installed.
+    """
+    device = jax.default_backend()
+    nvidia = device == "gpu" and "rocm" not in jax.devices()[0].client.platform_version.lower()
+    if engine == "auto" and device == "cpu":
+        return "c"
+    if engine == "auto":
+        return "warp" if preferred == "warp" and nvidia and _warp_installed() else "mjx"
+    if engine == "c" and device != "cpu":
+        raise InputError(f"engine 'c' needs JAX on the CPU, not on {device}; use --engine=mjx")
+    if engine == "warp" and not (nvidia or device == "cpu"):
+        raise InputError("engine 'warp' needs an NVIDIA GPU (or a CPU, where it is slow); use --engine=mjx")
+    if engine == "warp" and not _warp_installed():
+        raise InputError("engine 'warp' needs Warp, which is not installed: pip install 'mtjax[warp]'; or --engine=mjx")
+    return engine
+
+
+def _warp_installed() -> bool:
+    return importlib.util.find_spec("warp") is not None
+
+
+@lru_cache
+def mjx_module() -> Any:
+    """Import MJX, without its remark on standard output that Warp is not installed."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        from mujoco import mjx
+    return mjx
+
+
+def some(values: Array) -> Array | None:
+    """Return values, or None where there are none: arrays of size 0 can be neither reshaped by halves nor saved."""
+    return values if values.size else None
+
+
+def require_plain(model: mujoco.MjModel) -> None:
+    """Refuse a model whose state is more than positions and velocities.
+
+    Raises:
+        InputError: actuators with activations, delays, or a clock among the sensors.
+    """
+    if model.na or model.nhistory or mujoco.mjtSensor.mjSENS_CLOCK in model.sensor_type:
+        raise InputError(
+            "a model must have no state but positions and velocities, and this one has actuators with activations or "
+            "delays, sensors with delays or a clock"
+        )

@@ -1,0 +1,103 @@
+"""MuJoCo's JAX port, which runs on any device."""
+
+import dataclasses
+from functools import cached_property
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from mtjax.envs.engines.base import World, mjx_module, require_plain, some
+from mtjax.types import Array, Task
+
+# Sensors that read more than poses and velocities of bodies: these need the whole position and velocity stages.
+_INVOLVED = [getattr(mujoco.mjtSensor, f"mjSENS_{x}") for x in "TENDONPOS TENDONVEL ACTUATORPOS ACTUATORVEL".split()]
+_INVOLVED += [mujoco.mjtSensor.mjSENS_CONTACT, mujoco.mjtSensor.mjSENS_CAMPROJECTION]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Mjx:
+    """MuJoCo's JAX port: pure, and the reference on every device."""
+
+    base: mujoco.MjModel
+    num_substeps: int
+
+    def __post_init__(self):
+        require_plain(self.base)
+
+    @cached_property
+    def _constants(self) -> tuple[Any, Any]:
+        mjx = mjx_module()
+        with jax.ensure_compile_time_eval():
+            own = jax.local_devices()[0]  # the first of all may be another process's
+            return mjx.put_model(self.base, own, "jax"), mjx.make_data(self.base, own, "jax")
+
+    @cached_property
+    def _feels(self) -> bool:
+        return mujoco.mjtStage.mjSTAGE_ACC in self.base.sensor_needstage
+
+    def _bind(self, task: Task, qpos: Array, qvel: Array | None = None) -> tuple[Any, Any]:
+        """The task's model, and data in the given state."""
+        model, data = self._constants
+        leaves = {name: leaf for name, leaf in task.model.items() if name != "site_size"}
+        return model.tree_replace(leaves), data.replace(qpos=qpos, qvel=data.qvel if qvel is None else qvel)
+
+    def forward(self, task: Task, qpos: Array, qvel: Array, extra: Any = None) -> World:
+        """Put a world in a state without controls, and solve for the forces in it."""
+        if not self._feels:
+            return self.place(task, qpos, qvel, extra)
+        model, data = self._bind(task, qpos, qvel)
+        with jax.default_matmul_precision("highest"):
+            data = self._feel(task, model, mjx_module().forward(model, data))
+        return World(qpos, qvel, jnp.zeros_like(qvel), data.sensordata, extra)
+
+    def place(self, task: Task, qpos: Array, qvel: Array, extra: Any = None) -> World:
+        """Put a world in a state in which no force sensor is touched; far cheaper to compile than ``forward``."""
+        sensors = some(jnp.zeros(self.base.nsensordata, qpos.dtype))
+        return self.sense(task, World(qpos, qvel, jnp.zeros_like(qvel), sensors, extra))
+
+    def step(self, task: Task, world: World, ctrl: Array) -> World:
+        """Advance one control step under ``ctrl`` (nu,)."""
+        model, data = self._bind(task, world.qpos, world.qvel)
+
+        def substep(_, world: World) -> World:
+            now = data.replace(qpos=world.qpos, qvel=world.qvel, qacc_warmstart=world.warmstart, ctrl=ctrl)
+            new = self._feel(task, model, mjx_module().step(model, now))
+            sensors = new.sensordata if self._feels else world.sensors  # unread, they are never computed
+            return World(new.qpos, new.qvel, new.qacc_warmstart, sensors, world.extra)
+
+        with jax.default_matmul_precision("highest"):
+            world = jax.lax.fori_loop(0, self.num_substeps, substep, world)
+        return self.sense(task, world)
+
+    def touching(self, task: Task, qpos: Array) -> Array:
+        """Whether any two colliding geoms overlap in the positions ``qpos`` (nq,)."""
+        mjx = mjx_module()
+        model, data = self._bind(task, qpos)
+        with jax.default_matmul_precision("highest"):
+            data = mjx.collision(model, mjx.com_pos(model, mjx.kinematics(model, data)))
+        return jnp.any(data._impl.contact.dist < 0)
+
+    def sense(self, task: Task, world: World) -> World:
+        """Bring position and velocity sensors to the world's state; force sensors stay as they are."""
+        if np.all(self.base.sensor_needstage == mujoco.mjtStage.mjSTAGE_ACC):
+            return world
+        mjx = mjx_module()
+        model, data = self._bind(task, world.qpos, world.qvel)
+        involved = np.any(np.isin(self.base.sensor_type, _INVOLVED))
+        positions = mjx.fwd_position if involved else lambda m, d: mjx.com_pos(m, mjx.kinematics(m, d))
+        velocities = mjx.fwd_velocity if involved else mjx.com_vel
+        with jax.default_matmul_precision("highest"):
+            data = mjx.sensor_pos(model, positions(model, data.replace(sensordata=world.sensors)))
+            data = mjx.sensor_vel(model, velocities(model, data))
+        return world._replace(sensors=data.sensordata)
+
+    def _feel(self, task: Task, model: Any, data: Any) -> Any:
+        """Read the force sensors where MJX has not, or not with the task's own sizes of the sites that feel."""
+        if "site_size" in task.model:  # static to MJX, so that it cannot differ between tasks in the model itself
+            return mjx_module().sensor_acc(model.replace(site_size=task.model["site_size"]), data)
+        if self._feels and data._impl.efc_J.size == 0:  # MJX returns early where nothing constrains the motion
+            return mjx_module().sensor_acc(model, data)
+        return data

@@ -1,0 +1,1 @@
+"""MTEnv's own environments."""

@@ -1,0 +1,1 @@
+"""What learners learn from: replay, and what is drawn from it."""

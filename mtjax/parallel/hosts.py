@@ -1,0 +1,88 @@
+"""Several processes of one run, on one host or on many, by ``jax.distributed``."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jax.experimental import multihost_utils
+
+from mtjax.types import InputError
+
+_VARIABLES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
+_LAUNCHERS = ("SLURM_JOB_ID", "OMPI_MCA_orte_hnp_uri", "TPU_WORKER_ID", "KUBERNETES_SERVICE_HOST")  # that JAX reads
+_LONGEST_PATH = 4096
+_PATIENCE = 60  # seconds for which a process that ends, or fails, waits for the others before it ends them as well
+
+
+def initialise() -> None:
+    """Join the processes of a run on several hosts; before anything touches a device.
+
+    JAX finds the others by itself under SLURM, Open MPI, Kubernetes and on TPUs. Other launchers say in each process
+    where process 0 listens (JAX_COORDINATOR_ADDRESS, host:port), how many processes there are (JAX_NUM_PROCESSES), and
+    which of them this is (JAX_PROCESS_ID, from 0).
+
+    Raises:
+        InputError: nothing says so, or the processes do not find each other.
+    """
+    given = {name: os.environ[name] for name in _VARIABLES if os.environ.get(name)}
+    launched = any(name in os.environ for name in _LAUNCHERS)
+    if len(given) < len(_VARIABLES) and not launched:
+        missing = ", ".join(name for name in _VARIABLES if name not in given)
+        raise InputError(
+            f"--distributed needs a launcher that JAX knows (SLURM's srun, Open MPI, Kubernetes, TPUs), or {missing} "
+            "in the environment"
+        )
+    address, count, index = (given.get(name) for name in _VARIABLES)
+    try:
+        number = lambda text: None if text is None else int(text)
+        jax.distributed.initialize(address, number(count), number(index), shutdown_timeout_seconds=_PATIENCE)
+    except (ValueError, RuntimeError) as error:
+        reason = str(error).strip().splitlines()[0][:150]
+        raise InputError(f"--distributed cannot join the other processes: {reason}") from None
+
+
+def is_first() -> bool:
+    """Whether this is the process that writes and prints: the only one, or number 0."""
+    return jax.process_index() == 0
+
+
+def wait() -> None:
+    """Go on once every process is here, so that none times how long another compiles."""
+    if jax.process_count() > 1:
+        multihost_utils.sync_global_devices("mtjax")
+
+
+def gather(tree: Any) -> Any:
+    """Arrays (S, ...) whole, on every host."""
+    return jax.device_get(tree) if jax.process_count() == 1 else multihost_utils.process_allgather(tree, tiled=True)
+
+
+def anywhere(flag: bool) -> bool:
+    """Whether a flag is up in any process; all must ask."""
+    return flag if jax.process_count() == 1 else bool(np.any(multihost_utils.process_allgather(np.asarray(flag))))
+
+
+def agreed(choose: Callable[[], Path]) -> Path:
+    """The path that the first process chooses, in every process; all must ask.
+
+    Raises:
+        InputError: the first process could not choose, and says why itself.
+    """
+    if jax.process_count() == 1:
+        return choose()
+    chosen, failed = b"", None
+    if is_first():
+        try:
+            chosen = os.fsencode(choose().absolute())
+        except (OSError, InputError) as error:
+            failed = error
+    told = multihost_utils.broadcast_one_to_all(np.frombuffer(chosen.ljust(_LONGEST_PATH, b"\0"), np.uint8))
+    path = bytes(told).rstrip(b"\0")
+    if failed is not None:
+        raise failed
+    if not path:
+        raise InputError("process 0 could not make the run's folder")
+    return Path(os.fsdecode(path))

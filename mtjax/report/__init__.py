@@ -1,0 +1,1 @@
+"""Statistics, figures, films, diagnostics and tables of what was learned."""

@@ -1,0 +1,292 @@
+"""Diagnostics of a trained agent: whether its tasks pull its parameters apart, and how much of its networks is in use.
+
+They are taken on the training tasks, from the agent and the replay of a run's last checkpoint, by fixed keys. Gradients
+are of the agent's own losses, each task's alone, whatever rule combined them in training; importance of tasks is left
+out. What tasks do not share has no cosines: tasks cannot conflict over it.
+"""
+
+import json
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mtjax.agents import SAC
+from mtjax.agents.parts.gradients import surgery
+from mtjax.experience import replay as rings
+from mtjax.experience.replay import Replay
+from mtjax.networks import Network, Params, ReLU
+from mtjax.report import figures
+from mtjax.training.policy import Policy
+from mtjax.types import Array, InputError, Key, Metrics, Task, Transition
+
+DRAWS = 16
+"""Batches over which gradients, and what follows from them, are averaged."""
+SAMPLE = 1024
+"""Transitions of each task on which units and features are looked at."""
+DORMANT = 0.025
+"""tau: a unit is dormant if its activity is at most this share of its layer's mean (Sokar et al. 2023)."""
+HELD = 0.99
+"""1 - delta: the share of the sum of singular values that an effective rank holds (Kumar et al. 2021)."""
+
+
+class Findings(NamedTuple):
+    """What was found of the critics or of the actor, on average over seeds (and over critics)."""
+
+    gram: Any  # (T, T) inner products of the tasks' gradients on shared parameters; None if there are none
+    cosine: Any  # (T, T) their cosines, or None
+    conflict: Any  # () share of pairs of tasks with a negative cosine, or None
+    gradient_norm: Any  # (T,) lengths on shared parameters; where there are none, on the task's own
+    dormant: Any  # () share of dormant units
+    dormant_by_layer: dict[str, Any]  # the same for each layer of ReLUs
+    rank: Any  # () effective rank of the hidden layer on which heads stand: singular values that hold 99% of the sum
+    entropy_rank: Any  # () the same by Roy and Vetterli (2007): exp of the singular values' entropy
+    width: int  # units in that layer
+
+
+class Diagnostics(NamedTuple):
+    """What was found of an agent."""
+
+    critic: Findings
+    actor: Findings
+    td_error: Any  # (T,) mean |Q - target|, in the units of the rewards that the critics learn from
+    batch_size: int
+    seeds: int
+
+
+def diagnose(policy: Policy, replay: Replay, batch_size: int) -> Diagnostics:
+    """Look at every seed of a run, and average.
+
+    Args:
+        replay: rows (S, T, H, E, ...).
+        batch_size: transitions of a task in each batch; the run's own makes norms those of training.
+
+    Raises:
+        InputError: the replay is empty.
+    """
+    if not int(replay.size):
+        raise InputError("the replay of this run is empty; train it for longer")
+    tasks, agent = policy.env.tasks("train"), policy.agent
+    found = []
+    for s in range(len(policy.seeds)):
+        state, rows = jax.tree.map(lambda x, s=s: x[s], (policy.states, replay.rows))
+        gradient_key, sample_key = jax.random.split(jax.random.key(0))
+        of_seed = replay._replace(rows=rows)
+        gradients = _average_gradients(agent, state, of_seed, tasks, gradient_key, batch_size)
+        activity = _sample_activity(agent, state, of_seed, tasks, sample_key)
+        found.append(_summarise(agent, state, gradients, activity))
+    critic, actor, td_error = jax.tree.map(lambda *x: np.mean(x, axis=0), *found)
+    critic, actor = (x._replace(width=int(x.width)) for x in (critic, actor))
+    return Diagnostics(critic, actor, td_error, batch_size, len(found))
+
+
+def _summarise(agent: SAC, state: Any, gradients: Mapping, activity: Mapping) -> tuple[Findings, Findings, np.ndarray]:
+    of = lambda name, network, params: Findings(
+        **jax.device_get(gradients[name]), **utilisation(network, params, jax.device_get(activity[name]))
+    )
+    critic, actor = of("critic", agent.critic, state.critic), of("actor", agent.actor, state.actor)
+    return critic, actor, np.asarray(gradients["td_error"])
+
+
+# Gradients.
+
+
+@partial(jax.jit, static_argnums=(0, 5))
+def _average_gradients(agent: SAC, state: Any, replay: Replay, tasks: Task, key: Key, batch_size: int) -> dict:
+    def draw(key: Key) -> dict:
+        batch_key, loss_key = jax.random.split(key)
+        return compare_gradients(agent, state, rings.sample(replay, batch_key, batch_size), tasks, loss_key)
+
+    return jax.tree.map(lambda x: jnp.mean(x, axis=0), jax.lax.map(draw, jax.random.split(key, DRAWS)))
+
+
+def compare_gradients(agent: SAC, state: Any, batch: Transition, tasks: Task, key: Key) -> dict[str, Any]:
+    """Differentiate the agent's losses on a batch (T, B, ...), for each task alone.
+
+    Returns:
+        "critic" and "actor": gram, cosine, conflict and gradient_norm, as in ``Findings``; "td_error" (T,).
+    """
+    target_key, actor_key = jax.random.split(key)
+    state, batch, features, temperature = agent.prepare(state, batch, tasks)
+    critic, aux = _compare(state.critic, *agent.critic_problem(state, batch, features, temperature, target_key))
+    actor, _ = _compare(state.actor, *agent.actor_problem(state.critic, batch, features, temperature, actor_key))
+    return {"critic": critic, "actor": actor, "td_error": aux["td_error"]}
+
+
+def _compare(params: Params, loss: Callable, data: Any) -> tuple[dict[str, Any], Metrics]:
+    one_task = lambda shared, own, data: loss(Params(shared, own), data)
+    differentiate = jax.vmap(jax.grad(one_task, argnums=(0, 1), has_aux=True), (None, 0, 0))
+    (shared, own), aux = differentiate(params.shared, params.own, data)
+    share = bool(jax.tree.leaves(shared))
+    gram = surgery.gram_matrix(shared if share else own)
+    cosine, lengths = surgery.cosines(gram)
+    found = {"gram": gram, "cosine": cosine, "conflict": surgery.conflicts(gram)["conflict"]}
+    return {**(found if share else dict.fromkeys(found)), "gradient_norm": lengths}, aux
+
+
+# Units.
+
+
+class Activity(NamedTuple):
+    """What a network's units do. A single transition's has no leading axes."""
+
+    layers: dict[str, Any]  # (..., units) of each layer of ReLUs
+    hidden: Any  # (..., width), the layer on which heads stand
+
+
+@partial(jax.jit, static_argnums=0)
+def _sample_activity(agent: SAC, state: Any, replay: Replay, tasks: Task, key: Key) -> dict[str, Activity]:
+    return activity(agent, state, rings.sample(replay, key, SAMPLE), tasks)
+
+
+def activity(agent: SAC, state: Any, batch: Transition, tasks: Task) -> dict[str, Activity]:
+    """Watch "critic" and "actor" on a batch (T, B, ...). A representation under both is counted as the actor's.
+
+    Returns:
+        mean activity over the batch (T, N, units), and hidden layers (T, B, N, width); N is 1 for the actor.
+    """
+    state, batch, features, _ = agent.prepare(state, batch, tasks)
+    shape = (*batch.reward.shape, features.shape[-1])
+    features = jnp.broadcast_to(features if features.ndim == 3 else features[:, None], shape)
+
+    def one(actor: Params, critic: Params, features: Array, obs: Array, action: Array) -> dict[str, Activity]:
+        judging = agent.of_critics(partial(watch, agent.critic.apply), critic, features, obs, action)
+        acting = watch(agent.policy, actor, critic, features, obs)
+        return {"critic": judging, "actor": jax.tree.map(lambda x: x[None], acting)}
+
+    over_tasks = Params(shared=None, own=0)  # type: ignore
+    every = jax.vmap(jax.vmap(one, (None, None, 0, 0, 0)), (over_tasks, over_tasks, 0, 0, 0))
+    seen = every(state.actor, state.critic, features, batch.obs, batch.action)
+    level = lambda x: jnp.mean(jnp.abs(x), axis=1).reshape(*x.shape[:1], x.shape[2], -1)
+    return {name: Activity(jax.tree.map(level, x.layers), x.hidden) for name, x in seen.items()}
+
+
+def watch(function: Callable, *arguments: Any) -> Activity:
+    """Evaluate networks on a single transition and note what every ReLU, and the last body, puts out.
+
+    Layers are named by the path of modules to them.
+    """
+    outermost, layers, outputs = [], {}, []
+
+    def note(call: Callable, args: tuple, kwargs: dict, context: Any) -> Any:
+        module = context.module
+        first = not outermost
+        if first:
+            outermost.append(type(module).__name__)
+        output = call(*args, **kwargs)
+        if isinstance(module, ReLU):
+            name = "/".join((*outermost, *module.path))
+            layers[f"{name}:{len(layers)}" if name in layers else name] = output
+        if first:
+            outermost.clear()
+            outputs.append(output)
+        return output
+
+    with nn.intercept_methods(note):
+        function(*arguments)
+    return Activity(layers, outputs[-1])
+
+
+def utilisation(network: Network, params: Params, seen: Activity) -> dict[str, Any]:
+    """Dormant units and effective ranks, as in ``Findings``, of what ``activity`` gave."""
+    disjoint, front = "body" in params.own, type(network.front).__name__
+    by_layer, units = {}, {}
+    for name, levels in seen.layers.items():
+        levels = levels if disjoint or name.split("/")[0] == front else np.mean(levels, axis=0)
+        by_layer[name], units[name] = dormant_share(levels), levels.shape[-1]
+    total = sum(units.values())
+    features = np.moveaxis(seen.hidden, 2, 0)  # (N, T, B, width)
+    num_networks, num_tasks, _, width = features.shape
+    num_networks *= num_tasks if disjoint else 1
+    ranks = [effective_ranks(x) for x in features.reshape(num_networks, -1, width)]
+    rank, entropy_rank = np.mean(ranks, axis=0)
+    return {
+        "dormant": sum(by_layer[name] * units[name] for name in units) / total if total else np.nan,
+        "dormant_by_layer": by_layer,
+        "rank": rank,
+        "entropy_rank": entropy_rank,
+        "width": width,
+    }
+
+
+def dormant_share(levels: np.ndarray) -> float:
+    """The share of units of which the mean activity (..., units) is at most DORMANT times their layer's mean."""
+    return float(np.mean(levels <= DORMANT * np.mean(levels, axis=-1, keepdims=True)))
+
+
+def effective_ranks(features: np.ndarray) -> tuple[float, float]:
+    """Effective ranks of features (rows, width), by their singular values s_1 >= s_2 >= ... and p = s / sum s.
+
+    Returns:
+        the least k with p_1 + ... + p_k >= HELD ("srank", Kumar et al. 2021), and exp(-sum p log p) (Roy and Vetterli
+        2007); 0 and 0 for features that are 0.
+    """
+    values = np.linalg.svd(np.asarray(features, np.float64), compute_uv=False)
+    if not values[0] > 0:
+        return 0.0, 0.0
+    shares = values / np.sum(values)
+    rank = 1 + np.sum(np.cumsum(shares) < HELD - 1e-9)
+    present = shares[shares > 0]
+    return float(rank), float(np.exp(-np.sum(present * np.log(present))))
+
+
+# Reporting.
+
+
+def table(policy: Policy, found: Diagnostics) -> str:
+    """Lay out what was found: a line a network, and a line a task."""
+    lines = [
+        f"training tasks, {DRAWS} batches of {found.batch_size} transitions of each:",
+        f"{'network':10} {'cosine':>7} {'conflict':>9} {'dormant':>8}   effective rank",
+    ]
+    for name, x in (("critic", found.critic), ("actor", found.actor)):
+        cosine, conflict = "-", "-"
+        if x.cosine is not None and len(x.cosine) > 1:
+            cosine, conflict = f"{mean_cosine(x.cosine):.2f}", f"{x.conflict:.0%}"
+        lines.append(f"{name:10} {cosine:>7} {conflict:>9} {x.dormant:>8.1%}   {x.rank:.0f} of {x.width}")
+    for name, x in (("critic", found.critic), ("actor", found.actor)):
+        if x.cosine is None:
+            lines.append(f"tasks share no parameters of the {name}, over which they could conflict")
+    lines.append(f"{policy.env.task_axis[0]:>10} {'TD error':>9} {'critic gradient':>16} {'actor gradient':>15}")
+    rows = zip(found.td_error, found.critic.gradient_norm, found.actor.gradient_norm, strict=True)
+    for value, (error, critic, actor) in zip(policy.env.task_values("train"), rows, strict=True):
+        lines.append(f"{value:10.4g} {error:9.3g} {critic:16.3g} {actor:15.3g}")
+    return "\n".join(lines)
+
+
+def mean_cosine(cosine: np.ndarray) -> float:
+    """The mean over pairs of different tasks; NaN for a single task."""
+    pairs = cosine[~np.eye(len(cosine), dtype=bool)]
+    return float(np.mean(pairs)) if pairs.size else np.nan
+
+
+def write(policy: Policy, found: Diagnostics, directory: Path) -> None:
+    """Write ``diagnostics.json`` and ``diagnostics.png``."""
+    name, unit = policy.env.task_axis
+    values = policy.env.task_values("train")
+    record = {"parameter": name, "unit": unit, "values": values, "draws": DRAWS, "sample": SAMPLE}
+    networks = {"critic": found.critic._asdict(), "actor": found.actor._asdict()}
+    record = _plain({**record, **found._asdict(), **networks})
+    (directory / "diagnostics.json").write_text(json.dumps(record, indent=1, allow_nan=False) + "\n")
+    cosines = {who: x["cosine"] for who, x in networks.items()}
+    bars = {f"length of the {who}'s gradient": x["gradient_norm"] for who, x in networks.items()}
+    bars["mean TD error"] = found.td_error
+    figures.interference(directory / "diagnostics.png", name, unit, values, cosines, bars)
+
+
+def _plain(x: Any) -> Any:
+    """As JSON takes it: lists, numbers of seven digits, and null for what is not a number."""
+    if isinstance(x, Mapping):
+        return {str(k): _plain(v) for k, v in x.items()}
+    if isinstance(x, np.ndarray | np.generic):
+        return _plain(x.tolist())
+    if isinstance(x, list | tuple):
+        return [_plain(v) for v in x]
+    if isinstance(x, float):
+        return float(f"{x:.7g}") if np.isfinite(x) else None
+    return x

@@ -1,0 +1,218 @@
+"""Figures of returns and of diagnostics, written to PNG files without a display.
+
+Axes: ``S`` seeds, ``V`` evaluations, ``T`` tasks, ``E`` episodes. Bands and bars are 95 % percentile bootstrap
+intervals over seeds; there are none for a single seed. Whole seeds are resampled, because one agent learns all tasks.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mtjax.report.stats import mean_interval
+from mtjax.types import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
+    from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
+
+# Okabe and Ito's palette, which colour-blind readers can tell apart, without its yellow.
+_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")  # one more than colours, so that later pairs differ too
+_DOTS_PER_INCH = 120
+
+
+def learning_curve(path: str | Path, steps: np.ndarray, returns: Mapping[str, np.ndarray], title: str) -> None:
+    """Draw return against environment steps, one line a split: the mean over seeds, tasks and episodes.
+
+    Args:
+        path: the PNG file to write.
+        steps: (V,) environment steps at the evaluations.
+        returns: split -> (S, V, T, E); an empty array is left out.
+        title: title of the figure.
+    """
+    figure, axes = _new_figure()
+    for index, (split, values) in enumerate(returns.items()):
+        if np.size(values):
+            _draw_curve(axes, steps, values, f"{split} ({_count(np.shape(values)[2], 'task')})", index)
+    _label_steps(axes)
+    axes.set_title(title)
+    _save(figure, axes, path)
+
+
+def return_by_parameter(
+    path: str | Path,
+    parameter: str,
+    unit: str,
+    values: Mapping[str, np.ndarray],
+    returns: Mapping[str, np.ndarray],
+) -> None:
+    """Draw each task's mean return against its parameter, one marker shape a split.
+
+    Args:
+        path: the PNG file to write.
+        parameter: name of the parameter.
+        unit: its unit.
+        values: split -> (T,) the tasks' values of the parameter.
+        returns: split -> (S, T, E); an empty array is left out.
+    """
+    figure, axes = _new_figure()
+    for index, (split, scores) in enumerate(returns.items()):
+        if np.size(scores):
+            _draw_points(axes, values[split], scores, split, index)
+    axes.set_xlabel(f"{parameter} [{unit}]")
+    _save(figure, axes, path)
+
+
+def compare(
+    path: str | Path, curves: Mapping[str, tuple[np.ndarray, np.ndarray]], label: str = "return on training tasks"
+) -> None:
+    """Draw several agents' returns against environment steps.
+
+    Args:
+        path: the PNG file to write.
+        curves: agent -> (steps (V,), returns on the training tasks (S, V, T, E)).
+        label: of the axis of returns.
+    """
+    figure, axes = _new_figure()
+    many = len(curves) > len(_COLOURS)
+    if many:
+        figure.set_size_inches(9, 6)
+    for index, (agent, (steps, returns)) in enumerate(curves.items()):
+        if np.size(returns):
+            _draw_curve(axes, steps, returns, f"{agent} ({_count(len(returns), 'seed')})", index)
+    _label_steps(axes)
+    axes.set_ylabel(label)
+    _save(figure, axes, path, beside=many)
+
+
+def interference(
+    path: str | Path,
+    parameter: str,
+    unit: str,
+    values: np.ndarray,
+    cosines: Mapping[str, np.ndarray | None],
+    bars: Mapping[str, np.ndarray],
+) -> None:
+    """Draw how the training tasks' gradients agree, a heat map for each network, and below it bars for each task.
+
+    Args:
+        path: the PNG file to write.
+        parameter: name of the parameter in which tasks differ.
+        unit: its unit.
+        values: (T,) the tasks' values of it.
+        cosines: network -> (T, T), or None if tasks share nothing of it.
+        bars: title -> (T,).
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 7.5), dpi=_DOTS_PER_INCH, layout="constrained")
+    above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(1.75, 1))[:, 0]
+    labels, name = [f"{value:.3g}" for value in values], f"{parameter} [{unit}]"
+    maps, given = above.subplots(1, len(cosines), squeeze=False)[0], [x for x in cosines.values() if x is not None]
+    limit = max((_limit(x) for x in given), default=1.0)
+    images = [_draw_cosines(axes, who, x, limit) for axes, (who, x) in zip(maps, cosines.items(), strict=True)]
+    for axes in (axes for axes, image in zip(maps, images, strict=True) if image is not None):
+        _label_tasks(axes.xaxis, labels, name)
+        _label_tasks(axes.yaxis, labels, name)
+    if drawn := [image for image in images if image is not None]:
+        above.colorbar(drawn[0], ax=list(maps), label="cosine of two tasks' gradients", shrink=0.8)
+    charts = below.subplots(1, len(bars), squeeze=False)[0]
+    for index, (axes, (title, heights)) in enumerate(zip(charts, bars.items(), strict=True)):
+        axes.bar(range(len(heights)), heights, color=_COLOURS[index], width=0.7)
+        axes.set_title(title)
+        axes.grid(axis="y", color="0.9")
+        axes.set_axisbelow(True)
+        axes.spines[["top", "right"]].set_visible(False)
+        _label_tasks(axes.xaxis, labels, name)
+    figure.savefig(path, dpi=_DOTS_PER_INCH)
+
+
+def _draw_cosines(axes: "Axes", network: str, cosine: np.ndarray | None, limit: float) -> "AxesImage | None":
+    axes.set_title(network)
+    axes.set_facecolor("0.92")
+    axes.set_box_aspect(1)
+    axes.spines[:].set_visible(False)
+    if cosine is None:
+        axes.set_xticks([])
+        axes.set_yticks([])
+        axes.text(0.5, 0.5, "tasks share no parameters,\nso none can conflict", ha="center", va="center", color="0.3")
+        return None
+    pairs = np.ma.masked_array(cosine, np.eye(len(cosine), dtype=bool))  # each task's with itself is 1
+    image = axes.imshow(pairs, cmap="RdBu", vmin=-limit, vmax=limit)
+    if len(cosine) <= 10:
+        for (row, column), value in np.ndenumerate(cosine):
+            if row != column:
+                colour = "white" if abs(value) > 0.65 * limit else "black"
+                axes.text(column, row, f"{value:.2f}", ha="center", va="center", fontsize=7, color=colour)
+    return image
+
+
+def _limit(cosine: np.ndarray) -> float:
+    """A round number that no cosine between different tasks exceeds."""
+    largest = np.max(np.abs(cosine[~np.eye(len(cosine), dtype=bool)]), initial=0.0)
+    return next((limit for limit in (0.1, 0.2, 0.5) if largest <= limit), 1.0)
+
+
+def _label_tasks(axis: "Axis", labels: list[str], name: str) -> None:
+    """Put tasks' values on an axis: all of up to ten, else some."""
+    every = -(-len(labels) // 10)
+    axis.set_ticks(range(0, len(labels), every), labels[::every])
+    axis.set_tick_params(length=0, labelsize=8, labelrotation=45 if axis.axis_name == "x" and len(labels) > 5 else 0)
+    axis.set_label_text(name)
+
+
+def _new_figure() -> tuple["Figure", "Axes"]:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6, 4), dpi=_DOTS_PER_INCH, layout="constrained")
+    axes = figure.add_subplot()
+    axes.set_ylabel("return")
+    axes.grid(color="0.9")
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure, axes
+
+
+def _draw_curve(axes: "Axes", steps: np.ndarray, returns: np.ndarray, label: str, index: int) -> None:
+    mean, low, high = _intervals(np.mean(returns, axis=(2, 3)))
+    colour, marker = _COLOURS[index % len(_COLOURS)], _MARKERS[index % len(_MARKERS)]
+    every = max(1, len(mean) // 10)
+    axes.plot(steps, mean, color=colour, marker=marker, markersize=4, markevery=every, label=label)
+    axes.fill_between(steps, low, high, color=colour, alpha=0.15, linewidth=0)
+
+
+def _draw_points(axes: "Axes", values: np.ndarray, returns: np.ndarray, label: str, index: int) -> None:
+    mean, low, high = _intervals(np.mean(returns, axis=2))
+    colour, marker = _COLOURS[index % len(_COLOURS)], _MARKERS[index % len(_MARKERS)]
+    # Rounding can put the bounds of equal seeds on the wrong side of their mean, which Matplotlib refuses.
+    bars = np.maximum([mean - low, high - mean], 0)
+    axes.errorbar(values, mean, bars, color=colour, fmt=marker, markersize=6, capsize=3, label=label)
+
+
+def _intervals(scores: np.ndarray) -> np.ndarray:
+    """Return mean, low and high (3, columns) over the seeds of scores (S, columns)."""
+    return np.array([mean_interval(column[:, None]) for column in scores.T]).T
+
+
+def _label_steps(axes: "Axes") -> None:
+    from matplotlib.ticker import EngFormatter, MaxNLocator
+
+    axes.set_xlabel("environment steps")
+    axes.xaxis.set_major_locator(MaxNLocator("auto", steps=[1, 2, 5, 10], integer=True, min_n_ticks=1))
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def _save(figure: "Figure", axes: "Axes", path: str | Path, beside: bool = False) -> None:
+    if not axes.get_legend_handles_labels()[1]:
+        raise InputError(f"there is nothing to draw in {path}: every array of returns is empty")
+    axes.set_ylim(bottom=0)
+    axes.legend(frameon=False, **({"loc": "center left", "bbox_to_anchor": (1, 0.5)} if beside else {}))
+    figure.savefig(path, dpi=_DOTS_PER_INCH)

@@ -1,0 +1,1 @@
+"""Runs: the host's loop, their folders and checkpoints, sweeps, fine-tuning and trained policies."""

@@ -1,0 +1,120 @@
+"""Checkpoints of the whole training state, by orbax: what a run needs to go on bit for bit."""
+
+import json
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from mtjax.experience.replay import Replay
+from mtjax.loop import TrainState
+from mtjax.types import InputError
+
+_KEPT = 2
+_SIZES = "sizes.json"  # of a checkpoint's files, to know a damaged one before orbax meets it
+
+
+def save(directory: Path, state: TrainState) -> None:
+    """Write the state under its iteration; the last two checkpoints are kept."""
+    from orbax.checkpoint import v1 as ocp
+
+    iteration = int(state.iteration)
+    with ocp.training.Checkpointer(
+        str(directory.absolute()),
+        save_decision_policy=ocp.training.save_decision_policies.FixedIntervalPolicy(1),  # type: ignore
+        preservation_policy=ocp.training.preservation_policies.LatestN(_KEPT),  # type: ignore
+    ) as checkpointer:
+        known = checkpointer.latest
+        if known is None or known.step != iteration:
+            checkpointer.save_checkpointables(iteration, {"agent": state.agent, "loop": state._replace(agent=None)})
+    folder = directory / str(iteration)
+    if jax.process_index() == 0:
+        (folder / _SIZES).write_text(json.dumps(_sizes(folder)))
+
+
+def load(directory: Path, like: TrainState) -> TrainState:
+    """Read the newest checkpoint into the structure of ``like`` (shapes alone suffice), onto the devices it names.
+
+    Those need not be as many as saved it; where none are named, the first one is meant.
+    """
+    found = _load(directory, {"agent": like.agent, "loop": like._replace(agent=None)})
+    return found["loop"]._replace(agent=found["agent"])
+
+
+def load_agent(directory: Path, like: TrainState) -> Any:
+    """Read only the agent's state, which is all that acting needs."""
+    return _load(directory, {"agent": like.agent})["agent"]
+
+
+def load_replay(directory: Path, like: TrainState) -> Replay:
+    """Read only the replay, without the worlds and the agent."""
+    return _load(directory, {"loop": {"replay": like.replay}}, partial=True)["loop"]["replay"]
+
+
+def _sizes(folder: Path) -> dict[str, int]:
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != _SIZES)
+    return {str(path.relative_to(folder)): path.stat().st_size for path in files}
+
+
+def _newest(directory: Path) -> Path:
+    """The folder of the newest checkpoint; those still being written have longer names."""
+    folders = [path for path in directory.glob("*") if path.name.isdigit()]
+    if not folders:
+        raise InputError(f"{str(directory)!r} holds no checkpoint; the run stopped before its first one")
+    return max(folders, key=lambda path: int(path.name))
+
+
+def _require_whole(folder: Path, parts: Iterable[str]) -> None:
+    """Refuse a damaged checkpoint, as orbax would answer it with pages of its threads' tracebacks."""
+    if not (folder / _SIZES).exists():  # the run was killed just before it wrote them
+        return
+    try:
+        expected, found = json.loads((folder / _SIZES).read_text()), _sizes(folder)
+        needed = [name for name in expected if "/" not in name or name.split("/")[0] in parts]
+        damaged = next((name for name in needed if found.get(name) != expected[name]), None)
+    except (ValueError, AttributeError):
+        damaged = _SIZES
+    if damaged is not None:
+        raise InputError(
+            f"the checkpoint {str(folder)!r} is damaged: {damaged} is missing or has changed; "
+            "without this folder, the one before it is the newest"
+        )
+
+
+def _load(directory: Path, like: dict[str, Any], partial: bool = False) -> dict[str, Any]:
+    from orbax.checkpoint import v1 as ocp
+
+    first = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+    place = lambda x: getattr(x, "sharding", None) or first
+    like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place(x)), like)
+    newest = _newest(directory)
+    _require_whole(newest, like)
+    context = ocp.Context()
+    context.pytree.loading.partial_load = partial
+    try:
+        with context, ocp.training.Checkpointer(str(directory.absolute())) as checkpointer:
+            return checkpointer.load_checkpointables(int(newest.name), like)
+    except (ValueError, KeyError, OSError, json.JSONDecodeError) as error:
+        reason = str(error).strip().splitlines()[0][:150]
+        raise InputError(f"the checkpoint in {str(directory)!r} cannot be read: {reason}") from None
+
+
+def size_of(state: Any) -> int:
+    """Bytes that a state (or its shapes) takes."""
+    return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(state))
+
+
+def require_space(directory: Path, state: Any) -> None:
+    """Check that the disk can hold the checkpoints of a run.
+
+    Raises:
+        InputError: it cannot.
+    """
+    needed, free = (_KEPT + 1) * size_of(state), shutil.disk_usage(directory).free
+    if needed > free:
+        raise InputError(
+            f"checkpoints need {needed / 1e6:.0f} MB and {str(directory)!r} has {free / 1e6:.0f} MB free; "
+            "lower --replay-size or choose another place with --runs"
+        )

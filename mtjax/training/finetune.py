@@ -1,0 +1,99 @@
+"""Fine-tuning: an agent that begins on new tasks with what a run has learned on others."""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mtjax.agents import SAC, settings
+from mtjax.envs import Family
+from mtjax.history import forget
+from mtjax.networks import Params
+from mtjax.training.policy import Policy
+from mtjax.types import Array, Env, InputError, Task
+
+FREE = ("actor_lr", "critic_lr", "temperature_lr", "weight_decay", "max_gradient_norm", "gamma", "tau")
+FREE = (*FREE, "target_entropy", "distral_alpha", "vectors", "tune")
+"""Settings of an agent in which fine-tuning may differ from the run: they say how it learns, not what it is."""
+_FRESH = ("optimizers", "contexts", "vectors", "surgery", "progress")  # what is of the new tasks alone
+_BY_TASK = ("log_temperature", "scales")  # leaves (T, ...), or shared by all tasks
+
+
+def require_fit(start: Policy, env: Env, agent: SAC) -> None:
+    """Check that a run's networks can go on with an agent on a family of tasks.
+
+    Raises:
+        InputError: the agent is another one, or the family has other sizes or another context.
+    """
+    had, given = settings(start.agent), settings(agent)
+    if type(agent) is not type(start.agent) or had.keys() != given.keys():
+        raise InputError("the agent is not the run's; give the one that learned there")
+    other = next((name for name in had if had[name] != given[name] and name not in FREE), None)
+    if other is not None:
+        raise InputError(
+            f"{other.replace('_', '-')} is the run's, {had[other]}, and cannot be {given[other]}; "
+            f"what may change is {', '.join(name.replace('_', '-') for name in FREE if name in had)}"
+        )
+    family, known = forget(env), start.family
+    theirs, ours = known.spec, family.spec
+    if theirs[:2] != ours[:2]:
+        raise InputError(
+            f"the run's networks map {theirs.obs_size} observed numbers to {theirs.action_size} actions; "
+            f"the new tasks have {ours.obs_size} and {ours.action_size}"
+        )
+    alike = not isinstance(family, Family) or not isinstance(known, Family) or family.ranges == known.ranges
+    if theirs.context_size != ours.context_size or not alike:
+        raise InputError("the context of these tasks is not written as the run's; give env.scaled_as(policy.env)")
+    _require_numbers(start, env, agent)
+
+
+def _require_numbers(start: Policy, env: Env, agent: SAC) -> None:
+    """Refuse other tasks to networks that know tasks by number alone."""
+    if agent.conditioning != "one-hot":
+        return
+    nearest, count = np.asarray(agent.nearest_tasks(start.state, env.tasks("train"))), len(start.state.contexts)
+    if nearest.tolist() != list(range(count)):
+        raise InputError(
+            f"with conditioning=one-hot the run's networks know its {count} tasks by number, and the new ones are not "
+            "these; use a run with conditioning=embedding or parameters"
+        )
+
+
+def adopt(start: Policy, agent: SAC, tasks: Task, fresh: Any) -> Any:
+    """Return an agent's ``fresh`` state (S, ...) for new ``tasks`` (T, ...) with what a run learned in it.
+
+    Networks, their slow copies, temperatures, scales of rewards and moments of observations are the run's; of what
+    every task has for itself, a new task receives that of the run's nearest training task. Optimisers, and what
+    gradient surgery and samplers remember, are fresh. Seed number k begins with the run's seed k modulo its seeds.
+
+    Raises:
+        InputError: the shapes of networks differ.
+    """
+    seeds = jnp.arange(len(fresh.log_temperature)) % len(start.seeds)
+    old = jax.tree.map(lambda x: x[seeds], start.states)
+    state = jax.vmap(partial(_adopt, agent, tasks))(old, fresh)
+    pairs = zip(jax.tree.leaves_with_path(state), jax.tree.leaves(fresh), strict=True)
+    for (path, ours), expected in pairs:
+        if ours.shape != expected.shape:
+            name = jax.tree_util.keystr(path)
+            raise InputError(f"the run's networks do not fit: {name} is {ours.shape[1:]}, not {expected.shape[1:]}")
+    return state
+
+
+def _adopt(agent: SAC, tasks: Task, old: Any, fresh: Any) -> Any:
+    nearest, before, now = agent.nearest_tasks(old, tasks), len(old.contexts), len(tasks.id)
+
+    def by_task(x: Array, like: Array) -> Array:
+        return x[nearest] if x.shape[:1] == (before,) and like.shape[:1] == (now,) else x
+
+    def carry(name: str) -> Any:
+        learned = getattr(old, name)
+        if name in _BY_TASK:
+            return jax.tree.map(by_task, learned, getattr(fresh, name))
+        if isinstance(learned, Params):
+            return Params(learned.shared, jax.tree.map(lambda x: x[nearest], learned.own))
+        return learned
+
+    return fresh._replace(**{name: carry(name) for name in old._fields if name not in _FRESH})

@@ -1,0 +1,102 @@
+"""What a run leaves on disk beside its checkpoints: a folder of its own, and the record of all that decides it."""
+
+import dataclasses
+import itertools
+import json
+import os
+import platform
+import shlex
+import time
+from collections.abc import Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import jax
+
+from mtjax import __version__
+from mtjax.agents import settings
+from mtjax.config import RunConfig, from_json, import_flag
+from mtjax.types import InputError
+
+_PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
+
+
+def new_directory(root: Path, name: str) -> Path:
+    """Make a folder that did not exist before."""
+    stamp = time.strftime("%Y%m%d-%H%M%S")
+    root.mkdir(parents=True, exist_ok=True)
+    for attempt in range(1000):
+        directory = root / (f"{name}-{stamp}" + (f"-{attempt}" if attempt else ""))
+        try:
+            directory.mkdir()
+            return directory
+        except FileExistsError:
+            continue
+    raise InputError(f"cannot find a new name for a run in {str(root)!r}")
+
+
+def recorded(config: RunConfig, directory: Path, argv: Sequence[str]) -> RunConfig:
+    """The program of the run to go on with; ``--steps`` may extend it, and nothing else that it computes may change."""
+    given = {word.split("=", 1)[0] for word in argv if word.startswith("--")}
+    allowed = {"--resume", "--steps", "--import", "--distributed", "--profile"}
+    if given - allowed:
+        other = ", ".join(sorted(given - allowed))
+        raise InputError(f"--resume goes on with a run as it was; only --steps may change, not {other}")
+    recorded = from_json(directory / "config.json")
+    steps = config.plan.steps if "--steps" in given else recorded.plan.steps
+    now = {"plan": dataclasses.replace(recorded.plan, steps=steps)}
+    return dataclasses.replace(recorded, **now, profile=config.profile, distributed=config.distributed)
+
+
+def record_steps(file: Path, steps: int) -> None:
+    """Write how far a run goes now, so that resuming it once more goes as far."""
+    record = json.loads(file.read_text())
+    if record["plan"]["steps"] == steps:
+        return
+    record["command"] = record["command"].replace(f" --steps={record['plan']['steps']} ", f" --steps={steps} ")
+    record["plan"]["steps"] = steps
+    new = file.with_suffix(".new")
+    new.write_text(json.dumps(record, indent=2) + "\n")
+    os.replace(new, file)
+
+
+def circumstances(config: RunConfig) -> dict:
+    """What else decides a run's numbers: versions, device, engine; and the command that repeats it."""
+    versions = {"mtjax": __version__}
+    for package in _PACKAGES:
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            versions[package] = "not installed"
+    return {
+        "engine": config.family.engine_name,
+        "device": str(jax.devices()[0].device_kind),
+        "python": platform.python_version(),
+        "versions": versions,
+        "command": shlex.join(["python", "-m", "mtjax.train", *repeat(config)]),
+    }
+
+
+def repeat(config: RunConfig) -> list[str]:
+    """Every flag of this program, so that the command means the same whatever the presets become."""
+    words = [f"--env={config.env}", f"--agent={config.agent}", *import_flag(config.family)]
+    words += [f"--from={config.start}"] if config.start else []
+    for part, prefix in (("plan", "--"), ("training", "--"), ("family", "--env."), ("learner", "--agent.")):
+        value = getattr(config, part)
+        items = (settings(value) if part == "learner" else dataclasses.asdict(value)).items()
+        words += itertools.chain(*(_flag(prefix, name.replace("_", "-"), value) for name, value in items))
+    return words + (["--sweep", *config.sweep] if config.sweep else [])
+
+
+def _flag(prefix: str, name: str, value: object) -> list[str]:
+    if name == "context-ranges":  # the run's of --from
+        return []
+    if name == "vary":
+        return [f"{prefix}vary.{parameter}={values}" for parameter, values in value]  # type: ignore
+    prefix = "--" if name in ("split", "engine", "tune") else prefix
+    match value:
+        case bool():
+            return [f"{prefix}{name}" if value else f"{prefix}no-{name}"]
+        case tuple():
+            return [f"{prefix}{name}", *map(str, value)] if value else []
+    return [f"{prefix}{name}={value}"] if value != "" else []

@@ -1,0 +1,85 @@
+"""Begin a run as its configuration says: check it, fetch what it begins with, say what it is, and train."""
+
+import dataclasses
+from pathlib import Path
+
+from mtjax.agents.parts.conditioning import load_vectors
+from mtjax.config import RunConfig
+from mtjax.experience import hindsight
+from mtjax.parallel import hosts, mesh
+from mtjax.training.finetune import require_fit
+from mtjax.training.policy import Policy, load
+from mtjax.training.run import Result, train
+from mtjax.types import InputError
+
+
+def check(config: RunConfig) -> None:
+    """Meet whatever the family's and the agent's constructors could not check before a run's folder is made."""
+    family = config.family
+    _ = family.engine_name, family.table
+    mesh.mesh_for(config.plan.seeds, family.train_count, config.training.num_envs)
+    if config.training.hindsight:
+        hindsight.require(family)
+    if config.learner.vectors:
+        load_vectors(config.learner.vectors, family.train_count)
+    tune = config.learner.tune
+    if tune != "all" and not config.start:
+        raise InputError(f"--tune={tune} leaves the rest as a run left it; say which run: --from=RUN")
+    if config.start and config.training.reset_every:
+        raise InputError("--reset-every throws away what --from takes from a run; give one of them")
+
+
+def starting(config: RunConfig) -> Policy | None:
+    """What the run learned that is to be fine-tuned, if one is."""
+    if not config.start:
+        return None
+    start = load(config.start)
+    require_fit(start, config.family, config.learner)
+    return start
+
+
+def launch(config: RunConfig, directory: Path, start: Policy | None, resume: bool, label: str = "") -> Result:
+    """Run a program in its folder, from the start or from its newest checkpoint, and say what it is."""
+    said = f"{label}: {' '.join(config.sweep)}\n" if config.sweep else ""
+    origin = f"{_origin(config)}run: {directory}"
+    if hosts.is_first():
+        print(f"{said}{config.agent} on {config.env}: {_summary(config)}\n{origin}", flush=True)
+    plan = dataclasses.asdict(config.plan)
+    return train(
+        config.family,
+        config.learner,
+        **plan,
+        settings=config.training,
+        start=start,
+        sweep=config.points,
+        directory=directory,
+        resume=resume,
+        profile=config.profile,
+        label=label,
+        quiet=False,
+    )
+
+
+def _origin(config: RunConfig) -> str:
+    """A line on what is fine-tuned, if something is."""
+    if not config.start:
+        return ""
+    family, told = config.family, config.learner.conditioning == "parameters"
+    unseen = set(family.varied) - {name for name, _, _ in family.ranges} if told else ()
+    blind = f"; its networks cannot be told {', '.join(sorted(unseen))}" if unseen else ""
+    return f"from {config.start}: {config.learner.tune} of its parameters learn{blind}\n"
+
+
+def _summary(config: RunConfig) -> str:
+    family, plan = config.family, config.plan
+    found = family.variation
+    ends = ", ".join(
+        f"{name} {low:g} to {high:g}"
+        for name, low, high in zip(found.names, found.low, found.high, strict=True)
+        if low < high
+    )
+    count = family.train_count
+    return (
+        f"{count} training task{'s' * (count > 1)}{', ' * bool(ends)}{ends}, "
+        f"split {family.split}, engine {family.engine_name}, seeds {plan.seed} to {plan.seed + plan.seeds - 1}"
+    )

@@ -1,0 +1,92 @@
+"""Trained policies, read back from the folder of a run."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from mtjax import loop
+from mtjax.agents import SAC
+from mtjax.config import RunConfig, from_json
+from mtjax.envs import Family
+from mtjax.experience.replay import Replay
+from mtjax.history import History, forget, remember
+from mtjax.training import checkpoint, points
+from mtjax.types import Array, InputError, Key, Task
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Policy:
+    """What a run learned: ``action = policy(obs, task)``, for single observations (O,); map it for many."""
+
+    env: Family | History  # what the agent acts in: the family, showing past steps if the agent looks at any
+    agent: SAC
+    state: Any  # of one seed
+    states: Any  # of every seed, leading S; of a sweep, those of one point
+    seeds: Array  # (S,)
+
+    def __call__(self, obs: Array, task: Task, key: Key | None = None) -> Array:
+        """Return the mean action (A,), or a random one if a key is given."""
+        return self.agent.act(self.state, obs, task, key)
+
+    @property
+    def family(self) -> Family:
+        """The family that the run trained on."""
+        return forget(self.env)
+
+
+def load(directory: str | Path, seed: int = 0) -> Policy:
+    """Read the policy that a run learned.
+
+    Args:
+        directory: the run's folder.
+        seed: which of the run's seeds, counted from 0. A run of a sweep has all its seeds for each of its points:
+            number ``k`` is seed ``k % seeds`` of point ``k // seeds``, and the policy's agent is the one at that point.
+
+    Raises:
+        InputError: the folder is not a run, it has no such seed, or its checkpoint is missing or damaged.
+    """
+    directory = Path(directory)
+    config = from_json(directory / "config.json")
+    count = config.plan.seeds
+    last = count * max(len(config.points), 1) - 1
+    if not 0 <= seed <= last:
+        raise InputError(f"seed must be from 0 to {last}, counted from the run's first, not {seed}")
+    states = checkpoint.load_agent(directory / "checkpoints", shapes(config))
+    agent = config.learner
+    if config.points:
+        rows = _of_point(config, seed)
+        agent = points.at(agent, config.points[seed // count])
+        states = jax.tree.map(lambda x: x[rows], states.learner)
+    env, seeds = remember(config.family, agent.history), config.plan.seed + jnp.arange(count)
+    return Policy(env, agent, jax.tree.map(lambda x: x[seed % count], states), states, seeds)
+
+
+def _of_point(config: RunConfig, seed: int) -> slice:
+    """The rows of S that belong to one number's point."""
+    first = seed - seed % config.plan.seeds
+    return slice(first, first + config.plan.seeds)
+
+
+def load_experience(directory: str | Path, seed: int = 0) -> tuple[Replay, int]:
+    """Read what a run learned from: the replay of its last checkpoint, and the size of its batches.
+
+    Of a run of a sweep it is what the seeds of one point learned from, by ``seed`` as for ``load``.
+
+    Raises:
+        InputError: as for ``load``.
+    """
+    config = from_json(Path(directory) / "config.json")
+    replay = checkpoint.load_replay(Path(directory) / "checkpoints", shapes(config))
+    rows = _of_point(config, seed)
+    return replay._replace(rows=jax.tree.map(lambda x: x[rows], replay.rows)), config.training.batch_size
+
+
+def shapes(config: RunConfig) -> loop.TrainState:
+    """The shapes of a run's training state."""
+    env = remember(config.family, config.learner.history)
+    agent = points.Varied(config.learner) if config.points else config.learner
+    spread = points.spread(config.points, config.plan.seed + jnp.arange(config.plan.seeds))
+    return jax.eval_shape(lambda: loop.init(env, agent, config.training, env.tasks("train"), *spread))  # type: ignore

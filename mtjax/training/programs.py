@@ -1,0 +1,93 @@
+"""The jitted programs of a run: split over devices, lowered, compiled, and kept between runs."""
+
+import os
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from mtjax.evaluation import evaluate
+from mtjax.experience.replay import Replay
+from mtjax.loop import TrainState, init, run_chunk
+from mtjax.parallel import collectives
+from mtjax.parallel.mesh import BY_SEED, BY_WORLD, SAME
+
+_STATE = TrainState(*[BY_WORLD] * len(TrainState._fields))._replace(  # type: ignore
+    agent=BY_SEED,
+    replay=Replay(PartitionSpec("seeds", None, None, collectives.AXIS), SAME, SAME),  # type: ignore
+    iteration=SAME,  # type: ignore
+    key=BY_SEED,  # type: ignore
+    warmup_key=BY_SEED,  # type: ignore
+)
+
+
+class Jitted(NamedTuple):
+    """The jitted programs of a run, with the arguments of ``loop.init``, ``loop.run_chunk`` and ``evaluate``."""
+
+    init: Any
+    chunk: Any
+    evaluate: Any
+
+
+class Programs(NamedTuple):
+    """The compiled programs of a run."""
+
+    chunk: Callable  # state -> state, metrics
+    evaluate: Callable  # agents' state, number of the evaluation -> returns
+
+
+def jitted(mesh: Mesh | None) -> Jitted:
+    """The programs of a run, each split over the mesh if there is one."""
+    if mesh is None:
+        return Jitted(init, run_chunk, evaluate)
+    return Jitted(
+        _split(mesh, init, (SAME, BY_SEED, BY_SEED), _STATE),
+        _split(mesh, run_chunk, (SAME, _STATE), (_STATE, BY_SEED), donated=(4,)),
+        _split(mesh, evaluate, (BY_SEED, SAME, BY_SEED, SAME), BY_SEED),
+    )
+
+
+def _split(mesh: Mesh, program: Callable, inputs: tuple, outputs: Any, donated: tuple[int, ...] = ()) -> Any:
+    """A program of three static arguments and ``inputs``, of which each device computes its own part."""
+
+    def split(env, agent, setting, *arguments):
+        own = partial(program, env, agent, setting)
+        return jax.shard_map(own, mesh=mesh, in_specs=inputs, out_specs=outputs, check_vma=False)(*arguments)
+
+    places = [jax.tree.map(partial(NamedSharding, mesh), specs) for specs in (inputs, outputs)]
+    return jax.jit(
+        split, static_argnums=(0, 1, 2), in_shardings=places[0], out_shardings=places[1], donate_argnums=donated
+    )
+
+
+def sharded(mesh: Mesh | None, shapes: TrainState) -> TrainState:
+    """Shapes of a training state that also say which devices its leaves are on."""
+    if mesh is None:
+        return shapes
+    put = lambda spec, part: jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=NamedSharding(mesh, spec)), part
+    )
+    return jax.tree.map(put, _STATE, shapes)
+
+
+def compiled(program: Any, once: bool = False) -> Any:
+    """Compile what was lowered. On a CPU LLVM's later passes take a quarter of the time and make nothing faster.
+
+    Args:
+        once: it runs a single time, for a moment, so that compiling it is all that counts.
+    """
+    flag = "xla_backend_optimization_level"
+    chosen = jax.default_backend() != "cpu" or flag in os.environ.get("XLA_FLAGS", "")
+    return program.compile(None if chosen else {flag: 0 if once else 1})
+
+
+def enable_compile_cache() -> None:
+    """Keep compiled programs between runs, in ~/.cache/mtjax or $MTJAX_CACHE; MTJAX_CACHE=0 does not."""
+    place = os.environ.get("MTJAX_CACHE", "~/.cache/mtjax/xla")
+    if place == "0":
+        return
+    jax.config.update("jax_compilation_cache_dir", str(Path(place).expanduser()))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)

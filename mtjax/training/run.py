@@ -1,0 +1,349 @@
+"""The host loop around the jitted one: log, evaluate, checkpoint, stop cleanly, and go on where a run stopped."""
+
+import contextlib
+import dataclasses
+import math
+import signal
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
+
+from mtjax.config import Plan
+from mtjax.evaluation import Evaluations, load_evaluations, save_evaluations
+from mtjax.history import remember
+from mtjax.loop import Settings, TrainState
+from mtjax.parallel import hosts
+from mtjax.parallel import mesh as meshes
+from mtjax.training import checkpoint, finetune, log, points
+from mtjax.training.points import Point, Sweep, Varied
+from mtjax.training.policy import Policy
+from mtjax.training.programs import Programs, compiled, jitted, sharded
+from mtjax.types import SPLITS, Agent, Env, InputError
+
+
+class Result(NamedTuple):
+    """What a run gives back."""
+
+    state: TrainState
+    evaluations: Evaluations
+    rows: list[dict[str, Any]]  # the lines of metrics.csv
+    seconds: float  # spent training, without compiling and evaluating
+    compile_seconds: float  # from the start until the first chunk could begin
+    finished: bool  # False if a signal stopped it
+    directory: Path | None
+    points: tuple[Point, ...] = ()  # of a sweep: number k of S is seed k % seeds of point k // seeds
+
+
+def train(
+    env: Env,
+    agent: Agent,
+    *,
+    steps: int = Plan.steps,
+    seeds: int = Plan.seeds,
+    seed: int = Plan.seed,
+    eval_every: int = Plan.eval_every,
+    eval_episodes: int = Plan.eval_episodes,
+    settings: Settings | None = None,
+    start: Policy | None = None,
+    sweep: Sweep = (),
+    directory: str | Path | None = None,
+    resume: bool = False,
+    profile: bool = False,
+    quiet: bool = True,
+    label: str = "",
+    on_chunk: Callable[[dict[str, Any]], None] | None = None,
+) -> Result:
+    """Train an agent on a family of tasks, on as many devices as divide the seeds, and then their environments.
+
+    Under ``jax.distributed`` every process calls this alike; the first one writes and prints, and all return the same
+    but for ``Result.state``, whose leaves are spread over all of them.
+
+    Args:
+        env: the family; it trains on ``env.tasks("train")``.
+        agent: the learner.
+        steps: environment steps of each seed, summed over tasks; rounded up to whole chunks.
+        seeds: how many seeds to run at once; seed: the first of them.
+        eval_every: environment steps between evaluations (0: ten in the run), of ``eval_episodes`` episodes a task.
+        settings: how to collect and learn; by default ``Settings()``.
+        start: fine-tune what a run learned, from ``mtjax.load``: ``env`` is ``new.scaled_as(start.env)`` and ``agent``
+            is ``start.agent``, of which rates and ``tune`` may be replaced (``finetune.adopt`` says what is kept).
+        sweep: numbers of the agent that vary, all in one program, ``{"actor_lr": [1e-4, 1e-3], "gamma": [0.98, 0.99]}``
+            for every combination or a list of points ``{"actor_lr": 1e-4, "gamma": 0.98}``. Every point has all seeds,
+            and the S axis of whatever comes back holds them point by point. A seed whose numbers stop being finite is
+            given up, its returns being NaN, and the others go on.
+        directory: an existing folder for metrics, evaluations and checkpoints; None writes nothing.
+        resume: go on from the newest checkpoint in ``directory``, on however many devices there are now.
+        profile: leave a trace of one chunk, by ``jax.profiler``, in ``directory``/profile.
+        quiet: print nothing.
+        label: what lines of progress begin with.
+        on_chunk: called with each chunk's first row of metrics.
+
+    Raises:
+        InputError: an argument cannot be used.
+        FloatingPointError: numbers stopped being finite (in a sweep, of all seeds); the message names task and step.
+    """
+    plan = Plan(steps, seed, seeds, eval_every, eval_episodes)
+    found = points.grid(sweep)
+    for learner in [points.at(agent, point) for point in found] or [agent]:  # type: ignore
+        if start is not None:
+            finetune.require_fit(start, env, learner)  # type: ignore
+    directory = None if directory is None else Path(directory)
+    if profile and directory is None:
+        raise InputError("profile writes into the run's folder; give directory as well")
+    started = time.monotonic()
+    tasks, env = env.tasks("train"), remember(env, agent.history)
+    settings = fit_chunk(settings or Settings(), len(tasks.id), steps)
+    learner = Varied(agent) if found else agent  # type: ignore
+    console = log.Console(plan.steps, quiet or not hosts.is_first(), label)
+    mesh = meshes.mesh_for(seeds * max(len(found), 1), len(tasks.id), settings.num_envs)
+    run = _Run(env, learner, settings, plan, directory, console, found, mesh, profile)
+    try:
+        programs, state = run.begin(resume)
+        if start is not None and not resume:
+            begun = run.adopt(start, tasks, hosts.gather(state.agent))
+            state = state._replace(agent=meshes.by_seed(mesh, begun))
+        hosts.wait()
+        compile_seconds = time.monotonic() - started
+        run.console.say(f"compiled in {compile_seconds:.1f} s")
+        return run.drive(programs, state, started, on_chunk)._replace(compile_seconds=compile_seconds)
+    finally:
+        run.console.close()
+
+
+def fit_chunk(settings: Settings, num_tasks: int, steps: int) -> Settings:
+    """Shorten chunks that are longer than the whole run."""
+    whole_run = math.ceil(steps / (num_tasks * settings.num_envs))
+    return dataclasses.replace(settings, chunk_steps=min(settings.chunk_steps, whole_run))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Run:
+    """The fixed parts of one run."""
+
+    env: Env
+    agent: Agent
+    settings: Settings
+    plan: Plan
+    directory: Path | None
+    console: log.Console
+    points: tuple[Point, ...] = ()
+    mesh: Mesh | None = None
+    profile: bool = False
+
+    @cached_property
+    def spread(self) -> tuple[jax.Array, dict[str, jax.Array] | None]:
+        """Seeds (S,) of all points, and the values (S,) that vary between them."""
+        return points.spread(self.points, self.plan.seed + jnp.arange(self.plan.seeds))
+
+    @property
+    def seeds(self) -> jax.Array:
+        return self.spread[0]
+
+    def point(self, number: int) -> Point:
+        """The values of one of S that vary."""
+        return self.points[number // self.plan.seeds] if self.points else {}
+
+    def adopt(self, start: Policy, tasks: Any, fresh: Any) -> Any:
+        """The agent's state, fine-tuning what a run learned; every point begins with the same seeds of it."""
+        if not isinstance(self.agent, Varied):
+            return finetune.adopt(start, self.agent, tasks, fresh)  # type: ignore
+        apart = lambda x: x.reshape(len(self.points), self.plan.seeds, *x.shape[1:])
+        together = lambda x: x.reshape(-1, *x.shape[2:])
+        adopt = partial(finetune.adopt, start, self.agent.agent, tasks)
+        learner = jax.tree.map(together, jax.vmap(adopt)(jax.tree.map(apart, fresh.learner)))
+        return fresh._replace(learner=learner)
+
+    @property
+    def writes(self) -> bool:
+        return self.directory is not None and hosts.is_first()
+
+    @cached_property
+    def steps_per_iteration(self) -> int:
+        """Environment steps that one step of every environment makes, summed over tasks."""
+        return len(self.env.tasks("train").id) * self.settings.num_envs
+
+    @property
+    def eval_every(self) -> int:
+        return self.plan.eval_every or math.ceil(self.plan.steps / 10)
+
+    def begin(self, resume: bool) -> tuple[Programs, TrainState]:
+        """Compile every program at the same time, and make or restore the state; evaluation may be ready later."""
+        env, agent, settings, lazy = self.env, self.agent, self.settings, jitted(self.mesh)
+        tasks, everything = (meshes.everywhere(self.mesh, env.tasks(split)) for split in ("train", "all"))
+        (seeds, knobs), pool = meshes.by_seed(self.mesh, self.spread), ThreadPoolExecutor(2)
+        fresh = lazy.init.lower(env, agent, settings, tasks, seeds, knobs)
+        shapes = sharded(self.mesh, fresh.out_info)
+        self._describe(shapes)
+        make = None if resume else pool.submit(compiled, fresh, once=True)
+        chunk = lazy.chunk.lower(env, agent, settings, tasks, shapes)
+        lower = partial(lazy.evaluate.lower, env, agent, self.plan.eval_episodes, shapes.agent, everything, seeds)
+        score = pool.submit(lambda: compiled(lower(np.int32(0))))
+        pool.shutdown(wait=False)
+        evaluate = lambda agents, number: score.result()(agents, everything, seeds, np.int32(number))
+        programs = Programs(partial(compiled(chunk), tasks), evaluate)
+        return programs, self._restore(shapes) if make is None else make.result()(tasks, seeds, knobs)
+
+    def _describe(self, shapes: TrainState) -> None:
+        replay = checkpoint.size_of(shapes.replay) / 1e6
+        self.console.say(
+            f"memory: {checkpoint.size_of(shapes) / 1e6:,.0f} MB of state, of which {replay:,.0f} MB replay "
+            f"({self.settings.capacity:,} transitions a task)"
+        )
+        if spread := meshes.describe(self.mesh, len(self.seeds), self.settings.num_envs):
+            self.console.say(spread)
+        if self.directory is not None:
+            checkpoint.require_space(self.directory, shapes)
+
+    def _restore(self, shapes: TrainState) -> TrainState:
+        assert self.directory is not None
+        return checkpoint.load(self.directory / "checkpoints", shapes)
+
+    def _earlier_seconds(self, iteration: int) -> float:
+        """Seconds of training that a resumed run has behind it; its later lines of metrics are dropped."""
+        if not self.writes:
+            return 0.0
+        assert self.directory is not None
+        return log.truncate_rows(self.directory / "metrics.csv", iteration)
+
+    def drive(self, programs: Programs, state: TrainState, started: float, on_chunk) -> Result:
+        """Run chunks until the plan is done or a signal asks to stop."""
+        steps = int(state.iteration) * self.steps_per_iteration
+        evaluations = self._earlier_evaluations(steps)
+        rows, seconds, stop = [], self._earlier_seconds(int(state.iteration)), False
+        lost = np.zeros(len(self.seeds), bool)
+        with stop_signals() as received:
+            while steps < self.plan.steps and not stop:
+                steps_before = steps
+                with self._watch(len(rows), steps):
+                    before = time.monotonic()
+                    state, metrics = programs.chunk(state)
+                    metrics = hosts.gather(metrics)
+                    elapsed = time.monotonic() - before
+                seconds += elapsed
+                lost |= self._lose(metrics["bad_step"], steps_before // self.steps_per_iteration, lost)
+                steps += self.settings.chunk_steps * self.steps_per_iteration
+                common = {
+                    "iteration": steps // self.steps_per_iteration,
+                    "steps": steps,
+                    "seconds": f"{seconds:.3f}",
+                    "wall_seconds": f"{time.monotonic() - started:.3f}",
+                }
+                lines = log.metric_rows(metrics, np.asarray(self.seeds), common)
+                new = [{"seed": row["seed"], **self.point(k), **row} for k, row in enumerate(lines)]
+                rows += new
+                self._write(new)
+                rate = (steps - steps_before) * len(self.seeds) / elapsed
+                self.console.progress(steps, seconds, rate, metrics["return"])
+                if on_chunk is not None:
+                    on_chunk(new[0])
+                due = steps // self.eval_every > steps_before // self.eval_every
+                if due or steps >= self.plan.steps:
+                    evaluations = self._evaluate(programs.evaluate, state, evaluations, steps, lost)
+                stop = hosts.anywhere(bool(received))
+                if due or stop or steps >= self.plan.steps:
+                    self._save(state)
+        return Result(state, evaluations, rows, seconds, 0.0, steps >= self.plan.steps, self.directory, self.points)
+
+    @contextlib.contextmanager
+    def _watch(self, rows: int, steps: int) -> Iterator[None]:
+        """Trace the run's second chunk, by when all is warm, or its only one, if that is asked for."""
+        only = steps + self.settings.chunk_steps * self.steps_per_iteration >= self.plan.steps
+        if not (self.profile and self.writes and (rows == len(self.seeds) or (only and not rows))):
+            yield
+            return
+        place = self.directory / "profile"  # type: ignore
+        with jax.profiler.trace(place):
+            yield
+        self.console.say(f"profile of one chunk: {place} (xprof --logdir={place}, or its *.trace.json.gz in Perfetto)")
+
+    def _lose(self, bad_step: np.ndarray, first_step: int, lost: np.ndarray) -> np.ndarray:
+        """Which seeds (S,) are not finite any more; one that diverged must not end a sweep of many."""
+        broken = np.any(bad_step >= 0, axis=1)
+        if not self.points or np.all(broken | lost):
+            _require_finite(bad_step, first_step)
+        for k in np.flatnonzero(broken & ~lost):
+            values = ", ".join(f"{name}={value:g}" for name, value in self.point(int(k)).items())
+            self.console.say(f"seed {self.seeds[k]} of {values} diverged and is given up")
+        return broken
+
+    def _write(self, rows: list[dict[str, Any]]) -> None:
+        if self.writes:
+            assert self.directory is not None
+            log.append_rows(self.directory / "metrics.csv", rows)
+
+    def _save(self, state: TrainState) -> None:
+        if self.directory is not None:
+            checkpoint.save(self.directory / "checkpoints", state)
+
+    def _evaluate(self, program: Callable, state: TrainState, past: Evaluations, steps: int, lost) -> Evaluations:
+        """Evaluate on all splits, and add the result to the run's evaluations."""
+        returns = np.array(hosts.gather(program(state.agent, len(past.steps))))
+        returns[lost] = np.nan
+        grown = {}
+        for split, old in past.returns.items():
+            rows = np.asarray(self.env.tasks(split).id)
+            grown[split] = np.concatenate([old, returns[:, None, rows]], axis=1)
+        evaluations = Evaluations(np.append(past.steps, steps), grown, past.values)
+        if self.writes:
+            assert self.directory is not None
+            save_evaluations(self.directory / "evaluations.npz", evaluations)
+        means = ", ".join(f"{s} {x[~lost, -1].mean():.0f}" for s, x in grown.items() if x.size)
+        self.console.say(f"evaluation at {steps:,} steps: {means}")
+        return evaluations
+
+    def _earlier_evaluations(self, steps: int) -> Evaluations:
+        """The evaluations up to a step: those on disk if the run is resumed, else none."""
+        file = None if self.directory is None else self.directory / "evaluations.npz"
+        if steps and file is not None and file.exists():
+            past = load_evaluations(file)
+            kept = past.steps <= steps
+            return Evaluations(past.steps[kept], {s: x[:, kept] for s, x in past.returns.items()}, past.values)
+        tables = {split: self.env.tasks(split) for split in SPLITS}
+        empty = lambda table: np.zeros((len(self.seeds), 0, len(table.id), self.plan.eval_episodes), np.float32)
+        return Evaluations(
+            steps=np.zeros(0, np.int64),
+            returns={split: empty(table) for split, table in tables.items()},
+            values={split: self.env.task_values(split) for split in SPLITS},
+        )
+
+
+def _require_finite(bad_step: np.ndarray, first_step: int) -> None:
+    """Stop a run whose numbers are not finite, naming task and step."""
+    if np.all(bad_step < 0):
+        return
+    step = int(np.min(bad_step[bad_step >= 0]))
+    seed, task = (int(i) for i in np.argwhere(bad_step == step)[0])
+    raise FloatingPointError(
+        f"numbers stopped being finite at step {first_step + step} of task {task} (number {seed} of the run's seeds); "
+        "a checkpoint, if there is one, is from before it. Try lower learning rates or max-gradient-norm"
+    )
+
+
+@contextlib.contextmanager
+def stop_signals() -> Iterator[list[int]]:
+    """Collect Ctrl-C and SIGTERM instead of dying of them; a second Ctrl-C does what it always does."""
+    received: list[int] = []
+
+    def note(number, _frame) -> None:
+        received.append(number)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    try:
+        before = [signal.signal(number, note) for number in numbers]
+    except ValueError:  # not in the main thread, where Python keeps signals
+        yield received
+        return
+    try:
+        yield received
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)

@@ -1,0 +1,304 @@
+"""``python -m mtjax.train --sweep ...``: every combination of settings, and one table of them.
+
+The agent's numbers are points of one program (``points.py``); each combination of other settings is a program of its
+own, and one that does not fit into memory is run in rounds (``memory.py``). Every program and round is a run like any
+other, in a folder of the sweep's: ``run-1``, ``run-2`` and so on. A run in rounds is a sweep of one setting.
+"""
+
+import dataclasses
+import itertools
+import shlex
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mtjax.agents import AGENTS, PARTS
+from mtjax.config import RunConfig, from_json, import_flag, to_json
+from mtjax.evaluation import Evaluations, load_evaluations
+from mtjax.report import figures
+from mtjax.report.stats import seed_interval
+from mtjax.training import memory, points
+from mtjax.training.folder import circumstances, new_directory, record_steps, recorded
+from mtjax.training.launch import check, launch, starting
+from mtjax.training.log import append_rows, number
+from mtjax.training.programs import enable_compile_cache
+from mtjax.types import SPLITS, InputError
+
+Parse = Callable[[Sequence[str]], RunConfig]  # a command line to the run that it asks for
+_FIXED = ("seed", "seeds", "runs", "resume", "list", "import", "sweep", "from", "preset")
+_DIVERGED = "diverged.txt"  # beside a run of which no seed is finite any more: what stopped it
+
+
+class Axis(NamedTuple):
+    """One flag, without its dashes, and the values that it takes in turn."""
+
+    flag: str
+    values: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        """What it is called in tables and records."""
+        return self.flag.removeprefix("agent.")
+
+    @property
+    def setting(self) -> str:
+        """The agent's setting that it is, if it is one."""
+        return self.name.replace("-", "_") if self.flag != self.name else ""
+
+
+# What to run.
+
+
+def wanted(argv: Sequence[str]) -> bool:
+    """Whether a command line asks for a sweep, or to go on with one."""
+    names = [word.split("=", 1)[0] for word in argv]
+    if "--sweep" in names and "--resume" in names:
+        raise InputError("--resume goes on with a sweep as it was; leave out --sweep")
+    resumed = next((word.split("=", 1)[1] for word in argv if word.startswith("--resume=")), "")
+    return "--sweep" in names or bool(resumed and _runs(Path(resumed)))
+
+
+def read(argv: Sequence[str]) -> tuple[list[Axis], list[str]]:
+    """Take ``--sweep FLAG=VALUE,VALUE ...`` out of a command line.
+
+    Raises:
+        InputError: a word of it is not a flag with values, or a flag that no sweep can vary.
+    """
+    axes, rest, inside = {}, [], False
+    for word in argv:
+        if word.startswith("--"):
+            inside = word == "--sweep" or word.startswith("--sweep=")
+            word = word.removeprefix("--sweep").removeprefix("=") if inside else word
+        if not inside:
+            rest.append(word)
+        elif word:
+            axis = _axis(word)
+            if axis.flag in axes:
+                raise InputError(f"--sweep gives {axis.flag} twice; write its values in one list")
+            axes[axis.flag] = axis
+    if not axes:
+        raise InputError("--sweep needs flags and values, such as agent.actor-lr=1e-4,1e-3")
+    return list(axes.values()), rest
+
+
+def _axis(word: str) -> Axis:
+    flag, _, text = word.partition("=")
+    flag, values = flag.replace("_", "-"), tuple(value.strip() for value in text.split(","))
+    if not all(values):
+        raise InputError(f"--sweep needs values, not {word!r}; write FLAG=VALUE,VALUE such as agent.actor-lr=1e-4,1e-3")
+    if len(set(values)) < len(values):
+        raise InputError(f"--sweep gives a value of {flag} twice: {text}")
+    if flag in _FIXED:
+        raise InputError(f"--sweep cannot vary {flag}; give --{flag} once" + (" for all" if flag != "sweep" else ""))
+    return Axis(flag, values)
+
+
+def _varies_inside(axis: Axis) -> bool:
+    """Whether an axis is a number of agents or their parts, for all of whose values one program does."""
+    tables = [table.values() for kind, table in PARTS.items() if kind != "encoder"]
+    classes = [*(preset.cls for preset in AGENTS.values()), *itertools.chain(*tables)]
+    return any(f.name == axis.setting and f.type is float for cls in classes for f in dataclasses.fields(cls))
+
+
+def _words(flag: str, value: str) -> list[str]:
+    """A flag as it is written on a command line; true and false are what switches take, spaces part several words."""
+    if value.lower() in ("true", "false"):
+        group, dot, name = flag.rpartition(".")
+        return [f"--{group}{dot}{'' if value.lower() == 'true' else 'no-'}{name}"]
+    first, *others = value.split()
+    return [f"--{flag}", first, *others] if others else [f"--{flag}={value}"]
+
+
+def configurations(argv: Sequence[str], parse: Parse) -> list[RunConfig]:
+    """Every program that a command line with ``--sweep`` asks for, its points checked, before memory splits any.
+
+    Raises:
+        InputError: some value cannot be used.
+    """
+    axes, rest = read(argv)
+    inside = [axis for axis in axes if _varies_inside(axis)]
+    outside = [axis for axis in axes if axis not in inside]
+    found = []
+    for values in itertools.product(*(axis.values for axis in outside)):
+        chosen = [Axis(axis.flag, (value,)) for axis, value in zip(outside, values, strict=True)]
+        config = parse([*rest, *itertools.chain(*(_words(axis.flag, axis.values[0]) for axis in chosen))])
+        sweep = tuple(f"{axis.flag}={','.join(axis.values)}" for axis in (*chosen, *inside))
+        points_of_it = points.grid({axis.setting: [_number(axis, x) for x in axis.values] for axis in inside})
+        for point in points_of_it:
+            points.at(config.learner, point)
+        found.append(dataclasses.replace(config, sweep=sweep, points=points_of_it))
+    return found
+
+
+def _number(axis: Axis, text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(f"{axis.flag} is a number, and {text!r} is none") from None
+
+
+# Running it.
+
+
+def main(argv: Sequence[str], parse: Parse) -> None:
+    """Run what a command line with ``--sweep`` asks for, or go on with what ``--resume`` names."""
+    enable_compile_cache()
+    resume = next((Path(word.split("=", 1)[1]) for word in argv if word.startswith("--resume=")), None)
+    if resume is not None:
+        for directory in _runs(resume):
+            record_steps(directory / "config.json", recorded(parse(argv), directory, argv).plan.steps)
+        carry_on(resume)
+        return
+    found = configurations(argv, parse)
+    for config in found:
+        check(config)
+        starting(config)
+    begin(found, "sweep")
+
+
+def begin(found: Sequence[RunConfig], kind: str) -> None:
+    """Make a folder with a run for every program and round, and run them."""
+    limit = memory.memory()
+    split = [memory.split(config, limit) for config in found]
+    folder = new_directory(Path(found[0].runs), f"{found[0].env}-{found[0].agent}-{kind}")
+    for i, config in enumerate(itertools.chain(*split)):
+        (folder / f"run-{i + 1}").mkdir()
+        (folder / f"run-{i + 1}" / "config.json").write_text(to_json(config, circumstances(config)))
+    for config, parts in zip(found, split, strict=True):
+        print(memory.describe(config, len(parts), limit), flush=True)
+    carry_on(folder)
+
+
+def _runs(folder: Path) -> list[Path]:
+    """The folders of a sweep's runs, in order; a run of several points is a sweep by itself."""
+    if (folder / "config.json").is_file():
+        return [folder] if from_json(folder / "config.json").points else []
+    return sorted(folder.glob("run-*"), key=lambda run: int(run.name.removeprefix("run-")))
+
+
+def carry_on(folder: Path) -> None:
+    """Run whatever of a sweep has not been run to its end, and lay out the table of all."""
+    runs = _runs(folder)
+    print(f"sweep: {folder}", flush=True)
+    for i, run in enumerate(runs):
+        config = from_json(run / "config.json")
+        if last(config, run) is not None or (run / _DIVERGED).exists():
+            continue
+        label, resume = f"run {i + 1} of {len(runs)}", (run / "checkpoints").is_dir()
+        start = None if resume else starting(config)
+        try:
+            if not launch(config, run, start, resume, label).finished:
+                words = shlex.join([f"--resume={folder}", *import_flag(config.family)])
+                print(f"stopped; the state is saved. Go on with:\n  python -m mtjax.train {words}")
+                return
+            _draw(config, run)
+        except FloatingPointError as error:
+            print(f"{label}: {error}", flush=True)
+            (run / _DIVERGED).write_text(f"{error}\n")
+        (folder / "sweep.csv").unlink(missing_ok=True)
+        append_rows(folder / "sweep.csv", rows(runs))
+    print(f"{table(rows(runs))}\nsweep: {folder}")
+
+
+def _draw(config: RunConfig, run: Path) -> None:
+    """Draw the return on training tasks over steps, a line for each setting of which no seed diverged."""
+    evaluations, count = load_evaluations(run / "evaluations.npz"), config.plan.seeds
+    curves = {}
+    for p, point in enumerate(config.points or ({},)):
+        returns = evaluations.returns["train"][p * count : (p + 1) * count]
+        if np.isfinite(returns).all():
+            curves[", ".join(f"{name} {value}" for name, value in _values(config, point).items())] = returns
+    if curves:
+        figures.learning_curve(run / "curve.png", evaluations.steps, curves, f"{config.agent} on {config.env}")
+
+
+def last(config: RunConfig, run: Path) -> Evaluations | None:
+    """The evaluations of a run that is at its end; None if it is not."""
+    if not (run / "evaluations.npz").exists():
+        return None
+    found = load_evaluations(run / "evaluations.npz")
+    return found if len(found.steps) and found.steps[-1] >= config.plan.steps else None
+
+
+# The table.
+
+
+def rows(runs: Sequence[Path]) -> list[dict[str, Any]]:
+    """A row for each setting: its runs, its values, seeds that diverged, and the last evaluation of each split."""
+    found: dict[tuple, list[_Part]] = {}
+    for run in runs:
+        config = from_json(run / "config.json")
+        evaluations, count = last(config, run), config.plan.seeds
+        for p, point in enumerate(config.points or ({},)):
+            mine = slice(p * count, (p + 1) * count)
+            returns = evaluations and {split: x[mine, -1] for split, x in evaluations.returns.items() if x.size}
+            part = _Part(run.name, p, count, (run / _DIVERGED).exists(), returns)
+            found.setdefault(tuple(_values(config, point).items()), []).append(part)
+    made = [_row(dict(values), parts) for values, parts in found.items()]
+    columns = dict.fromkeys(name for row in made for name in row)
+    return [{name: row.get(name, "") for name in columns} for row in made]
+
+
+class _Part(NamedTuple):
+    """What one run holds of one setting: all of its seeds, or those of a round."""
+
+    run: str
+    number: int
+    seeds: int
+    diverged: bool
+    returns: dict[str, np.ndarray] | None  # split -> (S, T, episodes) of the last evaluation
+
+
+def _row(values: dict[str, str], parts: list[_Part]) -> dict[str, Any]:
+    row = {"run": " ".join(part.run for part in parts), "number": parts[0].number, **values}
+    row["seeds"] = sum(part.seeds for part in parts)
+    known = [part.returns for part in parts if part.returns is not None]
+    lost = sum(part.seeds for part in parts if part.diverged)
+    if lost:
+        return row | {"diverged": lost}
+    if len(known) < len(parts):
+        return row
+    return row | _scores({split: np.concatenate([x[split] for x in known]) for split in known[0]})
+
+
+def _values(config: RunConfig, point: Mapping[str, float]) -> dict[str, str]:
+    """The values of one setting, in the order in which the sweep was asked for."""
+    axes = [_axis(word) for word in config.sweep]
+    return {x.name: f"{point[x.setting]:g}" if x.setting in point else x.values[0] for x in axes}
+
+
+def _scores(returns: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Mean and interval over seeds of returns (S, T, episodes); none where a seed diverged, as that has no mean."""
+    diverged = max(int(np.sum(~np.isfinite(x).all(axis=(1, 2)))) for x in returns.values())
+    found: dict[str, Any] = {"diverged": diverged}
+    for split, x in returns.items():
+        scores = seed_interval(x.mean(axis=-1)) if not diverged else (np.nan,) * 3
+        found |= dict(zip((split, f"{split}_low", f"{split}_high"), map(number, scores), strict=True))
+    return found
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Lay out a sweep's rows: settings, then each split's mean return with its 95% interval over seeds."""
+    splits = [split for split in SPLITS if split in rows[0]] or [SPLITS[0]]
+    after = list(rows[0]).index("seeds")
+    settings = [name for name in list(rows[0])[:after] if name != "number"]
+    lines = [[*settings, *splits]]
+    for row in rows:
+        lines.append([*(str(row[name]) for name in settings), *(_cell(row, split) for split in splits)])
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    text = "\n".join("  ".join(x.rjust(w) for x, w in zip(line, widths, strict=True)) for line in lines)
+    known = [row for row in rows if row.get("train")]
+    if len(known) < 2:
+        return text
+    best = max(known, key=lambda row: float(row["train"]))
+    named = ", ".join(f"{name} {best[name]}" for name in settings if name != "run")
+    return f"{text}\nhighest on training tasks: {named} ({best['run']}, number {best['number']})"
+
+
+def _cell(row: Mapping[str, Any], split: str) -> str:
+    if not row.get(split):
+        return f"{row['diverged']} of {row['seeds']} seeds diverged" if row.get("diverged") else "-"
+    interval = f" [{float(row[f'{split}_low']):.0f}, {float(row[f'{split}_high']):.0f}]" if row[f"{split}_low"] else ""
+    return f"{float(row[split]):.0f}{interval}"
