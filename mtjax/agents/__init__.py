@@ -3,10 +3,10 @@
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from mtjax.agents.base import PARTS, BaseAgent, build, settings
 from mtjax.agents.deepmdp import DeepMDP
 from mtjax.agents.distral import Distral
 from mtjax.agents.hip_bmdp import HiPBMDP
-from mtjax.agents.hyperparameters import PARTS, Hyperparameters, build, settings
 from mtjax.agents.sac import SAC
 from mtjax.names import nearest_error
 
@@ -86,4 +86,4 @@ def preset_of(name: str) -> Preset:
     return AGENTS[name]
 
 
-__all__ = ["AGENTS", "PARTS", "SAC", "Hyperparameters", "Preset", "agent", "preset_of", "settings"]
+__all__ = ["AGENTS", "PARTS", "SAC", "BaseAgent", "Preset", "agent", "preset_of", "settings"]
