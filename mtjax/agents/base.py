@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Mapping
 from functools import partial
-from typing import Annotated, Any, Literal, NamedTuple, get_args
+from typing import Annotated, Any, Literal, NamedTuple, get_args, get_type_hints
 
 import jax
 import jax.numpy as jnp
@@ -36,6 +36,8 @@ PARTS: dict[str, Mapping[str, type]] = {
     "sampler": SAMPLERS,
     "experience": EXPERIENCES,
 }
+CHOICES = tuple(kind for kind in PARTS if kind != "experience")
+"""The kinds of parts that are chosen by name; an agent's experience is what it learns from, whoever asks."""
 FLAT = tyro.conf.arg(name="")  # a part's fields are flags of the agent's; its name is read before tyro's turn
 
 
@@ -279,6 +281,20 @@ class BaseAgent:
 def kinds_of(agent: Any) -> list[str]:
     """The kinds of parts that an agent, or a class of agents, has."""
     return [field.name for field in dataclasses.fields(agent) if field.name in PARTS]
+
+
+def flag_names(agent: Any) -> dict[str, str]:
+    """Return the command-line flag, without dashes, of each of an agent's settings, by the setting's name."""
+    bare = {name for holder in (agent, agent.experience) for name in _unprefixed(type(holder))}
+    names = {name: name.replace("_", "-") for name in settings(agent) if name != "experience"}
+    return {name: flag if name in bare else f"agent.{flag}" for name, flag in names.items()}
+
+
+def _unprefixed(cls: type) -> list[str]:
+    """The settings of a class whose flags do not begin with those of the agent's."""
+    hints = get_type_hints(cls, include_extras=True)
+    marks = {name: getattr(hint, "__metadata__", ()) for name, hint in hints.items()}
+    return [name for name, found in marks.items() if any(getattr(x, "prefix_name", None) is False for x in found)]
 
 
 def settings(agent: Any) -> dict[str, Any]:
