@@ -148,7 +148,7 @@ class Agent(Protocol):
     def act(self, state: Any, memory: Any, obs: Any, task: Task, key: Key | None) -> Acted: ...
     def remember(self, state: Any, memory: Any, transition: Transition, task: Task) -> Any: ...  # after a step
     def observe(self, state: Any, outcome: Outcome) -> Any: ...
-    def learn(self, env: Env, states: Any, data: Any, tasks: Task, keys: Key) -> tuple[Any, Metrics]: ...  # of all seeds
+    def learn(self, env: Env, states: Any, data: Any, tasks: Task, keys: Key) -> tuple[Any, Metrics]: ...  # all seeds
 
 
 class InputError(ValueError):

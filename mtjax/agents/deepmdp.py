@@ -128,9 +128,9 @@ class DeepMDP(SAC):
         state = super().init(spec, tasks, key)
         return state._replace(target=only(state.target, (*CRITIC, *SIGHT)))  # models do not bootstrap
 
-    def init_networks(self, num_tasks: int, features: Array, obs: Any, action: Array, key: Key) -> tuple[Params, Params]:
+    def init_networks(self, num_tasks: int, told: Array, obs: Any, action: Array, key: Key) -> tuple[Params, Params]:
         key, theta_key, *keys = jax.random.split(key, 2 + len(self.modules))
-        width = len(features) + self.embedding_size * (self.has_theta + (self.conditioning == "inferred"))
+        width = len(told) + self.embedding_size * (self.has_theta + (self.conditioning == "inferred"))
         latent, told = jnp.zeros(self.latent_widths[-1]), jnp.zeros(width)
         actor, critic = super().init_networks(num_tasks, told, latent, action, key)
         inputs = {"latent": (plain(obs),), "transition": (latent, told, action), "reward": (latent, told)}

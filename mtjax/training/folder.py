@@ -86,7 +86,9 @@ def repeat(config: RunConfig) -> list[str]:
         items = dataclasses.asdict(getattr(config, part)).items()
         words += itertools.chain(*(_flag(prefix, name.replace("_", "-"), value) for name, value in items))
     names, values = flag_names(config.learner), settings(config.learner)
-    words += itertools.chain(*(_flag("--", names[name], values[name]) for name in names))
+    for name, flag in names.items():
+        group, dot, rest = flag.rpartition(".")
+        words += _flag(f"--{group}{dot}", rest, values[name])
     return words + (["--sweep", *config.sweep] if config.sweep else [])
 
 

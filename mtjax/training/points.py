@@ -105,7 +105,8 @@ def vary(agent: BaseAgent, knobs: Mapping[str, Array]) -> BaseAgent:
 
 def _place(agent: BaseAgent, values: Mapping[str, Any], replace: Callable) -> BaseAgent:
     mine = lambda part: {f.name: values[f.name] for f in dataclasses.fields(part) if f.name in values}
-    changed = {kind: replace(getattr(agent, kind), **own) for kind in kinds_of(agent) if (own := mine(getattr(agent, kind)))}
+    held = {kind: getattr(agent, kind) for kind in kinds_of(agent)}
+    changed = {kind: replace(part, **own) for kind, part in held.items() if (own := mine(part))}
     return replace(agent, **changed, **mine(agent))
 
 
