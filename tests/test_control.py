@@ -10,6 +10,7 @@ import pytest
 from probes import tiny
 
 from mtjax import loop
+from mtjax.config import configure
 from mtjax.envs.mtenv.control import (
     Acrobot,
     AcrobotState,
@@ -288,7 +289,8 @@ def test_mtenv_numbers_of_an_acrobot():
 def test_an_agent_trains_on_it(env):
     """Traced, not run: the loop, agent and tasks fit together, and time limits are the loop's to count."""
     env, agent = dataclasses.replace(env, num_tasks=3), tiny("sac-conditioned")
-    settings = loop.Settings(num_envs=2, batch_size=4, replay_size=12, warmup_steps=1, chunk_steps=2)
+    given = {"num_envs": 2, "batch_size": 4, "replay_size": 12, "warmup_steps": 1, "chunk_steps": 2}
+    agent, settings = configure(agent, loop.Settings(), given)
     assert env.episode_length == 500
     state = jax.eval_shape(lambda: loop.init(env, agent, settings, env.tasks(), jnp.arange(1)))
     after, _ = jax.eval_shape(lambda state: loop.run_chunk(env, agent, settings, env.tasks(), state), state)

@@ -6,16 +6,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mtjax.history import Past, Seen, remember
 from probes import QUICK, Probe, learner, of_task, only_seed, pick, random_batch, tasks_of, tiny, train
 from probes import values as values_of
 
 from mtjax.agents.deepmdp import SIGHT, Targets, only
-from mtjax.history import Past, Seen, remember, widen
 from mtjax.loop import Settings
 from mtjax.networks import Params
 from mtjax.types import InputError, Spec
 
-SPEC, BATCH = Spec(3, 2, 1), 4
+SPEC, BATCH = Spec.vector(3, 2, 1), 4
 TASKS = tasks_of("one-step", (1.0, -0.5, 0.3))
 KEY = jax.random.key(2)
 SMALL = {"latent_widths": (8, 6), "model_widths": (8,)}
@@ -28,7 +28,7 @@ def make(name, **settings):
 
 
 def spec_of(agent):
-    return widen(SPEC, agent.history)
+    return SPEC
 
 
 def start(agent):

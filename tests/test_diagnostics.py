@@ -20,7 +20,6 @@ from mtjax import loop
 from mtjax.agents import AGENTS
 from mtjax.agents.parts.encoders import ENCODERS
 from mtjax.config import from_json, to_json
-from mtjax.history import widen
 from mtjax.networks import Params, tanh_normal
 from mtjax.report import diagnostics
 from mtjax.report import figures as plot
@@ -30,7 +29,7 @@ from mtjax.training.policy import load_experience
 from mtjax.types import InputError, Spec
 
 TASKS, BATCH, KEY = tasks_of("one-step", (1.0, -0.5, 0.3)), 8, jax.random.key(5)
-SPEC = Spec(3, 2, 1)
+SPEC = Spec.vector(3, 2, 1)
 
 
 def started(agent):
@@ -245,7 +244,7 @@ def test_activity_is_that_of_the_networks():
 
 def trace(agent):
     """What diagnostics of an agent would be: shapes alone."""
-    spec = widen(SPEC, agent.history)
+    spec = SPEC
     state = shapes_of(agent, spec)
     batch = jax.eval_shape(lambda: random_batch(0, 3, BATCH, spec))
     gradients = jax.eval_shape(partial(compare_gradients, agent), state, batch, TASKS, KEY)

@@ -10,6 +10,7 @@ import optax
 import pytest
 import scipy.optimize
 from probes import QUICK, learner, of_task, pick, random_batch, tasks_of, tiny
+from probes import act as act_once
 
 from mtjax.agents import agent
 from mtjax.agents.distral import Distral
@@ -18,7 +19,7 @@ from mtjax.agents.sac import SAC
 from mtjax.networks import Params, log_density, sample_raw, tanh_normal
 from mtjax.types import InputError, Spec
 
-SPEC, BATCH = Spec(3, 2, 1), 4
+SPEC, BATCH = Spec.vector(3, 2, 1), 4
 TASKS = tasks_of("one-step", (1.0, -0.5, 0.3))
 KEY, FEATURES = jax.random.key(5), jnp.zeros(0)
 
@@ -266,7 +267,7 @@ def optimum(alpha):
 def test_a_bandits_optimum(alpha):
     """The more the distilled policy counts, the nearer it draws the tasks' policies, and exactly so far."""
     made, optimizer = KnownCritic(hidden=(8,), distral_alpha=alpha), optax.adam(3e-3)
-    rows = jax.tree.map(jnp.zeros_like, random_batch(0, 2, 256, Spec(1, 1, 1)))
+    rows = jax.tree.map(jnp.zeros_like, random_batch(0, 2, 256, Spec.vector(1, 1, 1)))
     goals, temperature = jnp.float32([GOAL, -GOAL]), jnp.full(2, HEAT)
     of_tasks = jax.vmap(made.actor_loss, (Params(None, 0), (0, None, Params(None, 0), 0, 0)))
 
@@ -301,7 +302,7 @@ def test_optima_differ():
 def test_training_tasks_play_their_own_policies_and_others_the_distilled_one(state):
     """Whatever their contexts."""
     made, obs = tiny("distral"), jnp.float32([0.3, -1.0, 0.5])
-    act = lambda task: np.asarray(made.act(state, obs, task, None))
+    act = lambda task: np.asarray(act_once(made, state, obs, task, None))
     mean = lambda outputs: np.tanh(np.asarray(outputs)[:2])
     own = [made.policy(of_task(state.actor, i), of_task(state.critic, i), FEATURES, obs) for i in range(3)]
     common = made.actor.apply_distilled(of_task(state.actor, 0), FEATURES, obs)
@@ -319,7 +320,9 @@ def test_a_distilled_policy_may_be_told_the_task(told):
     """As the others are; it then acts differently in different tasks."""
     made = tiny("distral", conditioning=told)
     fresh = learner(made, TASKS, BATCH, SPEC)[0](TASKS, KEY)
-    played = [np.asarray(made.act(fresh, jnp.ones(3), pick(TASKS, i)._replace(id=jnp.int32(7)), None)) for i in (0, 1)]
+    played = [
+        np.asarray(act_once(made, fresh, jnp.ones(3), pick(TASKS, i)._replace(id=jnp.int32(7)), None)) for i in (0, 1)
+    ]
     assert not np.allclose(played[0], played[1], atol=1e-3)
     assert ("nearest" in made.unseen) == (told != "parameters")
 
