@@ -192,7 +192,7 @@ def values(agent, state, tasks: Task, obs, action) -> np.ndarray:
     rows = []
     for i in range(len(tasks.id)):
         features = agent.features(state, pick(tasks, i))
-        rows.append(agent.value.mean(agent.q(of_task(state.critic, i), features, obs, action)))
+        rows.append(agent.values(of_task(state.critic, i), features, obs, action))
     return np.stack(rows)
 
 

@@ -15,7 +15,7 @@ from probes import act as act_once
 from mtjax.agents import agent
 from mtjax.agents.distral import Distral
 from mtjax.agents.parts.gradients.descent import descend
-from mtjax.agents.sac import SAC
+from mtjax.agents.sac import SAC, Batch
 from mtjax.networks import Params, log_density, sample_raw, tanh_normal
 from mtjax.types import InputError, Spec
 
@@ -108,6 +108,12 @@ def charged(made, actor, obs):
     return raw, densities[0] - made.distral_alpha * densities[1], densities
 
 
+def seen(rows, gamma=0.99):
+    """What the losses see of transitions of one task."""
+    fields = (rows.obs, rows.action, rows.reward, gamma * rows.discount, rows.next_obs)
+    return Batch(*fields, told=FEATURES, temperature=TEMPERATURE, mask=None)
+
+
 def test_critic_target(state, batch):
     """y = r + discount gamma (min Q - a (log pi_i - alpha log pi_0))."""
     made, rows = tiny("distral", distral_alpha=ALPHA, gamma=0.9), pick(batch, 1)
@@ -115,9 +121,9 @@ def test_critic_target(state, batch):
     raw, cost, _ = charged(made, actor, rows.next_obs)
     values = np.min(made.values(target, FEATURES, rows.next_obs, jnp.tanh(raw)), axis=0)
     expected = np.asarray(rows.reward) + 0.9 * np.asarray(rows.discount) * (values - TEMPERATURE * cost)
-    found = made.critic_target(actor, critic, target, FEATURES, TEMPERATURE, rows, KEY)
+    found = made.target(actor, critic, target, seen(rows, 0.9), KEY)
     np.testing.assert_allclose(found, expected, rtol=1e-4)
-    plain = SAC.sample(made, actor, critic, FEATURES, rows.next_obs, KEY)[1]
+    plain = SAC.sample(made, actor, critic, seen(rows), rows.next_obs, KEY).log_prob
     assert np.all(np.abs(cost - plain) > 0.1)  # that the distilled policy has a say here
 
 
@@ -127,7 +133,7 @@ def test_actor_loss(state, batch):
     actor, critic, _ = problem(state)
     raw, cost, (own, common) = charged(made, actor, rows.obs)
     values = np.min(made.values(critic, FEATURES, rows.obs, jnp.tanh(raw)), axis=0)
-    loss, metrics = made.actor_loss(actor, (rows, FEATURES, critic, TEMPERATURE, KEY))
+    loss, metrics = made.actor_loss(actor, (seen(rows), critic, KEY))
     policy_loss = np.mean(TEMPERATURE * cost - values)
     np.testing.assert_allclose(loss, policy_loss - np.mean(common), rtol=1e-4)
     np.testing.assert_allclose(metrics["actor_loss"], policy_loss, rtol=1e-4)
@@ -146,7 +152,7 @@ def test_each_loss_reaches_its_own_policy_alone(state, batch):
     """The policy's never the distilled parameters, and distillation these alone, by its actions too."""
     made, rows = tiny("distral", distral_alpha=ALPHA), pick(batch, 1)
     actor, critic, _ = problem(state)
-    data = (rows, FEATURES, critic, TEMPERATURE, KEY)
+    data = (seen(rows), critic, KEY)
     own, distilled = slopes(made, actor, data, SAC.actor_loss)
     both_own, both_distilled = slopes(made, actor, data, Distral.actor_loss)
     assert all(np.all(x == 0) for x in leaves(distilled))
@@ -168,7 +174,7 @@ def test_the_action_carries_the_distilled_policys_slope(state, batch):
     made, rows = tiny("distral", distral_alpha=ALPHA), pick(batch, 1)
     actor, critic, _ = problem(state)
     mute = jax.tree.map(jnp.zeros_like, critic)
-    own, _ = slopes(made, actor, (rows, FEATURES, mute, TEMPERATURE, KEY), Distral.actor_loss)
+    own, _ = slopes(made, actor, (seen(rows), mute, KEY), Distral.actor_loss)
     outputs = np.asarray(made.policy(actor, actor, FEATURES, rows.obs), np.float64)
     common = made.actor.apply_distilled(actor, FEATURES, rows.obs)
     noise = np.asarray(jax.random.normal(KEY, (BATCH, 2)), np.float64)
@@ -269,11 +275,12 @@ def test_a_bandits_optimum(alpha):
     made, optimizer = KnownCritic(hidden=(8,), distral_alpha=alpha), optax.adam(3e-3)
     rows = jax.tree.map(jnp.zeros_like, random_batch(0, 2, 256, Spec.vector(1, 1, 1)))
     goals, temperature = jnp.float32([GOAL, -GOAL]), jnp.full(2, HEAT)
-    of_tasks = jax.vmap(made.actor_loss, (Params(None, 0), (0, None, Params(None, 0), 0, 0)))
+    own = Batch(rows.obs, rows.action, rows.reward, rows.discount, rows.next_obs, jnp.zeros((2, 0)), temperature, None)
+    of_tasks = jax.vmap(made.actor_loss, (Params(None, 0), (0, Params(None, 0), 0)))
 
     def learn(carry, key):
         actor, memory = carry
-        data = (rows, FEATURES, Params({}, goals), temperature, jax.random.split(key, 2))
+        data = (own, Params({}, goals), jax.random.split(key, 2))
         slope = jax.grad(lambda actor: jnp.mean(of_tasks(actor, data)[0]))(actor)
         actor, memory = descend(optimizer, slope, memory, actor)
         outputs = jax.vmap(lambda own: made.policy(Params({}, own), actor, FEATURES, jnp.zeros(1)))(actor.own)

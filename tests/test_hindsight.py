@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import compiled
-from probes import QUICK, Goals, pick, quick, train
+from probes import QUICK, Goals, Stub, pick, quick, tiny, train
 
 import mtjax.train
+from mtjax.agents.parts.trajectory import append, begin
 from mtjax.envs import make
-from mtjax.experience import hindsight
+from mtjax.experience import Replay, hindsight
 from mtjax.experience import ring as rings
 from mtjax.types import InputError, Transition
 

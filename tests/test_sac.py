@@ -11,7 +11,7 @@ import pytest
 from probes import quick, random_batch, tasks_of
 
 from mtjax.agents.parts.encoders import Identity
-from mtjax.agents.sac import SAC, SACState
+from mtjax.agents.sac import SAC, Batch, SACState
 from mtjax.networks import Params, join
 from mtjax.types import Spec, Transition
 
@@ -35,7 +35,7 @@ class LinearSAC(SAC):
     encoder: Identity = dataclasses.field(default_factory=Bare)
 
 
-def linear_policy(outputs, key):
+def linear_policy(outputs, key, mask=None):
     """The first output is the action and the second its log-probability, so that all is linear and without noise."""
     action, log_prob = jnp.split(outputs, 2, axis=-1)
     return action, log_prob[..., 0]

@@ -2,12 +2,13 @@
 
 import dataclasses
 from functools import partial
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import QUICK, Probe, Walk, learner, only_seed, random_batch, tasks_of, tiny, train, values
+from probes import QUICK, Probe, Stub, Walk, learner, only_seed, random_batch, tasks_of, tiny, train, values
 
 from mtjax import normalize
 from mtjax.agents import agent
