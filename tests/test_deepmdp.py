@@ -141,7 +141,7 @@ def test_theta_loss_of_three_tasks_by_hand(monkeypatch):
     """Thetas 3, 4 and 5 apart, and a state s that moves predictions by s theta: (d - |s| d)^2 for each sample."""
     agent = make("hip-bmdp", embedding_size=2)
     monkeypatch.setattr(type(agent), "foretell", lambda self, p, latent, told, a: (latent * told, 0 * latent * told))
-    monkeypatch.setattr(type(agent), "see", lambda self, p, features, obs: (obs, p.own["embedding"]))
+    monkeypatch.setattr(type(agent), "perceive", lambda self, p, features, obs: (obs, p.own["embedding"]))
     thetas = np.array([[0, 0], [3, 0], [3, 4]], np.float32)
     obs = jnp.float32([[0.0], [1.0], [-3.0]])
     for i, j, apart in ((0, 1, 3), (1, 2, 4), (2, 0, 5), (0, 0, 0)):
@@ -154,8 +154,8 @@ def test_a_rival_is_always_another_task():
     """Over many keys every other task has its turn; one that is alone is its own, and learns nothing of it."""
     agent = make("hip-bmdp")
     state, batch, _ = start(agent)
-    features, temperature = jnp.zeros((3, 0)), jnp.ones(3)
-    rivals = jit(lambda key: agent.critic_problem(state, batch, features, temperature, key)[1][2].rival)
+    _, seen = agent.prepare(state, batch, TASKS)
+    rivals = jit(lambda key: agent.critic_problem(state, seen, key)[1][1].rival)
     thetas, turns = np.asarray(state.critic.own["embedding"]), set()
     for seed in range(12):
         found = np.asarray(rivals(jax.random.key(seed)))
@@ -165,8 +165,7 @@ def test_a_rival_is_always_another_task():
     first = lambda tree: jax.tree.map(lambda x: x[:1], tree)
     state = state._replace(critic=Params(state.critic.shared, first(state.critic.own)))
     state = state._replace(target=Params(state.target.shared, first(state.target.own)))
-    batch, features, temperature = first((batch, features, temperature))
-    loss, data = agent.critic_problem(state, batch, features, temperature, KEY)
+    loss, data = agent.critic_problem(state, first(seen), KEY)
     theta_loss = lambda critic: loss(critic, jax.tree.map(lambda x: x[0], data))[1]["theta_loss"]
     value, slope = jit(jax.value_and_grad(theta_loss))(of_task(state.critic, 0))
     np.testing.assert_allclose(value, 0, atol=1e-10)
