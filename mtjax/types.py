@@ -8,6 +8,8 @@ from typing import Any, NamedTuple, Protocol
 
 import jax
 
+from mtjax.names import InputError as InputError  # everyone's, found here by most
+
 Array = jax.Array
 Key = jax.Array
 Metrics = dict[str, Array]
@@ -94,7 +96,3 @@ class Agent(Protocol):
     def update(self, state: Any, batch: Transition, tasks: Task, key: Key) -> tuple[Any, Metrics]: ...
     def observe(self, state: Any, outcome: Outcome) -> Any: ...
     def reset(self, state: Any, spec: Spec, tasks: Task, key: Key) -> Any: ...  # networks begin anew
-
-
-class InputError(ValueError):
-    """Something the user gave cannot be used; the message says what was given and what is allowed."""
