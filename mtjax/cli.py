@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from mtjax.agents import PARTS, settings
-from mtjax.commands import check_names, import_files, parse_with_tyro, value_of
+from mtjax.commands import check_names, import_files, parse_with_tyro, unknown_flag, value_of
 from mtjax.config import RunConfig, from_json, with_preset
-from mtjax.names import InputError, nearest_error
+from mtjax.names import InputError
 
 _VARY = "--env.vary."
 _FAMILY_FLAGS = {"combine": "env.combine", "split": "split"}  # they decide which values are allowed
@@ -105,5 +105,4 @@ def _check_flags(argv: Sequence[str], config: RunConfig) -> None:
     for word in argv:
         flag = word.split("=", 1)[0].replace("_", "-")
         if flag.startswith("--") and flag not in (*known, "--help"):
-            error = nearest_error("flag", flag, known)
-            raise InputError(str(error).split("choose from")[0] + "--help lists the flags")
+            raise unknown_flag(flag, known)

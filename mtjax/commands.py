@@ -6,7 +6,7 @@ import io
 import itertools
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,6 +17,7 @@ from mtjax.names import InputError, nearest_error
 PRESETS = ("auto", "cpu", "gpu")
 _KNOWN = (("environment", "env", ENVS), ("agent", "agent", AGENTS), ("preset", "preset", PRESETS))
 _MAY_CHANGE = {"--resume", "--steps", "--import", "--distributed", "--profile"}  # where a run goes on
+_FIELD = re.compile(r"^    (\w+): ", re.MULTILINE)  # a line of a class that may be a setting
 P = TypeVar("P")
 
 
@@ -66,6 +67,30 @@ def check_names(argv: Sequence[str]) -> None:
         folder = value_of(argv, flag, None)
         if folder is not None and not (flag == "resume" and any(Path(folder).glob("run-*"))):  # the runs of a sweep
             require_run(Path(folder))
+
+
+def check_flags(argv: Sequence[str]) -> None:
+    """Refuse a flag that is no setting of any family or agent; which of them has a setting is checked with the rest.
+
+    Raises:
+        InputError: there is no such flag, whatever is chosen.
+    """
+    places = (*(place for place, _ in ENVS.data.values()), *(preset.place for preset in AGENTS.values()))
+    if not all(isinstance(place, str) for place in places):  # a class of the user's own, with settings of its own
+        return
+    files = Path(__file__).parent.rglob("*.py")  # read and not run: to import the classes is to import JAX
+    fields = itertools.chain.from_iterable(_FIELD.findall(file.read_text(encoding="utf-8")) for file in files)
+    known = {*(field.replace("_", "-") for field in fields), "from", "help"}
+    for word in argv:
+        flag = word.split("=", 1)[0].replace("_", "-")
+        group, name = re.fullmatch(r"(--(?:\w+\.)*)?(.*)", flag).groups("")  # type: ignore
+        if group and not flag.startswith("--env.vary.") and not {name, name.removeprefix("no-")} & known:
+            raise unknown_flag(flag, [group + other for other in sorted(known)])
+
+
+def unknown_flag(flag: str, known: Iterable[str]) -> InputError:
+    """Return an error for a flag that there is not; --help lists the others, of which there are many."""
+    return InputError(str(nearest_error("flag", flag, known)).split("choose from")[0] + "--help lists the flags")
 
 
 def require_run(folder: Path) -> None:

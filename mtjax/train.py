@@ -16,6 +16,7 @@ def main(argv: Sequence[str]) -> None:
     """Answer what names alone can answer; then import what trains, and run what the command line asks for."""
     argv = commands.import_files(argv)
     commands.check_names(argv)
+    commands.check_flags(argv)
     if "--list" in argv:
         print(commands.catalogue())
         return

@@ -12,10 +12,12 @@ from conftest import SHORT_RUN
 from mujoco import mjx
 
 import mtjax
-from mtjax import commands
+from mtjax import cli, commands
 from mtjax.agents import AGENTS
+from mtjax.config import with_preset
 from mtjax.envs import ENVS, fields, outline
 from mtjax.envs.brax import NAMES
+from mtjax.names import InputError
 
 HEAVY = ("jax", "flax", "optax", "mujoco", "orbax", "brax", "warp", "matplotlib", "mtjax.config")
 ENGINES = ("mujoco.mjx", "warp", "brax")
@@ -42,6 +44,12 @@ def run(module, words, asked, folder):
     return done.returncode, "\n".join([*output, done.stderr]), json.loads(imported)
 
 
+@pytest.fixture
+def ours(monkeypatch):
+    """Forgets the families that other tests have registered."""
+    monkeypatch.setattr(ENVS, "data", {name: entry for name, entry in ENVS.data.items() if isinstance(entry[0], str)})
+
+
 @pytest.mark.parametrize(
     "module, words, code, said",
     [
@@ -50,6 +58,13 @@ def run(module, words, asked, folder):
         ("mtjax.train", ["--env=finger-spn"], 2, "did you mean 'finger-spin'?"),
         ("mtjax.train", ["--agent", "carr"], 2, "did you mean 'care'?"),
         ("mtjax.train", ["--preset=gpus"], 2, "did you mean 'gpu'?"),
+        (
+            "mtjax.train",
+            ["--num-env=3"],
+            2,
+            "'--num-env'; did you mean '--num-envs'? --help lists the flags",
+        ),
+        ("mtjax.train", ["--agent.num_expert", "3"], 2, "did you mean '--agent.num-experts'?"),
         ("mtjax.train", ["--import=nothing.py"], 2, "--import needs a Python file"),
         ("mtjax.train", ["--resume=nowhere"], 2, "'nowhere' is not a run"),
         ("mtjax.train", ["--resume=nowhere", "--num-envs=3"], 2, "only --steps may change, not --num-envs"),
@@ -74,6 +89,27 @@ def test_a_run_of_the_c_engine_imports_no_other(tmp_path):
     code, output, imported = run("mtjax.train", words, (*ENGINES, "mujoco"), tmp_path)
     assert code == 0 and "trained in" in output
     assert imported == ["mujoco"]
+
+
+@pytest.mark.parametrize("env, agent", [(env, "sac") for env in ENVS] + [("finger-spin", agent) for agent in AGENTS])
+def test_no_flag_is_refused_that_there_is(env, agent, ours):
+    """Of any family or agent, before either is known."""
+    flags = cli.flags(with_preset(env, agent, "cpu"))
+    commands.check_flags([*flags, *(f"{flag}=1" for flag in flags)])
+
+
+def test_no_way_to_write_a_flag_is_refused(ours):
+    """With underscores, switched off, or by a name that only the command line knows; and values are no flags."""
+    words = "--env.vary.mass=1:2:3 --agent.no-shared_temperature --num_envs=3 --no-profile --from=x --help -h 1 -3"
+    commands.check_flags(words.split())
+
+
+def test_a_class_of_the_users_own_may_have_any_flag(ours, monkeypatch):
+    """What its settings are is known once the command line is read in full."""
+    with pytest.raises(InputError, match=r"unknown flag '--env\.springiness'"):
+        commands.check_flags(["--env.springiness=3"])
+    monkeypatch.setitem(ENVS, "mine", ENVS["finger-spin"])
+    commands.check_flags(["--env.springiness=3"])
 
 
 @pytest.mark.parametrize("name", ENVS)
