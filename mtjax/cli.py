@@ -5,7 +5,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mtjax.agents import PARTS, settings
+from mtjax.agents import settings
+from mtjax.agents.base import CHOICES, flag_names
 from mtjax.commands import check_names, import_files, parse_with_tyro, unknown_flag, value_of
 from mtjax.config import RunConfig, from_json, with_preset
 from mtjax.names import InputError
@@ -59,7 +60,7 @@ def _peel_vary(argv: Sequence[str]) -> tuple[dict[str, str], list[str]]:
 
 def _peel_parts(argv: Sequence[str]) -> tuple[dict[str, str], list[str]]:
     """Take --agent.KIND=NAME out of a command line: the part decides which other flags there are."""
-    kinds = {f"--agent.{kind}": kind for kind in PARTS}
+    kinds = {f"--agent.{kind}": kind for kind in CHOICES}
     given, rest = _take(argv, kinds.__contains__, "a value")
     return {kinds[flag]: name for flag, name in given.items()}, rest
 
@@ -86,8 +87,7 @@ def flags(config: Any, prefix: str = "--") -> list[str]:
         if name in ("vary", "context-ranges", "points"):  # a flag for each parameter, taken out before; and no flags
             continue
         if name == "learner":
-            names += [f"--agent.{setting.replace('_', '-')}" for setting in settings(value) if setting != "tune"]
-            names.append("--tune")
+            names += [f"--{flag}" for flag in flag_names(value).values()]
             continue
         group = {"plan": "--", "training": "--", "family": "--env."}.get(field.name)
         if group is not None:

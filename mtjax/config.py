@@ -13,7 +13,8 @@ from typing import Annotated, Any, Literal
 import jax
 import tyro
 
-from mtjax.agents import SAC, agent, settings
+from mtjax.agents import SAC, BaseAgent, agent, preset_of, settings
+from mtjax.agents.base import replace
 from mtjax.commands import require_run
 from mtjax.envs import Family, make
 from mtjax.loop import Settings
@@ -80,7 +81,7 @@ class RunConfig:
     family: Annotated[Family, tyro.conf.arg(name="env")] = dataclasses.field(
         default_factory=lambda: make("finger-spin")
     )
-    learner: Annotated[SAC, tyro.conf.arg(name="agent")] = dataclasses.field(default_factory=SAC)
+    learner: Annotated[BaseAgent, tyro.conf.arg(name="agent")] = dataclasses.field(default_factory=SAC)
 
 
 def with_preset(
@@ -97,16 +98,30 @@ def with_preset(
     """
     family = make(env_name, **family_settings)
     preset = load_preset(env_name, _device_preset() if preset_name == "auto" else preset_name)
-    of_agent = preset.get("agent", {}) | preset.get(agent_name, {})
+    chosen = preset.get("training", {}) | preset.get("agent", {}) | preset.get(agent_name, {})
+    if not issubclass(preset_of(agent_name).cls, SAC):  # the tables of all agents are tuned for SAC
+        chosen = preset.get(agent_name, {})
+    played = {name: chosen.pop(name) for name in list(chosen) if name in Settings.__dataclass_fields__}
     return RunConfig(
         env=env_name,
         agent=agent_name,
         preset=preset_name,  # type: ignore
         plan=Plan(**preset.get("plan", {})),
-        training=Settings(**preset.get("training", {})),
+        training=Settings(**played),
         family=family,
-        learner=agent(agent_name, **{**of_agent, **agent_settings}),
+        learner=agent(agent_name, **{**chosen, **agent_settings}),
     )
+
+
+def configure(agent: Any, settings: Settings, given: Mapping[str, Any]) -> tuple[Any, Settings]:
+    """Return agent and settings with given values in place of their own, each where its name belongs.
+
+    Raises:
+        InputError: a name is neither's, or a value is not allowed.
+    """
+    played = {name: value for name, value in given.items() if name in Settings.__dataclass_fields__}
+    rest = {name: value for name, value in given.items() if name not in played}
+    return replace(agent, rest), dataclasses.replace(settings, **played)
 
 
 def load_preset(env_name: str, name: str) -> dict[str, Any]:

@@ -1,17 +1,25 @@
 """Evaluation: whole episodes under the mean action, on any tasks, with keys of its own."""
 
 import os
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.loop import actions, begin, play
-from mtjax.tasks import episode_task
+from mtjax.rollout import Worlds, reset_envs, step_envs
 from mtjax.types import SPLITS, Agent, Array, Env, InputError, Task
+
+
+class Scores(NamedTuple):
+    """Every episode of one evaluation."""
+
+    returns: Any  # (S, T, episodes) undiscounted
+    metrics: dict[str, Any]  # (S, T, episodes) each, such as success: their values in the episode's last step
 
 
 class Evaluations(NamedTuple):
@@ -20,13 +28,15 @@ class Evaluations(NamedTuple):
     steps: np.ndarray  # (V,) environment steps, summed over tasks, after which each evaluation took place
     returns: dict[str, np.ndarray]  # split -> (S, V, T, episodes)
     values: dict[str, np.ndarray]  # split -> (T,) value of the varying parameter
+    metrics: Mapping[str, dict[str, np.ndarray]] = MappingProxyType({})  # name -> split -> (S, V, T, episodes)
 
 
 def save_evaluations(path: Path, evaluations: Evaluations) -> None:
-    """Write every episode's return: ``steps`` (V,), and per split returns (S, V, T, episodes) and values (T,)."""
+    """Write every episode: ``steps`` (V,), and per split returns and metrics (S, V, T, episodes) and values (T,)."""
     values = {f"{split}_values": x for split, x in evaluations.values.items()}
+    metrics = {f"{split}_{name}": x for name, splits in evaluations.metrics.items() for split, x in splits.items()}
     new = path.with_suffix(".new.npz")
-    np.savez(new, steps=evaluations.steps, **evaluations.returns, **values)  # type: ignore
+    np.savez(new, steps=evaluations.steps, **evaluations.returns, **values, **metrics)  # type: ignore
     os.replace(new, path)
 
 
@@ -34,15 +44,20 @@ def load_evaluations(path: Path) -> Evaluations:
     """Read what ``save_evaluations`` wrote."""
     try:
         with np.load(path, allow_pickle=False) as file:
-            returns = {split: file[split] for split in SPLITS}
-            return Evaluations(file["steps"], returns, {s: file[f"{s}_values"] for s in SPLITS})
+            named = {name.removeprefix("train_") for name in file if name.startswith("train_")} - {"values"}
+            return Evaluations(
+                file["steps"],
+                {split: file[split] for split in SPLITS},
+                {split: file[f"{split}_values"] for split in SPLITS},
+                {name: {split: file[f"{split}_{name}"] for split in SPLITS} for name in sorted(named)},
+            )
     except (OSError, ValueError, KeyError) as error:
         raise InputError(f"cannot read evaluations from {str(path)!r}: {error}") from None
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
-def evaluate(env: Env, agent: Agent, episodes: int, state: Any, tasks: Task, seeds: Array, number: Array) -> Array:
-    """Return the undiscounted returns (S, T, episodes) of the mean action.
+def evaluate(env: Env, agent: Agent, episodes: int, state: Any, tasks: Task, seeds: Array, number: Array) -> Scores:
+    """Play whole episodes under the mean action.
 
     Args:
         state: agent states with leading S.
@@ -54,38 +69,43 @@ def evaluate(env: Env, agent: Agent, episodes: int, state: Any, tasks: Task, see
     shape = (len(seeds), len(tasks.id), episodes)
     fresh = lambda seed: jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), 0x7E57), number)
     keys = jax.vmap(lambda seed: jax.random.split(fresh(seed), shape[1:]))(seeds)
-    worlds, start = begin(env, tasks, keys)
 
     def step(carry, _):
-        env_state, obs, total, alive = carry
-        after = play(env, worlds, env_state, actions(agent, state, tasks, worlds, obs, None))
-        total = total + jnp.where(alive, after.reward, 0.0)  # what follows an episode's end may not be finite
-        return (after.state, after.obs, total, alive & ~after.terminated), None
+        worlds, scores, alive = carry
+        worlds, moment = step_envs(env, agent, state, tasks, worlds, None)
+        reward = jnp.where(alive, moment.transition.reward, 0.0)  # what follows an episode's end may not be finite
+        latest = lambda new, old: jnp.where(alive, new, old)
+        scores = Scores(scores.returns + reward, jax.tree.map(latest, moment.metrics, scores.metrics))
+        return (worlds, scores, alive & ~moment.transition.ended), None
 
-    carry = (start.state, start.obs, jnp.zeros(shape), jnp.ones(shape, bool))
-    return jax.lax.scan(step, carry, length=env.episode_length)[0][2]
+    worlds = reset_envs(env, agent, state, tasks, keys)
+    moment = jax.eval_shape(lambda worlds: step_envs(env, agent, state, tasks, worlds, None)[1], worlds)
+    nothing = Scores(jnp.zeros(shape), jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), moment.metrics))
+    return jax.lax.scan(step, (worlds, nothing, jnp.ones(shape, bool)), length=env.episode_length)[0][1]
+
+
+class Recording(NamedTuple):
+    """One episode of every task."""
+
+    returns: Array  # (T,)
+    rows: Array  # (T,) of the tasks that were played; where ranges are continuous, the episodes' own
+    lengths: Array  # (T,) int32 steps until the episode ended
+    states: Any  # the environment's after each step, leaves (T, H, ...)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def record(env: Env, agent: Agent, state: Any, tasks: Task, seed: Array) -> tuple[Array, Array, Any]:
-    """Play one episode of each task under the mean action; ``state`` has no leading axis.
+def record(env: Env, agent: Agent, state: Any, tasks: Task, seed: Array) -> Recording:
+    """Play one episode of each task under the mean action; ``state`` has no leading axis."""
+    learners = jax.tree.map(lambda x: x[None], state)
+    keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), 0xF11), (1, len(tasks.id), 1))
 
-    Returns:
-        returns (T,), the rows (T,) of the tasks that were played, and the environments' states at each step, leaves
-        (T, H, ...).
-    """
-    keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), 0xF11), len(tasks.id))
+    def step(worlds: Worlds, _):
+        worlds, moment = step_envs(env, agent, learners, tasks, worlds, None)
+        return worlds, (moment.transition.reward, moment.transition.ended, worlds.state)
 
-    def one_task(task: Task, key: Array) -> tuple[Array, Array, Any]:
-        task_key, key = jax.random.split(key)
-        task = episode_task(task, task_key)
-        start = env.reset(task, key)
-
-        def step(carry, _):
-            after = env.step(task, carry[0], agent.act(state, carry[1], task, None))
-            return (after.state, after.obs), (after.reward, after.state)
-
-        rewards, states = jax.lax.scan(step, (start.state, start.obs), length=env.episode_length)[1]
-        return jnp.sum(rewards), task.row, states
-
-    return jax.vmap(one_task)(tasks, keys)
+    worlds = reset_envs(env, agent, learners, tasks, keys)
+    _, played = jax.lax.scan(step, worlds, length=env.episode_length)  # leaves (H, 1, T, 1, ...)
+    rewards, ended, states = jax.tree.map(lambda x: jnp.moveaxis(x[:, 0, :, 0], 0, 1), played)
+    alive = jnp.cumsum(ended, axis=1) - ended == 0
+    rows = tasks.row if worlds.task is None else worlds.task.row[0, :, 0]
+    return Recording(jnp.sum(jnp.where(alive, rewards, 0.0), axis=1), rows, jnp.sum(alive, axis=1), states)

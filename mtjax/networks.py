@@ -69,7 +69,7 @@ class Network:
     embedding_size: int = 0  # of a learned vector a task, in place of features; 0 for none
     unit_embedding: bool = False  # scale those vectors to length 1
     front: nn.Module | None = None  # maps observations before the body; every task's own
-    trajectory: nn.Module | None = None  # makes features of what is seen, which is then a ``history.Seen``
+    trajectory: nn.Module | None = None  # makes features of what is seen, which is then a ``Seen``
 
     def init(self, key: Key, num_tasks: int, out: int, features: Array, *inputs: Array) -> Params:
         """Initialise for ``num_tasks`` tasks, ``out`` outputs, and inputs of the given shapes."""
@@ -124,38 +124,39 @@ def _init_linear(key: Key, width: int, out: int) -> dict[str, Array]:
     return {"kernel": nn.initializers.lecun_normal()(key, (width, out)), "bias": jnp.zeros(out)}
 
 
-def tanh_normal(outputs: Array, key: Key | None) -> tuple[Array, Array]:
+def tanh_normal(outputs: Array, key: Key | None, mask: Array | None = None) -> tuple[Array, Array]:
     """Sample a tanh-squashed Gaussian (Haarnoja et al. 2018, appendix C).
 
     Args:
         outputs: (..., 2A) means and unbounded log standard deviations.
         key: noise; None takes the mean.
+        mask: (A,) 1 for actions that there are; the others are 0 and have no part in the log-probability.
 
     Returns:
         actions (..., A) in (-1, 1) and their log-probabilities (...,); 0 for the mean action.
     """
     if key is None:
         mean, _ = jnp.split(outputs, 2, axis=-1)
-        return jnp.tanh(mean), jnp.zeros(mean.shape[:-1])
-    raw, log_prob = sample_raw(outputs, key)
-    return jnp.tanh(raw), log_prob
+        return _masked(jnp.tanh(mean), mask), jnp.zeros(mean.shape[:-1])
+    raw, log_prob = sample_raw(outputs, key, mask)
+    return _masked(jnp.tanh(raw), mask), log_prob
 
 
-def sample_raw(outputs: Array, key: Key) -> tuple[Array, Array]:
+def sample_raw(outputs: Array, key: Key, mask: Array | None = None) -> tuple[Array, Array]:
     """Sample as ``tanh_normal``, but return actions (..., A) from before the tanh, with the same log-probabilities."""
     mean, log_std = _moments(outputs)
     noise = jax.random.normal(key, mean.shape)
     raw = mean + jnp.exp(log_std) * noise
-    return raw, _log_density(noise, log_std, raw)
+    return raw, _log_density(noise, log_std, raw, mask)
 
 
-def log_density(outputs: Array, raw: Array) -> Array:
+def log_density(outputs: Array, raw: Array, mask: Array | None = None) -> Array:
     """Log-probability (...,) of the actions tanh(raw) under a tanh-squashed Gaussian with ``outputs`` (..., 2A).
 
     It takes actions from before the tanh, which no rounding has brought to 1.
     """
     mean, log_std = _moments(outputs)
-    return _log_density((raw - mean) * jnp.exp(-log_std), log_std, raw)
+    return _log_density((raw - mean) * jnp.exp(-log_std), log_std, raw, mask)
 
 
 def _moments(outputs: Array) -> tuple[Array, Array]:
@@ -165,7 +166,11 @@ def _moments(outputs: Array) -> tuple[Array, Array]:
     return mean, low + 0.5 * (high - low) * (jnp.tanh(log_std) + 1)
 
 
-def _log_density(noise: Array, log_std: Array, raw: Array) -> Array:
+def _log_density(noise: Array, log_std: Array, raw: Array, mask: Array | None) -> Array:
     log_normal = -0.5 * jnp.square(noise) - log_std - 0.5 * jnp.log(2 * jnp.pi)
     log_slope = 2 * (jnp.log(2.0) - raw - jax.nn.softplus(-2 * raw))
-    return jnp.sum(log_normal - log_slope, axis=-1)
+    return jnp.sum(_masked(log_normal - log_slope, mask), axis=-1)
+
+
+def _masked(x: Array, mask: Array | None) -> Array:
+    return x if mask is None else x * mask

@@ -8,7 +8,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from conftest import SHORT_RUN
 from mujoco import mjx
 
 import mtjax
@@ -85,7 +84,10 @@ def test_names_are_answered_without_jax(tmp_path, module, words, code, said):
 @pytest.mark.slow
 def test_a_run_of_the_c_engine_imports_no_other(tmp_path):
     """From the command line to the last evaluation."""
-    words = [*SHORT_RUN, "--env=finger-spin", "--engine=c", "--steps=100", "--seeds=1", f"--runs={tmp_path}"]
+    small = (
+        "--steps=100 --eval-episodes=1 --num-envs=2 --batch-size=4 --replay-size=200 --warmup-steps=5 --chunk-steps=25"
+    )
+    words = ["--env=finger-spin", "--engine=c", *small.split(), "--agent.hidden=8", f"--runs={tmp_path}"]
     code, output, imported = run("mtjax.train", words, (*ENGINES, "mujoco"), tmp_path)
     assert code == 0 and "trained in" in output
     assert imported == ["mujoco"]

@@ -6,13 +6,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from mtjax.names import lazily, load, nearest_error
 
 if TYPE_CHECKING:
-    from mtjax.agents.hyperparameters import PARTS, Hyperparameters, settings
+    from mtjax.agents.base import PARTS, BaseAgent, settings
     from mtjax.agents.sac import SAC
 
-_OF_ALL = "mtjax.agents.hyperparameters"
-__getattr__ = lazily(
-    __name__, {"PARTS": _OF_ALL, "Hyperparameters": _OF_ALL, "settings": _OF_ALL, "SAC": "mtjax.agents.sac"}
-)
+_BASE = "mtjax.agents.base"
+__getattr__ = lazily(__name__, {"PARTS": _BASE, "BaseAgent": _BASE, "settings": _BASE, "SAC": "mtjax.agents.sac"})
 
 
 class Preset(NamedTuple):
@@ -89,7 +87,7 @@ def agent(name: str, **given: Any) -> "SAC":
     defaults = dict(preset.defaults)
     if "encoder" in given:  # another encoder knows nothing of this one's settings
         defaults = {k: v for k, v in defaults.items() if k in preset.cls.__dataclass_fields__}
-    return load(f"{_OF_ALL}:build")(name, preset.cls, {**defaults, **given})
+    return load(f"{_BASE}:build")(name, preset.cls, {**defaults, **given})
 
 
 def preset_of(name: str) -> Preset:
@@ -99,4 +97,4 @@ def preset_of(name: str) -> Preset:
     return AGENTS[name]
 
 
-__all__ = ["AGENTS", "PARTS", "SAC", "Hyperparameters", "Preset", "agent", "preset_of", "settings"]
+__all__ = ["AGENTS", "PARTS", "SAC", "BaseAgent", "Preset", "agent", "preset_of", "settings"]

@@ -10,11 +10,10 @@ import jax.numpy as jnp
 import optax
 
 from mtjax.agents import parts
-from mtjax.agents.parts.trajectory import TrajectoryEncoder
-from mtjax.agents.sac import SAC, SACState
-from mtjax.history import Seen
+from mtjax.agents.parts.trajectory import Seen, TrajectoryEncoder
+from mtjax.agents.sac import SAC, Batch, SACState
 from mtjax.networks import MLP, Network, Params, Trunk, join
-from mtjax.types import Array, InputError, Key, Metrics, Spec, Task, Transition
+from mtjax.types import Array, InputError, Key, Metrics, Spec, Task
 
 DEVIATIONS = (0.01, 1.0)
 """Least and largest standard deviation of a predicted latent state, whose values lie in (-1, 1)."""
@@ -103,8 +102,8 @@ class DeepMDP(SAC):
         """Whether every task has a learned vector."""
         return self.conditioning == "embedding"
 
-    def _network(self, layer_norm: bool) -> Network:
-        return dataclasses.replace(super()._network(layer_norm), embedding_size=0, trajectory=None)
+    def network(self, layer_norm: bool) -> Network:
+        return dataclasses.replace(super().network(layer_norm), embedding_size=0, trajectory=None)
 
     @property
     def modules(self) -> dict[str, nn.Module]:
@@ -129,11 +128,11 @@ class DeepMDP(SAC):
         state = super().init(spec, tasks, key)
         return state._replace(target=only(state.target, (*CRITIC, *SIGHT)))  # models do not bootstrap
 
-    def networks(self, num_tasks: int, features: Array, obs: Any, action: Array, key: Key) -> tuple[Params, Params]:
+    def init_networks(self, num_tasks: int, told: Array, obs: Any, action: Array, key: Key) -> tuple[Params, Params]:
         key, theta_key, *keys = jax.random.split(key, 2 + len(self.modules))
-        width = len(features) + self.embedding_size * (self.has_theta + (self.conditioning == "inferred"))
+        width = len(told) + self.embedding_size * (self.has_theta + (self.conditioning == "inferred"))
         latent, told = jnp.zeros(self.latent_widths[-1]), jnp.zeros(width)
-        actor, critic = super().networks(num_tasks, told, latent, action, key)
+        actor, critic = super().init_networks(num_tasks, told, latent, action, key)
         inputs = {"latent": (plain(obs),), "transition": (latent, told, action), "reward": (latent, told)}
         for (name, module), part_key in zip(self.modules.items(), keys, strict=True):
             data = inputs.get(name, (obs,))
@@ -145,14 +144,14 @@ class DeepMDP(SAC):
             critic.own["embedding"] = jax.random.normal(theta_key, (num_tasks, self.embedding_size))
         return actor, critic
 
-    def follow(self, critic: Params, target: Params) -> Params:
+    def update_target(self, critic: Params, target: Params) -> Params:
         rate = lambda name: self.tau if name in CRITIC else self.encoder_tau
         step = lambda new, old: {k: optax.incremental_update(new[k], old[k], rate(k)) for k in old}
         return Params(step(critic.shared, target.shared), step(critic.own, target.own))
 
     # What networks see, of one task: observations (..., O), features (Z,) or (B, Z).
 
-    def see(self, critic: Params, features: Array, obs: Any) -> tuple[Array, Array]:
+    def perceive(self, critic: Params, features: Array, obs: Any) -> tuple[Array, Array]:
         """Latent states (..., D), and what is known of the task (Z,) or (..., Z)."""
         if self.conditioning == "inferred":
             features = self.apply(critic, "trajectory", obs)
@@ -174,26 +173,26 @@ class DeepMDP(SAC):
         return mean, low + (high - low) * jax.nn.sigmoid(deviation)
 
     def policy(self, actor: Params, critic: Params, features: Array, obs: Any) -> Array:
-        latent, told = jax.lax.stop_gradient(self.see(critic, features, obs))
+        latent, told = jax.lax.stop_gradient(self.perceive(critic, features, obs))
         return super().policy(actor, critic, told, latent)
 
     def of_critics(self, apply: Callable, critic: Params, features: Array, obs: Any, action: Array) -> Any:
-        latent, told = self.see(critic, features, obs)
+        latent, told = self.perceive(critic, features, obs)
         return super().of_critics(apply, only(critic, CRITIC), told, latent, action)
 
     # Losses.
 
-    def critic_target(self, actor, critic, target, features, temperature, batch: Transition, key: Key) -> Any:
+    def target(self, actor: Params, critic: Params, slow: Params, batch: Batch, key: Key) -> Targets:
         value_key, noise_key = jax.random.split(key)
-        value = super().critic_target(actor, critic, target, features, temperature, batch, value_key)
-        latent = self.apply(target, "latent", plain(batch.next_obs))
+        value = super().target(actor, critic, slow, batch, value_key)
+        latent = self.apply(slow, "latent", plain(batch.next_obs))
         drawn = self.transition == "probabilistic"
         return Targets(value, latent, jax.random.normal(noise_key, latent.shape) if drawn else jnp.float32(0))
 
     def critic_loss(self, critic: Params, data) -> tuple[Array, Metrics]:
-        batch, features, targets = data
-        loss, metrics = super().critic_loss(critic, (batch, features, targets.value))
-        latent, told = self.see(critic, features, batch.obs)
+        batch, targets = data
+        loss, metrics = super().critic_loss(critic, (batch, targets.value))
+        latent, told = self.perceive(critic, batch.told, batch.obs)
         mean, deviation = self.foretell(critic, latent, told, batch.action)
         error = (mean - jax.lax.stop_gradient(targets.latent)) / deviation
         transition_loss = jnp.mean(0.5 * jnp.square(error) + jnp.log(deviation))

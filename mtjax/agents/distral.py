@@ -1,13 +1,14 @@
 """Distral: every task its own policy, held together by one that is distilled from them all."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from mtjax.agents import parts
-from mtjax.agents.hyperparameters import PARTS, Heads
-from mtjax.agents.sac import SAC
+from mtjax.agents.base import PARTS, Heads
+from mtjax.agents.sac import SAC, Batch, Sample
 from mtjax.networks import Network, Params, log_density, sample_raw
 from mtjax.types import Array, InputError, Key, Metrics
 
@@ -93,15 +94,17 @@ class Distral(SAC):
         own = self.policy(actor, critic, features, obs)
         return jnp.where(trained, own, self.actor.apply_distilled(actor, features, obs))
 
-    def sample(self, actor, critic, features, obs, key: Key) -> tuple[Array, Array, Array]:
-        raw, log_prob = sample_raw(self.policy(actor, critic, features, obs), key)
-        prior = log_density(self.actor.apply_distilled(jax.lax.stop_gradient(actor), features, obs), raw)
-        return jnp.tanh(raw), log_prob, log_prob - self.distral_alpha * prior
+    def sample(self, actor: Params, critic: Params, batch: Batch, obs: Any, key: Key) -> Sample:
+        raw, log_prob = sample_raw(self.policy(actor, critic, batch.told, obs), key, batch.mask)
+        distilled = self.actor.apply_distilled(jax.lax.stop_gradient(actor), batch.told, obs)
+        cost = log_prob - self.distral_alpha * log_density(distilled, raw, batch.mask)
+        action = jnp.tanh(raw)
+        return Sample(action if batch.mask is None else action * batch.mask, log_prob, cost)
 
-    def actor_loss(self, actor: Params, data) -> tuple[Array, Metrics]:
+    def actor_loss(self, actor: Params, data: tuple[Batch, Params, Key]) -> tuple[Array, Metrics]:
         loss, metrics = super().actor_loss(actor, data)
-        batch, features, critic, _, key = data
-        raw, _ = sample_raw(self.policy(actor, critic, features, batch.obs), key)  # the actions of that loss
-        outputs = self.actor.apply_distilled(actor, features, batch.obs)
-        fit = jnp.mean(log_density(outputs, jax.lax.stop_gradient(raw)))
+        batch, critic, key = data
+        raw, _ = sample_raw(self.policy(actor, critic, batch.told, batch.obs), key)  # the actions of that loss
+        outputs = self.actor.apply_distilled(actor, batch.told, batch.obs)
+        fit = jnp.mean(log_density(outputs, jax.lax.stop_gradient(raw), batch.mask))
         return loss - fit, {**metrics, "kl": -metrics["entropy"] - fit}

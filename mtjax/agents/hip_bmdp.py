@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from mtjax.agents import parts
 from mtjax.agents.deepmdp import DeepMDP
-from mtjax.agents.sac import SACState
+from mtjax.agents.sac import Batch, SACState
 from mtjax.networks import Params
 from mtjax.types import Array, Key, Metrics, Task
 
@@ -98,17 +98,17 @@ class HiPBMDP(DeepMDP):
 
     # Losses.
 
-    def critic_problem(self, state: SACState, batch, features, temperature, key: Key) -> tuple[Callable, Any]:
+    def critic_problem(self, state: SACState, batch: Batch, key: Key) -> tuple[Callable, Any]:
         key, turn_key = jax.random.split(key)
-        loss, (batch, features, targets) = super().critic_problem(state, batch, features, temperature, key)
+        loss, (batch, targets) = super().critic_problem(state, batch, key)
         thetas = state.critic.own["embedding"]
         turn = jax.random.randint(turn_key, (), 1, max(len(thetas), 2))  # a task that is alone is its own rival
-        return loss, (batch, features, targets._replace(rival=jnp.roll(thetas, turn, axis=0)))
+        return loss, (batch, targets._replace(rival=jnp.roll(thetas, turn, axis=0)))
 
     def critic_loss(self, critic: Params, data) -> tuple[Array, Metrics]:
         loss, metrics = super().critic_loss(critic, data)
-        batch, features, targets = data
-        theta_loss = jnp.mean(self.theta_loss(critic, features, batch.obs, batch.action, targets.rival))
+        batch, targets = data
+        theta_loss = jnp.mean(self.theta_loss(critic, batch.told, batch.obs, batch.action, targets.rival))
         metrics |= {"theta_loss": theta_loss}
         loss += self.theta_coefficient * theta_loss
         if self.unseen_theta != "inferred":
@@ -120,7 +120,7 @@ class HiPBMDP(DeepMDP):
     def theta_loss(self, critic: Params, features: Array, obs: Any, action: Array, rival: Array) -> Array:
         """The theta loss (B,) of one task against another task's vector (Z,)."""
         still, other = jax.lax.stop_gradient((critic, with_theta(critic, rival)))
-        foretold = [self.foretell(p, *self.see(p, features, obs), action) for p in (still, other)]
+        foretold = [self.foretell(p, *self.perceive(p, features, obs), action) for p in (still, other)]
         ours, theirs = map(jnp.stack, foretold)  # (2, B, D), means and deviations
         moved = jnp.sqrt(jnp.sum(jnp.square(ours - theirs), axis=(0, -1)))
         return jnp.square(distance(self.theta(critic), self.theta(other)) - moved)

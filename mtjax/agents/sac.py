@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,13 +11,34 @@ import numpy as np
 import optax
 
 from mtjax import normalize
-from mtjax.agents.hyperparameters import Hyperparameters
+from mtjax.agents import parts
+from mtjax.agents.base import FLAT, BaseAgent, Memory
 from mtjax.agents.parts import conditioning
 from mtjax.agents.parts.gradients import descent, surgery
-from mtjax.agents.parts.trajectory import TrajectoryEncoder
-from mtjax.history import Seen, plain_obs_size, unpack
+from mtjax.agents.parts.scaling import SCALINGS
+from mtjax.agents.parts.trajectory import append
+from mtjax.agents.parts.values import VALUES, Value
+from mtjax.experience import Replay
 from mtjax.networks import Network, Params, tanh_normal
-from mtjax.types import Array, InputError, Key, Metrics, Outcome, Spec, Task, Transition
+from mtjax.types import Acted, Array, InputError, Key, Metrics, Spec, Task, Transition
+
+OVER_TASKS = Params(shared=None, own=0)  # type: ignore
+"""The axes of networks under a map over tasks."""
+
+
+class Optimizers(NamedTuple):
+    """What the optimisers remember."""
+
+    actor: Any
+    critic: Any
+    temperature: Any
+
+
+class Surgery(NamedTuple):
+    """What the rules of gradient surgery remember."""
+
+    critic: Any
+    actor: Any
 
 
 class SACState(NamedTuple):
@@ -27,17 +48,38 @@ class SACState(NamedTuple):
     critic: Params  # shared leaves (N, ...), own leaves (T, N, ...)
     target: Params  # slow copy of the critic
     log_temperature: Array  # (T,), or (1,) if shared
-    optimizers: tuple[Any, Any, Any]  # of actor, critic, temperature
+    optimizers: Optimizers
     moments: normalize.Moments
     contexts: Array  # (T, C) of the training tasks, among which an unseen task finds its nearest
     vectors: Array | None  # (T, V) given task vectors, if conditioned on them
-    surgery: tuple[Any, Any]  # what the rules of gradient surgery remember: critic's, actor's
+    surgery: Surgery
     scales: Any  # what the scaling of rewards remembers
     progress: Any  # what the sampler of tasks remembers
 
 
+class Batch(NamedTuple):
+    """What the losses of one task see; of all tasks, leaves (T, ...)."""
+
+    obs: Any  # (B, O) as the networks take them
+    action: Array  # (B, A)
+    reward: Array  # (B,) in the task's units
+    discount: Array  # (B,) gamma, or 0 where the episode terminated
+    next_obs: Any  # (B, O)
+    told: Array  # (Z,) or (B, Z), what the networks are told of the task
+    temperature: Array  # ()
+    mask: Array | None  # (A,) 1 for actions that the task has; None: it has all
+
+
+class Sample(NamedTuple):
+    """What a policy does."""
+
+    action: Array  # (B, A)
+    log_prob: Array  # (B,)
+    cost: Array  # (B,) what the temperature makes the policy pay for
+
+
 @dataclasses.dataclass(frozen=True)
-class SAC(Hyperparameters):
+class SAC(BaseAgent):
     """Multi-task soft actor-critic that is not told which task it is in (Haarnoja et al. 2018; "MT-SAC").
 
     Per transition of task i, with temperature a_i, N critics and their slow copies:
@@ -51,186 +93,80 @@ class SAC(Hyperparameters):
     Differs from the paper: layer-normalised critics; by default a target entropy H of -A/2 and one temperature a task.
     """
 
+    temperature_lr: float = 1e-3
+    """Adam's learning rate of the temperatures."""
+    tau: float = 0.005
+    """Share of the new critic that its slow copy takes at each update."""
+    num_critics: int = 2
+    """Critics."""
+    believe: Literal["least", "mean"] = "least"
+    """Which critic bootstraps and guides the actor: the least of them, or the mean of all."""
+    initial_temperature: float = 0.1
+    """Temperature at the start."""
+    target_entropy: float = -0.5
+    """Entropy that the temperature aims at, per action dimension."""
+    shared_temperature: bool = False
+    """One temperature for all tasks instead of one a task."""
+    value: Annotated[Value, FLAT] = dataclasses.field(default_factory=Value)
+    experience: Annotated[Replay, FLAT] = dataclasses.field(default_factory=Replay)
+
+    def _check_numbers(self) -> None:
+        super()._check_numbers()
+        parts.require_positive(self, "temperature_lr", "num_critics", "initial_temperature")
+        parts.require_rates(self, "tau")
+
+    def _check_combination(self) -> None:
+        super()._check_combination()
+        value, scaling = parts.name_of(VALUES, self.value), parts.name_of(SCALINGS, self.scaling)
+        if scaling == "popart" and (self.heads == "shared" or value != "scalar"):
+            raise InputError(
+                "scaling=popart rescales a scalar head of every task's own; use value=scalar and heads=per-task or "
+                f"disjoint, not {value} and {self.heads}"
+            )
+
     # Networks.
 
     @property
     def actor(self) -> Network:
-        return self._network(self.actor_layer_norm)
+        return self.network(self.actor_layer_norm)
 
     @property
     def critic(self) -> Network:
-        return self._network(self.critic_layer_norm)
-
-    def _network(self, layer_norm: bool) -> Network:
-        own = {"shared": (), "per-task": ("head",), "disjoint": ("trajectory", "body", "head")}[self.heads]
-        embedding = self.embedding_size if self.conditioning == "embedding" else 0
-        body = self.encoder.body(self.hidden, layer_norm)
-        trajectory = TrajectoryEncoder(self.embedding_size, layer_norm=layer_norm) if self.history else None
-        return Network(body, own, embedding, self.unit_embedding, self.encoder.front(), trajectory)
+        return self.network(self.critic_layer_norm)
 
     def init(self, spec: Spec, tasks: Task, key: Key) -> SACState:
         """Initialise for the training ``tasks`` (T, ...)."""
         num_tasks = len(tasks.id)
-        vectors = conditioning.load_vectors(self.vectors, num_tasks) if self.vectors else None
-        if self.history not in (0, spec.history):
-            raise InputError(
-                f"conditioning=inferred needs observations that show the last {self.history} steps, and these show "
-                f"{spec.history}; give the family as mtjax.history.remember(env, agent.history)"
-            )
-        moments = normalize.init(plain_obs_size(spec) if self.history else spec.obs_size)
-        obs, action = self._see(moments, jnp.zeros(spec.obs_size)), jnp.zeros(spec.action_size)
-        features = conditioning.features(self.conditioning, num_tasks, jnp.int32(0), tasks.context[0], vectors)
-        actor, critic = self.networks(num_tasks, features, obs, action, key)
+        vectors, moments = self.load_vectors(num_tasks), self.init_moments(spec, num_tasks)
+        told = conditioning.features(self.conditioning, num_tasks, jnp.int32(0), tasks.context[0], vectors)
+        obs, action = self.example(spec, moments), jnp.zeros(spec.action_size)
+        actor, critic = self.init_networks(num_tasks, told, obs, action, key)
         log = jnp.log if isinstance(self.initial_temperature, Array) else np.log
         log_temperature = jnp.full(1 if self.shared_temperature else num_tasks, log(self.initial_temperature))
         log_temperature = log_temperature.astype(jnp.float32)
         parameters = (actor, critic, log_temperature)
-        memory = lambda rule, params: surgery.init(rule, params, num_tasks, self.gradient_scope == "per-layer")
+        memory = lambda rule, params: surgery.init(rule, params, num_tasks, self.per_layer)
         return SACState(
             actor=actor,
             critic=critic,
             target=jax.tree.map(jnp.copy, critic),
             log_temperature=log_temperature,
-            optimizers=tuple(o.init(p) for o, p in zip(self._optimizers, parameters, strict=True)),  # type: ignore
+            optimizers=Optimizers(*(o.init(p) for o, p in zip(self.optimizers, parameters, strict=True))),
             moments=moments,
             contexts=tasks.context,
             vectors=vectors,
-            surgery=(memory(self.gradients, critic), memory(self.gradients.for_actor, actor)),
+            surgery=Surgery(memory(self.gradients, critic), memory(self.gradients.for_actor, actor)),
             scales=self.scaling.init(num_tasks),
             progress=self.sampler.init(num_tasks),
         )
 
-    def networks(self, num_tasks: int, features: Array, obs: Any, action: Array, key: Key) -> tuple[Params, Params]:
+    def init_networks(self, num_tasks: int, told: Array, obs: Any, action: Array, key: Key) -> tuple[Params, Params]:
         """Initialise actor and critics for inputs of the given shapes, (Z,), (O,) and (A,)."""
         actor_key, critic_key = jax.random.split(key)
-        actor = self.actor.init(actor_key, num_tasks, 2 * len(action), features, obs)
-        init_critic = lambda k: self.critic.init(k, num_tasks, self.value.outputs, features, obs, action)
+        actor = self.actor.init(actor_key, num_tasks, 2 * len(action), told, obs)
+        init_critic = lambda k: self.critic.init(k, num_tasks, self.value.outputs, told, obs, action)
         keys = jax.random.split(critic_key, self.num_critics)
         return actor, jax.vmap(init_critic, out_axes=Params(shared=0, own=1))(keys)  # type: ignore
-
-    @property
-    def _optimizers(self) -> tuple[optax.GradientTransformation, ...]:
-        chosen = partial(descent.adam, weight_decay=self.weight_decay, max_norm=self.max_gradient_norm, tune=self.tune)
-        return chosen(self.actor_lr), chosen(self.critic_lr), optax.adam(self.temperature_lr)
-
-    # Which task it is.
-
-    @property
-    def borrowed(self) -> list[str]:
-        """What a task that was not trained on has of its nearest training task."""
-        parts = {"shared": [], "per-task": ["head"], "disjoint": ["networks"]}[self.heads]
-        parts += ["input layer"] * (self.encoder.front() is not None)
-        return parts + conditioning.BORROWED.get(self.conditioning, [])
-
-    @property
-    def unseen(self) -> str:
-        """What stands for a task that was not trained on; empty if its own parameters, or nothing, do."""
-        parts = self.borrowed
-        return f"each uses the {' and '.join(parts)} of the nearest training task" if parts else ""
-
-    def known_task(self, state: SACState, task: Task) -> Array:
-        """The training task () int32 whose head, embedding or number stands for ``task``: itself, or the nearest."""
-        nearest = jnp.argmin(jnp.sum(jnp.square(state.contexts - task.context), axis=-1)).astype(jnp.int32)
-        return jnp.where(task.id < len(state.contexts), task.id, nearest)
-
-    def nearest_tasks(self, state: SACState, tasks: Task) -> Array:
-        """The training tasks (T,) that are nearest to ``tasks`` (T, ...), whoever these are."""
-        strangers = tasks._replace(id=jnp.full_like(tasks.id, len(state.contexts)))
-        return jax.vmap(partial(self.known_task, state))(strangers)
-
-    def features(self, state: SACState, task: Task) -> Array:
-        """What the networks see of one task (Z,)."""
-        known = self.known_task(state, task)
-        return conditioning.features(self.conditioning, len(state.contexts), known, task.context, state.vectors)
-
-    # Acting.
-
-    def act(self, state: SACState, obs: Array, task: Task, key: Key | None) -> Array:
-        """Choose an action (A,) for one observation (O,) of one task; no key: the mean action."""
-        actor, critic = self.parameters(state, task)
-        trained = task.id < len(state.contexts)
-        obs = self._see(state.moments, obs)
-        return tanh_normal(self.behaviour(trained, actor, critic, self.features(state, task), obs), key)[0]
-
-    def parameters(self, state: SACState, task: Task) -> tuple[Params, Params]:
-        """Actor and critics as one task uses them."""
-        index = self.known_task(state, task)
-        of_task = lambda params: Params(params.shared, jax.tree.map(lambda x: x[index], params.own))
-        return of_task(state.actor), of_task(state.critic)
-
-    def behaviour(self, trained: Array, actor: Params, critic: Params, features: Array, obs: Array) -> Array:
-        """Outputs of the policy that acts, in a task that was ``trained`` on () or in another."""
-        return self.policy(actor, critic, features, obs)
-
-    def _see(self, moments: normalize.Moments, obs: Array) -> Any:
-        """Observations (..., O) as the networks take them: normalised, and apart from the past if they show it."""
-        scaled = partial(normalize.apply, moments) if self.normalize_observations else lambda obs: obs
-        if not self.history:
-            return scaled(obs)
-        seen = unpack(obs, len(moments.mean), self.history)
-        return Seen(scaled(seen.obs), seen.past._replace(obs=scaled(seen.past.obs)))
-
-    # Losses, each on the data of one task: observations (B, O), features (Z,) or (B, Z), temperature ().
-
-    def policy(self, actor: Params, critic: Params, features: Array, obs: Array) -> Array:
-        """The policy's outputs (..., 2A); agents whose actor stands on the critic's representation use ``critic``."""
-        return self.actor.apply(actor, features, obs)
-
-    def sample(self, actor, critic, features, obs, key: Key) -> tuple[Array, Array, Array]:
-        """Actions (B, A), their log-probabilities (B,), and what the temperature makes the policy pay for (B,)."""
-        action, log_prob = tanh_normal(self.policy(actor, critic, features, obs), key)
-        return action, log_prob, log_prob
-
-    def outputs(self, critic: Params, features: Array, obs: Array, action: Array) -> Array:
-        """Every critic's outputs (N, B, outputs)."""
-        return self.of_critics(self.critic.apply, critic, features, obs, action)
-
-    def of_critics(self, apply: Callable, critic: Params, features: Array, obs: Array, action: Array) -> Any:
-        """What ``apply``, as ``Network.apply`` takes its inputs, makes of every critic (N, ...)."""
-        return jax.vmap(apply, (0, None, None, None))(critic, features, obs, action)
-
-    def values(self, critic: Params, features: Array, obs: Array, action: Array) -> Array:
-        """Every critic's estimate (N, B)."""
-        return self.value.mean(self.outputs(critic, features, obs, action))
-
-    def critic_target(self, actor, critic, target, features, temperature, batch: Transition, key: Key) -> Array:
-        """Soft Bellman target (B, ...), in the form that ``value.loss`` takes."""
-        action, _, cost = self.sample(actor, critic, features, batch.next_obs, key)
-        outputs = self.outputs(target, features, batch.next_obs, action)
-        discount, bonus = self.gamma * batch.discount, -temperature * cost
-        return self.value.target(outputs, self.believe == "least", batch.reward, discount, bonus)
-
-    def critic_loss(self, critic: Params, data) -> tuple[Array, Metrics]:
-        batch, features, target = data
-        outputs = self.outputs(critic, features, batch.obs, batch.action)
-        loss = jnp.mean(jnp.sum(self.value.loss(outputs, target), axis=0))
-        values, expected = self.value.mean(outputs), self.value.expected(target)
-        td_error = jnp.mean(jnp.abs(values - expected))
-        seen = {"critic_loss": loss, "value": jnp.mean(values), "td_error": td_error}
-        return loss, seen | {"target": expected}  # which ``update`` takes for the scaling
-
-    def actor_loss(self, actor: Params, data) -> tuple[Array, Metrics]:
-        batch, features, critic, temperature, key = data
-        action, log_prob, cost = self.sample(actor, critic, features, batch.obs, key)
-        values = self.values(critic, features, batch.obs, action)
-        value = least(values) if self.believe == "least" else jnp.mean(values, axis=0)
-        loss = jnp.mean(temperature * cost - value)
-        return loss, {"actor_loss": loss, "entropy": -jnp.mean(log_prob)}
-
-    def temperature_loss(self, log_temperature: Array, entropy: Array, action_size: int) -> Array:
-        return jnp.mean(jnp.exp(log_temperature) * (entropy - self.target_entropy * action_size))
-
-    # Watching.
-
-    @property
-    def watches(self) -> bool:
-        """Whether the agent wants to see the stream of outcomes."""
-        return self.scaling.watches or self.sampler.watches
-
-    def observe(self, state: SACState, outcome: Outcome) -> SACState:
-        """Take note of what one step of every environment brought, leaves (T, E)."""
-        scales = self.scaling.observe(state.scales, outcome)
-        return state._replace(scales=scales, progress=self.sampler.observe(state.progress, outcome))
 
     def reset(self, state: SACState, spec: Spec, tasks: Task, key: Key) -> SACState:
         """Begin anew with networks, optimisers, temperatures and surgery; what was learned of the data stays."""
@@ -242,84 +178,161 @@ class SAC(Hyperparameters):
             progress=state.progress,
         )
 
-    # Update.
+    @property
+    def optimizers(self) -> Optimizers:
+        chosen = partial(descent.adam, weight_decay=self.weight_decay, max_norm=self.max_gradient_norm, tune=self.tune)
+        return Optimizers(chosen(self.actor_lr), chosen(self.critic_lr), optax.adam(self.temperature_lr))
 
-    def update(self, state: SACState, batch: Transition, tasks: Task, key: Key) -> tuple[SACState, Metrics]:
+    # Acting.
+
+    def act(self, state: SACState, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
+        """Choose an action (A,) for one observation (O,) of one task; no key: the mean action."""
+        actor, critic = self.parameters(state, task)
+        trained = task.id < len(state.contexts)
+        seen = self.see(self.moments_of(state, self.known_task(state, task)), obs, memory.past)
+        outputs = self.behaviour(trained, actor, critic, self.features(state, task), seen)
+        return Acted(tanh_normal(outputs, key, task.action_mask)[0], memory.past, memory)
+
+    def parameters(self, state: SACState, task: Task) -> tuple[Params, Params]:
+        """Actor and critics as one task uses them."""
+        return self.of_task(state, task, state.actor, state.critic)  # type: ignore
+
+    def behaviour(self, trained: Array, actor: Params, critic: Params, told: Array, obs: Any) -> Array:
+        """Outputs of the policy that acts, in a task that was ``trained`` on () or in another."""
+        return self.policy(actor, critic, told, obs)
+
+    # Losses of one task.
+
+    def policy(self, actor: Params, critic: Params, told: Array, obs: Any) -> Array:
+        """The policy's outputs (..., 2A); agents whose actor stands on the critic's representation use ``critic``."""
+        return self.actor.apply(actor, told, obs)
+
+    def sample(self, actor: Params, critic: Params, batch: Batch, obs: Any, key: Key) -> Sample:
+        """Let the policy act at observations (B, O) of a batch."""
+        action, log_prob = tanh_normal(self.policy(actor, critic, batch.told, obs), key, batch.mask)
+        return Sample(action, log_prob, log_prob)
+
+    def q(self, critic: Params, told: Array, obs: Any, action: Array) -> Array:
+        """Every critic's outputs (N, B, outputs)."""
+        return self.of_critics(self.critic.apply, critic, told, obs, action)
+
+    def of_critics(self, apply: Callable, critic: Params, told: Array, obs: Any, action: Array) -> Any:
+        """What ``apply``, as ``Network.apply`` takes its inputs, makes of every critic (N, ...)."""
+        return jax.vmap(apply, (0, None, None, None))(critic, told, obs, action)
+
+    def target(self, actor: Params, critic: Params, slow: Params, batch: Batch, key: Key) -> Any:
+        """y (B, ...), in the form that ``value.loss`` takes."""
+        action, _, cost = self.sample(actor, critic, batch, batch.next_obs, key)
+        outputs = self.q(slow, batch.told, batch.next_obs, action)
+        bonus = -batch.temperature * cost
+        return self.value.target(outputs, self.believe == "least", batch.reward, batch.discount, bonus)
+
+    def critic_loss(self, critic: Params, data: tuple[Batch, Any]) -> tuple[Array, Metrics]:
+        batch, target = data
+        outputs = self.q(critic, batch.told, batch.obs, batch.action)
+        loss = jnp.mean(jnp.sum(self.value.loss(outputs, target), axis=0))
+        values, expected = self.value.mean(outputs), self.value.expected(target)
+        td_error = jnp.mean(jnp.abs(values - expected))
+        seen = {"critic_loss": loss, "value": jnp.mean(values), "td_error": td_error}
+        return loss, seen | {"target": expected}  # which ``update`` takes for the scaling
+
+    def actor_loss(self, actor: Params, data: tuple[Batch, Params, Key]) -> tuple[Array, Metrics]:
+        batch, critic, key = data
+        action, log_prob, cost = self.sample(actor, critic, batch, batch.obs, key)
+        values = self.value.mean(self.q(critic, batch.told, batch.obs, action))
+        value = least(values) if self.believe == "least" else jnp.mean(values, axis=0)
+        loss = jnp.mean(batch.temperature * cost - value)
+        return loss, {"actor_loss": loss, "entropy": -jnp.mean(log_prob)}
+
+    def temperature_loss(self, log_temperature: Array, entropy: Array, action_size: int | Array) -> Array:
+        return jnp.mean(jnp.exp(log_temperature) * (entropy - self.target_entropy * action_size))
+
+    # Update of all tasks.
+
+    def update(self, state: SACState, transitions: Transition, tasks: Task, key: Key) -> tuple[SACState, Metrics]:
         """Take one gradient step on a batch (T, B, ...) of the training tasks; metrics are (T,)."""
         target_key, actor_key, critic_order, actor_order = jax.random.split(key, 4)
-        state, batch, features, temperature = self.prepare(state, batch, tasks)
-        importance = self.sampler.weights(state.progress, temperature)
-        combine = partial(surgery.gradient, importance=importance, per_layer=self.gradient_scope == "per-layer")
-        actor_optimizer, critic_optimizer, temperature_optimizer = self._optimizers
+        state, batch = self.prepare(state, transitions, tasks)
+        importance = self.sampler.weights(state.progress, batch.temperature)
+        combine = partial(surgery.gradient, importance=importance, per_layer=self.per_layer)
 
-        loss, data = self.critic_problem(state, batch, features, temperature, target_key)
-        seen = combine(self.gradients, loss, state.critic, data, state.surgery[0], critic_order)
-        critic, critic_memory = descent.descend(critic_optimizer, seen.gradients, state.optimizers[1], state.critic)
+        loss, data = self.critic_problem(state, batch, target_key)
+        seen = combine(self.gradients, loss, state.critic, data, state.surgery.critic, critic_order)
+        critic, critic_memory = descent.descend(
+            self.optimizers.critic, seen.gradients, state.optimizers.critic, state.critic
+        )
         critic_weighing = surgery.look_again(self.gradients, loss, critic, data, seen)
 
-        loss, data = self.actor_problem(critic, batch, features, temperature, actor_key)
-        done = combine(self.gradients.for_actor, loss, state.actor, data, state.surgery[1], actor_order)
-        actor, actor_memory = descent.descend(actor_optimizer, done.gradients, state.optimizers[0], state.actor)
+        loss, data = self.actor_problem(critic, batch, actor_key)
+        done = combine(self.gradients.for_actor, loss, state.actor, data, state.surgery.actor, actor_order)
+        actor, actor_memory = descent.descend(
+            self.optimizers.actor, done.gradients, state.optimizers.actor, state.actor
+        )
 
-        action_size = batch.action.shape[-1]
+        action_size = action_sizes(batch.action, batch.mask)
         slope = jax.grad(self.temperature_loss)(state.log_temperature, done.aux["entropy"], action_size)
         log_temperature, temperature_memory = descent.descend(
-            temperature_optimizer, slope, state.optimizers[2], state.log_temperature
+            self.optimizers.temperature, slope, state.optimizers.temperature, state.log_temperature
         )
-        metrics = {**seen.aux, **done.aux, "temperature": temperature}
-        slow = self.follow(critic, state.target)
+        metrics = {**seen.aux, **done.aux, "temperature": batch.temperature}
+        slow = self.update_target(critic, state.target)
         scales, (critic, slow) = self.scaling.renew(state.scales, metrics.pop("target"), (critic, slow))
         state = state._replace(
             actor=actor,
             critic=critic,
             target=slow,
             log_temperature=log_temperature,
-            optimizers=(actor_memory, critic_memory, temperature_memory),
-            surgery=(critic_weighing, done.memory),
+            optimizers=Optimizers(actor_memory, critic_memory, temperature_memory),
+            surgery=Surgery(critic_weighing, done.memory),
             scales=scales,
         )
         named = (("critic", seen.metrics), ("actor", done.metrics))
         return state, metrics | {f"{who}_{k}": v for who, found in named for k, v in found.items()}
 
-    def prepare(self, state: SACState, batch: Transition, tasks: Task) -> tuple[SACState, Transition, Array, Array]:
-        """Fit the normalisers to a batch (T, B, ...) and apply them to it.
-
-        Returns:
-            the new state, the batch, what the networks see of the tasks (T, Z) or (T, B, Z), and temperatures (T,).
-        """
-        if self.normalize_observations:
-            state = state._replace(moments=normalize.update(state.moments, batch.obs[..., : len(state.moments.mean)]))
-        features = jax.vmap(partial(self.features, state))(tasks)
-        if batch.context is not None and self.conditioning == "parameters":
-            features = batch.context  # (T, B, C), as every episode has parameters of its own
-        bonus = jnp.exp(state.log_temperature) * abs(self.target_entropy) * batch.action.shape[-1] / 2
-        batch = batch._replace(
-            obs=self._see(state.moments, batch.obs),
-            next_obs=self._see(state.moments, batch.next_obs),
-            reward=self.scaling.rewards(state.scales, batch, self.gamma, bonus),
+    def prepare(self, state: SACState, batch: Transition, tasks: Task) -> tuple[SACState, Batch]:
+        """Fit the normalisers to transitions (T, B, ...), and make of them what the losses see (T, ...)."""
+        state = state._replace(moments=self.fit_moments(state.moments, batch.obs))
+        see = jax.vmap(self.see) if state.moments.mean.ndim > 1 else lambda _, *seen: self.see(state.moments, *seen)
+        past, next_past = batch.extras, None
+        if past is not None:
+            next_past = append(past, batch.obs, batch.action, batch.reward)
+        action_size = action_sizes(batch.action, tasks.action_mask)
+        bonus = jnp.exp(state.log_temperature) * abs(self.target_entropy) * action_size / 2
+        gamma = self.discounts(tasks)
+        return state, Batch(
+            obs=see(state.moments, batch.obs, past),
+            action=batch.action,
+            reward=self.scaling.rewards(state.scales, batch, gamma, bonus),
+            discount=(gamma[:, None] if jnp.ndim(gamma) else gamma) * batch.discount,  # type: ignore
+            next_obs=see(state.moments, batch.next_obs, next_past),
+            told=self.features_of_batch(state, batch, tasks),
+            temperature=jnp.broadcast_to(jnp.exp(state.log_temperature), len(tasks.id)),
+            mask=tasks.action_mask,
         )
-        return state, batch, features, jnp.broadcast_to(jnp.exp(state.log_temperature), len(tasks.id))
 
-    def follow(self, critic: Params, target: Params) -> Params:
-        """The slow critic's step towards the new critic."""
+    def update_target(self, critic: Params, target: Params) -> Params:
+        """Move the slow critic towards the new critic."""
         return optax.incremental_update(critic, target, self.tau)  # type: ignore
 
-    def critic_problem(self, state: SACState, batch, features, temperature, key: Key) -> tuple[Callable, Any]:
+    def critic_problem(self, state: SACState, batch: Batch, key: Key) -> tuple[Callable, Any]:
         """The critic's loss for one task, and the data of all (T, ...): what ``surgery.gradient`` differentiates."""
-        over_tasks = Params(shared=None, own=0)  # type: ignore
-        bootstrap = jax.vmap(self.critic_target, (over_tasks, over_tasks, over_tasks, 0, 0, 0, 0))
-        keys = jax.random.split(key, len(temperature))
-        target = bootstrap(state.actor, state.critic, state.target, features, temperature, batch, keys)
-        return self.critic_loss, (batch, features, target)
+        bootstrap = jax.vmap(self.target, (OVER_TASKS, OVER_TASKS, OVER_TASKS, 0, 0))
+        keys = jax.random.split(key, len(batch.temperature))
+        return self.critic_loss, (batch, bootstrap(state.actor, state.critic, state.target, batch, keys))
 
-    def actor_problem(self, critic: Params, batch, features, temperature, key: Key) -> tuple[Callable, Any]:
+    def actor_problem(self, critic: Params, batch: Batch, key: Key) -> tuple[Callable, Any]:
         """The actor's loss for one task under a critic, and the data of all tasks (T, ...)."""
 
         def loss(actor: Params, data) -> tuple[Array, Metrics]:
-            batch, features, own_critic, temperature, key = data
-            return self.actor_loss(actor, (batch, features, Params(critic.shared, own_critic), temperature, key))
+            batch, own_critic, key = data
+            return self.actor_loss(actor, (batch, Params(critic.shared, own_critic), key))
 
-        return loss, (batch, features, critic.own, temperature, jax.random.split(key, len(temperature)))
+        return loss, (batch, critic.own, jax.random.split(key, len(batch.temperature)))
+
+
+def action_sizes(action: Array, mask: Array | None) -> int | Array:
+    """Count the actions that each task has: A for actions (..., A) without a mask (T, A), else (T,)."""
+    return action.shape[-1] if mask is None else jnp.sum(mask, axis=-1)
 
 
 def least(values: Array) -> Array:

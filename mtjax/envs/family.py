@@ -16,6 +16,7 @@ import tyro
 
 from mtjax.envs import variation
 from mtjax.envs.parameters import Parameter
+from mtjax.maps import Flat
 from mtjax.types import SPLITS, Array, InputError, Key, Spec, Step, Task, Transition
 
 _MAX_DRAWS = 1000
@@ -31,7 +32,7 @@ class Table(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Family(abc.ABC):
+class Family(Flat, abc.ABC):
     """Tasks that differ in named parameters. Subclasses give the parameters, ``reset`` and ``step``."""
 
     vary: Annotated[Any, tyro.conf.Suppress] = ()
@@ -148,6 +149,7 @@ class Family(abc.ABC):
             "row": np.arange(self.count, dtype=np.int32),
             "context": self._context(),
             "params": {name: np.float32(x) for name, x in self.values.items()},
+            "horizon": np.full(self.count, self.episode_length, np.int32),
             **self.build(),
         }
         rows: dict[str, np.ndarray] = dict(zip(SPLITS, np.split(np.arange(listed), np.cumsum(sizes)[:-1]), strict=True))
@@ -233,7 +235,7 @@ class Family(abc.ABC):
     def _spec(self) -> Spec:
         task = jax.tree.map(lambda x: x[0], self.table.tasks)
         step = jax.eval_shape(self.reset, task, jax.eval_shape(jax.random.key, 0))
-        return Spec(step.obs.shape[0], self.action_size, task.context.shape[0])
+        return Spec(step.obs, self.action_size, task.context.shape[0])
 
 
 def draw_until(accepted: Callable[[Array], Array], draw: Callable[[Key], Array], key: Key) -> Array:

@@ -1,1 +1,6 @@
-"""What learners learn from: replay, and what is drawn from it."""
+"""What learners learn from: replay of all steps, or rollouts of the latest ones."""
+
+from mtjax.experience.replay import Replay
+from mtjax.experience.rollouts import Rollouts
+
+EXPERIENCES: dict[str, type] = {"replay": Replay, "rollouts": Rollouts}

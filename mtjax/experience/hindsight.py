@@ -16,8 +16,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mtjax.experience import replay as rings
-from mtjax.experience.replay import Replay
+from mtjax.experience import ring as rings
+from mtjax.experience.ring import Ring
 from mtjax.tasks import episode_task
 from mtjax.types import Env, InputError, Key, Task, Transition
 
@@ -43,7 +43,9 @@ def require(env: Env) -> None:
     raise InputError(f"hindsight cannot replay steps as another task's in this family: {reason}; or use --hindsight=0")
 
 
-def sample(env: Env, tasks: Task, share: float, replay: Replay, key: Key, shape: tuple[int, int, int]) -> Transition:
+def sample(
+    env: Env, agent: Any, tasks: Task, share: float, ring: Ring, key: Key, shape: tuple[int, int, int]
+) -> Transition:
     """Draw U batches of B transitions a task, ``shape`` (T, U, B), of which the first round(share B) are relabelled.
 
     These come from the rings of all other tasks, with the same chance; also from the task's own if its episodes draw
@@ -54,17 +56,17 @@ def sample(env: Env, tasks: Task, share: float, replay: Replay, key: Key, shape:
     again = (*shape[:2], count)
     shift = jax.random.randint(source_key, again, 0 if fresh_goals(env, tasks) else 1, num_tasks)
     own = jnp.broadcast_to(jnp.arange(num_tasks)[:, None, None], shape)
-    rows = rings.sample_from(replay, row_key, own.at[:, :, :count].add(shift) % num_tasks)
+    rows = rings.sample_from(ring, row_key, own.at[:, :, :count].add(shift) % num_tasks)
     keys = (jax.random.split(task_key, again), jax.random.split(goal_key, again))
-    of_task = jax.vmap(jax.vmap(partial(relabel, env), (None, 0, 0, 0)), (None, 0, 0, 0))
+    of_task = jax.vmap(jax.vmap(partial(relabel, env, agent), (None, 0, 0, 0)), (None, 0, 0, 0))
     new = jax.vmap(of_task)(tasks, jax.tree.map(lambda x: x[:, :, :count], rows), *keys)
     return jax.tree.map(lambda new, rows: jnp.concatenate([new, rows[:, :, count:]], axis=2), new, rows)
 
 
-def relabel(env: Any, task: Task, transition: Transition, task_key: Key, goal_key: Key) -> Transition:
+def relabel(env: Env, agent: Any, task: Task, transition: Transition, task_key: Key, goal_key: Key) -> Transition:
     """One transition as a step of ``task``, or where episodes draw their tasks of one that it draws."""
     world = episode_task(task, task_key)
-    new = env.relabel(world, transition, goal_key)
+    new = agent.relabel(env, world, transition, goal_key)
     return new if transition.context is None else new._replace(context=world.context)
 
 

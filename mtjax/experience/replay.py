@@ -1,61 +1,160 @@
-"""Replay on the device: one ring of transitions a task, sampled evenly over tasks.
+"""Replay: off-policy learners store every step and learn from random ones."""
 
-A ring is a row of slots, each with one step of every environment, so that devices can share it as they share those.
-"""
-
-from collections.abc import Callable
-from typing import Any, NamedTuple
+import dataclasses
+import math
+from functools import partial
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import tyro
+from jax.sharding import PartitionSpec
 
-from mtjax.parallel import collectives as shares
-from mtjax.types import Array, Key
+from mtjax.experience import hindsight
+from mtjax.experience import ring as rings
+from mtjax.experience.ring import OVER_SEEDS, Ring
+from mtjax.maps import over_seeds
+from mtjax.parallel import collectives
+from mtjax.types import Array, Env, InputError, Key, Metrics, Task, Transition
 
-
-class Replay(NamedTuple):
-    """The rings of all tasks, which fill in step with each other."""
-
-    rows: Any  # leaves (T, H, E, ...)
-    position: Array  # () int32, the slot where the next step goes
-    size: Array  # () int32, slots written so far
-
-
-def init(item: Any, num_tasks: int, num_slots: int, num_envs: int) -> Replay:
-    """Return empty rings for items like ``item`` (no leading axes)."""
-    shape = (num_tasks, num_slots, num_envs)
-    rows = jax.tree.map(lambda x: jnp.zeros((*shape, *jnp.shape(x)), jnp.result_type(x)), item)
-    return Replay(rows, jnp.int32(0), jnp.int32(0))
+_FLAG = tyro.conf.arg(prefix_name=False)  # --batch-size, not --agent.batch-size
 
 
-def add(replay: Replay, items: Any) -> Replay:
-    """Write items (T, E, ...) over those of the oldest slot."""
-    num_slots = jax.tree.leaves(replay.rows)[0].shape[1]
-    write = lambda rows, new: jax.lax.dynamic_update_slice_in_dim(rows, new[:, None], replay.position, axis=1)
-    return Replay(
-        rows=jax.tree.map(write, replay.rows, items),
-        position=(replay.position + 1) % num_slots,
-        size=jnp.minimum(replay.size + 1, num_slots),
-    )
+class Buffer(NamedTuple):
+    """The replay of all seeds."""
+
+    ring: Ring  # rows (S, T, H, E, ...)
+    count: Array  # () int32, steps of every environment stored so far, forgotten ones included
+    key: Key  # (S,) of the random actions before learning; fixed, so that an action drawn from it can be held
 
 
-def sample(replay: Replay, key: Key, batch_size: int) -> Any:
-    """Draw rows (T, batch_size, ...) uniformly and with replacement from each task's ring."""
-    num_tasks = jax.tree.leaves(replay.rows)[0].shape[0]
-    return _draw(replay, key, (num_tasks, batch_size), jax.vmap(lambda ring, index: ring[index]))
+@dataclasses.dataclass(frozen=True)
+class Replay:
+    """Store every step in a ring a task, and update on random batches of them.
+
+    The first steps are random actions, each held for a while; then follow ``updates_per_step`` updates after each step
+    of every environment.
+    """
+
+    updates_per_step: Annotated[int, _FLAG] = 1
+    """Gradient updates after each step of all environments."""
+    batch_size: Annotated[int, _FLAG] = 64
+    """Transitions per task in each update."""
+    replay_size: Annotated[int, _FLAG] = 100_000
+    """Transitions each task's replay holds."""
+    warmup_steps: Annotated[int, _FLAG] = 100
+    """Steps of every environment under random actions before learning starts."""
+    warmup_hold: Annotated[int, _FLAG] = 10
+    """Steps for which each of those random actions is held; actions that last find more than ones that jitter."""
+    reset_every: Annotated[int, _FLAG] = 0
+    """Steps of every environment after which networks and optimisers begin anew, replay kept; 0 never."""
+    hindsight: Annotated[float, _FLAG] = 0.0
+    """Share of each batch that is taken from other tasks and replayed with this task's goal; only for families whose
+    tasks differ in their goals alone."""
+
+    steps: ClassVar[int] = 1
+
+    def __post_init__(self):
+        if not 0 <= self.hindsight <= 1:
+            raise InputError(f"hindsight is a share from 0 to 1, not {self.hindsight}")
+        for field in dataclasses.fields(self):
+            least = 0 if field.name in ("updates_per_step", "reset_every", "hindsight") else 1
+            if getattr(self, field.name) < least:
+                flag = field.name.replace("_", "-")
+                raise InputError(f"{flag} must be at least {least}, not {getattr(self, field.name)}")
+
+    def check(self, env: Env, num_envs: int) -> None:
+        """Refuse what cannot be replayed.
+
+        Raises:
+            InputError: the replay does not hold one step of every environment, or hindsight cannot relabel the family.
+        """
+        if self.replay_size < num_envs:
+            raise InputError(f"replay-size ({self.replay_size}) must hold one step of num-envs ({num_envs})")
+        if self.hindsight:
+            hindsight.require(env)
+
+    def describe(self, num_envs: int) -> str:
+        """Say how much it holds."""
+        return f"replay ({self.replay_size // num_envs * num_envs:,} transitions a task)"
+
+    @property
+    def sharding(self) -> Buffer:
+        """How devices share the data: the axes of seeds and of environments are split."""
+        seeds, whole = PartitionSpec("seeds"), PartitionSpec()
+        rows = PartitionSpec("seeds", None, None, collectives.AXIS)
+        return Buffer(Ring(rows, whole, whole), whole, seeds)  # type: ignore
+
+    # Data.
+
+    def init(self, item: Transition, num_tasks: int, num_envs: int, keys: Key) -> Buffer:
+        """Return an empty replay for transitions like ``item`` (no leading axes) and seeds with ``keys`` (S,)."""
+        own, slots = num_envs // collectives.count(), self.replay_size // num_envs
+        blank = lambda _: rings.init(item, num_tasks, slots, own)
+        return Buffer(jax.vmap(blank, out_axes=OVER_SEEDS)(keys), jnp.int32(0), keys)
+
+    def explore(self, data: Buffer, action: Array) -> Array:
+        """Replace actions (S, T, E, A) by held random ones before learning starts."""
+        everywhere = (action.shape[1], action.shape[2] * collectives.count(), action.shape[3])
+        fold = lambda key: jax.random.fold_in(key, data.count // self.warmup_hold)
+        drawn = jax.vmap(lambda key: jax.random.uniform(fold(key), everywhere, minval=-1.0))(data.key)
+        return jnp.where(data.count < self.warmup_steps, collectives.own(drawn, axis=2), action)
+
+    def add(self, data: Buffer, steps: Transition) -> Buffer:
+        """Store one step of every environment, leaves (S, T, 1, E, ...)."""
+        latest = jax.tree.map(lambda x: x[:, :, 0], steps)
+        ring = jax.vmap(rings.add, (OVER_SEEDS, 0), OVER_SEEDS)(data.ring, latest)
+        return Buffer(ring, data.count + 1, data.key)
+
+    def keep(self, data: Buffer) -> Buffer:
+        """Keep everything."""
+        return data
+
+    # Learning.
+
+    def learn(self, env: Env, agent: Any, states: Any, data: Buffer, tasks: Task, keys: Key) -> tuple[Any, Metrics]:
+        """Update the agents of all seeds, leaves (S, ...), unless it is too early.
+
+        Returns:
+            their new states, and the means of the updates' metrics with ``learning`` (), 1 if there were any.
+        """
+        warming = data.count <= self.warmup_steps
+        metrics = {}
+        if self.updates_per_step:
+            # All seeds begin to learn at once, so that this stays a branch.
+            learn = lambda states: _learn(env, agent, self, tasks, states, data.ring, keys)
+            shapes = jax.eval_shape(learn, states)[1]
+            rest = lambda states: (states, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes))
+            states, metrics = jax.lax.cond(warming, rest, learn, states)
+        return self._renew(env, agent, states, data, tasks, keys), metrics | {"learning": 1.0 - warming}
+
+    def _renew(self, env: Env, agent: Any, states: Any, data: Buffer, tasks: Task, keys: Key) -> Any:
+        """Let the networks begin anew where that is due."""
+        if not self.reset_every:
+            return states
+        due = (data.count > self.warmup_steps) & (data.count % self.reset_every == 0)
+        one = lambda state, key: agent.reset(state, env.spec, tasks, jax.random.fold_in(key, 1))
+        return jax.lax.cond(due, lambda states: over_seeds(one, 0, 0)(states, keys), lambda states: states, states)
+
+    def draw(self, env: Env, agent: Any, tasks: Task, ring: Ring, key: Key) -> Transition:
+        """Draw the batches (U, T, B, ...) of one step's updates of one agent; one gather of all is cheapest."""
+        shape = (len(tasks.id), self.updates_per_step, self.batch_size)
+        if self.hindsight:
+            rows = hindsight.sample(env, agent, tasks, self.hindsight, ring, key, shape)
+        else:
+            rows = rings.sample(ring, key, math.prod(shape[1:]))
+            rows = jax.tree.map(lambda x: x.reshape(*shape, *x.shape[2:]), rows)
+        return jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), rows)
 
 
-def sample_from(replay: Replay, key: Key, ring: Array) -> Any:
-    """Draw a row from each ring that ``ring`` names by the number of its task; leaves (*ring.shape, ...)."""
-    return _draw(replay, key, ring.shape, lambda rings, index: rings[ring, index])
+@partial(jax.jit, static_argnums=(0, 1, 2))  # traced once, though the cond above asks for its shapes as well
+def _learn(env: Env, agent: Any, replay: Replay, tasks: Task, states: Any, ring: Ring, keys: Key):
+    def learn_one(state, ring: Ring, key: Key) -> tuple[Any, Metrics]:
+        batch_key, update_key = jax.random.split(key)
+        batches = replay.draw(env, agent, tasks, ring, batch_key)
+        keys = jax.random.split(update_key, replay.updates_per_step)
+        update = lambda state, x: agent.update(state, x[0], tasks, x[1])
+        state, metrics = jax.lax.scan(update, state, (batches, keys))
+        return state, jax.tree.map(lambda x: jnp.mean(x, axis=0), metrics)
 
-
-def _draw(replay: Replay, key: Key, shape: tuple[int, ...], take: Callable) -> Any:
-    """Draw slots and environments of ``shape``, all alike, and ``take(rings, index)`` from rings (T, H E, ...)."""
-    num_slots, held = jax.tree.leaves(replay.rows)[0].shape[1:3]
-    num_envs = held * shares.count()
-    index = jax.random.randint(key, shape, 0, replay.size * num_envs)
-    slot, env = index // num_envs, index % num_envs
-    flat = lambda x: x.reshape(len(x), num_slots * held, *x.shape[3:])
-    rows = jax.tree.map(lambda x: take(flat(x), slot * held + env % held), replay.rows)
-    return shares.pick(rows, env // held)
+    return over_seeds(learn_one, 0, OVER_SEEDS, 0)(states, ring, keys)

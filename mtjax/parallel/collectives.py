@@ -16,13 +16,13 @@ AXIS = "envs"
 
 
 def count() -> int:
-    """How many devices share each seed's environments."""
+    """Count the devices that share each seed's environments."""
     mesh = jax.sharding.get_abstract_mesh()
     return mesh.shape[AXIS] if AXIS in mesh.manual_axes else 1
 
 
 def own(tree: Any, axis: int) -> Any:
-    """This device's part along E, which is ``axis``, of what all devices have whole."""
+    """Slice out this device's part of ``tree`` along ``axis``, which is E."""
     if count() == 1:
         return tree
 
@@ -34,25 +34,26 @@ def own(tree: Any, axis: int) -> Any:
 
 
 def whole(tree: Any, axis: int) -> Any:
-    """All of what each device has its own part of along E, which is ``axis``."""
+    """Put all devices' parts of ``tree`` side by side along ``axis``, which is E."""
     return tree if count() == 1 else jax.lax.all_gather(tree, AXIS, axis=axis, tiled=True)
 
 
 def total(tree: Any) -> Any:
-    """The sum over devices."""
+    """Sum ``tree`` over devices."""
     return tree if count() == 1 else jax.lax.psum(tree, AXIS)
 
 
 def pick(tree: Any, holder: Array) -> Any:
-    """Rows as the device has them that ``holder`` numbers; leaves (*holder.shape, ...)."""
+    """Take each row from the device that ``holder`` (...) names by its number; leaves (*holder.shape, ...)."""
     if count() == 1:
         return tree
     mine = holder == jax.lax.axis_index(AXIS)
-    others = lambda x: jnp.where(mine.reshape(mine.shape + (1,) * (x.ndim - mine.ndim)), x, 0)
-    return total(jax.tree.map(others, tree))
+    others = lambda x: jnp.where(mine.reshape(mine.shape + (1,) * (x.ndim - mine.ndim)), x, jnp.zeros_like(x))
+    summed = total(jax.tree.map(lambda x: others(jnp.int8(x) if x.dtype == bool else x), tree))
+    return jax.tree.map(lambda x, like: x.astype(like.dtype), summed, tree)
 
 
 def agreed(tree: Any) -> Any:
-    """What should be the same on all devices, made so again: GPUs may add in any order, and then round differently."""
+    """Give all devices the first one's numbers: GPUs may add in any order, and then round differently."""
     first = lambda x: pick(x, jnp.int32(0)) if jnp.issubdtype(x.dtype, jnp.floating) else x
     return jax.tree.map(first, tree)

@@ -18,8 +18,8 @@ import numpy as np
 
 from mtjax.agents import SAC
 from mtjax.agents.parts.gradients import surgery
-from mtjax.experience import replay as rings
-from mtjax.experience.replay import Replay
+from mtjax.experience import ring as rings
+from mtjax.experience.ring import Ring
 from mtjax.networks import Network, Params, ReLU
 from mtjax.report import figures
 from mtjax.training.policy import Policy
@@ -59,7 +59,7 @@ class Diagnostics(NamedTuple):
     seeds: int
 
 
-def diagnose(policy: Policy, replay: Replay, batch_size: int) -> Diagnostics:
+def diagnose(policy: Policy, replay: Ring, batch_size: int) -> Diagnostics:
     """Look at every seed of a run, and average.
 
     Args:
@@ -97,7 +97,7 @@ def _summarise(agent: SAC, state: Any, gradients: Mapping, activity: Mapping) ->
 
 
 @partial(jax.jit, static_argnums=(0, 5))
-def _average_gradients(agent: SAC, state: Any, replay: Replay, tasks: Task, key: Key, batch_size: int) -> dict:
+def _average_gradients(agent: SAC, state: Any, replay: Ring, tasks: Task, key: Key, batch_size: int) -> dict:
     def draw(key: Key) -> dict:
         batch_key, loss_key = jax.random.split(key)
         return compare_gradients(agent, state, rings.sample(replay, batch_key, batch_size), tasks, loss_key)
@@ -112,9 +112,9 @@ def compare_gradients(agent: SAC, state: Any, batch: Transition, tasks: Task, ke
         "critic" and "actor": gram, cosine, conflict and gradient_norm, as in ``Findings``; "td_error" (T,).
     """
     target_key, actor_key = jax.random.split(key)
-    state, batch, features, temperature = agent.prepare(state, batch, tasks)
-    critic, aux = _compare(state.critic, *agent.critic_problem(state, batch, features, temperature, target_key))
-    actor, _ = _compare(state.actor, *agent.actor_problem(state.critic, batch, features, temperature, actor_key))
+    state, seen = agent.prepare(state, batch, tasks)
+    critic, aux = _compare(state.critic, *agent.critic_problem(state, seen, target_key))
+    actor, _ = _compare(state.actor, *agent.actor_problem(state.critic, seen, actor_key))
     return {"critic": critic, "actor": actor, "td_error": aux["td_error"]}
 
 
@@ -140,7 +140,7 @@ class Activity(NamedTuple):
 
 
 @partial(jax.jit, static_argnums=0)
-def _sample_activity(agent: SAC, state: Any, replay: Replay, tasks: Task, key: Key) -> dict[str, Activity]:
+def _sample_activity(agent: SAC, state: Any, replay: Ring, tasks: Task, key: Key) -> dict[str, Activity]:
     return activity(agent, state, rings.sample(replay, key, SAMPLE), tasks)
 
 
@@ -150,9 +150,9 @@ def activity(agent: SAC, state: Any, batch: Transition, tasks: Task) -> dict[str
     Returns:
         mean activity over the batch (T, N, units), and hidden layers (T, B, N, width); N is 1 for the actor.
     """
-    state, batch, features, _ = agent.prepare(state, batch, tasks)
-    shape = (*batch.reward.shape, features.shape[-1])
-    features = jnp.broadcast_to(features if features.ndim == 3 else features[:, None], shape)
+    state, seen_batch = agent.prepare(state, batch, tasks)
+    told, shape = seen_batch.told, (*batch.reward.shape, seen_batch.told.shape[-1])
+    features = jnp.broadcast_to(told if told.ndim == 3 else told[:, None], shape)
 
     def one(actor: Params, critic: Params, features: Array, obs: Array, action: Array) -> dict[str, Activity]:
         judging = agent.of_critics(partial(watch, agent.critic.apply), critic, features, obs, action)
@@ -161,7 +161,7 @@ def activity(agent: SAC, state: Any, batch: Transition, tasks: Task) -> dict[str
 
     over_tasks = Params(shared=None, own=0)  # type: ignore
     every = jax.vmap(jax.vmap(one, (None, None, 0, 0, 0)), (over_tasks, over_tasks, 0, 0, 0))
-    seen = every(state.actor, state.critic, features, batch.obs, batch.action)
+    seen = every(state.actor, state.critic, features, seen_batch.obs, seen_batch.action)
     level = lambda x: jnp.mean(jnp.abs(x), axis=1).reshape(*x.shape[:1], x.shape[2], -1)
     return {name: Activity(jax.tree.map(level, x.layers), x.hidden) for name, x in seen.items()}
 

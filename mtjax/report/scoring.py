@@ -33,7 +33,7 @@ def report(run: str, point: int, episodes: int, seed: int, video: bool, diagnose
     enable_compile_cache()
     first = _first_seed(run, point)
     policy = load(run, first)
-    if video and not isinstance(policy.family, Domain):
+    if video and not isinstance(policy.env, Domain):
         raise InputError("only MuJoCo families can be filmed; leave out --video")
     found = diagnostics.diagnose(policy, *load_experience(run, first)) if diagnose else None
     scores = score(policy, episodes, seed)
@@ -89,16 +89,16 @@ def _write(policy: Policy, episodes: dict[str, np.ndarray], directory: Path) -> 
 
 def _film(policy: Policy, directory: Path, seed: int) -> None:
     """Film the beginning of one episode of every task, at the speed at which it happens."""
-    env = policy.family
+    env = policy.env
     assert isinstance(env, Domain)
     render.choose_backend()
-    returns, played, states = record(policy.env, policy.agent, policy.state, env.tasks("all"), jnp.int32(seed))
-    worlds = states.world if policy.agent.history else states
+    played = record(env, policy.agent, policy.state, env.tasks("all"), jnp.int32(seed))
     stride = max(round(1 / (_FILM_FPS * env.seconds_per_step)), 1)
-    shown, fps = slice(0, round(_FILM_SECONDS / env.seconds_per_step), stride), 1 / (stride * env.seconds_per_step)
+    fps, longest = 1 / (stride * env.seconds_per_step), round(_FILM_SECONDS / env.seconds_per_step)
     for split in SPLITS:
         for i in env.table.rows[split]:
-            row = int(played[i])  # where ranges are continuous, an episode's own
-            frames = render.film(env, row, np.asarray(worlds.qpos[i, shown]))
+            row = int(played.rows[i])  # where ranges are continuous, an episode's own
+            shown = slice(0, min(longest, int(played.lengths[i])), stride)
+            frames = render.film(env, row, np.asarray(played.states.qpos[i, shown]))
             path = render.write_video(directory / f"{split}-{env.describe(row)}".replace("=", "-"), frames, fps)
-            print(f"filmed {path.name}: return {float(returns[i]):.0f}", flush=True)
+            print(f"filmed {path.name}: return {float(played.returns[i]):.0f}", flush=True)

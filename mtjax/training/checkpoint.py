@@ -8,7 +8,6 @@ from typing import Any
 
 import jax
 
-from mtjax.experience.replay import Replay
 from mtjax.loop import TrainState
 from mtjax.types import InputError
 
@@ -48,9 +47,9 @@ def load_agent(directory: Path, like: TrainState) -> Any:
     return _load(directory, {"agent": like.agent})["agent"]
 
 
-def load_replay(directory: Path, like: TrainState) -> Replay:
-    """Read only the replay, without the worlds and the agent."""
-    return _load(directory, {"loop": {"replay": like.replay}}, partial=True)["loop"]["replay"]
+def load_data(directory: Path, like: TrainState) -> Any:
+    """Read only what the learner learns from, without the worlds and the agent."""
+    return _load(directory, {"loop": {"data": like.data}}, partial=True)["loop"]["data"]
 
 
 def _sizes(folder: Path) -> dict[str, int]:

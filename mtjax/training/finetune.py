@@ -7,9 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.agents import SAC, settings
+from mtjax.agents import BaseAgent, parts, settings
 from mtjax.envs import Family
-from mtjax.history import forget
 from mtjax.networks import Params
 from mtjax.training.policy import Policy
 from mtjax.types import Array, Env, InputError, Task
@@ -21,13 +20,13 @@ _FRESH = ("optimizers", "contexts", "vectors", "surgery", "progress")  # what is
 _BY_TASK = ("log_temperature", "scales")  # leaves (T, ...), or shared by all tasks
 
 
-def require_fit(start: Policy, env: Env, agent: SAC) -> None:
+def require_fit(start: Policy, env: Env, agent: BaseAgent) -> None:
     """Check that a run's networks can go on with an agent on a family of tasks.
 
     Raises:
         InputError: the agent is another one, or the family has other sizes or another context.
     """
-    had, given = settings(start.agent), settings(agent)
+    had, given = _learned(start.agent), _learned(agent)
     if type(agent) is not type(start.agent) or had.keys() != given.keys():
         raise InputError("the agent is not the run's; give the one that learned there")
     other = next((name for name in had if had[name] != given[name] and name not in FREE), None)
@@ -36,7 +35,7 @@ def require_fit(start: Policy, env: Env, agent: SAC) -> None:
             f"{other.replace('_', '-')} is the run's, {had[other]}, and cannot be {given[other]}; "
             f"what may change is {', '.join(name.replace('_', '-') for name in FREE if name in had)}"
         )
-    family, known = forget(env), start.family
+    family, known = env, start.env
     theirs, ours = known.spec, family.spec
     if theirs[:2] != ours[:2]:
         raise InputError(
@@ -49,7 +48,13 @@ def require_fit(start: Policy, env: Env, agent: SAC) -> None:
     _require_numbers(start, env, agent)
 
 
-def _require_numbers(start: Policy, env: Env, agent: SAC) -> None:
+def _learned(agent: BaseAgent) -> dict[str, Any]:
+    """The settings of an agent but for those of its experience, in which fine-tuning may differ."""
+    collected = parts.settings(agent.experience)
+    return {name: value for name, value in settings(agent).items() if name not in collected}
+
+
+def _require_numbers(start: Policy, env: Env, agent: BaseAgent) -> None:
     """Refuse other tasks to networks that know tasks by number alone."""
     if agent.conditioning != "one-hot":
         return
@@ -61,7 +66,7 @@ def _require_numbers(start: Policy, env: Env, agent: SAC) -> None:
         )
 
 
-def adopt(start: Policy, agent: SAC, tasks: Task, fresh: Any) -> Any:
+def adopt(start: Policy, agent: BaseAgent, tasks: Task, fresh: Any) -> Any:
     """Return an agent's ``fresh`` state (S, ...) for new ``tasks`` (T, ...) with what a run learned in it.
 
     Networks, their slow copies, temperatures, scales of rewards and moments of observations are the run's; of what
@@ -82,7 +87,7 @@ def adopt(start: Policy, agent: SAC, tasks: Task, fresh: Any) -> Any:
     return state
 
 
-def _adopt(agent: SAC, tasks: Task, old: Any, fresh: Any) -> Any:
+def _adopt(agent: BaseAgent, tasks: Task, old: Any, fresh: Any) -> Any:
     nearest, before, now = agent.nearest_tasks(old, tasks), len(old.contexts), len(tasks.id)
 
     def by_task(x: Array, like: Array) -> Array:

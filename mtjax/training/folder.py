@@ -15,6 +15,7 @@ import jax
 
 from mtjax import __version__
 from mtjax.agents import settings
+from mtjax.agents.base import flag_names
 from mtjax.config import RunConfig, from_json, import_flag
 from mtjax.types import InputError
 
@@ -77,10 +78,13 @@ def repeat(config: RunConfig) -> list[str]:
     """Every flag of this program, so that the command means the same whatever the presets become."""
     words = [f"--env={config.env}", f"--agent={config.agent}", *import_flag(config.family)]
     words += [f"--from={config.start}"] if config.start else []
-    for part, prefix in (("plan", "--"), ("training", "--"), ("family", "--env."), ("learner", "--agent.")):
-        value = getattr(config, part)
-        items = (settings(value) if part == "learner" else dataclasses.asdict(value)).items()
+    for part, prefix in (("plan", "--"), ("training", "--"), ("family", "--env.")):
+        items = dataclasses.asdict(getattr(config, part)).items()
         words += itertools.chain(*(_flag(prefix, name.replace("_", "-"), value) for name, value in items))
+    names, values = flag_names(config.learner), settings(config.learner)
+    for name, flag in names.items():
+        group, dot, rest = flag.rpartition(".")
+        words += _flag(f"--{group}{dot}", rest, values[name])
     return words + (["--sweep", *config.sweep] if config.sweep else [])
 
 
@@ -89,7 +93,7 @@ def _flag(prefix: str, name: str, value: object) -> list[str]:
         return []
     if name == "vary":
         return [f"{prefix}vary.{parameter}={values}" for parameter, values in value]  # type: ignore
-    prefix = "--" if name in ("split", "engine", "tune") else prefix
+    prefix = "--" if name in ("split", "engine") else prefix
     match value:
         case bool():
             return [f"{prefix}{name}" if value else f"{prefix}no-{name}"]

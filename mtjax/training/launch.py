@@ -5,7 +5,6 @@ from pathlib import Path
 
 from mtjax.agents.parts.conditioning import load_vectors
 from mtjax.config import RunConfig
-from mtjax.experience import hindsight
 from mtjax.parallel import hosts, mesh
 from mtjax.training.finetune import require_fit
 from mtjax.training.policy import Policy, load
@@ -18,14 +17,13 @@ def check(config: RunConfig) -> None:
     family = config.family
     _ = family.engine_name, family.table
     mesh.mesh_for(config.plan.seeds, family.train_count, config.training.num_envs)
-    if config.training.hindsight:
-        hindsight.require(family)
+    config.learner.experience.check(family, config.training.num_envs)
     if config.learner.vectors:
         load_vectors(config.learner.vectors, family.train_count)
     tune = config.learner.tune
     if tune != "all" and not config.start:
         raise InputError(f"--tune={tune} leaves the rest as a run left it; say which run: --from=RUN")
-    if config.start and config.training.reset_every:
+    if config.start and getattr(config.learner.experience, "reset_every", 0):
         raise InputError("--reset-every throws away what --from takes from a run; give one of them")
 
 

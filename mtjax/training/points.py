@@ -12,13 +12,14 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.agents import PARTS, SAC, parts
+from mtjax.agents import BaseAgent, parts
+from mtjax.agents.base import kinds_of
 from mtjax.names import nearest_error
-from mtjax.types import Array, InputError, Key, Metrics, Outcome, Spec, Task, Transition
+from mtjax.types import Acted, Array, Env, Experience, InputError, Key, Metrics, Outcome, Spec, Task, Transition
 
 Point = Mapping[str, float]
 Sweep = Mapping[str, Sequence[float]] | Sequence[Point]
-_SHAPE = ("encoder",)  # parts whose numbers are written into the networks' modules, and are not data
+_STATIC = ("encoder", "experience")  # parts whose numbers are shapes, or written into the networks' modules
 
 
 class Swept(NamedTuple):
@@ -36,33 +37,36 @@ class Varied:
     ``at`` checks them beforehand.
     """
 
-    agent: SAC
+    agent: BaseAgent
 
     @property
     def watches(self) -> bool:
         return self.agent.watches
 
     @property
-    def history(self) -> int:
-        return self.agent.history
-
-    @property
-    def gamma(self) -> float:
-        """The discount of what the sweep leaves as it is; ``discounts`` has that of every point."""
-        return self.agent.gamma
-
-    def discounts(self, state: Swept) -> Array | float:
-        """The discounts (S, 1, 1) of states with a leading S, or one for all."""
-        gamma = state.knobs.get("gamma")
-        return self.agent.gamma if gamma is None else gamma[:, None, None]
+    def experience(self) -> Experience:
+        return self.agent.experience
 
     def init(self, spec: Spec, tasks: Task, key: Key, knobs: dict[str, Array] | None = None) -> Swept:
         knobs = knobs or {}
         return Swept(vary(self.agent, knobs).init(spec, tasks, key), knobs)
 
-    def act(self, state: Swept, obs: Array, task: Task, key: Key | None) -> Array:
-        action = vary(self.agent, state.knobs).act(state.learner, obs, task, key)
-        return jnp.where(jnp.isfinite(action), action, 0.0)  # one that diverged goes on beside the others
+    def begin(self, state: Swept, task: Task) -> Any:
+        return vary(self.agent, state.knobs).begin(state.learner, task)
+
+    def act(self, state: Swept, memory: Any, obs: Any, task: Task, key: Key | None) -> Acted:
+        acted = vary(self.agent, state.knobs).act(state.learner, memory, obs, task, key)
+        whole = jnp.isfinite(acted.action)  # one that diverged goes on beside the others
+        return acted._replace(action=jnp.where(whole, acted.action, 0.0))
+
+    def remember(self, state: Swept, memory: Any, transition: Transition, task: Task) -> Any:
+        return vary(self.agent, state.knobs).remember(state.learner, memory, transition, task)
+
+    def relabel(self, env: Env, task: Task, transition: Transition, key: Key) -> Transition:
+        return self.agent.relabel(env, task, transition, key)
+
+    def learn(self, env: Env, states: Swept, data: Any, tasks: Task, keys: Key) -> tuple[Swept, Metrics]:
+        return self.experience.learn(env, self, states, data, tasks, keys)  # type: ignore
 
     def update(self, state: Swept, batch: Transition, tasks: Task, key: Key) -> tuple[Swept, Metrics]:
         learner, metrics = vary(self.agent, state.knobs).update(state.learner, batch, tasks, key)
@@ -75,13 +79,13 @@ class Varied:
         return state._replace(learner=vary(self.agent, state.knobs).reset(state.learner, spec, tasks, key))
 
 
-def numbers(agent: SAC) -> dict[str, float]:
+def numbers(agent: BaseAgent) -> dict[str, float]:
     """The settings of an agent and of its parts that may vary within a program: numbers that are no counts."""
-    holders = [agent, *(getattr(agent, kind) for kind in PARTS if kind not in _SHAPE)]
+    holders = [agent, *(getattr(agent, kind) for kind in kinds_of(agent) if kind not in _STATIC)]
     return {f.name: getattr(x, f.name) for x in holders for f in dataclasses.fields(x) if f.type is float}
 
 
-def at(agent: SAC, point: Point) -> SAC:
+def at(agent: BaseAgent, point: Point) -> BaseAgent:
     """Return the agent at a point, as if its values had been given plainly.
 
     Raises:
@@ -94,14 +98,15 @@ def at(agent: SAC, point: Point) -> SAC:
     return _place(agent, point, dataclasses.replace)
 
 
-def vary(agent: SAC, knobs: Mapping[str, Array]) -> SAC:
+def vary(agent: BaseAgent, knobs: Mapping[str, Array]) -> BaseAgent:
     """Return the agent with traced values, which its constructors could not check."""
     return _place(agent, knobs, parts.put)
 
 
-def _place(agent: SAC, values: Mapping[str, Any], replace: Callable) -> SAC:
+def _place(agent: BaseAgent, values: Mapping[str, Any], replace: Callable) -> BaseAgent:
     mine = lambda part: {f.name: values[f.name] for f in dataclasses.fields(part) if f.name in values}
-    changed = {kind: replace(getattr(agent, kind), **own) for kind in PARTS if (own := mine(getattr(agent, kind)))}
+    held = {kind: getattr(agent, kind) for kind in kinds_of(agent)}
+    changed = {kind: replace(part, **own) for kind, part in held.items() if (own := mine(part))}
     return replace(agent, **changed, **mine(agent))
 
 

@@ -8,33 +8,43 @@ import jax
 import jax.numpy as jnp
 
 from mtjax import loop
-from mtjax.agents import SAC
+from mtjax.agents import BaseAgent
 from mtjax.config import RunConfig, from_json
 from mtjax.envs import Family
-from mtjax.experience.replay import Replay
-from mtjax.history import History, forget, remember
+from mtjax.experience import Replay
+from mtjax.experience.ring import Ring
 from mtjax.training import checkpoint, points
-from mtjax.types import Array, InputError, Key, Task
+from mtjax.types import Array, InputError, Key, Task, Transition
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Policy:
     """What a run learned: ``action = policy(obs, task)``, for single observations (O,); map it for many."""
 
-    env: Family | History  # what the agent acts in: the family, showing past steps if the agent looks at any
-    agent: SAC
+    env: Family
+    agent: BaseAgent
     state: Any  # of one seed
     states: Any  # of every seed, leading S; of a sweep, those of one point
     seeds: Array  # (S,)
 
-    def __call__(self, obs: Array, task: Task, key: Key | None = None) -> Array:
-        """Return the mean action (A,), or a random one if a key is given."""
-        return self.agent.act(self.state, obs, task, key)
+    def __call__(self, obs: Array, task: Task, key: Key | None = None, memory: Any = None) -> Array:
+        """Return the mean action (A,), or a random one if a key is given.
 
-    @property
-    def family(self) -> Family:
-        """The family that the run trained on."""
-        return forget(self.env)
+        Args:
+            memory: what the agent remembers of the episode, from ``begin`` and ``remember``. Only an agent that infers
+                its task needs it; without it, the episode counts as just begun.
+        """
+        memory = self.begin(task) if memory is None else memory
+        return self.agent.act(self.state, memory, obs, task, key).action
+
+    def begin(self, task: Task) -> Any:
+        """Return the memory with which an episode begins."""
+        return self.agent.begin(self.state, task)
+
+    def remember(self, memory: Any, task: Task, obs: Array, action: Array, reward: Array, next_obs: Array) -> Any:
+        """Return the memory after a step."""
+        step = Transition(obs, action, reward, jnp.float32(1), next_obs)
+        return self.agent.remember(self.state, memory, step, task)
 
 
 def load(directory: str | Path, seed: int = 0) -> Policy:
@@ -60,8 +70,8 @@ def load(directory: str | Path, seed: int = 0) -> Policy:
         rows = _of_point(config, seed)
         agent = points.at(agent, config.points[seed // count])
         states = jax.tree.map(lambda x: x[rows], states.learner)
-    env, seeds = remember(config.family, agent.history), config.plan.seed + jnp.arange(count)
-    return Policy(env, agent, jax.tree.map(lambda x: x[seed % count], states), states, seeds)
+    seeds = config.plan.seed + jnp.arange(count)
+    return Policy(config.family, agent, jax.tree.map(lambda x: x[seed % count], states), states, seeds)
 
 
 def _of_point(config: RunConfig, seed: int) -> slice:
@@ -70,23 +80,24 @@ def _of_point(config: RunConfig, seed: int) -> slice:
     return slice(first, first + config.plan.seeds)
 
 
-def load_experience(directory: str | Path, seed: int = 0) -> tuple[Replay, int]:
+def load_experience(directory: str | Path, seed: int = 0) -> tuple[Ring, int]:
     """Read what a run learned from: the replay of its last checkpoint, and the size of its batches.
 
     Of a run of a sweep it is what the seeds of one point learned from, by ``seed`` as for ``load``.
 
     Raises:
-        InputError: as for ``load``.
+        InputError: as for ``load``; or the run has no replay.
     """
     config = from_json(Path(directory) / "config.json")
-    replay = checkpoint.load_replay(Path(directory) / "checkpoints", shapes(config))
+    if not isinstance(config.learner.experience, Replay):
+        raise InputError(f"{config.agent} keeps no replay, so that there is nothing to look at")
+    ring = checkpoint.load_data(Path(directory) / "checkpoints", shapes(config)).ring
     rows = _of_point(config, seed)
-    return replay._replace(rows=jax.tree.map(lambda x: x[rows], replay.rows)), config.training.batch_size
+    return ring._replace(rows=jax.tree.map(lambda x: x[rows], ring.rows)), config.learner.experience.batch_size
 
 
 def shapes(config: RunConfig) -> loop.TrainState:
     """The shapes of a run's training state."""
-    env = remember(config.family, config.learner.history)
-    agent = points.Varied(config.learner) if config.points else config.learner
+    env, agent = config.family, points.Varied(config.learner) if config.points else config.learner
     spread = points.spread(config.points, config.plan.seed + jnp.arange(config.plan.seeds))
     return jax.eval_shape(lambda: loop.init(env, agent, config.training, env.tasks("train"), *spread))  # type: ignore

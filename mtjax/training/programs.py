@@ -7,21 +7,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import Mesh, NamedSharding
 
 from mtjax.evaluation import evaluate
-from mtjax.experience.replay import Replay
 from mtjax.loop import TrainState, init, run_chunk
-from mtjax.parallel import collectives
 from mtjax.parallel.mesh import BY_SEED, BY_WORLD, SAME
-
-_STATE = TrainState(*[BY_WORLD] * len(TrainState._fields))._replace(  # type: ignore
-    agent=BY_SEED,
-    replay=Replay(PartitionSpec("seeds", None, None, collectives.AXIS), SAME, SAME),  # type: ignore
-    iteration=SAME,  # type: ignore
-    key=BY_SEED,  # type: ignore
-    warmup_key=BY_SEED,  # type: ignore
-)
+from mtjax.types import Agent
 
 
 class Jitted(NamedTuple):
@@ -39,13 +30,21 @@ class Programs(NamedTuple):
     evaluate: Callable  # agents' state, number of the evaluation -> returns
 
 
-def jitted(mesh: Mesh | None) -> Jitted:
+def _specs(agent: Agent) -> TrainState:
+    """How devices share a training state."""
+    by_world = TrainState(*[BY_WORLD] * len(TrainState._fields))  # type: ignore
+    data = agent.experience.sharding
+    return by_world._replace(agent=BY_SEED, data=data, iteration=SAME, key=BY_SEED)  # type: ignore
+
+
+def jitted(mesh: Mesh | None, agent: Agent) -> Jitted:
     """The programs of a run, each split over the mesh if there is one."""
     if mesh is None:
         return Jitted(init, run_chunk, evaluate)
+    state = _specs(agent)
     return Jitted(
-        _split(mesh, init, (SAME, BY_SEED, BY_SEED), _STATE),
-        _split(mesh, run_chunk, (SAME, _STATE), (_STATE, BY_SEED), donated=(4,)),
+        _split(mesh, init, (SAME, BY_SEED, BY_SEED), state),
+        _split(mesh, run_chunk, (SAME, state), (state, BY_SEED), donated=(4,)),
         _split(mesh, evaluate, (BY_SEED, SAME, BY_SEED, SAME), BY_SEED),
     )
 
@@ -63,14 +62,14 @@ def _split(mesh: Mesh, program: Callable, inputs: tuple, outputs: Any, donated: 
     )
 
 
-def sharded(mesh: Mesh | None, shapes: TrainState) -> TrainState:
+def sharded(mesh: Mesh | None, agent: Agent, shapes: TrainState) -> TrainState:
     """Shapes of a training state that also say which devices its leaves are on."""
     if mesh is None:
         return shapes
     put = lambda spec, part: jax.tree.map(
         lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=NamedSharding(mesh, spec)), part
     )
-    return jax.tree.map(put, _STATE, shapes)
+    return jax.tree.map(put, _specs(agent), shapes)
 
 
 def compiled(program: Any, once: bool = False) -> Any:

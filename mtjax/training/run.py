@@ -5,7 +5,7 @@ import dataclasses
 import math
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property, partial
 from pathlib import Path
@@ -16,9 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from mtjax.config import Plan
+from mtjax.config import Plan, configure
 from mtjax.evaluation import Evaluations, load_evaluations, save_evaluations
-from mtjax.history import remember
 from mtjax.loop import Settings, TrainState
 from mtjax.parallel import hosts
 from mtjax.parallel import mesh as meshes
@@ -60,6 +59,7 @@ def train(
     quiet: bool = True,
     label: str = "",
     on_chunk: Callable[[dict[str, Any]], None] | None = None,
+    **given: Any,
 ) -> Result:
     """Train an agent on a family of tasks, on as many devices as divide the seeds, and then their environments.
 
@@ -72,7 +72,7 @@ def train(
         steps: environment steps of each seed, summed over tasks; rounded up to whole chunks.
         seeds: how many seeds to run at once; seed: the first of them.
         eval_every: environment steps between evaluations (0: ten in the run), of ``eval_episodes`` episodes a task.
-        settings: how to collect and learn; by default ``Settings()``.
+        settings: how worlds are played; by default ``Settings()``.
         start: fine-tune what a run learned, from ``mtjax.load``: ``env`` is ``new.scaled_as(start.env)`` and ``agent``
             is ``start.agent``, of which rates and ``tune`` may be replaced (``finetune.adopt`` says what is kept).
         sweep: numbers of the agent that vary, all in one program, ``{"actor_lr": [1e-4, 1e-3], "gamma": [0.98, 0.99]}``
@@ -85,12 +85,14 @@ def train(
         quiet: print nothing.
         label: what lines of progress begin with.
         on_chunk: called with each chunk's first row of metrics.
+        given: any setting of ``Settings``, of the agent or of its parts, by name: ``num_envs=64, batch_size=128``.
 
     Raises:
         InputError: an argument cannot be used.
         FloatingPointError: numbers stopped being finite (in a sweep, of all seeds); the message names task and step.
     """
     plan = Plan(steps, seed, seeds, eval_every, eval_episodes)
+    agent, settings = configure(agent, settings or Settings(), given)
     found = points.grid(sweep)
     for learner in [points.at(agent, point) for point in found] or [agent]:  # type: ignore
         if start is not None:
@@ -99,8 +101,9 @@ def train(
     if profile and directory is None:
         raise InputError("profile writes into the run's folder; give directory as well")
     started = time.monotonic()
-    tasks, env = env.tasks("train"), remember(env, agent.history)
-    settings = fit_chunk(settings or Settings(), len(tasks.id), steps)
+    tasks = env.tasks("train")
+    agent.experience.check(env, settings.num_envs)
+    settings = fit_chunk(settings, len(tasks.id), steps, agent.experience.steps)
     learner = Varied(agent) if found else agent  # type: ignore
     console = log.Console(plan.steps, quiet or not hosts.is_first(), label)
     mesh = meshes.mesh_for(seeds * max(len(found), 1), len(tasks.id), settings.num_envs)
@@ -118,10 +121,11 @@ def train(
         run.console.close()
 
 
-def fit_chunk(settings: Settings, num_tasks: int, steps: int) -> Settings:
-    """Shorten chunks that are longer than the whole run."""
+def fit_chunk(settings: Settings, num_tasks: int, steps: int, grain: int = 1) -> Settings:
+    """Shorten chunks that are longer than the whole run, and round them up to a multiple of ``grain`` steps."""
     whole_run = math.ceil(steps / (num_tasks * settings.num_envs))
-    return dataclasses.replace(settings, chunk_steps=min(settings.chunk_steps, whole_run))
+    chunk = math.ceil(min(settings.chunk_steps, whole_run) / grain) * grain
+    return dataclasses.replace(settings, chunk_steps=chunk)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -176,11 +180,11 @@ class _Run:
 
     def begin(self, resume: bool) -> tuple[Programs, TrainState]:
         """Compile every program at the same time, and make or restore the state; evaluation may be ready later."""
-        env, agent, settings, lazy = self.env, self.agent, self.settings, jitted(self.mesh)
+        env, agent, settings, lazy = self.env, self.agent, self.settings, jitted(self.mesh, self.agent)
         tasks, everything = (meshes.everywhere(self.mesh, env.tasks(split)) for split in ("train", "all"))
         (seeds, knobs), pool = meshes.by_seed(self.mesh, self.spread), ThreadPoolExecutor(2)
         fresh = lazy.init.lower(env, agent, settings, tasks, seeds, knobs)
-        shapes = sharded(self.mesh, fresh.out_info)
+        shapes = sharded(self.mesh, agent, fresh.out_info)
         self._describe(shapes)
         make = None if resume else pool.submit(compiled, fresh, once=True)
         chunk = lazy.chunk.lower(env, agent, settings, tasks, shapes)
@@ -192,10 +196,10 @@ class _Run:
         return programs, self._restore(shapes) if make is None else make.result()(tasks, seeds, knobs)
 
     def _describe(self, shapes: TrainState) -> None:
-        replay = checkpoint.size_of(shapes.replay) / 1e6
+        data = checkpoint.size_of(shapes.data) / 1e6
         self.console.say(
-            f"memory: {checkpoint.size_of(shapes) / 1e6:,.0f} MB of state, of which {replay:,.0f} MB replay "
-            f"({self.settings.capacity:,} transitions a task)"
+            f"memory: {checkpoint.size_of(shapes) / 1e6:,.0f} MB of state, of which {data:,.0f} MB "
+            f"{self.agent.experience.describe(self.settings.num_envs)}"
         )
         if spread := meshes.describe(self.mesh, len(self.seeds), self.settings.num_envs):
             self.console.say(spread)
@@ -285,13 +289,18 @@ class _Run:
 
     def _evaluate(self, program: Callable, state: TrainState, past: Evaluations, steps: int, lost) -> Evaluations:
         """Evaluate on all splits, and add the result to the run's evaluations."""
-        returns = np.array(hosts.gather(program(state.agent, len(past.steps))))
-        returns[lost] = np.nan
-        grown = {}
-        for split, old in past.returns.items():
-            rows = np.asarray(self.env.tasks(split).id)
-            grown[split] = np.concatenate([old, returns[:, None, rows]], axis=1)
-        evaluations = Evaluations(np.append(past.steps, steps), grown, past.values)
+        scores = hosts.gather(program(state.agent, len(past.steps)))
+        rows = {split: np.asarray(self.env.tasks(split).id) for split in SPLITS}
+
+        def grow(old: Mapping[str, np.ndarray], new: np.ndarray) -> dict[str, np.ndarray]:
+            new = np.array(new, np.float32)
+            new[lost] = np.nan
+            return {split: np.concatenate([x, new[:, None, rows[split]]], axis=1) for split, x in old.items()}
+
+        none = {split: np.zeros((len(lost), 0, *x.shape[2:]), np.float32) for split, x in past.returns.items()}
+        metrics = {name: grow(past.metrics.get(name, none), x) for name, x in scores.metrics.items()}
+        grown = grow(past.returns, scores.returns)
+        evaluations = Evaluations(np.append(past.steps, steps), grown, past.values, metrics)
         if self.writes:
             assert self.directory is not None
             save_evaluations(self.directory / "evaluations.npz", evaluations)
@@ -305,7 +314,9 @@ class _Run:
         if steps and file is not None and file.exists():
             past = load_evaluations(file)
             kept = past.steps <= steps
-            return Evaluations(past.steps[kept], {s: x[:, kept] for s, x in past.returns.items()}, past.values)
+            upto = lambda splits: {split: x[:, kept] for split, x in splits.items()}
+            metrics = {name: upto(splits) for name, splits in past.metrics.items()}
+            return Evaluations(past.steps[kept], upto(past.returns), past.values, metrics)
         tables = {split: self.env.tasks(split) for split in SPLITS}
         empty = lambda table: np.zeros((len(self.seeds), 0, len(table.id), self.plan.eval_episodes), np.float32)
         return Evaluations(

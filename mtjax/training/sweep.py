@@ -97,7 +97,7 @@ def _axis(word: str) -> Axis:
 
 def _varies_inside(axis: Axis) -> bool:
     """Whether an axis is a number of agents or their parts, for all of whose values one program does."""
-    tables = [table.values() for kind, table in PARTS.items() if kind != "encoder"]
+    tables = [table.values() for kind, table in PARTS.items() if kind not in ("encoder", "experience")]
     classes = [*(preset.cls for preset in AGENTS.values()), *itertools.chain(*tables)]
     return any(f.name == axis.setting and f.type is float for cls in classes for f in dataclasses.fields(cls))
 

@@ -109,6 +109,12 @@ def require_shares(holder: Any, *names: str) -> None:
         _require(0 <= getattr(holder, name) <= 1, holder, name, "must be in [0, 1]")
 
 
+def require_counts(holder: Any, *names: str) -> None:
+    """Numbers are at least 1."""
+    for name in names:
+        _require(getattr(holder, name) >= 1, holder, name, "must be at least 1")
+
+
 def require_layers(holder: Any, *names: str) -> None:
     """Widths are of at least one layer of at least one unit."""
     for name in names:

@@ -20,7 +20,7 @@ from mtjax.types import Array, Outcome, Transition
 class NoScaling(parts.Watcher):
     """Rewards as they are. Every scaling is a class like this one."""
 
-    def units(self, memory: Any, gamma: float, bonus: Array) -> tuple[Array, Array] | None:
+    def units(self, memory: Any, gamma: float | Array, bonus: Array) -> tuple[Array, Array] | None:
         """Each task's factor and offset (T,); None for 1 and 0.
 
         Args:
@@ -28,13 +28,22 @@ class NoScaling(parts.Watcher):
         """
         return None
 
-    def rewards(self, memory: Any, batch: Transition, gamma: float, bonus: Array) -> Array:
-        """The rewards (T, B) of a batch in each task's units."""
+    def rewards(self, memory: Any, batch: Transition, gamma: float | Array, bonus: Array) -> Array:
+        """The rewards (T, B) of a batch in each task's units; ``gamma`` is () or (T,)."""
         units = self.units(memory, gamma, bonus)
         if units is None:
             return batch.reward
         factor, offset = (x[:, None] for x in units)
+        gamma = gamma[:, None] if jnp.ndim(gamma) else gamma  # type: ignore
         return factor * (batch.reward - (1 - gamma * batch.discount) * offset)
+
+    def begin(self) -> Any:
+        """What is remembered of an episode that begins; None for nothing."""
+        return None
+
+    def remember(self, memory: Any, reward: Array, gamma: float) -> Any:
+        """What is remembered of an episode after a step of it."""
+        return memory
 
     def renew(self, memory: Any, target: Array, critics: tuple[Params, ...]) -> tuple[Any, tuple[Params, ...]]:
         """Take note of the targets (T, B) of an update that is done, and bring critics to the new units."""
@@ -83,7 +92,7 @@ class RewardScaling(NoScaling):
         spread = jnp.mean(jnp.square(outcome.reward - mean[:, None]), axis=1)
         return Moments(mean, memory.variance + rate * (spread - memory.variance))
 
-    def units(self, memory: Moments, gamma: float, bonus: Array) -> tuple[Array, Array]:
+    def units(self, memory: Moments, gamma: float | Array, bonus: Array) -> tuple[Array, Array]:
         return 1 / (jnp.sqrt(memory.variance) + 1e-8), jnp.zeros_like(memory.mean)
 
 
@@ -115,13 +124,20 @@ class ReturnScaling(NoScaling):
     def init(self, num_tasks: int) -> LargestReturns:
         return LargestReturns(jnp.zeros(num_tasks), jnp.zeros(num_tasks))
 
+    def begin(self) -> Array:
+        """The sum of the episode's rewards so far, each discounted once more at every later step."""
+        return jnp.float32(0)
+
+    def remember(self, memory: Array, reward: Array, gamma: float) -> Array:
+        return gamma * memory + reward
+
     def observe(self, memory: LargestReturns, outcome: Outcome) -> LargestReturns:
         cut = outcome.ended & ~outcome.terminated
         mean = jnp.where(cut, outcome.total / outcome.age, 0.0)
         largest = lambda old, new: jnp.maximum(old, jnp.max(jnp.abs(new), axis=1))
-        return LargestReturns(largest(memory.discounted, outcome.discounted), largest(memory.reward, mean))
+        return LargestReturns(largest(memory.discounted, outcome.memory.scaling), largest(memory.reward, mean))
 
-    def units(self, memory: LargestReturns, gamma: float, bonus: Array) -> tuple[Array, Array]:
+    def units(self, memory: LargestReturns, gamma: float | Array, bonus: Array) -> tuple[Array, Array]:
         horizon = 1 / (1 - gamma)
         largest = jnp.maximum(memory.discounted, horizon * memory.reward)
         known = largest > 0
@@ -160,7 +176,7 @@ class PopArt(NoScaling):
         """The standard deviation (T,) by which targets are divided."""
         return jnp.clip(jnp.sqrt(memory.variance), 1e-4, 1e6)
 
-    def units(self, memory: Moments, gamma: float, bonus: Array) -> tuple[Array, Array]:
+    def units(self, memory: Moments, gamma: float | Array, bonus: Array) -> tuple[Array, Array]:
         return 1 / self.std(memory), memory.mean
 
     def renew(self, memory: Moments, target: Array, critics: tuple[Params, ...]):
@@ -221,7 +237,7 @@ class AdaptiveScaling(NoScaling):
         means = jnp.maximum(memory.mean, self.least_mean_reward)
         return jnp.where(memory.factor > 0, memory.factor, jnp.max(means) / means)
 
-    def units(self, memory: MeanRewards, gamma: float, bonus: Array) -> tuple[Array, Array]:
+    def units(self, memory: MeanRewards, gamma: float | Array, bonus: Array) -> tuple[Array, Array]:
         return self.factors(memory), jnp.zeros_like(memory.mean)
 
     def renew(self, memory: MeanRewards, target: Array, critics: tuple[Params, ...]):

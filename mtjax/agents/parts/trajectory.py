@@ -1,11 +1,62 @@
 """What an agent infers of a hidden task from the steps it has just taken."""
 
+from collections.abc import Callable
+from typing import NamedTuple
+
 import flax.linen as nn
+import jax
 import jax.numpy as jnp
 
-from mtjax.history import Seen
 from mtjax.networks import MLP
-from mtjax.types import Array
+from mtjax.types import Array, Transition
+
+
+class Past(NamedTuple):
+    """The last H steps of an episode, the latest one last; all zero where the episode had not begun."""
+
+    obs: Array  # (..., H, O) in which the agent acted
+    action: Array  # (..., H, A)
+    reward: Array  # (..., H)
+    known: Array  # (..., H) 1 for a step that was taken, 0 from before the episode
+
+
+class Seen(NamedTuple):
+    """An observation and the steps that led to it."""
+
+    obs: Array  # (..., O)
+    past: Past
+
+
+def begin(steps: int, obs_size: int, action_size: int) -> Past:
+    """Return the past of an episode that begins."""
+    blank = lambda *shape: jnp.zeros((steps, *shape))
+    return Past(blank(obs_size), blank(action_size), blank(), blank())
+
+
+def append(past: Past, obs: Array, action: Array, reward: Array) -> Past:
+    """Add a step, leaves (..., O), (..., A) and (...,); the oldest one is forgotten."""
+    latest = Past(obs, action, reward, jnp.ones_like(reward))
+    lead = reward.ndim
+    join = lambda old, new: jnp.concatenate(
+        [jax.lax.slice_in_dim(old, 1, None, axis=lead), jnp.expand_dims(new, lead)], axis=lead
+    )
+    return jax.tree.map(join, past, latest)
+
+
+def relabel(one: Callable[[Transition], Transition], transition: Transition) -> Transition:
+    """Relabel a transition and its past by ``one``, which relabels single steps: both are another task's then."""
+    past: Past = transition.extras
+    following = jnp.concatenate([past.obs[1:], transition.obs[None]])
+
+    def step(obs: Array, action: Array, reward: Array, next_obs: Array) -> Transition:
+        return one(transition._replace(obs=obs, action=action, reward=reward, next_obs=next_obs, extras=None))
+
+    then = jax.vmap(step)(past.obs, past.action, past.reward, following)
+    known = past.known > 0
+    past = past._replace(
+        obs=jnp.where(known[:, None], then.obs, past.obs), reward=jnp.where(known, then.reward, past.reward)
+    )
+    return one(transition)._replace(extras=past)
 
 
 class TrajectoryEncoder(nn.Module):

@@ -1,0 +1,338 @@
+"""What all agents share: what their networks are told of a task, how they normalise, and the parts they are made of."""
+
+import dataclasses
+from collections.abc import Mapping
+from functools import partial
+from typing import Annotated, Any, Literal, NamedTuple, get_args, get_type_hints
+
+import jax
+import jax.numpy as jnp
+import tyro
+
+from mtjax import normalize
+from mtjax.agents import parts
+from mtjax.agents.parts import conditioning, trajectory
+from mtjax.agents.parts.encoders import ENCODERS, Encoder
+from mtjax.agents.parts.gradients import surgery
+from mtjax.agents.parts.samplers import SAMPLERS, Sampler
+from mtjax.agents.parts.scaling import SCALINGS, Scaling
+from mtjax.agents.parts.trajectory import Past, Seen, TrajectoryEncoder
+from mtjax.agents.parts.values import VALUES
+from mtjax.experience import EXPERIENCES
+from mtjax.names import frozen, nearest_error
+from mtjax.networks import Network, Params
+from mtjax.types import Array, Env, InputError, Key, Metrics, Outcome, Spec, Task, Transition
+
+Conditioning = Literal["none", "one-hot", "embedding", "parameters", "vectors", "inferred"]
+CONDITIONINGS = get_args(Conditioning)
+Heads = Literal["shared", "per-task", "disjoint"]
+Tune = Literal["all", "heads", "embedding"]
+
+PARTS: dict[str, Mapping[str, type]] = {
+    "encoder": ENCODERS,
+    "gradients": surgery.RULES,
+    "value": VALUES,
+    "scaling": SCALINGS,
+    "sampler": SAMPLERS,
+    "experience": EXPERIENCES,
+}
+CHOICES = tuple(kind for kind in PARTS if kind != "experience")
+"""The kinds of parts that are chosen by name; an agent's experience is what it learns from, whoever asks."""
+FLAT = tyro.conf.arg(name="")  # a part's fields are flags of the agent's; its name is read before tyro's turn
+
+
+class Memory(NamedTuple):
+    """What an agent remembers of an episode."""
+
+    past: Past | None  # the last steps, if the task is inferred from them
+    scaling: Any  # what the scaling of rewards remembers
+
+
+@dataclasses.dataclass(frozen=True)
+class BaseAgent:
+    """Settings and pieces of every agent. A subclass gives networks, losses and updates.
+
+    Its state is a NamedTuple with at least the fields ``moments`` of observations (of each task's, leaves (T, O), in a
+    mixture), ``contexts`` (T, C) of the training tasks, ``vectors`` (T, V) or None, ``scales`` and ``progress``, what
+    the scaling of rewards and the sampler of tasks remember.
+    """
+
+    hidden: tuple[int, ...] = (256, 256)
+    """Widths of the hidden layers of actor and critics."""
+    actor_lr: float = 1e-3
+    """Adam's learning rate of the actor."""
+    critic_lr: float = 1e-3
+    """Adam's learning rate of the critics."""
+    weight_decay: float = 0.0
+    """Decoupled weight decay of actor and critics (AdamW)."""
+    gamma: float = 0.99
+    """Discount of future reward per step."""
+    discounting: Literal["gamma", "horizon"] = "gamma"
+    """How late rewards count: by gamma in every task, or by each task's horizon h as 1 - 5 / h, in [0.95, 0.995]."""
+    normalize_observations: bool = False
+    """Scale observations by their running mean and variance, fitted on training data alone."""
+    max_gradient_norm: float = 0.0
+    """Clip the global norm of actor and critic gradients to this; 0 does not clip."""
+    critic_layer_norm: bool = True
+    """Layer normalisation in the critics."""
+    actor_layer_norm: bool = False
+    """Layer normalisation in the actor."""
+    conditioning: Conditioning = "none"
+    """What the networks are told of the task: none, one-hot, embedding (learned), parameters (the task's context),
+    vectors (rows of a file) or inferred (from the last steps, by an encoder of trajectories). For one-hot, embedding
+    and vectors, an unseen task is taken for its nearest neighbour."""
+    embedding_size: int = 16
+    """Width of learned task embeddings, and of what is inferred."""
+    unit_embedding: bool = False
+    """Scale learned task embeddings to length 1."""
+    vectors: str = ""
+    """A .npy file of task vectors (T, V), a row for every training task, for conditioning on vectors."""
+    inferred_from: int = 8
+    """Steps from which the task is inferred, if it is; they are stored with every transition."""
+    heads: Heads = "shared"
+    """What a task has for itself: nothing (shared), output layers (per-task) or whole networks (disjoint)."""
+    gradient_scope: Literal["shared", "per-layer"] = "shared"
+    """Combine the tasks' gradients over all shared parameters at once, or for each layer by its own."""
+    tune: Annotated[Tune, tyro.conf.arg(name="tune", prefix_name=False)] = "all"
+    """Which parameters of actor and critics learn: all, heads (output layers) or embedding (learned task embeddings).
+    The others stay as the run left them that --from names."""
+    encoder: Annotated[Encoder, FLAT] = dataclasses.field(default_factory=Encoder)
+    gradients: Annotated[surgery.Rule, FLAT] = dataclasses.field(default_factory=surgery.Rule)
+    scaling: Annotated[Scaling, FLAT] = dataclasses.field(default_factory=Scaling)
+    sampler: Annotated[Sampler, FLAT] = dataclasses.field(default_factory=Sampler)
+
+    def __post_init__(self):
+        for kind in kinds_of(self):
+            object.__setattr__(self, kind, parts.choose(kind, PARTS[kind], getattr(self, kind)))
+        parts.require_choices(self)
+        self._check_numbers()
+        self._check_combination()
+
+    # Settings that cannot be used.
+
+    def _check_numbers(self) -> None:
+        parts.require_positive(self, "actor_lr", "critic_lr")
+        if not self.max_gradient_norm >= 0:
+            raise InputError(f"max-gradient-norm must be at least 0 (0 does not clip), not {self.max_gradient_norm}")
+        parts.require_not_negative(self, "weight_decay")
+        parts.require_layers(self, "hidden")
+        parts.require_shares(self, "gamma")
+        parts.require_counts(self, "embedding_size", "inferred_from")
+
+    def _check_combination(self) -> None:
+        """Refuse parts that do not go together."""
+        if (self.conditioning == "vectors") != bool(self.vectors):
+            raise InputError("conditioning=vectors and vectors=FILE.npy go together; give both or neither")
+        if self.tune == "embedding" and self.conditioning != "embedding":
+            raise InputError(f"tune=embedding needs conditioning=embedding, not {self.conditioning}")
+        encoder, rule = (parts.name_of(PARTS[kind], getattr(self, kind)) for kind in ("encoder", "gradients"))
+        reason = self.encoder.refuses(self.conditioning)
+        if reason:
+            raise InputError(f"{encoder} {reason}")
+        self.encoder.body(self.hidden, layer_norm=False)  # which refuses widths that it cannot take
+        if self.heads == "disjoint" and rule != "mean":
+            raise InputError(f"heads=disjoint leaves no parameters that tasks share for gradients={rule}; use mean")
+        if self.gradient_scope == "per-layer" and self.gradients.needs != "gradients":
+            raise InputError(f"gradient-scope=per-layer needs gradients of every task, which {rule} does not use")
+        if parts.name_of(SCALINGS, self.scaling) == "return" and self.gamma == 1:
+            raise InputError("scaling=return needs discounted returns, which have bounds; use gamma below 1")
+
+    # Networks.
+
+    def network(self, layer_norm: bool) -> Network:
+        """The body and head that the settings ask for."""
+        own = {"shared": (), "per-task": ("head",), "disjoint": ("trajectory", "body", "head")}[self.heads]
+        embedding = self.embedding_size if self.conditioning == "embedding" else 0
+        body = self.encoder.body(self.hidden, layer_norm)
+        inference = TrajectoryEncoder(self.embedding_size, layer_norm=layer_norm) if self.history else None
+        return Network(body, own, embedding, self.unit_embedding, self.encoder.front(), inference)
+
+    @property
+    def per_layer(self) -> bool:
+        """Whether gradients are combined layer by layer."""
+        return self.gradient_scope == "per-layer"
+
+    # What the networks see: observations, and what they are told of the task.
+
+    @property
+    def history(self) -> int:
+        """How many past steps the agent sees beside each observation."""
+        return self.inferred_from if self.conditioning == "inferred" else 0
+
+    def init_moments(self, spec: Spec, num_tasks: int) -> normalize.Moments:
+        """Moments of no observations; in a mixture each task has its own, leaves (T, O)."""
+        moments = normalize.init(spec.obs_size)
+        return jax.tree.map(lambda x: jnp.stack([x] * num_tasks), moments) if spec.mixed else moments
+
+    def fit_moments(self, moments: normalize.Moments, obs: Array) -> normalize.Moments:
+        """Take observations (T, B, O) of training tasks into account, if they are to be normalised."""
+        if not self.normalize_observations:
+            return moments
+        update = jax.vmap(normalize.update) if moments.mean.ndim > 1 else normalize.update
+        return update(moments, obs)
+
+    def see(self, moments: normalize.Moments, obs: Array, past: Past | None = None) -> Any:
+        """Observations (..., O) of one task as networks take them: normalised, and with the past if they see any."""
+        scaled = partial(normalize.apply, moments) if self.normalize_observations else lambda obs: obs
+        return scaled(obs) if past is None else Seen(scaled(obs), past._replace(obs=scaled(past.obs)))
+
+    def moments_of(self, state: Any, known: Array) -> normalize.Moments:
+        """The moments of one training task's observations."""
+        mixed = state.moments.mean.ndim > 1
+        return jax.tree.map(lambda x: x[known], state.moments) if mixed else state.moments
+
+    def example(self, spec: Spec, moments: normalize.Moments) -> Any:
+        """What networks see, all zero."""
+        moments = jax.tree.map(lambda x: x[0], moments) if spec.mixed else moments
+        past = trajectory.begin(self.history, spec.obs_size, spec.action_size) if self.history else None
+        return self.see(moments, jnp.zeros(spec.obs_size), past)
+
+    def load_vectors(self, num_tasks: int) -> Array | None:
+        """Read the task vectors (T, V), if there are any."""
+        return conditioning.load_vectors(self.vectors, num_tasks) if self.vectors else None
+
+    def known_task(self, state: Any, task: Task) -> Array:
+        """The training task () int32 whose head, embedding or number stands for ``task``: itself, or the nearest."""
+        nearest = jnp.argmin(jnp.sum(jnp.square(state.contexts - task.context), axis=-1)).astype(jnp.int32)
+        return jnp.where(task.id < len(state.contexts), task.id, nearest)
+
+    def nearest_tasks(self, state: Any, tasks: Task) -> Array:
+        """The training tasks (T,) that are nearest to ``tasks`` (T, ...), whoever these are."""
+        strangers = tasks._replace(id=jnp.full_like(tasks.id, len(state.contexts)))
+        return jax.vmap(partial(self.known_task, state))(strangers)
+
+    def features(self, state: Any, task: Task) -> Array:
+        """What the networks are told of one task (Z,)."""
+        known = self.known_task(state, task)
+        return conditioning.features(self.conditioning, len(state.contexts), known, task.context, state.vectors)
+
+    def features_of_batch(self, state: Any, batch: Transition, tasks: Task) -> Array:
+        """What the networks are told of a batch's tasks: (T, Z), or (T, B, Z) where each episode has its own."""
+        if batch.context is not None and self.conditioning == "parameters":
+            return batch.context
+        return jax.vmap(partial(self.features, state))(tasks)
+
+    def of_task(self, state: Any, task: Task, *networks: Params) -> tuple[Params, ...]:
+        """Networks as one task uses them."""
+        known = self.known_task(state, task)
+        return tuple(Params(net.shared, jax.tree.map(lambda x: x[known], net.own)) for net in networks)
+
+    def discounts(self, tasks: Task) -> float | Array:
+        """The discount of each task (T,), or one for all."""
+        if self.discounting == "gamma":
+            return self.gamma
+        return jnp.clip(1 - 5 / tasks.horizon, 0.95, 0.995)
+
+    @property
+    def borrowed(self) -> list[str]:
+        """What a task that was not trained on has of its nearest training task."""
+        found = {"shared": [], "per-task": ["head"], "disjoint": ["networks"]}[self.heads]
+        found += ["input layer"] * (self.encoder.front() is not None)
+        return found + conditioning.BORROWED.get(self.conditioning, [])
+
+    @property
+    def unseen(self) -> str:
+        """What stands for a task that was not trained on; empty if its own parameters, or nothing, do."""
+        borrowed = self.borrowed
+        return f"each uses the {' and '.join(borrowed)} of the nearest training task" if borrowed else ""
+
+    # Memory of an episode, and watching all of them.
+
+    def begin(self, state: Any, task: Task) -> Memory:
+        """The memory with which an episode begins."""
+        sizes = (state.moments.mean.shape[-1], self.action_size(state)) if self.history else ()
+        past = trajectory.begin(self.history, *sizes) if self.history else None
+        return Memory(past, self.scaling.begin())
+
+    def action_size(self, state: Any) -> int:
+        """The size A of actions, as the actor's head has 2 A outputs."""
+        head = {**state.actor.shared, **state.actor.own}["head"]
+        return head["bias"].shape[-1] // 2
+
+    def remember(self, state: Any, memory: Memory, transition: Transition, task: Task) -> Memory:
+        """The memory after a step."""
+        past = memory.past
+        if past is not None:
+            past = trajectory.append(past, transition.obs, transition.action, transition.reward)
+        return Memory(past, self.scaling.remember(memory.scaling, transition.reward, self.discounts(task)))
+
+    def relabel(self, env: Env, task: Task, transition: Transition, key: Key) -> Transition:
+        """Return a transition of another task as ``task`` would have had it, what is remembered included."""
+        one = lambda transition: env.relabel(task, transition, key)  # type: ignore
+        return one(transition) if transition.extras is None else trajectory.relabel(one, transition)
+
+    @property
+    def watches(self) -> bool:
+        """Whether the agent wants to see the stream of outcomes."""
+        return self.scaling.watches or self.sampler.watches
+
+    def observe(self, state: Any, outcome: Outcome) -> Any:
+        """Take note of what one step of every environment brought, leaves (T, E)."""
+        scales = self.scaling.observe(state.scales, outcome)
+        return state._replace(scales=scales, progress=self.sampler.observe(state.progress, outcome))
+
+    # Learning.
+
+    def learn(self, env: Env, states: Any, data: Any, tasks: Task, keys: Key) -> tuple[Any, Metrics]:
+        """Learn from experience, for all seeds at once: leaves (S, ...)."""
+        return self.experience.learn(env, self, states, data, tasks, keys)  # type: ignore
+
+
+def kinds_of(agent: Any) -> list[str]:
+    """The kinds of parts that an agent, or a class of agents, has."""
+    return [field.name for field in dataclasses.fields(agent) if field.name in PARTS]
+
+
+def flag_names(agent: Any) -> dict[str, str]:
+    """Return the command-line flag, without dashes, of each of an agent's settings, by the setting's name."""
+    bare = {name for holder in (agent, agent.experience) for name in _unprefixed(type(holder))}
+    names = {name: name.replace("_", "-") for name in settings(agent) if name != "experience"}
+    return {name: flag if name in bare else f"agent.{flag}" for name, flag in names.items()}
+
+
+def _unprefixed(cls: type) -> list[str]:
+    """The settings of a class whose flags do not begin with those of the agent's."""
+    hints = get_type_hints(cls, include_extras=True)
+    marks = {name: getattr(hint, "__metadata__", ()) for name, hint in hints.items()}
+    return [name for name, found in marks.items() if any(getattr(x, "prefix_name", None) is False for x in found)]
+
+
+def settings(agent: Any) -> dict[str, Any]:
+    """Return all of an agent's settings in one flat table: parts by name, and their own settings after them."""
+    found = {}
+    for name, value in parts.settings(agent).items():
+        found |= {name: parts.name_of(PARTS[name], value), **parts.settings(value)} if name in PARTS else {name: value}
+    return found
+
+
+def replace(agent: Any, given: Mapping[str, Any]) -> Any:
+    """Return an agent with given settings, its own or its parts', in place of what it has.
+
+    Raises:
+        InputError: it has no such setting, or the value is not allowed.
+    """
+    rest, fields = frozen(given), {field.name for field in dataclasses.fields(agent)}
+    chosen = {kind: parts.take(rest, getattr(agent, kind)) for kind in kinds_of(agent) if kind not in rest}
+    unknown = next((name for name in rest if name not in fields), None)
+    if unknown is not None:
+        raise nearest_error("setting", unknown, settings(agent))
+    return dataclasses.replace(agent, **rest, **chosen)
+
+
+def build(name: str, cls: type, given: Mapping[str, Any]) -> Any:
+    """Make the agent called ``name`` from a flat table of settings.
+
+    Raises:
+        InputError: a setting is neither the agent's nor one of its parts', or its value is not allowed.
+    """
+    rest = frozen(given)
+    fields = {field.name: field for field in dataclasses.fields(cls)}
+    chosen = {}
+    for kind in kinds_of(cls):
+        part = parts.choose(kind, PARTS[kind], rest.pop(kind, None) or fields[kind].default_factory())  # type: ignore
+        chosen[kind] = parts.take(rest, part)
+    unknown = next((name for name in rest if name not in fields), None)
+    if unknown is not None:
+        known = [*fields, *(name for part in chosen.values() for name in parts.settings(part))]
+        raise nearest_error(f"setting of {name}", unknown, known)
+    return cls(**rest, **chosen)

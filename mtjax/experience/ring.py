@@ -1,0 +1,65 @@
+"""A ring of transitions for every task, on the device, sampled evenly over tasks.
+
+A ring is a row of slots, each with one step of every environment, so that devices can share it as they share those.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from mtjax.parallel import collectives
+from mtjax.types import Array, Key
+
+
+class Ring(NamedTuple):
+    """The rings of all tasks, which fill in step with each other."""
+
+    rows: Any  # leaves (T, H, E, ...)
+    position: Array  # () int32, the slot where the next step goes
+    size: Array  # () int32, slots written so far
+
+
+OVER_SEEDS = Ring(rows=0, position=None, size=None)  # type: ignore
+"""The axes of rings under a map over seeds."""
+
+
+def init(item: Any, num_tasks: int, num_slots: int, num_envs: int) -> Ring:
+    """Return empty rings for items like ``item`` (no leading axes)."""
+    shape = (num_tasks, num_slots, num_envs)
+    rows = jax.tree.map(lambda x: jnp.zeros((*shape, *jnp.shape(x)), jnp.result_type(x)), item)
+    return Ring(rows, jnp.int32(0), jnp.int32(0))
+
+
+def add(ring: Ring, items: Any) -> Ring:
+    """Write items (T, E, ...) over those of the oldest slot."""
+    num_slots = jax.tree.leaves(ring.rows)[0].shape[1]
+    write = lambda rows, new: jax.lax.dynamic_update_slice_in_dim(rows, new[:, None], ring.position, axis=1)
+    return Ring(
+        rows=jax.tree.map(write, ring.rows, items),
+        position=(ring.position + 1) % num_slots,
+        size=jnp.minimum(ring.size + 1, num_slots),
+    )
+
+
+def sample(ring: Ring, key: Key, batch_size: int) -> Any:
+    """Draw rows (T, batch_size, ...) uniformly and with replacement from each task's ring."""
+    num_tasks = jax.tree.leaves(ring.rows)[0].shape[0]
+    return _draw(ring, key, (num_tasks, batch_size), jax.vmap(lambda ring, index: ring[index]))
+
+
+def sample_from(ring: Ring, key: Key, task: Array) -> Any:
+    """Draw a row from the ring of each ``task`` (...) int32; leaves (*task.shape, ...)."""
+    return _draw(ring, key, task.shape, lambda rings, index: rings[task, index])
+
+
+def _draw(ring: Ring, key: Key, shape: tuple[int, ...], take: Callable) -> Any:
+    """Draw slots and environments of ``shape``, all alike, and ``take(rings, index)`` from rings (T, H E, ...)."""
+    num_slots, held = jax.tree.leaves(ring.rows)[0].shape[1:3]
+    num_envs = held * collectives.count()
+    index = jax.random.randint(key, shape, 0, ring.size * num_envs)
+    slot, env = index // num_envs, index % num_envs
+    flat = lambda x: x.reshape(len(x), num_slots * held, *x.shape[3:])
+    rows = jax.tree.map(lambda x: take(flat(x), slot * held + env % held), ring.rows)
+    return collectives.pick(rows, env // held)

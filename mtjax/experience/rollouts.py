@@ -1,0 +1,48 @@
+"""Rollouts: on-policy learners act for some steps, learn from just these, and forget them."""
+
+import dataclasses
+from typing import Any, ClassVar
+
+from mtjax.types import Array, Env, InputError, Key, Transition
+
+
+@dataclasses.dataclass(frozen=True)
+class Rollouts:
+    """Hand every learner the latest ``unroll`` steps of every environment."""
+
+    unroll: int = 32
+    """Steps of every environment between two updates."""
+
+    sharding: ClassVar[Any] = ()
+
+    def __post_init__(self):
+        if self.unroll < 1:
+            raise InputError(f"unroll must be at least 1, not {self.unroll}")
+
+    @property
+    def steps(self) -> int:
+        """Steps of every environment between two calls of ``learn``."""
+        return self.unroll
+
+    def check(self, env: Env, num_envs: int) -> None:
+        """Refuse nothing."""
+
+    def describe(self, num_envs: int) -> str:
+        """Say how much it holds."""
+        return f"rollouts ({self.unroll * num_envs:,} transitions a task, not kept)"
+
+    def init(self, item: Transition, num_tasks: int, num_envs: int, keys: Key) -> tuple[()]:
+        """Return nothing, as nothing is kept between iterations."""
+        return ()
+
+    def explore(self, data: tuple[()], action: Array) -> Array:
+        """Take the policy's own actions."""
+        return action
+
+    def add(self, data: tuple[()], steps: Transition) -> Transition:
+        """Return the latest steps, leaves (S, T, H, E, ...)."""
+        return steps
+
+    def keep(self, data: Transition) -> tuple[()]:
+        """Keep nothing."""
+        return ()

@@ -1,0 +1,124 @@
+"""Playing: the one way in which agents act in worlds, for training, evaluation and films."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from mtjax.maps import over_learners, where_worlds
+from mtjax.parallel import collectives
+from mtjax.tasks import episode_task
+from mtjax.types import Acted, Agent, Array, Env, Key, Task, Transition
+
+
+class Worlds(NamedTuple):
+    """Where every world is; leaves (S, T, E, ...)."""
+
+    state: Any  # the environment's
+    task: Task | None  # the episodes' own tasks where episodes draw theirs
+    obs: Any  # (S, T, E, O)
+    memory: Any  # what the agent remembers of the episode
+    age: Array  # (S, T, E) int32, steps since the last reset
+
+
+def split_keys(keys: Key, count: int) -> tuple[Key, ...]:
+    """Split each seed's key (S,) into ``count`` keys (S,)."""
+    return tuple(jax.vmap(lambda key: jax.random.split(key, count), out_axes=1)(keys))
+
+
+def world_keys(keys: Key, shape: tuple[int, ...]) -> Key:
+    """Make one key for every world (S, T, E) of this device from one a seed (S,)."""
+    everywhere = (shape[1], shape[2] * collectives.count())
+    return collectives.own(jax.vmap(lambda key: jax.random.split(key, everywhere))(keys), axis=2)
+
+
+def spread(tasks: Task, shape: tuple[int, ...]) -> Task:
+    """Repeat tasks (T, ...) for all worlds of shape (S, T, E)."""
+    single = tasks._replace(draws=None)
+    return jax.tree.map(lambda x: jnp.broadcast_to(x[None, :, None], shape + x.shape[1:]), single)
+
+
+def reset_envs(env: Env, agent: Agent, learners: Any, tasks: Task, keys: Key) -> Worlds:
+    """Begin an episode in every world, with keys (S, T, E), of agents with states ``learners`` (S, ...)."""
+    if tasks.draws is None:
+        each = spread(tasks, keys.shape)
+    else:
+        task_keys, keys = jnp.moveaxis(jax.vmap(jax.vmap(jax.vmap(jax.random.split)))(keys), -1, 0)
+        of_task = jax.vmap(episode_task, (None, 0))
+        each = jax.vmap(jax.vmap(of_task), (None, 0))(tasks, task_keys)
+    start = env.reset_worlds(each._replace(blocks=tasks.blocks), keys)
+    age = jnp.zeros(keys.shape, jnp.int32)
+    memory = over_learners(lambda learner, task, _: agent.begin(learner, task))(learners, tasks, age)
+    return Worlds(start.state, None if tasks.draws is None else each, start.obs, memory, age)
+
+
+def tasks_of_worlds(tasks: Task, worlds: Worlds) -> Task:
+    """Return the task of every world (S, T, E, ...)."""
+    return spread(tasks, worlds.age.shape) if worlds.task is None else worlds.task._replace(blocks=tasks.blocks)
+
+
+def act(agent: Agent, learners: Any, tasks: Task, worlds: Worlds, keys: Key | None) -> Acted:
+    """Let agents act in all worlds; without keys (S, T, E) they take their mean actions."""
+    noise = () if keys is None else (keys,)
+    if worlds.task is None:  # all worlds of a task see the same of it
+        one = lambda learner, task, memory, obs, *key: agent.act(learner, memory, obs, task, *(key or (None,)))
+        return over_learners(one)(learners, tasks, worlds.memory, worlds.obs, *noise)
+    one = lambda learner, _, task, memory, obs, *key: agent.act(learner, memory, obs, task, *(key or (None,)))
+    return over_learners(one)(learners, tasks.id, worlds.task, worlds.memory, worlds.obs, *noise)
+
+
+class Moment(NamedTuple):
+    """One step of every world; leaves (S, T, E, ...)."""
+
+    transition: Transition
+    metrics: dict[str, Array]  # the environment's
+
+
+def step_envs(
+    env: Env,
+    agent: Agent,
+    learners: Any,
+    tasks: Task,
+    worlds: Worlds,
+    keys: Key | None,
+    explore: Callable[[Array], Array] = lambda action: action,
+) -> tuple[Worlds, Moment]:
+    """Act in every world and step it; episodes that end are left where they ended.
+
+    Args:
+        keys: (S, T, E) noise of the actions; None takes the mean ones.
+        explore: makes the actions that are taken (S, T, E, A) from the agent's.
+    """
+    each = tasks_of_worlds(tasks, worlds)
+    acted = act(agent, learners, tasks, worlds, keys)
+    action = explore(acted.action)
+    action = action if each.action_mask is None else action * each.action_mask
+    step = env.step_worlds(each, worlds.state, action)
+    age = worlds.age + 1
+    transition = Transition(
+        obs=worlds.obs,
+        action=action,
+        reward=step.reward,
+        discount=1.0 - step.terminated,
+        next_obs=step.obs,
+        ended=step.terminated | (age >= each.horizon),
+        context=None if worlds.task is None else worlds.task.context,
+        extras=acted.extras,
+    )
+    memory = acted.memory
+    if jax.tree.leaves(memory):
+        note = lambda learner, task, memory, transition: agent.remember(learner, memory, transition, task)
+        memory = over_learners(note)(learners, tasks, memory, transition)
+    return Worlds(step.state, worlds.task, step.obs, memory, age), Moment(transition, step.metrics)
+
+
+def reset_ended(env: Env, agent: Agent, learners: Any, tasks: Task, worlds: Worlds, ended: Array, keys: Key) -> Worlds:
+    """Begin new episodes, with keys (S,), in the worlds that ``ended`` (S, T, E); a branch, as mostly none has."""
+
+    def restart(worlds: Worlds) -> Worlds:
+        fresh = reset_envs(env, agent, learners, tasks, world_keys(keys, ended.shape))
+        rest = where_worlds(ended, fresh._replace(state=()), worlds._replace(state=()))
+        return rest._replace(state=env.where_worlds(ended, fresh.state, worlds.state))
+
+    return jax.lax.cond(jnp.any(ended), restart, lambda worlds: worlds, worlds)
