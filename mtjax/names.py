@@ -37,12 +37,17 @@ def load(place: Any) -> Any:
 
 
 def lazily(module: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
-    """Return the ``__getattr__`` of a module, which imports a name from its home when it is first used."""
+    """Return the ``__getattr__`` of a module, which imports a name from its home when it is first used.
+
+    Args:
+        homes: name -> the module that has it, or "module:other" where it is called otherwise.
+    """
 
     def find(name: str) -> Any:
         if name not in homes:
             raise AttributeError(f"module {module!r} has no attribute {name!r}")
-        found = load(f"{homes[name]}:{name}")
+        home = homes[name]
+        found = load(home if ":" in home else f"{home}:{name}")
         setattr(sys.modules[module], name, found)
         return found
 
