@@ -15,11 +15,10 @@ import tyro
 
 from mtjax.agents import SAC, BaseAgent, agent, preset_of, settings
 from mtjax.agents.base import replace
+from mtjax.commands import require_run
 from mtjax.envs import Family, make
 from mtjax.loop import Settings
 from mtjax.types import InputError
-
-PRESETS = ("auto", "cpu", "gpu")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -161,8 +160,7 @@ def from_json(path: Path) -> RunConfig:
     Raises:
         InputError: there is no such file, or it does not describe a run.
     """
-    if not path.is_file():
-        raise InputError(f"{str(path.parent)!r} is not a run: it has no config.json")
+    require_run(path.parent)
     try:
         record = json.loads(path.read_text())
         return RunConfig(

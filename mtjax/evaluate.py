@@ -1,27 +1,11 @@
 """``python -m mtjax.evaluate --run=DIR``: score a trained run on every task of every split, plot it, film it."""
 
-import contextlib
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
-import jax.numpy as jnp
-import numpy as np
-
-from mtjax import cli
-from mtjax.config import from_json
-from mtjax.envs import Domain
-from mtjax.evaluation import evaluate, record
-from mtjax.names import nearest_error
-from mtjax.report import diagnostics, figures, render
-from mtjax.report.tables import task_table
-from mtjax.training.log import append_rows, number
-from mtjax.training.policy import Policy, load, load_experience
-from mtjax.training.programs import enable_compile_cache
-from mtjax.types import SPLITS, InputError
-
-_FIRST_NUMBER = 1_000_000  # far from the numbers of a run's own evaluations, so that the episodes are new
-_FILM_FPS, _FILM_SECONDS = 25, 10
+from mtjax import commands
+from mtjax.names import InputError, load, nearest_error
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,99 +27,29 @@ class Request:
 
 
 def main(argv: Sequence[str]) -> None:
-    """Score the run, print the table, and leave table, plot and films in a new folder inside the run's."""
+    """Read what is asked for; then import what evaluates, and score the run."""
     request = _parse(argv)
-    enable_compile_cache()
-    seed = _first_seed(request)
-    policy = load(request.run, seed)
-    if request.video and not isinstance(policy.env, Domain):
-        raise InputError("only MuJoCo families can be filmed; leave out --video")
-    found = diagnostics.diagnose(policy, *load_experience(request.run, seed)) if request.diagnostics else None
-    episodes = score(policy, request.episodes, request.seed)
-    directory = _new_folder(Path(request.run))
-    print(task_table(policy, episodes))
-    if policy.agent.unseen:
-        print(f"unseen tasks: {policy.agent.unseen}")
-    _write(policy, episodes, directory)
-    if found is not None:
-        print(diagnostics.table(policy, found))
-        diagnostics.write(policy, found, directory)
-    if request.video:
-        _film(policy, directory, request.seed)
-    print(f"written to {directory}")
+    load("mtjax.report.scoring:report")(*dataclasses.astuple(request))
 
 
 def _parse(argv: Sequence[str]) -> Request:
-    argv = cli.import_files(argv)
+    argv = commands.import_files(argv)
     known = [f"--{f.name}" for f in dataclasses.fields(Request)] + ["--no-video", "--no-diagnostics", "--help", "-h"]
     for word in argv:
         if word.startswith("-") and word.split("=")[0] not in known:
             raise nearest_error("flag", word.split("=")[0], known)
-    request = cli.parse_with_tyro(Request, argv, Request(), "python -m mtjax.evaluate")
+    request = commands.parse_with_tyro(Request, argv, Request(), "python -m mtjax.evaluate")
     if not request.run:
         raise InputError("say which run to evaluate: --run=DIR")
     if request.episodes < 1 or request.seed < 0:
         raise InputError("episodes must be at least 1 and seed at least 0")
+    commands.require_run(Path(request.run))
     return request
-
-
-def _first_seed(request: Request) -> int:
-    """The first number of a setting's seeds."""
-    config = from_json(Path(request.run) / "config.json")
-    if not 0 <= request.point < max(len(config.points), 1):
-        raise InputError(f"point must be from 0 to {max(len(config.points), 1) - 1}, not {request.point}")
-    return request.point * config.plan.seeds
-
-
-def score(policy: Policy, episodes: int, seed: int = 0) -> dict[str, np.ndarray]:
-    """Return the returns (S, T, episodes) of each split, in episodes that no training run has seen."""
-    env, config = policy.env, jnp.int32(_FIRST_NUMBER + seed)
-    returns = np.asarray(evaluate(env, policy.agent, episodes, policy.states, env.tasks("all"), policy.seeds, config))
-    return {split: returns[:, env.table.rows[split]] for split in SPLITS}
-
-
-def _new_folder(run: Path) -> Path:
-    for attempt in range(1, 10_000):
-        with contextlib.suppress(FileExistsError):
-            (run / f"evaluation-{attempt}").mkdir()
-            return run / f"evaluation-{attempt}"
-    raise InputError(f"{str(run)!r} is full of evaluations; move some away")
-
-
-def _write(policy: Policy, episodes: dict[str, np.ndarray], directory: Path) -> None:
-    name, unit = policy.env.task_axis
-    rows = [
-        {"split": split, name: number(value), "seed": int(seed), "episode": e, "return": number(x)}
-        for split, returns in episodes.items()
-        for seed, of_seed in zip(policy.seeds, returns, strict=True)
-        for value, of_task in zip(policy.env.task_values(split), of_seed, strict=True)
-        for e, x in enumerate(of_task)
-    ]
-    append_rows(directory / "returns.csv", rows)
-    values = {split: policy.env.task_values(split) for split in episodes}
-    figures.return_by_parameter(directory / f"return_by_{name.replace('-', '_')}.png", name, unit, values, episodes)
-
-
-def _film(policy: Policy, directory: Path, seed: int) -> None:
-    """Film the beginning of one episode of every task, at the speed at which it happens."""
-    env = policy.env
-    assert isinstance(env, Domain)
-    render.choose_backend()
-    played = record(env, policy.agent, policy.state, env.tasks("all"), jnp.int32(seed))
-    stride = max(round(1 / (_FILM_FPS * env.seconds_per_step)), 1)
-    fps, longest = 1 / (stride * env.seconds_per_step), round(_FILM_SECONDS / env.seconds_per_step)
-    for split in SPLITS:
-        for i in env.table.rows[split]:
-            row = int(played.rows[i])  # where ranges are continuous, an episode's own
-            shown = slice(0, min(longest, int(played.lengths[i])), stride)
-            frames = render.film(env, row, np.asarray(played.states.qpos[i, shown]))
-            path = render.write_video(directory / f"{split}-{env.describe(row)}".replace("=", "-"), frames, fps)
-            print(f"filmed {path.name}: return {float(played.returns[i]):.0f}", flush=True)
 
 
 def run() -> None:
     """Entry point of the command line."""
-    cli.main(main)
+    commands.main(main)
 
 
 if __name__ == "__main__":

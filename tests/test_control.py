@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from probes import tiny
 
+import mtjax
 from mtjax import loop
 from mtjax.config import configure
 from mtjax.envs.mtenv.control import (
@@ -238,6 +239,15 @@ def test_episodes_start_near_rest(env, width):
     again = reset(first(env), keys)
     assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(step), jax.tree.leaves(again), strict=True))
     assert not np.array_equal(step.obs[0], step.obs[1])
+
+
+@pytest.mark.parametrize(
+    ("name", "ranges"), [("control-cartpole", CARTPOLE_RANGES), ("control-acrobot", ACROBOT_RANGES)]
+)
+def test_registered_families_draw_from_the_ranges(name, ranges):
+    """Of which MTEnv draws."""
+    found = mtjax.make(name).variation
+    assert dict(zip(found.names, zip(found.low, found.high, strict=True), strict=True)) == ranges
 
 
 @pytest.mark.parametrize(("env", "ranges"), [(CARTPOLE, CARTPOLE_RANGES), (ACROBOT, ACROBOT_RANGES)])

@@ -21,7 +21,7 @@ from mtjax.agents import AGENTS
 from mtjax.agents.parts.encoders import ENCODERS
 from mtjax.config import from_json, to_json
 from mtjax.networks import Params, tanh_normal
-from mtjax.report import diagnostics
+from mtjax.report import diagnostics, scoring
 from mtjax.report import figures as plot
 from mtjax.report.diagnostics import Activity, activity, compare_gradients, dormant_share, effective_ranks, utilisation
 from mtjax.training import checkpoint, log
@@ -344,7 +344,7 @@ def run_of(copied_run):
 def no_episodes(monkeypatch):
     """Leaves out what an evaluation does besides, which compiles for ten seconds."""
     empty = lambda policy, episodes, seed: {"train": np.zeros((len(policy.seeds), 2, 1))}
-    monkeypatch.setattr(mtjax.evaluate, "score", empty)
+    monkeypatch.setattr(scoring, "score", empty)
 
 
 @pytest.mark.parametrize("name", ["sac-conditioned", "pcgrad", "disjoint"])

@@ -37,14 +37,10 @@ def new_directory(root: Path, name: str) -> Path:
 
 
 def recorded(config: RunConfig, directory: Path, argv: Sequence[str]) -> RunConfig:
-    """The program of the run to go on with; ``--steps`` may extend it, and nothing else that it computes may change."""
-    given = {word.split("=", 1)[0] for word in argv if word.startswith("--")}
-    allowed = {"--resume", "--steps", "--import", "--distributed", "--profile"}
-    if given - allowed:
-        other = ", ".join(sorted(given - allowed))
-        raise InputError(f"--resume goes on with a run as it was; only --steps may change, not {other}")
+    """The program of the run to go on with, which ``--steps`` may extend."""
     recorded = from_json(directory / "config.json")
-    steps = config.plan.steps if "--steps" in given else recorded.plan.steps
+    extended = any(word.split("=", 1)[0] == "--steps" for word in argv)
+    steps = config.plan.steps if extended else recorded.plan.steps
     now = {"plan": dataclasses.replace(recorded.plan, steps=steps)}
     return dataclasses.replace(recorded, **now, profile=config.profile, distributed=config.distributed)
 
