@@ -20,7 +20,7 @@ def episodes(returns, ended):
     """One step of every environment (T, E), of which some end with these returns."""
     returns, ended = jnp.float32(returns), jnp.asarray(ended)
     zeros = jnp.zeros_like(returns)
-    return Outcome(zeros, zeros, returns, ended, zeros > 0, zeros.astype(jnp.int32))
+    return Outcome(zeros, returns, ended, zeros > 0, zeros.astype(jnp.int32))
 
 
 def all_end(returns):

@@ -12,6 +12,7 @@ from probes import QUICK, Probe, Stub, Walk, learner, only_seed, random_batch, t
 
 from mtjax import normalize
 from mtjax.agents import agent
+from mtjax.agents.base import Memory
 from mtjax.agents.parts.scaling import SCALINGS, AdaptiveScaling, NoScaling, PopArt, ReturnScaling, RewardScaling
 from mtjax.experience import Replay
 from mtjax.networks import Params
@@ -31,8 +32,8 @@ def stream(rewards, *, ends=(), cuts=(), gamma=0.5):
         discounted, total, age = gamma * discounted + reward, total + reward, age + 1
         over = step in (*ends, *cuts)
         everywhere = lambda flag: jnp.full(rewards.shape[1:], flag)
-        outcome = (reward, discounted, total, everywhere(over), everywhere(step in ends), np.int32(age))
-        yield Outcome(*map(jnp.asarray, outcome))
+        outcome = (reward, total, everywhere(over), everywhere(step in ends), np.int32(age))
+        yield Outcome(*map(jnp.asarray, outcome), memory=Memory(None, jnp.asarray(discounted)))
         if over:
             discounted = total = age = np.zeros(rewards.shape[1:], np.float32)
 
@@ -331,7 +332,7 @@ class Diary(Stub):
 
     def reset(self, state, spec, tasks, key):
         assert spec.obs_size == 1 and len(tasks.id) == 2
-        resets = state["resets"] | (1 << state["step"])
+        resets = state["resets"] | (1 << (state["step"] - 1))  # the step is taken, and not yet learned from
         return state | {"resets": resets, "updates": jnp.int32(0), "noise": jax.random.normal(key)}
 
 

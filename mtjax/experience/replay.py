@@ -122,21 +122,22 @@ class Replay:
         Returns:
             their new states, and the means of the updates' metrics with ``learning`` (), 1 if there were any.
         """
-        warming = data.count <= self.warmup_steps
-        metrics = {}
+        warming, metrics = data.count <= self.warmup_steps, {}
+        states = self._renew(env, agent, states, data, tasks, keys)
         if self.updates_per_step:
             # All seeds begin to learn at once, so that this stays a branch.
             learn = lambda states: _learn(env, agent, self, tasks, states, data.ring, keys)
             shapes = jax.eval_shape(learn, states)[1]
             rest = lambda states: (states, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes))
             states, metrics = jax.lax.cond(warming, rest, learn, states)
-        return self._renew(env, agent, states, data, tasks, keys), metrics | {"learning": 1.0 - warming}
+        return states, metrics | {"learning": 1.0 - warming}
 
     def _renew(self, env: Env, agent: Any, states: Any, data: Buffer, tasks: Task, keys: Key) -> Any:
         """Let the networks begin anew where that is due."""
         if not self.reset_every:
             return states
-        due = (data.count > self.warmup_steps) & (data.count % self.reset_every == 0)
+        before = data.count - 1
+        due = (before > self.warmup_steps) & (before % self.reset_every == 0)
         one = lambda state, key: agent.reset(state, env.spec, tasks, jax.random.fold_in(key, 1))
         return jax.lax.cond(due, lambda states: over_seeds(one, 0, 0)(states, keys), lambda states: states, states)
 
