@@ -1,6 +1,7 @@
 """Proximal policy optimisation over many tasks at once."""
 
 import dataclasses
+from collections.abc import Callable
 from functools import partial
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -277,36 +278,38 @@ class PPO(BaseAgent):
 
     def prepare(self, state: PPOState, steps: Transition, tasks: Task) -> tuple[PPOState, Batch, Metrics]:
         """Fit the normalisers to rollouts (T, H, E, ...), and make of them what the losses see (T, H E, ...)."""
-        shape = steps.reward.shape
-        flat: Transition = jax.tree.map(lambda x: x.reshape(shape[0], -1, *x.shape[3:]), steps)
+        flat: Transition = jax.tree.map(lambda x: x.reshape(x.shape[0], -1, *x.shape[3:]), steps)
         taken: Taken = flat.extras
-        state = state._replace(moments=self.fit_moments(state.moments, flat.obs))
         next_past = None if taken.past is None else append(taken.past, flat.obs, flat.action, flat.reward)
+        state = state._replace(moments=self.fit_moments(state.moments, flat.obs))
         told, obs = self.features_of_batch(state, flat, tasks), self.see_batch(state.moments, flat.obs, taken.past)
-        next_obs = self.see_batch(state.moments, flat.next_obs, next_past)
-
-        gamma = jnp.broadcast_to(self.discounts(tasks), shape[:1])
-        reward = self.reward_scale * self.scaling.rewards(state.scales, flat, gamma, jnp.zeros(shape[0]))
-        value, next_value = (self.values(state, told, x) for x in (obs, next_obs))
-        played = (x.reshape(shape) for x in (reward, flat.discount, flat.ended, value, next_value))
-        advantage = jax.vmap(partial(advantages, lambda_=self.gae_lambda))(*played, gamma).reshape(value.shape)
+        value = self.values(state, told, obs)
+        next_value = self.values(state, told, self.see_batch(state.moments, flat.next_obs, next_past))
+        advantage = self.advantages(state, flat, tasks, steps.reward.shape, value, next_value)
         target = value + advantage
-        explained = 1 - spread(target - value, 1)[1] / jnp.maximum(spread(target, 1)[1], LEAST_STD**2)
-
-        state = self.renew(state, target)
-        scale = lambda x: (x - state.units.mean[:, None]) / state.units.std[:, None]
         scales, _ = self.scaling.renew(state.scales, target, ())
+        state = self.renew(state, target)._replace(scales=scales)
+        in_units = lambda x: (x - state.units.mean[:, None]) / state.units.std[:, None]
         batch = Batch(
             obs=obs,
             raw=taken.raw,
             log_prob=taken.log_prob,
             advantage=self.normalize_advantages(advantage),
-            value=scale(value),
-            target=scale(target),
+            value=in_units(value),
+            target=in_units(target),
             told=told,
             mask=tasks.action_mask,
         )
-        return state._replace(scales=scales), batch, {"value": jnp.mean(value, 1), "explained_variance": explained}
+        missed, there = (spread(x, 1)[1][:, 0] for x in (advantage, target))
+        explained = 1 - missed / jnp.maximum(there, LEAST_STD**2)
+        return state, batch, {"value": spread(value, 1)[0][:, 0], "explained_variance": explained}
+
+    def advantages(self, state: PPOState, flat: Transition, tasks: Task, shape, value: Array, next_value: Array):
+        """Advantages (T, H E) of steps (T, H E), which were played as ``shape`` (T, H, E)."""
+        gamma = jnp.broadcast_to(self.discounts(tasks), len(tasks.id))
+        reward = self.reward_scale * self.scaling.rewards(state.scales, flat, gamma, jnp.zeros(len(gamma)))
+        played = (x.reshape(shape) for x in (reward, flat.discount, flat.ended, value, next_value))
+        return jax.vmap(partial(advantages, lambda_=self.gae_lambda))(*played, gamma=gamma).reshape(value.shape)
 
     def values(self, state: PPOState, told: Array, obs: Any) -> Array:
         """The critic's values (T, B) of observations (T, B, ...), in units of reward."""
@@ -333,10 +336,12 @@ class PPO(BaseAgent):
         return state._replace(units=new, critic=self.follow(state.critic, old, new))
 
     def follow(self, critic: Params, old: Units, new: Units) -> Params:
-        """Adapt the critic's heads to new units, so that its values stay as they are."""
+        """Adapt the critic's heads to new units, so that its values stay as they are; its first ones mean nothing."""
         if self.value_normalization != "popart":
             return critic
-        ratio, shift = old.std / new.std, (old.mean - new.mean) / new.std
+        known = old.count > 0
+        ratio = jnp.where(known, old.std / new.std, 1.0)
+        shift = jnp.where(known, (old.mean - new.mean) / new.std, 0.0)
         head = critic.own["head"]  # kernel (T, D, 1), bias (T, 1)
         head = {"kernel": ratio[:, None, None] * head["kernel"], "bias": ratio[:, None] * head["bias"] + shift[:, None]}
         return Params(critic.shared, {**critic.own, "head": head})
@@ -359,45 +364,38 @@ class PPO(BaseAgent):
         orders = jax.vmap(lambda key: jax.random.permutation(key, count))(jax.random.split(key, self.epochs))
         return orders[:, : size * self.minibatches].reshape(-1, size)
 
-    def improve(self, batch: Batch, carry: tuple[PPOState, Array], given: tuple[Array, Key]):
-        """Take one gradient step of actor and critic on the steps (B,) of every task that are ``given``."""
+    def improve(self, batch: Batch, carry: tuple[PPOState, Array], given: tuple[Array, Key]) -> tuple[Any, Metrics]:
+        """Take a gradient step of critic and actor on the steps (B,) of every task that are ``given``."""
         (state, near), (order, key) = carry, given
         sample_key, actor_order, critic_order = jax.random.split(key, 3)
-        chosen, num_tasks = choose(batch, order), len(batch.advantage)
-        importance = self.sampler.weights(state.progress, jnp.ones(num_tasks))
-        combine = partial(surgery.gradient, importance=importance, per_layer=self.per_layer)
-
-        loss = surgery.over_devices(self.critic_loss)
-        seen = combine(self.gradients, loss, state.critic, chosen, state.surgery.critic, critic_order)
-        critic, critic_memory = descent.descend(
-            self.optimizers.critic, seen.gradients, state.optimizers.critic, state.critic
+        chosen = choose(batch, order)
+        sample_keys = jax.random.split(sample_key, len(batch.advantage))
+        state, seen = self.descend("critic", self.gradients, self.critic_loss, state, chosen, critic_order)
+        moved, done = self.descend(
+            "actor", self.gradients.for_actor, self.actor_loss, state, (chosen, sample_keys), actor_order
         )
-        critic_weighing = surgery.look_again(self.gradients, loss, critic, chosen, seen)
+        if parts.is_zero(self.kl_limit):
+            return (moved, near), seen | done
+        limit = jnp.where(self.kl_limit > 0, self.kl_limit, jnp.inf)
+        near &= jnp.mean(done["kl"]) <= limit
+        return (jax.tree.map(partial(jnp.where, near), moved, state), near), seen | done
 
-        loss, data = surgery.over_devices(self.actor_loss), (chosen, jax.random.split(sample_key, num_tasks))
-        done = combine(self.gradients.for_actor, loss, state.actor, data, state.surgery.actor, actor_order)
-        actor, actor_memory = descent.descend(
-            self.optimizers.actor, done.gradients, state.optimizers.actor, state.actor
-        )
-        actor_new, actor_old = (
-            (actor, actor_memory, done.memory),
-            (state.actor, state.optimizers.actor, state.surgery.actor),
-        )
-        if not parts.is_zero(self.kl_limit):
-            limit = jnp.where(self.kl_limit > 0, self.kl_limit, jnp.inf)
-            near &= jnp.mean(done.aux["kl"]) <= limit
-            actor_new = jax.tree.map(partial(jnp.where, near), actor_new, actor_old)
-        actor, actor_memory, actor_weighing = actor_new
-
+    def descend(
+        self, name: str, rule: surgery.Rule, loss: Callable, state: PPOState, data: Any, key: Key
+    ) -> tuple[PPOState, Metrics]:
+        """Take a gradient step of the network called ``name`` on data (T, ...) for a loss of one task."""
+        loss, params = surgery.over_devices(loss), getattr(state, name)
+        importance = self.sampler.weights(state.progress, jnp.ones(len(state.contexts)))
+        memory = getattr(state.surgery, name)
+        seen = surgery.gradient(rule, loss, params, data, memory, key, importance, self.per_layer)
+        memory = getattr(state.optimizers, name)
+        params, memory = descent.descend(getattr(self.optimizers, name), seen.gradients, memory, params)
         state = state._replace(
-            actor=actor,
-            critic=critic,
-            optimizers=Optimizers(actor_memory, critic_memory),
-            surgery=Surgery(actor_weighing, critic_weighing),
+            **{name: params},
+            optimizers=state.optimizers._replace(**{name: memory}),
+            surgery=state.surgery._replace(**{name: surgery.look_again(rule, loss, params, data, seen)}),
         )
-        named = (("critic", seen.metrics), ("actor", done.metrics))
-        metrics = {**seen.aux, **done.aux} | {f"{who}_{k}": v for who, found in named for k, v in found.items()}
-        return (state, near), metrics
+        return state, seen.aux | {f"{name}_{key}": value for key, value in seen.metrics.items()}
 
 
 def advantages(
