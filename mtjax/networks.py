@@ -4,6 +4,7 @@ A network is a body and a linear head, applied to the data of one task; the call
 """
 
 import dataclasses
+import math
 from typing import Any, NamedTuple
 
 import flax.linen as nn
@@ -13,6 +14,8 @@ import jax.numpy as jnp
 from mtjax.types import Array, Key
 
 _LOG_STD_RANGE = (-5.0, 2.0)
+STD_RANGE = tuple(math.exp(bound) for bound in _LOG_STD_RANGE)
+"""Standard deviations that a tanh-squashed Gaussian may have before its tanh."""
 
 
 class Params(NamedTuple):
@@ -20,6 +23,10 @@ class Params(NamedTuple):
 
     shared: Any  # used by every task
     own: Any  # leaves (T, ...): each task's own, such as its head or its embedding
+
+
+OVER_TASKS = Params(shared=None, own=0)
+"""The axes of networks under a map over tasks."""
 
 
 class ReLU(nn.Module):
@@ -164,6 +171,12 @@ def _moments(outputs: Array) -> tuple[Array, Array]:
     mean, log_std = jnp.split(outputs, 2, axis=-1)
     low, high = _LOG_STD_RANGE
     return mean, low + 0.5 * (high - low) * (jnp.tanh(log_std) + 1)
+
+
+def outputs_for(std: float | Array) -> Array:
+    """The output () from which a tanh-squashed Gaussian has the standard deviation ``std`` before its tanh."""
+    low, high = _LOG_STD_RANGE
+    return jnp.arctanh(2 * (jnp.log(std) - low) / (high - low) - 1)
 
 
 def _log_density(noise: Array, log_std: Array, raw: Array, mask: Array | None) -> Array:

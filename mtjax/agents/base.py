@@ -186,6 +186,10 @@ class BaseAgent(abc.ABC):
         scaled = partial(normalize.apply, moments) if self.normalize_observations else lambda obs: obs
         return scaled(obs) if past is None else Seen(scaled(obs), past._replace(obs=scaled(past.obs)))
 
+    def see_batch(self, moments: normalize.Moments, obs: Array, past: Past | None = None) -> Any:
+        """Observations (T, B, O) of all training tasks as networks take them."""
+        return (jax.vmap(self.see) if moments.mean.ndim > 1 else self.see)(moments, obs, past)
+
     def moments_of(self, state: Any, known: Array) -> normalize.Moments:
         """The moments of one training task's observations."""
         mixed = state.moments.mean.ndim > 1

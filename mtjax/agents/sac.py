@@ -19,11 +19,8 @@ from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.trajectory import append
 from mtjax.agents.parts.values import VALUES, Value
 from mtjax.experience import Replay
-from mtjax.networks import Network, Params, tanh_normal
+from mtjax.networks import OVER_TASKS, Network, Params, tanh_normal
 from mtjax.types import Acted, Array, InputError, Key, Metrics, Spec, Task, Transition
-
-OVER_TASKS = Params(shared=None, own=0)  # type: ignore
-"""The axes of networks under a map over tasks."""
 
 
 class Optimizers(NamedTuple):
@@ -296,7 +293,6 @@ class SAC(BaseAgent):
     def prepare(self, state: SACState, batch: Transition, tasks: Task) -> tuple[SACState, Batch]:
         """Fit the normalisers to transitions (T, B, ...), and make of them what the losses see (T, ...)."""
         state = state._replace(moments=self.fit_moments(state.moments, batch.obs))
-        see = jax.vmap(self.see) if state.moments.mean.ndim > 1 else lambda _, *seen: self.see(state.moments, *seen)
         past, next_past = batch.extras, None
         if past is not None:
             next_past = append(past, batch.obs, batch.action, batch.reward)
@@ -304,11 +300,11 @@ class SAC(BaseAgent):
         bonus = jnp.exp(state.log_temperature) * abs(self.target_entropy) * action_size / 2
         gamma = self.discounts(tasks)
         return state, Batch(
-            obs=see(state.moments, batch.obs, past),
+            obs=self.see_batch(state.moments, batch.obs, past),
             action=batch.action,
             reward=self.scaling.rewards(state.scales, batch, gamma, bonus),
             discount=(gamma[:, None] if jnp.ndim(gamma) else gamma) * batch.discount,  # type: ignore
-            next_obs=see(state.moments, batch.next_obs, next_past),
+            next_obs=self.see_batch(state.moments, batch.next_obs, next_past),
             told=self.features_of_batch(state, batch, tasks),
             temperature=jnp.broadcast_to(jnp.exp(state.log_temperature), len(tasks.id)),
             mask=tasks.action_mask,

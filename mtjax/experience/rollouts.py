@@ -3,7 +3,10 @@
 import dataclasses
 from typing import Any, ClassVar
 
-from mtjax.types import Array, Env, InputError, Key, Transition
+import jax.numpy as jnp
+
+from mtjax.maps import over_seeds
+from mtjax.types import Array, Env, InputError, Key, Metrics, Task, Transition
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,3 +49,15 @@ class Rollouts:
     def keep(self, data: Transition) -> tuple[()]:
         """Keep nothing."""
         return ()
+
+    # Learning.
+
+    def learn(self, env: Env, agent: Any, states: Any, data: Transition, tasks: Task, keys: Key) -> tuple[Any, Metrics]:
+        """Let the agents of all seeds, leaves (S, ...), learn from their steps, leaves (S, T, H, E, ...).
+
+        Returns:
+            their new states, and their metrics with ``learning`` (), which is 1.
+        """
+        update = lambda state, steps, key: agent.update(state, steps, tasks, key)
+        states, metrics = over_seeds(update, 0, 0, 0)(states, data, keys)
+        return states, metrics | {"learning": jnp.float32(1)}

@@ -15,6 +15,7 @@ import numpy as np
 
 from mtjax.agents.parts.gradients import balancing, rules
 from mtjax.networks import Params
+from mtjax.parallel import collectives
 from mtjax.types import Array, Key, Metrics
 
 Rule = rules.Mean
@@ -84,6 +85,25 @@ def gradient(
 
     combine = partial(_of_gradients, per_layer=per_layer) if rule.needs == "gradients" else _of_losses
     return combine(rule, one_task, params, data, memory, key, importance)
+
+
+def over_devices(loss: Callable) -> Callable:
+    """Make a loss, its gradient and whatever else it returns the means over the devices that share the data.
+
+    Where all devices have the same data, as those that replay do, a loss needs none of this.
+    """
+    if collectives.count() == 1:
+        return loss
+    mean = lambda tree: jax.tree.map(lambda x: x / collectives.count(), collectives.total(tree))
+    same = jax.custom_vjp(lambda params: params)
+    same.defvjp(lambda params: (params, None), lambda _, gradient: (mean(gradient),))
+
+    def averaged(params: Params, data: Any) -> tuple[Array, Any]:
+        value, aux = loss(same(params), data)
+        others = jax.lax.stop_gradient(mean(value) - value)  # the gradient is summed where it reaches the parameters
+        return value + others, mean(jax.lax.stop_gradient(aux))
+
+    return averaged
 
 
 def look_again(rule: Rule, loss: Callable, params: Params, data: Any, before: Combined) -> Any:

@@ -1,0 +1,168 @@
+"""How well and how fast PPO learns families of tasks on one GPU: three seeds of every family in one program each.
+
+    python benchmarks/ppo.py [--family=NAME] ... [--steps=N] [--seeds=3] [--out=FOLDER] [NAME=VALUE ...]
+
+Every family leaves ``OUT/NAME.csv`` (a line of metrics a chunk and seed), ``NAME.npz`` (every episode of every
+evaluation) and ``NAME.json`` (the row of the table below); one that has its ``NAME.json`` is not run again, so that the
+five may be run in parts, in any order. Further words are settings of the agent or of the loop that replace the
+preset's: ``epochs=8 num_envs=512 hidden=[256,256]``.
+
+Steps are of each seed, summed over its ten tasks; steps a second are of all seeds, without compiling and evaluating.
+The return is the mean of the last evaluation under the mean action, over tasks and episodes; its interval is the 95%
+bootstrap interval over whole seeds, which of three seeds is from the worst to the best one.
+"""
+
+import argparse
+import dataclasses
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from report import markdown
+
+from mtjax.config import configure, with_preset
+from mtjax.evaluation import save_evaluations
+from mtjax.training.log import append_rows
+from mtjax.training.programs import enable_compile_cache
+from mtjax.training.run import Result, train
+from mtjax.types import SPLITS, InputError
+
+# Steps of each seed, in millions, and the return that is aimed at.
+FAMILIES = {
+    "finger-spin-vary-size": (40, 700),
+    "cheetah-run-vary-torso-length": (60, 850),
+    "cartpole-swingup-vary-pole-mass": (40, 750),
+    "walker-walk-vary-friction": (30, 940),
+    "walker-run-vary-friction": (30, 700),
+}
+_SHOWN = ("kl", "clip_fraction", "entropy", "explained_variance")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--family", action="append", choices=list(FAMILIES), metavar="NAME", help="by default all")
+    parser.add_argument("--agent", default="ppo")
+    parser.add_argument("--preset", default="gpu")
+    parser.add_argument("--engine", default="auto", help="of the physics; auto is the family's own choice for a GPU")
+    parser.add_argument("--steps", type=float, help="of each seed; by default the family's")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--evaluations", type=int, default=4)
+    parser.add_argument("--eval-episodes", type=int, default=10)
+    parser.add_argument("--out", type=Path, default=Path("runs") / "ppo")
+    parser.add_argument("given", nargs="*", metavar="NAME=VALUE")
+    arguments = parser.parse_args()
+    enable_compile_cache()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    for family in arguments.family or FAMILIES:
+        if not (arguments.out / f"{family}.json").exists():
+            learn(arguments, family)
+    tabulate(arguments.out)
+
+
+def learn(arguments: argparse.Namespace, family: str) -> None:
+    """Train on one family, and keep what came of it."""
+    given = dict(word.split("=", 1) for word in arguments.given)
+    config = with_preset(family, arguments.agent, arguments.preset, engine=arguments.engine)
+    agent, settings = configure(config.learner, config.training, {name: value(x) for name, x in given.items()})
+    steps = int(arguments.steps or FAMILIES[family][0] * 1e6)
+    print(f"{family}: {steps:,} steps of {arguments.seeds} seeds\n{agent}\n{settings}", flush=True)
+    file, last = arguments.out / f"{family}.csv", [0.0]
+
+    def show(row: dict[str, Any]) -> None:
+        if float(row["seconds"]) >= last[0] + 5:
+            last[0] = float(row["seconds"])
+            rest = ", ".join(f"{name} {float(row[name]):.3g}" for name in _SHOWN if name in row)
+            print(f"{last[0]:7.1f} s  {int(row['steps']):12,} steps  return {row['return'] or '-'}, {rest}", flush=True)
+
+    began = time.monotonic()
+    result = train(
+        config.family,
+        agent,
+        steps=steps,
+        seeds=arguments.seeds,
+        seed=arguments.seed,
+        eval_every=-(-steps // arguments.evaluations),
+        eval_episodes=arguments.eval_episodes,
+        settings=settings,
+        on_chunk=show,
+    )
+    if not result.finished:
+        raise SystemExit(f"stopped before {family} was finished; the same command goes on with it")
+    file.unlink(missing_ok=True)
+    append_rows(file, result.rows)
+    save_evaluations(file.with_suffix(".npz"), result.evaluations)
+    found = row(family, result, arguments.seeds) | {"wall_seconds": round(time.monotonic() - began, 1)}
+    record = {**found, "agent": str(agent), "settings": dataclasses.asdict(settings)}
+    file.with_suffix(".json").write_text(json.dumps(record, indent=2) + "\n")
+    print({**found}, flush=True)
+
+
+def value(word: str) -> Any:
+    """Read a setting as JSON where it is that, and as a word where it is not."""
+    try:
+        found = json.loads(word)
+    except json.JSONDecodeError:
+        return word
+    return tuple(found) if isinstance(found, list) else found
+
+
+def row(family: str, result: Result, seeds: int) -> dict[str, Any]:
+    """What a run came to."""
+    evaluations = result.evaluations
+    scores = {split: x[:, -1].mean(axis=(-2, -1)) for split, x in evaluations.returns.items() if x.size}  # (S,)
+    steps = int(result.rows[-1]["steps"])
+    low, high = interval(scores["train"])
+    return {
+        "family": family,
+        "steps": steps,
+        "seconds": round(result.seconds, 1),
+        "compile_seconds": round(result.compile_seconds, 1),
+        "steps_per_second": round(steps * seeds / result.seconds),
+        **{split: round(float(scores[split].mean()), 1) if split in scores else None for split in SPLITS},
+        "low": round(low, 1),
+        "high": round(high, 1),
+        "seeds": [round(float(x), 1) for x in scores["train"]],
+        "worst_task": round(float(evaluations.returns["train"][:, -1].mean(axis=(0, -1)).min()), 1),
+        "over_time": [round(float(x), 1) for x in evaluations.returns["train"].mean(axis=(0, 2, 3))],
+    }
+
+
+def interval(scores: np.ndarray) -> tuple[float, float]:
+    """The 95% bootstrap interval of the mean of seeds' scores (S,)."""
+    draws = np.random.default_rng(0).integers(len(scores), size=(20_000, len(scores)))
+    low, high = np.quantile(scores[draws].mean(axis=1), [0.025, 0.975])
+    return float(low), float(high)
+
+
+def tabulate(out: Path) -> None:
+    """Print and keep a table of all families that are done."""
+    head = ["family", "steps of a seed", "training s", "steps/s, all seeds", "train", "interpolation", "extrapolation"]
+    head += ["worst task", "aim"]
+    found = [json.loads(path.read_text()) for path in sorted(out.glob("*.json"))]
+    show = lambda x: "-" if x is None else f"{x:.0f}"
+    lines = [
+        [
+            x["family"],
+            f"{x['steps']:,}",
+            f"{x['seconds']:.0f}",
+            f"{x['steps_per_second']:,}",
+            f"{x['train']:.0f} [{x['low']:.0f}, {x['high']:.0f}]",
+            *(show(x[split]) for split in SPLITS[1:]),
+            show(x["worst_task"]),
+            show(FAMILIES.get(x["family"], (0, None))[1]),
+        ]
+        for x in found
+    ]
+    table = markdown(head, lines)
+    (out / "table.md").write_text(table + "\n")
+    print(table)
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except InputError as error:
+        raise SystemExit(f"error: {error}") from None

@@ -1,0 +1,447 @@
+"""Proximal policy optimisation over many tasks at once."""
+
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+from typing import Annotated, Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from mtjax import normalize
+from mtjax.agents import parts
+from mtjax.agents.base import FLAT, BaseAgent, Memory
+from mtjax.agents.parts import conditioning
+from mtjax.agents.parts.gradients import descent, surgery
+from mtjax.agents.parts.samplers import SAMPLERS
+from mtjax.agents.parts.scaling import SCALINGS
+from mtjax.agents.parts.trajectory import Past, append
+from mtjax.experience import Rollouts
+from mtjax.networks import (
+    OVER_TASKS,
+    STD_RANGE,
+    Network,
+    Params,
+    log_density,
+    outputs_for,
+    sample_raw,
+    tanh_normal,
+)
+from mtjax.parallel import collectives
+from mtjax.types import Acted, Array, InputError, Key, Metrics, Spec, Task, Transition
+
+FARTHEST = 20.0
+"""Logarithms of the ratio of two policies are kept within this, as its exponential must stay finite."""
+LEAST_STD = 1e-4
+"""Of targets and of advantages, by which they are divided."""
+FIRST_HEAD = 0.01
+"""Scale of the output layers' first weights: policies begin as one, and values at zero."""
+
+
+class Optimizers(NamedTuple):
+    """What the optimisers remember."""
+
+    actor: Any
+    critic: Any
+
+
+class Surgery(NamedTuple):
+    """What the rules of gradient surgery remember."""
+
+    actor: Any
+    critic: Any
+
+
+class Units(NamedTuple):
+    """In what the critic counts: a value v is mean + std times its output."""
+
+    count: Array  # () rollouts seen
+    mean: Array  # (T,)
+    variance: Array  # (T,)
+
+    @property
+    def std(self) -> Array:
+        return jnp.maximum(jnp.sqrt(self.variance), LEAST_STD)
+
+
+class PPOState(NamedTuple):
+    """Everything PPO learns, and what it remembers of the training tasks."""
+
+    actor: Params
+    critic: Params
+    optimizers: Optimizers
+    moments: normalize.Moments
+    contexts: Array  # (T, C) of the training tasks, among which an unseen task finds its nearest
+    vectors: Array | None  # (T, V) given task vectors, if conditioned on them
+    surgery: Surgery
+    scales: Any  # what the scaling of rewards remembers
+    progress: Any  # what the sampler of tasks remembers
+    units: Units
+
+
+class Taken(NamedTuple):
+    """What is noted of an action when it is taken."""
+
+    raw: Array  # (A,) it, before the tanh
+    log_prob: Array  # () under the policy that took it
+    past: Past | None  # the steps before it, if the task is inferred from them
+
+
+class Batch(NamedTuple):
+    """What the losses of one task see; of all tasks, leaves (T, ...)."""
+
+    obs: Any  # (B, O) as the networks take them
+    raw: Array  # (B, A) actions before the tanh
+    log_prob: Array  # (B,) under the policy that took them
+    advantage: Array  # (B,)
+    value: Array  # (B,) what the critic said before the update, in its units
+    target: Array  # (B,) what it should say
+    told: Array  # (Z,) or (B, Z), what the networks are told of the task
+    mask: Array | None  # (A,) 1 for actions that the task has; None: it has all
+
+
+@dataclasses.dataclass(frozen=True)
+class PPO(BaseAgent):
+    """Multi-task proximal policy optimisation (Schulman et al. 2017), with an actor and a critic apart.
+
+    H steps of every environment are played by one policy pi_old. At each of task i, with s' the true next observation,
+    d = 0 where the episode terminated and e = 1 where it ended, be it by its time limit:
+        delta_t = r_t + gamma_i d_t V(s'_t) - V(s_t)                                        (error of the critic)
+        A_t = delta_t + gamma_i lambda (1 - e_t) A_(t+1),  A_H = 0                          (advantage)
+        y_t = A_t + V(s_t)                                                                  (target)
+    Then, for some epochs, the steps are shuffled and dealt out to minibatches, each with as many of every task. With
+    ratio = pi(a|s) / pi_old(a|s):
+        L_pi = -min(ratio A, clip(ratio, 1 - epsilon, 1 + epsilon) A) - c H(pi(s))          (actor loss)
+        L_V = (V(s) - y)^2 / 2                                                              (critic loss)
+    averaged over a task's minibatch, then over tasks. Advantages are brought to mean 0 and standard deviation 1 in each
+    task. The critic counts in units of each task, V = m_i + s_i V', with m_i and s_i moving estimates of the mean and
+    the standard deviation of the task's targets; with PopArt its heads follow them, so that V stays as it was (van
+    Hasselt et al. 2016, Hessel et al. 2019):
+        kernel' = kernel s / s',  bias' = (s bias + m - m') / s'
+
+    A policy is a tanh-squashed Gaussian, whose entropy is estimated by one action. Where ``kl_limit`` is given, the
+    actor rests for what is left of an update as soon as mean(ratio - 1 - log ratio), an estimate of KL(pi_old | pi), is
+    beyond it on a minibatch.
+
+    Differs from the paper: networks share nothing, so that there is no weight of the critic's loss; advantages and
+    values are normalised; a time limit bootstraps, as nothing ended there; observations are normalised by moments that
+    include the rollout's, which the ratio counts as a change of the policy.
+    """
+
+    actor_lr: float = 3e-4
+    """Adam's learning rate of the actor."""
+    critic_lr: float = 1e-3
+    """Adam's learning rate of the critic."""
+    normalize_observations: bool = True
+    """Scale observations by their running mean and variance, fitted on training data alone."""
+    max_gradient_norm: float = 1.0
+    """Clip the global norm of actor and critic gradients to this; 0 does not clip."""
+    critic_layer_norm: bool = False
+    """Layer normalisation in the critic."""
+    gae_lambda: float = 0.95
+    """Share of the advantage of the next step in that of a step (lambda): 0 trusts the critic, 1 the returns."""
+    epochs: int = 4
+    """How often an update goes through the rollout."""
+    minibatches: int = 8
+    """Gradient steps in which it does; what does not divide evenly is left out, other steps each time."""
+    clip_range: float = 0.2
+    """How far the ratio of policies may lead away from 1 (epsilon)."""
+    value_clip: float = 0.0
+    """How far values may move in an update, in standard deviations of the targets; 0 for any."""
+    entropy_cost: float = 1e-2
+    """What entropy is worth, in standard deviations of the advantage (c)."""
+    kl_limit: float = 0.0
+    """Divergence from the policy that acted beyond which the actor rests until the next rollout; 0 for none."""
+    initial_std: float = 0.7
+    """Standard deviation of actions, before the tanh, with which policies begin."""
+    reward_scale: float = 1.0
+    """Factor of all rewards."""
+    advantage_normalization: Literal["none", "all", "task"] = "task"
+    """Bring advantages to mean 0 and standard deviation 1: not at all, over all tasks alike, or in each task."""
+    value_normalization: Literal["none", "running", "popart"] = "running"
+    """Let the critic count in standard deviations of each task's targets from their mean; with popart it has a head for
+    every task, which follows them as they move."""
+    value_rate: float = 0.1
+    """Share of a new rollout in the moving estimates of targets' mean and variance."""
+    experience: Annotated[Rollouts, FLAT] = dataclasses.field(default_factory=Rollouts)
+
+    def _check_numbers(self) -> None:
+        super()._check_numbers()
+        parts.require_shares(self, "gae_lambda")
+        parts.require_counts(self, "epochs", "minibatches")
+        parts.require_positive(self, "clip_range", "reward_scale")
+        parts.require_not_negative(self, "value_clip", "entropy_cost", "kl_limit")
+        parts.require_rates(self, "value_rate")
+        low, high = STD_RANGE
+        if not low < self.initial_std < high:
+            raise InputError(f"initial-std must be between {low:.2g} and {high:.2g}, not {self.initial_std}")
+
+    def _check_combination(self) -> None:
+        super()._check_combination()
+        if parts.name_of(SCALINGS, self.scaling) == "popart":
+            raise InputError("scaling=popart is for critics of actions; use value-normalization=popart")
+        if parts.name_of(SAMPLERS, self.sampler) == "temperature":
+            raise InputError("sampler=temperature needs an agent with temperatures; use another sampler")
+
+    # Networks.
+
+    @property
+    def actor(self) -> Network:
+        return self.network(self.actor_layer_norm)
+
+    @property
+    def critic(self) -> Network:
+        network = self.network(self.critic_layer_norm)
+        if self.value_normalization != "popart" or "head" in network.own:
+            return network
+        return dataclasses.replace(network, own=(*network.own, "head"))
+
+    def init(self, spec: Spec, tasks: Task, key: Key) -> PPOState:
+        """Initialise for the training ``tasks`` (T, ...)."""
+        num_tasks = len(tasks.id)
+        actor_key, critic_key = jax.random.split(key)
+        vectors, moments = self.load_vectors(num_tasks), self.init_moments(spec, num_tasks)
+        told = conditioning.features(self.conditioning, num_tasks, jnp.int32(0), tasks.context[0], vectors)
+        obs = self.example(spec, moments)
+        first = jnp.repeat(jnp.array([0.0, outputs_for(self.initial_std)]), spec.action_size)
+        actor = calm(self.actor.init(actor_key, num_tasks, 2 * spec.action_size, told, obs), first)
+        critic = calm(self.critic.init(critic_key, num_tasks, 1, told, obs), jnp.zeros(1))
+        memory = lambda rule, params: surgery.init(rule, params, num_tasks, self.per_layer)
+        return PPOState(
+            actor=actor,
+            critic=critic,
+            optimizers=Optimizers(self.optimizers.actor.init(actor), self.optimizers.critic.init(critic)),
+            moments=moments,
+            contexts=tasks.context,
+            vectors=vectors,
+            surgery=Surgery(memory(self.gradients.for_actor, actor), memory(self.gradients, critic)),
+            scales=self.scaling.init(num_tasks),
+            progress=self.sampler.init(num_tasks),
+            units=Units(jnp.float32(0), jnp.zeros(num_tasks), jnp.ones(num_tasks)),
+        )
+
+    @property
+    def optimizers(self) -> Optimizers:
+        chosen = partial(descent.adam, weight_decay=self.weight_decay, max_norm=self.max_gradient_norm, tune=self.tune)
+        return Optimizers(chosen(self.actor_lr), chosen(self.critic_lr))
+
+    # Acting.
+
+    def act(self, state: PPOState, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
+        """Choose an action (A,) for one observation (O,) of one task; no key: the mean action."""
+        (actor,) = self.of_task(state, task, state.actor)
+        seen = self.see(self.moments_of(state, self.known_task(state, task)), obs, memory.past)
+        outputs = self.actor.apply(actor, self.features(state, task), seen)
+        if key is None:
+            return Acted(tanh_normal(outputs, None, task.action_mask)[0], None, memory)
+        raw, log_prob = sample_raw(outputs, key, task.action_mask)
+        action = jnp.tanh(raw)
+        action = action if task.action_mask is None else action * task.action_mask
+        return Acted(action, Taken(raw, log_prob, memory.past), memory)
+
+    # Losses of one task.
+
+    def actor_loss(self, actor: Params, data: tuple[Batch, Key]) -> tuple[Array, Metrics]:
+        batch, key = data
+        outputs = self.actor.apply(actor, batch.told, batch.obs)
+        log_ratio = log_density(outputs, batch.raw, batch.mask) - batch.log_prob
+        log_ratio = jnp.clip(log_ratio, -FARTHEST, FARTHEST)
+        ratio = jnp.exp(log_ratio)
+        clipped = jnp.clip(ratio, 1 - self.clip_range, 1 + self.clip_range)
+        gain = jnp.mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
+        entropy = -jnp.mean(sample_raw(outputs, key, batch.mask)[1])
+        loss = -gain - self.entropy_cost * entropy
+        kl, beyond = jnp.mean(ratio - 1 - log_ratio), jnp.mean(ratio != clipped)
+        return loss, {"actor_loss": loss, "entropy": entropy, "kl": kl, "clip_fraction": beyond}
+
+    def critic_loss(self, critic: Params, batch: Batch) -> tuple[Array, Metrics]:
+        value = self.critic.apply(critic, batch.told, batch.obs)[..., 0]
+        error = jnp.square(value - batch.target)
+        if not parts.is_zero(self.value_clip):
+            near = batch.value + jnp.clip(value - batch.value, -self.value_clip, self.value_clip)
+            error = jnp.maximum(error, jnp.square(near - batch.target))
+        loss = jnp.mean(error) / 2
+        return loss, {"critic_loss": loss}
+
+    # Update of all tasks.
+
+    def update(self, state: PPOState, steps: Transition, tasks: Task, key: Key) -> tuple[PPOState, Metrics]:
+        """Learn from the rollouts (T, H, E, ...) of the training tasks; metrics are (T,)."""
+        order_key, key = jax.random.split(key)
+        state, batch, seen = self.prepare(state, steps, tasks)
+        orders = self.deal(batch.advantage.shape[1], order_key)
+        improve = partial(self.improve, batch)
+        (state, _), metrics = jax.lax.scan(
+            improve, (state, jnp.bool_(True)), (orders, jax.random.split(key, len(orders)))
+        )
+        return state, jax.tree.map(lambda x: jnp.mean(x, axis=0), metrics) | seen
+
+    def prepare(self, state: PPOState, steps: Transition, tasks: Task) -> tuple[PPOState, Batch, Metrics]:
+        """Fit the normalisers to rollouts (T, H, E, ...), and make of them what the losses see (T, H E, ...)."""
+        flat: Transition = jax.tree.map(lambda x: x.reshape(x.shape[0], -1, *x.shape[3:]), steps)
+        taken: Taken = flat.extras
+        next_past = None if taken.past is None else append(taken.past, flat.obs, flat.action, flat.reward)
+        state = state._replace(moments=self.fit_moments(state.moments, flat.obs))
+        told, obs = self.features_of_batch(state, flat, tasks), self.see_batch(state.moments, flat.obs, taken.past)
+        value = self.values(state, told, obs)
+        next_value = self.values(state, told, self.see_batch(state.moments, flat.next_obs, next_past))
+        advantage = self.advantages(state, flat, tasks, steps.reward.shape, value, next_value)
+        target = value + advantage
+        scales, _ = self.scaling.renew(state.scales, target, ())
+        state = self.renew(state, target)._replace(scales=scales)
+        in_units = lambda x: (x - state.units.mean[:, None]) / state.units.std[:, None]
+        batch = Batch(
+            obs=obs,
+            raw=taken.raw,
+            log_prob=taken.log_prob,
+            advantage=self.normalize_advantages(advantage),
+            value=in_units(value),
+            target=in_units(target),
+            told=told,
+            mask=tasks.action_mask,
+        )
+        missed, there = (spread(x, 1)[1][:, 0] for x in (advantage, target))
+        explained = 1 - missed / jnp.maximum(there, LEAST_STD**2)
+        return state, batch, {"value": spread(value, 1)[0][:, 0], "explained_variance": explained}
+
+    def advantages(self, state: PPOState, flat: Transition, tasks: Task, shape, value: Array, next_value: Array):
+        """Advantages (T, H E) of steps (T, H E), which were played as ``shape`` (T, H, E)."""
+        gamma = jnp.broadcast_to(self.discounts(tasks), len(tasks.id))
+        reward = self.reward_scale * self.scaling.rewards(state.scales, flat, gamma, jnp.zeros(len(gamma)))
+        played = (x.reshape(shape) for x in (reward, flat.discount, flat.ended, value, next_value))
+        return jax.vmap(partial(advantages, lambda_=self.gae_lambda))(*played, gamma=gamma).reshape(value.shape)
+
+    def values(self, state: PPOState, told: Array, obs: Any) -> Array:
+        """The critic's values (T, B) of observations (T, B, ...), in units of reward."""
+        out = jax.vmap(self.critic.apply, (OVER_TASKS, 0, 0))(state.critic, told, obs)[..., 0]
+        return state.units.mean[:, None] + state.units.std[:, None] * out
+
+    def normalize_advantages(self, advantage: Array) -> Array:
+        """Bring advantages (T, B) to mean 0 and standard deviation 1."""
+        if self.advantage_normalization == "none":
+            return advantage
+        mean, variance = spread(advantage, 1 if self.advantage_normalization == "task" else (0, 1))
+        return (advantage - mean) / jnp.maximum(jnp.sqrt(variance), LEAST_STD)
+
+    def renew(self, state: PPOState, target: Array) -> PPOState:
+        """Bring the critic's units up to date with targets (T, B)."""
+        if self.value_normalization == "none":
+            return state
+        old, count = state.units, state.units.count + 1
+        rate = jnp.maximum(self.value_rate, 1 / count)  # the first rollouts count alike
+        mean, variance = (x[:, 0] for x in spread(target, 1))
+        ahead = mean - old.mean
+        variance = (1 - rate) * old.variance + rate * variance + rate * (1 - rate) * jnp.square(ahead)
+        new = Units(count, old.mean + rate * ahead, variance)
+        return state._replace(units=new, critic=self.follow(state.critic, old, new))
+
+    def follow(self, critic: Params, old: Units, new: Units) -> Params:
+        """Adapt the critic's heads to new units, so that its values stay as they are; its first ones mean nothing."""
+        if self.value_normalization != "popart":
+            return critic
+        known = old.count > 0
+        ratio = jnp.where(known, old.std / new.std, 1.0)
+        shift = jnp.where(known, (old.mean - new.mean) / new.std, 0.0)
+        head = critic.own["head"]  # kernel (T, D, 1), bias (T, 1)
+        head = {"kernel": ratio[:, None, None] * head["kernel"], "bias": ratio[:, None] * head["bias"] + shift[:, None]}
+        return Params(critic.shared, {**critic.own, "head": head})
+
+    def fit_moments(self, moments: normalize.Moments, obs: Array) -> normalize.Moments:
+        """Take observations (T, B, O) into account, those on other devices included."""
+        if not self.normalize_observations:
+            return moments
+        mixed = moments.mean.ndim > 1
+        count = (obs.shape[1] if mixed else obs.shape[0] * obs.shape[1]) * collectives.count()
+        mean, variance = (x.reshape(moments.mean.shape) for x in spread(obs, 1 if mixed else (0, 1)))
+        one = normalize.Moments(jnp.full_like(moments.count, count), mean, count * variance)
+        return jax.vmap(merge)(moments, one) if mixed else merge(moments, one)
+
+    def deal(self, count: int, key: Key) -> Array:
+        """Deal out ``count`` steps to the minibatches of all epochs: numbers of steps (U, B)."""
+        size = count // self.minibatches
+        if not size:
+            raise InputError(f"minibatches ({self.minibatches}) must not be more than a rollout's {count} steps a task")
+        orders = jax.vmap(lambda key: jax.random.permutation(key, count))(jax.random.split(key, self.epochs))
+        return orders[:, : size * self.minibatches].reshape(-1, size)
+
+    def improve(self, batch: Batch, carry: tuple[PPOState, Array], given: tuple[Array, Key]) -> tuple[Any, Metrics]:
+        """Take a gradient step of critic and actor on the steps (B,) of every task that are ``given``."""
+        (state, near), (order, key) = carry, given
+        sample_key, actor_order, critic_order = jax.random.split(key, 3)
+        chosen = choose(batch, order)
+        sample_keys = jax.random.split(sample_key, len(batch.advantage))
+        state, seen = self.descend("critic", self.gradients, self.critic_loss, state, chosen, critic_order)
+        moved, done = self.descend(
+            "actor", self.gradients.for_actor, self.actor_loss, state, (chosen, sample_keys), actor_order
+        )
+        if parts.is_zero(self.kl_limit):
+            return (moved, near), seen | done
+        limit = jnp.where(self.kl_limit > 0, self.kl_limit, jnp.inf)
+        near &= jnp.mean(done["kl"]) <= limit
+        return (jax.tree.map(partial(jnp.where, near), moved, state), near), seen | done
+
+    def descend(
+        self, name: str, rule: surgery.Rule, loss: Callable, state: PPOState, data: Any, key: Key
+    ) -> tuple[PPOState, Metrics]:
+        """Take a gradient step of the network called ``name`` on data (T, ...) for a loss of one task."""
+        loss, params = surgery.over_devices(loss), getattr(state, name)
+        importance = self.sampler.weights(state.progress, jnp.ones(len(state.contexts)))
+        memory = getattr(state.surgery, name)
+        seen = surgery.gradient(rule, loss, params, data, memory, key, importance, self.per_layer)
+        memory = getattr(state.optimizers, name)
+        params, memory = descent.descend(getattr(self.optimizers, name), seen.gradients, memory, params)
+        state = state._replace(
+            **{name: params},
+            optimizers=state.optimizers._replace(**{name: memory}),
+            surgery=state.surgery._replace(**{name: surgery.look_again(rule, loss, params, data, seen)}),
+        )
+        return state, seen.aux | {f"{name}_{key}": value for key, value in seen.metrics.items()}
+
+
+def advantages(
+    reward: Array, discount: Array, ended: Array, value: Array, next_value: Array, gamma: Array, lambda_: float | Array
+) -> Array:
+    """Generalised advantages (H, E) of one task's steps (H, E) (Schulman et al. 2016)."""
+    delta = reward + gamma * discount * next_value - value
+    decay = gamma * lambda_ * ~ended
+
+    def back(later: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
+        delta, decay = step
+        advantage = delta + decay * later
+        return advantage, advantage
+
+    return jax.lax.scan(back, jnp.zeros_like(delta[0]), (delta, decay), reverse=True)[1]
+
+
+def choose(batch: Batch, order: Array) -> Batch:
+    """Take the steps with numbers ``order`` (B,) of every task."""
+    rows = lambda x: x[:, order]
+    told = rows(batch.told) if batch.told.ndim == 3 else batch.told
+    return jax.tree.map(rows, batch._replace(told=None, mask=None))._replace(told=told, mask=batch.mask)
+
+
+def calm(params: Params, bias: Array) -> Params:
+    """Give a network a head that says nearly the same of everything."""
+
+    def calmed(part: dict) -> dict:
+        if "head" not in part:
+            return part
+        head = part["head"]
+        return {**part, "head": {"kernel": FIRST_HEAD * head["kernel"], "bias": head["bias"] + bias}}
+
+    return Params(calmed(params.shared), calmed(params.own))
+
+
+def spread(x: Array, axes: int | tuple[int, ...]) -> tuple[Array, Array]:
+    """Mean and variance along axes, which stay with length 1, over all devices that share the data."""
+    mean_of = lambda x: collectives.total(jnp.mean(x, axis=axes, keepdims=True)) / collectives.count()
+    mean = mean_of(x)
+    return mean, mean_of(jnp.square(x - mean))
+
+
+def merge(moments: normalize.Moments, others: normalize.Moments) -> normalize.Moments:
+    """Moments of what either has seen (Chan et al. 1979)."""
+    count, shift = moments.count + others.count, others.mean - moments.mean
+    share = others.count / count
+    deviation = moments.deviation + others.deviation + jnp.square(shift) * moments.count * share
+    return normalize.Moments(count, moments.mean + shift * share, deviation)

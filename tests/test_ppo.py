@@ -1,0 +1,494 @@
+"""PPO: advantages, losses, minibatches and units against numbers worked by hand, and probes learned by the loop."""
+
+import itertools
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from probes import Walk, mean_actions, of_task, only_seed, pick, quick, random_past, tiny, train
+
+from mtjax import agents, normalize
+from mtjax.agents.base import CONDITIONINGS
+from mtjax.agents.parts.encoders import ENCODERS
+from mtjax.agents.parts.gradients.surgery import RULES
+from mtjax.agents.parts.samplers import SAMPLERS
+from mtjax.agents.parts.scaling import SCALINGS
+from mtjax.agents.ppo import Batch, Taken, Units, advantages, choose
+from mtjax.config import with_preset
+from mtjax.envs.probes import Probe, tasks_of
+from mtjax.networks import log_density
+from mtjax.types import InputError, Spec, Transition
+
+SPEC, LENGTH, ENVS = Spec.vector(3, 2, 1), 4, 2
+TASKS = tasks_of("one-step", (1.0, -0.5, 0.3))
+KEY = jax.random.key(2)
+
+
+def small(**settings):
+    return tiny("ppo", **{"epochs": 1, "minibatches": 2, **settings})
+
+
+def random_steps(agent, num_tasks=3, spec=SPEC, seed=0):
+    """Rollouts (T, H, E, ...) in which every field is random."""
+    random, shape = np.random.default_rng(seed), (num_tasks, LENGTH, ENVS)
+    normal = lambda *size: jnp.float32(random.normal(size=(*shape, *size)))
+    raw, past = normal(spec.action_size), None
+    if agent.history:
+        past = random_past(random, (*shape, agent.history), spec)
+    return Transition(
+        obs=normal(spec.obs_size),
+        action=jnp.tanh(raw),
+        reward=normal(),
+        discount=jnp.float32(random.random(shape) < 0.75),
+        next_obs=normal(spec.obs_size),
+        ended=jnp.asarray(random.random(shape) < 0.5),
+        extras=Taken(raw, normal() - 2, past),
+    )
+
+
+# Advantages.
+
+
+def test_advantages_worked_by_hand():
+    """Terminated, cut off and going on; with gamma a half and lambda a half."""
+    reward, value, next_value = jnp.ones((3, 1)), jnp.full((3, 1), 2.0), jnp.full((3, 1), 4.0)
+    find = lambda discount, ended: advantages(
+        reward, jnp.float32(discount)[:, None], jnp.array(ended)[:, None], value, next_value, jnp.float32(0.5), 0.5
+    )[:, 0]
+    # Each error is 1 + 0.5 * 4 - 2 = 1, or 1 - 2 = -1 where an episode terminated.
+    np.testing.assert_allclose(find([1, 1, 1], [False] * 3), [1 + 0.25 * 1.25, 1.25, 1])
+    np.testing.assert_allclose(find([1, 0, 1], [False, True, False]), [1 - 0.25, -1, 1])
+    np.testing.assert_allclose(find([1, 1, 1], [False, True, False]), [1.25, 1, 1])
+
+
+def test_advantages_are_those_of_a_plain_loop():
+    """Random rollouts of three tasks, each with a discount of its own, by the sum over errors of each episode."""
+    random, (length, envs) = np.random.default_rng(0), (7, 5)
+    for gamma in (0.9, 0.99, 1.0):
+        reward, value, next_value = random.normal(size=(3, length, envs))
+        ended = random.random((length, envs)) < 0.3
+        discount = 1.0 - ended * (random.random((length, envs)) < 0.5)
+        found = advantages(*map(jnp.asarray, (reward, discount, ended, value, next_value)), jnp.float32(gamma), 0.8)
+        error = reward + gamma * discount * next_value - value
+        for t, e in np.ndindex(length, envs):
+            expected = 0.0
+            for k in range(t, length):
+                expected += (gamma * 0.8) ** (k - t) * error[k, e]
+                if ended[k, e]:
+                    break
+            assert found[t, e] == pytest.approx(expected, abs=1e-5)
+
+
+def test_every_task_has_its_own_discount():
+    agent = small(discounting="horizon", value_normalization="none", advantage_normalization="none", gae_lambda=0.0)
+    tasks, steps = TASKS._replace(horizon=jnp.array([200, 1000, 125])), random_steps(agent)
+    state = agent.init(SPEC, tasks, KEY)
+    state, batch, _ = agent.prepare(state, steps, tasks)
+    told = agent.features_of_batch(state, steps, tasks)
+    see = lambda obs: agent.see(state.moments, obs.reshape(3, -1, 3))
+    value, following = (agent.values(state, told, see(obs)) for obs in (steps.obs, steps.next_obs))
+    gamma = np.array([0.975, 0.995, 0.96])[:, None]
+    flat = lambda x: x.reshape(3, -1)
+    expected = flat(steps.reward) + gamma * flat(steps.discount) * following - value
+    np.testing.assert_allclose(batch.advantage, expected, rtol=1e-4, atol=1e-5)
+
+
+# Losses.
+
+
+def batch_of(agent, state, **fields):
+    """Four steps of the first task, with its parameters of actor and critic."""
+    random = np.random.default_rng(1)
+    normal = lambda *size: jnp.float32(random.normal(size=(4, *size)))
+    told = agent.features(state, pick(TASKS, 0))
+    blank = dict.fromkeys(("log_prob", "advantage", "value", "target"), jnp.zeros(4))
+    batch = Batch(**{"obs": normal(3), "raw": normal(2), "told": told, "mask": None, **blank, **fields})
+    return batch, of_task(state.actor, 0), of_task(state.critic, 0)
+
+
+def test_actor_loss_worked_by_hand():
+    """Ratios of 1.5 and 0.5, clipped at 1.2 and 0.8 only where that lowers the gain."""
+    agent = small(clip_range=0.2, entropy_cost=0.0)
+    state = agent.init(SPEC, TASKS, KEY)
+    ratio, advantage = jnp.array([1.5, 1.5, 0.5, 0.5]), jnp.array([1.0, -1.0, 1.0, -1.0])
+    batch, actor, _ = batch_of(agent, state, advantage=advantage)
+    now = log_density(agent.actor.apply(actor, batch.told, batch.obs), batch.raw)
+    batch = batch._replace(log_prob=now - jnp.log(ratio))
+    loss, metrics = agent.actor_loss(actor, (batch, KEY))
+    assert loss == pytest.approx(-(1.2 - 1.5 + 0.5 - 0.8) / 4, abs=1e-5)
+    assert metrics["kl"] == pytest.approx(float(jnp.mean(ratio - 1 - jnp.log(ratio))), abs=1e-5)
+    assert metrics["clip_fraction"] == 1
+
+    one = lambda i: (jax.tree.map(lambda x: x[i : i + 1] if x.shape[:1] == (4,) else x, batch), KEY)
+    slope = lambda i: sum(
+        float(jnp.sum(jnp.abs(x))) for x in jax.tree.leaves(jax.grad(lambda a: agent.actor_loss(a, one(i))[0])(actor))
+    )
+    assert [slope(i) > 0 for i in range(4)] == [False, True, True, False]
+
+
+def test_entropy_is_paid_for():
+    agent, plain = small(entropy_cost=0.5), small(entropy_cost=0.0)
+    state = agent.init(SPEC, TASKS, KEY)
+    batch, actor, _ = batch_of(agent, state)
+    (loss, metrics), (without, _) = (x.actor_loss(actor, (batch, KEY)) for x in (agent, plain))
+    assert loss == pytest.approx(float(without - 0.5 * metrics["entropy"]), abs=1e-5)
+
+
+def test_ratios_beyond_all_bounds_stay_finite():
+    agent = small()
+    state = agent.init(SPEC, TASKS, KEY)
+    batch, actor, _ = batch_of(agent, state, log_prob=jnp.full(4, -1e6), advantage=-jnp.ones(4))
+    (loss, _), slope = jax.value_and_grad(agent.actor_loss, has_aux=True)(actor, (batch, KEY))
+    assert all(np.all(np.isfinite(x)) for x in (loss, *jax.tree.leaves(slope)))
+
+
+def test_critic_loss_worked_by_hand():
+    """A value that would leave its clipped range is held to the error at its edge, where that is larger."""
+    agent, free = small(value_clip=0.5), small()
+    state = agent.init(SPEC, TASKS, KEY)
+    batch, _, critic = batch_of(agent, state)
+    value = agent.critic.apply(critic, batch.told, batch.obs)[..., 0]
+    batch = batch._replace(value=value - jnp.array([0.2, 1.0, -1.0, 1.0]), target=value + jnp.array([1.0, 1, 1, -1]))
+    assert free.critic_loss(critic, batch)[0] == pytest.approx(0.5, abs=1e-5)
+    # The second value may only be 0.5 above the old one, which is 1.5 from its target; and so on.
+    expected = np.mean([1.0, 1.5**2, 1.0, 1.0]) / 2
+    assert agent.critic_loss(critic, batch)[0] == pytest.approx(expected, abs=1e-5)
+
+
+def test_actions_that_a_task_lacks_count_for_nothing():
+    """Neither in the density nor in what is taken; the others' are those of a policy that has no more."""
+    agent = small(conditioning="none")
+    tasks = TASKS._replace(action_mask=jnp.array([[1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]))
+    state, obs = agent.init(SPEC, tasks, KEY), jnp.float32([0.3, -1.0, 2.0])
+    act = lambda i, key=KEY: agent.act(state, agent.begin(state, pick(tasks, i)), obs, pick(tasks, i), key)
+    acted, whole = act(0), act(1)
+    assert acted.action[1] == 0 and acted.action[0] == whole.action[0] and act(2, None).action[0] == 0
+    outputs = agent.actor.apply(of_task(state.actor, 0), jnp.zeros(0), obs)
+    density = lambda i: float(log_density(outputs[i::2], acted.extras.raw[i : i + 1]))
+    assert acted.extras.log_prob == pytest.approx(density(0), abs=1e-5)
+    assert whole.extras.log_prob == pytest.approx(density(0) + density(1), abs=1e-5)
+    steps = random_steps(agent)
+    _, batch, _ = agent.prepare(state, steps, tasks)
+    np.testing.assert_array_equal(choose(batch, jnp.arange(2)).mask, tasks.action_mask)
+
+
+def test_policies_begin_wide_and_alike():
+    agent = small(initial_std=0.5)
+    state = agent.init(SPEC, TASKS, KEY)
+    outputs = agent.actor.apply(of_task(state.actor, 0), TASKS.context[0], jnp.float32([[1, 2, 3], [-3, 0, 1]]))
+    np.testing.assert_allclose(outputs[:, :2], 0, atol=0.1)
+    at_mean = log_density(outputs, outputs[:, :2])
+    np.testing.assert_allclose(at_mean, -2 * np.log(0.5 * np.sqrt(2 * np.pi)), atol=0.2)
+
+
+# Minibatches.
+
+
+def test_every_minibatch_has_as_many_steps_of_every_task():
+    """An epoch deals out every step once; what does not divide is left out, other steps in every epoch."""
+    agent = small(epochs=3, minibatches=4)
+    orders = np.asarray(agent.deal(12, KEY))
+    assert orders.shape == (12, 3)
+    for epoch in orders.reshape(3, -1):
+        assert sorted(epoch) == list(range(12))
+    assert not np.array_equal(orders[:4], orders[4:8])
+    uneven = np.asarray(agent.deal(14, KEY)).reshape(3, -1)
+    assert uneven.shape == (3, 12) and all(len(set(epoch)) == 12 for epoch in uneven)
+    assert len({tuple(set(range(14)) - set(epoch)) for epoch in uneven}) > 1
+
+    batch = agent.prepare(agent.init(SPEC, TASKS, KEY), random_steps(agent), TASKS)[1]
+    chosen = choose(batch, jnp.array([5, 0, 3]))
+    assert chosen.advantage.shape == (3, 3) and chosen.told is batch.told
+    np.testing.assert_array_equal(chosen.obs, batch.obs[:, np.array([5, 0, 3])])
+    with pytest.raises(InputError, match=r"minibatches \(4\) must not be more than a rollout's 3 steps"):
+        agent.deal(3, KEY)
+
+
+def test_steps_keep_their_contexts():
+    """Where every episode draws its own task, a minibatch tells each step its own."""
+    agent = small()
+    steps = random_steps(agent)
+    context = steps.reward[..., None] * 2
+    batch = agent.prepare(agent.init(SPEC, TASKS, KEY), steps._replace(context=context), TASKS)[1]
+    order = jnp.array([1, 6])
+    np.testing.assert_array_equal(choose(batch, order).told, context.reshape(3, -1, 1)[:, order])
+
+
+@pytest.mark.parametrize("kind", ["none", "all", "task"])
+def test_advantages_are_brought_to_one_scale(kind):
+    agent = small(advantage_normalization=kind)
+    advantage = jnp.float32(np.random.default_rng(0).normal(size=(3, 50)) * [[1], [10], [100]] + 5)
+    found = agent.normalize_advantages(advantage)
+    axis = {"none": (), "all": None, "task": 1}[kind]
+    if kind == "none":
+        np.testing.assert_array_equal(found, advantage)
+    else:
+        np.testing.assert_allclose(np.mean(found, axis), 0, atol=1e-5)
+        np.testing.assert_allclose(np.std(found, axis), 1, atol=1e-4)
+
+
+def test_advantages_of_a_task_that_earns_nothing_are_nothing():
+    assert np.all(np.asarray(small().normalize_advantages(jnp.zeros((2, 5)))) == 0)
+
+
+# Units of values.
+
+
+@pytest.mark.parametrize("kind", ["none", "running", "popart"])
+def test_units_are_moments_of_all_targets_at_first(kind):
+    """Two rollouts count alike: mean and variance are those of both together. With PopArt values then stay."""
+    agent = small(value_normalization=kind, value_rate=0.1)
+    state, obs = agent.init(SPEC, TASKS, KEY), jnp.float32(np.random.default_rng(0).normal(size=(3, 5, 3)))
+    targets = jnp.float32(np.random.default_rng(0).normal(size=(2, 3, 50)) * 7 + [[[3], [100], [0]]])
+    targets = targets.at[1].multiply(2)
+    state = agent.renew(state, targets[0])
+    before = agent.values(state, TASKS.context, obs)
+    state = agent.renew(state, targets[1])
+    if kind == "none":
+        assert state.units.count == 0 and np.all(state.units.std == 1)
+        return
+    both = np.concatenate(targets, axis=1)
+    np.testing.assert_allclose(state.units.mean, both.mean(axis=1), rtol=1e-4)
+    np.testing.assert_allclose(state.units.variance, both.var(axis=1), rtol=1e-4)
+    after = agent.values(state, TASKS.context, obs)
+    assert np.allclose(before, after, atol=1e-3) == (kind == "popart")
+
+    many = state._replace(units=state.units._replace(count=jnp.float32(500)))
+    moved = agent.renew(many, targets[0]).units
+    np.testing.assert_allclose(moved.mean, 0.9 * state.units.mean + 0.1 * targets[0].mean(axis=1), rtol=1e-4)
+
+
+def test_popart_gives_the_critic_alone_a_head_for_every_task():
+    agent = small(value_normalization="popart")
+    state = agent.init(SPEC, TASKS, KEY)
+    assert "head" in state.critic.own and "head" in state.actor.shared
+    with pytest.raises(InputError, match="value-normalization=popart"):
+        small(scaling="popart")
+
+
+def test_units_have_a_least_size():
+    assert np.all(np.asarray(Units(jnp.float32(1), jnp.zeros(2), jnp.zeros(2)).std) > 0)
+
+
+def test_moments_are_those_of_all_observations():
+    """Of rollouts one after the other, as if they had come at once; in a mixture each task has its own."""
+    agent, obs = small(), np.float32(np.random.default_rng(0).normal(size=(2, 3, 8, 3)) * 3 + 1)
+    for mixed in (False, True):
+        moments = agent.init_moments(SPEC._replace(mixed=mixed), 3)
+        for batch in obs:
+            moments = agent.fit_moments(moments, jnp.asarray(batch))
+        rows = np.moveaxis(obs, 1, 0).reshape(3, -1, 3) if mixed else np.asarray(obs).reshape(1, -1, 3)
+        expected = [normalize.update(normalize.init(3), jnp.asarray(x)) for x in rows]
+        for found, wanted in zip(moments, map(jnp.stack, zip(*expected, strict=True)), strict=True):
+            np.testing.assert_allclose(found, wanted if mixed else wanted[0], rtol=1e-4)
+    still = small(normalize_observations=False)
+    assert still.fit_moments(still.init_moments(SPEC, 3), obs[0]).count == 0
+
+
+# Updates.
+
+
+def test_the_actor_rests_once_it_is_too_far_away():
+    """Its first step is free, as it is no farther than rounding until then; the critic goes on."""
+    agent = small(kl_limit=1e-5, minibatches=4, epochs=2, normalize_observations=False, actor_lr=0.1)
+    state = agent.init(SPEC, TASKS, KEY)
+    steps = random_steps(agent)
+    outputs = jnp.zeros((3, LENGTH, ENVS, 4)) + agent.actor.apply(
+        of_task(state.actor, 0), TASKS.context[0], jnp.zeros(3)
+    )
+    told = TASKS.context[:, None, None] * jnp.ones((3, LENGTH, ENVS, 1))
+    outputs = agent.actor.apply(of_task(state.actor, 0), told, steps.obs)
+    raw = steps.extras.raw * 0.5
+    steps = steps._replace(extras=Taken(raw, log_density(outputs, raw), None))
+    after, _ = jax.jit(agent.update)(state, steps, TASKS, KEY)
+
+    order_key, key = jax.random.split(KEY)
+    renewed, batch, _ = agent.prepare(state, steps, TASKS)
+    orders = agent.deal(batch.advantage.shape[1], order_key)
+    given = (orders[0], jax.random.split(key, len(orders))[0])
+    (first, near), _ = jax.jit(agent.improve)(batch, (renewed, jnp.bool_(True)), given)
+    assert near
+    close = lambda x, y: all(np.allclose(a, b, atol=1e-5) for a, b in zip(*map(jax.tree.leaves, (x, y)), strict=True))
+    assert close(after.actor, first.actor) and not close(after.actor, state.actor)
+    assert not close(after.critic, first.critic)
+    far = small(kl_limit=1e9, minibatches=4, epochs=2, normalize_observations=False, actor_lr=0.1)
+    free = small(minibatches=4, epochs=2, normalize_observations=False, actor_lr=0.1)
+    states = [jax.jit(x.update)(state, steps, TASKS, KEY)[0].actor for x in (far, free)]
+    assert close(*states) and not close(states[0], after.actor)
+
+
+def allowed(row):
+    try:
+        return bool(small(**row, **({"vectors": "x"} if row["conditioning"] == "vectors" else {})))
+    except InputError:
+        return False
+
+
+def pairs(**choices):
+    """Settings in which every two choices of different kinds meet at least once, but for those that are refused."""
+    pairs_of = lambda row: {frozenset(pair) for pair in itertools.combinations(row.items(), 2)}
+    whole = [dict(zip(choices, row, strict=True)) for row in itertools.product(*choices.values())]
+    np.random.default_rng(0).shuffle(whole)
+    rows, met = [], set()
+    for fewest in range(math.comb(len(choices), 2), 0, -1):
+        for row in whole:
+            new = pairs_of(row) - met
+            if len(new) >= fewest and allowed(row):
+                rows.append(row)
+                met |= new
+    return rows
+
+
+COMBINED = pairs(
+    conditioning=CONDITIONINGS,
+    encoder=list(ENCODERS),
+    heads=["shared", "per-task", "disjoint"],
+    gradients=list(RULES),
+    value_normalization=["running", "popart"],
+    gradient_scope=["shared", "per-layer"],
+)
+COMBINED += [
+    {"conditioning": "parameters", "scaling": scaling, "sampler": sampler}
+    for scaling, sampler in itertools.zip_longest(SCALINGS, SAMPLERS, fillvalue="uniform")
+]
+COMBINED = [row for row in COMBINED if allowed(row)]
+
+
+def test_most_combinations_are_allowed():
+    assert len(COMBINED) > 50
+    for kind, table in (("encoder", ENCODERS), ("gradients", RULES), ("conditioning", CONDITIONINGS)):
+        assert {row[kind] for row in COMBINED if kind in row} == set(table)
+
+
+@pytest.mark.parametrize("row", COMBINED, ids=lambda row: "-".join(map(str, row.values())))
+def test_every_combination_keeps_its_shapes(row, tmp_path):
+    """Traced, not run: an update keeps the state's shapes and types, and acting gives an action and its density."""
+    if row["conditioning"] == "vectors":
+        np.save(tmp_path / "tasks.npy", np.random.default_rng(0).normal(size=(3, 5)))
+        row = {**row, "vectors": str(tmp_path / "tasks.npy")}
+    agent = small(**row)
+    state = jax.eval_shape(lambda: agent.init(SPEC, TASKS, KEY))
+    after, metrics = jax.eval_shape(lambda state: agent.update(state, random_steps(agent), TASKS, KEY), state)
+    shapes = lambda tree: jax.tree.map(lambda x: (x.shape, str(x.dtype)), tree)
+    assert shapes(after) == shapes(state)
+    for name in ("actor_loss", "critic_loss", "entropy", "kl", "clip_fraction", "explained_variance", "value"):
+        assert metrics[name].shape == (3,)
+    assert ("critic_cosine" in metrics) == (agent.gradients.needs == "gradients")
+    task, obs = pick(TASKS, 0), jnp.zeros(3)
+    for key in (None, KEY):
+        acted = jax.eval_shape(lambda s, key=key: agent.act(s, agent.begin(s, task), obs, task, key), state)
+        assert acted.action.shape == (2,) and (key is None or acted.extras.log_prob.shape == ())
+
+
+RUN = [
+    {},
+    {"conditioning": "inferred", "gradients": "pcgrad", "heads": "per-task"},
+    {"encoder": "care", "gradients": "famo", "value_normalization": "popart"},
+    {"conditioning": "embedding", "heads": "disjoint", "value_clip": 0.2, "kl_limit": 1e9, "scaling": "return"},
+]
+
+
+@pytest.mark.parametrize("row", RUN, ids=lambda row: "-".join(map(str, row.values())))
+def test_updates_are_finite_and_the_key_decides(row):
+    agent = small(**row)
+    steps = random_steps(agent)
+    init = quick(lambda key: agent.init(SPEC, TASKS, key), KEY)
+    state = init(KEY)
+    update = quick(lambda state, key: agent.update(state, steps, TASKS, key), state, KEY)
+    (after, metrics), (again, _), (other, _) = update(state, KEY), update(state, KEY), update(state, jax.random.key(3))
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves((after, metrics)))
+    leaves = [np.concatenate([np.ravel(x) for x in jax.tree.leaves(s.actor)]) for s in (state, after, again, other)]
+    assert np.array_equal(leaves[1], leaves[2])
+    assert not np.array_equal(leaves[0], leaves[1]) and not np.array_equal(leaves[1], leaves[3])
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("gae_lambda", 1.5),
+        ("epochs", 0),
+        ("minibatches", 0),
+        ("clip_range", 0.0),
+        ("initial_std", 0.0),
+        ("initial_std", 20.0),
+        ("entropy_cost", -1.0),
+        ("value_rate", 0.0),
+        ("advantage_normalization", "some"),
+    ],
+)
+def test_numbers_out_of_range_are_refused(name, value):
+    with pytest.raises(InputError, match=name.replace("_", "-")):
+        agents.agent("ppo", **{name: value})
+    with pytest.raises(InputError, match="sampler=temperature"):
+        agents.agent("ppo", sampler="temperature")
+
+
+@pytest.mark.parametrize("family", ["finger-spin", "cheetah-run", "point-mass-vary-goal"])
+@pytest.mark.parametrize("preset", ["cpu", "gpu"])
+def test_presets_deal_out_every_step(family, preset):
+    """No step is left out of an epoch, and a chunk is whole rollouts."""
+    config = with_preset(family, "ppo", preset)
+    agent, settings = config.learner, config.training
+    assert settings.num_envs * agent.experience.unroll % agent.minibatches == 0
+    assert settings.chunk_steps % agent.experience.unroll == 0
+
+
+# Learning, through the whole loop.
+
+GAMMA = 0.9
+SCALES = (1.0, -0.5)
+LEARN = {"num_envs": 16, "chunk_steps": 800, "unroll": 8, "epochs": 4, "minibatches": 4, "gamma": GAMMA}
+LEARN |= {"actor_lr": 3e-3, "critic_lr": 1e-2, "entropy_cost": 0.0}
+# V(scale, obs) at observations, and how far the critic may be from it.
+KNOWN = {
+    "one-step": (lambda scale, obs: scale, [0.0], 0.02),
+    "by-observation": (lambda scale, obs: scale * obs, [-1.0, 1.0], 0.05),
+    "delayed": (lambda scale, obs: scale * GAMMA ** (1 - obs), [0.0, 1.0], 0.05),
+    "endless": (lambda scale, obs: scale * GAMMA ** (1 - obs) / (1 - GAMMA), [0.0, 1.0], 0.3),
+    "by-action": (lambda scale, obs: 0.0, [0.0], 0.15),
+    "by-both": (lambda scale, obs: 0.0, [-1.0, 1.0], 0.3),
+}
+BEST = {"by-action": lambda scale, obs: scale, "by-both": lambda scale, obs: scale * obs}
+
+
+def learned(kind, agent=None, **settings):
+    agent, tasks = agent or tiny("ppo", value_normalization="popart"), tasks_of(kind, SCALES)
+    state, history = train(Probe(), agent, LEARN | settings, tasks=tasks)
+    return agent, only_seed(state.agent), tasks, history
+
+
+@pytest.mark.parametrize("kind", KNOWN)
+def test_probes_are_learned(kind):
+    """Values of every task, and the best action where there is one."""
+    agent, state, tasks, history = learned(kind)
+    expected, obs, tolerance = KNOWN[kind]
+    seen = jax.vmap(lambda x: agent.see(state.moments, x[None]))(jnp.float32(obs))
+    found = agent.values(state, tasks.context, jnp.broadcast_to(seen, (2, *seen.shape)))
+    for i, scale in enumerate(SCALES):
+        wanted = [expected(scale, x) for x in obs]
+        np.testing.assert_allclose(found[i], wanted, atol=tolerance)
+    if kind in BEST:
+        wanted = [[BEST[kind](scale, x) for x in obs] for scale in SCALES]
+        np.testing.assert_allclose(mean_actions(agent, state, tasks, obs), wanted, atol=0.2)
+    assert history[0]["bad_step"].max() == -1 and history[0]["return"].shape == (1, 2)
+
+
+def test_a_hidden_task_is_inferred():
+    """From the rewards of the steps before: the best action is the scale, which nothing else tells."""
+    agent = tiny("ppo", conditioning="inferred", inferred_from=4)
+    state, history = train(Walk(), agent, {**LEARN, "chunk_steps": 80})
+    assert history[0]["bad_step"].max() == -1
+    assert np.all(np.isfinite(np.concatenate([np.ravel(x) for x in jax.tree.leaves(state.agent.actor)])))
+
+
+def test_seeds_are_alone():
+    """A seed learns beside others what it learns by itself."""
+    agent, given = tiny("ppo"), LEARN | {"chunk_steps": 40}
+    both, _ = train(Walk(), agent, given, seeds=(3, 4))
+    alone, _ = train(Walk(), agent, given, seeds=(4,))
+    for x, y in zip(
+        jax.tree.leaves(pick(both.agent.actor, 1)), jax.tree.leaves(pick(alone.agent.actor, 0)), strict=True
+    ):
+        np.testing.assert_allclose(x, y, atol=1e-4)
