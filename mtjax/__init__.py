@@ -17,6 +17,7 @@ _HOME = {
     "agent": "mtjax.agents",
     "load": "mtjax.training.policy",
     "make": "mtjax.envs",
+    "mixture": "mtjax.envs",
     "preset": "mtjax.config",
 }
 __all__ = [*_HOME, "train"]
