@@ -130,7 +130,7 @@ def make(name: str, vary: Mapping[str, Any] | tuple = (), **settings: Any) -> An
     return family(**{**settings, "vary": dict(defaults.get("vary", {})) | dict(vary)})
 
 
-def mixture(families: Sequence[str | Tabled]) -> Mixture:
+def mixture(families: Sequence[str | Family | Mixture]) -> Mixture:
     """Return a mixture of families, each by its name or as ``make`` returned it.
 
     Families may share a model, or a name, as long as their tasks are not the same: a walker whose friction varies and

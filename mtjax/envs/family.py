@@ -82,6 +82,10 @@ class Tabled(abc.ABC):
         """The states of each part."""
 
     @abc.abstractmethod
+    def own_row(self, row: int) -> int:
+        """The row of a family's table that a row of this table stands for."""
+
+    @abc.abstractmethod
     def describe(self, row: int) -> str:
         """Name a task by what makes it different, such as "size=0.95"."""
 
@@ -309,6 +313,10 @@ class Family(Flat, Tabled):
     def apart(self, states: Any) -> tuple[Any, ...]:
         """The states of each part."""
         return (states,)
+
+    def own_row(self, row: int) -> int:
+        """The row itself."""
+        return row
 
     @property
     def ends(self) -> str:

@@ -201,7 +201,7 @@ class Mixture(Tabled):
         """The longest family's steps of an episode."""
         return max(family.episode_length for family in self.families)
 
-    # States, leaves (S, T, E, ...).
+    # Worlds, leaves (S, T, E, ...).
 
     def reset_worlds(self, tasks: Task, keys: Key) -> Step:
         """Begin an episode in every world."""
@@ -313,6 +313,10 @@ class Mixture(Tabled):
         """The states of each part."""
         return states.families
 
+    def own_row(self, row: int) -> int:
+        """The row of a family's table that a row of this table stands for."""
+        return self._place(row)[1]
+
     def task_values(self, split: str) -> np.ndarray:
         """The numbers (T,) of a split's tasks."""
         return np.asarray(self.tasks(split).id)
@@ -350,6 +354,16 @@ class Mixture(Tabled):
             f"{count} training task{'s' * (count > 1)} of {many} famil{'ies' if many > 1 else 'y'}: {kinds}; "
             f"split {splits}, engine {self.engine_name}"
         )
+
+
+def require_family(env: Any, reason: str) -> None:
+    """Refuse a mixture, with the reason.
+
+    Raises:
+        InputError: ``env`` is a mixture.
+    """
+    if isinstance(env, Mixture):
+        raise InputError(f"{reason}, and {'+'.join(env.names)} is a mixture; take one family")
 
 
 def _merged(runs: list[tuple[int, int]]) -> tuple[tuple[int, int], ...]:

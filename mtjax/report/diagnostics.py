@@ -254,8 +254,8 @@ def table(policy: Policy, found: Diagnostics) -> str:
             lines.append(f"tasks share no parameters of the {name}, over which they could conflict")
     lines.append(f"{policy.env.task_axis[0]:>10} {'TD error':>9} {'critic gradient':>16} {'actor gradient':>15}")
     rows = zip(found.td_error, found.critic.gradient_norm, found.actor.gradient_norm, strict=True)
-    for value, (error, critic, actor) in zip(policy.env.task_values("train"), rows, strict=True):
-        lines.append(f"{value:10.4g} {error:9.3g} {critic:16.3g} {actor:15.3g}")
+    for label, (error, critic, actor) in zip(policy.env.labels("train"), rows, strict=True):
+        lines.append(f"{label:>10} {error:9.3g} {critic:16.3g} {actor:15.3g}")
     return "\n".join(lines)
 
 
@@ -276,7 +276,8 @@ def write(policy: Policy, found: Diagnostics, directory: Path) -> None:
     cosines = {who: x["cosine"] for who, x in networks.items()}
     bars = {f"length of the {who}'s gradient": x["gradient_norm"] for who, x in networks.items()}
     bars["mean TD error"] = found.td_error
-    figures.interference(directory / "diagnostics.png", name, unit, values, cosines, bars)
+    labels = policy.env.labels("train") if len(policy.env.parts) > 1 else values
+    figures.interference(directory / "diagnostics.png", name, unit, labels, cosines, bars)
 
 
 def _plain(x: Any) -> Any:

@@ -4,7 +4,7 @@ Axes: ``S`` seeds, ``V`` evaluations, ``T`` tasks, ``E`` episodes. Bands and bar
 intervals over seeds; there are none for a single seed. Whole seeds are resampled, because one agent learns all tasks.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -67,6 +67,32 @@ def return_by_parameter(
     _save(figure, axes, path)
 
 
+def return_by_task(path: str | Path, labels: Mapping[str, Sequence[str]], returns: Mapping[str, np.ndarray]) -> None:
+    """Draw each task's mean return in a line of its own, one marker shape a split.
+
+    Args:
+        path: the PNG file to write.
+        labels: split -> (T,) the tasks' names.
+        returns: split -> (S, T, E); an empty array is left out.
+    """
+    names = sorted({name for split in labels.values() for name in split})
+    figure, axes = _new_figure()
+    figure.set_size_inches(7, 1.5 + 0.25 * len(names))
+    for index, (split, scores) in enumerate(returns.items()):
+        if np.size(scores):
+            mean, low, high = _intervals(np.mean(scores, axis=2))
+            places = [names.index(name) for name in labels[split]]
+            bars = np.maximum([mean - low, high - mean], 0)
+            colour, marker = _COLOURS[index % len(_COLOURS)], _MARKERS[index % len(_MARKERS)]
+            axes.errorbar(mean, places, xerr=bars, color=colour, fmt=marker, markersize=6, capsize=3, label=split)
+    axes.set_yticks(range(len(names)), names, fontsize=8)
+    axes.invert_yaxis()
+    axes.set_xlabel("return")
+    axes.set_ylabel("")
+    axes.legend(frameon=False)
+    figure.savefig(path, dpi=_DOTS_PER_INCH)
+
+
 def compare(
     path: str | Path, curves: Mapping[str, tuple[np.ndarray, np.ndarray]], label: str = "return on training tasks"
 ) -> None:
@@ -93,7 +119,7 @@ def interference(
     path: str | Path,
     parameter: str,
     unit: str,
-    values: np.ndarray,
+    values: Sequence[str] | np.ndarray,
     cosines: Mapping[str, np.ndarray | None],
     bars: Mapping[str, np.ndarray],
 ) -> None:
@@ -103,7 +129,7 @@ def interference(
         path: the PNG file to write.
         parameter: name of the parameter in which tasks differ.
         unit: its unit.
-        values: (T,) the tasks' values of it.
+        values: (T,) the tasks' values of it, or their names.
         cosines: network -> (T, T), or None if tasks share nothing of it.
         bars: title -> (T,).
     """
@@ -111,7 +137,7 @@ def interference(
 
     figure = Figure(figsize=(9, 7.5), dpi=_DOTS_PER_INCH, layout="constrained")
     above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(1.75, 1))[:, 0]
-    labels, name = [f"{value:.3g}" for value in values], f"{parameter} [{unit}]"
+    labels, name = [_label(value) for value in values], f"{parameter} [{unit}]"
     maps, given = above.subplots(1, len(cosines), squeeze=False)[0], [x for x in cosines.values() if x is not None]
     limit = max((_limit(x) for x in given), default=1.0)
     images = [_draw_cosines(axes, who, x, limit) for axes, (who, x) in zip(maps, cosines.items(), strict=True)]
@@ -129,6 +155,10 @@ def interference(
         axes.spines[["top", "right"]].set_visible(False)
         _label_tasks(axes.xaxis, labels, name)
     figure.savefig(path, dpi=_DOTS_PER_INCH)
+
+
+def _label(value: str | float) -> str:
+    return value if isinstance(value, str) else f"{value:.3g}"
 
 
 def _draw_cosines(axes: "Axes", network: str, cosine: np.ndarray | None, limit: float) -> "AxesImage | None":
