@@ -327,11 +327,17 @@ class Mixture(Tabled):
         return "task", "number"
 
     def labels(self, split: str) -> list[str]:
-        """A short name for every task of a split."""
-        return [self.describe(int(row)) for row in self.tasks(split).row]
+        """A short name for every task of a split, such as "walker-walk friction=0.7"."""
+        found = [""] * len(self.table.rows[split])
+        for part in self.parts:
+            own, axis = part.family.labels(split), part.family.task_axis[0]
+            alone = len(part.family.table.tasks.id) == 1
+            for place, label in zip(part.places[split], own, strict=True):
+                found[place] = part.name if alone else f"{part.name} {axis}={label}"
+        return found
 
     def describe(self, row: int) -> str:
-        """Name a task by its family and what makes it different there, such as "walker-walk friction=0.7"."""
+        """Name the task of a row by its family and all that makes it different there."""
         i, own = self._place(row)
         alone = len(self.families[i].table.tasks.id) == 1
         return self.names[i] if alone else f"{self.names[i]} {self.families[i].describe(own)}"

@@ -75,16 +75,15 @@ def return_by_task(path: str | Path, labels: Mapping[str, Sequence[str]], return
         labels: split -> (T,) the tasks' names.
         returns: split -> (S, T, E); an empty array is left out.
     """
-    names = sorted({name for split in labels.values() for name in split})
+    names = list(dict.fromkeys(sorted(name for split in labels.values() for name in split)))
     figure, axes = _new_figure()
     figure.set_size_inches(7, 1.5 + 0.25 * len(names))
     for index, (split, scores) in enumerate(returns.items()):
         if np.size(scores):
             mean, low, high = _intervals(np.mean(scores, axis=2))
-            places = [names.index(name) for name in labels[split]]
             bars = np.maximum([mean - low, high - mean], 0)
-            colour, marker = _COLOURS[index % len(_COLOURS)], _MARKERS[index % len(_MARKERS)]
-            axes.errorbar(mean, places, xerr=bars, color=colour, fmt=marker, markersize=6, capsize=3, label=split)
+            style = {"color": _COLOURS[index % len(_COLOURS)], "fmt": _MARKERS[index % len(_MARKERS)], "label": split}
+            axes.errorbar(mean, [names.index(name) for name in labels[split]], xerr=bars, capsize=3, **style)
     axes.set_yticks(range(len(names)), names, fontsize=8)
     axes.invert_yaxis()
     axes.set_xlabel("return")
@@ -119,7 +118,7 @@ def interference(
     path: str | Path,
     parameter: str,
     unit: str,
-    values: Sequence[str] | np.ndarray,
+    values: np.ndarray,
     cosines: Mapping[str, np.ndarray | None],
     bars: Mapping[str, np.ndarray],
 ) -> None:
@@ -129,7 +128,7 @@ def interference(
         path: the PNG file to write.
         parameter: name of the parameter in which tasks differ.
         unit: its unit.
-        values: (T,) the tasks' values of it, or their names.
+        values: (T,) the tasks' values of it.
         cosines: network -> (T, T), or None if tasks share nothing of it.
         bars: title -> (T,).
     """
@@ -137,7 +136,7 @@ def interference(
 
     figure = Figure(figsize=(9, 7.5), dpi=_DOTS_PER_INCH, layout="constrained")
     above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(1.75, 1))[:, 0]
-    labels, name = [_label(value) for value in values], f"{parameter} [{unit}]"
+    labels, name = [f"{value:.3g}" for value in values], f"{parameter} [{unit}]"
     maps, given = above.subplots(1, len(cosines), squeeze=False)[0], [x for x in cosines.values() if x is not None]
     limit = max((_limit(x) for x in given), default=1.0)
     images = [_draw_cosines(axes, who, x, limit) for axes, (who, x) in zip(maps, cosines.items(), strict=True)]
@@ -155,10 +154,6 @@ def interference(
         axes.spines[["top", "right"]].set_visible(False)
         _label_tasks(axes.xaxis, labels, name)
     figure.savefig(path, dpi=_DOTS_PER_INCH)
-
-
-def _label(value: str | float) -> str:
-    return value if isinstance(value, str) else f"{value:.3g}"
 
 
 def _draw_cosines(axes: "Axes", network: str, cosine: np.ndarray | None, limit: float) -> "AxesImage | None":
