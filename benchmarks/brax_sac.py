@@ -56,7 +56,8 @@ def brax_rates(program: RunConfig, worlds: int, arguments: argparse.Namespace) -
     from mujoco_playground import registry, wrapper  # type: ignore  # not a dependency of this package
 
     jax.device_put_replicated = lambda tree, devices: jax.tree.map(lambda x: jnp.stack([x] * len(devices)), tree)
-    settings, agent = program.training, program.learner
+    agent = program.learner
+    settings = agent.experience
     prefill, rates = 2 * worlds, []
     env = registry.load("FingerSpin", config_overrides={"impl": "jax"})
     sac.train(

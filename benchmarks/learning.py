@@ -15,7 +15,6 @@ and evaluating, after which the training policy's mean return over tasks and see
 
 import argparse
 import csv
-import dataclasses
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -81,7 +80,8 @@ def learn(arguments: argparse.Namespace, env: str, agent: str) -> None:
         seed=arguments.seed,
         eval_every=-(-steps // arguments.evaluations),
         eval_episodes=arguments.eval_episodes,
-        settings=dataclasses.replace(program.training, **training),
+        settings=program.training,
+        **training,
         quiet=False,
     )
     if not result.finished:

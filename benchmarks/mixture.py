@@ -28,7 +28,7 @@ import numpy as np
 from report import machine, markdown
 
 import mtjax
-from mtjax.envs.mixture import States
+from mtjax.envs.mixtures import States
 from mtjax.rollout import spread
 from mtjax.training.programs import enable_compile_cache
 
@@ -220,8 +220,8 @@ def summarise(arguments: argparse.Namespace) -> str:
         writer.writerows(rows)
     cell = lambda x: "-" if x is None else f"{x:.0f}"
     lines = [[row["task"], *(cell(row[name]) for name in columns)] for row in rows]
-    known = {name: list(column.values()) for name, column in columns.items()}
-    means = {name: None if None in values else float(np.mean(values)) for name, values in known.items()}
+    known = {name: [x for x in column.values() if x is not None] for name, column in columns.items()}
+    means = {name: float(np.mean(x)) if len(x) == len(rows) else None for name, x in known.items()}
     lines.append(["mean", *(cell(means[name]) for name in columns)])
     lines.append(["seconds", "-", *(f"{part['seconds']:.0f}" for part in agents.values())])
     lines.append(["compile seconds", "-", *(f"{part['compile_seconds']:.0f}" for part in agents.values())])

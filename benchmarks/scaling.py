@@ -14,7 +14,6 @@ but for what the axis says and a warm-up of one step; no episode ends while timi
 """
 
 import argparse
-import dataclasses
 import statistics
 from pathlib import Path
 
@@ -24,7 +23,7 @@ from report import markdown, publish
 from training import Training
 
 import mtjax
-from mtjax.config import RunConfig
+from mtjax.config import RunConfig, configure
 from mtjax.types import InputError
 
 _ON_CPU = jax.default_backend() == "cpu"
@@ -86,15 +85,15 @@ def contestant(axis: str, value: int, arguments: argparse.Namespace) -> Training
     seeds = {"seeds": value, "devices": _SEEDS}.get(axis, 1)
     program = preset(num_tasks, arguments)
     num_envs = max(worlds // num_tasks, 1)
-    settings = dataclasses.replace(
-        program.training,
-        num_envs=num_envs,
-        batch_size=max(arguments.batch // num_tasks, 1),
-        replay_size=max(10 * program.training.replay_size // num_tasks, _SLOTS * num_envs),
-        warmup_steps=1,
-        chunk_steps=arguments.steps,
-    )
-    return Training(program.family, program.learner, settings, seeds, value if axis == "devices" else 1)
+    given = {
+        "num_envs": num_envs,
+        "batch_size": max(arguments.batch // num_tasks, 1),
+        "replay_size": max(10 * program.learner.experience.replay_size // num_tasks, _SLOTS * num_envs),
+        "warmup_steps": 1,
+        "chunk_steps": arguments.steps,
+    }
+    agent, settings = configure(program.learner, program.training, given)
+    return Training(program.family, agent, settings, seeds, value if axis == "devices" else 1)
 
 
 def preset(num_tasks: int, arguments: argparse.Namespace) -> RunConfig:

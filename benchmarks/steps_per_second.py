@@ -23,8 +23,8 @@ from report import publish
 from training import Training
 
 import mtjax
-from mtjax import loop
 from mtjax.envs import Domain
+from mtjax.rollout import spread
 from mtjax.types import InputError
 
 # Ours (with ten values of a physical parameter), and Playground's of the same task.
@@ -136,25 +136,25 @@ def ours(name: str, settings: dict, per_task: int, steps: int, resets: bool) -> 
     shape = (1, len(tasks.id), per_task)
 
     def play(tasks, carry):
-        worlds = loop.spread(tasks, shape)
+        worlds = spread(tasks, shape)
 
         def step(carry, _):
             state, age, key = carry
             key, act_key, reset_key = jax.random.split(key, 3)
             action = jax.random.uniform(act_key, (*shape, env.spec.action_size), minval=-1.0)
-            after = loop.play(env, worlds, state, action)
+            after = env.step_worlds(worlds, state, action)
             seen = jnp.sum(after.reward) + jnp.sum(after.obs)
             age = age + 1
             if not resets:
                 return (after.state, age, key), seen
-            fresh = lambda _: loop.begin(env, tasks, jax.random.split(reset_key, shape))[1].state
+            fresh = lambda _: env.reset_worlds(worlds, jax.random.split(reset_key, shape)).state
             ended = age >= env.episode_length
             return (jax.lax.cond(ended, fresh, lambda _: after.state, None), jnp.where(ended, 0, age), key), seen
 
         carry, seen = jax.lax.scan(step, carry, length=steps)
         return carry, jnp.sum(seen)
 
-    start = jax.jit(lambda tasks, key: loop.begin(env, tasks, jax.random.split(key, shape))[1].state)
+    start = jax.jit(lambda tasks, key: env.reset_worlds(spread(tasks, shape), jax.random.split(key, shape)).state)
     program = jax.jit(play, donate_argnums=1)
     held = [(start(tasks, jax.random.key(0)), jnp.int32(0), jax.random.key(1))]
 

@@ -6,13 +6,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mtjax.agents import SAC
+from mtjax.agents import BaseAgent
 from mtjax.envs import Family
-from mtjax.history import remember
 from mtjax.loop import Settings
 from mtjax.parallel import mesh as meshes
-from mtjax.training.programs import jitted
-from mtjax.training.run import compiled
+from mtjax.training.programs import compiled, jitted
 
 
 class Training:
@@ -24,14 +22,17 @@ class Training:
         most_devices: of those there are, how many it may use.
     """
 
-    def __init__(self, family: Family, agent: SAC, settings: Settings, seeds: int = 1, most_devices: int | None = None):
-        env, num_tasks = remember(family, agent.history), family.train_count
+    def __init__(
+        self, family: Family, agent: BaseAgent, settings: Settings, seeds: int = 1, most_devices: int | None = None
+    ):
+        env, num_tasks, experience = family, family.train_count, agent.experience
         mesh = meshes.mesh_for(seeds, num_tasks, settings.num_envs, most_devices)
-        programs, numbers = jitted(mesh), meshes.by_seed(mesh, jnp.arange(seeds))
+        programs, numbers = jitted(mesh, agent), meshes.by_seed(mesh, jnp.arange(seeds))
         tasks = meshes.everywhere(mesh, env.tasks())
         self.num_devices = 1 if mesh is None else mesh.size
         self.worlds = num_tasks * settings.num_envs
-        self.steps, self.updates = (seeds * settings.chunk_steps * n for n in (self.worlds, settings.updates_per_step))
+        self.steps = seeds * settings.chunk_steps * self.worlds
+        self.updates = seeds * settings.chunk_steps * getattr(experience, "updates_per_step", 0)
         self.seconds: list[float] = []
         jax.clear_caches()  # of the programs of others, which may be the same
         before = time.perf_counter()
@@ -40,7 +41,7 @@ class Training:
         chunk = compiled(programs.chunk.lower(env, agent, settings, tasks, self.state))
         self.compile_seconds = time.perf_counter() - before
         self.run = lambda state: chunk(tasks, state)
-        while int(self.state.iteration) <= settings.warmup_steps:
+        while int(self.state.iteration) <= getattr(experience, "warmup_steps", 0):
             self.time(count=False)
 
     def time(self, count: bool = True) -> None:

@@ -19,11 +19,10 @@ import numpy as np
 from report import markdown, publish
 
 import mtjax
-from mtjax import loop
-from mtjax.history import widen
+from mtjax.maps import over_seeds
 from mtjax.types import InputError, Spec, Task, Transition
 
-SPEC = Spec(obs_size=9, action_size=2, context_size=1)
+SPEC = Spec.vector(obs_size=9, action_size=2, context_size=1)
 _ON_CPU = jax.default_backend() == "cpu"
 
 
@@ -64,10 +63,9 @@ class Contestant:
         self.name, self.updates, self.seconds = name, arguments.updates, []
         self.num_tasks, self.num_seeds = num_tasks, num_seeds
         agent = mtjax.agent(name, hidden=arguments.hidden)
-        spec = widen(SPEC, agent.history)
         tasks, keys = tasks_of(num_tasks), jax.random.split(jax.random.key(0), num_seeds)
-        batch = random_batch(spec, num_tasks, arguments.batch)
-        self.state = jax.jit(jax.vmap(lambda key: agent.init(spec, tasks, key)))(keys)
+        batch = random_batch(SPEC, num_tasks, arguments.batch)
+        self.state = jax.jit(jax.vmap(lambda key: agent.init(SPEC, tasks, key)))(keys)
         self.num_parameters = size_of((self.state.actor, self.state.critic)) // num_seeds
 
         def learn(state: Any, keys: jax.Array) -> Any:
@@ -75,7 +73,7 @@ class Contestant:
             return jax.lax.scan(update, state, jax.random.split(keys, arguments.updates))[0]
 
         before = time.perf_counter()
-        self.run = jax.jit(loop.over_seeds(learn, 0, 0), donate_argnums=0).lower(self.state, keys).compile()
+        self.run = jax.jit(over_seeds(learn, 0, 0), donate_argnums=0).lower(self.state, keys).compile()
         self.compile_seconds, self.keys = time.perf_counter() - before, keys
         self.time(count=False)
 
@@ -102,7 +100,8 @@ class Contestant:
 
 def tasks_of(num_tasks: int) -> Task:
     row = jnp.arange(num_tasks, dtype=jnp.int32)
-    return Task(row, row, jnp.linspace(-1, 1, num_tasks)[:, None], {}, {}, {})
+    horizon = jnp.full(num_tasks, 1000, jnp.int32)
+    return Task(row, row, jnp.linspace(-1, 1, num_tasks)[:, None], {}, {}, {}, horizon)
 
 
 def random_batch(spec: Spec, num_tasks: int, batch_size: int) -> Transition:

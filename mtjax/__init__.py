@@ -3,12 +3,14 @@
 from importlib import import_module
 from typing import Any
 
+from mtjax.names import lazily
+
 __version__ = "0.1.0"
 
 _HOME = {
     "AGENTS": "mtjax.agents",
     "ENVS": "mtjax.envs",
-    "InputError": "mtjax.types",
+    "InputError": "mtjax.names",
     "Result": "mtjax.training.run",
     "Settings": "mtjax.loop",
     "Step": "mtjax.types",
@@ -18,21 +20,17 @@ _HOME = {
     "load": "mtjax.training.policy",
     "make": "mtjax.envs",
     "mixture": "mtjax.envs",
-    "preset": "mtjax.config",
+    "preset": "mtjax.config:with_preset",
 }
 __all__ = [*_HOME, "train"]
 
 
+_find = lazily(__name__, _HOME)
+
+
 def __getattr__(name: str) -> Any:
     """Import a public name when it is first used, so that ``import mtjax`` takes no time."""
-    if name in _HOME:
-        found = getattr(import_module(_HOME[name]), name)
-    elif name == "train":
-        found = import_module("mtjax.train")  # a module that is called like the function
-    else:
-        raise AttributeError(f"module 'mtjax' has no attribute {name!r}")
-    globals()[name] = found
-    return found
+    return import_module("mtjax.train") if name == "train" else _find(name)  # a module that is called like the function
 
 
 def __dir__() -> list[str]:

@@ -1,30 +1,22 @@
-"""The command line: names first, then typed overrides of what the names stand for; and its record as JSON."""
+"""The command line of training: names first, then typed overrides of what the names stand for."""
 
-import contextlib
 import dataclasses
-import importlib.util
-import io
-import itertools
-import re
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-import tyro
-
-from mtjax.agents import AGENTS, settings
+from mtjax.agents import settings
 from mtjax.agents.base import CHOICES, flag_names
-from mtjax.config import NO_FINE_TUNING, PRESETS, RunConfig, from_json, with_preset
-from mtjax.envs import ENVS, Family, Mixture, make
-from mtjax.envs.mixture import require_family
-from mtjax.names import nearest_error
-from mtjax.types import InputError
+from mtjax.commands import check_names, import_files, parse_with_tyro, unknown_flag, value_of
+from mtjax.config import NO_FINE_TUNING, RunConfig, from_json, with_preset
+from mtjax.envs import make
+from mtjax.envs.family import Family
+from mtjax.envs.mixtures import Mixture, require_family
+from mtjax.names import InputError
 
 _VARY = "--env.vary."
 _FAMILY_FLAGS = {"combine": "env.combine", "split": "split"}  # they decide which values are allowed
 _DECIDING = ("conditioning", "vectors", "heads")  # which parts go together with the rest of an agent
-P = TypeVar("P")
 
 
 def parse(argv: Sequence[str]) -> RunConfig:
@@ -34,23 +26,22 @@ def parse(argv: Sequence[str]) -> RunConfig:
         InputError: a name, flag or value cannot be used.
     """
     argv = import_files(argv)
-    env_name = _peel(argv, "env", RunConfig.env)
-    start = _peel(argv, "from", "")
+    check_names(argv)
+    env_name = value_of(argv, "env", RunConfig.env)
+    start = value_of(argv, "from", "")
     begun = from_json(Path(start) / "config.json") if start or "--from=" in argv else None
     if begun is not None and begun.points:
         raise InputError(f"--from takes a run of one setting, and {start!r} holds {len(begun.points)} of a sweep")
-    agent_name = _peel(argv, "agent", RunConfig.agent if begun is None else begun.agent)
-    preset_name = _peel(argv, "preset", RunConfig.preset)
-    if preset_name not in PRESETS:
-        raise nearest_error("preset", preset_name, PRESETS)
+    agent_name = value_of(argv, "agent", RunConfig.agent if begun is None else begun.agent)
+    preset_name = value_of(argv, "preset", RunConfig.preset)
     vary, argv = _peel_vary(argv)
     chosen, argv = _peel_parts(argv)
     of_family: dict[str, Any] = {
-        name: value for name in ("combine", "split") if (value := _peel(argv, _FAMILY_FLAGS[name], ""))
+        name: value for name in ("combine", "split") if (value := value_of(argv, _FAMILY_FLAGS[name], ""))
     }
     if "+" in env_name:
         of_family, argv = _peel_shared(argv, make(env_name))
-    told = {name: value for name in _DECIDING if (value := _peel(argv, f"agent.{name}", ""))}
+    told = {name: value for name in _DECIDING if (value := value_of(argv, f"agent.{name}", ""))}
     default = with_preset(env_name, agent_name, preset_name, {**chosen, **told}, vary=vary, **of_family)
     if begun is not None:
         default = _fine_tuning(default, begun, start, chosen)
@@ -69,43 +60,6 @@ def _fine_tuning(config: RunConfig, begun: RunConfig, start: str, chosen: Mappin
     assert isinstance(config.family, Family) and isinstance(begun.family, Family)
     learner, family = dataclasses.replace(begun.learner, tune="all"), config.family.scaled_as(begun.family)
     return dataclasses.replace(config, start=start, learner=learner, family=family)
-
-
-def _peel(argv: Sequence[str], name: str, default: str) -> str:
-    """Find --name=VALUE or --name VALUE; the last one counts."""
-    value = default
-    for i, word in enumerate(argv):
-        if word.startswith(f"--{name}="):
-            value = word.split("=", 1)[1]
-        elif word == f"--{name}":
-            if i + 1 == len(argv):
-                raise InputError(f"--{name} needs a value")
-            value = argv[i + 1]
-    return value
-
-
-def import_files(argv: Sequence[str]) -> list[str]:
-    """Run the FILE.py of every --import=FILE.py, which may register families; returns the other words.
-
-    Raises:
-        InputError: there is no such file.
-    """
-    for word in argv:
-        if word.startswith("--import="):
-            _import(Path(word.split("=", 1)[1]))
-    return [word for word in argv if not word.startswith("--import=")]
-
-
-def _import(path: Path) -> None:
-    if not path.is_file() or path.suffix != ".py":
-        raise InputError(f"--import needs a Python file, and {str(path)!r} is none")
-    known = (getattr(module, "__file__", None) for module in list(sys.modules.values()))
-    if any(file and Path(file).resolve() == path.resolve() for file in known):
-        return
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    assert spec is not None and spec.loader is not None
-    sys.modules[path.stem] = module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
 
 
 def _peel_vary(argv: Sequence[str]) -> tuple[dict[str, str], list[str]]:
@@ -202,59 +156,4 @@ def _check_flags(argv: Sequence[str], config: RunConfig) -> None:
     for word in argv:
         flag = word.split("=", 1)[0].replace("_", "-")
         if flag.startswith("--") and flag not in (*known, "--help"):
-            error = nearest_error("flag", flag, known)
-            raise InputError(str(error).split("choose from")[0] + "--help lists the flags")
-
-
-def parse_with_tyro(cls: type[P], argv: Sequence[str], default: P, name: str) -> P:
-    """Parse with tyro, whose framed error becomes one line.
-
-    Raises:
-        InputError: tyro refused the command line.
-    """
-    output = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(output):
-            return tyro.cli(cls, args=list(argv), default=default, prog=name)
-    except SystemExit as stop:
-        if stop.code in (0, None):
-            raise
-        message = re.sub(r"^Error parsing ((plan|training|family|learner): )?", "", _unframed(output.getvalue()))
-        raise InputError(message or "the command line cannot be read; --help lists the flags") from None
-
-
-def _unframed(text: str) -> str:
-    """The lines between the first two rules of tyro's frame, which has no corners where output is not UTF-8."""
-    is_rule = lambda line: line.startswith("╭") or not line.strip(" │─╰╯-")
-    below = itertools.dropwhile(lambda line: not is_rule(line), text.splitlines())
-    next(below, None)
-    return " ".join(line.strip(" │") for line in itertools.takewhile(lambda line: not is_rule(line), below))
-
-
-def catalogue() -> str:
-    """List families and agents with the first sentence of their documentation."""
-    first = lambda cls: (cls.__doc__ or "").split(".")[0].split(" (")[0].replace("\n", " ").split("  ")[0]
-    lines = ["environments:"]
-    for name, (family, _) in ENVS.items():
-        tasks = make(name).train_count
-        lines.append(f"  {name:36} {tasks:3} task{'s' if tasks > 1 else ' '}  {first(family)}")
-    lines.append("agents:")
-    return "\n".join(lines + [f"  {name:36} {preset.says}" for name, preset in AGENTS.items()])
-
-
-def main(run: Any) -> None:
-    """Run a program's entry point; what the user got wrong becomes a line and exit code 2."""
-    try:
-        run(sys.argv[1:])
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        sys.exit(130)
-    except FloatingPointError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(1)
-    except OSError as error:
-        print(f"error: {error.strerror or error}: {error.filename or ''}".rstrip(": "), file=sys.stderr)
-        sys.exit(2)
+            raise unknown_flag(flag, known)

@@ -15,11 +15,12 @@ import tyro
 
 from mtjax.agents import SAC, BaseAgent, agent, preset_of, settings
 from mtjax.agents.base import replace
-from mtjax.envs import Tabled, make
+from mtjax.commands import require_run
+from mtjax.envs import make
+from mtjax.envs.family import Tabled
 from mtjax.loop import Settings
 from mtjax.types import InputError
 
-PRESETS = ("auto", "cpu", "gpu")
 NO_FINE_TUNING = "fine-tuning takes the networks of one family's tasks to other tasks of the same shapes"
 
 
@@ -165,8 +166,7 @@ def from_json(path: Path) -> RunConfig:
     Raises:
         InputError: there is no such file, or it does not describe a run.
     """
-    if not path.is_file():
-        raise InputError(f"{str(path.parent)!r} is not a run: it has no config.json")
+    require_run(path.parent)
     try:
         record = json.loads(path.read_text())
         return RunConfig(

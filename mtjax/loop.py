@@ -158,7 +158,7 @@ def _step(env, agent, tasks, state: TrainState, keys: Key, reset_keys: Key):
     return state, (transition, _look(moment, total, state.counted))
 
 
-def _look(moment: Moment, total: Array, counted: Array) -> Metrics:
+def _look(moment: Moment, total: Array, counted: Array) -> dict[str, Any]:
     """Reduce a step to what metrics need of it, leaves (S, T)."""
     transition = moment.transition
     finished = transition.ended & counted

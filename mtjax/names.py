@@ -1,12 +1,16 @@
-"""Settings by name: errors that say what was given, what is allowed and the nearest match; lists made hashable."""
+"""Things by name: errors that say what was given and the nearest match, and imports that wait until they are needed."""
 
 import difflib
-from collections.abc import Iterable, Mapping
+import sys
+from collections.abc import Callable, Iterable, Mapping
+from importlib import import_module
 from typing import Any
 
-from mtjax.types import InputError
-
 _MANY = 20
+
+
+class InputError(ValueError):
+    """Something the user gave cannot be used; the message says what was given and what is allowed."""
 
 
 def nearest_error(kind: str, given: str, allowed: Iterable[str]) -> InputError:
@@ -22,3 +26,29 @@ def nearest_error(kind: str, given: str, allowed: Iterable[str]) -> InputError:
 def frozen(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return settings whose lists are tuples, as what is static under ``jit`` must be hashable."""
     return {name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()}
+
+
+def load(place: Any) -> Any:
+    """Import what "module:name" names; anything but a string is returned as it is."""
+    if not isinstance(place, str):
+        return place
+    module, name = place.split(":")
+    return getattr(import_module(module), name)
+
+
+def lazily(module: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
+    """Return the ``__getattr__`` of a module, which imports a name from its home when it is first used.
+
+    Args:
+        homes: name -> the module that has it, or "module:other" where it is called otherwise.
+    """
+
+    def find(name: str) -> Any:
+        if name not in homes:
+            raise AttributeError(f"module {module!r} has no attribute {name!r}")
+        home = homes[name]
+        found = load(home if ":" in home else f"{home}:{name}")
+        setattr(sys.modules[module], name, found)
+        return found
+
+    return find

@@ -9,6 +9,8 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 
+from mtjax.names import InputError as InputError  # everyone's, found here by most
+
 Array = jax.Array
 Key = jax.Array
 Metrics = dict[str, Array]
@@ -149,7 +151,3 @@ class Agent(Protocol):
     def remember(self, state: Any, memory: Any, transition: Transition, task: Task) -> Any: ...  # after a step
     def observe(self, state: Any, outcome: Outcome) -> Any: ...
     def learn(self, env: Env, states: Any, data: Any, tasks: Task, keys: Key) -> tuple[Any, Metrics]: ...  # all seeds
-
-
-class InputError(ValueError):
-    """Something the user gave cannot be used; the message says what was given and what is allowed."""

@@ -52,7 +52,7 @@ def halfway(tmp_path_factory):
 
 
 def devices_of(result):
-    return len(result.state.obs.sharding.device_set)
+    return len(result.state.worlds.obs.sharding.device_set)
 
 
 def plain(state):
@@ -71,7 +71,7 @@ def assert_same(result, other, chunks=4, rtol=1e-4):
         for name in row.keys() - set(clocks):
             number = lambda x: float(x) if x != "" else np.nan
             assert number(row[name]) == pytest.approx(number(expected[name]), rel=rtol, abs=rtol, nan_ok=True), name
-    assert len(other.rows) == len(other.state.obs) * chunks
+    assert len(other.rows) == len(other.state.worlds.obs) * chunks
     np.testing.assert_array_equal(result.evaluations.steps, other.evaluations.steps)
     for split, returns in result.evaluations.returns.items():
         np.testing.assert_allclose(returns, other.evaluations.returns[split], rtol=rtol, atol=rtol)
@@ -82,8 +82,8 @@ def test_four_devices_change_no_seed(alone, tmp_path, capfd):
     result = play(tmp_path / "run", Walk(), 4, quiet=False)
     assert "devices: 4 of 4, 1 seed on each" in capfd.readouterr().out
     assert devices_of(result) == 4 and devices_of(alone) == 1
-    assert [len(x.addressable_shards) for x in (result.state.obs, result.state.replay.rows.obs)] == [4, 4]
-    assert result.state.iteration.is_fully_replicated and result.state.replay.size.is_fully_replicated
+    assert [len(x.addressable_shards) for x in (result.state.worlds.obs, result.state.data.ring.rows.obs)] == [4, 4]
+    assert result.state.iteration.is_fully_replicated and result.state.data.ring.size.is_fully_replicated
     assert_same(result, alone)
 
 
@@ -94,7 +94,7 @@ def test_donated_state_is_gone(tmp_path):
     tasks, seeds = meshes.everywhere(mesh, env.tasks()), meshes.by_seed(mesh, jnp.arange(4))
     state = programs.init(env, AGENT, SETTINGS, tasks, seeds, None)
     after, metrics = programs.chunk(env, AGENT, SETTINGS, tasks, state)
-    assert state.replay.rows.obs.is_deleted() and int(after.iteration) == 10
+    assert state.data.ring.rows.obs.is_deleted() and int(after.iteration) == 10
     assert metrics["return"].shape == (4, 2) and len(metrics["return"].sharding.device_set) == 4
 
 
@@ -161,8 +161,8 @@ def test_devices_that_share_a_seed_learn_what_one_does(wide_alone, tmp_path, cro
     """Each has an environment of every task and what it brought, and the whole agent."""
     result = wide(tmp_path / "run", quiet=False)
     assert "devices: 4 of 4, 1 seed on every 4, 1 of each task's 4 environments on each" in capfd.readouterr().out
-    assert parts_of(result.state.obs) == ({(1, 2, 1, 1)}, 4)
-    assert parts_of(result.state.replay.rows.obs) == ({(1, 2, 25, 1, 1)}, 4)
+    assert parts_of(result.state.worlds.obs) == ({(1, 2, 1, 1)}, 4)
+    assert parts_of(result.state.data.ring.rows.obs) == ({(1, 2, 25, 1, 1)}, 4)
     assert all(x.is_fully_replicated for x in jax.tree.leaves((result.state.agent, result.state.key)))
     assert_same(result, wide_alone)
 
@@ -173,7 +173,7 @@ def test_two_seeds_on_two_devices_each(tmp_path, use, crowd):
     settings = Settings(**{**vars(WIDE), "hindsight": 0.5})
     share = lambda name: play(tmp_path / name, Goals(drawn=True), 2, agent, settings, seeds=2)
     result = share("four")
-    assert parts_of(result.state.obs) == ({(1, 4, 2, 1)}, 4)
+    assert parts_of(result.state.worlds.obs) == ({(1, 4, 2, 1)}, 4)
     use(1)
     assert_same(result, share("one"), chunks=2)
 
@@ -183,7 +183,7 @@ def test_checkpoint_goes_on_with_other_shares(wide_alone, tmp_path, use, crowd, 
     """While the ring is half full, which it is in every part alike."""
     use(before)
     halfway = wide(tmp_path, 2)
-    assert devices_of(halfway) == before and int(halfway.state.replay.size) == 20
+    assert devices_of(halfway) == before and int(halfway.state.data.ring.size) == 20
     use(after)
     result = wide(tmp_path, resume=True)
     assert devices_of(result) == after

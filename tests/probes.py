@@ -1,134 +1,25 @@
-"""Probe environments: problems so small that every Q-value is known, each of which breaks one part of a learner.
-
-After Andy Jones' five, with a task axis and a time limit. A probe is data, as a task is: one environment, and so one
-compiled program, serves all of them.
-"""
+"""What tests run agents and loops on: the package's probes, some that break on purpose, and compiled programs."""
 
 import dataclasses
 from functools import lru_cache
-from typing import NamedTuple
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from mtjax import agents, loop
-from mtjax.history import remember, widen
+from mtjax.agents.parts import trajectory
+from mtjax.config import configure
+from mtjax.envs.probes import AFTER, LIMIT, RULES, SPEC, Probe, tasks_of
+from mtjax.experience import Replay
 from mtjax.networks import Params
-from mtjax.types import Array, Key, Spec, Step, Task, Transition
+from mtjax.types import Acted, Spec, Task, Transition
 
-AFTER = 5.0  # seen only once an episode has terminated, when its value must not matter
-LIMIT = 2  # steps after which an episode is cut off
+__all__ = ["AFTER", "LIMIT", "RULES", "SPEC", "Probe", "tasks_of"]
 
 # Tests compile much and run little; without LLVM's optimisations they take half as long.
 QUICK = {"xla_backend_optimization_level": 0}
-_SPEC = Spec(obs_size=1, action_size=1, context_size=1)
-
-
-# The rules of each probe: scale, observation (), action () -> reward, next observation, terminated.
-
-
-def _one_step(scale, obs, action):
-    """Earns ``scale``: Q = scale. Needs the critic's fit to the reward, and ``discount``."""
-    return scale, AFTER, True
-
-
-def _by_observation(scale, obs, action):
-    """One step from -1 or 1: Q = scale obs. Needs the observation to reach the critic."""
-    return scale * obs, AFTER, True
-
-
-def _delayed(scale, obs, action):
-    """Two steps, from 0 and from 1, of which the last earns: Q(1) = scale, Q(0) = gamma scale."""
-    last = obs > 0.5
-    return scale * last, jnp.where(last, AFTER, 1.0), last
-
-
-def _by_action(scale, obs, action):
-    """One step: Q = -(action - scale)^2, so that the policy has a best action in each task."""
-    return -jnp.square(action - scale), AFTER, True
-
-
-def _by_both(scale, obs, action):
-    """One step from -1 or 1: Q = -(action - scale obs)^2, so that the best action turns with observation and task."""
-    return -jnp.square(action - scale * obs), AFTER, True
-
-
-def _endless(scale, obs, action):
-    """Never terminates: nothing from 0, then ``scale`` from 1 for ever, so that Q(1) = scale / (1 - gamma).
-
-    Were the time limit a termination, Q(1) would be scale; were the observation after the reset stored as the next
-    one, scale / (1 - gamma^2).
-    """
-    return scale * (obs > 0.5), 1.0, False
-
-
-RULES = {
-    "one-step": _one_step,
-    "by-observation": _by_observation,
-    "delayed": _delayed,
-    "by-action": _by_action,
-    "by-both": _by_both,
-    "endless": _endless,
-}
-EITHER_SIGN = ("by-observation", "by-both")  # episodes begin at -1 or 1, and not at 0
-
-
-class World(NamedTuple):
-    """The state of every probe."""
-
-    obs: Array  # (1,)
-    age: Array  # () int32
-
-
-def tasks_of(kind: str, scales=(1.0, -0.5)) -> Task:
-    """Tasks (T, ...) of one probe, told apart by a scale, which is also their context."""
-    scales = jnp.asarray(scales, jnp.float32)
-    same = lambda value, dtype: jnp.full(scales.shape, value, dtype)
-    goal = {
-        "scale": scales,
-        "kind": same(list(RULES).index(kind), jnp.int32),
-        "either_sign": same(kind in EITHER_SIGN, bool),
-    }
-    row = jnp.arange(len(scales), dtype=jnp.int32)
-    return Task(row, row, scales[:, None], {"scale": scales}, {}, goal)
-
-
-@dataclasses.dataclass(frozen=True)
-class Probe:
-    """Any of the probes, by the task's ``kind``."""
-
-    kind: str = "one-step"
-    episode_length: int = LIMIT
-
-    @property
-    def spec(self) -> Spec:
-        return _SPEC
-
-    def tasks(self, split: str = "train") -> Task:
-        return tasks_of(self.kind)
-
-    def task_values(self, split: str) -> np.ndarray:
-        return np.asarray(self.tasks(split).params["scale"])
-
-    def reset(self, task: Task, key: Key) -> Step:
-        state = World(self.start(task, key), jnp.int32(0))
-        return Step(state, state.obs, jnp.float32(0), jnp.bool_(False))
-
-    def step(self, task: Task, state: World, action: Array) -> Step:
-        reward, obs, terminated = self.rules(task, state, action[0])
-        obs = jnp.reshape(jnp.float32(obs), 1)
-        return Step(World(obs, state.age + 1), obs, jnp.float32(reward), jnp.bool_(terminated))
-
-    def start(self, task: Task, key: Key) -> Array:
-        sign = jnp.where(jax.random.bernoulli(key, shape=(1,)), 1.0, -1.0)
-        return jnp.where(task.goal["either_sign"], sign, 0.0)
-
-    def rules(self, task: Task, state: World, action: Array):
-        as_arrays = lambda rule: lambda *inputs: tuple(map(jnp.float32, rule(*inputs)))
-        branches = [as_arrays(rule) for rule in RULES.values()]
-        reward, obs, terminated = jax.lax.switch(task.goal["kind"], branches, task.goal["scale"], state.obs[0], action)
-        return reward, obs, terminated > 0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -169,7 +60,7 @@ class Goals(Walk):
     varied = ("scale",)
 
     def tasks(self, split="train"):
-        tasks = tasks_of("one-step", (1.0, 2.0, 3.0, 4.0))
+        tasks = tasks_of("one-step", (1.0, 2.0, 3.0, 4.0), self.episode_length)
         if not self.drawn:
             return tasks
         scales = jnp.linspace(0.1, 0.9, 50) + 10 * tasks.goal["scale"][:, None]
@@ -181,6 +72,43 @@ class Goals(Walk):
 
 
 # Agents, and running them.
+
+
+@dataclasses.dataclass(frozen=True)
+class Stub:
+    """An agent without networks: subclasses say what it does."""
+
+    experience: Replay = dataclasses.field(default_factory=Replay)
+
+    watches: ClassVar[bool] = False
+
+    def init(self, spec, tasks, key):
+        return jnp.zeros(1)
+
+    def begin(self, state, task):
+        return ()
+
+    def act(self, state, memory, obs, task, key):
+        return Acted(self.choose(state, obs, task, key), None, memory)
+
+    def choose(self, state, obs, task, key):
+        """The action (A,)."""
+        return jnp.zeros(1)
+
+    def remember(self, state, memory, transition, task):
+        return memory
+
+    def relabel(self, env, task, transition, key):
+        return env.relabel(task, transition, key)
+
+    def observe(self, state, outcome):
+        return state
+
+    def update(self, state, batch, tasks, key):
+        return state, {}
+
+    def learn(self, env, states, data, tasks, keys):
+        return self.experience.learn(env, self, states, data, tasks, keys)
 
 
 SMALL = {  # of parts that have such settings
@@ -210,9 +138,13 @@ def _programs(env, agent, settings: loop.Settings, num_seeds: int):
     return init, loop.run_chunk.lower(env, agent, settings, tasks, state).compile(QUICK)
 
 
-def train(env, agent, settings: loop.Settings, *, tasks: Task | None = None, seeds=(0,), chunks: int = 1):
-    """Return the training state after ``chunks`` chunks, and the metrics of each."""
-    tasks, history, env = env.tasks() if tasks is None else tasks, [], remember(env, agent.history)
+def train(env, agent, given: dict, *, tasks: Task | None = None, seeds=(0,), chunks: int = 1):
+    """Return the training state after ``chunks`` chunks, and the metrics of each.
+
+    ``given`` are settings of the loop and of the agent by name; episodes are not staggered unless they say so.
+    """
+    agent, settings = configure(agent, loop.Settings(stagger=False), given)
+    tasks, history = env.tasks() if tasks is None else tasks, []
     init, run_chunk = _programs(env, agent, settings, len(seeds))
     state = init(tasks, jnp.asarray(seeds, jnp.uint32))
     for _ in range(chunks):
@@ -229,13 +161,12 @@ def quick(function, *arguments):
 @lru_cache
 def _agent_programs(agent, spec: Spec, num_tasks: int, batch_size: int):
     tasks, key = tasks_of("one-step", np.ones(num_tasks)), jax.random.key(0)
-    spec = spec if spec.history else widen(spec, agent.history)
     init = lambda tasks, key: agent.init(spec, tasks, key)
-    batch = random_batch(0, num_tasks, batch_size, spec)
+    batch = random_batch(0, num_tasks, batch_size, spec, agent.history)
     return quick(init, tasks, key), quick(agent.update, jax.eval_shape(init, tasks, key), batch, tasks, key)
 
 
-def learner(agent, tasks: Task, batch_size: int, spec: Spec = _SPEC):
+def learner(agent, tasks: Task, batch_size: int, spec: Spec = SPEC):
     """Compile an agent: ``init(tasks, key)`` and ``update(state, batch, tasks, key)``."""
     return _agent_programs(agent, spec, len(tasks.id), batch_size)
 
@@ -265,20 +196,37 @@ def values(agent, state, tasks: Task, obs, action) -> np.ndarray:
     return np.stack(rows)
 
 
+def act(agent, state, obs, task, key, past=None):
+    """The action (A,) at an observation (O,) of an episode that has just begun, or after a ``past``."""
+    memory = agent.begin(state, task)
+    memory = memory if past is None else memory._replace(past=past)
+    return agent.act(state, memory, obs, task, key).action
+
+
 def mean_actions(agent, state, tasks: Task, obs) -> np.ndarray:
     """The mean action (T, B) at observations (B,)."""
-    act = lambda task: jax.vmap(lambda x: agent.act(state, x, task, None)[0])(jnp.float32(obs)[:, None])
-    return np.stack([act(pick(tasks, i)) for i in range(len(tasks.id))])
+    one = lambda task, x: act(agent, state, x, task, None)[0]
+    act_all = lambda task: jax.vmap(lambda x: one(task, x))(jnp.float32(obs)[:, None])
+    return np.stack([act_all(pick(tasks, i)) for i in range(len(tasks.id))])
 
 
-def random_batch(seed: int, num_tasks: int, batch_size: int, spec: Spec = _SPEC) -> Transition:
+def random_batch(seed: int, num_tasks: int, batch_size: int, spec: Spec = SPEC, history: int = 0) -> Transition:
     """A batch (T, B, ...) in which every field is random and about one discount in four is 0."""
     random = np.random.default_rng(seed)
     normal = lambda *shape: jnp.float32(random.normal(size=(num_tasks, batch_size, *shape)))
-    return Transition(
+    batch = Transition(
         obs=normal(spec.obs_size),
         action=jnp.tanh(normal(spec.action_size)),
         reward=normal(),
         discount=jnp.float32(random.random((num_tasks, batch_size)) < 0.75),
         next_obs=normal(spec.obs_size),
     )
+    return batch._replace(extras=random_past(random, (num_tasks, batch_size, history), spec)) if history else batch
+
+
+def random_past(random: np.random.Generator, shape: tuple[int, ...], spec: Spec = SPEC) -> trajectory.Past:
+    """Random last steps (..., H, x), ``shape`` being (..., H), of which the first half had not been taken yet."""
+    known = np.broadcast_to(np.arange(shape[-1]) >= shape[-1] // 2, shape).astype(np.float32)
+    normal = lambda size: jnp.float32(random.normal(size=(*shape, size)) * known[..., None])
+    reward = jnp.float32(random.normal(size=shape) * known)
+    return trajectory.Past(normal(spec.obs_size), jnp.tanh(normal(spec.action_size)), reward, jnp.asarray(known))

@@ -6,23 +6,25 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from mtjax.agents.hyperparameters import CONDITIONINGS
+from probes import act as act_once
 from probes import learner, pick, quick, random_batch, tasks_of, tiny
 
 from mtjax import normalize
 from mtjax.agents import AGENTS, agent
-from mtjax.agents.hyperparameters import CONDITIONINGS
 from mtjax.agents.parts.conditioning import load_vectors
 from mtjax.agents.parts.encoders import ENCODERS
 from mtjax.agents.parts.gradients.surgery import RULES
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.values import VALUES
-from mtjax.history import widen
-from mtjax.loop import actions
+from mtjax.maps import over_learners
 from mtjax.networks import Params
+from mtjax.rollout import Worlds
+from mtjax.rollout import act as act_in_all
 from mtjax.types import InputError, Spec
 
-SPEC, BATCH, ENVS = Spec(3, 2, 1), 4, 2
+SPEC, BATCH, ENVS = Spec.vector(3, 2, 1), 4, 2
 TASKS = tasks_of("one-step", (1.0, -0.5, 0.3))
 KEY = jax.random.key(2)
 SAC_METRICS = {"critic_loss", "value", "td_error", "actor_loss", "entropy", "temperature"}
@@ -81,9 +83,9 @@ def observations(spec=SPEC):
 def act(agent, state, obs, keys):
     """Actions (T, E, A) under the maps over tasks and environments; no keys: the mean ones."""
     if keys is None:
-        of_task = jax.vmap(lambda task, obs: agent.act(state, obs, task, None), (None, 0))
+        of_task = jax.vmap(lambda task, obs: act_once(agent, state, obs, task, None), (None, 0))
         return jax.vmap(of_task)(TASKS, obs)
-    of_task = jax.vmap(lambda task, obs, key: agent.act(state, obs, task, key), (None, 0, 0))
+    of_task = jax.vmap(lambda task, obs, key: act_once(agent, state, obs, task, key), (None, 0, 0))
     return jax.vmap(of_task)(TASKS, obs, keys)
 
 
@@ -99,9 +101,8 @@ def label(x):
 def test_every_combination_has_the_right_shapes(name, settings, vectors):
     """Traced, not run: an update keeps the state's shapes and types, and acting gives an action for each world."""
     agent = make(name, settings, vectors)
-    spec = widen(SPEC, agent.history)
-    state = jax.eval_shape(lambda: agent.init(spec, TASKS, KEY))
-    batch = random_batch(0, 3, BATCH, spec)
+    state = jax.eval_shape(lambda: agent.init(SPEC, TASKS, KEY))
+    batch = random_batch(0, 3, BATCH, SPEC, agent.history)
     after, metrics = jax.eval_shape(lambda state: agent.update(state, batch, TASKS, KEY), state)
     assert shapes(after) == shapes(state)
     conflicts = CONFLICTS if agent.gradients.needs == "gradients" else set()
@@ -109,7 +110,7 @@ def test_every_combination_has_the_right_shapes(name, settings, vectors):
     assert all(metrics[k].shape == () for k in conflicts - LENGTHS)
     assert all(metrics[k].shape == (3,) for k in set(metrics) - (conflicts - LENGTHS))
     for keys in (None, jax.random.split(KEY, (3, ENVS))):
-        actions = jax.eval_shape(lambda state, keys=keys: act(agent, state, observations(spec), keys), state)
+        actions = jax.eval_shape(lambda state, keys=keys: act(agent, state, observations(), keys), state)
         assert (actions.shape, actions.dtype) == ((3, ENVS, 2), jnp.float32)
 
 
@@ -133,8 +134,10 @@ def test_agents_act_and_learn(name, settings, vectors):
     assert noisy.shape == mean.shape == (3, ENVS, 2)
     assert np.all(np.abs(noisy) <= 1) and not np.allclose(noisy, mean)
     for t, e in ((0, 0), (1, 1), (2, 0)):
-        np.testing.assert_allclose(agent.act(after, obs[t, e], pick(TASKS, t), keys[t, e]), noisy[t, e], atol=1e-5)
-        np.testing.assert_allclose(agent.act(after, obs[t, e], pick(TASKS, t), None), mean[t, e], atol=1e-5)
+        np.testing.assert_allclose(
+            act_once(agent, after, obs[t, e], pick(TASKS, t), keys[t, e]), noisy[t, e], atol=1e-5
+        )
+        np.testing.assert_allclose(act_once(agent, after, obs[t, e], pick(TASKS, t), None), mean[t, e], atol=1e-5)
 
 
 MIXED = ("care", "moe", "hip-bmdp")
@@ -144,20 +147,23 @@ MIXED = ("care", "moe", "hip-bmdp")
 def test_a_world_among_many_is_that_world_alone(name):
     """Seeds x tasks x environments as an evaluation has them, on whatever device tests run: no row is another's."""
     agent, shape = tiny(name), (10, 8, 5)
-    spec, worlds = widen(SPEC, agent.history), tasks_of("one-step", np.linspace(-1, 1, 8))
-    init = lambda key: agent.init(spec, TASKS, key)
+    worlds = tasks_of("one-step", np.linspace(-1, 1, 8))
+    init = lambda key: agent.init(SPEC, TASKS, key)
     states = quick(jax.vmap(init), jax.random.split(KEY, 10))(jax.random.split(KEY, 10))
     shake = lambda x: x + 0.2 * np.random.default_rng(0).normal(size=x.shape).astype(x.dtype) if x.dtype == "f" else x
     states = states._replace(actor=jax.tree.map(shake, states.actor), critic=jax.tree.map(shake, states.critic))
-    obs = jnp.float32(np.random.default_rng(1).normal(size=(*shape, spec.obs_size)))
+    obs = jnp.float32(np.random.default_rng(1).normal(size=(*shape, SPEC.obs_size)))
     places = jnp.stack(jnp.meshgrid(*map(jnp.arange, shape), indexing="ij"), axis=-1).reshape(-1, 3)
 
     def alone(states, obs):
         pick = lambda tree, i: jax.tree.map(lambda x: x[i], tree)
-        one = lambda at: agent.act(pick(states, at[0]), obs[tuple(at)], pick(worlds, at[1]), None)
+        one = lambda at: act_once(agent, pick(states, at[0]), obs[tuple(at)], pick(worlds, at[1]), None)
         return jax.lax.map(one, places).reshape(*shape, -1)
 
-    many = lambda states, obs: actions(agent, states, worlds, worlds, obs, None)
+    def many(states, obs):
+        memory = over_learners(lambda state, task, _: agent.begin(state, task))(states, worlds, obs)
+        return act_in_all(agent, states, worlds, Worlds((), None, obs, memory, obs), None).action
+
     together, apart = (quick(f, states, obs)(states, obs) for f in (many, alone))
     assert np.ptp(np.asarray(apart), axis=(0, 2)).min() > 0.01
     np.testing.assert_allclose(together, apart, atol=1e-5 if jax.default_backend() == "cpu" else 0.02)
@@ -167,8 +173,7 @@ def test_a_world_among_many_is_that_world_alone(name):
 def test_what_the_networks_see_of_a_task(told, vectors):
     """Features (Z,) of the second task."""
     agent = make("sac", {"conditioning": told}, vectors)
-    spec = widen(SPEC, agent.history)
-    state = jax.eval_shape(lambda: agent.init(spec, TASKS, KEY))._replace(contexts=TASKS.context, vectors=None)
+    state = jax.eval_shape(lambda: agent.init(SPEC, TASKS, KEY))._replace(contexts=TASKS.context, vectors=None)
     state = state._replace(vectors=load_vectors(vectors, 3) if told == "vectors" else None)
     expected = {"one-hot": [0, 1, 0], "parameters": [-0.5], "vectors": np.load(vectors)[1]}.get(told, [])
     np.testing.assert_allclose(agent.features(state, pick(TASKS, 1)), np.float32(expected))

@@ -19,7 +19,7 @@ from conftest import SHORT_RUN
 
 import mtjax.evaluate
 import mtjax.train
-from mtjax import cli
+from mtjax import cli, commands
 from mtjax.agents import AGENTS, PARTS
 from mtjax.agents import settings as settings_of
 from mtjax.config import from_json, load_preset, to_json, with_preset
@@ -42,7 +42,7 @@ def complaint(monkeypatch, capsys, tmp_path, short_family):
     def complaint(command, *words):
         monkeypatch.setattr("sys.argv", [command, *map(str, words)])
         with pytest.raises(SystemExit) as stop:
-            cli.main(COMMANDS[command])
+            commands.main(COMMANDS[command])
         said = capsys.readouterr().err
         assert stop.value.code == 2 and said.startswith("error: ") and said.count("\n") == 1
         assert len(said) < 400
@@ -373,7 +373,7 @@ def test_errors_of_a_run_are_one_line(capsys, error, code, said):
         raise error
 
     with pytest.raises((SystemExit, KeyboardInterrupt)) as stop:  # an interrupt let through would end pytest
-        cli.main(fails)
+        commands.main(fails)
     assert getattr(stop.value, "code", None) == code and capsys.readouterr().err == said
 
 
@@ -384,7 +384,7 @@ def test_errors_of_ours_are_not_hidden():
         raise KeyError("ours")
 
     with pytest.raises(KeyError):
-        cli.main(fails)
+        commands.main(fails)
 
 
 @pytest.mark.parametrize(

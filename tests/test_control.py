@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from probes import tiny
 
+import mtjax
 from mtjax import loop
+from mtjax.config import configure
 from mtjax.envs.mtenv.control import (
     Acrobot,
     AcrobotState,
@@ -239,6 +241,15 @@ def test_episodes_start_near_rest(env, width):
     assert not np.array_equal(step.obs[0], step.obs[1])
 
 
+@pytest.mark.parametrize(
+    ("name", "ranges"), [("control-cartpole", CARTPOLE_RANGES), ("control-acrobot", ACROBOT_RANGES)]
+)
+def test_registered_families_draw_from_the_ranges(name, ranges):
+    """Of which MTEnv draws."""
+    found = mtjax.make(name).variation
+    assert dict(zip(found.names, zip(found.low, found.high, strict=True), strict=True)) == ranges
+
+
 @pytest.mark.parametrize(("env", "ranges"), [(CARTPOLE, CARTPOLE_RANGES), (ACROBOT, ACROBOT_RANGES)])
 def test_random_tasks_fill_the_ranges(env, ranges):
     """The context is the varied parameters, each scaled to [-1, 1]; those that do not vary are nominal."""
@@ -288,7 +299,8 @@ def test_mtenv_numbers_of_an_acrobot():
 def test_an_agent_trains_on_it(env):
     """Traced, not run: the loop, agent and tasks fit together, and time limits are the loop's to count."""
     env, agent = dataclasses.replace(env, num_tasks=3), tiny("sac-conditioned")
-    settings = loop.Settings(num_envs=2, batch_size=4, replay_size=12, warmup_steps=1, chunk_steps=2)
+    given = {"num_envs": 2, "batch_size": 4, "replay_size": 12, "warmup_steps": 1, "chunk_steps": 2}
+    agent, settings = configure(agent, loop.Settings(), given)
     assert env.episode_length == 500
     state = jax.eval_shape(lambda: loop.init(env, agent, settings, env.tasks(), jnp.arange(1)))
     after, _ = jax.eval_shape(lambda state: loop.run_chunk(env, agent, settings, env.tasks(), state), state)

@@ -7,15 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from probes import QUICK, Probe, learner, of_task, only_seed, pick, random_batch, tasks_of, tiny, train
+from probes import act as act_once
 from probes import values as values_of
 
 from mtjax.agents.deepmdp import SIGHT, Targets, only
-from mtjax.history import Past, Seen, remember, widen
-from mtjax.loop import Settings
+from mtjax.agents.parts.trajectory import Past, Seen, append
+from mtjax.agents.sac import Batch
 from mtjax.networks import Params
 from mtjax.types import InputError, Spec
 
-SPEC, BATCH = Spec(3, 2, 1), 4
+SPEC, BATCH = Spec.vector(3, 2, 1), 4
 TASKS = tasks_of("one-step", (1.0, -0.5, 0.3))
 KEY = jax.random.key(2)
 SMALL = {"latent_widths": (8, 6), "model_widths": (8,)}
@@ -27,37 +28,39 @@ def make(name, **settings):
     return tiny(name, **{**SMALL, **settings})
 
 
-def spec_of(agent):
-    return widen(SPEC, agent.history)
-
-
 def start(agent):
     """A fresh state, a batch and the compiled update."""
-    init, update = learner(agent, TASKS, BATCH, spec_of(agent))
-    return init(TASKS, KEY), random_batch(0, 3, BATCH, spec_of(agent)), update
+    init, update = learner(agent, TASKS, BATCH, SPEC)
+    return init(TASKS, KEY), random_batch(0, 3, BATCH, SPEC, agent.history), update
 
 
 def random_params(agent, task=0):
     """Actor and critics of one task, all random, so that no bias is zero."""
-    state = jax.eval_shape(lambda: agent.init(spec_of(agent), TASKS, KEY))
+    state = jax.eval_shape(lambda: agent.init(SPEC, TASKS, KEY))
     random = np.random.default_rng(4)
     draw = lambda tree: jax.tree.map(lambda x: jnp.float32(random.normal(size=x.shape)), tree)
     return tuple(of_task(draw(params), task) for params in (state.actor, state.critic))
 
 
 def one_task(agent):
-    """A batch of one task, as the losses see it, its features, and targets that are random."""
-    batch, random = pick(random_batch(1, 3, BATCH, spec_of(agent)), 1), np.random.default_rng(6)
-    see = lambda obs: agent._see(agent_moments(agent), obs)
-    batch = batch._replace(obs=see(batch.obs), next_obs=see(batch.next_obs))
+    """A batch of one task, as the losses see it, and targets that are random."""
+    batch, random = pick(random_batch(1, 3, BATCH, SPEC, agent.history), 1), np.random.default_rng(6)
+    next_past = append(batch.extras, batch.obs, batch.action, batch.reward) if agent.history else None
+    see = lambda obs, past: agent.see(None, obs, past)
     normal = lambda *shape: jnp.float32(random.normal(size=shape))
     width = {"parameters": 1, "one-hot": 3}.get(agent.conditioning, 0)
     noise = normal(BATCH, 6) if agent.transition == "probabilistic" else jnp.float32(0)
-    return batch, normal(width), Targets(normal(BATCH), normal(BATCH, 6), noise, normal(agent.embedding_size))
-
-
-def agent_moments(agent):
-    return jax.eval_shape(lambda: agent.init(spec_of(agent), TASKS, KEY)).moments
+    seen = Batch(
+        obs=see(batch.obs, batch.extras),
+        action=batch.action,
+        reward=batch.reward,
+        discount=agent.gamma * batch.discount,
+        next_obs=see(batch.next_obs, next_past),
+        told=normal(width),
+        temperature=jnp.float32(0.1),
+        mask=None,
+    )
+    return seen, Targets(normal(BATCH), normal(BATCH, 6), noise, normal(agent.embedding_size))
 
 
 # Plain NumPy: networks from their parameters.
@@ -101,12 +104,12 @@ def test_model_losses(name, transition):
     """The likelihood of the slow encoder's next state, and the reward told from the state that is drawn."""
     agent = make(name, transition=transition)
     _, critic = random_params(agent)
-    batch, features, targets = one_task(agent)
-    told = np.asarray(critic.own["embedding"] if name == "hip-bmdp" else features)
+    batch, targets = one_task(agent)
+    told = np.asarray(critic.own["embedding"] if name == "hip-bmdp" else batch.told)
     mean, deviation = plain_transition(agent, critic, told, batch)
     likelihood = 0.5 * ((mean - targets.latent) / deviation) ** 2 + np.log(deviation)
     reward = plain_model(critic.shared["reward"], mean + deviation * np.asarray(targets.noise), told)[:, 0]
-    _, metrics = jit(agent.critic_loss)(critic, (batch, features, targets))
+    _, metrics = jit(agent.critic_loss)(critic, (batch, targets))
     np.testing.assert_allclose(metrics["transition_loss"], likelihood.mean(), rtol=1e-4)
     np.testing.assert_allclose(metrics["reward_loss"], np.mean((reward - batch.reward) ** 2), rtol=1e-4)
 
@@ -126,11 +129,11 @@ def test_theta_loss(transition):
     """Per sample: the distance of two vectors against that of the two predictions, in mean and deviation."""
     agent = make("hip-bmdp", transition=transition)
     _, critic = random_params(agent)
-    batch, features, targets = one_task(agent)
+    batch, targets = one_task(agent)
     theta, rival = np.asarray(critic.own["embedding"]), np.asarray(targets.rival)
     ours, theirs = (np.stack(plain_transition(agent, critic, x, batch)) for x in (theta, rival))
     moved = np.sqrt(((ours - theirs) ** 2).sum(axis=(0, 2)))
-    loss = jit(agent.theta_loss)(critic, features, batch.obs, batch.action, rival)
+    loss = jit(agent.theta_loss)(critic, batch.told, batch.obs, batch.action, rival)
     np.testing.assert_allclose(loss, (np.linalg.norm(theta - rival) - moved) ** 2, rtol=1e-4)
 
 
@@ -138,7 +141,7 @@ def test_theta_loss_of_three_tasks_by_hand(monkeypatch):
     """Thetas 3, 4 and 5 apart, and a state s that moves predictions by s theta: (d - |s| d)^2 for each sample."""
     agent = make("hip-bmdp", embedding_size=2)
     monkeypatch.setattr(type(agent), "foretell", lambda self, p, latent, told, a: (latent * told, 0 * latent * told))
-    monkeypatch.setattr(type(agent), "see", lambda self, p, features, obs: (obs, p.own["embedding"]))
+    monkeypatch.setattr(type(agent), "perceive", lambda self, p, features, obs: (obs, p.own["embedding"]))
     thetas = np.array([[0, 0], [3, 0], [3, 4]], np.float32)
     obs = jnp.float32([[0.0], [1.0], [-3.0]])
     for i, j, apart in ((0, 1, 3), (1, 2, 4), (2, 0, 5), (0, 0, 0)):
@@ -151,8 +154,8 @@ def test_a_rival_is_always_another_task():
     """Over many keys every other task has its turn; one that is alone is its own, and learns nothing of it."""
     agent = make("hip-bmdp")
     state, batch, _ = start(agent)
-    features, temperature = jnp.zeros((3, 0)), jnp.ones(3)
-    rivals = jit(lambda key: agent.critic_problem(state, batch, features, temperature, key)[1][2].rival)
+    _, seen = agent.prepare(state, batch, TASKS)
+    rivals = jit(lambda key: agent.critic_problem(state, seen, key)[1][1].rival)
     thetas, turns = np.asarray(state.critic.own["embedding"]), set()
     for seed in range(12):
         found = np.asarray(rivals(jax.random.key(seed)))
@@ -162,8 +165,7 @@ def test_a_rival_is_always_another_task():
     first = lambda tree: jax.tree.map(lambda x: x[:1], tree)
     state = state._replace(critic=Params(state.critic.shared, first(state.critic.own)))
     state = state._replace(target=Params(state.target.shared, first(state.target.own)))
-    batch, features, temperature = first((batch, features, temperature))
-    loss, data = agent.critic_problem(state, batch, features, temperature, KEY)
+    loss, data = agent.critic_problem(state, first(seen), KEY)
     theta_loss = lambda critic: loss(critic, jax.tree.map(lambda x: x[0], data))[1]["theta_loss"]
     value, slope = jit(jax.value_and_grad(theta_loss))(of_task(state.critic, 0))
     np.testing.assert_allclose(value, 0, atol=1e-10)
@@ -202,11 +204,11 @@ def test_what_is_detached_stays():
     """The next state, the rival's theta, and whatever the actor stands on."""
     agent = make("hip-bmdp", transition="probabilistic", **INFERRED)
     actor, critic = random_params(agent)
-    batch, features, targets = one_task(agent)
-    model = lambda x: agent.critic_loss(critic, (batch, features, targets._replace(**x)))[0]
+    batch, targets = one_task(agent)
+    model = lambda x: agent.critic_loss(critic, (batch, targets._replace(**x)))[0]
     slopes = jit(jax.grad(model))({"latent": targets.latent, "rival": targets.rival})
     assert not any(np.any(x) for x in jax.tree.leaves(slopes))
-    acted = lambda actor, critic: jnp.sum(agent.policy(actor, critic, features, batch.obs) ** 2)
+    acted = lambda actor, critic: jnp.sum(agent.policy(actor, critic, batch.told, batch.obs) ** 2)
     of_actor, of_critic = jit(jax.grad(acted, argnums=(0, 1)))(actor, critic)
     assert reached(of_actor) == {"body", "head"} and reached(of_critic) == set()
 
@@ -236,7 +238,7 @@ def test_everything_that_should_learn_does(name, settings):
     before, _, update = start(agent)
     after = before
     for i in range(10):
-        after, metrics = update(after, random_batch(i, 3, BATCH, spec_of(agent)), TASKS, jax.random.key(i))
+        after, metrics = update(after, random_batch(i, 3, BATCH, SPEC, agent.history), TASKS, jax.random.key(i))
     assert jax.tree.map(jnp.shape, after) == jax.tree.map(jnp.shape, before)
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves((after, metrics)))
     for network in ("actor", "critic", "target"):
@@ -265,16 +267,16 @@ def test_the_target_is_the_slow_encoders():
     """Next latent states come from the slow copy; the slow critics stand on it, too."""
     agent = make("deepmdp")
     actor, critic = random_params(agent)
-    batch, features, _ = one_task(agent)
+    batch, _ = one_task(agent)
     slow = only(jax.tree.map(lambda x: x * 1.5 + 0.05, critic), ("body", "head", *SIGHT))
-    target = jit(agent.critic_target)(actor, critic, slow, features, 0.1, batch, KEY)
+    target = jit(agent.target)(actor, critic, slow, batch, KEY)
     expected = plain_latent(slow.shared["latent"], np.asarray(batch.next_obs))
     np.testing.assert_allclose(target.latent, expected, rtol=1e-4, atol=1e-5)
-    latent, told = agent.see(slow, features, batch.obs)
+    latent, told = agent.perceive(slow, batch.told, batch.obs)
     plain = jax.vmap(agent.critic.apply, (0, None, None, None))(
         only(slow, ("body", "head")), told, latent, batch.action
     )
-    np.testing.assert_allclose(agent.values(slow, features, batch.obs, batch.action), plain[..., 0], rtol=1e-5)
+    np.testing.assert_allclose(agent.values(slow, batch.told, batch.obs, batch.action), plain[..., 0], rtol=1e-5)
 
 
 # Tasks that were not trained on.
@@ -288,12 +290,12 @@ def test_theta_of_an_unseen_task(strategy):
     agent, plain = make("hip-bmdp", unseen_theta=strategy), make("hip-bmdp")
     state, _, _ = start(plain)
     thetas, obs = state.critic.own["embedding"], jnp.ones(3)
-    act = jit(lambda state, task: agent.act(state, obs, task, None))
+    act = jit(lambda state, task: act_once(agent, state, obs, task, None))
     stand_in = {"nearest": thetas[2], "zero": jnp.zeros(4), "mean": np.mean(thetas, axis=0)}[strategy]
     given = state._replace(critic=state.critic._replace(own={"embedding": thetas.at[0].set(stand_in)}))
     np.testing.assert_allclose(act(state, STRANGER), act(given, pick(TASKS, 0)), atol=1e-6)
     for i in range(3):
-        expected = plain.act(state, obs, pick(TASKS, i), None)
+        expected = act_once(plain, state, obs, pick(TASKS, i), None)
         np.testing.assert_allclose(act(state, pick(TASKS, i)), expected, atol=1e-6)
     assert (
         agent.unseen
@@ -309,23 +311,24 @@ def test_theta_of_an_unseen_task_is_inferred_from_its_last_steps():
     """The guess takes theta's place there, follows the steps, and leaves training tasks alone."""
     agent = make("hip-bmdp", **INFERRED)
     state, batch, _ = start(agent)
-    act = jit(lambda state, obs, task: agent.act(state, obs, task, None))
-    obs = batch.obs[0, 0]
-    guess = agent.apply(state.critic, "guess", agent._see(state.moments, obs))
+    act = jit(lambda state, past, task: act_once(agent, state, batch.obs[0, 0], task, None, past))
+    past = pick(batch.extras, (0, 0))
+    guess = agent.apply(state.critic, "guess", agent.see(state.moments, batch.obs[0, 0], past))
     thetas = state.critic.own["embedding"]
     given = state._replace(critic=state.critic._replace(own={"embedding": thetas.at[0].set(guess)}))
-    np.testing.assert_allclose(act(state, obs, STRANGER), act(given, obs, pick(TASKS, 0)), atol=1e-6)
-    other = obs.at[3:].add(1.0)
-    assert not np.allclose(act(state, obs, STRANGER), act(state, other, STRANGER))
-    np.testing.assert_array_equal(act(state, obs, pick(TASKS, 0)), act(state, other, pick(TASKS, 0)))
+    np.testing.assert_allclose(act(state, past, STRANGER), act(given, past, pick(TASKS, 0)), atol=1e-6)
+    other = past._replace(reward=past.reward + 1.0)
+    assert not np.allclose(act(state, past, STRANGER), act(state, other, STRANGER))
+    np.testing.assert_array_equal(act(state, past, pick(TASKS, 0)), act(state, other, pick(TASKS, 0)))
     assert agent.unseen == "each has a theta inferred from its last steps"
 
 
 def test_the_guess_finds_the_theta_of_the_task_that_steps_were_taken_in():
     """Rewards of a step tell the task; after training each task's guess is near its own theta."""
     agent = make("hip-bmdp", critic_lr=1e-2, **INFERRED)
-    env = remember(Probe("endless", episode_length=4), agent.history)
-    state, history = train(env, agent, Settings(4, 2, 16, 2000, 20, 1, 300))
+    given = {"num_envs": 4, "updates_per_step": 2, "batch_size": 16, "replay_size": 2000, "warmup_steps": 20}
+    env = Probe("endless", episode_length=4)
+    state, history = train(env, agent, given | {"warmup_hold": 1, "chunk_steps": 300})
     assert history[0]["guess_loss"].shape == (1, 2)
     state = only_seed(state.agent)
     thetas = state.critic.own["embedding"]
@@ -380,7 +383,8 @@ def test_values_are_learned_through_the_slow_encoder():
     rates = {"tau": 0.3, "encoder_tau": 0.3, "actor_lr": 1e-2, "critic_lr": 1e-2}
     agent = make("hip-bmdp", gamma=0.9, initial_temperature=1e-6, temperature_lr=1e-9, **rates)
     tasks = tasks_of("delayed", (0.7, -0.5))
-    state, _ = train(Probe("delayed"), agent, Settings(8, 4, 32, 8000, 150, 1, 300), tasks=tasks)
+    given = {"num_envs": 8, "updates_per_step": 4, "batch_size": 32, "replay_size": 8000, "warmup_steps": 150}
+    state, _ = train(Probe("delayed"), agent, given | {"warmup_hold": 1, "chunk_steps": 300}, tasks=tasks)
     obs, action = np.repeat([0.0, 1.0], 3), np.tile([-0.8, 0.0, 0.8], 2)
     for found, scale in zip(values_of(agent, only_seed(state.agent), tasks, obs, action), (0.7, -0.5), strict=True):
         np.testing.assert_allclose(found, [scale * np.where(obs > 0.5, 1, 0.9)] * 2, atol=0.08)
@@ -407,15 +411,14 @@ def test_parts_combine(name, settings):
     """Traced over two seeds, not run: an update keeps shapes and types, and there is an action for each world."""
     settings = {k: v for k, v in settings.items() if name == "hip-bmdp" or k != "unseen_theta"}
     agent, keys = make(name, **settings), jax.random.split(KEY, 2)
-    spec = spec_of(agent)
-    batch = jax.tree.map(lambda x: jnp.stack([x, x]), random_batch(0, 3, BATCH, spec))
-    state = jax.eval_shape(jax.vmap(lambda key: agent.init(spec, TASKS, key)), keys)
+    batch = jax.tree.map(lambda x: jnp.stack([x, x]), random_batch(0, 3, BATCH, SPEC, agent.history))
+    state = jax.eval_shape(jax.vmap(lambda key: agent.init(SPEC, TASKS, key)), keys)
     update = jax.vmap(lambda state, batch, key: agent.update(state, batch, TASKS, key))
     after, metrics = jax.eval_shape(update, state, batch, keys)
     types = lambda tree: jax.tree.map(lambda x: (x.shape, x.dtype), tree)
     assert types(after) == types(state)
     assert all(metrics[k].shape == (2, 3) for k in ("critic_loss", "transition_loss", "reward_loss", "actor_loss"))
-    act = jax.vmap(lambda state, obs: agent.act(state, obs, STRANGER, None))
+    act = jax.vmap(lambda state, obs: act_once(agent, state, obs, STRANGER, None))
     assert jax.eval_shape(act, state, batch.obs[:, 0, 0]).shape == (2, 2)
 
 

@@ -20,9 +20,8 @@ from mtjax import loop
 from mtjax.agents import AGENTS
 from mtjax.agents.parts.encoders import ENCODERS
 from mtjax.config import from_json, to_json
-from mtjax.history import widen
 from mtjax.networks import Params, tanh_normal
-from mtjax.report import diagnostics
+from mtjax.report import diagnostics, scoring
 from mtjax.report import figures as plot
 from mtjax.report.diagnostics import Activity, activity, compare_gradients, dormant_share, effective_ranks, utilisation
 from mtjax.training import checkpoint, log
@@ -30,7 +29,7 @@ from mtjax.training.policy import load_experience
 from mtjax.types import InputError, Spec
 
 TASKS, BATCH, KEY = tasks_of("one-step", (1.0, -0.5, 0.3)), 8, jax.random.key(5)
-SPEC = Spec(3, 2, 1)
+SPEC = Spec.vector(3, 2, 1)
 
 
 def started(agent):
@@ -231,23 +230,22 @@ def test_activity_is_that_of_the_networks():
     """Mean activity and hidden layers of every critic and of the actor are what the networks compute for each task."""
     agent = tiny("multi-head", hidden=(8, 4), normalize_observations=True)
     state, batch = started(agent), random_batch(1, 3, BATCH, SPEC)
-    seen, (_, batch, features, _) = watched(agent, state, batch), agent.prepare(state, batch, TASKS)
+    seen, (_, batch) = watched(agent, state, batch), agent.prepare(state, batch, TASKS)
     for i in range(3):
-        hidden = agent.actor.hidden(of_task(state.actor, i), features[i], batch.obs[i])
+        hidden = agent.actor.hidden(of_task(state.actor, i), batch.told[i], batch.obs[i])
         np.testing.assert_allclose(seen["actor"].hidden[i, :, 0], hidden, rtol=1e-4, atol=1e-5)
         level = seen["actor"].layers["Trunk/MLP_0/ReLU_1"][i, 0]
         np.testing.assert_allclose(level, np.mean(hidden, axis=0), rtol=1e-4, atol=1e-5)
         for n in range(2):
             params = pick(of_task(state.critic, i), n)
-            hidden = agent.critic.hidden(params, features[i], batch.obs[i], batch.action[i])
+            hidden = agent.critic.hidden(params, batch.told[i], batch.obs[i], batch.action[i])
             np.testing.assert_allclose(seen["critic"].hidden[i, :, n], hidden, rtol=1e-4, atol=1e-5)
 
 
 def trace(agent):
     """What diagnostics of an agent would be: shapes alone."""
-    spec = widen(SPEC, agent.history)
-    state = shapes_of(agent, spec)
-    batch = jax.eval_shape(lambda: random_batch(0, 3, BATCH, spec))
+    state = shapes_of(agent)
+    batch = jax.eval_shape(lambda: random_batch(0, 3, BATCH, SPEC, agent.history))
     gradients = jax.eval_shape(partial(compare_gradients, agent), state, batch, TASKS, KEY)
     seen = jax.eval_shape(partial(activity, agent), state, batch, TASKS)
     return state, gradients, seen
@@ -346,7 +344,7 @@ def run_of(copied_run):
 def no_episodes(monkeypatch):
     """Leaves out what an evaluation does besides, which compiles for ten seconds."""
     empty = lambda policy, episodes, seed: {"train": np.zeros((len(policy.seeds), 2, 1))}
-    monkeypatch.setattr(mtjax.evaluate, "score", empty)
+    monkeypatch.setattr(scoring, "score", empty)
 
 
 @pytest.mark.parametrize("name", ["sac-conditioned", "pcgrad", "disjoint"])
@@ -407,7 +405,7 @@ def test_replay_is_read_without_the_rest(copied_run):
     whole = checkpoint.load(copied_run / "checkpoints", jax.eval_shape(lambda: loop.init(*fixed)))
     shutil.rmtree(copied_run / "checkpoints" / "150" / "agent")
     replay, batch_size = load_experience(copied_run)
-    jax.tree.map(np.testing.assert_array_equal, replay, whole.replay)
+    jax.tree.map(np.testing.assert_array_equal, replay, whole.data.ring)
     assert batch_size == 4 and int(replay.size) == 100
 
 

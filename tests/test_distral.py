@@ -10,15 +10,16 @@ import optax
 import pytest
 import scipy.optimize
 from probes import QUICK, learner, of_task, pick, random_batch, tasks_of, tiny
+from probes import act as act_once
 
 from mtjax.agents import agent
 from mtjax.agents.distral import Distral
 from mtjax.agents.parts.gradients.descent import descend
-from mtjax.agents.sac import SAC
+from mtjax.agents.sac import SAC, Batch
 from mtjax.networks import Params, log_density, sample_raw, tanh_normal
 from mtjax.types import InputError, Spec
 
-SPEC, BATCH = Spec(3, 2, 1), 4
+SPEC, BATCH = Spec.vector(3, 2, 1), 4
 TASKS = tasks_of("one-step", (1.0, -0.5, 0.3))
 KEY, FEATURES = jax.random.key(5), jnp.zeros(0)
 
@@ -107,6 +108,12 @@ def charged(made, actor, obs):
     return raw, densities[0] - made.distral_alpha * densities[1], densities
 
 
+def seen(rows, gamma=0.99):
+    """What the losses see of transitions of one task."""
+    fields = (rows.obs, rows.action, rows.reward, gamma * rows.discount, rows.next_obs)
+    return Batch(*fields, told=FEATURES, temperature=TEMPERATURE, mask=None)
+
+
 def test_critic_target(state, batch):
     """y = r + discount gamma (min Q - a (log pi_i - alpha log pi_0))."""
     made, rows = tiny("distral", distral_alpha=ALPHA, gamma=0.9), pick(batch, 1)
@@ -114,9 +121,9 @@ def test_critic_target(state, batch):
     raw, cost, _ = charged(made, actor, rows.next_obs)
     values = np.min(made.values(target, FEATURES, rows.next_obs, jnp.tanh(raw)), axis=0)
     expected = np.asarray(rows.reward) + 0.9 * np.asarray(rows.discount) * (values - TEMPERATURE * cost)
-    found = made.critic_target(actor, critic, target, FEATURES, TEMPERATURE, rows, KEY)
+    found = made.target(actor, critic, target, seen(rows, 0.9), KEY)
     np.testing.assert_allclose(found, expected, rtol=1e-4)
-    plain = SAC.sample(made, actor, critic, FEATURES, rows.next_obs, KEY)[1]
+    plain = SAC.sample(made, actor, critic, seen(rows), rows.next_obs, KEY).log_prob
     assert np.all(np.abs(cost - plain) > 0.1)  # that the distilled policy has a say here
 
 
@@ -126,7 +133,7 @@ def test_actor_loss(state, batch):
     actor, critic, _ = problem(state)
     raw, cost, (own, common) = charged(made, actor, rows.obs)
     values = np.min(made.values(critic, FEATURES, rows.obs, jnp.tanh(raw)), axis=0)
-    loss, metrics = made.actor_loss(actor, (rows, FEATURES, critic, TEMPERATURE, KEY))
+    loss, metrics = made.actor_loss(actor, (seen(rows), critic, KEY))
     policy_loss = np.mean(TEMPERATURE * cost - values)
     np.testing.assert_allclose(loss, policy_loss - np.mean(common), rtol=1e-4)
     np.testing.assert_allclose(metrics["actor_loss"], policy_loss, rtol=1e-4)
@@ -145,7 +152,7 @@ def test_each_loss_reaches_its_own_policy_alone(state, batch):
     """The policy's never the distilled parameters, and distillation these alone, by its actions too."""
     made, rows = tiny("distral", distral_alpha=ALPHA), pick(batch, 1)
     actor, critic, _ = problem(state)
-    data = (rows, FEATURES, critic, TEMPERATURE, KEY)
+    data = (seen(rows), critic, KEY)
     own, distilled = slopes(made, actor, data, SAC.actor_loss)
     both_own, both_distilled = slopes(made, actor, data, Distral.actor_loss)
     assert all(np.all(x == 0) for x in leaves(distilled))
@@ -167,7 +174,7 @@ def test_the_action_carries_the_distilled_policys_slope(state, batch):
     made, rows = tiny("distral", distral_alpha=ALPHA), pick(batch, 1)
     actor, critic, _ = problem(state)
     mute = jax.tree.map(jnp.zeros_like, critic)
-    own, _ = slopes(made, actor, (rows, FEATURES, mute, TEMPERATURE, KEY), Distral.actor_loss)
+    own, _ = slopes(made, actor, (seen(rows), mute, KEY), Distral.actor_loss)
     outputs = np.asarray(made.policy(actor, actor, FEATURES, rows.obs), np.float64)
     common = made.actor.apply_distilled(actor, FEATURES, rows.obs)
     noise = np.asarray(jax.random.normal(KEY, (BATCH, 2)), np.float64)
@@ -266,13 +273,14 @@ def optimum(alpha):
 def test_a_bandits_optimum(alpha):
     """The more the distilled policy counts, the nearer it draws the tasks' policies, and exactly so far."""
     made, optimizer = KnownCritic(hidden=(8,), distral_alpha=alpha), optax.adam(3e-3)
-    rows = jax.tree.map(jnp.zeros_like, random_batch(0, 2, 256, Spec(1, 1, 1)))
+    rows = jax.tree.map(jnp.zeros_like, random_batch(0, 2, 256, Spec.vector(1, 1, 1)))
     goals, temperature = jnp.float32([GOAL, -GOAL]), jnp.full(2, HEAT)
-    of_tasks = jax.vmap(made.actor_loss, (Params(None, 0), (0, None, Params(None, 0), 0, 0)))
+    own = Batch(rows.obs, rows.action, rows.reward, rows.discount, rows.next_obs, jnp.zeros((2, 0)), temperature, None)
+    of_tasks = jax.vmap(made.actor_loss, (Params(None, 0), (0, Params(None, 0), 0)))
 
     def learn(carry, key):
         actor, memory = carry
-        data = (rows, FEATURES, Params({}, goals), temperature, jax.random.split(key, 2))
+        data = (own, Params({}, goals), jax.random.split(key, 2))
         slope = jax.grad(lambda actor: jnp.mean(of_tasks(actor, data)[0]))(actor)
         actor, memory = descend(optimizer, slope, memory, actor)
         outputs = jax.vmap(lambda own: made.policy(Params({}, own), actor, FEATURES, jnp.zeros(1)))(actor.own)
@@ -301,7 +309,7 @@ def test_optima_differ():
 def test_training_tasks_play_their_own_policies_and_others_the_distilled_one(state):
     """Whatever their contexts."""
     made, obs = tiny("distral"), jnp.float32([0.3, -1.0, 0.5])
-    act = lambda task: np.asarray(made.act(state, obs, task, None))
+    act = lambda task: np.asarray(act_once(made, state, obs, task, None))
     mean = lambda outputs: np.tanh(np.asarray(outputs)[:2])
     own = [made.policy(of_task(state.actor, i), of_task(state.critic, i), FEATURES, obs) for i in range(3)]
     common = made.actor.apply_distilled(of_task(state.actor, 0), FEATURES, obs)
@@ -319,7 +327,9 @@ def test_a_distilled_policy_may_be_told_the_task(told):
     """As the others are; it then acts differently in different tasks."""
     made = tiny("distral", conditioning=told)
     fresh = learner(made, TASKS, BATCH, SPEC)[0](TASKS, KEY)
-    played = [np.asarray(made.act(fresh, jnp.ones(3), pick(TASKS, i)._replace(id=jnp.int32(7)), None)) for i in (0, 1)]
+    played = [
+        np.asarray(act_once(made, fresh, jnp.ones(3), pick(TASKS, i)._replace(id=jnp.int32(7)), None)) for i in (0, 1)
+    ]
     assert not np.allclose(played[0], played[1], atol=1e-3)
     assert ("nearest" in made.unseen) == (told != "parameters")
 

@@ -256,7 +256,7 @@ def test_tables_of_tasks_must_fit_the_tasks(settings, message):
     made = agent("sac", encoder="moe", conditioning="one-hot", hidden=(4,), **settings)
     tasks = tasks_of("one-step", (1.0, -0.5, 0.3))
     with pytest.raises(InputError, match=message):
-        jax.eval_shape(lambda: made.init(Spec(3, 2, 1), tasks, jax.random.key(0)))
+        jax.eval_shape(lambda: made.init(Spec.vector(3, 2, 1), tasks, jax.random.key(0)))
 
 
 REFUSED = [
@@ -289,7 +289,7 @@ def test_what_cannot_work_is_refused(settings, message):
 def test_an_ensemble_needs_not_know_the_task():
     """The only mixture that an agent may have which is told nothing."""
     made = agent("sac", encoder="moe", mode="ensemble", hidden=(4,))
-    state = jax.eval_shape(lambda: made.init(Spec(3, 2, 1), tasks_of("one-step"), jax.random.key(0)))
+    state = jax.eval_shape(lambda: made.init(Spec.vector(3, 2, 1), tasks_of("one-step"), jax.random.key(0)))
     assert set(state.actor.shared["body"]["params"]) == {"experts", "trunk"}
 
 
@@ -455,7 +455,11 @@ AGENTS |= {name: (name, {"hidden": (6,)}) for name in ("film", "moe", "moore")}
 def test_agents_of_these_parts_have_the_right_shapes(name):
     """Traced, under a map over seeds: an update keeps the state's shapes, also where gradients are combined."""
     base, settings = AGENTS[name]
-    spec, tasks, keys = Spec(3, 2, 1), tasks_of("one-step", (1.0, -0.5, 0.3)), jax.random.split(jax.random.key(0), 2)
+    spec, tasks, keys = (
+        Spec.vector(3, 2, 1),
+        tasks_of("one-step", (1.0, -0.5, 0.3)),
+        jax.random.split(jax.random.key(0), 2),
+    )
     made = agent(base, **{"gradients": "pcgrad", **settings})
     state = jax.eval_shape(jax.vmap(lambda key: made.init(spec, tasks, key)), keys)
     update = jax.vmap(lambda state, key: made.update(state, random_batch(0, 3, 4, spec), tasks, key)[0])
@@ -467,7 +471,7 @@ def test_agents_of_these_parts_have_the_right_shapes(name):
 def test_agents_learn_with_them(name):
     """Two updates, the second of which bootstraps from what the first moved, stay finite and move everything."""
     _, settings = AGENTS[name]
-    tasks, spec = tasks_of("one-step", (1.0, -0.5, 0.3)), Spec(3, 2, 1)
+    tasks, spec = tasks_of("one-step", (1.0, -0.5, 0.3)), Spec.vector(3, 2, 1)
     init, update = learner(tiny("sac", **settings), tasks, 4, spec)
     before = after = init(tasks, jax.random.key(0))
     for i in range(2):

@@ -20,7 +20,7 @@ import mtjax.train
 from mtjax import loop
 from mtjax.config import from_json
 from mtjax.evaluation import Evaluations, evaluate, load_evaluations
-from mtjax.report import render
+from mtjax.report import render, scoring
 from mtjax.report.tables import split_table
 from mtjax.training import checkpoint, launch
 from mtjax.types import InputError
@@ -107,7 +107,7 @@ def test_last_evaluation_of_a_run_is_of_its_last_policy(finished_run, policy):
 def test_scores_are_of_episodes_that_the_run_never_saw(finished_run, policy):
     """Though policy and tasks are those of its last evaluation."""
     past = load_evaluations(finished_run / "evaluations.npz")
-    for split, returns in mtjax.evaluate.score(policy, 1).items():
+    for split, returns in scoring.score(policy, 1).items():
         assert returns.shape == (2, len(VALUES[split]), 1)
         assert not np.intersect1d(returns, past.returns[split]).size
 

@@ -4,15 +4,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from probes import act as act_once
 from probes import learner, pick, random_batch, tasks_of, tiny
 
 from mtjax.agents import AGENTS
 from mtjax.agents.parts.encoders.care import Mixture
-from mtjax.history import widen
 from mtjax.networks import Params
 from mtjax.types import Spec
 
-SPEC, BATCH = Spec(3, 2, 1), 4
+SPEC, BATCH = Spec.vector(3, 2, 1), 4
 SCALES = (1.0, -0.5, 0.3)
 TASKS = tasks_of("one-step", SCALES)
 
@@ -69,7 +69,7 @@ def start(case, seed=0):
 def batch_of(case, seed, spec=SPEC):
     """A random batch of what the agent sees."""
     name, settings, _ = PARTS[case]
-    return random_batch(seed, 3, BATCH, widen(spec, tiny(name, **settings).history))
+    return random_batch(seed, 3, BATCH, spec, tiny(name, **settings).history)
 
 
 def leaves_of(params):
@@ -257,7 +257,7 @@ def test_an_unseen_task_acts_as_its_nearest_or_by_its_own_parameters(case):
     name, settings, _ = PARTS[case]
     agent, state = tiny(name, **settings), start(case)[0]
     unseen = pick(tasks_of("one-step", [0.2]), 0)._replace(id=jnp.int32(7))
-    act = lambda task: np.asarray(agent.act(state, OBS[0], task, None))
+    act = lambda task: np.asarray(act_once(agent, state, OBS[0], task, None))
     actions = np.stack([act(pick(TASKS, i)) for i in range(3)])
     assert len(np.unique(actions, axis=0)) == 3
     assert np.array_equal(act(unseen), actions[2]) == (case != "sac-conditioned")
@@ -271,5 +271,7 @@ def test_a_head_or_embedding_moves_the_action_of_its_task_alone():
         own = jax.tree.map(lambda x: x.at[1].add(0.5), state.actor.own)
         assert set(own) == {part}
         changed = state._replace(actor=state.actor._replace(own=own))
-        acts = [np.stack([agent.act(s, OBS[0], pick(TASKS, i), None) for i in range(3)]) for s in (state, changed)]
+        acts = [
+            np.stack([act_once(agent, s, OBS[0], pick(TASKS, i), None) for i in range(3)]) for s in (state, changed)
+        ]
         np.testing.assert_array_equal(np.any(acts[0] != acts[1], axis=1), [False, True, False])

@@ -8,16 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import compiled
-from probes import QUICK, Goals, pick, quick, train
+from probes import QUICK, Goals, Stub, pick, quick, tiny, train
 
 import mtjax.train
-from mtjax import loop
+from mtjax.agents.parts.trajectory import append, begin
 from mtjax.envs import make
-from mtjax.experience import hindsight
-from mtjax.experience import replay as rings
-from mtjax.experience.replay import Replay
-from mtjax.history import History
-from mtjax.loop import Settings
+from mtjax.experience import Replay, hindsight
+from mtjax.experience import ring as rings
 from mtjax.types import InputError, Transition
 
 WORLDS = 256
@@ -90,34 +87,33 @@ def test_a_relabelled_step_is_that_of_the_other_task(name):
 
 
 @pytest.mark.parametrize("name", ["point-mass", "reacher"])
-def test_a_relabelled_history_is_that_of_the_other_task(name):
+def test_a_relabelled_past_is_that_of_the_other_task(name):
     """Past rewards and observations too: the same actions from the same start, under the other goal all along."""
-    env = History(family(name), 3)
+    env = family(name)
     tasks, key, goal_key = env.tasks(), jax.random.key(0), jax.random.key(1)
     old, new = pick(tasks, 0), pick(tasks, -1)
     actions = np.float32(np.random.default_rng(0).uniform(-1, 1, (5, env.spec.action_size)))
     step = jax.jit(env.step, compiler_options=QUICK)
 
     def play(task, at_goal):
-        start = env.reset(old, key)
-        world = at_goal(start.state.world)
-        inner = env.env.observe(task, world)
-        seen = start.state.seen._replace(obs=inner)
-        states = [start._replace(state=start.state._replace(world=world, seen=seen), obs=None)]
+        """Transitions with the three steps before each."""
+        world = at_goal(env.reset(old, key).state)
+        obs, past, steps = env.observe(task, world), begin(3, env.spec.obs_size, env.spec.action_size), []
         for action in actions:
-            states.append(step(task, states[-1].state, action))
-        return states
+            after = step(task, world, action)
+            steps.append(Transition(obs, action, after.reward, jnp.float32(1), after.obs, extras=past))
+            past, world, obs = append(past, obs, action, after.reward), after.state, after.obs
+        return steps
 
     ours = play(old, lambda world: world)
-    theirs = play(new, lambda world: with_goal_of(env.env, new, world, goal_key))
-    relabel = jax.jit(env.relabel, compiler_options=QUICK)
+    theirs = play(new, lambda world: with_goal_of(env, new, world, goal_key))
+    agent = tiny("sac", conditioning="inferred", inferred_from=3)
+    again = jax.jit(lambda transition: agent.relabel(env, new, transition, goal_key), compiler_options=QUICK)
     for i in (1, 4):  # with one step known, and with all three
-        transition = Transition(ours[i].obs, actions[i], ours[i + 1].reward, jnp.float32(1), ours[i + 1].obs)
-        found = relabel(new, transition, goal_key)
-        np.testing.assert_allclose(found.obs, theirs[i].obs, atol=1e-6)
-        np.testing.assert_allclose(found.next_obs, theirs[i + 1].obs, atol=1e-6)
-        np.testing.assert_allclose(found.reward, theirs[i + 1].reward, atol=1e-6)
-        assert not np.allclose(found.obs, ours[i].obs)
+        found = again(ours[i])
+        for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(theirs[i]), strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-6)
+        assert not np.allclose(found.extras.reward, ours[i].extras.reward)
 
 
 # Batches.
@@ -132,12 +128,14 @@ def filled(with_context=False):
     obs = np.float32(np.stack([task, row], axis=-1)) + 1
     number = np.full((TASKS, 100), -1, np.float32)
     context = obs[..., :1] - 100 if with_context else None
-    rows = Transition(obs, obs[..., :1], number, number, obs, context)
-    return Replay(jax.tree.map(lambda x: x.reshape(TASKS, 25, 4, *x.shape[2:]), rows), np.int32(0), np.int32(25))
+    rows = Transition(obs, obs[..., :1], number, number, obs, context=context)
+    return rings.Ring(jax.tree.map(lambda x: x.reshape(TASKS, 25, 4, *x.shape[2:]), rows), np.int32(0), np.int32(25))
 
 
 def batches(env, share):
-    sample = lambda tasks, replay, key: hindsight.sample(env, tasks, share, replay, key, (TASKS, BATCHES, BATCH))
+    sample = lambda tasks, replay, key: hindsight.sample(
+        env, Auditor(), tasks, share, replay, key, (TASKS, BATCHES, BATCH)
+    )
     rows = quick(sample, *(inputs := (env.tasks(), filled(env.drawn), KEY)))(*inputs)
     return jax.tree.map(np.asarray, rows)
 
@@ -184,25 +182,21 @@ def test_where_goals_are_drawn_a_tasks_own_steps_are_relabelled_too(env):
 
 def test_without_hindsight_batches_are_those_of_before():
     """To the bit: the same key draws the same rows as the replay alone does."""
-    settings, replay = Settings(updates_per_step=BATCHES, batch_size=BATCH), filled()
-    found = loop.draw(Goals(), settings, Goals().tasks(), replay, KEY)
+    settings, replay = Replay(updates_per_step=BATCHES, batch_size=BATCH), filled()
+    found = settings.draw(Goals(), Auditor(), Goals().tasks(), replay, KEY)
     rows = rings.sample(replay, KEY, BATCHES * BATCH)
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(rows), strict=True):
         np.testing.assert_array_equal(np.moveaxis(a, 0, 1).reshape(b.shape), b)
 
 
 @dataclasses.dataclass(frozen=True)
-class Auditor:
+class Auditor(Stub):
     """Acts at random, and notes how far rewards are from what the walks of the batch's tasks pay."""
-
-    gamma: float = 0.9
-    watches: bool = False
-    history: int = 0
 
     def init(self, spec, tasks, key):
         return jnp.float32(0)
 
-    def act(self, state, obs, task, key):
+    def choose(self, state, obs, task, key):
         return jax.random.uniform(key, (1,))
 
     def update(self, state, batch, tasks, key):
@@ -214,7 +208,14 @@ class Auditor:
 @pytest.mark.parametrize("drawn", [False, True])
 def test_the_loop_learns_from_relabelled_batches(drawn):
     """Over two seeds: every reward is what the task of its row of the batch pays, and its context is that task's."""
-    settings = Settings(num_envs=4, batch_size=8, replay_size=80, warmup_steps=3, chunk_steps=9, hindsight=0.5)
+    settings = {
+        "num_envs": 4,
+        "batch_size": 8,
+        "replay_size": 80,
+        "warmup_steps": 3,
+        "chunk_steps": 9,
+        "hindsight": 0.5,
+    }
     state, (metrics,) = train(Goals(drawn=drawn), Auditor(), settings, seeds=(0, 1))
     assert metrics["wrong"].shape == (2, TASKS)
     np.testing.assert_allclose(metrics["wrong"], 0, atol=2e-5)
@@ -243,7 +244,7 @@ def test_families_that_cannot_relabel_are_refused_with_the_reason(name, settings
     with pytest.raises(InputError, match=reason):
         hindsight.require(env)
     with pytest.raises(InputError, match=reason):
-        mtjax.train(env, mtjax.agent("sac"), steps=10, settings=Settings(hindsight=0.5))
+        mtjax.train(env, mtjax.agent("sac"), steps=10, hindsight=0.5)
 
 
 def test_families_that_can_relabel_are_not_refused():
@@ -258,7 +259,7 @@ def test_families_that_can_relabel_are_not_refused():
 def test_a_share_is_from_0_to_1(share):
     """As a flag is checked, so is the setting."""
     with pytest.raises(InputError, match="hindsight is a share from 0 to 1, not"):
-        Settings(hindsight=share)
+        Replay(hindsight=share)
 
 
 def test_the_command_line_refuses_before_it_makes_a_folder(tmp_path):

@@ -7,11 +7,10 @@ import pytest
 
 import mtjax
 from mtjax.agents import AGENTS
-from mtjax.loop import Settings
 
 # The goal is not seen: three places on one circle, of which a policy that is not told which can serve but one.
 GOALS = {"goal-x": "-0.2,0.2,0.0", "goal-y": "0.0,0.0,0.2"}
-SETTINGS = Settings(num_envs=16, batch_size=32, replay_size=16_000, warmup_steps=100, chunk_steps=500)
+SETTINGS = {"num_envs": 16, "batch_size": 32, "replay_size": 16_000, "warmup_steps": 100, "chunk_steps": 500}
 QUICK = {
     "hidden": (64, 64),
     "actor_lr": 2e-3,

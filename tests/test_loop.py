@@ -6,38 +6,40 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import Broken, Probe, Walk, tasks_of, tiny, train
+from probes import Broken, Probe, Stub, Walk, tasks_of, tiny, train
 
+import mtjax
 from mtjax import loop
-from mtjax.loop import Settings, over_learners, over_worlds, spread
+from mtjax.config import configure
+from mtjax.experience import Replay
+from mtjax.loop import Settings
+from mtjax.maps import over_learners, over_worlds
+from mtjax.rollout import spread
 from mtjax.types import InputError, Spec
 
 ENVS, BATCH, WARMUP, HOLD, CHUNK, UPDATES = 4, 8, 8, 3, 13, 2
-SETTINGS = Settings(
-    num_envs=ENVS,
-    updates_per_step=UPDATES,
-    batch_size=BATCH,
-    replay_size=200,
-    warmup_steps=WARMUP,
-    warmup_hold=HOLD,
-    chunk_steps=CHUNK,
-)
+SETTINGS = {
+    "num_envs": ENVS,
+    "updates_per_step": UPDATES,
+    "batch_size": BATCH,
+    "replay_size": 200,
+    "warmup_steps": WARMUP,
+    "warmup_hold": HOLD,
+    "chunk_steps": CHUNK,
+}
 
 
 @dataclasses.dataclass(frozen=True)
-class Recorder:
+class Recorder(Stub):
     """Acts 2 + task's number, which no random action is; counts updates, and those given the batch before once more."""
 
     nan_update: int = -1
-    gamma: float = 0.5
-    watches: bool = False
-    history: int = 0
 
     def init(self, spec, tasks, key):
         last = jnp.zeros((len(tasks.id), BATCH, spec.obs_size))
         return {"updates": jnp.int32(0), "repeats": jnp.int32(0), "last": last}
 
-    def act(self, state, obs, task, key):
+    def choose(self, state, obs, task, key):
         return jnp.full(1, 2.0) + task.id
 
     def update(self, state, batch, tasks, key):
@@ -56,7 +58,7 @@ def walk():
 
 def stored(state):
     """What the replay of each seed holds, as (S, T, E, H, ...) in the order of time."""
-    return jax.tree.map(lambda x: np.moveaxis(np.asarray(x)[:, :, : 3 * CHUNK], 2, 3), state.replay.rows)
+    return jax.tree.map(lambda x: np.moveaxis(np.asarray(x)[:, :, : 3 * CHUNK], 2, 3), state.data.ring.rows)
 
 
 def ends(rows):
@@ -85,7 +87,7 @@ def test_an_episode_goes_on_until_it_ends_and_the_next_begins_anew(walk):
     np.testing.assert_array_equal(following[~ended], next_obs[~ended])
     assert np.all(following[ended] < 1)
     state = walk[0]
-    np.testing.assert_array_equal(state.obs[..., 0] // 1, state.age)
+    np.testing.assert_array_equal(state.worlds.obs[..., 0] // 1, state.worlds.age)
 
 
 def test_every_episode_begins_somewhere_else(walk):
@@ -141,7 +143,7 @@ def test_updates_begin_after_the_warmup_and_each_has_its_own_batch(walk):
     np.testing.assert_allclose(history[1]["count"], first + (1 + UPDATES * CHUNK) / 2)
     np.testing.assert_allclose(history[1]["loss"], [[0, 1], [0, 1]])
     np.testing.assert_array_equal(state.iteration, 3 * CHUNK)
-    np.testing.assert_array_equal(state.replay.size, 3 * CHUNK)
+    np.testing.assert_array_equal(state.data.ring.size, 3 * CHUNK)
 
 
 def test_finite_numbers_report_no_bad_step(walk):
@@ -156,12 +158,12 @@ def test_a_bad_step_names_its_task():
     state, (metrics,) = train(env, Recorder(nan_update=update), SETTINGS)
     in_loss = WARMUP + (update - 1) // UPDATES
     np.testing.assert_array_equal(metrics["bad_step"], [[in_loss, env.broken_age]])
-    assert np.isnan(state.replay.rows.reward[0, 1]).any() and not np.isnan(state.replay.rows.reward[0, 0]).any()
+    assert np.isnan(state.data.ring.rows.reward[0, 1]).any() and not np.isnan(state.data.ring.rows.reward[0, 0]).any()
 
 
 def test_a_bad_reward_is_not_blamed_on_the_tasks_that_share_the_networks():
     """Learned from in the step in which it occurs, it spoils all losses; the first bad step is its own task's."""
-    env, settings = Broken(), dataclasses.replace(SMALL, replay_size=2, warmup_steps=1, chunk_steps=6)
+    env, settings = Broken(), {**SMALL, "replay_size": 2, "warmup_steps": 1, "chunk_steps": 6}
     _, (metrics,) = train(env, tiny("sac-conditioned", hidden=(8,)), settings)
     first, second = metrics["bad_step"][0]
     assert second == env.broken_age < first
@@ -169,7 +171,7 @@ def test_a_bad_reward_is_not_blamed_on_the_tasks_that_share_the_networks():
 
 # With an agent that learns.
 
-SMALL = Settings(num_envs=2, batch_size=4, replay_size=12, warmup_steps=4, chunk_steps=4)  # one chunk of warm-up
+SMALL = dict(num_envs=2, batch_size=4, replay_size=12, warmup_steps=4, chunk_steps=4)  # one chunk of warm-up
 
 
 def learn(seeds, chunks=2):
@@ -185,7 +187,7 @@ def leaves_of(state):
 def test_seeds_do_not_touch_each_other():
     """Two in one program are each one alone, up to the rounding of products of other shapes."""
     both, _ = learn((3, 5))
-    each = lambda state: leaves_of(state._replace(replay=state.replay.rows, iteration=None))
+    each = lambda state: leaves_of(state._replace(data=(state.data.ring.rows, state.data.key), iteration=None))
     for i, seed in enumerate((3, 5)):
         alone, _ = learn((seed,))
         for a, b in zip(each(both), each(alone), strict=True):
@@ -210,7 +212,7 @@ def test_the_agent_rests_through_the_warmup():
     bytes_of = lambda state: [x.tobytes() for x in leaves_of(state.agent)]
     assert bytes_of(start) == bytes_of(warm) != bytes_of(after)
     assert np.all(metrics["critic_loss"] == 0) and np.all(metrics["bad_step"] == -1)
-    np.testing.assert_array_equal(after.agent.optimizers[0][1][0].count, SMALL.chunk_steps)
+    np.testing.assert_array_equal(after.agent.optimizers[0][1][0].count, SMALL["chunk_steps"])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -226,21 +228,23 @@ class Counted(Walk):
 
 def test_chunks_compile_once_and_take_over_the_memory_of_the_state():
     """However many there are; the state that was given is gone."""
-    env, agent, tasks = Counted(), Recorder(), Walk().tasks()
-    state, counts = loop.init(env, agent, SETTINGS, tasks, jnp.uint32([0])), []
+    env, tasks = Counted(), Walk().tasks()
+    agent, settings = configure(Recorder(), Settings(stagger=False), SETTINGS)
+    state, counts = loop.init(env, agent, settings, tasks, jnp.uint32([0])), []
     for _ in range(3):
         given = state
-        state, _ = loop.run_chunk(env, agent, SETTINGS, tasks, state)
+        state, _ = loop.run_chunk(env, agent, settings, tasks, state)
         counts.append(len(env.traces))
-        assert all(x.is_deleted() for x in (given.replay.rows.obs, given.obs, given.agent["updates"], given.key))
+        assert all(
+            x.is_deleted() for x in (given.data.ring.rows.obs, given.worlds.obs, given.agent["updates"], given.key)
+        )
     assert counts[0] == counts[1] == counts[2] > 0
     assert state.iteration == 3 * CHUNK
 
 
 def test_collecting_without_learning_is_allowed():
     """No updates: no losses, and the agent stays."""
-    settings = dataclasses.replace(SETTINGS, updates_per_step=0)
-    state, (metrics,) = train(Walk(), Recorder(), settings)
+    state, (metrics,) = train(Walk(), Recorder(), {**SETTINGS, "updates_per_step": 0})
     assert set(metrics) == {"return", "episodes", "bad_step"}
     assert state.agent["updates"] == 0 and state.iteration == CHUNK
 
@@ -273,11 +277,11 @@ def test_over_learners_gives_each_world_its_seeds_learner_and_its_task():
 
 def test_capacity_is_a_whole_number_of_steps():
     """Rounded down, as a slot of the ring holds a step of all environments; what is stored is as large."""
-    settings = dataclasses.replace(SMALL, num_envs=3, replay_size=17)
-    assert settings.capacity == 15 and SMALL.capacity == 12
-    start = jax.eval_shape(lambda: loop.init(Probe(), Recorder(), settings, Probe().tasks(), jnp.uint32([0])))
-    assert start.replay.rows.obs.shape == (1, 2, 5, 3, 1) and start.obs.shape == (1, 2, 3, 1)
-    assert Probe().spec == Spec(1, 1, 1)
+    agent, settings = configure(Recorder(), Settings(), {**SMALL, "num_envs": 3, "replay_size": 17})
+    assert agent.experience.capacity(3) == 15 and Replay(replay_size=12).capacity(2) == 12
+    start = jax.eval_shape(lambda: loop.init(Probe(), agent, settings, Probe().tasks(), jnp.uint32([0])))
+    assert start.data.ring.rows.obs.shape == (1, 2, 5, 3, 1) and start.worlds.obs.shape == (1, 2, 3, 1)
+    assert Probe().spec == Spec.vector(1, 1, 1)
 
 
 @pytest.mark.parametrize(
@@ -295,7 +299,7 @@ def test_capacity_is_a_whole_number_of_steps():
 def test_settings_that_make_no_sense_are_refused(settings, message):
     """With the flag, what was given and what is allowed."""
     with pytest.raises(InputError, match=message):
-        Settings(**settings)
+        mtjax.train(Walk(), tiny("sac"), steps=10, **settings)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -312,7 +316,7 @@ class Drifting(Walk):
 class Sees(Recorder):
     """Acts by what it is shown of the task."""
 
-    def act(self, state, obs, task, key):
+    def choose(self, state, obs, task, key):
         return task.context + 100 * task.id
 
 

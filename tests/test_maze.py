@@ -9,6 +9,7 @@ import pytest
 from probes import tiny
 
 from mtjax import loop
+from mtjax.config import configure
 from mtjax.envs.mtenv.maze import MazeState, TwoGoalMaze
 from mtjax.types import InputError, Spec
 
@@ -183,7 +184,7 @@ def test_episodes_start_apart():
 def test_both_tasks_and_nothing_between():
     """Blue is context -1 and red 1; what is neither is refused."""
     np.testing.assert_array_equal(MAZE.tasks().context, [[-1], [1]])
-    assert MAZE.spec == Spec(4, 3, 1) and SEEING.spec == Spec(8, 3, 1)
+    assert MAZE.spec == Spec.vector(4, 3, 1) and SEEING.spec == Spec.vector(8, 3, 1)
     assert [len(MAZE.tasks(split).id) for split in ("train", "interpolation", "extrapolation")] == [2, 0, 0]
     np.testing.assert_array_equal(TwoGoalMaze().tasks().goal["goal-box"], [0])
     for vary in ({"goal-box": "0,1"}, {"goal-box": "0.5"}, {"goal-box": "0:1"}):
@@ -194,7 +195,8 @@ def test_both_tasks_and_nothing_between():
 def test_an_agent_trains_on_it():
     """Traced, not run: the loop, agent and tasks fit together; the loop counts time."""
     agent = tiny("sac-conditioned")
-    settings = loop.Settings(num_envs=2, batch_size=4, replay_size=12, warmup_steps=1, chunk_steps=2)
+    given = {"num_envs": 2, "batch_size": 4, "replay_size": 12, "warmup_steps": 1, "chunk_steps": 2}
+    agent, settings = configure(agent, loop.Settings(), given)
     assert MAZE.episode_length == 200
     state = jax.eval_shape(lambda: loop.init(MAZE, agent, settings, MAZE.tasks(), jnp.arange(1)))
     after, _ = jax.eval_shape(lambda state: loop.run_chunk(MAZE, agent, settings, MAZE.tasks(), state), state)

@@ -2,22 +2,22 @@
 
 import numpy as np
 import pytest
-from probes import EITHER_SIGN, Probe, mean_actions, only_seed, tasks_of, tiny, train, values
+from probes import Probe, mean_actions, only_seed, tasks_of, tiny, train, values
 
 from mtjax.agents import AGENTS
-from mtjax.loop import Settings
+from mtjax.envs.probes import EITHER_SIGN
 
 GAMMA = 0.9
 SCALES = (1.0, -0.5)
-SETTINGS = Settings(
-    num_envs=8,
-    updates_per_step=4,
-    batch_size=32,
-    replay_size=8000,
-    warmup_steps=150,
-    warmup_hold=1,
-    chunk_steps=300,
-)
+SETTINGS = {
+    "num_envs": 8,
+    "updates_per_step": 4,
+    "batch_size": 32,
+    "replay_size": 8000,
+    "warmup_steps": 150,
+    "warmup_hold": 1,
+    "chunk_steps": 300,
+}
 # The temperature stays negligible, so that the soft Q-value is the plain one.
 PLAIN = {"gamma": GAMMA, "initial_temperature": 1e-6, "temperature_lr": 1e-9}
 # Values are compared in the units of rewards; and two experts are too few for four signs of observation and scale.

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mtjax.experience import replay as rings
+from mtjax.experience import ring as rings
 from mtjax.types import Transition
 
 TASKS, ENVS, SLOTS = 3, 2, 4

@@ -321,7 +321,8 @@ def test_signals_are_left_alone_outside_the_main_thread():
 
 def lost_world(state):
     """An observation of seed 1, task 1 that is not a number."""
-    return state._replace(obs=state.obs.at[1, 1, 0, 3].set(jnp.nan))
+    worlds = state.worlds._replace(obs=state.worlds.obs.at[1, 1, 0, 3].set(jnp.nan))
+    return state._replace(worlds=worlds)
 
 
 def diverged_critic(state):

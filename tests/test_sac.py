@@ -11,7 +11,7 @@ import pytest
 from probes import quick, random_batch, tasks_of
 
 from mtjax.agents.parts.encoders import Identity
-from mtjax.agents.sac import SAC, SACState
+from mtjax.agents.sac import SAC, Batch, SACState
 from mtjax.networks import Params, join
 from mtjax.types import Spec, Transition
 
@@ -35,7 +35,7 @@ class LinearSAC(SAC):
     encoder: Identity = dataclasses.field(default_factory=Bare)
 
 
-def linear_policy(outputs, key):
+def linear_policy(outputs, key, mask=None):
     """The first output is the action and the second its log-probability, so that all is linear and without noise."""
     action, log_prob = jnp.split(outputs, 2, axis=-1)
     return action, log_prob[..., 0]
@@ -62,26 +62,31 @@ def rows(obs, action, reward, discount, next_obs):
     return Transition(column(obs), column(action), jnp.float32(reward), jnp.float32(discount), column(next_obs))
 
 
+def seen(batch, gamma=1.0, temperature=0.0):
+    """What the losses see of transitions."""
+    fields = (batch.obs, batch.action, batch.reward, gamma * batch.discount, batch.next_obs)
+    return Batch(*fields, told=FEATURES, temperature=temperature, mask=None)
+
+
 @pytest.mark.parametrize(("discount", "expected"), [(1.0, 4.87), (0.0, 1.0), (0.5, 2.935)])
 def test_critic_target(linear, discount, expected):
     """From s' = 3: a' = 6, log pi = -1.5, Q = 6 and 4; y = 1 + 0.9 d (4 + 0.2 1.5)."""
     batch = rows([0.0], [0.0], [1.0], [discount], [3.0])
-    agent = LinearSAC(gamma=0.9)
-    target = agent.critic_target(ACTOR, CRITICS, CRITICS, FEATURES, 0.2, batch, jax.random.key(0))
+    target = LinearSAC().target(ACTOR, CRITICS, CRITICS, seen(batch, 0.9, 0.2), jax.random.key(0))
     np.testing.assert_allclose(target, [expected], rtol=1e-6)
 
 
 def test_critic_target_believes_the_least_critic_at_each_transition(linear):
     """From s' = 3 the least is the second critic's 4, and from s' = -3 the first's -6."""
     batch = rows([0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [1.0, 1.0], [3.0, -3.0])
-    target = LinearSAC(gamma=1.0).critic_target(ACTOR, CRITICS, CRITICS, FEATURES, 0.0, batch, jax.random.key(0))
+    target = LinearSAC().target(ACTOR, CRITICS, CRITICS, seen(batch), jax.random.key(0))
     np.testing.assert_allclose(target, [4.0, -6.0], rtol=1e-6)
 
 
 def test_critic_loss_sums_over_critics_and_averages_over_the_batch():
     """At (1, 2) Q = 2 and 2, at (0, 4) Q = 2 and -1; against 1 and 0: ((1 + 1) + (4 + 1)) / 2."""
     batch = rows([1.0, 0.0], [2.0, 4.0], [9.0, 9.0], [1.0, 1.0], [9.0, 9.0])
-    loss, metrics = LinearSAC().critic_loss(CRITICS, (batch, FEATURES, jnp.float32([1.0, 0.0])))
+    loss, metrics = LinearSAC().critic_loss(CRITICS, (seen(batch), jnp.float32([1.0, 0.0])))
     np.testing.assert_allclose(loss, 3.5, rtol=1e-6)
     np.testing.assert_allclose((metrics["critic_loss"], metrics["value"]), (3.5, 1.25), rtol=1e-6)
 
@@ -89,7 +94,7 @@ def test_critic_loss_sums_over_critics_and_averages_over_the_batch():
 def test_actor_loss_weighs_entropy_by_temperature(linear):
     """At s = 3: 0.2 (-1.5) - 4 = -4.3; at s = -1: 0.2 0.5 - min(-2, 0) = 2.1; their mean is -1.1."""
     batch = rows([3.0, -1.0], [9.0, 9.0], [9.0, 9.0], [0.0, 1.0], [9.0, 9.0])
-    loss, metrics = LinearSAC().actor_loss(ACTOR, (batch, FEATURES, CRITICS, 0.2, jax.random.key(0)))
+    loss, metrics = LinearSAC().actor_loss(ACTOR, (seen(batch, temperature=0.2), CRITICS, jax.random.key(0)))
     np.testing.assert_allclose(loss, -1.1, rtol=1e-6)
     np.testing.assert_allclose(metrics["entropy"], (1.5 - 0.5) / 2, rtol=1e-6)
 
@@ -107,7 +112,7 @@ def test_temperature_loss_and_the_sign_of_its_slope():
 
 # A whole update in NumPy. Observations of two numbers, actions of one, one feature: critics have 4 inputs, actors 3.
 
-SPEC, BATCH = Spec(2, 1, 1), 3
+SPEC, BATCH = Spec.vector(2, 1, 1), 3
 RATES = {"actor_lr": 0.05, "critic_lr": 0.5, "temperature_lr": 0.02, "tau": 0.25, "gamma": 0.8}
 
 

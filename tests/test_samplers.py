@@ -11,7 +11,7 @@ from mtjax.agents.parts.samplers import SAMPLERS, ByTemperature, Hardest, Progre
 from mtjax.types import InputError, Outcome, Spec
 
 ALIKE = jnp.full(3, 0.1)
-SPEC, BATCH = Spec(3, 2, 1), 4
+SPEC, BATCH = Spec.vector(3, 2, 1), 4
 TASKS = tasks_of("one-step", (1.0, -0.5, 0.3))
 KEY = jax.random.key(0)
 

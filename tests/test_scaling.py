@@ -2,21 +2,22 @@
 
 import dataclasses
 from functools import partial
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import QUICK, Probe, Walk, learner, only_seed, random_batch, tasks_of, tiny, train, values
+from probes import QUICK, Probe, Stub, Walk, learner, only_seed, random_batch, tasks_of, tiny, train, values
 
 from mtjax import normalize
 from mtjax.agents import agent
 from mtjax.agents.parts.scaling import SCALINGS, AdaptiveScaling, NoScaling, PopArt, ReturnScaling, RewardScaling
-from mtjax.loop import Settings
+from mtjax.experience import Replay
 from mtjax.networks import Params
 from mtjax.types import InputError, Outcome, Spec, Transition
 
-SPEC, BATCH = Spec(3, 2, 1), 4
+SPEC, BATCH = Spec.vector(3, 2, 1), 4
 TASKS = tasks_of("one-step", (1.0, -0.5, 0.3))
 KEY = jax.random.key(0)
 NO_BONUS = jnp.zeros(1)
@@ -273,9 +274,15 @@ def test_settings_that_make_no_sense_are_refused(settings, message):
         agent("sac", **settings)
 
 
-LEARNING = Settings(
-    num_envs=8, updates_per_step=4, batch_size=32, replay_size=8000, warmup_steps=150, warmup_hold=1, chunk_steps=300
-)
+LEARNING = {
+    "num_envs": 8,
+    "updates_per_step": 4,
+    "batch_size": 32,
+    "replay_size": 8000,
+    "warmup_steps": 150,
+    "warmup_hold": 1,
+    "chunk_steps": 300,
+}
 
 
 @pytest.mark.parametrize(
@@ -304,22 +311,17 @@ def test_values_are_known_in_reward_whatever_their_scale(name, settings):
 
 # Networks that begin anew.
 
-BRIEF = Settings(num_envs=2, batch_size=4, replay_size=40, warmup_steps=4, chunk_steps=10)
+BRIEF = {"num_envs": 2, "batch_size": 4, "replay_size": 40, "warmup_steps": 4, "chunk_steps": 10}
 
 
 @dataclasses.dataclass(frozen=True)
-class Diary:
+class Diary(Stub):
     """Notes as bits in which of the steps it was reset, and how many updates it has taken since."""
 
-    gamma: float = 0.9
-    watches: bool = True
-    history: int = 0
+    watches: ClassVar[bool] = True
 
     def init(self, spec, tasks, key):
         return {"step": jnp.int32(0), "resets": jnp.int32(0), "updates": jnp.int32(0), "noise": jnp.float32(0)}
-
-    def act(self, state, obs, task, key):
-        return jnp.zeros(1)
 
     def observe(self, state, outcome):
         return state | {"step": state["step"] + 1}
@@ -337,11 +339,11 @@ class Diary:
 @pytest.mark.parametrize(("every", "expected"), [(0, ()), (3, (6, 9, 12, 15, 18)), (4, (8, 12, 16)), (11, (11,))])
 def test_resets_come_at_multiples_of_their_period_after_the_warmup(every, expected, seeds):
     """In all seeds alike, across chunks, before the step is learned from; each seed with a key of its own."""
-    settings = dataclasses.replace(BRIEF, reset_every=every)
+    settings = BRIEF | {"reset_every": every}
     state, _ = train(Walk(), Diary(), settings, seeds=seeds, chunks=2)
     for seed in range(len(seeds)):
         assert [i for i in range(31) if state.agent["resets"][seed] >> i & 1] == list(expected)
-        assert state.agent["updates"][seed] == 20 - max(expected, default=BRIEF.warmup_steps)
+        assert state.agent["updates"][seed] == 20 - max(expected, default=BRIEF["warmup_steps"])
         assert (state.agent["noise"][seed] != 0) == bool(expected)
     assert len(np.unique(state.agent["noise"])) == (len(seeds) if expected else 1)
 
@@ -371,7 +373,7 @@ def test_a_reset_renews_all_that_learns_and_nothing_else():
 
 def test_resets_work_in_the_loop_with_seeds():
     """ARS under two seeds: the factors of the last reset, from the mean rewards of that time."""
-    settings = dataclasses.replace(BRIEF, reset_every=8, warmup_steps=2)
+    settings = BRIEF | {"reset_every": 8, "warmup_steps": 2}
     state, _ = train(Probe("one-step"), tiny("sac", scaling="ars", hidden=(8,)), settings, seeds=(3, 5))
     np.testing.assert_allclose(state.agent.scales.mean, np.tile([1.0, -0.5], (2, 1)), rtol=1e-5)
     np.testing.assert_allclose(state.agent.scales.factor, np.tile([1.0, 100.0], (2, 1)), rtol=1e-5)
@@ -381,7 +383,7 @@ def test_resets_work_in_the_loop_with_seeds():
 def test_a_negative_period_is_refused():
     """As other settings of the loop are."""
     with pytest.raises(InputError, match="reset-every must be at least 0, not -1"):
-        Settings(reset_every=-1)
+        Replay(reset_every=-1)
 
 
 def test_a_batch_is_scaled_and_nothing_else_of_it():

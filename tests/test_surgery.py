@@ -320,7 +320,7 @@ def test_other_rules_do_not_look_again():
 @pytest.mark.parametrize("name", ["gradnorm", "famo"])
 def test_agents_remember_their_weights(name):
     """What a rule learned of the critic is in the agent's state: nothing at first, and other after each update."""
-    tasks, spec = tasks_of("one-step", (1.0, -0.5, 0.3)), Spec(3, 2, 1)
+    tasks, spec = tasks_of("one-step", (1.0, -0.5, 0.3)), Spec.vector(3, 2, 1)
     init, update = learner(tiny(name), tasks, 4, spec)
     state = init(tasks, KEY)
     seen = []

@@ -18,7 +18,7 @@ import mtjax.train
 from mtjax import cli, loop
 from mtjax.agents import PARTS
 from mtjax.agents import settings as settings_of
-from mtjax.config import from_json, to_json
+from mtjax.config import configure, from_json, to_json
 from mtjax.evaluation import load_evaluations
 from mtjax.loop import Settings
 from mtjax.training import memory, points, sweep
@@ -28,7 +28,7 @@ from mtjax.training.points import Varied
 from mtjax.training.run import Plan, _Run, train
 from mtjax.types import InputError, Outcome, Spec
 
-SMALL = Settings(num_envs=4, batch_size=8, replay_size=200, warmup_steps=5, chunk_steps=20)
+SMALL = {"num_envs": 4, "batch_size": 8, "replay_size": 200, "warmup_steps": 5, "chunk_steps": 20}
 
 
 # Points.
@@ -92,7 +92,7 @@ def _variants():
 def test_every_number_can_vary(name, settings):
     """All at once, in every method: none decides what is compiled, and none is left out of what is."""
     agent = tiny(name, **settings)
-    tasks, spec = tasks_of("one-step"), Spec(obs_size=1, action_size=1, context_size=1)
+    tasks, spec = tasks_of("one-step"), Spec.vector(obs_size=1, action_size=1, context_size=1)
     values = points.numbers(agent)
     assert set(values) <= set(settings_of(agent)) and {"actor_lr", "gamma"} <= set(values)
 
@@ -101,18 +101,22 @@ def test_every_number_can_vary(name, settings):
         state = varied.init(spec, tasks, key, knobs)
         state, _ = varied.update(state, random_batch(0, 2, 4), tasks, key)
         one = jnp.ones((2, 3))
-        state = varied.observe(state, Outcome(one, one, one, one > 0, one < 0, jnp.int32(one)))
+        task = jax.tree.map(lambda x: x[0], tasks)
+        memory = varied.begin(state, task)
+        everywhere = jax.tree.map(lambda x: jnp.broadcast_to(x, (2, 3, *x.shape)), memory)
+        state = varied.observe(state, Outcome(one, one, one > 0, one < 0, jnp.int32(one), everywhere))
         state = varied.reset(state, spec, tasks, key)
-        return varied.act(state, jnp.zeros(1), jax.tree.map(lambda x: x[0], tasks), key)
+        return varied.act(state, memory, jnp.zeros(1), task, key).action
 
     assert jax.eval_shape(everything, {name: jnp.float32(x) for name, x in values.items()}).shape == (1,)
 
 
 def _run(env, agent, seeds, knobs=None, chunks=2):
-    tasks = env.tasks()
-    init = loop.init.lower(env, agent, SMALL, tasks, seeds, knobs).compile(QUICK)
+    plain, settings = configure(getattr(agent, "agent", agent), Settings(), SMALL)
+    tasks, agent = env.tasks(), Varied(plain) if isinstance(agent, Varied) else plain
+    init = loop.init.lower(env, agent, settings, tasks, seeds, knobs).compile(QUICK)
     state = init(tasks, seeds, knobs)
-    run_chunk = loop.run_chunk.lower(env, agent, SMALL, tasks, state).compile(QUICK)
+    run_chunk = loop.run_chunk.lower(env, agent, settings, tasks, state).compile(QUICK)
     for _ in range(chunks):
         state, metrics = run_chunk(tasks, state)
     return state, metrics
@@ -139,7 +143,8 @@ def test_a_point_trains_as_the_run_with_its_values():
             ours, theirs = getattr(learned, part), getattr(alone.agent, part)
             same = lambda x, y, rows=rows: np.testing.assert_allclose(x[rows], y, rtol=2e-3, atol=2e-4)
             jax.tree.map(same, ours, theirs)
-        np.testing.assert_allclose(state.discounted[rows], alone.discounted, rtol=1e-4, atol=1e-5)
+        discounted, of_alone = (x.worlds.memory.scaling for x in (state, alone))
+        np.testing.assert_allclose(discounted[rows], of_alone, rtol=1e-4, atol=1e-5)
         np.testing.assert_allclose(metrics["return"][rows], its_metrics["return"], rtol=1e-4)
     first, second = (plain[p][0].agent.critic for p in range(2))
     apart = jax.tree.map(lambda x, y: float(jnp.max(jnp.abs(x - y))), first, second)
@@ -148,9 +153,9 @@ def test_a_point_trains_as_the_run_with_its_values():
 
 def test_one_point_that_diverges_does_not_end_the_others():
     """Its returns are none; those of the others, whose numbers are apart, are there. Rows say which point they are."""
-    settings = dataclasses.replace(SMALL, chunk_steps=15)
+    settings = SMALL | {"chunk_steps": 15}
     result = train(
-        Walk(), tiny("sac"), steps=240, seeds=2, eval_episodes=2, settings=settings, sweep={"actor_lr": [1e-3, 1e38]}
+        Walk(), tiny("sac"), steps=240, seeds=2, eval_episodes=2, **settings, sweep={"actor_lr": [1e-3, 1e38]}
     )
     assert result.finished and result.points == ({"actor_lr": 1e-3}, {"actor_lr": 1e38})
     assert [(row["seed"], row["actor_lr"]) for row in result.rows[:4]] == [(0, 1e-3), (1, 1e-3), (0, 1e38), (1, 1e38)]
@@ -384,9 +389,10 @@ def test_fine_tuning_begins_every_point_with_the_same_seeds(swept):
     """Three seeds of each of two points, from a run of two seeds: 0, 1, 0 and again 0, 1, 0."""
     start = mtjax.load(swept / "run-1", seed=0)
     found, tasks = ({"tau": 0.1}, {"tau": 0.2}), start.env.tasks("train")
-    run = _Run(start.env, Varied(start.agent), SMALL, Plan(seeds=3), None, Console(1, quiet=True), found)
+    plain, settings = configure(start.agent, Settings(), SMALL)
+    run = _Run(start.env, Varied(plain), settings, Plan(seeds=3), None, Console(1, quiet=True), found)
     seeds, knobs = run.spread
-    shapes = jax.eval_shape(lambda: loop.init(start.env, run.agent, SMALL, tasks, seeds, knobs)).agent
+    shapes = jax.eval_shape(lambda: loop.init(start.env, run.agent, settings, tasks, seeds, knobs)).agent
     fresh = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)._replace(knobs=knobs)
     state = run.adopt(start, tasks, fresh)
     np.testing.assert_array_equal(state.knobs["tau"], np.float32([0.1] * 3 + [0.2] * 3))

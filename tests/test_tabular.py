@@ -7,6 +7,7 @@ import pytest
 from probes import tiny
 
 from mtjax import loop
+from mtjax.config import configure
 from mtjax.envs.mtenv.tabular import Bandit, TabularMDP
 from mtjax.types import InputError, Spec
 
@@ -169,7 +170,7 @@ def test_held_out_tasks_are_further_draws(env):
 def test_the_context_is_the_whole_task():
     """MTEnv's 100 numbers, rewards then transitions, as 2 x - 1."""
     tasks = MDP.tasks()
-    assert MDP.spec == Spec(5, 5, 100) and BANDIT.spec == Spec(1, 5, 5)
+    assert MDP.spec == Spec.vector(5, 5, 100) and BANDIT.spec == Spec.vector(1, 5, 5)
     numbers = (np.asarray(tasks.context) + 1) / 2
     np.testing.assert_allclose(numbers[:, :20].reshape(3, 4, 5), tasks.goal["rewards"], atol=1e-6)
     np.testing.assert_allclose(numbers[:, 20:].reshape(3, 4, 5, 4), tasks.goal["transitions"], atol=1e-6)
@@ -209,7 +210,8 @@ def test_wrong_settings_are_refused(make, message):
 def test_an_agent_trains_on_it(env):
     """Traced, not run: the loop, agent and tasks fit together, keys in the state included; the loop counts time."""
     agent = tiny("sac-conditioned")
-    settings = loop.Settings(num_envs=2, batch_size=4, replay_size=12, warmup_steps=1, chunk_steps=2)
+    given = {"num_envs": 2, "batch_size": 4, "replay_size": 12, "warmup_steps": 1, "chunk_steps": 2}
+    agent, settings = configure(agent, loop.Settings(), given)
     assert env.episode_length == 100
     state = jax.eval_shape(lambda: loop.init(env, agent, settings, env.tasks(), jnp.arange(1)))
     after, _ = jax.eval_shape(lambda state: loop.run_chunk(env, agent, settings, env.tasks(), state), state)

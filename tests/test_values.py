@@ -10,7 +10,6 @@ from probes import Probe, only_seed, tasks_of, tiny, train, values
 
 from mtjax.agents import agent
 from mtjax.agents.parts.values import C51, VALUES, HLGauss, Scalar
-from mtjax.loop import Settings
 from mtjax.types import InputError
 
 FIVE = C51(num_bins=5, value_low=-2.0, value_high=2.0)  # atoms -2 -1 0 1 2
@@ -152,9 +151,15 @@ def test_settings_that_make_no_sense_are_refused(settings, message):
         agent("sac", **settings)
 
 
-SETTINGS = Settings(
-    num_envs=8, updates_per_step=4, batch_size=32, replay_size=8000, warmup_steps=150, warmup_hold=1, chunk_steps=300
-)
+SETTINGS = {
+    "num_envs": 8,
+    "updates_per_step": 4,
+    "batch_size": 32,
+    "replay_size": 8000,
+    "warmup_steps": 150,
+    "warmup_hold": 1,
+    "chunk_steps": 300,
+}
 
 
 @pytest.mark.parametrize(("kind", "believe"), [("c51", "least"), ("hl-gauss", "mean")])

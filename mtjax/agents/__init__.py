@@ -1,14 +1,16 @@
 """Agents by name: presets of parts, and the few that are more. To add one: a line here, and a file if it is more."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from mtjax.agents.base import PARTS, BaseAgent, build, settings
-from mtjax.agents.deepmdp import DeepMDP
-from mtjax.agents.distral import Distral
-from mtjax.agents.hip_bmdp import HiPBMDP
-from mtjax.agents.sac import SAC
-from mtjax.names import nearest_error
+from mtjax.names import lazily, load, nearest_error
+
+if TYPE_CHECKING:
+    from mtjax.agents.base import PARTS, BaseAgent, settings
+    from mtjax.agents.sac import SAC
+
+_BASE = "mtjax.agents.base"
+__getattr__ = lazily(__name__, {"PARTS": _BASE, "BaseAgent": _BASE, "settings": _BASE, "SAC": "mtjax.agents.sac"})
 
 
 class Preset(NamedTuple):
@@ -16,7 +18,12 @@ class Preset(NamedTuple):
 
     says: str  # what it is, in a line
     defaults: Mapping[str, Any] = {}
-    cls: type[SAC] = SAC
+    place: "str | type[SAC]" = "mtjax.agents.sac:SAC"  # the class; one of this package is imported when it is used
+
+    @property
+    def cls(self) -> "type[SAC]":
+        """The class of agent."""
+        return load(self.place)
 
 
 _TOLD = {"conditioning": "parameters"}
@@ -43,7 +50,11 @@ AGENTS: dict[str, Preset] = {
     "sac-conditioned": Preset("SAC that sees the task's parameters (Schaul et al. 2015)", _TOLD),
     "multi-head": Preset("SAC with an output layer for every task (Yu et al. 2020)", {"heads": "per-task"}),
     "disjoint": Preset("One SAC for every task, all in one program: the upper bound", {"heads": "disjoint"}),
-    "distral": Preset("A policy for every task, held together by a distilled one (Teh et al. 2017)", {}, Distral),
+    "distral": Preset(
+        "A policy for every task, held together by a distilled one (Teh et al. 2017)",
+        {},
+        "mtjax.agents.distral:Distral",
+    ),
     "care": Preset("Attention over a mixture of encoders (Sodhani et al. 2021)", {"encoder": "care", **_TOLD}),
     "moe": Preset("Soft mixture of encoders (Sodhani et al. 2021, MTRL)", {"encoder": "moe", **_TOLD}),
     "film": Preset("Layers scaled and shifted by the task (Perez et al. 2018)", {"encoder": "film", **_TOLD}),
@@ -53,11 +64,11 @@ AGENTS: dict[str, Preset] = {
     "soft-modularization": Preset("Modules routed by task (Yang et al. 2020)", {"encoder": "soft-modules", **_TOLD}),
     "paco": Preset("Parameters composed for each task (Sun et al. 2022)", {"encoder": "paco", **_TOLD}),
     "brc": Preset("Bigger, regularised, categorical critics (Nauman et al. 2025)", _BRC),
-    "deepmdp": Preset("SAC on a latent model of the task (Gelada et al. 2019)", _TOLD, DeepMDP),
+    "deepmdp": Preset("SAC on a latent model of the task (Gelada et al. 2019)", _TOLD, "mtjax.agents.deepmdp:DeepMDP"),
     "hip-bmdp": Preset(
         "DeepMDP with learned hidden parameters (Zhang et al. 2021)",
         {"conditioning": "embedding", "embedding_size": 50},
-        HiPBMDP,
+        "mtjax.agents.hip_bmdp:HiPBMDP",
     ),
     "pcgrad": Preset("Conflicting gradients projected (Yu et al. 2020)", {"gradients": "pcgrad", **_TOLD}),
     "cagrad": Preset("Conflict-averse gradients (Liu et al. 2021)", {"gradients": "cagrad", **_TOLD}),
@@ -66,7 +77,7 @@ AGENTS: dict[str, Preset] = {
 }
 
 
-def agent(name: str, **given: Any) -> SAC:
+def agent(name: str, **given: Any) -> "SAC":
     """Return the agent called ``name``, with any of its settings, or those of its parts, replaced.
 
     Raises:
@@ -76,7 +87,7 @@ def agent(name: str, **given: Any) -> SAC:
     defaults = dict(preset.defaults)
     if "encoder" in given:  # another encoder knows nothing of this one's settings
         defaults = {k: v for k, v in defaults.items() if k in preset.cls.__dataclass_fields__}
-    return build(name, preset.cls, {**defaults, **given})  # type: ignore
+    return load(f"{_BASE}:build")(name, preset.cls, {**defaults, **given})
 
 
 def preset_of(name: str) -> Preset:

@@ -1,5 +1,6 @@
 """What all agents share: what their networks are told of a task, how they normalise, and the parts they are made of."""
 
+import abc
 import dataclasses
 from collections.abc import Mapping
 from functools import partial
@@ -18,10 +19,10 @@ from mtjax.agents.parts.samplers import SAMPLERS, Sampler
 from mtjax.agents.parts.scaling import SCALINGS, Scaling
 from mtjax.agents.parts.trajectory import Past, Seen, TrajectoryEncoder
 from mtjax.agents.parts.values import VALUES
-from mtjax.experience import EXPERIENCES
+from mtjax.experience import EXPERIENCES, Replay
 from mtjax.names import frozen, nearest_error
 from mtjax.networks import Network, Params
-from mtjax.types import Array, Env, InputError, Key, Metrics, Outcome, Spec, Task, Transition
+from mtjax.types import Acted, Array, Env, InputError, Key, Metrics, Outcome, Spec, Task, Transition
 
 Conditioning = Literal["none", "one-hot", "embedding", "parameters", "vectors", "inferred"]
 CONDITIONINGS = get_args(Conditioning)
@@ -49,7 +50,7 @@ class Memory(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class BaseAgent:
+class BaseAgent(abc.ABC):
     """Settings and pieces of every agent. A subclass gives networks, losses and updates.
 
     Its state is a NamedTuple with at least the fields ``moments`` of observations (of each task's, leaves (T, O), in a
@@ -100,6 +101,7 @@ class BaseAgent:
     gradients: Annotated[surgery.Rule, FLAT] = dataclasses.field(default_factory=surgery.Rule)
     scaling: Annotated[Scaling, FLAT] = dataclasses.field(default_factory=Scaling)
     sampler: Annotated[Sampler, FLAT] = dataclasses.field(default_factory=Sampler)
+    experience: Annotated[Any, FLAT] = dataclasses.field(default_factory=Replay)
 
     def __post_init__(self):
         for kind in kinds_of(self):
@@ -107,6 +109,14 @@ class BaseAgent:
         parts.require_choices(self)
         self._check_numbers()
         self._check_combination()
+
+    @abc.abstractmethod
+    def init(self, spec: Spec, tasks: Task, key: Key) -> Any:
+        """Return the state for the training ``tasks`` (T, ...)."""
+
+    @abc.abstractmethod
+    def act(self, state: Any, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
+        """Choose an action (A,) for one observation (O,) of one task; no key: the mean action."""
 
     # Settings that cannot be used.
 
@@ -278,7 +288,7 @@ class BaseAgent:
 
     def learn(self, env: Env, states: Any, data: Any, tasks: Task, keys: Key) -> tuple[Any, Metrics]:
         """Learn from experience, for all seeds at once: leaves (S, ...)."""
-        return self.experience.learn(env, self, states, data, tasks, keys)  # type: ignore
+        return self.experience.learn(env, self, states, data, tasks, keys)
 
 
 def kinds_of(agent: Any) -> list[str]:

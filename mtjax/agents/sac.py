@@ -216,6 +216,10 @@ class SAC(BaseAgent):
         """Every critic's outputs (N, B, outputs)."""
         return self.of_critics(self.critic.apply, critic, told, obs, action)
 
+    def values(self, critic: Params, told: Array, obs: Any, action: Array) -> Array:
+        """Every critic's estimate (N, B)."""
+        return self.value.mean(self.q(critic, told, obs, action))
+
     def of_critics(self, apply: Callable, critic: Params, told: Array, obs: Any, action: Array) -> Any:
         """What ``apply``, as ``Network.apply`` takes its inputs, makes of every critic (N, ...)."""
         return jax.vmap(apply, (0, None, None, None))(critic, told, obs, action)
@@ -239,7 +243,7 @@ class SAC(BaseAgent):
     def actor_loss(self, actor: Params, data: tuple[Batch, Params, Key]) -> tuple[Array, Metrics]:
         batch, critic, key = data
         action, log_prob, cost = self.sample(actor, critic, batch, batch.obs, key)
-        values = self.value.mean(self.q(critic, batch.told, batch.obs, action))
+        values = self.values(critic, batch.told, batch.obs, action)
         value = least(values) if self.believe == "least" else jnp.mean(values, axis=0)
         loss = jnp.mean(batch.temperature * cost - value)
         return loss, {"actor_loss": loss, "entropy": -jnp.mean(log_prob)}

@@ -1,109 +1,156 @@
 """Environment families by name. To add one: a file for its domain, and a line here; or ``register`` your own."""
 
+import ast
 import re
+from collections import UserDict
 from collections.abc import Mapping, Sequence
-from typing import Any
+from functools import lru_cache
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
 
-from mtjax.envs.brax import NAMES, Brax, BraxAntDirection, BraxHalfcheetahSpeed
-from mtjax.envs.dm_control.acrobot import AcrobotSwingup
-from mtjax.envs.dm_control.ball_in_cup import BallInCup
-from mtjax.envs.dm_control.cartpole import CartpoleBalance, CartpoleSwingup
-from mtjax.envs.dm_control.cheetah import CheetahDirection, CheetahRun, CheetahSpeed
-from mtjax.envs.dm_control.finger import FingerSpin, FingerTurn, FingerTurnTarget
-from mtjax.envs.dm_control.hopper import HopperHop, HopperStand
-from mtjax.envs.dm_control.pendulum import PendulumSwingup
-from mtjax.envs.dm_control.point_mass import PointMass, PointMassNavigate
-from mtjax.envs.dm_control.reacher import Reacher, ReacherTarget
-from mtjax.envs.dm_control.walker import WalkerRun, WalkerSpeed, WalkerStand, WalkerWalk
-from mtjax.envs.domain import Domain
-from mtjax.envs.engines.base import World
-from mtjax.envs.family import Family, Tabled
-from mtjax.envs.mixture import Mixture
-from mtjax.envs.mtenv.control import ACROBOT_RANGES, CARTPOLE_RANGES, Acrobot, CartPole
-from mtjax.envs.mtenv.maze import TwoGoalMaze
-from mtjax.envs.mtenv.tabular import Bandit, TabularMDP
-from mtjax.envs.parameters import Parameter
-from mtjax.names import frozen, nearest_error
-from mtjax.types import InputError
+from mtjax.envs import variation
+from mtjax.names import InputError, frozen, lazily, load, nearest_error
 
-__all__ = ["ENVS", "Domain", "Family", "Mixture", "Parameter", "Tabled", "World", "make", "mixture", "register"]
+if TYPE_CHECKING:
+    from mtjax.envs.domain import Domain
+    from mtjax.envs.engines.base import World
+    from mtjax.envs.family import Family
+    from mtjax.envs.mixtures import Mixture
+    from mtjax.envs.parameters import Parameter
 
-Entry = tuple[type[Family], dict[str, Any]]
+__all__ = ["ENVS", "Domain", "Family", "Mixture", "Parameter", "World", "make", "mixture", "outline", "register"]
+
+__getattr__ = lazily(
+    __name__,
+    {
+        "Domain": "mtjax.envs.domain",
+        "Family": "mtjax.envs.family",
+        "Mixture": "mtjax.envs.mixtures",
+        "Parameter": "mtjax.envs.parameters",
+        "World": "mtjax.envs.engines.base",
+    },
+)
+
+Entry = tuple[Any, dict[str, Any]]  # a family's class, or the place that it is imported from; and its settings
+
+
+class Families(UserDict[str, Entry]):
+    """Families by name, of which a class is imported when it is asked for; ``data`` holds where it is."""
+
+    def __getitem__(self, name: str) -> Entry:
+        family, settings = self.data[name]
+        return load(family), settings
+
+
+# Where each class is in its folder, "module:Class", and its settings. Families whose tasks are drawn say how many.
 
 # dm_control's tasks (Tassa et al. 2018), with whatever parameters are asked for.
 _DOMAINS: dict[str, Entry] = {
-    "acrobot-swingup": (AcrobotSwingup, {}),
-    "acrobot-swingup-sparse": (AcrobotSwingup, {"sparse": True}),
-    "ball-in-cup-catch": (BallInCup, {}),
-    "cartpole-balance": (CartpoleBalance, {}),
-    "cartpole-balance-sparse": (CartpoleBalance, {"sparse": True}),
-    "cartpole-swingup": (CartpoleSwingup, {}),
-    "cartpole-swingup-sparse": (CartpoleSwingup, {"sparse": True}),
-    "cheetah-run": (CheetahRun, {}),
-    "finger-spin": (FingerSpin, {}),
-    "finger-turn-easy": (FingerTurn, {}),
-    "finger-turn-hard": (FingerTurn, {"vary": {"target-size": "0.03"}}),
-    "hopper-hop": (HopperHop, {}),
-    "hopper-stand": (HopperStand, {}),
-    "pendulum-swingup": (PendulumSwingup, {}),
-    "point-mass-easy": (PointMass, {}),
-    "reacher-easy": (Reacher, {}),
-    "reacher-hard": (Reacher, {"vary": {"target-size": "0.015"}}),
-    "walker-run": (WalkerRun, {}),
-    "walker-stand": (WalkerStand, {}),
-    "walker-walk": (WalkerWalk, {}),
+    "acrobot-swingup": ("acrobot:AcrobotSwingup", {}),
+    "acrobot-swingup-sparse": ("acrobot:AcrobotSwingup", {"sparse": True}),
+    "ball-in-cup-catch": ("ball_in_cup:BallInCup", {}),
+    "cartpole-balance": ("cartpole:CartpoleBalance", {}),
+    "cartpole-balance-sparse": ("cartpole:CartpoleBalance", {"sparse": True}),
+    "cartpole-swingup": ("cartpole:CartpoleSwingup", {}),
+    "cartpole-swingup-sparse": ("cartpole:CartpoleSwingup", {"sparse": True}),
+    "cheetah-run": ("cheetah:CheetahRun", {}),
+    "finger-spin": ("finger:FingerSpin", {}),
+    "finger-turn-easy": ("finger:FingerTurn", {}),
+    "finger-turn-hard": ("finger:FingerTurn", {"vary": {"target-size": "0.03"}}),
+    "hopper-hop": ("hopper:HopperHop", {}),
+    "hopper-stand": ("hopper:HopperStand", {}),
+    "pendulum-swingup": ("pendulum:PendulumSwingup", {}),
+    "point-mass-easy": ("point_mass:PointMass", {}),
+    "reacher-easy": ("reacher:Reacher", {}),
+    "reacher-hard": ("reacher:Reacher", {"vary": {"target-size": "0.015"}}),
+    "walker-run": ("walker:WalkerRun", {}),
+    "walker-stand": ("walker:WalkerStand", {}),
+    "walker-walk": ("walker:WalkerWalk", {}),
 }
 
 # HiP-BMDP's families (Zhang et al. 2021) with the values of MTEnv's models; `--split=hip-bmdp` for its held-out tasks.
 _HIP_BMDP: dict[str, Entry] = {
-    "cartpole-swingup-vary-cart-mass": (CartpoleSwingup, {"vary": {"cart-mass": "1:5.5:10"}}),
-    "cartpole-swingup-vary-pole-mass": (CartpoleSwingup, {"vary": {"pole-mass": "0.1:0.55:10"}}),
-    "cheetah-run-vary-back-foot-length": (CheetahRun, {"vary": {"back-foot-length": "0.094:0.184:10"}}),
+    "cartpole-swingup-vary-cart-mass": ("cartpole:CartpoleSwingup", {"vary": {"cart-mass": "1:5.5:10"}}),
+    "cartpole-swingup-vary-pole-mass": ("cartpole:CartpoleSwingup", {"vary": {"pole-mass": "0.1:0.55:10"}}),
+    "cheetah-run-vary-back-foot-length": ("cheetah:CheetahRun", {"vary": {"back-foot-length": "0.094:0.184:10"}}),
     "cheetah-run-vary-foot-position": (
-        CheetahRun,
+        "cheetah:CheetahRun",
         {"vary": {"foot-position": "0.5,0.48,0.46,0.44,0.42,0.4,0.38,0.36,0.34,0.32"}},
     ),
     "cheetah-run-vary-foot-size": (
-        CheetahRun,
+        "cheetah:CheetahRun",
         {"vary": {"foot-size": "0.046,0.0552,0.0598,0.0644,0.069,0.0736,0.0782,0.0828,0.0874,0.092"}},
     ),
-    "cheetah-run-vary-torso-length": (CheetahRun, {"vary": {"torso-length": "0.5:1.4:10"}}),
-    "finger-spin-vary-size": (FingerSpin, {"vary": {"size": "0.95:1.13:10"}}),
-    "finger-spin-vary-touch-size": (FingerSpin, {"vary": {"touch-size": "0.025:0.25:10"}}),
-    "walker-run-vary-foot-length": (WalkerRun, {"vary": {"foot-length": "0.08:0.17:10"}}),
-    "walker-run-vary-friction": (WalkerRun, {"vary": {"friction": "0.7:1.6:10"}}),
-    "walker-walk-vary-foot-length": (WalkerWalk, {"vary": {"foot-length": "0.08:0.17:10"}}),
-    "walker-walk-vary-friction": (WalkerWalk, {"vary": {"friction": "0.7:1.6:10"}}),
+    "cheetah-run-vary-torso-length": ("cheetah:CheetahRun", {"vary": {"torso-length": "0.5:1.4:10"}}),
+    "finger-spin-vary-size": ("finger:FingerSpin", {"vary": {"size": "0.95:1.13:10"}}),
+    "finger-spin-vary-touch-size": ("finger:FingerSpin", {"vary": {"touch-size": "0.025:0.25:10"}}),
+    "walker-run-vary-foot-length": ("walker:WalkerRun", {"vary": {"foot-length": "0.08:0.17:10"}}),
+    "walker-run-vary-friction": ("walker:WalkerRun", {"vary": {"friction": "0.7:1.6:10"}}),
+    "walker-walk-vary-foot-length": ("walker:WalkerWalk", {"vary": {"foot-length": "0.08:0.17:10"}}),
+    "walker-walk-vary-friction": ("walker:WalkerWalk", {"vary": {"friction": "0.7:1.6:10"}}),
 }
 
 _GOALS: dict[str, Entry] = {
-    "cheetah-run-vary-speed": (CheetahSpeed, {"vary": {"speed": "1:5.5:10"}}),
-    "cheetah-vary-direction": (CheetahDirection, {"vary": {"direction": "-1,1"}, "split": "none"}),
-    "finger-turn-vary-target": (FingerTurnTarget, {"vary": {"target-angle": "-2:2:10"}}),
+    "cheetah-run-vary-speed": ("cheetah:CheetahSpeed", {"vary": {"speed": "1:5.5:10"}}),
+    "cheetah-vary-direction": ("cheetah:CheetahDirection", {"vary": {"direction": "-1,1"}, "split": "none"}),
+    "finger-turn-vary-target": ("finger:FingerTurnTarget", {"vary": {"target-angle": "-2:2:10"}}),
     "point-mass-vary-goal": (
-        PointMassNavigate,
-        {"vary": {"goal-x": "-0.2:0.2", "goal-y": "-0.2:0.2"}, "combine": "random"},
+        "point_mass:PointMassNavigate",
+        {"vary": {"goal-x": "-0.2:0.2", "goal-y": "-0.2:0.2"}, "combine": "random", "num_tasks": 10},
     ),
-    "reacher-vary-goal": (ReacherTarget, {"vary": {"target-angle": "-2:2:10"}}),
-    "walker-vary-speed": (WalkerSpeed, {"vary": {"speed": "0.5:5:10"}}),
+    "reacher-vary-goal": ("reacher:ReacherTarget", {"vary": {"target-angle": "-2:2:10"}}),
+    "walker-vary-speed": ("walker:WalkerSpeed", {"vary": {"speed": "0.5:5:10"}}),
 }
 
+# From which MTEnv draws each task's parameters.
+_ACROBOT_RANGES = {
+    "link-length-1": "0.5:1.5",
+    "link-length-2": "0.5:1.5",
+    "link-mass-1": "0.5:1.5",
+    "link-mass-2": "0.5:1.5",
+    "torque-sign": "-1:1",
+}
+_CARTPOLE_RANGES = {
+    "gravity": "4.8:14.8",
+    "cart-mass": "0.5:1.5",
+    "pole-mass": "0.01:0.19",
+    "pole-length": "0.2:0.8",
+    "force": "-10:10",
+}
 _MTENV: dict[str, Entry] = {
-    "bandit": (Bandit, {}),
-    "control-acrobot": (Acrobot, {"vary": ACROBOT_RANGES, "combine": "random"}),
-    "control-cartpole": (CartPole, {"vary": CARTPOLE_RANGES, "combine": "random"}),
-    "tabular-mdp": (TabularMDP, {}),
-    "two-goal-maze": (TwoGoalMaze, {"vary": {"goal-box": "0,1"}, "split": "none"}),
-    "two-goal-maze-seen": (TwoGoalMaze, {"vary": {"goal-box": "0,1"}, "split": "none", "observe_boxes": True}),
+    "bandit": ("tabular:Bandit", {"num_tasks": 10}),
+    "control-acrobot": ("control:Acrobot", {"vary": _ACROBOT_RANGES, "combine": "random", "num_tasks": 10}),
+    "control-cartpole": ("control:CartPole", {"vary": _CARTPOLE_RANGES, "combine": "random", "num_tasks": 10}),
+    "tabular-mdp": ("tabular:TabularMDP", {"num_tasks": 10}),
+    "two-goal-maze": ("maze:TwoGoalMaze", {"vary": {"goal-box": "0,1"}, "split": "none"}),
+    "two-goal-maze-seen": ("maze:TwoGoalMaze", {"vary": {"goal-box": "0,1"}, "split": "none", "observe_boxes": True}),
 }
 
+_BRAX_NAMES = (
+    "ant",
+    "fast",
+    "halfcheetah",
+    "hopper",
+    "humanoid",
+    "humanoidstandup",
+    "inverted_double_pendulum",
+    "inverted_pendulum",
+    "pusher",
+    "reacher",
+    "walker2d",
+)
 _BRAX: dict[str, Entry] = {
-    **{f"brax-{name.replace('_', '-')}": (Brax, {"environment": name}) for name in NAMES},
-    "brax-ant-vary-direction": (BraxAntDirection, {"vary": {"direction": "-2:2:10"}}),
-    "brax-halfcheetah-vary-speed": (BraxHalfcheetahSpeed, {"vary": {"speed": "0.3:3:10"}}),
+    **{f"brax-{name.replace('_', '-')}": ("brax:Brax", {"environment": name}) for name in _BRAX_NAMES},
+    "brax-ant-vary-direction": ("brax:BraxAntDirection", {"vary": {"direction": "-2:2:10"}}),
+    "brax-halfcheetah-vary-speed": ("brax:BraxHalfcheetahSpeed", {"vary": {"speed": "0.3:3:10"}}),
 }
 
-ENVS: dict[str, Entry] = {**_DOMAINS, **_HIP_BMDP, **_GOALS, **_MTENV, **_BRAX}
+_inside = lambda folder, table: {name: (f"{folder}.{place}", settings) for name, (place, settings) in table.items()}
+ENVS = Families(
+    _inside("mtjax.envs.dm_control", _DOMAINS | _HIP_BMDP | _GOALS)
+    | _inside("mtjax.envs.mtenv", _MTENV)
+    | _inside("mtjax.envs", _BRAX)
+)
 
 
 def make(name: str, vary: Mapping[str, Any] | tuple = (), **settings: Any) -> Any:
@@ -130,7 +177,7 @@ def make(name: str, vary: Mapping[str, Any] | tuple = (), **settings: Any) -> An
     return family(**{**settings, "vary": dict(defaults.get("vary", {})) | dict(vary)})
 
 
-def mixture(families: Sequence[str | Family | Mixture]) -> Mixture:
+def mixture(families: "Sequence[str | Family | Mixture]") -> "Mixture":
     """Return a mixture of families, each by its name or as ``make`` returned it.
 
     Families may share a model, or a name, as long as their tasks are not the same: a walker whose friction varies and
@@ -139,7 +186,9 @@ def mixture(families: Sequence[str | Family | Mixture]) -> Mixture:
     Raises:
         InputError: no family has a name, or one is in the mixture twice.
     """
-    named: list[tuple[str, Family]] = []
+    from mtjax.envs.mixtures import Mixture
+
+    named: list[tuple[str, Any]] = []
     for given in families:
         found = make(given) if isinstance(given, str) else given
         if isinstance(found, Mixture):
@@ -155,15 +204,19 @@ def mixture(families: Sequence[str | Family | Mixture]) -> Mixture:
 
 def _name_of(family: Any) -> str:
     """The name under which ``make`` knows a family, whatever else it varies; or that of its class."""
-    known = [name for name, (cls, _) in ENVS.items() if cls is type(family)]
+    cls = type(family)
+    place = f"{cls.__module__}:{cls.__name__}"
+    known = [name for name, (home, _) in ENVS.data.items() if home is cls or home == place]
     exact = [name for name in known if make(name) == family]
-    plain = [name for name in known if not ENVS[name][1]]
-    of_class = re.sub(r"(?<!^)(?=[A-Z])", "-", type(family).__name__).lower()
+    plain = [name for name in known if not ENVS.data[name][1]]
+    of_class = re.sub(r"(?<!^)(?=[A-Z])", "-", cls.__name__).lower()
     return next(iter((*exact, *plain, *known)), of_class)
 
 
-def _make_mixture(names: tuple[str, ...], vary: dict[str, Any], settings: dict[str, Any]) -> Mixture:
+def _make_mixture(names: tuple[str, ...], vary: dict[str, Any], settings: dict[str, Any]) -> "Mixture":
     """Make the families of a mixture by their names, with values of their parameters by "NAME.PARAMETER"."""
+    from mtjax.envs.mixtures import Mixture
+
     recorded = settings.pop("families", None)
     if recorded is not None:  # of config.json
         return Mixture(tuple(make(n, **each) for n, each in zip(names, recorded, strict=True)), names)
@@ -188,7 +241,7 @@ def _make_mixture(names: tuple[str, ...], vary: dict[str, Any], settings: dict[s
     return Mixture(tuple(made), names)
 
 
-def register(name: str, family: type[Family], **settings: Any) -> None:
+def register(name: str, family: "type[Family]", **settings: Any) -> None:
     """Give a family of your own a name, under which ``make``, the command line and notebooks know it.
 
     Args:
@@ -207,3 +260,24 @@ def register(name: str, family: type[Family], **settings: Any) -> None:
     except InputError:
         del ENVS[name]
         raise
+
+
+def outline(name: str) -> tuple[int, str]:
+    """Return a family's number of training tasks and what it is in a sentence, without importing it if it is ours."""
+    place, settings = ENVS.data[name]
+    if isinstance(place, str):
+        module, _, cls = place.partition(":")
+        count, text = variation.count_tasks(settings), _documented(module)[cls]
+    else:
+        count, text = make(name).train_count, place.__doc__ or ""
+    sentence = " ".join(text.split("\n\n")[0].split())
+    return count, sentence.split(". ")[0].split(" (")[0].removesuffix(".")
+
+
+@lru_cache
+def _documented(module: str) -> dict[str, str]:
+    """Read the documentation of a module's classes from its file, which is not run."""
+    spec = find_spec(module)
+    assert spec is not None and spec.loader is not None
+    tree = ast.parse(spec.loader.get_source(module))  # type: ignore
+    return {node.name: ast.get_docstring(node) or "" for node in tree.body if isinstance(node, ast.ClassDef)}

@@ -10,6 +10,7 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
 from importlib import resources
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -19,17 +20,16 @@ import mujoco
 import numpy as np
 import tyro
 
-from mtjax.envs.engines.base import ENGINES, Engine, World, choose_engine, mjx_module
+from mtjax.envs.engines.base import ENGINES, Engine, World, choose_engine
 from mtjax.envs.engines.c import MujocoC
 from mtjax.envs.engines.mjx import Mjx
 from mtjax.envs.engines.warp import Warp
 from mtjax.envs.family import Family, draw_until
+from mtjax.envs.fields import FIXED, VARIABLE
 from mtjax.envs.planar import Planar, is_planar, locate
 from mtjax.names import nearest_error
 from mtjax.types import Array, InputError, Key, Step, Task, Transition
 
-# Fields of the model that never reach the dynamics: statistics, and what only a renderer reads.
-_UNUSED = ("stat", "cam_", "light_", "mat_", "tex_", "name", "_", "signature", "geom_rgba")
 INTEGRATORS = ("model", "euler")
 
 
@@ -212,7 +212,6 @@ def stack_differing(models: Sequence[mujoco.MjModel]) -> dict[str, np.ndarray]:
     Raises:
         InputError: a field differs that one program cannot hold in several versions; it names field and task.
     """
-    mjx = mjx_module()
     first = {}  # model -> the first task that has it; many tasks may share one
     for task, model in enumerate(models):
         first.setdefault(id(model), task)
@@ -220,19 +219,15 @@ def stack_differing(models: Sequence[mujoco.MjModel]) -> dict[str, np.ndarray]:
     place = {identity: i for i, identity in enumerate(first)}
     places = [place[id(model)] for model in models]
     differing = {}
-    for owner, prefix, read in ((mjx.Model, "", lambda m: m), (mjx.Option, "opt.", lambda m: m.opt)):
-        for field in dataclasses.fields(owner):
-            if not hasattr(read(models[0]), field.name) or field.name.startswith(_UNUSED) or field.name == "opt":
-                continue
-            column = [getattr(read(m), field.name) for m in unique]
-            odd = _first_unlike(column)
-            if odd is None:
-                continue
-            # MJX keeps site sizes out of its traced leaves but reads them as values only (touch sensors).
-            if "Array" not in str(field.type) and field.name != "site_size":
-                task = first[id(unique[odd])]
-                raise InputError(f"task {task} changes {prefix}{field.name}, which must be the same in every task")
-            differing[prefix + field.name] = np.stack(column)[places]
+    for name in (*FIXED, *VARIABLE):
+        column = [attrgetter(name)(model) for model in unique]
+        odd = _first_unlike(column)
+        if odd is None:
+            continue
+        if name in FIXED:
+            task = first[id(unique[odd])]
+            raise InputError(f"task {task} changes {name}, which must be the same in every task")
+        differing[name] = np.stack(column)[places]
     loss = differing.get("dof_frictionloss")
     if loss is not None:  # MJX solves a friction row of exactly 0 as a rigid joint
         differing["dof_frictionloss"] = np.where(np.any(loss > 0, axis=0), np.maximum(loss, 1e-8), loss)

@@ -1,10 +1,13 @@
 """Quantities that may differ between tasks, and the ones that every MuJoCo model has."""
 
+from __future__ import annotations  # annotations name MuJoCo, which a list of families need not import
+
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-import mujoco
+if TYPE_CHECKING:
+    import mujoco
 
 
 class Parameter(NamedTuple):

@@ -6,8 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mtjax.envs.parameters import Parameter
-from mtjax.names import nearest_error
-from mtjax.types import InputError
+from mtjax.names import InputError, nearest_error
 
 COMBINATIONS = ("grid", "paired", "random")
 SCHEMES = ("dense", "hip-bmdp", "none")
@@ -124,6 +123,16 @@ def vary(
     continuous = [i for i, axis in enumerate(axes.values()) if axis.continuous and combine != "random"]
     draws = _draw(rows["train"], continuous, low, high, num_draws, random) if continuous else None
     return Variation(names, rows, draws, low, high)
+
+
+def count_tasks(settings: Mapping[str, Any]) -> int:
+    """Count the training tasks of a family by its settings alone; where tasks are drawn, ``num_tasks`` is one."""
+    if "num_tasks" in settings:
+        return settings["num_tasks"]
+    given = settings.get("vary", {})
+    anything = dict.fromkeys(given, Parameter("", 0.0, minimum=-np.inf))
+    combine, split = settings.get("combine", "grid"), settings.get("split", "dense")
+    return len(vary(given, anything, combine, 1, split, 1, 0).rows["train"])
 
 
 def _ends(axes: list[Axis], train: np.ndarray, combine: str) -> tuple[np.ndarray, np.ndarray]:

@@ -76,7 +76,11 @@ class Replay:
 
     def describe(self, num_envs: int) -> str:
         """Say how much it holds."""
-        return f"replay ({self.replay_size // num_envs * num_envs:,} transitions a task)"
+        return f"replay ({self.capacity(num_envs):,} transitions a task)"
+
+    def capacity(self, num_envs: int) -> int:
+        """Count the transitions that each task's ring holds: the replay size, rounded down to whole steps."""
+        return self.replay_size // num_envs * num_envs
 
     @property
     def sharding(self) -> Buffer:

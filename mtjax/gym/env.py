@@ -10,7 +10,7 @@ from gymnasium import spaces
 
 from mtjax import envs
 from mtjax.envs.domain import Domain
-from mtjax.envs.mixture import require_family
+from mtjax.envs.mixtures import require_family
 from mtjax.gym.tasks import TaskStream, TaskTable, read_options
 from mtjax.names import nearest_error
 from mtjax.report import render

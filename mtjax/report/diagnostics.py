@@ -67,11 +67,13 @@ def diagnose(policy: Policy, replay: Ring, batch_size: int) -> Diagnostics:
         batch_size: transitions of a task in each batch; the run's own makes norms those of training.
 
     Raises:
-        InputError: the replay is empty.
+        InputError: the replay is empty, or the agent has no critics of actions.
     """
     if not int(replay.size):
         raise InputError("the replay of this run is empty; train it for longer")
     tasks, agent = policy.env.tasks("train"), policy.agent
+    if not isinstance(agent, SAC):
+        raise InputError(f"diagnostics are of SAC and agents made from it, not of {type(agent).__name__}")
     found = []
     for s in range(len(policy.seeds)):
         state, rows = jax.tree.map(lambda x, s=s: x[s], (policy.states, replay.rows))

@@ -81,9 +81,9 @@ def return_by_task(path: str | Path, labels: Mapping[str, Sequence[str]], return
     for index, (split, scores) in enumerate(returns.items()):
         if np.size(scores):
             mean, low, high = _intervals(np.mean(scores, axis=2))
-            bars = np.maximum([mean - low, high - mean], 0)
-            style = {"color": _COLOURS[index % len(_COLOURS)], "fmt": _MARKERS[index % len(_MARKERS)], "label": split}
-            axes.errorbar(mean, [names.index(name) for name in labels[split]], xerr=bars, capsize=3, **style)
+            bars, places = np.maximum([mean - low, high - mean], 0), [names.index(name) for name in labels[split]]
+            colour, marker = _COLOURS[index % len(_COLOURS)], _MARKERS[index % len(_MARKERS)]
+            axes.errorbar(mean, places, xerr=bars, color=colour, fmt=marker, markersize=6, capsize=3, label=split)
     axes.set_yticks(range(len(names)), names, fontsize=8)
     axes.invert_yaxis()
     axes.set_xlabel("return")

@@ -10,7 +10,7 @@ import numpy as np
 from mtjax.agents import BaseAgent, parts, settings
 from mtjax.config import NO_FINE_TUNING
 from mtjax.envs import Family
-from mtjax.envs.mixture import require_family
+from mtjax.envs.mixtures import require_family
 from mtjax.networks import Params
 from mtjax.training.policy import Policy
 from mtjax.types import Array, Env, InputError, Task

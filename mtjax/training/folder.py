@@ -18,7 +18,7 @@ from mtjax import __version__
 from mtjax.agents import settings
 from mtjax.agents.base import flag_names
 from mtjax.config import RunConfig, from_json, import_flags
-from mtjax.envs import Family, Tabled
+from mtjax.envs.family import Family, Tabled
 from mtjax.types import InputError
 
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
@@ -46,14 +46,10 @@ def short_name(env_name: str) -> str:
 
 
 def recorded(config: RunConfig, directory: Path, argv: Sequence[str]) -> RunConfig:
-    """The program of the run to go on with; ``--steps`` may extend it, and nothing else that it computes may change."""
-    given = {word.split("=", 1)[0] for word in argv if word.startswith("--")}
-    allowed = {"--resume", "--steps", "--import", "--distributed", "--profile"}
-    if given - allowed:
-        other = ", ".join(sorted(given - allowed))
-        raise InputError(f"--resume goes on with a run as it was; only --steps may change, not {other}")
+    """The program of the run to go on with, which ``--steps`` may extend."""
     recorded = from_json(directory / "config.json")
-    steps = config.plan.steps if "--steps" in given else recorded.plan.steps
+    extended = any(word.split("=", 1)[0] == "--steps" for word in argv)
+    steps = config.plan.steps if extended else recorded.plan.steps
     now = {"plan": dataclasses.replace(recorded.plan, steps=steps)}
     return dataclasses.replace(recorded, **now, profile=config.profile, distributed=config.distributed)
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from mtjax import loop
 from mtjax.agents import BaseAgent
 from mtjax.config import RunConfig, from_json
-from mtjax.envs import Tabled
+from mtjax.envs.family import Tabled
 from mtjax.experience import Replay
 from mtjax.experience.ring import Ring
 from mtjax.training import checkpoint, points

@@ -41,7 +41,7 @@ class NoScaling(parts.Watcher):
         """What is remembered of an episode that begins; None for nothing."""
         return None
 
-    def remember(self, memory: Any, reward: Array, gamma: float) -> Any:
+    def remember(self, memory: Any, reward: Array, gamma: float | Array) -> Any:
         """What is remembered of an episode after a step of it."""
         return memory
 
@@ -128,7 +128,7 @@ class ReturnScaling(NoScaling):
         """The sum of the episode's rewards so far, each discounted once more at every later step."""
         return jnp.float32(0)
 
-    def remember(self, memory: Array, reward: Array, gamma: float) -> Array:
+    def remember(self, memory: Array, reward: Array, gamma: float | Array) -> Array:
         return gamma * memory + reward
 
     def observe(self, memory: LargestReturns, outcome: Outcome) -> LargestReturns:

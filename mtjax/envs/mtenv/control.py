@@ -222,10 +222,6 @@ _ACROBOT_FORM = {
     "link-mass-2": (1.0, 0.5),
     "torque-sign": (0.0, 1.0),
 }
-CARTPOLE_RANGES, ACROBOT_RANGES = (
-    {name: f"{centre - half:g}:{centre + half:g}" for name, (centre, half) in form.items()}
-    for form in (_CARTPOLE_FORM, _ACROBOT_FORM)
-)
 _ACROBOT_SLOTS = (0, 1, 2, 3, 6)  # MTEnv reads nothing from 4 and 5
 
 

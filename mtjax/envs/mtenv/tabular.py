@@ -52,7 +52,8 @@ class DrawnTasks(Family):
             raise InputError(f"the tables of a task have the shapes {self.shapes}, not {given}")
         numbers = np.concatenate([goal[name].ravel() for name in self.shapes])
         leaves: dict[str, Any] = {"id": np.int32(row), "row": np.int32(row), "context": 2 * numbers - 1, "goal": goal}
-        return Task(**leaves, params={}, model={}, horizon=np.int32(self.episode_length))
+        leaves["horizon"] = np.int32(self.episode_length)
+        return Task(**leaves, params={}, model={})
 
     @property
     def train_count(self) -> int:

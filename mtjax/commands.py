@@ -1,0 +1,165 @@
+"""What the commands share, and what they answer before JAX is imported: the list, wrong names, missing runs."""
+
+import contextlib
+import importlib.util
+import io
+import itertools
+import re
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from mtjax.agents import AGENTS
+from mtjax.envs import ENVS, outline
+from mtjax.names import InputError, nearest_error
+
+PRESETS = ("auto", "cpu", "gpu")
+_KNOWN = (("environment", "env", ENVS), ("agent", "agent", AGENTS), ("preset", "preset", PRESETS))
+_MAY_CHANGE = {"--resume", "--steps", "--import", "--distributed", "--profile"}  # where a run goes on
+_FIELD = re.compile(r"^    (\w+): ", re.MULTILINE)  # a line of a class that may be a setting
+P = TypeVar("P")
+
+
+def main(run: Any) -> None:
+    """Run a program's entry point; what the user got wrong becomes a line and exit code 2."""
+    try:
+        run(sys.argv[1:])
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        sys.exit(130)
+    except FloatingPointError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(1)
+    except OSError as error:
+        print(f"error: {error.strerror or error}: {error.filename or ''}".rstrip(": "), file=sys.stderr)
+        sys.exit(2)
+
+
+def catalogue() -> str:
+    """List families and agents with the first sentence of their documentation."""
+    lines = ["environments:"]
+    for name in ENVS:
+        tasks, says = outline(name)
+        lines.append(f"  {name:36} {tasks:3} task{'s' if tasks > 1 else ' '}  {says}")
+    lines.append("agents:")
+    return "\n".join(lines + [f"  {name:36} {preset.says}" for name, preset in AGENTS.items()])
+
+
+def check_names(argv: Sequence[str]) -> None:
+    """Refuse what names alone show to be wrong: an environment, agent or preset, or a run to begin with.
+
+    Raises:
+        InputError: there is no such thing, or a run that goes on was told to change.
+    """
+    for kind, flag, known in _KNOWN:
+        given = value_of(argv, flag, None)
+        names = () if given is None else given.split("+") if flag == "env" else (given,)  # several are a mixture
+        wrong = next((name for name in names if name not in known), None)
+        if wrong is not None:
+            raise nearest_error(kind, wrong, known)
+    given = {word.split("=", 1)[0] for word in argv if word.startswith("--")}
+    other = ", ".join(sorted(given - _MAY_CHANGE))
+    if "--resume" in given and "--sweep" not in given and other:
+        raise InputError(f"--resume goes on with a run as it was; only --steps may change, not {other}")
+    for flag in ("resume", "from"):
+        folder = value_of(argv, flag, None)
+        if folder is not None and not (flag == "resume" and any(Path(folder).glob("run-*"))):  # the runs of a sweep
+            require_run(Path(folder))
+
+
+def check_flags(argv: Sequence[str]) -> None:
+    """Refuse a flag that is no setting of any family or agent; which of them has a setting is checked with the rest.
+
+    Raises:
+        InputError: there is no such flag, whatever is chosen.
+    """
+    places = (*(place for place, _ in ENVS.data.values()), *(preset.place for preset in AGENTS.values()))
+    if not all(isinstance(place, str) for place in places):  # a class of the user's own, with settings of its own
+        return
+    files = Path(__file__).parent.rglob("*.py")  # read and not run: to import the classes is to import JAX
+    fields = itertools.chain.from_iterable(_FIELD.findall(file.read_text(encoding="utf-8")) for file in files)
+    known = {*(field.replace("_", "-") for field in fields), "from", "help"}
+    for word in argv:
+        flag = word.split("=", 1)[0].replace("_", "-")
+        group, name = re.fullmatch(r"(--(?:\w+\.)*)?(.*)", flag).groups("")  # type: ignore
+        if group and not flag.startswith("--env.vary.") and not {name, name.removeprefix("no-")} & known:
+            raise unknown_flag(flag, [group + other for other in sorted(known)])
+
+
+def unknown_flag(flag: str, known: Iterable[str]) -> InputError:
+    """Return an error for a flag that there is not; --help lists the others, of which there are many."""
+    return InputError(str(nearest_error("flag", flag, known)).split("choose from")[0] + "--help lists the flags")
+
+
+def require_run(folder: Path) -> None:
+    """Refuse a folder that is not a run's."""
+    if not (folder / "config.json").is_file():
+        raise InputError(f"{str(folder)!r} is not a run: it has no config.json")
+
+
+def value_of(argv: Sequence[str], name: str, default: P) -> str | P:
+    """Find --name=VALUE or --name VALUE; the last one counts."""
+    value = default
+    for i, word in enumerate(argv):
+        if word.startswith(f"--{name}="):
+            value = word.split("=", 1)[1]
+        elif word == f"--{name}":
+            if i + 1 == len(argv):
+                raise InputError(f"--{name} needs a value")
+            value = argv[i + 1]
+    return value
+
+
+def import_files(argv: Sequence[str]) -> list[str]:
+    """Run the FILE.py of every --import=FILE.py, which may register families; returns the other words.
+
+    Raises:
+        InputError: there is no such file.
+    """
+    for word in argv:
+        if word.startswith("--import="):
+            _import(Path(word.split("=", 1)[1]))
+    return [word for word in argv if not word.startswith("--import=")]
+
+
+def _import(path: Path) -> None:
+    if not path.is_file() or path.suffix != ".py":
+        raise InputError(f"--import needs a Python file, and {str(path)!r} is none")
+    known = (getattr(module, "__file__", None) for module in list(sys.modules.values()))
+    if any(file and Path(file).resolve() == path.resolve() for file in known):
+        return
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None and spec.loader is not None
+    sys.modules[path.stem] = module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+
+
+def parse_with_tyro(cls: type[P], argv: Sequence[str], default: P, name: str) -> P:
+    """Parse with tyro, whose framed error becomes one line.
+
+    Raises:
+        InputError: tyro refused the command line.
+    """
+    import tyro  # only here: names are checked without it
+
+    output = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(output):
+            return tyro.cli(cls, args=list(argv), default=default, prog=name)
+    except SystemExit as stop:
+        if stop.code in (0, None):
+            raise
+        message = re.sub(r"^Error parsing ((plan|training|family|learner): )?", "", _unframed(output.getvalue()))
+        raise InputError(message or "the command line cannot be read; --help lists the flags") from None
+
+
+def _unframed(text: str) -> str:
+    """The lines between the first two rules of tyro's frame, which has no corners where output is not UTF-8."""
+    is_rule = lambda line: line.startswith("╭") or not line.strip(" │─╰╯-")
+    below = itertools.dropwhile(lambda line: not is_rule(line), text.splitlines())
+    next(below, None)
+    return " ".join(line.strip(" │") for line in itertools.takewhile(lambda line: not is_rule(line), below))

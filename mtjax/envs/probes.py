@@ -1,0 +1,128 @@
+"""Probe environments: problems so small that every Q-value is known, each of which breaks one part of a learner.
+
+After Andy Jones' five, with a task axis and a time limit. A probe is data, as a task is: one environment, and so one
+compiled program, serves all of them. Use them to check an agent of your own: train it on ``Probe(kind)`` and compare
+its values with those that the rules' docstrings give.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mtjax.maps import Flat
+from mtjax.types import Array, Key, Spec, Step, Task
+
+AFTER = 5.0
+"""The observation after an episode has terminated, when its value must not matter."""
+LIMIT = 2
+"""Steps after which an episode is cut off."""
+SPEC = Spec.vector(obs_size=1, action_size=1, context_size=1)
+
+
+# The rules of each probe: scale, observation (), action () -> reward, next observation, terminated.
+
+
+def _one_step(scale, obs, action):
+    """Earns ``scale``: Q = scale. Needs the critic's fit to the reward, and ``discount``."""
+    return scale, AFTER, True
+
+
+def _by_observation(scale, obs, action):
+    """One step from -1 or 1: Q = scale obs. Needs the observation to reach the critic."""
+    return scale * obs, AFTER, True
+
+
+def _delayed(scale, obs, action):
+    """Two steps, from 0 and from 1, of which the last earns: Q(1) = scale, Q(0) = gamma scale."""
+    last = obs > 0.5
+    return scale * last, jnp.where(last, AFTER, 1.0), last
+
+
+def _by_action(scale, obs, action):
+    """One step: Q = -(action - scale)^2, so that the policy has a best action in each task."""
+    return -jnp.square(action - scale), AFTER, True
+
+
+def _by_both(scale, obs, action):
+    """One step from -1 or 1: Q = -(action - scale obs)^2, so that the best action turns with observation and task."""
+    return -jnp.square(action - scale * obs), AFTER, True
+
+
+def _endless(scale, obs, action):
+    """Never terminates: nothing from 0, then ``scale`` from 1 for ever, so that Q(1) = scale / (1 - gamma).
+
+    Were the time limit a termination, Q(1) would be scale; were the observation after the reset stored as the next
+    one, scale / (1 - gamma^2).
+    """
+    return scale * (obs > 0.5), 1.0, False
+
+
+RULES = {
+    "one-step": _one_step,
+    "by-observation": _by_observation,
+    "delayed": _delayed,
+    "by-action": _by_action,
+    "by-both": _by_both,
+    "endless": _endless,
+}
+EITHER_SIGN = ("by-observation", "by-both")  # episodes begin at -1 or 1, and not at 0
+
+
+class World(NamedTuple):
+    """The state of every probe."""
+
+    obs: Array  # (1,)
+    age: Array  # () int32
+
+
+def tasks_of(kind: str, scales=(1.0, -0.5), horizon: int = LIMIT) -> Task:
+    """Tasks (T, ...) of one probe, told apart by a scale, which is also their context."""
+    scales = jnp.asarray(scales, jnp.float32)
+    same = lambda value, dtype: jnp.full(scales.shape, value, dtype)
+    goal = {
+        "scale": scales,
+        "kind": same(list(RULES).index(kind), jnp.int32),
+        "either_sign": same(kind in EITHER_SIGN, bool),
+    }
+    row = jnp.arange(len(scales), dtype=jnp.int32)
+    return Task(row, row, scales[:, None], {"scale": scales}, {}, goal, same(horizon, jnp.int32))
+
+
+@dataclasses.dataclass(frozen=True)
+class Probe(Flat):
+    """Any of the probes, by the task's ``kind``."""
+
+    kind: str = "one-step"
+    episode_length: int = LIMIT
+
+    @property
+    def spec(self) -> Spec:
+        return SPEC
+
+    def tasks(self, split: str = "train") -> Task:
+        return tasks_of(self.kind, horizon=self.episode_length)
+
+    def task_values(self, split: str) -> np.ndarray:
+        return np.asarray(self.tasks(split).params["scale"])
+
+    def reset(self, task: Task, key: Key) -> Step:
+        state = World(self.start(task, key), jnp.int32(0))
+        return Step(state, state.obs, jnp.float32(0), jnp.bool_(False))
+
+    def step(self, task: Task, state: World, action: Array) -> Step:
+        reward, obs, terminated = self.rules(task, state, action[0])
+        obs = jnp.reshape(jnp.float32(obs), 1)
+        return Step(World(obs, state.age + 1), obs, jnp.float32(reward), jnp.bool_(terminated))
+
+    def start(self, task: Task, key: Key) -> Array:
+        sign = jnp.where(jax.random.bernoulli(key, shape=(1,)), 1.0, -1.0)
+        return jnp.where(task.goal["either_sign"], sign, 0.0)
+
+    def rules(self, task: Task, state: World, action: Array):
+        as_arrays = lambda rule: lambda *inputs: tuple(map(jnp.float32, rule(*inputs)))
+        branches = [as_arrays(rule) for rule in RULES.values()]
+        reward, obs, terminated = jax.lax.switch(task.goal["kind"], branches, task.goal["scale"], state.obs[0], action)
+        return reward, obs, terminated > 0

@@ -1,0 +1,65 @@
+"""What ``python -m mtjax.train`` does: train, or go on with a run, and say where it is and how each split scored."""
+
+import shlex
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+
+from mtjax.config import RunConfig, import_flags, to_json
+from mtjax.parallel import hosts
+from mtjax.report import figures
+from mtjax.report.tables import split_table
+from mtjax.training import memory, sweep
+from mtjax.training.folder import circumstances, new_directory, record_steps, recorded, short_name
+from mtjax.training.launch import check, launch, starting
+from mtjax.training.programs import enable_compile_cache
+from mtjax.training.run import Result
+from mtjax.types import InputError
+
+
+def main(argv: Sequence[str], parse: Callable[[Sequence[str]], RunConfig]) -> None:
+    """Run what a command line asks for, which ``parse`` reads: a run, a sweep, or more steps of either."""
+    if "--distributed" in argv:
+        hosts.initialise()  # before anything asks which devices there are
+    if sweep.wanted(argv):
+        if "--distributed" in argv:
+            raise InputError("a sweep runs in one process; leave out --distributed")
+        return sweep.main(argv, parse)
+    config = parse(argv)
+    resume = any(word.split("=", 1)[0] == "--resume" for word in argv)
+    directory = Path(config.resume) if resume else None
+    if directory is not None:
+        config = recorded(config, directory, argv)
+    enable_compile_cache()
+    check(config)
+    start = starting(config) if directory is None else None
+    if directory is None and memory.too_many_seeds(config):
+        return sweep.begin([config], "rounds")
+    directory = hosts.agreed(partial(_prepare, config, directory))
+    result = launch(config, directory, start, resume)
+    if hosts.is_first():
+        _conclude(config, result, directory)
+
+
+def _prepare(config: RunConfig, directory: Path | None) -> Path:
+    """Make the run's folder with the record of it, or bring that of a run to go on with up to date."""
+    if directory is not None:
+        record_steps(directory / "config.json", config.plan.steps)
+        return directory
+    directory = new_directory(Path(config.runs), f"{short_name(config.env)}-{config.agent}")
+    (directory / "config.json").write_text(to_json(config, circumstances(config)))
+    return directory
+
+
+def _conclude(config: RunConfig, result: Result, directory: Path) -> None:
+    if not result.finished:
+        words = [f"--resume={directory}", *import_flags(config.family)]
+        print(f"stopped; the state is saved. Go on with:\n  python -m mtjax.train {shlex.join(words)}")
+        return
+    if len(result.evaluations.steps):
+        title = f"{config.agent} on {short_name(config.env)}"
+        figures.learning_curve(directory / "curve.png", result.evaluations.steps, result.evaluations.returns, title)
+        print(split_table(result.evaluations, config.family.parts))
+        if config.learner.unseen:
+            print(f"unseen tasks: {config.learner.unseen}")
+    print(f"trained in {result.seconds:.1f} s (compiled in {result.compile_seconds:.1f} s); run: {directory}")

@@ -1,0 +1,103 @@
+"""Who imports whom: read from the source, so that no import is missed and none has to run."""
+
+import ast
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+from mtjax.agents import AGENTS
+from mtjax.envs import ENVS
+
+PACKAGE = Path(__file__).parent.parent / "mtjax"
+FILES = {
+    ".".join(file.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__"): file
+    for file in PACKAGE.rglob("*.py")
+}
+TREES = {module: ast.parse(file.read_text()) for module, file in FILES.items()}
+
+# From the ground up: a module imports its own layer and those below it. Within a layer only a group's own modules.
+GROUND = ("types", "names", "networks", "normalize", "tasks", "maps", "parallel.collectives")
+LAYERS = (
+    [GROUND],
+    [("envs",), ("experience",), ("agents",)],
+    [("rollout", "loop", "evaluation")],
+    [("parallel", "commands", "config")],
+    [("training", "report")],
+    [("cli",), ("gym",)],
+    [("train",), ("evaluate",), ("plot",)],
+)
+BESIDE = {("agents", "experience")}  # the groups of one layer of which the first may import the second
+
+
+def imported(module: str, node: ast.AST) -> list[str]:
+    """The modules of the package that a statement imports, or that a string names for a later import."""
+    match node:
+        case ast.Import():
+            names = [alias.name for alias in node.names]
+        case ast.ImportFrom():
+            assert not node.level, f"{module} imports relatively"
+            whole = f"{node.module}"
+            names = [f"{whole}.{alias.name}" if f"{whole}.{alias.name}" in FILES else whole for alias in node.names]
+        case ast.Constant(value=str(text)):
+            names = [text.split(":")[0]] if ":" in text else []  # "module:name", for ``load``
+        case _:
+            names = []
+    return [name for name in names if name in FILES and name != module]
+
+
+def edges() -> dict[str, set[str]]:
+    """Every module and what it imports, at once or, where a registry names it by a string, when it is asked for."""
+    found = {
+        module: {name for node in ast.walk(tree) for name in imported(module, node)} for module, tree in TREES.items()
+    }
+    places = [place for place, _ in ENVS.data.values() if isinstance(place, str)]
+    found["mtjax.envs"] |= {place.split(":")[0] for place in places}
+    found["mtjax.agents"] |= {preset.place.split(":")[0] for preset in AGENTS.values()}
+    del found["mtjax"]  # whose table says where each public name is
+    return {module: names - {"mtjax"} for module, names in found.items()}
+
+
+EDGES = edges()
+
+
+def place_of(module: str) -> tuple[int, int]:
+    """The layer of a module and its group in it: by the longest name that the table has."""
+    name = module.removeprefix("mtjax.")
+    known = {
+        start: (i, j)
+        for i, layer in enumerate(LAYERS)
+        for j, group in enumerate(layer)
+        for start in group
+        if f"{name}.".startswith(f"{start}.")
+    }
+    assert known, f"{module} has no layer: give it one in LAYERS"
+    return known[max(known, key=len)]
+
+
+def test_imports_go_in_no_circle():
+    """Nor do those that wait until a registry's entry is asked for."""
+    assert len(list(TopologicalSorter(EDGES).static_order())) == len(FILES) - 1
+
+
+@pytest.mark.parametrize("module", FILES)
+def test_no_function_imports_the_package(module):
+    """Which is how circles are hidden."""
+    functions = [node for node in ast.walk(TREES[module]) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
+    inside = [node for function in functions for node in ast.walk(function)]
+    hidden = [
+        name for node in inside if isinstance(node, ast.Import | ast.ImportFrom) for name in imported(module, node)
+    ]
+    assert not hidden
+
+
+@pytest.mark.parametrize("module", EDGES)
+def test_a_module_imports_none_above_it(module):
+    """And of its own layer none of another group, unless the two are named together."""
+    layer, group = place_of(module)
+    for name in EDGES[module]:
+        other, theirs = place_of(name)
+        assert other <= layer, f"{module} imports {name}, which is above it"
+        if other == layer and theirs != group:
+            pair = LAYERS[layer][group][0], LAYERS[layer][theirs][0]
+            assert pair in BESIDE, f"{module} imports {name}, which is beside it"

@@ -1,0 +1,157 @@
+"""What each command imports: answers that need names alone come without JAX, and MuJoCo C without the other engines."""
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from mujoco import mjx
+
+import mtjax
+from mtjax import cli, commands
+from mtjax.agents import AGENTS
+from mtjax.config import with_preset
+from mtjax.envs import ENVS, fields, outline
+from mtjax.envs.brax import NAMES
+from mtjax.names import InputError
+
+HEAVY = ("jax", "flax", "optax", "mujoco", "orbax", "brax", "warp", "matplotlib", "mtjax.config")
+ENGINES = ("mujoco.mjx", "warp", "brax")
+# Runs a command and says, as the last line of its output, which of some modules were imported.
+SCRIPT = """
+import json, runpy, sys
+module, words, asked = json.loads(sys.argv[1])
+sys.argv = [module, *words]
+try:
+    runpy.run_module(module, run_name="__main__") if "." in module else __import__(module)
+finally:
+    print(json.dumps([name for name in asked if name in sys.modules]))
+"""
+
+
+def run(module, words, asked, folder):
+    """Run a command in a process of its own; returns its exit code, its output, and what of ``asked`` it imported."""
+    root = str(Path(mtjax.__file__).parents[1])
+    environment = {**os.environ, "PYTHONPATH": root, "MTJAX_CACHE": "0", "JAX_PLATFORMS": "cpu"}
+    given = json.dumps([module, words, asked])
+    command = [sys.executable, "-c", SCRIPT, given]
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=600)
+    *output, imported = done.stdout.splitlines()
+    return done.returncode, "\n".join([*output, done.stderr]), json.loads(imported)
+
+
+@pytest.fixture
+def ours(monkeypatch):
+    """Forgets the families that other tests have registered."""
+    monkeypatch.setattr(ENVS, "data", {name: entry for name, entry in ENVS.data.items() if isinstance(entry[0], str)})
+
+
+@pytest.mark.parametrize(
+    "module, words, code, said",
+    [
+        ("mtjax", [], 0, ""),
+        ("mtjax.train", ["--list"], 0, "two-goal-maze-seen"),
+        ("mtjax.train", ["--env=finger-spn"], 2, "did you mean 'finger-spin'?"),
+        ("mtjax.train", ["--agent", "carr"], 2, "did you mean 'care'?"),
+        ("mtjax.train", ["--preset=gpus"], 2, "did you mean 'gpu'?"),
+        (
+            "mtjax.train",
+            ["--num-env=3"],
+            2,
+            "'--num-env'; did you mean '--num-envs'? --help lists the flags",
+        ),
+        ("mtjax.train", ["--agent.num_expert", "3"], 2, "did you mean '--agent.num-experts'?"),
+        ("mtjax.train", ["--import=nothing.py"], 2, "--import needs a Python file"),
+        ("mtjax.train", ["--resume=nowhere"], 2, "'nowhere' is not a run"),
+        ("mtjax.train", ["--resume=nowhere", "--num-envs=3"], 2, "only --steps may change, not --num-envs"),
+        ("mtjax.train", ["--from=nowhere"], 2, "'nowhere' is not a run"),
+        ("mtjax.evaluate", ["--help"], 0, "--episodes"),
+        ("mtjax.evaluate", ["--run=nowhere"], 2, "'nowhere' is not a run"),
+        ("mtjax.evaluate", ["--runs=x"], 2, "did you mean '--run'?"),
+        ("mtjax.evaluate", ["--run=x", "--episodes=some"], 2, "some"),
+        ("mtjax.evaluate", [], 2, "say which run to evaluate"),
+    ],
+)
+def test_names_are_answered_without_jax(tmp_path, module, words, code, said):
+    """Nor anything else that takes long to import."""
+    found, output, imported = run(module, words, HEAVY, tmp_path)
+    assert (found, imported) == (code, []) and said in output
+
+
+@pytest.mark.slow
+def test_a_run_of_the_c_engine_imports_no_other(tmp_path):
+    """From the command line to the last evaluation."""
+    small = (
+        "--steps=100 --eval-episodes=1 --num-envs=2 --batch-size=4 --replay-size=200 --warmup-steps=5 --chunk-steps=25"
+    )
+    words = ["--env=finger-spin", "--engine=c", *small.split(), "--agent.hidden=8", f"--runs={tmp_path}"]
+    code, output, imported = run("mtjax.train", words, (*ENGINES, "mujoco"), tmp_path)
+    assert code == 0 and "trained in" in output
+    assert imported == ["mujoco"]
+
+
+@pytest.mark.parametrize("env, agent", [(env, "sac") for env in ENVS] + [("finger-spin", agent) for agent in AGENTS])
+def test_no_flag_is_refused_that_there_is(env, agent, ours):
+    """Of any family or agent, before either is known."""
+    flags = cli.flags(with_preset(env, agent, "cpu"))
+    commands.check_flags([*flags, *(f"{flag}=1" for flag in flags)])
+
+
+def test_no_way_to_write_a_flag_is_refused(ours):
+    """With underscores, switched off, or by a name that only the command line knows; and values are no flags."""
+    words = "--env.vary.mass=1:2:3 --agent.no-shared_temperature --num_envs=3 --no-profile --from=x --help -h 1 -3"
+    commands.check_flags(words.split())
+
+
+def test_a_class_of_the_users_own_may_have_any_flag(ours, monkeypatch):
+    """What its settings are is known once the command line is read in full."""
+    with pytest.raises(InputError, match=r"unknown flag '--env\.springiness'"):
+        commands.check_flags(["--env.springiness=3"])
+    monkeypatch.setitem(ENVS, "mine", ENVS["finger-spin"])
+    commands.check_flags(["--env.springiness=3"])
+
+
+@pytest.mark.parametrize("name", ENVS)
+def test_outline_is_what_the_family_says(name):
+    """Tasks are counted without its class, and the sentence is read without running its file."""
+    count, says = outline(name)
+    family = mtjax.make(name)
+    assert count == family.train_count
+    assert " ".join(type(family).__doc__.split()).startswith(says) and len(says) > 20
+
+
+def test_outline_of_a_class_that_is_given_is_the_same(monkeypatch):
+    """As of a family that a user registers."""
+    for name in ("finger-spin-vary-size", "bandit", "control-acrobot"):
+        listed = outline(name)
+        monkeypatch.setitem(ENVS, name, ENVS[name])
+        assert outline(name) == listed and not isinstance(ENVS.data[name][0], str)
+
+
+def test_every_environment_of_brax_is_registered():
+    """By the name that Brax gives it."""
+    assert {settings["environment"] for name, (_, settings) in ENVS.items() if "environment" in settings} == set(NAMES)
+
+
+def test_an_agent_may_be_given_as_a_class(monkeypatch):
+    """Beside those that are named by their place."""
+    cls = AGENTS["distral"].cls
+    assert dataclasses.is_dataclass(cls) and cls.__name__ == "Distral"
+    monkeypatch.setitem(AGENTS, "mine", AGENTS["sac"]._replace(place=cls))
+    assert type(mtjax.agent("mine")) is cls
+    assert "mine" in commands.catalogue()
+
+
+def test_fields_of_models_are_those_of_mjx():
+    """Which may differ between tasks, and which must not."""
+    model = mtjax.make("finger-spin").models[0]
+    traced, static = set(), {"site_size"}
+    for owner, prefix, own in ((mjx.Model, "", model), (mjx.Option, "opt.", model.opt)):
+        for field in dataclasses.fields(owner):
+            if hasattr(own, field.name) and not field.name.startswith(fields.UNUSED) and field.name != "opt":
+                (traced if "Array" in str(field.type) else static).add(prefix + field.name)
+    assert set(fields.VARIABLE) == traced | {"site_size"}
+    assert set(fields.FIXED) == static - {"site_size"}
