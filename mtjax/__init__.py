@@ -19,6 +19,7 @@ _HOME = {
     "agent": "mtjax.agents",
     "load": "mtjax.training.policy",
     "make": "mtjax.envs",
+    "mixture": "mtjax.envs",
     "preset": "mtjax.config:with_preset",
 }
 __all__ = [*_HOME, "train"]

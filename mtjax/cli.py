@@ -8,7 +8,10 @@ from typing import Any
 from mtjax.agents import settings
 from mtjax.agents.base import CHOICES, flag_names
 from mtjax.commands import check_names, import_files, parse_with_tyro, unknown_flag, value_of
-from mtjax.config import RunConfig, from_json, with_preset
+from mtjax.config import NO_FINE_TUNING, RunConfig, from_json, with_preset
+from mtjax.envs import make
+from mtjax.envs.family import Family
+from mtjax.envs.mixtures import Mixture, require_family
 from mtjax.names import InputError
 
 _VARY = "--env.vary."
@@ -33,7 +36,11 @@ def parse(argv: Sequence[str]) -> RunConfig:
     preset_name = value_of(argv, "preset", RunConfig.preset)
     vary, argv = _peel_vary(argv)
     chosen, argv = _peel_parts(argv)
-    of_family = {name: value for name in ("combine", "split") if (value := value_of(argv, _FAMILY_FLAGS[name], ""))}
+    of_family: dict[str, Any] = {
+        name: value for name in ("combine", "split") if (value := value_of(argv, _FAMILY_FLAGS[name], ""))
+    }
+    if "+" in env_name:
+        of_family, argv = _peel_shared(argv, make(env_name))
     told = {name: value for name in _DECIDING if (value := value_of(argv, f"agent.{name}", ""))}
     default = with_preset(env_name, agent_name, preset_name, {**chosen, **told}, vary=vary, **of_family)
     if begun is not None:
@@ -48,6 +55,9 @@ def _fine_tuning(config: RunConfig, begun: RunConfig, start: str, chosen: Mappin
     for name, given in {"agent": config.agent, **chosen}.items():
         if given != had[name]:
             raise InputError(f"--from goes on with the run's {name}, {had[name]}, not with {given}; leave it out")
+    for env in (config.family, begun.family):
+        require_family(env, NO_FINE_TUNING)
+    assert isinstance(config.family, Family) and isinstance(begun.family, Family)
     learner, family = dataclasses.replace(begun.learner, tune="all"), config.family.scaled_as(begun.family)
     return dataclasses.replace(config, start=start, learner=learner, family=family)
 
@@ -63,6 +73,43 @@ def _peel_parts(argv: Sequence[str]) -> tuple[dict[str, str], list[str]]:
     kinds = {f"--agent.{kind}": kind for kind in CHOICES}
     given, rest = _take(argv, kinds.__contains__, "a value")
     return {kinds[flag]: name for flag, name in given.items()}, rest
+
+
+def _peel_shared(argv: Sequence[str], mixture: Mixture) -> tuple[dict[str, Any], list[str]]:
+    """Take the flags that hold for every family of a mixture out of a command line, and read their values."""
+    fields = {f.name: (f.type, getattr(family, f.name)) for family in mixture.families for f in shared_fields(family)}
+    known = {_family_flag(name): name for name in fields}
+    known |= {_negated(flag): name for flag, name in known.items()}
+    given, words, rest = {}, [], []
+    name = None
+    for word in argv:
+        if word.startswith("--"):
+            flag, equals, value = word.partition("=")
+            name = known.get(flag.replace("_", "-"))
+            if name is not None:
+                kind, default = fields[name]
+                given[name] = (name, kind, dataclasses.field(default=default))
+                word = f"--{flag.removeprefix('--').rpartition('.')[2]}{equals}{value}"
+        (rest if name is None else words).append(word)
+    if not given:
+        return {}, rest
+    shared = dataclasses.make_dataclass("Shared", given.values(), frozen=True)
+    return dataclasses.asdict(parse_with_tyro(shared, words, shared(), "python -m mtjax.train")), rest
+
+
+def shared_fields(family: Family) -> list[dataclasses.Field]:
+    """The fields of a family that are flags by themselves."""
+    return [field for field in dataclasses.fields(family) if field.name not in ("vary", "context_ranges")]
+
+
+def _family_flag(name: str) -> str:
+    flag = name.replace("_", "-")
+    return f"--{flag}" if flag in ("split", "engine") else f"--env.{flag}"
+
+
+def _negated(flag: str) -> str:
+    group, dot, name = flag.removeprefix("--").rpartition(".")
+    return f"--{group}{dot}no-{name}"
 
 
 def _take(argv: Sequence[str], mine: Callable[[str], bool], needed: str) -> tuple[dict[str, str], list[str]]:
@@ -88,6 +135,10 @@ def flags(config: Any, prefix: str = "--") -> list[str]:
             continue
         if name == "learner":
             names += [f"--{flag}" for flag in flag_names(value).values()]
+            continue
+        if isinstance(value, Mixture):
+            shared = [f.name for family in value.families for f in shared_fields(family)]
+            names += [_family_flag(each) for each in dict.fromkeys(shared)]
             continue
         group = {"plan": "--", "training": "--", "family": "--env."}.get(field.name)
         if group is not None:

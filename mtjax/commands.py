@@ -56,9 +56,11 @@ def check_names(argv: Sequence[str]) -> None:
         InputError: there is no such thing, or a run that goes on was told to change.
     """
     for kind, flag, known in _KNOWN:
-        name = value_of(argv, flag, None)
-        if name is not None and name not in known:
-            raise nearest_error(kind, name, known)
+        given = value_of(argv, flag, None)
+        names = () if given is None else given.split("+") if flag == "env" else (given,)  # several are a mixture
+        wrong = next((name for name in names if name not in known), None)
+        if wrong is not None:
+            raise nearest_error(kind, wrong, known)
     given = {word.split("=", 1)[0] for word in argv if word.startswith("--")}
     other = ", ".join(sorted(given - _MAY_CHANGE))
     if "--resume" in given and "--sweep" not in given and other:

@@ -16,9 +16,12 @@ import tyro
 from mtjax.agents import SAC, BaseAgent, agent, preset_of, settings
 from mtjax.agents.base import replace
 from mtjax.commands import require_run
-from mtjax.envs import Family, make
+from mtjax.envs import make
+from mtjax.envs.family import Tabled
 from mtjax.loop import Settings
 from mtjax.types import InputError
+
+NO_FINE_TUNING = "fine-tuning takes the networks of one family's tasks to other tasks of the same shapes"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,7 +52,9 @@ class RunConfig:
     """Train a multi-task agent: ``python -m mtjax.train --env=NAME --agent=NAME``."""
 
     env: str = "finger-spin-vary-size"
-    """Name of the environment family; --list shows all. --import=FILE.py makes those known that a file registers."""
+    """Name of the environment family; --list shows all. --import=FILE.py makes those known that a file registers.
+    NAME+NAME is a mixture of families, in which --engine, --split and --env.FIELD hold for every family that has such a
+    flag, and --env.vary.NAME.PARAMETER=VALUES for one."""
     agent: str = "sac-conditioned"
     """Name of the agent; --list shows all. Its parts: --agent.encoder, --agent.gradients, --agent.value,
     --agent.scaling and --agent.sampler, each by name and with flags of its own."""
@@ -78,7 +83,7 @@ class RunConfig:
     """Print the families and agents, and stop."""
     plan: Annotated[Plan, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Plan)
     training: Annotated[Settings, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Settings)
-    family: Annotated[Family, tyro.conf.arg(name="env")] = dataclasses.field(
+    family: Annotated[Tabled, tyro.conf.arg(name="env")] = dataclasses.field(
         default_factory=lambda: make("finger-spin")
     )
     learner: Annotated[BaseAgent, tyro.conf.arg(name="agent")] = dataclasses.field(default_factory=SAC)
@@ -125,9 +130,9 @@ def configure(agent: Any, settings: Settings, given: Mapping[str, Any]) -> tuple
 
 
 def load_preset(env_name: str, name: str) -> dict[str, Any]:
-    """Read the tables of a preset: the family's own file, or the domain's, or the default one."""
+    """Read the tables of a preset: the family's own file, or the domain's, or the default one, as for mixtures."""
     folder = resources.files("mtjax") / "configs"
-    words = env_name.split("-")
+    words = [] if "+" in env_name else env_name.split("-")
     names = ["-".join(words[:n]) for n in range(len(words), 0, -1)]
     file = next((f for n in [*names, "default"] if (f := folder / f"{n}.toml").is_file()), None)
     assert file is not None, "the package lacks configs/default.toml"
@@ -138,11 +143,12 @@ def _device_preset() -> str:
     return "cpu" if jax.default_backend() == "cpu" else "gpu"
 
 
-def import_flag(family: Family) -> list[str]:
-    """The flag that makes a family of the user's own known to another program; none for those of this package."""
-    module = type(family).__module__
-    file = getattr(sys.modules.get(module), "__file__", None)
-    return [] if module.split(".")[0] == "mtjax" or file is None else [f"--import={Path(file).resolve()}"]
+def import_flags(env: Tabled) -> list[str]:
+    """The flags that make families of the user's own known to another program; none for those of this package."""
+    modules = dict.fromkeys(type(part.family).__module__ for part in env.parts)
+    own = [sys.modules.get(name) for name in modules if name.split(".")[0] != "mtjax"]
+    files = [getattr(module, "__file__", None) for module in own]
+    return [f"--import={Path(file).resolve()}" for file in files if file is not None]
 
 
 # The record of a run.

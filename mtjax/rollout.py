@@ -65,7 +65,8 @@ def act(agent: Agent, learners: Any, tasks: Task, worlds: Worlds, keys: Key | No
         one = lambda learner, task, memory, obs, *key: agent.act(learner, memory, obs, task, *(key or (None,)))
         return over_learners(one)(learners, tasks, worlds.memory, worlds.obs, *noise)
     one = lambda learner, _, task, memory, obs, *key: agent.act(learner, memory, obs, task, *(key or (None,)))
-    return over_learners(one)(learners, tasks.id, worlds.task, worlds.memory, worlds.obs, *noise)
+    each = tasks_of_worlds(tasks, worlds)
+    return over_learners(one)(learners, tasks.id, each, worlds.memory, worlds.obs, *noise)
 
 
 class Moment(NamedTuple):

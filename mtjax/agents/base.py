@@ -207,7 +207,10 @@ class BaseAgent(abc.ABC):
 
     def known_task(self, state: Any, task: Task) -> Array:
         """The training task () int32 whose head, embedding or number stands for ``task``: itself, or the nearest."""
-        nearest = jnp.argmin(jnp.sum(jnp.square(state.contexts - task.context), axis=-1)).astype(jnp.int32)
+        distance = jnp.sum(jnp.square(state.contexts - task.context), axis=-1)
+        if task.blocks is not None:  # another family's task is no neighbour
+            distance = jnp.where(task.blocks.related(state.contexts, task.context), distance, jnp.inf)
+        nearest = jnp.argmin(distance).astype(jnp.int32)
         return jnp.where(task.id < len(state.contexts), task.id, nearest)
 
     def nearest_tasks(self, state: Any, tasks: Task) -> Array:

@@ -1,8 +1,9 @@
 """Environment families by name. To add one: a file for its domain, and a line here; or ``register`` your own."""
 
 import ast
+import re
 from collections import UserDict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
@@ -14,15 +15,17 @@ if TYPE_CHECKING:
     from mtjax.envs.domain import Domain
     from mtjax.envs.engines.base import World
     from mtjax.envs.family import Family
+    from mtjax.envs.mixtures import Mixture
     from mtjax.envs.parameters import Parameter
 
-__all__ = ["ENVS", "Domain", "Family", "Parameter", "World", "make", "outline", "register"]
+__all__ = ["ENVS", "Domain", "Family", "Mixture", "Parameter", "World", "make", "mixture", "outline", "register"]
 
 __getattr__ = lazily(
     __name__,
     {
         "Domain": "mtjax.envs.domain",
         "Family": "mtjax.envs.family",
+        "Mixture": "mtjax.envs.mixtures",
         "Parameter": "mtjax.envs.parameters",
         "World": "mtjax.envs.engines.base",
     },
@@ -150,16 +153,19 @@ ENVS = Families(
 )
 
 
-def make(name: str, vary: Mapping[str, Any] | tuple = (), **settings: Any) -> "Family":
-    """Return the family called ``name``, with any of its fields replaced.
+def make(name: str, vary: Mapping[str, Any] | tuple = (), **settings: Any) -> Any:
+    """Return the family called ``name``, or the mixture of "NAME+NAME", with any of its fields replaced.
 
     Args:
         vary: values of parameters, {"mass": "0.5:1.5:10"}, beside those that the family varies by itself; a parameter
-            given a single value no longer varies.
+            given a single value no longer varies. In a mixture {"NAME.mass": ...} says of which family.
+        settings: fields of the family; in a mixture, of every family that has such a field.
 
     Raises:
         InputError: no family has that name, no field has one of the given names, or a value is out of range.
     """
+    if "+" in name:
+        return _make_mixture(tuple(name.split("+")), dict(vary), dict(settings))
     if name not in ENVS:
         raise nearest_error("environment", name, ENVS)
     family, defaults = ENVS[name]
@@ -169,6 +175,70 @@ def make(name: str, vary: Mapping[str, Any] | tuple = (), **settings: Any) -> "F
         raise nearest_error(f"setting of {name}", unknown, fields)
     settings = defaults | frozen(settings)
     return family(**{**settings, "vary": dict(defaults.get("vary", {})) | dict(vary)})
+
+
+def mixture(families: "Sequence[str | Family | Mixture]") -> "Mixture":
+    """Return a mixture of families, each by its name or as ``make`` returned it.
+
+    Families may share a model, or a name, as long as their tasks are not the same: a walker whose friction varies and
+    one whose feet do make a mixture of two families.
+
+    Raises:
+        InputError: no family has a name, or one is in the mixture twice.
+    """
+    from mtjax.envs.mixtures import Mixture
+
+    named: list[tuple[str, Any]] = []
+    for given in families:
+        found = make(given) if isinstance(given, str) else given
+        if isinstance(found, Mixture):
+            named += zip(found.names, found.families, strict=True)
+        else:
+            named.append((given if isinstance(given, str) else _name_of(found), found))
+    names: list[str] = []
+    for name, _ in named:
+        again = sum(other == name or other.startswith(f"{name}#") for other in names)
+        names.append(f"{name}#{again + 1}" if again else name)
+    return Mixture(tuple(family for _, family in named), tuple(names))
+
+
+def _name_of(family: Any) -> str:
+    """The name under which ``make`` knows a family, whatever else it varies; or that of its class."""
+    cls = type(family)
+    place = f"{cls.__module__}:{cls.__name__}"
+    known = [name for name, (home, _) in ENVS.data.items() if home is cls or home == place]
+    exact = [name for name in known if make(name) == family]
+    plain = [name for name in known if not ENVS.data[name][1]]
+    of_class = re.sub(r"(?<!^)(?=[A-Z])", "-", cls.__name__).lower()
+    return next(iter((*exact, *plain, *known)), of_class)
+
+
+def _make_mixture(names: tuple[str, ...], vary: dict[str, Any], settings: dict[str, Any]) -> "Mixture":
+    """Make the families of a mixture by their names, with values of their parameters by "NAME.PARAMETER"."""
+    from mtjax.envs.mixtures import Mixture
+
+    recorded = settings.pop("families", None)
+    if recorded is not None:  # of config.json
+        return Mixture(tuple(make(n, **each) for n, each in zip(names, recorded, strict=True)), names)
+    plain = [make(name) for name in names]
+    for given in settings:
+        known = dict.fromkeys(field for family in plain for field in family.__dataclass_fields__)
+        if given not in known:
+            raise nearest_error("setting of these families", given, known)
+    own: dict[str, dict[str, Any]] = {name: {} for name in names}
+    for given, values in vary.items():
+        name, dot, parameter = given.rpartition(".")
+        if not dot or name not in own:
+            raise InputError(
+                f"in a mixture, say which family's {parameter} varies: one of "
+                f"{', '.join(f'{known}.{parameter}' for known in own)}; not {given}"
+            )
+        own[name][parameter] = values
+    made = []
+    for name, family in zip(names, plain, strict=True):
+        mine = {key: value for key, value in settings.items() if key in family.__dataclass_fields__}
+        made.append(make(name, vary=own[name], **mine))
+    return Mixture(tuple(made), names)
 
 
 def register(name: str, family: "type[Family]", **settings: Any) -> None:

@@ -31,8 +31,101 @@ class Table(NamedTuple):
     draws: np.ndarray | None  # (rows of all splits, P) row numbers of the tasks that episodes draw
 
 
+class Part(NamedTuple):
+    """One family, and where its tasks lie among those of an environment."""
+
+    name: str  # empty where there is but one
+    family: "Family"
+    places: Mapping[str, np.ndarray]  # split, or "all" -> which of that split's tasks are the family's
+
+
+class Tabled(abc.ABC):
+    """Tasks in a table: what configurations, reports and films ask of an environment, a family or a mixture of them."""
+
+    @property
+    @abc.abstractmethod
+    def table(self) -> Table:
+        """Every task of every split, and the tasks that episodes draw where ranges are continuous."""
+
+    @property
+    @abc.abstractmethod
+    def train_count(self) -> int:
+        """Training tasks."""
+
+    @property
+    @abc.abstractmethod
+    def spec(self) -> Spec:
+        """Sizes of observation, action and context."""
+
+    @property
+    @abc.abstractmethod
+    def episode_length(self) -> int:
+        """Steps after which the longest episode is cut off."""
+
+    @property
+    @abc.abstractmethod
+    def engine_name(self) -> str:
+        """What steps its worlds: "jax", or the name of a physics engine."""
+
+    @property
+    @abc.abstractmethod
+    def summary(self) -> str:
+        """A line on its tasks."""
+
+    @property
+    @abc.abstractmethod
+    def parts(self) -> tuple[Part, ...]:
+        """Its families."""
+
+    @abc.abstractmethod
+    def apart(self, states: Any) -> tuple[Any, ...]:
+        """The states of each part."""
+
+    @abc.abstractmethod
+    def own_row(self, row: int) -> int:
+        """The row of a family's table that a row of this table stands for."""
+
+    @abc.abstractmethod
+    def describe(self, row: int) -> str:
+        """Name a task by what makes it different, such as "size=0.95"."""
+
+    @abc.abstractmethod
+    def labels(self, split: str) -> list[str]:
+        """A short name for every task of a split."""
+
+    @abc.abstractmethod
+    def task_values(self, split: str) -> np.ndarray:
+        """What tells the tasks of a split apart (T,)."""
+
+    @property
+    @abc.abstractmethod
+    def task_axis(self) -> tuple[str, str]:
+        """Name and unit of ``task_values``."""
+
+    @abc.abstractmethod
+    def reset(self, task: Task, key: Key) -> Step: ...
+    @abc.abstractmethod
+    def step(self, task: Task, state: Any, action: Array) -> Step: ...
+    @abc.abstractmethod
+    def reset_worlds(self, tasks: Task, keys: Key) -> Step: ...
+    @abc.abstractmethod
+    def step_worlds(self, tasks: Task, states: Any, actions: Array) -> Step: ...
+    @abc.abstractmethod
+    def where_worlds(self, mask: Array, new: Any, old: Any) -> Any: ...
+
+    def tasks(self, split: str = "train") -> Task:
+        """Return the tasks of a split: "train", "interpolation", "extrapolation", or "all" of them in this order."""
+        table = self.table
+        splits = {**table.rows, "all": np.concatenate(list(table.rows.values()))}
+        if split not in splits:
+            raise InputError(f"unknown split {split!r}; choose from {', '.join(splits)}")
+        take = lambda rows: jax.tree.map(lambda x: jnp.asarray(x[rows]), table.tasks)
+        tasks = take(splits[split])
+        return tasks if table.draws is None else tasks._replace(draws=take(table.draws[splits[split]]))
+
+
 @dataclasses.dataclass(frozen=True)
-class Family(Flat, abc.ABC):
+class Family(Flat, Tabled):
     """Tasks that differ in named parameters. Subclasses give the parameters, ``reset`` and ``step``."""
 
     vary: Annotated[Any, tyro.conf.Suppress] = ()
@@ -186,16 +279,6 @@ class Family(Flat, abc.ABC):
         """
         return dataclasses.replace(self, context_ranges=other.ranges)
 
-    def tasks(self, split: str = "train") -> Task:
-        """Return the tasks of a split: "train", "interpolation", "extrapolation", or "all" of them in this order."""
-        table = self.table
-        splits = {**table.rows, "all": np.concatenate(list(table.rows.values()))}
-        if split not in splits:
-            raise InputError(f"unknown split {split!r}; choose from {', '.join(splits)}")
-        take = lambda rows: jax.tree.map(lambda x: jnp.asarray(x[rows]), table.tasks)
-        tasks = take(splits[split])
-        return tasks if table.draws is None else tasks._replace(draws=take(table.draws[splits[split]]))
-
     @property
     def varied(self) -> tuple[str, ...]:
         """The parameters that differ between training tasks or episodes."""
@@ -215,6 +298,39 @@ class Family(Flat, abc.ABC):
         """Name a task by what makes it different, such as "size=0.95"."""
         params = self.table.tasks.params
         return ",".join(f"{name}={params[name][row]:.4g}" for name in self.varied) or f"task={row}"
+
+    def labels(self, split: str) -> list[str]:
+        """A short name for every task of a split: its ``task_values``."""
+        return [f"{value:.4g}" for value in self.task_values(split)]
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """The family itself."""
+        counts = {split: len(rows) for split, rows in self.table.rows.items()}
+        counts["all"] = sum(counts.values())
+        return (Part("", self, {split: np.arange(count) for split, count in counts.items()}),)
+
+    def apart(self, states: Any) -> tuple[Any, ...]:
+        """The states of each part."""
+        return (states,)
+
+    def own_row(self, row: int) -> int:
+        """The row itself."""
+        return row
+
+    @property
+    def ends(self) -> str:
+        """The parameters that vary in training, and their least and greatest values."""
+        found = self.variation
+        ends = zip(found.names, found.low, found.high, strict=True)
+        return ", ".join(f"{name} {low:g} to {high:g}" for name, low, high in ends if low < high)
+
+    @property
+    def summary(self) -> str:
+        """A line on its tasks."""
+        count, ends = self.train_count, self.ends
+        tasks = f"{count} training task{'s' * (count > 1)}{', ' * bool(ends)}{ends}"
+        return f"{tasks}, split {self.split}, engine {self.engine_name}"
 
     @property
     def engine_name(self) -> str:

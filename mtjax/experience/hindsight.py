@@ -29,6 +29,8 @@ def require(env: Env) -> None:
         InputError: with the reason.
     """
     family: Any = env
+    if env.spec.mixed:
+        raise InputError("hindsight replays steps of one task as another's, and a mixture's tasks share no physics")
     goals = [name for name in getattr(family, "relabels", ()) if name in family.parameters]
     varied = getattr(family, "varied", ())
     physical = [name for name in varied if name not in goals]

@@ -10,6 +10,7 @@ from gymnasium import spaces
 
 from mtjax import envs
 from mtjax.envs.domain import Domain
+from mtjax.envs.mixtures import require_family
 from mtjax.gym.tasks import TaskStream, TaskTable, read_options
 from mtjax.names import nearest_error
 from mtjax.report import render
@@ -71,7 +72,9 @@ def family_named(name: str, settings: dict[str, Any]) -> Env:
         raise InputError(f"{name}: the Meta-World families are not part of mtjax yet")
     if name.startswith("MT-") and name not in MTENV_IDS:
         raise nearest_error("environment of MTEnv", name, MTENV_IDS)
-    return envs.make(MTENV_IDS.get(name, name), **settings)
+    family = envs.make(MTENV_IDS.get(name, name), **settings)
+    require_family(family, "Gymnasium's environments have one space of observations and one of actions")
+    return family
 
 
 def make(

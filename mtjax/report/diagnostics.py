@@ -254,10 +254,12 @@ def table(policy: Policy, found: Diagnostics) -> str:
     for name, x in (("critic", found.critic), ("actor", found.actor)):
         if x.cosine is None:
             lines.append(f"tasks share no parameters of the {name}, over which they could conflict")
-    lines.append(f"{policy.env.task_axis[0]:>10} {'TD error':>9} {'critic gradient':>16} {'actor gradient':>15}")
+    labels = policy.env.labels("train")
+    width = max(10, *map(len, labels))
+    lines.append(f"{policy.env.task_axis[0]:>{width}} {'TD error':>9} {'critic gradient':>16} {'actor gradient':>15}")
     rows = zip(found.td_error, found.critic.gradient_norm, found.actor.gradient_norm, strict=True)
-    for value, (error, critic, actor) in zip(policy.env.task_values("train"), rows, strict=True):
-        lines.append(f"{value:10.4g} {error:9.3g} {critic:16.3g} {actor:15.3g}")
+    for label, (error, critic, actor) in zip(labels, rows, strict=True):
+        lines.append(f"{label:>{width}} {error:9.3g} {critic:16.3g} {actor:15.3g}")
     return "\n".join(lines)
 
 
@@ -271,7 +273,8 @@ def write(policy: Policy, found: Diagnostics, directory: Path) -> None:
     """Write ``diagnostics.json`` and ``diagnostics.png``."""
     name, unit = policy.env.task_axis
     values = policy.env.task_values("train")
-    record = {"parameter": name, "unit": unit, "values": values, "draws": DRAWS, "sample": SAMPLE}
+    tasks = policy.env.labels("train")
+    record = {"parameter": name, "unit": unit, "values": values, "tasks": tasks, "draws": DRAWS, "sample": SAMPLE}
     networks = {"critic": found.critic._asdict(), "actor": found.actor._asdict()}
     record = _plain({**record, **found._asdict(), **networks})
     (directory / "diagnostics.json").write_text(json.dumps(record, indent=1, allow_nan=False) + "\n")

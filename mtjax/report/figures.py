@@ -4,7 +4,7 @@ Axes: ``S`` seeds, ``V`` evaluations, ``T`` tasks, ``E`` episodes. Bands and bar
 intervals over seeds; there are none for a single seed. Whole seeds are resampled, because one agent learns all tasks.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -65,6 +65,31 @@ def return_by_parameter(
             _draw_points(axes, values[split], scores, split, index)
     axes.set_xlabel(f"{parameter} [{unit}]")
     _save(figure, axes, path)
+
+
+def return_by_task(path: str | Path, labels: Mapping[str, Sequence[str]], returns: Mapping[str, np.ndarray]) -> None:
+    """Draw each task's mean return in a line of its own, one marker shape a split.
+
+    Args:
+        path: the PNG file to write.
+        labels: split -> (T,) the tasks' names.
+        returns: split -> (S, T, E); an empty array is left out.
+    """
+    names = list(dict.fromkeys(sorted(name for split in labels.values() for name in split)))
+    figure, axes = _new_figure()
+    figure.set_size_inches(7, 1.5 + 0.25 * len(names))
+    for index, (split, scores) in enumerate(returns.items()):
+        if np.size(scores):
+            mean, low, high = _intervals(np.mean(scores, axis=2))
+            bars, places = np.maximum([mean - low, high - mean], 0), [names.index(name) for name in labels[split]]
+            colour, marker = _COLOURS[index % len(_COLOURS)], _MARKERS[index % len(_MARKERS)]
+            axes.errorbar(mean, places, xerr=bars, color=colour, fmt=marker, markersize=6, capsize=3, label=split)
+    axes.set_yticks(range(len(names)), names, fontsize=8)
+    axes.invert_yaxis()
+    axes.set_xlabel("return")
+    axes.set_ylabel("")
+    axes.legend(frameon=False)
+    figure.savefig(path, dpi=_DOTS_PER_INCH)
 
 
 def compare(

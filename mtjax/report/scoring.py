@@ -2,13 +2,15 @@
 
 import contextlib
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from mtjax.config import from_json
 from mtjax.envs import Domain
-from mtjax.evaluation import evaluate, record
+from mtjax.envs.family import Part
+from mtjax.evaluation import Recording, evaluate, record
 from mtjax.report import diagnostics, figures, render
 from mtjax.report.tables import task_table
 from mtjax.training.log import append_rows, number
@@ -33,7 +35,7 @@ def report(run: str, point: int, episodes: int, seed: int, video: bool, diagnose
     enable_compile_cache()
     first = _first_seed(run, point)
     policy = load(run, first)
-    if video and not isinstance(policy.env, Domain):
+    if video and not any(isinstance(part.family, Domain) for part in policy.env.parts):
         raise InputError("only MuJoCo families can be filmed; leave out --video")
     found = diagnostics.diagnose(policy, *load_experience(run, first)) if diagnose else None
     scores = score(policy, episodes, seed)
@@ -61,8 +63,9 @@ def _first_seed(run: str, point: int) -> int:
 def score(policy: Policy, episodes: int, seed: int = 0) -> dict[str, np.ndarray]:
     """Return the returns (S, T, episodes) of each split, in episodes that no training run has seen."""
     env, config = policy.env, jnp.int32(_FIRST_NUMBER + seed)
-    returns = np.asarray(evaluate(env, policy.agent, episodes, policy.states, env.tasks("all"), policy.seeds, config))
-    return {split: returns[:, env.table.rows[split]] for split in SPLITS}
+    scores = evaluate(env, policy.agent, episodes, policy.states, env.tasks("all"), policy.seeds, config)
+    returns = np.asarray(scores.returns)
+    return {split: returns[:, np.asarray(env.tasks(split).id)] for split in SPLITS}
 
 
 def _new_folder(run: Path) -> Path:
@@ -74,31 +77,46 @@ def _new_folder(run: Path) -> Path:
 
 
 def _write(policy: Policy, episodes: dict[str, np.ndarray], directory: Path) -> None:
-    name, unit = policy.env.task_axis
+    env, (name, unit), many = policy.env, policy.env.task_axis, len(policy.env.parts) > 1
+    labels = {split: env.labels(split) if many else map(number, env.task_values(split)) for split in episodes}
+    labels = {split: list(found) for split, found in labels.items()}
     rows = [
-        {"split": split, name: number(value), "seed": int(seed), "episode": e, "return": number(x)}
+        {"split": split, name: label, "seed": int(seed), "episode": e, "return": number(x)}
         for split, returns in episodes.items()
         for seed, of_seed in zip(policy.seeds, returns, strict=True)
-        for value, of_task in zip(policy.env.task_values(split), of_seed, strict=True)
+        for label, of_task in zip(labels[split], of_seed, strict=True)
         for e, x in enumerate(of_task)
     ]
     append_rows(directory / "returns.csv", rows)
-    values = {split: policy.env.task_values(split) for split in episodes}
-    figures.return_by_parameter(directory / f"return_by_{name.replace('-', '_')}.png", name, unit, values, episodes)
+    file = directory / f"return_by_{name.replace('-', '_')}.png"
+    if many:
+        return figures.return_by_task(file, labels, episodes)
+    figures.return_by_parameter(file, name, unit, {split: env.task_values(split) for split in episodes}, episodes)
 
 
 def _film(policy: Policy, directory: Path, seed: int) -> None:
-    """Film the beginning of one episode of every task, at the speed at which it happens."""
+    """Film the beginning of one episode of every task of MuJoCo's families, at the speed at which it happens."""
     env = policy.env
-    assert isinstance(env, Domain)
     render.choose_backend()
     played = record(env, policy.agent, policy.state, env.tasks("all"), jnp.int32(seed))
-    stride = max(round(1 / (_FILM_FPS * env.seconds_per_step)), 1)
-    fps, longest = 1 / (stride * env.seconds_per_step), round(_FILM_SECONDS / env.seconds_per_step)
+    for part, states in zip(env.parts, env.apart(played.states), strict=True):
+        if isinstance(part.family, Domain):
+            _film_family(policy, part, played._replace(states=states), directory)
+        else:
+            print(f"{part.name} has no model to film")
+
+
+def _film_family(policy: Policy, part: Part, played: Recording, directory: Path) -> None:
+    """Film the tasks of one family, of which ``played`` has the states."""
+    family: Any = part.family
+    stride = max(round(1 / (_FILM_FPS * family.seconds_per_step)), 1)
+    fps, longest = 1 / (stride * family.seconds_per_step), round(_FILM_SECONDS / family.seconds_per_step)
     for split in SPLITS:
-        for i in env.table.rows[split]:
-            row = int(played.rows[i])  # where ranges are continuous, an episode's own
-            shown = slice(0, min(longest, int(played.lengths[i])), stride)
-            frames = render.film(env, row, np.asarray(played.states.qpos[i, shown]))
-            path = render.write_video(directory / f"{split}-{env.describe(row)}".replace("=", "-"), frames, fps)
-            print(f"filmed {path.name}: return {float(played.returns[i]):.0f}", flush=True)
+        for i in family.table.rows[split]:
+            place = part.places["all"][i]
+            row = int(played.rows[place])  # where ranges are continuous, an episode's own
+            shown = slice(0, min(longest, int(played.lengths[place])), stride)
+            frames = render.film(family, policy.env.own_row(row), np.asarray(played.states.qpos[i, shown]))
+            named = f"{split}-{policy.env.describe(row)}".replace("=", "-").replace(" ", "-")
+            path = render.write_video(directory / named, frames, fps)
+            print(f"filmed {path.name}: return {float(played.returns[place]):.0f}", flush=True)

@@ -1,7 +1,10 @@
 """Returns of a run as tables of text."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
+from mtjax.envs.family import Part
 from mtjax.evaluation import Evaluations
 from mtjax.report.stats import seed_interval
 from mtjax.training.policy import Policy
@@ -13,24 +16,42 @@ def _interval(scores: np.ndarray) -> str:
     return f"{point:6.0f}" + (f"  [{low:.0f}, {high:.0f}]" if scores.shape[0] > 1 else "")
 
 
-def split_table(evaluations: Evaluations) -> str:
-    """Lay out the last evaluation of a run: mean return by split, and the worst task's."""
+def split_table(evaluations: Evaluations, parts: Sequence[Part] = ()) -> str:
+    """Lay out the last evaluation of a run: mean return by split, and the worst task's; then by family of a mixture."""
+    last = {split: x[:, -1].mean(axis=-1) for split, x in evaluations.returns.items() if x.size}  # (S, T)
     lines = [f"{'split':15} {'tasks':>5} {'return':>7}  worst task"]
-    for split, returns in evaluations.returns.items():
-        if returns.size:
-            scores = returns[:, -1].mean(axis=-1)  # (S, T)
-            lines.append(f"{split:15} {scores.shape[1]:5} {_interval(scores):>7}  {scores.mean(axis=0).min():.0f}")
+    lines += [_split_line(split, scores) for split, scores in last.items()]
+    for part in parts if len(parts) > 1 else ():
+        lines.append(part.name)
+        found = {split: scores[:, part.places[split]] for split, scores in last.items()}
+        lines += [_split_line(split, scores) for split, scores in found.items() if scores.size]
     return "\n".join(lines)
+
+
+def _split_line(split: str, scores: np.ndarray) -> str:
+    return f"{split:15} {scores.shape[1]:5} {_interval(scores):>7}  {scores.mean(axis=0).min():.0f}"
 
 
 def task_table(policy: Policy, episodes: dict[str, np.ndarray]) -> str:
-    """Lay out returns (S, T, episodes) by split and task."""
-    lines = [f"{'split':15} {policy.env.task_axis[0]:>10} {'return':>7}   episodes from, to"]
-    for split, returns in episodes.items():
-        if not returns.size:
-            continue
-        for value, task in zip(policy.env.task_values(split), np.moveaxis(returns, 1, 0), strict=True):
-            mean = _interval(task.mean(axis=-1, keepdims=True))
-            lines.append(f"{split:15} {value:10.4g} {mean:>7}   {task.min():.0f}, {task.max():.0f}")
-        lines.append(f"{split:15} {'all':>10} {_interval(returns.mean(axis=-1)):>7}")
+    """Lay out returns (S, T, episodes) by split and task, of a mixture a family after another."""
+    parts = policy.env.parts
+    lines = []
+    for part in parts:
+        lines += [part.name] if part.name else []
+        lines.append(f"{'split':15} {part.family.task_axis[0]:>10} {'return':>7}   episodes from, to")
+        for split, returns in episodes.items():
+            own = returns[:, part.places[split]]
+            if not own.size:
+                continue
+            for label, task in zip(part.family.labels(split), np.moveaxis(own, 1, 0), strict=True):
+                mean = _interval(task.mean(axis=-1, keepdims=True))
+                lines.append(f"{split:15} {label:>10} {mean:>7}   {task.min():.0f}, {task.max():.0f}")
+            lines.append(_all_line(split, own))
+    if len(parts) > 1:
+        lines.append("all families")
+        lines += [_all_line(split, returns) for split, returns in episodes.items() if returns.size]
     return "\n".join(lines)
+
+
+def _all_line(split: str, returns: np.ndarray) -> str:
+    return f"{split:15} {'all':>10} {_interval(returns.mean(axis=-1)):>7}"

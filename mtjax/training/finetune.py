@@ -8,7 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from mtjax.agents import BaseAgent, parts, settings
+from mtjax.config import NO_FINE_TUNING
 from mtjax.envs import Family
+from mtjax.envs.mixtures import require_family
 from mtjax.networks import Params
 from mtjax.training.policy import Policy
 from mtjax.types import Array, Env, InputError, Task
@@ -26,6 +28,8 @@ def require_fit(start: Policy, env: Env, agent: BaseAgent) -> None:
     Raises:
         InputError: the agent is another one, or the family has other sizes or another context.
     """
+    for each in (env, start.env):
+        require_family(each, NO_FINE_TUNING)
     had, given = _learned(start.agent), _learned(agent)
     if type(agent) is not type(start.agent) or had.keys() != given.keys():
         raise InputError("the agent is not the run's; give the one that learned there")

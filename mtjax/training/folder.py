@@ -10,16 +10,19 @@ import time
 from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
 import jax
 
 from mtjax import __version__
 from mtjax.agents import settings
 from mtjax.agents.base import flag_names
-from mtjax.config import RunConfig, from_json, import_flag
+from mtjax.config import RunConfig, from_json, import_flags
+from mtjax.envs.family import Family, Tabled
 from mtjax.types import InputError
 
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
+_LONGEST = 80
 
 
 def new_directory(root: Path, name: str) -> Path:
@@ -34,6 +37,12 @@ def new_directory(root: Path, name: str) -> Path:
         except FileExistsError:
             continue
     raise InputError(f"cannot find a new name for a run in {str(root)!r}")
+
+
+def short_name(env_name: str) -> str:
+    """Name an environment in folders and titles, where the names of many families would be too long."""
+    count = env_name.count("+") + 1
+    return env_name if len(env_name) <= _LONGEST else f"mixture-of-{count}"
 
 
 def recorded(config: RunConfig, directory: Path, argv: Sequence[str]) -> RunConfig:
@@ -76,16 +85,32 @@ def circumstances(config: RunConfig) -> dict:
 
 def repeat(config: RunConfig) -> list[str]:
     """Every flag of this program, so that the command means the same whatever the presets become."""
-    words = [f"--env={config.env}", f"--agent={config.agent}", *import_flag(config.family)]
+    words = [f"--env={config.env}", f"--agent={config.agent}", *import_flags(config.family)]
     words += [f"--from={config.start}"] if config.start else []
-    for part, prefix in (("plan", "--"), ("training", "--"), ("family", "--env.")):
-        items = dataclasses.asdict(getattr(config, part)).items()
-        words += itertools.chain(*(_flag(prefix, name.replace("_", "-"), value) for name, value in items))
+    found = {"--": {**_fields(config.plan), **_fields(config.training)}, "--env.": _family_settings(config.family)}
+    for prefix, items in found.items():
+        words += itertools.chain(*(_flag(prefix, name.replace("_", "-"), value) for name, value in items.items()))
     names, values = flag_names(config.learner), settings(config.learner)
     for name, flag in names.items():
         group, dot, rest = flag.rpartition(".")
         words += _flag(f"--{group}{dot}", rest, values[name])
     return words + (["--sweep", *config.sweep] if config.sweep else [])
+
+
+def _fields(family: Any) -> dict[str, Any]:
+    return {field.name: getattr(family, field.name) for field in dataclasses.fields(family)}
+
+
+def _family_settings(env: Tabled) -> dict[str, Any]:
+    """The settings of a family; of a mixture those that its families share, and what each of them varies."""
+    if isinstance(env, Family):
+        return _fields(env)
+    each = {part.name: _fields(part.family) for part in env.parts}
+    names = dict.fromkeys(name for own in each.values() for name in own)
+    held = {name: [own[name] for own in each.values() if name in own] for name in names if name != "vary"}
+    alike = {name: values[0] for name, values in held.items() if values.count(values[0]) == len(values)}
+    vary = [(f"{name}.{parameter}", values) for name, own in each.items() for parameter, values in own["vary"]]
+    return {"vary": tuple(vary), **alike}
 
 
 def _flag(prefix: str, name: str, value: object) -> list[str]:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from mtjax.agents.parts.conditioning import load_vectors
 from mtjax.config import RunConfig
+from mtjax.envs import Family
 from mtjax.parallel import hosts, mesh
 from mtjax.training.finetune import require_fit
 from mtjax.training.policy import Policy, load
@@ -40,13 +41,14 @@ def launch(config: RunConfig, directory: Path, start: Policy | None, resume: boo
     """Run a program in its folder, from the start or from its newest checkpoint, and say what it is."""
     said = f"{label}: {' '.join(config.sweep)}\n" if config.sweep else ""
     origin = f"{_origin(config)}run: {directory}"
+    plan = config.plan
+    seeds = f"seeds {plan.seed} to {plan.seed + plan.seeds - 1}"
     if hosts.is_first():
-        print(f"{said}{config.agent} on {config.env}: {_summary(config)}\n{origin}", flush=True)
-    plan = dataclasses.asdict(config.plan)
+        print(f"{said}{config.agent} on {config.env}: {config.family.summary}, {seeds}\n{origin}", flush=True)
     return train(
         config.family,
         config.learner,
-        **plan,
+        **dataclasses.asdict(plan),
         settings=config.training,
         start=start,
         sweep=config.points,
@@ -63,21 +65,7 @@ def _origin(config: RunConfig) -> str:
     if not config.start:
         return ""
     family, told = config.family, config.learner.conditioning == "parameters"
+    assert isinstance(family, Family)
     unseen = set(family.varied) - {name for name, _, _ in family.ranges} if told else ()
     blind = f"; its networks cannot be told {', '.join(sorted(unseen))}" if unseen else ""
     return f"from {config.start}: {config.learner.tune} of its parameters learn{blind}\n"
-
-
-def _summary(config: RunConfig) -> str:
-    family, plan = config.family, config.plan
-    found = family.variation
-    ends = ", ".join(
-        f"{name} {low:g} to {high:g}"
-        for name, low, high in zip(found.names, found.low, found.high, strict=True)
-        if low < high
-    )
-    count = family.train_count
-    return (
-        f"{count} training task{'s' * (count > 1)}{', ' * bool(ends)}{ends}, "
-        f"split {family.split}, engine {family.engine_name}, seeds {plan.seed} to {plan.seed + plan.seeds - 1}"
-    )

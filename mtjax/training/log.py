@@ -59,7 +59,7 @@ def metric_rows(metrics: dict[str, np.ndarray], seeds: np.ndarray, common: dict[
     rows = []
     for s, seed in enumerate(seeds):
         row = {"seed": int(seed), **common, "return": number(_mean(metrics["return"][s]))}
-        row |= {name: number(np.mean(x[s])) for name, x in metrics.items() if name not in ("return", "bad_step")}
+        row |= {name: number(_mean(x[s])) for name, x in metrics.items() if name not in ("return", "bad_step")}
         for name in (*_OF_EACH_TASK, "return"):
             row |= {f"{name}_{t}": number(x) for t, x in enumerate(metrics[name][s] if name in metrics else ())}
         rows.append(row)

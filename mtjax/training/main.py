@@ -5,12 +5,12 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-from mtjax.config import RunConfig, import_flag, to_json
+from mtjax.config import RunConfig, import_flags, to_json
 from mtjax.parallel import hosts
 from mtjax.report import figures
 from mtjax.report.tables import split_table
 from mtjax.training import memory, sweep
-from mtjax.training.folder import circumstances, new_directory, record_steps, recorded
+from mtjax.training.folder import circumstances, new_directory, record_steps, recorded, short_name
 from mtjax.training.launch import check, launch, starting
 from mtjax.training.programs import enable_compile_cache
 from mtjax.training.run import Result
@@ -46,20 +46,20 @@ def _prepare(config: RunConfig, directory: Path | None) -> Path:
     if directory is not None:
         record_steps(directory / "config.json", config.plan.steps)
         return directory
-    directory = new_directory(Path(config.runs), f"{config.env}-{config.agent}")
+    directory = new_directory(Path(config.runs), f"{short_name(config.env)}-{config.agent}")
     (directory / "config.json").write_text(to_json(config, circumstances(config)))
     return directory
 
 
 def _conclude(config: RunConfig, result: Result, directory: Path) -> None:
     if not result.finished:
-        words = [f"--resume={directory}", *import_flag(config.family)]
+        words = [f"--resume={directory}", *import_flags(config.family)]
         print(f"stopped; the state is saved. Go on with:\n  python -m mtjax.train {shlex.join(words)}")
         return
     if len(result.evaluations.steps):
-        title = f"{config.agent} on {config.env}"
+        title = f"{config.agent} on {short_name(config.env)}"
         figures.learning_curve(directory / "curve.png", result.evaluations.steps, result.evaluations.returns, title)
-        print(split_table(result.evaluations))
+        print(split_table(result.evaluations, config.family.parts))
         if config.learner.unseen:
             print(f"unseen tasks: {config.learner.unseen}")
     print(f"trained in {result.seconds:.1f} s (compiled in {result.compile_seconds:.1f} s); run: {directory}")

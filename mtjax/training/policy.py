@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from mtjax import loop
 from mtjax.agents import BaseAgent
 from mtjax.config import RunConfig, from_json
-from mtjax.envs import Family
+from mtjax.envs.family import Tabled
 from mtjax.experience import Replay
 from mtjax.experience.ring import Ring
 from mtjax.training import checkpoint, points
@@ -21,7 +21,7 @@ from mtjax.types import Array, InputError, Key, Task, Transition
 class Policy:
     """What a run learned: ``action = policy(obs, task)``, for single observations (O,); map it for many."""
 
-    env: Family
+    env: Tabled
     agent: BaseAgent
     state: Any  # of one seed
     states: Any  # of every seed, leading S; of a sweep, those of one point

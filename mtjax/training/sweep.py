@@ -15,12 +15,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mtjax.agents import AGENTS, PARTS
-from mtjax.config import RunConfig, from_json, import_flag, to_json
+from mtjax.config import RunConfig, from_json, import_flags, to_json
 from mtjax.evaluation import Evaluations, load_evaluations
 from mtjax.report import figures
 from mtjax.report.stats import seed_interval
 from mtjax.training import memory, points
-from mtjax.training.folder import circumstances, new_directory, record_steps, recorded
+from mtjax.training.folder import circumstances, new_directory, record_steps, recorded, short_name
 from mtjax.training.launch import check, launch, starting
 from mtjax.training.log import append_rows, number
 from mtjax.training.programs import enable_compile_cache
@@ -162,7 +162,7 @@ def begin(found: Sequence[RunConfig], kind: str) -> None:
     """Make a folder with a run for every program and round, and run them."""
     limit = memory.memory()
     split = [memory.split(config, limit) for config in found]
-    folder = new_directory(Path(found[0].runs), f"{found[0].env}-{found[0].agent}-{kind}")
+    folder = new_directory(Path(found[0].runs), f"{short_name(found[0].env)}-{found[0].agent}-{kind}")
     for i, config in enumerate(itertools.chain(*split)):
         (folder / f"run-{i + 1}").mkdir()
         (folder / f"run-{i + 1}" / "config.json").write_text(to_json(config, circumstances(config)))
@@ -190,7 +190,7 @@ def carry_on(folder: Path) -> None:
         start = None if resume else starting(config)
         try:
             if not launch(config, run, start, resume, label).finished:
-                words = shlex.join([f"--resume={folder}", *import_flag(config.family)])
+                words = shlex.join([f"--resume={folder}", *import_flags(config.family)])
                 print(f"stopped; the state is saved. Go on with:\n  python -m mtjax.train {words}")
                 return
             _draw(config, run)
@@ -211,7 +211,9 @@ def _draw(config: RunConfig, run: Path) -> None:
         if np.isfinite(returns).all():
             curves[", ".join(f"{name} {value}" for name, value in _values(config, point).items())] = returns
     if curves:
-        figures.learning_curve(run / "curve.png", evaluations.steps, curves, f"{config.agent} on {config.env}")
+        figures.learning_curve(
+            run / "curve.png", evaluations.steps, curves, f"{config.agent} on {short_name(config.env)}"
+        )
 
 
 def last(config: RunConfig, run: Path) -> Evaluations | None:

@@ -1,0 +1,383 @@
+"""Mixtures: families with other observations, actions, horizons and physics than each other, as one environment.
+
+A mixture's tasks are those of its families, one family after another in every split. Each family steps its own worlds
+in a call of its own; what agents see of all of them has one shape, as observations are padded with zeros and actions
+beyond a family's own are masked.
+"""
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from typing import Annotated, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from mtjax.envs.family import Family, Part, Table, Tabled
+from mtjax.types import SPLITS, Array, InputError, Key, Spec, Step, Task
+
+
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class Blocks:
+    """Which tasks of a table belong to which family. It is static, so that worlds are sliced and never gathered."""
+
+    runs: tuple[tuple[int, int], ...]  # (family, how many of its tasks follow each other), in the table's order
+    marks: int  # leading numbers of a context that say which family it is of
+
+    @property
+    def count(self) -> int:
+        """Tasks of the table."""
+        return sum(count for _, count in self.runs)
+
+    def slices(self) -> Iterator[tuple[int, slice]]:
+        """Each run's family, and where it lies among the tasks."""
+        begin = 0
+        for family, count in self.runs:
+            yield family, slice(begin, begin + count)
+            begin += count
+
+    def take(self, tree: Any, family: int) -> Any:
+        """The part (S, T', ...) of leaves (S, T, ...) that belongs to one family."""
+        places = [place for owner, place in self.slices() if owner == family]
+        return jax.tree.map(lambda x: _joined([x[:, place] for place in places]), tree)
+
+    def join(self, parts: Mapping[int, Array]) -> Array:
+        """Lay arrays (S, T', ...) of the families out as one (S, T, ...)."""
+        taken, found = dict.fromkeys(parts, 0), []
+        for family, count in self.runs:
+            found.append(parts[family][:, taken[family] : taken[family] + count])
+            taken[family] += count
+        return _joined(found)
+
+    def related(self, contexts: Array, context: Array) -> Array:
+        """Which of several contexts (T, C) are of the same family as one (C,)."""
+        return jnp.all(contexts[:, : self.marks] == context[: self.marks], axis=-1)
+
+
+def _joined(parts: list[Array]) -> Array:
+    return parts[0] if len(parts) == 1 else jnp.concatenate(parts, axis=1)
+
+
+class States(NamedTuple):
+    """The states of a mixture's worlds."""
+
+    blocks: Blocks
+    families: tuple[Any, ...]  # each family's own states, leaves (S, T', E, ...); None where a split has no task of it
+
+
+@dataclasses.dataclass(frozen=True)
+class Mixture(Tabled):
+    """Tasks of several families. ``mtjax.mixture`` and ``mtjax.make("NAME+NAME")`` make one.
+
+    Observation (O,): the family's own, and zeros up to the widest family's.
+    Action (A,): as many as the widest family has; a task's ``action_mask`` says which of them are its own.
+    Context (C,): which family it is, one-hot, then a slot for each family with that family's own context, zero in the
+        slots of the others; a family whose contexts are all zero, as it has a single task, has no slot. A task that was
+        not trained on finds its nearest training task in its own family.
+    Metrics: those of all families, NaN for a family that has no such metric.
+    Reward, start, termination and time limit are each family's own.
+
+    A mixture of one family is that family: the same context, no mask, one normaliser.
+    """
+
+    families: Annotated[tuple[Family, ...], tyro.conf.Suppress]
+    names: Annotated[tuple[str, ...], tyro.conf.Suppress]
+
+    def __post_init__(self):
+        if not self.families or len(self.names) != len(self.families):
+            raise InputError("a mixture needs at least one family, and a name for each")
+        for i, (name, family) in enumerate(zip(self.names, self.families, strict=True)):
+            if not isinstance(family, Family):
+                raise InputError(f"a mixture is of families, and {family!r} is none")
+            if family in self.families[:i]:
+                raise InputError(f"{name} is in the mixture twice, with the same tasks; vary something in one of them")
+
+    # Tasks.
+
+    @property
+    def train_count(self) -> int:
+        """Training tasks."""
+        return sum(family.train_count for family in self.families)
+
+    @cached_property
+    def table(self) -> Table:
+        """The families' tables one after another. Tasks are numbered in the order of the splits."""
+        tables = [family.table for family in self.families]
+        rows = {
+            split: np.concatenate([first + table.rows[split] for first, table in zip(self._first, tables, strict=True)])
+            for split in SPLITS
+        }
+        listed = np.concatenate(list(rows.values()))
+        count = sum(len(table.tasks.id) for table in tables)
+        numbers = np.zeros(count, np.int32)
+        numbers[listed] = np.arange(len(listed))
+        leaves: dict[str, Any] = {
+            "id": numbers,
+            "row": np.arange(count, dtype=np.int32),
+            "context": self._context(),
+            "params": {},
+            "model": {},
+            "goal": {},
+            "horizon": np.concatenate([table.tasks.horizon for table in tables]),
+            "action_mask": self._mask(),
+        }
+        return Table(Task(**leaves), rows, self._draws(count))
+
+    @cached_property
+    def _first(self) -> np.ndarray:
+        """The row at which each family's table begins."""
+        counts = [len(family.table.tasks.id) for family in self.families]
+        return np.cumsum([0, *counts[:-1]])
+
+    def _context(self) -> np.ndarray:
+        """What tells all tasks apart (R, C)."""
+        contexts = [np.asarray(family.table.tasks.context) for family in self.families]
+        if len(contexts) == 1:
+            return contexts[0]
+        slots = [context if np.any(context) else context[:, :0] for context in contexts]
+        ends = len(slots) + np.cumsum([slot.shape[1] for slot in slots])
+        rows = []
+        for i, (slot, end) in enumerate(zip(slots, ends, strict=True)):
+            row = np.zeros((len(slot), ends[-1]), np.float32)
+            row[:, i] = 1
+            row[:, end - slot.shape[1] : end] = slot
+            rows.append(row)
+        return np.concatenate(rows)
+
+    def _mask(self) -> np.ndarray | None:
+        """Which actions each task has (R, A); None where all have them all."""
+        masks = []
+        for family in self.families:
+            own = family.table.tasks.action_mask
+            shape = (len(family.table.tasks.id), family.spec.action_size)
+            masks.append(np.ones(shape, np.float32) if own is None else np.float32(own))
+        whole = np.concatenate([np.pad(x, ((0, 0), (0, self.spec.action_size - x.shape[1]))) for x in masks])
+        return None if np.all(whole == 1) else whole
+
+    def _draws(self, count: int) -> np.ndarray | None:
+        """Rows (R, P) of which the episodes of each row draw one; where a family draws nothing, its own."""
+        drawn = [family.table.draws for family in self.families]
+        widths = {draws.shape[1] for draws in drawn if draws is not None}
+        if not widths:
+            return None
+        if len(widths) > 1:
+            raise InputError(
+                f"families of a mixture must draw alike; give all the same num-draws, not {sorted(widths)}"
+            )
+        rows = np.repeat(np.arange(count)[:, None], widths.pop(), axis=1)
+        for first, draws in zip(self._first, drawn, strict=True):
+            if draws is not None:
+                rows[first : first + len(draws)] = first + draws
+        return rows
+
+    def tasks(self, split: str = "train") -> Task:
+        tasks = super().tasks(split)
+        return tasks._replace(blocks=self._blocks[split])
+
+    @cached_property
+    def _blocks(self) -> dict[str, Blocks]:
+        runs = {split: [(i, len(f.table.rows[split])) for i, f in enumerate(self.families)] for split in SPLITS}
+        runs["all"] = [run for split in SPLITS for run in runs[split]]
+        marks = len(self.families) if len(self.families) > 1 else 0
+        return {split: Blocks(_merged(found), marks) for split, found in runs.items()}
+
+    @property
+    def spec(self) -> Spec:
+        """Sizes of observation, action and context: the widest family's."""
+        return self._spec
+
+    @cached_property
+    def _spec(self) -> Spec:
+        specs = [family.spec for family in self.families]
+        obs_size, action_size = max(spec.obs_size for spec in specs), max(spec.action_size for spec in specs)
+        spec = Spec.vector(obs_size, action_size, self._context().shape[1])
+        return spec._replace(mixed=len(self.families) > 1)
+
+    @property
+    def episode_length(self) -> int:
+        """The longest family's steps of an episode."""
+        return max(family.episode_length for family in self.families)
+
+    # Worlds, leaves (S, T, E, ...).
+
+    def reset_worlds(self, tasks: Task, keys: Key) -> Step:
+        """Begin an episode in every world."""
+        blocks = self._require(tasks)
+        begin = lambda family, own, i: family.reset_worlds(own, blocks.take(keys, i))
+        return self._each(tasks, begin)
+
+    def step_worlds(self, tasks: Task, states: States, actions: Array) -> Step:
+        """Step every world by its action (S, T, E, A)."""
+        blocks = self._require(tasks)
+
+        def advance(family: Family, own: Task, i: int) -> Step:
+            action = blocks.take(actions, i)[..., : family.spec.action_size]
+            return family.step_worlds(own, states.families[i], action)
+
+        return self._each(tasks, advance)
+
+    def where_worlds(self, mask: Array, new: States, old: States) -> States:
+        """Choose states by ``mask`` (S, T, E)."""
+        chosen = [
+            None if ours is None else self.families[i].where_worlds(new.blocks.take(mask, i), ours, theirs)
+            for i, (ours, theirs) in enumerate(zip(new.families, old.families, strict=True))
+        ]
+        return new._replace(families=tuple(chosen))
+
+    def _require(self, tasks: Task) -> Blocks:
+        if tasks.blocks is None or tasks.blocks.count != tasks.id.shape[1]:
+            raise InputError("the worlds of a mixture are those of a whole split: env.tasks(split), and not some of it")
+        return tasks.blocks
+
+    def _each(self, tasks: Task, act: Any) -> Step:
+        """Let every family act on its own tasks, and lay the steps out as one."""
+        blocks: Blocks = tasks.blocks
+        steps = {i: act(self.families[i], self._own(tasks, i), i) for i in dict.fromkeys(i for i, _ in blocks.runs)}
+        states = tuple(steps[i].state if i in steps else None for i in range(len(self.families)))
+        join = lambda of: blocks.join({i: of(step) for i, step in steps.items()})
+        names = sorted({name for step in steps.values() for name in step.metrics})
+        unknown = lambda step: jnp.full(step.reward.shape, jnp.nan)
+        return Step(
+            state=States(blocks, states),
+            obs=join(lambda step: self.pad(step.obs)),
+            reward=join(lambda step: step.reward),
+            terminated=join(lambda step: step.terminated),
+            metrics={name: join(lambda step, name=name: step.metrics.get(name, unknown(step))) for name in names},
+        )
+
+    def _own(self, tasks: Task, i: int) -> Task:
+        """The tasks of one family's worlds, as that family knows them."""
+        rows = tasks.blocks.take(tasks.row, i) - int(self._first[i])
+        own = jax.tree.map(lambda x: jnp.take(jnp.asarray(x), rows, axis=0, mode="clip"), self.families[i].table.tasks)
+        # A compiler that sees constants divides by them otherwise than by numbers that it does not know.
+        return jax.lax.optimization_barrier(own)
+
+    def pad(self, obs: Array) -> Array:
+        """Observations (..., O') of a family, as wide as the mixture's (..., O)."""
+        missing = self.spec.obs_size - obs.shape[-1]
+        return jnp.pad(obs, [(0, 0)] * (obs.ndim - 1) + [(0, missing)]) if missing else obs
+
+    # A single world, outside of compiled programs.
+
+    def reset(self, task: Task, key: Key) -> Step:
+        """Begin an episode of a task that is no tracer; the state is the family's own."""
+        family, own = self.member(task)
+        step = family.reset(own, key)
+        return step._replace(obs=self.pad(step.obs))
+
+    def step(self, task: Task, state: Any, action: Array) -> Step:
+        """Advance a world of a task that is no tracer."""
+        family, own = self.member(task)
+        step = family.step(own, state, action[: family.spec.action_size])
+        return step._replace(obs=self.pad(step.obs))
+
+    def member(self, task: Task) -> tuple[Family, Task]:
+        """The family of a task that is no tracer, and the task as that family knows it.
+
+        Raises:
+            InputError: the task is traced, so that nobody knows its family while the program is made.
+        """
+        if isinstance(task.row, jax.core.Tracer):
+            raise InputError(
+                "in a compiled program the families of a mixture step whole splits, by reset_worlds and step_worlds; "
+                "for single worlds take one of env.families"
+            )
+        i, row = self._place(int(task.row))
+        return self.families[i], jax.tree.map(lambda x: jnp.asarray(x[row]), self.families[i].table.tasks)
+
+    # Names.
+
+    def _place(self, row: int) -> tuple[int, int]:
+        """The family of a row of the table, and its row there."""
+        i = int(np.searchsorted(self._first, row, side="right")) - 1
+        return i, row - int(self._first[i])
+
+    @cached_property
+    def parts(self) -> tuple[Part, ...]:
+        """The families, and where their tasks lie in each split."""
+        found = []
+        for i, (name, family) in enumerate(zip(self.names, self.families, strict=True)):
+            places = {
+                split: np.concatenate([np.arange(place.start, place.stop) for j, place in blocks.slices() if j == i])
+                if any(j == i for j, _ in blocks.runs)
+                else np.zeros(0, int)
+                for split, blocks in self._blocks.items()
+            }
+            found.append(Part(name, family, places))
+        return tuple(found)
+
+    def apart(self, states: States) -> tuple[Any, ...]:
+        """The states of each part."""
+        return states.families
+
+    def own_row(self, row: int) -> int:
+        """The row of a family's table that a row of this table stands for."""
+        return self._place(row)[1]
+
+    def task_values(self, split: str) -> np.ndarray:
+        """The numbers (T,) of a split's tasks."""
+        return np.asarray(self.tasks(split).id)
+
+    @property
+    def task_axis(self) -> tuple[str, str]:
+        """Name and unit of ``task_values``."""
+        return "task", "number"
+
+    def labels(self, split: str) -> list[str]:
+        """A short name for every task of a split, such as "walker-walk friction=0.7"."""
+        found = [""] * len(self.table.rows[split])
+        for part in self.parts:
+            own, axis = part.family.labels(split), part.family.task_axis[0]
+            alone = len(part.family.table.tasks.id) == 1
+            for place, label in zip(part.places[split], own, strict=True):
+                found[place] = part.name if alone else f"{part.name} {axis}={label}"
+        return found
+
+    def describe(self, row: int) -> str:
+        """Name the task of a row by its family and all that makes it different there."""
+        i, own = self._place(row)
+        alone = len(self.families[i].table.tasks.id) == 1
+        return self.names[i] if alone else f"{self.names[i]} {self.families[i].describe(own)}"
+
+    @property
+    def engine_name(self) -> str:
+        """What steps its worlds, of all families."""
+        return ", ".join(dict.fromkeys(family.engine_name for family in self.families))
+
+    @property
+    def summary(self) -> str:
+        """A line on its tasks."""
+        count, many = self.train_count, len(self.families)
+        kinds = ", ".join(
+            name + (f" ({family.train_count}{': ' * bool(family.ends)}{family.ends})" * (family.train_count > 1))
+            for name, family in zip(self.names, self.families, strict=True)
+        )
+        splits = "/".join(dict.fromkeys(family.split for family in self.families))
+        return (
+            f"{count} training task{'s' * (count > 1)} of {many} famil{'ies' if many > 1 else 'y'}: {kinds}; "
+            f"split {splits}, engine {self.engine_name}"
+        )
+
+
+def require_family(env: Any, reason: str) -> None:
+    """Refuse a mixture, with the reason.
+
+    Raises:
+        InputError: ``env`` is a mixture.
+    """
+    if isinstance(env, Mixture):
+        raise InputError(f"{reason}, and {'+'.join(env.names)} is a mixture; take one family")
+
+
+def _merged(runs: list[tuple[int, int]]) -> tuple[tuple[int, int], ...]:
+    """Runs without empty ones, and with those of one family that follow each other as one."""
+    found: list[tuple[int, int]] = []
+    for family, count in runs:
+        if found and found[-1][0] == family:
+            found[-1] = (family, found[-1][1] + count)
+        elif count:
+            found.append((family, count))
+    return tuple(found)

@@ -1,0 +1,570 @@
+"""Mixtures: every family as it is alone, padding that changes nothing, and whole runs."""
+
+import dataclasses
+import types
+from pathlib import Path
+from typing import ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mtjax
+import mtjax.evaluate
+import mtjax.train
+from mtjax import agents, cli, networks, normalize, rollout
+from mtjax.agents.sac import Batch, action_sizes
+from mtjax.config import from_json, to_json
+from mtjax.envs import ENVS, Family, Mixture, make, mixture
+from mtjax.envs.parameters import Parameter
+from mtjax.evaluation import evaluate, record
+from mtjax.experience.replay import Replay
+from mtjax.loop import Settings
+from mtjax.networks import Params
+from mtjax.report.tables import split_table, task_table
+from mtjax.training.folder import repeat, short_name
+from mtjax.types import SPLITS, InputError, Spec, Step, Task, Transition
+
+QUICK = {"xla_backend_optimization_level": 0}
+
+
+class State(NamedTuple):
+    obs: jax.Array
+
+
+@dataclasses.dataclass(frozen=True)
+class Aim(Family):
+    """Earns most for the action that the task's goal names, in episodes of four steps."""
+
+    parameters: ClassVar = {"goal": Parameter("1", 0.0, minimum=-10), "drift": Parameter("1", 0.25, minimum=-10)}
+    action_size: ClassVar[int] = 1
+    obs_size: ClassVar[int] = 2
+    episode_steps: ClassVar[int] = 4
+
+    def reset(self, task, key):
+        obs = jax.random.normal(key, (self.obs_size,))
+        return Step(State(obs), obs, jnp.float32(0), jnp.bool_(False))
+
+    def step(self, task, state, action):
+        obs = state.obs * 0.9 + task.goal["drift"] + 0.1 * action[0]
+        return Step(State(obs), obs, -jnp.sum(jnp.square(action - task.goal["goal"])), jnp.bool_(False))
+
+
+@dataclasses.dataclass(frozen=True)
+class WideAim(Aim):
+    """The same with two actions, three numbers to see, episodes of seven steps, and success."""
+
+    action_size: ClassVar[int] = 2
+    obs_size: ClassVar[int] = 3
+    episode_steps: ClassVar[int] = 7
+
+    def step(self, task, state, action):
+        step = super().step(task, state, action)
+        return step._replace(metrics={"success": jnp.float32(step.reward > -0.5)})
+
+
+AIM = Aim(vary={"goal": "-1:1:3"})  # 3 training tasks, 2 between them, 4 beyond
+WIDE = WideAim(vary={"goal": "0.5"})  # 1 and none
+BOTH = mixture([AIM, WIDE])
+
+
+@pytest.fixture(scope="module", autouse=True)
+def names():
+    """Makes ``aim`` and ``wide-aim`` names like any others, and keeps programs out of the user's cache."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(ENVS, "aim", (Aim, {"vary": {"goal": "-1:1:3"}}))
+        patch.setitem(ENVS, "wide-aim", (WideAim, {"vary": {"goal": "0.5"}}))
+        patch.setenv("MTJAX_CACHE", "0")
+        yield
+    jax.clear_caches()
+
+
+def quick(function, *arguments):
+    """Compile a function for such arguments, and call it."""
+    return jax.jit(function).lower(*arguments).compile(QUICK)(*arguments)
+
+
+def tiny(name="sac-conditioned", **settings):
+    """An agent small enough to compile in a few seconds."""
+    small = {
+        "num_experts": 2,
+        "expert_widths": (8, 4),
+        "encoder_widths": (8,),
+        "module_width": 8,
+        "routing_widths": (8,),
+        "hypernetwork_widths": (8, 4),
+        "latent_widths": (8, 8),
+        "model_widths": (8,),
+    }
+    made = agents.agent(name, **{"hidden": (8,), "embedding_size": 4, **settings})
+    small = {k: v for k, v in small.items() if k in agents.settings(made) and k not in settings}
+    return agents.agent(name, **{**agents.settings(made), **small})
+
+
+def keys_of(tasks: Task, envs: int = 2, seed: int = 0):
+    return jax.random.split(jax.random.key(seed), (1, len(tasks.id), envs))
+
+
+def spread(tasks: Task, envs: int = 2) -> Task:
+    return rollout.spread(tasks, (1, len(tasks.id), envs))
+
+
+def pick(tree, index):
+    return jax.tree.map(lambda x: x[index], tree)
+
+
+# Tasks.
+
+
+def test_tasks_lie_family_after_family_in_every_split():
+    tasks = {split: BOTH.tasks(split) for split in (*SPLITS, "all")}
+    assert [len(tasks[split].id) for split in SPLITS] == [4, 2, 4]
+    assert np.concatenate([tasks[split].id for split in SPLITS]).tolist() == list(range(10)) == tasks["all"].id.tolist()
+    assert tasks["train"].row.tolist() == [0, 1, 2, 9] and tasks["interpolation"].row.tolist() == [3, 4]
+    assert tasks["train"].horizon.tolist() == [4, 4, 4, 7] and BOTH.episode_length == 7
+    assert tasks["train"].action_mask.tolist() == [[1, 0]] * 3 + [[1, 1]]
+    assert BOTH.spec == Spec(jax.ShapeDtypeStruct((3,), jnp.float32), 2, 3, True)
+    assert tasks["all"].blocks.runs == ((0, 3), (1, 1), (0, 6))
+
+
+def test_the_context_says_which_family_and_what_is_different_there():
+    # The marks of two families, and the one slot of the family that has several tasks.
+    assert BOTH.tasks("train").context.tolist() == [[1, 0, -1], [1, 0, 0], [1, 0, 1], [0, 1, 0]]
+
+
+def test_families_of_as_many_actions_need_no_mask():
+    assert mixture(["control-cartpole", "control-acrobot"]).tasks().action_mask is None
+
+
+def test_a_mixture_of_one_has_that_familys_tasks_but_for_what_only_the_family_reads():
+    ours, theirs = mixture([AIM]).tasks("train"), AIM.tasks("train")
+    for name in ("id", "row", "context", "horizon", "action_mask", "draws"):
+        np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
+    assert mixture([AIM]).spec == AIM.spec
+
+
+def test_the_nearest_training_task_is_of_the_same_family():
+    env = mixture([make("tabular-mdp", num_tasks=2), make("bandit", num_tasks=3)])
+    train, held_out = env.tasks("train"), env.tasks("interpolation")
+    known = jax.vmap(lambda task: tiny("sac").known_task(types.SimpleNamespace(contexts=train.context), task))
+    nearest = np.asarray(known(held_out))
+    families = np.argmax(held_out.context[:, :2], axis=1)
+    assert np.argmax(train.context[nearest][:, :2], axis=1).tolist() == families.tolist() == [0] * 2 + [1] * 3
+    far = held_out._replace(context=held_out.context.at[:, 2:].multiply(100.0))  # nearer to the other family
+    assert np.argmax(train.context[known(far)][:, :2], axis=1).tolist() == families.tolist()
+
+
+def test_names_of_families_and_tasks():
+    env = mixture([make("walker-walk", vary={"friction": "0.7,1"}), "bandit", AIM])
+    assert env.names == ("walker-walk", "bandit", "aim")
+    assert env.labels("train")[:3] == ["walker-walk friction=0.7", "walker-walk friction=1", "bandit task=0"]
+    assert env.labels("train")[-1] == "aim goal=1"
+    twice = mixture([make("walker-walk", vary={"friction": "0.7,1"}), make("walker-walk", vary={"mass": "1,2"})])
+    assert twice.names == ("walker-walk", "walker-walk#2") and twice.train_count == 4
+    assert mixture([mixture(["bandit"]), "control-acrobot"]).names == ("bandit", "control-acrobot")
+    assert "2 training tasks" in mixture(["cartpole-swingup", "walker-walk"]).summary
+
+
+@pytest.mark.parametrize(
+    "make_it, said",
+    [
+        (lambda: make("cartpole-swingup+wlaker-walk"), "did you mean 'walker-walk'"),
+        (lambda: make("bandit+bandit"), "bandit is in the mixture twice"),
+        (lambda: make("bandit+control-acrobot", vary={"link-mass-1": "1,2"}), "control-acrobot.link-mass-1"),
+        (lambda: make("bandit+control-acrobot", vary={"acrobot.torque": "1"}), "which family's torque varies"),
+        (lambda: make("bandit+control-acrobot", num_task=2), "did you mean 'num_tasks'"),
+        (lambda: mixture([]), "at least one family"),
+        (lambda: mixture([make("control-cartpole", num_draws=3, combine="grid"),
+                          make("control-acrobot", num_draws=2, combine="grid")]).tasks(), "num-draws"),
+        (lambda: Replay(hindsight=0.5).check(BOTH, 1), "share no physics"),
+    ],
+)  # fmt: skip
+def test_what_makes_no_mixture_is_refused_with_the_reason(make_it, said):
+    with pytest.raises(InputError, match=said):
+        make_it()
+
+
+def test_gymnasium_and_fine_tuning_take_one_family():
+    gym = pytest.importorskip("mtjax.gym")
+    with pytest.raises(InputError, match="one space of observations"):
+        gym.make("bandit+control-acrobot")
+    from mtjax.training.finetune import require_fit
+
+    start = types.SimpleNamespace(env=AIM, agent=tiny())
+    with pytest.raises(InputError, match=r"aim\+wide-aim is a mixture; take one family"):
+        require_fit(start, BOTH, tiny())  # type: ignore
+
+
+# Worlds.
+
+
+def steps_of(env, tasks, keys, actions):
+    """The steps of worlds under actions (H, S, T, E, A), and the state after them."""
+
+    def play(tasks, keys, actions):
+        start = env.reset_worlds(tasks, keys)
+
+        def step(state, action):
+            step = env.step_worlds(tasks, state, action)
+            return step.state, step._replace(state=())
+
+        state, seen = jax.lax.scan(step, start.state, actions)
+        return start.obs, seen, state
+
+    return quick(play, spread(tasks, keys.shape[2]), keys, actions)
+
+
+@pytest.mark.parametrize("split", ["train", "all"])
+def test_every_family_steps_as_it_does_alone(split):
+    env = mixture([make(name, num_tasks=2) for name in ("control-cartpole", "tabular-mdp", "two-goal-maze-seen")])
+    tasks = env.tasks(split)
+    keys = keys_of(tasks)
+    actions = jax.random.uniform(jax.random.key(1), (5, *keys.shape, env.spec.action_size), minval=-1.0)
+    start, seen, states = steps_of(env, tasks, keys, actions)
+    for part, state in zip(env.parts, env.apart(states), strict=True):
+        size, width, places = part.family.spec.action_size, part.family.spec.obs_size, part.places[split]
+        first, alone, end = steps_of(
+            part.family, part.family.tasks(split), keys[:, places], actions[:, :, places, :, :size]
+        )
+        np.testing.assert_array_equal(start[:, places, :, :width], first)
+        np.testing.assert_array_equal(seen.obs[:, :, places, :, :width], alone.obs)
+        np.testing.assert_array_equal(seen.reward[:, :, places], alone.reward)
+        np.testing.assert_array_equal(seen.terminated[:, :, places], alone.terminated)
+        assert not np.any(seen.obs[:, :, places, :, width:])
+        for ours, theirs in zip(jax.tree.leaves(state), jax.tree.leaves(end), strict=True):
+            same = jax.random.key_data if jnp.issubdtype(ours.dtype, jax.dtypes.prng_key) else np.asarray
+            np.testing.assert_array_equal(same(ours), same(theirs))
+
+
+def test_worlds_that_end_begin_anew_and_the_others_go_on():
+    tasks = BOTH.tasks("all")
+    each, keys = spread(tasks), keys_of(tasks)
+    old, new = BOTH.reset_worlds(each, keys), BOTH.reset_worlds(each, keys_of(tasks, seed=1))
+    mask = jax.random.bernoulli(jax.random.key(2), shape=keys.shape)
+    chosen = BOTH.step_worlds(each, BOTH.where_worlds(mask, new.state, old.state), jnp.zeros((*keys.shape, 2)))
+    both = [BOTH.step_worlds(each, step.state, jnp.zeros((*keys.shape, 2))).obs for step in (new, old)]
+    np.testing.assert_array_equal(chosen.obs, jnp.where(mask[..., None], *both))
+
+
+def test_metrics_are_those_of_all_families_and_unknown_elsewhere():
+    tasks = BOTH.tasks("train")
+    step = BOTH.step_worlds(
+        spread(tasks), BOTH.reset_worlds(spread(tasks), keys_of(tasks)).state, jnp.full((1, 4, 2, 2), 0.5)
+    )
+    assert np.isnan(step.metrics["success"][0, :3]).all() and (step.metrics["success"][0, 3] == 1).all()
+
+
+def test_only_whole_splits_are_stepped():
+    with pytest.raises(InputError, match="a whole split"):
+        BOTH.reset_worlds(spread(pick(BOTH.tasks(), slice(2))), keys_of(pick(BOTH.tasks(), slice(2))))
+
+
+def test_a_single_world_plays_outside_of_programs():
+    task = pick(BOTH.tasks(), 1)
+    start = BOTH.reset(task, jax.random.key(0))
+    step = BOTH.step(task, start.state, jnp.array([0.5, 9.0]))
+    alone = AIM.step(pick(AIM.tasks(), 1), start.state, jnp.array([0.5]))
+    assert step.obs.shape == (3,) and step.reward == alone.reward
+    with pytest.raises(InputError, match="reset_worlds"):
+        jax.jit(BOTH.reset)(task, jax.random.key(0))
+
+
+def test_episodes_draw_tasks_of_their_own_family():
+    """Where a range is continuous, an episode's draw decides physics and context; other families' stay as they are."""
+    drawn = Aim(vary={"goal": "-1:1"}, num_draws=50)
+    env = mixture([drawn, WIDE])
+    tasks, agent = env.tasks("train"), tiny()
+    learners = jax.vmap(lambda key: agent.init(env.spec, tasks, key))(jax.random.split(jax.random.key(0), 1))
+    worlds = rollout.reset_envs(env, agent, learners, tasks, keys_of(tasks, 20))
+    context = np.asarray(worlds.task.context)[0]
+    assert len(np.unique(context[0, :, 2])) > 10 and (context[0, :, :2] == [1, 0]).all()
+    assert (context[1] == [0, 1, 0]).all()
+    worlds, moment = rollout.step_envs(env, agent, learners, tasks, worlds, None)
+    action = np.asarray(moment.transition.action)[0, 0, :, 0]
+    np.testing.assert_allclose(moment.transition.reward[0, 0], -np.square(action - context[0, :, 2]), rtol=1e-4)
+    assert not np.any(moment.transition.action[0, 0, :, 1])  # which that family has not
+
+
+def test_episodes_end_at_their_own_horizons():
+    tasks, agent = BOTH.tasks("all"), tiny()
+    state = agent.init(BOTH.spec, BOTH.tasks("train"), jax.random.key(0))
+    played = record(BOTH, agent, state, tasks, jnp.int32(0))
+    assert played.lengths.tolist() == [4, 4, 4, 7] + [4] * 6
+    aim, wide = BOTH.apart(played.states)
+    assert aim.obs.shape == (9, 7, 2) and wide.obs.shape == (1, 7, 3)
+
+
+def test_discounts_follow_horizons():
+    env = mixture(["control-cartpole", "tabular-mdp"])
+    found = tiny(discounting="horizon").discounts(env.tasks())
+    np.testing.assert_allclose(found, np.repeat([0.99, 0.95], 10), rtol=1e-6)
+
+
+# Padding changes nothing.
+
+
+def test_padded_actions_have_no_part_in_the_density():
+    outputs, raw = jax.random.normal(jax.random.key(0), (2, 5, 4))
+    small = jnp.concatenate([outputs[:, :1], outputs[:, 2:3]], axis=1)  # mean and deviation of the first action
+    mask = jnp.array([1.0, 0.0])
+    np.testing.assert_allclose(
+        networks.log_density(outputs, raw[:, :2], mask), networks.log_density(small, raw[:, :1]), rtol=1e-6
+    )
+    action, _ = networks.tanh_normal(outputs, jax.random.key(1), mask)
+    assert not np.any(action[:, 1]) and np.all(action[:, 0] != 0)
+
+
+def test_target_entropy_counts_the_actions_that_there_are():
+    tasks = BOTH.tasks()
+    assert action_sizes(jnp.zeros((4, 5, 2)), tasks.action_mask).tolist() == [1, 1, 1, 2]
+    agent = tiny(target_entropy=-2.0)
+    slope = jax.grad(agent.temperature_loss)(jnp.zeros(4), jnp.array([-2.0, -2.0, -2.0, -4.0]), jnp.array([1, 1, 1, 2]))
+    np.testing.assert_array_equal(slope, 0)  # each is at its own target
+
+
+def test_every_task_has_its_own_normaliser_and_padding_stays_zero():
+    agent, random = tiny(normalize_observations=True), np.random.default_rng(0)
+    obs = jnp.float32(random.normal(size=(4, 50, 3)) * [[[1]], [[2]], [[5]], [[9]]])
+    obs = obs.at[:3, :, 2].set(0.0)  # of the three tasks that see two numbers
+    moments = agent.fit_moments(agent.init_moments(BOTH.spec, 4), obs)
+    seen = jax.vmap(agent.see)(moments, obs)
+    assert not np.any(seen[:3, :, 2])
+    for i, width in enumerate((2, 2, 2, 3)):
+        alone = normalize.update(normalize.init(width), obs[i, :, :width])
+        np.testing.assert_allclose(seen[i, :, :width], normalize.apply(alone, obs[i, :, :width]), rtol=1e-5, atol=1e-6)
+
+
+def widened(params: Params, like: Params, rows: np.ndarray, outputs: np.ndarray | None) -> Params:
+    """Small networks inside of wide ones: weights at the wide one's input ``rows`` and ``outputs``, zero elsewhere."""
+
+    def place(path, small, wide):
+        name = jax.tree_util.keystr(path)
+        if small.shape == wide.shape:
+            return small
+        index = [np.arange(n) for n in small.shape]
+        if "Dense_0" in name:
+            index[-2] = rows
+        elif outputs is not None and "head" in name:
+            index[-1] = outputs
+        return jnp.zeros_like(wide).at[np.ix_(*index)].set(small)
+
+    return jax.tree_util.tree_map_with_path(place, params, like)
+
+
+def test_losses_of_a_padded_task_are_those_of_the_task_alone(monkeypatch):
+    """A task with 2 observed numbers and 1 action, in networks of 4 and 3 that hold the same weights, and zeros."""
+    noise = np.random.default_rng(1).normal(size=(6, 3)).astype(np.float32)
+    monkeypatch.setattr(networks.jax.random, "normal", lambda key, shape: jnp.asarray(noise[: shape[0], : shape[1]]))
+    agent, random = tiny("sac"), np.random.default_rng(0)
+    task, told = WIDE.tasks(), jnp.zeros(0)
+    pad = lambda x, width: jnp.pad(x, ((0, 0), (0, width - x.shape[1])))
+    obs, next_obs = jnp.float32(random.normal(size=(2, 6, 2)))
+    action, reward = jnp.tanh(jnp.float32(random.normal(size=(6, 1)))), jnp.float32(random.normal(size=6))
+    common = {"reward": reward, "discount": jnp.full(6, 0.9), "told": told, "temperature": jnp.float32(0.3)}
+    small = Batch(obs, action, next_obs=next_obs, mask=None, **common)
+    wide = Batch(pad(obs, 4), pad(action, 3), next_obs=pad(next_obs, 4), mask=jnp.array([1.0, 0, 0]), **common)
+    monkeypatch.undo()
+    init = lambda o, a: agent.init(Spec.vector(o, a, 1), task, jax.random.key(0))
+    states = init(2, 1), init(4, 3)
+    actors = [pick(s.actor, ...) for s in states]
+    critics = [s.critic for s in states]
+    actors[1] = widened(actors[0], actors[1], np.arange(2), np.array([0, 3]))
+    critics[1] = widened(critics[0], critics[1], np.array([0, 1, 4]), None)
+    monkeypatch.setattr(networks.jax.random, "normal", lambda key, shape: jnp.asarray(noise[: shape[0], : shape[1]]))
+    key, found = jax.random.key(0), []
+    for actor, critic, batch in zip(actors, critics, (small, wide), strict=True):
+        target = agent.target(actor, critic, critic, batch, key)
+        (critic_loss, _), critic_slope = jax.value_and_grad(agent.critic_loss, has_aux=True)(critic, (batch, target))
+        (actor_loss, seen), slope = jax.value_and_grad(agent.actor_loss, has_aux=True)(actor, (batch, critic, key))
+        found.append((critic_loss, actor_loss, seen["entropy"], slope, critic_slope))
+    np.testing.assert_allclose(found[1][:3], found[0][:3], rtol=1e-5)
+    slopes = widened(found[0][3], found[1][3], np.arange(2), np.array([0, 3]))
+    for ours, theirs in zip(jax.tree.leaves(found[1][3]), jax.tree.leaves(slopes), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-6)  # zero for all that is padded
+    slopes = widened(found[0][4], found[1][4], np.array([0, 1, 4]), None)
+    for ours, theirs in zip(jax.tree.leaves(found[1][4]), jax.tree.leaves(slopes), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-6)
+
+
+def test_input_maps_begin_as_the_identity_and_are_every_tasks_own():
+    agent = tiny("sac", encoder="input-map")
+    state = agent.init(BOTH.spec, BOTH.tasks(), jax.random.key(0))
+    front = state.actor.own["front"]["params"]["map"]
+    np.testing.assert_array_equal(front["kernel"], np.broadcast_to(np.eye(3), (4, 3, 3)))
+    plain = tiny("sac")
+    without = state._replace(actor=Params(state.actor.shared, {}))
+    obs, task = jnp.array([0.3, -2.0, 0.0]), pick(BOTH.tasks(), 1)
+    ours, theirs = (a.act(s, a.begin(s, task), obs, task, None).action for a, s in ((agent, state), (plain, without)))
+    np.testing.assert_allclose(ours, theirs, rtol=1e-6)
+
+
+# Agents.
+
+
+def random_batch(env, num_batch: int = 3) -> Transition:
+    random, tasks = np.random.default_rng(0), env.tasks()
+    shape = (len(tasks.id), num_batch)
+    normal = lambda size: jnp.float32(random.normal(size=(*shape, size)))
+    return Transition(
+        obs=normal(env.spec.obs_size),
+        action=jnp.tanh(normal(env.spec.action_size)) * tasks.action_mask[:, None],
+        reward=jnp.float32(random.normal(size=shape)),
+        discount=jnp.ones(shape),
+        next_obs=normal(env.spec.obs_size),
+    )
+
+
+def init_and_update(agent, tasks: Task, batch: Transition, key):
+    state = agent.init(BOTH.spec, tasks, key)
+    new, metrics = agent.update(state, batch, tasks, key)
+    act = lambda task, obs: agent.act(new, agent.begin(new, task), obs, task, key).action
+    return state, new, metrics, jax.vmap(act)(tasks, batch.obs[:, 0])
+
+
+@pytest.mark.parametrize("name", agents.AGENTS)
+def test_every_agent_learns_a_mixture(name):
+    """That it can be traced; what it computes, those agents show that are compiled below."""
+    arguments = (BOTH.tasks(), random_batch(BOTH), jax.random.key(0))
+    state, new, metrics, action = jax.eval_shape(lambda *x: init_and_update(tiny(name), *x), *arguments)
+    assert jax.tree.map(lambda x: (x.shape, x.dtype), state) == jax.tree.map(lambda x: (x.shape, x.dtype), new)
+    assert action.shape == (4, 2) and metrics["td_error"].shape == (4,)
+
+
+@pytest.mark.parametrize("name", ["distral", "hip-bmdp", "brc", "pcgrad"])
+def test_an_update_is_finite_and_acts_where_there_are_actions(name):
+    agent = tiny(name, normalize_observations=True, discounting="horizon")
+    run = lambda *arguments: init_and_update(agent, *arguments)
+    _, new, metrics, action = quick(run, BOTH.tasks(), random_batch(BOTH), jax.random.key(0))
+    finite = [jnp.isfinite(x).all() for x in jax.tree.leaves((new, metrics)) if jnp.issubdtype(x.dtype, jnp.floating)]
+    assert all(finite)
+    assert not np.any(action[:3, 1]) and np.all(action[:, 0] != 0)
+
+
+# Whole runs.
+
+PLAN = {"num_envs": 2, "batch_size": 4, "replay_size": 40, "warmup_steps": 2, "chunk_steps": 5, "eval_episodes": 2}
+
+
+def test_a_mixture_of_one_learns_bit_for_bit_as_the_family():
+    family, agent = make("control-acrobot", num_tasks=2), tiny("multi-head", normalize_observations=True)
+    plan = {**PLAN, "steps": 80, "eval_every": 40}
+    alone, mixed = (mtjax.train(env, agent, **plan) for env in (family, mixture([family])))
+    for ours, theirs in zip(jax.tree.leaves(mixed.state.agent), jax.tree.leaves(alone.state.agent), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    for split in SPLITS:
+        np.testing.assert_array_equal(mixed.evaluations.returns[split], alone.evaluations.returns[split])
+
+
+def test_mujocos_families_learn_in_one_program():
+    env = mixture([make(name, engine="c") for name in ("cartpole-swingup", "pendulum-swingup")])
+    assert env.engine_name == "c" and env.spec.obs_size == 5 and env.tasks().action_mask is None
+    agent = tiny("sac", normalize_observations=True)
+    result = mtjax.train(env, agent, **{**PLAN, "eval_episodes": 1}, steps=80, eval_every=80)
+    returns = result.evaluations.returns["train"]
+    assert returns.shape == (1, 1, 2, 1) and np.isfinite(returns).all() and result.evaluations.metrics == {}
+    tasks = env.tasks("train")
+    again = evaluate(env, agent, 1, result.state.agent, tasks, jnp.zeros(1, int), jnp.int32(0)).returns
+    np.testing.assert_allclose(again, returns[:, 0], rtol=1e-3)
+
+
+@pytest.fixture(scope="module")
+def run(names, tmp_path_factory) -> Path:
+    """The folder of a run on a mixture, by the program. Only to be read."""
+    runs = tmp_path_factory.mktemp("runs")
+    words = (
+        "--env=aim+wide-aim --agent=multi-head --steps=80 --eval-every=40 --eval-episodes=2 --num-envs=2 "
+        "--batch-size=4 --replay-size=40 --warmup-steps=2 --chunk-steps=5 --agent.hidden 8"
+    )
+    mtjax.train.main([*words.split(), f"--runs={runs}"])
+    (directory,) = runs.iterdir()
+    return directory
+
+
+def test_a_run_keeps_every_tasks_returns(run):
+    with np.load(run / "evaluations.npz") as found:
+        assert found["train"].shape == (1, 2, 4, 2) and found["interpolation"].shape == (1, 2, 2, 2)
+        success = found["train_success"]
+        assert np.isnan(success[:, :, :3]).all() and np.isfinite(success[:, :, 3]).all()
+    with (run / "metrics.csv").open() as file:
+        lines = [line.strip().split(",") for line in file]
+    assert all(line[lines[0].index("success")] != "" for line in lines[2:])  # of the family that has it
+
+
+def test_a_run_is_scored_family_by_family(run, capsys):
+    mtjax.evaluate.main([f"--run={run}", "--episodes=1", "--diagnostics"])
+    said = capsys.readouterr().out
+    assert said.index("\naim") > said.index("aim\nsplit") >= 0 and "all families" in said
+    assert "wide-aim" in said and "aim goal=-1" in said
+    (folder,) = run.glob("evaluation-*")
+    assert {"returns.csv", "return_by_task.png", "diagnostics.json"} <= {file.name for file in folder.iterdir()}
+    assert "train,aim goal=-1,0,0," in (folder / "returns.csv").read_text()
+    with pytest.raises(InputError, match="only MuJoCo families can be filmed"):
+        mtjax.evaluate.main([f"--run={run}", "--video"])
+
+
+def test_a_run_and_its_policy_are_read_back(run):
+    config = from_json(run / "config.json")
+    assert isinstance(config.family, Mixture) and config.family == make("aim+wide-aim")
+    assert cli.parse(repeat(config)) == dataclasses.replace(config, runs="runs")
+    policy = mtjax.load(run)
+    task = pick(policy.env.tasks(), 0)
+    action = policy(policy.env.reset(task, jax.random.key(0)).obs, task)
+    assert action.shape == (2,) and action[1] == 0
+    assert "aim" in task_table(policy, {"train": np.zeros((1, 4, 2))})
+
+
+def test_a_run_goes_on_bit_for_bit(tmp_path):
+    agent, plan = tiny("sac", normalize_observations=True), {**PLAN, "eval_every": 40}
+    drawn = mixture([Aim(vary={"goal": "-1:1"}, num_draws=5), WIDE])
+    whole = mtjax.train(drawn, agent, **plan, steps=80)
+    mtjax.train(drawn, agent, **plan, steps=40, directory=tmp_path)
+    rest = mtjax.train(drawn, agent, **plan, steps=80, directory=tmp_path, resume=True)
+    for ours, theirs in zip(jax.tree.leaves(rest.state), jax.tree.leaves(whole.state), strict=True):
+        if jnp.issubdtype(ours.dtype, jax.dtypes.prng_key):
+            ours, theirs = jax.random.key_data(ours), jax.random.key_data(theirs)
+        np.testing.assert_array_equal(ours, theirs)
+    assert "wide-aim" in split_table(rest.evaluations, drawn.parts)
+
+
+# The command line.
+
+
+def test_flags_of_families_hold_for_all_of_them(tmp_path):
+    words = "--env=control-cartpole+tabular-mdp+cartpole-swingup --split=none --env.num-tasks 3 --engine=mjx --seeds=2"
+    config = cli.parse([*words.split(), "--env.vary.cartpole-swingup.pole-mass=0.1,0.2"])
+    pole, table, swingup = config.family.families  # type: ignore
+    assert (pole.num_tasks, table.num_tasks, pole.split, table.split) == (3, 3, "none", "none")
+    assert swingup.engine == "mjx" and swingup.train_count == 2 and config.plan.seeds == 2
+    assert config.training == Settings(num_envs=16)  # the default preset's
+    (tmp_path / "config.json").write_text(to_json(config, {}))
+    assert from_json(tmp_path / "config.json") == config
+    assert cli.parse(repeat(config)) == config
+
+
+@pytest.mark.parametrize(
+    "flag, said",
+    [
+        ("--env.vary.gravity=1,2", "say which family's gravity varies: one of bandit.gravity"),
+        ("--env.num-task=3", "did you mean '--env.num-tasks'"),
+        ("--env.num-tasks=many", "num-tasks"),
+        ("--split=denze", "did you mean 'dense'"),
+        ("--env.vary.control-cartpole.gravty=1,2", "did you mean 'gravity'"),
+        ("--hindsight=0.5", "share no physics"),
+    ],
+)
+def test_wrong_flags_are_refused(flag, said):
+    with pytest.raises(InputError) as error:
+        config = cli.parse(["--env=bandit+control-cartpole", flag])
+        config.learner.experience.check(config.family, 16)
+    assert said in str(error.value)
+
+
+def test_a_mixture_is_not_fine_tuned(run):
+    with pytest.raises(InputError, match="is a mixture; take one family"):
+        cli.parse(["--env=aim", f"--from={run}"])
+
+
+def test_names_of_many_families_are_shortened():
+    assert short_name("bandit+tabular-mdp") == "bandit+tabular-mdp"
+    assert short_name("+".join(f"family-number-{i}" for i in range(9))) == "mixture-of-9"
