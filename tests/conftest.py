@@ -1,8 +1,9 @@
 """What several test files share. Compiled programs live for the whole session: an MJX step costs ten seconds."""
 
 import dataclasses
+import os
 import shutil
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import ClassVar, NamedTuple
 
 import jax
@@ -10,11 +11,40 @@ import jax.numpy as jnp
 import numpy as np
 import probes
 import pytest
-from probes import QUICK
 
 import mtjax.train
 from mtjax.envs import ENVS
 from mtjax.envs.dm_control.finger import FingerSpin
+
+# Tests compile much and run little: without LLVM's optimisations and by XLA's plain emitters a program is made in a
+# fifth of the time. One thread a program is enough, as pytest runs several processes.
+QUICK_FLAGS = {
+    "xla_backend_optimization_level": "0",
+    "xla_cpu_use_fusion_emitters": "false",
+    "xla_cpu_parallel_codegen_split_count": "1",
+}
+
+
+def pytest_configure(config):
+    """Compile quickly, here and in processes that tests start, and never twice: workers share what they compiled."""
+    given = os.environ.get("XLA_FLAGS", "")
+    added = [f"--{name}={value}" for name, value in QUICK_FLAGS.items() if name not in given]
+    os.environ["XLA_FLAGS"] = " ".join([given, *added]).strip()
+    cache = getattr(config, "cache", None)
+    if cache is not None:
+        keep = {
+            "jax_compilation_cache_dir": str(cache.mkdir("xla")),
+            "jax_persistent_cache_min_compile_time_secs": 0.0,
+            "jax_persistent_cache_min_entry_size_bytes": -1,
+        }
+        for name, value in keep.items():
+            os.environ[name.upper()] = str(value)
+            jax.config.update(name, value)
+
+
+def pytest_xdist_auto_num_workers(config):
+    """Use every core that this process may, but no more than four: each worker takes some two gigabytes."""
+    return min(4, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
 
 
 class Worlds(NamedTuple):
@@ -36,8 +66,7 @@ class Programs(NamedTuple):
 @lru_cache
 def compiled(env) -> Programs:
     put = jax.vmap(lambda task, qpos, qvel: env.set_physics(task, None, qpos, qvel))
-    quick = partial(jax.jit, compiler_options=QUICK)
-    return Programs(quick(jax.vmap(env.reset)), quick(put), quick(jax.vmap(env.step)))
+    return Programs(jax.jit(jax.vmap(env.reset)), jax.jit(put), jax.jit(jax.vmap(env.step)))
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -42,16 +42,27 @@ def valid(name, **settings):
 
 VALID = [(name, told) for name in AGENTS for told in CONDITIONINGS if valid(name, conditioning=told)]
 SURGERY = [("embedding" if name == "sac" else "parameters", name) for name in AGENTS]
-# Each tells tasks apart in its own way, and pcgrad must compose with every network that tasks share.
-TRACED = [(name, {"conditioning": told}) for name, told in VALID]
-TRACED += [(name, {"conditioning": told, "gradients": "pcgrad"}) for told, name in SURGERY]
-TRACED += [("sac-conditioned", {"gradients": rule}) for rule in RULES]
-TRACED += [("sac-conditioned", {"gradients": rule, "gradient_scope": "per-layer"}) for rule in RULES]
-TRACED += [("sac-conditioned", {"encoder": name}) for name in ENCODERS]
-TRACED += [(name, {"value": value}) for value in VALUES for name in ("sac-conditioned", "deepmdp")]
-TRACED += [("multi-head", {"scaling": scaling}) for scaling in SCALINGS]
-TRACED += [("sac-conditioned", {"sampler": sampler}) for sampler in SAMPLERS]
-TRACED = [case for case in TRACED if valid(case[0], **case[1])]
+
+
+def some(cases, every):
+    """Cases of which one in so many is traced by default and all by .ci/run, less those that cannot be."""
+    cases = [(name, settings) for name, settings in cases if valid(name, **settings)]
+    mark = lambda i: [pytest.mark.slow] if i % every else []
+    return [pytest.param(*case, marks=mark(i)) for i, case in enumerate(cases)]
+
+
+# Each tells tasks apart in its own way, and pcgrad must compose with every network that tasks share. Five has no
+# divisor in common with the number of ways, so that every agent and every way is in the default.
+TRACED = [
+    *some([(name, {"conditioning": told}) for name, told in VALID], 5),
+    *some([(name, {"conditioning": told, "gradients": "pcgrad"}) for told, name in SURGERY], 5),
+    *some([("sac-conditioned", {"gradients": rule}) for rule in RULES], 1),
+    *some([("sac-conditioned", {"gradients": rule, "gradient_scope": "per-layer"}) for rule in RULES], 3),
+    *some([("sac-conditioned", {"encoder": name}) for name in ENCODERS], 1),
+    *some([(name, {"value": value}) for value in VALUES for name in ("sac-conditioned", "deepmdp")], 1),
+    *some([("multi-head", {"scaling": scaling}) for scaling in SCALINGS], 1),
+    *some([("sac-conditioned", {"sampler": sampler}) for sampler in SAMPLERS], 1),
+]
 # Those that are also run, as compiling takes seconds: every agent, and every way to tell the task.
 RUN = [(name, {}) for name in AGENTS]
 RUN += [("sac", {"conditioning": told}) for told in ("one-hot", "embedding", "vectors")]

@@ -192,7 +192,7 @@ def test_every_parameter_receives_a_gradient(name):
     for path, slope in slopes:
         path = jax.tree_util.keystr(path)
         split = "experts" in path or "own" in path
-        for i, piece in enumerate(slope if split else [slope]):
+        for i, piece in enumerate(np.asarray(slope) if split else [np.asarray(slope)]):
             assert np.all(np.isfinite(piece)) and np.any(piece != 0), (path, i)
 
 

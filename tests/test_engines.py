@@ -39,7 +39,9 @@ VARIED = {
     "reacher-easy": {"mass": "0.8,1.2"},
     "walker-walk": {"foot-length": "0.08,0.12"},
 }
-DOMAINS = list(VARIED)
+DOMAINS, SLOW = list(VARIED), pytest.mark.slow
+# MJX takes ten seconds to compile a domain: one without contact, one in an elliptic cone and one in a pyramidal one.
+QUICK_DOMAINS = ("finger-spin", "hopper-hop", "pendulum-swingup")
 # Bounds on each world's largest error in velocity, by quantile, relative to the domain's fastest velocity. MJX and Warp
 # count in float32, whose relative rounding of 6e-8 ten substeps and the mass matrix's condition amplify up to tenfold;
 # in contact the solver stops where float32 sees no more progress, which is a hundred times sooner in elliptic cones.
@@ -127,7 +129,7 @@ def assert_agreement(name, new):
     assert np.median(errors(play, wrong)) > 10 * np.median(found)
 
 
-@pytest.mark.parametrize("name", DOMAINS)
+@pytest.mark.parametrize("name", [pytest.param(x, marks=[] if x in QUICK_DOMAINS else SLOW) for x in DOMAINS])
 def test_mjx_steps_as_c_does(name):
     """With solver iterations to spare: it stops by itself where the solution no longer improves."""
     play, engine = played(name), family(name, engine="mjx", solver_iterations=50).simulator
@@ -135,7 +137,7 @@ def test_mjx_steps_as_c_does(name):
     assert_agreement(name, step(play.tasks, play.world, play.action))
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("name", DOMAINS)
 def test_warp_steps_as_c_does(name):
     """Under a map of a map, which picks every world's own model."""

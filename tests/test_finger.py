@@ -1,5 +1,7 @@
 """The finger against dm_control's: model, observation, reward and starts."""
 
+from functools import lru_cache
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -102,7 +104,7 @@ def test_what_can_touch_is_what_touches_in_dm_control(suite_finger, sizes):
     assert np.sum(contacts) > 50
 
 
-@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("engine", ["c", pytest.param("mjx", marks=pytest.mark.slow)])
 def test_observation_and_reward_are_those_of_dm_control(engine, suite_finger, worlds, programs):
     """At 100 states, 50 in contact. Kinematics to float32 rounding (sums of numbers below 50 carry 4e-6).
 
@@ -169,14 +171,15 @@ def test_starts_are_at_rest_and_feel_nothing(starts):
 
 @pytest.fixture(scope="module")
 def size_starts(sizes, programs):
-    """Reset of all ten sizes, 300 starts each, in both engines from the same keys."""
+    """Reset of all ten sizes, 300 starts each, in either engine from the same keys."""
     keys, ids = jax.random.split(jax.random.key(1), 3000), np.repeat(np.arange(10), 300)
-    return {
-        engine: programs(envs.make("finger-spin-vary-size", {"size": "0.95:1.4:10"}, engine=engine)).reset(
-            rows(sizes, ids), keys
-        )
-        for engine in ENGINES
-    }
+
+    @lru_cache
+    def start(engine):
+        env = envs.make("finger-spin-vary-size", {"size": "0.95:1.4:10"}, engine=engine)
+        return programs(env).reset(rows(sizes, ids), keys)
+
+    return start
 
 
 def contact_counts(model, positions):
@@ -190,15 +193,16 @@ def contact_counts(model, positions):
 def test_nothing_touches_at_any_start(sizes, size_starts):
     """MuJoCo finds no contact at 300 starts of each size, though it does at a good part of unrejected draws."""
     draws = np.random.RandomState(0).uniform([-1.9, -1.9, -np.pi], [1.9, 1.9, np.pi], (300, 3))
-    starts = np.asarray(size_starts["c"].state.qpos).reshape(10, 300, 3)
+    starts = np.asarray(size_starts("c").state.qpos).reshape(10, 300, 3)
     for model, start in zip(sizes.models, starts, strict=False):
         assert not np.any(contact_counts(model, start))
         assert np.sum(contact_counts(model, draws) > 0) >= 10
 
 
+@pytest.mark.slow
 def test_engines_start_alike(size_starts):
     """Starts and first observations are the same in both engines, to float32 rounding of the kinematics."""
-    c, mjx = size_starts["c"], size_starts["mjx"]
+    c, mjx = size_starts("c"), size_starts("mjx")
     np.testing.assert_allclose(c.state.qpos, mjx.state.qpos, rtol=0, atol=1e-6)
     np.testing.assert_allclose(c.obs, mjx.obs, rtol=0, atol=2e-6)
 

@@ -2,10 +2,11 @@
 
 MJX compiles in ten seconds a program, so these tests share two steps and one ``set_physics``, all of 100 worlds: of
 the sizes with twenty solver iterations, which stand for the converged solver (more change no bit of any state here),
-and of the touch sizes with the default.
+and of the touch sizes with the default. What needs them is marked slow; ``test_engines`` holds MJX to C by default.
 """
 
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +22,8 @@ STEPS = 50
 NOMINAL = 1  # the row of finger-spin-vary-size whose size is 1
 SIZE, TOUCH = "finger-spin-vary-size", "finger-spin-vary-touch-size"
 ENGINES = {"c": {"engine": "c"}, "mjx": {"engine": "mjx", "solver_iterations": 20}}
+slow = pytest.mark.slow
+either_engine = pytest.mark.parametrize("engine", ["c", pytest.param("mjx", marks=slow)])
 
 
 def make(name, engine):
@@ -101,8 +104,9 @@ def suite_play(suite_finger, worlds, actions):
 
 @pytest.fixture(scope="module")
 def played(worlds, actions, programs):
-    """Fifty steps of the nominal task in each engine: the first ``Step``, and states (B, H, 6)."""
+    """Fifty steps of the nominal task in an engine: the first ``Step``, and states (B, H, 6)."""
 
+    @lru_cache
     def play(engine):
         env = make(SIZE, engine)
         tasks, world = begin(env, worlds)
@@ -113,12 +117,12 @@ def played(worlds, actions, programs):
             states.append(np.concatenate([step.state.qpos, step.state.qvel], axis=1))
         return first, np.stack(states, axis=1)
 
-    return {engine: play(engine) for engine in ENGINES}
+    return play
 
 
 def test_one_step_of_c_is_that_of_dm_control(played, suite_play):
     """State, observation and reward after one step, to float32 rounding of numbers up to 45 (2e-6 each)."""
-    step, (states, observations, rewards) = played["c"][0], suite_play
+    step, (states, observations, rewards) = played("c")[0], suite_play
     assert np.sum(observations[:, 0, 7:].any(axis=1)) >= 20
     np.testing.assert_allclose(step.state.qpos, states[:, 0, :3], rtol=0, atol=1e-6)
     np.testing.assert_allclose(step.state.qvel, states[:, 0, 3:], rtol=0, atol=5e-6)
@@ -127,12 +131,13 @@ def test_one_step_of_c_is_that_of_dm_control(played, suite_play):
     assert 3 < step.reward.sum() < 97
 
 
+@slow
 def test_one_step_of_converged_mjx_is_that_of_dm_control(played, suite_play):
     """Without contact to float32 rounding; in contact to where a float32 solver stops, in a stiff elliptic cone.
 
     Some contacts lie outside the sensors, so that only half of the worlds that feel nothing are surely free.
     """
-    step, (states, observations, rewards) = played["mjx"][0], suite_play
+    step, (states, observations, rewards) = played("mjx")[0], suite_play
     touched = observations[:, 0, 7:].any(axis=1)
     assert touched.sum() >= 20
     qpos, qvel = worst(step.state.qpos, states[:, 0, :3]), worst(step.state.qvel, states[:, 0, 3:])
@@ -147,16 +152,19 @@ def test_fifty_steps_of_c_are_dm_control_with_a_float32_state(played, suite_fing
     """Bit for bit, once dm_control's state is rounded to float32 after each step: the engines are one code."""
     states, observations, _ = play_suite(suite_finger, worlds, actions, rounded=True)
     assert observations[:, :, 7:].any(axis=(1, 2)).sum() > 50
-    np.testing.assert_array_equal(played["c"][1], states.astype(np.float32))
+    np.testing.assert_array_equal(played("c")[1], states.astype(np.float32))
 
 
-@pytest.mark.parametrize(("engine", "bounds"), [("c", {0.5: 2e-5, 0.9: 1e-3}), ("mjx", {0.5: 1e-3, 0.8: 5e-2})])
+@pytest.mark.parametrize(
+    ("engine", "bounds"), [("c", {0.5: 2e-5, 0.9: 1e-3}), pytest.param("mjx", {0.5: 1e-3, 0.8: 5e-2}, marks=slow)]
+)
 def test_fifty_steps_follow_dm_control(engine, bounds, played, suite_play):
     """Largest state error of each world on the way; no bound on the last tenth, where contact is chaotic."""
     assert suite_play[1][:, :, 7:].any(axis=(1, 2)).sum() > 50
-    assert_within(worst(played[engine][1], suite_play[0]), bounds)
+    assert_within(worst(played(engine)[1], suite_play[0]), bounds)
 
 
+@slow
 def test_a_model_stacked_with_others_moves_as_it_does_alone(played, worlds, actions, programs):
     """MJX: size 1 from the table of ten sizes, against a family that stacks no dynamics and whose one model is size 1.
 
@@ -165,7 +173,7 @@ def test_a_model_stacked_with_others_moves_as_it_does_alone(played, worlds, acti
     alone = envs.make(TOUCH, engine="mjx")
     assert "geom_size" in make(SIZE, "mjx").table.tasks.model and set(alone.table.tasks.model) == {"site_size"}
     tasks, world = begin(alone, worlds)
-    step, stacked = programs(alone).step(tasks, world, actions[0]), played["mjx"][0]
+    step, stacked = programs(alone).step(tasks, world, actions[0]), played("mjx")[0]
     assert_within(worst(step.state.qvel, stacked.state.qvel), {0.5: 1e-5, 0.75: 1e-3})
     assert_within(worst(step.obs[:, :4], stacked.obs[:, :4]), {0.5: 1e-6, 0.75: 1e-5})
 
@@ -193,6 +201,7 @@ def size_contacts(programs):
     return contacts_in_play(make(SIZE, "c"), programs, each=10)
 
 
+@slow
 def test_ten_sizes_in_one_call_move_as_each_does_in_c(size_contacts, programs):
     """All ten stacked models in one MJX step, in contact, against MuJoCo C with each task's own model."""
     tasks, world, action = size_contacts
@@ -206,6 +215,7 @@ def test_ten_sizes_in_one_call_move_as_each_does_in_c(size_contacts, programs):
     assert np.median(worst(wrong.state.qvel, c.state.qvel)) > 0.1
 
 
+@slow
 def test_default_iterations_are_near_the_converged_solver(programs):
     """One step from the last step's solution: three contacts in four are solved, and the worst are hard impacts.
 
@@ -252,7 +262,7 @@ def test_c_follows_a_change_of_tasks_between_calls(size_contacts, programs):
     assert_same(first, step(tasks, world, action))
 
 
-@pytest.mark.parametrize("engine", ENGINES)
+@either_engine
 def test_step_is_deterministic(engine, size_contacts, programs):
     """The same tasks, states and actions give the same bits."""
     step = programs(make(SIZE, engine)).step
@@ -268,7 +278,7 @@ def touch_contacts(programs):
     return rows(env, np.repeat(np.arange(10), 10)), world, action
 
 
-@pytest.mark.parametrize("engine", ENGINES)
+@either_engine
 def test_touch_sizes_share_one_dynamics(engine, touch_contacts, programs):
     """Ten steps in contact: ten sensor sizes, one motion, one reward; only touch differs, and grows with the sensor."""
     tasks, world, action = touch_contacts
@@ -285,6 +295,7 @@ def test_touch_sizes_share_one_dynamics(engine, touch_contacts, programs):
     assert np.max(np.ptp(touch, axis=1)) > 1
 
 
+@slow
 def test_touch_sizes_feel_the_same_in_both_engines(touch_contacts, programs):
     """Every size's touch in the same ten contacts, by ``set_physics`` to the converged forces in float32.
 
@@ -303,7 +314,7 @@ def test_touch_sizes_feel_the_same_in_both_engines(touch_contacts, programs):
     assert_within(worst(*stepped), {0.8: 5e-3})
 
 
-@pytest.mark.parametrize("engine", ENGINES)
+@either_engine
 def test_set_physics_returns_the_given_state(engine, worlds, programs):
     """Positions and velocities come back as given, and sensors feel the contacts there."""
     env = make(TOUCH, engine)
