@@ -1,16 +1,18 @@
 """How well and how fast agents learn families of tasks: every agent on every family, many seeds in one program each.
 
     python benchmarks/learning.py [--envs NAME ...] [--agents NAME ...] [--seeds 10] [--steps N] [--split hip-bmdp]
-                                  [--out DIR]
+                                  [--baseline NAME] [--out DIR]
 
 Every pair of family and agent leaves ``DIR/ENV/AGENT.csv`` (training returns over steps and seconds, a line a chunk and
 seed) and ``AGENT.npz`` (every episode of every evaluation); pairs that are there already are not run again, so a long
-table may be made in parts, by several processes. From all that is in DIR come ``table.md``, ``evaluations.csv`` and a
-figure for each family.
+table may be made in parts, by several processes. From all that is in DIR come ``table.md``, ``differences.md``,
+``evaluations.csv`` and a figure for each family. With ``--agents`` and no name nothing is run, and only these are made.
 
 Scores are interquartile means over seeds and tasks of the last evaluation (never the best one) under the mean action,
-with 95% stratified bootstrap intervals (Agarwal et al. 2021). "s to 900" is the seconds of training, without compiling
-and evaluating, after which the training policy's mean return over tasks and seeds first reached 900.
+with 95% bootstrap intervals over whole seeds. "s to 900" is the seconds of training, without compiling and evaluating,
+after which the training policy's mean return over tasks and seeds first reached 900. Differences are those of
+scores against the baseline's, with the seeds of both in pairs and without; beside them is the probability that a seed
+of the agent earns more than one of the baseline on a task drawn at random (Agarwal et al. 2021).
 """
 
 import argparse
@@ -25,7 +27,14 @@ from report import markdown
 import mtjax
 from mtjax.evaluation import load_evaluations, save_evaluations
 from mtjax.report import figures as plot
-from mtjax.report.stats import stratified_bootstrap
+from mtjax.report.stats import (
+    Interval,
+    iqm,
+    paired_difference,
+    probability_of_improvement,
+    seed_interval,
+    unpaired_difference,
+)
 from mtjax.training.log import append_rows
 from mtjax.training.programs import enable_compile_cache
 from mtjax.training.run import Result
@@ -54,6 +63,7 @@ def main() -> None:
     parser.add_argument("--vary", nargs="*", default=[], metavar="NAME=VALUES", help="besides what the family varies")
     parser.add_argument("--training", nargs="*", default=[], metavar="NAME=N", help="such as num_envs=64")
     parser.add_argument("--mark", type=float, default=900.0, help="the return whose time is told")
+    parser.add_argument("--baseline", default="sac-conditioned", metavar="NAME", help="what differences are against")
     parser.add_argument("--out", type=Path, default=Path("runs") / f"learning-{time.strftime('%Y%m%d-%H%M%S')}")
     arguments = parser.parse_args()
     enable_compile_cache()
@@ -61,7 +71,7 @@ def main() -> None:
         for agent in arguments.agents:
             if not (arguments.out / env / f"{agent}.npz").exists():
                 learn(arguments, env, agent)
-    tabulate(arguments.out, arguments.mark)
+    tabulate(arguments.out, arguments.mark, arguments.baseline)
 
 
 def learn(arguments: argparse.Namespace, env: str, agent: str) -> None:
@@ -97,23 +107,27 @@ def save(folder: Path, agent: str, result: Result) -> None:
     save_evaluations(folder / f"{agent}.npz", result.evaluations)
 
 
-def tabulate(out: Path, mark: float) -> None:
+def tabulate(out: Path, mark: float, baseline: str) -> None:
     """Make tables and figures of all runs in a folder."""
     head = ["family", "agent", *(f"{split}, IQM" for split in SPLITS), "worst task", f"s to {mark:.0f}"]
     head += ["training s", "wall s", "steps/s, all seeds"]
-    lines, rows = [], []
+    lines, rows, differences = [], [], []
     for env in sorted({path.parent.name for path in out.glob("*/*.npz")}):
-        curves = {}
+        curves, found = {}, {}
         for agent, curve, evaluations in runs(out / env):
+            found[agent] = last_scores(evaluations)
             known = curve[np.all(np.isfinite(curve[:, :, -1]), axis=1)]  # chunks in which episodes ended
             if len(known):
                 curves[agent] = (known[:, 0, 1], known[:, :, -1].T[:, :, None, None])
             lines.append(row(env, agent, curve, evaluations, mark))
             rows += evaluation_rows(env, agent, evaluations)
+        differences += difference_rows(env, found, baseline)
         if curves:
             plot.compare(out / f"{env}.png", curves, f"return on training tasks of {env}")
     table = markdown(head, lines)
     (out / "table.md").write_text(table + "\n")
+    head = ["family", "agent", "split", f"IQM less {baseline}'s, seeds in pairs", "seeds not in pairs"]
+    (out / "differences.md").write_text(markdown([*head, "probability of improvement"], differences) + "\n")
     (out / "evaluations.csv").unlink(missing_ok=True)
     append_rows(out / "evaluations.csv", rows)
     print(table)
@@ -133,17 +147,37 @@ def runs(folder: Path) -> Iterator[tuple]:
 
 def row(env: str, agent: str, curve: np.ndarray, evaluations, mark: float) -> list[str]:
     """The cells of one run's line: last evaluation by split, times, rate."""
-    scores = {split: x[:, -1].mean(axis=-1) for split, x in evaluations.returns.items() if x.size}  # (S, T)
+    scores = last_scores(evaluations)
     cells = [env, agent]
-    for split in SPLITS:
-        point, low, high = stratified_bootstrap(scores[split]) if split in scores else (np.nan,) * 3
-        cells.append(f"{point:.0f} [{low:.0f}, {high:.0f}]" if split in scores else "-")
+    cells += [_cell(seed_interval(scores[split], iqm)) if split in scores else "-" for split in SPLITS]
     cells.append(f"{scores['train'].mean(axis=0).min():.0f}")
     steps, seconds, wall, returns = np.moveaxis(curve[:, :, 1:], -1, 0).mean(axis=-1)
     reached = np.flatnonzero(returns >= mark)
     cells.append(f"{seconds[reached[0]]:.1f}" if len(reached) else "-")
     rate = steps[-1] * curve.shape[1] / seconds[-1]
     return [*cells, f"{seconds[-1]:.1f}", f"{wall[-1]:.0f}", f"{rate:,.0f}"]
+
+
+def difference_rows(env: str, found: dict[str, dict[str, np.ndarray]], baseline: str) -> list[list[str]]:
+    """Cells of every agent's differences from the baseline, a line a split; there are no pairs of unlike numbers."""
+    lines = []
+    for agent, scores in found.items():
+        for split in scores if agent != baseline and baseline in found else ():
+            pair = scores[split], found[baseline][split]
+            paired = _cell(paired_difference(*pair, iqm), "+.1f") if len(pair[0]) == len(pair[1]) else "-"
+            improvement = _cell(probability_of_improvement(*pair), ".2f")
+            lines.append([env, agent, split, paired, _cell(unpaired_difference(*pair, iqm), "+.1f"), improvement])
+    return lines
+
+
+def last_scores(evaluations) -> dict[str, np.ndarray]:
+    """Mean returns (S, T) of the last evaluation, by split; splits without tasks are left out."""
+    return {split: x[:, -1].mean(axis=-1) for split, x in evaluations.returns.items() if x.size}
+
+
+def _cell(interval: Interval, form: str = ".0f") -> str:
+    point, low, high = (format(x, form) for x in interval)
+    return f"{point} [{low}, {high}]"
 
 
 def evaluation_rows(env: str, agent: str, evaluations) -> list[dict]:

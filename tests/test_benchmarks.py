@@ -5,6 +5,7 @@ import json
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 FOLDER = Path(__file__).parent.parent / "benchmarks"
@@ -83,3 +84,14 @@ def test_returns_are_those_of_whole_chunks(script, tmp_path):
     chunks = script("time_to_return").chunks
     assert chunks(tmp_path, 2) == [(10, 1.0, None), (20, 2.0, 6.0)]
     assert chunks(tmp_path / "none", 2) == []
+
+
+def test_differences_are_against_the_baseline(script):
+    """A line for every other agent and split, with no pairs where the numbers of seeds differ."""
+    plain, better = np.array([[1.0], [2.0]]), np.array([[11.0], [12.0]])
+    found = {"plain": {"train": plain}, "better": {"train": better}, "more": {"train": np.tile(better, (2, 1))}}
+    lines = script("learning").difference_rows("family", found, "plain")
+    pairs = "+10.0 [+10.0, +10.0]"
+    assert lines[0] == ["family", "better", "train", pairs, "+10.0 [+9.0, +11.0]", "1.00 [1.00, 1.00]"]
+    assert lines[1][:4] == ["family", "more", "train", "-"] and len(lines) == 2
+    assert script("learning").difference_rows("family", found, "absent") == []

@@ -1,7 +1,7 @@
 """Every MuJoCo domain in every engine: one step from the same states under the same actions.
 
-States are those of random play with MuJoCo C. Half of the worlds have one model and half another, so that a step which
-takes its model from the wrong row is off in every world.
+States are those of random play with MuJoCo C, from the very start of an episode on. Half of the worlds have one model
+and half another, so that a step which takes its model from the wrong row is off in every world.
 """
 
 import importlib.util
@@ -24,7 +24,8 @@ from mtjax.envs.engines.mjx import Mjx
 from mtjax.types import InputError, Task
 
 COUNT = 64  # worlds
-PLAYED = 60  # control steps before the one that is compared
+AGES = (0, 1, 5, 20, 60, 150)  # control steps before the one that is compared
+PLAYED = 60  # the age that is held to the tighter bounds
 # Each domain, and what differs between its two tasks. Cartpole and acrobot are integrated by Runge-Kutta.
 VARIED = {
     "acrobot-swingup": {"gravity": "8,11"},
@@ -47,6 +48,9 @@ QUICK_DOMAINS = ("finger-spin", "hopper-hop", "pendulum-swingup")
 # in contact the solver stops where float32 sees no more progress, which is a hundred times sooner in elliptic cones.
 FREE = {0.5: 1e-6, 1: 1e-5}
 TOUCHING = {0.5: 3e-5, 0.9: 3e-4, 1: 1e-2}
+# In states of all ages MJX may be off by more than this, relative as above, in such a share of worlds: 0 elsewhere.
+OFF = 1e-3
+MAY_BE_OFF = {"hopper-hop": 0.013}  # limbs that cross, as in 4 of 384 states: see the domain
 
 
 class Play(NamedTuple):
@@ -63,16 +67,27 @@ def family(name, **settings):
 
 
 @lru_cache
-def played(name):
+def plays(name):
+    """Play at each of ``AGES``."""
     env = family(name, engine="c")
     tasks = jax.tree.map(lambda x: x[np.arange(COUNT) % 2], env.tasks())
     world = jax.jit(jax.vmap(env.reset))(tasks, jax.random.split(jax.random.key(0), COUNT)).state
-    actions = np.random.RandomState(1).uniform(-1, 1, (PLAYED // 5 + 1, COUNT, env.spec.action_size))
-    actions = np.repeat(np.float32(actions), 5, axis=0)[: PLAYED + 1]
-    step = jax.jit(jax.vmap(env.step))
-    for action in actions[:-1]:
-        world = step(tasks, world, action).state
-    return Play(tasks, world, actions[-1], step(tasks, world, actions[-1]))
+    if name == "ball-in-cup-catch":  # random play catches the ball too rarely: in half of the worlds it begins there
+        caught = jnp.arange(COUNT)[:, None] < COUNT // 2
+        world = world._replace(qpos=jnp.where(caught, jnp.array([0, 0, 0, 0.335]), world.qpos))
+    actions = np.random.RandomState(1).uniform(-1, 1, (max(AGES) // 5 + 1, COUNT, env.spec.action_size))
+    step, found = jax.jit(jax.vmap(env.step)), {}
+    for age in range(max(AGES) + 1):
+        action = np.float32(actions[age // 5])
+        new = step(tasks, world, action)
+        if age in AGES:
+            found[age] = Play(tasks, world, action, new)
+        world = new.state
+    return found
+
+
+def played(name):
+    return plays(name)[PLAYED]
 
 
 def alone(engine, task, world, action):
@@ -129,12 +144,29 @@ def assert_agreement(name, new):
     assert np.median(errors(play, wrong)) > 10 * np.median(found)
 
 
+def compiled_step(name, env, play):
+    """Compile a step in little time; the hopper's takes ten seconds more, and runs in 0.1 s where it took 20."""
+    if name != "hopper-hop":
+        return quick(jax.vmap(env.simulator.step), *play[:3])
+    some = {"xla_backend_optimization_level": 1}
+    return jax.jit(jax.vmap(env.simulator.step)).lower(*play[:3]).compile(compiler_options=some)
+
+
 @pytest.mark.parametrize("name", [pytest.param(x, marks=[] if x in QUICK_DOMAINS else SLOW) for x in DOMAINS])
 def test_mjx_steps_as_c_does(name):
-    """With solver iterations to spare: it stops by itself where the solution no longer improves."""
-    play, engine = played(name), family(name, engine="mjx", solver_iterations=50).simulator
-    step = quick(jax.vmap(engine.step), play.tasks, play.world, play.action)
-    assert_agreement(name, step(play.tasks, play.world, play.action))
+    """With solver iterations to spare, in all but a stated share of the states of play; and rewards are those of C."""
+    env, play = family(name, engine="mjx", solver_iterations=10), played(name)
+    step = compiled_step(name, env, play)
+    found = {age: step(*play[:3]) for age, play in plays(name).items()}
+    assert_agreement(name, found[PLAYED])
+    off = np.array([errors(play, found[age]) > OFF for age, play in plays(name).items()])
+    assert np.mean(off) <= MAY_BE_OFF.get(name, 0), (name, off.sum(axis=1))
+    rewards = [jax.vmap(env.reward)(play.tasks, found[age], play.action) for age, play in plays(name).items()]
+    expected = np.array([play.step.reward for play in plays(name).values()])
+    unlike = np.abs(np.array(rewards) - expected) > 1e-3
+    assert not np.any(unlike & ~off), (name, unlike.sum(axis=1))
+    if name == "ball-in-cup-catch":
+        assert np.sum(expected == 1) > COUNT  # states of success
 
 
 @SLOW
@@ -207,7 +239,7 @@ def test_rare_sensors_read_as_in_c():
     """Those of motors and tendons after the step, and those of forces, before which MJX stops without constraints."""
     base = mujoco.MjModel.from_xml_string(ROD % INVOLVED)
     zero = np.int32(0)
-    task = Task(zero, zero, np.zeros(1, np.float32), {}, {}, {})
+    task = Task(zero, zero, np.zeros(1, np.float32), {}, {}, {}, horizon=zero)
 
     def run(engine):
         world = engine.forward(task, jnp.ones(1), jnp.ones(1))

@@ -18,7 +18,9 @@ class Preset(NamedTuple):
 
     says: str  # what it is, in a line
     defaults: Mapping[str, Any] = {}
-    place: "str | type[BaseAgent]" = "mtjax.agents.sac:SAC"  # the class; one of this package is imported when it is used
+    place: "str | type[BaseAgent]" = (
+        "mtjax.agents.sac:SAC"  # the class; one of this package is imported when it is used
+    )
 
     @property
     def cls(self) -> "type[BaseAgent]":
@@ -70,9 +72,7 @@ AGENTS: dict[str, Preset] = {
         {"conditioning": "embedding", "embedding_size": 50},
         "mtjax.agents.hip_bmdp:HiPBMDP",
     ),
-    "ppo": Preset(
-        "Proximal policy optimisation (Schulman et al. 2017), told its task", _TOLD, "mtjax.agents.ppo:PPO"
-    ),
+    "ppo": Preset("Proximal policy optimisation (Schulman et al. 2017), told its task", _TOLD, "mtjax.agents.ppo:PPO"),
     "pcgrad": Preset("Conflicting gradients projected (Yu et al. 2020)", {"gradients": "pcgrad", **_TOLD}),
     "cagrad": Preset("Conflict-averse gradients (Liu et al. 2021)", {"gradients": "cagrad", **_TOLD}),
     "gradnorm": Preset("Weights that even out learning rates (Chen et al. 2018)", {"gradients": "gradnorm", **_TOLD}),

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mtjax.report.stats import mean_interval
+from mtjax.report.stats import seed_interval
 from mtjax.types import InputError
 
 if TYPE_CHECKING:
@@ -220,7 +220,7 @@ def _draw_points(axes: "Axes", values: np.ndarray, returns: np.ndarray, label: s
 
 def _intervals(scores: np.ndarray) -> np.ndarray:
     """Return mean, low and high (3, columns) over the seeds of scores (S, columns)."""
-    return np.array([mean_interval(column[:, None]) for column in scores.T]).T
+    return np.array([seed_interval(column) for column in scores.T]).T
 
 
 def _label_steps(axes: "Axes") -> None:
