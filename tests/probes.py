@@ -111,6 +111,9 @@ class Stub:
         return self.experience.learn(env, self, states, data, tasks, keys)
 
 
+OFF_POLICY = [name for name, preset in agents.AGENTS.items() if issubclass(preset.cls, agents.SAC)]
+"""The agents that learn from batches of a replay; ``test_ppo`` is of the one that does not."""
+
 SMALL = {  # of parts that have such settings
     "num_experts": 2,
     "expert_widths": (8, 4),

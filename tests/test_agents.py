@@ -7,8 +7,8 @@ import numpy as np
 import optax
 import pytest
 from mtjax.agents.hyperparameters import CONDITIONINGS
+from probes import OFF_POLICY, learner, pick, quick, random_batch, tasks_of, tiny
 from probes import act as act_once
-from probes import learner, pick, quick, random_batch, tasks_of, tiny
 
 from mtjax import normalize
 from mtjax.agents import AGENTS, agent
@@ -40,8 +40,8 @@ def valid(name, **settings):
         return False
 
 
-VALID = [(name, told) for name in AGENTS for told in CONDITIONINGS if valid(name, conditioning=told)]
-SURGERY = [("embedding" if name == "sac" else "parameters", name) for name in AGENTS]
+VALID = [(name, told) for name in OFF_POLICY for told in CONDITIONINGS if valid(name, conditioning=told)]
+SURGERY = [("embedding" if name == "sac" else "parameters", name) for name in OFF_POLICY]
 
 
 def some(cases, every):
@@ -64,7 +64,7 @@ TRACED = [
     *some([("sac-conditioned", {"sampler": sampler}) for sampler in SAMPLERS], 1),
 ]
 # Those that are also run, as compiling takes seconds: every agent, and every way to tell the task.
-RUN = [(name, {}) for name in AGENTS]
+RUN = [(name, {}) for name in OFF_POLICY]
 RUN += [("sac", {"conditioning": told}) for told in ("one-hot", "embedding", "vectors")]
 RUN += [
     ("multi-head", {"gradients": "pcgrad", "conditioning": "embedding"}),
@@ -154,7 +154,7 @@ def test_agents_act_and_learn(name, settings, vectors):
 MIXED = ("care", "moe", "hip-bmdp")
 
 
-@pytest.mark.parametrize("name", [pytest.param(x, marks=[] if x in MIXED else pytest.mark.nightly) for x in AGENTS])
+@pytest.mark.parametrize("name", [pytest.param(x, marks=[] if x in MIXED else pytest.mark.nightly) for x in OFF_POLICY])
 def test_a_world_among_many_is_that_world_alone(name):
     """Seeds x tasks x environments as an evaluation has them, on whatever device tests run: no row is another's."""
     agent, shape = tiny(name), (10, 8, 5)

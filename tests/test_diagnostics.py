@@ -12,12 +12,11 @@ import jax.numpy as jnp
 import matplotlib.image
 import numpy as np
 import pytest
-from probes import QUICK, learner, of_task, pick, random_batch, tasks_of, tiny
+from probes import OFF_POLICY, QUICK, learner, of_task, pick, random_batch, tasks_of, tiny
 
 import mtjax
 import mtjax.evaluate
 from mtjax import loop
-from mtjax.agents import AGENTS
 from mtjax.agents.parts.encoders import ENCODERS
 from mtjax.config import from_json, to_json
 from mtjax.networks import Params, tanh_normal
@@ -251,7 +250,7 @@ def trace(agent):
     return state, gradients, seen
 
 
-@pytest.mark.parametrize("name", AGENTS)
+@pytest.mark.parametrize("name", OFF_POLICY)
 def test_every_agent_has_diagnostics(name):
     """Matrices unless it is disjoint, TD errors for each task, and layers of both networks."""
     agent = tiny(name)

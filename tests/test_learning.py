@@ -4,9 +4,9 @@ from functools import cache
 
 import numpy as np
 import pytest
+from probes import OFF_POLICY
 
 import mtjax
-from mtjax.agents import AGENTS
 
 # The goal is not seen: three places on one circle, of which a policy that is not told which can serve but one.
 GOALS = {"goal-x": "-0.2,0.2,0.0", "goal-y": "0.0,0.0,0.2"}
@@ -23,7 +23,7 @@ QUICK = {
 }
 LONGER = {"distral": 2500}  # whose tasks share no experience
 USUAL = ("sac-conditioned", "multi-head", "soft-modularization", "hip-bmdp")
-TOLD = [name for name in AGENTS if name != "sac"]
+TOLD = [name for name in OFF_POLICY if name != "sac"]
 EVERY = [pytest.param(name, marks=[] if name in USUAL else pytest.mark.nightly) for name in TOLD]
 
 
