@@ -271,3 +271,21 @@ def test_what_differs_is_made_the_first_devices():
     floats, counts = shared(drift, 2, SEEDS, SEEDS)(np.float32([1, 2]))
     np.testing.assert_array_equal(floats, [1, 1, 2, 2])
     np.testing.assert_array_equal(counts, [1, 2, 2, 3])
+
+
+@pytest.mark.parametrize("rule", ["pcgrad", "famo"])
+def test_rollouts_on_two_devices_are_learned_from_as_on_one(crowd, use, rule):
+    """Gradients are averaged before they are compared, and so are moments, units and advantages.
+
+    With one minibatch, as each device deals out its own steps, and without entropy's noise.
+    """
+    settings = {"minibatches": 1, "epochs": 2, "entropy_cost": 0.0, "unroll": 4, "value_normalization": "popart"}
+    agent, given = tiny("ppo", hidden=(8,), gradients=rule, **settings), {"num_envs": 4, "chunk_steps": 8}
+    states = []
+    for count in (2, 1):
+        use(count)
+        result = run.train(Walk(), agent, steps=2 * 4 * 16, seeds=1, eval_episodes=1, **given)
+        assert devices_of(result) == count
+        states.append(jax.tree.leaves(plain(result.state.agent)))
+    for x, y in zip(*states, strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-5)
