@@ -475,8 +475,8 @@ def test_probes_are_learned(kind):
     assert history[0]["bad_step"].max() == -1 and history[0]["return"].shape == (1, 2)
 
 
-def test_a_hidden_task_is_inferred():
-    """From the rewards of the steps before: the best action is the scale, which nothing else tells."""
+def test_a_run_that_infers_its_task_stays_finite():
+    """Through the whole loop, where what is remembered of an episode is stored with its steps."""
     agent = tiny("ppo", conditioning="inferred", inferred_from=4)
     state, history = train(Walk(), agent, {**LEARN, "chunk_steps": 80})
     assert history[0]["bad_step"].max() == -1
