@@ -274,7 +274,7 @@ def test_units_have_a_least_size():
 
 def test_moments_are_those_of_all_observations():
     """Of rollouts one after the other, as if they had come at once; in a mixture each task has its own."""
-    agent, obs = small(), np.float32(np.random.default_rng(0).normal(size=(2, 3, 8, 3)) * 3 + 1)
+    agent, obs = small(), (np.random.default_rng(0).normal(size=(2, 3, 8, 3)) * 3 + 1).astype(np.float32)
     for mixed in (False, True):
         moments = agent.init_moments(SPEC._replace(mixed=mixed), 3)
         for batch in obs:
