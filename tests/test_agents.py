@@ -6,12 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from mtjax.agents.hyperparameters import CONDITIONINGS
 from probes import OFF_POLICY, learner, pick, quick, random_batch, tasks_of, tiny
 from probes import act as act_once
 
 from mtjax import normalize
 from mtjax.agents import AGENTS, agent
+from mtjax.agents.base import CONDITIONINGS
 from mtjax.agents.parts.conditioning import load_vectors
 from mtjax.agents.parts.encoders import ENCODERS
 from mtjax.agents.parts.gradients.surgery import RULES
