@@ -144,8 +144,8 @@ def test_presets_name_only_what_there_is(file):
     preset = tomllib.loads(file.read_text())
     assert set(preset) == {"cpu", "gpu"}
     fields = lambda cls: {field.name for field in dataclasses.fields(cls)}
-    known = {"plan": fields(Plan), "training": fields(Settings)}
-    known["agent"] = set(settings_of(mtjax.agent("sac")))
+    known = {"plan": fields(Plan), "agent": set(settings_of(mtjax.agent("sac")))}
+    known["training"] = known["agent"] | fields(Settings)
     known |= {name: set(settings_of(mtjax.agent(name))) | fields(Settings) for name in AGENTS}
     for tables in preset.values():
         for table, settings in tables.items():
