@@ -276,21 +276,28 @@ def test_episodes_draw_tasks_of_their_own_family():
     drawn = Aim(vary={"goal": "-1:1"}, num_draws=50)
     env = mixture([drawn, WIDE])
     tasks, agent = env.tasks("train"), tiny()
-    learners = jax.vmap(lambda key: agent.init(env.spec, tasks, key))(jax.random.split(jax.random.key(0), 1))
-    worlds = rollout.reset_envs(env, agent, learners, tasks, keys_of(tasks, 20))
-    context = np.asarray(worlds.task.context)[0]
+
+    def play(keys):
+        learners = jax.vmap(lambda key: agent.init(env.spec, tasks, key))(keys[:, 0, 0])
+        worlds = rollout.reset_envs(env, agent, learners, tasks, keys)
+        return worlds.task.context[0], rollout.step_envs(env, agent, learners, tasks, worlds, None)[1].transition
+
+    context, step = quick(play, keys_of(tasks, 20))
+    context = np.asarray(context)
     assert len(np.unique(context[0, :, 2])) > 10 and (context[0, :, :2] == [1, 0]).all()
     assert (context[1] == [0, 1, 0]).all()
-    worlds, moment = rollout.step_envs(env, agent, learners, tasks, worlds, None)
-    action = np.asarray(moment.transition.action)[0, 0, :, 0]
-    np.testing.assert_allclose(moment.transition.reward[0, 0], -np.square(action - context[0, :, 2]), rtol=1e-4)
-    assert not np.any(moment.transition.action[0, 0, :, 1])  # which that family has not
+    action = np.asarray(step.action)[0, 0, :, 0]
+    np.testing.assert_allclose(step.reward[0, 0], -np.square(action - context[0, :, 2]), rtol=1e-4)
+    assert not np.any(step.action[0, 0, :, 1])  # which that family has not
 
 
 def test_episodes_end_at_their_own_horizons():
     tasks, agent = BOTH.tasks("all"), tiny()
-    state = agent.init(BOTH.spec, BOTH.tasks("train"), jax.random.key(0))
-    played = record(BOTH, agent, state, tasks, jnp.int32(0))
+
+    def play(key):
+        return record(BOTH, agent, agent.init(BOTH.spec, BOTH.tasks("train"), key), tasks, jnp.int32(0))
+
+    played = quick(play, jax.random.key(0))
     assert played.lengths.tolist() == [4, 4, 4, 7] + [4] * 6
     aim, wide = BOTH.apart(played.states)
     assert aim.obs.shape == (9, 7, 2) and wide.obs.shape == (1, 7, 3)
@@ -329,7 +336,7 @@ def test_every_task_has_its_own_normaliser_and_padding_stays_zero():
     obs = jnp.float32(random.normal(size=(4, 50, 3)) * [[[1]], [[2]], [[5]], [[9]]])
     obs = obs.at[:3, :, 2].set(0.0)  # of the three tasks that see two numbers
     moments = agent.fit_moments(agent.init_moments(BOTH.spec, 4), obs)
-    seen = jax.vmap(agent.see)(moments, obs)
+    seen = quick(jax.vmap(agent.see), moments, obs)
     assert not np.any(seen[:3, :, 2])
     for i, width in enumerate((2, 2, 2, 3)):
         alone = normalize.update(normalize.init(width), obs[i, :, :width])
@@ -366,19 +373,22 @@ def test_losses_of_a_padded_task_are_those_of_the_task_alone(monkeypatch):
     small = Batch(obs, action, next_obs=next_obs, mask=None, **common)
     wide = Batch(pad(obs, 4), pad(action, 3), next_obs=pad(next_obs, 4), mask=jnp.array([1.0, 0, 0]), **common)
     monkeypatch.undo()
-    init = lambda o, a: agent.init(Spec.vector(o, a, 1), task, jax.random.key(0))
+    init = lambda o, a: quick(lambda key: agent.init(Spec.vector(o, a, 1), task, key), jax.random.key(0))
     states = init(2, 1), init(4, 3)
     actors = [pick(s.actor, ...) for s in states]
     critics = [s.critic for s in states]
     actors[1] = widened(actors[0], actors[1], np.arange(2), np.array([0, 3]))
     critics[1] = widened(critics[0], critics[1], np.array([0, 1, 4]), None)
     monkeypatch.setattr(networks.jax.random, "normal", lambda key, shape: jnp.asarray(noise[: shape[0], : shape[1]]))
-    key, found = jax.random.key(0), []
-    for actor, critic, batch in zip(actors, critics, (small, wide), strict=True):
+    key = jax.random.key(0)
+
+    def losses(actor, critic, batch):
         target = agent.target(actor, critic, critic, batch, key)
         (critic_loss, _), critic_slope = jax.value_and_grad(agent.critic_loss, has_aux=True)(critic, (batch, target))
         (actor_loss, seen), slope = jax.value_and_grad(agent.actor_loss, has_aux=True)(actor, (batch, critic, key))
-        found.append((critic_loss, actor_loss, seen["entropy"], slope, critic_slope))
+        return critic_loss, actor_loss, seen["entropy"], slope, critic_slope
+
+    found = [quick(losses, *of_one) for of_one in zip(actors, critics, (small, wide), strict=True)]
     np.testing.assert_allclose(found[1][:3], found[0][:3], rtol=1e-5)
     slopes = widened(found[0][3], found[1][3], np.arange(2), np.array([0, 3]))
     for ours, theirs in zip(jax.tree.leaves(found[1][3]), jax.tree.leaves(slopes), strict=True):
@@ -390,7 +400,7 @@ def test_losses_of_a_padded_task_are_those_of_the_task_alone(monkeypatch):
 
 def test_input_maps_begin_as_the_identity_and_are_every_tasks_own():
     agent = tiny("sac", encoder="input-map")
-    state = agent.init(BOTH.spec, BOTH.tasks(), jax.random.key(0))
+    state = quick(lambda key: agent.init(BOTH.spec, BOTH.tasks(), key), jax.random.key(0))
     front = state.actor.own["front"]["params"]["map"]
     np.testing.assert_array_equal(front["kernel"], np.broadcast_to(np.eye(3), (4, 3, 3)))
     plain = tiny("sac")
@@ -448,7 +458,7 @@ PLAN = {"num_envs": 2, "batch_size": 4, "replay_size": 40, "warmup_steps": 2, "c
 
 
 def test_a_mixture_of_one_learns_bit_for_bit_as_the_family():
-    family, agent = make("control-acrobot", num_tasks=2), tiny("multi-head", normalize_observations=True)
+    family, agent = AIM, tiny("multi-head", normalize_observations=True)
     plan = {**PLAN, "steps": 80, "eval_every": 40}
     alone, mixed = (mtjax.train(env, agent, **plan) for env in (family, mixture([family])))
     for ours, theirs in zip(jax.tree.leaves(mixed.state.agent), jax.tree.leaves(alone.state.agent), strict=True):

@@ -186,12 +186,11 @@ def mixture(families: "Sequence[str | Family | Mixture]") -> "Mixture":
     Raises:
         InputError: no family has a name, or one is in the mixture twice.
     """
-    from mtjax.envs.mixtures import Mixture
-
+    cls = load("mtjax.envs.mixtures:Mixture")
     named: list[tuple[str, Any]] = []
     for given in families:
         found = make(given) if isinstance(given, str) else given
-        if isinstance(found, Mixture):
+        if isinstance(found, cls):
             named += zip(found.names, found.families, strict=True)
         else:
             named.append((given if isinstance(given, str) else _name_of(found), found))
@@ -199,7 +198,7 @@ def mixture(families: "Sequence[str | Family | Mixture]") -> "Mixture":
     for name, _ in named:
         again = sum(other == name or other.startswith(f"{name}#") for other in names)
         names.append(f"{name}#{again + 1}" if again else name)
-    return Mixture(tuple(family for _, family in named), tuple(names))
+    return cls(tuple(family for _, family in named), tuple(names))
 
 
 def _name_of(family: Any) -> str:
@@ -215,11 +214,10 @@ def _name_of(family: Any) -> str:
 
 def _make_mixture(names: tuple[str, ...], vary: dict[str, Any], settings: dict[str, Any]) -> "Mixture":
     """Make the families of a mixture by their names, with values of their parameters by "NAME.PARAMETER"."""
-    from mtjax.envs.mixtures import Mixture
-
+    cls = load("mtjax.envs.mixtures:Mixture")
     recorded = settings.pop("families", None)
     if recorded is not None:  # of config.json
-        return Mixture(tuple(make(n, **each) for n, each in zip(names, recorded, strict=True)), names)
+        return cls(tuple(make(n, **each) for n, each in zip(names, recorded, strict=True)), names)
     plain = [make(name) for name in names]
     for given in settings:
         known = dict.fromkeys(field for family in plain for field in family.__dataclass_fields__)
@@ -238,7 +236,7 @@ def _make_mixture(names: tuple[str, ...], vary: dict[str, Any], settings: dict[s
     for name, family in zip(names, plain, strict=True):
         mine = {key: value for key, value in settings.items() if key in family.__dataclass_fields__}
         made.append(make(name, vary=own[name], **mine))
-    return Mixture(tuple(made), names)
+    return cls(tuple(made), names)
 
 
 def register(name: str, family: "type[Family]", **settings: Any) -> None:
