@@ -65,7 +65,7 @@ def check_names(argv: Sequence[str]) -> None:
     other = ", ".join(sorted(given - _MAY_CHANGE))
     if "--resume" in given and "--sweep" not in given and other:
         raise InputError(f"--resume goes on with a run as it was; only --steps may change, not {other}")
-    for flag in ("resume", "from"):
+    for flag in () if {"--resume", "--sweep"} <= given else ("resume", "from"):
         folder = value_of(argv, flag, None)
         if folder is not None and not (flag == "resume" and any(Path(folder).glob("run-*"))):  # the runs of a sweep
             require_run(Path(folder))

@@ -106,9 +106,9 @@ def test_one_device_needs_no_mesh(hosts, counts, seeds):
     """Then the programs are the loop's own, and arrays stay where they are."""
     hosts(*counts)
     assert meshes.mesh_for(seeds, 10, 16) is None
-    assert jitted(None) == (mtjax.loop.init, mtjax.loop.run_chunk, mtjax.evaluation.evaluate)
+    assert jitted(None, mtjax.agent("sac")) == (mtjax.loop.init, mtjax.loop.run_chunk, mtjax.evaluation.evaluate)
     state = object()
-    assert meshes.everywhere(None, state) is meshes.by_seed(None, state) is sharded(None, state) is state
+    assert meshes.everywhere(None, state) is meshes.by_seed(None, state) is sharded(None, None, state) is state
     assert bool(meshes.describe(None, seeds, 16)) == (sum(counts) > 1)
 
 

@@ -13,6 +13,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 from conftest import SHORT_RUN
+from probes import act as act_once
 
 import mtjax
 import mtjax.evaluate
@@ -54,7 +55,8 @@ def rows_of(path):
 def score(policy, number, seeds=None):
     tasks = policy.env.tasks("all")
     seeds = policy.seeds if seeds is None else seeds
-    return np.asarray(evaluate(policy.env, policy.agent, 1, policy.states, tasks, seeds, jnp.int32(number)))
+    scores = evaluate(policy.env, policy.agent, 1, policy.states, tasks, seeds, jnp.int32(number))
+    return np.asarray(scores.returns)
 
 
 # The policy.
@@ -72,7 +74,7 @@ def test_policy_acts_as_the_checkpoint_does(finished_run):
     for seed, chosen in ((0, policy), (1, mtjax.load(finished_run, seed=1))):
         learned = jax.tree.map(lambda x, seed=seed: x[seed], state.agent)
         for key in (None, jax.random.key(3)):
-            expected = program.learner.act(learned, obs, task, key)
+            expected = act_once(program.learner, learned, obs, task, key)
             np.testing.assert_array_equal(chosen(obs, task, key), expected)
     assert action.shape == (2,) and np.all(np.abs(action) < 1)
     assert not np.array_equal(action, mtjax.load(finished_run, seed=1)(obs, task))

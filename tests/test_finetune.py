@@ -172,8 +172,8 @@ def test_a_fine_tuned_run_goes_on(learned, tuned, capsys):
 def test_training_takes_a_policy(learned):
     """In Python; without updates, what was learned is all there is."""
     env = mtjax.make("aim", {"goal": "0.9,-0.8"}).scaled_as(learned.env)
-    settings = mtjax.Settings(num_envs=1, updates_per_step=0, chunk_steps=5, replay_size=10)
-    result = run.train(env, learned.agent, start=learned, steps=10, eval_episodes=1, settings=settings)
+    settings = {"num_envs": 1, "updates_per_step": 0, "chunk_steps": 5, "replay_size": 10}
+    result = run.train(env, learned.agent, start=learned, steps=10, eval_episodes=1, **settings)
     found = {**named({"actor": result.state.agent.actor}), **named({"critic": result.state.agent.critic})}
     for path, leaf in inherited(learned.states, [0]).items():
         np.testing.assert_array_equal(found[path], leaf)

@@ -36,7 +36,7 @@ def returns_of(name, **settings):
     """The last evaluation (T,), of at most 100 an episode, after 1500 steps or more of 16 environments a goal."""
     agent = mtjax.agent(name, **{**QUICK, **settings})
     steps = LONGER.get(name, 1500) * 16 * 3
-    result = mtjax.train(env(), agent, steps=steps, eval_every=steps, eval_episodes=1, settings=SETTINGS)
+    result = mtjax.train(env(), agent, steps=steps, eval_every=steps, eval_episodes=1, **SETTINGS)
     return result.evaluations.returns["train"][0, -1].mean(axis=-1)
 
 

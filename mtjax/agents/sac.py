@@ -108,9 +108,10 @@ class SAC(BaseAgent):
     experience: Annotated[Replay, FLAT] = dataclasses.field(default_factory=Replay)
 
     def _check_numbers(self) -> None:
+        if not 0 <= self.gamma <= 1 or not 0 < self.tau <= 1:
+            raise InputError(f"gamma must be in [0, 1] and tau in (0, 1], not {self.gamma} and {self.tau}")
         super()._check_numbers()
         parts.require_positive(self, "temperature_lr", "num_critics", "initial_temperature")
-        parts.require_rates(self, "tau")
 
     def _check_combination(self) -> None:
         super()._check_combination()

@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 
+from mtjax.experience.ring import Ring
 from mtjax.loop import TrainState
 from mtjax.types import InputError
 
@@ -47,9 +48,9 @@ def load_agent(directory: Path, like: TrainState) -> Any:
     return _load(directory, {"agent": like.agent})["agent"]
 
 
-def load_data(directory: Path, like: TrainState) -> Any:
-    """Read only what the learner learns from, without the worlds and the agent."""
-    return _load(directory, {"loop": {"data": like.data}}, partial=True)["loop"]["data"]
+def load_ring(directory: Path, like: TrainState) -> Ring:
+    """Read only the ring of a replay, without the worlds and the agent."""
+    return _load(directory, {"loop": {"data": {"ring": like.data.ring}}}, partial=True)["loop"]["data"]["ring"]
 
 
 def _sizes(folder: Path) -> dict[str, int]:

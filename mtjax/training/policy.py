@@ -91,7 +91,7 @@ def load_experience(directory: str | Path, seed: int = 0) -> tuple[Ring, int]:
     config = from_json(Path(directory) / "config.json")
     if not isinstance(config.learner.experience, Replay):
         raise InputError(f"{config.agent} keeps no replay, so that there is nothing to look at")
-    ring = checkpoint.load_data(Path(directory) / "checkpoints", shapes(config)).ring
+    ring = checkpoint.load_ring(Path(directory) / "checkpoints", shapes(config))
     rows = _of_point(config, seed)
     return ring._replace(rows=jax.tree.map(lambda x: x[rows], ring.rows)), config.learner.experience.batch_size
 
