@@ -325,7 +325,7 @@ def run_of(copied_run):
 
     def remake(name):
         program = from_json(copied_run / "config.json")
-        learner = mtjax.agent(name, hidden=program.learner.hidden)
+        learner = mtjax.agent(name, hidden=program.learner.hidden, experience=program.learner.experience)
         tasks, seeds, checkpoints = program.family.tasks("train"), jnp.arange(2), copied_run / "checkpoints"
         shapes = jax.eval_shape(lambda: loop.init(program.family, program.learner, program.training, tasks, seeds))
         state = checkpoint.load(checkpoints, shapes)
