@@ -119,8 +119,15 @@ SETTINGS = [
 ]
 
 
-@pytest.mark.parametrize("settings", SETTINGS)
-@pytest.mark.parametrize("agent", AGENTS)
+# Reading a command line takes half a second: one pair in three by default, in which every agent and line has its turn.
+REPEATED = [
+    pytest.param(agent, settings, marks=[pytest.mark.slow] if (i + j) % 3 else [])
+    for i, agent in enumerate(AGENTS)
+    for j, settings in enumerate(SETTINGS)
+]
+
+
+@pytest.mark.parametrize(("agent", "settings"), REPEATED)
 def test_repeating_flags_give_the_same_program(agent, settings):
     """The command in config.json, word for word, and whatever the presets are by then."""
     program = cli.parse([f"--agent={agent}", *settings.split()])
