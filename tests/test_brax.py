@@ -236,7 +236,10 @@ def test_tasks_and_worlds_step_in_one_scan():
     assert np.all(np.diff(np.sum(falls, axis=1)) > 0)
 
 
-@pytest.mark.parametrize("name", NAMES)
+SMALL = ("ant", "fast", "inverted_pendulum")
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[] if name in SMALL else slow) for name in NAMES])
 def test_every_environment_traces(name):
     """Reset and step trace on this JAX, and a state keeps its shapes and dtypes."""
     env = Brax(environment=name)
