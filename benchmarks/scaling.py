@@ -24,6 +24,7 @@ from training import Training
 
 import mtjax
 from mtjax.config import RunConfig, configure
+from mtjax.envs import Family
 from mtjax.types import InputError
 
 _ON_CPU = jax.default_backend() == "cpu"
@@ -93,6 +94,7 @@ def contestant(axis: str, value: int, arguments: argparse.Namespace) -> Training
         "chunk_steps": arguments.steps,
     }
     agent, settings = configure(program.learner, program.training, given)
+    assert isinstance(program.family, Family)
     return Training(program.family, agent, settings, seeds, value if axis == "devices" else 1)
 
 

@@ -42,6 +42,7 @@ def pytest_configure(config):
             jax.config.update(name, value)
 
 
+@pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers(config):
     """Use every core that this process may, but no more than four: each worker takes some two gigabytes."""
     return min(4, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)

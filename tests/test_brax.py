@@ -2,7 +2,7 @@
 
 import subprocess
 import sys
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import NamedTuple
@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from probes import QUICK
 
 import mtjax.envs.brax as adapter
 from mtjax.envs.brax import BACKENDS, NAMES, Brax, BraxAntDirection, BraxHalfcheetahSpeed
@@ -22,11 +21,10 @@ from mtjax.types import InputError
 pytest.importorskip("brax")
 
 STEPS = 20
+slow = pytest.mark.slow  # an ant or a half-cheetah takes a minute to compile; pendulums stand for them by default
 # Four tasks: Brax's own numbers, then a heavier, a lighter-falling and a more slippery world.
 FOUR = {"mass": "1,3,1,1", "gravity": "9.81,9.81,3,9.81", "friction": "1,1,1,0.1"}
 CONTROL_STEP = 0.05  # [s] of ant and half-cheetah
-
-quick = partial(jax.jit, compiler_options=QUICK)
 
 
 @lru_cache
@@ -34,7 +32,7 @@ def programs(env):
     """Reset, placement and step of an environment, mapped over a flat batch."""
     place = lambda task, qpos, qvel: env.set_physics(task, None, qpos, qvel)
     functions = {"reset": env.reset, "place": place, "step": env.step}
-    return SimpleNamespace(**{name: quick(jax.vmap(function)) for name, function in functions.items()})
+    return SimpleNamespace(**{name: jax.jit(jax.vmap(function)) for name, function in functions.items()})
 
 
 def actions(size):
@@ -75,8 +73,8 @@ def brax_rollout(name, backend, count):
     """The same by Brax alone, in a batch as large: rounding depends on its size, and contacts amplify it."""
     with adapter._without_remarks():
         theirs = adapter.brax_module().envs.get_environment(name, backend=backend)
-    step = quick(jax.vmap(theirs.step))
-    states = [quick(jax.vmap(theirs.reset))(repeat(jax.random.key(7), count))]
+    step = jax.jit(jax.vmap(theirs.step))
+    states = [jax.jit(jax.vmap(theirs.reset))(repeat(jax.random.key(7), count))]
     for action in actions(theirs.action_size):
         states.append(step(states[-1], repeat(action, count)))
     kept = [first((s.obs, s.reward, s.done, s.metrics, s.pipeline_state.x.pos)) for s in states]
@@ -92,8 +90,8 @@ PENDULUM_MJX = Brax(environment="inverted_pendulum", backend="mjx")
 @pytest.mark.parametrize(
     "env",
     [
-        pytest.param(ANT, id="ant"),
-        pytest.param(CHEETAH, id="halfcheetah", marks=pytest.mark.slow),
+        pytest.param(ANT, id="ant", marks=slow),
+        pytest.param(CHEETAH, id="halfcheetah", marks=slow),
         pytest.param(PENDULUM_MJX, id="inverted_pendulum-mjx"),
     ],
 )
@@ -115,6 +113,7 @@ def test_a_fall_terminates():
     assert terminated[-1] and not terminated[1]
 
 
+@slow
 def test_every_parameter_acts():
     """Mass, gravity and friction each change the ant's motion from the same start; mass and friction not its start."""
     obs = rollout(ANT).obs
@@ -124,6 +123,7 @@ def test_every_parameter_acts():
     assert np.all(np.isfinite(obs))
 
 
+@slow
 def test_a_falling_ant_obeys_its_gravity():
     """High above the floor, at rest: velocity -g t whatever the mass, and Euler's height of semi-implicit steps."""
     tasks, count, steps, substep = ANT.tasks(), 4, 4, 0.01
@@ -162,6 +162,7 @@ def test_an_edited_system_is_what_brax_loads_from_an_edited_model():
     assert not np.allclose(env.original.sys.dof.invweight, expected.dof.invweight, rtol=0.1)
 
 
+@slow
 @pytest.mark.parametrize("direction", [0.0, np.pi / 2, -2.0])
 def test_reward_of_a_direction(direction):
     """By hand, from how far the torso came: velocity along the direction, 1 for survival, half the motors' squares."""
@@ -188,7 +189,7 @@ def test_reward_of_a_speed(speed, velocity):
     assert float(reward) == pytest.approx(-abs(velocity - speed) - 0.05 * 2.3125, abs=1e-6)
 
 
-@pytest.mark.slow
+@slow
 def test_velocity_of_the_half_cheetah_is_that_of_its_torso():
     """Which the reward of a speed is made of, in metres a second."""
     theirs = brax_rollout("halfcheetah", "generalized", 1)
@@ -235,7 +236,10 @@ def test_tasks_and_worlds_step_in_one_scan():
     assert np.all(np.diff(np.sum(falls, axis=1)) > 0)
 
 
-@pytest.mark.parametrize("name", NAMES)
+SMALL = ("ant", "fast", "inverted_pendulum")
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[] if name in SMALL else slow) for name in NAMES])
 def test_every_environment_traces(name):
     """Reset and step trace on this JAX, and a state keeps its shapes and dtypes."""
     env = Brax(environment=name)

@@ -23,7 +23,6 @@ from mtjax.training.programs import jitted, sharded
 from mtjax.types import InputError
 
 HERE = Path(__file__).parent
-QUICK_FLAG = "--xla_backend_optimization_level=0"
 TINY_RUN = (
     "--env=pendulum-swingup --env.vary.mass=1,1.5 --split=none --engine=mjx --agent=sac-conditioned --seeds=2 "
     "--eval-every=80 --eval-episodes=1 --num-envs=2 --batch-size=4 --replay-size=40 --warmup-steps=4 "
@@ -145,7 +144,7 @@ def test_variables_that_mean_nothing_are_refused(monkeypatch, count, index):
 def python(*words, **variables):
     """Start a Python process of its own, on CPUs."""
     root, path = str(HERE.parent), os.environ.get("PYTHONPATH", "")
-    common = {"JAX_PLATFORMS": "cpu", "MTJAX_CACHE": "0", "XLA_FLAGS": QUICK_FLAG, "PYTHONPATH": f"{root}:{path}"}
+    common = {"JAX_PLATFORMS": "cpu", "MTJAX_CACHE": "0", "PYTHONPATH": f"{root}:{path}"}
     environment = {**os.environ, **common, **variables}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
     return subprocess.Popen([sys.executable, *words], env=environment, cwd=HERE, **pipes)
@@ -155,8 +154,8 @@ def python(*words, **variables):
 @pytest.mark.parametrize("which", ["not nightly", pytest.param("nightly", marks=pytest.mark.nightly)])
 def test_four_devices(which):
     """The tests of ``four_devices.py``, where JAX shows four devices of this CPU."""
-    words = ("-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", which, "four_devices.py")
-    flags = f"{QUICK_FLAG} --xla_force_host_platform_device_count=4"
+    words = ("-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", "-m", which, "four_devices.py")
+    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=4"
     assert "skipped" not in finish(*words, XLA_FLAGS=flags)
 
 
