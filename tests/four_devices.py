@@ -10,22 +10,23 @@ from jax.sharding import PartitionSpec
 from probes import Goals, Walk, tiny
 
 from mtjax import envs
+from mtjax.config import configure
 from mtjax.loop import Settings
 from mtjax.parallel import collectives as shares
 from mtjax.parallel import mesh as meshes
 from mtjax.training import run
 from mtjax.training.programs import jitted
 
-SETTINGS = Settings(num_envs=2, batch_size=4, replay_size=40, warmup_steps=4, chunk_steps=10)
-WIDE = Settings(num_envs=4, batch_size=4, replay_size=100, warmup_steps=4, chunk_steps=10)  # half full in two chunks
+SETTINGS = {"num_envs": 2, "batch_size": 4, "replay_size": 40, "warmup_steps": 4, "chunk_steps": 10, "stagger": False}
+WIDE = SETTINGS | {"num_envs": 4, "replay_size": 100}  # half full in two chunks
 AGENT = tiny("sac-conditioned", hidden=(8,))
 
 
 def play(directory, env, chunks, agent=AGENT, settings=SETTINGS, **changes):
     directory.mkdir(exist_ok=True)
-    chunk = len(env.tasks().id) * settings.num_envs * settings.chunk_steps  # environment steps of a seed
+    chunk = len(env.tasks().id) * settings["num_envs"] * settings["chunk_steps"]  # environment steps of a seed
     steps = {"steps": chunks * chunk, "eval_every": 2 * chunk, "eval_episodes": 2}
-    return run.train(env, agent, settings=settings, directory=directory, **{"seeds": 4, **steps, **changes})
+    return run.train(env, agent, directory=directory, **settings, **{"seeds": 4, **steps, **changes})
 
 
 @pytest.fixture
@@ -90,10 +91,11 @@ def test_four_devices_change_no_seed(alone, tmp_path, capfd):
 def test_donated_state_is_gone(tmp_path):
     """A chunk's replay takes the place of the one before it, on every device."""
     mesh = meshes.mesh_for(4, 2, 2)
-    programs, env = jitted(mesh), Walk()
+    agent, settings = configure(AGENT, Settings(), SETTINGS)
+    programs, env = jitted(mesh, agent), Walk()
     tasks, seeds = meshes.everywhere(mesh, env.tasks()), meshes.by_seed(mesh, jnp.arange(4))
-    state = programs.init(env, AGENT, SETTINGS, tasks, seeds, None)
-    after, metrics = programs.chunk(env, AGENT, SETTINGS, tasks, state)
+    state = programs.init(env, agent, settings, tasks, seeds, None)
+    after, metrics = programs.chunk(env, agent, settings, tasks, state)
     assert state.data.ring.rows.obs.is_deleted() and int(after.iteration) == 10
     assert metrics["return"].shape == (4, 2) and len(metrics["return"].sharding.device_set) == 4
 
@@ -170,7 +172,7 @@ def test_devices_that_share_a_seed_learn_what_one_does(wide_alone, tmp_path, cro
 def test_two_seeds_on_two_devices_each(tmp_path, use, crowd):
     """With parts that watch all outcomes, hindsight, and episodes that draw their tasks."""
     agent = tiny("sac-conditioned", hidden=(8,), scaling="reward", sampler="progress", actor_lr=1e-5)
-    settings = Settings(**{**vars(WIDE), "hindsight": 0.5})
+    settings = WIDE | {"hindsight": 0.5}
     share = lambda name: play(tmp_path / name, Goals(drawn=True), 2, agent, settings, seeds=2)
     result = share("four")
     assert parts_of(result.state.worlds.obs) == ({(1, 4, 2, 1)}, 4)
@@ -193,14 +195,15 @@ def test_checkpoint_goes_on_with_other_shares(wide_alone, tmp_path, use, crowd, 
 def test_devices_of_a_seed_agree_by_themselves(crowd, monkeypatch):
     """They make the same updates to the bit, where sums are made in the same order."""
     monkeypatch.setattr(shares, "agreed", lambda tree: tree)
-    programs, env = jitted(mesh := meshes.mesh_for(1, 2, 4)), Walk()
+    given = WIDE | {"chunk_steps": 12}  # so that no program of before is taken
+    agent, settings = configure(AGENT, Settings(), given)
+    programs, env = jitted(mesh := meshes.mesh_for(1, 2, 4), agent), Walk()
     tasks, seeds = meshes.everywhere(mesh, env.tasks()), meshes.by_seed(mesh, jnp.arange(1))
-    settings = Settings(**{**vars(WIDE), "chunk_steps": 12})  # so that no program of before is taken
-    start = programs.init(env, AGENT, settings, tasks, seeds, None)
+    start = programs.init(env, agent, settings, tasks, seeds, None)
     first = jax.tree.map(np.asarray, start.agent.critic)
-    after, _ = programs.chunk(env, AGENT, settings, tasks, start)
+    after, _ = programs.chunk(env, agent, settings, tasks, start)
     assert not jax.tree.all(jax.tree.map(np.array_equal, first, after.agent.critic))
-    for x in jax.tree.leaves((after.agent, after.replay.size, after.iteration)):
+    for x in jax.tree.leaves((after.agent, after.data.ring.size, after.iteration)):
         assert len({np.asarray(part.data).tobytes() for part in x.addressable_shards}) == 1
 
 
@@ -208,7 +211,7 @@ def test_host_engine_serves_shares_of_a_seed(short_family, tmp_path, use, crowd)
     """Each device calls back with its own worlds."""
     env = envs.make("finger-short")
     result = play(tmp_path / "four", env, 1, settings=WIDE, seeds=1, eval_episodes=1)
-    assert parts_of(result.state.env.qpos) == ({(1, 2, 1, 3)}, 4)
+    assert parts_of(result.state.worlds.state.qpos) == ({(1, 2, 1, 3)}, 4)
     use(1)
     alone = play(tmp_path / "one", env, 1, settings=WIDE, seeds=1, eval_episodes=1)
     assert_same(result, alone, chunks=1, rtol=1e-2)
