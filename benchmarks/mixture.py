@@ -2,11 +2,11 @@
 
     python benchmarks/mixture.py [--agents NAME ...] [--alone NAME ...] [--steps N] [--minutes 8] [--out DIR]
 
-Parts are the agents on the mixture, each task alone (by sac-conditioned, which is then plain SAC, with the same steps,
-environments and updates per task) and the cost of a step. Each leaves a file in DIR, and parts that are there already
-are not run again: after ``--minutes`` no further part begins, and the same command goes on with the rest. Processes
-with the same DIR and other parts may run beside each other, if no time is to be told. From all that is in DIR come
-``returns.csv``, ``table.md`` and ``mixture.json``.
+Parts are the agents on the mixture, each task alone (by sac-conditioned, which is then plain SAC, with the same
+preset, steps, environments and updates per task) and the cost of a step. Each leaves a file in DIR, and parts that are
+there already are not run again: after ``--minutes`` no further part begins, and the same command goes on with the rest.
+Processes with the same DIR and other parts may run beside each other, if no time is to be told. From all that is in DIR
+come ``returns.csv``, ``table.md`` and ``mixture.json``.
 
 A return is the mean of the last evaluation under the mean action, over episodes and seeds. ``disjoint`` is one SAC for
 every task inside the mixture: beside "alone" it shows that padding and masks lose nothing. The cost is the median time
@@ -100,12 +100,13 @@ def parts(arguments: argparse.Namespace) -> Iterator[tuple[str, Any]]:
 
 
 def learn(arguments: argparse.Namespace, env_name: str, agent: str) -> dict[str, Any]:
-    """Train one agent with its preset."""
-    config = mtjax.preset(env_name, agent, arguments.preset, **engine(arguments, env_name))
+    """Train one agent; a task alone with the mixture's preset, and not with one that was tuned for it."""
+    config = mtjax.preset("+".join(arguments.tasks), agent, arguments.preset)
+    family = mtjax.make(env_name, **engine(arguments, env_name))
     given = {name: int(value) for name, value in (pair.split("=", 1) for pair in arguments.training)}
-    steps = arguments.steps * config.family.train_count
+    steps = arguments.steps * family.train_count
     result = mtjax.train(
-        config.family,
+        family,
         config.learner,
         steps=steps,
         seeds=arguments.seeds,
@@ -118,7 +119,7 @@ def learn(arguments: argparse.Namespace, env_name: str, agent: str) -> dict[str,
         **given,
     )
     returns = result.evaluations.returns["train"].mean(axis=-1)  # (S, V, T)
-    names = config.family.labels("train") if "+" in env_name else [env_name]
+    names = family.labels("train") if "+" in env_name else [env_name]
     return {
         "tasks": names,
         "steps": result.evaluations.steps.tolist(),
