@@ -1,8 +1,11 @@
-"""MJX-Warp: MuJoCo on NVIDIA GPUs, with kernels of its own that XLA calls; on a CPU it runs, slowly."""
+"""MuJoCo Warp: MuJoCo on NVIDIA GPUs, with kernels of its own that XLA calls; on a CPU it runs, slowly."""
 
 import dataclasses
 import importlib
-from functools import cached_property, lru_cache, partial
+import inspect
+import weakref
+from collections.abc import Callable
+from functools import cached_property, partial
 from operator import attrgetter
 from typing import Any, NamedTuple
 
@@ -17,6 +20,7 @@ from mtjax.types import Array, InputError, Task
 # Fields that no stage of a step reads, so that tasks may differ in them though Warp has room for one value only.
 _UNREAD = ("dof_M0",)
 _DOUBLED = 8  # pairs that may touch in two points where MJX-JAX finds one, at the same time in one world
+_STATE = ("qpos", "qvel", "qacc_warmstart")  # what a step begins with, beside controls, and what it ends with
 
 
 class _Flat(NamedTuple):
@@ -29,14 +33,38 @@ class _Flat(NamedTuple):
     ctrl: Array
 
 
-def _own_device() -> Any:
-    """A device of this process; MJX would take the first of all, which may be another's."""
-    return jax.local_devices()[0]
+class _Place(NamedTuple):
+    """Warp's memory on one device for a number of worlds."""
+
+    model: Any
+    data: Any
+
+
+def _keep_streams(warp: Any) -> None:
+    """Keep every CUDA stream of XLA's known to Warp for as long as the process lives.
+
+    Warp makes a ``Stream`` of the same CUDA stream for each graph that it captures, and forgets the CUDA stream when
+    any of them is collected. Where Python collects an older one while a younger one captures, Warp 1.18 fails with
+    "unknown stream".
+    """
+    release = warp.Stream.__del__
+    if not hasattr(release, "keeps_streams"):
+
+        def keep(stream: Any) -> None:
+            if stream.owner:
+                release(stream)
+
+        keep.keeps_streams = True
+        warp.Stream.__del__ = keep
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Warp:
-    """Steps by MJX-Warp; start states, contacts and the sensors of positions and velocities by MJX-JAX.
+    """Steps by MuJoCo Warp; start states, contacts and the sensors of positions and velocities by MJX-JAX.
+
+    XLA hands positions, velocities, warm starts, controls and what differs between tasks to one call, which takes all
+    substeps in Warp's own memory. MJX would pass everything Warp works with through XLA, at every substep: slower, and
+    wrong on GPUs where several such arrays are alike at the start, as XLA 0.11 gives these one piece of memory.
 
     Warp picks a world's model by the world's number along one axis, so that maps, however they are nested, are
     flattened into one before it is called.
@@ -51,6 +79,7 @@ class Warp:
     def __post_init__(self):
         warp = importlib.import_module("warp")
         warp.config.log_level = warp.LOG_WARNING  # before it first runs, and says so on standard output
+        _keep_streams(warp)
 
     @cached_property
     def mjx(self) -> Mjx:
@@ -88,52 +117,12 @@ class Warp:
         return True
 
     @cached_property
-    def _model(self) -> Any:
-        from mujoco.mjx.third_party.mujoco_warp import OverflowType
-
-        with jax.ensure_compile_time_eval():
-            model = mjx_module().put_model(self.base, _own_device(), "warp")
-        options = model.opt._impl
-        # To stop after the iterations that are asked for is no fault to print; to run out of room would be.
-        warned = options.warn_overflow & ~(OverflowType.ITERATIONS | OverflowType.LS_ITERATIONS)
-        return model.replace(opt=model.opt.replace(_impl=options.replace(warn_overflow=int(warned))))
-
-    @cached_property
-    def _make_data(self) -> Any:
-        """Data (by ``lru_cache``) for so many worlds, with room for every contact that they can have."""
-        mjx = mjx_module()
-        like = jax.eval_shape(partial(mjx.make_data, self.base, _own_device(), "jax"))._impl
-
-        @lru_cache(maxsize=8)
-        def make(count: int) -> Any:
-            # MJX-JAX's arrays hold all that is possible, but that some pairs of shapes touch in twice as many points
-            # here. Room costs time: it is filled anew at each step.
-            slots = like.contact.dist.shape[0]
-            doubled = min(slots, _DOUBLED)
-            contacts, rows = slots + doubled, like.efc_J.shape[0] + 4 * doubled
-            with jax.ensure_compile_time_eval():
-                return mjx.make_data(
-                    self.base, _own_device(), "warp", naconmax=max(count * contacts, 1), njmax=max(rows, 1)
-                )
-
-        return make
-
-    @cached_property
     def _advance(self) -> Any:
         """Step worlds along one leading axis; a map over it adds to that axis."""
-        step = mjx_module().step
-
-        def one(data: Any, flat: _Flat) -> tuple[Array, ...]:
-            model = self._model
-            leaves = {name: leaf.reshape(attrgetter(name)(model).shape) for name, leaf in flat.leaves.items()}
-            model = model.tree_replace(leaves)
-            data = data.replace(qpos=flat.qpos, qvel=flat.qvel, qacc_warmstart=flat.warmstart, ctrl=flat.ctrl)
-            data = jax.lax.fori_loop(0, self.num_substeps, lambda _, data: step(model, data), data)
-            return data.qpos, data.qvel, data.qacc_warmstart, data.sensordata
 
         @jax.custom_batching.custom_vmap
         def advance(flat: _Flat) -> tuple[Array, ...]:
-            return jax.vmap(partial(one, self._make_data(len(flat.qpos))))(flat)
+            return self._call(flat)
 
         @advance.def_vmap
         def _(count: int, mapped: Any, flat: _Flat) -> tuple[Any, Any]:
@@ -142,3 +131,134 @@ class Warp:
             return jax.tree.map(lambda x: x.reshape(count, len(x) // count, *x.shape[1:]), new), (True,) * 4
 
         return advance
+
+    # What Warp runs.
+
+    @cached_property
+    def _calls(self) -> dict[Any, Callable]:
+        return {}
+
+    @cached_property
+    def _models(self) -> dict[str, Any]:
+        return {}
+
+    @cached_property
+    def _places(self) -> dict[Any, _Place]:
+        return {}
+
+    def _call(self, flat: _Flat) -> tuple[Array, ...]:
+        """Take all substeps of worlds (W, ...): new positions, velocities, warm starts and sensors."""
+        count, names, devices = len(flat.qpos), tuple(flat.leaves), _own_devices()
+        for device in devices:  # not while it runs, when Warp records and cannot make room
+            if (device.alias, count) not in self._places:
+                self._places[device.alias, count] = self._make_place(device, count)
+        model, _ = self._places[devices[0].alias, count]
+        if (count, names) not in self._calls:
+            self._calls[count, names] = self._make_call(model, count, names)
+        leaves = [_as_warp(flat.leaves[name], attrgetter(name)(model)) for name in names]
+        found = self._calls[count, names](flat.qpos, flat.qvel, flat.warmstart, flat.ctrl, *leaves)
+        return tuple(found) if self.base.nsensordata else (*found, jnp.zeros((count, 0)))
+
+    def _make_place(self, device: Any, count: int) -> _Place:
+        """Make room for so many worlds, with every contact that they can have."""
+        import warp
+        from mujoco.mjx.third_party import mujoco_warp
+
+        contacts, rows = self._room
+        with warp.ScopedDevice(device):
+            if device.alias not in self._models:
+                self._models[device.alias] = self._make_model()
+            shared = self._models[device.alias]
+            model = dataclasses.replace(shared, opt=dataclasses.replace(shared.opt))  # its fields will be of its worlds
+            room = {"naconmax": max(count * contacts, 1), "njmax": max(rows, 1)}
+            return _Place(model, mujoco_warp.make_data(self.base, nworld=count, **room))
+
+    def _make_model(self) -> Any:
+        from mujoco.mjx.third_party import mujoco_warp
+
+        model = mujoco_warp.put_model(self.base)
+        # To stop after the iterations that are asked for is no fault to print; to run out of room would be.
+        unwarned = mujoco_warp.OverflowType.ITERATIONS | mujoco_warp.OverflowType.LS_ITERATIONS
+        model.opt.warn_overflow = int(model.opt.warn_overflow & ~unwarned)
+        return model
+
+    @cached_property
+    def _room(self) -> tuple[int, int]:
+        """Contacts and rows of constraints that one world can have.
+
+        MJX-JAX's arrays hold all that is possible, but that some pairs of shapes touch in twice as many points in Warp.
+        """
+        like = jax.eval_shape(partial(mjx_module().make_data, self.base, jax.local_devices()[0], "jax"))._impl
+        slots = like.contact.dist.shape[0]
+        doubled = min(slots, _DOUBLED)
+        return slots + doubled, like.efc_J.shape[0] + 4 * doubled
+
+    def _make_call(self, model: Any, count: int, names: tuple[str, ...]) -> Callable:
+        """Make a function of JAX's from what Warp does with so many worlds."""
+        import warp
+
+        outputs = {**dict.fromkeys(_STATE[:1], self.base.nq), **dict.fromkeys(_STATE[1:], self.base.nv)}
+        if self.base.nsensordata:
+            outputs["sensordata"] = self.base.nsensordata
+        kinds = {name: warp.array(dtype=float, ndim=2) for name in (*_STATE, "ctrl")}
+        kinds |= {_plain(name): warp.array(dtype=(x := attrgetter(name)(model)).dtype, ndim=x.ndim) for name in names}
+        kinds |= {f"new_{name}": warp.array(dtype=float, ndim=2) for name in outputs}
+        on_gpu = jax.default_backend() != "cpu"
+        mode = warp.JaxCallableGraphMode.WARP if on_gpu else warp.JaxCallableGraphMode.NONE
+        return warp.jax_callable(
+            _annotated(_stepper(weakref.ref(self), count, names, tuple(outputs)), kinds),
+            num_outputs=len(outputs),
+            graph_mode=mode,
+            output_dims={f"new_{name}": (count, size) for name, size in outputs.items()},
+        )
+
+
+def _own_devices() -> list[Any]:
+    """Warp's names for the devices of this process."""
+    import warp
+
+    return [warp.device_from_jax(device) for device in jax.local_devices()]
+
+
+def _stepper(engine: Any, count: int, names: tuple[str, ...], outputs: tuple[str, ...]) -> Callable:
+    """What Warp does in a call: take over the state, step, and hand back the new one.
+
+    It holds the engine weakly, as Warp keeps functions that JAX calls for good, and Warp's memory is to go with it.
+    """
+    import warp
+    from mujoco.mjx.third_party import mujoco_warp
+
+    given = (*_STATE, "ctrl")
+
+    def step(*arrays: Any) -> None:
+        own = engine()
+        model, data = own._places[arrays[0].device.alias, count]
+        for name, array in zip(names, arrays[len(given) :], strict=False):
+            *path, field = name.split(".")
+            setattr(attrgetter(*path)(model) if path else model, field, array)
+        for name, array in zip(given, arrays, strict=False):
+            warp.copy(getattr(data, name), array)
+        for _ in range(own.num_substeps):
+            mujoco_warp.step(model, data)
+        for name, array in zip(outputs, arrays[len(arrays) - len(outputs) :], strict=True):
+            warp.copy(array, getattr(data, name))
+
+    return step
+
+
+def _annotated(function: Callable, kinds: dict[str, Any]) -> Callable:
+    """Give a function of many arrays the signature by which Warp tells JAX what they are."""
+    kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
+    parameters = [inspect.Parameter(name, kind, annotation=annotation) for name, annotation in kinds.items()]
+    function.__signature__ = inspect.Signature(parameters)  # type: ignore
+    function.__annotations__ = dict(kinds)
+    return function
+
+
+def _as_warp(leaf: Array, field: Any) -> Array:
+    """A model's field of every world (W, ...) in the shape in which Warp takes it."""
+    return leaf.reshape(len(leaf), *field.shape[1:], *getattr(field.dtype, "_shape_", ()))
+
+
+def _plain(name: str) -> str:
+    return name.replace(".", "__")

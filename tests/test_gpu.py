@@ -1,0 +1,220 @@
+"""On an NVIDIA GPU: that it computes what the CPU does. ``pytest -m gpu -n 8`` there; elsewhere they are left out."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from probes import random_batch
+
+import mtjax
+from mtjax import rollout
+from mtjax.agents import AGENTS
+from mtjax.agents.ppo import Taken
+from mtjax.envs.engines.base import World
+from mtjax.envs.engines.mjx import Mjx
+from mtjax.envs.mixtures import States
+from mtjax.envs.probes import tasks_of
+from mtjax.types import Spec
+
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(jax.default_backend() != "gpu", reason="there is no GPU"),
+]
+SPEC = Spec.vector(9, 2, 1)
+# Acting: (S, T, E) of evaluation with ten seeds, of evaluation with one, and of training.
+SHAPES = {"ten-seeds": (10, 8, 5), "evaluation": (1, 10, 10), "training": (1, 4, 64)}
+SEEDS = {"one-seed": 1, "ten-seeds": 10}
+QUICK = {"xla_backend_optimization_level": 0}  # of the CPU's program alone, which takes minutes otherwise
+DOMAINS = {
+    "acrobot-swingup": {"gravity": "8,11"},
+    "ball-in-cup-catch": {"mass": "0.8,1.2"},
+    "cartpole-swingup": {"pole-length": "0.9,1.2"},
+    "cheetah-run": {"torso-length": "0.5,0.6"},
+    "finger-spin": {"size": "0.95,1.05"},
+    "hopper-stand": {"foot-length": "0.9,1.1"},
+    "pendulum-swingup": {"length": "0.4,0.6"},
+    "point-mass-easy": {"mass": "0.8,1.2"},
+    "reacher-easy": {"mass": "0.8,1.2"},
+    "walker-walk": {"foot-length": "0.08,0.12"},
+}
+
+
+def on(platform):
+    return jax.default_device(jax.devices(platform)[0])
+
+
+def both(function, *arguments):
+    """What the CPU and the GPU make of the same arguments, at full float32 precision."""
+    found = []
+    for platform in ("cpu", "gpu"):
+        device = jax.devices(platform)[0]
+        given = jax.device_put(arguments, device)
+        with jax.default_device(device), jax.default_matmul_precision("highest"):
+            compiled = jax.jit(function).lower(*given).compile(QUICK if platform == "cpu" else None)
+            found.append(jax.device_get(compiled(*given)))
+    return found
+
+
+def learned(name, num_seeds, tasks):
+    """The agent called ``name`` by its preset for GPUs, and states whose networks are not as they began."""
+    agent = mtjax.preset("finger-spin-vary-size", name, "gpu").learner
+    random = np.random.default_rng(0)
+    shake = lambda x: x + np.float32(0.1 * random.normal(size=x.shape)) if x.dtype == np.float32 else x
+    with on("cpu"):
+        init = jax.jit(jax.vmap(lambda key: agent.init(SPEC, tasks, key)), compiler_options=QUICK)
+        states = jax.device_get(init(jax.random.split(jax.random.key(0), num_seeds)))
+    return agent, states._replace(actor=jax.tree.map(shake, states.actor))
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("name", AGENTS)
+def test_agents_act_as_on_the_cpu(name, shape):
+    """The mean actions in worlds whose tasks were seen and in others."""
+    shape = SHAPES[shape]
+    with on("cpu"):
+        tasks, worlds = (
+            tasks_of("one-step", np.linspace(-1, 1, 4)),
+            tasks_of("one-step", np.linspace(-1.3, 1.3, shape[1])),
+        )
+    agent, states = learned(name, shape[0], tasks)
+    obs = np.random.default_rng(1).normal(size=(*shape, SPEC.obs_size)).astype(np.float32)
+
+    def act(states, worlds, obs):
+        age = jnp.zeros(shape, jnp.int32)
+        begin = lambda state, task: agent.begin(state, task)
+        memory = jax.vmap(jax.vmap(jax.vmap(begin, (None, 0)), (None, 0)), (0, None))(
+            states, jax.tree.map(lambda x: jnp.broadcast_to(x[:, None], (*shape[1:], *x.shape[1:])), worlds)
+        )
+        return rollout.act(agent, states, worlds, rollout.Worlds((), None, obs, memory, age), None).action
+
+    expected, found = both(act, states, worlds, obs)
+    error = np.abs(expected - found).max(axis=(0, 2, 3))
+    assert error.max() < 1e-3, error
+
+
+def experience(agent, num_seeds, num_tasks):
+    """Batches (S, T, B, ...), or rollouts (S, T, H, E, ...) for agents that learn from these."""
+    batches = [random_batch(seed, num_tasks, 64, SPEC, agent.history) for seed in range(num_seeds)]
+    batch = jax.tree.map(lambda *x: np.stack(x), *batches)
+    if hasattr(agent, "target"):
+        return batch
+    steps = jax.tree.map(lambda x: x.reshape(*x.shape[:2], 8, 8, *x.shape[3:]), batch)
+    random = np.random.default_rng(0)
+    raw = np.arctanh(np.clip(steps.action, -0.99, 0.99))
+    ended = random.random(steps.reward.shape) < 0.1
+    return steps._replace(ended=ended, extras=Taken(raw, random.normal(size=ended.shape).astype(np.float32) - 2, None))
+
+
+@pytest.mark.parametrize("seeds", SEEDS)
+@pytest.mark.parametrize("name", AGENTS)
+def test_agents_learn_as_on_the_cpu(name, seeds):
+    """Losses of an update, and its gradients by what Adam remembers, seed by seed."""
+    num_seeds, num_tasks = SEEDS[seeds], 10
+    with on("cpu"):
+        tasks = tasks_of("one-step", np.linspace(-1, 1, num_tasks))
+    agent, states = learned(name, num_seeds, tasks)
+    with on("cpu"):
+        data, keys = experience(agent, num_seeds, num_tasks), jax.random.split(jax.random.key(1), num_seeds)
+    update = lambda states, data, tasks, keys: jax.vmap(lambda s, d, k: agent.update(s, d, tasks, k))(
+        states, data, keys
+    )
+    (expected, metrics), (found, measured) = both(update, states, data, tasks, keys)
+    for key, value in metrics.items():
+        assert np.abs(value - measured[key]).max() <= 0.02 * np.abs(value).max() + 1e-4, key
+    leaves = zip(
+        jax.tree_util.tree_leaves_with_path(expected.optimizers), jax.tree.leaves(found.optimizers), strict=True
+    )
+    for (path, one), other in leaves:
+        if ".mu" in jax.tree_util.keystr(path) and one.size:
+            difference, size = (np.linalg.norm(x.reshape(num_seeds, -1), axis=1) for x in (one - other, one))
+            assert np.all(difference <= 0.05 * size + 1e-7), (jax.tree_util.keystr(path), difference / size)
+
+
+# Physics.
+
+
+def played(env, count=64, steps=40):
+    """States (count, ...) of random play by MuJoCo itself, actions, and where each leads; tasks in turn."""
+    random, found = np.random.default_rng(0), []
+    tasks = jax.device_get(env.tasks())
+    with on("cpu"):
+        each = jax.tree.map(lambda x: x[np.arange(count) % len(tasks.id)], tasks)
+        keys = jax.random.split(jax.random.key(0), count)
+        starts = jax.device_get(jax.jit(jax.vmap(env.reset), compiler_options=QUICK)(each, keys).state)
+    for i in range(count):
+        model = env.models[each.row[i]]
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:] = starts.qpos[i], starts.qvel[i]
+        for step in range(steps + 1):
+            if step % 5 == 0:
+                data.ctrl[:] = random.uniform(-1, 1, model.nu)
+            if step == steps:
+                state = [np.float32(x) for x in (data.qpos, data.qvel, data.qacc_warmstart, data.ctrl)]
+                data.qpos[:], data.qvel[:], data.qacc_warmstart[:], data.ctrl[:] = state
+            mujoco.mj_step(model, data, env.num_substeps)
+        found.append((*state, np.float32(data.qpos), np.float32(data.qvel)))
+    return each, [np.stack(x) for x in zip(*found, strict=True)]
+
+
+@pytest.mark.parametrize("engine", ["warp", "mjx"])
+@pytest.mark.parametrize("name", DOMAINS)
+def test_engines_step_as_mujoco_does(name, engine):
+    """One control step from states of play: nearly all worlds to rounding, with solver iterations to spare."""
+    from mtjax.envs.engines.warp import Warp
+
+    env = mtjax.make(name, vary=DOMAINS[name], split="none", engine="mjx", solver_iterations=50)
+    tasks, (qpos, qvel, warmstart, ctrl, new_qpos, new_qvel) = played(env)
+    simulator = env.simulator if engine == "mjx" else Warp(env.mjx.base, env.num_substeps)
+    assert isinstance(simulator, Mjx | Warp)
+    sensors = np.zeros((len(qpos), env.models[0].nsensordata), np.float32)
+    world = World(qpos, qvel, warmstart, sensors if sensors.size else None)
+    new = jax.device_get(jax.jit(jax.vmap(simulator.step))(tasks, world, ctrl))
+    error = np.abs(new.qvel - new_qvel).max(axis=1) / np.abs(new_qvel).max()
+    assert np.median(error) < 1e-4 and np.quantile(error, 0.9) < 1e-2, np.sort(error)[-8:]
+    assert np.quantile(np.abs(new.qpos - new_qpos).max(axis=1), 0.9) < 1e-3
+
+
+@pytest.mark.parametrize("num_envs", [64, 512])
+def test_a_mixture_steps_as_its_families(num_envs):
+    """Ten models in one program, each in memory of its own."""
+    env = mtjax.mixture([mtjax.make(name, vary=vary, engine="warp") for name, vary in DOMAINS.items()])
+    shape = lambda tasks: (1, len(tasks.id), num_envs)
+    keys = lambda tasks: jax.random.split(jax.random.key(0), shape(tasks))
+    begin = lambda family, tasks: jax.jit(
+        lambda tasks, keys: family.reset_worlds(rollout.spread(tasks, keys.shape), keys).state
+    )(tasks, keys(tasks))
+    tasks = env.tasks()
+    states = [begin(part.family, part.family.tasks()) for part in env.parts]
+    action = jax.random.uniform(jax.random.key(1), (3, *shape(tasks), env.spec.action_size), minval=-1.0)
+
+    @partial(jax.jit, static_argnums=0)
+    def play(family, tasks, state, action):
+        step = lambda state, action: (
+            family.step_worlds(rollout.spread(tasks, action.shape[:3]), state, action).state,
+            None,
+        )
+        return jax.lax.scan(step, state, action)[0]
+
+    together = play(env, tasks, States(tasks.blocks, tuple(states)), action).families
+    for i, (part, state) in enumerate(zip(env.parts, states, strict=True)):
+        places = [place for owner, place in tasks.blocks.slices() if owner == i]
+        own = jnp.concatenate([action[:, :, place] for place in places], axis=2)[..., : part.family.spec.action_size]
+        alone = play(part.family, part.family.tasks(), state, own)
+        error = np.abs(np.asarray(alone.qpos) - np.asarray(together[i].qpos)).max(axis=-1)
+        assert np.quantile(error, 0.9) < 1e-3 and np.all(np.isfinite(error)), part.name
+
+
+def test_a_run_goes_on_bit_for_bit(tmp_path):
+    """On MJX-JAX; MuJoCo Warp adds up in another order each time."""
+    env = mtjax.make("pendulum-swingup", vary={"length": "0.4,0.6"}, split="none", engine="mjx")
+    settings = {"num_envs": 4, "batch_size": 8, "replay_size": 200, "warmup_steps": 5, "chunk_steps": 25}
+    agent = mtjax.agent("sac-conditioned", hidden=(8, 8))
+    run = partial(mtjax.train, env, agent, seeds=2, eval_every=4000, eval_episodes=1, directory=tmp_path, **settings)
+    run(steps=4000)
+    again = run(steps=8000, resume=True)
+    whole = mtjax.train(env, agent, seeds=2, steps=8000, eval_every=4000, eval_episodes=1, **settings)
+    for one, other in zip(*(jax.tree.leaves(jax.device_get(x.state.agent.actor)) for x in (whole, again)), strict=True):
+        np.testing.assert_array_equal(one, other)
