@@ -201,6 +201,11 @@ class SAC(BaseAgent):
 
     # Losses of one task.
 
+    @property
+    def least_loss(self) -> float | Array:
+        """The least that a task's critic loss can be; rules that look at losses are given what lies above it."""
+        return 0.0
+
     def policy(self, actor: Params, critic: Params, told: Array, obs: Any) -> Array:
         """The policy's outputs (..., 2A); agents whose actor stands on the critic's representation use ``critic``."""
         return self.actor.apply(actor, told, obs)
@@ -319,7 +324,12 @@ class SAC(BaseAgent):
         """The critic's loss for one task, and the data of all (T, ...): what ``surgery.gradient`` differentiates."""
         bootstrap = jax.vmap(self.target, (OVER_TASKS, OVER_TASKS, OVER_TASKS, 0, 0))
         keys = jax.random.split(key, len(batch.temperature))
-        return self.critic_loss, (batch, bootstrap(state.actor, state.critic, state.target, batch, keys))
+
+        def loss(critic: Params, data) -> tuple[Array, Metrics]:
+            value, metrics = self.critic_loss(critic, data)
+            return value - self.least_loss, metrics
+
+        return loss, (batch, bootstrap(state.actor, state.critic, state.target, batch, keys))
 
     def actor_problem(self, critic: Params, batch: Batch, key: Key) -> tuple[Callable, Any]:
         """The actor's loss for one task under a critic, and the data of all tasks (T, ...)."""
