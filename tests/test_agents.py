@@ -221,6 +221,14 @@ def test_observations_are_normalised_by_what_was_learned_from():
     np.testing.assert_allclose(metrics["actor_loss"], expected["actor_loss"], rtol=1e-3, atol=1e-4)
 
 
+def test_every_method_says_what_differs_from_its_paper():
+    """In the docstring of its class, which --help shows; what has no paper has nothing to say."""
+    methods = {preset.cls for preset in AGENTS.values()}
+    for table, own in ((ENCODERS, ("identity", "mlp")), (SCALINGS, ("none",)), (VALUES, ("scalar",))):
+        methods |= {cls for name, cls in table.items() if name not in own}
+    assert not [cls.__name__ for cls in methods if "Differs from" not in (vars(cls)["__doc__"] or "")]
+
+
 @pytest.mark.parametrize("name", ["sac", "ppo"])
 def test_what_lies_far_from_what_was_learned_is_clipped(name):
     """What the networks see of observations and of the past, in acting and in learning; nothing if not normalised."""

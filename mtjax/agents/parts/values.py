@@ -129,6 +129,8 @@ class HLGauss(C51):
     summing to one, fitted by the cross-entropy; the value is the mean of the bins' centres. Sigma is 0.75 bin widths,
     as in Farebrother et al. (2024). Within two bin widths of the range's ends the truncated normal's mean, and so the
     value, falls short of y.
+
+    Differs from the papers: y is a soft value, by the least critic or by the mean of all.
     """
 
     bin_sigma: float = 0.75
