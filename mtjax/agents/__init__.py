@@ -34,7 +34,7 @@ AGENTS: dict[str, Preset] = {
     "sac": Preset("Soft actor-critic that is not told its task (Haarnoja et al. 2018)"),
     "sac-conditioned": Preset("SAC that sees the task's parameters (Schaul et al. 2015)", _TOLD),
     "multi-head": Preset("SAC with an output layer for every task (Yu et al. 2020)", {"heads": "per-task"}),
-    "disjoint": Preset("One SAC for every task, all in one program: the upper bound", {"heads": "disjoint"}),
+    "disjoint": Preset("One SAC for every task, all in one program: nothing is shared", {"heads": "disjoint"}),
     "distral": Preset(
         "A policy for every task, held together by a distilled one (Teh et al. 2017)",
         {},
