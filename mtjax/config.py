@@ -15,6 +15,9 @@ import tyro
 
 from mtjax.agents import SAC, BaseAgent, agent, preset_of, settings
 from mtjax.agents.base import replace
+from mtjax.agents.parts import name_of
+from mtjax.agents.parts.scaling import SCALINGS
+from mtjax.agents.parts.values import VALUES
 from mtjax.commands import require_run
 from mtjax.envs import make
 from mtjax.envs.family import Tabled
@@ -127,6 +130,18 @@ def configure(agent: Any, settings: Settings, given: Mapping[str, Any]) -> tuple
     played = {name: value for name, value in given.items() if name in Settings.__dataclass_fields__}
     rest = {name: value for name, value in given.items() if name not in played}
     return replace(agent, rest), dataclasses.replace(settings, **played)
+
+
+def require_range(agent: Any) -> None:
+    """Refuse critics whose range nobody chose for returns that are not scaled to it, once all settings are given.
+
+    Raises:
+        InputError: the agent has such critics.
+    """
+    if isinstance(agent, SAC):
+        reason = agent.value.refuses(name_of(SCALINGS, agent.scaling))
+        if reason:
+            raise InputError(f"value={name_of(VALUES, agent.value)} {reason}")
 
 
 def load_preset(env_name: str, name: str) -> dict[str, Any]:

@@ -166,6 +166,19 @@ def log_density(outputs: Array, raw: Array, mask: Array | None = None) -> Array:
     return _log_density((raw - mean) * jnp.exp(-log_std), log_std, raw, mask)
 
 
+def divergence(outputs: Array, others: Array, mask: Array | None = None) -> Array:
+    """Kullback-Leibler divergence KL(p | q) (...,) of two tanh-squashed Gaussians, by their outputs (..., 2A).
+
+    It is that of the Gaussians before the tanh, as a map that both go through changes no divergence:
+        sum_a (s^2 / s'^2 - 1) / 2 - log(s / s') + ((m - m') / s')^2 / 2
+    A mean of log p - log q over actions is that too, but noisy, and lost to rounding where p and q are near each other.
+    """
+    (mean, log_std), (other_mean, other_log_std) = _moments(outputs), _moments(others)
+    wider = 2 * (log_std - other_log_std)
+    apart = jnp.square((mean - other_mean) * jnp.exp(-other_log_std))
+    return jnp.sum(_masked(jnp.expm1(wider) - wider + apart, mask), axis=-1) / 2
+
+
 def _moments(outputs: Array) -> tuple[Array, Array]:
     """Means (..., A) and bounded log standard deviations (..., A)."""
     mean, log_std = jnp.split(outputs, 2, axis=-1)

@@ -7,6 +7,8 @@ import jax.numpy as jnp
 from mtjax.types import Array
 
 _MIN_STD = 1e-3
+LARGEST = 10.0
+"""Size within which normalised observations are clipped: what a network never saw must not drive it out of range."""
 
 
 class Moments(NamedTuple):
@@ -18,7 +20,7 @@ class Moments(NamedTuple):
 
 
 def init(size: int) -> Moments:
-    """Return moments of nothing; they normalise to the identity."""
+    """Return moments of nothing; they normalise to the identity, but for the clip."""
     return Moments(jnp.float32(0), jnp.zeros(size), jnp.zeros(size))
 
 
@@ -37,6 +39,6 @@ def update(moments: Moments, batch: Array) -> Moments:
 
 
 def apply(moments: Moments, x: Array) -> Array:
-    """Scale x (..., O) to zero mean and unit variance."""
+    """Scale x (..., O) to zero mean and unit variance, and clip it to ``LARGEST`` in size."""
     variance = jnp.where(moments.count > 0, moments.deviation / jnp.maximum(moments.count, 1), 1.0)
-    return (x - moments.mean) / jnp.maximum(jnp.sqrt(variance), _MIN_STD)
+    return jnp.clip((x - moments.mean) / jnp.maximum(jnp.sqrt(variance), _MIN_STD), -LARGEST, LARGEST)

@@ -118,6 +118,7 @@ SMALL = {  # of parts that have such settings
     "num_experts": 2,
     "expert_widths": (8, 4),
     "encoder_widths": (8,),
+    "weight_widths": (8,),
     "module_width": 8,
     "routing_widths": (8,),
     "hypernetwork_widths": (8, 4),

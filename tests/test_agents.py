@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from probes import OFF_POLICY, learner, pick, quick, random_batch, tasks_of, tiny
+from probes import OFF_POLICY, learner, pick, quick, random_batch, random_past, tasks_of, tiny
 from probes import act as act_once
 
 from mtjax import normalize
@@ -219,6 +219,28 @@ def test_observations_are_normalised_by_what_was_learned_from():
     _, expected = plain_update(state, batch._replace(obs=see(batch.obs), next_obs=see(batch.next_obs)), TASKS, KEY)
     np.testing.assert_allclose(metrics["critic_loss"], expected["critic_loss"], rtol=1e-3)
     np.testing.assert_allclose(metrics["actor_loss"], expected["actor_loss"], rtol=1e-3, atol=1e-4)
+
+
+def test_every_method_says_what_differs_from_its_paper():
+    """In the docstring of its class, which --help shows; what has no paper has nothing to say."""
+    methods = {preset.cls for preset in AGENTS.values()}
+    for table, own in ((ENCODERS, ("identity", "mlp")), (SCALINGS, ("none",)), (VALUES, ("scalar",))):
+        methods |= {cls for name, cls in table.items() if name not in own}
+    assert not [cls.__name__ for cls in methods if "Differs from" not in (vars(cls)["__doc__"] or "")]
+
+
+@pytest.mark.parametrize("name", ["sac", "ppo"])
+def test_what_lies_far_from_what_was_learned_is_clipped(name):
+    """What the networks see of observations and of the past, in acting and in learning; nothing if not normalised."""
+    agent = tiny(name, normalize_observations=True, conditioning="inferred", inferred_from=2)
+    moments = agent.fit_moments(agent.init_moments(SPEC, 3), random_batch(0, 3, BATCH, SPEC).obs)
+    obs, past = jnp.full((3, BATCH, 3), 1e3), random_past(np.random.default_rng(0), (3, BATCH, 2), SPEC)
+    past = past._replace(obs=jnp.full_like(past.obs, -1e3))
+    for see in (agent.see, agent.see_batch):
+        seen = see(moments, obs, past)
+        assert np.all(seen.obs == 10) and np.all(seen.past.obs == -10)
+    plain = tiny(name, normalize_observations=False, conditioning="inferred", inferred_from=2).see(moments, obs, past)
+    assert np.all(plain.obs == 1e3) and np.all(plain.past.obs == -1e3)
 
 
 def test_without_normalisation_moments_stay_empty():

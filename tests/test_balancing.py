@@ -1,6 +1,8 @@
 """Rules whose weights are learned over time: GradNorm and FAMO, by hand and where the right weights are known."""
 
+import dataclasses
 from functools import partial
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -8,8 +10,11 @@ import numpy as np
 import pytest
 from probes import QUICK
 
+from mtjax.agents.parts.gradients import surgery
 from mtjax.agents.parts.gradients.balancing import FAMO, Balance, GradNorm
 from mtjax.agents.parts.gradients.rules import Mean
+from mtjax.agents.sac import SAC, Batch
+from mtjax.networks import Params
 from mtjax.types import InputError
 
 KEY = jax.random.key(0)
@@ -167,6 +172,47 @@ def test_an_actor_s_losses_say_nothing_to_gradnorm():
     lengths = np.random.default_rng(5).uniform(0.2, 3, (6, 3))
     a, b = (run_gradnorm(lengths, x, 0.0)[0] for x in losses)
     np.testing.assert_array_equal(a, b)
+
+
+# Losses below zero.
+
+
+@dataclasses.dataclass(frozen=True)
+class Likelihood(SAC):
+    """Its critics' losses lie above a negative constant, as a normal distribution's negative log-likelihood may be."""
+
+    below: float = 0.0
+
+    @property
+    def least_loss(self):
+        return -self.below
+
+    def target(self, actor, critic, slow, batch, key):
+        return jnp.float32(0)
+
+    def critic_loss(self, critic, data):
+        loss = 1 + jnp.square(data[0].reward * critic.shared) - self.below
+        return loss, {"critic_loss": loss}
+
+
+@pytest.mark.parametrize("rule", [FAMO(), GradNorm(weight_lr=0.3)], ids=["famo", "gradnorm"])
+def test_losses_are_counted_from_the_least_that_they_can_be(rule):
+    """Updates in which losses fall, each at its rate: gradients are weighted as if none were below 0; metrics not."""
+    nothing, scales = Params({}, {}), jnp.float32([1.0, 2.0, 3.0])
+    state = SimpleNamespace(actor=nothing, critic=nothing, target=nothing)
+    batch = Batch(*[None] * 2, scales, *[None] * 3, temperature=jnp.ones(3), mask=None)  # type: ignore
+
+    def found(below):
+        loss, data = Likelihood(below=below).critic_problem(state, batch, KEY)  # type: ignore
+        memory, gradients = surgery.init(rule, Params(jnp.float32(1), {}), 3), []
+        for place, after in ((1.0, 0.5), (0.5, 0.4), (0.4, 0.1), (0.1, 0.1)):
+            seen = surgery.gradient(rule, loss, Params(jnp.float32(place), {}), data, memory, KEY)
+            memory = surgery.look_again(rule, loss, Params(jnp.float32(after), {}), data, seen)
+            gradients.append(seen.gradients.shared)
+            np.testing.assert_allclose(seen.aux["critic_loss"], 1 + np.square(place * scales) - below, rtol=1e-5)
+        return gradients
+
+    np.testing.assert_allclose(found(20.0), found(0.0), rtol=1e-4)
 
 
 # FAMO.

@@ -16,7 +16,7 @@ from mtjax.agents import agent
 from mtjax.agents.distral import Distral
 from mtjax.agents.parts.gradients.descent import descend
 from mtjax.agents.sac import SAC, Batch
-from mtjax.networks import Params, log_density, sample_raw, tanh_normal
+from mtjax.networks import Params, divergence, log_density, sample_raw, tanh_normal
 from mtjax.types import InputError, Spec
 
 SPEC, BATCH = Spec.vector(3, 2, 1), 4
@@ -89,6 +89,39 @@ def test_density_and_its_slopes_are_finite_where_tanh_is_one():
     assert all(np.all(np.isfinite(x)) and np.all(x != 0) for x in slopes)
 
 
+# The divergence of two policies.
+
+
+def plain_divergence(outputs, others):
+    """KL(p | q) in float64, between the normals before the tanh."""
+    (m, s), (other_m, other_s) = (
+        (half[0], np.exp(-5 + 3.5 * (np.tanh(half[1]) + 1)))
+        for half in (np.split(np.float64(x), 2, axis=-1) for x in (outputs, others))
+    )
+    return np.sum(np.log(other_s / s) + (s**2 + (m - other_m) ** 2) / (2 * other_s**2) - 0.5, axis=-1)
+
+
+@pytest.mark.parametrize("middle", [0.0, 40.0], ids=["inside", "where tanh is 1"])
+@pytest.mark.parametrize("apart", [1.0, 1e-3])
+def test_divergence_of_two_policies(middle, apart):
+    """Also of policies so near each other that the log-densities of their actions differ by no more than rounding."""
+    random = np.random.default_rng(2)
+    outputs = jnp.float32(random.normal(size=(50, 6)) + middle * np.repeat([1, 0], 3))
+    others = jnp.float32(outputs + apart * random.normal(size=(50, 6)))
+    found = divergence(outputs, others)
+    np.testing.assert_allclose(found, plain_divergence(outputs, others), rtol=1e-3)
+    np.testing.assert_array_equal(divergence(outputs, outputs), 0)
+
+
+def test_divergence_is_the_mean_of_log_densities():
+    """Over many actions; of actions that a task does not have, nothing."""
+    outputs, others = jnp.float32(np.random.default_rng(3).normal(size=(2, 6)))
+    raw, log_prob = sample_raw(jnp.tile(outputs, (100_000, 1)), KEY)
+    np.testing.assert_allclose(divergence(outputs, others), np.mean(log_prob - log_density(others, raw)), rtol=0.02)
+    mask, first = jnp.float32([1, 0, 0]), np.array([0, 3])
+    np.testing.assert_allclose(divergence(outputs, others, mask), divergence(outputs[first], others[first]), rtol=1e-6)
+
+
 # Losses of one task.
 
 ALPHA, TEMPERATURE = 0.3, 0.2
@@ -138,7 +171,8 @@ def test_actor_loss(state, batch):
     np.testing.assert_allclose(loss, policy_loss - np.mean(common), rtol=1e-4)
     np.testing.assert_allclose(metrics["actor_loss"], policy_loss, rtol=1e-4)
     np.testing.assert_allclose(metrics["entropy"], -np.mean(own), rtol=1e-4)
-    np.testing.assert_allclose(metrics["kl"], np.mean(own - common), rtol=1e-4)
+    policies = made.policy(actor, actor, FEATURES, rows.obs), made.actor.apply_distilled(actor, FEATURES, rows.obs)
+    np.testing.assert_allclose(metrics["kl"], np.mean(plain_divergence(*policies)), rtol=1e-4)
 
 
 def slopes(made, actor, data, loss):
@@ -200,7 +234,7 @@ def test_all_policies_begin_as_one(batch):
         own = {name: pick(fresh.actor.own[name], i) for name in ("body", "head")}
         assert same(own, fresh.actor.shared["distilled"])
     _, metrics = update(fresh, batch, TASKS, KEY)
-    np.testing.assert_allclose(metrics["kl"], 0, atol=1e-3)
+    np.testing.assert_allclose(metrics["kl"], 0, atol=1e-9)
 
 
 def test_without_alpha_it_is_one_sac_for_every_task(state):

@@ -140,7 +140,8 @@ def gram_schmidt(vectors):
 def plain_moore(name, p, obs, action, task):
     x = np.concatenate([obs, *action])
     basis = gram_schmidt(np.stack([expert(p["experts"], k, x) for k in range(3)]))
-    return np.tanh(dense(p["weights"], NUMBERS[task]) @ basis)
+    weights = dense(p["weights"]["out"], mlp(p["weights"], NUMBERS[task]))
+    return np.tanh(weights @ basis)
 
 
 PLAIN = {"moe": plain_mixture, "film": plain_film, "moore": plain_moore}
@@ -269,6 +270,7 @@ REFUSED = [
     ({"encoder": "moe", "num_experts": 0}, "at least one expert"),
     ({"encoder": "moe", "expert_widths": ()}, "at least one expert"),
     ({"encoder": "moore", "num_experts": 0}, "at least one expert"),
+    ({"encoder": "moore", "weight_widths": (0,)}, "weight-widths must be of at least one unit each"),
     ({"encoder": "moe", "mode": "top-k", "top_k": 1}, "top-k must be from 2 to num-experts=4, not 1"),
     ({"encoder": "moe", "mode": "top-k", "top_k": 5}, "top-k must be from 2"),
     ({"encoder": "moe", "mode": "cluster"}, "go together"),

@@ -5,11 +5,13 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from probes import QUICK
 
 from mtjax import agents
 from mtjax.agents.parts.encoders.composed import Composed, Hypernetwork, HyperTrunk, PaCo, PaCoTrunk
+from mtjax.agents.parts.encoders.mixture import TaskWeights
 from mtjax.agents.parts.encoders.residual import BroNet, BroNetTrunk, SimBa, SimBaTrunk
 from mtjax.agents.parts.encoders.soft_modules import Modules, SoftModules
 from mtjax.types import InputError
@@ -171,13 +173,14 @@ def plain_trunk(p, x, weights, layer_norm=False):
 
 @pytest.mark.parametrize("layer_norm", [False, True])
 def test_paco_composes_every_hidden_layer(layer_norm):
-    """theta = sum_k w_k Phi_k with w linear in the features, in actor and critic."""
-    module = PaCoTrunk(3, (6, 5), layer_norm)
+    """theta = sum_k w_k Phi_k with w an MLP of the features, in actor and critic."""
+    module = PaCoTrunk(3, (6, 5), layer_norm, (4,))
     for data in (DATA, DATA[:2]):
         params = parameters(module, *data)
         obs, features, *action = (np.float64(x) for x in data)
         inputs, p = np.concatenate([obs, *action], axis=-1), plain(params)
-        rows = [plain_trunk(p["trunk"], x, dense(p["weights"], features), layer_norm) for x in inputs]
+        weights = dense(p["weights"]["out"], mlp(p["weights"], features))
+        rows = [plain_trunk(p["trunk"], x, weights, layer_norm) for x in inputs]
         close(apply(module, params, *data), np.stack(rows))
 
 
@@ -231,15 +234,54 @@ def test_generated_kernels_begin_as_usual_ones_and_the_same_for_all_tasks():
     assert not np.allclose(run(after, obs, DATA[1]), run(after, obs, -3 * DATA[1]))
 
 
-def test_paco_begins_with_kernels_of_the_usual_size():
+@pytest.mark.parametrize(("widths", "expected"), [((), (1, 2)), ((64,), (7 / 6, 13 / 6))])
+def test_paco_begins_with_kernels_of_the_usual_size(widths, expected):
     """Between one and two times LeCun's variance, for features from nothing to unit ones."""
-    module = PaCoTrunk(5, (80,), False)
+    module = PaCoTrunk(5, (80,), False, widths)
     init = compiled(jax.vmap(lambda key: module.init(key, jnp.zeros(50), jnp.zeros(64))["params"]))
-    params = jax.tree.map(np.asarray, init(jax.random.split(jax.random.key(0), 50)))
-    kernels = params["trunk"]["Composed_0"]["kernels"]
-    for size, expected in ((0.0, 1.0), (1.0, 2.0)):
-        weights = size * params["weights"]["kernel"].sum(1) + params["weights"]["bias"]
-        np.testing.assert_allclose(50 * np.var(np.einsum("sk,skio->sio", weights, kernels)), expected, rtol=0.15)
+    params = init(jax.random.split(jax.random.key(0), 50))
+    kernels, of_task = params["trunk"]["Composed_0"]["kernels"], TaskWeights(5, widths, 5**-0.5)
+    for size, variance in zip((0.0, 1.0), expected, strict=True):
+        weights = jax.vmap(lambda p, size=size: of_task.apply({"params": p}, jnp.full(64, size)))(params["weights"])
+        np.testing.assert_allclose(50 * np.var(np.einsum("sk,skio->sio", weights, kernels)), variance, rtol=0.15)
+
+
+def effective_rank(rows):
+    """Singular values of more than a hundredth of the largest."""
+    values = np.linalg.svd(np.asarray(rows), compute_uv=False)
+    return np.sum(values > 0.01 * values[0])
+
+
+@pytest.mark.parametrize(("name", "num"), [("paco", {"num_sets": 5}), ("moore", {"num_experts": 4})])
+def test_weights_of_tasks_along_one_parameter_are_not_a_line(name, num):
+    """Ten scalar contexts, as the agent makes its networks: by a linear map every task would mix the same two."""
+    contexts, obs = jnp.linspace(-1, 1, 10)[:, None], jnp.zeros((10, OBS))
+
+    def weights(**settings):
+        module = agents.agent(name, **num, **settings).encoder.body((8,), False)
+        params = module.init(jax.random.key(0), obs, contexts)
+        _, seen = module.apply(params, obs, contexts, capture_intermediates=lambda m, _: m.name == "weights")
+        (found,) = seen["intermediates"]["weights"]["__call__"]
+        return found
+
+    assert effective_rank(weights(weight_widths=())) == 2
+    assert effective_rank(weights()) >= 4
+
+
+def test_weights_of_a_task_fit_what_a_line_cannot():
+    """Ten tasks' random weights, of which the best line leaves three quarters; every task reaches its own."""
+    contexts, wanted = jnp.linspace(-1, 1, 10)[:, None], jnp.float32(RANDOM.normal(size=(10, 5)))
+    module, optimizer = TaskWeights(5, (64,)), optax.adam(1e-2)
+    loss = lambda params: jnp.mean((module.apply(params, contexts) - wanted) ** 2)
+
+    def step(carry, _):
+        updates, memory = optimizer.update(jax.grad(loss)(carry[0]), carry[1])
+        return (optax.apply_updates(carry[0], updates), memory), None
+
+    params = module.init(jax.random.key(0), contexts)
+    fit = compiled(lambda *start: jax.lax.scan(step, start, length=2000)[0][0])
+    line = np.linalg.lstsq(np.hstack([contexts, np.ones((10, 1))]), wanted, rcond=None)[1].sum() / wanted.size
+    assert loss(fit(params, optimizer.init(params))) < 0.1 * line
 
 
 # Residual bodies.
@@ -327,6 +369,7 @@ def test_settings_that_make_no_network_are_refused():
         ("soft-modules", {"num_modules": 0}, "at least one module"),
         ("soft-modules", {"variant": "oficial"}, "did you mean 'official'"),
         ("paco", {"num_sets": 0}, "num-sets must be at least 1"),
+        ("paco", {"weight_widths": (4, 0)}, "weight-widths must be of at least one unit each"),
         ("hypernetwork", {"hypernetwork_widths": ()}, "at least one unit"),
         ("simba", {"expansion": 0}, "expansion must be at least 1"),
         ("bronet", {"hidden": (8, 4)}, r"bronet.*\(8, 4\)"),

@@ -13,6 +13,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 from conftest import SHORT_RUN
+from probes import Stub, Walk, pick, tasks_of
 from probes import act as act_once
 
 import mtjax
@@ -112,6 +113,50 @@ def test_scores_are_of_episodes_that_the_run_never_saw(finished_run, policy):
     for split, returns in scoring.score(policy, 1).items():
         assert returns.shape == (2, len(VALUES[split]), 1)
         assert not np.intersect1d(returns, past.returns[split]).size
+
+
+@dataclasses.dataclass(frozen=True)
+class Fatal(Walk):
+    """A walk paid by its action too, which counts its steps; what would follow a termination is not a number."""
+
+    episode_length: int = 6
+
+    def step(self, task, state, action):
+        step = super().step(task, state, action)
+        over = (state.obs[0] % 1 < 0.5) & (state.age > 2)
+        reward = jnp.where(over, jnp.nan, step.reward + action[0])
+        return step._replace(reward=reward, metrics={"steps": step.state.age})
+
+
+class Leaning(Stub):
+    """Acts by its state and by the observation."""
+
+    def choose(self, state, obs, task, key):
+        return jnp.tanh(state - obs)
+
+
+def test_evaluation_is_a_plain_loop_over_single_worlds():
+    """Episodes that terminate, or are cut off at their task's limit, count up to there and no further."""
+    env, agent, episodes = Fatal(), Leaning(), 4
+    tasks = tasks_of("one-step", (1.0, -0.5, 2.0))._replace(horizon=jnp.int32([6, 4, 2]))
+    states, seeds = jnp.float32([[0.3], [1.7]]), (3, 8)
+    found = evaluate(env, agent, episodes, states, tasks, jnp.asarray(seeds), jnp.int32(5))
+    reset, step, lengths = jax.jit(env.reset), jax.jit(env.step), set()
+    for s, seed in enumerate(seeds):
+        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), 0x7E57), 5)
+        keys = jax.random.split(key, (3, episodes))
+        for i in range(3):
+            task = pick(tasks, i)
+            for e in range(episodes):
+                world, total, age = reset(task, keys[i, e]), 0.0, 0
+                while not world.terminated and age < task.horizon:
+                    action = agent.act(states[s], (), world.obs, task, None).action
+                    world, age = step(task, world.state, action), age + 1
+                    total += float(world.reward)
+                np.testing.assert_allclose(found.returns[s, i, e], total, rtol=1e-5)
+                assert found.metrics["steps"][s, i, e] == age
+                lengths.add(age)
+    assert lengths == {2, 3, 4, 6}  # both ways to end, in one batch
 
 
 # The program.

@@ -1,5 +1,6 @@
 """Running moments against NumPy's of everything at once."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ def random_batches(*sizes, offset=0.0, scale=1.0):
 
 def test_moments_of_nothing_normalise_to_the_identity():
     """An agent that has not learned yet sees what there is."""
-    x = jnp.float32([[1.0, -2.0, 300.0]])
+    x = jnp.float32([[1.0, -2.0, 9.0]])
     np.testing.assert_array_equal(normalize.apply(normalize.init(3), x), x)
 
 
@@ -57,4 +58,13 @@ def test_a_constant_dimension_stays_finite():
     """It is centred and scaled by no more than the inverse of the least deviation."""
     moments = fitted(np.full((10, 3), 7.0))
     np.testing.assert_allclose(normalize.apply(moments, jnp.full(3, 7.0)), 0, atol=1e-3)
-    np.testing.assert_allclose(normalize.apply(moments, jnp.full(3, 7.5)), 500, rtol=1e-3)
+    np.testing.assert_allclose(normalize.apply(moments, jnp.full(3, 7.005)), 5, rtol=1e-3)
+
+
+def test_what_lies_far_outside_is_clipped():
+    """At ten deviations on either side, infinities included; what lies within keeps its slope."""
+    moments = fitted(np.float32([[-1.0, 4.0, 0.0], [1.0, 6.0, 0.0]]))
+    x = jnp.float32([[9.9, 5.0, 1e-3], [11.0, -6.0, 1.0], [-jnp.inf, 1e30, -1.0]])
+    np.testing.assert_allclose(normalize.apply(moments, x), [[9.9, 0, 1], [10, -10, 10], [-10, 10, -10]], rtol=1e-4)
+    slopes = jax.jacobian(lambda x: normalize.apply(moments, x))(x[0])
+    np.testing.assert_allclose(jnp.diag(slopes), [1, 1, 1000], rtol=1e-4)

@@ -8,8 +8,12 @@ import numpy as np
 import pytest
 from probes import Probe, only_seed, tasks_of, tiny, train, values
 
+import mtjax
 from mtjax.agents import agent
 from mtjax.agents.parts.values import C51, VALUES, HLGauss, Scalar
+from mtjax.cli import parse
+from mtjax.config import require_range
+from mtjax.training import launch
 from mtjax.types import InputError
 
 FIVE = C51(num_bins=5, value_low=-2.0, value_high=2.0)  # atoms -2 -1 0 1 2
@@ -149,6 +153,26 @@ def test_settings_that_make_no_sense_are_refused(settings, message):
     """With what was given."""
     with pytest.raises(InputError, match=message):
         agent("sac", **settings)
+
+
+def test_returns_must_be_scaled_to_a_range_that_nobody_chose():
+    """Before anything compiles, by the program too; at every point of a sweep."""
+    for name, settings in (("sac", {"value": "c51"}), ("sac", {"value": "hl-gauss", "scaling": "reward"})):
+        with pytest.raises(InputError, match=f"value={settings['value']} reaches returns from -10 to 10.*=return, or"):
+            mtjax.train(Probe("delayed"), agent(name, **settings), steps=10)
+    sweep = {"value_high": [20.0, 10.0]}
+    with pytest.raises(InputError, match="value=c51 reaches returns from -10 to 10"):
+        mtjax.train(Probe("delayed"), agent("brc", scaling="none"), steps=10, sweep=sweep)
+    with pytest.raises(InputError, match="scaling=none does not keep them there"):
+        launch.check(parse(["--env=pendulum-swingup", "--engine=mjx", "--agent=brc", "--agent.scaling=none"]))
+
+
+def test_a_range_that_is_given_or_scaled_to_is_taken():
+    """Given on a command line too, where a part has its settings after its name."""
+    for settings in ({"value": "c51", "value_high": 200.0}, {"value": "hl-gauss", "scaling": "return"}, {}):
+        require_range(agent("sac", **settings))
+    words = ["--env=pendulum-swingup", "--agent=sac", "--agent.value=c51", "--agent.value-high=200"]
+    require_range(parse(words).learner)
 
 
 SETTINGS = {

@@ -29,29 +29,12 @@ class Preset(NamedTuple):
 
 
 _TOLD = {"conditioning": "parameters"}
-# Differs from its authors' code: actor and critics are of one size, by ``hidden`` (there, critics have two blocks of
-# 4096 and the actor one of 256); each network owns its embeddings (there, critics share theirs and lend it the actor);
-# the temperature's Adam has a first decay of 0.9 (there, 0.5).
-_BRC = {
-    "encoder": "bronet",
-    "value": "c51",
-    "scaling": "return",
-    "conditioning": "embedding",
-    "embedding_size": 32,
-    "unit_embedding": True,
-    "believe": "mean",
-    "shared_temperature": True,
-    "weight_decay": 1e-4,
-    "actor_lr": 3e-4,
-    "critic_lr": 3e-4,
-    "temperature_lr": 3e-4,
-}
 
 AGENTS: dict[str, Preset] = {
     "sac": Preset("Soft actor-critic that is not told its task (Haarnoja et al. 2018)"),
     "sac-conditioned": Preset("SAC that sees the task's parameters (Schaul et al. 2015)", _TOLD),
     "multi-head": Preset("SAC with an output layer for every task (Yu et al. 2020)", {"heads": "per-task"}),
-    "disjoint": Preset("One SAC for every task, all in one program: the upper bound", {"heads": "disjoint"}),
+    "disjoint": Preset("One SAC for every task, all in one program: nothing is shared", {"heads": "disjoint"}),
     "distral": Preset(
         "A policy for every task, held together by a distilled one (Teh et al. 2017)",
         {},
@@ -65,7 +48,7 @@ AGENTS: dict[str, Preset] = {
     ),
     "soft-modularization": Preset("Modules routed by task (Yang et al. 2020)", {"encoder": "soft-modules", **_TOLD}),
     "paco": Preset("Parameters composed for each task (Sun et al. 2022)", {"encoder": "paco", **_TOLD}),
-    "brc": Preset("Bigger, regularised, categorical critics (Nauman et al. 2025)", _BRC),
+    "brc": Preset("Bigger, regularised, categorical critics (Nauman et al. 2025)", {}, "mtjax.agents.brc:BRC"),
     "deepmdp": Preset("SAC on a latent model of the task (Gelada et al. 2019)", _TOLD, "mtjax.agents.deepmdp:DeepMDP"),
     "hip-bmdp": Preset(
         "DeepMDP with learned hidden parameters (Zhang et al. 2021)",

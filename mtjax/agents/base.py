@@ -71,7 +71,7 @@ class BaseAgent(abc.ABC):
     discounting: Literal["gamma", "horizon"] = "gamma"
     """How late rewards count: by gamma in every task, or by each task's horizon h as 1 - 5 / h, in [0.95, 0.995]."""
     normalize_observations: bool = False
-    """Scale observations by their running mean and variance, fitted on training data alone."""
+    """Scale observations by their running mean and variance, fitted on training data alone, and clip them to +-10."""
     max_gradient_norm: float = 0.0
     """Clip the global norm of actor and critic gradients to this; 0 does not clip."""
     critic_layer_norm: bool = True

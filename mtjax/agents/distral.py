@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from mtjax.agents import parts
 from mtjax.agents.base import PARTS, Heads
 from mtjax.agents.sac import SAC, Batch, Sample
-from mtjax.networks import Network, Params, log_density, sample_raw
+from mtjax.networks import Network, Params, divergence, log_density, sample_raw
 from mtjax.types import Array, InputError, Key, Metrics
 
 
@@ -50,7 +50,7 @@ class Distral(SAC):
     each on the data of task i alone. The actor loss reaches pi_i also by the action in log pi_0, but not pi_0's
     parameters; distillation reaches these alone, and minimises KL(pi_i || pi_0) over them. Temperatures are tuned as
     SAC's, on the entropy of pi_i, so that c_KL = alpha a_i and c_Ent = (1 - alpha) a_i; alpha = 0 is one SAC for every
-    task, watched by pi_0. ``kl`` in the metrics is the mean of log pi_i - log pi_0.
+    task, watched by pi_0. ``kl`` in the metrics is the mean of KL(pi_i || pi_0) over the batch's observations.
 
     Training tasks are played by their own policies, others by the distilled one. As in the paper no policy is told its
     task; with another conditioning all are, pi_0 too.
@@ -104,7 +104,8 @@ class Distral(SAC):
     def actor_loss(self, actor: Params, data: tuple[Batch, Params, Key]) -> tuple[Array, Metrics]:
         loss, metrics = super().actor_loss(actor, data)
         batch, critic, key = data
-        raw, _ = sample_raw(self.policy(actor, critic, batch.told, batch.obs), key)  # the actions of that loss
-        outputs = self.actor.apply_distilled(actor, batch.told, batch.obs)
-        fit = jnp.mean(log_density(outputs, jax.lax.stop_gradient(raw), batch.mask))
-        return loss - fit, {**metrics, "kl": -metrics["entropy"] - fit}
+        own = self.policy(actor, critic, batch.told, batch.obs)
+        raw, _ = sample_raw(own, key)  # the actions of that loss
+        distilled = self.actor.apply_distilled(actor, batch.told, batch.obs)
+        fit = jnp.mean(log_density(distilled, jax.lax.stop_gradient(raw), batch.mask))
+        return loss - fit, {**metrics, "kl": jnp.mean(divergence(own, distilled, batch.mask))}

@@ -133,7 +133,7 @@ class PPO(BaseAgent):
     critic_lr: float = 1e-3
     """Adam's learning rate of the critic."""
     normalize_observations: bool = True
-    """Scale observations by their running mean and variance, fitted on training data alone."""
+    """Scale observations by their running mean and variance, fitted on training data alone, and clip them to +-10."""
     max_gradient_norm: float = 1.0
     """Clip the global norm of actor and critic gradients to this; 0 does not clip."""
     critic_layer_norm: bool = False

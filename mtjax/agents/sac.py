@@ -87,7 +87,8 @@ class SAC(BaseAgent):
     averaged over the batch of a task, then over tasks. ``discount`` is 0 only where an episode terminated, so that a
     time limit bootstraps. The actor follows the new critic, and so does the target.
 
-    Differs from the paper: layer-normalised critics; by default a target entropy H of -A/2 and one temperature a task.
+    Differs from the paper: layer-normalised critics; a learning rate of 1e-3, a target entropy H of -A/2 and one
+    temperature a task by default; log standard deviations are brought into [-5, 2] by a tanh.
     """
 
     temperature_lr: float = 1e-3
@@ -200,6 +201,11 @@ class SAC(BaseAgent):
         return self.policy(actor, critic, told, obs)
 
     # Losses of one task.
+
+    @property
+    def least_loss(self) -> float | Array:
+        """The least that a task's critic loss can be; rules that look at losses are given what lies above it."""
+        return 0.0
 
     def policy(self, actor: Params, critic: Params, told: Array, obs: Any) -> Array:
         """The policy's outputs (..., 2A); agents whose actor stands on the critic's representation use ``critic``."""
@@ -319,7 +325,12 @@ class SAC(BaseAgent):
         """The critic's loss for one task, and the data of all (T, ...): what ``surgery.gradient`` differentiates."""
         bootstrap = jax.vmap(self.target, (OVER_TASKS, OVER_TASKS, OVER_TASKS, 0, 0))
         keys = jax.random.split(key, len(batch.temperature))
-        return self.critic_loss, (batch, bootstrap(state.actor, state.critic, state.target, batch, keys))
+
+        def loss(critic: Params, data) -> tuple[Array, Metrics]:
+            value, metrics = self.critic_loss(critic, data)
+            return value - self.least_loss, metrics
+
+        return loss, (batch, bootstrap(state.actor, state.critic, state.target, batch, keys))
 
     def actor_problem(self, critic: Params, batch: Batch, key: Key) -> tuple[Callable, Any]:
         """The actor's loss for one task under a critic, and the data of all tasks (T, ...)."""

@@ -4,9 +4,10 @@ import dataclasses
 from pathlib import Path
 
 from mtjax.agents.parts.conditioning import load_vectors
-from mtjax.config import RunConfig
+from mtjax.config import RunConfig, require_range
 from mtjax.envs import Family
 from mtjax.parallel import hosts, mesh
+from mtjax.training import points
 from mtjax.training.finetune import require_fit
 from mtjax.training.policy import Policy, load
 from mtjax.training.run import Result, train
@@ -19,6 +20,8 @@ def check(config: RunConfig) -> None:
     _ = family.engine_name, family.table
     mesh.mesh_for(config.plan.seeds, family.train_count, config.training.num_envs)
     config.learner.experience.check(family, config.training.num_envs)
+    for learner in points.every(config.learner, config.points):
+        require_range(learner)
     if config.learner.vectors:
         load_vectors(config.learner.vectors, family.train_count)
     tune = config.learner.tune

@@ -98,6 +98,11 @@ def at(agent: BaseAgent, point: Point) -> BaseAgent:
     return _place(agent, point, dataclasses.replace)
 
 
+def every(agent: Any, found: Sequence[Point]) -> list[Any]:
+    """The agent at every point, or as it is if there are none."""
+    return [at(agent, point) for point in found] or [agent]
+
+
 def vary(agent: BaseAgent, knobs: Mapping[str, Array]) -> BaseAgent:
     """Return the agent with traced values, which its constructors could not check."""
     return _place(agent, knobs, parts.put)

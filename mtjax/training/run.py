@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from mtjax.config import Plan, configure
+from mtjax.config import Plan, configure, require_range
 from mtjax.evaluation import Evaluations, load_evaluations, save_evaluations
 from mtjax.loop import Settings, TrainState
 from mtjax.parallel import hosts
@@ -94,7 +94,8 @@ def train(
     plan = Plan(steps, seed, seeds, eval_every, eval_episodes)
     agent, settings = configure(agent, settings or Settings(), given)
     found = points.grid(sweep)
-    for learner in [points.at(agent, point) for point in found] or [agent]:  # type: ignore
+    for learner in points.every(agent, found):
+        require_range(learner)
         if start is not None:
             finetune.require_fit(start, env, learner)  # type: ignore
     directory = None if directory is None else Path(directory)

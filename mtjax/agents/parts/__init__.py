@@ -122,6 +122,12 @@ def require_layers(holder: Any, *names: str) -> None:
         _require(widths and min(widths) >= 1, holder, name, "needs at least one layer of at least one unit")
 
 
+def require_widths(holder: Any, *names: str) -> None:
+    """Widths are of at least one unit each; there may be none."""
+    for name in names:
+        _require(all(width >= 1 for width in getattr(holder, name)), holder, name, "must be of at least one unit each")
+
+
 def _require(met: Any, holder: Any, name: str, rule: str) -> None:
     if not met:
         raise InputError(f"{_flag(name)} {rule}, not {getattr(holder, name)}")

@@ -17,6 +17,10 @@ class Scalar:
     Every kind of value is a class like this one. Critics' outputs have a leading N.
     """
 
+    def refuses(self, scaling: str) -> str:
+        """Why it cannot work with a scaling of rewards; empty if it can."""
+        return ""
+
     @property
     def outputs(self) -> int:
         """Outputs of a critic."""
@@ -56,7 +60,8 @@ class C51(Scalar):
     several critics p is the distribution with the least mean, sample by sample, or the mean of all distributions.
 
     Differs from the paper: a soft value's bonus shifts the atoms, and the policy is the actor's, as in BRC (Nauman et
-    al. 2025), whose range is the default; it suits returns scaled to it.
+    al. 2025). BRC's range is the default, for returns that scaling=return brings into it; without that scaling a range
+    must be given, as returns beyond it are all the same to the critic.
     """
 
     num_bins: int = 101
@@ -64,13 +69,22 @@ class C51(Scalar):
     value_low: float = -10.0
     """Lowest return the distribution reaches; lower ones are taken for it."""
     value_high: float = 10.0
-    """Highest return the distribution reaches; higher ones are taken for it. Choose it to fit, or scaling=return."""
+    """Highest return the distribution reaches; higher ones are taken for it."""
 
     def __post_init__(self):
         if self.num_bins < 2:
             raise InputError(f"num-bins must be at least 2, not {self.num_bins}")
         if not -np.inf < self.value_low < self.value_high < np.inf:
             raise InputError(f"value-low must be below value-high, not {self.value_low} and {self.value_high}")
+
+    def refuses(self, scaling: str) -> str:
+        given = (self.value_low, self.value_high) != (C51.value_low, C51.value_high)
+        if given or scaling == "return":
+            return ""
+        return (
+            f"reaches returns from {self.value_low:g} to {self.value_high:g}, and scaling={scaling} does not keep them "
+            "there; use scaling=return, or give a value-low and value-high that they fit"
+        )
 
     @property
     def outputs(self) -> int:
@@ -115,6 +129,8 @@ class HLGauss(C51):
     summing to one, fitted by the cross-entropy; the value is the mean of the bins' centres. Sigma is 0.75 bin widths,
     as in Farebrother et al. (2024). Within two bin widths of the range's ends the truncated normal's mean, and so the
     value, falls short of y.
+
+    Differs from the papers: y is a soft value, by the least critic or by the mean of all.
     """
 
     bin_sigma: float = 0.75

@@ -7,7 +7,9 @@ from typing import Any, ClassVar
 import flax.linen as nn
 import jax.numpy as jnp
 
+from mtjax.agents import parts
 from mtjax.agents.parts.encoders.base import Identity
+from mtjax.agents.parts.encoders.mixture import TaskWeights
 from mtjax.networks import MLP, ReLU
 from mtjax.types import Array, InputError
 
@@ -49,18 +51,17 @@ class ComposedTrunk(nn.Module):
 
 
 class PaCoTrunk(nn.Module):
-    """Composed layers by weights that are linear in the task's features."""
+    """Composed layers by weights that an MLP makes of the task's features."""
 
     num_sets: int
     hidden: tuple[int, ...]
     layer_norm: bool
+    weight_widths: tuple[int, ...] = ()
 
     @nn.compact
     def __call__(self, obs: Array, features: Array, *action: Array) -> Array:
-        # Squares of weights add up to about 1 for features near 0 and 2 for unit ones: kernels of LeCun's size.
-        share = 1 / self.num_sets
-        slope, level = nn.initializers.variance_scaling(share, "fan_in", "normal"), nn.initializers.constant(share**0.5)
-        weights = nn.Dense(self.num_sets, kernel_init=slope, bias_init=level, name="weights")(features)
+        level = self.num_sets**-0.5  # squares of weights add up to between 1 and 2: kernels of LeCun's size
+        weights = TaskWeights(self.num_sets, self.weight_widths, level, name="weights")(features)
         return ComposedTrunk(self.hidden, self.layer_norm, name="trunk")(jnp.concatenate([obs, *action], -1), weights)
 
 
@@ -69,24 +70,28 @@ class PaCo(Identity):
     """Parameter composition (Sun, Zhang, Xu and Tomizuka 2022): theta_task = sum_k w_k(task) Phi_k.
 
     Every hidden layer's kernel and bias are such sums, of sets Phi that all tasks share; the task enters in no other
-    way. The weights w = A z + b are linear in the task's features z. For conditioning=one-hot that is the paper's free
-    vector for every task; for parameters, tasks that were not trained on get a policy of their own from the sets.
+    way. A small MLP makes the weights w of the task's features, so that tasks that were not trained on get a policy of
+    their own from the sets.
 
-    Differs from the paper: the output layer is the network's head, composed for no task (heads=per-task gives each its
-    own); scales and shifts of layer normalisation are shared; a task whose loss explodes is neither masked out nor
-    given new weights from those of solved tasks.
+    Differs from the paper: there every task has a vector w of its own, which ``weight_widths=()`` is for
+    conditioning=one-hot. Linear in few parameters, weights would not be free: of tasks along one parameter they would
+    be a line, and two sets would make all policies, however many there are. The output layer is the network's head,
+    composed for no task (heads=per-task gives each its own); scales and shifts of layer normalisation are shared; a
+    task whose loss explodes is neither masked out nor given new weights from those of solved tasks.
     """
 
     needs_features: ClassVar[bool] = True
     num_sets: int = 5
     """Sets of parameters. The paper: 5 for 10 tasks."""
+    weight_widths: tuple[int, ...] = (64,)
+    """Widths of the hidden layers between the task's features and its weights; none makes these linear."""
 
     def __post_init__(self):
-        if self.num_sets < 1:
-            raise InputError(f"num-sets must be at least 1, not {self.num_sets}")
+        parts.require_counts(self, "num_sets")
+        parts.require_widths(self, "weight_widths")
 
     def body(self, hidden: tuple[int, ...], layer_norm: bool) -> nn.Module:
-        return PaCoTrunk(self.num_sets, hidden, layer_norm)
+        return PaCoTrunk(self.num_sets, hidden, layer_norm, self.weight_widths)
 
 
 def _first_alone(key, shape: tuple[int, ...], dtype=jnp.float32) -> Array:

@@ -7,9 +7,10 @@ import flax.linen as nn
 import jax.numpy as jnp
 import numpy as np
 
+from mtjax.agents import parts
 from mtjax.agents.parts.encoders.base import Identity
 from mtjax.networks import MLP, ReLU
-from mtjax.types import Array, InputError
+from mtjax.types import Array
 
 
 class ModulatedMLP(nn.Module):
@@ -44,8 +45,8 @@ class FiLMTrunk(nn.Module):
         # From zero, so that at the start every task has the same plain network.
         to_modulation = nn.Dense(2 * sum(sizes), kernel_init=nn.initializers.zeros, name="modulation")
         modulation = to_modulation(MLP(self.film_widths, name="generator")(features))
-        parts = jnp.split(modulation, np.cumsum(sizes + sizes)[:-1], axis=-1)
-        scales, shifts = [1 + part for part in parts[: len(sizes)]], parts[len(sizes) :]
+        read = jnp.split(modulation, np.cumsum(sizes + sizes)[:-1], axis=-1)
+        scales, shifts = [1 + part for part in read[: len(sizes)]], read[len(sizes) :]
         x = jnp.concatenate([obs, *action], axis=-1)
         return ModulatedMLP(self.widths, self.layer_norm, scalar, name="trunk")(x, scales, shifts)
 
@@ -72,8 +73,7 @@ class FiLM(Identity):
 
     def __post_init__(self):
         super().__post_init__()
-        if any(width < 1 for width in self.film_widths):
-            raise InputError(f"film-widths must be of at least one unit each, not {self.film_widths}")
+        parts.require_widths(self, "film_widths")
 
     def body(self, hidden: tuple[int, ...], layer_norm: bool) -> nn.Module:
         return FiLMTrunk(hidden, layer_norm, self.film, self.film_widths)

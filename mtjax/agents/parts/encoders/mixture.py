@@ -69,6 +69,31 @@ class Gate(nn.Module):
         return nn.Dense(self.num_experts, name="scores")(MLP(self.widths)(features))
 
 
+def _either_way(key, shape: tuple[int, ...], dtype=jnp.float32) -> Array:
+    return jax.random.uniform(key, shape, dtype, -1.0, 1.0)
+
+
+class TaskWeights(nn.Module):
+    """An MLP from what is known of a task to weights (..., K) of any sign; without hidden layers it is linear.
+
+    At the start a weight is about ``level``, and its square one to two times as large as that of ``level``, for
+    features from nothing to unit ones. Hidden units begin to be active at places spread over the training range, so
+    that tasks along a line have weights that do not lie on one.
+    """
+
+    num: int
+    widths: tuple[int, ...]
+    level: float = 1.0
+
+    @nn.compact
+    def __call__(self, features: Array) -> Array:
+        for width in self.widths:
+            features = nn.Dense(width, kernel_init=nn.initializers.he_normal(), bias_init=_either_way)(features)
+            features = ReLU()(features)
+        slope, level = nn.initializers.variance_scaling(self.level**2, "fan_in", "normal"), self.level
+        return nn.Dense(self.num, kernel_init=slope, bias_init=nn.initializers.constant(level), name="out")(features)
+
+
 class MixtureTrunk(nn.Module):
     """Encode an observation by a task's mixture of experts, and an MLP on the encoding and everything else."""
 

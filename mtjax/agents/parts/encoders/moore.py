@@ -7,8 +7,9 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from mtjax.agents import parts
 from mtjax.agents.parts.encoders.base import Identity
-from mtjax.agents.parts.encoders.mixture import Experts, check_experts, mix
+from mtjax.agents.parts.encoders.mixture import Experts, TaskWeights, check_experts, mix
 from mtjax.types import Array, InputError
 
 _SHARE, _LENGTH = 1e-4, 1e-3  # a vector of which less is new counts for little; slopes are bounded by the inverses
@@ -38,13 +39,13 @@ class OrthogonalMixture(nn.Module):
     num_experts: int
     widths: tuple[int, ...]
     layer_norm: bool
+    weight_widths: tuple[int, ...] = ()
 
     @nn.compact
     def __call__(self, obs: Array, features: Array, *action: Array) -> Array:
         inputs = jnp.concatenate([obs, *action], axis=-1)
         basis = orthonormal(Experts(self.num_experts, self.widths, self.layer_norm, name="experts")(inputs))
-        # From 1, as the parameters of a task may all be 0, and would weigh every expert by nothing.
-        weights = nn.Dense(self.num_experts, bias_init=nn.initializers.ones, name="weights")(features)
+        weights = TaskWeights(self.num_experts, self.weight_widths, name="weights")(features)
         return jnp.tanh(mix(weights, basis))
 
 
@@ -52,27 +53,32 @@ class OrthogonalMixture(nn.Module):
 class MOORE(Identity):
     """A mixture of orthogonal experts (Hendawy, Peters and D'Eramo 2024).
 
-    K experts h_k read the observation and, in a critic, the action. For a task of features c:
-        U = [h_1(x), ..., h_K(x)],   V = Gram-Schmidt(U),   z = tanh(V (W c + b))
+    K experts h_k read the observation and, in a critic, the action. For a task of features c, with an MLP w:
+        U = [h_1(x), ..., h_K(x)],   V = Gram-Schmidt(U),   z = tanh(V w(c))
     and the task's head stands on z, as nothing follows the mixture but the paper's linear output, one for each task
     (heads=per-task). ``hidden`` are the widths of an expert; the last layer is linear, and where layer normalisation is
     asked for it comes before the ReLU of the others. The paper has hidden layers of 400, K = 4 for MT10 and 6 for MT50.
 
-    Differs from the paper: the weights have a bias b, without which a task whose features are 0 would be told nothing
-    of its observation (the paper's task numbers are one-hot, for which W alone can be the same); Gram-Schmidt is
-    finite where experts are 0 or dependent.
+    Differs from the paper: there w(c) = W c for one-hot task numbers c, so that every task's weights are free. Linear
+    in few parameters they would not be: of tasks along one parameter they would be a line, and two mixtures of experts
+    would make all others. ``weight_widths=()`` with conditioning=one-hot is the paper's, but for a bias, without which
+    a task whose features are 0 would be told nothing of its observation. Gram-Schmidt is finite where experts are 0 or
+    dependent.
     """
 
     needs_features: ClassVar[bool] = True
     num_experts: int = 4
     """Orthogonal experts; no more than the last hidden layer has units."""
+    weight_widths: tuple[int, ...] = (64,)
+    """Widths of the hidden layers between the task's features and its weights; none makes these linear."""
 
     def __post_init__(self):
         check_experts(self.num_experts, (1,))
+        parts.require_widths(self, "weight_widths")
 
     def body(self, hidden: tuple[int, ...], layer_norm: bool) -> nn.Module:
         if hidden[-1] < self.num_experts:
             raise InputError(
                 f"{self.num_experts} orthogonal experts need a last hidden layer as wide, not {hidden[-1]}"
             )
-        return OrthogonalMixture(self.num_experts, hidden, layer_norm)
+        return OrthogonalMixture(self.num_experts, hidden, layer_norm, self.weight_widths)

@@ -58,9 +58,12 @@ class BroNet(Identity):
     """BroNet (Nauman et al. 2024, "Bigger, Regularized, Optimistic"), with a block for each width of ``hidden``.
 
         x = relu(LN(Dense(inputs)));   x <- x + LN(Dense(relu(LN(Dense(x)))))   in each block
-    Kernels start by He's initialisation, where the authors' are orthogonal times sqrt 2, which is of the same size and
-    takes a QR decomposition each. Norms are the body's own: critic-layer-norm and actor-layer-norm say nothing here.
-    The paper: 2 blocks of 512 in critics, 1 of 256 in the actor; actor and critics are of one size here.
+    Norms are the body's own: critic-layer-norm and actor-layer-norm say nothing here.
+
+    Differs from the paper: actor and critics are of one size (there, 2 blocks of 512 in critics and 1 of 256 in the
+    actor); kernels start by He's initialisation, where the authors' are orthogonal times sqrt 2, which is of the same
+    size and takes a QR decomposition each, and heads by LeCun's; of the paper's agent it is the network alone, without
+    optimistic exploration, quantiles and resets.
     """
 
     def body(self, hidden: tuple[int, ...], layer_norm: bool) -> nn.Module:
@@ -72,10 +75,11 @@ class SimBa(Identity):
     """SimBa (Lee et al. 2024, "Simplicity Bias for Scaling Up Parameters"), with a block for each width of ``hidden``.
 
         x = Dense(inputs);   x <- x + Dense(relu(Dense_4w(LN(x))))   in each block;   LN(x)
-    Kernels start by He's initialisation in blocks; the authors' first layer is orthogonal. Norms are the body's own:
-    critic-layer-norm and actor-layer-norm say nothing here. The paper scales observations by their running statistics
-    too, which is normalize-observations, and decays weights; it has 2 blocks of 512 in critics and 1 of 128 in the
-    actor; actor and critics are of one size here.
+    Norms are the body's own: critic-layer-norm and actor-layer-norm say nothing here. The paper scales observations by
+    their running statistics, which is normalize-observations, and decays weights, which is weight-decay.
+
+    Differs from the paper: actor and critics are of one size (there, 2 blocks of 512 in critics and 1 of 128 in the
+    actor); the first layer starts by LeCun's initialisation, where the authors' is orthogonal.
     """
 
     expansion: int = 4

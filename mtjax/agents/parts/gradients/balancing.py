@@ -1,4 +1,9 @@
-"""Rules of gradient surgery that balance tasks over time: weights that are parameters, learned beside the networks'."""
+"""Rules of gradient surgery that balance tasks over time: weights that are parameters, learned beside the networks'.
+
+Both look at ratios of losses, which mean something only where 0 is the least that a loss can be. Agents count their
+critics' losses from there (``SAC.least_loss``), as a log-likelihood, for one, may be negative; an actor's loss has no
+known least, and ``for_actor`` looks at none. A loss that is 0 or below all the same is that of a task that is absent.
+"""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -63,8 +68,8 @@ class GradNorm(_Learned):
     its weight.
 
     Differs from the paper: n_i is over all shared parameters, of which the paper takes the last layer; L is in units of
-    the mean length, so that Adam's step does not depend on the losses' scale; losses below 0 count as 0. An actor's
-    losses tell nothing of its progress, so that its weights make all lengths equal (a = 0).
+    the mean length, so that Adam's step does not depend on the losses' scale; losses are counted from the least that
+    they can be. An actor's losses tell nothing of its progress, so that its weights make all lengths equal (a = 0).
     """
 
     needs = "gradients"
@@ -112,7 +117,8 @@ class FAMO(_Learned):
     With the losses l of a batch before the update and l' after it, and logits x:
         z = softmax(x),  w_i = (z_i / l_i) / sum_j (z_j / l_j)                     (weights of the update)
         x descends  z_i (d_i - z . d) + decay x_i,  d = log l - log l'             (the losses' part: d by z's slope)
-    Losses must be positive, so that the actor's are averaged.
+    Losses are counted from the least that they can be, as in its authors' code. The actor's may be anything, and are
+    averaged.
 
     Differs from the paper: x descends by Adam, as in its authors' code; algorithm 1 has a plain step of the same size,
     which at the pace of a critic's losses would leave z all but uniform. Parameters of one task are not weighted.
