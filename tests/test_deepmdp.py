@@ -1,4 +1,4 @@
-"""DeepMDP and HiP-BMDP: their losses in plain NumPy, which parameters each moves, and what they learn."""
+"""DeepMDP and HiP-BMDP under SAC and PPO: their losses in NumPy, which parameters each moves, what they learn."""
 
 from functools import partial
 
@@ -6,15 +6,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import QUICK, Probe, learner, of_task, only_seed, pick, random_batch, tasks_of, tiny, train
+from probes import QUICK, Probe, learner, of_task, only_seed, pick, random_batch, random_past, tasks_of, tiny, train
 from probes import act as act_once
 from probes import values as values_of
 
+from mtjax import agents
 from mtjax.agents.parts.representations.deepmdp import SIGHT, Ahead
 from mtjax.agents.parts.trajectory import Past, Seen, append
+from mtjax.agents.ppo import Taken
 from mtjax.agents.sac import Batch
 from mtjax.networks import Params
-from mtjax.types import InputError, Spec
+from mtjax.types import InputError, Spec, Transition
 
 SPEC, BATCH = Spec.vector(3, 2, 1), 4
 TASKS = tasks_of("one-step", (1.0, -0.5, 0.3))
@@ -430,9 +432,128 @@ def test_parts_combine(name, settings):
     assert jax.eval_shape(act, state, batch.obs[:, 0, 0]).shape == (2, 2)
 
 
+def test_the_agents_are_sac_with_that_part():
+    """And another representation in its place leaves SAC as it is."""
+    assert agents.agent("deepmdp") == agents.agent("sac-conditioned", representation="deepmdp")
+    assert agents.agent("deepmdp", representation="plain") == agents.agent("sac-conditioned")
+    theta = {"conditioning": "embedding", "embedding_size": 50}
+    assert agents.agent("hip-bmdp") == agents.agent("sac", representation="hip-bmdp", **theta)
+
+
+@pytest.mark.parametrize("representation", ["deepmdp", "hip-bmdp"])
+@pytest.mark.parametrize("name", ["sac", "care", "soft-modularization", "multi-head", "disjoint", "brc", "cagrad"])
+def test_other_agents_stand_on_it(name, representation):
+    """Traced, not run: actor and critics on latent states, one encoder and one of each model beside them."""
+    agent, batch = make(name, representation=representation), random_batch(0, 3, BATCH, SPEC)
+    state = jax.eval_shape(lambda: agent.init(SPEC, TASKS, KEY))
+    after, metrics = jax.eval_shape(lambda state: agent.update(state, batch, TASKS, KEY), state)
+    assert jax.tree.map(jnp.shape, after) == jax.tree.map(jnp.shape, state)
+    assert metrics["transition_loss"].shape == metrics["reward_loss"].shape == (3,)
+    place = "own" if name == "disjoint" else "shared"
+    for network, there in ((state.critic, {"latent", "transition", "reward"}), (state.target, {"latent"})):
+        assert {"latent", "transition", "reward"} & set(getattr(network, place)) == there
+    assert not set(agent.representation.names) & {*state.actor.shared, *state.actor.own}
+    assert jax.eval_shape(lambda s: act_once(agent, s, jnp.ones(3), STRANGER, None), state).shape == (2,)
+
+
+# PPO, which has neither replay nor slow copies.
+
+
+def make_ppo(**settings):
+    return make("ppo", epochs=1, minibatches=1, normalize_observations=False, **settings)
+
+
+def rollouts(agent, seed=0):
+    """Rollouts (T, H, E, ...) in which every field is random."""
+    random, shape = np.random.default_rng(seed), (3, 4, 2)
+    normal = lambda *size: jnp.float32(random.normal(size=(*shape, *size)))
+    past = random_past(random, (*shape, agent.history), SPEC) if agent.history else None
+    raw, ended = normal(2), jnp.asarray(random.random(shape) < 0.5)
+    fields = {"reward": normal(), "discount": jnp.ones(shape), "ended": ended, "extras": Taken(raw, normal() - 2, past)}
+    return Transition(obs=normal(3), action=jnp.tanh(raw), next_obs=normal(3), **fields)
+
+
+def of_first_task(agent, state, steps):
+    """The critic of the first task, and its steps as the losses see them."""
+    _, batch, _ = agent.prepare(state, steps, TASKS)
+    ahead, _ = agent.sight.targets(state.critic, state.critic, batch.next_obs, KEY)
+    return of_task(state.critic, 0), pick(batch._replace(ahead=ahead), 0)
+
+
+def test_ppos_critic_loss_reaches_the_representation():
+    """Each loss its own part of it; the critic's own is joined by all."""
+    agent = make_ppo(representation="hip-bmdp", transition="probabilistic", **INFERRED)
+    state = agent.init(SPEC, TASKS, KEY)
+    draw = lambda x: x + 0.1 * jnp.float32(np.random.default_rng(4).normal(size=x.shape))  # heads begin near zero
+    state = state._replace(critic=jax.tree.map(draw, state.critic))
+    critic, batch = of_first_task(agent, state, rollouts(agent))
+    jacobian = jit(jax.jacrev(lambda critic: {k: agent.critic_loss(critic, batch)[1][k] for k in REACHES}))(critic)
+    for loss, expected in REACHES.items():
+        assert reached(jacobian[loss]) == expected, loss
+    whole = jit(jax.grad(lambda critic: agent.critic_loss(critic, batch)[0]))(critic)
+    assert reached(whole) == set.union(*REACHES.values())
+    loss, found = jit(agent.critic_loss)(critic, batch)
+    models = found["transition_loss"] + found["reward_loss"]
+    expected = found["critic_loss"] + models + 0.01 * found["theta_loss"] + found["guess_loss"]
+    np.testing.assert_allclose(loss, expected, rtol=1e-5)
+
+
+def test_ppos_actor_does_not_train_the_representation():
+    """Another cost of entropy and another actor leave critic, encoder, models and thetas bit for bit."""
+    agents_of = [make_ppo(representation="hip-bmdp", entropy_cost=cost) for cost in (0.0, 1.0)]
+    steps = rollouts(agents_of[0])
+    state = agents_of[0].init(SPEC, TASKS, KEY)
+    other = state._replace(actor=jax.tree.map(lambda x: x * 1.5 + 0.05, state.actor))
+    plain, *moved = (
+        jit(agent.update)(start, steps, TASKS, KEY)[0]
+        for agent, start in ((agents_of[0], state), (agents_of[1], state), (agents_of[0], other))
+    )
+    for after in moved:
+        for a, b in zip(jax.tree.leaves(plain.critic), jax.tree.leaves(after.critic), strict=True):
+            np.testing.assert_array_equal(a, b)
+        assert reached(jax.tree.map(jnp.subtract, plain.actor, after.actor)) == {"body", "head"}
+    # And what the actor does depends on it: the same actor on another encoder acts otherwise.
+    blind = state._replace(critic=jax.tree.map(lambda x: x * 1.5 + 0.05, state.critic))
+    seeing, other = (act_once(agents_of[0], x, jnp.ones(3), pick(TASKS, 0), None) for x in (state, blind))
+    assert not np.array_equal(seeing, other)
+
+
+def test_ppos_models_foretell_what_the_encoder_saw_before_the_update():
+    """The critic's targets do not change with it, the transition loss does."""
+    agent = make_ppo(representation="deepmdp")
+    state = agent.init(SPEC, TASKS, KEY)
+    state, batch, _ = agent.prepare(state, rollouts(agent), TASKS)
+    given = (jnp.arange(8), KEY)
+    improve = jit(lambda slow: agent.improve(batch, slow, (state, jnp.bool_(True)), given)[1])
+    now, other = improve(state.critic), improve(jax.tree.map(lambda x: x * 1.5 + 0.05, state.critic))
+    np.testing.assert_array_equal(now["critic_loss"], other["critic_loss"])
+    assert np.all(np.asarray(now["transition_loss"]) != np.asarray(other["transition_loss"]))
+    critic, one = of_first_task(agent, state, rollouts(agent))
+    expected = plain_latent(critic.shared["latent"], np.asarray(one.next_obs))
+    np.testing.assert_allclose(one.ahead.latent, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_ppo_learns_a_model_of_its_rollouts():
+    """Everything moves, and after many updates models foretell s' = s / 2 + (a, 0) and its first number far better."""
+    agent = make_ppo(representation="deepmdp", critic_lr=1e-2, gamma=0.0)
+    before, steps = agent.init(SPEC, TASKS, KEY), rollouts(agent)
+    then = 0.5 * steps.obs + jnp.pad(steps.action, [(0, 0)] * 3 + [(0, 1)])
+    steps = steps._replace(next_obs=then, reward=then[..., 0])
+    learn = lambda state, key: agent.update(state, steps, TASKS, key)
+    after, history = jit(lambda state: jax.lax.scan(learn, state, jax.random.split(KEY, 300)))(before)
+    moved = jax.tree.map(jnp.subtract, after.critic, before.critic)
+    assert reached(moved) == {"body", "head", "latent", "transition", "reward"}
+    for name in ("transition_loss", "reward_loss"):
+        assert np.all(history[name][-1] < 0.2 * history[name][0]), (name, history[name][-1] / history[name][0])
+
+
 @pytest.mark.parametrize(
     ("name", "settings", "message"),
     [
+        ("distral", {"representation": "deepmdp"}, "distilled policy cannot stand; use representation=plain"),
+        ("sac", {"representation": "deepmpd"}, "unknown representation 'deepmpd'; did you mean 'deepmdp'"),
+        ("sac", {"latent_widths": (8,)}, "unknown setting of sac 'latent_widths'"),
+        ("ppo", {"representation": "hip-bmdp", "encoder": "input-map"}, "input-map maps observations"),
         ("deepmdp", {"transition": "gaussian"}, "unknown transition 'gaussian'.*probabilistic"),
         ("deepmdp", {"latent_widths": ()}, r"latent-widths needs at least one layer .*not \(\)"),
         ("deepmdp", {"model_widths": (8, 0)}, r"model-widths .*at least one unit, not \(8, 0\)"),
@@ -447,4 +568,4 @@ def test_parts_combine(name, settings):
 def test_settings_that_make_no_sense_are_refused(name, settings, message):
     """With what was given and what is allowed."""
     with pytest.raises(InputError, match=message):
-        make(name, **settings)
+        agents.agent(name, **settings)
