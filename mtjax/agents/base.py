@@ -206,6 +206,7 @@ class BaseAgent(abc.ABC):
 
     @property
     def network_optimizers(self) -> Pair:
+        """Adam for the actor, and for the critics with the representation beside them."""
         chosen = partial(descent.adam, weight_decay=self.weight_decay, max_norm=self.max_gradient_norm, tune=self.tune)
         return Pair(chosen(self.actor_lr), chosen(self.critic_lr))
 
@@ -306,6 +307,13 @@ class BaseAgent(abc.ABC):
         """Networks as one task uses them."""
         known = self.known_task(state, task)
         return tuple(Params(net.shared, jax.tree.map(lambda x: x[known], net.own)) for net in networks)
+
+    def situation(self, state: Any, memory: Memory, obs: Any, task: Task) -> tuple[Params, Params, Array, Any]:
+        """Actor and critics as one task uses them to act, what they are told (Z,), and an observation (O,) as seen."""
+        actor, critic = self.of_task(state, task, state.actor, state.critic)
+        seen = self.see(self.moments_of(state, self.known_task(state, task)), obs, memory.past)
+        critic = self.sight.stand_in(critic, state.critic, task.id < len(state.contexts), seen)
+        return actor, critic, self.features(state, task), seen
 
     def discounts(self, tasks: Task) -> float | Array:
         """The discount of each task (T,), or one for all."""

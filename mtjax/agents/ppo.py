@@ -206,10 +206,8 @@ class PPO(BaseAgent):
 
     def act(self, state: PPOState, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
         """Choose an action (A,) for one observation (O,) of one task; no key: the mean action."""
-        actor, critic = self.of_task(state, task, state.actor, state.critic)
-        seen = self.see(self.moments_of(state, self.known_task(state, task)), obs, memory.past)
-        critic = self.sight.stand_in(critic, state.critic, task.id < len(state.contexts), seen)
-        outputs = self.actor.apply(actor, *self.look(critic, self.features(state, task), seen))
+        actor, critic, told, seen = self.situation(state, memory, obs, task)
+        outputs = self.actor.apply(actor, *self.look(critic, told, seen))
         if key is None:
             return Acted(tanh_normal(outputs, None, task.action_mask)[0], None, memory)
         raw, log_prob = sample_raw(outputs, key, task.action_mask)

@@ -156,11 +156,8 @@ class SAC(BaseAgent):
 
     def act(self, state: SACState, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
         """Choose an action (A,) for one observation (O,) of one task; no key: the mean action."""
-        actor, critic = self.of_task(state, task, state.actor, state.critic)
         trained = task.id < len(state.contexts)
-        seen = self.see(self.moments_of(state, self.known_task(state, task)), obs, memory.past)
-        critic = self.sight.stand_in(critic, state.critic, trained, seen)
-        outputs = self.behaviour(trained, actor, critic, self.features(state, task), seen)
+        outputs = self.behaviour(trained, *self.situation(state, memory, obs, task))
         return Acted(tanh_normal(outputs, key, task.action_mask)[0], memory.past, memory)
 
     def behaviour(self, trained: Array, actor: Params, critic: Params, told: Array, obs: Any) -> Array:
