@@ -11,6 +11,7 @@ from probes import act as act_once
 from probes import values as values_of
 
 from mtjax import agents
+from mtjax.agents.parts.gradients.balancing import FAMO
 from mtjax.agents.parts.representations.deepmdp import SIGHT, Ahead
 from mtjax.agents.parts.trajectory import Past, Seen, append
 from mtjax.agents.ppo import Taken
@@ -118,6 +119,46 @@ def test_model_losses(name, transition):
     _, metrics = jit(agent.critic_loss)(critic, (batch, value))
     np.testing.assert_allclose(metrics["transition_loss"], likelihood.mean(), rtol=1e-4)
     np.testing.assert_allclose(metrics["reward_loss"], np.mean((reward - batch.reward) ** 2), rtol=1e-4)
+
+
+@pytest.mark.parametrize("transition", ["deterministic", "probabilistic"])
+@pytest.mark.parametrize("name", ["deepmdp", "hip-bmdp"])
+def test_no_loss_is_less_than_the_least(name, transition, monkeypatch):
+    """Where the next state is foretold exactly, and as surely as can be, what is left is the other losses'."""
+    without_theta = {"theta_coefficient": 0.0} if name == "hip-bmdp" else {}
+    agent = make(name, transition=transition, model_coefficient=0.5, **without_theta)
+    deviation = 0.01 if transition == "probabilistic" else 1.0
+    exact = lambda self, critic, told, latent, a: (jnp.full_like(latent, 0.3), jnp.full_like(latent, deviation))
+    monkeypatch.setattr(type(agent.representation), "foretell", exact)
+    _, critic = random_params(agent)
+    batch, value = one_task(agent)
+    ahead = batch.ahead._replace(latent=jnp.full_like(batch.ahead.latent, 0.3))
+    loss, found = agent.critic_loss(critic, (batch._replace(ahead=ahead), value))
+    np.testing.assert_allclose(loss - agent.least_loss, found["critic_loss"] + 0.5 * found["reward_loss"], rtol=1e-4)
+
+
+def test_networks_on_plain_observations_add_nothing_to_the_least():
+    """In SAC as in PPO."""
+    assert tiny("sac").least_loss == tiny("ppo").least_loss == 0
+
+
+@pytest.mark.parametrize("transition", ["deterministic", "probabilistic"])
+@pytest.mark.parametrize("name", ["sac", "ppo"])
+def test_rules_see_losses_from_the_least(name, transition, monkeypatch):
+    """What FAMO is given in an update of either agent, and that it sees the losses fall from there."""
+    weigh = lambda self, memory, gram, losses, key: (jnp.ones(3) / 3, memory._replace(logits=losses))
+    adapt = lambda self, memory, before, after: memory._replace(
+        logits=jnp.where((before == memory.logits) & (after > 0) & (after != before), before, jnp.nan)
+    )
+    monkeypatch.setattr(FAMO, "weigh", weigh)
+    monkeypatch.setattr(FAMO, "adapt", adapt)
+    settings = {"representation": "deepmdp", "transition": transition, "model_coefficient": 0.5, "gradients": "famo"}
+    agent = make_ppo(**settings) if name == "ppo" else make(name, **settings)
+    batch = rollouts(agent) if name == "ppo" else random_batch(0, 3, BATCH, SPEC, agent.history)
+    state, found = jit(agent.update)(agent.init(SPEC, TASKS, KEY), batch, TASKS, KEY)
+    surest = np.log(0.01) if transition == "probabilistic" else 0.0
+    expected = found["critic_loss"] + 0.5 * (found["transition_loss"] + found["reward_loss"]) - 0.5 * surest
+    np.testing.assert_allclose(state.surgery.critic.logits, expected, rtol=1e-4)
 
 
 def test_the_losses_add_up():

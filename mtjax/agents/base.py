@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Annotated, Any, Literal, NamedTuple, get_args, get_type_hints
 
@@ -371,6 +371,20 @@ class BaseAgent(abc.ABC):
         return state._replace(scales=scales, progress=self.sampler.observe(state.progress, outcome))
 
     # Learning.
+
+    @property
+    def least_loss(self) -> float | Array:
+        """The least that a task's critic loss can be: that of critics, which is 0, and of the representation."""
+        return self.representation.least_loss
+
+    def above_least(self, critic_loss: Callable) -> Callable:
+        """A critic loss of one task as far as it lies above the least, which rules that look at losses are given."""
+
+        def loss(critic: Params, data: Any) -> tuple[Array, Metrics]:
+            value, metrics = critic_loss(critic, data)
+            return value - self.least_loss, metrics
+
+        return loss
 
     def learn(self, env: Env, states: Any, data: Any, tasks: Task, keys: Key) -> tuple[Any, Metrics]:
         """Learn from experience, for all seeds at once: leaves (S, ...)."""

@@ -167,11 +167,6 @@ class SAC(BaseAgent):
 
     # Losses of one task.
 
-    @property
-    def least_loss(self) -> float | Array:
-        """The least that a task's critic loss can be; rules that look at losses are given what lies above it."""
-        return 0.0
-
     def policy(self, actor: Params, critic: Params, told: Array, obs: Any) -> Array:
         """The policy's outputs (..., 2A); the actor stands on the representation that lies beside the critics."""
         return self.actor.apply(actor, *self.look(critic, told, obs))
@@ -295,12 +290,7 @@ class SAC(BaseAgent):
         ahead, keys = self.sight.targets(state.critic, state.target, batch.next_obs, key)
         bootstrap = jax.vmap(self.target, (OVER_TASKS, OVER_TASKS, OVER_TASKS, 0, 0))
         target = bootstrap(state.actor, state.critic, state.target, batch, keys)
-
-        def loss(critic: Params, data) -> tuple[Array, Metrics]:
-            value, metrics = self.critic_loss(critic, data)
-            return value - self.least_loss, metrics
-
-        return loss, (batch._replace(ahead=ahead), target)
+        return self.above_least(self.critic_loss), (batch._replace(ahead=ahead), target)
 
     def actor_problem(self, critic: Params, batch: Batch, key: Key) -> tuple[Callable, Any]:
         """The actor's loss for one task under a critic, and the data of all tasks (T, ...)."""

@@ -92,6 +92,11 @@ class Plain:
         """
         return loss, metrics
 
+    @property
+    def least_loss(self) -> float | Array:
+        """The least that its own losses can add to the critics'."""
+        return 0.0
+
     # Tasks that were not trained on.
 
     def stand_in(self, params: Params, trained: Params, known: Array, obs: Any) -> Params:

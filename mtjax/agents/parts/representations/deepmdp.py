@@ -1,6 +1,7 @@
 """DeepMDP: a latent state that foretells the next latent state and the reward."""
 
 import dataclasses
+import math
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import flax.linen as nn
@@ -183,3 +184,9 @@ class DeepMDP(Plain):
         reward_loss = jnp.mean(jnp.square(reward - batch.reward))
         metrics = {**metrics, "transition_loss": transition_loss, "reward_loss": reward_loss}
         return loss + self.model_coefficient * (transition_loss + reward_loss), metrics
+
+    @property
+    def least_loss(self) -> float | Array:
+        """That of a reward that is told right, and of a prediction that is exact and as sure as it can be."""
+        surest = math.log(DEVIATIONS[0]) if self.transition == "probabilistic" else 0.0
+        return self.model_coefficient * surest
