@@ -59,8 +59,8 @@ class RunConfig:
     NAME+NAME is a mixture of families, in which --engine, --split and --env.FIELD hold for every family that has such a
     flag, and --env.vary.NAME.PARAMETER=VALUES for one."""
     agent: str = "sac-conditioned"
-    """Name of the agent; --list shows all. Its parts: --agent.encoder, --agent.gradients, --agent.value,
-    --agent.scaling and --agent.sampler, each by name and with flags of its own."""
+    """Name of the agent; --list shows all. Its parts: --agent.representation, --agent.encoder, --agent.gradients,
+    --agent.value, --agent.scaling and --agent.sampler, each by name and with flags of its own."""
     preset: Literal["auto", "cpu", "gpu"] = "auto"
     """Tuned defaults of the flags below for a kind of device; auto chooses by the device that JAX runs on."""
     runs: str = "runs"

@@ -5,6 +5,7 @@ A network is a body and a linear head, applied to the data of one task; the call
 
 import dataclasses
 import math
+from collections.abc import Collection
 from typing import Any, NamedTuple
 
 import flax.linen as nn
@@ -23,6 +24,15 @@ class Params(NamedTuple):
 
     shared: Any  # used by every task
     own: Any  # leaves (T, ...): each task's own, such as its head or its embedding
+
+    def beside(self, others: "Params") -> "Params":
+        """Both, where no two parts have the same name."""
+        return Params({**self.shared, **others.shared}, {**self.own, **others.own})
+
+    def without(self, names: Collection[str]) -> "Params":
+        """All parts but those that have one of the names."""
+        keep = lambda parts: {name: part for name, part in parts.items() if name not in names}
+        return Params(keep(self.shared), keep(self.own))
 
 
 OVER_TASKS = Params(shared=None, own=0)

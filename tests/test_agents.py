@@ -15,6 +15,7 @@ from mtjax.agents.base import CONDITIONINGS
 from mtjax.agents.parts.conditioning import load_vectors
 from mtjax.agents.parts.encoders import ENCODERS
 from mtjax.agents.parts.gradients.surgery import RULES
+from mtjax.agents.parts.representations import REPRESENTATIONS
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.values import VALUES
@@ -224,7 +225,8 @@ def test_observations_are_normalised_by_what_was_learned_from():
 def test_every_method_says_what_differs_from_its_paper():
     """In the docstring of its class, which --help shows; what has no paper has nothing to say."""
     methods = {preset.cls for preset in AGENTS.values()}
-    for table, own in ((ENCODERS, ("identity", "mlp")), (SCALINGS, ("none",)), (VALUES, ("scalar",))):
+    plain = ((REPRESENTATIONS, ("plain",)), (ENCODERS, ("identity", "mlp")), (SCALINGS, ("none",)))
+    for table, own in (*plain, (VALUES, ("scalar",))):
         methods |= {cls for name, cls in table.items() if name not in own}
     assert not [cls.__name__ for cls in methods if "Differs from" not in (vars(cls)["__doc__"] or "")]
 

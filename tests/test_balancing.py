@@ -200,7 +200,7 @@ def test_losses_are_counted_from_the_least_that_they_can_be(rule):
     """Updates in which losses fall, each at its rate: gradients are weighted as if none were below 0; metrics not."""
     nothing, scales = Params({}, {}), jnp.float32([1.0, 2.0, 3.0])
     state = SimpleNamespace(actor=nothing, critic=nothing, target=nothing)
-    batch = Batch(*[None] * 2, scales, *[None] * 3, temperature=jnp.ones(3), mask=None)  # type: ignore
+    batch = Batch(None, None, scales, None, jnp.zeros((3, 1, 1)), None, jnp.ones(3), None)  # type: ignore
 
     def found(below):
         loss, data = Likelihood(below=below).critic_problem(state, batch, KEY)  # type: ignore

@@ -23,6 +23,7 @@ from mtjax import cli, commands
 from mtjax.agents import AGENTS
 from mtjax.agents import settings as settings_of
 from mtjax.agents.base import CHOICES
+from mtjax.agents.parts.representations import DeepMDP
 from mtjax.config import from_json, load_preset, to_json, with_preset
 from mtjax.envs import ENVS
 from mtjax.loop import Settings
@@ -68,6 +69,16 @@ def test_names_choose_the_defaults():
     assert program == dataclasses.replace(named, learner=dataclasses.replace(named.learner, encoder=encoder))
     assert program.family == mtjax.make("finger-spin-vary-size")
     assert named != with_preset("finger-spin-vary-size", "care", "cpu")
+
+
+@pytest.mark.parametrize("agent", ["sac", "ppo"])
+def test_a_representation_brings_its_flags(agent, tmp_path):
+    """Whatever the agent; and a record of them is read back."""
+    program = cli.parse([f"--agent={agent}", "--agent.representation=deepmdp", "--agent.latent-widths", "8", "4"])
+    assert program.learner.representation == DeepMDP(latent_widths=(8, 4))
+    assert settings_of(program.learner)["latent_widths"] == (8, 4)
+    (tmp_path / "config.json").write_text(to_json(program, {"command": "x"}))
+    assert from_json(tmp_path / "config.json") == program
 
 
 @pytest.mark.parametrize(

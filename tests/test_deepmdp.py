@@ -1,4 +1,4 @@
-"""DeepMDP and HiP-BMDP: their losses in plain NumPy, which parameters each moves, and what they learn."""
+"""DeepMDP and HiP-BMDP under SAC and PPO: their losses in NumPy, which parameters each moves, what they learn."""
 
 from functools import partial
 
@@ -6,15 +6,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import QUICK, Probe, learner, of_task, only_seed, pick, random_batch, tasks_of, tiny, train
+from probes import QUICK, Probe, learner, of_task, only_seed, pick, random_batch, random_past, tasks_of, tiny, train
 from probes import act as act_once
 from probes import values as values_of
 
-from mtjax.agents.deepmdp import SIGHT, Targets, only
+from mtjax import agents
+from mtjax.agents.parts.gradients.balancing import FAMO
+from mtjax.agents.parts.representations.deepmdp import SIGHT, Ahead
 from mtjax.agents.parts.trajectory import Past, Seen, append
+from mtjax.agents.ppo import Taken
 from mtjax.agents.sac import Batch
 from mtjax.networks import Params
-from mtjax.types import InputError, Spec
+from mtjax.types import InputError, Spec, Transition
 
 SPEC, BATCH = Spec.vector(3, 2, 1), 4
 TASKS = tasks_of("one-step", (1.0, -0.5, 0.3))
@@ -43,13 +46,15 @@ def random_params(agent, task=0):
 
 
 def one_task(agent):
-    """A batch of one task, as the losses see it, and targets that are random."""
+    """A batch of one task, as the losses see it, and what they fit, which is random: of the models, and of critics."""
     batch, random = pick(random_batch(1, 3, BATCH, SPEC, agent.history), 1), np.random.default_rng(6)
     next_past = append(batch.extras, batch.obs, batch.action, batch.reward) if agent.history else None
     see = lambda obs, past: agent.see(None, obs, past)
     normal = lambda *shape: jnp.float32(random.normal(size=shape))
     width = {"parameters": 1, "one-hot": 3}.get(agent.conditioning, 0)
-    noise = normal(BATCH, 6) if agent.transition == "probabilistic" else jnp.float32(0)
+    drawn = agent.representation.transition == "probabilistic"
+    value = normal(BATCH)
+    ahead = Ahead(normal(BATCH, 6), normal(BATCH, 6) if drawn else jnp.float32(0), normal(agent.embedding_size))
     seen = Batch(
         obs=see(batch.obs, batch.extras),
         action=batch.action,
@@ -59,8 +64,9 @@ def one_task(agent):
         told=normal(width),
         temperature=jnp.float32(0.1),
         mask=None,
+        ahead=ahead,
     )
-    return seen, Targets(normal(BATCH), normal(BATCH, 6), noise, normal(agent.embedding_size))
+    return seen, value
 
 
 # Plain NumPy: networks from their parameters.
@@ -92,7 +98,7 @@ def plain_transition(agent, critic, told, batch):
     """Mean and deviation of the next latent state."""
     latent = plain_latent(critic.shared["latent"], np.asarray(batch.obs))
     outputs = plain_model(critic.shared["transition"], latent, np.asarray(batch.action), told)
-    if agent.transition == "deterministic":
+    if agent.representation.transition == "deterministic":
         return outputs, np.ones_like(outputs)
     mean, raw = np.split(outputs, 2, axis=-1)
     return mean, 0.01 + 0.99 / (1 + np.exp(-raw))
@@ -104,14 +110,55 @@ def test_model_losses(name, transition):
     """The likelihood of the slow encoder's next state, and the reward told from the state that is drawn."""
     agent = make(name, transition=transition)
     _, critic = random_params(agent)
-    batch, targets = one_task(agent)
+    batch, value = one_task(agent)
+    ahead = batch.ahead
     told = np.asarray(critic.own["embedding"] if name == "hip-bmdp" else batch.told)
     mean, deviation = plain_transition(agent, critic, told, batch)
-    likelihood = 0.5 * ((mean - targets.latent) / deviation) ** 2 + np.log(deviation)
-    reward = plain_model(critic.shared["reward"], mean + deviation * np.asarray(targets.noise), told)[:, 0]
-    _, metrics = jit(agent.critic_loss)(critic, (batch, targets))
+    likelihood = 0.5 * ((mean - ahead.latent) / deviation) ** 2 + np.log(deviation)
+    reward = plain_model(critic.shared["reward"], mean + deviation * np.asarray(ahead.noise), told)[:, 0]
+    _, metrics = jit(agent.critic_loss)(critic, (batch, value))
     np.testing.assert_allclose(metrics["transition_loss"], likelihood.mean(), rtol=1e-4)
     np.testing.assert_allclose(metrics["reward_loss"], np.mean((reward - batch.reward) ** 2), rtol=1e-4)
+
+
+@pytest.mark.parametrize("transition", ["deterministic", "probabilistic"])
+@pytest.mark.parametrize("name", ["deepmdp", "hip-bmdp"])
+def test_no_loss_is_less_than_the_least(name, transition, monkeypatch):
+    """Where the next state is foretold exactly, and as surely as can be, what is left is the other losses'."""
+    without_theta = {"theta_coefficient": 0.0} if name == "hip-bmdp" else {}
+    agent = make(name, transition=transition, model_coefficient=0.5, **without_theta)
+    deviation = 0.01 if transition == "probabilistic" else 1.0
+    exact = lambda self, critic, told, latent, a: (jnp.full_like(latent, 0.3), jnp.full_like(latent, deviation))
+    monkeypatch.setattr(type(agent.representation), "foretell", exact)
+    _, critic = random_params(agent)
+    batch, value = one_task(agent)
+    ahead = batch.ahead._replace(latent=jnp.full_like(batch.ahead.latent, 0.3))
+    loss, found = agent.critic_loss(critic, (batch._replace(ahead=ahead), value))
+    np.testing.assert_allclose(loss - agent.least_loss, found["critic_loss"] + 0.5 * found["reward_loss"], rtol=1e-4)
+
+
+def test_networks_on_plain_observations_add_nothing_to_the_least():
+    """In SAC as in PPO."""
+    assert tiny("sac").least_loss == tiny("ppo").least_loss == 0
+
+
+@pytest.mark.parametrize("transition", ["deterministic", "probabilistic"])
+@pytest.mark.parametrize("name", ["sac", "ppo"])
+def test_rules_see_losses_from_the_least(name, transition, monkeypatch):
+    """What FAMO is given in an update of either agent, and that it sees the losses fall from there."""
+    weigh = lambda self, memory, gram, losses, key: (jnp.ones(3) / 3, memory._replace(logits=losses))
+    adapt = lambda self, memory, before, after: memory._replace(
+        logits=jnp.where((before == memory.logits) & (after > 0) & (after != before), before, jnp.nan)
+    )
+    monkeypatch.setattr(FAMO, "weigh", weigh)
+    monkeypatch.setattr(FAMO, "adapt", adapt)
+    settings = {"representation": "deepmdp", "transition": transition, "model_coefficient": 0.5, "gradients": "famo"}
+    agent = make_ppo(**settings) if name == "ppo" else make(name, **settings)
+    batch = rollouts(agent) if name == "ppo" else random_batch(0, 3, BATCH, SPEC, agent.history)
+    state, found = jit(agent.update)(agent.init(SPEC, TASKS, KEY), batch, TASKS, KEY)
+    surest = np.log(0.01) if transition == "probabilistic" else 0.0
+    expected = found["critic_loss"] + 0.5 * (found["transition_loss"] + found["reward_loss"]) - 0.5 * surest
+    np.testing.assert_allclose(state.surgery.critic.logits, expected, rtol=1e-4)
 
 
 def test_the_losses_add_up():
@@ -129,24 +176,24 @@ def test_theta_loss(transition):
     """Per sample: the distance of two vectors against that of the two predictions, in mean and deviation."""
     agent = make("hip-bmdp", transition=transition)
     _, critic = random_params(agent)
-    batch, targets = one_task(agent)
-    theta, rival = np.asarray(critic.own["embedding"]), np.asarray(targets.rival)
+    batch, _ = one_task(agent)
+    theta, rival = np.asarray(critic.own["embedding"]), np.asarray(batch.ahead.rival)
     ours, theirs = (np.stack(plain_transition(agent, critic, x, batch)) for x in (theta, rival))
     moved = np.sqrt(((ours - theirs) ** 2).sum(axis=(0, 2)))
-    loss = jit(agent.theta_loss)(critic, batch.told, batch.obs, batch.action, rival)
+    loss = jit(agent.sight.theta_loss)(critic, batch.told, batch.obs, batch.action, rival)
     np.testing.assert_allclose(loss, (np.linalg.norm(theta - rival) - moved) ** 2, rtol=1e-4)
 
 
 def test_theta_loss_of_three_tasks_by_hand(monkeypatch):
     """Thetas 3, 4 and 5 apart, and a state s that moves predictions by s theta: (d - |s| d)^2 for each sample."""
-    agent = make("hip-bmdp", embedding_size=2)
-    monkeypatch.setattr(type(agent), "foretell", lambda self, p, latent, told, a: (latent * told, 0 * latent * told))
-    monkeypatch.setattr(type(agent), "perceive", lambda self, p, features, obs: (obs, p.own["embedding"]))
+    sight = make("hip-bmdp", embedding_size=2).sight
+    monkeypatch.setattr(type(sight), "foretell", lambda self, p, told, latent, a: (latent * told, 0 * latent * told))
+    monkeypatch.setattr(type(sight), "perceive", lambda self, p, features, obs: (p.own["embedding"], obs))
     thetas = np.array([[0, 0], [3, 0], [3, 4]], np.float32)
     obs = jnp.float32([[0.0], [1.0], [-3.0]])
     for i, j, apart in ((0, 1, 3), (1, 2, 4), (2, 0, 5), (0, 0, 0)):
         critic = Params({}, {"embedding": jnp.asarray(thetas[i])})
-        loss = agent.theta_loss(critic, jnp.zeros(0), obs, jnp.zeros((3, 1)), jnp.asarray(thetas[j]))
+        loss = sight.theta_loss(critic, jnp.zeros(0), obs, jnp.zeros((3, 1)), jnp.asarray(thetas[j]))
         np.testing.assert_allclose(loss, np.square([apart, 0.0, 2 * apart]), rtol=1e-5, atol=1e-5)
 
 
@@ -155,7 +202,7 @@ def test_a_rival_is_always_another_task():
     agent = make("hip-bmdp")
     state, batch, _ = start(agent)
     _, seen = agent.prepare(state, batch, TASKS)
-    rivals = jit(lambda key: agent.critic_problem(state, seen, key)[1][1].rival)
+    rivals = jit(lambda key: agent.critic_problem(state, seen, key)[1][0].ahead.rival)
     thetas, turns = np.asarray(state.critic.own["embedding"]), set()
     for seed in range(12):
         found = np.asarray(rivals(jax.random.key(seed)))
@@ -204,9 +251,10 @@ def test_what_is_detached_stays():
     """The next state, the rival's theta, and whatever the actor stands on."""
     agent = make("hip-bmdp", transition="probabilistic", **INFERRED)
     actor, critic = random_params(agent)
-    batch, targets = one_task(agent)
-    model = lambda x: agent.critic_loss(critic, (batch, targets._replace(**x)))[0]
-    slopes = jit(jax.grad(model))({"latent": targets.latent, "rival": targets.rival})
+    batch, value = one_task(agent)
+    ahead = batch.ahead
+    model = lambda x: agent.critic_loss(critic, (batch._replace(ahead=ahead._replace(**x)), value))[0]
+    slopes = jit(jax.grad(model))({"latent": ahead.latent, "rival": ahead.rival})
     assert not any(np.any(x) for x in jax.tree.leaves(slopes))
     acted = lambda actor, critic: jnp.sum(agent.policy(actor, critic, batch.told, batch.obs) ** 2)
     of_actor, of_critic = jit(jax.grad(acted, argnums=(0, 1)))(actor, critic)
@@ -266,15 +314,18 @@ def test_the_slow_encoder_follows_at_its_own_rate():
 def test_the_target_is_the_slow_encoders():
     """Next latent states come from the slow copy; the slow critics stand on it, too."""
     agent = make("deepmdp")
-    actor, critic = random_params(agent)
+    _, critic = random_params(agent)
     batch, _ = one_task(agent)
-    slow = only(jax.tree.map(lambda x: x * 1.5 + 0.05, critic), ("body", "head", *SIGHT))
-    target = jit(agent.target)(actor, critic, slow, batch, KEY)
+    slow = jax.tree.map(lambda x: x * 1.5 + 0.05, critic).without(agent.representation.models)
+    assert set(slow.shared) == {"body", "head", "latent"}
+    every = lambda tree: jax.tree.map(lambda x: x[None], tree)  # one task is all
+    of_all = lambda params: params._replace(own=every(params.own))
+    ahead, _ = jit(agent.sight.targets)(of_all(critic), of_all(slow), every(batch.next_obs), KEY)
     expected = plain_latent(slow.shared["latent"], np.asarray(batch.next_obs))
-    np.testing.assert_allclose(target.latent, expected, rtol=1e-4, atol=1e-5)
-    latent, told = agent.perceive(slow, batch.told, batch.obs)
+    np.testing.assert_allclose(ahead.latent[0], expected, rtol=1e-4, atol=1e-5)
+    told, latent = agent.sight.perceive(slow, batch.told, batch.obs)
     plain = jax.vmap(agent.critic.apply, (0, None, None, None))(
-        only(slow, ("body", "head")), told, latent, batch.action
+        slow.without(agent.representation.names), told, latent, batch.action
     )
     np.testing.assert_allclose(agent.values(slow, batch.told, batch.obs, batch.action), plain[..., 0], rtol=1e-5)
 
@@ -313,7 +364,7 @@ def test_theta_of_an_unseen_task_is_inferred_from_its_last_steps():
     state, batch, _ = start(agent)
     act = jit(lambda state, past, task: act_once(agent, state, batch.obs[0, 0], task, None, past))
     past = pick(batch.extras, (0, 0))
-    guess = agent.apply(state.critic, "guess", agent.see(state.moments, batch.obs[0, 0], past))
+    guess = agent.sight.apply(state.critic, "guess", agent.see(state.moments, batch.obs[0, 0], past))
     thetas = state.critic.own["embedding"]
     given = state._replace(critic=state.critic._replace(own={"embedding": thetas.at[0].set(guess)}))
     np.testing.assert_allclose(act(state, past, STRANGER), act(given, past, pick(TASKS, 0)), atol=1e-6)
@@ -335,7 +386,7 @@ def test_the_guess_finds_the_theta_of_the_task_that_steps_were_taken_in():
     reward = jnp.float32([1.0, -0.5])[:, None]  # of a step taken from 1, which comes second
     ones = jnp.ones((2, 2))
     past = Past(jnp.float32([[[0.0], [1.0]]] * 2), jnp.zeros((2, 2, 1)), jnp.concatenate([0 * reward, reward], 1), ones)
-    guess = agent.apply(state.critic, "guess", Seen(jnp.ones((2, 1)), past))
+    guess = agent.sight.apply(state.critic, "guess", Seen(jnp.ones((2, 1)), past))
     distances = np.linalg.norm(guess[:, None] - thetas, axis=-1)
     assert np.all(np.diagonal(distances) < 0.3 * np.linalg.norm(thetas[0] - thetas[1]))
 
@@ -368,8 +419,8 @@ def test_the_transition_model_learns_linear_dynamics():
     def foretold(critic: Params, batch):
         """The next latent states of one task, as foretold and as they are."""
         told = critic.own["embedding"]
-        latent, then = (agent.apply(critic, "latent", x) for x in (batch.obs, batch.next_obs))
-        return agent.foretell(critic, latent, told, batch.action)[0], then
+        latent, then = (agent.sight.apply(critic, "latent", x) for x in (batch.obs, batch.next_obs))
+        return agent.sight.foretell(critic, told, latent, batch.action)[0], then
 
     fresh = experience(jax.random.key(9))
     mean, then = jit(jax.vmap(foretold, (Params(None, 0), 0)))(state.critic, fresh)
@@ -422,9 +473,128 @@ def test_parts_combine(name, settings):
     assert jax.eval_shape(act, state, batch.obs[:, 0, 0]).shape == (2, 2)
 
 
+def test_the_agents_are_sac_with_that_part():
+    """And another representation in its place leaves SAC as it is."""
+    assert agents.agent("deepmdp") == agents.agent("sac-conditioned", representation="deepmdp")
+    assert agents.agent("deepmdp", representation="plain") == agents.agent("sac-conditioned")
+    theta = {"conditioning": "embedding", "embedding_size": 50}
+    assert agents.agent("hip-bmdp") == agents.agent("sac", representation="hip-bmdp", **theta)
+
+
+@pytest.mark.parametrize("representation", ["deepmdp", "hip-bmdp"])
+@pytest.mark.parametrize("name", ["sac", "care", "soft-modularization", "multi-head", "disjoint", "brc", "cagrad"])
+def test_other_agents_stand_on_it(name, representation):
+    """Traced, not run: actor and critics on latent states, one encoder and one of each model beside them."""
+    agent, batch = make(name, representation=representation), random_batch(0, 3, BATCH, SPEC)
+    state = jax.eval_shape(lambda: agent.init(SPEC, TASKS, KEY))
+    after, metrics = jax.eval_shape(lambda state: agent.update(state, batch, TASKS, KEY), state)
+    assert jax.tree.map(jnp.shape, after) == jax.tree.map(jnp.shape, state)
+    assert metrics["transition_loss"].shape == metrics["reward_loss"].shape == (3,)
+    place = "own" if name == "disjoint" else "shared"
+    for network, there in ((state.critic, {"latent", "transition", "reward"}), (state.target, {"latent"})):
+        assert {"latent", "transition", "reward"} & set(getattr(network, place)) == there
+    assert not set(agent.representation.names) & {*state.actor.shared, *state.actor.own}
+    assert jax.eval_shape(lambda s: act_once(agent, s, jnp.ones(3), STRANGER, None), state).shape == (2,)
+
+
+# PPO, which has neither replay nor slow copies.
+
+
+def make_ppo(**settings):
+    return make("ppo", epochs=1, minibatches=1, normalize_observations=False, **settings)
+
+
+def rollouts(agent, seed=0):
+    """Rollouts (T, H, E, ...) in which every field is random."""
+    random, shape = np.random.default_rng(seed), (3, 4, 2)
+    normal = lambda *size: jnp.float32(random.normal(size=(*shape, *size)))
+    past = random_past(random, (*shape, agent.history), SPEC) if agent.history else None
+    raw, ended = normal(2), jnp.asarray(random.random(shape) < 0.5)
+    fields = {"reward": normal(), "discount": jnp.ones(shape), "ended": ended, "extras": Taken(raw, normal() - 2, past)}
+    return Transition(obs=normal(3), action=jnp.tanh(raw), next_obs=normal(3), **fields)
+
+
+def of_first_task(agent, state, steps):
+    """The critic of the first task, and its steps as the losses see them."""
+    _, batch, _ = agent.prepare(state, steps, TASKS)
+    ahead, _ = agent.sight.targets(state.critic, state.critic, batch.next_obs, KEY)
+    return of_task(state.critic, 0), pick(batch._replace(ahead=ahead), 0)
+
+
+def test_ppos_critic_loss_reaches_the_representation():
+    """Each loss its own part of it; the critic's own is joined by all."""
+    agent = make_ppo(representation="hip-bmdp", transition="probabilistic", **INFERRED)
+    state = agent.init(SPEC, TASKS, KEY)
+    draw = lambda x: x + 0.1 * jnp.float32(np.random.default_rng(4).normal(size=x.shape))  # heads begin near zero
+    state = state._replace(critic=jax.tree.map(draw, state.critic))
+    critic, batch = of_first_task(agent, state, rollouts(agent))
+    jacobian = jit(jax.jacrev(lambda critic: {k: agent.critic_loss(critic, batch)[1][k] for k in REACHES}))(critic)
+    for loss, expected in REACHES.items():
+        assert reached(jacobian[loss]) == expected, loss
+    whole = jit(jax.grad(lambda critic: agent.critic_loss(critic, batch)[0]))(critic)
+    assert reached(whole) == set.union(*REACHES.values())
+    loss, found = jit(agent.critic_loss)(critic, batch)
+    models = found["transition_loss"] + found["reward_loss"]
+    expected = found["critic_loss"] + models + 0.01 * found["theta_loss"] + found["guess_loss"]
+    np.testing.assert_allclose(loss, expected, rtol=1e-5)
+
+
+def test_ppos_actor_does_not_train_the_representation():
+    """Another cost of entropy and another actor leave critic, encoder, models and thetas bit for bit."""
+    agents_of = [make_ppo(representation="hip-bmdp", entropy_cost=cost) for cost in (0.0, 1.0)]
+    steps = rollouts(agents_of[0])
+    state = agents_of[0].init(SPEC, TASKS, KEY)
+    other = state._replace(actor=jax.tree.map(lambda x: x * 1.5 + 0.05, state.actor))
+    plain, *moved = (
+        jit(agent.update)(start, steps, TASKS, KEY)[0]
+        for agent, start in ((agents_of[0], state), (agents_of[1], state), (agents_of[0], other))
+    )
+    for after in moved:
+        for a, b in zip(jax.tree.leaves(plain.critic), jax.tree.leaves(after.critic), strict=True):
+            np.testing.assert_array_equal(a, b)
+        assert reached(jax.tree.map(jnp.subtract, plain.actor, after.actor)) == {"body", "head"}
+    # And what the actor does depends on it: the same actor on another encoder acts otherwise.
+    blind = state._replace(critic=jax.tree.map(lambda x: x * 1.5 + 0.05, state.critic))
+    seeing, other = (act_once(agents_of[0], x, jnp.ones(3), pick(TASKS, 0), None) for x in (state, blind))
+    assert not np.array_equal(seeing, other)
+
+
+def test_ppos_models_foretell_what_the_encoder_saw_before_the_update():
+    """The critic's targets do not change with it, the transition loss does."""
+    agent = make_ppo(representation="deepmdp")
+    state = agent.init(SPEC, TASKS, KEY)
+    state, batch, _ = agent.prepare(state, rollouts(agent), TASKS)
+    given = (jnp.arange(8), KEY)
+    improve = jit(lambda slow: agent.improve(batch, slow, (state, jnp.bool_(True)), given)[1])
+    now, other = improve(state.critic), improve(jax.tree.map(lambda x: x * 1.5 + 0.05, state.critic))
+    np.testing.assert_array_equal(now["critic_loss"], other["critic_loss"])
+    assert np.all(np.asarray(now["transition_loss"]) != np.asarray(other["transition_loss"]))
+    critic, one = of_first_task(agent, state, rollouts(agent))
+    expected = plain_latent(critic.shared["latent"], np.asarray(one.next_obs))
+    np.testing.assert_allclose(one.ahead.latent, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_ppo_learns_a_model_of_its_rollouts():
+    """Everything moves, and after many updates models foretell s' = s / 2 + (a, 0) and its first number far better."""
+    agent = make_ppo(representation="deepmdp", critic_lr=1e-2, gamma=0.0)
+    before, steps = agent.init(SPEC, TASKS, KEY), rollouts(agent)
+    then = 0.5 * steps.obs + jnp.pad(steps.action, [(0, 0)] * 3 + [(0, 1)])
+    steps = steps._replace(next_obs=then, reward=then[..., 0])
+    learn = lambda state, key: agent.update(state, steps, TASKS, key)
+    after, history = jit(lambda state: jax.lax.scan(learn, state, jax.random.split(KEY, 300)))(before)
+    moved = jax.tree.map(jnp.subtract, after.critic, before.critic)
+    assert reached(moved) == {"body", "head", "latent", "transition", "reward"}
+    for name in ("transition_loss", "reward_loss"):
+        assert np.all(history[name][-1] < 0.2 * history[name][0]), (name, history[name][-1] / history[name][0])
+
+
 @pytest.mark.parametrize(
     ("name", "settings", "message"),
     [
+        ("distral", {"representation": "deepmdp"}, "distilled policy cannot stand; use representation=plain"),
+        ("sac", {"representation": "deepmpd"}, "unknown representation 'deepmpd'; did you mean 'deepmdp'"),
+        ("sac", {"latent_widths": (8,)}, "unknown setting of sac 'latent_widths'"),
+        ("ppo", {"representation": "hip-bmdp", "encoder": "input-map"}, "input-map maps observations"),
         ("deepmdp", {"transition": "gaussian"}, "unknown transition 'gaussian'.*probabilistic"),
         ("deepmdp", {"latent_widths": ()}, r"latent-widths needs at least one layer .*not \(\)"),
         ("deepmdp", {"model_widths": (8, 0)}, r"model-widths .*at least one unit, not \(8, 0\)"),
@@ -439,4 +609,4 @@ def test_parts_combine(name, settings):
 def test_settings_that_make_no_sense_are_refused(name, settings, message):
     """With what was given and what is allowed."""
     with pytest.raises(InputError, match=message):
-        make(name, **settings)
+        agents.agent(name, **settings)

@@ -22,6 +22,8 @@ BRONET = {f"shared/body/{kind}_{i}" for kind in ("Dense", "LayerNorm") for i in 
 MODELS = {"shared/transition", "shared/reward"}
 LATENT = {"actor": TRUNK, "critic": TRUNK | {"shared/latent"} | MODELS, "target": TRUNK | {"shared/latent"}}
 WITH_THETA = {**LATENT, **{who: LATENT[who] | {"own/embedding"} for who in ("critic", "target")}}
+WHOLE_CARE = CARE | {"shared/body/after"}
+CARE_ON_LATENT = {who: (parts - TRUNK) | WHOLE_CARE for who, parts in LATENT.items()}
 body = lambda *parts: {f"shared/body/{part}" for part in parts} | {"shared/head"}
 # The parts of actor and critics, or of each, all of which their losses must move.
 PARTS = {
@@ -34,7 +36,7 @@ PARTS = {
     "multi-head": ("multi-head", {}, {"shared/body/MLP_0", "own/head"}),
     "disjoint": ("disjoint", {}, OWN),
     "distral": ("distral", {}, {"actor": OWN | {"shared/distilled"}, "critic": OWN, "target": OWN}),
-    "care": ("care", {}, CARE | {"shared/body/after"}),
+    "care": ("care", {}, WHOLE_CARE),
     "care-mtrl": ("care", {"variant": "mtrl"}, CARE | {"shared/body/gate", "shared/body/gate_out"}),
     "moe": ("moe", {}, body("experts", "gate", "trunk")),
     "moe-ensemble": ("moe", {"mode": "ensemble"}, body("experts", "trunk")),
@@ -50,6 +52,7 @@ PARTS = {
     "brc": ("brc", {"value": "hl-gauss"}, BRONET | {"shared/head", "own/embedding"}),
     "deepmdp": ("deepmdp", {}, LATENT),
     "hip-bmdp": ("hip-bmdp", {}, WITH_THETA),
+    "care-deepmdp": ("care", {"representation": "deepmdp"}, CARE_ON_LATENT),
     "pcgrad": ("pcgrad", {}, TRUNK),
     "cagrad": ("cagrad", {}, TRUNK),
     "gradnorm": ("gradnorm", {}, TRUNK),
@@ -133,7 +136,10 @@ FLOW = {
 # Where the actor stands on the critic's representation, all that moves this moves the policy's entropy; and what the
 # slow encoder sees is what models foretell. BRC scales rewards by what entropy pays.
 _ON_LATENT = {"critic": ((), ("actor",)), "target": ((), ("critic",)), "reward": ((), ("actor", "critic", "target"))}
-FLOW_OF = {"deepmdp": _ON_LATENT, "hip-bmdp": _ON_LATENT, "brc": {"log_temperature": ((), ("actor",))}}
+FLOW_OF = {
+    **dict.fromkeys(("deepmdp", "hip-bmdp", "care-deepmdp"), _ON_LATENT),
+    "brc": {"log_temperature": ((), ("actor",))},
+}
 
 OPTIMIZERS = {"actor": 0, "critic": 1, "log_temperature": 2}
 
@@ -171,7 +177,7 @@ def test_losses_reach_their_own_parameters_alone(case):
 
 def tau_of(agent, part):
     """How fast the slow copy of a part follows."""
-    return agent.tau if part in ("body", "head") else getattr(agent, "encoder_tau", agent.tau)
+    return agent.tau if part in ("body", "head") else getattr(agent.representation, "encoder_tau", agent.tau)
 
 
 @EVERY_AGENT

@@ -308,7 +308,7 @@ def test_the_actor_rests_once_it_is_too_far_away():
     renewed, batch, _ = agent.prepare(state, steps, TASKS)
     orders = agent.deal(batch.advantage.shape[1], order_key)
     given = (orders[0], jax.random.split(key, len(orders))[0])
-    (first, near), _ = jax.jit(agent.improve)(batch, (renewed, jnp.bool_(True)), given)
+    (first, near), _ = jax.jit(agent.improve)(batch, renewed.critic, (renewed, jnp.bool_(True)), given)
     assert near
     close = lambda x, y: all(np.allclose(a, b, atol=1e-5) for a, b in zip(*map(jax.tree.leaves, (x, y)), strict=True))
     assert close(after.actor, first.actor) and not close(after.actor, state.actor)
@@ -352,6 +352,15 @@ COMBINED = pairs(
 COMBINED += [
     {"conditioning": "parameters", "scaling": scaling, "sampler": sampler}
     for scaling, sampler in itertools.zip_longest(SCALINGS, SAMPLERS, fillvalue="uniform")
+]
+COMBINED += [
+    {"conditioning": told, "representation": kind, **rest}
+    for told, kind, rest in [
+        ("parameters", "deepmdp", {"gradients": "pcgrad", "encoder": "care", "kl_limit": 0.01}),
+        ("inferred", "deepmdp", {"heads": "disjoint", "transition": "probabilistic"}),
+        ("embedding", "hip-bmdp", {"value_normalization": "popart"}),
+        ("one-hot", "hip-bmdp", {"unseen_theta": "inferred", "heads": "per-task"}),
+    ]
 ]
 COMBINED = [row for row in COMBINED if allowed(row)]
 

@@ -49,11 +49,10 @@ AGENTS: dict[str, Preset] = {
     "soft-modularization": Preset("Modules routed by task (Yang et al. 2020)", {"encoder": "soft-modules", **_TOLD}),
     "paco": Preset("Parameters composed for each task (Sun et al. 2022)", {"encoder": "paco", **_TOLD}),
     "brc": Preset("Bigger, regularised, categorical critics (Nauman et al. 2025)", {}, "mtjax.agents.brc:BRC"),
-    "deepmdp": Preset("SAC on a latent model of the task (Gelada et al. 2019)", _TOLD, "mtjax.agents.deepmdp:DeepMDP"),
+    "deepmdp": Preset("SAC on a latent model of the task (Gelada et al. 2019)", {"representation": "deepmdp", **_TOLD}),
     "hip-bmdp": Preset(
         "DeepMDP with learned hidden parameters (Zhang et al. 2021)",
-        {"conditioning": "embedding", "embedding_size": 50},
-        "mtjax.agents.hip_bmdp:HiPBMDP",
+        {"representation": "hip-bmdp", "conditioning": "embedding", "embedding_size": 50},
     ),
     "ppo": Preset("Proximal policy optimisation (Schulman et al. 2017), told its task", _TOLD, "mtjax.agents.ppo:PPO"),
     "pcgrad": Preset("Conflicting gradients projected (Yu et al. 2020)", {"gradients": "pcgrad", **_TOLD}),

@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Annotated, Any, Literal, NamedTuple, get_args, get_type_hints
 
@@ -14,7 +14,8 @@ from mtjax import normalize
 from mtjax.agents import parts
 from mtjax.agents.parts import conditioning, trajectory
 from mtjax.agents.parts.encoders import ENCODERS, Encoder
-from mtjax.agents.parts.gradients import surgery
+from mtjax.agents.parts.gradients import descent, surgery
+from mtjax.agents.parts.representations import REPRESENTATIONS, Place, Representation
 from mtjax.agents.parts.samplers import SAMPLERS, Sampler
 from mtjax.agents.parts.scaling import SCALINGS, Scaling
 from mtjax.agents.parts.trajectory import Past, Seen, TrajectoryEncoder
@@ -30,6 +31,7 @@ Heads = Literal["shared", "per-task", "disjoint"]
 Tune = Literal["all", "heads", "embedding"]
 
 PARTS: dict[str, Mapping[str, type]] = {
+    "representation": REPRESENTATIONS,
     "encoder": ENCODERS,
     "gradients": surgery.RULES,
     "value": VALUES,
@@ -49,13 +51,21 @@ class Memory(NamedTuple):
     scaling: Any  # what the scaling of rewards remembers
 
 
+class Pair(NamedTuple):
+    """Something of the actor, and the same of the critics."""
+
+    actor: Any
+    critic: Any
+
+
 @dataclasses.dataclass(frozen=True)
 class BaseAgent(abc.ABC):
     """Settings and pieces of every agent. A subclass gives networks, losses and updates.
 
-    Its state is a NamedTuple with at least the fields ``moments`` of observations (of each task's, leaves (T, O), in a
-    mixture), ``contexts`` (T, C) of the training tasks, ``vectors`` (T, V) or None, ``scales`` and ``progress``, what
-    the scaling of rewards and the sampler of tasks remember.
+    Its state is a NamedTuple with at least the fields ``actor``, ``critic`` (beside which lies the representation),
+    ``moments`` of observations (of each task's, leaves (T, O), in a mixture), ``contexts`` (T, C) of training tasks,
+    ``vectors`` (T, V) or None, and what is remembered by the rules of gradient ``surgery``, by the scaling of rewards,
+    ``scales``, and by the sampler of tasks, ``progress``.
     """
 
     hidden: tuple[int, ...] = (256, 256)
@@ -97,6 +107,7 @@ class BaseAgent(abc.ABC):
     tune: Annotated[Tune, tyro.conf.arg(name="tune", prefix_name=False)] = "all"
     """Which parameters of actor and critics learn: all, heads (output layers) or embedding (learned task embeddings).
     The others stay as the run left them that --from names."""
+    representation: Annotated[Representation, FLAT] = dataclasses.field(default_factory=Representation)
     encoder: Annotated[Encoder, FLAT] = dataclasses.field(default_factory=Encoder)
     gradients: Annotated[surgery.Rule, FLAT] = dataclasses.field(default_factory=surgery.Rule)
     scaling: Annotated[Scaling, FLAT] = dataclasses.field(default_factory=Scaling)
@@ -113,6 +124,10 @@ class BaseAgent(abc.ABC):
     @abc.abstractmethod
     def init(self, spec: Spec, tasks: Task, key: Key) -> Any:
         """Return the state for the training ``tasks`` (T, ...)."""
+
+    @abc.abstractmethod
+    def init_networks(self, num_tasks: int, told: Array, obs: Any, action: Array, key: Key) -> Pair:
+        """Initialise actor and critics for inputs of the given shapes, (Z,), (O,) and (A,)."""
 
     @abc.abstractmethod
     def act(self, state: Any, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
@@ -139,6 +154,12 @@ class BaseAgent(abc.ABC):
         reason = self.encoder.refuses(self.conditioning)
         if reason:
             raise InputError(f"{encoder} {reason}")
+        if self.representation.learns and self.encoder.front() is not None:
+            name = parts.name_of(REPRESENTATIONS, self.representation)
+            raise InputError(
+                f"{encoder} maps observations, and with representation={name} networks see a latent state; "
+                "choose another encoder"
+            )
         self.encoder.body(self.hidden, layer_norm=False)  # which refuses widths that it cannot take
         if self.heads == "disjoint" and rule != "mean":
             raise InputError(f"heads=disjoint leaves no parameters that tasks share for gradients={rule}; use mean")
@@ -152,10 +173,63 @@ class BaseAgent(abc.ABC):
     def network(self, layer_norm: bool) -> Network:
         """The body and head that the settings ask for."""
         own = {"shared": (), "per-task": ("head",), "disjoint": ("trajectory", "body", "head")}[self.heads]
-        embedding = self.embedding_size if self.conditioning == "embedding" else 0
         body = self.encoder.body(self.hidden, layer_norm)
+        if self.representation.learns:  # also what is learned of tasks, for all networks
+            return Network(body, own)
+        embedding = self.embedding_size if self.conditioning == "embedding" else 0
         inference = TrajectoryEncoder(self.embedding_size, layer_norm=layer_norm) if self.history else None
         return Network(body, own, embedding, self.unit_embedding, self.encoder.front(), inference)
+
+    @property
+    def actor(self) -> Network:
+        return self.network(self.actor_layer_norm)
+
+    @property
+    def critic(self) -> Network:
+        return self.network(self.critic_layer_norm)
+
+    @property
+    def sight(self) -> Representation:
+        """The representation, as it stands under these networks."""
+        place = Place(
+            self.conditioning,
+            self.embedding_size,
+            self.unit_embedding,
+            layer_norm=self.critic_layer_norm,
+            own=self.heads == "disjoint",
+        )
+        return self.representation.at(place)
+
+    def look(self, critic: Params, told: Array, obs: Any) -> tuple[Array, Any]:
+        """What one task's actor is told (Z,) and sees (..., O), through a representation that it does not train."""
+        return jax.lax.stop_gradient(self.sight.perceive(critic, told, obs))
+
+    @property
+    def network_optimizers(self) -> Pair:
+        """Adam for the actor, and for the critics with the representation beside them."""
+        chosen = partial(descent.adam, weight_decay=self.weight_decay, max_norm=self.max_gradient_norm, tune=self.tune)
+        return Pair(chosen(self.actor_lr), chosen(self.critic_lr))
+
+    def init_common(self, spec: Spec, tasks: Task, key: Key) -> dict[str, Any]:
+        """Initialise what the states of all agents have for the training ``tasks`` (T, ...): fields by name."""
+        num_tasks = len(tasks.id)
+        vectors, moments = self.load_vectors(num_tasks), self.init_moments(spec, num_tasks)
+        told = conditioning.features(self.conditioning, num_tasks, jnp.int32(0), tasks.context[0], vectors)
+        obs, action = self.example(spec, moments), jnp.zeros(spec.action_size)
+        basis = self.sight.init(num_tasks, told, obs, action, key)
+        actor, critic = self.init_networks(num_tasks, basis.told, basis.obs, action, basis.key)
+        critic = critic.beside(basis.params)
+        remembered = lambda rule, params: surgery.init(rule, params, num_tasks, self.per_layer)
+        return {
+            "actor": actor,
+            "critic": critic,
+            "moments": moments,
+            "contexts": tasks.context,
+            "vectors": vectors,
+            "surgery": Pair(remembered(self.gradients.for_actor, actor), remembered(self.gradients, critic)),
+            "scales": self.scaling.init(num_tasks),
+            "progress": self.sampler.init(num_tasks),
+        }
 
     @property
     def per_layer(self) -> bool:
@@ -167,7 +241,7 @@ class BaseAgent(abc.ABC):
     @property
     def history(self) -> int:
         """How many past steps the agent sees beside each observation."""
-        return self.inferred_from if self.conditioning == "inferred" else 0
+        return self.inferred_from if self.conditioning == "inferred" or self.representation.looks_back else 0
 
     def init_moments(self, spec: Spec, num_tasks: int) -> normalize.Moments:
         """Moments of no observations; in a mixture each task has its own, leaves (T, O)."""
@@ -234,6 +308,13 @@ class BaseAgent(abc.ABC):
         known = self.known_task(state, task)
         return tuple(Params(net.shared, jax.tree.map(lambda x: x[known], net.own)) for net in networks)
 
+    def situation(self, state: Any, memory: Memory, obs: Any, task: Task) -> tuple[Params, Params, Array, Any]:
+        """Actor and critics as one task uses them to act, what they are told (Z,), and an observation (O,) as seen."""
+        actor, critic = self.of_task(state, task, state.actor, state.critic)
+        seen = self.see(self.moments_of(state, self.known_task(state, task)), obs, memory.past)
+        critic = self.sight.stand_in(critic, state.critic, task.id < len(state.contexts), seen)
+        return actor, critic, self.features(state, task), seen
+
     def discounts(self, tasks: Task) -> float | Array:
         """The discount of each task (T,), or one for all."""
         if self.discounting == "gamma":
@@ -245,13 +326,14 @@ class BaseAgent(abc.ABC):
         """What a task that was not trained on has of its nearest training task."""
         found = {"shared": [], "per-task": ["head"], "disjoint": ["networks"]}[self.heads]
         found += ["input layer"] * (self.encoder.front() is not None)
-        return found + conditioning.BORROWED.get(self.conditioning, [])
+        return self.representation.borrowed(found + conditioning.BORROWED.get(self.conditioning, []))
 
     @property
     def unseen(self) -> str:
         """What stands for a task that was not trained on; empty if its own parameters, or nothing, do."""
-        borrowed = self.borrowed
-        return f"each uses the {' and '.join(borrowed)} of the nearest training task" if borrowed else ""
+        borrowed, replaced = " and ".join(self.borrowed), self.representation.replaced
+        said = (f"each uses the {borrowed} of the nearest training task", f"each has {replaced}")
+        return ", and ".join(text for text, there in zip(said, (borrowed, replaced), strict=True) if there)
 
     # Memory of an episode, and watching all of them.
 
@@ -289,6 +371,20 @@ class BaseAgent(abc.ABC):
         return state._replace(scales=scales, progress=self.sampler.observe(state.progress, outcome))
 
     # Learning.
+
+    @property
+    def least_loss(self) -> float | Array:
+        """The least that a task's critic loss can be: that of critics, which is 0, and of the representation."""
+        return self.representation.least_loss
+
+    def above_least(self, critic_loss: Callable) -> Callable:
+        """A critic loss of one task as far as it lies above the least, which rules that look at losses are given."""
+
+        def loss(critic: Params, data: Any) -> tuple[Array, Metrics]:
+            value, metrics = critic_loss(critic, data)
+            return value - self.least_loss, metrics
+
+        return loss
 
     def learn(self, env: Env, states: Any, data: Any, tasks: Task, keys: Key) -> tuple[Any, Metrics]:
         """Learn from experience, for all seeds at once: leaves (S, ...)."""

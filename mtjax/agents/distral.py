@@ -71,6 +71,11 @@ class Distral(SAC):
     def _check_combination(self) -> None:
         if self.heads != "disjoint":
             raise InputError(f"distral gives every task a policy of its own: heads is disjoint, not {self.heads}")
+        if self.representation.learns:
+            raise InputError(
+                "distral would give every task a representation of its own, on all of which the distilled policy "
+                "cannot stand; use representation=plain"
+            )
         rule = parts.name_of(PARTS["gradients"], self.gradients)
         if rule != "mean":
             raise InputError(

@@ -10,8 +10,7 @@ import jax.numpy as jnp
 
 from mtjax import normalize
 from mtjax.agents import parts
-from mtjax.agents.base import FLAT, BaseAgent, Memory
-from mtjax.agents.parts import conditioning
+from mtjax.agents.base import FLAT, BaseAgent, Memory, Pair
 from mtjax.agents.parts.gradients import descent, surgery
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
@@ -38,20 +37,6 @@ FIRST_HEAD = 0.01
 """Scale of the output layers' first weights: policies begin as one, and values at zero."""
 
 
-class Optimizers(NamedTuple):
-    """What the optimisers remember."""
-
-    actor: Any
-    critic: Any
-
-
-class Surgery(NamedTuple):
-    """What the rules of gradient surgery remember."""
-
-    actor: Any
-    critic: Any
-
-
 class Units(NamedTuple):
     """In what the critic counts: a value v is mean + std times its output."""
 
@@ -68,12 +53,12 @@ class PPOState(NamedTuple):
     """Everything PPO learns, and what it remembers of the training tasks."""
 
     actor: Params
-    critic: Params
-    optimizers: Optimizers
+    critic: Params  # beside it the representation
+    optimizers: Pair
     moments: normalize.Moments
     contexts: Array  # (T, C) of the training tasks, among which an unseen task finds its nearest
     vectors: Array | None  # (T, V) given task vectors, if conditioned on them
-    surgery: Surgery
+    surgery: Pair
     scales: Any  # what the scaling of rewards remembers
     progress: Any  # what the sampler of tasks remembers
     units: Units
@@ -98,6 +83,11 @@ class Batch(NamedTuple):
     target: Array  # (B,) what it should say
     told: Array  # (Z,) or (B, Z), what the networks are told of the task
     mask: Array | None  # (A,) 1 for actions that the task has; None: it has all
+    # What the representation learns from, if it does.
+    action: Array | None = None  # (B, A)
+    reward: Array | None = None  # (B,) in the task's units
+    next_obs: Any = None  # (B, O)
+    ahead: Any = None  # what its models fit
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,9 +113,13 @@ class PPO(BaseAgent):
     actor rests for what is left of an update as soon as mean(ratio - 1 - log ratio), an estimate of KL(pi_old | pi), is
     beyond it on a minibatch.
 
+    A representation that learns (``representation``) is trained by L_V and its own losses on the same minibatches. What
+    its models foretell is seen by the encoder from before the update, as values are by the critic from before it; that
+    is the slow copy, so that ``encoder_tau`` counts for nothing here.
+
     Differs from the paper: networks share nothing, so that there is no weight of the critic's loss; advantages and
     values are normalised; a time limit bootstraps, as nothing ended there; observations are normalised by moments that
-    include the rollout's, which the ratio counts as a change of the policy.
+    include the rollout's, which the ratio counts as a change of the policy, and so it does a representation's steps.
     """
 
     actor_lr: float = 3e-4
@@ -186,52 +180,34 @@ class PPO(BaseAgent):
     # Networks.
 
     @property
-    def actor(self) -> Network:
-        return self.network(self.actor_layer_norm)
-
-    @property
     def critic(self) -> Network:
-        network = self.network(self.critic_layer_norm)
+        network = super().critic
         if self.value_normalization != "popart" or "head" in network.own:
             return network
         return dataclasses.replace(network, own=(*network.own, "head"))
 
     def init(self, spec: Spec, tasks: Task, key: Key) -> PPOState:
         """Initialise for the training ``tasks`` (T, ...)."""
-        num_tasks = len(tasks.id)
-        actor_key, critic_key = jax.random.split(key)
-        vectors, moments = self.load_vectors(num_tasks), self.init_moments(spec, num_tasks)
-        told = conditioning.features(self.conditioning, num_tasks, jnp.int32(0), tasks.context[0], vectors)
-        obs = self.example(spec, moments)
-        first = jnp.repeat(jnp.array([0.0, outputs_for(self.initial_std)]), spec.action_size)
-        actor = calm(self.actor.init(actor_key, num_tasks, 2 * spec.action_size, told, obs), first)
-        critic = calm(self.critic.init(critic_key, num_tasks, 1, told, obs), jnp.zeros(1))
-        memory = lambda rule, params: surgery.init(rule, params, num_tasks, self.per_layer)
+        num_tasks, common = len(tasks.id), self.init_common(spec, tasks, key)
+        optimizers = self.network_optimizers
         return PPOState(
-            actor=actor,
-            critic=critic,
-            optimizers=Optimizers(self.optimizers.actor.init(actor), self.optimizers.critic.init(critic)),
-            moments=moments,
-            contexts=tasks.context,
-            vectors=vectors,
-            surgery=Surgery(memory(self.gradients.for_actor, actor), memory(self.gradients, critic)),
-            scales=self.scaling.init(num_tasks),
-            progress=self.sampler.init(num_tasks),
+            **common,
+            optimizers=Pair(optimizers.actor.init(common["actor"]), optimizers.critic.init(common["critic"])),
             units=Units(jnp.float32(0), jnp.zeros(num_tasks), jnp.ones(num_tasks)),
         )
 
-    @property
-    def optimizers(self) -> Optimizers:
-        chosen = partial(descent.adam, weight_decay=self.weight_decay, max_norm=self.max_gradient_norm, tune=self.tune)
-        return Optimizers(chosen(self.actor_lr), chosen(self.critic_lr))
+    def init_networks(self, num_tasks: int, told: Array, obs: Any, action: Array, key: Key) -> Pair:
+        actor_key, critic_key = jax.random.split(key)
+        first = jnp.repeat(jnp.array([0.0, outputs_for(self.initial_std)]), len(action))
+        actor = calm(self.actor.init(actor_key, num_tasks, 2 * len(action), told, obs), first)
+        return Pair(actor, calm(self.critic.init(critic_key, num_tasks, 1, told, obs), jnp.zeros(1)))
 
     # Acting.
 
     def act(self, state: PPOState, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
         """Choose an action (A,) for one observation (O,) of one task; no key: the mean action."""
-        (actor,) = self.of_task(state, task, state.actor)
-        seen = self.see(self.moments_of(state, self.known_task(state, task)), obs, memory.past)
-        outputs = self.actor.apply(actor, self.features(state, task), seen)
+        actor, critic, told, seen = self.situation(state, memory, obs, task)
+        outputs = self.actor.apply(actor, *self.look(critic, told, seen))
         if key is None:
             return Acted(tanh_normal(outputs, None, task.action_mask)[0], None, memory)
         raw, log_prob = sample_raw(outputs, key, task.action_mask)
@@ -242,6 +218,7 @@ class PPO(BaseAgent):
     # Losses of one task.
 
     def actor_loss(self, actor: Params, data: tuple[Batch, Key]) -> tuple[Array, Metrics]:
+        """The actor's loss on a batch of what the actor is told and sees."""
         batch, key = data
         outputs = self.actor.apply(actor, batch.told, batch.obs)
         log_ratio = log_density(outputs, batch.raw, batch.mask) - batch.log_prob
@@ -255,13 +232,18 @@ class PPO(BaseAgent):
         return loss, {"actor_loss": loss, "entropy": entropy, "kl": kl, "clip_fraction": beyond}
 
     def critic_loss(self, critic: Params, batch: Batch) -> tuple[Array, Metrics]:
-        value = self.critic.apply(critic, batch.told, batch.obs)[..., 0]
+        value = self.value(critic, batch.told, batch.obs)
         error = jnp.square(value - batch.target)
         if not parts.is_zero(self.value_clip):
             near = batch.value + jnp.clip(value - batch.value, -self.value_clip, self.value_clip)
             error = jnp.maximum(error, jnp.square(near - batch.target))
         loss = jnp.mean(error) / 2
-        return loss, {"critic_loss": loss}
+        return self.sight.join(loss, {"critic_loss": loss}, critic, batch)
+
+    def value(self, critic: Params, told: Array, obs: Any) -> Array:
+        """The critic's values (B,) of observations (B, ...), in its units."""
+        told, seen = self.sight.perceive(critic, told, obs)
+        return self.critic.apply(critic.without(self.sight.names), told, seen)[..., 0]
 
     # Update of all tasks.
 
@@ -270,7 +252,7 @@ class PPO(BaseAgent):
         order_key, key = jax.random.split(key)
         state, batch, seen = self.prepare(state, steps, tasks)
         orders = self.deal(batch.advantage.shape[1], order_key)
-        improve = partial(self.improve, batch)
+        improve = partial(self.improve, batch, state.critic)
         (state, _), metrics = jax.lax.scan(
             improve, (state, jnp.bool_(True)), (orders, jax.random.split(key, len(orders)))
         )
@@ -283,13 +265,15 @@ class PPO(BaseAgent):
         next_past = None if taken.past is None else append(taken.past, flat.obs, flat.action, flat.reward)
         state = state._replace(moments=self.fit_moments(state.moments, flat.obs))
         told, obs = self.features_of_batch(state, flat, tasks), self.see_batch(state.moments, flat.obs, taken.past)
-        value = self.values(state, told, obs)
-        next_value = self.values(state, told, self.see_batch(state.moments, flat.next_obs, next_past))
-        advantage = self.advantages(state, flat, tasks, steps.reward.shape, value, next_value)
+        next_obs = self.see_batch(state.moments, flat.next_obs, next_past)
+        value, next_value = (self.values(state, told, seen) for seen in (obs, next_obs))
+        reward = self.rewards(state, flat, tasks)
+        advantage = self.advantages(flat._replace(reward=reward), tasks, steps.reward.shape, value, next_value)
         target = value + advantage
         scales, _ = self.scaling.renew(state.scales, target, ())
         state = self.renew(state, target)._replace(scales=scales)
         in_units = lambda x: (x - state.units.mean[:, None]) / state.units.std[:, None]
+        models = {"action": flat.action, "reward": reward, "next_obs": next_obs} if self.representation.learns else {}
         batch = Batch(
             obs=obs,
             raw=taken.raw,
@@ -299,21 +283,26 @@ class PPO(BaseAgent):
             target=in_units(target),
             told=told,
             mask=tasks.action_mask,
+            **models,
         )
         missed, there = (spread(x, 1)[1][:, 0] for x in (advantage, target))
         explained = 1 - missed / jnp.maximum(there, LEAST_STD**2)
         return state, batch, {"value": spread(value, 1)[0][:, 0], "explained_variance": explained}
 
-    def advantages(self, state: PPOState, flat: Transition, tasks: Task, shape, value: Array, next_value: Array):
+    def rewards(self, state: PPOState, flat: Transition, tasks: Task) -> Array:
+        """The rewards (T, H E) of steps in the task's units."""
+        gamma = jnp.broadcast_to(self.discounts(tasks), len(tasks.id))
+        return self.reward_scale * self.scaling.rewards(state.scales, flat, gamma, jnp.zeros(len(gamma)))
+
+    def advantages(self, flat: Transition, tasks: Task, shape: Any, value: Array, next_value: Array) -> Array:
         """Advantages (T, H E) of steps (T, H E), which were played as ``shape`` (T, H, E)."""
         gamma = jnp.broadcast_to(self.discounts(tasks), len(tasks.id))
-        reward = self.reward_scale * self.scaling.rewards(state.scales, flat, gamma, jnp.zeros(len(gamma)))
-        played = (x.reshape(shape) for x in (reward, flat.discount, flat.ended, value, next_value))
+        played = (x.reshape(shape) for x in (flat.reward, flat.discount, flat.ended, value, next_value))
         return jax.vmap(partial(advantages, lambda_=self.gae_lambda))(*played, gamma=gamma).reshape(value.shape)
 
     def values(self, state: PPOState, told: Array, obs: Any) -> Array:
         """The critic's values (T, B) of observations (T, B, ...), in units of reward."""
-        out = jax.vmap(self.critic.apply, (OVER_TASKS, 0, 0))(state.critic, told, obs)[..., 0]
+        out = jax.vmap(self.value, (OVER_TASKS, 0, 0))(state.critic, told, obs)
         return state.units.mean[:, None] + state.units.std[:, None] * out
 
     def normalize_advantages(self, advantage: Array) -> Array:
@@ -364,16 +353,26 @@ class PPO(BaseAgent):
         orders = jax.vmap(lambda key: jax.random.permutation(key, count))(jax.random.split(key, self.epochs))
         return orders[:, : size * self.minibatches].reshape(-1, size)
 
-    def improve(self, batch: Batch, carry: tuple[PPOState, Array], given: tuple[Array, Key]) -> tuple[Any, Metrics]:
-        """Take a gradient step of critic and actor on the steps (B,) of every task that are ``given``."""
+    def improve(
+        self, batch: Batch, slow: Params, carry: tuple[PPOState, Array], given: tuple[Array, Key]
+    ) -> tuple[Any, Metrics]:
+        """Take a gradient step of critic and actor on the steps (B,) of every task that are ``given``.
+
+        Args:
+            slow: the critic, and the representation, from before the update.
+        """
         (state, near), (order, key) = carry, given
         sample_key, actor_order, critic_order = jax.random.split(key, 3)
         chosen = choose(batch, order)
+        if self.representation.learns:
+            ahead, _ = self.sight.targets(state.critic, slow, chosen.next_obs, jax.random.fold_in(key, 3))
+            chosen = chosen._replace(ahead=ahead)
         sample_keys = jax.random.split(sample_key, len(batch.advantage))
-        state, seen = self.descend("critic", self.gradients, self.critic_loss, state, chosen, critic_order)
-        moved, done = self.descend(
-            "actor", self.gradients.for_actor, self.actor_loss, state, (chosen, sample_keys), actor_order
-        )
+        critic_loss = self.above_least(self.critic_loss)
+        state, seen = self.descend("critic", self.gradients, critic_loss, state, chosen, critic_order)
+        told, obs = jax.vmap(self.look, (OVER_TASKS, 0, 0))(state.critic, chosen.told, chosen.obs)
+        data = (chosen._replace(told=told, obs=obs, ahead=None), sample_keys)
+        moved, done = self.descend("actor", self.gradients.for_actor, self.actor_loss, state, data, actor_order)
         if parts.is_zero(self.kl_limit):
             return (moved, near), seen | done
         limit = jnp.where(self.kl_limit > 0, self.kl_limit, jnp.inf)
@@ -389,7 +388,7 @@ class PPO(BaseAgent):
         memory = getattr(state.surgery, name)
         seen = surgery.gradient(rule, loss, params, data, memory, key, importance, self.per_layer)
         memory = getattr(state.optimizers, name)
-        params, memory = descent.descend(getattr(self.optimizers, name), seen.gradients, memory, params)
+        params, memory = descent.descend(getattr(self.network_optimizers, name), seen.gradients, memory, params)
         state = state._replace(
             **{name: params},
             optimizers=state.optimizers._replace(**{name: memory}),

@@ -12,14 +12,13 @@ import optax
 
 from mtjax import normalize
 from mtjax.agents import parts
-from mtjax.agents.base import FLAT, BaseAgent, Memory
-from mtjax.agents.parts import conditioning
+from mtjax.agents.base import FLAT, BaseAgent, Memory, Pair
 from mtjax.agents.parts.gradients import descent, surgery
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.trajectory import append
 from mtjax.agents.parts.values import VALUES, Value
 from mtjax.experience import Replay
-from mtjax.networks import OVER_TASKS, Network, Params, tanh_normal
+from mtjax.networks import OVER_TASKS, Params, tanh_normal
 from mtjax.types import Acted, Array, InputError, Key, Metrics, Spec, Task, Transition
 
 
@@ -31,25 +30,18 @@ class Optimizers(NamedTuple):
     temperature: Any
 
 
-class Surgery(NamedTuple):
-    """What the rules of gradient surgery remember."""
-
-    critic: Any
-    actor: Any
-
-
 class SACState(NamedTuple):
     """Everything SAC learns, and what it remembers of the training tasks."""
 
     actor: Params
-    critic: Params  # shared leaves (N, ...), own leaves (T, N, ...)
+    critic: Params  # shared leaves (N, ...), own leaves (T, N, ...); beside them the representation, without N
     target: Params  # slow copy of the critic
     log_temperature: Array  # (T,), or (1,) if shared
     optimizers: Optimizers
     moments: normalize.Moments
     contexts: Array  # (T, C) of the training tasks, among which an unseen task finds its nearest
     vectors: Array | None  # (T, V) given task vectors, if conditioned on them
-    surgery: Surgery
+    surgery: Pair
     scales: Any  # what the scaling of rewards remembers
     progress: Any  # what the sampler of tasks remembers
 
@@ -65,6 +57,7 @@ class Batch(NamedTuple):
     told: Array  # (Z,) or (B, Z), what the networks are told of the task
     temperature: Array  # ()
     mask: Array | None  # (A,) 1 for actions that the task has; None: it has all
+    ahead: Any = None  # what the models of the representation fit
 
 
 class Sample(NamedTuple):
@@ -125,47 +118,26 @@ class SAC(BaseAgent):
 
     # Networks.
 
-    @property
-    def actor(self) -> Network:
-        return self.network(self.actor_layer_norm)
-
-    @property
-    def critic(self) -> Network:
-        return self.network(self.critic_layer_norm)
-
     def init(self, spec: Spec, tasks: Task, key: Key) -> SACState:
         """Initialise for the training ``tasks`` (T, ...)."""
-        num_tasks = len(tasks.id)
-        vectors, moments = self.load_vectors(num_tasks), self.init_moments(spec, num_tasks)
-        told = conditioning.features(self.conditioning, num_tasks, jnp.int32(0), tasks.context[0], vectors)
-        obs, action = self.example(spec, moments), jnp.zeros(spec.action_size)
-        actor, critic = self.init_networks(num_tasks, told, obs, action, key)
+        common = self.init_common(spec, tasks, key)
         log = jnp.log if isinstance(self.initial_temperature, Array) else np.log
-        log_temperature = jnp.full(1 if self.shared_temperature else num_tasks, log(self.initial_temperature))
+        log_temperature = jnp.full(1 if self.shared_temperature else len(tasks.id), log(self.initial_temperature))
         log_temperature = log_temperature.astype(jnp.float32)
-        parameters = (actor, critic, log_temperature)
-        memory = lambda rule, params: surgery.init(rule, params, num_tasks, self.per_layer)
+        parameters = (common["actor"], common["critic"], log_temperature)
         return SACState(
-            actor=actor,
-            critic=critic,
-            target=jax.tree.map(jnp.copy, critic),
+            **common,
+            target=jax.tree.map(jnp.copy, common["critic"].without(self.representation.models)),
             log_temperature=log_temperature,
             optimizers=Optimizers(*(o.init(p) for o, p in zip(self.optimizers, parameters, strict=True))),
-            moments=moments,
-            contexts=tasks.context,
-            vectors=vectors,
-            surgery=Surgery(memory(self.gradients, critic), memory(self.gradients.for_actor, actor)),
-            scales=self.scaling.init(num_tasks),
-            progress=self.sampler.init(num_tasks),
         )
 
-    def init_networks(self, num_tasks: int, told: Array, obs: Any, action: Array, key: Key) -> tuple[Params, Params]:
-        """Initialise actor and critics for inputs of the given shapes, (Z,), (O,) and (A,)."""
+    def init_networks(self, num_tasks: int, told: Array, obs: Any, action: Array, key: Key) -> Pair:
         actor_key, critic_key = jax.random.split(key)
         actor = self.actor.init(actor_key, num_tasks, 2 * len(action), told, obs)
         init_critic = lambda k: self.critic.init(k, num_tasks, self.value.outputs, told, obs, action)
         keys = jax.random.split(critic_key, self.num_critics)
-        return actor, jax.vmap(init_critic, out_axes=Params(shared=0, own=1))(keys)  # type: ignore
+        return Pair(actor, jax.vmap(init_critic, out_axes=Params(shared=0, own=1))(keys))  # type: ignore
 
     def reset(self, state: SACState, spec: Spec, tasks: Task, key: Key) -> SACState:
         """Begin anew with networks, optimisers, temperatures and surgery; what was learned of the data stays."""
@@ -179,22 +151,15 @@ class SAC(BaseAgent):
 
     @property
     def optimizers(self) -> Optimizers:
-        chosen = partial(descent.adam, weight_decay=self.weight_decay, max_norm=self.max_gradient_norm, tune=self.tune)
-        return Optimizers(chosen(self.actor_lr), chosen(self.critic_lr), optax.adam(self.temperature_lr))
+        return Optimizers(*self.network_optimizers, optax.adam(self.temperature_lr))
 
     # Acting.
 
     def act(self, state: SACState, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
         """Choose an action (A,) for one observation (O,) of one task; no key: the mean action."""
-        actor, critic = self.parameters(state, task)
         trained = task.id < len(state.contexts)
-        seen = self.see(self.moments_of(state, self.known_task(state, task)), obs, memory.past)
-        outputs = self.behaviour(trained, actor, critic, self.features(state, task), seen)
+        outputs = self.behaviour(trained, *self.situation(state, memory, obs, task))
         return Acted(tanh_normal(outputs, key, task.action_mask)[0], memory.past, memory)
-
-    def parameters(self, state: SACState, task: Task) -> tuple[Params, Params]:
-        """Actor and critics as one task uses them."""
-        return self.of_task(state, task, state.actor, state.critic)  # type: ignore
 
     def behaviour(self, trained: Array, actor: Params, critic: Params, told: Array, obs: Any) -> Array:
         """Outputs of the policy that acts, in a task that was ``trained`` on () or in another."""
@@ -202,14 +167,9 @@ class SAC(BaseAgent):
 
     # Losses of one task.
 
-    @property
-    def least_loss(self) -> float | Array:
-        """The least that a task's critic loss can be; rules that look at losses are given what lies above it."""
-        return 0.0
-
     def policy(self, actor: Params, critic: Params, told: Array, obs: Any) -> Array:
-        """The policy's outputs (..., 2A); agents whose actor stands on the critic's representation use ``critic``."""
-        return self.actor.apply(actor, told, obs)
+        """The policy's outputs (..., 2A); the actor stands on the representation that lies beside the critics."""
+        return self.actor.apply(actor, *self.look(critic, told, obs))
 
     def sample(self, actor: Params, critic: Params, batch: Batch, obs: Any, key: Key) -> Sample:
         """Let the policy act at observations (B, O) of a batch."""
@@ -226,7 +186,8 @@ class SAC(BaseAgent):
 
     def of_critics(self, apply: Callable, critic: Params, told: Array, obs: Any, action: Array) -> Any:
         """What ``apply``, as ``Network.apply`` takes its inputs, makes of every critic (N, ...)."""
-        return jax.vmap(apply, (0, None, None, None))(critic, told, obs, action)
+        told, seen = self.sight.perceive(critic, told, obs)
+        return jax.vmap(apply, (0, None, None, None))(critic.without(self.sight.names), told, seen, action)
 
     def target(self, actor: Params, critic: Params, slow: Params, batch: Batch, key: Key) -> Any:
         """y (B, ...), in the form that ``value.loss`` takes."""
@@ -242,7 +203,8 @@ class SAC(BaseAgent):
         values, expected = self.value.mean(outputs), self.value.expected(target)
         td_error = jnp.mean(jnp.abs(values - expected))
         seen = {"critic_loss": loss, "value": jnp.mean(values), "td_error": td_error}
-        return loss, seen | {"target": expected}  # which ``update`` takes for the scaling
+        seen |= {"target": expected}  # which ``update`` takes for the scaling
+        return self.sight.join(loss, seen, critic, batch)
 
     def actor_loss(self, actor: Params, data: tuple[Batch, Params, Key]) -> tuple[Array, Metrics]:
         batch, critic, key = data
@@ -291,7 +253,7 @@ class SAC(BaseAgent):
             target=slow,
             log_temperature=log_temperature,
             optimizers=Optimizers(actor_memory, critic_memory, temperature_memory),
-            surgery=Surgery(critic_weighing, done.memory),
+            surgery=Pair(done.memory, critic_weighing),
             scales=scales,
         )
         named = (("critic", seen.metrics), ("actor", done.metrics))
@@ -318,19 +280,17 @@ class SAC(BaseAgent):
         )
 
     def update_target(self, critic: Params, target: Params) -> Params:
-        """Move the slow critic towards the new critic."""
-        return optax.incremental_update(critic, target, self.tau)  # type: ignore
+        """Move the slow critic, and the slow representation, towards the new one."""
+        rate = lambda name: self.representation.rates.get(name, self.tau)
+        step = lambda new, old: {k: optax.incremental_update(new[k], old[k], rate(k)) for k in old}
+        return Params(step(critic.shared, target.shared), step(critic.own, target.own))
 
     def critic_problem(self, state: SACState, batch: Batch, key: Key) -> tuple[Callable, Any]:
         """The critic's loss for one task, and the data of all (T, ...): what ``surgery.gradient`` differentiates."""
+        ahead, keys = self.sight.targets(state.critic, state.target, batch.next_obs, key)
         bootstrap = jax.vmap(self.target, (OVER_TASKS, OVER_TASKS, OVER_TASKS, 0, 0))
-        keys = jax.random.split(key, len(batch.temperature))
-
-        def loss(critic: Params, data) -> tuple[Array, Metrics]:
-            value, metrics = self.critic_loss(critic, data)
-            return value - self.least_loss, metrics
-
-        return loss, (batch, bootstrap(state.actor, state.critic, state.target, batch, keys))
+        target = bootstrap(state.actor, state.critic, state.target, batch, keys)
+        return self.above_least(self.critic_loss), (batch._replace(ahead=ahead), target)
 
     def actor_problem(self, critic: Params, batch: Batch, key: Key) -> tuple[Callable, Any]:
         """The actor's loss for one task under a critic, and the data of all tasks (T, ...)."""

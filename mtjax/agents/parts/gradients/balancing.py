@@ -1,7 +1,7 @@
 """Rules of gradient surgery that balance tasks over time: weights that are parameters, learned beside the networks'.
 
 Both look at ratios of losses, which mean something only where 0 is the least that a loss can be. Agents count their
-critics' losses from there (``SAC.least_loss``), as a log-likelihood, for one, may be negative; an actor's loss has no
+critics' losses from there (``least_loss``), as a log-likelihood, for one, may be negative; an actor's loss has no
 known least, and ``for_actor`` looks at none. A loss that is 0 or below all the same is that of a task that is absent.
 """
 

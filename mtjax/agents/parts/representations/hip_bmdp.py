@@ -1,18 +1,16 @@
 """HiP-BMDP: a DeepMDP in which tasks have vectors of hidden parameters, as far apart as what happens in them."""
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
 from mtjax.agents import parts
-from mtjax.agents.deepmdp import DeepMDP
-from mtjax.agents.sac import Batch, SACState
+from mtjax.agents.parts.representations.deepmdp import Ahead, DeepMDP
 from mtjax.networks import Params
-from mtjax.types import Array, Key, Metrics, Task
+from mtjax.types import Array, Key, Metrics
 
 STAND_INS = {
     "nearest": "",
@@ -37,7 +35,7 @@ class HiPBMDP(DeepMDP):
 
     ``unseen_theta`` says what stands for the theta of a task that was not trained on. (MTRL has a mean over all tasks
     and one over training tasks; here only training tasks have a theta, and the two are one.) "inferred" is a
-    trajectory encoder g of the last steps (``agents/trajectory.py``), fitted to training tasks by
+    trajectory encoder g of the last steps (``parts/trajectory.py``), fitted to training tasks by
         L_g = mean |g(last steps) - sg(theta_i)|^2                                                     (guess loss)
 
     Whatever else ``conditioning`` tells stands beside theta, and conditioning=embedding is theta itself.
@@ -53,6 +51,9 @@ class HiPBMDP(DeepMDP):
     """The theta of an unseen task: that of the nearest training task, zero, the mean of all training tasks', or
     inferred from the last steps."""
 
+    names: ClassVar[tuple[str, ...]] = (*DeepMDP.names, "guess")
+    models: ClassVar[tuple[str, ...]] = (*DeepMDP.models, "guess")
+
     def __post_init__(self):
         super().__post_init__()
         parts.require_not_negative(self, "theta_coefficient")
@@ -62,73 +63,67 @@ class HiPBMDP(DeepMDP):
         return True
 
     @property
-    def history(self) -> int:
-        return self.inferred_from if self.unseen_theta == "inferred" else super().history
+    def looks_back(self) -> bool:
+        return self.unseen_theta == "inferred"
 
     @property
     def modules(self) -> dict[str, nn.Module]:
-        guess = {"guess": self.trajectory} if self.unseen_theta == "inferred" else {}
-        return super().modules | guess
+        return super().modules | ({"guess": self.trajectory} if self.looks_back else {})
 
-    # Unseen tasks.
+    # Tasks that were not trained on.
+
+    def stand_in(self, params: Params, trained: Params, known: Array, obs: Any) -> Params:
+        thetas = trained.own["embedding"]
+        match self.unseen_theta:
+            case "zero":
+                theta = jnp.zeros_like(thetas[0])
+            case "mean":
+                theta = jnp.mean(thetas, axis=0)
+            case "inferred":
+                theta = self.apply(params, "guess", obs)
+            case _:
+                return params
+        return with_theta(params, jnp.where(known, params.own["embedding"], theta))
+
+    def borrowed(self, found: list[str]) -> list[str]:
+        return [part for part in found if part != "embedding"] + ["theta"] * (self.unseen_theta == "nearest")
 
     @property
-    def borrowed(self) -> list[str]:
-        rest = [part for part in super().borrowed if part != "embedding"]
-        return rest + ["theta"] * (self.unseen_theta == "nearest")
-
-    @property
-    def unseen(self) -> str:
-        own = f"each has {STAND_INS[self.unseen_theta]}" if STAND_INS[self.unseen_theta] else ""
-        return ", and ".join(filter(None, [super().unseen, own]))
-
-    def parameters(self, state: SACState, task: Task) -> tuple[Params, Params]:
-        actor, critic = super().parameters(state, task)
-        thetas = state.critic.own["embedding"]
-        stand_in = {"zero": jnp.zeros_like(thetas[0]), "mean": jnp.mean(thetas, axis=0)}.get(self.unseen_theta)
-        if stand_in is None:
-            return actor, critic
-        return actor, with_theta(critic, jnp.where(task.id < len(thetas), critic.own["embedding"], stand_in))
-
-    def behaviour(self, trained: Array, actor: Params, critic: Params, features: Array, obs: Any) -> Array:
-        if self.unseen_theta == "inferred":
-            theta = jnp.where(trained, critic.own["embedding"], self.apply(critic, "guess", obs))
-            critic = with_theta(critic, theta)
-        return super().behaviour(trained, actor, critic, features, obs)
+    def replaced(self) -> str:
+        return STAND_INS[self.unseen_theta]
 
     # Losses.
 
-    def critic_problem(self, state: SACState, batch: Batch, key: Key) -> tuple[Callable, Any]:
+    def targets(self, params: Params, slow: Params, next_obs: Any, key: Key) -> tuple[Ahead, Key]:
         key, turn_key = jax.random.split(key)
-        loss, (batch, targets) = super().critic_problem(state, batch, key)
-        thetas = state.critic.own["embedding"]
+        ahead, keys = super().targets(params, slow, next_obs, key)
+        thetas = params.own["embedding"]
         turn = jax.random.randint(turn_key, (), 1, max(len(thetas), 2))  # a task that is alone is its own rival
-        return loss, (batch, targets._replace(rival=jnp.roll(thetas, turn, axis=0)))
+        return ahead._replace(rival=jnp.roll(thetas, turn, axis=0)), keys
 
-    def critic_loss(self, critic: Params, data) -> tuple[Array, Metrics]:
-        loss, metrics = super().critic_loss(critic, data)
-        batch, targets = data
-        theta_loss = jnp.mean(self.theta_loss(critic, batch.told, batch.obs, batch.action, targets.rival))
+    def join(self, loss: Array, metrics: Metrics, params: Params, batch: Any) -> tuple[Array, Metrics]:
+        loss, metrics = super().join(loss, metrics, params, batch)
+        theta_loss = jnp.mean(self.theta_loss(params, batch.told, batch.obs, batch.action, batch.ahead.rival))
         metrics |= {"theta_loss": theta_loss}
         loss += self.theta_coefficient * theta_loss
         if self.unseen_theta != "inferred":
             return loss, metrics
-        error = self.apply(critic, "guess", batch.obs) - jax.lax.stop_gradient(critic.own["embedding"])
+        error = self.apply(params, "guess", batch.obs) - jax.lax.stop_gradient(params.own["embedding"])
         guess_loss = jnp.mean(jnp.sum(jnp.square(error), axis=-1))
         return loss + guess_loss, metrics | {"guess_loss": guess_loss}
 
-    def theta_loss(self, critic: Params, features: Array, obs: Any, action: Array, rival: Array) -> Array:
+    def theta_loss(self, params: Params, told: Array, obs: Any, action: Array, rival: Array) -> Array:
         """The theta loss (B,) of one task against another task's vector (Z,)."""
-        still, other = jax.lax.stop_gradient((critic, with_theta(critic, rival)))
-        foretold = [self.foretell(p, *self.perceive(p, features, obs), action) for p in (still, other)]
+        still, other = jax.lax.stop_gradient((params, with_theta(params, rival)))
+        foretold = [self.foretell(p, *self.perceive(p, told, obs), action) for p in (still, other)]
         ours, theirs = map(jnp.stack, foretold)  # (2, B, D), means and deviations
         moved = jnp.sqrt(jnp.sum(jnp.square(ours - theirs), axis=(0, -1)))
-        return jnp.square(distance(self.theta(critic), self.theta(other)) - moved)
+        return jnp.square(distance(self.theta(params), self.theta(other)) - moved)
 
 
-def with_theta(critic: Params, theta: Array) -> Params:
-    """One task's critics with another vector."""
-    return critic._replace(own={**critic.own, "embedding": theta})
+def with_theta(params: Params, theta: Array) -> Params:
+    """One task's parameters with another vector."""
+    return params._replace(own={**params.own, "embedding": theta})
 
 
 def distance(x: Array, y: Array) -> Array:

@@ -1,0 +1,11 @@
+"""Representations by name: what all networks of an agent stand on. To add one: a file, and a line here."""
+
+from mtjax.agents.parts.representations.base import Place, Plain
+from mtjax.agents.parts.representations.deepmdp import DeepMDP
+from mtjax.agents.parts.representations.hip_bmdp import HiPBMDP
+
+Representation = Plain
+
+REPRESENTATIONS: dict[str, type[Representation]] = {"plain": Plain, "deepmdp": DeepMDP, "hip-bmdp": HiPBMDP}
+
+__all__ = ["REPRESENTATIONS", "DeepMDP", "HiPBMDP", "Place", "Plain", "Representation"]
