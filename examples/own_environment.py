@@ -9,7 +9,8 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from mtjax.envs import Domain, Parameter, register
+import mtjax
+from mtjax.envs import Domain, Parameter
 from mtjax.envs.parameters import MASS
 
 
@@ -53,4 +54,4 @@ class Spring(Domain):
         return jnp.exp(-10 * jnp.abs(world.qpos[0] - task.goal["goal"]))
 
 
-register("spring", Spring, vary={"stiffness": "5:20:4", "goal": "-0.3,0,0.3"})
+mtjax.register("spring", Spring, vary={"stiffness": "5:20:4", "goal": "-0.3,0,0.3"})

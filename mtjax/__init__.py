@@ -21,6 +21,7 @@ _HOME = {
     "make": "mtjax.envs",
     "mixture": "mtjax.envs",
     "preset": "mtjax.config:with_preset",
+    "register": "mtjax.registry",
 }
 __all__ = [*_HOME, "train"]
 

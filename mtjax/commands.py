@@ -115,7 +115,7 @@ def value_of(argv: Sequence[str], name: str, default: P) -> str | P:
 
 
 def import_files(argv: Sequence[str]) -> list[str]:
-    """Run the FILE.py of every --import=FILE.py, which may register families; returns the other words.
+    """Run the FILE.py of every --import=FILE.py, which may ``register`` something; return the other words.
 
     Raises:
         InputError: there is no such file.

@@ -14,7 +14,7 @@ import jax
 import tyro
 
 from mtjax.agents import SAC, BaseAgent, agent, preset_of, settings
-from mtjax.agents.base import replace
+from mtjax.agents.base import kinds_of, replace
 from mtjax.agents.parts import name_of
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.values import VALUES
@@ -55,9 +55,9 @@ class RunConfig:
     """Train a multi-task agent: ``python -m mtjax.train --env=NAME --agent=NAME``."""
 
     env: str = "finger-spin-vary-size"
-    """Name of the environment family; --list shows all. --import=FILE.py makes those known that a file registers.
-    NAME+NAME is a mixture of families, in which --engine, --split and --env.FIELD hold for every family that has such a
-    flag, and --env.vary.NAME.PARAMETER=VALUES for one."""
+    """Name of the environment family; --list shows all. --import=FILE.py makes known what a file registers: families,
+    agents, and parts of agents. NAME+NAME is a mixture of families, in which --engine, --split and --env.FIELD hold for
+    every family that has such a flag, and --env.vary.NAME.PARAMETER=VALUES for one."""
     agent: str = "sac-conditioned"
     """Name of the agent; --list shows all. Its parts: --agent.representation, --agent.encoder, --agent.gradients,
     --agent.value, --agent.scaling and --agent.sampler, each by name and with flags of its own."""
@@ -158,9 +158,11 @@ def _device_preset() -> str:
     return "cpu" if jax.default_backend() == "cpu" else "gpu"
 
 
-def import_flags(env: Tabled) -> list[str]:
-    """The flags that make families of the user's own known to another program; none for those of this package."""
-    modules = dict.fromkeys(type(part.family).__module__ for part in env.parts)
+def import_flags(config: RunConfig) -> list[str]:
+    """The flags that make what is the user's own known to another program: families, the agent and its parts."""
+    used = [*(part.family for part in config.family.parts), config.learner]
+    used += [getattr(config.learner, kind) for kind in kinds_of(config.learner)]
+    modules = dict.fromkeys(type(each).__module__ for each in used)
     own = [sys.modules.get(name) for name in modules if name.split(".")[0] != "mtjax"]
     files = [getattr(module, "__file__", None) for module in own]
     return [f"--import={Path(file).resolve()}" for file in files if file is not None]

@@ -14,9 +14,11 @@ if TYPE_CHECKING:
 
 def main(argv: Sequence[str]) -> None:
     """Answer what names alone can answer; then import what trains, and run what the command line asks for."""
+    own = any(word.startswith("--import=") for word in argv)  # whose settings are read with the rest
     argv = commands.import_files(argv)
     commands.check_names(argv)
-    commands.check_flags(argv)
+    if not own:
+        commands.check_flags(argv)
     if "--list" in argv:
         print(commands.catalogue())
         return

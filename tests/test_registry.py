@@ -1,7 +1,9 @@
 """Every registered family, whatever runs it: it starts, steps, stays finite, repeats itself and names its tasks."""
 
+import dataclasses
 import json
 import shlex
+import sys
 from functools import partial
 from pathlib import Path
 
@@ -9,11 +11,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import SHORT_RUN
 
 import mtjax
 import mtjax.evaluate
 import mtjax.train
-from mtjax.envs import ENVS, register
+from mtjax import register
+from mtjax.agents import AGENTS, PARTS
+from mtjax.envs import ENVS
 from mtjax.tasks import episode_task
 from mtjax.types import SPLITS, InputError
 
@@ -106,3 +111,67 @@ def test_names_are_given_once_and_with_settings_that_exist():
     with pytest.raises(InputError, match="unknown setting of mine 'varry'"):
         register("mine", ENVS["finger-spin"][0], varry={})
     assert "mine" not in ENVS
+
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+OWN = {  # each file, what it registers and where, and the flags of its worked example
+    "own_encoder": ("encoder", "gated", ["--agent.encoder=gated", "--agent.gate-widths", "4"]),
+    "own_gradient_rule": ("gradients", "consensus", ["--agent.gradients=consensus", "--agent.sharpness=2"]),
+    "own_sampler": ("sampler", "below-mark", ["--agent.sampler=below-mark", "--agent.mark=1"]),
+    "own_scaling": ("scaling", "largest", ["--agent.scaling=largest"]),
+    "own_agent": ("agent", "best-of", ["--agent=best-of", "--agent.candidates=2"]),
+}
+
+
+@pytest.fixture
+def forget():
+    """Take what a test registers out of the tables again, and its files out of those that were imported."""
+    tables = (ENVS, AGENTS, *PARTS.values())
+    before, modules = [set(table) for table in tables], set(sys.modules)
+    yield
+    for table, names in zip(tables, before, strict=True):
+        for name in set(table) - names:
+            del table[name]
+    for name in set(sys.modules) - modules:
+        if name.startswith("own_"):
+            del sys.modules[name]
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_parts_and_agents_of_ones_own_are_trained(name, short_family, forget, tmp_path, capsys):
+    """The worked examples, by the command line, and again from the run's own record; each is under 60 lines."""
+    kind, own, flags = OWN[name]
+    file = EXAMPLES / f"{name}.py"
+    assert len(file.read_text().splitlines()) < 60
+    mtjax.train.main([f"--import={file}", *SHORT_RUN[:1], *SHORT_RUN[2:], *flags, "--steps=200", f"--runs={tmp_path}"])
+    (run,) = tmp_path.iterdir()
+    record = json.loads((run / "config.json").read_text())
+    assert f"--import={file}" in shlex.split(record["command"])
+    assert (record["agent"] if kind == "agent" else record["learner"][kind]) == own
+    assert type(mtjax.load(run).agent) is AGENTS[record["agent"]].cls
+
+
+def test_an_agent_is_another_with_other_defaults(forget):
+    register("my-care", "care", num_experts=3, actor_lr=1e-2)
+    agent = mtjax.agent("my-care")
+    assert agent.encoder.num_experts == 3 and agent.actor_lr == 1e-2 and agent.conditioning == "parameters"
+
+
+def test_what_cannot_be_registered_is_refused(forget):
+    """In a line that says why, and without a trace."""
+
+    @dataclasses.dataclass(frozen=True)
+    class Clash(PARTS["encoder"]["identity"]):
+        gamma: float = 0.5
+
+    with pytest.raises(InputError, match="Clash and agents would both have a setting gamma"):
+        register("clash", Clash)
+    with pytest.raises(InputError, match="encoder 'care' exists already"):
+        register("care", type("Mine", (PARTS["encoder"]["identity"],), {}))
+    with pytest.raises(InputError, match="agent 'sac' already"):
+        register("sac", "care")
+    with pytest.raises(InputError, match="must be a subclass of"):
+        register("mine", dict)
+    with pytest.raises(InputError, match="actor-lr must be greater than 0"):
+        register("mine", "sac", actor_lr=-1.0)
+    assert "mine" not in AGENTS and "clash" not in PARTS["encoder"]

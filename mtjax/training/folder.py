@@ -85,7 +85,7 @@ def circumstances(config: RunConfig) -> dict:
 
 def repeat(config: RunConfig) -> list[str]:
     """Every flag of this program, so that the command means the same whatever the presets become."""
-    words = [f"--env={config.env}", f"--agent={config.agent}", *import_flags(config.family)]
+    words = [f"--env={config.env}", f"--agent={config.agent}", *import_flags(config)]
     words += [f"--from={config.start}"] if config.start else []
     found = {"--": {**_fields(config.plan), **_fields(config.training)}, "--env.": _family_settings(config.family)}
     for prefix, items in found.items():

@@ -53,7 +53,7 @@ def _prepare(config: RunConfig, directory: Path | None) -> Path:
 
 def _conclude(config: RunConfig, result: Result, directory: Path) -> None:
     if not result.finished:
-        words = [f"--resume={directory}", *import_flags(config.family)]
+        words = [f"--resume={directory}", *import_flags(config)]
         print(f"stopped; the state is saved. Go on with:\n  python -m mtjax.train {shlex.join(words)}")
         return
     if len(result.evaluations.steps):

@@ -190,7 +190,7 @@ def carry_on(folder: Path) -> None:
         start = None if resume else starting(config)
         try:
             if not launch(config, run, start, resume, label).finished:
-                words = shlex.join([f"--resume={folder}", *import_flags(config.family)])
+                words = shlex.join([f"--resume={folder}", *import_flags(config)])
                 print(f"stopped; the state is saved. Go on with:\n  python -m mtjax.train {words}")
                 return
             _draw(config, run)

@@ -1,0 +1,47 @@
+"""An agent of your own: SAC whose actor also imitates the best of a few sampled actions.
+
+python -m mtjax.train --import=examples/own_agent.py --agent=best-of --agent.candidates=8
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+import mtjax
+from mtjax.agents import SAC
+from mtjax.agents.parts import require_counts, require_not_negative
+from mtjax.networks import tanh_normal
+
+
+@dataclasses.dataclass(frozen=True)
+class BestOf(SAC):
+    """SAC with L_pi + weight |mean action - a*|^2, a* the best of K sampled actions by the least critic.
+
+    An agent's losses are of one task: it learns from a batch of every task at once, and has every conditioning,
+    encoder, head, scaling, sampler and gradient rule without more code.
+    """
+
+    candidates: int = 4
+    """Actions that are drawn at every observation (K)."""
+    imitation: float = 0.1
+    """Weight of the distance to the best of them."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        require_counts(self, "candidates")
+        require_not_negative(self, "imitation")
+
+    def actor_loss(self, actor, data):
+        loss, metrics = super().actor_loss(actor, data)
+        batch, critic, key = data
+        outputs = self.policy(actor, critic, batch.told, batch.obs)
+        draw = lambda key: jax.lax.stop_gradient(tanh_normal(outputs, key, batch.mask)[0])
+        drawn = jax.vmap(draw)(jax.random.split(key, self.candidates))  # (K, B, A)
+        worth = jax.vmap(lambda a: jnp.min(self.values(critic, batch.told, batch.obs, a), axis=0))(drawn)  # (K, B)
+        best = jnp.take_along_axis(drawn, jnp.argmax(worth, axis=0)[None, :, None], axis=0)[0]
+        distance = jnp.mean(jnp.square(tanh_normal(outputs, None, batch.mask)[0] - best))
+        return loss + self.imitation * distance, metrics | {"imitation": distance}
+
+
+mtjax.register("best-of", BestOf, conditioning="parameters")

@@ -1,0 +1,79 @@
+"""Names for what a user adds: families of environments, agents, and the parts that agents are made of."""
+
+import dataclasses
+from typing import Any
+
+from mtjax import agents, envs
+from mtjax.agents.base import CHOICES, PARTS, BaseAgent
+from mtjax.envs.family import Family
+from mtjax.names import InputError
+
+
+def register(name: str, thing: "type | str", **defaults: Any) -> None:
+    """Give a class of your own a name, under which Python, notebooks and the command line know it.
+
+    Args:
+        name: what ``--env``, ``--agent`` or ``--agent.KIND`` takes.
+        thing: a frozen dataclass. Its base says what it is: ``Domain`` or ``Family`` an environment; ``BaseAgent``,
+            ``SAC`` or ``PPO`` an agent; the plainest part of a kind a part of that kind, whose fields become flags
+            of the agents that choose it. Or the name of an agent, which is given other defaults under a new name.
+        defaults: values of the fields of a family or an agent, such as ``vary={"mass": "0.5:2:10"}``.
+
+    Raises:
+        InputError: the name is taken, the class is of no such kind, or a default is not allowed.
+    """
+    if isinstance(thing, str):
+        known = agents.preset_of(thing)
+        return _register_agent(name, known._replace(defaults={**known.defaults, **defaults}))
+    if issubclass(thing, Family):
+        return envs.register(name, thing, **defaults)
+    if issubclass(thing, BaseAgent):
+        return _register_agent(name, agents.Preset(_sentence(thing), defaults, thing))
+    if defaults:
+        raise InputError(f"a part has the defaults of its class; leave out {', '.join(defaults)}")
+    _register_part(name, thing)
+
+
+def _register_agent(name: str, preset: agents.Preset) -> None:
+    if name in agents.AGENTS:
+        raise InputError(f"there is an agent {name!r} already; choose another name")
+    agents.AGENTS[name] = preset
+    try:
+        agents.agent(name)
+    except InputError:
+        del agents.AGENTS[name]
+        raise
+
+
+def _register_part(name: str, part: type) -> None:
+    kind = next((kind for kind in CHOICES if issubclass(part, plainest(kind))), None)
+    if kind is None:
+        bases = ", ".join(plainest(kind).__name__ for kind in CHOICES)
+        raise InputError(f"{part.__name__} must be a subclass of Domain, Family, BaseAgent, or of one of {bases}")
+    if name in PARTS[kind]:
+        raise InputError(f"{kind} {name!r} exists already; choose another name")
+    if not dataclasses.is_dataclass(part):
+        raise InputError(f"{part.__name__} must be a frozen dataclass, whose fields are its settings")
+    own = {field.name for field in dataclasses.fields(part)} - {f.name for f in dataclasses.fields(plainest(kind))}
+    taken = sorted(own & _names_beside(kind))
+    if taken:
+        raise InputError(f"{part.__name__} and agents would both have a setting {taken[0]}; call it otherwise")
+    PARTS[kind][name] = part  # type: ignore
+
+
+def plainest(kind: str) -> type:
+    """The base of all parts of a kind."""
+    return next(iter(PARTS[kind].values()))
+
+
+def _names_beside(kind: str) -> set[str]:
+    """The settings of all agents and of parts of other kinds, beside which those of a part lie."""
+    of_agents = {name for preset in agents.AGENTS.values() for name in preset.cls.__dataclass_fields__}
+    others = [part for other in PARTS if other != kind for part in PARTS[other].values()]
+    return of_agents | {field.name for part in others for field in dataclasses.fields(part)}
+
+
+def _sentence(thing: type) -> str:
+    """The first sentence of a class's documentation."""
+    text = " ".join((thing.__doc__ or thing.__name__).split("\n\n")[0].split())
+    return text.split(". ")[0].removesuffix(".")
