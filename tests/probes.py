@@ -7,6 +7,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from mtjax import agents, loop
 from mtjax.agents.parts import trajectory
@@ -113,6 +114,12 @@ class Stub:
 
 OFF_POLICY = [name for name, preset in agents.AGENTS.items() if issubclass(preset.cls, agents.SAC)]
 """The agents that learn from batches of a replay; ``test_ppo`` is of the one that does not."""
+
+
+def slow_but(names, *quick):
+    """All names as a test's parameters, marked slow but for the ``quick``."""
+    return [pytest.param(name, marks=[] if name in quick else [pytest.mark.slow]) for name in names]
+
 
 SMALL = {  # of parts that have such settings
     "num_experts": 2,

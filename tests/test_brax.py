@@ -92,7 +92,7 @@ PENDULUM_MJX = Brax(environment="inverted_pendulum", backend="mjx")
     [
         pytest.param(ANT, id="ant", marks=slow),
         pytest.param(CHEETAH, id="halfcheetah", marks=slow),
-        pytest.param(PENDULUM_MJX, id="inverted_pendulum-mjx"),
+        pytest.param(PENDULUM_MJX, id="inverted_pendulum-mjx", marks=slow),
     ],
 )
 def test_nominal_parameters_give_the_trajectory_of_brax(env):

@@ -4,7 +4,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from probes import OFF_POLICY
+from probes import OFF_POLICY, slow_but
 
 import mtjax
 
@@ -24,7 +24,10 @@ QUICK = {
 LONGER = {"distral": 2500}  # whose tasks share no experience
 USUAL = ("sac-conditioned", "multi-head", "soft-modularization", "hip-bmdp")
 TOLD = [name for name in OFF_POLICY if name != "sac"]
-EVERY = [pytest.param(name, marks=[] if name in USUAL else pytest.mark.nightly) for name in TOLD]
+EVERY = [
+    *slow_but(USUAL, "sac-conditioned"),
+    *(pytest.param(x, marks=pytest.mark.nightly) for x in TOLD if x not in USUAL),
+]
 
 
 @cache

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from probes import OFF_POLICY, Probe, mean_actions, only_seed, tasks_of, tiny, train, values
+from probes import OFF_POLICY, Probe, mean_actions, only_seed, slow_but, tasks_of, tiny, train, values
 
 from mtjax.envs.probes import EITHER_SIGN
 
@@ -68,7 +68,7 @@ def test_the_policy_finds_the_best_action_of_each_task():
     assert actions[0] > 0.85  # 1 is the edge of what tanh reaches
 
 
-@pytest.mark.parametrize("name", OFF_POLICY)
+@pytest.mark.parametrize("name", slow_but(OFF_POLICY, "sac", "care", "pcgrad"))
 def test_every_agent_learns_values_and_actions(name):
     """On the probe that needs observation, action and task; an agent that is not told its task gets two alike."""
     scales = (0.7, 0.7) if name == "sac" else SCALES

@@ -4,7 +4,7 @@ import abc
 import dataclasses
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Annotated, Any, Literal, NamedTuple, get_args, get_type_hints
+from typing import Annotated, Any, ClassVar, get_args, get_type_hints, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -68,6 +68,16 @@ class BaseAgent(abc.ABC):
     ``scales``, and by the sampler of tasks, ``progress``.
     """
 
+    adjustable: ClassVar[tuple[str, ...]] = (
+        "actor_lr",
+        "critic_lr",
+        "weight_decay",
+        "max_gradient_norm",
+        "gamma",
+        "vectors",
+        "tune",
+    )
+    """Settings in which fine-tuning may differ from the run: they say how an agent learns, not what it is."""
     hidden: tuple[int, ...] = (256, 256)
     """Widths of the hidden layers of actor and critics."""
     actor_lr: float = 1e-3

@@ -1,7 +1,7 @@
 """Distral: every task its own policy, held together by one that is distilled from them all."""
 
 import dataclasses
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -60,6 +60,7 @@ class Distral(SAC):
     discounts late steps. Its two-column policies, of which pi_0 is one column, are not here.
     """
 
+    adjustable: ClassVar[tuple[str, ...]] = (*SAC.adjustable, "distral_alpha")
     heads: Heads = "disjoint"
     distral_alpha: float = 0.5
     """Share of the distilled policy in what a policy pays for: 0 is none, 1 leaves no entropy bonus."""

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable
 from functools import partial
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -122,6 +122,10 @@ class PPO(BaseAgent):
     include the rollout's, which the ratio counts as a change of the policy, and so it does a representation's steps.
     """
 
+    adjustable: ClassVar[tuple[str, ...]] = (
+        *BaseAgent.adjustable,
+        *("gae_lambda", "epochs", "minibatches", "clip_range", "value_clip", "entropy_cost", "kl_limit", "value_rate"),
+    )
     actor_lr: float = 3e-4
     """Adam's learning rate of the actor."""
     critic_lr: float = 1e-3

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable
 from functools import partial
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -84,6 +84,7 @@ class SAC(BaseAgent):
     temperature a task by default; log standard deviations are brought into [-5, 2] by a tanh.
     """
 
+    adjustable: ClassVar[tuple[str, ...]] = (*BaseAgent.adjustable, "temperature_lr", "tau", "target_entropy")
     temperature_lr: float = 1e-3
     """Adam's learning rate of the temperatures."""
     tau: float = 0.005

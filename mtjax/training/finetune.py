@@ -15,11 +15,8 @@ from mtjax.networks import Params
 from mtjax.training.policy import Policy
 from mtjax.types import Array, Env, InputError, Task
 
-FREE = ("actor_lr", "critic_lr", "temperature_lr", "weight_decay", "max_gradient_norm", "gamma", "tau")
-FREE = (*FREE, "target_entropy", "distral_alpha", "vectors", "tune")
-"""Settings of an agent in which fine-tuning may differ from the run: they say how it learns, not what it is."""
 _FRESH = ("optimizers", "contexts", "vectors", "surgery", "progress")  # what is of the new tasks alone
-_BY_TASK = ("log_temperature", "scales")  # leaves (T, ...), or shared by all tasks
+_BY_TASK = ("log_temperature", "scales", "units")  # leaves (T, ...), or shared by all tasks
 
 
 def require_fit(start: Policy, env: Env, agent: BaseAgent) -> None:
@@ -33,11 +30,11 @@ def require_fit(start: Policy, env: Env, agent: BaseAgent) -> None:
     had, given = _learned(start.agent), _learned(agent)
     if type(agent) is not type(start.agent) or had.keys() != given.keys():
         raise InputError("the agent is not the run's; give the one that learned there")
-    other = next((name for name in had if had[name] != given[name] and name not in FREE), None)
+    other = next((name for name in had if had[name] != given[name] and name not in agent.adjustable), None)
     if other is not None:
         raise InputError(
             f"{other.replace('_', '-')} is the run's, {had[other]}, and cannot be {given[other]}; "
-            f"what may change is {', '.join(name.replace('_', '-') for name in FREE if name in had)}"
+            f"what may change is {', '.join(name.replace('_', '-') for name in agent.adjustable if name in had)}"
         )
     family, known = env, start.env
     theirs, ours = known.spec, family.spec
@@ -73,14 +70,15 @@ def _require_numbers(start: Policy, env: Env, agent: BaseAgent) -> None:
 def adopt(start: Policy, agent: BaseAgent, tasks: Task, fresh: Any) -> Any:
     """Return an agent's ``fresh`` state (S, ...) for new ``tasks`` (T, ...) with what a run learned in it.
 
-    Networks, their slow copies, temperatures, scales of rewards and moments of observations are the run's; of what
+    Networks, their slow copies, temperatures, units of values, scales of rewards and moments of observations are the
+    run's; of what
     every task has for itself, a new task receives that of the run's nearest training task. Optimisers, and what
     gradient surgery and samplers remember, are fresh. Seed number k begins with the run's seed k modulo its seeds.
 
     Raises:
         InputError: the shapes of networks differ.
     """
-    seeds = jnp.arange(len(fresh.log_temperature)) % len(start.seeds)
+    seeds = jnp.arange(len(fresh.contexts)) % len(start.seeds)
     old = jax.tree.map(lambda x: x[seeds], start.states)
     state = jax.vmap(partial(_adopt, agent, tasks))(old, fresh)
     pairs = zip(jax.tree.leaves_with_path(state), jax.tree.leaves(fresh), strict=True)
