@@ -1,12 +1,14 @@
 """What the commands share, and what they answer before JAX is imported: the list, wrong names, missing runs."""
 
+import ast
 import contextlib
 import importlib.util
 import io
 import itertools
 import re
 import sys
-from collections.abc import Iterable, Sequence
+import textwrap
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,6 +18,11 @@ from mtjax.names import InputError, nearest_error
 
 PRESETS = ("auto", "cpu", "gpu")
 _KNOWN = (("environment", "env", ENVS), ("agent", "agent", AGENTS), ("preset", "preset", PRESETS))
+_OVERVIEW = (  # titles, and the classes whose fields are flags of every run
+    ("what runs", "config.py", "RunConfig"),
+    ("for how long (a preset may say otherwise)", "config.py", "Plan"),
+    ("how worlds are played (a preset may say otherwise)", "loop.py", "Settings"),
+)
 _MAY_CHANGE = {"--resume", "--steps", "--import", "--distributed", "--profile"}  # where a run goes on
 _FIELD = re.compile(r"^    (\w+): ", re.MULTILINE)  # a line of a class that may be a setting
 P = TypeVar("P")
@@ -47,6 +54,33 @@ def catalogue() -> str:
         lines.append(f"  {name:36} {tasks:3} task{'s' if tasks > 1 else ' '}  {says}")
     lines.append("agents:")
     return "\n".join(lines + [f"  {name:36} {preset.says}" for name, preset in AGENTS.items()])
+
+
+def overview() -> str:
+    """Return what ``--help`` alone says: the flags of every run, read from the classes' source as JAX is not needed."""
+    lines = [
+        "usage: python -m mtjax.train [--env=NAME] [--agent=NAME] [FLAGS]",
+        "       python -m mtjax.train --env=NAME --agent=NAME --help    all flags of these, with defaults",
+        "       python -m mtjax.train --list                            all families and agents",
+    ]
+    for title, file, cls in _OVERVIEW:
+        lines += ["", f"{title}:"]
+        for flag, default, text in _fields(Path(__file__).parent / file, cls):
+            lines.append(f"  --{flag + default}")
+            lines += textwrap.wrap(text, 110, initial_indent=" " * 6, subsequent_indent=" " * 6)
+    return "\n".join(lines)
+
+
+def _fields(file: Path, cls: str) -> Iterator[tuple[str, str, str]]:
+    """Yield the flag, default and documentation of every documented field of a class that is a plain value."""
+    tree = ast.parse(file.read_text(encoding="utf-8"))
+    body = next(node.body for node in tree.body if isinstance(node, ast.ClassDef) and node.name == cls)
+    for field, text in itertools.pairwise(body):
+        if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
+            flag = ast.unparse(field.target).replace("_", "-").replace("start", "from")
+            default = ast.literal_eval(field.value) if field.value is not None else ""
+            plain = isinstance(default, bool) or default in ("", ())
+            yield flag, "" if plain else f"={default}", " ".join(str(text.value.value).split())
 
 
 def check_names(argv: Sequence[str]) -> None:

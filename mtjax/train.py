@@ -19,6 +19,9 @@ def main(argv: Sequence[str]) -> None:
     commands.check_names(argv)
     if not own:
         commands.check_flags(argv)
+    if argv in (["--help"], ["-h"]):
+        print(commands.overview())
+        return
     if "--list" in argv:
         print(commands.catalogue())
         return

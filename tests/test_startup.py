@@ -54,6 +54,7 @@ def ours(monkeypatch):
     [
         ("mtjax", [], 0, ""),
         ("mtjax.train", ["--list"], 0, "two-goal-maze-seen"),
+        ("mtjax.train", ["--help"], 0, "--eval-every"),
         ("mtjax.train", ["--env=finger-spn"], 2, "did you mean 'finger-spin'?"),
         ("mtjax.train", ["--agent", "carr"], 2, "did you mean 'care'?"),
         ("mtjax.train", ["--preset=gpus"], 2, "did you mean 'gpu'?"),
