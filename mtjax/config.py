@@ -105,16 +105,18 @@ def with_preset(
         InputError: a name or setting is unknown.
     """
     family = make(env_name, **family_settings)
-    preset = load_preset(env_name, _device_preset() if preset_name == "auto" else preset_name)
-    chosen = preset.get("training", {}) | preset.get("agent", {}) | preset.get(agent_name, {})
-    if not issubclass(preset_of(agent_name).cls, SAC):  # the tables of all agents are tuned for SAC
-        chosen = preset.get(agent_name, {})
-    played = {name: chosen.pop(name) for name in list(chosen) if name in Settings.__dataclass_fields__}
+    device = _device_preset() if preset_name == "auto" else preset_name
+    preset, common = load_preset(env_name, device), load_preset("+", device)
+    chosen = common.get(agent_name, {}) | preset.get(agent_name, {})
+    if issubclass(preset_of(agent_name).cls, SAC):  # for which the tables of all agents are tuned
+        chosen = preset.get("training", {}) | preset.get("agent", {}) | chosen
+    take = lambda cls: {name: chosen.pop(name) for name in list(chosen) if name in cls.__dataclass_fields__}
+    planned, played = preset.get("plan", {}) | take(Plan), take(Settings)
     return RunConfig(
         env=env_name,
         agent=agent_name,
         preset=preset_name,  # type: ignore
-        plan=Plan(**preset.get("plan", {})),
+        plan=Plan(**planned),
         training=Settings(**played),
         family=family,
         learner=agent(agent_name, **{**chosen, **agent_settings}),

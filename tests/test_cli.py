@@ -164,7 +164,7 @@ def test_presets_name_only_what_there_is(file):
     fields = lambda cls: {field.name for field in dataclasses.fields(cls)}
     known = {"plan": fields(Plan), "agent": set(settings_of(mtjax.agent("sac")))}
     known["training"] = known["agent"] | fields(Settings)
-    known |= {name: set(settings_of(mtjax.agent(name))) | fields(Settings) for name in AGENTS}
+    known |= {name: set(settings_of(mtjax.agent(name))) | fields(Settings) | fields(Plan) for name in AGENTS}
     for tables in preset.values():
         for table, settings in tables.items():
             assert set(settings) <= known[table], table
@@ -183,10 +183,10 @@ def test_every_preset_makes_a_program(env, agent, preset):
     """Its settings are allowed, and arrive."""
     program = with_preset(env, agent, preset)
     tables = load_preset(env, preset)
-    expected = tables.get(agent, {})
+    expected = load_preset("+", preset).get(agent, {}) | tables.get(agent, {})
     if agent != "ppo":  # the tables of all agents are tuned for replay
         expected = tables["training"] | tables["agent"] | expected
-    found = settings_of(program.learner) | dataclasses.asdict(program.training)
+    found = settings_of(program.learner) | dataclasses.asdict(program.training) | dataclasses.asdict(program.plan)
     assert set(expected) <= set(found)
     for name, value in expected.items():
         assert found[name] == (tuple(value) if isinstance(value, list) else value)
