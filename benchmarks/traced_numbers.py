@@ -1,0 +1,86 @@
+"""What it costs to keep an agent's numbers (rates, discounts, weights) as data instead of constants of the program.
+
+    python benchmarks/traced_numbers.py [--agents NAME ...] [--json FILE]
+
+A sweep keeps its numbers as data, so that they differ within one program; a plain run has constants. Both forms take
+the same updates (10 tasks x 64 transitions, 2 x 256) in turn; ratios are medians of seven rounds. Compiling is timed
+once, without a cache.
+"""
+
+import argparse
+import json
+import statistics
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from report import machine, markdown
+
+import mtjax
+from mtjax.envs.probes import tasks_of
+from mtjax.training.points import Varied, numbers
+from mtjax.types import Spec, Transition
+
+TASKS, BATCH, UPDATES, ROUNDS = 10, 64, 20, 7
+SPEC = Spec.vector(9, 2, 1)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--agents", nargs="+", default=["sac-conditioned", "care", "pcgrad"], metavar="NAME")
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    rows = [compare(name) for name in arguments.agents]
+    head = ["agent", "numbers", "compile s, constants", "compile s, data", "ms, constants", "ms, data", "ratio of ms"]
+    print(markdown(head, [[f"{x:.3g}" if isinstance(x, float) else str(x) for x in row.values()] for row in rows]))
+    if arguments.json:
+        arguments.json.write_text(json.dumps({"machine": machine(), "rows": rows}, indent=1) + "\n")
+
+
+def compare(name: str) -> dict[str, Any]:
+    """Compile and time the updates of one agent in both forms."""
+    agent = mtjax.agent(name, hidden=(256, 256))
+    tasks, key, values = tasks_of("one-step", np.linspace(-1, 1, TASKS)), jax.random.key(0), numbers(agent)
+    varied, knobs = Varied(agent), {name: jnp.float32(value) for name, value in values.items()}
+    states = {
+        "constants": (agent, jax.jit(lambda key: agent.init(SPEC, tasks, key))(key)),
+        "data": (varied, jax.jit(lambda key: varied.init(SPEC, tasks, key, knobs))(key)),
+    }
+    compiled, compile_seconds = {}, {}
+    for form, (learner, state) in states.items():
+
+        def update(state, batch, key, learner=learner):
+            step = lambda state, key: (learner.update(state, batch, tasks, key)[0], None)
+            return jax.lax.scan(step, state, jax.random.split(key, UPDATES))[0]
+
+        lowered, before = jax.jit(update).lower(state, random_batch(), key), time.perf_counter()
+        compiled[form] = lowered.compile()
+        compile_seconds[form] = time.perf_counter() - before
+    seconds = {form: [] for form in states}
+    for _ in range(ROUNDS + 1):
+        for form, (_, state) in states.items():
+            before = time.perf_counter()
+            jax.block_until_ready(compiled[form](state, random_batch(), key))
+            seconds[form].append((time.perf_counter() - before) / UPDATES)
+    each = {form: [1e3 * x for x in times[1:]] for form, times in seconds.items()}
+    return {
+        "agent": name,
+        "numbers": len(values),
+        **{f"compile_{form}": compile_seconds[form] for form in states},
+        **{form: statistics.median(each[form]) for form in states},
+        "ratio": statistics.median(b / a for a, b in zip(each["constants"], each["data"], strict=True)),
+    }
+
+
+def random_batch() -> Transition:
+    """Draw a batch (T, B, ...) of transitions."""
+    random = np.random.default_rng(0)
+    normal = lambda *size: jnp.float32(random.normal(size=(TASKS, BATCH, *size)))
+    return Transition(normal(9), jnp.tanh(normal(2)), normal(), jnp.ones((TASKS, BATCH)), normal(9))
+
+
+if __name__ == "__main__":
+    main()
