@@ -116,6 +116,11 @@ OFF_POLICY = [name for name, preset in agents.AGENTS.items() if issubclass(prese
 """The agents that learn from batches of a replay; ``test_ppo`` is of the one that does not."""
 
 
+def one_in(count, cases):
+    """All cases as a test's parameters, marked slow but for one in ``count``."""
+    return [pytest.param(case, marks=[pytest.mark.slow] if i % count else []) for i, case in enumerate(cases)]
+
+
 def slow_but(names, *quick):
     """All names as a test's parameters, marked slow but for the ``quick``."""
     return [pytest.param(name, marks=[] if name in quick else [pytest.mark.slow]) for name in names]

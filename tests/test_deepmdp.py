@@ -6,7 +6,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import QUICK, Probe, learner, of_task, only_seed, pick, random_batch, random_past, tasks_of, tiny, train
+from probes import (
+    QUICK,
+    Probe,
+    learner,
+    of_task,
+    only_seed,
+    pick,
+    random_batch,
+    random_past,
+    slow_but,
+    tasks_of,
+    tiny,
+    train,
+)
 from probes import act as act_once
 from probes import values as values_of
 
@@ -143,7 +156,7 @@ def test_networks_on_plain_observations_add_nothing_to_the_least():
 
 
 @pytest.mark.parametrize("transition", ["deterministic", "probabilistic"])
-@pytest.mark.parametrize("name", ["sac", "ppo"])
+@pytest.mark.parametrize("name", slow_but(["sac", "ppo"], "sac"))
 def test_rules_see_losses_from_the_least(name, transition, monkeypatch):
     """What FAMO is given in an update of either agent, and that it sees the losses fall from there."""
     weigh = lambda self, memory, gram, losses, key: (jnp.ones(3) / 3, memory._replace(logits=losses))
@@ -197,6 +210,7 @@ def test_theta_loss_of_three_tasks_by_hand(monkeypatch):
         np.testing.assert_allclose(loss, np.square([apart, 0.0, 2 * apart]), rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_rival_is_always_another_task():
     """Over many keys every other task has its turn; one that is alone is its own, and learns nothing of it."""
     agent = make("hip-bmdp")
@@ -374,6 +388,7 @@ def test_theta_of_an_unseen_task_is_inferred_from_its_last_steps():
     assert agent.unseen == "each has a theta inferred from its last steps"
 
 
+@pytest.mark.slow
 def test_the_guess_finds_the_theta_of_the_task_that_steps_were_taken_in():
     """Rewards of a step tell the task; after training each task's guess is near its own theta."""
     agent = make("hip-bmdp", critic_lr=1e-2, **INFERRED)
@@ -429,6 +444,7 @@ def test_the_transition_model_learns_linear_dynamics():
     assert np.all(spread > 0.01) and np.all(error < 0.2 * spread), (error, spread)
 
 
+@pytest.mark.slow
 def test_values_are_learned_through_the_slow_encoder():
     """Two steps of which the last earns the scale: Q(1) = scale and Q(0) = gamma scale, whatever the action."""
     rates = {"tau": 0.3, "encoder_tau": 0.3, "actor_lr": 1e-2, "critic_lr": 1e-2}

@@ -286,6 +286,7 @@ def with_seeds(program, count):
     return dataclasses.replace(program, plan=dataclasses.replace(program.plan, seeds=count))
 
 
+@pytest.mark.slow
 def test_a_run_of_too_many_seeds_is_run_in_rounds(tmp_path, monkeypatch, capsys):
     """By the same command, with a table of all seeds, and gone on with by its folder."""
     small = "--num-envs=2 --batch-size=2 --replay-size=20 --warmup-steps=1 --eval-episodes=1 --agent.hidden 4".split()
