@@ -448,7 +448,7 @@ def test_presets_deal_out_every_step(family, preset):
 
 GAMMA = 0.9
 SCALES = (1.0, -0.5)
-LEARN = {"num_envs": 16, "chunk_steps": 800, "unroll": 8, "epochs": 4, "minibatches": 4, "gamma": GAMMA}
+LEARN = {"num_envs": 16, "chunk_steps": 1600, "unroll": 8, "epochs": 4, "minibatches": 4, "gamma": GAMMA}
 LEARN |= {"actor_lr": 3e-3, "critic_lr": 1e-2, "entropy_cost": 0.0}
 # V(scale, obs) at observations, and how far the critic may be from it.
 KNOWN = {
