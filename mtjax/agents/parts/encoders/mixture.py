@@ -38,6 +38,8 @@ class Experts(nn.Module):
 
 def mix(weights: Array, encodings: Array) -> Array:
     """Sum encodings (K, ..., D) by weights (..., K), or (K,) for every sample, to (..., D)."""
+    # XLA 0.11 fuses a softmax, its transpose and this sum into one Triton kernel that is wrong for every second task.
+    weights, encodings = jax.lax.optimization_barrier((weights, encodings))
     weights = jnp.moveaxis(weights, -1, 0)
     # Not a matrix product, which for a handful of terms is slower on a GPU than a sum fused with what made them.
     return jnp.sum(weights.reshape(*weights.shape, *[1] * (encodings.ndim - weights.ndim)) * encodings, axis=0)
