@@ -10,7 +10,7 @@ from mtjax.agents import BaseAgent
 from mtjax.envs import Family
 from mtjax.loop import Settings
 from mtjax.parallel import mesh as meshes
-from mtjax.training.programs import compiled, jitted
+from mtjax.training.programs import compile_lowered, jit_programs
 
 
 class Training:
@@ -27,8 +27,8 @@ class Training:
     ):
         env, num_tasks, experience = family, family.train_count, agent.experience
         mesh = meshes.mesh_for(seeds, num_tasks, settings.num_envs, most_devices)
-        programs, numbers = jitted(mesh, agent), meshes.by_seed(mesh, jnp.arange(seeds))
-        tasks = meshes.everywhere(mesh, env.tasks())
+        programs, numbers = jit_programs(mesh, agent), meshes.shard_by_seed(mesh, jnp.arange(seeds))
+        tasks = meshes.replicate(mesh, env.tasks())
         self.num_devices = 1 if mesh is None else mesh.size
         self.worlds = num_tasks * settings.num_envs
         self.steps = seeds * settings.chunk_steps * self.worlds
@@ -36,9 +36,9 @@ class Training:
         self.seconds: list[float] = []
         jax.clear_caches()  # of the programs of others, which may be the same
         before = time.perf_counter()
-        init = compiled(programs.init.lower(env, agent, settings, tasks, numbers, None), once=True)
+        init = compile_lowered(programs.init.lower(env, agent, settings, tasks, numbers, None), once=True)
         self.state = init(tasks, numbers, None)
-        chunk = compiled(programs.chunk.lower(env, agent, settings, tasks, self.state))
+        chunk = compile_lowered(programs.chunk.lower(env, agent, settings, tasks, self.state))
         self.compile_seconds = time.perf_counter() - before
         self.run = lambda state: chunk(tasks, state)
         while int(self.state.iteration) <= getattr(experience, "warmup_steps", 0):

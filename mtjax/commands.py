@@ -56,7 +56,7 @@ def check_names(argv: Sequence[str]) -> None:
         InputError: there is no such thing, or a run that goes on was told to change.
     """
     for kind, flag, known in _KNOWN:
-        given = value_of(argv, flag, None)
+        given = flag_value(argv, flag, None)
         names = () if given is None else given.split("+") if flag == "env" else (given,)  # several are a mixture
         wrong = next((name for name in names if name not in known), None)
         if wrong is not None:
@@ -66,7 +66,7 @@ def check_names(argv: Sequence[str]) -> None:
     if "--resume" in given and "--sweep" not in given and other:
         raise InputError(f"--resume goes on with a run as it was; only --steps may change, not {other}")
     for flag in () if {"--resume", "--sweep"} <= given else ("resume", "from"):
-        folder = value_of(argv, flag, None)
+        folder = flag_value(argv, flag, None)
         if folder is not None and not (flag == "resume" and any(Path(folder).glob("run-*"))):  # the runs of a sweep
             require_run(Path(folder))
 
@@ -101,7 +101,7 @@ def require_run(folder: Path) -> None:
         raise InputError(f"{str(folder)!r} is not a run: it has no config.json")
 
 
-def value_of(argv: Sequence[str], name: str, default: P) -> str | P:
+def flag_value(argv: Sequence[str], name: str, default: P) -> str | P:
     """Find --name=VALUE or --name VALUE; the last one counts."""
     value = default
     for i, word in enumerate(argv):

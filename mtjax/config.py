@@ -109,13 +109,13 @@ def with_preset(
     chosen = preset.get("training", {}) | preset.get("agent", {}) | preset.get(agent_name, {})
     if not issubclass(preset_of(agent_name).cls, SAC):  # the tables of all agents are tuned for SAC
         chosen = preset.get(agent_name, {})
-    played = {name: chosen.pop(name) for name in list(chosen) if name in Settings.__dataclass_fields__}
+    loop_values = {name: chosen.pop(name) for name in list(chosen) if name in Settings.__dataclass_fields__}
     return RunConfig(
         env=env_name,
         agent=agent_name,
         preset=preset_name,  # type: ignore
         plan=Plan(**preset.get("plan", {})),
-        training=Settings(**played),
+        training=Settings(**loop_values),
         family=family,
         learner=agent(agent_name, **{**chosen, **agent_settings}),
     )
@@ -127,12 +127,12 @@ def configure(agent: Any, settings: Settings, given: Mapping[str, Any]) -> tuple
     Raises:
         InputError: a name is neither's, or a value is not allowed.
     """
-    played = {name: value for name, value in given.items() if name in Settings.__dataclass_fields__}
-    rest = {name: value for name, value in given.items() if name not in played}
-    return replace(agent, rest), dataclasses.replace(settings, **played)
+    loop_values = {name: value for name, value in given.items() if name in Settings.__dataclass_fields__}
+    rest = {name: value for name, value in given.items() if name not in loop_values}
+    return replace(agent, rest), dataclasses.replace(settings, **loop_values)
 
 
-def require_range(agent: Any) -> None:
+def require_value_range(agent: Any) -> None:
     """Refuse critics whose range nobody chose for returns that are not scaled to it, once all settings are given.
 
     Raises:

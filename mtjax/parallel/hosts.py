@@ -49,7 +49,7 @@ def is_first() -> bool:
     return jax.process_index() == 0
 
 
-def wait() -> None:
+def wait_for_all() -> None:
     """Go on once every process is here, so that none times how long another compiles."""
     if jax.process_count() > 1:
         multihost_utils.sync_global_devices("mtjax")
@@ -60,12 +60,12 @@ def gather(tree: Any) -> Any:
     return jax.device_get(tree) if jax.process_count() == 1 else multihost_utils.process_allgather(tree, tiled=True)
 
 
-def anywhere(flag: bool) -> bool:
+def any_process(flag: bool) -> bool:
     """Whether a flag is up in any process; all must ask."""
     return flag if jax.process_count() == 1 else bool(np.any(multihost_utils.process_allgather(np.asarray(flag))))
 
 
-def agreed(choose: Callable[[], Path]) -> Path:
+def broadcast_path(choose: Callable[[], Path]) -> Path:
     """The path that the first process chooses, in every process; all must ask.
 
     Raises:

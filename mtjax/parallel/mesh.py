@@ -9,7 +9,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from mtjax.parallel import collectives
 from mtjax.types import InputError
 
-SAME, BY_SEED = PartitionSpec(), PartitionSpec("seeds")  # what every device has whole; leaves with a leading S
+REPLICATED, BY_SEED = PartitionSpec(), PartitionSpec("seeds")  # what every device has whole; leaves with a leading S
 BY_WORLD = PartitionSpec("seeds", None, collectives.AXIS)  # leaves (S, T, E, ...)
 LEAST_WORLDS = 2048
 """Worlds that a device keeps, at the least, when a seed's environments are shared out: fewer do not fill a GPU."""
@@ -53,12 +53,12 @@ def describe(mesh: Mesh | None, seeds: int, num_envs: int) -> str:
     return f"devices: {used} of {found}{hosts}, {own} seed{'s' * (own > 1)} on {split}{rest}"
 
 
-def everywhere(mesh: Mesh | None, tree: Any) -> Any:
+def replicate(mesh: Mesh | None, tree: Any) -> Any:
     """Put arrays that all processes hold alike whole onto every device."""
-    return tree if mesh is None else _place(NamedSharding(mesh, SAME), tree)
+    return tree if mesh is None else _place(NamedSharding(mesh, REPLICATED), tree)
 
 
-def by_seed(mesh: Mesh | None, tree: Any) -> Any:
+def shard_by_seed(mesh: Mesh | None, tree: Any) -> Any:
     """Put arrays (S, ...) that all processes hold alike onto the devices of their seeds."""
     return tree if mesh is None else _place(NamedSharding(mesh, BY_SEED), tree)
 

@@ -45,7 +45,7 @@ def short_name(env_name: str) -> str:
     return env_name if len(env_name) <= _LONGEST else f"mixture-of-{count}"
 
 
-def recorded(config: RunConfig, directory: Path, argv: Sequence[str]) -> RunConfig:
+def resumed_config(config: RunConfig, directory: Path, argv: Sequence[str]) -> RunConfig:
     """The program of the run to go on with, which ``--steps`` may extend."""
     recorded = from_json(directory / "config.json")
     extended = any(word.split("=", 1)[0] == "--steps" for word in argv)
@@ -66,7 +66,7 @@ def record_steps(file: Path, steps: int) -> None:
     os.replace(new, file)
 
 
-def circumstances(config: RunConfig) -> dict:
+def run_metadata(config: RunConfig) -> dict:
     """What else decides a run's numbers: versions, device, engine; and the command that repeats it."""
     versions = {"mtjax": __version__}
     for package in _PACKAGES:
@@ -79,11 +79,11 @@ def circumstances(config: RunConfig) -> dict:
         "device": str(jax.devices()[0].device_kind),
         "python": platform.python_version(),
         "versions": versions,
-        "command": shlex.join(["python", "-m", "mtjax.train", *repeat(config)]),
+        "command": shlex.join(["python", "-m", "mtjax.train", *to_flags(config)]),
     }
 
 
-def repeat(config: RunConfig) -> list[str]:
+def to_flags(config: RunConfig) -> list[str]:
     """Every flag of this program, so that the command means the same whatever the presets become."""
     words = [f"--env={config.env}", f"--agent={config.agent}", *import_flags(config)]
     words += [f"--from={config.start}"] if config.start else []

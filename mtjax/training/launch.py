@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 
 from mtjax.agents.parts.conditioning import load_vectors
-from mtjax.config import RunConfig, require_range
+from mtjax.config import RunConfig, require_value_range
 from mtjax.envs import Family
 from mtjax.parallel import hosts, mesh
 from mtjax.training import points
@@ -20,8 +20,8 @@ def check(config: RunConfig) -> None:
     _ = family.engine_name, family.table
     mesh.mesh_for(config.plan.seeds, family.train_count, config.training.num_envs)
     config.learner.experience.check(family, config.training.num_envs)
-    for learner in points.every(config.learner, config.points):
-        require_range(learner)
+    for learner in points.agents_at(config.learner, config.points):
+        require_value_range(learner)
     if config.learner.vectors:
         load_vectors(config.learner.vectors, family.train_count)
     tune = config.learner.tune
@@ -31,7 +31,7 @@ def check(config: RunConfig) -> None:
         raise InputError("--reset-every throws away what --from takes from a run; give one of them")
 
 
-def starting(config: RunConfig) -> Policy | None:
+def load_start(config: RunConfig) -> Policy | None:
     """What the run learned that is to be fine-tuned, if one is."""
     if not config.start:
         return None

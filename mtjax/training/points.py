@@ -22,7 +22,7 @@ Sweep = Mapping[str, Sequence[float]] | Sequence[Point]
 _STATIC = ("encoder", "experience")  # parts whose numbers are shapes, or written into the networks' modules
 
 
-class Swept(NamedTuple):
+class SweptState(NamedTuple):
     """The state of an agent at one point."""
 
     learner: Any  # the agent's own
@@ -30,11 +30,11 @@ class Swept(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Varied:
+class SweptAgent:
     """An agent of which some numbers are in its state; it is static under ``jit``, and they are not.
 
     In every method the agent is a copy that holds the state's numbers, traced and unchecked, in place of its own:
-    ``at`` checks them beforehand.
+    ``agent_at`` checks them beforehand.
     """
 
     agent: BaseAgent
@@ -47,68 +47,68 @@ class Varied:
     def experience(self) -> Experience:
         return self.agent.experience
 
-    def init(self, spec: Spec, tasks: Task, key: Key, knobs: dict[str, Array] | None = None) -> Swept:
+    def init(self, spec: Spec, tasks: Task, key: Key, knobs: dict[str, Array] | None = None) -> SweptState:
         knobs = knobs or {}
-        return Swept(vary(self.agent, knobs).init(spec, tasks, key), knobs)
+        return SweptState(with_values(self.agent, knobs).init(spec, tasks, key), knobs)
 
-    def begin(self, state: Swept, task: Task) -> Any:
-        return vary(self.agent, state.knobs).begin(state.learner, task)
+    def begin(self, state: SweptState, task: Task) -> Any:
+        return with_values(self.agent, state.knobs).begin(state.learner, task)
 
-    def act(self, state: Swept, memory: Any, obs: Any, task: Task, key: Key | None) -> Acted:
-        acted = vary(self.agent, state.knobs).act(state.learner, memory, obs, task, key)
+    def act(self, state: SweptState, memory: Any, obs: Any, task: Task, key: Key | None) -> Acted:
+        acted = with_values(self.agent, state.knobs).act(state.learner, memory, obs, task, key)
         whole = jnp.isfinite(acted.action)  # one that diverged goes on beside the others
         return acted._replace(action=jnp.where(whole, acted.action, 0.0))
 
-    def remember(self, state: Swept, memory: Any, transition: Transition, task: Task) -> Any:
-        return vary(self.agent, state.knobs).remember(state.learner, memory, transition, task)
+    def remember(self, state: SweptState, memory: Any, transition: Transition, task: Task) -> Any:
+        return with_values(self.agent, state.knobs).remember(state.learner, memory, transition, task)
 
     def relabel(self, env: Env, task: Task, transition: Transition, key: Key) -> Transition:
         return self.agent.relabel(env, task, transition, key)
 
-    def learn(self, env: Env, states: Swept, data: Any, tasks: Task, keys: Key) -> tuple[Swept, Metrics]:
+    def learn(self, env: Env, states: SweptState, data: Any, tasks: Task, keys: Key) -> tuple[SweptState, Metrics]:
         return self.experience.learn(env, self, states, data, tasks, keys)  # type: ignore
 
-    def update(self, state: Swept, batch: Transition, tasks: Task, key: Key) -> tuple[Swept, Metrics]:
-        learner, metrics = vary(self.agent, state.knobs).update(state.learner, batch, tasks, key)
+    def update(self, state: SweptState, batch: Transition, tasks: Task, key: Key) -> tuple[SweptState, Metrics]:
+        learner, metrics = with_values(self.agent, state.knobs).update(state.learner, batch, tasks, key)
         return state._replace(learner=learner), metrics
 
-    def observe(self, state: Swept, outcome: Outcome) -> Swept:
-        return state._replace(learner=vary(self.agent, state.knobs).observe(state.learner, outcome))
+    def observe(self, state: SweptState, outcome: Outcome) -> SweptState:
+        return state._replace(learner=with_values(self.agent, state.knobs).observe(state.learner, outcome))
 
-    def reset(self, state: Swept, spec: Spec, tasks: Task, key: Key) -> Swept:
-        return state._replace(learner=vary(self.agent, state.knobs).reset(state.learner, spec, tasks, key))
+    def reset(self, state: SweptState, spec: Spec, tasks: Task, key: Key) -> SweptState:
+        return state._replace(learner=with_values(self.agent, state.knobs).reset(state.learner, spec, tasks, key))
 
 
-def numbers(agent: BaseAgent) -> dict[str, float]:
+def sweepable(agent: BaseAgent) -> dict[str, float]:
     """The settings of an agent and of its parts that may vary within a program: numbers that are no counts."""
     holders = [agent, *(getattr(agent, kind) for kind in kinds_of(agent) if kind not in _STATIC)]
     return {f.name: getattr(x, f.name) for x in holders for f in dataclasses.fields(x) if f.type is float}
 
 
-def at(agent: BaseAgent, point: Point) -> BaseAgent:
+def agent_at(agent: BaseAgent, point: Point) -> BaseAgent:
     """Return the agent at a point, as if its values had been given plainly.
 
     Raises:
         InputError: a name is not that of a number, or a value is not allowed.
     """
-    known = numbers(agent)
+    known = sweepable(agent)
     unknown = next((name for name in point if name not in known), None)
     if unknown is not None:
         raise nearest_error("number of this agent", unknown, known)
-    return _place(agent, point, dataclasses.replace)
+    return _replace_values(agent, point, dataclasses.replace)
 
 
-def every(agent: Any, found: Sequence[Point]) -> list[Any]:
+def agents_at(agent: Any, points: Sequence[Point]) -> list[Any]:
     """The agent at every point, or as it is if there are none."""
-    return [at(agent, point) for point in found] or [agent]
+    return [agent_at(agent, point) for point in points] or [agent]
 
 
-def vary(agent: BaseAgent, knobs: Mapping[str, Array]) -> BaseAgent:
+def with_values(agent: BaseAgent, knobs: Mapping[str, Array]) -> BaseAgent:
     """Return the agent with traced values, which its constructors could not check."""
-    return _place(agent, knobs, parts.put)
+    return _replace_values(agent, knobs, parts.put)
 
 
-def _place(agent: BaseAgent, values: Mapping[str, Any], replace: Callable) -> BaseAgent:
+def _replace_values(agent: BaseAgent, values: Mapping[str, Any], replace: Callable) -> BaseAgent:
     mine = lambda part: {f.name: values[f.name] for f in dataclasses.fields(part) if f.name in values}
     held = {kind: getattr(agent, kind) for kind in kinds_of(agent)}
     changed = {kind: replace(part, **own) for kind, part in held.items() if (own := mine(part))}
@@ -134,7 +134,7 @@ def grid(sweep: Sweep) -> tuple[dict[str, float], ...]:
     return found
 
 
-def spread(points: Sequence[Point], seeds: Array) -> tuple[Array, dict[str, Array] | None]:
+def seed_axis(points: Sequence[Point], seeds: Array) -> tuple[Array, dict[str, Array] | None]:
     """The seed of each number of S, and the values (S,) by name; without points, the seeds (S,) alone."""
     if not points:
         return seeds, None

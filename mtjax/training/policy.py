@@ -64,17 +64,17 @@ def load(directory: str | Path, seed: int = 0) -> Policy:
     last = count * max(len(config.points), 1) - 1
     if not 0 <= seed <= last:
         raise InputError(f"seed must be from 0 to {last}, counted from the run's first, not {seed}")
-    states = checkpoint.load_agent(directory / "checkpoints", shapes(config))
+    states = checkpoint.load_agent(directory / "checkpoints", state_shapes(config))
     agent = config.learner
     if config.points:
-        rows = _of_point(config, seed)
-        agent = points.at(agent, config.points[seed // count])
+        rows = _point_rows(config, seed)
+        agent = points.agent_at(agent, config.points[seed // count])
         states = jax.tree.map(lambda x: x[rows], states.learner)
     seeds = config.plan.seed + jnp.arange(count)
     return Policy(config.family, agent, jax.tree.map(lambda x: x[seed % count], states), states, seeds)
 
 
-def _of_point(config: RunConfig, seed: int) -> slice:
+def _point_rows(config: RunConfig, seed: int) -> slice:
     """The rows of S that belong to one number's point."""
     first = seed - seed % config.plan.seeds
     return slice(first, first + config.plan.seeds)
@@ -91,13 +91,13 @@ def load_experience(directory: str | Path, seed: int = 0) -> tuple[Ring, int]:
     config = from_json(Path(directory) / "config.json")
     if not isinstance(config.learner.experience, Replay):
         raise InputError(f"{config.agent} keeps no replay, so that there is nothing to look at")
-    ring = checkpoint.load_ring(Path(directory) / "checkpoints", shapes(config))
-    rows = _of_point(config, seed)
+    ring = checkpoint.load_ring(Path(directory) / "checkpoints", state_shapes(config))
+    rows = _point_rows(config, seed)
     return ring._replace(rows=jax.tree.map(lambda x: x[rows], ring.rows)), config.learner.experience.batch_size
 
 
-def shapes(config: RunConfig) -> loop.TrainState:
+def state_shapes(config: RunConfig) -> loop.TrainState:
     """The shapes of a run's training state."""
-    env, agent = config.family, points.Varied(config.learner) if config.points else config.learner
-    spread = points.spread(config.points, config.plan.seed + jnp.arange(config.plan.seeds))
-    return jax.eval_shape(lambda: loop.init(env, agent, config.training, env.tasks("train"), *spread))  # type: ignore
+    env, agent = config.family, points.SweptAgent(config.learner) if config.points else config.learner
+    axis = points.seed_axis(config.points, config.plan.seed + jnp.arange(config.plan.seeds))
+    return jax.eval_shape(lambda: loop.init(env, agent, config.training, env.tasks("train"), *axis))  # type: ignore

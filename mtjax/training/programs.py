@@ -11,7 +11,7 @@ from jax.sharding import Mesh, NamedSharding
 
 from mtjax.evaluation import evaluate
 from mtjax.loop import TrainState, init, run_chunk
-from mtjax.parallel.mesh import BY_SEED, BY_WORLD, SAME
+from mtjax.parallel.mesh import BY_SEED, BY_WORLD, REPLICATED
 from mtjax.types import Agent
 
 
@@ -34,18 +34,18 @@ def _specs(agent: Agent) -> TrainState:
     """How devices share a training state."""
     by_world = TrainState(*[BY_WORLD] * len(TrainState._fields))  # type: ignore
     data = agent.experience.sharding
-    return by_world._replace(agent=BY_SEED, data=data, iteration=SAME, key=BY_SEED)  # type: ignore
+    return by_world._replace(agent=BY_SEED, data=data, iteration=REPLICATED, key=BY_SEED)  # type: ignore
 
 
-def jitted(mesh: Mesh | None, agent: Agent) -> Jitted:
+def jit_programs(mesh: Mesh | None, agent: Agent) -> Jitted:
     """The programs of a run, each split over the mesh if there is one."""
     if mesh is None:
         return Jitted(init, run_chunk, evaluate)
     state = _specs(agent)
     return Jitted(
-        _split(mesh, init, (SAME, BY_SEED, BY_SEED), state),
-        _split(mesh, run_chunk, (SAME, state), (state, BY_SEED), donated=(4,)),
-        _split(mesh, evaluate, (BY_SEED, SAME, BY_SEED, SAME), BY_SEED),
+        _split(mesh, init, (REPLICATED, BY_SEED, BY_SEED), state),
+        _split(mesh, run_chunk, (REPLICATED, state), (state, BY_SEED), donated=(4,)),
+        _split(mesh, evaluate, (BY_SEED, REPLICATED, BY_SEED, REPLICATED), BY_SEED),
     )
 
 
@@ -62,7 +62,7 @@ def _split(mesh: Mesh, program: Callable, inputs: tuple, outputs: Any, donated: 
     )
 
 
-def sharded(mesh: Mesh | None, agent: Agent, shapes: TrainState) -> TrainState:
+def sharded_shapes(mesh: Mesh | None, agent: Agent, shapes: TrainState) -> TrainState:
     """Shapes of a training state that also say which devices its leaves are on."""
     if mesh is None:
         return shapes
@@ -72,7 +72,7 @@ def sharded(mesh: Mesh | None, agent: Agent, shapes: TrainState) -> TrainState:
     return jax.tree.map(put, _specs(agent), shapes)
 
 
-def compiled(program: Any, once: bool = False) -> Any:
+def compile_lowered(program: Any, once: bool = False) -> Any:
     """Compile what was lowered. On a CPU LLVM's later passes take a quarter of the time and make nothing faster.
 
     Args:

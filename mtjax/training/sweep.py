@@ -20,8 +20,8 @@ from mtjax.evaluation import Evaluations, load_evaluations
 from mtjax.report import figures
 from mtjax.report.stats import seed_interval
 from mtjax.training import memory, points
-from mtjax.training.folder import circumstances, new_directory, record_steps, recorded, short_name
-from mtjax.training.launch import check, launch, starting
+from mtjax.training.folder import new_directory, record_steps, resumed_config, run_metadata, short_name
+from mtjax.training.launch import check, launch, load_start
 from mtjax.training.log import append_rows, number
 from mtjax.training.programs import enable_compile_cache
 from mtjax.types import SPLITS, InputError
@@ -51,16 +51,16 @@ class Axis(NamedTuple):
 # What to run.
 
 
-def wanted(argv: Sequence[str]) -> bool:
+def is_sweep(argv: Sequence[str]) -> bool:
     """Whether a command line asks for a sweep, or to go on with one."""
     names = [word.split("=", 1)[0] for word in argv]
     if "--sweep" in names and "--resume" in names:
         raise InputError("--resume goes on with a sweep as it was; leave out --sweep")
     resumed = next((word.split("=", 1)[1] for word in argv if word.startswith("--resume=")), "")
-    return "--sweep" in names or bool(resumed and _runs(Path(resumed)))
+    return "--sweep" in names or bool(resumed and _run_folders(Path(resumed)))
 
 
-def read(argv: Sequence[str]) -> tuple[list[Axis], list[str]]:
+def read_axes(argv: Sequence[str]) -> tuple[list[Axis], list[str]]:
     """Take ``--sweep FLAG=VALUE,VALUE ...`` out of a command line.
 
     Raises:
@@ -95,14 +95,14 @@ def _axis(word: str) -> Axis:
     return Axis(flag, values)
 
 
-def _varies_inside(axis: Axis) -> bool:
+def _is_agent_number(axis: Axis) -> bool:
     """Whether an axis is a number of agents or their parts, for all of whose values one program does."""
     tables = [table.values() for kind, table in PARTS.items() if kind not in ("encoder", "experience")]
     classes = [*(preset.cls for preset in AGENTS.values()), *itertools.chain(*tables)]
     return any(f.name == axis.setting and f.type is float for cls in classes for f in dataclasses.fields(cls))
 
 
-def _words(flag: str, value: str) -> list[str]:
+def _to_flags(flag: str, value: str) -> list[str]:
     """A flag as it is written on a command line; true and false are what switches take, spaces part several words."""
     if value.lower() in ("true", "false"):
         group, dot, name = flag.rpartition(".")
@@ -117,17 +117,17 @@ def configurations(argv: Sequence[str], parse: Parse) -> list[RunConfig]:
     Raises:
         InputError: some value cannot be used.
     """
-    axes, rest = read(argv)
-    inside = [axis for axis in axes if _varies_inside(axis)]
+    axes, rest = read_axes(argv)
+    inside = [axis for axis in axes if _is_agent_number(axis)]
     outside = [axis for axis in axes if axis not in inside]
     found = []
     for values in itertools.product(*(axis.values for axis in outside)):
         chosen = [Axis(axis.flag, (value,)) for axis, value in zip(outside, values, strict=True)]
-        config = parse([*rest, *itertools.chain(*(_words(axis.flag, axis.values[0]) for axis in chosen))])
+        config = parse([*rest, *itertools.chain(*(_to_flags(axis.flag, axis.values[0]) for axis in chosen))])
         sweep = tuple(f"{axis.flag}={','.join(axis.values)}" for axis in (*chosen, *inside))
         points_of_it = points.grid({axis.setting: [_number(axis, x) for x in axis.values] for axis in inside})
         for point in points_of_it:
-            points.at(config.learner, point)
+            points.agent_at(config.learner, point)
         found.append(dataclasses.replace(config, sweep=sweep, points=points_of_it))
     return found
 
@@ -147,47 +147,47 @@ def main(argv: Sequence[str], parse: Parse) -> None:
     enable_compile_cache()
     resume = next((Path(word.split("=", 1)[1]) for word in argv if word.startswith("--resume=")), None)
     if resume is not None:
-        for directory in _runs(resume):
-            record_steps(directory / "config.json", recorded(parse(argv), directory, argv).plan.steps)
-        carry_on(resume)
+        for directory in _run_folders(resume):
+            record_steps(directory / "config.json", resumed_config(parse(argv), directory, argv).plan.steps)
+        run_unfinished(resume)
         return
     found = configurations(argv, parse)
     for config in found:
         check(config)
-        starting(config)
-    begin(found, "sweep")
+        load_start(config)
+    run_all(found, "sweep")
 
 
-def begin(found: Sequence[RunConfig], kind: str) -> None:
+def run_all(found: Sequence[RunConfig], kind: str) -> None:
     """Make a folder with a run for every program and round, and run them."""
-    limit = memory.memory()
-    split = [memory.split(config, limit) for config in found]
+    limit = memory.available_bytes()
+    split = [memory.split_to_fit(config, limit) for config in found]
     folder = new_directory(Path(found[0].runs), f"{short_name(found[0].env)}-{found[0].agent}-{kind}")
     for i, config in enumerate(itertools.chain(*split)):
         (folder / f"run-{i + 1}").mkdir()
-        (folder / f"run-{i + 1}" / "config.json").write_text(to_json(config, circumstances(config)))
+        (folder / f"run-{i + 1}" / "config.json").write_text(to_json(config, run_metadata(config)))
     for config, parts in zip(found, split, strict=True):
         print(memory.describe(config, len(parts), limit), flush=True)
-    carry_on(folder)
+    run_unfinished(folder)
 
 
-def _runs(folder: Path) -> list[Path]:
+def _run_folders(folder: Path) -> list[Path]:
     """The folders of a sweep's runs, in order; a run of several points is a sweep by itself."""
     if (folder / "config.json").is_file():
         return [folder] if from_json(folder / "config.json").points else []
     return sorted(folder.glob("run-*"), key=lambda run: int(run.name.removeprefix("run-")))
 
 
-def carry_on(folder: Path) -> None:
+def run_unfinished(folder: Path) -> None:
     """Run whatever of a sweep has not been run to its end, and lay out the table of all."""
-    runs = _runs(folder)
+    runs = _run_folders(folder)
     print(f"sweep: {folder}", flush=True)
     for i, run in enumerate(runs):
         config = from_json(run / "config.json")
-        if last(config, run) is not None or (run / _DIVERGED).exists():
+        if final_evaluations(config, run) is not None or (run / _DIVERGED).exists():
             continue
         label, resume = f"run {i + 1} of {len(runs)}", (run / "checkpoints").is_dir()
-        start = None if resume else starting(config)
+        start = None if resume else load_start(config)
         try:
             if not launch(config, run, start, resume, label).finished:
                 words = shlex.join([f"--resume={folder}", *import_flags(config)])
@@ -216,7 +216,7 @@ def _draw(config: RunConfig, run: Path) -> None:
         )
 
 
-def last(config: RunConfig, run: Path) -> Evaluations | None:
+def final_evaluations(config: RunConfig, run: Path) -> Evaluations | None:
     """The evaluations of a run that is at its end; None if it is not."""
     if not (run / "evaluations.npz").exists():
         return None
@@ -232,7 +232,7 @@ def rows(runs: Sequence[Path]) -> list[dict[str, Any]]:
     found: dict[tuple, list[_Part]] = {}
     for run in runs:
         config = from_json(run / "config.json")
-        evaluations, count = last(config, run), config.plan.seeds
+        evaluations, count = final_evaluations(config, run), config.plan.seeds
         for p, point in enumerate(config.points or ({},)):
             mine = slice(p * count, (p + 1) * count)
             returns = evaluations and {split: x[mine, -1] for split, x in evaluations.returns.items() if x.size}
