@@ -1,4 +1,4 @@
-"""The command line of training: names first, then typed overrides of what the names stand for."""
+"""The command line of training: names choose the defaults, and typed flags override them."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -16,11 +16,13 @@ from mtjax.names import InputError
 
 _VARY = "--env.vary."
 _FAMILY_FLAGS = {"combine": "env.combine", "split": "split"}  # they decide which values are allowed
-_DECIDING = ("conditioning", "vectors", "heads")  # which parts go together with the rest of an agent
+_DECIDING = ("conditioning", "vectors", "heads")  # they decide which parts are allowed
 
 
 def parse(argv: Sequence[str]) -> RunConfig:
-    """Read a command line: the names choose the defaults, the other flags change them.
+    """Read the configuration of a run from a command line.
+
+    The names of environment, agent and preset choose the defaults; the other flags change them.
 
     Raises:
         InputError: a name, flag or value cannot be used.
@@ -50,7 +52,7 @@ def parse(argv: Sequence[str]) -> RunConfig:
 
 
 def _fine_tuning(config: RunConfig, source: RunConfig, start: str, chosen: Mapping[str, str]) -> RunConfig:
-    """A program with the agent of a run, and tasks whose context is written as the run's."""
+    """Return a configuration with the agent of the run ``source``, and tasks whose context is scaled as there."""
     had = {"agent": source.agent, **settings(source.learner)}
     for name, given in {"agent": config.agent, **chosen}.items():
         if given != had[name]:
@@ -63,13 +65,13 @@ def _fine_tuning(config: RunConfig, source: RunConfig, start: str, chosen: Mappi
 
 
 def _peel_vary(argv: Sequence[str]) -> tuple[dict[str, str], list[str]]:
-    """Take --env.vary.NAME=VALUES out of a command line: which names there are is the family's to say."""
+    """Take --env.vary.NAME=VALUES out of a command line, because only the family knows the names."""
     given, rest = _split_flags(argv, lambda flag: flag.startswith(_VARY), "values; give lo:hi:n, lo:hi or a list a,b,c")
     return {flag.removeprefix(_VARY): value for flag, value in given.items()}, rest
 
 
 def _peel_parts(argv: Sequence[str]) -> tuple[dict[str, str], list[str]]:
-    """Take --agent.KIND=NAME out of a command line: the part decides which other flags there are."""
+    """Take --agent.KIND=NAME out of a command line, because each part adds flags of its own."""
     kinds = {f"--agent.{kind}": kind for kind in CHOICES}
     given, rest = _split_flags(argv, kinds.__contains__, "a value")
     return {kinds[flag]: name for flag, name in given.items()}, rest
@@ -98,7 +100,7 @@ def _peel_shared(argv: Sequence[str], mixture: Mixture) -> tuple[dict[str, Any],
 
 
 def shared_fields(family: Family) -> list[dataclasses.Field]:
-    """The fields of a family that are flags by themselves."""
+    """Return the fields of a family that are command-line flags."""
     return [field for field in dataclasses.fields(family) if field.name not in ("vary", "context_ranges")]
 
 
@@ -113,7 +115,7 @@ def _negated(flag: str) -> str:
 
 
 def _split_flags(argv: Sequence[str], mine: Callable[[str], bool], needed: str) -> tuple[dict[str, str], list[str]]:
-    """Part the flags that are ``mine``, with their values, from the other words of a command line."""
+    """Return the flags for which ``mine`` is true, with their values, and the other words of a command line."""
     given, rest, words = {}, [], iter(argv)
     for word in words:
         flag, equals, value = word.partition("=")
@@ -127,7 +129,7 @@ def _split_flags(argv: Sequence[str], mine: Callable[[str], bool], needed: str) 
 
 
 def flags(config: Any, prefix: str = "--") -> list[str]:
-    """Every flag of a program."""
+    """Return every flag of a configuration."""
     names = []
     for field in dataclasses.fields(config):
         value, name = getattr(config, field.name), field.name.replace("_", "-")

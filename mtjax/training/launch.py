@@ -1,4 +1,4 @@
-"""Begin a run as its configuration says: check it, fetch what it begins with, say what it is, and train."""
+"""Start a run from its configuration: check it, load the policy to fine-tune, print a summary, and train."""
 
 import dataclasses
 from pathlib import Path
@@ -15,7 +15,11 @@ from mtjax.types import InputError
 
 
 def check(config: RunConfig) -> None:
-    """Meet whatever the family's and the agent's constructors could not check before a run's folder is made."""
+    """Check a configuration as a whole, before a folder is made.
+
+    Raises:
+        InputError: family, agent, devices and flags do not go together.
+    """
     family = config.family
     _ = family.engine_name, family.table
     mesh.mesh_for(config.plan.seeds, family.train_count, config.training.num_envs)
@@ -32,7 +36,7 @@ def check(config: RunConfig) -> None:
 
 
 def load_start(config: RunConfig) -> Policy | None:
-    """What the run learned that is to be fine-tuned, if one is."""
+    """Return the policy that this run fine-tunes, or None."""
     if not config.start:
         return None
     start = load(config.start)
@@ -41,7 +45,7 @@ def load_start(config: RunConfig) -> Policy | None:
 
 
 def launch(config: RunConfig, directory: Path, start: Policy | None, resume: bool, label: str = "") -> Result:
-    """Run a program in its folder, from the start or from its newest checkpoint, and say what it is."""
+    """Print what a run does, and train it in ``directory`` from the start or from its newest checkpoint."""
     said = f"{label}: {' '.join(config.sweep)}\n" if config.sweep else ""
     origin = f"{_origin(config)}run: {directory}"
     plan = config.plan
@@ -64,7 +68,7 @@ def launch(config: RunConfig, directory: Path, start: Policy | None, resume: boo
 
 
 def _origin(config: RunConfig) -> str:
-    """A line on what is fine-tuned, if something is."""
+    """Return a line on the run that is fine-tuned, or an empty string."""
     if not config.start:
         return ""
     family, told = config.family, config.learner.conditioning == "parameters"

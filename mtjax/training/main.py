@@ -1,4 +1,4 @@
-"""What ``python -m mtjax.train`` does: train, or go on with a run, and say where it is and how each split scored."""
+"""The command ``python -m mtjax.train``: start or resume a run, and print its folder and scores."""
 
 import shlex
 from collections.abc import Callable, Sequence
@@ -18,9 +18,9 @@ from mtjax.types import InputError
 
 
 def main(argv: Sequence[str], parse: Callable[[Sequence[str]], RunConfig]) -> None:
-    """Run what a command line asks for, which ``parse`` reads: a run, a sweep, or more steps of either."""
+    """Start or resume a run or a sweep. ``parse`` reads the command line."""
     if "--distributed" in argv:
-        hosts.initialise()  # before anything asks which devices there are
+        hosts.initialise()  # before anything looks at the devices
     if sweep.is_sweep(argv):
         if "--distributed" in argv:
             raise InputError("a sweep runs in one process; leave out --distributed")
@@ -42,7 +42,7 @@ def main(argv: Sequence[str], parse: Callable[[Sequence[str]], RunConfig]) -> No
 
 
 def _prepare(config: RunConfig, directory: Path | None) -> Path:
-    """Make the run's folder with the record of it, or bring that of a run to go on with up to date."""
+    """Make the folder of a new run with its config.json, or update the steps of a resumed run."""
     if directory is not None:
         record_steps(directory / "config.json", config.plan.steps)
         return directory

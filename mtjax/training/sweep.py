@@ -1,8 +1,8 @@
-"""``python -m mtjax.train --sweep ...``: every combination of settings, and one table of them.
+"""``python -m mtjax.train --sweep ...``: train every combination of settings, and write one table.
 
-The agent's numbers are points of one program (``points.py``); each combination of other settings is a program of its
-own, and one that does not fit into memory is run in rounds (``memory.py``). Every program and round is a run like any
-other, in a folder of the sweep's: ``run-1``, ``run-2`` and so on. A run in rounds is a sweep of one setting.
+Real numbers of the agent are points of one program (``points.py``). Each combination of other settings is a program of
+its own. A program that does not fit into memory is split into rounds (``memory.py``). Every program and round is a run
+in the sweep's folder: ``run-1``, ``run-2`` and so on. A plain run in rounds is a sweep of one setting.
 """
 
 import dataclasses
@@ -26,33 +26,33 @@ from mtjax.training.log import append_rows, number
 from mtjax.training.programs import enable_compile_cache
 from mtjax.types import SPLITS, InputError
 
-Parse = Callable[[Sequence[str]], RunConfig]  # a command line to the run that it asks for
+Parse = Callable[[Sequence[str]], RunConfig]  # command line -> configuration
 _FIXED = ("seed", "seeds", "runs", "resume", "list", "import", "sweep", "from", "preset")
-_DIVERGED = "diverged.txt"  # beside a run of which no seed is finite any more: what stopped it
+_DIVERGED = "diverged.txt"  # holds the error of a run whose seeds all diverged
 
 
 class Axis(NamedTuple):
-    """One flag, without its dashes, and the values that it takes in turn."""
+    """One flag, without its dashes, and the values to try."""
 
     flag: str
     values: tuple[str, ...]
 
     @property
     def name(self) -> str:
-        """What it is called in tables and records."""
+        """Return its name in tables and records."""
         return self.flag.removeprefix("agent.")
 
     @property
     def setting(self) -> str:
-        """The agent's setting that it is, if it is one."""
+        """Return the name of the agent's setting; an empty string for other flags."""
         return self.name.replace("-", "_") if self.flag != self.name else ""
 
 
-# What to run.
+# Reading the command line.
 
 
 def is_sweep(argv: Sequence[str]) -> bool:
-    """Whether a command line asks for a sweep, or to go on with one."""
+    """Return whether a command line starts or resumes a sweep."""
     names = [word.split("=", 1)[0] for word in argv]
     if "--sweep" in names and "--resume" in names:
         raise InputError("--resume goes on with a sweep as it was; leave out --sweep")
@@ -64,7 +64,7 @@ def read_axes(argv: Sequence[str]) -> tuple[list[Axis], list[str]]:
     """Take ``--sweep FLAG=VALUE,VALUE ...`` out of a command line.
 
     Raises:
-        InputError: a word of it is not a flag with values, or a flag that no sweep can vary.
+        InputError: a word is not a flag with values, or a sweep cannot vary that flag.
     """
     axes, rest, inside = {}, [], False
     for word in argv:
@@ -96,14 +96,17 @@ def _axis(word: str) -> Axis:
 
 
 def _is_agent_number(axis: Axis) -> bool:
-    """Whether an axis is a number of agents or their parts, for all of whose values one program does."""
+    """Return whether an axis is a float of an agent or its parts, which can vary inside one program."""
     tables = [table.values() for kind, table in PARTS.items() if kind not in ("encoder", "experience")]
     classes = [*(preset.cls for preset in AGENTS.values()), *itertools.chain(*tables)]
     return any(f.name == axis.setting and f.type is float for cls in classes for f in dataclasses.fields(cls))
 
 
 def _to_flags(flag: str, value: str) -> list[str]:
-    """A flag as it is written on a command line; true and false are what switches take, spaces part several words."""
+    """Return a flag and its value as words of a command line.
+
+    "true" and "false" are values of switches. Spaces separate the values of a list.
+    """
     if value.lower() in ("true", "false"):
         group, dot, name = flag.rpartition(".")
         return [f"--{group}{dot}{'' if value.lower() == 'true' else 'no-'}{name}"]
@@ -112,10 +115,10 @@ def _to_flags(flag: str, value: str) -> list[str]:
 
 
 def configurations(argv: Sequence[str], parse: Parse) -> list[RunConfig]:
-    """Every program that a command line with ``--sweep`` asks for, its points checked, before memory splits any.
+    """Return the configuration of every program of a sweep, with checked points, before memory splits them.
 
     Raises:
-        InputError: some value cannot be used.
+        InputError: a value is not allowed.
     """
     axes, rest = read_axes(argv)
     inside = [axis for axis in axes if _is_agent_number(axis)]
@@ -139,11 +142,11 @@ def _number(axis: Axis, text: str) -> float:
         raise InputError(f"{axis.flag} is a number, and {text!r} is none") from None
 
 
-# Running it.
+# Running.
 
 
 def main(argv: Sequence[str], parse: Parse) -> None:
-    """Run what a command line with ``--sweep`` asks for, or go on with what ``--resume`` names."""
+    """Start the sweep of ``--sweep``, or resume the sweep in the folder of ``--resume``."""
     enable_compile_cache()
     resume = next((Path(word.split("=", 1)[1]) for word in argv if word.startswith("--resume=")), None)
     if resume is not None:
@@ -159,7 +162,7 @@ def main(argv: Sequence[str], parse: Parse) -> None:
 
 
 def run_all(found: Sequence[RunConfig], kind: str) -> None:
-    """Make a folder with a run for every program and round, and run them."""
+    """Make a folder with a run for every program and round, and train them all."""
     limit = memory.available_bytes()
     split = [memory.split_to_fit(config, limit) for config in found]
     folder = new_directory(Path(found[0].runs), f"{short_name(found[0].env)}-{found[0].agent}-{kind}")
@@ -172,14 +175,14 @@ def run_all(found: Sequence[RunConfig], kind: str) -> None:
 
 
 def _run_folders(folder: Path) -> list[Path]:
-    """The folders of a sweep's runs, in order; a run of several points is a sweep by itself."""
+    """Return the folders of a sweep's runs in order. A run of several points is a sweep by itself."""
     if (folder / "config.json").is_file():
         return [folder] if from_json(folder / "config.json").points else []
     return sorted(folder.glob("run-*"), key=lambda run: int(run.name.removeprefix("run-")))
 
 
 def run_unfinished(folder: Path) -> None:
-    """Run whatever of a sweep has not been run to its end, and lay out the table of all."""
+    """Train all runs of a sweep that are not finished, and print the table of the whole sweep."""
     runs = _run_folders(folder)
     print(f"sweep: {folder}", flush=True)
     for i, run in enumerate(runs):
@@ -203,7 +206,7 @@ def run_unfinished(folder: Path) -> None:
 
 
 def _draw(config: RunConfig, run: Path) -> None:
-    """Draw the return on training tasks over steps, a line for each setting of which no seed diverged."""
+    """Draw training return over steps, one line per setting. Settings with a diverged seed are left out."""
     evaluations, count = load_evaluations(run / "evaluations.npz"), config.plan.seeds
     curves = {}
     for p, point in enumerate(config.points or ({},)):
@@ -217,7 +220,7 @@ def _draw(config: RunConfig, run: Path) -> None:
 
 
 def final_evaluations(config: RunConfig, run: Path) -> Evaluations | None:
-    """The evaluations of a run that is at its end; None if it is not."""
+    """Return the evaluations of a finished run; None if it is not finished."""
     if not (run / "evaluations.npz").exists():
         return None
     found = load_evaluations(run / "evaluations.npz")
@@ -228,7 +231,7 @@ def final_evaluations(config: RunConfig, run: Path) -> Evaluations | None:
 
 
 def rows(runs: Sequence[Path]) -> list[dict[str, Any]]:
-    """A row for each setting: its runs, its values, seeds that diverged, and the last evaluation of each split."""
+    """Return a row for each setting: its runs, values, diverged seeds, and last evaluation of each split."""
     found: dict[tuple, list[_Part]] = {}
     for run in runs:
         config = from_json(run / "config.json")
@@ -244,7 +247,7 @@ def rows(runs: Sequence[Path]) -> list[dict[str, Any]]:
 
 
 class _Part(NamedTuple):
-    """What one run holds of one setting: all of its seeds, or those of a round."""
+    """The seeds of one setting in one run: all of them, or those of a round."""
 
     run: str
     number: int
@@ -266,13 +269,13 @@ def _row(values: dict[str, str], parts: list[_Part]) -> dict[str, Any]:
 
 
 def _values(config: RunConfig, point: Mapping[str, float]) -> dict[str, str]:
-    """The values of one setting, in the order in which the sweep was asked for."""
+    """Return the values of one setting, in the order of the sweep's flags."""
     axes = [_axis(word) for word in config.sweep]
     return {x.name: f"{point[x.setting]:g}" if x.setting in point else x.values[0] for x in axes}
 
 
 def _scores(returns: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Mean and interval over seeds of returns (S, T, episodes); none where a seed diverged, as that has no mean."""
+    """Return mean and interval over seeds of returns (S, T, episodes); NaN if a seed diverged."""
     diverged = max(int(np.sum(~np.isfinite(x).all(axis=(1, 2)))) for x in returns.values())
     found: dict[str, Any] = {"diverged": diverged}
     for split, x in returns.items():
@@ -282,7 +285,7 @@ def _scores(returns: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Lay out a sweep's rows: settings, then each split's mean return with its 95% interval over seeds."""
+    """Return a sweep's rows as text: settings, then each split's mean return with its 95% interval over seeds."""
     splits = [split for split in SPLITS if split in rows[0]] or [SPLITS[0]]
     after = list(rows[0]).index("seeds")
     settings = [name for name in list(rows[0])[:after] if name != "number"]

@@ -1,7 +1,6 @@
 """MTEnv's classic control tasks, cart-pole and acrobot, whose physical constants differ between tasks.
 
-Each is a handful of equations in float32 without a MuJoCo model, so that a step of thousands of worlds costs next to
-nothing.
+Each is a few equations in float32 without a MuJoCo model, so a step of thousands of worlds costs almost nothing.
 """
 
 import dataclasses
