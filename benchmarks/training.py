@@ -1,4 +1,4 @@
-"""The training loop as something to time: compiled and warmed up once, then run chunk by chunk."""
+"""The training loop for timing: compiled and warmed up once, then run chunk by chunk."""
 
 import time
 from typing import Any
@@ -14,12 +14,12 @@ from mtjax.training.programs import compile_lowered, jit_programs
 
 
 class Training:
-    """The loop of ``mtjax.train`` without evaluations, logs and checkpoints.
+    """The training loop of ``mtjax.train`` without evaluations, logs and checkpoints.
 
     Args:
-        family, agent, settings: what is trained; learning is under way by the time it is first timed.
-        seeds: how many at once.
-        most_devices: of those there are, how many it may use.
+        family, agent, settings: the run. Learning has begun before the first timing.
+        seeds: how many seeds to train at once.
+        most_devices: the largest number of devices to use.
     """
 
     def __init__(
@@ -53,10 +53,10 @@ class Training:
 
     @property
     def rates(self) -> list[float]:
-        """Environment steps a second of all seeds, of every chunk timed."""
+        """Return the environment steps a second, of all seeds, of every timed chunk."""
         return [self.steps / seconds for seconds in self.seconds]
 
     def memory(self) -> int | None:
-        """Bytes of the device's memory that were in use at most, by whatever ran so far; None on a CPU."""
+        """Return the peak bytes of the device's memory in this process; None on a CPU."""
         found: Any = jax.local_devices()[0].memory_stats() or {}
         return found.get("peak_bytes_in_use")
