@@ -44,7 +44,7 @@ class Families(UserDict[str, Entry]):
 
 # Where each class is in its folder, "module:Class", and its settings. Families whose tasks are drawn say how many.
 
-# dm_control's tasks (Tassa et al. 2018), with whatever parameters are asked for.
+# dm_control's tasks (Tassa et al. 2018). Their parameters vary on request.
 _DOMAINS: dict[str, Entry] = {
     "acrobot-swingup": ("acrobot:AcrobotSwingup", {}),
     "acrobot-swingup-sparse": ("acrobot:AcrobotSwingup", {"sparse": True}),

@@ -1,4 +1,4 @@
-"""Probe environments: tiny problems with known Q-values, each of which tests one part of a learner.
+"""Probe environments: tiny problems with known Q-values. Each tests one part of a learner.
 
 They are Andy Jones' five, with a task axis and a time limit. A probe is data, like a task, so one compiled program
 serves all of them. Use them to check an agent of your own: train it on ``Probe(kind)``, and compare its values with

@@ -273,7 +273,7 @@ class _Run:
         self.console.say(f"profile of one chunk: {place} (xprof --logdir={place}, or its *.trace.json.gz in Perfetto)")
 
     def _find_diverged(self, bad_step: np.ndarray, first_step: int, diverged: np.ndarray) -> np.ndarray:
-        """Return which seeds (S,) are not finite. Stop the run only if it is no sweep or no seed is left."""
+        """Return which seeds (S,) have diverged in this chunk. In a sweep the other seeds continue."""
         broken = np.any(bad_step >= 0, axis=1)
         if not self.points or np.all(broken | diverged):
             _require_finite(bad_step, first_step)

@@ -1,4 +1,4 @@
-"""MTEnv's maze of two goals, in plan: a walker among walls and two boxes, of which the task says which one to reach."""
+"""MTEnv's maze of two goals, in plan: a walker among walls and two boxes. The task names the box to reach."""
 
 import dataclasses
 import math
