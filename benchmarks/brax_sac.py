@@ -1,4 +1,4 @@
-"""Training beside Brax SAC: environment steps a second with the same networks, batch and updates a step.
+"""Compare training speed with Brax SAC, with the same networks, batch and updates per step.
 
     python benchmarks/brax_sac.py [--agent sac-conditioned] [--json FILE]
 
@@ -50,7 +50,7 @@ def main() -> None:
 
 
 def brax_rates(program: RunConfig, worlds: int, arguments: argparse.Namespace) -> list[float]:
-    """Brax's own figure, environment steps a second, of every epoch but the first, which compiles."""
+    """Return Brax's own environment steps a second of every epoch but the first, which compiles."""
     from brax.training.agents.sac import networks
     from brax.training.agents.sac import train as sac
     from mujoco_playground import registry, wrapper  # type: ignore  # not a dependency of this package

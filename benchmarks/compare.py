@@ -1,13 +1,13 @@
-"""Flag what has become slower: two reports of one benchmark beside each other, by ratio.
+"""Compare two reports of one benchmark, and flag every figure that has become slower.
 
     python benchmarks/compare.py RECORDED.json NEW.json [--tolerance 1.15] [--absolute]
     python benchmarks/compare.py RECORDED.json --again [--tolerance 1.15] [--absolute]
 
-With ``--again`` the benchmark that wrote RECORDED runs anew with the settings it had then. Rows are matched by all that
-they hold besides figures. A figure's ratio says how many times slower it is than it was (1.2: a fifth more time, or a
-sixth less rate). As no two machines, nor one machine twice, are equally fast, each ratio is taken beside the median
-ratio of its kind of figure, so that what changed for all alike is not flagged; ``--absolute`` takes it as it is, which
-is for one quiet machine. Exits with 1 if anything is slower by more than the tolerance or is missing.
+With ``--again`` the benchmark of RECORDED runs again with its recorded settings. Rows are matched by everything but
+figures. A ratio says how many times slower a figure is than before (1.2: a fifth more time, or a sixth less rate).
+Machines differ in speed, so each ratio is divided by the median ratio of its kind of figure. A change that is common to
+all is then not flagged. ``--absolute`` uses plain ratios, which suits one quiet machine. The exit code is 1 if a figure
+is missing or slower by more than the tolerance.
 """
 
 import argparse
@@ -19,7 +19,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-# Figures of which less is better, and those of which more is. What else a row holds says what was measured, or spreads.
+# Figures of which less is better, and those of which more is. Other entries of a row are its settings or spreads.
 LESS = ("milliseconds", "compile_seconds", "first_call_seconds", "first_metrics", "training", "reached", "cost")
 MORE = ("steps_per_second", "updates_per_second")
 _IDENTITY = ("agent", "domain", "contestant", "axis", "value", "tasks", "seeds", "worlds", "cache", "setting", "engine")
@@ -49,7 +49,7 @@ def main() -> None:
 
 
 def read(path: Path) -> dict[str, Any]:
-    """Read what a benchmark's ``--json`` wrote."""
+    """Read a report that a benchmark wrote with ``--json``."""
     try:
         report = json.loads(path.read_text())
         return {"machine": dict(report["machine"]), **report, "rows": list(report["rows"])}
@@ -58,7 +58,7 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def measure(recorded: dict[str, Any]) -> dict[str, Any]:
-    """Run the benchmark of a report once more, with its settings."""
+    """Run the benchmark of a report again with its settings, and return the new report."""
     if "benchmark" not in recorded:
         raise SystemExit("error: the report does not say which benchmark wrote it; run that, and give both reports")
     with tempfile.TemporaryDirectory() as place:
@@ -71,7 +71,7 @@ def measure(recorded: dict[str, Any]) -> dict[str, Any]:
 
 
 def words(settings: dict[str, Any]) -> list[str]:
-    """The flags that give a benchmark these settings."""
+    """Return the command-line flags of a benchmark's settings."""
     found, last = [], list(settings.pop("flags", ()))
     for name, value in settings.items():
         flag = f"--{name.replace('_', '-')}"
@@ -85,7 +85,7 @@ def words(settings: dict[str, Any]) -> list[str]:
 
 
 def judge(recorded: list[dict], new: list[dict], tolerance: float, absolute: bool) -> tuple[list[str], bool]:
-    """Lines that tell of every figure, and whether one is slower or missing."""
+    """Return a line for every figure, and whether any is slower or missing."""
     identity = lambda row: tuple((name, row[name]) for name in _IDENTITY if name in row)
     now = {identity(row): row for row in new}
     missing = [identity(row) for row in recorded if identity(row) not in now]

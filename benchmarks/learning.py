@@ -1,12 +1,12 @@
-"""How well and how fast agents learn families of tasks: every agent on every family, many seeds in one program each.
+"""Measure how well and how fast agents learn: every agent on every family, many seeds in one program each.
 
     python benchmarks/learning.py [--envs NAME ...] [--agents NAME ...] [--seeds 10] [--steps N] [--split hip-bmdp]
                                   [--baseline NAME] [--out DIR]
 
-Every pair of family and agent leaves ``DIR/ENV/AGENT.csv`` (training returns over steps and seconds, a line a chunk and
-seed) and ``AGENT.npz`` (every episode of every evaluation); pairs that are there already are not run again, so a long
-table may be made in parts, by several processes. From all that is in DIR come ``table.md``, ``differences.md``,
-``evaluations.csv`` and a figure for each family. With ``--agents`` and no name nothing is run, and only these are made.
+Every pair of family and agent writes ``DIR/ENV/AGENT.csv`` (training returns over steps and seconds, one line per chunk
+and seed) and ``AGENT.npz`` (every episode of every evaluation). Finished pairs are not run again, so several processes
+can make a long table in parts. All results in DIR together give ``table.md``, ``differences.md``, ``evaluations.csv``
+and a figure for each family. ``--agents`` without a name runs nothing and only makes these.
 
 Scores are interquartile means over seeds and tasks of the last evaluation (never the best one) under the mean action,
 with 95% bootstrap intervals over whole seeds. "s to 900" is the seconds of training, without compiling and evaluating,
@@ -75,7 +75,7 @@ def main() -> None:
 
 
 def learn(arguments: argparse.Namespace, env: str, agent: str) -> None:
-    """Train one agent on one family with its preset, and keep what it did."""
+    """Train one agent on one family with its preset, and save the run."""
     print(f"{agent} on {env}", flush=True)
     settings = {"vary": dict(pair.split("=", 1) for pair in arguments.vary)}
     settings |= {"split": arguments.split} if arguments.split else {}
@@ -100,7 +100,7 @@ def learn(arguments: argparse.Namespace, env: str, agent: str) -> None:
 
 
 def save(folder: Path, agent: str, result: Result) -> None:
-    """Keep one run: the evaluations last, as they say that it is whole."""
+    """Save one run. The evaluations come last, because they mark it as complete."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{agent}.csv").unlink(missing_ok=True)
     append_rows(folder / f"{agent}.csv", [{name: row[name] for name in _KEPT} for row in result.rows])
@@ -134,7 +134,7 @@ def tabulate(out: Path, mark: float, baseline: str) -> None:
 
 
 def runs(folder: Path) -> Iterator[tuple]:
-    """The runs of a family: the agent, its curve (lines (V, S) of ``_KEPT``), its evaluations."""
+    """Return the runs of a family: agent, curve (lines (V, S) of ``_KEPT``) and evaluations."""
     known = list(mtjax.AGENTS)
     order = lambda path: known.index(path.stem) if path.stem in known else len(known)
     for path in sorted(folder.glob("*.npz"), key=order):
@@ -146,7 +146,7 @@ def runs(folder: Path) -> Iterator[tuple]:
 
 
 def row(env: str, agent: str, curve: np.ndarray, evaluations, mark: float) -> list[str]:
-    """The cells of one run's line: last evaluation by split, times, rate."""
+    """Return the cells of one run's line: last evaluation by split, times, rate."""
     scores = last_scores(evaluations)
     cells = [env, agent]
     cells += [_cell(seed_interval(scores[split], iqm)) if split in scores else "-" for split in SPLITS]
@@ -159,7 +159,7 @@ def row(env: str, agent: str, curve: np.ndarray, evaluations, mark: float) -> li
 
 
 def difference_rows(env: str, found: dict[str, dict[str, np.ndarray]], baseline: str) -> list[list[str]]:
-    """Cells of every agent's differences from the baseline, a line a split; there are no pairs of unlike numbers."""
+    """Return each agent's differences from the baseline, one line per split. Pairs need equal numbers of seeds."""
     lines = []
     for agent, scores in found.items():
         for split in scores if agent != baseline and baseline in found else ():
@@ -171,7 +171,7 @@ def difference_rows(env: str, found: dict[str, dict[str, np.ndarray]], baseline:
 
 
 def last_scores(evaluations) -> dict[str, np.ndarray]:
-    """Mean returns (S, T) of the last evaluation, by split; splits without tasks are left out."""
+    """Return the mean returns (S, T) of the last evaluation by split, without empty splits."""
     return {split: x[:, -1].mean(axis=-1) for split, x in evaluations.returns.items() if x.size}
 
 
@@ -181,7 +181,7 @@ def _cell(interval: Interval, form: str = ".0f") -> str:
 
 
 def evaluation_rows(env: str, agent: str, evaluations) -> list[dict]:
-    """A line for each split, evaluation, seed and task: the mean over episodes."""
+    """Return a line for each split, evaluation, seed and task: the mean over episodes."""
     return [
         {"env": env, "agent": agent, "split": split, "steps": int(steps), "seed": s, "task": t, "return": f"{x:.1f}"}
         for split, returns in evaluations.returns.items()

@@ -1,12 +1,12 @@
-"""Ten tasks of dm_control with ten models in one program: what agents learn of all of them, and what a step costs.
+"""Measure returns and the cost of a step on ten tasks of dm_control with ten models in one program.
 
     python benchmarks/mixture.py [--agents NAME ...] [--alone NAME ...] [--steps N] [--minutes 8] [--out DIR]
 
 Parts are the agents on the mixture, each task alone (by sac-conditioned, which is then plain SAC, with the same
-preset, steps, environments and updates per task) and the cost of a step. Each leaves a file in DIR, and parts that are
-there already are not run again: after ``--minutes`` no further part begins, and the same command goes on with the rest.
-Processes with the same DIR and other parts may run beside each other, if no time is to be told. From all that is in DIR
-come ``returns.csv``, ``table.md`` and ``mixture.json``.
+preset, steps, environments and updates per task) and the cost of a step. Each part writes a file into DIR, and finished
+parts are not run again. After ``--minutes`` no further part begins; the same command continues with the rest. Several
+processes may run other parts in the same DIR, if times do not matter. All results in DIR together give ``returns.csv``,
+``table.md`` and ``mixture.json``.
 
 A return is the mean of the last evaluation under the mean action, over episodes and seeds. ``disjoint`` is one SAC for
 every task inside the mixture: beside "alone" it shows that padding and masks lose nothing. The cost is the median time
@@ -86,7 +86,7 @@ def main() -> None:
 
 
 def parts(arguments: argparse.Namespace) -> Iterator[tuple[str, Any]]:
-    """Every part's name, and the function that runs it."""
+    """Return every part's name and the function that runs it."""
     if arguments.timed_steps:
         yield "cost", lambda: cost(arguments)
     everything = "+".join(arguments.tasks)
@@ -100,7 +100,7 @@ def parts(arguments: argparse.Namespace) -> Iterator[tuple[str, Any]]:
 
 
 def learn(arguments: argparse.Namespace, env_name: str, agent: str) -> dict[str, Any]:
-    """Train one agent; a task alone with the mixture's preset, and not with one that was tuned for it."""
+    """Train one agent. A task alone uses the preset of the mixture, not its own tuned preset."""
     config = mtjax.preset("+".join(arguments.tasks), agent, arguments.preset)
     family = mtjax.make(env_name, **engine(arguments, env_name))
     given = {name: int(value) for name, value in (pair.split("=", 1) for pair in arguments.training)}
@@ -131,7 +131,7 @@ def learn(arguments: argparse.Namespace, env_name: str, agent: str) -> dict[str,
 
 
 def engine(arguments: argparse.Namespace, env_name: str) -> dict[str, str]:
-    """The setting of the engine, where families have one."""
+    """Return the setting of the engine, if families have one."""
     families = [mtjax.make(name) for name in env_name.split("+")]
     return {"engine": arguments.engine} if any("engine" in vars(family) for family in families) else {}
 
@@ -167,7 +167,7 @@ def cost(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def begin(family: Any, num_envs: int) -> Any:
-    """The states of a family's worlds as episodes begin."""
+    """Return the states of a family's worlds at the start of episodes."""
     tasks = family.tasks()
     keys = jax.random.split(jax.random.key(0), (1, len(tasks.id), num_envs))
     return jax.jit(lambda tasks, keys: family.reset_worlds(spread(tasks, keys.shape), keys).state)(tasks, keys)
@@ -206,7 +206,7 @@ class Stepper:
 
 
 def summarise(arguments: argparse.Namespace) -> str:
-    """Lay out all parts that are there, and write the files of them together."""
+    """Print all finished parts, and write the files that join them."""
     found = {file.stem: json.loads(file.read_text()) for file in sorted(arguments.out.glob("*-*.json"))}
     alone = {name: part for part in found.values() if len(part["tasks"]) == 1 for name in part["tasks"]}
     agents = {name.removeprefix("agent-"): part for name, part in found.items() if name.startswith("agent-")}

@@ -1,11 +1,11 @@
-"""How well and how fast PPO learns families of tasks on one GPU: three seeds of every family in one program each.
+"""Measure how well and how fast PPO learns on one GPU: three seeds of every family in one program each.
 
     python benchmarks/ppo.py [--family=NAME] ... [--steps=N] [--seeds=3] [--out=FOLDER] [NAME=VALUE ...]
 
-Every family leaves ``OUT/NAME.csv`` (a line of metrics a chunk and seed), ``NAME.npz`` (every episode of every
-evaluation) and ``NAME.json`` (the row of the table below); one that has its ``NAME.json`` is not run again, so that the
-five may be run in parts, in any order. Further words are settings of the agent or of the loop that replace the
-preset's: ``epochs=8 num_envs=512 hidden=[256,256]``.
+Every family writes ``OUT/NAME.csv`` (one line of metrics per chunk and seed), ``NAME.npz`` (every episode of every
+evaluation) and ``NAME.json`` (the row of the table below). A family with a ``NAME.json`` is not run again, so the five
+can be run in parts, in any order. Further words replace settings of the preset, for the agent or the loop:
+``epochs=8 num_envs=512 hidden=[256,256]``.
 
 Steps are of each seed, summed over its ten tasks; steps a second are of all seeds, without compiling and evaluating.
 The return is the mean of the last evaluation under the mean action, over tasks and episodes; its interval is the 95%
@@ -63,7 +63,7 @@ def main() -> None:
 
 
 def learn(arguments: argparse.Namespace, family: str) -> None:
-    """Train on one family, and keep what came of it."""
+    """Train on one family, and save the results."""
     given = dict(word.split("=", 1) for word in arguments.given)
     config = with_preset(family, arguments.agent, arguments.preset, engine=arguments.engine)
     agent, settings = configure(config.learner, config.training, {name: value(x) for name, x in given.items()})
@@ -101,7 +101,7 @@ def learn(arguments: argparse.Namespace, family: str) -> None:
 
 
 def value(word: str) -> Any:
-    """Read a setting as JSON where it is that, and as a word where it is not."""
+    """Read a setting as JSON, or else as a word."""
     try:
         found = json.loads(word)
     except json.JSONDecodeError:
@@ -110,7 +110,7 @@ def value(word: str) -> Any:
 
 
 def row(family: str, result: Result, seeds: int) -> dict[str, Any]:
-    """What a run came to."""
+    """Return the table's row of a run."""
     evaluations = result.evaluations
     scores = {split: x[:, -1].mean(axis=(-2, -1)) for split, x in evaluations.returns.items() if x.size}  # (S,)
     steps = int(result.rows[-1]["steps"])
@@ -131,14 +131,14 @@ def row(family: str, result: Result, seeds: int) -> dict[str, Any]:
 
 
 def interval(scores: np.ndarray) -> tuple[float, float]:
-    """The 95% bootstrap interval of the mean of seeds' scores (S,)."""
+    """Return the 95% bootstrap interval of the mean of seeds' scores (S,)."""
     draws = np.random.default_rng(0).integers(len(scores), size=(20_000, len(scores)))
     low, high = np.quantile(scores[draws].mean(axis=1), [0.025, 0.975])
     return float(low), float(high)
 
 
 def tabulate(out: Path) -> None:
-    """Print and keep a table of all families that are done."""
+    """Print and save a table of all finished families."""
     head = ["family", "steps of a seed", "training s", "steps/s, all seeds", "train", "interpolation", "extrapolation"]
     head += ["worst task", "aim"]
     found = [json.loads(path.read_text()) for path in sorted(out.glob("*.json"))]

@@ -1,4 +1,4 @@
-"""What every benchmark says of where and how its figures came about."""
+"""Helpers of all benchmarks: the description of the machine, tables and JSON reports."""
 
 import argparse
 import json
@@ -16,7 +16,7 @@ import mtjax
 
 
 def machine() -> dict[str, Any]:
-    """Where the figures come from."""
+    """Return the machine, the versions and the commit of the figures."""
     commit = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=os.path.dirname(__file__) or "."
     )
@@ -32,7 +32,7 @@ def machine() -> dict[str, Any]:
 
 
 def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown."""
+    """Return a table in Markdown."""
     line = lambda cells: "| " + " | ".join(cells) + " |"
     return "\n".join([line(head), "|" + "---|" * len(head), *map(line, rows)])
 

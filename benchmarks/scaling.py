@@ -1,4 +1,4 @@
-"""What more tasks, environments, seeds and devices cost: the training loop along one axis at a time.
+"""Measure the training loop with more tasks, environments, seeds or devices, one axis at a time.
 
     python benchmarks/scaling.py [--axes tasks envs seeds devices] [--agent NAME] [--json FILE] [--plots DIR]
 
@@ -7,8 +7,8 @@
     seeds     in one program, the same steps of each
     devices   with 40 seeds, which they share
 
-All settings of an axis are compiled first and then timed in turn, round after round, so that what else the machine does
-falls on all of them. "cost" is the time of a step of every environment beside the axis's base setting (10 tasks; the
+All settings of an axis are compiled first and then timed in turn, round after round, so that other load on the machine
+affects all of them. "cost" is the time of a step of every environment beside the axis's base setting (10 tasks; the
 fewest environments; 1 seed; 1 device), as the median of each round's ratio. Settings are the preset's of this device
 but for what the axis says and a warm-up of one step; no episode ends while timing.
 """
@@ -67,7 +67,7 @@ def main() -> None:
 
 
 def along(axis: str, values: list[int], arguments: argparse.Namespace) -> list[dict]:
-    """Time all settings of one axis, in turn."""
+    """Time all settings of one axis in turn, and return a row for each."""
     contestants = {}
     for value in values:
         contestants[value] = contestant(axis, value, arguments)
@@ -80,7 +80,7 @@ def along(axis: str, values: list[int], arguments: argparse.Namespace) -> list[d
 
 
 def contestant(axis: str, value: int, arguments: argparse.Namespace) -> Training:
-    """The training loop at one setting."""
+    """Return the training loop at one setting."""
     num_tasks = {"tasks": value, "envs": _TASKS}.get(axis, 10)
     worlds = value if axis == "envs" else arguments.worlds
     seeds = {"seeds": value, "devices": _SEEDS}.get(axis, 1)
@@ -135,7 +135,7 @@ def table(rows: list[dict]) -> str:
 
 
 def draw(path: Path, axis: str, rows: list[dict]) -> None:
-    """Rate and cost along one axis."""
+    """Draw rate and cost along one axis."""
     figure = Figure(figsize=(8, 3.2), layout="constrained")
     values = [row["value"] for row in rows]
     for axes, name, label in zip(

@@ -1,4 +1,4 @@
-"""What the constraint solver's iterations cost and buy: speed, and one step's error, by domain and engine.
+"""Measure speed and one step's error for numbers of solver iterations, by domain and engine.
 
     python benchmarks/solver_iterations.py [--envs NAME ...] [--engines mjx warp] [--settings 1/2 4/8 ...] [--json FILE]
 
@@ -33,7 +33,7 @@ _HELD = 5  # control steps for which random play holds an action
 
 
 class Sample(NamedTuple):
-    """Worlds of random play, an action for each, and the velocities to which the exact step leads (n, nv)."""
+    """Worlds of random play, an action for each, and the velocities (n, nv) after the exact step."""
 
     tasks: Task
     world: World
@@ -65,7 +65,7 @@ def main() -> None:
 
 
 def domains() -> list[str]:
-    """The first name of every MuJoCo model."""
+    """Return the first family's name of every MuJoCo model."""
     families = {name: family for name, (family, _) in ENVS.items() if issubclass(family, Domain)}
     first = {family.model_file: name for name, family in reversed(families.items())}
     return list(first.values())
@@ -83,7 +83,7 @@ def measure(name: str, engines: tuple[str, ...], arguments: argparse.Namespace) 
 
 
 def build(env: Domain, kind: str, setting: str) -> Engine:
-    """The engine ``kind`` of a family, with "iterations/line-search iterations" of its solver."""
+    """Return the engine ``kind`` of a family, with "iterations/line-search iterations" of its solver."""
     if kind == "c":
         return MujocoC(env.models, env.num_substeps)
     base = copy.copy(env.mjx.base)
@@ -125,7 +125,7 @@ def exact(model: mujoco.MjModel) -> mujoco.MjModel:
 
 
 def evaluate(engine: Engine, sample: Sample, arguments: argparse.Namespace) -> dict[str, float]:
-    """Errors of one step in the sample's worlds, and the speed of many worlds under random actions, by one program."""
+    """Return errors of one step in the sample's worlds, and the speed of many worlds under random actions."""
     count, sampled = arguments.worlds, len(sample.qvel)
     tasks, world, action = jax.tree.map(lambda x: jnp.asarray(x)[np.arange(count) % sampled], sample[:3])
 

@@ -1,12 +1,12 @@
-"""How many steps a second: environments on every engine beside MuJoCo Playground, and the whole training loop.
+"""Measure steps a second of environments on every engine, of MuJoCo Playground, and of the training loop.
 
     python benchmarks/steps_per_second.py [--domains finger cheetah ...] [--worlds N] [--json FILE]
 
 All contestants of a domain are compiled first and then timed in turn, round after round, in this one process, so that
-what else the machine does falls on all of them; figures are medians over the rounds, and ratios are medians of each
-round's ratio. Ten tasks, random actions, fresh random starts every 1000 steps; "no resets" is the same program whose
-episodes never end. Playground 0.2 (pip install playground==0.2.0) runs one task, in its own wrapper for training, whose
-automatic reset returns to one stored state. Compile time is reported apart.
+other load on the machine affects all of them. Figures are medians over the rounds, and ratios are medians of each
+round's ratio. There are ten tasks, random actions, and fresh random starts every 1000 steps. "no resets" is the same
+program with endless episodes. Playground 0.2 (pip install playground==0.2.0) runs one task, in its own wrapper for
+training, whose automatic reset returns to one stored state. Compile time is reported separately.
 """
 
 import argparse
@@ -130,7 +130,7 @@ def _row(domain: str, contestant: Contestant, best: Contestant | None) -> dict:
 
 
 def ours(name: str, settings: dict, per_task: int, steps: int, resets: bool) -> Callable[[], Any]:
-    """Random actions in a scan, as the training loop steps: one flat batch, fresh starts behind one branch."""
+    """Return our contestant: random actions in a scan, stepped and reset as in the training loop."""
     env = mtjax.make(name, **settings)
     tasks = env.tasks()
     shape = (1, len(tasks.id), per_task)
@@ -166,7 +166,7 @@ def ours(name: str, settings: dict, per_task: int, steps: int, resets: bool) -> 
 
 
 def batch_alone(name: str, vary: dict, per_task: int, steps: int) -> Callable[[], Any]:
-    """MuJoCo's own threaded batch, with the same models and substeps, and nothing around it."""
+    """Return MuJoCo's own threaded batch as a contestant, with the same models and substeps."""
     from mujoco import batch
 
     env = mtjax.make(name, vary, engine="c")
@@ -186,7 +186,7 @@ def batch_alone(name: str, vary: dict, per_task: int, steps: int) -> Callable[[]
 
 
 def playground(name: str, impl: str, worlds: int, steps: int) -> Callable[[], Any]:
-    """Playground's environment in its own wrapper for training, with its default configuration but for the engine."""
+    """Return Playground's environment in its training wrapper, with its default configuration but for the engine."""
     from mujoco_playground import registry, wrapper  # type: ignore  # not a dependency of this package
 
     env = registry.load(name, config_overrides={"impl": impl})

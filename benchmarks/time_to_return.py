@@ -1,4 +1,4 @@
-"""How long a user waits for a return: the program as it is called, with a cold and with a warm compile cache.
+"""Measure the time from the start of ``mtjax.train`` to a return, with a cold and a warm compile cache.
 
     python benchmarks/time_to_return.py [--mark 900] [--tasks 10 200] [--agents NAME ...] [--seeds N] [--json FILE]
                                         [-- FLAGS OF mtjax.train ...]
@@ -85,7 +85,7 @@ def watch(words: list[str], place: Path, cache: str, arguments: argparse.Namespa
 
 
 def follow(process: subprocess.Popen, runs: Path, before: float, arguments: argparse.Namespace) -> dict:
-    """What a run's metrics say, up to the mark or the end."""
+    """Return the times in a run's metrics, up to the mark or the end."""
     found: dict[str, Any] = dict.fromkeys(FIGURES)
     while process.poll() is None and time.monotonic() - before < arguments.patience and found["reached"] is None:
         time.sleep(_POLL)
@@ -109,7 +109,7 @@ def follow(process: subprocess.Popen, runs: Path, before: float, arguments: argp
 
 
 def chunks(runs: Path, seeds: int) -> list[tuple[int, float, float | None]]:
-    """Steps of a seed, training seconds and mean return (None where no episode ended) of every chunk written so far."""
+    """Return steps of a seed, training seconds and mean return of every chunk so far; None if no episode ended."""
     files = list(runs.glob("*/metrics.csv"))
     if not files:
         return []

@@ -1,4 +1,4 @@
-"""The training loop as something to time: compiled and warmed up once, then run chunk by chunk."""
+"""The training loop for timing: compiled and warmed up once, then run chunk by chunk."""
 
 import time
 from typing import Any
@@ -10,16 +10,16 @@ from mtjax.agents import BaseAgent
 from mtjax.envs import Family
 from mtjax.loop import Settings
 from mtjax.parallel import mesh as meshes
-from mtjax.training.programs import compiled, jitted
+from mtjax.training.programs import compile_lowered, jit_programs
 
 
 class Training:
-    """The loop of ``mtjax.train`` without evaluations, logs and checkpoints.
+    """The training loop of ``mtjax.train`` without evaluations, logs and checkpoints.
 
     Args:
-        family, agent, settings: what is trained; learning is under way by the time it is first timed.
-        seeds: how many at once.
-        most_devices: of those there are, how many it may use.
+        family, agent, settings: the run. Learning has begun before the first timing.
+        seeds: how many seeds to train at once.
+        most_devices: the largest number of devices to use.
     """
 
     def __init__(
@@ -27,8 +27,8 @@ class Training:
     ):
         env, num_tasks, experience = family, family.train_count, agent.experience
         mesh = meshes.mesh_for(seeds, num_tasks, settings.num_envs, most_devices)
-        programs, numbers = jitted(mesh, agent), meshes.by_seed(mesh, jnp.arange(seeds))
-        tasks = meshes.everywhere(mesh, env.tasks())
+        programs, numbers = jit_programs(mesh, agent), meshes.shard_by_seed(mesh, jnp.arange(seeds))
+        tasks = meshes.replicate(mesh, env.tasks())
         self.num_devices = 1 if mesh is None else mesh.size
         self.worlds = num_tasks * settings.num_envs
         self.steps = seeds * settings.chunk_steps * self.worlds
@@ -36,9 +36,9 @@ class Training:
         self.seconds: list[float] = []
         jax.clear_caches()  # of the programs of others, which may be the same
         before = time.perf_counter()
-        init = compiled(programs.init.lower(env, agent, settings, tasks, numbers, None), once=True)
+        init = compile_lowered(programs.init.lower(env, agent, settings, tasks, numbers, None), once=True)
         self.state = init(tasks, numbers, None)
-        chunk = compiled(programs.chunk.lower(env, agent, settings, tasks, self.state))
+        chunk = compile_lowered(programs.chunk.lower(env, agent, settings, tasks, self.state))
         self.compile_seconds = time.perf_counter() - before
         self.run = lambda state: chunk(tasks, state)
         while int(self.state.iteration) <= getattr(experience, "warmup_steps", 0):
@@ -53,10 +53,10 @@ class Training:
 
     @property
     def rates(self) -> list[float]:
-        """Environment steps a second of all seeds, of every chunk timed."""
+        """Return the environment steps a second, of all seeds, of every timed chunk."""
         return [self.steps / seconds for seconds in self.seconds]
 
     def memory(self) -> int | None:
-        """Bytes of the device's memory that were in use at most, by whatever ran so far; None on a CPU."""
+        """Return the peak bytes of the device's memory in this process; None on a CPU."""
         found: Any = jax.local_devices()[0].memory_stats() or {}
         return found.get("peak_bytes_in_use")

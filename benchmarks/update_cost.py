@@ -1,4 +1,4 @@
-"""What an update of every agent costs beside plain SAC's.
+"""Measure the time of an update of every agent, compared with plain SAC.
 
     python benchmarks/update_cost.py [--agents NAME ...] [--tasks 10 50] [--seeds 1 10] [--json FILE]
 
@@ -46,7 +46,7 @@ def main() -> None:
 
 
 def compare(arguments: argparse.Namespace, num_tasks: int, num_seeds: int) -> list[dict]:
-    """Time all agents in turn."""
+    """Time all agents in turn, and return their rows."""
     names = ["sac", *(name for name in arguments.agents if name != "sac")]
     contestants = [Contestant(name, arguments, num_tasks, num_seeds) for name in names]
     for _ in range(arguments.repeats):

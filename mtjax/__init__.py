@@ -31,7 +31,7 @@ _find = lazily(__name__, _HOME)
 
 def __getattr__(name: str) -> Any:
     """Import a public name when it is first used, so that ``import mtjax`` takes no time."""
-    return import_module("mtjax.train") if name == "train" else _find(name)  # a module that is called like the function
+    return import_module("mtjax.train") if name == "train" else _find(name)  # the module has the name of the function
 
 
 def __dir__() -> list[str]:

@@ -1,4 +1,4 @@
-"""The command line of training: names first, then typed overrides of what the names stand for."""
+"""The command line of training: names choose the defaults, and typed flags override them."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -7,7 +7,7 @@ from typing import Any
 
 from mtjax.agents import settings
 from mtjax.agents.base import CHOICES, flag_names
-from mtjax.commands import check_names, import_files, parse_with_tyro, unknown_flag, value_of
+from mtjax.commands import check_names, flag_value, import_files, parse_with_tyro, unknown_flag
 from mtjax.config import NO_FINE_TUNING, RunConfig, from_json, with_preset
 from mtjax.envs import make
 from mtjax.envs.family import Family
@@ -16,62 +16,64 @@ from mtjax.names import InputError
 
 _VARY = "--env.vary."
 _FAMILY_FLAGS = {"combine": "env.combine", "split": "split"}  # they decide which values are allowed
-_DECIDING = ("conditioning", "vectors", "heads")  # which parts go together with the rest of an agent
+_DECIDING = ("conditioning", "vectors", "heads")  # they decide which parts are allowed
 
 
 def parse(argv: Sequence[str]) -> RunConfig:
-    """Read a command line: the names choose the defaults, the other flags change them.
+    """Read the configuration of a run from a command line.
+
+    The names of environment, agent and preset choose the defaults; the other flags change them.
 
     Raises:
         InputError: a name, flag or value cannot be used.
     """
     argv = import_files(argv)
     check_names(argv)
-    env_name = value_of(argv, "env", RunConfig.env)
-    start = value_of(argv, "from", "")
-    begun = from_json(Path(start) / "config.json") if start or "--from=" in argv else None
-    if begun is not None and begun.points:
-        raise InputError(f"--from takes a run of one setting, and {start!r} holds {len(begun.points)} of a sweep")
-    agent_name = value_of(argv, "agent", RunConfig.agent if begun is None else begun.agent)
-    preset_name = value_of(argv, "preset", RunConfig.preset)
+    env_name = flag_value(argv, "env", RunConfig.env)
+    start = flag_value(argv, "from", "")
+    source = from_json(Path(start) / "config.json") if start or "--from=" in argv else None
+    if source is not None and source.points:
+        raise InputError(f"--from takes a run of one setting, and {start!r} holds {len(source.points)} of a sweep")
+    agent_name = flag_value(argv, "agent", RunConfig.agent if source is None else source.agent)
+    preset_name = flag_value(argv, "preset", RunConfig.preset)
     vary, argv = _peel_vary(argv)
     chosen, argv = _peel_parts(argv)
     of_family: dict[str, Any] = {
-        name: value for name in ("combine", "split") if (value := value_of(argv, _FAMILY_FLAGS[name], ""))
+        name: value for name in ("combine", "split") if (value := flag_value(argv, _FAMILY_FLAGS[name], ""))
     }
     if "+" in env_name:
         of_family, argv = _peel_shared(argv, make(env_name))
-    told = {name: value for name in _DECIDING if (value := value_of(argv, f"agent.{name}", ""))}
-    default = with_preset(env_name, agent_name, preset_name, {**chosen, **told}, vary=vary, **of_family)
-    if begun is not None:
-        default = _fine_tuning(default, begun, start, chosen)
+    deciding = {name: value for name in _DECIDING if (value := flag_value(argv, f"agent.{name}", ""))}
+    default = with_preset(env_name, agent_name, preset_name, {**chosen, **deciding}, vary=vary, **of_family)
+    if source is not None:
+        default = _fine_tuning(default, source, start, chosen)
     _check_flags(argv, default)
     return parse_with_tyro(RunConfig, argv, default, "python -m mtjax.train")
 
 
-def _fine_tuning(config: RunConfig, begun: RunConfig, start: str, chosen: Mapping[str, str]) -> RunConfig:
-    """A program with the agent of a run, and tasks whose context is written as the run's."""
-    had = {"agent": begun.agent, **settings(begun.learner)}
+def _fine_tuning(config: RunConfig, source: RunConfig, start: str, chosen: Mapping[str, str]) -> RunConfig:
+    """Return a configuration with the agent of the run ``source``, and tasks whose context is scaled as there."""
+    had = {"agent": source.agent, **settings(source.learner)}
     for name, given in {"agent": config.agent, **chosen}.items():
         if given != had[name]:
             raise InputError(f"--from goes on with the run's {name}, {had[name]}, not with {given}; leave it out")
-    for env in (config.family, begun.family):
+    for env in (config.family, source.family):
         require_family(env, NO_FINE_TUNING)
-    assert isinstance(config.family, Family) and isinstance(begun.family, Family)
-    learner, family = dataclasses.replace(begun.learner, tune="all"), config.family.scaled_as(begun.family)
+    assert isinstance(config.family, Family) and isinstance(source.family, Family)
+    learner, family = dataclasses.replace(source.learner, tune="all"), config.family.scaled_as(source.family)
     return dataclasses.replace(config, start=start, learner=learner, family=family)
 
 
 def _peel_vary(argv: Sequence[str]) -> tuple[dict[str, str], list[str]]:
-    """Take --env.vary.NAME=VALUES out of a command line: which names there are is the family's to say."""
-    given, rest = _take(argv, lambda flag: flag.startswith(_VARY), "values; give lo:hi:n, lo:hi or a list a,b,c")
+    """Take --env.vary.NAME=VALUES out of a command line, because only the family knows the names."""
+    given, rest = _split_flags(argv, lambda flag: flag.startswith(_VARY), "values; give lo:hi:n, lo:hi or a list a,b,c")
     return {flag.removeprefix(_VARY): value for flag, value in given.items()}, rest
 
 
 def _peel_parts(argv: Sequence[str]) -> tuple[dict[str, str], list[str]]:
-    """Take --agent.KIND=NAME out of a command line: the part decides which other flags there are."""
+    """Take --agent.KIND=NAME out of a command line, because each part adds flags of its own."""
     kinds = {f"--agent.{kind}": kind for kind in CHOICES}
-    given, rest = _take(argv, kinds.__contains__, "a value")
+    given, rest = _split_flags(argv, kinds.__contains__, "a value")
     return {kinds[flag]: name for flag, name in given.items()}, rest
 
 
@@ -98,7 +100,7 @@ def _peel_shared(argv: Sequence[str], mixture: Mixture) -> tuple[dict[str, Any],
 
 
 def shared_fields(family: Family) -> list[dataclasses.Field]:
-    """The fields of a family that are flags by themselves."""
+    """Return the fields of a family that are command-line flags."""
     return [field for field in dataclasses.fields(family) if field.name not in ("vary", "context_ranges")]
 
 
@@ -112,8 +114,8 @@ def _negated(flag: str) -> str:
     return f"--{group}{dot}no-{name}"
 
 
-def _take(argv: Sequence[str], mine: Callable[[str], bool], needed: str) -> tuple[dict[str, str], list[str]]:
-    """Part the flags that are ``mine``, with their values, from the other words of a command line."""
+def _split_flags(argv: Sequence[str], mine: Callable[[str], bool], needed: str) -> tuple[dict[str, str], list[str]]:
+    """Return the flags for which ``mine`` is true, with their values, and the other words of a command line."""
     given, rest, words = {}, [], iter(argv)
     for word in words:
         flag, equals, value = word.partition("=")
@@ -127,7 +129,7 @@ def _take(argv: Sequence[str], mine: Callable[[str], bool], needed: str) -> tupl
 
 
 def flags(config: Any, prefix: str = "--") -> list[str]:
-    """Every flag of a program."""
+    """Return every flag of a configuration."""
     names = []
     for field in dataclasses.fields(config):
         value, name = getattr(config, field.name), field.name.replace("_", "-")

@@ -1,4 +1,4 @@
-"""What the commands share, and what they answer before JAX is imported: the list, wrong names, missing runs."""
+"""Helpers of all commands, and checks that need no JAX: the list of names, wrong names, missing runs."""
 
 import ast
 import contextlib
@@ -23,13 +23,13 @@ _OVERVIEW = (  # titles, and the classes whose fields are flags of every run
     ("for how long (a preset may say otherwise)", "config.py", "Plan"),
     ("how worlds are played (a preset may say otherwise)", "loop.py", "Settings"),
 )
-_MAY_CHANGE = {"--resume", "--steps", "--import", "--distributed", "--profile"}  # where a run goes on
+_MAY_CHANGE = {"--resume", "--steps", "--import", "--distributed", "--profile"}  # the only flags beside --resume
 _FIELD = re.compile(r"^    (\w+): ", re.MULTILINE)  # a line of a class that may be a setting
 P = TypeVar("P")
 
 
 def main(run: Any) -> None:
-    """Run a program's entry point; what the user got wrong becomes a line and exit code 2."""
+    """Run a command's entry point. A mistake of the user prints one line and exits with code 2."""
     try:
         run(sys.argv[1:])
     except InputError as error:
@@ -47,7 +47,7 @@ def main(run: Any) -> None:
 
 
 def catalogue() -> str:
-    """List families and agents with the first sentence of their documentation."""
+    """Return a list of families and agents, each with the first sentence of its documentation."""
     lines = ["environments:"]
     for name in ENVS:
         tasks, says = outline(name)
@@ -84,13 +84,13 @@ def _fields(file: Path, cls: str) -> Iterator[tuple[str, str, str]]:
 
 
 def check_names(argv: Sequence[str]) -> None:
-    """Refuse what names alone show to be wrong: an environment, agent or preset, or a run to begin with.
+    """Refuse an unknown environment, agent, preset or run, before anything slow is imported.
 
     Raises:
-        InputError: there is no such thing, or a run that goes on was told to change.
+        InputError: there is no such name or folder, or --resume came with flags that change the run.
     """
     for kind, flag, known in _KNOWN:
-        given = value_of(argv, flag, None)
+        given = flag_value(argv, flag, None)
         names = () if given is None else given.split("+") if flag == "env" else (given,)  # several are a mixture
         wrong = next((name for name in names if name not in known), None)
         if wrong is not None:
@@ -100,21 +100,23 @@ def check_names(argv: Sequence[str]) -> None:
     if "--resume" in given and "--sweep" not in given and other:
         raise InputError(f"--resume goes on with a run as it was; only --steps may change, not {other}")
     for flag in () if {"--resume", "--sweep"} <= given else ("resume", "from"):
-        folder = value_of(argv, flag, None)
+        folder = flag_value(argv, flag, None)
         if folder is not None and not (flag == "resume" and any(Path(folder).glob("run-*"))):  # the runs of a sweep
             require_run(Path(folder))
 
 
 def check_flags(argv: Sequence[str]) -> None:
-    """Refuse a flag that is no setting of any family or agent; which of them has a setting is checked with the rest.
+    """Refuse a flag that no family and no agent has.
+
+    Whether the chosen ones have it is checked later, by the full parser.
 
     Raises:
-        InputError: there is no such flag, whatever is chosen.
+        InputError: there is no such flag.
     """
     places = (*(place for place, _ in ENVS.data.values()), *(preset.place for preset in AGENTS.values()))
-    if not all(isinstance(place, str) for place in places):  # a class of the user's own, with settings of its own
+    if not all(isinstance(place, str) for place in places):  # the user's own classes have further settings
         return
-    files = Path(__file__).parent.rglob("*.py")  # read and not run: to import the classes is to import JAX
+    files = Path(__file__).parent.rglob("*.py")  # read as text, because importing the classes would import JAX
     fields = itertools.chain.from_iterable(_FIELD.findall(file.read_text(encoding="utf-8")) for file in files)
     known = {*(field.replace("_", "-") for field in fields), "from", "help"}
     for word in argv:
@@ -125,18 +127,18 @@ def check_flags(argv: Sequence[str]) -> None:
 
 
 def unknown_flag(flag: str, known: Iterable[str]) -> InputError:
-    """Return an error for a flag that there is not; --help lists the others, of which there are many."""
+    """Return an error for an unknown flag. It names the nearest flag and points to --help for the rest."""
     return InputError(str(nearest_error("flag", flag, known)).split("choose from")[0] + "--help lists the flags")
 
 
 def require_run(folder: Path) -> None:
-    """Refuse a folder that is not a run's."""
+    """Raise InputError unless a folder holds a run."""
     if not (folder / "config.json").is_file():
         raise InputError(f"{str(folder)!r} is not a run: it has no config.json")
 
 
-def value_of(argv: Sequence[str], name: str, default: P) -> str | P:
-    """Find --name=VALUE or --name VALUE; the last one counts."""
+def flag_value(argv: Sequence[str], name: str, default: P) -> str | P:
+    """Return the value of --name=VALUE or --name VALUE. The last one counts."""
     value = default
     for i, word in enumerate(argv):
         if word.startswith(f"--{name}="):
@@ -149,7 +151,9 @@ def value_of(argv: Sequence[str], name: str, default: P) -> str | P:
 
 
 def import_files(argv: Sequence[str]) -> list[str]:
-    """Run the FILE.py of every --import=FILE.py, which may ``register`` something; return the other words.
+    """Run the file of every --import=FILE.py, and return the other words of the command line.
+
+    Such a file calls ``mtjax.register`` for the user's own classes.
 
     Raises:
         InputError: there is no such file.
@@ -173,7 +177,7 @@ def _import(path: Path) -> None:
 
 
 def parse_with_tyro(cls: type[P], argv: Sequence[str], default: P, name: str) -> P:
-    """Parse with tyro, whose framed error becomes one line.
+    """Parse with tyro, and turn its framed error message into one line.
 
     Raises:
         InputError: tyro refused the command line.
@@ -192,7 +196,7 @@ def parse_with_tyro(cls: type[P], argv: Sequence[str], default: P, name: str) ->
 
 
 def _unframed(text: str) -> str:
-    """The lines between the first two rules of tyro's frame, which has no corners where output is not UTF-8."""
+    """Return the lines inside tyro's frame. The frame has no corners where output is not UTF-8."""
     is_rule = lambda line: line.startswith("╭") or not line.strip(" │─╰╯-")
     below = itertools.dropwhile(lambda line: not is_rule(line), text.splitlines())
     next(below, None)

@@ -1,4 +1,4 @@
-"""What a run is made of: its names, presets and settings, and their record as JSON."""
+"""The configuration of a run: names, presets and settings, read from and written to JSON."""
 
 import dataclasses
 import json
@@ -32,15 +32,15 @@ class Plan:
     """How long a run lasts, over which seeds, and when it is evaluated."""
 
     steps: int = 1_000_000
-    """Environment steps of each seed, summed over tasks; rounded up to whole chunks."""
+    """Environment steps of each seed, summed over tasks. They are rounded up to whole chunks."""
     seed: int = 0
     """The first seed."""
     seeds: int = 1
-    """Seeds to run at once, in one program."""
+    """How many seeds to train at once, in one program."""
     eval_every: int = 0
-    """Environment steps between evaluations, rounded up to whole chunks; 0 evaluates ten times in the run."""
+    """Environment steps between evaluations, rounded up to whole chunks. 0 means ten evaluations in the run."""
     eval_episodes: int = 10
-    """Episodes of each task in an evaluation."""
+    """Episodes of each task in every evaluation."""
 
     def __post_init__(self):
         for field, least in (("steps", 1), ("seeds", 1), ("seed", 0), ("eval_every", 0), ("eval_episodes", 1)):
@@ -55,35 +55,35 @@ class RunConfig:
     """Train a multi-task agent: ``python -m mtjax.train --env=NAME --agent=NAME``."""
 
     env: str = "finger-spin-vary-size"
-    """Name of the environment family; --list shows all. --import=FILE.py makes known what a file registers: families,
-    agents, and parts of agents. NAME+NAME is a mixture of families, in which --engine, --split and --env.FIELD hold for
-    every family that has such a flag, and --env.vary.NAME.PARAMETER=VALUES for one."""
+    """Name of the environment family. --list shows all names. --import=FILE.py runs a file that registers families,
+    agents or parts of your own. NAME+NAME is a mixture of families: --engine, --split and --env.FIELD then hold for
+    every family that has such a flag, and --env.vary.NAME.PARAMETER=VALUES holds for the family NAME."""
     agent: str = "sac-conditioned"
-    """Name of the agent; --list shows all. Its parts: --agent.representation, --agent.encoder, --agent.gradients,
-    --agent.value, --agent.scaling and --agent.sampler, each by name and with flags of its own."""
+    """Name of the agent. --list shows all names. These flags choose its parts by name: --agent.representation,
+    --agent.encoder, --agent.gradients, --agent.value, --agent.scaling and --agent.sampler. Each part adds its flags."""
     preset: Literal["auto", "cpu", "gpu"] = "auto"
-    """Tuned defaults of the flags below for a kind of device; auto chooses by the device that JAX runs on."""
+    """Tuned defaults of the flags below for one kind of device. auto takes the device that JAX runs on."""
     runs: str = "runs"
-    """Folder in which the run's own folder is made."""
+    """Folder in which the run makes a folder of its own."""
     resume: str = ""
-    """A run's folder to go on with; only --steps may be given beside it."""
+    """Folder of the run to resume. Of the settings only --steps may be given beside it."""
     start: Annotated[str, tyro.conf.arg(name="from")] = ""
-    """A run's folder whose agent to fine-tune on this environment's tasks. Agent and networks are the run's; rates of
-    learning and --tune may be given. What every task has for itself begins as that of the run's nearest training task,
-    and seeds beyond the run's begin with its first ones again."""
+    """Folder of a run whose agent is fine-tuned on this environment's tasks. Agent and networks are those of that run;
+    learning rates and --tune may be given. Parameters of a single task start from the nearest training task of that
+    run. Seed number k starts from seed k modulo the number of its seeds."""
     sweep: tuple[str, ...] = ()
-    """Train once for every combination of values: agent.actor-lr=1e-4,1e-3 agent.num-experts=2,4 and so on, flags
-    without their dashes. The agent's numbers vary inside one program, beside the seeds; whatever else varies is one
-    program after another. A table of all settings lies in the sweep's folder, whose name --resume takes too."""
+    """Train once for every combination of values, such as agent.actor-lr=1e-4,1e-3 agent.num-experts=2,4. Flags are
+    written without their dashes. Real numbers of the agent vary inside one program, beside the seeds. Other settings
+    run as one program after another. The sweep's folder holds a table of all settings; --resume takes this folder."""
     points: Annotated[tuple[dict[str, float], ...], tyro.conf.Suppress] = ()
     profile: bool = False
-    """Leave a trace of one warm chunk, by JAX's profiler, in the run's folder."""
+    """Write a trace of one warm chunk by JAX's profiler into the run's folder."""
     distributed: bool = False
-    """Run as one of several processes, each on devices of its own, that share the seeds. All are started with the same
-    command: by SLURM's srun, Open MPI or Kubernetes, or with JAX_COORDINATOR_ADDRESS (host:port of process 0),
-    JAX_NUM_PROCESSES and JAX_PROCESS_ID in the environment. They share the folder of --runs."""
+    """Run as one of several processes that share the seeds, each on its own devices. Start every process with the same
+    command by SLURM's srun, Open MPI or Kubernetes. Elsewhere set JAX_COORDINATOR_ADDRESS (host:port of process 0),
+    JAX_NUM_PROCESSES and JAX_PROCESS_ID in the environment. All processes must see the folder of --runs."""
     list: bool = False
-    """Print the families and agents, and stop."""
+    """Print the families and agents, then stop."""
     plan: Annotated[Plan, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Plan)
     training: Annotated[Settings, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Settings)
     family: Annotated[Tabled, tyro.conf.arg(name="env")] = dataclasses.field(
@@ -99,7 +99,11 @@ def with_preset(
     agent_settings: Mapping[str, str] = MappingProxyType({}),
     **family_settings: Any,
 ) -> RunConfig:
-    """Return the program that a family and an agent, each with any settings of its own, and a preset stand for.
+    """Return the configuration of a family and an agent with the tuned settings of a preset.
+
+    Args:
+        agent_settings: values that replace those of the preset.
+        family_settings: fields of the family.
 
     Raises:
         InputError: a name or setting is unknown.
@@ -124,18 +128,18 @@ def with_preset(
 
 
 def configure(agent: Any, settings: Settings, given: Mapping[str, Any]) -> tuple[Any, Settings]:
-    """Return agent and settings with given values in place of their own, each where its name belongs.
+    """Return the agent and the loop's settings with the given values in place of their own.
 
     Raises:
-        InputError: a name is neither's, or a value is not allowed.
+        InputError: neither has a setting of that name, or a value is not allowed.
     """
-    played = {name: value for name, value in given.items() if name in Settings.__dataclass_fields__}
-    rest = {name: value for name, value in given.items() if name not in played}
-    return replace(agent, rest), dataclasses.replace(settings, **played)
+    loop_values = {name: value for name, value in given.items() if name in Settings.__dataclass_fields__}
+    rest = {name: value for name, value in given.items() if name not in loop_values}
+    return replace(agent, rest), dataclasses.replace(settings, **loop_values)
 
 
-def require_range(agent: Any) -> None:
-    """Refuse critics whose range nobody chose for returns that are not scaled to it, once all settings are given.
+def require_value_range(agent: Any) -> None:
+    """Refuse categorical critics that have no chosen range and whose returns are not scaled to the default range.
 
     Raises:
         InputError: the agent has such critics.
@@ -147,7 +151,10 @@ def require_range(agent: Any) -> None:
 
 
 def load_preset(env_name: str, name: str) -> dict[str, Any]:
-    """Read the tables of a preset: the family's own file, or the domain's, or the default one, as for mixtures."""
+    """Read the tables of a preset from the family's file, else the domain's file, else the default file.
+
+    Mixtures use the default file.
+    """
     folder = resources.files("mtjax") / "configs"
     words = [] if "+" in env_name else env_name.split("-")
     names = ["-".join(words[:n]) for n in range(len(words), 0, -1)]
@@ -161,7 +168,7 @@ def _device_preset() -> str:
 
 
 def import_flags(config: RunConfig) -> list[str]:
-    """The flags that make what is the user's own known to another program: families, the agent and its parts."""
+    """Return the --import flags that register the user's own families, agent and parts in another process."""
     used = [*(part.family for part in config.family.parts), config.learner]
     used += [getattr(config.learner, kind) for kind in kinds_of(config.learner)]
     modules = dict.fromkeys(type(each).__module__ for each in used)
@@ -170,17 +177,17 @@ def import_flags(config: RunConfig) -> list[str]:
     return [f"--import={Path(file).resolve()}" for file in files if file is not None]
 
 
-# The record of a run.
+# Configurations as JSON.
 
 
 def to_json(config: RunConfig, extra: dict[str, Any]) -> str:
-    """Write everything a run is made of."""
+    """Return the configuration, and the entries of ``extra``, as JSON."""
     record = {**dataclasses.asdict(config), "learner": settings(config.learner)}
     return json.dumps({**record, **extra}, indent=2) + "\n"
 
 
 def from_json(path: Path) -> RunConfig:
-    """Read the program of a run from its config.json.
+    """Read the configuration of a run from its config.json.
 
     Raises:
         InputError: there is no such file, or it does not describe a run.

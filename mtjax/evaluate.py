@@ -1,4 +1,4 @@
-"""``python -m mtjax.evaluate --run=DIR``: score a trained run on every task of every split, plot it, film it."""
+"""``python -m mtjax.evaluate --run=DIR``: score, plot and film a trained run on every task of every split."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -15,19 +15,19 @@ class Request:
     run: str = ""
     """The run's folder."""
     point: int = 0
-    """Which setting of a run that holds several of a sweep: its number in sweep.csv."""
+    """Number of the setting in sweep.csv, if the run holds several settings of a sweep."""
     episodes: int = 10
     """Episodes of each task and seed."""
     seed: int = 0
-    """Chooses the starting states."""
+    """Seed of the starting states."""
     video: bool = False
     """Film the first ten seconds of an episode of each task (mp4 if ffmpeg is installed, else gif)."""
     diagnostics: bool = False
-    """Measure how the training tasks' gradients agree and how much of the networks is in use, from the run's replay."""
+    """Measure conflicts between the tasks' gradients, and unused units of the networks, from the run's replay."""
 
 
 def main(argv: Sequence[str]) -> None:
-    """Read what is asked for; then import what evaluates, and score the run."""
+    """Read the command line first, then import the evaluation code and score the run."""
     request = _parse(argv)
     load("mtjax.report.scoring:report")(*dataclasses.astuple(request))
 
@@ -48,7 +48,7 @@ def _parse(argv: Sequence[str]) -> Request:
 
 
 def run() -> None:
-    """Entry point of the command line."""
+    """Run the command line."""
     commands.main(main)
 
 

@@ -59,7 +59,7 @@ def init(
     """Return a fresh training state for ``seeds`` (S,) on training ``tasks`` (T, ...).
 
     Args:
-        knobs: values (S,) of an agent's numbers that vary between seeds, if it is a ``Varied``.
+        knobs: values (S,) of an agent's numbers that vary between seeds, if it is a ``SweptAgent``.
     """
     agent.experience.check(env, settings.num_envs)
     num_tasks = len(tasks.id)

@@ -1,4 +1,4 @@
-"""Things by name: errors that say what was given and the nearest match, and imports that wait until they are needed."""
+"""Errors that name the nearest match, and imports that wait until they are needed."""
 
 import difflib
 import sys
@@ -10,11 +10,14 @@ _MANY = 20
 
 
 class InputError(ValueError):
-    """Something the user gave cannot be used; the message says what was given and what is allowed."""
+    """The user gave something that cannot be used. The message says what was given and what is allowed."""
 
 
 def nearest_error(kind: str, given: str, allowed: Iterable[str]) -> InputError:
-    """Return an error for a name that is not among the allowed ones; of very many it shows those that are near."""
+    """Return an error for an unknown name, with the nearest match and the allowed names.
+
+    Of more than 20 allowed names the message lists only similar ones.
+    """
     allowed = list(allowed)
     near = difflib.get_close_matches(given, allowed, n=6, cutoff=0.5)
     hint = f"did you mean {near[0]!r}? " if near else ""
@@ -24,12 +27,12 @@ def nearest_error(kind: str, given: str, allowed: Iterable[str]) -> InputError:
 
 
 def frozen(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings whose lists are tuples, as what is static under ``jit`` must be hashable."""
+    """Return settings with tuples in place of lists, because static arguments of ``jit`` must be hashable."""
     return {name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()}
 
 
 def load(place: Any) -> Any:
-    """Import what "module:name" names; anything but a string is returned as it is."""
+    """Import and return the object called "module:name". Return anything but a string as it is."""
     if not isinstance(place, str):
         return place
     module, name = place.split(":")
@@ -37,10 +40,10 @@ def load(place: Any) -> Any:
 
 
 def lazily(module: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
-    """Return the ``__getattr__`` of a module, which imports a name from its home when it is first used.
+    """Return a ``__getattr__`` for a module that imports each name when it is first used.
 
     Args:
-        homes: name -> the module that has it, or "module:other" where it is called otherwise.
+        homes: name -> the module that defines it, or "module:other" if it has another name there.
     """
 
     def find(name: str) -> Any:

@@ -1,4 +1,4 @@
-"""Names for what a user adds: families of environments, agents, and the parts that agents are made of."""
+"""Registration of a user's own families, agents and parts of agents under names."""
 
 import dataclasses
 from typing import Any
@@ -10,17 +10,18 @@ from mtjax.names import InputError
 
 
 def register(name: str, thing: "type | str", **defaults: Any) -> None:
-    """Give a class of your own a name, under which Python, notebooks and the command line know it.
+    """Register your own class under a name that Python, notebooks and the command line accept.
 
     Args:
         name: what ``--env``, ``--agent`` or ``--agent.KIND`` takes.
-        thing: a frozen dataclass. Its base says what it is: ``Domain`` or ``Family`` an environment; ``BaseAgent``,
-            ``SAC`` or ``PPO`` an agent; the plainest part of a kind a part of that kind, whose fields become flags
-            of the agents that choose it. Or the name of an agent, which is given other defaults under a new name.
+        thing: a frozen dataclass, or the name of an agent that gets other defaults under the new name. The base of
+            the class says what it is. An environment derives from ``Domain`` or ``Family``; an agent from
+            ``BaseAgent``, ``SAC`` or ``PPO``; a part from the base of its kind. The fields of a part become flags of
+            every agent that chooses it.
         defaults: values of the fields of a family or an agent, such as ``vary={"mass": "0.5:2:10"}``.
 
     Raises:
-        InputError: the name is taken, the class is of no such kind, or a default is not allowed.
+        InputError: the name is taken, the class has none of these bases, or a default is not allowed.
     """
     if isinstance(thing, str):
         known = agents.preset_of(thing)
@@ -62,18 +63,18 @@ def _register_part(name: str, part: type) -> None:
 
 
 def plainest(kind: str) -> type:
-    """The base of all parts of a kind."""
+    """Return the class from which all parts of a kind derive."""
     return next(iter(PARTS[kind].values()))
 
 
 def _names_beside(kind: str) -> set[str]:
-    """The settings of all agents and of parts of other kinds, beside which those of a part lie."""
+    """Return the settings of all agents and of parts of other kinds, which a part's own must not repeat."""
     of_agents = {name for preset in agents.AGENTS.values() for name in preset.cls.__dataclass_fields__}
     others = [part for other in PARTS if other != kind for part in PARTS[other].values()]
     return of_agents | {field.name for part in others for field in dataclasses.fields(part)}
 
 
 def _sentence(thing: type) -> str:
-    """The first sentence of a class's documentation."""
+    """Return the first sentence of a class's documentation."""
     text = " ".join((thing.__doc__ or thing.__name__).split("\n\n")[0].split())
     return text.split(". ")[0].removesuffix(".")

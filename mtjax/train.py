@@ -1,4 +1,4 @@
-"""``python -m mtjax.train``: train an agent on a family of tasks, and keep all there is to know of it in a folder."""
+"""``python -m mtjax.train``: train an agent on a family of tasks, and write the results to a folder."""
 
 import sys
 import types
@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 
 
 def main(argv: Sequence[str]) -> None:
-    """Answer what names alone can answer; then import what trains, and run what the command line asks for."""
-    own = any(word.startswith("--import=") for word in argv)  # whose settings are read with the rest
+    """Check names and flags first, then import the training code and run the command line."""
+    own = any(word.startswith("--import=") for word in argv)  # the full parser checks their flags
     argv = commands.import_files(argv)
     commands.check_names(argv)
     if not own:
@@ -29,14 +29,14 @@ def main(argv: Sequence[str]) -> None:
 
 
 class _CallableModule(types.ModuleType):
-    """Lets ``mtjax.train(...)`` stay a function after ``import mtjax.train`` has put this module in its place."""
+    """A module that can be called: ``mtjax.train(...)`` works even after ``import mtjax.train``."""
 
     def __call__(self, *args, **kwargs) -> "Result":
         return load("mtjax.training.run:train")(*args, **kwargs)
 
 
 def run() -> None:
-    """Entry point of the command line."""
+    """Run the command line."""
     commands.main(main)
 
 

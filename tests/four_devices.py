@@ -15,7 +15,7 @@ from mtjax.loop import Settings
 from mtjax.parallel import collectives as shares
 from mtjax.parallel import mesh as meshes
 from mtjax.training import run
-from mtjax.training.programs import jitted
+from mtjax.training.programs import jit_programs
 
 SETTINGS = {"num_envs": 2, "batch_size": 4, "replay_size": 40, "warmup_steps": 4, "chunk_steps": 10, "stagger": False}
 WIDE = SETTINGS | {"num_envs": 4, "replay_size": 100}  # half full in two chunks
@@ -92,8 +92,8 @@ def test_donated_state_is_gone(tmp_path):
     """A chunk's replay takes the place of the one before it, on every device."""
     mesh = meshes.mesh_for(4, 2, 2)
     agent, settings = configure(AGENT, Settings(), SETTINGS)
-    programs, env = jitted(mesh, agent), Walk()
-    tasks, seeds = meshes.everywhere(mesh, env.tasks()), meshes.by_seed(mesh, jnp.arange(4))
+    programs, env = jit_programs(mesh, agent), Walk()
+    tasks, seeds = meshes.replicate(mesh, env.tasks()), meshes.shard_by_seed(mesh, jnp.arange(4))
     state = programs.init(env, agent, settings, tasks, seeds, None)
     after, metrics = programs.chunk(env, agent, settings, tasks, state)
     assert state.data.ring.rows.obs.is_deleted() and int(after.iteration) == 10
@@ -197,8 +197,8 @@ def test_devices_of_a_seed_agree_by_themselves(crowd, monkeypatch):
     monkeypatch.setattr(shares, "agreed", lambda tree: tree)
     given = WIDE | {"chunk_steps": 12}  # so that no program of before is taken
     agent, settings = configure(AGENT, Settings(), given)
-    programs, env = jitted(mesh := meshes.mesh_for(1, 2, 4), agent), Walk()
-    tasks, seeds = meshes.everywhere(mesh, env.tasks()), meshes.by_seed(mesh, jnp.arange(1))
+    programs, env = jit_programs(mesh := meshes.mesh_for(1, 2, 4), agent), Walk()
+    tasks, seeds = meshes.replicate(mesh, env.tasks()), meshes.shard_by_seed(mesh, jnp.arange(1))
     start = programs.init(env, agent, settings, tasks, seeds, None)
     first = jax.tree.map(np.asarray, start.agent.critic)
     after, _ = programs.chunk(env, agent, settings, tasks, start)

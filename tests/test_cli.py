@@ -28,7 +28,7 @@ from mtjax.config import from_json, load_preset, to_json, with_preset
 from mtjax.envs import ENVS
 from mtjax.loop import Settings
 from mtjax.training import launch
-from mtjax.training.folder import repeat
+from mtjax.training.folder import to_flags
 from mtjax.training.run import Plan
 from mtjax.types import InputError
 
@@ -143,7 +143,7 @@ REPEATED = [
 def test_repeating_flags_give_the_same_program(agent, settings):
     """The command in config.json, word for word, and whatever the presets are by then."""
     program = cli.parse([f"--agent={agent}", *settings.split()])
-    words = shlex.split(shlex.join(["python", "-m", "mtjax.train", *repeat(program)]))[3:]
+    words = shlex.split(shlex.join(["python", "-m", "mtjax.train", *to_flags(program)]))[3:]
     again = cli.parse([*words, "--preset=cpu"])
     assert dataclasses.replace(again, preset=program.preset) == program
 
@@ -152,7 +152,7 @@ def test_repeating_flags_name_the_file_of_vectors(tmp_path):
     """Also where its name has spaces."""
     file = tmp_path / "my vectors.npy"
     program = cli.parse(["--agent=care", "--agent.conditioning=vectors", f"--agent.vectors={file}"])
-    words = shlex.split(shlex.join(repeat(program)))
+    words = shlex.split(shlex.join(to_flags(program)))
     assert cli.parse(words) == program and program.learner.vectors == str(file)
 
 

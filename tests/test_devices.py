@@ -19,7 +19,7 @@ import mtjax.train
 from mtjax.evaluation import load_evaluations
 from mtjax.parallel import hosts as processes
 from mtjax.parallel import mesh as meshes
-from mtjax.training.programs import jitted, sharded
+from mtjax.training.programs import jit_programs, sharded_shapes
 from mtjax.types import InputError
 
 HERE = Path(__file__).parent
@@ -105,9 +105,11 @@ def test_one_device_needs_no_mesh(hosts, counts, seeds):
     """Then the programs are the loop's own, and arrays stay where they are."""
     hosts(*counts)
     assert meshes.mesh_for(seeds, 10, 16) is None
-    assert jitted(None, mtjax.agent("sac")) == (mtjax.loop.init, mtjax.loop.run_chunk, mtjax.evaluation.evaluate)
+    assert jit_programs(None, mtjax.agent("sac")) == (mtjax.loop.init, mtjax.loop.run_chunk, mtjax.evaluation.evaluate)
     state = object()
-    assert meshes.everywhere(None, state) is meshes.by_seed(None, state) is sharded(None, None, state) is state
+    assert (
+        meshes.replicate(None, state) is meshes.shard_by_seed(None, state) is sharded_shapes(None, None, state) is state
+    )
     assert bool(meshes.describe(None, seeds, 16)) == (sum(counts) > 1)
 
 

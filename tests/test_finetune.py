@@ -19,7 +19,7 @@ from mtjax.envs.family import Family
 from mtjax.envs.parameters import Parameter
 from mtjax.training import finetune, run
 from mtjax.training.finetune import adopt
-from mtjax.training.folder import repeat
+from mtjax.training.folder import to_flags
 from mtjax.types import InputError, Step
 
 
@@ -156,7 +156,7 @@ def test_a_run_records_where_it_comes_from(base, tuned):
 def test_recorded_command_repeats_the_program(tuned):
     """The run of --from included."""
     program = from_json(tuned("heads") / "config.json")
-    again = cli.parse([*repeat(program), f"--runs={program.runs}", f"--preset={program.preset}"])
+    again = cli.parse([*to_flags(program), f"--runs={program.runs}", f"--preset={program.preset}"])
     assert again == program
 
 

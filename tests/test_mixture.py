@@ -24,7 +24,7 @@ from mtjax.experience.replay import Replay
 from mtjax.loop import Settings
 from mtjax.networks import Params
 from mtjax.report.tables import split_table, task_table
-from mtjax.training.folder import repeat, short_name
+from mtjax.training.folder import short_name, to_flags
 from mtjax.types import SPLITS, InputError, Spec, Step, Task, Transition
 
 QUICK = {"xla_backend_optimization_level": 0}
@@ -306,7 +306,7 @@ def test_episodes_end_at_their_own_horizons():
 def test_discounts_follow_horizons():
     env = mixture(["control-cartpole", "tabular-mdp"])
     found = tiny(discounting="horizon").discounts(env.tasks())
-    np.testing.assert_allclose(found, np.repeat([0.99, 0.95], 10), rtol=1e-6)
+    np.testing.assert_allclose(found, np.to_flags([0.99, 0.95], 10), rtol=1e-6)
 
 
 # Padding changes nothing.
@@ -517,7 +517,7 @@ def test_a_run_is_scored_family_by_family(run, capsys):
 def test_a_run_and_its_policy_are_read_back(run):
     config = from_json(run / "config.json")
     assert isinstance(config.family, Mixture) and config.family == make("aim+wide-aim")
-    assert cli.parse(repeat(config)) == dataclasses.replace(config, runs="runs")
+    assert cli.parse(to_flags(config)) == dataclasses.replace(config, runs="runs")
     policy = mtjax.load(run)
     task = pick(policy.env.tasks(), 0)
     action = policy(policy.env.reset(task, jax.random.key(0)).obs, task)
@@ -550,7 +550,7 @@ def test_flags_of_families_hold_for_all_of_them(tmp_path):
     assert config.training == Settings(num_envs=16)  # the default preset's
     (tmp_path / "config.json").write_text(to_json(config, {}))
     assert from_json(tmp_path / "config.json") == config
-    assert cli.parse(repeat(config)) == config
+    assert cli.parse(to_flags(config)) == config
 
 
 @pytest.mark.parametrize(

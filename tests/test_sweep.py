@@ -22,9 +22,9 @@ from mtjax.config import configure, from_json, to_json
 from mtjax.evaluation import load_evaluations
 from mtjax.loop import Settings
 from mtjax.training import memory, points, sweep
-from mtjax.training.folder import repeat
+from mtjax.training.folder import to_flags
 from mtjax.training.log import Console
-from mtjax.training.points import Varied
+from mtjax.training.points import SweptAgent
 from mtjax.training.run import Plan, _Run, train
 from mtjax.types import InputError, Outcome, Spec
 
@@ -44,10 +44,10 @@ def test_points_are_every_combination_in_order():
 
 def test_seeds_lie_side_by_side_in_each_point():
     """Number k is seed k % seeds of point k // seeds."""
-    seeds, knobs = points.spread(points.grid({"tau": [0.1, 0.2]}), jnp.arange(3) + 7)
+    seeds, knobs = points.seed_axis(points.grid({"tau": [0.1, 0.2]}), jnp.arange(3) + 7)
     np.testing.assert_array_equal(seeds, [7, 8, 9, 7, 8, 9])
     np.testing.assert_array_equal(knobs["tau"], np.float32([0.1, 0.1, 0.1, 0.2, 0.2, 0.2]))
-    seeds, knobs = points.spread((), jnp.arange(2))
+    seeds, knobs = points.seed_axis((), jnp.arange(2))
     assert len(seeds) == 2 and knobs is None
 
 
@@ -73,7 +73,7 @@ def test_values_are_refused_by_name_before_anything_compiles(given, said):
 def test_a_point_is_the_agent_with_its_values():
     """Those of parts too; whatever is not named stays."""
     agent = tiny("cagrad", tau=0.1)
-    found = points.at(agent, {"cagrad_radius": 0.25, "gamma": 0.5})
+    found = points.agent_at(agent, {"cagrad_radius": 0.25, "gamma": 0.5})
     assert found == tiny("cagrad", tau=0.1, cagrad_radius=0.25, gamma=0.5)
     assert agent == tiny("cagrad", tau=0.1)
 
@@ -93,11 +93,11 @@ def test_every_number_can_vary(name, settings):
     """All at once, in every method: none decides what is compiled, and none is left out of what is."""
     agent = tiny(name, **settings)
     tasks, spec = tasks_of("one-step"), Spec.vector(obs_size=1, action_size=1, context_size=1)
-    values = points.numbers(agent)
+    values = points.sweepable(agent)
     assert set(values) <= set(settings_of(agent)) and {"actor_lr", "gamma"} <= set(values)
 
     def everything(knobs):
-        varied, key = Varied(agent), jax.random.key(0)
+        varied, key = SweptAgent(agent), jax.random.key(0)
         state = varied.init(spec, tasks, key, knobs)
         state, _ = varied.update(state, random_batch(0, 2, 4), tasks, key)
         one = jnp.ones((2, 3))
@@ -113,7 +113,7 @@ def test_every_number_can_vary(name, settings):
 
 def _run(env, agent, seeds, knobs=None, chunks=2):
     plain, settings = configure(getattr(agent, "agent", agent), Settings(), SMALL)
-    tasks, agent = env.tasks(), Varied(plain) if isinstance(agent, Varied) else plain
+    tasks, agent = env.tasks(), SweptAgent(plain) if isinstance(agent, SweptAgent) else plain
     init = loop.init.lower(env, agent, settings, tasks, seeds, knobs).compile(QUICK)
     state = init(tasks, seeds, knobs)
     run_chunk = loop.run_chunk.lower(env, agent, settings, tasks, state).compile(QUICK)
@@ -132,11 +132,11 @@ POINTS = (
 
 def test_a_point_trains_as_the_run_with_its_values():
     """Both seeds of two points, one with clipping and decay and one without, against plain runs of the same seeds."""
-    assert set(_NAMES) == set(points.numbers(tiny("sac", scaling="return")))
+    assert set(_NAMES) == set(points.sweepable(tiny("sac", scaling="return")))
     env, agent, seeds = Walk(), tiny("sac", scaling="return"), jnp.arange(2, dtype=jnp.uint32)
-    state, metrics = _run(env, Varied(agent), *points.spread(POINTS, seeds))
+    state, metrics = _run(env, SweptAgent(agent), *points.seed_axis(POINTS, seeds))
     learned = jax.device_get(state.agent.learner)
-    plain = [_run(env, points.at(agent, point), seeds) for point in POINTS]
+    plain = [_run(env, points.agent_at(agent, point), seeds) for point in POINTS]
     for p, (alone, its_metrics) in enumerate(plain):
         rows = slice(2 * p, 2 * p + 2)
         for part in ("actor", "critic", "target", "log_temperature", "scales"):
@@ -181,7 +181,7 @@ def test_one_point_that_diverges_does_not_end_the_others():
 )
 def test_sweeps_are_read_out_of_a_command_line(words, found, rest):
     """Until the next flag."""
-    axes, others = sweep.read(words)
+    axes, others = sweep.read_axes(words)
     assert [tuple(axis) for axis in axes] == found and others == rest
 
 
@@ -234,7 +234,7 @@ def test_numbers_vary_inside_a_program_and_the_rest_between_programs():
 def test_the_command_of_a_run_repeats_its_part_of_the_sweep(tmp_path):
     """And its record is read back as it was."""
     (program,) = sweep.configurations(["--sweep", "agent.tau=0.1,1", "agent.num-critics=3"], cli.parse)
-    (again,) = sweep.configurations(repeat(program), cli.parse)
+    (again,) = sweep.configurations(to_flags(program), cli.parse)
     assert again == program
     (tmp_path / "config.json").write_text(to_json(program, {}))
     assert from_json(tmp_path / "config.json") == program
@@ -245,18 +245,18 @@ def test_points_that_do_not_fit_into_memory_are_run_in_rounds(monkeypatch):
     (program,) = sweep.configurations(
         ["--sweep", "agent.tau=0.1,0.2,0.3,0.4,0.5", "--seeds=2", "--replay-size=1000"], cli.parse
     )
-    one, two = (memory.needed(with_seeds(program, n)) for n in (1, 2))
+    one, two = (memory.required_bytes(with_seeds(program, n)) for n in (1, 2))
     assert 1.9 < two / one < 2.1
-    count = lambda limit: [len(part.points) for part in memory.split(program, limit)]
+    count = lambda limit: [len(part.points) for part in memory.split_to_fit(program, limit)]
     assert count(1e15) == [5] and count(2.5 * two / 0.9) == [2, 2, 1] and count(1.1 * two / 0.9) == [1] * 5
-    assert sum((part.points for part in memory.split(program, 2.5 * two)), ()) == program.points
+    assert sum((part.points for part in memory.split_to_fit(program, 2.5 * two)), ()) == program.points
     monkeypatch.setenv("MTJAX_MEMORY", "0.5")
-    assert memory.memory() == 0.5e9
+    assert memory.available_bytes() == 0.5e9
     monkeypatch.setenv("MTJAX_MEMORY", "much")
     with pytest.raises(InputError, match="a number of GB, not 'much'"):
-        memory.memory()
+        memory.available_bytes()
     monkeypatch.delenv("MTJAX_MEMORY")
-    assert memory.memory() > 1e8
+    assert memory.available_bytes() > 1e8
 
 
 def test_seeds_that_do_not_fit_into_memory_are_run_in_rounds(monkeypatch):
@@ -264,9 +264,9 @@ def test_seeds_that_do_not_fit_into_memory_are_run_in_rounds(monkeypatch):
     (program,) = sweep.configurations(
         ["--sweep", "agent.tau=0.1,0.2", "--seeds=5", "--seed=3", "--replay-size=1000"], cli.parse
     )
-    one = memory.needed(program) / 5
+    one = memory.required_bytes(program) / 5
     parts = lambda program, limit: [
-        (part.points, part.plan.seed, part.plan.seeds) for part in memory.split(program, limit)
+        (part.points, part.plan.seed, part.plan.seeds) for part in memory.split_to_fit(program, limit)
     ]
     first, second = (({"tau": tau},) for tau in (0.1, 0.2))
     assert parts(program, 2.5 * one / 0.9) == [
@@ -277,9 +277,9 @@ def test_seeds_that_do_not_fit_into_memory_are_run_in_rounds(monkeypatch):
     assert parts(alone, 1.0) == [((), seed, 1) for seed in range(3, 8)]
     for limit, too_many in ((5.5 * one / 0.9, False), (4.5 * one / 0.9, True)):
         monkeypatch.setenv("MTJAX_MEMORY", f"{limit / 1e9:.12f}")
-        assert memory.too_many_seeds(alone) == too_many
+        assert memory.seeds_exceed_memory(alone) == too_many
     monkeypatch.setenv("MTJAX_MEMORY", "1e-9")
-    assert not memory.too_many_seeds(with_seeds(alone, 1))
+    assert not memory.seeds_exceed_memory(with_seeds(alone, 1))
 
 
 def with_seeds(program, count):
@@ -292,11 +292,11 @@ def test_a_run_of_too_many_seeds_is_run_in_rounds(tmp_path, monkeypatch, capsys)
     small = "--num-envs=2 --batch-size=2 --replay-size=20 --warmup-steps=1 --eval-episodes=1 --agent.hidden 4".split()
     words = ["--env=bandit", "--agent=sac-conditioned", "--seeds=3", "--steps=40", f"--runs={tmp_path}", *small]
     program = cli.parse(words)
-    monkeypatch.setenv("MTJAX_MEMORY", f"{2.5 * memory.needed(program) / 3 / 0.9 / 1e9:.12f}")
+    monkeypatch.setenv("MTJAX_MEMORY", f"{2.5 * memory.required_bytes(program) / 3 / 0.9 / 1e9:.12f}")
     mtjax.train.main(words)
     (folder,) = tmp_path.iterdir()
     assert "2 rounds" in capsys.readouterr().out and "-rounds-" in folder.name
-    runs = sweep._runs(folder)
+    runs = sweep._run_folders(folder)
     assert [from_json(run / "config.json").plan.seeds for run in runs] == [2, 1]
     (row,) = sweep.rows(runs)
     returns = [load_evaluations(run / "evaluations.npz").returns["train"][:, -1] for run in runs]
@@ -327,7 +327,7 @@ def swept(short_family, tmp_path_factory):
         return real(program, directory, *rest)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("MTJAX_MEMORY", f"{2.5 * memory.needed(program) / 0.9 / 1e9:.12f}")
+        patch.setenv("MTJAX_MEMORY", f"{2.5 * memory.required_bytes(program) / 0.9 / 1e9:.12f}")
         patch.setattr(sweep, "launch", stop)
         with pytest.raises(KeyboardInterrupt):
             mtjax.train.main(words)
@@ -355,7 +355,7 @@ def test_a_sweep_leaves_a_table_of_all_settings(swept):
     assert (swept / "run-1" / "curve.png").exists()
     header = (swept / "run-1" / "metrics.csv").read_text().splitlines()[0]
     assert header.startswith("seed,actor_lr,iteration,")
-    text = sweep.table(sweep.rows(sweep._runs(swept)))
+    text = sweep.table(sweep.rows(sweep._run_folders(swept)))
     assert "2 of 2 seeds diverged" in text and "highest on training tasks" in text and len(text.splitlines()) == 5
 
 
@@ -391,8 +391,8 @@ def test_fine_tuning_begins_every_point_with_the_same_seeds(swept):
     start = mtjax.load(swept / "run-1", seed=0)
     found, tasks = ({"tau": 0.1}, {"tau": 0.2}), start.env.tasks("train")
     plain, settings = configure(start.agent, Settings(), SMALL)
-    run = _Run(start.env, Varied(plain), settings, Plan(seeds=3), None, Console(1, quiet=True), found)
-    seeds, knobs = run.spread
+    run = _Run(start.env, SweptAgent(plain), settings, Plan(seeds=3), None, Console(1, quiet=True), found)
+    seeds, knobs = run.seed_axis
     shapes = jax.eval_shape(lambda: loop.init(start.env, run.agent, settings, tasks, seeds, knobs)).agent
     fresh = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)._replace(knobs=knobs)
     state = run.adopt(start, tasks, fresh)

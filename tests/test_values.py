@@ -12,7 +12,7 @@ import mtjax
 from mtjax.agents import agent
 from mtjax.agents.parts.values import C51, VALUES, HLGauss, Scalar
 from mtjax.cli import parse
-from mtjax.config import require_range
+from mtjax.config import require_value_range
 from mtjax.training import launch
 from mtjax.types import InputError
 
@@ -170,9 +170,9 @@ def test_returns_must_be_scaled_to_a_range_that_nobody_chose():
 def test_a_range_that_is_given_or_scaled_to_is_taken():
     """Given on a command line too, where a part has its settings after its name."""
     for settings in ({"value": "c51", "value_high": 200.0}, {"value": "hl-gauss", "scaling": "return"}, {}):
-        require_range(agent("sac", **settings))
+        require_value_range(agent("sac", **settings))
     words = ["--env=pendulum-swingup", "--agent=sac", "--agent.value=c51", "--agent.value-high=200"]
-    require_range(parse(words).learner)
+    require_value_range(parse(words).learner)
 
 
 SETTINGS = {

@@ -1,4 +1,4 @@
-"""Environment families by name. To add one: a file for its domain, and a line here; or ``register`` your own."""
+"""Environment families by name. To add one, write a file for its domain and a line here, or ``register`` it."""
 
 import ast
 import re
@@ -35,7 +35,7 @@ Entry = tuple[Any, dict[str, Any]]  # a family's class, or the place that it is 
 
 
 class Families(UserDict[str, Entry]):
-    """Families by name, of which a class is imported when it is asked for; ``data`` holds where it is."""
+    """Families by name. A class is imported when it is first used; ``data`` holds its place."""
 
     def __getitem__(self, name: str) -> Entry:
         family, settings = self.data[name]
@@ -44,7 +44,7 @@ class Families(UserDict[str, Entry]):
 
 # Where each class is in its folder, "module:Class", and its settings. Families whose tasks are drawn say how many.
 
-# dm_control's tasks (Tassa et al. 2018), with whatever parameters are asked for.
+# dm_control's tasks (Tassa et al. 2018). Their parameters vary on request.
 _DOMAINS: dict[str, Entry] = {
     "acrobot-swingup": ("acrobot:AcrobotSwingup", {}),
     "acrobot-swingup-sparse": ("acrobot:AcrobotSwingup", {"sparse": True}),
@@ -154,15 +154,15 @@ ENVS = Families(
 
 
 def make(name: str, vary: Mapping[str, Any] | tuple = (), **settings: Any) -> Any:
-    """Return the family called ``name``, or the mixture of "NAME+NAME", with any of its fields replaced.
+    """Return the family called ``name``, or the mixture "NAME+NAME", with any of its fields replaced.
 
     Args:
-        vary: values of parameters, {"mass": "0.5:1.5:10"}, beside those that the family varies by itself; a parameter
-            given a single value no longer varies. In a mixture {"NAME.mass": ...} says of which family.
-        settings: fields of the family; in a mixture, of every family that has such a field.
+        vary: values of parameters, {"mass": "0.5:1.5:10"}, beside those that the family varies by itself. A single
+            value fixes a parameter. In a mixture, {"NAME.mass": ...} names the family.
+        settings: fields of the family. In a mixture they apply to every family that has such a field.
 
     Raises:
-        InputError: no family has that name, no field has one of the given names, or a value is out of range.
+        InputError: there is no such family or field, or a value is out of range.
     """
     if "+" in name:
         return _make_mixture(tuple(name.split("+")), dict(vary), dict(settings))
@@ -178,13 +178,13 @@ def make(name: str, vary: Mapping[str, Any] | tuple = (), **settings: Any) -> An
 
 
 def mixture(families: "Sequence[str | Family | Mixture]") -> "Mixture":
-    """Return a mixture of families, each by its name or as ``make`` returned it.
+    """Return a mixture of families, each given by name or as returned by ``make``.
 
-    Families may share a model, or a name, as long as their tasks are not the same: a walker whose friction varies and
-    one whose feet do make a mixture of two families.
+    Families may share a model or a name if their tasks differ, such as a walker with varied friction and a walker with
+    varied feet.
 
     Raises:
-        InputError: no family has a name, or one is in the mixture twice.
+        InputError: there is no family of a name, or a family is in the mixture twice.
     """
     cls = load("mtjax.envs.mixtures:Mixture")
     named: list[tuple[str, Any]] = []
@@ -202,7 +202,7 @@ def mixture(families: "Sequence[str | Family | Mixture]") -> "Mixture":
 
 
 def _name_of(family: Any) -> str:
-    """The name under which ``make`` knows a family, whatever else it varies; or that of its class."""
+    """Return the name of a family in ``make``, or else the name of its class."""
     cls = type(family)
     place = f"{cls.__module__}:{cls.__name__}"
     known = [name for name, (home, _) in ENVS.data.items() if home is cls or home == place]
@@ -213,7 +213,7 @@ def _name_of(family: Any) -> str:
 
 
 def _make_mixture(names: tuple[str, ...], vary: dict[str, Any], settings: dict[str, Any]) -> "Mixture":
-    """Make the families of a mixture by their names, with values of their parameters by "NAME.PARAMETER"."""
+    """Make a mixture from names of families, and values of parameters by "NAME.PARAMETER"."""
     cls = load("mtjax.envs.mixtures:Mixture")
     recorded = settings.pop("families", None)
     if recorded is not None:  # of config.json
@@ -240,7 +240,7 @@ def _make_mixture(names: tuple[str, ...], vary: dict[str, Any], settings: dict[s
 
 
 def register(name: str, family: "type[Family]", **settings: Any) -> None:
-    """Give a family of your own a name, under which ``make``, the command line and notebooks know it.
+    """Register your own family under a name that ``make``, the command line and notebooks accept.
 
     Args:
         family: a frozen dataclass, a subclass of ``Domain`` (an MJCF file, parameters, observation and reward) or of
@@ -261,7 +261,7 @@ def register(name: str, family: "type[Family]", **settings: Any) -> None:
 
 
 def outline(name: str) -> tuple[int, str]:
-    """Return a family's number of training tasks and what it is in a sentence, without importing it if it is ours."""
+    """Return a family's number of training tasks and its first sentence, without importing families of mtjax."""
     place, settings = ENVS.data[name]
     if isinstance(place, str):
         module, _, cls = place.partition(":")
@@ -274,7 +274,7 @@ def outline(name: str) -> tuple[int, str]:
 
 @lru_cache
 def _documented(module: str) -> dict[str, str]:
-    """Read the documentation of a module's classes from its file, which is not run."""
+    """Return the docstrings of a module's classes, read from its file without importing it."""
     spec = find_spec(module)
     assert spec is not None and spec.loader is not None
     tree = ast.parse(spec.loader.get_source(module))  # type: ignore

@@ -1,4 +1,4 @@
-"""Brax's own environments and physics as families of tasks. Brax is imported only when one of them is made.
+"""Families of tasks with Brax's own environments and physics. Brax is imported only when one of them is made.
 
 The physical parameters reach Brax as leaves of its ``System``, which is replaced inside ``reset`` and ``step``.
 """
@@ -43,7 +43,7 @@ _REFUSED = {
     "swimmer": "its fluid forces call jax.numpy.clip with an argument, a_min, that no jax of version 0.10 or later has",
 }
 _SPEED_CONTROL_COST = 0.05
-# What one step of MJX reads of the last one; everything else it computes anew.
+# What a step of MJX reads from the last state. It computes everything else anew.
 _MJX_KEPT = ("x", "qpos", "qvel", "qacc_warmstart")
 
 
@@ -120,11 +120,11 @@ class Brax(Family):
             return self._pack(self._edited(task).pipeline_init(jnp.float32(qpos), jnp.float32(qvel)))
 
     def reward(self, task: Task, metrics: Mapping[str, Array], reward: Array, action: Array) -> Array:
-        """Return the reward () of a step, of which Brax reports ``metrics`` and its own ``reward``."""
+        """Return the reward () of a step from Brax's ``metrics`` and its own ``reward``."""
         return reward
 
     def build(self) -> dict[str, dict[str, np.ndarray]]:
-        """Add to each task what MuJoCo derives from its masses."""
+        """Return the leaves of the table, with the values that MuJoCo derives from each task's masses."""
         leaves = super().build()
         if "mass" in self.values:
             weights = [inverse_weights(self.original.sys.mj_model, mass) for mass in self.values["mass"]]
@@ -133,22 +133,22 @@ class Brax(Family):
 
     @property
     def engine_name(self) -> str:
-        """Brax's physics, as its backend is called."""
+        """Return the name of Brax's backend."""
         return self.backend
 
     @cached_property
     def action_size(self) -> int:  # type: ignore
-        """Numbers in an action."""
+        """Return the number of actions A."""
         return self.original.action_size
 
     @cached_property
     def original(self) -> Any:
-        """Brax's own environment, whose system no task has edited."""
+        """Return Brax's own environment with its unedited system."""
         with _without_remarks(), jax.ensure_compile_time_eval():
             return brax_module().envs.get_environment(self.environment, backend=self.backend)
 
     def _edited(self, task: Task) -> Any:
-        """Brax's environment with the system of this task, which may hold tracers: never keep it."""
+        """Return Brax's environment with the system of a task. It may hold tracers, so never keep it."""
         environment = copy.copy(self.original)
         for name in task.params:
             if name in _EDITS:
@@ -156,12 +156,12 @@ class Brax(Family):
         return environment
 
     def _pack(self, physics: Any) -> Any:
-        """What the next step needs of Brax's physical state."""
+        """Return the part of Brax's physical state that the next step needs."""
         kept = {name: getattr(physics, name) for name in _MJX_KEPT} if self._is_mjx else physics
         return jax.tree.map(strong, kept)
 
     def _unpack(self, state: Any) -> Any:
-        """Brax's state of the environment, where nothing has been reported yet."""
+        """Return Brax's environment state with empty reports."""
         physics = self._blank.replace(**state) if self._is_mjx else state
         zero = jnp.float32(0)
         return brax_module().envs.State(physics, obs=None, reward=zero, done=zero, metrics={}, info={})
@@ -172,7 +172,7 @@ class Brax(Family):
 
     @cached_property
     def _blank(self) -> Any:
-        """MJX's data of a state in which everything that a step computes anew is 0."""
+        """Return MJX's data with 0 in every field that a step computes anew."""
         shapes = jax.eval_shape(self.original.reset, jax.eval_shape(jax.random.key, 0)).pipeline_state
         with jax.ensure_compile_time_eval():
             return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
@@ -235,7 +235,7 @@ def brax_module() -> Any:
     """Import Brax.
 
     Raises:
-        InputError: it is installed but cannot be imported.
+        InputError: Brax is installed but cannot be imported.
     """
     mjx_module()  # so that its remark on standard output is not printed
     try:
@@ -247,7 +247,7 @@ def brax_module() -> Any:
 
 @contextlib.contextmanager
 def _without_remarks() -> Iterator[None]:
-    """Keep quiet about what loading a model of Brax always says, and only about that."""
+    """Suppress the known remarks of loading a Brax model, and nothing else."""
 
     def note(text: str) -> None:  # without this, MuJoCo also writes a file into the working directory
         if "settotalmass" not in text:
@@ -264,7 +264,10 @@ def _without_remarks() -> Iterator[None]:
 
 
 def inverse_weights(model: mujoco.MjModel, mass: float) -> dict[str, np.ndarray]:
-    """What regularises MuJoCo's constraints, of ``model`` with all masses and inertias scaled by ``mass``."""
+    """Return the inverse weights of ``model``, with all masses and inertias scaled by ``mass``.
+
+    MuJoCo regularises constraints by them.
+    """
     scaled = copy.copy(model)
     scaled.body_mass *= mass
     scaled.body_inertia *= mass
@@ -273,7 +276,7 @@ def inverse_weights(model: mujoco.MjModel, mass: float) -> dict[str, np.ndarray]
 
 
 def strong(x: Any) -> Array:
-    """The same array with a dtype that is not weak, as a carry of a scan must have."""
+    """Return the array with a dtype that is not weak, because the carry of a scan needs one."""
     return jax.lax.convert_element_type(x, jnp.asarray(x).dtype)
 
 

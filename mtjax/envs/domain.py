@@ -1,7 +1,7 @@
-"""Families of one MuJoCo model: parameters become models, and models become the leaves that differ.
+"""Families of one MuJoCo model: parameters give models, and models give the leaves that differ.
 
-Tasks are built on the host by editing an ``MjSpec`` and compiling it, so that every derived field is MuJoCo's own;
-then only the leaves that differ between tasks are stacked.
+Tasks are built on the host. An ``MjSpec`` is edited and compiled, so that MuJoCo computes every derived field. Then
+only the leaves that differ between tasks are stacked.
 """
 
 import abc
@@ -35,16 +35,16 @@ INTEGRATORS = ("model", "euler")
 
 @dataclasses.dataclass(frozen=True)
 class Domain(Family):
-    """Tasks of one MuJoCo model. Subclasses give the model, the start of an episode, observation and reward."""
+    """A family of tasks of one MuJoCo model. Subclasses give model, start of an episode, observation and reward."""
 
     engine: Annotated[str, tyro.conf.arg(name="engine", prefix_name=False)] = "auto"
-    """Physics engine: auto, mjx (any device), warp (NVIDIA GPUs) or c (MuJoCo's C engine, threaded; CPU only). Auto is
-    c on a CPU, warp on an NVIDIA GPU where it is installed and faster, and mjx elsewhere."""
+    """Physics engine: auto, mjx (any device), warp (NVIDIA GPUs) or c (MuJoCo's C engine, threaded; CPU only). auto is
+    c on a CPU, warp on an NVIDIA GPU if it is installed and faster there, and mjx elsewhere."""
     solver_iterations: int = 0
-    """Constraint solver iterations of MJX and Warp, and twice as many line-search steps; 0 is the domain's own choice
-    for the engine."""
+    """Iterations of the constraint solver in MJX and Warp, with twice as many line-search steps. 0 takes the domain's
+    own choice for the engine."""
     integrator: str = "model"
-    """How MJX and Warp integrate: as the model says (cartpole and acrobot: rk4), or euler, faster and less exact."""
+    """Integrator of MJX and Warp: that of the model (rk4 for cartpole and acrobot), or the faster, less exact euler."""
 
     model_file: ClassVar[str]  # a file in mtjax/envs/models, a path, or the MJCF itself
     num_substeps: ClassVar[int]
@@ -65,14 +65,14 @@ class Domain(Family):
     # What a domain gives.
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
-        """Edit the model in the way that all tasks share, before the parameters do."""
+        """Edit the model for all tasks alike, before the parameters edit it."""
 
     def starts(self, models: Sequence[mujoco.MjModel], random: np.random.Generator) -> np.ndarray | None:
-        """States (R, P, nq + nv) in which episodes of each model begin, if ``start`` cannot draw them itself."""
+        """Return pools of start states (R, P, nq + nv) for the models, or None if ``start`` draws them itself."""
 
     @abc.abstractmethod
     def start(self, task: Task, key: Key) -> tuple[Array, ...]:
-        """Draw the positions (nq,) and velocities (nv,) in which an episode begins; and what else a world carries."""
+        """Draw start positions (nq,) and velocities (nv,) of an episode, and what else a world carries."""
 
     @abc.abstractmethod
     def observe(self, task: Task, world: World) -> Array:
@@ -80,10 +80,10 @@ class Domain(Family):
 
     @abc.abstractmethod
     def reward(self, task: Task, world: World, action: Array) -> Array:
-        """Return the reward () of having arrived in a world."""
+        """Return the reward () of a world after the step."""
 
     def recall(self, task: Task, obs: Array) -> World:
-        """Return a world that looks like ``obs``, right in all that the reward depends on; for ``relabel``."""
+        """Return a world with the observation ``obs``, exact in all that the reward reads. ``relabel`` needs it."""
         raise NotImplementedError(f"{type(self).__name__} does not say which world an observation shows")
 
     # What every domain does.
@@ -100,7 +100,7 @@ class Domain(Family):
         return Step(world, self.observe(task, world), self.reward(task, world, action), jnp.bool_(False))
 
     def relabel(self, task: Task, transition: Transition, key: Key) -> Transition:
-        """Return a transition of another task as ``task`` would have had it, if observations show no goal."""
+        """Return another task's transition with the reward of ``task``. Observations must not show the goal."""
         world = self.recall(task, transition.next_obs)
         return transition._replace(reward=self.reward(task, world, transition.action))
 
@@ -110,24 +110,24 @@ class Domain(Family):
         return self.simulator.forward(task, as_float(qpos), as_float(qvel), None if state is None else state.extra)
 
     def leaf(self, task: Task, name: str) -> Array:
-        """A field of the task's compiled model, by its name in MJX, such as "geom_size" (ngeom, 3)."""
+        """Return a field of the task's compiled model by its name in MJX, such as "geom_size" (ngeom, 3)."""
         if name in task.model:
             return task.model[name]
         return jnp.asarray(getattr(self.models[0], name), jnp.float32)
 
     def planar(self, task: Task, world: World) -> Planar:
-        """Where all bodies are and how fast they move, of a model that moves in the x-z plane."""
+        """Return places and velocities of all bodies of a model that moves in the x-z plane."""
         if not is_planar(self.models[0]):
             raise InputError(f"the model of {type(self).__name__} leaves the x-z plane; declare sensors instead")
         return locate(self.models[0], partial(self.leaf, task), world.qpos, world.qvel)
 
     def forward_velocity(self, task: Task, world: World) -> Array:
-        """Velocity along x of the centre of mass of everything, () [m/s]."""
+        """Return the velocity () [m/s] along x of the whole model's centre of mass."""
         mass = self.leaf(task, "body_mass")
         return jnp.dot(mass, self.planar(task, world).velocity[:, 0], precision="highest") / jnp.sum(mass)
 
     def start_apart(self, task: Task, key: Key, draw: Callable[[Key], Array]) -> Array:
-        """Draw positions (nq,) until nothing touches."""
+        """Draw positions (nq,) again and again until nothing touches."""
         return draw_until(lambda qpos: ~self.simulator.touching(task, qpos), draw, key)
 
     # Models.
@@ -141,7 +141,7 @@ class Domain(Family):
         return mujoco.MjSpec.from_file(str(path))
 
     def compile_spec(self, values: Mapping[str, float] | None = None) -> mujoco.MjSpec:
-        """Return the editable model of the task with these parameter values; other parameters keep the model's own."""
+        """Return the editable model with these parameter values. Other parameters keep the model's own."""
         spec = self._read_model()
         self.prepare(spec)
         given = values or {}
@@ -152,7 +152,7 @@ class Domain(Family):
 
     @cached_property
     def models(self) -> tuple[mujoco.MjModel, ...]:
-        """The compiled model of every row of the table; rows that differ in goals alone share one."""
+        """Return the compiled model of every row of the table. Rows that differ only in goals share one."""
         names = [name for name in self.values if self.parameters[name].edit is not None]
         rows = list(zip(*(self.values[name].tolist() for name in names), strict=True))
         compiled = {row: self.compile_spec(dict(zip(names, row, strict=True))).compile() for row in dict.fromkeys(rows)}
@@ -168,23 +168,23 @@ class Domain(Family):
 
     @property
     def action_size(self) -> int:  # type: ignore
-        """Motors of the model."""
+        """Return the number of motors."""
         return self.models[0].nu
 
     @property
     def seconds_per_step(self) -> float:
-        """How long a control step lasts [s]."""
+        """Return the length of a control step [s]."""
         return self.models[0].opt.timestep * self.num_substeps
 
     @property
     def engine_name(self) -> str:
-        """The engine that runs this family on this device."""
+        """Return the name of the engine that runs this family on this device."""
         sized = "site_size" in self.table.tasks.model  # which Warp cannot vary
         return choose_engine(self.engine, "mjx" if sized else self.gpu_engine)
 
     @cached_property
     def simulator(self) -> Engine:
-        """The engine that runs this family; MuJoCo C keeps the model's own solver settings."""
+        """Return the engine that runs this family. MuJoCo C keeps the model's own solver settings."""
         if self.engine_name == "c":
             return MujocoC(self.models, self.num_substeps)
         if self.engine_name == "warp":
@@ -193,11 +193,11 @@ class Domain(Family):
 
     @cached_property
     def mjx(self) -> Mjx:
-        """The MJX engine of this family."""
+        """Return the MJX engine of this family."""
         return Mjx(self._base(self.default_iterations), self.num_substeps)
 
     def _base(self, iterations: int) -> mujoco.MjModel:
-        """The first task's model with the settings of an engine that stops early."""
+        """Return the first task's model with the solver settings of MJX or Warp."""
         base = copy.copy(self.models[0])
         base.opt.iterations = self.solver_iterations or iterations
         base.opt.ls_iterations = 2 * base.opt.iterations
@@ -210,7 +210,7 @@ def stack_differing(models: Sequence[mujoco.MjModel]) -> dict[str, np.ndarray]:
     """Stack the fields that differ between compiled models into arrays (R, ...), by MJX name ("opt.gravity").
 
     Raises:
-        InputError: a field differs that one program cannot hold in several versions; it names field and task.
+        InputError: a field differs that must be the same in all tasks. The message names field and task.
     """
     first = {}  # model -> the first task that has it; many tasks may share one
     for task, model in enumerate(models):
@@ -235,7 +235,7 @@ def stack_differing(models: Sequence[mujoco.MjModel]) -> dict[str, np.ndarray]:
 
 
 def _first_unlike(column: Sequence[Any]) -> int | None:
-    """The first of several values or arrays that is not equal to the first one."""
+    """Return the index of the first value or array that differs from the first one."""
     if not isinstance(column[0], np.ndarray):
         return next((i for i, x in enumerate(column) if x != column[0]), None)
     reshaped = next((i for i, x in enumerate(column) if x.shape != column[0].shape), None)
@@ -246,7 +246,7 @@ def _first_unlike(column: Sequence[Any]) -> int | None:
 
 
 def start_joints(model: mujoco.MjModel, key: Key) -> Array:
-    """Draw joint positions as dm_control does: limited joints in their range, free hinges in [-pi, pi] (nq,)."""
+    """Draw joint positions (nq,) as dm_control does: limited joints in their range, free hinges in [-pi, pi]."""
     limited = model.jnt_limited.astype(bool)
     hinge = model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
     default = np.stack([model.qpos0, model.qpos0], axis=-1)

@@ -1,6 +1,6 @@
-"""A family of tasks: parameters that differ between them, and a table with a row for every task.
+"""Families of tasks: their parameters, and a table with a row for every task.
 
-Tables are built on the host; nothing here loops over tasks once a program runs.
+Tables are built on the host. Compiled programs never loop over tasks.
 """
 
 import abc
@@ -24,7 +24,7 @@ Values = Mapping[str, np.ndarray]  # parameter -> (R,) its value in every row
 
 
 class Table(NamedTuple):
-    """Every task of a family: training tasks first, then interpolation, then extrapolation, then what they draw."""
+    """All tasks of a family: training, interpolation and extrapolation tasks, then the draws of continuous ranges."""
 
     tasks: Task  # leading axis: all rows; on the host
     rows: Mapping[str, np.ndarray]  # split -> row numbers
@@ -32,75 +32,75 @@ class Table(NamedTuple):
 
 
 class Part(NamedTuple):
-    """One family, and where its tasks lie among those of an environment."""
+    """A family, and the places of its tasks among those of an environment."""
 
-    name: str  # empty where there is but one
+    name: str  # empty for a single family
     family: "Family"
     places: Mapping[str, np.ndarray]  # split, or "all" -> which of that split's tasks are the family's
 
 
 class Tabled(abc.ABC):
-    """Tasks in a table: what configurations, reports and films ask of an environment, a family or a mixture of them."""
+    """An environment with a table of tasks: a family or a mixture. Configurations, reports and films use it."""
 
     @property
     @abc.abstractmethod
     def table(self) -> Table:
-        """Every task of every split, and the tasks that episodes draw where ranges are continuous."""
+        """Return all tasks of all splits, and the draws of continuous ranges."""
 
     @property
     @abc.abstractmethod
     def train_count(self) -> int:
-        """Training tasks."""
+        """Return the number of training tasks."""
 
     @property
     @abc.abstractmethod
     def spec(self) -> Spec:
-        """Sizes of observation, action and context."""
+        """Return the sizes of observation, action and context."""
 
     @property
     @abc.abstractmethod
     def episode_length(self) -> int:
-        """Steps after which the longest episode is cut off."""
+        """Return the steps after which the longest episode is cut off."""
 
     @property
     @abc.abstractmethod
     def engine_name(self) -> str:
-        """What steps its worlds: "jax", or the name of a physics engine."""
+        """Return what steps its worlds: "jax" or the name of a physics engine."""
 
     @property
     @abc.abstractmethod
     def summary(self) -> str:
-        """A line on its tasks."""
+        """Return a line on its tasks."""
 
     @property
     @abc.abstractmethod
     def parts(self) -> tuple[Part, ...]:
-        """Its families."""
+        """Return its families."""
 
     @abc.abstractmethod
     def apart(self, states: Any) -> tuple[Any, ...]:
-        """The states of each part."""
+        """Return the states of each part."""
 
     @abc.abstractmethod
     def own_row(self, row: int) -> int:
-        """The row of a family's table that a row of this table stands for."""
+        """Return the row of the family's own table for a row of this table."""
 
     @abc.abstractmethod
     def describe(self, row: int) -> str:
-        """Name a task by what makes it different, such as "size=0.95"."""
+        """Return a task's varied parameters as text, such as "size=0.95"."""
 
     @abc.abstractmethod
     def labels(self, split: str) -> list[str]:
-        """A short name for every task of a split."""
+        """Return a short name for every task of a split."""
 
     @abc.abstractmethod
     def task_values(self, split: str) -> np.ndarray:
-        """What tells the tasks of a split apart (T,)."""
+        """Return the values (T,) that tell the tasks of a split apart."""
 
     @property
     @abc.abstractmethod
     def task_axis(self) -> tuple[str, str]:
-        """Name and unit of ``task_values``."""
+        """Return name and unit of ``task_values``."""
 
     @abc.abstractmethod
     def reset(self, task: Task, key: Key) -> Step: ...
@@ -114,7 +114,7 @@ class Tabled(abc.ABC):
     def where_worlds(self, mask: Array, new: Any, old: Any) -> Any: ...
 
     def tasks(self, split: str = "train") -> Task:
-        """Return the tasks of a split: "train", "interpolation", "extrapolation", or "all" of them in this order."""
+        """Return the tasks of a split: "train", "interpolation", "extrapolation", or "all" in this order."""
         table = self.table
         splits = {**table.rows, "all": np.concatenate(list(table.rows.values()))}
         if split not in splits:
@@ -126,29 +126,28 @@ class Tabled(abc.ABC):
 
 @dataclasses.dataclass(frozen=True)
 class Family(Flat, Tabled):
-    """Tasks that differ in named parameters. Subclasses give the parameters, ``reset`` and ``step``."""
+    """A family of tasks that differ in named parameters. Subclasses give parameters, ``reset`` and ``step``."""
 
     vary: Annotated[Any, tyro.conf.Suppress] = ()
-    """The parameters that differ between tasks, and their values: {"name": "lo:hi:n", "lo:hi", "a,b,c" or numbers}. A
-    range without a number is continuous: each episode has a value of its own. ``--env.vary.NAME=...`` on a command
-    line."""
+    """Values of the parameters that differ between tasks: {"name": "lo:hi:n", "lo:hi", "a,b,c" or numbers}. A range
+    "lo:hi" is continuous: each episode draws its own value. On a command line: ``--env.vary.NAME=...``."""
     combine: str = "grid"
-    """How the values of several --env.vary.NAME=VALUES combine: grid (all combinations), paired (first with first and
-    so on) or random (num-tasks draws between each one's least and greatest value). VALUES are lo:hi:n, a list a,b,c, or
-    lo:hi, from which every episode draws anew."""
+    """How several --env.vary.NAME=VALUES combine: grid (all combinations), paired (first with first and so on) or
+    random (num-tasks draws between the least and greatest value of each). VALUES are lo:hi:n, a list a,b,c, or lo:hi,
+    from which every episode draws its own value."""
     num_tasks: int = 10
-    """Training tasks of combine=random, and of families whose tasks are drawn."""
+    """Number of training tasks with combine=random, and in families whose tasks are drawn."""
     num_draws: int = 256
-    """Values that stand for continuous ranges, for each task."""
+    """Number of values drawn from the continuous ranges of each task, from which episodes take theirs."""
     task_seed: int = 0
-    """Chooses the random tasks and the values of continuous ranges, whatever the run's seeds."""
+    """Seed of random tasks and of values from continuous ranges. The run's seeds do not change them."""
     split: Annotated[str, tyro.conf.arg(name="split", prefix_name=False)] = "dense"
     """Which tasks train and which are held out: dense (train on all values; test between and beyond them), hip-bmdp
     (of ten values train on numbers 3, 4, 7 and 8 counted from 0; interpolation 5, 6; extrapolation 2, 9) or none."""
 
     context_ranges: Annotated[Any, tyro.conf.Suppress] = None
-    """Parameters of the context and the ranges that become [-1, 1], ((name, low, high), ...), where they are another
-    family's: see ``scaled_as``. None: those that vary in training."""
+    """Parameters of the context, and the ranges that are scaled to [-1, 1]: ((name, low, high), ...). ``scaled_as``
+    sets them to another family's. None takes the parameters that vary in training."""
 
     parameters: ClassVar[Mapping[str, Parameter]]
     action_size: ClassVar[int]
@@ -177,10 +176,10 @@ class Family(Flat, Tabled):
         """Advance one step under ``action`` (A,) in [-1, 1]; observation and reward are those after it."""
 
     def relabel(self, task: Task, transition: Transition, key: Key) -> Transition:
-        """Return a transition of another task as ``task`` would have had it, if they differ in ``relabels`` alone.
+        """Return another task's transition as ``task`` would have had it. They may differ in ``relabels`` alone.
 
-        The reward, and what the observations show of the goal, are those of a step of ``task`` from the same state; the
-        key draws the goal where every episode has one of its own.
+        Reward and observed goal are those of a step of ``task`` from the same state. The key draws the goal if every
+        episode has its own.
         """
         raise NotImplementedError(f"{type(self).__name__} declares no parameters that it relabels")
 
@@ -192,7 +191,7 @@ class Family(Flat, Tabled):
 
     @cached_property
     def variation(self) -> variation.Variation:
-        """The values of every task of every split."""
+        """Return the values of every task of every split."""
         return variation.vary(
             dict(self.vary),
             self.parameters,
@@ -204,14 +203,14 @@ class Family(Flat, Tabled):
         )
 
     def goals(self) -> dict[str, np.ndarray]:
-        """The goal parameters (R,) of every row: varied, or nominal."""
+        """Return the goal parameters (R,) of every row: varied, or nominal."""
         goals = {name: p.nominal for name, p in self.parameters.items() if p.edit is None}
         full = lambda x: np.array(np.broadcast_to(x, self.count), np.float32)
         return {name: full(self.values.get(name, nominal)) for name, nominal in goals.items()}
 
     @cached_property
     def values(self) -> Values:
-        """The values (R,) of each varied parameter in every row of the table, in float64."""
+        """Return the values (R,) of each varied parameter in every row of the table, in float64."""
         found = self.variation
         parts = [found.rows[split] for split in SPLITS]
         if found.draws is not None:
@@ -220,18 +219,18 @@ class Family(Flat, Tabled):
 
     @property
     def train_count(self) -> int:
-        """Training tasks."""
+        """Return the number of training tasks."""
         return len(self.variation.rows["train"])
 
     @cached_property
     def count(self) -> int:
-        """Rows of the table."""
+        """Return the number of rows of the table."""
         listed = sum(len(rows) for rows in self.variation.rows.values())
         return listed if self.variation.draws is None else listed + self.train_count * self.num_draws
 
     @cached_property
     def table(self) -> Table:
-        """Every task of every split, and the tasks that episodes draw where ranges are continuous."""
+        """Return all tasks of all splits, and the draws of continuous ranges."""
         sizes = [len(self.variation.rows[split]) for split in SPLITS]
         listed, draws = sum(sizes), None
         if self.count > listed:  # held-out tasks stay what they are
@@ -249,7 +248,7 @@ class Family(Flat, Tabled):
         return Table(Task(**leaves), rows, draws)
 
     def _context(self) -> np.ndarray:
-        """What differs between tasks (R, C), scaled; a single task has one constant number, as networks need some."""
+        """Return the contexts (R, C), which are scaled parameters. A single task has one constant number."""
         if not self.ranges:
             return np.zeros((self.count, 1), np.float32)
         _, low, high = zip(*self.ranges, strict=True)
@@ -257,13 +256,13 @@ class Family(Flat, Tabled):
         return variation.scale(np.stack(columns, axis=1), np.array(low), np.array(high)).astype(np.float32)
 
     def _column(self, name: str, low: float, high: float) -> np.ndarray:
-        """The values (R,) of a parameter that may not vary here, or not be known."""
+        """Return the values (R,) of a parameter that may be constant or unknown here."""
         known = self.parameters[name].nominal if name in self.parameters else (low + high) / 2
         return self.values.get(name, np.full(self.count, known))
 
     @property
     def ranges(self) -> tuple[tuple[str, float, float], ...]:
-        """Parameters of the context, and the ranges that become [-1, 1] in it."""
+        """Return the parameters of the context, and the ranges that are scaled to [-1, 1]."""
         if self.context_ranges is not None:
             return self.context_ranges
         found = self.variation
@@ -271,80 +270,80 @@ class Family(Flat, Tabled):
         return tuple((name, low, high) for name, low, high in ends if low < high)
 
     def scaled_as(self, other: "Family") -> Self:
-        """These tasks with the other family's context: its parameters, by its ranges.
+        """Return these tasks with contexts of another family's parameters and ranges.
 
-        A network that was trained on the other family so reads contexts as it has learned to. What does not vary here
-        has its one value, what these tasks do not know the middle of its range (0 in the context), and what varies here
-        alone is not in the context.
+        A network that was trained on the other family can then read them. A parameter that does not vary here has its
+        one value. A parameter that is unknown here has the middle of its range (0 in the context). A parameter that
+        varies only here is not in the context.
         """
         return dataclasses.replace(self, context_ranges=other.ranges)
 
     @property
     def varied(self) -> tuple[str, ...]:
-        """The parameters that differ between training tasks or episodes."""
+        """Return the parameters that differ between training tasks or episodes."""
         return self.variation.varied
 
     def task_values(self, split: str) -> np.ndarray:
-        """What tells the tasks of a split apart (T,): the one parameter that varies, or else their numbers."""
+        """Return the values (T,) that tell the tasks of a split apart: the only varied parameter, or task numbers."""
         tasks = self.tasks(split)
         return np.asarray(tasks.params[self.varied[0]] if len(self.varied) == 1 else tasks.id)
 
     @property
     def task_axis(self) -> tuple[str, str]:
-        """Name and unit of ``task_values``."""
+        """Return name and unit of ``task_values``."""
         return (self.varied[0], self.parameters[self.varied[0]].unit) if len(self.varied) == 1 else ("task", "number")
 
     def describe(self, row: int) -> str:
-        """Name a task by what makes it different, such as "size=0.95"."""
+        """Return a task's varied parameters as text, such as "size=0.95"."""
         params = self.table.tasks.params
         return ",".join(f"{name}={params[name][row]:.4g}" for name in self.varied) or f"task={row}"
 
     def labels(self, split: str) -> list[str]:
-        """A short name for every task of a split: its ``task_values``."""
+        """Return a short name for every task of a split: its ``task_values``."""
         return [f"{value:.4g}" for value in self.task_values(split)]
 
     @property
     def parts(self) -> tuple[Part, ...]:
-        """The family itself."""
+        """Return the family itself as the only part."""
         counts = {split: len(rows) for split, rows in self.table.rows.items()}
         counts["all"] = sum(counts.values())
         return (Part("", self, {split: np.arange(count) for split, count in counts.items()}),)
 
     def apart(self, states: Any) -> tuple[Any, ...]:
-        """The states of each part."""
+        """Return the states of each part."""
         return (states,)
 
     def own_row(self, row: int) -> int:
-        """The row itself."""
+        """Return the row itself."""
         return row
 
     @property
     def ends(self) -> str:
-        """The parameters that vary in training, and their least and greatest values."""
+        """Return the parameters that vary in training, with their least and greatest values."""
         found = self.variation
         ends = zip(found.names, found.low, found.high, strict=True)
         return ", ".join(f"{name} {low:g} to {high:g}" for name, low, high in ends if low < high)
 
     @property
     def summary(self) -> str:
-        """A line on its tasks."""
+        """Return a line on its tasks."""
         count, ends = self.train_count, self.ends
         tasks = f"{count} training task{'s' * (count > 1)}{', ' * bool(ends)}{ends}"
         return f"{tasks}, split {self.split}, engine {self.engine_name}"
 
     @property
     def engine_name(self) -> str:
-        """What steps its worlds: "jax", or the name of a physics engine."""
+        """Return what steps its worlds: "jax" or the name of a physics engine."""
         return "jax"
 
     @property
     def episode_length(self) -> int:
-        """Steps after which an episode is cut off."""
+        """Return the steps after which an episode is cut off."""
         return self.episode_steps
 
     @property
     def spec(self) -> Spec:
-        """Sizes of observation, action and context."""
+        """Return the sizes of observation, action and context."""
         return self._spec
 
     @cached_property
@@ -355,7 +354,7 @@ class Family(Flat, Tabled):
 
 
 def draw_until(accepted: Callable[[Array], Array], draw: Callable[[Key], Array], key: Key) -> Array:
-    """Draw until the draw is accepted, at most as often as dm_control does."""
+    """Draw until a draw is accepted, at most as often as dm_control does."""
 
     def again(carry):
         key, _, draws = carry

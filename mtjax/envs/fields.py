@@ -1,6 +1,6 @@
-"""The fields of a compiled model in which tasks may differ, and those in which they must not: as MJX has them.
+"""The fields of a compiled model in which tasks may differ, and those that must be equal, by their names in MJX.
 
-MJX's own dataclasses say the same, but to import them takes seconds, which a run of MuJoCo's C engine need not wait.
+MJX's own dataclasses hold the same, but importing them takes seconds, and runs of MuJoCo's C engine do not need them.
 """
 
 # Fields of the model that never reach the dynamics: statistics, and what only a renderer reads.

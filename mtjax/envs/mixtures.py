@@ -1,8 +1,7 @@
-"""Mixtures: families with other observations, actions, horizons and physics than each other, as one environment.
+"""Mixtures: families with different observations, actions, horizons and physics, as one environment.
 
-A mixture's tasks are those of its families, one family after another in every split. Each family steps its own worlds
-in a call of its own; what agents see of all of them has one shape, as observations are padded with zeros and actions
-beyond a family's own are masked.
+A mixture has the tasks of its families, one family after another in every split. Each family steps its own worlds in a
+separate call. Observations are padded with zeros to one size, and actions beyond a family's own are masked.
 """
 
 import dataclasses
@@ -22,30 +21,30 @@ from mtjax.types import SPLITS, Array, InputError, Key, Spec, Step, Task
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Blocks:
-    """Which tasks of a table belong to which family. It is static, so that worlds are sliced and never gathered."""
+    """The order of families along the tasks of a table. It is static, so worlds are sliced and never gathered."""
 
     runs: tuple[tuple[int, int], ...]  # (family, how many of its tasks follow each other), in the table's order
     marks: int  # leading numbers of a context that say which family it is of
 
     @property
     def count(self) -> int:
-        """Tasks of the table."""
+        """Return the number of tasks."""
         return sum(count for _, count in self.runs)
 
     def slices(self) -> Iterator[tuple[int, slice]]:
-        """Each run's family, and where it lies among the tasks."""
+        """Return the family and the slice of tasks of each block."""
         begin = 0
         for family, count in self.runs:
             yield family, slice(begin, begin + count)
             begin += count
 
     def take(self, tree: Any, family: int) -> Any:
-        """The part (S, T', ...) of leaves (S, T, ...) that belongs to one family."""
+        """Return the part (S, T', ...) of leaves (S, T, ...) that belongs to one family."""
         places = [place for owner, place in self.slices() if owner == family]
         return jax.tree.map(lambda x: _joined([x[:, place] for place in places]), tree)
 
     def join(self, parts: Mapping[int, Array]) -> Array:
-        """Lay arrays (S, T', ...) of the families out as one (S, T, ...)."""
+        """Join arrays (S, T', ...) of the families into one (S, T, ...)."""
         taken, found = dict.fromkeys(parts, 0), []
         for family, count in self.runs:
             found.append(parts[family][:, taken[family] : taken[family] + count])
@@ -53,7 +52,7 @@ class Blocks:
         return _joined(found)
 
     def related(self, contexts: Array, context: Array) -> Array:
-        """Which of several contexts (T, C) are of the same family as one (C,)."""
+        """Return which contexts (T, C) are of the same family as ``context`` (C,)."""
         return jnp.all(contexts[:, : self.marks] == context[: self.marks], axis=-1)
 
 
@@ -62,7 +61,7 @@ def _joined(parts: list[Array]) -> Array:
 
 
 class States(NamedTuple):
-    """The states of a mixture's worlds."""
+    """The states of a mixture's worlds, by family."""
 
     blocks: Blocks
     families: tuple[Any, ...]  # each family's own states, leaves (S, T', E, ...); None where a split has no task of it
@@ -70,14 +69,14 @@ class States(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Mixture(Tabled):
-    """Tasks of several families. ``mtjax.mixture`` and ``mtjax.make("NAME+NAME")`` make one.
+    """An environment with the tasks of several families, from ``mtjax.mixture`` or ``mtjax.make("NAME+NAME")``.
 
-    Observation (O,): the family's own, and zeros up to the widest family's.
-    Action (A,): as many as the widest family has; a task's ``action_mask`` says which of them are its own.
-    Context (C,): which family it is, one-hot, then a slot for each family with that family's own context, zero in the
-        slots of the others; a family whose contexts are all zero, as it has a single task, has no slot. A task that was
-        not trained on finds its nearest training task in its own family.
-    Metrics: those of all families, NaN for a family that has no such metric.
+    Observation (O,): the family's own, padded with zeros to that of the widest family.
+    Action (A,): as many as the widest family has. A task's ``action_mask`` says which of them are its own.
+    Context (C,): the family as one-hot, then one slot per family. The task's own slot holds its context in that family;
+        other slots are zero. A family whose contexts are all zero, because it has a single task, has no slot. The
+        nearest training task of an unseen task is in its own family.
+    Metrics: those of all families. They are NaN for a family that has no such metric.
     Reward, start, termination and time limit are each family's own.
 
     A mixture of one family is that family: the same context, no mask, one normaliser.
@@ -99,12 +98,12 @@ class Mixture(Tabled):
 
     @property
     def train_count(self) -> int:
-        """Training tasks."""
+        """Return the number of training tasks."""
         return sum(family.train_count for family in self.families)
 
     @cached_property
     def table(self) -> Table:
-        """The families' tables one after another. Tasks are numbered in the order of the splits."""
+        """Return the families' tables one after another. Tasks are numbered in the order of the splits."""
         tables = [family.table for family in self.families]
         rows = {
             split: np.concatenate([first + table.rows[split] for first, table in zip(self._first, tables, strict=True)])
@@ -128,12 +127,12 @@ class Mixture(Tabled):
 
     @cached_property
     def _first(self) -> np.ndarray:
-        """The row at which each family's table begins."""
+        """Return the row at which each family's table begins."""
         counts = [len(family.table.tasks.id) for family in self.families]
         return np.cumsum([0, *counts[:-1]])
 
     def _context(self) -> np.ndarray:
-        """What tells all tasks apart (R, C)."""
+        """Return the contexts (R, C) of all rows."""
         contexts = [np.asarray(family.table.tasks.context) for family in self.families]
         if len(contexts) == 1:
             return contexts[0]
@@ -148,7 +147,7 @@ class Mixture(Tabled):
         return np.concatenate(rows)
 
     def _mask(self) -> np.ndarray | None:
-        """Which actions each task has (R, A); None where all have them all."""
+        """Return which actions (R, A) each task has; None if all tasks have all actions."""
         masks = []
         for family in self.families:
             own = family.table.tasks.action_mask
@@ -158,7 +157,7 @@ class Mixture(Tabled):
         return None if np.all(whole == 1) else whole
 
     def _draws(self, count: int) -> np.ndarray | None:
-        """Rows (R, P) of which the episodes of each row draw one; where a family draws nothing, its own."""
+        """Return the rows (R, P) from which the episodes of each row draw. A family without draws has its own row."""
         drawn = [family.table.draws for family in self.families]
         widths = {draws.shape[1] for draws in drawn if draws is not None}
         if not widths:
@@ -186,7 +185,7 @@ class Mixture(Tabled):
 
     @property
     def spec(self) -> Spec:
-        """Sizes of observation, action and context: the widest family's."""
+        """Return the sizes of observation, action and context, those of the widest family."""
         return self._spec
 
     @cached_property
@@ -198,7 +197,7 @@ class Mixture(Tabled):
 
     @property
     def episode_length(self) -> int:
-        """The longest family's steps of an episode."""
+        """Return the steps of the longest family's episodes."""
         return max(family.episode_length for family in self.families)
 
     # Worlds, leaves (S, T, E, ...).
@@ -233,7 +232,7 @@ class Mixture(Tabled):
         return tasks.blocks
 
     def _each(self, tasks: Task, act: Any) -> Step:
-        """Let every family act on its own tasks, and lay the steps out as one."""
+        """Call a function for every family on its own tasks, and join the steps."""
         blocks: Blocks = tasks.blocks
         steps = {i: act(self.families[i], self._own(tasks, i), i) for i in dict.fromkeys(i for i, _ in blocks.runs)}
         states = tuple(steps[i].state if i in steps else None for i in range(len(self.families)))
@@ -249,36 +248,36 @@ class Mixture(Tabled):
         )
 
     def _own(self, tasks: Task, i: int) -> Task:
-        """The tasks of one family's worlds, as that family knows them."""
+        """Return the tasks of one family in that family's own form."""
         rows = tasks.blocks.take(tasks.row, i) - int(self._first[i])
         own = jax.tree.map(lambda x: jnp.take(jnp.asarray(x), rows, axis=0, mode="clip"), self.families[i].table.tasks)
         # A compiler that sees constants divides by them otherwise than by numbers that it does not know.
         return jax.lax.optimization_barrier(own)
 
     def pad(self, obs: Array) -> Array:
-        """Observations (..., O') of a family, as wide as the mixture's (..., O)."""
+        """Pad a family's observations (..., O') with zeros to the mixture's (..., O)."""
         missing = self.spec.obs_size - obs.shape[-1]
         return jnp.pad(obs, [(0, 0)] * (obs.ndim - 1) + [(0, missing)]) if missing else obs
 
     # A single world, outside of compiled programs.
 
     def reset(self, task: Task, key: Key) -> Step:
-        """Begin an episode of a task that is no tracer; the state is the family's own."""
+        """Begin an episode of a task that is not traced. The state is the family's own."""
         family, own = self.member(task)
         step = family.reset(own, key)
         return step._replace(obs=self.pad(step.obs))
 
     def step(self, task: Task, state: Any, action: Array) -> Step:
-        """Advance a world of a task that is no tracer."""
+        """Advance a world of a task that is not traced."""
         family, own = self.member(task)
         step = family.step(own, state, action[: family.spec.action_size])
         return step._replace(obs=self.pad(step.obs))
 
     def member(self, task: Task) -> tuple[Family, Task]:
-        """The family of a task that is no tracer, and the task as that family knows it.
+        """Return the family of a task that is not traced, and the task in that family's own form.
 
         Raises:
-            InputError: the task is traced, so that nobody knows its family while the program is made.
+            InputError: the task is traced, so its family is unknown at compile time.
         """
         if isinstance(task.row, jax.core.Tracer):
             raise InputError(
@@ -291,13 +290,13 @@ class Mixture(Tabled):
     # Names.
 
     def _place(self, row: int) -> tuple[int, int]:
-        """The family of a row of the table, and its row there."""
+        """Return the family of a row of the table, and the row in its own table."""
         i = int(np.searchsorted(self._first, row, side="right")) - 1
         return i, row - int(self._first[i])
 
     @cached_property
     def parts(self) -> tuple[Part, ...]:
-        """The families, and where their tasks lie in each split."""
+        """Return the families, and the places of their tasks in each split."""
         found = []
         for i, (name, family) in enumerate(zip(self.names, self.families, strict=True)):
             places = {
@@ -310,24 +309,24 @@ class Mixture(Tabled):
         return tuple(found)
 
     def apart(self, states: States) -> tuple[Any, ...]:
-        """The states of each part."""
+        """Return the states of each part."""
         return states.families
 
     def own_row(self, row: int) -> int:
-        """The row of a family's table that a row of this table stands for."""
+        """Return the row of the family's own table for a row of this table."""
         return self._place(row)[1]
 
     def task_values(self, split: str) -> np.ndarray:
-        """The numbers (T,) of a split's tasks."""
+        """Return the numbers (T,) of a split's tasks."""
         return np.asarray(self.tasks(split).id)
 
     @property
     def task_axis(self) -> tuple[str, str]:
-        """Name and unit of ``task_values``."""
+        """Return name and unit of ``task_values``."""
         return "task", "number"
 
     def labels(self, split: str) -> list[str]:
-        """A short name for every task of a split, such as "walker-walk friction=0.7"."""
+        """Return a short name for every task of a split, such as "walker-walk friction=0.7"."""
         found = [""] * len(self.table.rows[split])
         for part in self.parts:
             own, axis = part.family.labels(split), part.family.task_axis[0]
@@ -337,19 +336,19 @@ class Mixture(Tabled):
         return found
 
     def describe(self, row: int) -> str:
-        """Name the task of a row by its family and all that makes it different there."""
+        """Return the task of a row as text: its family and its varied parameters."""
         i, own = self._place(row)
         alone = len(self.families[i].table.tasks.id) == 1
         return self.names[i] if alone else f"{self.names[i]} {self.families[i].describe(own)}"
 
     @property
     def engine_name(self) -> str:
-        """What steps its worlds, of all families."""
+        """Return the engines of all families."""
         return ", ".join(dict.fromkeys(family.engine_name for family in self.families))
 
     @property
     def summary(self) -> str:
-        """A line on its tasks."""
+        """Return a line on its tasks."""
         count, many = self.train_count, len(self.families)
         kinds = ", ".join(
             name + (f" ({family.train_count}{': ' * bool(family.ends)}{family.ends})" * (family.train_count > 1))
@@ -363,7 +362,7 @@ class Mixture(Tabled):
 
 
 def require_family(env: Any, reason: str) -> None:
-    """Refuse a mixture, with the reason.
+    """Raise InputError with the reason if ``env`` is a mixture.
 
     Raises:
         InputError: ``env`` is a mixture.
@@ -373,7 +372,7 @@ def require_family(env: Any, reason: str) -> None:
 
 
 def _merged(runs: list[tuple[int, int]]) -> tuple[tuple[int, int], ...]:
-    """Runs without empty ones, and with those of one family that follow each other as one."""
+    """Return the blocks without empty ones, with neighbouring blocks of one family joined."""
     found: list[tuple[int, int]] = []
     for family, count in runs:
         if found and found[-1][0] == family:

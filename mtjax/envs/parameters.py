@@ -1,6 +1,6 @@
-"""Quantities that may differ between tasks, and the ones that every MuJoCo model has."""
+"""Parameters that may differ between tasks, and those that every MuJoCo model has."""
 
-from __future__ import annotations  # annotations name MuJoCo, which a list of families need not import
+from __future__ import annotations  # annotations name MuJoCo, but listing the families must not import it
 
 import math
 from collections.abc import Callable
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 class Parameter(NamedTuple):
-    """A quantity that may differ between tasks: physical if it edits the model, otherwise a goal."""
+    """A parameter that may differ between tasks. It is physical if it edits the model, otherwise a goal."""
 
     unit: str
     nominal: float  # the value in the unedited model, or of a goal that does not vary
@@ -62,7 +62,7 @@ def _scale_gear(spec: mujoco.MjSpec, scale: float) -> None:
 
 
 def body_mass(name: str) -> Parameter:
-    """Scale of the mass and inertia of one body."""
+    """Return a parameter that scales mass and inertia of one body."""
     return Parameter("1", 1.0, lambda spec, scale: _scale_body(spec.body(name), scale))
 
 

@@ -1,7 +1,7 @@
-"""Where the bodies of a model are that moves in the x-z plane, and how fast.
+"""Places and velocities of the bodies of a model that moves in the x-z plane.
 
-MuJoCo's sensors would tell the same after a further pass over the whole model; this reads only what an observation
-needs, and becomes one kernel.
+MuJoCo's sensors give the same after another pass over the whole model. This code computes only what an observation
+needs, in one kernel.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ Vector = tuple[Array, Array]  # x and z
 
 
 class Planar(NamedTuple):
-    """Every body of a model, the world being the first."""
+    """Places and velocities of every body. The first body is the world."""
 
     angle: Array  # (nbody,) rotation about the y axis [rad], from z towards x
     position: Array  # (nbody, 2) x and z of the body's frame [m]
@@ -25,7 +25,7 @@ class Planar(NamedTuple):
     velocity: Array  # (nbody, 2) of its centre of mass [m/s]
 
     def offset(self, body: int, point: Array) -> Array:
-        """Where a point (3,) of a body's frame lies from the frame's origin: x and z (2,) [m]."""
+        """Return x and z (2,) [m] of a point (3,) of a body's frame, relative to the frame's origin."""
         return jnp.stack(_rotate(self.angle[body], (point[0], point[2])))
 
 
@@ -73,7 +73,7 @@ def locate(model: mujoco.MjModel, leaf: Callable[[str], Array], qpos: Array, qve
 
 
 def is_planar(model: mujoco.MjModel) -> bool:
-    """Whether every joint slides in the plane or turns across it."""
+    """Return whether every joint slides in the plane or turns about its normal."""
     hinge = model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
     across, within = np.abs(model.jnt_axis[:, 1]), np.hypot(model.jnt_axis[:, 0], model.jnt_axis[:, 2])
     return bool(np.all(np.where(hinge, within, across) < 1e-9))
@@ -86,7 +86,7 @@ def _rotate(angle: Array, vector: Vector) -> Vector:
 
 
 def _cross(spin: Array, arm: Vector) -> Vector:
-    """Velocity of the end of an arm that turns about y."""
+    """Return the velocity of the end of an arm that turns about y."""
     return spin * arm[1], -spin * arm[0]
 
 

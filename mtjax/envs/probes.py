@@ -1,8 +1,8 @@
-"""Probe environments: problems so small that every Q-value is known, each of which breaks one part of a learner.
+"""Probe environments: tiny problems with known Q-values. Each tests one part of a learner.
 
-After Andy Jones' five, with a task axis and a time limit. A probe is data, as a task is: one environment, and so one
-compiled program, serves all of them. Use them to check an agent of your own: train it on ``Probe(kind)`` and compare
-its values with those that the rules' docstrings give.
+They are Andy Jones' five, with a task axis and a time limit. A probe is data, like a task, so one compiled program
+serves all of them. Use them to check an agent of your own: train it on ``Probe(kind)``, and compare its values with
+those in the docstrings of the rules.
 """
 
 import dataclasses
@@ -26,7 +26,7 @@ SPEC = Spec.vector(obs_size=1, action_size=1, context_size=1)
 
 
 def _one_step(scale, obs, action):
-    """Earns ``scale``: Q = scale. Needs the critic's fit to the reward, and ``discount``."""
+    """One step that earns ``scale``: Q = scale. Needs the critic's fit to the reward, and ``discount``."""
     return scale, AFTER, True
 
 
@@ -36,26 +36,26 @@ def _by_observation(scale, obs, action):
 
 
 def _delayed(scale, obs, action):
-    """Two steps, from 0 and from 1, of which the last earns: Q(1) = scale, Q(0) = gamma scale."""
+    """Two steps, from 0 and from 1. The last one earns: Q(1) = scale, Q(0) = gamma scale."""
     last = obs > 0.5
     return scale * last, jnp.where(last, AFTER, 1.0), last
 
 
 def _by_action(scale, obs, action):
-    """One step: Q = -(action - scale)^2, so that the policy has a best action in each task."""
+    """One step: Q = -(action - scale)^2. Each task has its own best action."""
     return -jnp.square(action - scale), AFTER, True
 
 
 def _by_both(scale, obs, action):
-    """One step from -1 or 1: Q = -(action - scale obs)^2, so that the best action turns with observation and task."""
+    """One step from -1 or 1: Q = -(action - scale obs)^2. The best action depends on observation and task."""
     return -jnp.square(action - scale * obs), AFTER, True
 
 
 def _endless(scale, obs, action):
-    """Never terminates: nothing from 0, then ``scale`` from 1 for ever, so that Q(1) = scale / (1 - gamma).
+    """No termination: 0 earns nothing, then 1 earns ``scale`` forever, so Q(1) = scale / (1 - gamma).
 
-    Were the time limit a termination, Q(1) would be scale; were the observation after the reset stored as the next
-    one, scale / (1 - gamma^2).
+    If the time limit were a termination, Q(1) would be scale. If the observation after the reset were stored as the
+    next one, Q(1) would be scale / (1 - gamma^2).
     """
     return scale * (obs > 0.5), 1.0, False
 
@@ -79,7 +79,7 @@ class World(NamedTuple):
 
 
 def tasks_of(kind: str, scales=(1.0, -0.5), horizon: int = LIMIT) -> Task:
-    """Tasks (T, ...) of one probe, told apart by a scale, which is also their context."""
+    """Return tasks (T, ...) of one probe. They differ in a scale, which is also their context."""
     scales = jnp.asarray(scales, jnp.float32)
     same = lambda value, dtype: jnp.full(scales.shape, value, dtype)
     goal = {
@@ -93,7 +93,7 @@ def tasks_of(kind: str, scales=(1.0, -0.5), horizon: int = LIMIT) -> Task:
 
 @dataclasses.dataclass(frozen=True)
 class Probe(Flat):
-    """Any of the probes, by the task's ``kind``."""
+    """An environment that is any of the probes, by the task's ``kind``."""
 
     kind: str = "one-step"
     episode_length: int = LIMIT

@@ -1,4 +1,4 @@
-"""Which values the parameters of a family take in which task, and which tasks are held out."""
+"""The values of a family's parameters in every task, and the split into training and held-out tasks."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -15,29 +15,29 @@ _FORMS = "lo:hi:n (n even steps), lo:hi (a new value each episode) or a list a,b
 
 
 class Axis(NamedTuple):
-    """The values of one parameter: points for tasks to take, or a range in which every episode draws anew."""
+    """The values of one parameter: one for each task, or a range from which every episode draws."""
 
     points: np.ndarray  # (n,), or the two ends of a range
     continuous: bool
 
 
 class Variation(NamedTuple):
-    """The values of all varied parameters, by split, in rows: a row is a task, a column a parameter."""
+    """The values of all varied parameters by split. A row is a task, a column a parameter."""
 
     names: tuple[str, ...]
     rows: Mapping[str, np.ndarray]  # split -> (R, names)
-    draws: np.ndarray | None  # (T, P, names) values of which each episode of a training task takes one
+    draws: np.ndarray | None  # (T, P, names) values; each episode of a training task takes one
     low: np.ndarray  # (names,) ends of the training range
     high: np.ndarray
 
     @property
     def varied(self) -> tuple[str, ...]:
-        """The parameters that differ between training tasks or episodes."""
+        """Return the parameters that differ between training tasks or episodes."""
         return tuple(name for name, low, high in zip(self.names, self.low, self.high, strict=True) if low < high)
 
 
 def write_values(given: str | float | Sequence[float]) -> str:
-    """Return a parameter's values as the command line spells them."""
+    """Return a parameter's values in the notation of the command line."""
     if isinstance(given, str):
         return given
     points = np.atleast_1d(np.asarray(given, np.float64))
@@ -87,18 +87,19 @@ def vary(
     num_draws: int,
     seed: int,
 ) -> Variation:
-    """Choose the values of every task of every split.
+    """Return the parameter values of every task of every split.
 
     Args:
         given: the values of each varied parameter, as ``read_axis`` reads them.
         combine: how several parameters combine: every combination ("grid"), value by value ("paired"), or
             ``num_tasks`` tasks drawn uniformly between each one's least and greatest value ("random").
-        split: "dense" trains on all; interpolation is between neighbouring training values, extrapolation one and two
-            steps beyond each end of each parameter, where a step is that end's spacing (in a grid, of a continuous
-            range a tenth); steps that leave a parameter's range are left out. "hip-bmdp" (Zhang et al. 2021, by the
-            indices of MTRL's configuration): of ten tasks. "none" holds nothing out.
-        num_draws: values that stand for the continuous ranges of one task.
-        seed: of random tasks and draws.
+        split: "dense" trains on all values. Interpolation tasks lie between neighbouring training values.
+            Extrapolation tasks lie one and two steps beyond each end of each parameter. A step is the spacing at that
+            end (in a grid, a tenth of a continuous range); steps that leave a parameter's range are left out.
+            "hip-bmdp" splits ten tasks (Zhang et al. 2021, by the indices of MTRL's configuration). "none" holds
+            nothing out.
+        num_draws: number of values drawn from the continuous ranges of one task.
+        seed: seed of random tasks and draws.
 
     Raises:
         InputError: a name is unknown, or the values do not fit each other or the split.
@@ -126,7 +127,7 @@ def vary(
 
 
 def count_tasks(settings: Mapping[str, Any]) -> int:
-    """Count the training tasks of a family by its settings alone; where tasks are drawn, ``num_tasks`` is one."""
+    """Return the number of training tasks from a family's settings alone, as ``outline`` needs it."""
     if "num_tasks" in settings:
         return settings["num_tasks"]
     given = settings.get("vary", {})
@@ -136,14 +137,14 @@ def count_tasks(settings: Mapping[str, Any]) -> int:
 
 
 def _ends(axes: list[Axis], train: np.ndarray, combine: str) -> tuple[np.ndarray, np.ndarray]:
-    """Least and greatest value (names,) of each parameter in training: of ranges their ends, whatever is drawn."""
+    """Return the least and greatest training value (names,) of each parameter; of ranges, their ends."""
     ranged = [axis.continuous or combine == "random" for axis in axes]
     values = [axis.points if whole else column for axis, whole, column in zip(axes, ranged, train.T, strict=True)]
     return np.array([np.min(x) for x in values]), np.array([np.max(x) for x in values])
 
 
 def _draw(train: np.ndarray, columns: list[int], low, high, count: int, random: np.random.Generator) -> np.ndarray:
-    """Values (T, P, names) for the episodes of training tasks (T, names), of which some columns are ranges."""
+    """Return values (T, P, names) for episodes of training tasks (T, names), drawn where a column is a range."""
     draws = np.repeat(train[:, None], count, axis=1)
     for i in columns:
         # One draw in each of P equal parts of the range: no gaps, whatever the seed.
@@ -223,7 +224,7 @@ def _beyond_rows(train: np.ndarray) -> list[np.ndarray]:
 
 
 def _between_grid(axes: list[Axis]) -> np.ndarray:
-    """Midpoints of every cell of the grid; of a continuous range five values inside it."""
+    """Return the midpoints of all cells of the grid; of a continuous range, five values inside it."""
     if not any(len(axis.points) > 1 for axis in axes):
         return np.zeros((0, len(axes)))
     return np.stack([x.ravel() for x in np.meshgrid(*map(_inside, axes), indexing="ij")], axis=1)
@@ -236,7 +237,7 @@ def _inside(axis: Axis) -> np.ndarray:
 
 
 def _beyond_grid(axes: list[Axis]) -> list[np.ndarray]:
-    """One parameter at a time beyond its ends, the others at their middle value."""
+    """Return tasks with one parameter beyond its ends and the others at their middle value."""
     middle = np.array([np.mean(a.points) if a.continuous else a.points[(len(a.points) - 1) // 2] for a in axes])
     rows = []
     for i, axis in enumerate(axes):
@@ -247,6 +248,6 @@ def _beyond_grid(axes: list[Axis]) -> list[np.ndarray]:
 
 
 def scale(values: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Map values (..., names) so that the training range becomes [-1, 1]; a range of one value becomes 0."""
+    """Scale values (..., names) from the training range to [-1, 1]. A range of one value becomes 0."""
     half = (high - low) / 2
     return (values - (low + high) / 2) / np.where(half > 0, half, 1.0)

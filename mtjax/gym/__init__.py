@@ -1,7 +1,7 @@
-"""Families as Gymnasium environments with MTEnv's interface, one at a time or many worlds at once.
+"""Families as Gymnasium environments with MTEnv's interface: one world, or a vector of many.
 
-``import mtjax.gym`` registers every family with Gymnasium, as ``mtjax/NAME``. The methods that concern tasks are those
-of ``gymnasium.make("mtjax/NAME").unwrapped``, or of what ``mtjax.gym.make("NAME")`` returns.
+``import mtjax.gym`` registers every family with Gymnasium as ``mtjax/NAME``. The methods for tasks belong to
+``mtjax.gym.make("NAME")``, or to ``gymnasium.make("mtjax/NAME").unwrapped``.
 """
 
 from mtjax.envs import ENVS

@@ -1,4 +1,4 @@
-"""One world of one family as a Gymnasium environment with MTEnv's interface."""
+"""A Gymnasium environment of one world of a family, with MTEnv's interface."""
 
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -30,14 +30,14 @@ _METAWORLD = "MT-MetaWorld-"
 
 
 class Programs(NamedTuple):
-    """A family's functions, compiled once for all environments of the family."""
+    """The jitted functions of a family, shared by all its environments."""
 
     reset: Any  # task, seed (2,) uint32 -> Step
     step: Any  # task, state, action -> Step
 
 
 def begin(family: Env, task: Task, seed: Array) -> Step:
-    """Begin an episode with the key made of ``seed`` (2,) uint32."""
+    """Begin an episode with the random key ``seed`` (2,) uint32."""
     return family.reset(task, jax.random.wrap_key_data(seed, impl="threefry2x32"))
 
 
@@ -52,7 +52,7 @@ def draw_seeds(random: np.random.Generator, *shape: int) -> np.ndarray:
 
 
 def spaces_of(family: Env, table: TaskTable) -> tuple[spaces.Dict, spaces.Box]:
-    """The observations and actions of one world."""
+    """Return the observation space and the action space of one world."""
     obs = spaces.Box(-np.inf, np.inf, (family.spec.obs_size,), np.float32)
     action = spaces.Box(-1.0, 1.0, (family.spec.action_size,), np.float32)
     return spaces.Dict({"env_obs": obs, "task_obs": table.space}), action
@@ -67,7 +67,7 @@ def read_action(action: Any, space: spaces.Space) -> np.ndarray:
 
 
 def family_named(name: str, settings: dict[str, Any]) -> Env:
-    """The family with this name, or the one that MTEnv registers under it."""
+    """Return the family with a name of mtjax or of MTEnv."""
     if name.startswith(_METAWORLD):
         raise InputError(f"{name}: the Meta-World families are not part of mtjax yet")
     if name.startswith("MT-") and name not in MTENV_IDS:
@@ -80,12 +80,12 @@ def family_named(name: str, settings: dict[str, Any]) -> Env:
 def make(
     name: str, *, tasks: str = "train", task_obs: str = "context", render_mode: str | None = None, **settings: Any
 ) -> "FamilyEnv":
-    """Return the family ``name``, or MTEnv's ``name``, as a Gymnasium environment.
+    """Return a family as a Gymnasium environment.
 
     Args:
-        name: as ``mtjax.make`` knows it, or one of ``MTENV_IDS``.
-        tasks: the split that is sampled: train, interpolation, extrapolation or all.
-        task_obs: what is seen of the task: its context, its id, or none.
+        name: a name of ``mtjax.make``, or one of ``MTENV_IDS``.
+        tasks: the split from which tasks are drawn: train, interpolation, extrapolation or all.
+        task_obs: the observation of the task: "context", "id" or "none".
         render_mode: "rgb_array" for families that MuJoCo simulates, or None.
         settings: fields of the family.
 
@@ -96,16 +96,16 @@ def make(
 
 
 class FamilyEnv(TaskStream, gymnasium.Env):
-    """A family with MTEnv's interface: ``reset`` begins an episode of the present task and never changes the task.
+    """A family with MTEnv's interface. ``reset`` begins an episode of the current task and never changes the task.
 
-    Observation: ``env_obs`` (O,), what a single-task environment returns; ``task_obs``, what may be seen of the task:
-        its context (C,), its number among all tasks of the family, or nothing (0,).
+    Observation: ``env_obs`` (O,) is the observation of the world. ``task_obs`` is that of the task: its context (C,),
+        its number among all tasks of the family, or nothing (0,).
     Action: (A,) in [-1, 1]. A time limit truncates.
-    Task state: an int, which with the family's settings is all that is needed to enter the task again. The first task
-        of the split is entered at the start; a new task needs a reset before it can be stepped.
-    Streams: ``reset(seed=...)`` seeds the environment's, ``seed_task(seed)`` or ``reset(options={"task_seed": seed})``
-        the tasks'; unseeded they start from fresh entropy.
-    Info: ``task_id``, the task's number, and ``params``, its parameters in SI units.
+    Task state: an int. With the family's settings it identifies the task. The environment starts with the first task
+        of the split. After a change of the task call ``reset`` before ``step``.
+    Random streams: ``reset(seed=...)`` seeds that of the environment; ``seed_task(seed)`` or
+        ``reset(options={"task_seed": seed})`` seeds that of the tasks. Unseeded streams start from fresh entropy.
+    Info: ``task_id`` is the task's number, ``params`` its parameters in SI units.
     """
 
     def __init__(self, family: Env, tasks: str = "train", task_obs: str = "context", render_mode: str | None = None):
@@ -121,7 +121,7 @@ class FamilyEnv(TaskStream, gymnasium.Env):
         self.set_task_state(self._table.first)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
-        """Begin an episode of the present task. The one option is ``task_seed``."""
+        """Begin an episode of the current task. The only option is ``task_seed``."""
         super().reset(seed=seed)
         options = read_options(options, ("task_seed",))
         if "task_seed" in options:
@@ -140,27 +140,27 @@ class FamilyEnv(TaskStream, gymnasium.Env):
         return self._observe(), float(step.reward), bool(step.terminated), truncated, info
 
     def render(self) -> np.ndarray | None:
-        """Draw the world as it is now (height, width, 3) uint8."""
+        """Return a picture (height, width, 3) uint8 of the world as it is now."""
         if self.render_mode is None or self._step is None:
             raise InputError("to draw, give render_mode='rgb_array' to make, and reset first")
         return render.film(self.family, int(self._task.row), np.asarray(self._step.state.qpos)[None])[0]  # type: ignore
 
     def get_task_obs(self) -> Any:
-        """What may be seen of the present task."""
+        """Return the observation of the current task."""
         return self._table.observe(self._row)
 
     def get_task_state(self) -> int:
-        """All that is needed to enter the present task again."""
+        """Return the state of the current task, from which it can be entered again."""
         return self._row
 
     def set_task_state(self, task_state: int) -> None:
-        """Enter a task. The episode of the former one is over: reset next."""
+        """Enter a task. This ends the episode; call ``reset`` next."""
         self._row = self._table.check(task_state)
         self._task = self._table.enter(self._row)
         self._step: Step | None = None
 
     def sample_task_state(self) -> int:
-        """Draw a task from the tasks' stream, without entering it."""
+        """Draw a task from the tasks' random stream without entering it."""
         return self._table.sample(self.np_random_task, 1)[0]
 
     def reset_task_state(self) -> None:

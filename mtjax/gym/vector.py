@@ -1,4 +1,4 @@
-"""Many worlds of one family as a Gymnasium vector environment: one compiled program steps them all."""
+"""A Gymnasium vector environment of many worlds of a family, stepped by one compiled program."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -17,7 +17,7 @@ from mtjax.types import Array, Env, InputError, Step
 
 
 class Programs(NamedTuple):
-    """A family's functions over worlds, mapped along one flat axis and compiled once for each number of worlds."""
+    """The jitted functions of a family, mapped over worlds and compiled once for each number of worlds."""
 
     reset: Any  # tasks, seeds (worlds, 2) -> Step
     step: Any  # tasks, state, actions -> Step
@@ -31,7 +31,7 @@ def _programs(family: Env) -> Programs:
 
 @jax.jit
 def _where(mask: Array, ours: Step, theirs: Step) -> Step:
-    """Our step for the worlds in ``mask``, their step for the others."""
+    """Return ``ours`` for the worlds in ``mask`` and ``theirs`` for the others."""
     pick = lambda x, y: jnp.where(mask.reshape(mask.shape + (1,) * (x.ndim - 1)), x, y)
     return jax.tree.map(pick, ours, theirs)
 
@@ -45,14 +45,14 @@ def make_vec(
     resample_tasks: bool = False,
     **settings: Any,
 ) -> "FamilyVectorEnv":
-    """Return ``num_envs`` worlds of the family ``name``, or of MTEnv's ``name``, as a Gymnasium vector environment.
+    """Return many worlds of a family as a Gymnasium vector environment.
 
     Args:
-        name: as ``mtjax.make`` knows it, or one of ``MTENV_IDS``.
-        num_envs: worlds, spread evenly over the tasks.
-        tasks: the split whose tasks the worlds hold: train, interpolation, extrapolation or all.
-        task_obs: what is seen of the task: its context, its id, or none.
-        resample_tasks: every episode has a task of its own, drawn from the split.
+        name: a name of ``mtjax.make``, or one of ``MTENV_IDS``.
+        num_envs: number of worlds, spread evenly over the tasks.
+        tasks: the split of the worlds' tasks: train, interpolation, extrapolation or all.
+        task_obs: the observation of the task: "context", "id" or "none".
+        resample_tasks: draw a new task from the split for every episode.
         settings: fields of the family.
 
     Raises:
@@ -62,14 +62,14 @@ def make_vec(
 
 
 class FamilyVectorEnv(TaskStream, VectorEnv):
-    """Worlds of one family, each with a task of its own; ``FamilyEnv`` is the same for one world.
+    """Worlds of one family, each with its own task. ``FamilyEnv`` is the same for one world.
 
-    Worlds are task-major: with T tasks world i holds task ``i * T // num_envs`` of the split, so that where T divides
-    ``num_envs`` an array (num_envs, ...) reshapes to (T, num_envs // T, ...). Observations, task observations and task
-    states have the worlds as leading axis. ``reset`` changes no task, unless every episode has its own.
+    Worlds are task-major: with T tasks, world i has task ``i * T // num_envs`` of the split. If T divides ``num_envs``,
+    an array (num_envs, ...) reshapes to (T, num_envs // T, ...). Worlds are the leading axis of observations, task
+    observations and task states. ``reset`` changes no task unless ``resample_tasks`` is set.
 
-    An episode that ends returns its own last observation; the next step ignores the world's action, starts it anew and
-    returns its first observation with a reward of 0 (``AutoresetMode.NEXT_STEP``).
+    The last step of an episode returns the episode's own last observation. The next step ignores the world's action,
+    begins a new episode and returns its first observation with a reward of 0 (``AutoresetMode.NEXT_STEP``).
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class FamilyVectorEnv(TaskStream, VectorEnv):
         self.set_task_state(self._table.chosen[np.arange(num_envs) * len(self._table.chosen) // num_envs])
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
-        """Begin an episode in every world, or in those of the option ``reset_mask`` (num_envs,).
+        """Begin an episode in every world, or in the worlds of the option ``reset_mask`` (num_envs,) bool.
 
         The other option is ``task_seed``.
         """
@@ -111,7 +111,7 @@ class FamilyVectorEnv(TaskStream, VectorEnv):
         return self._observe(self._step), self._table.describe(self._rows)
 
     def step(self, actions: np.ndarray) -> tuple[dict, np.ndarray, np.ndarray, np.ndarray, dict]:
-        """Advance every world one step under ``actions`` (num_envs, A), or start it anew if its episode has ended."""
+        """Advance every world one step under ``actions`` (num_envs, A). Worlds whose episode has ended are reset."""
         if self._step is None:
             raise gymnasium.error.ResetNeeded("call reset() first, and after each change of the tasks")
         step = self._programs.step(self._tasks, self._step.state, read_action(actions, self.action_space))
@@ -125,15 +125,15 @@ class FamilyVectorEnv(TaskStream, VectorEnv):
         return self._observe(step), reward, terminated, truncated, self._table.describe(self._rows)
 
     def get_task_obs(self) -> np.ndarray:
-        """What may be seen of the present tasks."""
+        """Return the observation of the current tasks."""
         return self._table.observe(self._rows)
 
     def get_task_state(self) -> list[int]:
-        """All that is needed to enter the present tasks again."""
+        """Return the states of the current tasks, from which they can be entered again."""
         return self._rows.tolist()
 
     def set_task_state(self, task_state: Sequence[int] | np.ndarray) -> None:
-        """Enter a task in every world. The episodes of the former ones are over: reset next."""
+        """Enter a task in every world. This ends all episodes; call ``reset`` next."""
         if len(task_state) != self.num_envs:
             raise InputError(f"give a task state for each of the {self.num_envs} worlds, not {len(task_state)}")
         self._enter(np.array([self._table.check(state) for state in task_state]))
@@ -141,7 +141,7 @@ class FamilyVectorEnv(TaskStream, VectorEnv):
         self._ended, self._elapsed = np.zeros(self.num_envs, bool), np.zeros(self.num_envs, int)
 
     def sample_task_state(self) -> list[int]:
-        """Draw a task for every world from the tasks' stream, without entering it."""
+        """Draw a task for every world from the tasks' random stream without entering it."""
         return self._table.sample(self.np_random_task, self.num_envs)
 
     def reset_task_state(self) -> None:
@@ -152,7 +152,7 @@ class FamilyVectorEnv(TaskStream, VectorEnv):
         self._rows, self._tasks = rows, self._table.enter(rows)
 
     def _restart(self, worlds: np.ndarray, step: Step | None) -> Step:
-        """Begin an episode in ``worlds`` (num_envs,) bool; the others stay where ``step`` brought them."""
+        """Begin an episode in ``worlds`` (num_envs,) bool. The others keep their state in ``step``."""
         if self._resample:
             rows = self._rows.copy()
             rows[worlds] = self._table.sample(self.np_random_task, int(worlds.sum()))

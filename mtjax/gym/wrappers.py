@@ -1,4 +1,4 @@
-"""Wrappers that choose tasks, and one that gives any Gymnasium environment the interface of tasks."""
+"""Wrappers that choose tasks, and one that gives any Gymnasium environment MTEnv's interface."""
 
 import copy
 from collections.abc import Callable
@@ -13,14 +13,14 @@ from gymnasium.utils import RecordConstructorArgs
 from mtjax.gym.tasks import TaskStream
 from mtjax.types import InputError
 
-_MAX_DRAWS = 100  # for each task of a bag, before it counts as one of too few
+_MAX_DRAWS = 100  # for each task of a bag, before giving up
 
 
 class TaskWrapper(gymnasium.Wrapper):
-    """Passes MTEnv's methods on to the environment inside, which other wrappers may hide."""
+    """A wrapper that passes MTEnv's methods on to the environment inside, through other wrappers."""
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict]:
-        """Begin an episode; the option ``task_seed`` seeds the tasks' stream first."""
+        """Begin an episode. The option ``task_seed`` seeds the tasks' random stream first."""
         options = dict(options or {})
         if "task_seed" in options:
             self.seed_task(options.pop("task_seed"))
@@ -35,19 +35,19 @@ class TaskWrapper(gymnasium.Wrapper):
 
     @property
     def np_random_task(self) -> np.random.Generator:
-        """The generator that tasks are drawn with."""
+        """Return the generator of the tasks."""
         return self.env.get_wrapper_attr("np_random_task")
 
     def seed_task(self, seed: int | None = None) -> None:
-        """Start the stream of tasks anew."""
+        """Restart the tasks' random stream."""
         self.env.get_wrapper_attr("seed_task")(seed)
 
     def get_task_obs(self) -> Any:
-        """What may be seen of the present task."""
+        """Return the observation of the current task."""
         return self.env.get_wrapper_attr("get_task_obs")()
 
     def get_task_state(self) -> Any:
-        """All that is needed to enter the present task again."""
+        """Return the state of the current task, from which it can be entered again."""
         return self.env.get_wrapper_attr("get_task_state")()
 
     def set_task_state(self, task_state: Any) -> None:
@@ -55,7 +55,7 @@ class TaskWrapper(gymnasium.Wrapper):
         self.env.get_wrapper_attr("set_task_state")(task_state)
 
     def sample_task_state(self) -> Any:
-        """Draw a task, without entering it."""
+        """Draw a task without entering it."""
         return self.env.get_wrapper_attr("sample_task_state")()
 
     def reset_task_state(self) -> None:
@@ -63,15 +63,15 @@ class TaskWrapper(gymnasium.Wrapper):
         self.set_task_state(self.sample_task_state())
 
     def _choose_task(self) -> None:
-        """What happens to the task before a reset."""
+        """Change the task before a reset. By default do nothing."""
 
     def _see(self, obs: Any) -> Any:
-        """What becomes of an observation, which must not be changed in place."""
+        """Return the observation that the wrapper shows. It must not change ``obs`` in place."""
         return obs
 
 
 class SampleRandomTask(TaskWrapper, RecordConstructorArgs):
-    """Every reset begins an episode of a newly drawn task."""
+    """A wrapper that draws a new task at every reset."""
 
     def __init__(self, env: gymnasium.Env):
         RecordConstructorArgs.__init__(self)
@@ -82,10 +82,10 @@ class SampleRandomTask(TaskWrapper, RecordConstructorArgs):
 
 
 class NTasks(TaskWrapper, RecordConstructorArgs):
-    """A fixed bag of ``n`` different tasks, drawn when it is first needed; tasks are sampled from the bag.
+    """A wrapper that draws tasks from a fixed bag of ``n`` different tasks.
 
-    The bag follows from the seed of the tasks' stream: seeding it draws a new bag. Before a task is set, the present
-    task is the bag's first.
+    The bag is drawn when it is first needed. ``seed_task`` decides its content, and draws a new bag. The bag's first
+    task is the current one until another is set.
     """
 
     def __init__(self, env: gymnasium.Env, n: int):
@@ -99,23 +99,23 @@ class NTasks(TaskWrapper, RecordConstructorArgs):
 
     @property
     def tasks(self) -> list[Any]:
-        """The states of the ``n`` tasks."""
+        """Return the states of the ``n`` tasks."""
         if not self._bag:
             self._bag = self._draw_bag()
         return list(self._bag)
 
     def seed_task(self, seed: int | None = None) -> None:
-        """Start the stream of tasks anew, and with it the bag, whose first task becomes the present one."""
+        """Restart the tasks' random stream, and draw a new bag. Its first task becomes the current one."""
         super().seed_task(seed)
         self._bag, self._entered = [], False
 
     def get_task_obs(self) -> Any:
-        """What may be seen of the present task."""
+        """Return the observation of the current task."""
         self._choose_task()
         return super().get_task_obs()
 
     def get_task_state(self) -> Any:
-        """All that is needed to enter the present task again."""
+        """Return the state of the current task, from which it can be entered again."""
         self._choose_task()
         return super().get_task_state()
 
@@ -125,7 +125,7 @@ class NTasks(TaskWrapper, RecordConstructorArgs):
         self._entered = True
 
     def sample_task_state(self) -> Any:
-        """Draw a task of the bag, without entering it."""
+        """Draw a task of the bag without entering it."""
         return self.tasks[self.np_random_task.integers(self.n)]
 
     def _choose_task(self) -> None:
@@ -144,7 +144,7 @@ class NTasks(TaskWrapper, RecordConstructorArgs):
 
 
 class NTasksId(NTasks):
-    """A fixed bag of ``n`` tasks, of which the place in the bag is seen: a task's state and observation are an int."""
+    """A fixed bag of ``n`` tasks. The state and the observation of a task are its place in the bag, an int."""
 
     def __init__(self, env: gymnasium.Env, n: int):
         super().__init__(env, n)
@@ -155,11 +155,11 @@ class NTasksId(NTasks):
         self._place = 0
 
     def get_task_obs(self) -> np.int64:
-        """The task's place in the bag."""
+        """Return the task's place in the bag."""
         return np.int64(self.get_task_state())
 
     def get_task_state(self) -> int:
-        """The task's place in the bag."""
+        """Return the task's place in the bag."""
         self._choose_task()
         return self._place
 
@@ -183,11 +183,11 @@ class NTasksId(NTasks):
 
 
 class EnvToMTEnv(TaskStream, TaskWrapper, RecordConstructorArgs):
-    """Gives any Gymnasium environment the interface of tasks.
+    """A wrapper that gives any Gymnasium environment MTEnv's interface.
 
-    A task's state is an element of ``task_observation_space``, is seen as it is, and is put into effect by
-    ``apply_task(env.unwrapped, task_state)`` whenever a task is entered; without it tasks differ in name alone. The
-    first task is drawn when it is needed. Where the state is more than may be seen, override ``get_task_obs`` and
+    The state of a task is an element of ``task_observation_space``, and is also its observation. Entering a task calls
+    ``apply_task(env.unwrapped, task_state)``; without ``apply_task`` tasks differ in name alone. The first task is
+    drawn when it is needed. If agents may not see the whole state, override ``get_task_obs`` and
     ``sample_task_state``.
     """
 
@@ -205,11 +205,11 @@ class EnvToMTEnv(TaskStream, TaskWrapper, RecordConstructorArgs):
         self.observation_space = spaces.Dict({"env_obs": env.observation_space, "task_obs": task_observation_space})
 
     def get_task_obs(self) -> Any:
-        """What may be seen of the present task: its state."""
+        """Return the observation of the current task, which is its state."""
         return self.get_task_state()
 
     def get_task_state(self) -> Any:
-        """All that is needed to enter the present task again."""
+        """Return the state of the current task, from which it can be entered again."""
         self._choose_task()
         return copy.deepcopy(self._task_state)
 
@@ -220,7 +220,7 @@ class EnvToMTEnv(TaskStream, TaskWrapper, RecordConstructorArgs):
             self._apply_task(self.env.unwrapped, task_state)
 
     def sample_task_state(self) -> Any:
-        """Draw a task, without entering it."""
+        """Draw a task without entering it."""
         self._task_space.seed(int(self.np_random_task.integers(2**31)))
         return self._task_space.sample()
 

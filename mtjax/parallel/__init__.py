@@ -1,1 +1,1 @@
-"""Many devices and many processes."""
+"""Training on several devices and in several processes."""

@@ -1,8 +1,8 @@
-"""A device's share of a seed's environments, where there are more devices than seeds.
+"""Collective operations between the devices that share a seed's environments.
 
-The devices of a seed hold the same agent and make the same updates of it; worlds and replay are split along ``E``.
-Programs are written as for one device and ask here for what another device holds. Whether there is one, the mesh says
-under which they are traced; without it, all of these return what they are given.
+The devices of a seed hold the same agent and make the same updates. Worlds and replay are split along ``E``. Programs
+are written as for one device, and call these functions to reach the data of other devices. The mesh under which they
+are traced says how many devices there are. Without a mesh every function returns its argument.
 """
 
 from typing import Any
@@ -34,7 +34,7 @@ def own(tree: Any, axis: int) -> Any:
 
 
 def whole(tree: Any, axis: int) -> Any:
-    """Put all devices' parts of ``tree`` side by side along ``axis``, which is E."""
+    """Join all devices' parts of ``tree`` along ``axis``, which is E."""
     return tree if count() == 1 else jax.lax.all_gather(tree, AXIS, axis=axis, tiled=True)
 
 
@@ -44,7 +44,7 @@ def total(tree: Any) -> Any:
 
 
 def pick(tree: Any, holder: Array) -> Any:
-    """Take each row from the device that ``holder`` (...) names by its number; leaves (*holder.shape, ...)."""
+    """Take each row of leaves (*holder.shape, ...) from the device whose number is in ``holder`` (...)."""
     if count() == 1:
         return tree
     mine = holder == jax.lax.axis_index(AXIS)
@@ -54,6 +54,6 @@ def pick(tree: Any, holder: Array) -> Any:
 
 
 def agreed(tree: Any) -> Any:
-    """Give all devices the first one's numbers: GPUs may add in any order, and then round differently."""
+    """Give all devices the first one's floats, because GPUs may add in another order and round differently."""
     first = lambda x: pick(x, jnp.int32(0)) if jnp.issubdtype(x.dtype, jnp.floating) else x
     return jax.tree.map(first, tree)

@@ -1,4 +1,4 @@
-"""Several processes of one run, on one host or on many, by ``jax.distributed``."""
+"""Several processes of one run, on one host or on many, joined by ``jax.distributed``."""
 
 import os
 from collections.abc import Callable
@@ -12,20 +12,25 @@ from jax.experimental import multihost_utils
 from mtjax.types import InputError
 
 _VARIABLES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
-_LAUNCHERS = ("SLURM_JOB_ID", "OMPI_MCA_orte_hnp_uri", "TPU_WORKER_ID", "KUBERNETES_SERVICE_HOST")  # that JAX reads
+_LAUNCHERS = (
+    "SLURM_JOB_ID",
+    "OMPI_MCA_orte_hnp_uri",
+    "TPU_WORKER_ID",
+    "KUBERNETES_SERVICE_HOST",
+)  # variables of launchers that JAX recognises
 _LONGEST_PATH = 4096
-_PATIENCE = 60  # seconds for which a process that ends, or fails, waits for the others before it ends them as well
+_PATIENCE = 60  # seconds that a process waits for the others at its end before it stops them
 
 
 def initialise() -> None:
-    """Join the processes of a run on several hosts; before anything touches a device.
+    """Join the processes of a run. Call it before anything touches a device.
 
-    JAX finds the others by itself under SLURM, Open MPI, Kubernetes and on TPUs. Other launchers say in each process
-    where process 0 listens (JAX_COORDINATOR_ADDRESS, host:port), how many processes there are (JAX_NUM_PROCESSES), and
-    which of them this is (JAX_PROCESS_ID, from 0).
+    JAX finds the other processes by itself under SLURM, Open MPI, Kubernetes and on TPUs. Elsewhere each process needs
+    three variables: JAX_COORDINATOR_ADDRESS (host:port of process 0), JAX_NUM_PROCESSES, and JAX_PROCESS_ID (its own
+    number, from 0).
 
     Raises:
-        InputError: nothing says so, or the processes do not find each other.
+        InputError: there is no known launcher and a variable is missing, or the processes do not find each other.
     """
     given = {name: os.environ[name] for name in _VARIABLES if os.environ.get(name)}
     launched = any(name in os.environ for name in _LAUNCHERS)
@@ -45,31 +50,31 @@ def initialise() -> None:
 
 
 def is_first() -> bool:
-    """Whether this is the process that writes and prints: the only one, or number 0."""
+    """Return whether this is process 0, the only one that writes and prints."""
     return jax.process_index() == 0
 
 
-def wait() -> None:
-    """Go on once every process is here, so that none times how long another compiles."""
+def wait_for_all() -> None:
+    """Wait until every process is here, so that none measures the compile time of another."""
     if jax.process_count() > 1:
         multihost_utils.sync_global_devices("mtjax")
 
 
 def gather(tree: Any) -> Any:
-    """Arrays (S, ...) whole, on every host."""
+    """Return the whole arrays (S, ...) on every host."""
     return jax.device_get(tree) if jax.process_count() == 1 else multihost_utils.process_allgather(tree, tiled=True)
 
 
-def anywhere(flag: bool) -> bool:
-    """Whether a flag is up in any process; all must ask."""
+def any_process(flag: bool) -> bool:
+    """Return whether a flag is true in any process. Every process must call this."""
     return flag if jax.process_count() == 1 else bool(np.any(multihost_utils.process_allgather(np.asarray(flag))))
 
 
-def agreed(choose: Callable[[], Path]) -> Path:
-    """The path that the first process chooses, in every process; all must ask.
+def broadcast_path(choose: Callable[[], Path]) -> Path:
+    """Return the path that the first process chooses, in every process. Every process must call this.
 
     Raises:
-        InputError: the first process could not choose, and says why itself.
+        InputError: the first process could not choose a path. It reports the reason itself.
     """
     if jax.process_count() == 1:
         return choose()

@@ -1,4 +1,4 @@
-"""Which devices share a run's seeds, and each seed's environments, and how arrays are put onto them."""
+"""The mesh of devices that share a run's seeds and environments, and the placement of arrays on it."""
 
 from typing import Any
 
@@ -9,20 +9,20 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from mtjax.parallel import collectives
 from mtjax.types import InputError
 
-SAME, BY_SEED = PartitionSpec(), PartitionSpec("seeds")  # what every device has whole; leaves with a leading S
+REPLICATED, BY_SEED = PartitionSpec(), PartitionSpec("seeds")  # whole on every device; split along a leading S
 BY_WORLD = PartitionSpec("seeds", None, collectives.AXIS)  # leaves (S, T, E, ...)
 LEAST_WORLDS = 2048
-"""Worlds that a device keeps, at the least, when a seed's environments are shared out: fewer do not fill a GPU."""
+"""Least number of worlds per device when devices share a seed's environments. Fewer do not fill a GPU."""
 
 
 def mesh_for(seeds: int, num_tasks: int, num_envs: int, most: int | None = None) -> Mesh | None:
-    """The devices that share ``seeds`` evenly, and each seed's environments where devices are left over.
+    """Return the mesh of devices that share ``seeds`` evenly, or None if that is one device.
 
-    Of each process these are as many as divide its seeds, times as many as divide the environments of a task and leave
-    each device ``LEAST_WORLDS``; ``most`` of them at most. None if it is one device.
+    Devices that are left over share the environments of each seed, if their number divides a task's environments and
+    leaves each device ``LEAST_WORLDS`` worlds. At most ``most`` devices of each process are used.
 
     Raises:
-        InputError: there are several processes, and their number does not divide the seeds.
+        InputError: the number of processes does not divide the seeds.
     """
     processes = jax.process_count()
     if seeds % processes:
@@ -41,7 +41,7 @@ def mesh_for(seeds: int, num_tasks: int, num_envs: int, most: int | None = None)
 
 
 def describe(mesh: Mesh | None, seeds: int, num_envs: int) -> str:
-    """A line on how many devices share the seeds, and their environments; empty if there is but one."""
+    """Return a line on how devices share seeds and environments; an empty string for one device."""
     groups, each = (1, 1) if mesh is None else mesh.devices.shape
     used, found, own = groups * each, jax.device_count(), seeds // groups
     if found == 1:
@@ -53,13 +53,13 @@ def describe(mesh: Mesh | None, seeds: int, num_envs: int) -> str:
     return f"devices: {used} of {found}{hosts}, {own} seed{'s' * (own > 1)} on {split}{rest}"
 
 
-def everywhere(mesh: Mesh | None, tree: Any) -> Any:
-    """Put arrays that all processes hold alike whole onto every device."""
-    return tree if mesh is None else _place(NamedSharding(mesh, SAME), tree)
+def replicate(mesh: Mesh | None, tree: Any) -> Any:
+    """Copy arrays that are equal in all processes to every device."""
+    return tree if mesh is None else _place(NamedSharding(mesh, REPLICATED), tree)
 
 
-def by_seed(mesh: Mesh | None, tree: Any) -> Any:
-    """Put arrays (S, ...) that all processes hold alike onto the devices of their seeds."""
+def shard_by_seed(mesh: Mesh | None, tree: Any) -> Any:
+    """Split arrays (S, ...) that are equal in all processes over the devices of their seeds."""
     return tree if mesh is None else _place(NamedSharding(mesh, BY_SEED), tree)
 
 

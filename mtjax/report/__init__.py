@@ -1,1 +1,1 @@
-"""Statistics, figures, films, diagnostics and tables of what was learned."""
+"""Statistics, figures, films, diagnostics and tables of a run's results."""

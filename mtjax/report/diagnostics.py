@@ -1,8 +1,8 @@
-"""Diagnostics of a trained agent: whether its tasks pull its parameters apart, and how much of its networks is in use.
+"""Diagnostics of a trained agent: conflicts between its tasks' gradients, and the use of its networks' units.
 
-They are taken on the training tasks, from the agent and the replay of a run's last checkpoint, by fixed keys. Gradients
-are of the agent's own losses, each task's alone, whatever rule combined them in training; importance of tasks is left
-out. What tasks do not share has no cosines: tasks cannot conflict over it.
+They use the training tasks, the agent and the replay of a run's last checkpoint, and fixed random keys. Gradients are
+those of the agent's own losses for each task alone, without the rule that combined them in training and without task
+weights. Cosines are over shared parameters only, because tasks cannot conflict over parameters of their own.
 """
 
 import json
@@ -26,9 +26,9 @@ from mtjax.training.policy import Policy
 from mtjax.types import Array, InputError, Key, Metrics, Task, Transition
 
 DRAWS = 16
-"""Batches over which gradients, and what follows from them, are averaged."""
+"""Number of batches over which gradients and their statistics are averaged."""
 SAMPLE = 1024
-"""Transitions of each task on which units and features are looked at."""
+"""Transitions of each task on which units and features are measured."""
 DORMANT = 0.025
 """tau: a unit is dormant if its activity is at most this share of its layer's mean (Sokar et al. 2023)."""
 HELD = 0.99
@@ -36,7 +36,7 @@ HELD = 0.99
 
 
 class Findings(NamedTuple):
-    """What was found of the critics or of the actor, on average over seeds (and over critics)."""
+    """Diagnostics of the critics or of the actor, averaged over seeds (and critics)."""
 
     gram: Any  # (T, T) inner products of the tasks' gradients on shared parameters; None if there are none
     cosine: Any  # (T, T) their cosines, or None
@@ -50,7 +50,7 @@ class Findings(NamedTuple):
 
 
 class Diagnostics(NamedTuple):
-    """What was found of an agent."""
+    """Diagnostics of an agent."""
 
     critic: Findings
     actor: Findings
@@ -60,11 +60,11 @@ class Diagnostics(NamedTuple):
 
 
 def diagnose(policy: Policy, replay: Ring, batch_size: int) -> Diagnostics:
-    """Look at every seed of a run, and average.
+    """Return the diagnostics of a policy, averaged over its seeds.
 
     Args:
         replay: rows (S, T, H, E, ...).
-        batch_size: transitions of a task in each batch; the run's own makes norms those of training.
+        batch_size: transitions of a task in each batch. The run's own size gives the gradient norms of training.
 
     Raises:
         InputError: the replay is empty, or the agent has no critics of actions.
@@ -108,7 +108,7 @@ def _average_gradients(agent: SAC, state: Any, replay: Ring, tasks: Task, key: K
 
 
 def compare_gradients(agent: SAC, state: Any, batch: Transition, tasks: Task, key: Key) -> dict[str, Any]:
-    """Differentiate the agent's losses on a batch (T, B, ...), for each task alone.
+    """Differentiate the agent's losses on a batch (T, B, ...) for each task alone.
 
     Returns:
         "critic" and "actor": gram, cosine, conflict and gradient_norm, as in ``Findings``; "td_error" (T,).
@@ -135,7 +135,7 @@ def _compare(params: Params, loss: Callable, data: Any) -> tuple[dict[str, Any],
 
 
 class Activity(NamedTuple):
-    """What a network's units do. A single transition's has no leading axes."""
+    """Outputs of a network's units. For a single transition there are no leading axes."""
 
     layers: dict[str, Any]  # (..., units) of each layer of ReLUs
     hidden: Any  # (..., width), the layer on which heads stand
@@ -147,7 +147,7 @@ def _sample_activity(agent: SAC, state: Any, replay: Ring, tasks: Task, key: Key
 
 
 def activity(agent: SAC, state: Any, batch: Transition, tasks: Task) -> dict[str, Activity]:
-    """Watch "critic" and "actor" on a batch (T, B, ...). A representation under both is counted as the actor's.
+    """Return the activity of "critic" and "actor" on a batch (T, B, ...). A representation counts as the actor's.
 
     Returns:
         mean activity over the batch (T, N, units), and hidden layers (T, B, N, width); N is 1 for the actor.
@@ -169,7 +169,7 @@ def activity(agent: SAC, state: Any, batch: Transition, tasks: Task) -> dict[str
 
 
 def watch(function: Callable, *arguments: Any) -> Activity:
-    """Evaluate networks on a single transition and note what every ReLU, and the last body, puts out.
+    """Evaluate networks on a single transition, and record the outputs of every ReLU and of the last body.
 
     Layers are named by the path of modules to them.
     """
@@ -195,7 +195,7 @@ def watch(function: Callable, *arguments: Any) -> Activity:
 
 
 def utilisation(network: Network, params: Params, seen: Activity) -> dict[str, Any]:
-    """Dormant units and effective ranks, as in ``Findings``, of what ``activity`` gave."""
+    """Return dormant units and effective ranks, as in ``Findings``, from the result of ``activity``."""
     disjoint, front = "body" in params.own, type(network.front).__name__
     by_layer, units = {}, {}
     for name, levels in seen.layers.items():
@@ -217,12 +217,12 @@ def utilisation(network: Network, params: Params, seen: Activity) -> dict[str, A
 
 
 def dormant_share(levels: np.ndarray) -> float:
-    """The share of units of which the mean activity (..., units) is at most DORMANT times their layer's mean."""
+    """Return the share of units whose mean activity (..., units) is at most DORMANT times their layer's mean."""
     return float(np.mean(levels <= DORMANT * np.mean(levels, axis=-1, keepdims=True)))
 
 
 def effective_ranks(features: np.ndarray) -> tuple[float, float]:
-    """Effective ranks of features (rows, width), by their singular values s_1 >= s_2 >= ... and p = s / sum s.
+    """Return two effective ranks of features (rows, width), with singular values s_1 >= s_2 >= ... and p = s / sum s.
 
     Returns:
         the least k with p_1 + ... + p_k >= HELD ("srank", Kumar et al. 2021), and exp(-sum p log p) (Roy and Vetterli
@@ -241,7 +241,7 @@ def effective_ranks(features: np.ndarray) -> tuple[float, float]:
 
 
 def table(policy: Policy, found: Diagnostics) -> str:
-    """Lay out what was found: a line a network, and a line a task."""
+    """Return the diagnostics as text: one line per network, then one line per task."""
     lines = [
         f"training tasks, {DRAWS} batches of {found.batch_size} transitions of each:",
         f"{'network':10} {'cosine':>7} {'conflict':>9} {'dormant':>8}   effective rank",
@@ -264,13 +264,13 @@ def table(policy: Policy, found: Diagnostics) -> str:
 
 
 def mean_cosine(cosine: np.ndarray) -> float:
-    """The mean over pairs of different tasks; NaN for a single task."""
+    """Return the mean cosine over pairs of different tasks; NaN for a single task."""
     pairs = cosine[~np.eye(len(cosine), dtype=bool)]
     return float(np.mean(pairs)) if pairs.size else np.nan
 
 
 def write(policy: Policy, found: Diagnostics, directory: Path) -> None:
-    """Write ``diagnostics.json`` and ``diagnostics.png``."""
+    """Write ``diagnostics.json`` and ``diagnostics.png`` into ``directory``."""
     name, unit = policy.env.task_axis
     values = policy.env.task_values("train")
     tasks = policy.env.labels("train")
@@ -285,7 +285,7 @@ def write(policy: Policy, found: Diagnostics, directory: Path) -> None:
 
 
 def _plain(x: Any) -> Any:
-    """As JSON takes it: lists, numbers of seven digits, and null for what is not a number."""
+    """Convert to JSON's types: lists, numbers of seven digits, and null for NaN."""
     if isinstance(x, Mapping):
         return {str(k): _plain(v) for k, v in x.items()}
     if isinstance(x, np.ndarray | np.generic):

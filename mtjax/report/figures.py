@@ -1,7 +1,7 @@
 """Figures of returns and of diagnostics, written to PNG files without a display.
 
 Axes: ``S`` seeds, ``V`` evaluations, ``T`` tasks, ``E`` episodes. Bands and bars are 95 % percentile bootstrap
-intervals over seeds; there are none for a single seed. Whole seeds are resampled, because one agent learns all tasks.
+intervals over seeds. A single seed has none. Whole seeds are resampled, because one agent learns all tasks.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,7 +26,7 @@ _DOTS_PER_INCH = 120
 
 
 def learning_curve(path: str | Path, steps: np.ndarray, returns: Mapping[str, np.ndarray], title: str) -> None:
-    """Draw return against environment steps, one line a split: the mean over seeds, tasks and episodes.
+    """Draw return over environment steps, one line per split: the mean over seeds, tasks and episodes.
 
     Args:
         path: the PNG file to write.
@@ -50,7 +50,7 @@ def return_by_parameter(
     values: Mapping[str, np.ndarray],
     returns: Mapping[str, np.ndarray],
 ) -> None:
-    """Draw each task's mean return against its parameter, one marker shape a split.
+    """Draw each task's mean return over its parameter, one marker shape per split.
 
     Args:
         path: the PNG file to write.
@@ -68,7 +68,7 @@ def return_by_parameter(
 
 
 def return_by_task(path: str | Path, labels: Mapping[str, Sequence[str]], returns: Mapping[str, np.ndarray]) -> None:
-    """Draw each task's mean return in a line of its own, one marker shape a split.
+    """Draw each task's mean return on a line of its own, one marker shape per split.
 
     Args:
         path: the PNG file to write.
@@ -95,12 +95,12 @@ def return_by_task(path: str | Path, labels: Mapping[str, Sequence[str]], return
 def compare(
     path: str | Path, curves: Mapping[str, tuple[np.ndarray, np.ndarray]], label: str = "return on training tasks"
 ) -> None:
-    """Draw several agents' returns against environment steps.
+    """Draw several agents' returns over environment steps.
 
     Args:
         path: the PNG file to write.
         curves: agent -> (steps (V,), returns on the training tasks (S, V, T, E)).
-        label: of the axis of returns.
+        label: label of the axis of returns.
     """
     figure, axes = _new_figure()
     many = len(curves) > len(_COLOURS)
@@ -122,14 +122,14 @@ def interference(
     cosines: Mapping[str, np.ndarray | None],
     bars: Mapping[str, np.ndarray],
 ) -> None:
-    """Draw how the training tasks' gradients agree, a heat map for each network, and below it bars for each task.
+    """Draw the cosines of the training tasks' gradients, one heat map per network, and bars for each task below.
 
     Args:
         path: the PNG file to write.
         parameter: name of the parameter in which tasks differ.
         unit: its unit.
         values: (T,) the tasks' values of it.
-        cosines: network -> (T, T), or None if tasks share nothing of it.
+        cosines: network -> (T, T), or None if tasks share none of its parameters.
         bars: title -> (T,).
     """
     from matplotlib.figure import Figure
@@ -177,13 +177,13 @@ def _draw_cosines(axes: "Axes", network: str, cosine: np.ndarray | None, limit: 
 
 
 def _limit(cosine: np.ndarray) -> float:
-    """A round number that no cosine between different tasks exceeds."""
+    """Return a round number that no cosine between different tasks exceeds."""
     largest = np.max(np.abs(cosine[~np.eye(len(cosine), dtype=bool)]), initial=0.0)
     return next((limit for limit in (0.1, 0.2, 0.5) if largest <= limit), 1.0)
 
 
 def _label_tasks(axis: "Axis", labels: list[str], name: str) -> None:
-    """Put tasks' values on an axis: all of up to ten, else some."""
+    """Put the tasks' values on an axis, at most ten of them."""
     every = -(-len(labels) // 10)
     axis.set_ticks(range(0, len(labels), every), labels[::every])
     axis.set_tick_params(length=0, labelsize=8, labelrotation=45 if axis.axis_name == "x" and len(labels) > 5 else 0)

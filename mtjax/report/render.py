@@ -1,4 +1,4 @@
-"""Videos of one task, drawn without a display."""
+"""Videos of a task, drawn without a display."""
 
 import importlib
 import math
@@ -23,9 +23,9 @@ _FIX = (
 
 
 def choose_backend() -> str:
-    """Make MuJoCo draw with the OpenGL backend in ``MUJOCO_GL``, on Linux "egl" where it is unset; return its name.
+    """Select the OpenGL backend of ``MUJOCO_GL`` for MuJoCo, by default "egl" on Linux, and return its name.
 
-    It may be called after MuJoCo was imported. Raises whatever the backend raises where its libraries are missing.
+    It may be called after MuJoCo was imported. If libraries are missing, the backend raises its own error.
     """
     if platform.system() == "Linux":
         os.environ.setdefault("MUJOCO_GL", "egl")
@@ -37,14 +37,14 @@ def choose_backend() -> str:
 def film(env: Domain, task_row: int, qpos: np.ndarray, width: int = 320, height: int = 240) -> np.ndarray:
     """Draw the task in row ``task_row`` of ``env.table`` in each of the positions (H, nq).
 
-    The camera looks along +y and down, as cam0 of dm_control's finger does. It stands in one place for every task of
-    the family, so that their sizes can be compared, and does not follow a model that travels.
+    The camera looks along +y and down, like cam0 of dm_control's finger. It has the same place for every task of the
+    family, so that their sizes can be compared. It does not follow a model that travels.
 
     Returns:
         Frames (H, height, width, 3) uint8.
 
     Raises:
-        InputError: there is no such row, or no OpenGL backend works; then it names what to install.
+        InputError: there is no such row, or no OpenGL backend works. The message names what to install.
     """
     if not 0 <= task_row < env.count:
         raise InputError(f"there is no task {task_row}; this family has tasks 0 to {env.count - 1}")
@@ -61,9 +61,10 @@ def film(env: Domain, task_row: int, qpos: np.ndarray, width: int = 320, height:
 
 
 def write_video(path_stem: str | Path, frames: np.ndarray, fps: float) -> Path:
-    """Write frames (H, height, width, 3) uint8 to ``path_stem`` plus .mp4, or .gif where mediapy or ffmpeg is missing.
+    """Write frames (H, height, width, 3) uint8 to ``path_stem`` plus .mp4, and return the path.
 
-    A GIF keeps its speed, to 0.01 s a frame, by leaving out frames above 50 a second. Returns the file's path.
+    Without mediapy or ffmpeg the file is a GIF.
+    A GIF has at most 50 frames a second. Others are left out, so that its speed is right to 0.01 s a frame.
 
     Raises:
         InputError: the file exists already, or there are no frames.

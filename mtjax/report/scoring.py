@@ -1,4 +1,4 @@
-"""What ``python -m mtjax.evaluate`` does: score a trained run on every task of every split, plot it, film it."""
+"""The command ``python -m mtjax.evaluate``: score, plot and film a trained run on every task of every split."""
 
 import contextlib
 from pathlib import Path
@@ -18,19 +18,19 @@ from mtjax.training.policy import Policy, load, load_experience
 from mtjax.training.programs import enable_compile_cache
 from mtjax.types import SPLITS, InputError
 
-_FIRST_NUMBER = 1_000_000  # far from the numbers of a run's own evaluations, so that the episodes are new
+_FIRST_NUMBER = 1_000_000  # beyond the numbers of a run's own evaluations, so that the episodes are new
 _FILM_FPS, _FILM_SECONDS = 25, 10
 
 
 def report(run: str, point: int, episodes: int, seed: int, video: bool, diagnose: bool) -> None:
-    """Score the run, print the table, and leave table, plot and films in a new folder inside the run's.
+    """Score a run, print the table, and write table, plot and films into a new folder inside the run's folder.
 
     Args:
-        point: which setting of a run that holds several of a sweep.
+        point: number of the setting, if the run holds several settings of a sweep.
         episodes: episodes of each task and seed.
-        seed: chooses the starting states.
+        seed: seed of the starting states.
         video: film an episode of each task.
-        diagnose: measure how the training tasks' gradients agree, from the run's replay.
+        diagnose: write the diagnostics of the agent, from the run's replay.
     """
     enable_compile_cache()
     first = _first_seed(run, point)
@@ -53,7 +53,7 @@ def report(run: str, point: int, episodes: int, seed: int, video: bool, diagnose
 
 
 def _first_seed(run: str, point: int) -> int:
-    """The first number of a setting's seeds."""
+    """Return the first entry of S that belongs to a setting."""
     config = from_json(Path(run) / "config.json")
     if not 0 <= point < max(len(config.points), 1):
         raise InputError(f"point must be from 0 to {max(len(config.points), 1) - 1}, not {point}")
@@ -95,7 +95,7 @@ def _write(policy: Policy, episodes: dict[str, np.ndarray], directory: Path) -> 
 
 
 def _film(policy: Policy, directory: Path, seed: int) -> None:
-    """Film the beginning of one episode of every task of MuJoCo's families, at the speed at which it happens."""
+    """Film the start of one episode of every task of the MuJoCo families, in real time."""
     env = policy.env
     render.choose_backend()
     played = record(env, policy.agent, policy.state, env.tasks("all"), jnp.int32(seed))
@@ -107,14 +107,14 @@ def _film(policy: Policy, directory: Path, seed: int) -> None:
 
 
 def _film_family(policy: Policy, part: Part, played: Recording, directory: Path) -> None:
-    """Film the tasks of one family, of which ``played`` has the states."""
+    """Film the tasks of one family from the states in ``played``."""
     family: Any = part.family
     stride = max(round(1 / (_FILM_FPS * family.seconds_per_step)), 1)
     fps, longest = 1 / (stride * family.seconds_per_step), round(_FILM_SECONDS / family.seconds_per_step)
     for split in SPLITS:
         for i in family.table.rows[split]:
             place = part.places["all"][i]
-            row = int(played.rows[place])  # where ranges are continuous, an episode's own
+            row = int(played.rows[place])  # continuous ranges have a row for each episode
             shown = slice(0, min(longest, int(played.lengths[place])), stride)
             frames = render.film(family, policy.env.own_row(row), np.asarray(played.states.qpos[i, shown]))
             named = f"{split}-{policy.env.describe(row)}".replace("=", "-").replace(" ", "-")

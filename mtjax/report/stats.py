@@ -1,10 +1,10 @@
-"""Aggregate scores with intervals: whole seeds are the only unit that is resampled.
+"""Aggregate scores with bootstrap intervals that resample whole seeds only.
 
-One agent learns all tasks of a seed, so these rise and fall together and are no independent runs. A bootstrap within
+One agent learns all tasks of a seed, so they rise and fall together and are not independent runs. A bootstrap within
 each task (Agarwal et al. 2021, "Deep RL at the Edge of the Statistical Precipice") would make intervals too narrow;
 the interquartile mean and the probability of improvement are from that paper.
 
-Axes: ``S`` seeds come first; whatever follows, such as ``T`` tasks, belongs to its seed.
+Axes: ``S`` seeds come first. Further axes, such as ``T`` tasks, belong to a seed.
 """
 
 from collections.abc import Callable
@@ -16,7 +16,7 @@ Statistic = Callable[..., np.ndarray]  # takes an array and ``axis``, as ``iqm``
 
 
 class Interval(NamedTuple):
-    """A statistic and the bounds of its interval, which are nan where a single seed leaves them unknown."""
+    """A statistic and the bounds of its interval. The bounds of a single seed are nan."""
 
     point: float
     low: float
@@ -24,7 +24,7 @@ class Interval(NamedTuple):
 
 
 class Bootstrap(NamedTuple):
-    """How intervals are drawn: percentiles of so many resamples."""
+    """Settings of a percentile bootstrap."""
 
     resamples: int = 2000
     confidence: float = 0.95
@@ -47,7 +47,7 @@ def iqm(scores: np.ndarray, axis: int | None = None) -> np.ndarray:
 
 
 def seed_interval(scores: np.ndarray, statistic: Statistic = np.mean, bootstrap: Bootstrap = DEFAULT) -> Interval:
-    """Return a statistic of all scores (S, ...), and its interval over whole seeds.
+    """Return a statistic of all scores (S, ...) and its interval over whole seeds.
 
     Percentile intervals of few seeds are too narrow: in simulation, those of 95 % held the mean of normal scores in
     90 % of cases with ten seeds, in 84 % with five and in 75 % with three.
@@ -61,9 +61,8 @@ def paired_difference(
 ) -> Interval:
     """Return the statistic of ``a`` less that of ``b``, both (S, ...), and its interval over whole pairs of seeds.
 
-    Row ``s`` of both must be the same seed. What two runs of a seed share cancels, and the interval narrows. Where they
-    share nothing, pairs are right but arbitrary: others would give another interval, and ``unpaired_difference`` needs
-    none.
+    Row ``s`` of both must be the same seed. Effects that both runs of a seed share cancel, and the interval narrows.
+    Without shared effects the pairs are valid but arbitrary; then use ``unpaired_difference``.
 
     Raises:
         ValueError: the numbers of seeds differ.
@@ -77,16 +76,19 @@ def paired_difference(
 def unpaired_difference(
     a: np.ndarray, b: np.ndarray, statistic: Statistic = np.mean, bootstrap: Bootstrap = DEFAULT
 ) -> Interval:
-    """Return the statistic of ``a`` (S, ...) less that of ``b`` (S', ...), and its interval, drawing seeds of each."""
+    """Return the statistic of ``a`` (S, ...) less that of ``b`` (S', ...), and its interval.
+
+    The interval draws the seeds of each apart.
+    """
     of_a, of_b = _draw(bootstrap, a, b)
     return _difference(a, b, statistic, of_a, of_b, bootstrap)
 
 
 def probability_of_improvement(a: np.ndarray, b: np.ndarray, bootstrap: Bootstrap = DEFAULT) -> Interval:
-    """Return how probably a new seed of ``a`` scores higher than a new one of ``b`` on a task drawn at random.
+    """Return the probability that a new seed of ``a`` scores higher than one of ``b`` on a random task.
 
-    It is the share of all pairs of a seed of ``a`` (S, T) and one of ``b`` (S', T) in which the first is higher, a tie
-    counting half, averaged over tasks; its interval draws whole seeds of each on their own.
+    It is the share of pairs of a seed of ``a`` (S, T) and one of ``b`` (S', T) in which the first is higher, averaged
+    over tasks. A tie counts half. The interval draws the seeds of each apart.
     """
     first, second = np.asarray(a)[:, None], np.asarray(b)[None]
     wins = np.mean((first > second) + 0.5 * (first == second), axis=-1)  # (S, S')
@@ -113,7 +115,7 @@ def _of_all(statistic: Statistic, scores: np.ndarray) -> float:
 
 
 def _of_each(statistic: Statistic, scores: np.ndarray, draws: np.ndarray) -> np.ndarray:
-    """Take the statistic of every resample (resamples,); nan of a single seed, which says nothing of the spread."""
+    """Return the statistic of every resample (resamples,); nan for a single seed, which has no spread."""
     if len(scores) == 1:
         return np.full(len(draws), np.nan)
     resampled = np.asarray(scores, np.float64)[draws]

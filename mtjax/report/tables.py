@@ -11,13 +11,13 @@ from mtjax.training.policy import Policy
 
 
 def _interval(scores: np.ndarray) -> str:
-    """Mean of scores (S, T) with its 95% interval over seeds, if there are several."""
+    """Return the mean of scores (S, T) as text, with its 95% interval if there are several seeds."""
     point, low, high = seed_interval(scores)
     return f"{point:6.0f}" + (f"  [{low:.0f}, {high:.0f}]" if scores.shape[0] > 1 else "")
 
 
 def split_table(evaluations: Evaluations, parts: Sequence[Part] = ()) -> str:
-    """Lay out the last evaluation of a run: mean return by split, and the worst task's; then by family of a mixture."""
+    """Return a run's last evaluation as text: mean and worst task's return by split; of a mixture also by family."""
     last = {split: x[:, -1].mean(axis=-1) for split, x in evaluations.returns.items() if x.size}  # (S, T)
     lines = [f"{'split':15} {'tasks':>5} {'return':>7}  worst task"]
     lines += [_split_line(split, scores) for split, scores in last.items()]
@@ -33,7 +33,7 @@ def _split_line(split: str, scores: np.ndarray) -> str:
 
 
 def task_table(policy: Policy, episodes: dict[str, np.ndarray]) -> str:
-    """Lay out returns (S, T, episodes) by split and task, of a mixture a family after another."""
+    """Return a table of returns (S, T, episodes) by family, split and task."""
     parts = policy.env.parts
     lines = []
     for part in parts:

@@ -1,1 +1,1 @@
-"""Runs: the host's loop, their folders and checkpoints, sweeps, fine-tuning and trained policies."""
+"""Training runs: the host loop, run folders, checkpoints, sweeps, fine-tuning and trained policies."""

@@ -1,4 +1,4 @@
-"""Checkpoints of the whole training state, by orbax: what a run needs to go on bit for bit."""
+"""Checkpoints of the whole training state by orbax. A resumed run continues bit for bit."""
 
 import json
 import shutil
@@ -13,11 +13,11 @@ from mtjax.loop import TrainState
 from mtjax.types import InputError
 
 _KEPT = 2
-_SIZES = "sizes.json"  # of a checkpoint's files, to know a damaged one before orbax meets it
+_SIZES = "sizes.json"  # sizes of a checkpoint's files, by which damage is found before orbax reads them
 
 
 def save(directory: Path, state: TrainState) -> None:
-    """Write the state under its iteration; the last two checkpoints are kept."""
+    """Write the state under its iteration, and keep the last two checkpoints."""
     from orbax.checkpoint import v1 as ocp
 
     iteration = int(state.iteration)
@@ -35,21 +35,22 @@ def save(directory: Path, state: TrainState) -> None:
 
 
 def load(directory: Path, like: TrainState) -> TrainState:
-    """Read the newest checkpoint into the structure of ``like`` (shapes alone suffice), onto the devices it names.
+    """Read the newest checkpoint into the structure of ``like``, whose leaves may be shapes alone.
 
-    Those need not be as many as saved it; where none are named, the first one is meant.
+    Arrays go to the devices that ``like`` names, by default to the first one. Their number may differ from that of
+    the devices that saved the checkpoint.
     """
     found = _load(directory, {"agent": like.agent, "loop": like._replace(agent=None)})
     return found["loop"]._replace(agent=found["agent"])
 
 
 def load_agent(directory: Path, like: TrainState) -> Any:
-    """Read only the agent's state, which is all that acting needs."""
+    """Read only the agent's state, which suffices for acting."""
     return _load(directory, {"agent": like.agent})["agent"]
 
 
 def load_ring(directory: Path, like: TrainState) -> Ring:
-    """Read only the ring of a replay, without the worlds and the agent."""
+    """Read only the replay's ring buffer, without the worlds and the agent."""
     return _load(directory, {"loop": {"data": {"ring": like.data.ring}}}, partial=True)["loop"]["data"]["ring"]
 
 
@@ -59,7 +60,7 @@ def _sizes(folder: Path) -> dict[str, int]:
 
 
 def _newest(directory: Path) -> Path:
-    """The folder of the newest checkpoint; those still being written have longer names."""
+    """Return the folder of the newest checkpoint. Folders that are still being written have longer names."""
     folders = [path for path in directory.glob("*") if path.name.isdigit()]
     if not folders:
         raise InputError(f"{str(directory)!r} holds no checkpoint; the run stopped before its first one")
@@ -67,7 +68,7 @@ def _newest(directory: Path) -> Path:
 
 
 def _require_whole(folder: Path, parts: Iterable[str]) -> None:
-    """Refuse a damaged checkpoint, as orbax would answer it with pages of its threads' tracebacks."""
+    """Refuse a damaged checkpoint with one line, where orbax would print pages of tracebacks."""
     if not (folder / _SIZES).exists():  # the run was killed just before it wrote them
         return
     try:
@@ -102,15 +103,15 @@ def _load(directory: Path, like: dict[str, Any], partial: bool = False) -> dict[
 
 
 def size_of(state: Any) -> int:
-    """Bytes that a state (or its shapes) takes."""
+    """Return the bytes that a state, or its shapes, takes."""
     return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(state))
 
 
 def require_space(directory: Path, state: Any) -> None:
-    """Check that the disk can hold the checkpoints of a run.
+    """Check that the disk has room for the checkpoints of a run.
 
     Raises:
-        InputError: it cannot.
+        InputError: it has too little.
     """
     needed, free = (_KEPT + 1) * size_of(state), shutil.disk_usage(directory).free
     if needed > free:

@@ -1,4 +1,4 @@
-"""Fine-tuning: an agent that begins on new tasks with what a run has learned on others."""
+"""Fine-tuning: an agent starts on new tasks from the parameters that a run learned on other tasks."""
 
 from functools import partial
 from typing import Any
@@ -15,15 +15,15 @@ from mtjax.networks import Params
 from mtjax.training.policy import Policy
 from mtjax.types import Array, Env, InputError, Task
 
-_FRESH = ("optimizers", "contexts", "vectors", "surgery", "progress")  # what is of the new tasks alone
+_FRESH = ("optimizers", "contexts", "vectors", "surgery", "progress")  # fields that belong to the new tasks alone
 _BY_TASK = ("log_temperature", "scales", "units")  # leaves (T, ...), or shared by all tasks
 
 
 def require_fit(start: Policy, env: Env, agent: BaseAgent) -> None:
-    """Check that a run's networks can go on with an agent on a family of tasks.
+    """Check that an agent can fine-tune a run's networks on the tasks of ``env``.
 
     Raises:
-        InputError: the agent is another one, or the family has other sizes or another context.
+        InputError: the agent differs from the run's, or the tasks have other sizes or another context.
     """
     for each in (env, start.env):
         require_family(each, NO_FINE_TUNING)
@@ -50,13 +50,13 @@ def require_fit(start: Policy, env: Env, agent: BaseAgent) -> None:
 
 
 def _learned(agent: BaseAgent) -> dict[str, Any]:
-    """The settings of an agent but for those of its experience, in which fine-tuning may differ."""
+    """Return the settings of an agent without those of its experience, which fine-tuning may change."""
     collected = parts.settings(agent.experience)
     return {name: value for name, value in settings(agent).items() if name not in collected}
 
 
 def _require_numbers(start: Policy, env: Env, agent: BaseAgent) -> None:
-    """Refuse other tasks to networks that know tasks by number alone."""
+    """Refuse new tasks for networks that know tasks by number alone."""
     if agent.conditioning != "one-hot":
         return
     nearest, count = np.asarray(agent.nearest_tasks(start.state, env.tasks("train"))), len(start.state.contexts)
@@ -68,15 +68,15 @@ def _require_numbers(start: Policy, env: Env, agent: BaseAgent) -> None:
 
 
 def adopt(start: Policy, agent: BaseAgent, tasks: Task, fresh: Any) -> Any:
-    """Return an agent's ``fresh`` state (S, ...) for new ``tasks`` (T, ...) with what a run learned in it.
+    """Return an agent's ``fresh`` state (S, ...) for new ``tasks`` (T, ...) with a run's learned values put in.
 
-    Networks, their slow copies, temperatures, units of values, scales of rewards and moments of observations are the
-    run's; of what
-    every task has for itself, a new task receives that of the run's nearest training task. Optimisers, and what
-    gradient surgery and samplers remember, are fresh. Seed number k begins with the run's seed k modulo its seeds.
+    The run gives networks, target networks, temperatures, units of values, scales of rewards and moments of
+    observations. Each new task takes the parameters that the run's nearest training task has for itself. Optimisers
+    and the memories of gradient surgery and samplers stay fresh. Seed number k starts from the run's seed k modulo
+    the number of its seeds.
 
     Raises:
-        InputError: the shapes of networks differ.
+        InputError: the shapes of the networks differ.
     """
     seeds = jnp.arange(len(fresh.contexts)) % len(start.seeds)
     old = jax.tree.map(lambda x: x[seeds], start.states)

@@ -1,4 +1,4 @@
-"""What a run leaves on disk beside its checkpoints: a folder of its own, and the record of all that decides it."""
+"""The folder of a run, and its config.json: settings, versions, device and command."""
 
 import dataclasses
 import itertools
@@ -26,7 +26,7 @@ _LONGEST = 80
 
 
 def new_directory(root: Path, name: str) -> Path:
-    """Make a folder that did not exist before."""
+    """Make a new folder called ``name`` and the time, and return it."""
     stamp = time.strftime("%Y%m%d-%H%M%S")
     root.mkdir(parents=True, exist_ok=True)
     for attempt in range(1000):
@@ -40,13 +40,13 @@ def new_directory(root: Path, name: str) -> Path:
 
 
 def short_name(env_name: str) -> str:
-    """Name an environment in folders and titles, where the names of many families would be too long."""
+    """Return an environment's name for folders and titles, shortened for mixtures of many families."""
     count = env_name.count("+") + 1
     return env_name if len(env_name) <= _LONGEST else f"mixture-of-{count}"
 
 
-def recorded(config: RunConfig, directory: Path, argv: Sequence[str]) -> RunConfig:
-    """The program of the run to go on with, which ``--steps`` may extend."""
+def resumed_config(config: RunConfig, directory: Path, argv: Sequence[str]) -> RunConfig:
+    """Return the configuration of the run to resume, with the steps of ``--steps`` if that was given."""
     recorded = from_json(directory / "config.json")
     extended = any(word.split("=", 1)[0] == "--steps" for word in argv)
     steps = config.plan.steps if extended else recorded.plan.steps
@@ -55,7 +55,7 @@ def recorded(config: RunConfig, directory: Path, argv: Sequence[str]) -> RunConf
 
 
 def record_steps(file: Path, steps: int) -> None:
-    """Write how far a run goes now, so that resuming it once more goes as far."""
+    """Write the new number of steps into config.json, so that the next resume uses it too."""
     record = json.loads(file.read_text())
     if record["plan"]["steps"] == steps:
         return
@@ -66,8 +66,8 @@ def record_steps(file: Path, steps: int) -> None:
     os.replace(new, file)
 
 
-def circumstances(config: RunConfig) -> dict:
-    """What else decides a run's numbers: versions, device, engine; and the command that repeats it."""
+def run_metadata(config: RunConfig) -> dict:
+    """Return what else decides a run's results: engine, device and versions; and the command that repeats it."""
     versions = {"mtjax": __version__}
     for package in _PACKAGES:
         try:
@@ -79,12 +79,12 @@ def circumstances(config: RunConfig) -> dict:
         "device": str(jax.devices()[0].device_kind),
         "python": platform.python_version(),
         "versions": versions,
-        "command": shlex.join(["python", "-m", "mtjax.train", *repeat(config)]),
+        "command": shlex.join(["python", "-m", "mtjax.train", *to_flags(config)]),
     }
 
 
-def repeat(config: RunConfig) -> list[str]:
-    """Every flag of this program, so that the command means the same whatever the presets become."""
+def to_flags(config: RunConfig) -> list[str]:
+    """Return every setting as a flag, so that the command keeps its meaning when presets change."""
     words = [f"--env={config.env}", f"--agent={config.agent}", *import_flags(config)]
     words += [f"--from={config.start}"] if config.start else []
     found = {"--": {**_fields(config.plan), **_fields(config.training)}, "--env.": _family_settings(config.family)}
@@ -102,7 +102,7 @@ def _fields(family: Any) -> dict[str, Any]:
 
 
 def _family_settings(env: Tabled) -> dict[str, Any]:
-    """The settings of a family; of a mixture those that its families share, and what each of them varies."""
+    """Return the settings of a family; of a mixture, its families' common settings and varied parameters."""
     if isinstance(env, Family):
         return _fields(env)
     each = {part.name: _fields(part.family) for part in env.parts}
@@ -114,7 +114,7 @@ def _family_settings(env: Tabled) -> dict[str, Any]:
 
 
 def _flag(prefix: str, name: str, value: object) -> list[str]:
-    if name == "context-ranges":  # the run's of --from
+    if name == "context-ranges":  # --from takes them from its run
         return []
     if name == "vary":
         return [f"{prefix}vary.{parameter}={values}" for parameter, values in value]  # type: ignore

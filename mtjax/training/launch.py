@@ -1,10 +1,10 @@
-"""Begin a run as its configuration says: check it, fetch what it begins with, say what it is, and train."""
+"""Start a run from its configuration: check it, load the policy to fine-tune, print a summary, and train."""
 
 import dataclasses
 from pathlib import Path
 
 from mtjax.agents.parts.conditioning import load_vectors
-from mtjax.config import RunConfig, require_range
+from mtjax.config import RunConfig, require_value_range
 from mtjax.envs import Family
 from mtjax.parallel import hosts, mesh
 from mtjax.training import points
@@ -15,13 +15,17 @@ from mtjax.types import InputError
 
 
 def check(config: RunConfig) -> None:
-    """Meet whatever the family's and the agent's constructors could not check before a run's folder is made."""
+    """Check a configuration as a whole, before a folder is made.
+
+    Raises:
+        InputError: family, agent, devices and flags do not go together.
+    """
     family = config.family
     _ = family.engine_name, family.table
     mesh.mesh_for(config.plan.seeds, family.train_count, config.training.num_envs)
     config.learner.experience.check(family, config.training.num_envs)
-    for learner in points.every(config.learner, config.points):
-        require_range(learner)
+    for learner in points.agents_at(config.learner, config.points):
+        require_value_range(learner)
     if config.learner.vectors:
         load_vectors(config.learner.vectors, family.train_count)
     tune = config.learner.tune
@@ -31,8 +35,8 @@ def check(config: RunConfig) -> None:
         raise InputError("--reset-every throws away what --from takes from a run; give one of them")
 
 
-def starting(config: RunConfig) -> Policy | None:
-    """What the run learned that is to be fine-tuned, if one is."""
+def load_start(config: RunConfig) -> Policy | None:
+    """Return the policy that this run fine-tunes, or None."""
     if not config.start:
         return None
     start = load(config.start)
@@ -41,7 +45,7 @@ def starting(config: RunConfig) -> Policy | None:
 
 
 def launch(config: RunConfig, directory: Path, start: Policy | None, resume: bool, label: str = "") -> Result:
-    """Run a program in its folder, from the start or from its newest checkpoint, and say what it is."""
+    """Print what a run does, and train it in ``directory`` from the start or from its newest checkpoint."""
     said = f"{label}: {' '.join(config.sweep)}\n" if config.sweep else ""
     origin = f"{_origin(config)}run: {directory}"
     plan = config.plan
@@ -64,7 +68,7 @@ def launch(config: RunConfig, directory: Path, start: Policy | None, resume: boo
 
 
 def _origin(config: RunConfig) -> str:
-    """A line on what is fine-tuned, if something is."""
+    """Return a line on the run that is fine-tuned, or an empty string."""
     if not config.start:
         return ""
     family, told = config.family, config.learner.conditioning == "parameters"

@@ -1,4 +1,4 @@
-"""What a run writes while it goes: a line of metrics a chunk, on the terminal and in a file."""
+"""Metrics of a run: one line per chunk on the terminal, and rows in a CSV file."""
 
 import csv
 import itertools
@@ -13,7 +13,7 @@ _OF_EACH_TASK = ("td_error", "critic_gradient_norm", "actor_gradient_norm")  # b
 
 
 def append_rows(path: Path, rows: list[dict[str, Any]]) -> None:
-    """Append rows to a CSV file, with a header if it is new; an old one keeps its columns."""
+    """Append rows to a CSV file. A new file gets a header; an old file keeps its columns."""
     is_new = not path.exists() or not path.stat().st_size
     names = list(rows[0]) if is_new else _columns(path)
     with path.open("a", newline="") as file:
@@ -29,10 +29,10 @@ def _columns(path: Path) -> list[str]:
 
 
 def truncate_rows(path: Path, iteration: int) -> float:
-    """Drop the rows of metrics that lie after an iteration, as a resumed run will write them again.
+    """Drop the rows of metrics after an iteration, because a resumed run writes them again.
 
     Returns:
-        the seconds of training up to there.
+        the seconds of training up to that iteration.
     """
     if not path.exists():
         return 0.0
@@ -50,12 +50,12 @@ def truncate_rows(path: Path, iteration: int) -> float:
 
 
 def _is_whole(row: dict[str, str | None]) -> bool:
-    """Whether a line was written to its end: a process that is killed may leave half of one."""
+    """Return whether a line is complete. A killed process may leave half of one."""
     return None not in row.values() and row["iteration"].isdigit()  # type: ignore
 
 
 def metric_rows(metrics: dict[str, np.ndarray], seeds: np.ndarray, common: dict[str, Any]) -> list[dict[str, Any]]:
-    """Lay out one chunk's metrics (S, T) or (S,) as one row a seed: means over tasks, and a few for each task."""
+    """Return one row per seed of a chunk's metrics (S, T) or (S,): means over tasks, and some for each task."""
     rows = []
     for s, seed in enumerate(seeds):
         row = {"seed": int(seed), **common, "return": number(_mean(metrics["return"][s]))}
@@ -67,17 +67,17 @@ def metric_rows(metrics: dict[str, np.ndarray], seeds: np.ndarray, common: dict[
 
 
 def _mean(x: np.ndarray) -> float:
-    """Mean of what is there, NaN of nothing."""
+    """Return the mean of the finite entries, or NaN if there are none."""
     return float(np.mean(x[np.isfinite(x)])) if np.any(np.isfinite(x)) else np.nan
 
 
 def number(x: Any) -> str:
-    """Format a number for a file: seven digits, nothing for NaN."""
+    """Format a number for a file with seven digits. NaN becomes an empty string."""
     return "" if np.isnan(x) else f"{float(x):.7g}"
 
 
 class Console:
-    """Live progress: a bar on a terminal, plain lines elsewhere. Silent if asked to be."""
+    """Progress display: a bar on a terminal, plain lines elsewhere, nothing if ``quiet``."""
 
     def __init__(self, total_steps: int, quiet: bool = False, label: str = ""):
         self.total, self.quiet, self.bar, self.label = total_steps, quiet, None, f"{label}  " if label else ""
@@ -97,7 +97,7 @@ class Console:
             print(text, flush=True)
 
     def progress(self, steps: int, seconds: float, rate: float, returns: np.ndarray) -> None:
-        """Show where training is; ``returns`` (S, T) of this chunk's episodes, NaN where none ended."""
+        """Show steps, time and return. ``returns`` (S, T) are those of this chunk, NaN where no episode ended."""
         known = returns[np.isfinite(returns)]
         score = f"return {known.mean():.0f} ({known.min():.0f} to {known.max():.0f})" if known.size else "return -"
         text = f"{self.label}{steps:,} of {self.total:,} steps  {seconds:.1f} s  {rate:,.0f} steps/s  {score}"
@@ -107,5 +107,6 @@ class Console:
             self.say(text)
 
     def close(self) -> None:
+        """Stop the bar."""
         if self.bar is not None:
             self.bar.stop()

@@ -1,4 +1,4 @@
-"""What ``python -m mtjax.train`` does: train, or go on with a run, and say where it is and how each split scored."""
+"""The command ``python -m mtjax.train``: start or resume a run, and print its folder and scores."""
 
 import shlex
 from collections.abc import Callable, Sequence
@@ -10,18 +10,18 @@ from mtjax.parallel import hosts
 from mtjax.report import figures
 from mtjax.report.tables import split_table
 from mtjax.training import memory, sweep
-from mtjax.training.folder import circumstances, new_directory, record_steps, recorded, short_name
-from mtjax.training.launch import check, launch, starting
+from mtjax.training.folder import new_directory, record_steps, resumed_config, run_metadata, short_name
+from mtjax.training.launch import check, launch, load_start
 from mtjax.training.programs import enable_compile_cache
 from mtjax.training.run import Result
 from mtjax.types import InputError
 
 
 def main(argv: Sequence[str], parse: Callable[[Sequence[str]], RunConfig]) -> None:
-    """Run what a command line asks for, which ``parse`` reads: a run, a sweep, or more steps of either."""
+    """Start or resume a run or a sweep. ``parse`` reads the command line."""
     if "--distributed" in argv:
-        hosts.initialise()  # before anything asks which devices there are
-    if sweep.wanted(argv):
+        hosts.initialise()  # before anything looks at the devices
+    if sweep.is_sweep(argv):
         if "--distributed" in argv:
             raise InputError("a sweep runs in one process; leave out --distributed")
         return sweep.main(argv, parse)
@@ -29,25 +29,25 @@ def main(argv: Sequence[str], parse: Callable[[Sequence[str]], RunConfig]) -> No
     resume = any(word.split("=", 1)[0] == "--resume" for word in argv)
     directory = Path(config.resume) if resume else None
     if directory is not None:
-        config = recorded(config, directory, argv)
+        config = resumed_config(config, directory, argv)
     enable_compile_cache()
     check(config)
-    start = starting(config) if directory is None else None
-    if directory is None and memory.too_many_seeds(config):
-        return sweep.begin([config], "rounds")
-    directory = hosts.agreed(partial(_prepare, config, directory))
+    start = load_start(config) if directory is None else None
+    if directory is None and memory.seeds_exceed_memory(config):
+        return sweep.run_all([config], "rounds")
+    directory = hosts.broadcast_path(partial(_prepare, config, directory))
     result = launch(config, directory, start, resume)
     if hosts.is_first():
         _conclude(config, result, directory)
 
 
 def _prepare(config: RunConfig, directory: Path | None) -> Path:
-    """Make the run's folder with the record of it, or bring that of a run to go on with up to date."""
+    """Make the folder of a new run with its config.json, or update the steps of a resumed run."""
     if directory is not None:
         record_steps(directory / "config.json", config.plan.steps)
         return directory
     directory = new_directory(Path(config.runs), f"{short_name(config.env)}-{config.agent}")
-    (directory / "config.json").write_text(to_json(config, circumstances(config)))
+    (directory / "config.json").write_text(to_json(config, run_metadata(config)))
     return directory
 
 

@@ -1,4 +1,4 @@
-"""Memory: what a program takes, and its parts, one after another, where that is more than there is."""
+"""Memory: how much a program needs, and how to split it into rounds that fit."""
 
 import dataclasses
 import math
@@ -10,18 +10,18 @@ import numpy as np
 
 from mtjax.config import RunConfig
 from mtjax.training import checkpoint
-from mtjax.training.policy import shapes
+from mtjax.training.policy import state_shapes
 from mtjax.types import InputError
 
-_SHARE = 0.9  # of the memory there is that a program may take
-_COPIES = 3  # of an agent that learning needs beside its state: gradients, steps, and the new one
+_USABLE_SHARE = 0.9  # of the available memory, for one program
+_AGENT_COPIES = 3  # of the agent beside its state: gradients, steps, and the new state
 
 
-def memory() -> float:
-    """Bytes of the devices' memory, or of the machine's; $MTJAX_MEMORY, in GB, says otherwise.
+def available_bytes() -> float:
+    """Return the memory in bytes: $MTJAX_MEMORY (in GB), else the devices', else the machine's.
 
     Raises:
-        InputError: $MTJAX_MEMORY is no number.
+        InputError: $MTJAX_MEMORY is not a number.
     """
     given = os.environ.get("MTJAX_MEMORY", "")
     try:
@@ -33,46 +33,48 @@ def memory() -> float:
     return sum(known) or os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
-def needed(config: RunConfig) -> int:
-    """Bytes that one of its points takes with all its seeds, roughly: the state, and what an update needs beside it."""
-    state = shapes(dataclasses.replace(config, points=config.points[:1]))
-    return checkpoint.size_of(state) + _COPIES * checkpoint.size_of(state.agent)
+def required_bytes(config: RunConfig) -> int:
+    """Return roughly the bytes that one point takes with all its seeds: its state and an update's copies."""
+    state = state_shapes(dataclasses.replace(config, points=config.points[:1]))
+    return checkpoint.size_of(state) + _AGENT_COPIES * checkpoint.size_of(state.agent)
 
 
-def too_many_seeds(config: RunConfig) -> bool:
-    """Whether a program's seeds do not fit into memory together; one seed is tried whatever it takes."""
-    return config.plan.seeds > 1 and not config.distributed and needed(config) > memory() * _SHARE
+def seeds_exceed_memory(config: RunConfig) -> bool:
+    """Return whether several seeds do not fit into memory together. A single seed is always tried."""
+    return (
+        config.plan.seeds > 1 and not config.distributed and required_bytes(config) > available_bytes() * _USABLE_SHARE
+    )
 
 
-def split(config: RunConfig, limit: float) -> list[RunConfig]:
-    """The program, or parts of it with fewer points or, of a point, fewer seeds, each to fit into ``limit`` bytes."""
+def split_to_fit(config: RunConfig, limit: float) -> list[RunConfig]:
+    """Split a program into parts that fit into ``limit`` bytes: fewer points each, or fewer seeds of one point."""
     points, seeds = config.points or ({},), config.plan.seeds
-    fitting = max(math.floor(limit * _SHARE * seeds / needed(config)), 1)  # seeds of any points at once
+    fitting = max(math.floor(limit * _USABLE_SHARE * seeds / required_bytes(config)), 1)  # seeds of any points at once
     if fitting < seeds:
         alone = [dataclasses.replace(config, points=config.points and (point,)) for point in points]
-        return [part for one in alone for part in _seeds_apart(one, fitting)]
-    parts = _even(range(len(points)), fitting // seeds)
+        return [part for one in alone for part in _split_seeds(one, fitting)]
+    parts = _even_parts(range(len(points)), fitting // seeds)
     return [dataclasses.replace(config, points=config.points and tuple(points[i] for i in part)) for part in parts]
 
 
-def _seeds_apart(config: RunConfig, fitting: int) -> list[RunConfig]:
+def _split_seeds(config: RunConfig, fitting: int) -> list[RunConfig]:
     plan = config.plan
-    parts = _even(range(plan.seed, plan.seed + plan.seeds), fitting)
+    parts = _even_parts(range(plan.seed, plan.seed + plan.seeds), fitting)
     plans = [dataclasses.replace(plan, seed=int(part[0]), seeds=len(part)) for part in parts]
     return [dataclasses.replace(config, plan=each) for each in plans]
 
 
-def _even(numbers: Sequence[int], most: int) -> list[np.ndarray]:
-    """Numbers in parts of at most so many, as even as can be."""
+def _even_parts(numbers: Sequence[int], most: int) -> list[np.ndarray]:
+    """Split numbers into even parts of at most ``most``."""
     return np.array_split(np.asarray(numbers), math.ceil(len(numbers) / most))
 
 
 def describe(config: RunConfig, count: int, limit: float) -> str:
-    """A line on what one program holds, what it takes, and in how many rounds it runs."""
+    """Return a line on a program's settings, its memory and its rounds."""
     settings, seeds = max(len(config.points), 1), config.plan.seeds
     held = f"{settings} setting{'s' * (settings > 1)} of {seeds} seed{'s' * (seeds > 1)}, about"
     name = " ".join(config.sweep) or f"{config.agent} on {config.env}"
     return (
-        f"{name}: {held} {needed(config) / 1e6:,.0f} MB each, "
-        f"{limit * _SHARE / 1e6:,.0f} MB to use: {count} round{'s' * (count > 1)}"
+        f"{name}: {held} {required_bytes(config) / 1e6:,.0f} MB each, "
+        f"{limit * _USABLE_SHARE / 1e6:,.0f} MB to use: {count} round{'s' * (count > 1)}"
     )

@@ -1,7 +1,7 @@
-"""Several settings of an agent in one program: numbers that are data, one a seed, instead of constants.
+"""Several settings of an agent in one program: some numbers become arrays over seeds instead of constants.
 
-A point is one setting: values by name, ``{"actor_lr": 3e-4, "gamma": 0.98}``. The S axis of a run holds all points with
-all seeds, point by point: number ``k`` of S is seed ``k % seeds`` of point ``k // seeds``.
+A point is one setting, values by name: ``{"actor_lr": 3e-4, "gamma": 0.98}``. The S axis of a run
+holds all points with all seeds, point by point: entry ``k`` is seed ``k % seeds`` of point ``k // seeds``.
 """
 
 import dataclasses
@@ -19,22 +19,22 @@ from mtjax.types import Acted, Array, Env, Experience, InputError, Key, Metrics,
 
 Point = Mapping[str, float]
 Sweep = Mapping[str, Sequence[float]] | Sequence[Point]
-_STATIC = ("encoder", "experience")  # parts whose numbers are shapes, or written into the networks' modules
+_STATIC = ("encoder", "experience")  # their numbers are shapes, or constants in the networks' modules
 
 
-class Swept(NamedTuple):
+class SweptState(NamedTuple):
     """The state of an agent at one point."""
 
-    learner: Any  # the agent's own
-    knobs: dict[str, Array]  # () each
+    learner: Any  # the state of the agent itself
+    knobs: dict[str, Array]  # the swept values, () each
 
 
 @dataclasses.dataclass(frozen=True)
-class Varied:
-    """An agent of which some numbers are in its state; it is static under ``jit``, and they are not.
+class SweptAgent:
+    """An agent that keeps some of its numbers in its state, where ``jit`` traces them.
 
-    In every method the agent is a copy that holds the state's numbers, traced and unchecked, in place of its own:
-    ``at`` checks them beforehand.
+    Every method uses a copy of the agent that holds the traced values. They are unchecked there; ``agent_at`` checks
+    them beforehand.
     """
 
     agent: BaseAgent
@@ -47,68 +47,68 @@ class Varied:
     def experience(self) -> Experience:
         return self.agent.experience
 
-    def init(self, spec: Spec, tasks: Task, key: Key, knobs: dict[str, Array] | None = None) -> Swept:
+    def init(self, spec: Spec, tasks: Task, key: Key, knobs: dict[str, Array] | None = None) -> SweptState:
         knobs = knobs or {}
-        return Swept(vary(self.agent, knobs).init(spec, tasks, key), knobs)
+        return SweptState(with_values(self.agent, knobs).init(spec, tasks, key), knobs)
 
-    def begin(self, state: Swept, task: Task) -> Any:
-        return vary(self.agent, state.knobs).begin(state.learner, task)
+    def begin(self, state: SweptState, task: Task) -> Any:
+        return with_values(self.agent, state.knobs).begin(state.learner, task)
 
-    def act(self, state: Swept, memory: Any, obs: Any, task: Task, key: Key | None) -> Acted:
-        acted = vary(self.agent, state.knobs).act(state.learner, memory, obs, task, key)
-        whole = jnp.isfinite(acted.action)  # one that diverged goes on beside the others
+    def act(self, state: SweptState, memory: Any, obs: Any, task: Task, key: Key | None) -> Acted:
+        acted = with_values(self.agent, state.knobs).act(state.learner, memory, obs, task, key)
+        whole = jnp.isfinite(acted.action)  # a diverged seed must not stop the others
         return acted._replace(action=jnp.where(whole, acted.action, 0.0))
 
-    def remember(self, state: Swept, memory: Any, transition: Transition, task: Task) -> Any:
-        return vary(self.agent, state.knobs).remember(state.learner, memory, transition, task)
+    def remember(self, state: SweptState, memory: Any, transition: Transition, task: Task) -> Any:
+        return with_values(self.agent, state.knobs).remember(state.learner, memory, transition, task)
 
     def relabel(self, env: Env, task: Task, transition: Transition, key: Key) -> Transition:
         return self.agent.relabel(env, task, transition, key)
 
-    def learn(self, env: Env, states: Swept, data: Any, tasks: Task, keys: Key) -> tuple[Swept, Metrics]:
+    def learn(self, env: Env, states: SweptState, data: Any, tasks: Task, keys: Key) -> tuple[SweptState, Metrics]:
         return self.experience.learn(env, self, states, data, tasks, keys)  # type: ignore
 
-    def update(self, state: Swept, batch: Transition, tasks: Task, key: Key) -> tuple[Swept, Metrics]:
-        learner, metrics = vary(self.agent, state.knobs).update(state.learner, batch, tasks, key)
+    def update(self, state: SweptState, batch: Transition, tasks: Task, key: Key) -> tuple[SweptState, Metrics]:
+        learner, metrics = with_values(self.agent, state.knobs).update(state.learner, batch, tasks, key)
         return state._replace(learner=learner), metrics
 
-    def observe(self, state: Swept, outcome: Outcome) -> Swept:
-        return state._replace(learner=vary(self.agent, state.knobs).observe(state.learner, outcome))
+    def observe(self, state: SweptState, outcome: Outcome) -> SweptState:
+        return state._replace(learner=with_values(self.agent, state.knobs).observe(state.learner, outcome))
 
-    def reset(self, state: Swept, spec: Spec, tasks: Task, key: Key) -> Swept:
-        return state._replace(learner=vary(self.agent, state.knobs).reset(state.learner, spec, tasks, key))
+    def reset(self, state: SweptState, spec: Spec, tasks: Task, key: Key) -> SweptState:
+        return state._replace(learner=with_values(self.agent, state.knobs).reset(state.learner, spec, tasks, key))
 
 
-def numbers(agent: BaseAgent) -> dict[str, float]:
-    """The settings of an agent and of its parts that may vary within a program: numbers that are no counts."""
+def sweepable(agent: BaseAgent) -> dict[str, float]:
+    """Return the settings of an agent and its parts that can vary inside one program: floats, by name."""
     holders = [agent, *(getattr(agent, kind) for kind in kinds_of(agent) if kind not in _STATIC)]
     return {f.name: getattr(x, f.name) for x in holders for f in dataclasses.fields(x) if f.type is float}
 
 
-def at(agent: BaseAgent, point: Point) -> BaseAgent:
-    """Return the agent at a point, as if its values had been given plainly.
+def agent_at(agent: BaseAgent, point: Point) -> BaseAgent:
+    """Return the agent with the values of a point, checked by its constructor.
 
     Raises:
-        InputError: a name is not that of a number, or a value is not allowed.
+        InputError: no number has that name, or a value is not allowed.
     """
-    known = numbers(agent)
+    known = sweepable(agent)
     unknown = next((name for name in point if name not in known), None)
     if unknown is not None:
         raise nearest_error("number of this agent", unknown, known)
-    return _place(agent, point, dataclasses.replace)
+    return _replace_values(agent, point, dataclasses.replace)
 
 
-def every(agent: Any, found: Sequence[Point]) -> list[Any]:
-    """The agent at every point, or as it is if there are none."""
-    return [at(agent, point) for point in found] or [agent]
+def agents_at(agent: Any, points: Sequence[Point]) -> list[Any]:
+    """Return the agent at every point, or the agent itself if there are no points."""
+    return [agent_at(agent, point) for point in points] or [agent]
 
 
-def vary(agent: BaseAgent, knobs: Mapping[str, Array]) -> BaseAgent:
-    """Return the agent with traced values, which its constructors could not check."""
-    return _place(agent, knobs, parts.put)
+def with_values(agent: BaseAgent, knobs: Mapping[str, Array]) -> BaseAgent:
+    """Return the agent with traced values, which its constructor cannot check."""
+    return _replace_values(agent, knobs, parts.put)
 
 
-def _place(agent: BaseAgent, values: Mapping[str, Any], replace: Callable) -> BaseAgent:
+def _replace_values(agent: BaseAgent, values: Mapping[str, Any], replace: Callable) -> BaseAgent:
     mine = lambda part: {f.name: values[f.name] for f in dataclasses.fields(part) if f.name in values}
     held = {kind: getattr(agent, kind) for kind in kinds_of(agent)}
     changed = {kind: replace(part, **own) for kind, part in held.items() if (own := mine(part))}
@@ -116,10 +116,12 @@ def _place(agent: BaseAgent, values: Mapping[str, Any], replace: Callable) -> Ba
 
 
 def grid(sweep: Sweep) -> tuple[dict[str, float], ...]:
-    """All points of a sweep: every combination of values, the last name's changing fastest; or the points themselves.
+    """Return all points of a sweep.
+
+    A mapping gives every combination of its values; the last name changes fastest. A list gives the points themselves.
 
     Raises:
-        InputError: there are no values, or points do not all give the same names.
+        InputError: a name has no values, or the points have different names.
     """
     if isinstance(sweep, Mapping):
         empty = next((name for name, values in sweep.items() if not len(values)), None)
@@ -134,8 +136,8 @@ def grid(sweep: Sweep) -> tuple[dict[str, float], ...]:
     return found
 
 
-def spread(points: Sequence[Point], seeds: Array) -> tuple[Array, dict[str, Array] | None]:
-    """The seed of each number of S, and the values (S,) by name; without points, the seeds (S,) alone."""
+def seed_axis(points: Sequence[Point], seeds: Array) -> tuple[Array, dict[str, Array] | None]:
+    """Return seeds (S,) and swept values (S,) by name for all points; without points, the seeds and None."""
     if not points:
         return seeds, None
     column = lambda name: np.repeat(np.asarray([point[name] for point in points], np.float32), len(seeds))

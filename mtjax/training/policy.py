@@ -1,4 +1,4 @@
-"""Trained policies, read back from the folder of a run."""
+"""Trained policies, read from the folder of a run."""
 
 import dataclasses
 from pathlib import Path
@@ -19,7 +19,7 @@ from mtjax.types import Array, InputError, Key, Task, Transition
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Policy:
-    """What a run learned: ``action = policy(obs, task)``, for single observations (O,); map it for many."""
+    """A trained policy: ``action = policy(obs, task)`` for a single observation (O,). Use ``vmap`` for many."""
 
     env: Tabled
     agent: BaseAgent
@@ -28,35 +28,35 @@ class Policy:
     seeds: Array  # (S,)
 
     def __call__(self, obs: Array, task: Task, key: Key | None = None, memory: Any = None) -> Array:
-        """Return the mean action (A,), or a random one if a key is given.
+        """Return the mean action (A,), or a sampled one if a key is given.
 
         Args:
-            memory: what the agent remembers of the episode, from ``begin`` and ``remember``. Only an agent that infers
-                its task needs it; without it, the episode counts as just begun.
+            memory: the agent's memory of the episode, from ``begin`` and ``remember``. Only agents that infer their
+                task need it. None means that the episode has just begun.
         """
         memory = self.begin(task) if memory is None else memory
         return self.agent.act(self.state, memory, obs, task, key).action
 
     def begin(self, task: Task) -> Any:
-        """Return the memory with which an episode begins."""
+        """Return the memory at the start of an episode."""
         return self.agent.begin(self.state, task)
 
     def remember(self, memory: Any, task: Task, obs: Array, action: Array, reward: Array, next_obs: Array) -> Any:
-        """Return the memory after a step."""
+        """Return the memory after one step."""
         step = Transition(obs, action, reward, jnp.float32(1), next_obs)
         return self.agent.remember(self.state, memory, step, task)
 
 
 def load(directory: str | Path, seed: int = 0) -> Policy:
-    """Read the policy that a run learned.
+    """Load the trained policy of a run.
 
     Args:
         directory: the run's folder.
         seed: which of the run's seeds, counted from 0. A run of a sweep has all its seeds for each of its points:
-            number ``k`` is seed ``k % seeds`` of point ``k // seeds``, and the policy's agent is the one at that point.
+            number ``k`` is seed ``k % seeds`` of point ``k // seeds``. The policy then has the agent of that point.
 
     Raises:
-        InputError: the folder is not a run, it has no such seed, or its checkpoint is missing or damaged.
+        InputError: the folder is not a run, the run has no such seed, or its checkpoint is missing or damaged.
     """
     directory = Path(directory)
     config = from_json(directory / "config.json")
@@ -64,26 +64,26 @@ def load(directory: str | Path, seed: int = 0) -> Policy:
     last = count * max(len(config.points), 1) - 1
     if not 0 <= seed <= last:
         raise InputError(f"seed must be from 0 to {last}, counted from the run's first, not {seed}")
-    states = checkpoint.load_agent(directory / "checkpoints", shapes(config))
+    states = checkpoint.load_agent(directory / "checkpoints", state_shapes(config))
     agent = config.learner
     if config.points:
-        rows = _of_point(config, seed)
-        agent = points.at(agent, config.points[seed // count])
+        rows = _point_rows(config, seed)
+        agent = points.agent_at(agent, config.points[seed // count])
         states = jax.tree.map(lambda x: x[rows], states.learner)
     seeds = config.plan.seed + jnp.arange(count)
     return Policy(config.family, agent, jax.tree.map(lambda x: x[seed % count], states), states, seeds)
 
 
-def _of_point(config: RunConfig, seed: int) -> slice:
-    """The rows of S that belong to one number's point."""
+def _point_rows(config: RunConfig, seed: int) -> slice:
+    """Return the slice of S with all seeds of one point: that of entry ``seed``."""
     first = seed - seed % config.plan.seeds
     return slice(first, first + config.plan.seeds)
 
 
 def load_experience(directory: str | Path, seed: int = 0) -> tuple[Ring, int]:
-    """Read what a run learned from: the replay of its last checkpoint, and the size of its batches.
+    """Load the replay of a run's last checkpoint, and the size of its batches.
 
-    Of a run of a sweep it is what the seeds of one point learned from, by ``seed`` as for ``load``.
+    For a run of a sweep, return the replay of all seeds of one point. ``seed`` chooses the point as in ``load``.
 
     Raises:
         InputError: as for ``load``; or the run has no replay.
@@ -91,13 +91,13 @@ def load_experience(directory: str | Path, seed: int = 0) -> tuple[Ring, int]:
     config = from_json(Path(directory) / "config.json")
     if not isinstance(config.learner.experience, Replay):
         raise InputError(f"{config.agent} keeps no replay, so that there is nothing to look at")
-    ring = checkpoint.load_ring(Path(directory) / "checkpoints", shapes(config))
-    rows = _of_point(config, seed)
+    ring = checkpoint.load_ring(Path(directory) / "checkpoints", state_shapes(config))
+    rows = _point_rows(config, seed)
     return ring._replace(rows=jax.tree.map(lambda x: x[rows], ring.rows)), config.learner.experience.batch_size
 
 
-def shapes(config: RunConfig) -> loop.TrainState:
-    """The shapes of a run's training state."""
-    env, agent = config.family, points.Varied(config.learner) if config.points else config.learner
-    spread = points.spread(config.points, config.plan.seed + jnp.arange(config.plan.seeds))
-    return jax.eval_shape(lambda: loop.init(env, agent, config.training, env.tasks("train"), *spread))  # type: ignore
+def state_shapes(config: RunConfig) -> loop.TrainState:
+    """Return the shapes of a run's training state."""
+    env, agent = config.family, points.SweptAgent(config.learner) if config.points else config.learner
+    axis = points.seed_axis(config.points, config.plan.seed + jnp.arange(config.plan.seeds))
+    return jax.eval_shape(lambda: loop.init(env, agent, config.training, env.tasks("train"), *axis))  # type: ignore

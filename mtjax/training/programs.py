@@ -1,4 +1,4 @@
-"""The jitted programs of a run: split over devices, lowered, compiled, and kept between runs."""
+"""The jitted programs of a run: split over devices, compiled, and cached between runs."""
 
 import os
 from collections.abc import Callable
@@ -11,12 +11,12 @@ from jax.sharding import Mesh, NamedSharding
 
 from mtjax.evaluation import evaluate
 from mtjax.loop import TrainState, init, run_chunk
-from mtjax.parallel.mesh import BY_SEED, BY_WORLD, SAME
+from mtjax.parallel.mesh import BY_SEED, BY_WORLD, REPLICATED
 from mtjax.types import Agent
 
 
 class Jitted(NamedTuple):
-    """The jitted programs of a run, with the arguments of ``loop.init``, ``loop.run_chunk`` and ``evaluate``."""
+    """The jitted functions of a run. They take the arguments of ``loop.init``, ``loop.run_chunk`` and ``evaluate``."""
 
     init: Any
     chunk: Any
@@ -31,26 +31,26 @@ class Programs(NamedTuple):
 
 
 def _specs(agent: Agent) -> TrainState:
-    """How devices share a training state."""
+    """Return how devices share each field of a training state."""
     by_world = TrainState(*[BY_WORLD] * len(TrainState._fields))  # type: ignore
     data = agent.experience.sharding
-    return by_world._replace(agent=BY_SEED, data=data, iteration=SAME, key=BY_SEED)  # type: ignore
+    return by_world._replace(agent=BY_SEED, data=data, iteration=REPLICATED, key=BY_SEED)  # type: ignore
 
 
-def jitted(mesh: Mesh | None, agent: Agent) -> Jitted:
-    """The programs of a run, each split over the mesh if there is one."""
+def jit_programs(mesh: Mesh | None, agent: Agent) -> Jitted:
+    """Return the jitted functions of a run, split over the mesh if there is one."""
     if mesh is None:
         return Jitted(init, run_chunk, evaluate)
     state = _specs(agent)
     return Jitted(
-        _split(mesh, init, (SAME, BY_SEED, BY_SEED), state),
-        _split(mesh, run_chunk, (SAME, state), (state, BY_SEED), donated=(4,)),
-        _split(mesh, evaluate, (BY_SEED, SAME, BY_SEED, SAME), BY_SEED),
+        _split(mesh, init, (REPLICATED, BY_SEED, BY_SEED), state),
+        _split(mesh, run_chunk, (REPLICATED, state), (state, BY_SEED), donated=(4,)),
+        _split(mesh, evaluate, (BY_SEED, REPLICATED, BY_SEED, REPLICATED), BY_SEED),
     )
 
 
 def _split(mesh: Mesh, program: Callable, inputs: tuple, outputs: Any, donated: tuple[int, ...] = ()) -> Any:
-    """A program of three static arguments and ``inputs``, of which each device computes its own part."""
+    """Return a program of three static arguments and ``inputs`` that splits its work over the mesh."""
 
     def split(env, agent, setting, *arguments):
         own = partial(program, env, agent, setting)
@@ -62,8 +62,8 @@ def _split(mesh: Mesh, program: Callable, inputs: tuple, outputs: Any, donated: 
     )
 
 
-def sharded(mesh: Mesh | None, agent: Agent, shapes: TrainState) -> TrainState:
-    """Shapes of a training state that also say which devices its leaves are on."""
+def sharded_shapes(mesh: Mesh | None, agent: Agent, shapes: TrainState) -> TrainState:
+    """Return the shapes of a training state with the devices of every leaf."""
     if mesh is None:
         return shapes
     put = lambda spec, part: jax.tree.map(
@@ -72,11 +72,13 @@ def sharded(mesh: Mesh | None, agent: Agent, shapes: TrainState) -> TrainState:
     return jax.tree.map(put, _specs(agent), shapes)
 
 
-def compiled(program: Any, once: bool = False) -> Any:
-    """Compile what was lowered. On a CPU LLVM's later passes take a quarter of the time and make nothing faster.
+def compile_lowered(program: Any, once: bool = False) -> Any:
+    """Compile a lowered program.
+
+    On a CPU, LLVM's later passes are left out: they take a quarter of the compile time and make nothing faster.
 
     Args:
-        once: it runs a single time, for a moment, so that compiling it is all that counts.
+        once: the program runs only once and briefly, so compile it as fast as possible.
     """
     flag = "xla_backend_optimization_level"
     chosen = jax.default_backend() != "cpu" or flag in os.environ.get("XLA_FLAGS", "")
@@ -84,7 +86,7 @@ def compiled(program: Any, once: bool = False) -> Any:
 
 
 def enable_compile_cache() -> None:
-    """Keep compiled programs between runs, in ~/.cache/mtjax or $MTJAX_CACHE; MTJAX_CACHE=0 does not."""
+    """Cache compiled programs in ~/.cache/mtjax or $MTJAX_CACHE. MTJAX_CACHE=0 turns this off."""
     place = os.environ.get("MTJAX_CACHE", "~/.cache/mtjax/xla")
     if place == "0":
         return

@@ -1,4 +1,4 @@
-"""The host loop around the jitted one: log, evaluate, checkpoint, stop cleanly, and go on where a run stopped."""
+"""The host loop around the jitted loop: log, evaluate, save checkpoints, stop cleanly and resume."""
 
 import contextlib
 import dataclasses
@@ -16,29 +16,29 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from mtjax.config import Plan, configure, require_range
+from mtjax.config import Plan, configure, require_value_range
 from mtjax.evaluation import Evaluations, load_evaluations, save_evaluations
 from mtjax.loop import Settings, TrainState
 from mtjax.parallel import hosts
 from mtjax.parallel import mesh as meshes
 from mtjax.training import checkpoint, finetune, log, points
-from mtjax.training.points import Point, Sweep, Varied
+from mtjax.training.points import Point, Sweep, SweptAgent
 from mtjax.training.policy import Policy
-from mtjax.training.programs import Programs, compiled, jitted, sharded
+from mtjax.training.programs import Programs, compile_lowered, jit_programs, sharded_shapes
 from mtjax.types import SPLITS, Agent, Env, InputError
 
 
 class Result(NamedTuple):
-    """What a run gives back."""
+    """The result of a run."""
 
     state: TrainState
     evaluations: Evaluations
     rows: list[dict[str, Any]]  # the lines of metrics.csv
-    seconds: float  # spent training, without compiling and evaluating
+    seconds: float  # of training, without compiling and evaluating
     compile_seconds: float  # from the start until the first chunk could begin
     finished: bool  # False if a signal stopped it
     directory: Path | None
-    points: tuple[Point, ...] = ()  # of a sweep: number k of S is seed k % seeds of point k // seeds
+    points: tuple[Point, ...] = ()  # of a sweep: entry k of S is seed k % seeds of point k // seeds
 
 
 def train(
@@ -61,41 +61,44 @@ def train(
     on_chunk: Callable[[dict[str, Any]], None] | None = None,
     **given: Any,
 ) -> Result:
-    """Train an agent on a family of tasks, on as many devices as divide the seeds, and then their environments.
+    """Train an agent on a family of tasks.
 
-    Under ``jax.distributed`` every process calls this alike; the first one writes and prints, and all return the same
-    but for ``Result.state``, whose leaves are spread over all of them.
+    Devices share the seeds evenly. Devices that are left over share the environments of each seed. Under
+    ``jax.distributed`` every process makes the same call. The first process writes and prints. All return the same
+    result, except that the leaves of ``Result.state`` are spread over the processes.
 
     Args:
         env: the family; it trains on ``env.tasks("train")``.
         agent: the learner.
-        steps: environment steps of each seed, summed over tasks; rounded up to whole chunks.
-        seeds: how many seeds to run at once; seed: the first of them.
-        eval_every: environment steps between evaluations (0: ten in the run), of ``eval_episodes`` episodes a task.
-        settings: how worlds are played; by default ``Settings()``.
-        start: fine-tune what a run learned, from ``mtjax.load``: ``env`` is ``new.scaled_as(start.env)`` and ``agent``
-            is ``start.agent``, of which rates and ``tune`` may be replaced (``finetune.adopt`` says what is kept).
-        sweep: numbers of the agent that vary, all in one program, ``{"actor_lr": [1e-4, 1e-3], "gamma": [0.98, 0.99]}``
-            for every combination or a list of points ``{"actor_lr": 1e-4, "gamma": 0.98}``. Every point has all seeds,
-            and the S axis of whatever comes back holds them point by point. A seed whose numbers stop being finite is
-            given up, its returns being NaN, and the others go on.
+        steps: environment steps of each seed, summed over tasks. They are rounded up to whole chunks.
+        seeds: how many seeds to train at once.
+        seed: the first seed.
+        eval_every: environment steps between evaluations. 0 means ten evaluations in the run.
+        eval_episodes: episodes of each task in every evaluation.
+        settings: settings of the training loop; by default ``Settings()``.
+        start: the policy to fine-tune, from ``mtjax.load``. Then ``env`` is ``new.scaled_as(start.env)`` and ``agent``
+            is ``start.agent``; only learning rates and ``tune`` may differ. ``finetune.adopt`` says what is kept.
+        sweep: numbers of the agent that vary inside one program. Give ``{"actor_lr": [1e-4, 1e-3], "gamma": [0.98,
+            0.99]}`` for every combination, or a list of points ``{"actor_lr": 1e-4, "gamma": 0.98}``. Every point has
+            all seeds, and the S axis of the result holds them point by point. A seed whose numbers stop being finite
+            is given up: its returns become NaN, and the other seeds continue.
         directory: an existing folder for metrics, evaluations and checkpoints; None writes nothing.
-        resume: go on from the newest checkpoint in ``directory``, on however many devices there are now.
-        profile: leave a trace of one chunk, by ``jax.profiler``, in ``directory``/profile.
+        resume: continue from the newest checkpoint in ``directory``. The number of devices may have changed.
+        profile: write a trace of one chunk by ``jax.profiler`` into ``directory``/profile.
         quiet: print nothing.
-        label: what lines of progress begin with.
-        on_chunk: called with each chunk's first row of metrics.
+        label: the first words of progress lines.
+        on_chunk: a function that is called with each chunk's first row of metrics.
         given: any setting of ``Settings``, of the agent or of its parts, by name: ``num_envs=64, batch_size=128``.
 
     Raises:
         InputError: an argument cannot be used.
-        FloatingPointError: numbers stopped being finite (in a sweep, of all seeds); the message names task and step.
+        FloatingPointError: numbers stopped being finite (in a sweep: of every seed). The message names task and step.
     """
     plan = Plan(steps, seed, seeds, eval_every, eval_episodes)
     agent, settings = configure(agent, settings or Settings(), given)
     found = points.grid(sweep)
-    for learner in points.every(agent, found):
-        require_range(learner)
+    for learner in points.agents_at(agent, found):
+        require_value_range(learner)
         if start is not None:
             finetune.require_fit(start, env, learner)  # type: ignore
     directory = None if directory is None else Path(directory)
@@ -105,25 +108,25 @@ def train(
     tasks = env.tasks("train")
     agent.experience.check(env, settings.num_envs)
     settings = fit_chunk(settings, len(tasks.id), steps, agent.experience.steps)
-    learner = Varied(agent) if found else agent  # type: ignore
+    learner = SweptAgent(agent) if found else agent  # type: ignore
     console = log.Console(plan.steps, quiet or not hosts.is_first(), label)
     mesh = meshes.mesh_for(seeds * max(len(found), 1), len(tasks.id), settings.num_envs)
     run = _Run(env, learner, settings, plan, directory, console, found, mesh, profile)
     try:
-        programs, state = run.begin(resume)
+        programs, state = run.prepare(resume)
         if start is not None and not resume:
             begun = run.adopt(start, tasks, hosts.gather(state.agent))
-            state = state._replace(agent=meshes.by_seed(mesh, begun))
-        hosts.wait()
+            state = state._replace(agent=meshes.shard_by_seed(mesh, begun))
+        hosts.wait_for_all()
         compile_seconds = time.monotonic() - started
         run.console.say(f"compiled in {compile_seconds:.1f} s")
-        return run.drive(programs, state, started, on_chunk)._replace(compile_seconds=compile_seconds)
+        return run.run_chunks(programs, state, started, on_chunk)._replace(compile_seconds=compile_seconds)
     finally:
         run.console.close()
 
 
 def fit_chunk(settings: Settings, num_tasks: int, steps: int, grain: int = 1) -> Settings:
-    """Shorten chunks that are longer than the whole run, and round them up to a multiple of ``grain`` steps."""
+    """Return settings whose chunks are no longer than the run, rounded up to a multiple of ``grain`` steps."""
     whole_run = math.ceil(steps / (num_tasks * settings.num_envs))
     chunk = math.ceil(min(settings.chunk_steps, whole_run) / grain) * grain
     return dataclasses.replace(settings, chunk_steps=chunk)
@@ -144,21 +147,21 @@ class _Run:
     profile: bool = False
 
     @cached_property
-    def spread(self) -> tuple[jax.Array, dict[str, jax.Array] | None]:
-        """Seeds (S,) of all points, and the values (S,) that vary between them."""
-        return points.spread(self.points, self.plan.seed + jnp.arange(self.plan.seeds))
+    def seed_axis(self) -> tuple[jax.Array, dict[str, jax.Array] | None]:
+        """Return the seeds (S,) of all points, and the swept values (S,) by name."""
+        return points.seed_axis(self.points, self.plan.seed + jnp.arange(self.plan.seeds))
 
     @property
     def seeds(self) -> jax.Array:
-        return self.spread[0]
+        return self.seed_axis[0]
 
     def point(self, number: int) -> Point:
-        """The values of one of S that vary."""
+        """Return the swept values of one entry of S."""
         return self.points[number // self.plan.seeds] if self.points else {}
 
     def adopt(self, start: Policy, tasks: Any, fresh: Any) -> Any:
-        """The agent's state, fine-tuning what a run learned; every point begins with the same seeds of it."""
-        if not isinstance(self.agent, Varied):
+        """Return the agent's state with the values of the run to fine-tune. Every point starts from the same seeds."""
+        if not isinstance(self.agent, SweptAgent):
             return finetune.adopt(start, self.agent, tasks, fresh)  # type: ignore
         apart = lambda x: x.reshape(len(self.points), self.plan.seeds, *x.shape[1:])
         together = lambda x: x.reshape(-1, *x.shape[2:])
@@ -167,33 +170,33 @@ class _Run:
         return fresh._replace(learner=learner)
 
     @property
-    def writes(self) -> bool:
+    def is_writer(self) -> bool:
         return self.directory is not None and hosts.is_first()
 
     @cached_property
     def steps_per_iteration(self) -> int:
-        """Environment steps that one step of every environment makes, summed over tasks."""
+        """Return the number of environments, summed over tasks: environment steps of one iteration."""
         return len(self.env.tasks("train").id) * self.settings.num_envs
 
     @property
     def eval_every(self) -> int:
         return self.plan.eval_every or math.ceil(self.plan.steps / 10)
 
-    def begin(self, resume: bool) -> tuple[Programs, TrainState]:
-        """Compile every program at the same time, and make or restore the state; evaluation may be ready later."""
-        env, agent, settings, lazy = self.env, self.agent, self.settings, jitted(self.mesh, self.agent)
-        tasks, everything = (meshes.everywhere(self.mesh, env.tasks(split)) for split in ("train", "all"))
-        (seeds, knobs), pool = meshes.by_seed(self.mesh, self.spread), ThreadPoolExecutor(2)
+    def prepare(self, resume: bool) -> tuple[Programs, TrainState]:
+        """Compile all programs in parallel, and make or restore the state. Evaluation may be ready later."""
+        env, agent, settings, lazy = self.env, self.agent, self.settings, jit_programs(self.mesh, self.agent)
+        tasks, everything = (meshes.replicate(self.mesh, env.tasks(split)) for split in ("train", "all"))
+        (seeds, knobs), pool = meshes.shard_by_seed(self.mesh, self.seed_axis), ThreadPoolExecutor(2)
         fresh = lazy.init.lower(env, agent, settings, tasks, seeds, knobs)
-        shapes = sharded(self.mesh, agent, fresh.out_info)
+        shapes = sharded_shapes(self.mesh, agent, fresh.out_info)
         self._describe(shapes)
-        make = None if resume else pool.submit(compiled, fresh, once=True)
+        make = None if resume else pool.submit(compile_lowered, fresh, once=True)
         chunk = lazy.chunk.lower(env, agent, settings, tasks, shapes)
         lower = partial(lazy.evaluate.lower, env, agent, self.plan.eval_episodes, shapes.agent, everything, seeds)
-        score = pool.submit(lambda: compiled(lower(np.int32(0))))
+        score = pool.submit(lambda: compile_lowered(lower(np.int32(0))))
         pool.shutdown(wait=False)
         evaluate = lambda agents, number: score.result()(agents, everything, seeds, np.int32(number))
-        programs = Programs(partial(compiled(chunk), tasks), evaluate)
+        programs = Programs(partial(compile_lowered(chunk), tasks), evaluate)
         return programs, self._restore(shapes) if make is None else make.result()(tasks, seeds, knobs)
 
     def _describe(self, shapes: TrainState) -> None:
@@ -202,8 +205,8 @@ class _Run:
             f"memory: {checkpoint.size_of(shapes) / 1e6:,.0f} MB of state, of which {data:,.0f} MB "
             f"{self.agent.experience.describe(self.settings.num_envs)}"
         )
-        if spread := meshes.describe(self.mesh, len(self.seeds), self.settings.num_envs):
-            self.console.say(spread)
+        if line := meshes.describe(self.mesh, len(self.seeds), self.settings.num_envs):
+            self.console.say(line)
         if self.directory is not None:
             checkpoint.require_space(self.directory, shapes)
 
@@ -212,28 +215,28 @@ class _Run:
         return checkpoint.load(self.directory / "checkpoints", shapes)
 
     def _earlier_seconds(self, iteration: int) -> float:
-        """Seconds of training that a resumed run has behind it; its later lines of metrics are dropped."""
-        if not self.writes:
+        """Return the training seconds of a resumed run so far, and drop its later lines of metrics."""
+        if not self.is_writer:
             return 0.0
         assert self.directory is not None
         return log.truncate_rows(self.directory / "metrics.csv", iteration)
 
-    def drive(self, programs: Programs, state: TrainState, started: float, on_chunk) -> Result:
-        """Run chunks until the plan is done or a signal asks to stop."""
+    def run_chunks(self, programs: Programs, state: TrainState, started: float, on_chunk) -> Result:
+        """Run chunks until all steps are done or a signal asks to stop."""
         steps = int(state.iteration) * self.steps_per_iteration
         evaluations = self._earlier_evaluations(steps)
         rows, seconds, stop = [], self._earlier_seconds(int(state.iteration)), False
-        lost = np.zeros(len(self.seeds), bool)
+        diverged = np.zeros(len(self.seeds), bool)
         with stop_signals() as received:
             while steps < self.plan.steps and not stop:
                 steps_before = steps
-                with self._watch(len(rows), steps):
+                with self._profile_chunk(len(rows), steps):
                     before = time.monotonic()
                     state, metrics = programs.chunk(state)
                     metrics = hosts.gather(metrics)
                     elapsed = time.monotonic() - before
                 seconds += elapsed
-                lost |= self._lose(metrics["bad_step"], steps_before // self.steps_per_iteration, lost)
+                diverged |= self._find_diverged(metrics["bad_step"], steps_before // self.steps_per_iteration, diverged)
                 steps += self.settings.chunk_steps * self.steps_per_iteration
                 common = {
                     "iteration": steps // self.steps_per_iteration,
@@ -251,17 +254,17 @@ class _Run:
                     on_chunk(new[0])
                 due = steps // self.eval_every > steps_before // self.eval_every
                 if due or steps >= self.plan.steps:
-                    evaluations = self._evaluate(programs.evaluate, state, evaluations, steps, lost)
-                stop = hosts.anywhere(bool(received))
+                    evaluations = self._evaluate(programs.evaluate, state, evaluations, steps, diverged)
+                stop = hosts.any_process(bool(received))
                 if due or stop or steps >= self.plan.steps:
                     self._save(state)
         return Result(state, evaluations, rows, seconds, 0.0, steps >= self.plan.steps, self.directory, self.points)
 
     @contextlib.contextmanager
-    def _watch(self, rows: int, steps: int) -> Iterator[None]:
-        """Trace the run's second chunk, by when all is warm, or its only one, if that is asked for."""
+    def _profile_chunk(self, rows: int, steps: int) -> Iterator[None]:
+        """Trace the run's second, warm chunk, or its only one, if ``profile`` asks for it."""
         only = steps + self.settings.chunk_steps * self.steps_per_iteration >= self.plan.steps
-        if not (self.profile and self.writes and (rows == len(self.seeds) or (only and not rows))):
+        if not (self.profile and self.is_writer and (rows == len(self.seeds) or (only and not rows))):
             yield
             return
         place = self.directory / "profile"  # type: ignore
@@ -269,18 +272,18 @@ class _Run:
             yield
         self.console.say(f"profile of one chunk: {place} (xprof --logdir={place}, or its *.trace.json.gz in Perfetto)")
 
-    def _lose(self, bad_step: np.ndarray, first_step: int, lost: np.ndarray) -> np.ndarray:
-        """Which seeds (S,) are not finite any more; one that diverged must not end a sweep of many."""
+    def _find_diverged(self, bad_step: np.ndarray, first_step: int, diverged: np.ndarray) -> np.ndarray:
+        """Return which seeds (S,) have diverged in this chunk. In a sweep the other seeds continue."""
         broken = np.any(bad_step >= 0, axis=1)
-        if not self.points or np.all(broken | lost):
+        if not self.points or np.all(broken | diverged):
             _require_finite(bad_step, first_step)
-        for k in np.flatnonzero(broken & ~lost):
+        for k in np.flatnonzero(broken & ~diverged):
             values = ", ".join(f"{name}={value:g}" for name, value in self.point(int(k)).items())
             self.console.say(f"seed {self.seeds[k]} of {values} diverged and is given up")
         return broken
 
     def _write(self, rows: list[dict[str, Any]]) -> None:
-        if self.writes:
+        if self.is_writer:
             assert self.directory is not None
             log.append_rows(self.directory / "metrics.csv", rows)
 
@@ -288,29 +291,29 @@ class _Run:
         if self.directory is not None:
             checkpoint.save(self.directory / "checkpoints", state)
 
-    def _evaluate(self, program: Callable, state: TrainState, past: Evaluations, steps: int, lost) -> Evaluations:
-        """Evaluate on all splits, and add the result to the run's evaluations."""
+    def _evaluate(self, program: Callable, state: TrainState, past: Evaluations, steps: int, diverged) -> Evaluations:
+        """Evaluate on all splits, and append the result to the run's evaluations."""
         scores = hosts.gather(program(state.agent, len(past.steps)))
         rows = {split: np.asarray(self.env.tasks(split).id) for split in SPLITS}
 
-        def grow(old: Mapping[str, np.ndarray], new: np.ndarray) -> dict[str, np.ndarray]:
+        def append(old: Mapping[str, np.ndarray], new: np.ndarray) -> dict[str, np.ndarray]:
             new = np.array(new, np.float32)
-            new[lost] = np.nan
+            new[diverged] = np.nan
             return {split: np.concatenate([x, new[:, None, rows[split]]], axis=1) for split, x in old.items()}
 
-        none = {split: np.zeros((len(lost), 0, *x.shape[2:]), np.float32) for split, x in past.returns.items()}
-        metrics = {name: grow(past.metrics.get(name, none), x) for name, x in scores.metrics.items()}
-        grown = grow(past.returns, scores.returns)
-        evaluations = Evaluations(np.append(past.steps, steps), grown, past.values, metrics)
-        if self.writes:
+        none = {split: np.zeros((len(diverged), 0, *x.shape[2:]), np.float32) for split, x in past.returns.items()}
+        metrics = {name: append(past.metrics.get(name, none), x) for name, x in scores.metrics.items()}
+        returns = append(past.returns, scores.returns)
+        evaluations = Evaluations(np.append(past.steps, steps), returns, past.values, metrics)
+        if self.is_writer:
             assert self.directory is not None
             save_evaluations(self.directory / "evaluations.npz", evaluations)
-        means = ", ".join(f"{s} {x[~lost, -1].mean():.0f}" for s, x in grown.items() if x.size)
+        means = ", ".join(f"{s} {x[~diverged, -1].mean():.0f}" for s, x in returns.items() if x.size)
         self.console.say(f"evaluation at {steps:,} steps: {means}")
         return evaluations
 
     def _earlier_evaluations(self, steps: int) -> Evaluations:
-        """The evaluations up to a step: those on disk if the run is resumed, else none."""
+        """Return the evaluations of a resumed run up to a step; of a new run, empty ones."""
         file = None if self.directory is None else self.directory / "evaluations.npz"
         if steps and file is not None and file.exists():
             past = load_evaluations(file)
@@ -328,7 +331,7 @@ class _Run:
 
 
 def _require_finite(bad_step: np.ndarray, first_step: int) -> None:
-    """Stop a run whose numbers are not finite, naming task and step."""
+    """Raise FloatingPointError with task and step if a number is not finite."""
     if np.all(bad_step < 0):
         return
     step = int(np.min(bad_step[bad_step >= 0]))
@@ -341,7 +344,7 @@ def _require_finite(bad_step: np.ndarray, first_step: int) -> None:
 
 @contextlib.contextmanager
 def stop_signals() -> Iterator[list[int]]:
-    """Collect Ctrl-C and SIGTERM instead of dying of them; a second Ctrl-C does what it always does."""
+    """Collect Ctrl-C and SIGTERM instead of stopping at once. A second Ctrl-C stops as usual."""
     received: list[int] = []
 
     def note(number, _frame) -> None:

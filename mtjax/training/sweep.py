@@ -1,8 +1,8 @@
-"""``python -m mtjax.train --sweep ...``: every combination of settings, and one table of them.
+"""``python -m mtjax.train --sweep ...``: train every combination of settings, and write one table.
 
-The agent's numbers are points of one program (``points.py``); each combination of other settings is a program of its
-own, and one that does not fit into memory is run in rounds (``memory.py``). Every program and round is a run like any
-other, in a folder of the sweep's: ``run-1``, ``run-2`` and so on. A run in rounds is a sweep of one setting.
+Real numbers of the agent are points of one program (``points.py``). Each combination of other settings is a program of
+its own. A program that does not fit into memory is split into rounds (``memory.py``). Every program and round is a run
+in the sweep's folder: ``run-1``, ``run-2`` and so on. A plain run in rounds is a sweep of one setting.
 """
 
 import dataclasses
@@ -20,51 +20,51 @@ from mtjax.evaluation import Evaluations, load_evaluations
 from mtjax.report import figures
 from mtjax.report.stats import seed_interval
 from mtjax.training import memory, points
-from mtjax.training.folder import circumstances, new_directory, record_steps, recorded, short_name
-from mtjax.training.launch import check, launch, starting
+from mtjax.training.folder import new_directory, record_steps, resumed_config, run_metadata, short_name
+from mtjax.training.launch import check, launch, load_start
 from mtjax.training.log import append_rows, number
 from mtjax.training.programs import enable_compile_cache
 from mtjax.types import SPLITS, InputError
 
-Parse = Callable[[Sequence[str]], RunConfig]  # a command line to the run that it asks for
+Parse = Callable[[Sequence[str]], RunConfig]  # command line -> configuration
 _FIXED = ("seed", "seeds", "runs", "resume", "list", "import", "sweep", "from", "preset")
-_DIVERGED = "diverged.txt"  # beside a run of which no seed is finite any more: what stopped it
+_DIVERGED = "diverged.txt"  # holds the error of a run whose seeds all diverged
 
 
 class Axis(NamedTuple):
-    """One flag, without its dashes, and the values that it takes in turn."""
+    """One flag, without its dashes, and the values to try."""
 
     flag: str
     values: tuple[str, ...]
 
     @property
     def name(self) -> str:
-        """What it is called in tables and records."""
+        """Return its name in tables and records."""
         return self.flag.removeprefix("agent.")
 
     @property
     def setting(self) -> str:
-        """The agent's setting that it is, if it is one."""
+        """Return the name of the agent's setting; an empty string for other flags."""
         return self.name.replace("-", "_") if self.flag != self.name else ""
 
 
-# What to run.
+# Reading the command line.
 
 
-def wanted(argv: Sequence[str]) -> bool:
-    """Whether a command line asks for a sweep, or to go on with one."""
+def is_sweep(argv: Sequence[str]) -> bool:
+    """Return whether a command line starts or resumes a sweep."""
     names = [word.split("=", 1)[0] for word in argv]
     if "--sweep" in names and "--resume" in names:
         raise InputError("--resume goes on with a sweep as it was; leave out --sweep")
     resumed = next((word.split("=", 1)[1] for word in argv if word.startswith("--resume=")), "")
-    return "--sweep" in names or bool(resumed and _runs(Path(resumed)))
+    return "--sweep" in names or bool(resumed and _run_folders(Path(resumed)))
 
 
-def read(argv: Sequence[str]) -> tuple[list[Axis], list[str]]:
+def read_axes(argv: Sequence[str]) -> tuple[list[Axis], list[str]]:
     """Take ``--sweep FLAG=VALUE,VALUE ...`` out of a command line.
 
     Raises:
-        InputError: a word of it is not a flag with values, or a flag that no sweep can vary.
+        InputError: a word is not a flag with values, or a sweep cannot vary that flag.
     """
     axes, rest, inside = {}, [], False
     for word in argv:
@@ -95,15 +95,18 @@ def _axis(word: str) -> Axis:
     return Axis(flag, values)
 
 
-def _varies_inside(axis: Axis) -> bool:
-    """Whether an axis is a number of agents or their parts, for all of whose values one program does."""
+def _is_agent_number(axis: Axis) -> bool:
+    """Return whether an axis is a float of an agent or its parts, which can vary inside one program."""
     tables = [table.values() for kind, table in PARTS.items() if kind not in ("encoder", "experience")]
     classes = [*(preset.cls for preset in AGENTS.values()), *itertools.chain(*tables)]
     return any(f.name == axis.setting and f.type is float for cls in classes for f in dataclasses.fields(cls))
 
 
-def _words(flag: str, value: str) -> list[str]:
-    """A flag as it is written on a command line; true and false are what switches take, spaces part several words."""
+def _to_flags(flag: str, value: str) -> list[str]:
+    """Return a flag and its value as words of a command line.
+
+    "true" and "false" are values of switches. Spaces separate the values of a list.
+    """
     if value.lower() in ("true", "false"):
         group, dot, name = flag.rpartition(".")
         return [f"--{group}{dot}{'' if value.lower() == 'true' else 'no-'}{name}"]
@@ -112,22 +115,22 @@ def _words(flag: str, value: str) -> list[str]:
 
 
 def configurations(argv: Sequence[str], parse: Parse) -> list[RunConfig]:
-    """Every program that a command line with ``--sweep`` asks for, its points checked, before memory splits any.
+    """Return the configuration of every program of a sweep, with checked points, before memory splits them.
 
     Raises:
-        InputError: some value cannot be used.
+        InputError: a value is not allowed.
     """
-    axes, rest = read(argv)
-    inside = [axis for axis in axes if _varies_inside(axis)]
+    axes, rest = read_axes(argv)
+    inside = [axis for axis in axes if _is_agent_number(axis)]
     outside = [axis for axis in axes if axis not in inside]
     found = []
     for values in itertools.product(*(axis.values for axis in outside)):
         chosen = [Axis(axis.flag, (value,)) for axis, value in zip(outside, values, strict=True)]
-        config = parse([*rest, *itertools.chain(*(_words(axis.flag, axis.values[0]) for axis in chosen))])
+        config = parse([*rest, *itertools.chain(*(_to_flags(axis.flag, axis.values[0]) for axis in chosen))])
         sweep = tuple(f"{axis.flag}={','.join(axis.values)}" for axis in (*chosen, *inside))
         points_of_it = points.grid({axis.setting: [_number(axis, x) for x in axis.values] for axis in inside})
         for point in points_of_it:
-            points.at(config.learner, point)
+            points.agent_at(config.learner, point)
         found.append(dataclasses.replace(config, sweep=sweep, points=points_of_it))
     return found
 
@@ -139,55 +142,55 @@ def _number(axis: Axis, text: str) -> float:
         raise InputError(f"{axis.flag} is a number, and {text!r} is none") from None
 
 
-# Running it.
+# Running.
 
 
 def main(argv: Sequence[str], parse: Parse) -> None:
-    """Run what a command line with ``--sweep`` asks for, or go on with what ``--resume`` names."""
+    """Start the sweep of ``--sweep``, or resume the sweep in the folder of ``--resume``."""
     enable_compile_cache()
     resume = next((Path(word.split("=", 1)[1]) for word in argv if word.startswith("--resume=")), None)
     if resume is not None:
-        for directory in _runs(resume):
-            record_steps(directory / "config.json", recorded(parse(argv), directory, argv).plan.steps)
-        carry_on(resume)
+        for directory in _run_folders(resume):
+            record_steps(directory / "config.json", resumed_config(parse(argv), directory, argv).plan.steps)
+        run_unfinished(resume)
         return
     found = configurations(argv, parse)
     for config in found:
         check(config)
-        starting(config)
-    begin(found, "sweep")
+        load_start(config)
+    run_all(found, "sweep")
 
 
-def begin(found: Sequence[RunConfig], kind: str) -> None:
-    """Make a folder with a run for every program and round, and run them."""
-    limit = memory.memory()
-    split = [memory.split(config, limit) for config in found]
+def run_all(found: Sequence[RunConfig], kind: str) -> None:
+    """Make a folder with a run for every program and round, and train them all."""
+    limit = memory.available_bytes()
+    split = [memory.split_to_fit(config, limit) for config in found]
     folder = new_directory(Path(found[0].runs), f"{short_name(found[0].env)}-{found[0].agent}-{kind}")
     for i, config in enumerate(itertools.chain(*split)):
         (folder / f"run-{i + 1}").mkdir()
-        (folder / f"run-{i + 1}" / "config.json").write_text(to_json(config, circumstances(config)))
+        (folder / f"run-{i + 1}" / "config.json").write_text(to_json(config, run_metadata(config)))
     for config, parts in zip(found, split, strict=True):
         print(memory.describe(config, len(parts), limit), flush=True)
-    carry_on(folder)
+    run_unfinished(folder)
 
 
-def _runs(folder: Path) -> list[Path]:
-    """The folders of a sweep's runs, in order; a run of several points is a sweep by itself."""
+def _run_folders(folder: Path) -> list[Path]:
+    """Return the folders of a sweep's runs in order. A run of several points is a sweep by itself."""
     if (folder / "config.json").is_file():
         return [folder] if from_json(folder / "config.json").points else []
     return sorted(folder.glob("run-*"), key=lambda run: int(run.name.removeprefix("run-")))
 
 
-def carry_on(folder: Path) -> None:
-    """Run whatever of a sweep has not been run to its end, and lay out the table of all."""
-    runs = _runs(folder)
+def run_unfinished(folder: Path) -> None:
+    """Train all runs of a sweep that are not finished, and print the table of the whole sweep."""
+    runs = _run_folders(folder)
     print(f"sweep: {folder}", flush=True)
     for i, run in enumerate(runs):
         config = from_json(run / "config.json")
-        if last(config, run) is not None or (run / _DIVERGED).exists():
+        if final_evaluations(config, run) is not None or (run / _DIVERGED).exists():
             continue
         label, resume = f"run {i + 1} of {len(runs)}", (run / "checkpoints").is_dir()
-        start = None if resume else starting(config)
+        start = None if resume else load_start(config)
         try:
             if not launch(config, run, start, resume, label).finished:
                 words = shlex.join([f"--resume={folder}", *import_flags(config)])
@@ -203,7 +206,7 @@ def carry_on(folder: Path) -> None:
 
 
 def _draw(config: RunConfig, run: Path) -> None:
-    """Draw the return on training tasks over steps, a line for each setting of which no seed diverged."""
+    """Draw training return over steps, one line per setting. Settings with a diverged seed are left out."""
     evaluations, count = load_evaluations(run / "evaluations.npz"), config.plan.seeds
     curves = {}
     for p, point in enumerate(config.points or ({},)):
@@ -216,8 +219,8 @@ def _draw(config: RunConfig, run: Path) -> None:
         )
 
 
-def last(config: RunConfig, run: Path) -> Evaluations | None:
-    """The evaluations of a run that is at its end; None if it is not."""
+def final_evaluations(config: RunConfig, run: Path) -> Evaluations | None:
+    """Return the evaluations of a finished run; None if it is not finished."""
     if not (run / "evaluations.npz").exists():
         return None
     found = load_evaluations(run / "evaluations.npz")
@@ -228,11 +231,11 @@ def last(config: RunConfig, run: Path) -> Evaluations | None:
 
 
 def rows(runs: Sequence[Path]) -> list[dict[str, Any]]:
-    """A row for each setting: its runs, its values, seeds that diverged, and the last evaluation of each split."""
+    """Return a row for each setting: its runs, values, diverged seeds, and last evaluation of each split."""
     found: dict[tuple, list[_Part]] = {}
     for run in runs:
         config = from_json(run / "config.json")
-        evaluations, count = last(config, run), config.plan.seeds
+        evaluations, count = final_evaluations(config, run), config.plan.seeds
         for p, point in enumerate(config.points or ({},)):
             mine = slice(p * count, (p + 1) * count)
             returns = evaluations and {split: x[mine, -1] for split, x in evaluations.returns.items() if x.size}
@@ -244,7 +247,7 @@ def rows(runs: Sequence[Path]) -> list[dict[str, Any]]:
 
 
 class _Part(NamedTuple):
-    """What one run holds of one setting: all of its seeds, or those of a round."""
+    """The seeds of one setting in one run: all of them, or those of a round."""
 
     run: str
     number: int
@@ -266,13 +269,13 @@ def _row(values: dict[str, str], parts: list[_Part]) -> dict[str, Any]:
 
 
 def _values(config: RunConfig, point: Mapping[str, float]) -> dict[str, str]:
-    """The values of one setting, in the order in which the sweep was asked for."""
+    """Return the values of one setting, in the order of the sweep's flags."""
     axes = [_axis(word) for word in config.sweep]
     return {x.name: f"{point[x.setting]:g}" if x.setting in point else x.values[0] for x in axes}
 
 
 def _scores(returns: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Mean and interval over seeds of returns (S, T, episodes); none where a seed diverged, as that has no mean."""
+    """Return mean and interval over seeds of returns (S, T, episodes); NaN if a seed diverged."""
     diverged = max(int(np.sum(~np.isfinite(x).all(axis=(1, 2)))) for x in returns.values())
     found: dict[str, Any] = {"diverged": diverged}
     for split, x in returns.items():
@@ -282,7 +285,7 @@ def _scores(returns: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Lay out a sweep's rows: settings, then each split's mean return with its 95% interval over seeds."""
+    """Return a sweep's rows as text: settings, then each split's mean return with its 95% interval over seeds."""
     splits = [split for split in SPLITS if split in rows[0]] or [SPLITS[0]]
     after = list(rows[0]).index("seeds")
     settings = [name for name in list(rows[0])[:after] if name != "number"]

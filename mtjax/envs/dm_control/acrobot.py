@@ -37,7 +37,7 @@ class AcrobotSwingup(Domain):
     """
 
     sparse: bool = False
-    """Reward only the goal itself, with 1."""
+    """Give a reward of 1 at the goal and 0 elsewhere."""
 
     parameters: ClassVar = MappingProxyType(
         {
@@ -67,7 +67,7 @@ class AcrobotSwingup(Domain):
         return tolerance(jnp.linalg.norm(self.to_target(task, world)), 0.0, _TARGET_RADIUS, margin)
 
     def to_target(self, task: Task, world: World) -> Array:
-        """From the tip to the target, along x and z (2,) [m]."""
+        """Return the vector (2,) [m] from the tip to the target, along x and z."""
         model, bodies, sites = self.models[0], self.leaf(task, "body_pos")[:, 2], self.leaf(task, "site_pos")[:, 2]
         shoulder, elbow = bodies[model.body("upper_arm").id], bodies[model.body("lower_arm").id]
         target, tip = sites[model.site("target").id], sites[model.site("tip").id]

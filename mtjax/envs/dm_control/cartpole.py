@@ -54,7 +54,7 @@ class CartpoleBalance(Domain):
     """
 
     sparse: bool = False
-    """Reward only the goal itself, with 1."""
+    """Give a reward of 1 at the goal and 0 elsewhere."""
 
     parameters: ClassVar = MappingProxyType(
         {

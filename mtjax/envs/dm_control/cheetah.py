@@ -24,7 +24,7 @@ _POOL = 1024  # start states of all models together, as far as each has between 
 
 
 def _weigh(spec: mujoco.MjSpec) -> None:
-    """Give all geoms the density with which the whole body has the domain's mass."""
+    """Set the density of all geoms so that the whole body has the domain's mass."""
     _set_density(spec, 1.0)
     _set_density(spec, _TOTAL_MASS / np.sum(spec.compile().body_mass))
 
@@ -171,7 +171,7 @@ class CheetahDirection(CheetahRun):
 
 
 def _settle(models: Sequence[mujoco.MjModel], random: np.random.Generator) -> np.ndarray:
-    """Drop one body of each model in a random pose; return where they come to (N, nq + nv)."""
+    """Drop one body of each model from a random pose, and return its settled state (N, nq + nv)."""
     from mujoco import batch
 
     limited = models[0].jnt_limited.astype(bool)

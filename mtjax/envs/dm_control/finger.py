@@ -29,7 +29,7 @@ def _scale_links(spec: mujoco.MjSpec, size: float) -> None:
 
 
 def _widen_touch(spec: mujoco.MjSpec, size: float) -> None:
-    """Set the first radius of both touch sensors' ellipsoids; no mass, shape or motion changes."""
+    """Set the first radius of both touch sensors' ellipsoids. No mass, shape or motion changes."""
     for name in ("touchtop", "touchbottom"):
         site = spec.site(name)
         site.size = [size, *site.size[1:]]
@@ -143,24 +143,24 @@ class FingerTurn(FingerSpin):
         return *super().start(task, joint_key), self.target(task, self.target_angle(task, target_key))
 
     def target_angle(self, task: Task, key: Key) -> Array:
-        """The target's angle () [rad] in an episode: 0 is up, positive towards x."""
+        """Return the target's angle () [rad] in an episode: 0 is up, positive towards x."""
         return jax.random.uniform(key, minval=-math.pi, maxval=math.pi)
 
     def target(self, task: Task, angle: Array) -> Array:
-        """Where the target is (2,): x and z [m] from the hinge, as far as the spinner's first capsule is long."""
+        """Return x and z (2,) [m] of the target from the hinge. Its distance is the first capsule's length."""
         radius = jnp.sum(self.leaf(task, "geom_size")[self.models[0].geom("cap1").id])
         return radius * jnp.stack([jnp.sin(angle), jnp.cos(angle)])
 
     def distance(self, task: Task, seen: Array, target: Array) -> Array:
-        """From the tip to the surface of the target, () [m], negative inside, where FingerSpin sees ``seen`` (9,)."""
+        """Return the distance () [m] from the tip to the target's surface, negative inside, given ``seen`` (9,)."""
         return jnp.linalg.norm(target - seen[2:4]) - task.goal["target-size"]
 
     def show(self, task: Task, seen: Array, target: Array) -> Array:
-        """The observation where FingerSpin sees ``seen`` (9,)."""
+        """Return the observation, given FingerSpin's ``seen`` (9,)."""
         return jnp.concatenate([seen, target, self.distance(task, seen, target)[None]])
 
     def pay(self, task: Task, seen: Array, target: Array) -> Array:
-        """The reward () where FingerSpin sees ``seen`` (9,)."""
+        """Return the reward (), given FingerSpin's observation ``seen`` (9,)."""
         return (self.distance(task, seen, target) <= 0).astype(jnp.float32)
 
     def observe(self, task: Task, world: World) -> Array:

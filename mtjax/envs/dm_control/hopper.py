@@ -84,7 +84,7 @@ class HopperStand(Domain):
         return self.standing(task, world) * (4 + jnp.mean(effort)) / 5
 
     def standing(self, task: Task, world: World) -> Array:
-        """Whether the torso is high enough over the foot, ()."""
+        """Return whether the torso is high enough over the foot, ()."""
         height = self.planar(task, world).centre[:, 1]
         torso, foot = (self.models[0].body(name).id for name in ("torso", "foot"))
         return tolerance(height[torso] - height[foot], *_HEIGHTS)

@@ -81,7 +81,7 @@ class PointMass(Domain):
         return tolerance(distance, 0.0, radius, radius) * (4 + gentle) / 5
 
     def _target(self, task: Task, world: World) -> tuple[Array, Array]:
-        """Distance () from the goal, and the goal's radius () [m]."""
+        """Return distance () from the goal and the goal's radius () [m]."""
         target = self.models[0].geom("target").id
         position, size = self.leaf(task, "geom_pos")[target], self.leaf(task, "geom_size")[target]
         return jnp.linalg.norm(world.qpos - position[:2]), size[0]

@@ -62,7 +62,7 @@ class Reacher(Domain):
     fresh_goals: ClassVar[bool] = True
 
     def start(self, task: Task, key: Key) -> tuple[Array, Array, Array]:
-        """Draw positions and velocities of the joints, and where the target is (2,) [m]."""
+        """Draw positions and velocities of the joints, and the place of the target (2,) [m]."""
         joint_key, target_key = jax.random.split(key)
         return start_joints(self.models[0], joint_key), jnp.zeros(2), self.target(task, target_key)
 
@@ -85,12 +85,12 @@ class Reacher(Domain):
         )
 
     def target(self, task: Task, key: Key) -> Array:
-        """Where the target is (2,) [m] in an episode."""
+        """Return the place of the target (2,) [m] in an episode."""
         angle, radius = self.polar_target(task, key)
         return radius * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
 
     def polar_target(self, task: Task, key: Key) -> tuple[Array, Array]:
-        """Direction () [rad] and distance () [m] of the target from the shoulder in one episode."""
+        """Return direction () [rad] and distance () [m] of the target from the shoulder in one episode."""
         angle_key, radius_key = jax.random.split(key)
         return (
             jax.random.uniform(angle_key, minval=-jnp.pi, maxval=jnp.pi),
@@ -98,7 +98,7 @@ class Reacher(Domain):
         )
 
     def finger(self, task: Task, world: World) -> Array:
-        """Where the middle of the finger is (2,) [m]."""
+        """Return the middle of the finger (2,) [m]."""
         bodies = jnp.array([self.models[0].body(name).id for name in ("hand", "finger")])
         lengths, angles = self.leaf(task, "body_pos")[bodies, 0], jnp.cumsum(world.qpos)
         return jnp.stack([jnp.sum(lengths * jnp.cos(angles)), jnp.sum(lengths * jnp.sin(angles))])

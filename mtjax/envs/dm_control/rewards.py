@@ -16,11 +16,11 @@ def tolerance(
 ) -> Array:
     """Return 1 for ``x`` between the bounds, falling to ``value_at_margin`` at a distance ``margin`` from them.
 
-    The function of that name in dm_control (Tassa et al. 2018, "DeepMind Control Suite", section 2.1).
+    It is the function of that name in dm_control (Tassa et al. 2018, "DeepMind Control Suite", section 2.1).
 
     Args:
         x: () or any shape; the bounds and the margin may be arrays. A margin of 0 gives 0 outside the bounds.
-        sigmoid: how it falls: "gaussian", "linear" or "quadratic"; the last two reach 0 and stay there.
+        sigmoid: shape of the fall: "gaussian", "linear" or "quadratic". The last two reach 0 and stay there.
     """
     outside = jnp.maximum(jnp.maximum(lower - x, x - upper), 0.0)
     distance = outside / jnp.where(jnp.asarray(margin) > 0, margin, 1.0)

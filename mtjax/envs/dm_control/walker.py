@@ -109,7 +109,7 @@ class WalkerWalk(WalkerStand):
         return super().reward(task, world, action) * (5 * self.move(task, world) + 1) / 6
 
     def move(self, task: Task, world: World) -> Array:
-        """How well the walker moves, () in [0, 1]."""
+        """Return the reward's factor () in [0, 1] for forward velocity."""
         speed = task.goal["speed"]
         return tolerance(self.forward_velocity(task, world), speed, jnp.inf, speed / 2, "linear", value_at_margin=0.5)
 

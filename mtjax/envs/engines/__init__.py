@@ -1,1 +1,1 @@
-"""Physics engines behind one step."""
+"""Physics engines with one interface."""

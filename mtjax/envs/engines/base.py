@@ -1,7 +1,7 @@
-"""What an engine is, and which one runs: MJX-JAX anywhere, MuJoCo C on the CPU, and MJX-Warp on NVIDIA's GPUs.
+"""The interface of physics engines, and the choice of one: MJX anywhere, MuJoCo C on CPUs, MuJoCo Warp on NVIDIA GPUs.
 
-All advance a world by ``num_substeps`` and then bring the position and velocity sensors up to the new state, as
-dm_control does; force sensors (touch) stay those of the last substep. Worlds are single: the caller maps.
+An engine advances a world by ``num_substeps``. It then updates position and velocity sensors to the new state, as
+dm_control does. Force sensors (touch) keep the values of the last substep. Worlds are single: the caller maps.
 """
 
 import contextlib
@@ -19,17 +19,17 @@ ENGINES = ("auto", "mjx", "warp", "c")
 
 
 class World(NamedTuple):
-    """The physical state of one simulated world, and what its sensors read in it."""
+    """The physical state of one simulated world, and the values of its sensors."""
 
     qpos: Array  # (nq,) [m or rad]
     qvel: Array  # (nv,) [m/s or rad/s]
     warmstart: Array  # (nv,) last constrained acceleration, where the next solve starts
     sensors: Any  # (nsensordata,); None where the model has none
-    extra: Any = None  # what the domain itself remembers of the episode; no engine touches it
+    extra: Any = None  # the domain's own memory of the episode; engines leave it alone
 
 
 class Engine(Protocol):
-    """Physics of every task of one family. ``task`` selects the model; worlds are not batched."""
+    """The physics of every task of one family. ``task`` selects the model; worlds are not batched."""
 
     def forward(self, task: Task, qpos: Array, qvel: Array, extra: Any = None) -> World: ...
     def place(self, task: Task, qpos: Array, qvel: Array, extra: Any = None) -> World: ...
@@ -38,13 +38,13 @@ class Engine(Protocol):
 
 
 def choose_engine(engine: str, preferred: str = "mjx") -> str:
-    """Return the engine that runs for ``engine``: where that is "auto", MuJoCo C on a CPU.
+    """Return the name of the engine to run. "auto" is MuJoCo C on a CPU, and ``preferred`` elsewhere.
 
     Args:
-        preferred: what "auto" is elsewhere, "mjx" or "warp"; MJX where Warp cannot run.
+        preferred: "mjx" or "warp". MJX replaces Warp where Warp cannot run.
 
     Raises:
-        InputError: the engine that is asked for cannot run on this device, or Warp is not installed.
+        InputError: this device cannot run the engine, or Warp is not installed.
     """
     device = jax.default_backend()
     nvidia = device == "gpu" and "rocm" not in jax.devices()[0].client.platform_version.lower()
@@ -67,22 +67,22 @@ def _warp_installed() -> bool:
 
 @lru_cache
 def mjx_module() -> Any:
-    """Import MJX, without its remark on standard output that Warp is not installed."""
+    """Import MJX without its message on standard output that Warp is not installed."""
     with contextlib.redirect_stdout(io.StringIO()):
         from mujoco import mjx
     return mjx
 
 
 def some(values: Array) -> Array | None:
-    """Return values, or None where there are none: arrays of size 0 can be neither reshaped by halves nor saved."""
+    """Return values, or None if there are none, because arrays of size 0 cannot be reshaped or saved."""
     return values if values.size else None
 
 
 def require_plain(model: mujoco.MjModel) -> None:
-    """Refuse a model whose state is more than positions and velocities.
+    """Refuse a model with more state than positions and velocities.
 
     Raises:
-        InputError: actuators with activations, delays, or a clock among the sensors.
+        InputError: the model has actuators with activations, delays, or a clock sensor.
     """
     if model.na or model.nhistory or mujoco.mjtSensor.mjSENS_CLOCK in model.sensor_type:
         raise InputError(

@@ -19,10 +19,10 @@ from mtjax.types import Array, Task
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MujocoC:
-    """The C engine, threaded over worlds, as a pure function through a callback: for CPUs.
+    """MuJoCo's C engine for CPUs: a pure function through a callback, threaded over worlds.
 
-    The host flattens every mapped axis into one batch with one model a world, picked by ``task.row``. A batch keeps
-    what it computed in the state it hands out, and goes on from there if it is given that very state back.
+    The host flattens every mapped axis into one batch with one model per world, picked by ``task.row``. A batch keeps
+    its computed data, and continues from there if it receives the very state that it returned last.
     """
 
     models: Sequence[mujoco.MjModel]
@@ -35,14 +35,14 @@ class MujocoC:
 
     @cached_property
     def _models(self) -> list[mujoco.MjModel]:
-        """The models, of which a world that diverges shows it: MuJoCo would put it back to its first pose."""
+        """Return the models without MuJoCo's automatic reset, so that a diverged world stays visible."""
         copies = {id(model): copy.copy(model) for model in self.models}
         for model in copies.values():
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         return [copies[id(model)] for model in self.models]
 
     def forward(self, task: Task, qpos: Array, qvel: Array, extra: Any = None) -> World:
-        """Put a world in a state without controls, and solve for the forces in it."""
+        """Put a world in a state without controls, and solve for its forces."""
         zeros = jnp.zeros_like(qvel)
         if not self.models[0].nsensor:
             return World(qpos, qvel, zeros, None, extra)
@@ -61,12 +61,12 @@ class MujocoC:
         return World(qpos, qvel, warmstart, some(sensors), world.extra)
 
     def touching(self, task: Task, qpos: Array) -> Array:
-        """Whether any two colliding geoms overlap in the positions ``qpos`` (nq,)."""
+        """Return whether any two colliding geoms overlap in the positions ``qpos`` (nq,)."""
         zeros = jnp.zeros(self.models[0].nv, qpos.dtype)
         return self._call(_count_contacts, 1, task, qpos, zeros, zeros)[0] > 0
 
     def _call(self, act: Callable, width: int, task: Task, *state: Array) -> Array:
-        """Act on worlds on the host: one array there and one back (width,), as each array costs as much as a world."""
+        """Call the host with one array and return one array (width,). Each further array costs as much as a world."""
         if len(state) == 3:
             state = (*state, jnp.zeros(self.models[0].nu))
         packed = jnp.concatenate([jnp.float32(task.row)[None], *(jnp.float32(x) for x in state)])
@@ -82,7 +82,7 @@ class MujocoC:
         return result.reshape(*packed.shape[:-1], -1)
 
     def _batch(self, rows: np.ndarray) -> Any:
-        """The batch for these worlds, told of its models only when they change."""
+        """Return the batch for these worlds. Its models are set only when they change."""
         worlds, known = self._batches.get(len(rows), (None, None))
         if worlds is None:
             worlds = batch.Batch(self._models[0], len(rows), persistent=True)
@@ -93,12 +93,12 @@ class MujocoC:
 
 
 def _state(worlds: Any, size: int) -> np.ndarray:
-    """The first ``size`` of qpos, qvel, qacc_warmstart and ctrl (n, size), which follow the time in a plain state."""
+    """Return the first ``size`` of qpos, qvel, qacc_warmstart and ctrl (n, size), which follow the time in a state."""
     return worlds.state[:, 1 : 1 + size]
 
 
 def _advance(num_substeps: int, size: int, worlds: Any) -> np.ndarray:
-    """Step, and sense in the new state as the caller will know it: in float32."""
+    """Step, and compute the sensors from the new state in float32, as the caller receives it."""
     sensors = worlds.bind("sensordata") if worlds.model.nsensor else np.zeros((worlds.nsim, 0))
     worlds.step(nstep=num_substeps)
     result = np.empty((worlds.nsim, size + sensors.shape[1]), np.float32)

@@ -1,4 +1,4 @@
-"""MuJoCo's JAX port, which runs on any device."""
+"""MJX, MuJoCo's JAX port, which runs on any device."""
 
 import dataclasses
 from functools import cached_property
@@ -19,7 +19,7 @@ _INVOLVED += [mujoco.mjtSensor.mjSENS_CONTACT, mujoco.mjtSensor.mjSENS_CAMPROJEC
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Mjx:
-    """MuJoCo's JAX port: pure, and the reference on every device."""
+    """MJX: pure JAX, and the reference on every device."""
 
     base: mujoco.MjModel
     num_substeps: int
@@ -39,13 +39,13 @@ class Mjx:
         return mujoco.mjtStage.mjSTAGE_ACC in self.base.sensor_needstage
 
     def _bind(self, task: Task, qpos: Array, qvel: Array | None = None) -> tuple[Any, Any]:
-        """The task's model, and data in the given state."""
+        """Return the task's model, and its data in the given state."""
         model, data = self._constants
         leaves = {name: leaf for name, leaf in task.model.items() if name != "site_size"}
         return model.tree_replace(leaves), data.replace(qpos=qpos, qvel=data.qvel if qvel is None else qvel)
 
     def forward(self, task: Task, qpos: Array, qvel: Array, extra: Any = None) -> World:
-        """Put a world in a state without controls, and solve for the forces in it."""
+        """Put a world in a state without controls, and solve for its forces."""
         if not self._feels:
             return self.place(task, qpos, qvel, extra)
         model, data = self._bind(task, qpos, qvel)
@@ -54,7 +54,7 @@ class Mjx:
         return World(qpos, qvel, jnp.zeros_like(qvel), data.sensordata, extra)
 
     def place(self, task: Task, qpos: Array, qvel: Array, extra: Any = None) -> World:
-        """Put a world in a state in which no force sensor is touched; far cheaper to compile than ``forward``."""
+        """Put a world in a state in which no force sensor is touched. It compiles much faster than ``forward``."""
         sensors = some(jnp.zeros(self.base.nsensordata, qpos.dtype))
         return self.sense(task, World(qpos, qvel, jnp.zeros_like(qvel), sensors, extra))
 
@@ -73,7 +73,7 @@ class Mjx:
         return self.sense(task, world)
 
     def touching(self, task: Task, qpos: Array) -> Array:
-        """Whether any two colliding geoms overlap in the positions ``qpos`` (nq,)."""
+        """Return whether any two colliding geoms overlap in the positions ``qpos`` (nq,)."""
         mjx = mjx_module()
         model, data = self._bind(task, qpos)
         with jax.default_matmul_precision("highest"):
@@ -81,7 +81,7 @@ class Mjx:
         return jnp.any(data._impl.contact.dist < 0)
 
     def sense(self, task: Task, world: World) -> World:
-        """Bring position and velocity sensors to the world's state; force sensors stay as they are."""
+        """Update position and velocity sensors to the world's state. Force sensors stay as they are."""
         if np.all(self.base.sensor_needstage == mujoco.mjtStage.mjSTAGE_ACC):
             return world
         mjx = mjx_module()
@@ -95,7 +95,7 @@ class Mjx:
         return world._replace(sensors=data.sensordata)
 
     def _feel(self, task: Task, model: Any, data: Any) -> Any:
-        """Read the force sensors where MJX has not, or not with the task's own sizes of the sites that feel."""
+        """Compute the force sensors that MJX does not compute, or not with the task's own sites."""
         if "site_size" in task.model:  # static to MJX, so that it cannot differ between tasks in the model itself
             return mjx_module().sensor_acc(model.replace(site_size=task.model["site_size"]), data)
         if self._feels and data._impl.efc_J.size == 0:  # MJX returns early where nothing constrains the motion

@@ -1,4 +1,4 @@
-"""MuJoCo Warp: MuJoCo on NVIDIA GPUs, with kernels of its own that XLA calls; on a CPU it runs, slowly."""
+"""MuJoCo Warp: MuJoCo on NVIDIA GPUs, with its own kernels that XLA calls. On a CPU it runs slowly."""
 
 import dataclasses
 import importlib
@@ -24,7 +24,7 @@ _STATE = ("qpos", "qvel", "qacc_warmstart")  # what a step begins with, beside c
 
 
 class _Flat(NamedTuple):
-    """Everything one step reads, of worlds along one leading axis."""
+    """All arrays that a step reads, with worlds along one leading axis."""
 
     leaves: dict[str, Array]
     qpos: Array
@@ -34,17 +34,17 @@ class _Flat(NamedTuple):
 
 
 class _Place(NamedTuple):
-    """Warp's memory on one device for a number of worlds."""
+    """The memory of Warp on one device, for a number of worlds."""
 
     model: Any
     data: Any
 
 
 def _keep_streams(warp: Any) -> None:
-    """Keep every CUDA stream of XLA's known to Warp for as long as the process lives.
+    """Keep Warp's references to XLA's CUDA streams for as long as the process lives.
 
     Warp makes a ``Stream`` of the same CUDA stream for each graph that it captures, and forgets the CUDA stream when
-    any of them is collected. Where Python collects an older one while a younger one captures, Warp 1.18 fails with
+    any of them is collected. If Python collects an older one while a younger one captures, Warp 1.18 fails with
     "unknown stream".
     """
     release = warp.Stream.__del__
@@ -60,17 +60,16 @@ def _keep_streams(warp: Any) -> None:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Warp:
-    """Steps by MuJoCo Warp; start states, contacts and the sensors of positions and velocities by MJX-JAX.
+    """An engine that steps by MuJoCo Warp. MJX computes start states, contacts, and position and velocity sensors.
 
-    XLA hands positions, velocities, warm starts, controls and what differs between tasks to one call, which takes all
-    substeps in Warp's own memory. MJX would pass everything Warp works with through XLA, at every substep: slower, and
-    wrong on GPUs where several such arrays are alike at the start, as XLA 0.11 gives these one piece of memory.
+    XLA passes positions, velocities, warm starts, controls and the differing leaves of tasks to one call. This call
+    takes all substeps in Warp's own memory. MJX would pass all of Warp's arrays through XLA at every substep. That is
+    slower, and wrong on GPUs if several such arrays start equal, because XLA 0.11 gives them one piece of memory.
 
-    Warp picks a world's model by the world's number along one axis, so that maps, however they are nested, are
-    flattened into one before it is called.
+    Warp picks a world's model by the world's number along one axis. Nested maps are therefore flattened into one axis.
 
     Raises:
-        InputError: tasks differ in a field of the model of which Warp can hold one value only.
+        InputError: tasks differ in a model field for which Warp holds only one value.
     """
 
     base: mujoco.MjModel
@@ -83,11 +82,11 @@ class Warp:
 
     @cached_property
     def mjx(self) -> Mjx:
-        """The engine of all that is not a step."""
+        """Return the MJX engine, for everything but steps."""
         return Mjx(self.base, self.num_substeps)
 
     def forward(self, task: Task, qpos: Array, qvel: Array, extra: Any = None) -> World:
-        """Put a world in a state without controls, and solve for the forces in it."""
+        """Put a world in a state without controls, and solve for its forces."""
         return self.mjx.forward(task, qpos, qvel, extra)
 
     def place(self, task: Task, qpos: Array, qvel: Array, extra: Any = None) -> World:
@@ -95,7 +94,7 @@ class Warp:
         return self.mjx.place(task, qpos, qvel, extra)
 
     def touching(self, task: Task, qpos: Array) -> Array:
-        """Whether any two colliding geoms overlap in the positions ``qpos`` (nq,)."""
+        """Return whether any two colliding geoms overlap in the positions ``qpos`` (nq,)."""
         return self.mjx.touching(task, qpos)
 
     def step(self, task: Task, world: World, ctrl: Array) -> World:
@@ -107,7 +106,7 @@ class Warp:
         return self.mjx.sense(task, World(qpos, qvel, warmstart, some(sensors), world.extra))
 
     def _varies(self, name: str) -> bool:
-        """Whether Warp must be told of a field that differs between tasks."""
+        """Return whether Warp needs the tasks' values of a field."""
         from mujoco.mjx.warp.types import _BATCH_DIM
 
         if name in _UNREAD:
@@ -118,7 +117,7 @@ class Warp:
 
     @cached_property
     def _advance(self) -> Any:
-        """Step worlds along one leading axis; a map over it adds to that axis."""
+        """Return the function that steps worlds along one leading axis. ``vmap`` extends that axis."""
 
         @jax.custom_batching.custom_vmap
         def advance(flat: _Flat) -> tuple[Array, ...]:
@@ -147,7 +146,7 @@ class Warp:
         return {}
 
     def _call(self, flat: _Flat) -> tuple[Array, ...]:
-        """Take all substeps of worlds (W, ...): new positions, velocities, warm starts and sensors."""
+        """Take all substeps of worlds (W, ...); return positions, velocities, warm starts and sensors."""
         count, names, devices = len(flat.qpos), tuple(flat.leaves), _own_devices()
         for device in devices:  # not while it runs, when Warp records and cannot make room
             if (device.alias, count) not in self._places:
@@ -160,7 +159,7 @@ class Warp:
         return tuple(found) if self.base.nsensordata else (*found, jnp.zeros((count, 0)))
 
     def _make_place(self, device: Any, count: int) -> _Place:
-        """Make room for so many worlds, with every contact that they can have."""
+        """Allocate Warp's memory for a number of worlds, with room for every possible contact."""
         import warp
         from mujoco.mjx.third_party import mujoco_warp
 
@@ -184,9 +183,9 @@ class Warp:
 
     @cached_property
     def _room(self) -> tuple[int, int]:
-        """Contacts and rows of constraints that one world can have.
+        """Return the most contacts and constraint rows that one world can have.
 
-        MJX-JAX's arrays hold all that is possible, but that some pairs of shapes touch in twice as many points in Warp.
+        They are the sizes of MJX's arrays, but some pairs of shapes touch in twice as many points in Warp.
         """
         like = jax.eval_shape(partial(mjx_module().make_data, self.base, jax.local_devices()[0], "jax"))._impl
         slots = like.contact.dist.shape[0]
@@ -194,7 +193,7 @@ class Warp:
         return slots + doubled, like.efc_J.shape[0] + 4 * doubled
 
     def _make_call(self, model: Any, count: int, names: tuple[str, ...]) -> Callable:
-        """Make a function of JAX's from what Warp does with so many worlds."""
+        """Return a JAX function that steps a number of worlds in Warp."""
         import warp
 
         outputs = {**dict.fromkeys(_STATE[:1], self.base.nq), **dict.fromkeys(_STATE[1:], self.base.nv)}
@@ -214,16 +213,16 @@ class Warp:
 
 
 def _own_devices() -> list[Any]:
-    """Warp's names for the devices of this process."""
+    """Return Warp's names of this process's devices."""
     import warp
 
     return [warp.device_from_jax(device) for device in jax.local_devices()]
 
 
 def _stepper(engine: Any, count: int, names: tuple[str, ...], outputs: tuple[str, ...]) -> Callable:
-    """What Warp does in a call: take over the state, step, and hand back the new one.
+    """Return the function that Warp runs in a call: copy the state in, step, and copy the new state out.
 
-    It holds the engine weakly, as Warp keeps functions that JAX calls for good, and Warp's memory is to go with it.
+    It holds a weak reference to the engine: Warp keeps such functions for good, but its memory must be freed.
     """
     import warp
     from mujoco.mjx.third_party import mujoco_warp
@@ -247,7 +246,7 @@ def _stepper(engine: Any, count: int, names: tuple[str, ...], outputs: tuple[str
 
 
 def _annotated(function: Callable, kinds: dict[str, Any]) -> Callable:
-    """Give a function of many arrays the signature by which Warp tells JAX what they are."""
+    """Set the signature of a function of many arrays, from which Warp derives their types for JAX."""
     kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
     parameters = [inspect.Parameter(name, kind, annotation=annotation) for name, annotation in kinds.items()]
     function.__signature__ = inspect.Signature(parameters)  # type: ignore
@@ -256,7 +255,7 @@ def _annotated(function: Callable, kinds: dict[str, Any]) -> Callable:
 
 
 def _as_warp(leaf: Array, field: Any) -> Array:
-    """A model's field of every world (W, ...) in the shape in which Warp takes it."""
+    """Return a model field of every world (W, ...) in Warp's shape."""
     return leaf.reshape(len(leaf), *field.shape[1:], *getattr(field.dtype, "_shape_", ()))
 
 

@@ -1,7 +1,6 @@
 """MTEnv's classic control tasks, cart-pole and acrobot, whose physical constants differ between tasks.
 
-Each is a handful of equations in float32 without a MuJoCo model, so that a step of thousands of worlds costs next to
-nothing.
+Each is a few equations in float32 without a MuJoCo model, so a step of thousands of worlds costs almost nothing.
 """
 
 import dataclasses
@@ -98,7 +97,7 @@ class CartPole(Family):
 
 
 def _move_cartpole(goal: Mapping[str, Array], state: CartPoleState, force: Array) -> CartPoleState:
-    """One Euler step of a pole on a cart without friction (Barto, Sutton and Anderson 1983)."""
+    """Take one Euler step of a pole on a cart without friction (Barto, Sutton and Anderson 1983)."""
     mass, length = goal["pole-mass"], goal["pole-length"]
     total = goal["cart-mass"] + mass
     sin, cos = jnp.sin(state.angle), jnp.cos(state.angle)
@@ -168,7 +167,7 @@ def _observe_acrobot(state: AcrobotState) -> Array:
 
 
 def _move_acrobot(goal: Mapping[str, Array], state: AcrobotState, torque: Array) -> AcrobotState:
-    """One Runge-Kutta step; angles are then wrapped into [-pi, pi] and speeds held to their limits."""
+    """Take one Runge-Kutta step, wrap angles into [-pi, pi], and limit speeds."""
 
     def slope(x: AcrobotState) -> AcrobotState:
         return AcrobotState(x.velocities, _acrobot_acceleration(goal, x, torque))
@@ -187,7 +186,7 @@ def _move_acrobot(goal: Mapping[str, Array], state: AcrobotState, torque: Array)
 
 
 def _acrobot_acceleration(goal: Mapping[str, Array], state: AcrobotState, torque: Array) -> Array:
-    """Angular accelerations (2,) by the equations of Sutton and Barto's book (1998, section 11.3).
+    """Return angular accelerations (2,) by the equations of Sutton and Barto's book (1998, section 11.3).
 
     Written as M a = f: the inertia matrix M has ``whole`` and ``outer`` on its diagonal and ``shared`` beside it.
     """

@@ -1,4 +1,4 @@
-"""MTEnv's maze of two goals, in plan: a walker among walls and two boxes, of which the task says which one to reach."""
+"""MTEnv's maze of two goals, in plan: a walker among walls and two boxes. The task names the box to reach."""
 
 import dataclasses
 import math
@@ -76,7 +76,7 @@ class TwoGoalMaze(Family):
     """
 
     observe_boxes: bool = False
-    """Observe where both boxes are as well; MTEnv hides them, and then no policy does much better than chance."""
+    """Also observe the places of both boxes. MTEnv hides them, and then no policy does much better than chance."""
 
     parameters: ClassVar[Mapping[str, Parameter]] = MappingProxyType(
         {"goal-box": Parameter("1", 0.0, minimum=-1.0, maximum=1.0)}
@@ -112,7 +112,7 @@ class TwoGoalMaze(Family):
 
     @property
     def relabels(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Only who sees the boxes knows which of them was reached."""
+        """Return the relabelled parameters: none unless observations show the boxes."""
         return ("goal-box",) if self.observe_boxes else ()
 
     def relabel(self, task: Task, transition: Transition, key: Key) -> Transition:
@@ -131,18 +131,18 @@ class TwoGoalMaze(Family):
 
 
 def _goal(task: Task) -> Array:
-    """Which box to reach, () int32: 0 the blue one, 1 the red one."""
+    """Return the box to reach, () int32: 0 for blue, 1 for red."""
     return (task.goal["goal-box"] > 0.5).astype(jnp.int32)
 
 
 def _pay(task: Task, position: Array, boxes: Array) -> Array:
-    """The reward () of being at ``position`` (2,)."""
+    """Return the reward () at ``position`` (2,)."""
     near, goal = _distance(position, boxes) < _REACHED, _goal(task)
     return jnp.where(near[1 - goal], -1.0, jnp.where(near[goal], 1.0, 0.0))
 
 
 def _facing(turns: Array) -> Array:
-    """The unit vector (2,) in which a walker looks; exact for the four ways along an axis."""
+    """Return the unit vector (2,) of a walker's heading, exact along the axes."""
     way = np.arange(8) * _TURN
     table = np.round(np.stack([np.cos(way), -np.sin(way)], axis=1), 12) + 0.0  # + 0.0: no negative zeros
     return jnp.asarray(table, jnp.float32)[turns]
@@ -153,7 +153,7 @@ def _distance(place: Array, others: Array) -> Array:
 
 
 def _wall_distance(place: Array) -> Array:
-    """The distance () from a place (2,) to the nearest wall."""
+    """Return the distance () from a place (2,) to the nearest wall."""
     start, side = _WALLS[:, 0], _WALLS[:, 1] - _WALLS[:, 0]
     offset = jnp.abs(place) - start
     along = jnp.clip(jnp.sum(offset * side, axis=1) / np.sum(side * side, axis=1), 0, 1)

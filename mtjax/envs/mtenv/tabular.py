@@ -20,7 +20,7 @@ _MOST_HELD_OUT = 10
 
 @dataclasses.dataclass(frozen=True)
 class DrawnTasks(Family):
-    """Tasks that are tables of numbers in [0, 1], drawn at random; the context is all of them, from -1 to 1.
+    """A family whose tasks are random tables of numbers in [0, 1]. The context holds all numbers, scaled to [-1, 1].
 
     Task number i of a split depends on ``task_seed`` and i alone, so that more tasks keep the first ones. The split
     "dense" holds out up to ten further draws as its interpolation tasks; "none" holds out nothing.
@@ -31,7 +31,7 @@ class DrawnTasks(Family):
     @property
     @abc.abstractmethod
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """The tables of a task, and their shapes."""
+        """Return the names of a task's tables with their shapes."""
 
     @abc.abstractmethod
     def draw(self, random: np.random.Generator) -> dict[str, np.ndarray]:
@@ -57,17 +57,17 @@ class DrawnTasks(Family):
 
     @property
     def train_count(self) -> int:
-        """Training tasks."""
+        """Return the number of training tasks."""
         return self.num_tasks
 
     @cached_property
     def count(self) -> int:
-        """Rows of the table."""
+        """Return the number of rows of the table."""
         return len(self.table.tasks.id)
 
     @cached_property
     def table(self) -> Table:
-        """Every task of every split."""
+        """Return all tasks of all splits."""
         held_out = min(self.num_tasks, _MOST_HELD_OUT) if self.split == "dense" else 0
         counts = dict(zip(SPLITS, (self.num_tasks, held_out, 0), strict=True))
         seeds = [(self.task_seed, kind, i) for kind, count in enumerate(counts.values()) for i in range(count)]
@@ -103,9 +103,9 @@ class TabularMDP(DrawnTasks):
     """
 
     num_states: int = 4
-    """States of each process."""
+    """Number of states of each process."""
     num_actions: int = 5
-    """Actions in every state."""
+    """Number of actions in every state."""
 
     episode_steps: ClassVar[int] = 100
 
@@ -116,7 +116,7 @@ class TabularMDP(DrawnTasks):
 
     @property
     def action_size(self) -> int:  # type: ignore[override]
-        """Scores, one an action."""
+        """Return the number of scores, one per action."""
         return self.num_actions
 
     @property
@@ -170,7 +170,7 @@ class Bandit(DrawnTasks):
     """
 
     num_arms: int = 5
-    """Arms of each bandit."""
+    """Number of arms of each bandit."""
 
     episode_steps: ClassVar[int] = 100
 
@@ -181,7 +181,7 @@ class Bandit(DrawnTasks):
 
     @property
     def action_size(self) -> int:  # type: ignore[override]
-        """Scores, one an arm."""
+        """Return the number of scores, one per arm."""
         return self.num_arms
 
     @property
