@@ -72,15 +72,15 @@ def evaluate(env: Env, agent: Agent, episodes: int, state: Any, tasks: Task, see
 
     def step(carry, _):
         worlds, scores, alive = carry
-        worlds, moment = step_envs(env, agent, state, tasks, worlds, None)
-        reward = jnp.where(alive, moment.transition.reward, 0.0)  # what follows an episode's end may not be finite
+        worlds, env_step = step_envs(env, agent, state, tasks, worlds, None)
+        reward = jnp.where(alive, env_step.transition.reward, 0.0)  # what follows an episode's end may not be finite
         latest = lambda new, old: jnp.where(alive, new, old)
-        scores = Scores(scores.returns + reward, jax.tree.map(latest, moment.metrics, scores.metrics))
-        return (worlds, scores, alive & ~moment.transition.ended), None
+        scores = Scores(scores.returns + reward, jax.tree.map(latest, env_step.metrics, scores.metrics))
+        return (worlds, scores, alive & ~env_step.transition.ended), None
 
     worlds = reset_envs(env, agent, state, tasks, keys)
-    moment = jax.eval_shape(lambda worlds: step_envs(env, agent, state, tasks, worlds, None)[1], worlds)
-    nothing = Scores(jnp.zeros(shape), jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), moment.metrics))
+    env_step = jax.eval_shape(lambda worlds: step_envs(env, agent, state, tasks, worlds, None)[1], worlds)
+    nothing = Scores(jnp.zeros(shape), jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), env_step.metrics))
     return jax.lax.scan(step, (worlds, nothing, jnp.ones(shape, bool)), length=env.episode_length)[0][1]
 
 
@@ -100,8 +100,8 @@ def record(env: Env, agent: Agent, state: Any, tasks: Task, seed: Array) -> Reco
     keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), 0xF11), (1, len(tasks.id), 1))
 
     def step(worlds: Worlds, _):
-        worlds, moment = step_envs(env, agent, learners, tasks, worlds, None)
-        return worlds, (moment.transition.reward, moment.transition.ended, worlds.state)
+        worlds, env_step = step_envs(env, agent, learners, tasks, worlds, None)
+        return worlds, (env_step.transition.reward, env_step.transition.ended, worlds.state)
 
     worlds = reset_envs(env, agent, learners, tasks, keys)
     _, played = jax.lax.scan(step, worlds, length=env.episode_length)  # leaves (H, 1, T, 1, ...)

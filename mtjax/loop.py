@@ -15,7 +15,7 @@ import jax.numpy as jnp
 
 from mtjax.maps import over_seeds
 from mtjax.parallel import collectives
-from mtjax.rollout import Moment, Worlds, reset_ended, reset_envs, split_keys, step_envs, world_keys
+from mtjax.rollout import EnvStep, Worlds, reset_ended, reset_envs, split_keys, step_envs, world_keys
 from mtjax.types import Agent, Array, Env, InputError, Key, Metrics, Outcome, Task, Transition
 
 PHASES = 10
@@ -140,8 +140,8 @@ def _step(env, agent, tasks, state: TrainState, keys: Key, reset_keys: Key):
     """Step every environment once, and begin new episodes where old ones ended."""
     explore = partial(agent.experience.explore, state.data)
     act_keys = world_keys(keys, state.total.shape)
-    worlds, moment = step_envs(env, agent, state.agent, tasks, state.worlds, act_keys, explore)
-    transition, total = moment.transition, state.total + moment.transition.reward
+    worlds, env_step = step_envs(env, agent, state.agent, tasks, state.worlds, act_keys, explore)
+    transition, total = env_step.transition, state.total + env_step.transition.reward
     ended = transition.ended
     learners = state.agent
     if agent.watches:
@@ -155,12 +155,12 @@ def _step(env, agent, tasks, state: TrainState, keys: Key, reset_keys: Key):
         counted=state.counted | ended,
         iteration=state.iteration + 1,
     )
-    return state, (transition, _look(moment, total, state.counted))
+    return state, (transition, _reduce_step(env_step, total, state.counted))
 
 
-def _look(moment: Moment, total: Array, counted: Array) -> dict[str, Any]:
+def _reduce_step(env_step: EnvStep, total: Array, counted: Array) -> dict[str, Any]:
     """Reduce a step to what metrics need of it, leaves (S, T)."""
-    transition = moment.transition
+    transition = env_step.transition
     finished = transition.ended & counted
     over_envs = lambda x: jnp.sum(finished * x, axis=2)
     finite = lambda x: jnp.all(jnp.isfinite(x), axis=tuple(range(2, x.ndim)))
@@ -169,7 +169,7 @@ def _look(moment: Moment, total: Array, counted: Array) -> dict[str, Any]:
         "finished": jnp.sum(finished, axis=2),
         "total": over_envs(total),
         "finite": jnp.all(jnp.stack([finite(x) for x in (*numbers, transition.reward)]), axis=0),
-        "metrics": {name: over_envs(x) for name, x in moment.metrics.items()},
+        "metrics": {name: over_envs(x) for name, x in env_step.metrics.items()},
     }
 
 

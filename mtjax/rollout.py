@@ -33,7 +33,7 @@ def world_keys(keys: Key, shape: tuple[int, ...]) -> Key:
     return collectives.own(jax.vmap(lambda key: jax.random.split(key, everywhere))(keys), axis=2)
 
 
-def spread(tasks: Task, shape: tuple[int, ...]) -> Task:
+def broadcast_tasks(tasks: Task, shape: tuple[int, ...]) -> Task:
     """Repeat tasks (T, ...) for all worlds of shape (S, T, E)."""
     single = tasks._replace(draws=None)
     return jax.tree.map(lambda x: jnp.broadcast_to(x[None, :, None], shape + x.shape[1:]), single)
@@ -42,7 +42,7 @@ def spread(tasks: Task, shape: tuple[int, ...]) -> Task:
 def reset_envs(env: Env, agent: Agent, learners: Any, tasks: Task, keys: Key) -> Worlds:
     """Begin an episode in every world, with keys (S, T, E), of agents with states ``learners`` (S, ...)."""
     if tasks.draws is None:
-        each = spread(tasks, keys.shape)
+        each = broadcast_tasks(tasks, keys.shape)
     else:
         task_keys, keys = jnp.moveaxis(jax.vmap(jax.vmap(jax.vmap(jax.random.split)))(keys), -1, 0)
         of_task = jax.vmap(episode_task, (None, 0))
@@ -55,7 +55,9 @@ def reset_envs(env: Env, agent: Agent, learners: Any, tasks: Task, keys: Key) ->
 
 def tasks_of_worlds(tasks: Task, worlds: Worlds) -> Task:
     """Return the task of every world (S, T, E, ...)."""
-    return spread(tasks, worlds.age.shape) if worlds.task is None else worlds.task._replace(blocks=tasks.blocks)
+    return (
+        broadcast_tasks(tasks, worlds.age.shape) if worlds.task is None else worlds.task._replace(blocks=tasks.blocks)
+    )
 
 
 def act(agent: Agent, learners: Any, tasks: Task, worlds: Worlds, keys: Key | None) -> Acted:
@@ -69,7 +71,7 @@ def act(agent: Agent, learners: Any, tasks: Task, worlds: Worlds, keys: Key | No
     return over_learners(one)(learners, tasks.id, each, worlds.memory, worlds.obs, *noise)
 
 
-class Moment(NamedTuple):
+class EnvStep(NamedTuple):
     """One step of every world; leaves (S, T, E, ...)."""
 
     transition: Transition
@@ -84,7 +86,7 @@ def step_envs(
     worlds: Worlds,
     keys: Key | None,
     explore: Callable[[Array], Array] = lambda action: action,
-) -> tuple[Worlds, Moment]:
+) -> tuple[Worlds, EnvStep]:
     """Act in every world and step it; episodes that end are left where they ended.
 
     Args:
@@ -111,7 +113,7 @@ def step_envs(
     if jax.tree.leaves(memory):
         note = lambda learner, task, memory, transition: agent.remember(learner, memory, transition, task)
         memory = over_learners(note)(learners, tasks, memory, transition)
-    return Worlds(step.state, worlds.task, step.obs, memory, age), Moment(transition, step.metrics)
+    return Worlds(step.state, worlds.task, step.obs, memory, age), EnvStep(transition, step.metrics)
 
 
 def reset_ended(env: Env, agent: Agent, learners: Any, tasks: Task, worlds: Worlds, ended: Array, keys: Key) -> Worlds:

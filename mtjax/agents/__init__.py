@@ -28,11 +28,11 @@ class Preset(NamedTuple):
         return load(self.place)
 
 
-_TOLD = {"conditioning": "parameters"}
+_PARAMS = {"conditioning": "parameters"}
 
 AGENTS: dict[str, Preset] = {
     "sac": Preset("Soft actor-critic that is not told its task (Haarnoja et al. 2018)"),
-    "sac-conditioned": Preset("SAC that sees the task's parameters (Schaul et al. 2015)", _TOLD),
+    "sac-conditioned": Preset("SAC that sees the task's parameters (Schaul et al. 2015)", _PARAMS),
     "multi-head": Preset("SAC with an output layer for every task (Yu et al. 2020)", {"heads": "per-task"}),
     "disjoint": Preset("One SAC for every task, all in one program: nothing is shared", {"heads": "disjoint"}),
     "distral": Preset(
@@ -40,25 +40,29 @@ AGENTS: dict[str, Preset] = {
         {},
         "mtjax.agents.distral:Distral",
     ),
-    "care": Preset("Attention over a mixture of encoders (Sodhani et al. 2021)", {"encoder": "care", **_TOLD}),
-    "moe": Preset("Soft mixture of encoders (Sodhani et al. 2021, MTRL)", {"encoder": "moe", **_TOLD}),
-    "film": Preset("Layers scaled and shifted by the task (Perez et al. 2018)", {"encoder": "film", **_TOLD}),
+    "care": Preset("Attention over a mixture of encoders (Sodhani et al. 2021)", {"encoder": "care", **_PARAMS}),
+    "moe": Preset("Soft mixture of encoders (Sodhani et al. 2021, MTRL)", {"encoder": "moe", **_PARAMS}),
+    "film": Preset("Layers scaled and shifted by the task (Perez et al. 2018)", {"encoder": "film", **_PARAMS}),
     "moore": Preset(
-        "Mixture of orthogonal experts (Hendawy et al. 2024)", {"encoder": "moore", "heads": "per-task", **_TOLD}
+        "Mixture of orthogonal experts (Hendawy et al. 2024)", {"encoder": "moore", "heads": "per-task", **_PARAMS}
     ),
-    "soft-modularization": Preset("Modules routed by task (Yang et al. 2020)", {"encoder": "soft-modules", **_TOLD}),
-    "paco": Preset("Parameters composed for each task (Sun et al. 2022)", {"encoder": "paco", **_TOLD}),
+    "soft-modularization": Preset("Modules routed by task (Yang et al. 2020)", {"encoder": "soft-modules", **_PARAMS}),
+    "paco": Preset("Parameters composed for each task (Sun et al. 2022)", {"encoder": "paco", **_PARAMS}),
     "brc": Preset("Bigger, regularised, categorical critics (Nauman et al. 2025)", {}, "mtjax.agents.brc:BRC"),
-    "deepmdp": Preset("SAC on a latent model of the task (Gelada et al. 2019)", {"representation": "deepmdp", **_TOLD}),
+    "deepmdp": Preset(
+        "SAC on a latent model of the task (Gelada et al. 2019)", {"representation": "deepmdp", **_PARAMS}
+    ),
     "hip-bmdp": Preset(
         "DeepMDP with learned hidden parameters (Zhang et al. 2021)",
         {"representation": "hip-bmdp", "conditioning": "embedding", "embedding_size": 50},
     ),
-    "ppo": Preset("Proximal policy optimisation (Schulman et al. 2017), told its task", _TOLD, "mtjax.agents.ppo:PPO"),
-    "pcgrad": Preset("Conflicting gradients projected (Yu et al. 2020)", {"gradients": "pcgrad", **_TOLD}),
-    "cagrad": Preset("Conflict-averse gradients (Liu et al. 2021)", {"gradients": "cagrad", **_TOLD}),
-    "gradnorm": Preset("Weights that even out learning rates (Chen et al. 2018)", {"gradients": "gradnorm", **_TOLD}),
-    "famo": Preset("Weights that even out losses' decrease (Liu et al. 2023)", {"gradients": "famo", **_TOLD}),
+    "ppo": Preset(
+        "Proximal policy optimisation (Schulman et al. 2017), told its task", _PARAMS, "mtjax.agents.ppo:PPO"
+    ),
+    "pcgrad": Preset("Conflicting gradients projected (Yu et al. 2020)", {"gradients": "pcgrad", **_PARAMS}),
+    "cagrad": Preset("Conflict-averse gradients (Liu et al. 2021)", {"gradients": "cagrad", **_PARAMS}),
+    "gradnorm": Preset("Weights that even out learning rates (Chen et al. 2018)", {"gradients": "gradnorm", **_PARAMS}),
+    "famo": Preset("Weights that even out losses' decrease (Liu et al. 2023)", {"gradients": "famo", **_PARAMS}),
 }
 
 

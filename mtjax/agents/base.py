@@ -4,7 +4,7 @@ import abc
 import dataclasses
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Annotated, Any, ClassVar, get_args, get_type_hints, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args, get_type_hints
 
 import jax
 import jax.numpy as jnp
@@ -136,7 +136,7 @@ class BaseAgent(abc.ABC):
         """Return the state for the training ``tasks`` (T, ...)."""
 
     @abc.abstractmethod
-    def init_networks(self, num_tasks: int, told: Array, obs: Any, action: Array, key: Key) -> Pair:
+    def init_networks(self, num_tasks: int, features: Array, obs: Any, action: Array, key: Key) -> Pair:
         """Initialise actor and critics for inputs of the given shapes, (Z,), (O,) and (A,)."""
 
     @abc.abstractmethod
@@ -187,7 +187,7 @@ class BaseAgent(abc.ABC):
         if self.representation.learns:  # also what is learned of tasks, for all networks
             return Network(body, own)
         embedding = self.embedding_size if self.conditioning == "embedding" else 0
-        inference = TrajectoryEncoder(self.embedding_size, layer_norm=layer_norm) if self.history else None
+        inference = TrajectoryEncoder(self.embedding_size, layer_norm=layer_norm) if self.history_length else None
         return Network(body, own, embedding, self.unit_embedding, self.encoder.front(), inference)
 
     @property
@@ -199,7 +199,7 @@ class BaseAgent(abc.ABC):
         return self.network(self.critic_layer_norm)
 
     @property
-    def sight(self) -> Representation:
+    def placed_representation(self) -> Representation:
         """The representation, as it stands under these networks."""
         place = Place(
             self.conditioning,
@@ -210,9 +210,9 @@ class BaseAgent(abc.ABC):
         )
         return self.representation.at(place)
 
-    def look(self, critic: Params, told: Array, obs: Any) -> tuple[Array, Any]:
+    def actor_inputs(self, critic: Params, features: Array, obs: Any) -> tuple[Array, Any]:
         """What one task's actor is told (Z,) and sees (..., O), through a representation that it does not train."""
-        return jax.lax.stop_gradient(self.sight.perceive(critic, told, obs))
+        return jax.lax.stop_gradient(self.placed_representation.perceive(critic, features, obs))
 
     @property
     def network_optimizers(self) -> Pair:
@@ -224,10 +224,10 @@ class BaseAgent(abc.ABC):
         """Initialise what the states of all agents have for the training ``tasks`` (T, ...): fields by name."""
         num_tasks = len(tasks.id)
         vectors, moments = self.load_vectors(num_tasks), self.init_moments(spec, num_tasks)
-        told = conditioning.features(self.conditioning, num_tasks, jnp.int32(0), tasks.context[0], vectors)
+        features = conditioning.features(self.conditioning, num_tasks, jnp.int32(0), tasks.context[0], vectors)
         obs, action = self.example(spec, moments), jnp.zeros(spec.action_size)
-        basis = self.sight.init(num_tasks, told, obs, action, key)
-        actor, critic = self.init_networks(num_tasks, basis.told, basis.obs, action, basis.key)
+        basis = self.placed_representation.init(num_tasks, features, obs, action, key)
+        actor, critic = self.init_networks(num_tasks, basis.features, basis.obs, action, basis.key)
         critic = critic.beside(basis.params)
         remembered = lambda rule, params: surgery.init(rule, params, num_tasks, self.per_layer)
         return {
@@ -249,7 +249,7 @@ class BaseAgent(abc.ABC):
     # What the networks see: observations, and what they are told of the task.
 
     @property
-    def history(self) -> int:
+    def history_length(self) -> int:
         """How many past steps the agent sees beside each observation."""
         return self.inferred_from if self.conditioning == "inferred" or self.representation.looks_back else 0
 
@@ -282,7 +282,7 @@ class BaseAgent(abc.ABC):
     def example(self, spec: Spec, moments: normalize.Moments) -> Any:
         """What networks see, all zero."""
         moments = jax.tree.map(lambda x: x[0], moments) if spec.mixed else moments
-        past = trajectory.begin(self.history, spec.obs_size, spec.action_size) if self.history else None
+        past = trajectory.begin(self.history_length, spec.obs_size, spec.action_size) if self.history_length else None
         return self.see(moments, jnp.zeros(spec.obs_size), past)
 
     def load_vectors(self, num_tasks: int) -> Array | None:
@@ -318,11 +318,11 @@ class BaseAgent(abc.ABC):
         known = self.known_task(state, task)
         return tuple(Params(net.shared, jax.tree.map(lambda x: x[known], net.own)) for net in networks)
 
-    def situation(self, state: Any, memory: Memory, obs: Any, task: Task) -> tuple[Params, Params, Array, Any]:
+    def acting_inputs(self, state: Any, memory: Memory, obs: Any, task: Task) -> tuple[Params, Params, Array, Any]:
         """Actor and critics as one task uses them to act, what they are told (Z,), and an observation (O,) as seen."""
         actor, critic = self.of_task(state, task, state.actor, state.critic)
         seen = self.see(self.moments_of(state, self.known_task(state, task)), obs, memory.past)
-        critic = self.sight.stand_in(critic, state.critic, task.id < len(state.contexts), seen)
+        critic = self.placed_representation.stand_in(critic, state.critic, task.id < len(state.contexts), seen)
         return actor, critic, self.features(state, task), seen
 
     def discounts(self, tasks: Task) -> float | Array:
@@ -349,8 +349,8 @@ class BaseAgent(abc.ABC):
 
     def begin(self, state: Any, task: Task) -> Memory:
         """The memory with which an episode begins."""
-        sizes = (state.moments.mean.shape[-1], self.action_size(state)) if self.history else ()
-        past = trajectory.begin(self.history, *sizes) if self.history else None
+        sizes = (state.moments.mean.shape[-1], self.action_size(state)) if self.history_length else ()
+        past = trajectory.begin(self.history_length, *sizes) if self.history_length else None
         return Memory(past, self.scaling.begin())
 
     def action_size(self, state: Any) -> int:

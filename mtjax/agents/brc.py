@@ -17,7 +17,7 @@ class BRC(SAC):
     Every task i has a learned vector e_i, and all tasks share the rest:
         Q_n(s, a, e_i / |e_i|) and pi(s, e_i / |e_i|) are residual, layer-normalised networks    (encoder=bronet)
         Q_n is a distribution over returns in [-10, 10], fitted by its cross-entropy             (value=c51)
-        the mean of both critics' distributions bootstraps, and its mean guides the actor        (believe=mean)
+        the mean of both critics' distributions bootstraps, and its mean guides the actor        (critic_reduction=mean)
         rewards are divided so that the task's largest return fits the range                     (scaling=return)
     with one temperature, a target entropy of -A/2 and AdamW. Each part's class has its equations.
 
@@ -42,7 +42,7 @@ class BRC(SAC):
     conditioning: Conditioning = "embedding"
     embedding_size: int = 32
     unit_embedding: bool = True
-    believe: Literal["least", "mean"] = "mean"
+    critic_reduction: Literal["min", "mean"] = "mean"
     shared_temperature: bool = True
     encoder: Annotated[Encoder, FLAT] = dataclasses.field(default_factory=BroNet)
     value: Annotated[Value, FLAT] = dataclasses.field(default_factory=C51)

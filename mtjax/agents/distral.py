@@ -101,8 +101,8 @@ class Distral(SAC):
         return jnp.where(trained, own, self.actor.apply_distilled(actor, features, obs))
 
     def sample(self, actor: Params, critic: Params, batch: Batch, obs: Any, key: Key) -> Sample:
-        raw, log_prob = sample_raw(self.policy(actor, critic, batch.told, obs), key, batch.mask)
-        distilled = self.actor.apply_distilled(jax.lax.stop_gradient(actor), batch.told, obs)
+        raw, log_prob = sample_raw(self.policy(actor, critic, batch.features, obs), key, batch.mask)
+        distilled = self.actor.apply_distilled(jax.lax.stop_gradient(actor), batch.features, obs)
         cost = log_prob - self.distral_alpha * log_density(distilled, raw, batch.mask)
         action = jnp.tanh(raw)
         return Sample(action if batch.mask is None else action * batch.mask, log_prob, cost)
@@ -110,8 +110,8 @@ class Distral(SAC):
     def actor_loss(self, actor: Params, data: tuple[Batch, Params, Key]) -> tuple[Array, Metrics]:
         loss, metrics = super().actor_loss(actor, data)
         batch, critic, key = data
-        own = self.policy(actor, critic, batch.told, batch.obs)
+        own = self.policy(actor, critic, batch.features, batch.obs)
         raw, _ = sample_raw(own, key)  # the actions of that loss
-        distilled = self.actor.apply_distilled(actor, batch.told, batch.obs)
+        distilled = self.actor.apply_distilled(actor, batch.features, batch.obs)
         fit = jnp.mean(log_density(distilled, jax.lax.stop_gradient(raw), batch.mask))
         return loss - fit, {**metrics, "kl": jnp.mean(divergence(own, distilled, batch.mask))}

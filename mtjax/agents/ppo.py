@@ -29,11 +29,11 @@ from mtjax.networks import (
 from mtjax.parallel import collectives
 from mtjax.types import Acted, Array, InputError, Key, Metrics, Spec, Task, Transition
 
-FARTHEST = 20.0
+LOG_RATIO_LIMIT = 20.0
 """Logarithms of the ratio of two policies are kept within this, as its exponential must stay finite."""
-LEAST_STD = 1e-4
+MIN_STD = 1e-4
 """Of targets and of advantages, by which they are divided."""
-FIRST_HEAD = 0.01
+HEAD_SCALE = 0.01
 """Scale of the output layers' first weights: policies begin as one, and values at zero."""
 
 
@@ -46,7 +46,7 @@ class Units(NamedTuple):
 
     @property
     def std(self) -> Array:
-        return jnp.maximum(jnp.sqrt(self.variance), LEAST_STD)
+        return jnp.maximum(jnp.sqrt(self.variance), MIN_STD)
 
 
 class PPOState(NamedTuple):
@@ -81,13 +81,13 @@ class Batch(NamedTuple):
     advantage: Array  # (B,)
     value: Array  # (B,) what the critic said before the update, in its units
     target: Array  # (B,) what it should say
-    told: Array  # (Z,) or (B, Z), what the networks are told of the task
+    features: Array  # (Z,) or (B, Z), what the networks are told of the task
     mask: Array | None  # (A,) 1 for actions that the task has; None: it has all
     # What the representation learns from, if it does.
     action: Array | None = None  # (B, A)
     reward: Array | None = None  # (B,) in the task's units
     next_obs: Any = None  # (B, O)
-    ahead: Any = None  # what its models fit
+    model_targets: Any = None  # what its models fit
 
 
 @dataclasses.dataclass(frozen=True)
@@ -200,18 +200,18 @@ class PPO(BaseAgent):
             units=Units(jnp.float32(0), jnp.zeros(num_tasks), jnp.ones(num_tasks)),
         )
 
-    def init_networks(self, num_tasks: int, told: Array, obs: Any, action: Array, key: Key) -> Pair:
+    def init_networks(self, num_tasks: int, features: Array, obs: Any, action: Array, key: Key) -> Pair:
         actor_key, critic_key = jax.random.split(key)
         first = jnp.repeat(jnp.array([0.0, outputs_for(self.initial_std)]), len(action))
-        actor = calm(self.actor.init(actor_key, num_tasks, 2 * len(action), told, obs), first)
-        return Pair(actor, calm(self.critic.init(critic_key, num_tasks, 1, told, obs), jnp.zeros(1)))
+        actor = scale_head(self.actor.init(actor_key, num_tasks, 2 * len(action), features, obs), first)
+        return Pair(actor, scale_head(self.critic.init(critic_key, num_tasks, 1, features, obs), jnp.zeros(1)))
 
     # Acting.
 
     def act(self, state: PPOState, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
         """Choose an action (A,) for one observation (O,) of one task; no key: the mean action."""
-        actor, critic, told, seen = self.situation(state, memory, obs, task)
-        outputs = self.actor.apply(actor, *self.look(critic, told, seen))
+        actor, critic, features, inputs = self.acting_inputs(state, memory, obs, task)
+        outputs = self.actor.apply(actor, *self.actor_inputs(critic, features, inputs))
         if key is None:
             return Acted(tanh_normal(outputs, None, task.action_mask)[0], None, memory)
         raw, log_prob = sample_raw(outputs, key, task.action_mask)
@@ -224,9 +224,9 @@ class PPO(BaseAgent):
     def actor_loss(self, actor: Params, data: tuple[Batch, Key]) -> tuple[Array, Metrics]:
         """The actor's loss on a batch of what the actor is told and sees."""
         batch, key = data
-        outputs = self.actor.apply(actor, batch.told, batch.obs)
+        outputs = self.actor.apply(actor, batch.features, batch.obs)
         log_ratio = log_density(outputs, batch.raw, batch.mask) - batch.log_prob
-        log_ratio = jnp.clip(log_ratio, -FARTHEST, FARTHEST)
+        log_ratio = jnp.clip(log_ratio, -LOG_RATIO_LIMIT, LOG_RATIO_LIMIT)
         ratio = jnp.exp(log_ratio)
         clipped = jnp.clip(ratio, 1 - self.clip_range, 1 + self.clip_range)
         gain = jnp.mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
@@ -236,31 +236,31 @@ class PPO(BaseAgent):
         return loss, {"actor_loss": loss, "entropy": entropy, "kl": kl, "clip_fraction": beyond}
 
     def critic_loss(self, critic: Params, batch: Batch) -> tuple[Array, Metrics]:
-        value = self.value(critic, batch.told, batch.obs)
+        value = self.value(critic, batch.features, batch.obs)
         error = jnp.square(value - batch.target)
         if not parts.is_zero(self.value_clip):
-            near = batch.value + jnp.clip(value - batch.value, -self.value_clip, self.value_clip)
-            error = jnp.maximum(error, jnp.square(near - batch.target))
+            clipped = batch.value + jnp.clip(value - batch.value, -self.value_clip, self.value_clip)
+            error = jnp.maximum(error, jnp.square(clipped - batch.target))
         loss = jnp.mean(error) / 2
-        return self.sight.join(loss, {"critic_loss": loss}, critic, batch)
+        return self.placed_representation.join(loss, {"critic_loss": loss}, critic, batch)
 
-    def value(self, critic: Params, told: Array, obs: Any) -> Array:
+    def value(self, critic: Params, features: Array, obs: Any) -> Array:
         """The critic's values (B,) of observations (B, ...), in its units."""
-        told, seen = self.sight.perceive(critic, told, obs)
-        return self.critic.apply(critic.without(self.sight.names), told, seen)[..., 0]
+        features, inputs = self.placed_representation.perceive(critic, features, obs)
+        return self.critic.apply(critic.without(self.placed_representation.names), features, inputs)[..., 0]
 
     # Update of all tasks.
 
     def update(self, state: PPOState, steps: Transition, tasks: Task, key: Key) -> tuple[PPOState, Metrics]:
         """Learn from the rollouts (T, H, E, ...) of the training tasks; metrics are (T,)."""
         order_key, key = jax.random.split(key)
-        state, batch, seen = self.prepare(state, steps, tasks)
-        orders = self.deal(batch.advantage.shape[1], order_key)
-        improve = partial(self.improve, batch, state.critic)
+        state, batch, statistics = self.prepare(state, steps, tasks)
+        indices = self.minibatch_indices(batch.advantage.shape[1], order_key)
+        minibatch_step = partial(self.minibatch_step, batch, state.critic)
         (state, _), metrics = jax.lax.scan(
-            improve, (state, jnp.bool_(True)), (orders, jax.random.split(key, len(orders)))
+            minibatch_step, (state, jnp.bool_(True)), (indices, jax.random.split(key, len(indices)))
         )
-        return state, jax.tree.map(lambda x: jnp.mean(x, axis=0), metrics) | seen
+        return state, jax.tree.map(lambda x: jnp.mean(x, axis=0), metrics) | statistics
 
     def prepare(self, state: PPOState, steps: Transition, tasks: Task) -> tuple[PPOState, Batch, Metrics]:
         """Fit the normalisers to rollouts (T, H, E, ...), and make of them what the losses see (T, H E, ...)."""
@@ -268,9 +268,9 @@ class PPO(BaseAgent):
         taken: Taken = flat.extras
         next_past = None if taken.past is None else append(taken.past, flat.obs, flat.action, flat.reward)
         state = state._replace(moments=self.fit_moments(state.moments, flat.obs))
-        told, obs = self.features_of_batch(state, flat, tasks), self.see_batch(state.moments, flat.obs, taken.past)
+        features, obs = self.features_of_batch(state, flat, tasks), self.see_batch(state.moments, flat.obs, taken.past)
         next_obs = self.see_batch(state.moments, flat.next_obs, next_past)
-        value, next_value = (self.values(state, told, seen) for seen in (obs, next_obs))
+        value, next_value = (self.values(state, features, inputs) for inputs in (obs, next_obs))
         reward = self.rewards(state, flat, tasks)
         advantage = self.advantages(flat._replace(reward=reward), tasks, steps.reward.shape, value, next_value)
         target = value + advantage
@@ -285,13 +285,13 @@ class PPO(BaseAgent):
             advantage=self.normalize_advantages(advantage),
             value=in_units(value),
             target=in_units(target),
-            told=told,
+            features=features,
             mask=tasks.action_mask,
             **models,
         )
-        missed, there = (spread(x, 1)[1][:, 0] for x in (advantage, target))
-        explained = 1 - missed / jnp.maximum(there, LEAST_STD**2)
-        return state, batch, {"value": spread(value, 1)[0][:, 0], "explained_variance": explained}
+        residual_variance, target_variance = (mean_and_variance(x, 1)[1][:, 0] for x in (advantage, target))
+        explained = 1 - residual_variance / jnp.maximum(target_variance, MIN_STD**2)
+        return state, batch, {"value": mean_and_variance(value, 1)[0][:, 0], "explained_variance": explained}
 
     def rewards(self, state: PPOState, flat: Transition, tasks: Task) -> Array:
         """The rewards (T, H E) of steps in the task's units."""
@@ -304,17 +304,17 @@ class PPO(BaseAgent):
         played = (x.reshape(shape) for x in (flat.reward, flat.discount, flat.ended, value, next_value))
         return jax.vmap(partial(advantages, lambda_=self.gae_lambda))(*played, gamma=gamma).reshape(value.shape)
 
-    def values(self, state: PPOState, told: Array, obs: Any) -> Array:
+    def values(self, state: PPOState, features: Array, obs: Any) -> Array:
         """The critic's values (T, B) of observations (T, B, ...), in units of reward."""
-        out = jax.vmap(self.value, (OVER_TASKS, 0, 0))(state.critic, told, obs)
+        out = jax.vmap(self.value, (OVER_TASKS, 0, 0))(state.critic, features, obs)
         return state.units.mean[:, None] + state.units.std[:, None] * out
 
     def normalize_advantages(self, advantage: Array) -> Array:
         """Bring advantages (T, B) to mean 0 and standard deviation 1."""
         if self.advantage_normalization == "none":
             return advantage
-        mean, variance = spread(advantage, 1 if self.advantage_normalization == "task" else (0, 1))
-        return (advantage - mean) / jnp.maximum(jnp.sqrt(variance), LEAST_STD)
+        mean, variance = mean_and_variance(advantage, 1 if self.advantage_normalization == "task" else (0, 1))
+        return (advantage - mean) / jnp.maximum(jnp.sqrt(variance), MIN_STD)
 
     def renew(self, state: PPOState, target: Array) -> PPOState:
         """Bring the critic's units up to date with targets (T, B)."""
@@ -322,10 +322,10 @@ class PPO(BaseAgent):
             return state
         old, count = state.units, state.units.count + 1
         rate = jnp.maximum(self.value_rate, 1 / count)  # the first rollouts count alike
-        mean, variance = (x[:, 0] for x in spread(target, 1))
-        ahead = mean - old.mean
-        variance = (1 - rate) * old.variance + rate * variance + rate * (1 - rate) * jnp.square(ahead)
-        new = Units(count, old.mean + rate * ahead, variance)
+        mean, variance = (x[:, 0] for x in mean_and_variance(target, 1))
+        drift = mean - old.mean
+        variance = (1 - rate) * old.variance + rate * variance + rate * (1 - rate) * jnp.square(drift)
+        new = Units(count, old.mean + rate * drift, variance)
         return state._replace(units=new, critic=self.follow(state.critic, old, new))
 
     def follow(self, critic: Params, old: Units, new: Units) -> Params:
@@ -345,43 +345,50 @@ class PPO(BaseAgent):
             return moments
         mixed = moments.mean.ndim > 1
         count = (obs.shape[1] if mixed else obs.shape[0] * obs.shape[1]) * collectives.count()
-        mean, variance = (x.reshape(moments.mean.shape) for x in spread(obs, 1 if mixed else (0, 1)))
+        mean, variance = (x.reshape(moments.mean.shape) for x in mean_and_variance(obs, 1 if mixed else (0, 1)))
         one = normalize.Moments(jnp.full_like(moments.count, count), mean, count * variance)
         return jax.vmap(merge)(moments, one) if mixed else merge(moments, one)
 
-    def deal(self, count: int, key: Key) -> Array:
+    def minibatch_indices(self, count: int, key: Key) -> Array:
         """Deal out ``count`` steps to the minibatches of all epochs: numbers of steps (U, B)."""
         size = count // self.minibatches
         if not size:
             raise InputError(f"minibatches ({self.minibatches}) must not be more than a rollout's {count} steps a task")
-        orders = jax.vmap(lambda key: jax.random.permutation(key, count))(jax.random.split(key, self.epochs))
-        return orders[:, : size * self.minibatches].reshape(-1, size)
+        indices = jax.vmap(lambda key: jax.random.permutation(key, count))(jax.random.split(key, self.epochs))
+        return indices[:, : size * self.minibatches].reshape(-1, size)
 
-    def improve(
-        self, batch: Batch, slow: Params, carry: tuple[PPOState, Array], given: tuple[Array, Key]
+    def minibatch_step(
+        self, batch: Batch, old_critic: Params, carry: tuple[PPOState, Array], given: tuple[Array, Key]
     ) -> tuple[Any, Metrics]:
-        """Take a gradient step of critic and actor on the steps (B,) of every task that are ``given``.
+        """Take a gradient step of critic and actor on one minibatch, steps (B,) of every task.
 
         Args:
-            slow: the critic, and the representation, from before the update.
+            old_critic: the critic, and the representation, from before the update.
+            carry: the state, and whether KL(pi_old | pi) has stayed within ``kl_limit`` so far ().
+            given: indices of steps (B,), and a key.
         """
-        (state, near), (order, key) = carry, given
+        (state, within_limit), (index, key) = carry, given
         sample_key, actor_order, critic_order = jax.random.split(key, 3)
-        chosen = choose(batch, order)
+        minibatch = take_steps(batch, index)
         if self.representation.learns:
-            ahead, _ = self.sight.targets(state.critic, slow, chosen.next_obs, jax.random.fold_in(key, 3))
-            chosen = chosen._replace(ahead=ahead)
+            model_targets, _ = self.placed_representation.targets(
+                state.critic, old_critic, minibatch.next_obs, jax.random.fold_in(key, 3)
+            )
+            minibatch = minibatch._replace(model_targets=model_targets)
         sample_keys = jax.random.split(sample_key, len(batch.advantage))
         critic_loss = self.above_least(self.critic_loss)
-        state, seen = self.descend("critic", self.gradients, critic_loss, state, chosen, critic_order)
-        told, obs = jax.vmap(self.look, (OVER_TASKS, 0, 0))(state.critic, chosen.told, chosen.obs)
-        data = (chosen._replace(told=told, obs=obs, ahead=None), sample_keys)
-        moved, done = self.descend("actor", self.gradients.for_actor, self.actor_loss, state, data, actor_order)
+        state, critic_metrics = self.descend("critic", self.gradients, critic_loss, state, minibatch, critic_order)
+        features, obs = jax.vmap(self.actor_inputs, (OVER_TASKS, 0, 0))(state.critic, minibatch.features, minibatch.obs)
+        data = (minibatch._replace(features=features, obs=obs, model_targets=None), sample_keys)
+        moved, actor_metrics = self.descend(
+            "actor", self.gradients.for_actor, self.actor_loss, state, data, actor_order
+        )
         if parts.is_zero(self.kl_limit):
-            return (moved, near), seen | done
+            return (moved, within_limit), critic_metrics | actor_metrics
         limit = jnp.where(self.kl_limit > 0, self.kl_limit, jnp.inf)
-        near &= jnp.mean(done["kl"]) <= limit
-        return (jax.tree.map(partial(jnp.where, near), moved, state), near), seen | done
+        within_limit &= jnp.mean(actor_metrics["kl"]) <= limit
+        state = jax.tree.map(partial(jnp.where, within_limit), moved, state)
+        return (state, within_limit), critic_metrics | actor_metrics
 
     def descend(
         self, name: str, rule: surgery.Rule, loss: Callable, state: PPOState, data: Any, key: Key
@@ -390,15 +397,15 @@ class PPO(BaseAgent):
         loss, params = surgery.over_devices(loss), getattr(state, name)
         importance = self.sampler.weights(state.progress, jnp.ones(len(state.contexts)))
         memory = getattr(state.surgery, name)
-        seen = surgery.gradient(rule, loss, params, data, memory, key, importance, self.per_layer)
+        step = surgery.gradient(rule, loss, params, data, memory, key, importance, self.per_layer)
         memory = getattr(state.optimizers, name)
-        params, memory = descent.descend(getattr(self.network_optimizers, name), seen.gradients, memory, params)
+        params, memory = descent.descend(getattr(self.network_optimizers, name), step.gradients, memory, params)
         state = state._replace(
             **{name: params},
             optimizers=state.optimizers._replace(**{name: memory}),
-            surgery=state.surgery._replace(**{name: surgery.look_again(rule, loss, params, data, seen)}),
+            surgery=state.surgery._replace(**{name: surgery.adapt_rule(rule, loss, params, data, step)}),
         )
-        return state, seen.aux | {f"{name}_{key}": value for key, value in seen.metrics.items()}
+        return state, step.aux | {f"{name}_{key}": value for key, value in step.metrics.items()}
 
 
 def advantages(
@@ -416,26 +423,26 @@ def advantages(
     return jax.lax.scan(back, jnp.zeros_like(delta[0]), (delta, decay), reverse=True)[1]
 
 
-def choose(batch: Batch, order: Array) -> Batch:
-    """Take the steps with numbers ``order`` (B,) of every task."""
-    rows = lambda x: x[:, order]
-    told = rows(batch.told) if batch.told.ndim == 3 else batch.told
-    return jax.tree.map(rows, batch._replace(told=None, mask=None))._replace(told=told, mask=batch.mask)
+def take_steps(batch: Batch, index: Array) -> Batch:
+    """Take the steps at ``index`` (B,) of every task's batch."""
+    rows = lambda x: x[:, index]
+    features = rows(batch.features) if batch.features.ndim == 3 else batch.features
+    return jax.tree.map(rows, batch._replace(features=None, mask=None))._replace(features=features, mask=batch.mask)
 
 
-def calm(params: Params, bias: Array) -> Params:
+def scale_head(params: Params, bias: Array) -> Params:
     """Give a network a head that says nearly the same of everything."""
 
-    def calmed(part: dict) -> dict:
+    def scaled(part: dict) -> dict:
         if "head" not in part:
             return part
         head = part["head"]
-        return {**part, "head": {"kernel": FIRST_HEAD * head["kernel"], "bias": head["bias"] + bias}}
+        return {**part, "head": {"kernel": HEAD_SCALE * head["kernel"], "bias": head["bias"] + bias}}
 
-    return Params(calmed(params.shared), calmed(params.own))
+    return Params(scaled(params.shared), scaled(params.own))
 
 
-def spread(x: Array, axes: int | tuple[int, ...]) -> tuple[Array, Array]:
+def mean_and_variance(x: Array, axes: int | tuple[int, ...]) -> tuple[Array, Array]:
     """Mean and variance along axes, which stay with length 1, over all devices that share the data."""
     mean_of = lambda x: collectives.total(jnp.mean(x, axis=axes, keepdims=True)) / collectives.count()
     mean = mean_of(x)

@@ -138,7 +138,7 @@ class Replay:
             return states
         before = data.count - 1
         due = (before > self.warmup_steps) & (before % self.reset_every == 0)
-        one = lambda state, key: agent.reset(state, env.spec, tasks, jax.random.fold_in(key, 1))
+        one = lambda state, key: agent.reset_networks(state, env.spec, tasks, jax.random.fold_in(key, 1))
         return jax.lax.cond(due, lambda states: over_seeds(one, 0, 0)(states, keys), lambda states: states, states)
 
     def draw(self, env: Env, agent: Any, tasks: Task, ring: Ring, key: Key) -> Transition:

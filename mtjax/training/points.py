@@ -75,8 +75,8 @@ class Varied:
     def observe(self, state: Swept, outcome: Outcome) -> Swept:
         return state._replace(learner=vary(self.agent, state.knobs).observe(state.learner, outcome))
 
-    def reset(self, state: Swept, spec: Spec, tasks: Task, key: Key) -> Swept:
-        return state._replace(learner=vary(self.agent, state.knobs).reset(state.learner, spec, tasks, key))
+    def reset_networks(self, state: Swept, spec: Spec, tasks: Task, key: Key) -> Swept:
+        return state._replace(learner=vary(self.agent, state.knobs).reset_networks(state.learner, spec, tasks, key))
 
 
 def numbers(agent: BaseAgent) -> dict[str, float]:

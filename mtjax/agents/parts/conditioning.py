@@ -10,7 +10,7 @@ BORROWED = {"one-hot": ["number"], "embedding": ["embedding"], "vectors": ["vect
 """What a task that was not trained on has of its nearest training task, by what networks are told."""
 
 
-def features(told: str, num_tasks: int, index: Array, context: Array, vectors: Array | None) -> Array:
+def features(conditioning: str, num_tasks: int, index: Array, context: Array, vectors: Array | None) -> Array:
     """What the networks see of a task (Z,); a learned embedding is added by the network that owns it.
 
     Args:
@@ -18,7 +18,7 @@ def features(told: str, num_tasks: int, index: Array, context: Array, vectors: A
         index: () the training task that it is, or that stands for it; context: (C,) its own parameters.
         vectors: (T, V) of the training tasks, if they are told.
     """
-    match told:
+    match conditioning:
         case "one-hot":
             return jax.nn.one_hot(index, num_tasks)
         case "parameters":

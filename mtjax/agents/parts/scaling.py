@@ -89,8 +89,8 @@ class RewardScaling(NoScaling):
     def observe(self, memory: Moments, outcome: Outcome) -> Moments:
         rate = 1 - (1 - self.variance_rate) ** outcome.reward.shape[1]
         mean = memory.mean + rate * (jnp.mean(outcome.reward, axis=1) - memory.mean)
-        spread = jnp.mean(jnp.square(outcome.reward - mean[:, None]), axis=1)
-        return Moments(mean, memory.variance + rate * (spread - memory.variance))
+        variance_now = jnp.mean(jnp.square(outcome.reward - mean[:, None]), axis=1)
+        return Moments(mean, memory.variance + rate * (variance_now - memory.variance))
 
     def units(self, memory: Moments, gamma: float | Array, bonus: Array) -> tuple[Array, Array]:
         return 1 / (jnp.sqrt(memory.variance) + 1e-8), jnp.zeros_like(memory.mean)
@@ -181,10 +181,10 @@ class PopArt(NoScaling):
 
     def renew(self, memory: Moments, target: Array, critics: tuple[Params, ...]):
         rate, std = self.target_rate, self.std(memory)
-        ahead = std * jnp.mean(target, axis=1)  # of the old mean, in reward
-        spread = jnp.square(std) * jnp.var(target, axis=1)
-        variance = (1 - rate) * memory.variance + rate * spread + rate * (1 - rate) * jnp.square(ahead)
-        new = Moments(memory.mean + rate * ahead, variance)
+        drift = std * jnp.mean(target, axis=1)  # of the old mean, in reward
+        variance_now = jnp.square(std) * jnp.var(target, axis=1)
+        variance = (1 - rate) * memory.variance + rate * variance_now + rate * (1 - rate) * jnp.square(drift)
+        new = Moments(memory.mean + rate * drift, variance)
         ratio = std / self.std(new)
         shift = (new.mean - memory.mean) / self.std(new)  # by as much as the mean moved, rounding included
 
@@ -229,8 +229,8 @@ class AdaptiveScaling(NoScaling):
     def observe(self, memory: MeanRewards, outcome: Outcome) -> MeanRewards:
         added = outcome.reward.shape[1]
         count = memory.count + added
-        ahead = jnp.mean(outcome.reward, axis=1) - memory.mean
-        return memory._replace(count=count, mean=memory.mean + ahead * added / count)
+        drift = jnp.mean(outcome.reward, axis=1) - memory.mean
+        return memory._replace(count=count, mean=memory.mean + drift * added / count)
 
     def factors(self, memory: MeanRewards) -> Array:
         """The factors (T,) of the present networks; of ones that are about to learn, those by the means so far."""

@@ -25,8 +25,8 @@ class Identity:
 
     def refuses(self, conditioning: str) -> str:
         """Why it cannot work with what the networks are told of the task; empty if it can."""
-        told = conditioning != "none" or not self.needs_features
-        return "" if told else "works by the task's features, so conditioning cannot be none; use parameters"
+        has_features = conditioning != "none" or not self.needs_features
+        return "" if has_features else "works by the task's features, so conditioning cannot be none; use parameters"
 
     def body(self, hidden: tuple[int, ...], layer_norm: bool) -> nn.Module:
         """A module (observations (..., O), features (..., Z) or (Z,), [actions (..., A)]) -> (..., width)."""

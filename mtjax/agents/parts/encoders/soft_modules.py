@@ -47,8 +47,8 @@ class Routing(nn.Module):
         found, seen, gate = [], [], joint
         for i, count in enumerate(receivers):
             if i:
-                told = jnp.concatenate(seen, axis=-1) if self.official else seen[-1]
-                gate = nn.Dense(joint.shape[-1], name=f"up_{i}")(told) * joint
+                previous = jnp.concatenate(seen, axis=-1) if self.official else seen[-1]
+                gate = nn.Dense(joint.shape[-1], name=f"up_{i}")(previous) * joint
             scores = nn.Dense(count * self.num_modules, name=f"down_{i}")(ReLU()(gate))
             weights = jax.nn.softmax(scores.reshape(*scores.shape[:-1], count, self.num_modules), axis=-1)
             self.sow("intermediates", "weights", weights)

@@ -106,7 +106,7 @@ def over_devices(loss: Callable) -> Callable:
     return averaged
 
 
-def look_again(rule: Rule, loss: Callable, params: Params, data: Any, before: Combined) -> Any:
+def adapt_rule(rule: Rule, loss: Callable, params: Params, data: Any, before: Combined) -> Any:
     """What a rule remembers once the parameters have moved; looks at their losses on the same data if it needs them."""
     if rule.needs != "losses":
         return before.memory

@@ -26,7 +26,7 @@ class Basis(NamedTuple):
     """A representation as it begins, and what the networks above it see."""
 
     params: Params
-    told: Array  # (Z,) zeros
+    features: Array  # (Z,) zeros
     obs: Any  # zeros
     key: Key  # for the networks
 
@@ -67,22 +67,22 @@ class Plain:
         """The share of new parameters that their slow copy takes, by name, where it is not the critics'."""
         return {}
 
-    def init(self, num_tasks: int, told: Array, obs: Any, action: Array, key: Key) -> Basis:
+    def init(self, num_tasks: int, features: Array, obs: Any, action: Array, key: Key) -> Basis:
         """Initialise for inputs of the given shapes, (Z,), (O,) and (A,)."""
-        return Basis(Params({}, {}), told, obs, key)
+        return Basis(Params({}, {}), features, obs, key)
 
-    def perceive(self, params: Params, told: Array, obs: Any) -> tuple[Array, Any]:
+    def perceive(self, params: Params, features: Array, obs: Any) -> tuple[Array, Any]:
         """What is known of the task (Z,) or (B, Z), and what networks see in place of observations (B, O)."""
-        return told, obs
+        return features, obs
 
-    def targets(self, params: Params, slow: Params, next_obs: Any, key: Key) -> tuple[Any, Key]:
+    def targets(self, params: Params, target_params: Params, next_obs: Any, key: Key) -> tuple[Any, Key]:
         """What the models of all tasks fit, leaves (T, ...), and a key for each task's critics (T,).
 
         Args:
             params: those of all tasks; slow: their slow copy.
             next_obs: (T, B, O).
         """
-        return None, jax.random.split(key, len(alone(next_obs)))
+        return None, jax.random.split(key, len(without_past(next_obs)))
 
     def join(self, loss: Array, metrics: Metrics, params: Params, batch: Any) -> tuple[Array, Metrics]:
         """The critics' loss and metrics, joined by its own.
@@ -118,6 +118,6 @@ class Plain:
         return ""
 
 
-def alone(obs: Any) -> Array:
+def without_past(obs: Any) -> Array:
     """The observation alone, where the past is seen too."""
     return obs.obs if isinstance(obs, Seen) else obs

@@ -9,14 +9,14 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents import parts
-from mtjax.agents.parts.representations.base import Basis, Plain, alone
+from mtjax.agents.parts.representations.base import Basis, Plain, without_past
 from mtjax.agents.parts.trajectory import TrajectoryEncoder
 from mtjax.networks import MLP, OVER_TASKS, Network, Params, Trunk, join
 from mtjax.types import Array, Key, Metrics
 
 DEVIATIONS = (0.01, 1.0)
 """Least and largest standard deviation of a predicted latent state, whose values lie in (-1, 1)."""
-SIGHT = ("latent", "trajectory", "embedding")
+ENCODERS = ("latent", "trajectory", "embedding")
 
 
 class Latent(nn.Module):
@@ -37,16 +37,16 @@ class Model(nn.Module):
     out: int
 
     @nn.compact
-    def __call__(self, latent: Array, told: Array, *action: Array) -> Array:
-        return nn.Dense(self.out)(Trunk(self.widths, layer_norm=True)(latent, told, *action))
+    def __call__(self, latent: Array, features: Array, *action: Array) -> Array:
+        return nn.Dense(self.out)(Trunk(self.widths, layer_norm=True)(latent, features, *action))
 
 
-class Ahead(NamedTuple):
+class ModelTargets(NamedTuple):
     """What the models of one task fit; of all tasks, leaves (T, ...)."""
 
     latent: Array  # (B, D) of the next observations, by the slow encoder
     noise: Array  # (B, D) that draws next latent states; () zero where they are points
-    rival: Array | None = None  # (Z,) the vector of another task
+    other_theta: Array | None = None  # (Z,) the vector of another task
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,7 +83,7 @@ class DeepMDP(Plain):
     encoder_tau: float = 0.05
     """Share of the new encoder that its slow copy takes at each update."""
 
-    names: ClassVar[tuple[str, ...]] = (*SIGHT, "transition", "reward")
+    names: ClassVar[tuple[str, ...]] = (*ENCODERS, "transition", "reward")
     models: ClassVar[tuple[str, ...]] = ("transition", "reward")
 
     def __post_init__(self):
@@ -94,7 +94,7 @@ class DeepMDP(Plain):
 
     @property
     def rates(self) -> dict[str, float]:
-        return dict.fromkeys(SIGHT, self.encoder_tau)
+        return dict.fromkeys(ENCODERS, self.encoder_tau)
 
     # Networks: one each for all N critics, and for the actor.
 
@@ -127,11 +127,18 @@ class DeepMDP(Plain):
         """Map one task's inputs by an encoder or a model."""
         return self.modules[name].apply({**params.shared, **params.own}[name], *inputs)  # type: ignore
 
-    def init(self, num_tasks: int, told: Array, obs: Any, action: Array, key: Key) -> Basis:
+    def init(self, num_tasks: int, features: Array, obs: Any, action: Array, key: Key) -> Basis:
         key, theta_key, *keys = jax.random.split(key, 2 + len(self.modules))
         size, params = self.place.embedding_size, Params({}, {})
-        latent, told = jnp.zeros(self.latent_widths[-1]), jnp.zeros(len(told) + size * (self.has_theta + self.infers))
-        inputs = {"latent": (alone(obs),), "transition": (latent, told, action), "reward": (latent, told)}
+        latent, features = (
+            jnp.zeros(self.latent_widths[-1]),
+            jnp.zeros(len(features) + size * (self.has_theta + self.infers)),
+        )
+        inputs = {
+            "latent": (without_past(obs),),
+            "transition": (latent, features, action),
+            "reward": (latent, features),
+        }
         for (name, module), part_key in zip(self.modules.items(), keys, strict=True):
             data = inputs.get(name, (obs,))
             if self.place.own:
@@ -140,25 +147,25 @@ class DeepMDP(Plain):
                 params.shared[name] = module.init(part_key, *data)
         if self.has_theta:
             params.own["embedding"] = jax.random.normal(theta_key, (num_tasks, size))
-        return Basis(params, told, latent, key)
+        return Basis(params, features, latent, key)
 
     # What networks see, of one task: features (Z,) or (B, Z), observations (..., O).
 
-    def perceive(self, params: Params, told: Array, obs: Any) -> tuple[Array, Array]:
+    def perceive(self, params: Params, features: Array, obs: Any) -> tuple[Array, Array]:
         """What is known of the task (Z,) or (..., Z), and latent states (..., D)."""
         if self.infers:
-            told = self.apply(params, "trajectory", obs)
-        told = join(told, task=self.theta(params)) if self.has_theta else told
-        return told, self.apply(params, "latent", alone(obs))
+            features = self.apply(params, "trajectory", obs)
+        features = join(features, task=self.theta(params)) if self.has_theta else features
+        return features, self.apply(params, "latent", without_past(obs))
 
     def theta(self, params: Params) -> Array:
         """A task's learned vector (Z,)."""
         theta = params.own["embedding"]
         return theta / jnp.maximum(jnp.linalg.norm(theta), 1e-6) if self.place.unit_embedding else theta
 
-    def foretell(self, params: Params, told: Array, latent: Array, action: Array) -> tuple[Array, Array]:
+    def predict(self, params: Params, features: Array, latent: Array, action: Array) -> tuple[Array, Array]:
         """Mean and standard deviation (..., D) of the next latent state."""
-        outputs = self.apply(params, "transition", latent, told, action)
+        outputs = self.apply(params, "transition", latent, features, action)
         if self.transition == "deterministic":
             return outputs, jnp.ones_like(outputs)
         mean, deviation = jnp.split(outputs, 2, axis=-1)
@@ -167,20 +174,20 @@ class DeepMDP(Plain):
 
     # Losses.
 
-    def targets(self, params: Params, slow: Params, next_obs: Any, key: Key) -> tuple[Ahead, Key]:
-        encode = lambda slow, obs: self.apply(slow, "latent", obs)
-        latent = jax.vmap(encode, (OVER_TASKS, 0))(slow, alone(next_obs))
+    def targets(self, params: Params, target_params: Params, next_obs: Any, key: Key) -> tuple[ModelTargets, Key]:
+        encode = lambda target_params, obs: self.apply(target_params, "latent", obs)
+        latent = jax.vmap(encode, (OVER_TASKS, 0))(target_params, without_past(next_obs))
         keys = jax.vmap(jax.random.split)(jax.random.split(key, len(latent)))  # (T, 2): for critics, and for models
         draw = lambda key: jax.random.normal(key, latent.shape[1:])
         drawn = self.transition == "probabilistic"
-        return Ahead(latent, jax.vmap(draw)(keys[:, 1]) if drawn else jnp.zeros(len(latent))), keys[:, 0]
+        return ModelTargets(latent, jax.vmap(draw)(keys[:, 1]) if drawn else jnp.zeros(len(latent))), keys[:, 0]
 
     def join(self, loss: Array, metrics: Metrics, params: Params, batch: Any) -> tuple[Array, Metrics]:
-        told, latent = self.perceive(params, batch.told, batch.obs)
-        mean, deviation = self.foretell(params, told, latent, batch.action)
-        error = (mean - jax.lax.stop_gradient(batch.ahead.latent)) / deviation
+        features, latent = self.perceive(params, batch.features, batch.obs)
+        mean, deviation = self.predict(params, features, latent, batch.action)
+        error = (mean - jax.lax.stop_gradient(batch.model_targets.latent)) / deviation
         transition_loss = jnp.mean(0.5 * jnp.square(error) + jnp.log(deviation))
-        reward = self.apply(params, "reward", mean + deviation * batch.ahead.noise, told)[..., 0]
+        reward = self.apply(params, "reward", mean + deviation * batch.model_targets.noise, features)[..., 0]
         reward_loss = jnp.mean(jnp.square(reward - batch.reward))
         metrics = {**metrics, "transition_loss": transition_loss, "reward_loss": reward_loss}
         return loss + self.model_coefficient * (transition_loss + reward_loss), metrics

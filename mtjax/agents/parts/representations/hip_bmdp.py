@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents import parts
-from mtjax.agents.parts.representations.deepmdp import Ahead, DeepMDP
+from mtjax.agents.parts.representations.deepmdp import DeepMDP, ModelTargets
 from mtjax.networks import Params
 from mtjax.types import Array, Key, Metrics
 
@@ -94,16 +94,18 @@ class HiPBMDP(DeepMDP):
 
     # Losses.
 
-    def targets(self, params: Params, slow: Params, next_obs: Any, key: Key) -> tuple[Ahead, Key]:
+    def targets(self, params: Params, target_params: Params, next_obs: Any, key: Key) -> tuple[ModelTargets, Key]:
         key, turn_key = jax.random.split(key)
-        ahead, keys = super().targets(params, slow, next_obs, key)
+        model_targets, keys = super().targets(params, target_params, next_obs, key)
         thetas = params.own["embedding"]
         turn = jax.random.randint(turn_key, (), 1, max(len(thetas), 2))  # a task that is alone is its own rival
-        return ahead._replace(rival=jnp.roll(thetas, turn, axis=0)), keys
+        return model_targets._replace(other_theta=jnp.roll(thetas, turn, axis=0)), keys
 
     def join(self, loss: Array, metrics: Metrics, params: Params, batch: Any) -> tuple[Array, Metrics]:
         loss, metrics = super().join(loss, metrics, params, batch)
-        theta_loss = jnp.mean(self.theta_loss(params, batch.told, batch.obs, batch.action, batch.ahead.rival))
+        theta_loss = jnp.mean(
+            self.theta_loss(params, batch.features, batch.obs, batch.action, batch.model_targets.other_theta)
+        )
         metrics |= {"theta_loss": theta_loss}
         loss += self.theta_coefficient * theta_loss
         if self.unseen_theta != "inferred":
@@ -112,11 +114,11 @@ class HiPBMDP(DeepMDP):
         guess_loss = jnp.mean(jnp.sum(jnp.square(error), axis=-1))
         return loss + guess_loss, metrics | {"guess_loss": guess_loss}
 
-    def theta_loss(self, params: Params, told: Array, obs: Any, action: Array, rival: Array) -> Array:
+    def theta_loss(self, params: Params, features: Array, obs: Any, action: Array, other_theta: Array) -> Array:
         """The theta loss (B,) of one task against another task's vector (Z,)."""
-        still, other = jax.lax.stop_gradient((params, with_theta(params, rival)))
-        foretold = [self.foretell(p, *self.perceive(p, told, obs), action) for p in (still, other)]
-        ours, theirs = map(jnp.stack, foretold)  # (2, B, D), means and deviations
+        still, other = jax.lax.stop_gradient((params, with_theta(params, other_theta)))
+        predictions = [self.predict(p, *self.perceive(p, features, obs), action) for p in (still, other)]
+        ours, theirs = map(jnp.stack, predictions)  # (2, B, D), means and deviations
         moved = jnp.sqrt(jnp.sum(jnp.square(ours - theirs), axis=(0, -1)))
         return jnp.square(distance(self.theta(params), self.theta(other)) - moved)
 
