@@ -1,4 +1,4 @@
-"""Agents by name: presets of parts, and the few that are more. To add one: a line here, and a file if it is more."""
+"""``AGENTS`` lists agents by name. To add one, add a line here, and a file if it is more than a choice of parts."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -14,24 +14,22 @@ __getattr__ = lazily(__name__, {"PARTS": _BASE, "BaseAgent": _BASE, "settings": 
 
 
 class Preset(NamedTuple):
-    """A class of agent with some settings of its own."""
+    """A preset names a class of agents and its settings."""
 
-    says: str  # what it is, in a line
+    says: str  # a description in one line
     defaults: Mapping[str, Any] = {}
-    place: "str | type[BaseAgent]" = (
-        "mtjax.agents.sac:SAC"  # the class; one of this package is imported when it is used
-    )
+    place: "str | type[BaseAgent]" = "mtjax.agents.sac:SAC"  # the class, or where it is, to be imported when it is used
 
     @property
     def cls(self) -> "type[BaseAgent]":
-        """The class of agent."""
+        """The class of agents."""
         return load(self.place)
 
 
 _PARAMS = {"conditioning": "parameters"}
 
 AGENTS: dict[str, Preset] = {
-    "sac": Preset("Soft actor-critic that is not told its task (Haarnoja et al. 2018)"),
+    "sac": Preset("Soft actor-critic that does not see its task (Haarnoja et al. 2018)"),
     "sac-conditioned": Preset("SAC that sees the task's parameters (Schaul et al. 2015)", _PARAMS),
     "multi-head": Preset("SAC with an output layer for every task (Yu et al. 2020)", {"heads": "per-task"}),
     "disjoint": Preset("One SAC for every task, all in one program: nothing is shared", {"heads": "disjoint"}),
@@ -57,7 +55,7 @@ AGENTS: dict[str, Preset] = {
         {"representation": "hip-bmdp", "conditioning": "embedding", "embedding_size": 50},
     ),
     "ppo": Preset(
-        "Proximal policy optimisation (Schulman et al. 2017), told its task", _PARAMS, "mtjax.agents.ppo:PPO"
+        "Proximal policy optimisation (Schulman et al. 2017), sees its task", _PARAMS, "mtjax.agents.ppo:PPO"
     ),
     "pcgrad": Preset("Conflicting gradients projected (Yu et al. 2020)", {"gradients": "pcgrad", **_PARAMS}),
     "cagrad": Preset("Conflict-averse gradients (Liu et al. 2021)", {"gradients": "cagrad", **_PARAMS}),
@@ -74,13 +72,17 @@ def agent(name: str, **given: Any) -> "BaseAgent":
     """
     preset = preset_of(name)
     defaults = dict(preset.defaults)
-    if "encoder" in given:  # another encoder knows nothing of this one's settings
+    if "encoder" in given:  # the preset's settings of another encoder do not apply
         defaults = {k: v for k, v in defaults.items() if k in preset.cls.__dataclass_fields__}
     return load(f"{_BASE}:build")(name, preset.cls, {**defaults, **given})
 
 
 def preset_of(name: str) -> Preset:
-    """Return what ``name`` stands for."""
+    """Return the preset called ``name``.
+
+    Raises:
+        InputError: no agent has that name.
+    """
     if name not in AGENTS:
         raise nearest_error("agent", name, AGENTS)
     return AGENTS[name]

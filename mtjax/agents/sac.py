@@ -23,7 +23,7 @@ from mtjax.types import Acted, Array, InputError, Key, Metrics, Spec, Task, Tran
 
 
 class Optimizers(NamedTuple):
-    """Hold the optimisers' states."""
+    """Holds the optimisers' states."""
 
     actor: Any
     critic: Any
@@ -31,7 +31,7 @@ class Optimizers(NamedTuple):
 
 
 class SACState(NamedTuple):
-    """Hold everything that SAC learns, and what it remembers of the training tasks."""
+    """Holds everything that SAC learns, and what it remembers of the training tasks."""
 
     actor: Params
     critic: Params  # shared leaves (N, ...), own leaves (T, N, ...); beside them the representation, without N
@@ -47,7 +47,7 @@ class SACState(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """Hold the data for the losses of one task; for all tasks, leaves are (T, ...)."""
+    """Holds the data for the losses of one task; for all tasks, leaves are (T, ...)."""
 
     obs: Any  # (B, O) as the networks take them
     action: Array  # (B, A)
@@ -61,7 +61,7 @@ class Batch(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """Hold actions that a policy has sampled."""
+    """Holds actions that a policy has sampled."""
 
     action: Array  # (B, A)
     log_prob: Array  # (B,)
