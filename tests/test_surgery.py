@@ -298,7 +298,7 @@ def test_the_second_look_is_at_the_new_losses():
     assert memory.logits[np.argmin(gain)] > 0 > memory.logits[np.argmax(gain)]
 
 
-def test_other_rules_do_not_look_again():
+def test_other_rules_keep_their_memory():
     """Their loss is not even traced."""
 
     def never(params, data):
