@@ -29,7 +29,7 @@ from report import machine, markdown
 
 import mtjax
 from mtjax.envs.mixtures import States
-from mtjax.rollout import spread
+from mtjax.rollout import broadcast_tasks
 from mtjax.training.programs import enable_compile_cache
 
 TASKS = (
@@ -170,7 +170,7 @@ def begin(family: Any, num_envs: int) -> Any:
     """Return the states of a family's worlds at the start of episodes."""
     tasks = family.tasks()
     keys = jax.random.split(jax.random.key(0), (1, len(tasks.id), num_envs))
-    return jax.jit(lambda tasks, keys: family.reset_worlds(spread(tasks, keys.shape), keys).state)(tasks, keys)
+    return jax.jit(lambda tasks, keys: family.reset_worlds(broadcast_tasks(tasks, keys.shape), keys).state)(tasks, keys)
 
 
 class Stepper:
@@ -183,7 +183,7 @@ class Stepper:
         def play(tasks, states, key):
             def step(states, key):
                 actions = jax.random.uniform(key, (*shape, env.spec.action_size), minval=-1.0)
-                stepped = env.step_worlds(spread(tasks, shape), states, actions)
+                stepped = env.step_worlds(broadcast_tasks(tasks, shape), states, actions)
                 return stepped.state, jnp.sum(stepped.reward)
 
             return jax.lax.scan(step, states, jax.random.split(key, count))

@@ -24,7 +24,7 @@ from training import Training
 
 import mtjax
 from mtjax.envs import Domain
-from mtjax.rollout import spread
+from mtjax.rollout import broadcast_tasks
 from mtjax.types import InputError
 
 # Ours (with ten values of a physical parameter), and Playground's of the same task.
@@ -136,7 +136,7 @@ def ours(name: str, settings: dict, per_task: int, steps: int, resets: bool) -> 
     shape = (1, len(tasks.id), per_task)
 
     def play(tasks, carry):
-        worlds = spread(tasks, shape)
+        worlds = broadcast_tasks(tasks, shape)
 
         def step(carry, _):
             state, age, key = carry
@@ -154,7 +154,9 @@ def ours(name: str, settings: dict, per_task: int, steps: int, resets: bool) -> 
         carry, seen = jax.lax.scan(step, carry, length=steps)
         return carry, jnp.sum(seen)
 
-    start = jax.jit(lambda tasks, key: env.reset_worlds(spread(tasks, shape), jax.random.split(key, shape)).state)
+    start = jax.jit(
+        lambda tasks, key: env.reset_worlds(broadcast_tasks(tasks, shape), jax.random.split(key, shape)).state
+    )
     program = jax.jit(play, donate_argnums=1)
     held = [(start(tasks, jax.random.key(0)), jnp.int32(0), jax.random.key(1))]
 

@@ -21,7 +21,7 @@ from report import machine, markdown
 
 import mtjax
 from mtjax.envs.probes import tasks_of
-from mtjax.training.points import Varied, numbers
+from mtjax.training.points import SweptAgent, sweepable
 from mtjax.types import Spec, Transition
 
 TASKS, BATCH, UPDATES, ROUNDS = 10, 64, 20, 7
@@ -43,8 +43,8 @@ def main() -> None:
 def compare(name: str) -> dict[str, Any]:
     """Compile and time the updates of one agent in both forms."""
     agent = mtjax.agent(name, hidden=(256, 256))
-    tasks, key, values = tasks_of("one-step", np.linspace(-1, 1, TASKS)), jax.random.key(0), numbers(agent)
-    varied, knobs = Varied(agent), {name: jnp.float32(value) for name, value in values.items()}
+    tasks, key, values = tasks_of("one-step", np.linspace(-1, 1, TASKS)), jax.random.key(0), sweepable(agent)
+    varied, knobs = SweptAgent(agent), {name: jnp.float32(value) for name, value in values.items()}
     states = {
         "constants": (agent, jax.jit(lambda key: agent.init(SPEC, tasks, key))(key)),
         "data": (varied, jax.jit(lambda key: varied.init(SPEC, tasks, key, knobs))(key)),

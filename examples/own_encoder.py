@@ -37,7 +37,7 @@ class GatedTrunk(nn.Module):
 class Gated(Encoder):
     """A network whose units the task gates. Its fields are flags: --agent.gate-widths."""
 
-    needs_features: ClassVar[bool] = True  # an agent that is told nothing of its task is refused
+    needs_features: ClassVar[bool] = True  # if so, conditioning=none is refused
     gate_widths: tuple[int, ...] = (64,)
     """Widths of the network from the task's features to the gates."""
 

@@ -1,4 +1,4 @@
-"""Evaluation: whole episodes under the mean action, on any tasks, with keys of its own."""
+"""Evaluation plays whole episodes under the mean action, on any tasks, with keys of its own."""
 
 import os
 from collections.abc import Mapping
@@ -16,23 +16,23 @@ from mtjax.types import SPLITS, Agent, Array, Env, InputError, Task
 
 
 class Scores(NamedTuple):
-    """Every episode of one evaluation."""
+    """Holds every episode of one evaluation."""
 
     returns: Any  # (S, T, episodes) undiscounted
-    metrics: dict[str, Any]  # (S, T, episodes) each, such as success: their values in the episode's last step
+    metrics: dict[str, Any]  # (S, T, episodes) each, such as success: values at the episode's last step
 
 
 class Evaluations(NamedTuple):
-    """Every episode of every evaluation of a run."""
+    """Holds every episode of every evaluation of a run."""
 
-    steps: np.ndarray  # (V,) environment steps, summed over tasks, after which each evaluation took place
+    steps: np.ndarray  # (V,) environment steps, summed over tasks, before each evaluation
     returns: dict[str, np.ndarray]  # split -> (S, V, T, episodes)
     values: dict[str, np.ndarray]  # split -> (T,) value of the varying parameter
     metrics: Mapping[str, dict[str, np.ndarray]] = MappingProxyType({})  # name -> split -> (S, V, T, episodes)
 
 
 def save_evaluations(path: Path, evaluations: Evaluations) -> None:
-    """Write every episode: ``steps`` (V,), and per split returns and metrics (S, V, T, episodes) and values (T,)."""
+    """Write every episode: ``steps`` (V,), and for each split returns, metrics (S, V, T, episodes) and values (T,)."""
     values = {f"{split}_values": x for split, x in evaluations.values.items()}
     metrics = {f"{split}_{name}": x for name, splits in evaluations.metrics.items() for split, x in splits.items()}
     new = path.with_suffix(".new.npz")
@@ -41,7 +41,11 @@ def save_evaluations(path: Path, evaluations: Evaluations) -> None:
 
 
 def load_evaluations(path: Path) -> Evaluations:
-    """Read what ``save_evaluations`` wrote."""
+    """Read a file that ``save_evaluations`` wrote.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
     try:
         with np.load(path, allow_pickle=False) as file:
             named = {name.removeprefix("train_") for name in file if name.startswith("train_")} - {"values"}
@@ -63,7 +67,7 @@ def evaluate(env: Env, agent: Agent, episodes: int, state: Any, tasks: Task, see
         state: agent states with leading S.
         tasks: (T, ...), training tasks or not.
         seeds: (S,) the runs' seeds.
-        number: () which evaluation of the run it is; each has fresh keys, whatever training drew.
+        number: () number of the evaluation in the run; each has fresh keys, independent of training.
     """
 
     shape = (len(seeds), len(tasks.id), episodes)
@@ -72,25 +76,25 @@ def evaluate(env: Env, agent: Agent, episodes: int, state: Any, tasks: Task, see
 
     def step(carry, _):
         worlds, scores, alive = carry
-        worlds, moment = step_envs(env, agent, state, tasks, worlds, None)
-        reward = jnp.where(alive, moment.transition.reward, 0.0)  # what follows an episode's end may not be finite
+        worlds, env_step = step_envs(env, agent, state, tasks, worlds, None)
+        reward = jnp.where(alive, env_step.transition.reward, 0.0)  # rewards after an episode's end may not be finite
         latest = lambda new, old: jnp.where(alive, new, old)
-        scores = Scores(scores.returns + reward, jax.tree.map(latest, moment.metrics, scores.metrics))
-        return (worlds, scores, alive & ~moment.transition.ended), None
+        scores = Scores(scores.returns + reward, jax.tree.map(latest, env_step.metrics, scores.metrics))
+        return (worlds, scores, alive & ~env_step.transition.ended), None
 
     worlds = reset_envs(env, agent, state, tasks, keys)
-    moment = jax.eval_shape(lambda worlds: step_envs(env, agent, state, tasks, worlds, None)[1], worlds)
-    nothing = Scores(jnp.zeros(shape), jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), moment.metrics))
+    env_step = jax.eval_shape(lambda worlds: step_envs(env, agent, state, tasks, worlds, None)[1], worlds)
+    nothing = Scores(jnp.zeros(shape), jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), env_step.metrics))
     return jax.lax.scan(step, (worlds, nothing, jnp.ones(shape, bool)), length=env.episode_length)[0][1]
 
 
 class Recording(NamedTuple):
-    """One episode of every task."""
+    """Holds one episode of every task."""
 
     returns: Array  # (T,)
-    rows: Array  # (T,) of the tasks that were played; where ranges are continuous, the episodes' own
+    rows: Array  # (T,) of the tasks that were played; where ranges are continuous, of the episodes' draws
     lengths: Array  # (T,) int32 steps until the episode ended
-    states: Any  # the environment's after each step, leaves (T, H, ...)
+    states: Any  # of the environment after each step, leaves (T, H, ...)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -100,8 +104,8 @@ def record(env: Env, agent: Agent, state: Any, tasks: Task, seed: Array) -> Reco
     keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), 0xF11), (1, len(tasks.id), 1))
 
     def step(worlds: Worlds, _):
-        worlds, moment = step_envs(env, agent, learners, tasks, worlds, None)
-        return worlds, (moment.transition.reward, moment.transition.ended, worlds.state)
+        worlds, env_step = step_envs(env, agent, learners, tasks, worlds, None)
+        return worlds, (env_step.transition.reward, env_step.transition.ended, worlds.state)
 
     worlds = reset_envs(env, agent, learners, tasks, keys)
     _, played = jax.lax.scan(step, worlds, length=env.episode_length)  # leaves (H, 1, T, 1, ...)

@@ -1,9 +1,9 @@
-"""The learning loop as a pure function: ``init`` makes a training state, ``run_chunk`` advances it.
+"""The learning loop is two pure functions: ``init`` makes a training state, and ``run_chunk`` advances it.
 
-A chunk is one jitted, donated ``lax.scan`` of collect, add and learn, for all seeds at once. Learners are mapped over
-seeds; worlds of all seeds, tasks and environments are one flat batch, which traces and compiles faster than nested maps
-and keeps decisions that all seeds share as branches. Where devices share a seed's environments, E is a device's own
-part of them, and random numbers are drawn for all before each takes its own.
+A chunk is one jitted, donated ``lax.scan`` of collect, add and learn, for all seeds at once. Agents are mapped over
+seeds. The worlds of all seeds, tasks and environments are one flat batch: it traces and compiles faster than nested
+maps, and decisions that all seeds share stay branches. Where devices share a seed's environments, E counts one device's
+own. Random numbers are then drawn for all environments, and each device takes its own.
 """
 
 import dataclasses
@@ -15,24 +15,24 @@ import jax.numpy as jnp
 
 from mtjax.maps import over_seeds
 from mtjax.parallel import collectives
-from mtjax.rollout import Moment, Worlds, reset_ended, reset_envs, split_keys, step_envs, world_keys
+from mtjax.rollout import EnvStep, Worlds, reset_ended, reset_envs, split_keys, step_envs, world_keys
 from mtjax.types import Agent, Array, Env, InputError, Key, Metrics, Outcome, Task, Transition
 
 PHASES = 10
-"""First ages are so many different ones: each asks for a reset of its own in every episode."""
+"""Largest number of different first ages, as each causes a separate reset in every episode."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """How worlds are played."""
+    """Holds the settings of the loop."""
 
     num_envs: int = 16
-    """Environments per task."""
+    """Number of environments per task."""
     chunk_steps: int = 1000
-    """Steps of every environment between two lines of metrics; also the grain of evaluation and checkpoints."""
+    """Steps of every environment between two lines of metrics; evaluation and checkpoints happen between chunks."""
     stagger: bool = True
-    """Begin environments at different ages, so that their episodes do not end all at once; a first, shortened episode
-    is not counted among the returns."""
+    """Begin environments at different ages, so that their episodes end at different times; returns do not count first
+    episodes, which are shorter."""
 
     def __post_init__(self):
         for name in ("num_envs", "chunk_steps"):
@@ -41,13 +41,13 @@ class Settings:
 
 
 class TrainState(NamedTuple):
-    """All that is needed to go on bit for bit."""
+    """Holds everything that a run needs to continue bit for bit."""
 
     agent: Any  # leaves (S, ...)
     worlds: Worlds  # leaves (S, T, E, ...)
     total: Array  # (S, T, E) return of the episode so far
-    counted: Array  # (S, T, E) bool: the episode began at its beginning
-    data: Any  # what the learner learns from, leaves (S, ...)
+    counted: Array  # (S, T, E) bool: the episode began at age 0, so its return counts
+    data: Any  # the experience's, leaves (S, ...)
     iteration: Array  # () int32, steps taken by every environment
     key: Key  # (S,)
 
@@ -59,7 +59,7 @@ def init(
     """Return a fresh training state for ``seeds`` (S,) on training ``tasks`` (T, ...).
 
     Args:
-        knobs: values (S,) of an agent's numbers that vary between seeds, if it is a ``SweptAgent``.
+        knobs: values (S,), by name, of the agent's numbers that vary between seeds, for a ``SweptAgent`` agent.
     """
     agent.experience.check(env, settings.num_envs)
     num_tasks = len(tasks.id)
@@ -83,7 +83,7 @@ def init(
 
 
 def _first_ages(tasks: Task, shape: tuple[int, ...]) -> Array:
-    """Ages (S, T, E) spread evenly over the tasks' horizons, in ``PHASES`` at most."""
+    """Return first ages (S, T, E), spread evenly over the tasks' horizons, with at most ``PHASES`` values."""
     count = shape[2] * collectives.count()
     phases = min(count, PHASES)
     phase = jnp.arange(count, dtype=jnp.int32) * phases // count
@@ -92,7 +92,7 @@ def _first_ages(tasks: Task, shape: tuple[int, ...]) -> Array:
 
 
 def _blank(env: Env, agent: Agent, learners: Any, tasks: Task, worlds: Worlds, keys: Key) -> Transition:
-    """A transition of zeros, without leading axes."""
+    """Return a transition of zeros, without leading axes."""
     step = lambda learners, worlds, keys: step_envs(env, agent, learners, tasks, worlds, keys)[1].transition
     shapes = jax.eval_shape(step, learners, worlds, keys)
     return jax.tree.map(lambda x: jnp.zeros(x.shape[3:], x.dtype), shapes)
@@ -103,9 +103,9 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
     """Advance all seeds by ``settings.chunk_steps`` steps of every environment.
 
     Returns:
-        the new state, and metrics: "return" and "episodes" (S, T) of episodes that ended; the environment's (S, T), as
-        means over these episodes' last steps; the agent's own, as means (S, T) or (S,) over the chunk; "bad_step"
-        (S, T), the first step whose numbers were not finite, or -1.
+        the new state, and metrics: "return" and "episodes" (S, T), mean return and number of ended episodes; the
+        environment's (S, T), as means over these episodes' last steps; the agent's, as means (S, T) or (S,) over the
+        chunk; "bad_step" (S, T), the first step whose numbers were not finite, or -1.
     """
     experience = agent.experience
 
@@ -121,10 +121,10 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
 
 
 def _collect(env, agent, tasks, state: TrainState, keys: Key, reset_keys: Key) -> tuple[TrainState, Transition, Any]:
-    """Take the steps that the learner asks for.
+    """Take as many steps as the agent's experience asks for.
 
     Returns:
-        the new state; the steps, leaves (S, T, H, E, ...); and what was seen of them, leaves (H, S, ...).
+        the new state; the steps, leaves (S, T, H, E, ...); and their statistics, leaves (H, S, ...).
     """
     count = agent.experience.steps
     if count == 1:
@@ -137,11 +137,11 @@ def _collect(env, agent, tasks, state: TrainState, keys: Key, reset_keys: Key) -
 
 
 def _step(env, agent, tasks, state: TrainState, keys: Key, reset_keys: Key):
-    """Step every environment once, and begin new episodes where old ones ended."""
+    """Step every environment once, and begin new episodes where episodes ended."""
     explore = partial(agent.experience.explore, state.data)
     act_keys = world_keys(keys, state.total.shape)
-    worlds, moment = step_envs(env, agent, state.agent, tasks, state.worlds, act_keys, explore)
-    transition, total = moment.transition, state.total + moment.transition.reward
+    worlds, env_step = step_envs(env, agent, state.agent, tasks, state.worlds, act_keys, explore)
+    transition, total = env_step.transition, state.total + env_step.transition.reward
     ended = transition.ended
     learners = state.agent
     if agent.watches:
@@ -155,12 +155,12 @@ def _step(env, agent, tasks, state: TrainState, keys: Key, reset_keys: Key):
         counted=state.counted | ended,
         iteration=state.iteration + 1,
     )
-    return state, (transition, _look(moment, total, state.counted))
+    return state, (transition, _reduce_step(env_step, total, state.counted))
 
 
-def _look(moment: Moment, total: Array, counted: Array) -> dict[str, Any]:
-    """Reduce a step to what metrics need of it, leaves (S, T)."""
-    transition = moment.transition
+def _reduce_step(env_step: EnvStep, total: Array, counted: Array) -> dict[str, Any]:
+    """Reduce a step to the statistics for metrics, leaves (S, T)."""
+    transition = env_step.transition
     finished = transition.ended & counted
     over_envs = lambda x: jnp.sum(finished * x, axis=2)
     finite = lambda x: jnp.all(jnp.isfinite(x), axis=tuple(range(2, x.ndim)))
@@ -169,12 +169,12 @@ def _look(moment: Moment, total: Array, counted: Array) -> dict[str, Any]:
         "finished": jnp.sum(finished, axis=2),
         "total": over_envs(total),
         "finite": jnp.all(jnp.stack([finite(x) for x in (*numbers, transition.reward)]), axis=0),
-        "metrics": {name: over_envs(x) for name, x in moment.metrics.items()},
+        "metrics": {name: over_envs(x) for name, x in env_step.metrics.items()},
     }
 
 
 def _summarise(history: dict) -> Metrics:
-    """Reduce what was seen at each of H steps (iterations, steps, S, ...) to one line of metrics."""
+    """Reduce the statistics of all steps, leaves (iterations, steps, S, ...), to one line of metrics."""
     losses = dict(history["losses"])
     learning = losses.pop("learning")
     mean = lambda x: jnp.sum(x, axis=0) / jnp.maximum(jnp.sum(learning), 1)
@@ -183,7 +183,7 @@ def _summarise(history: dict) -> Metrics:
     bad = jnp.int32(~history["finite"])
     episodes, total, metrics, bad = collectives.total((finished, total, metrics, bad))
     bad = bad > 0
-    # One task's experience spoils the losses of all who share its networks; then it alone is to blame.
+    # A bad step of one task spoils the losses of all that share its networks; then only that task is reported.
     blameless = ~jnp.any(bad, axis=3, keepdims=True)
     for loss in losses.values():
         bad |= blameless & ~jnp.isfinite(loss).reshape(len(loss), 1, loss.shape[1], -1)

@@ -1,4 +1,4 @@
-"""Maps over seeds, worlds and learners."""
+"""Map functions over seeds, worlds and agents."""
 
 import math
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from mtjax.types import Array, Key, Step, Task
 
 
 def over_seeds(function: Callable, *axes: Any) -> Callable:
-    """Map a function over seeds. A single seed is not mapped: a CPU runs a batch of one at half the speed or less.
+    """Map a function over seeds; a single seed is not mapped, as a CPU runs a batch of one at half the speed or less.
 
     Args:
         axes: for each argument, 0 (leaves have a leading S), None, or a tree of these.
@@ -31,7 +31,7 @@ def over_seeds(function: Callable, *axes: Any) -> Callable:
 
 
 def over_worlds(function: Callable) -> Callable:
-    """Map a function of single worlds over arguments with leaves (S, T, E, ...), as one flat batch."""
+    """Map a function of one world over arguments with leaves (S, T, E, ...), as one flat batch."""
 
     def mapped(*arguments):
         shape = jax.tree.leaves(arguments)[0].shape[:3]
@@ -54,28 +54,28 @@ def over_learners(function: Callable) -> Callable:
 
 
 def where_worlds(mask: Array, new: Any, old: Any) -> Any:
-    """Choose trees with leaves (S, T, E, ...) by ``mask`` (S, T, E)."""
+    """Select leaves (S, T, E, ...) of ``new`` where ``mask`` (S, T, E), else of ``old``."""
     choose = lambda new, old: jnp.where(mask.reshape(mask.shape + (1,) * (new.ndim - 3)), new, old)
     return jax.tree.map(choose, new, old)
 
 
 class Flat:
-    """Methods of all worlds (S, T, E, ...) for an environment with ``reset`` and ``step`` of one."""
+    """Provides the methods of all worlds (S, T, E, ...) for environments with ``reset`` and ``step`` of one world."""
 
     def reset_worlds(self, tasks: Task, keys: Key) -> Step:
         """Begin an episode in every world."""
         return over_worlds(partial(_reset, self))(tasks, keys)
 
     def step_worlds(self, tasks: Task, states: Any, actions: Array) -> Step:
-        """Step every world by its action (S, T, E, A)."""
+        """Step every world with its action (S, T, E, A)."""
         return over_worlds(partial(_step, self))(tasks, states, actions)
 
     def where_worlds(self, mask: Array, new: Any, old: Any) -> Any:
-        """Choose states by ``mask`` (S, T, E)."""
+        """Select states of ``new`` where ``mask`` (S, T, E), else of ``old``."""
         return where_worlds(mask, new, old)
 
 
-@partial(jax.jit, static_argnums=0)  # physics takes seconds to trace: once for all programs, whatever their batches
+@partial(jax.jit, static_argnums=0)  # tracing physics takes seconds: do it once for all programs
 def _reset(env: Any, task: Task, key: Key) -> Step:
     return env.reset(task, key)
 

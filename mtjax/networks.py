@@ -1,6 +1,6 @@
-"""Networks as pure functions over parameters that know which of them all tasks share.
+"""Networks are pure functions of parameters, which are divided into shared ones and each task's own.
 
-A network is a body and a linear head, applied to the data of one task; the caller maps over tasks.
+A network is a body and a linear head. It is applied to the data of one task; the caller maps over tasks.
 """
 
 import dataclasses
@@ -16,38 +16,38 @@ from mtjax.types import Array, Key
 
 _LOG_STD_RANGE = (-5.0, 2.0)
 STD_RANGE = tuple(math.exp(bound) for bound in _LOG_STD_RANGE)
-"""Standard deviations that a tanh-squashed Gaussian may have before its tanh."""
+"""Range of a tanh-squashed Gaussian's standard deviation before the tanh."""
 
 
 class Params(NamedTuple):
-    """Parameters of a network, by who uses them."""
+    """Holds the parameters of a network, divided by which tasks use them."""
 
     shared: Any  # used by every task
-    own: Any  # leaves (T, ...): each task's own, such as its head or its embedding
+    own: Any  # leaves (T, ...): used by one task each, such as heads or embeddings
 
     def beside(self, others: "Params") -> "Params":
-        """Both, where no two parts have the same name."""
+        """Return the union of both; no two parts may have the same name."""
         return Params({**self.shared, **others.shared}, {**self.own, **others.own})
 
     def without(self, names: Collection[str]) -> "Params":
-        """All parts but those that have one of the names."""
+        """Return all parts but those with the given names."""
         keep = lambda parts: {name: part for name, part in parts.items() if name not in names}
         return Params(keep(self.shared), keep(self.own))
 
 
 OVER_TASKS = Params(shared=None, own=0)
-"""The axes of networks under a map over tasks."""
+"""Axes of ``Params`` for ``jax.vmap`` over tasks."""
 
 
 class ReLU(nn.Module):
-    """max(x, 0), as a module, so that diagnostics see the activity of a layer's units."""
+    """Computes max(x, 0) as a module, so that diagnostics can read the activity of a layer's units."""
 
     def __call__(self, x: Array) -> Array:
         return nn.relu(x)
 
 
 class MLP(nn.Module):
-    """Dense layers with ReLU, and layer normalisation before it if asked for."""
+    """Applies dense layers with ReLU, and optionally layer normalisation before it."""
 
     widths: tuple[int, ...]
     layer_norm: bool = False
@@ -61,7 +61,7 @@ class MLP(nn.Module):
 
 
 class Trunk(nn.Module):
-    """An MLP on everything there is: observation, task features and, in a critic, the action."""
+    """Applies an MLP to the observation, task features and, in a critic, the action."""
 
     widths: tuple[int, ...]
     layer_norm: bool = False
@@ -72,24 +72,24 @@ class Trunk(nn.Module):
 
 
 def join(*inputs: Array, task: Array) -> Array:
-    """Concatenate per-sample inputs (..., x) and what is known of the task: (..., Z), or (Z,) for every sample."""
+    """Concatenate inputs (..., x) of samples and task features: (..., Z), or (Z,) for all samples."""
     task = jnp.broadcast_to(task, (*inputs[0].shape[:-1], task.shape[-1]))
     return jnp.concatenate([*inputs, task], axis=-1)
 
 
 @dataclasses.dataclass(frozen=True)
 class Network:
-    """A body and a linear head, each shared by all tasks or every task's own."""
+    """Applies a body and a linear head; each is shared by all tasks, or every task has its own."""
 
     body: nn.Module
-    own: tuple[str, ...] = ()  # which of "trajectory", "body" and "head" every task has for itself
-    embedding_size: int = 0  # of a learned vector a task, in place of features; 0 for none
+    own: tuple[str, ...] = ()  # those of "trajectory", "body" and "head" that every task has for itself
+    embedding_size: int = 0  # of each task's learned vector, in place of features; 0 for none
     unit_embedding: bool = False  # scale those vectors to length 1
     front: nn.Module | None = None  # maps observations before the body; every task's own
-    trajectory: nn.Module | None = None  # makes features of what is seen, which is then a ``Seen``
+    trajectory: nn.Module | None = None  # maps observation and past, a ``Seen``, to features
 
     def init(self, key: Key, num_tasks: int, out: int, features: Array, *inputs: Array) -> Params:
-        """Initialise for ``num_tasks`` tasks, ``out`` outputs, and inputs of the given shapes."""
+        """Initialise parameters for ``num_tasks`` tasks, ``out`` outputs, and inputs of the given shapes."""
         body_key, head_key, embedding_key, front_key = jax.random.split(key, 4)
         params, parts = Params({}, {}), {}
         if self.embedding_size:
@@ -116,16 +116,16 @@ class Network:
 
     @staticmethod
     def for_each_task(init, key: Key, num_tasks: int, *arguments: Any):
-        """Initialise a part anew for every task, leaves (T, ...)."""
+        """Initialise a part separately for every task, leaves (T, ...)."""
         return jax.vmap(lambda k: init(k, *arguments))(jax.random.split(key, num_tasks))
 
     def apply(self, params: Params, features: Array, *inputs: Array) -> Array:
-        """Map one task's inputs (..., O), (..., A) to outputs (..., out); ``params.own`` holds that task's alone."""
+        """Map one task's inputs (..., O), (..., A) to outputs (..., out); ``params.own`` is that task's, without T."""
         head = {**params.shared, **params.own}["head"]
         return self.hidden(params, features, *inputs) @ head["kernel"] + head["bias"]
 
     def hidden(self, params: Params, features: Array, *inputs: Array) -> Array:
-        """The hidden layer (..., width) on which the head stands."""
+        """Return the hidden layer (..., width) below the head."""
         parts = {**params.shared, **params.own}
         if "embedding" in parts:
             features = parts["embedding"]
@@ -146,8 +146,8 @@ def tanh_normal(outputs: Array, key: Key | None, mask: Array | None = None) -> t
 
     Args:
         outputs: (..., 2A) means and unbounded log standard deviations.
-        key: noise; None takes the mean.
-        mask: (A,) 1 for actions that there are; the others are 0 and have no part in the log-probability.
+        key: for sampling; None takes the mean.
+        mask: (A,) 1 for actions that exist; the others are set to 0 and do not count in the log-probability.
 
     Returns:
         actions (..., A) in (-1, 1) and their log-probabilities (...,); 0 for the mean action.
@@ -160,7 +160,7 @@ def tanh_normal(outputs: Array, key: Key | None, mask: Array | None = None) -> t
 
 
 def sample_raw(outputs: Array, key: Key, mask: Array | None = None) -> tuple[Array, Array]:
-    """Sample as ``tanh_normal``, but return actions (..., A) from before the tanh, with the same log-probabilities."""
+    """Sample as ``tanh_normal`` does, but return actions (..., A) before the tanh, with the same log-probabilities."""
     mean, log_std = _moments(outputs)
     noise = jax.random.normal(key, mean.shape)
     raw = mean + jnp.exp(log_std) * noise
@@ -168,20 +168,20 @@ def sample_raw(outputs: Array, key: Key, mask: Array | None = None) -> tuple[Arr
 
 
 def log_density(outputs: Array, raw: Array, mask: Array | None = None) -> Array:
-    """Log-probability (...,) of the actions tanh(raw) under a tanh-squashed Gaussian with ``outputs`` (..., 2A).
+    """Return the log-probability (...,) of actions tanh(raw) under a tanh-squashed Gaussian of ``outputs`` (..., 2A).
 
-    It takes actions from before the tanh, which no rounding has brought to 1.
+    It takes actions before the tanh, as rounding may bring those after it to 1.
     """
     mean, log_std = _moments(outputs)
     return _log_density((raw - mean) * jnp.exp(-log_std), log_std, raw, mask)
 
 
 def divergence(outputs: Array, others: Array, mask: Array | None = None) -> Array:
-    """Kullback-Leibler divergence KL(p | q) (...,) of two tanh-squashed Gaussians, by their outputs (..., 2A).
+    """Compute the Kullback-Leibler divergence KL(p | q) (...,) of two tanh-squashed Gaussians of outputs (..., 2A).
 
-    It is that of the Gaussians before the tanh, as a map that both go through changes no divergence:
+    It equals that of the Gaussians before the tanh, as the same invertible map of both does not change it:
         sum_a (s^2 / s'^2 - 1) / 2 - log(s / s') + ((m - m') / s')^2 / 2
-    A mean of log p - log q over actions is that too, but noisy, and lost to rounding where p and q are near each other.
+    A mean of log p - log q over sampled actions estimates it too, but is noisy, and lost to rounding if p is near q.
     """
     (mean, log_std), (other_mean, other_log_std) = _moments(outputs), _moments(others)
     wider = 2 * (log_std - other_log_std)
@@ -190,14 +190,14 @@ def divergence(outputs: Array, others: Array, mask: Array | None = None) -> Arra
 
 
 def _moments(outputs: Array) -> tuple[Array, Array]:
-    """Means (..., A) and bounded log standard deviations (..., A)."""
+    """Split outputs into means (..., A) and bounded log standard deviations (..., A)."""
     mean, log_std = jnp.split(outputs, 2, axis=-1)
     low, high = _LOG_STD_RANGE
     return mean, low + 0.5 * (high - low) * (jnp.tanh(log_std) + 1)
 
 
 def outputs_for(std: float | Array) -> Array:
-    """The output () from which a tanh-squashed Gaussian has the standard deviation ``std`` before its tanh."""
+    """Return the output () for which a tanh-squashed Gaussian has the standard deviation ``std`` before its tanh."""
     low, high = _LOG_STD_RANGE
     return jnp.arctanh(2 * (jnp.log(std) - low) / (high - low) - 1)
 

@@ -1,4 +1,4 @@
-"""Running mean and variance of observations (Welford; parallel form by Chan et al. 1979)."""
+"""Normalise observations by their running mean and variance (Welford; parallel form by Chan et al. 1979)."""
 
 from typing import NamedTuple
 
@@ -8,11 +8,11 @@ from mtjax.types import Array
 
 _MIN_STD = 1e-3
 LARGEST = 10.0
-"""Size within which normalised observations are clipped: what a network never saw must not drive it out of range."""
+"""Clip normalised observations to this size, so that rare ones do not drive networks out of range."""
 
 
 class Moments(NamedTuple):
-    """What has been seen so far."""
+    """Holds the moments of all observations so far."""
 
     count: Array  # ()
     mean: Array  # (O,)
@@ -20,12 +20,12 @@ class Moments(NamedTuple):
 
 
 def init(size: int) -> Moments:
-    """Return moments of nothing; they normalise to the identity, but for the clip."""
+    """Return moments of no observations; ``apply`` then only clips."""
     return Moments(jnp.float32(0), jnp.zeros(size), jnp.zeros(size))
 
 
 def update(moments: Moments, batch: Array) -> Moments:
-    """Add a batch (..., O)."""
+    """Add a batch (..., O) to the moments."""
     batch = batch.reshape(-1, batch.shape[-1])
     count, mean = moments.count + len(batch), jnp.mean(batch, axis=0)
     shift = mean - moments.mean
@@ -39,6 +39,6 @@ def update(moments: Moments, batch: Array) -> Moments:
 
 
 def apply(moments: Moments, x: Array) -> Array:
-    """Scale x (..., O) to zero mean and unit variance, and clip it to ``LARGEST`` in size."""
+    """Scale x (..., O) to mean 0 and variance 1, and clip it to +-``LARGEST``."""
     variance = jnp.where(moments.count > 0, moments.deviation / jnp.maximum(moments.count, 1), 1.0)
     return jnp.clip((x - moments.mean) / jnp.maximum(jnp.sqrt(variance), _MIN_STD), -LARGEST, LARGEST)

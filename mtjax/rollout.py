@@ -1,4 +1,4 @@
-"""Playing: the one way in which agents act in worlds, for training, evaluation and films."""
+"""Rollouts of agents in environments, for training, evaluation and films."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -13,9 +13,9 @@ from mtjax.types import Acted, Agent, Array, Env, Key, Task, Transition
 
 
 class Worlds(NamedTuple):
-    """Where every world is; leaves (S, T, E, ...)."""
+    """Holds the state of every world; leaves (S, T, E, ...)."""
 
-    state: Any  # the environment's
+    state: Any  # of the environment
     task: Task | None  # the episodes' own tasks where episodes draw theirs
     obs: Any  # (S, T, E, O)
     memory: Any  # what the agent remembers of the episode
@@ -28,21 +28,21 @@ def split_keys(keys: Key, count: int) -> tuple[Key, ...]:
 
 
 def world_keys(keys: Key, shape: tuple[int, ...]) -> Key:
-    """Make one key for every world (S, T, E) of this device from one a seed (S,)."""
+    """Split each seed's key (S,) into keys (S, T, E) of this device's worlds."""
     everywhere = (shape[1], shape[2] * collectives.count())
     return collectives.own(jax.vmap(lambda key: jax.random.split(key, everywhere))(keys), axis=2)
 
 
-def spread(tasks: Task, shape: tuple[int, ...]) -> Task:
-    """Repeat tasks (T, ...) for all worlds of shape (S, T, E)."""
+def broadcast_tasks(tasks: Task, shape: tuple[int, ...]) -> Task:
+    """Broadcast tasks (T, ...) to all worlds of ``shape`` (S, T, E)."""
     single = tasks._replace(draws=None)
     return jax.tree.map(lambda x: jnp.broadcast_to(x[None, :, None], shape + x.shape[1:]), single)
 
 
 def reset_envs(env: Env, agent: Agent, learners: Any, tasks: Task, keys: Key) -> Worlds:
-    """Begin an episode in every world, with keys (S, T, E), of agents with states ``learners`` (S, ...)."""
+    """Begin an episode in every world, with keys (S, T, E), for agents with states ``learners`` (S, ...)."""
     if tasks.draws is None:
-        each = spread(tasks, keys.shape)
+        each = broadcast_tasks(tasks, keys.shape)
     else:
         task_keys, keys = jnp.moveaxis(jax.vmap(jax.vmap(jax.vmap(jax.random.split)))(keys), -1, 0)
         of_task = jax.vmap(episode_task, (None, 0))
@@ -55,13 +55,15 @@ def reset_envs(env: Env, agent: Agent, learners: Any, tasks: Task, keys: Key) ->
 
 def tasks_of_worlds(tasks: Task, worlds: Worlds) -> Task:
     """Return the task of every world (S, T, E, ...)."""
-    return spread(tasks, worlds.age.shape) if worlds.task is None else worlds.task._replace(blocks=tasks.blocks)
+    return (
+        broadcast_tasks(tasks, worlds.age.shape) if worlds.task is None else worlds.task._replace(blocks=tasks.blocks)
+    )
 
 
 def act(agent: Agent, learners: Any, tasks: Task, worlds: Worlds, keys: Key | None) -> Acted:
     """Let agents act in all worlds; without keys (S, T, E) they take their mean actions."""
     noise = () if keys is None else (keys,)
-    if worlds.task is None:  # all worlds of a task see the same of it
+    if worlds.task is None:  # all worlds of a task have the same parameters
         one = lambda learner, task, memory, obs, *key: agent.act(learner, memory, obs, task, *(key or (None,)))
         return over_learners(one)(learners, tasks, worlds.memory, worlds.obs, *noise)
     one = lambda learner, _, task, memory, obs, *key: agent.act(learner, memory, obs, task, *(key or (None,)))
@@ -69,11 +71,11 @@ def act(agent: Agent, learners: Any, tasks: Task, worlds: Worlds, keys: Key | No
     return over_learners(one)(learners, tasks.id, each, worlds.memory, worlds.obs, *noise)
 
 
-class Moment(NamedTuple):
-    """One step of every world; leaves (S, T, E, ...)."""
+class EnvStep(NamedTuple):
+    """Holds one step of every world; leaves (S, T, E, ...)."""
 
     transition: Transition
-    metrics: dict[str, Array]  # the environment's
+    metrics: dict[str, Array]  # of the environment
 
 
 def step_envs(
@@ -84,12 +86,12 @@ def step_envs(
     worlds: Worlds,
     keys: Key | None,
     explore: Callable[[Array], Array] = lambda action: action,
-) -> tuple[Worlds, Moment]:
-    """Act in every world and step it; episodes that end are left where they ended.
+) -> tuple[Worlds, EnvStep]:
+    """Act in every world and step it; episodes that end are not reset.
 
     Args:
-        keys: (S, T, E) noise of the actions; None takes the mean ones.
-        explore: makes the actions that are taken (S, T, E, A) from the agent's.
+        keys: (S, T, E) for sampling actions; None takes the mean ones.
+        explore: maps the agent's actions (S, T, E, A) to those that are taken.
     """
     each = tasks_of_worlds(tasks, worlds)
     acted = act(agent, learners, tasks, worlds, keys)
@@ -111,11 +113,11 @@ def step_envs(
     if jax.tree.leaves(memory):
         note = lambda learner, task, memory, transition: agent.remember(learner, memory, transition, task)
         memory = over_learners(note)(learners, tasks, memory, transition)
-    return Worlds(step.state, worlds.task, step.obs, memory, age), Moment(transition, step.metrics)
+    return Worlds(step.state, worlds.task, step.obs, memory, age), EnvStep(transition, step.metrics)
 
 
 def reset_ended(env: Env, agent: Agent, learners: Any, tasks: Task, worlds: Worlds, ended: Array, keys: Key) -> Worlds:
-    """Begin new episodes, with keys (S,), in the worlds that ``ended`` (S, T, E); a branch, as mostly none has."""
+    """Begin new episodes, with keys (S,), where ``ended`` (S, T, E); a branch skips this if no episode has ended."""
 
     def restart(worlds: Worlds) -> Worlds:
         fresh = reset_envs(env, agent, learners, tasks, world_keys(keys, ended.shape))

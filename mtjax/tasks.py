@@ -1,4 +1,4 @@
-"""Choosing tasks inside a program: pure functions on tables of tasks, as MTEnv's wrappers are on its environments.
+"""Functions on tables of tasks choose tasks inside a program, like MTEnv's wrappers of environments.
 
 ``mtjax.gym`` has the same as wrappers of Gymnasium environments.
 """
@@ -12,7 +12,7 @@ from mtjax.types import Env, InputError, Key, Task
 def n_tasks(env: Env, n: int, key: Key, split: str = "train") -> Task:
     """Draw a fixed bag of ``n`` tasks of a split, with leading axis ``n``.
 
-    They are different tasks of the table; where parameters are continuous, ``n`` fresh draws of them.
+    They are different rows of the table; where parameters are continuous, they are ``n`` fresh draws.
 
     Raises:
         InputError: the split has fewer than ``n`` tasks, or none.
@@ -28,21 +28,21 @@ def n_tasks(env: Env, n: int, key: Key, split: str = "train") -> Task:
 
 
 def with_ids(tasks: Task) -> Task:
-    """Number the tasks of a bag (n,) from 0, for agents that see the number; each keeps its physics."""
+    """Number the tasks of a bag (n,) from 0, for agents that see the number; their physics is unchanged."""
     return tasks._replace(id=jnp.arange(len(tasks.id), dtype=jnp.int32))
 
 
 def sample_random_task(tasks: Task, key: Key) -> Task:
-    """Draw one task from a table (T,), where parameters are continuous with fresh values; at each reset, say."""
+    """Draw one task from a table (T,); where parameters are continuous, with fresh values."""
     row_key, draw_key = jax.random.split(key)
     row = jax.random.randint(row_key, (), 0, len(tasks.id))
     return episode_task(jax.tree.map(lambda x: x[row], tasks), draw_key)
 
 
 def episode_task(task: Task, key: Key) -> Task:
-    """The task of one episode: ``task`` itself, or where its parameters are continuous a fresh draw.
+    """Return the task of one episode: ``task`` itself, or a fresh draw where its parameters are continuous.
 
-    A draw keeps the identity of the task it is drawn for, and has parameters and a context of its own.
+    A draw has the id of the task for which it is drawn, and its own parameters and context.
     """
     if task.draws is None:
         return task

@@ -1,4 +1,4 @@
-"""The data that flows between environments, agents and the loop, and the two protocols they meet in.
+"""Types of the data between environments, agents and the loop, and the protocols of these.
 
 Axes, used in every docstring: ``S`` seeds, ``T`` tasks, ``E`` environments per task, ``B`` batch per task,
 ``O`` observation, ``A`` action, ``C`` context, ``K`` experts, ``N`` critics, ``H`` steps.
@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 
-from mtjax.names import InputError as InputError  # everyone's, found here by most
+from mtjax.names import InputError as InputError  # re-exported for convenience
 
 Array = jax.Array
 Key = jax.Array
@@ -19,73 +19,73 @@ SPLITS = ("train", "interpolation", "extrapolation")
 
 
 class Task(NamedTuple):
-    """One task as data; a table of tasks has a leading ``T`` on every leaf."""
+    """Holds one task as data; a table of tasks has a leading ``T`` on every leaf."""
 
-    id: Array  # () int32, its number among the family's tasks: who it is to an agent
-    row: Array  # () int32, row of the family's table: what it is to the physics
-    context: Array  # (C,) parameters scaled so that the training range is [-1, 1]
-    params: dict[str, Array]  # raw values in SI units, for logs and rewards
-    model: dict[str, Array]  # the model leaves that differ between tasks, nothing else
+    id: Array  # () int32, number of the task for agents
+    row: Array  # () int32, row of the family's table, which selects its physics
+    context: Array  # (C,) parameters, scaled so that the training range is [-1, 1]
+    params: dict[str, Array]  # parameters in SI units, for logs and rewards
+    model: dict[str, Array]  # only those leaves of the physics model that differ between tasks
     goal: dict[str, Array]  # reward and reset parameters
-    horizon: Array  # () int32, steps after which an episode is cut off
-    draws: Any = None  # a Task with leaves (P, ...) of which each episode takes one; None: every episode is this task
-    action_mask: Array | None = None  # (A,) 1 for actions that the task has, 0 for padding; None: it has all
-    blocks: Any = None  # of a mixture: which tasks belong to which family; static, without leaves
+    horizon: Array  # () int32, time limit of an episode in steps
+    draws: Any = None  # a Task with leaves (P, ...); each episode draws one of them; None: every episode is this task
+    action_mask: Array | None = None  # (A,) 1 for actions that the task has, else 0; None: it has all
+    blocks: Any = None  # in a mixture, which tasks belong to which family; static, without leaves
 
 
 class Step(NamedTuple):
-    """What an environment returns, before any automatic reset."""
+    """Holds what an environment returns, before any automatic reset."""
 
     state: Any
     obs: Any  # (O,), or a tree of arrays as in ``Spec.obs``
     reward: Array  # ()
-    terminated: Array  # () bool: the episode is over for good; a time limit is not this
+    terminated: Array  # () bool: the episode reached a terminal state; not by its time limit
     metrics: dict[str, Array] = {}  # () each, such as success  # noqa: RUF012
 
 
 class Transition(NamedTuple):
-    """One environment step as the learner sees it; time limits leave ``discount`` at 1."""
+    """Holds one environment step for learning; a time limit leaves ``discount`` at 1."""
 
     obs: Any  # (O,)
     action: Array  # (A,)
     reward: Array  # ()
     discount: Array  # () = 1 - terminated
     next_obs: Any  # (O,) from before any reset
-    ended: Any = None  # () bool: the episode is over, by whatever cause
-    context: Array | None = None  # (C,) of the episode's own task where episodes draw theirs
-    extras: Any = None  # what the agent noted when it acted
+    ended: Any = None  # () bool: the episode ended, terminated or by its time limit
+    context: Array | None = None  # (C,) of the episode's task, if episodes draw their tasks
+    extras: Any = None  # data that the agent stores when it acts
 
 
 class Acted(NamedTuple):
-    """What an agent does in one world."""
+    """Holds an agent's action in one world."""
 
     action: Array  # (A,) in [-1, 1]
-    extras: Any  # what its learning needs of the moment, stored with the transition; None for nothing
-    memory: Any  # what it remembers of the episode from here on
+    extras: Any  # data that learning needs, stored with the transition; None for none
+    memory: Any  # the agent's memory of the episode after the action
 
 
 class Outcome(NamedTuple):
-    """What one step of every environment brought; leaves (T, E)."""
+    """Holds the outcomes of one step of every environment; leaves (T, E)."""
 
     reward: Array
     total: Array  # sum of the episode's rewards so far
-    ended: Array  # bool: the episode is over, by whatever cause
-    terminated: Array  # bool: it is over for good, and not by its time limit
+    ended: Array  # bool: the episode ended, terminated or by its time limit
+    terminated: Array  # bool: the episode reached a terminal state
     age: Array  # int32, steps of the episode so far
-    memory: Any = None  # what the agent remembers of the episode, this step included
+    memory: Any = None  # the agent's memory of the episode, with this step
 
 
 class Spec(NamedTuple):
-    """The shapes an agent must know before it can build its networks."""
+    """Holds the shapes from which an agent builds its networks."""
 
-    obs: Any  # a tree of jax.ShapeDtypeStruct; of most families one vector (O,)
+    obs: Any  # a tree of jax.ShapeDtypeStruct; for most families one vector (O,)
     action_size: int
     context_size: int
-    mixed: bool = False  # observations of one task mean other things than those of another
+    mixed: bool = False  # whether entries of observations differ in meaning between tasks
 
     @staticmethod
     def vector(obs_size: int, action_size: int, context_size: int) -> "Spec":
-        """The spec of a family that observes vectors (O,)."""
+        """Return the spec of a family whose observations are vectors (O,)."""
         return Spec(jax.ShapeDtypeStruct((obs_size,), jnp.float32), action_size, context_size)
 
     @property
@@ -93,7 +93,7 @@ class Spec(NamedTuple):
         """The size O of observations.
 
         Raises:
-            InputError: they are no vectors.
+            InputError: observations are not vectors.
         """
         if not isinstance(self.obs, jax.ShapeDtypeStruct) or len(self.obs.shape) != 1:
             raise InputError(f"observations must be vectors here, not {self.obs}")
@@ -101,10 +101,10 @@ class Spec(NamedTuple):
 
 
 class Env(Protocol):
-    """A family of tasks. Frozen and hashable, so that it is static under ``jit``.
+    """An environment is a family of tasks. It is frozen and hashable, so that it is static under ``jit``.
 
-    ``reset`` and ``step`` are of one world and are what a family writes. The methods that end in ``worlds`` are of all
-    worlds at once, leaves (S, T, E, ...); ``mtjax.maps.Flat`` makes them by mapping the former over one flat batch.
+    A family implements ``reset`` and ``step`` for one world. The methods that end in ``worlds`` are for all worlds at
+    once, leaves (S, T, E, ...); ``mtjax.maps.Flat`` derives them by mapping the former over one flat batch.
     """
 
     @property
@@ -121,30 +121,30 @@ class Env(Protocol):
 
 
 class Experience(Protocol):
-    """What a learner learns from. A frozen dataclass whose fields are flags of the agent that has it.
+    """An experience collects what an agent learns from. It is a frozen dataclass whose fields are flags of the agent.
 
-    Its data lies in the training state, leaves (S, ...).
+    Its data is in the training state, leaves (S, ...).
     """
 
     @property
     def steps(self) -> int: ...  # of every environment between two calls of ``Agent.learn``
     @property
-    def sharding(self) -> Any: ...  # the data's, as a tree of PartitionSpec
+    def sharding(self) -> Any: ...  # of the data, as a tree of PartitionSpec
     def check(self, env: Env, num_envs: int) -> None: ...  # raises InputError
     def describe(self, num_envs: int) -> str: ...
     def init(self, item: Transition, num_tasks: int, num_envs: int, keys: Key) -> Any: ...  # keys (S,)
     def explore(self, data: Any, action: Array) -> Array: ...  # (S, T, E, A): the actions to take
     def add(self, data: Any, steps: Transition) -> Any: ...  # leaves (S, T, H, E, ...)
-    def keep(self, data: Any) -> Any: ...  # what of it the next iteration needs
+    def keep(self, data: Any) -> Any: ...  # what the next iteration needs
 
 
 class Agent(Protocol):
-    """A learner. A frozen dataclass whose fields are its hyper-parameters and its command-line flags."""
+    """An agent acts and learns. It is a frozen dataclass; its fields are hyper-parameters and command-line flags."""
 
     @property
     def experience(self) -> Experience: ...
     @property
-    def watches(self) -> bool: ...  # whether ``observe`` wants to be called
+    def watches(self) -> bool: ...  # whether ``observe`` has to be called
     def init(self, spec: Spec, tasks: Task, key: Key) -> Any: ...
     def begin(self, state: Any, task: Task) -> Any: ...  # the memory with which an episode begins; () for none
     def act(self, state: Any, memory: Any, obs: Any, task: Task, key: Key | None) -> Acted: ...

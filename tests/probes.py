@@ -178,7 +178,7 @@ def quick(function, *arguments):
 def _agent_programs(agent, spec: Spec, num_tasks: int, batch_size: int):
     tasks, key = tasks_of("one-step", np.ones(num_tasks)), jax.random.key(0)
     init = lambda tasks, key: agent.init(spec, tasks, key)
-    batch = random_batch(0, num_tasks, batch_size, spec, agent.history)
+    batch = random_batch(0, num_tasks, batch_size, spec, agent.history_length)
     return quick(init, tasks, key), quick(agent.update, jax.eval_shape(init, tasks, key), batch, tasks, key)
 
 

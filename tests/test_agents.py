@@ -41,7 +41,12 @@ def valid(name, **settings):
         return False
 
 
-VALID = [(name, told) for name in OFF_POLICY for told in CONDITIONINGS if valid(name, conditioning=told)]
+VALID = [
+    (name, conditioning)
+    for name in OFF_POLICY
+    for conditioning in CONDITIONINGS
+    if valid(name, conditioning=conditioning)
+]
 SURGERY = [("embedding" if name == "sac" else "parameters", name) for name in OFF_POLICY]
 
 
@@ -55,8 +60,8 @@ def some(cases, every):
 # Each tells tasks apart in its own way, and pcgrad must compose with every network that tasks share. Five has no
 # divisor in common with the number of ways, so that every agent and every way is in the default.
 TRACED = [
-    *some([(name, {"conditioning": told}) for name, told in VALID], 5),
-    *some([(name, {"conditioning": told, "gradients": "pcgrad"}) for told, name in SURGERY], 5),
+    *some([(name, {"conditioning": conditioning}) for name, conditioning in VALID], 5),
+    *some([(name, {"conditioning": conditioning, "gradients": "pcgrad"}) for conditioning, name in SURGERY], 5),
     *some([("sac-conditioned", {"gradients": rule}) for rule in RULES], 1),
     *some([("sac-conditioned", {"gradients": rule, "gradient_scope": "per-layer"}) for rule in RULES], 3),
     *some([("sac-conditioned", {"encoder": name}) for name in ENCODERS], 1),
@@ -66,7 +71,7 @@ TRACED = [
 ]
 # Those that are also run, as compiling takes seconds: every agent, and every way to tell the task.
 RUN = [(name, {}) for name in OFF_POLICY]
-RUN += [("sac", {"conditioning": told}) for told in ("one-hot", "embedding", "vectors")]
+RUN += [("sac", {"conditioning": conditioning}) for conditioning in ("one-hot", "embedding", "vectors")]
 RUN += [
     ("multi-head", {"gradients": "pcgrad", "conditioning": "embedding"}),
     ("care", {"variant": "mtrl"}),
@@ -84,8 +89,8 @@ def vectors(tmp_path_factory):
 
 
 def make(name, settings, vectors):
-    told = {"vectors": vectors} if settings.get("conditioning") == "vectors" else {}
-    return tiny(name, **settings, **told)
+    extra = {"vectors": vectors} if settings.get("conditioning") == "vectors" else {}
+    return tiny(name, **settings, **extra)
 
 
 def observations(spec=SPEC):
@@ -114,7 +119,7 @@ def test_every_combination_has_the_right_shapes(name, settings, vectors):
     """Traced, not run: an update keeps the state's shapes and types, and acting gives an action for each world."""
     agent = make(name, settings, vectors)
     state = jax.eval_shape(lambda: agent.init(SPEC, TASKS, KEY))
-    batch = random_batch(0, 3, BATCH, SPEC, agent.history)
+    batch = random_batch(0, 3, BATCH, SPEC, agent.history_length)
     after, metrics = jax.eval_shape(lambda state: agent.update(state, batch, TASKS, KEY), state)
     assert shapes(after) == shapes(state)
     conflicts = CONFLICTS if agent.gradients.needs == "gradients" else set()
@@ -181,13 +186,13 @@ def test_a_world_among_many_is_that_world_alone(name):
     np.testing.assert_allclose(together, apart, atol=1e-5 if jax.default_backend() == "cpu" else 0.02)
 
 
-@pytest.mark.parametrize("told", CONDITIONINGS)
-def test_what_the_networks_see_of_a_task(told, vectors):
+@pytest.mark.parametrize("conditioning", CONDITIONINGS)
+def test_what_the_networks_see_of_a_task(conditioning, vectors):
     """Features (Z,) of the second task."""
-    agent = make("sac", {"conditioning": told}, vectors)
+    agent = make("sac", {"conditioning": conditioning}, vectors)
     state = jax.eval_shape(lambda: agent.init(SPEC, TASKS, KEY))._replace(contexts=TASKS.context, vectors=None)
-    state = state._replace(vectors=load_vectors(vectors, 3) if told == "vectors" else None)
-    expected = {"one-hot": [0, 1, 0], "parameters": [-0.5], "vectors": np.load(vectors)[1]}.get(told, [])
+    state = state._replace(vectors=load_vectors(vectors, 3) if conditioning == "vectors" else None)
+    expected = {"one-hot": [0, 1, 0], "parameters": [-0.5], "vectors": np.load(vectors)[1]}.get(conditioning, [])
     np.testing.assert_allclose(agent.features(state, pick(TASKS, 1)), np.float32(expected))
 
 

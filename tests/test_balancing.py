@@ -187,7 +187,7 @@ class Likelihood(SAC):
     def least_loss(self):
         return -self.below
 
-    def target(self, actor, critic, slow, batch, key):
+    def critic_target(self, actor, critic, target_critic, batch, key):
         return jnp.float32(0)
 
     def critic_loss(self, critic, data):
@@ -207,7 +207,7 @@ def test_losses_are_counted_from_the_least_that_they_can_be(rule):
         memory, gradients = surgery.init(rule, Params(jnp.float32(1), {}), 3), []
         for place, after in ((1.0, 0.5), (0.5, 0.4), (0.4, 0.1), (0.1, 0.1)):
             seen = surgery.gradient(rule, loss, Params(jnp.float32(place), {}), data, memory, KEY)
-            memory = surgery.look_again(rule, loss, Params(jnp.float32(after), {}), data, seen)
+            memory = surgery.adapt_rule(rule, loss, Params(jnp.float32(after), {}), data, seen)
             gradients.append(seen.gradients.shared)
             np.testing.assert_allclose(seen.aux["critic_loss"], 1 + np.square(place * scales) - below, rtol=1e-5)
         return gradients

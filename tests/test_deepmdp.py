@@ -25,7 +25,7 @@ from probes import values as values_of
 
 from mtjax import agents
 from mtjax.agents.parts.gradients.balancing import FAMO
-from mtjax.agents.parts.representations.deepmdp import SIGHT, Ahead
+from mtjax.agents.parts.representations.deepmdp import ENCODERS, ModelTargets
 from mtjax.agents.parts.trajectory import Past, Seen, append
 from mtjax.agents.ppo import Taken
 from mtjax.agents.sac import Batch
@@ -47,7 +47,7 @@ def make(name, **settings):
 def start(agent):
     """A fresh state, a batch and the compiled update."""
     init, update = learner(agent, TASKS, BATCH, SPEC)
-    return init(TASKS, KEY), random_batch(0, 3, BATCH, SPEC, agent.history), update
+    return init(TASKS, KEY), random_batch(0, 3, BATCH, SPEC, agent.history_length), update
 
 
 def random_params(agent, task=0):
@@ -60,24 +60,26 @@ def random_params(agent, task=0):
 
 def one_task(agent):
     """A batch of one task, as the losses see it, and what they fit, which is random: of the models, and of critics."""
-    batch, random = pick(random_batch(1, 3, BATCH, SPEC, agent.history), 1), np.random.default_rng(6)
-    next_past = append(batch.extras, batch.obs, batch.action, batch.reward) if agent.history else None
+    batch, random = pick(random_batch(1, 3, BATCH, SPEC, agent.history_length), 1), np.random.default_rng(6)
+    next_past = append(batch.extras, batch.obs, batch.action, batch.reward) if agent.history_length else None
     see = lambda obs, past: agent.see(None, obs, past)
     normal = lambda *shape: jnp.float32(random.normal(size=shape))
     width = {"parameters": 1, "one-hot": 3}.get(agent.conditioning, 0)
     drawn = agent.representation.transition == "probabilistic"
     value = normal(BATCH)
-    ahead = Ahead(normal(BATCH, 6), normal(BATCH, 6) if drawn else jnp.float32(0), normal(agent.embedding_size))
+    model_targets = ModelTargets(
+        normal(BATCH, 6), normal(BATCH, 6) if drawn else jnp.float32(0), normal(agent.embedding_size)
+    )
     seen = Batch(
         obs=see(batch.obs, batch.extras),
         action=batch.action,
         reward=batch.reward,
         discount=agent.gamma * batch.discount,
         next_obs=see(batch.next_obs, next_past),
-        told=normal(width),
+        features=normal(width),
         temperature=jnp.float32(0.1),
         mask=None,
-        ahead=ahead,
+        model_targets=model_targets,
     )
     return seen, value
 
@@ -107,10 +109,10 @@ def plain_model(params, *inputs):
     return dense(params["Dense_0"], np.maximum(norm(inner["LayerNorm_0"], dense(inner["Dense_0"], x)), 0))
 
 
-def plain_transition(agent, critic, told, batch):
+def plain_transition(agent, critic, features, batch):
     """Mean and deviation of the next latent state."""
     latent = plain_latent(critic.shared["latent"], np.asarray(batch.obs))
-    outputs = plain_model(critic.shared["transition"], latent, np.asarray(batch.action), told)
+    outputs = plain_model(critic.shared["transition"], latent, np.asarray(batch.action), features)
     if agent.representation.transition == "deterministic":
         return outputs, np.ones_like(outputs)
     mean, raw = np.split(outputs, 2, axis=-1)
@@ -120,15 +122,15 @@ def plain_transition(agent, critic, told, batch):
 @pytest.mark.parametrize("transition", ["deterministic", "probabilistic"])
 @pytest.mark.parametrize("name", ["deepmdp", "hip-bmdp"])
 def test_model_losses(name, transition):
-    """The likelihood of the slow encoder's next state, and the reward told from the state that is drawn."""
+    """The likelihood of the target encoder's next state, and the reward predicted from the state that is drawn."""
     agent = make(name, transition=transition)
     _, critic = random_params(agent)
     batch, value = one_task(agent)
-    ahead = batch.ahead
-    told = np.asarray(critic.own["embedding"] if name == "hip-bmdp" else batch.told)
-    mean, deviation = plain_transition(agent, critic, told, batch)
-    likelihood = 0.5 * ((mean - ahead.latent) / deviation) ** 2 + np.log(deviation)
-    reward = plain_model(critic.shared["reward"], mean + deviation * np.asarray(ahead.noise), told)[:, 0]
+    model_targets = batch.model_targets
+    features = np.asarray(critic.own["embedding"] if name == "hip-bmdp" else batch.features)
+    mean, deviation = plain_transition(agent, critic, features, batch)
+    likelihood = 0.5 * ((mean - model_targets.latent) / deviation) ** 2 + np.log(deviation)
+    reward = plain_model(critic.shared["reward"], mean + deviation * np.asarray(model_targets.noise), features)[:, 0]
     _, metrics = jit(agent.critic_loss)(critic, (batch, value))
     np.testing.assert_allclose(metrics["transition_loss"], likelihood.mean(), rtol=1e-4)
     np.testing.assert_allclose(metrics["reward_loss"], np.mean((reward - batch.reward) ** 2), rtol=1e-4)
@@ -137,16 +139,16 @@ def test_model_losses(name, transition):
 @pytest.mark.parametrize("transition", ["deterministic", "probabilistic"])
 @pytest.mark.parametrize("name", ["deepmdp", "hip-bmdp"])
 def test_no_loss_is_less_than_the_least(name, transition, monkeypatch):
-    """Where the next state is foretold exactly, and as surely as can be, what is left is the other losses'."""
+    """Where the next state is predicted exactly, and as surely as can be, what is left is the other losses'."""
     without_theta = {"theta_coefficient": 0.0} if name == "hip-bmdp" else {}
     agent = make(name, transition=transition, model_coefficient=0.5, **without_theta)
     deviation = 0.01 if transition == "probabilistic" else 1.0
-    exact = lambda self, critic, told, latent, a: (jnp.full_like(latent, 0.3), jnp.full_like(latent, deviation))
-    monkeypatch.setattr(type(agent.representation), "foretell", exact)
+    exact = lambda self, critic, features, latent, a: (jnp.full_like(latent, 0.3), jnp.full_like(latent, deviation))
+    monkeypatch.setattr(type(agent.representation), "predict", exact)
     _, critic = random_params(agent)
     batch, value = one_task(agent)
-    ahead = batch.ahead._replace(latent=jnp.full_like(batch.ahead.latent, 0.3))
-    loss, found = agent.critic_loss(critic, (batch._replace(ahead=ahead), value))
+    model_targets = batch.model_targets._replace(latent=jnp.full_like(batch.model_targets.latent, 0.3))
+    loss, found = agent.critic_loss(critic, (batch._replace(model_targets=model_targets), value))
     np.testing.assert_allclose(loss - agent.least_loss, found["critic_loss"] + 0.5 * found["reward_loss"], rtol=1e-4)
 
 
@@ -167,7 +169,7 @@ def test_rules_see_losses_from_the_least(name, transition, monkeypatch):
     monkeypatch.setattr(FAMO, "adapt", adapt)
     settings = {"representation": "deepmdp", "transition": transition, "model_coefficient": 0.5, "gradients": "famo"}
     agent = make_ppo(**settings) if name == "ppo" else make(name, **settings)
-    batch = rollouts(agent) if name == "ppo" else random_batch(0, 3, BATCH, SPEC, agent.history)
+    batch = rollouts(agent) if name == "ppo" else random_batch(0, 3, BATCH, SPEC, agent.history_length)
     state, found = jit(agent.update)(agent.init(SPEC, TASKS, KEY), batch, TASKS, KEY)
     surest = np.log(0.01) if transition == "probabilistic" else 0.0
     expected = found["critic_loss"] + 0.5 * (found["transition_loss"] + found["reward_loss"]) - 0.5 * surest
@@ -190,23 +192,25 @@ def test_theta_loss(transition):
     agent = make("hip-bmdp", transition=transition)
     _, critic = random_params(agent)
     batch, _ = one_task(agent)
-    theta, rival = np.asarray(critic.own["embedding"]), np.asarray(batch.ahead.rival)
-    ours, theirs = (np.stack(plain_transition(agent, critic, x, batch)) for x in (theta, rival))
+    theta, other_theta = np.asarray(critic.own["embedding"]), np.asarray(batch.model_targets.other_theta)
+    ours, theirs = (np.stack(plain_transition(agent, critic, x, batch)) for x in (theta, other_theta))
     moved = np.sqrt(((ours - theirs) ** 2).sum(axis=(0, 2)))
-    loss = jit(agent.sight.theta_loss)(critic, batch.told, batch.obs, batch.action, rival)
-    np.testing.assert_allclose(loss, (np.linalg.norm(theta - rival) - moved) ** 2, rtol=1e-4)
+    loss = jit(agent.placed_representation.theta_loss)(critic, batch.features, batch.obs, batch.action, other_theta)
+    np.testing.assert_allclose(loss, (np.linalg.norm(theta - other_theta) - moved) ** 2, rtol=1e-4)
 
 
 def test_theta_loss_of_three_tasks_by_hand(monkeypatch):
     """Thetas 3, 4 and 5 apart, and a state s that moves predictions by s theta: (d - |s| d)^2 for each sample."""
-    sight = make("hip-bmdp", embedding_size=2).sight
-    monkeypatch.setattr(type(sight), "foretell", lambda self, p, told, latent, a: (latent * told, 0 * latent * told))
-    monkeypatch.setattr(type(sight), "perceive", lambda self, p, features, obs: (p.own["embedding"], obs))
+    representation = make("hip-bmdp", embedding_size=2).placed_representation
+    monkeypatch.setattr(
+        type(representation), "predict", lambda self, p, features, latent, a: (latent * features, 0 * latent * features)
+    )
+    monkeypatch.setattr(type(representation), "perceive", lambda self, p, features, obs: (p.own["embedding"], obs))
     thetas = np.array([[0, 0], [3, 0], [3, 4]], np.float32)
     obs = jnp.float32([[0.0], [1.0], [-3.0]])
     for i, j, apart in ((0, 1, 3), (1, 2, 4), (2, 0, 5), (0, 0, 0)):
         critic = Params({}, {"embedding": jnp.asarray(thetas[i])})
-        loss = sight.theta_loss(critic, jnp.zeros(0), obs, jnp.zeros((3, 1)), jnp.asarray(thetas[j]))
+        loss = representation.theta_loss(critic, jnp.zeros(0), obs, jnp.zeros((3, 1)), jnp.asarray(thetas[j]))
         np.testing.assert_allclose(loss, np.square([apart, 0.0, 2 * apart]), rtol=1e-5, atol=1e-5)
 
 
@@ -216,7 +220,7 @@ def test_a_rival_is_always_another_task():
     agent = make("hip-bmdp")
     state, batch, _ = start(agent)
     _, seen = agent.prepare(state, batch, TASKS)
-    rivals = jit(lambda key: agent.critic_problem(state, seen, key)[1][0].ahead.rival)
+    rivals = jit(lambda key: agent.critic_problem(state, seen, key)[1][0].model_targets.other_theta)
     thetas, turns = np.asarray(state.critic.own["embedding"]), set()
     for seed in range(12):
         found = np.asarray(rivals(jax.random.key(seed)))
@@ -266,11 +270,11 @@ def test_what_is_detached_stays():
     agent = make("hip-bmdp", transition="probabilistic", **INFERRED)
     actor, critic = random_params(agent)
     batch, value = one_task(agent)
-    ahead = batch.ahead
-    model = lambda x: agent.critic_loss(critic, (batch._replace(ahead=ahead._replace(**x)), value))[0]
-    slopes = jit(jax.grad(model))({"latent": ahead.latent, "rival": ahead.rival})
+    model_targets = batch.model_targets
+    model = lambda x: agent.critic_loss(critic, (batch._replace(model_targets=model_targets._replace(**x)), value))[0]
+    slopes = jit(jax.grad(model))({"latent": model_targets.latent, "other_theta": model_targets.other_theta})
     assert not any(np.any(x) for x in jax.tree.leaves(slopes))
-    acted = lambda actor, critic: jnp.sum(agent.policy(actor, critic, batch.told, batch.obs) ** 2)
+    acted = lambda actor, critic: jnp.sum(agent.policy(actor, critic, batch.features, batch.obs) ** 2)
     of_actor, of_critic = jit(jax.grad(acted, argnums=(0, 1)))(actor, critic)
     assert reached(of_actor) == {"body", "head"} and reached(of_critic) == set()
 
@@ -300,7 +304,7 @@ def test_everything_that_should_learn_does(name, settings):
     before, _, update = start(agent)
     after = before
     for i in range(10):
-        after, metrics = update(after, random_batch(i, 3, BATCH, SPEC, agent.history), TASKS, jax.random.key(i))
+        after, metrics = update(after, random_batch(i, 3, BATCH, SPEC, agent.history_length), TASKS, jax.random.key(i))
     assert jax.tree.map(jnp.shape, after) == jax.tree.map(jnp.shape, before)
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves((after, metrics)))
     for network in ("actor", "critic", "target"):
@@ -315,12 +319,12 @@ def test_the_slow_encoder_follows_at_its_own_rate():
     """And so does theta; body and head take ``tau``. Models have no slow copy."""
     agent = make("hip-bmdp")
     state, batch, update = start(agent)
-    slow = state._replace(target=jax.tree.map(lambda x: x * 1.5 + 0.05, state.target))
-    after, _ = update(slow, batch, TASKS, KEY)
+    moved = state._replace(target=jax.tree.map(lambda x: x * 1.5 + 0.05, state.target))
+    after, _ = update(moved, batch, TASKS, KEY)
     assert set(after.target.shared) == {"body", "head", "latent"} and set(after.target.own) == {"embedding"}
-    for old, new, target in zip(slow.target, after.critic, after.target, strict=True):
+    for old, new, target in zip(moved.target, after.critic, after.target, strict=True):
         for part, found in target.items():
-            rate = 0.05 if part in SIGHT else 0.005
+            rate = 0.05 if part in ENCODERS else 0.005
             mixed = jax.tree.map(lambda a, b, rate=rate: (1 - rate) * a + rate * b, old[part], new[part])
             jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), found, mixed)
 
@@ -330,18 +334,22 @@ def test_the_target_is_the_slow_encoders():
     agent = make("deepmdp")
     _, critic = random_params(agent)
     batch, _ = one_task(agent)
-    slow = jax.tree.map(lambda x: x * 1.5 + 0.05, critic).without(agent.representation.models)
-    assert set(slow.shared) == {"body", "head", "latent"}
+    target_critic = jax.tree.map(lambda x: x * 1.5 + 0.05, critic).without(agent.representation.models)
+    assert set(target_critic.shared) == {"body", "head", "latent"}
     every = lambda tree: jax.tree.map(lambda x: x[None], tree)  # one task is all
     of_all = lambda params: params._replace(own=every(params.own))
-    ahead, _ = jit(agent.sight.targets)(of_all(critic), of_all(slow), every(batch.next_obs), KEY)
-    expected = plain_latent(slow.shared["latent"], np.asarray(batch.next_obs))
-    np.testing.assert_allclose(ahead.latent[0], expected, rtol=1e-4, atol=1e-5)
-    told, latent = agent.sight.perceive(slow, batch.told, batch.obs)
-    plain = jax.vmap(agent.critic.apply, (0, None, None, None))(
-        slow.without(agent.representation.names), told, latent, batch.action
+    model_targets, _ = jit(agent.placed_representation.targets)(
+        of_all(critic), of_all(target_critic), every(batch.next_obs), KEY
     )
-    np.testing.assert_allclose(agent.values(slow, batch.told, batch.obs, batch.action), plain[..., 0], rtol=1e-5)
+    expected = plain_latent(target_critic.shared["latent"], np.asarray(batch.next_obs))
+    np.testing.assert_allclose(model_targets.latent[0], expected, rtol=1e-4, atol=1e-5)
+    features, latent = agent.placed_representation.perceive(target_critic, batch.features, batch.obs)
+    plain = jax.vmap(agent.critic.apply, (0, None, None, None))(
+        target_critic.without(agent.representation.names), features, latent, batch.action
+    )
+    np.testing.assert_allclose(
+        agent.values(target_critic, batch.features, batch.obs, batch.action), plain[..., 0], rtol=1e-5
+    )
 
 
 # Tasks that were not trained on.
@@ -378,7 +386,7 @@ def test_theta_of_an_unseen_task_is_inferred_from_its_last_steps():
     state, batch, _ = start(agent)
     act = jit(lambda state, past, task: act_once(agent, state, batch.obs[0, 0], task, None, past))
     past = pick(batch.extras, (0, 0))
-    guess = agent.sight.apply(state.critic, "guess", agent.see(state.moments, batch.obs[0, 0], past))
+    guess = agent.placed_representation.apply(state.critic, "guess", agent.see(state.moments, batch.obs[0, 0], past))
     thetas = state.critic.own["embedding"]
     given = state._replace(critic=state.critic._replace(own={"embedding": thetas.at[0].set(guess)}))
     np.testing.assert_allclose(act(state, past, STRANGER), act(given, past, pick(TASKS, 0)), atol=1e-6)
@@ -401,7 +409,7 @@ def test_the_guess_finds_the_theta_of_the_task_that_steps_were_taken_in():
     reward = jnp.float32([1.0, -0.5])[:, None]  # of a step taken from 1, which comes second
     ones = jnp.ones((2, 2))
     past = Past(jnp.float32([[[0.0], [1.0]]] * 2), jnp.zeros((2, 2, 1)), jnp.concatenate([0 * reward, reward], 1), ones)
-    guess = agent.sight.apply(state.critic, "guess", Seen(jnp.ones((2, 1)), past))
+    guess = agent.placed_representation.apply(state.critic, "guess", Seen(jnp.ones((2, 1)), past))
     distances = np.linalg.norm(guess[:, None] - thetas, axis=-1)
     assert np.all(np.diagonal(distances) < 0.3 * np.linalg.norm(thetas[0] - thetas[1]))
 
@@ -410,7 +418,7 @@ def test_the_guess_finds_the_theta_of_the_task_that_steps_were_taken_in():
 
 
 def test_the_transition_model_learns_linear_dynamics():
-    """s' = M s + N a in another way for each task: the error of what is foretold all but vanishes."""
+    """s' = M s + N a in another way for each task: the error of the prediction all but vanishes."""
     agent = make("hip-bmdp", latent_widths=(32, 8), model_widths=(64,), critic_lr=3e-3, gamma=0.0)
     turn = jnp.float32([[0.9, 0.3, 0.0], [-0.3, 0.9, 0.0], [0.0, 0.0, 0.5]])
     push = jnp.float32([1.0, -1.0, 0.2])[:, None, None] * jnp.float32([[0.5, 0.0, 0.0], [0.0, 0.5, 0.5]])
@@ -431,14 +439,14 @@ def test_the_transition_model_learns_linear_dynamics():
     assert np.all(last < 0.02 * first), (first, last)
     assert np.all(np.mean(history["reward_loss"][-50:], axis=0) < 0.02)
 
-    def foretold(critic: Params, batch):
-        """The next latent states of one task, as foretold and as they are."""
-        told = critic.own["embedding"]
-        latent, then = (agent.sight.apply(critic, "latent", x) for x in (batch.obs, batch.next_obs))
-        return agent.sight.foretell(critic, told, latent, batch.action)[0], then
+    def predicted(critic: Params, batch):
+        """The next latent states of one task, as predicted and as they are."""
+        features = critic.own["embedding"]
+        latent, then = (agent.placed_representation.apply(critic, "latent", x) for x in (batch.obs, batch.next_obs))
+        return agent.placed_representation.predict(critic, features, latent, batch.action)[0], then
 
     fresh = experience(jax.random.key(9))
-    mean, then = jit(jax.vmap(foretold, (Params(None, 0), 0)))(state.critic, fresh)
+    mean, then = jit(jax.vmap(predicted, (Params(None, 0), 0)))(state.critic, fresh)
     error, spread = np.mean((mean - then) ** 2, axis=(1, 2)), np.mean(np.var(then, axis=1), axis=-1)
     # Not because all states look alike. Bounds are half as far again as the worst of three seeds, or further.
     assert np.all(spread > 0.01) and np.all(error < 0.2 * spread), (error, spread)
@@ -463,7 +471,7 @@ def test_values_are_learned_through_the_slow_encoder():
 @pytest.mark.parametrize(
     "settings",
     [
-        *({"conditioning": told} for told in ("one-hot", "embedding", "parameters", "inferred")),
+        *({"conditioning": conditioning} for conditioning in ("one-hot", "embedding", "parameters", "inferred")),
         {"conditioning": "embedding", "unit_embedding": True, "unseen_theta": "zero"},
         {"conditioning": "inferred", **INFERRED},
         {"encoder": "care"},
@@ -478,7 +486,7 @@ def test_parts_combine(name, settings):
     """Traced over two seeds, not run: an update keeps shapes and types, and there is an action for each world."""
     settings = {k: v for k, v in settings.items() if name == "hip-bmdp" or k != "unseen_theta"}
     agent, keys = make(name, **settings), jax.random.split(KEY, 2)
-    batch = jax.tree.map(lambda x: jnp.stack([x, x]), random_batch(0, 3, BATCH, SPEC, agent.history))
+    batch = jax.tree.map(lambda x: jnp.stack([x, x]), random_batch(0, 3, BATCH, SPEC, agent.history_length))
     state = jax.eval_shape(jax.vmap(lambda key: agent.init(SPEC, TASKS, key)), keys)
     update = jax.vmap(lambda state, batch, key: agent.update(state, batch, TASKS, key))
     after, metrics = jax.eval_shape(update, state, batch, keys)
@@ -524,7 +532,7 @@ def rollouts(agent, seed=0):
     """Rollouts (T, H, E, ...) in which every field is random."""
     random, shape = np.random.default_rng(seed), (3, 4, 2)
     normal = lambda *size: jnp.float32(random.normal(size=(*shape, *size)))
-    past = random_past(random, (*shape, agent.history), SPEC) if agent.history else None
+    past = random_past(random, (*shape, agent.history_length), SPEC) if agent.history_length else None
     raw, ended = normal(2), jnp.asarray(random.random(shape) < 0.5)
     fields = {"reward": normal(), "discount": jnp.ones(shape), "ended": ended, "extras": Taken(raw, normal() - 2, past)}
     return Transition(obs=normal(3), action=jnp.tanh(raw), next_obs=normal(3), **fields)
@@ -533,8 +541,8 @@ def rollouts(agent, seed=0):
 def of_first_task(agent, state, steps):
     """The critic of the first task, and its steps as the losses see them."""
     _, batch, _ = agent.prepare(state, steps, TASKS)
-    ahead, _ = agent.sight.targets(state.critic, state.critic, batch.next_obs, KEY)
-    return of_task(state.critic, 0), pick(batch._replace(ahead=ahead), 0)
+    model_targets, _ = agent.placed_representation.targets(state.critic, state.critic, batch.next_obs, KEY)
+    return of_task(state.critic, 0), pick(batch._replace(model_targets=model_targets), 0)
 
 
 def test_ppos_critic_loss_reaches_the_representation():
@@ -575,23 +583,23 @@ def test_ppos_actor_does_not_train_the_representation():
     assert not np.array_equal(seeing, other)
 
 
-def test_ppos_models_foretell_what_the_encoder_saw_before_the_update():
+def test_ppos_models_predict_what_the_encoder_saw_before_the_update():
     """The critic's targets do not change with it, the transition loss does."""
     agent = make_ppo(representation="deepmdp")
     state = agent.init(SPEC, TASKS, KEY)
     state, batch, _ = agent.prepare(state, rollouts(agent), TASKS)
     given = (jnp.arange(8), KEY)
-    improve = jit(lambda slow: agent.improve(batch, slow, (state, jnp.bool_(True)), given)[1])
-    now, other = improve(state.critic), improve(jax.tree.map(lambda x: x * 1.5 + 0.05, state.critic))
+    step = jit(lambda target_critic: agent.minibatch_step(batch, target_critic, (state, jnp.bool_(True)), given)[1])
+    now, other = step(state.critic), step(jax.tree.map(lambda x: x * 1.5 + 0.05, state.critic))
     np.testing.assert_array_equal(now["critic_loss"], other["critic_loss"])
     assert np.all(np.asarray(now["transition_loss"]) != np.asarray(other["transition_loss"]))
     critic, one = of_first_task(agent, state, rollouts(agent))
     expected = plain_latent(critic.shared["latent"], np.asarray(one.next_obs))
-    np.testing.assert_allclose(one.ahead.latent, expected, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(one.model_targets.latent, expected, rtol=1e-4, atol=1e-5)
 
 
 def test_ppo_learns_a_model_of_its_rollouts():
-    """Everything moves, and after many updates models foretell s' = s / 2 + (a, 0) and its first number far better."""
+    """Everything moves, and after many updates models predict s' = s / 2 + (a, 0) and its first number far better."""
     agent = make_ppo(representation="deepmdp", critic_lr=1e-2, gamma=0.0)
     before, steps = agent.init(SPEC, TASKS, KEY), rollouts(agent)
     then = 0.5 * steps.obs + jnp.pad(steps.action, [(0, 0)] * 3 + [(0, 1)])

@@ -231,20 +231,20 @@ def test_activity_is_that_of_the_networks():
     state, batch = started(agent), random_batch(1, 3, BATCH, SPEC)
     seen, (_, batch) = watched(agent, state, batch), agent.prepare(state, batch, TASKS)
     for i in range(3):
-        hidden = agent.actor.hidden(of_task(state.actor, i), batch.told[i], batch.obs[i])
+        hidden = agent.actor.hidden(of_task(state.actor, i), batch.features[i], batch.obs[i])
         np.testing.assert_allclose(seen["actor"].hidden[i, :, 0], hidden, rtol=1e-4, atol=1e-5)
         level = seen["actor"].layers["Trunk/MLP_0/ReLU_1"][i, 0]
         np.testing.assert_allclose(level, np.mean(hidden, axis=0), rtol=1e-4, atol=1e-5)
         for n in range(2):
             params = pick(of_task(state.critic, i), n)
-            hidden = agent.critic.hidden(params, batch.told[i], batch.obs[i], batch.action[i])
+            hidden = agent.critic.hidden(params, batch.features[i], batch.obs[i], batch.action[i])
             np.testing.assert_allclose(seen["critic"].hidden[i, :, n], hidden, rtol=1e-4, atol=1e-5)
 
 
 def trace(agent):
     """What diagnostics of an agent would be: shapes alone."""
     state = shapes_of(agent)
-    batch = jax.eval_shape(lambda: random_batch(0, 3, BATCH, SPEC, agent.history))
+    batch = jax.eval_shape(lambda: random_batch(0, 3, BATCH, SPEC, agent.history_length))
     gradients = jax.eval_shape(partial(compare_gradients, agent), state, batch, TASKS, KEY)
     seen = jax.eval_shape(partial(activity, agent), state, batch, TASKS)
     return state, gradients, seen

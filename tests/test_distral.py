@@ -144,7 +144,7 @@ def charged(made, actor, obs):
 def seen(rows, gamma=0.99):
     """What the losses see of transitions of one task."""
     fields = (rows.obs, rows.action, rows.reward, gamma * rows.discount, rows.next_obs)
-    return Batch(*fields, told=FEATURES, temperature=TEMPERATURE, mask=None)
+    return Batch(*fields, features=FEATURES, temperature=TEMPERATURE, mask=None)
 
 
 def test_critic_target(state, batch):
@@ -154,7 +154,7 @@ def test_critic_target(state, batch):
     raw, cost, _ = charged(made, actor, rows.next_obs)
     values = np.min(made.values(target, FEATURES, rows.next_obs, jnp.tanh(raw)), axis=0)
     expected = np.asarray(rows.reward) + 0.9 * np.asarray(rows.discount) * (values - TEMPERATURE * cost)
-    found = made.target(actor, critic, target, seen(rows, 0.9), KEY)
+    found = made.critic_target(actor, critic, target, seen(rows, 0.9), KEY)
     np.testing.assert_allclose(found, expected, rtol=1e-4)
     plain = SAC.sample(made, actor, critic, seen(rows), rows.next_obs, KEY).log_prob
     assert np.all(np.abs(cost - plain) > 0.1)  # that the distilled policy has a say here
@@ -356,16 +356,16 @@ def test_training_tasks_play_their_own_policies_and_others_the_distilled_one(sta
     assert made.unseen == "the distilled policy plays them"
 
 
-@pytest.mark.parametrize("told", ["parameters", "one-hot", "embedding"])
-def test_a_distilled_policy_may_be_told_the_task(told):
+@pytest.mark.parametrize("conditioning", ["parameters", "one-hot", "embedding"])
+def test_a_distilled_policy_may_be_told_the_task(conditioning):
     """As the others are; it then acts differently in different tasks."""
-    made = tiny("distral", conditioning=told)
+    made = tiny("distral", conditioning=conditioning)
     fresh = learner(made, TASKS, BATCH, SPEC)[0](TASKS, KEY)
     played = [
         np.asarray(act_once(made, fresh, jnp.ones(3), pick(TASKS, i)._replace(id=jnp.int32(7)), None)) for i in (0, 1)
     ]
     assert not np.allclose(played[0], played[1], atol=1e-3)
-    assert ("nearest" in made.unseen) == (told != "parameters")
+    assert ("nearest" in made.unseen) == (conditioning != "parameters")
 
 
 # What makes no sense.

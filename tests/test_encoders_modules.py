@@ -84,8 +84,8 @@ def plain_routing(p, joint, num_layers, num_modules, official):
     for i in range(num_layers - 1 + official):
         gate = joint
         if i:
-            told = np.concatenate([w.ravel() for w in found]) if official else scores[-1]
-            gate = dense(p[f"up_{i}"], told) * joint
+            previous = np.concatenate([w.ravel() for w in found]) if official else scores[-1]
+            gate = dense(p[f"up_{i}"], previous) * joint
         scores.append(dense(p[f"down_{i}"], relu(gate)))
         found.append(np.stack([softmax(row) for row in scores[-1].reshape(-1, num_modules)]))
     return found

@@ -97,9 +97,9 @@ def test_agents_act_as_on_the_cpu(name, shape):
 
 def experience(agent, num_seeds, num_tasks):
     """Batches (S, T, B, ...), or rollouts (S, T, H, E, ...) for agents that learn from these."""
-    batches = [random_batch(seed, num_tasks, 64, SPEC, agent.history) for seed in range(num_seeds)]
+    batches = [random_batch(seed, num_tasks, 64, SPEC, agent.history_length) for seed in range(num_seeds)]
     batch = jax.tree.map(lambda *x: np.stack(x), *batches)
-    if hasattr(agent, "target"):
+    if hasattr(agent, "critic_target"):
         return batch
     steps = jax.tree.map(lambda x: x.reshape(*x.shape[:2], 8, 8, *x.shape[3:]), batch)
     random = np.random.default_rng(0)
@@ -184,7 +184,7 @@ def test_a_mixture_steps_as_its_families(num_envs):
     shape = lambda tasks: (1, len(tasks.id), num_envs)
     keys = lambda tasks: jax.random.split(jax.random.key(0), shape(tasks))
     begin = lambda family, tasks: jax.jit(
-        lambda tasks, keys: family.reset_worlds(rollout.spread(tasks, keys.shape), keys).state
+        lambda tasks, keys: family.reset_worlds(rollout.broadcast_tasks(tasks, keys.shape), keys).state
     )(tasks, keys(tasks))
     tasks = env.tasks()
     states = [begin(part.family, part.family.tasks()) for part in env.parts]
@@ -193,7 +193,7 @@ def test_a_mixture_steps_as_its_families(num_envs):
     @partial(jax.jit, static_argnums=0)
     def play(family, tasks, state, action):
         step = lambda state, action: (
-            family.step_worlds(rollout.spread(tasks, action.shape[:3]), state, action).state,
+            family.step_worlds(rollout.broadcast_tasks(tasks, action.shape[:3]), state, action).state,
             None,
         )
         return jax.lax.scan(step, state, action)[0]

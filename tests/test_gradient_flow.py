@@ -74,7 +74,7 @@ def start(case, seed=0):
 def batch_of(case, seed, spec=SPEC):
     """A random batch of what the agent sees."""
     name, settings, _ = PARTS[case]
-    return random_batch(seed, 3, BATCH, spec, tiny(name, **settings).history)
+    return random_batch(seed, 3, BATCH, spec, tiny(name, **settings).history_length)
 
 
 def leaves_of(params):
@@ -134,7 +134,7 @@ FLOW = {
 
 
 # Where the actor stands on the critic's representation, all that moves this moves the policy's entropy; and what the
-# slow encoder sees is what models foretell. BRC scales rewards by what entropy pays.
+# slow encoder sees is what models predict. BRC scales rewards by what entropy pays.
 _ON_LATENT = {"critic": ((), ("actor",)), "target": ((), ("critic",)), "reward": ((), ("actor", "critic", "target"))}
 FLOW_OF = {
     **dict.fromkeys(("deepmdp", "hip-bmdp", "care-deepmdp"), _ON_LATENT),

@@ -52,8 +52,8 @@ def test_who_infers_nothing_remembers_nothing():
     """No past is stored for it."""
     agent, tasks = tiny("sac"), tasks_of("one-step")
     state = jax.eval_shape(lambda: agent.init(SPEC, tasks, jax.random.key(0)))
-    assert not jax.tree.leaves(agent.begin(state, tasks)) and agent.history == 0
-    assert tiny("sac", **INFERRED).history == STEPS
+    assert not jax.tree.leaves(agent.begin(state, tasks)) and agent.history_length == 0
+    assert tiny("sac", **INFERRED).history_length == STEPS
 
 
 def test_the_loop_stores_what_was_seen():
@@ -158,9 +158,11 @@ class Hidden(Probe):
 
 def learned(conditioning):
     """Train, and return agent, environment and the learner's states."""
-    told = {"conditioning": conditioning, "embedding_size": 4}
+    inference = {"conditioning": conditioning, "embedding_size": 4}
     plain = {"initial_temperature": 1e-6, "temperature_lr": 1e-9, "gamma": 0.5, "tau": 0.3}
-    agent = tiny("sac", **told, inferred_from=2, num_critics=1, hidden=(32,), actor_lr=3e-3, critic_lr=3e-3, **plain)
+    agent = tiny(
+        "sac", **inference, inferred_from=2, num_critics=1, hidden=(32,), actor_lr=3e-3, critic_lr=3e-3, **plain
+    )
     settings = {"num_envs": 8, "updates_per_step": 4, "batch_size": 64, "warmup_steps": 150, "warmup_hold": 1}
     return agent, Hidden(), train(Hidden(), agent, settings | {"chunk_steps": 400})[0].agent
 

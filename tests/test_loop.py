@@ -14,7 +14,7 @@ from mtjax.config import configure
 from mtjax.experience import Replay
 from mtjax.loop import Settings
 from mtjax.maps import over_learners, over_worlds
-from mtjax.rollout import spread
+from mtjax.rollout import broadcast_tasks
 from mtjax.types import InputError, Spec
 
 ENVS, BATCH, WARMUP, HOLD, CHUNK, UPDATES = 4, 8, 8, 3, 13, 2
@@ -254,7 +254,7 @@ def test_collecting_without_learning_is_allowed():
 
 def test_spread_repeats_tasks_along_seeds_and_environments():
     """Every leaf (T, ...) becomes (S, T, E, ...)."""
-    worlds = spread(tasks_of("one-step", (1.0, 2.0, 3.0)), (2, 3, 4))
+    worlds = broadcast_tasks(tasks_of("one-step", (1.0, 2.0, 3.0)), (2, 3, 4))
     assert worlds.context.shape == (2, 3, 4, 1) and worlds.id.shape == (2, 3, 4)
     np.testing.assert_array_equal(worlds.goal["scale"], np.broadcast_to(np.float32([[1], [2], [3]]), (2, 3, 4)))
 

@@ -108,7 +108,7 @@ def keys_of(tasks: Task, envs: int = 2, seed: int = 0):
 
 
 def spread(tasks: Task, envs: int = 2) -> Task:
-    return rollout.spread(tasks, (1, len(tasks.id), envs))
+    return rollout.broadcast_tasks(tasks, (1, len(tasks.id), envs))
 
 
 def pick(tree, index):
@@ -365,11 +365,11 @@ def test_losses_of_a_padded_task_are_those_of_the_task_alone(monkeypatch):
     noise = np.random.default_rng(1).normal(size=(6, 3)).astype(np.float32)
     monkeypatch.setattr(networks.jax.random, "normal", lambda key, shape: jnp.asarray(noise[: shape[0], : shape[1]]))
     agent, random = tiny("sac"), np.random.default_rng(0)
-    task, told = WIDE.tasks(), jnp.zeros(0)
+    task, features = WIDE.tasks(), jnp.zeros(0)
     pad = lambda x, width: jnp.pad(x, ((0, 0), (0, width - x.shape[1])))
     obs, next_obs = jnp.float32(random.normal(size=(2, 6, 2)))
     action, reward = jnp.tanh(jnp.float32(random.normal(size=(6, 1)))), jnp.float32(random.normal(size=6))
-    common = {"reward": reward, "discount": jnp.full(6, 0.9), "told": told, "temperature": jnp.float32(0.3)}
+    common = {"reward": reward, "discount": jnp.full(6, 0.9), "features": features, "temperature": jnp.float32(0.3)}
     small = Batch(obs, action, next_obs=next_obs, mask=None, **common)
     wide = Batch(pad(obs, 4), pad(action, 3), next_obs=pad(next_obs, 4), mask=jnp.array([1.0, 0, 0]), **common)
     monkeypatch.undo()
@@ -383,7 +383,7 @@ def test_losses_of_a_padded_task_are_those_of_the_task_alone(monkeypatch):
     key = jax.random.key(0)
 
     def losses(actor, critic, batch):
-        target = agent.target(actor, critic, critic, batch, key)
+        target = agent.critic_target(actor, critic, critic, batch, key)
         (critic_loss, _), critic_slope = jax.value_and_grad(agent.critic_loss, has_aux=True)(critic, (batch, target))
         (actor_loss, seen), slope = jax.value_and_grad(agent.actor_loss, has_aux=True)(actor, (batch, critic, key))
         return critic_loss, actor_loss, seen["entropy"], slope, critic_slope

@@ -15,7 +15,7 @@ from mtjax.agents.parts.encoders import ENCODERS
 from mtjax.agents.parts.gradients.surgery import RULES
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
-from mtjax.agents.ppo import Batch, Taken, Units, advantages, choose
+from mtjax.agents.ppo import Batch, Taken, Units, advantages, take_steps
 from mtjax.config import with_preset
 from mtjax.envs.probes import Probe, tasks_of
 from mtjax.networks import log_density
@@ -35,8 +35,8 @@ def random_steps(agent, num_tasks=3, spec=SPEC, seed=0):
     random, shape = np.random.default_rng(seed), (num_tasks, LENGTH, ENVS)
     normal = lambda *size: jnp.float32(random.normal(size=(*shape, *size)))
     raw, past = normal(spec.action_size), None
-    if agent.history:
-        past = random_past(random, (*shape, agent.history), spec)
+    if agent.history_length:
+        past = random_past(random, (*shape, agent.history_length), spec)
     return Transition(
         obs=normal(spec.obs_size),
         action=jnp.tanh(raw),
@@ -86,9 +86,9 @@ def test_every_task_has_its_own_discount():
     tasks, steps = TASKS._replace(horizon=jnp.array([200, 1000, 125])), random_steps(agent)
     state = agent.init(SPEC, tasks, KEY)
     state, batch, _ = agent.prepare(state, steps, tasks)
-    told = agent.features_of_batch(state, steps, tasks)
+    features = agent.features_of_batch(state, steps, tasks)
     see = lambda obs: agent.see(state.moments, obs.reshape(3, -1, 3))
-    value, following = (agent.values(state, told, see(obs)) for obs in (steps.obs, steps.next_obs))
+    value, following = (agent.values(state, features, see(obs)) for obs in (steps.obs, steps.next_obs))
     gamma = np.array([0.975, 0.995, 0.96])[:, None]
     flat = lambda x: x.reshape(3, -1)
     expected = flat(steps.reward) + gamma * flat(steps.discount) * following - value
@@ -102,9 +102,9 @@ def batch_of(agent, state, **fields):
     """Four steps of the first task, with its parameters of actor and critic."""
     random = np.random.default_rng(1)
     normal = lambda *size: jnp.float32(random.normal(size=(4, *size)))
-    told = agent.features(state, pick(TASKS, 0))
+    features = agent.features(state, pick(TASKS, 0))
     blank = dict.fromkeys(("log_prob", "advantage", "value", "target"), jnp.zeros(4))
-    batch = Batch(**{"obs": normal(3), "raw": normal(2), "told": told, "mask": None, **blank, **fields})
+    batch = Batch(**{"obs": normal(3), "raw": normal(2), "features": features, "mask": None, **blank, **fields})
     return batch, of_task(state.actor, 0), of_task(state.critic, 0)
 
 
@@ -114,7 +114,7 @@ def test_actor_loss_worked_by_hand():
     state = agent.init(SPEC, TASKS, KEY)
     ratio, advantage = jnp.array([1.5, 1.5, 0.5, 0.5]), jnp.array([1.0, -1.0, 1.0, -1.0])
     batch, actor, _ = batch_of(agent, state, advantage=advantage)
-    now = log_density(agent.actor.apply(actor, batch.told, batch.obs), batch.raw)
+    now = log_density(agent.actor.apply(actor, batch.features, batch.obs), batch.raw)
     batch = batch._replace(log_prob=now - jnp.log(ratio))
     loss, metrics = agent.actor_loss(actor, (batch, KEY))
     assert loss == pytest.approx(-(1.2 - 1.5 + 0.5 - 0.8) / 4, abs=1e-5)
@@ -149,7 +149,7 @@ def test_critic_loss_worked_by_hand():
     agent, free = small(value_clip=0.5), small()
     state = agent.init(SPEC, TASKS, KEY)
     batch, _, critic = batch_of(agent, state)
-    value = agent.critic.apply(critic, batch.told, batch.obs)[..., 0]
+    value = agent.critic.apply(critic, batch.features, batch.obs)[..., 0]
     batch = batch._replace(value=value - jnp.array([0.2, 1.0, -1.0, 1.0]), target=value + jnp.array([1.0, 1, 1, -1]))
     assert free.critic_loss(critic, batch)[0] == pytest.approx(0.5, abs=1e-5)
     # The second value may only be 0.5 above the old one, which is 1.5 from its target; and so on.
@@ -171,7 +171,7 @@ def test_actions_that_a_task_lacks_count_for_nothing():
     assert whole.extras.log_prob == pytest.approx(density(0) + density(1), abs=1e-5)
     steps = random_steps(agent)
     _, batch, _ = agent.prepare(state, steps, tasks)
-    np.testing.assert_array_equal(choose(batch, jnp.arange(2)).mask, tasks.action_mask)
+    np.testing.assert_array_equal(take_steps(batch, jnp.arange(2)).mask, tasks.action_mask)
 
 
 def test_policies_begin_wide_and_alike():
@@ -189,21 +189,21 @@ def test_policies_begin_wide_and_alike():
 def test_every_minibatch_has_as_many_steps_of_every_task():
     """An epoch deals out every step once; what does not divide is left out, other steps in every epoch."""
     agent = small(epochs=3, minibatches=4)
-    orders = np.asarray(agent.deal(12, KEY))
+    orders = np.asarray(agent.minibatch_indices(12, KEY))
     assert orders.shape == (12, 3)
     for epoch in orders.reshape(3, -1):
         assert sorted(epoch) == list(range(12))
     assert not np.array_equal(orders[:4], orders[4:8])
-    uneven = np.asarray(agent.deal(14, KEY)).reshape(3, -1)
+    uneven = np.asarray(agent.minibatch_indices(14, KEY)).reshape(3, -1)
     assert uneven.shape == (3, 12) and all(len(set(epoch)) == 12 for epoch in uneven)
     assert len({tuple(set(range(14)) - set(epoch)) for epoch in uneven}) > 1
 
     batch = agent.prepare(agent.init(SPEC, TASKS, KEY), random_steps(agent), TASKS)[1]
-    chosen = choose(batch, jnp.array([5, 0, 3]))
-    assert chosen.advantage.shape == (3, 3) and chosen.told is batch.told
+    chosen = take_steps(batch, jnp.array([5, 0, 3]))
+    assert chosen.advantage.shape == (3, 3) and chosen.features is batch.features
     np.testing.assert_array_equal(chosen.obs, batch.obs[:, np.array([5, 0, 3])])
     with pytest.raises(InputError, match=r"minibatches \(4\) must not be more than a rollout's 3 steps"):
-        agent.deal(3, KEY)
+        agent.minibatch_indices(3, KEY)
 
 
 def test_steps_keep_their_contexts():
@@ -213,7 +213,7 @@ def test_steps_keep_their_contexts():
     context = steps.reward[..., None] * 2
     batch = agent.prepare(agent.init(SPEC, TASKS, KEY), steps._replace(context=context), TASKS)[1]
     order = jnp.array([1, 6])
-    np.testing.assert_array_equal(choose(batch, order).told, context.reshape(3, -1, 1)[:, order])
+    np.testing.assert_array_equal(take_steps(batch, order).features, context.reshape(3, -1, 1)[:, order])
 
 
 @pytest.mark.parametrize("kind", ["none", "all", "task"])
@@ -298,18 +298,18 @@ def test_the_actor_rests_once_it_is_too_far_away():
     outputs = jnp.zeros((3, LENGTH, ENVS, 4)) + agent.actor.apply(
         of_task(state.actor, 0), TASKS.context[0], jnp.zeros(3)
     )
-    told = TASKS.context[:, None, None] * jnp.ones((3, LENGTH, ENVS, 1))
-    outputs = agent.actor.apply(of_task(state.actor, 0), told, steps.obs)
+    features = TASKS.context[:, None, None] * jnp.ones((3, LENGTH, ENVS, 1))
+    outputs = agent.actor.apply(of_task(state.actor, 0), features, steps.obs)
     raw = steps.extras.raw * 0.5
     steps = steps._replace(extras=Taken(raw, log_density(outputs, raw), None))
     after, _ = jax.jit(agent.update)(state, steps, TASKS, KEY)
 
     order_key, key = jax.random.split(KEY)
     renewed, batch, _ = agent.prepare(state, steps, TASKS)
-    orders = agent.deal(batch.advantage.shape[1], order_key)
+    orders = agent.minibatch_indices(batch.advantage.shape[1], order_key)
     given = (orders[0], jax.random.split(key, len(orders))[0])
-    (first, near), _ = jax.jit(agent.improve)(batch, renewed.critic, (renewed, jnp.bool_(True)), given)
-    assert near
+    (first, within_limit), _ = jax.jit(agent.minibatch_step)(batch, renewed.critic, (renewed, jnp.bool_(True)), given)
+    assert within_limit
     close = lambda x, y: all(np.allclose(a, b, atol=1e-5) for a, b in zip(*map(jax.tree.leaves, (x, y)), strict=True))
     assert close(after.actor, first.actor) and not close(after.actor, state.actor)
     assert not close(after.critic, first.critic)
@@ -354,8 +354,8 @@ COMBINED += [
     for scaling, sampler in itertools.zip_longest(SCALINGS, SAMPLERS, fillvalue="uniform")
 ]
 COMBINED += [
-    {"conditioning": told, "representation": kind, **rest}
-    for told, kind, rest in [
+    {"conditioning": conditioning, "representation": kind, **rest}
+    for conditioning, kind, rest in [
         ("parameters", "deepmdp", {"gradients": "pcgrad", "encoder": "care", "kl_limit": 0.01}),
         ("inferred", "deepmdp", {"heads": "disjoint", "transition": "probabilistic"}),
         ("embedding", "hip-bmdp", {"value_normalization": "popart"}),

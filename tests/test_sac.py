@@ -65,21 +65,21 @@ def rows(obs, action, reward, discount, next_obs):
 def seen(batch, gamma=1.0, temperature=0.0):
     """What the losses see of transitions."""
     fields = (batch.obs, batch.action, batch.reward, gamma * batch.discount, batch.next_obs)
-    return Batch(*fields, told=FEATURES, temperature=temperature, mask=None)
+    return Batch(*fields, features=FEATURES, temperature=temperature, mask=None)
 
 
 @pytest.mark.parametrize(("discount", "expected"), [(1.0, 4.87), (0.0, 1.0), (0.5, 2.935)])
 def test_critic_target(linear, discount, expected):
     """From s' = 3: a' = 6, log pi = -1.5, Q = 6 and 4; y = 1 + 0.9 d (4 + 0.2 1.5)."""
     batch = rows([0.0], [0.0], [1.0], [discount], [3.0])
-    target = LinearSAC().target(ACTOR, CRITICS, CRITICS, seen(batch, 0.9, 0.2), jax.random.key(0))
+    target = LinearSAC().critic_target(ACTOR, CRITICS, CRITICS, seen(batch, 0.9, 0.2), jax.random.key(0))
     np.testing.assert_allclose(target, [expected], rtol=1e-6)
 
 
-def test_critic_target_believes_the_least_critic_at_each_transition(linear):
+def test_critic_target_takes_the_least_critic_at_each_transition(linear):
     """From s' = 3 the least is the second critic's 4, and from s' = -3 the first's -6."""
     batch = rows([0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [1.0, 1.0], [3.0, -3.0])
-    target = LinearSAC().target(ACTOR, CRITICS, CRITICS, seen(batch), jax.random.key(0))
+    target = LinearSAC().critic_target(ACTOR, CRITICS, CRITICS, seen(batch), jax.random.key(0))
     np.testing.assert_allclose(target, [4.0, -6.0], rtol=1e-6)
 
 

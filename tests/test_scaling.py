@@ -330,7 +330,7 @@ class Diary(Stub):
     def update(self, state, batch, tasks, key):
         return state | {"updates": state["updates"] + 1}, {"updates": jnp.float32(state["updates"])}
 
-    def reset(self, state, spec, tasks, key):
+    def reset_networks(self, state, spec, tasks, key):
         assert spec.obs_size == 1 and len(tasks.id) == 2
         resets = state["resets"] | (1 << (state["step"] - 1))  # the step is taken, and not yet learned from
         return state | {"resets": resets, "updates": jnp.int32(0), "noise": jax.random.normal(key)}
@@ -359,7 +359,7 @@ def test_a_reset_renews_all_that_learns_and_nothing_else():
         state = scaled.observe(state, outcome)
         state, _ = update(state, random_batch(i, 3, BATCH, SPEC), TASKS, jax.random.key(i))
     key = jax.random.key(7)
-    fresh, anew = init(TASKS, key), jax.jit(partial(scaled.reset, spec=SPEC, tasks=TASKS, key=key))(state)
+    fresh, anew = init(TASKS, key), jax.jit(partial(scaled.reset_networks, spec=SPEC, tasks=TASKS, key=key))(state)
     kept = ("moments", "contexts", "progress")
     for field in state._fields:
         given = getattr(state if field in kept else fresh, field)

@@ -220,7 +220,7 @@ def test_memories_keep_their_shapes(name, per_layer):
         params, memory = carry
         found = surgery.gradient(rule, quadratic, params, DATA, memory, KEY, None, per_layer)
         params = jax.tree.map(lambda p, g: p - 0.05 * g, params, found.gradients)
-        return (params, surgery.look_again(rule, quadratic, params, DATA, found)), jnp.mean(found.losses)
+        return (params, surgery.adapt_rule(rule, quadratic, params, DATA, found)), jnp.mean(found.losses)
 
     run = lambda params: jax.lax.scan(update, (params, surgery.init(rule, params, TASKS, per_layer)), length=4)
     seeds = jax.tree.map(lambda x: jnp.stack([x, x + 0.1]), PARAMS)
@@ -290,7 +290,7 @@ def test_the_second_look_is_at_the_new_losses():
     rule = RULES["famo"]()
     before = combined("famo")
     moved = jax.tree.map(lambda p, g: p - 0.02 * g, PARAMS, before.gradients)
-    memory = jax.jit(lambda: surgery.look_again(rule, quadratic, moved, DATA, before))()
+    memory = jax.jit(lambda: surgery.adapt_rule(rule, quadratic, moved, DATA, before))()
     after = np.asarray(combined("mean", moved).losses)
     expected = rule.adapt(before.memory, before.losses, jnp.asarray(after))
     np.testing.assert_allclose(memory.logits, expected.logits, rtol=1e-4)
@@ -298,7 +298,7 @@ def test_the_second_look_is_at_the_new_losses():
     assert memory.logits[np.argmin(gain)] > 0 > memory.logits[np.argmax(gain)]
 
 
-def test_other_rules_do_not_look_again():
+def test_other_rules_keep_their_memory():
     """Their loss is not even traced."""
 
     def never(params, data):
@@ -306,7 +306,7 @@ def test_other_rules_do_not_look_again():
 
     for name in set(RULES) - {"famo"}:
         before = combined(name)
-        assert surgery.look_again(RULES[name](), never, PARAMS, DATA, before) is before.memory
+        assert surgery.adapt_rule(RULES[name](), never, PARAMS, DATA, before) is before.memory
 
 
 @pytest.mark.parametrize("name", ["gradnorm", "famo"])

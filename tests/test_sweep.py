@@ -105,7 +105,7 @@ def test_every_number_can_vary(name, settings):
         memory = varied.begin(state, task)
         everywhere = jax.tree.map(lambda x: jnp.broadcast_to(x, (2, 3, *x.shape)), memory)
         state = varied.observe(state, Outcome(one, one, one > 0, one < 0, jnp.int32(one), everywhere))
-        state = varied.reset(state, spec, tasks, key)
+        state = varied.reset_networks(state, spec, tasks, key)
         return varied.act(state, memory, jnp.zeros(1), task, key).action
 
     assert jax.eval_shape(everything, {name: jnp.float32(x) for name, x in values.items()}).shape == (1,)

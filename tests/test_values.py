@@ -186,13 +186,13 @@ SETTINGS = {
 }
 
 
-@pytest.mark.parametrize(("kind", "believe"), [("c51", "least"), ("hl-gauss", "mean")])
-def test_distributional_critics_learn_known_values(kind, believe):
+@pytest.mark.parametrize(("kind", "critic_reduction"), [("c51", "min"), ("hl-gauss", "mean")])
+def test_distributional_critics_learn_known_values(kind, critic_reduction):
     """Two steps, of which the second earns 1 or -0.5: Q(1) = scale, Q(0) = 0.9 scale."""
     learner = tiny(
         "sac-conditioned",
         value=kind,
-        believe=believe,
+        critic_reduction=critic_reduction,
         **{"num_bins": 41, "value_low": -2.0, "value_high": 2.0},
         **{"gamma": 0.9, "initial_temperature": 1e-6, "temperature_lr": 1e-9},
         **{"tau": 0.3, "actor_lr": 1e-2, "critic_lr": 1e-2},

@@ -1,4 +1,4 @@
-"""Agents by name: presets of parts, and the few that are more. To add one: a line here, and a file if it is more."""
+"""``AGENTS`` lists agents by name. To add one, add a line here, and a file if it is more than a choice of parts."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -14,25 +14,23 @@ __getattr__ = lazily(__name__, {"PARTS": _BASE, "BaseAgent": _BASE, "settings": 
 
 
 class Preset(NamedTuple):
-    """A class of agent with some settings of its own."""
+    """A preset names a class of agents and its settings."""
 
-    says: str  # what it is, in a line
+    says: str  # a description in one line
     defaults: Mapping[str, Any] = {}
-    place: "str | type[BaseAgent]" = (
-        "mtjax.agents.sac:SAC"  # the class; one of this package is imported when it is used
-    )
+    place: "str | type[BaseAgent]" = "mtjax.agents.sac:SAC"  # the class, or where it is, to be imported when it is used
 
     @property
     def cls(self) -> "type[BaseAgent]":
-        """The class of agent."""
+        """The class of agents."""
         return load(self.place)
 
 
-_TOLD = {"conditioning": "parameters"}
+_PARAMS = {"conditioning": "parameters"}
 
 AGENTS: dict[str, Preset] = {
-    "sac": Preset("Soft actor-critic that is not told its task (Haarnoja et al. 2018)"),
-    "sac-conditioned": Preset("SAC that sees the task's parameters (Schaul et al. 2015)", _TOLD),
+    "sac": Preset("Soft actor-critic that does not see its task (Haarnoja et al. 2018)"),
+    "sac-conditioned": Preset("SAC that sees the task's parameters (Schaul et al. 2015)", _PARAMS),
     "multi-head": Preset("SAC with an output layer for every task (Yu et al. 2020)", {"heads": "per-task"}),
     "disjoint": Preset("One SAC for every task, all in one program: nothing is shared", {"heads": "disjoint"}),
     "distral": Preset(
@@ -40,25 +38,29 @@ AGENTS: dict[str, Preset] = {
         {},
         "mtjax.agents.distral:Distral",
     ),
-    "care": Preset("Attention over a mixture of encoders (Sodhani et al. 2021)", {"encoder": "care", **_TOLD}),
-    "moe": Preset("Soft mixture of encoders (Sodhani et al. 2021, MTRL)", {"encoder": "moe", **_TOLD}),
-    "film": Preset("Layers scaled and shifted by the task (Perez et al. 2018)", {"encoder": "film", **_TOLD}),
+    "care": Preset("Attention over a mixture of encoders (Sodhani et al. 2021)", {"encoder": "care", **_PARAMS}),
+    "moe": Preset("Soft mixture of encoders (Sodhani et al. 2021, MTRL)", {"encoder": "moe", **_PARAMS}),
+    "film": Preset("Layers scaled and shifted by the task (Perez et al. 2018)", {"encoder": "film", **_PARAMS}),
     "moore": Preset(
-        "Mixture of orthogonal experts (Hendawy et al. 2024)", {"encoder": "moore", "heads": "per-task", **_TOLD}
+        "Mixture of orthogonal experts (Hendawy et al. 2024)", {"encoder": "moore", "heads": "per-task", **_PARAMS}
     ),
-    "soft-modularization": Preset("Modules routed by task (Yang et al. 2020)", {"encoder": "soft-modules", **_TOLD}),
-    "paco": Preset("Parameters composed for each task (Sun et al. 2022)", {"encoder": "paco", **_TOLD}),
+    "soft-modularization": Preset("Modules routed by task (Yang et al. 2020)", {"encoder": "soft-modules", **_PARAMS}),
+    "paco": Preset("Parameters composed for each task (Sun et al. 2022)", {"encoder": "paco", **_PARAMS}),
     "brc": Preset("Bigger, regularised, categorical critics (Nauman et al. 2025)", {}, "mtjax.agents.brc:BRC"),
-    "deepmdp": Preset("SAC on a latent model of the task (Gelada et al. 2019)", {"representation": "deepmdp", **_TOLD}),
+    "deepmdp": Preset(
+        "SAC on a latent model of the task (Gelada et al. 2019)", {"representation": "deepmdp", **_PARAMS}
+    ),
     "hip-bmdp": Preset(
         "DeepMDP with learned hidden parameters (Zhang et al. 2021)",
         {"representation": "hip-bmdp", "conditioning": "embedding", "embedding_size": 50},
     ),
-    "ppo": Preset("Proximal policy optimisation (Schulman et al. 2017), told its task", _TOLD, "mtjax.agents.ppo:PPO"),
-    "pcgrad": Preset("Conflicting gradients projected (Yu et al. 2020)", {"gradients": "pcgrad", **_TOLD}),
-    "cagrad": Preset("Conflict-averse gradients (Liu et al. 2021)", {"gradients": "cagrad", **_TOLD}),
-    "gradnorm": Preset("Weights that even out learning rates (Chen et al. 2018)", {"gradients": "gradnorm", **_TOLD}),
-    "famo": Preset("Weights that even out losses' decrease (Liu et al. 2023)", {"gradients": "famo", **_TOLD}),
+    "ppo": Preset(
+        "Proximal policy optimisation (Schulman et al. 2017), sees its task", _PARAMS, "mtjax.agents.ppo:PPO"
+    ),
+    "pcgrad": Preset("Conflicting gradients projected (Yu et al. 2020)", {"gradients": "pcgrad", **_PARAMS}),
+    "cagrad": Preset("Conflict-averse gradients (Liu et al. 2021)", {"gradients": "cagrad", **_PARAMS}),
+    "gradnorm": Preset("Weights that even out learning rates (Chen et al. 2018)", {"gradients": "gradnorm", **_PARAMS}),
+    "famo": Preset("Weights that even out losses' decrease (Liu et al. 2023)", {"gradients": "famo", **_PARAMS}),
 }
 
 
@@ -70,13 +72,17 @@ def agent(name: str, **given: Any) -> "BaseAgent":
     """
     preset = preset_of(name)
     defaults = dict(preset.defaults)
-    if "encoder" in given:  # another encoder knows nothing of this one's settings
+    if "encoder" in given:  # the preset's settings of another encoder do not apply
         defaults = {k: v for k, v in defaults.items() if k in preset.cls.__dataclass_fields__}
     return load(f"{_BASE}:build")(name, preset.cls, {**defaults, **given})
 
 
 def preset_of(name: str) -> Preset:
-    """Return what ``name`` stands for."""
+    """Return the preset called ``name``.
+
+    Raises:
+        InputError: no agent has that name.
+    """
     if name not in AGENTS:
         raise nearest_error("agent", name, AGENTS)
     return AGENTS[name]

@@ -1,4 +1,4 @@
-"""What all agents share: what their networks are told of a task, how they normalise, and the parts they are made of."""
+"""``BaseAgent`` holds what all agents share: conditioning on the task, normalisation and the parts of an agent."""
 
 import abc
 import dataclasses
@@ -40,19 +40,19 @@ PARTS: dict[str, Mapping[str, type]] = {
     "experience": EXPERIENCES,
 }
 CHOICES = tuple(kind for kind in PARTS if kind != "experience")
-"""The kinds of parts that are chosen by name; an agent's experience is what it learns from, whoever asks."""
-FLAT = tyro.conf.arg(name="")  # a part's fields are flags of the agent's; its name is read before tyro's turn
+"""The kinds of parts that a user chooses by name; the kind of experience follows from the agent."""
+FLAT = tyro.conf.arg(name="")  # a part's fields become flags of the agent; the part is chosen before tyro parses
 
 
 class Memory(NamedTuple):
-    """What an agent remembers of an episode."""
+    """Holds what an agent remembers of an episode."""
 
-    past: Past | None  # the last steps, if the task is inferred from them
-    scaling: Any  # what the scaling of rewards remembers
+    past: Past | None  # the last steps, if the agent infers the task from them
+    scaling: Any  # memory of the scaling of rewards
 
 
 class Pair(NamedTuple):
-    """Something of the actor, and the same of the critics."""
+    """Holds one thing for the actor, and the same for the critics."""
 
     actor: Any
     critic: Any
@@ -60,12 +60,15 @@ class Pair(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class BaseAgent(abc.ABC):
-    """Settings and pieces of every agent. A subclass gives networks, losses and updates.
+    """Provides the settings and methods of every agent; a subclass adds networks, losses and updates.
 
-    Its state is a NamedTuple with at least the fields ``actor``, ``critic`` (beside which lies the representation),
-    ``moments`` of observations (of each task's, leaves (T, O), in a mixture), ``contexts`` (T, C) of training tasks,
-    ``vectors`` (T, V) or None, and what is remembered by the rules of gradient ``surgery``, by the scaling of rewards,
-    ``scales``, and by the sampler of tasks, ``progress``.
+    The state of an agent is a NamedTuple with at least these fields:
+        actor, critic: parameters; those of the representation lie beside the critic's.
+        moments: of observations; in a mixture one for each task, leaves (T, O).
+        contexts: (T, C) of the training tasks.
+        vectors: (T, V) given task vectors, or None.
+        surgery, scales, progress: memories of the rules of gradient surgery, of the scaling of rewards and of the
+            sampler of tasks.
     """
 
     adjustable: ClassVar[tuple[str, ...]] = (
@@ -77,46 +80,46 @@ class BaseAgent(abc.ABC):
         "vectors",
         "tune",
     )
-    """Settings in which fine-tuning may differ from the run: they say how an agent learns, not what it is."""
+    """Settings that fine-tuning may change: they say how an agent learns, not what its networks are."""
     hidden: tuple[int, ...] = (256, 256)
-    """Widths of the hidden layers of actor and critics."""
+    """Widths of the hidden layers in actor and critics."""
     actor_lr: float = 1e-3
-    """Adam's learning rate of the actor."""
+    """Adam's learning rate for the actor."""
     critic_lr: float = 1e-3
-    """Adam's learning rate of the critics."""
+    """Adam's learning rate for the critics."""
     weight_decay: float = 0.0
     """Decoupled weight decay of actor and critics (AdamW)."""
     gamma: float = 0.99
-    """Discount of future reward per step."""
+    """Discount of rewards per step."""
     discounting: Literal["gamma", "horizon"] = "gamma"
-    """How late rewards count: by gamma in every task, or by each task's horizon h as 1 - 5 / h, in [0.95, 0.995]."""
+    """Discount every task by gamma, or each by its own horizon h: 1 - 5 / h, kept in [0.95, 0.995]."""
     normalize_observations: bool = False
-    """Scale observations by their running mean and variance, fitted on training data alone, and clip them to +-10."""
+    """Scale observations to mean 0 and variance 1, by moments of training data alone, and clip them to +-10."""
     max_gradient_norm: float = 0.0
-    """Clip the global norm of actor and critic gradients to this; 0 does not clip."""
+    """Clip the global norms of actor and critic gradients to this; 0 does not clip."""
     critic_layer_norm: bool = True
-    """Layer normalisation in the critics."""
+    """Use layer normalisation in the critics."""
     actor_layer_norm: bool = False
-    """Layer normalisation in the actor."""
+    """Use layer normalisation in the actor."""
     conditioning: Conditioning = "none"
-    """What the networks are told of the task: none, one-hot, embedding (learned), parameters (the task's context),
-    vectors (rows of a file) or inferred (from the last steps, by an encoder of trajectories). For one-hot, embedding
-    and vectors, an unseen task is taken for its nearest neighbour."""
+    """Features of the task that the networks take as inputs: none, one-hot, embedding (learned), parameters (the task's
+    context), vectors (rows of a file) or inferred (from the last steps, by a trajectory encoder). With one-hot,
+    embedding and vectors, an unseen task uses those of the nearest training task."""
     embedding_size: int = 16
-    """Width of learned task embeddings, and of what is inferred."""
+    """Size of learned task embeddings, and of inferred features."""
     unit_embedding: bool = False
     """Scale learned task embeddings to length 1."""
     vectors: str = ""
-    """A .npy file of task vectors (T, V), a row for every training task, for conditioning on vectors."""
+    """A .npy file of task vectors (T, V), one row for each training task, for conditioning=vectors."""
     inferred_from: int = 8
-    """Steps from which the task is inferred, if it is; they are stored with every transition."""
+    """Number of last steps from which the task is inferred; they are stored with every transition."""
     heads: Heads = "shared"
-    """What a task has for itself: nothing (shared), output layers (per-task) or whole networks (disjoint)."""
+    """What each task has for itself: nothing (shared), output layers (per-task) or whole networks (disjoint)."""
     gradient_scope: Literal["shared", "per-layer"] = "shared"
-    """Combine the tasks' gradients over all shared parameters at once, or for each layer by its own."""
+    """Weigh the tasks' gradients once for all shared parameters, or separately in each layer."""
     tune: Annotated[Tune, tyro.conf.arg(name="tune", prefix_name=False)] = "all"
     """Which parameters of actor and critics learn: all, heads (output layers) or embedding (learned task embeddings).
-    The others stay as the run left them that --from names."""
+    The others keep their values from the run that --from names."""
     representation: Annotated[Representation, FLAT] = dataclasses.field(default_factory=Representation)
     encoder: Annotated[Encoder, FLAT] = dataclasses.field(default_factory=Encoder)
     gradients: Annotated[surgery.Rule, FLAT] = dataclasses.field(default_factory=surgery.Rule)
@@ -133,15 +136,15 @@ class BaseAgent(abc.ABC):
 
     @abc.abstractmethod
     def init(self, spec: Spec, tasks: Task, key: Key) -> Any:
-        """Return the state for the training ``tasks`` (T, ...)."""
+        """Return the initial state for the training ``tasks`` (T, ...)."""
 
     @abc.abstractmethod
-    def init_networks(self, num_tasks: int, told: Array, obs: Any, action: Array, key: Key) -> Pair:
-        """Initialise actor and critics for inputs of the given shapes, (Z,), (O,) and (A,)."""
+    def init_networks(self, num_tasks: int, features: Array, obs: Any, action: Array, key: Key) -> Pair:
+        """Initialise actor and critics for features (Z,), an observation (O,) and an action (A,) of these shapes."""
 
     @abc.abstractmethod
     def act(self, state: Any, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
-        """Choose an action (A,) for one observation (O,) of one task; no key: the mean action."""
+        """Choose an action (A,) for one observation (O,) of one task; without a key, the mean action."""
 
     # Settings that cannot be used.
 
@@ -181,13 +184,13 @@ class BaseAgent(abc.ABC):
     # Networks.
 
     def network(self, layer_norm: bool) -> Network:
-        """The body and head that the settings ask for."""
+        """Return a network of the body and heads that the settings ask for."""
         own = {"shared": (), "per-task": ("head",), "disjoint": ("trajectory", "body", "head")}[self.heads]
         body = self.encoder.body(self.hidden, layer_norm)
-        if self.representation.learns:  # also what is learned of tasks, for all networks
+        if self.representation.learns:  # it also holds the task embeddings of all networks
             return Network(body, own)
         embedding = self.embedding_size if self.conditioning == "embedding" else 0
-        inference = TrajectoryEncoder(self.embedding_size, layer_norm=layer_norm) if self.history else None
+        inference = TrajectoryEncoder(self.embedding_size, layer_norm=layer_norm) if self.history_length else None
         return Network(body, own, embedding, self.unit_embedding, self.encoder.front(), inference)
 
     @property
@@ -199,8 +202,8 @@ class BaseAgent(abc.ABC):
         return self.network(self.critic_layer_norm)
 
     @property
-    def sight(self) -> Representation:
-        """The representation, as it stands under these networks."""
+    def placed_representation(self) -> Representation:
+        """A copy of the representation that knows the agent's settings."""
         place = Place(
             self.conditioning,
             self.embedding_size,
@@ -210,33 +213,33 @@ class BaseAgent(abc.ABC):
         )
         return self.representation.at(place)
 
-    def look(self, critic: Params, told: Array, obs: Any) -> tuple[Array, Any]:
-        """What one task's actor is told (Z,) and sees (..., O), through a representation that it does not train."""
-        return jax.lax.stop_gradient(self.sight.perceive(critic, told, obs))
+    def actor_inputs(self, critic: Params, features: Array, obs: Any) -> tuple[Array, Any]:
+        """Return features (Z,) and inputs (..., O) of one task's actor; no gradient reaches the representation."""
+        return jax.lax.stop_gradient(self.placed_representation.perceive(critic, features, obs))
 
     @property
     def network_optimizers(self) -> Pair:
-        """Adam for the actor, and for the critics with the representation beside them."""
+        """Optimisers for the actor, and for the critics with their representation."""
         chosen = partial(descent.adam, weight_decay=self.weight_decay, max_norm=self.max_gradient_norm, tune=self.tune)
         return Pair(chosen(self.actor_lr), chosen(self.critic_lr))
 
     def init_common(self, spec: Spec, tasks: Task, key: Key) -> dict[str, Any]:
-        """Initialise what the states of all agents have for the training ``tasks`` (T, ...): fields by name."""
+        """Initialise the fields that all agents' states have, by name, for the training ``tasks`` (T, ...)."""
         num_tasks = len(tasks.id)
         vectors, moments = self.load_vectors(num_tasks), self.init_moments(spec, num_tasks)
-        told = conditioning.features(self.conditioning, num_tasks, jnp.int32(0), tasks.context[0], vectors)
+        features = conditioning.features(self.conditioning, num_tasks, jnp.int32(0), tasks.context[0], vectors)
         obs, action = self.example(spec, moments), jnp.zeros(spec.action_size)
-        basis = self.sight.init(num_tasks, told, obs, action, key)
-        actor, critic = self.init_networks(num_tasks, basis.told, basis.obs, action, basis.key)
+        basis = self.placed_representation.init(num_tasks, features, obs, action, key)
+        actor, critic = self.init_networks(num_tasks, basis.features, basis.obs, action, basis.key)
         critic = critic.beside(basis.params)
-        remembered = lambda rule, params: surgery.init(rule, params, num_tasks, self.per_layer)
+        rule_memory = lambda rule, params: surgery.init(rule, params, num_tasks, self.per_layer)
         return {
             "actor": actor,
             "critic": critic,
             "moments": moments,
             "contexts": tasks.context,
             "vectors": vectors,
-            "surgery": Pair(remembered(self.gradients.for_actor, actor), remembered(self.gradients, critic)),
+            "surgery": Pair(rule_memory(self.gradients.for_actor, actor), rule_memory(self.gradients, critic)),
             "scales": self.scaling.init(num_tasks),
             "progress": self.sampler.init(num_tasks),
         }
@@ -246,137 +249,137 @@ class BaseAgent(abc.ABC):
         """Whether gradients are combined layer by layer."""
         return self.gradient_scope == "per-layer"
 
-    # What the networks see: observations, and what they are told of the task.
+    # Inputs of the networks: observations, and features of the task.
 
     @property
-    def history(self) -> int:
-        """How many past steps the agent sees beside each observation."""
+    def history_length(self) -> int:
+        """Number of past steps that the networks take beside each observation."""
         return self.inferred_from if self.conditioning == "inferred" or self.representation.looks_back else 0
 
     def init_moments(self, spec: Spec, num_tasks: int) -> normalize.Moments:
-        """Moments of no observations; in a mixture each task has its own, leaves (T, O)."""
+        """Return moments of no observations; in a mixture each task has its own, leaves (T, O)."""
         moments = normalize.init(spec.obs_size)
         return jax.tree.map(lambda x: jnp.stack([x] * num_tasks), moments) if spec.mixed else moments
 
     def fit_moments(self, moments: normalize.Moments, obs: Array) -> normalize.Moments:
-        """Take observations (T, B, O) of training tasks into account, if they are to be normalised."""
+        """Add observations (T, B, O) of training tasks to the moments, if observations are normalised."""
         if not self.normalize_observations:
             return moments
         update = jax.vmap(normalize.update) if moments.mean.ndim > 1 else normalize.update
         return update(moments, obs)
 
     def see(self, moments: normalize.Moments, obs: Array, past: Past | None = None) -> Any:
-        """Observations (..., O) of one task as networks take them: normalised, and with the past if they see any."""
+        """Return observations (..., O) of one task as networks take them: normalised, and with the past if given."""
         scaled = partial(normalize.apply, moments) if self.normalize_observations else lambda obs: obs
         return scaled(obs) if past is None else Seen(scaled(obs), past._replace(obs=scaled(past.obs)))
 
     def see_batch(self, moments: normalize.Moments, obs: Array, past: Past | None = None) -> Any:
-        """Observations (T, B, O) of all training tasks as networks take them."""
+        """Return observations (T, B, O) of all training tasks as networks take them."""
         return (jax.vmap(self.see) if moments.mean.ndim > 1 else self.see)(moments, obs, past)
 
     def moments_of(self, state: Any, known: Array) -> normalize.Moments:
-        """The moments of one training task's observations."""
+        """Return the moments of one training task's observations."""
         mixed = state.moments.mean.ndim > 1
         return jax.tree.map(lambda x: x[known], state.moments) if mixed else state.moments
 
     def example(self, spec: Spec, moments: normalize.Moments) -> Any:
-        """What networks see, all zero."""
+        """Return an input of networks that is all zero."""
         moments = jax.tree.map(lambda x: x[0], moments) if spec.mixed else moments
-        past = trajectory.begin(self.history, spec.obs_size, spec.action_size) if self.history else None
+        past = trajectory.begin(self.history_length, spec.obs_size, spec.action_size) if self.history_length else None
         return self.see(moments, jnp.zeros(spec.obs_size), past)
 
     def load_vectors(self, num_tasks: int) -> Array | None:
-        """Read the task vectors (T, V), if there are any."""
+        """Read the task vectors (T, V) from their file; None if there is none."""
         return conditioning.load_vectors(self.vectors, num_tasks) if self.vectors else None
 
     def known_task(self, state: Any, task: Task) -> Array:
-        """The training task () int32 whose head, embedding or number stands for ``task``: itself, or the nearest."""
+        """Return the number () int32 of ``task`` if it is a training task, else of the nearest training task."""
         distance = jnp.sum(jnp.square(state.contexts - task.context), axis=-1)
-        if task.blocks is not None:  # another family's task is no neighbour
+        if task.blocks is not None:  # only a task of the same family can be nearest
             distance = jnp.where(task.blocks.related(state.contexts, task.context), distance, jnp.inf)
         nearest = jnp.argmin(distance).astype(jnp.int32)
         return jnp.where(task.id < len(state.contexts), task.id, nearest)
 
     def nearest_tasks(self, state: Any, tasks: Task) -> Array:
-        """The training tasks (T,) that are nearest to ``tasks`` (T, ...), whoever these are."""
-        strangers = tasks._replace(id=jnp.full_like(tasks.id, len(state.contexts)))
-        return jax.vmap(partial(self.known_task, state))(strangers)
+        """Return the training tasks (T,) nearest to ``tasks`` (T, ...), for training tasks too by their contexts."""
+        unseen = tasks._replace(id=jnp.full_like(tasks.id, len(state.contexts)))
+        return jax.vmap(partial(self.known_task, state))(unseen)
 
     def features(self, state: Any, task: Task) -> Array:
-        """What the networks are told of one task (Z,)."""
+        """Return the features (Z,) of one task that networks take as inputs."""
         known = self.known_task(state, task)
         return conditioning.features(self.conditioning, len(state.contexts), known, task.context, state.vectors)
 
     def features_of_batch(self, state: Any, batch: Transition, tasks: Task) -> Array:
-        """What the networks are told of a batch's tasks: (T, Z), or (T, B, Z) where each episode has its own."""
+        """Return the features of a batch's tasks: (T, Z), or (T, B, Z) where each episode has its own."""
         if batch.context is not None and self.conditioning == "parameters":
             return batch.context
         return jax.vmap(partial(self.features, state))(tasks)
 
     def of_task(self, state: Any, task: Task, *networks: Params) -> tuple[Params, ...]:
-        """Networks as one task uses them."""
+        """Select one task's parameters from networks of all tasks."""
         known = self.known_task(state, task)
         return tuple(Params(net.shared, jax.tree.map(lambda x: x[known], net.own)) for net in networks)
 
-    def situation(self, state: Any, memory: Memory, obs: Any, task: Task) -> tuple[Params, Params, Array, Any]:
-        """Actor and critics as one task uses them to act, what they are told (Z,), and an observation (O,) as seen."""
+    def acting_inputs(self, state: Any, memory: Memory, obs: Any, task: Task) -> tuple[Params, Params, Array, Any]:
+        """Return what one task needs to act: actor, critics, task features (Z,) and the observation (O,) as input."""
         actor, critic = self.of_task(state, task, state.actor, state.critic)
-        seen = self.see(self.moments_of(state, self.known_task(state, task)), obs, memory.past)
-        critic = self.sight.stand_in(critic, state.critic, task.id < len(state.contexts), seen)
-        return actor, critic, self.features(state, task), seen
+        inputs = self.see(self.moments_of(state, self.known_task(state, task)), obs, memory.past)
+        critic = self.placed_representation.stand_in(critic, state.critic, task.id < len(state.contexts), inputs)
+        return actor, critic, self.features(state, task), inputs
 
     def discounts(self, tasks: Task) -> float | Array:
-        """The discount of each task (T,), or one for all."""
+        """Return the discount of each task (T,), or one for all."""
         if self.discounting == "gamma":
             return self.gamma
         return jnp.clip(1 - 5 / tasks.horizon, 0.95, 0.995)
 
     @property
     def borrowed(self) -> list[str]:
-        """What a task that was not trained on has of its nearest training task."""
+        """Names of what a task that was not trained on uses of its nearest training task."""
         found = {"shared": [], "per-task": ["head"], "disjoint": ["networks"]}[self.heads]
         found += ["input layer"] * (self.encoder.front() is not None)
         return self.representation.borrowed(found + conditioning.BORROWED.get(self.conditioning, []))
 
     @property
     def unseen(self) -> str:
-        """What stands for a task that was not trained on; empty if its own parameters, or nothing, do."""
+        """A sentence on what stands in for unseen tasks; empty if nothing has to."""
         borrowed, replaced = " and ".join(self.borrowed), self.representation.replaced
-        said = (f"each uses the {borrowed} of the nearest training task", f"each has {replaced}")
-        return ", and ".join(text for text, there in zip(said, (borrowed, replaced), strict=True) if there)
+        texts = (f"each uses the {borrowed} of the nearest training task", f"each has {replaced}")
+        return ", and ".join(text for text, present in zip(texts, (borrowed, replaced), strict=True) if present)
 
-    # Memory of an episode, and watching all of them.
+    # Memory of an episode, and statistics of all episodes.
 
     def begin(self, state: Any, task: Task) -> Memory:
-        """The memory with which an episode begins."""
-        sizes = (state.moments.mean.shape[-1], self.action_size(state)) if self.history else ()
-        past = trajectory.begin(self.history, *sizes) if self.history else None
+        """Return the memory with which an episode begins."""
+        sizes = (state.moments.mean.shape[-1], self.action_size(state)) if self.history_length else ()
+        past = trajectory.begin(self.history_length, *sizes) if self.history_length else None
         return Memory(past, self.scaling.begin())
 
     def action_size(self, state: Any) -> int:
-        """The size A of actions, as the actor's head has 2 A outputs."""
+        """Return the size A of actions; the actor's head has 2 A outputs."""
         head = {**state.actor.shared, **state.actor.own}["head"]
         return head["bias"].shape[-1] // 2
 
     def remember(self, state: Any, memory: Memory, transition: Transition, task: Task) -> Memory:
-        """The memory after a step."""
+        """Return the memory after a step."""
         past = memory.past
         if past is not None:
             past = trajectory.append(past, transition.obs, transition.action, transition.reward)
         return Memory(past, self.scaling.remember(memory.scaling, transition.reward, self.discounts(task)))
 
     def relabel(self, env: Env, task: Task, transition: Transition, key: Key) -> Transition:
-        """Return a transition of another task as ``task`` would have had it, what is remembered included."""
+        """Return a transition of another task as it would have been in ``task``; its past steps change too."""
         one = lambda transition: env.relabel(task, transition, key)  # type: ignore
         return one(transition) if transition.extras is None else trajectory.relabel(one, transition)
 
     @property
     def watches(self) -> bool:
-        """Whether the agent wants to see the stream of outcomes."""
+        """Whether ``observe`` has to be called with the outcomes of every step."""
         return self.scaling.watches or self.sampler.watches
 
     def observe(self, state: Any, outcome: Outcome) -> Any:
-        """Take note of what one step of every environment brought, leaves (T, E)."""
+        """Update the statistics by the outcomes of one step of every environment, leaves (T, E)."""
         scales = self.scaling.observe(state.scales, outcome)
         return state._replace(scales=scales, progress=self.sampler.observe(state.progress, outcome))
 
@@ -384,11 +387,11 @@ class BaseAgent(abc.ABC):
 
     @property
     def least_loss(self) -> float | Array:
-        """The least that a task's critic loss can be: that of critics, which is 0, and of the representation."""
+        """Lower bound of a task's critic loss: 0 for the critics, plus that of the representation."""
         return self.representation.least_loss
 
     def above_least(self, critic_loss: Callable) -> Callable:
-        """A critic loss of one task as far as it lies above the least, which rules that look at losses are given."""
+        """Subtract the lower bound from a critic loss of one task, for rules of surgery that compare losses."""
 
         def loss(critic: Params, data: Any) -> tuple[Array, Metrics]:
             value, metrics = critic_loss(critic, data)
@@ -397,31 +400,31 @@ class BaseAgent(abc.ABC):
         return loss
 
     def learn(self, env: Env, states: Any, data: Any, tasks: Task, keys: Key) -> tuple[Any, Metrics]:
-        """Learn from experience, for all seeds at once: leaves (S, ...)."""
+        """Update the agents of all seeds, leaves (S, ...), from their experience."""
         return self.experience.learn(env, self, states, data, tasks, keys)
 
 
 def kinds_of(agent: Any) -> list[str]:
-    """The kinds of parts that an agent, or a class of agents, has."""
+    """List the kinds of parts that an agent, or a class of agents, has."""
     return [field.name for field in dataclasses.fields(agent) if field.name in PARTS]
 
 
 def flag_names(agent: Any) -> dict[str, str]:
-    """Return the command-line flag, without dashes, of each of an agent's settings, by the setting's name."""
+    """Map the name of each of an agent's settings to its command-line flag, without dashes."""
     bare = {name for holder in (agent, agent.experience) for name in _unprefixed(type(holder))}
     names = {name: name.replace("_", "-") for name in settings(agent) if name != "experience"}
     return {name: flag if name in bare else f"agent.{flag}" for name, flag in names.items()}
 
 
 def _unprefixed(cls: type) -> list[str]:
-    """The settings of a class whose flags do not begin with those of the agent's."""
+    """List the settings of a class whose flags have no prefix ``agent.``."""
     hints = get_type_hints(cls, include_extras=True)
     marks = {name: getattr(hint, "__metadata__", ()) for name, hint in hints.items()}
     return [name for name, found in marks.items() if any(getattr(x, "prefix_name", None) is False for x in found)]
 
 
 def settings(agent: Any) -> dict[str, Any]:
-    """Return all of an agent's settings in one flat table: parts by name, and their own settings after them."""
+    """Return all of an agent's settings in one flat table: each part by name, followed by the part's settings."""
     found = {}
     for name, value in parts.settings(agent).items():
         found |= {name: parts.name_of(PARTS[name], value), **parts.settings(value)} if name in PARTS else {name: value}
@@ -429,7 +432,7 @@ def settings(agent: Any) -> dict[str, Any]:
 
 
 def replace(agent: Any, given: Mapping[str, Any]) -> Any:
-    """Return an agent with given settings, its own or its parts', in place of what it has.
+    """Return a copy of an agent with other settings, of its own or of its parts.
 
     Raises:
         InputError: it has no such setting, or the value is not allowed.

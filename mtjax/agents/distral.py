@@ -1,4 +1,4 @@
-"""Distral: every task its own policy, held together by one that is distilled from them all."""
+"""Distral gives every task its own policy, and keeps these near one policy that is distilled from all."""
 
 import dataclasses
 from typing import Any, ClassVar
@@ -15,10 +15,10 @@ from mtjax.types import Array, InputError, Key, Metrics
 
 @dataclasses.dataclass(frozen=True)
 class Policies(Network):
-    """A network for every task and, beside it, one of the same shape that is shared by all: the distilled policy."""
+    """Holds a network for every task, and one of the same shape that all tasks share: the distilled policy."""
 
     def init(self, key: Key, num_tasks: int, out: int, features: Array, *inputs: Array) -> Params:
-        """Initialise the distilled policy, and every task's as a copy of it: random ones would be worlds apart."""
+        """Initialise the distilled policy, and every task's policy as a copy, so that all begin with divergence 0."""
         distilled = self._distilled.init(key, num_tasks, out, features, *inputs)
         own = jax.tree.map(lambda x: jnp.repeat(x[None], num_tasks, axis=0), distilled.shared)
         again = jax.tree.map(jnp.copy, distilled.own)
@@ -37,33 +37,34 @@ class Policies(Network):
 
 @dataclasses.dataclass(frozen=True)
 class Distral(SAC):
-    """Distill and transfer (Teh et al. 2017, "KL + ent 1 col"), on soft actor-critic.
+    """Distral distills and transfers policies (Teh et al. 2017, "KL + ent 1 col"), on soft actor-critic.
 
     Task i has a policy pi_i and critics of its own, and all share a distilled policy pi_0. The paper's equation 1,
         J = sum_i E_{pi_i} sum_t gamma^t (r_i - c_KL log(pi_i / pi_0) - c_Ent log pi_i),
-    is with alpha = c_KL / (c_KL + c_Ent) and 1 / beta = c_KL + c_Ent
+    is, with alpha = c_KL / (c_KL + c_Ent) and 1 / beta = c_KL + c_Ent,
         J = sum_i E_{pi_i} sum_t gamma^t (r_i + alpha / beta log pi_0 - 1 / beta log pi_i)          (equation 2)
-    in which SAC's temperature a_i takes the place of 1 / beta:
+    SAC's temperature a_i takes the place of 1 / beta:
         y = r + discount gamma (min_n Qbar_n(s', a') - a_i (log pi_i(a'|s') - alpha log pi_0(a'|s')))   (critic target)
         L_pi_i = a_i (log pi_i(a|s) - alpha log pi_0(a|s)) - min_n Q_n(s, a),  a ~ pi_i(s)              (actor loss)
         L_pi_0 = -log pi_0(a|s),  a ~ pi_i(s), summed over tasks                                        (distillation)
-    each on the data of task i alone. The actor loss reaches pi_i also by the action in log pi_0, but not pi_0's
-    parameters; distillation reaches these alone, and minimises KL(pi_i || pi_0) over them. Temperatures are tuned as
-    SAC's, on the entropy of pi_i, so that c_KL = alpha a_i and c_Ent = (1 - alpha) a_i; alpha = 0 is one SAC for every
-    task, watched by pi_0. ``kl`` in the metrics is the mean of KL(pi_i || pi_0) over the batch's observations.
+    each on the data of task i alone. The gradient of L_pi_i passes through the action in log pi_0 to pi_i, and does not
+    change pi_0. The gradient of L_pi_0 changes pi_0 alone, and minimises KL(pi_i || pi_0). Temperatures are tuned as in
+    SAC, on the entropy of pi_i, so that c_KL = alpha a_i and c_Ent = (1 - alpha) a_i. With alpha = 0, every task has
+    its own SAC, and pi_0 only imitates. The metric ``kl`` is the mean of KL(pi_i || pi_0) over the batch's
+    observations.
 
-    Training tasks are played by their own policies, others by the distilled one. As in the paper no policy is told its
-    task; with another conditioning all are, pi_0 too.
+    Training tasks use their own policies, other tasks the distilled one. By default, as in the paper, no policy sees
+    features of its task; with another conditioning all do, pi_0 too.
 
-    Differs from the paper: all policies begin as one, where their divergence is zero; off-policy, with critics in place
-    of returns and temperatures that are tuned. The paper's distillation is weighed by c_KL, which Adam forgets, and
-    discounts late steps. Its two-column policies, of which pi_0 is one column, are not here.
+    Differs from the paper: all policies begin equal, with divergence 0; learning is off-policy, with critics in place
+    of returns, and temperatures are tuned. The paper weighs distillation by c_KL, which makes no difference under Adam,
+    and discounts late steps. Its two-column policies are not implemented.
     """
 
     adjustable: ClassVar[tuple[str, ...]] = (*SAC.adjustable, "distral_alpha")
     heads: Heads = "disjoint"
     distral_alpha: float = 0.5
-    """Share of the distilled policy in what a policy pays for: 0 is none, 1 leaves no entropy bonus."""
+    """Share of the divergence from the distilled policy in the regulariser; the rest is entropy (alpha)."""
 
     def __post_init__(self):
         super().__post_init__()
@@ -87,7 +88,7 @@ class Distral(SAC):
 
     @property
     def unseen(self) -> str:
-        """What plays a task that was not trained on."""
+        """A sentence on what stands in for unseen tasks."""
         rest = [part for part in self.borrowed if part != "networks"]
         return "the distilled policy plays them" + (f", by the {' and '.join(rest)} of the nearest" if rest else "")
 
@@ -101,8 +102,8 @@ class Distral(SAC):
         return jnp.where(trained, own, self.actor.apply_distilled(actor, features, obs))
 
     def sample(self, actor: Params, critic: Params, batch: Batch, obs: Any, key: Key) -> Sample:
-        raw, log_prob = sample_raw(self.policy(actor, critic, batch.told, obs), key, batch.mask)
-        distilled = self.actor.apply_distilled(jax.lax.stop_gradient(actor), batch.told, obs)
+        raw, log_prob = sample_raw(self.policy(actor, critic, batch.features, obs), key, batch.mask)
+        distilled = self.actor.apply_distilled(jax.lax.stop_gradient(actor), batch.features, obs)
         cost = log_prob - self.distral_alpha * log_density(distilled, raw, batch.mask)
         action = jnp.tanh(raw)
         return Sample(action if batch.mask is None else action * batch.mask, log_prob, cost)
@@ -110,8 +111,8 @@ class Distral(SAC):
     def actor_loss(self, actor: Params, data: tuple[Batch, Params, Key]) -> tuple[Array, Metrics]:
         loss, metrics = super().actor_loss(actor, data)
         batch, critic, key = data
-        own = self.policy(actor, critic, batch.told, batch.obs)
+        own = self.policy(actor, critic, batch.features, batch.obs)
         raw, _ = sample_raw(own, key)  # the actions of that loss
-        distilled = self.actor.apply_distilled(actor, batch.told, batch.obs)
+        distilled = self.actor.apply_distilled(actor, batch.features, batch.obs)
         fit = jnp.mean(log_density(distilled, jax.lax.stop_gradient(raw), batch.mask))
         return loss - fit, {**metrics, "kl": jnp.mean(divergence(own, distilled, batch.mask))}

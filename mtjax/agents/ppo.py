@@ -1,4 +1,4 @@
-"""Proximal policy optimisation over many tasks at once."""
+"""PPO trains by proximal policy optimisation on many tasks at once."""
 
 import dataclasses
 from collections.abc import Callable
@@ -29,97 +29,97 @@ from mtjax.networks import (
 from mtjax.parallel import collectives
 from mtjax.types import Acted, Array, InputError, Key, Metrics, Spec, Task, Transition
 
-FARTHEST = 20.0
-"""Logarithms of the ratio of two policies are kept within this, as its exponential must stay finite."""
-LEAST_STD = 1e-4
-"""Of targets and of advantages, by which they are divided."""
-FIRST_HEAD = 0.01
-"""Scale of the output layers' first weights: policies begin as one, and values at zero."""
+LOG_RATIO_LIMIT = 20.0
+"""Bound of |log ratio| of two policies, so that its exponential stays finite."""
+MIN_STD = 1e-4
+"""Lower bound of standard deviations of targets and advantages, which divide them."""
+HEAD_SCALE = 0.01
+"""Factor of the output layers' initial weights: all policies begin nearly equal, and values near zero."""
 
 
 class Units(NamedTuple):
-    """In what the critic counts: a value v is mean + std times its output."""
+    """Holds the units of the critic: a value is mean + std times its output."""
 
-    count: Array  # () rollouts seen
+    count: Array  # () number of rollouts so far
     mean: Array  # (T,)
     variance: Array  # (T,)
 
     @property
     def std(self) -> Array:
-        return jnp.maximum(jnp.sqrt(self.variance), LEAST_STD)
+        return jnp.maximum(jnp.sqrt(self.variance), MIN_STD)
 
 
 class PPOState(NamedTuple):
-    """Everything PPO learns, and what it remembers of the training tasks."""
+    """Holds everything that PPO learns, and what it remembers of the training tasks."""
 
     actor: Params
     critic: Params  # beside it the representation
     optimizers: Pair
     moments: normalize.Moments
-    contexts: Array  # (T, C) of the training tasks, among which an unseen task finds its nearest
+    contexts: Array  # (T, C) of the training tasks; an unseen task finds its nearest among them
     vectors: Array | None  # (T, V) given task vectors, if conditioned on them
     surgery: Pair
-    scales: Any  # what the scaling of rewards remembers
-    progress: Any  # what the sampler of tasks remembers
+    scales: Any  # memory of the scaling of rewards
+    progress: Any  # memory of the sampler of tasks
     units: Units
 
 
 class Taken(NamedTuple):
-    """What is noted of an action when it is taken."""
+    """Holds what is stored with an action when it is taken."""
 
-    raw: Array  # (A,) it, before the tanh
-    log_prob: Array  # () under the policy that took it
-    past: Past | None  # the steps before it, if the task is inferred from them
+    raw: Array  # (A,) the action before the tanh
+    log_prob: Array  # () its log-probability under the policy that took it
+    past: Past | None  # the steps before it, if the agent infers the task from them
 
 
 class Batch(NamedTuple):
-    """What the losses of one task see; of all tasks, leaves (T, ...)."""
+    """Holds the data for the losses of one task; for all tasks, leaves are (T, ...)."""
 
     obs: Any  # (B, O) as the networks take them
     raw: Array  # (B, A) actions before the tanh
-    log_prob: Array  # (B,) under the policy that took them
+    log_prob: Array  # (B,) their log-probabilities under the policy that took them
     advantage: Array  # (B,)
-    value: Array  # (B,) what the critic said before the update, in its units
-    target: Array  # (B,) what it should say
-    told: Array  # (Z,) or (B, Z), what the networks are told of the task
-    mask: Array | None  # (A,) 1 for actions that the task has; None: it has all
-    # What the representation learns from, if it does.
+    value: Array  # (B,) the critic's values before the update, in its units
+    target: Array  # (B,) the critic's targets, in its units
+    features: Array  # (Z,) or (B, Z) features of the task, which networks take as inputs
+    mask: Array | None  # (A,) 1 for actions that the task has, else 0; None: it has all
+    # For a representation that learns.
     action: Array | None = None  # (B, A)
     reward: Array | None = None  # (B,) in the task's units
     next_obs: Any = None  # (B, O)
-    ahead: Any = None  # what its models fit
+    model_targets: Any = None  # targets of its models
 
 
 @dataclasses.dataclass(frozen=True)
 class PPO(BaseAgent):
-    """Multi-task proximal policy optimisation (Schulman et al. 2017), with an actor and a critic apart.
+    """PPO trains by multi-task proximal policy optimisation, with separate actor and critic (Schulman et al. 2017).
 
-    H steps of every environment are played by one policy pi_old. At each of task i, with s' the true next observation,
-    d = 0 where the episode terminated and e = 1 where it ended, be it by its time limit:
+    The policy pi_old plays H steps of every environment. For each step of task i, with s' the true next observation,
+    d = 0 if the episode terminated, and e = 1 if it ended, by a time limit too:
         delta_t = r_t + gamma_i d_t V(s'_t) - V(s_t)                                        (error of the critic)
         A_t = delta_t + gamma_i lambda (1 - e_t) A_(t+1),  A_H = 0                          (advantage)
         y_t = A_t + V(s_t)                                                                  (target)
-    Then, for some epochs, the steps are shuffled and dealt out to minibatches, each with as many of every task. With
+    In each epoch the steps are shuffled and split into minibatches, with the same number of steps of every task. With
     ratio = pi(a|s) / pi_old(a|s):
         L_pi = -min(ratio A, clip(ratio, 1 - epsilon, 1 + epsilon) A) - c H(pi(s))          (actor loss)
         L_V = (V(s) - y)^2 / 2                                                              (critic loss)
-    averaged over a task's minibatch, then over tasks. Advantages are brought to mean 0 and standard deviation 1 in each
-    task. The critic counts in units of each task, V = m_i + s_i V', with m_i and s_i moving estimates of the mean and
-    the standard deviation of the task's targets; with PopArt its heads follow them, so that V stays as it was (van
-    Hasselt et al. 2016, Hessel et al. 2019):
+    averaged over a task's minibatch, then over tasks. Advantages are scaled to mean 0 and standard deviation 1 in each
+    task. The critic's output V' is in units of each task, V = m_i + s_i V', with moving estimates m_i and s_i of the
+    mean and the standard deviation of the task's targets. With PopArt the heads are rescaled when these move, so that V
+    does not change (van Hasselt et al. 2016, Hessel et al. 2019):
         kernel' = kernel s / s',  bias' = (s bias + m - m') / s'
 
-    A policy is a tanh-squashed Gaussian, whose entropy is estimated by one action. Where ``kl_limit`` is given, the
-    actor rests for what is left of an update as soon as mean(ratio - 1 - log ratio), an estimate of KL(pi_old | pi), is
-    beyond it on a minibatch.
+    The policy is a tanh-squashed Gaussian; its entropy is estimated from one sample. With a ``kl_limit``, the actor is
+    not updated for the rest of an update once mean(ratio - 1 - log ratio), an estimate of KL(pi_old | pi), exceeds it
+    on a minibatch.
 
-    A representation that learns (``representation``) is trained by L_V and its own losses on the same minibatches. What
-    its models foretell is seen by the encoder from before the update, as values are by the critic from before it; that
-    is the slow copy, so that ``encoder_tau`` counts for nothing here.
+    A representation that learns (``representation``) is trained by L_V and its own losses on the same minibatches. Its
+    target encoder is the encoder from before the update, as values are the critic's from before the update; so
+    ``encoder_tau`` has no effect here.
 
-    Differs from the paper: networks share nothing, so that there is no weight of the critic's loss; advantages and
-    values are normalised; a time limit bootstraps, as nothing ended there; observations are normalised by moments that
-    include the rollout's, which the ratio counts as a change of the policy, and so it does a representation's steps.
+    Differs from the paper: actor and critic share no parameters, so that the critic's loss needs no weight; advantages
+    and values are normalised; time limits bootstrap; observations are normalised by moments that include the rollout's
+    own. The ratio counts that last change, and a representation's steps, as changes of the policy.
     """
 
     adjustable: ClassVar[tuple[str, ...]] = (
@@ -127,40 +127,40 @@ class PPO(BaseAgent):
         *("gae_lambda", "epochs", "minibatches", "clip_range", "value_clip", "entropy_cost", "kl_limit", "value_rate"),
     )
     actor_lr: float = 3e-4
-    """Adam's learning rate of the actor."""
+    """Adam's learning rate for the actor."""
     critic_lr: float = 1e-3
-    """Adam's learning rate of the critic."""
+    """Adam's learning rate for the critic."""
     normalize_observations: bool = True
-    """Scale observations by their running mean and variance, fitted on training data alone, and clip them to +-10."""
+    """Scale observations to mean 0 and variance 1, by moments of training data alone, and clip them to +-10."""
     max_gradient_norm: float = 1.0
-    """Clip the global norm of actor and critic gradients to this; 0 does not clip."""
+    """Clip the global norms of actor and critic gradients to this; 0 does not clip."""
     critic_layer_norm: bool = False
-    """Layer normalisation in the critic."""
+    """Use layer normalisation in the critic."""
     gae_lambda: float = 0.95
-    """Share of the advantage of the next step in that of a step (lambda): 0 trusts the critic, 1 the returns."""
+    """Lambda of generalised advantages: 0 relies on the critic alone, 1 on the rewards of the rollout."""
     epochs: int = 4
-    """How often an update goes through the rollout."""
+    """Passes over the rollout in each update."""
     minibatches: int = 8
-    """Gradient steps in which it does; what does not divide evenly is left out, other steps each time."""
+    """Minibatches in each pass; steps that do not divide evenly are left out, other ones in each pass."""
     clip_range: float = 0.2
-    """How far the ratio of policies may lead away from 1 (epsilon)."""
+    """Clip the ratio of policies to this distance from 1 (epsilon)."""
     value_clip: float = 0.0
-    """How far values may move in an update, in standard deviations of the targets; 0 for any."""
+    """Clip the change of values in an update to this, in standard deviations of the targets; 0 does not clip."""
     entropy_cost: float = 1e-2
-    """What entropy is worth, in standard deviations of the advantage (c)."""
+    """Weight of the entropy in the actor loss (c), in standard deviations of the advantage."""
     kl_limit: float = 0.0
-    """Divergence from the policy that acted beyond which the actor rests until the next rollout; 0 for none."""
+    """Stop updating the actor until the next rollout once KL(pi_old | pi) exceeds this; 0 never stops."""
     initial_std: float = 0.7
-    """Standard deviation of actions, before the tanh, with which policies begin."""
+    """Standard deviation of the initial policy's actions, before the tanh."""
     reward_scale: float = 1.0
-    """Factor of all rewards."""
+    """Multiply all rewards by this."""
     advantage_normalization: Literal["none", "all", "task"] = "task"
-    """Bring advantages to mean 0 and standard deviation 1: not at all, over all tasks alike, or in each task."""
+    """Scale advantages to mean 0 and standard deviation 1: never, over all tasks together, or in each task."""
     value_normalization: Literal["none", "running", "popart"] = "running"
-    """Let the critic count in standard deviations of each task's targets from their mean; with popart it has a head for
-    every task, which follows them as they move."""
+    """Units of the critic: none, or standard deviations of each task's targets from their mean (running). With popart
+    it also has a head for every task, which is rescaled when these estimates move."""
     value_rate: float = 0.1
-    """Share of a new rollout in the moving estimates of targets' mean and variance."""
+    """Weight of a new rollout in the moving estimates of targets' mean and variance."""
     experience: Annotated[Rollouts, FLAT] = dataclasses.field(default_factory=Rollouts)
 
     def _check_numbers(self) -> None:
@@ -191,7 +191,7 @@ class PPO(BaseAgent):
         return dataclasses.replace(network, own=(*network.own, "head"))
 
     def init(self, spec: Spec, tasks: Task, key: Key) -> PPOState:
-        """Initialise for the training ``tasks`` (T, ...)."""
+        """Return the initial state for the training ``tasks`` (T, ...)."""
         num_tasks, common = len(tasks.id), self.init_common(spec, tasks, key)
         optimizers = self.network_optimizers
         return PPOState(
@@ -200,18 +200,18 @@ class PPO(BaseAgent):
             units=Units(jnp.float32(0), jnp.zeros(num_tasks), jnp.ones(num_tasks)),
         )
 
-    def init_networks(self, num_tasks: int, told: Array, obs: Any, action: Array, key: Key) -> Pair:
+    def init_networks(self, num_tasks: int, features: Array, obs: Any, action: Array, key: Key) -> Pair:
         actor_key, critic_key = jax.random.split(key)
         first = jnp.repeat(jnp.array([0.0, outputs_for(self.initial_std)]), len(action))
-        actor = calm(self.actor.init(actor_key, num_tasks, 2 * len(action), told, obs), first)
-        return Pair(actor, calm(self.critic.init(critic_key, num_tasks, 1, told, obs), jnp.zeros(1)))
+        actor = scale_head(self.actor.init(actor_key, num_tasks, 2 * len(action), features, obs), first)
+        return Pair(actor, scale_head(self.critic.init(critic_key, num_tasks, 1, features, obs), jnp.zeros(1)))
 
     # Acting.
 
     def act(self, state: PPOState, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
-        """Choose an action (A,) for one observation (O,) of one task; no key: the mean action."""
-        actor, critic, told, seen = self.situation(state, memory, obs, task)
-        outputs = self.actor.apply(actor, *self.look(critic, told, seen))
+        """Choose an action (A,) for one observation (O,) of one task; without a key, the mean action."""
+        actor, critic, features, inputs = self.acting_inputs(state, memory, obs, task)
+        outputs = self.actor.apply(actor, *self.actor_inputs(critic, features, inputs))
         if key is None:
             return Acted(tanh_normal(outputs, None, task.action_mask)[0], None, memory)
         raw, log_prob = sample_raw(outputs, key, task.action_mask)
@@ -222,11 +222,11 @@ class PPO(BaseAgent):
     # Losses of one task.
 
     def actor_loss(self, actor: Params, data: tuple[Batch, Key]) -> tuple[Array, Metrics]:
-        """The actor's loss on a batch of what the actor is told and sees."""
+        """Compute the actor loss on a batch whose features and observations are the actor's inputs."""
         batch, key = data
-        outputs = self.actor.apply(actor, batch.told, batch.obs)
+        outputs = self.actor.apply(actor, batch.features, batch.obs)
         log_ratio = log_density(outputs, batch.raw, batch.mask) - batch.log_prob
-        log_ratio = jnp.clip(log_ratio, -FARTHEST, FARTHEST)
+        log_ratio = jnp.clip(log_ratio, -LOG_RATIO_LIMIT, LOG_RATIO_LIMIT)
         ratio = jnp.exp(log_ratio)
         clipped = jnp.clip(ratio, 1 - self.clip_range, 1 + self.clip_range)
         gain = jnp.mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
@@ -236,41 +236,41 @@ class PPO(BaseAgent):
         return loss, {"actor_loss": loss, "entropy": entropy, "kl": kl, "clip_fraction": beyond}
 
     def critic_loss(self, critic: Params, batch: Batch) -> tuple[Array, Metrics]:
-        value = self.value(critic, batch.told, batch.obs)
+        value = self.value(critic, batch.features, batch.obs)
         error = jnp.square(value - batch.target)
         if not parts.is_zero(self.value_clip):
-            near = batch.value + jnp.clip(value - batch.value, -self.value_clip, self.value_clip)
-            error = jnp.maximum(error, jnp.square(near - batch.target))
+            clipped = batch.value + jnp.clip(value - batch.value, -self.value_clip, self.value_clip)
+            error = jnp.maximum(error, jnp.square(clipped - batch.target))
         loss = jnp.mean(error) / 2
-        return self.sight.join(loss, {"critic_loss": loss}, critic, batch)
+        return self.placed_representation.join(loss, {"critic_loss": loss}, critic, batch)
 
-    def value(self, critic: Params, told: Array, obs: Any) -> Array:
-        """The critic's values (B,) of observations (B, ...), in its units."""
-        told, seen = self.sight.perceive(critic, told, obs)
-        return self.critic.apply(critic.without(self.sight.names), told, seen)[..., 0]
+    def value(self, critic: Params, features: Array, obs: Any) -> Array:
+        """Return the critic's values (B,) of observations (B, ...), in its units."""
+        features, inputs = self.placed_representation.perceive(critic, features, obs)
+        return self.critic.apply(critic.without(self.placed_representation.names), features, inputs)[..., 0]
 
     # Update of all tasks.
 
     def update(self, state: PPOState, steps: Transition, tasks: Task, key: Key) -> tuple[PPOState, Metrics]:
         """Learn from the rollouts (T, H, E, ...) of the training tasks; metrics are (T,)."""
         order_key, key = jax.random.split(key)
-        state, batch, seen = self.prepare(state, steps, tasks)
-        orders = self.deal(batch.advantage.shape[1], order_key)
-        improve = partial(self.improve, batch, state.critic)
+        state, batch, statistics = self.prepare(state, steps, tasks)
+        indices = self.minibatch_indices(batch.advantage.shape[1], order_key)
+        minibatch_step = partial(self.minibatch_step, batch, state.critic)
         (state, _), metrics = jax.lax.scan(
-            improve, (state, jnp.bool_(True)), (orders, jax.random.split(key, len(orders)))
+            minibatch_step, (state, jnp.bool_(True)), (indices, jax.random.split(key, len(indices)))
         )
-        return state, jax.tree.map(lambda x: jnp.mean(x, axis=0), metrics) | seen
+        return state, jax.tree.map(lambda x: jnp.mean(x, axis=0), metrics) | statistics
 
     def prepare(self, state: PPOState, steps: Transition, tasks: Task) -> tuple[PPOState, Batch, Metrics]:
-        """Fit the normalisers to rollouts (T, H, E, ...), and make of them what the losses see (T, H E, ...)."""
+        """Fit the normalisers to rollouts (T, H, E, ...), and return the batch (T, H E, ...) for the losses."""
         flat: Transition = jax.tree.map(lambda x: x.reshape(x.shape[0], -1, *x.shape[3:]), steps)
         taken: Taken = flat.extras
         next_past = None if taken.past is None else append(taken.past, flat.obs, flat.action, flat.reward)
         state = state._replace(moments=self.fit_moments(state.moments, flat.obs))
-        told, obs = self.features_of_batch(state, flat, tasks), self.see_batch(state.moments, flat.obs, taken.past)
+        features, obs = self.features_of_batch(state, flat, tasks), self.see_batch(state.moments, flat.obs, taken.past)
         next_obs = self.see_batch(state.moments, flat.next_obs, next_past)
-        value, next_value = (self.values(state, told, seen) for seen in (obs, next_obs))
+        value, next_value = (self.values(state, features, inputs) for inputs in (obs, next_obs))
         reward = self.rewards(state, flat, tasks)
         advantage = self.advantages(flat._replace(reward=reward), tasks, steps.reward.shape, value, next_value)
         target = value + advantage
@@ -285,51 +285,51 @@ class PPO(BaseAgent):
             advantage=self.normalize_advantages(advantage),
             value=in_units(value),
             target=in_units(target),
-            told=told,
+            features=features,
             mask=tasks.action_mask,
             **models,
         )
-        missed, there = (spread(x, 1)[1][:, 0] for x in (advantage, target))
-        explained = 1 - missed / jnp.maximum(there, LEAST_STD**2)
-        return state, batch, {"value": spread(value, 1)[0][:, 0], "explained_variance": explained}
+        residual_variance, target_variance = (mean_and_variance(x, 1)[1][:, 0] for x in (advantage, target))
+        explained = 1 - residual_variance / jnp.maximum(target_variance, MIN_STD**2)
+        return state, batch, {"value": mean_and_variance(value, 1)[0][:, 0], "explained_variance": explained}
 
     def rewards(self, state: PPOState, flat: Transition, tasks: Task) -> Array:
-        """The rewards (T, H E) of steps in the task's units."""
+        """Return the rewards (T, H E) of steps in the task's units."""
         gamma = jnp.broadcast_to(self.discounts(tasks), len(tasks.id))
         return self.reward_scale * self.scaling.rewards(state.scales, flat, gamma, jnp.zeros(len(gamma)))
 
     def advantages(self, flat: Transition, tasks: Task, shape: Any, value: Array, next_value: Array) -> Array:
-        """Advantages (T, H E) of steps (T, H E), which were played as ``shape`` (T, H, E)."""
+        """Compute advantages (T, H E) of steps (T, H E) that were played in the ``shape`` (T, H, E)."""
         gamma = jnp.broadcast_to(self.discounts(tasks), len(tasks.id))
         played = (x.reshape(shape) for x in (flat.reward, flat.discount, flat.ended, value, next_value))
         return jax.vmap(partial(advantages, lambda_=self.gae_lambda))(*played, gamma=gamma).reshape(value.shape)
 
-    def values(self, state: PPOState, told: Array, obs: Any) -> Array:
-        """The critic's values (T, B) of observations (T, B, ...), in units of reward."""
-        out = jax.vmap(self.value, (OVER_TASKS, 0, 0))(state.critic, told, obs)
+    def values(self, state: PPOState, features: Array, obs: Any) -> Array:
+        """Return the critic's values (T, B) of observations (T, B, ...), in units of reward."""
+        out = jax.vmap(self.value, (OVER_TASKS, 0, 0))(state.critic, features, obs)
         return state.units.mean[:, None] + state.units.std[:, None] * out
 
     def normalize_advantages(self, advantage: Array) -> Array:
-        """Bring advantages (T, B) to mean 0 and standard deviation 1."""
+        """Scale advantages (T, B) to mean 0 and standard deviation 1, as the settings say."""
         if self.advantage_normalization == "none":
             return advantage
-        mean, variance = spread(advantage, 1 if self.advantage_normalization == "task" else (0, 1))
-        return (advantage - mean) / jnp.maximum(jnp.sqrt(variance), LEAST_STD)
+        mean, variance = mean_and_variance(advantage, 1 if self.advantage_normalization == "task" else (0, 1))
+        return (advantage - mean) / jnp.maximum(jnp.sqrt(variance), MIN_STD)
 
     def renew(self, state: PPOState, target: Array) -> PPOState:
-        """Bring the critic's units up to date with targets (T, B)."""
+        """Update the critic's units by targets (T, B)."""
         if self.value_normalization == "none":
             return state
         old, count = state.units, state.units.count + 1
-        rate = jnp.maximum(self.value_rate, 1 / count)  # the first rollouts count alike
-        mean, variance = (x[:, 0] for x in spread(target, 1))
-        ahead = mean - old.mean
-        variance = (1 - rate) * old.variance + rate * variance + rate * (1 - rate) * jnp.square(ahead)
-        new = Units(count, old.mean + rate * ahead, variance)
+        rate = jnp.maximum(self.value_rate, 1 / count)  # the first rollouts have equal weights
+        mean, variance = (x[:, 0] for x in mean_and_variance(target, 1))
+        drift = mean - old.mean
+        variance = (1 - rate) * old.variance + rate * variance + rate * (1 - rate) * jnp.square(drift)
+        new = Units(count, old.mean + rate * drift, variance)
         return state._replace(units=new, critic=self.follow(state.critic, old, new))
 
     def follow(self, critic: Params, old: Units, new: Units) -> Params:
-        """Adapt the critic's heads to new units, so that its values stay as they are; its first ones mean nothing."""
+        """Rescale the critic's heads to new units, so that its values do not change; the first units change nothing."""
         if self.value_normalization != "popart":
             return critic
         known = old.count > 0
@@ -340,48 +340,55 @@ class PPO(BaseAgent):
         return Params(critic.shared, {**critic.own, "head": head})
 
     def fit_moments(self, moments: normalize.Moments, obs: Array) -> normalize.Moments:
-        """Take observations (T, B, O) into account, those on other devices included."""
+        """Add observations (T, B, O) to the moments, with those on other devices."""
         if not self.normalize_observations:
             return moments
         mixed = moments.mean.ndim > 1
         count = (obs.shape[1] if mixed else obs.shape[0] * obs.shape[1]) * collectives.count()
-        mean, variance = (x.reshape(moments.mean.shape) for x in spread(obs, 1 if mixed else (0, 1)))
+        mean, variance = (x.reshape(moments.mean.shape) for x in mean_and_variance(obs, 1 if mixed else (0, 1)))
         one = normalize.Moments(jnp.full_like(moments.count, count), mean, count * variance)
         return jax.vmap(merge)(moments, one) if mixed else merge(moments, one)
 
-    def deal(self, count: int, key: Key) -> Array:
-        """Deal out ``count`` steps to the minibatches of all epochs: numbers of steps (U, B)."""
+    def minibatch_indices(self, count: int, key: Key) -> Array:
+        """Split ``count`` steps at random into the minibatches of all epochs: indices (U, B)."""
         size = count // self.minibatches
         if not size:
             raise InputError(f"minibatches ({self.minibatches}) must not be more than a rollout's {count} steps a task")
-        orders = jax.vmap(lambda key: jax.random.permutation(key, count))(jax.random.split(key, self.epochs))
-        return orders[:, : size * self.minibatches].reshape(-1, size)
+        indices = jax.vmap(lambda key: jax.random.permutation(key, count))(jax.random.split(key, self.epochs))
+        return indices[:, : size * self.minibatches].reshape(-1, size)
 
-    def improve(
-        self, batch: Batch, slow: Params, carry: tuple[PPOState, Array], given: tuple[Array, Key]
+    def minibatch_step(
+        self, batch: Batch, old_critic: Params, carry: tuple[PPOState, Array], given: tuple[Array, Key]
     ) -> tuple[Any, Metrics]:
-        """Take a gradient step of critic and actor on the steps (B,) of every task that are ``given``.
+        """Take a gradient step of critic and actor on one minibatch, steps (B,) of every task.
 
         Args:
-            slow: the critic, and the representation, from before the update.
+            old_critic: the critic, and the representation, from before the update.
+            carry: the state, and whether KL(pi_old | pi) has stayed within ``kl_limit`` so far ().
+            given: indices of steps (B,), and a key.
         """
-        (state, near), (order, key) = carry, given
+        (state, within_limit), (index, key) = carry, given
         sample_key, actor_order, critic_order = jax.random.split(key, 3)
-        chosen = choose(batch, order)
+        minibatch = take_steps(batch, index)
         if self.representation.learns:
-            ahead, _ = self.sight.targets(state.critic, slow, chosen.next_obs, jax.random.fold_in(key, 3))
-            chosen = chosen._replace(ahead=ahead)
+            model_targets, _ = self.placed_representation.targets(
+                state.critic, old_critic, minibatch.next_obs, jax.random.fold_in(key, 3)
+            )
+            minibatch = minibatch._replace(model_targets=model_targets)
         sample_keys = jax.random.split(sample_key, len(batch.advantage))
         critic_loss = self.above_least(self.critic_loss)
-        state, seen = self.descend("critic", self.gradients, critic_loss, state, chosen, critic_order)
-        told, obs = jax.vmap(self.look, (OVER_TASKS, 0, 0))(state.critic, chosen.told, chosen.obs)
-        data = (chosen._replace(told=told, obs=obs, ahead=None), sample_keys)
-        moved, done = self.descend("actor", self.gradients.for_actor, self.actor_loss, state, data, actor_order)
+        state, critic_metrics = self.descend("critic", self.gradients, critic_loss, state, minibatch, critic_order)
+        features, obs = jax.vmap(self.actor_inputs, (OVER_TASKS, 0, 0))(state.critic, minibatch.features, minibatch.obs)
+        data = (minibatch._replace(features=features, obs=obs, model_targets=None), sample_keys)
+        moved, actor_metrics = self.descend(
+            "actor", self.gradients.for_actor, self.actor_loss, state, data, actor_order
+        )
         if parts.is_zero(self.kl_limit):
-            return (moved, near), seen | done
+            return (moved, within_limit), critic_metrics | actor_metrics
         limit = jnp.where(self.kl_limit > 0, self.kl_limit, jnp.inf)
-        near &= jnp.mean(done["kl"]) <= limit
-        return (jax.tree.map(partial(jnp.where, near), moved, state), near), seen | done
+        within_limit &= jnp.mean(actor_metrics["kl"]) <= limit
+        state = jax.tree.map(partial(jnp.where, within_limit), moved, state)
+        return (state, within_limit), critic_metrics | actor_metrics
 
     def descend(
         self, name: str, rule: surgery.Rule, loss: Callable, state: PPOState, data: Any, key: Key
@@ -390,21 +397,21 @@ class PPO(BaseAgent):
         loss, params = surgery.over_devices(loss), getattr(state, name)
         importance = self.sampler.weights(state.progress, jnp.ones(len(state.contexts)))
         memory = getattr(state.surgery, name)
-        seen = surgery.gradient(rule, loss, params, data, memory, key, importance, self.per_layer)
+        step = surgery.gradient(rule, loss, params, data, memory, key, importance, self.per_layer)
         memory = getattr(state.optimizers, name)
-        params, memory = descent.descend(getattr(self.network_optimizers, name), seen.gradients, memory, params)
+        params, memory = descent.descend(getattr(self.network_optimizers, name), step.gradients, memory, params)
         state = state._replace(
             **{name: params},
             optimizers=state.optimizers._replace(**{name: memory}),
-            surgery=state.surgery._replace(**{name: surgery.look_again(rule, loss, params, data, seen)}),
+            surgery=state.surgery._replace(**{name: surgery.adapt_rule(rule, loss, params, data, step)}),
         )
-        return state, seen.aux | {f"{name}_{key}": value for key, value in seen.metrics.items()}
+        return state, step.aux | {f"{name}_{key}": value for key, value in step.metrics.items()}
 
 
 def advantages(
     reward: Array, discount: Array, ended: Array, value: Array, next_value: Array, gamma: Array, lambda_: float | Array
 ) -> Array:
-    """Generalised advantages (H, E) of one task's steps (H, E) (Schulman et al. 2016)."""
+    """Compute generalised advantages (H, E) of one task's steps (H, E) (Schulman et al. 2016)."""
     delta = reward + gamma * discount * next_value - value
     decay = gamma * lambda_ * ~ended
 
@@ -416,34 +423,34 @@ def advantages(
     return jax.lax.scan(back, jnp.zeros_like(delta[0]), (delta, decay), reverse=True)[1]
 
 
-def choose(batch: Batch, order: Array) -> Batch:
-    """Take the steps with numbers ``order`` (B,) of every task."""
-    rows = lambda x: x[:, order]
-    told = rows(batch.told) if batch.told.ndim == 3 else batch.told
-    return jax.tree.map(rows, batch._replace(told=None, mask=None))._replace(told=told, mask=batch.mask)
+def take_steps(batch: Batch, index: Array) -> Batch:
+    """Take the steps at ``index`` (B,) of every task's batch."""
+    rows = lambda x: x[:, index]
+    features = rows(batch.features) if batch.features.ndim == 3 else batch.features
+    return jax.tree.map(rows, batch._replace(features=None, mask=None))._replace(features=features, mask=batch.mask)
 
 
-def calm(params: Params, bias: Array) -> Params:
-    """Give a network a head that says nearly the same of everything."""
+def scale_head(params: Params, bias: Array) -> Params:
+    """Shrink the weights of a network's head by ``HEAD_SCALE``, and add ``bias`` to its bias."""
 
-    def calmed(part: dict) -> dict:
+    def scaled(part: dict) -> dict:
         if "head" not in part:
             return part
         head = part["head"]
-        return {**part, "head": {"kernel": FIRST_HEAD * head["kernel"], "bias": head["bias"] + bias}}
+        return {**part, "head": {"kernel": HEAD_SCALE * head["kernel"], "bias": head["bias"] + bias}}
 
-    return Params(calmed(params.shared), calmed(params.own))
+    return Params(scaled(params.shared), scaled(params.own))
 
 
-def spread(x: Array, axes: int | tuple[int, ...]) -> tuple[Array, Array]:
-    """Mean and variance along axes, which stay with length 1, over all devices that share the data."""
+def mean_and_variance(x: Array, axes: int | tuple[int, ...]) -> tuple[Array, Array]:
+    """Return mean and variance along axes, which keep length 1, over all devices that share the data."""
     mean_of = lambda x: collectives.total(jnp.mean(x, axis=axes, keepdims=True)) / collectives.count()
     mean = mean_of(x)
     return mean, mean_of(jnp.square(x - mean))
 
 
 def merge(moments: normalize.Moments, others: normalize.Moments) -> normalize.Moments:
-    """Moments of what either has seen (Chan et al. 1979)."""
+    """Combine moments of two sets of data (Chan et al. 1979)."""
     count, shift = moments.count + others.count, others.mean - moments.mean
     share = others.count / count
     deviation = moments.deviation + others.deviation + jnp.square(shift) * moments.count * share

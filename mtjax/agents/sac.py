@@ -1,4 +1,4 @@
-"""Soft actor-critic over many tasks at once, and the parts in which its variants differ."""
+"""SAC trains soft actor-critic on many tasks at once; its variants override single methods."""
 
 import dataclasses
 from collections.abc import Callable
@@ -23,7 +23,7 @@ from mtjax.types import Acted, Array, InputError, Key, Metrics, Spec, Task, Tran
 
 
 class Optimizers(NamedTuple):
-    """What the optimisers remember."""
+    """Holds the optimisers' states."""
 
     actor: Any
     critic: Any
@@ -31,74 +31,74 @@ class Optimizers(NamedTuple):
 
 
 class SACState(NamedTuple):
-    """Everything SAC learns, and what it remembers of the training tasks."""
+    """Holds everything that SAC learns, and what it remembers of the training tasks."""
 
     actor: Params
     critic: Params  # shared leaves (N, ...), own leaves (T, N, ...); beside them the representation, without N
-    target: Params  # slow copy of the critic
+    target: Params  # the target critic: a slow copy of the critic
     log_temperature: Array  # (T,), or (1,) if shared
     optimizers: Optimizers
     moments: normalize.Moments
-    contexts: Array  # (T, C) of the training tasks, among which an unseen task finds its nearest
+    contexts: Array  # (T, C) of the training tasks; an unseen task finds its nearest among them
     vectors: Array | None  # (T, V) given task vectors, if conditioned on them
     surgery: Pair
-    scales: Any  # what the scaling of rewards remembers
-    progress: Any  # what the sampler of tasks remembers
+    scales: Any  # memory of the scaling of rewards
+    progress: Any  # memory of the sampler of tasks
 
 
 class Batch(NamedTuple):
-    """What the losses of one task see; of all tasks, leaves (T, ...)."""
+    """Holds the data for the losses of one task; for all tasks, leaves are (T, ...)."""
 
     obs: Any  # (B, O) as the networks take them
     action: Array  # (B, A)
     reward: Array  # (B,) in the task's units
     discount: Array  # (B,) gamma, or 0 where the episode terminated
     next_obs: Any  # (B, O)
-    told: Array  # (Z,) or (B, Z), what the networks are told of the task
+    features: Array  # (Z,) or (B, Z) features of the task, which networks take as inputs
     temperature: Array  # ()
-    mask: Array | None  # (A,) 1 for actions that the task has; None: it has all
-    ahead: Any = None  # what the models of the representation fit
+    mask: Array | None  # (A,) 1 for actions that the task has, else 0; None: it has all
+    model_targets: Any = None  # targets of the representation's models
 
 
 class Sample(NamedTuple):
-    """What a policy does."""
+    """Holds actions that a policy has sampled."""
 
     action: Array  # (B, A)
     log_prob: Array  # (B,)
-    cost: Array  # (B,) what the temperature makes the policy pay for
+    cost: Array  # (B,) what the temperature weighs: log pi, in Distral less a share of log pi_0
 
 
 @dataclasses.dataclass(frozen=True)
 class SAC(BaseAgent):
-    """Multi-task soft actor-critic that is not told which task it is in (Haarnoja et al. 2018; "MT-SAC").
+    """SAC trains one soft actor-critic on all tasks, by default blind to the task (Haarnoja et al. 2018; "MT-SAC").
 
-    Per transition of task i, with temperature a_i, N critics and their slow copies:
+    Per transition of task i, with temperature a_i, N critics Q_n and target critics Qbar_n:
         y = r + discount gamma (min_n Qbar_n(s', a') - a_i log pi(a'|s')),  a' ~ pi(s')     (critic target)
         L_Q = sum_n (Q_n(s, a) - y)^2                                                        (critic loss)
         L_pi = a_i log pi(a|s) - min_n Q_n(s, a),  a ~ pi(s)                                 (actor loss)
         L_a = a_i (-log pi(a|s) - H)                                                         (temperature loss)
     averaged over the batch of a task, then over tasks. ``discount`` is 0 only where an episode terminated, so that a
-    time limit bootstraps. The actor follows the new critic, and so does the target.
+    time limit bootstraps. The actor loss and the target critics use the critic that this update has changed.
 
-    Differs from the paper: layer-normalised critics; a learning rate of 1e-3, a target entropy H of -A/2 and one
-    temperature a task by default; log standard deviations are brought into [-5, 2] by a tanh.
+    Differs from the paper: critics have layer normalisation; by default the learning rate is 1e-3, the target entropy H
+    is -A/2 and each task has its own temperature; a tanh brings log standard deviations into [-5, 2].
     """
 
     adjustable: ClassVar[tuple[str, ...]] = (*BaseAgent.adjustable, "temperature_lr", "tau", "target_entropy")
     temperature_lr: float = 1e-3
     """Adam's learning rate of the temperatures."""
     tau: float = 0.005
-    """Share of the new critic that its slow copy takes at each update."""
+    """Step of the target critic towards the new critic at each update, as a share of the distance."""
     num_critics: int = 2
-    """Critics."""
-    believe: Literal["least", "mean"] = "least"
-    """Which critic bootstraps and guides the actor: the least of them, or the mean of all."""
+    """Number of critics."""
+    critic_reduction: Literal["min", "mean"] = "min"
+    """How the critics' values become one, for targets and for the actor: their minimum or their mean."""
     initial_temperature: float = 0.1
-    """Temperature at the start."""
+    """Temperature before training."""
     target_entropy: float = -0.5
-    """Entropy that the temperature aims at, per action dimension."""
+    """Entropy to which the temperature is tuned, per action dimension."""
     shared_temperature: bool = False
-    """One temperature for all tasks instead of one a task."""
+    """Use one temperature for all tasks instead of one for each task."""
     value: Annotated[Value, FLAT] = dataclasses.field(default_factory=Value)
     experience: Annotated[Replay, FLAT] = dataclasses.field(default_factory=Replay)
 
@@ -120,7 +120,7 @@ class SAC(BaseAgent):
     # Networks.
 
     def init(self, spec: Spec, tasks: Task, key: Key) -> SACState:
-        """Initialise for the training ``tasks`` (T, ...)."""
+        """Return the initial state for the training ``tasks`` (T, ...)."""
         common = self.init_common(spec, tasks, key)
         log = jnp.log if isinstance(self.initial_temperature, Array) else np.log
         log_temperature = jnp.full(1 if self.shared_temperature else len(tasks.id), log(self.initial_temperature))
@@ -133,15 +133,15 @@ class SAC(BaseAgent):
             optimizers=Optimizers(*(o.init(p) for o, p in zip(self.optimizers, parameters, strict=True))),
         )
 
-    def init_networks(self, num_tasks: int, told: Array, obs: Any, action: Array, key: Key) -> Pair:
+    def init_networks(self, num_tasks: int, features: Array, obs: Any, action: Array, key: Key) -> Pair:
         actor_key, critic_key = jax.random.split(key)
-        actor = self.actor.init(actor_key, num_tasks, 2 * len(action), told, obs)
-        init_critic = lambda k: self.critic.init(k, num_tasks, self.value.outputs, told, obs, action)
+        actor = self.actor.init(actor_key, num_tasks, 2 * len(action), features, obs)
+        init_critic = lambda k: self.critic.init(k, num_tasks, self.value.outputs, features, obs, action)
         keys = jax.random.split(critic_key, self.num_critics)
         return Pair(actor, jax.vmap(init_critic, out_axes=Params(shared=0, own=1))(keys))  # type: ignore
 
-    def reset(self, state: SACState, spec: Spec, tasks: Task, key: Key) -> SACState:
-        """Begin anew with networks, optimisers, temperatures and surgery; what was learned of the data stays."""
+    def reset_networks(self, state: SACState, spec: Spec, tasks: Task, key: Key) -> SACState:
+        """Return a state with new networks, optimisers, temperatures and surgery; statistics of the data are kept."""
         return self.init(spec, tasks, key)._replace(
             moments=state.moments,
             contexts=state.contexts,
@@ -157,61 +157,62 @@ class SAC(BaseAgent):
     # Acting.
 
     def act(self, state: SACState, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
-        """Choose an action (A,) for one observation (O,) of one task; no key: the mean action."""
+        """Choose an action (A,) for one observation (O,) of one task; without a key, the mean action."""
         trained = task.id < len(state.contexts)
-        outputs = self.behaviour(trained, *self.situation(state, memory, obs, task))
+        outputs = self.behaviour(trained, *self.acting_inputs(state, memory, obs, task))
         return Acted(tanh_normal(outputs, key, task.action_mask)[0], memory.past, memory)
 
-    def behaviour(self, trained: Array, actor: Params, critic: Params, told: Array, obs: Any) -> Array:
-        """Outputs of the policy that acts, in a task that was ``trained`` on () or in another."""
-        return self.policy(actor, critic, told, obs)
+    def behaviour(self, trained: Array, actor: Params, critic: Params, features: Array, obs: Any) -> Array:
+        """Return the outputs (2A,) of the policy that acts; ``trained`` () says whether the task was trained on."""
+        return self.policy(actor, critic, features, obs)
 
     # Losses of one task.
 
-    def policy(self, actor: Params, critic: Params, told: Array, obs: Any) -> Array:
-        """The policy's outputs (..., 2A); the actor stands on the representation that lies beside the critics."""
-        return self.actor.apply(actor, *self.look(critic, told, obs))
+    def policy(self, actor: Params, critic: Params, features: Array, obs: Any) -> Array:
+        """Return the policy's outputs (..., 2A). The representation's parameters lie beside the critics'."""
+        return self.actor.apply(actor, *self.actor_inputs(critic, features, obs))
 
     def sample(self, actor: Params, critic: Params, batch: Batch, obs: Any, key: Key) -> Sample:
-        """Let the policy act at observations (B, O) of a batch."""
-        action, log_prob = tanh_normal(self.policy(actor, critic, batch.told, obs), key, batch.mask)
+        """Sample the policy's actions at observations (B, O) of a batch."""
+        action, log_prob = tanh_normal(self.policy(actor, critic, batch.features, obs), key, batch.mask)
         return Sample(action, log_prob, log_prob)
 
-    def q(self, critic: Params, told: Array, obs: Any, action: Array) -> Array:
-        """Every critic's outputs (N, B, outputs)."""
-        return self.of_critics(self.critic.apply, critic, told, obs, action)
+    def q(self, critic: Params, features: Array, obs: Any, action: Array) -> Array:
+        """Return every critic's outputs (N, B, outputs)."""
+        return self.of_critics(self.critic.apply, critic, features, obs, action)
 
-    def values(self, critic: Params, told: Array, obs: Any, action: Array) -> Array:
-        """Every critic's estimate (N, B)."""
-        return self.value.mean(self.q(critic, told, obs, action))
+    def values(self, critic: Params, features: Array, obs: Any, action: Array) -> Array:
+        """Return every critic's estimate of the value (N, B)."""
+        return self.value.mean(self.q(critic, features, obs, action))
 
-    def of_critics(self, apply: Callable, critic: Params, told: Array, obs: Any, action: Array) -> Any:
-        """What ``apply``, as ``Network.apply`` takes its inputs, makes of every critic (N, ...)."""
-        told, seen = self.sight.perceive(critic, told, obs)
-        return jax.vmap(apply, (0, None, None, None))(critic.without(self.sight.names), told, seen, action)
+    def of_critics(self, apply: Callable, critic: Params, features: Array, obs: Any, action: Array) -> Any:
+        """Apply ``apply``, a function with the signature of ``Network.apply``, to every critic: (N, ...)."""
+        features, inputs = self.placed_representation.perceive(critic, features, obs)
+        critics = critic.without(self.placed_representation.names)
+        return jax.vmap(apply, (0, None, None, None))(critics, features, inputs, action)
 
-    def target(self, actor: Params, critic: Params, slow: Params, batch: Batch, key: Key) -> Any:
-        """y (B, ...), in the form that ``value.loss`` takes."""
+    def critic_target(self, actor: Params, critic: Params, target_critic: Params, batch: Batch, key: Key) -> Any:
+        """Compute the critic target y (B, ...), in the form that ``value.loss`` takes."""
         action, _, cost = self.sample(actor, critic, batch, batch.next_obs, key)
-        outputs = self.q(slow, batch.told, batch.next_obs, action)
+        outputs = self.q(target_critic, batch.features, batch.next_obs, action)
         bonus = -batch.temperature * cost
-        return self.value.target(outputs, self.believe == "least", batch.reward, batch.discount, bonus)
+        return self.value.target(outputs, self.critic_reduction == "min", batch.reward, batch.discount, bonus)
 
     def critic_loss(self, critic: Params, data: tuple[Batch, Any]) -> tuple[Array, Metrics]:
         batch, target = data
-        outputs = self.q(critic, batch.told, batch.obs, batch.action)
+        outputs = self.q(critic, batch.features, batch.obs, batch.action)
         loss = jnp.mean(jnp.sum(self.value.loss(outputs, target), axis=0))
         values, expected = self.value.mean(outputs), self.value.expected(target)
         td_error = jnp.mean(jnp.abs(values - expected))
-        seen = {"critic_loss": loss, "value": jnp.mean(values), "td_error": td_error}
-        seen |= {"target": expected}  # which ``update`` takes for the scaling
-        return self.sight.join(loss, seen, critic, batch)
+        metrics = {"critic_loss": loss, "value": jnp.mean(values), "td_error": td_error}
+        metrics |= {"target": expected}  # ``update`` hands it to the scaling
+        return self.placed_representation.join(loss, metrics, critic, batch)
 
     def actor_loss(self, actor: Params, data: tuple[Batch, Params, Key]) -> tuple[Array, Metrics]:
         batch, critic, key = data
         action, log_prob, cost = self.sample(actor, critic, batch, batch.obs, key)
-        values = self.values(critic, batch.told, batch.obs, action)
-        value = least(values) if self.believe == "least" else jnp.mean(values, axis=0)
+        values = self.values(critic, batch.features, batch.obs, action)
+        value = minimum(values) if self.critic_reduction == "min" else jnp.mean(values, axis=0)
         loss = jnp.mean(batch.temperature * cost - value)
         return loss, {"actor_loss": loss, "entropy": -jnp.mean(log_prob)}
 
@@ -228,40 +229,42 @@ class SAC(BaseAgent):
         combine = partial(surgery.gradient, importance=importance, per_layer=self.per_layer)
 
         loss, data = self.critic_problem(state, batch, target_key)
-        seen = combine(self.gradients, loss, state.critic, data, state.surgery.critic, critic_order)
+        critic_step = combine(self.gradients, loss, state.critic, data, state.surgery.critic, critic_order)
         critic, critic_memory = descent.descend(
-            self.optimizers.critic, seen.gradients, state.optimizers.critic, state.critic
+            self.optimizers.critic, critic_step.gradients, state.optimizers.critic, state.critic
         )
-        critic_weighing = surgery.look_again(self.gradients, loss, critic, data, seen)
+        critic_rule = surgery.adapt_rule(self.gradients, loss, critic, data, critic_step)
 
         loss, data = self.actor_problem(critic, batch, actor_key)
-        done = combine(self.gradients.for_actor, loss, state.actor, data, state.surgery.actor, actor_order)
+        actor_step = combine(self.gradients.for_actor, loss, state.actor, data, state.surgery.actor, actor_order)
         actor, actor_memory = descent.descend(
-            self.optimizers.actor, done.gradients, state.optimizers.actor, state.actor
+            self.optimizers.actor, actor_step.gradients, state.optimizers.actor, state.actor
         )
 
         action_size = action_sizes(batch.action, batch.mask)
-        slope = jax.grad(self.temperature_loss)(state.log_temperature, done.aux["entropy"], action_size)
+        slope = jax.grad(self.temperature_loss)(state.log_temperature, actor_step.aux["entropy"], action_size)
         log_temperature, temperature_memory = descent.descend(
             self.optimizers.temperature, slope, state.optimizers.temperature, state.log_temperature
         )
-        metrics = {**seen.aux, **done.aux, "temperature": batch.temperature}
-        slow = self.update_target(critic, state.target)
-        scales, (critic, slow) = self.scaling.renew(state.scales, metrics.pop("target"), (critic, slow))
+        metrics = {**critic_step.aux, **actor_step.aux, "temperature": batch.temperature}
+        target_critic = self.update_target(critic, state.target)
+        scales, (critic, target_critic) = self.scaling.renew(
+            state.scales, metrics.pop("target"), (critic, target_critic)
+        )
         state = state._replace(
             actor=actor,
             critic=critic,
-            target=slow,
+            target=target_critic,
             log_temperature=log_temperature,
             optimizers=Optimizers(actor_memory, critic_memory, temperature_memory),
-            surgery=Pair(done.memory, critic_weighing),
+            surgery=Pair(actor_step.memory, critic_rule),
             scales=scales,
         )
-        named = (("critic", seen.metrics), ("actor", done.metrics))
-        return state, metrics | {f"{who}_{k}": v for who, found in named for k, v in found.items()}
+        named = (("critic", critic_step.metrics), ("actor", actor_step.metrics))
+        return state, metrics | {f"{name}_{k}": v for name, found in named for k, v in found.items()}
 
     def prepare(self, state: SACState, batch: Transition, tasks: Task) -> tuple[SACState, Batch]:
-        """Fit the normalisers to transitions (T, B, ...), and make of them what the losses see (T, ...)."""
+        """Fit the normalisers to transitions (T, B, ...), and return the batch (T, ...) for the losses."""
         state = state._replace(moments=self.fit_moments(state.moments, batch.obs))
         past, next_past = batch.extras, None
         if past is not None:
@@ -275,26 +278,26 @@ class SAC(BaseAgent):
             reward=self.scaling.rewards(state.scales, batch, gamma, bonus),
             discount=(gamma[:, None] if jnp.ndim(gamma) else gamma) * batch.discount,  # type: ignore
             next_obs=self.see_batch(state.moments, batch.next_obs, next_past),
-            told=self.features_of_batch(state, batch, tasks),
+            features=self.features_of_batch(state, batch, tasks),
             temperature=jnp.broadcast_to(jnp.exp(state.log_temperature), len(tasks.id)),
             mask=tasks.action_mask,
         )
 
     def update_target(self, critic: Params, target: Params) -> Params:
-        """Move the slow critic, and the slow representation, towards the new one."""
+        """Move the target critic, and its representation, a step towards the new critic."""
         rate = lambda name: self.representation.rates.get(name, self.tau)
         step = lambda new, old: {k: optax.incremental_update(new[k], old[k], rate(k)) for k in old}
         return Params(step(critic.shared, target.shared), step(critic.own, target.own))
 
     def critic_problem(self, state: SACState, batch: Batch, key: Key) -> tuple[Callable, Any]:
-        """The critic's loss for one task, and the data of all (T, ...): what ``surgery.gradient`` differentiates."""
-        ahead, keys = self.sight.targets(state.critic, state.target, batch.next_obs, key)
-        bootstrap = jax.vmap(self.target, (OVER_TASKS, OVER_TASKS, OVER_TASKS, 0, 0))
+        """Return the critic's loss of one task, and the data of all tasks (T, ...), for ``surgery.gradient``."""
+        model_targets, keys = self.placed_representation.targets(state.critic, state.target, batch.next_obs, key)
+        bootstrap = jax.vmap(self.critic_target, (OVER_TASKS, OVER_TASKS, OVER_TASKS, 0, 0))
         target = bootstrap(state.actor, state.critic, state.target, batch, keys)
-        return self.above_least(self.critic_loss), (batch._replace(ahead=ahead), target)
+        return self.above_least(self.critic_loss), (batch._replace(model_targets=model_targets), target)
 
     def actor_problem(self, critic: Params, batch: Batch, key: Key) -> tuple[Callable, Any]:
-        """The actor's loss for one task under a critic, and the data of all tasks (T, ...)."""
+        """Return the actor's loss of one task under a critic, and the data of all tasks (T, ...)."""
 
         def loss(actor: Params, data) -> tuple[Array, Metrics]:
             batch, own_critic, key = data
@@ -308,10 +311,10 @@ def action_sizes(action: Array, mask: Array | None) -> int | Array:
     return action.shape[-1] if mask is None else jnp.sum(mask, axis=-1)
 
 
-def least(values: Array) -> Array:
-    """The least of values (N, B), differentiably.
+def minimum(values: Array) -> Array:
+    """Return the minimum (B,) of values (N, B), with a gradient that is always finite.
 
-    The slope of ``jnp.min`` looks for values that equal the least, finds none where XLA computes them twice and rounds
-    them otherwise, and is then 0 / 0.
+    The gradient of ``jnp.min`` looks for values that equal the minimum. Where XLA computes the values twice and rounds
+    them differently it finds none, and the gradient is 0 / 0.
     """
     return jnp.take_along_axis(values, jnp.argmin(values, axis=0, keepdims=True), axis=0)[0]

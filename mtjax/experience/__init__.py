@@ -1,4 +1,4 @@
-"""What learners learn from: replay of all steps, or rollouts of the latest ones."""
+"""Experience is what agents learn from: replay of all steps, or rollouts of the latest ones."""
 
 from mtjax.experience.replay import Replay
 from mtjax.experience.rollouts import Rollouts

@@ -1,13 +1,13 @@
-"""Hindsight: steps of one task replayed as they would have been in another.
+"""Hindsight replays steps of one task as steps of another.
 
-Where tasks share their physics and differ in a goal alone, what happened in one could have happened in any other, for
-another reward (Andrychowicz et al. 2017, "Hindsight experience replay"; across tasks Li et al. 2020, "Generalized
-hindsight"). A family says for which of its parameters that holds, ``relabels``, and recomputes the reward, and what
-observations show of the goal, exactly: ``relabel(task, transition, key)``.
+Where tasks share their physics and differ in goals alone, the same steps are possible in every task, with other rewards
+(Andrychowicz et al. 2017, "Hindsight experience replay"; across tasks Li et al. 2020, "Generalized hindsight"). A
+family lists the parameters for which that holds in ``relabels``; its ``relabel(task, transition, key)`` recomputes
+exactly the reward, and what observations show of the goal.
 
-Differs from Andrychowicz et al.: goals are those of the training tasks, and where every episode draws its own goal
-those of fresh draws; never what an episode happened to reach. Differs from Li et al.: the other task is any, with the
-same chance, not the one in which the steps would have earned the most.
+Differs from Andrychowicz et al.: goals are those of the training tasks, or fresh draws where every episode draws its
+own goal; never states that an episode reached. Differs from Li et al.: the other task is drawn uniformly, and is not
+the one in which the steps would have earned the most.
 """
 
 from functools import partial
@@ -23,10 +23,10 @@ from mtjax.types import Env, InputError, Key, Task, Transition
 
 
 def require(env: Env) -> None:
-    """Refuse a family whose steps cannot be replayed as another task's.
+    """Check that steps of a family can be replayed as another task's.
 
     Raises:
-        InputError: with the reason.
+        InputError: they cannot; it says why.
     """
     family: Any = env
     if env.spec.mixed:
@@ -48,10 +48,10 @@ def require(env: Env) -> None:
 def sample(
     env: Env, agent: Any, tasks: Task, share: float, ring: Ring, key: Key, shape: tuple[int, int, int]
 ) -> Transition:
-    """Draw U batches of B transitions a task, ``shape`` (T, U, B), of which the first round(share B) are relabelled.
+    """Draw U batches of B transitions for each task, ``shape`` (T, U, B), and relabel the first round(share B).
 
-    These come from the rings of all other tasks, with the same chance; also from the task's own if its episodes draw
-    their goals, as then the goal is another all the same.
+    The relabelled transitions come uniformly from the rings of all other tasks. If episodes draw their goals, they also
+    come from the task's own ring, as the new goal differs there too.
     """
     source_key, row_key, task_key, goal_key = jax.random.split(key, 4)
     num_tasks, count = shape[0], max(round(share * shape[2]), 1)
@@ -66,12 +66,12 @@ def sample(
 
 
 def relabel(env: Env, agent: Any, task: Task, transition: Transition, task_key: Key, goal_key: Key) -> Transition:
-    """One transition as a step of ``task``, or where episodes draw their tasks of one that it draws."""
+    """Relabel a transition as a step of ``task``, or of a fresh draw where episodes draw their tasks."""
     world = episode_task(task, task_key)
     new = agent.relabel(env, world, transition, goal_key)
     return new if transition.context is None else new._replace(context=world.context)
 
 
 def fresh_goals(env: Any, tasks: Task) -> bool:
-    """Whether two episodes of one task have different goals."""
+    """Return whether two episodes of one task have different goals."""
     return tasks.draws is not None or env.fresh_goals

@@ -1,4 +1,4 @@
-"""Replay: off-policy learners store every step and learn from random ones."""
+"""Replay stores every step, and off-policy agents learn from random ones."""
 
 import dataclasses
 import math
@@ -21,36 +21,36 @@ _FLAG = tyro.conf.arg(prefix_name=False)  # --batch-size, not --agent.batch-size
 
 
 class Buffer(NamedTuple):
-    """The replay of all seeds."""
+    """Holds the replay of all seeds."""
 
     ring: Ring  # rows (S, T, H, E, ...)
-    count: Array  # () int32, steps of every environment stored so far, forgotten ones included
-    key: Key  # (S,) of the random actions before learning; fixed, so that an action drawn from it can be held
+    count: Array  # () int32, steps of every environment stored so far, with those overwritten since
+    key: Key  # (S,) for random actions before learning; it never changes, so that a drawn action can be held
 
 
 @dataclasses.dataclass(frozen=True)
 class Replay:
-    """Store every step in a ring a task, and update on random batches of them.
+    """Stores every step in a ring for each task, and updates the agent on random batches.
 
-    The first steps are random actions, each held for a while; then follow ``updates_per_step`` updates after each step
-    of every environment.
+    The first actions are random, and each is held for some steps. Then each step of every environment is followed by
+    ``updates_per_step`` updates.
     """
 
     updates_per_step: Annotated[int, _FLAG] = 1
-    """Gradient updates after each step of all environments."""
+    """Gradient updates after each step of every environment."""
     batch_size: Annotated[int, _FLAG] = 64
-    """Transitions per task in each update."""
+    """Transitions of each task in an update."""
     replay_size: Annotated[int, _FLAG] = 100_000
-    """Transitions each task's replay holds."""
+    """Transitions that each task's replay holds."""
     warmup_steps: Annotated[int, _FLAG] = 100
     """Steps of every environment under random actions before learning starts."""
     warmup_hold: Annotated[int, _FLAG] = 10
-    """Steps for which each of those random actions is held; actions that last find more than ones that jitter."""
+    """Steps for which each random action is held; held actions explore more than ones that change every step."""
     reset_every: Annotated[int, _FLAG] = 0
-    """Steps of every environment after which networks and optimisers begin anew, replay kept; 0 never."""
+    """Reset networks and optimisers after every so many steps of every environment, and keep the replay; 0 never."""
     hindsight: Annotated[float, _FLAG] = 0.0
-    """Share of each batch that is taken from other tasks and replayed with this task's goal; only for families whose
-    tasks differ in their goals alone."""
+    """Share of each batch that comes from other tasks and is relabelled with this task's goal; only for families whose
+    tasks differ in goals alone."""
 
     steps: ClassVar[int] = 1
 
@@ -64,7 +64,7 @@ class Replay:
                 raise InputError(f"{flag} must be at least {least}, not {getattr(self, field.name)}")
 
     def check(self, env: Env, num_envs: int) -> None:
-        """Refuse what cannot be replayed.
+        """Check that the settings fit the environment.
 
         Raises:
             InputError: the replay does not hold one step of every environment, or hindsight cannot relabel the family.
@@ -75,16 +75,16 @@ class Replay:
             hindsight.require(env)
 
     def describe(self, num_envs: int) -> str:
-        """Say how much it holds."""
+        """Return a description of its size."""
         return f"replay ({self.capacity(num_envs):,} transitions a task)"
 
     def capacity(self, num_envs: int) -> int:
-        """Count the transitions that each task's ring holds: the replay size, rounded down to whole steps."""
+        """Return how many transitions each task's ring holds: the replay size, rounded down to whole steps."""
         return self.replay_size // num_envs * num_envs
 
     @property
     def sharding(self) -> Buffer:
-        """How devices share the data: the axes of seeds and of environments are split."""
+        """How devices share the data: by the axes of seeds and of environments."""
         seeds, whole = PartitionSpec("seeds"), PartitionSpec()
         rows = PartitionSpec("seeds", None, None, collectives.AXIS)
         return Buffer(Ring(rows, whole, whole), whole, seeds)  # type: ignore
@@ -98,7 +98,7 @@ class Replay:
         return Buffer(jax.vmap(blank, out_axes=OVER_SEEDS)(keys), jnp.int32(0), keys)
 
     def explore(self, data: Buffer, action: Array) -> Array:
-        """Replace actions (S, T, E, A) by held random ones before learning starts."""
+        """Replace actions (S, T, E, A) by held random ones until learning starts."""
         everywhere = (action.shape[1], action.shape[2] * collectives.count(), action.shape[3])
         fold = lambda key: jax.random.fold_in(key, data.count // self.warmup_hold)
         drawn = jax.vmap(lambda key: jax.random.uniform(fold(key), everywhere, minval=-1.0))(data.key)
@@ -111,21 +111,21 @@ class Replay:
         return Buffer(ring, data.count + 1, data.key)
 
     def keep(self, data: Buffer) -> Buffer:
-        """Keep everything."""
+        """Return all of the data."""
         return data
 
     # Learning.
 
     def learn(self, env: Env, agent: Any, states: Any, data: Buffer, tasks: Task, keys: Key) -> tuple[Any, Metrics]:
-        """Update the agents of all seeds, leaves (S, ...), unless it is too early.
+        """Update the agents of all seeds, leaves (S, ...), once the first random steps are over.
 
         Returns:
-            their new states, and the means of the updates' metrics with ``learning`` (), 1 if there were any.
+            their new states, and the means of the updates' metrics, with ``learning`` (): 1 if there were updates.
         """
         warming, metrics = data.count <= self.warmup_steps, {}
         states = self._renew(env, agent, states, data, tasks, keys)
         if self.updates_per_step:
-            # All seeds begin to learn at once, so that this stays a branch.
+            # All seeds begin to learn at the same step, so that this stays a branch.
             learn = lambda states: _learn(env, agent, self, tasks, states, data.ring, keys)
             shapes = jax.eval_shape(learn, states)[1]
             rest = lambda states: (states, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes))
@@ -133,16 +133,16 @@ class Replay:
         return states, metrics | {"learning": 1.0 - warming}
 
     def _renew(self, env: Env, agent: Any, states: Any, data: Buffer, tasks: Task, keys: Key) -> Any:
-        """Let the networks begin anew where that is due."""
+        """Reset the networks if ``reset_every`` says so at this step."""
         if not self.reset_every:
             return states
         before = data.count - 1
         due = (before > self.warmup_steps) & (before % self.reset_every == 0)
-        one = lambda state, key: agent.reset(state, env.spec, tasks, jax.random.fold_in(key, 1))
+        one = lambda state, key: agent.reset_networks(state, env.spec, tasks, jax.random.fold_in(key, 1))
         return jax.lax.cond(due, lambda states: over_seeds(one, 0, 0)(states, keys), lambda states: states, states)
 
     def draw(self, env: Env, agent: Any, tasks: Task, ring: Ring, key: Key) -> Transition:
-        """Draw the batches (U, T, B, ...) of one step's updates of one agent; one gather of all is cheapest."""
+        """Draw the batches (U, T, B, ...) of one step's updates for one agent, by one gather, which is fastest."""
         shape = (len(tasks.id), self.updates_per_step, self.batch_size)
         if self.hindsight:
             rows = hindsight.sample(env, agent, tasks, self.hindsight, ring, key, shape)
@@ -152,7 +152,7 @@ class Replay:
         return jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), rows)
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))  # traced once, though the cond above asks for its shapes as well
+@partial(jax.jit, static_argnums=(0, 1, 2))  # so that it is traced once, though ``learn`` needs its shapes too
 def _learn(env: Env, agent: Any, replay: Replay, tasks: Task, states: Any, ring: Ring, keys: Key):
     def learn_one(state, ring: Ring, key: Key) -> tuple[Any, Metrics]:
         batch_key, update_key = jax.random.split(key)

@@ -1,6 +1,6 @@
-"""A ring of transitions for every task, on the device, sampled evenly over tasks.
+"""Rings hold the latest transitions of every task on the device, and are sampled equally for all tasks.
 
-A ring is a row of slots, each with one step of every environment, so that devices can share it as they share those.
+A ring is a row of slots, each with one step of every environment. So devices share it as they share environments.
 """
 
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from mtjax.types import Array, Key
 
 
 class Ring(NamedTuple):
-    """The rings of all tasks, which fill in step with each other."""
+    """Holds the rings of all tasks, which are filled at the same pace."""
 
     rows: Any  # leaves (T, H, E, ...)
     position: Array  # () int32, the slot where the next step goes
@@ -33,7 +33,7 @@ def init(item: Any, num_tasks: int, num_slots: int, num_envs: int) -> Ring:
 
 
 def add(ring: Ring, items: Any) -> Ring:
-    """Write items (T, E, ...) over those of the oldest slot."""
+    """Write items (T, E, ...) to the next slot, over the oldest items."""
     num_slots = jax.tree.leaves(ring.rows)[0].shape[1]
     write = lambda rows, new: jax.lax.dynamic_update_slice_in_dim(rows, new[:, None], ring.position, axis=1)
     return Ring(
@@ -55,7 +55,7 @@ def sample_from(ring: Ring, key: Key, task: Array) -> Any:
 
 
 def _draw(ring: Ring, key: Key, shape: tuple[int, ...], take: Callable) -> Any:
-    """Draw slots and environments of ``shape``, all alike, and ``take(rings, index)`` from rings (T, H E, ...)."""
+    """Draw uniform slots and environments of ``shape``, and apply ``take(rings, index)`` to rings (T, H E, ...)."""
     num_slots, held = jax.tree.leaves(ring.rows)[0].shape[1:3]
     num_envs = held * collectives.count()
     index = jax.random.randint(key, shape, 0, ring.size * num_envs)

@@ -1,4 +1,4 @@
-"""Rollouts: on-policy learners act for some steps, learn from just these, and forget them."""
+"""Rollouts hold the latest steps, from which on-policy agents learn once."""
 
 import dataclasses
 from typing import Any, ClassVar
@@ -11,7 +11,7 @@ from mtjax.types import Array, Env, InputError, Key, Metrics, Task, Transition
 
 @dataclasses.dataclass(frozen=True)
 class Rollouts:
-    """Hand every learner the latest ``unroll`` steps of every environment."""
+    """Gives the agent the latest ``unroll`` steps of every environment, and then drops them."""
 
     unroll: int = 32
     """Steps of every environment between two updates."""
@@ -28,18 +28,18 @@ class Rollouts:
         return self.unroll
 
     def check(self, env: Env, num_envs: int) -> None:
-        """Refuse nothing."""
+        """Accept every environment."""
 
     def describe(self, num_envs: int) -> str:
-        """Say how much it holds."""
+        """Return a description of its size."""
         return f"rollouts ({self.unroll * num_envs:,} transitions a task, not kept)"
 
     def init(self, item: Transition, num_tasks: int, num_envs: int, keys: Key) -> tuple[()]:
-        """Return nothing, as nothing is kept between iterations."""
+        """Return (), as no data is kept between iterations."""
         return ()
 
     def explore(self, data: tuple[()], action: Array) -> Array:
-        """Take the policy's own actions."""
+        """Return the policy's own actions."""
         return action
 
     def add(self, data: tuple[()], steps: Transition) -> Transition:
@@ -47,16 +47,16 @@ class Rollouts:
         return steps
 
     def keep(self, data: Transition) -> tuple[()]:
-        """Keep nothing."""
+        """Return (), as learning is over."""
         return ()
 
     # Learning.
 
     def learn(self, env: Env, agent: Any, states: Any, data: Transition, tasks: Task, keys: Key) -> tuple[Any, Metrics]:
-        """Let the agents of all seeds, leaves (S, ...), learn from their steps, leaves (S, T, H, E, ...).
+        """Update the agents of all seeds, leaves (S, ...), by their steps, leaves (S, T, H, E, ...).
 
         Returns:
-            their new states, and their metrics with ``learning`` (), which is 1.
+            their new states, and their metrics, with ``learning`` () = 1.
         """
         update = lambda state, steps, key: agent.update(state, steps, tasks, key)
         states, metrics = over_seeds(update, 0, 0, 0)(states, data, keys)

@@ -153,8 +153,8 @@ def activity(agent: SAC, state: Any, batch: Transition, tasks: Task) -> dict[str
         mean activity over the batch (T, N, units), and hidden layers (T, B, N, width); N is 1 for the actor.
     """
     state, seen_batch = agent.prepare(state, batch, tasks)
-    told, shape = seen_batch.told, (*batch.reward.shape, seen_batch.told.shape[-1])
-    features = jnp.broadcast_to(told if told.ndim == 3 else told[:, None], shape)
+    given, shape = seen_batch.features, (*batch.reward.shape, seen_batch.features.shape[-1])
+    features = jnp.broadcast_to(given if given.ndim == 3 else given[:, None], shape)
 
     def one(actor: Params, critic: Params, features: Array, obs: Array, action: Array) -> dict[str, Activity]:
         judging = agent.of_critics(partial(watch, agent.critic.apply), critic, features, obs, action)

@@ -75,8 +75,10 @@ class SweptAgent:
     def observe(self, state: SweptState, outcome: Outcome) -> SweptState:
         return state._replace(learner=with_values(self.agent, state.knobs).observe(state.learner, outcome))
 
-    def reset(self, state: SweptState, spec: Spec, tasks: Task, key: Key) -> SweptState:
-        return state._replace(learner=with_values(self.agent, state.knobs).reset(state.learner, spec, tasks, key))
+    def reset_networks(self, state: SweptState, spec: Spec, tasks: Task, key: Key) -> SweptState:
+        return state._replace(
+            learner=with_values(self.agent, state.knobs).reset_networks(state.learner, spec, tasks, key)
+        )
 
 
 def sweepable(agent: BaseAgent) -> dict[str, float]:

@@ -1,7 +1,7 @@
-"""Parts of an agent: frozen dataclasses that are chosen by name and whose fields are hyper-parameters of their own.
+"""Parts of an agent are frozen dataclasses, chosen by name, whose fields are hyper-parameters.
 
-An agent has one part of each kind. Their fields lie beside the agent's on the command line and in ``mtjax.agent``, so
-no two kinds may use a field's name.
+An agent has one part of each kind. A part's fields are flags of the agent on the command line and arguments of
+``mtjax.agent``, so no two kinds of parts may have a field of the same name.
 """
 
 import copy
@@ -19,21 +19,21 @@ P = TypeVar("P")
 
 @dataclasses.dataclass(frozen=True)
 class Watcher:
-    """A part that may remember what it sees of the stream of outcomes."""
+    """A watcher is a part that may keep statistics of the outcomes of all steps."""
 
-    watches: ClassVar[bool] = False  # the stream
+    watches: ClassVar[bool] = False  # whether ``observe`` has to be called
 
     def init(self, num_tasks: int) -> Any:
-        """A memory of nothing."""
+        """Return the memory before the first step."""
         return None
 
     def observe(self, memory: Any, outcome: Outcome) -> Any:
-        """Take note of what one step of every environment brought, leaves (T, E)."""
+        """Update the memory by the outcomes of one step of every environment, leaves (T, E)."""
         return memory
 
 
 def choose(kind: str, table: Mapping[str, type[P]], given: Any) -> P:
-    """Return the part that is ``given`` itself or by name.
+    """Return the part that is ``given``, itself or by name.
 
     Raises:
         InputError: no part of this kind has that name.
@@ -46,7 +46,7 @@ def choose(kind: str, table: Mapping[str, type[P]], given: Any) -> P:
 
 
 def name_of(table: Mapping[str, type], part: Any) -> str:
-    """Return the name under which a part is chosen; a part of the user's own has that of its class."""
+    """Return the name by which a part is chosen; for a part that is not in the table, its class's name."""
     return next((name for name, cls in table.items() if type(part) is cls), type(part).__name__)
 
 
@@ -56,13 +56,13 @@ def settings(part: Any) -> dict[str, Any]:
 
 
 def take(settings: dict[str, Any], part: P) -> P:
-    """Return the part with those of the settings that are its own, which leave ``settings``."""
+    """Move a part's own settings out of ``settings``, and return a copy of the part that has them."""
     own = {field.name for field in dataclasses.fields(part)} & set(settings)  # type: ignore
     return dataclasses.replace(part, **frozen({name: settings.pop(name) for name in own}))  # type: ignore
 
 
 def put(part: P, **values: Any) -> P:
-    """Return a copy of a frozen dataclass with other values, which may be traced and are not checked."""
+    """Return a copy of a frozen dataclass with other values, unchecked, as they may be traced."""
     changed = copy.copy(part)
     for name, value in values.items():
         object.__setattr__(changed, name, value)
@@ -70,7 +70,7 @@ def put(part: P, **values: Any) -> P:
 
 
 def is_zero(value: Any) -> bool:
-    """Whether a number is zero for good, and what it switches on needs no program; a traced one may be anything."""
+    """Return whether a number is known to be zero before tracing, so that its branch need not be compiled."""
     return not isinstance(value, jax.Array) and value == 0
 
 
@@ -78,7 +78,7 @@ def is_zero(value: Any) -> bool:
 
 
 def require_choices(holder: Any) -> None:
-    """Every setting of ``Literal`` type is one of its choices."""
+    """Require every setting of ``Literal`` type to be one of its choices."""
     for field in dataclasses.fields(holder):
         allowed = get_args(field.type) if get_origin(field.type) is Literal else ()
         if allowed and getattr(holder, field.name) not in allowed:
@@ -86,44 +86,44 @@ def require_choices(holder: Any) -> None:
 
 
 def require_positive(holder: Any, *names: str) -> None:
-    """Numbers are greater than 0."""
+    """Require numbers greater than 0."""
     for name in names:
         _require(getattr(holder, name) > 0, holder, name, "must be greater than 0")
 
 
 def require_not_negative(holder: Any, *names: str) -> None:
-    """Numbers are at least 0."""
+    """Require numbers of at least 0."""
     for name in names:
         _require(getattr(holder, name) >= 0, holder, name, "must be at least 0")
 
 
 def require_rates(holder: Any, *names: str) -> None:
-    """Numbers are in (0, 1]."""
+    """Require numbers in (0, 1]."""
     for name in names:
         _require(0 < getattr(holder, name) <= 1, holder, name, "must be in (0, 1]")
 
 
 def require_shares(holder: Any, *names: str) -> None:
-    """Numbers are in [0, 1]."""
+    """Require numbers in [0, 1]."""
     for name in names:
         _require(0 <= getattr(holder, name) <= 1, holder, name, "must be in [0, 1]")
 
 
 def require_counts(holder: Any, *names: str) -> None:
-    """Numbers are at least 1."""
+    """Require numbers of at least 1."""
     for name in names:
         _require(getattr(holder, name) >= 1, holder, name, "must be at least 1")
 
 
 def require_layers(holder: Any, *names: str) -> None:
-    """Widths are of at least one layer of at least one unit."""
+    """Require widths of at least one layer, of at least one unit each."""
     for name in names:
         widths = getattr(holder, name)
         _require(widths and min(widths) >= 1, holder, name, "needs at least one layer of at least one unit")
 
 
 def require_widths(holder: Any, *names: str) -> None:
-    """Widths are of at least one unit each; there may be none."""
+    """Require widths of at least one unit each; there may be no layers."""
     for name in names:
         _require(all(width >= 1 for width in getattr(holder, name)), holder, name, "must be of at least one unit each")
 

@@ -1,4 +1,4 @@
-"""What the networks are told of the task, and the training task that stands for one they do not know."""
+"""Conditioning gives networks features of the task as inputs."""
 
 import jax
 import jax.numpy as jnp
@@ -7,18 +7,19 @@ import numpy as np
 from mtjax.types import Array, InputError
 
 BORROWED = {"one-hot": ["number"], "embedding": ["embedding"], "vectors": ["vector"]}
-"""What a task that was not trained on has of its nearest training task, by what networks are told."""
+"""What an unseen task uses of its nearest training task, by conditioning."""
 
 
-def features(told: str, num_tasks: int, index: Array, context: Array, vectors: Array | None) -> Array:
-    """What the networks see of a task (Z,); a learned embedding is added by the network that owns it.
+def features(conditioning: str, num_tasks: int, index: Array, context: Array, vectors: Array | None) -> Array:
+    """Return the features (Z,) of a task; learned embeddings are not among them, as networks hold these themselves.
 
     Args:
-        told: the agent's conditioning.
-        index: () the training task that it is, or that stands for it; context: (C,) its own parameters.
-        vectors: (T, V) of the training tasks, if they are told.
+        conditioning: the agent's.
+        index: () number of the task if it is a training task, else of the nearest one.
+        context: (C,) the task's own parameters.
+        vectors: (T, V) of the training tasks, for conditioning on vectors.
     """
-    match told:
+    match conditioning:
         case "one-hot":
             return jax.nn.one_hot(index, num_tasks)
         case "parameters":
@@ -37,7 +38,7 @@ def load_vectors(file: str, num_tasks: int) -> Array:
     """
     try:
         with open(file, "rb") as opened:
-            vectors = np.asarray(np.load(opened, allow_pickle=False), np.float32)  # neither an archive nor words
+            vectors = np.asarray(np.load(opened, allow_pickle=False), np.float32)  # fails for archives and strings
     except (OSError, EOFError, TypeError, ValueError) as error:
         raise InputError(f"cannot read task vectors from {file!r}: {error}") from None
     if vectors.ndim != 2 or len(vectors) != num_tasks or not np.all(np.isfinite(vectors)):

@@ -1,7 +1,7 @@
-"""Samplers of tasks: how much each counts in an update.
+"""Samplers of tasks weigh the tasks' losses in an update.
 
-Every task brings the same number of transitions to a batch, as shapes are fixed; that a task is sampled twice as often
-is a weight of two on its losses, which is the same in expectation and less noisy.
+Every task has the same number of transitions in a batch, as shapes are fixed. To sample a task twice as often is to
+weigh its losses by two: the same in expectation, and less noisy.
 """
 
 import dataclasses
@@ -16,39 +16,39 @@ from mtjax.types import Array, InputError, Outcome
 
 @dataclasses.dataclass(frozen=True)
 class Uniform(parts.Watcher):
-    """All tasks alike. Every sampler is a class like this one."""
+    """Weighs all tasks equally. Every sampler is a class with these methods."""
 
     def weights(self, memory: Any, temperature: Array) -> Array | None:
-        """What each task's losses count (T,), 1 on average; None for 1. ``temperature`` (T,) is SAC's."""
+        """Return the weights (T,) of the tasks' losses, of mean 1; None for all 1. ``temperature`` (T,) is SAC's."""
         return None
 
 
 @dataclasses.dataclass(frozen=True)
 class _Unequal(Uniform):
-    """Samplers of which each task keeps a part of its share."""
+    """Weighs tasks by shares, and keeps a least weight for each."""
 
     least_weight: float = 0.1
-    """Weight that every task has whatever happens; the rest is shared out. 1 weighs all tasks alike."""
+    """Weight that every task has at least; the rest is divided by the sampler. 1 weighs all tasks equally."""
 
     def __post_init__(self):
         parts.require_choices(self)
         parts.require_shares(self, "least_weight")
 
     def share_out(self, shares: Array) -> Array:
-        """Weights (T,) of mean 1 and at least ``least_weight`` from shares (T,) that sum to one."""
+        """Return weights (T,) of mean 1, at least ``least_weight`` each, from shares (T,) that sum to one."""
         return self.least_weight + (1 - self.least_weight) * len(shares) * shares
 
 
 class Returns(NamedTuple):
-    """Moving means (T,) of episodes' returns; those of a task that has ended none are nothing yet."""
+    """Holds moving means (T,) of episodes' returns; they are valid for tasks that have ended an episode."""
 
-    known: Array  # (T,) bool
+    known: Array  # (T,) bool: the task has ended an episode
     fast: Array
     slow: Array
 
 
 def _follow(memory: Returns, outcome: Outcome, fast: float, slow: float) -> Returns:
-    """Take in the episodes that ended, at rates per episode; a task's first ones are what its means begin at."""
+    """Move the means towards the returns of ended episodes, at rates per episode; a task's first ones set them."""
     count = jnp.sum(outcome.ended, axis=1)
     mean = jnp.sum(jnp.where(outcome.ended, outcome.total, 0.0), axis=1) / jnp.maximum(count, 1)
 
@@ -60,20 +60,20 @@ def _follow(memory: Returns, outcome: Outcome, fast: float, slow: float) -> Retu
 
 @dataclasses.dataclass(frozen=True)
 class Progress(_Unequal):
-    """Tasks of which the return moves, up or down, count more (learning progress; Matiisen et al. 2017).
+    """Gives more weight to tasks whose return changes, up or down (learning progress; Matiisen et al. 2017).
 
     Progress is |fast - slow| / max(|fast|, |slow|), for two moving means of the task's returns at different rates, and
-    the shares are proportional to it. A task that has ended no episode counts as the mean of those that have.
+    the shares are proportional to it. A task that has ended no episode has the mean progress of the others.
 
-    Differs from the paper, where the slope of returns decides which single task is trained next. (The scheduler of T3S,
-    Yu et al. 2023, works the other way: it favours tasks that progress slowly.)
+    Differs from the paper, where the slope of returns decides which single task is trained next. (T3S, Yu et al. 2023,
+    does the opposite: its scheduler favours tasks that progress slowly.)
     """
 
     watches = True
     progress_fast: float = 0.1
-    """Share of a new episode in the fast mean of returns."""
+    """Weight of a new episode in the fast mean of returns."""
     progress_slow: float = 0.01
-    """Share of a new episode in the slow mean of returns."""
+    """Weight of a new episode in the slow mean of returns."""
 
     def __post_init__(self):
         super().__post_init__()
@@ -100,17 +100,17 @@ class Progress(_Unequal):
 
 @dataclasses.dataclass(frozen=True)
 class Hardest(_Unequal):
-    """Tasks with low returns count more: shares softmax(-hardness z), z the standardised returns.
+    """Gives more weight to tasks of low return: shares are softmax(-hardness z), z the standardised returns.
 
     z is a moving mean of each task's returns minus the tasks' mean, over their standard deviation; 0 for a task that
-    has ended no episode. It compares returns between tasks, and so suits families in which all tasks pay alike.
+    has ended no episode. It compares returns between tasks, so rewards of all tasks should have one scale.
     """
 
     watches = True
     hardness: float = 1.0
-    """How much a task counts for its return being low; 0 weighs all tasks alike."""
+    """How strongly low returns raise a task's weight; 0 weighs all tasks equally."""
     return_rate: float = 0.1
-    """Share of a new episode in the moving mean of returns."""
+    """Weight of a new episode in the moving mean of returns."""
 
     def __post_init__(self):
         super().__post_init__()
@@ -134,18 +134,18 @@ class Hardest(_Unequal):
 
 @dataclasses.dataclass(frozen=True)
 class ByTemperature(_Unequal):
-    """Tasks whose policies have become certain count more (soft modularization; Yang et al. 2020).
+    """Gives more weight to tasks of low temperature, whose policies are certain (Yang et al. 2020).
 
-    With a_i the tasks' temperatures, shares are softmax(-log a), that is (1 / a_i) / sum_j (1 / a_j): what the authors'
-    code does, and MTRL's. Their paper writes softmax(-a), which temperatures below 1 leave nearly even;
-    ``certainty="temperature"`` is that.
+    With a_i the tasks' temperatures, shares are softmax(-log a), that is (1 / a_i) / sum_j (1 / a_j), as in the
+    authors' code and in MTRL. The paper writes softmax(-a), which is nearly uniform for temperatures below 1;
+    ``certainty="temperature"`` computes that.
 
-    Differs from the paper: a part of the weight is everyone's, as temperatures differ by orders of magnitude;
-    ``least_weight=0`` has no such part.
+    Differs from the paper: every task has a least weight, as temperatures differ by orders of magnitude;
+    ``least_weight=0`` removes it.
     """
 
     certainty: Literal["log-temperature", "temperature"] = "log-temperature"
-    """Softmax of minus the temperatures' logarithms, as in the authors' code, or of minus themselves (their paper)."""
+    """Take the softmax of the negative log temperatures (the authors' code) or negative temperatures (the paper)."""
 
     def weights(self, memory: Any, temperature: Array) -> Array:
         score = temperature if self.certainty == "temperature" else jnp.log(temperature)

@@ -1,4 +1,4 @@
-"""What an agent infers of a hidden task from the steps it has just taken."""
+"""The trajectory encoder infers features of a hidden task from the last steps."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -12,29 +12,29 @@ from mtjax.types import Array, Transition
 
 
 class Past(NamedTuple):
-    """The last H steps of an episode, the latest one last; all zero where the episode had not begun."""
+    """Holds the last H steps of an episode, the latest one last; entries from before the episode are zero."""
 
-    obs: Array  # (..., H, O) in which the agent acted
+    obs: Array  # (..., H, O) before the action
     action: Array  # (..., H, A)
     reward: Array  # (..., H)
     known: Array  # (..., H) 1 for a step that was taken, 0 from before the episode
 
 
 class Seen(NamedTuple):
-    """An observation and the steps that led to it."""
+    """Holds an observation and the steps before it."""
 
     obs: Array  # (..., O)
     past: Past
 
 
 def begin(steps: int, obs_size: int, action_size: int) -> Past:
-    """Return the past of an episode that begins."""
+    """Return the empty past with which an episode begins."""
     blank = lambda *shape: jnp.zeros((steps, *shape))
     return Past(blank(obs_size), blank(action_size), blank(), blank())
 
 
 def append(past: Past, obs: Array, action: Array, reward: Array) -> Past:
-    """Add a step, leaves (..., O), (..., A) and (...,); the oldest one is forgotten."""
+    """Append a step, leaves (..., O), (..., A) and (...,), and drop the oldest one."""
     latest = Past(obs, action, reward, jnp.ones_like(reward))
     lead = reward.ndim
     join = lambda old, new: jnp.concatenate(
@@ -44,7 +44,7 @@ def append(past: Past, obs: Array, action: Array, reward: Array) -> Past:
 
 
 def relabel(one: Callable[[Transition], Transition], transition: Transition) -> Transition:
-    """Relabel a transition and its past by ``one``, which relabels single steps: both are another task's then."""
+    """Relabel a transition and its past as another task's by ``one``, which relabels single steps."""
     past: Past = transition.extras
     following = jnp.concatenate([past.obs[1:], transition.obs[None]])
 
@@ -60,27 +60,26 @@ def relabel(one: Callable[[Transition], Transition], transition: Transition) -> 
 
 
 class TrajectoryEncoder(nn.Module):
-    """Encode the last steps as features of the task.
+    """Encodes the last steps as features of the task.
 
     For steps t with state, action, reward and change of state (s_t, a_t, r_t, s_{t+1} - s_t), of which n were taken in
     this episode:
         z = W mean_t MLP([s_t, a_t, r_t, s_{t+1} - s_t]) + b
-    and z = b as long as there is none. Given the task, the steps of a Markov process tell of it in any order, so their
-    features are averaged, as the context encoder of PEARL combines them by a product that has no order either
-    (Rakelly et al. 2019, section 4.1). That is one batched product over all steps, where a recurrent network (Duan et
-    al. 2016, "RL^2") would take H in a row.
+    and z = b while n = 0. In a Markov process the order of these steps tells nothing of the task, so their features are
+    averaged; PEARL's context encoder combines them by a product without order too (Rakelly et al. 2019, section 4.1).
+    All steps are one batched product, where a recurrent network (Duan et al. 2016, "RL^2") takes H in sequence.
 
-    Differs from PEARL: z is a number and not a distribution, each network has an encoder of its own that learns from
-    that network's loss, and steps are those right before the observation, not drawn from all of the task's.
+    Differs from PEARL: z is a point and not a distribution; each network has its own encoder, trained by that network's
+    loss; the steps are those right before the observation, and not drawn from all of the task's.
     """
 
-    size: int  # of the features
+    size: int  # number of features
     widths: tuple[int, ...] = (64, 64)
     layer_norm: bool = False
 
     @nn.compact
     def __call__(self, seen: Seen) -> Array:
-        """Map what is seen, leaves (..., O) and (..., H, x), to features (..., Z)."""
+        """Map observations (..., O) and past steps (..., H, x) to features (..., Z)."""
         past = seen.past
         following = jnp.concatenate([past.obs[..., 1:, :], seen.obs[..., None, :]], axis=-2)
         steps = jnp.concatenate([past.obs, past.action, past.reward[..., None], following - past.obs], axis=-1)

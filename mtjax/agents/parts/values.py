@@ -1,4 +1,4 @@
-"""What a critic's outputs mean: a number, or a distribution over returns."""
+"""Kinds of value interpret a critic's outputs as a number, or as a distribution over returns."""
 
 import dataclasses
 
@@ -12,64 +12,66 @@ from mtjax.types import Array, InputError
 
 @dataclasses.dataclass(frozen=True)
 class Scalar:
-    """A critic that outputs the value itself, fitted by the squared error (Haarnoja et al. 2018).
+    """The critic outputs the value itself, and is fitted by the squared error (Haarnoja et al. 2018).
 
-    Every kind of value is a class like this one. Critics' outputs have a leading N.
+    Every kind of value is a class with these methods. Outputs of N critics have a leading N.
     """
 
     def refuses(self, scaling: str) -> str:
-        """Why it cannot work with a scaling of rewards; empty if it can."""
+        """Return why this kind of value cannot work with a scaling of rewards; empty if it can."""
         return ""
 
     @property
     def outputs(self) -> int:
-        """Outputs of a critic."""
+        """Number of a critic's outputs."""
         return 1
 
     def mean(self, outputs: Array) -> Array:
-        """The value (...,) that outputs (..., outputs) stand for."""
+        """Return the value (...,) for which outputs (..., outputs) stand."""
         return outputs[..., 0]
 
     def target(self, next_outputs: Array, pessimistic: bool, reward: Array, discount: Array, bonus: Array) -> Array:
-        """What to fit (B, ...): reward + discount (value + bonus), by the least critic or by the mean of all.
+        """Compute the target (B, ...): reward + discount (value + bonus), by the critics' minimum or their mean.
 
         Args:
-            next_outputs: (N, B, outputs) of the slow critics; reward, discount and bonus are (B,).
+            next_outputs: (N, B, outputs) of the target critics.
+            pessimistic: take the minimum of critics instead of the mean.
+            reward, discount, bonus: (B,).
         """
         values = self.mean(next_outputs)
         value = jnp.min(values, axis=0) if pessimistic else jnp.mean(values, axis=0)
         return reward + discount * (value + bonus)
 
     def loss(self, outputs: Array, target: Array) -> Array:
-        """Each critic's loss (N, B) for outputs (N, B, outputs) and what ``target`` gave."""
+        """Compute each critic's loss (N, B) for outputs (N, B, outputs) and a result of ``target``."""
         return jnp.square(self.mean(outputs) - target)
 
     def expected(self, target: Array) -> Array:
-        """The value (B,) at which what ``target`` gave aims."""
+        """Return the value (B,) for which a result of ``target`` stands."""
         return target
 
 
 @dataclasses.dataclass(frozen=True)
 class C51(Scalar):
-    """A distribution over returns: the logits of K atoms z_k, evenly spaced over a range (Bellemare et al. 2017).
+    """The critic outputs a distribution over returns: logits of K evenly spaced atoms z_k (Bellemare et al. 2017).
 
     The next return's distribution p, shifted to the atoms reward + discount (z_k + bonus) and clipped to the range, is
     projected back onto the z_j (their equation 7):
         m_j = sum_k p_k max(0, 1 - |clip(reward + discount (z_k + bonus)) - z_j| / spacing)
-    and fitted by the cross-entropy -sum_j m_j log p_j. The projection keeps the mean of what is inside the range. With
-    several critics p is the distribution with the least mean, sample by sample, or the mean of all distributions.
+    and fitted by the cross-entropy -sum_j m_j log p_j. The projection keeps the mean if all is inside the range.
+    With several critics, p is for each sample the distribution of least mean, or the mean of all distributions.
 
     Differs from the paper: a soft value's bonus shifts the atoms, and the policy is the actor's, as in BRC (Nauman et
-    al. 2025). BRC's range is the default, for returns that scaling=return brings into it; without that scaling a range
-    must be given, as returns beyond it are all the same to the critic.
+    al. 2025). The default range is BRC's, which fits returns under scaling=return. Without that scaling a range must be
+    given, as the critic cannot represent returns beyond it.
     """
 
     num_bins: int = 101
-    """Atoms or bins of the distribution over returns."""
+    """Number of atoms, or bins, of the distribution over returns."""
     value_low: float = -10.0
-    """Lowest return the distribution reaches; lower ones are taken for it."""
+    """Lowest return of the distribution; lower ones are clipped to it."""
     value_high: float = 10.0
-    """Highest return the distribution reaches; higher ones are taken for it."""
+    """Highest return of the distribution; higher ones are clipped to it."""
 
     def __post_init__(self):
         if self.num_bins < 2:
@@ -107,7 +109,7 @@ class C51(Scalar):
         return self.project(jnp.mean(p, axis=0), shifted)
 
     def project(self, p: Array, places: Array) -> Array:
-        """Share probabilities p (B, K) at places (B, K) out between the atoms on either side of each: (B, K)."""
+        """Split each of the probabilities p (B, K) at places (B, K) between the two nearest atoms: (B, K)."""
         spacing = (self.value_high - self.value_low) / (self.num_bins - 1)
         position = (jnp.clip(places, self.value_low, self.value_high) - self.value_low) / spacing
         distance = jnp.abs(position[:, None, :] - jnp.arange(self.num_bins)[:, None])
@@ -122,15 +124,15 @@ class C51(Scalar):
 
 @dataclasses.dataclass(frozen=True)
 class HLGauss(C51):
-    """A histogram fitted to a normal distribution around the scalar target (Imani & White 2018, "HL-Gauss").
+    """The critic outputs a histogram, fitted to a normal distribution around the target (Imani & White 2018).
 
     With y the target of a scalar critic, clipped to the range, and K bins between edges e_0 ... e_K that fill it,
         m_j proportional to Phi((e_j - y) / sigma) - Phi((e_(j-1) - y) / sigma)
     summing to one, fitted by the cross-entropy; the value is the mean of the bins' centres. Sigma is 0.75 bin widths,
-    as in Farebrother et al. (2024). Within two bin widths of the range's ends the truncated normal's mean, and so the
-    value, falls short of y.
+    as in Farebrother et al. (2024). If y lies within two bin widths of an end of the range, the truncated normal's
+    mean, and so the value, is nearer to the range's centre than y.
 
-    Differs from the papers: y is a soft value, by the least critic or by the mean of all.
+    Differs from the papers: y is a soft value, by the critics' minimum or their mean.
     """
 
     bin_sigma: float = 0.75
@@ -153,7 +155,7 @@ class HLGauss(C51):
         return self.smooth(Scalar.target(self, next_outputs, pessimistic, reward, discount, bonus))
 
     def smooth(self, values: Array) -> Array:
-        """Bins' probabilities (B, K) for values (B,)."""
+        """Return bins' probabilities (B, K) for values (B,)."""
         edges = jnp.linspace(self.value_low, self.value_high, self.num_bins + 1)
         values = jnp.clip(values, self.value_low, self.value_high)
         below = jax.scipy.stats.norm.cdf((edges - values[:, None]) / (self.bin_sigma * self.width))

@@ -1,4 +1,4 @@
-"""Encoders by name: what stands between a network's inputs and its heads. To add one: a file, and a line here."""
+"""Encoders, by name, build the bodies of networks, below their heads. To add one, add a file, and a line here."""
 
 from mtjax.agents.parts.encoders.base import Identity, MLPEncoder
 from mtjax.agents.parts.encoders.care import CARE

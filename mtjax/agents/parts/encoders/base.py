@@ -1,4 +1,4 @@
-"""What an encoder is, and the plainest."""
+"""``Identity`` is the interface of encoders, and the one that encodes nothing."""
 
 import dataclasses
 from typing import ClassVar
@@ -12,33 +12,33 @@ from mtjax.types import Array
 
 @dataclasses.dataclass(frozen=True)
 class Identity:
-    """No encoder: an MLP on observation, task features and, in a critic, the action.
+    """Builds an MLP on observation, task features and, in a critic, the action.
 
-    Every encoder is a class like this one. Networks have a body that ends in the hidden layer on which heads stand; it
-    is applied to the data of one task, and its parameters are shared by all tasks.
+    Every encoder is a class with these methods. The body of a network ends in the hidden layer below the heads. It is
+    applied to the data of one task, and all tasks share its parameters.
     """
 
-    needs_features: ClassVar[bool] = False  # of the task; then an agent that is told nothing is refused
+    needs_features: ClassVar[bool] = False  # if so, conditioning=none is refused
 
     def __post_init__(self):
         parts.require_choices(self)
 
     def refuses(self, conditioning: str) -> str:
-        """Why it cannot work with what the networks are told of the task; empty if it can."""
-        told = conditioning != "none" or not self.needs_features
-        return "" if told else "works by the task's features, so conditioning cannot be none; use parameters"
+        """Return why the encoder cannot work with a conditioning; empty if it can."""
+        has_features = conditioning != "none" or not self.needs_features
+        return "" if has_features else "works by the task's features, so conditioning cannot be none; use parameters"
 
     def body(self, hidden: tuple[int, ...], layer_norm: bool) -> nn.Module:
-        """A module (observations (..., O), features (..., Z) or (Z,), [actions (..., A)]) -> (..., width)."""
+        """Return a module (observations (..., O), features (..., Z) or (Z,), [actions (..., A)]) -> (..., width)."""
         return Trunk(hidden, layer_norm)
 
     def front(self) -> nn.Module | None:
-        """A module (observations (..., O)) -> (..., O') before the body, of which every task has its own."""
+        """Return a module (observations (..., O)) -> (..., O') before the body, one for each task; None for none."""
         return None
 
 
 class EncodedTrunk(nn.Module):
-    """An MLP that encodes the observation, then one on the encoding and everything else."""
+    """Encodes the observation by an MLP, and applies another to the encoding, the features and the action."""
 
     encoder_widths: tuple[int, ...]
     hidden: tuple[int, ...]
@@ -53,7 +53,7 @@ class EncodedTrunk(nn.Module):
 
 @dataclasses.dataclass(frozen=True)
 class MLPEncoder(Identity):
-    """An MLP that encodes the observation before task and action join it (MTRL's feed-forward encoder)."""
+    """Encodes the observation by an MLP of its own, without task and action (MTRL's feed-forward encoder)."""
 
     encoder_widths: tuple[int, ...] = (64, 64)
     """Widths of the encoder's layers; the last is the size of the encoding."""

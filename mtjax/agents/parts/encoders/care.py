@@ -1,4 +1,4 @@
-"""CARE: contextual attention over a mixture of encoders."""
+"""CARE attends to a mixture of encoders by the task's context."""
 
 import dataclasses
 from typing import ClassVar, Literal
@@ -15,7 +15,7 @@ from mtjax.types import Array
 
 
 class Mixture(nn.Module):
-    """Encode an observation as a context-dependent mixture, and the rest of the network on top of it."""
+    """Encodes observations as a context-dependent mixture, and applies the rest of the network to the encoding."""
 
     num_experts: int
     expert_widths: tuple[int, ...]
@@ -45,34 +45,33 @@ class Mixture(nn.Module):
 
 @dataclasses.dataclass(frozen=True)
 class CARE(Identity):
-    """Contextual attention-based representation learning (Sodhani, Zhang and Pineau 2021).
+    """CARE learns representations by contextual attention (Sodhani, Zhang and Pineau 2021).
 
     For a task with context features c and K encoders E_j of the observation s:
         z_context = C(c)                                   (context encoder)
         a_j = softmax_j <E_j(s), sg(z_context)> / tau      (attention; no gradient into the context here)
         z = MLP(sum_j a_j E_j(s))                          (mixture)
-    and SAC's actor and critics work on [z, z_context], through which alone the context encoder learns.
+    and SAC's actor and critics take [z, z_context]. The context encoder learns through that z_context alone.
 
-    ``variant="mtrl"`` is what the authors' MTRL code computes: the weights are softmax(MLP(z_context)), the same in
-    every state, gradients flow through them, and no MLP follows the mixture.
+    ``variant="mtrl"`` computes what the authors' MTRL code does: the weights are softmax(MLP(z_context)), the same in
+    every state; gradients flow through them; and no MLP follows the mixture.
 
-    Differs from the paper: the inner products are divided by tau, the square root of the encoding's size, without which
-    the attention is nearly hard from the start and learning slow (``attention_temperature=1`` is the paper's); the
-    context comes from the task's conditioning (by default its physical parameters) where
-    the paper embeds a sentence, which conditioning=vectors also allows; actor and critics each own a mixture, so that
-    every parameter is trained by its own loss (MTRL ties some of the actor's to the critic's and leaves others at
-    their initial values).
+    Differs from the paper: inner products are divided by tau, by default the square root of the encoding's size, as
+    otherwise the attention is nearly one-hot from the start and learning is slow (``attention_temperature=1`` is the
+    paper's). The context comes from the conditioning, by default the task's physical parameters, where the paper embeds
+    a sentence; conditioning=vectors allows that too. Actor and critics have a mixture each, trained by their own loss;
+    MTRL shares some of the actor's parameters with the critic and leaves others at their initial values.
     """
 
     needs_features: ClassVar[bool] = True
     num_experts: int = 6
-    """Encoders in the mixture."""
+    """Number of encoders in the mixture."""
     expert_widths: tuple[int, ...] = (64, 64)
-    """Widths of each encoder's layers and of the context encoder; the last is the size of the encoding."""
+    """Widths of the layers in each encoder and in the context encoder; the last is the size of the encoding."""
     variant: Literal["paper", "mtrl"] = "paper"
-    """Attention as in the paper, or the gate of the authors' code."""
+    """Use the attention of the paper, or the gate of the authors' code."""
     attention_temperature: float = 0.0
-    """Divides the paper's inner products; 0 is the square root of the encoding's size, 1 the paper's formula."""
+    """Divisor of the paper's inner products: 0 for the square root of the encoding's size, 1 as in the paper."""
 
     def __post_init__(self):
         super().__post_init__()

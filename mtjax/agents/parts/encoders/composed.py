@@ -1,4 +1,4 @@
-"""Trunks whose parameters are made for each task: weighted sums of K sets of parameters."""
+"""Trunks compose the parameters of each task as weighted sums of K sets of parameters."""
 
 import dataclasses
 from collections.abc import Callable
@@ -17,26 +17,26 @@ _lecun = nn.initializers.lecun_normal(batch_axis=0)
 
 
 class Composed(nn.Module):
-    """A dense layer of which kernel and bias are sums of K kernels and biases by weights w."""
+    """Applies a dense layer whose kernel and bias are sums of K kernels and biases by weights w."""
 
     width: int
     init_kernels: Callable[..., Any] = _lecun
 
     @nn.compact
     def __call__(self, x: Array, weights: Array) -> Array:
-        """Map (..., I) to (..., width) by a task's weights (K,), or by weights (..., K) of every sample."""
+        """Map (..., I) to (..., width) by weights (K,) of the task, or (..., K) of each sample."""
         num_sets = weights.shape[-1]
         kernels = self.param("kernels", self.init_kernels, (num_sets, x.shape[-1], self.width))
         biases = self.param("biases", nn.initializers.zeros, (num_sets, self.width))
         if weights.ndim == 1:  # composed once for all samples
             return x @ jnp.tensordot(weights, kernels, axes=1) + weights @ biases
-        # Kernels of every sample would not fit in memory; x sum_k w_k W_k is one product on all w_k x side by side.
+        # A kernel for each sample would not fit in memory; x sum_k w_k W_k is one product with all w_k x concatenated.
         weighed = weights[..., :, None] * x[..., None, :]
         return jnp.einsum("...ki,kio->...o", weighed, kernels) + weights @ biases
 
 
 class ComposedTrunk(nn.Module):
-    """An MLP of composed layers; layer normalisation, if any, has one scale and shift for all tasks."""
+    """Applies an MLP of composed layers; layer normalisation, if any, has one scale and shift for all tasks."""
 
     widths: tuple[int, ...]
     layer_norm: bool
@@ -51,7 +51,7 @@ class ComposedTrunk(nn.Module):
 
 
 class PaCoTrunk(nn.Module):
-    """Composed layers by weights that an MLP makes of the task's features."""
+    """Applies composed layers by weights that an MLP computes from the task's features."""
 
     num_sets: int
     hidden: tuple[int, ...]
@@ -67,24 +67,24 @@ class PaCoTrunk(nn.Module):
 
 @dataclasses.dataclass(frozen=True)
 class PaCo(Identity):
-    """Parameter composition (Sun, Zhang, Xu and Tomizuka 2022): theta_task = sum_k w_k(task) Phi_k.
+    """PaCo composes parameters: theta_task = sum_k w_k(task) Phi_k (Sun, Zhang, Xu and Tomizuka 2022).
 
-    Every hidden layer's kernel and bias are such sums, of sets Phi that all tasks share; the task enters in no other
-    way. A small MLP makes the weights w of the task's features, so that tasks that were not trained on get a policy of
-    their own from the sets.
+    Kernels and biases of all hidden layers are such sums, of sets Phi that all tasks share; the task has no other
+    influence. A small MLP computes the weights w from the task's features, so that unseen tasks get weights of their
+    own.
 
-    Differs from the paper: there every task has a vector w of its own, which ``weight_widths=()`` is for
-    conditioning=one-hot. Linear in few parameters, weights would not be free: of tasks along one parameter they would
-    be a line, and two sets would make all policies, however many there are. The output layer is the network's head,
-    composed for no task (heads=per-task gives each its own); scales and shifts of layer normalisation are shared; a
-    task whose loss explodes is neither masked out nor given new weights from those of solved tasks.
+    Differs from the paper: there every task has a free vector w, as here with conditioning=one-hot and
+    ``weight_widths=()``. Weights that are linear in few features would not be free: for tasks along one parameter they
+    would lie on a line, and two sets would make all policies. The output layer is the network's head, and is not
+    composed (heads=per-task gives each task its own); scales and shifts of layer normalisation are shared; a task whose
+    loss explodes is neither masked out nor given new weights.
     """
 
     needs_features: ClassVar[bool] = True
     num_sets: int = 5
-    """Sets of parameters. The paper: 5 for 10 tasks."""
+    """Number of sets of parameters. The paper: 5 for 10 tasks."""
     weight_widths: tuple[int, ...] = (64,)
-    """Widths of the hidden layers between the task's features and its weights; none makes these linear."""
+    """Widths of the hidden layers from the task's features to its weights; without any, weights are linear."""
 
     def __post_init__(self):
         parts.require_counts(self, "num_sets")
@@ -100,7 +100,7 @@ def _first_alone(key, shape: tuple[int, ...], dtype=jnp.float32) -> Array:
 
 
 class HyperTrunk(nn.Module):
-    """Composed layers by a code of the task's features, which an MLP with linear output makes."""
+    """Applies composed layers by a code that an MLP with linear output computes from the task's features."""
 
     hypernetwork_widths: tuple[int, ...]
     hidden: tuple[int, ...]
@@ -117,25 +117,25 @@ class HyperTrunk(nn.Module):
 
 @dataclasses.dataclass(frozen=True)
 class Hypernetwork(Identity):
-    """A network that writes the trunk's parameters from the task's features (Rezaei-Shoshtari et al. 2023).
+    """The hypernetwork computes the trunk's parameters from the task's features (Rezaei-Shoshtari et al. 2023).
 
     All kernels and biases of the hidden layers are theta(z) = Theta_0 + sum_k e_k(z) Theta_k, where the code e (K,) is
-    an MLP of the features with linear output: a composition of K + 1 sets by weights (1, e). With K the last of
-    ``hypernetwork_widths``, it has about K + 1 times the parameters of the trunk that it writes (17 times by default:
-    1.2 million for a trunk of 2 x 256 units), and acts at the trunk's cost.
+    an MLP of the features with linear output: a composition of K + 1 sets by weights (1, e). K is the last of
+    ``hypernetwork_widths``. There are about K + 1 times the parameters of the trunk (by default 17 times: 1.2 million
+    for a trunk of 2 x 256 units), and acting costs as much as with the trunk alone.
 
-    Theta_0 starts by LeCun's initialisation and the other sets at zero, so that every task begins with the same usual
-    network ("Bias-HyperInit", Beck et al. 2022). Usual initialisations of a hypernetwork's output make kernels of the
-    wrong size, with which learning may fail.
+    Theta_0 starts by LeCun's initialisation and the other sets at zero, so that all tasks begin with the same network
+    of the usual scale ("Bias-HyperInit", Beck et al. 2022). With usual initialisations of a hypernetwork's output,
+    kernels have the wrong scale, and learning may fail.
 
-    Differs from the paper: actor and critics are trained by SAC's losses from experience, and not fitted to solutions
-    that were found for each task before; the map from code to parameters is linear, of rank K; the output layer is the
-    network's head, the same for all tasks.
+    Differs from the paper: actor and critics are trained by SAC's losses, and not fitted to solutions that were found
+    for each task before; the map from code to parameters is linear, of rank K; the output layer is the network's head,
+    the same for all tasks.
     """
 
     needs_features: ClassVar[bool] = True
     hypernetwork_widths: tuple[int, ...] = (64, 16)
-    """Widths of the layers that encode the task's features; the last is the size of the code, without relu."""
+    """Widths of the layers that encode the task's features; the last, without ReLU, is the size of the code."""
 
     def __post_init__(self):
         if not self.hypernetwork_widths or min(self.hypernetwork_widths) < 1:

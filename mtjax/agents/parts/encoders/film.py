@@ -1,4 +1,4 @@
-"""FiLM: layers that are scaled and shifted by the task."""
+"""FiLM scales and shifts layers by the task."""
 
 import dataclasses
 from typing import ClassVar, Literal
@@ -14,7 +14,7 @@ from mtjax.types import Array
 
 
 class ModulatedMLP(nn.Module):
-    """An MLP of which every layer is scaled and shifted, before its ReLU or after it."""
+    """Applies an MLP whose layers are scaled and shifted, before their ReLU or after it."""
 
     widths: tuple[int, ...]
     layer_norm: bool
@@ -31,7 +31,7 @@ class ModulatedMLP(nn.Module):
 
 
 class FiLMTrunk(nn.Module):
-    """A modulated MLP on observation and action, and the one that reads its scales and shifts off the task."""
+    """Applies a modulated MLP to observation and action; another MLP computes scales and shifts from the task."""
 
     widths: tuple[int, ...]
     layer_norm: bool
@@ -53,23 +53,23 @@ class FiLMTrunk(nn.Module):
 
 @dataclasses.dataclass(frozen=True)
 class FiLM(Identity):
-    """Feature-wise linear modulation: the task scales and shifts every layer (Perez et al. 2018, equations 1 and 2).
+    """FiLM scales and shifts every layer by the task's features (Perez et al. 2018, equations 1 and 2).
 
     With the task's features c and an MLP g, layer l of the network on observation and action computes
         (d_1, ..., d_L, b_1, ..., b_L) = g(c),    x <- ReLU((1 + d_l) W_l x + b_l)
-    with layer normalisation, where there is one, before the modulation. ``film="channel"`` is the paper's, a scale and
-    a shift for every unit; ``film="scalar"`` is MTRL's, one scale and one shift a layer, applied after its ReLU.
+    with layer normalisation, if any, before the modulation. ``film="channel"`` is the paper's: a scale and a shift for
+    every unit. ``film="scalar"`` is MTRL's: one scale and one shift for each layer, after its ReLU.
 
     Differs from the paper: the output layer of g starts at 0 (scales are 1 and shifts 0), and layer normalisation keeps
-    its own scale and shift. Differs from MTRL: scales are 1 + d where MTRL reads them off as they are, the last layer
-    has a ReLU like the others, and the actor's modulation is trained (MTRL leaves it at its initial values).
+    its own scale and shift. Differs from MTRL: scales are 1 + d where MTRL's are d; the last layer has a ReLU
+    like the others; and the actor's modulation is trained (MTRL leaves it at its initial values).
     """
 
     needs_features: ClassVar[bool] = True
     film: Literal["channel", "scalar"] = "channel"
-    """A scale and a shift for every unit before its ReLU, or one of each for every layer after it."""
+    """Modulate every unit before its ReLU (channel), or each layer as a whole after its ReLU (scalar)."""
     film_widths: tuple[int, ...] = (64, 64)
-    """Widths of the hidden layers of the network that gives scales and shifts; none makes it linear."""
+    """Widths of the hidden layers in the network of scales and shifts; without any it is linear."""
 
     def __post_init__(self):
         super().__post_init__()

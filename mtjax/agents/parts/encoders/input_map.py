@@ -1,4 +1,4 @@
-"""A linear map of the observation for every task, before what all tasks share."""
+"""The input map transforms each task's observations before the networks that all tasks share."""
 
 import dataclasses
 
@@ -10,7 +10,7 @@ from mtjax.types import Array
 
 
 class AffineMap(nn.Module):
-    """An affine map of the observation onto one of the same size, at first the identity."""
+    """Maps observations to vectors of the same size by an affine map, initially the identity."""
 
     @nn.compact
     def __call__(self, obs: Array) -> Array:
@@ -20,12 +20,12 @@ class AffineMap(nn.Module):
 
 @dataclasses.dataclass(frozen=True)
 class InputMap(Identity):
-    """Every task maps its observations into those that the shared network reads (domain adaptation).
+    """Maps each task's observations to inputs of the shared network (domain adaptation).
 
     For task i, with networks f that all tasks share:
-        f(phi_i(s), ...),   phi_i(s) = A_i s + b_i,   at first A_i = 1 and b_i = 0
-    so that tasks begin as one and move apart as their dynamics or sensors differ: the linear input network of
-    Neto et al. (1995), one a task. Actions and task features are left as they are.
+        f(phi_i(s), ...),   phi_i(s) = A_i s + b_i,   initially A_i = 1 and b_i = 0
+    so that all tasks begin with the same network. It is the linear input network of Neto et al. (1995), one for each
+    task. Actions and task features are not mapped.
 
     Differs from the paper: maps and shared network are trained together, from the start.
     """

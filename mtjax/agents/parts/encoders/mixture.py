@@ -1,4 +1,4 @@
-"""Mixtures of experts: several encoders of the observation, and how a task chooses among them."""
+"""Mixtures of experts encode the observation several times, and weigh the encodings by the task."""
 
 import dataclasses
 from typing import ClassVar, Literal
@@ -15,7 +15,7 @@ _BY_NUMBER = ("identity", "cluster")
 
 
 class Experts(nn.Module):
-    """K networks of the same shape, each an MLP with a linear output, evaluated as batched products."""
+    """Applies K MLPs of the same shape, with linear outputs, as batched products."""
 
     num_experts: int
     widths: tuple[int, ...]
@@ -41,12 +41,12 @@ def mix(weights: Array, encodings: Array) -> Array:
     # XLA 0.11 fuses a softmax, its transpose and this sum into one Triton kernel that is wrong for every second task.
     weights, encodings = jax.lax.optimization_barrier((weights, encodings))
     weights = jnp.moveaxis(weights, -1, 0)
-    # Not a matrix product, which for a handful of terms is slower on a GPU than a sum fused with what made them.
+    # Not a matrix product: for few terms, a sum that fuses with the operations before it is faster on a GPU.
     return jnp.sum(weights.reshape(*weights.shape, *[1] * (encodings.ndim - weights.ndim)) * encodings, axis=0)
 
 
 def top_k_softmax(scores: Array, k: int) -> Array:
-    """Weights (..., K) of which exactly k are not 0: the softmax of the k highest scores (..., K)."""
+    """Return the softmax of the k highest scores (..., K); the other weights (..., K) are 0."""
     highest, chosen = jax.lax.top_k(scores, k)
     return jnp.einsum("...j,...jk->...k", nn.softmax(highest), jax.nn.one_hot(chosen, scores.shape[-1]))
 
@@ -61,7 +61,7 @@ def check_experts(num_experts: int, expert_widths: tuple[int, ...]) -> None:
 
 
 class Gate(nn.Module):
-    """An MLP from what is known of a task to scores (..., K) of the experts."""
+    """Maps task features to scores (..., K) of the experts by an MLP."""
 
     num_experts: int
     widths: tuple[int, ...]
@@ -76,11 +76,11 @@ def _either_way(key, shape: tuple[int, ...], dtype=jnp.float32) -> Array:
 
 
 class TaskWeights(nn.Module):
-    """An MLP from what is known of a task to weights (..., K) of any sign; without hidden layers it is linear.
+    """Maps task features to weights (..., K) of any sign by an MLP; without hidden layers it is linear.
 
-    At the start a weight is about ``level``, and its square one to two times as large as that of ``level``, for
-    features from nothing to unit ones. Hidden units begin to be active at places spread over the training range, so
-    that tasks along a line have weights that do not lie on one.
+    Initial weights are about ``level``: their mean square is one to two times its square, for features of length 0 to
+    1. Hidden units become active at points spread over the training range, so that tasks along a line have weights that
+    do not lie on one.
     """
 
     num: int
@@ -97,7 +97,7 @@ class TaskWeights(nn.Module):
 
 
 class MixtureTrunk(nn.Module):
-    """Encode an observation by a task's mixture of experts, and an MLP on the encoding and everything else."""
+    """Encodes observations by a mixture of experts, and applies an MLP to the encoding, features and action."""
 
     spec: "MoE"
     hidden: tuple[int, ...]
@@ -121,34 +121,34 @@ class MixtureTrunk(nn.Module):
 
 @dataclasses.dataclass(frozen=True)
 class MoE(Identity):
-    """A mixture of experts on the observation, and SAC's networks on top of it (MTRL's ``moe`` encoder).
+    """Encodes observations by a mixture of experts below the other layers (MTRL's ``moe`` encoder).
 
-    With K encoders E_k of the observation s, a task of features c and number i is given
+    With K encoders E_k of the observation s, and a task with features c and number i,
         z = sum_k w_k E_k(s)
-    and actor and critics work on [z, c]. How a task weighs the experts is the ``mode``:
+    and actor and critics take [z, c]. The ``mode`` chooses the weights:
         attention   w = softmax(g(c)), with an MLP g
         top-k       the softmax of the k highest scores g(c), and 0 elsewhere (Shazeer et al. 2017, without noise)
         ensemble    w_k = 1 / K
         cluster     the one expert that ``clusters`` gives for task i
         identity    expert i
 
-    Differs from MTRL: what a task does not choose has weight 0 and nothing is divided by a count, where MTRL's keyword
-    clusters leave tasks with none of 0 experts, which is not a number; and top-k lets gradients flow through the
-    weights that it keeps, where MTRL detaches the gate, which then stays as it was initialised. For the same reason
-    top-k=1 is refused: a single weight is always 1 and teaches the gate nothing. No loss balances the experts: one that
-    no task keeps does not learn. All experts are evaluated for every task, in one product, whatever their weights.
+    Differs from MTRL: experts that a task does not choose have weight 0, and no weight is divided by a count; MTRL's
+    keyword clusters divide by 0 for tasks without experts. Under top-k, gradients flow through the weights that are
+    kept; MTRL detaches the gate, so that it never learns. top-k=1 is refused, as a single weight is always 1 and gives
+    the gate no gradient. No loss balances the experts, so one that no task keeps does not learn. All experts are
+    evaluated for every task, in one product.
     """
 
     needs_features: ClassVar[bool] = True
     num_experts: int = 4
-    """Encoders in the mixture."""
+    """Number of encoders in the mixture."""
     expert_widths: tuple[int, ...] = (64, 64)
-    """Widths of each encoder's layers and of the gate's; the last is the size of the encoding."""
+    """Widths of the layers in each encoder and in the gate; the last is the size of the encoding."""
     mode: Literal["attention", "top-k", "ensemble", "cluster", "identity"] = "attention"
-    """How a task weighs the experts: by a soft gate, by the gate's highest scores alone, all alike, by a table, or
-    each task its own expert."""
+    """Weights of the experts: of a soft gate (attention), of the gate's highest scores (top-k), all equal (ensemble),
+    one expert by a table (cluster), or one for each task (identity)."""
     top_k: int = 2
-    """Experts that a task uses under mode=top-k."""
+    """Number of experts that a task uses with mode=top-k."""
     clusters: tuple[int, ...] = ()
     """The expert of every training task, numbered from 0, for mode=cluster."""
 
@@ -169,7 +169,7 @@ class MoE(Identity):
         return "" if self.mode == "ensemble" else super().refuses(conditioning)
 
     def weights_by_number(self, features: Array) -> Array:
-        """Weights (..., K) from one-hot task numbers (..., T)."""
+        """Return weights (..., K) for one-hot task numbers (..., T)."""
         table = self.clusters or tuple(range(self.num_experts))
         if len(table) != features.shape[-1]:
             given = f"clusters={table}" if self.clusters else f"num-experts={self.num_experts}"

@@ -1,4 +1,4 @@
-"""MOORE: a mixture of experts whose representations are kept orthogonal."""
+"""MOORE mixes experts whose representations are made orthogonal."""
 
 import dataclasses
 from typing import ClassVar
@@ -12,7 +12,7 @@ from mtjax.agents.parts.encoders.base import Identity
 from mtjax.agents.parts.encoders.mixture import Experts, TaskWeights, check_experts, mix
 from mtjax.types import Array, InputError
 
-_SHARE, _LENGTH = 1e-4, 1e-3  # a vector of which less is new counts for little; slopes are bounded by the inverses
+_SHARE, _LENGTH = 1e-4, 1e-3  # relative and absolute lengths below which a residual shrinks to 0
 
 
 def orthonormal(vectors: Array) -> Array:
@@ -20,8 +20,8 @@ def orthonormal(vectors: Array) -> Array:
 
     With the part r_k of u_k that is orthogonal to all v before it:
         v_k = r_k / sqrt(|r_k|^2 + (10^-4 |u_k|)^2 + (10^-3)^2)
-    so that a vector that is 0, or lies in the span of those before it, gives nearly 0, smoothly and with a finite
-    slope, by which experts can part again; all others give the unit vector, as |r_k| is much the largest term.
+    If u_k is 0, or lies in the span of the vectors before it, v_k is nearly 0, with a finite gradient by which experts
+    can separate again. Otherwise |r_k| is by far the largest term, and v_k has length 1.
     """
     floors = _SHARE**2 * jnp.sum(jnp.square(vectors), axis=-1, keepdims=True) + _LENGTH**2
     basis, rest = [], vectors
@@ -34,7 +34,7 @@ def orthonormal(vectors: Array) -> Array:
 
 
 class OrthogonalMixture(nn.Module):
-    """The task's weighted sum of orthonormal representations of the input, squashed."""
+    """Returns tanh of the task's weighted sum of orthonormal representations of the input."""
 
     num_experts: int
     widths: tuple[int, ...]
@@ -51,26 +51,25 @@ class OrthogonalMixture(nn.Module):
 
 @dataclasses.dataclass(frozen=True)
 class MOORE(Identity):
-    """A mixture of orthogonal experts (Hendawy, Peters and D'Eramo 2024).
+    """MOORE mixes orthogonal experts (Hendawy, Peters and D'Eramo 2024).
 
-    K experts h_k read the observation and, in a critic, the action. For a task of features c, with an MLP w:
+    K experts h_k take the observation x and, in a critic, the action. For a task with features c, with an MLP w:
         U = [h_1(x), ..., h_K(x)],   V = Gram-Schmidt(U),   z = tanh(V w(c))
-    and the task's head stands on z, as nothing follows the mixture but the paper's linear output, one for each task
-    (heads=per-task). ``hidden`` are the widths of an expert; the last layer is linear, and where layer normalisation is
-    asked for it comes before the ReLU of the others. The paper has hidden layers of 400, K = 4 for MT10 and 6 for MT50.
+    The task's head is applied to z, as the paper has only a linear output after the mixture, one for each task
+    (heads=per-task). ``hidden`` are the widths of an expert. Its last layer is linear; layer normalisation, if any, is
+    before the ReLU of the others. The paper has hidden layers of 400, K = 4 for MT10 and 6 for MT50.
 
-    Differs from the paper: there w(c) = W c for one-hot task numbers c, so that every task's weights are free. Linear
-    in few parameters they would not be: of tasks along one parameter they would be a line, and two mixtures of experts
-    would make all others. ``weight_widths=()`` with conditioning=one-hot is the paper's, but for a bias, without which
-    a task whose features are 0 would be told nothing of its observation. Gram-Schmidt is finite where experts are 0 or
-    dependent.
+    Differs from the paper: there w(c) = W c for one-hot task numbers c, so that every task's weights are free. Weights
+    that are linear in few features would not be: for tasks along one parameter they would lie on a line, and two
+    mixtures would make all others. ``weight_widths=()`` with conditioning=one-hot is the paper's, plus a bias, without
+    which z would be 0 for a task whose features are 0. Gram-Schmidt is finite where experts are 0 or dependent.
     """
 
     needs_features: ClassVar[bool] = True
     num_experts: int = 4
-    """Orthogonal experts; no more than the last hidden layer has units."""
+    """Number of orthogonal experts, at most the width of the last hidden layer."""
     weight_widths: tuple[int, ...] = (64,)
-    """Widths of the hidden layers between the task's features and its weights; none makes these linear."""
+    """Widths of the hidden layers from the task's features to its weights; without any, weights are linear."""
 
     def __post_init__(self):
         check_experts(self.num_experts, (1,))

@@ -1,4 +1,4 @@
-"""Residual bodies with layer normalisation, which go on learning where plain networks of their size do not."""
+"""Residual bodies with layer normalisation keep learning at sizes at which plain MLPs stop."""
 
 import dataclasses
 
@@ -12,7 +12,7 @@ _he = nn.initializers.he_normal()
 
 
 class BroNetTrunk(nn.Module):
-    """Dense, norm and relu; then blocks that add to it."""
+    """Applies a dense layer with norm and ReLU, then residual blocks."""
 
     width: int
     num_blocks: int
@@ -27,7 +27,7 @@ class BroNetTrunk(nn.Module):
 
 
 class SimBaTrunk(nn.Module):
-    """A linear layer, blocks that add to it, and a last norm."""
+    """Applies a linear layer, residual blocks and a last norm."""
 
     width: int
     num_blocks: int
@@ -43,10 +43,10 @@ class SimBaTrunk(nn.Module):
 
 
 def blocks(name: str, hidden: tuple[int, ...]) -> tuple[int, int]:
-    """Width and number of residual blocks, one for every hidden layer.
+    """Return width and number of residual blocks, one for every hidden layer.
 
     Raises:
-        InputError: hidden layers differ in width, through which nothing could be added.
+        InputError: hidden layers differ in width, so that blocks could not be added.
     """
     if len(set(hidden)) > 1:
         raise InputError(f"{name} has a block of one width for each hidden layer; hidden={hidden} has several")
@@ -55,15 +55,15 @@ def blocks(name: str, hidden: tuple[int, ...]) -> tuple[int, int]:
 
 @dataclasses.dataclass(frozen=True)
 class BroNet(Identity):
-    """BroNet (Nauman et al. 2024, "Bigger, Regularized, Optimistic"), with a block for each width of ``hidden``.
+    """BroNet has a residual block for each width of ``hidden`` (Nauman et al. 2024, "Bigger, Regularized, Optimistic").
 
         x = relu(LN(Dense(inputs)));   x <- x + LN(Dense(relu(LN(Dense(x)))))   in each block
-    Norms are the body's own: critic-layer-norm and actor-layer-norm say nothing here.
+    Its norms do not depend on critic-layer-norm and actor-layer-norm.
 
-    Differs from the paper: actor and critics are of one size (there, 2 blocks of 512 in critics and 1 of 256 in the
-    actor); kernels start by He's initialisation, where the authors' are orthogonal times sqrt 2, which is of the same
-    size and takes a QR decomposition each, and heads by LeCun's; of the paper's agent it is the network alone, without
-    optimistic exploration, quantiles and resets.
+    Differs from the paper: actor and critics have the same size (there, 2 blocks of 512 in critics and 1 of 256 in the
+    actor). Kernels start by He's initialisation, and heads by LeCun's; the authors' are orthogonal times sqrt 2, which
+    has He's scale but needs a QR decomposition for each. Only the network is implemented, not the paper's optimistic
+    exploration, quantiles and resets.
     """
 
     def body(self, hidden: tuple[int, ...], layer_norm: bool) -> nn.Module:
@@ -72,18 +72,18 @@ class BroNet(Identity):
 
 @dataclasses.dataclass(frozen=True)
 class SimBa(Identity):
-    """SimBa (Lee et al. 2024, "Simplicity Bias for Scaling Up Parameters"), with a block for each width of ``hidden``.
+    """SimBa has a residual block for each width of ``hidden`` (Lee et al. 2024).
 
         x = Dense(inputs);   x <- x + Dense(relu(Dense_4w(LN(x))))   in each block;   LN(x)
-    Norms are the body's own: critic-layer-norm and actor-layer-norm say nothing here. The paper scales observations by
-    their running statistics, which is normalize-observations, and decays weights, which is weight-decay.
+    Its norms do not depend on critic-layer-norm and actor-layer-norm. For the paper's scaling of observations use
+    normalize-observations, and for its weight decay weight-decay.
 
-    Differs from the paper: actor and critics are of one size (there, 2 blocks of 512 in critics and 1 of 128 in the
+    Differs from the paper: actor and critics have the same size (there, 2 blocks of 512 in critics and 1 of 128 in the
     actor); the first layer starts by LeCun's initialisation, where the authors' is orthogonal.
     """
 
     expansion: int = 4
-    """Width inside a block, in widths of the block."""
+    """Factor between the width inside a block and the width of the block."""
 
     def __post_init__(self):
         if self.expansion < 1:

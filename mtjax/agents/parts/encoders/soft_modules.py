@@ -1,4 +1,4 @@
-"""Soft modularization: layers of modules, and a network that routes every task through them."""
+"""Soft modularization routes every task through layers of modules."""
 
 import dataclasses
 from typing import ClassVar, Literal
@@ -13,7 +13,7 @@ from mtjax.types import Array, InputError
 
 
 class Modules(nn.Module):
-    """A layer of M modules, as one batched product, and what the next layer's modules receive of it."""
+    """Applies a layer of M modules, as one batched product, and mixes the outputs for the next layer."""
 
     width: int
     official: bool
@@ -21,18 +21,18 @@ class Modules(nn.Module):
 
     @nn.compact
     def __call__(self, x: Array, weights: Array) -> Array:
-        """Map every module's input (..., M, I), or the same for all (..., I), by weights (..., R, M) to (..., R, D)."""
+        """Map inputs (..., M, I) of the modules, or one (..., I) for all, by weights (..., R, M) to (..., R, D)."""
         num_modules, init = weights.shape[-1], nn.initializers.lecun_normal(batch_axis=0)
         kernel = self.param("kernel", init, (num_modules, x.shape[-1], self.width))
         bias = self.param("bias", nn.initializers.zeros, (num_modules, self.width))
         x = jnp.einsum("...mi,mid->...md" if x.ndim == weights.ndim else "...i,mid->...md", x, kernel) + bias
-        norm = nn.LayerNorm(feature_axes=(-2, -1)) if self.layer_norm else lambda x: x  # each by a scale of its own
+        norm = nn.LayerNorm(feature_axes=(-2, -1)) if self.layer_norm else lambda x: x  # a scale for each module
         mix = lambda x: jnp.einsum("...rm,...md->...rd", weights, x)
         return ReLU()(norm(mix(x))) if self.official else mix(ReLU()(norm(x)))
 
 
 class Routing(nn.Module):
-    """From f(s) h(z) (..., F) to every layer's weights (..., R, M): of R receivers, on M modules; rows sum to one."""
+    """Maps f(s) h(z) (..., F) to every layer's weights (..., R, M) of M modules for R receivers; rows sum to one."""
 
     num_layers: int
     num_modules: int
@@ -47,8 +47,8 @@ class Routing(nn.Module):
         found, seen, gate = [], [], joint
         for i, count in enumerate(receivers):
             if i:
-                told = jnp.concatenate(seen, axis=-1) if self.official else seen[-1]
-                gate = nn.Dense(joint.shape[-1], name=f"up_{i}")(told) * joint
+                previous = jnp.concatenate(seen, axis=-1) if self.official else seen[-1]
+                gate = nn.Dense(joint.shape[-1], name=f"up_{i}")(previous) * joint
             scores = nn.Dense(count * self.num_modules, name=f"down_{i}")(ReLU()(gate))
             weights = jax.nn.softmax(scores.reshape(*scores.shape[:-1], count, self.num_modules), axis=-1)
             self.sow("intermediates", "weights", weights)
@@ -58,7 +58,7 @@ class Routing(nn.Module):
 
 
 class SoftTrunk(nn.Module):
-    """A base network of modules under the weights of a routing network."""
+    """Applies layers of modules, weighed by a routing network, to an encoding of the observation."""
 
     num_layers: int
     num_modules: int
@@ -84,36 +84,36 @@ class SoftTrunk(nn.Module):
 
 @dataclasses.dataclass(frozen=True)
 class SoftModules(Identity):
-    """Soft modularization (Yang, Xu, Wu and Wang 2020).
+    """SoftModules routes every task softly through layers of modules (Yang, Xu, Wu and Wang 2020).
 
-    L layers of M modules W_j^l work on an encoding f(s) of the observation (in a critic, and the action); module i of
-    a layer takes a mixture of the modules j before it, by weights that a routing network computes from the state and
-    the task's features z:
+    L layers of M modules W_j^l are applied to an encoding f(s) of the observation and, in a critic, the action. Module
+    i of a layer takes a mixture of the previous layer's modules j. A routing network computes the weights from the
+    state and the task's features z:
         p^1 = W_d^1 relu(f(s) h(z)),   p^(l+1) = W_d^(l+1) relu((W_u^l p^l) f(s) h(z))
         phat_i = softmax_j p_ij
         g_i^(l+1) = sum_j phat_ij^l relu(W_j^l g_j^l),   g_j^1 = f(s)
         output = sum_j W_j^L g_j^L
-    The last layer's modules are one linear layer on all g_j^L side by side: the network's head. So num_layers counts
-    the head, and num_layers - 1 layers of modules stand below it. f is an MLP of the widths ``hidden``, and h linear.
+    The last layer's modules are one linear layer on all g_j^L concatenated: the network's head. So num_layers counts
+    the head, and num_layers - 1 layers of modules are below it. f is an MLP of the widths ``hidden``, and h is linear.
 
-    ``variant="official"`` is what the authors' code computes: MLP layers embed f(s) h(z) for the routing alone; relu
-    acts on f(s) before the modules; every p is told all weights before it, not the last scores alone; relu follows
-    each mixture in place of each module; and the L-th layer is one of modules as well, of which a last p makes the one
-    mixture that the head sees.
+    ``variant="official"`` computes what the authors' code does: MLP layers embed f(s) h(z) for the routing alone; relu
+    is applied to f(s) before the modules; every p depends on all weights before it, and not only on the last scores;
+    relu follows each mixture instead of each module; the L-th layer has modules too, and a last p mixes them for the
+    head.
 
-    Differs from the paper: all weights start by LeCun's initialisation; with layer normalisation on, it precedes relu
-    in f and in the modules. The paper also weighs the tasks' losses by their temperatures, which is not this part's.
+    Differs from the paper: all weights start by LeCun's initialisation; layer normalisation, if any, precedes relu in f
+    and in the modules. The paper also weighs the tasks' losses by their temperatures: see sampler=temperature.
     """
 
     needs_features: ClassVar[bool] = True
     num_layers: int = 2
-    """Layers of modules, the head counted as the paper does. The paper: 2 x 2 of 256 and 4 x 4 of 128."""
+    """Number of layers of modules, with the head, as in the paper. The paper: 2 x 2 of 256 and 4 x 4 of 128."""
     num_modules: int = 2
-    """Modules in a layer."""
+    """Number of modules in a layer."""
     module_width: int = 256
     """Width of a module's output."""
     variant: Literal["paper", "official"] = "paper"
-    """The paper's equations, or the authors' code."""
+    """Use the paper's equations, or those of the authors' code."""
     routing_widths: tuple[int, ...] = (256, 256)
     """Widths of the layers that embed the routing's input in the official variant."""
 

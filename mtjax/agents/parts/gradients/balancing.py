@@ -1,8 +1,8 @@
-"""Rules of gradient surgery that balance tasks over time: weights that are parameters, learned beside the networks'.
+"""Rules of gradient surgery that balance tasks over time, by weights that are learned.
 
-Both look at ratios of losses, which mean something only where 0 is the least that a loss can be. Agents count their
-critics' losses from there (``least_loss``), as a log-likelihood, for one, may be negative; an actor's loss has no
-known least, and ``for_actor`` looks at none. A loss that is 0 or below all the same is that of a task that is absent.
+Both rules use ratios of losses, which make sense only if 0 is the lower bound of a loss. Agents therefore subtract the
+lower bound of their critics' losses (``least_loss``), as a log-likelihood, for one, may be negative. An actor's loss
+has no known bound, so ``for_actor`` returns rules that use no losses. A loss of 0 or less marks a task as absent.
 """
 
 import dataclasses
@@ -17,32 +17,32 @@ from mtjax.agents.parts.gradients.rules import Mean
 from mtjax.types import Array, Key
 
 LEAST_WEIGHT = 1e-6
-"""What GradNorm leaves to a task, as a step may cross zero."""
+"""Lower bound of GradNorm's weights, as a step of Adam may cross zero."""
 NEVER = -1e30
-"""The logit of a task without a say; where none has one, a softmax of it is uniform."""
+"""Logit of an absent task; if all are absent, the softmax is uniform."""
 
 
 class Balance(NamedTuple):
-    """What GradNorm remembers."""
+    """Holds the memory of GradNorm."""
 
-    weights: Array  # (T,), which sum to T
-    optimizer: Any  # theirs
-    first: Array  # (T,) each task's first loss; 0 before there was one
+    weights: Array  # (T,) of sum T
+    optimizer: Any  # state of their optimiser
+    first: Array  # (T,) each task's first loss; 0 before it
 
 
 class Logits(NamedTuple):
-    """What FAMO remembers."""
+    """Holds the memory of FAMO."""
 
     logits: Array  # (T,)
-    optimizer: Any  # theirs
+    optimizer: Any  # state of their optimiser
 
 
 @dataclasses.dataclass(frozen=True)
 class _Learned(Mean):
-    """Weights by Adam."""
+    """Learns weights by Adam."""
 
     weight_lr: float = 0.025
-    """Adam's learning rate of the tasks' weights."""
+    """Adam's learning rate for the tasks' weights."""
 
     def __post_init__(self):
         parts.require_positive(self, "weight_lr")
@@ -52,29 +52,29 @@ class _Learned(Mean):
         return optax.adam(self.weight_lr)
 
     def step(self, values: Array, slope: Array, memory: Any, present: Array) -> tuple[Array, Any]:
-        """Descend ``slope`` (T,) where tasks are present; returns the values (T,) and the optimiser's memory."""
+        """Descend ``slope`` (T,) where tasks are present, and return values (T,) and the optimiser's state."""
         change, memory = self.optimizer.update(jnp.where(present, slope, 0.0), memory)
         return values + jnp.where(present, change, 0.0), memory  # type: ignore
 
 
 @dataclasses.dataclass(frozen=True)
 class GradNorm(_Learned):
-    """Weights that let all tasks learn at one rate (Chen et al. 2018, algorithm 1).
+    """GradNorm learns weights that let all tasks learn at one rate (Chen et al. 2018, algorithm 1).
 
     With the length n_i of task i's gradient and its loss L_i, relative to its first:
         r_i = (L_i / L_i(0)) / mean_j (L_j / L_j(0))                          (how far behind a task is)
         L(w) = sum_i |w_i n_i - mean_j (w_j n_j) r_i^a|                       (the second term a constant)
-    Weights descend L by Adam and are scaled to sum to T; an update uses those from before. A task that is absent keeps
-    its weight.
+    Weights descend L by Adam and are scaled to sum to T; an update uses the weights from before it. An absent task
+    keeps its weight.
 
-    Differs from the paper: n_i is over all shared parameters, of which the paper takes the last layer; L is in units of
-    the mean length, so that Adam's step does not depend on the losses' scale; losses are counted from the least that
-    they can be. An actor's losses tell nothing of its progress, so that its weights make all lengths equal (a = 0).
+    Differs from the paper: n_i is over all shared parameters, where the paper takes the last layer; L is in units of
+    the mean length, so that Adam's step does not depend on the losses' scale; losses are counted from their lower
+    bound. An actor's losses do not measure its progress, so its weights make all lengths equal (a = 0).
     """
 
     needs = "gradients"
     gradnorm_asymmetry: float = 1.0
-    """How much more the tasks that are behind count (a); 0 makes all lengths equal. The paper: 0.12 to 1.5."""
+    """How strongly tasks that are behind gain weight (a); 0 makes all lengths equal. The paper: 0.12 to 1.5."""
 
     def __post_init__(self):
         super().__post_init__()
@@ -112,16 +112,16 @@ class GradNorm(_Learned):
 
 @dataclasses.dataclass(frozen=True)
 class FAMO(_Learned):
-    """Weights that lower all losses' logarithms at one rate (Liu et al. 2023, algorithm 1), without tasks' gradients.
+    """FAMO learns weights that lower all losses' logarithms at one rate (Liu et al. 2023, algorithm 1).
 
     With the losses l of a batch before the update and l' after it, and logits x:
         z = softmax(x),  w_i = (z_i / l_i) / sum_j (z_j / l_j)                     (weights of the update)
         x descends  z_i (d_i - z . d) + decay x_i,  d = log l - log l'             (the losses' part: d by z's slope)
-    Losses are counted from the least that they can be, as in its authors' code. The actor's may be anything, and are
-    averaged.
+    It needs no gradients of single tasks. Losses are counted from their lower bound, as in its authors' code. The
+    actor's losses have no such bound, and are averaged.
 
     Differs from the paper: x descends by Adam, as in its authors' code; algorithm 1 has a plain step of the same size,
-    which at the pace of a critic's losses would leave z all but uniform. Parameters of one task are not weighted.
+    which would leave z nearly uniform, as a critic's losses change slowly. Parameters of one task are not weighted.
     """
 
     needs = "losses"

@@ -1,4 +1,4 @@
-"""Gradient descent on the parameters of actor and critics."""
+"""Optimisers and optimiser steps for actor and critics."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from mtjax.types import Array
 
 
 def adam(rate: Any, weight_decay: Any, max_norm: Any, tune: str) -> optax.GradientTransformation:
-    """Adam or AdamW on clipped gradients, of which only the parameters that ``tune`` names learn."""
+    """Return Adam, or AdamW, on clipped gradients, for those parameters that ``tune`` names."""
     clip = optax.identity() if parts.is_zero(max_norm) else clip_to(max_norm)
     step = optax.adam(rate) if parts.is_zero(weight_decay) else optax.adamw(rate, weight_decay=weight_decay)
     learn = optax.chain(clip, step)
@@ -22,7 +22,7 @@ def adam(rate: Any, weight_decay: Any, max_norm: Any, tune: str) -> optax.Gradie
 
 
 def _learning(tune: str, params: Params) -> Any:
-    """Which leaves of actor or critic learn where not all do: those of heads, or learned embeddings."""
+    """Mark the leaves of actor or critic that learn: those of heads, or learned embeddings."""
     part = {"heads": "head", "embedding": "embedding"}[tune]
 
     def learns(path, _) -> bool:
@@ -33,11 +33,11 @@ def _learning(tune: str, params: Params) -> Any:
 
 
 def clip_to(norm: Any) -> optax.GradientTransformation:
-    """Clip gradients to a global norm; a traced one may be 0, which does not clip."""
+    """Return a transformation that clips gradients to a global norm; a traced norm may be 0, which does not clip."""
     return optax.clip_by_global_norm(jnp.where(norm > 0, norm, jnp.inf) if isinstance(norm, Array) else norm)
 
 
 def descend(optimizer: optax.GradientTransformation, gradients: Any, memory: Any, params: Any) -> tuple[Any, Any]:
-    """Apply one optimiser step; returns parameters and the optimiser's state."""
+    """Apply one optimiser step, and return the parameters and the optimiser's state."""
     updates, memory = optimizer.update(gradients, memory, params)
     return optax.apply_updates(params, updates), memory

@@ -1,4 +1,4 @@
-"""Quadratic problems in T-vectors, which rules of gradient surgery solve on the cosines of the tasks' gradients."""
+"""Solvers of the quadratic problems in T-vectors that rules of gradient surgery pose."""
 
 import jax
 import jax.numpy as jnp
@@ -6,13 +6,16 @@ import jax.numpy as jnp
 from mtjax.types import Array
 
 RIDGE = 1e-6
-"""Added to cosines' diagonal, times T, which is how their rounding grows."""
+"""Ridge on the diagonal of cosines, to be multiplied by T, as rounding errors grow with T."""
 CENTRAL_STEPS = 30
-"""Interior-point iterations: 15 bring 50 tasks to rounding, 30 also where lengths differ by a factor of 10 000."""
+"""Interior-point iterations: 15 converge to rounding for 50 tasks, 30 even if lengths differ by 10 000 times."""
 
 
 def cosines(gram: Array) -> tuple[Array, Array, Array]:
-    """Cosines (T, T) with a ridge, lengths (T,) and who has a gradient (T,); the absent are orthogonal, of length 1."""
+    """Return cosines (T, T) with a ridge, lengths (T,) and a mask (T,) of the tasks that have a gradient.
+
+    Tasks without a gradient count as orthogonal to the others, and of length 1.
+    """
     present = jnp.diagonal(gram) > 0
     norms = jnp.where(present, jnp.sqrt(jnp.diagonal(gram)), 1.0)
     ridge = jnp.where(present, RIDGE * len(gram), 1.0)
@@ -22,8 +25,8 @@ def cosines(gram: Array) -> tuple[Array, Array, Array]:
 def minimise(matrix: Array, linear: Array, budget: Array) -> Array:
     """Minimise y . matrix y / 2 + linear . y over y >= 0 (T,), under budget . y = 1 unless budget is zero throughout.
 
-    An infeasible primal-dual interior-point method: Newton's steps towards y z = m with m a tenth of its mean at each,
-    where z = matrix y + linear - price budget are the multipliers of y >= 0.
+    The method is an infeasible primal-dual interior-point method. With the multipliers z = matrix y + linear - price
+    budget of y >= 0, each Newton step aims at y z = m, where m is a tenth of the current mean of y z.
     """
     bound = jnp.max(budget) > 0
 

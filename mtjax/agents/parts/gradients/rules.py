@@ -1,12 +1,12 @@
-"""Rules of gradient surgery: from the Gram matrix G (T, T) of the tasks' gradients J to weights w (T,) of their sum.
+"""Rules of gradient surgery map the Gram matrix G (T, T) of the tasks' gradients J to weights w (T,) of their sum.
 
-Conventions, for every rule. Weights stand beside the mean's 1 / T, so that an update scales as the gradients do and a
-learning rate or a clipped norm means the same under each. Where all gradients are zero, weights are the mean's. A task
-whose gradient is zero (it is absent from the batch) has no say: it neither constrains the others nor divides by zero.
-Under Adam, which forgets the length of an update, rules differ in its direction alone.
+Conventions for every rule: weights have the size of the mean's 1 / T, so that a learning rate, or a clipped norm, means
+the same under each rule. If all gradients are zero, weights are 1 / T. A task whose gradient is zero is absent: it does
+not constrain the others, and nothing is divided by zero. Adam normalises the length of updates, so rules matter by the
+direction that they choose.
 
-Most rules solve their problem for unit gradients, on the matrix of cosines, as tasks' gradients differ in length by
-orders of magnitude. Iterations are fixed in number, as all runs under one jit and vmap.
+Most rules solve their problem for unit gradients, on the matrix of cosines, as lengths of gradients differ by orders of
+magnitude. Numbers of iterations are fixed, as everything runs under one jit and vmap.
 """
 
 import dataclasses
@@ -19,28 +19,28 @@ from mtjax.agents.parts.gradients.quadratic import RIDGE, cosines, minimise
 from mtjax.types import Array, InputError, Key
 
 NEWTON_STEPS = 25
-"""Newton steps to Nash's bargain: 20 bring 50 tasks to rounding, opposite gradients and unequal lengths included."""
+"""Newton steps of Nash-MTL: 20 converge to rounding for 50 tasks, even of opposite and unequal gradients."""
 CAGRAD_GRID = 16
-"""Points at which CAGrad brackets its multiplier, twice."""
+"""Points of each of CAGrad's two grids of multipliers."""
 PCGRAD_BLOCK = 10
-"""Projections that PCGrad writes out in one piece."""
+"""Projections that PCGrad unrolls into one block."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Mean:
-    """The mean of all tasks' gradients. Every rule is a class like this one; its fields are hyper-parameters."""
+    """Averages all tasks' gradients. Every rule is a class with these methods; its fields are hyper-parameters."""
 
-    needs: ClassVar[str] = ""  # "gradients": of every task; "losses": those before and after each update; "": neither
+    needs: ClassVar[str] = ""  # "gradients" of every task, "losses" before and after each update, or "" for neither
 
     def init(self, num_tasks: int) -> Any:
-        """What the rule remembers from one update to the next."""
+        """Return the initial memory, which is carried from update to update."""
         return None
 
     def weigh(self, memory: Any, gram: Array, losses: Array, key: Key) -> tuple[Array, Any]:
         """Choose the weights of an update.
 
         Args:
-            memory: what ``init`` or the last update gave.
+            memory: from ``init`` or the last update.
             gram: (T, T) inner products of the tasks' gradients; None to rules that do not need gradients.
             losses: (T,).
             key: for rules that draw.
@@ -51,22 +51,22 @@ class Mean:
         return jnp.full(len(losses), 1 / len(losses)), memory
 
     def adapt(self, memory: Any, before: Array, after: Array) -> Any:
-        """The new memory, from the losses (T,) of one batch before and after the update, for rules that need losses."""
+        """Return the new memory from losses (T,) of one batch before and after the update, if the rule needs losses."""
         return memory
 
     @property
     def for_actor(self) -> "Mean":
-        """The rule by which the actor's gradients combine, whose losses may be negative."""
+        """The rule for the actor's gradients, whose losses may be negative."""
         return self
 
 
 class OfGram(Mean):
-    """A rule of the Gram matrix alone: in full float32, and plain averaging where no task has a gradient."""
+    """Computes weights from the Gram matrix alone, in full float32; they are 1 / T if all gradients are zero."""
 
     needs = "gradients"
 
     def weights(self, gram: Array) -> Array:
-        """Weights (T,) for a Gram matrix (T, T) whose largest entry is 1."""
+        """Return weights (T,) for a Gram matrix (T, T) whose largest entry is 1."""
         raise NotImplementedError
 
     def weigh(self, memory: Any, gram: Array, losses: Array, key: Key) -> tuple[Array, Any]:
@@ -78,14 +78,13 @@ class OfGram(Mean):
 
 @dataclasses.dataclass(frozen=True)
 class PCGrad(Mean):
-    """Project away conflicts between tasks (Yu et al. 2020, algorithm 1), exactly, on T-vectors.
+    """PCGrad projects away conflicts between tasks, exactly, on T-vectors (Yu et al. 2020, algorithm 1).
 
-    Each task's gradient is c^T J with c = e_i; in a fresh random order over the other tasks j, where the two conflict,
-    c_j loses (c . G[:, j]) / G[j, j]. The result is the mean over tasks; their sum in the paper.
+    Each task's gradient is c^T J with c = e_i. In a fresh random order over the other tasks j, where the two conflict,
+    c_j loses (c . G[:, j]) / G[j, j]. The result is the mean over tasks; the paper takes the sum.
 
-    In a plain loop, T tasks are T steps one after the other, each so small that a GPU takes longer to launch it than to
-    run it. A block of steps needs c alone at its start: the shares that its others take follow one from the other, as
-    in a triangular solve but for the minimum. Written out, they compile to one or a few kernels a block.
+    A plain loop over T tasks has T small steps in sequence, and a GPU needs longer to launch each than to run it. Steps
+    are therefore unrolled in blocks. A block needs c only at its start, and compiles to a few kernels.
     """
 
     needs = "gradients"
@@ -93,12 +92,14 @@ class PCGrad(Mean):
     def weigh(self, memory: Any, gram: Array, losses: Array, key: Key) -> tuple[Array, Any]:
         num_tasks, block = len(gram), min(len(gram), PCGRAD_BLOCK)
         squares = jnp.diagonal(gram)
-        along = gram / jnp.where(squares > 0, squares, jnp.inf)  # of each gradient along each other, in its lengths
-        along = jnp.pad(along, (0, -num_tasks % block)).T  # to whole blocks, by tasks that are absent
+        along = gram / jnp.where(
+            squares > 0, squares, jnp.inf
+        )  # components of gradients along each other, relative to the lengths of the latter
+        along = jnp.pad(along, (0, -num_tasks % block)).T  # absent tasks fill the last block
         size = len(along)
 
         def against(c: Array, others: Array) -> tuple[Array, None]:
-            """Project every task's gradient (T, T) against the next of its others (T, block)."""
+            """Project every task's gradient (T, T) against the next block of other tasks (T, block)."""
             parts = jnp.sum(c[:, None] * along[others], axis=-1)
             between = along[others[:, None], others[:, :, None]]
             counts = others != jnp.arange(size)[:, None]
@@ -114,23 +115,23 @@ class PCGrad(Mean):
 
 
 def orders(key: Key, num_tasks: int) -> Array:
-    """A random order of all tasks for each of them (T, T)."""
+    """Draw a random order of all tasks for each task: (T, T)."""
     return jnp.argsort(jax.random.bits(key, (num_tasks, num_tasks)))
 
 
 @dataclasses.dataclass(frozen=True)
 class CAGrad(OfGram):
-    """Improve the worst-off task near the mean gradient (Liu et al. 2021a, "CAGrad").
+    """CAGrad improves the worst-off task near the mean gradient (Liu et al. 2021a).
 
-    With the mean g_0, the update d solves max_d min_i g_i . d under |d - g_0| <= c |g_0|. It is d = g_0 + J^T x, where
-    for some multiplier t > 0 the vector t x minimises t g_0 . g_y + |g_y|^2 / 2 over y in the simplex (g_y = y^T J) and
-    |J^T x| = c |g_0|; or less, where no d helps every task. |J^T x| falls with t, so that two grids of quadratic
-    problems bracket t, and x is interpolated between the last two (exactly, if they hold the same tasks back): to 1e-3
-    of c |g_0|. As in the authors' code, the result is d / (1 + c^2), which scales with the gradients.
+    With the mean g_0, the update d solves max_d min_i g_i . d under |d - g_0| <= c |g_0|. It is d = g_0 + J^T x. For a
+    multiplier t > 0, the vector t x minimises t g_0 . g_y + |g_y|^2 / 2 over y in the simplex, with g_y = y^T J; t is
+    such that |J^T x| = c |g_0|, or less if no d helps every task. As |J^T x| falls with t, two grids of quadratic
+    problems bracket t. Between the last two x is interpolated: to 1e-3 of c |g_0|, and exactly if the same entries of
+    both are zero. As in the authors' code, the result is d / (1 + c^2), which scales with the gradients.
     """
 
     cagrad_radius: float = 0.5
-    """How far CAGrad's update may leave the mean, in lengths of the mean (c). Its authors: 0.5 (MT50), 0.9 (MT10)."""
+    """Largest distance of CAGrad's update from the mean, in lengths of the mean (c). Paper: 0.5 (MT50), 0.9 (MT10)."""
 
     def __post_init__(self):
         if not 0 < self.cagrad_radius < 1:
@@ -166,9 +167,10 @@ class CAGrad(OfGram):
 
 @dataclasses.dataclass(frozen=True)
 class MGDA(OfGram):
-    """The shortest convex combination of gradients (Désidéri 2012; Sener & Koltun 2018): min w^T G w on the simplex.
+    """MGDA takes the shortest convex combination of gradients (Désidéri 2012; Sener & Koltun 2018).
 
-    No task's loss rises along it; it is zero where no direction helps every task. Weights sum to one.
+    Weights minimise w^T G w on the simplex. No task's loss rises along the update; it is zero where no direction helps
+    every task.
     """
 
     def weights(self, gram: Array) -> Array:
@@ -180,11 +182,13 @@ class MGDA(OfGram):
 
 @dataclasses.dataclass(frozen=True)
 class IMTLG(OfGram):
-    """Equal projections onto every task's direction (Liu et al. 2021b, "IMTL-G"): d . g_i / |g_i| the same for all i.
+    """IMTL-G makes the projections d . g_i / |g_i| of the update on all gradients equal (Liu et al. 2021b).
 
     With the matrix C of cosines, w_i = y_i / |g_i| where C y = 1. Weights sum to one, as in the paper, and may be
-    negative. Differs from it where they cancel: magnitudes sum to ten at most, and the update never turns against all
-    tasks, which the paper's does for gradients that agree but differ in length.
+    negative.
+
+    Differs from the paper where weights cancel: their magnitudes sum to at most ten, and the update never points
+    against all tasks. The paper's update does for gradients that agree in direction but differ in length.
     """
 
     def weights(self, gram: Array) -> Array:
@@ -195,9 +199,9 @@ class IMTLG(OfGram):
 
 @dataclasses.dataclass(frozen=True)
 class NashMTL(OfGram):
-    """The tasks' bargain (Navon et al. 2022, "Nash-MTL"): w > 0 with G w proportional to 1 / w.
+    """Nash-MTL finds the Nash bargaining solution of the tasks: w > 0 with G w ~ 1 / w (Navon et al. 2022).
 
-    The paper's G a = 1 / a makes every update as long as sqrt(T), however small the gradients; here weights sum to one.
+    The paper's G a = 1 / a gives every update the length sqrt(T), however small the gradients; here weights sum to one.
     With the matrix C of cosines and y = a |g|, C y = 1 / y minimises y^T C y / 2 - sum log y; Newton's steps r in log y
     are shortened to r / (1 + max |r|), which always descends and tends to the full step.
     """
@@ -217,11 +221,11 @@ class NashMTL(OfGram):
 
 @dataclasses.dataclass(frozen=True)
 class AlignedMTL(OfGram):
-    """Gradients made orthogonal and equally long (Senushkin et al. 2023, "Aligned-MTL"), then averaged.
+    """Aligned-MTL makes gradients orthogonal and equally long, then averages them (Senushkin et al. 2023).
 
     With G = V diag(s) V^T and s_r its least eigenvalue above rounding, w = sqrt(s_r) V diag(s)^(-1/2) V^T 1 / T, over
-    the eigenvalues from s_r up. Lengths are part of G here, and gradients a thousand times shorter than the longest are
-    lost to rounding.
+    the eigenvalues of at least s_r. This rule uses G and not cosines, so gradients a thousand times shorter than the
+    longest are lost to rounding.
     """
 
     def weights(self, gram: Array) -> Array:
@@ -234,10 +238,10 @@ class AlignedMTL(OfGram):
 
 @dataclasses.dataclass(frozen=True)
 class UPGrad(OfGram):
-    """Project each gradient onto the directions that raise no loss, then average (Quinton & Rey 2024, "UPGrad").
+    """UPGrad projects each gradient onto the directions that raise no loss, then averages (Quinton & Rey 2024).
 
     The nearest d to g_i with J d >= 0 is J^T (e_i + v_i), v_i minimising (e_i + v)^T G (e_i + v) over v >= 0; the
-    weights are the mean of e_i + v_i. Without conflict that is the mean.
+    weights are the mean of e_i + v_i. Without conflicts, they are 1 / T.
     """
 
     def weights(self, gram: Array) -> Array:

@@ -1,8 +1,8 @@
-"""Gradient surgery: how the gradients of several tasks become one update of the parameters they share.
+"""Gradient surgery combines the gradients of several tasks into one update of the parameters that they share.
 
-Per-task gradients J (leading T) give a Gram matrix G = J J^T (T, T); a rule turns it into weights w (T,); the update is
-w^T J. Rules (``rules.py``, ``balancing.py``) differ only in G -> w; a few remember something, and FAMO looks at losses
-alone. A task's own parameters receive that task's gradient / T, as under plain averaging.
+Per-task gradients J (leading T) give a Gram matrix G = J J^T (T, T); a rule maps it to weights w (T,); the update is
+w^T J. Rules (``rules.py``, ``balancing.py``) differ only in G -> w. A few have a memory, and FAMO uses losses instead
+of G. A task's own parameters receive that task's gradient / T, as under plain averaging.
 """
 
 from collections.abc import Callable
@@ -33,11 +33,11 @@ RULES: dict[str, type[Rule]] = {
 }
 
 SMALL = 2**14
-"""Gradients of fewer numbers a task are put side by side: their products cost little but a kernel's launch each."""
+"""Leaves with fewer numbers per task are concatenated, as a kernel launch for each costs more than its product."""
 
 
 class Combined(NamedTuple):
-    """What ``gradient`` returns."""
+    """Holds what ``gradient`` returns."""
 
     gradients: Params  # like the parameters
     memory: Any  # the rule's
@@ -47,7 +47,7 @@ class Combined(NamedTuple):
 
 
 def init(rule: Rule, params: Params, num_tasks: int, per_layer: bool = False) -> Any:
-    """What a rule remembers at the start; leaves have a leading axis of layers if it weighs gradients."""
+    """Return a rule's initial memory; leaves have a leading axis of layers if the rule needs gradients."""
     memory = rule.init(num_tasks)
     if rule.needs != "gradients":
         return memory
@@ -65,10 +65,10 @@ def gradient(
     importance: Array | None = None,
     per_layer: bool = False,
 ) -> Combined:
-    """Differentiate ``loss(params of one task, data of one task) -> (loss, aux)`` for all tasks and combine.
+    """Differentiate ``loss(params of one task, data of one task) -> (loss, aux)`` for all tasks, and combine.
 
     Args:
-        rule: how they combine.
+        rule: combines the tasks' gradients.
         loss: of one task.
         params: ``shared`` as is, ``own`` with leading T.
         data: leaves (T, ...).
@@ -88,9 +88,9 @@ def gradient(
 
 
 def over_devices(loss: Callable) -> Callable:
-    """Make a loss, its gradient and whatever else it returns the means over the devices that share the data.
+    """Average a loss, its gradient and its auxiliary outputs over the devices that share the data.
 
-    Where all devices have the same data, as those that replay do, a loss needs none of this.
+    Where all devices have the same data, as with replay, this is not needed.
     """
     if collectives.count() == 1:
         return loss
@@ -106,8 +106,8 @@ def over_devices(loss: Callable) -> Callable:
     return averaged
 
 
-def look_again(rule: Rule, loss: Callable, params: Params, data: Any, before: Combined) -> Any:
-    """What a rule remembers once the parameters have moved; looks at their losses on the same data if it needs them."""
+def adapt_rule(rule: Rule, loss: Callable, params: Params, data: Any, before: Combined) -> Any:
+    """Return a rule's memory after the update; rules that need losses see the new ones on the same data."""
     if rule.needs != "losses":
         return before.memory
     of_task = lambda own, data: loss(Params(params.shared, own), data)[0]
@@ -115,7 +115,7 @@ def look_again(rule: Rule, loss: Callable, params: Params, data: Any, before: Co
 
 
 def _of_gradients(rule: Rule, one_task, params: Params, data, memory, key, importance, per_layer) -> Combined:
-    """By the gradients of every task."""
+    """Combine by the gradients of every task."""
     differentiate = jax.vmap(jax.grad(one_task, argnums=(0, 1), has_aux=True), (None, 0, 0, 0))
     (jacobian, own), (weighted, losses, aux) = differentiate(params.shared, params.own, data, importance)
     leaves, structure = jax.tree.flatten(jacobian)
@@ -133,7 +133,7 @@ def _of_gradients(rule: Rule, one_task, params: Params, data, memory, key, impor
 
 
 def _of_losses(rule: Rule, one_task, params: Params, data, memory, key, importance) -> Combined:
-    """By losses alone: one backward pass, of their weighted sum."""
+    """Combine by the losses alone, with one backward pass of their weighted sum."""
     all_tasks = lambda shared, own: jax.vmap(one_task, (None, 0, 0, 0))(shared, own, data, importance)
     weighted, pull, (_, losses, aux) = jax.vjp(all_tasks, params.shared, params.own, has_aux=True)
     weights, memory = rule.weigh(memory, None, weighted, key)  # type: ignore
@@ -144,7 +144,7 @@ def _of_losses(rule: Rule, one_task, params: Params, data, memory, key, importan
 
 
 def layers_of(tree: Any, per_layer: bool) -> list[list[int]]:
-    """The numbers of the leaves that are weighed together: all, or those of each layer (its kernel and its bias)."""
+    """Group the indices of leaves that are weighed together: all, or the kernel and bias of each layer."""
     layers: dict[Any, list[int]] = {}
     for i, (path, _) in enumerate(jax.tree_util.tree_leaves_with_path(tree)):
         layers.setdefault(path[:-1] if per_layer else (), []).append(i)
@@ -156,7 +156,7 @@ def _is_small(leaf: Array) -> bool:
 
 
 def gram_matrix(jacobian: Any) -> Array:
-    """Inner products (T, T) of per-task gradients, leaves (T, ...), in full float32, as small signs decide."""
+    """Compute inner products (T, T) of per-task gradients, leaves (T, ...), in full float32, as signs matter."""
     flat = [leaf.reshape(len(leaf), -1) for leaf in jax.tree.leaves(jacobian)]
     small = [leaf for leaf in flat if _is_small(leaf)]
     parts = [leaf for leaf in flat if not _is_small(leaf)] + ([jnp.concatenate(small, axis=1)] if small else [])
@@ -164,7 +164,7 @@ def gram_matrix(jacobian: Any) -> Array:
 
 
 def weighted_sums(weights: Array, leaves: list[Array]) -> list[Array]:
-    """The sums over tasks of per-task gradients (T, ...) by weights (T,)."""
+    """Sum per-task gradients (T, ...) over tasks by weights (T,)."""
     small = [leaf.reshape(len(leaf), -1) for leaf in leaves if _is_small(leaf)]
     sums: Any = []
     if small:
@@ -176,13 +176,13 @@ def weighted_sums(weights: Array, leaves: list[Array]) -> list[Array]:
 
 
 def cosines(gram: Array) -> tuple[Array, Array]:
-    """Cosines (T, T) between the tasks' gradients, 0 of those that are 0, and their lengths (T,)."""
+    """Return cosines (T, T) between the tasks' gradients, 0 for zero gradients, and lengths (T,)."""
     norms = jnp.sqrt(jnp.diagonal(gram))
     return gram / jnp.maximum(norms[:, None] * norms, 1e-30), norms
 
 
 def conflicts(gram: Array) -> Metrics:
-    """Mean cosine between different tasks' gradients, the share of pairs that point apart, and lengths (T,)."""
+    """Return the mean cosine of pairs of tasks, the share of pairs with negative cosine, and lengths (T,)."""
     cosine, norms = cosines(gram)
     pairs = ~jnp.eye(len(gram), dtype=bool)
     count = jnp.maximum(jnp.sum(pairs), 1)

@@ -1,4 +1,4 @@
-"""Representations by name: what all networks of an agent stand on. To add one: a file, and a line here."""
+"""Representations, by name, encode the inputs of an agent's networks. To add one, add a file, and a line here."""
 
 from mtjax.agents.parts.representations.base import Place, Plain
 from mtjax.agents.parts.representations.deepmdp import DeepMDP

@@ -1,4 +1,4 @@
-"""What a representation is, and the plainest."""
+"""``Plain`` is the interface of representations, and the one that does nothing."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -13,36 +13,35 @@ from mtjax.types import Array, Key, Metrics
 
 
 class Place(NamedTuple):
-    """Where a representation stands: what its agent says of networks and tasks."""
+    """Holds the agent's settings that a representation needs."""
 
     conditioning: str
-    embedding_size: int  # of learned vectors of tasks, and of what is inferred
+    embedding_size: int  # of learned task embeddings, and of inferred features
     unit_embedding: bool
-    layer_norm: bool  # that of critics
-    own: bool  # every task has networks of its own
+    layer_norm: bool  # of the critics
+    own: bool  # whether every task has networks of its own
 
 
 class Basis(NamedTuple):
-    """A representation as it begins, and what the networks above it see."""
+    """Holds a representation's initial parameters, and example inputs for the networks on top of it."""
 
     params: Params
-    told: Array  # (Z,) zeros
+    features: Array  # (Z,) zeros
     obs: Any  # zeros
-    key: Key  # for the networks
+    key: Key  # for initialising the networks
 
 
 @dataclasses.dataclass(frozen=True)
 class Plain:
-    """No representation: networks see observations as they are.
+    """Passes observations on to the networks as they are.
 
-    Every representation is a class like this one. Its parameters lie beside the critics', under its ``names``, and are
-    trained by the critics' loss, which its own losses ``join``; the actor sees what it makes of observations, and does
-    not train it. Agents use the copy that knows its ``place``. Parameters are those of one task, if nothing else is
-    said.
+    Every representation is a class with these methods. Its parameters lie beside the critics', under its ``names``. The
+    critics' loss trains them, together with losses of the representation's own, which ``join`` adds; the actor's loss
+    does not. Agents use a copy that knows its ``place``. Parameters are those of one task unless stated otherwise.
     """
 
-    names: ClassVar[tuple[str, ...]] = ()  # that its parameters may have
-    models: ClassVar[tuple[str, ...]] = ()  # those of them of which nobody needs a slow copy
+    names: ClassVar[tuple[str, ...]] = ()  # of its parameters
+    models: ClassVar[tuple[str, ...]] = ()  # names of parameters that need no target copy
     place: ClassVar[Place]
 
     def __post_init__(self):
@@ -54,70 +53,72 @@ class Plain:
 
     @property
     def learns(self) -> bool:
-        """Whether it has parameters, among them whatever is learned of tasks in place of the networks above it."""
+        """Whether it has parameters; if so, it also holds the task embeddings, in place of the networks."""
         return bool(self.names)
 
     @property
     def looks_back(self) -> bool:
-        """Whether it needs the last steps, however the networks are told the task."""
+        """Whether it needs the last steps, whatever the conditioning."""
         return False
 
     @property
     def rates(self) -> Mapping[str, float]:
-        """The share of new parameters that their slow copy takes, by name, where it is not the critics'."""
+        """Step sizes of target parameters, by name, where they are not the critics' ``tau``."""
         return {}
 
-    def init(self, num_tasks: int, told: Array, obs: Any, action: Array, key: Key) -> Basis:
-        """Initialise for inputs of the given shapes, (Z,), (O,) and (A,)."""
-        return Basis(Params({}, {}), told, obs, key)
+    def init(self, num_tasks: int, features: Array, obs: Any, action: Array, key: Key) -> Basis:
+        """Initialise for features (Z,), an observation (O,) and an action (A,) of these shapes."""
+        return Basis(Params({}, {}), features, obs, key)
 
-    def perceive(self, params: Params, told: Array, obs: Any) -> tuple[Array, Any]:
-        """What is known of the task (Z,) or (B, Z), and what networks see in place of observations (B, O)."""
-        return told, obs
+    def perceive(self, params: Params, features: Array, obs: Any) -> tuple[Array, Any]:
+        """Return the networks' inputs: task features (Z,) or (B, Z), and what replaces observations (B, O)."""
+        return features, obs
 
-    def targets(self, params: Params, slow: Params, next_obs: Any, key: Key) -> tuple[Any, Key]:
-        """What the models of all tasks fit, leaves (T, ...), and a key for each task's critics (T,).
+    def targets(self, params: Params, target_params: Params, next_obs: Any, key: Key) -> tuple[Any, Key]:
+        """Return the targets of all tasks' models, leaves (T, ...), and a key (T,) for each task's critics.
 
         Args:
-            params: those of all tasks; slow: their slow copy.
+            params: those of all tasks.
+            target_params: their target copy.
             next_obs: (T, B, O).
         """
-        return None, jax.random.split(key, len(alone(next_obs)))
+        return None, jax.random.split(key, len(without_past(next_obs)))
 
     def join(self, loss: Array, metrics: Metrics, params: Params, batch: Any) -> tuple[Array, Metrics]:
-        """The critics' loss and metrics, joined by its own.
+        """Add the representation's losses to the critics' loss, and its metrics to theirs.
 
         Args:
-            batch: has obs, action, reward, told, and in ``ahead`` what ``targets`` gave.
+            batch: has obs, action, reward, features, and in ``model_targets`` a result of ``targets``.
         """
         return loss, metrics
 
     @property
     def least_loss(self) -> float | Array:
-        """The least that its own losses can add to the critics'."""
+        """Lower bound of what its losses add to the critics' loss."""
         return 0.0
 
     # Tasks that were not trained on.
 
     def stand_in(self, params: Params, trained: Params, known: Array, obs: Any) -> Params:
-        """Parameters by which to act in one task, at an observation (O,).
+        """Return the parameters for acting in one task, at an observation (O,).
 
         Args:
-            params: those of the task, or of the training task that is nearest; trained: those of all training tasks.
+            params: those of the task, or of the nearest training task.
+            trained: those of all training tasks.
             known: () whether the task is a training task.
         """
         return params
 
     def borrowed(self, found: list[str]) -> list[str]:
-        """What such a task has of its nearest training task, where its agent finds so much."""
+        """Return the names of what an unseen task uses of its nearest training task; ``found`` are its agent's."""
         return found
 
     @property
     def replaced(self) -> str:
-        """What such a task has that no training task has; empty for nothing."""
+        """What an unseen task has that no training task has; empty for nothing."""
         return ""
 
 
-def alone(obs: Any) -> Array:
-    """The observation alone, where the past is seen too."""
+def without_past(obs: Any) -> Array:
+    """Return the observation without the past steps that may come with it."""
     return obs.obs if isinstance(obs, Seen) else obs

@@ -1,4 +1,4 @@
-"""DeepMDP: a latent state that foretells the next latent state and the reward."""
+"""DeepMDP learns a latent state from which models predict the next latent state and the reward."""
 
 import dataclasses
 import math
@@ -9,18 +9,18 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents import parts
-from mtjax.agents.parts.representations.base import Basis, Plain, alone
+from mtjax.agents.parts.representations.base import Basis, Plain, without_past
 from mtjax.agents.parts.trajectory import TrajectoryEncoder
 from mtjax.networks import MLP, OVER_TASKS, Network, Params, Trunk, join
 from mtjax.types import Array, Key, Metrics
 
 DEVIATIONS = (0.01, 1.0)
-"""Least and largest standard deviation of a predicted latent state, whose values lie in (-1, 1)."""
-SIGHT = ("latent", "trajectory", "embedding")
+"""Smallest and largest standard deviation of a predicted latent state, whose values lie in (-1, 1)."""
+ENCODERS = ("latent", "trajectory", "embedding")
 
 
 class Latent(nn.Module):
-    """Encode observations (..., O) as latent states (..., D) in (-1, 1)."""
+    """Encodes observations (..., O) as latent states (..., D) in (-1, 1)."""
 
     widths: tuple[int, ...]
 
@@ -31,59 +31,59 @@ class Latent(nn.Module):
 
 
 class Model(nn.Module):
-    """A layer-normalised trunk with a linear output, on latent states and what is known of the task."""
+    """Maps latent states and task features to outputs, by a trunk with layer normalisation and a linear layer."""
 
     widths: tuple[int, ...]
     out: int
 
     @nn.compact
-    def __call__(self, latent: Array, told: Array, *action: Array) -> Array:
-        return nn.Dense(self.out)(Trunk(self.widths, layer_norm=True)(latent, told, *action))
+    def __call__(self, latent: Array, features: Array, *action: Array) -> Array:
+        return nn.Dense(self.out)(Trunk(self.widths, layer_norm=True)(latent, features, *action))
 
 
-class Ahead(NamedTuple):
-    """What the models of one task fit; of all tasks, leaves (T, ...)."""
+class ModelTargets(NamedTuple):
+    """Holds the targets of one task's models; for all tasks, leaves are (T, ...)."""
 
-    latent: Array  # (B, D) of the next observations, by the slow encoder
-    noise: Array  # (B, D) that draws next latent states; () zero where they are points
-    rival: Array | None = None  # (Z,) the vector of another task
+    latent: Array  # (B, D) of the next observations, by the target encoder
+    noise: Array  # (B, D) for sampling next latent states; () zero if the model is deterministic
+    other_theta: Array | None = None  # (Z,) vector of another task
 
 
 @dataclasses.dataclass(frozen=True)
 class DeepMDP(Plain):
-    """Actor and critics stand on a latent model of the task (Gelada et al. 2019, as in Zhang et al. 2021 and MTRL).
+    """DeepMDP gives actor and critics a latent state (Gelada et al. 2019, as in Zhang et al. 2021 and MTRL).
 
-    There are one encoder h = phi(s), one transition model T(h, a, z) = (mu, sigma) and one reward model R(h', z), where
-    z is what is known of the task. For a transition (s, a, r, s'), the loss of SAC's critics Q_n(h, z, a), or of PPO's
-    critic V(h, z), is joined by
+    It has an encoder h = phi(s), a transition model T(h, a, z) = (mu, sigma) and a reward model R(h', z), where z are
+    the features of the task. For a transition (s, a, r, s'), these losses are added to that of the critics, Q_n(h, z,
+    a) in SAC and V(h, z) in PPO:
         L_T = mean_d ((mu - sg(phibar(s')))^2 / (2 sigma^2) + log sigma)             (transition loss)
         L_R = (R(h~, z) - r)^2,  h~ = mu + sigma noise                               (reward loss)
-    and all of them train phi. The actor sees sg(phi(s)), so that its loss does not. With transition=deterministic,
-    sigma is 1 and h~ is mu. phi ends in layer normalisation and tanh, as in SAC-AE (Yarats et al. 2021): L_T alone
-    would shrink latent states to a point. phibar is the slow copy of phi, on which SAC's slow critics stand; it takes
-    steps of ``encoder_tau``. In PPO, which has no slow copies, it is phi as it was before the update.
+    All of them train phi. The actor's input is sg(phi(s)), so its loss does not train phi. With
+    transition=deterministic, sigma is 1 and h~ is mu. phi ends in layer normalisation and tanh, as in SAC-AE (Yarats et
+    al. 2021), because L_T alone would shrink latent states to a point. phibar is the target encoder, which SAC's target
+    critics use; it moves by ``encoder_tau``. In PPO, which has no target networks, it is phi from before the update.
 
-    Vectors of conditioning=embedding, and the trajectory encoder of conditioning=inferred, are part of this
-    representation: one for all networks, trained by critics and models, and seen by the actor as they are.
+    The vectors of conditioning=embedding, and the trajectory encoder of conditioning=inferred, belong to this
+    representation: all networks use the same, which critics and models train, and the actor does not.
 
-    Differs from the papers: h' is the slow encoder's, as an encoder that chases itself is less stable (Zhang et al. and
-    MTRL take sg(phi(s'))); R works on the predicted state, as theirs does, where Gelada et al. have R(h, a), but is
-    told the task; L_T is their likelihood and not a Wasserstein distance; sigma is in [0.01, 1] where MTRL's is in
-    [1e-4, 10], as the slope of L_T grows with 1 / sigma^2. Observations are vectors, so that nothing is decoded.
+    Differs from the papers: targets come from the target encoder, which is more stable than the sg(phi(s')) of Zhang et
+    al. and MTRL; R takes the predicted state, as theirs does (Gelada et al.: R(h, a)), and also z; L_T is their
+    likelihood and not a Wasserstein distance; sigma is in [0.01, 1] where MTRL's is in [1e-4, 10], as the gradient of
+    L_T grows with 1 / sigma^2. Observations are vectors, so there is no decoder.
     """
 
     latent_widths: tuple[int, ...] = (256, 50)
     """Widths of the encoder's layers; the last is the size of the latent state."""
     model_widths: tuple[int, ...] = (512,)
-    """Widths of the hidden layers of transition and reward model."""
+    """Widths of the hidden layers in transition and reward model."""
     transition: Literal["deterministic", "probabilistic"] = "deterministic"
-    """Foretell the next latent state as a point or as a Gaussian."""
+    """Predict the next latent state as a point or as a Gaussian."""
     model_coefficient: float = 1.0
-    """Weight of transition and reward loss beside the critics'."""
+    """Weight of transition and reward loss relative to the critics' loss."""
     encoder_tau: float = 0.05
-    """Share of the new encoder that its slow copy takes at each update."""
+    """Step of the target encoder towards the new encoder at each update, as a share of the distance."""
 
-    names: ClassVar[tuple[str, ...]] = (*SIGHT, "transition", "reward")
+    names: ClassVar[tuple[str, ...]] = (*ENCODERS, "transition", "reward")
     models: ClassVar[tuple[str, ...]] = ("transition", "reward")
 
     def __post_init__(self):
@@ -94,9 +94,9 @@ class DeepMDP(Plain):
 
     @property
     def rates(self) -> dict[str, float]:
-        return dict.fromkeys(SIGHT, self.encoder_tau)
+        return dict.fromkeys(ENCODERS, self.encoder_tau)
 
-    # Networks: one each for all N critics, and for the actor.
+    # Networks: each is used by all N critics and by the actor.
 
     @property
     def has_theta(self) -> bool:
@@ -105,12 +105,12 @@ class DeepMDP(Plain):
 
     @property
     def infers(self) -> bool:
-        """Whether the networks are told what the last steps say of the task."""
+        """Whether task features are inferred from the last steps."""
         return self.place.conditioning == "inferred"
 
     @property
     def modules(self) -> dict[str, nn.Module]:
-        """Encoders and models."""
+        """The encoders and models, by name."""
         size = self.latent_widths[-1]
         found: dict[str, nn.Module] = {
             "latent": Latent(self.latent_widths),
@@ -127,11 +127,16 @@ class DeepMDP(Plain):
         """Map one task's inputs by an encoder or a model."""
         return self.modules[name].apply({**params.shared, **params.own}[name], *inputs)  # type: ignore
 
-    def init(self, num_tasks: int, told: Array, obs: Any, action: Array, key: Key) -> Basis:
+    def init(self, num_tasks: int, features: Array, obs: Any, action: Array, key: Key) -> Basis:
         key, theta_key, *keys = jax.random.split(key, 2 + len(self.modules))
         size, params = self.place.embedding_size, Params({}, {})
-        latent, told = jnp.zeros(self.latent_widths[-1]), jnp.zeros(len(told) + size * (self.has_theta + self.infers))
-        inputs = {"latent": (alone(obs),), "transition": (latent, told, action), "reward": (latent, told)}
+        latent = jnp.zeros(self.latent_widths[-1])
+        features = jnp.zeros(len(features) + size * (self.has_theta + self.infers))
+        inputs = {
+            "latent": (without_past(obs),),
+            "transition": (latent, features, action),
+            "reward": (latent, features),
+        }
         for (name, module), part_key in zip(self.modules.items(), keys, strict=True):
             data = inputs.get(name, (obs,))
             if self.place.own:
@@ -140,25 +145,25 @@ class DeepMDP(Plain):
                 params.shared[name] = module.init(part_key, *data)
         if self.has_theta:
             params.own["embedding"] = jax.random.normal(theta_key, (num_tasks, size))
-        return Basis(params, told, latent, key)
+        return Basis(params, features, latent, key)
 
-    # What networks see, of one task: features (Z,) or (B, Z), observations (..., O).
+    # Inputs of networks, for one task: features (Z,) or (B, Z), observations (..., O).
 
-    def perceive(self, params: Params, told: Array, obs: Any) -> tuple[Array, Array]:
-        """What is known of the task (Z,) or (..., Z), and latent states (..., D)."""
+    def perceive(self, params: Params, features: Array, obs: Any) -> tuple[Array, Array]:
+        """Return features of the task (Z,) or (..., Z), and latent states (..., D)."""
         if self.infers:
-            told = self.apply(params, "trajectory", obs)
-        told = join(told, task=self.theta(params)) if self.has_theta else told
-        return told, self.apply(params, "latent", alone(obs))
+            features = self.apply(params, "trajectory", obs)
+        features = join(features, task=self.theta(params)) if self.has_theta else features
+        return features, self.apply(params, "latent", without_past(obs))
 
     def theta(self, params: Params) -> Array:
-        """A task's learned vector (Z,)."""
+        """Return a task's learned vector (Z,)."""
         theta = params.own["embedding"]
         return theta / jnp.maximum(jnp.linalg.norm(theta), 1e-6) if self.place.unit_embedding else theta
 
-    def foretell(self, params: Params, told: Array, latent: Array, action: Array) -> tuple[Array, Array]:
-        """Mean and standard deviation (..., D) of the next latent state."""
-        outputs = self.apply(params, "transition", latent, told, action)
+    def predict(self, params: Params, features: Array, latent: Array, action: Array) -> tuple[Array, Array]:
+        """Predict the mean and standard deviation (..., D) of the next latent state."""
+        outputs = self.apply(params, "transition", latent, features, action)
         if self.transition == "deterministic":
             return outputs, jnp.ones_like(outputs)
         mean, deviation = jnp.split(outputs, 2, axis=-1)
@@ -167,26 +172,26 @@ class DeepMDP(Plain):
 
     # Losses.
 
-    def targets(self, params: Params, slow: Params, next_obs: Any, key: Key) -> tuple[Ahead, Key]:
-        encode = lambda slow, obs: self.apply(slow, "latent", obs)
-        latent = jax.vmap(encode, (OVER_TASKS, 0))(slow, alone(next_obs))
+    def targets(self, params: Params, target_params: Params, next_obs: Any, key: Key) -> tuple[ModelTargets, Key]:
+        encode = lambda target_params, obs: self.apply(target_params, "latent", obs)
+        latent = jax.vmap(encode, (OVER_TASKS, 0))(target_params, without_past(next_obs))
         keys = jax.vmap(jax.random.split)(jax.random.split(key, len(latent)))  # (T, 2): for critics, and for models
         draw = lambda key: jax.random.normal(key, latent.shape[1:])
         drawn = self.transition == "probabilistic"
-        return Ahead(latent, jax.vmap(draw)(keys[:, 1]) if drawn else jnp.zeros(len(latent))), keys[:, 0]
+        return ModelTargets(latent, jax.vmap(draw)(keys[:, 1]) if drawn else jnp.zeros(len(latent))), keys[:, 0]
 
     def join(self, loss: Array, metrics: Metrics, params: Params, batch: Any) -> tuple[Array, Metrics]:
-        told, latent = self.perceive(params, batch.told, batch.obs)
-        mean, deviation = self.foretell(params, told, latent, batch.action)
-        error = (mean - jax.lax.stop_gradient(batch.ahead.latent)) / deviation
+        features, latent = self.perceive(params, batch.features, batch.obs)
+        mean, deviation = self.predict(params, features, latent, batch.action)
+        error = (mean - jax.lax.stop_gradient(batch.model_targets.latent)) / deviation
         transition_loss = jnp.mean(0.5 * jnp.square(error) + jnp.log(deviation))
-        reward = self.apply(params, "reward", mean + deviation * batch.ahead.noise, told)[..., 0]
+        reward = self.apply(params, "reward", mean + deviation * batch.model_targets.noise, features)[..., 0]
         reward_loss = jnp.mean(jnp.square(reward - batch.reward))
         metrics = {**metrics, "transition_loss": transition_loss, "reward_loss": reward_loss}
         return loss + self.model_coefficient * (transition_loss + reward_loss), metrics
 
     @property
     def least_loss(self) -> float | Array:
-        """That of a reward that is told right, and of a prediction that is exact and as sure as it can be."""
-        surest = math.log(DEVIATIONS[0]) if self.transition == "probabilistic" else 0.0
-        return self.model_coefficient * surest
+        """The losses of an exact reward, and of an exact latent state with the smallest standard deviation."""
+        least = math.log(DEVIATIONS[0]) if self.transition == "probabilistic" else 0.0
+        return self.model_coefficient * least
