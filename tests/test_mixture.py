@@ -306,7 +306,7 @@ def test_episodes_end_at_their_own_horizons():
 def test_discounts_follow_horizons():
     env = mixture(["control-cartpole", "tabular-mdp"])
     found = tiny(discounting="horizon").discounts(env.tasks())
-    np.testing.assert_allclose(found, np.to_flags([0.99, 0.95], 10), rtol=1e-6)
+    np.testing.assert_allclose(found, np.repeat([0.99, 0.95], 10), rtol=1e-6)
 
 
 # Padding changes nothing.
