@@ -59,8 +59,8 @@ class RunConfig:
     agents or parts of your own. NAME+NAME is a mixture of families: --engine, --split and --env.FIELD then hold for
     every family that has such a flag, and --env.vary.NAME.PARAMETER=VALUES holds for the family NAME."""
     agent: str = "sac-conditioned"
-    """Name of the agent. --list shows all names. --agent.representation, --agent.encoder, --agent.gradients,
-    --agent.value, --agent.scaling, --agent.sampler, each by name, choose its parts. Each part adds its flags."""
+    """Name of the agent. --list shows all names. Its parts are chosen by --agent.representation, --agent.encoder,
+    --agent.gradients, --agent.value, --agent.scaling and --agent.sampler, each by name. A part adds its own flags."""
     preset: Literal["auto", "cpu", "gpu"] = "auto"
     """Tuned defaults of the flags below for one kind of device. auto takes the device that JAX runs on."""
     runs: str = "runs"
