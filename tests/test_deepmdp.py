@@ -370,6 +370,7 @@ def test_theta_of_an_unseen_task(strategy):
     for i in range(3):
         expected = act_once(plain, state, obs, pick(TASKS, i), None)
         np.testing.assert_allclose(act(state, pick(TASKS, i)), expected, atol=1e-6)
+    assert make("hip-bmdp").representation.unseen_theta == "mean"  # the others' parameters are hidden
     assert (
         agent.unseen
         == {

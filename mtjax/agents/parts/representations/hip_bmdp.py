@@ -33,9 +33,10 @@ class HiPBMDP(DeepMDP):
     L_theta trains theta_i alone; theta_j is trained by task j's loss. Losses of critics and models train thetas too,
     the actor's does not.
 
-    ``unseen_theta`` chooses the theta of a task that was not trained on. (MTRL distinguishes a mean over all tasks from
-    one over training tasks; here only training tasks have a theta.) "inferred" is a trajectory encoder g of the last
-    steps (``parts/trajectory.py``), fitted to training tasks by
+    ``unseen_theta`` chooses the theta of a task that was not trained on: by default the mean of the training tasks'.
+    "nearest" looks at the task's true parameters, which the method assumes to be hidden. (MTRL distinguishes a mean
+    over all tasks from one over training tasks; here only training tasks have a theta.) "inferred" is a trajectory
+    encoder g of the last steps (``parts/trajectory.py``), fitted to training tasks by
         L_g = mean |g(last steps) - sg(theta_i)|^2                                                     (guess loss)
 
     Other features of ``conditioning`` are joined to theta; conditioning=embedding is theta itself.
@@ -47,9 +48,9 @@ class HiPBMDP(DeepMDP):
 
     theta_coefficient: float = 0.01
     """Weight of the theta loss."""
-    unseen_theta: Literal["nearest", "zero", "mean", "inferred"] = "nearest"
-    """Theta of an unseen task: that of the nearest training task, zero, the mean of all training tasks', or inferred
-    from the last steps."""
+    unseen_theta: Literal["nearest", "zero", "mean", "inferred"] = "mean"
+    """Theta of an unseen task: the mean of all training tasks', zero, that of the nearest training task (by its true
+    parameters), or inferred from the last steps."""
 
     names: ClassVar[tuple[str, ...]] = (*DeepMDP.names, "guess")
     models: ClassVar[tuple[str, ...]] = (*DeepMDP.models, "guess")
