@@ -39,7 +39,8 @@ class Domain(Family):
 
     engine: Annotated[str, tyro.conf.arg(name="engine", prefix_name=False)] = "auto"
     """Physics engine: auto, mjx (any device), warp (NVIDIA GPUs) or c (MuJoCo's C engine, threaded; CPU only). auto is
-    c on a CPU, warp on an NVIDIA GPU if it is installed and faster there, and mjx elsewhere."""
+    c on a CPU, warp on an NVIDIA GPU if it is installed and faster there, and mjx elsewhere. Runs on c and mjx repeat
+    bit for bit; runs on warp do not."""
     solver_iterations: int = 0
     """Iterations of the constraint solver in MJX and Warp, with twice as many line-search steps. 0 takes the domain's
     own choice for the engine."""

@@ -1,4 +1,4 @@
-"""Checkpoints of the whole training state by orbax. A resumed run continues bit for bit."""
+"""Checkpoints of the whole training state by orbax. A resumed run continues bit for bit, but on MuJoCo Warp."""
 
 import json
 import shutil

@@ -48,6 +48,8 @@ def launch(config: RunConfig, directory: Path, start: Policy | None, resume: boo
     """Print what a run does, and train it in ``directory`` from the start or from its newest checkpoint."""
     said = f"{label}: {' '.join(config.sweep)}\n" if config.sweep else ""
     origin = f"{_origin(config)}run: {directory}"
+    if resume and "warp" in config.family.engine_name:
+        origin += "\nMuJoCo Warp does not repeat bit for bit: the run goes on from its state, in other numbers"
     plan = config.plan
     seeds = f"seeds {plan.seed} to {plan.seed + plan.seeds - 1}"
     if hosts.is_first():
