@@ -65,26 +65,27 @@ def overview() -> str:
     ]
     for title, file, cls in _OVERVIEW:
         lines += ["", f"{title}:"]
-        for flag, default, text in _fields(Path(__file__).parent / file, cls):
+        for flag, _, default, text in _fields(file, cls):
             lines.append(f"  --{flag + default}")
             lines += textwrap.wrap(text, 110, initial_indent=" " * 6, subsequent_indent=" " * 6)
     return "\n".join(lines)
 
 
-def _fields(file: Path, cls: str) -> Iterator[tuple[str, str, str]]:
-    """Yield the flag, default and documentation of every documented field of a class that is a plain value."""
-    tree = ast.parse(file.read_text(encoding="utf-8"))
+def _fields(file: str, cls: str) -> Iterator[tuple[str, str, str, str]]:
+    """Yield flag, type, default and documentation of every documented field of a class of this package."""
+    tree = ast.parse((Path(__file__).parent / file).read_text(encoding="utf-8"))
     body = next(node.body for node in tree.body if isinstance(node, ast.ClassDef) and node.name == cls)
     for field, text in itertools.pairwise(body):
         if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
             flag = ast.unparse(field.target).replace("_", "-").replace("start", "from")
             default = ast.literal_eval(field.value) if field.value is not None else ""
             plain = isinstance(default, bool) or default in ("", ())
-            yield flag, "" if plain else f"={default}", " ".join(str(text.value.value).split())
+            says = " ".join(str(text.value.value).split())
+            yield flag, ast.unparse(field.annotation), "" if plain else f"={default}", says
 
 
 def check_names(argv: Sequence[str]) -> None:
-    """Refuse an unknown environment, agent, preset or run, before anything slow is imported.
+    """Refuse an unknown environment, agent, preset or run, and numbers that are none, before JAX is imported.
 
     Raises:
         InputError: there is no such name or folder, or --resume came with flags that change the run.
@@ -95,6 +96,7 @@ def check_names(argv: Sequence[str]) -> None:
         wrong = next((name for name in names if name not in known), None)
         if wrong is not None:
             raise nearest_error(kind, wrong, known)
+    _check_numbers(argv)
     given = {word.split("=", 1)[0] for word in argv if word.startswith("--")}
     other = ", ".join(sorted(given - _MAY_CHANGE))
     if "--resume" in given and "--sweep" not in given and other:
@@ -103,6 +105,17 @@ def check_names(argv: Sequence[str]) -> None:
         folder = flag_value(argv, flag, None)
         if folder is not None and not (flag == "resume" and any(Path(folder).glob("run-*"))):  # the runs of a sweep
             require_run(Path(folder))
+
+
+def _check_numbers(argv: Sequence[str]) -> None:
+    """Refuse a value that is no whole number where a flag of every run takes one."""
+    for flag, kind, *_ in itertools.chain.from_iterable(_fields(file, cls) for _, file, cls in _OVERVIEW):
+        value = flag_value(argv, flag, None) if kind == "int" else None
+        if value is None or re.fullmatch(r"[+-]?\d+(_\d+)*", value):
+            continue
+        meant = re.fullmatch(r"\d+(\.\d*)?[eE]\+?\d", value)
+        hint = f"; write {int(float(value))}" if meant and float(value).is_integer() else ""
+        raise InputError(f"--{flag} must be a whole number, not {value!r}{hint}")
 
 
 def check_flags(argv: Sequence[str]) -> None:

@@ -260,7 +260,7 @@ def test_list_names_every_family_and_agent(capsys):
         ("--env.vary.size=", "--env.vary.size needs values"),
         ("--env.vary.size=a", "cannot read the values 'a' of size"),
         ("--steps=many", "many"),
-        ("--steps=1e6", "1e6"),
+        ("--steps=1e6", "not '1e6'; write 1000000"),
         ("--steps", "--steps"),
         ("--env", "--env needs a value"),
         ("--no-steps", "--no-steps"),
@@ -304,7 +304,8 @@ def test_train_says_what_is_wrong(complaint, monkeypatch, tmp_path, words, said)
 def test_messages_do_not_depend_on_the_terminal(complaint, monkeypatch, encoding):
     """Tyro frames its errors in ASCII where standard output is not UTF-8."""
     monkeypatch.setattr("sys.stdout", io.TextIOWrapper(io.BytesIO(), encoding=encoding))
-    assert "--steps: invalid literal for int() with base 10: 'many'" in complaint("train", "--steps=many")
+    said = complaint("train", "--agent.num-critics=many")
+    assert "--agent.num-critics: invalid literal for int() with base 10: 'many'" in said
 
 
 @pytest.mark.parametrize(

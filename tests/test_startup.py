@@ -58,6 +58,7 @@ def ours(monkeypatch):
         ("mtjax.train", ["--env=finger-spn"], 2, "did you mean 'finger-spin'?"),
         ("mtjax.train", ["--agent", "carr"], 2, "did you mean 'care'?"),
         ("mtjax.train", ["--preset=gpus"], 2, "did you mean 'gpu'?"),
+        ("mtjax.train", ["--seeds", "3.5"], 2, "--seeds must be a whole number, not '3.5'"),
         (
             "mtjax.train",
             ["--num-env=3"],
