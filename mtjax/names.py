@@ -26,6 +26,11 @@ def nearest_error(kind: str, given: str, allowed: Iterable[str]) -> InputError:
     return InputError(f"unknown {kind} {given!r}; {hint}choose from: {shown}")
 
 
+def first_sentence(text: str | None) -> str:
+    """Return the first sentence of a documentation, without its full stop."""
+    return " ".join((text or "").split("\n\n")[0].split()).split(". ")[0].removesuffix(".")
+
+
 def frozen(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return settings with tuples in place of lists, because static arguments of ``jit`` must be hashable."""
     return {name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()}

@@ -6,7 +6,7 @@ from typing import Any
 from mtjax import agents, envs
 from mtjax.agents.base import CHOICES, PARTS, BaseAgent
 from mtjax.envs.family import Family
-from mtjax.names import InputError
+from mtjax.names import InputError, first_sentence
 
 
 def register(name: str, thing: "type | str", **defaults: Any) -> None:
@@ -29,7 +29,7 @@ def register(name: str, thing: "type | str", **defaults: Any) -> None:
     if issubclass(thing, Family):
         return envs.register(name, thing, **defaults)
     if issubclass(thing, BaseAgent):
-        return _register_agent(name, agents.Preset(_sentence(thing), defaults, thing))
+        return _register_agent(name, agents.Preset(first_sentence(thing.__doc__ or thing.__name__), defaults, thing))
     if defaults:
         raise InputError(f"a part has the defaults of its class; leave out {', '.join(defaults)}")
     _register_part(name, thing)
@@ -72,9 +72,3 @@ def _names_beside(kind: str) -> set[str]:
     of_agents = {name for preset in agents.AGENTS.values() for name in preset.cls.__dataclass_fields__}
     others = [part for other in PARTS if other != kind for part in PARTS[other].values()]
     return of_agents | {field.name for part in others for field in dataclasses.fields(part)}
-
-
-def _sentence(thing: type) -> str:
-    """Return the first sentence of a class's documentation."""
-    text = " ".join((thing.__doc__ or thing.__name__).split("\n\n")[0].split())
-    return text.split(". ")[0].removesuffix(".")

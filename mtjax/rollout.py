@@ -91,7 +91,7 @@ def step_envs(
 
     Args:
         keys: (S, T, E) for sampling actions; None takes the mean ones.
-        explore: maps the agent's actions (S, T, E, A) to those that are taken.
+        explore: a function from the agent's actions (S, T, E, A) to the actions that the worlds take.
     """
     each = tasks_of_worlds(tasks, worlds)
     acted = act(agent, learners, tasks, worlds, keys)

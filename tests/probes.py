@@ -126,6 +126,17 @@ def slow_but(names, *quick):
     return [pytest.param(name, marks=[] if name in quick else [pytest.mark.slow]) for name in names]
 
 
+# The loop and the replay with which SAC learns what a probe asks for.
+LEARNING = {
+    "num_envs": 8,
+    "updates_per_step": 4,
+    "batch_size": 32,
+    "replay_size": 8000,
+    "warmup_steps": 150,
+    "warmup_hold": 1,
+    "chunk_steps": 300,
+}
+
 SMALL = {  # of parts that have such settings
     "num_experts": 2,
     "expert_widths": (8, 4),

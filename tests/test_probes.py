@@ -2,21 +2,12 @@
 
 import numpy as np
 import pytest
-from probes import OFF_POLICY, Probe, mean_actions, only_seed, slow_but, tasks_of, tiny, train, values
+from probes import LEARNING, OFF_POLICY, Probe, mean_actions, only_seed, slow_but, tasks_of, tiny, train, values
 
 from mtjax.envs.probes import EITHER_SIGN
 
 GAMMA = 0.9
 SCALES = (1.0, -0.5)
-SETTINGS = {
-    "num_envs": 8,
-    "updates_per_step": 4,
-    "batch_size": 32,
-    "replay_size": 8000,
-    "warmup_steps": 150,
-    "warmup_hold": 1,
-    "chunk_steps": 300,
-}
 # The temperature stays negligible, so that the soft Q-value is the plain one.
 PLAIN = {"gamma": GAMMA, "initial_temperature": 1e-6, "temperature_lr": 1e-9}
 # Values are compared in the units of rewards; and two experts are too few for four signs of observation and scale.
@@ -38,7 +29,7 @@ EXPECTED = {
 def learned(name, kind, scales=SCALES):
     """Train, and return the agent, its state and the tasks."""
     agent, tasks = tiny(name, **{**PLAIN, **RATES, **OF_AGENT.get(name, {})}), tasks_of(kind, scales)
-    state, _ = train(Probe(), agent, SETTINGS, tasks=tasks, chunks=1 + (kind == "by-both"))
+    state, _ = train(Probe(), agent, LEARNING, tasks=tasks, chunks=1 + (kind == "by-both"))
     return agent, only_seed(state.agent), tasks
 
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import QUICK, Probe, Stub, Walk, learner, only_seed, random_batch, tasks_of, tiny, train, values
+from probes import LEARNING, QUICK, Probe, Stub, Walk, learner, only_seed, random_batch, tasks_of, tiny, train, values
 
 from mtjax import normalize
 from mtjax.agents import agent
@@ -273,17 +273,6 @@ def test_settings_that_make_no_sense_are_refused(settings, message):
     """With what was given."""
     with pytest.raises(InputError, match=message):
         agent("sac", **settings)
-
-
-LEARNING = {
-    "num_envs": 8,
-    "updates_per_step": 4,
-    "batch_size": 32,
-    "replay_size": 8000,
-    "warmup_steps": 150,
-    "warmup_hold": 1,
-    "chunk_steps": 300,
-}
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import Probe, only_seed, tasks_of, tiny, train, values
+from probes import LEARNING, Probe, only_seed, tasks_of, tiny, train, values
 
 import mtjax
 from mtjax.agents import agent
@@ -175,17 +175,6 @@ def test_a_range_that_is_given_or_scaled_to_is_taken():
     require_value_range(parse(words).learner)
 
 
-SETTINGS = {
-    "num_envs": 8,
-    "updates_per_step": 4,
-    "batch_size": 32,
-    "replay_size": 8000,
-    "warmup_steps": 150,
-    "warmup_hold": 1,
-    "chunk_steps": 300,
-}
-
-
 @pytest.mark.parametrize(("kind", "critic_reduction"), [("c51", "min"), ("hl-gauss", "mean")])
 def test_distributional_critics_learn_known_values(kind, critic_reduction):
     """Two steps, of which the second earns 1 or -0.5: Q(1) = scale, Q(0) = 0.9 scale."""
@@ -198,7 +187,7 @@ def test_distributional_critics_learn_known_values(kind, critic_reduction):
         **{"tau": 0.3, "actor_lr": 1e-2, "critic_lr": 1e-2},
     )
     tasks = tasks_of("delayed")
-    state, _ = train(Probe("delayed"), learner, SETTINGS, tasks=tasks, chunks=1)
+    state, _ = train(Probe("delayed"), learner, LEARNING, tasks=tasks, chunks=1)
     found = values(learner, only_seed(state.agent), tasks, [0.0, 1.0], [0.1, -0.6])
     for estimates, scale in zip(found, (1.0, -0.5), strict=True):
         np.testing.assert_allclose(estimates, np.tile([0.9 * scale, scale], (2, 1)), atol=0.1)

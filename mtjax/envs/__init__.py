@@ -9,7 +9,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 from mtjax.envs import variation
-from mtjax.names import InputError, frozen, lazily, load, nearest_error
+from mtjax.names import InputError, first_sentence, frozen, lazily, load, nearest_error
 
 if TYPE_CHECKING:
     from mtjax.envs.domain import Domain
@@ -268,8 +268,7 @@ def outline(name: str) -> tuple[int, str]:
         count, text = variation.count_tasks(settings), _documented(module)[cls]
     else:
         count, text = make(name).train_count, place.__doc__ or ""
-    sentence = " ".join(text.split("\n\n")[0].split())
-    return count, sentence.split(". ")[0].split(" (")[0].removesuffix(".")
+    return count, first_sentence(text).split(" (")[0]
 
 
 @lru_cache

@@ -111,7 +111,7 @@ class Warp:
 
         if name in _UNREAD:
             return False
-        if not _BATCH_DIM["Model"].get(name.replace(".", "__")):
+        if not _BATCH_DIM["Model"].get(_plain(name)):
             raise InputError(f"engine 'warp' cannot vary {name} between tasks; use --engine=mjx")
         return True
 
