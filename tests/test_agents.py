@@ -284,6 +284,22 @@ def test_critics_and_heads_begin_apart():
     assert len(np.unique(flat, axis=0)) == 6
 
 
+@pytest.mark.parametrize(
+    ("name", "settings"), [("sac", {}), ("ppo", {}), ("distral", {}), ("brc", {"num_bins": 5}), ("multi-head", {})]
+)
+def test_actor_and_critics_may_have_widths_of_their_own(name, settings):
+    """Each as an agent of that common width has it."""
+
+    def shapes(**widths):
+        state = jax.eval_shape(lambda: tiny(name, **settings, **widths).init(SPEC, TASKS, KEY))
+        return jax.tree.map(jnp.shape, (state.actor, state.critic))
+
+    (wide, narrow) = shapes(hidden=(6, 6)), shapes(hidden=(4,))
+    assert shapes(hidden=(6, 6), actor_hidden=(4,)) == (narrow[0], wide[1])
+    assert shapes(hidden=(6, 6), critic_hidden=(4,)) == (wide[0], narrow[1])
+    assert shapes(hidden=(5,), actor_hidden=(4,), critic_hidden=(6, 6)) == (narrow[0], wide[1])
+
+
 # Files of task vectors.
 
 
@@ -352,6 +368,8 @@ REFUSED = [
     ("sac", {"hidden": ()}, r"hidden needs at least one layer .*not \(\)"),
     ("sac", {"encoder": "mlp", "encoder_widths": ()}, r"encoder-widths needs at least one layer .*not \(\)"),
     ("sac", {"hidden": (8, 0)}, r"at least one unit, not \(8, 0\)"),
+    ("sac", {"critic_hidden": (8, 0)}, r"critic-hidden must be of at least one unit each, not \(8, 0\)"),
+    ("sac", {"encoder": "simba", "actor_hidden": (8, 4)}, r"hidden=\(8, 4\) has several"),
     ("sac", {"gamma": 1.1}, r"gamma must be in \[0, 1\] .*1.1"),
     ("sac", {"tau": 0.0}, r"tau in \(0, 1\], not .*0.0"),
     ("sac", {"tau": float("nan")}, r"tau in \(0, 1\], not .*nan"),

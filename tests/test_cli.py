@@ -122,7 +122,7 @@ def test_a_record_is_read_back_as_it_was(env, agent, tmp_path):
 SETTINGS = [
     "",
     "--steps=123 --seed=4 --seeds=2 --eval-every=7 --eval-episodes=3",
-    "--agent.hidden 6 6 6 --agent.actor-lr=1e-05 --agent.target-entropy=-0.25",
+    "--agent.hidden 6 6 6 --agent.critic-hidden 9 9 --agent.actor-lr=1e-05 --agent.target-entropy=-0.25",
     "--agent.shared-temperature --agent.no-critic-layer-norm --agent.normalize-observations",
     "--env.vary.size=.95,1,1.05,1.1,1.15,1.2,1.25,1.3,1.35,1.4 --split=hip-bmdp --engine=c --env.solver-iterations=3",
     "--env.vary.touch-size 0.1:0.3:3 --env.vary.size=1:1.1 --env.num-draws=5 --engine mjx",

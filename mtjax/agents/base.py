@@ -83,6 +83,10 @@ class BaseAgent(abc.ABC):
     """Settings that fine-tuning may change: they say how an agent learns, not what its networks are."""
     hidden: tuple[int, ...] = (256, 256)
     """Widths of the hidden layers in actor and critics."""
+    actor_hidden: tuple[int, ...] = ()
+    """Widths of the actor's hidden layers, where they are not those of ``hidden``."""
+    critic_hidden: tuple[int, ...] = ()
+    """Widths of the critics' hidden layers, where they are not those of ``hidden``. Critics profit most from size."""
     actor_lr: float = 1e-3
     """Adam's learning rate for the actor."""
     critic_lr: float = 1e-3
@@ -154,6 +158,7 @@ class BaseAgent(abc.ABC):
             raise InputError(f"max-gradient-norm must be at least 0 (0 does not clip), not {self.max_gradient_norm}")
         parts.require_not_negative(self, "weight_decay")
         parts.require_layers(self, "hidden")
+        parts.require_widths(self, "actor_hidden", "critic_hidden")
         parts.require_shares(self, "gamma")
         parts.require_counts(self, "embedding_size", "inferred_from")
 
@@ -173,7 +178,8 @@ class BaseAgent(abc.ABC):
                 f"{encoder} maps observations, and with representation={name} networks see a latent state; "
                 "choose another encoder"
             )
-        self.encoder.body(self.hidden, layer_norm=False)  # which refuses widths that it cannot take
+        for hidden in self.widths:
+            self.encoder.body(hidden, layer_norm=False)  # which refuses widths that it cannot take
         if self.heads == "disjoint" and rule != "mean":
             raise InputError(f"heads=disjoint leaves no parameters that tasks share for gradients={rule}; use mean")
         if self.gradient_scope == "per-layer" and self.gradients.needs != "gradients":
@@ -183,10 +189,10 @@ class BaseAgent(abc.ABC):
 
     # Networks.
 
-    def network(self, layer_norm: bool) -> Network:
+    def network(self, hidden: tuple[int, ...], layer_norm: bool) -> Network:
         """Return a network of the body and heads that the settings ask for."""
         own = {"shared": (), "per-task": ("head",), "disjoint": ("trajectory", "body", "head")}[self.heads]
-        body = self.encoder.body(self.hidden, layer_norm)
+        body = self.encoder.body(hidden, layer_norm)
         if self.representation.learns:  # it also holds the task embeddings of all networks
             return Network(body, own)
         embedding = self.embedding_size if self.conditioning == "embedding" else 0
@@ -194,12 +200,17 @@ class BaseAgent(abc.ABC):
         return Network(body, own, embedding, self.unit_embedding, self.encoder.front(), inference)
 
     @property
+    def widths(self) -> Pair:
+        """Widths of the hidden layers in actor and critics."""
+        return Pair(self.actor_hidden or self.hidden, self.critic_hidden or self.hidden)
+
+    @property
     def actor(self) -> Network:
-        return self.network(self.actor_layer_norm)
+        return self.network(self.widths.actor, self.actor_layer_norm)
 
     @property
     def critic(self) -> Network:
-        return self.network(self.critic_layer_norm)
+        return self.network(self.widths.critic, self.critic_layer_norm)
 
     @property
     def placed_representation(self) -> Representation:

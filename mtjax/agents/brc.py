@@ -23,7 +23,7 @@ class BRC(SAC):
 
     Differs from the authors' code:
         Size: actor and critics have the widths ``hidden``; there, critics have two blocks of 4096 and the actor one of
-        256.
+        256, which are critic_hidden=(4096, 4096) and actor_hidden=(256,).
         Head: output layers begin by LeCun's initialisation; there they are orthogonal times sqrt 2, as all layers, and
         those of the log standard deviations, which lie in [-10, 2], orthogonal. Here these lie in [-5, 2].
         Batch: every update draws ``batch_size`` transitions of each task; there, 1024 at random from all tasks.

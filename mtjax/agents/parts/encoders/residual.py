@@ -60,10 +60,10 @@ class BroNet(Identity):
         x = relu(LN(Dense(inputs)));   x <- x + LN(Dense(relu(LN(Dense(x)))))   in each block
     Its norms do not depend on critic-layer-norm and actor-layer-norm.
 
-    Differs from the paper: actor and critics have the same size (there, 2 blocks of 512 in critics and 1 of 256 in the
-    actor). Kernels start by He's initialisation, and heads by LeCun's; the authors' are orthogonal times sqrt 2, which
-    has He's scale but needs a QR decomposition for each. Only the network is implemented, not the paper's optimistic
-    exploration, quantiles and resets.
+    Differs from the paper: by default actor and critics have the same size (there, 2 blocks of 512 in critics and 1 of
+    256 in the actor: critic_hidden=(512, 512) and actor_hidden=(256,)). Kernels start by He's initialisation, and heads
+    by LeCun's; the authors' are orthogonal times sqrt 2, which has He's scale but needs a QR decomposition for each.
+    Only the network is implemented, not the paper's optimistic exploration, quantiles and resets.
     """
 
     def body(self, hidden: tuple[int, ...], layer_norm: bool) -> nn.Module:
@@ -78,8 +78,9 @@ class SimBa(Identity):
     Its norms do not depend on critic-layer-norm and actor-layer-norm. For the paper's scaling of observations use
     normalize-observations, and for its weight decay weight-decay.
 
-    Differs from the paper: actor and critics have the same size (there, 2 blocks of 512 in critics and 1 of 128 in the
-    actor); the first layer starts by LeCun's initialisation, where the authors' is orthogonal.
+    Differs from the paper: by default actor and critics have the same size (there, 2 blocks of 512 in critics and 1 of
+    128 in the actor: critic_hidden=(512, 512) and actor_hidden=(128,)); the first layer starts by LeCun's
+    initialisation, where the authors' is orthogonal.
     """
 
     expansion: int = 4
