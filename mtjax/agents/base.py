@@ -20,7 +20,7 @@ from mtjax.agents.parts.samplers import SAMPLERS, Sampler
 from mtjax.agents.parts.scaling import SCALINGS, Scaling
 from mtjax.agents.parts.trajectory import Past, Seen, TrajectoryEncoder
 from mtjax.agents.parts.values import VALUES
-from mtjax.experience import EXPERIENCES, Replay
+from mtjax.experience import EXPERIENCES, Replay, multistep
 from mtjax.names import frozen, nearest_error
 from mtjax.networks import Network, Params
 from mtjax.types import Acted, Array, Env, InputError, Key, Metrics, Outcome, Spec, Task, Transition
@@ -344,6 +344,10 @@ class BaseAgent(abc.ABC):
         if self.discounting == "gamma":
             return self.gamma
         return jnp.clip(1 - 5 / tasks.horizon, 0.95, 0.995)
+
+    def join_steps(self, state: Any, steps: Transition, tasks: Task) -> Transition:
+        """Join windows of consecutive steps (T, ..., n) to transitions (T, ...), by the tasks' discounts."""
+        return jax.vmap(multistep.join)(steps, jnp.broadcast_to(self.discounts(tasks), len(tasks.id)))
 
     @property
     def borrowed(self) -> list[str]:

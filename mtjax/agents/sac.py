@@ -14,6 +14,7 @@ from mtjax import normalize
 from mtjax.agents import parts
 from mtjax.agents.base import FLAT, BaseAgent, Memory, Pair
 from mtjax.agents.parts.gradients import descent, surgery
+from mtjax.agents.parts.representations import REPRESENTATIONS
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.trajectory import append
 from mtjax.agents.parts.values import VALUES, Value
@@ -116,6 +117,9 @@ class SAC(BaseAgent):
                 "scaling=popart rescales a scalar head of every task's own; use value=scalar and heads=per-task or "
                 f"disjoint, not {value} and {self.heads}"
             )
+        if self.representation.learns and self.experience.n_step > 1:
+            name = parts.name_of(REPRESENTATIONS, self.representation)
+            raise InputError(f"{name} learns models of single steps; use n-step=1, not {self.experience.n_step}")
 
     # Networks.
 
@@ -268,7 +272,8 @@ class SAC(BaseAgent):
         state = state._replace(moments=self.fit_moments(state.moments, batch.obs))
         past, next_past = batch.extras, None
         if past is not None:
-            next_past = append(past, batch.obs, batch.action, batch.reward)
+            last = batch if batch.last is None else batch.last
+            next_past = append(last.extras, last.obs, last.action, last.reward)
         action_size = action_sizes(batch.action, tasks.action_mask)
         bonus = jnp.exp(state.log_temperature) * abs(self.target_entropy) * action_size / 2
         gamma = self.discounts(tasks)

@@ -46,19 +46,20 @@ def require(env: Env) -> None:
 
 
 def sample(
-    env: Env, agent: Any, tasks: Task, share: float, ring: Ring, key: Key, shape: tuple[int, int, int]
+    env: Env, agent: Any, tasks: Task, share: float, ring: Ring, key: Key, shape: tuple[int, int, int], window: int = 0
 ) -> Transition:
     """Draw U batches of B transitions for each task, ``shape`` (T, U, B), and relabel the first round(share B).
 
     The relabelled transitions come uniformly from the rings of all other tasks. If episodes draw their goals, they also
-    come from the task's own ring, as the new goal differs there too.
+    come from the task's own ring, as the new goal differs there too. With a ``window``, so many consecutive steps are
+    drawn for each transition, and relabelled with the same goal.
     """
     source_key, row_key, task_key, goal_key = jax.random.split(key, 4)
     num_tasks, count = shape[0], max(round(share * shape[2]), 1)
     again = (*shape[:2], count)
     shift = jax.random.randint(source_key, again, 0 if fresh_goals(env, tasks) else 1, num_tasks)
     own = jnp.broadcast_to(jnp.arange(num_tasks)[:, None, None], shape)
-    rows = rings.sample_from(ring, row_key, own.at[:, :, :count].add(shift) % num_tasks)
+    rows = rings.sample_from(ring, row_key, own.at[:, :, :count].add(shift) % num_tasks, window)
     keys = (jax.random.split(task_key, again), jax.random.split(goal_key, again))
     of_task = jax.vmap(jax.vmap(partial(relabel, env, agent), (None, 0, 0, 0)), (None, 0, 0, 0))
     new = jax.vmap(of_task)(tasks, jax.tree.map(lambda x: x[:, :, :count], rows), *keys)
@@ -66,10 +67,14 @@ def sample(
 
 
 def relabel(env: Env, agent: Any, task: Task, transition: Transition, task_key: Key, goal_key: Key) -> Transition:
-    """Relabel a transition as a step of ``task``, or of a fresh draw where episodes draw their tasks."""
+    """Relabel a step, or a window (n, ...), as of ``task``, or of a fresh draw where episodes draw their tasks."""
     world = episode_task(task, task_key)
-    new = agent.relabel(env, world, transition, goal_key)
-    return new if transition.context is None else new._replace(context=world.context)
+
+    def one(step: Transition) -> Transition:
+        new = agent.relabel(env, world, step, goal_key)
+        return new if step.context is None else new._replace(context=world.context)
+
+    return jax.vmap(one)(transition) if jnp.ndim(transition.reward) else one(transition)
 
 
 def fresh_goals(env: Any, tasks: Task) -> bool:

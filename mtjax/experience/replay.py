@@ -33,7 +33,7 @@ class Replay:
     """Stores every step in a ring for each task, and updates the agent on random batches.
 
     The first actions are random, and each is held for some steps. Then each step of every environment is followed by
-    ``updates_per_step`` updates.
+    ``updates_per_step`` updates. ``multistep`` has the equations of ``n_step``.
     """
 
     updates_per_step: Annotated[int, _FLAG] = 1
@@ -48,6 +48,8 @@ class Replay:
     """Steps for which each random action is held; held actions explore more than ones that change every step."""
     reset_every: Annotated[int, _FLAG] = 0
     """Reset networks and optimisers after every so many steps of every environment, and keep the replay; 0 never."""
+    n_step: Annotated[int, _FLAG] = 1
+    """Number of rewards that a critic target sums before it bootstraps; fewer where the episode ends."""
     hindsight: Annotated[float, _FLAG] = 0.0
     """Share of each batch that comes from other tasks and is relabelled with this task's goal; only for families whose
     tasks differ in goals alone."""
@@ -62,21 +64,33 @@ class Replay:
             if getattr(self, field.name) < least:
                 flag = field.name.replace("_", "-")
                 raise InputError(f"{flag} must be at least {least}, not {getattr(self, field.name)}")
+        if self.n_step > self.warmup_steps + 1:
+            raise InputError(
+                f"n-step={self.n_step} needs as many steps before the first update: warmup-steps of at least "
+                f"{self.n_step - 1}, not {self.warmup_steps}"
+            )
 
     def check(self, env: Env, num_envs: int) -> None:
         """Check that the settings fit the environment.
 
         Raises:
-            InputError: the replay does not hold one step of every environment, or hindsight cannot relabel the family.
+            InputError: the replay does not hold enough steps of every environment, or hindsight cannot relabel the
+                family.
         """
-        if self.replay_size < num_envs:
-            raise InputError(f"replay-size ({self.replay_size}) must hold one step of num-envs ({num_envs})")
+        if self.replay_size < self.n_step * num_envs:
+            steps = "one step" if self.n_step == 1 else f"n-step={self.n_step} steps"
+            raise InputError(f"replay-size ({self.replay_size}) must hold {steps} of num-envs ({num_envs})")
         if self.hindsight:
             hindsight.require(env)
 
     def describe(self, num_envs: int) -> str:
         """Return a description of its size."""
         return f"replay ({self.capacity(num_envs):,} transitions a task)"
+
+    @property
+    def window(self) -> int:
+        """Number of consecutive steps to draw for each transition; 0 if transitions are single steps."""
+        return self.n_step if self.n_step > 1 else 0
 
     def capacity(self, num_envs: int) -> int:
         """Return how many transitions each task's ring holds: the replay size, rounded down to whole steps."""
@@ -141,14 +155,19 @@ class Replay:
         one = lambda state, key: agent.reset_networks(state, env.spec, tasks, jax.random.fold_in(key, 1))
         return jax.lax.cond(due, lambda states: over_seeds(one, 0, 0)(states, keys), lambda states: states, states)
 
-    def draw(self, env: Env, agent: Any, tasks: Task, ring: Ring, key: Key) -> Transition:
-        """Draw the batches (U, T, B, ...) of one step's updates for one agent, by one gather, which is fastest."""
+    def draw(self, env: Env, agent: Any, tasks: Task, ring: Ring, key: Key, state: Any = None) -> Transition:
+        """Draw the batches (U, T, B, ...) of one step's updates for one agent, by one gather, which is fastest.
+
+        Args:
+            state: the agent's, for multi-step returns.
+        """
         shape = (len(tasks.id), self.updates_per_step, self.batch_size)
         if self.hindsight:
-            rows = hindsight.sample(env, agent, tasks, self.hindsight, ring, key, shape)
+            rows = hindsight.sample(env, agent, tasks, self.hindsight, ring, key, shape, self.window)
         else:
-            rows = rings.sample(ring, key, math.prod(shape[1:]))
+            rows = rings.sample(ring, key, math.prod(shape[1:]), self.window)
             rows = jax.tree.map(lambda x: x.reshape(*shape, *x.shape[2:]), rows)
+        rows = agent.join_steps(state, rows, tasks) if self.window else rows
         return jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), rows)
 
 
@@ -156,7 +175,7 @@ class Replay:
 def _learn(env: Env, agent: Any, replay: Replay, tasks: Task, states: Any, ring: Ring, keys: Key):
     def learn_one(state, ring: Ring, key: Key) -> tuple[Any, Metrics]:
         batch_key, update_key = jax.random.split(key)
-        batches = replay.draw(env, agent, tasks, ring, batch_key)
+        batches = replay.draw(env, agent, tasks, ring, batch_key, state)
         keys = jax.random.split(update_key, replay.updates_per_step)
         update = lambda state, x: agent.update(state, x[0], tasks, x[1])
         state, metrics = jax.lax.scan(update, state, (batches, keys))

@@ -43,23 +43,34 @@ def add(ring: Ring, items: Any) -> Ring:
     )
 
 
-def sample(ring: Ring, key: Key, batch_size: int) -> Any:
-    """Draw rows (T, batch_size, ...) uniformly and with replacement from each task's ring."""
+def sample(ring: Ring, key: Key, batch_size: int, window: int = 0) -> Any:
+    """Draw rows (T, batch_size, ...) uniformly and with replacement from each task's ring.
+
+    Args:
+        window: draw so many consecutive steps of an environment, leaves (T, batch_size, window, ...). The last of them
+            is at most the latest step, as those after it are not known, or are old ones that it will overwrite.
+    """
     num_tasks = jax.tree.leaves(ring.rows)[0].shape[0]
-    return _draw(ring, key, (num_tasks, batch_size), jax.vmap(lambda ring, index: ring[index]))
+    return _draw(ring, key, (num_tasks, batch_size), window, jax.vmap(lambda ring, index: ring[index]))
 
 
-def sample_from(ring: Ring, key: Key, task: Array) -> Any:
-    """Draw a row from the ring of each ``task`` (...) int32; leaves (*task.shape, ...)."""
-    return _draw(ring, key, task.shape, lambda rings, index: rings[task, index])
+def sample_from(ring: Ring, key: Key, task: Array, window: int = 0) -> Any:
+    """Draw a row, or a window, from the ring of each ``task`` (...) int32; leaves (*task.shape, ...)."""
+    each = task[..., None] if window else task
+    return _draw(ring, key, task.shape, window, lambda rings, index: rings[each, index])
 
 
-def _draw(ring: Ring, key: Key, shape: tuple[int, ...], take: Callable) -> Any:
+def _draw(ring: Ring, key: Key, shape: tuple[int, ...], window: int, take: Callable) -> Any:
     """Draw uniform slots and environments of ``shape``, and apply ``take(rings, index)`` to rings (T, H E, ...)."""
     num_slots, held = jax.tree.leaves(ring.rows)[0].shape[1:3]
     num_envs = held * collectives.count()
-    index = jax.random.randint(key, shape, 0, ring.size * num_envs)
+    starts = ring.size - window + 1 if window else ring.size
+    index = jax.random.randint(key, shape, 0, starts * num_envs)
     slot, env = index // num_envs, index % num_envs
+    holder = env // held
+    if window:
+        oldest = ring.position - ring.size
+        slot, env = (oldest + slot[..., None] + jnp.arange(window)) % num_slots, env[..., None]
     flat = lambda x: x.reshape(len(x), num_slots * held, *x.shape[3:])
     rows = jax.tree.map(lambda x: take(flat(x), slot * held + env % held), ring.rows)
-    return collectives.pick(rows, env // held)
+    return collectives.pick(rows, holder)

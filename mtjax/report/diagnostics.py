@@ -69,7 +69,7 @@ def diagnose(policy: Policy, replay: Ring, batch_size: int) -> Diagnostics:
     Raises:
         InputError: the replay is empty, or the agent has no critics of actions.
     """
-    if not int(replay.size):
+    if int(replay.size) < getattr(policy.agent.experience, "n_step", 1):
         raise InputError("the replay of this run is empty; train it for longer")
     tasks, agent = policy.env.tasks("train"), policy.agent
     if not isinstance(agent, SAC):
@@ -102,7 +102,10 @@ def _summarise(agent: SAC, state: Any, gradients: Mapping, activity: Mapping) ->
 def _average_gradients(agent: SAC, state: Any, replay: Ring, tasks: Task, key: Key, batch_size: int) -> dict:
     def draw(key: Key) -> dict:
         batch_key, loss_key = jax.random.split(key)
-        return compare_gradients(agent, state, rings.sample(replay, batch_key, batch_size), tasks, loss_key)
+        window = agent.experience.window
+        batch = rings.sample(replay, batch_key, batch_size, window)
+        batch = agent.join_steps(state, batch, tasks) if window else batch
+        return compare_gradients(agent, state, batch, tasks, loss_key)
 
     return jax.tree.map(lambda x: jnp.mean(x, axis=0), jax.lax.map(draw, jax.random.split(key, DRAWS)))
 

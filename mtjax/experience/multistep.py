@@ -1,0 +1,43 @@
+"""Multi-step returns join a transition with the steps that follow it in its environment.
+
+For a window of n steps from t on, let m be the number of steps up to and with the first that ended its episode, or n:
+    R = r_t + gamma r_(t+1) + ... + gamma^(m-1) r_(t+m-1)
+    y = R + gamma^m d_(t+m-1) V(s_(t+m))
+s_(t+m) is the true observation after the window's last step, from before any reset, and d = 0 if that step terminated.
+So a termination ends the bootstrap, and a time limit ends the sum alone (Sutton 1988; for off-policy critics Hessel et
+al. 2018, "Rainbow", and Barth-Maron et al. 2018, "D4PG").
+
+As there, nothing corrects for actions of an older policy. Of a soft value's bonus for entropy only that after the
+window counts.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from mtjax.types import Array, Transition
+
+
+def join(steps: Transition, gamma: float | Array) -> Transition:
+    """Join windows of consecutive steps (..., n) to one transition (...) each, for a discount () of one task.
+
+    Its reward is R. Its discount is gamma^(m-1) d, as agents multiply it by gamma once more. Where agents store data
+    with their actions, ``last`` is the window's last step, which that data continues.
+    """
+    goes_on = jnp.cumprod(~steps.ended, axis=-1)
+    counts = jnp.concatenate([jnp.ones_like(goes_on[..., :1]), goes_on[..., :-1]], axis=-1)  # the first m steps
+    powers = jnp.power(gamma, jnp.arange(steps.reward.shape[-1]))
+    final = jnp.sum(counts, axis=-1, keepdims=True) - 1
+    lead = steps.reward.ndim - 1
+
+    def at(x: Array, index: Array) -> Array:
+        index = index.reshape(index.shape + (1,) * (x.ndim - index.ndim))
+        return jnp.take_along_axis(x, index, axis=lead).squeeze(lead)
+
+    first, last = (jax.tree.map(lambda x, index=index: at(x, index), steps) for index in (0 * final, final))
+    return first._replace(
+        reward=jnp.sum(jnp.where(counts > 0, powers * steps.reward, 0.0), axis=-1),
+        discount=powers[final.squeeze(-1)] * last.discount,
+        next_obs=last.next_obs,
+        ended=last.ended,
+        last=None if steps.extras is None else last._replace(next_obs=None, discount=None, ended=None, context=None),
+    )
