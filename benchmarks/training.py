@@ -32,7 +32,7 @@ class Training:
         self.num_devices = 1 if mesh is None else mesh.size
         self.worlds = num_tasks * settings.num_envs
         self.steps = seeds * settings.chunk_steps * self.worlds
-        self.updates = seeds * settings.chunk_steps * getattr(experience, "updates_per_step", 0)
+        self.updates = seeds * settings.chunk_steps // experience.steps * getattr(experience, "updates_per_step", 0)
         self.seconds: list[float] = []
         jax.clear_caches()  # of the programs of others, which may be the same
         before = time.perf_counter()

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from mtjax.maps import over_seeds
 from mtjax.parallel import collectives
 from mtjax.rollout import EnvStep, Worlds, reset_ended, reset_envs, split_keys, step_envs, world_keys
-from mtjax.types import Agent, Array, Env, InputError, Key, Metrics, Outcome, Task, Transition
+from mtjax.types import Agent, Array, Env, InputError, Key, Metrics, Outcome, Sometimes, Task, Transition
 
 PHASES = 10
 """Largest number of different first ages, as each causes a separate reset in every episode."""
@@ -138,7 +138,7 @@ def _collect(env, agent, tasks, state: TrainState, keys: Key, reset_keys: Key) -
 
 def _step(env, agent, tasks, state: TrainState, keys: Key, reset_keys: Key):
     """Step every environment once, and begin new episodes where episodes ended."""
-    explore = partial(agent.experience.explore, state.data)
+    explore = lambda action: agent.experience.explore(state.data, action, state.iteration)
     act_keys = world_keys(keys, state.total.shape)
     worlds, env_step = step_envs(env, agent, state.agent, tasks, state.worlds, act_keys, explore)
     transition, total = env_step.transition, state.total + env_step.transition.reward
@@ -185,10 +185,11 @@ def _summarise(history: dict) -> Metrics:
     bad = bad > 0
     # A bad step of one task spoils the losses of all that share its networks; then only that task is reported.
     blameless = ~jnp.any(bad, axis=3, keepdims=True)
-    for loss in losses.values():
+    for loss in jax.tree.leaves(losses):
         bad |= blameless & ~jnp.isfinite(loss).reshape(len(loss), 1, loss.shape[1], -1)
     bad = bad.reshape(-1, *bad.shape[2:])  # (H, S, T)
-    return jax.tree.map(mean, losses) | {
+    means = jax.tree.map(mean, losses)
+    return {name: x.value / x.weight if isinstance(x, Sometimes) else x for name, x in means.items()} | {
         "episodes": episodes,
         "return": total / episodes,
         **{name: x / episodes for name, x in metrics.items()},

@@ -1,4 +1,4 @@
-"""Map functions over seeds, worlds and agents."""
+"""Map functions over seeds, worlds and agents, and apply them when it is their turn."""
 
 import math
 from collections.abc import Callable
@@ -51,6 +51,17 @@ def over_learners(function: Callable) -> Callable:
         return over_seeds(of_seed, 0, None, *world)(states, tasks, *arguments)
 
     return mapped
+
+
+def when(due: Array, function: Callable, state: Any) -> tuple[Any, Any]:
+    """Apply ``function(state) -> (state, results)`` if ``due``; if not, the state stays and results are zeros.
+
+    Args:
+        due: () bool. Under a map over seeds it must be the same for all, and not mapped: then it stays a branch.
+    """
+    shapes = jax.eval_shape(function, state)[1]
+    rest = lambda state: (state, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes))
+    return jax.lax.cond(due, function, rest, state)
 
 
 def where_worlds(mask: Array, new: Any, old: Any) -> Any:

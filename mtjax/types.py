@@ -57,6 +57,18 @@ class Transition(NamedTuple):
     last: Any = None  # where several steps are joined to one, what the agent needs of the last of them
 
 
+class Sometimes(NamedTuple):
+    """Holds a metric that only some updates have; its mean is that of ``value`` over that of ``weight``."""
+
+    value: Any  # 0 where the update does not have it
+    weight: Any  # 1 where the update has it, else 0; of the same shape
+
+    @staticmethod
+    def over(metrics: Metrics, present: Array) -> "dict[str, Sometimes]":
+        """Return metrics that an update has if ``present`` ()."""
+        return {name: Sometimes(x, jnp.full(x.shape, present, jnp.float32)) for name, x in metrics.items()}
+
+
 class Acted(NamedTuple):
     """Holds an agent's action in one world."""
 
@@ -134,7 +146,7 @@ class Experience(Protocol):
     def check(self, env: Env, num_envs: int) -> None: ...  # raises InputError
     def describe(self, num_envs: int) -> str: ...
     def init(self, item: Transition, num_tasks: int, num_envs: int, keys: Key) -> Any: ...  # keys (S,)
-    def explore(self, data: Any, action: Array) -> Array: ...  # (S, T, E, A): the actions to take
+    def explore(self, data: Any, action: Array, step: Array) -> Array: ...  # actions (S, T, E, A) to take at a step ()
     def add(self, data: Any, steps: Transition) -> Any: ...  # leaves (S, T, H, E, ...)
     def keep(self, data: Any) -> Any: ...  # what the next iteration needs
 

@@ -68,7 +68,7 @@ def filled(num_steps):
     ring = rings.init(jnp.zeros(3), TASKS, SLOTS, ENVS)
     for step in range(1, num_steps + 1):
         task, env = np.meshgrid(np.arange(TASKS), np.arange(ENVS), indexing="ij")
-        ring = rings.add(ring, np.float32(np.stack([task, env, np.full_like(task, step)], axis=-1)))
+        ring = rings.add(ring, np.float32(np.stack([task, env, np.full_like(task, step)], axis=-1))[:, None])
     return ring
 
 
@@ -242,5 +242,5 @@ def test_what_cannot_be_right_is_refused(name, settings, message):
 
 def test_the_ring_must_hold_a_window():
     """Of every environment."""
-    with pytest.raises(InputError, match=r"replay-size \(11\) must hold n-step=3 steps of num-envs \(4\)"):
+    with pytest.raises(InputError, match=r"replay-size \(11\) must hold 3 steps of num-envs \(4\)"):
         Replay(replay_size=11, n_step=3).check(Walk(), 4)

@@ -22,7 +22,7 @@ def step_of_all(step):
 def filled(num_steps, num_slots=SLOTS):
     replay = rings.init(jax.tree.map(lambda x: jnp.asarray(x[0, 0]), step_of_all(0)), TASKS, num_slots, ENVS)
     for step in range(1, num_steps + 1):
-        replay = rings.add(replay, step_of_all(step))
+        replay = rings.add(replay, jax.tree.map(lambda x: x[:, None], step_of_all(step)))
     return replay
 
 

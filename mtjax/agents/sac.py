@@ -19,8 +19,9 @@ from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.trajectory import append
 from mtjax.agents.parts.values import VALUES, Value
 from mtjax.experience import Replay
+from mtjax.maps import when
 from mtjax.networks import OVER_TASKS, Params, tanh_normal
-from mtjax.types import Acted, Array, InputError, Key, Metrics, Spec, Task, Transition
+from mtjax.types import Acted, Array, InputError, Key, Metrics, Sometimes, Spec, Task, Transition
 
 
 class Optimizers(NamedTuple):
@@ -225,8 +226,14 @@ class SAC(BaseAgent):
 
     # Update of all tasks.
 
-    def update(self, state: SACState, transitions: Transition, tasks: Task, key: Key) -> tuple[SACState, Metrics]:
-        """Take one gradient step on a batch (T, B, ...) of the training tasks; metrics are (T,)."""
+    def update(
+        self, state: SACState, transitions: Transition, tasks: Task, key: Key, actor_turn: Array | None = None
+    ) -> tuple[SACState, Metrics]:
+        """Take one gradient step on a batch (T, B, ...) of the training tasks; metrics are (T,).
+
+        Args:
+            actor_turn: () bool, whether actor and temperatures learn too; None if they always do.
+        """
         target_key, actor_key, critic_order, actor_order = jax.random.split(key, 4)
         state, batch = self.prepare(state, transitions, tasks)
         importance = self.sampler.weights(state.progress, batch.temperature)
@@ -239,33 +246,49 @@ class SAC(BaseAgent):
         )
         critic_rule = surgery.adapt_rule(self.gradients, loss, critic, data, critic_step)
 
-        loss, data = self.actor_problem(critic, batch, actor_key)
-        actor_step = combine(self.gradients.for_actor, loss, state.actor, data, state.surgery.actor, actor_order)
-        actor, actor_memory = descent.descend(
-            self.optimizers.actor, actor_step.gradients, state.optimizers.actor, state.actor
-        )
+        improve = lambda state: self.improve(state, critic, batch, combine, actor_key, actor_order)
+        if actor_turn is None:
+            state, actor_metrics = improve(state)
+        else:
+            state, actor_metrics = when(actor_turn, improve, state)
+            actor_metrics = Sometimes.over(actor_metrics, actor_turn)
 
-        action_size = action_sizes(batch.action, batch.mask)
-        slope = jax.grad(self.temperature_loss)(state.log_temperature, actor_step.aux["entropy"], action_size)
-        log_temperature, temperature_memory = descent.descend(
-            self.optimizers.temperature, slope, state.optimizers.temperature, state.log_temperature
-        )
-        metrics = {**critic_step.aux, **actor_step.aux, "temperature": batch.temperature}
+        metrics = {**critic_step.aux, **actor_metrics, "temperature": batch.temperature}
         target_critic = self.update_target(critic, state.target)
         scales, (critic, target_critic) = self.scaling.renew(
             state.scales, metrics.pop("target"), (critic, target_critic)
         )
         state = state._replace(
-            actor=actor,
             critic=critic,
             target=target_critic,
-            log_temperature=log_temperature,
-            optimizers=Optimizers(actor_memory, critic_memory, temperature_memory),
-            surgery=Pair(actor_step.memory, critic_rule),
+            optimizers=state.optimizers._replace(critic=critic_memory),
+            surgery=state.surgery._replace(critic=critic_rule),
             scales=scales,
         )
-        named = (("critic", critic_step.metrics), ("actor", actor_step.metrics))
-        return state, metrics | {f"{name}_{k}": v for name, found in named for k, v in found.items()}
+        return state, metrics | {f"critic_{name}": x for name, x in critic_step.metrics.items()}
+
+    def improve(
+        self, state: SACState, critic: Params, batch: Batch, combine: Callable, key: Key, order: Key
+    ) -> tuple[SACState, Metrics]:
+        """Take one gradient step of the actor under a critic, and one of the temperatures."""
+        loss, data = self.actor_problem(critic, batch, key)
+        step = combine(self.gradients.for_actor, loss, state.actor, data, state.surgery.actor, order)
+        actor, actor_memory = descent.descend(
+            self.optimizers.actor, step.gradients, state.optimizers.actor, state.actor
+        )
+
+        action_size = action_sizes(batch.action, batch.mask)
+        slope = jax.grad(self.temperature_loss)(state.log_temperature, step.aux["entropy"], action_size)
+        log_temperature, temperature_memory = descent.descend(
+            self.optimizers.temperature, slope, state.optimizers.temperature, state.log_temperature
+        )
+        state = state._replace(
+            actor=actor,
+            log_temperature=log_temperature,
+            optimizers=state.optimizers._replace(actor=actor_memory, temperature=temperature_memory),
+            surgery=state.surgery._replace(actor=step.memory),
+        )
+        return state, {**step.aux, **{f"actor_{name}": x for name, x in step.metrics.items()}}
 
     def prepare(self, state: SACState, batch: Transition, tasks: Task) -> tuple[SACState, Batch]:
         """Fit the normalisers to transitions (T, B, ...), and return the batch (T, ...) for the losses."""

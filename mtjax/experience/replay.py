@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from functools import partial
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from jax.sharding import PartitionSpec
 from mtjax.experience import hindsight
 from mtjax.experience import ring as rings
 from mtjax.experience.ring import OVER_SEEDS, Ring
-from mtjax.maps import over_seeds
+from mtjax.maps import over_seeds, when
 from mtjax.parallel import collectives
 from mtjax.types import Array, Env, InputError, Key, Metrics, Task, Transition
 
@@ -32,12 +32,17 @@ class Buffer(NamedTuple):
 class Replay:
     """Stores every step in a ring for each task, and updates the agent on random batches.
 
-    The first actions are random, and each is held for some steps. Then each step of every environment is followed by
-    ``updates_per_step`` updates. ``multistep`` has the equations of ``n_step``.
+    The first actions are random, and each is held for some steps. Then each step of every environment, or every
+    ``update_every``-th, is followed by ``updates_per_step`` updates. ``multistep`` has the equations of ``n_step``.
     """
 
     updates_per_step: Annotated[int, _FLAG] = 1
-    """Gradient updates after each step of every environment."""
+    """Gradient updates after each step of every environment, or after every so many by update-every."""
+    update_every: Annotated[int, _FLAG] = 1
+    """Steps of every environment between two times of updates."""
+    policy_delay: Annotated[int, _FLAG] = 1
+    """Update the actor and the temperatures at every so many updates of the critics (TD3; Fujimoto et al. 2018). There
+    target critics wait as well; here they move at every update."""
     batch_size: Annotated[int, _FLAG] = 64
     """Transitions of each task in an update."""
     replay_size: Annotated[int, _FLAG] = 100_000
@@ -53,8 +58,6 @@ class Replay:
     hindsight: Annotated[float, _FLAG] = 0.0
     """Share of each batch that comes from other tasks and is relabelled with this task's goal; only for families whose
     tasks differ in goals alone."""
-
-    steps: ClassVar[int] = 1
 
     def __post_init__(self):
         if not 0 <= self.hindsight <= 1:
@@ -77,8 +80,9 @@ class Replay:
             InputError: the replay does not hold enough steps of every environment, or hindsight cannot relabel the
                 family.
         """
-        if self.replay_size < self.n_step * num_envs:
-            steps = "one step" if self.n_step == 1 else f"n-step={self.n_step} steps"
+        if self.capacity(num_envs) < max(self.n_step, self.update_every) * num_envs:
+            least = math.ceil(self.n_step / self.update_every) * self.update_every
+            steps = "one step" if least == 1 else f"{least} steps"
             raise InputError(f"replay-size ({self.replay_size}) must hold {steps} of num-envs ({num_envs})")
         if self.hindsight:
             hindsight.require(env)
@@ -92,9 +96,15 @@ class Replay:
         """Number of consecutive steps to draw for each transition; 0 if transitions are single steps."""
         return self.n_step if self.n_step > 1 else 0
 
+    @property
+    def steps(self) -> int:
+        """Steps of every environment between two calls of ``learn``."""
+        return self.update_every
+
     def capacity(self, num_envs: int) -> int:
-        """Return how many transitions each task's ring holds: the replay size, rounded down to whole steps."""
-        return self.replay_size // num_envs * num_envs
+        """Return how many transitions each task's ring holds: the replay size, rounded down to whole iterations."""
+        stored = self.steps * num_envs
+        return self.replay_size // stored * stored
 
     @property
     def sharding(self) -> Buffer:
@@ -107,22 +117,21 @@ class Replay:
 
     def init(self, item: Transition, num_tasks: int, num_envs: int, keys: Key) -> Buffer:
         """Return an empty replay for transitions like ``item`` (no leading axes) and seeds with ``keys`` (S,)."""
-        own, slots = num_envs // collectives.count(), self.replay_size // num_envs
+        own, slots = num_envs // collectives.count(), self.capacity(num_envs) // num_envs
         blank = lambda _: rings.init(item, num_tasks, slots, own)
         return Buffer(jax.vmap(blank, out_axes=OVER_SEEDS)(keys), jnp.int32(0), keys)
 
-    def explore(self, data: Buffer, action: Array) -> Array:
-        """Replace actions (S, T, E, A) by held random ones until learning starts."""
+    def explore(self, data: Buffer, action: Array, step: Array) -> Array:
+        """Replace actions (S, T, E, A) at a step () by held random ones until learning starts."""
         everywhere = (action.shape[1], action.shape[2] * collectives.count(), action.shape[3])
-        fold = lambda key: jax.random.fold_in(key, data.count // self.warmup_hold)
+        fold = lambda key: jax.random.fold_in(key, step // self.warmup_hold)
         drawn = jax.vmap(lambda key: jax.random.uniform(fold(key), everywhere, minval=-1.0))(data.key)
-        return jnp.where(data.count < self.warmup_steps, collectives.own(drawn, axis=2), action)
+        return jnp.where(step < self.warmup_steps, collectives.own(drawn, axis=2), action)
 
     def add(self, data: Buffer, steps: Transition) -> Buffer:
-        """Store one step of every environment, leaves (S, T, 1, E, ...)."""
-        latest = jax.tree.map(lambda x: x[:, :, 0], steps)
-        ring = jax.vmap(rings.add, (OVER_SEEDS, 0), OVER_SEEDS)(data.ring, latest)
-        return Buffer(ring, data.count + 1, data.key)
+        """Store the latest steps of every environment, leaves (S, T, H, E, ...)."""
+        ring = jax.vmap(rings.add, (OVER_SEEDS, 0), OVER_SEEDS)(data.ring, steps)
+        return Buffer(ring, data.count + self.steps, data.key)
 
     def keep(self, data: Buffer) -> Buffer:
         """Return all of the data."""
@@ -136,24 +145,33 @@ class Replay:
         Returns:
             their new states, and the means of the updates' metrics, with ``learning`` (): 1 if there were updates.
         """
-        warming, metrics = data.count <= self.warmup_steps, {}
+        learning, metrics = data.count > self.warmup_steps, {}
         states = self._renew(env, agent, states, data, tasks, keys)
         if self.updates_per_step:
-            # All seeds begin to learn at the same step, so that this stays a branch.
-            learn = lambda states: _learn(env, agent, self, tasks, states, data.ring, keys)
-            shapes = jax.eval_shape(learn, states)[1]
-            rest = lambda states: (states, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes))
-            states, metrics = jax.lax.cond(warming, rest, learn, states)
-        return states, metrics | {"learning": 1.0 - warming}
+            learn = lambda states: _learn(env, agent, self, tasks, states, data, keys)
+            states, metrics = when(learning, learn, states)  # all seeds begin to learn at the same step
+        return states, metrics | {"learning": jnp.float32(learning)}
 
     def _renew(self, env: Env, agent: Any, states: Any, data: Buffer, tasks: Task, keys: Key) -> Any:
         """Reset the networks if ``reset_every`` says so at this step."""
         if not self.reset_every:
             return states
         before = data.count - 1
-        due = (before > self.warmup_steps) & (before % self.reset_every == 0)
+        passed = before // self.reset_every > jnp.maximum(before - self.steps, 0) // self.reset_every
+        due = (before > self.warmup_steps) & passed
         one = lambda state, key: agent.reset_networks(state, env.spec, tasks, jax.random.fold_in(key, 1))
         return jax.lax.cond(due, lambda states: over_seeds(one, 0, 0)(states, keys), lambda states: states, states)
+
+    def turns(self, count: Array) -> tuple[Array, ...]:
+        """Return in which updates (U,) after ``count`` () steps the actor learns; () if it learns in all.
+
+        They are the same for all seeds, so that each stays a branch.
+        """
+        if self.policy_delay == 1:
+            return ()
+        before = count // self.steps - self.warmup_steps // self.steps - 1  # earlier times of updates
+        number = before * self.updates_per_step + jnp.arange(self.updates_per_step)
+        return ((number + 1) % self.policy_delay == 0,)
 
     def draw(self, env: Env, agent: Any, tasks: Task, ring: Ring, key: Key, state: Any = None) -> Transition:
         """Draw the batches (U, T, B, ...) of one step's updates for one agent, by one gather, which is fastest.
@@ -172,13 +190,13 @@ class Replay:
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))  # so that it is traced once, though ``learn`` needs its shapes too
-def _learn(env: Env, agent: Any, replay: Replay, tasks: Task, states: Any, ring: Ring, keys: Key):
+def _learn(env: Env, agent: Any, replay: Replay, tasks: Task, states: Any, data: Buffer, keys: Key):
     def learn_one(state, ring: Ring, key: Key) -> tuple[Any, Metrics]:
         batch_key, update_key = jax.random.split(key)
         batches = replay.draw(env, agent, tasks, ring, batch_key, state)
         keys = jax.random.split(update_key, replay.updates_per_step)
-        update = lambda state, x: agent.update(state, x[0], tasks, x[1])
-        state, metrics = jax.lax.scan(update, state, (batches, keys))
+        update = lambda state, x: agent.update(state, x[0], tasks, *x[1:])
+        state, metrics = jax.lax.scan(update, state, (batches, keys, *replay.turns(data.count)))
         return state, jax.tree.map(lambda x: jnp.mean(x, axis=0), metrics)
 
-    return over_seeds(learn_one, 0, OVER_SEEDS, 0)(states, ring, keys)
+    return over_seeds(learn_one, 0, OVER_SEEDS, 0)(states, data.ring, keys)

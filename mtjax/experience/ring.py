@@ -33,13 +33,13 @@ def init(item: Any, num_tasks: int, num_slots: int, num_envs: int) -> Ring:
 
 
 def add(ring: Ring, items: Any) -> Ring:
-    """Write items (T, E, ...) to the next slot, over the oldest items."""
-    num_slots = jax.tree.leaves(ring.rows)[0].shape[1]
-    write = lambda rows, new: jax.lax.dynamic_update_slice_in_dim(rows, new[:, None], ring.position, axis=1)
+    """Write items (T, H, E, ...) to the next H slots, over the oldest items; H divides the number of slots."""
+    num_slots, count = (jax.tree.leaves(tree)[0].shape[1] for tree in (ring.rows, items))
+    write = lambda rows, new: jax.lax.dynamic_update_slice_in_dim(rows, new, ring.position, axis=1)
     return Ring(
         rows=jax.tree.map(write, ring.rows, items),
-        position=(ring.position + 1) % num_slots,
-        size=jnp.minimum(ring.size + 1, num_slots),
+        position=(ring.position + count) % num_slots,
+        size=jnp.minimum(ring.size + count, num_slots),
     )
 
 

@@ -38,7 +38,7 @@ class Rollouts:
         """Return (), as no data is kept between iterations."""
         return ()
 
-    def explore(self, data: tuple[()], action: Array) -> Array:
+    def explore(self, data: tuple[()], action: Array, step: Array) -> Array:
         """Return the policy's own actions."""
         return action
 

@@ -71,8 +71,8 @@ class SweptAgent:
     def learn(self, env: Env, states: SweptState, data: Any, tasks: Task, keys: Key) -> tuple[SweptState, Metrics]:
         return self.experience.learn(env, self, states, data, tasks, keys)  # type: ignore
 
-    def update(self, state: SweptState, batch: Transition, tasks: Task, key: Key) -> tuple[SweptState, Metrics]:
-        learner, metrics = with_values(self.agent, state.knobs).update(state.learner, batch, tasks, key)
+    def update(self, state: SweptState, batch: Any, tasks: Task, key: Key, *turn: Array) -> tuple[SweptState, Metrics]:
+        learner, metrics = with_values(self.agent, state.knobs).update(state.learner, batch, tasks, key, *turn)
         return state._replace(learner=learner), metrics
 
     def observe(self, state: SweptState, outcome: Outcome) -> SweptState:
