@@ -142,6 +142,11 @@ class Experience(Protocol):
     @property
     def steps(self) -> int: ...  # of every environment between two calls of ``Agent.learn``
     @property
+    def policy_delay(self) -> int: ...  # the actor learns at every so many updates
+    @property
+    def reset_every(self) -> int: ...  # steps of every environment between two resets of networks; 0 for never
+    def updates_in(self, steps: int) -> int: ...  # updates, or calls of ``learn``, in so many steps of all environments
+    @property
     def sharding(self) -> Any: ...  # of the data, as a tree of PartitionSpec
     def check(self, env: Env, num_envs: int) -> None: ...  # raises InputError
     def describe(self, num_envs: int) -> str: ...

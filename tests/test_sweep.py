@@ -123,17 +123,18 @@ def _run(env, agent, seeds, knobs=None, chunks=2):
 
 
 _NAMES = ("actor_lr", "critic_lr", "temperature_lr", "gamma", "tau", "initial_temperature", "target_entropy")
-_NAMES = (*_NAMES, "weight_decay", "max_gradient_norm", "return_range")
+_NAMES = (*_NAMES, "weight_decay", "max_gradient_norm", "return_range", "lr_final")
 POINTS = (
-    dict(zip(_NAMES, (1e-3, 2e-3, 1e-3, 0.9, 0.01, 0.1, -0.5, 0.0, 0.0, 10.0), strict=True)),
-    dict(zip(_NAMES, (1e-2, 1e-3, 3e-3, 0.5, 0.1, 1.0, 0.5, 0.1, 0.1, 5.0), strict=True)),
+    dict(zip(_NAMES, (1e-3, 2e-3, 1e-3, 0.9, 0.01, 0.1, -0.5, 0.0, 0.0, 10.0, 1.0), strict=True)),
+    dict(zip(_NAMES, (1e-2, 1e-3, 3e-3, 0.5, 0.1, 1.0, 0.5, 0.1, 0.1, 5.0, 0.2), strict=True)),
 )
 
 
 def test_a_point_trains_as_the_run_with_its_values():
     """Both seeds of two points, one with clipping and decay and one without, against plain runs of the same seeds."""
-    assert set(_NAMES) == set(points.sweepable(tiny("sac", scaling="return")))
-    env, agent, seeds = Walk(), tiny("sac", scaling="return"), jnp.arange(2, dtype=jnp.uint32)
+    agent = tiny("sac", scaling="return", lr_schedule="linear", lr_updates=20)
+    assert set(_NAMES) == set(points.sweepable(agent))
+    env, seeds = Walk(), jnp.arange(2, dtype=jnp.uint32)
     state, metrics = _run(env, SweptAgent(agent), *points.seed_axis(POINTS, seeds))
     learned = jax.device_get(state.agent.learner)
     plain = [_run(env, points.agent_at(agent, point), seeds) for point in POINTS]

@@ -4,7 +4,7 @@ import abc
 import dataclasses
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args, get_type_hints
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, get_args, get_type_hints
 
 import jax
 import jax.numpy as jnp
@@ -74,6 +74,10 @@ class BaseAgent(abc.ABC):
     adjustable: ClassVar[tuple[str, ...]] = (
         "actor_lr",
         "critic_lr",
+        "lr_schedule",
+        "lr_final",
+        "lr_warmup",
+        "lr_updates",
         "weight_decay",
         "max_gradient_norm",
         "gamma",
@@ -91,6 +95,15 @@ class BaseAgent(abc.ABC):
     """Adam's learning rate for the actor."""
     critic_lr: float = 1e-3
     """Adam's learning rate for the critics."""
+    lr_schedule: descent.Shape = "constant"
+    """Keep all learning rates (constant), or let them fall over the run along a line or half a cosine. A run that is
+    resumed with more --steps goes on along the schedule of a run of that length, so that rates rise at once."""
+    lr_final: float = 0.0
+    """Share of the learning rates that a schedule leaves at the end."""
+    lr_warmup: int = 0
+    """Updates of the critics over which the learning rates rise from 0, at first and after a reset."""
+    lr_updates: int = 0
+    """Updates of the critics after which the learning rates stay at their last values; 0 means the end of the run."""
     weight_decay: float = 0.0
     """Decoupled weight decay of actor and critics (AdamW)."""
     gamma: float = 0.99
@@ -156,10 +169,10 @@ class BaseAgent(abc.ABC):
         parts.require_positive(self, "actor_lr", "critic_lr")
         if not self.max_gradient_norm >= 0:
             raise InputError(f"max-gradient-norm must be at least 0 (0 does not clip), not {self.max_gradient_norm}")
-        parts.require_not_negative(self, "weight_decay")
+        parts.require_not_negative(self, "weight_decay", "lr_warmup", "lr_updates")
         parts.require_layers(self, "hidden")
         parts.require_widths(self, "actor_hidden", "critic_hidden")
-        parts.require_shares(self, "gamma")
+        parts.require_shares(self, "gamma", "lr_final")
         parts.require_counts(self, "embedding_size", "inferred_from")
 
     def _check_combination(self) -> None:
@@ -186,6 +199,10 @@ class BaseAgent(abc.ABC):
             raise InputError(f"gradient-scope=per-layer needs gradients of every task, which {rule} does not use")
         if parts.name_of(SCALINGS, self.scaling) == "return" and self.gamma == 1:
             raise InputError("scaling=return needs discounted returns, which have bounds; use gamma below 1")
+        if self.lr_schedule != "constant" and self.experience.reset_every:
+            raise InputError(
+                f"reset-every begins the optimisers anew, and lr-schedule={self.lr_schedule} with them; use constant"
+            )
 
     # Networks.
 
@@ -232,7 +249,33 @@ class BaseAgent(abc.ABC):
     def network_optimizers(self) -> Pair:
         """Optimisers for the actor, and for the critics with their representation."""
         chosen = partial(descent.adam, weight_decay=self.weight_decay, max_norm=self.max_gradient_norm, tune=self.tune)
-        return Pair(chosen(self.actor_lr), chosen(self.critic_lr))
+        actor_lr = self.scheduled(self.actor_lr, self.experience.policy_delay)
+        return Pair(chosen(actor_lr), chosen(self.scheduled(self.critic_lr)))
+
+    def scheduled(self, rate: Any, delay: int = 1) -> Any:
+        """Return a learning rate, or its schedule, for parameters that learn at every ``delay``-th update."""
+        if self.lr_schedule == "constant" and not self.lr_warmup:
+            return rate
+        updates = self.lr_warmup / delay, self.lr_updates / delay
+        return descent.schedule(rate, self.lr_schedule, self.lr_final, *updates)
+
+    def planned(self, steps: int) -> Self:
+        """Return the agent with its schedule spread over a run of so many steps of every environment.
+
+        Raises:
+            InputError: the run ends before the schedule's warm-up does.
+        """
+        if self.lr_schedule == "constant":
+            return self
+        updates = self.lr_updates or self.updates_in(steps)
+        if updates <= self.lr_warmup:
+            left = f"none of the run's {updates} updates to lr-schedule={self.lr_schedule}"
+            raise InputError(f"lr-warmup={self.lr_warmup} leaves {left}")
+        return dataclasses.replace(self, lr_updates=updates)
+
+    def updates_in(self, steps: int) -> int:
+        """Count the critics' updates in a run of so many steps of every environment."""
+        return self.experience.updates_in(steps)
 
     def init_common(self, spec: Spec, tasks: Task, key: Key) -> dict[str, Any]:
         """Initialise the fields that all agents' states have, by name, for the training ``tasks`` (T, ...)."""

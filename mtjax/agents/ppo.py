@@ -111,7 +111,7 @@ class PPO(BaseAgent):
 
     The policy is a tanh-squashed Gaussian; its entropy is estimated from one sample. With a ``kl_limit``, the actor is
     not updated for the rest of an update once mean(ratio - 1 - log ratio), an estimate of KL(pi_old | pi), exceeds it
-    on a minibatch.
+    on a minibatch. Then a schedule of the actor's learning rate waits too.
 
     A representation that learns (``representation``) is trained by L_V and its own losses on the same minibatches. Its
     target encoder is the encoder from before the update, as values are the critic's from before the update; so
@@ -180,6 +180,9 @@ class PPO(BaseAgent):
             raise InputError("scaling=popart is for critics of actions; use value-normalization=popart")
         if parts.name_of(SAMPLERS, self.sampler) == "temperature":
             raise InputError("sampler=temperature needs an agent with temperatures; use another sampler")
+
+    def updates_in(self, steps: int) -> int:
+        return super().updates_in(steps) * self.epochs * self.minibatches
 
     # Networks.
 

@@ -157,7 +157,8 @@ class SAC(BaseAgent):
 
     @property
     def optimizers(self) -> Optimizers:
-        return Optimizers(*self.network_optimizers, optax.adam(self.temperature_lr))
+        temperature_lr = self.scheduled(self.temperature_lr, self.experience.policy_delay)
+        return Optimizers(*self.network_optimizers, optax.adam(temperature_lr))
 
     # Acting.
 

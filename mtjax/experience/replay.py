@@ -101,6 +101,10 @@ class Replay:
         """Steps of every environment between two calls of ``learn``."""
         return self.update_every
 
+    def updates_in(self, steps: int) -> int:
+        """Count the updates in a run of so many steps of every environment."""
+        return self.updates_per_step * max(steps // self.steps - self.warmup_steps // self.steps, 0)
+
     def capacity(self, num_envs: int) -> int:
         """Return how many transitions each task's ring holds: the replay size, rounded down to whole iterations."""
         stored = self.steps * num_envs

@@ -17,6 +17,8 @@ class Rollouts:
     """Steps of every environment between two updates."""
 
     sharding: ClassVar[Any] = ()
+    policy_delay: ClassVar[int] = 1  # the actor learns in every update
+    reset_every: ClassVar[int] = 0  # networks are never reset
 
     def __post_init__(self):
         if self.unroll < 1:
@@ -26,6 +28,10 @@ class Rollouts:
     def steps(self) -> int:
         """Steps of every environment between two calls of ``learn``."""
         return self.unroll
+
+    def updates_in(self, steps: int) -> int:
+        """Count the calls of ``learn`` in a run of so many steps of every environment."""
+        return steps // self.unroll
 
     def check(self, env: Env, num_envs: int) -> None:
         """Accept every environment."""

@@ -31,7 +31,7 @@ def check(config: RunConfig) -> None:
     tune = config.learner.tune
     if tune != "all" and not config.start:
         raise InputError(f"--tune={tune} leaves the rest as a run left it; say which run: --from=RUN")
-    if config.start and getattr(config.learner.experience, "reset_every", 0):
+    if config.start and config.learner.experience.reset_every:
         raise InputError("--reset-every throws away what --from takes from a run; give one of them")
 
 
@@ -51,6 +51,8 @@ def launch(config: RunConfig, directory: Path, start: Policy | None, resume: boo
     if resume and "warp" in config.family.engine_name:
         origin += "\nMuJoCo Warp does not repeat bit for bit: the run goes on from its state, in other numbers"
     plan = config.plan
+    if resume and config.learner.lr_schedule != "constant" and not config.learner.lr_updates:
+        origin += f"\nlearning rates go on along the schedule of a run of {plan.steps:,} steps"
     seeds = f"seeds {plan.seed} to {plan.seed + plan.seeds - 1}"
     if hosts.is_first():
         print(f"{said}{config.agent} on {config.env}: {config.family.summary}, {seeds}\n{origin}", flush=True)

@@ -108,6 +108,7 @@ def train(
     tasks = env.tasks("train")
     agent.experience.check(env, settings.num_envs)
     settings = fit_chunk(settings, len(tasks.id), steps, agent.experience.steps)
+    agent = agent.planned(_played(settings, len(tasks.id), steps))  # type: ignore
     learner = SweptAgent(agent) if found else agent  # type: ignore
     console = log.Console(plan.steps, quiet or not hosts.is_first(), label)
     mesh = meshes.mesh_for(seeds * max(len(found), 1), len(tasks.id), settings.num_envs)
@@ -130,6 +131,12 @@ def fit_chunk(settings: Settings, num_tasks: int, steps: int, grain: int = 1) ->
     whole_run = math.ceil(steps / (num_tasks * settings.num_envs))
     chunk = math.ceil(min(settings.chunk_steps, whole_run) / grain) * grain
     return dataclasses.replace(settings, chunk_steps=chunk)
+
+
+def _played(settings: Settings, num_tasks: int, steps: int) -> int:
+    """Count the steps of every environment in a run, which are whole chunks."""
+    chunk = settings.chunk_steps
+    return math.ceil(steps / (num_tasks * settings.num_envs * chunk)) * chunk
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,6 +1,7 @@
-"""Optimisers and optimiser steps for actor and critics."""
+"""Optimisers and optimiser steps for actor and critics, and schedules of their learning rates."""
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +9,9 @@ import optax
 
 from mtjax.agents import parts
 from mtjax.networks import Params
-from mtjax.types import Array
+from mtjax.types import Array, InputError
+
+Shape = Literal["constant", "linear", "cosine"]
 
 
 def adam(rate: Any, weight_decay: Any, max_norm: Any, tune: str) -> optax.GradientTransformation:
@@ -19,6 +22,32 @@ def adam(rate: Any, weight_decay: Any, max_norm: Any, tune: str) -> optax.Gradie
     if tune == "all":
         return learn
     return optax.partition({True: learn, False: optax.set_to_zero()}, lambda params: _learning(tune, params))
+
+
+def schedule(rate: Any, shape: Shape, final: Any, warmup: float, updates: float) -> Callable[[Array], Array]:
+    """Return a learning rate as a function of the number n of updates so far.
+
+    With N updates in all, W of them for the warm-up, a final share f and p = (n - W) / (N - W), clipped to [0, 1]:
+        n < W       rate (n + 1) / W
+        constant    rate
+        linear      rate (1 - (1 - f) p)
+        cosine      rate (f + (1 - f) (1 + cos(pi p)) / 2)      (Loshchilov & Hutter 2017, "SGDR", without restarts)
+    """
+
+    def at(count: Array) -> Array:
+        rising = jnp.minimum((count + 1) / max(warmup, 1), 1)
+        if shape == "constant":
+            return rate * rising
+        if not updates:
+            raise InputError(
+                f"lr-schedule={shape} must know when the run ends: mtjax.train takes that from the run's steps; "
+                "elsewhere give lr-updates"
+            )
+        progress = jnp.clip((count - warmup) / max(updates - warmup, 1), 0, 1)
+        left = 1 - progress if shape == "linear" else (1 + jnp.cos(jnp.pi * progress)) / 2
+        return rate * rising * (final + (1 - final) * left)
+
+    return at
 
 
 def _learning(tune: str, params: Params) -> Any:
