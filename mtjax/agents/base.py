@@ -82,6 +82,8 @@ class BaseAgent(abc.ABC):
         "context_limit",
     )
     """Settings that fine-tuning may change: they say how an agent learns, not what its networks are."""
+    common_presets: ClassVar[bool] = True
+    """Whether the tables of presets that name no agent hold for it. They are tuned for learning from replay."""
     hidden: tuple[int, ...] = (256, 256)
     """Widths of the hidden layers in actor and critics."""
     actor_lr: float = 1e-3
