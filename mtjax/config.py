@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 import jax
 import tyro
 
-from mtjax.agents import SAC, BaseAgent, agent, preset_of, settings
+from mtjax.agents import BaseAgent, agent, preset_of, settings
 from mtjax.agents.base import kinds_of, replace
 from mtjax.agents.parts import name_of
 from mtjax.agents.parts.scaling import SCALINGS
@@ -89,7 +89,7 @@ class RunConfig:
     family: Annotated[Tabled, tyro.conf.arg(name="env")] = dataclasses.field(
         default_factory=lambda: make("finger-spin")
     )
-    learner: Annotated[BaseAgent, tyro.conf.arg(name="agent")] = dataclasses.field(default_factory=SAC)
+    learner: Annotated[BaseAgent, tyro.conf.arg(name="agent")] = dataclasses.field(default_factory=lambda: agent("sac"))
 
 
 def with_preset(
@@ -112,7 +112,7 @@ def with_preset(
     device = _device_preset() if preset_name == "auto" else preset_name
     preset, common = load_preset(env_name, device), load_preset("+", device)
     chosen = common.get(agent_name, {}) | preset.get(agent_name, {})
-    if issubclass(preset_of(agent_name).cls, SAC):  # for which the tables of all agents are tuned
+    if preset_of(agent_name).cls.common_presets:
         chosen = preset.get("training", {}) | preset.get("agent", {}) | chosen
     take = lambda cls: {name: chosen.pop(name) for name in list(chosen) if name in cls.__dataclass_fields__}
     planned, played = preset.get("plan", {}) | take(Plan), take(Settings)
@@ -144,7 +144,7 @@ def require_value_range(agent: Any) -> None:
     Raises:
         InputError: the agent has such critics.
     """
-    if isinstance(agent, SAC):
+    if "value" in kinds_of(agent):
         reason = agent.value.refuses(name_of(SCALINGS, agent.scaling))
         if reason:
             raise InputError(f"value={name_of(VALUES, agent.value)} {reason}")

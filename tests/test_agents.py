@@ -196,6 +196,17 @@ def test_what_the_networks_see_of_a_task(conditioning, vectors):
     np.testing.assert_allclose(agent.features(state, pick(TASKS, 1)), np.float32(expected))
 
 
+def test_the_context_limit_shows_a_task_beyond_the_range_as_its_end():
+    """Acting and learning; a limit of 0 is none."""
+    beyond = pick(TASKS, 1)._replace(context=jnp.array([1.7]))
+    drawn = random_batch(0, 3, 4, SPEC)._replace(context=jnp.full((3, 4, 1), -1.7))
+    for limit, expected in ((0.0, 1.7), (1.0, 1.0)):
+        agent = tiny("sac", conditioning="parameters", context_limit=limit)
+        state = jax.eval_shape(lambda agent=agent: agent.init(SPEC, TASKS, KEY))._replace(contexts=TASKS.context)
+        np.testing.assert_allclose(agent.features(state, beyond), [expected], rtol=1e-6)
+        np.testing.assert_allclose(agent.features_of_batch(state, drawn, TASKS), -expected, rtol=1e-6)
+
+
 def test_an_agent_that_is_told_nothing_acts_alike_in_all_tasks():
     """And one that is told does not."""
     obs = jnp.ones((3, 1, 3))

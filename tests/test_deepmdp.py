@@ -616,7 +616,7 @@ def test_ppo_learns_a_model_of_its_rollouts():
 @pytest.mark.parametrize(
     ("name", "settings", "message"),
     [
-        ("distral", {"representation": "deepmdp"}, "distilled policy cannot stand; use representation=plain"),
+        ("distral", {"representation": "deepmdp"}, "all tasks share; use representation=plain"),
         ("sac", {"representation": "deepmpd"}, "unknown representation 'deepmpd'; did you mean 'deepmdp'"),
         ("sac", {"latent_widths": (8,)}, "unknown setting of sac 'latent_widths'"),
         ("ppo", {"representation": "hip-bmdp", "encoder": "input-map"}, "input-map maps observations"),

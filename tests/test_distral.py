@@ -377,7 +377,7 @@ def test_a_distilled_policy_may_be_told_the_task(conditioning):
         ({"distral_alpha": 1.1}, r"distral-alpha must be in \[0, 1\], not 1.1"),
         ({"distral_alpha": float("nan")}, "distral-alpha must be"),
         ({"heads": "per-task"}, "a policy of its own: heads is disjoint, not per-task"),
-        ({"gradients": "pcgrad"}, "no conflicts for gradients=pcgrad to settle; use mean"),
+        ({"gradients": "pcgrad"}, "gradients=pcgrad has nothing to do; use gradients=mean"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(settings, message):

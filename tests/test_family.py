@@ -80,6 +80,18 @@ def test_a_single_task_holds_nothing_out():
     assert len(env.tasks("interpolation").id) == len(env.tasks("extrapolation").id) == 0
 
 
+def test_contexts_show_an_angle_as_a_point():
+    """Angles beyond the training range are close to it on the circle; other parameters are scaled as ever."""
+    env = envs.make("reacher-vary-goal", {"target-angle": "-2,0,2", "damping": "1,2"})
+    tasks = env.tasks()
+    angle = np.asarray(tasks.params["target-angle"])
+    damping, sine, cosine = (np.asarray(tasks.context[:, i]) for i in (2, 0, 1))
+    np.testing.assert_allclose(sine, np.sin(angle), atol=1e-6)
+    np.testing.assert_allclose(cosine, np.cos(angle), atol=1e-6)
+    assert sorted(set(damping.tolist())) == [-1.0, 1.0]
+    assert env.spec.context_size == 3
+
+
 def test_context_is_scaled_by_the_training_range(sizes):
     """Training tasks fill [-1, 1] evenly, midpoints lie between, and extrapolation lies outside."""
     np.testing.assert_allclose(sizes.tasks().context[:, 0], np.linspace(-1, 1, 10), atol=1e-6)

@@ -12,6 +12,7 @@ from probes import random_batch
 import mtjax
 from mtjax import rollout
 from mtjax.agents import AGENTS
+from mtjax.agents.base import replace
 from mtjax.agents.ppo import Taken
 from mtjax.envs.engines.base import World
 from mtjax.envs.engines.mjx import Mjx
@@ -59,8 +60,13 @@ def both(function, *arguments):
 
 
 def learned(name, num_seeds, tasks):
-    """The agent called ``name`` by its preset for GPUs, and states whose networks are not as they began."""
+    """The agent called ``name`` by its preset for GPUs, and states whose networks are not as they began.
+
+    An update is one gradient step: each further step of Adam magnifies rounding.
+    """
     agent = mtjax.preset("finger-spin-vary-size", name, "gpu").learner
+    if not hasattr(agent, "critic_target"):
+        agent = replace(agent, {"epochs": 1, "minibatches": 1})
     random = np.random.default_rng(0)
     shake = lambda x: x + np.float32(0.1 * random.normal(size=x.shape)) if x.dtype == np.float32 else x
     with on("cpu"):

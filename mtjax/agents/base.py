@@ -83,14 +83,17 @@ class BaseAgent(abc.ABC):
         "gamma",
         "vectors",
         "tune",
+        "context_limit",
     )
     """Settings that fine-tuning may change: they say how an agent learns, not what its networks are."""
+    common_presets: ClassVar[bool] = True
+    """Whether the tables of presets that name no agent hold for it. They are tuned for learning from replay."""
     hidden: tuple[int, ...] = (256, 256)
     """Widths of the hidden layers in actor and critics."""
     actor_hidden: tuple[int, ...] = ()
-    """Widths of the actor's hidden layers, where they are not those of ``hidden``."""
+    """Widths of the actor's hidden layers; without any they are those of hidden."""
     critic_hidden: tuple[int, ...] = ()
-    """Widths of the critics' hidden layers, where they are not those of ``hidden``. Critics profit most from size."""
+    """Widths of the critics' hidden layers; without any they are those of hidden."""
     actor_lr: float = 1e-3
     """Adam's learning rate for the actor."""
     critic_lr: float = 1e-3
@@ -122,6 +125,9 @@ class BaseAgent(abc.ABC):
     """Features of the task that the networks take as inputs: none, one-hot, embedding (learned), parameters (the task's
     context), vectors (rows of a file) or inferred (from the last steps, by a trajectory encoder). With one-hot,
     embedding and vectors, an unseen task uses those of the nearest training task."""
+    context_limit: float = 0.0
+    """Clip every parameter of the task to at most this size before networks see it, 0 for no limit. Training tasks lie
+    in [-1, 1], so that 1 shows a task beyond them as the end of the range."""
     embedding_size: int = 16
     """Size of learned task embeddings, and of inferred features."""
     unit_embedding: bool = False
@@ -169,7 +175,7 @@ class BaseAgent(abc.ABC):
         parts.require_positive(self, "actor_lr", "critic_lr")
         if not self.max_gradient_norm >= 0:
             raise InputError(f"max-gradient-norm must be at least 0 (0 does not clip), not {self.max_gradient_norm}")
-        parts.require_not_negative(self, "weight_decay", "lr_warmup", "lr_updates")
+        parts.require_not_negative(self, "weight_decay", "context_limit", "lr_warmup", "lr_updates")
         parts.require_layers(self, "hidden")
         parts.require_widths(self, "actor_hidden", "critic_hidden")
         parts.require_shares(self, "gamma", "lr_final")
@@ -361,13 +367,17 @@ class BaseAgent(abc.ABC):
 
     def features(self, state: Any, task: Task) -> Array:
         """Return the features (Z,) of one task that networks take as inputs."""
-        known = self.known_task(state, task)
-        return conditioning.features(self.conditioning, len(state.contexts), known, task.context, state.vectors)
+        known, context = self.known_task(state, task), self.limited(task.context)
+        return conditioning.features(self.conditioning, len(state.contexts), known, context, state.vectors)
+
+    def limited(self, context: Array) -> Array:
+        """Return contexts (..., C) as networks see them."""
+        return jnp.clip(context, -self.context_limit, self.context_limit) if self.context_limit else context
 
     def features_of_batch(self, state: Any, batch: Transition, tasks: Task) -> Array:
         """Return the features of a batch's tasks: (T, Z), or (T, B, Z) where each episode has its own."""
         if batch.context is not None and self.conditioning == "parameters":
-            return batch.context
+            return self.limited(batch.context)
         return jax.vmap(partial(self.features, state))(tasks)
 
     def of_task(self, state: Any, task: Task, *networks: Params) -> tuple[Params, ...]:

@@ -75,14 +75,14 @@ class Distral(SAC):
             raise InputError(f"distral gives every task a policy of its own: heads is disjoint, not {self.heads}")
         if self.representation.learns:
             raise InputError(
-                "distral would give every task a representation of its own, on all of which the distilled policy "
-                "cannot stand; use representation=plain"
+                "in distral every task would have a representation of its own, but the distilled policy needs one that "
+                "all tasks share; use representation=plain"
             )
         rule = parts.name_of(PARTS["gradients"], self.gradients)
         if rule != "mean":
             raise InputError(
-                f"distral's tasks share only what is distilled from them, which has no conflicts for gradients={rule} "
-                "to settle; use mean"
+                f"distral's tasks share the distilled policy alone, and its gradients do not conflict, so "
+                f"gradients={rule} has nothing to do; use gradients=mean"
             )
         super()._check_combination()
 

@@ -126,6 +126,7 @@ class PPO(BaseAgent):
         *BaseAgent.adjustable,
         *("gae_lambda", "epochs", "minibatches", "clip_range", "value_clip", "entropy_cost", "kl_limit", "value_rate"),
     )
+    common_presets: ClassVar[bool] = False
     actor_lr: float = 3e-4
     """Adam's learning rate for the actor."""
     critic_lr: float = 1e-3

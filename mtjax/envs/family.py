@@ -248,17 +248,21 @@ class Family(Flat, Tabled):
         return Table(Task(**leaves), rows, draws)
 
     def _context(self) -> np.ndarray:
-        """Return the contexts (R, C), which are scaled parameters. A single task has one constant number."""
+        """Return the contexts (R, C): scaled parameters, and for an angle its sine and cosine.
+
+        A single task has one constant number.
+        """
         if not self.ranges:
             return np.zeros((self.count, 1), np.float32)
-        _, low, high = zip(*self.ranges, strict=True)
-        columns = [self._column(*of_one) for of_one in self.ranges]
-        return variation.scale(np.stack(columns, axis=1), np.array(low), np.array(high)).astype(np.float32)
+        return np.concatenate([self._columns(*of_one) for of_one in self.ranges], axis=1).astype(np.float32)
 
-    def _column(self, name: str, low: float, high: float) -> np.ndarray:
-        """Return the values (R,) of a parameter that may be constant or unknown here."""
+    def _columns(self, name: str, low: float, high: float) -> np.ndarray:
+        """Return what contexts tell of a parameter that may be constant or unknown here: (R, 1), of an angle (R, 2)."""
         known = self.parameters[name].nominal if name in self.parameters else (low + high) / 2
-        return self.values.get(name, np.full(self.count, known))
+        values = self.values.get(name, np.full(self.count, known))
+        if name in self.parameters and self.parameters[name].direction:
+            return np.stack([np.sin(values), np.cos(values)], axis=1)
+        return variation.scale(values[:, None], np.array([low]), np.array([high]))
 
     @property
     def ranges(self) -> tuple[tuple[str, float, float], ...]:

@@ -19,6 +19,11 @@ class Parameter(NamedTuple):
     minimum: float = 0.0  # values must be greater than this
     maximum: float = math.inf  # and not greater than this
 
+    @property
+    def direction(self) -> bool:
+        """Whether it is an angle of a goal, which networks see as a point on the circle."""
+        return self.unit == "rad" and self.edit is None
+
 
 def _scale_geom(geom: mujoco.MjsGeom, scale: float) -> None:
     """Scale mass and inertia together, however the model gives them."""

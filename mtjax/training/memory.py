@@ -72,9 +72,9 @@ def _even_parts(numbers: Sequence[int], most: int) -> list[np.ndarray]:
 def describe(config: RunConfig, count: int, limit: float) -> str:
     """Return a line on a program's settings, its memory and its rounds."""
     settings, seeds = max(len(config.points), 1), config.plan.seeds
-    held = f"{settings} setting{'s' * (settings > 1)} of {seeds} seed{'s' * (seeds > 1)}, about"
     name = " ".join(config.sweep) or f"{config.agent} on {config.env}"
     return (
-        f"{name}: {held} {required_bytes(config) / 1e6:,.0f} MB each, "
-        f"{limit * _USABLE_SHARE / 1e6:,.0f} MB to use: {count} round{'s' * (count > 1)}"
+        f"{name}: {settings} setting{'s' * (settings > 1)} of {seeds} seed{'s' * (seeds > 1)}; "
+        f"each setting needs about {required_bytes(config) / 1e6:,.0f} MB of {limit * _USABLE_SHARE / 1e6:,.0f} MB, "
+        f"so all run in {count} round{'s' * (count > 1)}"
     )

@@ -38,7 +38,7 @@ class Experts(nn.Module):
 
 def mix(weights: Array, encodings: Array) -> Array:
     """Sum encodings (K, ..., D) by weights (..., K), or (K,) for every sample, to (..., D)."""
-    # XLA 0.11 fuses a softmax, its transpose and this sum into one Triton kernel that is wrong for every second task.
+    # Without a barrier XLA 0.11 makes a Triton kernel that is wrong for every second task: benchmarks/triton_fusion.py
     weights, encodings = jax.lax.optimization_barrier((weights, encodings))
     weights = jnp.moveaxis(weights, -1, 0)
     # Not a matrix product: for few terms, a sum that fuses with the operations before it is faster on a GPU.

@@ -1,15 +1,16 @@
-"""Measure how well and how fast PPO learns on one GPU: three seeds of every family in one program each.
+"""Measure which returns agents reach on families of dm_control within minutes of training on one GPU.
 
-    python benchmarks/ppo.py [--family=NAME] ... [--steps=N] [--seeds=3] [--out=FOLDER] [NAME=VALUE ...]
+    python benchmarks/returns.py [--family=NAME] ... [--agent=ppo] [--steps=N] [--seeds=3] [NAME=VALUE ...]
 
-Every family writes ``OUT/NAME.csv`` (one line of metrics per chunk and seed), ``NAME.npz`` (every episode of every
-evaluation) and ``NAME.json`` (the row of the table below). A family with a ``NAME.json`` is not run again, so the five
-can be run in parts, in any order. Further words replace settings of the preset, for the agent or the loop:
-``epochs=8 num_envs=512 hidden=[256,256]``.
+Every family is trained in one program with all seeds, and writes ``OUT/NAME.csv`` (one line of metrics per chunk and
+seed), ``NAME.npz`` (every episode of every evaluation) and ``NAME.json`` (the row of the table below). A family with a
+``NAME.json`` is not run again, so the families can be run in parts, in any order. Further words replace settings of the
+preset, for the agent or the loop: ``epochs=8 num_envs=512 hidden=[256,256]``.
 
 Steps are of each seed, summed over its ten tasks; steps a second are of all seeds, without compiling and evaluating.
 The return is the mean of the last evaluation under the mean action, over tasks and episodes; its interval is the 95%
-bootstrap interval over whole seeds, which of three seeds is from the worst to the best one.
+bootstrap interval over whole seeds, which of three seeds is from the worst to the best one. "Limited" is extrapolation
+by the same policies with ``context_limit=1``, which shows them a task beyond the range as the end of the range.
 """
 
 import argparse
@@ -17,25 +18,44 @@ import dataclasses
 import json
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from report import markdown
 
+from mtjax.agents.base import replace
 from mtjax.config import configure, with_preset
-from mtjax.evaluation import save_evaluations
+from mtjax.envs import Family
+from mtjax.evaluation import evaluate, save_evaluations
 from mtjax.training.log import append_rows
 from mtjax.training.programs import enable_compile_cache
 from mtjax.training.run import Result, train
-from mtjax.types import SPLITS, InputError
+from mtjax.types import SPLITS, Agent, InputError
 
-# Steps of each seed, in millions, and the return that is aimed at.
+_GEAR = {"gear": "0.8:1.2:10"}
+
+
+class Aim(NamedTuple):
+    """Holds a family's parameters, the steps of each seed and the return that is aimed at."""
+
+    vary: dict[str, str]
+    steps: int
+    least: float
+
+
 FAMILIES = {
-    "finger-spin-vary-size": (40, 700),
-    "cheetah-run-vary-torso-length": (60, 850),
-    "cartpole-swingup-vary-pole-mass": (40, 750),
-    "walker-walk-vary-friction": (30, 940),
-    "walker-run-vary-friction": (30, 700),
+    "finger-spin-vary-size": Aim({}, 100_000_000, 960),
+    "cheetah-run-vary-torso-length": Aim({}, 150_000_000, 890),
+    "cartpole-swingup-vary-pole-mass": Aim({}, 100_000_000, 850),
+    "walker-walk-vary-friction": Aim({}, 45_000_000, 970),
+    "walker-run-vary-friction": Aim({}, 75_000_000, 800),
+    "hopper-hop": Aim(_GEAR, 100_000_000, 250),
+    "acrobot-swingup": Aim(_GEAR, 100_000_000, 350),
+    "reacher-hard": Aim(_GEAR, 100_000_000, 960),
+    "finger-turn-hard": Aim(_GEAR, 100_000_000, 900),
+    "ball-in-cup-catch": Aim(_GEAR, 30_000_000, 970),
+    "pendulum-swingup": Aim(_GEAR, 60_000_000, 800),
 }
 _SHOWN = ("kl", "clip_fraction", "entropy", "explained_variance")
 
@@ -46,7 +66,7 @@ def main() -> None:
     parser.add_argument("--agent", default="ppo")
     parser.add_argument("--preset", default="gpu")
     parser.add_argument("--engine", default="auto", help="of the physics; auto is the family's own choice for a GPU")
-    parser.add_argument("--steps", type=float, help="of each seed; by default the family's")
+    parser.add_argument("--steps", type=lambda x: int(float(x)), help="of each seed; by default the family's")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--evaluations", type=int, default=4)
@@ -65,9 +85,11 @@ def main() -> None:
 def learn(arguments: argparse.Namespace, family: str) -> None:
     """Train on one family, and save the results."""
     given = dict(word.split("=", 1) for word in arguments.given)
-    config = with_preset(family, arguments.agent, arguments.preset, engine=arguments.engine)
+    aim = FAMILIES[family]
+    varied = {"vary": aim.vary} if aim.vary else {}
+    config = with_preset(family, arguments.agent, arguments.preset, engine=arguments.engine, **varied)
     agent, settings = configure(config.learner, config.training, {name: value(x) for name, x in given.items()})
-    steps = int(arguments.steps or FAMILIES[family][0] * 1e6)
+    steps = arguments.steps or aim.steps
     print(f"{family}: {steps:,} steps of {arguments.seeds} seeds\n{agent}\n{settings}", flush=True)
     file, last = arguments.out / f"{family}.csv", [0.0]
 
@@ -94,10 +116,22 @@ def learn(arguments: argparse.Namespace, family: str) -> None:
     file.unlink(missing_ok=True)
     append_rows(file, result.rows)
     save_evaluations(file.with_suffix(".npz"), result.evaluations)
-    found = row(family, result, arguments.seeds) | {"wall_seconds": round(time.monotonic() - began, 1)}
+    wall = round(time.monotonic() - began, 1)
+    found = row(family, result, arguments.seeds) | {"limited": limited(config.family, agent, result, arguments)}
+    found |= {"aim": aim.least, "wall_seconds": wall}
     record = {**found, "agent": str(agent), "settings": dataclasses.asdict(settings)}
     file.with_suffix(".json").write_text(json.dumps(record, indent=2) + "\n")
     print({**found}, flush=True)
+
+
+def limited(family: Family, agent: Agent, result: Result, arguments: argparse.Namespace) -> float | None:
+    """Return the mean return of extrapolation with ``context_limit=1``."""
+    tasks, seeds = family.tasks("extrapolation"), arguments.seed + jnp.arange(arguments.seeds)
+    if not len(tasks.id):
+        return None
+    agent = replace(agent, {"context_limit": 1.0})
+    scores = evaluate(family, agent, arguments.eval_episodes, result.state.agent, tasks, seeds, jnp.int32(0))
+    return round(float(scores.returns.mean()), 1)
 
 
 def value(word: str) -> Any:
@@ -140,7 +174,7 @@ def interval(scores: np.ndarray) -> tuple[float, float]:
 def tabulate(out: Path) -> None:
     """Print and save a table of all finished families."""
     head = ["family", "steps of a seed", "training s", "steps/s, all seeds", "train", "interpolation", "extrapolation"]
-    head += ["worst task", "aim"]
+    head += ["limited", "worst task", "aim"]
     found = [json.loads(path.read_text()) for path in sorted(out.glob("*.json"))]
     show = lambda x: "-" if x is None else f"{x:.0f}"
     lines = [
@@ -151,8 +185,9 @@ def tabulate(out: Path) -> None:
             f"{x['steps_per_second']:,}",
             f"{x['train']:.0f} [{x['low']:.0f}, {x['high']:.0f}]",
             *(show(x[split]) for split in SPLITS[1:]),
+            show(x["limited"]),
             show(x["worst_task"]),
-            show(FAMILIES.get(x["family"], (0, None))[1]),
+            show(x["aim"]),
         ]
         for x in found
     ]

@@ -1,0 +1,117 @@
+"""Compare the speed of training and of compiling of two checkouts, run in turn on one machine.
+
+    python benchmarks/side_by_side.py OTHER [--agents sac-conditioned care] [--seeds 1 10] [--repeats 3]
+        [--ours=--no-stagger] [--cold] -- --env=finger-spin-vary-size --preset=cpu --steps=128000 ...
+
+OTHER is the root of another checkout, say of an older commit. What follows ``--`` goes to ``mtjax.train`` of both;
+``--ours`` goes to this checkout alone, for flags that the older one lacks. Each run is a process of its own with the
+same Python. Milliseconds are of one iteration: the median over chunks, without the first one and those of the warm-up,
+then the least over repeats, as whatever else a machine does only adds to them. ``--cold`` gives every run an empty
+cache, so that seconds of compiling are those of a first run; otherwise each checkout keeps a cache of its own.
+"""
+
+import argparse
+import csv
+import os
+import re
+import statistics
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+from report import markdown, publish
+
+HERE = Path(__file__).resolve().parent.parent
+
+
+class Timing(NamedTuple):
+    """Holds the figures of one run."""
+
+    milliseconds: float  # of an iteration
+    compile_seconds: float
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("other", type=Path)
+    parser.add_argument("--agents", nargs="+", default=["sac-conditioned", "care"])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 10])
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--ours", nargs="*", default=[], help="flags for this checkout alone")
+    parser.add_argument("--cold", action="store_true", help="begin each run with an empty cache")
+    parser.add_argument("--json", help="write the figures to this file")
+    words = [*sys.argv[1:], "--"]
+    own, flags = words[: words.index("--")], words[words.index("--") + 1 : -1]
+    arguments = parser.parse_args(own)
+    arguments.flags = flags
+    if not (arguments.other / "mtjax" / "train.py").exists():
+        parser.error(f"{str(arguments.other)!r} is no checkout of mtjax")
+    rows = [row for agent in arguments.agents for seeds in arguments.seeds for row in compare(arguments, agent, seeds)]
+    head = ["agent", "seeds", "checkout", "ms an iteration", "all repeats", "compile s", "all repeats"]
+    shown = [
+        [
+            row["agent"],
+            str(row["seeds"]),
+            row["setting"],
+            f"{row['milliseconds']:.3f}",
+            ", ".join(f"{x:.3f}" for x in row["all_milliseconds"]),
+            f"{row['compile_seconds']:.1f}",
+            ", ".join(f"{x:.1f}" for x in row["all_compile_seconds"]),
+        ]
+        for row in rows
+    ]
+    print(markdown(head, shown))
+    publish(arguments, rows)
+
+
+def compare(arguments: argparse.Namespace, agent: str, seeds: int) -> list[dict]:
+    """Run both checkouts in turn, and return a row for each."""
+    flags = [f"--agent={agent}", f"--seeds={seeds}", *arguments.flags]
+    checkouts = {"other": (arguments.other.resolve(), flags), "this": (HERE, flags + arguments.ours)}
+    found: dict[str, list[Timing]] = {name: [] for name in checkouts}
+    with tempfile.TemporaryDirectory() as place:
+        for repeat in range(arguments.repeats):
+            for name, (root, given) in checkouts.items():
+                cache = Path(place) / f"{name}-{repeat if arguments.cold else 0}"
+                found[name].append(run(root, given, Path(place) / f"{name}-runs-{repeat}", cache))
+                print(agent, seeds, name, found[name][-1], flush=True)
+    return [row(agent, seeds, name, timings) for name, timings in found.items()]
+
+
+def row(agent: str, seeds: int, name: str, timings: list[Timing]) -> dict:
+    """Return the row of one checkout."""
+    milliseconds, compiled = zip(*timings, strict=True)
+    best = {"milliseconds": min(milliseconds), "compile_seconds": min(compiled)}
+    every = {"all_milliseconds": list(milliseconds), "all_compile_seconds": list(compiled)}
+    return {"agent": agent, "seeds": seeds, "setting": name, **best, **every}
+
+
+def run(root: Path, flags: list[str], runs: Path, cache: Path) -> Timing:
+    """Train once with the code of ``root``."""
+    search = os.pathsep.join([str(root), *filter(None, [os.environ.get("PYTHONPATH")])])
+    command = [sys.executable, "-m", "mtjax.train", f"--runs={runs}", *flags]
+    environment = {**os.environ, "PYTHONPATH": search, "MTJAX_CACHE": str(cache)}
+    done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True)
+    if done.returncode:
+        raise SystemExit(f"{' '.join(command)} failed in {root}:\n{done.stderr[-2000:]}")
+    told = re.search(r"compiled in ([\d.]+) s", done.stdout)
+    (file,) = runs.glob("*/metrics.csv")
+    return Timing(milliseconds(file), float(told[1]) if told else float("nan"))
+
+
+def milliseconds(file: Path) -> float:
+    """Return the median time of an iteration over the chunks in which the agent learned."""
+    with file.open() as lines:
+        rows = [row for row in csv.DictReader(lines) if row["seed"] == "0"]
+    learned = [i for i in range(1, len(rows)) if float(rows[i - 1]["critic_loss"] or 0)]
+    if not learned:
+        raise SystemExit("no chunk came after the warm-up; train for more steps or with shorter chunks")
+    elapsed = lambda i: float(rows[i]["seconds"]) - float(rows[i - 1]["seconds"])
+    count = lambda i: int(rows[i]["iteration"]) - int(rows[i - 1]["iteration"])
+    return 1000 * statistics.median(elapsed(i) / count(i) for i in learned)
+
+
+if __name__ == "__main__":
+    main()
