@@ -169,10 +169,11 @@ def test_devices_that_share_a_seed_learn_what_one_does(wide_alone, tmp_path, cro
     assert_same(result, wide_alone)
 
 
-def test_two_seeds_on_two_devices_each(tmp_path, use, crowd):
+@pytest.mark.parametrize("given", [{}, {"n_step": 3, "update_every": 2, "policy_delay": 3}], ids=["plain", "options"])
+def test_two_seeds_on_two_devices_each(tmp_path, use, crowd, given):
     """With parts that watch all outcomes, hindsight, and episodes that draw their tasks."""
     agent = tiny("sac-conditioned", hidden=(8,), scaling="reward", sampler="progress", actor_lr=1e-5)
-    settings = WIDE | {"hindsight": 0.5}
+    settings = WIDE | {"hindsight": 0.5} | given
     share = lambda name: play(tmp_path / name, Goals(drawn=True), 2, agent, settings, seeds=2)
     result = share("four")
     assert parts_of(result.state.worlds.obs) == ({(1, 4, 2, 1)}, 4)
