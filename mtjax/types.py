@@ -54,7 +54,6 @@ class Transition(NamedTuple):
     ended: Any = None  # () bool: the episode ended, terminated or by its time limit
     context: Array | None = None  # (C,) of the episode's task, if episodes draw their tasks
     extras: Any = None  # data that the agent stores when it acts
-    last: Any = None  # where several steps are joined to one, what the agent needs of the last of them
 
 
 class Sometimes(NamedTuple):

@@ -43,7 +43,7 @@ def test_a_window_is_the_transition_worked_by_hand(discounts, ended, reward, dis
     joined = multistep.join(window([8, 4, 2], discounts, ended), 0.5)
     np.testing.assert_allclose((joined.reward, joined.discount), (reward, discount), rtol=1e-6)
     np.testing.assert_array_equal((joined.obs[0], joined.action[0], joined.next_obs[0]), (0, 0, 10 + final))
-    assert joined.ended == ended[final] and joined.last is None
+    assert joined.ended == ended[final] and joined.extras is None
 
 
 def test_what_follows_an_end_does_not_count_even_if_it_is_no_number():

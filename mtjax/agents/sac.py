@@ -19,6 +19,7 @@ from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.trajectory import append
 from mtjax.agents.parts.values import VALUES, Value
 from mtjax.experience import Replay
+from mtjax.experience.multistep import Ends
 from mtjax.maps import when
 from mtjax.networks import OVER_TASKS, Params, tanh_normal
 from mtjax.types import Acted, Array, InputError, Key, Metrics, Sometimes, Spec, Task, Transition
@@ -294,10 +295,8 @@ class SAC(BaseAgent):
     def prepare(self, state: SACState, batch: Transition, tasks: Task) -> tuple[SACState, Batch]:
         """Fit the normalisers to transitions (T, B, ...), and return the batch (T, ...) for the losses."""
         state = state._replace(moments=self.fit_moments(state.moments, batch.obs))
-        past, next_past = batch.extras, None
-        if past is not None:
-            last = batch if batch.last is None else batch.last
-            next_past = append(last.extras, last.obs, last.action, last.reward)
+        past, last = batch.extras if isinstance(batch.extras, Ends) else (batch.extras, batch)
+        next_past = None if past is None else append(last.extras, last.obs, last.action, last.reward)
         action_size = action_sizes(batch.action, tasks.action_mask)
         bonus = jnp.exp(state.log_temperature) * abs(self.target_entropy) * action_size / 2
         gamma = self.discounts(tasks)

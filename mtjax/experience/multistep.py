@@ -11,17 +11,26 @@ As there, nothing corrects for actions of an older policy. Of a soft value's bon
 window counts.
 """
 
+from typing import Any, NamedTuple
+
 import jax
 import jax.numpy as jnp
 
 from mtjax.types import Array, Transition
 
 
+class Ends(NamedTuple):
+    """Holds the data that the agent stored with the first action of joined steps, and the whole last step."""
+
+    first: Any
+    last: Transition
+
+
 def join(steps: Transition, gamma: float | Array) -> Transition:
     """Join windows of consecutive steps (..., n) to one transition (...) each, for a discount () of one task.
 
     Its reward is R. Its discount is gamma^(m-1) d, as agents multiply it by gamma once more. Where agents store data
-    with their actions, ``last`` is the window's last step, which that data continues.
+    with their actions, ``extras`` are ``Ends``.
     """
     goes_on = jnp.cumprod(~steps.ended, axis=-1)
     counts = jnp.concatenate([jnp.ones_like(goes_on[..., :1]), goes_on[..., :-1]], axis=-1)  # the first m steps
@@ -39,5 +48,5 @@ def join(steps: Transition, gamma: float | Array) -> Transition:
         discount=powers[final.squeeze(-1)] * last.discount,
         next_obs=last.next_obs,
         ended=last.ended,
-        last=None if steps.extras is None else last._replace(next_obs=None, discount=None, ended=None, context=None),
+        extras=None if steps.extras is None else Ends(first.extras, last),
     )
