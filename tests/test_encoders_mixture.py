@@ -267,6 +267,7 @@ REFUSED = [
     ({"encoder": "film"}, "conditioning cannot be none"),
     ({"encoder": "moore"}, "conditioning cannot be none"),
     ({"encoder": "moe", "mode": "sofft"}, "attention"),
+    ({"encoder": "care", "variant": "mtrl", "unit_attention": True, "conditioning": "parameters"}, "no inner products"),
     ({"encoder": "moe", "num_experts": 0}, "at least one expert"),
     ({"encoder": "moe", "expert_widths": ()}, "at least one expert"),
     ({"encoder": "moore", "num_experts": 0}, "at least one expert"),

@@ -205,8 +205,8 @@ OBS = jnp.float32(np.random.default_rng(0).normal(size=(4, 3)))
 FEATURES = jnp.float32([0.3, -0.7])
 
 
-def mixture(variant):
-    module = Mixture(3, (6, 4), variant, 2.0, (7,), layer_norm=False)
+def mixture(variant, unit_attention=False):
+    module = Mixture(3, (6, 4), variant, 2.0, unit_attention, (7,), layer_norm=False)
     params = jax.eval_shape(module.init, jax.random.key(0), OBS, FEATURES)
     random = np.random.default_rng(1)
     return module, jax.tree.map(lambda x: jnp.float32(random.normal(size=x.shape)), params)
@@ -232,6 +232,24 @@ def test_attention_teaches_the_context_encoder_in_mtrl_alone(variant):
     slope = size_of_slope(attention, params)
     moved = {part for part, size in slope.items() if size > 0}
     assert moved == ({"experts"} if variant == "paper" else {"context", "context_out", "gate", "gate_out"})
+
+
+@pytest.mark.parametrize("unit_attention", [False, True])
+def test_attention_compares_each_encoding_with_the_context(unit_attention):
+    """By inner products, or by cosines, which bound the scores by 1 / temperature."""
+    module, params = mixture("paper", unit_attention)
+    _, seen = module.apply(params, OBS, FEATURES, mutable="intermediates")
+    p = jax.tree.map(np.float64, params["params"])
+    relu = lambda x: np.maximum(x, 0)
+    context = relu(FEATURES @ p["context"]["Dense_0"]["kernel"] + p["context"]["Dense_0"]["bias"])
+    context = context @ p["context_out"]["kernel"] + p["context_out"]["bias"]
+    experts, scores = p["experts"], []
+    for k in range(3):
+        code = relu(OBS @ experts["kernel_0"][k] + experts["bias_0"][k]) @ experts["kernel_1"][k] + experts["bias_1"][k]
+        size = np.linalg.norm(code, axis=-1) * np.linalg.norm(context, axis=-1) if unit_attention else 1
+        scores.append(np.sum(code * context, axis=-1) / size / 2.0)
+    weights = np.exp(scores - np.max(scores, axis=0))
+    np.testing.assert_allclose(seen["intermediates"]["attention"][0], weights / weights.sum(axis=0), rtol=1e-4)
 
 
 @pytest.mark.parametrize("variant", ["paper", "mtrl"])

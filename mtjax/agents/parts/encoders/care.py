@@ -11,7 +11,12 @@ from mtjax.agents import parts
 from mtjax.agents.parts.encoders.base import Identity
 from mtjax.agents.parts.encoders.mixture import Experts, check_experts
 from mtjax.networks import MLP, join
-from mtjax.types import Array
+from mtjax.types import Array, InputError
+
+
+def unit(x: Array) -> Array:
+    """Scale vectors (..., D) to length 1."""
+    return x * jax.lax.rsqrt(jnp.sum(jnp.square(x), axis=-1, keepdims=True) + 1e-6)
 
 
 class Mixture(nn.Module):
@@ -21,6 +26,7 @@ class Mixture(nn.Module):
     expert_widths: tuple[int, ...]
     variant: str
     temperature: float
+    unit_attention: bool
     hidden: tuple[int, ...]
     layer_norm: bool
 
@@ -30,7 +36,9 @@ class Mixture(nn.Module):
         context = nn.Dense(size, name="context_out")(MLP(self.expert_widths[:-1], name="context")(features))  # (..., D)
         encodings = Experts(self.num_experts, self.expert_widths, name="experts")(obs)  # (K, ..., D)
         if self.variant == "paper":
-            scores = jnp.sum(encodings * jax.lax.stop_gradient(context), axis=-1) / self.temperature  # (K, ...)
+            scale = unit if self.unit_attention else lambda x: x
+            products = scale(encodings) * scale(jax.lax.stop_gradient(context))
+            scores = jnp.sum(products, axis=-1) / self.temperature  # (K, ...)
         else:
             gate = nn.Dense(self.num_experts, name="gate_out")(MLP((size, size), name="gate")(context))
             gate = jnp.broadcast_to(gate, (*obs.shape[:-1], self.num_experts))  # the same in every state of a task
@@ -71,13 +79,20 @@ class CARE(Identity):
     variant: Literal["paper", "mtrl"] = "paper"
     """Use the attention of the paper, or the gate of the authors' code."""
     attention_temperature: float = 0.0
-    """Divisor of the paper's inner products: 0 for the square root of the encoding's size, 1 as in the paper."""
+    """Divisor of the inner products: 1 as in the paper; 0 for the square root of the encoding's size, or with
+    ``unit_attention`` for 0.2."""
+    unit_attention: bool = False
+    """Scale encodings and context to length 1 before the paper's inner products, so that scores stay bounded."""
 
     def __post_init__(self):
         super().__post_init__()
         parts.require_not_negative(self, "attention_temperature")
         check_experts(self.num_experts, self.expert_widths)
+        if self.unit_attention and self.variant == "mtrl":
+            raise InputError("unit-attention is of the paper's attention; variant=mtrl computes no inner products")
 
     def body(self, hidden: tuple[int, ...], layer_norm: bool) -> nn.Module:
-        temperature = self.attention_temperature or self.expert_widths[-1] ** 0.5
-        return Mixture(self.num_experts, self.expert_widths, self.variant, temperature, hidden, layer_norm)
+        default = 0.2 if self.unit_attention else self.expert_widths[-1] ** 0.5
+        temperature = self.attention_temperature or default
+        shape = (self.num_experts, self.expert_widths, self.variant)
+        return Mixture(*shape, temperature, self.unit_attention, hidden, layer_norm)
