@@ -123,10 +123,10 @@ def _run(env, agent, seeds, knobs=None, chunks=2):
 
 
 _NAMES = ("actor_lr", "critic_lr", "temperature_lr", "gamma", "tau", "initial_temperature", "target_entropy")
-_NAMES = (*_NAMES, "weight_decay", "max_gradient_norm", "return_range", "lr_final")
+_NAMES = (*_NAMES, "weight_decay", "max_gradient_norm", "return_range", "lr_final", "context_limit")
 POINTS = (
-    dict(zip(_NAMES, (1e-3, 2e-3, 1e-3, 0.9, 0.01, 0.1, -0.5, 0.0, 0.0, 10.0, 1.0), strict=True)),
-    dict(zip(_NAMES, (1e-2, 1e-3, 3e-3, 0.5, 0.1, 1.0, 0.5, 0.1, 0.1, 5.0, 0.2), strict=True)),
+    dict(zip(_NAMES, (1e-3, 2e-3, 1e-3, 0.9, 0.01, 0.1, -0.5, 0.0, 0.0, 10.0, 1.0, 0.0), strict=True)),
+    dict(zip(_NAMES, (1e-2, 1e-3, 3e-3, 0.5, 0.1, 1.0, 0.5, 0.1, 0.1, 5.0, 0.2, 0.5), strict=True)),
 )
 
 

@@ -372,7 +372,10 @@ class BaseAgent(abc.ABC):
 
     def limited(self, context: Array) -> Array:
         """Return contexts (..., C) as networks see them."""
-        return jnp.clip(context, -self.context_limit, self.context_limit) if self.context_limit else context
+        if parts.is_zero(self.context_limit):
+            return context
+        limit = jnp.where(self.context_limit > 0, self.context_limit, jnp.inf)  # traced, it may be 0 after all
+        return jnp.clip(context, -limit, limit)
 
     def features_of_batch(self, state: Any, batch: Transition, tasks: Task) -> Array:
         """Return the features of a batch's tasks: (T, Z), or (T, B, Z) where each episode has its own."""
