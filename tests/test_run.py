@@ -25,6 +25,7 @@ from mtjax.evaluation import load_evaluations
 from mtjax.loop import Settings
 from mtjax.training import checkpoint
 from mtjax.training.folder import new_directory
+from mtjax.training import traced
 from mtjax.training.programs import enable_compile_cache
 from mtjax.training.run import fit_chunk, stop_signals, train
 from mtjax.types import InputError
@@ -387,6 +388,8 @@ def test_compile_cache_follows_the_environment(monkeypatch, place, folder):
     """MTJAX_CACHE names the folder, and 0 keeps none."""
     updates = {}
     monkeypatch.setattr(jax.config, "update", updates.__setitem__)
+    monkeypatch.setattr(traced, "_folder", [])
     monkeypatch.setenv("MTJAX_CACHE", place)
     enable_compile_cache()
     assert updates.get("jax_compilation_cache_dir") == folder
+    assert traced._folder == ([Path(folder) / "traced"] if folder else [])
