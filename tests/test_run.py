@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import json
 import os
+import pathlib
 import shlex
 import shutil
 import signal
@@ -23,9 +24,8 @@ from mtjax import cli, loop
 from mtjax.config import Plan, from_json
 from mtjax.evaluation import load_evaluations
 from mtjax.loop import Settings
-from mtjax.training import checkpoint
+from mtjax.training import checkpoint, traced
 from mtjax.training.folder import new_directory
-from mtjax.training import traced
 from mtjax.training.programs import enable_compile_cache
 from mtjax.training.run import fit_chunk, stop_signals, train
 from mtjax.types import InputError
@@ -392,4 +392,4 @@ def test_compile_cache_follows_the_environment(monkeypatch, place, folder):
     monkeypatch.setenv("MTJAX_CACHE", place)
     enable_compile_cache()
     assert updates.get("jax_compilation_cache_dir") == folder
-    assert traced._folder == ([Path(folder) / "traced"] if folder else [])
+    assert traced._folder == ([pathlib.Path(folder, "traced")] if folder else [])
