@@ -7,6 +7,7 @@ import os
 import pickle
 import subprocess
 import sys
+import types
 from pathlib import Path
 from typing import NamedTuple
 
@@ -57,6 +58,9 @@ class Settings:
     file: str = ""
 
 
+INSIDE = types.SimpleNamespace(targets=dict)  # an environment that makes no calls out of XLA
+
+
 @pytest.fixture
 def times():
     """A program of three static arguments with a key in its state. Its attribute counts how often it was traced."""
@@ -95,11 +99,11 @@ def arguments():
     return Point(jnp.arange(3.0), jax.random.key(3)), {"by": np.float32(0.3)}
 
 
-def run(program, setting=None, given=None, donated=()):
+def run(program, setting=None, given=None, donated=(), env=INSIDE):
     """Trace by the cache as a new process would, and call."""
     jax.clear_caches()
     given = given or arguments()
-    return traced.trace(program, donated, ((), "agent", setting or Settings()), given).lower().compile()(*given)
+    return traced.trace(env, program, donated, ((), "agent", setting or Settings()), given).lower().compile()(*given)
 
 
 def same(one, other):

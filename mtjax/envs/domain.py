@@ -192,6 +192,11 @@ class Domain(Family):
             return Warp(self._base(self.warp_iterations), self.num_substeps)
         return self.mjx
 
+    @property
+    def outside(self) -> Warp | None:
+        """Return the engine if it is MuJoCo Warp, which runs outside XLA."""
+        return self.simulator if isinstance(self.simulator, Warp) else None
+
     @cached_property
     def mjx(self) -> Mjx:
         """Return the MJX engine of this family."""

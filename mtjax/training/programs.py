@@ -9,11 +9,12 @@ from typing import Any, NamedTuple
 import jax
 from jax.sharding import Mesh, NamedSharding
 
+from mtjax.envs.family import Tabled
 from mtjax.evaluation import evaluate
 from mtjax.loop import TrainState, init, run_chunk
 from mtjax.parallel.mesh import BY_SEED, BY_WORLD, REPLICATED
 from mtjax.training import traced
-from mtjax.types import Agent, Env
+from mtjax.types import Agent
 
 
 class Jitted(NamedTuple):
@@ -66,12 +67,18 @@ def _split(mesh: Mesh, program: Callable, inputs: tuple, outputs: Any, donated: 
 _DONATED = {init: (), run_chunk: (1,), evaluate: ()}  # the functions that are kept, and what they donate
 
 
-def trace(function: Any, env: Env, agent: Any, setting: Any, *arguments: Any) -> jax.stages.Traced:
+def trace(function: Any, env: Any, agent: Any, setting: Any, *arguments: Any) -> jax.stages.Traced:
     """Trace a jitted function of three static arguments, or read it from the cache if it was traced before."""
     static = (env, agent, setting)
-    if function not in _DONATED:  # it is split over devices
+    if function not in _DONATED or not isinstance(env, Tabled):  # the first if it is split over devices
         return function.trace(*static, *arguments)
-    return traced.trace(function, _DONATED[function], static, arguments)
+    return traced.trace(env, function, _DONATED[function], static, arguments)
+
+
+def load_kernels(env: Any) -> None:
+    """Compile or load what an environment runs outside XLA. XLA may compile meanwhile."""
+    if isinstance(env, Tabled):
+        env.load_kernels()
 
 
 def sharded_shapes(mesh: Mesh | None, agent: Agent, shapes: TrainState) -> TrainState:

@@ -51,6 +51,7 @@ class _Kept(NamedTuple):
 
     exported: export.Exported
     result: Any
+    targets: dict[str, Any]  # its calls out of XLA, by name: the arguments of the environment's ``provide``
 
 
 def use_folder(folder: Path | None) -> None:
@@ -58,17 +59,21 @@ def use_folder(folder: Path | None) -> None:
     _folder[:] = [] if folder is None else [folder]
 
 
-def trace(program: Any, donated: tuple[int, ...], static: tuple, arguments: tuple) -> jax.stages.Traced:
+def trace(env: Any, program: Any, donated: tuple[int, ...], static: tuple, arguments: tuple) -> jax.stages.Traced:
     """Trace a jitted program, or read it from the cache if it was traced before.
 
     Args:
+        env: the environment, which makes calls out of XLA in this process (``Tabled.provide``).
         donated: which of ``arguments`` the program donates.
         static: its static arguments, which come first.
         arguments: arrays or shapes.
     """
     try:
         file = _file_of(program, static, arguments)
-        kept = _read(file) or _export(file, program, static, arguments)
+        kept = _read(file) or _export(file, env, program, static, arguments)
+        for name, about in kept.targets.items():
+            if env.provide(*about) != name:
+                raise Unkept(f"this process has another {name}")
     except (Unkept, OSError):
         return program.trace(*static, *arguments)
 
@@ -163,15 +168,18 @@ def _require_older(path: Path) -> None:
 # Files.
 
 
-def _export(file: Path, program: Any, static: tuple, arguments: tuple) -> _Kept:
+def _export(file: Path, env: Any, program: Any, static: tuple, arguments: tuple) -> _Kept:
     """Trace a program and write it to a file."""
     traced = program.trace(*static, *arguments)
     leaves, tree = jax.tree.flatten(arguments)
     result = jax.tree.structure(traced.out_info)
     flat = jax.jit(lambda *leaves: jax.tree.leaves(program(*static, *jax.tree.unflatten(tree, leaves))))
+    targets = env.targets()
+    checks = [export.DisabledSafetyCheck.custom_call(name) for name in targets]
     try:
-        exported = export.export(flat)(*leaves).serialize()
-        header = {"result": _encode(jax.tree.unflatten(result, range(result.num_leaves)))}
+        exported = export.export(flat, disabled_checks=checks)(*leaves).serialize()
+        containers = _encode(jax.tree.unflatten(result, range(result.num_leaves)))
+        header = {"result": containers, "targets": targets}
     except (Unkept, ValueError, NotImplementedError, ImportError) as error:
         exported, header = b"", {"unkept": str(error).split("\n")[0]}  # known from now on
     content = json.dumps(header).encode() + b"\n" + exported
@@ -202,7 +210,7 @@ def _parse(content: bytes) -> _Kept:
     header = json.loads(line)
     if "unkept" in header:
         raise Unkept(header["unkept"])
-    return _Kept(export.deserialize(bytearray(exported)), _decode(header["result"]))
+    return _Kept(export.deserialize(bytearray(exported)), _decode(header["result"]), header["targets"])
 
 
 def _write(file: Path, content: bytes) -> None:
