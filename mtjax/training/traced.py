@@ -130,11 +130,12 @@ def _surroundings() -> Any:
 def _code() -> Any:
     """Return the hash of this package's files, and the names and versions of installed packages."""
     places = (_PACKAGE, *_installed_places())
+    known = tuple(f"{place}{os.sep}" for place in places)
     for module in list(sys.modules.values()):
         file = getattr(module, "__dict__", {}).get("__file__")
         if file is None and module is not sys.modules["__main__"]:
             continue  # part of Python itself
-        if not any(place in Path(file or "").parents for place in places):
+        if not str(file).startswith(known):
             raise Unkept(f"{file or 'an interactive session'} may change anything")
     return _versions(places)
 
