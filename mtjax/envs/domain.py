@@ -193,9 +193,9 @@ class Domain(Family):
         return self.mjx
 
     @property
-    def outside(self) -> Warp | None:
-        """Return the engine if it is MuJoCo Warp, which runs outside XLA."""
-        return self.simulator if isinstance(self.simulator, Warp) else None
+    def outside(self) -> Warp | MujocoC | None:
+        """Return the engine if it runs outside XLA, as all but MJX do."""
+        return self.simulator if isinstance(self.simulator, Warp | MujocoC) else None
 
     @cached_property
     def mjx(self) -> Mjx:
