@@ -8,6 +8,7 @@ import pickle
 import subprocess
 import sys
 import types
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -38,7 +39,7 @@ runpy.run_module(module, run_name="__main__", alter_sys=True)
 print(json.dumps(count))
 """
 SMALL = (
-    "--env=control-cartpole --agent=sac-conditioned --steps=600 --eval-every=300 --eval-episodes=1 --num-envs=2 "
+    "--agent=sac-conditioned --steps=600 --eval-every=300 --eval-episodes=1 --num-envs=2 "
     "--batch-size=4 --replay-size=200 --warmup-steps=5 --chunk-steps=30 --agent.hidden 8 8"
 ).split()
 
@@ -177,6 +178,27 @@ def test_what_cannot_be_kept_is_traced_as_ever(folder):
         assert same(run(program, given=given), jnp.arange(1.0, 4.0))
 
 
+def test_a_program_with_calls_out_of_xla_runs_where_they_have_the_same_names(folder):
+    """Elsewhere it is traced anew."""
+    family = lambda: mtjax.make("pendulum-swingup", engine="c")
+    env, other, count = family(), family(), []
+
+    @partial(jax.jit, static_argnums=(0, 1, 2))
+    def program(env, agent, setting, tasks, states, actions):
+        count.append(1)
+        return jax.vmap(env.step)(tasks, states, actions).obs
+
+    states = jax.vmap(env.reset)(env.tasks(), jax.random.split(jax.random.key(0), 1)).state
+    given = env.tasks(), states, jnp.ones((1, 1))
+    kept = lambda: traced.trace(env, program, (), (env, "agent", None), given).lower().compile()(*given)
+    first = kept()
+    jax.clear_caches()
+    assert list(env.targets().values()) == [[0, "advance"]] and same(first, kept()) and len(count) == 1
+    jax.clear_caches()
+    found = traced.trace(other, program, (), (other, "agent", None), given).lower().compile()(*given)
+    assert same(first, found) and len(count) == 2
+
+
 def test_objects_that_may_hold_anything_are_in_no_key(folder, times):
     """Then nothing is kept."""
     run(times, dataclasses.replace(Settings(), file=len))  # type: ignore
@@ -257,11 +279,12 @@ def results(directory):
 
 
 @pytest.mark.slow
-def test_a_second_run_traces_nothing(tmp_path):
-    """Training and evaluation; and what they write is what a run without the cache writes."""
+@pytest.mark.parametrize("env", ["control-cartpole", "finger-spin-vary-size"])
+def test_a_second_run_traces_nothing(tmp_path, env):
+    """Training and evaluation, in JAX and by MuJoCo C; and what they write is what a run without the cache writes."""
     runs = [tmp_path / name for name in ("without", "first", "second")]
     caches = ("0", tmp_path / "cache", tmp_path / "cache")
-    train = lambda place, cache: command(["mtjax.train", *SMALL, f"--runs={place}"], cache)
+    train = lambda place, cache: command(["mtjax.train", f"--env={env}", *SMALL, f"--runs={place}"], cache)
     counts = [train(place, cache) for place, cache in zip(runs, caches, strict=True)]
     assert counts[0] > 0 and counts[1] > 0 and counts[2] == 0
     written = [results(next(place.iterdir())) for place in runs]

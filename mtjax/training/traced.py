@@ -9,7 +9,8 @@ Programs are traced as ever where this hash could miss something or where a prog
 
 - the process has imported a file that is neither of this package nor installed, such as a user's own family;
 - the package's files or the installed packages changed after the process began;
-- a program calls back into Python, as the engine "c" does;
+- a program holds an address of this process, as those of ``jax.pure_callback`` do. Engines outside XLA are called by
+  names instead (``Tabled.targets``);
 - several devices share the program.
 
 A file holds StableHLO, and in JSON the containers of the program's result. Python runs nothing of it. A checksum tells

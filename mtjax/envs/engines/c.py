@@ -100,7 +100,7 @@ class MujocoC:
             if id(model) not in rows:
                 saved = np.empty(mujoco.mj_sizeModel(model), np.uint8)
                 mujoco.mj_saveModel(model, None, saved)
-                content.update(saved)
+                content.update(saved.tobytes())
             content.update(repr(rows.setdefault(id(model), len(rows))).encode())
         return content.hexdigest()[:16]
 
