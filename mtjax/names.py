@@ -2,10 +2,13 @@
 
 import difflib
 import sys
+import time
 from collections.abc import Callable, Iterable, Mapping
 from importlib import import_module
 from typing import Any
 
+BEGAN = time.time()
+"""When this process began to import the package, in seconds since 1970."""
 _MANY = 20
 
 

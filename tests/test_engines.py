@@ -5,7 +5,7 @@ and half another, so that a step which takes its model from the wrong row is off
 """
 
 import importlib.util
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import jax
@@ -18,6 +18,7 @@ from probes import quick
 from mtjax import envs
 from mtjax.envs.domain import Domain
 from mtjax.envs.engines import base as physics
+from mtjax.envs.engines import host
 from mtjax.envs.engines.base import World
 from mtjax.envs.engines.c import MujocoC
 from mtjax.envs.engines.mjx import Mjx
@@ -187,6 +188,23 @@ def test_every_domain_is_tested():
     """A MuJoCo domain that has a name has a line here."""
     ours = [cls for cls, _ in envs.ENVS.values() if issubclass(cls, Domain) and cls.__module__.startswith("mtjax.")]
     assert {envs.ENVS[name][0].model_file for name in DOMAINS} >= {cls.model_file for cls in ours}
+
+
+def test_host_functions_are_called_by_name():
+    """With any number of mapped axes, even an empty one. What they raise is raised."""
+    doubled = lambda given, result: np.copyto(result, 2 * given[..., :2])
+    host.register("doubled", doubled)
+    call = partial(host.call, "doubled", 2)
+    for function, shape in ((call, (3,)), (jax.vmap(jax.vmap(call)), (4, 5, 3)), (jax.vmap(call), (0, 3))):
+        x = np.random.RandomState(0).normal(size=shape).astype(np.float32)
+        np.testing.assert_array_equal(jax.jit(function)(x), 2 * x[..., :2])
+
+    def refuse(given, result):
+        raise ValueError("no such world")
+
+    host.register("refuse", refuse)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="ValueError: no such world"):
+        jax.block_until_ready(jax.jit(partial(host.call, "refuse", 2))(np.zeros(3, np.float32)))
 
 
 def test_c_results_do_not_depend_on_what_the_batch_did_before():

@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import json
 import os
+import pathlib
 import shlex
 import shutil
 import signal
@@ -23,7 +24,7 @@ from mtjax import cli, loop
 from mtjax.config import Plan, from_json
 from mtjax.evaluation import load_evaluations
 from mtjax.loop import Settings
-from mtjax.training import checkpoint
+from mtjax.training import checkpoint, traced
 from mtjax.training.folder import new_directory
 from mtjax.training.programs import enable_compile_cache
 from mtjax.training.run import fit_chunk, stop_signals, train
@@ -387,6 +388,8 @@ def test_compile_cache_follows_the_environment(monkeypatch, place, folder):
     """MTJAX_CACHE names the folder, and 0 keeps none."""
     updates = {}
     monkeypatch.setattr(jax.config, "update", updates.__setitem__)
+    monkeypatch.setattr(traced, "_folder", [])
     monkeypatch.setenv("MTJAX_CACHE", place)
     enable_compile_cache()
     assert updates.get("jax_compilation_cache_dir") == folder
+    assert traced._folder == ([pathlib.Path(folder, "traced")] if folder else [])

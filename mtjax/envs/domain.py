@@ -192,6 +192,11 @@ class Domain(Family):
             return Warp(self._base(self.warp_iterations), self.num_substeps)
         return self.mjx
 
+    @property
+    def outside(self) -> Warp | MujocoC | None:
+        """Return the engine if it runs outside XLA, as all but MJX do."""
+        return self.simulator if isinstance(self.simulator, Warp | MujocoC) else None
+
     @cached_property
     def mjx(self) -> Mjx:
         """Return the MJX engine of this family."""

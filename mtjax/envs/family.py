@@ -10,7 +10,6 @@ from functools import cached_property
 from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import tyro
 
@@ -113,13 +112,32 @@ class Tabled(abc.ABC):
     @abc.abstractmethod
     def where_worlds(self, mask: Array, new: Any, old: Any) -> Any: ...
 
+    def targets(self) -> dict[str, Any]:
+        """Return what ``provide`` needs for every call out of XLA in programs of this environment, by its name there.
+
+        Only physics that another library computes makes such calls.
+        """
+        engines = [part.family.outside for part in self.parts]
+        found = [(i, each) for i, engine in enumerate(engines) if engine for each in engine.targets().items()]
+        return {name: [i, *about] for i, (name, about) in found}
+
+    def provide(self, part: int, *about: Any) -> str:
+        """Make a call out of XLA for a program that was traced in another process, and return its name."""
+        return self.parts[part].family.outside.provide(*about)
+
+    def load_kernels(self) -> None:
+        """Compile or load what runs outside XLA."""
+        for part in self.parts:
+            if part.family.outside:
+                part.family.outside.load_kernels()
+
     def tasks(self, split: str = "train") -> Task:
         """Return the tasks of a split: "train", "interpolation", "extrapolation", or "all" in this order."""
         table = self.table
         splits = {**table.rows, "all": np.concatenate(list(table.rows.values()))}
         if split not in splits:
             raise InputError(f"unknown split {split!r}; choose from {', '.join(splits)}")
-        take = lambda rows: jax.tree.map(lambda x: jnp.asarray(x[rows]), table.tasks)
+        take = lambda rows: jax.device_put(jax.tree.map(lambda x: x[rows], table.tasks))  # jnp.asarray would compile
         tasks = take(splits[split])
         return tasks if table.draws is None else tasks._replace(draws=take(table.draws[splits[split]]))
 
@@ -339,6 +357,11 @@ class Family(Flat, Tabled):
     def engine_name(self) -> str:
         """Return what steps its worlds: "jax" or the name of a physics engine."""
         return "jax"
+
+    @property
+    def outside(self) -> Any:
+        """Return the engine if it runs outside XLA, else None."""
+        return None
 
     @property
     def episode_length(self) -> int:

@@ -15,7 +15,7 @@ from mtjax.report import diagnostics, figures, render
 from mtjax.report.tables import task_table
 from mtjax.training.log import append_rows, number
 from mtjax.training.policy import Policy, load, load_experience
-from mtjax.training.programs import enable_compile_cache
+from mtjax.training.programs import compile_lowered, enable_compile_cache, trace
 from mtjax.types import SPLITS, InputError
 
 _FIRST_NUMBER = 1_000_000  # beyond the numbers of a run's own evaluations, so that the episodes are new
@@ -62,8 +62,9 @@ def _first_seed(run: str, point: int) -> int:
 
 def score(policy: Policy, episodes: int, seed: int = 0) -> dict[str, np.ndarray]:
     """Return the returns (S, T, episodes) of each split, in episodes that no training run has seen."""
-    env, config = policy.env, jnp.int32(_FIRST_NUMBER + seed)
-    scores = evaluate(env, policy.agent, episodes, policy.states, env.tasks("all"), policy.seeds, config)
+    env = policy.env
+    arguments = policy.states, env.tasks("all"), policy.seeds, jnp.int32(_FIRST_NUMBER + seed)
+    scores = compile_lowered(trace(evaluate, env, policy.agent, episodes, *arguments).lower())(*arguments)
     returns = np.asarray(scores.returns)
     return {split: returns[:, np.asarray(env.tasks(split).id)] for split in SPLITS}
 

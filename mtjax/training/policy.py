@@ -14,6 +14,7 @@ from mtjax.envs.family import Tabled
 from mtjax.experience import Replay
 from mtjax.experience.ring import Ring
 from mtjax.training import checkpoint, points
+from mtjax.training.programs import trace
 from mtjax.types import Array, InputError, Key, Task, Transition
 
 
@@ -100,4 +101,4 @@ def state_shapes(config: RunConfig) -> loop.TrainState:
     """Return the shapes of a run's training state."""
     env, agent = config.family, points.SweptAgent(config.learner) if config.points else config.learner
     axis = points.seed_axis(config.points, config.plan.seed + jnp.arange(config.plan.seeds))
-    return jax.eval_shape(lambda: loop.init(env, agent, config.training, env.tasks("train"), *axis))  # type: ignore
+    return trace(loop.init, env, agent, config.training, env.tasks("train"), *axis).out_info  # type: ignore

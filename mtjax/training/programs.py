@@ -1,4 +1,4 @@
-"""The jitted programs of a run: split over devices, compiled, and cached between runs."""
+"""The jitted programs of a run: split over devices, traced, compiled, and cached between runs."""
 
 import os
 from collections.abc import Callable
@@ -9,9 +9,11 @@ from typing import Any, NamedTuple
 import jax
 from jax.sharding import Mesh, NamedSharding
 
+from mtjax.envs.family import Tabled
 from mtjax.evaluation import evaluate
 from mtjax.loop import TrainState, init, run_chunk
 from mtjax.parallel.mesh import BY_SEED, BY_WORLD, REPLICATED
+from mtjax.training import traced
 from mtjax.types import Agent
 
 
@@ -62,6 +64,23 @@ def _split(mesh: Mesh, program: Callable, inputs: tuple, outputs: Any, donated: 
     )
 
 
+_DONATED = {init: (), run_chunk: (1,), evaluate: ()}  # the functions that are kept, and what they donate
+
+
+def trace(function: Any, env: Any, agent: Any, setting: Any, *arguments: Any) -> jax.stages.Traced:
+    """Trace a jitted function of three static arguments, or read it from the cache if it was traced before."""
+    static = (env, agent, setting)
+    if function not in _DONATED or not isinstance(env, Tabled):  # the first if it is split over devices
+        return function.trace(*static, *arguments)
+    return traced.trace(env, function, _DONATED[function], static, arguments)
+
+
+def load_kernels(env: Any) -> None:
+    """Compile or load what an environment runs outside XLA. XLA may compile meanwhile."""
+    if isinstance(env, Tabled):
+        env.load_kernels()
+
+
 def sharded_shapes(mesh: Mesh | None, agent: Agent, shapes: TrainState) -> TrainState:
     """Return the shapes of a training state with the devices of every leaf."""
     if mesh is None:
@@ -86,9 +105,11 @@ def compile_lowered(program: Any, once: bool = False) -> Any:
 
 
 def enable_compile_cache() -> None:
-    """Cache compiled programs in ~/.cache/mtjax or $MTJAX_CACHE. MTJAX_CACHE=0 turns this off."""
+    """Cache traced and compiled programs in ~/.cache/mtjax/xla or $MTJAX_CACHE. MTJAX_CACHE=0 turns this off."""
     place = os.environ.get("MTJAX_CACHE", "~/.cache/mtjax/xla")
     if place == "0":
         return
-    jax.config.update("jax_compilation_cache_dir", str(Path(place).expanduser()))
+    folder = Path(place).expanduser()
+    traced.use_folder(folder / "traced")
+    jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)

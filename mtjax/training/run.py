@@ -24,7 +24,7 @@ from mtjax.parallel import mesh as meshes
 from mtjax.training import checkpoint, finetune, log, points
 from mtjax.training.points import Point, Sweep, SweptAgent
 from mtjax.training.policy import Policy
-from mtjax.training.programs import Programs, compile_lowered, jit_programs, sharded_shapes
+from mtjax.training.programs import Programs, compile_lowered, jit_programs, load_kernels, sharded_shapes, trace
 from mtjax.types import SPLITS, Agent, Env, InputError
 
 
@@ -193,17 +193,19 @@ class _Run:
         """Compile all programs in parallel, and make or restore the state. Evaluation may be ready later."""
         env, agent, settings, lazy = self.env, self.agent, self.settings, jit_programs(self.mesh, self.agent)
         tasks, everything = (meshes.replicate(self.mesh, env.tasks(split)) for split in ("train", "all"))
-        (seeds, knobs), pool = meshes.shard_by_seed(self.mesh, self.seed_axis), ThreadPoolExecutor(2)
-        fresh = lazy.init.lower(env, agent, settings, tasks, seeds, knobs)
+        (seeds, knobs), pool = meshes.shard_by_seed(self.mesh, self.seed_axis), ThreadPoolExecutor(3)
+        fresh = trace(lazy.init, env, agent, settings, tasks, seeds, knobs)
         shapes = sharded_shapes(self.mesh, agent, fresh.out_info)
         self._describe(shapes)
-        make = None if resume else pool.submit(compile_lowered, fresh, once=True)
-        chunk = lazy.chunk.lower(env, agent, settings, tasks, shapes)
-        lower = partial(lazy.evaluate.lower, env, agent, self.plan.eval_episodes, shapes.agent, everything, seeds)
-        score = pool.submit(lambda: compile_lowered(lower(np.int32(0))))
+        kernels = pool.submit(load_kernels, env)
+        make = None if resume else pool.submit(lambda: compile_lowered(fresh.lower(), once=True))
+        chunk = trace(lazy.chunk, env, agent, settings, tasks, shapes)
+        played = partial(trace, lazy.evaluate, env, agent, self.plan.eval_episodes, shapes.agent, everything, seeds)
+        score = pool.submit(lambda: compile_lowered(played(np.int32(0)).lower()))
         pool.shutdown(wait=False)
         evaluate = lambda agents, number: score.result()(agents, everything, seeds, np.int32(number))
-        programs = Programs(partial(compile_lowered(chunk), tasks), evaluate)
+        programs = Programs(partial(compile_lowered(chunk.lower()), tasks), evaluate)
+        kernels.result()  # else the first chunk waits for them
         return programs, self._restore(shapes) if make is None else make.result()(tasks, seeds, knobs)
 
     def _describe(self, shapes: TrainState) -> None:

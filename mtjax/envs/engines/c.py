@@ -2,24 +2,26 @@
 
 import copy
 import dataclasses
+import hashlib
 import threading
+import weakref
 from collections.abc import Callable, Sequence
 from functools import cached_property, partial
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from mujoco import batch
 
+from mtjax.envs.engines import host
 from mtjax.envs.engines.base import World, require_plain, some
 from mtjax.types import Array, Task
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MujocoC:
-    """MuJoCo's C engine for CPUs: a pure function through a callback, threaded over worlds.
+    """MuJoCo's C engine for CPUs: a pure function on the host that programs call by name, threaded over worlds.
 
     The host flattens every mapped axis into one batch with one model per world, picked by ``task.row``. A batch keeps
     its computed data, and continues from there if it receives the very state that it returned last.
@@ -29,6 +31,7 @@ class MujocoC:
     num_substeps: int
     _batches: dict[int, tuple[Any, np.ndarray]] = dataclasses.field(default_factory=dict)
     _lock: Any = dataclasses.field(default_factory=threading.Lock)
+    _names: dict[str, str] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
         require_plain(self.models[0])
@@ -46,7 +49,7 @@ class MujocoC:
         zeros = jnp.zeros_like(qvel)
         if not self.models[0].nsensor:
             return World(qpos, qvel, zeros, None, extra)
-        sensors = self._call(_solve, self.models[0].nsensordata, task, qpos, qvel, zeros)
+        sensors = self._call("solve", self.models[0].nsensordata, task, qpos, qvel, zeros)
         return World(qpos, qvel, zeros, sensors, extra)
 
     place = forward
@@ -55,31 +58,66 @@ class MujocoC:
         """Advance one control step under ``ctrl`` (nu,)."""
         model = self.models[0]
         size = model.nq + 2 * model.nv
-        act = partial(_advance, self.num_substeps, size)
-        new = self._call(act, size + model.nsensordata, task, world.qpos, world.qvel, world.warmstart, ctrl)
+        new = self._call("advance", size + model.nsensordata, task, world.qpos, world.qvel, world.warmstart, ctrl)
         qpos, qvel, warmstart, sensors = jnp.split(new, (model.nq, model.nq + model.nv, size))
         return World(qpos, qvel, warmstart, some(sensors), world.extra)
 
     def touching(self, task: Task, qpos: Array) -> Array:
         """Return whether any two colliding geoms overlap in the positions ``qpos`` (nq,)."""
         zeros = jnp.zeros(self.models[0].nv, qpos.dtype)
-        return self._call(_count_contacts, 1, task, qpos, zeros, zeros)[0] > 0
+        return self._call("count", 1, task, qpos, zeros, zeros)[0] > 0
 
-    def _call(self, act: Callable, width: int, task: Task, *state: Array) -> Array:
+    # Calls of programs.
+
+    def targets(self) -> dict[str, list[str]]:
+        """Return the arguments of ``provide`` for every call until now, by the call's name in programs."""
+        return {name: [act] for act, name in list(self._names.items())}
+
+    def provide(self, act: str) -> str:
+        """Give the host's function for ``act`` a name in programs, and return it. It is the same in every process."""
+        with self._lock:
+            if act not in self._names:
+                name = f"mujoco_{act}_{self._digest}"
+                self._names[act] = name = f"{name}_{sum(other.startswith(name) for other in host.names())}"
+                host.register(name, partial(_run, weakref.ref(self), act))
+        return self._names[act]
+
+    def load_kernels(self) -> None:
+        """Do nothing, as MuJoCo is compiled."""
+
+    @cached_property
+    def _acts(self) -> dict[str, Callable]:
+        model = self.models[0]
+        advance = partial(_advance, self.num_substeps, model.nq + 2 * model.nv)
+        return {"solve": _solve, "advance": advance, "count": _count_contacts}
+
+    @cached_property
+    def _digest(self) -> str:
+        """Return a short hash of the models and the number of substeps."""
+        content = hashlib.sha256(repr(self.num_substeps).encode())
+        rows: dict[int, int] = {}  # many tasks may share a model
+        for model in self.models:
+            if id(model) not in rows:
+                saved = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+                mujoco.mj_saveModel(model, None, saved)
+                content.update(saved.tobytes())
+            content.update(repr(rows.setdefault(id(model), len(rows))).encode())
+        return content.hexdigest()[:16]
+
+    def _call(self, act: str, width: int, task: Task, *state: Array) -> Array:
         """Call the host with one array and return one array (width,). Each further array costs as much as a world."""
         if len(state) == 3:
             state = (*state, jnp.zeros(self.models[0].nu))
         packed = jnp.concatenate([jnp.float32(task.row)[None], *(jnp.float32(x) for x in state)])
-        result = jax.ShapeDtypeStruct((width,), jnp.float32)
-        return jax.pure_callback(partial(self._host, act), result, packed, vmap_method="broadcast_all")
+        return host.call(self.provide(act), width, packed)
 
-    def _host(self, act: Callable, packed: Array) -> np.ndarray:
-        rows = np.asarray(packed).reshape(-1, packed.shape[-1])
+    def run(self, act: str, packed: np.ndarray, result: np.ndarray) -> None:
+        """Fill in the result of ``act`` on worlds (..., K). Programs call this on the host."""
+        rows = packed.reshape(-1, packed.shape[-1])
         with self._lock:  # a batch serves one call at a time, and MuJoCo lets other threads run while it steps
             worlds = self._batch(rows[:, 0].astype(np.int32))
             _state(worlds, rows.shape[1] - 1)[:] = rows[:, 1:]
-            result = act(worlds)
-        return result.reshape(*packed.shape[:-1], -1)
+            result[:] = self._acts[act](worlds).reshape(result.shape)
 
     def _batch(self, rows: np.ndarray) -> Any:
         """Return the batch for these worlds. Its models are set only when they change."""
@@ -90,6 +128,11 @@ class MujocoC:
             worlds.set_models([self._models[i] for i in rows])
             self._batches[len(rows)] = worlds, rows
         return worlds
+
+
+def _run(engine: Any, act: str, packed: np.ndarray, result: np.ndarray) -> None:
+    """Call an engine by a weak reference, because names are kept for good but its memory must be freed."""
+    engine().run(act, packed, result)
 
 
 def _state(worlds: Any, size: int) -> np.ndarray:

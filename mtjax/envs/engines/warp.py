@@ -1,10 +1,13 @@
 """MuJoCo Warp: MuJoCo on NVIDIA GPUs, with its own kernels that XLA calls. On a CPU it runs slowly."""
 
 import dataclasses
+import hashlib
 import importlib
 import inspect
+import itertools
+import threading
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property, partial
 from operator import attrgetter
 from typing import Any, NamedTuple
@@ -12,6 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 
 from mtjax.envs.engines.base import World, mjx_module, some
 from mtjax.envs.engines.mjx import Mjx
@@ -21,6 +25,7 @@ from mtjax.types import Array, InputError, Task
 _UNREAD = ("dof_M0",)
 _DOUBLED = 8  # pairs that may touch in two points where MJX-JAX finds one, at the same time in one world
 _STATE = ("qpos", "qvel", "qacc_warmstart")  # what a step begins with, beside controls, and what it ends with
+_ALONE = threading.Lock()  # Warp's choice of a device holds for all threads
 
 
 class _Flat(NamedTuple):
@@ -31,6 +36,14 @@ class _Flat(NamedTuple):
     qvel: Array
     warmstart: Array
     ctrl: Array
+
+
+class _Call(NamedTuple):
+    """A call of Warp in JAX's programs."""
+
+    name: str  # XLA's name of it
+    function: Callable
+    leaves: list[jax.ShapeDtypeStruct]  # the shapes of the differing leaves in Warp
 
 
 class _Place(NamedTuple):
@@ -134,7 +147,7 @@ class Warp:
     # What Warp runs.
 
     @cached_property
-    def _calls(self) -> dict[Any, Callable]:
+    def _calls(self) -> dict[Any, _Call]:
         return {}
 
     @cached_property
@@ -147,16 +160,41 @@ class Warp:
 
     def _call(self, flat: _Flat) -> tuple[Array, ...]:
         """Take all substeps of worlds (W, ...); return positions, velocities, warm starts and sensors."""
-        count, names, devices = len(flat.qpos), tuple(flat.leaves), _own_devices()
-        for device in devices:  # not while it runs, when Warp records and cannot make room
-            if (device.alias, count) not in self._places:
-                self._places[device.alias, count] = self._make_place(device, count)
-        model, _ = self._places[devices[0].alias, count]
-        if (count, names) not in self._calls:
-            self._calls[count, names] = self._make_call(model, count, names)
-        leaves = [_as_warp(flat.leaves[name], attrgetter(name)(model)) for name in names]
-        found = self._calls[count, names](flat.qpos, flat.qvel, flat.warmstart, flat.ctrl, *leaves)
+        count, names = len(flat.qpos), tuple(flat.leaves)
+        self.provide(count, names)
+        call = self._calls[count, names]
+        leaves = [leaf.reshape(like.shape) for leaf, like in zip(flat.leaves.values(), call.leaves, strict=True)]
+        found = call.function(flat.qpos, flat.qvel, flat.warmstart, flat.ctrl, *leaves)
         return tuple(found) if self.base.nsensordata else (*found, jnp.zeros((count, 0)))
+
+    def targets(self) -> dict[str, Any]:
+        """Return the arguments of ``provide`` for every call until now, by the call's name in programs."""
+        return {call.name: [count, list(names)] for (count, names), call in list(self._calls.items())}
+
+    def provide(self, count: int, names: Sequence[str]) -> str:
+        """Make the call that steps a number of worlds with these differing leaves; return its name in programs.
+
+        A program that was traced in another process can then run in this one.
+        """
+        key, devices = (count, tuple(names)), _own_devices()
+        with _ALONE:
+            for device in devices:  # not while it runs, when Warp records and cannot make room
+                if (device.alias, count) not in self._places:
+                    self._places[device.alias, count] = self._make_place(device, count)
+            if key not in self._calls:
+                self._calls[key] = self._make_call(self._places[devices[0].alias, count].model, *key)
+        return self._calls[key].name
+
+    def load_kernels(self) -> None:
+        """Compile or load all kernels of a step, before programs run that would wait for them."""
+        import warp
+        from mujoco.mjx.third_party import mujoco_warp
+
+        counts = sorted(count for _, count in list(self._places))[:1]
+        for count, device in itertools.product(counts, _own_devices()):
+            with _ALONE, warp.ScopedDevice(device):
+                mujoco_warp.step(*self._places[device.alias, count])
+                warp.synchronize_device(device)
 
     def _make_place(self, device: Any, count: int) -> _Place:
         """Allocate Warp's memory for a number of worlds, with room for every possible contact."""
@@ -192,8 +230,8 @@ class Warp:
         doubled = min(slots, _DOUBLED)
         return slots + doubled, like.efc_J.shape[0] + 4 * doubled
 
-    def _make_call(self, model: Any, count: int, names: tuple[str, ...]) -> Callable:
-        """Return a JAX function that steps a number of worlds in Warp."""
+    def _make_call(self, model: Any, count: int, names: tuple[str, ...]) -> _Call:
+        """Return the JAX function that steps a number of worlds in Warp."""
         import warp
 
         outputs = {**dict.fromkeys(_STATE[:1], self.base.nq), **dict.fromkeys(_STATE[1:], self.base.nv)}
@@ -204,12 +242,30 @@ class Warp:
         kinds |= {f"new_{name}": warp.array(dtype=float, ndim=2) for name in outputs}
         on_gpu = jax.default_backend() != "cpu"
         mode = warp.JaxCallableGraphMode.WARP if on_gpu else warp.JaxCallableGraphMode.NONE
-        return warp.jax_callable(
-            _annotated(_stepper(weakref.ref(self), count, names, tuple(outputs)), kinds),
+        step = _stepper(weakref.ref(self), count, names, tuple(outputs))
+        step.__qualname__ = f"step_{self._digest(count, names)}"  # the call's name is made of it
+        target = warp.jax_callable(
+            _annotated(step, kinds),
             num_outputs=len(outputs),
             graph_mode=mode,
             output_dims={f"new_{name}": (count, size) for name, size in outputs.items()},
         )
+        leaves = [_as_warp(count, attrgetter(name)(model)) for name in names]
+        sizes = (self.base.nq, self.base.nv, self.base.nv, self.base.nu)
+        given = [jax.ShapeDtypeStruct((count, size), jnp.float32) for size in sizes]
+
+        def function(*arrays: Array) -> Any:
+            target.call_id = 0  # Warp's number of a trace, part of the program: each trace makes the same call
+            return target(*arrays)
+
+        jax.eval_shape(function, *given, *leaves)  # so that Warp knows the call if no program is traced
+        return _Call(target.name, function, leaves)
+
+    def _digest(self, count: int, names: tuple[str, ...]) -> str:
+        """Return a short hash of all that decides a step, so that calls have the same names in every process."""
+        model = np.empty(mujoco.mj_sizeModel(self.base), np.uint8)
+        mujoco.mj_saveModel(self.base, None, model)
+        return hashlib.sha256(model.tobytes() + repr((self.num_substeps, count, names)).encode()).hexdigest()[:16]
 
 
 def _own_devices() -> list[Any]:
@@ -254,9 +310,10 @@ def _annotated(function: Callable, kinds: dict[str, Any]) -> Callable:
     return function
 
 
-def _as_warp(leaf: Array, field: Any) -> Array:
-    """Return a model field of every world (W, ...) in Warp's shape."""
-    return leaf.reshape(len(leaf), *field.shape[1:], *getattr(field.dtype, "_shape_", ()))
+def _as_warp(count: int, field: Any) -> jax.ShapeDtypeStruct:
+    """Return the shape of a model field of all worlds, which holds Warp's vectors and matrices as further axes."""
+    shape = (count, *field.shape[1:], *getattr(field.dtype, "_shape_", ()))
+    return jax.ShapeDtypeStruct(shape, jnp.float32)
 
 
 def _plain(name: str) -> str:
