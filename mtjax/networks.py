@@ -46,6 +46,29 @@ class ReLU(nn.Module):
         return nn.relu(x)
 
 
+def to_unit(x: Array, axis: int = -1) -> Array:
+    """Scale vectors along an axis to length 1; the gradient is finite at zero too."""
+    return x * jax.lax.rsqrt(jnp.sum(jnp.square(x), axis=axis, keepdims=True) + 1e-30)
+
+
+def init_direction(key: Key, shape: tuple[int, int]) -> Array:
+    """Draw weights (inputs, outputs) with a vector of length 1 and of random direction for each output."""
+    return to_unit(nn.initializers.lecun_normal()(key, shape), axis=-2)
+
+
+class UnitDense(nn.Module):
+    """Applies a linear layer without bias, in which the weights of each output are a vector of length 1.
+
+    Optimisers keep that length of every leaf called ``direction`` (``descent.on_sphere``).
+    """
+
+    width: int
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        return x @ self.param("direction", init_direction, (x.shape[-1], self.width))
+
+
 class MLP(nn.Module):
     """Applies dense layers with ReLU, and optionally layer normalisation before it."""
 
@@ -87,6 +110,7 @@ class Network:
     unit_embedding: bool = False  # scale those vectors to length 1
     front: nn.Module | None = None  # maps observations before the body; every task's own
     trajectory: nn.Module | None = None  # maps observation and past, a ``Seen``, to features
+    unit_head: bool = False  # keep the head's weights of each output at length 1
 
     def init(self, key: Key, num_tasks: int, out: int, features: Array, *inputs: Array) -> Params:
         """Initialise parameters for ``num_tasks`` tasks, ``out`` outputs, and inputs of the given shapes."""
@@ -106,7 +130,7 @@ class Network:
         data = (inputs[0], features, *inputs[1:])
         width = jax.eval_shape(lambda: self.body.init_with_output(body_key, *data)[0]).shape[-1]
         parts["body"] = (self.body.init, body_key, *data)
-        parts["head"] = (lambda key: _init_linear(key, width, out), head_key)
+        parts["head"] = (lambda key: self._init_head(key, width, out), head_key)
         for name, (init, part_key, *arguments) in parts.items():
             if name in self.own:
                 params.own[name] = self.for_each_task(init, part_key, num_tasks, *arguments)
@@ -122,7 +146,7 @@ class Network:
     def apply(self, params: Params, features: Array, *inputs: Array) -> Array:
         """Map one task's inputs (..., O), (..., A) to outputs (..., out); ``params.own`` is that task's, without T."""
         head = {**params.shared, **params.own}["head"]
-        return self.hidden(params, features, *inputs) @ head["kernel"] + head["bias"]
+        return self.hidden(params, features, *inputs) @ head[self._head_weights] + head["bias"]
 
     def hidden(self, params: Params, features: Array, *inputs: Array) -> Array:
         """Return the hidden layer (..., width) below the head."""
@@ -136,9 +160,13 @@ class Network:
         obs: Any = inputs[0] if self.front is None else self.front.apply(parts["front"], inputs[0])
         return self.body.apply(parts["body"], obs, features, *inputs[1:])  # type: ignore
 
+    @property
+    def _head_weights(self) -> str:
+        return "direction" if self.unit_head else "kernel"
 
-def _init_linear(key: Key, width: int, out: int) -> dict[str, Array]:
-    return {"kernel": nn.initializers.lecun_normal()(key, (width, out)), "bias": jnp.zeros(out)}
+    def _init_head(self, key: Key, width: int, out: int) -> dict[str, Array]:
+        init = init_direction if self.unit_head else nn.initializers.lecun_normal()
+        return {self._head_weights: init(key, (width, out)), "bias": jnp.zeros(out)}
 
 
 def tanh_normal(outputs: Array, key: Key | None, mask: Array | None = None) -> tuple[Array, Array]:

@@ -19,6 +19,7 @@ TRUNK = {"shared/body/MLP_0", "shared/head"}
 OWN = {"own/body", "own/head"}
 CARE = {f"shared/body/{part}" for part in ("context", "context_out", "experts", "trunk")} | {"shared/head"}
 BRONET = {f"shared/body/{kind}_{i}" for kind in ("Dense", "LayerNorm") for i in range(3)}
+HYPERSPHERE = {f"shared/body/{kind}_{i}" for kind, count in (("UnitDense", 4), ("Scaler", 4)) for i in range(count)}
 MODELS = {"shared/transition", "shared/reward"}
 LATENT = {"actor": TRUNK, "critic": TRUNK | {"shared/latent"} | MODELS, "target": TRUNK | {"shared/latent"}}
 WITH_THETA = {**LATENT, **{who: LATENT[who] | {"own/embedding"} for who in ("critic", "target")}}
@@ -50,6 +51,7 @@ PARTS = {
     ),
     "paco": ("paco", {}, body("trunk", "weights")),
     "brc": ("brc", {"value": "hl-gauss"}, BRONET | {"shared/head", "own/embedding"}),
+    "simba-v2": ("simba-v2", {"value": "hl-gauss"}, HYPERSPHERE | {"shared/head"}),
     "deepmdp": ("deepmdp", {}, LATENT),
     "hip-bmdp": ("hip-bmdp", {}, WITH_THETA),
     "care-deepmdp": ("care", {"representation": "deepmdp"}, CARE_ON_LATENT),

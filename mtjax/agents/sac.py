@@ -18,7 +18,7 @@ from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.trajectory import append
 from mtjax.agents.parts.values import VALUES, Value
 from mtjax.experience import Replay
-from mtjax.networks import OVER_TASKS, Params, tanh_normal
+from mtjax.networks import OVER_TASKS, Network, Params, tanh_normal
 from mtjax.types import Acted, Array, InputError, Key, Metrics, Spec, Task, Transition
 
 
@@ -99,6 +99,8 @@ class SAC(BaseAgent):
     """Entropy to which the temperature is tuned, per action dimension."""
     shared_temperature: bool = False
     """Use one temperature for all tasks instead of one for each task."""
+    unit_head: bool = False
+    """Keep the weights of each output of actor and critics at length 1."""
     value: Annotated[Value, FLAT] = dataclasses.field(default_factory=Value)
     experience: Annotated[Replay, FLAT] = dataclasses.field(default_factory=Replay)
 
@@ -116,8 +118,13 @@ class SAC(BaseAgent):
                 "scaling=popart rescales a scalar head of every task's own; use value=scalar and heads=per-task or "
                 f"disjoint, not {value} and {self.heads}"
             )
+        if scaling == "popart" and self.unit_head:
+            raise InputError("scaling=popart rescales heads, which unit-head keeps at length 1; use one of them")
 
     # Networks.
+
+    def network(self, layer_norm: bool) -> Network:
+        return dataclasses.replace(super().network(layer_norm), unit_head=self.unit_head)
 
     def init(self, spec: Spec, tasks: Task, key: Key) -> SACState:
         """Return the initial state for the training ``tasks`` (T, ...)."""

@@ -4,6 +4,7 @@ from mtjax.agents.parts.encoders.base import Identity, MLPEncoder
 from mtjax.agents.parts.encoders.care import CARE
 from mtjax.agents.parts.encoders.composed import Hypernetwork, PaCo
 from mtjax.agents.parts.encoders.film import FiLM
+from mtjax.agents.parts.encoders.hypersphere import Hypersphere
 from mtjax.agents.parts.encoders.input_map import InputMap
 from mtjax.agents.parts.encoders.mixture import MoE
 from mtjax.agents.parts.encoders.moore import MOORE
@@ -25,4 +26,5 @@ ENCODERS: dict[str, type[Encoder]] = {
     "hypernetwork": Hypernetwork,
     "bronet": BroNet,
     "simba": SimBa,
+    "hypersphere": Hypersphere,
 }

@@ -8,7 +8,7 @@ latest statistics when an update uses them; logged returns are raw.
 
 from mtjax.agents.parts.scaling.base import NoScaling
 from mtjax.agents.parts.scaling.popart import PopArt
-from mtjax.agents.parts.scaling.returns import ReturnScaling
+from mtjax.agents.parts.scaling.returns import ReturnNormalization, ReturnScaling
 from mtjax.agents.parts.scaling.rewards import AdaptiveScaling, RewardScaling
 
 Scaling = NoScaling
@@ -16,6 +16,7 @@ SCALINGS: dict[str, type[Scaling]] = {
     "none": NoScaling,
     "reward": RewardScaling,
     "return": ReturnScaling,
+    "return-std": ReturnNormalization,
     "popart": PopArt,
     "ars": AdaptiveScaling,
 }

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
+from mtjax import normalize
 from mtjax.agents import parts
 from mtjax.agents.parts.scaling.base import NoScaling
 from mtjax.types import Array, Outcome
@@ -60,3 +61,50 @@ class ReturnScaling(NoScaling):
         known = largest > 0
         factor = self.return_range / jnp.where(known, largest + horizon * bonus, 1.0)
         return jnp.where(known, factor, 1.0), jnp.zeros_like(largest)
+
+
+class SpreadOfReturns(NamedTuple):
+    """Holds the moments of discounted returns, and the largest so far."""
+
+    moments: normalize.Moments  # count (), mean (T,), deviation (T,)
+    largest: Array  # (T,) largest |discounted sum of rewards|
+
+
+@dataclasses.dataclass(frozen=True)
+class ReturnNormalization(NoScaling):
+    """Divides by the standard deviation of the task's discounted returns, and keeps these in a range (SimbaV2).
+
+    With G_t = r_t + gamma G_(t-1) from the start of an episode, as Lee et al. (2025, "Hyperspherical normalization"):
+        factor = 1 / max(std(G), max |G| / range)
+    over all steps of training so far. Before there is any reward the factor is 1.
+
+    Differs from the authors' code: every task has its own statistics; no small number is added to the variance, as the
+    range already bounds the factor. As there, the bonus of entropy has no room in the range.
+    """
+
+    watches = True
+    return_range: float = 5.0
+    """Largest |discounted return| after scaling; with value=c51 or hl-gauss, the range of their bins."""
+
+    def __post_init__(self):
+        parts.require_positive(self, "return_range")
+
+    def init(self, num_tasks: int) -> SpreadOfReturns:
+        return SpreadOfReturns(normalize.init(num_tasks), jnp.zeros(num_tasks))
+
+    def begin(self) -> Array:
+        """Return 0, the discounted sum before the first reward."""
+        return jnp.float32(0)
+
+    def remember(self, memory: Array, reward: Array, gamma: float | Array) -> Array:
+        return gamma * memory + reward
+
+    def observe(self, memory: SpreadOfReturns, outcome: Outcome) -> SpreadOfReturns:
+        returns = outcome.memory.scaling  # (T, E)
+        largest = jnp.maximum(memory.largest, jnp.max(jnp.abs(returns), axis=1))
+        return SpreadOfReturns(normalize.update(memory.moments, returns.T), largest)
+
+    def units(self, memory: SpreadOfReturns, gamma: float | Array, bonus: Array) -> tuple[Array, Array]:
+        variance = memory.moments.deviation / jnp.maximum(memory.moments.count, 1)
+        divisor = jnp.maximum(jnp.sqrt(variance), memory.largest / self.return_range)
+        return 1 / jnp.where(divisor > 0, divisor, 1.0), jnp.zeros_like(divisor)
