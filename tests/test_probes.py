@@ -14,7 +14,8 @@ PLAIN = {"gamma": GAMMA, "initial_temperature": 1e-6, "temperature_lr": 1e-9}
 # observation and scale.
 OF_AGENT = {
     "brc": {"scaling": "none"},
-    "simba-v2": {"scaling": "none", "normalize_observations": False, "hidden": (32,)},
+    "simba-v2": {"scaling": "none", "normalize_observations": False, "hidden": (64,), "critic_lr": 3e-3},
+    "xqc": {"scaling": "none", "hidden": (32,)},
     "moe": {"num_experts": 4},
 }
 RATES = {"tau": 0.3, "actor_lr": 3e-3, "critic_lr": 1e-2}

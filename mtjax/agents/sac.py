@@ -201,13 +201,19 @@ class SAC(BaseAgent):
     def critic_target(self, actor: Params, critic: Params, target_critic: Params, batch: Batch, key: Key) -> Any:
         """Compute the critic target y (B, ...), in the form that ``value.loss`` takes."""
         action, _, cost = self.sample(actor, critic, batch, batch.next_obs, key)
-        outputs = self.q(target_critic, batch.features, batch.next_obs, action)
+        return self.bootstrap(self.q(target_critic, batch.features, batch.next_obs, action), batch, cost)
+
+    def bootstrap(self, outputs: Array, batch: Batch, cost: Array) -> Any:
+        """Compute the critic target from the target critics' ``outputs`` (N, B, outputs) at the next states."""
         bonus = -batch.temperature * cost
         return self.value.target(outputs, self.critic_reduction == "min", batch.reward, batch.discount, bonus)
 
     def critic_loss(self, critic: Params, data: tuple[Batch, Any]) -> tuple[Array, Metrics]:
         batch, target = data
-        outputs = self.q(critic, batch.features, batch.obs, batch.action)
+        return self.fitting_loss(self.q(critic, batch.features, batch.obs, batch.action), target, critic, batch)
+
+    def fitting_loss(self, outputs: Array, target: Any, critic: Params, batch: Batch) -> tuple[Array, Metrics]:
+        """Compute the critic loss of ``outputs`` (N, B, outputs) for a result of ``bootstrap``."""
         loss = jnp.mean(jnp.sum(self.value.loss(outputs, target), axis=0))
         values, expected = self.value.mean(outputs), self.value.expected(target)
         td_error = jnp.mean(jnp.abs(values - expected))
@@ -217,7 +223,11 @@ class SAC(BaseAgent):
 
     def actor_loss(self, actor: Params, data: tuple[Batch, Params, Key]) -> tuple[Array, Metrics]:
         batch, critic, key = data
-        action, log_prob, cost = self.sample(actor, critic, batch, batch.obs, key)
+        return self.policy_loss(self.sample(actor, critic, batch, batch.obs, key), critic, batch)
+
+    def policy_loss(self, sample: Sample, critic: Params, batch: Batch) -> tuple[Array, Metrics]:
+        """Compute the actor loss of actions sampled at a batch's observations."""
+        action, log_prob, cost = sample
         values = self.values(critic, batch.features, batch.obs, action)
         value = minimum(values) if self.critic_reduction == "min" else jnp.mean(values, axis=0)
         loss = jnp.mean(batch.temperature * cost - value)
@@ -240,6 +250,7 @@ class SAC(BaseAgent):
         critic, critic_memory = descent.descend(
             self.optimizers.critic, critic_step.gradients, state.optimizers.critic, state.critic
         )
+        critic = with_statistics(critic, critic_step.aux)
         critic_rule = surgery.adapt_rule(self.gradients, loss, critic, data, critic_step)
 
         loss, data = self.actor_problem(critic, batch, actor_key)
@@ -247,6 +258,7 @@ class SAC(BaseAgent):
         actor, actor_memory = descent.descend(
             self.optimizers.actor, actor_step.gradients, state.optimizers.actor, state.actor
         )
+        actor = with_statistics(actor, actor_step.aux)
 
         action_size = action_sizes(batch.action, batch.mask)
         slope = jax.grad(self.temperature_loss)(state.log_temperature, actor_step.aux["entropy"], action_size)
@@ -311,6 +323,11 @@ class SAC(BaseAgent):
             return self.actor_loss(actor, (batch, Params(critic.shared, own_critic), key))
 
         return loss, (batch, critic.own, jax.random.split(key, len(batch.temperature)))
+
+
+def with_statistics(params: Params, aux: Metrics) -> Params:
+    """Take the running statistics that a loss found, if any, out of ``aux``, and return parameters that have them."""
+    return params._replace(own=params.own | aux.pop("statistics", {}))  # type: ignore
 
 
 def action_sizes(action: Array, mask: Array | None) -> int | Array:

@@ -1,6 +1,7 @@
 """Encoders, by name, build the bodies of networks, below their heads. To add one, add a file, and a line here."""
 
 from mtjax.agents.parts.encoders.base import Identity, MLPEncoder
+from mtjax.agents.parts.encoders.batch_norm import BatchNorm
 from mtjax.agents.parts.encoders.care import CARE
 from mtjax.agents.parts.encoders.composed import Hypernetwork, PaCo
 from mtjax.agents.parts.encoders.film import FiLM
@@ -27,4 +28,5 @@ ENCODERS: dict[str, type[Encoder]] = {
     "bronet": BroNet,
     "simba": SimBa,
     "hypersphere": Hypersphere,
+    "batch-norm": BatchNorm,
 }
