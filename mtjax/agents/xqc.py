@@ -33,10 +33,9 @@ class XQC(SAC):
         rewards are divided by the standard deviation of returns                     (scaling=return-std)
     Critics and target critics see both ends of the transitions as one batch (CrossQ; Bhatt et al. 2024):
         [Q_n(s, a), Q_n(s', a')] = Q_n([s, s'], [a, a']),  a' ~ pi(s')
-    so that one mean and variance normalise both, and neither is foreign to them. Here their first half is fitted, by
-    a target from the second half of the target critics'. The policy normalises by the batch in its own loss. Everywhere
-    else networks use the running statistics of their task: the policy for a' and for acting, and critics in the
-    policy's loss. Each part's class has its equations.
+    so that one mean and variance normalise both. The critics' first half is fitted to a target from the target critics'
+    second half. The policy normalises by the batch in its own loss. Elsewhere networks use the running statistics of
+    their task: the policy for a' and for acting, and critics in the policy's loss. Each part's class has its equations.
 
     Differs from the authors' code:
         Rates: learning rates stay at 3e-4; there they fall linearly to 3e-5. Actor and temperatures learn at every
