@@ -35,11 +35,11 @@ class BatchNorm(Identity):
 
     With features z of the task and, for every unit, BN(x) = scale (x - mean) / sqrt(variance + 0.001) + bias:
         x = BN([s, a]);   x <- relu(BN(W x) + V z)   for each width of ``hidden``
-    Rows of W have length 1 after every step of an optimiser (weight normalisation). A network that is being fitted takes
-    mean and variance of the batch, and the task's running statistics move towards these by a hundredth. Every other
-    network takes the running ones. Each task has its own, and they follow its data whatever ``tune`` says. Scale and
-    bias are like other parameters of the body. For the paper's output layers use unit-head. Its norms do not depend on
-    critic-layer-norm and actor-layer-norm.
+    Rows of W have length 1 after every step of an optimiser (weight normalisation). A network that is being fitted
+    takes mean and variance of the batch, and the task's running statistics move towards these by a hundredth. Every
+    other network takes the running ones. Each task has its own, and they follow its data whatever ``tune`` says. Scale
+    and bias are like other parameters of the body. For the paper's output layers use unit-head. Its norms do not depend
+    on critic-layer-norm and actor-layer-norm.
 
     Differs from the papers: there is one task there. A task's features are often the same in all of its batch, and BN
     would subtract whatever they add; so V z comes after it. Rows of W begin as independent directions (there,
