@@ -12,6 +12,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from mtjax.sphere import init_direction
 from mtjax.types import Array, Key
 
 _LOG_STD_RANGE = (-5.0, 2.0)
@@ -34,6 +35,9 @@ class Params(NamedTuple):
         keep = lambda parts: {name: part for name, part in parts.items() if name not in names}
         return Params(keep(self.shared), keep(self.own))
 
+
+STATISTICS = "batch_stats"
+"""What a body with batch normalisation remembers of the batches that it has seen, by flax's name."""
 
 OVER_TASKS = Params(shared=None, own=0)
 """Axes of ``Params`` for ``jax.vmap`` over tasks."""
@@ -87,6 +91,7 @@ class Network:
     unit_embedding: bool = False  # scale those vectors to length 1
     front: nn.Module | None = None  # maps observations before the body; every task's own
     trajectory: nn.Module | None = None  # maps observation and past, a ``Seen``, to features
+    unit_head: bool = False  # keep the head's weights of each output at length 1
 
     def init(self, key: Key, num_tasks: int, out: int, features: Array, *inputs: Array) -> Params:
         """Initialise parameters for ``num_tasks`` tasks, ``out`` outputs, and inputs of the given shapes."""
@@ -106,13 +111,23 @@ class Network:
         data = (inputs[0], features, *inputs[1:])
         width = jax.eval_shape(lambda: self.body.init_with_output(body_key, *data)[0]).shape[-1]
         parts["body"] = (self.body.init, body_key, *data)
-        parts["head"] = (lambda key: _init_linear(key, width, out), head_key)
+        parts["head"] = (lambda key: self._init_head(key, width, out), head_key)
         for name, (init, part_key, *arguments) in parts.items():
             if name in self.own:
                 params.own[name] = self.for_each_task(init, part_key, num_tasks, *arguments)
             else:
                 params.shared[name] = init(part_key, *arguments)
+        if STATISTICS in {**params.shared, **params.own}["body"]:
+            self._give_statistics(params, num_tasks)
         return params
+
+    def _give_statistics(self, params: Params, num_tasks: int) -> None:
+        """Move the statistics of a new body to what every task has for itself."""
+        if "body" in self.own:
+            params.own[STATISTICS] = params.own["body"].pop(STATISTICS)
+        else:
+            each = lambda x: jnp.repeat(x[None], num_tasks, axis=0)
+            params.own[STATISTICS] = jax.tree.map(each, params.shared["body"].pop(STATISTICS))
 
     @staticmethod
     def for_each_task(init, key: Key, num_tasks: int, *arguments: Any):
@@ -121,11 +136,23 @@ class Network:
 
     def apply(self, params: Params, features: Array, *inputs: Array) -> Array:
         """Map one task's inputs (..., O), (..., A) to outputs (..., out); ``params.own`` is that task's, without T."""
-        head = {**params.shared, **params.own}["head"]
-        return self.hidden(params, features, *inputs) @ head["kernel"] + head["bias"]
+        return self._head(params, self.hidden(params, features, *inputs))
+
+    def fit(self, params: Params, features: Array, *inputs: Array) -> tuple[Array, Any]:
+        """Apply to a batch by its own statistics.
+
+        Returns:
+            outputs (..., out), and the task's new running statistics by their name among its own parameters: an empty
+            table for bodies without batch normalisation.
+        """
+        hidden, found = self._body(params, features, *inputs, mutable=STATISTICS)
+        return self._head(params, hidden), found
 
     def hidden(self, params: Params, features: Array, *inputs: Array) -> Array:
         """Return the hidden layer (..., width) below the head."""
+        return self._body(params, features, *inputs, mutable=False)
+
+    def _body(self, params: Params, features: Array, *inputs: Array, mutable: Any) -> Any:
         parts = {**params.shared, **params.own}
         if "embedding" in parts:
             features = parts["embedding"]
@@ -134,11 +161,20 @@ class Network:
             features = self.trajectory.apply(parts["trajectory"], inputs[0])  # type: ignore
             inputs = (inputs[0].obs, *inputs[1:])  # type: ignore
         obs: Any = inputs[0] if self.front is None else self.front.apply(parts["front"], inputs[0])
-        return self.body.apply(parts["body"], obs, features, *inputs[1:])  # type: ignore
+        variables = parts["body"] | {name: parts[name] for name in (STATISTICS,) if name in parts}
+        return self.body.apply(variables, obs, features, *inputs[1:], mutable=mutable)
 
+    def _head(self, params: Params, hidden: Array) -> Array:
+        head = {**params.shared, **params.own}["head"]
+        return hidden @ head[self._head_weights] + head["bias"]
 
-def _init_linear(key: Key, width: int, out: int) -> dict[str, Array]:
-    return {"kernel": nn.initializers.lecun_normal()(key, (width, out)), "bias": jnp.zeros(out)}
+    @property
+    def _head_weights(self) -> str:
+        return "direction" if self.unit_head else "kernel"
+
+    def _init_head(self, key: Key, width: int, out: int) -> dict[str, Array]:
+        init = init_direction if self.unit_head else nn.initializers.lecun_normal()
+        return {self._head_weights: init(key, (width, out)), "bias": jnp.zeros(out)}
 
 
 def tanh_normal(outputs: Array, key: Key | None, mask: Array | None = None) -> tuple[Array, Array]:

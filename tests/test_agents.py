@@ -392,7 +392,7 @@ REFUSED = [
     ("care", {"variant": "papers"}, "unknown variant 'papers'; did you mean 'paper'"),
     ("care", {"num_experts": 0}, "at least one expert"),
     ("care", {"expert_widths": ()}, "at least one layer"),
-    ("cares", {}, "unknown agent 'cares'; did you mean 'care'.*multi-head"),
+    ("cares", {}, "unknown agent 'cares'; did you mean 'care'.*in all"),
 ]
 
 

@@ -11,6 +11,7 @@ from probes import QUICK
 
 from mtjax import agents
 from mtjax.agents.parts.encoders.composed import Composed, Hypernetwork, HyperTrunk, PaCo, PaCoTrunk
+from mtjax.agents.parts.encoders.hypersphere import Hypersphere
 from mtjax.agents.parts.encoders.mixture import TaskWeights
 from mtjax.agents.parts.encoders.residual import BroNet, BroNetTrunk, SimBa, SimBaTrunk
 from mtjax.agents.parts.encoders.soft_modules import Modules, SoftModules
@@ -329,6 +330,7 @@ MODULES = {
     "hypernetwork": Hypernetwork((8, 6)).body((6, 5), True),
     "bronet": BroNet().body((6, 6), True),
     "simba": SimBa(2).body((6, 6), True),
+    "hypersphere": Hypersphere(2).body((6, 6), True),
 }
 EVERY_MODULE = pytest.mark.parametrize("name", MODULES)
 
@@ -372,6 +374,9 @@ def test_settings_that_make_no_network_are_refused():
         ("paco", {"weight_widths": (4, 0)}, "weight-widths must be of at least one unit each"),
         ("hypernetwork", {"hypernetwork_widths": ()}, "at least one unit"),
         ("simba", {"expansion": 0}, "expansion must be at least 1"),
+        ("hypersphere", {"expansion": 0}, "expansion must be at least 1"),
+        ("hypersphere", {"input_shift": 0.0}, "input-shift must be greater than 0"),
+        ("hypersphere", {"hidden": (8, 4)}, r"hypersphere.*\(8, 4\)"),
         ("bronet", {"hidden": (8, 4)}, r"bronet.*\(8, 4\)"),
         ("simba", {"hidden": (8, 4)}, r"simba.*\(8, 4\)"),
         ("paco", {"conditioning": "none"}, "conditioning cannot be none"),

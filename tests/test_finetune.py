@@ -142,6 +142,20 @@ def test_what_is_tuned_moves_and_all_else_stays_to_the_bit(learned, tuned, tune)
             assert moved == (MOVES[tune] in path), path
 
 
+@pytest.mark.parametrize("name", slow_but(["simba-v2", "xqc"], "xqc"))
+def test_weights_of_length_one_stay_and_statistics_follow_the_data(name, tmp_path):
+    """With heads that learn alone: from the nearest task's statistics, which are no parameters."""
+    begun = train(tmp_path, "--env=aim", "--split=none", f"--agent={name}", "--seeds=2", "--agent.hidden", "8")
+    after = mtjax.load(train(tmp_path, *NEW, f"--from={begun}", "--tune=heads", "--seeds=3")).states
+    expected = inherited(mtjax.load(begun).states, [0, 1, 0])
+    found = {**named({"actor": after.actor}), **named({"critic": after.critic})}
+    assert found.keys() == expected.keys() and any("batch_stats" in path for path in found) == (name == "xqc")
+    for path, leaf in found.items():
+        for seed in range(3):
+            moved = not np.array_equal(leaf[seed], expected[path][seed])
+            assert moved == ("['head']" in path or "batch_stats" in path), path
+
+
 def test_a_run_records_where_it_comes_from(base, tuned):
     """Its agent is the run's but for what was given; its contexts are written as the run's."""
     directory = tuned("heads")

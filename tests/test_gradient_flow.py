@@ -19,6 +19,8 @@ TRUNK = {"shared/body/MLP_0", "shared/head"}
 OWN = {"own/body", "own/head"}
 CARE = {f"shared/body/{part}" for part in ("context", "context_out", "experts", "trunk")} | {"shared/head"}
 BRONET = {f"shared/body/{kind}_{i}" for kind in ("Dense", "LayerNorm") for i in range(3)}
+HYPERSPHERE = {f"shared/body/{kind}_{i}" for kind, count in (("UnitDense", 4), ("Scaler", 4)) for i in range(count)}
+BATCH_NORM = {f"shared/body/{part}" for part in ("BatchNorm_0", "BatchNorm_1", "UnitDense_0", "task_0")}
 MODELS = {"shared/transition", "shared/reward"}
 LATENT = {"actor": TRUNK, "critic": TRUNK | {"shared/latent"} | MODELS, "target": TRUNK | {"shared/latent"}}
 WITH_THETA = {**LATENT, **{who: LATENT[who] | {"own/embedding"} for who in ("critic", "target")}}
@@ -50,6 +52,8 @@ PARTS = {
     ),
     "paco": ("paco", {}, body("trunk", "weights")),
     "brc": ("brc", {"value": "hl-gauss"}, BRONET | {"shared/head", "own/embedding"}),
+    "simba-v2": ("simba-v2", {"value": "hl-gauss"}, HYPERSPHERE | {"shared/head"}),
+    "xqc": ("xqc", {"value": "hl-gauss"}, BATCH_NORM | {"shared/head", "own/batch_stats"}),
     "deepmdp": ("deepmdp", {}, LATENT),
     "hip-bmdp": ("hip-bmdp", {}, WITH_THETA),
     "care-deepmdp": ("care", {"representation": "deepmdp"}, CARE_ON_LATENT),
@@ -134,11 +138,13 @@ FLOW = {
 
 
 # Where the actor stands on the critic's representation, all that moves this moves the policy's entropy; and what the
-# slow encoder sees is what models predict. BRC scales rewards by what entropy pays.
+# slow encoder sees is what models predict. BRC scales rewards by what entropy pays. XQC's critics are normalised over
+# the policy's next actions too.
 _ON_LATENT = {"critic": ((), ("actor",)), "target": ((), ("critic",)), "reward": ((), ("actor", "critic", "target"))}
 FLOW_OF = {
     **dict.fromkeys(("deepmdp", "hip-bmdp", "care-deepmdp"), _ON_LATENT),
     "brc": {"log_temperature": ((), ("actor",))},
+    "xqc": {"actor": ((), ("critic", "target", "log_temperature"))},
 }
 
 OPTIMIZERS = {"actor": 0, "critic": 1, "log_temperature": 2}

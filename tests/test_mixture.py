@@ -353,6 +353,8 @@ def widened(params: Params, like: Params, rows: np.ndarray, outputs: np.ndarray 
         index = [np.arange(n) for n in small.shape]
         if "Dense_0" in name:
             index[-2] = rows
+        elif "BatchNorm_0" in name:
+            index[-1] = rows
         elif outputs is not None and "head" in name:
             index[-1] = outputs
         return jnp.zeros_like(wide).at[np.ix_(*index)].set(small)
@@ -360,11 +362,12 @@ def widened(params: Params, like: Params, rows: np.ndarray, outputs: np.ndarray 
     return jax.tree_util.tree_map_with_path(place, params, like)
 
 
-def test_losses_of_a_padded_task_are_those_of_the_task_alone(monkeypatch):
+@pytest.mark.parametrize(("name", "constants"), [("sac", 0), ("simba-v2", 1), ("xqc", 0)])
+def test_losses_of_a_padded_task_are_those_of_the_task_alone(name, constants, monkeypatch):
     """A task with 2 observed numbers and 1 action, in networks of 4 and 3 that hold the same weights, and zeros."""
     noise = np.random.default_rng(1).normal(size=(6, 3)).astype(np.float32)
     monkeypatch.setattr(networks.jax.random, "normal", lambda key, shape: jnp.asarray(noise[: shape[0], : shape[1]]))
-    agent, random = tiny("sac"), np.random.default_rng(0)
+    agent, random = tiny(name, conditioning="none"), np.random.default_rng(0)
     task, features = WIDE.tasks(), jnp.zeros(0)
     pad = lambda x, width: jnp.pad(x, ((0, 0), (0, width - x.shape[1])))
     obs, next_obs = jnp.float32(random.normal(size=(2, 6, 2)))
@@ -375,10 +378,12 @@ def test_losses_of_a_padded_task_are_those_of_the_task_alone(monkeypatch):
     monkeypatch.undo()
     init = lambda o, a: quick(lambda key: agent.init(Spec.vector(o, a, 1), task, key), jax.random.key(0))
     states = init(2, 1), init(4, 3)
-    actors = [pick(s.actor, ...) for s in states]
-    critics = [s.critic for s in states]
-    actors[1] = widened(actors[0], actors[1], np.arange(2), np.array([0, 3]))
-    critics[1] = widened(critics[0], critics[1], np.array([0, 1, 4]), None)
+    alone = lambda params: Params(pick(params.shared, ...), pick(params.own, 0))
+    actors, critics = ([alone(getattr(s, network)) for s in states] for network in ("actor", "critic"))
+    constant = np.arange(constants)  # what an encoder puts behind the inputs
+    of_actor, of_critic = np.append([0, 1], 4 + constant), np.append([0, 1, 4], 7 + constant)
+    actors[1] = widened(actors[0], actors[1], of_actor, np.array([0, 3]))
+    critics[1] = widened(critics[0], critics[1], of_critic, None)
     monkeypatch.setattr(networks.jax.random, "normal", lambda key, shape: jnp.asarray(noise[: shape[0], : shape[1]]))
     key = jax.random.key(0)
 
@@ -390,10 +395,10 @@ def test_losses_of_a_padded_task_are_those_of_the_task_alone(monkeypatch):
 
     found = [quick(losses, *of_one) for of_one in zip(actors, critics, (small, wide), strict=True)]
     np.testing.assert_allclose(found[1][:3], found[0][:3], rtol=1e-5)
-    slopes = widened(found[0][3], found[1][3], np.arange(2), np.array([0, 3]))
+    slopes = widened(found[0][3], found[1][3], of_actor, np.array([0, 3]))
     for ours, theirs in zip(jax.tree.leaves(found[1][3]), jax.tree.leaves(slopes), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-6)  # zero for all that is padded
-    slopes = widened(found[0][4], found[1][4], np.array([0, 1, 4]), None)
+    slopes = widened(found[0][4], found[1][4], of_critic, None)
     for ours, theirs in zip(jax.tree.leaves(found[1][4]), jax.tree.leaves(slopes), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-6)
 
@@ -442,7 +447,7 @@ def test_every_agent_learns_a_mixture(name):
     assert action.shape == (4, 2) and metrics["td_error"].shape == (4,)
 
 
-@pytest.mark.parametrize("name", ["distral", "hip-bmdp", "brc", "pcgrad"])
+@pytest.mark.parametrize("name", ["distral", "hip-bmdp", "brc", "simba-v2", "xqc", "pcgrad"])
 def test_an_update_is_finite_and_acts_where_there_are_actions(name):
     agent = tiny(name, normalize_observations=True, discounting="horizon")
     run = lambda *arguments: init_and_update(agent, *arguments)

@@ -367,7 +367,8 @@ COMBINED = [row for row in COMBINED if allowed(row)]
 
 def test_most_combinations_are_allowed():
     assert len(COMBINED) > 50
-    for kind, table in (("encoder", ENCODERS), ("gradients", RULES), ("conditioning", CONDITIONINGS)):
+    encoders = set(ENCODERS) - {"batch-norm"}  # whose statistics PPO does not keep
+    for kind, table in (("encoder", encoders), ("gradients", RULES), ("conditioning", CONDITIONINGS)):
         assert {row[kind] for row in COMBINED if kind in row} == set(table)
 
 

@@ -10,8 +10,15 @@ GAMMA = 0.9
 SCALES = (1.0, -0.5)
 # The temperature stays negligible, so that the soft Q-value is the plain one.
 PLAIN = {"gamma": GAMMA, "initial_temperature": 1e-6, "temperature_lr": 1e-9}
-# Values are compared in the units of rewards; and two experts are too few for four signs of observation and scale.
-OF_AGENT = {"brc": {"scaling": "none"}, "moe": {"num_experts": 4}}
+# Values are compared in the units of rewards, at observations as they are. Two experts are too few for four signs of
+# observation and scale. Weights of length 1 turn far in a step.
+SLOWER = {"critic_lr": 3e-3, "actor_lr": 1e-3}
+OF_AGENT = {
+    "brc": {"scaling": "none"},
+    "simba-v2": {"scaling": "none", "normalize_observations": False, "hidden": (64,), **SLOWER},
+    "xqc": {"scaling": "none", "hidden": (64, 64), **SLOWER},
+    "moe": {"num_experts": 4},
+}
 RATES = {"tau": 0.3, "actor_lr": 3e-3, "critic_lr": 1e-2}
 
 # Q(scale, obs, action), and how far a critic may be from it: at least half as far again as the worst of five seeds.

@@ -13,7 +13,15 @@ from probes import LEARNING, QUICK, Probe, Stub, Walk, learner, only_seed, rando
 from mtjax import normalize
 from mtjax.agents import agent
 from mtjax.agents.base import Memory
-from mtjax.agents.parts.scaling import SCALINGS, AdaptiveScaling, NoScaling, PopArt, ReturnScaling, RewardScaling
+from mtjax.agents.parts.scaling import (
+    SCALINGS,
+    AdaptiveScaling,
+    NoScaling,
+    PopArt,
+    ReturnNormalization,
+    ReturnScaling,
+    RewardScaling,
+)
 from mtjax.experience import Replay
 from mtjax.networks import Params
 from mtjax.types import InputError, Outcome, Spec, Transition
@@ -93,6 +101,19 @@ def test_what_lies_beyond_a_time_limit_counts_and_beyond_an_end_does_not():
     for over, largest in (({"cuts": (1,)}, 10.0), ({"ends": (1,)}, 1.9)):
         memory = watch(scaling, stream(rewards, gamma=0.9, **over))
         np.testing.assert_allclose(units(scaling, memory, gamma=0.9)[0], 2 / largest, rtol=1e-5)
+
+
+def test_returns_are_divided_by_their_standard_deviation():
+    """Sums of 1, 2.5 and -2, 2 in one task; 8, 4 in the other, whose largest is beyond 1.5 standard deviations."""
+    rewards = np.array([[[1.0, -2.0], [8.0, 8.0]], [[2.0, 3.0], [0.0, 0.0]]])
+    scaling = ReturnNormalization(return_range=1.5)
+    memory = watch(scaling, stream(rewards))
+    np.testing.assert_allclose(memory.moments.mean, [0.875, 6.0])
+    factor, offset = units(scaling, memory)
+    np.testing.assert_allclose(factor, [1 / np.std([1, 2.5, -2, 2]), 1.5 / 8], rtol=1e-5)
+    np.testing.assert_array_equal(offset, 0)
+    again = watch(scaling, stream(rewards, ends=(0,)))
+    np.testing.assert_allclose(again.moments.mean, [(1 + 2 - 2 + 3) / 4, 4.0])
 
 
 def test_the_bonus_of_entropy_has_room_in_the_range():
@@ -234,7 +255,7 @@ def test_an_update_rescales_critic_and_target_beside_its_own_step():
     np.testing.assert_array_equal(after.actor.own["head"]["kernel"], expected.actor.own["head"]["kernel"])
 
 
-@pytest.mark.parametrize("name", ["reward", "return"])
+@pytest.mark.parametrize("name", ["reward", "return", "return-std"])
 def test_statistics_change_by_what_is_observed_alone(name):
     """Not by learning and not by acting; and they decide what an update sees."""
     scaled = tiny("sac", scaling=name)
@@ -263,6 +284,7 @@ def test_agents_without_statistics_do_not_watch():
         ({"scaling": "popart", "heads": "per-task", "value": "c51"}, "not c51 and per-task"),
         ({"scaling": "return", "gamma": 1.0}, "use gamma below 1"),
         ({"scaling": "return", "return_range": 0.0}, "return-range must be greater than 0"),
+        ({"scaling": "return-std", "return_range": -1.0}, "return-range must be greater than 0"),
         ({"scaling": "reward", "variance_rate": 0.0}, r"variance-rate must be in \(0, 1\], not 0.0"),
         ({"scaling": "popart", "heads": "per-task", "target_rate": 1.5}, "target-rate must be"),
         ({"scaling": "ars", "least_mean_reward": 0.0}, "least-mean-reward must be greater than 0"),
@@ -281,8 +303,9 @@ def test_settings_that_make_no_sense_are_refused(settings, message):
         ("multi-head", {"scaling": "popart", "target_rate": 0.02}),
         ("sac-conditioned", {"scaling": "return", "value": "c51", "num_bins": 41, "return_range": 8.0}),
         ("sac-conditioned", {"scaling": "reward"}),
+        ("sac-conditioned", {"scaling": "return-std", "value": "c51", "num_bins": 41, "value_high": 6.0}),
     ],
-    ids=["popart", "return", "reward"],
+    ids=["popart", "return", "reward", "return-std"],
 )
 def test_values_are_known_in_reward_whatever_their_scale(name, settings):
     """Two steps, of which the second earns 200 or -0.5; errors are relative to the task's own scale."""

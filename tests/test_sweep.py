@@ -85,7 +85,7 @@ def _variants():
     for row in zip(*(itertools.islice(itertools.cycle(c), max(map(len, columns))) for c in columns), strict=True):
         yield "sac", dict(zip(("gradients", "value", "scaling", "sampler"), row, strict=True))
     yield "sac", {"scaling": "popart", "heads": "per-task", "weight_decay": 0.1, "max_gradient_norm": 1.0}
-    yield from ((name, {}) for name in ("distral", "brc", "deepmdp", "hip-bmdp"))
+    yield from ((name, {}) for name in ("distral", "brc", "simba-v2", "xqc", "deepmdp", "hip-bmdp"))
 
 
 @pytest.mark.parametrize("name, settings", _variants())

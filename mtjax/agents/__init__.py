@@ -47,6 +47,8 @@ AGENTS: dict[str, Preset] = {
     "soft-modularization": Preset("Modules routed by task (Yang et al. 2020)", {"encoder": "soft-modules", **_PARAMS}),
     "paco": Preset("Parameters composed for each task (Sun et al. 2022)", {"encoder": "paco", **_PARAMS}),
     "brc": Preset("Bigger, regularised, categorical critics (Nauman et al. 2025)", {}, "mtjax.agents.brc:BRC"),
+    "simba-v2": Preset("Features and weights on unit spheres (Lee et al. 2025)", {}, "mtjax.agents.simba_v2:SimbaV2"),
+    "xqc": Preset("Batches and weights normalised (Palenicek et al. 2025)", {}, "mtjax.agents.xqc:XQC"),
     "deepmdp": Preset(
         "SAC on a latent model of the task (Gelada et al. 2019)", {"representation": "deepmdp", **_PARAMS}
     ),

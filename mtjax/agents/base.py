@@ -88,6 +88,8 @@ class BaseAgent(abc.ABC):
     """Settings that fine-tuning may change: they say how an agent learns, not what its networks are."""
     common_presets: ClassVar[bool] = True
     """Whether the tables of presets that name no agent hold for it. They are tuned for learning from replay."""
+    fits_statistics: ClassVar[bool] = False
+    """Whether learning keeps the running statistics of bodies with batch normalisation."""
     hidden: tuple[int, ...] = (256, 256)
     """Widths of the hidden layers in actor and critics."""
     actor_hidden: tuple[int, ...] = ()
@@ -191,6 +193,10 @@ class BaseAgent(abc.ABC):
         reason = self.encoder.refuses(self.conditioning)
         if reason:
             raise InputError(f"{encoder} {reason}")
+        if self.encoder.has_statistics and not self.fits_statistics:
+            raise InputError(
+                f"{encoder} needs an agent that keeps running statistics, such as xqc; use another encoder"
+            )
         if self.representation.learns and self.encoder.front() is not None:
             name = parts.name_of(REPRESENTATIONS, self.representation)
             raise InputError(
@@ -409,7 +415,7 @@ class BaseAgent(abc.ABC):
     def borrowed(self) -> list[str]:
         """Names of what a task that was not trained on uses of its nearest training task."""
         found = {"shared": [], "per-task": ["head"], "disjoint": ["networks"]}[self.heads]
-        found += ["input layer"] * (self.encoder.front() is not None)
+        found += ["input layer"] * (self.encoder.front() is not None) + ["statistics"] * self.encoder.has_statistics
         return self.representation.borrowed(found + conditioning.BORROWED.get(self.conditioning, []))
 
     @property

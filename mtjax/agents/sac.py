@@ -21,7 +21,7 @@ from mtjax.agents.parts.values import VALUES, Value
 from mtjax.experience import Replay
 from mtjax.experience.multistep import Ends
 from mtjax.maps import when
-from mtjax.networks import OVER_TASKS, Params, tanh_normal
+from mtjax.networks import OVER_TASKS, Network, Params, tanh_normal
 from mtjax.types import Acted, Array, InputError, Key, Metrics, Sometimes, Spec, Task, Transition
 
 
@@ -102,6 +102,8 @@ class SAC(BaseAgent):
     """Entropy to which the temperature is tuned, per action dimension."""
     shared_temperature: bool = False
     """Use one temperature for all tasks instead of one for each task."""
+    unit_head: bool = False
+    """Keep the weights of each output of actor and critics at length 1."""
     value: Annotated[Value, FLAT] = dataclasses.field(default_factory=Value)
     experience: Annotated[Replay, FLAT] = dataclasses.field(default_factory=Replay)
 
@@ -122,8 +124,13 @@ class SAC(BaseAgent):
         if self.representation.learns and self.experience.n_step > 1:
             name = parts.name_of(REPRESENTATIONS, self.representation)
             raise InputError(f"{name} learns models of single steps; use n-step=1, not {self.experience.n_step}")
+        if scaling == "popart" and self.unit_head:
+            raise InputError("scaling=popart rescales heads, which unit-head keeps at length 1; use one of them")
 
     # Networks.
+
+    def network(self, hidden: tuple[int, ...], layer_norm: bool) -> Network:
+        return dataclasses.replace(super().network(hidden, layer_norm), unit_head=self.unit_head)
 
     def init(self, spec: Spec, tasks: Task, key: Key) -> SACState:
         """Return the initial state for the training ``tasks`` (T, ...)."""
@@ -201,13 +208,19 @@ class SAC(BaseAgent):
     def critic_target(self, actor: Params, critic: Params, target_critic: Params, batch: Batch, key: Key) -> Any:
         """Compute the critic target y (B, ...), in the form that ``value.loss`` takes."""
         action, _, cost = self.sample(actor, critic, batch, batch.next_obs, key)
-        outputs = self.q(target_critic, batch.features, batch.next_obs, action)
+        return self.bootstrap(self.q(target_critic, batch.features, batch.next_obs, action), batch, cost)
+
+    def bootstrap(self, outputs: Array, batch: Batch, cost: Array) -> Any:
+        """Compute the critic target from the target critics' ``outputs`` (N, B, outputs) at the next states."""
         bonus = -batch.temperature * cost
         return self.value.target(outputs, self.critic_reduction == "min", batch.reward, batch.discount, bonus)
 
     def critic_loss(self, critic: Params, data: tuple[Batch, Any]) -> tuple[Array, Metrics]:
         batch, target = data
-        outputs = self.q(critic, batch.features, batch.obs, batch.action)
+        return self.fitting_loss(self.q(critic, batch.features, batch.obs, batch.action), target, critic, batch)
+
+    def fitting_loss(self, outputs: Array, target: Any, critic: Params, batch: Batch) -> tuple[Array, Metrics]:
+        """Compute the critic loss of ``outputs`` (N, B, outputs) for a result of ``bootstrap``."""
         loss = jnp.mean(jnp.sum(self.value.loss(outputs, target), axis=0))
         values, expected = self.value.mean(outputs), self.value.expected(target)
         td_error = jnp.mean(jnp.abs(values - expected))
@@ -217,7 +230,11 @@ class SAC(BaseAgent):
 
     def actor_loss(self, actor: Params, data: tuple[Batch, Params, Key]) -> tuple[Array, Metrics]:
         batch, critic, key = data
-        action, log_prob, cost = self.sample(actor, critic, batch, batch.obs, key)
+        return self.policy_loss(self.sample(actor, critic, batch, batch.obs, key), critic, batch)
+
+    def policy_loss(self, sample: Sample, critic: Params, batch: Batch) -> tuple[Array, Metrics]:
+        """Compute the actor loss of actions sampled at a batch's observations."""
+        action, log_prob, cost = sample
         values = self.values(critic, batch.features, batch.obs, action)
         value = minimum(values) if self.critic_reduction == "min" else jnp.mean(values, axis=0)
         loss = jnp.mean(batch.temperature * cost - value)
@@ -246,6 +263,7 @@ class SAC(BaseAgent):
         critic, critic_memory = descent.descend(
             self.optimizers.critic, critic_step.gradients, state.optimizers.critic, state.critic
         )
+        critic = with_statistics(critic, critic_step.aux)
         critic_rule = surgery.adapt_rule(self.gradients, loss, critic, data, critic_step)
 
         improve = lambda state: self.improve(state, critic, batch, combine, actor_key, actor_order)
@@ -278,6 +296,7 @@ class SAC(BaseAgent):
         actor, actor_memory = descent.descend(
             self.optimizers.actor, step.gradients, state.optimizers.actor, state.actor
         )
+        actor = with_statistics(actor, step.aux)
 
         action_size = action_sizes(batch.action, batch.mask)
         slope = jax.grad(self.temperature_loss)(state.log_temperature, step.aux["entropy"], action_size)
@@ -332,6 +351,11 @@ class SAC(BaseAgent):
             return self.actor_loss(actor, (batch, Params(critic.shared, own_critic), key))
 
         return loss, (batch, critic.own, jax.random.split(key, len(batch.temperature)))
+
+
+def with_statistics(params: Params, aux: Metrics) -> Params:
+    """Take the running statistics that a loss found, if any, out of ``aux``, and return parameters that have them."""
+    return params._replace(own=params.own | aux.pop("statistics", {}))  # type: ignore
 
 
 def action_sizes(action: Array, mask: Array | None) -> int | Array:

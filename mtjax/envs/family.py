@@ -125,11 +125,9 @@ class Tabled(abc.ABC):
         """Make a call out of XLA for a program that was traced in another process, and return its name."""
         return self.parts[part].family.outside.provide(*about)
 
-    def load_kernels(self) -> None:
-        """Compile or load what runs outside XLA."""
-        for part in self.parts:
-            if part.family.outside:
-                part.family.outside.load_kernels()
+    def load_kernels(self) -> bool:
+        """Compile or load what runs outside XLA. Return whether XLA must compile nothing while programs first run."""
+        return any([part.family.outside.load_kernels() for part in self.parts if part.family.outside])
 
     def tasks(self, split: str = "train") -> Task:
         """Return the tasks of a split: "train", "interpolation", "extrapolation", or "all" in this order."""

@@ -75,10 +75,13 @@ def trace(function: Any, env: Any, agent: Any, setting: Any, *arguments: Any) ->
     return traced.trace(env, function, _DONATED[function], static, arguments)
 
 
-def load_kernels(env: Any) -> None:
-    """Compile or load what an environment runs outside XLA. XLA may compile meanwhile."""
-    if isinstance(env, Tabled):
-        env.load_kernels()
+def load_kernels(env: Any) -> bool:
+    """Compile or load what an environment runs outside XLA. XLA may compile meanwhile.
+
+    Returns:
+        whether XLA must compile nothing while programs first run.
+    """
+    return isinstance(env, Tabled) and env.load_kernels()
 
 
 def sharded_shapes(mesh: Mesh | None, agent: Agent, shapes: TrainState) -> TrainState:

@@ -205,7 +205,8 @@ class _Run:
         pool.shutdown(wait=False)
         evaluate = lambda agents, number: score.result()(agents, everything, seeds, np.int32(number))
         programs = Programs(partial(compile_lowered(chunk.lower()), tasks), evaluate)
-        kernels.result()  # else the first chunk waits for them
+        if kernels.result():  # else the first chunk would wait for them
+            score.result()
         return programs, self._restore(shapes) if make is None else make.result()(tasks, seeds, knobs)
 
     def _describe(self, shapes: TrainState) -> None:

@@ -81,7 +81,7 @@ class C51(Scalar):
 
     def refuses(self, scaling: str) -> str:
         given = (self.value_low, self.value_high) != (C51.value_low, C51.value_high)
-        if given or scaling == "return":
+        if given or scaling in ("return", "return-std"):
             return ""
         return (
             f"reaches returns from {self.value_low:g} to {self.value_high:g}, and scaling={scaling} does not keep them "

@@ -82,8 +82,9 @@ class MujocoC:
                 host.register(name, partial(_run, weakref.ref(self), act))
         return self._names[act]
 
-    def load_kernels(self) -> None:
-        """Do nothing, as MuJoCo is compiled."""
+    def load_kernels(self) -> bool:
+        """Do nothing, as MuJoCo is compiled. Return False, as programs record nothing."""
+        return False
 
     @cached_property
     def _acts(self) -> dict[str, Callable]:

@@ -185,8 +185,13 @@ class Warp:
                 self._calls[key] = self._make_call(self._places[devices[0].alias, count].model, *key)
         return self._calls[key].name
 
-    def load_kernels(self) -> None:
-        """Compile or load all kernels of a step, before programs run that would wait for them."""
+    def load_kernels(self) -> bool:
+        """Compile or load all kernels of a step, before programs run that would wait for them.
+
+        Returns:
+            whether programs record CUDA graphs when they first run. XLA must then compile nothing at the same time: it
+            tries kernels out on the device, and both fail.
+        """
         import warp
         from mujoco.mjx.third_party import mujoco_warp
 
@@ -195,6 +200,7 @@ class Warp:
             with _ALONE, warp.ScopedDevice(device):
                 mujoco_warp.step(*self._places[device.alias, count])
                 warp.synchronize_device(device)
+        return jax.default_backend() != "cpu"
 
     def _make_place(self, device: Any, count: int) -> _Place:
         """Allocate Warp's memory for a number of worlds, with room for every possible contact."""

@@ -19,6 +19,7 @@ class Identity:
     """
 
     needs_features: ClassVar[bool] = False  # if so, conditioning=none is refused
+    has_statistics: ClassVar[bool] = False  # if so, only agents that keep running statistics of batches take it
 
     def __post_init__(self):
         parts.require_choices(self)

@@ -9,6 +9,7 @@ import optax
 
 from mtjax.agents import parts
 from mtjax.networks import Params
+from mtjax.sphere import to_unit
 from mtjax.types import Array, InputError
 
 Shape = Literal["constant", "linear", "cosine"]
@@ -18,7 +19,7 @@ def adam(rate: Any, weight_decay: Any, max_norm: Any, tune: str) -> optax.Gradie
     """Return Adam, or AdamW, on clipped gradients, for those parameters that ``tune`` names."""
     clip = optax.identity() if parts.is_zero(max_norm) else clip_to(max_norm)
     step = optax.adam(rate) if parts.is_zero(weight_decay) else optax.adamw(rate, weight_decay=weight_decay)
-    learn = optax.chain(clip, step)
+    learn = on_sphere(optax.chain(clip, step))
     if tune == "all":
         return learn
     return optax.partition({True: learn, False: optax.set_to_zero()}, lambda params: _learning(tune, params))
@@ -59,6 +60,24 @@ def _learning(tune: str, params: Params) -> Any:
         return part in names and "body" not in names[: names.index(part)]
 
     return jax.tree_util.tree_map_with_path(learns, params)
+
+
+def on_sphere(optimizer: optax.GradientTransformation) -> optax.GradientTransformation:
+    """Return an optimiser whose steps end on the unit sphere, for every leaf called ``direction``.
+
+    Such leaves are (..., inputs, outputs), and the weights of each output have length 1 after a step.
+    """
+
+    def stay(path: Any, update: Array, start: Array) -> Array:
+        if getattr(path[-1], "key", None) != "direction":
+            return update
+        return to_unit(start + update, axis=-2) - start
+
+    def step(updates: Any, state: Any, params: Any = None) -> tuple[Any, Any]:
+        updates, state = optimizer.update(updates, state, params)
+        return jax.tree_util.tree_map_with_path(stay, updates, params), state
+
+    return optax.GradientTransformation(optimizer.init, step)
 
 
 def clip_to(norm: Any) -> optax.GradientTransformation:

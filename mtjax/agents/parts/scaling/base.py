@@ -1,0 +1,59 @@
+"""``NoScaling`` is the interface of scalings, and the one that changes nothing."""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from mtjax.agents import parts
+from mtjax.networks import Params
+from mtjax.types import Array, Transition
+
+
+@dataclasses.dataclass(frozen=True)
+class NoScaling(parts.Watcher):
+    """Leaves rewards as they are. Every scaling is a class with these methods."""
+
+    def units(self, memory: Any, gamma: float | Array, bonus: Array) -> tuple[Array, Array] | None:
+        """Return each task's factor and offset (T,); None for 1 and 0.
+
+        Args:
+            bonus: (T,) or (1,), a |H| / 2: half of what the target entropy adds to the reward of a step.
+        """
+        return None
+
+    def rewards(self, memory: Any, batch: Transition, gamma: float | Array, bonus: Array) -> Array:
+        """Return the rewards (T, B) of a batch in each task's units; ``gamma`` is () or (T,)."""
+        units = self.units(memory, gamma, bonus)
+        if units is None:
+            return batch.reward
+        factor, offset = (x[:, None] for x in units)
+        gamma = gamma[:, None] if jnp.ndim(gamma) else gamma  # type: ignore
+        return factor * (batch.reward - (1 - gamma * batch.discount) * offset)
+
+    def begin(self) -> Any:
+        """Return the memory with which an episode begins; None for none."""
+        return None
+
+    def remember(self, memory: Any, reward: Array, gamma: float | Array) -> Any:
+        """Return the memory of an episode after a step."""
+        return memory
+
+    def renew(self, memory: Any, target: Array, critics: tuple[Params, ...]) -> tuple[Any, tuple[Params, ...]]:
+        """Update the memory by the targets (T, B) of an update, and rescale the critics to the new units."""
+        return memory, critics
+
+    def reset(self, memory: Any) -> Any:
+        """Return the memory for networks that begin anew."""
+        return memory
+
+
+class Moments(NamedTuple):
+    """Holds the mean and variance of rewards or of targets; they begin at 0 and 1."""
+
+    mean: Array  # (T,)
+    variance: Array  # (T,)
+
+    @staticmethod
+    def begin(num_tasks: int) -> "Moments":
+        return Moments(jnp.zeros(num_tasks), jnp.ones(num_tasks))

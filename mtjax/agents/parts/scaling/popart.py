@@ -1,0 +1,62 @@
+"""PopArt scales by the critics' targets."""
+
+import dataclasses
+
+import jax.numpy as jnp
+
+from mtjax.agents import parts
+from mtjax.agents.parts.scaling.base import Moments, NoScaling
+from mtjax.networks import Params
+from mtjax.types import Array
+
+
+@dataclasses.dataclass(frozen=True)
+class PopArt(NoScaling):
+    """Scales values to mean 0 and deviation 1 of the task's targets (van Hasselt et al. 2016, "Pop-Art").
+
+    With moving estimates m and s of targets y, critics fit (y - m) / s; when the estimates move, the heads of critics
+    and of target critics are rescaled so that m + s head(x) does not change (there, algorithm 1; per task as in Hessel
+    et al. 2019):
+        m' = m + b (mean(y) - m),  s'^2 = (1 - b) s^2 + b var(y) + b (1 - b) (mean(y) - m)^2
+        kernel' = kernel s / s',  bias' = (s bias + m - m') / s'
+    The paper's moving second moment is written here as a variance, which rounding cannot make negative. As in Hessel et
+    al., b = 3e-4, s is clipped to [1e-4, 1e6], and m = 0 and s = 1 at the start. The actor's loss uses the scaled
+    values, so that all tasks have one scale; temperatures are in these units too.
+
+    Differs from the papers: an update uses the units from before it, and each batch of a task's targets is one step of
+    the estimates. Adam's moments of the heads are not rescaled.
+    """
+
+    target_rate: float = 3e-4
+    """Weight of a new batch in the moving estimates of targets' mean and variance."""
+
+    def __post_init__(self):
+        parts.require_rates(self, "target_rate")
+
+    def init(self, num_tasks: int) -> Moments:
+        return Moments.begin(num_tasks)
+
+    @staticmethod
+    def std(memory: Moments) -> Array:
+        """Return the standard deviation (T,) that divides targets."""
+        return jnp.clip(jnp.sqrt(memory.variance), 1e-4, 1e6)
+
+    def units(self, memory: Moments, gamma: float | Array, bonus: Array) -> tuple[Array, Array]:
+        return 1 / self.std(memory), memory.mean
+
+    def renew(self, memory: Moments, target: Array, critics: tuple[Params, ...]):
+        rate, std = self.target_rate, self.std(memory)
+        drift = std * jnp.mean(target, axis=1)  # of the old mean, in reward
+        variance_now = jnp.square(std) * jnp.var(target, axis=1)
+        variance = (1 - rate) * memory.variance + rate * variance_now + rate * (1 - rate) * jnp.square(drift)
+        new = Moments(memory.mean + rate * drift, variance)
+        ratio = std / self.std(new)
+        shift = (new.mean - memory.mean) / self.std(new)  # by as much as the mean moved, rounding included
+
+        def adapt(params: Params) -> Params:
+            head = params.own["head"]  # kernel (T, N, D, 1), bias (T, N, 1)
+            kernel = ratio[:, None, None, None] * head["kernel"]
+            bias = ratio[:, None, None] * head["bias"] - shift[:, None, None]
+            return Params(params.shared, {**params.own, "head": {"kernel": kernel, "bias": bias}})
+
+        return new, tuple(adapt(params) for params in critics)

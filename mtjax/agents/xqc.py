@@ -1,0 +1,94 @@
+"""XQC trains soft actor-critic with batch normalisation, weight normalisation and categorical critics."""
+
+import dataclasses
+from typing import Annotated, Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from mtjax.agents.base import FLAT, Conditioning
+from mtjax.agents.parts.encoders import BatchNorm, Encoder
+from mtjax.agents.parts.scaling import ReturnNormalization, Scaling
+from mtjax.agents.parts.values import C51, Value
+from mtjax.agents.sac import SAC, Batch, Sample
+from mtjax.networks import Params, tanh_normal
+from mtjax.types import Array, Key, Metrics
+
+
+class Aim(NamedTuple):
+    """Holds what the critics' loss needs beside the batch."""
+
+    target: Any  # (B, ...) as ``Value.loss`` takes it
+    next_action: Array  # (B, A) of the policy
+
+
+@dataclasses.dataclass(frozen=True)
+class XQC(SAC):
+    """XQC is SAC whose critics are well conditioned (Palenicek et al. 2025, "XQC: well-conditioned optimization").
+
+    Batch normalisation, weight normalisation and the cross-entropy bound the critics' gradients and the condition
+    number of their Hessian:
+        every layer normalises the batch of a task, and its weights have length 1    (encoder=batch-norm, unit_head)
+        Q_n is a distribution over returns in [-5, 5], fitted by its cross-entropy   (value=c51)
+        rewards are divided by the standard deviation of returns                     (scaling=return-std)
+    Critics and target critics see both ends of the transitions as one batch (CrossQ; Bhatt et al. 2024):
+        [Q_n(s, a), Q_n(s', a')] = Q_n([s, s'], [a, a']),  a' ~ pi(s')
+    so that one mean and variance normalise both. The critics' first half is fitted to a target from the target critics'
+    second half. The policy normalises by the batch in its own loss. Elsewhere networks use the running statistics of
+    their task: the policy for a' and for acting, and critics in the policy's loss. Each part's class has its equations.
+
+    Differs from the authors' code:
+        Rates: by default learning rates stay at 3e-4; there they fall to 3e-5 (lr_schedule=linear, lr_final=0.1). By
+        default actor and temperatures learn at every update; there, at every third (policy_delay=3).
+        Size: actor and critics have the widths ``hidden``; there, critics have four layers of 512 and the actor four
+        of 256 (critic_hidden=(512, 512, 512, 512), actor_hidden=(256, 256, 256, 256)).
+        Tasks: networks see the task's parameters, and every task has its own temperature and statistics; there is one
+        task there.
+        Rewards: the largest return fits the range too; there, the standard deviation alone divides.
+        Actor: log standard deviations lie in [-5, 2] by a tanh; there, they are clipped to [-10, 2].
+        ``BatchNorm`` describes how the task enters, and the initial weights.
+    """
+
+    fits_statistics: ClassVar[bool] = True
+    actor_lr: float = 3e-4
+    critic_lr: float = 3e-4
+    temperature_lr: float = 3e-4
+    initial_temperature: float = 0.01
+    conditioning: Conditioning = "parameters"
+    unit_head: bool = True
+    encoder: Annotated[Encoder, FLAT] = dataclasses.field(default_factory=BatchNorm)
+    value: Annotated[Value, FLAT] = dataclasses.field(default_factory=lambda: C51(value_low=-5.0, value_high=5.0))
+    scaling: Annotated[Scaling, FLAT] = dataclasses.field(default_factory=ReturnNormalization)
+
+    # Losses of one task.
+
+    def q_of_both(self, critic: Params, batch: Batch, next_action: Array) -> tuple[Array, Array, Any]:
+        """Apply every critic to both ends of the transitions as one batch.
+
+        Returns:
+            outputs (N, B, outputs) at (s, a), those at (s', a'), and new statistics (N, ...).
+        """
+        join = lambda now, later: jnp.concatenate([now, later])
+        obs = jax.tree.map(join, batch.obs, batch.next_obs)
+        features = join(batch.features, batch.features) if batch.features.ndim == 2 else batch.features
+        outputs, found = self.of_critics(self.critic.fit, critic, features, obs, join(batch.action, next_action))
+        now, later = jnp.split(outputs, 2, axis=1)
+        return now, later, found
+
+    def critic_target(self, actor: Params, critic: Params, target_critic: Params, batch: Batch, key: Key) -> Aim:
+        action, _, cost = self.sample(actor, critic, batch, batch.next_obs, key)
+        _, outputs, _ = self.q_of_both(target_critic, batch, action)
+        return Aim(self.bootstrap(outputs, batch, cost), action)
+
+    def critic_loss(self, critic: Params, data: tuple[Batch, Aim]) -> tuple[Array, Metrics]:
+        batch, aim = data
+        outputs, _, found = self.q_of_both(critic, batch, aim.next_action)
+        loss, metrics = self.fitting_loss(outputs, aim.target, critic, batch)
+        return loss, metrics | {"statistics": found}
+
+    def actor_loss(self, actor: Params, data: tuple[Batch, Params, Key]) -> tuple[Array, Metrics]:
+        batch, critic, key = data
+        outputs, found = self.actor.fit(actor, *self.actor_inputs(critic, batch.features, batch.obs))
+        action, log_prob = tanh_normal(outputs, key, batch.mask)
+        loss, metrics = self.policy_loss(Sample(action, log_prob, log_prob), critic, batch)
+        return loss, metrics | {"statistics": found}
