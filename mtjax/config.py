@@ -150,6 +150,12 @@ def require_value_range(agent: Any) -> None:
             raise InputError(f"value={name_of(VALUES, agent.value)} {reason}")
 
 
+def wants_gpu(env_name: str) -> bool:
+    """Return whether a CPU was not seen to learn a family, or one of a mixture, within minutes."""
+    slow = tomllib.loads((resources.files("mtjax") / "configs" / "default.toml").read_text())["wants_gpu"]
+    return not set(slow).isdisjoint(env_name.split("+"))
+
+
 def load_preset(env_name: str, name: str) -> dict[str, Any]:
     """Read the tables of a preset from the family's file, else the domain's file, else the default file.
 

@@ -24,7 +24,7 @@ from mtjax.agents import AGENTS
 from mtjax.agents import settings as settings_of
 from mtjax.agents.base import CHOICES
 from mtjax.agents.parts.representations import DeepMDP
-from mtjax.config import from_json, load_preset, to_json, with_preset
+from mtjax.config import from_json, load_preset, to_json, wants_gpu, with_preset
 from mtjax.envs import ENVS
 from mtjax.loop import Settings
 from mtjax.training import launch
@@ -160,6 +160,7 @@ def test_repeating_flags_name_the_file_of_vectors(tmp_path):
 def test_presets_name_only_what_there_is(file):
     """A word that is misspelt in a preset would otherwise be left out without a sign."""
     preset = tomllib.loads(file.read_text())
+    assert set(preset.pop("wants_gpu", ())) <= set(ENVS)
     assert set(preset) == {"cpu", "gpu"}
     fields = lambda cls: {field.name for field in dataclasses.fields(cls)}
     known = {"plan": fields(Plan), "agent": set(settings_of(mtjax.agent("sac")))}
@@ -440,3 +441,9 @@ def test_unusable_names_are_input_errors_in_the_library():
         mtjax.agent("sacc")
     with pytest.raises(InputError, match="unknown setting of sac 'hiden'; did you mean 'hidden'"):
         mtjax.agent("sac", hiden=(3,))
+
+
+def test_a_family_that_a_cpu_does_not_learn_is_known():
+    """Alone and in a mixture."""
+    assert wants_gpu("hopper-hop") and not wants_gpu("finger-spin")
+    assert wants_gpu("finger-spin+hopper-hop") and not wants_gpu("finger-spin+cheetah-run")

@@ -3,8 +3,10 @@
 import dataclasses
 from pathlib import Path
 
+import jax
+
 from mtjax.agents.parts.conditioning import load_vectors
-from mtjax.config import RunConfig, require_value_range
+from mtjax.config import RunConfig, require_value_range, wants_gpu
 from mtjax.envs import Family
 from mtjax.parallel import hosts, mesh
 from mtjax.training import points
@@ -50,6 +52,8 @@ def launch(config: RunConfig, directory: Path, start: Policy | None, resume: boo
     origin = f"{_origin(config)}run: {directory}"
     if resume and "warp" in config.family.engine_name:
         origin += "\nMuJoCo Warp does not repeat bit for bit: the run goes on from its state, in other numbers"
+    if jax.default_backend() == "cpu" and wants_gpu(config.env):
+        origin += f"\n{config.env} wants a GPU: two CPU cores were not seen to learn it in seven minutes"
     plan = config.plan
     if resume and config.learner.lr_schedule != "constant" and not config.learner.lr_updates:
         origin += f"\nlearning rates go on along the schedule of a run of {plan.steps:,} steps"
