@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from report import markdown
 
-from mtjax.agents.base import replace
+from mtjax.agents.choices import replace
 from mtjax.config import configure, with_preset
 from mtjax.envs import Family
 from mtjax.evaluation import evaluate, save_evaluations

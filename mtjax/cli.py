@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mtjax.agents import settings
-from mtjax.agents.base import CHOICES, flag_names
+from mtjax.agents.choices import CHOICES, flag_names
 from mtjax.commands import check_names, flag_value, import_files, parse_with_tyro, unknown_flag
 from mtjax.config import NO_FINE_TUNING, RunConfig, from_json, with_preset
 from mtjax.envs import make

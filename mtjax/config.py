@@ -14,7 +14,7 @@ import jax
 import tyro
 
 from mtjax.agents import BaseAgent, agent, preset_of, settings
-from mtjax.agents.base import kinds_of, replace
+from mtjax.agents.choices import kinds_of, replace
 from mtjax.agents.parts import name_of
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.values import VALUES

@@ -4,7 +4,8 @@ import dataclasses
 from typing import Any
 
 from mtjax import agents, envs
-from mtjax.agents.base import CHOICES, PARTS, BaseAgent
+from mtjax.agents.base import BaseAgent
+from mtjax.agents.choices import CHOICES, PARTS
 from mtjax.envs.family import Family
 from mtjax.names import InputError, first_sentence
 

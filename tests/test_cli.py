@@ -22,7 +22,7 @@ import mtjax.train
 from mtjax import cli, commands
 from mtjax.agents import AGENTS
 from mtjax.agents import settings as settings_of
-from mtjax.agents.base import CHOICES
+from mtjax.agents.choices import CHOICES
 from mtjax.agents.parts.representations import DeepMDP
 from mtjax.config import from_json, load_preset, to_json, wants_gpu, with_preset
 from mtjax.envs import ENVS

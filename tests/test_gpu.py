@@ -12,7 +12,7 @@ from probes import random_batch
 import mtjax
 from mtjax import rollout
 from mtjax.agents import AGENTS
-from mtjax.agents.base import replace
+from mtjax.agents.choices import replace
 from mtjax.agents.ppo import Taken
 from mtjax.envs.engines.base import World
 from mtjax.envs.engines.mjx import Mjx

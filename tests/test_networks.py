@@ -126,7 +126,7 @@ def test_care_is_its_equations(data, variant, with_action):
     """The mixture by a loop over samples and experts."""
     obs, action, features = data
     actions = (action,) if with_action else ()
-    module = Mixture(3, (6, 4), variant, 3.0, (7,), layer_norm=True)
+    module = Mixture(3, (6, 4), variant, 3.0, False, (7,), layer_norm=True)
     params = jiggle(jax.eval_shape(module.init, jax.random.key(0), obs, features, *actions))
     p = jax.tree.map(np.asarray, params["params"])
     dense = lambda layer, x: x @ layer["kernel"] + layer["bias"]
@@ -149,7 +149,9 @@ def test_care_is_its_equations(data, variant, with_action):
 
 def test_layer_norm_is_in_the_trunk_alone(data):
     """The setting is the critic's; encoders have none."""
-    params = Mixture(2, (4,), "paper", 2.0, (7,), layer_norm=True).init(jax.random.key(0), data[0], data[2])["params"]
+    params = Mixture(2, (4,), "paper", 2.0, False, (7,), layer_norm=True).init(jax.random.key(0), data[0], data[2])[
+        "params"
+    ]
     has_norm = {name for name, part in params.items() if any("LayerNorm" in key for key in part)}
     assert has_norm == {"trunk"}
 

@@ -6,11 +6,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from mtjax.names import lazily, load, nearest_error
 
 if TYPE_CHECKING:
-    from mtjax.agents.base import PARTS, BaseAgent, settings
+    from mtjax.agents.base import BaseAgent
+    from mtjax.agents.choices import PARTS, settings
     from mtjax.agents.sac import SAC
 
-_BASE = "mtjax.agents.base"
-__getattr__ = lazily(__name__, {"PARTS": _BASE, "BaseAgent": _BASE, "settings": _BASE, "SAC": "mtjax.agents.sac"})
+_PLACES = {"PARTS": "choices", "settings": "choices", "BaseAgent": "base", "SAC": "sac"}
+__getattr__ = lazily(__name__, {name: f"mtjax.agents.{place}" for name, place in _PLACES.items()})
 
 
 class Preset(NamedTuple):
@@ -76,7 +77,7 @@ def agent(name: str, **given: Any) -> "BaseAgent":
     defaults = dict(preset.defaults)
     if "encoder" in given:  # the preset's settings of another encoder do not apply
         defaults = {k: v for k, v in defaults.items() if k in preset.cls.__dataclass_fields__}
-    return load(f"{_BASE}:build")(name, preset.cls, {**defaults, **given})
+    return load("mtjax.agents.choices:build")(name, preset.cls, {**defaults, **given})
 
 
 def preset_of(name: str) -> Preset:

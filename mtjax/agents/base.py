@@ -2,9 +2,9 @@
 
 import abc
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, get_args, get_type_hints
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, get_args
 
 import jax
 import jax.numpy as jnp
@@ -12,16 +12,15 @@ import tyro
 
 from mtjax import normalize
 from mtjax.agents import parts
+from mtjax.agents.choices import FLAT, PARTS, kinds_of
 from mtjax.agents.parts import conditioning, trajectory
-from mtjax.agents.parts.encoders import ENCODERS, Encoder
+from mtjax.agents.parts.encoders import Encoder
 from mtjax.agents.parts.gradients import descent, surgery
 from mtjax.agents.parts.representations import REPRESENTATIONS, Place, Representation
-from mtjax.agents.parts.samplers import SAMPLERS, Sampler
+from mtjax.agents.parts.samplers import Sampler
 from mtjax.agents.parts.scaling import SCALINGS, Scaling
 from mtjax.agents.parts.trajectory import Past, Seen, TrajectoryEncoder
-from mtjax.agents.parts.values import VALUES
-from mtjax.experience import EXPERIENCES, Replay, multistep
-from mtjax.names import frozen, nearest_error
+from mtjax.experience import Replay, multistep
 from mtjax.networks import Network, Params
 from mtjax.types import Acted, Array, Env, InputError, Key, Metrics, Outcome, Spec, Task, Transition
 
@@ -29,19 +28,6 @@ Conditioning = Literal["none", "one-hot", "embedding", "parameters", "vectors", 
 CONDITIONINGS = get_args(Conditioning)
 Heads = Literal["shared", "per-task", "disjoint"]
 Tune = Literal["all", "heads", "embedding"]
-
-PARTS: dict[str, Mapping[str, type]] = {
-    "representation": REPRESENTATIONS,
-    "encoder": ENCODERS,
-    "gradients": surgery.RULES,
-    "value": VALUES,
-    "scaling": SCALINGS,
-    "sampler": SAMPLERS,
-    "experience": EXPERIENCES,
-}
-CHOICES = tuple(kind for kind in PARTS if kind != "experience")
-"""The kinds of parts that a user chooses by name; the kind of experience follows from the agent."""
-FLAT = tyro.conf.arg(name="")  # a part's fields become flags of the agent; the part is chosen before tyro parses
 
 
 class Memory(NamedTuple):
@@ -479,63 +465,3 @@ class BaseAgent(abc.ABC):
     def learn(self, env: Env, states: Any, data: Any, tasks: Task, keys: Key) -> tuple[Any, Metrics]:
         """Update the agents of all seeds, leaves (S, ...), from their experience."""
         return self.experience.learn(env, self, states, data, tasks, keys)
-
-
-def kinds_of(agent: Any) -> list[str]:
-    """List the kinds of parts that an agent, or a class of agents, has."""
-    return [field.name for field in dataclasses.fields(agent) if field.name in PARTS]
-
-
-def flag_names(agent: Any) -> dict[str, str]:
-    """Map the name of each of an agent's settings to its command-line flag, without dashes."""
-    bare = {name for holder in (agent, agent.experience) for name in _unprefixed(type(holder))}
-    names = {name: name.replace("_", "-") for name in settings(agent) if name != "experience"}
-    return {name: flag if name in bare else f"agent.{flag}" for name, flag in names.items()}
-
-
-def _unprefixed(cls: type) -> list[str]:
-    """List the settings of a class whose flags have no prefix ``agent.``."""
-    hints = get_type_hints(cls, include_extras=True)
-    marks = {name: getattr(hint, "__metadata__", ()) for name, hint in hints.items()}
-    return [name for name, found in marks.items() if any(getattr(x, "prefix_name", None) is False for x in found)]
-
-
-def settings(agent: Any) -> dict[str, Any]:
-    """Return all of an agent's settings in one flat table: each part by name, followed by the part's settings."""
-    found = {}
-    for name, value in parts.settings(agent).items():
-        found |= {name: parts.name_of(PARTS[name], value), **parts.settings(value)} if name in PARTS else {name: value}
-    return found
-
-
-def replace(agent: Any, given: Mapping[str, Any]) -> Any:
-    """Return a copy of an agent with other settings, of its own or of its parts.
-
-    Raises:
-        InputError: it has no such setting, or the value is not allowed.
-    """
-    rest, fields = frozen(given), {field.name for field in dataclasses.fields(agent)}
-    chosen = {kind: parts.take(rest, getattr(agent, kind)) for kind in kinds_of(agent) if kind not in rest}
-    unknown = next((name for name in rest if name not in fields), None)
-    if unknown is not None:
-        raise nearest_error("setting", unknown, settings(agent))
-    return dataclasses.replace(agent, **rest, **chosen)
-
-
-def build(name: str, cls: type, given: Mapping[str, Any]) -> Any:
-    """Make the agent called ``name`` from a flat table of settings.
-
-    Raises:
-        InputError: a setting is neither the agent's nor one of its parts', or its value is not allowed.
-    """
-    rest = frozen(given)
-    fields = {field.name: field for field in dataclasses.fields(cls)}
-    chosen = {}
-    for kind in kinds_of(cls):
-        part = parts.choose(kind, PARTS[kind], rest.pop(kind, None) or fields[kind].default_factory())  # type: ignore
-        chosen[kind] = parts.take(rest, part)
-    unknown = next((name for name in rest if name not in fields), None)
-    if unknown is not None:
-        known = [*fields, *(name for part in chosen.values() for name in parts.settings(part))]
-        raise nearest_error(f"setting of {name}", unknown, known)
-    return cls(**rest, **chosen)

@@ -3,7 +3,8 @@
 import dataclasses
 from typing import Annotated, Literal
 
-from mtjax.agents.base import FLAT, Conditioning
+from mtjax.agents.base import Conditioning
+from mtjax.agents.choices import FLAT
 from mtjax.agents.parts.encoders import BroNet, Encoder
 from mtjax.agents.parts.scaling import ReturnScaling, Scaling
 from mtjax.agents.parts.values import C51, Value

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents import parts
-from mtjax.agents.base import PARTS, Heads
+from mtjax.agents.base import Heads
+from mtjax.agents.choices import PARTS
 from mtjax.agents.sac import SAC, Batch, Sample
 from mtjax.networks import Network, Params, divergence, log_density, sample_raw
 from mtjax.types import Array, InputError, Key, Metrics

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 
 from mtjax import normalize
 from mtjax.agents import parts
-from mtjax.agents.base import FLAT, BaseAgent, Memory, Pair
+from mtjax.agents.base import BaseAgent, Memory, Pair
+from mtjax.agents.choices import FLAT
 from mtjax.agents.parts.gradients import descent, surgery
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS

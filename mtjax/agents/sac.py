@@ -12,7 +12,8 @@ import optax
 
 from mtjax import normalize
 from mtjax.agents import parts
-from mtjax.agents.base import FLAT, BaseAgent, Memory, Pair
+from mtjax.agents.base import BaseAgent, Memory, Pair
+from mtjax.agents.choices import FLAT
 from mtjax.agents.parts.gradients import descent, surgery
 from mtjax.agents.parts.representations import REPRESENTATIONS
 from mtjax.agents.parts.scaling import SCALINGS

@@ -6,7 +6,8 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mtjax.agents.base import FLAT, Conditioning
+from mtjax.agents.base import Conditioning
+from mtjax.agents.choices import FLAT
 from mtjax.agents.parts.encoders import BatchNorm, Encoder
 from mtjax.agents.parts.scaling import ReturnNormalization, Scaling
 from mtjax.agents.parts.values import C51, Value

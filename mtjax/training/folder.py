@@ -16,7 +16,7 @@ import jax
 
 from mtjax import __version__
 from mtjax.agents import settings
-from mtjax.agents.base import flag_names
+from mtjax.agents.choices import flag_names
 from mtjax.config import RunConfig, from_json, import_flags
 from mtjax.envs.family import Family, Tabled
 from mtjax.types import InputError

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mtjax.agents import BaseAgent, parts
-from mtjax.agents.base import kinds_of
+from mtjax.agents.choices import kinds_of
 from mtjax.names import nearest_error
 from mtjax.types import Acted, Array, Env, Experience, InputError, Key, Metrics, Outcome, Spec, Task, Transition
 
