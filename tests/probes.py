@@ -118,7 +118,8 @@ OFF_POLICY = [name for name, preset in agents.AGENTS.items() if issubclass(prese
 
 def one_in(count, cases):
     """All cases as a test's parameters, marked slow but for one in ``count``."""
-    return [pytest.param(case, marks=[pytest.mark.slow] if i % count else []) for i, case in enumerate(cases)]
+    values = lambda case: case if isinstance(case, tuple) else (case,)
+    return [pytest.param(*values(x), marks=[pytest.mark.slow] if i % count else []) for i, x in enumerate(cases)]
 
 
 def slow_but(names, *quick):

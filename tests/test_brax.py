@@ -107,6 +107,7 @@ def test_nominal_parameters_give_the_trajectory_of_brax(env):
     assert ours.reward.dtype == np.float32 and ours.terminated.dtype == bool
 
 
+@pytest.mark.slow
 def test_a_fall_terminates():
     """Random pushes topple the pendulum within twenty steps, and not at the first."""
     terminated = rollout(PENDULUM_MJX).terminated[:, 0]

@@ -11,6 +11,7 @@ from probes import (
     Probe,
     learner,
     of_task,
+    one_in,
     only_seed,
     pick,
     random_batch,
@@ -291,12 +292,15 @@ def test_the_actor_does_not_move_the_critics_parameters():
 
 @pytest.mark.parametrize(
     ("name", "settings"),
-    [
-        ("deepmdp", {}),
-        ("deepmdp", {"conditioning": "inferred", "inferred_from": 2}),
-        ("hip-bmdp", {"transition": "probabilistic", **INFERRED}),
-        ("hip-bmdp", {"heads": "disjoint", "value": "c51"}),
-    ],
+    one_in(
+        2,
+        [
+            ("deepmdp", {}),
+            ("deepmdp", {"conditioning": "inferred", "inferred_from": 2}),
+            ("hip-bmdp", {"transition": "probabilistic", **INFERRED}),
+            ("hip-bmdp", {"heads": "disjoint", "value": "c51"}),
+        ],
+    ),
 )
 def test_everything_that_should_learn_does(name, settings):
     """After ten updates no leaf is where it began, nor any task's part of it, and shapes are as they were."""
@@ -482,7 +486,7 @@ def test_values_are_learned_through_the_slow_encoder():
     ],
     ids=lambda x: "-".join(map(str, x.values())),
 )
-@pytest.mark.parametrize("name", ["deepmdp", "hip-bmdp"])
+@pytest.mark.parametrize("name", slow_but(["deepmdp", "hip-bmdp"], "hip-bmdp"))
 def test_parts_combine(name, settings):
     """Traced over two seeds, not run: an update keeps shapes and types, and there is an action for each world."""
     settings = {k: v for k, v in settings.items() if name == "hip-bmdp" or k != "unseen_theta"}
@@ -506,8 +510,10 @@ def test_the_agents_are_sac_with_that_part():
     assert agents.agent("hip-bmdp") == agents.agent("sac", representation="hip-bmdp", **theta)
 
 
-@pytest.mark.parametrize("representation", ["deepmdp", "hip-bmdp"])
-@pytest.mark.parametrize("name", ["sac", "care", "soft-modularization", "multi-head", "disjoint", "brc", "cagrad"])
+@pytest.mark.parametrize("representation", slow_but(["deepmdp", "hip-bmdp"], "deepmdp"))
+@pytest.mark.parametrize(
+    "name", one_in(2, ["sac", "care", "soft-modularization", "multi-head", "disjoint", "brc", "cagrad"])
+)
 def test_other_agents_stand_on_it(name, representation):
     """Traced, not run: actor and critics on latent states, one encoder and one of each model beside them."""
     agent, batch = make(name, representation=representation), random_batch(0, 3, BATCH, SPEC)

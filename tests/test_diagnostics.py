@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import matplotlib.image
 import numpy as np
 import pytest
-from probes import OFF_POLICY, QUICK, learner, of_task, pick, random_batch, tasks_of, tiny
+from probes import OFF_POLICY, QUICK, learner, of_task, one_in, pick, random_batch, slow_but, tasks_of, tiny
 
 import mtjax
 import mtjax.evaluate
@@ -250,7 +250,7 @@ def trace(agent):
     return state, gradients, seen
 
 
-@pytest.mark.parametrize("name", OFF_POLICY)
+@pytest.mark.parametrize("name", one_in(3, OFF_POLICY))
 def test_every_agent_has_diagnostics(name):
     """Matrices unless it is disjoint, TD errors for each task, and layers of both networks."""
     agent = tiny(name)
@@ -263,7 +263,7 @@ def test_every_agent_has_diagnostics(name):
     assert gradients["td_error"].shape == (3,)
 
 
-@pytest.mark.parametrize("encoder", ENCODERS)
+@pytest.mark.parametrize("encoder", one_in(3, ENCODERS))
 def test_units_of_every_encoder_are_seen(encoder):
     """Layers of the right number of networks, all of ReLUs."""
     agent = tiny("xqc" if encoder == "batch-norm" else "sac", encoder=encoder, conditioning="one-hot", hidden=(16, 16))
@@ -346,7 +346,7 @@ def no_episodes(monkeypatch):
     monkeypatch.setattr(scoring, "score", empty)
 
 
-@pytest.mark.parametrize("name", ["sac-conditioned", "pcgrad", "disjoint"])
+@pytest.mark.parametrize("name", slow_but(["sac-conditioned", "pcgrad", "disjoint"], "pcgrad"))
 def test_program_writes_and_prints_diagnostics(name, copied_run, run_of, no_episodes, capsys):
     """For a trained agent, for one by whose rule gradients combine, and for one that shares nothing."""
     if name != "sac-conditioned":

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import learner, quick, random_batch, tasks_of, tiny
+from probes import learner, one_in, quick, random_batch, tasks_of, tiny
 
 from mtjax.agents import agent
 from mtjax.agents.parts.encoders import ENCODERS
@@ -454,7 +454,7 @@ AGENTS = {name: ("sac", {"encoder": PARTS[name][0], **PARTS[name][1], **TOLD}) f
 AGENTS |= {name: (name, {"hidden": (6,)}) for name in ("film", "moe", "moore")}
 
 
-@pytest.mark.parametrize("name", AGENTS)
+@pytest.mark.parametrize("name", one_in(2, AGENTS))
 def test_agents_of_these_parts_have_the_right_shapes(name):
     """Traced, under a map over seeds: an update keeps the state's shapes, also where gradients are combined."""
     base, settings = AGENTS[name]

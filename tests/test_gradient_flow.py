@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import OFF_POLICY, learner, pick, random_batch, tasks_of, tiny
+from probes import OFF_POLICY, learner, pick, random_batch, slow_but, tasks_of, tiny
 from probes import act as act_once
 
 from mtjax.agents.parts.encoders.care import Mixture
@@ -62,10 +62,9 @@ PARTS = {
     "gradnorm": ("gradnorm", {}, TRUNK),
     "famo": ("famo", {}, TRUNK),
 }
-VARIANTS = [case for case in PARTS if case not in OFF_POLICY]  # of agents that are in the table by their own names
-EVERY_AGENT = pytest.mark.parametrize(
-    "case", [pytest.param(case, marks=[pytest.mark.slow] if case in VARIANTS else []) for case in PARTS]
-)
+ALIKE = ("cagrad", "gradnorm", "famo")  # with pcgrad's networks
+QUICK = [case for case in PARTS if case in OFF_POLICY and case not in ALIKE]  # others are variants of these
+EVERY_AGENT = pytest.mark.parametrize("case", slow_but(PARTS, *QUICK))
 
 
 def start(case, seed=0):

@@ -223,6 +223,7 @@ def run(tmp_path_factory):
     return directory
 
 
+@pytest.mark.slow
 def test_a_run_is_loaded_with_its_past(run):
     """The policy remembers; without a memory, an episode counts as just begun. Films play it from there."""
     policy = mtjax.load(run)

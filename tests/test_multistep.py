@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import Goals, Stub, Walk, pick, quick, random_batch, random_past, tasks_of, tiny, train
+from probes import Goals, Stub, Walk, one_in, pick, quick, random_batch, random_past, tasks_of, tiny, train
 
 from mtjax.agents.parts.trajectory import append
 from mtjax.experience import Replay, multistep
@@ -205,7 +205,9 @@ def test_the_past_at_the_bootstrap_is_that_of_the_windows_last_step():
             jax.tree.map(np.testing.assert_array_equal, pick(ours, (task, b)), theirs)
 
 
-@pytest.mark.parametrize("settings", [{}, {"conditioning": "inferred", "inferred_from": 2}], ids=["plain", "inferred"])
+@pytest.mark.parametrize(
+    "settings", one_in(2, [{}, {"conditioning": "inferred", "inferred_from": 2}]), ids=["plain", "inferred"]
+)
 def test_an_agent_learns_from_joined_steps(settings):
     """The whole update runs, for two seeds in one program."""
     given = {"num_envs": 2, "batch_size": 4, "replay_size": 40, "warmup_steps": 3, "chunk_steps": 8, "n_step": 3}

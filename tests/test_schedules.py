@@ -6,7 +6,7 @@ import numpy as np
 import optax
 import pytest
 from conftest import SHORT_RUN
-from probes import Walk, quick, random_batch, tasks_of, tiny, train
+from probes import Walk, one_in, quick, random_batch, tasks_of, tiny, train
 
 import mtjax.train
 from mtjax.agents.parts.gradients.descent import schedule
@@ -57,7 +57,7 @@ AGENTS = {
 }
 
 
-@pytest.mark.parametrize(("name", "chunk", "given", "expected"), AGENTS.values(), ids=AGENTS)
+@pytest.mark.parametrize(("name", "chunk", "given", "expected"), one_in(3, AGENTS.values()), ids=AGENTS)
 def test_a_schedule_ends_with_the_run(name, chunk, given, expected):
     """All rates are 0 then, and not before: the last updates change what the next would not."""
     agent, settings = tiny(name, lr_schedule="linear"), {"eval_episodes": 1, "chunk_steps": chunk}
@@ -73,6 +73,7 @@ def test_a_schedule_ends_with_the_run(name, chunk, given, expected):
     assert not any(jax.tree.leaves(jax.tree.map(np.array_equal, networks(soon), networks(state))))
 
 
+@pytest.mark.slow
 def test_a_share_that_is_swept_is_the_one_of_each_point():
     """A final share of 1 takes the steps of constant rates; one of 0, at the end, takes none."""
     plain, planned = tiny("sac"), tiny("sac", lr_schedule="cosine", lr_updates=1)
@@ -93,6 +94,7 @@ def test_a_share_that_is_swept_is_the_one_of_each_point():
         jax.tree.map(close, (found.actor, found.critic, found.log_temperature), (expected[0], expected[1], expected[3]))
 
 
+@pytest.mark.slow
 def test_a_run_that_goes_on_for_longer_says_so(short_family, tmp_path, capsys):
     """Its rates are those of a run of the new length; policies load without knowing the length of their run."""
     words = [*SHORT_RUN, "--agent.lr-schedule=cosine", "--agent.lr-final=0.1", "--agent.lr-warmup=5", "--steps=200"]

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from probes import learner, random_batch, tasks_of, tiny
+from probes import learner, random_batch, slow_but, tasks_of, tiny
 
 from mtjax.agents import agent
 from mtjax.agents.parts.encoders import Hypersphere
@@ -82,7 +82,7 @@ def test_what_is_not_tuned_stays_to_the_bit():
     np.testing.assert_allclose(lengths(after.shared["head"]["direction"]), 1, rtol=1e-6)
 
 
-@pytest.mark.parametrize("heads", ["shared", "per-task", "disjoint"])
+@pytest.mark.parametrize("heads", slow_but(["shared", "per-task", "disjoint"], "per-task"))
 def test_weights_begin_and_stay_on_the_sphere(heads):
     """Every unit of actor and critics, outputs too; and target critics lie inside, as means of such weights."""
     made = tiny("simba-v2", heads=heads, weight_decay=0.1, actor_lr=0.1, critic_lr=0.1)

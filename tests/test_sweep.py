@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import SHORT_RUN
-from probes import QUICK, Walk, random_batch, tasks_of, tiny
+from probes import QUICK, Walk, one_in, random_batch, tasks_of, tiny
 
 import mtjax
 import mtjax.evaluate
@@ -88,7 +88,7 @@ def _variants():
     yield from ((name, {}) for name in ("distral", "brc", "simba-v2", "xqc", "deepmdp", "hip-bmdp"))
 
 
-@pytest.mark.parametrize("name, settings", _variants())
+@pytest.mark.parametrize("name, settings", one_in(2, _variants()))
 def test_every_number_can_vary(name, settings):
     """All at once, in every method: none decides what is compiled, and none is left out of what is."""
     agent = tiny(name, **settings)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import act, learner, of_task, pick, quick, random_batch, tasks_of, tiny
+from probes import act, learner, of_task, pick, quick, random_batch, slow_but, tasks_of, tiny
 
 from mtjax.agents import agent
 from mtjax.agents.parts.encoders import BatchNorm
@@ -15,7 +15,7 @@ SPEC, BATCH = Spec.vector(3, 2, 1), 4
 TASKS = tasks_of("one-step", (1.0, -0.5, 0.3))
 RANDOM = np.random.default_rng(0)
 KEY = jax.random.key(0)
-EVERY_HEADS = pytest.mark.parametrize("heads", ["shared", "per-task", "disjoint"])
+EVERY_HEADS = pytest.mark.parametrize("heads", slow_but(["shared", "per-task", "disjoint"], "per-task"))
 
 
 def started(**settings):
