@@ -57,13 +57,13 @@ def some(cases, every):
     return [pytest.param(*case, marks=mark(i)) for i, case in enumerate(cases)]
 
 
-# Each tells tasks apart in its own way, and pcgrad must compose with every network that tasks share. Five has no
-# divisor in common with the number of ways, so that every agent and every way is in the default.
+# Each tells tasks apart in its own way, and pcgrad must compose with every network that tasks share. Seven
+# has no divisor in common with the number of ways, so that every way is in the default.
 TRACED = [
-    *some([(name, {"conditioning": conditioning}) for name, conditioning in VALID], 5),
-    *some([(name, {"conditioning": conditioning, "gradients": "pcgrad"}) for conditioning, name in SURGERY], 5),
-    *some([("sac-conditioned", {"gradients": rule}) for rule in RULES], 1),
-    *some([("sac-conditioned", {"gradients": rule, "gradient_scope": "per-layer"}) for rule in RULES], 3),
+    *some([(name, {"conditioning": conditioning}) for name, conditioning in VALID], 7),
+    *some([(name, {"conditioning": conditioning, "gradients": "pcgrad"}) for conditioning, name in SURGERY], 7),
+    *some([("sac-conditioned", {"gradients": rule}) for rule in RULES], 2),
+    *some([("sac-conditioned", {"gradients": rule, "gradient_scope": "per-layer"}) for rule in RULES], 5),
     *some([("sac-conditioned", {"encoder": name}) for name in ENCODERS], 1),
     *some([(name, {"value": value}) for value in VALUES for name in ("sac-conditioned", "deepmdp")], 1),
     *some([("multi-head", {"scaling": scaling}) for scaling in SCALINGS], 1),

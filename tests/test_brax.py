@@ -211,6 +211,7 @@ def test_goals_are_parameters_of_their_families():
         BraxAntDirection(vary={"direction": "4"})
 
 
+@pytest.mark.slow
 def test_tasks_and_worlds_step_in_one_scan():
     """Three gravities, five worlds, sixty steps with fresh starts after falls: a heavier pole falls sooner."""
     tasks = PENDULUM.tasks()

@@ -9,7 +9,7 @@ import numpy as np
 import optax
 import pytest
 import scipy.optimize
-from probes import QUICK, learner, of_task, pick, random_batch, tasks_of, tiny
+from probes import QUICK, learner, of_task, pick, random_batch, slow_but, tasks_of, tiny
 from probes import act as act_once
 
 from mtjax.agents import agent
@@ -303,7 +303,7 @@ def optimum(alpha):
     return x[0], np.exp(x[1])
 
 
-@pytest.mark.parametrize("alpha", [0.0, 0.5, 0.9])
+@pytest.mark.parametrize("alpha", slow_but([0.0, 0.5, 0.9], 0.5))
 def test_a_bandits_optimum(alpha):
     """The more the distilled policy counts, the nearer it draws the tasks' policies, and exactly so far."""
     made, optimizer = KnownCritic(hidden=(8,), distral_alpha=alpha), optax.adam(3e-3)

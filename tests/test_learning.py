@@ -25,7 +25,7 @@ LONGER = {"distral": 2500}  # whose tasks share no experience
 USUAL = ("sac-conditioned", "multi-head", "soft-modularization", "hip-bmdp")
 TOLD = [name for name in OFF_POLICY if name != "sac"]
 EVERY = [
-    *slow_but(USUAL, "sac-conditioned"),
+    *slow_but(USUAL),
     *(pytest.param(x, marks=pytest.mark.nightly) for x in TOLD if x not in USUAL),
 ]
 

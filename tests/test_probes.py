@@ -72,7 +72,7 @@ def test_the_policy_finds_the_best_action_of_each_task():
     assert actions[0] > 0.85  # 1 is the edge of what tanh reaches
 
 
-@pytest.mark.parametrize("name", slow_but(OFF_POLICY, "sac", "pcgrad"))
+@pytest.mark.parametrize("name", slow_but(OFF_POLICY, "pcgrad"))
 def test_every_agent_learns_values_and_actions(name):
     """On the probe that needs observation, action and task; an agent that is not told its task gets two alike."""
     scales = (0.7, 0.7) if name == "sac" else SCALES
