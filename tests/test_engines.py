@@ -4,6 +4,7 @@ States are those of random play with MuJoCo C, from the very start of an episode
 and half another, so that a step which takes its model from the wrong row is off in every world.
 """
 
+import gc
 import importlib.util
 from functools import lru_cache, partial
 from typing import NamedTuple
@@ -308,3 +309,19 @@ def test_warp_refuses_tasks_that_differ_in_the_size_of_sites():
     world = World(*(jnp.zeros(3),) * 3, jnp.zeros(13))
     with pytest.raises(InputError, match="cannot vary site_size between tasks; use --engine=mjx"):
         jax.eval_shape(engine.step, task, world, jnp.zeros(2))
+
+
+def test_a_program_runs_after_its_environment_is_gone():
+    """Programs call MuJoCo by name, and outlive the objects of Python that made them."""
+
+    def swing(env, torque):
+        task = jax.tree.map(lambda x: x[0], env.tasks())
+        return env.step(task, env.reset(task, jax.random.key(0)).state, torque).obs
+
+    env = envs.make("pendulum-swingup", engine="c")
+    program = jax.jit(partial(swing, env)).lower(jnp.ones(1)).compile()
+    before = np.asarray(program(jnp.ones(1)))
+    del env
+    jax.clear_caches()
+    gc.collect()
+    np.testing.assert_array_equal(program(jnp.ones(1)), before)

@@ -179,8 +179,8 @@ def test_what_cannot_be_kept_is_traced_as_ever(folder):
 
 
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="MuJoCo's C engine steps on CPUs")
-def test_a_program_with_calls_out_of_xla_runs_where_they_have_the_same_names(folder):
-    """Elsewhere it is traced anew."""
+def test_a_program_with_calls_out_of_xla_runs_where_they_have_the_same_names(folder, monkeypatch):
+    """A family that is made anew has them. Elsewhere the program is traced anew."""
     family = lambda: mtjax.make("pendulum-swingup", engine="c")
     env, other, count = family(), family(), []
 
@@ -196,8 +196,11 @@ def test_a_program_with_calls_out_of_xla_runs_where_they_have_the_same_names(fol
     jax.clear_caches()
     assert list(env.targets().values()) == [[0, "advance"]] and same(first, kept()) and len(count) == 1
     jax.clear_caches()
-    found = traced.trace(other, program, (), (other, "agent", None), given).lower().compile()(*given)
-    assert same(first, found) and len(count) == 2
+    again = lambda: traced.trace(other, program, (), (other, "agent", None), given).lower().compile()(*given)
+    assert same(first, again()) and len(count) == 1
+    jax.clear_caches()
+    monkeypatch.setattr(type(other), "provide", lambda *_: "another")
+    assert same(first, again()) and len(count) == 2
 
 
 def test_objects_that_may_hold_anything_are_in_no_key(folder, times):

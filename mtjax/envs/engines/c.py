@@ -4,8 +4,7 @@ import copy
 import dataclasses
 import hashlib
 import threading
-import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property, partial
 from typing import Any
 
@@ -18,6 +17,8 @@ from mtjax.envs.engines import host
 from mtjax.envs.engines.base import World, require_plain, some
 from mtjax.types import Array, Task
 
+_MOST_BATCHES = 16  # kept of all engines; those that were not used for longest are dropped
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MujocoC:
@@ -29,20 +30,10 @@ class MujocoC:
 
     models: Sequence[mujoco.MjModel]
     num_substeps: int
-    _batches: dict[int, tuple[Any, np.ndarray]] = dataclasses.field(default_factory=dict)
-    _lock: Any = dataclasses.field(default_factory=threading.Lock)
     _names: dict[str, str] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
         require_plain(self.models[0])
-
-    @cached_property
-    def _models(self) -> list[mujoco.MjModel]:
-        """Return the models without MuJoCo's automatic reset, so that a diverged world stays visible."""
-        copies = {id(model): copy.copy(model) for model in self.models}
-        for model in copies.values():
-            model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        return [copies[id(model)] for model in self.models]
 
     def forward(self, task: Task, qpos: Array, qvel: Array, extra: Any = None) -> World:
         """Put a world in a state without controls, and solve for its forces."""
@@ -75,22 +66,18 @@ class MujocoC:
 
     def provide(self, act: str) -> str:
         """Give the host's function for ``act`` a name in programs, and return it. It is the same in every process."""
-        with self._lock:
-            if act not in self._names:
-                name = f"mujoco_{act}_{self._digest}"
-                self._names[act] = name = f"{name}_{sum(other.startswith(name) for other in host.names())}"
-                host.register(name, partial(_run, weakref.ref(self), act))
-        return self._names[act]
+        name = f"mujoco_{act}_{self._digest}"
+        with _LOCK:
+            if self._digest not in _known:
+                _known[self._digest] = _Worlds(self.models, self.num_substeps)
+            if name not in host.names():
+                host.register(name, partial(_known[self._digest].run, act))
+            self._names[act] = name
+        return name
 
     def load_kernels(self) -> bool:
         """Do nothing, as MuJoCo is compiled. Return False, as programs record nothing."""
         return False
-
-    @cached_property
-    def _acts(self) -> dict[str, Callable]:
-        model = self.models[0]
-        advance = partial(_advance, self.num_substeps, model.nq + 2 * model.nv)
-        return {"solve": _solve, "advance": advance, "count": _count_contacts}
 
     @cached_property
     def _digest(self) -> str:
@@ -112,28 +99,51 @@ class MujocoC:
         packed = jnp.concatenate([jnp.float32(task.row)[None], *(jnp.float32(x) for x in state)])
         return host.call(self.provide(act), width, packed)
 
-    def run(self, act: str, packed: np.ndarray, result: np.ndarray) -> None:
-        """Fill in the result of ``act`` on worlds (..., K). Programs call this on the host."""
-        rows = packed.reshape(-1, packed.shape[-1])
-        with self._lock:  # a batch serves one call at a time, and MuJoCo lets other threads run while it steps
-            worlds = self._batch(rows[:, 0].astype(np.int32))
-            _state(worlds, rows.shape[1] - 1)[:] = rows[:, 1:]
-            result[:] = self._acts[act](worlds).reshape(result.shape)
 
-    def _batch(self, rows: np.ndarray) -> Any:
+class _Worlds:
+    """Worlds on the host, for all engines with the same models.
+
+    Programs call it by name, and may do so after every engine is gone. So it is kept for good, without its batches.
+    """
+
+    def __init__(self, models: Sequence[mujoco.MjModel], num_substeps: int):
+        self.models, self.lock = _without_reset(models), threading.Lock()
+        advance = partial(_advance, num_substeps, models[0].nq + 2 * models[0].nv)
+        self.acts = {"solve": _solve, "advance": advance, "count": _count_contacts}
+
+    def run(self, act: str, packed: np.ndarray, result: np.ndarray) -> None:
+        """Fill in the result of ``act`` on worlds (..., K)."""
+        rows = packed.reshape(-1, packed.shape[-1])
+        with self.lock:  # a batch serves one call at a time, and MuJoCo lets other threads run while it steps
+            worlds = self.batch(rows[:, 0].astype(np.int32))
+            _state(worlds, rows.shape[1] - 1)[:] = rows[:, 1:]
+            result[:] = self.acts[act](worlds).reshape(result.shape)
+
+    def batch(self, rows: np.ndarray) -> Any:
         """Return the batch for these worlds. Its models are set only when they change."""
-        worlds, known = self._batches.get(len(rows), (None, None))
+        worlds, known = _batches.pop((self, len(rows)), (None, None))
         if worlds is None:
-            worlds = batch.Batch(self._models[0], len(rows), persistent=True)
+            worlds = batch.Batch(self.models[0], len(rows), persistent=True)
         if known is None or not np.array_equal(known, rows):
-            worlds.set_models([self._models[i] for i in rows])
-            self._batches[len(rows)] = worlds, rows
+            worlds.set_models([self.models[i] for i in rows])
+        with _LOCK:
+            _batches[self, len(rows)] = worlds, rows  # at the end, as the latest
+            if len(_batches) > _MOST_BATCHES:
+                _batches.pop(next(iter(_batches)))
         return worlds
 
 
-def _run(engine: Any, act: str, packed: np.ndarray, result: np.ndarray) -> None:
-    """Call an engine by a weak reference, because names are kept for good but its memory must be freed."""
-    engine().run(act, packed, result)
+_known: dict[str, _Worlds] = {}  # by the hash of their models and substeps
+_batches: dict[tuple[_Worlds, int], tuple[Any, np.ndarray]] = {}
+_LOCK = threading.Lock()  # of both tables
+
+
+def _without_reset(models: Sequence[mujoco.MjModel]) -> list[mujoco.MjModel]:
+    """Return the models without MuJoCo's automatic reset, so that a diverged world stays visible."""
+    copies = {id(model): copy.copy(model) for model in models}
+    for model in copies.values():
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    return [copies[id(model)] for model in models]
 
 
 def _state(worlds: Any, size: int) -> np.ndarray:
