@@ -158,7 +158,7 @@ def test_networks_on_plain_observations_add_nothing_to_the_least():
     assert tiny("sac").least_loss == tiny("ppo").least_loss == 0
 
 
-@pytest.mark.parametrize("transition", ["deterministic", "probabilistic"])
+@pytest.mark.parametrize("transition", slow_but(["deterministic", "probabilistic"], "probabilistic"))
 @pytest.mark.parametrize("name", slow_but(["sac", "ppo"], "sac"))
 def test_rules_see_losses_from_the_least(name, transition, monkeypatch):
     """What FAMO is given in an update of either agent, and that it sees the losses fall from there."""
@@ -293,7 +293,7 @@ def test_the_actor_does_not_move_the_critics_parameters():
 @pytest.mark.parametrize(
     ("name", "settings"),
     one_in(
-        2,
+        4,
         [
             ("deepmdp", {}),
             ("deepmdp", {"conditioning": "inferred", "inferred_from": 2}),
@@ -556,6 +556,7 @@ def of_first_task(agent, state, steps):
     return of_task(state.critic, 0), pick(batch._replace(model_targets=model_targets), 0)
 
 
+@pytest.mark.slow
 def test_ppos_critic_loss_reaches_the_representation():
     """Each loss its own part of it; the critic's own is joined by all."""
     agent = make_ppo(representation="hip-bmdp", transition="probabilistic", **INFERRED)
@@ -574,6 +575,7 @@ def test_ppos_critic_loss_reaches_the_representation():
     np.testing.assert_allclose(loss, expected, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_ppos_actor_does_not_train_the_representation():
     """Another cost of entropy and another actor leave critic, encoder, models and thetas bit for bit."""
     agents_of = [make_ppo(representation="hip-bmdp", entropy_cost=cost) for cost in (0.0, 1.0)]

@@ -190,6 +190,7 @@ def test_evaluate_prints_every_task_and_leaves_a_folder(copied_run, capsys):
     assert not {r["return"] for r in rows} & {r["return"] for r in other}
 
 
+@pytest.mark.slow
 def test_hip_bmdp_run_is_scored_with_its_nearest_heads(multi_head_run, capsys):
     """Eight of ten values have a split, and the output says what stands for those that did not train."""
     mtjax.evaluate.main([f"--run={multi_head_run}", "--episodes=1"])

@@ -438,7 +438,7 @@ def init_and_update(agent, tasks: Task, batch: Transition, key):
     return state, new, metrics, jax.vmap(act)(tasks, batch.obs[:, 0])
 
 
-@pytest.mark.parametrize("name", OFF_POLICY)
+@pytest.mark.parametrize("name", one_in(2, OFF_POLICY))
 def test_every_agent_learns_a_mixture(name):
     """That it can be traced; what it computes, those agents show that are compiled below."""
     arguments = (BOTH.tasks(), random_batch(BOTH), jax.random.key(0))

@@ -85,6 +85,7 @@ def test_family_round_trips_its_tasks(name):
     assert np.all(np.abs(np.asarray(env.tasks().context)) <= 1 + 1e-5)
 
 
+@pytest.mark.slow
 def test_a_family_of_ones_own_is_trained_and_evaluated(tmp_path, monkeypatch, capsys):
     """The worked example, by the commands that are printed; and it is under 60 lines."""
     file = Path(__file__).parents[1] / "examples" / "own_environment.py"

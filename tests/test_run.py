@@ -223,6 +223,7 @@ def test_seeds_differ(whole):
     assert not [path for path, data in chance.items() if data[: len(data) // 2] == data[len(data) // 2 :]]
 
 
+@pytest.mark.slow
 def test_a_seed_among_many_is_that_seed_alone(short_family, whole):
     """Up to rounding: the same draws, so the first chunk is the same."""
     program = cli.parse(SHORT_RUN)

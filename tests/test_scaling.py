@@ -314,7 +314,7 @@ def test_settings_that_make_no_sense_are_refused(settings, message):
 @pytest.mark.parametrize(
     ("name", "settings"),
     one_in(
-        2,
+        4,
         [
             ("multi-head", {"scaling": "popart", "target_rate": 0.02}),
             ("sac-conditioned", {"scaling": "return", "value": "c51", "num_bins": 41, "return_range": 8.0}),

@@ -6,7 +6,7 @@ import numpy as np
 import optax
 import pytest
 from conftest import SHORT_RUN
-from probes import Walk, one_in, quick, random_batch, tasks_of, tiny, train
+from probes import Walk, quick, random_batch, tasks_of, tiny, train
 
 import mtjax.train
 from mtjax.agents.parts.gradients.descent import schedule
@@ -57,7 +57,8 @@ AGENTS = {
 }
 
 
-@pytest.mark.parametrize(("name", "chunk", "given", "expected"), one_in(3, AGENTS.values()), ids=AGENTS)
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "chunk", "given", "expected"), AGENTS.values(), ids=AGENTS)
 def test_a_schedule_ends_with_the_run(name, chunk, given, expected):
     """All rates are 0 then, and not before: the last updates change what the next would not."""
     agent, settings = tiny(name, lr_schedule="linear"), {"eval_episodes": 1, "chunk_steps": chunk}
