@@ -131,7 +131,7 @@ def test_every_combination_has_the_right_shapes(name, settings, vectors):
         assert (actions.shape, actions.dtype) == ((3, ENVS, 2), jnp.float32)
 
 
-@pytest.mark.parametrize(("name", "settings"), some(RUN, 2), ids=label)
+@pytest.mark.parametrize(("name", "settings"), some(RUN, 3), ids=label)
 def test_agents_act_and_learn(name, settings, vectors):
     """Finite, the same for the same keys and different for others; acting in a batch is acting one at a time."""
     agent, keys, obs = make(name, settings, vectors), jax.random.split(KEY, (3, ENVS)), observations()

@@ -349,6 +349,7 @@ def test_damaged_record_is_refused(complaint, tmp_path, content):
         assert "config.json' does not describe a run" in complaint(command, f"{flag}={tmp_path}")
 
 
+@pytest.mark.slow
 def test_record_of_a_family_that_is_gone_is_refused(complaint, finished_run, tmp_path):
     """As a name is refused on the command line."""
     text = (finished_run / "config.json").read_text()

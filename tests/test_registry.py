@@ -139,7 +139,7 @@ def forget():
             del sys.modules[name]
 
 
-@pytest.mark.parametrize("name", slow_but(OWN, "own_agent"))
+@pytest.mark.parametrize("name", slow_but(OWN))
 def test_parts_and_agents_of_ones_own_are_trained(name, short_family, forget, tmp_path, capsys):
     """The worked examples, by the command line, and again from the run's own record; each is under 60 lines."""
     kind, own, flags = OWN[name]
