@@ -26,7 +26,7 @@ from report import markdown
 
 from mtjax.agents.choices import replace
 from mtjax.config import configure, with_preset
-from mtjax.envs import Family
+from mtjax.envs.family import Tabled
 from mtjax.evaluation import evaluate, save_evaluations
 from mtjax.training.log import append_rows
 from mtjax.training.programs import enable_compile_cache
@@ -124,7 +124,7 @@ def learn(arguments: argparse.Namespace, family: str) -> None:
     print({**found}, flush=True)
 
 
-def limited(family: Family, agent: Agent, result: Result, arguments: argparse.Namespace) -> float | None:
+def limited(family: Tabled, agent: Agent, result: Result, arguments: argparse.Namespace) -> float | None:
     """Return the mean return of extrapolation with ``context_limit=1``."""
     tasks, seeds = family.tasks("extrapolation"), arguments.seed + jnp.arange(arguments.seeds)
     if not len(tasks.id):

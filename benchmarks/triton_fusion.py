@@ -12,6 +12,7 @@ import argparse
 
 import jax
 import jax.numpy as jnp
+import jaxlib
 import numpy as np
 
 SEEDS, TASKS, ENVS, INPUTS, EXPERTS, WIDTH, HIDDEN = 10, 8, 5, 9, 4, 64, 256
@@ -85,7 +86,7 @@ def errors(form) -> tuple[np.ndarray, bool]:
         given = jax.device_put(inputs(), jax.devices(platform)[0])
         program = jax.jit(over_all).lower(*given).compile()
         found.append(np.asarray(program(*given)))
-        text = program.as_text()
+        text = program.as_text() or ""
     return np.abs(found[0] - found[1]).max(axis=(0, 2, 3)), "__triton" in text
 
 
@@ -93,7 +94,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--form", action="append", choices=FORMS)
     forms = parser.parse_args().form or list(FORMS)
-    print(f"jax {jax.__version__}, jaxlib {jax.lib.__version__}, {jax.devices()[0].device_kind}")
+    print(f"jax {jax.__version__}, jaxlib {jaxlib.__version__}, {jax.devices()[0].device_kind}")
     for name in forms:
         error, triton = errors(FORMS[name])
         judged = "WRONG" if error.max() > 0.05 else "right"
