@@ -9,10 +9,10 @@ each task; rounding is below 0.01. ``mtjax.agents.parts.encoders.mixture.mix`` k
 """
 
 import argparse
+from importlib.metadata import version
 
 import jax
 import jax.numpy as jnp
-import jaxlib
 import numpy as np
 
 SEEDS, TASKS, ENVS, INPUTS, EXPERTS, WIDTH, HIDDEN = 10, 8, 5, 9, 4, 64, 256
@@ -94,7 +94,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--form", action="append", choices=FORMS)
     forms = parser.parse_args().form or list(FORMS)
-    print(f"jax {jax.__version__}, jaxlib {jaxlib.__version__}, {jax.devices()[0].device_kind}")
+    print(f"jax {jax.__version__}, jaxlib {version('jaxlib')}, {jax.devices()[0].device_kind}")
     for name in forms:
         error, triton = errors(FORMS[name])
         judged = "WRONG" if error.max() > 0.05 else "right"
