@@ -21,13 +21,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from report import markdown
 
 from mtjax.agents.choices import replace
 from mtjax.config import configure, with_preset
 from mtjax.envs.family import Tabled
 from mtjax.evaluation import evaluate, save_evaluations
+from mtjax.report.stats import seed_interval
 from mtjax.training.log import append_rows
 from mtjax.training.programs import enable_compile_cache
 from mtjax.training.run import Result, train
@@ -148,7 +148,7 @@ def row(family: str, result: Result, seeds: int) -> dict[str, Any]:
     evaluations = result.evaluations
     scores = {split: x[:, -1].mean(axis=(-2, -1)) for split, x in evaluations.returns.items() if x.size}  # (S,)
     steps = int(result.rows[-1]["steps"])
-    low, high = interval(scores["train"])
+    _, low, high = seed_interval(scores["train"])
     return {
         "family": family,
         "steps": steps,
@@ -162,13 +162,6 @@ def row(family: str, result: Result, seeds: int) -> dict[str, Any]:
         "worst_task": round(float(evaluations.returns["train"][:, -1].mean(axis=(0, -1)).min()), 1),
         "over_time": [round(float(x), 1) for x in evaluations.returns["train"].mean(axis=(0, 2, 3))],
     }
-
-
-def interval(scores: np.ndarray) -> tuple[float, float]:
-    """Return the 95% bootstrap interval of the mean of seeds' scores (S,)."""
-    draws = np.random.default_rng(0).integers(len(scores), size=(20_000, len(scores)))
-    low, high = np.quantile(scores[draws].mean(axis=1), [0.025, 0.975])
-    return float(low), float(high)
 
 
 def tabulate(out: Path) -> None:

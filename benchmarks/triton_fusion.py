@@ -9,6 +9,7 @@ each task; rounding is below 0.01. ``mtjax.agents.parts.encoders.mixture.mix`` k
 """
 
 import argparse
+from functools import partial
 from importlib.metadata import version
 
 import jax
@@ -34,10 +35,6 @@ def mix(weights, encodings):
     return jnp.sum(weights[:, None] * encodings, axis=0)
 
 
-def barrier(x):
-    return jax.lax.optimization_barrier(x)
-
-
 def whole(params, task, obs, middle=lambda x: x):
     weights, encodings = middle((jax.nn.softmax(gate(params, task)), encode(params, obs)))
     return jnp.concatenate([mix(weights, encodings), task]) @ params["out"]
@@ -60,7 +57,7 @@ FORMS = {
     "without output layer": without_output,
     "without concatenation": without_task,
     "without gate": without_gate,
-    "with barrier": lambda *given: whole(*given, middle=barrier),
+    "with barrier": partial(whole, middle=jax.lax.optimization_barrier),
 }
 
 

@@ -7,9 +7,12 @@ import jax.numpy as jnp
 from mtjax.types import Array, Key
 
 
-def to_unit(x: Array, axis: int = -1) -> Array:
-    """Scale vectors along an axis to length 1; the gradient is finite at zero too."""
-    return x * jax.lax.rsqrt(jnp.sum(jnp.square(x), axis=axis, keepdims=True) + 1e-30)
+def to_unit(x: Array, axis: int = -1, floor: float = 1e-30) -> Array:
+    """Scale vectors along an axis to length 1.
+
+    The gradient is finite at zero too. Vectors whose squared length is not far above the ``floor`` stay shorter.
+    """
+    return x * jax.lax.rsqrt(jnp.sum(jnp.square(x), axis=axis, keepdims=True) + floor)
 
 
 def init_direction(key: Key, shape: tuple[int, int]) -> Array:

@@ -366,7 +366,7 @@ class BaseAgent(abc.ABC):
         """Return contexts (..., C) as networks see them."""
         if parts.is_zero(self.context_limit):
             return context
-        limit = jnp.where(self.context_limit > 0, self.context_limit, jnp.inf)  # traced, it may be 0 after all
+        limit = parts.or_infinite(self.context_limit)
         return jnp.clip(context, -limit, limit)
 
     def features_of_batch(self, state: Any, batch: Transition, tasks: Task) -> Array:

@@ -189,8 +189,11 @@ class Replay:
         else:
             rows = rings.sample(ring, key, math.prod(shape[1:]), self.window)
             rows = jax.tree.map(lambda x: x.reshape(*shape, *x.shape[2:]), rows)
-        rows = agent.join_steps(state, rows, tasks) if self.window else rows
-        return jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), rows)
+        return jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), self.joined(agent, state, rows, tasks))
+
+    def joined(self, agent: Any, state: Any, rows: Transition, tasks: Task) -> Transition:
+        """Return transitions (T, ...) from drawn rows, which are windows (T, ..., n) if returns are multi-step."""
+        return agent.join_steps(state, rows, tasks) if self.window else rows
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))  # so that it is traced once, though ``learn`` needs its shapes too

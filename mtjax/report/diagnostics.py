@@ -102,9 +102,8 @@ def _summarise(agent: SAC, state: Any, gradients: Mapping, activity: Mapping) ->
 def _average_gradients(agent: SAC, state: Any, replay: Ring, tasks: Task, key: Key, batch_size: int) -> dict:
     def draw(key: Key) -> dict:
         batch_key, loss_key = jax.random.split(key)
-        window = agent.experience.window
-        batch = rings.sample(replay, batch_key, batch_size, window)
-        batch = agent.join_steps(state, batch, tasks) if window else batch
+        rows = rings.sample(replay, batch_key, batch_size, agent.experience.window)
+        batch = agent.experience.joined(agent, state, rows, tasks)
         return compare_gradients(agent, state, batch, tasks, loss_key)
 
     return jax.tree.map(lambda x: jnp.mean(x, axis=0), jax.lax.map(draw, jax.random.split(key, DRAWS)))

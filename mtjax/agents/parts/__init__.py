@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, Literal, TypeVar, get_args, get_origin
 
 import jax
+import jax.numpy as jnp
 
 from mtjax.names import frozen, nearest_error
 from mtjax.types import InputError, Outcome
@@ -72,6 +73,11 @@ def put(part: P, **values: Any) -> P:
 def is_zero(value: Any) -> bool:
     """Return whether a number is known to be zero before tracing, so that its branch need not be compiled."""
     return not isinstance(value, jax.Array) and value == 0
+
+
+def or_infinite(limit: Any) -> Any:
+    """Return a limit. A traced one may be zero, which means that there is no limit: then infinity."""
+    return jnp.where(limit > 0, limit, jnp.inf) if isinstance(limit, jax.Array) else limit
 
 
 # Checks of settings. Each raises an InputError that names the setting, its value and what is allowed.

@@ -1,6 +1,7 @@
 """CARE attends to a mixture of encoders by the task's context."""
 
 import dataclasses
+from functools import partial
 from typing import ClassVar, Literal
 
 import flax.linen as nn
@@ -11,12 +12,8 @@ from mtjax.agents import parts
 from mtjax.agents.parts.encoders.base import Identity
 from mtjax.agents.parts.encoders.mixture import Experts, check_experts
 from mtjax.networks import MLP, join
+from mtjax.sphere import to_unit
 from mtjax.types import Array, InputError
-
-
-def unit(x: Array) -> Array:
-    """Scale vectors (..., D) to length 1."""
-    return x * jax.lax.rsqrt(jnp.sum(jnp.square(x), axis=-1, keepdims=True) + 1e-6)
 
 
 class Mixture(nn.Module):
@@ -36,7 +33,7 @@ class Mixture(nn.Module):
         context = nn.Dense(size, name="context_out")(MLP(self.expert_widths[:-1], name="context")(features))  # (..., D)
         encodings = Experts(self.num_experts, self.expert_widths, name="experts")(obs)  # (K, ..., D)
         if self.variant == "paper":
-            scale = unit if self.unit_attention else lambda x: x
+            scale = partial(to_unit, floor=1e-6) if self.unit_attention else lambda x: x
             products = scale(encodings) * scale(jax.lax.stop_gradient(context))
             scores = jnp.sum(products, axis=-1) / self.temperature  # (K, ...)
         else:

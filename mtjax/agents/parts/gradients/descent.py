@@ -82,7 +82,7 @@ def on_sphere(optimizer: optax.GradientTransformation) -> optax.GradientTransfor
 
 def clip_to(norm: Any) -> optax.GradientTransformation:
     """Return a transformation that clips gradients to a global norm; a traced norm may be 0, which does not clip."""
-    return optax.clip_by_global_norm(jnp.where(norm > 0, norm, jnp.inf) if isinstance(norm, Array) else norm)
+    return optax.clip_by_global_norm(parts.or_infinite(norm))
 
 
 def descend(optimizer: optax.GradientTransformation, gradients: Any, memory: Any, params: Any) -> tuple[Any, Any]:

@@ -11,6 +11,25 @@ from mtjax.agents.parts.scaling.base import NoScaling
 from mtjax.types import Array, Outcome
 
 
+@dataclasses.dataclass(frozen=True)
+class _OfReturns(NoScaling):
+    """Remembers the discounted sum of an episode's rewards, backwards: G_t = r_t + gamma G_(t-1)."""
+
+    watches = True
+    return_range: float = 10.0
+    """Largest |discounted return| after scaling; with value=c51 or hl-gauss, the range of their bins."""
+
+    def __post_init__(self):
+        parts.require_positive(self, "return_range")
+
+    def begin(self) -> Array:
+        """Return 0, the sum before the first reward."""
+        return jnp.float32(0)
+
+    def remember(self, memory: Array, reward: Array, gamma: float | Array) -> Array:
+        return gamma * memory + reward
+
+
 class LargestReturns(NamedTuple):
     """Holds the largest absolute values so far."""
 
@@ -19,7 +38,7 @@ class LargestReturns(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class ReturnScaling(NoScaling):
+class ReturnScaling(_OfReturns):
     """Divides so that the task's largest discounted return just fits a range (BRC; Nauman et al. 2025).
 
     With G the largest |return| so far, horizon h = 1 / (1 - gamma), temperature a and target entropy H, the
@@ -32,22 +51,8 @@ class ReturnScaling(NoScaling):
     the factor is 1.
     """
 
-    watches = True
-    return_range: float = 10.0
-    """Largest |discounted return| after scaling; with value=c51 or hl-gauss, the range of their bins."""
-
-    def __post_init__(self):
-        parts.require_positive(self, "return_range")
-
     def init(self, num_tasks: int) -> LargestReturns:
         return LargestReturns(jnp.zeros(num_tasks), jnp.zeros(num_tasks))
-
-    def begin(self) -> Array:
-        """Return 0, the backwards discounted sum r_t + gamma r_(t-1) + ... before the first reward."""
-        return jnp.float32(0)
-
-    def remember(self, memory: Array, reward: Array, gamma: float | Array) -> Array:
-        return gamma * memory + reward
 
     def observe(self, memory: LargestReturns, outcome: Outcome) -> LargestReturns:
         cut = outcome.ended & ~outcome.terminated
@@ -71,7 +76,7 @@ class SpreadOfReturns(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class ReturnNormalization(NoScaling):
+class ReturnNormalization(_OfReturns):
     """Divides by the standard deviation of the task's discounted returns, and keeps these in a range (SimbaV2).
 
     With G_t = r_t + gamma G_(t-1) from the start of an episode, as Lee et al. (2025, "Hyperspherical normalization"):
@@ -82,22 +87,11 @@ class ReturnNormalization(NoScaling):
     range already bounds the factor. As there, the bonus of entropy has no room in the range.
     """
 
-    watches = True
     return_range: float = 5.0
     """Largest |discounted return| after scaling; with value=c51 or hl-gauss, the range of their bins."""
 
-    def __post_init__(self):
-        parts.require_positive(self, "return_range")
-
     def init(self, num_tasks: int) -> SpreadOfReturns:
         return SpreadOfReturns(normalize.init(num_tasks), jnp.zeros(num_tasks))
-
-    def begin(self) -> Array:
-        """Return 0, the discounted sum before the first reward."""
-        return jnp.float32(0)
-
-    def remember(self, memory: Array, reward: Array, gamma: float | Array) -> Array:
-        return gamma * memory + reward
 
     def observe(self, memory: SpreadOfReturns, outcome: Outcome) -> SpreadOfReturns:
         returns = outcome.memory.scaling  # (T, E)
