@@ -11,7 +11,7 @@ _HOME = {
     "AGENTS": "mtjax.agents",
     "ENVS": "mtjax.envs",
     "InputError": "mtjax.names",
-    "Result": "mtjax.training.run",
+    "Result": "mtjax.training.result",
     "Settings": "mtjax.loop",
     "Step": "mtjax.types",
     "Task": "mtjax.types",

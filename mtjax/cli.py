@@ -7,13 +7,14 @@ from typing import Any
 
 from mtjax.agents import settings
 from mtjax.agents.choices import CHOICES, flag_names
-from mtjax.commands import check_names, flag_value, import_files, parse_with_tyro, unknown_flag
-from mtjax.config import NO_FINE_TUNING, RunConfig, from_json, with_preset
+from mtjax.commands import check_names, flag_value, import_files, imports_of, parse_with_tyro, unknown_flag
+from mtjax.config import NO_FINE_TUNING, RunConfig, from_json, own_files, with_preset
 from mtjax.envs import make
 from mtjax.envs.family import Family
 from mtjax.envs.mixtures import Mixture, require_family
 from mtjax.names import InputError
 
+_NO_FLAGS = ("vary", "context-ranges", "points", "imports")  # vary has a flag for each parameter, taken out before
 _VARY = "--env.vary."
 _FAMILY_FLAGS = {"combine": "env.combine", "split": "split"}  # they decide which values are allowed
 _DECIDING = ("conditioning", "vectors", "heads")  # they decide which parts are allowed
@@ -27,6 +28,7 @@ def parse(argv: Sequence[str]) -> RunConfig:
     Raises:
         InputError: a name, flag or value cannot be used.
     """
+    files, _ = imports_of(argv)
     argv = import_files(argv)
     check_names(argv)
     env_name = flag_value(argv, "env", RunConfig.env)
@@ -48,7 +50,9 @@ def parse(argv: Sequence[str]) -> RunConfig:
     if source is not None:
         default = _fine_tuning(default, source, start, chosen)
     _check_flags(argv, default)
-    return parse_with_tyro(RunConfig, argv, default, "python -m mtjax.train")
+    config = parse_with_tyro(RunConfig, argv, default, "python -m mtjax.train")
+    config = dataclasses.replace(config, imports=tuple(files))
+    return dataclasses.replace(config, imports=own_files(config))
 
 
 def _fine_tuning(config: RunConfig, source: RunConfig, start: str, chosen: Mapping[str, str]) -> RunConfig:
@@ -133,7 +137,12 @@ def flags(config: Any, prefix: str = "--") -> list[str]:
     names = []
     for field in dataclasses.fields(config):
         value, name = getattr(config, field.name), field.name.replace("_", "-")
-        if name in ("vary", "context-ranges", "points"):  # a flag for each parameter, taken out before; and no flags
+        if name in (
+            "vary",
+            "context-ranges",
+            "points",
+            "imports",
+        ):  # a flag for each parameter, taken out before; and no flags
             continue
         if name == "learner":
             names += [f"--{flag}" for flag in flag_names(value).values()]

@@ -23,7 +23,9 @@ _OVERVIEW = (  # titles, and the classes whose fields are flags of every run
     ("for how long (a preset may say otherwise)", "config.py", "Plan"),
     ("how worlds are played (a preset may say otherwise)", "loop.py", "Settings"),
 )
-_MAY_CHANGE = {"--resume", "--steps", "--import", "--distributed", "--profile"}  # the only flags beside --resume
+_MAY_CHANGE = {  # the only flags beside --resume
+    *("--resume", "--steps", "--import", "--distributed", "--profile", "--tensorboard", "--wandb")
+}
 _FIELD = re.compile(r"^    (\w+): ", re.MULTILINE)  # a line of a class that may be a setting
 P = TypeVar("P")
 
@@ -171,22 +173,44 @@ def import_files(argv: Sequence[str]) -> list[str]:
     Raises:
         InputError: there is no such file.
     """
-    for word in argv:
-        if word.startswith("--import="):
-            _import(Path(word.split("=", 1)[1]))
-    return [word for word in argv if not word.startswith("--import=")]
+    files, rest = imports_of(argv)
+    for file in files:
+        _import(Path(file))
+    return rest
+
+
+def imports_of(argv: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the files of every --import, as absolute paths, and the other words of a command line."""
+    files, rest, words = [], [], iter(argv)
+    for word in words:
+        if word == "--import":
+            files.append(next(words, ""))
+        elif word.startswith("--import="):
+            files.append(word.split("=", 1)[1])
+        else:
+            rest.append(word)
+    return [str(Path(file).resolve()) if file else "" for file in dict.fromkeys(files)], rest
+
+
+def is_imported(path: Path) -> bool:
+    """Return whether a Python file was imported by this process, as a module or by --import."""
+    known = (getattr(module, "__file__", None) for module in list(sys.modules.values()))
+    return any(file and Path(file).resolve() == path.resolve() for file in known)
 
 
 def _import(path: Path) -> None:
     if not path.is_file() or path.suffix != ".py":
         raise InputError(f"--import needs a Python file, and {str(path)!r} is none")
-    known = (getattr(module, "__file__", None) for module in list(sys.modules.values()))
-    if any(file and Path(file).resolve() == path.resolve() for file in known):
+    if is_imported(path):
         return
     spec = importlib.util.spec_from_file_location(path.stem, path)
     assert spec is not None and spec.loader is not None
     sys.modules[path.stem] = module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    try:
+        spec.loader.exec_module(module)
+    except Exception:
+        del sys.modules[path.stem]
+        raise
 
 
 def parse_with_tyro(cls: type[P], argv: Sequence[str], default: P, name: str) -> P:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shlex
 import sys
 import tomllib
 from collections.abc import Mapping
@@ -13,13 +14,14 @@ from typing import Annotated, Any, Literal
 import jax
 import tyro
 
-from mtjax.agents import BaseAgent, agent, preset_of, settings
+from mtjax.agents import AGENTS, BaseAgent, agent, preset_of, settings
 from mtjax.agents.choices import kinds_of, replace
 from mtjax.agents.parts import name_of
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.values import VALUES
-from mtjax.commands import require_run
-from mtjax.envs import make
+from mtjax.checks import check_fields
+from mtjax.commands import is_imported, require_run
+from mtjax.envs import ENVS, make
 from mtjax.envs.family import Tabled
 from mtjax.loop import Settings
 from mtjax.types import InputError
@@ -43,6 +45,7 @@ class Plan:
     """Episodes of each task in every evaluation."""
 
     def __post_init__(self):
+        check_fields(self)
         for field, least in (("steps", 1), ("seeds", 1), ("seed", 0), ("eval_every", 0), ("eval_episodes", 1)):
             if getattr(self, field) < least:
                 raise InputError(f"{field.replace('_', '-')} must be at least {least}, not {getattr(self, field)}")
@@ -76,6 +79,12 @@ class RunConfig:
     written without their dashes. Real numbers of the agent vary inside one program, beside the seeds. Other settings
     run as one program after another. The sweep's folder holds a table of all settings; --resume takes this folder."""
     points: Annotated[tuple[dict[str, float], ...], tyro.conf.Suppress] = ()
+    imports: Annotated[tuple[str, ...], tyro.conf.Suppress] = ()
+    tensorboard: bool = False
+    """Write metrics for TensorBoard into the run's folder (pip install 'mtjax[tensorboard]')."""
+    wandb: str = ""
+    """Name of the Weights & Biases project to log to, with one run for each seed (pip install 'mtjax[wandb]').
+    WANDB_MODE=offline keeps the logs in the run's folder."""
     profile: bool = False
     """Write a trace of one warm chunk by JAX's profiler into the run's folder."""
     distributed: bool = False
@@ -96,19 +105,21 @@ def with_preset(
     env_name: str,
     agent_name: str,
     preset_name: str = "auto",
-    agent_settings: Mapping[str, str] = MappingProxyType({}),
+    agent_settings: Mapping[str, Any] = MappingProxyType({}),
+    family: Tabled | None = None,
     **family_settings: Any,
 ) -> RunConfig:
     """Return the configuration of a family and an agent with the tuned settings of a preset.
 
     Args:
         agent_settings: values that replace those of the preset.
+        family: the family if it is made already; by default it is made from its name and ``family_settings``.
         family_settings: fields of the family.
 
     Raises:
         InputError: a name or setting is unknown.
     """
-    family = make(env_name, **family_settings)
+    made = make(env_name, **family_settings) if family is None else family
     device = _device_preset() if preset_name == "auto" else preset_name
     preset, common = load_preset(env_name, device), load_preset("+", device)
     chosen = common.get(agent_name, {}) | preset.get(agent_name, {})
@@ -122,7 +133,7 @@ def with_preset(
         preset=preset_name,  # type: ignore
         plan=Plan(**planned),
         training=Settings(**played),
-        family=family,
+        family=made,
         learner=agent(agent_name, **{**chosen, **agent_settings}),
     )
 
@@ -133,7 +144,8 @@ def configure(agent: Any, settings: Settings, given: Mapping[str, Any]) -> tuple
     Raises:
         InputError: neither has a setting of that name, or a value is not allowed.
     """
-    loop_values = {name: value for name, value in given.items() if name in Settings.__dataclass_fields__}
+    loop_names = {field.name for field in dataclasses.fields(Settings)}
+    loop_values = {name: value for name, value in given.items() if name in loop_names}
     rest = {name: value for name, value in given.items() if name not in loop_values}
     return replace(agent, rest), dataclasses.replace(settings, **loop_values)
 
@@ -175,12 +187,17 @@ def _device_preset() -> str:
 
 def import_flags(config: RunConfig) -> list[str]:
     """Return the --import flags that register the user's own families, agent and parts in another process."""
+    return [f"--import={file}" for file in config.imports]
+
+
+def own_files(config: RunConfig) -> tuple[str, ...]:
+    """Return the files of --import, and those with the user's own classes that a configuration uses."""
     used = [*(part.family for part in config.family.parts), config.learner]
     used += [getattr(config.learner, kind) for kind in kinds_of(config.learner)]
     modules = dict.fromkeys(type(each).__module__ for each in used)
     own = [sys.modules.get(name) for name in modules if name.split(".")[0] != "mtjax"]
-    files = [getattr(module, "__file__", None) for module in own]
-    return [f"--import={Path(file).resolve()}" for file in files if file is not None]
+    files = [*(getattr(module, "__file__", None) for module in own), preset_of(config.agent).home]
+    return tuple(dict.fromkeys([*config.imports, *(str(Path(file).resolve()) for file in files if file)]))
 
 
 # Configurations as JSON.
@@ -201,6 +218,7 @@ def from_json(path: Path) -> RunConfig:
     require_run(path.parent)
     try:
         record = json.loads(path.read_text())
+        imports = _imports(record)
         return RunConfig(
             env=record["env"],
             agent=record["agent"],
@@ -209,10 +227,35 @@ def from_json(path: Path) -> RunConfig:
             start=record.get("start", ""),
             sweep=tuple(record.get("sweep", ())),
             points=tuple(record.get("points", ())),
+            imports=imports,
+            tensorboard=record.get("tensorboard", False),
+            wandb=record.get("wandb", ""),
             plan=Plan(**record["plan"]),
             training=Settings(**record["training"]),
             family=make(record["env"], **record["family"]),
             learner=agent(record["agent"], **record["learner"]),
         )
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, AttributeError) as error:
+    except InputError as error:
+        raise _with_import(error, str(path.parent), record) from None
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{str(path)!r} does not describe a run: {type(error).__name__}: {error}") from None
+
+
+def _imports(record: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the user's own files that a run names. Its command holds them where no list does."""
+    words = [word for word in shlex.split(record.get("command", "")) if word.startswith("--import=")]
+    return tuple(record.get("imports") or (word.removeprefix("--import=") for word in words))
+
+
+def _with_import(error: InputError, run: str, record: Mapping[str, Any]) -> InputError:
+    """Return an error that asks for the user's own files, if a run needs some that are not imported.
+
+    They are never run because a run's record names them.
+    """
+    missing = [file for file in _imports(record) if not is_imported(Path(file))]
+    if missing:
+        flags = shlex.join(f"--import={file}" for file in missing)
+        return InputError(f"{run!r} uses code of your own: add {flags} (in Python: import that file first)")
+    if (record["env"] not in ENVS and "+" not in record["env"]) or record["agent"] not in AGENTS:
+        return InputError(f"{error}. If it is your own, give --import=FILE.py with the file that registers it")
+    return error

@@ -1,6 +1,7 @@
 """Registration of a user's own families, agents and parts of agents under names."""
 
 import dataclasses
+import sys
 from typing import Any
 
 from mtjax import agents, envs
@@ -25,8 +26,8 @@ def register(name: str, thing: "type | str", **defaults: Any) -> None:
         InputError: the name is taken, the class has none of these bases, or a default is not allowed.
     """
     if isinstance(thing, str):
-        known = agents.preset_of(thing)
-        return _register_agent(name, known._replace(defaults={**known.defaults, **defaults}))
+        known, home = agents.preset_of(thing), sys._getframe(1).f_globals.get("__file__", "")
+        return _register_agent(name, known._replace(defaults={**known.defaults, **defaults}, home=home))
     if issubclass(thing, Family):
         return envs.register(name, thing, **defaults)
     if issubclass(thing, BaseAgent):

@@ -14,15 +14,14 @@ if TYPE_CHECKING:
 
 def main(argv: Sequence[str]) -> None:
     """Check names and flags first, then import the training code and run the command line."""
-    own = any(word.startswith("--import=") for word in argv)  # the full parser checks their flags
-    argv = commands.import_files(argv)
-    commands.check_names(argv)
-    if not own:
-        commands.check_flags(argv)
-    if argv in (["--help"], ["-h"]):
+    words = commands.import_files(argv)
+    commands.check_names(words)
+    if len(words) == len(argv):  # else the full parser checks the flags of the user's own classes
+        commands.check_flags(words)
+    if words in (["--help"], ["-h"]):
         print(commands.overview())
         return
-    if "--list" in argv:
+    if "--list" in words:
         print(commands.catalogue())
         return
     load("mtjax.training.main:main")(argv, load("mtjax.cli:parse"))
@@ -32,7 +31,7 @@ class _CallableModule(types.ModuleType):
     """A module that can be called: ``mtjax.train(...)`` works even after ``import mtjax.train``."""
 
     def __call__(self, *args, **kwargs) -> "Result":
-        return load("mtjax.training.run:train")(*args, **kwargs)
+        return load("mtjax.training.api:train")(*args, **kwargs)
 
 
 def run() -> None:

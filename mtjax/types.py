@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mtjax.names import InputError as InputError  # re-exported for convenience
 
@@ -31,6 +32,23 @@ class Task(NamedTuple):
     draws: Any = None  # a Task with leaves (P, ...); each episode draws one of them; None: every episode is this task
     action_mask: Array | None = None  # (A,) 1 for actions that the task has, else 0; None: it has all
     blocks: Any = None  # in a mixture, which tasks belong to which family; static, without leaves
+
+    def __repr__(self) -> str:
+        """Return a line: the number of tasks, and the values of their parameters where they are known."""
+        shape, params = np.shape(self.id), self.params if isinstance(self.params, dict) else {}
+        count = f"{shape[0]} task{'s' * (shape[0] != 1)}" if shape else "one task"
+        told = ", ".join(_range(name, values) for name, values in params.items())
+        return f"Task({count}{': ' * bool(told)}{told})"
+
+
+def _range(name: str, values: Any) -> str:
+    """Return a parameter's name with its value, or its least and greatest value, unless they are traced."""
+    if isinstance(values, jax.core.Tracer) or not isinstance(values, np.ndarray | np.generic | jax.Array):
+        return name
+    if not np.size(values):
+        return name
+    low, high = np.min(values), np.max(values)
+    return f"{name} {low:.4g}" if low == high else f"{name} {low:.4g} to {high:.4g}"
 
 
 class Step(NamedTuple):
@@ -142,6 +160,8 @@ class Experience(Protocol):
     def steps(self) -> int: ...  # of every environment between two calls of ``Agent.learn``
     @property
     def policy_delay(self) -> int: ...  # the actor learns at every so many updates
+    @property
+    def warmup_steps(self) -> int: ...  # of every environment under random actions before learning starts
     @property
     def reset_every(self) -> int: ...  # steps of every environment between two resets of networks; 0 for never
     def updates_in(self, steps: int) -> int: ...  # updates, or calls of ``learn``, in so many steps of all environments

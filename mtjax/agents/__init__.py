@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from mtjax.names import lazily, load, nearest_error
+from mtjax.names import InputError, frozen, lazily, load, nearest_error
 
 if TYPE_CHECKING:
     from mtjax.agents.base import BaseAgent
@@ -20,6 +20,7 @@ class Preset(NamedTuple):
     says: str  # a description in one line
     defaults: Mapping[str, Any] = {}
     place: "str | type[BaseAgent]" = "mtjax.agents.sac:SAC"  # the class, or where it is, to be imported when it is used
+    home: str = ""  # the file that registered it, if it is the user's own
 
     @property
     def cls(self) -> "type[BaseAgent]":
@@ -86,9 +87,21 @@ def preset_of(name: str) -> Preset:
     Raises:
         InputError: no agent has that name.
     """
+    if not isinstance(name, str):
+        raise InputError(f"an agent is chosen by name, such as 'care', not by {name!r}")
     if name not in AGENTS:
         raise nearest_error("agent", name, AGENTS)
     return AGENTS[name]
 
 
-__all__ = ["AGENTS", "PARTS", "SAC", "BaseAgent", "Preset", "agent", "preset_of", "settings"]
+def name_of(agent: Any) -> str:
+    """Return the name of an agent: of those of its class, the one whose defaults it shares most."""
+    cls, own = type(agent), load("mtjax.agents.choices:settings")(agent)
+    homes = (cls, f"{cls.__module__}:{cls.__name__}")
+    presets = {name: preset for name, preset in AGENTS.items() if preset.place in homes}
+    shared = lambda preset: all(own.get(name) == value for name, value in frozen(preset.defaults).items())
+    found = [name for name, preset in presets.items() if shared(preset)]
+    return max(found, key=lambda name: len(presets[name].defaults), default=next(iter(presets), cls.__name__))
+
+
+__all__ = ["AGENTS", "PARTS", "SAC", "BaseAgent", "Preset", "agent", "name_of", "preset_of", "settings"]

@@ -13,8 +13,9 @@ from mtjax.agents.parts.representations import REPRESENTATIONS
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.values import VALUES
+from mtjax.checks import OF_TRAIN, checked
 from mtjax.experience import EXPERIENCES
-from mtjax.names import frozen, nearest_error
+from mtjax.names import InputError, frozen, nearest_error
 
 PARTS: dict[str, Mapping[str, type]] = {
     "representation": REPRESENTATIONS,
@@ -64,11 +65,14 @@ def replace(agent: Any, given: Mapping[str, Any]) -> Any:
         InputError: it has no such setting, or the value is not allowed.
     """
     rest, fields = frozen(given), {field.name for field in dataclasses.fields(agent)}
-    chosen = {kind: parts.take(rest, getattr(agent, kind)) for kind in kinds_of(agent) if kind not in rest}
+    chosen = {}
+    for kind in kinds_of(agent):
+        part = parts.choose(kind, PARTS[kind], rest.pop(kind)) if kind in rest else getattr(agent, kind)
+        chosen[kind] = parts.take(rest, part)
     unknown = next((name for name in rest if name not in fields), None)
     if unknown is not None:
-        raise nearest_error("setting", unknown, settings(agent))
-    return dataclasses.replace(agent, **rest, **chosen)
+        raise nearest_error("setting", unknown, [*settings(agent), *OF_TRAIN])
+    return dataclasses.replace(agent, **checked(agent, rest), **chosen)
 
 
 def build(name: str, cls: type, given: Mapping[str, Any]) -> Any:
@@ -84,7 +88,9 @@ def build(name: str, cls: type, given: Mapping[str, Any]) -> Any:
         part = parts.choose(kind, PARTS[kind], rest.pop(kind, None) or fields[kind].default_factory())  # type: ignore
         chosen[kind] = parts.take(rest, part)
     unknown = next((name for name in rest if name not in fields), None)
+    if unknown in OF_TRAIN:
+        raise InputError(f"{unknown} is no setting of an agent; give it to mtjax.train({unknown}=...)")
     if unknown is not None:
         known = [*fields, *(name for part in chosen.values() for name in parts.settings(part))]
         raise nearest_error(f"setting of {name}", unknown, known)
-    return cls(**rest, **chosen)
+    return cls(**checked(cls, rest), **chosen)

@@ -1,6 +1,7 @@
 """Environment families by name. To add one, write a file for its domain and a line here, or ``register`` it."""
 
 import ast
+import dataclasses
 import re
 from collections import UserDict
 from collections.abc import Mapping, Sequence
@@ -8,6 +9,7 @@ from functools import lru_cache
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
+from mtjax.checks import OF_TRAIN, checked
 from mtjax.envs import variation
 from mtjax.names import InputError, first_sentence, frozen, lazily, load, nearest_error
 
@@ -18,7 +20,19 @@ if TYPE_CHECKING:
     from mtjax.envs.mixtures import Mixture
     from mtjax.envs.parameters import Parameter
 
-__all__ = ["ENVS", "Domain", "Family", "Mixture", "Parameter", "World", "make", "mixture", "outline", "register"]
+__all__ = [
+    "ENVS",
+    "Domain",
+    "Family",
+    "Mixture",
+    "Parameter",
+    "World",
+    "make",
+    "mixture",
+    "name_of",
+    "outline",
+    "register",
+]
 
 __getattr__ = lazily(
     __name__,
@@ -164,17 +178,41 @@ def make(name: str, vary: Mapping[str, Any] | tuple = (), **settings: Any) -> An
     Raises:
         InputError: there is no such family or field, or a value is out of range.
     """
+    if not isinstance(name, str):
+        raise InputError(f"an environment is chosen by name, such as 'finger-spin', not by {name!r}")
     if "+" in name:
-        return _make_mixture(tuple(name.split("+")), dict(vary), dict(settings))
+        return _make_mixture(tuple(name.split("+")), _pairs(vary), dict(settings))
     if name not in ENVS:
         raise nearest_error("environment", name, ENVS)
     family, defaults = ENVS[name]
-    fields = family.__dataclass_fields__
+    fields = [field.name for field in dataclasses.fields(family)]
     unknown = next((s for s in (*settings, *defaults) if s not in fields), None)
     if unknown is not None:
-        raise nearest_error(f"setting of {name}", unknown, fields)
-    settings = defaults | frozen(settings)
-    return family(**{**settings, "vary": dict(defaults.get("vary", {})) | dict(vary)})
+        raise _unknown_setting(name, family, unknown, settings.get(unknown))
+    settings = checked(family, defaults | frozen(settings))
+    return family(**{**settings, "vary": dict(defaults.get("vary", {})) | _pairs(vary)})
+
+
+def _pairs(vary: Any) -> dict[str, Any]:
+    """Return the values of each parameter by name.
+
+    Raises:
+        InputError: they are no mapping.
+    """
+    try:
+        return dict(vary)
+    except (TypeError, ValueError):
+        raise InputError(f"vary maps parameters to values, such as {{'size': '0.9:1.1:5'}}; not {vary!r}") from None
+
+
+def _unknown_setting(name: str, family: Any, unknown: str, value: Any) -> InputError:
+    """Return an error that says where a name belongs which is no field of a family."""
+    parameter = unknown.replace("_", "-")
+    if parameter in getattr(family, "parameters", ()):
+        return InputError(f"{unknown} is a parameter of {name}, not a setting: use vary={{{parameter!r}: {value!r}}}")
+    if unknown in OF_TRAIN:
+        return InputError(f"{unknown} is no setting of an environment; give it to mtjax.train({unknown}=...)")
+    return nearest_error(f"setting of {name}", unknown, [field.name for field in dataclasses.fields(family)])
 
 
 def mixture(families: "Sequence[str | Family | Mixture]") -> "Mixture":
@@ -193,7 +231,7 @@ def mixture(families: "Sequence[str | Family | Mixture]") -> "Mixture":
         if isinstance(found, cls):
             named += zip(found.names, found.families, strict=True)
         else:
-            named.append((given if isinstance(given, str) else _name_of(found), found))
+            named.append((given if isinstance(given, str) else name_of(found), found))
     names: list[str] = []
     for name, _ in named:
         again = sum(other == name or other.startswith(f"{name}#") for other in names)
@@ -201,9 +239,11 @@ def mixture(families: "Sequence[str | Family | Mixture]") -> "Mixture":
     return cls(tuple(family for _, family in named), tuple(names))
 
 
-def _name_of(family: Any) -> str:
+def name_of(family: Any) -> str:
     """Return the name of a family in ``make``, or else the name of its class."""
     cls = type(family)
+    if cls is load("mtjax.envs.mixtures:Mixture"):
+        return "+".join(family.names)
     place = f"{cls.__module__}:{cls.__name__}"
     known = [name for name, (home, _) in ENVS.data.items() if home is cls or home == place]
     exact = [name for name in known if make(name) == family]
@@ -217,10 +257,10 @@ def _make_mixture(names: tuple[str, ...], vary: dict[str, Any], settings: dict[s
     cls = load("mtjax.envs.mixtures:Mixture")
     recorded = settings.pop("families", None)
     if recorded is not None:  # of config.json
-        return cls(tuple(make(n, **each) for n, each in zip(names, recorded, strict=True)), names)
+        return cls(tuple(make(n.partition("#")[0], **each) for n, each in zip(names, recorded, strict=True)), names)
     plain = [make(name) for name in names]
     for given in settings:
-        known = dict.fromkeys(field for family in plain for field in family.__dataclass_fields__)
+        known = dict.fromkeys(field.name for family in plain for field in dataclasses.fields(family))
         if given not in known:
             raise nearest_error("setting of these families", given, known)
     own: dict[str, dict[str, Any]] = {name: {} for name in names}

@@ -19,6 +19,7 @@ class Rollouts:
     sharding: ClassVar[Any] = ()
     policy_delay: ClassVar[int] = 1  # the actor learns in every update
     reset_every: ClassVar[int] = 0  # networks are never reset
+    warmup_steps: ClassVar[int] = 0  # no action is random before learning
 
     def __post_init__(self):
         if self.unroll < 1:

@@ -39,6 +39,16 @@ def new_directory(root: Path, name: str) -> Path:
     raise InputError(f"cannot find a new name for a run in {str(root)!r}")
 
 
+def require_unused(directory: Path) -> None:
+    """Raise InputError if a folder holds a run, or files of one, so that nothing is overwritten."""
+    held = [
+        name for name in ("config.json", "metrics.csv", "evaluations.npz", "checkpoints") if (directory / name).exists()
+    ]
+    if directory.is_file() or held:
+        holds = f"holds {held[0]} of a run already" if held else "is a file"
+        raise InputError(f"{str(directory)!r} {holds}; give another directory, or resume=True to continue that run")
+
+
 def short_name(env_name: str) -> str:
     """Return an environment's name for folders and titles, shortened for mixtures of many families."""
     count = env_name.count("+") + 1
@@ -50,7 +60,8 @@ def resumed_config(config: RunConfig, directory: Path, argv: Sequence[str]) -> R
     recorded = from_json(directory / "config.json")
     extended = any(word.split("=", 1)[0] == "--steps" for word in argv)
     steps = config.plan.steps if extended else recorded.plan.steps
-    now = {"plan": dataclasses.replace(recorded.plan, steps=steps)}
+    now: dict[str, Any] = {"plan": dataclasses.replace(recorded.plan, steps=steps)}
+    now |= {"tensorboard": recorded.tensorboard or config.tensorboard, "wandb": config.wandb or recorded.wandb}
     return dataclasses.replace(recorded, **now, profile=config.profile, distributed=config.distributed)
 
 
@@ -87,6 +98,7 @@ def to_flags(config: RunConfig) -> list[str]:
     """Return every setting as a flag, so that the command keeps its meaning when presets change."""
     words = [f"--env={config.env}", f"--agent={config.agent}", *import_flags(config)]
     words += [f"--from={config.start}"] if config.start else []
+    words += ["--tensorboard"] * config.tensorboard + [f"--wandb={config.wandb}"] * bool(config.wandb)
     found = {"--": {**_fields(config.plan), **_fields(config.training)}, "--env.": _family_settings(config.family)}
     for prefix, items in found.items():
         words += itertools.chain(*(_flag(prefix, name.replace("_", "-"), value) for name, value in items.items()))

@@ -2,22 +2,30 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import jax
+import numpy as np
 
 from mtjax.agents.parts.conditioning import load_vectors
 from mtjax.config import RunConfig, require_value_range, wants_gpu
 from mtjax.envs import Family
 from mtjax.parallel import hosts, mesh
+from mtjax.report import figures
 from mtjax.training import points
 from mtjax.training.finetune import require_fit
+from mtjax.training.folder import short_name
 from mtjax.training.policy import Policy, load
-from mtjax.training.run import Result, train
+from mtjax.training.result import Result
+from mtjax.training.run import train
 from mtjax.types import InputError
 
 
-def check(config: RunConfig) -> None:
+def check(config: RunConfig, start: Policy | None = None) -> None:
     """Check a configuration as a whole, before a folder is made.
+
+    Args:
+        start: the policy to fine-tune, if it is loaded already.
 
     Raises:
         InputError: family, agent, devices and flags do not go together.
@@ -28,12 +36,15 @@ def check(config: RunConfig) -> None:
     config.learner.experience.check(family, config.training.num_envs)
     for learner in points.agents_at(config.learner, config.points):
         require_value_range(learner)
+        if start is not None:
+            require_fit(start, family, learner)
+    begins = start is not None or bool(config.start)
     if config.learner.vectors:
         load_vectors(config.learner.vectors, family.train_count)
     tune = config.learner.tune
-    if tune != "all" and not config.start:
+    if tune != "all" and not begins:
         raise InputError(f"--tune={tune} leaves the rest as a run left it; say which run: --from=RUN")
-    if config.start and config.learner.experience.reset_every:
+    if begins and config.learner.experience.reset_every:
         raise InputError("--reset-every throws away what --from takes from a run; give one of them")
 
 
@@ -46,33 +57,66 @@ def load_start(config: RunConfig) -> Policy | None:
     return start
 
 
-def launch(config: RunConfig, directory: Path, start: Policy | None, resume: bool, label: str = "") -> Result:
+def launch(
+    config: RunConfig,
+    directory: Path | None,
+    start: Policy | None,
+    resume: bool,
+    label: str = "",
+    quiet: bool = False,
+    **hooks: Any,
+) -> Result:
     """Print what a run does, and train it in ``directory`` from the start or from its newest checkpoint."""
-    said = f"{label}: {' '.join(config.sweep)}\n" if config.sweep else ""
-    origin = f"{_origin(config)}run: {directory}"
-    if resume and "warp" in config.family.engine_name:
-        origin += "\nMuJoCo Warp does not repeat bit for bit: the run goes on from its state, in other numbers"
-    if jax.default_backend() == "cpu" and wants_gpu(config.env):
-        origin += f"\n{config.env} wants a GPU: two CPU cores were not seen to learn it in seven minutes"
-    plan = config.plan
-    if resume and config.learner.lr_schedule != "constant" and not config.learner.lr_updates:
-        origin += f"\nlearning rates go on along the schedule of a run of {plan.steps:,} steps"
-    seeds = f"seeds {plan.seed} to {plan.seed + plan.seeds - 1}"
-    if hosts.is_first():
-        print(f"{said}{config.agent} on {config.env}: {config.family.summary}, {seeds}\n{origin}", flush=True)
+    if hosts.is_first() and not quiet:
+        print(_introduction(config, directory, resume, label), flush=True)
     return train(
         config.family,
         config.learner,
-        **dataclasses.asdict(plan),
+        **dataclasses.asdict(config.plan),
         settings=config.training,
         start=start,
         sweep=config.points,
         directory=directory,
         resume=resume,
         profile=config.profile,
+        tensorboard=config.tensorboard,
+        wandb=config.wandb,
         label=label,
-        quiet=False,
+        quiet=quiet,
+        **hooks,
     )
+
+
+def _introduction(config: RunConfig, directory: Path | None, resume: bool, label: str) -> str:
+    """Return the first lines of a run: what learns, on which tasks, and where the results are."""
+    plan = config.plan
+    lines = [f"{label}: {' '.join(config.sweep)}"] if config.sweep else []
+    seeds = f"seeds {plan.seed} to {plan.seed + plan.seeds - 1}" if plan.seeds > 1 else f"seed {plan.seed}"
+    lines.append(f"{config.agent} on {config.env}: {config.family.summary}, {seeds}")
+    lines += [line for line in (_origin(config),) if line]
+    lines += [] if directory is None else [f"run: {directory}"]
+    if resume and "warp" in config.family.engine_name:
+        lines.append("MuJoCo Warp does not repeat bit for bit: the run goes on from its state, in other numbers")
+    if jax.default_backend() == "cpu" and wants_gpu(config.env):
+        lines.append(f"{config.env} wants a GPU: two CPU cores were not seen to learn it in seven minutes")
+    if resume and config.learner.lr_schedule != "constant" and not config.learner.lr_updates:
+        lines.append(f"learning rates go on along the schedule of a run of {plan.steps:,} steps")
+    return "\n".join(lines)
+
+
+def draw(config: RunConfig, result: Result, directory: Path) -> None:
+    """Draw a run's returns over its steps into curve.png, one line per split; of a sweep, one per point."""
+    evaluations, count = result.evaluations, config.plan.seeds
+    if not len(evaluations.steps) or not hosts.is_first():
+        return
+    curves = evaluations.returns
+    for p, point in enumerate(config.points):
+        named = ", ".join(f"{name} {value:g}" for name, value in point.items())
+        curves = {**(curves if p else {}), named: evaluations.returns["train"][p * count : (p + 1) * count]}
+    known = {name: x for name, x in curves.items() if np.isfinite(x).all()}
+    if known:
+        title = f"{config.agent} on {short_name(config.env)}"
+        figures.learning_curve(directory / "curve.png", evaluations.steps, known, title)
 
 
 def _origin(config: RunConfig) -> str:
@@ -83,4 +127,4 @@ def _origin(config: RunConfig) -> str:
     assert isinstance(family, Family)
     unseen = set(family.varied) - {name for name, _, _ in family.ranges} if told else ()
     blind = f"; its networks cannot be told {', '.join(sorted(unseen))}" if unseen else ""
-    return f"from {config.start}: {config.learner.tune} of its parameters learn{blind}\n"
+    return f"from {config.start}: {config.learner.tune} of its parameters learn{blind}"

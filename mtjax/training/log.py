@@ -1,9 +1,8 @@
-"""Metrics of a run: one line per chunk on the terminal, and rows in a CSV file."""
+"""Metrics of a run as rows of a CSV file."""
 
 import csv
 import itertools
 import os
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -74,39 +73,3 @@ def _mean(x: np.ndarray) -> float:
 def number(x: Any) -> str:
     """Format a number for a file with seven digits. NaN becomes an empty string."""
     return "" if np.isnan(x) else f"{float(x):.7g}"
-
-
-class Console:
-    """Progress display: a bar on a terminal, plain lines elsewhere, nothing if ``quiet``."""
-
-    def __init__(self, total_steps: int, quiet: bool = False, label: str = ""):
-        self.total, self.quiet, self.bar, self.label = total_steps, quiet, None, f"{label}  " if label else ""
-        if quiet or not sys.stdout.isatty():
-            return
-        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-        self.bar = Progress(BarColumn(24), TextColumn("{task.description}"), TimeRemainingColumn(), transient=False)
-        self.task = self.bar.add_task("compiling", total=total_steps)
-        self.bar.start()
-
-    def say(self, text: str) -> None:
-        """Print a line."""
-        if self.bar is not None:
-            self.bar.console.print(text, highlight=False, markup=False)
-        elif not self.quiet:
-            print(text, flush=True)
-
-    def progress(self, steps: int, seconds: float, rate: float, returns: np.ndarray) -> None:
-        """Show steps, time and return. ``returns`` (S, T) are those of this chunk, NaN where no episode ended."""
-        known = returns[np.isfinite(returns)]
-        score = f"return {known.mean():.0f} ({known.min():.0f} to {known.max():.0f})" if known.size else "return -"
-        text = f"{self.label}{steps:,} of {self.total:,} steps  {seconds:.1f} s  {rate:,.0f} steps/s  {score}"
-        if self.bar is not None:
-            self.bar.update(self.task, completed=steps, description=text)
-        else:
-            self.say(text)
-
-    def close(self) -> None:
-        """Stop the bar."""
-        if self.bar is not None:
-            self.bar.stop()

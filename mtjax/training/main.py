@@ -7,13 +7,13 @@ from pathlib import Path
 
 from mtjax.config import RunConfig, import_flags, to_json
 from mtjax.parallel import hosts
-from mtjax.report import figures
 from mtjax.report.tables import split_table
 from mtjax.training import memory, sweep
+from mtjax.training.console import duration
 from mtjax.training.folder import new_directory, record_steps, resumed_config, run_metadata, short_name
-from mtjax.training.launch import check, launch, load_start
+from mtjax.training.launch import check, draw, launch, load_start
 from mtjax.training.programs import enable_compile_cache
-from mtjax.training.run import Result
+from mtjax.training.result import Result
 from mtjax.types import InputError
 
 
@@ -56,10 +56,13 @@ def _conclude(config: RunConfig, result: Result, directory: Path) -> None:
         words = [f"--resume={directory}", *import_flags(config)]
         print(f"stopped; the state is saved. Go on with:\n  python -m mtjax.train {shlex.join(words)}")
         return
+    draw(config, result, directory)
     if len(result.evaluations.steps):
-        title = f"{config.agent} on {short_name(config.env)}"
-        figures.learning_curve(directory / "curve.png", result.evaluations.steps, result.evaluations.returns, title)
         print(split_table(result.evaluations, config.family.parts))
         if config.learner.unseen:
             print(f"unseen tasks: {config.learner.unseen}")
-    print(f"trained in {result.seconds:.1f} s (compiled in {result.compile_seconds:.1f} s); run: {directory}")
+    rest = max(result.total_seconds - result.compile_seconds - result.trained_seconds, 0)
+    print(
+        f"done in {duration(result.total_seconds)}: compiled in {duration(result.compile_seconds)}, trained in "
+        f"{duration(result.trained_seconds)}, evaluated and saved in {duration(rest)}; run: {directory}"
+    )

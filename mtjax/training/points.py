@@ -6,7 +6,7 @@ holds all points with all seeds, point by point: entry ``k`` is seed ``k % seeds
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -128,17 +128,29 @@ def grid(sweep: Sweep) -> tuple[dict[str, float], ...]:
     Raises:
         InputError: a name has no values, or the points have different names.
     """
+    listed_all = isinstance(sweep, Mapping) and all(isinstance(x, Iterable) for x in sweep.values())
+    points = isinstance(sweep, Sequence) and all(isinstance(point, Mapping) for point in sweep)
+    if not (listed_all or points):
+        raise InputError(f"sweep gives each number a list of values, {{'actor_lr': [1e-4, 1e-3]}}; not {sweep!r}")
     if isinstance(sweep, Mapping):
+        sweep = {name: list(values) for name, values in sweep.items()}
         empty = next((name for name, values in sweep.items() if not len(values)), None)
         if empty is not None:
             raise InputError(f"the sweep gives no values to {empty}")
         rows = itertools.product(*sweep.values()) if sweep else ()
-        return tuple({name: float(value) for name, value in zip(sweep, row, strict=True)} for row in rows)
-    listed = ({name: float(value) for name, value in point.items()} for point in sweep)  # type: ignore
+        return tuple({name: _number(name, value) for name, value in zip(sweep, row, strict=True)} for row in rows)
+    listed = ({name: _number(name, value) for name, value in point.items()} for point in sweep)  # type: ignore
     found = tuple(listed)
     if any(point.keys() != found[0].keys() for point in found):
         raise InputError("every point of a sweep must give a value to the same names")
     return found
+
+
+def _number(name: str, value: Any) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} is a number, and {value!r} is none") from None
 
 
 def seed_axis(points: Sequence[Point], seeds: Array) -> tuple[Array, dict[str, Array] | None]:

@@ -1,19 +1,24 @@
 """Trained policies, read from the folder of a run."""
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mtjax import loop
-from mtjax.agents import BaseAgent
+from mtjax.agents import BaseAgent, name_of
+from mtjax.checks import path
 from mtjax.config import RunConfig, from_json
+from mtjax.envs import name_of as env_name_of
 from mtjax.envs.family import Tabled
 from mtjax.experience import Replay
 from mtjax.experience.ring import Ring
 from mtjax.training import checkpoint, points
+from mtjax.training.points import Point
 from mtjax.training.programs import trace
 from mtjax.types import Array, InputError, Key, Task, Transition
 
@@ -27,6 +32,12 @@ class Policy:
     state: Any  # of one seed
     states: Any  # of every seed, leading S; of a sweep, those of one point
     seeds: Array  # (S,)
+    directory: Path | None = None  # of the run
+
+    def __repr__(self) -> str:
+        spec, names = self.env.spec, f"{name_of(self.agent)} on {env_name_of(self.env)}"
+        shapes = f"observation {tuple(getattr(spec.obs, 'shape', ()))}, action ({spec.action_size},)"
+        return f"Policy({names}: {shapes}, one of {len(self.seeds)} seed{'s' * (len(self.seeds) > 1)})"
 
     def __call__(self, obs: Array, task: Task, key: Key | None = None, memory: Any = None) -> Array:
         """Return the mean action (A,), or a sampled one if a key is given.
@@ -35,6 +46,11 @@ class Policy:
             memory: the agent's memory of the episode, from ``begin`` and ``remember``. Only agents that infer their
                 task need it. None means that the episode has just begun.
         """
+        if np.ndim(task.id):
+            raise InputError(f"policy(obs, task) takes one task, not {task!r}: jax.tree.map(lambda x: x[0], tasks)")
+        shape, wanted = jax.tree.map(np.shape, obs), jax.tree.map(lambda x: x.shape, self.env.spec.obs)
+        if shape != wanted:
+            raise InputError(f"an observation of this family has shape {wanted}, not {shape}; use jax.vmap for many")
         memory = self.begin(task) if memory is None else memory
         return self.agent.act(self.state, memory, obs, task, key).action
 
@@ -59,26 +75,40 @@ def load(directory: str | Path, seed: int = 0) -> Policy:
     Raises:
         InputError: the folder is not a run, the run has no such seed, or its checkpoint is missing or damaged.
     """
-    directory = Path(directory)
+    directory = path(directory)
     config = from_json(directory / "config.json")
-    count = config.plan.seeds
-    last = count * max(len(config.points), 1) - 1
-    if not 0 <= seed <= last:
-        raise InputError(f"seed must be from 0 to {last}, counted from the run's first, not {seed}")
+    _require_seed(seed, config.plan.seeds, len(config.points))
     states = checkpoint.load_agent(directory / "checkpoints", state_shapes(config))
-    agent = config.learner
-    if config.points:
-        rows = _point_rows(config, seed)
-        agent = points.agent_at(agent, config.points[seed // count])
-        states = jax.tree.map(lambda x: x[rows], states.learner)
-    seeds = config.plan.seed + jnp.arange(count)
-    return Policy(config.family, agent, jax.tree.map(lambda x: x[seed % count], states), states, seeds)
+    seeds = config.plan.seed + jnp.arange(config.plan.seeds)
+    return policy_of(config.family, config.learner, config.points, seeds, states, seed, directory)
 
 
-def _point_rows(config: RunConfig, seed: int) -> slice:
-    """Return the slice of S with all seeds of one point: that of entry ``seed``."""
-    first = seed - seed % config.plan.seeds
-    return slice(first, first + config.plan.seeds)
+def policy_of(
+    env: Any, agent: Any, found: Sequence[Point], seeds: Array, states: Any, seed: int, directory: Path | None
+) -> Policy:
+    """Return the policy of one seed from the agent's states, leaves (S, ...), of all seeds of all points of a run.
+
+    Raises:
+        InputError: the run has no such seed.
+    """
+    count = len(seeds)
+    _require_seed(seed, count, len(found))
+    if found:
+        agent = points.agent_at(agent, found[seed // count])
+        states = jax.tree.map(lambda x: x[_point_rows(count, seed)], states.learner)
+    return Policy(env, agent, jax.tree.map(lambda x: x[seed % count], states), states, seeds, directory)
+
+
+def _require_seed(seed: int, seeds: int, num_points: int) -> None:
+    last = seeds * max(num_points, 1) - 1
+    if not isinstance(seed, int | np.integer) or not 0 <= seed <= last:
+        raise InputError(f"seed must be from 0 to {last}, counted from the run's first, not {seed!r}")
+
+
+def _point_rows(count: int, seed: int) -> slice:
+    """Return the slice of S with all ``count`` seeds of one point: that of entry ``seed``."""
+    first = seed - seed % count
+    return slice(first, first + count)
 
 
 def load_experience(directory: str | Path, seed: int = 0) -> tuple[Ring, int]:
@@ -93,7 +123,7 @@ def load_experience(directory: str | Path, seed: int = 0) -> tuple[Ring, int]:
     if not isinstance(config.learner.experience, Replay):
         raise InputError(f"{config.agent} keeps no replay, so that there is nothing to look at")
     ring = checkpoint.load_ring(Path(directory) / "checkpoints", state_shapes(config))
-    rows = _point_rows(config, seed)
+    rows = _point_rows(config.plan.seeds, seed)
     return ring._replace(rows=jax.tree.map(lambda x: x[rows], ring.rows)), config.learner.experience.batch_size
 
 

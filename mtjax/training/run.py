@@ -9,36 +9,27 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
+from mtjax.agents import settings as settings_of
 from mtjax.config import Plan, configure, require_value_range
 from mtjax.evaluation import Evaluations, load_evaluations, save_evaluations
 from mtjax.loop import Settings, TrainState
 from mtjax.parallel import hosts
 from mtjax.parallel import mesh as meshes
 from mtjax.training import checkpoint, finetune, log, points
+from mtjax.training.console import Clock, Console, describe_rounding, describe_running, describe_warmup, duration
 from mtjax.training.points import Point, Sweep, SweptAgent
 from mtjax.training.policy import Policy
 from mtjax.training.programs import Programs, compile_lowered, jit_programs, load_kernels, sharded_shapes, trace
+from mtjax.training.result import Result
+from mtjax.training.sinks import Sink, open_sinks, require, write_rows
 from mtjax.types import SPLITS, Agent, Env, InputError
-
-
-class Result(NamedTuple):
-    """The result of a run."""
-
-    state: TrainState
-    evaluations: Evaluations
-    rows: list[dict[str, Any]]  # the lines of metrics.csv
-    seconds: float  # of training, without compiling and evaluating
-    compile_seconds: float  # from the start until the first chunk could begin
-    finished: bool  # False if a signal stopped it
-    directory: Path | None
-    points: tuple[Point, ...] = ()  # of a sweep: entry k of S is seed k % seeds of point k // seeds
 
 
 def train(
@@ -56,39 +47,18 @@ def train(
     directory: str | Path | None = None,
     resume: bool = False,
     profile: bool = False,
+    tensorboard: bool = False,
+    wandb: str = "",
     quiet: bool = True,
     label: str = "",
     on_chunk: Callable[[dict[str, Any]], None] | None = None,
+    on_evaluation: Callable[[Evaluations], None] | None = None,
     **given: Any,
 ) -> Result:
-    """Train an agent on a family of tasks.
-
-    Devices share the seeds evenly. Devices that are left over share the environments of each seed. Under
-    ``jax.distributed`` every process makes the same call. The first process writes and prints. All return the same
-    result, except that the leaves of ``Result.state`` are spread over the processes.
+    """Train an agent on a family of tasks. ``api.train`` says what the arguments mean; here all are objects.
 
     Args:
-        env: the family; it trains on ``env.tasks("train")``.
-        agent: the learner.
-        steps: environment steps of each seed, summed over tasks. They are rounded up to whole chunks.
-        seeds: how many seeds to train at once.
-        seed: the first seed.
-        eval_every: environment steps between evaluations. 0 means ten evaluations in the run.
-        eval_episodes: episodes of each task in every evaluation.
-        settings: settings of the training loop; by default ``Settings()``.
-        start: the policy to fine-tune, from ``mtjax.load``. Then ``env`` is ``new.scaled_as(start.env)`` and ``agent``
-            is ``start.agent``; only learning rates and ``tune`` may differ. ``finetune.adopt`` says what is kept.
-        sweep: numbers of the agent that vary inside one program. Give ``{"actor_lr": [1e-4, 1e-3], "gamma": [0.98,
-            0.99]}`` for every combination, or a list of points ``{"actor_lr": 1e-4, "gamma": 0.98}``. Every point has
-            all seeds, and the S axis of the result holds them point by point. A seed whose numbers stop being finite
-            is given up: its returns become NaN, and the other seeds continue.
         directory: an existing folder for metrics, evaluations and checkpoints; None writes nothing.
-        resume: continue from the newest checkpoint in ``directory``. The number of devices may have changed.
-        profile: write a trace of one chunk by ``jax.profiler`` into ``directory``/profile.
-        quiet: print nothing.
-        label: the first words of progress lines.
-        on_chunk: a function that is called with each chunk's first row of metrics.
-        given: any setting of ``Settings``, of the agent or of its parts, by name: ``num_envs=64, batch_size=128``.
 
     Raises:
         InputError: an argument cannot be used.
@@ -102,28 +72,41 @@ def train(
         if start is not None:
             finetune.require_fit(start, env, learner)  # type: ignore
     directory = None if directory is None else Path(directory)
-    if profile and directory is None:
-        raise InputError("profile writes into the run's folder; give directory as well")
+    if (profile or tensorboard or wandb) and directory is None:
+        raise InputError("profile, tensorboard and wandb write into the run's folder; give directory as well")
+    for name in (["tensorboardX"] if tensorboard else []) + (["wandb"] if wandb else []):
+        require(name)
     started = time.monotonic()
     tasks = env.tasks("train")
     agent.experience.check(env, settings.num_envs)
     settings = fit_chunk(settings, len(tasks.id), steps, agent.experience.steps)
-    agent = agent.planned(_played(settings, len(tasks.id), steps))  # type: ignore
+    plain, length = agent, _played(settings, len(tasks.id), steps)
+    agent = agent.planned(length)  # type: ignore
     learner = SweptAgent(agent) if found else agent  # type: ignore
-    console = log.Console(plan.steps, quiet or not hosts.is_first(), label)
     mesh = meshes.mesh_for(seeds * max(len(found), 1), len(tasks.id), settings.num_envs)
-    run = _Run(env, learner, settings, plan, directory, console, found, mesh, profile)
+    total = length * len(tasks.id) * settings.num_envs
+    console = Console(total, quiet or not hosts.is_first(), label)
+    run = _Run(
+        *(env, learner, settings, plan, directory, console, found, mesh),
+        *(profile, tensorboard, wandb, on_chunk, on_evaluation),
+    )
     try:
+        if not resume:
+            run.introduce(total)
         programs, state = run.prepare(resume)
         if start is not None and not resume:
             begun = run.adopt(start, tasks, hosts.gather(state.agent))
             state = state._replace(agent=meshes.shard_by_seed(mesh, begun))
         hosts.wait_for_all()
         compile_seconds = time.monotonic() - started
-        run.console.say(f"compiled in {compile_seconds:.1f} s")
-        return run.run_chunks(programs, state, started, on_chunk)._replace(compile_seconds=compile_seconds)
+        run.console.say(f"compiled in {duration(compile_seconds)}")
+        result = run.run_chunks(programs, state, started, total)
     finally:
         run.console.close()
+    named = {"env": env, "agent": plain, "seeds": tuple(range(seed, seed + seeds))}
+    return result._replace(
+        compile_seconds=compile_seconds, total_seconds=time.monotonic() - started, points=found, **named
+    )
 
 
 def fit_chunk(settings: Settings, num_tasks: int, steps: int, grain: int = 1) -> Settings:
@@ -148,10 +131,14 @@ class _Run:
     settings: Settings
     plan: Plan
     directory: Path | None
-    console: log.Console
+    console: Console
     points: tuple[Point, ...] = ()
     mesh: Mesh | None = None
     profile: bool = False
+    tensorboard: bool = False
+    wandb: str = ""
+    on_chunk: Callable[[dict[str, Any]], None] | None = None
+    on_evaluation: Callable[[Evaluations], None] | None = None
 
     @cached_property
     def seed_axis(self) -> tuple[jax.Array, dict[str, jax.Array] | None]:
@@ -231,11 +218,60 @@ class _Run:
         assert self.directory is not None
         return log.truncate_rows(self.directory / "metrics.csv", iteration)
 
-    def run_chunks(self, programs: Programs, state: TrainState, started: float, on_chunk) -> Result:
+    def _open_sinks(self, steps: int) -> list[Sink]:
+        """Return where metrics go beside metrics.csv, in a run that is at a step."""
+        if not self.is_writer:
+            return []
+        assert self.directory is not None
+        config = {**dataclasses.asdict(self.plan), **dataclasses.asdict(self.settings), **settings_of(self.learner)}
+        return open_sinks(self.directory, self.tensorboard, self.wandb, steps, config)
+
+    @property
+    def learner(self) -> Any:
+        """Return the agent without its sweep."""
+        return self.agent.agent if isinstance(self.agent, SweptAgent) else self.agent
+
+    def _name(self, k: int) -> str:
+        """Return the name of entry k of S for TensorBoard and W&B."""
+        values = [f"{name}={value:g}" for name, value in self.point(k).items()]
+        return "-".join([*values, f"seed-{self.seeds[k]}"])
+
+    def introduce(self, total: int) -> None:
+        """Say how many steps a new run takes, and what the first of them are."""
+        chunk = self.settings.chunk_steps * self.steps_per_iteration
+        warmup = self.agent.experience.warmup_steps * self.steps_per_iteration
+        for line in (*describe_rounding(self.plan.steps, total, chunk), *describe_warmup(warmup, total)):
+            self.console.say(line)
+
+    def _clock(self, steps: int, total: int) -> Clock:
+        """Return a clock that counts the chunks and evaluations to come."""
+        chunk = self.settings.chunk_steps * self.steps_per_iteration
+        ends = range(steps + chunk, total + chunk, chunk)
+        due = sum(end // self.eval_every > (end - chunk) // self.eval_every or end >= self.plan.steps for end in ends)
+        return Clock(len(ends), due)
+
+    def _running(self, state: TrainState, returns: np.ndarray) -> str:
+        """Return a text on first episodes that still run, if no episode has ended."""
+        if np.isfinite(returns).any() or jax.process_count() > 1:
+            return ""
+        totals, ages, counted = jax.device_get((state.total, state.worlds.age, state.counted))
+        return describe_running(totals, ages, counted, self.env.episode_length)
+
+    def run_chunks(self, programs: Programs, state: TrainState, started: float, total: int) -> Result:
         """Run chunks until all steps are done or a signal asks to stop."""
         steps = int(state.iteration) * self.steps_per_iteration
+        self.console.clock = self._clock(steps, total)
+        with contextlib.ExitStack() as opened:
+            found = self._open_sinks(steps)
+            for sink in found:
+                opened.callback(sink.close)
+            return self._run_chunks(programs, state, started, found)
+
+    def _run_chunks(self, programs: Programs, state: TrainState, started: float, found: list[Sink]) -> Result:
+        steps, clock = int(state.iteration) * self.steps_per_iteration, self.console.clock
         evaluations = self._earlier_evaluations(steps)
-        rows, seconds, stop = [], self._earlier_seconds(int(state.iteration)), False
+        earlier = seconds = self._earlier_seconds(int(state.iteration))
+        rows, stop = [], False
         diverged = np.zeros(len(self.seeds), bool)
         with stop_signals() as received:
             while steps < self.plan.steps and not stop:
@@ -258,17 +294,28 @@ class _Run:
                 new = [{"seed": row["seed"], **self.point(k), **row} for k, row in enumerate(lines)]
                 rows += new
                 self._write(new)
+                write_rows(found, lines, [self._name(k) for k in range(len(lines))])
                 rate = (steps - steps_before) * len(self.seeds) / elapsed
-                self.console.progress(steps, seconds, rate, metrics["return"])
-                if on_chunk is not None:
-                    on_chunk(new[0])
-                due = steps // self.eval_every > steps_before // self.eval_every
-                if due or steps >= self.plan.steps:
+                clock.chunk(elapsed)
+                running = self._running(state, metrics["return"])
+                self.console.progress(steps, time.monotonic() - started, rate, metrics["return"], running)
+                if self.on_chunk is not None:
+                    self.on_chunk(new[0])
+                due = steps // self.eval_every > steps_before // self.eval_every or steps >= self.plan.steps
+                before = time.monotonic()
+                if due:
+                    self.console.doing(f"{steps:,} steps  evaluating")
                     evaluations = self._evaluate(programs.evaluate, state, evaluations, steps, diverged)
+                    write_rows(found, *self._evaluation_rows(evaluations))
                 stop = hosts.any_process(bool(received))
-                if due or stop or steps >= self.plan.steps:
+                if due or stop:
                     self._save(state)
-        return Result(state, evaluations, rows, seconds, 0.0, steps >= self.plan.steps, self.directory, self.points)
+                    clock.evaluation(time.monotonic() - before)
+                    if self.on_evaluation is not None and due:
+                        self.on_evaluation(evaluations)
+        return Result(state, evaluations, rows, seconds, 0.0, steps >= self.plan.steps, self.directory)._replace(
+            trained_seconds=seconds - earlier
+        )
 
     @contextlib.contextmanager
     def _profile_chunk(self, rows: int, steps: int) -> Iterator[None]:
@@ -318,9 +365,17 @@ class _Run:
         if self.is_writer:
             assert self.directory is not None
             save_evaluations(self.directory / "evaluations.npz", evaluations)
-        means = ", ".join(f"{s} {x[~diverged, -1].mean():.0f}" for s, x in returns.items() if x.size)
-        self.console.say(f"evaluation at {steps:,} steps: {means}")
+        if not diverged.all():
+            self.console.evaluation(steps, {split: x[~diverged, -1] for split, x in returns.items()})
         return evaluations
+
+    def _evaluation_rows(self, evaluations: Evaluations) -> tuple[list[dict[str, Any]], list[str]]:
+        """Return a row for each entry of S with the last evaluation's mean return by split, and its name."""
+        last = {split: x[:, -1] for split, x in evaluations.returns.items() if x.size}
+        score = lambda x: log.number(x.mean())
+        rows = [{"steps": evaluations.steps[-1]} for _ in self.seeds]
+        rows = [row | {f"evaluation/{split}": score(x[k]) for split, x in last.items()} for k, row in enumerate(rows)]
+        return rows, [self._name(k) for k in range(len(rows))]
 
     def _earlier_evaluations(self, steps: int) -> Evaluations:
         """Return the evaluations of a resumed run up to a step; of a new run, empty ones."""

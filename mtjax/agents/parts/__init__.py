@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Literal, TypeVar, get_args, get_origin
 import jax
 import jax.numpy as jnp
 
+from mtjax.checks import checked
 from mtjax.names import frozen, nearest_error
 from mtjax.types import InputError, Outcome
 
@@ -41,6 +42,8 @@ def choose(kind: str, table: Mapping[str, type[P]], given: Any) -> P:
     """
     if isinstance(given, tuple(table.values())):
         return given
+    if not isinstance(given, str):
+        raise InputError(f"{kind} must be a name or a part of that kind, not {given!r}")
     if given not in table:
         raise nearest_error(kind, given, table)
     return table[given]()
@@ -58,8 +61,8 @@ def settings(part: Any) -> dict[str, Any]:
 
 def take(settings: dict[str, Any], part: P) -> P:
     """Move a part's own settings out of ``settings``, and return a copy of the part that has them."""
-    own = {field.name for field in dataclasses.fields(part)} & set(settings)  # type: ignore
-    return dataclasses.replace(part, **frozen({name: settings.pop(name) for name in own}))  # type: ignore
+    own = [field.name for field in dataclasses.fields(part) if field.name in settings]  # type: ignore
+    return dataclasses.replace(part, **checked(part, frozen({name: settings.pop(name) for name in own})))  # type: ignore
 
 
 def put(part: P, **values: Any) -> P:

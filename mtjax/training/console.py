@@ -1,0 +1,151 @@
+"""Progress of a run: a bar on a terminal, plain lines elsewhere."""
+
+import sys
+from collections.abc import Mapping
+
+import numpy as np
+
+_SHARE = 1 / 3  # of a run under random actions from which a warning is due
+
+
+class Clock:
+    """Estimates the seconds that a run still takes: its chunks, and its evaluations with their checkpoints."""
+
+    def __init__(self, chunks: int, evaluations: int):
+        self.chunks, self.evaluations = chunks, evaluations  # that are still to come
+        self.chunk_seconds: list[float] = []
+        self.evaluation_seconds: list[float] = []
+
+    def chunk(self, seconds: float) -> None:
+        """Note a chunk."""
+        self.chunks -= 1
+        self.chunk_seconds.append(seconds)
+
+    def evaluation(self, seconds: float) -> None:
+        """Note an evaluation. The first one may have waited for its program, so later ones count alone."""
+        self.evaluations -= 1
+        self.evaluation_seconds.append(seconds)
+
+    @property
+    def left(self) -> float | None:
+        """Return the seconds that are left, by the last ten chunks; None before the first one."""
+        if not self.chunk_seconds:
+            return None
+        warm = self.evaluation_seconds[1:] or self.evaluation_seconds
+        each = float(np.mean(self.chunk_seconds[-10:])), float(np.mean(warm)) if warm else 0.0
+        return max(self.chunks, 0) * each[0] + max(self.evaluations, 0) * each[1]
+
+
+class Console:
+    """Progress display: a bar on a terminal, plain lines elsewhere, nothing if ``quiet``."""
+
+    def __init__(self, total_steps: int, quiet: bool = False, label: str = "", clock: Clock | None = None):
+        self.total, self.quiet, self.bar = total_steps, quiet, None
+        self.label, self.clock = f"{label}  " if label else "", clock or Clock(0, 0)
+        self.evaluated = ""
+        if quiet or not sys.stdout.isatty():
+            return
+        from rich.progress import BarColumn, Progress, TextColumn
+
+        self.bar = Progress(BarColumn(16), TextColumn("{task.description}"), transient=False)
+        self.task = self.bar.add_task("compiling", total=total_steps)
+        self.bar.start()
+
+    def say(self, text: str) -> None:
+        """Print a line."""
+        if self.bar is not None:
+            self.bar.console.print(text, highlight=False, markup=False, soft_wrap=True)
+        elif not self.quiet:
+            print(text, flush=True)
+
+    def doing(self, what: str) -> None:
+        """Show on the bar what takes time now."""
+        if self.bar is not None:
+            self.bar.update(self.task, description=what)
+
+    def progress(self, steps: int, seconds: float, rate: float, returns: np.ndarray, running: str = "") -> None:
+        """Show steps, rate, time left and returns.
+
+        Args:
+            seconds: since the start.
+            rate: steps a second of all seeds.
+            returns: (S, T) of this chunk's episodes, NaN where none ended.
+            running: a text on the episodes that still run, shown if none has ended.
+        """
+        if self.quiet:
+            return
+        left = "" if self.clock.left is None else f", {duration(self.clock.left)} left"
+        text = (
+            f"{self.label}{steps:,} of {self.total:,} steps  {duration(seconds)}{left}  {rate:,.0f} steps/s  "
+            f"{describe_returns(returns) or running or 'no episode has ended'}"
+        )
+        if self.bar is not None:
+            self.bar.update(self.task, completed=steps, description=f"{text}{self.evaluated}")
+        else:
+            self.say(text)
+
+    def evaluation(self, steps: int, returns: Mapping[str, np.ndarray]) -> None:
+        """Show an evaluation's mean return and worst task by split. ``returns`` are (S, T, episodes) by split."""
+        told = ", ".join(_of_split(split, x) for split, x in returns.items() if x.size)
+        self.say(f"{self.label}evaluation at {steps:,} steps: {told}")
+        means = "  ".join(f"{split} {x.mean():.0f}" for split, x in returns.items() if x.size)
+        self.evaluated = f"  evaluated: {means}"
+
+    def close(self) -> None:
+        """Stop the bar."""
+        if self.bar is not None:
+            self.bar.stop()
+
+
+def describe_returns(returns: np.ndarray) -> str:
+    """Return the mean of returns (S, T), and those of the worst and the best task; empty if none is known."""
+    known = np.isfinite(returns)
+    if not known.any():
+        return ""
+    tasks = [np.mean(column[seen]) for column, seen in zip(returns.T, known.T, strict=True) if seen.any()]
+    mean = f"return {np.mean(returns[known]):.0f}"
+    if len(tasks) == 1:
+        return mean
+    return f"{mean} (worst task {min(tasks):.0f}, best {max(tasks):.0f})"
+
+
+def describe_running(totals: np.ndarray, ages: np.ndarray, counted: np.ndarray, horizon: int) -> str:
+    """Return a text on the returns so far of episodes that still run, leaves (S, T, E), if some began at age 0."""
+    if not counted.any() or not ages[counted].any():
+        return ""
+    age = int(np.max(ages[counted]))
+    return f"first episodes run: return {np.mean(totals[counted]):.0f} so far, at step {age:,} of {horizon:,}"
+
+
+def describe_warmup(steps: int, total: int) -> list[str]:
+    """Return lines on the random actions at the start of a run, which may be most of it."""
+    if steps <= 0:
+        return []
+    lines = [f"random actions until step {steps:,}; learning begins there"]
+    if steps > total * _SHARE:
+        share = min(steps / total, 1)
+        lines.append(
+            f"warning: {share:.0%} of this run's {total:,} steps are random actions: "
+            "give more --steps, or a lower --warmup-steps"
+        )
+    return lines
+
+
+def describe_rounding(steps: int, total: int, chunk: int) -> list[str]:
+    """Return a line if a run's steps are rounded up to whole chunks."""
+    return [f"{steps:,} steps are rounded up to {total:,}, whole chunks of {chunk:,}"] if total > steps else []
+
+
+def _of_split(split: str, returns: np.ndarray) -> str:
+    worst = f" (worst task {returns.mean(axis=(0, 2)).min():.0f})" if returns.shape[1] > 1 else ""
+    return f"{split} {returns.mean():.0f}{worst}"
+
+
+def duration(seconds: float) -> str:
+    """Return seconds as text: 41 s, 3 min 5 s, 2 h 4 min."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{seconds:.1f} s" if seconds < 10 else f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60} s"
+    return f"{whole // 3600} h {whole % 3600 // 60} min"

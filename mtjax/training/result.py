@@ -1,0 +1,51 @@
+"""The result of a run in Python: its state, evaluations, metrics and policies."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mtjax.evaluation import Evaluations
+from mtjax.loop import TrainState
+from mtjax.parallel import hosts
+from mtjax.training.points import Point
+from mtjax.training.policy import Policy, policy_of
+
+
+class Result(NamedTuple):
+    """The result of a run."""
+
+    state: TrainState
+    evaluations: Evaluations
+    rows: list[dict[str, Any]]  # the lines of metrics.csv
+    seconds: float  # of training, without compiling and evaluating; of a resumed run, with those before
+    compile_seconds: float  # from the start until the first chunk could begin
+    finished: bool  # False if a signal stopped it
+    directory: Path | None
+    points: tuple[Point, ...] = ()  # of a sweep: entry k of S is seed k % seeds of point k // seeds
+    env: Any = None
+    agent: Any = None
+    seeds: tuple[int, ...] = ()  # of each point
+    trained_seconds: float = 0.0  # of ``seconds``, those since this start
+    total_seconds: float = 0.0  # from the start to the end: compiling, training, evaluating and saving
+
+    def __repr__(self) -> str:
+        """Return a line: steps, and the last evaluation's mean return by split."""
+        known = {split: x[:, -1] for split, x in self.evaluations.returns.items() if x.size}
+        scores = ", ".join(f"{split} {np.nanmean(x):.0f}" for split, x in known.items())
+        steps = f"{self.rows[-1]['steps']:,} steps" if self.rows else "no steps"
+        place = "" if self.directory is None else f", in {str(self.directory)!r}"
+        return f"Result({steps}, return {scores or '-'}{'' if self.finished else ', stopped'}{place})"
+
+    def policy(self, seed: int = 0) -> Policy:
+        """Return the trained policy of a seed, counted from 0; in a sweep of entry ``seed`` of S, as ``mtjax.load``.
+
+        Under ``jax.distributed`` every process must call this.
+
+        Raises:
+            InputError: the run has no such seed.
+        """
+        states = jax.tree.map(jnp.asarray, hosts.gather(self.state.agent))
+        return policy_of(self.env, self.agent, self.points, jnp.asarray(self.seeds), states, seed, self.directory)
