@@ -22,8 +22,10 @@ _HOME = {
     "mixture": "mtjax.envs",
     "preset": "mtjax.config:with_preset",
     "register": "mtjax.registry",
+    "runs": "mtjax.report.frames",
 }
-__all__ = [*_HOME, "train"]
+_MODULES = ("report", "train")  # the module train has the name of the function, and can be called
+__all__ = [*_HOME, *_MODULES]
 
 
 _find = lazily(__name__, _HOME)
@@ -31,7 +33,7 @@ _find = lazily(__name__, _HOME)
 
 def __getattr__(name: str) -> Any:
     """Import a public name when it is first used, so that ``import mtjax`` takes no time."""
-    return import_module("mtjax.train") if name == "train" else _find(name)  # the module has the name of the function
+    return import_module(f"mtjax.{name}") if name in _MODULES else _find(name)
 
 
 def __dir__() -> list[str]:

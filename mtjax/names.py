@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from importlib import import_module
 from typing import Any
 
+SPLITS = ("train", "interpolation", "extrapolation")
 BEGAN = time.time()
 """When this process began to import the package, in seconds since 1970."""
 _MANY = 20

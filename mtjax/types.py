@@ -10,13 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.names import InputError as InputError  # re-exported for convenience
+from mtjax.names import SPLITS as SPLITS  # re-exported for convenience, as is the next
+from mtjax.names import InputError as InputError
 
 Array = jax.Array
 Key = jax.Array
 Metrics = dict[str, Array]
-
-SPLITS = ("train", "interpolation", "extrapolation")
 
 
 class Task(NamedTuple):

@@ -238,7 +238,9 @@ def test_table_of_a_run_shows_splits_and_the_worst_task():
     one = split_table(Evaluations(np.arange(2), returns, {}))
     assert [line.split() for line in one.splitlines()[1:]] == [["train", "2", "110", "20"]]
     two = {"train": np.concatenate([returns["train"], returns["train"] + 10])}
-    assert "115  [110, 120]" in split_table(Evaluations(np.arange(2), two, {}))
+    assert split_table(Evaluations(np.arange(2), two, {})).splitlines()[1].split() == ["train", "2", "115", "25"]
+    three = {"train": np.concatenate([two["train"], returns["train"] + 20])}
+    assert "120  [110, 130]" in split_table(Evaluations(np.arange(2), three, {}))
 
 
 # Training by the program.
@@ -252,11 +254,12 @@ def test_train_prints_where_the_run_is_and_how_it_scored(short_family, tmp_path,
     assert lines[0] == (
         "sac-conditioned on finger-short: 2 training tasks, size 1 to 1.2, split dense, engine c, seeds 0 to 1"
     )
-    assert lines[1] == f"run: {directory}" and lines[2].startswith("memory: ")
+    assert lines[1] == f"run: {directory}" and lines[2] == "random actions until step 20; learning begins there"
+    assert lines[3].startswith("memory: ")
     assert [x.split()[0] for x in lines if " of 600 steps" in x] == ["100", "200", "300", "400", "500", "600"]
     assert [x.split()[2] for x in lines if x.startswith("evaluation at")] == ["200", "400", "600"]
     assert [x.split()[0] for x in lines[-5:-1]] == ["split", "train", "interpolation", "extrapolation"]
-    assert lines[-1].endswith(f"run: {directory}")
+    assert lines[-1].startswith("done in ") and lines[-1].endswith(f"run: {directory}")
 
 
 def test_resume_extends_and_the_hint_goes_on(finished_run, copied_run, capsys, monkeypatch):

@@ -1,7 +1,6 @@
-"""Lines of metrics, in the file and on the terminal."""
+"""Lines of metrics in their file."""
 
 import csv
-import io
 
 import numpy as np
 import pytest
@@ -60,43 +59,3 @@ def test_rows_are_means_over_tasks_and_each_tasks_return():
 def test_numbers_have_seven_digits(given, text):
     """What is not a number is left empty; what is infinite is not."""
     assert log.number(given) == text
-
-
-def test_console_prints_a_line_a_chunk(capsys):
-    """Returns that are not there yet are a dash, not a number."""
-    console = log.Console(2000)
-    console.progress(1000, 2.0, 512.3, np.array([[np.nan, np.nan]]))
-    console.progress(2000, 4.0, 512.3, np.array([[np.nan, 10.0], [20.0, 60.4]]))
-    console.close()
-    assert capsys.readouterr().out.splitlines() == [
-        "1,000 of 2,000 steps  2.0 s  512 steps/s  return -",
-        "2,000 of 2,000 steps  4.0 s  512 steps/s  return 30 (10 to 60)",
-    ]
-
-
-def test_quiet_console_is_quiet(capsys):
-    """Nothing on either stream."""
-    console = log.Console(10, quiet=True)
-    console.say("text")
-    console.progress(5, 1.0, 5.0, np.zeros((1, 1)))
-    console.close()
-    assert capsys.readouterr() == ("", "")
-
-
-def test_console_draws_a_bar_on_a_terminal(monkeypatch):
-    """Lines still come out whole, and closing leaves the terminal as it was."""
-
-    class Terminal(io.StringIO):
-        def isatty(self):
-            return True
-
-    monkeypatch.setattr("sys.stdout", terminal := Terminal())
-    monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.setenv("COLUMNS", "120")
-    console = log.Console(2000)
-    console.say("a [line] with brackets")
-    console.progress(2000, 4.0, 512.3, np.array([[30.0]]))
-    console.close()
-    text = terminal.getvalue()
-    assert "a [line] with brackets\n" in text and "2,000 of 2,000 steps" in text and "━" in text
-    assert text.count("\x1b[?25l") == text.count("\x1b[?25h") == 1

@@ -93,15 +93,20 @@ def test_colour_of_a_split_does_not_depend_on_which_are_empty(drawn, tmp_path):
     assert drawn[0].lines[1].get_color() == drawn[1].lines[2].get_color()
 
 
-def test_one_seed_has_no_band(drawn, tmp_path):
-    draw_learning_curve(tmp_path / "figure.png", 1)
-    assert not any(np.any(np.isfinite(path.vertices)) for c in drawn[0].collections for path in c.get_paths())
+@pytest.mark.parametrize("seeds", [1, 2])
+def test_few_seeds_have_no_band_and_no_bars(drawn, tmp_path, seeds):
+    draw_learning_curve(tmp_path / "figure.png", seeds)
+    assert not drawn[0].collections
+    draw_return_by_parameter(tmp_path / "other.png", seeds)
+    assert not any(container.has_yerr for container in drawn[1].containers)
+    draw_return_by_parameter(tmp_path / "third.png", 3)
+    assert all(container.has_yerr for container in drawn[2].containers)
 
 
 def test_return_by_parameter_shows_each_task(drawn, tmp_path):
     returns = draw_return_by_parameter(tmp_path / "figure.png", 3)
     (axes,) = drawn
-    assert axes.get_xlabel() == "size [1]" and axes.get_ylim()[0] == 0
+    assert axes.get_xlabel() == "size" and axes.get_ylim()[0] == 0
     assert axes.get_legend_handles_labels()[1] == ["train", "interpolation"]
     line = axes.containers[0].lines[0]
     np.testing.assert_array_equal(line.get_xdata(), [1, 2])

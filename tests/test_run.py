@@ -196,7 +196,7 @@ def test_profile_is_of_one_warm_chunk(play, tmp_path, capsys):
 
 def test_profile_needs_a_folder(play):
     """It is refused before anything compiles."""
-    with pytest.raises(InputError, match="profile writes into the run's folder"):
+    with pytest.raises(InputError, match="write into the run's folder"):
         play(None, profile=True)
 
 

@@ -74,8 +74,8 @@ def test_interval_of_the_mean_agrees_with_closed_form():
 def test_interval_of_two_seeds_agrees_with_enumeration():
     """Resamples of {0, 1} have the means 0, 1/2, 1 with probabilities 1/4, 1/2, 1/4."""
     scores = np.array([0.0, 1.0])
-    assert seed_interval(scores, bootstrap=Bootstrap(confidence=0.9)) == (0.5, 0.0, 1.0)
-    assert seed_interval(scores, bootstrap=Bootstrap(confidence=0.4)) == (0.5, 0.5, 0.5)
+    assert seed_interval(scores, bootstrap=Bootstrap(confidence=0.9, least_seeds=2)) == (0.5, 0.0, 1.0)
+    assert seed_interval(scores, bootstrap=Bootstrap(confidence=0.4, least_seeds=2)) == (0.5, 0.5, 0.5)
 
 
 @pytest.mark.parametrize("statistic", [np.mean, iqm])
@@ -94,15 +94,15 @@ def test_tasks_of_a_seed_stay_together():
 def test_paired_difference_is_hand_worked():
     """Differences of the seeds are 1 and 3: resamples have the means 1, 2, 3, with probabilities 1/4, 1/2, 1/4."""
     a, b = np.array([[101.0], [3.0]]), np.array([[100.0], [0.0]])
-    assert paired_difference(a, b, bootstrap=Bootstrap(confidence=0.9)) == (2, 1, 3)
-    assert paired_difference(b, a, bootstrap=Bootstrap(confidence=0.9)) == (-2, -3, -1)
-    assert paired_difference(a, b, bootstrap=Bootstrap(confidence=0.4)) == (2, 2, 2)
+    assert paired_difference(a, b, bootstrap=Bootstrap(confidence=0.9, least_seeds=2)) == (2, 1, 3)
+    assert paired_difference(b, a, bootstrap=Bootstrap(confidence=0.9, least_seeds=2)) == (-2, -3, -1)
+    assert paired_difference(a, b, bootstrap=Bootstrap(confidence=0.4, least_seeds=2)) == (2, 2, 2)
 
 
 def test_unpaired_difference_is_hand_worked():
     """Means of a are 3, 52, 101 and of b 0, 50, 100, with 1/4, 1/2, 1/4 each: the ends have 1/16 each."""
     a, b = np.array([[101.0], [3.0]]), np.array([[100.0], [0.0]])
-    assert unpaired_difference(a, b, bootstrap=Bootstrap(confidence=0.95)) == (2, -97, 101)
+    assert unpaired_difference(a, b, bootstrap=Bootstrap(confidence=0.95, least_seeds=2)) == (2, -97, 101)
 
 
 def test_pairs_cancel_what_their_seeds_share():
@@ -138,8 +138,8 @@ def test_probability_of_improvement_is_hand_worked(a, b, expected):
 def test_interval_of_the_probability_of_improvement_is_hand_worked():
     """One seed of a beats b and the other does not: a resample has both with 1/2, and each alone with 1/4."""
     a, b = np.array([[1.0], [3.0]]), np.array([[2.0], [2.0]])
-    assert probability_of_improvement(a, b, Bootstrap(confidence=0.9)) == (0.5, 0, 1)
-    assert probability_of_improvement(a, b, Bootstrap(confidence=0.4)) == (0.5, 0.5, 0.5)
+    assert probability_of_improvement(a, b, Bootstrap(confidence=0.9, least_seeds=2)) == (0.5, 0, 1)
+    assert probability_of_improvement(a, b, Bootstrap(confidence=0.4, least_seeds=2)) == (0.5, 0.5, 0.5)
 
 
 def test_nominal_coverage():
@@ -149,8 +149,9 @@ def test_nominal_coverage():
     assert 0.87 < np.mean([low < 0 < high for _, low, high in intervals]) < 0.93
 
 
-def test_one_seed_has_no_bounds():
-    one = random_scores(1)
+@pytest.mark.parametrize("seeds", [1, 2])
+def test_one_or_two_seeds_have_no_bounds(seeds):
+    one = random_scores(seeds)
     for point, low, high in (seed_interval(one), *(f(one, one + 1) for f in DIFFERENCES)):
         assert np.isfinite(point) and np.isnan(low) and np.isnan(high)
 

@@ -22,8 +22,8 @@ from mtjax.config import configure, from_json, to_json
 from mtjax.evaluation import load_evaluations
 from mtjax.loop import Settings
 from mtjax.training import memory, points, sweep
+from mtjax.training.console import Console
 from mtjax.training.folder import to_flags
-from mtjax.training.log import Console
 from mtjax.training.points import SweptAgent
 from mtjax.training.run import Plan, _Run, train
 from mtjax.types import InputError, Outcome, Spec

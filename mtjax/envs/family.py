@@ -112,6 +112,11 @@ class Tabled(abc.ABC):
     @abc.abstractmethod
     def where_worlds(self, mask: Array, new: Any, old: Any) -> Any: ...
 
+    def params(self, split: str) -> dict[str, Any]:
+        """Return the values (T,) of the parameters of a split's tasks; of a mixture their names as ``task_name``."""
+        params = self.tasks(split).params
+        return {name: np.asarray(x) for name, x in params.items()} or {"task_name": self.labels(split)}
+
     def targets(self) -> dict[str, Any]:
         """Return what ``provide`` needs for every call out of XLA in programs of this environment, by its name there.
 

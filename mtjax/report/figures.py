@@ -1,7 +1,7 @@
 """Figures of returns and of diagnostics, written to PNG files without a display.
 
 Axes: ``S`` seeds, ``V`` evaluations, ``T`` tasks, ``E`` episodes. Bands and bars are 95 % percentile bootstrap
-intervals over seeds. A single seed has none. Whole seeds are resampled, because one agent learns all tasks.
+intervals over seeds. Fewer than three seeds have none. Whole seeds are resampled, because one agent learns all tasks.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 # Okabe and Ito's palette, which colour-blind readers can tell apart, without its yellow.
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")  # one more than colours, so that later pairs differ too
-_DOTS_PER_INCH = 120
+DOTS_PER_INCH = 120
 
 
 def learning_curve(path: str | Path, steps: np.ndarray, returns: Mapping[str, np.ndarray], title: str) -> None:
@@ -37,8 +37,8 @@ def learning_curve(path: str | Path, steps: np.ndarray, returns: Mapping[str, np
     figure, axes = _new_figure()
     for index, (split, values) in enumerate(returns.items()):
         if np.size(values):
-            _draw_curve(axes, steps, values, f"{split} ({_count(np.shape(values)[2], 'task')})", index)
-    _label_steps(axes)
+            draw_curve(axes, steps, values, f"{split} ({_count(np.shape(values)[2], 'task')})", index)
+    label_steps(axes)
     axes.set_title(title)
     _save(figure, axes, path)
 
@@ -63,7 +63,7 @@ def return_by_parameter(
     for index, (split, scores) in enumerate(returns.items()):
         if np.size(scores):
             _draw_points(axes, values[split], scores, split, index)
-    axes.set_xlabel(f"{parameter} [{unit}]")
+    axes.set_xlabel(axis_label(parameter, unit))
     _save(figure, axes, path)
 
 
@@ -81,7 +81,7 @@ def return_by_task(path: str | Path, labels: Mapping[str, Sequence[str]], return
     for index, (split, scores) in enumerate(returns.items()):
         if np.size(scores):
             mean, low, high = _intervals(np.mean(scores, axis=2))
-            bars, places = np.maximum([mean - low, high - mean], 0), [names.index(name) for name in labels[split]]
+            bars, places = bars_of(mean, low, high), [names.index(name) for name in labels[split]]
             colour, marker = _COLOURS[index % len(_COLOURS)], _MARKERS[index % len(_MARKERS)]
             axes.errorbar(mean, places, xerr=bars, color=colour, fmt=marker, markersize=6, capsize=3, label=split)
     axes.set_yticks(range(len(names)), names, fontsize=8)
@@ -89,7 +89,7 @@ def return_by_task(path: str | Path, labels: Mapping[str, Sequence[str]], return
     axes.set_xlabel("return")
     axes.set_ylabel("")
     axes.legend(frameon=False)
-    figure.savefig(path, dpi=_DOTS_PER_INCH)
+    figure.savefig(path, dpi=DOTS_PER_INCH)
 
 
 def compare(
@@ -108,8 +108,8 @@ def compare(
         figure.set_size_inches(9, 6)
     for index, (agent, (steps, returns)) in enumerate(curves.items()):
         if np.size(returns):
-            _draw_curve(axes, steps, returns, f"{agent} ({_count(len(returns), 'seed')})", index)
-    _label_steps(axes)
+            draw_curve(axes, steps, returns, f"{agent} ({_count(len(returns), 'seed')})", index)
+    label_steps(axes)
     axes.set_ylabel(label)
     _save(figure, axes, path, beside=many)
 
@@ -134,9 +134,9 @@ def interference(
     """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(9, 7.5), dpi=_DOTS_PER_INCH, layout="constrained")
+    figure = Figure(figsize=(9, 7.5), dpi=DOTS_PER_INCH, layout="constrained")
     above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(1.75, 1))[:, 0]
-    labels, name = [f"{value:.3g}" for value in values], f"{parameter} [{unit}]"
+    labels, name = [f"{value:.3g}" for value in values], axis_label(parameter, unit)
     maps, given = above.subplots(1, len(cosines), squeeze=False)[0], [x for x in cosines.values() if x is not None]
     limit = max((_limit(x) for x in given), default=1.0)
     images = [_draw_cosines(axes, who, x, limit) for axes, (who, x) in zip(maps, cosines.items(), strict=True)]
@@ -153,7 +153,7 @@ def interference(
         axes.set_axisbelow(True)
         axes.spines[["top", "right"]].set_visible(False)
         _label_tasks(axes.xaxis, labels, name)
-    figure.savefig(path, dpi=_DOTS_PER_INCH)
+    figure.savefig(path, dpi=DOTS_PER_INCH)
 
 
 def _draw_cosines(axes: "Axes", network: str, cosine: np.ndarray | None, limit: float) -> "AxesImage | None":
@@ -190,32 +190,68 @@ def _label_tasks(axis: "Axis", labels: list[str], name: str) -> None:
     axis.set_label_text(name)
 
 
-def _new_figure() -> tuple["Figure", "Axes"]:
+def new_axes() -> "Axes":
+    """Return the axes of a new figure that no window shows."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(6, 4), dpi=_DOTS_PER_INCH, layout="constrained")
-    axes = figure.add_subplot()
+    axes = Figure(figsize=(6, 4), dpi=DOTS_PER_INCH, layout="constrained").add_subplot()
+    style(axes)
+    return axes
+
+
+def style(axes: "Axes") -> None:
+    """Give axes of returns the look of all figures."""
     axes.set_ylabel("return")
     axes.grid(color="0.9")
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
-    return figure, axes
 
 
-def _draw_curve(axes: "Axes", steps: np.ndarray, returns: np.ndarray, label: str, index: int) -> None:
-    mean, low, high = _intervals(np.mean(returns, axis=(2, 3)))
-    colour, marker = _COLOURS[index % len(_COLOURS)], _MARKERS[index % len(_MARKERS)]
+def _new_figure() -> tuple["Figure", "Axes"]:
+    axes = new_axes()
+    return axes.figure, axes  # type: ignore
+
+
+def colour(index: int) -> str:
+    """Return the colour of a line by its number."""
+    return _COLOURS[index % len(_COLOURS)]
+
+
+def draw_curve(axes: "Axes", steps: np.ndarray, returns: np.ndarray, label: str, index: int) -> None:
+    """Draw the mean of returns (S, V, T, E) over steps (V,), with its interval over seeds."""
+    draw_line(axes, steps, np.mean(returns, axis=(2, 3)), label, index)
+
+
+def draw_line(
+    axes: "Axes", x: np.ndarray, scores: np.ndarray, label: str, index: int, marker: str | None = None
+) -> str:
+    """Draw the mean of scores (S, V) over x (V,), with a band where there is an interval. Return the colour."""
+    mean, low, high = _intervals(scores)
+    marker = _MARKERS[index % len(_MARKERS)] if marker is None else marker
     every = max(1, len(mean) // 10)
-    axes.plot(steps, mean, color=colour, marker=marker, markersize=4, markevery=every, label=label)
-    axes.fill_between(steps, low, high, color=colour, alpha=0.15, linewidth=0)
+    axes.plot(x, mean, color=colour(index), marker=marker, markersize=4, markevery=every, label=label)
+    if np.isfinite(low).any():
+        axes.fill_between(x, low, high, color=colour(index), alpha=0.15, linewidth=0)
+    return colour(index)
 
 
 def _draw_points(axes: "Axes", values: np.ndarray, returns: np.ndarray, label: str, index: int) -> None:
     mean, low, high = _intervals(np.mean(returns, axis=2))
-    colour, marker = _COLOURS[index % len(_COLOURS)], _MARKERS[index % len(_MARKERS)]
+    looks = {"color": colour(index), "fmt": _MARKERS[index % len(_MARKERS)], "markersize": 6, "capsize": 3}
+    axes.errorbar(values, mean, bars_of(mean, low, high), label=label, **looks)
+
+
+def bars_of(mean: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray | None:
+    """Return the lengths (2, columns) of error bars, or None if there are no intervals, so that no legend shows one."""
+    if not np.isfinite(low).any():
+        return None
     # Rounding can put the bounds of equal seeds on the wrong side of their mean, which Matplotlib refuses.
-    bars = np.maximum([mean - low, high - mean], 0)
-    axes.errorbar(values, mean, bars, color=colour, fmt=marker, markersize=6, capsize=3, label=label)
+    return np.maximum([mean - low, high - mean], 0)
+
+
+def axis_label(parameter: str, unit: str) -> str:
+    """Return a parameter's name with its unit, if it has one."""
+    return parameter if unit in ("", "1") else f"{parameter} [{unit}]"
 
 
 def _intervals(scores: np.ndarray) -> np.ndarray:
@@ -223,7 +259,8 @@ def _intervals(scores: np.ndarray) -> np.ndarray:
     return np.array([seed_interval(column) for column in scores.T]).T
 
 
-def _label_steps(axes: "Axes") -> None:
+def label_steps(axes: "Axes") -> None:
+    """Label the axis of environment steps."""
     from matplotlib.ticker import EngFormatter, MaxNLocator
 
     axes.set_xlabel("environment steps")
@@ -240,4 +277,4 @@ def _save(figure: "Figure", axes: "Axes", path: str | Path, beside: bool = False
         raise InputError(f"there is nothing to draw in {path}: every array of returns is empty")
     axes.set_ylim(bottom=0)
     axes.legend(frameon=False, **({"loc": "center left", "bbox_to_anchor": (1, 0.5)} if beside else {}))
-    figure.savefig(path, dpi=_DOTS_PER_INCH)
+    figure.savefig(path, dpi=DOTS_PER_INCH)

@@ -11,9 +11,9 @@ from mtjax.training.policy import Policy
 
 
 def _interval(scores: np.ndarray) -> str:
-    """Return the mean of scores (S, T) as text, with its 95% interval if there are several seeds."""
+    """Return the mean of scores (S, T) as text, with its 95% interval if there are enough seeds for one."""
     point, low, high = seed_interval(scores)
-    return f"{point:6.0f}" + (f"  [{low:.0f}, {high:.0f}]" if scores.shape[0] > 1 else "")
+    return f"{point:6.0f}" + (f"  [{low:.0f}, {high:.0f}]" if np.isfinite(low) else "")
 
 
 def split_table(evaluations: Evaluations, parts: Sequence[Part] = ()) -> str:

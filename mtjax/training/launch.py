@@ -12,7 +12,7 @@ from mtjax.config import RunConfig, require_value_range, wants_gpu
 from mtjax.envs import Family
 from mtjax.parallel import hosts, mesh
 from mtjax.report import figures
-from mtjax.training import points
+from mtjax.training import points, sinks
 from mtjax.training.finetune import require_fit
 from mtjax.training.folder import short_name
 from mtjax.training.policy import Policy, load
@@ -31,6 +31,7 @@ def check(config: RunConfig, start: Policy | None = None) -> None:
         InputError: family, agent, devices and flags do not go together.
     """
     family = config.family
+    sinks.require_libraries(config.tensorboard, config.wandb)
     _ = family.engine_name, family.table
     mesh.mesh_for(config.plan.seeds, family.train_count, config.training.num_envs)
     config.learner.experience.check(family, config.training.num_envs)

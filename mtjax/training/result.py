@@ -9,7 +9,9 @@ import numpy as np
 
 from mtjax.evaluation import Evaluations
 from mtjax.loop import TrainState
+from mtjax.names import nearest_error
 from mtjax.parallel import hosts
+from mtjax.report.frames import frame_of, metrics_frame
 from mtjax.training.points import Point
 from mtjax.training.policy import Policy, policy_of
 
@@ -49,3 +51,15 @@ class Result(NamedTuple):
         """
         states = jax.tree.map(jnp.asarray, hosts.gather(self.state.agent))
         return policy_of(self.env, self.agent, self.points, jnp.asarray(self.seeds), states, seed, self.directory)
+
+    def frame(self, of: str = "evaluations") -> Any:
+        """Return the run as a pandas table: its evaluations by task, or with "metrics" the lines of metrics.csv.
+
+        Raises:
+            InputError: pandas is missing, or there is no such table.
+        """
+        if of == "metrics":
+            return metrics_frame(self.rows)
+        if of != "evaluations":
+            raise nearest_error("table", of, ("evaluations", "metrics"))
+        return frame_of(self.env, self.evaluations, self.seeds, self.points)

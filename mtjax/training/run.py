@@ -28,7 +28,7 @@ from mtjax.training.points import Point, Sweep, SweptAgent
 from mtjax.training.policy import Policy
 from mtjax.training.programs import Programs, compile_lowered, jit_programs, load_kernels, sharded_shapes, trace
 from mtjax.training.result import Result
-from mtjax.training.sinks import Sink, open_sinks, require, write_rows
+from mtjax.training.sinks import Sink, open_sinks, require_libraries, write_rows
 from mtjax.types import SPLITS, Agent, Env, InputError
 
 
@@ -74,8 +74,7 @@ def train(
     directory = None if directory is None else Path(directory)
     if (profile or tensorboard or wandb) and directory is None:
         raise InputError("profile, tensorboard and wandb write into the run's folder; give directory as well")
-    for name in (["tensorboardX"] if tensorboard else []) + (["wandb"] if wandb else []):
-        require(name)
+    require_libraries(tensorboard, wandb)
     started = time.monotonic()
     tasks = env.tasks("train")
     agent.experience.check(env, settings.num_envs)

@@ -69,6 +69,12 @@ class WandB:
             run.finish()
 
 
+def require_libraries(tensorboard: bool, wandb: str) -> None:
+    """Raise InputError if a library is missing for what a run asks for."""
+    for module in ["tensorboardX"] * bool(tensorboard) + ["wandb"] * bool(wandb):
+        require(module)
+
+
 def require(module: str) -> Any:
     """Import and return a library.
 

@@ -1,0 +1,70 @@
+"""``python -m mtjax.plot RUN ...``: draw figures of trained runs into a PNG, PDF or SVG file."""
+
+import dataclasses
+from collections.abc import Sequence
+
+from mtjax import commands
+from mtjax.names import SPLITS, InputError, load, nearest_error
+
+FIGURES = ("curves", "families", "parameter", "iqm", "profile", "improvement", "all")
+ENDINGS = (".png", ".pdf", ".svg")
+
+
+@dataclasses.dataclass(frozen=True)
+class Request:
+    """Draw figures of trained runs: ``python -m mtjax.plot RUN ...``. RUN is a run's folder, a sweep's, or a pattern.
+
+    Runs with equal settings and other seeds are one line. Intervals are over seeds, of three or more.
+    """
+
+    figure: str = "curves"
+    """curves (return over steps, of one family), families (the same in a grid), parameter (return over the varied
+    parameter), iqm (interquartile means of agents), profile (share of seeds and tasks above a return), improvement
+    (probability of improvement over a baseline), or all that the runs allow."""
+    split: str = "train"
+    """train, interpolation or extrapolation: whose returns are drawn."""
+    baseline: str = ""
+    """The agent that improvement compares with; by default the first run's."""
+    out: str = ""
+    """The file to write, which ends with .png, .pdf or .svg; by default the figure's name and .png."""
+
+
+def main(argv: Sequence[str]) -> None:
+    """Read the command line first, then import the code that draws."""
+    argv = commands.import_files(argv)
+    known = [*(f"--{f.name}" for f in dataclasses.fields(Request)), "--help", "-h"]
+    for word in argv:
+        if word.startswith("-") and word.split("=")[0] not in known:
+            raise nearest_error("flag", word.split("=")[0], known)
+    runs, flags = _apart(argv)
+    request = commands.parse_with_tyro(Request, flags, Request(), "python -m mtjax.plot RUN ...")
+    if not runs:
+        raise InputError("say which runs to draw: python -m mtjax.plot runs/*")
+    for name, value, allowed in (("figure", request.figure, FIGURES), ("split", request.split, SPLITS)):
+        if value not in allowed:
+            raise nearest_error(name, value, allowed)
+    if request.out and not request.out.lower().endswith(ENDINGS):
+        raise InputError(f"--out must end with {', '.join(ENDINGS)}, not {request.out!r}")
+    load("mtjax.report.drawing:draw")(runs, *dataclasses.astuple(request))
+
+
+def _apart(argv: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the runs, and the flags with their values."""
+    runs, flags, words = [], [], iter(argv)
+    for word in words:
+        if not word.startswith("-"):
+            runs.append(word)
+            continue
+        flags.append(word)
+        if "=" not in word and word not in ("--help", "-h"):
+            flags += [value for value in [next(words, None)] if value is not None]
+    return runs, flags
+
+
+def run() -> None:
+    """Run the command line."""
+    commands.main(main)
+
+
+if __name__ == "__main__":
+    run()

@@ -1,0 +1,133 @@
+"""Runs on disk, read for tables and figures: what each agent scored on each family, with all of its seeds."""
+
+import glob
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mtjax.agents import settings
+from mtjax.checks import path
+from mtjax.config import RunConfig, from_json
+from mtjax.evaluation import Evaluations, load_evaluations
+from mtjax.names import InputError
+
+
+class Found(NamedTuple):
+    """A run that was read from its folder."""
+
+    directory: Path
+    config: RunConfig
+    evaluations: Evaluations
+    settings: dict[str, str]  # those that a sweep sets for the whole run, outside its points
+
+
+class Learned(NamedTuple):
+    """What one agent, with one setting, scored on one family."""
+
+    env: str
+    agent: str  # with the settings that tell it from others
+    steps: np.ndarray  # (V,)
+    returns: Mapping[str, np.ndarray]  # split -> (S, V, T, episodes)
+    values: Mapping[str, np.ndarray]  # split -> (T,) of the varied parameter, or task numbers
+    axis: tuple[str, str]  # name and unit of ``values``
+    seeds: tuple[int, ...] = ()
+
+    def final(self, split: str = "train") -> np.ndarray:
+        """Return the last evaluation's mean returns (S, T)."""
+        return self.returns[split][:, -1].mean(axis=-1)
+
+
+def read(pattern: str | Path | Iterable[str | Path]) -> list[Found]:
+    """Read the runs of folders or patterns, also those inside the folders of sweeps.
+
+    Raises:
+        InputError: there is no run with an evaluation, or a file of one cannot be read.
+    """
+    given = [pattern] if isinstance(pattern, str | Path) or not isinstance(pattern, Iterable) else list(pattern)
+    folders = [folder for each in given for folder in _folders(str(path(each, "runs")))]
+    done = [folder for folder in dict.fromkeys(folders) if (folder / "evaluations.npz").exists()]
+    if not done:
+        raise InputError(f"there is no run with an evaluation in {', '.join(map(str, given)) or 'an empty list'}")
+    return [_read(folder) for folder in done]
+
+
+def _folders(pattern: str) -> list[Path]:
+    places = sorted(map(Path, glob.glob(pattern)))
+    number = lambda run: int(re.sub(r"\D", "", run.name) or 0)
+    inside = [[place, *sorted(place.glob("run-*"), key=number)] for place in places]
+    return [folder for group in inside for folder in group if (folder / "config.json").is_file()]
+
+
+def _read(directory: Path) -> Found:
+    config = from_json(directory / "config.json")
+    named = (word.removeprefix("agent.").partition("=")[::2] for word in config.sweep)
+    outside = {name: values for name, values in named if name.replace("-", "_") not in _swept(config)}
+    return Found(directory, config, load_evaluations(directory / "evaluations.npz"), outside)
+
+
+def _swept(config: RunConfig) -> set[str]:
+    return {name for point in config.points for name in point}
+
+
+def learned(runs: Any) -> list[Learned]:
+    """Return what was learned in runs: seeds of equal settings together, others apart under names that differ.
+
+    Args:
+        runs: patterns or folders as for ``read``, or a list of ``Learned`` already.
+    """
+    if isinstance(runs, Sequence) and runs and all(isinstance(x, Learned) for x in runs):
+        return list(runs)
+    apart = [one for found in read(runs) for one in _points(found)]
+    groups: dict[Any, list] = {}
+    for key, config_settings, one in apart:
+        groups.setdefault(repr(key), []).append((config_settings, one))
+    joined = [(group[0][0], _join([one for _, one in group])) for group in groups.values()]
+    return _named(joined)
+
+
+def _points(found: Found) -> Iterable[tuple[Any, dict[str, Any], Learned]]:
+    """Yield every point of a run: what must be equal for its seeds to be joined, its settings, and what it learned."""
+    config, evaluations = found.config, found.evaluations
+    count, family = config.plan.seeds, config.family
+    for p, point in enumerate(config.points or ({},)):
+        mine = slice(p * count, (p + 1) * count)
+        own = {**settings(config.learner), **vars(config.training), **point}
+        one = Learned(
+            config.env,
+            config.agent,
+            evaluations.steps,
+            {split: x[mine] for split, x in evaluations.returns.items()},
+            evaluations.values,
+            family.task_axis,
+            tuple(range(config.plan.seed, config.plan.seed + count)),
+        )
+        shape = (evaluations.steps.tolist(), config.plan.eval_episodes, config.start)
+        yield (config.env, config.agent, family, sorted(own.items(), key=str), shape), own, one
+
+
+def _join(parts: list[Learned]) -> Learned:
+    """Return the seeds of several runs together; a seed that was run twice counts once."""
+    seeds: dict[int, tuple[Learned, int]] = {}
+    for part in parts:
+        for i, seed in enumerate(part.seeds):
+            seeds.setdefault(seed, (part, i))
+    stack = lambda split: np.stack([part.returns[split][i] for part, i in seeds.values()])
+    return parts[0]._replace(returns={split: stack(split) for split in parts[0].returns}, seeds=tuple(seeds))
+
+
+def _named(found: list[tuple[dict[str, Any], Learned]]) -> list[Learned]:
+    """Add to agents of one name on one family the settings in which they differ."""
+    made = []
+    for own, one in found:
+        others = [s for s, other in found if (other.env, other.agent) == (one.env, one.agent)]
+        differ = [name for name in own if any(s.get(name) != own[name] for s in others)]
+        told = ", ".join(f"{name.replace('_', '-')} {_short(own[name])}" for name in differ[:3])
+        made.append(one._replace(agent=f"{one.agent}{', ' * bool(told)}{told}"))
+    return made
+
+
+def _short(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,229 @@
+"""``mtjax.train`` in Python: names and keywords, the folder of a run, its policies, and what is refused and how."""
+
+import dataclasses
+import json
+import shlex
+
+import jax
+import numpy as np
+import pytest
+from conftest import ShortFinger
+from probes import Probe, tiny
+
+import mtjax
+import mtjax.evaluate
+import mtjax.train
+from mtjax import agents, checks, cli, envs
+from mtjax.config import Plan, from_json, with_preset
+from mtjax.loop import Settings
+from mtjax.training import api
+from mtjax.types import InputError
+
+SMALL = {"num_envs": 2, "chunk_steps": 25, "batch_size": 4, "replay_size": 200, "warmup_steps": 5, "hidden": (8, 8)}
+PLAN = {"seeds": 2, "eval_every": 200, "eval_episodes": 1}
+
+
+@pytest.fixture(scope="module")
+def result(short_family, tmp_path_factory):
+    """A run by names and keywords, in a folder that did not exist."""
+    place = tmp_path_factory.mktemp("python") / "new" / "run"
+    return mtjax.train("finger-short", "sac-conditioned", steps=600, directory=place, **PLAN, **SMALL)
+
+
+def test_a_run_of_python_is_that_of_the_command_line(result, finished_run):
+    """The same settings, metrics and evaluations, to the bit."""
+    ours, theirs = (from_json(folder / "config.json") for folder in (result.directory, finished_run))
+    assert dataclasses.replace(ours, runs=theirs.runs) == theirs
+    clocks = {"seconds", "wall_seconds"}
+    read = lambda folder: [line.split(",") for line in (folder / "metrics.csv").read_text().splitlines()]
+    kept = [i for i, name in enumerate(read(finished_run)[0]) if name not in clocks]
+    assert [[row[i] for i in kept] for row in read(result.directory)] == [
+        [row[i] for i in kept] for row in read(finished_run)
+    ]
+    names = lambda folder: {path.name for path in folder.iterdir()}
+    assert names(result.directory) == names(finished_run)
+
+
+def test_its_folder_is_loaded_evaluated_and_resumed(result, copied_run, capsys):
+    """By ``mtjax.load``, by both commands, and by the command that it records."""
+    task = jax.tree.map(lambda x: x[0], mtjax.make("finger-short").tasks())
+    loaded, ours = mtjax.load(result.directory, seed=1), result.policy(1)
+    obs = ours.env.reset(task, jax.random.key(0)).obs
+    np.testing.assert_array_equal(loaded(obs, task), ours(obs, task))
+    assert np.any(np.asarray(ours(obs, task)) != np.asarray(result.policy(0)(obs, task)))
+    mtjax.evaluate.main([f"--run={result.directory}", "--episodes=1"])
+    words = shlex.split(json.loads((result.directory / "config.json").read_text())["command"])
+    recorded = from_json(result.directory / "config.json")
+    assert cli.parse(words[3:]) == recorded
+    more = mtjax.train("finger-short", "sac-conditioned", steps=700, directory=copied_run, resume=True, **PLAN, **SMALL)
+    assert more.finished and more.rows[0]["steps"] == 700
+    assert from_json(copied_run / "config.json").plan.steps == 700
+    mtjax.train.main([f"--resume={copied_run}", "--steps=800"])
+    assert "800 of 800 steps" in capsys.readouterr().out
+
+
+def test_nothing_is_overwritten(result, short_family, tmp_path):
+    """Neither a run nor what else lies in a folder; and another agent does not go on with a run."""
+    before = (result.directory / "metrics.csv").read_bytes()
+    with pytest.raises(
+        InputError, match=r"holds config\.json of a run already; give another directory, or resume=True"
+    ):
+        mtjax.train("finger-short", "sac", directory=result.directory)
+    with pytest.raises(InputError, match="had another learner"):
+        mtjax.train("finger-short", "sac-conditioned", directory=result.directory, resume=True, gamma=0.5, **SMALL)
+    assert (result.directory / "metrics.csv").read_bytes() == before
+    (tmp_path / "metrics.csv").write_text("mine")
+    with pytest.raises(InputError, match=r"holds metrics\.csv"):
+        mtjax.train("finger-short", "sac", directory=tmp_path)
+
+
+def test_names_bring_the_tuned_settings_and_objects_their_own(monkeypatch):
+    """What is given by keyword changes them."""
+    configured = lambda *words, **given: api._configured(*words, {}, None, None, given)
+    assert configured("finger-spin-vary-size", "care") == with_preset("finger-spin-vary-size", "care")
+    env = mtjax.make("finger-spin-vary-size")
+    tuned = configured(env, "care", num_envs=3, num_experts=2)
+    assert tuned.training.num_envs == 3 and tuned.learner.encoder.num_experts == 2
+    assert tuned.learner.actor_lr == with_preset("finger-spin-vary-size", "care").learner.actor_lr
+    assert tuned.plan == Plan() and tuned.family is env
+    plain = configured("finger-spin", mtjax.agent("sac-conditioned"), vary={"size": "1:1.1:3"}, encoder="film")
+    assert plain.training == Settings() and plain.family.train_count == 3
+    assert agents.settings(plain.learner)["encoder"] == "film"
+
+
+def test_keywords_of_train_are_known_to_errors():
+    """Agents and environments say that these belong to ``mtjax.train``."""
+    fields = [field.name for cls in (Plan, Settings) for field in dataclasses.fields(cls)]
+    assert sorted(checks.OF_TRAIN) == sorted(fields)
+
+
+ENV = "finger-spin"
+WRONG = [
+    (("finger-spi", "sac"), {}, "unknown environment 'finger-spi'; did you mean 'finger-spin'?"),
+    ((ENV, "sca"), {}, "unknown agent 'sca'; did you mean 'sac'?"),
+    ((3, "sac"), {}, "env is the name of a family, or what mtjax.make returns; not 3"),
+    ((ENV,), {}, "agent is a name such as 'care'"),
+    ((ENV, agents.SAC), {}, "not the class SAC itself"),
+    ((ENV, "sac"), {"size": 1}, "size is a parameter of finger-spin, not a setting: use vary={'size': 1}"),
+    ((envs.make(ENV), "sac"), {"size": 1}, "use mtjax.make('finger-spin', vary={'size': 1})"),
+    ((envs.make(ENV), "sac"), {"vary": {}}, "vary is a setting of the environment: use mtjax.make('finger-spin', vary"),
+    ((ENV, "sac"), {"num_env": 4}, "unknown setting 'num_env'; did you mean 'num_envs'?"),
+    ((ENV, "sac"), {"num_envs": "4"}, "num_envs must be a whole number, not '4'; leave out the quotes"),
+    ((ENV, "sac"), {"steps": 1e5}, "steps must be a whole number, not 100000.0; write 100000"),
+    ((ENV, "sac"), {"seeds": 2.5}, "seeds must be a whole number, not 2.5"),
+    ((ENV, "sac"), {"seeds": True}, "seeds must be a whole number, not True"),
+    ((ENV, "sac"), {"gamma": "high"}, "gamma must be a number, not 'high'"),
+    ((ENV, "sac"), {"hidden": 64}, "hidden must be a list of whole numbers, such as (64, 64), not 64"),
+    ((ENV, "sac"), {"stagger": 1}, "stagger must be True or False, not 1"),
+    ((ENV, "sac"), {"encoder": 3}, "encoder must be a name or a part of that kind, not 3"),
+    ((ENV, "sac"), {"directory": 3}, "directory must be a path, not 3"),
+    ((ENV, "sac"), {"resume": True}, "give directory as well"),
+    ((ENV, "sac"), {"tensorboard": True}, "give directory as well"),
+    ((ENV, "sac"), {"settings": {"num_envs": 3}}, "settings is a mtjax.Settings, not a dict"),
+    ((ENV, "sac"), {"sweep": {"actor_lr": 1e-3}}, "sweep gives each number a list of values"),
+    ((ENV, "sac"), {"sweep": {"actor_lr": ["x"]}}, "actor_lr is a number, and 'x' is none"),
+    ((ENV, "sac"), {"start": "nowhere"}, "'nowhere' is not a run"),
+    ((ENV, "sac"), {"on_chunk": 3}, "on_chunk is a function of a row of metrics, not 3"),
+    ((Probe("delayed"), tiny("sac")), {"directory": "x"}, "an environment derived from Family"),
+]
+
+
+@pytest.mark.parametrize("words, given, said", WRONG, ids=range(len(WRONG)))
+def test_wrong_arguments_are_refused_in_a_line(words, given, said, tmp_path, monkeypatch):
+    """Before anything compiles, and before a folder is made."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError) as error:
+        mtjax.train(*words, **given)
+    assert said in str(error.value) and "\n" not in str(error.value)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "make, said",
+    [
+        (lambda: mtjax.make(ENV, size=1), "size is a parameter of finger-spin, not a setting: use vary={'size': 1}"),
+        (lambda: mtjax.make(ENV, num_envs=4), "give it to mtjax.train(num_envs=...)"),
+        (lambda: mtjax.make(ENV, vary=3), "vary maps parameters to values"),
+        (lambda: mtjax.make(ENV, num_draws=1.5), "num_draws must be a whole number, not 1.5"),
+        (lambda: mtjax.make(3), "an environment is chosen by name"),
+        (lambda: mtjax.agent("sac", num_envs=4), "give it to mtjax.train(num_envs=...)"),
+        (lambda: mtjax.agent("sac", batch_size="7"), "batch_size must be a whole number, not '7'"),
+        (lambda: mtjax.agent(3), "an agent is chosen by name"),
+        (lambda: mtjax.load(3), "directory must be a path, not 3"),
+    ],
+)
+def test_other_functions_say_it_alike(make, said):
+    """The command line's kind of message."""
+    with pytest.raises(InputError) as error:
+        make()
+    assert said in str(error.value)
+
+
+def test_no_class_variable_is_offered_as_a_setting():
+    """They cannot be given."""
+    with pytest.raises(InputError) as error:
+        mtjax.make(ENV, actionsize=1)
+    assert "action_size" not in str(error.value)
+    with pytest.raises(InputError, match="unknown setting"):
+        mtjax.make(ENV, action_size=1)
+
+
+def test_a_class_without_a_name_has_no_folder(tmp_path):
+    """Nothing could read it again."""
+
+    @dataclasses.dataclass(frozen=True)
+    class Nameless(ShortFinger):
+        pass
+
+    with pytest.raises(InputError, match=r"needs a name for Nameless: mtjax\.register\('my-env', Nameless\)"):
+        mtjax.train(Nameless(), "sac", directory=tmp_path / "x")
+    assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize("name", agents.AGENTS)
+def test_agents_are_called_by_their_names(name):
+    """Also with other settings of their own."""
+    assert agents.name_of(mtjax.agent(name)) == name
+    assert agents.name_of(mtjax.agent(name, gamma=0.5)) == name
+
+
+def test_what_is_printed_is_a_line(result):
+    """Policies, results and tables of tasks; inside a compiled function too."""
+    env = mtjax.make("finger-spin-vary-size")
+    tasks = env.tasks()
+    assert repr(tasks) == "Task(10 tasks: size 0.95 to 1.13)"
+    assert repr(jax.tree.map(lambda x: x[0], tasks)) == "Task(one task: size 0.95)"
+    assert repr(mtjax.make(ENV).tasks()) == "Task(1 task)"
+    seen = []
+    jax.make_jaxpr(lambda task: seen.append(repr(task)) or task.id)(tasks)
+    assert seen == ["Task(10 tasks: size)"]
+    assert repr(result.policy()) == (
+        "Policy(sac-conditioned on finger-short: observation (9,), action (2,), one of 2 seeds)"
+    )
+    assert repr(result).startswith("Result(600 steps, return train ") and "\n" not in repr(result)
+
+
+def test_a_policy_takes_one_task_and_one_observation(result):
+    """And says how to give several."""
+    policy = result.policy()
+    tasks = policy.env.tasks()
+    one = jax.tree.map(lambda x: x[0], tasks)
+    with pytest.raises(InputError, match="takes one task, not Task"):
+        policy(np.zeros(9), tasks)
+    with pytest.raises(InputError, match=r"has shape \(9,\), not \(3, 9\); use jax.vmap for many"):
+        policy(np.zeros((3, 9)), one)
+    assert jax.vmap(policy, (0, None))(np.zeros((3, 9)), one).shape == (3, 2)
+    with pytest.raises(InputError, match="seed must be from 0 to 1"):
+        result.policy(2)
+
+
+def test_a_sweep_of_python_leaves_a_run_too(short_family, tmp_path):
+    """Its points are read back, and each has its policies."""
+    given = {**PLAN, **SMALL, "sweep": {"actor_lr": [1e-3, 1e-2]}, "eval_every": 100}
+    swept = mtjax.train("finger-short", "sac", steps=100, directory=tmp_path / "x", **given)
+    recorded = from_json(tmp_path / "x" / "config.json")
+    assert recorded.points == ({"actor_lr": 1e-3}, {"actor_lr": 1e-2})
+    assert recorded.sweep == ("agent.actor-lr=0.001,0.01",)
+    assert swept.policy(3).agent.actor_lr == mtjax.load(tmp_path / "x", 3).agent.actor_lr == 1e-2
+    with pytest.raises(InputError, match="seed must be from 0 to 3"):
+        swept.policy(4)

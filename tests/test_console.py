@@ -1,0 +1,108 @@
+"""Progress of a run on the terminal: what lines and bars say, and the time that is left."""
+
+import io
+
+import numpy as np
+import pytest
+
+from mtjax.training import console as consoles
+from mtjax.training.console import Clock, Console
+
+
+def test_a_line_says_steps_time_left_rate_and_what_the_range_is(capsys):
+    """Of tasks, not of seeds; episodes that still run speak for themselves."""
+    clock = Clock(chunks=4, evaluations=1)
+    console = Console(2000, clock=clock)
+    clock.chunk(2.0)
+    console.progress(500, 30.0, 512.3, np.array([[np.nan, np.nan]]), "first episodes run")
+    clock.evaluation(5.0)
+    clock.chunk(2.0)
+    console.progress(1000, 75.0, 512.3, np.array([[np.nan, 10.0], [20.0, 60.4]]))
+    console.close()
+    assert capsys.readouterr().out.splitlines() == [
+        "500 of 2,000 steps  30 s, 6.0 s left  512 steps/s  first episodes run",
+        "1,000 of 2,000 steps  1 min 15 s, 4.0 s left  512 steps/s  return 30 (worst task 20, best 35)",
+    ]
+
+
+def test_one_task_has_no_worst_one():
+    """Whatever the number of seeds."""
+    assert consoles.describe_returns(np.array([[3.0], [5.0]])) == "return 4"
+    assert consoles.describe_returns(np.full((2, 3), np.nan)) == ""
+
+
+def test_the_first_evaluation_waits_for_its_program_and_counts_only_until_the_second():
+    """The time left is that of chunks and evaluations to come."""
+    clock = Clock(chunks=10, evaluations=3)
+    assert clock.left is None
+    clock.chunk(1.0)
+    assert clock.left == 9
+    clock.evaluation(40.0)
+    assert clock.left == 9 + 2 * 40
+    clock.evaluation(2.0)
+    assert clock.left == 9 + 2
+
+
+def test_running_episodes_count_if_they_began_at_age_zero():
+    """Others are shorter, and their returns say little."""
+    totals, ages = np.array([[[4.0, 100.0], [8.0, 100.0]]]), np.array([[[30, 930], [30, 930]]])
+    counted = np.array([[[True, False], [True, False]]])
+    told = consoles.describe_running(totals, ages, counted, 1000)
+    assert told == "first episodes run: return 6 so far, at step 30 of 1,000"
+    assert consoles.describe_running(totals, ages, ~counted & False, 1000) == ""
+
+
+@pytest.mark.parametrize("warmup, total, lines", [(0, 100, 0), (30, 100, 1), (34, 100, 2), (500, 100, 2)])
+def test_random_actions_are_announced_and_warned_of(warmup, total, lines):
+    """If they are more than a third of the run."""
+    told = consoles.describe_warmup(warmup, total)
+    assert len(told) == lines
+    assert not lines or told[0] == f"random actions until step {warmup:,}; learning begins there"
+    assert lines < 2 or "are random actions" in told[1]
+
+
+def test_rounding_is_said():
+    """Once, where a run takes more steps than were asked for."""
+    assert consoles.describe_rounding(600_000, 640_000, 160_000) == [
+        "600,000 steps are rounded up to 640,000, whole chunks of 160,000"
+    ]
+    assert not consoles.describe_rounding(640_000, 640_000, 160_000)
+
+
+def test_evaluations_name_splits_and_worst_tasks(capsys):
+    """A split without tasks is left out, and a single task is not its own worst."""
+    returns = {"train": np.array([[[1.0, 3.0], [10.0, 10.0]]]), "interpolation": np.zeros((1, 0, 2))}
+    Console(10).evaluation(5, {**returns, "extrapolation": np.ones((1, 1, 2))})
+    assert capsys.readouterr().out == "evaluation at 5 steps: train 6 (worst task 2), extrapolation 1\n"
+
+
+def test_quiet_console_is_quiet(capsys):
+    """Nothing on either stream."""
+    console = Console(10, quiet=True)
+    console.say("text")
+    console.progress(5, 1.0, 5.0, np.zeros((1, 1)))
+    console.evaluation(5, {"train": np.zeros((1, 1, 1))})
+    console.close()
+    assert capsys.readouterr() == ("", "")
+
+
+def test_console_draws_a_bar_on_a_terminal(monkeypatch):
+    """Lines still come out whole, and closing leaves the terminal as it was."""
+
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    monkeypatch.setattr("sys.stdout", terminal := Terminal())
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "160")
+    console = Console(2000)
+    console.say("a [line] with brackets")
+    console.doing("evaluating")
+    console.evaluation(1000, {"train": np.full((1, 1, 1), 7.0)})
+    console.progress(2000, 4.0, 512.3, np.array([[30.0]]))
+    console.close()
+    text = terminal.getvalue()
+    assert "a [line] with brackets\n" in text and "2,000 of 2,000 steps" in text and "━" in text
+    assert "evaluated: train 7" in text
+    assert text.count("\x1b[?25l") == text.count("\x1b[?25h") == 1

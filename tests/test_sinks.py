@@ -1,0 +1,91 @@
+"""Metrics for TensorBoard and Weights & Biases, beside metrics.csv."""
+
+import sys
+import types
+
+import pytest
+
+import mtjax
+from mtjax.training import sinks
+from mtjax.types import InputError
+
+SMALL = {"num_envs": 2, "chunk_steps": 25, "batch_size": 4, "replay_size": 200, "warmup_steps": 5, "hidden": (8, 8)}
+PLAN = {"steps": 200, "seeds": 2, "eval_every": 200, "eval_episodes": 1}
+
+
+class Recorder:
+    """Stands for both libraries, and keeps what it is given."""
+
+    def __init__(self):
+        self.opened, self.written, self.closed = [], [], 0
+        recorder = self
+
+        class Writer:
+            def __init__(self, *place, **given):
+                self.place = given.get("name") or place[0].rsplit("/", 1)[-1]
+                recorder.opened.append((self.place, given))
+
+            def add_scalar(self, name, value, step):
+                recorder.written.append((self.place, step, name, value))
+
+            def log(self, values, step):
+                recorder.written.extend((self.place, step, name, value) for name, value in values.items())
+
+            def flush(self):
+                pass
+
+            def close(self):
+                recorder.closed += 1
+
+            finish = close
+
+        self.module = types.SimpleNamespace(SummaryWriter=Writer, init=Writer, Settings=lambda **given: given)
+
+
+@pytest.mark.parametrize("library, given", [("tensorboardX", {"tensorboard": True}), ("wandb", {"wandb": "project"})])
+def test_every_number_is_logged_at_its_step(library, given, short_family, tmp_path, monkeypatch):
+    """A run for each seed, with the rows of metrics.csv and the evaluations by split."""
+    recorder = Recorder()
+    monkeypatch.setitem(sys.modules, library, recorder.module)
+    folder = tmp_path / "run"
+    result = mtjax.train("finger-short", "sac-conditioned", directory=folder, **PLAN, **SMALL, **given)
+    prefix = "run-" if library == "wandb" else ""
+    assert [place for place, _ in recorder.opened] == [f"{prefix}seed-0", f"{prefix}seed-1"] and recorder.closed == 2
+    told = {(place, step, name): value for place, step, name, value in recorder.written}
+    for row in result.rows:
+        value = told[f"{prefix}seed-{row['seed']}", row["steps"], "td_error"]
+        assert value == float(row["td_error"])
+    assert {name for place, _, name in told if place.endswith("seed-1")} >= {"return", "episodes", "evaluation/train"}
+    score = told[f"{prefix}seed-1", 200, "evaluation/train"]
+    assert score == pytest.approx(result.evaluations.returns["train"][1, -1].mean(), rel=1e-5)
+
+
+def test_tensorboard_writes_files_that_its_reader_reads(tmp_path):
+    """By the real library."""
+    pytest.importorskip("tensorboardX")
+    found = sinks.open_sinks(tmp_path, True, "", 0, {})
+    sinks.write_rows(found, [{"seed": 0, "steps": 5, "return": "2.5", "loss": ""}], ["seed-0"])
+    found[0].close()
+    (file,) = (tmp_path / "tensorboard" / "seed-0").iterdir()
+    assert b"return" in file.read_bytes() and b"loss" not in file.read_bytes()
+
+
+@pytest.mark.slow
+def test_wandb_logs_offline(tmp_path, monkeypatch):
+    """By the real library, without a network."""
+    pytest.importorskip("wandb")
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    found = sinks.open_sinks(tmp_path, False, "project", 0, {"steps": 5})
+    rows = [{"seed": seed, "steps": 5, "return": "2.5"} for seed in range(2)]
+    sinks.write_rows(found, rows, ["seed-0", "seed-1"])
+    found[0].close()
+    assert len(list((tmp_path / "wandb").glob("offline-run-*"))) == 2
+
+
+@pytest.mark.parametrize("library, given", [("tensorboardX", {"tensorboard": True}), ("wandb", {"wandb": "project"})])
+def test_a_missing_library_is_named_before_anything_compiles(library, given, short_family, tmp_path, monkeypatch):
+    """With what to install."""
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(InputError, match=f"pip install 'mtjax\\[{library.removesuffix('X')}\\]'"):
+        mtjax.train("finger-short", "sac", directory=tmp_path / "run", **PLAN, **given)
+    assert not list(tmp_path.iterdir())
