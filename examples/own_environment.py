@@ -39,10 +39,10 @@ class Spring(Domain):
         "mass": MASS,
         "goal": Parameter("m", 0.0, minimum=-1.0, maximum=1.0),  # no edit: it reaches the reward as task.goal["goal"]
     }
-    num_substeps: ClassVar[int] = 2
-    episode_steps: ClassVar[int] = 100
-    default_iterations: ClassVar[int] = 1
-    starts_untouched: ClassVar[bool] = True
+    num_substeps: ClassVar[int] = 2  # of the physics in a step of the agent
+    episode_steps: ClassVar[int] = 100  # the time limit, which truncates: values are bootstrapped beyond it
+    default_iterations: ClassVar[int] = 1  # of the solver in MJX; where things touch or have limits, try 4 or more
+    starts_untouched: ClassVar[bool] = True  # no force sensor feels anything in a start: resets need not solve for it
 
     def start(self, task, key):
         return jax.random.uniform(key, (1,), minval=-0.5, maxval=0.5), jnp.zeros(1)
@@ -53,5 +53,10 @@ class Spring(Domain):
     def reward(self, task, world, action):
         return jnp.exp(-10 * jnp.abs(world.qpos[0] - task.goal["goal"]))
 
+    def terminates(self, task, world):
+        """Whether the episode ends here, with no rewards after it. Without this method only the time limit ends one."""
+        return jnp.abs(world.qpos[0]) > 2.0
 
+
+# The methods are called once with abstract arrays, so that a wrong shape or name is told at once.
 mtjax.register("spring", Spring, vary={"stiffness": "5:20:4", "goal": "-0.3,0,0.3"})

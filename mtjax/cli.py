@@ -1,13 +1,22 @@
 """The command line of training: names choose the defaults, and typed flags override them."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from mtjax.agents import settings
 from mtjax.agents.choices import CHOICES, flag_names
-from mtjax.commands import check_names, flag_value, import_files, imports_of, parse_with_tyro, unknown_flag
+from mtjax.commands import (
+    check_names,
+    flag_value,
+    import_files,
+    imports_of,
+    parse_with_tyro,
+    split_flags,
+    unknown_flag,
+    vary_flags,
+)
 from mtjax.config import NO_FINE_TUNING, RunConfig, from_json, own_files, with_preset
 from mtjax.envs import make
 from mtjax.envs.family import Family
@@ -15,7 +24,6 @@ from mtjax.envs.mixtures import Mixture, require_family
 from mtjax.names import InputError
 
 _NO_FLAGS = ("vary", "context-ranges", "points", "imports")  # vary has a flag for each parameter, taken out before
-_VARY = "--env.vary."
 _FAMILY_FLAGS = {"combine": "env.combine", "split": "split"}  # they decide which values are allowed
 _DECIDING = ("conditioning", "vectors", "heads")  # they decide which parts are allowed
 
@@ -38,7 +46,7 @@ def parse(argv: Sequence[str]) -> RunConfig:
         raise InputError(f"--from takes a run of one setting, and {start!r} holds {len(source.points)} of a sweep")
     agent_name = flag_value(argv, "agent", RunConfig.agent if source is None else source.agent)
     preset_name = flag_value(argv, "preset", RunConfig.preset)
-    vary, argv = _peel_vary(argv)
+    vary, argv = vary_flags(argv)
     chosen, argv = _peel_parts(argv)
     of_family: dict[str, Any] = {
         name: value for name in ("combine", "split") if (value := flag_value(argv, _FAMILY_FLAGS[name], ""))
@@ -68,16 +76,10 @@ def _fine_tuning(config: RunConfig, source: RunConfig, start: str, chosen: Mappi
     return dataclasses.replace(config, start=start, learner=learner, family=family)
 
 
-def _peel_vary(argv: Sequence[str]) -> tuple[dict[str, str], list[str]]:
-    """Take --env.vary.NAME=VALUES out of a command line, because only the family knows the names."""
-    given, rest = _split_flags(argv, lambda flag: flag.startswith(_VARY), "values; give lo:hi:n, lo:hi or a list a,b,c")
-    return {flag.removeprefix(_VARY): value for flag, value in given.items()}, rest
-
-
 def _peel_parts(argv: Sequence[str]) -> tuple[dict[str, str], list[str]]:
     """Take --agent.KIND=NAME out of a command line, because each part adds flags of its own."""
     kinds = {f"--agent.{kind}": kind for kind in CHOICES}
-    given, rest = _split_flags(argv, kinds.__contains__, "a value")
+    given, rest = split_flags(argv, kinds.__contains__, "a value")
     return {kinds[flag]: name for flag, name in given.items()}, rest
 
 
@@ -116,20 +118,6 @@ def _family_flag(name: str) -> str:
 def _negated(flag: str) -> str:
     group, dot, name = flag.removeprefix("--").rpartition(".")
     return f"--{group}{dot}no-{name}"
-
-
-def _split_flags(argv: Sequence[str], mine: Callable[[str], bool], needed: str) -> tuple[dict[str, str], list[str]]:
-    """Return the flags for which ``mine`` is true, with their values, and the other words of a command line."""
-    given, rest, words = {}, [], iter(argv)
-    for word in words:
-        flag, equals, value = word.partition("=")
-        if not mine(flag):
-            rest.append(word)
-            continue
-        given[flag] = value if equals else next(words, "")
-        if not given[flag]:
-            raise InputError(f"{flag} needs {needed}")
-    return given, rest
 
 
 def flags(config: Any, prefix: str = "--") -> list[str]:

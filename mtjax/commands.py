@@ -8,12 +8,12 @@ import itertools
 import re
 import sys
 import textwrap
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 from mtjax.agents import AGENTS
-from mtjax.envs import ENVS, outline
+from mtjax.envs import ENVS, outline, varied
 from mtjax.names import InputError, nearest_error
 
 PRESETS = ("auto", "cpu", "gpu")
@@ -26,6 +26,7 @@ _OVERVIEW = (  # titles, and the classes whose fields are flags of every run
 _MAY_CHANGE = {  # the only flags beside --resume
     *("--resume", "--steps", "--import", "--distributed", "--profile", "--tensorboard", "--wandb")
 }
+_VARY = "--env.vary."
 _FIELD = re.compile(r"^    (\w+): ", re.MULTILINE)  # a line of a class that may be a setting
 P = TypeVar("P")
 
@@ -50,10 +51,11 @@ def main(run: Any) -> None:
 
 def catalogue() -> str:
     """Return a list of families and agents, each with the first sentence of its documentation."""
-    lines = ["environments:"]
+    lines = ["environments, and what varies between their tasks (more by --env.vary.NAME=VALUES):"]
     for name in ENVS:
         tasks, says = outline(name)
-        lines.append(f"  {name:36} {tasks:3} task{'s' if tasks > 1 else ' '}  {says}")
+        varies = varied(name)
+        lines.append(f"  {name:36} {tasks:3} task{'s' if tasks > 1 else ' '}  {says}{f' [{varies}]' * bool(varies)}")
     lines.append("agents:")
     return "\n".join(lines + [f"  {name:36} {preset.says}" for name, preset in AGENTS.items()])
 
@@ -64,6 +66,8 @@ def overview() -> str:
         "usage: python -m mtjax.train [--env=NAME] [--agent=NAME] [FLAGS]",
         "       python -m mtjax.train --env=NAME --agent=NAME --help    all flags of these, with defaults",
         "       python -m mtjax.train --list                            all families and agents",
+        "       python -m mtjax.train --import=FILE.py ...              first run a file that registers your own",
+        "       python -m mtjax.train --resume=RUN                      go on with a run",
     ]
     for title, file, cls in _OVERVIEW:
         lines += ["", f"{title}:"]
@@ -163,6 +167,27 @@ def flag_value(argv: Sequence[str], name: str, default: P) -> str | P:
                 raise InputError(f"--{name} needs a value")
             value = argv[i + 1]
     return value
+
+
+def vary_flags(argv: Sequence[str]) -> tuple[dict[str, str], list[str]]:
+    """Take --env.vary.NAME=VALUES out of a command line, because only the family knows the names."""
+    needed = "values; give lo:hi:n, lo:hi or a list a,b,c"
+    given, rest = split_flags(argv, lambda flag: flag.startswith(_VARY), needed)
+    return {flag.removeprefix(_VARY): value for flag, value in given.items()}, rest
+
+
+def split_flags(argv: Sequence[str], mine: Callable[[str], bool], needed: str) -> tuple[dict[str, str], list[str]]:
+    """Return the flags for which ``mine`` is true, with their values, and the other words of a command line."""
+    given, rest, words = {}, [], iter(argv)
+    for word in words:
+        flag, equals, value = word.partition("=")
+        if not mine(flag):
+            rest.append(word)
+            continue
+        given[flag] = value if equals else next(words, "")
+        if not given[flag]:
+            raise InputError(f"{flag} needs {needed}")
+    return given, rest
 
 
 def import_files(argv: Sequence[str]) -> list[str]:

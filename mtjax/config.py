@@ -106,7 +106,7 @@ def with_preset(
     agent_name: str,
     preset_name: str = "auto",
     agent_settings: Mapping[str, Any] = MappingProxyType({}),
-    family: Tabled | None = None,
+    family: Any = None,
     **family_settings: Any,
 ) -> RunConfig:
     """Return the configuration of a family and an agent with the tuned settings of a preset.

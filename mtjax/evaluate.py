@@ -1,16 +1,20 @@
 """``python -m mtjax.evaluate --run=DIR``: score, plot and film a trained run on every task of every split."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
 from mtjax import commands
-from mtjax.names import InputError, load, nearest_error
+from mtjax.names import SPLITS, InputError, load, nearest_error
 
 
 @dataclasses.dataclass(frozen=True)
 class Request:
-    """Evaluate a trained run: ``python -m mtjax.evaluate --run=DIR``."""
+    """Evaluate a trained run: ``python -m mtjax.evaluate --run=DIR``.
+
+    ``--env.vary.NAME=VALUES`` evaluates on other values of a parameter: lo:hi:n or a list a,b,c.
+    """
 
     run: str = ""
     """The run's folder."""
@@ -20,31 +24,51 @@ class Request:
     """Episodes of each task and seed."""
     seed: int = 0
     """Seed of the starting states."""
+    checkpoint: int = 0
+    """Iteration of the checkpoint to evaluate, as its folder in checkpoints/ is called; 0 takes the newest."""
     video: bool = False
-    """Film the first ten seconds of an episode of each task (mp4 if ffmpeg is installed, else gif)."""
+    """Film episodes of some tasks of each split, in one grid that names each (mp4 if ffmpeg is installed, else gif)."""
+    video_splits: tuple[str, ...] = ()
+    """Splits to film: train, interpolation, extrapolation; by default all."""
+    video_tasks: tuple[int, ...] = ()
+    """Numbers of the tasks to film in each split, counted from 0; by default the first, the middle and the last."""
+    video_seconds: float = 10.0
+    """Seconds of an episode to film."""
     diagnostics: bool = False
     """Measure conflicts between the tasks' gradients, and unused units of the networks, from the run's replay."""
 
 
 def main(argv: Sequence[str]) -> None:
     """Read the command line first, then import the evaluation code and score the run."""
-    request = _parse(argv)
-    load("mtjax.report.scoring:report")(*dataclasses.astuple(request))
+    request, vary = _parse(argv)
+    load("mtjax.report.scoring:report")(request, vary)
 
 
-def _parse(argv: Sequence[str]) -> Request:
-    argv = commands.import_files(argv)
-    known = [f"--{f.name}" for f in dataclasses.fields(Request)] + ["--no-video", "--no-diagnostics", "--help", "-h"]
+def _parse(argv: Sequence[str]) -> tuple[Request, dict[str, str]]:
+    """Return the request, and the values of --env.vary.NAME=VALUES by name."""
+    vary, argv = commands.vary_flags(commands.import_files(argv))
+    names = [f.name.replace("_", "-") for f in dataclasses.fields(Request)]
+    known = [*(f"--{name}" for name in names), "--no-video", "--no-diagnostics", "--help", "-h"]
     for word in argv:
-        if word.startswith("-") and word.split("=")[0] not in known:
-            raise nearest_error("flag", word.split("=")[0], known)
+        if word.startswith("--") and word.split("=")[0].replace("_", "-") not in known:
+            raise nearest_error("flag", word.split("=")[0], [*known, "--env.vary.NAME"])
     request = commands.parse_with_tyro(Request, argv, Request(), "python -m mtjax.evaluate")
     if not request.run:
         raise InputError("say which run to evaluate: --run=DIR")
-    if request.episodes < 1 or request.seed < 0:
-        raise InputError("episodes must be at least 1 and seed at least 0")
+    if request.episodes < 1 or request.seed < 0 or request.checkpoint < 0:
+        raise InputError("episodes must be at least 1, and seed and checkpoint at least 0")
+    if not 0 < request.video_seconds < math.inf:
+        raise InputError(f"video-seconds must be greater than 0, not {request.video_seconds:g}")
+    for split in request.video_splits:
+        if split not in SPLITS:
+            raise nearest_error("split", split, SPLITS)
+    chosen = request.video_splits or request.video_tasks
+    if chosen and not request.video:
+        raise InputError("--video-splits and --video-tasks say what to film; give --video as well")
+    if vary and (request.video_splits or request.diagnostics):
+        raise InputError("tasks of --env.vary belong to no split, and diagnostics are of the run's own tasks")
     commands.require_run(Path(request.run))
-    return request
+    return request, vary
 
 
 def run() -> None:

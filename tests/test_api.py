@@ -65,9 +65,7 @@ def test_its_folder_is_loaded_evaluated_and_resumed(result, copied_run, capsys):
 def test_nothing_is_overwritten(result, short_family, tmp_path):
     """Neither a run nor what else lies in a folder; and another agent does not go on with a run."""
     before = (result.directory / "metrics.csv").read_bytes()
-    with pytest.raises(
-        InputError, match=r"holds config\.json of a run already; give another directory, or resume=True"
-    ):
+    with pytest.raises(InputError, match=r"holds config\.json of a run already; give another directory"):
         mtjax.train("finger-short", "sac", directory=result.directory)
     with pytest.raises(InputError, match="had another learner"):
         mtjax.train("finger-short", "sac-conditioned", directory=result.directory, resume=True, gamma=0.5, **SMALL)

@@ -22,7 +22,7 @@ import mtjax.train
 from mtjax import loop
 from mtjax.config import from_json
 from mtjax.evaluation import Evaluations, evaluate, load_evaluations
-from mtjax.report import render, scoring
+from mtjax.report import films, render, scoring
 from mtjax.report.tables import split_table
 from mtjax.training import checkpoint, launch
 from mtjax.types import InputError
@@ -204,22 +204,107 @@ def test_hip_bmdp_run_is_scored_with_its_nearest_heads(multi_head_run, capsys):
     }
 
 
-def test_video_films_each_task(copied_run, capsys, monkeypatch):
-    """Under a name with split, parameter and value, from every second state of an episode of its own row."""
-    filmed = {}
+@pytest.fixture
+def filmed(monkeypatch):
+    """The films that are written, and the tasks that are drawn, without OpenGL."""
+    found = {"drawn": []}
+
+    def film(env, row, qpos, width, height):
+        found["drawn"].append((row, qpos.shape))
+        return np.full((len(qpos), height, width, 3), 10 + row, np.uint8)
 
     def write(path, frames, fps):
-        filmed[path.name] = (*frames, fps)
+        found[path.name] = (frames, fps)
         return types.SimpleNamespace(name=path.name)
 
     monkeypatch.setattr(render, "choose_backend", lambda: None)
-    monkeypatch.setattr(render, "film", lambda env, row, qpos: (row, qpos.shape))
+    monkeypatch.setattr(render, "film", film)
     monkeypatch.setattr(render, "write_video", write)
-    mtjax.evaluate.main([f"--run={copied_run}", "--episodes=1", "--video"])
-    names = [f"{split}-size-{value:g}" for split, values in VALUES.items() for value in values]
-    assert filmed == {name: (row, (10, 3), 25) for row, name in enumerate(names)}
+    return found
+
+
+def test_video_films_some_tasks_of_each_split_in_one_grid(copied_run, capsys, filmed):
+    """The first, the middle and the last; each tile names its task."""
+    mtjax.evaluate.main([f"--run={copied_run}", "--episodes=1", "--video", "--video-seconds=0.2"])
+    frames, fps = filmed["film"]
+    assert fps == 25 and frames.shape == (5, 2 * 180, 3 * 240, 3)
+    assert filmed["drawn"] == [(row, (5, 3)) for row in (0, 1, 2, 3, 5, 6)]
+    assert [int(frames[0, 90 + 180 * i, 120 + 240 * j, 0]) for i in range(2) for j in range(3)] == [
+        10,
+        11,
+        12,
+        13,
+        15,
+        16,
+    ]
+    assert np.any(frames[0, :15, :240] > 200)  # the caption
     out = capsys.readouterr().out
-    assert all(f"filmed {name}: return " in out for name in names)
+    assert "filming 1 of 6: train size=1, return " in out and "filmed film: 6 tasks" in out
+
+
+def test_chosen_tasks_are_filmed(copied_run, filmed):
+    """By split and number."""
+    words = ["--video", "--video-splits", "extrapolation", "--video-tasks", "3", "1"]
+    mtjax.evaluate.main([f"--run={copied_run}", "--episodes=1", *words])
+    assert [row for row, _ in filmed["drawn"]] == [6, 4]
+    for wrong, said in (
+        (["--video", "--video-tasks=9"], "there is no task 9 to film"),
+        (["--video-tasks=1"], "give --video as well"),
+        (["--video", "--video-splits=test"], "unknown split 'test'"),
+        (["--video", "--video-seconds=0"], "video-seconds must be greater than 0"),
+    ):
+        with pytest.raises(InputError, match=said):
+            mtjax.evaluate.main([f"--run={copied_run}", *wrong])
+
+
+def test_a_film_that_ends_stands_still():
+    """Until the longest one ends; the grid is as square as can be."""
+    short, long = np.full((1, 2, 2, 3), 1, np.uint8), np.full((3, 2, 2, 3), 2, np.uint8)
+    whole = films.grid([short, long, long])
+    assert whole.shape == (3, 4, 4, 3)
+    assert np.all(whole[:, :2, :2] == 1) and np.all(whole[:, 2:, 2:] == 0) and np.all(whole[2, :2, 2:] == 2)
+
+
+def test_other_values_are_scored_as_the_run_scores_them(copied_run, capsys):
+    """A value that trained keeps its number; contexts are scaled as in the run."""
+    words = [f"--run={copied_run}", "--episodes=1", "--env.vary.size=0.9:1.2:4"]
+    mtjax.evaluate.main(words)
+    out = capsys.readouterr().out
+    assert "trained on size 1 to 1.2; scored on size 0.9 to 1.2" in out
+    rows = rows_of(copied_run / "evaluation-1" / "returns.csv")
+    assert {(row["split"], row["size"]) for row in rows} == {("given", x) for x in ("0.9", "1", "1.1", "1.2")}
+    policy = mtjax.load(copied_run)
+    family = scoring.on_values(policy.env, {"size": "0.9,1,1.2"})
+    tasks = scoring.as_unseen(family.tasks("all"), policy.env.tasks())
+    assert np.asarray(tasks.id).tolist() == [2, 0, 1]
+    np.testing.assert_allclose(tasks.context[:, 0], [-2, -1, 1], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        (["--env.vary.siez=1,2"], "unknown parameter 'siez'; did you mean 'size'"),
+        (["--env.vary.size=-1,2"], "size must be greater than 0"),
+        (["--env.vary.size"], "--env.vary.size needs values"),
+        (["--env.vary.size=1,2", "--diagnostics"], "diagnostics are of the run's own tasks"),
+        (["--checkpoint=7"], "has no checkpoint 7; it has 100, 150"),
+        (["--checkpoint=-7"], "checkpoint at least 0"),
+    ],
+)
+def test_wrong_values_and_checkpoints_are_refused(copied_run, words, said):
+    """In a line, and without a new folder."""
+    with pytest.raises(InputError, match=said):
+        mtjax.evaluate.main([f"--run={copied_run}", *words])
+    assert not list(copied_run.glob("evaluation-*"))
+
+
+def test_an_earlier_checkpoint_is_evaluated(copied_run):
+    """As in Python."""
+    old, new = mtjax.load(copied_run, checkpoint=100), mtjax.load(copied_run)
+    same = jax.tree.map(lambda x, y: np.array_equal(x, y), old.state.actor, new.state.actor)
+    assert not all(jax.tree.leaves(same))
+    mtjax.evaluate.main([f"--run={copied_run}", "--checkpoint=100", "--episodes=1"])
+    assert (copied_run / "evaluation-1" / "returns.csv").exists()
 
 
 def test_run_without_a_checkpoint_is_refused(copied_run):

@@ -184,17 +184,18 @@ def test_runs_are_tables(runs, make_run):
     assert len(mine) == 3 * 3 * 23
 
 
-def test_a_result_is_a_table(finished_run, short_family):
+def test_a_result_is_a_table(make_run):
     """As is its folder, and the lines of its metrics."""
     pytest.importorskip("pandas")
     from mtjax.evaluation import load_evaluations
     from mtjax.training.result import Result
 
-    evaluations, env = load_evaluations(finished_run / "evaluations.npz"), mtjax.make("finger-short")
+    folder = make_run("x", "finger-spin-vary-size", "sac", seeds=2)
+    evaluations, env = load_evaluations(folder / "evaluations.npz"), mtjax.make("finger-spin-vary-size")
     rows = [{"seed": 0, "steps": 100, "return": "1.5", "loss": ""}]
     result = Result(None, evaluations, rows, 0.0, 0.0, True, None, env=env, seeds=(0, 1))
-    table, folder = result.frame(), mtjax.runs(finished_run)
-    assert table.equals(folder[table.columns])
+    table, read = result.frame(), mtjax.runs(folder)
+    assert table.equals(read[table.columns])
     metrics = result.frame("metrics")
     assert metrics["return"][0] == 1.5 and np.isnan(metrics["loss"][0]) and metrics["steps"].dtype == int
     with pytest.raises(InputError, match="unknown table 'metric'"):
@@ -216,8 +217,8 @@ def test_a_sweep_is_read_with_its_runs(make_run, tmp_path):
     ]
 
 
-def test_without_pandas_the_error_says_what_to_install(monkeypatch, finished_run):
+def test_without_pandas_the_error_says_what_to_install(monkeypatch, make_run):
     """In a line."""
     monkeypatch.setitem(__import__("sys").modules, "pandas", None)
     with pytest.raises(InputError, match=r"pip install 'mtjax\[pandas\]'"):
-        mtjax.runs(finished_run)
+        mtjax.runs(make_run("x", "finger-spin", "sac"))

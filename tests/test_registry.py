@@ -1,6 +1,7 @@
 """Every registered family, whatever runs it: it starts, steps, stays finite, repeats itself and names its tasks."""
 
 import dataclasses
+import importlib
 import json
 import shlex
 import sys
@@ -17,10 +18,13 @@ from probes import slow_but
 import mtjax
 import mtjax.evaluate
 import mtjax.train
-from mtjax import register
+from mtjax import cli, commands, register
 from mtjax.agents import AGENTS, PARTS
-from mtjax.envs import ENVS
+from mtjax.config import to_json
+from mtjax.envs import ENVS, Parameter, declared
 from mtjax.tasks import episode_task
+from mtjax.training import api
+from mtjax.training.folder import to_flags
 from mtjax.types import SPLITS, InputError
 
 STEPS = 200
@@ -87,9 +91,9 @@ def test_family_round_trips_its_tasks(name):
 
 @pytest.mark.slow
 def test_a_family_of_ones_own_is_trained_and_evaluated(tmp_path, monkeypatch, capsys):
-    """The worked example, by the commands that are printed; and it is under 60 lines."""
+    """The worked example, by the commands that are printed; and it is under 70 lines."""
     file = Path(__file__).parents[1] / "examples" / "own_environment.py"
-    assert len(file.read_text().splitlines()) < 60
+    assert len(file.read_text().splitlines()) < 70
     monkeypatch.setenv("MTJAX_CACHE", "0")
     small = (
         "--steps=480 --num-envs=2 --batch-size=2 --replay-size=50 --warmup-steps=1 --chunk-steps=20 --agent.hidden 4"
@@ -177,3 +181,160 @@ def test_what_cannot_be_registered_is_refused(forget):
     with pytest.raises(InputError, match="actor-lr must be greater than 0"):
         register("mine", "sac", actor_lr=-1.0)
     assert "mine" not in AGENTS and "clash" not in PARTS["encoder"]
+
+
+# Own files in a run's record, and checks of own families.
+
+
+@pytest.fixture
+def spring(forget):
+    """The worked example's class, registered."""
+    sys.path.insert(0, str(EXAMPLES))
+    yield importlib.import_module("own_environment").Spring
+    sys.path.remove(str(EXAMPLES))
+
+
+def set_missing(spec, value):
+    """Edits a joint that the model lacks."""
+    spec.joint("slid").stiffness[0] = value
+
+
+def set_wrongly(spec, value):
+    """Fails with a name that the model has."""
+    spec.joint("slide").stiffnes = value
+
+
+WRONG = [
+    (
+        {"reward": lambda s, t, w, a: jnp.zeros(2)},
+        r"Mine\.reward must return a number of shape \(\), not \(2,\)",
+    ),
+    ({"reward": lambda s, t, w, a: t.goal["gaol"]}, "reward: unknown goal of the task 'gaol'; did you mean 'goal'"),
+    ({"reward": lambda s, t, w: 0}, "reward: TypeError: .* takes 3 positional arguments"),
+    ({"observe": lambda s, t, w: jnp.zeros((2, 2))}, r"observe must return one vector \(O,\), not shape \(2, 2\)"),
+    ({"observe": lambda s, t, w: s.models[0].geom("x")}, "observe: KeyError: .*Invalid name 'x'"),
+    ({"start": lambda s, t, k: (jnp.zeros(2), jnp.zeros(1))}, r"start must return positions of shape \(1,\)"),
+    ({"start": lambda s, t, k: jnp.zeros(2)}, "start must return positions and velocities"),
+    ({"terminates": lambda s, t, w: 1.0}, "terminates must return a bool as an array of bool, not float32"),
+    ({"episode_steps": None}, "episode_steps must be a whole number of at least 1, not None"),
+    (
+        {"parameters": {"x": Parameter("1", 0.0, set_missing)}},
+        r"\(set_missing\): unknown joint .*'slid'; did you",
+    ),
+    ({"parameters": {"x": Parameter("1", 0.0, set_wrongly)}}, r"parameters\['x'\] \(set_wrongly\): AttributeError"),
+    ({"parameters": {"x": Parameter("1", 5.0, maximum=1.0)}}, "the bounds of 'x' are out of order"),
+    ({"model_file": "<mujoco><geo/></mujoco>"}, "model_file: ValueError: XML Error"),
+    ({"model_file": "none.xml"}, "model_file: there is no model file"),
+]
+
+
+@pytest.mark.parametrize("given, said", WRONG, ids=range(len(WRONG)))
+def test_a_wrong_method_of_a_family_is_named_when_it_is_registered(given, said, spring):
+    """Without compiling anything; and the name stays free."""
+    mine = dataclasses.dataclass(frozen=True)(type("Mine", (spring,), given))
+    with pytest.raises(InputError, match=said) as error:
+        register("mine", mine)
+    assert "\n" not in str(error.value) and "mine" not in ENVS
+
+
+def test_a_family_that_steps_itself_is_checked_too(forget):
+    """Reset and step must agree."""
+    corridor = type(mtjax.make("two-goal-maze"))
+
+    @dataclasses.dataclass(frozen=True)
+    class Mine(corridor):
+        def step(self, task, state, action):
+            step = super().step(task, state, action)
+            return step._replace(obs=step.obs[:-1])
+
+    with pytest.raises(InputError, match="Mine: reset and step return a different obs"):
+        register("mine", Mine)
+    with pytest.raises(InputError, match="Family cannot be made"):
+        register("mine", mtjax.envs.Family)
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_every_family_of_the_package_passes_the_check(name):
+    """So that the check asks for nothing that a family need not have."""
+    declared.check(mtjax.make(name))
+
+
+def test_an_episode_ends_where_the_family_says(spring):
+    """With no discount left; the time limit is another matter."""
+    env = mtjax.make("spring")
+    task = jax.tree.map(lambda x: x[0], env.tasks())
+    begun = env.reset(task, jax.random.key(0))
+    far = env.set_physics(task, begun.state, jnp.array([2.5]), jnp.zeros(1))
+    assert not env.step(task, begun.state, jnp.zeros(1)).terminated and env.step(task, far, jnp.zeros(1)).terminated
+
+
+OWN_FILES = [EXAMPLES / f"{name}.py" for name in ("own_environment", "own_encoder")]
+OWN_FLAGS = [f"--import={file}" for file in OWN_FILES]
+OWN_WORDS = ["--env=spring", "--agent=sac-conditioned", "--agent.encoder=gated", "--split=none", "--steps=480"]
+
+
+def forget_own():
+    """Let this process know the files no longer."""
+    for table, name in ((ENVS, "spring"), (PARTS["encoder"], "gated")):
+        del table[name]
+    for file in OWN_FILES:
+        del sys.modules[file.stem]
+
+
+def test_all_files_of_a_run_are_recorded_and_asked_for_and_never_run_by_themselves(forget, tmp_path):
+    """By evaluation, by resuming and in Python."""
+    config = cli.parse([OWN_FLAGS[0], "--import", str(OWN_FILES[1]), *OWN_WORDS])
+    assert [word for word in to_flags(config) if word.startswith("--import")] == OWN_FLAGS
+    (tmp_path / "config.json").write_text(to_json(config, {"command": ""}))
+    (tmp_path / "evaluations.npz").touch()
+    forget_own()
+    for call in (
+        lambda: mtjax.evaluate.main([f"--run={tmp_path}"]),
+        lambda: mtjax.train.main([f"--resume={tmp_path}", "--steps=960"]),
+        lambda: mtjax.load(tmp_path),
+        lambda: mtjax.runs(tmp_path),
+    ):
+        with pytest.raises(InputError, match="uses code of your own: add ") as error:
+            call()
+        assert " ".join(OWN_FLAGS) in str(error.value)
+    assert "own_environment" not in sys.modules and "spring" not in ENVS
+    with pytest.raises(InputError, match="holds no checkpoint"):  # the files are found, and the run is read
+        mtjax.evaluate.main([f"--run={tmp_path}", *OWN_FLAGS])
+
+
+@pytest.mark.slow
+def test_a_run_of_own_files_is_evaluated_and_resumed_with_them(forget, short_family, tmp_path, capsys):
+    """By the flags that the errors ask for."""
+    small = [word for word in SHORT_RUN if not word.startswith(("--env", "--agent=", "--steps", "--seeds"))]
+    mtjax.train.main([*OWN_FLAGS, *OWN_WORDS, *small, f"--runs={tmp_path}"])
+    (run,) = tmp_path.iterdir()
+    forget_own()
+    mtjax.evaluate.main([f"--run={run}", "--episodes=1", *OWN_FLAGS])
+    forget_own()
+    mtjax.train.main([*OWN_FLAGS, f"--resume={run}", "--steps=960"])
+    assert "done in" in capsys.readouterr().out
+
+
+def test_an_agent_with_other_defaults_names_its_file(forget, tmp_path):
+    """Though its class is the package's own."""
+    file = tmp_path / "own_defaults.py"
+    file.write_text('import mtjax\n\nmtjax.register("my-care", "care", num_experts=3)\n')
+    flag = f"--import={file}"
+    config = cli.parse([flag, "--agent=my-care"])
+    assert config.imports == (str(file),) and flag in to_flags(config)
+    assert api._configured("finger-spin", "my-care", {}, None, None, {}).imports == (str(file),)
+
+
+def test_unknown_names_of_a_run_mention_import(tmp_path):
+    """If the run does not say which file, as it was registered in a notebook."""
+    record = json.loads(to_json(cli.parse([]), {"command": ""}))
+    (tmp_path / "config.json").write_text(json.dumps({**record, "env": "gone"}))
+    with pytest.raises(InputError, match=r"unknown environment 'gone'.*give --import=FILE\.py with the file that"):
+        mtjax.load(tmp_path)
+
+
+def test_the_list_says_what_varies():
+    """And the help how to import."""
+    lines = commands.catalogue().splitlines()
+    assert any("finger-spin-vary-size " in line and "[size=0.95:1.13:10]" in line for line in lines)
+    assert "--import=FILE.py" in commands.overview()

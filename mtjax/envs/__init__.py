@@ -282,22 +282,33 @@ def _make_mixture(names: tuple[str, ...], vary: dict[str, Any], settings: dict[s
 def register(name: str, family: "type[Family]", **settings: Any) -> None:
     """Register your own family under a name that ``make``, the command line and notebooks accept.
 
+    Its methods are called once with abstract arrays, so that a wrong shape or name is found here.
+
     Args:
         family: a frozen dataclass, a subclass of ``Domain`` (an MJCF file, parameters, observation and reward) or of
             ``Family`` (anything that steps in JAX).
         settings: values of its fields, such as ``vary={"mass": "0.5:2:10"}``.
 
     Raises:
-        InputError: the name is taken, or a value is out of range.
+        InputError: the name is taken, a value is out of range, or a method is wrong.
     """
     if name in ENVS:
         raise InputError(f"there is an environment {name!r} already; choose another name")
     ENVS[name] = (family, settings)
     try:
-        make(name)
-    except InputError:
+        load("mtjax.envs.declared:check")(make(name))
+    except TypeError as error:  # an abstract method is missing
+        del ENVS[name]
+        raise InputError(f"{family.__name__} cannot be made: {error}") from None
+    except Exception:
         del ENVS[name]
         raise
+
+
+def varied(name: str) -> str:
+    """Return what differs between the tasks of a registered family, as ``--env.vary`` takes it."""
+    given = dict(ENVS.data[name][1].get("vary", {}))
+    return ", ".join(f"{parameter}={variation.write_values(values)}" for parameter, values in given.items())
 
 
 def outline(name: str) -> tuple[int, str]:

@@ -52,7 +52,7 @@ class Domain(Family):
     default_iterations: ClassVar[int]  # of MJX, where each costs about as much as the rest of a step
     warp_iterations: ClassVar[int] = 10  # of Warp, where they are cheap
     gpu_engine: ClassVar[str] = "warp"  # what "auto" is on an NVIDIA GPU, as measured: mjx or warp
-    starts_untouched: ClassVar[bool] = False  # no force sensor feels anything when an episode begins
+    starts_untouched: ClassVar[bool] = False  # no force sensor feels anything at a start: it need not be solved for
 
     def __post_init__(self):
         super().__post_init__()
@@ -83,6 +83,10 @@ class Domain(Family):
     def reward(self, task: Task, world: World, action: Array) -> Array:
         """Return the reward () of a world after the step."""
 
+    def terminates(self, task: Task, world: World) -> Array:
+        """Return whether () an episode ends in this world, with no rewards after it. By default only time ends one."""
+        return jnp.bool_(False)
+
     def recall(self, task: Task, obs: Array) -> World:
         """Return a world with the observation ``obs``, exact in all that the reward reads. ``relabel`` needs it."""
         raise NotImplementedError(f"{type(self).__name__} does not say which world an observation shows")
@@ -98,7 +102,8 @@ class Domain(Family):
     def step(self, task: Task, state: World, action: Array) -> Step:
         """Advance one control step under ``action`` (A,) in [-1, 1]; observation and reward are those after it."""
         world = self.simulator.step(task, state, action)
-        return Step(world, self.observe(task, world), self.reward(task, world, action), jnp.bool_(False))
+        reward, over = self.reward(task, world, action), self.terminates(task, world)
+        return Step(world, self.observe(task, world), reward, over)
 
     def relabel(self, task: Task, transition: Transition, key: Key) -> Transition:
         """Return another task's transition with the reward of ``task``. Observations must not show the goal."""

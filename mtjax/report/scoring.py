@@ -1,6 +1,8 @@
 """The command ``python -m mtjax.evaluate``: score, plot and film a trained run on every task of every split."""
 
 import contextlib
+import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -8,48 +10,75 @@ import jax.numpy as jnp
 import numpy as np
 
 from mtjax.config import from_json
-from mtjax.envs import Domain
-from mtjax.envs.family import Part
-from mtjax.evaluation import Recording, evaluate, record
-from mtjax.report import diagnostics, figures, render
+from mtjax.envs import Family
+from mtjax.evaluation import evaluate
+from mtjax.report import diagnostics, figures, films
 from mtjax.report.tables import task_table
 from mtjax.training.log import append_rows, number
 from mtjax.training.policy import Policy, load, load_experience
 from mtjax.training.programs import compile_lowered, enable_compile_cache, trace
-from mtjax.types import SPLITS, InputError
+from mtjax.types import SPLITS, InputError, Task
 
 _FIRST_NUMBER = 1_000_000  # beyond the numbers of a run's own evaluations, so that the episodes are new
-_FILM_FPS, _FILM_SECONDS = 25, 10
 
 
-def report(run: str, point: int, episodes: int, seed: int, video: bool, diagnose: bool) -> None:
-    """Score a run, print the table, and write table, plot and films into a new folder inside the run's folder.
+def report(request: Any, vary: Mapping[str, str]) -> None:
+    """Score a run, print the table, and write table, plot and film into a new folder inside the run's folder.
 
     Args:
-        point: number of the setting, if the run holds several settings of a sweep.
-        episodes: episodes of each task and seed.
-        seed: seed of the starting states.
-        video: film an episode of each task.
-        diagnose: write the diagnostics of the agent, from the run's replay.
+        request: the settings of ``mtjax.evaluate``.
+        vary: values of parameters for tasks of its own, by name; without any, the run's tasks are scored.
     """
     enable_compile_cache()
-    first = _first_seed(run, point)
-    policy = load(run, first)
-    if video and not any(isinstance(part.family, Domain) for part in policy.env.parts):
-        raise InputError("only MuJoCo families can be filmed; leave out --video")
-    found = diagnostics.diagnose(policy, *load_experience(run, first)) if diagnose else None
-    scores = score(policy, episodes, seed)
+    run = request.run
+    first = _first_seed(run, request.point)
+    policy = load(run, first, request.checkpoint)
+    if request.video:
+        films.require(policy.env)
+    found = diagnostics.diagnose(policy, *load_experience(run, first)) if request.diagnostics else None
+    named = {"train": "given"} if vary else {}
+    if vary:
+        trained = policy.env
+        policy = dataclasses.replace(policy, env=on_values(trained, vary))
+        print(f"trained on {trained.ends or 'one task'}; scored on {policy.env.ends or 'one task'}")  # type: ignore
+        tasks = as_unseen(policy.env.tasks("all"), trained.tasks("train"))
+    else:
+        tasks = policy.env.tasks("all")
+    chosen = films.choose(policy.env, request.video_splits, request.video_tasks) if request.video else ()
+    scores = score(policy, request.episodes, request.seed, tasks)
     directory = _new_folder(Path(run))
-    print(task_table(policy, scores))
+    print(task_table(policy, scores, named))
     if policy.agent.unseen:
         print(f"unseen tasks: {policy.agent.unseen}")
-    _write(policy, scores, directory)
+    _write(policy, {named.get(split, split): x for split, x in scores.items()}, directory, named)
     if found is not None:
         print(diagnostics.table(policy, found))
         diagnostics.write(policy, found, directory)
-    if video:
-        _film(policy, directory, seed)
+    if chosen:
+        films.write(policy, tasks, chosen, request.video_seconds, request.seed, directory / "film", named)
     print(f"written to {directory}")
+
+
+def on_values(env: Any, vary: Mapping[str, Any]) -> Any:
+    """Return a family with other values of its parameters, all in its training split, with contexts scaled as before.
+
+    Raises:
+        InputError: it is a mixture, or has no such parameter or value.
+    """
+    if not isinstance(env, Family):
+        raise InputError("other values are for runs of one family, and this run is of a mixture")
+    own = {name: values for name, values in env.vary if name not in vary}
+    made = dataclasses.replace(env, vary={**own, **vary}, combine="grid", split="none")
+    return made.scaled_as(env)
+
+
+def as_unseen(tasks: Task, trained: Task) -> Task:
+    """Number tasks (T,) for an agent that learned others: a task that it learned by its number, others beyond these."""
+    same = np.all(np.isclose(np.asarray(tasks.context)[:, None], np.asarray(trained.context), atol=1e-5), axis=-1)
+    known, count = same.any(axis=1), len(trained.id)
+    return tasks._replace(
+        id=jnp.asarray(np.where(known, same.argmax(axis=1), count + np.arange(len(known))), jnp.int32)
+    )
 
 
 def _first_seed(run: str, point: int) -> int:
@@ -60,10 +89,15 @@ def _first_seed(run: str, point: int) -> int:
     return point * config.plan.seeds
 
 
-def score(policy: Policy, episodes: int, seed: int = 0) -> dict[str, np.ndarray]:
-    """Return the returns (S, T, episodes) of each split, in episodes that no training run has seen."""
+def score(policy: Policy, episodes: int, seed: int = 0, tasks: Task | None = None) -> dict[str, np.ndarray]:
+    """Return the returns (S, T, episodes) of each split, in episodes that no training run has seen.
+
+    Args:
+        tasks: all tasks of the policy's environment, if they are numbered anew.
+    """
     env = policy.env
-    arguments = policy.states, env.tasks("all"), policy.seeds, jnp.int32(_FIRST_NUMBER + seed)
+    tasks = env.tasks("all") if tasks is None else tasks
+    arguments = policy.states, tasks, policy.seeds, jnp.int32(_FIRST_NUMBER + seed)
     scores = compile_lowered(trace(evaluate, env, policy.agent, episodes, *arguments).lower())(*arguments)
     returns = np.asarray(scores.returns)
     return {split: returns[:, np.asarray(env.tasks(split).id)] for split in SPLITS}
@@ -77,10 +111,11 @@ def _new_folder(run: Path) -> Path:
     raise InputError(f"{str(run)!r} is full of evaluations; move some away")
 
 
-def _write(policy: Policy, episodes: dict[str, np.ndarray], directory: Path) -> None:
+def _write(policy: Policy, episodes: dict[str, np.ndarray], directory: Path, named: Mapping[str, str]) -> None:
     env, (name, unit), many = policy.env, policy.env.task_axis, len(policy.env.parts) > 1
-    labels = {split: env.labels(split) if many else map(number, env.task_values(split)) for split in episodes}
-    labels = {split: list(found) for split, found in labels.items()}
+    values = {named.get(split, split): env.task_values(split) for split in SPLITS}
+    labels = {split: list(map(number, x)) for split, x in values.items()}
+    labels = {named.get(split, split): env.labels(split) for split in SPLITS} if many else labels
     rows = [
         {"split": split, name: label, "seed": int(seed), "episode": e, "return": number(x)}
         for split, returns in episodes.items()
@@ -92,32 +127,4 @@ def _write(policy: Policy, episodes: dict[str, np.ndarray], directory: Path) -> 
     file = directory / f"return_by_{name.replace('-', '_')}.png"
     if many:
         return figures.return_by_task(file, labels, episodes)
-    figures.return_by_parameter(file, name, unit, {split: env.task_values(split) for split in episodes}, episodes)
-
-
-def _film(policy: Policy, directory: Path, seed: int) -> None:
-    """Film the start of one episode of every task of the MuJoCo families, in real time."""
-    env = policy.env
-    render.choose_backend()
-    played = record(env, policy.agent, policy.state, env.tasks("all"), jnp.int32(seed))
-    for part, states in zip(env.parts, env.apart(played.states), strict=True):
-        if isinstance(part.family, Domain):
-            _film_family(policy, part, played._replace(states=states), directory)
-        else:
-            print(f"{part.name} has no model to film")
-
-
-def _film_family(policy: Policy, part: Part, played: Recording, directory: Path) -> None:
-    """Film the tasks of one family from the states in ``played``."""
-    family: Any = part.family
-    stride = max(round(1 / (_FILM_FPS * family.seconds_per_step)), 1)
-    fps, longest = 1 / (stride * family.seconds_per_step), round(_FILM_SECONDS / family.seconds_per_step)
-    for split in SPLITS:
-        for i in family.table.rows[split]:
-            place = part.places["all"][i]
-            row = int(played.rows[place])  # continuous ranges have a row for each episode
-            shown = slice(0, min(longest, int(played.lengths[place])), stride)
-            frames = render.film(family, policy.env.own_row(row), np.asarray(played.states.qpos[i, shown]))
-            named = f"{split}-{policy.env.describe(row)}".replace("=", "-").replace(" ", "-")
-            path = render.write_video(directory / named, frames, fps)
-            print(f"filmed {path.name}: return {float(played.returns[place]):.0f}", flush=True)
+    figures.return_by_parameter(file, name, unit, values, episodes)

@@ -1,6 +1,7 @@
 """Returns of a run as tables of text."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 
 import numpy as np
 
@@ -32,8 +33,13 @@ def _split_line(split: str, scores: np.ndarray) -> str:
     return f"{split:15} {scores.shape[1]:5} {_interval(scores):>7}  {scores.mean(axis=0).min():.0f}"
 
 
-def task_table(policy: Policy, episodes: dict[str, np.ndarray]) -> str:
-    """Return a table of returns (S, T, episodes) by family, split and task."""
+def task_table(policy: Policy, episodes: dict[str, np.ndarray], named: Mapping[str, str] = MappingProxyType({})) -> str:
+    """Return a table of returns (S, T, episodes) by family, split and task.
+
+    Args:
+        named: other names of splits.
+    """
+    called = lambda split: named.get(split, split)
     parts = policy.env.parts
     lines = []
     for part in parts:
@@ -45,11 +51,11 @@ def task_table(policy: Policy, episodes: dict[str, np.ndarray]) -> str:
                 continue
             for label, task in zip(part.family.labels(split), np.moveaxis(own, 1, 0), strict=True):
                 mean = _interval(task.mean(axis=-1, keepdims=True))
-                lines.append(f"{split:15} {label:>10} {mean:>7}   {task.min():.0f}, {task.max():.0f}")
-            lines.append(_all_line(split, own))
+                lines.append(f"{called(split):15} {label:>10} {mean:>7}   {task.min():.0f}, {task.max():.0f}")
+            lines.append(_all_line(called(split), own))
     if len(parts) > 1:
         lines.append("all families")
-        lines += [_all_line(split, returns) for split, returns in episodes.items() if returns.size]
+        lines += [_all_line(called(split), returns) for split, returns in episodes.items() if returns.size]
     return "\n".join(lines)
 
 

@@ -44,9 +44,12 @@ def load(directory: Path, like: TrainState) -> TrainState:
     return found["loop"]._replace(agent=found["agent"])
 
 
-def load_agent(directory: Path, like: TrainState) -> Any:
-    """Read only the agent's state, which suffices for acting."""
-    return _load(directory, {"agent": like.agent})["agent"]
+def load_agent(directory: Path, like: TrainState, iteration: int = 0) -> Any:
+    """Read only the agent's state, which suffices for acting: the newest, or that of an iteration."""
+    if iteration and not (directory / str(iteration)).is_dir():
+        kept = ", ".join(sorted((path.name for path in directory.glob("*") if path.name.isdigit()), key=int))
+        raise InputError(f"{str(directory)!r} has no checkpoint {iteration}; it has {kept or 'none'}")
+    return _load(directory, {"agent": like.agent}, iteration=iteration)["agent"]
 
 
 def load_ring(directory: Path, like: TrainState) -> Ring:
@@ -84,13 +87,13 @@ def _require_whole(folder: Path, parts: Iterable[str]) -> None:
         )
 
 
-def _load(directory: Path, like: dict[str, Any], partial: bool = False) -> dict[str, Any]:
+def _load(directory: Path, like: dict[str, Any], partial: bool = False, iteration: int = 0) -> dict[str, Any]:
     from orbax.checkpoint import v1 as ocp
 
     first = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
     place = lambda x: getattr(x, "sharding", None) or first
     like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place(x)), like)
-    newest = _newest(directory)
+    newest = directory / str(iteration) if iteration else _newest(directory)
     _require_whole(newest, like)
     context = ocp.Context()
     context.pytree.loading.partial_load = partial

@@ -17,7 +17,8 @@ from mtjax.envs import name_of as env_name_of
 from mtjax.envs.family import Tabled
 from mtjax.experience import Replay
 from mtjax.experience.ring import Ring
-from mtjax.training import checkpoint, points
+from mtjax.training import checkpoint as checkpoints
+from mtjax.training import points
 from mtjax.training.points import Point
 from mtjax.training.programs import trace
 from mtjax.types import Array, InputError, Key, Task, Transition
@@ -64,13 +65,14 @@ class Policy:
         return self.agent.remember(self.state, memory, step, task)
 
 
-def load(directory: str | Path, seed: int = 0) -> Policy:
+def load(directory: str | Path, seed: int = 0, checkpoint: int = 0) -> Policy:
     """Load the trained policy of a run.
 
     Args:
         directory: the run's folder.
         seed: which of the run's seeds, counted from 0. A run of a sweep has all its seeds for each of its points:
             number ``k`` is seed ``k % seeds`` of point ``k // seeds``. The policy then has the agent of that point.
+        checkpoint: the iteration of a checkpoint that the run keeps; 0 takes the newest.
 
     Raises:
         InputError: the folder is not a run, the run has no such seed, or its checkpoint is missing or damaged.
@@ -78,7 +80,7 @@ def load(directory: str | Path, seed: int = 0) -> Policy:
     directory = path(directory)
     config = from_json(directory / "config.json")
     _require_seed(seed, config.plan.seeds, len(config.points))
-    states = checkpoint.load_agent(directory / "checkpoints", state_shapes(config))
+    states = checkpoints.load_agent(directory / "checkpoints", state_shapes(config), checkpoint)
     seeds = config.plan.seed + jnp.arange(config.plan.seeds)
     return policy_of(config.family, config.learner, config.points, seeds, states, seed, directory)
 
@@ -122,7 +124,7 @@ def load_experience(directory: str | Path, seed: int = 0) -> tuple[Ring, int]:
     config = from_json(Path(directory) / "config.json")
     if not isinstance(config.learner.experience, Replay):
         raise InputError(f"{config.agent} keeps no replay, so that there is nothing to look at")
-    ring = checkpoint.load_ring(Path(directory) / "checkpoints", state_shapes(config))
+    ring = checkpoints.load_ring(Path(directory) / "checkpoints", state_shapes(config))
     rows = _point_rows(config.plan.seeds, seed)
     return ring._replace(rows=jax.tree.map(lambda x: x[rows], ring.rows)), config.learner.experience.batch_size
 

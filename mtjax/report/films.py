@@ -1,0 +1,135 @@
+"""Films of several tasks side by side, with split, parameters and return written on each."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from mtjax.envs.domain import Domain
+from mtjax.envs.family import Part, Tabled
+from mtjax.evaluation import Recording, record
+from mtjax.names import InputError
+from mtjax.report import render
+from mtjax.training.policy import Policy
+from mtjax.types import SPLITS, Task
+
+_FPS = 25
+_WIDTHS = ((4, 320), (9, 240))  # of a tile, for up to so many tasks; beyond, the narrowest
+_NARROWEST = 160
+
+
+class Chosen(NamedTuple):
+    """A task to film."""
+
+    part: Part
+    split: str
+    place: int  # among all tasks of the environment
+    own: int  # among all tasks of its family
+
+
+def require(env: Tabled) -> None:
+    """Raise InputError unless a model can be filmed."""
+    if not any(isinstance(part.family, Domain) for part in env.parts):
+        raise InputError("only MuJoCo families can be filmed; leave out --video")
+
+
+def choose(env: Tabled, splits: Sequence[str], tasks: Sequence[int]) -> list[Chosen]:
+    """Return the tasks to film: of each split and family those numbers, or the first, the middle and the last.
+
+    Raises:
+        InputError: no family has such a task.
+    """
+    found, most = [], 0
+    for part in (part for part in env.parts if isinstance(part.family, Domain)):
+        for split in splits or SPLITS:
+            rows = part.family.table.rows[split]
+            most = max(most, len(rows))
+            spread = dict.fromkeys((0, len(rows) // 2, len(rows) - 1)) if len(rows) else ()
+            numbers = [t for t in dict.fromkeys(tasks) if 0 <= t < len(rows)] if tasks else spread
+            found += [Chosen(part, split, int(part.places["all"][rows[t]]), int(rows[t])) for t in numbers]
+    wrong = next((t for t in tasks if not 0 <= t < most), None)
+    if wrong is not None:
+        raise InputError(f"there is no task {wrong} to film; there are tasks 0 to {most - 1}")
+    if not found:
+        raise InputError(f"there are no tasks to film in {', '.join(splits)}")
+    return found
+
+
+def write(
+    policy: Policy,
+    tasks: Task,
+    chosen: Sequence[Chosen],
+    seconds: float,
+    seed: int,
+    stem: Path,
+    named: Mapping[str, str],
+) -> Path:
+    """Film one episode of each chosen task, and write them as one grid. Progress is printed.
+
+    Args:
+        tasks: all tasks of the environment.
+        seconds: how much of an episode to film; one that ends before stands still.
+        named: other names of splits.
+    """
+    env = policy.env
+    render.choose_backend()
+    played = record(env, policy.agent, policy.state, tasks, jnp.int32(seed))
+    by_name = {part.name: states for part, states in zip(env.parts, env.apart(played.states), strict=True)}
+    width = next((width for most, width in _WIDTHS if len(chosen) <= most), _NARROWEST)
+    count, tiles = max(round(seconds * _FPS), 1), []
+    for i, one in enumerate(chosen):
+        print(f"filming {i + 1} of {len(chosen)}: {_caption(env, one, played, named)}", flush=True)
+        tiles.append(_tile(env, one, played, by_name[one.part.name], count, width, named))
+    path = render.write_video(stem, grid(tiles), _FPS)
+    print(f"filmed {path.name}: {len(chosen)} tasks")
+    return path
+
+
+def _caption(env: Tabled, one: Chosen, played: Recording, named: Mapping[str, str]) -> str:
+    row = int(played.rows[one.place])  # continuous ranges have a row for each episode
+    split = named.get(one.split, one.split)
+    return f"{split} {env.describe(row)}, return {float(played.returns[one.place]):.0f}"
+
+
+def _tile(
+    env: Tabled, one: Chosen, played: Recording, states: Any, count: int, width: int, named: Mapping[str, str]
+) -> np.ndarray:
+    """Return the frames (F, height, width, 3) of one task, at most ``count``."""
+    family: Any = one.part.family
+    row = env.own_row(int(played.rows[one.place]))
+    length = int(played.lengths[one.place])
+    times = np.arange(count) / _FPS / family.seconds_per_step
+    steps = np.unique(np.minimum(times.astype(int), length - 1))
+    drawn = render.film(family, row, np.asarray(states.qpos[one.own])[steps], width, width * 3 // 4)
+    frames = drawn[np.searchsorted(steps, np.minimum(times.astype(int), length - 1))]
+    moving = max(int(np.sum(times < length)), 1)
+    return captioned(frames[:moving], _caption(env, one, played, named))
+
+
+def captioned(frames: np.ndarray, text: str) -> np.ndarray:
+    """Write a text into the upper left corner of frames (F, height, width, 3)."""
+    width = frames.shape[2]
+    font = ImageFont.load_default(max(width // 22, 9))
+    strip = Image.new("RGB", (width, max(width // 14, 13)), "black")
+    ImageDraw.Draw(strip).text((3, 1), text, fill="white", font=font)
+    written = frames.copy()
+    written[:, : strip.height] = np.asarray(strip)
+    return written
+
+
+def grid(tiles: Sequence[np.ndarray]) -> np.ndarray:
+    """Return tiles (F, height, width, 3) side by side; a shorter one stands still at its end."""
+    longest = max(map(len, tiles))
+    columns = math.ceil(math.sqrt(len(tiles)))
+    lines = math.ceil(len(tiles) / columns)
+    height, width = tiles[0].shape[1:3]
+    whole = np.zeros((longest, lines * height, columns * width, 3), np.uint8)
+    for i, tile in enumerate(tiles):
+        line, column = divmod(i, columns)
+        rest = np.minimum(np.arange(longest), len(tile) - 1)
+        whole[:, line * height : (line + 1) * height, column * width : (column + 1) * width] = tile[rest]
+    return whole
