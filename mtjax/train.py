@@ -5,7 +5,7 @@ import types
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from mtjax import commands
+from mtjax import commands, flag_files
 from mtjax.names import load
 
 if TYPE_CHECKING:
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 def main(argv: Sequence[str]) -> None:
     """Check names and flags first, then import the training code and run the command line."""
+    argv = flag_files.expand(argv)
     words = commands.import_files(argv)
     commands.check_names(words)
     if len(words) == len(argv):  # else the full parser checks the flags of the user's own classes

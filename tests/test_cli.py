@@ -19,7 +19,7 @@ from probes import OFF_POLICY, one_in
 
 import mtjax.evaluate
 import mtjax.train
-from mtjax import cli, commands
+from mtjax import cli, commands, flag_files
 from mtjax.agents import AGENTS
 from mtjax.agents import settings as settings_of
 from mtjax.agents.choices import CHOICES
@@ -448,3 +448,54 @@ def test_a_family_that_a_cpu_does_not_learn_is_known():
     """Alone and in a mixture."""
     assert wants_gpu("hopper-hop") and not wants_gpu("finger-spin")
     assert wants_gpu("finger-spin+hopper-hop") and not wants_gpu("finger-spin+cheetah-run")
+
+
+# Files of flags.
+
+
+def test_a_file_of_flags_is_a_command_line(tmp_path):
+    """With tables, lists and switches; what the command line says counts more."""
+    file = tmp_path / "x.toml"
+    file.write_text(
+        """
+steps = 5000
+num_envs = 3
+stagger = false
+[env]
+name = "finger-spin"
+vary = { size = [1, 1.1, 1.2], touch-size = "0.1:0.3:2" }
+[agent]
+name = "care"
+num-experts = 3
+hidden = [8, 8]
+actor_lr = 1e-4
+"""
+    )
+    words = "--steps=5000 --num-envs=3 --no-stagger --env=finger-spin --agent=care --agent.num-experts=3".split()
+    words += ["--env.vary.size=1,1.1,1.2", "--env.vary.touch-size=0.1:0.3:2", "--agent.hidden", "8", "8"]
+    assert cli.parse(flag_files.expand([f"--config={file}"])) == cli.parse([*words, "--agent.actor-lr=1e-4"])
+    changed = cli.parse(flag_files.expand(["--config", str(file), "--agent.hidden", "9", "--agent.actor-lr=1"]))
+    assert changed.learner.hidden == (9,) and changed.learner.actor_lr == 1 and changed.plan.steps == 5000
+
+
+@pytest.mark.parametrize(
+    "text, said",
+    [
+        ("steps = ", "cannot be read as TOML"),
+        ("stepps = 5", "did you mean '--steps'?"),
+        ('import = "x.py"', "runs no code; give --import on the command line"),
+        ('resume = "x"', "gives resume"),
+        ("steps = 2020-01-01", "gives steps a value that no flag takes"),
+        ("steps = 1.5", "--steps must be a whole number, not '1.5'"),
+        ('[agent]\nname = "care"\nnum-expert = 3', "did you mean '--agent.num-experts'?"),
+    ],
+)
+def test_wrong_files_of_flags_are_refused(text, said, complaint, tmp_path):
+    """In a line, like a command line."""
+    (tmp_path / "x.toml").write_text(text)
+    assert said in complaint("train", f"--config={tmp_path / 'x.toml'}")
+
+
+def test_a_missing_file_of_flags_is_refused(complaint):
+    """As is one of another kind."""
+    assert "--config needs a TOML file, and 'none.toml' is none" in complaint("train", "--config=none.toml")

@@ -22,7 +22,7 @@ LAYERS = (
     [GROUND],
     [("envs",), ("experience",), ("agents",)],
     [("rollout", "loop", "evaluation")],
-    [("parallel", "commands", "config", "registry")],
+    [("parallel", "commands", "flag_files", "config", "registry")],
     [("training", "report")],
     [("cli",), ("gym",)],
     [("train",), ("evaluate",), ("plot",)],

@@ -322,10 +322,10 @@ def swept(short_family, tmp_path_factory):
     (program,) = sweep.configurations(words, cli.parse)
     real = sweep.launch
 
-    def stop(program, directory, *rest):
+    def stop(program, directory, *rest, **hooks):
         if directory.name == "run-2":
             raise KeyboardInterrupt
-        return real(program, directory, *rest)
+        return real(program, directory, *rest, **hooks)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MTJAX_MEMORY", f"{2.5 * memory.required_bytes(program) / 0.9 / 1e9:.12f}")
@@ -333,6 +333,7 @@ def swept(short_family, tmp_path_factory):
         with pytest.raises(KeyboardInterrupt):
             mtjax.train.main(words)
     (folder,) = root.iterdir()
+    (folder / "sweep.csv").rename(folder / "stopped.csv")
     mtjax.train.main([f"--resume={folder}"])
     return folder
 
@@ -351,13 +352,44 @@ def test_a_sweep_leaves_a_table_of_all_settings(swept):
         returns = file["train"][:, -1]
     for p, row in enumerate(rows[:2]):
         assert float(row["train"]) == pytest.approx(returns[2 * p : 2 * p + 2].mean(), rel=1e-5)
-        assert float(row["train_low"]) <= float(row["train"]) <= float(row["train_high"])
+        assert row["train_low"] == row["train_high"] == ""  # of two seeds
     assert rows[2]["train"] == "" and (swept / "run-2" / "diverged.txt").exists()
     assert (swept / "run-1" / "curve.png").exists()
     header = (swept / "run-1" / "metrics.csv").read_text().splitlines()[0]
     assert header.startswith("seed,actor_lr,iteration,")
     text = sweep.table(sweep.rows(sweep._run_folders(swept)))
     assert "2 of 2 seeds diverged" in text and "highest on training tasks" in text and len(text.splitlines()) == 5
+
+
+def test_the_table_is_there_when_a_sweep_is_stopped(swept):
+    """With what was evaluated until then."""
+    with (swept / "stopped.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(r["steps"], r["train"] != "") for r in rows] == [("200", True), ("200", True), ("0", False)]
+
+
+def test_the_table_grows_with_every_evaluation(swept, tmp_path, monkeypatch):
+    """Also of a run that is not finished."""
+    run = shutil.copytree(swept / "run-1", tmp_path / "run-1")
+    past = load_evaluations(run / "evaluations.npz")
+    config = from_json(run / "config.json")
+    longer = dataclasses.replace(config, plan=dataclasses.replace(config.plan, steps=10_000))
+    (run / "config.json").write_text(to_json(longer, {"command": ""}))
+    assert sweep.final_evaluations(longer, run) is None
+    sweep._write_table(tmp_path, [run])
+    with (tmp_path / "sweep.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [r["steps"] for r in rows] == ["200", "200"]
+    assert float(rows[0]["train"]) == pytest.approx(past.returns["train"][:2, -1].mean(), rel=1e-5)
+    assert {path.name for path in tmp_path.iterdir()} == {"run-1", "sweep.csv"}
+
+
+def test_a_sweeps_folder_is_named_after_all_it_holds():
+    """Or after their number, if they are many."""
+    two = sweep.configurations(["--sweep", "agent=sac,care", "--env=finger-spin"], cli.parse)
+    assert sweep._folder_name(two, "sweep") == "finger-spin-sac+care-sweep"
+    many = [dataclasses.replace(two[0], agent=f"{name}-of-a-long-name") for name in "abcdefgh"]
+    assert sweep._folder_name(many, "sweep") == "finger-spin-8-agents-sweep"
 
 
 def test_a_finished_sweep_has_nothing_left_to_do(swept, capsys):

@@ -7,6 +7,7 @@ in the sweep's folder: ``run-1``, ``run-2`` and so on. A plain run in rounds is 
 
 import dataclasses
 import itertools
+import os
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -28,6 +29,7 @@ from mtjax.types import SPLITS, InputError
 
 Parse = Callable[[Sequence[str]], RunConfig]  # command line -> configuration
 _FIXED = ("seed", "seeds", "runs", "resume", "list", "import", "sweep", "from", "preset")
+_LONGEST = 100  # of a folder's name
 _DIVERGED = "diverged.txt"  # holds the error of a run whose seeds all diverged
 
 
@@ -165,13 +167,23 @@ def run_all(found: Sequence[RunConfig], kind: str) -> None:
     """Make a folder with a run for every program and round, and train them all."""
     limit = memory.available_bytes()
     split = [memory.split_to_fit(config, limit) for config in found]
-    folder = new_directory(Path(found[0].runs), f"{short_name(found[0].env)}-{found[0].agent}-{kind}")
+    folder = new_directory(Path(found[0].runs), _folder_name(found, kind))
     for i, config in enumerate(itertools.chain(*split)):
         (folder / f"run-{i + 1}").mkdir()
         (folder / f"run-{i + 1}" / "config.json").write_text(to_json(config, run_metadata(config)))
     for config, parts in zip(found, split, strict=True):
         print(memory.describe(config, len(parts), limit), flush=True)
     run_unfinished(folder)
+
+
+def _folder_name(found: Sequence[RunConfig], kind: str) -> str:
+    """Return a name with all environments and agents of a sweep, or their numbers if there are many."""
+    envs, agents = (list(dict.fromkeys(x)) for x in ([short_name(c.env) for c in found], [c.agent for c in found]))
+    name = f"{'+'.join(envs)}-{'+'.join(agents)}-{kind}"
+    if len(name) <= _LONGEST:
+        return name
+    told = [x[0] if len(x) == 1 else f"{len(x)}-{what}" for x, what in ((envs, "environments"), (agents, "agents"))]
+    return f"{'-'.join(told)}-{kind}"
 
 
 def _run_folders(folder: Path) -> list[Path]:
@@ -192,17 +204,25 @@ def run_unfinished(folder: Path) -> None:
         label, resume = f"run {i + 1} of {len(runs)}", (run / "checkpoints").is_dir()
         start = None if resume else load_start(config)
         try:
-            if not launch(config, run, start, resume, label).finished:
+            grow = lambda _: _write_table(folder, runs)
+            if not launch(config, run, start, resume, label, on_evaluation=grow).finished:
                 words = shlex.join([f"--resume={folder}", *import_flags(config)])
-                print(f"stopped; the state is saved. Go on with:\n  python -m mtjax.train {words}")
+                print(f"{table(rows(runs))}\nstopped; the state is saved. Go on with:\n  python -m mtjax.train {words}")
                 return
             _draw(config, run)
         except FloatingPointError as error:
             print(f"{label}: {error}", flush=True)
             (run / _DIVERGED).write_text(f"{error}\n")
-        (folder / "sweep.csv").unlink(missing_ok=True)
-        append_rows(folder / "sweep.csv", rows(runs))
+        _write_table(folder, runs)
     print(f"{table(rows(runs))}\nsweep: {folder}")
+
+
+def _write_table(folder: Path, runs: Sequence[Path]) -> None:
+    """Write the table of all settings anew, with the latest evaluations; whoever reads it sees a whole one."""
+    new = folder / "sweep.csv.new"
+    new.unlink(missing_ok=True)
+    append_rows(new, rows(runs))
+    os.replace(new, folder / "sweep.csv")
 
 
 def _draw(config: RunConfig, run: Path) -> None:
@@ -221,25 +241,32 @@ def _draw(config: RunConfig, run: Path) -> None:
 
 def final_evaluations(config: RunConfig, run: Path) -> Evaluations | None:
     """Return the evaluations of a finished run; None if it is not finished."""
+    found = _latest_evaluations(run)
+    return found if found and found.steps[-1] >= config.plan.steps else None
+
+
+def _latest_evaluations(run: Path) -> Evaluations | None:
+    """Return the evaluations of a run; None if it has none yet."""
     if not (run / "evaluations.npz").exists():
         return None
     found = load_evaluations(run / "evaluations.npz")
-    return found if len(found.steps) and found.steps[-1] >= config.plan.steps else None
+    return found if len(found.steps) else None
 
 
 # The table.
 
 
 def rows(runs: Sequence[Path]) -> list[dict[str, Any]]:
-    """Return a row for each setting: its runs, values, diverged seeds, and last evaluation of each split."""
+    """Return a row for each setting: its runs, values, diverged seeds, and last evaluation of each split so far."""
     found: dict[tuple, list[_Part]] = {}
     for run in runs:
         config = from_json(run / "config.json")
-        evaluations, count = final_evaluations(config, run), config.plan.seeds
+        evaluations, count = _latest_evaluations(run), config.plan.seeds
         for p, point in enumerate(config.points or ({},)):
             mine = slice(p * count, (p + 1) * count)
             returns = evaluations and {split: x[mine, -1] for split, x in evaluations.returns.items() if x.size}
-            part = _Part(run.name, p, count, (run / _DIVERGED).exists(), returns)
+            steps = int(evaluations.steps[-1]) if evaluations else 0
+            part = _Part(run.name, p, count, (run / _DIVERGED).exists(), returns, steps)
             found.setdefault(tuple(_values(config, point).items()), []).append(part)
     made = [_row(dict(values), parts) for values, parts in found.items()]
     columns = dict.fromkeys(name for row in made for name in row)
@@ -254,11 +281,12 @@ class _Part(NamedTuple):
     seeds: int
     diverged: bool
     returns: dict[str, np.ndarray] | None  # split -> (S, T, episodes) of the last evaluation
+    steps: int  # of the last evaluation
 
 
 def _row(values: dict[str, str], parts: list[_Part]) -> dict[str, Any]:
     row = {"run": " ".join(part.run for part in parts), "number": parts[0].number, **values}
-    row["seeds"] = sum(part.seeds for part in parts)
+    row |= {"seeds": sum(part.seeds for part in parts), "steps": min(part.steps for part in parts)}
     known = [part.returns for part in parts if part.returns is not None]
     lost = sum(part.seeds for part in parts if part.diverged)
     if lost:

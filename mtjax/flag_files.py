@@ -1,0 +1,73 @@
+"""Flags of a command line from a TOML file: ``--config=FILE.toml``."""
+
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from mtjax.names import InputError
+
+_LEFT_OUT = {
+    "import": "a file of settings runs no code; give --import on the command line",
+    "resume": "--resume goes on with a run as it was",
+    "config": "a file of settings names no other",
+}
+
+
+def expand(argv: Sequence[str]) -> list[str]:
+    """Put the flags of every --config=FILE.toml before the other words of a command line, which override them.
+
+    A key is a flag without its dashes. Tables hold those with a dot: ``num-experts`` in the table ``agent`` is
+    ``--agent.num-experts``. ``name`` in the tables ``env`` and ``agent`` is ``--env`` and ``--agent``.
+
+    Raises:
+        InputError: there is no such file, or it cannot be read.
+    """
+    given, rest, words = [], [], iter(argv)
+    for word in words:
+        flag, equals, value = word.partition("=")
+        if flag == "--config":
+            given += _read(value if equals else next(words, ""))
+        else:
+            rest.append(word)
+    return [*given, *rest]
+
+
+def _read(file: str) -> list[str]:
+    path = Path(file)
+    if path.suffix != ".toml" or not path.is_file():
+        raise InputError(f"--config needs a TOML file, and {file!r} is none")
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{file!r} cannot be read as TOML: {error}") from None
+    words = []
+    for flag, value in _flat(table):
+        if flag in _LEFT_OUT:
+            raise InputError(f"{file!r} gives {flag}: {_LEFT_OUT[flag]}")
+        words += _words(flag, value, file)
+    return words
+
+
+def _flat(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield every flag, without dashes, and its value."""
+    for key, value in table.items():
+        name = prefix[:-1] if prefix in ("env.", "agent.") and key == "name" else f"{prefix}{key}".replace("_", "-")
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{name}.")
+        else:
+            yield name, value
+
+
+def _words(flag: str, value: Any, file: str) -> list[str]:
+    match value:
+        case bool():
+            group, dot, name = flag.rpartition(".")
+            return [f"--{flag}" if value else f"--{group}{dot}no-{name}"]
+        case list() if flag.startswith("env.vary."):
+            return [f"--{flag}={','.join(map(str, value))}"]
+        case list():
+            return [f"--{flag}", *map(str, value)]
+        case str() | int() | float():
+            return [f"--{flag}={value}"]
+    raise InputError(f"{file!r} gives {flag} a value that no flag takes: {value!r}")
