@@ -17,6 +17,7 @@ _HOME = {
     "Task": "mtjax.types",
     "Transition": "mtjax.types",
     "agent": "mtjax.agents",
+    "export": "mtjax.training.export",
     "load": "mtjax.training.policy",
     "make": "mtjax.envs",
     "mixture": "mtjax.envs",

@@ -34,6 +34,9 @@ class Request:
     """Numbers of the tasks to film in each split, counted from 0; by default the first, the middle and the last."""
     video_seconds: float = 10.0
     """Seconds of an episode to film."""
+    export: str = ""
+    """File that ends with .npz: write the first seed's policy into it, for ``mtjax/standalone.py``, which reads it with
+    NumPy or JAX alone."""
     diagnostics: bool = False
     """Measure conflicts between the tasks' gradients, and unused units of the networks, from the run's replay."""
 

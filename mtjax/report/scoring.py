@@ -14,6 +14,7 @@ from mtjax.envs import Family
 from mtjax.evaluation import evaluate
 from mtjax.report import diagnostics, figures, films
 from mtjax.report.tables import task_table
+from mtjax.training.export import export
 from mtjax.training.log import append_rows, number
 from mtjax.training.policy import Policy, load, load_experience
 from mtjax.training.programs import compile_lowered, enable_compile_cache, trace
@@ -35,6 +36,8 @@ def report(request: Any, vary: Mapping[str, str]) -> None:
     policy = load(run, first, request.checkpoint)
     if request.video:
         films.require(policy.env)
+    if request.export:
+        print(f"exported to {export(policy, request.export)}", flush=True)
     found = diagnostics.diagnose(policy, *load_experience(run, first)) if request.diagnostics else None
     named = {"train": "given"} if vary else {}
     if vary:

@@ -1,0 +1,130 @@
+"""Policies in one file: by NumPy and by JAX alone, they act as the policy does on every task."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from probes import slow_but, tiny
+
+import mtjax
+import mtjax.evaluate
+from mtjax import agents, standalone
+from mtjax.training.export import require_file, steps_of
+from mtjax.training.policy import Policy
+from mtjax.types import InputError
+
+ENV = mtjax.make("finger-spin", vary={"size": "1:1.2:3"})
+
+
+def policy_of(agent, env=ENV):
+    """A policy that has not learned, with moments of observations that are not those at the start."""
+    state = jax.jit(lambda key: agent.init(env.spec, env.tasks(), key))(jax.random.key(0))
+    if hasattr(state, "moments"):
+        random = np.random.default_rng(3)
+        shift = lambda x: jnp.asarray(np.float32(random.uniform(0.5, 2.0, x.shape)))
+        state = state._replace(moments=jax.tree.map(shift, state.moments))
+    return Policy(env, agent, state, None, jnp.arange(1))
+
+
+def observations(count, env=ENV):
+    return np.float32(np.random.default_rng(0).normal(size=(count, env.spec.obs_size)))
+
+
+CASES = {name: {} for name in agents.AGENTS} | {
+    "care": {"normalize_observations": True},
+    "input-map": {"encoder": "input-map", "conditioning": "parameters"},
+    "hypernetwork": {"encoder": "hypernetwork", "conditioning": "parameters"},
+    "one-hot": {"conditioning": "one-hot"},
+}
+
+
+@pytest.mark.parametrize("name", slow_but(CASES, "care"))
+def test_both_forms_act_as_the_policy(name, tmp_path):
+    """On tasks that trained and on others, whose context and nearest task are found inside."""
+    given = CASES[name]
+    policy = policy_of(tiny(name if name in agents.AGENTS else "sac", **given))
+    file = mtjax.export(policy, tmp_path / "policy.npz")
+    by_numpy, by_jax = standalone.load(file), standalone.load_jax(file)
+    tasks, obs = ENV.tasks("all"), observations(len(ENV.tasks("all").id))
+    expected = np.asarray(jax.jit(jax.vmap(policy))(obs, tasks))
+    sizes = np.asarray(tasks.params["size"])
+    np.testing.assert_allclose(by_jax(obs, sizes[:, None]), expected, atol=2e-5)
+    found = np.stack([by_numpy(x, size=float(size)) for x, size in zip(obs, sizes, strict=True)])
+    np.testing.assert_allclose(found, expected, atol=2e-5)
+    assert np.ptp(expected, axis=0).max() > 1e-3
+
+
+def test_angles_of_goals_are_points_on_the_circle(tmp_path):
+    """As in the context that networks learned from."""
+    env = mtjax.make("finger-turn-vary-target")
+    policy = policy_of(tiny("sac-conditioned"), env)
+    by_numpy = standalone.load(mtjax.export(policy, tmp_path / "x.npz"))
+    tasks, obs = env.tasks("extrapolation"), observations(4, env)
+    for i in range(len(tasks.id)):
+        task = jax.tree.map(lambda x, i=i: x[i], tasks)
+        action = by_numpy(obs[i], target_angle=float(task.params["target-angle"]))
+        np.testing.assert_allclose(action, policy(obs[i], task), atol=2e-5)
+
+
+def test_the_reader_needs_numpy_alone(tmp_path):
+    """Copied elsewhere, in a process that cannot import JAX or this package."""
+    policy = policy_of(tiny("sac-conditioned"))
+    file = mtjax.export(policy, tmp_path / "policy.npz")
+    source = Path(standalone.__file__).read_text()
+    (tmp_path / "reader.py").write_text(source)
+    script = (
+        "import sys; sys.modules['jax'] = sys.modules['mtjax'] = None\n"
+        "import numpy as np, reader\n"
+        f"policy = reader.load({str(file)!r})\n"
+        "print(*policy(np.ones(9), size=1.1).tolist()); print(policy)"
+    )
+    done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=True)
+    action, told = done.stdout.splitlines()
+    task = jax.tree.map(lambda x: x[1], ENV.tasks())
+    np.testing.assert_allclose(np.float32(action.split()), policy(np.ones(9, np.float32), task), atol=2e-5)
+    assert told == "Policy(sac-conditioned on finger-spin: observation (9,), action (2,), parameters ['size'])"
+    top = [node for node in ast.parse(source).body if isinstance(node, ast.Import | ast.ImportFrom)]
+    assert {getattr(node, "module", None) or node.names[0].name for node in top} == {
+        "json", "collections.abc", "typing", "numpy"
+    }  # fmt: skip
+
+
+def test_what_the_reader_is_given_is_checked(tmp_path):
+    """In the words of the file."""
+    policy = standalone.load(mtjax.export(policy_of(tiny("sac-conditioned")), tmp_path / "x.npz"))
+    with pytest.raises(ValueError, match=r"give the task's parameters \['size'\], not \['mass'\]"):
+        policy(np.zeros(9), mass=1.0)
+    with pytest.raises(ValueError, match=r"shape \(9,\), not \(3,\)"):
+        policy(np.zeros(3), size=1.0)
+
+
+def test_what_cannot_be_exported_is_refused(tmp_path):
+    """In a line, and nothing is overwritten."""
+    (tmp_path / "x.npz").touch()
+    for file, said in ((tmp_path / "x.npz", "exists already"), (tmp_path / "x.pt", "ends with .npz"), (3, "a path")):
+        with pytest.raises(InputError, match=said):
+            require_file(file)
+    with pytest.raises(InputError, match="export takes a policy"):
+        mtjax.export(3, tmp_path / "y.npz")
+    with pytest.raises(InputError, match="infers its task from memory"):
+        mtjax.export(policy_of(tiny("sac", conditioning="inferred")), tmp_path / "y.npz")
+    with pytest.raises(InputError, match="knows no operation 'sort'"):
+        steps_of(jax.make_jaxpr(jnp.sort)(jnp.zeros(3)))
+    assert [path.name for path in tmp_path.iterdir()] == ["x.npz"]
+
+
+@pytest.mark.slow
+def test_the_command_exports_a_run(copied_run, tmp_path, capsys):
+    """Beside its scores."""
+    file = tmp_path / "policy.npz"
+    mtjax.evaluate.main([f"--run={copied_run}", "--episodes=1", f"--export={file}"])
+    assert f"exported to {file}" in capsys.readouterr().out
+    policy = mtjax.load(copied_run)
+    task = jax.tree.map(lambda x: x[0], policy.env.tasks())
+    obs = np.ones(9, np.float32)
+    np.testing.assert_allclose(standalone.load(file)(obs, size=1.0), policy(obs, task), atol=2e-5)
