@@ -103,6 +103,6 @@ def test_console_draws_a_bar_on_a_terminal(monkeypatch):
     console.progress(2000, 4.0, 512.3, np.array([[30.0]]))
     console.close()
     text = terminal.getvalue()
-    assert "a [line] with brackets\n" in text and "2,000 of 2,000 steps" in text and "━" in text
-    assert "evaluated: train 7" in text
+    assert "a [line] with brackets\n" in text and "2,000 of 2,000  " in text and "━" in text
+    assert "evaluated train 7" in text
     assert text.count("\x1b[?25l") == text.count("\x1b[?25h") == 1

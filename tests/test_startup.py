@@ -75,6 +75,9 @@ def ours(monkeypatch):
         ("mtjax.evaluate", ["--runs=x"], 2, "did you mean '--run'?"),
         ("mtjax.evaluate", ["--run=x", "--episodes=some"], 2, "some"),
         ("mtjax.evaluate", [], 2, "say which run to evaluate"),
+        ("mtjax.evaluate", ["--run=x", "--video-tasks=1"], 2, "give --video as well"),
+        ("mtjax.plot", ["--help"], 0, "--figure"),
+        ("mtjax.plot", ["x", "--figure=curve"], 2, "did you mean 'curves'?"),
     ],
 )
 def test_names_are_answered_without_jax(tmp_path, module, words, code, said):
@@ -91,7 +94,7 @@ def test_a_run_of_the_c_engine_imports_no_other(tmp_path):
     )
     words = ["--env=finger-spin", "--engine=c", *small.split(), "--agent.hidden=8", f"--runs={tmp_path}"]
     code, output, imported = run("mtjax.train", words, (*ENGINES, "mujoco"), tmp_path)
-    assert code == 0 and "trained in" in output
+    assert code == 0 and "done in" in output
     assert imported == ["mujoco"]
 
 

@@ -74,9 +74,10 @@ def return_by_parameter(runs: Any = "runs/*", ax: "Axes | None" = None) -> "Axes
         values = np.concatenate([one.values[split] for split in splits])
         scores = np.concatenate([one.final(split) for split in splits], axis=1)
         order = np.argsort(values)
-        colour = figures.draw_line(axes, values[order], scores[:, order], _label(one), index)
-        trained = one.values["train"]
-        axes.plot(trained, one.final().mean(axis=0), "o", color=colour, markersize=5)
+        colour = figures.draw_line(axes, values[order], scores[:, order], _label(one), index, marker="")
+        for split in splits:
+            filled = {"markerfacecolor": colour if split == "train" else "white", "color": colour, "markersize": 5}
+            axes.plot(one.values[split], one.final(split).mean(axis=0), "o", **filled)
     trained = found[0].values["train"]
     axes.axvspan(float(np.min(trained)), float(np.max(trained)), color="0.95", zorder=0)
     axes.set_xlabel(figures.axis_label(*found[0].axis))
@@ -90,7 +91,7 @@ def iqm(runs: Any = "runs/*", split: str = "train", ax: "Axes | None" = None) ->
     axes = ax if ax is not None else figures.new_axes()
     for index, (agent, x) in enumerate(scores.items()):
         mean, low, high = seed_interval(x, iqm_of)
-        bars = figures.bars_of(np.array([mean]), np.array([low]), np.array([high]))
+        bars = figures.bars_of(*np.array([[mean], [low], [high]]))
         axes.errorbar([mean], [index], xerr=bars, fmt="o", color=figures.colour(index), capsize=4, label=agent)
     _name_rows(axes, list(scores))
     axes.set_xlabel(f"interquartile mean of returns, {split}")
@@ -132,8 +133,8 @@ def improvement(
     axes = ax if ax is not None else figures.new_axes()
     for index, agent in enumerate(others):
         mean, low, high = probability_of_improvement(scores[agent], scores[first])
-        bars = figures.bars_of(np.array([mean]), np.array([low]), np.array([high]))
-        axes.errorbar([mean], [index], xerr=bars, fmt="o", color=figures.colour(index), capsize=4, label=agent)
+        bars, colour = figures.bars_of(*np.array([[mean], [low], [high]])), figures.colour(list(scores).index(agent))
+        axes.errorbar([mean], [index], xerr=bars, fmt="o", color=colour, capsize=4, label=agent)
     axes.axvline(0.5, color="0.6", linewidth=1)
     axes.set_xlim(0, 1)
     _name_rows(axes, others)

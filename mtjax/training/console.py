@@ -47,7 +47,7 @@ class Console:
             return
         from rich.progress import BarColumn, Progress, TextColumn
 
-        self.bar = Progress(BarColumn(16), TextColumn("{task.description}"), transient=False)
+        self.bar = Progress(BarColumn(8), TextColumn("{task.description}"), transient=False)
         self.task = self.bar.add_task("compiling", total=total_steps)
         self.bar.start()
 
@@ -74,22 +74,21 @@ class Console:
         """
         if self.quiet:
             return
-        left = "" if self.clock.left is None else f", {duration(self.clock.left)} left"
-        text = (
-            f"{self.label}{steps:,} of {self.total:,} steps  {duration(seconds)}{left}  {rate:,.0f} steps/s  "
-            f"{describe_returns(returns) or running or 'no episode has ended'}"
-        )
-        if self.bar is not None:
-            self.bar.update(self.task, completed=steps, description=f"{text}{self.evaluated}")
+        left = "" if self.clock.left is None else f"{duration(self.clock.left)} left"
+        told = describe_returns(returns) or running or "no episode has ended"
+        if self.bar is not None:  # whose end a narrow terminal cuts off
+            text = f"{self.label}{steps:,} of {self.total:,}  {left}  {rate:,.0f} steps/s  {told}{self.evaluated}"
+            self.bar.update(self.task, completed=steps, description=text)
         else:
-            self.say(text)
+            when = f"{duration(seconds)}{', ' * bool(left)}{left}"
+            self.say(f"{self.label}{steps:,} of {self.total:,} steps  {when}  {rate:,.0f} steps/s  {told}")
 
     def evaluation(self, steps: int, returns: Mapping[str, np.ndarray]) -> None:
         """Show an evaluation's mean return and worst task by split. ``returns`` are (S, T, episodes) by split."""
         told = ", ".join(_of_split(split, x) for split, x in returns.items() if x.size)
         self.say(f"{self.label}evaluation at {steps:,} steps: {told}")
-        means = "  ".join(f"{split} {x.mean():.0f}" for split, x in returns.items() if x.size)
-        self.evaluated = f"  evaluated: {means}"
+        means = ", ".join(f"{split} {x.mean():.0f}" for split, x in returns.items() if x.size)
+        self.evaluated = f"  evaluated {means}"
 
     def close(self) -> None:
         """Stop the bar."""
