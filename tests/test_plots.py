@@ -202,6 +202,25 @@ def test_a_result_is_a_table(make_run):
         result.frame("metric")
 
 
+def test_results_are_drawn_like_runs(make_run):
+    """Under names of one's own; every point of a sweep is a line."""
+    from mtjax.evaluation import load_evaluations
+    from mtjax.training.result import Result
+
+    folder = make_run("x", "finger-spin-vary-size", "sac", seeds=4)
+    evaluations, env = load_evaluations(folder / "evaluations.npz"), mtjax.make("finger-spin-vary-size")
+    points = ({"actor_lr": 0.1}, {"actor_lr": 0.01})
+    given = {"env": env, "agent": mtjax.agent("sac"), "seeds": (0, 1)}
+    swept = Result(None, evaluations, [], 0.0, 0.0, True, None, points, **given)
+    axes = report.learning_curves({"mine": swept, "theirs": folder})
+    names = ["mine, actor-lr 0.1 (2 seeds)", "mine, actor-lr 0.01 (2 seeds)", "theirs (4 seeds)"]
+    assert axes.get_legend_handles_labels()[1] == names
+    np.testing.assert_allclose(
+        axes.lines[1].get_ydata(), evaluations.returns["train"][2:].mean(axis=(0, 2, 3)), rtol=1e-5
+    )
+    assert report.learning_curves(swept).get_title() == "finger-spin-vary-size"
+
+
 def test_a_sweep_is_read_with_its_runs(make_run, tmp_path):
     """Its folder stands for them, and settings between programs are columns."""
     for k, critics in enumerate((2, 3)):

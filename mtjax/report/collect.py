@@ -8,9 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mtjax.agents import settings
+from mtjax.agents import name_of, settings
 from mtjax.checks import path
 from mtjax.config import RunConfig, from_json
+from mtjax.envs import name_of as env_name_of
 from mtjax.evaluation import Evaluations, load_evaluations
 from mtjax.names import InputError
 
@@ -76,8 +77,13 @@ def learned(runs: Any) -> list[Learned]:
     """Return what was learned in runs: seeds of equal settings together, others apart under names that differ.
 
     Args:
-        runs: patterns or folders as for ``read``, or a list of ``Learned`` already.
+        runs: patterns or folders as for ``read``, a result of ``mtjax.train``, any of these by name in a mapping, or a
+            list of ``Learned`` already.
     """
+    if isinstance(runs, Mapping):
+        return [_renamed(one, str(name)) for name, run in runs.items() for one in learned(run)]
+    if hasattr(runs, "evaluations"):
+        return _of_result(runs)
     if isinstance(runs, Sequence) and runs and all(isinstance(x, Learned) for x in runs):
         return list(runs)
     apart = [one for found in read(runs) for one in _points(found)]
@@ -86,6 +92,23 @@ def learned(runs: Any) -> list[Learned]:
         groups.setdefault(repr(key), []).append((config_settings, one))
     joined = [(group[0][0], _join([one for _, one in group])) for group in groups.values()]
     return _named(joined)
+
+
+def _renamed(one: Learned, name: str) -> Learned:
+    """Return what an agent learned under another name; the settings that tell it from others stay."""
+    _, comma, told = one.agent.partition(", ")
+    return one._replace(agent=f"{name}{comma}{told}")
+
+
+def _of_result(result: Any) -> list[Learned]:
+    """Return what was learned at every point of a result of ``mtjax.train``."""
+    found, count, env = result.evaluations, len(result.seeds), result.env
+    made = []
+    for p, point in enumerate(result.points or ({},)):
+        name = ", ".join([name_of(result.agent), *(f"{k.replace('_', '-')} {_short(x)}" for k, x in point.items())])
+        returns = {split: x[p * count : (p + 1) * count] for split, x in found.returns.items()}
+        made.append(Learned(env_name_of(env), name, found.steps, returns, found.values, env.task_axis, result.seeds))
+    return made
 
 
 def _points(found: Found) -> Iterable[tuple[Any, dict[str, Any], Learned]]:

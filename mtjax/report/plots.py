@@ -1,7 +1,7 @@
 """Figures over several runs. Each function draws on Matplotlib axes and returns them.
 
-They take folders of runs, patterns such as "runs/*", or ``collect.learned``'s list. Bands and bars are 95 % intervals
-over whole seeds; fewer than three seeds have none. ``save`` writes PNG, PDF or SVG, by the file's ending.
+They take folders of runs, patterns such as "runs/*", or results of ``mtjax.train`` by name. Bands and bars are 95 %
+intervals over whole seeds; fewer than three seeds have none. ``save`` writes PNG, PDF or SVG, by the file's ending.
 """
 
 import math
