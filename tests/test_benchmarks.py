@@ -27,7 +27,7 @@ def script(monkeypatch):
         return module
 
     yield load
-    for name in ("report", "training", "returns"):
+    for name in ("report", "training", "returns", "update_cost"):
         sys.modules.pop(name, None)
 
 
@@ -127,3 +127,10 @@ def test_points_are_ranked_by_the_end_of_their_runs(script, tmp_path):
     presets.tabulate(tmp_path / "family")
     table = (tmp_path / "family.md").read_text().splitlines()
     assert "tau=0.02" in table[2] and "tau=0.01" in table[3]
+
+
+def test_time_that_two_operations_share_counts_once(script):
+    """Operations of two streams: from 0 to 2, inside it from 1 to 1.5, from 1.5 to 3, and from 5 to 6."""
+    kernels = script("kernels")
+    operations = [kernels.Operation("x", *times) for times in ((0, 2), (1, 0.5), (1.5, 1.5), (5, 1))]
+    assert kernels.busy_seconds(operations) == 4
