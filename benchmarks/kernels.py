@@ -15,7 +15,7 @@ import argparse
 import re
 import tempfile
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -136,7 +136,7 @@ def count_flops(name: str, arguments: argparse.Namespace) -> float:
 
 def slowest(operations: list[Operation], arguments: argparse.Namespace) -> str:
     """Return a table of the kinds of operations that take longest; numbers at the ends of names are left out."""
-    times, counts = Counter(), Counter()
+    times, counts = defaultdict(float), Counter()
     for each in operations:
         kind = re.sub(r"[._]\d+", "", each.name)[:70]
         times[kind] += each.seconds
@@ -144,7 +144,7 @@ def slowest(operations: list[Operation], arguments: argparse.Namespace) -> str:
     total = sum(times.values())
     lines = [
         [kind, f"{counts[kind] / arguments.updates:.1f}", f"{1e3 * x / arguments.updates:.4f}", f"{x / total:.0%}"]
-        for kind, x in times.most_common(arguments.top)
+        for kind, x in sorted(times.items(), key=lambda item: -item[1])[: arguments.top]
     ]
     return markdown(["operation", "an update", "ms an update", "share"], lines)
 
