@@ -1,12 +1,14 @@
 """Measure how well and how fast agents learn: every agent on every family, many seeds in one program each.
 
-    python benchmarks/learning.py [--envs NAME ...] [--agents NAME ...] [--seeds 10] [--steps N] [--split hip-bmdp]
+    python benchmarks/learning.py [--envs NAME ...] [--agents NAME ...] [--seeds 10] [--steps N] [--split NAME]
                                   [--baseline NAME] [--out DIR]
 
-Every pair of family and agent writes ``DIR/ENV/AGENT.csv`` (training returns over steps and seconds, one line per chunk
-and seed) and ``AGENT.npz`` (every episode of every evaluation). Finished pairs are not run again, so several processes
-can make a long table in parts. All results in DIR together give ``table.md``, ``differences.md``, ``evaluations.csv``
-and a figure for each family. ``--agents`` without a name runs nothing and only makes these.
+Without further flags it is the whole table: every agent on six families with its preset, on the splits and for the
+steps of ``FAMILIES``. Every pair of family and agent writes ``DIR/ENV/AGENT.csv`` (training returns over steps and
+seconds, one line per chunk and seed) and ``AGENT.npz`` (every episode of every evaluation). Finished pairs are not run
+again, so several processes can make a long table in parts. All results in DIR together give ``table.md``,
+``differences.md``, ``conflicts.md`` (cosines between the tasks' gradients, of the agents that log them),
+``evaluations.csv`` and a figure for each family. ``--agents`` without a name runs nothing and only makes these.
 
 Scores are interquartile means over seeds and tasks of the last evaluation (never the best one) under the mean action,
 with 95% bootstrap intervals over whole seeds. "s to 900" is the seconds of training, without compiling and evaluating,
@@ -20,12 +22,14 @@ import csv
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from report import markdown
 
 import mtjax
 from mtjax.evaluation import load_evaluations, save_evaluations
+from mtjax.experience.replay import Replay
 from mtjax.report import figures as plot
 from mtjax.report.stats import (
     Interval,
@@ -40,24 +44,37 @@ from mtjax.training.programs import enable_compile_cache
 from mtjax.training.run import Result
 from mtjax.types import SPLITS, InputError
 
-FAMILIES = (
-    "finger-spin-vary-size",
-    "cheetah-run-vary-torso-length",
-    "walker-walk-vary-friction",
-    "walker-walk-vary-foot-length",
-)
+
+class Trial(NamedTuple):
+    """Holds a family's split and the steps of each seed, by the kind of experience; None is the preset's."""
+
+    split: str | None = None
+    replay_steps: int | None = None
+    rollout_steps: int | None = None
+
+
+# Ten seeds of four tasks then train for about half a minute on an H200. On-policy steps cost less, so there are more.
+FAMILIES = {
+    "finger-spin-vary-size": Trial("hip-bmdp", 4_000_000, 20_000_000),
+    "cheetah-run-vary-torso-length": Trial("hip-bmdp", 1_000_000, 20_000_000),
+    "walker-run-vary-friction": Trial("hip-bmdp", 1_000_000, 5_000_000),
+    "cartpole-swingup-vary-pole-mass": Trial("hip-bmdp", 1_000_000, 20_000_000),
+    "cheetah-vary-direction": Trial(None, 500_000, 10_000_000),
+    "reacher-vary-goal": Trial(None, 1_000_000, 20_000_000),
+}
 _KEPT = ("seed", "steps", "seconds", "wall_seconds", "return")
+_CONFLICTS = ("critic_cosine", "critic_conflict", "actor_cosine", "actor_conflict")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--envs", nargs="*", default=FAMILIES, metavar="NAME")
+    parser.add_argument("--envs", nargs="*", default=list(FAMILIES), metavar="NAME")
     parser.add_argument("--agents", nargs="*", default=list(mtjax.AGENTS), choices=list(mtjax.AGENTS), metavar="NAME")
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--steps", type=int, help="by default the preset's")
+    parser.add_argument("--steps", type=int, help="by default those of FAMILIES, else the preset's")
     parser.add_argument("--preset", default="auto")
-    parser.add_argument("--split", help="by default the family's")
+    parser.add_argument("--split", help="by default that of FAMILIES, else the family's")
     parser.add_argument("--evaluations", type=int, default=4)
     parser.add_argument("--eval-episodes", type=int, default=10)
     parser.add_argument("--vary", nargs="*", default=[], metavar="NAME=VALUES", help="besides what the family varies")
@@ -77,10 +94,12 @@ def main() -> None:
 def learn(arguments: argparse.Namespace, env: str, agent: str) -> None:
     """Train one agent on one family with its preset, and save the run."""
     print(f"{agent} on {env}", flush=True)
-    settings = {"vary": dict(pair.split("=", 1) for pair in arguments.vary)}
-    settings |= {"split": arguments.split} if arguments.split else {}
+    trial = FAMILIES.get(env, Trial())
+    split = arguments.split or trial.split
+    settings = {"vary": dict(pair.split("=", 1) for pair in arguments.vary)} | ({"split": split} if split else {})
     program = mtjax.preset(env, agent, arguments.preset, **settings)
-    steps = arguments.steps or program.plan.steps
+    given = trial.replay_steps if isinstance(program.learner.experience, Replay) else trial.rollout_steps
+    steps = arguments.steps or given or program.plan.steps
     training = {name: int(value) for name, value in (pair.split("=", 1) for pair in arguments.training)}
     result = mtjax.train(
         program.family,
@@ -102,8 +121,9 @@ def learn(arguments: argparse.Namespace, env: str, agent: str) -> None:
 def save(folder: Path, agent: str, result: Result) -> None:
     """Save one run. The evaluations come last, because they mark it as complete."""
     folder.mkdir(parents=True, exist_ok=True)
+    kept = [name for name in (*_KEPT, *_CONFLICTS) if name in result.rows[-1]]
     (folder / f"{agent}.csv").unlink(missing_ok=True)
-    append_rows(folder / f"{agent}.csv", [{name: row[name] for name in _KEPT} for row in result.rows])
+    append_rows(folder / f"{agent}.csv", [{name: row[name] for name in kept} for row in result.rows])
     save_evaluations(folder / f"{agent}.npz", result.evaluations)
 
 
@@ -128,6 +148,8 @@ def tabulate(out: Path, mark: float, baseline: str) -> None:
     (out / "table.md").write_text(table + "\n")
     head = ["family", "agent", "split", f"IQM less {baseline}'s, seeds in pairs", "seeds not in pairs"]
     (out / "differences.md").write_text(markdown([*head, "probability of improvement"], differences) + "\n")
+    head = ["family", "agent", *(name.replace("_", " ") for name in _CONFLICTS)]
+    (out / "conflicts.md").write_text(markdown(head, conflict_rows(out)) + "\n")
     (out / "evaluations.csv").unlink(missing_ok=True)
     append_rows(out / "evaluations.csv", rows)
     print(table)
@@ -167,6 +189,17 @@ def difference_rows(env: str, found: dict[str, dict[str, np.ndarray]], baseline:
             paired = _cell(paired_difference(*pair, iqm), "+.1f") if len(pair[0]) == len(pair[1]) else "-"
             improvement = _cell(probability_of_improvement(*pair), ".2f")
             lines.append([env, agent, split, paired, _cell(unpaired_difference(*pair, iqm), "+.1f"), improvement])
+    return lines
+
+
+def conflict_rows(out: Path) -> list[list[str]]:
+    """Return the mean cosine and share of conflicting pairs of every agent that logs them, over its run and seeds."""
+    lines = []
+    for path in sorted(out.glob("*/*.csv")):
+        with path.open(newline="") as file:
+            rows = [line for line in csv.DictReader(file) if line.get(_CONFLICTS[0])]
+        means = [np.nanmean([float(line[name]) for line in rows]) for name in _CONFLICTS] if rows else []
+        lines += [[path.parent.name, path.stem, *(f"{x:.2f}" for x in means)]] if rows else []
     return lines
 
 

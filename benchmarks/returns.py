@@ -1,6 +1,6 @@
 """Measure which returns agents reach on families of dm_control within minutes of training on one GPU.
 
-    python benchmarks/returns.py [--family=NAME] ... [--agent=ppo] [--steps=N] [--seeds=3] [NAME=VALUE ...]
+    python benchmarks/returns.py [--family=NAME] ... [--agent=NAME] [--steps=N] [--seeds=3] [NAME=VALUE ...]
 
 Every family is trained in one program with all seeds, and writes ``OUT/NAME.csv`` (one line of metrics per chunk and
 seed), ``NAME.npz`` (every episode of every evaluation) and ``NAME.json`` (the row of the table below). A family with a
@@ -37,25 +37,26 @@ _GEAR = {"gear": "0.8:1.2:10"}
 
 
 class Aim(NamedTuple):
-    """Holds a family's parameters, the steps of each seed and the return that is aimed at."""
+    """Holds a family's parameters, its agent, the steps of each seed and the return that is aimed at."""
 
     vary: dict[str, str]
+    agent: str
     steps: int
     least: float
 
 
 FAMILIES = {
-    "finger-spin-vary-size": Aim({}, 100_000_000, 960),
-    "cheetah-run-vary-torso-length": Aim({}, 150_000_000, 890),
-    "cartpole-swingup-vary-pole-mass": Aim({}, 100_000_000, 850),
-    "walker-walk-vary-friction": Aim({}, 45_000_000, 970),
-    "walker-run-vary-friction": Aim({}, 75_000_000, 800),
-    "hopper-hop": Aim(_GEAR, 100_000_000, 250),
-    "acrobot-swingup": Aim(_GEAR, 100_000_000, 350),
-    "reacher-hard": Aim(_GEAR, 100_000_000, 960),
-    "finger-turn-hard": Aim(_GEAR, 100_000_000, 900),
-    "ball-in-cup-catch": Aim(_GEAR, 30_000_000, 970),
-    "pendulum-swingup": Aim(_GEAR, 60_000_000, 800),
+    "finger-spin-vary-size": Aim({}, "ppo", 100_000_000, 960),
+    "cheetah-run-vary-torso-length": Aim({}, "ppo", 150_000_000, 890),
+    "cartpole-swingup-vary-pole-mass": Aim({}, "ppo", 100_000_000, 850),
+    "walker-walk-vary-friction": Aim({}, "ppo", 45_000_000, 970),
+    "walker-run-vary-friction": Aim({}, "brc", 4_300_000, 800),
+    "hopper-hop": Aim(_GEAR, "brc", 5_000_000, 250),
+    "acrobot-swingup": Aim(_GEAR, "brc", 8_000_000, 350),
+    "reacher-hard": Aim(_GEAR, "ppo", 60_000_000, 960),
+    "finger-turn-hard": Aim(_GEAR, "ppo", 180_000_000, 900),
+    "ball-in-cup-catch": Aim(_GEAR, "brc", 1_600_000, 970),
+    "pendulum-swingup": Aim(_GEAR, "brc", 5_200_000, 800),
 }
 _SHOWN = ("kl", "clip_fraction", "entropy", "explained_variance")
 
@@ -63,7 +64,7 @@ _SHOWN = ("kl", "clip_fraction", "entropy", "explained_variance")
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--family", action="append", choices=list(FAMILIES), metavar="NAME", help="by default all")
-    parser.add_argument("--agent", default="ppo")
+    parser.add_argument("--agent", help="by default the family's, of the table above")
     parser.add_argument("--preset", default="gpu")
     parser.add_argument("--engine", default="auto", help="of the physics; auto is the family's own choice for a GPU")
     parser.add_argument("--steps", type=lambda x: int(float(x)), help="of each seed; by default the family's")
@@ -71,7 +72,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--evaluations", type=int, default=4)
     parser.add_argument("--eval-episodes", type=int, default=10)
-    parser.add_argument("--out", type=Path, default=Path("runs") / "ppo")
+    parser.add_argument("--out", type=Path, default=Path("runs") / "returns")
     parser.add_argument("given", nargs="*", metavar="NAME=VALUE")
     arguments = parser.parse_args()
     enable_compile_cache()
@@ -87,7 +88,7 @@ def learn(arguments: argparse.Namespace, family: str) -> None:
     given = dict(word.split("=", 1) for word in arguments.given)
     aim = FAMILIES[family]
     varied = {"vary": aim.vary} if aim.vary else {}
-    config = with_preset(family, arguments.agent, arguments.preset, engine=arguments.engine, **varied)
+    config = with_preset(family, arguments.agent or aim.agent, arguments.preset, engine=arguments.engine, **varied)
     agent, settings = configure(config.learner, config.training, {name: value(x) for name, x in given.items()})
     steps = arguments.steps or aim.steps
     print(f"{family}: {steps:,} steps of {arguments.seeds} seeds\n{agent}\n{settings}", flush=True)
@@ -166,13 +167,23 @@ def row(family: str, result: Result, seeds: int) -> dict[str, Any]:
 
 def tabulate(out: Path) -> None:
     """Print and save a table of all finished families."""
-    head = ["family", "steps of a seed", "training s", "steps/s, all seeds", "train", "interpolation", "extrapolation"]
+    head = [
+        "family",
+        "agent",
+        "steps of a seed",
+        "training s",
+        "steps/s, all seeds",
+        "train",
+        "interpolation",
+        "extrapolation",
+    ]
     head += ["limited", "worst task", "aim"]
     found = [json.loads(path.read_text()) for path in sorted(out.glob("*.json"))]
     show = lambda x: "-" if x is None else f"{x:.0f}"
     lines = [
         [
             x["family"],
+            x["agent"].split("(")[0],
             f"{x['steps']:,}",
             f"{x['seconds']:.0f}",
             f"{x['steps_per_second']:,}",

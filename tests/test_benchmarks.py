@@ -4,9 +4,13 @@ import importlib.util
 import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+
+import mtjax
+from mtjax.training.log import append_rows
 
 FOLDER = Path(__file__).parent.parent / "benchmarks"
 
@@ -23,7 +27,7 @@ def script(monkeypatch):
         return module
 
     yield load
-    for name in ("report", "training"):
+    for name in ("report", "training", "returns", "update_cost"):
         sys.modules.pop(name, None)
 
 
@@ -98,3 +102,38 @@ def test_differences_are_against_the_baseline(script):
     assert script("learning").difference_rows("family", few, "plain")[0][3:] == ["+10.0", "+10.0", "1.00"]
     assert lines[1][:4] == ["family", "more", "train", "-"] and len(lines) == 2
     assert script("learning").difference_rows("family", found, "absent") == []
+
+
+def test_a_grid_has_every_combination_and_lr_means_all_rates(script):
+    presets = script("presets")
+    found = presets.grid(["lr=1e-3,3e-3", "tau=0.01"])
+    assert found == [{"lr": 1e-3, "tau": 0.01}, {"lr": 3e-3, "tau": 0.01}]
+    rates = dict.fromkeys(("actor_lr", "critic_lr"), 3e-3)
+    assert presets.as_point(mtjax.agent("ppo"), {"lr": 3e-3, "gamma": 0.9}) == {**rates, "gamma": 0.9}
+    assert presets.as_point(mtjax.agent("sac"), found[1]) == {**rates, "temperature_lr": 3e-3, "tau": 0.01}
+
+
+def test_points_are_ranked_by_the_end_of_their_runs(script, tmp_path):
+    """Two points of two seeds and ten chunks: the last tenth is the last chunk."""
+    presets = script("presets")
+    rows = [
+        {"return": 10 * point + seed + chunk, "steps": 100 * chunk, "seconds": chunk}
+        for chunk in range(10)
+        for point in range(2)
+        for seed in range(2)
+    ]
+    lines = presets.rows(SimpleNamespace(rows=rows), [{"tau": 0.01}, {"tau": 0.02}], seeds=2)
+    assert [line["return"] for line in lines] == [9.5, 19.5]
+    assert (lines[1]["least"], lines[1]["largest"], lines[1]["whole_run"]) == (19, 20, 15)
+    (tmp_path / "family").mkdir()
+    append_rows(tmp_path / "family" / "sac-lr.csv", [{**line, "given": ""} for line in lines])
+    presets.tabulate(tmp_path / "family")
+    table = (tmp_path / "family.md").read_text().splitlines()
+    assert "tau=0.02" in table[2] and "tau=0.01" in table[3]
+
+
+def test_time_that_two_operations_share_counts_once(script):
+    """Operations of two streams: from 0 to 2, inside it from 1 to 1.5, from 1.5 to 3, and from 5 to 6."""
+    kernels = script("kernels")
+    operations = [kernels.Operation("x", *times) for times in ((0, 2), (1, 0.5), (1.5, 1.5), (5, 1))]
+    assert kernels.busy_seconds(operations) == 4
