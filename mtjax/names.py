@@ -1,10 +1,13 @@
 """Errors that name the nearest match, and imports that wait until they are needed."""
 
+import contextlib
 import difflib
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 BEGAN = time.time()
@@ -14,6 +17,26 @@ _MANY = 20
 
 class InputError(ValueError):
     """The user gave something that cannot be used. The message says what was given and what is allowed."""
+
+
+class Notice(UserWarning):
+    """Something was amiss, and the command went on. The message says how."""
+
+
+def notice(text: str) -> None:
+    """Warn the user in one line; commands print it without the place in the code."""
+    warnings.warn(text, Notice, stacklevel=3)
+
+
+@contextlib.contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Name a file in errors of the system that leave it out, as those of a full disk do."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is not None or error.errno is None:
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from None
 
 
 def nearest_error(kind: str, given: str, allowed: Iterable[str]) -> InputError:

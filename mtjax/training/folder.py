@@ -17,8 +17,9 @@ import jax
 from mtjax import __version__
 from mtjax.agents import settings
 from mtjax.agents.choices import flag_names
-from mtjax.config import RunConfig, from_json, import_flags
+from mtjax.config import RunConfig, from_json, import_flags, to_json
 from mtjax.envs.family import Family, Tabled
+from mtjax.names import naming
 from mtjax.types import InputError
 
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
@@ -54,15 +55,27 @@ def resumed_config(config: RunConfig, directory: Path, argv: Sequence[str]) -> R
     return dataclasses.replace(recorded, **now, profile=config.profile, distributed=config.distributed)
 
 
+def write_config(directory: Path, config: RunConfig) -> None:
+    """Write config.json into the folder of a new run."""
+    _replace(directory / "config.json", to_json(config, run_metadata(config)))
+
+
 def record_steps(file: Path, steps: int) -> None:
     """Write the new number of steps into config.json, so that the next resume uses it too."""
     record = json.loads(file.read_text())
     if record["plan"]["steps"] == steps:
         return
-    record["command"] = record["command"].replace(f" --steps={record['plan']['steps']} ", f" --steps={steps} ")
+    if isinstance(record.get("command"), str):
+        record["command"] = record["command"].replace(f" --steps={record['plan']['steps']} ", f" --steps={steps} ")
     record["plan"]["steps"] = steps
+    _replace(file, json.dumps(record, indent=2) + "\n")
+
+
+def _replace(file: Path, text: str) -> None:
+    """Write a file in one step, so that no moment leaves half of it."""
     new = file.with_suffix(".new")
-    new.write_text(json.dumps(record, indent=2) + "\n")
+    with naming(new):
+        new.write_text(text)
     os.replace(new, file)
 
 
