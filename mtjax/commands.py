@@ -8,13 +8,14 @@ import itertools
 import re
 import sys
 import textwrap
+import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 from mtjax.agents import AGENTS
 from mtjax.envs import ENVS, outline
-from mtjax.names import InputError, nearest_error
+from mtjax.names import InputError, Notice, nearest_error
 
 PRESETS = ("auto", "cpu", "gpu")
 _KNOWN = (("environment", "env", ENVS), ("agent", "agent", AGENTS), ("preset", "preset", PRESETS))
@@ -31,7 +32,8 @@ P = TypeVar("P")
 def main(run: Any) -> None:
     """Run a command's entry point. A mistake of the user prints one line and exits with code 2."""
     try:
-        run(sys.argv[1:])
+        with _plain_notices():
+            run(sys.argv[1:])
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
@@ -44,6 +46,23 @@ def main(run: Any) -> None:
     except OSError as error:
         print(f"error: {error.strerror or error}: {error.filename or ''}".rstrip(": "), file=sys.stderr)
         sys.exit(2)
+
+
+@contextlib.contextmanager
+def _plain_notices() -> Iterator[None]:
+    """Print notices in one line each, without the place in the code."""
+    with warnings.catch_warnings():
+        others = warnings.showwarning
+
+        def show(message, category, *place) -> None:
+            if issubclass(category, Notice):
+                print(f"warning: {message}", file=sys.stderr, flush=True)
+            else:
+                others(message, category, *place)
+
+        warnings.showwarning = show
+        warnings.simplefilter("always", Notice)
+        yield
 
 
 def catalogue() -> str:
@@ -205,6 +224,9 @@ def parse_with_tyro(cls: type[P], argv: Sequence[str], default: P, name: str) ->
         if stop.code in (0, None):
             raise
         message = re.sub(r"^Error parsing ((plan|training|family|learner): )?", "", _unframed(output.getvalue()))
+        message = re.sub(
+            r"^Unrecognized options: (--(\w+\.)*)no-(\S+).*", r"\1\3 is no switch; give it a value", message
+        )
         raise InputError(message or "the command line cannot be read; --help lists the flags") from None
 
 

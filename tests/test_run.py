@@ -27,7 +27,8 @@ from mtjax.loop import Settings
 from mtjax.training import checkpoint, traced
 from mtjax.training.folder import new_directory
 from mtjax.training.programs import enable_compile_cache
-from mtjax.training.run import fit_chunk, stop_signals, train
+from mtjax.training.run import fit_chunk, train
+from mtjax.training.stops import stop_signals
 from mtjax.types import InputError
 
 CLOCKS = {"seconds", "wall_seconds"}

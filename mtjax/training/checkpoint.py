@@ -29,7 +29,7 @@ _KEPT = 2
 _SUMS = "checksums.txt"  # as of sha256sum, by which users can check them too
 _LINE = re.compile(r"([0-9a-f]{64})  (.+)")
 _UNFINISHED = ("*.new", "*.orbax-checkpoint-tmp")  # what a killed process leaves
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_UNKNOWN = (errno.EOPNOTSUPP, errno.EINVAL)  # of a file system that reserves no room
 
 # Writing.
 
@@ -78,6 +78,11 @@ def _begin(folder: Path, state: TrainState, thread: ThreadPoolExecutor) -> Futur
     if folder.exists():
         return None
     new = folder.with_suffix(".new")
+    shortage = hosts.largest(_shortage(folder, size_of(state)) if hosts.is_first() else 0)
+    if shortage:
+        raise OSError(
+            shortage, f"checkpoint not written ({os.strerror(shortage)}); the one before it stays", str(folder)
+        )
     _silence_orbax()
     try:
         parts = {"agent": state.agent, "loop": state._replace(agent=None)}
@@ -85,6 +90,26 @@ def _begin(folder: Path, state: TrainState, thread: ThreadPoolExecutor) -> Futur
     except (OSError, ValueError) as error:
         raise _as_oserror(error, new) from None
     return thread.submit(_finish, written, new, folder)
+
+
+def _shortage(folder: Path, size: int) -> int:
+    """Return the system's error number if it has no room for a new folder of so many bytes, else 0.
+
+    Asked beforehand, because orbax meets a full disk in many threads, of which each reports it at length.
+    """
+    room = folder.with_suffix(".new")
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with room.open("wb") as file:
+            if hasattr(os, "posix_fallocate"):  # which knows of quotas and limits too
+                os.posix_fallocate(file.fileno(), 0, size)
+            elif shutil.disk_usage(folder.parent).free < size:
+                return errno.ENOSPC
+    except OSError as error:
+        return 0 if error.errno in _UNKNOWN else error.errno or errno.EIO
+    finally:
+        room.unlink(missing_ok=True)
+    return 0
 
 
 def _finish(written: Any, new: Path, folder: Path) -> None:
@@ -105,12 +130,10 @@ def _finish(written: Any, new: Path, folder: Path) -> None:
 
 def _as_oserror(error: Exception, place: Path) -> OSError:
     """Return an error of orbax or of the system as one that names the place."""
-    if isinstance(error, OSError) and error.filename:
-        return error
     known = re.search(r"os_error_code='(\d+)'", str(error))
     number = int(known[1]) if known else getattr(error, "errno", None) or errno.EIO
-    reason = os.strerror(number) if known or number in _FULL else str(error).strip().splitlines()[0][:150]
-    return OSError(number, f"checkpoint not written ({reason}); the one before it stays", str(place))
+    reason = os.strerror(number) if number != errno.EIO else str(error).strip().splitlines()[0][:150]
+    return OSError(number, f"checkpoint not written ({reason}); the one before it stays", str(place.with_suffix("")))
 
 
 def _silence_orbax() -> None:

@@ -20,7 +20,7 @@ from mtjax.evaluation import Evaluations
 from mtjax.loop import Settings, TrainState
 from mtjax.parallel import hosts
 from mtjax.parallel import mesh as meshes
-from mtjax.training import checkpoint, finetune, lock, log, points
+from mtjax.training import checkpoint, finetune, lock, log, memory, points
 from mtjax.training.points import Point, Sweep, SweptAgent
 from mtjax.training.policy import Policy
 from mtjax.training.programs import Programs, compile_lowered, jit_programs, load_kernels, sharded_shapes, trace
@@ -121,9 +121,12 @@ def train(
     run = _Run(env, learner, settings, plan, directory, console, found, mesh, profile)
     with contextlib.ExitStack() as held:
         held.callback(console.close)
+        held.enter_context(memory.explaining())
         if directory is not None:
             hosts.broadcast_path(lambda: held.enter_context(lock.hold(directory)))
-        resume = run.records.found(resume)
+        asked, resume = resume, run.records.found(resume)
+        if asked and not resume:
+            console.say("there is no checkpoint yet, so the run starts over")
         programs, state = run.prepare(resume)
         if start is not None and not resume:
             begun = run.adopt(start, tasks, hosts.gather(state.agent))
@@ -218,6 +221,7 @@ class _Run:
         return programs, self.records.restore(shapes) if make is None else make.result()(tasks, seeds, knobs)
 
     def _describe(self, shapes: TrainState) -> None:
+        memory.require_room(shapes)
         data = checkpoint.size_of(shapes.data) / 1e6
         self.console.say(
             f"memory: {checkpoint.size_of(shapes) / 1e6:,.0f} MB of state, of which {data:,.0f} MB "
