@@ -25,6 +25,7 @@ _OVERVIEW = (  # titles, and the classes whose fields are flags of every run
     ("how worlds are played (a preset may say otherwise)", "loop.py", "Settings"),
 )
 _MAY_CHANGE = {"--resume", "--steps", "--import", "--distributed", "--profile"}  # the only flags beside --resume
+_LONGEST = 600  # letters of a message
 _FIELD = re.compile(r"^    (\w+): ", re.MULTILINE)  # a line of a class that may be a setting
 P = TypeVar("P")
 
@@ -35,7 +36,7 @@ def main(run: Any) -> None:
         with _plain_notices():
             run(sys.argv[1:])
     except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {one_line(error)}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
@@ -46,6 +47,12 @@ def main(run: Any) -> None:
     except OSError as error:
         print(f"error: {error.strerror or error}: {error.filename or ''}".rstrip(": "), file=sys.stderr)
         sys.exit(2)
+
+
+def one_line(error: Exception) -> str:
+    """Return the message of an error in one line, without the middle of what is overlong, such as a value of a book."""
+    text = " ".join(str(error).split())
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST // 2]} ... {text[-_LONGEST // 2 :]}"
 
 
 @contextlib.contextmanager

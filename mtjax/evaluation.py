@@ -49,7 +49,7 @@ def load_evaluations(path: Path) -> Evaluations:
         InputError: the file cannot be read, or its arrays do not fit together.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             named = {name.removeprefix("train_") for name in file if name.startswith("train_")} - {"values"}
             found = Evaluations(
                 file["steps"],

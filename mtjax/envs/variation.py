@@ -207,7 +207,7 @@ def _combine(points: list[np.ndarray], combine: str) -> np.ndarray:
     else:
         count = math.prod(len(p) for p in points)
         if count > MOST_TASKS:
-            raise InputError(f"the grid has {count:,} tasks, and {MOST_TASKS:,} are the most; give fewer values")
+            raise InputError(f"the grid has {count:,} tasks, and {MOST_TASKS:,} are most; give fewer values")
         if any(np.any(np.diff(p) <= 0) and np.any(np.diff(p) >= 0) for p in points):
             raise InputError("the values of a parameter must increase (or decrease), and these do not")
         rows = (

@@ -63,10 +63,11 @@ def write_config(directory: Path, config: RunConfig) -> None:
 def record_steps(file: Path, steps: int) -> None:
     """Write the new number of steps into config.json, so that the next resume uses it too."""
     record = json.loads(file.read_text())
-    if record["plan"]["steps"] == steps:
+    before = record["plan"].get("steps")  # an edited record may lack it
+    if before == steps:
         return
     if isinstance(record.get("command"), str):
-        record["command"] = record["command"].replace(f" --steps={record['plan']['steps']} ", f" --steps={steps} ")
+        record["command"] = record["command"].replace(f" --steps={before} ", f" --steps={steps} ")
     record["plan"]["steps"] = steps
     _replace(file, json.dumps(record, indent=2) + "\n")
 
