@@ -230,10 +230,9 @@ def parse_with_tyro(cls: type[P], argv: Sequence[str], default: P, name: str) ->
     except SystemExit as stop:
         if stop.code in (0, None):
             raise
-        message = re.sub(r"^Error parsing ((plan|training|family|learner): )?", "", _unframed(output.getvalue()))
-        message = re.sub(
-            r"^Unrecognized options: (--(\w+\.)*)no-(\S+).*", r"\1\3 is no switch; give it a value", message
-        )
+        message = re.sub(r"^Error parsing ((plan|training|family|learner)[.\w]*: )?", "", _unframed(output.getvalue()))
+        negated = r"^Unrecognized options: (--(\w+\.)*)no-(\S+).*"
+        message = re.sub(negated, r"\1\3 is no switch that could be off; give it a value", message)
         raise InputError(message or "the command line cannot be read; --help lists the flags") from None
 
 

@@ -44,9 +44,9 @@ def _parse(argv: Sequence[str]) -> Request:
     if not request.run:
         raise InputError("say which run to evaluate: --run=DIR")
     if not 1 <= request.episodes <= _MOST_EPISODES:
-        raise InputError(f"episodes must be at least 1 and at most {_MOST_EPISODES:,}, not {request.episodes}")
+        raise InputError(f"episodes must be at least 1 and at most {_MOST_EPISODES}, not {request.episodes}")
     if not 0 <= request.seed <= _LARGEST_SEED:
-        raise InputError(f"seed must be at least 0 and at most {_LARGEST_SEED:,}, not {request.seed}")
+        raise InputError(f"seed must be at least 0 and at most {_LARGEST_SEED}, not {request.seed}")
     commands.require_run(Path(request.run))
     return request
 

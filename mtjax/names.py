@@ -81,7 +81,7 @@ def _broken_rule(kind: Any, value: Any, largest: int) -> str:
     plain = not isinstance(value, bool)
     if kind is int:
         whole = isinstance(value, Integral) and plain
-        at_most = "" if whole and abs(value) <= largest else f"must be at most {largest:,}"
+        at_most = "" if whole and abs(value) <= largest else f"must be at most {largest}"
         return at_most if whole else "must be a whole number"
     if kind is float:
         return "" if isinstance(value, Real) and plain and abs(value) <= _LARGEST_FLOAT else "must be a finite number"

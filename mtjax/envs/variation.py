@@ -53,6 +53,8 @@ def read_axis(name: str, text: str, parameter: Parameter) -> Axis:
     Raises:
         InputError: the text is none of these, or a value is outside the parameter's range.
     """
+    if not text.strip():
+        raise InputError(f"{name} has no values; give {_FORMS}")
     parts = text.split(":")
     try:
         numbers = [float(x) for x in (text.split(",") if len(parts) == 1 else parts[:2])]
@@ -62,7 +64,7 @@ def read_axis(name: str, text: str, parameter: Parameter) -> Axis:
     except ValueError:
         raise InputError(f"cannot read the values {text!r} of {name}; give {_FORMS}") from None
     if count > MOST_TASKS:
-        raise InputError(f"{name} can have {MOST_TASKS:,} values at most, each of which is a task, not {count:,}")
+        raise InputError(f"{name} can have {MOST_TASKS} values at most, each of which is a task, not {count}")
     if len(parts) == 3 and count < 2:
         asked = "one value" if count == 1 else f"{count} values"
         raise InputError(f"{text} asks for {asked} of {name}; give it alone, or a range of at least two")
@@ -207,7 +209,7 @@ def _combine(points: list[np.ndarray], combine: str) -> np.ndarray:
     else:
         count = math.prod(len(p) for p in points)
         if count > MOST_TASKS:
-            raise InputError(f"the grid has {count:,} tasks, and {MOST_TASKS:,} are most; give fewer values")
+            raise InputError(f"the grid has {count} tasks, and {MOST_TASKS} are most; give fewer values")
         if any(np.any(np.diff(p) <= 0) and np.any(np.diff(p) >= 0) for p in points):
             raise InputError("the values of a parameter must increase (or decrease), and these do not")
         rows = (

@@ -24,7 +24,7 @@ class Rollouts:
 
     def __post_init__(self):
         if not 1 <= self.unroll <= _LONGEST:
-            raise InputError(f"unroll must be at least 1 and at most {_LONGEST:,}, not {self.unroll}")
+            raise InputError(f"unroll must be at least 1 and at most {_LONGEST}, not {self.unroll}")
 
     @property
     def steps(self) -> int:

@@ -14,8 +14,8 @@ _NAME = "lock"
 
 
 @contextlib.contextmanager
-def hold(directory: Path) -> Iterator[None]:
-    """Hold the lock of a folder.
+def hold(directory: Path) -> Iterator[Path]:
+    """Hold the lock of a folder, and return the folder.
 
     The system releases the lock when the process ends, however it ends, so that a killed run is never in the way. On
     network file systems the lock holds between hosts if the file system has locks (NFS 4, Lustre with ``flock``, GPFS).
@@ -37,7 +37,7 @@ def hold(directory: Path) -> Iterator[None]:
     try:
         os.truncate(file, 0)
         os.pwrite(file, f"process {os.getpid()} on {platform.node()}".encode(), 0)
-        yield
+        yield directory
     finally:
         path.unlink(missing_ok=True)
         os.close(file)
