@@ -1,6 +1,5 @@
 """Evaluation plays whole episodes under the mean action, on any tasks, with keys of its own."""
 
-import os
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -11,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.names import naming
+from mtjax.names import replacing
 from mtjax.rollout import Worlds, reset_envs, step_envs
 from mtjax.types import SPLITS, Agent, Array, Env, InputError, Task
 
@@ -36,10 +35,8 @@ def save_evaluations(path: Path, evaluations: Evaluations) -> None:
     """Write every episode: ``steps`` (V,), and for each split returns, metrics (S, V, T, episodes) and values (T,)."""
     values = {f"{split}_values": x for split, x in evaluations.values.items()}
     metrics = {f"{split}_{name}": x for name, splits in evaluations.metrics.items() for split, x in splits.items()}
-    new = path.with_suffix(".new.npz")
-    with naming(new):
-        np.savez(new, steps=evaluations.steps, **evaluations.returns, **values, **metrics)  # type: ignore
-    os.replace(new, path)
+    with replacing(path) as new, new.open("wb") as file:
+        np.savez(file, steps=evaluations.steps, **evaluations.returns, **values, **metrics)  # type: ignore
 
 
 def load_evaluations(path: Path) -> Evaluations:

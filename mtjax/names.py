@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import difflib
+import os
 import sys
 import time
 import warnings
@@ -41,6 +42,18 @@ def naming(path: Path) -> Iterator[None]:
         if error.filename is not None or error.errno is None:
             raise
         raise OSError(error.errno, error.strerror, str(path)) from None
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Give a path at which to write a file anew. It takes the place of ``path`` once it is whole, and never before."""
+    new = path.with_name(f"{path.name}.new")
+    try:
+        with naming(path):
+            yield new
+            os.replace(new, path)
+    finally:
+        new.unlink(missing_ok=True)
 
 
 def nearest_error(kind: str, given: str, allowed: Iterable[str]) -> InputError:

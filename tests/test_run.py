@@ -1,5 +1,6 @@
 """The host loop: what a run leaves behind, that it repeats to the bit, and that it stops and goes on cleanly."""
 
+import contextlib
 import csv
 import dataclasses
 import errno
@@ -28,7 +29,7 @@ import mtjax
 import mtjax.train
 from mtjax import cli, commands, loop
 from mtjax.config import Plan, from_json
-from mtjax.evaluation import load_evaluations
+from mtjax.evaluation import load_evaluations, save_evaluations
 from mtjax.loop import Settings
 from mtjax.names import Notice
 from mtjax.training import checkpoint, log, run, traced
@@ -334,16 +335,31 @@ def test_a_checkpoint_that_fails_later_is_told_all_the_same(play, tmp_path, monk
         play(tmp_path, steps=100)
 
 
-def test_a_full_disk_is_told_with_the_file(tmp_path):
-    """The system leaves the name out."""
+@contextlib.contextmanager
+def files_of_at_most(size):
+    """Make the system refuse longer files, as a full disk does."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:
-        with pytest.raises(OSError, match="File too large") as caught:
-            log.append_rows(tmp_path / "metrics.csv", [{"x": "1" * 200}])
+        yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_full_disk_is_told_with_the_file(tmp_path):
+    """The system leaves the name out."""
+    with files_of_at_most(100), pytest.raises(OSError, match="File too large") as caught:
+        log.append_rows(tmp_path / "metrics.csv", [{"x": "1" * 200}])
     assert caught.value.filename == str(tmp_path / "metrics.csv")
+
+
+def test_a_full_disk_leaves_the_file_before(whole, tmp_path):
+    """And no half of a new one."""
+    file = shutil.copy(whole.directory / "evaluations.npz", tmp_path / "evaluations.npz")
+    with files_of_at_most(100), pytest.raises(OSError, match="File too large") as caught:
+        save_evaluations(file, whole.evaluations)
+    assert caught.value.filename == str(file) and list(tmp_path.iterdir()) == [file]
+    assert_same_evaluations(load_evaluations(file), whole.evaluations)
 
 
 def test_lost_evaluations_are_told(play, whole, tmp_path):

@@ -3,7 +3,6 @@
 import dataclasses
 import itertools
 import json
-import os
 import platform
 import shlex
 import time
@@ -19,7 +18,7 @@ from mtjax.agents import settings
 from mtjax.agents.choices import flag_names
 from mtjax.config import RunConfig, from_json, import_flags, to_json
 from mtjax.envs.family import Family, Tabled
-from mtjax.names import naming
+from mtjax.names import replacing
 from mtjax.types import InputError
 
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
@@ -57,7 +56,8 @@ def resumed_config(config: RunConfig, directory: Path, argv: Sequence[str]) -> R
 
 def write_config(directory: Path, config: RunConfig) -> None:
     """Write config.json into the folder of a new run."""
-    _replace(directory / "config.json", to_json(config, run_metadata(config)))
+    with replacing(directory / "config.json") as new:
+        new.write_text(to_json(config, run_metadata(config)))
 
 
 def record_steps(file: Path, steps: int) -> None:
@@ -69,15 +69,8 @@ def record_steps(file: Path, steps: int) -> None:
     if isinstance(record.get("command"), str):
         record["command"] = record["command"].replace(f" --steps={before} ", f" --steps={steps} ")
     record["plan"]["steps"] = steps
-    _replace(file, json.dumps(record, indent=2) + "\n")
-
-
-def _replace(file: Path, text: str) -> None:
-    """Write a file in one step, so that no moment leaves half of it."""
-    new = file.with_suffix(".new")
-    with naming(new):
-        new.write_text(text)
-    os.replace(new, file)
+    with replacing(file) as new:
+        new.write_text(json.dumps(record, indent=2) + "\n")
 
 
 def run_metadata(config: RunConfig) -> dict:

@@ -1,7 +1,6 @@
 """Metrics of a run: one line per chunk on the terminal, and rows in a CSV file."""
 
 import csv
-import os
 import re
 import shutil
 import sys
@@ -10,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mtjax.names import naming, notice
+from mtjax.names import naming, notice, replacing
 
 _OF_EACH_TASK = ("td_error", "critic_gradient_norm", "actor_gradient_norm")  # beside the return
 
@@ -51,13 +50,11 @@ def truncate_rows(path: Path, iteration: int) -> float:
         aside = path.with_suffix(".damaged.csv")
         shutil.copyfile(path, aside)
         notice(f"{str(path)!r} is damaged: {len(kept)} rows up to step {last} are left; it is kept as {aside.name!r}")
-    replacement = path.with_suffix(".new")
-    with naming(replacement), replacement.open("w", newline="") as file:
+    with replacing(path) as new, new.open("w", newline="") as file:
         if kept:
             writer = csv.DictWriter(file, fieldnames=names)
             writer.writeheader()
             writer.writerows(kept)
-    os.replace(replacement, path)
     return max((float(row["seconds"]) for row in kept), default=0.0)
 
 
