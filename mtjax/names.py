@@ -94,10 +94,11 @@ def _broken_rule(kind: Any, value: Any, largest: int) -> str:
     plain = not isinstance(value, bool)
     if kind is int:
         whole = isinstance(value, Integral) and plain
-        at_most = "" if whole and abs(value) <= largest else f"must be at most {largest}"
+        at_most = "" if whole and abs(value) <= largest else f"must be at most {largest}"  # type: ignore
         return at_most if whole else "must be a whole number"
     if kind is float:
-        return "" if isinstance(value, Real) and plain and abs(value) <= _LARGEST_FLOAT else "must be a finite number"
+        finite = isinstance(value, Real) and plain and abs(value) <= _LARGEST_FLOAT  # type: ignore
+        return "" if finite else "must be a finite number"
     if kind in (bool, str):
         return "" if isinstance(value, kind) else f"must be {'true or false' if kind is bool else 'text'}"
     return ""

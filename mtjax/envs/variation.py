@@ -73,7 +73,7 @@ def read_axis(name: str, text: str, parameter: Parameter) -> Axis:
         most = min(parameter.maximum, _LARGEST)
         limit = f" and at most {most:g}" if most < _LARGEST or not wrong <= most else ""
         raise InputError(f"{name} must be greater than {parameter.minimum:g}{limit}, not {wrong:g}")
-    axis = Axis(np.linspace(*numbers, count) if len(parts) == 3 else np.array(numbers), len(parts) == 2)
+    axis = Axis(np.linspace(numbers[0], numbers[1], count) if len(parts) == 3 else np.array(numbers), len(parts) == 2)
     if len(parts) > 1 and float(parts[1]) <= float(parts[0]) and axis.points.size > 1:
         raise InputError(f"the range of {name} must go from low to high, not {text}")
     return axis

@@ -220,7 +220,7 @@ def _newest_whole(directory: Path, parts: Iterable[str]) -> Path:
                 notice(f"{text}; the checkpoint before it is used, of iteration {folder.name}")
             return folder
         reasons.append(f"the checkpoint {str(folder)!r} is damaged: {reason}")
-    raise InputError(f"{reasons[0]}; there is no whole one before it")
+    raise InputError(f"{reasons[0]}; there is no whole one before it. Remove {str(directory)!r} to start over")
 
 
 def _damage(folder: Path, parts: Iterable[str]) -> str:

@@ -72,7 +72,7 @@ def _read_rows(path: Path) -> tuple[list[str], list[dict[str, Any]]]:
     return names, rows
 
 
-def _is_whole(row: dict[str | None, Any]) -> bool:
+def _is_whole(row: dict[Any, Any]) -> bool:
     """Return whether a line of metrics is complete. A killed process may leave half of one."""
     iteration, seconds = str(row.get("iteration")), str(row.get("seconds"))
     if None in row or None in row.values() or not (iteration.isascii() and iteration.isdigit()):

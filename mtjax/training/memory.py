@@ -43,9 +43,13 @@ def physical_bytes() -> float:
 
 
 def required_bytes(config: RunConfig) -> int:
-    """Return roughly the bytes that one point takes with all its seeds: its state and an update's copies."""
+    """Return roughly the bytes that one point takes with all its seeds: its state and an update's copies.
+
+    On a CPU the state that is being saved lies in the same memory.
+    """
     state = state_shapes(dataclasses.replace(config, points=config.points[:1]))
-    return checkpoint.size_of(state) + _AGENT_COPIES * checkpoint.size_of(state.agent)
+    saved = checkpoint.size_of(state) if jax.default_backend() == "cpu" else 0
+    return checkpoint.size_of(state) + saved + _AGENT_COPIES * checkpoint.size_of(state.agent)
 
 
 def require_room(state: TrainState) -> None:
