@@ -210,7 +210,7 @@ def from_json(path: Path) -> RunConfig:
     try:
         return _from_record(record)
     except InputError as error:
-        raise InputError(f"{error}{_other_version(record)}") from None
+        raise InputError(f"{str(path)!r}: {error}{_other_version(record)}") from None
     except Exception as error:  # whatever an edited record makes of the classes it is read into
         text = f"{str(path)!r} does not describe a run: {type(error).__name__}: {str(error)[:150]}"
         raise InputError(text + _other_version(record)) from None

@@ -95,3 +95,18 @@ def test_differences_are_against_the_baseline(script):
     assert lines[0] == ["family", "better", "train", pairs, "+10.0 [+9.0, +11.0]", "1.00 [1.00, 1.00]"]
     assert lines[1][:4] == ["family", "more", "train", "-"] and len(lines) == 2
     assert script("learning").difference_rows("family", found, "absent") == []
+
+
+@pytest.mark.parametrize(
+    "samples, flat",
+    [
+        ([*range(0, 300, 5), *[300] * 120], True),  # which grows at first
+        ([*range(300, 480)], False),
+        ([*[300] * 120, *[319] * 60], True),  # by less than 20 MB
+        ([*[5000] * 120, *[5090] * 60], True),  # by less than a fiftieth
+        ([*[5000] * 120, *[5110] * 60], False),
+    ],
+)
+def test_memory_that_grows_to_the_end_is_not_flat(script, samples, flat):
+    """By the medians of the second and the last third of a run."""
+    assert script("soak").judge(samples)[1] == flat

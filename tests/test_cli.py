@@ -310,6 +310,7 @@ def test_list_names_every_family_and_agent(capsys):
         ),
         ("--env.vary.mass=1e300", "mass must be greater than 0 and at most 1e+30, not 1e+300"),
         ("--env=walker-walk --env.vary.torso-mass=1e308", "torso-mass must be greater than 0 and at most 1e+30"),
+        ("--env.vary.size=1e15", "FingerSpin with size=1e+15 has a body_mass beyond 32-bit numbers"),
         ("--env.vary.size=1e-8", "MuJoCo cannot build FingerSpin with size=1e-08: "),
         ("--resume=nowhere", "'nowhere' is not a run"),
         ("--resume=", "not a run"),
