@@ -267,7 +267,9 @@ def test_resume_extends_and_the_hint_goes_on(finished_run, copied_run, capsys, m
         return train(*arguments, **settings, on_chunk=lambda _: os.kill(os.getpid(), signal.SIGINT))
 
     monkeypatch.setattr(launch, "train", stops)
-    mtjax.train.main(["--resume", str(copied_run), "--steps=1000"])
+    with pytest.raises(SystemExit) as stop:
+        mtjax.train.main(["--resume", str(copied_run), "--steps=1000"])
+    assert stop.value.code == 130
     hint = capsys.readouterr().out.splitlines()[-1]
     assert hint.startswith("  python -m mtjax.train ")
     monkeypatch.undo()

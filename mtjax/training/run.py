@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import math
-import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -17,14 +16,16 @@ import numpy as np
 from jax.sharding import Mesh
 
 from mtjax.config import Plan, configure, require_value_range
-from mtjax.evaluation import Evaluations, load_evaluations, save_evaluations
+from mtjax.evaluation import Evaluations
 from mtjax.loop import Settings, TrainState
 from mtjax.parallel import hosts
 from mtjax.parallel import mesh as meshes
-from mtjax.training import checkpoint, finetune, log, points
+from mtjax.training import checkpoint, finetune, lock, log, memory, points
 from mtjax.training.points import Point, Sweep, SweptAgent
 from mtjax.training.policy import Policy
 from mtjax.training.programs import Programs, compile_lowered, jit_programs, load_kernels, sharded_shapes, trace
+from mtjax.training.records import Records
+from mtjax.training.stops import require_finite, require_finite_parameters, stop_signals
 from mtjax.types import SPLITS, Agent, Env, InputError
 
 
@@ -38,6 +39,7 @@ class Result(NamedTuple):
     compile_seconds: float  # from the start until the first chunk could begin
     finished: bool  # False if a signal stopped it
     directory: Path | None
+    signal: int = 0  # the signal that stopped it
     points: tuple[Point, ...] = ()  # of a sweep: entry k of S is seed k % seeds of point k // seeds
 
 
@@ -82,8 +84,10 @@ def train(
             0.99]}`` for every combination, or a list of points ``{"actor_lr": 1e-4, "gamma": 0.98}``. Every point has
             all seeds, and the S axis of the result holds them point by point. A seed whose numbers stop being finite
             is given up: its returns become NaN, and the other seeds continue.
-        directory: an existing folder for metrics, evaluations and checkpoints; None writes nothing.
-        resume: continue from the newest checkpoint in ``directory``. The number of devices may have changed.
+        directory: an existing folder for metrics, evaluations and checkpoints; None writes nothing. Only one process
+            at a time may write there.
+        resume: continue from the newest whole checkpoint in ``directory``, or start over if there is none yet. The
+            number of devices may have changed.
         profile: write a trace of one chunk by ``jax.profiler`` into ``directory``/profile.
         quiet: print nothing.
         label: the first words of progress lines.
@@ -92,7 +96,9 @@ def train(
 
     Raises:
         InputError: an argument cannot be used.
-        FloatingPointError: numbers stopped being finite (in a sweep: of every seed). The message names task and step.
+        FloatingPointError: numbers stopped being finite (in a sweep: of every seed). The message names task, step and
+            the last checkpoint.
+        OSError: a file could not be written. The checkpoint before it stays.
     """
     plan = Plan(steps, seed, seeds, eval_every, eval_episodes)
     agent, settings = configure(agent, settings or Settings(), given)
@@ -113,7 +119,14 @@ def train(
     console = log.Console(plan.steps, quiet or not hosts.is_first(), label)
     mesh = meshes.mesh_for(seeds * max(len(found), 1), len(tasks.id), settings.num_envs)
     run = _Run(env, learner, settings, plan, directory, console, found, mesh, profile)
-    try:
+    with contextlib.ExitStack() as held:
+        held.callback(console.close)
+        held.enter_context(memory.explaining())
+        if directory is not None:
+            hosts.broadcast_path(lambda: held.enter_context(lock.hold(directory)))
+        asked, resume = resume, run.records.found(resume)
+        if asked and not resume:
+            console.say("there is no checkpoint yet, so the run starts over")
         programs, state = run.prepare(resume)
         if start is not None and not resume:
             begun = run.adopt(start, tasks, hosts.gather(state.agent))
@@ -122,8 +135,6 @@ def train(
         compile_seconds = time.monotonic() - started
         run.console.say(f"compiled in {compile_seconds:.1f} s")
         return run.run_chunks(programs, state, started, on_chunk)._replace(compile_seconds=compile_seconds)
-    finally:
-        run.console.close()
 
 
 def fit_chunk(settings: Settings, num_tasks: int, steps: int, grain: int = 1) -> Settings:
@@ -176,9 +187,9 @@ class _Run:
         learner = jax.tree.map(together, jax.vmap(adopt)(jax.tree.map(apart, fresh.learner)))
         return fresh._replace(learner=learner)
 
-    @property
-    def is_writer(self) -> bool:
-        return self.directory is not None and hosts.is_first()
+    @cached_property
+    def records(self) -> Records:
+        return Records(self.directory)
 
     @cached_property
     def steps_per_iteration(self) -> int:
@@ -207,9 +218,10 @@ class _Run:
         programs = Programs(partial(compile_lowered(chunk.lower()), tasks), evaluate)
         if kernels.result():  # else the first chunk would wait for them
             score.result()
-        return programs, self._restore(shapes) if make is None else make.result()(tasks, seeds, knobs)
+        return programs, self.records.restore(shapes) if make is None else make.result()(tasks, seeds, knobs)
 
     def _describe(self, shapes: TrainState) -> None:
+        memory.require_room(shapes)
         data = checkpoint.size_of(shapes.data) / 1e6
         self.console.say(
             f"memory: {checkpoint.size_of(shapes) / 1e6:,.0f} MB of state, of which {data:,.0f} MB "
@@ -220,25 +232,16 @@ class _Run:
         if self.directory is not None:
             checkpoint.require_space(self.directory, shapes)
 
-    def _restore(self, shapes: TrainState) -> TrainState:
-        assert self.directory is not None
-        return checkpoint.load(self.directory / "checkpoints", shapes)
-
-    def _earlier_seconds(self, iteration: int) -> float:
-        """Return the training seconds of a resumed run so far, and drop its later lines of metrics."""
-        if not self.is_writer:
-            return 0.0
-        assert self.directory is not None
-        return log.truncate_rows(self.directory / "metrics.csv", iteration)
-
     def run_chunks(self, programs: Programs, state: TrainState, started: float, on_chunk) -> Result:
         """Run chunks until all steps are done or a signal asks to stop."""
-        steps = int(state.iteration) * self.steps_per_iteration
-        evaluations = self._earlier_evaluations(steps)
-        rows, seconds, stop = [], self._earlier_seconds(int(state.iteration)), False
+        steps, iteration = int(state.iteration) * self.steps_per_iteration, int(state.iteration)
+        due = steps >= self.eval_every
+        evaluations = self.records.earlier_evaluations(steps, due, self._no_evaluations())
+        rows, seconds, stop = [], self.records.earlier_seconds(iteration), 0
         diverged = np.zeros(len(self.seeds), bool)
-        with stop_signals() as received:
+        with stop_signals() as received, self.records.closing():
             while steps < self.plan.steps and not stop:
+                self.records.check()
                 steps_before = steps
                 with self._profile_chunk(len(rows), steps):
                     before = time.monotonic()
@@ -257,7 +260,7 @@ class _Run:
                 lines = log.metric_rows(metrics, np.asarray(self.seeds), common)
                 new = [{"seed": row["seed"], **self.point(k), **row} for k, row in enumerate(lines)]
                 rows += new
-                self._write(new)
+                self.records.add_rows(new)
                 rate = (steps - steps_before) * len(self.seeds) / elapsed
                 self.console.progress(steps, seconds, rate, metrics["return"])
                 if on_chunk is not None:
@@ -265,16 +268,19 @@ class _Run:
                 due = steps // self.eval_every > steps_before // self.eval_every
                 if due or steps >= self.plan.steps:
                     evaluations = self._evaluate(programs.evaluate, state, evaluations, steps, diverged)
-                stop = hosts.any_process(bool(received))
+                stop = hosts.largest(received[0] if received else 0)
                 if due or stop or steps >= self.plan.steps:
-                    self._save(state)
-        return Result(state, evaluations, rows, seconds, 0.0, steps >= self.plan.steps, self.directory, self.points)
+                    self._save(state, steps // self.steps_per_iteration)
+        finished = steps >= self.plan.steps
+        return Result(
+            state, evaluations, rows, seconds, 0.0, finished, self.directory, 0 if finished else stop, self.points
+        )
 
     @contextlib.contextmanager
     def _profile_chunk(self, rows: int, steps: int) -> Iterator[None]:
         """Trace the run's second, warm chunk, or its only one, if ``profile`` asks for it."""
         only = steps + self.settings.chunk_steps * self.steps_per_iteration >= self.plan.steps
-        if not (self.profile and self.is_writer and (rows == len(self.seeds) or (only and not rows))):
+        if not (self.profile and self.records.writes and (rows == len(self.seeds) or (only and not rows))):
             yield
             return
         place = self.directory / "profile"  # type: ignore
@@ -286,20 +292,17 @@ class _Run:
         """Return which seeds (S,) have diverged in this chunk. In a sweep the other seeds continue."""
         broken = np.any(bad_step >= 0, axis=1)
         if not self.points or np.all(broken | diverged):
-            _require_finite(bad_step, first_step)
+            require_finite(bad_step, first_step, self.records.last)
         for k in np.flatnonzero(broken & ~diverged):
             values = ", ".join(f"{name}={value:g}" for name, value in self.point(int(k)).items())
             self.console.say(f"seed {self.seeds[k]} of {values} diverged and is given up")
         return broken
 
-    def _write(self, rows: list[dict[str, Any]]) -> None:
-        if self.is_writer:
-            assert self.directory is not None
-            log.append_rows(self.directory / "metrics.csv", rows)
-
-    def _save(self, state: TrainState) -> None:
-        if self.directory is not None:
-            checkpoint.save(self.directory / "checkpoints", state)
+    def _save(self, state: TrainState, iteration: int) -> None:
+        """Save a checkpoint, unless the last update has spoiled an agent: then the checkpoint before it must stay."""
+        if not self.points:
+            require_finite_parameters(state.agent, iteration, self.records.last)
+        self.records.save(state)
 
     def _evaluate(self, program: Callable, state: TrainState, past: Evaluations, steps: int, diverged) -> Evaluations:
         """Evaluate on all splits, and append the result to the run's evaluations."""
@@ -315,22 +318,13 @@ class _Run:
         metrics = {name: append(past.metrics.get(name, none), x) for name, x in scores.metrics.items()}
         returns = append(past.returns, scores.returns)
         evaluations = Evaluations(np.append(past.steps, steps), returns, past.values, metrics)
-        if self.is_writer:
-            assert self.directory is not None
-            save_evaluations(self.directory / "evaluations.npz", evaluations)
+        self.records.save_evaluations(evaluations)
         means = ", ".join(f"{s} {x[~diverged, -1].mean():.0f}" for s, x in returns.items() if x.size)
         self.console.say(f"evaluation at {steps:,} steps: {means}")
         return evaluations
 
-    def _earlier_evaluations(self, steps: int) -> Evaluations:
-        """Return the evaluations of a resumed run up to a step; of a new run, empty ones."""
-        file = None if self.directory is None else self.directory / "evaluations.npz"
-        if steps and file is not None and file.exists():
-            past = load_evaluations(file)
-            kept = past.steps <= steps
-            upto = lambda splits: {split: x[:, kept] for split, x in splits.items()}
-            metrics = {name: upto(splits) for name, splits in past.metrics.items()}
-            return Evaluations(past.steps[kept], upto(past.returns), past.values, metrics)
+    def _no_evaluations(self) -> Evaluations:
+        """Return the evaluations of a run that has not begun."""
         tables = {split: self.env.tasks(split) for split in SPLITS}
         empty = lambda table: np.zeros((len(self.seeds), 0, len(table.id), self.plan.eval_episodes), np.float32)
         return Evaluations(
@@ -338,37 +332,3 @@ class _Run:
             returns={split: empty(table) for split, table in tables.items()},
             values={split: self.env.task_values(split) for split in SPLITS},
         )
-
-
-def _require_finite(bad_step: np.ndarray, first_step: int) -> None:
-    """Raise FloatingPointError with task and step if a number is not finite."""
-    if np.all(bad_step < 0):
-        return
-    step = int(np.min(bad_step[bad_step >= 0]))
-    seed, task = (int(i) for i in np.argwhere(bad_step == step)[0])
-    raise FloatingPointError(
-        f"numbers stopped being finite at step {first_step + step} of task {task} (number {seed} of the run's seeds); "
-        "a checkpoint, if there is one, is from before it. Try lower learning rates or max-gradient-norm"
-    )
-
-
-@contextlib.contextmanager
-def stop_signals() -> Iterator[list[int]]:
-    """Collect Ctrl-C and SIGTERM instead of stopping at once. A second Ctrl-C stops as usual."""
-    received: list[int] = []
-
-    def note(number, _frame) -> None:
-        received.append(number)
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    try:
-        before = [signal.signal(number, note) for number in numbers]
-    except ValueError:  # not in the main thread, where Python keeps signals
-        yield received
-        return
-    try:
-        yield received
-    finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)
