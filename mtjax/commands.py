@@ -8,13 +8,14 @@ import itertools
 import re
 import sys
 import textwrap
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 from mtjax.agents import AGENTS
 from mtjax.envs import ENVS, outline, varied
-from mtjax.names import InputError, nearest_error
+from mtjax.names import InputError, Notice, nearest_error
 
 PRESETS = ("auto", "cpu", "gpu")
 _KNOWN = (("environment", "env", ENVS), ("agent", "agent", AGENTS), ("preset", "preset", PRESETS))
@@ -27,6 +28,7 @@ _MAY_CHANGE = {  # the only flags beside --resume
     *("--resume", "--steps", "--import", "--distributed", "--profile", "--tensorboard", "--wandb")
 }
 _VARY = "--env.vary."
+_LONGEST = 600  # letters of a message
 _FIELD = re.compile(r"^    (\w+): ", re.MULTILINE)  # a line of a class that may be a setting
 P = TypeVar("P")
 
@@ -34,9 +36,10 @@ P = TypeVar("P")
 def main(run: Any) -> None:
     """Run a command's entry point. A mistake of the user prints one line and exits with code 2."""
     try:
-        run(sys.argv[1:])
+        with _plain_notices():
+            run(sys.argv[1:])
     except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {one_line(error)}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
@@ -47,6 +50,29 @@ def main(run: Any) -> None:
     except OSError as error:
         print(f"error: {error.strerror or error}: {error.filename or ''}".rstrip(": "), file=sys.stderr)
         sys.exit(2)
+
+
+def one_line(error: Exception) -> str:
+    """Return the message of an error in one line, without the middle of what is overlong, such as a value of a book."""
+    text = " ".join(str(error).split())
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST // 2]} ... {text[-_LONGEST // 2 :]}"
+
+
+@contextlib.contextmanager
+def _plain_notices() -> Iterator[None]:
+    """Print notices in one line each, without the place in the code."""
+    with warnings.catch_warnings():
+        others = warnings.showwarning
+
+        def show(message, category, *place) -> None:
+            if issubclass(category, Notice):
+                print(f"warning: {message}", file=sys.stderr, flush=True)
+            else:
+                others(message, category, *place)
+
+        warnings.showwarning = show
+        warnings.simplefilter("always", Notice)
+        yield
 
 
 def catalogue() -> str:
@@ -253,7 +279,9 @@ def parse_with_tyro(cls: type[P], argv: Sequence[str], default: P, name: str) ->
     except SystemExit as stop:
         if stop.code in (0, None):
             raise
-        message = re.sub(r"^Error parsing ((plan|training|family|learner): )?", "", _unframed(output.getvalue()))
+        message = re.sub(r"^Error parsing ((plan|training|family|learner)[.\w]*: )?", "", _unframed(output.getvalue()))
+        negated = r"^Unrecognized options: (--(\w+\.)*)no-(\S+).*"
+        message = re.sub(negated, r"\1\3 is no switch that could be off; give it a value", message)
         raise InputError(message or "the command line cannot be read; --help lists the flags") from None
 
 

@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal
 import jax
 import tyro
 
+from mtjax import __version__
 from mtjax.agents import AGENTS, BaseAgent, agent, preset_of, settings
 from mtjax.agents.choices import kinds_of, replace
 from mtjax.agents.parts import name_of
@@ -24,8 +25,10 @@ from mtjax.commands import is_imported, require_run
 from mtjax.envs import ENVS, make
 from mtjax.envs.family import Tabled
 from mtjax.loop import Settings
+from mtjax.names import require_values
 from mtjax.types import InputError
 
+_MOST_STEPS, _MOST_SEEDS, _MOST_EPISODES = 10**15, 10**5, 10**5
 NO_FINE_TUNING = "fine-tuning takes the networks of one family's tasks to other tasks of the same shapes"
 
 
@@ -46,11 +49,12 @@ class Plan:
 
     def __post_init__(self):
         check_fields(self)
+        require_values(self, steps=_MOST_STEPS, eval_every=_MOST_STEPS, seeds=_MOST_SEEDS, eval_episodes=_MOST_EPISODES)
         for field, least in (("steps", 1), ("seeds", 1), ("seed", 0), ("eval_every", 0), ("eval_episodes", 1)):
             if getattr(self, field) < least:
                 raise InputError(f"{field.replace('_', '-')} must be at least {least}, not {getattr(self, field)}")
         if self.seed + self.seeds > 2**31:
-            raise InputError(f"seed must be less than 2^31, as it is a 32-bit number, not {self.seed}")
+            raise InputError(f"seeds must end below 2^31, and {self.seed} + {self.seeds} does not")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -220,28 +224,44 @@ def from_json(path: Path) -> RunConfig:
     """
     require_run(path.parent)
     try:
-        record = json.loads(path.read_text())
-        imports = _imports(record)
-        return RunConfig(
-            env=record["env"],
-            agent=record["agent"],
-            preset=record["preset"],
-            runs=record["runs"],
-            start=record.get("start", ""),
-            sweep=tuple(record.get("sweep", ())),
-            points=tuple(record.get("points", ())),
-            imports=imports,
-            tensorboard=record.get("tensorboard", False),
-            wandb=record.get("wandb", ""),
-            plan=Plan(**record["plan"]),
-            training=Settings(**record["training"]),
-            family=make(record["env"], **record["family"]),
-            learner=agent(record["agent"], **record["learner"]),
-        )
-    except InputError as error:
-        raise _with_import(error, str(path.parent), record) from None
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{str(path)!r} does not describe a run: {type(error).__name__}: {error}") from None
+    try:
+        return _from_record(record)
+    except InputError as error:
+        asked = _with_import(error, str(path.parent), record)
+        if asked is not error:
+            raise asked from None
+        raise InputError(f"{str(path)!r}: {error}{_other_version(record)}") from None
+    except Exception as error:  # whatever an edited record makes of the classes it is read into
+        text = f"{str(path)!r} does not describe a run: {type(error).__name__}: {str(error)[:150]}"
+        raise InputError(text + _other_version(record)) from None
+
+
+def _from_record(record: Any) -> RunConfig:
+    config = RunConfig(
+        env=record["env"],
+        agent=record["agent"],
+        preset=record["preset"],
+        runs=record["runs"],
+        start=record.get("start", ""),
+        sweep=tuple(record.get("sweep", ())),
+        points=tuple(record.get("points", ())),
+        imports=_imports(record),
+        tensorboard=record.get("tensorboard", False),
+        wandb=record.get("wandb", ""),
+        plan=Plan(**record["plan"]),
+        training=Settings(**record["training"]),
+        family=make(record["env"], **record["family"]),
+        learner=agent(record["agent"], **record["learner"]),
+    )
+    require_values(config)
+    if not all(isinstance(word, str) for word in config.sweep):
+        raise InputError(f"sweep must be a list of texts, not {config.sweep}")
+    for point in config.points:
+        replace(config.learner, point)  # which checks the values
+    return config
 
 
 def _imports(record: Mapping[str, Any]) -> tuple[str, ...]:
@@ -262,3 +282,10 @@ def _with_import(error: InputError, run: str, record: Mapping[str, Any]) -> Inpu
     if (record["env"] not in ENVS and "+" not in record["env"]) or record["agent"] not in AGENTS:
         return InputError(f"{error}. If it is your own, give --import=FILE.py with the file that registers it")
     return error
+
+
+def _other_version(record: Any) -> str:
+    """Return a clause if another version of mtjax wrote a record, else an empty string."""
+    versions = record.get("versions") if isinstance(record, dict) else None
+    wrote = versions.get("mtjax") if isinstance(versions, dict) else None
+    return f" (mtjax {wrote} wrote it, and this is {__version__})" if wrote not in (None, __version__) else ""

@@ -8,6 +8,8 @@ from pathlib import Path
 from mtjax import commands
 from mtjax.names import SPLITS, InputError, load, nearest_error
 
+_MOST_EPISODES, _LARGEST_SEED = 100_000, 2_000_000_000
+
 
 @dataclasses.dataclass(frozen=True)
 class Request:
@@ -58,8 +60,12 @@ def _parse(argv: Sequence[str]) -> tuple[Request, dict[str, str]]:
     request = commands.parse_with_tyro(Request, argv, Request(), "python -m mtjax.evaluate")
     if not request.run:
         raise InputError("say which run to evaluate: --run=DIR")
-    if request.episodes < 1 or request.seed < 0 or request.checkpoint < 0:
-        raise InputError("episodes must be at least 1, and seed and checkpoint at least 0")
+    if not 1 <= request.episodes <= _MOST_EPISODES:
+        raise InputError(f"episodes must be at least 1 and at most {_MOST_EPISODES}, not {request.episodes}")
+    if not 0 <= request.seed <= _LARGEST_SEED:
+        raise InputError(f"seed must be at least 0 and at most {_LARGEST_SEED}, not {request.seed}")
+    if request.checkpoint < 0:
+        raise InputError(f"checkpoint must be at least 0, not {request.checkpoint}")
     if not 0 < request.video_seconds < math.inf:
         raise InputError(f"video-seconds must be greater than 0, not {request.video_seconds:g}")
     for split in request.video_splits:

@@ -1,6 +1,5 @@
 """Evaluation plays whole episodes under the mean action, on any tasks, with keys of its own."""
 
-import os
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -11,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mtjax.names import replacing
 from mtjax.rollout import Worlds, reset_envs, step_envs
 from mtjax.types import SPLITS, Agent, Array, Env, InputError, Task
 
@@ -35,28 +35,55 @@ def save_evaluations(path: Path, evaluations: Evaluations) -> None:
     """Write every episode: ``steps`` (V,), and for each split returns, metrics (S, V, T, episodes) and values (T,)."""
     values = {f"{split}_values": x for split, x in evaluations.values.items()}
     metrics = {f"{split}_{name}": x for name, splits in evaluations.metrics.items() for split, x in splits.items()}
-    new = path.with_suffix(".new.npz")
-    np.savez(new, steps=evaluations.steps, **evaluations.returns, **values, **metrics)  # type: ignore
-    os.replace(new, path)
+    with replacing(path) as new, new.open("wb") as file:
+        np.savez(file, steps=evaluations.steps, **evaluations.returns, **values, **metrics)  # type: ignore
 
 
 def load_evaluations(path: Path) -> Evaluations:
-    """Read a file that ``save_evaluations`` wrote.
+    """Read a file that ``save_evaluations`` wrote. The checksums inside the file tell whether it is damaged.
 
     Raises:
-        InputError: the file cannot be read.
+        InputError: the file cannot be read, or its arrays do not fit together.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             named = {name.removeprefix("train_") for name in file if name.startswith("train_")} - {"values"}
-            return Evaluations(
+            found = Evaluations(
                 file["steps"],
                 {split: file[split] for split in SPLITS},
                 {split: file[f"{split}_values"] for split in SPLITS},
                 {name: {split: file[f"{split}_{name}"] for split in SPLITS} for name in sorted(named)},
             )
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(f"cannot read evaluations from {str(path)!r}: {error}") from None
+    except FileNotFoundError:
+        raise InputError(f"there is no file {str(path)!r}") from None
+    except Exception as error:  # a damaged archive may raise anything
+        raise InputError(
+            f"cannot read evaluations from {str(path)!r}, which is damaged: {type(error).__name__}"
+        ) from None
+    _require_fit(path, found)
+    return found
+
+
+def _require_fit(path: Path, found: Evaluations) -> None:
+    """Check that returns (S, V, T, episodes) of all splits have the steps (V,), values (T,), S and episodes."""
+    arrays = [
+        found.steps,
+        *found.values.values(),
+        *(x for splits in (found.returns, *found.metrics.values()) for x in splits.values()),
+    ]
+    numbers = all(np.issubdtype(x.dtype, np.number) for x in arrays)
+    wanted = lambda split: (len(found.steps), *found.values[split].shape)
+    fits = (
+        numbers
+        and found.steps.ndim == 1
+        and all(
+            x.ndim == 4 and x.shape[1:3] == wanted(split) and x.shape[::3] == found.returns["train"].shape[::3]
+            for splits in (found.returns, *found.metrics.values())
+            for split, x in splits.items()
+        )
+    )
+    if not fits:
+        raise InputError(f"cannot read evaluations from {str(path)!r}: its arrays are not those of a run")
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))

@@ -137,3 +137,18 @@ def test_time_that_two_operations_share_counts_once(script):
     kernels = script("kernels")
     operations = [kernels.Operation("x", *times) for times in ((0, 2), (1, 0.5), (1.5, 1.5), (5, 1))]
     assert kernels.busy_seconds(operations) == 4
+
+
+@pytest.mark.parametrize(
+    "samples, flat",
+    [
+        ([*range(0, 300, 5), *[300] * 120], True),  # which grows at first
+        ([*range(300, 480)], False),
+        ([*[300] * 120, *[319] * 60], True),  # by less than 20 MB
+        ([*[5000] * 120, *[5090] * 60], True),  # by less than a fiftieth
+        ([*[5000] * 120, *[5110] * 60], False),
+    ],
+)
+def test_memory_that_grows_to_the_end_is_not_flat(script, samples, flat):
+    """By the medians of the second and the last third of a run."""
+    assert script("soak").judge(samples)[1] == flat

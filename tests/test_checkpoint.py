@@ -1,7 +1,9 @@
 """Checkpoints: they hold everything, two are kept, and what is damaged is said in a line."""
 
 import gc
+import resource
 import shutil
+import threading
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +12,7 @@ import pytest
 
 from mtjax import loop
 from mtjax.config import from_json
+from mtjax.names import Notice
 from mtjax.training import checkpoint
 from mtjax.types import InputError
 
@@ -108,19 +111,99 @@ def lose_metadata(folder):
         path.unlink()
 
 
-DAMAGES = [empty_files, halve_files, halve_data, lose_data, lose_agent, lose_metadata]
+def lose_sums(folder):
+    (folder / "checksums.txt").unlink()
 
 
-@pytest.mark.parametrize("read", [checkpoint.load, checkpoint.load_agent])
+DAMAGES = [empty_files, halve_files, halve_data, lose_data, lose_agent, lose_metadata, lose_sums]
+
+
 @pytest.mark.parametrize("damage", DAMAGES)
-def test_damage_is_an_input_error(copied_run, shapes, damage, read, capfd):
-    """One line that names the folder, whichever file is lost or cut short, and no noise from the threads that read."""
+def test_the_checkpoint_before_a_damaged_one_is_used(copied_run, shapes, damage, capfd):
+    """Whichever file is lost or cut short, and no noise from the threads that read."""
     damage(copied_run / "checkpoints" / "150")
-    with pytest.raises(InputError, match="checkpoint") as caught:
-        read(copied_run / "checkpoints", shapes)
-    assert "\n" not in str(caught.value) and str(copied_run) in str(caught.value)
-    assert len(str(caught.value)) < 400
+    with pytest.warns(Notice, match=r"150' is damaged: .* missing or has changed; .* is used, of iteration 100"):
+        assert int(checkpoint.load(copied_run / "checkpoints", shapes).iteration) == 100
+    with pytest.warns(Notice, match="of iteration 100"):
+        checkpoint.load_agent(copied_run / "checkpoints", shapes)
     gc.collect()  # when coroutines that nobody awaited complain
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("read", [checkpoint.load, checkpoint.load_agent, checkpoint.load_ring])
+def test_no_whole_checkpoint_is_an_input_error(copied_run, shapes, read, capfd):
+    """One line that names the newest one."""
+    for folder in (copied_run / "checkpoints").iterdir():
+        halve_files(folder)
+    with pytest.raises(InputError, match=r"150' is damaged: .*; there is no whole one before it") as caught:
+        read(copied_run / "checkpoints", shapes)
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 400
+    assert capfd.readouterr() == ("", "")
+
+
+def test_every_flipped_bit_is_noticed(copied_run):
+    """150 of them, in files of every kind; whole again, the checkpoint is whole."""
+    folder, random = copied_run / "checkpoints" / "150", np.random.default_rng(0)
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and path.stat().st_size)
+    assert {path.name for path in files} > {"checksums.txt", "_METADATA"}
+    for number in range(150):
+        file = files[number % len(files)]
+        before = file.read_bytes()
+        place, bit = random.integers(len(before)), random.integers(8)
+        file.write_bytes(before[:place] + bytes([before[place] ^ (1 << bit)]) + before[place + 1 :])
+        assert checkpoint._damage(folder, ("agent", "loop")), (file, place, bit)
+        file.write_bytes(before)
+    assert checkpoint._damage(folder, ("agent", "loop")) == ""
+
+
+def test_stray_folders_are_ignored(copied_run, shapes):
+    """Empty ones, names that only look like numbers, and those of other programs; files with a number for a name."""
+    folder = copied_run / "checkpoints"
+    for name in ("99999", "\u00b2", "\u0661", "150.new", "-1", "1e9"):
+        (folder / name).mkdir()
+    (folder / "88888").write_text("")
+    assert int(checkpoint.load(folder, shapes).iteration) == 150
+    (folder / "99999" / "notes.txt").write_text("mine")
+    with pytest.warns(Notice, match="99999' is damaged: checksums.txt is missing"):
+        assert int(checkpoint.load(folder, shapes).iteration) == 150
+
+
+def test_damaged_checkpoints_are_set_aside(copied_run, shapes):
+    """Under another name, so that nothing is lost and the run can write its own."""
+    folder = copied_run / "checkpoints"
+    checkpoint.set_aside(folder, 100)
+    assert {path.name for path in folder.iterdir()} == {"100", "150.damaged"}
+    assert int(checkpoint.load(folder, shapes).iteration) == 100
+
+
+def test_saving_does_not_wait(state, tmp_path, monkeypatch):
+    """The state may be overwritten at once: what is written is what it was."""
+    gate, seal = threading.Event(), checkpoint._finish
+    monkeypatch.setattr(checkpoint, "_finish", lambda *given: gate.wait(60) and seal(*given))
+    spoil = jax.jit(lambda tree: jax.tree.map(jnp.zeros_like, tree), donate_argnums=0)
+    agent = jax.tree.map(jnp.copy, state.agent)
+    writer = checkpoint.Writer(tmp_path)
+    writer.save(state._replace(agent=agent))
+    jax.block_until_ready(spoil(agent))
+    assert not (tmp_path / "150").exists()
+    gate.set()
+    writer.wait()
+    assert_equal(checkpoint.load_agent(tmp_path, state), state.agent)
+
+
+def test_a_full_disk_keeps_the_checkpoint_before(state, tmp_path, capfd):
+    """One error with the reason and the place, no page of log, and nothing half-written stays."""
+    checkpoint.save(tmp_path, at(state, 25))
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, before[1]))  # the system then refuses longer files
+    try:
+        with pytest.raises(OSError, match=r"File too large.*; the one before it stays") as caught:
+            checkpoint.save(tmp_path, at(state, 50))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert caught.value.filename == str(tmp_path / "50")
+    assert [path.name for path in tmp_path.iterdir()] == ["25"]
+    assert int(checkpoint.load(tmp_path, state).iteration) == 25
     assert capfd.readouterr() == ("", "")
 
 

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import io
+import json
 import os
 import re
 import shlex
@@ -12,6 +13,7 @@ import sys
 import tomllib
 from importlib import resources
 
+import jax
 import numpy as np
 import pytest
 from conftest import SHORT_RUN
@@ -27,8 +29,10 @@ from mtjax.agents.parts.representations import DeepMDP
 from mtjax.config import from_json, load_preset, to_json, wants_gpu, with_preset
 from mtjax.envs import ENVS
 from mtjax.loop import Settings
+from mtjax.names import notice
 from mtjax.training import launch
 from mtjax.training.folder import to_flags
+from mtjax.training.memory import explaining
 from mtjax.training.run import Plan
 from mtjax.types import InputError
 
@@ -264,7 +268,7 @@ def test_list_names_every_family_and_agent(capsys):
         ("--steps=1e6", "not '1e6'; write 1000000"),
         ("--steps", "--steps"),
         ("--env", "--env needs a value"),
-        ("--no-steps", "--no-steps"),
+        ("--no-steps", "--steps is no switch"),
         ("finger-spin", "finger-spin"),
         ("-x", "-x"),
         ("--agent.hidden wide", "wide"),
@@ -272,12 +276,12 @@ def test_list_names_every_family_and_agent(capsys):
         ("--agent.conditioning=onehot", "onehot"),
         ("--agent.shared-temperature=yes", "yes"),
         ("--seed=-1", "seed must be at least 0"),
-        ("--seed=3000000000", "seed must be less than 2^31"),
+        ("--seed=3000000000", "seed must be at most 2147483647"),
         ("--steps=0", "steps must be at least 1"),
         ("--num-envs=0", "num-envs must be at least 1"),
         ("--replay-size=3", "must hold one step of num-envs"),
         ("--agent.gamma=1.5", "gamma must be in [0, 1]"),
-        ("--agent.actor-lr=nan", "actor-lr must be greater than 0"),
+        ("--agent.actor-lr=nan", "actor-lr must be a finite number, not nan"),
         ("--agent.max-gradient-norm=-1", "max-gradient-norm must be"),
         ("--agent.conditioning=embedding --agent.embedding-size=0", "embedding-size must be"),
         ("--agent=care --agent.expert-widths 8 0", "expert"),
@@ -288,6 +292,26 @@ def test_list_names_every_family_and_agent(capsys):
         ("--agent.conditioning=vectors", "go together"),
         ("--agent.vectors=x.npy", "go together"),
         ("--agent.conditioning=vectors --agent.vectors=missing.npy", "cannot read task vectors from 'missing.npy'"),
+        ("--seeds=99999999999999999999", "seeds must be at most 100000, not 99999999999999999999"),
+        ("--steps=99999999999999999999", "steps must be at most 1000000000000000"),
+        ("--updates-per-step=99999999999", "updates-per-step must be at most 2147483647"),
+        ("--agent.actor-lr=inf", "actor-lr must be a finite number, not inf"),
+        ("--agent.critic-lr=1e39", "critic-lr must be a finite number, not 1e+39"),
+        ("--agent.weight-decay=inf", "weight-decay must be a finite number, not inf"),
+        ("--agent.target-entropy=nan", "target-entropy must be a finite number, not nan"),
+        ("--agent=ppo --agent.unroll=1000000000", "unroll must be at least 1 and at most 100000"),
+        ("--agent.no-sampler", "--agent.sampler is no switch that could be off; give it a value"),
+        ("--env.task-seed=-1", "task-seed must be at least 0, not -1"),
+        ("--env.vary.size=1:1:1", "1:1:1 asks for one value of size; give it alone, or a range of at least two"),
+        ("--env.vary.gear=1:2:1000000000", "gear can have 10000 values at most, each of which is a task"),
+        (
+            "--env.vary.gear=1:2:1000 --env.vary.size=1:1.1:1000",
+            "the grid has 1000000 tasks, and 10000 are most",
+        ),
+        ("--env.vary.mass=1e300", "mass must be greater than 0 and at most 1e+30, not 1e+300"),
+        ("--env=walker-walk --env.vary.torso-mass=1e308", "torso-mass must be greater than 0 and at most 1e+30"),
+        ("--env.vary.size=1e15", "FingerSpin with size=1e+15 has a body_mass beyond 32-bit numbers"),
+        ("--env.vary.size=1e-8", "MuJoCo cannot build FingerSpin with size=1e-08: "),
         ("--resume=nowhere", "'nowhere' is not a run"),
         ("--resume=", "not a run"),
         ("--resume nowhere --num-envs=3", "only --steps may change, not --num-envs"),
@@ -316,6 +340,8 @@ def test_messages_do_not_depend_on_the_terminal(complaint, monkeypatch, encoding
         ("--run=nowhere", "'nowhere' is not a run"),
         ("--runs=x", "unknown flag '--runs'; did you mean '--run'?"),
         ("--run=x --episodes=0", "episodes must be at least 1"),
+        ("--run=x --episodes=1000000", "and at most 100000, not 1000000"),
+        ("--run=x --seed=2147483647", "seed must be at least 0 and at most 2000000000"),
         ("--run=x --episodes=some", "some"),
     ],
 )
@@ -357,15 +383,47 @@ def test_record_of_a_family_that_is_gone_is_refused(complaint, finished_run, tmp
     assert "unknown environment 'finger-shirt'" in complaint("train", f"--resume={tmp_path}")
 
 
-def test_damaged_checkpoint_is_refused(complaint, copied_run):
-    """By both programs; the folder stays as it is."""
-    for file in (copied_run / "checkpoints" / "150").rglob("*"):
+def test_damaged_checkpoints_are_refused(complaint, copied_run):
+    """By both programs, if none is whole; the folder stays as it is."""
+    for file in (copied_run / "checkpoints").rglob("*"):
         if file.is_file():
             file.write_bytes(b"")
     before = sorted(copied_run.rglob("*"))
-    assert "checkpoint" in complaint("train", f"--resume={copied_run}")
-    assert "checkpoint" in complaint("evaluate", f"--run={copied_run}")
+    assert "150' is damaged" in complaint("train", f"--resume={copied_run}")
+    assert "150' is damaged" in complaint("evaluate", f"--run={copied_run}")
     assert sorted(copied_run.rglob("*")) == before
+
+
+def test_record_of_another_version_is_told(complaint, finished_run, tmp_path):
+    """Where it cannot be read; and one that can is read."""
+    record = json.loads((finished_run / "config.json").read_text())
+    record["versions"]["mtjax"] = "9.9"
+    (tmp_path / "config.json").write_text(json.dumps(record))
+    assert from_json(tmp_path / "config.json").env == "finger-short"
+    record["learner"]["believe"] = "least"
+    (tmp_path / "config.json").write_text(json.dumps(record))
+    said = complaint("evaluate", f"--run={tmp_path}")
+    assert "'believe'" in said and "(mtjax 9.9 wrote it, and this is 0.1.0)" in said
+
+
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        (["--agent.hidden", "99999999"], "GB of networks, "),
+        (["--replay-size=2147483647", "--num-envs=2"], "lower --replay-size, --num-envs or --seeds"),
+    ],
+)
+def test_what_no_memory_could_hold_is_refused(complaint, short_family, tmp_path, words, said):
+    """With the sizes, before anything compiles."""
+    assert said in complaint("train", "--env=finger-short", f"--runs={tmp_path}", *words)
+
+
+def test_running_out_of_memory_is_one_line():
+    """With what would help. Other errors of the device are shown as they are."""
+    with pytest.raises(InputError, match=r"out of memory \(RESOURCE_EXHAUSTED: .*\); lower --num-envs"), explaining():
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 5 bytes.\nand more")
+    with pytest.raises(jax.errors.JaxRuntimeError), explaining():
+        raise jax.errors.JaxRuntimeError("INTERNAL: no device")
 
 
 def test_place_that_cannot_be_written_is_refused(complaint, tmp_path):
@@ -399,6 +457,18 @@ def test_errors_of_a_run_are_one_line(capsys, error, code, said):
     with pytest.raises((SystemExit, KeyboardInterrupt)) as stop:  # an interrupt let through would end pytest
         commands.main(fails)
     assert getattr(stop.value, "code", None) == code and capsys.readouterr().err == said
+
+
+def test_what_is_overlong_is_shortened():
+    """A message stays a line of readable length, with its beginning and its end."""
+    told = commands.one_line(InputError(f"unknown split {'9' * 5000!r};\nchoose from: dense"))
+    assert told.startswith("unknown split '999") and told.endswith("999'; choose from: dense") and len(told) < 620
+
+
+def test_notices_are_one_line(capsys):
+    """On the error stream, without the place in the code."""
+    commands.main(lambda _: notice("the file is damaged"))
+    assert capsys.readouterr() == ("", "warning: the file is damaged\n")
 
 
 def test_errors_of_ours_are_not_hidden():

@@ -199,7 +199,7 @@ def test_two_processes_are_one_run(tmp_path):
             process.kill()
             process.stdout.close()
             process.wait()
-    assert [process.returncode for process in both] == [0, 0], said
+    assert [process.returncode for process in both] == [143, 143], said
     assert "devices: 2 of 2 in 2 processes, 1 seed on each" in said[0] and "stopped; the state is saved" in said[0]
     assert "run:" not in said[1] and "compiled" not in said[1]
 

@@ -288,7 +288,7 @@ def test_other_values_are_scored_as_the_run_scores_them(copied_run, capsys):
         (["--env.vary.size"], "--env.vary.size needs values"),
         (["--env.vary.size=1,2", "--diagnostics"], "diagnostics are of the run's own tasks"),
         (["--checkpoint=7"], "has no checkpoint 7; it has 100, 150"),
-        (["--checkpoint=-7"], "checkpoint at least 0"),
+        (["--checkpoint=-7"], "checkpoint must be at least 0"),
     ],
 )
 def test_wrong_values_and_checkpoints_are_refused(copied_run, words, said):
@@ -355,7 +355,9 @@ def test_resume_extends_and_the_hint_goes_on(finished_run, copied_run, capsys, m
         return train(*arguments, **settings, on_chunk=lambda _: os.kill(os.getpid(), signal.SIGINT))
 
     monkeypatch.setattr(launch, "train", stops)
-    mtjax.train.main(["--resume", str(copied_run), "--steps=1000"])
+    with pytest.raises(SystemExit) as stop:
+        mtjax.train.main(["--resume", str(copied_run), "--steps=1000"])
+    assert stop.value.code == 130
     hint = capsys.readouterr().out.splitlines()[-1]
     assert hint.startswith("  python -m mtjax.train ")
     monkeypatch.undo()

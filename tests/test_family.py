@@ -230,7 +230,7 @@ def test_friction_of_zero_never_reaches_mjx():
         ("finger-spin", {"vary": {"size": [1.0, np.inf]}}, "size must be"),
         ("finger-spin", {"vary": {"size": "1:x:3"}}, "cannot read the values '1:x:3' of size; give lo:hi:n"),
         ("finger-spin", {"vary": {"size": "1.2:1:3"}}, "the range of size must go from low to high, not 1.2:1:3"),
-        ("finger-spin", {"vary": {"size": "1:1.2:0"}}, "size has no values"),
+        ("finger-spin", {"vary": {"size": "1:1.2:0"}}, "asks for 0 values of size"),
         (
             "finger-spin",
             {"vary": {"size": [1.0, 1.2]}, "split": "hip-bmdp"},

@@ -5,6 +5,7 @@ import csv
 import numpy as np
 import pytest
 
+from mtjax.names import Notice
 from mtjax.training import log
 
 
@@ -28,14 +29,47 @@ def test_truncation_keeps_an_iteration_and_what_is_before_it(tmp_path):
     log.append_rows(path, rows)
     assert log.truncate_rows(path, 20) == 2.0
     assert read(path) == [{k: str(v) for k, v in row.items()} for row in rows[:4]]
-    assert log.truncate_rows(path, 5) == 0.0 and read(path) == []
+    assert log.truncate_rows(path, 0) == 0.0 and read(path) == []
     log.append_rows(path, rows[:1])
     assert len(read(path)) == 1 and list(tmp_path.iterdir()) == [path]
 
 
-def test_truncation_of_no_file_is_nothing(tmp_path):
-    """A run that was resumed before its first row."""
-    assert log.truncate_rows(tmp_path / "metrics.csv", 3) == 0.0 and not list(tmp_path.iterdir())
+def test_a_missing_file_is_told(tmp_path):
+    """Unless the run was resumed before its first row."""
+    assert log.truncate_rows(tmp_path / "metrics.csv", 0) == 0.0
+    with pytest.warns(Notice, match=r"metrics.csv' is missing; the run goes on without its earlier rows"):
+        assert log.truncate_rows(tmp_path / "metrics.csv", 3) == 0.0
+    assert not list(tmp_path.iterdir())
+
+
+LINES = "seed,iteration,seconds,x", "0,10,1.5,3", "0,20,2.5,4", "0,30,3.5,5"
+
+
+@pytest.mark.parametrize(
+    "content, left",
+    [
+        (b"", 0),
+        (b"\0" * 90, 0),
+        (b"\xff\xfe\x00binary\n\x80\x81", 0),
+        ("\n".join(LINES[1:]).encode(), 0),  # without its header
+        (b"seed,iteration\n0,10\n0,20\n", 0),
+        (b"x" * 200_000, 0),
+        ("\n".join([*LINES[:2], "0,20," + "9" * 200_000, ""]).encode(), 1),
+        ("\n".join([LINES[0], "0,10,fast,3", *LINES[2:]]).encode(), 1),
+        ("\n".join([LINES[0], "0,\u00b2,1.5,3", *LINES[2:]]).encode(), 1),
+        ("\n".join([*LINES[:2], "0,2"]).encode(), 1),
+    ],
+)
+def test_what_can_be_read_of_a_damaged_file_is_kept(tmp_path, content, left):
+    """The damaged file is kept too, a notice says so, and rows can be written again."""
+    path = tmp_path / "metrics.csv"
+    path.write_bytes(content)
+    with pytest.warns(Notice, match=f"is damaged: {left} rows .* kept as 'metrics.damaged.csv'"):
+        log.truncate_rows(path, 20)
+    assert (tmp_path / "metrics.damaged.csv").read_bytes() == content
+    log.append_rows(path, [{"seed": 0, "iteration": 30, "seconds": "3.5", "x": 5}])
+    rows = read(path)
+    assert len(rows) == left + 1 and rows[-1] == {"seed": "0", "iteration": "30", "seconds": "3.5", "x": "5"}
 
 
 def test_rows_are_means_over_tasks_and_each_tasks_return():

@@ -1,13 +1,20 @@
 """The host loop: what a run leaves behind, that it repeats to the bit, and that it stops and goes on cleanly."""
 
+import contextlib
 import csv
 import dataclasses
+import errno
+import io
 import json
 import os
 import pathlib
+import pickle
+import re
+import resource
 import shlex
 import shutil
 import signal
+import sys
 import threading
 import types
 
@@ -20,14 +27,17 @@ from conftest import SHORT_RUN
 
 import mtjax
 import mtjax.train
-from mtjax import cli, loop
+from mtjax import cli, commands, loop
 from mtjax.config import Plan, from_json
-from mtjax.evaluation import load_evaluations
+from mtjax.evaluation import load_evaluations, save_evaluations
 from mtjax.loop import Settings
-from mtjax.training import checkpoint, traced
+from mtjax.names import Notice
+from mtjax.training import checkpoint, log, run, traced
 from mtjax.training.folder import new_directory
 from mtjax.training.programs import enable_compile_cache
-from mtjax.training.run import fit_chunk, stop_signals, train
+from mtjax.training.records import Records
+from mtjax.training.run import fit_chunk, train
+from mtjax.training.stops import require_finite, stop_signals
 from mtjax.types import InputError
 
 CLOCKS = {"seconds", "wall_seconds"}
@@ -263,6 +273,113 @@ def test_broken_run_goes_on_from_its_last_checkpoint(play, whole, tmp_path):
     assert_same_run(play(tmp_path, resume=True), whole)
 
 
+def test_run_that_died_before_its_first_checkpoint_starts_over(play, whole, tmp_path, capsys):
+    """What it left in its folder does no harm; the line says that it starts over."""
+
+    def breaks():
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        play(tmp_path, on_chunk=after(1, breaks))
+    assert len(rows_of(tmp_path)) == 2
+    (tmp_path / "checkpoints" / "25.new" / "agent").mkdir(parents=True)
+    (tmp_path / "evaluations.npz").write_bytes(b"half")
+    assert_same_run(play(tmp_path, resume=True, quiet=False), whole)
+    assert "there is no checkpoint yet, so the run starts over" in capsys.readouterr().out
+    assert {path.name for path in (tmp_path / "checkpoints").iterdir()} == {"100", "150"}
+
+
+def test_a_run_goes_on_from_the_checkpoint_before_a_damaged_one(play, whole, tmp_path):
+    """To the same bytes; the damaged one is kept under another name."""
+    shutil.copytree(whole.directory, tmp_path, dirs_exist_ok=True)
+    file = max((tmp_path / "checkpoints" / "150").rglob("d/*"), key=lambda path: path.stat().st_size)
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.write_bytes(content)
+    with pytest.warns(Notice, match="150' is damaged: .* is used, of iteration 100"):
+        assert_same_run(play(tmp_path, resume=True), whole)
+    assert {path.name for path in (tmp_path / "checkpoints").iterdir()} == {"100", "150", "150.damaged"}
+
+
+def test_a_folder_that_holds_a_run_is_not_overwritten(play, whole):
+    """By a new run that was not meant to go on with it."""
+    before = rows_of(whole.directory)
+    with pytest.raises(InputError, match="holds a run; resume it, or choose another folder"):
+        play(whole.directory)
+    assert rows_of(whole.directory) == before
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EROFS])
+def test_a_checkpoint_that_cannot_be_written_ends_the_run(play, whole, tmp_path, monkeypatch, number):
+    """With reason and path. The one before stays, and the run goes on from there once there is room."""
+    ask = checkpoint._shortage
+    monkeypatch.setattr(
+        checkpoint, "_shortage", lambda folder, size: number if folder.name == "100" else ask(folder, size)
+    )
+    with pytest.raises(OSError, match=re.escape(os.strerror(number))) as caught:
+        play(tmp_path)
+    assert caught.value.filename == str(tmp_path / "checkpoints" / "100")
+    assert {path.name for path in (tmp_path / "checkpoints").iterdir()} == {"50"}
+    monkeypatch.undo()
+    assert_same_run(play(tmp_path, resume=True), whole)
+
+
+def test_a_checkpoint_that_fails_later_is_told_all_the_same(play, tmp_path, monkeypatch):
+    """By the next chunk, or at the end: no run ends well whose last checkpoint is missing."""
+
+    def breaks(*_):
+        raise OSError(errno.EIO, "checkpoint not written", "somewhere")
+
+    monkeypatch.setattr(checkpoint, "_finish", breaks)
+    with pytest.raises(OSError, match="checkpoint not written"):
+        play(tmp_path, steps=100)
+
+
+@contextlib.contextmanager
+def files_of_at_most(size):
+    """Make the system refuse longer files, as a full disk does."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_full_disk_is_told_with_the_file(tmp_path):
+    """The system leaves the name out."""
+    with files_of_at_most(100), pytest.raises(OSError, match="File too large") as caught:
+        log.append_rows(tmp_path / "metrics.csv", [{"x": "1" * 200}])
+    assert caught.value.filename == str(tmp_path / "metrics.csv")
+
+
+def test_a_full_disk_leaves_the_file_before(whole, tmp_path):
+    """And no half of a new one."""
+    file = shutil.copy(whole.directory / "evaluations.npz", tmp_path / "evaluations.npz")
+    with files_of_at_most(100), pytest.raises(OSError, match="File too large") as caught:
+        save_evaluations(file, whole.evaluations)
+    assert caught.value.filename == str(file) and list(tmp_path.iterdir()) == [file]
+    assert_same_evaluations(load_evaluations(file), whole.evaluations)
+
+
+def test_lost_evaluations_are_told(play, whole, tmp_path):
+    """The run goes on without those before."""
+    shutil.copytree(whole.directory, tmp_path, dirs_exist_ok=True)
+    shutil.rmtree(tmp_path / "checkpoints" / "150")
+    (tmp_path / "evaluations.npz").unlink()
+    with pytest.warns(Notice, match=r"evaluations.npz' is missing; the run goes on"):
+        assert play(tmp_path, resume=True).evaluations.steps.tolist() == [600]
+
+
+def test_evaluations_of_another_run_are_refused(play, whole, tmp_path):
+    """As they would be joined with this run's."""
+    shutil.copytree(whole.directory, tmp_path, dirs_exist_ok=True)
+    with np.load(whole.directory / "evaluations.npz") as file:
+        np.savez(tmp_path / "evaluations.npz", **{k: x[:1] if x.ndim == 4 else x for k, x in file.items()})
+    with pytest.raises(InputError, match="of other tasks, seeds or episodes; move it away"):
+        play(tmp_path, resume=True)
+
+
 def test_evaluations_after_the_checkpoint_are_dropped(play, whole, tmp_path):
     """A run that died between an evaluation and its checkpoint evaluates again, under the same number."""
     shutil.copytree(whole.directory, tmp_path, dirs_exist_ok=True)
@@ -341,11 +458,43 @@ def test_not_finite_numbers_stop_the_run_and_spare_the_checkpoint(play, whole, t
     shutil.copytree(whole.directory, directory)
     load, before = checkpoint.load, rows_of(directory)
     monkeypatch.setattr(checkpoint, "load", lambda *arguments: poison(load(*arguments)))
-    with pytest.raises(FloatingPointError, match=rf"finite at step 150 of task {task} \(number 1 of the run's seeds\)"):
+    told = rf"finite at step 150 of task {task} \(number 1 of the run's seeds\); the last checkpoint is '.*/150'"
+    with pytest.raises(FloatingPointError, match=told):
         play(directory, resume=True, steps=800)
     assert rows_of(directory) == before
     monkeypatch.undo()
     assert bytes_of(checkpoint.load(directory / "checkpoints", whole.state)) == bytes_of(whole.state)
+
+
+def test_spoiled_parameters_are_not_saved(play, tmp_path, monkeypatch):
+    """Those of a chunk's last update, which none of its losses has seen."""
+    spoil = lambda agent: agent._replace(actor=jax.tree.map(lambda x: x.at[1].set(jnp.nan), agent.actor))
+    check = run.require_finite_parameters
+    late = lambda agent, step, last: check(spoil(agent) if step == 100 else agent, step, last)
+    monkeypatch.setattr(run, "require_finite_parameters", late)
+    with pytest.raises(FloatingPointError, match=r"before step 100 \(number 1 .*; the last checkpoint is '.*/50'"):
+        play(tmp_path)
+    assert {path.name for path in (tmp_path / "checkpoints").iterdir()} == {"50"}
+
+
+def test_before_the_first_checkpoint_there_is_none_to_name(tmp_path):
+    """The message says so."""
+    with pytest.raises(FloatingPointError, match=r"step 12 of task 0 .*; there is no checkpoint from before it"):
+        require_finite(np.array([[2, -1]]), 10, Records(tmp_path).last)
+
+
+@pytest.mark.parametrize("number, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_stopped_run_exits_with_the_signal(short_family, tmp_path, monkeypatch, capsys, number, code):
+    """After saving, so that no script takes it for finished."""
+    monkeypatch.setattr(sys, "argv", ["train", *SHORT_RUN, f"--runs={tmp_path}"])
+    metrics, pid = log.metric_rows, os.getpid()
+    monkeypatch.setattr(log, "metric_rows", lambda *given: (os.kill(pid, number), metrics(*given))[1])
+    with pytest.raises(SystemExit) as stop:
+        commands.main(mtjax.train.main)
+    (directory,) = tmp_path.iterdir()
+    assert stop.value.code == code and f"--resume={directory}" in capsys.readouterr().out
+    assert {path.name for path in directory.iterdir()} == {"config.json", "metrics.csv", "checkpoints"}
+    assert [path.name for path in (directory / "checkpoints").iterdir()] == ["25"]
 
 
 # Arguments.
@@ -377,11 +526,55 @@ def test_full_disk_is_met_before_training(play, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_damaged_evaluations_are_an_input_error(tmp_path):
-    """The message names the file."""
-    (tmp_path / "evaluations.npz").write_bytes(b"PK not a zip file")
-    with pytest.raises(InputError, match=r"cannot read evaluations from .*evaluations\.npz"):
+class Harm:
+    """Makes a file when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return (pathlib.Path.touch, (self.path,))
+
+
+def damaged_evaluations(name, whole, harm):
+    """The content of a damaged evaluations.npz."""
+    file = io.BytesIO()
+    arrays = dict(np.load(io.BytesIO(whole)))
+    match name:
+        case "empty" | "junk" | "zeroed":
+            return {"empty": b"", "junk": b"PK not a zip file", "zeroed": bytes(len(whole))}[name]
+        case "truncated":
+            return whole[: len(whole) // 2]
+        case "flipped":
+            place = whole.index(arrays["train"].tobytes())
+            return whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :]
+        case "one array":
+            np.save(file, arrays["train"])
+        case "pickle":
+            pickle.dump(Harm(harm), file)
+        case "objects":
+            np.savez(file, **{**arrays, "train": np.array([Harm(harm)], object)}, allow_pickle=True)
+        case "text":
+            np.savez(file, **{**arrays, "steps": np.array(["a"])})
+        case "other shapes":
+            np.savez(file, **{**arrays, "train": arrays["train"][:, :1]})
+        case "no steps":
+            np.savez(file, **{k: x for k, x in arrays.items() if k != "steps"})
+    return file.getvalue()
+
+
+@pytest.mark.parametrize(
+    "name",
+    [*"empty junk zeroed truncated flipped pickle objects text".split(), "one array", "other shapes", "no steps"],
+)
+def test_damaged_evaluations_are_an_input_error(whole, tmp_path, name):
+    """One line that names the file; no code in it runs, and nobody advises to let it."""
+    content = damaged_evaluations(name, (whole.directory / "evaluations.npz").read_bytes(), tmp_path / "harm")
+    (tmp_path / "evaluations.npz").write_bytes(content)
+    with pytest.raises(InputError, match=r"cannot read evaluations from .*evaluations\.npz") as caught:
         load_evaluations(tmp_path / "evaluations.npz")
+    assert "\n" not in str(caught.value) and "allow_pickle" not in str(caught.value)
+    assert not (tmp_path / "harm").exists()
 
 
 @pytest.mark.parametrize("place, folder", [("0", None), ("/some/where", "/some/where")])

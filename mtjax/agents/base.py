@@ -21,6 +21,7 @@ from mtjax.agents.parts.samplers import Sampler
 from mtjax.agents.parts.scaling import SCALINGS, Scaling
 from mtjax.agents.parts.trajectory import Past, Seen, TrajectoryEncoder
 from mtjax.experience import Replay, multistep
+from mtjax.names import require_values
 from mtjax.networks import Network, Params
 from mtjax.types import Acted, Array, Env, InputError, Key, Metrics, Outcome, Spec, Task, Transition
 
@@ -142,6 +143,8 @@ class BaseAgent(abc.ABC):
         for kind in kinds_of(self):
             object.__setattr__(self, kind, parts.choose(kind, PARTS[kind], getattr(self, kind)))
         parts.require_choices(self)
+        for holder in (self, *(getattr(self, kind) for kind in kinds_of(self))):
+            require_values(holder)
         self._check_numbers()
         self._check_combination()
 

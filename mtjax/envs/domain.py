@@ -161,10 +161,28 @@ class Domain(Family):
         """Return the compiled model of every row of the table. Rows that differ only in goals share one."""
         names = [name for name in self.values if self.parameters[name].edit is not None]
         rows = list(zip(*(self.values[name].tolist() for name in names), strict=True))
-        compiled = {row: self.compile_spec(dict(zip(names, row, strict=True))).compile() for row in dict.fromkeys(rows)}
+        compiled = {row: self._compile(dict(zip(names, row, strict=True))) for row in dict.fromkeys(rows)}
         if not names:
-            return (self.compile_spec().compile(),) * self.count
+            return (self._compile({}),) * self.count
         return tuple(compiled[row] for row in rows)
+
+    def _compile(self, values: Mapping[str, float]) -> mujoco.MjModel:
+        """Return the compiled model with these parameter values.
+
+        Raises:
+            InputError: MuJoCo refuses them, or the model has numbers beyond 32 bits.
+        """
+        given = ", ".join(f"{name}={value:g}" for name, value in values.items()) or "its own values"
+        try:
+            model = self.compile_spec(values).compile()
+        except ValueError as error:
+            reason = str(error).strip().splitlines()[0][:150] if str(error).strip() else "no reason given"
+            raise InputError(f"MuJoCo cannot build {type(self).__name__} with {given}: {reason}") from None
+        for name in VARIABLE:
+            field = np.asarray(attrgetter(name)(model))
+            if np.any(np.isfinite(field) & (np.abs(field) > np.finfo(np.float32).max)) or np.any(np.isnan(field)):
+                raise InputError(f"{type(self).__name__} with {given} has a {name} beyond 32-bit numbers")
+        return model
 
     def build(self) -> dict[str, dict[str, Any]]:
         """Return the "model" and "goal" leaves (R, ...) of every row of the table."""

@@ -16,6 +16,7 @@ import tyro
 from mtjax.envs import variation
 from mtjax.envs.parameters import Parameter
 from mtjax.maps import Flat
+from mtjax.names import require_values
 from mtjax.types import SPLITS, Array, InputError, Key, Spec, Step, Task, Transition
 
 _MAX_DRAWS = 1000
@@ -182,8 +183,11 @@ class Family(Flat, Tabled):
         if self.context_ranges is not None:
             ranges = tuple((str(name), float(low), float(high)) for name, low, high in self.context_ranges)
             object.__setattr__(self, "context_ranges", ranges)
+        require_values(self, num_tasks=variation.MOST_TASKS, num_draws=variation.MOST_TASKS)
         if self.num_draws < 1 or self.num_tasks < 1:
             raise InputError("num-tasks and num-draws must be at least 1")
+        if self.task_seed < 0:
+            raise InputError(f"task-seed must be at least 0, not {self.task_seed}")
         _ = self.variation
 
     # What a family gives.

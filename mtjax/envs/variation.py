@@ -1,5 +1,6 @@
 """The values of a family's parameters in every task, and the split into training and held-out tasks."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -11,6 +12,8 @@ from mtjax.names import InputError, nearest_error
 COMBINATIONS = ("grid", "paired", "random")
 SCHEMES = ("dense", "hip-bmdp", "none")
 _HIP_BMDP = {"train": (3, 4, 7, 8), "interpolation": (5, 6), "extrapolation": (2, 9)}
+MOST_TASKS = 10_000
+_LARGEST = 1e30  # beyond it, 32-bit numbers overflow in the physics
 _FORMS = "lo:hi:n (n even steps), lo:hi (a new value each episode) or a list a,b,c"
 
 
@@ -50,27 +53,29 @@ def read_axis(name: str, text: str, parameter: Parameter) -> Axis:
     Raises:
         InputError: the text is none of these, or a value is outside the parameter's range.
     """
+    if not text.strip():
+        raise InputError(f"{name} has no values; give {_FORMS}")
+    parts = text.split(":")
     try:
-        parts = text.split(":")
-        if len(parts) == 1:
-            axis = Axis(np.array([float(x) for x in text.split(",")]), False)
-        elif len(parts) == 2:
-            axis = Axis(np.array([float(x) for x in parts]), True)
-        else:
-            low, high, count = parts
-            axis = Axis(np.linspace(float(low), float(high), int(count)), False)
-            if int(count) == 1:
-                raise InputError(f"{text} asks for one value of {name}; give it alone, or a range of at least two")
+        numbers = [float(x) for x in (text.split(",") if len(parts) == 1 else parts[:2])]
+        count = int(parts[2]) if len(parts) == 3 else len(numbers)
+        if len(parts) > 3:
+            raise ValueError
     except ValueError:
         raise InputError(f"cannot read the values {text!r} of {name}; give {_FORMS}") from None
-    if not axis.points.size:
-        raise InputError(f"{name} has no values; give {_FORMS}")
+    if count > MOST_TASKS:
+        raise InputError(f"{name} can have {MOST_TASKS} values at most, each of which is a task, not {count}")
+    if len(parts) == 3 and count < 2:
+        asked = "one value" if count == 1 else f"{count} values"
+        raise InputError(f"{text} asks for {asked} of {name}; give it alone, or a range of at least two")
+    wrong = next((x for x in numbers if not abs(x) <= _LARGEST or not _allowed(x, parameter)), None)
+    if wrong is not None:
+        most = min(parameter.maximum, _LARGEST)
+        limit = f" and at most {most:g}" if most < _LARGEST or not wrong <= most else ""
+        raise InputError(f"{name} must be greater than {parameter.minimum:g}{limit}, not {wrong:g}")
+    axis = Axis(np.linspace(numbers[0], numbers[1], count) if len(parts) == 3 else np.array(numbers), len(parts) == 2)
     if len(parts) > 1 and float(parts[1]) <= float(parts[0]) and axis.points.size > 1:
         raise InputError(f"the range of {name} must go from low to high, not {text}")
-    wrong = next((x for x in axis.points if not np.isfinite(x) or not _allowed(x, parameter)), None)
-    if wrong is not None:
-        limit = "" if np.isinf(parameter.maximum) else f" and at most {parameter.maximum:g}"
-        raise InputError(f"{name} must be greater than {parameter.minimum:g}{limit}, not {wrong:g}")
     return axis
 
 
@@ -202,6 +207,9 @@ def _combine(points: list[np.ndarray], combine: str) -> np.ndarray:
             raise InputError(f"combine=paired needs as many values of each parameter, not {sorted(counts)}")
         rows = np.stack([np.broadcast_to(p, max(counts)) for p in points], axis=1) if points else np.zeros((1, 0))
     else:
+        count = math.prod(len(p) for p in points)
+        if count > MOST_TASKS:
+            raise InputError(f"the grid has {count} tasks, and {MOST_TASKS} are most; give fewer values")
         if any(np.any(np.diff(p) <= 0) and np.any(np.diff(p) >= 0) for p in points):
             raise InputError("the values of a parameter must increase (or decrease), and these do not")
         rows = (

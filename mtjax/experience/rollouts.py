@@ -8,6 +8,8 @@ import jax.numpy as jnp
 from mtjax.maps import over_seeds
 from mtjax.types import Array, Env, InputError, Key, Metrics, Task, Transition
 
+_LONGEST = 100_000
+
 
 @dataclasses.dataclass(frozen=True)
 class Rollouts:
@@ -22,8 +24,8 @@ class Rollouts:
     warmup_steps: ClassVar[int] = 0  # no action is random before learning
 
     def __post_init__(self):
-        if self.unroll < 1:
-            raise InputError(f"unroll must be at least 1, not {self.unroll}")
+        if not 1 <= self.unroll <= _LONGEST:
+            raise InputError(f"unroll must be at least 1 and at most {_LONGEST}, not {self.unroll}")
 
     @property
     def steps(self) -> int:

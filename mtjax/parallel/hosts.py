@@ -65,9 +65,9 @@ def gather(tree: Any) -> Any:
     return jax.device_get(tree) if jax.process_count() == 1 else multihost_utils.process_allgather(tree, tiled=True)
 
 
-def any_process(flag: bool) -> bool:
-    """Return whether a flag is true in any process. Every process must call this."""
-    return flag if jax.process_count() == 1 else bool(np.any(multihost_utils.process_allgather(np.asarray(flag))))
+def largest(number: int) -> int:
+    """Return the largest of all processes' numbers. Every process must call this."""
+    return number if jax.process_count() == 1 else int(np.max(multihost_utils.process_allgather(np.asarray(number))))
 
 
 def broadcast_path(choose: Callable[[], Path]) -> Path:
@@ -89,5 +89,5 @@ def broadcast_path(choose: Callable[[], Path]) -> Path:
     if failed is not None:
         raise failed
     if not path:
-        raise InputError("process 0 could not make the run's folder")
+        raise InputError("process 0 could not use the run's folder, and says why")
     return Path(os.fsdecode(path))

@@ -1,8 +1,19 @@
-"""Checkpoints of the whole training state by orbax. A resumed run continues bit for bit, but on MuJoCo Warp."""
+"""Checkpoints of the whole training state, written by orbax beside training, and their checksums.
 
-import json
+A run's ``checkpoints`` folder holds the newest two, each in a folder named after its iteration. A checkpoint is written
+under another name, and gets its own name last: whatever ends a run, a folder with a number for a name is whole. Disks
+and copies damage files later. The checksums tell, and then the checkpoint before is used. A resumed run continues bit
+for bit, but on MuJoCo Warp.
+"""
+
+import errno
+import hashlib
+import logging
+import os
+import re
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -10,99 +21,274 @@ import jax
 
 from mtjax.experience.ring import Ring
 from mtjax.loop import TrainState
+from mtjax.names import notice
+from mtjax.parallel import hosts
 from mtjax.types import InputError
 
 _KEPT = 2
-_SIZES = "sizes.json"  # sizes of a checkpoint's files, by which damage is found before orbax reads them
+_SUMS = "checksums.txt"  # as of sha256sum, by which users can check them too
+_LINE = re.compile(r"([0-9a-f]{64})  (.+)")
+_UNFINISHED = ("*.new", "*.orbax-checkpoint-tmp")  # what a killed process leaves
+_UNKNOWN = (errno.EOPNOTSUPP, errno.EINVAL)  # of a file system that reserves no room
+
+# Writing.
+
+
+class Writer:
+    """Writes checkpoints into a folder, one at a time, while training goes on.
+
+    The state is copied to the host before ``save`` returns, so that the next chunk may overwrite it.
+    """
+
+    def __init__(self, directory: Path):
+        self.directory, self.pending = directory, None
+        self.thread = ThreadPoolExecutor(1, "checkpoint")
+
+    def save(self, state: TrainState) -> None:
+        """Begin to write the state under its iteration, once the checkpoint before is written.
+
+        Raises:
+            OSError: that checkpoint could not be written, or this one cannot be begun.
+        """
+        self.wait()
+        self.pending = _begin(self.directory / str(int(state.iteration)), state, self.thread)
+
+    def wait(self) -> None:
+        """Wait until the last checkpoint is written.
+
+        Raises:
+            OSError: it could not be written. Those before it are still there.
+        """
+        pending, self.pending = self.pending, None
+        if pending is not None:
+            pending.result()
 
 
 def save(directory: Path, state: TrainState) -> None:
     """Write the state under its iteration, and keep the last two checkpoints."""
+    writer = Writer(directory)
+    writer.save(state)
+    writer.wait()
+
+
+def _begin(folder: Path, state: TrainState, thread: ThreadPoolExecutor) -> Future[None] | None:
+    """Copy the state to the host, and let the thread write it. Every process writes what its devices hold."""
     from orbax.checkpoint import v1 as ocp
 
-    iteration = int(state.iteration)
-    with ocp.training.Checkpointer(
-        str(directory.absolute()),
-        save_decision_policy=ocp.training.save_decision_policies.FixedIntervalPolicy(1),  # type: ignore
-        preservation_policy=ocp.training.preservation_policies.LatestN(_KEPT),  # type: ignore
-    ) as checkpointer:
-        known = checkpointer.latest
-        if known is None or known.step != iteration:
-            checkpointer.save_checkpointables(iteration, {"agent": state.agent, "loop": state._replace(agent=None)})
-    folder = directory / str(iteration)
-    if jax.process_index() == 0:
-        (folder / _SIZES).write_text(json.dumps(_sizes(folder)))
+    if folder.exists():
+        return None
+    new = folder.with_suffix(".new")
+    shortage = hosts.largest(_shortage(folder, size_of(state)) if hosts.is_first() else 0)
+    if shortage:
+        raise OSError(
+            shortage, f"checkpoint not written ({os.strerror(shortage)}); the one before it stays", str(folder)
+        )
+    _silence_orbax()
+    try:
+        parts = {"agent": state.agent, "loop": state._replace(agent=None)}
+        written = ocp.save_checkpointables_async(str(new.absolute()), parts)
+    except (OSError, ValueError) as error:
+        raise _as_oserror(error, new) from None
+    return thread.submit(_finish, written, new, folder)
+
+
+def _shortage(folder: Path, size: int) -> int:
+    """Return the system's error number if it has no room for a new folder of so many bytes, else 0.
+
+    Asked beforehand, because orbax meets a full disk in many threads, of which each reports it at length.
+    """
+    room = folder.with_suffix(".new")
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with room.open("wb") as file:
+            if hasattr(os, "posix_fallocate"):  # which knows of quotas and limits too
+                os.posix_fallocate(file.fileno(), 0, size)
+            elif shutil.disk_usage(folder.parent).free < size:
+                return errno.ENOSPC
+    except OSError as error:
+        return 0 if error.errno in _UNKNOWN else error.errno or errno.EIO
+    finally:
+        room.unlink(missing_ok=True)
+    return 0
+
+
+def _finish(written: Any, new: Path, folder: Path) -> None:
+    """Seal a written checkpoint: add checksums, give it its name, and drop what is older than the last two."""
+    try:
+        written.result()
+        if not hosts.is_first():
+            return
+        names = sorted(_files(new))
+        (new / _SUMS).write_text("".join(f"{digest}  {name}\n" for name, digest in _digests(new, names).items()))
+        new.rename(folder)
+    except (OSError, ValueError) as error:
+        remove_unfinished(folder.parent)
+        raise _as_oserror(error, new) from None
+    for old in _folders(folder.parent)[_KEPT:]:
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def _as_oserror(error: Exception, place: Path) -> OSError:
+    """Return an error of orbax or of the system as one that names the place."""
+    known = re.search(r"os_error_code='(\d+)'", str(error))
+    number = int(known[1]) if known else getattr(error, "errno", None) or errno.EIO
+    reason = os.strerror(number) if number != errno.EIO else str(error).strip().splitlines()[0][:150]
+    return OSError(number, f"checkpoint not written ({reason}); the one before it stays", str(place.with_suffix("")))
+
+
+def _silence_orbax() -> None:
+    """Keep orbax from logging pages about what it also raises."""
+    logger = logging.getLogger("absl")
+    if not any(each is _not_of_orbax for each in logger.filters):
+        logger.addFilter(_not_of_orbax)
+
+
+def _not_of_orbax(record: logging.LogRecord) -> bool:
+    return "orbax" not in record.pathname
+
+
+def remove_unfinished(directory: Path) -> None:
+    """Remove what is left of checkpoints that were never finished."""
+    for pattern in _UNFINISHED:
+        for path in directory.glob(pattern):
+            shutil.rmtree(path, ignore_errors=True)
+
+
+# Reading.
+
+
+def newest(directory: Path) -> Path | None:
+    """Return the folder of the newest checkpoint, whole or damaged; None if there is none."""
+    return next(iter(_folders(directory)), None)
 
 
 def load(directory: Path, like: TrainState) -> TrainState:
-    """Read the newest checkpoint into the structure of ``like``, whose leaves may be shapes alone.
+    """Read the newest whole checkpoint into the structure of ``like``, whose leaves may be shapes alone.
 
     Arrays go to the devices that ``like`` names, by default to the first one. Their number may differ from that of
-    the devices that saved the checkpoint.
+    the devices that saved the checkpoint. Every process must call this.
+
+    Raises:
+        InputError: there is no whole checkpoint, or it is of another agent or family.
     """
-    found = _load(directory, {"agent": like.agent, "loop": like._replace(agent=None)})
-    return found["loop"]._replace(agent=found["agent"])
+    like_parts = {"agent": like.agent, "loop": like._replace(agent=None)}
+    read = _read(hosts.broadcast_path(lambda: _newest_whole(directory, like_parts)), like_parts)
+    return read["loop"]._replace(agent=read["agent"])
 
 
 def load_agent(directory: Path, like: TrainState, iteration: int = 0) -> Any:
-    """Read only the agent's state, which suffices for acting: the newest, or that of an iteration."""
-    if iteration and not (directory / str(iteration)).is_dir():
-        kept = ", ".join(sorted((path.name for path in directory.glob("*") if path.name.isdigit()), key=int))
+    """Read only the agent's state, which suffices for acting: the newest whole one, or that of an iteration.
+
+    Raises:
+        InputError: there is no such checkpoint, or it is damaged or of another agent.
+    """
+    parts = {"agent": like.agent}
+    folder = _of_iteration(directory, iteration, parts) if iteration else _newest_whole(directory, parts)
+    return _read(folder, parts)["agent"]
+
+
+def _of_iteration(directory: Path, iteration: int, parts: Iterable[str]) -> Path:
+    folder = directory / str(iteration)
+    if folder not in _folders(directory):
+        kept = ", ".join(path.name for path in reversed(_folders(directory)))
         raise InputError(f"{str(directory)!r} has no checkpoint {iteration}; it has {kept or 'none'}")
-    return _load(directory, {"agent": like.agent}, iteration=iteration)["agent"]
+    reason = _damage(folder, parts)
+    if reason:
+        raise InputError(f"the checkpoint {str(folder)!r} is damaged: {reason}")
+    return folder
 
 
 def load_ring(directory: Path, like: TrainState) -> Ring:
     """Read only the replay's ring buffer, without the worlds and the agent."""
-    return _load(directory, {"loop": {"data": {"ring": like.data.ring}}}, partial=True)["loop"]["data"]["ring"]
+    parts = {"loop": {"data": {"ring": like.data.ring}}}
+    return _read(_newest_whole(directory, parts), parts, partial=True)["loop"]["data"]["ring"]
 
 
-def _sizes(folder: Path) -> dict[str, int]:
-    files = (path for path in folder.rglob("*") if path.is_file() and path.name != _SIZES)
-    return {str(path.relative_to(folder)): path.stat().st_size for path in files}
+def set_aside(directory: Path, iteration: int) -> None:
+    """Rename the damaged checkpoints after an iteration, so that a run that goes on from there can write its own."""
+    for folder in _folders(directory):
+        if int(folder.name) > iteration:
+            aside = folder.with_suffix(".damaged")
+            shutil.rmtree(aside, ignore_errors=True)
+            folder.rename(aside)
 
 
-def _newest(directory: Path) -> Path:
-    """Return the folder of the newest checkpoint. Folders that are still being written have longer names."""
-    folders = [path for path in directory.glob("*") if path.name.isdigit()]
+def _folders(directory: Path) -> list[Path]:
+    """Return the folders of all checkpoints, the newest first. Empty folders are none."""
+    named = [path for path in directory.glob("*") if path.name.isascii() and path.name.isdigit() and path.is_dir()]
+    return sorted((path for path in named if any(path.iterdir())), key=lambda path: int(path.name), reverse=True)
+
+
+def _newest_whole(directory: Path, parts: Iterable[str]) -> Path:
+    """Return the folder of the newest checkpoint whose ``parts`` are whole, and tell of damaged ones.
+
+    Raises:
+        InputError: there is none.
+    """
+    folders = _folders(directory)
     if not folders:
         raise InputError(f"{str(directory)!r} holds no checkpoint; the run stopped before its first one")
-    return max(folders, key=lambda path: int(path.name))
+    reasons = []
+    for folder in folders:
+        reason = _damage(folder, parts)
+        if not reason:
+            for text in reasons:
+                notice(f"{text}; the checkpoint before it is used, of iteration {folder.name}")
+            return folder
+        reasons.append(f"the checkpoint {str(folder)!r} is damaged: {reason}")
+    raise InputError(f"{reasons[0]}; there is no whole one before it. Remove {str(directory)!r} to start over")
 
 
-def _require_whole(folder: Path, parts: Iterable[str]) -> None:
-    """Refuse a damaged checkpoint with one line, where orbax would print pages of tracebacks."""
-    if not (folder / _SIZES).exists():  # the run was killed just before it wrote them
-        return
+def _damage(folder: Path, parts: Iterable[str]) -> str:
+    """Return which file of a checkpoint has changed, of those of its ``parts``; an empty string if none has."""
     try:
-        expected, found = json.loads((folder / _SIZES).read_text()), _sizes(folder)
-        needed = [name for name in expected if "/" not in name or name.split("/")[0] in parts]
-        damaged = next((name for name in needed if found.get(name) != expected[name]), None)
-    except (ValueError, AttributeError):
-        damaged = _SIZES
-    if damaged is not None:
-        raise InputError(
-            f"the checkpoint {str(folder)!r} is damaged: {damaged} is missing or has changed; "
-            "without this folder, the one before it is the newest"
-        )
+        lines = [_LINE.fullmatch(line) for line in (folder / _SUMS).read_text().splitlines()]
+        expected = {line[2]: line[1] for line in lines if line}
+        wanted = lambda name: "/" not in name or name.split("/")[0] in parts
+        names = sorted({name for name in (*expected, *_files(folder)) if wanted(name)})
+        digests = _digests(folder, names)
+    except (OSError, UnicodeDecodeError):
+        return f"{_SUMS} is missing or has changed"
+    return next((f"{name} is missing or has changed" for name in names if digests[name] != expected.get(name)), "")
 
 
-def _load(directory: Path, like: dict[str, Any], partial: bool = False, iteration: int = 0) -> dict[str, Any]:
+def _files(folder: Path) -> list[str]:
+    """List the files of a checkpoint, by their places in it. Hidden files are the system's."""
+    files = (path for path in folder.rglob("*") if path.is_file() and not path.name.startswith("."))
+    return [str(path.relative_to(folder)) for path in files if path.name != _SUMS]
+
+
+def _digests(folder: Path, names: list[str]) -> Mapping[str, str]:
+    """Return the SHA-256 of files; an empty string where there is none."""
+
+    def digest(name: str) -> str:
+        if not (folder / name).is_file():
+            return ""
+        with (folder / name).open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+
+    with ThreadPoolExecutor(4) as pool:
+        return dict(zip(names, pool.map(digest, names), strict=True))
+
+
+def _read(folder: Path, like: dict[str, Any], partial: bool = False) -> dict[str, Any]:
     from orbax.checkpoint import v1 as ocp
 
     first = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
     place = lambda x: getattr(x, "sharding", None) or first
     like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place(x)), like)
-    newest = directory / str(iteration) if iteration else _newest(directory)
-    _require_whole(newest, like)
     context = ocp.Context()
     context.pytree.loading.partial_load = partial
+    _silence_orbax()
     try:
-        with context, ocp.training.Checkpointer(str(directory.absolute())) as checkpointer:
-            return checkpointer.load_checkpointables(int(newest.name), like)
-    except (ValueError, KeyError, OSError, json.JSONDecodeError) as error:
+        with context:
+            return ocp.load_checkpointables(str(folder.absolute()), like)
+    except (ValueError, KeyError, OSError) as error:
         reason = str(error).strip().splitlines()[0][:150]
-        raise InputError(f"the checkpoint in {str(directory)!r} cannot be read: {reason}") from None
+        raise InputError(f"the checkpoint {str(folder)!r} cannot be read: {reason}") from None
+
+
+# Sizes.
 
 
 def size_of(state: Any) -> int:

@@ -3,7 +3,6 @@
 import dataclasses
 import itertools
 import json
-import os
 import platform
 import shlex
 import time
@@ -17,8 +16,9 @@ import jax
 from mtjax import __version__
 from mtjax.agents import settings
 from mtjax.agents.choices import flag_names
-from mtjax.config import RunConfig, from_json, import_flags
+from mtjax.config import RunConfig, from_json, import_flags, to_json
 from mtjax.envs.family import Family, Tabled
+from mtjax.names import replacing
 from mtjax.types import InputError
 
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
@@ -65,16 +65,23 @@ def resumed_config(config: RunConfig, directory: Path, argv: Sequence[str]) -> R
     return dataclasses.replace(recorded, **now, profile=config.profile, distributed=config.distributed)
 
 
+def write_config(directory: Path, config: RunConfig) -> None:
+    """Write config.json into the folder of a new run."""
+    with replacing(directory / "config.json") as new:
+        new.write_text(to_json(config, run_metadata(config)))
+
+
 def record_steps(file: Path, steps: int) -> None:
     """Write the new number of steps into config.json, so that the next resume uses it too."""
     record = json.loads(file.read_text())
-    if record["plan"]["steps"] == steps:
+    before = record["plan"].get("steps")  # an edited record may lack it
+    if before == steps:
         return
-    record["command"] = record["command"].replace(f" --steps={record['plan']['steps']} ", f" --steps={steps} ")
+    if isinstance(record.get("command"), str):
+        record["command"] = record["command"].replace(f" --steps={before} ", f" --steps={steps} ")
     record["plan"]["steps"] = steps
-    new = file.with_suffix(".new")
-    new.write_text(json.dumps(record, indent=2) + "\n")
-    os.replace(new, file)
+    with replacing(file) as new:
+        new.write_text(json.dumps(record, indent=2) + "\n")
 
 
 def run_metadata(config: RunConfig) -> dict:

@@ -1,12 +1,14 @@
 """Metrics of a run as rows of a CSV file."""
 
 import csv
-import itertools
-import os
+import re
+import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from mtjax.names import naming, notice, replacing
 
 _OF_EACH_TASK = ("td_error", "critic_gradient_norm", "actor_gradient_norm")  # beside the return
 
@@ -15,7 +17,7 @@ def append_rows(path: Path, rows: list[dict[str, Any]]) -> None:
     """Append rows to a CSV file. A new file gets a header; an old file keeps its columns."""
     is_new = not path.exists() or not path.stat().st_size
     names = list(rows[0]) if is_new else _columns(path)
-    with path.open("a", newline="") as file:
+    with naming(path), path.open("a", newline="") as file:
         writer = csv.DictWriter(file, fieldnames=names, extrasaction="ignore")
         if is_new:
             writer.writeheader()
@@ -30,27 +32,51 @@ def _columns(path: Path) -> list[str]:
 def truncate_rows(path: Path, iteration: int) -> float:
     """Drop the rows of metrics after an iteration, because a resumed run writes them again.
 
+    What can be read of a damaged file is kept. The file itself is then kept beside it, and a notice says so.
+
     Returns:
         the seconds of training up to that iteration.
     """
     if not path.exists():
+        if iteration:
+            notice(f"{str(path)!r} is missing; the run goes on without its earlier rows")
         return 0.0
-    with path.open(newline="") as file:
-        reader = csv.DictReader(file)
-        kept = list(itertools.takewhile(lambda row: _is_whole(row) and int(row["iteration"]) <= iteration, reader))
-        names = reader.fieldnames or []
-    replacement = path.with_suffix(".new")
-    with replacement.open("w", newline="") as file:
-        writer = csv.DictWriter(file, fieldnames=names)
-        writer.writeheader()
-        writer.writerows(kept)
-    os.replace(replacement, path)
+    names, rows = _read_rows(path)
+    good = [row for row in rows if _is_whole(row)]
+    kept = [row for row in good if int(row["iteration"]) <= iteration]
+    last = max((int(row["iteration"]) for row in kept), default=0)
+    if iteration and (last < iteration or any(not _is_whole(row) for row in rows[:-1])):
+        aside = path.with_suffix(".damaged.csv")
+        shutil.copyfile(path, aside)
+        notice(f"{str(path)!r} is damaged: {len(kept)} rows up to step {last} are left; it is kept as {aside.name!r}")
+    with replacing(path) as new, new.open("w", newline="") as file:
+        if kept:
+            writer = csv.DictWriter(file, fieldnames=names)
+            writer.writeheader()
+            writer.writerows(kept)
     return max((float(row["seconds"]) for row in kept), default=0.0)
 
 
-def _is_whole(row: dict[str, str | None]) -> bool:
-    """Return whether a line is complete. A killed process may leave half of one."""
-    return None not in row.values() and row["iteration"].isdigit()  # type: ignore
+def _read_rows(path: Path) -> tuple[list[str], list[dict[str, Any]]]:
+    """Return the columns and rows of a CSV file as far as they can be read."""
+    rows = []
+    with path.open(newline="", encoding="utf-8", errors="replace") as file:
+        reader = csv.DictReader(file)
+        try:
+            names = list(reader.fieldnames or ())
+            rows.extend(reader)
+        except csv.Error:  # a line without end
+            names = list(reader.fieldnames or ()) if rows else []
+            rows.append({})
+    return names, rows
+
+
+def _is_whole(row: dict[Any, Any]) -> bool:
+    """Return whether a line of metrics is complete. A killed process may leave half of one."""
+    iteration, seconds = str(row.get("iteration")), str(row.get("seconds"))
+    if None in row or None in row.values() or not (iteration.isascii() and iteration.isdigit()):
+        return False
+    return re.fullmatch(r"[0-9]+(\.[0-9]+)?", seconds) is not None
 
 
 def metric_rows(metrics: dict[str, np.ndarray], seeds: np.ndarray, common: dict[str, Any]) -> list[dict[str, Any]]:

@@ -1,16 +1,17 @@
 """The command ``python -m mtjax.train``: start or resume a run, and print its folder and scores."""
 
 import shlex
+import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-from mtjax.config import RunConfig, import_flags, to_json
+from mtjax.config import RunConfig, import_flags
 from mtjax.parallel import hosts
 from mtjax.report.tables import split_table
-from mtjax.training import memory, sweep
+from mtjax.training import checkpoint, lock, memory, sweep
 from mtjax.training.console import duration
-from mtjax.training.folder import new_directory, record_steps, resumed_config, run_metadata, short_name
+from mtjax.training.folder import new_directory, record_steps, resumed_config, short_name, write_config
 from mtjax.training.launch import check, draw, launch, load_start
 from mtjax.training.programs import enable_compile_cache
 from mtjax.training.result import Result
@@ -32,22 +33,26 @@ def main(argv: Sequence[str], parse: Callable[[Sequence[str]], RunConfig]) -> No
         config = resumed_config(config, directory, argv)
     enable_compile_cache()
     check(config)
-    start = load_start(config) if directory is None else None
+    begun = directory is not None and checkpoint.newest(directory / "checkpoints") is not None
+    start = None if begun else load_start(config)
     if directory is None and memory.seeds_exceed_memory(config):
         return sweep.run_all([config], "rounds")
     directory = hosts.broadcast_path(partial(_prepare, config, directory))
     result = launch(config, directory, start, resume)
     if hosts.is_first():
         _conclude(config, result, directory)
+    if result.signal:
+        sys.exit(128 + result.signal)
 
 
 def _prepare(config: RunConfig, directory: Path | None) -> Path:
     """Make the folder of a new run with its config.json, or update the steps of a resumed run."""
     if directory is not None:
-        record_steps(directory / "config.json", config.plan.steps)
+        with lock.hold(directory):
+            record_steps(directory / "config.json", config.plan.steps)
         return directory
     directory = new_directory(Path(config.runs), f"{short_name(config.env)}-{config.agent}")
-    (directory / "config.json").write_text(to_json(config, run_metadata(config)))
+    write_config(directory, config)
     return directory
 
 

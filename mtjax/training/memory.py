@@ -1,19 +1,23 @@
 """Memory: how much a program needs, and how to split it into rounds that fit."""
 
+import contextlib
 import dataclasses
 import math
 import os
-from collections.abc import Sequence
+import re
+from collections.abc import Iterator, Sequence
 
 import jax
 import numpy as np
 
 from mtjax.config import RunConfig
+from mtjax.loop import TrainState
 from mtjax.training import checkpoint
 from mtjax.training.policy import state_shapes
 from mtjax.types import InputError
 
 _USABLE_SHARE = 0.9  # of the available memory, for one program
+_EXHAUSTED = re.compile("RESOURCE_EXHAUSTED|[Oo]ut of memory|allocate memory")
 _AGENT_COPIES = 3  # of the agent beside its state: gradients, steps, and the new state
 
 
@@ -29,14 +33,57 @@ def available_bytes() -> float:
             return float(given) * 1e9
     except ValueError:
         raise InputError(f"MTJAX_MEMORY is a number of GB, not {given!r}") from None
+    return physical_bytes()
+
+
+def physical_bytes() -> float:
+    """Return the memory of this process's devices in bytes, on a CPU the machine's."""
     known = [(device.memory_stats() or {}).get("bytes_limit", 0) for device in jax.local_devices()]
     return sum(known) or os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
 def required_bytes(config: RunConfig) -> int:
-    """Return roughly the bytes that one point takes with all its seeds: its state and an update's copies."""
+    """Return roughly the bytes that one point takes with all its seeds: its state and an update's copies.
+
+    On a CPU the state that is being saved lies in the same memory.
+    """
     state = state_shapes(dataclasses.replace(config, points=config.points[:1]))
-    return checkpoint.size_of(state) + _AGENT_COPIES * checkpoint.size_of(state.agent)
+    saved = checkpoint.size_of(state) if jax.default_backend() == "cpu" else 0
+    return checkpoint.size_of(state) + saved + _AGENT_COPIES * checkpoint.size_of(state.agent)
+
+
+def require_room(state: TrainState) -> None:
+    """Check that a training state fits into memory at all.
+
+    Raises:
+        InputError: it is larger than the memory of all devices.
+    """
+    held, agent = checkpoint.size_of(state), checkpoint.size_of(state.agent)
+    limit = physical_bytes() * jax.process_count()
+    if held <= limit:
+        return
+    fix = "--agent.hidden or --seeds" if 2 * agent > held else "--replay-size, --num-envs or --seeds"
+    raise InputError(
+        f"the run needs {held / 1e9:,.1f} GB ({agent / 1e9:,.1f} GB of networks, {(held - agent) / 1e9:,.1f} GB of "
+        f"worlds and data) and there are {limit / 1e9:,.1f} GB; lower {fix}"
+    )
+
+
+@contextlib.contextmanager
+def explaining() -> Iterator[None]:
+    """Say what to do where a program runs out of memory.
+
+    Raises:
+        InputError: it does.
+    """
+    try:
+        yield
+    except jax.errors.JaxRuntimeError as error:
+        line = str(error).strip().splitlines()[0][:150]
+        if not _EXHAUSTED.search(line):
+            raise
+        fix = "lower --num-envs, --batch-size, --eval-episodes, --replay-size or --seeds"
+        raise InputError(f"out of memory ({line}); {fix}") from None
 
 
 def seeds_exceed_memory(config: RunConfig) -> bool:

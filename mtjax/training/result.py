@@ -31,6 +31,7 @@ class Result(NamedTuple):
     agent: Any = None
     seeds: tuple[int, ...] = ()  # of each point
     trained_seconds: float = 0.0  # of ``seconds``, those since this start
+    signal: int = 0  # the signal that stopped it
     total_seconds: float = 0.0  # from the start to the end: compiling, training, evaluating and saving
 
     def __repr__(self) -> str:

@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import math
-import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -18,17 +17,19 @@ from jax.sharding import Mesh
 
 from mtjax.agents import settings as settings_of
 from mtjax.config import Plan, configure, require_value_range
-from mtjax.evaluation import Evaluations, load_evaluations, save_evaluations
+from mtjax.evaluation import Evaluations
 from mtjax.loop import Settings, TrainState
 from mtjax.parallel import hosts
 from mtjax.parallel import mesh as meshes
-from mtjax.training import checkpoint, finetune, log, points
+from mtjax.training import checkpoint, finetune, lock, log, memory, points
 from mtjax.training.console import Clock, Console, describe_rounding, describe_running, describe_warmup, duration
 from mtjax.training.points import Point, Sweep, SweptAgent
 from mtjax.training.policy import Policy
 from mtjax.training.programs import Programs, compile_lowered, jit_programs, load_kernels, sharded_shapes, trace
+from mtjax.training.records import Records
 from mtjax.training.result import Result
 from mtjax.training.sinks import Sink, open_sinks, require_libraries, write_rows
+from mtjax.training.stops import require_finite, require_finite_parameters, stop_signals
 from mtjax.types import SPLITS, Agent, Env, InputError
 
 
@@ -58,11 +59,15 @@ def train(
     """Train an agent on a family of tasks. ``api.train`` says what the arguments mean; here all are objects.
 
     Args:
-        directory: an existing folder for metrics, evaluations and checkpoints; None writes nothing.
+        directory: an existing folder for metrics, evaluations and checkpoints; None writes nothing. Only one process
+            at a time may write there.
+        resume: continue from the newest whole checkpoint in ``directory``, or start over if there is none yet.
 
     Raises:
         InputError: an argument cannot be used.
-        FloatingPointError: numbers stopped being finite (in a sweep: of every seed). The message names task and step.
+        FloatingPointError: numbers stopped being finite (in a sweep: of every seed). The message names task, step and
+            the last checkpoint.
+        OSError: a file could not be written. The checkpoint before it stays.
     """
     plan = Plan(steps, seed, seeds, eval_every, eval_episodes)
     agent, settings = configure(agent, settings or Settings(), given)
@@ -89,7 +94,14 @@ def train(
         *(env, learner, settings, plan, directory, console, found, mesh),
         *(profile, tensorboard, wandb, on_chunk, on_evaluation),
     )
-    try:
+    with contextlib.ExitStack() as held:
+        held.callback(console.close)
+        held.enter_context(memory.explaining())
+        if directory is not None:
+            hosts.broadcast_path(lambda: held.enter_context(lock.hold(directory)))
+        asked, resume = resume, run.records.found(resume)
+        if asked and not resume:
+            console.say("there is no checkpoint yet, so the run starts over")
         if not resume:
             run.introduce(total)
         programs, state = run.prepare(resume)
@@ -98,10 +110,8 @@ def train(
             state = state._replace(agent=meshes.shard_by_seed(mesh, begun))
         hosts.wait_for_all()
         compile_seconds = time.monotonic() - started
-        run.console.say(f"compiled in {duration(compile_seconds)}")
+        console.say(f"compiled in {duration(compile_seconds)}")
         result = run.run_chunks(programs, state, started, total)
-    finally:
-        run.console.close()
     named = {"env": env, "agent": plain, "seeds": tuple(range(seed, seed + seeds))}
     return result._replace(
         compile_seconds=compile_seconds, total_seconds=time.monotonic() - started, points=found, **named
@@ -162,9 +172,9 @@ class _Run:
         learner = jax.tree.map(together, jax.vmap(adopt)(jax.tree.map(apart, fresh.learner)))
         return fresh._replace(learner=learner)
 
-    @property
-    def is_writer(self) -> bool:
-        return self.directory is not None and hosts.is_first()
+    @cached_property
+    def records(self) -> Records:
+        return Records(self.directory)
 
     @cached_property
     def steps_per_iteration(self) -> int:
@@ -193,9 +203,10 @@ class _Run:
         programs = Programs(partial(compile_lowered(chunk.lower()), tasks), evaluate)
         if kernels.result():  # else the first chunk would wait for them
             score.result()
-        return programs, self._restore(shapes) if make is None else make.result()(tasks, seeds, knobs)
+        return programs, self.records.restore(shapes) if make is None else make.result()(tasks, seeds, knobs)
 
     def _describe(self, shapes: TrainState) -> None:
+        memory.require_room(shapes)
         data = checkpoint.size_of(shapes.data) / 1e6
         self.console.say(
             f"memory: {checkpoint.size_of(shapes) / 1e6:,.0f} MB of state, of which {data:,.0f} MB "
@@ -206,20 +217,9 @@ class _Run:
         if self.directory is not None:
             checkpoint.require_space(self.directory, shapes)
 
-    def _restore(self, shapes: TrainState) -> TrainState:
-        assert self.directory is not None
-        return checkpoint.load(self.directory / "checkpoints", shapes)
-
-    def _earlier_seconds(self, iteration: int) -> float:
-        """Return the training seconds of a resumed run so far, and drop its later lines of metrics."""
-        if not self.is_writer:
-            return 0.0
-        assert self.directory is not None
-        return log.truncate_rows(self.directory / "metrics.csv", iteration)
-
     def _open_sinks(self, steps: int) -> list[Sink]:
         """Return where metrics go beside metrics.csv, in a run that is at a step."""
-        if not self.is_writer:
+        if not self.records.writes:
             return []
         assert self.directory is not None
         config = {**dataclasses.asdict(self.plan), **dataclasses.asdict(self.settings), **settings_of(self.learner)}
@@ -267,13 +267,15 @@ class _Run:
             return self._run_chunks(programs, state, started, found)
 
     def _run_chunks(self, programs: Programs, state: TrainState, started: float, found: list[Sink]) -> Result:
-        steps, clock = int(state.iteration) * self.steps_per_iteration, self.console.clock
-        evaluations = self._earlier_evaluations(steps)
-        earlier = seconds = self._earlier_seconds(int(state.iteration))
-        rows, stop = [], False
+        iteration, clock = int(state.iteration), self.console.clock
+        steps = iteration * self.steps_per_iteration
+        evaluations = self.records.earlier_evaluations(steps, steps >= self.eval_every, self._no_evaluations())
+        earlier = seconds = self.records.earlier_seconds(iteration)
+        rows, stop = [], 0
         diverged = np.zeros(len(self.seeds), bool)
-        with stop_signals() as received:
+        with stop_signals() as received, self.records.closing():
             while steps < self.plan.steps and not stop:
+                self.records.check()
                 steps_before = steps
                 with self._profile_chunk(len(rows), steps):
                     before = time.monotonic()
@@ -292,7 +294,7 @@ class _Run:
                 lines = log.metric_rows(metrics, np.asarray(self.seeds), common)
                 new = [{"seed": row["seed"], **self.point(k), **row} for k, row in enumerate(lines)]
                 rows += new
-                self._write(new)
+                self.records.add_rows(new)
                 write_rows(found, lines, [self._name(k) for k in range(len(lines))])
                 rate = (steps - steps_before) * len(self.seeds) / elapsed
                 clock.chunk(elapsed)
@@ -306,21 +308,22 @@ class _Run:
                     self.console.doing(f"{steps:,} steps  evaluating")
                     evaluations = self._evaluate(programs.evaluate, state, evaluations, steps, diverged)
                     write_rows(found, *self._evaluation_rows(evaluations))
-                stop = hosts.any_process(bool(received))
+                stop = hosts.largest(received[0] if received else 0)
                 if due or stop:
-                    self._save(state)
+                    self._save(state, steps // self.steps_per_iteration)
                     clock.evaluation(time.monotonic() - before)
                     if self.on_evaluation is not None and due:
                         self.on_evaluation(evaluations)
-        return Result(state, evaluations, rows, seconds, 0.0, steps >= self.plan.steps, self.directory)._replace(
-            trained_seconds=seconds - earlier
+        finished = steps >= self.plan.steps
+        return Result(state, evaluations, rows, seconds, 0.0, finished, self.directory)._replace(
+            trained_seconds=seconds - earlier, signal=0 if finished else stop
         )
 
     @contextlib.contextmanager
     def _profile_chunk(self, rows: int, steps: int) -> Iterator[None]:
         """Trace the run's second, warm chunk, or its only one, if ``profile`` asks for it."""
         only = steps + self.settings.chunk_steps * self.steps_per_iteration >= self.plan.steps
-        if not (self.profile and self.is_writer and (rows == len(self.seeds) or (only and not rows))):
+        if not (self.profile and self.records.writes and (rows == len(self.seeds) or (only and not rows))):
             yield
             return
         place = self.directory / "profile"  # type: ignore
@@ -332,20 +335,17 @@ class _Run:
         """Return which seeds (S,) have diverged in this chunk. In a sweep the other seeds continue."""
         broken = np.any(bad_step >= 0, axis=1)
         if not self.points or np.all(broken | diverged):
-            _require_finite(bad_step, first_step)
+            require_finite(bad_step, first_step, self.records.last)
         for k in np.flatnonzero(broken & ~diverged):
             values = ", ".join(f"{name}={value:g}" for name, value in self.point(int(k)).items())
             self.console.say(f"seed {self.seeds[k]} of {values} diverged and is given up")
         return broken
 
-    def _write(self, rows: list[dict[str, Any]]) -> None:
-        if self.is_writer:
-            assert self.directory is not None
-            log.append_rows(self.directory / "metrics.csv", rows)
-
-    def _save(self, state: TrainState) -> None:
-        if self.directory is not None:
-            checkpoint.save(self.directory / "checkpoints", state)
+    def _save(self, state: TrainState, iteration: int) -> None:
+        """Save a checkpoint, unless the last update has spoiled an agent: then the checkpoint before it must stay."""
+        if not self.points:
+            require_finite_parameters(state.agent, iteration, self.records.last)
+        self.records.save(state)
 
     def _evaluate(self, program: Callable, state: TrainState, past: Evaluations, steps: int, diverged) -> Evaluations:
         """Evaluate on all splits, and append the result to the run's evaluations."""
@@ -361,9 +361,7 @@ class _Run:
         metrics = {name: append(past.metrics.get(name, none), x) for name, x in scores.metrics.items()}
         returns = append(past.returns, scores.returns)
         evaluations = Evaluations(np.append(past.steps, steps), returns, past.values, metrics)
-        if self.is_writer:
-            assert self.directory is not None
-            save_evaluations(self.directory / "evaluations.npz", evaluations)
+        self.records.save_evaluations(evaluations)
         if not diverged.all():
             self.console.evaluation(steps, {split: x[~diverged, -1] for split, x in returns.items()})
         return evaluations
@@ -376,15 +374,8 @@ class _Run:
         rows = [row | {f"evaluation/{split}": score(x[k]) for split, x in last.items()} for k, row in enumerate(rows)]
         return rows, [self._name(k) for k in range(len(rows))]
 
-    def _earlier_evaluations(self, steps: int) -> Evaluations:
-        """Return the evaluations of a resumed run up to a step; of a new run, empty ones."""
-        file = None if self.directory is None else self.directory / "evaluations.npz"
-        if steps and file is not None and file.exists():
-            past = load_evaluations(file)
-            kept = past.steps <= steps
-            upto = lambda splits: {split: x[:, kept] for split, x in splits.items()}
-            metrics = {name: upto(splits) for name, splits in past.metrics.items()}
-            return Evaluations(past.steps[kept], upto(past.returns), past.values, metrics)
+    def _no_evaluations(self) -> Evaluations:
+        """Return the evaluations of a run that has not begun."""
         tables = {split: self.env.tasks(split) for split in SPLITS}
         empty = lambda table: np.zeros((len(self.seeds), 0, len(table.id), self.plan.eval_episodes), np.float32)
         return Evaluations(
@@ -392,37 +383,3 @@ class _Run:
             returns={split: empty(table) for split, table in tables.items()},
             values={split: self.env.task_values(split) for split in SPLITS},
         )
-
-
-def _require_finite(bad_step: np.ndarray, first_step: int) -> None:
-    """Raise FloatingPointError with task and step if a number is not finite."""
-    if np.all(bad_step < 0):
-        return
-    step = int(np.min(bad_step[bad_step >= 0]))
-    seed, task = (int(i) for i in np.argwhere(bad_step == step)[0])
-    raise FloatingPointError(
-        f"numbers stopped being finite at step {first_step + step} of task {task} (number {seed} of the run's seeds); "
-        "a checkpoint, if there is one, is from before it. Try lower learning rates or max-gradient-norm"
-    )
-
-
-@contextlib.contextmanager
-def stop_signals() -> Iterator[list[int]]:
-    """Collect Ctrl-C and SIGTERM instead of stopping at once. A second Ctrl-C stops as usual."""
-    received: list[int] = []
-
-    def note(number, _frame) -> None:
-        received.append(number)
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    try:
-        before = [signal.signal(number, note) for number in numbers]
-    except ValueError:  # not in the main thread, where Python keeps signals
-        yield received
-        return
-    try:
-        yield received
-    finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)

@@ -5,10 +5,13 @@ its own. A program that does not fit into memory is split into rounds (``memory.
 in the sweep's folder: ``run-1``, ``run-2`` and so on. A plain run in rounds is a sweep of one setting.
 """
 
+import contextlib
 import dataclasses
 import itertools
 import os
+import re
 import shlex
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,12 +19,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mtjax.agents import AGENTS, PARTS
-from mtjax.config import RunConfig, from_json, import_flags, to_json
+from mtjax.config import RunConfig, from_json, import_flags
 from mtjax.evaluation import Evaluations, load_evaluations
 from mtjax.report import figures
 from mtjax.report.stats import seed_interval
-from mtjax.training import memory, points
-from mtjax.training.folder import new_directory, record_steps, resumed_config, run_metadata, short_name
+from mtjax.training import checkpoint, lock, memory, points
+from mtjax.training.folder import new_directory, record_steps, resumed_config, short_name, write_config
 from mtjax.training.launch import check, launch, load_start
 from mtjax.training.log import append_rows, number
 from mtjax.training.programs import enable_compile_cache
@@ -152,9 +155,10 @@ def main(argv: Sequence[str], parse: Parse) -> None:
     enable_compile_cache()
     resume = next((Path(word.split("=", 1)[1]) for word in argv if word.startswith("--resume=")), None)
     if resume is not None:
-        for directory in _run_folders(resume):
-            record_steps(directory / "config.json", resumed_config(parse(argv), directory, argv).plan.steps)
-        run_unfinished(resume)
+        with _locked(resume):
+            for directory in _run_folders(resume):
+                record_steps(directory / "config.json", resumed_config(parse(argv), directory, argv).plan.steps)
+            run_unfinished(resume)
         return
     found = configurations(argv, parse)
     for config in found:
@@ -170,10 +174,11 @@ def run_all(found: Sequence[RunConfig], kind: str) -> None:
     folder = new_directory(Path(found[0].runs), _folder_name(found, kind))
     for i, config in enumerate(itertools.chain(*split)):
         (folder / f"run-{i + 1}").mkdir()
-        (folder / f"run-{i + 1}" / "config.json").write_text(to_json(config, run_metadata(config)))
+        write_config(folder / f"run-{i + 1}", config)
     for config, parts in zip(found, split, strict=True):
         print(memory.describe(config, len(parts), limit), flush=True)
-    run_unfinished(folder)
+    with _locked(folder):
+        run_unfinished(folder)
 
 
 def _folder_name(found: Sequence[RunConfig], kind: str) -> str:
@@ -190,7 +195,13 @@ def _run_folders(folder: Path) -> list[Path]:
     """Return the folders of a sweep's runs in order. A run of several points is a sweep by itself."""
     if (folder / "config.json").is_file():
         return [folder] if from_json(folder / "config.json").points else []
-    return sorted(folder.glob("run-*"), key=lambda run: int(run.name.removeprefix("run-")))
+    runs = [path for path in folder.glob("run-*") if re.fullmatch(r"run-[0-9]+", path.name)]
+    return sorted(runs, key=lambda run: int(run.name.removeprefix("run-")))
+
+
+def _locked(folder: Path) -> contextlib.AbstractContextManager:
+    """Hold the lock of a sweep's folder. A run of several points is locked while it trains."""
+    return contextlib.nullcontext() if (folder / "config.json").is_file() else lock.hold(folder)
 
 
 def run_unfinished(folder: Path) -> None:
@@ -201,14 +212,15 @@ def run_unfinished(folder: Path) -> None:
         config = from_json(run / "config.json")
         if final_evaluations(config, run) is not None or (run / _DIVERGED).exists():
             continue
-        label, resume = f"run {i + 1} of {len(runs)}", (run / "checkpoints").is_dir()
+        label, resume = f"run {i + 1} of {len(runs)}", checkpoint.newest(run / "checkpoints") is not None
         start = None if resume else load_start(config)
         try:
             grow = lambda _: _write_table(folder, runs)
-            if not launch(config, run, start, resume, label, on_evaluation=grow).finished:
+            result = launch(config, run, start, resume, label, on_evaluation=grow)
+            if not result.finished:
                 words = shlex.join([f"--resume={folder}", *import_flags(config)])
                 print(f"{table(rows(runs))}\nstopped; the state is saved. Go on with:\n  python -m mtjax.train {words}")
-                return
+                sys.exit(128 + result.signal)
             _draw(config, run)
         except FloatingPointError as error:
             print(f"{label}: {error}", flush=True)

@@ -39,8 +39,10 @@ def load_vectors(file: str, num_tasks: int) -> Array:
     try:
         with open(file, "rb") as opened:
             vectors = np.asarray(np.load(opened, allow_pickle=False), np.float32)  # fails for archives and strings
-    except (OSError, EOFError, TypeError, ValueError) as error:
-        raise InputError(f"cannot read task vectors from {file!r}: {error}") from None
+    except OSError as error:
+        raise InputError(f"cannot read task vectors from {file!r}: {error.strerror or error}") from None
+    except Exception:  # a damaged file may raise anything
+        raise InputError(f"cannot read task vectors from {file!r}: it is no .npy file of numbers") from None
     if vectors.ndim != 2 or len(vectors) != num_tasks or not np.all(np.isfinite(vectors)):
         raise InputError(
             f"{file!r} must hold {num_tasks} finite rows, one a training task; its shape is {vectors.shape}"

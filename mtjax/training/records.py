@@ -1,0 +1,125 @@
+"""The files of a run: metrics, evaluations and checkpoints, as it writes them and as a resumed run finds them."""
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from mtjax.evaluation import Evaluations, load_evaluations, save_evaluations
+from mtjax.loop import TrainState
+from mtjax.names import notice
+from mtjax.parallel import hosts
+from mtjax.training import checkpoint, log
+from mtjax.types import InputError
+
+
+class Records:
+    """Writes and reads the files in a run's folder. Only the first process writes, apart from checkpoints.
+
+    Without a folder nothing is written, and nothing is found.
+    """
+
+    def __init__(self, directory: Path | None):
+        self.directory = directory
+        self.writes = directory is not None and hosts.is_first()
+        self.checkpoints = Path() if directory is None else directory / "checkpoints"
+        self.writer = None if directory is None else checkpoint.Writer(self.checkpoints)
+
+    def found(self, resume: bool) -> bool:
+        """Return whether there is a checkpoint to resume from. Every process must call this.
+
+        Raises:
+            InputError: there is one, and the run is not to be resumed.
+        """
+        known = bool(hosts.largest(int(self.directory is not None and checkpoint.newest(self.checkpoints) is not None)))
+        if known and not resume:
+            raise InputError(f"{str(self.directory)!r} holds a run; resume it, or choose another folder")
+        if self.writes:
+            checkpoint.remove_unfinished(self.checkpoints)
+        return known
+
+    def restore(self, shapes: TrainState) -> TrainState:
+        """Return the state of the newest whole checkpoint. Damaged ones after it are renamed."""
+        state = checkpoint.load(self.checkpoints, shapes)
+        if self.writes:
+            checkpoint.set_aside(self.checkpoints, int(state.iteration))
+        return state
+
+    def earlier_seconds(self, iteration: int) -> float:
+        """Return the training seconds up to an iteration, and drop the lines of metrics after it."""
+        return log.truncate_rows(self._path("metrics.csv"), iteration) if self.writes else 0.0
+
+    def earlier_evaluations(self, steps: int, due: bool, empty: Evaluations) -> Evaluations:
+        """Return the evaluations up to a step.
+
+        Args:
+            due: whether there should be any.
+            empty: those of a run that has none.
+
+        Raises:
+            InputError: they cannot be read, or are of other tasks or seeds.
+        """
+        if not steps or self.directory is None:
+            return empty
+        file = self._path("evaluations.npz")
+        if not file.exists():
+            if due:
+                notice(f"{str(file)!r} is missing; the run goes on without its earlier evaluations")
+            return empty
+        past = load_evaluations(file)
+        shape = lambda each: {split: (x.shape[0], *x.shape[2:]) for split, x in each.returns.items()}
+        if shape(past) != shape(empty):
+            raise InputError(
+                f"{str(file)!r} holds evaluations of other tasks, seeds or episodes; move it away to go on"
+            )
+        kept = past.steps <= steps
+        upto = lambda splits: {split: x[:, kept] for split, x in splits.items()}
+        metrics = {name: upto(splits) for name, splits in past.metrics.items()}
+        return Evaluations(past.steps[kept], upto(past.returns), past.values, metrics)
+
+    def add_rows(self, rows: list[dict[str, Any]]) -> None:
+        """Append rows to metrics.csv."""
+        if self.writes:
+            log.append_rows(self._path("metrics.csv"), rows)
+
+    def save_evaluations(self, evaluations: Evaluations) -> None:
+        """Write all evaluations."""
+        if self.writes:
+            save_evaluations(self._path("evaluations.npz"), evaluations)
+
+    def save(self, state: TrainState) -> None:
+        """Begin to write a checkpoint. Errors are raised here, by ``check`` or by ``wait``."""
+        if self.writer is not None:
+            self.writer.save(state)
+
+    def check(self) -> None:
+        """Raise the OSError of a checkpoint that could not be written, as soon as it is known."""
+        if self.writer is not None and self.writer.pending is not None and self.writer.pending.done():
+            self.writer.wait()
+
+    def wait(self) -> None:
+        """Wait until the last checkpoint is written."""
+        if self.writer is not None:
+            self.writer.wait()
+
+    @contextlib.contextmanager
+    def closing(self) -> Iterator[None]:
+        """Wait at the end until the last checkpoint is written, whatever the end was."""
+        try:
+            yield
+        except BaseException:
+            with contextlib.suppress(OSError):  # the first error is the one to tell
+                self.wait()
+            raise
+        self.wait()
+
+    def last(self) -> str:
+        """Return a clause that names the last checkpoint."""
+        with contextlib.suppress(OSError):
+            self.wait()
+        newest = None if self.directory is None else checkpoint.newest(self.checkpoints)
+        return "there is no checkpoint from before it" if newest is None else f"the last checkpoint is {str(newest)!r}"
+
+    def _path(self, name: str) -> Path:
+        assert self.directory is not None
+        return self.directory / name

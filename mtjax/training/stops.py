@@ -1,0 +1,83 @@
+"""What ends a run before its last step: signals, and numbers that are not finite."""
+
+import contextlib
+import signal
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mtjax.parallel import hosts
+from mtjax.types import Array
+
+_HINT = "Try lower learning rates or max-gradient-norm"
+
+
+@contextlib.contextmanager
+def stop_signals() -> Iterator[list[int]]:
+    """Collect Ctrl-C and SIGTERM instead of stopping at once. A second Ctrl-C stops as usual."""
+    received: list[int] = []
+
+    def note(number, _frame) -> None:
+        received.append(number)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    try:
+        before = [signal.signal(number, note) for number in numbers]
+    except ValueError:  # not in the main thread, where Python keeps signals
+        yield received
+        return
+    try:
+        yield received
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+
+
+def require_finite(bad_step: np.ndarray, first_step: int, last: Callable[[], str]) -> None:
+    """Check that all numbers of a chunk are finite.
+
+    Args:
+        bad_step: (S, T), the first step of the chunk with a number that is not, or -1.
+        first_step: the steps of every environment before the chunk.
+        last: returns a clause on the run's last checkpoint.
+
+    Raises:
+        FloatingPointError: one is not. The message names task, step and checkpoint.
+    """
+    if np.all(bad_step < 0):
+        return
+    step = int(np.min(bad_step[bad_step >= 0]))
+    seed, task = (int(i) for i in np.argwhere(bad_step == step)[0])
+    raise FloatingPointError(
+        f"numbers stopped being finite at step {first_step + step} of task {task} (number {seed} of the run's seeds); "
+        f"{last()}. {_HINT}"
+    )
+
+
+def require_finite_parameters(state: Any, iteration: int, last: Callable[[], str]) -> None:
+    """Check the parameters of an agent before they are saved, because a chunk's last update is in none of its losses.
+
+    Args:
+        state: the agent's, leaves (S, ...).
+
+    Raises:
+        FloatingPointError: actor or critics hold numbers that are not finite.
+    """
+    parameters = [getattr(state, name) for name in ("actor", "critic") if hasattr(state, name)]
+    finite = hosts.gather(_finite_seeds(parameters)) if parameters else np.ones(1, bool)
+    if not np.all(finite):
+        raise FloatingPointError(
+            f"parameters stopped being finite in the update before step {iteration} (number {np.argmin(finite)} of the "
+            f"run's seeds); {last()}. {_HINT}"
+        )
+
+
+@jax.jit
+def _finite_seeds(parameters: Any) -> Array:
+    """Return which seeds (S,) have finite parameters only; leaves (S, ...)."""
+    floats = [x for x in jax.tree.leaves(parameters) if jnp.issubdtype(x.dtype, jnp.floating)]
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x).reshape(len(x), -1), axis=1) for x in floats]), axis=0)

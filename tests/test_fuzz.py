@@ -1,0 +1,159 @@
+"""Command lines and records that nobody would write: each is used as it says, or refused in a line."""
+
+import copy
+import dataclasses
+import json
+import math
+import string
+
+import hypothesis.strategies as st
+import pytest
+from conftest import SHORT_RUN
+from hypothesis import HealthCheck, given, settings
+
+from mtjax import cli, commands
+from mtjax.agents import AGENTS
+from mtjax.agents import settings as settings_of
+from mtjax.config import from_json, to_json
+from mtjax.names import InputError
+from mtjax.training import launch, sweep
+from mtjax.training.folder import record_steps, run_metadata
+
+QUIET = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+quick = settings(max_examples=25, deadline=None, derandomize=True, suppress_health_check=QUIET)
+long = settings(max_examples=150, deadline=None, suppress_health_check=QUIET)
+
+NUMBERS = "0 1 2 3 7 -1 0.5 -0.5 1e-8 1e-300 1e30 1e39 1e308 nan inf -inf 2147483647 2147483648 99999999999 1e6".split()
+VALUES = [*NUMBERS, "9" * 25, "9" * 5000, "", "=", "²", "٣", "true", "None", "[]", "a,b", "1,1", "../..", "\0", "--"]
+RANGES = (
+    "1:1:1 1:2:1000000000 2:1:3 1:2:0 1:2:-1 1:2:2.5 1:2 1:inf nan:1 1e308:1e309:3 :: 1:2:3:4 0.9:1.1:3 1,2,3".split()
+)
+FLAGS = [flag for flag in cli.flags(cli.parse([])) if flag not in ("--runs", "--resume", "--from", "--list", "--sweep")]
+FAMILIES = "finger-spin walker-walk bandit two-goal-maze control-cartpole point-mass-vary-goal".split()
+PARAMETERS = "size mass gravity torso-mass gear touch-size friction goal-x nonsense".split()
+
+value = st.sampled_from(VALUES) | st.floats().map(str) | st.integers().map(str) | st.text(string.printable, max_size=6)
+setting = st.tuples(st.sampled_from(FLAGS), value).map("=".join)
+switch = st.sampled_from(FLAGS).map(lambda flag: "no-".join(flag.rpartition("--" if "." not in flag else ".")[1:]))
+varied = st.tuples(st.sampled_from(PARAMETERS), st.sampled_from([*RANGES, *VALUES])).map(
+    "--env.vary.{0[0]}={0[1]}".format
+)
+named = st.sampled_from(FAMILIES).map("--env={}".format) | st.sampled_from([*AGENTS]).map("--agent={}".format)
+lines = st.lists(setting | varied | named | switch | value, min_size=1, max_size=4)
+
+
+def require_use_or_refusal(words, folder):
+    """What a command line or record says is refused in one line, or holds finite numbers and is recorded."""
+    try:
+        commands.check_names(words)
+        commands.check_flags(words)
+        config = cli.parse(words)
+        launch.check(config)
+    except InputError as error:
+        assert commands.one_line(error)
+        return
+    assert config.plan.seed >= 0 and config.plan.seed + config.plan.seeds <= 2**31
+    found = {**dataclasses.asdict(config.plan), **dataclasses.asdict(config.training), **settings_of(config.learner)}
+    numbers = [x for x in found.values() if isinstance(x, int | float)]
+    assert all(math.isfinite(x) for x in numbers) and config.family.train_count <= 10_000
+    (folder / "config.json").write_text(to_json(config, {}))
+    assert from_json(folder / "config.json") == config
+
+
+@quick
+@given(words=lines)
+def test_any_command_line_is_used_or_refused(words, tmp_path):
+    """Before anything compiles."""
+    require_use_or_refusal(words, tmp_path)
+
+
+@pytest.mark.slow
+@long
+@given(words=lines)
+def test_many_command_lines_are_used_or_refused(words, tmp_path):
+    """More of them, and others each time."""
+    require_use_or_refusal(words, tmp_path)
+
+
+@quick
+@given(words=st.lists(st.tuples(st.sampled_from(FLAGS), st.lists(value, max_size=3)), max_size=2))
+def test_any_sweep_is_used_or_refused(words):
+    """Axes and their values."""
+    axes = [f"{flag.removeprefix('--')}={','.join(values)}" for flag, values in words]
+    try:
+        sweep.configurations(["--sweep", *axes], cli.parse)
+    except InputError as error:
+        assert commands.one_line(error)
+
+
+def places(node, path=()):
+    """Every place in a record: the keys that lead there."""
+    yield path
+    inner = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
+    for key, each in inner:
+        yield from places(each, (*path, key))
+
+
+def edited(record, path, new):
+    """A record with another value at a place, or without the place."""
+    if not path:
+        return new
+    record = copy.deepcopy(record)
+    node = record
+    for key in path[:-1]:
+        node = node[key]
+    if new is dataclasses.MISSING:
+        del node[path[-1]]
+    else:
+        node[path[-1]] = new
+    return record
+
+
+JUNK = [dataclasses.MISSING, None, True, [], {}, "", "x", "²", -1, 0, 0.5, 2**31, 10**25, 1e308, -1e-9, [[]], {"a": 1}]
+JUNK += [float("nan"), float("inf"), ["1", "2"], [1, 2.5], "1:2:1000000000", "../..", "finger-spin+walker-walk"]
+
+
+@pytest.fixture(scope="module")
+def record(short_family):
+    config = cli.parse(SHORT_RUN)
+    return json.loads(to_json(config, run_metadata(config)))
+
+
+def require_read_or_refused(record, folder):
+    file = folder / "config.json"
+    file.write_text(record if isinstance(record, str) else json.dumps(record))
+    try:
+        config = from_json(file)
+        launch.check(config)
+        record_steps(file, 5)
+        assert from_json(file).plan.steps == 5
+    except InputError as error:
+        assert commands.one_line(error)
+
+
+def test_any_edited_record_is_read_or_refused(record, tmp_path):
+    """Every place with some other value, and every place without any."""
+    for number, path in enumerate(places(record)):
+        for new in (dataclasses.MISSING, JUNK[number % len(JUNK)]) if path else (None, [], "x", 3):
+            require_read_or_refused(edited(record, path, new), tmp_path)
+
+
+@pytest.mark.slow
+def test_every_edited_record_is_read_or_refused(record, tmp_path):
+    """Every place with every other value."""
+    for path in places(record):
+        for new in JUNK if path else JUNK[1:]:
+            require_read_or_refused(edited(record, path, new), tmp_path)
+
+
+TEXTS = {"lists": "[" * 100_000, "tables": '{"env":' * 100_000, "empty": "", "zeros": "\0" * 99, "number": "9" * 5000}
+TEXTS |= {"half a character": '"\\ud800"', "no number": "NaN", "text": "text"}
+
+
+@pytest.mark.parametrize("text", TEXTS.values(), ids=TEXTS)
+def test_texts_that_are_no_record_are_refused(text, tmp_path):
+    """However deep or long."""
+    (tmp_path / "config.json").write_text(text)
+    with pytest.raises(InputError, match="does not describe a run") as caught:
+        from_json(tmp_path / "config.json")
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 400
