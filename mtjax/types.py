@@ -31,6 +31,7 @@ class Task(NamedTuple):
     draws: Any = None  # a Task with leaves (P, ...); each episode draws one of them; None: every episode is this task
     action_mask: Array | None = None  # (A,) 1 for actions that the task has, else 0; None: it has all
     blocks: Any = None  # in a mixture, which tasks belong to which family; static, without leaves
+    scene: dict[str, Array] | None = None  # only what differs between tasks in what is seen; None without pixels
 
 
 class Step(NamedTuple):
@@ -94,6 +95,7 @@ class Spec(NamedTuple):
     action_size: int
     context_size: int
     mixed: bool = False  # whether entries of observations differ in meaning between tasks
+    frames: int = 1  # how many of the last images an agent should see at once; observations hold the newest
 
     @staticmethod
     def vector(obs_size: int, action_size: int, context_size: int) -> "Spec":
@@ -108,7 +110,8 @@ class Spec(NamedTuple):
             InputError: observations are not vectors.
         """
         if not isinstance(self.obs, jax.ShapeDtypeStruct) or len(self.obs.shape) != 1:
-            raise InputError(f"observations must be vectors here, not {self.obs}")
+            shapes = jax.tree.map(lambda x: x.shape, self.obs)
+            raise InputError(f"observations must be vectors here, not {shapes}; leave out --env.pixels")
         return self.obs.shape[0]
 
 

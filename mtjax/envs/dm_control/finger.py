@@ -11,6 +11,7 @@ import mujoco
 
 from mtjax.envs.domain import Domain, start_joints
 from mtjax.envs.engines.base import World
+from mtjax.envs.looks import Look
 from mtjax.envs.parameters import DAMPING, FRICTION, GEAR, MASS, Parameter
 from mtjax.types import Array, Key, Task, Transition
 
@@ -90,6 +91,7 @@ class FingerSpin(Domain):
     default_iterations: ClassVar[int] = 2
     warp_iterations: ClassVar[int] = 4
     starts_untouched: ClassVar[bool] = True
+    look: ClassVar = Look((0, -1, 0.8), 63.435, sun=True)
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
         _set_spinner_damping(spec, 0.03)

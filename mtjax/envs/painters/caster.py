@@ -1,0 +1,225 @@
+"""A small ray caster in plain JAX, for CPUs and all devices without a painter of their own.
+
+It casts one ray through the middle of each pixel, and lights the nearest geom as MuJoCo does: the headlight, the scene's
+lights with their cones, highlights, a checkered floor and the sky. There are no shadows and no mirrors. Everything is in
+the camera's frame, so that rays are constants. Arrays are (P,), one number for each pixel; the loop over geoms is static.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from mtjax.envs.painters.batch import flat_batch, in_chunks
+from mtjax.envs.painters.poses import Pose, Poses, Vector
+from mtjax.envs.painters.scene import Scene
+from mtjax.envs.painters.shapes import MISSED, SHAPES, Body, Rays, along, at, dot
+from mtjax.types import Array, InputError
+
+_CHUNK = 16  # pictures that a CPU draws at once: their arrays fit into its caches
+_MOST = 63  # geoms, whose numbers have to fit into the last bits of a distance
+_SHINE = 6  # highlights are the 2^6th power of a cosine: MuJoCo's shininess of 0.5
+_GLOSS = 0.5  # MuJoCo's specular of materials
+
+
+class View(NamedTuple):
+    """What a picture shows, in the camera's frame."""
+
+    bodies: tuple[Body, ...]
+    colours: tuple[Array, ...]  # (4,) of each body
+    lights: tuple[tuple[Vector, Vector], ...]  # position and direction of each
+    strength: Array  # (lights, 3)
+    up: Vector  # the world's z axis
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Caster:
+    """Draws the scene of a family by casting rays.
+
+    Raises:
+        InputError: the scene has a shape that the caster does not know.
+    """
+
+    scene: Scene
+    size: int
+
+    def __post_init__(self):
+        kinds = [int(self.scene.model.geom_type[geom]) for geom in self.scene.shown]
+        odd = next((kind for kind in kinds if kind not in SHAPES), None)
+        if odd is not None:
+            shape = mujoco.mjtGeom(odd).name.removeprefix("mjGEOM_").lower()
+            raise InputError(f"painter 'caster' knows no {shape}; use --env.painter=warp on an NVIDIA GPU")
+        if len(kinds) > _MOST:
+            raise InputError(f"painter 'caster' draws at most {_MOST} geoms, and this scene has {len(kinds)}")
+
+    def paint(self, leaf: Callable[[str], Array], poses: Poses) -> Array:
+        """Return the picture (H, W, 3) uint8 of one world.
+
+        Args:
+            leaf: a field of the task's scene, by its name.
+            poses: of the world's geoms, camera and lights.
+        """
+        packed = self._draw(jax.tree.map(jnp.float32, self._view(leaf, poses)))
+        picture = packed.reshape(self.size, self.size)
+        return jnp.stack([(picture >> shift).astype(jnp.uint8) for shift in (0, 8, 16)], axis=-1)
+
+    @cached_property
+    def _draw(self) -> Callable:
+        """Return the function that draws all worlds, first what is nearest in each pixel and then its colour.
+
+        Between the two, XLA would repeat the former for every use of its result in the latter.
+        """
+
+        def draw(views: View) -> Array:
+            chunk = _CHUNK if jax.default_backend() == "cpu" else 0
+            nearest = in_chunks(self._nearest, chunk, views)
+            return in_chunks(lambda both: self._colour(*both), chunk, (views, nearest))
+
+        return flat_batch(draw)
+
+    def _view(self, leaf: Callable[[str], Array], poses: Poses) -> View:
+        sizes, colours, eye = leaf("geom_size"), leaf("geom_rgba"), poses.camera
+        bodies = []
+        for geom in self.scene.shown:
+            place = _seen_from(eye, poses.geoms[geom])
+            bodies.append(Body(place.position, place.axes, sizes[geom], ()))
+        lights = []
+        for position, direction in poses.lights:
+            place = _seen_from(eye, Pose(position, (direction,) * 3))
+            lights.append((place.position, place.axes[2]))
+        up = tuple(axis[2] for axis in eye.axes)
+        return View(tuple(bodies), tuple(colours[i] for i in self.scene.shown), tuple(lights), leaf("light_diffuse"), up)  # type: ignore
+
+    @cached_property
+    def _rays(self) -> Rays:
+        height = math.tan(math.radians(float(self.scene.model.cam_fovy[0])) / 2)
+        line = ((np.arange(self.size) + 0.5) / self.size * 2 - 1) * height
+        u, v = (np.float32(x.ravel()) for x in np.meshgrid(line, -line))
+        return Rays(u, v, u * u + v * v + 1)
+
+    def _nearest(self, view: View) -> Array:
+        """Return the distance (P,) of the nearest geom as an integer whose last bits are the geom's number.
+
+        Positive floating-point numbers are in the order of their bits.
+        """
+        nearest = _tag(jnp.full(self._rays.u.shape, MISSED, jnp.float32), _MOST)
+        for i, (geom, body) in enumerate(zip(self.scene.shown, view.bodies, strict=True)):
+            endless = tuple(bool(x <= 0) for x in self.scene.model.geom_size[geom, :2])
+            shape = SHAPES[int(self.scene.model.geom_type[geom])]
+            distance = shape.distance(self._rays, body._replace(endless=endless))
+            nearest = jnp.minimum(nearest, _tag(distance, i))
+        return nearest
+
+    def _colour(self, view: View, nearest: Array) -> Array:
+        """Return the colours (P,) of pixels, packed as one number so that one kernel computes all channels."""
+        number = nearest & _MOST
+        distance = jax.lax.bitcast_convert_type(nearest & ~_MOST, jnp.float32)
+        point, normal, colour = at(self._rays, distance), (0.0, 0.0, 1.0), self._sky(view)
+        for i, (geom, body) in enumerate(zip(self.scene.shown, view.bodies, strict=True)):
+            here = number == i
+            normal = _pick(here, SHAPES[int(self.scene.model.geom_type[geom])].normal(point, body), normal)
+            colour = _pick(here, self._paint(view.colours[i], geom, body, distance), colour)
+        shaded = self._light(view, point, normal, colour, number != _MOST)
+        red, green, blue = (jnp.uint32(jnp.clip(c, 0.0, 1.0) * 255 + 0.5) for c in shaded)
+        return red | (green << 8) | (blue << 16)
+
+    def _sky(self, view: View) -> Vector:
+        """Return the colour of the sky, whose fits are polynomials of the sine of the elevation."""
+        height = along(self._rays, view.up) * (1 / np.sqrt(self._rays.square))
+        colour = [jnp.float32(0)] * 3
+        for powers in self.scene.sky:
+            colour = [c * height + p for c, p in zip(colour, powers, strict=True)]
+        return tuple(colour)  # type: ignore
+
+    def _paint(self, rgba: Array, geom: int, body: Body, distance: Array) -> Vector:
+        """Return the colour of a geom where rays meet it; planes may be checkered."""
+        tiles = self.scene.tiles.get(geom)
+        if tiles is None:
+            return rgba[0], rgba[1], rgba[2]
+        blend, (one, other) = self._checker(geom, body, distance), tiles.colours
+        return tuple(rgba[i] * (one[i] + blend * (other[i] - one[i])) for i in range(3))  # type: ignore
+
+    def _checker(self, geom: int, body: Body, distance: Array) -> Array:
+        """Return 0 on tiles of one colour and 1 on those of the other, and between them across edges."""
+        tiles, waves = self.scene.tiles[geom], []
+        slope = jnp.maximum(-along(self._rays, body.axes[2]), 1e-3)
+        pixel = 2 * self._rays.v.max() / self.size * distance
+        for i in (0, 1):
+            across = distance * along(self._rays, body.axes[i]) - dot(body.centre, body.axes[i])
+            phase = tiles.repeat[i] * (across + (body.size[i] if tiles.from_edge[i] else 0.0))
+            blur = tiles.repeat[i] * pixel * (1 + jnp.abs(body.axes[i][2]) / slope)  # of one pixel
+            wave = jnp.abs(phase - jnp.floor(phase) - 0.5) - 0.25  # crosses 0 at edges of tiles
+            waves.append(jnp.clip(wave * 2 / jnp.maximum(blur, 1e-6), -1.0, 1.0) / jnp.maximum(2 * blur, 1.0))
+        return 0.5 + 0.5 * waves[0] * waves[1]
+
+    def _light(self, view: View, point: Vector, normal: Vector, colour: Vector, solid: Array) -> Vector:
+        """Return the colours of pixels in the light of the headlight and of the scene's lights. The sky is not lit."""
+        model, rays = self.scene.model, self._rays
+        short = 1 / np.sqrt(rays.square)
+        eye = (-rays.u * short, -rays.v * short, short)
+        head = model.vis.headlight
+        facing = jnp.maximum(normal[2], 0.0)
+        shine = _shine(normal, _unit_half(eye), facing)
+        diffuse = [jnp.where(solid, head.ambient[i] + head.diffuse[i] * facing, 1.0) for i in range(3)]
+        bright = [head.specular[i] * shine for i in range(3)]
+        for i, (position, direction) in enumerate(view.lights):
+            if model.light_type[i] == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL:
+                to_light, reach = tuple(-x for x in direction), 1.0
+            else:
+                away = tuple(q - p for p, q in zip(point, position, strict=True))
+                short = 1 / jnp.sqrt(dot(away, away))  # type: ignore
+                to_light = tuple(short * x for x in away)
+                reach = _cone(model, i, -dot(to_light, direction))  # type: ignore
+            facing = jnp.maximum(dot(normal, to_light), 0.0) * reach  # type: ignore
+            half = tuple(a + b for a, b in zip(to_light, eye, strict=True))
+            shine = _shine(normal, half, facing) * reach
+            for c in range(3):
+                diffuse[c] += jnp.where(solid, model.light_ambient[i][c] + view.strength[i, c] * facing, 0.0)
+                bright[c] += model.light_specular[i][c] * shine
+        gloss = jnp.where(solid, _GLOSS, 0.0)
+        return tuple(c * d + gloss * b for c, d, b in zip(colour, diffuse, bright, strict=True))  # type: ignore
+
+
+def _tag(distance: Array, number: int) -> Array:
+    """Return a distance as an integer with a geom's number in the last bits."""
+    return (jax.lax.bitcast_convert_type(distance, jnp.int32) & ~_MOST) | number
+
+
+def _pick(mask: Array, one: Vector, other: Vector) -> Vector:
+    return tuple(jnp.where(mask, a, b) for a, b in zip(one, other, strict=True))  # type: ignore
+
+
+def _unit_half(eye: Vector) -> Vector:
+    """Return the direction half way between the eye and the headlight, which is in the eye."""
+    scale = 1 / np.sqrt(eye[0] ** 2 + eye[1] ** 2 + (eye[2] + 1) ** 2)
+    return eye[0] * scale, eye[1] * scale, (eye[2] + 1) * scale
+
+
+def _shine(normal: Vector, half: Vector, facing: Array) -> Array:
+    """Return the highlight (P,) in [0, 1] of a surface where it faces the light."""
+    cosine = jnp.maximum(dot(normal, half), 0.0)
+    square = cosine * cosine / dot(half, half)
+    for _ in range(_SHINE - 1):
+        square = square * square
+    return jnp.where(facing > 0, square, 0.0)
+
+
+def _cone(model: mujoco.MjModel, light: int, cosine: Array) -> Array:
+    """Return how much of a light reaches a direction whose angle to the light's own has this cosine."""
+    if model.light_type[light] != mujoco.mjtLightType.mjLIGHT_SPOT:
+        return jnp.float32(1)
+    edge = math.cos(math.radians(float(model.light_cutoff[light])))
+    return jnp.where(cosine > edge, jnp.maximum(cosine, edge) ** float(model.light_exponent[light]), 0.0)
+
+
+def _seen_from(eye: Pose, thing: Pose) -> Pose:
+    """Return a pose in the camera's frame."""
+    inside = lambda vector: tuple(dot(axis, vector) for axis in eye.axes)
+    apart = tuple(a - b for a, b in zip(thing.position, eye.position, strict=True))
+    return Pose(inside(apart), tuple(inside(axis) for axis in thing.axes))  # type: ignore
