@@ -22,6 +22,7 @@ _HOME = {
     "mixture": "mtjax.envs",
     "preset": "mtjax.config:with_preset",
     "register": "mtjax.registry",
+    "stacked": "mtjax.envs",
 }
 __all__ = [*_HOME, "train"]
 

@@ -16,9 +16,23 @@ if TYPE_CHECKING:
     from mtjax.envs.engines.base import World
     from mtjax.envs.family import Family
     from mtjax.envs.mixtures import Mixture
+    from mtjax.envs.stacked import stacked
     from mtjax.envs.parameters import Parameter
 
-__all__ = ["ENVS", "Domain", "Family", "Mixture", "Parameter", "World", "make", "mixture", "outline", "register"]
+__all__ = [
+    "ENVS",
+    "Domain",
+    "Family",
+    "Mixture",
+    "Parameter",
+    "World",
+    "make",
+    "mixture",
+    "outline",
+    "register",
+    "require_pictures",
+    "stacked",
+]
 
 __getattr__ = lazily(
     __name__,
@@ -28,6 +42,7 @@ __getattr__ = lazily(
         "Mixture": "mtjax.envs.mixtures",
         "Parameter": "mtjax.envs.parameters",
         "World": "mtjax.envs.engines.base",
+        "stacked": "mtjax.envs.stacked",
     },
 )
 
@@ -145,6 +160,9 @@ _BRAX: dict[str, Entry] = {
     "brax-halfcheetah-vary-speed": ("brax:BraxHalfcheetahSpeed", {"vary": {"speed": "0.3:3:10"}}),
 }
 
+PICTURES = ("pixels", "frames", "repeat", "grey", "state", "plain", "painter")
+"""Settings that only families with a MuJoCo model have."""
+
 _inside = lambda folder, table: {name: (f"{folder}.{place}", settings) for name, (place, settings) in table.items()}
 ENVS = Families(
     _inside("mtjax.envs.dm_control", _DOMAINS | _HIP_BMDP | _GOALS)
@@ -172,9 +190,20 @@ def make(name: str, vary: Mapping[str, Any] | tuple = (), **settings: Any) -> An
     fields = family.__dataclass_fields__
     unknown = next((s for s in (*settings, *defaults) if s not in fields), None)
     if unknown is not None:
+        require_pictures(name, unknown)
         raise nearest_error(f"setting of {name}", unknown, fields)
     settings = defaults | frozen(settings)
     return family(**{**settings, "vary": dict(defaults.get("vary", {})) | dict(vary)})
+
+
+def require_pictures(name: str, setting: str) -> None:
+    """Refuse a setting of pictures for a family that does not have it.
+
+    Raises:
+        InputError: the setting belongs to families with a MuJoCo model only.
+    """
+    if setting in PICTURES:
+        raise InputError(f"{name} has no MuJoCo model, which {setting} needs; take a family such as cheetah-run")
 
 
 def mixture(families: "Sequence[str | Family | Mixture]") -> "Mixture":

@@ -21,11 +21,13 @@ SELF, EFFECTOR, DECORATION, TARGET = (
     (0.3, 0.5, 0.7, 1.0),
     (0.6, 0.3, 0.3, 1.0),
 )
+HIDDEN = 3  # a group that MuJoCo does not show unless asked to
 _FLOORS = ("ground", "floor")
 _FLOOR = (0.2, 0.3, 0.4)  # brighter tiles of the floor
 _DARK = (0.5, 2 / 3, 0.75)  # factors of the darker ones
 _SKY, _NADIR = (0.4, 0.6, 0.8), (0.0, 0.0, 0.0)
 _HORIZON = (0.2, 0.3, 0.4)
+_EXTENT = 2.0  # [m] of a model on a long floor, as MuJoCo draws nothing within a hundredth of the extent
 _DISTANCE = 2.0  # from an own model's camera to its centre, in extents of the model
 _LIGHT, _FOLLOW = mujoco.mjtLightType, mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM
 
@@ -51,10 +53,14 @@ def dress(spec: mujoco.MjSpec, look: Look | None, plain: bool) -> None:
     spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.4] * 3, [0.8] * 3
     spec.visual.headlight.specular, spec.visual.map.znear = [0.1] * 3, 0.01
     _paint_background(spec, plain)
+    for site in spec.sites:
+        site.group = HIDDEN
     for name, rgba in look.colours if look else ():
         spec.geom(name).rgba = rgba
     if look is None:
         look = _survey(spec)
+    if look.follow:
+        spec.stat.extent = _EXTENT
     body = spec.body(look.follow) if look.follow else spec.worldbody
     follow = {"mode": _FOLLOW} if look.follow else {}
     if not spec.cameras:
@@ -76,7 +82,7 @@ def _paint_background(spec: mujoco.MjSpec, plain: bool) -> None:
     if floors and not plain:
         tiles = spec.add_texture(name="tiles", type=mujoco.mjtTexture.mjTEXTURE_2D, width=256, height=256)
         tiles.builtin, tiles.rgb1, tiles.rgb2 = builtin.mjBUILTIN_CHECKER, _DARK, [1, 1, 1]
-        material = spec.add_material(name="tiles", texuniform=True, texrepeat=[1, 1])
+        material = spec.add_material(name="tiles", texuniform=True, texrepeat=[1, 1], specular=0)
         material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
         for geom in floors:
             geom.material = "tiles"

@@ -4,6 +4,7 @@ import contextlib
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -117,7 +118,7 @@ def _film_family(policy: Policy, part: Part, played: Recording, directory: Path)
             place = part.places["all"][i]
             row = int(played.rows[place])  # continuous ranges have a row for each episode
             shown = slice(0, min(longest, int(played.lengths[place])), stride)
-            frames = render.film(family, policy.env.own_row(row), np.asarray(played.states.qpos[i, shown]))
+            frames = render.film(family, policy.env.own_row(row), jax.tree.map(lambda x: x[i, shown], played.states))
             named = f"{split}-{policy.env.describe(row)}".replace("=", "-").replace(" ", "-")
             path = render.write_video(directory / named, frames, fps)
             print(f"filmed {path.name}: return {float(played.returns[place]):.0f}", flush=True)

@@ -11,8 +11,9 @@ import mujoco
 
 from mtjax.envs.domain import Domain, start_joints
 from mtjax.envs.engines.base import World
-from mtjax.envs.looks import Look
+from mtjax.envs.looks import TARGET, Look
 from mtjax.envs.parameters import DAMPING, FRICTION, GEAR, MASS, Parameter
+from mtjax.envs.pixels import Mark
 from mtjax.types import Array, Key, Task, Transition
 
 _SPIN_VELOCITY = 15.0  # [rad/s]
@@ -137,6 +138,18 @@ class FingerTurn(FingerSpin):
     relabels: ClassVar[tuple[str, ...]] = ("target-size", "target-angle")
     fresh_goals: ClassVar[bool] = True
 
+    def add_marks(self, spec: mujoco.MjSpec) -> None:
+        """Add the target, and the spinner's tip that has to be in it."""
+        seen = {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "rgba": TARGET, "mass": 0, "contype": 0, "conaffinity": 0}
+        site = spec.site("tip")
+        spec.body("spinner").add_geom(name="tip", pos=site.pos, size=site.size, **seen)
+        spec.worldbody.add_geom(name="target", size=[self.parameters["target-size"].nominal, 0, 0], **seen)
+
+    def marks(self, task: Task, world: World) -> dict[str, Mark]:
+        hinge = self.leaf(task, "body_pos")[self.models[0].body("spinner").id]
+        place = hinge + jnp.stack([world.extra[0], jnp.float32(0), world.extra[1]])
+        return {"target": Mark(place, size=jnp.stack([task.goal["target-size"], 0.0, 0.0]))}
+
     def prepare(self, spec: mujoco.MjSpec) -> None:
         pass  # the model's own damping is this task's
 
@@ -195,6 +208,7 @@ class FingerTurnTarget(FingerTurn):
         {**FingerTurn.parameters, "target-angle": Parameter("rad", 0.0, minimum=-math.inf)}
     )
     fresh_goals: ClassVar[bool] = False
+    hides: ClassVar[tuple[str, ...]] = ("target",)
 
     def target_angle(self, task: Task, key: Key) -> Array:
         return task.goal["target-angle"]

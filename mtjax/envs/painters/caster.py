@@ -24,8 +24,9 @@ from mtjax.types import Array, InputError
 
 _CHUNK = 16  # pictures that a CPU draws at once: their arrays fit into its caches
 _MOST = 63  # geoms, whose numbers have to fit into the last bits of a distance
+_ROUND = tuple(int(getattr(mujoco.mjtGeom, f"mjGEOM_{x}")) for x in ("SPHERE", "CAPSULE", "CYLINDER"))
+_HALF = 0.51  # of a pixel, and a bit
 _SHINE = 6  # highlights are the 2^6th power of a cosine: MuJoCo's shininess of 0.5
-_GLOSS = 0.5  # MuJoCo's specular of materials
 
 
 class View(NamedTuple):
@@ -85,10 +86,14 @@ class Caster:
 
     def _view(self, leaf: Callable[[str], Array], poses: Poses) -> View:
         sizes, colours, eye = leaf("geom_size"), leaf("geom_rgba"), poses.camera
+        model = self.scene.model
         bodies = []
         for geom in self.scene.shown:
             place = _seen_from(eye, poses.geoms[geom])
-            bodies.append(Body(place.position, place.axes, sizes[geom], ()))
+            size = sizes[geom]
+            if model.geom_type[geom] in _ROUND:  # at least a pixel wide, so that no ray misses it
+                size = size.at[0].max(_HALF * self._pixel * -place.position[2])
+            bodies.append(Body(place.position, place.axes, size, ()))
         lights = []
         for position, direction in poses.lights:
             place = _seen_from(eye, Pose(position, (direction,) * 3))
@@ -96,10 +101,14 @@ class Caster:
         up = tuple(axis[2] for axis in eye.axes)
         return View(tuple(bodies), tuple(colours[i] for i in self.scene.shown), tuple(lights), leaf("light_diffuse"), up)  # type: ignore
 
+    @property
+    def _pixel(self) -> float:
+        """Return the width of a pixel at a distance of 1."""
+        return 2 * math.tan(math.radians(float(self.scene.model.cam_fovy[0])) / 2) / self.size
+
     @cached_property
     def _rays(self) -> Rays:
-        height = math.tan(math.radians(float(self.scene.model.cam_fovy[0])) / 2)
-        line = ((np.arange(self.size) + 0.5) / self.size * 2 - 1) * height
+        line = (np.arange(self.size) + 0.5 - self.size / 2) * self._pixel
         u, v = (np.float32(x.ravel()) for x in np.meshgrid(line, -line))
         return Rays(u, v, u * u + v * v + 1)
 
@@ -108,7 +117,7 @@ class Caster:
 
         Positive floating-point numbers are in the order of their bits.
         """
-        nearest = _tag(jnp.full(self._rays.u.shape, MISSED, jnp.float32), _MOST)
+        nearest = _tag(jnp.full(self._rays.u.shape, MISSED / 2, jnp.float32), _MOST)  # the sky, before all that is missed
         for i, (geom, body) in enumerate(zip(self.scene.shown, view.bodies, strict=True)):
             endless = tuple(bool(x <= 0) for x in self.scene.model.geom_size[geom, :2])
             shape = SHAPES[int(self.scene.model.geom_type[geom])]
@@ -120,12 +129,13 @@ class Caster:
         """Return the colours (P,) of pixels, packed as one number so that one kernel computes all channels."""
         number = nearest & _MOST
         distance = jax.lax.bitcast_convert_type(nearest & ~_MOST, jnp.float32)
-        point, normal, colour = at(self._rays, distance), (0.0, 0.0, 1.0), self._sky(view)
+        point, normal, colour, gloss = at(self._rays, distance), (0.0, 0.0, 1.0), self._sky(view), 0.0
         for i, (geom, body) in enumerate(zip(self.scene.shown, view.bodies, strict=True)):
             here = number == i
             normal = _pick(here, SHAPES[int(self.scene.model.geom_type[geom])].normal(point, body), normal)
             colour = _pick(here, self._paint(view.colours[i], geom, body, distance), colour)
-        shaded = self._light(view, point, normal, colour, number != _MOST)
+            gloss = jnp.where(here, self.scene.gloss[geom], gloss)
+        shaded = self._light(view, point, normal, colour, gloss, number != _MOST)
         red, green, blue = (jnp.uint32(jnp.clip(c, 0.0, 1.0) * 255 + 0.5) for c in shaded)
         return red | (green << 8) | (blue << 16)
 
@@ -149,16 +159,16 @@ class Caster:
         """Return 0 on tiles of one colour and 1 on those of the other, and between them across edges."""
         tiles, waves = self.scene.tiles[geom], []
         slope = jnp.maximum(-along(self._rays, body.axes[2]), 1e-3)
-        pixel = 2 * self._rays.v.max() / self.size * distance
+        pixel = self._pixel * distance
         for i in (0, 1):
             across = distance * along(self._rays, body.axes[i]) - dot(body.centre, body.axes[i])
-            phase = tiles.repeat[i] * (across + (body.size[i] if tiles.from_edge[i] else 0.0))
+            phase = tiles.repeat[i] * ((-across if i else across) + (body.size[i] if tiles.from_edge[i] else 0.0)) + 0.25
             blur = tiles.repeat[i] * pixel * (1 + jnp.abs(body.axes[i][2]) / slope)  # of one pixel
             wave = jnp.abs(phase - jnp.floor(phase) - 0.5) - 0.25  # crosses 0 at edges of tiles
             waves.append(jnp.clip(wave * 2 / jnp.maximum(blur, 1e-6), -1.0, 1.0) / jnp.maximum(2 * blur, 1.0))
-        return 0.5 + 0.5 * waves[0] * waves[1]
+        return 0.5 - 0.5 * waves[0] * waves[1]
 
-    def _light(self, view: View, point: Vector, normal: Vector, colour: Vector, solid: Array) -> Vector:
+    def _light(self, view: View, point: Vector, normal: Vector, colour: Vector, gloss, solid: Array) -> Vector:
         """Return the colours of pixels in the light of the headlight and of the scene's lights. The sky is not lit."""
         model, rays = self.scene.model, self._rays
         short = 1 / np.sqrt(rays.square)
@@ -182,7 +192,6 @@ class Caster:
             for c in range(3):
                 diffuse[c] += jnp.where(solid, model.light_ambient[i][c] + view.strength[i, c] * facing, 0.0)
                 bright[c] += model.light_specular[i][c] * shine
-        gloss = jnp.where(solid, _GLOSS, 0.0)
         return tuple(c * d + gloss * b for c, d, b in zip(colour, diffuse, bright, strict=True))  # type: ignore
 
 

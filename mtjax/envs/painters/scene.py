@@ -42,6 +42,12 @@ class Scene:
         return tuple(int(i) for i in np.flatnonzero(self.model.geom_group < GROUPS))
 
     @cached_property
+    def gloss(self) -> np.ndarray:
+        """Return how much of a light's highlight each geom shows (ngeom,), all with MuJoCo's default shininess."""
+        model = self.model
+        return np.where(model.geom_matid >= 0, np.append(model.mat_specular, 0.5)[model.geom_matid], 0.5)
+
+    @cached_property
     def sky(self) -> np.ndarray:
         """Return polynomials (degree + 1, 3) of the sine of the elevation, for the colours of the sky."""
         model = self.model

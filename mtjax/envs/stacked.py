@@ -1,0 +1,78 @@
+"""Environments whose observations hold the last pictures, for users who keep no memory of their own."""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+
+from mtjax import frames
+from mtjax.envs.pixels import Pictured
+from mtjax.maps import Flat
+from mtjax.types import Array, InputError, Key, Spec, Step, Task
+
+
+class Remembered(NamedTuple):
+    """The state of a world, and the pictures before the newest."""
+
+    world: Any
+    memory: frames.Frames
+
+
+@dataclasses.dataclass(frozen=True)
+class Stacked(Flat):
+    """A family with pictures, each observation of which holds the last ``family.frames``: (H, W, N C), newest last.
+
+    ``reset`` and ``step`` are as the family's. Its state holds the pictures before the newest.
+    """
+
+    family: Pictured
+
+    def __post_init__(self):
+        if not self.family.pixels:
+            raise InputError("there is nothing to stack without pictures; give pixels=64")
+
+    def tasks(self, split: str = "train") -> Task:
+        """Return the tasks of a split."""
+        return self.family.tasks(split)
+
+    def task_values(self, split: str) -> Any:
+        """Return the values (T,) that tell the tasks of a split apart."""
+        return self.family.task_values(split)
+
+    @property
+    def episode_length(self) -> int:
+        """Return the steps after which an episode is cut off."""
+        return self.family.episode_length
+
+    @property
+    def spec(self) -> Spec:
+        """Return the sizes of observation, action and context."""
+        spec = self.family.spec
+        *size, channels = spec.obs["pixels"].shape
+        pixels = jax.ShapeDtypeStruct((*size, channels * spec.frames), spec.obs["pixels"].dtype)
+        return spec._replace(obs=spec.obs | {"pixels": pixels}, frames=1)
+
+    def reset(self, task: Task, key: Key) -> Step:
+        """Begin an episode of ``task`` in a fresh random state."""
+        step = self.family.reset(task, key)
+        memory = frames.begin(step.obs["pixels"].shape, self.family.frames)
+        return self._seen(step, memory)
+
+    def step(self, task: Task, state: Remembered, action: Array) -> Step:
+        """Advance one step under ``action`` (A,)."""
+        step = self.family.step(task, state.world, action)
+        return self._seen(step, state.memory)
+
+    def _seen(self, step: Step, memory: frames.Frames) -> Step:
+        picture = step.obs["pixels"]
+        obs = step.obs | {"pixels": frames.stack(memory, picture)}
+        return step._replace(obs=obs, state=Remembered(step.state, frames.push(memory, picture)))
+
+
+def stacked(family: Any) -> Any:
+    """Return a family whose observations hold its last ``family.frames`` pictures at once.
+
+    Raises:
+        InputError: the family shows no pictures.
+    """
+    return Stacked(family)
