@@ -17,7 +17,7 @@ FILES = {
 TREES = {module: ast.parse(file.read_text()) for module, file in FILES.items()}
 
 # From the ground up: a module imports its own layer and those below it. Within a layer only a group's own modules.
-GROUND = ("types", "names", "sphere", "networks", "normalize", "tasks", "maps", "parallel.collectives")
+GROUND = ("types", "names", "sphere", "networks", "normalize", "tasks", "maps", "frames", "parallel.collectives")
 LAYERS = (
     [GROUND],
     [("envs",), ("experience",), ("agents",)],

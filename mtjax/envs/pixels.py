@@ -112,7 +112,7 @@ class Pictured(Family):
     @property
     def every_parameter(self) -> Mapping[str, Parameter]:
         """Return the parameters of the family and those of looks."""
-        return {**looks.LOOKS, **self.parameters}
+        return {**self.parameters, **looks.LOOKS, **self.parameters}
 
     def compile_scene(self, values: Mapping[str, float] | None = None) -> mujoco.MjSpec:
         """Return the editable model of what is seen with these parameter values."""
