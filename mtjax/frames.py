@@ -1,52 +1,64 @@
-"""Stacks of the last pictures of an episode, newest last.
+"""Stacks of the last pictures of an episode, newest last: arrays (..., H, W, N C) for N pictures of C channels.
 
-Observations hold one picture, so that a replay keeps each picture once. A stack is the agent's memory of the pictures
-before; a replay gathers the same stack from the pictures that it keeps. Where an episode is younger than the stack, its
-first picture is repeated.
+An observation of an environment holds one picture. Rollouts keep the stack that an agent sees, and a replay stores the
+newest picture of every stack. An episode's first picture is repeated where the episode is younger than the stack.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 
-from mtjax.types import Array
+from mtjax.types import Array, Spec
+
+PICTURES = "pixels"
+"""The entry of an observation that holds pictures, uint8."""
+STATE = "state"
+"""The entry that holds a vector beside them."""
 
 
-class Frames(NamedTuple):
-    """The pictures of an episode before the newest."""
-
-    past: Array  # (N - 1, H, W, C) oldest first
-    count: Array  # () int32, how many pictures the episode had before the newest
+def shown(obs: Any) -> bool:
+    """Return whether an observation, or its shapes, holds pictures."""
+    return isinstance(obs, Mapping) and PICTURES in obs
 
 
-def begin(shape: tuple[int, ...], frames: int, dtype=jnp.uint8) -> Frames:
-    """Return the memory with which an episode begins, for stacks of ``frames`` pictures of ``shape`` (H, W, C)."""
-    return Frames(jnp.zeros((frames - 1, *shape), dtype), jnp.int32(0))
+def begin(obs: Any, frames: int) -> Any:
+    """Return what an agent sees first: an observation whose picture (..., H, W, C) is repeated ``frames`` times."""
+    if frames == 1 or not shown(obs):
+        return obs
+    return obs | {PICTURES: jnp.concatenate([obs[PICTURES]] * frames, axis=-1)}
 
 
-def push(memory: Frames, picture: Array) -> Frames:
-    """Remember the picture (H, W, C) that was the newest until now."""
-    past = jnp.concatenate([memory.past, picture[None]])[1:]
-    return Frames(past, memory.count + 1)
+def push(seen: Any, obs: Any) -> Any:
+    """Return what an agent sees after a step: the next observation, with its picture at the end of the stack."""
+    if not shown(obs):
+        return obs
+    picture = obs[PICTURES]
+    return obs | {PICTURES: jnp.concatenate([seen[PICTURES][..., picture.shape[-1] :], picture], axis=-1)}
 
 
-def stack(memory: Frames, picture: Array) -> Array:
-    """Return the last pictures (H, W, N C) with ``picture`` (H, W, C) as the newest."""
-    everything = jnp.concatenate([memory.past, picture[None]])
-    return join(gather(everything, jnp.int32(len(everything) - 1), memory.count, len(everything)))
+def seen(spec: Spec) -> Any:
+    """Return the shapes of what an agent sees: those of observations, with stacks in place of pictures."""
+    return jax.eval_shape(lambda obs: begin(obs, spec.frames), spec.obs)
 
 
-def gather(pictures: Array, place: Array, age: Array, frames: int) -> Array:
-    """Return the ``frames`` last pictures (N, H, W, C) up to ``place`` of a ring of pictures (L, H, W, C).
-
-    Args:
-        place: () index of the newest picture.
-        age: () how many pictures of the same episode are before it. Older ones are replaced by the episode's first.
-    """
-    back = jnp.minimum(jnp.arange(frames - 1, -1, -1), age)
-    return pictures[(place - back) % len(pictures)]
+# The vector in an observation, if any: the observation itself, or what comes beside pictures.
 
 
-def join(pictures: Array) -> Array:
-    """Join pictures (N, H, W, C) along their channels: (H, W, N C)."""
-    return jnp.concatenate(list(pictures), axis=-1)
+def state(obs: Any) -> Array | None:
+    """Return the vector (..., O) in an observation, or None."""
+    return obs.get(STATE) if shown(obs) else obs
+
+
+def with_state(change: Callable[[Array], Array], obs: Any) -> Any:
+    """Return an observation whose vector is changed."""
+    if not shown(obs):
+        return change(obs)
+    return obs | {STATE: change(obs[STATE])} if STATE in obs else obs
+
+
+def state_size(spec: Spec) -> int:
+    """Return the size O of the vector in observations, 0 if there is none."""
+    found = state(spec.obs)
+    return spec.obs_size if found is spec.obs else 0 if found is None else found.shape[0]

@@ -152,7 +152,7 @@ class Experience(Protocol):
     def sharding(self) -> Any: ...  # of the data, as a tree of PartitionSpec
     def check(self, env: Env, num_envs: int) -> None: ...  # raises InputError
     def describe(self, num_envs: int) -> str: ...
-    def init(self, item: Transition, num_tasks: int, num_envs: int, keys: Key) -> Any: ...  # keys (S,)
+    def init(self, item: Transition, spec: Spec, num_tasks: int, num_envs: int, keys: Key) -> Any: ...  # keys (S,)
     def explore(self, data: Any, action: Array, step: Array) -> Array: ...  # actions (S, T, E, A) to take at a step ()
     def add(self, data: Any, steps: Transition) -> Any: ...  # leaves (S, T, H, E, ...)
     def keep(self, data: Any) -> Any: ...  # what the next iteration needs
