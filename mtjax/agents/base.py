@@ -320,7 +320,7 @@ class BaseAgent(abc.ABC):
 
     def init_moments(self, spec: Spec, num_tasks: int) -> normalize.Moments:
         """Return moments of no observations; in a mixture each task has its own, leaves (T, O)."""
-        moments = normalize.init(frames.state_size(spec))
+        moments = normalize.init(max(frames.state_size(spec), 1))  # checkpoints hold no empty arrays
         return jax.tree.map(lambda x: jnp.stack([x] * num_tasks), moments) if spec.mixed else moments
 
     def fit_moments(self, moments: normalize.Moments, obs: Array) -> normalize.Moments:
