@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property, partial
 from typing import Any, ClassVar, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -173,12 +174,13 @@ class Pictured(Family):
     def see(self, task: Task, world: World) -> Poses:
         """Return the poses of all that a picture of the world shows."""
         poses = locate(self.scene.model, partial(self.scene_leaf, task), world.qpos)
-        geoms = list(poses.geoms)
+        geoms = poses.geoms
         for name, mark in self.marks(task, world).items():
             i = self.scene.model.geom(name).id
-            axes = geoms[i].axes if mark.along is None else _frame(mark.along)
-            geoms[i] = Pose(tuple(mark.position), axes)  # type: ignore
-        return poses._replace(geoms=tuple(geoms))
+            put = lambda numbers, number, i=i: numbers.at[i].set(number)
+            axes = geoms.axes if mark.along is None else jax.tree.map(put, geoms.axes, _frame(mark.along))
+            geoms = Pose(jax.tree.map(put, geoms.position, tuple(mark.position)), axes)
+        return poses._replace(geoms=geoms)
 
     def draw(self, task: Task, world: World) -> Array:
         """Return a picture (H, W, 3), or grey (H, W, 1), uint8 of a world."""

@@ -27,11 +27,11 @@ class Rays(NamedTuple):
 
 
 class Body(NamedTuple):
-    """A geom in the camera's frame."""
+    """A geom in the camera's frame, or the geoms of all pixels (P,)."""
 
     centre: Vector
     axes: Axes
-    size: Array  # (3,)
+    size: Vector
     endless: tuple[bool, bool]  # whether a plane has no edges along x and y
 
 
