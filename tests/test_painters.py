@@ -1,4 +1,4 @@
-"""Painters: shapes against their equations, poses against MuJoCo's, pictures against MuJoCo's own and against Warp's."""
+"""Painters: poses, rays and pictures against those of MuJoCo and of Warp."""
 
 import os
 import subprocess
@@ -204,7 +204,7 @@ def test_a_shape_that_the_caster_does_not_know_is_refused():
         "<mujoco><asset><hfield name='h' nrow='2' ncol='2' size='1 1 1 1'/></asset>"
         "<worldbody><camera/><light/><geom type='hfield' hfield='h'/></worldbody></mujoco>"
     )
-    with pytest.raises(InputError, match="knows no hfield; use --env.painter=warp"):
+    with pytest.raises(InputError, match=r"knows no hfield; use --env.painter=warp"):
         Caster(Scene(model), 32)
 
 

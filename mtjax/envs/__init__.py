@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from mtjax.envs.engines.base import World
     from mtjax.envs.family import Family
     from mtjax.envs.mixtures import Mixture
-    from mtjax.envs.stacked import stacked
     from mtjax.envs.parameters import Parameter
+    from mtjax.envs.stacked import stacked
 
 __all__ = [
     "ENVS",

@@ -89,7 +89,9 @@ class Pictured(Family):
             choose_painter(self.painter)
             return
         shown = [name for name, _ in self.vary if self.every_parameter[name].looks]
-        shown += [f for f, default in (("grey", False), ("plain", False), ("state", "hidden")) if getattr(self, f) != default]
+        shown += [
+            f for f, plain in (("grey", False), ("plain", False), ("state", "hidden")) if getattr(self, f) != plain
+        ]
         if shown:
             raise InputError(f"{shown[0]} changes only what is seen; add --env.pixels=64")
 

@@ -2,7 +2,8 @@
 
 It casts one ray through the middle of each pixel, and lights the nearest geom as MuJoCo does: the headlight, the scene's
 lights with their cones, highlights, a checkered floor and the sky. There are no shadows and no mirrors. Everything is in
-the camera's frame, so that rays are constants. Arrays are (P,), one number for each pixel; the loop over geoms is static.
+the camera's frame, so that rays are constants. Arrays are (P,), one number for each pixel; the loop
+over geoms is a scan for each shape.
 """
 
 import dataclasses
@@ -139,7 +140,8 @@ class Caster:
 
         Positive floating-point numbers are in the order of their bits.
         """
-        nearest = _tag(jnp.full(self._rays.u.shape, MISSED / 2, jnp.float32), _MOST)  # the sky, before all that is missed
+        sky = jnp.full(self._rays.u.shape, MISSED / 2, jnp.float32)  # nearer than geoms that a ray misses
+        nearest = _tag(sky, _MOST)
         for group in self._groups:
 
             def nearer(nearest: Array, geom: tuple[Body, Array], group: Group = group) -> tuple[Array, None]:
@@ -173,7 +175,9 @@ class Caster:
         chosen = jax.tree.map(lambda x: x[first], numbers)
         for place in rest:
             here = number == place
-            chosen = jax.tree.map(lambda x, old, here=here, place=place: jnp.where(here, x[place], old), numbers, chosen)
+            chosen = jax.tree.map(
+                lambda x, old, here=here, place=place: jnp.where(here, x[place], old), numbers, chosen
+            )
         return chosen
 
     def _sky(self, view: View) -> Vector:
@@ -198,7 +202,8 @@ class Caster:
         pixel = self._pixel * distance
         for i in (0, 1):
             across = distance * along(self._rays, body.axes[i]) - dot(body.centre, body.axes[i])
-            phase = tiles.repeat[i] * ((-across if i else across) + (body.size[i] if tiles.from_edge[i] else 0.0)) + 0.25
+            begun = body.size[i] if tiles.from_edge[i] else 0.0
+            phase = tiles.repeat[i] * (begun - across if i else begun + across) + 0.25
             blur = tiles.repeat[i] * pixel * (1 + jnp.abs(body.axes[i][2]) / slope)  # of one pixel
             wave = jnp.abs(phase - jnp.floor(phase) - 0.5) - 0.25  # crosses 0 at edges of tiles
             waves.append(jnp.clip(wave * 2 / jnp.maximum(blur, 1e-6), -1.0, 1.0) / jnp.maximum(2 * blur, 1.0))

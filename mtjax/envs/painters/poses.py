@@ -171,7 +171,7 @@ def _light(model: mujoco.MjModel, leaf: Callable[[str], Array], frames: Array, i
     return _follow(model, leaf, frames, body, mode, "light", i), tuple(leaf("light_dir0")[i])
 
 
-def _follow(model: mujoco.MjModel, leaf: Callable[[str], Array], frames: Array, body: int, mode: int, kind: str, i: int):
+def _follow(model, leaf, frames: Array, body: int, mode: int, kind: str, i: int) -> Vector:
     """Return the position of a camera or light that follows a body, or its subtree's centre of mass."""
     if mode == _MODE.mjCAMLIGHT_TRACK:
         return _add(_of(frames, body)[0], tuple(leaf(f"{kind}_pos0")[i]))
