@@ -96,7 +96,7 @@ def _survey(spec: mujoco.MjSpec) -> Look:
     slope = math.atan(0.5)
     away = _DISTANCE * model.stat.extent
     camera = centre + away * np.array([0, -math.cos(slope), math.sin(slope)])
-    return Look(tuple(camera), 90 - math.degrees(slope), tuple(centre + [0, 0, 2 * model.stat.extent]), sun=True)
+    return Look(tuple(camera), 90 - math.degrees(slope), tuple(np.add(centre, [0, 0, 2 * model.stat.extent])), sun=True)
 
 
 def _about(axis: str, degrees: float) -> np.ndarray:

@@ -1,9 +1,9 @@
 """A small ray caster in plain JAX, for CPUs and all devices without a painter of their own.
 
-It casts one ray through the middle of each pixel, and lights the nearest geom as MuJoCo does: the headlight, the scene's
-lights with their cones, highlights, a checkered floor and the sky. There are no shadows and no mirrors. Everything is in
-the camera's frame, so that rays are constants. Arrays are (P,), one number for each pixel; the loop
-over geoms is a scan for each shape.
+It casts one ray through the middle of each pixel, and lights the nearest geom as MuJoCo does: the headlight, the
+scene's lights with their cones, highlights, a checkered floor and the sky. There are no shadows and no mirrors.
+Everything is in the camera's frame, so that rays are constants. Arrays are (P,), one number for each pixel. The loop
+over geoms is a scan for each shape, so that the time to compile does not depend on their number.
 """
 
 import dataclasses

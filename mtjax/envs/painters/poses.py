@@ -1,7 +1,7 @@
 """Poses of everything that a picture shows, from the positions of any engine's world.
 
-MuJoCo's C engine and MuJoCo Warp do not return poses, and importing MJX takes seconds. This code computes what a picture
-needs, in plain JAX. Vectors and quaternions are tuples of scalars, or of arrays with one number for each geom.
+MuJoCo's C engine and MuJoCo Warp do not return poses, and importing MJX takes seconds. This code computes what a
+picture needs, in plain JAX. Vectors and quaternions are tuples of scalars, or of arrays with one number for each geom.
 """
 
 from collections.abc import Callable

@@ -1,7 +1,7 @@
 """Where rays from a camera meet the shapes of geoms. All vectors are in the camera's frame, whose origin is the eye.
 
-Rays are (u, v, -1) and not of unit length, so that they are the same for all cameras and worlds. Nothing here is divided
-or rooted twice: XLA would write each such array to memory.
+Rays are (u, v, -1) and not of unit length, so that they are the same for all cameras and worlds. Quotients and roots
+are few, because XLA writes each one that is used twice to memory.
 """
 
 from collections.abc import Callable

@@ -201,7 +201,10 @@ class WarpPainter:
 
 
 def _drawer(painter: Any, count: int) -> Callable:
-    """Return the function that Warp runs in a call. It holds a weak reference, as Warp keeps such functions for good."""
+    """Return the function that Warp runs in a call.
+
+    It holds a weak reference to the painter: Warp keeps such functions for good, but its memory must be freed.
+    """
     from mujoco.mjx.third_party import mujoco_warp
 
     def draw(*arrays: Any) -> None:
