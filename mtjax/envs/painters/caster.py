@@ -121,7 +121,7 @@ class Caster:
             place = _seen_from(eye, Pose(position, (direction,) * 3))
             lights.append((place.position, place.axes[2]))
         up: Any = tuple(axis[2] for axis in eye.axes)
-        bodies = Body(geoms.position, geoms.axes, size, ())
+        bodies = Body(geoms.position, geoms.axes, size)
         return View(bodies, leaf("geom_rgba")[shown, :3], tuple(lights), leaf("light_diffuse"), up)
 
     @property
@@ -132,7 +132,7 @@ class Caster:
     @cached_property
     def _rays(self) -> Rays:
         line = (np.arange(self.size) + 0.5 - self.size / 2) * self._pixel
-        u, v = (np.float32(x.ravel()) for x in np.meshgrid(line, -line))
+        u, v = (x.ravel().astype(np.float32) for x in np.meshgrid(line, -line))
         return Rays(u, v, u * u + v * v + 1)
 
     def _nearest(self, view: View) -> Array:

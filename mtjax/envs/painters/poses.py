@@ -14,9 +14,9 @@ import numpy as np
 
 from mtjax.types import Array, InputError
 
-Vector = tuple[Array, Array, Array]
-Quaternion = tuple[Array, Array, Array, Array]
-Axes = tuple[Vector, Vector, Vector]  # the x, y and z axis of a frame
+Vector = tuple[Any, ...]  # three numbers or arrays of the same shape
+Quaternion = tuple[Any, ...]  # four of them
+Axes = tuple[Vector, ...]  # the x, y and z axis of a frame
 
 _MODE = mujoco.mjtCamLight
 MODES = tuple(map(int, (_MODE.mjCAMLIGHT_FIXED, _MODE.mjCAMLIGHT_TRACK, _MODE.mjCAMLIGHT_TRACKCOM)))

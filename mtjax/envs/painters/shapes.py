@@ -5,7 +5,7 @@ are few, because XLA writes each one that is used twice to memory.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import mujoco
@@ -32,7 +32,7 @@ class Body(NamedTuple):
     centre: Vector
     axes: Axes
     size: Vector
-    endless: tuple[bool, bool]  # whether a plane has no edges along x and y
+    endless: tuple[bool, ...] = ()  # whether a plane has no edges along x and y
 
 
 class Shape(NamedTuple):
@@ -42,7 +42,7 @@ class Shape(NamedTuple):
     normal: Callable[[Vector, Body], Vector]  # unit normals at points (P,) of the surface
 
 
-def along(rays: Rays, vector: Vector) -> Array:
+def along(rays: Rays, vector: Vector) -> Any:
     """Return the dot product (P,) of rays and a vector."""
     return rays.u * vector[0] + rays.v * vector[1] - vector[2]
 
@@ -52,7 +52,7 @@ def at(rays: Rays, distance: Array) -> Vector:
     return distance * rays.u, distance * rays.v, -distance
 
 
-def dot(one: Vector, other: Vector) -> Array:
+def dot(one: Vector, other: Vector) -> Any:
     """Return the dot product of two vectors."""
     return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
 
