@@ -105,7 +105,7 @@ class Caster:
             alone = geom if geom in scene.tiles else -1
             found.setdefault((kind, endless if kind == _PLANE else (), alone), []).append(place)
         return tuple(
-            Group(SHAPES[kind], np.array(places), endless, scene.tiles.get(alone))  # type: ignore
+            Group(SHAPES[kind], np.array(places), endless, scene.tiles.get(alone))
             for (kind, endless, alone), places in found.items()
         )
 
@@ -186,14 +186,14 @@ class Caster:
         colour = [jnp.float32(0)] * 3
         for powers in self.scene.sky:
             colour = [c * height + p for c, p in zip(colour, powers, strict=True)]
-        return tuple(colour)  # type: ignore
+        return tuple(colour)
 
     def _paint(self, rgb: Vector, group: Group, body: Body, distance: Array) -> Vector:
         """Return the colour of geoms where rays meet them; planes may be checkered."""
         if group.tiles is None:
             return rgb
         blend, (one, other) = self._checker(group.tiles, body, distance), group.tiles.colours
-        return tuple(rgb[i] * (one[i] + blend * (other[i] - one[i])) for i in range(3))  # type: ignore
+        return tuple(rgb[i] * (one[i] + blend * (other[i] - one[i])) for i in range(3))
 
     def _checker(self, tiles: Tiles, body: Body, distance: Array) -> Array:
         """Return 0 on tiles of one colour and 1 on those of the other, and between them across edges."""
@@ -224,16 +224,16 @@ class Caster:
                 to_light, reach = tuple(-x for x in direction), 1.0
             else:
                 away = tuple(q - p for p, q in zip(point, position, strict=True))
-                short = 1 / jnp.sqrt(dot(away, away))  # type: ignore
+                short = 1 / jnp.sqrt(dot(away, away))
                 to_light = tuple(short * x for x in away)
-                reach = _cone(model, i, -dot(to_light, direction))  # type: ignore
-            facing = jnp.maximum(dot(normal, to_light), 0.0) * reach  # type: ignore
+                reach = _cone(model, i, -dot(to_light, direction))
+            facing = jnp.maximum(dot(normal, to_light), 0.0) * reach
             half = tuple(a + b for a, b in zip(to_light, eye, strict=True))
             shine = _shine(normal, half, facing) * reach
             for c in range(3):
                 diffuse[c] += jnp.where(solid, model.light_ambient[i][c] + view.strength[i, c] * facing, 0.0)
                 bright[c] += model.light_specular[i][c] * shine
-        return tuple(c * d + gloss * b for c, d, b in zip(colour, diffuse, bright, strict=True))  # type: ignore
+        return tuple(c * d + gloss * b for c, d, b in zip(colour, diffuse, bright, strict=True))
 
 
 def _tag(distance: Array, number: Any) -> Array:
@@ -242,7 +242,7 @@ def _tag(distance: Array, number: Any) -> Array:
 
 
 def _pick(mask: Array, one: Vector, other: Vector) -> Vector:
-    return tuple(jnp.where(mask, a, b) for a, b in zip(one, other, strict=True))  # type: ignore
+    return tuple(jnp.where(mask, a, b) for a, b in zip(one, other, strict=True))
 
 
 def _unit_half(eye: Vector) -> Vector:
@@ -272,4 +272,4 @@ def _seen_from(eye: Pose, thing: Pose) -> Pose:
     """Return a pose in the camera's frame."""
     inside = lambda vector: tuple(dot(axis, vector) for axis in eye.axes)
     apart = tuple(a - b for a, b in zip(thing.position, eye.position, strict=True))
-    return Pose(inside(apart), tuple(inside(axis) for axis in thing.axes))  # type: ignore
+    return Pose(inside(apart), tuple(inside(axis) for axis in thing.axes))

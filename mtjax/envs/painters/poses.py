@@ -130,16 +130,16 @@ def _joints(model: mujoco.MjModel, leaf: Callable[[str], Array], qpos: Array) ->
 def _move(position: Vector, quat: Quaternion, joint: _Joints, special: bool) -> tuple[Vector, Quaternion]:
     """Return a body's frame after one of its joints."""
     axis, anchor = tuple(joint.axis), tuple(joint.anchor)
-    position = _add(position, _times(joint.slid, turn(quat, axis)))  # type: ignore
-    turned = _about(axis, joint.angle)  # type: ignore
+    position = _add(position, _times(joint.slid, turn(quat, axis)))
+    turned = _about(axis, joint.angle)
     if special:
-        turned = _choose(joint.ball, _unit(tuple(joint.given[:4])), turned)  # type: ignore
-    held = _add(position, turn(quat, anchor))  # type: ignore
+        turned = _choose(joint.ball, _unit(tuple(joint.given[:4])), turned)
+    held = _add(position, turn(quat, anchor))
     quat = _multiply(quat, turned)
-    position = _add(held, _times(-1.0, turn(quat, anchor)))  # type: ignore
+    position = _add(held, _times(-1.0, turn(quat, anchor)))
     if not special:
         return position, quat
-    free = tuple(joint.given[:3]), _unit(tuple(joint.given[3:]))  # type: ignore
+    free = tuple(joint.given[:3]), _unit(tuple(joint.given[3:]))
     return _choose(joint.free, free[0], position), _choose(joint.free, free[1], quat)
 
 
@@ -150,7 +150,7 @@ def _choose(mask: Array, ours: tuple, theirs: tuple) -> tuple:
 def _of(frames: Array, body: Any) -> tuple[Vector, Quaternion]:
     """Return position and rotation of one body, or of several."""
     numbers = frames[body]
-    return tuple(numbers[..., i] for i in range(3)), tuple(numbers[..., i] for i in range(3, 7))  # type: ignore
+    return tuple(numbers[..., i] for i in range(3)), tuple(numbers[..., i] for i in range(3, 7))
 
 
 def _camera(model: mujoco.MjModel, leaf: Callable[[str], Array], frames: Array) -> Pose:
@@ -160,7 +160,7 @@ def _camera(model: mujoco.MjModel, leaf: Callable[[str], Array], frames: Array) 
         return Pose(position, axes_of(quat))
     rows = leaf("cam_mat0")[0].reshape(3, 3)
     axes = tuple(tuple(rows[:, i]) for i in range(3))
-    return Pose(_follow(model, leaf, frames, body, mode, "cam", 0), axes)  # type: ignore
+    return Pose(_follow(model, leaf, frames, body, mode, "cam", 0), axes)
 
 
 def _light(model: mujoco.MjModel, leaf: Callable[[str], Array], frames: Array, i: int) -> tuple[Vector, Vector]:
@@ -187,7 +187,7 @@ def _centre(model: mujoco.MjModel, leaf: Callable[[str], Array], frames: Array, 
     position, quat = _of(frames, members)
     masses = leaf("body_mass")[members]
     centres = _add(position, turn(quat, tuple(leaf("body_ipos")[members].T)))
-    return tuple(jnp.sum(masses * x) / jnp.sum(masses) for x in centres)  # type: ignore
+    return tuple(jnp.sum(masses * x) / jnp.sum(masses) for x in centres)
 
 
 def axes_of(quat: Quaternion) -> Axes:
@@ -230,7 +230,7 @@ def _about(axis: Vector, angle: Array) -> Quaternion:
 
 def _unit(quat: Quaternion) -> Quaternion:
     scale = 1 / jnp.sqrt(sum(x * x for x in quat))
-    return tuple(x * scale for x in quat)  # type: ignore
+    return tuple(x * scale for x in quat)
 
 
 def _cross(one, other) -> Vector:
