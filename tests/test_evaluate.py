@@ -213,7 +213,7 @@ def test_video_films_each_task(copied_run, capsys, monkeypatch):
         return types.SimpleNamespace(name=path.name)
 
     monkeypatch.setattr(render, "choose_backend", lambda: None)
-    monkeypatch.setattr(render, "film", lambda env, row, qpos: (row, qpos.shape))
+    monkeypatch.setattr(render, "film", lambda env, row, states: (row, states.qpos.shape))
     monkeypatch.setattr(render, "write_video", write)
     mtjax.evaluate.main([f"--run={copied_run}", "--episodes=1", "--video"])
     names = [f"{split}-size-{value:g}" for split, values in VALUES.items() for value in values]

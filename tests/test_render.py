@@ -75,8 +75,8 @@ def test_film_puts_targets_where_the_episode_has_them():
     render._place(model, family.marks(task, STATES._replace(extra=place)))
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    hinge = model.body("spinner").pos
-    np.testing.assert_allclose(data.geom("target").xpos, hinge + [0.1, 0, -0.05], atol=1e-6)
+    hinge = np.array(model.body("spinner").pos)
+    np.testing.assert_allclose(data.geom("target").xpos, np.add(hinge, [0.1, 0, -0.05]), atol=1e-6)
 
 
 @pytest.mark.parametrize("row", [-1, 99])

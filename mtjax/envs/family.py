@@ -321,7 +321,9 @@ class Family(Flat, Tabled):
     @property
     def task_axis(self) -> tuple[str, str]:
         """Return name and unit of ``task_values``."""
-        return (self.varied[0], self.every_parameter[self.varied[0]].unit) if len(self.varied) == 1 else ("task", "number")
+        return (
+            (self.varied[0], self.every_parameter[self.varied[0]].unit) if len(self.varied) == 1 else ("task", "number")
+        )
 
     def describe(self, row: int) -> str:
         """Return a task's varied parameters as text, such as "size=0.95"."""

@@ -74,13 +74,13 @@ def _paint_background(spec: mujoco.MjSpec, plain: bool) -> None:
     builtin = mujoco.mjtBuiltin
     gradient = builtin.mjBUILTIN_FLAT if plain else builtin.mjBUILTIN_GRADIENT
     if not any(texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX for texture in spec.textures):
-        sky = spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, width=128, height=128)
+        sky = spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, width=32, height=32)
         sky.builtin, sky.rgb1, sky.rgb2 = gradient, _HORIZON if plain else _SKY, _HORIZON if plain else _NADIR
     floors = [geom for geom in spec.geoms if geom.name in _FLOORS and not geom.material]
     for geom in floors:
         geom.rgba = [*_FLOOR, 1]
     if floors and not plain:
-        tiles = spec.add_texture(name="tiles", type=mujoco.mjtTexture.mjTEXTURE_2D, width=256, height=256)
+        tiles = spec.add_texture(name="tiles", type=mujoco.mjtTexture.mjTEXTURE_2D, width=128, height=128)
         tiles.builtin, tiles.rgb1, tiles.rgb2 = builtin.mjBUILTIN_CHECKER, _DARK, [1, 1, 1]
         material = spec.add_material(name="tiles", texuniform=True, texrepeat=[1, 1], specular=0)
         material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
@@ -96,7 +96,7 @@ def _survey(spec: mujoco.MjSpec) -> Look:
     slope = math.atan(0.5)
     away = _DISTANCE * model.stat.extent
     camera = centre + away * np.array([0, -math.cos(slope), math.sin(slope)])
-    return Look(tuple(camera), 90 - math.degrees(slope), tuple(centre + [0, 0, 2 * model.stat.extent]), sun=True)
+    return Look(tuple(camera), 90 - math.degrees(slope), tuple(np.add(centre, [0, 0, 2 * model.stat.extent])), sun=True)
 
 
 def _about(axis: str, degrees: float) -> np.ndarray:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property, partial
 from typing import Any, ClassVar, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -88,7 +89,9 @@ class Pictured(Family):
             choose_painter(self.painter)
             return
         shown = [name for name, _ in self.vary if self.every_parameter[name].looks]
-        shown += [f for f, default in (("grey", False), ("plain", False), ("state", "hidden")) if getattr(self, f) != default]
+        shown += [
+            f for f, plain in (("grey", False), ("plain", False), ("state", "hidden")) if getattr(self, f) != plain
+        ]
         if shown:
             raise InputError(f"{shown[0]} changes only what is seen; add --env.pixels=64")
 
@@ -126,23 +129,20 @@ class Pictured(Family):
                 parameter.edit(spec, float(value))
         return spec
 
-    @cached_property
-    def scenes(self) -> tuple[mujoco.MjModel, ...]:
-        """Return the scene of every row of the table, for observations. Rows that look the same share one."""
-        compile_one = lambda values: observed(self.compile_scene(values).compile(), self.hides)
-        return self.for_rows(compile_one, [name for name, p in self.every_parameter.items() if p.edit is not None])
-
-    def for_rows(self, compile_one: Callable[[dict[str, float]], mujoco.MjModel], names: Iterable[str]):
-        """Return a compiled model for every row of the table. Rows with equal values of ``names`` share one."""
+    def for_rows(self, make: Callable[[dict[str, float]], Any], names: Iterable[str]) -> tuple[Any, ...]:
+        """Return what ``make`` returns for every row of the table. Rows with equal values of ``names`` share it."""
         used = [name for name in self.values if name in names]
         rows = list(zip(*(self.values[name].tolist() for name in used), strict=True)) or [()] * self.count
-        made = {row: compile_one(dict(zip(used, row, strict=True))) for row in dict.fromkeys(rows)}
+        made = {row: make(dict(zip(used, row, strict=True))) for row in dict.fromkeys(rows)}
         return tuple(made[row] for row in rows)
+
+    def _observed(self, values: Mapping[str, float]) -> mujoco.MjModel:
+        return observed(self.compile_scene(values).compile(), self.hides)
 
     @cached_property
     def scene(self) -> Scene:
         """Return what no task changes of the scene."""
-        return Scene(self.scenes[0])
+        return Scene(self._observed({name: values[0] for name, values in self.values.items()}))
 
     @cached_property
     def artist(self) -> Painter:
@@ -156,11 +156,14 @@ class Pictured(Family):
 
     def scene_leaves(self) -> dict[str, np.ndarray]:
         """Return the fields (R, ...) of scenes that differ between rows."""
-        rows = {id(model): model for model in self.scenes}
-        place = {identity: i for i, identity in enumerate(rows)}
-        places = [place[id(model)] for model in self.scenes]
-        columns = {name: np.stack([np.float32(getattr(m, name)) for m in rows.values()]) for name in LEAVES}
-        return {name: column[places] for name, column in columns.items() if np.any(column != column[0])}
+
+        def fields(values: dict[str, float]) -> dict[str, np.ndarray]:  # alone, as models hold textures
+            model = self._observed(values)
+            return {name: np.asarray(getattr(model, name), np.float32) for name in LEAVES}
+
+        rows = self.for_rows(fields, [name for name, p in self.every_parameter.items() if p.edit is not None])
+        columns = {name: np.stack([row[name] for row in rows]) for name in LEAVES}
+        return {name: column for name, column in columns.items() if np.any(column != column[0])}
 
     # Observations.
 
@@ -173,12 +176,13 @@ class Pictured(Family):
     def see(self, task: Task, world: World) -> Poses:
         """Return the poses of all that a picture of the world shows."""
         poses = locate(self.scene.model, partial(self.scene_leaf, task), world.qpos)
-        geoms = list(poses.geoms)
+        geoms = poses.geoms
         for name, mark in self.marks(task, world).items():
             i = self.scene.model.geom(name).id
-            axes = geoms[i].axes if mark.along is None else _frame(mark.along)
-            geoms[i] = Pose(tuple(mark.position), axes)  # type: ignore
-        return poses._replace(geoms=tuple(geoms))
+            put = lambda numbers, number, i=i: numbers.at[i].set(number)
+            axes = geoms.axes if mark.along is None else jax.tree.map(put, geoms.axes, _frame(mark.along))
+            geoms = Pose(jax.tree.map(put, geoms.position, tuple(mark.position)), axes)
+        return poses._replace(geoms=geoms)
 
     def draw(self, task: Task, world: World) -> Array:
         """Return a picture (H, W, 3), or grey (H, W, 1), uint8 of a world."""

@@ -119,8 +119,8 @@ def make(
 class FamilyEnv(TaskStream, gymnasium.Env):
     """A family with MTEnv's interface. ``reset`` begins an episode of the current task and never changes the task.
 
-    Observation: ``env_obs`` (O,) is the observation of the world, or its last pictures (H, W, N C), newest last. ``task_obs`` is that of the task: its context (C,),
-        its number among all tasks of the family, or nothing (0,).
+    Observation: ``env_obs`` (O,) is the observation of the world, or its last pictures (H, W, N C), newest last.
+        ``task_obs`` is that of the task: its context (C,), its number among all tasks of the family, or nothing (0,).
     Action: (A,) in [-1, 1]. A time limit truncates.
     Task state: an int. With the family's settings it identifies the task. The environment starts with the first task
         of the split. After a change of the task call ``reset`` before ``step``.

@@ -2,6 +2,7 @@
 
 import importlib
 import math
+import operator
 import os
 import platform
 from pathlib import Path
@@ -55,7 +56,7 @@ def film(env: Domain, task_row: int, states: World, width: int = 320, height: in
     frames = np.empty((len(qpos), height, width, 3), np.uint8)
     with _open_renderer(model, width, height) as renderer:
         for i, frame in enumerate(frames):
-            _place(model, {name: Mark(*(x if x is None else x[i] for x in mark)) for name, mark in marks.items()})
+            _place(model, jax.tree.map(operator.itemgetter(i), marks))
             data.qpos[:] = qpos[i]
             mujoco.mj_forward(model, data)
             renderer.update_scene(data, 0)

@@ -1,6 +1,7 @@
 """The command ``python -m mtjax.evaluate``: score, plot and film a trained run on every task of every split."""
 
 import contextlib
+import operator
 from pathlib import Path
 from typing import Any
 
@@ -118,7 +119,8 @@ def _film_family(policy: Policy, part: Part, played: Recording, directory: Path)
             place = part.places["all"][i]
             row = int(played.rows[place])  # continuous ranges have a row for each episode
             shown = slice(0, min(longest, int(played.lengths[place])), stride)
-            frames = render.film(family, policy.env.own_row(row), jax.tree.map(lambda x: x[i, shown], played.states))
+            states = jax.tree.map(operator.itemgetter((i, shown)), played.states)
+            frames = render.film(family, policy.env.own_row(row), states)
             named = f"{split}-{policy.env.describe(row)}".replace("=", "-").replace(" ", "-")
             path = render.write_video(directory / named, frames, fps)
             print(f"filmed {path.name}: return {float(played.returns[place]):.0f}", flush=True)

@@ -1,11 +1,13 @@
 """A small ray caster in plain JAX, for CPUs and all devices without a painter of their own.
 
-It casts one ray through the middle of each pixel, and lights the nearest geom as MuJoCo does: the headlight, the scene's
-lights with their cones, highlights, a checkered floor and the sky. There are no shadows and no mirrors. Everything is in
-the camera's frame, so that rays are constants. Arrays are (P,), one number for each pixel; the loop over geoms is static.
+It casts one ray through the middle of each pixel, and lights the nearest geom as MuJoCo does: the headlight, the
+scene's lights with their cones, highlights, a checkered floor and the sky. There are no shadows and no mirrors.
+Everything is in the camera's frame, so that rays are constants. Arrays are (P,), one number for each pixel. The loop
+over geoms is a scan for each shape, so that the time to compile does not depend on their number.
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 from functools import cached_property
@@ -18,13 +20,14 @@ import numpy as np
 
 from mtjax.envs.painters.batch import flat_batch, in_chunks
 from mtjax.envs.painters.poses import Pose, Poses, Vector
-from mtjax.envs.painters.scene import Scene
-from mtjax.envs.painters.shapes import MISSED, SHAPES, Body, Rays, along, at, dot
+from mtjax.envs.painters.scene import Scene, Tiles
+from mtjax.envs.painters.shapes import MISSED, SHAPES, Body, Rays, Shape, along, at, dot
 from mtjax.types import Array, InputError
 
 _CHUNK = 16  # pictures that a CPU draws at once: their arrays fit into its caches
 _MOST = 63  # geoms, whose numbers have to fit into the last bits of a distance
 _ROUND = tuple(int(getattr(mujoco.mjtGeom, f"mjGEOM_{x}")) for x in ("SPHERE", "CAPSULE", "CYLINDER"))
+_PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
 _HALF = 0.51  # of a pixel, and a bit
 _SHINE = 6  # highlights are the 2^6th power of a cosine: MuJoCo's shininess of 0.5
 
@@ -32,11 +35,20 @@ _SHINE = 6  # highlights are the 2^6th power of a cosine: MuJoCo's shininess of 
 class View(NamedTuple):
     """What a picture shows, in the camera's frame."""
 
-    bodies: tuple[Body, ...]
-    colours: tuple[Array, ...]  # (4,) of each body
+    bodies: Body  # with numbers (G,), one for each geom that is seen
+    colours: Array  # (G, 3)
     lights: tuple[tuple[Vector, Vector], ...]  # position and direction of each
     strength: Array  # (lights, 3)
     up: Vector  # the world's z axis
+
+
+class Group(NamedTuple):
+    """Geoms of one shape that are computed alike."""
+
+    shape: Shape
+    places: np.ndarray  # which of the geoms that are seen
+    endless: tuple[bool, bool]  # of planes: whether they have no edges along x and y
+    tiles: Tiles | None  # of checkered planes
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -84,22 +96,33 @@ class Caster:
 
         return flat_batch(draw)
 
+    @cached_property
+    def _groups(self) -> tuple[Group, ...]:
+        model, scene, found = self.scene.model, self.scene, {}
+        for place, geom in enumerate(scene.shown):
+            kind = int(model.geom_type[geom])
+            endless = (bool(model.geom_size[geom, 0] <= 0), bool(model.geom_size[geom, 1] <= 0))
+            alone = geom if geom in scene.tiles else -1
+            found.setdefault((kind, endless if kind == _PLANE else (), alone), []).append(place)
+        return tuple(
+            Group(SHAPES[kind], np.array(places), endless, scene.tiles.get(alone))
+            for (kind, endless, alone), places in found.items()
+        )
+
     def _view(self, leaf: Callable[[str], Array], poses: Poses) -> View:
-        sizes, colours, eye = leaf("geom_size"), leaf("geom_rgba"), poses.camera
-        model = self.scene.model
-        bodies = []
-        for geom in self.scene.shown:
-            place = _seen_from(eye, poses.geoms[geom])
-            size = sizes[geom]
-            if model.geom_type[geom] in _ROUND:  # at least a pixel wide, so that no ray misses it
-                size = size.at[0].max(_HALF * self._pixel * -place.position[2])
-            bodies.append(Body(place.position, place.axes, size, ()))
+        eye, shown, model = poses.camera, np.array(self.scene.shown), self.scene.model
+        chosen = jax.tree.map(lambda x: x[shown], poses.geoms)
+        geoms, sizes = _seen_from(eye, chosen), leaf("geom_size")[shown].T
+        round_ones = np.isin(model.geom_type[shown], _ROUND)
+        least = jnp.where(round_ones, _HALF * self._pixel * -geoms.position[2], 0.0)  # a pixel wide: no ray misses it
+        size = (jnp.maximum(sizes[0], least), sizes[1], sizes[2])
         lights = []
         for position, direction in poses.lights:
             place = _seen_from(eye, Pose(position, (direction,) * 3))
             lights.append((place.position, place.axes[2]))
-        up = tuple(axis[2] for axis in eye.axes)
-        return View(tuple(bodies), tuple(colours[i] for i in self.scene.shown), tuple(lights), leaf("light_diffuse"), up)  # type: ignore
+        up: Any = tuple(axis[2] for axis in eye.axes)
+        bodies = Body(geoms.position, geoms.axes, size)
+        return View(bodies, leaf("geom_rgba")[shown, :3], tuple(lights), leaf("light_diffuse"), up)
 
     @property
     def _pixel(self) -> float:
@@ -109,7 +132,7 @@ class Caster:
     @cached_property
     def _rays(self) -> Rays:
         line = (np.arange(self.size) + 0.5 - self.size / 2) * self._pixel
-        u, v = (np.float32(x.ravel()) for x in np.meshgrid(line, -line))
+        u, v = (x.ravel().astype(np.float32) for x in np.meshgrid(line, -line))
         return Rays(u, v, u * u + v * v + 1)
 
     def _nearest(self, view: View) -> Array:
@@ -117,12 +140,16 @@ class Caster:
 
         Positive floating-point numbers are in the order of their bits.
         """
-        nearest = _tag(jnp.full(self._rays.u.shape, MISSED / 2, jnp.float32), _MOST)  # the sky, before all that is missed
-        for i, (geom, body) in enumerate(zip(self.scene.shown, view.bodies, strict=True)):
-            endless = tuple(bool(x <= 0) for x in self.scene.model.geom_size[geom, :2])
-            shape = SHAPES[int(self.scene.model.geom_type[geom])]
-            distance = shape.distance(self._rays, body._replace(endless=endless))
-            nearest = jnp.minimum(nearest, _tag(distance, i))
+        sky = jnp.full(self._rays.u.shape, MISSED / 2, jnp.float32)  # nearer than geoms that a ray misses
+        nearest = _tag(sky, _MOST)
+        for group in self._groups:
+
+            def nearer(nearest: Array, geom: tuple[Body, Array], group: Group = group) -> tuple[Array, None]:
+                distance = group.shape.distance(self._rays, geom[0]._replace(endless=group.endless))
+                return jnp.minimum(nearest, _tag(distance, geom[1])), None
+
+            bodies = jax.tree.map(lambda x, group=group: x[group.places], view.bodies)
+            nearest, _ = jax.lax.scan(nearer, nearest, (bodies, jnp.int32(group.places)))
         return nearest
 
     def _colour(self, view: View, nearest: Array) -> Array:
@@ -130,14 +157,28 @@ class Caster:
         number = nearest & _MOST
         distance = jax.lax.bitcast_convert_type(nearest & ~_MOST, jnp.float32)
         point, normal, colour, gloss = at(self._rays, distance), (0.0, 0.0, 1.0), self._sky(view), 0.0
-        for i, (geom, body) in enumerate(zip(self.scene.shown, view.bodies, strict=True)):
-            here = number == i
-            normal = _pick(here, SHAPES[int(self.scene.model.geom_type[geom])].normal(point, body), normal)
-            colour = _pick(here, self._paint(view.colours[i], geom, body, distance), colour)
-            gloss = jnp.where(here, self.scene.gloss[geom], gloss)
+        for group in self._groups:
+            body, rgb, shine = self._chosen(view, group, number)
+            here = functools.reduce(jnp.logical_or, [number == place for place in group.places])
+            normal = _pick(here, group.shape.normal(point, body), normal)
+            colour = _pick(here, self._paint(rgb, group, body, distance), colour)
+            gloss = jnp.where(here, shine, gloss)
         shaded = self._light(view, point, normal, colour, gloss, number != _MOST)
         red, green, blue = (jnp.uint32(jnp.clip(c, 0.0, 1.0) * 255 + 0.5) for c in shaded)
         return red | (green << 8) | (blue << 16)
+
+    def _chosen(self, view: View, group: Group, number: Array) -> tuple[Body, Vector, Array]:
+        """Return body, colour and gloss of the geom in each pixel, if it is of this group."""
+        gloss = jnp.float32(self.scene.gloss[list(self.scene.shown)])
+        numbers = (view.bodies, tuple(view.colours.T), gloss)
+        first, *rest = group.places
+        chosen = jax.tree.map(lambda x: x[first], numbers)
+        for place in rest:
+            here = number == place
+            chosen = jax.tree.map(
+                lambda x, old, here=here, place=place: jnp.where(here, x[place], old), numbers, chosen
+            )
+        return chosen
 
     def _sky(self, view: View) -> Vector:
         """Return the colour of the sky, whose fits are polynomials of the sine of the elevation."""
@@ -145,24 +186,24 @@ class Caster:
         colour = [jnp.float32(0)] * 3
         for powers in self.scene.sky:
             colour = [c * height + p for c, p in zip(colour, powers, strict=True)]
-        return tuple(colour)  # type: ignore
+        return tuple(colour)
 
-    def _paint(self, rgba: Array, geom: int, body: Body, distance: Array) -> Vector:
-        """Return the colour of a geom where rays meet it; planes may be checkered."""
-        tiles = self.scene.tiles.get(geom)
-        if tiles is None:
-            return rgba[0], rgba[1], rgba[2]
-        blend, (one, other) = self._checker(geom, body, distance), tiles.colours
-        return tuple(rgba[i] * (one[i] + blend * (other[i] - one[i])) for i in range(3))  # type: ignore
+    def _paint(self, rgb: Vector, group: Group, body: Body, distance: Array) -> Vector:
+        """Return the colour of geoms where rays meet them; planes may be checkered."""
+        if group.tiles is None:
+            return rgb
+        blend, (one, other) = self._checker(group.tiles, body, distance), group.tiles.colours
+        return tuple(rgb[i] * (one[i] + blend * (other[i] - one[i])) for i in range(3))
 
-    def _checker(self, geom: int, body: Body, distance: Array) -> Array:
+    def _checker(self, tiles: Tiles, body: Body, distance: Array) -> Array:
         """Return 0 on tiles of one colour and 1 on those of the other, and between them across edges."""
-        tiles, waves = self.scene.tiles[geom], []
+        waves = []
         slope = jnp.maximum(-along(self._rays, body.axes[2]), 1e-3)
         pixel = self._pixel * distance
         for i in (0, 1):
             across = distance * along(self._rays, body.axes[i]) - dot(body.centre, body.axes[i])
-            phase = tiles.repeat[i] * ((-across if i else across) + (body.size[i] if tiles.from_edge[i] else 0.0)) + 0.25
+            begun = body.size[i] if tiles.from_edge[i] else 0.0
+            phase = tiles.repeat[i] * (begun - across if i else begun + across) + 0.25
             blur = tiles.repeat[i] * pixel * (1 + jnp.abs(body.axes[i][2]) / slope)  # of one pixel
             wave = jnp.abs(phase - jnp.floor(phase) - 0.5) - 0.25  # crosses 0 at edges of tiles
             waves.append(jnp.clip(wave * 2 / jnp.maximum(blur, 1e-6), -1.0, 1.0) / jnp.maximum(2 * blur, 1.0))
@@ -183,25 +224,25 @@ class Caster:
                 to_light, reach = tuple(-x for x in direction), 1.0
             else:
                 away = tuple(q - p for p, q in zip(point, position, strict=True))
-                short = 1 / jnp.sqrt(dot(away, away))  # type: ignore
+                short = 1 / jnp.sqrt(dot(away, away))
                 to_light = tuple(short * x for x in away)
-                reach = _cone(model, i, -dot(to_light, direction))  # type: ignore
-            facing = jnp.maximum(dot(normal, to_light), 0.0) * reach  # type: ignore
+                reach = _cone(model, i, -dot(to_light, direction))
+            facing = jnp.maximum(dot(normal, to_light), 0.0) * reach
             half = tuple(a + b for a, b in zip(to_light, eye, strict=True))
             shine = _shine(normal, half, facing) * reach
             for c in range(3):
                 diffuse[c] += jnp.where(solid, model.light_ambient[i][c] + view.strength[i, c] * facing, 0.0)
                 bright[c] += model.light_specular[i][c] * shine
-        return tuple(c * d + gloss * b for c, d, b in zip(colour, diffuse, bright, strict=True))  # type: ignore
+        return tuple(c * d + gloss * b for c, d, b in zip(colour, diffuse, bright, strict=True))
 
 
-def _tag(distance: Array, number: int) -> Array:
+def _tag(distance: Array, number: Any) -> Array:
     """Return a distance as an integer with a geom's number in the last bits."""
     return (jax.lax.bitcast_convert_type(distance, jnp.int32) & ~_MOST) | number
 
 
 def _pick(mask: Array, one: Vector, other: Vector) -> Vector:
-    return tuple(jnp.where(mask, a, b) for a, b in zip(one, other, strict=True))  # type: ignore
+    return tuple(jnp.where(mask, a, b) for a, b in zip(one, other, strict=True))
 
 
 def _unit_half(eye: Vector) -> Vector:
@@ -231,4 +272,4 @@ def _seen_from(eye: Pose, thing: Pose) -> Pose:
     """Return a pose in the camera's frame."""
     inside = lambda vector: tuple(dot(axis, vector) for axis in eye.axes)
     apart = tuple(a - b for a, b in zip(thing.position, eye.position, strict=True))
-    return Pose(inside(apart), tuple(inside(axis) for axis in thing.axes))  # type: ignore
+    return Pose(inside(apart), tuple(inside(axis) for axis in thing.axes))

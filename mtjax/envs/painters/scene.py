@@ -15,7 +15,7 @@ from mtjax.envs.painters.poses import FIELDS, require_known
 LEAVES = (*FIELDS, "geom_size", "geom_rgba", "light_diffuse")
 GROUPS = 3  # MuJoCo shows geoms of the groups 0, 1 and 2
 _DEGREE = 7  # of the polynomials that the colours of the sky are fitted to
-_UNSET = np.float32([0.5, 0.5, 0.5, 1])  # MuJoCo's colour of a geom that takes its material's
+_UNSET = np.array([0.5, 0.5, 0.5, 1], np.float32)  # MuJoCo's colour of a geom that takes its material's
 _TEXTURE, _ROLE = mujoco.mjtTexture, int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
 
 
@@ -66,7 +66,7 @@ class Scene:
             heights.append(np.broadcast_to(sine, row.shape).ravel())
             colours.append(face.reshape(-1, 3))
         powers = np.vander(np.concatenate(heights), _DEGREE + 1)
-        return np.float32(np.linalg.lstsq(powers, np.concatenate(colours), rcond=None)[0])
+        return np.linalg.lstsq(powers, np.concatenate(colours), rcond=None)[0].astype(np.float32)
 
     @cached_property
     def tiles(self) -> Mapping[int, Tiles]:
@@ -86,7 +86,7 @@ class Scene:
             uniform, repeat, size = model.mat_texuniform[material], model.mat_texrepeat[material], model.geom_size[geom]
             scale = [repeat[i] * (0.5 if uniform or size[i] <= 0 else 0.5 / size[i]) for i in (0, 1)]
             from_edge = bool(size[0] > 0), bool(size[1] > 0)
-            found[geom] = Tiles(np.float32([same, other]), (scale[0], scale[1]), from_edge)
+            found[geom] = Tiles(np.array([same, other], np.float32), (scale[0], scale[1]), from_edge)
         return found
 
 

@@ -1,11 +1,11 @@
 """Where rays from a camera meet the shapes of geoms. All vectors are in the camera's frame, whose origin is the eye.
 
-Rays are (u, v, -1) and not of unit length, so that they are the same for all cameras and worlds. Nothing here is divided
-or rooted twice: XLA would write each such array to memory.
+Rays are (u, v, -1) and not of unit length, so that they are the same for all cameras and worlds. Quotients and roots
+are few, because XLA writes each one that is used twice to memory.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import mujoco
@@ -27,12 +27,12 @@ class Rays(NamedTuple):
 
 
 class Body(NamedTuple):
-    """A geom in the camera's frame."""
+    """A geom in the camera's frame, or the geoms of all pixels (P,)."""
 
     centre: Vector
     axes: Axes
-    size: Array  # (3,)
-    endless: tuple[bool, bool]  # whether a plane has no edges along x and y
+    size: Vector
+    endless: tuple[bool, ...] = ()  # whether a plane has no edges along x and y
 
 
 class Shape(NamedTuple):
@@ -42,7 +42,7 @@ class Shape(NamedTuple):
     normal: Callable[[Vector, Body], Vector]  # unit normals at points (P,) of the surface
 
 
-def along(rays: Rays, vector: Vector) -> Array:
+def along(rays: Rays, vector: Vector) -> Any:
     """Return the dot product (P,) of rays and a vector."""
     return rays.u * vector[0] + rays.v * vector[1] - vector[2]
 
@@ -52,7 +52,7 @@ def at(rays: Rays, distance: Array) -> Vector:
     return distance * rays.u, distance * rays.v, -distance
 
 
-def dot(one: Vector, other: Vector) -> Array:
+def dot(one: Vector, other: Vector) -> Any:
     """Return the dot product of two vectors."""
     return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
 
@@ -69,7 +69,7 @@ def _apart_from_zero(x: Array) -> Array:
     return jnp.where(jnp.abs(x) > _TINY, x, _TINY)
 
 
-def _where(hit: Array, distance: Array) -> Array:
+def _where(hit: Any, distance: Any) -> Array:
     return jnp.where(hit & (distance > 0), distance, MISSED)
 
 
@@ -96,7 +96,7 @@ def _sphere_distance(rays: Rays, body: Body) -> Array:
 
 
 def _sphere_normal(point: Vector, body: Body) -> Vector:
-    return tuple((p - c) * (1 / body.size[0]) for p, c in zip(point, body.centre, strict=True))  # type: ignore
+    return tuple((p - c) * (1 / body.size[0]) for p, c in zip(point, body.centre, strict=True))
 
 
 def _tube(rays: Rays, body: Body) -> tuple[Array, ...]:
@@ -129,7 +129,7 @@ def _capsule_distance(rays: Rays, body: Body) -> Array:
 def _capsule_normal(point: Vector, body: Body) -> Vector:
     axis, away = body.axes[2], _minus(point, body.centre)
     height = jnp.clip(dot(away, axis), -body.size[1], body.size[1])
-    return tuple((x - height * a) * (1 / body.size[0]) for x, a in zip(away, axis, strict=True))  # type: ignore
+    return tuple((x - height * a) * (1 / body.size[0]) for x, a in zip(away, axis, strict=True))
 
 
 def _cylinder_distance(rays: Rays, body: Body) -> Array:
@@ -155,15 +155,15 @@ def _cylinder_normal(point: Vector, body: Body) -> Vector:
     lid = radius * radius - wide > 2 * radius * (half - jnp.abs(height))
     up = jnp.where(height > 0, 1.0, -1.0)
     side = ((x - height * a) * (1 / radius) for x, a in zip(away, axis, strict=True))
-    return tuple(jnp.where(lid, up * a, s) for s, a in zip(side, axis, strict=True))  # type: ignore
+    return tuple(jnp.where(lid, up * a, s) for s, a in zip(side, axis, strict=True))
 
 
 def _ellipsoid_distance(rays: Rays, body: Body) -> Array:
     """A sphere of radius 1 in a frame that is scaled by the three radii."""
     ray = tuple(along(rays, axis) * (1 / body.size[i]) for i, axis in enumerate(body.axes))
     eye = tuple(dot(body.centre, axis) / body.size[i] for i, axis in enumerate(body.axes))
-    square, forward = dot(ray, ray), dot(ray, eye)  # type: ignore
-    room = forward * forward - square * (dot(eye, eye) - 1)  # type: ignore
+    square, forward = dot(ray, ray), dot(ray, eye)
+    room = forward * forward - square * (dot(eye, eye) - 1)
     return _where(room > 0, (forward - _root(room)) / square)
 
 
@@ -181,7 +181,7 @@ def _box_distance(rays: Rays, body: Body) -> Array:
         inverse = 1 / _apart_from_zero(along(rays, axis))
         middle, reach = dot(body.centre, axis) * inverse, jnp.abs(inverse) * body.size[i]
         near, far = jnp.maximum(near, middle - reach), jnp.minimum(far, middle + reach)
-    return _where(near <= far, near)  # type: ignore
+    return _where(near <= far, near)
 
 
 def _box_normal(point: Vector, body: Body) -> Vector:
@@ -194,7 +194,7 @@ def _box_normal(point: Vector, body: Body) -> Vector:
 
 def _out_of(axes: Axes, vector) -> Vector:
     """Return a vector of a geom's frame in the camera's frame."""
-    return tuple(sum(axis[i] * x for axis, x in zip(axes, vector, strict=True)) for i in range(3))  # type: ignore
+    return tuple(sum(axis[i] * x for axis, x in zip(axes, vector, strict=True)) for i in range(3))
 
 
 _GEOM = mujoco.mjtGeom

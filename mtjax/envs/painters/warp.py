@@ -63,11 +63,11 @@ class WarpPainter:
         """
         model = self.scene.model
         stack = lambda vectors: jnp.stack([jnp.stack(vector) for vector in vectors])
-        matrix = lambda pose: jnp.stack([jnp.stack(axis) for axis in pose.axes], axis=-1)
+        matrix = lambda pose: jnp.stack([jnp.stack(axis, axis=-1) for axis in pose.axes], axis=-1)
         shot = Shot(
             *(leaf(name) for name in _FIELDS),
-            geom_xpos=stack([pose.position for pose in poses.geoms]),
-            geom_xmat=jnp.stack([matrix(pose) for pose in poses.geoms]),
+            geom_xpos=jnp.stack(poses.geoms.position, axis=-1),
+            geom_xmat=matrix(poses.geoms),
             cam_xpos=stack([poses.camera.position] * model.ncam),
             cam_xmat=jnp.stack([matrix(poses.camera)] * model.ncam),
             light_xpos=stack([position for position, _ in poses.lights]),
@@ -201,7 +201,10 @@ class WarpPainter:
 
 
 def _drawer(painter: Any, count: int) -> Callable:
-    """Return the function that Warp runs in a call. It holds a weak reference, as Warp keeps such functions for good."""
+    """Return the function that Warp runs in a call.
+
+    It holds a weak reference to the painter: Warp keeps such functions for good, but its memory must be freed.
+    """
     from mujoco.mjx.third_party import mujoco_warp
 
     def draw(*arrays: Any) -> None:
