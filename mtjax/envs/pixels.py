@@ -1,8 +1,8 @@
 """Pictures as observations, for every family with a MuJoCo model.
 
 An observation holds the newest picture alone, so that a replay keeps each picture once. Whoever needs the last few
-stacks them: an agent in its memory, a replay when it draws a batch, and ``mtjax.stacked`` for everyone else. All use
-``mtjax.frames``, and all repeat the first picture where an episode is younger than the stack.
+stacks them: rollouts for agents, a replay when it draws a batch, and ``mtjax.stacked`` for everyone else. All repeat
+the first picture where an episode is younger than the stack (``mtjax.frames``).
 """
 
 import dataclasses

@@ -3,8 +3,6 @@
 import dataclasses
 from typing import Any, NamedTuple
 
-import jax
-
 from mtjax import frames
 from mtjax.envs.pixels import Pictured
 from mtjax.maps import Flat
@@ -12,10 +10,10 @@ from mtjax.types import Array, InputError, Key, Spec, Step, Task
 
 
 class Remembered(NamedTuple):
-    """The state of a world, and the pictures before the newest."""
+    """The state of a world, and what an agent sees of it: its last pictures."""
 
     world: Any
-    memory: frames.Frames
+    seen: Any
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,25 +46,20 @@ class Stacked(Flat):
     def spec(self) -> Spec:
         """Return the sizes of observation, action and context."""
         spec = self.family.spec
-        *size, channels = spec.obs["pixels"].shape
-        pixels = jax.ShapeDtypeStruct((*size, channels * spec.frames), spec.obs["pixels"].dtype)
-        return spec._replace(obs=spec.obs | {"pixels": pixels}, frames=1)
+        return spec._replace(obs=frames.seen(spec), frames=1)
 
     def reset(self, task: Task, key: Key) -> Step:
         """Begin an episode of ``task`` in a fresh random state."""
         step = self.family.reset(task, key)
-        memory = frames.begin(step.obs["pixels"].shape, self.family.frames)
-        return self._seen(step, memory)
+        return self._show(step, frames.begin(step.obs, self.family.frames))
 
     def step(self, task: Task, state: Remembered, action: Array) -> Step:
         """Advance one step under ``action`` (A,)."""
         step = self.family.step(task, state.world, action)
-        return self._seen(step, state.memory)
+        return self._show(step, frames.push(state.seen, step.obs))
 
-    def _seen(self, step: Step, memory: frames.Frames) -> Step:
-        picture = step.obs["pixels"]
-        obs = step.obs | {"pixels": frames.stack(memory, picture)}
-        return step._replace(obs=obs, state=Remembered(step.state, frames.push(memory, picture)))
+    def _show(self, step: Step, seen: Any) -> Step:
+        return step._replace(obs=seen, state=Remembered(step.state, seen))
 
 
 def stacked(family: Any) -> Any:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import tyro
 from jax.sharding import PartitionSpec
 
-from mtjax.experience import hindsight, multistep, pictures
+from mtjax.experience import hindsight, pictures
 from mtjax.experience import ring as rings
 from mtjax.experience.ring import OVER_SEEDS, Ring
 from mtjax.frames import PICTURES, shown
@@ -204,8 +204,8 @@ class Replay:
         """Return transitions (T, ...) from drawn rows, which are windows (T, ..., W) if ``window`` says so."""
         if not self.window(spec):
             return rows
-        of_pictures = partial(pictures.join, frames=spec.frames, n_step=self.n_step)
-        return agent.join_steps(state, rows, tasks, of_pictures if shown(spec.obs) else multistep.join)
+        of_pictures = [partial(pictures.join, frames=spec.frames, n_step=self.n_step)] if shown(spec.obs) else []
+        return agent.join_steps(state, rows, tasks, *of_pictures)
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))  # so that it is traced once, though ``learn`` needs its shapes too
