@@ -24,6 +24,7 @@ _HOME = {
     "preset": "mtjax.config:with_preset",
     "register": "mtjax.registry",
     "runs": "mtjax.report.frames",
+    "stacked": "mtjax.envs",
 }
 _MODULES = ("report", "train")  # the module train has the name of the function, and can be called
 __all__ = [*_HOME, *_MODULES]

@@ -18,7 +18,7 @@ from mtjax.commands import (
     vary_flags,
 )
 from mtjax.config import NO_FINE_TUNING, RunConfig, from_json, own_files, with_preset
-from mtjax.envs import make
+from mtjax.envs import make, require_pictures
 from mtjax.envs.family import Family
 from mtjax.envs.mixtures import Mixture, require_family
 from mtjax.names import InputError
@@ -155,4 +155,5 @@ def _check_flags(argv: Sequence[str], config: RunConfig) -> None:
     for word in argv:
         flag = word.split("=", 1)[0].replace("_", "-")
         if flag.startswith("--") and flag not in (*known, "--help"):
+            require_pictures(config.env, flag.removeprefix("--env."))
             raise unknown_flag(flag, known)

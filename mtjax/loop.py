@@ -80,7 +80,7 @@ def init(
         worlds=worlds,
         total=jnp.zeros(shape),
         counted=worlds.age == 0,
-        data=agent.experience.init(blank, num_tasks, settings.num_envs, data_key),
+        data=agent.experience.init(blank, env.spec, num_tasks, settings.num_envs, data_key),
         iteration=jnp.int32(0),
         key=key,
     )

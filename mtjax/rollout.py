@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from mtjax import frames
 from mtjax.maps import over_learners, where_worlds
 from mtjax.parallel import collectives
 from mtjax.tasks import episode_task
@@ -17,7 +18,7 @@ class Worlds(NamedTuple):
 
     state: Any  # of the environment
     task: Task | None  # the episodes' own tasks where episodes draw theirs
-    obs: Any  # (S, T, E, O)
+    obs: Any  # (S, T, E, O), or with the last pictures
     memory: Any  # what the agent remembers of the episode
     age: Array  # (S, T, E) int32, steps since the last reset
 
@@ -50,7 +51,8 @@ def reset_envs(env: Env, agent: Agent, learners: Any, tasks: Task, keys: Key) ->
     start = env.reset_worlds(each._replace(blocks=tasks.blocks), keys)
     age = jnp.zeros(keys.shape, jnp.int32)
     memory = over_learners(lambda learner, task, _: agent.begin(learner, task))(learners, tasks, age)
-    return Worlds(start.state, None if tasks.draws is None else each, start.obs, memory, age)
+    obs = frames.begin(start.obs, env.spec.frames)
+    return Worlds(start.state, None if tasks.draws is None else each, obs, memory, age)
 
 
 def tasks_of_worlds(tasks: Task, worlds: Worlds) -> Task:
@@ -98,13 +100,14 @@ def step_envs(
     action = explore(acted.action)
     action = action if each.action_mask is None else action * each.action_mask
     step = env.step_worlds(each, worlds.state, action)
+    obs = frames.push(worlds.obs, step.obs)
     age = worlds.age + 1
     transition = Transition(
         obs=worlds.obs,
         action=action,
         reward=step.reward,
         discount=1.0 - step.terminated,
-        next_obs=step.obs,
+        next_obs=obs,
         ended=step.terminated | (age >= each.horizon),
         context=None if worlds.task is None else worlds.task.context,
         extras=acted.extras,
@@ -113,7 +116,7 @@ def step_envs(
     if jax.tree.leaves(memory):
         note = lambda learner, task, memory, transition: agent.remember(learner, memory, transition, task)
         memory = over_learners(note)(learners, tasks, memory, transition)
-    return Worlds(step.state, worlds.task, step.obs, memory, age), EnvStep(transition, step.metrics)
+    return Worlds(step.state, worlds.task, obs, memory, age), EnvStep(transition, step.metrics)
 
 
 def reset_ended(env: Env, agent: Agent, learners: Any, tasks: Task, worlds: Worlds, ended: Array, keys: Key) -> Worlds:

@@ -31,6 +31,7 @@ class Task(NamedTuple):
     draws: Any = None  # a Task with leaves (P, ...); each episode draws one of them; None: every episode is this task
     action_mask: Array | None = None  # (A,) 1 for actions that the task has, else 0; None: it has all
     blocks: Any = None  # in a mixture, which tasks belong to which family; static, without leaves
+    scene: dict[str, Array] | None = None  # only what differs between tasks in what is seen; None without pixels
 
     def __repr__(self) -> str:
         """Return a line: the number of tasks, and the values of their parameters where they are known."""
@@ -111,6 +112,7 @@ class Spec(NamedTuple):
     action_size: int
     context_size: int
     mixed: bool = False  # whether entries of observations differ in meaning between tasks
+    frames: int = 1  # how many of the last images an agent should see at once; observations hold the newest
 
     @staticmethod
     def vector(obs_size: int, action_size: int, context_size: int) -> "Spec":
@@ -125,7 +127,8 @@ class Spec(NamedTuple):
             InputError: observations are not vectors.
         """
         if not isinstance(self.obs, jax.ShapeDtypeStruct) or len(self.obs.shape) != 1:
-            raise InputError(f"observations must be vectors here, not {self.obs}")
+            shapes = jax.tree.map(lambda x: x.shape, self.obs)
+            raise InputError(f"observations must be vectors here, not {shapes}; leave out --env.pixels")
         return self.obs.shape[0]
 
 
@@ -168,7 +171,7 @@ class Experience(Protocol):
     def sharding(self) -> Any: ...  # of the data, as a tree of PartitionSpec
     def check(self, env: Env, num_envs: int) -> None: ...  # raises InputError
     def describe(self, num_envs: int) -> str: ...
-    def init(self, item: Transition, num_tasks: int, num_envs: int, keys: Key) -> Any: ...  # keys (S,)
+    def init(self, item: Transition, spec: Spec, num_tasks: int, num_envs: int, keys: Key) -> Any: ...  # keys (S,)
     def explore(self, data: Any, action: Array, step: Array) -> Array: ...  # actions (S, T, E, A) to take at a step ()
     def add(self, data: Any, steps: Transition) -> Any: ...  # leaves (S, T, H, E, ...)
     def keep(self, data: Any) -> Any: ...  # what the next iteration needs

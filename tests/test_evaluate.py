@@ -209,9 +209,9 @@ def filmed(monkeypatch):
     """The films that are written, and the tasks that are drawn, without OpenGL."""
     found = {"drawn": []}
 
-    def film(env, row, qpos, width, height):
-        found["drawn"].append((row, qpos.shape))
-        return np.full((len(qpos), height, width, 3), 10 + row, np.uint8)
+    def film(env, row, states, width, height):
+        found["drawn"].append((row, states.qpos.shape))
+        return np.full((len(states.qpos), height, width, 3), 10 + row, np.uint8)
 
     def write(path, frames, fps):
         found[path.name] = (frames, fps)

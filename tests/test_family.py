@@ -300,8 +300,11 @@ def test_environments_are_equal_when_their_settings_are():
     assert len(traces) == 1
     others = {"vary": {"touch-size": "1"}, "combine": "paired", "num_tasks": 9, "num_draws": 9, "task_seed": 1}
     others |= {"split": "hip-bmdp", "engine": "mjx", "solver_iterations": 3, "integrator": "euler"}
-    others |= {"context_ranges": (("size", 0.0, 1.0),)}
-    assert others.keys() == {f.name for f in dataclasses.fields(one)}
+    others |= {"context_ranges": (("size", 0.0, 1.0),), "pixels": 64, "frames": 2, "repeat": 2}
+    pictured = {"grey": True, "state": "also", "plain": True, "painter": "caster"}
+    seen = [envs.make("finger-spin-vary-size", engine="c", pixels=64, **{name: x}) for name, x in pictured.items()]
+    assert len({*seen, dataclasses.replace(one, pixels=64)}) == 1 + len(seen)
+    assert others.keys() | pictured.keys() == {f.name for f in dataclasses.fields(one)}
     for name, value in others.items():
         assert dataclasses.replace(one, **{name: value}) != one
 

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 from probes import random_batch
+from test_painters import SIZE, similarity, states_of
 
 import mtjax
 from mtjax import rollout
@@ -224,3 +225,24 @@ def test_a_run_goes_on_bit_for_bit(tmp_path):
     whole = mtjax.train(env, agent, seeds=2, steps=8000, eval_every=4000, eval_episodes=1, **settings)
     for one, other in zip(*(jax.tree.leaves(jax.device_get(x.state.agent.actor)) for x in (whole, again)), strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("name", ["ball-in-cup-catch", "cheetah-run", "finger-turn-easy", "walker-walk"])
+def test_warp_draws_what_the_caster_draws(name):
+    """Every task with a colour and a camera of its own, inside a scan that also draws the starts of episodes."""
+    vary = {"hue": "0,90", "camera-angle": "-20,20"}
+    make = lambda painter: mtjax.make(name, pixels=SIZE, vary=vary, combine="paired", split="none", painter=painter)
+    worlds = states_of(name)
+
+    def draw(env):
+        def again(states, _):
+            pictures = jax.vmap(jax.vmap(env.draw, (None, 0)), (0, None))(env.tasks(), states)
+            started = jax.vmap(env.reset)(env.tasks(), jax.random.split(jax.random.key(0), 2)).obs["pixels"]
+            return states._replace(qpos=states.qpos + 1e-3), (pictures, started)
+
+        return jax.device_get(jax.jit(lambda: jax.lax.scan(again, worlds, length=3)[1])())
+
+    ours, theirs = draw(make("caster")), draw(make("warp"))
+    for one, other in zip(ours, theirs, strict=True):
+        for place in np.ndindex(one.shape[:-3]):
+            assert similarity(one[place], other[place]) > 0.95

@@ -27,6 +27,7 @@ GROUND = (
     "normalize",
     "tasks",
     "maps",
+    "frames",
     "parallel.collectives",
 )
 LAYERS = (

@@ -218,7 +218,9 @@ def test_an_agent_learns_from_joined_steps(settings):
 def test_single_steps_are_drawn_as_ever():
     """To the bit: n-step=1 draws rows and joins nothing."""
     ring = jax.tree.map(lambda x: x, filled(11))
-    draw = lambda ring, key: Replay(updates_per_step=2, batch_size=5).draw(None, None, tasks_of("one-step"), ring, key)
+    draw = lambda ring, key: Replay(updates_per_step=2, batch_size=5).draw(
+        Walk(), None, tasks_of("one-step"), ring, key
+    )
     found = quick(draw, ring, jax.random.key(3))(ring, jax.random.key(3))
     rows = rings.sample(ring, jax.random.key(3), 10)
     np.testing.assert_array_equal(np.moveaxis(found, 0, 1).reshape(rows.shape), rows)

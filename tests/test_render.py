@@ -2,17 +2,19 @@ import os
 import sys
 from types import SimpleNamespace
 
+import jax
 import mujoco
 import numpy as np
 import pytest
 from PIL import Image
 
-from mtjax.envs.dm_control.finger import FingerSpin
+from mtjax.envs.dm_control.finger import FingerSpin, FingerTurn
+from mtjax.envs.engines.base import World
 from mtjax.report import render
 from mtjax.types import InputError
 
 FINGER = FingerSpin(vary={"size": [0.8, 1.4]})
-POSES = np.array([[0.0, 0.0, 0.0], [1.5, 0.5, 1.0]])
+STATES = World(np.array([[0.0, 0.0, 0.0], [1.5, 0.5, 1.0]]), *[np.zeros((2, 3))] * 3)
 
 
 def moving_square(count):
@@ -29,7 +31,7 @@ def warm_pixels(frame):
 
 def test_film_shows_the_task_or_names_what_to_install():
     try:
-        small, large = (render.film(FINGER, row, POSES, width=160, height=120) for row in (0, 1))
+        small, large = (render.film(FINGER, row, STATES, width=160, height=120) for row in (0, 1))
     except InputError as error:
         assert "apt install libegl1 libgl1-mesa-dri" in str(error) and "\n" not in str(error)
         return
@@ -47,7 +49,7 @@ def test_missing_driver_names_the_fix_and_leaves_the_environment_alone(monkeypat
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.setattr(mujoco, "Renderer", fail)
     with pytest.raises(InputError, match=r"MUJOCO_GL=.*apt install libegl1 libgl1-mesa-dri.*apt install libosmesa6"):
-        render.film(FINGER, 0, POSES)
+        render.film(FINGER, 0, STATES)
     assert "MUJOCO_GL" not in os.environ
 
 
@@ -56,20 +58,31 @@ def test_backend_that_the_user_chose_is_kept(monkeypatch):
     assert render.choose_backend() == "disable"
     monkeypatch.setenv("MUJOCO_GL", "nonsense")
     with pytest.raises(InputError, match="MUJOCO_GL=nonsense"):
-        render.film(FINGER, 0, POSES)
+        render.film(FINGER, 0, STATES)
 
 
 def test_camera_and_size_limits_do_not_depend_on_the_row():
-    cameras = [render._camera(FINGER) for _ in range(2)]
-    np.testing.assert_array_equal(cameras[0].lookat, [0, 0, 0.4])
-    model = render._lit_model(FINGER, 0, 1920, 1080)
-    assert (model.vis.global_.offwidth, model.vis.global_.offheight, model.nlight) == (1920, 1080, 1)
+    models = [render._scene(FINGER, row, 1920, 1080) for row in range(2)]
+    np.testing.assert_array_equal(models[0].cam_pos, models[1].cam_pos)
+    for model in models:
+        assert (model.vis.global_.offwidth, model.vis.global_.offheight, model.nlight) == (1920, 1080, 1)
+
+
+def test_film_puts_targets_where_the_episode_has_them():
+    family = FingerTurn()
+    model, place = render._scene(family, 0, 160, 120), np.array([0.1, -0.05], np.float32)
+    task = jax.tree.map(lambda x: x[0], family.table.tasks)
+    render._place(model, family.marks(task, STATES._replace(extra=place)))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    hinge = np.array(model.body("spinner").pos)
+    np.testing.assert_allclose(data.geom("target").xpos, np.add(hinge, [0.1, 0, -0.05]), atol=1e-6)
 
 
 @pytest.mark.parametrize("row", [-1, 99])
 def test_unknown_row_is_an_input_error(row):
     with pytest.raises(InputError, match=f"no task {row}"):
-        render.film(FINGER, row, POSES)
+        render.film(FINGER, row, STATES)
 
 
 @pytest.mark.parametrize("missing", ["ffmpeg", "mediapy"])

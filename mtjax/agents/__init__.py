@@ -58,6 +58,14 @@ AGENTS: dict[str, Preset] = {
         "DeepMDP with learned hidden parameters (Zhang et al. 2021)",
         {"representation": "hip-bmdp", "conditioning": "embedding", "embedding_size": 50},
     ),
+    "drq": Preset(
+        "SAC from pictures that are shifted at random (Yarats et al. 2022)",
+        {"representation": "encoded", "encoder_tau": 1.0, "n_step": 3, "tau": 0.01, **_PARAMS},
+    ),
+    "sac-ae": Preset(
+        "SAC from pictures, with a decoder (Yarats et al. 2021)",
+        {"representation": "autoencoder", "tau": 0.01, **_PARAMS},
+    ),
     "ppo": Preset(
         "Proximal policy optimisation (Schulman et al. 2017), sees its task", _PARAMS, "mtjax.agents.ppo:PPO"
     ),

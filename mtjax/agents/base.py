@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import tyro
 
-from mtjax import normalize
+from mtjax import frames, normalize
 from mtjax.agents import parts
 from mtjax.agents.choices import FLAT, PARTS, kinds_of
 from mtjax.agents.parts import conditioning, trajectory
@@ -205,6 +205,15 @@ class BaseAgent(abc.ABC):
                 f"reset-every begins the optimisers anew, and lr-schedule={self.lr_schedule} with them; use constant"
             )
 
+    def _require_sight(self, spec: Spec) -> None:
+        """Refuse pictures where no part encodes them."""
+        if not frames.shown(spec.obs):
+            return
+        if not self.representation.sees_pictures:
+            raise InputError("networks take vectors; for pictures use --agent=drq or --agent.representation=encoded")
+        if self.history_length:
+            raise InputError("tasks cannot be inferred from pictures; choose another conditioning")
+
     # Networks.
 
     def network(self, hidden: tuple[int, ...], layer_norm: bool) -> Network:
@@ -280,6 +289,7 @@ class BaseAgent(abc.ABC):
 
     def init_common(self, spec: Spec, tasks: Task, key: Key) -> dict[str, Any]:
         """Initialise the fields that all agents' states have, by name, for the training ``tasks`` (T, ...)."""
+        self._require_sight(spec)
         num_tasks = len(tasks.id)
         vectors, moments = self.load_vectors(num_tasks), self.init_moments(spec, num_tasks)
         features = conditioning.features(self.conditioning, num_tasks, jnp.int32(0), tasks.context[0], vectors)
@@ -313,7 +323,7 @@ class BaseAgent(abc.ABC):
 
     def init_moments(self, spec: Spec, num_tasks: int) -> normalize.Moments:
         """Return moments of no observations; in a mixture each task has its own, leaves (T, O)."""
-        moments = normalize.init(spec.obs_size)
+        moments = normalize.init(max(frames.state_size(spec), 1))  # checkpoints hold no empty arrays
         return jax.tree.map(lambda x: jnp.stack([x] * num_tasks), moments) if spec.mixed else moments
 
     def fit_moments(self, moments: normalize.Moments, obs: Array) -> normalize.Moments:
@@ -321,11 +331,13 @@ class BaseAgent(abc.ABC):
         if not self.normalize_observations:
             return moments
         update = jax.vmap(normalize.update) if moments.mean.ndim > 1 else normalize.update
-        return update(moments, obs)
+        found = frames.state(obs)
+        return moments if found is None else update(moments, found)
 
     def see(self, moments: normalize.Moments, obs: Array, past: Past | None = None) -> Any:
         """Return observations (..., O) of one task as networks take them: normalised, and with the past if given."""
-        scaled = partial(normalize.apply, moments) if self.normalize_observations else lambda obs: obs
+        scale = partial(normalize.apply, moments) if self.normalize_observations else lambda x: x
+        scaled = lambda obs: frames.with_state(scale, obs)
         return scaled(obs) if past is None else Seen(scaled(obs), past._replace(obs=scaled(past.obs)))
 
     def see_batch(self, moments: normalize.Moments, obs: Array, past: Past | None = None) -> Any:
@@ -341,7 +353,7 @@ class BaseAgent(abc.ABC):
         """Return an input of networks that is all zero."""
         moments = jax.tree.map(lambda x: x[0], moments) if spec.mixed else moments
         past = trajectory.begin(self.history_length, spec.obs_size, spec.action_size) if self.history_length else None
-        return self.see(moments, jnp.zeros(spec.obs_size), past)
+        return self.see(moments, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), frames.seen(spec)), past)
 
     def load_vectors(self, num_tasks: int) -> Array | None:
         """Read the task vectors (T, V) from their file; None if there is none."""
@@ -396,9 +408,15 @@ class BaseAgent(abc.ABC):
             return self.gamma
         return jnp.clip(1 - 5 / tasks.horizon, 0.95, 0.995)
 
-    def join_steps(self, state: Any, steps: Transition, tasks: Task) -> Transition:
-        """Join windows of consecutive steps (T, ..., n) to transitions (T, ...), by the tasks' discounts."""
-        return jax.vmap(multistep.join)(steps, jnp.broadcast_to(self.discounts(tasks), len(tasks.id)))
+    def join_steps(
+        self, state: Any, steps: Transition, tasks: Task, join: Callable[..., Transition] = multistep.join
+    ) -> Transition:
+        """Join windows of consecutive steps (T, ..., n) to transitions (T, ...), by the tasks' discounts.
+
+        Args:
+            join: a function of one task's windows and its discount ().
+        """
+        return jax.vmap(join)(steps, jnp.broadcast_to(self.discounts(tasks), len(tasks.id)))
 
     @property
     def borrowed(self) -> list[str]:

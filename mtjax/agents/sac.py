@@ -122,7 +122,7 @@ class SAC(BaseAgent):
                 "scaling=popart rescales a scalar head of every task's own; use value=scalar and heads=per-task or "
                 f"disjoint, not {value} and {self.heads}"
             )
-        if self.representation.learns and self.experience.n_step > 1:
+        if self.representation.predicts and self.experience.n_step > 1:
             name = parts.name_of(REPRESENTATIONS, self.representation)
             raise InputError(f"{name} learns models of single steps; use n-step=1, not {self.experience.n_step}")
         if scaling == "popart" and self.unit_head:
@@ -255,6 +255,7 @@ class SAC(BaseAgent):
             actor_turn: () bool, whether actor and temperatures learn too; None if they always do.
         """
         target_key, actor_key, critic_order, actor_order = jax.random.split(key, 4)
+        transitions = self.placed_representation.augment(transitions, jax.random.fold_in(key, 1))
         state, batch = self.prepare(state, transitions, tasks)
         importance = self.sampler.weights(state.progress, batch.temperature)
         combine = partial(surgery.gradient, importance=importance, per_layer=self.per_layer)

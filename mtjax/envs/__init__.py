@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from mtjax.envs.family import Family
     from mtjax.envs.mixtures import Mixture
     from mtjax.envs.parameters import Parameter
+    from mtjax.envs.stacked import stacked
 
 __all__ = [
     "ENVS",
@@ -32,6 +33,8 @@ __all__ = [
     "name_of",
     "outline",
     "register",
+    "require_pictures",
+    "stacked",
 ]
 
 __getattr__ = lazily(
@@ -42,6 +45,7 @@ __getattr__ = lazily(
         "Mixture": "mtjax.envs.mixtures",
         "Parameter": "mtjax.envs.parameters",
         "World": "mtjax.envs.engines.base",
+        "stacked": "mtjax.envs.stacked",
     },
 )
 
@@ -159,6 +163,9 @@ _BRAX: dict[str, Entry] = {
     "brax-halfcheetah-vary-speed": ("brax:BraxHalfcheetahSpeed", {"vary": {"speed": "0.3:3:10"}}),
 }
 
+PICTURES = ("pixels", "frames", "repeat", "grey", "state", "plain", "painter")
+"""Settings that only families with a MuJoCo model have."""
+
 _inside = lambda folder, table: {name: (f"{folder}.{place}", settings) for name, (place, settings) in table.items()}
 ENVS = Families(
     _inside("mtjax.envs.dm_control", _DOMAINS | _HIP_BMDP | _GOALS)
@@ -188,6 +195,7 @@ def make(name: str, vary: Mapping[str, Any] | tuple = (), **settings: Any) -> An
     fields = [field.name for field in dataclasses.fields(family)]
     unknown = next((s for s in (*settings, *defaults) if s not in fields), None)
     if unknown is not None:
+        require_pictures(name, unknown)
         raise _unknown_setting(name, family, unknown, settings.get(unknown))
     settings = checked(family, defaults | frozen(settings))
     return family(**{**settings, "vary": dict(defaults.get("vary", {})) | _pairs(vary)})
@@ -213,6 +221,16 @@ def _unknown_setting(name: str, family: Any, unknown: str, value: Any) -> InputE
     if unknown in OF_TRAIN:
         return InputError(f"{unknown} is no setting of an environment; give it to mtjax.train({unknown}=...)")
     return nearest_error(f"setting of {name}", unknown, [field.name for field in dataclasses.fields(family)])
+
+
+def require_pictures(name: str, setting: str) -> None:
+    """Refuse a setting of pictures for a family that does not have it.
+
+    Raises:
+        InputError: the setting belongs to families with a MuJoCo model only.
+    """
+    if setting in PICTURES:
+        raise InputError(f"{name} has no MuJoCo model, which {setting} needs; take a family such as cheetah-run")
 
 
 def mixture(families: "Sequence[str | Family | Mixture]") -> "Mixture":

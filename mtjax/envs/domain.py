@@ -24,8 +24,9 @@ from mtjax.envs.engines.base import ENGINES, Engine, World, choose_engine
 from mtjax.envs.engines.c import MujocoC
 from mtjax.envs.engines.mjx import Mjx
 from mtjax.envs.engines.warp import Warp
-from mtjax.envs.family import Family, draw_until
+from mtjax.envs.family import draw_until
 from mtjax.envs.fields import FIXED, VARIABLE
+from mtjax.envs.pixels import Pictured
 from mtjax.envs.planar import Planar, is_planar, locate
 from mtjax.names import nearest_error
 from mtjax.types import Array, InputError, Key, Step, Task, Transition
@@ -34,7 +35,7 @@ INTEGRATORS = ("model", "euler")
 
 
 @dataclasses.dataclass(frozen=True)
-class Domain(Family):
+class Domain(Pictured):
     """A family of tasks of one MuJoCo model. Subclasses give model, start of an episode, observation and reward."""
 
     engine: Annotated[str, tyro.conf.arg(name="engine", prefix_name=False)] = "auto"
@@ -97,13 +98,33 @@ class Domain(Family):
         """Begin an episode of ``task`` in a fresh random state."""
         put = self.simulator.place if self.starts_untouched else self.simulator.forward
         world = put(task, *self.start(task, key))
-        return Step(world, self.observe(task, world), jnp.float32(0), jnp.bool_(False))
+        return Step(world, self.look_at(task, world), jnp.float32(0), jnp.bool_(False))
 
     def step(self, task: Task, state: World, action: Array) -> Step:
-        """Advance one control step under ``action`` (A,) in [-1, 1]; observation and reward are those after it."""
-        world = self.simulator.step(task, state, action)
-        reward, over = self.reward(task, world, action), self.terminates(task, world)
-        return Step(world, self.observe(task, world), reward, over)
+        """Advance ``repeat`` control steps under ``action`` (A,) in [-1, 1]; observation and reward are those after it.
+
+        Rewards of repeated steps are summed, up to one that terminates the episode.
+        """
+
+        def once(_, carry: tuple[World, Array, Array]) -> tuple[World, Array, Array]:
+            world, total, over = carry
+            world = self.simulator.step(task, world, action)
+            total += jnp.where(over, 0.0, self.reward(task, world, action))
+            return world, total, over | self.terminates(task, world)
+
+        if self.repeat == 1:
+            world = self.simulator.step(task, state, action)
+            reward, over = self.reward(task, world, action), self.terminates(task, world)
+        else:
+            world, reward, over = jax.lax.fori_loop(0, self.repeat, once, (state, jnp.float32(0), jnp.bool_(False)))
+        return Step(world, self.look_at(task, world), reward, over)
+
+    def look_at(self, task: Task, world: World) -> Any:
+        """Return what the agent observes: the state (O,), pictures, or both."""
+        if not self.pixels:
+            return self.observe(task, world)
+        shown = {"pixels": self.draw(task, world)}
+        return shown | {"state": self.observe(task, world)} if self.state == "also" else shown
 
     def relabel(self, task: Task, transition: Transition, key: Key) -> Transition:
         """Return another task's transition with the reward of ``task``. Observations must not show the goal."""
@@ -159,12 +180,8 @@ class Domain(Family):
     @cached_property
     def models(self) -> tuple[mujoco.MjModel, ...]:
         """Return the compiled model of every row of the table. Rows that differ only in goals share one."""
-        names = [name for name in self.values if self.parameters[name].edit is not None]
-        rows = list(zip(*(self.values[name].tolist() for name in names), strict=True))
-        compiled = {row: self._compile(dict(zip(names, row, strict=True))) for row in dict.fromkeys(rows)}
-        if not names:
-            return (self._compile({}),) * self.count
-        return tuple(compiled[row] for row in rows)
+        names = [name for name, parameter in self.parameters.items() if parameter.edit is not None]
+        return self.for_rows(self._compile, names)
 
     def _compile(self, values: Mapping[str, float]) -> mujoco.MjModel:
         """Return the compiled model with these parameter values.
@@ -188,7 +205,8 @@ class Domain(Family):
         """Return the "model" and "goal" leaves (R, ...) of every row of the table."""
         leaves = {name: np.float32(leaf) for name, leaf in stack_differing(self.models).items()}
         goal, starts = self.goals(), self.starts(self.models, np.random.default_rng(self.task_seed))
-        return {"model": leaves, "goal": goal if starts is None else goal | {"starts": np.float32(starts)}}
+        seen = {"scene": self.scene_leaves()} if self.pixels else {}
+        return {"model": leaves, "goal": goal if starts is None else goal | {"starts": np.float32(starts)}, **seen}
 
     @property
     def action_size(self) -> int:  # type: ignore
@@ -197,8 +215,8 @@ class Domain(Family):
 
     @property
     def seconds_per_step(self) -> float:
-        """Return the length of a control step [s]."""
-        return self.models[0].opt.timestep * self.num_substeps
+        """Return the length of a step of the environment [s]."""
+        return self.models[0].opt.timestep * self.num_substeps * self.repeat
 
     @property
     def engine_name(self) -> str:

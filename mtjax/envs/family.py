@@ -123,17 +123,22 @@ class Tabled(abc.ABC):
 
         Only physics that another library computes makes such calls.
         """
-        engines = [part.family.outside for part in self.parts]
-        found = [(i, each) for i, engine in enumerate(engines) if engine for each in engine.targets().items()]
+        found = [(i, each) for i, maker in enumerate(self._outside) if maker for each in maker.targets().items()]
         return {name: [i, *about] for i, (name, about) in found}
 
-    def provide(self, part: int, *about: Any) -> str:
+    def provide(self, maker: int, *about: Any) -> str:
         """Make a call out of XLA for a program that was traced in another process, and return its name."""
-        return self.parts[part].family.outside.provide(*about)
+        return self._outside[maker].provide(*about)
 
     def load_kernels(self) -> bool:
         """Compile or load what runs outside XLA. Return whether XLA must compile nothing while programs first run."""
-        return any([part.family.outside.load_kernels() for part in self.parts if part.family.outside])
+        return any([maker.load_kernels() for maker in self._outside if maker])
+
+    @property
+    def _outside(self) -> list[Any]:
+        """Return what makes calls out of XLA: the engine of each part, then the painter of each part."""
+        families = [part.family for part in self.parts]
+        return [family.outside for family in families] + [family.outside_painter for family in families]
 
     def tasks(self, split: str = "train") -> Task:
         """Return the tasks of a split: "train", "interpolation", "extrapolation", or "all" in this order."""
@@ -219,13 +224,18 @@ class Family(Flat, Tabled):
         """Return the values of every task of every split."""
         return variation.vary(
             dict(self.vary),
-            self.parameters,
+            self.every_parameter,
             self.combine,
             self.num_tasks,
             self.split,
             self.num_draws,
             self.task_seed,
         )
+
+    @property
+    def every_parameter(self) -> Mapping[str, Parameter]:
+        """Return all parameters that can vary."""
+        return self.parameters
 
     def goals(self) -> dict[str, np.ndarray]:
         """Return the goal parameters (R,) of every row: varied, or nominal."""
@@ -283,7 +293,7 @@ class Family(Flat, Tabled):
 
     def _columns(self, name: str, low: float, high: float) -> np.ndarray:
         """Return what contexts tell of a parameter that may be constant or unknown here: (R, 1), of an angle (R, 2)."""
-        known = self.parameters[name].nominal if name in self.parameters else (low + high) / 2
+        known = self.every_parameter[name].nominal if name in self.every_parameter else (low + high) / 2
         values = self.values.get(name, np.full(self.count, known))
         if name in self.parameters and self.parameters[name].direction:
             return np.stack([np.sin(values), np.cos(values)], axis=1)
@@ -320,7 +330,9 @@ class Family(Flat, Tabled):
     @property
     def task_axis(self) -> tuple[str, str]:
         """Return name and unit of ``task_values``."""
-        return (self.varied[0], self.parameters[self.varied[0]].unit) if len(self.varied) == 1 else ("task", "number")
+        return (
+            (self.varied[0], self.every_parameter[self.varied[0]].unit) if len(self.varied) == 1 else ("task", "number")
+        )
 
     def describe(self, row: int) -> str:
         """Return a task's varied parameters as text, such as "size=0.95"."""
@@ -368,6 +380,11 @@ class Family(Flat, Tabled):
     @property
     def outside(self) -> Any:
         """Return the engine if it runs outside XLA, else None."""
+        return None
+
+    @property
+    def outside_painter(self) -> Any:
+        """Return the painter of its observations if it runs outside XLA, else None."""
         return None
 
     @property

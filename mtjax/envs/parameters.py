@@ -11,13 +11,14 @@ if TYPE_CHECKING:
 
 
 class Parameter(NamedTuple):
-    """A parameter that may differ between tasks. It is physical if it edits the model, otherwise a goal."""
+    """A parameter that may differ between tasks. It edits the physics or what is seen of it, or it is a goal."""
 
     unit: str
     nominal: float  # the value in the unedited model, or of a goal that does not vary
     edit: Callable[[mujoco.MjSpec, float], None] | None = None  # writes the value into a spec; None: ``Task.goal``
     minimum: float = 0.0  # values must be greater than this
     maximum: float = math.inf  # and not greater than this
+    looks: bool = False  # whether it edits what is seen, and not the physics
 
     @property
     def direction(self) -> bool:

@@ -126,3 +126,32 @@ class Probe(Flat):
         branches = [as_arrays(rule) for rule in RULES.values()]
         reward, obs, terminated = jax.lax.switch(task.goal["kind"], branches, task.goal["scale"], state.obs[0], action)
         return reward, obs, terminated > 0
+
+
+PIXELS = 16
+"""Height and width of the pictures of ``Pictured``."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Pictured(Probe):
+    """A probe that shows its observation: the left half of a picture is as bright as it is positive, else the right."""
+
+    frames: int = 2
+
+    @property
+    def spec(self) -> Spec:
+        shape = jax.ShapeDtypeStruct((PIXELS, PIXELS, 1), jnp.uint8)
+        return SPEC._replace(obs={"pixels": shape}, frames=self.frames)
+
+    def reset(self, task: Task, key: Key) -> Step:
+        return self.show(super().reset(task, key))
+
+    def step(self, task: Task, state: World, action: Array) -> Step:
+        return self.show(super().step(task, state, action))
+
+    def show(self, step: Step) -> Step:
+        """Return the step with a picture in place of its observation."""
+        left = jnp.arange(PIXELS) < PIXELS // 2
+        bright = jnp.where(left, jnp.maximum(step.obs, 0.0), jnp.maximum(-step.obs, 0.0))
+        picture = jnp.clip(200.0 * bright, 0, 255).astype(jnp.uint8)
+        return step._replace(obs={"pixels": jnp.broadcast_to(picture[None, :, None], (PIXELS, PIXELS, 1))})

@@ -31,6 +31,8 @@ def require(env: Env) -> None:
     family: Any = env
     if env.spec.mixed:
         raise InputError("hindsight replays steps of one task as another's, and a mixture's tasks share no physics")
+    if getattr(family, "pixels", 0) or getattr(family, "repeat", 1) > 1:
+        raise InputError("hindsight computes rewards from one step's state: leave out --env.pixels and --env.repeat")
     goals = [name for name in getattr(family, "relabels", ()) if name in family.parameters]
     varied = getattr(family, "varied", ())
     physical = [name for name in varied if name not in goals]

@@ -26,16 +26,22 @@ class Ends(NamedTuple):
     last: Transition
 
 
+def length(ended: Array) -> Array:
+    """Return m (...), how many steps of windows (..., n) count: up to and with the first that ended its episode."""
+    goes_on = jnp.cumprod(~ended[..., :-1], axis=-1)
+    return 1 + jnp.sum(goes_on, axis=-1)
+
+
 def join(steps: Transition, gamma: float | Array) -> Transition:
     """Join windows of consecutive steps (..., n) to one transition (...) each, for a discount () of one task.
 
     Its reward is R. Its discount is gamma^(m-1) d, as agents multiply it by gamma once more. Where agents store data
     with their actions, ``extras`` are ``Ends``.
     """
-    goes_on = jnp.cumprod(~steps.ended, axis=-1)
-    counts = jnp.concatenate([jnp.ones_like(goes_on[..., :1]), goes_on[..., :-1]], axis=-1)  # the first m steps
-    powers = jnp.power(gamma, jnp.arange(steps.reward.shape[-1]))
-    final = jnp.sum(counts, axis=-1, keepdims=True) - 1
+    count = length(steps.ended)[..., None]
+    index = jnp.arange(steps.reward.shape[-1])
+    powers = jnp.power(gamma, index)
+    final = count - 1
     lead = steps.reward.ndim - 1
 
     def at(x: Array, index: Array) -> Array:
@@ -44,7 +50,7 @@ def join(steps: Transition, gamma: float | Array) -> Transition:
 
     first, last = (jax.tree.map(lambda x, index=index: at(x, index), steps) for index in (0 * final, final))
     return first._replace(
-        reward=jnp.sum(jnp.where(counts > 0, powers * steps.reward, 0.0), axis=-1),
+        reward=jnp.sum(jnp.where(index < count, powers * steps.reward, 0.0), axis=-1),
         discount=powers[final.squeeze(-1)] * last.discount,
         next_obs=last.next_obs,
         ended=last.ended,

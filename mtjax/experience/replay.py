@@ -10,12 +10,13 @@ import jax.numpy as jnp
 import tyro
 from jax.sharding import PartitionSpec
 
-from mtjax.experience import hindsight
+from mtjax.experience import hindsight, pictures
 from mtjax.experience import ring as rings
 from mtjax.experience.ring import OVER_SEEDS, Ring
+from mtjax.frames import PICTURES, shown
 from mtjax.maps import over_seeds, when
 from mtjax.parallel import collectives
-from mtjax.types import Array, Env, InputError, Key, Metrics, Task, Transition
+from mtjax.types import Array, Env, InputError, Key, Metrics, Spec, Task, Transition
 
 _FLAG = tyro.conf.arg(prefix_name=False)  # --batch-size, not --agent.batch-size
 
@@ -80,7 +81,10 @@ class Replay:
             InputError: the replay does not hold enough steps of every environment, or hindsight cannot relabel the
                 family.
         """
-        if self.capacity(num_envs) < max(self.n_step, self.update_every) * num_envs:
+        window = self.window(env.spec)
+        if shown(env.spec.obs) and window > self.warmup_steps:
+            raise InputError(f"{window} steps tell one transition of pictures; use warmup-steps of at least {window}")
+        if self.capacity(num_envs) < max(window, self.n_step, self.update_every) * num_envs:
             least = math.ceil(self.n_step / self.update_every) * self.update_every
             steps = "one step" if least == 1 else f"{least} steps"
             raise InputError(f"replay-size ({self.replay_size}) must hold {steps} of num-envs ({num_envs})")
@@ -91,9 +95,10 @@ class Replay:
         """Return a description of its size."""
         return f"replay ({self.capacity(num_envs):,} transitions a task)"
 
-    @property
-    def window(self) -> int:
-        """Number of consecutive steps to draw for each transition; 0 if transitions are single steps."""
+    def window(self, spec: Spec) -> int:
+        """Return how many consecutive steps to draw for each transition; 0 if transitions are single steps."""
+        if shown(spec.obs):
+            return pictures.window(spec.frames, self.n_step)
         return self.n_step if self.n_step > 1 else 0
 
     @property
@@ -119,8 +124,9 @@ class Replay:
 
     # Data.
 
-    def init(self, item: Transition, num_tasks: int, num_envs: int, keys: Key) -> Buffer:
+    def init(self, item: Transition, spec: Spec, num_tasks: int, num_envs: int, keys: Key) -> Buffer:
         """Return an empty replay for transitions like ``item`` (no leading axes) and seeds with ``keys`` (S,)."""
+        item = pictures.compress(item, spec.obs[PICTURES].shape[-1]) if shown(spec.obs) else item
         own, slots = num_envs // collectives.count(), self.capacity(num_envs) // num_envs
         blank = lambda _: rings.init(item, num_tasks, slots, own)
         return Buffer(jax.vmap(blank, out_axes=OVER_SEEDS)(keys), jnp.int32(0), keys)
@@ -134,6 +140,8 @@ class Replay:
 
     def add(self, data: Buffer, steps: Transition) -> Buffer:
         """Store the latest steps of every environment, leaves (S, T, H, E, ...)."""
+        kept = data.ring.rows.obs
+        steps = pictures.compress(steps, kept[PICTURES].shape[-1]) if shown(kept) else steps
         ring = jax.vmap(rings.add, (OVER_SEEDS, 0), OVER_SEEDS)(data.ring, steps)
         return Buffer(ring, data.count + self.steps, data.key)
 
@@ -184,16 +192,20 @@ class Replay:
             state: the agent's, for multi-step returns.
         """
         shape = (len(tasks.id), self.updates_per_step, self.batch_size)
+        window = self.window(env.spec)
         if self.hindsight:
-            rows = hindsight.sample(env, agent, tasks, self.hindsight, ring, key, shape, self.window)
+            rows = hindsight.sample(env, agent, tasks, self.hindsight, ring, key, shape, window)
         else:
-            rows = rings.sample(ring, key, math.prod(shape[1:]), self.window)
+            rows = rings.sample(ring, key, math.prod(shape[1:]), window)
             rows = jax.tree.map(lambda x: x.reshape(*shape, *x.shape[2:]), rows)
-        return jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), self.joined(agent, state, rows, tasks))
+        return jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), self.joined(env.spec, agent, state, rows, tasks))
 
-    def joined(self, agent: Any, state: Any, rows: Transition, tasks: Task) -> Transition:
-        """Return transitions (T, ...) from drawn rows, which are windows (T, ..., n) if returns are multi-step."""
-        return agent.join_steps(state, rows, tasks) if self.window else rows
+    def joined(self, spec: Spec, agent: Any, state: Any, rows: Transition, tasks: Task) -> Transition:
+        """Return transitions (T, ...) from drawn rows, which are windows (T, ..., W) if ``window`` says so."""
+        if not self.window(spec):
+            return rows
+        of_pictures = [partial(pictures.join, frames=spec.frames, n_step=self.n_step)] if shown(spec.obs) else []
+        return agent.join_steps(state, rows, tasks, *of_pictures)
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))  # so that it is traced once, though ``learn`` needs its shapes too

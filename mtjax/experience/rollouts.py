@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 
 from mtjax.maps import over_seeds
-from mtjax.types import Array, Env, InputError, Key, Metrics, Task, Transition
+from mtjax.types import Array, Env, InputError, Key, Metrics, Spec, Task, Transition
 
 _LONGEST = 100_000
 
@@ -43,7 +43,7 @@ class Rollouts:
         """Return a description of its size."""
         return f"rollouts ({self.unroll * num_envs:,} transitions a task, not kept)"
 
-    def init(self, item: Transition, num_tasks: int, num_envs: int, keys: Key) -> tuple[()]:
+    def init(self, item: Transition, spec: Spec, num_tasks: int, num_envs: int, keys: Key) -> tuple[()]:
         """Return (), as no data is kept between iterations."""
         return ()
 

@@ -53,9 +53,30 @@ def draw_seeds(random: np.random.Generator, *shape: int) -> np.ndarray:
 
 def spaces_of(family: Env, table: TaskTable) -> tuple[spaces.Dict, spaces.Box]:
     """Return the observation space and the action space of one world."""
-    obs = spaces.Box(-np.inf, np.inf, (family.spec.obs_size,), np.float32)
+    obs = _space_of(family.spec.obs)
     action = spaces.Box(-1.0, 1.0, (family.spec.action_size,), np.float32)
     return spaces.Dict({"env_obs": obs, "task_obs": table.space}), action
+
+
+def _space_of(obs: Any) -> spaces.Space:
+    """Return the space of a vector or a picture, or of a dictionary of these; pictures alone are no dictionary."""
+    if isinstance(obs, dict):
+        return _space_of(obs["pixels"]) if len(obs) == 1 else spaces.Dict({k: _space_of(x) for k, x in obs.items()})
+    if obs.dtype == np.uint8:
+        return spaces.Box(0, 255, obs.shape, np.uint8)
+    return spaces.Box(-np.inf, np.inf, obs.shape, np.float32)
+
+
+def observed(obs: Any) -> Any:
+    """Return an observation on the host, in the form of its space."""
+    if isinstance(obs, dict) and len(obs) == 1:
+        (obs,) = obs.values()
+    return jax.tree.map(np.array, obs)
+
+
+def played(family: Env) -> Any:
+    """Return what Gymnasium steps: a family, or one with pictures whose observations hold the last few of them."""
+    return envs.stacked(family) if getattr(family, "pixels", 0) else family
 
 
 def read_action(action: Any, space: spaces.Space) -> np.ndarray:
@@ -98,8 +119,8 @@ def make(
 class FamilyEnv(TaskStream, gymnasium.Env):
     """A family with MTEnv's interface. ``reset`` begins an episode of the current task and never changes the task.
 
-    Observation: ``env_obs`` (O,) is the observation of the world. ``task_obs`` is that of the task: its context (C,),
-        its number among all tasks of the family, or nothing (0,).
+    Observation: ``env_obs`` (O,) is the observation of the world, or its last pictures (H, W, N C), newest last.
+        ``task_obs`` is that of the task: its context (C,), its number among all tasks of the family, or nothing (0,).
     Action: (A,) in [-1, 1]. A time limit truncates.
     Task state: an int. With the family's settings it identifies the task. The environment starts with the first task
         of the split. After a change of the task call ``reset`` before ``step``.
@@ -109,14 +130,14 @@ class FamilyEnv(TaskStream, gymnasium.Env):
     """
 
     def __init__(self, family: Env, tasks: str = "train", task_obs: str = "context", render_mode: str | None = None):
-        self.family, self.render_mode, self._programs = family, render_mode, _programs(family)
+        self.family, self.render_mode, self._programs = family, render_mode, _programs(played(family))
         self.metadata = _metadata(family)
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise InputError(
                 f"render_mode must be one of {[None, *self.metadata['render_modes']]}, not {render_mode!r}"
             )
         self._table = TaskTable(family, tasks, task_obs)
-        self.observation_space, self.action_space = spaces_of(family, self._table)
+        self.observation_space, self.action_space = spaces_of(played(family), self._table)
         self._elapsed = 0
         self.set_task_state(self._table.first)
 
@@ -143,7 +164,8 @@ class FamilyEnv(TaskStream, gymnasium.Env):
         """Return a picture (height, width, 3) uint8 of the world as it is now."""
         if self.render_mode is None or self._step is None:
             raise InputError("to draw, give render_mode='rgb_array' to make, and reset first")
-        return render.film(self.family, int(self._task.row), np.asarray(self._step.state.qpos)[None])[0]  # type: ignore
+        state = self._step.state.world if getattr(self.family, "pixels", 0) else self._step.state
+        return render.film(self.family, int(self._task.row), jax.tree.map(lambda x: x[None], state))[0]  # type: ignore
 
     def get_task_obs(self) -> Any:
         """Return the observation of the current task."""
@@ -168,7 +190,7 @@ class FamilyEnv(TaskStream, gymnasium.Env):
         self.set_task_state(self.sample_task_state())
 
     def _observe(self) -> dict[str, Any]:
-        return {"env_obs": np.array(self._step.obs), "task_obs": self.get_task_obs()}  # type: ignore
+        return {"env_obs": observed(self._step.obs), "task_obs": self.get_task_obs()}  # type: ignore
 
 
 def _metadata(family: Env) -> dict[str, Any]:

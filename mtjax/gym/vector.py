@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from mtjax.gym.env import begin, draw_seeds, family_named, read_action, spaces_of
+from mtjax.gym.env import begin, draw_seeds, family_named, observed, played, read_action, spaces_of
 from mtjax.gym.tasks import TaskStream, TaskTable, read_options
 from mtjax.types import Array, Env, InputError, Step
 
@@ -83,10 +83,10 @@ class FamilyVectorEnv(TaskStream, VectorEnv):
         if num_envs < 1:
             raise InputError(f"num_envs must be at least 1, not {num_envs}")
         self.family, self.num_envs, self._resample = family, num_envs, resample_tasks
-        self._programs = _programs(family)
+        self._programs = _programs(played(family))
         self.metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": []}
         self._table = TaskTable(family, tasks, task_obs)
-        self.single_observation_space, self.single_action_space = spaces_of(family, self._table)
+        self.single_observation_space, self.single_action_space = spaces_of(played(family), self._table)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.set_task_state(self._table.chosen[np.arange(num_envs) * len(self._table.chosen) // num_envs])
@@ -162,4 +162,4 @@ class FamilyVectorEnv(TaskStream, VectorEnv):
         return fresh if step is None else _where(worlds, fresh, step)
 
     def _observe(self, step: Step) -> dict[str, Any]:
-        return {"env_obs": np.array(step.obs), "task_obs": self.get_task_obs()}
+        return {"env_obs": observed(step.obs), "task_obs": self.get_task_obs()}

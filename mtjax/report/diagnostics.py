@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mtjax import frames
 from mtjax.agents import SAC
 from mtjax.agents.parts.gradients import surgery
 from mtjax.experience import ring as rings
@@ -23,7 +24,7 @@ from mtjax.experience.ring import Ring
 from mtjax.networks import Network, Params, ReLU
 from mtjax.report import figures
 from mtjax.training.policy import Policy
-from mtjax.types import Array, InputError, Key, Metrics, Task, Transition
+from mtjax.types import Array, Env, InputError, Key, Metrics, Task, Transition
 
 DRAWS = 16
 """Number of batches over which gradients and their statistics are averaged."""
@@ -69,6 +70,8 @@ def diagnose(policy: Policy, replay: Ring, batch_size: int) -> Diagnostics:
     Raises:
         InputError: the replay is empty, or the agent has no critics of actions.
     """
+    if frames.shown(policy.env.spec.obs):
+        raise InputError("diagnostics are of agents whose networks take vectors")
     if int(replay.size) < getattr(policy.agent.experience, "n_step", 1):
         raise InputError("the replay of this run is empty; train it for longer")
     tasks, agent = policy.env.tasks("train"), policy.agent
@@ -79,7 +82,7 @@ def diagnose(policy: Policy, replay: Ring, batch_size: int) -> Diagnostics:
         state, rows = jax.tree.map(lambda x, s=s: x[s], (policy.states, replay.rows))
         gradient_key, sample_key = jax.random.split(jax.random.key(0))
         of_seed = replay._replace(rows=rows)
-        gradients = _average_gradients(agent, state, of_seed, tasks, gradient_key, batch_size)
+        gradients = _average_gradients(policy.env, agent, state, of_seed, tasks, gradient_key, batch_size)
         activity = _sample_activity(agent, state, of_seed, tasks, sample_key)
         found.append(_summarise(agent, state, gradients, activity))
     critic, actor, td_error = jax.tree.map(lambda *x: np.mean(x, axis=0), *found)
@@ -98,12 +101,12 @@ def _summarise(agent: SAC, state: Any, gradients: Mapping, activity: Mapping) ->
 # Gradients.
 
 
-@partial(jax.jit, static_argnums=(0, 5))
-def _average_gradients(agent: SAC, state: Any, replay: Ring, tasks: Task, key: Key, batch_size: int) -> dict:
+@partial(jax.jit, static_argnums=(0, 1, 6))
+def _average_gradients(env: Env, agent: SAC, state: Any, replay: Ring, tasks: Task, key: Key, batch_size: int) -> dict:
     def draw(key: Key) -> dict:
         batch_key, loss_key = jax.random.split(key)
-        rows = rings.sample(replay, batch_key, batch_size, agent.experience.window)
-        batch = agent.experience.joined(agent, state, rows, tasks)
+        rows = rings.sample(replay, batch_key, batch_size, agent.experience.window(env.spec))
+        batch = agent.experience.joined(env.spec, agent, state, rows, tasks)
         return compare_gradients(agent, state, batch, tasks, loss_key)
 
     return jax.tree.map(lambda x: jnp.mean(x, axis=0), jax.lax.map(draw, jax.random.split(key, DRAWS)))

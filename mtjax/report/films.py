@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -104,7 +105,8 @@ def _tile(
     length = int(played.lengths[one.place])
     times = np.arange(count) / _FPS / family.seconds_per_step
     steps = np.unique(np.minimum(times.astype(int), length - 1))
-    drawn = render.film(family, row, np.asarray(states.qpos[one.own])[steps], width, width * 3 // 4)
+    shown = jax.tree.map(lambda x: np.asarray(x[one.own])[steps], states)
+    drawn = render.film(family, row, shown, width, width * 3 // 4)
     frames = drawn[np.searchsorted(steps, np.minimum(times.astype(int), length - 1))]
     moving = max(int(np.sum(times < length)), 1)
     return captioned(frames[:moving], _caption(env, one, played, named))

@@ -2,19 +2,21 @@
 
 import importlib
 import math
+import operator
 import os
 import platform
 from pathlib import Path
 
+import jax
 import mujoco
 import numpy as np
 from PIL import Image
 
 from mtjax.envs.domain import Domain
+from mtjax.envs.engines.base import World
+from mtjax.envs.pixels import Mark
 from mtjax.types import InputError
 
-_ELEVATION = -math.degrees(math.atan(0.5))  # dm_control's cam0 of the finger: xyaxes="1 0 0 0 1 2"
-_DISTANCES = 2.0  # from camera to centre, in extents of the model; cam0 of the finger is 1.7 away
 _GIF_FPS = 50  # browsers slow down frames that are shorter than 0.02 s
 _FIX = (
     "cannot draw without a display with MUJOCO_GL={}; on Debian or Ubuntu run `apt install libegl1 libgl1-mesa-dri` "
@@ -34,11 +36,10 @@ def choose_backend() -> str:
     return os.environ.get("MUJOCO_GL", "")
 
 
-def film(env: Domain, task_row: int, qpos: np.ndarray, width: int = 320, height: int = 240) -> np.ndarray:
-    """Draw the task in row ``task_row`` of ``env.table`` in each of the positions (H, nq).
+def film(env: Domain, task_row: int, states: World, width: int = 320, height: int = 240) -> np.ndarray:
+    """Draw the task in row ``task_row`` of ``env.table`` in each of the states, leaves (H, ...).
 
-    The camera looks along +y and down, like cam0 of dm_control's finger. It has the same place for every task of the
-    family, so that their sizes can be compared. It does not follow a model that travels.
+    The scene is that of observations from pixels, with shadows, and with goals that the agent does not see.
 
     Returns:
         Frames (H, height, width, 3) uint8.
@@ -48,14 +49,17 @@ def film(env: Domain, task_row: int, qpos: np.ndarray, width: int = 320, height:
     """
     if not 0 <= task_row < env.count:
         raise InputError(f"there is no task {task_row}; this family has tasks 0 to {env.count - 1}")
-    model = _lit_model(env, task_row, width, height)
-    data, camera = mujoco.MjData(model), _camera(env)
+    model = _scene(env, task_row, width, height)
+    data, qpos = mujoco.MjData(model), np.asarray(states.qpos)
+    task = jax.tree.map(lambda x: x[task_row], env.table.tasks)
+    marks = jax.tree.map(np.asarray, jax.vmap(env.marks, (None, 0))(task, states))
     frames = np.empty((len(qpos), height, width, 3), np.uint8)
     with _open_renderer(model, width, height) as renderer:
-        for frame, position in zip(frames, np.asarray(qpos), strict=True):
-            data.qpos[:] = position
+        for i, frame in enumerate(frames):
+            _place(model, jax.tree.map(operator.itemgetter(i), marks))
+            data.qpos[:] = qpos[i]
             mujoco.mj_forward(model, data)
-            renderer.update_scene(data, camera)
+            renderer.update_scene(data, 0)
             renderer.render(out=frame)
     return frames
 
@@ -82,32 +86,22 @@ def write_video(path_stem: str | Path, frames: np.ndarray, fps: float) -> Path:
     return path
 
 
-def _lit_model(env: Domain, task_row: int, width: int, height: int) -> mujoco.MjModel:
-    spec = env.compile_spec({name: values[task_row] for name, values in env.values.items()})
-    spec.worldbody.add_light(pos=[0, -1, 3], dir=[0, 0.3, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
-    spec.add_texture(
-        name="sky",
-        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-        rgb1=[0.4, 0.6, 0.8],
-        rgb2=[0.9, 0.95, 1],
-        width=64,
-        height=64,
-    )
-    spec.visual.global_.offwidth = width
-    spec.visual.global_.offheight = height
+def _scene(env: Domain, task_row: int, width: int, height: int) -> mujoco.MjModel:
+    spec = env.compile_scene({name: values[task_row] for name, values in env.values.items()})
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
     return spec.compile()
 
 
-def _camera(env: Domain) -> mujoco.MjvCamera:
-    largest = max(env.models, key=lambda model: model.stat.extent)
-    # The model's own centre depends on how its limbs hang at rest; what they hang from stays put.
-    roots = np.flatnonzero(largest.body_parentid == 0)[1:]
-    camera = mujoco.MjvCamera()
-    camera.lookat[:] = largest.body_pos[roots].mean(axis=0)
-    camera.distance = _DISTANCES * largest.stat.extent
-    camera.azimuth, camera.elevation = 90, _ELEVATION
-    return camera
+def _place(model: mujoco.MjModel, marks: dict[str, Mark]) -> None:
+    """Put the geoms whose places an episode decides where they are. They belong to the world's body."""
+    for name, mark in marks.items():
+        geom = model.geom(name).id
+        model.geom_sameframe[geom] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE  # else its place is not read
+        model.geom_pos[geom] = mark.position
+        if mark.size is not None:
+            model.geom_size[geom] = mark.size
+        if mark.along is not None:
+            mujoco.mju_quatZ2Vec(model.geom_quat[geom], np.float64(mark.along))
 
 
 def _open_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Renderer:

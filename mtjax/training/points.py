@@ -65,8 +65,8 @@ class SweptAgent:
     def relabel(self, env: Env, task: Task, transition: Transition, key: Key) -> Transition:
         return self.agent.relabel(env, task, transition, key)
 
-    def join_steps(self, state: SweptState, steps: Transition, tasks: Task) -> Transition:
-        return with_values(self.agent, state.knobs).join_steps(state.learner, steps, tasks)
+    def join_steps(self, state: SweptState, steps: Transition, tasks: Task, *join: Any) -> Transition:
+        return with_values(self.agent, state.knobs).join_steps(state.learner, steps, tasks, *join)
 
     def learn(self, env: Env, states: SweptState, data: Any, tasks: Task, keys: Key) -> tuple[SweptState, Metrics]:
         return self.experience.learn(env, self, states, data, tasks, keys)  # type: ignore

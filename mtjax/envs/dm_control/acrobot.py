@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from mtjax.envs.dm_control.rewards import tolerance
 from mtjax.envs.domain import Domain, start_joints
 from mtjax.envs.engines.base import World
+from mtjax.envs.looks import SELF, Look
 from mtjax.envs.parameters import DAMPING, GEAR, GRAVITY, body_mass
 from mtjax.types import Array, Key, Task
 
@@ -54,6 +55,7 @@ class AcrobotSwingup(Domain):
     gpu_engine: ClassVar[str] = "mjx"
     default_iterations: ClassVar[int] = 1
     starts_untouched: ClassVar[bool] = True
+    look: ClassVar = Look((0, -6, 2), 90, (0, 0, 6), colours=(("lower_arm", SELF),))
 
     def start(self, task: Task, key: Key) -> tuple[Array, Array]:
         return start_joints(self.models[0], key), jnp.zeros(2)

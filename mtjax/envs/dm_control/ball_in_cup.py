@@ -10,7 +10,9 @@ import mujoco
 
 from mtjax.envs.domain import Domain
 from mtjax.envs.engines.base import World
+from mtjax.envs.looks import Look
 from mtjax.envs.parameters import DAMPING, FRICTION, GEAR, GRAVITY, MASS, Parameter, body_mass
+from mtjax.envs.pixels import Mark
 from mtjax.types import Array, Key, Task
 
 _START_LOW, _START_HIGH = (-0.2, 0.2), (0.2, 0.5)  # [m] x and z of the ball's joints
@@ -60,6 +62,26 @@ class BallInCup(Domain):
     episode_steps: ClassVar[int] = 1000
     default_iterations: ClassVar[int] = 2
     starts_untouched: ClassVar[bool] = True
+    look: ClassVar = Look((0, -1, 0.8), 63.435, sun=True)
+
+    def add_marks(self, spec: mujoco.MjSpec) -> None:
+        """Add the string as a thin capsule, since the physics has a tendon."""
+        shape = {"type": mujoco.mjtGeom.mjGEOM_CAPSULE, "size": [spec.tendon("string").width, 0.1, 0]}
+        spec.worldbody.add_geom(
+            name="string", rgba=spec.tendon("string").rgba, mass=0, contype=0, conaffinity=0, **shape
+        )
+        spec.tendon("string").rgba = [0, 0, 0, 0]
+
+    def marks(self, task: Task, world: World) -> dict[str, Mark]:
+        model, bodies, sites = self.models[0], self.leaf(task, "body_pos"), self.leaf(task, "site_pos")
+        ends = []
+        for i, name in enumerate(("cup", "ball")):
+            x, z = world.qpos[2 * i], world.qpos[2 * i + 1]
+            ends.append(bodies[model.body(name).id] + sites[model.site(name).id] + jnp.stack([x, jnp.float32(0), z]))
+        apart = ends[1] - ends[0]
+        length = jnp.maximum(jnp.linalg.norm(apart), 1e-6)
+        size = jnp.stack([jnp.float32(model.tendon_width[0]), length / 2, jnp.float32(0)])
+        return {"string": Mark((ends[0] + ends[1]) / 2, size, apart / length)}
 
     def start(self, task: Task, key: Key) -> tuple[Array, Array]:
         low, high = jnp.array([_START_LOW, _START_HIGH]).T

@@ -11,6 +11,7 @@ import mujoco
 from mtjax.envs.dm_control.rewards import tolerance
 from mtjax.envs.domain import Domain
 from mtjax.envs.engines.base import World
+from mtjax.envs.looks import Look
 from mtjax.envs.parameters import DAMPING, GEAR, GRAVITY, Parameter
 from mtjax.types import Array, Key, Task
 
@@ -71,6 +72,7 @@ class CartpoleBalance(Domain):
     episode_steps: ClassVar[int] = 1000
     default_iterations: ClassVar[int] = 2
     starts_untouched: ClassVar[bool] = True
+    look: ClassVar = Look((0, -4, 1), 90, (0, 0, 6))
 
     def start(self, task: Task, key: Key) -> tuple[Array, Array]:
         position_key, velocity_key = jax.random.split(key)

@@ -13,6 +13,7 @@ import numpy as np
 from mtjax.envs.dm_control.rewards import tolerance
 from mtjax.envs.domain import Domain
 from mtjax.envs.engines.base import World
+from mtjax.envs.looks import Look
 from mtjax.envs.parameters import DAMPING, FRICTION, GEAR, GRAVITY, MASS, Parameter, body_mass
 from mtjax.types import Array, Key, Task
 
@@ -110,6 +111,7 @@ class CheetahRun(Domain):
     warp_iterations: ClassVar[int] = 4
     starts_untouched: ClassVar[bool] = True  # it has no force sensors
     relabels: ClassVar[tuple[str, ...]] = ("speed", "direction")
+    look: ClassVar = Look((0, -3, 0), 90, follow="torso")
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
         _weigh(spec)

@@ -11,7 +11,9 @@ import mujoco
 
 from mtjax.envs.domain import Domain, start_joints
 from mtjax.envs.engines.base import World
+from mtjax.envs.looks import TARGET, Look
 from mtjax.envs.parameters import DAMPING, FRICTION, GEAR, MASS, Parameter
+from mtjax.envs.pixels import Mark
 from mtjax.types import Array, Key, Task, Transition
 
 _SPIN_VELOCITY = 15.0  # [rad/s]
@@ -90,6 +92,7 @@ class FingerSpin(Domain):
     default_iterations: ClassVar[int] = 2
     warp_iterations: ClassVar[int] = 4
     starts_untouched: ClassVar[bool] = True
+    look: ClassVar = Look((0, -1, 0.8), 63.435, sun=True)
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
         _set_spinner_damping(spec, 0.03)
@@ -134,6 +137,18 @@ class FingerTurn(FingerSpin):
     )
     relabels: ClassVar[tuple[str, ...]] = ("target-size", "target-angle")
     fresh_goals: ClassVar[bool] = True
+
+    def add_marks(self, spec: mujoco.MjSpec) -> None:
+        """Add the target, and the spinner's tip that has to be in it."""
+        seen = {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "rgba": TARGET, "mass": 0, "contype": 0, "conaffinity": 0}
+        site = spec.site("tip")
+        spec.body("spinner").add_geom(name="tip", pos=site.pos, size=site.size, **seen)
+        spec.worldbody.add_geom(name="target", size=[self.parameters["target-size"].nominal, 0, 0], **seen)
+
+    def marks(self, task: Task, world: World) -> dict[str, Mark]:
+        hinge = self.leaf(task, "body_pos")[self.models[0].body("spinner").id]
+        place = hinge + jnp.stack([world.extra[0], jnp.float32(0), world.extra[1]])
+        return {"target": Mark(place, size=jnp.stack([task.goal["target-size"], 0.0, 0.0]))}
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
         pass  # the model's own damping is this task's
@@ -193,6 +208,7 @@ class FingerTurnTarget(FingerTurn):
         {**FingerTurn.parameters, "target-angle": Parameter("rad", 0.0, minimum=-math.inf)}
     )
     fresh_goals: ClassVar[bool] = False
+    hides: ClassVar[tuple[str, ...]] = ("target",)
 
     def target_angle(self, task: Task, key: Key) -> Array:
         return task.goal["target-angle"]

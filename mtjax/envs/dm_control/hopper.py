@@ -10,6 +10,7 @@ import mujoco
 from mtjax.envs.dm_control.rewards import tolerance
 from mtjax.envs.domain import Domain, start_joints
 from mtjax.envs.engines.base import World
+from mtjax.envs.looks import Look
 from mtjax.envs.parameters import DAMPING, FRICTION, GEAR, GRAVITY, MASS, Parameter, body_mass
 from mtjax.types import Array, Key, Task
 
@@ -72,6 +73,7 @@ class HopperStand(Domain):
     episode_steps: ClassVar[int] = 1000
     default_iterations: ClassVar[int] = 4
     starts_untouched: ClassVar[bool] = True  # nearly: to solve for the rest costs MJX half a step's compilation more
+    look: ClassVar = Look((0, -2.8, -0.2), 90, follow="torso")
 
     def start(self, task: Task, key: Key) -> tuple[Array, Array]:
         return start_joints(self.models[0], key), jnp.zeros(self.models[0].nv)

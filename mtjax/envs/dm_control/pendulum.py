@@ -10,6 +10,7 @@ import mujoco
 
 from mtjax.envs.domain import Domain, start_joints
 from mtjax.envs.engines.base import World
+from mtjax.envs.looks import Look
 from mtjax.envs.parameters import DAMPING, GEAR, GRAVITY, Parameter
 from mtjax.types import Array, Key, Task
 
@@ -60,6 +61,7 @@ class PendulumSwingup(Domain):
     gpu_engine: ClassVar[str] = "mjx"
     default_iterations: ClassVar[int] = 1
     starts_untouched: ClassVar[bool] = True
+    look: ClassVar = Look((0, -1.5, 2), 45)
 
     def start(self, task: Task, key: Key) -> tuple[Array, Array]:
         return start_joints(self.models[0], key), jnp.zeros(1)

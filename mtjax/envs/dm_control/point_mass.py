@@ -10,6 +10,7 @@ import mujoco
 from mtjax.envs.dm_control.rewards import tolerance
 from mtjax.envs.domain import Domain, start_joints
 from mtjax.envs.engines.base import World
+from mtjax.envs.looks import Look
 from mtjax.envs.parameters import DAMPING, GEAR, MASS, Parameter
 from mtjax.types import Array, Key, Task
 
@@ -65,6 +66,7 @@ class PointMass(Domain):
     default_iterations: ClassVar[int] = 2
     starts_untouched: ClassVar[bool] = True
     relabels: ClassVar[tuple[str, ...]] = ("goal-x", "goal-y")
+    look: ClassVar = Look((0, 0, 0.75), 0, (0, 0, 1))
 
     def start(self, task: Task, key: Key) -> tuple[Array, Array]:
         return start_joints(self.models[0], key), jnp.zeros(2)
@@ -102,6 +104,7 @@ class PointMassNavigate(PointMass):
 
     num_substeps: ClassVar[int] = 5
     episode_steps: ClassVar[int] = 100
+    hides: ClassVar[tuple[str, ...]] = ("target",)
 
     def start(self, task: Task, key: Key) -> tuple[Array, Array]:
         return jnp.zeros(2), jnp.zeros(2)

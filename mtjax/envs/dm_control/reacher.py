@@ -12,10 +12,13 @@ import mujoco
 from mtjax.envs.dm_control.rewards import tolerance
 from mtjax.envs.domain import Domain, start_joints
 from mtjax.envs.engines.base import World
+from mtjax.envs.looks import Look
 from mtjax.envs.parameters import DAMPING, GEAR, MASS, Parameter
+from mtjax.envs.pixels import Mark
 from mtjax.types import Array, Key, Task, Transition
 
 _NEAREST, _FARTHEST = 0.05, 0.2  # [m] of the target from the shoulder
+_HEIGHT = 0.01  # [m] of arm and target
 
 
 def _set_target_size(spec: mujoco.MjSpec, size: float) -> None:
@@ -60,11 +63,15 @@ class Reacher(Domain):
     starts_untouched: ClassVar[bool] = True
     relabels: ClassVar[tuple[str, ...]] = ("target-size", "target-angle", "target-radius")
     fresh_goals: ClassVar[bool] = True
+    look: ClassVar = Look((0, 0, 0.75), 0, (0, 0, 1))
 
     def start(self, task: Task, key: Key) -> tuple[Array, Array, Array]:
         """Draw positions and velocities of the joints, and the place of the target (2,) [m]."""
         joint_key, target_key = jax.random.split(key)
         return start_joints(self.models[0], joint_key), jnp.zeros(2), self.target(task, target_key)
+
+    def marks(self, task: Task, world: World) -> dict[str, Mark]:
+        return {"target": Mark(jnp.append(world.extra, _HEIGHT))}
 
     def observe(self, task: Task, world: World) -> Array:
         return jnp.concatenate([world.qpos, world.extra - self.finger(task, world), world.qvel])
@@ -124,6 +131,7 @@ class ReacherTarget(Reacher):
         }
     )
     fresh_goals: ClassVar[bool] = False
+    hides: ClassVar[tuple[str, ...]] = ("target",)
 
     def observe(self, task: Task, world: World) -> Array:
         return jnp.concatenate([world.qpos, self.finger(task, world), world.qvel])

@@ -10,6 +10,7 @@ import mujoco
 from mtjax.envs.dm_control.rewards import tolerance
 from mtjax.envs.domain import Domain, start_joints
 from mtjax.envs.engines.base import World
+from mtjax.envs.looks import Look
 from mtjax.envs.parameters import DAMPING, GEAR, GRAVITY, MASS, Parameter, body_mass
 from mtjax.types import Array, Key, Task
 
@@ -68,6 +69,7 @@ class WalkerStand(Domain):
     episode_steps: ClassVar[int] = 1000
     default_iterations: ClassVar[int] = 8
     starts_untouched: ClassVar[bool] = True  # it has no force sensors
+    look: ClassVar = Look((0, -2, 0.7), 60, follow="torso")
 
     def start(self, task: Task, key: Key) -> tuple[Array, Array]:
         return start_joints(self.models[0], key), jnp.zeros(self.models[0].nv)

@@ -46,22 +46,27 @@ def choose_engine(engine: str, preferred: str = "mjx") -> str:
     Raises:
         InputError: this device cannot run the engine, or Warp is not installed.
     """
-    device = jax.default_backend()
-    nvidia = device == "gpu" and "rocm" not in jax.devices()[0].client.platform_version.lower()
+    device, nvidia = jax.default_backend(), is_nvidia()
     if engine == "auto" and device == "cpu":
         return "c"
     if engine == "auto":
-        return "warp" if preferred == "warp" and nvidia and _warp_installed() else "mjx"
+        return "warp" if preferred == "warp" and nvidia and warp_installed() else "mjx"
     if engine == "c" and device != "cpu":
         raise InputError(f"engine 'c' needs JAX on the CPU, not on {device}; use --engine=mjx")
     if engine == "warp" and not (nvidia or device == "cpu"):
         raise InputError("engine 'warp' needs an NVIDIA GPU (or a CPU, where it is slow); use --engine=mjx")
-    if engine == "warp" and not _warp_installed():
+    if engine == "warp" and not warp_installed():
         raise InputError("engine 'warp' needs Warp, which is not installed: pip install 'mtjax[warp]'; or --engine=mjx")
     return engine
 
 
-def _warp_installed() -> bool:
+def is_nvidia() -> bool:
+    """Return whether JAX runs on NVIDIA GPUs."""
+    return jax.default_backend() == "gpu" and "rocm" not in jax.devices()[0].client.platform_version.lower()
+
+
+def warp_installed() -> bool:
+    """Return whether Warp is installed."""
     return importlib.util.find_spec("warp") is not None
 
 

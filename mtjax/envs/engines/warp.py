@@ -25,7 +25,7 @@ from mtjax.types import Array, InputError, Task
 _UNREAD = ("dof_M0",)
 _DOUBLED = 8  # pairs that may touch in two points where MJX-JAX finds one, at the same time in one world
 _STATE = ("qpos", "qvel", "qacc_warmstart")  # what a step begins with, beside controls, and what it ends with
-_ALONE = threading.Lock()  # Warp's choice of a device holds for all threads
+ALONE = threading.Lock()  # Warp's choice of a device holds for all threads
 
 
 class _Flat(NamedTuple):
@@ -53,7 +53,7 @@ class _Place(NamedTuple):
     data: Any
 
 
-def _keep_streams(warp: Any) -> None:
+def keep_streams(warp: Any) -> None:
     """Keep Warp's references to XLA's CUDA streams for as long as the process lives.
 
     Warp makes a ``Stream`` of the same CUDA stream for each graph that it captures, and forgets the CUDA stream when
@@ -91,7 +91,7 @@ class Warp:
     def __post_init__(self):
         warp = importlib.import_module("warp")
         warp.config.log_level = warp.LOG_WARNING  # before it first runs, and says so on standard output
-        _keep_streams(warp)
+        keep_streams(warp)
 
     @cached_property
     def mjx(self) -> Mjx:
@@ -176,8 +176,8 @@ class Warp:
 
         A program that was traced in another process can then run in this one.
         """
-        key, devices = (count, tuple(names)), _own_devices()
-        with _ALONE:
+        key, devices = (count, tuple(names)), own_devices()
+        with ALONE:
             for device in devices:  # not while it runs, when Warp records and cannot make room
                 if (device.alias, count) not in self._places:
                     self._places[device.alias, count] = self._make_place(device, count)
@@ -196,8 +196,8 @@ class Warp:
         from mujoco.mjx.third_party import mujoco_warp
 
         counts = sorted(count for _, count in list(self._places))[:1]
-        for count, device in itertools.product(counts, _own_devices()):
-            with _ALONE, warp.ScopedDevice(device):
+        for count, device in itertools.product(counts, own_devices()):
+            with ALONE, warp.ScopedDevice(device):
                 mujoco_warp.step(*self._places[device.alias, count])
                 warp.synchronize_device(device)
         return jax.default_backend() != "cpu"
@@ -251,7 +251,7 @@ class Warp:
         step = _stepper(weakref.ref(self), count, names, tuple(outputs))
         step.__qualname__ = f"step_{self._digest(count, names)}"  # the call's name is made of it
         target = warp.jax_callable(
-            _annotated(step, kinds),
+            annotated(step, kinds),
             num_outputs=len(outputs),
             graph_mode=mode,
             output_dims={f"new_{name}": (count, size) for name, size in outputs.items()},
@@ -274,7 +274,7 @@ class Warp:
         return hashlib.sha256(model.tobytes() + repr((self.num_substeps, count, names)).encode()).hexdigest()[:16]
 
 
-def _own_devices() -> list[Any]:
+def own_devices() -> list[Any]:
     """Return Warp's names of this process's devices."""
     import warp
 
@@ -307,7 +307,7 @@ def _stepper(engine: Any, count: int, names: tuple[str, ...], outputs: tuple[str
     return step
 
 
-def _annotated(function: Callable, kinds: dict[str, Any]) -> Callable:
+def annotated(function: Callable, kinds: dict[str, Any]) -> Callable:
     """Set the signature of a function of many arrays, from which Warp derives their types for JAX."""
     kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
     parameters = [inspect.Parameter(name, kind, annotation=annotation) for name, annotation in kinds.items()]

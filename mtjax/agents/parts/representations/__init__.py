@@ -1,11 +1,19 @@
 """Representations, by name, encode the inputs of an agent's networks. To add one, add a file, and a line here."""
 
+from mtjax.agents.parts.representations.autoencoder import Autoencoder
 from mtjax.agents.parts.representations.base import Place, Plain
 from mtjax.agents.parts.representations.deepmdp import DeepMDP
+from mtjax.agents.parts.representations.encoded import Encoded
 from mtjax.agents.parts.representations.hip_bmdp import HiPBMDP
 
 Representation = Plain
 
-REPRESENTATIONS: dict[str, type[Representation]] = {"plain": Plain, "deepmdp": DeepMDP, "hip-bmdp": HiPBMDP}
+REPRESENTATIONS: dict[str, type[Representation]] = {
+    "plain": Plain,
+    "encoded": Encoded,
+    "autoencoder": Autoencoder,
+    "deepmdp": DeepMDP,
+    "hip-bmdp": HiPBMDP,
+}
 
-__all__ = ["REPRESENTATIONS", "DeepMDP", "HiPBMDP", "Place", "Plain", "Representation"]
+__all__ = ["REPRESENTATIONS", "Autoencoder", "DeepMDP", "Encoded", "HiPBMDP", "Place", "Plain", "Representation"]

@@ -9,7 +9,7 @@ import jax
 from mtjax.agents import parts
 from mtjax.agents.parts.trajectory import Seen
 from mtjax.networks import Params
-from mtjax.types import Array, Key, Metrics
+from mtjax.types import Array, Key, Metrics, Transition
 
 
 class Place(NamedTuple):
@@ -42,6 +42,8 @@ class Plain:
 
     names: ClassVar[tuple[str, ...]] = ()  # of its parameters
     models: ClassVar[tuple[str, ...]] = ()  # names of parameters that need no target copy
+    sees_pictures: ClassVar[bool] = False  # whether it encodes pictures
+    predicts: ClassVar[bool] = False  # whether its models predict what a single step leads to
     place: ClassVar[Place]
 
     def __post_init__(self):
@@ -74,6 +76,10 @@ class Plain:
         """Return the networks' inputs: task features (Z,) or (B, Z), and what replaces observations (B, O)."""
         return features, obs
 
+    def augment(self, batch: Transition, key: Key) -> Transition:
+        """Return a batch of transitions (T, B, ...) with observations changed at random, as losses should see them."""
+        return batch
+
     def targets(self, params: Params, target_params: Params, next_obs: Any, key: Key) -> tuple[Any, Key]:
         """Return the targets of all tasks' models, leaves (T, ...), and a key (T,) for each task's critics.
 
@@ -82,7 +88,7 @@ class Plain:
             target_params: their target copy.
             next_obs: (T, B, O).
         """
-        return None, jax.random.split(key, len(without_past(next_obs)))
+        return None, jax.random.split(key, len(jax.tree.leaves(without_past(next_obs))[0]))
 
     def join(self, loss: Array, metrics: Metrics, params: Params, batch: Any) -> tuple[Array, Metrics]:
         """Add the representation's losses to the critics' loss, and its metrics to theirs.

@@ -8,26 +8,15 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from mtjax import frames
 from mtjax.agents import parts
-from mtjax.agents.parts.representations.base import Basis, Plain, without_past
-from mtjax.agents.parts.trajectory import TrajectoryEncoder
-from mtjax.networks import MLP, OVER_TASKS, Network, Params, Trunk, join
-from mtjax.types import Array, Key, Metrics
+from mtjax.agents.parts.representations.base import Basis, without_past
+from mtjax.agents.parts.representations.encoded import ENCODERS, Encoded
+from mtjax.networks import OVER_TASKS, Params, Trunk
+from mtjax.types import Array, InputError, Key, Metrics
 
 DEVIATIONS = (0.01, 1.0)
 """Smallest and largest standard deviation of a predicted latent state, whose values lie in (-1, 1)."""
-ENCODERS = ("latent", "trajectory", "embedding")
-
-
-class Latent(nn.Module):
-    """Encodes observations (..., O) as latent states (..., D) in (-1, 1)."""
-
-    widths: tuple[int, ...]
-
-    @nn.compact
-    def __call__(self, obs: Array) -> Array:
-        *inner, size = self.widths
-        return jnp.tanh(nn.LayerNorm()(nn.Dense(size)(MLP(tuple(inner))(obs))))
 
 
 class Model(nn.Module):
@@ -50,7 +39,7 @@ class ModelTargets(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class DeepMDP(Plain):
+class DeepMDP(Encoded):
     """DeepMDP gives actor and critics a latent state (Gelada et al. 2019, as in Zhang et al. 2021 and MTRL).
 
     It has an encoder h = phi(s), a transition model T(h, a, z) = (mu, sigma) and a reward model R(h', z), where z are
@@ -69,97 +58,40 @@ class DeepMDP(Plain):
     Differs from the papers: targets come from the target encoder, which is more stable than the sg(phi(s')) of Zhang et
     al. and MTRL; R takes the predicted state, as theirs does (Gelada et al.: R(h, a)), and also z; L_T is their
     likelihood and not a Wasserstein distance; sigma is in [0.01, 1] where MTRL's is in [1e-4, 10], as the gradient of
-    L_T grows with 1 / sigma^2. Observations are vectors, so there is no decoder.
+    L_T grows with 1 / sigma^2. From pictures there is no decoder.
     """
 
-    latent_widths: tuple[int, ...] = (256, 50)
-    """Widths of the encoder's layers; the last is the size of the latent state."""
     model_widths: tuple[int, ...] = (512,)
     """Widths of the hidden layers in transition and reward model."""
     transition: Literal["deterministic", "probabilistic"] = "deterministic"
     """Predict the next latent state as a point or as a Gaussian."""
     model_coefficient: float = 1.0
     """Weight of transition and reward loss relative to the critics' loss."""
-    encoder_tau: float = 0.05
-    """Step of the target encoder towards the new encoder at each update, as a share of the distance."""
 
     names: ClassVar[tuple[str, ...]] = (*ENCODERS, "transition", "reward")
     models: ClassVar[tuple[str, ...]] = ("transition", "reward")
+    predicts: ClassVar[bool] = True
 
     def __post_init__(self):
         super().__post_init__()
-        parts.require_layers(self, "latent_widths", "model_widths")
-        parts.require_rates(self, "encoder_tau")
+        parts.require_layers(self, "model_widths")
         parts.require_positive(self, "model_coefficient")
 
     @property
-    def rates(self) -> dict[str, float]:
-        return dict.fromkeys(ENCODERS, self.encoder_tau)
-
-    # Networks: each is used by all N critics and by the actor.
-
-    @property
-    def has_theta(self) -> bool:
-        """Whether every task has a learned vector."""
-        return self.place.conditioning == "embedding"
-
-    @property
-    def infers(self) -> bool:
-        """Whether task features are inferred from the last steps."""
-        return self.place.conditioning == "inferred"
-
-    @property
-    def modules(self) -> dict[str, nn.Module]:
-        """The encoders and models, by name."""
+    def model_modules(self) -> dict[str, nn.Module]:
         size = self.latent_widths[-1]
-        found: dict[str, nn.Module] = {
-            "latent": Latent(self.latent_widths),
+        return {
             "transition": Model(self.model_widths, 2 * size if self.transition == "probabilistic" else size),
             "reward": Model(self.model_widths, 1),
         }
-        return found | ({"trajectory": self.trajectory} if self.infers else {})
 
-    @property
-    def trajectory(self) -> TrajectoryEncoder:
-        return TrajectoryEncoder(self.place.embedding_size, layer_norm=self.place.layer_norm)
-
-    def apply(self, params: Params, name: str, *inputs: Any) -> Array:
-        """Map one task's inputs by an encoder or a model."""
-        return self.modules[name].apply({**params.shared, **params.own}[name], *inputs)  # type: ignore
+    def model_inputs(self, latent: Array, features: Array, action: Array) -> dict[str, tuple]:
+        return {"transition": (latent, features, action), "reward": (latent, features)}
 
     def init(self, num_tasks: int, features: Array, obs: Any, action: Array, key: Key) -> Basis:
-        key, theta_key, *keys = jax.random.split(key, 2 + len(self.modules))
-        size, params = self.place.embedding_size, Params({}, {})
-        latent = jnp.zeros(self.latent_widths[-1])
-        features = jnp.zeros(len(features) + size * (self.has_theta + self.infers))
-        inputs = {
-            "latent": (without_past(obs),),
-            "transition": (latent, features, action),
-            "reward": (latent, features),
-        }
-        for (name, module), part_key in zip(self.modules.items(), keys, strict=True):
-            data = inputs.get(name, (obs,))
-            if self.place.own:
-                params.own[name] = Network.for_each_task(module.init, part_key, num_tasks, *data)
-            else:
-                params.shared[name] = module.init(part_key, *data)
-        if self.has_theta:
-            params.own["embedding"] = jax.random.normal(theta_key, (num_tasks, size))
-        return Basis(params, features, latent, key)
-
-    # Inputs of networks, for one task: features (Z,) or (B, Z), observations (..., O).
-
-    def perceive(self, params: Params, features: Array, obs: Any) -> tuple[Array, Array]:
-        """Return features of the task (Z,) or (..., Z), and latent states (..., D)."""
-        if self.infers:
-            features = self.apply(params, "trajectory", obs)
-        features = join(features, task=self.theta(params)) if self.has_theta else features
-        return features, self.apply(params, "latent", without_past(obs))
-
-    def theta(self, params: Params) -> Array:
-        """Return a task's learned vector (Z,)."""
-        theta = params.own["embedding"]
-        return theta / jnp.maximum(jnp.linalg.norm(theta), 1e-6) if self.place.unit_embedding else theta
+        if frames.shown(obs) and frames.state(obs) is not None:
+            raise InputError("this representation predicts latent states of pictures alone; leave out --env.state=also")
+        return super().init(num_tasks, features, obs, action, key)
 
     def predict(self, params: Params, features: Array, latent: Array, action: Array) -> tuple[Array, Array]:
         """Predict the mean and standard deviation (..., D) of the next latent state."""

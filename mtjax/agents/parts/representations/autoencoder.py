@@ -1,0 +1,80 @@
+"""The autoencoder rebuilds what it observes from its latent states."""
+
+import dataclasses
+from typing import Any, ClassVar
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from mtjax import frames
+from mtjax.agents import parts
+from mtjax.agents.parts import vision
+from mtjax.agents.parts.representations.base import Basis, without_past
+from mtjax.agents.parts.representations.encoded import Encoded
+from mtjax.networks import MLP, Network, Params
+from mtjax.types import Array, Key, Metrics
+
+
+@dataclasses.dataclass(frozen=True)
+class Autoencoder(Encoded):
+    """Autoencoder is an encoder phi with a decoder g (Yarats et al. 2021, "SAC-AE").
+
+    Beside the critics' loss, this one trains phi and g; s are stacked pictures of 32 brightnesses with noise:
+        L_AE = mean (g(h) - s)^2 + lambda |h|^2 / 2 + decay |theta_g|^2 / 2,  h = phi(s)       (reconstruction loss)
+    where the mean is over pixels, lambda is ``latent_decay`` and theta_g are the decoder's parameters. Of vectors, s is
+    the observation, and g has the encoder's widths the other way round.
+
+    Differs from the paper: the linear layer after the convolutions is shared by actor and critics; one optimiser steps
+    encoder, decoder and critics together, at every update; the decay of the decoder is a part of the loss.
+    """
+
+    shift: int = 0
+    """Shift pictures of a batch by up to so many pixels at random; 0 for none."""
+    reconstruction: float = 1.0
+    """Weight of the reconstruction loss relative to the critics' loss."""
+    latent_decay: float = 1e-6
+    """Weight of the latent state's squared length."""
+    decoder_decay: float = 1e-7
+    """Weight of the squared length of the decoder's parameters."""
+
+    names: ClassVar[tuple[str, ...]] = (*Encoded.names, "decoder")
+    models: ClassVar[tuple[str, ...]] = ("decoder",)
+
+    def __post_init__(self):
+        super().__post_init__()
+        parts.require_positive(self, "reconstruction")
+        parts.require_not_negative(self, "latent_decay", "decoder_decay")
+
+    def init(self, num_tasks: int, features: Array, obs: Any, action: Array, key: Key) -> Basis:
+        basis = super().init(num_tasks, features, obs, action, key)
+        key, decoder_key = jax.random.split(basis.key)
+        init, latent = self.decoder(without_past(obs)).init, jnp.zeros(self.latent_widths[-1])
+        if self.place.own:
+            basis.params.own["decoder"] = Network.for_each_task(init, decoder_key, num_tasks, latent)
+        else:
+            basis.params.shared["decoder"] = init(decoder_key, latent)
+        return basis._replace(key=key)
+
+    def decoder(self, obs: Any) -> nn.Module:
+        """Return the decoder for observations like ``obs``."""
+        if frames.shown(obs):
+            return vision.Decoder(*obs[frames.PICTURES].shape[-2:])
+        return nn.Sequential([MLP(self.latent_widths[-2::-1]), nn.Dense(obs.shape[-1])])
+
+    def targets(self, params: Params, target_params: Params, next_obs: Any, key: Key) -> tuple[Key, Key]:
+        """Return keys (T,) for noise in pictures, and others for each task's critics."""
+        keys = jax.vmap(jax.random.split)(super().targets(params, target_params, next_obs, key)[1])
+        return keys[:, 1], keys[:, 0]
+
+    def join(self, loss: Array, metrics: Metrics, params: Params, batch: Any) -> tuple[Array, Metrics]:
+        obs = without_past(batch.obs)
+        latent = self.apply(params, "latent", obs)[..., : self.latent_widths[-1]]
+        weights = {**params.shared, **params.own}["decoder"]
+        rebuilt: Any = self.decoder(obs).apply(weights, latent)
+        wanted = vision.coarse(obs[frames.PICTURES], batch.model_targets) if frames.shown(obs) else obs
+        error = jnp.mean(jnp.square(rebuilt - wanted))
+        length = jnp.mean(jnp.sum(jnp.square(latent), axis=-1))
+        size = sum(jnp.sum(jnp.square(x)) for x in jax.tree.leaves(weights))
+        total = error + self.latent_decay * length / 2 + self.decoder_decay * size / 2
+        return loss + self.reconstruction * total, {**metrics, "reconstruction_loss": error}

@@ -1,0 +1,87 @@
+"""Vision: networks that encode stacks of pictures, networks that draw them, and random shifts.
+
+Pictures are uint8, (..., H, W, K) for K channels of all stacked pictures. Networks see values in [-0.5, 0.5].
+"""
+
+from typing import Literal
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from mtjax.types import Array, Key
+
+Vision = Literal["drq", "impala"]
+_FILTERS = 32
+_SECTIONS = (16, 32, 32)  # IMPALA's channels
+_ORTHOGONAL = nn.initializers.orthogonal(2**0.5)
+
+
+def as_numbers(pictures: Array) -> Array:
+    """Return uint8 pictures as numbers in [-0.5, 0.5]."""
+    return pictures.astype(jnp.float32) / 255.0 - 0.5
+
+
+class Convolutions(nn.Module):
+    """Four convolutions of 3 x 3 with 32 filters, the first with stride 2 (Yarats et al. 2021, SAC-AE, DrQ, DrQ-v2)."""
+
+    @nn.compact
+    def __call__(self, pictures: Array) -> Array:
+        """Map pictures (..., H, W, K) to features (..., F)."""
+        x = as_numbers(pictures)
+        for stride in (2, 1, 1, 1):
+            conv = nn.Conv(_FILTERS, (3, 3), (stride, stride), "VALID", kernel_init=_ORTHOGONAL)
+            x = nn.relu(conv(x))
+        return x.reshape(*x.shape[:-3], -1)
+
+
+class Residual(nn.Module):
+    """Three sections of a convolution, pooling and two residual blocks (Espeholt et al. 2018, "IMPALA", figure 3)."""
+
+    @nn.compact
+    def __call__(self, pictures: Array) -> Array:
+        """Map pictures (..., H, W, K) to features (..., F)."""
+        x = as_numbers(pictures)
+        lead = x.shape[:-3]
+        x = x.reshape(-1, *x.shape[-3:])  # pooling takes one leading axis
+        for filters in _SECTIONS:
+            x = nn.max_pool(nn.Conv(filters, (3, 3))(x), (3, 3), (2, 2), "SAME")
+            for _ in range(2):
+                inner = nn.Conv(filters, (3, 3))(nn.relu(x))
+                x = x + nn.Conv(filters, (3, 3))(nn.relu(inner))
+        return nn.relu(x).reshape(*lead, -1)
+
+
+NETWORKS: dict[str, type[nn.Module]] = {"drq": Convolutions, "impala": Residual}
+
+
+class Decoder(nn.Module):
+    """Draws pictures from latent states, by the convolutions of ``Convolutions`` the other way round (SAC-AE)."""
+
+    side: int  # of the square pictures, even
+    channels: int
+
+    @nn.compact
+    def __call__(self, latent: Array) -> Array:
+        """Map latent states (..., D) to pictures (..., H, W, K) of numbers in about [-0.5, 0.5]."""
+        side = self.side // 2 - 1 - 6
+        x = nn.relu(nn.Dense(side * side * _FILTERS)(latent)).reshape(*latent.shape[:-1], side, side, _FILTERS)
+        for _ in range(3):
+            x = nn.relu(nn.ConvTranspose(_FILTERS, (3, 3), padding="VALID")(x))
+        return nn.ConvTranspose(self.channels, (3, 3), (2, 2), padding=((2, 3), (2, 3)))(x)
+
+
+def coarse(pictures: Array, key: Key) -> Array:
+    """Return what a decoder is fitted to: pictures of 32 brightnesses with uniform noise (SAC-AE, after Glow)."""
+    steps = jnp.floor(pictures.astype(jnp.float32) / 8.0)
+    return (steps + jax.random.uniform(key, pictures.shape)) / 32.0 - 0.5
+
+
+def shifted(pictures: Array, key: Key, most: int) -> Array:
+    """Return pictures (..., H, W, K), each shifted by up to ``most`` pixels along both axes, with repeated edges."""
+    height, width, channels = pictures.shape[-3:]
+    flat = pictures.reshape(-1, height, width, channels)
+    padded = jnp.pad(flat, ((0, 0), (most, most), (most, most), (0, 0)), mode="edge")
+    offsets = jax.random.randint(key, (len(flat), 2), 0, 2 * most + 1)
+    crop = lambda picture, offset: jax.lax.dynamic_slice(picture, (*offset, 0), (height, width, channels))
+    return jax.vmap(crop)(padded, offsets).reshape(pictures.shape)

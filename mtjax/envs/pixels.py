@@ -1,0 +1,214 @@
+"""Pictures as observations, for every family with a MuJoCo model.
+
+An observation holds the newest picture alone, so that a replay keeps each picture once. Whoever needs the last few
+stacks them: rollouts for agents, a replay when it draws a batch, and ``mtjax.stacked`` for everyone else. All repeat
+the first picture where an episode is younger than the stack (``mtjax.frames``).
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterable, Mapping
+from functools import cached_property, partial
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from mtjax.envs import looks
+from mtjax.envs.engines.base import World
+from mtjax.envs.family import Family
+from mtjax.envs.painters.base import PAINTERS, Painter, choose_painter
+from mtjax.envs.painters.poses import Pose, Poses, locate
+from mtjax.envs.painters.scene import LEAVES, Scene, observed
+from mtjax.envs.painters.warp import WarpPainter
+from mtjax.envs.parameters import Parameter
+from mtjax.names import nearest_error
+from mtjax.types import Array, InputError, Spec, Task
+
+STATES = ("hidden", "also")
+_LEAST, _MOST = 16, 512
+_MOST_FRAMES = 16
+_GREY = (0.299, 0.587, 0.114)
+
+
+class Mark(NamedTuple):
+    """A geom of the scene whose place an episode decides, such as a target."""
+
+    position: Array  # (3,) [m]
+    size: Array | None = None  # (3,) None: the model's
+    along: Array | None = None  # (3,) direction of its z axis, of unit length; None: as the model has it
+
+
+@dataclasses.dataclass(frozen=True)
+class Pictured(Family):
+    """A family that can be seen: its observations are pictures if ``pixels`` is set."""
+
+    pixels: int = 0
+    """Observe pictures of so many pixels a side, such as 64 or 84, in place of the state. 0 observes the state. Then
+    camera-angle [deg], hue, floor-hue [deg] and light (a scale) can vary: --env.vary.hue=0:300:10."""
+    frames: int = 3
+    """How many of the last pictures an agent sees at once."""
+    repeat: int = 1
+    """Take every action for so many control steps and sum their rewards. Episodes last as long as before."""
+    grey: bool = False
+    """Observe brightness alone."""
+    state: str = "hidden"
+    """Whether the state is observed beside the pictures: hidden or also."""
+    plain: bool = False
+    """Draw floor and sky in one colour each."""
+    painter: str = "auto"
+    """What draws: auto, caster (plain JAX, any device) or warp (MuJoCo Warp, NVIDIA GPUs). auto is warp on an NVIDIA
+    GPU if it is installed, and caster elsewhere."""
+
+    look: ClassVar[looks.Look | None] = None  # camera and light; None: the model's own, or a view of all of it
+    hides: ClassVar[tuple[str, ...]] = ()  # geoms that films show and observations do not, such as a hidden goal
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.state not in STATES:
+            raise nearest_error("state", self.state, STATES)
+        if self.painter not in PAINTERS:
+            raise nearest_error("painter", self.painter, PAINTERS)
+        if self.pixels and (self.pixels % 2 or not _LEAST <= self.pixels <= _MOST):
+            raise InputError(f"pixels must be 0 or an even number from {_LEAST} to {_MOST}, not {self.pixels}")
+        if not 1 <= self.frames <= _MOST_FRAMES:
+            raise InputError(f"frames must be from 1 to {_MOST_FRAMES}, not {self.frames}")
+        if self.repeat < 1 or self.episode_steps % self.repeat:
+            near = [n for n in range(1, self.episode_steps + 1) if self.episode_steps % n == 0]
+            few = sorted(sorted(near, key=lambda n: abs(n - self.repeat))[:4])
+            raise InputError(
+                f"repeat must divide the {self.episode_steps} steps of an episode, such as "
+                f"{', '.join(map(str, few))}; not {self.repeat}"
+            )
+        self._require_pictures()
+
+    def _require_pictures(self) -> None:
+        """Refuse what only pictures show, where there are none, and a painter that cannot run here."""
+        if self.pixels:
+            choose_painter(self.painter)
+            return
+        shown = [name for name, _ in self.vary if self.every_parameter[name].looks]
+        shown += [
+            f for f, plain in (("grey", False), ("plain", False), ("state", "hidden")) if getattr(self, f) != plain
+        ]
+        if shown:
+            raise InputError(f"{shown[0]} changes only what is seen; add --env.pixels=64")
+
+    # What a domain may give.
+
+    def add_marks(self, spec: mujoco.MjSpec) -> None:
+        """Add geoms to the scene that the physics does not have."""
+
+    def marks(self, task: Task, world: World) -> Mapping[str, Mark]:
+        """Return the geoms of the scene whose places this episode has decided."""
+        return {}
+
+    # What every domain gives.
+
+    def compile_spec(self, values: Mapping[str, float] | None = None) -> mujoco.MjSpec:
+        """Return the editable model of the physics with these parameter values."""
+        raise NotImplementedError
+
+    # Scenes.
+
+    @property
+    def every_parameter(self) -> Mapping[str, Parameter]:
+        """Return the parameters of the family and those of looks."""
+        return {**self.parameters, **looks.LOOKS, **self.parameters}
+
+    def compile_scene(self, values: Mapping[str, float] | None = None) -> mujoco.MjSpec:
+        """Return the editable model of what is seen with these parameter values."""
+        given = dict(values or {})
+        spec = self.compile_spec(given)
+        self.add_marks(spec)
+        looks.dress(spec, self.look, self.plain)
+        for name, value in given.items():
+            parameter = self.every_parameter[name]
+            if parameter.looks and parameter.edit is not None:
+                parameter.edit(spec, float(value))
+        return spec
+
+    def for_rows(self, make: Callable[[dict[str, float]], Any], names: Iterable[str]) -> tuple[Any, ...]:
+        """Return what ``make`` returns for every row of the table. Rows with equal values of ``names`` share it."""
+        used = [name for name in self.values if name in names]
+        rows = list(zip(*(self.values[name].tolist() for name in used), strict=True)) or [()] * self.count
+        made = {row: make(dict(zip(used, row, strict=True))) for row in dict.fromkeys(rows)}
+        return tuple(made[row] for row in rows)
+
+    def _observed(self, values: Mapping[str, float]) -> mujoco.MjModel:
+        return observed(self.compile_scene(values).compile(), self.hides)
+
+    @cached_property
+    def scene(self) -> Scene:
+        """Return what no task changes of the scene."""
+        return Scene(self._observed({name: values[0] for name, values in self.values.items()}))
+
+    @cached_property
+    def artist(self) -> Painter:
+        """Return the painter of this family on this device."""
+        return choose_painter(self.painter)(self.scene, self.pixels)
+
+    @property
+    def outside_painter(self) -> WarpPainter | None:
+        """Return the painter if it runs outside XLA."""
+        return self.artist if self.pixels and isinstance(self.artist, WarpPainter) else None
+
+    def scene_leaves(self) -> dict[str, np.ndarray]:
+        """Return the fields (R, ...) of scenes that differ between rows."""
+
+        def fields(values: dict[str, float]) -> dict[str, np.ndarray]:  # alone, as models hold textures
+            model = self._observed(values)
+            return {name: np.asarray(getattr(model, name), np.float32) for name in LEAVES}
+
+        rows = self.for_rows(fields, [name for name, p in self.every_parameter.items() if p.edit is not None])
+        columns = {name: np.stack([row[name] for row in rows]) for name in LEAVES}
+        return {name: column for name, column in columns.items() if np.any(column != column[0])}
+
+    # Observations.
+
+    def scene_leaf(self, task: Task, name: str) -> Array:
+        """Return a field of the task's scene by its name in MuJoCo."""
+        if task.scene is not None and name in task.scene:
+            return task.scene[name]
+        return jnp.asarray(getattr(self.scene.model, name), jnp.float32)
+
+    def see(self, task: Task, world: World) -> Poses:
+        """Return the poses of all that a picture of the world shows."""
+        poses = locate(self.scene.model, partial(self.scene_leaf, task), world.qpos)
+        geoms = poses.geoms
+        for name, mark in self.marks(task, world).items():
+            i = self.scene.model.geom(name).id
+            put = lambda numbers, number, i=i: numbers.at[i].set(number)
+            axes = geoms.axes if mark.along is None else jax.tree.map(put, geoms.axes, _frame(mark.along))
+            geoms = Pose(jax.tree.map(put, geoms.position, tuple(mark.position)), axes)
+        return poses._replace(geoms=geoms)
+
+    def draw(self, task: Task, world: World) -> Array:
+        """Return a picture (H, W, 3), or grey (H, W, 1), uint8 of a world."""
+        sized = {name: mark.size for name, mark in self.marks(task, world).items() if mark.size is not None}
+        leaves = {name: self.scene_leaf(task, name) for name in LEAVES}
+        for name, size in sized.items():
+            leaves["geom_size"] = leaves["geom_size"].at[self.scene.model.geom(name).id].set(size)
+        picture = self.artist.paint(leaves.__getitem__, self.see(task, world))
+        if not self.grey:
+            return picture
+        return jnp.round(picture @ jnp.float32(_GREY))[..., None].astype(jnp.uint8)
+
+    @property
+    def spec(self) -> Spec:
+        """Return the sizes of observation, action and context, and how many pictures agents should see at once."""
+        return self._spec._replace(frames=self.frames) if self.pixels else self._spec
+
+    @property
+    def episode_length(self) -> int:
+        """Return the steps after which an episode is cut off."""
+        return self.episode_steps // self.repeat
+
+
+def _frame(z: Array) -> Any:
+    """Return axes with a given z axis, for shapes that are round about it."""
+    aside = jnp.where(jnp.abs(z[0]) < 0.9, jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 1.0, 0.0]))
+    x = jnp.cross(aside, z)
+    x = x / jnp.linalg.norm(x)
+    return tuple(x), tuple(jnp.cross(z, x)), tuple(z)

@@ -1,0 +1,66 @@
+"""A replay keeps one picture a step, and rebuilds the stacks that agents see from neighbouring steps.
+
+The ring of a task holds the newest picture of every step's observation, and none of what follows: the picture after a
+step is that of the next slot. After a time limit the next slot holds a new episode, and the true last picture is lost.
+So a transition that a time limit cut off is not drawn, and a multi-step return stops before it; where an episode
+terminated, the picture after it does not matter. Both cost one step of an episode.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from mtjax.experience import multistep
+from mtjax.frames import PICTURES
+from mtjax.types import Array, Transition
+
+
+def compress(steps: Transition, channels: int) -> Transition:
+    """Keep the newest picture (..., H, W, C) of stacks (..., H, W, N C), and no picture of what follows."""
+    newest = steps.obs[PICTURES][..., -channels:]
+    after = {name: x for name, x in steps.next_obs.items() if name != PICTURES}
+    return steps._replace(obs=steps.obs | {PICTURES: newest}, next_obs=after)
+
+
+def window(frames: int, n_step: int) -> int:
+    """Return how many consecutive steps tell a transition of ``n_step`` steps: those before it, and one after it."""
+    return frames + n_step + 1
+
+
+def join(rows: Transition, gamma: float | Array, *, frames: int, n_step: int) -> Transition:
+    """Join windows of consecutive steps (..., W) to a transition (...) each, with stacks (..., H, W, N C) of pictures.
+
+    A window's transition begins at step N, or one step earlier if a time limit cut that step off.
+    """
+    cut = rows.ended & (rows.discount > 0)
+    now = frames - cut[..., frames].astype(jnp.int32)
+    bare = rows._replace(obs={name: x for name, x in rows.obs.items() if name != PICTURES})
+    body = at(bare, now[..., None] + jnp.arange(n_step))
+    stops = jnp.concatenate([at(cut, now[..., None] + jnp.arange(1, n_step)), cut[..., :1] & False], axis=-1)
+    body = body._replace(ended=body.ended | stops)
+    after = now + multistep.length(body.ended)
+    joined = multistep.join(body, gamma) if n_step > 1 else jax.tree.map(lambda x: jnp.take(x, 0, now.ndim), body)
+    see = lambda place: {PICTURES: stack(rows.obs[PICTURES], rows.ended, place, frames)}
+    return joined._replace(obs=joined.obs | see(now), next_obs=joined.next_obs | see(after))
+
+
+def stack(pictures: Array, ended: Array, place: Array, frames: int) -> Array:
+    """Return the stack (..., H, W, N C) whose newest picture is at ``place`` (...) of pictures (..., W, H, W, C)."""
+    back = jnp.arange(1, frames)
+    same = jnp.cumprod(~at(ended, place[..., None] - back), axis=-1)  # whether the step so far back is of this episode
+    age = jnp.sum(same, axis=-1, keepdims=True)
+    steps = place[..., None] - jnp.minimum(jnp.arange(frames - 1, -1, -1), age)
+    found = at(pictures, steps)  # (..., N, H, W, C)
+    return jnp.concatenate([found[..., i, :, :, :] for i in range(frames)], axis=-1)
+
+
+def at(tree: Any, index: Array) -> Any:
+    """Take entries ``index`` (..., n) along the axis of steps of leaves (..., W, ...)."""
+    lead = index.ndim - 1
+
+    def take(x: Array) -> Array:
+        places = index.reshape(index.shape + (1,) * (x.ndim - index.ndim))
+        return jnp.take_along_axis(x, places, axis=lead)
+
+    return jax.tree.map(take, tree)

@@ -1,0 +1,42 @@
+"""Draw every domain by MuJoCo's own renderer, as the reference of ``test_painters.py``: MUJOCO_GL=osmesa or egl.
+
+    python tests/draw_pictures.py [--check]
+
+With --check nothing is written: pictures must equal those that are there.
+"""
+
+import sys
+from functools import partial
+
+import jax
+import numpy as np
+from PIL import Image
+from test_painters import DOMAINS, PICTURES, SIZE, family, similarity, states_of
+
+from mtjax.report import render
+from mtjax.types import InputError
+
+
+def draw(name: str) -> np.ndarray:
+    """The two states of a domain, drawn (2, H, W, 3)."""
+    return render.film(family(name), 0, jax.tree.map(np.asarray, states_of(name)), SIZE, SIZE)
+
+
+def check(name: str, i: int, picture: np.ndarray) -> None:
+    assert similarity(picture, np.asarray(Image.open(PICTURES / f"{name}-{i}.png"))) > 0.98, name
+
+
+def keep(name: str, i: int, picture: np.ndarray) -> None:
+    PICTURES.mkdir(exist_ok=True)
+    Image.fromarray(picture).save(PICTURES / f"{name}-{i}.png", optimize=True)
+
+
+if __name__ == "__main__":
+    act = check if "--check" in sys.argv else keep
+    try:
+        drawn = {name: draw(name) for name in DOMAINS}
+    except InputError as error:
+        sys.exit(str(error))
+    for name, pictures in drawn.items():
+        for i, picture in enumerate(pictures):
+            partial(act, name, i)(picture)

@@ -1,0 +1,134 @@
+"""Stacks of pictures: in rollouts, in the replay and in agents. ``envs/probes.py`` has a probe that is seen."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mtjax
+from mtjax import frames
+from mtjax.agents.parts import vision
+from mtjax.envs.probes import Pictured
+from mtjax.experience import pictures
+from mtjax.types import InputError, Transition
+
+KEY = jax.random.key(0)
+SIDE = 3
+
+
+def picture(number):
+    """A picture whose pixels tell which step of which episode it is."""
+    return np.full((SIDE, SIDE, 2), number, np.uint8)
+
+
+class Episodes:
+    """Steps of one environment as a plain list: pictures seen before and after each, and how episodes ended."""
+
+    def __init__(self, lengths, terminates):
+        self.steps, number = [], 0
+        for length, terminated in zip(lengths, terminates, strict=True):
+            seen = [picture(number := number + 1)]
+            for age in range(length):
+                seen.append(picture(number := number + 1))
+                last = age == length - 1
+                self.steps.append((list(seen[:-1]), seen[-1], last, last and terminated, len(self.steps)))
+
+    def stack(self, seen, count):
+        return np.concatenate(([seen[0]] * count + seen)[-count:], axis=-1)
+
+    def rows(self):
+        """The steps as a replay keeps them, leaves (L, ...)."""
+        obs = np.stack([seen[-1] for seen, *_ in self.steps])
+        ended, terminated = (np.array([step[i] for step in self.steps]) for i in (2, 3))
+        reward = np.arange(1.0, len(self.steps) + 1, dtype=np.float32)
+        return Transition({"pixels": obs}, reward[:, None], reward, 1 - np.float32(terminated), {}, ended=ended)
+
+    def expected(self, place, count, n_step, gamma):
+        """The transition of a window whose ``place`` is in the middle: stack, reward, discount, stack after it."""
+        cut = lambda step: step[2] and not step[3]
+        place -= cut(self.steps[place])
+        seen, total, factor = self.steps[place][0], 0.0, 1.0
+        for i in range(n_step):
+            step = self.steps[place + i]
+            if i and cut(step):
+                before = self.steps[place + i - 1]
+                return self.stack(seen, count), total, factor / gamma, self.stack([*before[0], before[1]], count)
+            total, factor = total + factor * (place + i + 1), factor * gamma
+            if step[3]:
+                return self.stack(seen, count), total, 0.0, None
+        return self.stack(seen, count), total, factor / gamma, self.stack([*step[0], step[1]], count)
+
+
+@pytest.mark.parametrize("n_step", (1, 3))
+@pytest.mark.parametrize("count", (1, 3))
+def test_windows_become_the_transitions_of_a_plain_list(count, n_step):
+    """Of episodes of every length, which a limit cuts off or which terminate."""
+    episodes = Episodes((5, 3, 4, 2, 6, 7), (False, True, False, True, True, False))
+    rows, width, gamma = episodes.rows(), pictures.window(count, n_step), 0.9
+    starts = np.arange(len(episodes.steps) - width + 1)
+    windows = jax.tree.map(lambda x: np.stack([x[i : i + width] for i in starts]), rows)
+    found = jax.jit(partial(pictures.join, frames=count, n_step=n_step))(windows, gamma)
+    for i in starts:
+        obs, reward, discount, after = episodes.expected(i + count, count, n_step, gamma)
+        np.testing.assert_array_equal(found.obs["pixels"][i], obs)
+        np.testing.assert_allclose([found.reward[i], found.discount[i]], [reward, discount], rtol=1e-6)
+        if after is not None:
+            np.testing.assert_array_equal(found.next_obs["pixels"][i], after)
+
+
+def test_a_rollout_repeats_the_first_picture_and_then_moves_on():
+    first = {"pixels": jnp.ones((2, 2, 1), jnp.uint8), "state": jnp.zeros(3)}
+    then = {"pixels": 2 * jnp.ones((2, 2, 1), jnp.uint8), "state": jnp.ones(3)}
+    seen = frames.begin(first, 3)
+    np.testing.assert_array_equal(seen["pixels"][0, 0], [1, 1, 1])
+    seen = frames.push(seen, then)
+    np.testing.assert_array_equal(seen["pixels"][0, 0], [1, 1, 2])
+    np.testing.assert_array_equal(seen["state"], np.ones(3))
+    assert frames.push(jnp.zeros(2), jnp.ones(2)).tolist() == [1, 1]
+
+
+def test_shifts_move_whole_pictures_by_whole_pixels():
+    """Every shift up to 2 along both axes occurs, and its edge is repeated."""
+    grid = np.arange(36, dtype=np.uint8).reshape(6, 6, 1)
+    padded = np.pad(grid, ((2, 2), (2, 2), (0, 0)), mode="edge")
+    allowed = {padded[y : y + 6, x : x + 6].tobytes() for y in range(5) for x in range(5)}
+    found = np.asarray(vision.shifted(jnp.broadcast_to(grid, (20, 25, 6, 6, 1)), KEY, 2))
+    assert {one.tobytes() for one in found.reshape(-1, 6, 6, 1)} == allowed
+
+
+@pytest.mark.parametrize("name", vision.NETWORKS)
+def test_networks_see_batches_as_single_pictures(name):
+    random = np.random.default_rng(0).integers(256, size=(2, 3, 16, 16, 2), dtype=np.uint8)
+    network = vision.NETWORKS[name]()
+    params = network.init(KEY, random[0, 0])
+    together = network.apply(params, random)
+    assert together.shape[:2] == (2, 3) and np.ptp(together) > 0
+    np.testing.assert_allclose(together[1, 2], network.apply(params, random[1, 2]), atol=1e-5)
+
+
+def test_a_decoder_draws_pictures_of_the_size_that_it_saw():
+    decoder = vision.Decoder(side=64, channels=9)
+    latent = jnp.zeros((2, 50))
+    assert decoder.apply(decoder.init(KEY, latent[0]), latent).shape == (2, 64, 64, 9)
+
+
+SMALL = dict(hidden=(32, 32), latent_widths=(16,), num_envs=2, batch_size=8, warmup_steps=10, replay_size=1000)
+FAST = dict(actor_lr=3e-3, critic_lr=3e-3, initial_temperature=0.01, updates_per_step=1, chunk_steps=100)
+
+
+@pytest.mark.slow  # convolutions are slow under the tests' flags of the compiler
+@pytest.mark.parametrize("name", ["drq", "sac-ae"])
+def test_agents_learn_what_only_pictures_show(name):
+    """The best action is the task's scale times a sign that the picture shows: 0 reward, and about -1 without it."""
+    agent = mtjax.agent(name, shift=1, n_step=1)
+    result = mtjax.train(Pictured("by-both"), agent, steps=1600, eval_every=10**9, eval_episodes=1, **SMALL, **FAST)
+    assert float(result.rows[-1]["return"]) > -0.15
+
+
+def test_pictures_need_an_agent_that_sees():
+    with pytest.raises(InputError, match="use --agent=drq or"):
+        mtjax.train(Pictured(), mtjax.agent("sac"), steps=100)
+    with pytest.raises(InputError, match="warmup-steps of at least 6"):
+        mtjax.train(Pictured(), mtjax.agent("drq"), steps=100, warmup_steps=5)
