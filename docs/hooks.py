@@ -264,7 +264,7 @@ def _block(text: str, below: list[str]) -> str:
     if text.endswith(":") and below:
         if not any(re.match(r"[\w, -]+: ", line) for line in below):
             return f"{text}\n\n```text\n{chr(10).join(below)}\n```"
-        joined = re.sub(r"\n {4,}", " ", "\n".join(below)).splitlines()
+        joined = re.sub(r"\n +", " ", "\n".join(below)).splitlines()
         items = [re.sub(r"^([\w, -]+?):", r"**\1**:", line) for line in joined]
         return f"**{text}**\n\n" + "\n".join(f"- {item}" for item in items)
     whole = " ".join([text, *(line.strip() for line in below)])
