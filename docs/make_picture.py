@@ -66,7 +66,7 @@ def curves(folder: Path, policy: Policy, size: tuple[int, int]) -> Image.Image:
         returns = [float(row[f"return_{task}"] or "nan") for row in rows]
         axes.plot([float(row["steps"]) / 1e6 for row in rows], returns, color=colour, lw=1.4)
     axes.set(xlabel="million environment steps", ylabel="return of training episodes", ylim=(0, 1000))
-    axes.set_title(f"one agent, ten fingers of size {sizes[0]:.2f} to {sizes[-1]:.2f}", fontsize=10)
+    axes.set_title(f"ten fingers, size {sizes[0]:.2f} to {sizes[-1]:.2f}", fontsize=10)
     axes.grid(color="0.9")
     axes.spines[["top", "right"]].set_visible(False)
     file = io.BytesIO()
