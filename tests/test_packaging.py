@@ -49,7 +49,7 @@ def test_source_archive_holds_what_a_contributor_needs(built):
     source, _, _ = built
     tests = {f"tests/{path.name}" for path in (ROOT / "tests").glob("*.py")}
     assert package_files() | tests | {"pyproject.toml", "README.md", "LICENSE", "constraints.txt"} <= source
-    tops = {"mtjax", "tests", "benchmarks", "examples", "notebooks"}
+    tops = {"mtjax", "tests", "benchmarks", "docs", "examples", "notebooks"}
     assert {name.split("/")[0] for name in source if "/" in name} <= tops
     assert not [name for name in source if "__pycache__" in name]
 

@@ -1,0 +1,271 @@
+"""Pages of the documentation that are made from the package: one for every family and every agent.
+
+MkDocs calls ``on_config`` and ``on_files``. Texts are the docstrings, numbers are those in ``benchmarks/results``.
+"""
+
+import ast
+import csv
+import dataclasses
+import inspect
+import json
+import re
+import textwrap
+from collections.abc import Iterable, Iterator
+from functools import lru_cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from mkdocs.structure.files import File, Files
+
+from mtjax import agents, envs
+from mtjax.agents.choices import PARTS, flag_names, kinds_of, settings
+from mtjax.agents.parts import name_of
+from mtjax.names import first_sentence
+
+ROOT = Path(__file__).parent.parent
+RESULTS = ROOT / "benchmarks" / "results"
+PICTURE = "../../benchmarks/results/"  # as pages name it, so that it is found on the site and in the repository
+GROUPS = {  # title -> whether a family belongs there; the first that fits
+    "Brax": lambda name, module: module.endswith("envs.brax"),
+    "MTEnv's own": lambda name, module: ".mtenv." in module,
+    "One physics, several goals": lambda name, module: name in envs._GOALS,
+    "HiP-BMDP's families": lambda name, module: name in envs._HIP_BMDP,
+    "dm_control's tasks": lambda name, module: True,
+}
+
+
+def on_config(config: Any) -> Any:
+    """Put the made pages into the navigation."""
+    for entry in config.nav:
+        (title,) = entry
+        if title == "Families":
+            pages = [{group: [{n: f"families/{n}.md"} for n in names]} for group, names in _grouped().items()]
+            entry[title] = ["families/index.md", *pages]
+        if title == "Agents":
+            entry[title] = ["agents/index.md", *({name: f"agents/{name}.md"} for name in agents.AGENTS)]
+    return config
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Add the made pages, and the plots that pages on results show."""
+    pages = {f"families/{name}.md": family_page(name) for name in envs.ENVS}
+    pages |= {f"agents/{name}.md": agent_page(name) for name in agents.AGENTS}
+    pages |= {"families/index.md": families_page(), "agents/index.md": agents_page()}
+    for place, text in pages.items():
+        files.append(File.generated(config, place, content=text))
+    for plot in RESULTS.glob("*.png"):
+        files.append(File.generated(config, f"results/plots/{plot.name}", abs_src_path=str(plot)))
+    return files
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Turn links to plots in the repository into links to their copies on the site."""
+    return markdown.replace(f"]({PICTURE}", "](plots/")
+
+
+# Families.
+
+
+def _grouped() -> dict[str, list[str]]:
+    found: dict[str, list[str]] = {title: [] for title in reversed(GROUPS)}
+    for name in envs.ENVS:
+        module = envs.ENVS[name][0].__module__
+        found[next(title for title, fits in GROUPS.items() if fits(name, module))].append(name)
+    return found
+
+
+def families_page() -> str:
+    """Return the list of all families."""
+    text = (
+        "# Families\n\nA family is one model and the values in which its tasks differ. `python -m mtjax.train --list`"
+    )
+    text += " prints this list. Every parameter of every family can vary: `--env.vary.NAME=VALUES`.\n"
+    for title, names in _grouped().items():
+        text += f"\n## {title}\n\n| family | training tasks | |\n|---|---|---|\n"
+        for name in names:
+            count, says = envs.outline(name)
+            text += f"| [{name}]({name}.md) | {count} | {says} |\n"
+    return text
+
+
+def family_page(name: str) -> str:
+    """Return the page of one family: command, docstring, parameters, tasks and figures."""
+    cls, _ = envs.ENVS[name]
+    family = envs.make(name)
+    text = f"# {name}\n\n```bash\npython -m mtjax.train --env={name}\n```\n\n{to_markdown(cls.__doc__)}\n"
+    if family.parameters:
+        text += "\n## Parameters\n\n| parameter | unit | nominal | in this family |\n|---|---|---|---|\n"
+        vary = dict(family.vary)
+        for key, parameter in family.parameters.items():
+            nominal = f"{parameter.nominal:g}" if isinstance(parameter.nominal, int | float) else "its own"
+            given = f"`{vary[key]}`" if key in vary else ""
+            text += f"| `{key}` | {parameter.unit} | {nominal} | {given} |\n"
+    text += _family_figures(name)
+    return text + _family_settings(family)
+
+
+def _family_settings(family: Any) -> str:
+    documented = _fields(type(family))
+    text = f"\n## Settings\n\nFields of `{type(family).__module__}.{type(family).__name__}`.\n\n"
+    text += "| flag | default | |\n|---|---|---|\n"
+    for field in dataclasses.fields(family):
+        if field.name not in ("vary", "context_ranges"):
+            flag = field.name.replace("_", "-")
+            flag = flag if flag in ("split", "engine") else f"env.{flag}"
+            text += _row(f"`--{flag}`", getattr(family, field.name), documented.get(field.name, ""))
+    return text
+
+
+def _row(flag: str, default: Any, text: str) -> str:
+    shown = "" if default in ("", ()) else f"`{default}`"
+    return f"| {flag} | {shown} | {text.replace('|', '&#124;')} |\n"
+
+
+def _family_figures(name: str) -> str:
+    text = ""
+    if rows := _rows(RESULTS / "h200-returns" / "table.md", 0, name):
+        text += "\n### One H200, three seeds\n\n" + rows
+        text += "\nThe [command](../results/returns.md#returns-within-minutes-of-training-on-one-h200-three-seeds).\n"
+    if rows := _rows(RESULTS / "h200-hip-bmdp" / "table.md", 0, name):
+        text += "\n### HiP-BMDP's split, one H200, ten seeds\n\n" + rows
+        text += "\nThe [command](../results/methods.md#every-agent-on-hip-bmdps-split-in-the-making).\n"
+    last = [row for row in _cpu_runs() if row["family"] == name][-1:]
+    for row in last:
+        text += f"\n### Two CPU cores, one seed\n\nsac-conditioned had a return of {float(row['return']):.0f} after "
+        text += f"{row['seconds']} seconds ({int(row['steps']):,} steps). The "
+        text += "[command](../results/returns.md#twenty-four-families-on-two-cpu-cores-seven-minutes-one-seed).\n"
+    return f"\n## Figures\n{text}" if text else ""
+
+
+@lru_cache
+def _cpu_runs() -> list[dict[str, str]]:
+    with (RESULTS / "cpu-families.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+# Agents.
+
+
+def agents_page() -> str:
+    """Return the list of all agents."""
+    text = "# Agents\n\nMost agents are a choice of parts, and every agent takes every part that fits it.\n\n"
+    text += "| agent | | parts that its name chooses |\n|---|---|---|\n"
+    for name, preset in agents.AGENTS.items():
+        chosen = ", ".join(f"`{key}={value}`" for key, value in preset.defaults.items())
+        text += f"| [{name}]({name}.md) | {preset.says} | {chosen} |\n"
+    return text + "\n" + "\n".join(_kind_table(kind) for kind in PARTS)
+
+
+def _kind_table(kind: str) -> str:
+    text = f"## `--agent.{kind}`\n\n| name | |\n|---|---|\n"
+    for name, cls in PARTS[kind].items():
+        text += f"| `{name}` | {first_sentence(cls.__doc__ or '')} |\n"
+    return text
+
+
+def agent_page(name: str) -> str:
+    """Return the page of one agent: command, docstrings of agent and parts, settings and figures."""
+    preset, agent = agents.AGENTS[name], agents.agent(name)
+    text = f"# {name}\n\n{preset.says}.\n\n```bash\npython -m mtjax.train --agent={name}\n```\n\n"
+    if preset.defaults:
+        pairs = ", ".join(f"`{key}={value}`" for key, value in preset.defaults.items())
+        text += f"It is `{preset.cls.__name__}` with {pairs}.\n\n"
+    text += f"## {preset.cls.__name__}\n\n{to_markdown(preset.cls.__doc__)}\n"
+    for kind in kinds_of(agent):
+        if kind in preset.defaults:
+            part = getattr(agent, kind)
+            text += f"\n## {kind}: {name_of(PARTS[kind], part)}\n\n{to_markdown(type(part).__doc__)}\n"
+    return text + _agent_figures(name) + _settings(agent)
+
+
+def _settings(agent: Any) -> str:
+    holders = [agent, *(getattr(agent, kind) for kind in kinds_of(agent)), agent.experience]
+    documented = {name: text for holder in reversed(holders) for name, text in _fields(type(holder)).items()}
+    values, text = settings(agent), "\n## Settings\n\n| flag | default | |\n|---|---|---|\n"
+    for name, flag in flag_names(agent).items():
+        text += _row(f"`--{flag}`", values[name], documented.get(name, "a part, chosen by name"))
+    return text
+
+
+def _fields(cls: type) -> dict[str, str]:
+    """Return the documentation of a dataclass's fields, its bases' included."""
+    found: dict[str, str] = {}
+    for base in reversed([each for each in cls.__mro__ if each.__module__.startswith("mtjax")]):
+        (node,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
+        for field, below in pairwise(node.body):  # type: ignore
+            if (
+                isinstance(field, ast.AnnAssign)
+                and isinstance(below, ast.Expr)
+                and isinstance(below.value, ast.Constant)
+            ):
+                found[ast.unparse(field.target)] = " ".join(str(below.value.value).split())
+    return found
+
+
+def _agent_figures(name: str) -> str:
+    text = ""
+    if rows := _rows(RESULTS / "h200-returns" / "table.md", 1, name.upper()):
+        text += "\n### One H200, three seeds\n\n" + rows
+        text += "\nThe [command](../results/returns.md#returns-within-minutes-of-training-on-one-h200-three-seeds).\n"
+    if rows := _rows(RESULTS / "h200-hip-bmdp" / "table.md", 1, name):
+        text += "\n### HiP-BMDP's split, one H200, ten seeds\n\n" + rows
+        text += "\nThe [command](../results/methods.md#every-agent-on-hip-bmdps-split-in-the-making).\n"
+    costs = {machine: _cost(file, name) for machine, file in _COSTS.items()}
+    if any(costs.values()):
+        told = ", ".join(f"{cost:.2f} times sac on {machine}" for machine, cost in costs.items() if cost)
+        text += f"\n### Cost of an update\n\n{told}, ten tasks. "
+        text += "The [command](../results/speed.md#what-an-update-of-every-agent-costs).\n"
+    return f"\n## Figures\n{text}" if text else ""
+
+
+_COSTS = {"one H200": "update-cost-h200-10-tasks.json", "two CPU cores": "update-cost-cpu.json"}
+
+
+@lru_cache
+def _cost(file: str, name: str) -> float | None:
+    rows = json.loads((RESULTS / file).read_text())["rows"]
+    return next((row["over_sac"] for row in rows if row["agent"] == name), None)
+
+
+# Text.
+
+
+def _rows(file: Path, column: int, value: str) -> str:
+    """Return a Markdown table's head and those rows that have a value in a column, or nothing."""
+    lines = file.read_text().splitlines()
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    kept = [line for line, row in zip(lines[2:], cells[2:], strict=True) if row[column : column + 1] == [value]]
+    return "\n".join([*lines[:2], *kept]) + "\n" if kept else ""
+
+
+def to_markdown(docstring: str | None) -> str:
+    """Return a docstring as Markdown: labels in bold, indented lists as lists, equations as code."""
+    return "\n\n".join(_block(*block) for block in _blocks(inspect.cleandoc(docstring or "").splitlines()))
+
+
+def _blocks(lines: Iterable[str]) -> Iterator[tuple[str, list[str]]]:
+    """Yield each paragraph or labelled line, and what is indented below it."""
+    text, below, fresh = "", [], True
+    for line in [*lines, ""]:
+        if line.startswith("    "):
+            below.append(line[4:])
+            continue
+        labelled = re.match(r"(?!Differs)[A-Z][\w ]*(\([^)]*\))?[^:.]*: ", line) and not text.endswith((",", "and"))
+        if (not line or below or fresh or labelled) and text:
+            yield text, below
+            text, below = "", []
+        text, fresh = f"{text} {line}".strip(), not line
+    if text:
+        yield text, below
+
+
+def _block(text: str, below: list[str]) -> str:
+    if text.endswith(":") and below:
+        if not any(re.match(r"[\w, -]+: ", line) for line in below):
+            return f"{text}\n\n```text\n{chr(10).join(below)}\n```"
+        joined = re.sub(r"\n +", " ", "\n".join(below)).splitlines()
+        items = [re.sub(r"^([\w, -]+?):", r"**\1**:", line) for line in joined]
+        return f"**{text}**\n\n" + "\n".join(f"- {item}" for item in items)
+    whole = " ".join([text, *(line.strip() for line in below)])
+    return re.sub(r"^([A-Z][\w ]*?(?: \([^)]*\))?(?:,[^:.]*)?): ", r"**\1**: ", whole)

@@ -1,0 +1,73 @@
+"""The documentation: its links, its names and commands, and the site that is built from it."""
+
+import importlib.util
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from mtjax.agents import AGENTS
+from mtjax.cli import parse
+from mtjax.envs import ENVS
+
+ROOT = Path(__file__).parents[1]
+DOCS = sorted((ROOT / "docs").rglob("*.md"))
+PAGES = [*DOCS, ROOT / "README.md", ROOT / "benchmarks" / "RESULTS.md"]
+MADE = {
+    *(ROOT / "docs" / "families" / f"{name}.md" for name in ["index", *ENVS]),
+    *(ROOT / "docs" / "agents" / f"{name}.md" for name in ["index", *AGENTS]),
+}
+NEEDED = ("mkdocs", "material", "mkdocstrings", "mkdocstrings_handlers")
+
+
+def identify(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+def commands(text: str) -> list[list[str]]:
+    """Return the words behind ``python -m mtjax.train`` in a page's shell blocks, where they are whole commands."""
+    blocks = "\n".join(re.findall(r"```bash\n(.*?)```", text, re.DOTALL)).replace("\\\n", " ")
+    lines = [line.partition("python -m mtjax.train")[2] for line in blocks.splitlines() if "mtjax.train " in line]
+    words = [shlex.split(line, comments=True) for line in lines]
+    not_here = ("--list", "--help", "--distributed", "--sweep")  # they do more than parse
+    return [each for each in words if not any(w in not_here or "..." in w or w.startswith("--import") for w in each)]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=identify)
+def test_links_lead_to_files(page):
+    """Every relative link names a file of the repository, or a page that is made when the site is built."""
+    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+    targets = [target.split("#")[0] for target in re.findall(r"\]\(([^)\s]+)\)", text)]
+    paths = [(page.parent / target).resolve() for target in targets if target and "://" not in target]
+    assert [path for path in paths if not path.exists() and path not in MADE] == []
+
+
+def test_commands_of_the_documentation_parse():
+    """Every whole training command in README and docs names what exists."""
+    found = [each for page in PAGES for each in commands(page.read_text())]
+    assert len(found) >= 5
+    for each in found:
+        parse([word for word in each if word != "&"])
+
+
+def test_examples_in_the_pages_exist():
+    """Files that pages include are files of the repository."""
+    included = [name for page in DOCS for name in re.findall(r'--8<-- "([^"]+)"', page.read_text())]
+    assert included and all((ROOT / name).is_file() for name in included)
+
+
+@pytest.mark.slow
+def test_site_builds_without_a_broken_link(tmp_path):
+    """Strict, so that a link or an anchor that leads nowhere is an error; with a page for every family and agent."""
+    missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
+    if missing:
+        pytest.skip(f"needs the extra docs: {', '.join(missing)} is not installed")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    for folder, names in (("families", ENVS), ("agents", AGENTS)):
+        assert all((tmp_path / folder / name / "index.html").is_file() for name in names)
+    assert "1.65 times sac" in (tmp_path / "agents" / "care" / "index.html").read_text()
