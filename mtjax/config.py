@@ -266,7 +266,7 @@ def _from_record(record: Any) -> RunConfig:
 
 def _imports(record: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the user's own files that a run names. Its command holds them where no list does."""
-    words = [word for word in shlex.split(record.get("command", "")) if word.startswith("--import=")]
+    words = [word for word in shlex.split(str(record.get("command", ""))) if word.startswith("--import=")]
     return tuple(record.get("imports") or (word.removeprefix("--import=") for word in words))
 
 
@@ -279,7 +279,8 @@ def _with_import(error: InputError, run: str, record: Mapping[str, Any]) -> Inpu
     if missing:
         flags = shlex.join(f"--import={file}" for file in missing)
         return InputError(f"{run!r} uses code of your own: add {flags} (in Python: import that file first)")
-    if (record["env"] not in ENVS and "+" not in record["env"]) or record["agent"] not in AGENTS:
+    env, name = str(record.get("env")), record.get("agent")
+    if (env not in ENVS and "+" not in env) or name not in AGENTS:
         return InputError(f"{error}. If it is your own, give --import=FILE.py with the file that registers it")
     return error
 

@@ -23,6 +23,8 @@ HYPERSPHERE = {f"shared/body/{kind}_{i}" for kind, count in (("UnitDense", 4), (
 BATCH_NORM = {f"shared/body/{part}" for part in ("BatchNorm_0", "BatchNorm_1", "UnitDense_0", "task_0")}
 MODELS = {"shared/transition", "shared/reward"}
 LATENT = {"actor": TRUNK, "critic": TRUNK | {"shared/latent"} | MODELS, "target": TRUNK | {"shared/latent"}}
+ENCODED = {"actor": TRUNK, "critic": TRUNK | {"shared/latent"}, "target": TRUNK | {"shared/latent"}}
+REBUILT = ENCODED | {"critic": ENCODED["critic"] | {"shared/decoder"}}
 WITH_THETA = {**LATENT, **{who: LATENT[who] | {"own/embedding"} for who in ("critic", "target")}}
 WHOLE_CARE = CARE | {"shared/body/after"}
 CARE_ON_LATENT = {who: (parts - TRUNK) | WHOLE_CARE for who, parts in LATENT.items()}
@@ -54,6 +56,8 @@ PARTS = {
     "brc": ("brc", {"value": "hl-gauss"}, BRONET | {"shared/head", "own/embedding"}),
     "simba-v2": ("simba-v2", {"value": "hl-gauss"}, HYPERSPHERE | {"shared/head"}),
     "xqc": ("xqc", {"value": "hl-gauss"}, BATCH_NORM | {"shared/head", "own/batch_stats"}),
+    "drq": ("drq", {"n_step": 1}, ENCODED),
+    "sac-ae": ("sac-ae", {}, REBUILT),
     "deepmdp": ("deepmdp", {}, LATENT),
     "hip-bmdp": ("hip-bmdp", {}, WITH_THETA),
     "care-deepmdp": ("care", {"representation": "deepmdp"}, CARE_ON_LATENT),
@@ -62,7 +66,7 @@ PARTS = {
     "gradnorm": ("gradnorm", {}, TRUNK),
     "famo": ("famo", {}, TRUNK),
 }
-ALIKE = ("cagrad", "gradnorm", "famo")  # with pcgrad's networks
+ALIKE = ("cagrad", "gradnorm", "famo", "drq")  # with pcgrad's networks, or sac-ae's but for the decoder
 QUICK = [case for case in PARTS if case in OFF_POLICY and case not in ALIKE]  # others are variants of these
 EVERY_AGENT = pytest.mark.parametrize("case", slow_but(PARTS, *QUICK))
 
@@ -93,7 +97,12 @@ def parts_of(case, network):
     return parts[network] if isinstance(parts, dict) else parts
 
 
-ONE_OF_A_KIND = {"shared/latent", "shared/transition", "shared/reward"}  # of which critics have one together
+ONE_OF_A_KIND = {
+    "shared/latent",
+    "shared/transition",
+    "shared/reward",
+    "shared/decoder",
+}  # of which critics have one together
 
 
 def slices(case, path, leaf, is_critic):
@@ -139,8 +148,10 @@ FLOW = {
 # Where the actor stands on the critic's representation, all that moves this moves the policy's entropy; and what the
 # slow encoder sees is what models predict. BRC scales rewards by what entropy pays. XQC's critics are normalised over
 # the policy's next actions too.
+_ON_ENCODED = {"critic": ((), ("actor",)), "reward": ((), ("actor", "critic", "target"))}
 _ON_LATENT = {"critic": ((), ("actor",)), "target": ((), ("critic",)), "reward": ((), ("actor", "critic", "target"))}
 FLOW_OF = {
+    **dict.fromkeys(("drq", "sac-ae"), _ON_ENCODED),
     **dict.fromkeys(("deepmdp", "hip-bmdp", "care-deepmdp"), _ON_LATENT),
     "brc": {"log_temperature": ((), ("actor",))},
     "xqc": {"actor": ((), ("critic", "target", "log_temperature"))},

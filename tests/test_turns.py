@@ -91,7 +91,7 @@ def test_the_actors_gradient_is_behind_a_branch_for_any_number_of_seeds(seeds):
         def learn(keys, agent=agent, replay=replay):
             item = jax.tree.map(lambda x: x[0, 0], random_batch(0, 2, 4, SPEC))
             states = jax.vmap(lambda key: agent.init(SPEC, TASKS, key))(keys)
-            return agent.learn(Walk(), states, replay.init(item, 2, 4, keys), TASKS, keys)
+            return agent.learn(Walk(), states, replay.init(item, SPEC, 2, 4, keys), TASKS, keys)
 
         found[delay] = branches(jax.make_jaxpr(learn)(jax.random.split(KEY, seeds)).jaxpr)
     assert found == {1: 1, 2: 2}  # whether to learn at all, and the actor's turn

@@ -77,7 +77,7 @@ def test_split_none_holds_nothing_out():
         ({"a": "1,2,1"}, "paired", "dense", "two tasks have the same values"),
         ({"c": "2,3"}, "grid", "dense", "c must be greater than -inf and at most 2.5, not 3"),
         ({"a": "1:2"}, "random", "hip-bmdp", "combine=random"),
-        ({"a": ""}, "grid", "dense", "cannot read the values '' of a"),
+        ({"a": ""}, "grid", "dense", "a has no values; give lo:hi:n"),
     ],
 )
 def test_what_does_not_fit_is_refused(given, combine, split, message):

@@ -74,7 +74,7 @@ class Pictured(Family):
             raise InputError(f"pixels must be 0 or an even number from {_LEAST} to {_MOST}, not {self.pixels}")
         if not 1 <= self.frames <= _MOST_FRAMES:
             raise InputError(f"frames must be from 1 to {_MOST_FRAMES}, not {self.frames}")
-        if self.repeat < 1 or self.episode_steps % self.repeat:
+        if self.repeat != 1 and (self.repeat < 1 or self.episode_steps % self.repeat):
             near = [n for n in range(1, self.episode_steps + 1) if self.episode_steps % n == 0]
             few = sorted(sorted(near, key=lambda n: abs(n - self.repeat))[:4])
             raise InputError(

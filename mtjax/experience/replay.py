@@ -84,8 +84,8 @@ class Replay:
         window = self.window(env.spec)
         if shown(env.spec.obs) and window > self.warmup_steps:
             raise InputError(f"{window} steps tell one transition of pictures; use warmup-steps of at least {window}")
-        if self.capacity(num_envs) < max(window, self.n_step, self.update_every) * num_envs:
-            least = math.ceil(self.n_step / self.update_every) * self.update_every
+        if self.capacity(num_envs) < max(window, self.update_every) * num_envs:
+            least = math.ceil(max(window, 1) / self.update_every) * self.update_every
             steps = "one step" if least == 1 else f"{least} steps"
             raise InputError(f"replay-size ({self.replay_size}) must hold {steps} of num-envs ({num_envs})")
         if self.hindsight:
