@@ -4,8 +4,9 @@ import dataclasses
 import numbers
 import os
 from collections.abc import Mapping
+from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, get_args, get_origin
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from mtjax.names import InputError
 
 OF_TRAIN = ("steps", "seed", "seeds", "eval_every", "eval_episodes", "num_envs", "chunk_steps", "stagger")
 """The settings of ``mtjax.train`` that are neither the agent's nor the environment's."""
+_LARGEST, _LARGEST_FLOAT = 2**31 - 1, 3.4e38  # of 32 bits
 
 
 def checked(cls: Any, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -25,14 +27,57 @@ def checked(cls: Any, given: Mapping[str, Any]) -> dict[str, Any]:
     return {name: _checked(name, types.get(name), value) for name, value in given.items()}
 
 
-def check_fields(holder: Any) -> None:
+def check_fields(holder: Any, **largest: int) -> None:
     """Check and convert the fields of a frozen dataclass in place, for its ``__post_init__``.
 
     Raises:
-        InputError: as ``checked``.
+        InputError: as ``checked`` and ``require_values``.
     """
     for name, value in checked(holder, {f.name: getattr(holder, f.name) for f in dataclasses.fields(holder)}).items():
         object.__setattr__(holder, name, value)
+    require_values(holder, **largest)
+
+
+def require_values(holder: Any, **largest: int) -> None:
+    """Check that the fields of a dataclass hold values of their types.
+
+    Whole numbers must fit into 32 bits, and real numbers must be finite as 32-bit numbers.
+
+    Args:
+        largest: other largest values of whole numbers, by name.
+
+    Raises:
+        InputError: one does not. The message names the field's flag.
+    """
+    for name, kind in _types(type(holder)).items():
+        value, items = getattr(holder, name), kind == tuple[int, ...]
+        rule = "must be whole numbers" if items and not isinstance(value, tuple) else ""
+        for each in value if items and not rule else [value]:
+            rule = rule or _broken_rule(int if items else kind, each, largest.get(name, _LARGEST))
+        if rule:
+            raise InputError(f"{name.replace('_', '-')} {rule}, not {str(value)[:40]}")
+
+
+def _broken_rule(kind: Any, value: Any, largest: int) -> str:
+    """Return the rule for values of a type that a value breaks, or an empty string."""
+    plain = not isinstance(value, bool)
+    if kind is int:
+        whole = isinstance(value, numbers.Integral) and plain
+        at_most = "" if whole and abs(value) <= largest else f"must be at most {largest}"  # type: ignore
+        return at_most if whole else "must be a whole number"
+    if kind is float:
+        finite = isinstance(value, numbers.Real) and plain and abs(value) <= _LARGEST_FLOAT  # type: ignore
+        return "" if finite else "must be a finite number"
+    if kind in (bool, str):
+        return "" if isinstance(value, kind) else f"must be {'true or false' if kind is bool else 'text'}"
+    return ""
+
+
+@lru_cache
+def _types(cls: type) -> dict[str, Any]:
+    """Return the types of a dataclass's fields by name, without annotations for the command line."""
+    hints = get_type_hints(cls)
+    return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
 
 
 def _checked(name: str, kind: Any, value: Any) -> Any:

@@ -20,12 +20,11 @@ from mtjax.agents.choices import kinds_of, replace
 from mtjax.agents.parts import name_of
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.values import VALUES
-from mtjax.checks import check_fields
+from mtjax.checks import check_fields, require_values
 from mtjax.commands import is_imported, require_run
 from mtjax.envs import ENVS, make
 from mtjax.envs.family import Tabled
 from mtjax.loop import Settings
-from mtjax.names import require_values
 from mtjax.types import InputError
 
 _MOST_STEPS, _MOST_SEEDS, _MOST_EPISODES = 10**15, 10**5, 10**5
@@ -48,8 +47,7 @@ class Plan:
     """Episodes of each task in every evaluation."""
 
     def __post_init__(self):
-        check_fields(self)
-        require_values(self, steps=_MOST_STEPS, eval_every=_MOST_STEPS, seeds=_MOST_SEEDS, eval_episodes=_MOST_EPISODES)
+        check_fields(self, steps=_MOST_STEPS, eval_every=_MOST_STEPS, seeds=_MOST_SEEDS, eval_episodes=_MOST_EPISODES)
         for field, least in (("steps", 1), ("seeds", 1), ("seed", 0), ("eval_every", 0), ("eval_episodes", 1)):
             if getattr(self, field) < least:
                 raise InputError(f"{field.replace('_', '-')} must be at least {least}, not {getattr(self, field)}")
@@ -279,7 +277,7 @@ def _with_import(error: InputError, run: str, record: Mapping[str, Any]) -> Inpu
     if missing:
         flags = shlex.join(f"--import={file}" for file in missing)
         return InputError(f"{run!r} uses code of your own: add {flags} (in Python: import that file first)")
-    env, name = str(record.get("env")), record.get("agent")
+    env, name = str(record.get("env")), str(record.get("agent"))
     if (env not in ENVS and "+" not in env) or name not in AGENTS:
         return InputError(f"{error}. If it is your own, give --import=FILE.py with the file that registers it")
     return error

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 
 from mtjax.checks import check_fields
 from mtjax.maps import over_seeds
-from mtjax.names import require_values
 from mtjax.parallel import collectives
 from mtjax.rollout import EnvStep, Worlds, reset_ended, reset_envs, split_keys, step_envs, world_keys
 from mtjax.types import Agent, Array, Env, InputError, Key, Metrics, Outcome, Sometimes, Task, Transition
@@ -38,7 +37,6 @@ class Settings:
 
     def __post_init__(self):
         check_fields(self)
-        require_values(self)
         for name in ("num_envs", "chunk_steps"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name.replace('_', '-')} must be at least 1, not {getattr(self, name)}")

@@ -1,24 +1,20 @@
 """Errors that name the nearest match, and imports that wait until they are needed."""
 
 import contextlib
-import dataclasses
 import difflib
 import os
 import sys
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from functools import lru_cache
 from importlib import import_module
-from numbers import Integral, Real
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any
 
 SPLITS = ("train", "interpolation", "extrapolation")
 BEGAN = time.time()
 """When this process began to import the package, in seconds since 1970."""
 _MANY = 20
-_LARGEST, _LARGEST_FLOAT = 2**31 - 1, 3.4e38  # of 32 bits
 
 
 class InputError(ValueError):
@@ -68,48 +64,6 @@ def nearest_error(kind: str, given: str, allowed: Iterable[str]) -> InputError:
     few = len(allowed) <= _MANY
     shown = ", ".join(allowed if few else near or allowed[:6]) + ("" if few else f", ... ({len(allowed)} in all)")
     return InputError(f"unknown {kind} {given!r}; {hint}choose from: {shown}")
-
-
-def require_values(holder: Any, **largest: int) -> None:
-    """Check that the fields of a dataclass hold values of their types.
-
-    Whole numbers must fit into 32 bits, and real numbers must be finite as 32-bit numbers.
-
-    Args:
-        largest: other largest values of whole numbers, by name.
-
-    Raises:
-        InputError: one does not. The message names the field's flag.
-    """
-    for name, kind in _types(type(holder)).items():
-        value, items = getattr(holder, name), kind == tuple[int, ...]
-        rule = "must be whole numbers" if items and not isinstance(value, tuple) else ""
-        for each in value if items and not rule else [value]:
-            rule = rule or _broken_rule(int if items else kind, each, largest.get(name, _LARGEST))
-        if rule:
-            raise InputError(f"{name.replace('_', '-')} {rule}, not {str(value)[:40]}")
-
-
-def _broken_rule(kind: Any, value: Any, largest: int) -> str:
-    """Return the rule for values of a type that a value breaks, or an empty string."""
-    plain = not isinstance(value, bool)
-    if kind is int:
-        whole = isinstance(value, Integral) and plain
-        at_most = "" if whole and abs(value) <= largest else f"must be at most {largest}"  # type: ignore
-        return at_most if whole else "must be a whole number"
-    if kind is float:
-        finite = isinstance(value, Real) and plain and abs(value) <= _LARGEST_FLOAT  # type: ignore
-        return "" if finite else "must be a finite number"
-    if kind in (bool, str):
-        return "" if isinstance(value, kind) else f"must be {'true or false' if kind is bool else 'text'}"
-    return ""
-
-
-@lru_cache
-def _types(cls: type) -> dict[str, Any]:
-    """Return the types of a dataclass's fields by name, without annotations for the command line."""
-    hints = get_type_hints(cls)
-    return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
 
 
 def first_sentence(text: str | None) -> str:

@@ -215,6 +215,7 @@ def test_a_policy_takes_one_task_and_one_observation(result):
         result.policy(2)
 
 
+@pytest.mark.slow
 def test_a_sweep_of_python_leaves_a_run_too(short_family, tmp_path):
     """Its points are read back, and each has its policies."""
     given = {**PLAN, **SMALL, "sweep": {"actor_lr": [1e-3, 1e-2]}, "eval_every": 100}

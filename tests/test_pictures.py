@@ -119,7 +119,7 @@ FAST = dict(actor_lr=3e-3, critic_lr=3e-3, initial_temperature=0.01, updates_per
 
 
 @pytest.mark.slow  # convolutions are slow under the tests' flags of the compiler
-@pytest.mark.parametrize("name", ["drq", "sac-ae"])
+@pytest.mark.parametrize("name", ["drq", pytest.param("sac-ae", marks=pytest.mark.nightly)])
 def test_agents_learn_what_only_pictures_show(name):
     """The best action is the task's scale times a sign that the picture shows: 0 reward, and about -1 without it."""
     agent = mtjax.agent(name, shift=1, n_step=1)

@@ -194,6 +194,7 @@ def test_agents_of_vectors_and_hindsight_refuse_pictures():
         mtjax.stacked(mtjax.make("pendulum-swingup"))
 
 
+@pytest.mark.slow
 def test_gymnasium_shows_stacks():
     gym = pytest.importorskip("mtjax.gym")
     env = gym.make("pendulum-swingup", pixels=SIZE, engine="c", repeat=4)

@@ -20,8 +20,8 @@ from mtjax.agents.parts.representations import REPRESENTATIONS, Place, Represent
 from mtjax.agents.parts.samplers import Sampler
 from mtjax.agents.parts.scaling import SCALINGS, Scaling
 from mtjax.agents.parts.trajectory import Past, Seen, TrajectoryEncoder
+from mtjax.checks import require_values
 from mtjax.experience import Replay, multistep
-from mtjax.names import require_values
 from mtjax.networks import Network, Params
 from mtjax.types import Acted, Array, Env, InputError, Key, Metrics, Outcome, Spec, Task, Transition
 

@@ -13,10 +13,10 @@ import jax
 import numpy as np
 import tyro
 
+from mtjax.checks import require_values
 from mtjax.envs import variation
 from mtjax.envs.parameters import Parameter
 from mtjax.maps import Flat
-from mtjax.names import require_values
 from mtjax.types import SPLITS, Array, InputError, Key, Spec, Step, Task, Transition
 
 _MAX_DRAWS = 1000

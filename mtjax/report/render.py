@@ -104,7 +104,9 @@ def _place(model: mujoco.MjModel, marks: dict[str, Mark]) -> None:
             mujoco.mju_quatZ2Vec(model.geom_quat[geom], np.float64(mark.along))
 
 
-def _open_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Renderer:
+def _open_renderer(
+    model: mujoco.MjModel, width: int, height: int
+) -> "mujoco.Renderer":  # which MuJoCo lacks without OpenGL
     unset = {"MUJOCO_GL", "PYOPENGL_PLATFORM"}.difference(os.environ)
     try:
         choose_backend()
