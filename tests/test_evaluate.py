@@ -331,6 +331,7 @@ def test_table_of_a_run_shows_splits_and_the_worst_task():
 # Training by the program.
 
 
+@pytest.mark.slow
 def test_train_prints_where_the_run_is_and_how_it_scored(short_family, tmp_path, capsys):
     """What, where, progress, evaluations, the table, and where again."""
     mtjax.train.main([*SHORT_RUN, f"--runs={tmp_path}"])

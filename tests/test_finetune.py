@@ -184,6 +184,7 @@ def test_a_fine_tuned_run_goes_on(learned, tuned, capsys):
         assert np.array_equal(leaf, before[path]) == ("head" not in path), path
 
 
+@pytest.mark.slow
 def test_training_takes_a_policy(learned):
     """In Python; without updates, what was learned is all there is."""
     env = mtjax.make("aim", {"goal": "0.9,-0.8"}).scaled_as(learned.env)

@@ -102,6 +102,7 @@ def test_the_encoder_averages_what_an_mlp_makes_of_the_known_steps():
     np.testing.assert_allclose(found[0], layers["Dense_0"]["bias"], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_every_network_has_an_encoder_of_trajectories_that_learns():
     """All of its leaves move, in actor and critics; if tasks share nothing, they do not share it either."""
     agent, tasks = tiny("sac", normalize_observations=True, **INFERRED), tasks_of("one-step")

@@ -184,6 +184,7 @@ def leaves_of(state):
     return [np.asarray(raw(x)) for x in jax.tree.leaves(state)]
 
 
+@pytest.mark.slow
 def test_seeds_do_not_touch_each_other():
     """Two in one program are each one alone, up to the rounding of products of other shapes."""
     both, _ = learn((3, 5))

@@ -485,6 +485,7 @@ def test_probes_are_learned(kind):
     assert history[0]["bad_step"].max() == -1 and history[0]["return"].shape == (1, 2)
 
 
+@pytest.mark.slow
 def test_a_run_that_infers_its_task_stays_finite():
     """Through the whole loop, where what is remembered of an episode is stored with its steps."""
     agent = tiny("ppo", conditioning="inferred", inferred_from=4)
@@ -493,6 +494,7 @@ def test_a_run_that_infers_its_task_stays_finite():
     assert np.all(np.isfinite(np.concatenate([np.ravel(x) for x in jax.tree.leaves(state.agent.actor)])))
 
 
+@pytest.mark.slow
 def test_seeds_are_alone():
     """A seed learns beside others what it learns by itself."""
     agent, given = tiny("ppo"), LEARN | {"chunk_steps": 40}

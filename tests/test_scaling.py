@@ -401,6 +401,7 @@ def test_a_reset_renews_all_that_learns_and_nothing_else():
     assert normalize.init(3).count == 0
 
 
+@pytest.mark.slow
 def test_resets_work_in_the_loop_with_seeds():
     """ARS under two seeds: the factors of the last reset, from the mean rewards of that time."""
     settings = BRIEF | {"reset_every": 8, "warmup_steps": 2}

@@ -42,6 +42,7 @@ class Recorder:
         self.module = types.SimpleNamespace(SummaryWriter=Writer, init=Writer, Settings=lambda **given: given)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("library, given", [("tensorboardX", {"tensorboard": True}), ("wandb", {"wandb": "project"})])
 def test_every_number_is_logged_at_its_step(library, given, short_family, tmp_path, monkeypatch):
     """A run for each seed, with the rows of metrics.csv and the evaluations by split."""
