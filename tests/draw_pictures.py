@@ -9,6 +9,14 @@ import sys
 from functools import partial
 
 import jax
+
+try:
+    import mujoco
+
+    mujoco.Renderer  # noqa: B018
+except Exception as error:  # every OpenGL backend without libraries fails with a type of its own
+    raise SystemExit(f"cannot draw: {error}") from None
+
 import numpy as np
 from PIL import Image
 from test_painters import DOMAINS, PICTURES, SIZE, family, similarity, states_of
