@@ -32,6 +32,17 @@ def length(ended: Array) -> Array:
     return 1 + jnp.sum(goes_on, axis=-1)
 
 
+def at(tree: Any, index: Array) -> Any:
+    """Take entries ``index`` (..., n) along the axis of steps of leaves (..., W, ...)."""
+    lead = index.ndim - 1
+
+    def take(x: Array) -> Array:
+        places = index.reshape(index.shape + (1,) * (x.ndim - index.ndim))
+        return jnp.take_along_axis(x, places, axis=lead)
+
+    return jax.tree.map(take, tree)
+
+
 def join(steps: Transition, gamma: float | Array) -> Transition:
     """Join windows of consecutive steps (..., n) to one transition (...) each, for a discount () of one task.
 
@@ -43,12 +54,7 @@ def join(steps: Transition, gamma: float | Array) -> Transition:
     powers = jnp.power(gamma, index)
     final = count - 1
     lead = steps.reward.ndim - 1
-
-    def at(x: Array, index: Array) -> Array:
-        index = index.reshape(index.shape + (1,) * (x.ndim - index.ndim))
-        return jnp.take_along_axis(x, index, axis=lead).squeeze(lead)
-
-    first, last = (jax.tree.map(lambda x, index=index: at(x, index), steps) for index in (0 * final, final))
+    first, last = (jax.tree.map(lambda x: x.squeeze(lead), at(steps, index)) for index in (0 * final, final))
     return first._replace(
         reward=jnp.sum(jnp.where(index < count, powers * steps.reward, 0.0), axis=-1),
         discount=powers[final.squeeze(-1)] * last.discount,

@@ -6,12 +6,11 @@ So a transition that a time limit cut off is not drawn, and a multi-step return 
 terminated, the picture after it does not matter. Both cost one step of an episode.
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
 from mtjax.experience import multistep
+from mtjax.experience.multistep import at
 from mtjax.frames import PICTURES
 from mtjax.types import Array, Transition
 
@@ -53,14 +52,3 @@ def stack(pictures: Array, ended: Array, place: Array, frames: int) -> Array:
     steps = place[..., None] - jnp.minimum(jnp.arange(frames - 1, -1, -1), age)
     found = at(pictures, steps)  # (..., N, H, W, C)
     return jnp.concatenate([found[..., i, :, :, :] for i in range(frames)], axis=-1)
-
-
-def at(tree: Any, index: Array) -> Any:
-    """Take entries ``index`` (..., n) along the axis of steps of leaves (..., W, ...)."""
-    lead = index.ndim - 1
-
-    def take(x: Array) -> Array:
-        places = index.reshape(index.shape + (1,) * (x.ndim - index.ndim))
-        return jnp.take_along_axis(x, places, axis=lead)
-
-    return jax.tree.map(take, tree)

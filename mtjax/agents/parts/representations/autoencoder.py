@@ -12,7 +12,7 @@ from mtjax.agents import parts
 from mtjax.agents.parts import vision
 from mtjax.agents.parts.representations.base import Basis, without_past
 from mtjax.agents.parts.representations.encoded import Encoded
-from mtjax.networks import MLP, Network, Params
+from mtjax.networks import MLP, Params
 from mtjax.types import Array, Key, Metrics
 
 
@@ -49,11 +49,8 @@ class Autoencoder(Encoded):
     def init(self, num_tasks: int, features: Array, obs: Any, action: Array, key: Key) -> Basis:
         basis = super().init(num_tasks, features, obs, action, key)
         key, decoder_key = jax.random.split(basis.key)
-        init, latent = self.decoder(without_past(obs)).init, jnp.zeros(self.latent_widths[-1])
-        if self.place.own:
-            basis.params.own["decoder"] = Network.for_each_task(init, decoder_key, num_tasks, latent)
-        else:
-            basis.params.shared["decoder"] = init(decoder_key, latent)
+        decoder, latent = self.decoder(without_past(obs)), jnp.zeros(self.latent_widths[-1])
+        self.init_part(basis.params, "decoder", decoder, decoder_key, num_tasks, latent)
         return basis._replace(key=key)
 
     def decoder(self, obs: Any) -> nn.Module:

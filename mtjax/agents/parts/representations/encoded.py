@@ -117,14 +117,17 @@ class Encoded(Plain):
         features = jnp.zeros(len(features) + size * (self.has_theta + self.infers))
         inputs = {"latent": (without_past(obs),), **self.model_inputs(latent, features, action)}
         for (name, module), part_key in zip(self.modules.items(), keys, strict=True):
-            data = inputs.get(name, (obs,))
-            if self.place.own:
-                params.own[name] = Network.for_each_task(module.init, part_key, num_tasks, *data)
-            else:
-                params.shared[name] = module.init(part_key, *data)
+            self.init_part(params, name, module, part_key, num_tasks, *inputs.get(name, (obs,)))
         if self.has_theta:
             params.own["embedding"] = jax.random.normal(theta_key, (num_tasks, size))
         return Basis(params, features, latent, key)
+
+    def init_part(self, params: Params, name: str, module: nn.Module, key: Key, num_tasks: int, *inputs: Any) -> None:
+        """Add the initial parameters of an encoder or a model: one for all tasks, or every task's own."""
+        if self.place.own:
+            params.own[name] = Network.for_each_task(module.init, key, num_tasks, *inputs)
+        else:
+            params.shared[name] = module.init(key, *inputs)
 
     def latent_size(self, obs: Any) -> int:
         """Return the size D of latent states, to which a state beside pictures is appended."""
