@@ -166,7 +166,7 @@ def check_flags(argv: Sequence[str]) -> None:
     known = {*(field.replace("_", "-") for field in fields), "from", "help"}
     for word in argv:
         flag = word.split("=", 1)[0].replace("_", "-")
-        group, name = re.fullmatch(r"(--(?:\w+\.)*)?(.*)", flag).groups("")  # type: ignore
+        group, name = re.fullmatch(r"(--(?:\w+\.)*)?(.*)", flag, re.DOTALL).groups("")  # type: ignore
         if group and not flag.startswith("--env.vary.") and not {name, name.removeprefix("no-")} & known:
             raise unknown_flag(flag, [group + other for other in sorted(known)])
 

@@ -1,7 +1,9 @@
 """Command lines and records that nobody would write: each is used as it says, or refused in a line."""
 
+import contextlib
 import copy
 import dataclasses
+import datetime
 import json
 import math
 import string
@@ -11,7 +13,7 @@ import pytest
 from conftest import SHORT_RUN
 from hypothesis import HealthCheck, given, settings
 
-from mtjax import cli, commands
+from mtjax import cli, commands, flag_files
 from mtjax.agents import AGENTS
 from mtjax.agents import settings as settings_of
 from mtjax.config import from_json, to_json
@@ -21,14 +23,16 @@ from mtjax.training.folder import record_steps, run_metadata
 
 QUIET = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
 quick = settings(max_examples=25, deadline=None, derandomize=True, suppress_health_check=QUIET)
-long = settings(max_examples=150, deadline=None, suppress_health_check=QUIET)
+long = settings(quick, max_examples=150)
+other = settings(max_examples=1000, deadline=None, suppress_health_check=QUIET)
 
 NUMBERS = "0 1 2 3 7 -1 0.5 -0.5 1e-8 1e-300 1e30 1e39 1e308 nan inf -inf 2147483647 2147483648 99999999999 1e6".split()
 VALUES = [*NUMBERS, "9" * 25, "9" * 5000, "", "=", "²", "٣", "true", "None", "[]", "a,b", "1,1", "../..", "\0", "--"]
 RANGES = (
     "1:1:1 1:2:1000000000 2:1:3 1:2:0 1:2:-1 1:2:2.5 1:2 1:inf nan:1 1e308:1e309:3 :: 1:2:3:4 0.9:1.1:3 1,2,3".split()
 )
-FLAGS = [flag for flag in cli.flags(cli.parse([])) if flag not in ("--runs", "--resume", "--from", "--list", "--sweep")]
+ELSEWHERE = ("--runs", "--resume", "--from", "--list", "--sweep", "--config")  # read before a run's flags
+FLAGS = [flag for flag in cli.flags(cli.parse([])) if flag not in ELSEWHERE]
 FAMILIES = "finger-spin walker-walk bandit two-goal-maze control-cartpole point-mass-vary-goal".split()
 PARAMETERS = "size mass gravity torso-mass gear touch-size friction goal-x nonsense".split()
 
@@ -61,19 +65,65 @@ def require_use_or_refusal(words, folder):
 
 
 @pytest.mark.slow
-@quick
+@long
 @given(words=lines)
 def test_any_command_line_is_used_or_refused(words, tmp_path):
     """Before anything compiles."""
     require_use_or_refusal(words, tmp_path)
 
 
+@pytest.mark.nightly
+@other
+@given(words=lines)
+def test_other_command_lines_are_used_or_refused(words, tmp_path):
+    """Others each time."""
+    require_use_or_refusal(words, tmp_path)
+
+
+KEYS = sorted({key for flag in FLAGS for key in (flag.lstrip("-"), *flag.lstrip("-").split("."))})
+key = st.sampled_from([*KEYS, "vary", "size", "import", "resume", "config", ""])
+leaf = st.sampled_from([*VALUES, *RANGES, *FAMILIES]) | st.integers() | st.floats() | st.booleans() | st.datetimes()
+tables = st.recursive(st.dictionaries(key, leaf, max_size=3), lambda x: st.dictionaries(key, leaf | st.lists(leaf) | x))
+
+
+def as_toml(value):
+    """A value as TOML, tables inline."""
+    match value:
+        case dict():
+            return "{" + ", ".join(f"{json.dumps(key)} = {as_toml(each)}" for key, each in value.items()) + "}"
+        case list():
+            return "[" + ", ".join(map(as_toml, value)) + "]"
+        case str() | bool():
+            return json.dumps(value)
+        case datetime.datetime():
+            return value.isoformat()
+    return repr(value)
+
+
 @pytest.mark.slow
 @long
-@given(words=lines)
-def test_many_command_lines_are_used_or_refused(words, tmp_path):
-    """More of them, and others each time."""
+@given(table=tables)
+def test_any_toml_file_is_used_or_refused(table, tmp_path):
+    """Whatever tables it holds."""
+    file = tmp_path / "flags.toml"
+    file.write_text("".join(f"{json.dumps(key)} = {as_toml(each)}\n" for key, each in table.items()))
+    try:
+        words = flag_files.expand([f"--config={file}"])
+    except InputError as error:
+        assert commands.one_line(error)
+        return
     require_use_or_refusal(words, tmp_path)
+
+
+@pytest.mark.slow
+@long
+@given(text=st.binary(max_size=40) | st.text(string.printable, max_size=40).map(str.encode))
+def test_any_text_as_toml_is_used_or_refused(text, tmp_path):
+    """However little it is TOML."""
+    file = tmp_path / "flags.toml"
+    file.write_bytes(text)
+    with contextlib.suppress(InputError):
+        flag_files.expand([f"--config={file}"])
 
 
 @quick
