@@ -53,6 +53,7 @@ __getattr__ = lazily(
     },
 )
 
+Settings = dict[str, Any]
 Entry = tuple[Any, dict[str, Any]]  # a family's class, or the place that it is imported from; and its settings
 
 
@@ -289,7 +290,9 @@ def name_of(family: Any) -> str:
     return next(iter((*exact, *plain, *known)), of_class)
 
 
-def _make_mixture(own: tuple[tuple[str, dict[str, Any]], ...], vary: dict[str, Any], settings: dict[str, Any]) -> "Mixture":
+def _make_mixture(
+    own: tuple[tuple[str, dict[str, Any]], ...], vary: dict[str, Any], settings: dict[str, Any]
+) -> "Mixture":
     """Make a mixture from its families' own settings, and values of parameters by "NAME.PARAMETER"."""
     cls, names = load("mtjax.envs.mixtures:Mixture"), tuple(name for name, _ in own)
     recorded = settings.pop("families", None)
