@@ -16,6 +16,12 @@ from mtjax.types import Array
 
 _LENGTH = 0.2  # [m] of the lever
 _LEVER = 9  # in qpos
+_GRIP = (
+    0.6625,
+    0.6625,
+    -0.24717,
+    0.24717,
+)  # orientation (w, x, y, z) in the lever of the mesh that Meta-World observes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,7 +33,8 @@ class LeverPull(Sawyer):
     Success: the lever stands within 7.5 degrees of upright.
     Start: the lever at the drawn place, pointing to the robot.
 
-    Success reads the lever's joint with its sign turned, so that pulling it to -90 degrees is what counts.
+    The observed orientation is that of a mesh of the handle, in MuJoCo's frame of it. The handle is nearly a sphere,
+    so that this frame differs between MuJoCo's versions; here it is that of Meta-World's own, 3.3.0.
     """
 
     scene: ClassVar[str] = "sawyer_lever_pull"
@@ -36,7 +43,7 @@ class LeverPull(Sawyer):
     drawn: ClassVar = ((-0.1, 0.7, 0.0), (0.1, 0.8, 0.0))
     goal_low: ClassVar = hand_low
     goal_high: ClassVar = Sawyer.hand_high
-    watched: ClassVar = {"end": "site:leverStart", "grip": "geom:objGeom"}
+    watched: ClassVar = {"end": "site:leverStart"}
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
         host.move("lever", vec)
@@ -44,7 +51,10 @@ class LeverPull(Sawyer):
         return {"target": vec + np.array([0.12, 0.0, 0.25 + _LENGTH]), "end_init": end, "obj_init": vec}
 
     def objects(self, at: At) -> tuple[Array, ...]:
-        return at.position["end"], scalar_last(at.quat["grip"])
+        cos, sin = jnp.cos(at.qpos[_LEVER] / 2), jnp.sin(at.qpos[_LEVER] / 2)
+        w, x, y, z = _GRIP
+        turned = jnp.stack([cos * w - sin * x, cos * x + sin * w, cos * y - sin * z, cos * z + sin * y])
+        return at.position["end"], scalar_last(turned)
 
     def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
         end, start, target = at.obs[4:7], began["end_init"], began["target"]

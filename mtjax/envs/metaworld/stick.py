@@ -25,13 +25,15 @@ class StickPush(Sawyer):
     Success: the flask is within 0.12 m of the target while the stick is lifted by 0.01 m and both pads press on it.
     Start: the stick at the drawn x and y, the flask always at the same place; the target at the drawn x and y, at the
         height of the flask's handle.
+
+    Forces on the pads are those of the last substep. Meta-World computes them once more, of the state after it.
     """
 
     scene: ClassVar[str] = "sawyer_stick_obj"
     drawn: ClassVar = ((-0.08, 0.58, 0.0, 0.399, 0.55, 0.1319), (-0.03, 0.62, 0.001, 0.401, 0.6, 0.1321))
     goal_low: ClassVar = drawn[0][3:]
     goal_high: ClassVar = drawn[1][3:]
-    watched: ClassVar = {"stick": "body:stick", "end": "site:stick_end", "handle": "site:insertion"}
+    watched: ClassVar = {"stick": "body:stick", "handle": "site:insertion"}
     pressed: ClassVar[str] = "objGeom"
     flask_at: ClassVar = (0.0, 0.0)  # x and y [m] of the flask at the start, from its place in the scene
     to_flask: ClassVar = (0.0, 0.09, 0.0)  # [m] from the handle to what the observation shows
@@ -72,7 +74,7 @@ class StickPush(Sawyer):
         lifted = (at.obs[3] > 0) & (stick[2] - 0.01 > began["stick_init"][2])
         reward = jnp.where(away <= _RADIUS, 10.0, 2 + 5 * stick_in_place + 3 * flask_in_place)
         reward = jnp.where(lifted & (distance(stick, at.tcp) < 0.02), reward, caged)
-        return reward, lifted & (away <= _RADIUS) & jnp.all(at.press > 0)
+        return reward, lifted & (away <= _RADIUS) & jnp.all(at.press != 0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,12 +87,15 @@ class StickPull(StickPush):
         handle within 0.12 m of the target.
     Success: the handle is within 0.12 m of the target, and the stick through it.
     Start: the stick at the drawn x and y, the flask always at the same place; the target at the drawn x and y.
+
+    The caging takes the flask's place at the start for that of the stick.
     """
 
     hand_low: ClassVar = (-0.5, 0.35, 0.05)
     drawn: ClassVar = ((-0.1, 0.55, 0.0, 0.35, 0.45, 0.0199), (0.0, 0.65, 0.001, 0.45, 0.55, 0.0201))
     goal_low: ClassVar = drawn[0][3:]
     goal_high: ClassVar = drawn[1][3:]
+    watched: ClassVar = {**StickPush.watched, "end": "site:stick_end"}
     flask_at: ClassVar = (0.0, 0.09)
     to_flask: ClassVar = (0.0, 0.0, 0.0)
 
@@ -105,16 +110,7 @@ class StickPull(StickPush):
         at_flask = near(jnp.linalg.norm((stick - flask) * scale), 0.05, margin)
         stick_in_place = near(distance(stick, target), 0.05, distance(stick_init, target))
         flask_in_place = near(distance(flask, target), 0.05, distance(flask_init, target))
-        caged = caging(
-            at,
-            began,
-            stick,
-            obj_radius=0.014,
-            pad_success_thresh=0.05,
-            xz_thresh=0.01,
-            high_density=True,
-            obj_init=stick_init,
-        )
+        caged = caging(at, began, stick, obj_radius=0.014, pad_success_thresh=0.05, xz_thresh=0.01, high_density=True)
 
         gap = abs(at.position["end"] - handle)
         through = (at.position["end"][0] >= handle[0]) & (gap[1] <= 0.04) & (gap[2] <= 0.06)
