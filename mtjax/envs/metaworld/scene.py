@@ -51,6 +51,7 @@ def read(name: str, watched: Mapping[str, str], pressed: str = "") -> mujoco.MjS
     for weld in spec.equalities:
         if weld.type == mujoco.mjtEq.mjEQ_WELD:  # hand and mocap body coincide; torques count five times
             weld.data[:11] = [0, 0, 0, 0, 0, 0, -1, 0, 0, 0, 5]
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MULTICCD  # MuJoCo 3.3, which Meta-World has, had no such
     position, turn = mujoco.mjtSensor.mjSENS_FRAMEPOS, mujoco.mjtSensor.mjSENS_FRAMEQUAT
     for place in _HAND:
         _add_sensor(spec, position, place.partition(":")[2], place)
