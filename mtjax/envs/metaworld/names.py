@@ -3,13 +3,37 @@
 from typing import Any
 
 TASKS = {  # name -> "module:Class"
+    "faucet-close": "faucet:FaucetClose",
+    "faucet-open": "faucet:FaucetOpen",
+    "hammer": "hammer:Hammer",
+    "hand-insert": "hole:HandInsert",
+    "handle-press": "handle:HandlePress",
+    "handle-press-side": "handle:HandlePressSide",
+    "handle-pull": "handle:HandlePull",
+    "handle-pull-side": "handle:HandlePullSide",
+    "lever-pull": "lever:LeverPull",
+    "peg-insert-side": "peg:PegInsertSide",
+    "peg-unplug-side": "peg:PegUnplugSide",
+    "pick-out-of-hole": "hole:PickOutOfHole",
     "pick-place": "pick_place:PickPlace",
     "pick-place-wall": "pick_place:PickPlaceWall",
+    "plate-slide": "plate:PlateSlide",
+    "plate-slide-back": "plate:PlateSlideBack",
+    "plate-slide-back-side": "plate:PlateSlideBackSide",
+    "plate-slide-side": "plate:PlateSlideSide",
     "push": "push:Push",
     "push-back": "push:PushBack",
     "push-wall": "push:PushWall",
     "reach": "reach:Reach",
     "reach-wall": "reach:ReachWall",
+    "shelf-place": "shelf:ShelfPlace",
+    "soccer": "soccer:Soccer",
+    "stick-pull": "stick:StickPull",
+    "stick-push": "stick:StickPush",
+    "sweep": "sweep:Sweep",
+    "sweep-into": "sweep:SweepInto",
+    "window-close": "window:WindowClose",
+    "window-open": "window:WindowOpen",
 }
 FAMILIES: dict[str, tuple[str, dict[str, Any]]] = {f"metaworld-{name}": (place, {}) for name, place in TASKS.items()}
 
