@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from mtjax.agents import AGENTS
-from mtjax.envs import ENVS, outline, varied
+from mtjax.envs import BENCHMARKS, ENVS, members, outline, varied
 from mtjax.names import InputError, Notice, nearest_error
 
 PRESETS = ("auto", "cpu", "gpu")
@@ -82,6 +82,9 @@ def catalogue() -> str:
         tasks, says = outline(name)
         varies = varied(name)
         lines.append(f"  {name:36} {tasks:3} task{'s' if tasks > 1 else ' '}  {says}{f' [{varies}]' * bool(varies)}")
+    lines.append("benchmarks, which are mixtures of the above:")
+    for name, (says, families) in BENCHMARKS.items():
+        lines.append(f"  {name:36} {sum('held_out' not in s for s in families.values()):3} tasks  {says}")
     lines.append("agents:")
     return "\n".join(lines + [f"  {name:36} {preset.says}" for name, preset in AGENTS.items()])
 
@@ -124,10 +127,11 @@ def check_names(argv: Sequence[str]) -> None:
     """
     for kind, flag, known in _KNOWN:
         given = flag_value(argv, flag, None)
-        names = () if given is None else given.split("+") if flag == "env" else (given,)  # several are a mixture
-        wrong = next((name for name in names if name not in known), None)
+        several = flag == "env" and given is not None  # of a mixture
+        names = [name for name, _ in members(given)] if several else [given]
+        wrong = next((name for name in names if name is not None and name not in known), None)
         if wrong is not None:
-            raise nearest_error(kind, wrong, known)
+            raise nearest_error(kind, wrong, (*known, *BENCHMARKS) if several else known)
     _check_numbers(argv)
     given = {word.split("=", 1)[0] for word in argv if word.startswith("--")}
     other = ", ".join(sorted(given - _MAY_CHANGE))

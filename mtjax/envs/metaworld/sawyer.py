@@ -66,6 +66,7 @@ class Sawyer(Domain):
     goal_low: ClassVar[tuple[float, ...]]  # to which the goal in observations is clipped
     goal_high: ClassVar[tuple[float, ...]]
     watched: ClassVar[Mapping[str, str]] = MappingProxyType({})  # short name -> "body:NAME", "site:NAME", "geom:NAME"
+    pressed: ClassVar[str] = ""  # a geom, if success needs that both pads press on it
 
     parameters: ClassVar = MappingProxyType({})
     action_size: ClassVar[int] = 4  # type: ignore
@@ -178,7 +179,7 @@ class Sawyer(Domain):
         return {"model": model, "goal": stacked([start.began for start in starts]) | states}
 
     def compile_spec(self, values: Mapping[str, float] | None = None) -> mujoco.MjSpec:
-        return scene.read(self.scene, self.watched)
+        return scene.read(self.scene, self.watched, self.pressed)
 
     # Steps.
 
@@ -232,8 +233,9 @@ class Sawyer(Domain):
     def _shown(self, world: World) -> At:
         """Return the places of the gripper and of watched things, from the sensors of ``scene.read``."""
         left_pad, right_pad, left, right = world.sensors[9:21].reshape(4, 3)
-        poses = world.sensors[21:].reshape(-1, 7)
+        poses, press = jnp.split(world.sensors[21:], [7 * len(self.watched)])
+        poses = poses.reshape(-1, 7)
         position = dict(zip(self.watched, poses[:, :3], strict=True))
         quat = dict(zip(self.watched, poses[:, 3:], strict=True))
         nothing = jnp.zeros(0)
-        return At(nothing, nothing, (left + right) / 2, left_pad, right_pad, position, quat, world.qpos)
+        return At(nothing, nothing, (left + right) / 2, left_pad, right_pad, position, quat, world.qpos, press[::3])

@@ -12,6 +12,8 @@ from mtjax.types import InputError
 INSTALL = "pip install --no-deps metaworld==3.1.1"
 _HAND = ("body:hand", "body:leftclaw", "body:rightclaw", "body:leftpad", "body:rightpad")
 _HAND += ("site:leftEndEffector", "site:rightEndEffector")
+_PADS = ("leftpad_geom", "rightpad_geom")
+_STRONGEST_FORCE = [1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 2, 1]  # (3,) of two geoms' contacts, normal first
 _KINDS = {
     "body": mujoco.mjtObj.mjOBJ_XBODY,  # the frame of the body, not its centre of mass
     "geom": mujoco.mjtObj.mjOBJ_GEOM,
@@ -31,12 +33,13 @@ def folder() -> Path:
     return Path(found.submodule_search_locations[0]) / "assets" / "sawyer_xyz"
 
 
-def read(name: str, watched: Mapping[str, str]) -> mujoco.MjSpec:
+def read(name: str, watched: Mapping[str, str], pressed: str = "") -> mujoco.MjSpec:
     """Return the editable scene of a task, with sensors of the hand and of what is watched.
 
     Args:
         name: the scene's file without its ending.
         watched: a short name, and "body:NAME", "site:NAME" or "geom:NAME".
+        pressed: a geom, whose contacts with the pads are then felt; or none.
     """
     path = folder() / f"{name}.xml"
     if not path.is_file():
@@ -48,12 +51,17 @@ def read(name: str, watched: Mapping[str, str]) -> mujoco.MjSpec:
     for weld in spec.equalities:
         if weld.type == mujoco.mjtEq.mjEQ_WELD:  # hand and mocap body coincide; torques count five times
             weld.data[:11] = [0, 0, 0, 0, 0, 0, -1, 0, 0, 0, 5]
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MULTICCD  # MuJoCo 3.3, which Meta-World has, had no such
     position, turn = mujoco.mjtSensor.mjSENS_FRAMEPOS, mujoco.mjtSensor.mjSENS_FRAMEQUAT
     for place in _HAND:
         _add_sensor(spec, position, place.partition(":")[2], place)
     for short, place in watched.items():
         _add_sensor(spec, position, f"position:{short}", place)
         _add_sensor(spec, turn, f"quat:{short}", place)
+    for pad in _PADS if pressed else ():
+        contact = spec.add_sensor(name=f"press:{pad}", type=mujoco.mjtSensor.mjSENS_CONTACT, intprm=_STRONGEST_FORCE)
+        contact.objtype = contact.reftype = mujoco.mjtObj.mjOBJ_GEOM
+        contact.objname, contact.refname = pad, pressed
     return spec
 
 
