@@ -42,13 +42,13 @@ class HandlePress(Sawyer):
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
         host.move("box", vec)
         _slide(host, -0.001)
-        return {"target": host.site("goalPress"), "handle_init": host.site("handleStart"), "obj_init": vec}
+        return {"target": host.site("goalPress"), "handle_init_pos": host.site("handleStart"), "obj_init": vec}
 
     def objects(self, at: At) -> tuple[Array, ...]:
         return at.position["handle"], jnp.zeros(4)
 
     def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
-        handle, start, target = at.position["handle"], began["handle_init"], began["target"]
+        handle, start, target = at.position["handle"], began["handle_init_pos"], began["target"]
         away = abs(handle[2] - target[2])
         in_place = near(away, _PRESSED, abs(abs(start[2] - target[2]) - _PRESSED))
         reach = near(distance(handle, at.tcp), 0.02, abs(distance(start, began["init_tcp"]) - 0.02))

@@ -48,7 +48,7 @@ class LeverPull(Sawyer):
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
         host.move("lever", vec)
         end = vec + np.array([0.12, -_LENGTH, 0.25])
-        return {"target": vec + np.array([0.12, 0.0, 0.25 + _LENGTH]), "end_init": end, "obj_init": vec}
+        return {"target": vec + np.array([0.12, 0.0, 0.25 + _LENGTH]), "lever_pos_init": end, "obj_init": vec}
 
     def objects(self, at: At) -> tuple[Array, ...]:
         cos, sin = jnp.cos(at.qpos[_LEVER] / 2), jnp.sin(at.qpos[_LEVER] / 2)
@@ -57,7 +57,7 @@ class LeverPull(Sawyer):
         return at.position["end"], scalar_last(turned)
 
     def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
-        end, start, target = at.obs[4:7], began["end_init"], began["target"]
+        end, start, target = at.obs[4:7], began["lever_pos_init"], began["target"]
         scale, to_shoulder = jnp.array([4.0, 1.0, 4.0]), jnp.array([0.0, 0.055, 0.07])
         below = jnp.linalg.norm((at.obs[:3] + to_shoulder - end) * scale)
         ready = near(below, 0.02, jnp.linalg.norm((began["init_tcp"] + to_shoulder - start) * scale))

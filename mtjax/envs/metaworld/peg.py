@@ -14,7 +14,11 @@ from mtjax.envs.metaworld.sawyer import Sawyer
 from mtjax.types import Array
 
 _RADIUS = 0.07  # [m] of both targets
-_CORNERS = ("bottom_right_corner_collision_box_", "top_left_corner_collision_box_")  # with 1 and 2 behind
+_HOLE = np.array([0.03, 0.0, 0.13])  # [m] from the block
+_BOXES = np.array(  # (2, 2, 3) [m] corners in the block's frame of two boxes before it, below and above the hole
+    [[[0.1, -0.11, 0.01], [-0.1, -0.15, 0.096]], [[0.1, -0.11, 0.16], [-0.1, -0.17, 0.19]]]
+)
+_TURN = np.array([[np.cos(1.57), np.sin(1.57), 0], [-np.sin(1.57), np.cos(1.57), 0], [0, 0, 1]])  # of the block
 
 
 def _inside_box(point: Array, corners: Array) -> Array:
@@ -54,9 +58,7 @@ class PegInsertSide(Sawyer):
         head = host.site("pegHead")
         host.move("box", vec[3:])
         host.place_free(vec[:3])
-        boxes = [[host.site(f"{corner}{i}") for corner in _CORNERS] for i in (1, 2)]
-        target = vec[3:] + np.array([0.03, 0.0, 0.13])
-        return {"target": target, "obj_init": vec[:3], "head_init": head, "boxes": np.array(boxes)}
+        return {"target": vec[3:] + _HOLE, "obj_init": vec[:3], "peg_head_pos_init": head}
 
     def objects(self, at: At) -> tuple[Array, ...]:
         return at.position["grasp"], scalar_last(at.quat["grasp"])
@@ -65,8 +67,9 @@ class PegInsertSide(Sawyer):
         peg, head, target = at.obs[4:7], at.position["head"], began["target"]
         scale = jnp.array([1.0, 2.0, 2.0])
         away = jnp.linalg.norm((head - target) * scale)
-        free = hamacher(_inside_box(head, began["boxes"][1]), _inside_box(head, began["boxes"][0]))
-        in_place = hamacher(near(away, _RADIUS, jnp.linalg.norm((began["head_init"] - target) * scale)), free)
+        below, above = target - _HOLE + _BOXES @ _TURN
+        free = hamacher(_inside_box(head, above), _inside_box(head, below))
+        in_place = hamacher(near(away, _RADIUS, jnp.linalg.norm((began["peg_head_pos_init"] - target) * scale)), free)
         caged = caging(at, began, peg, obj_radius=0.0075, pad_success_thresh=0.03, xz_thresh=0.005, high_density=True)
         held = (distance(peg, at.tcp) < 0.08) & (at.obs[3] > 0) & (peg[2] - 0.01 > began["obj_init"][2])
         reward = jnp.where(held, 1 + 6 * in_place, hamacher(caged, in_place))  # a product with 1 changes nothing

@@ -46,7 +46,7 @@ class StickPush(Sawyer):
         height = self.target_height(host)
         host.data.qpos[16:18], host.data.qvel[16:18] = self.flask_at, 0
         host.place_free(stick)
-        return {"target": np.array([*vec[3:5], height]), "stick_init": stick, "obj_init": host.body("object")}
+        return {"target": np.array([*vec[3:5], height]), "stick_init_pos": stick, "obj_init": host.body("object")}
 
     def target_height(self, host: Host) -> float:
         """Return the height [m] of the target."""
@@ -59,7 +59,7 @@ class StickPush(Sawyer):
     def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
         stick, flask, target = at.obs[4:7] + jnp.array([0.015, 0.0, 0.0]), at.obs[11:14], began["target"]
         away = distance(flask, target)
-        stick_in_place = near(distance(stick, target), _RADIUS, distance(began["stick_init"], target) - _RADIUS)
+        stick_in_place = near(distance(stick, target), _RADIUS, distance(began["stick_init_pos"], target) - _RADIUS)
         flask_in_place = near(away, _RADIUS, distance(began["obj_init"], target) - _RADIUS)
         caged = caging(
             at,
@@ -69,9 +69,9 @@ class StickPush(Sawyer):
             pad_success_thresh=0.05,
             xz_thresh=0.01,
             high_density=True,
-            obj_init=began["stick_init"],
+            obj_init=began["stick_init_pos"],
         )
-        lifted = (at.obs[3] > 0) & (stick[2] - 0.01 > began["stick_init"][2])
+        lifted = (at.obs[3] > 0) & (stick[2] - 0.01 > began["stick_init_pos"][2])
         reward = jnp.where(away <= _RADIUS, 10.0, 2 + 5 * stick_in_place + 3 * flask_in_place)
         reward = jnp.where(lifted & (distance(stick, at.tcp) < 0.02), reward, caged)
         return reward, lifted & (away <= _RADIUS) & jnp.all(at.press != 0)
@@ -105,7 +105,7 @@ class StickPull(StickPush):
     def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
         stick, handle, target = at.obs[4:7], at.obs[11:14], began["target"]
         to_flask, scale = jnp.array([0.05, 0.0, 0.0]), jnp.array([1.0, 1.0, 2.0])
-        flask, flask_init, stick_init = handle + to_flask, began["obj_init"], began["stick_init"]
+        flask, flask_init, stick_init = handle + to_flask, began["obj_init"], began["stick_init_pos"]
         margin = jnp.linalg.norm((stick_init - flask_init - to_flask) * scale)
         at_flask = near(jnp.linalg.norm((stick - flask) * scale), 0.05, margin)
         stick_in_place = near(distance(stick, target), 0.05, distance(stick_init, target))

@@ -34,13 +34,14 @@ class WindowOpen(Sawyer):
     goal_low: ClassVar = Sawyer.hand_low
     goal_high: ClassVar = Sawyer.hand_high
     watched: ClassVar = {"handle": "site:handleOpenStart"}
+    way_from: ClassVar[str] = "obj_init"  # from where the handle's way to the target is measured
     reach_shape: ClassVar[str] = "long_tail"
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
         host.move("window", vec)
         handle = host.site("handleOpenStart")
         host.data.qpos[9] = 0.0
-        return {"target": vec + np.array([0.2, 0.0, 0.0]), "way": np.array(0.2), "handle_init": handle}
+        return {"target": vec + np.array([0.2, 0.0, 0.0]), "obj_init": vec, "window_handle_pos_init": handle}
 
     def objects(self, at: At) -> tuple[Array, ...]:
         return at.position["handle"], jnp.zeros(4)
@@ -48,8 +49,9 @@ class WindowOpen(Sawyer):
     def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
         handle = at.position["handle"]
         away = abs(handle[0] - began["target"][0])
-        in_place = near(away, _RADIUS, abs(began["way"] - _RADIUS))
-        margin = abs(distance(began["handle_init"], began["init_tcp"]) - 0.02)
+        way = abs(began[self.way_from][0] - began["target"][0])
+        in_place = near(away, _RADIUS, abs(way - _RADIUS))
+        margin = abs(distance(began["window_handle_pos_init"], began["init_tcp"]) - 0.02)
         reach = tolerance(distance(handle, at.tcp), 0.0, 0.02, margin, self.reach_shape)
         return 10 * hamacher(reach, in_place), away <= _RADIUS
 
@@ -65,10 +67,11 @@ class WindowClose(WindowOpen):
 
     drawn: ClassVar = ((0.0, 0.75, 0.2), (0.0, 0.9, 0.2))
     watched: ClassVar = {"handle": "site:handleCloseStart"}
+    way_from: ClassVar[str] = "window_handle_pos_init"
     reach_shape: ClassVar[str] = "gaussian"
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
         host.move("window", vec)
         handle = host.site("handleCloseStart") + np.array([0.2, 0.0, 0.0])
         host.data.qpos[9] = 0.2
-        return {"target": vec, "way": abs(handle[0] - vec[0]), "handle_init": handle}
+        return {"target": vec, "obj_init": vec, "window_handle_pos_init": handle}
