@@ -1,15 +1,59 @@
 """The names of Meta-World's tasks and benchmarks (Yu et al. 2019; McLean et al. 2025), without importing any task."""
 
+from collections.abc import Sequence
 from typing import Any
 
 TASKS = {  # name -> "module:Class"
+    "assembly": "assembly:Assembly",
+    "basketball": "basketball:Basketball",
+    "bin-picking": "bin:BinPicking",
+    "box-close": "box:BoxClose",
+    "button-press": "button:ButtonPress",
+    "button-press-topdown": "button:ButtonPressTopdown",
+    "button-press-topdown-wall": "button:ButtonPressTopdownWall",
+    "button-press-wall": "button:ButtonPressWall",
+    "coffee-button": "coffee:CoffeeButton",
+    "coffee-pull": "coffee:CoffeePull",
+    "coffee-push": "coffee:CoffeePush",
+    "dial-turn": "dial:DialTurn",
+    "disassemble": "assembly:Disassemble",
+    "door-close": "door:DoorClose",
+    "door-lock": "lock:DoorLock",
+    "door-open": "door:DoorOpen",
+    "door-unlock": "lock:DoorUnlock",
+    "drawer-close": "drawer:DrawerClose",
+    "drawer-open": "drawer:DrawerOpen",
+    "faucet-close": "faucet:FaucetClose",
+    "faucet-open": "faucet:FaucetOpen",
+    "hammer": "hammer:Hammer",
+    "hand-insert": "hole:HandInsert",
+    "handle-press": "handle:HandlePress",
+    "handle-press-side": "handle:HandlePressSide",
+    "handle-pull": "handle:HandlePull",
+    "handle-pull-side": "handle:HandlePullSide",
+    "lever-pull": "lever:LeverPull",
+    "peg-insert-side": "peg:PegInsertSide",
+    "peg-unplug-side": "peg:PegUnplugSide",
+    "pick-out-of-hole": "hole:PickOutOfHole",
     "pick-place": "pick_place:PickPlace",
     "pick-place-wall": "pick_place:PickPlaceWall",
+    "plate-slide": "plate:PlateSlide",
+    "plate-slide-back": "plate:PlateSlideBack",
+    "plate-slide-back-side": "plate:PlateSlideBackSide",
+    "plate-slide-side": "plate:PlateSlideSide",
     "push": "push:Push",
     "push-back": "push:PushBack",
     "push-wall": "push:PushWall",
     "reach": "reach:Reach",
     "reach-wall": "reach:ReachWall",
+    "shelf-place": "shelf:ShelfPlace",
+    "soccer": "soccer:Soccer",
+    "stick-pull": "stick:StickPull",
+    "stick-push": "stick:StickPush",
+    "sweep": "sweep:Sweep",
+    "sweep-into": "sweep:SweepInto",
+    "window-close": "window:WindowClose",
+    "window-open": "window:WindowOpen",
 }
 FAMILIES: dict[str, tuple[str, dict[str, Any]]] = {f"metaworld-{name}": (place, {}) for name, place in TASKS.items()}
 
@@ -31,7 +75,7 @@ _ML10_TEST = "drawer-open door-close shelf-place sweep-into lever-pull".split()
 _ML45_TEST = "bin-picking box-close hand-insert door-lock door-unlock".split()
 
 
-def _mixed(train: list[str], test: list[str], **settings: Any) -> dict[str, dict[str, Any]]:
+def _mixed(train: Sequence[str], test: Sequence[str], **settings: Any) -> dict[str, dict[str, Any]]:
     """Return the settings of each family of a benchmark. Tasks of ``test`` are held out."""
     trained = {f"metaworld-{name}": settings for name in train}
     return trained | {f"metaworld-{name}": settings | {"held_out": True} for name in test}
