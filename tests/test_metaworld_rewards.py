@@ -4,8 +4,6 @@ What is observed, rewarded and called success follows from recorded poses; start
 """
 
 import importlib.util
-import pkgutil
-import re
 from importlib import import_module
 from pathlib import Path
 
@@ -14,11 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import mtjax.envs.metaworld
 from mtjax.envs.engines.base import World
+from mtjax.envs.metaworld import names
 from mtjax.envs.metaworld.at import At
 from mtjax.envs.metaworld.host import Host
-from mtjax.envs.metaworld.sawyer import Sawyer
 
 FOLDER = Path(__file__).parent / "data" / "metaworld"
 QUICK = ("assembly", "bin-picking", "coffee-pull", "door-open", "reach")
@@ -26,16 +23,13 @@ LOOSE = ("bin-picking", "door-close")  # a cube begins inside a wall, which thro
 INSTALLED = importlib.util.find_spec("metaworld") is not None
 
 
-def every_task(cls=Sawyer):
-    """Return the classes of all tasks by Meta-World's names, such as "door-open"."""
-    for module in pkgutil.iter_modules(mtjax.envs.metaworld.__path__):
-        import_module(f"mtjax.envs.metaworld.{module.name}")
-    below = [task for child in cls.__subclasses__() for task in every_task(child).values()]
-    classes = [x for x in (cls, *below) if not x.__abstractmethods__]
-    return {re.sub(r"(?<=[a-z])(?=[A-Z])", "-", x.__name__).lower(): x for x in classes}
+def find(place):
+    """Return the class at "module:Class"."""
+    module, _, name = place.partition(":")
+    return getattr(import_module(f"mtjax.envs.metaworld.{module}"), name)
 
 
-TASKS = every_task()
+TASKS = {name: find(place) for name, place in names.TASKS.items()}
 quick_or_slow = pytest.mark.parametrize(
     "name", [pytest.param(x, marks=() if x in QUICK else pytest.mark.slow) for x in sorted(TASKS)]
 )
