@@ -54,7 +54,7 @@ __getattr__ = lazily(
 )
 
 Settings = dict[str, Any]
-Entry = tuple[Any, dict[str, Any]]  # a family's class, or the place that it is imported from; and its settings
+Entry = tuple[Any, Settings]  # a family's class, or the place that it is imported from; and its settings
 
 
 class Families(UserDict[str, Entry]):
@@ -214,7 +214,7 @@ def is_mixture(name: str) -> bool:
     return "+" in name or name in BENCHMARKS
 
 
-def members(name: str) -> tuple[tuple[str, dict[str, Any]], ...]:
+def members(name: str) -> tuple[tuple[str, Settings], ...]:
     """Return the families that a name of ``make`` stands for, each with the settings that a benchmark has for it."""
     parts = [BENCHMARKS[part][1] if part in BENCHMARKS else {part: {}} for part in name.split("+")]
     return tuple(pair for part in parts for pair in part.items())
@@ -290,9 +290,7 @@ def name_of(family: Any) -> str:
     return next(iter((*exact, *plain, *known)), of_class)
 
 
-def _make_mixture(
-    own: tuple[tuple[str, dict[str, Any]], ...], vary: dict[str, Any], settings: dict[str, Any]
-) -> "Mixture":
+def _make_mixture(own: tuple[tuple[str, Settings], ...], vary: Settings, settings: Settings) -> "Mixture":
     """Make a mixture from its families' own settings, and values of parameters by "NAME.PARAMETER"."""
     cls, names = load("mtjax.envs.mixtures:Mixture"), tuple(name for name, _ in own)
     recorded = settings.pop("families", None)

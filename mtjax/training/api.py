@@ -163,9 +163,8 @@ def _configured(
     learner, training = configure(config.learner, base, rest)
     config = dataclasses.replace(config, training=training, learner=learner, start=_place_of(start))
     config = dataclasses.replace(config, plan=dataclasses.replace(config.plan, **plan))
-    return (
-        dataclasses.replace(config, imports=own_files(config)) if env_name in ENVS or is_mixture(env_name) else config
-    )
+    named = env_name in ENVS or is_mixture(env_name)
+    return dataclasses.replace(config, imports=own_files(config)) if named else config
 
 
 def _family(env: str | Tabled, start: Policy | None, given: dict[str, Any]) -> tuple[Tabled, dict[str, Any]]:

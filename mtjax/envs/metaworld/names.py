@@ -1,8 +1,28 @@
 """The names of Meta-World's tasks and benchmarks (Yu et al. 2019; McLean et al. 2025), without importing any task."""
 
+from collections.abc import Sequence
 from typing import Any
 
 TASKS = {  # name -> "module:Class"
+    "assembly": "assembly:Assembly",
+    "basketball": "basketball:Basketball",
+    "bin-picking": "bin:BinPicking",
+    "box-close": "box:BoxClose",
+    "button-press": "button:ButtonPress",
+    "button-press-topdown": "button:ButtonPressTopdown",
+    "button-press-topdown-wall": "button:ButtonPressTopdownWall",
+    "button-press-wall": "button:ButtonPressWall",
+    "coffee-button": "coffee:CoffeeButton",
+    "coffee-pull": "coffee:CoffeePull",
+    "coffee-push": "coffee:CoffeePush",
+    "dial-turn": "dial:DialTurn",
+    "disassemble": "assembly:Disassemble",
+    "door-close": "door:DoorClose",
+    "door-lock": "lock:DoorLock",
+    "door-open": "door:DoorOpen",
+    "door-unlock": "lock:DoorUnlock",
+    "drawer-close": "drawer:DrawerClose",
+    "drawer-open": "drawer:DrawerOpen",
     "faucet-close": "faucet:FaucetClose",
     "faucet-open": "faucet:FaucetOpen",
     "hammer": "hammer:Hammer",
@@ -55,7 +75,7 @@ _ML10_TEST = "drawer-open door-close shelf-place sweep-into lever-pull".split()
 _ML45_TEST = "bin-picking box-close hand-insert door-lock door-unlock".split()
 
 
-def _mixed(train: list[str], test: list[str], **settings: Any) -> dict[str, dict[str, Any]]:
+def _mixed(train: Sequence[str], test: Sequence[str], **settings: Any) -> dict[str, dict[str, Any]]:
     """Return the settings of each family of a benchmark. Tasks of ``test`` are held out."""
     trained = {f"metaworld-{name}": settings for name in train}
     return trained | {f"metaworld-{name}": settings | {"held_out": True} for name in test}

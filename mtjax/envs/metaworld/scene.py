@@ -89,7 +89,7 @@ def _shrink(spec: mujoco.MjSpec, weighs: range) -> None:
     heavy = {geom.meshname for geom in spec.geoms if geom.group in weighs}
     model = spec.copy().compile()
     for mesh in spec.meshes:
-        if mesh.name not in heavy:
+        if mesh.name not in heavy and model.mesh(mesh.name).graphadr[0] >= 0:  # only what collides has a hull
             mesh.uservert = _hull(model, mesh.name).ravel()
             mesh.file, mesh.scale = "", [1, 1, 1]
 
