@@ -13,6 +13,7 @@ to just after the first success. A file holds, with E episodes and K kept steps:
     start_qpos, start_qvel, start_mocap (E, 7: position and quaternion), start_obs (E, 39): after the reset
     const_NAME (E, ...): what the reset left in the environment's attribute of that name, in snake case. target is
         _target_pos, obj_init is obj_init_pos. One that is None until the first step has its value after it.
+    boxes (2, 6 + n) float64: least and greatest place of the hand's target (3), goal in observations (3), and rand_vec
     live (n,): the constants that are views of the simulator's arrays and so change with every step
     watched (W,): "body:NAME", "site:NAME" or "geom:NAME" of all that the task's class reads, but for the robot
     episode, time (K,): which step is kept; time 1 is the first after the start
@@ -106,6 +107,15 @@ def pose(env, watched):
     return np.concatenate([thing.xpos, thing.xquat if kind == "body" else quat])
 
 
+def boxes(name):
+    """Return the least and greatest hand's target, goal in observations, and drawn vector (2, 6 + n)."""
+    env = ALL_V3_ENVIRONMENTS[name]()
+    drawn, goal = env._random_reset_space, env.goal_space
+    return np.stack(
+        [np.hstack([env.mocap_low, goal.low, drawn.low]), np.hstack([env.mocap_high, goal.high, drawn.high])]
+    )
+
+
 def mocap(env):
     return np.concatenate([env.data.mocap_pos[0], env.data.mocap_quat[0]])
 
@@ -163,8 +173,9 @@ def record(name):
     data |= {key: np.stack([np.asarray(step[key]) for step in kept]) for key in kept[0]}
     small = {np.dtype(np.float64): np.float32, np.dtype(np.int64): np.int16}
     data = {key: x if key == "rand_vec" else x.astype(small.get(x.dtype, x.dtype)) for key, x in data.items()}
+    words = {"watched": np.array(watch(name)), "live": np.array(live, dtype=np.str_)}
     file = FOLDER / f"{name.removesuffix('-v3')}.npz"
-    np.savez_compressed(file, watched=np.array(watch(name)), live=np.array(live, dtype=np.str_), **data)
+    np.savez_compressed(file, boxes=boxes(name), **words, **data)
     return f"{len(kept)} steps kept of " + " and ".join(ended) + f"; {file.stat().st_size / 1000:.1f} kB; live: {live}"
 
 

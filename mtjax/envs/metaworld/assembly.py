@@ -52,7 +52,7 @@ class Assembly(Sawyer):
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
         nut, target = np.split(vec, 2)
         host.place_free(nut)
-        host.move("peg", target - (0, 0, 0.05))
+        host.move("peg", target - np.array([0.0, 0.0, 0.05]))
         return {"target": target, "obj_init": nut}
 
     def objects(self, at: At) -> tuple[Array, ...]:
@@ -94,9 +94,9 @@ class Disassemble(Sawyer):
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
         nut = vec[:3]
-        host.move("peg", nut + (0, 0, 0.03))
+        host.move("peg", nut + np.array([0.0, 0.0, 0.03]))
         host.place_free(nut)
-        return {"target": nut + (0, 0, 0.15), "obj_init": nut}
+        return {"target": nut + np.array([0.0, 0.0, 0.15]), "obj_init": nut}
 
     def objects(self, at: At) -> tuple[Array, ...]:
         return at.position["handle"], at.quat["nut"]

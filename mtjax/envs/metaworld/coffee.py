@@ -48,7 +48,7 @@ class CoffeeButton(Sawyer):
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
         host.move("coffee_machine", vec)
         _place_mug(host, vec - _BEHIND)
-        return {"target": vec - _BEHIND + (0, _DEPTH, 0.3)}
+        return {"target": vec - _BEHIND + np.array([0.0, _DEPTH, 0.3])}
 
     def objects(self, at: At) -> tuple[Array, ...]:
         return at.position["button"], jnp.array([1.0, 0.0, 0.0, 0.0])

@@ -38,7 +38,7 @@ class DialTurn(Sawyer):
         host.move("dial", vec)
         angle = host.data.qpos[_HINGE]
         mark = host.body("dial") + _RADIUS * np.array([np.sin(angle), -np.cos(angle), 0.0])
-        return {"target": vec + (0, 0.03, 0.03), "dial_push_position": mark + _PUSH}
+        return {"target": vec + np.array([0.0, 0.03, 0.03]), "dial_push_position": mark + _PUSH}
 
     def objects(self, at: At) -> tuple[Array, ...]:
         angle = at.qpos[_HINGE]

@@ -15,6 +15,7 @@ from mtjax.envs.metaworld.sawyer import Sawyer
 from mtjax.types import Array
 
 _SLIDE = 9  # the place of the drawer's joint in qpos
+_HANDLE = (0.0, -0.16, 0.05)  # [m] from the drawer's frame to where its handle is pushed
 _OPEN = 0.2  # [m] that the drawer is to be pulled
 
 
@@ -35,7 +36,7 @@ class DrawerOpen(Sawyer):
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
         host.move("drawer", vec)
-        return {"target": vec + (0, -0.16 - _OPEN, 0.09)}
+        return {"target": vec + np.array([0.0, -0.16 - _OPEN, 0.09])}
 
     def objects(self, at: At) -> tuple[Array, ...]:
         return at.position["drawer"] + jnp.array([0.0, -0.16, 0.0]), at.quat["drawer"]
@@ -70,10 +71,13 @@ class DrawerClose(Sawyer):
         host.move("drawer", vec)
         host.data.qpos[_SLIDE] = -0.15
         host.forward()
-        return {"target": vec + (0, -0.16, 0.09), "obj_init": host.body("drawer_link") + (0, -0.16, 0.05)}
+        return {
+            "target": vec + np.array([0.0, -0.16, 0.09]),
+            "obj_init": host.body("drawer_link") + np.array([0.0, -0.16, 0.05]),
+        }
 
     def objects(self, at: At) -> tuple[Array, ...]:
-        return at.position["drawer"] + jnp.array([0.0, -0.16, 0.05]), jnp.zeros(4)
+        return at.position["drawer"] + jnp.array(_HANDLE), jnp.zeros(4)
 
     def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
         handle, target, start = at.obs[4:7], began["target"], began["obj_init"]

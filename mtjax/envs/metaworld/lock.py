@@ -39,7 +39,7 @@ class DoorLock(Sawyer):
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
         host.move("door", vec)
         mujoco.mj_step(host.model, host.data, SUBSTEPS)
-        return {"target": host.body("lock_link") + (0, -0.04, -0.1)}
+        return {"target": host.body("lock_link") + np.array([0.0, -0.04, -0.1])}
 
     def objects(self, at: At) -> tuple[Array, ...]:
         return at.position["lock"], at.quat["door"]
@@ -72,7 +72,7 @@ class DoorUnlock(Sawyer):
         host.data.qpos[_HINGE], host.data.qvel[_HINGE] = 1.5708, 0
         host.forward()
         start = host.body("lock_link")
-        return {"target": start + (0.1, -0.04, 0.0), "obj_init": start}
+        return {"target": start + np.array([0.1, -0.04, 0.0]), "obj_init": start}
 
     def objects(self, at: At) -> tuple[Array, ...]:
         return at.position["lock"], at.quat["door"]
