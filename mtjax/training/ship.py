@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mtjax import commands, shipped
+from mtjax.config import RunConfig
 from mtjax.names import InputError
 from mtjax.training.export import steps_of
 from mtjax.training.policy import Policy, load
@@ -29,7 +30,7 @@ def write(run: str | Path, directory: Path) -> None:
     record = json.loads((Path(run) / _SETTINGS).read_text(encoding="utf-8"))
     if record.get("points"):
         raise InputError(f"{str(run)!r} holds several settings of a sweep; ship a run of one")
-    record["plan"]["seeds"] = 1
+    record["plan"]["seeds"], record["runs"] = 1, RunConfig.runs
     leaves = jax.tree.leaves(policy.state)
     arrays: Any = {str(i): np.asarray(leaves[i]) for i in read_by_acting(policy)}
     directory.mkdir(parents=True)
