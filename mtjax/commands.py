@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+from mtjax import shipped
 from mtjax.agents import AGENTS
 from mtjax.envs import BENCHMARKS, ENVS, members, outline, varied
 from mtjax.names import InputError, Notice, nearest_error
@@ -85,8 +86,9 @@ def catalogue() -> str:
     lines.append("benchmarks, which are mixtures of the above:")
     for name, (says, families) in BENCHMARKS.items():
         lines.append(f"  {name:36} {sum('held_out' not in s for s in families.values()):3} tasks  {says}")
-    lines.append("agents:")
-    return "\n".join(lines + [f"  {name:36} {preset.says}" for name, preset in AGENTS.items()])
+    lines += ["agents:", *(f"  {name:36} {preset.says}" for name, preset in AGENTS.items())]
+    lines += ["trained policies (python -m mtjax.evaluate --run=NAME, or mtjax.load(NAME)):"]
+    return "\n".join(lines + [f"  {name}" for name in shipped.names()])
 
 
 def overview() -> str:
