@@ -15,10 +15,10 @@ import pickle
 import sys
 import time
 
-import metaworld
 import numpy as np
 from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 from metaworld.policies import ENV_POLICY_MAP
+from metaworld.types import Task
 
 
 def begin(name, vector):
@@ -26,7 +26,7 @@ def begin(name, vector):
     cls = ALL_V3_ENVIRONMENTS[f"{name}-v3"]
     env = cls()
     given = {"env_cls": cls, "rand_vec": np.asarray(vector), "partially_observable": False}
-    env.set_task(metaworld.Task(name, pickle.dumps(given)))
+    env.set_task(Task(name, pickle.dumps(given)))
     return env, env.reset()[0]
 
 

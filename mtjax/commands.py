@@ -127,11 +127,12 @@ def check_names(argv: Sequence[str]) -> None:
     """
     for kind, flag, known in _KNOWN:
         given = flag_value(argv, flag, None)
-        several = flag == "env" and given is not None  # of a mixture
-        names = [name for name, _ in members(given)] if several else [given]
-        wrong = next((name for name in names if name is not None and name not in known), None)
+        if given is None:
+            continue
+        names = [name for name, _ in members(given)] if flag == "env" else [given]  # a mixture has several
+        wrong = next((name for name in names if name not in known), None)
         if wrong is not None:
-            raise nearest_error(kind, wrong, (*known, *BENCHMARKS) if several else known)
+            raise nearest_error(kind, wrong, (*known, *BENCHMARKS) if flag == "env" else known)
     _check_numbers(argv)
     given = {word.split("=", 1)[0] for word in argv if word.startswith("--")}
     other = ", ".join(sorted(given - _MAY_CHANGE))

@@ -14,7 +14,6 @@ from mtjax.names import replacing
 from mtjax.rollout import Worlds, reset_envs, step_envs
 from mtjax.types import SPLITS, Agent, Array, Env, InputError, Task
 
-
 _EVER = "success_ever"  # the metric that success was 1 at any step of an episode
 
 

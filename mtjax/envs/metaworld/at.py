@@ -1,7 +1,7 @@
 """What rewards read of a world, and how Meta-World writes orientations."""
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
@@ -19,7 +19,7 @@ class At(NamedTuple):
     position: Mapping[str, Array]  # (3,) [m] of each watched thing, by its short name
     quat: Mapping[str, Array]  # (4,) w x y z of each watched thing
     qpos: Array  # (nq,)
-    press: Array = ()  # (2,) [N] force of the left and the right pad on the geom ``pressed``, if the task names one
+    press: Any = ()  # (2,) [N] force of the left and the right pad on the geom ``pressed``, if the task names one
 
 
 def scalar_last(quat: Array) -> Array:

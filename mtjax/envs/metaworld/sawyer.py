@@ -76,9 +76,11 @@ class Sawyer(Domain):
 
     def __post_init__(self):
         scene.folder()
-        super().__post_init__()
         if self.vary:
-            raise InputError(f"Meta-World's tasks vary in their goals only, not in {self.vary[0][0]}")
+            raise InputError(f"Meta-World's tasks vary in their goals only, not in {next(iter(dict(self.vary)))}")
+        super().__post_init__()
+        if self.pixels:
+            raise InputError("Meta-World's scenes are read without what is only seen; leave out --env.pixels")
         if self.engine == "mjx":
             raise InputError("engine 'mjx' cannot compute Meta-World's cylinders on boxes; use --engine=c or warp")
 
