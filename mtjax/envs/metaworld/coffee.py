@@ -65,6 +65,8 @@ class CoffeePull(Sawyer):
     Reward: 10 with the mug at the goal (0.05 m, where x and y count twice); else the product of the caging reward and
         a long tail of the mug's way to the goal, and once the mug is held, 1 and 5 times that tail.
     Success: the mug is within 0.07 m of the goal.
+
+    The observation has the mug's orientation as x, y, z, w.
     """
 
     scene: ClassVar[str] = "sawyer_coffee"

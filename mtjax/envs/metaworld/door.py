@@ -36,6 +36,8 @@ class DoorOpen(Sawyer):
     Reward: 10 on success; else 8 times how far the door is open, and 2 times the product of how firmly the gripper
         closes (1 closing, 0 opening) and how well the hand comes to the handle: near it and above a funnel about it.
     Success: along x, the handle is within 0.08 m of the goal.
+
+    The observation has the handle's orientation as x, y, z, w.
     """
 
     scene: ClassVar[str] = "sawyer_door_pull"
@@ -67,6 +69,8 @@ class DoorClose(Sawyer):
     Reward: 10 with the handle within 0.05 m of the goal; else 6 times a Gaussian of the way from handle to goal, and 3
         times one of the way from tool centre to goal.
     Success: the handle is within 0.08 m of the goal.
+
+    The observation has the handle's orientation as x, y, z, w.
     """
 
     scene: ClassVar[str] = "sawyer_door_pull"

@@ -58,7 +58,7 @@ class DrawerClose(Sawyer):
         closes, and how near the handle is to the goal.
     Success: the handle is within 0.065 m of the goal.
 
-    The observation has zeros for the drawer's orientation. The goal is 0.04 m above where the handle can come.
+    The observation has zeros for the drawer's orientation. The handle of the closed drawer is 0.051 m from the goal.
     """
 
     scene: ClassVar[str] = "sawyer_drawer"
