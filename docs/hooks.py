@@ -87,7 +87,8 @@ def families_page() -> str:
         for name in names:
             count, says = envs.outline(name)
             text += f"| [{name}]({name}.md) | {count} | {says} |\n"
-    text += "\n## Benchmarks\n\nMixtures of the families above, by a name.\n\n| benchmark | training tasks | |\n|---|---|---|\n"
+    text += "\n## Benchmarks\n\nMixtures of the families above, by a name.\n\n"
+    text += "| benchmark | training tasks | |\n|---|---|---|\n"
     for name, (says, own) in envs.BENCHMARKS.items():
         text += f"| `{name}` | {sum('held_out' not in settings for settings in own.values())} | {says} |\n"
     return text
