@@ -20,14 +20,20 @@ TASKS = {
     "cartpole": ("balance", "balance_sparse", "swingup", "swingup_sparse"),
     "cheetah": ("run",),
     "finger": ("spin", "turn_easy", "turn_hard"),
+    "fish": ("swim", "upright"),
     "hopper": ("hop", "stand"),
+    "humanoid": ("run", "stand", "walk"),
     "pendulum": ("swingup",),
     "point_mass": ("easy",),
     "reacher": ("easy", "hard"),
+    "swimmer": ("swimmer6", "swimmer15"),
     "walker": ("run", "stand", "walk"),
 }
 SUITE = {f"{domain}-{task}".replace("_", "-"): (domain, task) for domain in TASKS for task in TASKS[domain]}
-TOUCHING = ("ball-in-cup-catch", "cheetah-run", "finger-spin", "hopper-stand", "walker-walk")
+TOUCHING = ("ball-in-cup-catch", "cheetah-run", "finger-spin", "hopper-stand", "humanoid-stand", "walker-walk")
+# Tasks whose target is a geom, by the beginnings of their names, and the axes along which it is put.
+TARGETS = {"reacher": "xy", "swimmer": "xy", "fish-swim": "xyz"}
+FASTEST = {"fish": 0.3, "swimmer": 1}  # beyond which water stops what is this light within a step; elsewhere 10
 DYNAMICS = ("body_", "jnt_", "dof_", "geom_", "actuator_", "tendon_", "wrap_", "eq_", "qpos")
 # Read by a renderer or the broad phase alone; what touches what is compared by its outcome.
 NOT_DYNAMICS = ("bvh", "rgba", "matid", "contype", "conaffinity")
@@ -35,13 +41,13 @@ EXCLUDED = {
     # Whether energy is computed: nothing reads it, and MJX refuses it.
     **{name: {"enableflags"} for name, (domain, _) in SUITE.items() if domain in ("acrobot", "cartpole", "pendulum")},
     # Whether islands of constraints are told apart: all bodies are one, whose motion is the same to rounding.
-    **{name: {"disableflags"} for name, (domain, _) in SUITE.items() if domain in ("cheetah", "hopper", "walker")},
+    **{name: {"disableflags"} for name, (domain, _) in SUITE.items() if domain in ("cheetah", "hopper", "humanoid", "walker")},
     # dm_control resizes the target after compilation, so that its bounds stay those of the big one; it never collides.
     "reacher-hard": {"geom_rbound", "geom_aabb"},
 }
 # What a parameter may change, by the last word of its name; any other is one of shape. All else must stay.
 MASS = ("body_mass", "body_subtreemass", "inertia", "ipos", "iquat", "invweight0", "dof_M0", "dof_length", "acc0")
-SHAPE = (*MASS, "body_pos", "geom_", "site_", "tendon_range")
+SHAPE = (*MASS, "body_pos", "jnt_pos", "geom_", "site_", "tendon_range")
 PARAMETERS = {
     "mass": MASS,
     "gravity": ("gravity",),
@@ -49,6 +55,8 @@ PARAMETERS = {
     "frictionloss": ("dof_frictionloss",),
     "damping": ("damping",),
     "gear": ("actuator_gear", "actuator_length0", "acc0"),
+    "strength": ("actuator_gainprm", "actuator_biasprm"),
+    "density": ("density",),
 }
 READINGS = {  # where a compiled model shows the value of a parameter
     ("acrobot-swingup", "lower-mass"): lambda model: model.body("lower_arm").mass[0],
@@ -70,6 +78,7 @@ class Suite(NamedTuple):
     """One of dm_control's environments, of which only physics and task are used."""
 
     domain: str
+    axes: str  # of its target, or none
     physics: object
     task: object
     num_substeps: int
@@ -95,27 +104,27 @@ class Suite(NamedTuple):
         return self.observe(), self.task.get_reward(self.physics)
 
     def target(self):
-        """What our worlds carry beside the physical state, (2,): the target; that of finger is from its hinge."""
+        """What our worlds carry beside the physical state, (2,) or (3,): the target; that of finger is from its hinge."""
         model, data = self.physics.named.model, self.physics.named.data
-        if self.domain == "reacher":
-            return model.geom_pos["target", ["x", "y"]]
+        if self.axes:
+            return model.geom_pos["target", list(self.axes)]
         if isinstance(self.task, suite.finger.Turn):
             return model.site_pos["target", ["x", "z"]] - data.xanchor["hinge", ["x", "z"]]
 
     def put_target(self, target):
         model, data = self.physics.named.model, self.physics.named.data
-        if self.domain == "reacher":
-            model.geom_pos["target", ["x", "y"]] = target
+        if self.axes:
+            model.geom_pos["target", list(self.axes)] = target
         if isinstance(self.task, suite.finger.Turn):
             model.site_pos["target", ["x", "z"]] = data.xanchor["hinge", ["x", "z"]] + target
 
 
 def polar(target):
-    """Distance and direction, each with a last axis of 1, of a target (..., 2); nothing of no target."""
+    """Distance, direction and height, each with a last axis of 1, of a target (..., 2) or (..., 3); or nothing."""
     if target is None:
         return []
-    x, y = np.split(np.asarray(target), 2, axis=-1)
-    return [np.hypot(x, y), np.arctan2(y, x)]
+    x, y, *z = np.split(np.asarray(target), np.shape(target)[-1], axis=-1)
+    return [np.hypot(x, y), np.arctan2(y, x), *z]
 
 
 @lru_cache
@@ -123,7 +132,8 @@ def load(name: str) -> Suite:
     domain, task = SUITE[name]
     made = suite.load(domain, task, task_kwargs={"random": 0})
     made.reset()
-    return Suite(domain, made.physics, made.task, made._n_sub_steps, made._step_limit)
+    axes = next((axes for start, axes in TARGETS.items() if name.startswith(start)), "")
+    return Suite(domain, axes, made.physics, made.task, made._n_sub_steps, made._step_limit)
 
 
 @lru_cache
@@ -141,8 +151,9 @@ def starts(name: str):
     return jax.jit(jax.vmap(env.reset))(repeat(env, STARTS), jax.random.split(jax.random.key(0), STARTS))
 
 
-def play(env: Domain, begin: World, random: np.random.Generator) -> World:
+def play(name: str, begin: World, random: np.random.Generator) -> World:
     """Worlds in the midst of random play, and as many about the model's own pose, fast and slow."""
+    env = make(name)
     model, count = env.models[0], STATES // 2
     data, played = mujoco.MjData(model), []
     for qpos in np.asarray(begin.qpos[:count]):
@@ -154,7 +165,8 @@ def play(env: Domain, begin: World, random: np.random.Generator) -> World:
         played.append((data.qpos.copy(), data.qvel.copy()))
     qpos, qvel = zip(*played, strict=True)
     posed = model.qpos0 + random.choice([0.01, 0.1], (count, 1)) * random.normal(size=(count, model.nq))
-    speed = random.choice([0.1, 10], (count, 1)) * random.normal(size=(count, model.nv))
+    fastest = FASTEST.get(load(name).domain, 10)
+    speed = random.choice([0.1, fastest], (count, 1)) * random.normal(size=(count, model.nv))
     qpos, qvel = np.float32([*qpos, *posed]), np.float32([*qvel, *speed])
     rest = jax.tree.map(lambda x: x[:STATES], begin)
     return rest._replace(qpos=qpos, qvel=qvel, warmstart=np.zeros_like(qvel))
@@ -176,8 +188,8 @@ def differing(ours, theirs):
 def test_model_and_timing_are_those_of_dm_control(name):
     """Every field that reaches the dynamics is equal, but for the named exclusions."""
     env, theirs = make(name), load(name)
-    if theirs.domain == "reacher":
-        theirs.put_target(np.zeros(2))
+    if theirs.axes:
+        theirs.put_target(env.models[0].geom("target").pos[: len(theirs.axes)])
     ours = fields_of(env.models[0])
     assert len(ours) > 150
     assert differing(ours, fields_of(theirs.physics.model.ptr)) == EXCLUDED.get(name, set())
@@ -188,7 +200,7 @@ def test_model_and_timing_are_those_of_dm_control(name):
 def test_a_step_gives_the_observation_and_reward_of_dm_control(name):
     """Of 400 states the 25 of highest reward and 25 others, to float32 rounding of the numbers that go into them."""
     env, theirs, random = make(name), load(name), np.random.default_rng(0)
-    worlds = play(env, starts(name).state, random)
+    worlds = play(name, starts(name).state, random)
     actions = np.float32(random.uniform(-1, 1, (STATES, env.action_size)))
     after = jax.device_get(jax.jit(jax.vmap(env.step))(repeat(env, STATES), worlds, actions))
     best, rest = np.split(np.argsort(-after.reward, kind="stable"), [25])
@@ -204,8 +216,12 @@ def test_a_step_gives_the_observation_and_reward_of_dm_control(name):
 def test_what_touches_is_what_touches_in_dm_control(name):
     """In 600 random positions the same geoms meet: what we leave out of collision detection is never in reach."""
     model, physics, random = make(name).models[0], load(name).physics, np.random.default_rng(0)
-    free = np.where(model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE, np.pi, 0.25)  # [rad or m]
-    limits = np.where(model.jnt_limited, model.jnt_range.T, [-free, free])
+    limits = np.tile([[-1.0], [1.0]], model.nq)  # of quaternions
+    for place, kind, limited, given in zip(model.jnt_qposadr, model.jnt_type, model.jnt_limited, model.jnt_range, strict=True):
+        free = np.pi if kind == mujoco.mjtJoint.mjJNT_HINGE else 0.25  # [rad or m]
+        limits[:, place] = given if limited else [-free, free]
+        if kind == mujoco.mjtJoint.mjJNT_FREE:
+            limits[:, place + 2] = [0.2, 1.5]
     data, contacts = mujoco.MjData(model), 0
     for _ in range(600):
         data.qpos[:] = random.uniform(*limits)
@@ -222,7 +238,7 @@ def test_starts_are_distributed_as_in_dm_control(name):
     """Joint positions, velocities, observations and targets of 1000 starts against 1000.
 
     Two-sample Kolmogorov-Smirnov: equal laws exceed the bound for one column in 10 000. Rank correlations have a
-    standard error of 0.04. Ends of the range differ by less than twice the expected tail of a hundredth. Where starts
+    standard error of 0.04. Ends of the range differ by less than three times the expected tail of a hundredth. Where starts
     come from a pool, it is the pool's size that counts, and it need not reach the ends.
     """
     step, theirs = starts(name), load(name)
@@ -236,7 +252,7 @@ def test_starts_are_distributed_as_in_dm_control(name):
         assert np.abs(share_below(a, [*a, *b]) - share_below(b, [*a, *b])).max() < 2.2 * error
         low, high = np.quantile(b, [0.01, 0.99])
         beyond = np.array([b.min() - a.min(), a.max() - b.max()])
-        tails = 2 * np.array([low - b.min(), b.max() - high]) + 1e-4
+        tails = 3 * np.array([low - b.min(), b.max() - high]) + 1e-4
         assert np.all(beyond < tails) and (count < STARTS or np.all(-beyond < tails))
     correlations = [np.corrcoef([share_below(x, x) for x in group[spread]]) for group in (ours, expected)]
     np.testing.assert_allclose(*correlations, atol=5 * error)

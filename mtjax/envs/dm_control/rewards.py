@@ -20,7 +20,8 @@ def tolerance(
 
     Args:
         x: () or any shape; the bounds and the margin may be arrays. A margin of 0 gives 0 outside the bounds.
-        sigmoid: shape of the fall: "gaussian", "linear" or "quadratic". The last two reach 0 and stay there.
+        sigmoid: shape of the fall: "gaussian", "long-tail", "linear" or "quadratic". The last two reach 0 and stay
+            there.
     """
     outside = jnp.maximum(jnp.maximum(lower - x, x - upper), 0.0)
     distance = outside / jnp.where(jnp.asarray(margin) > 0, margin, 1.0)
@@ -32,6 +33,10 @@ def _gaussian(distance: Array, value: float) -> Array:
     return jnp.exp(-0.5 * jnp.square(distance * np.sqrt(-2 * np.log(value))))
 
 
+def _long_tail(distance: Array, value: float) -> Array:
+    return 1 / (1 + jnp.square(distance) * (1 / value - 1))
+
+
 def _linear(distance: Array, value: float) -> Array:
     return jnp.maximum(1 - distance * (1 - value), 0.0)
 
@@ -40,4 +45,4 @@ def _quadratic(distance: Array, value: float) -> Array:
     return jnp.maximum(1 - jnp.square(distance) * (1 - value), 0.0)
 
 
-_SIGMOIDS = {"gaussian": _gaussian, "linear": _linear, "quadratic": _quadratic}
+_SIGMOIDS = {"gaussian": _gaussian, "long-tail": _long_tail, "linear": _linear, "quadratic": _quadratic}
