@@ -275,7 +275,7 @@ def test_a_model_with_a_state_of_its_own_is_refused():
     """A clock would read differently in the same state."""
     base = mujoco.MjModel.from_xml_string(ROD % "<clock/>")
     for engine in (Mjx, lambda base, count: MujocoC([base], count)):
-        with pytest.raises(InputError, match="no state but positions and velocities"):
+        with pytest.raises(InputError, match="remember nothing but positions, velocities and activations"):
             engine(base, 1)
 
 

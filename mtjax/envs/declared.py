@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import jax
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 import mujoco
 
 from mtjax.envs.domain import Domain
-from mtjax.envs.engines.base import World
+from mtjax.envs.engines.base import at_rest
 from mtjax.envs.family import Family
 from mtjax.envs.parameters import Parameter
 from mtjax.names import InputError, nearest_error
@@ -192,16 +193,15 @@ def _check_domain(family: Domain, task: Task, key: Any) -> None:
     if not model.nu:
         raise InputError(f"{name}.model_file has no actuators, so that an agent has nothing to do")
     started = _abstract(family, "start", task, key)
-    if not isinstance(started, tuple) or len(started) not in (2, 3):
-        raise InputError(f"{name}.start must return positions and velocities, and one thing more if worlds carry it")
+    if not isinstance(started, tuple) or len(started) not in (2, 3, 4):
+        raise InputError(f"{name}.start must return positions and velocities, and what else worlds carry")
     for what, found, size in zip(("positions", "velocities"), started, (model.nq, model.nv), strict=False):
         _require(family, "start", what, found, (size,))
     vector: Any = lambda size: jax.ShapeDtypeStruct((size,), jnp.float32)
-    sensors = vector(model.nsensordata) if model.nsensordata else None
-    world: Any = World(vector(model.nq), vector(model.nv), vector(model.nv), sensors, *started[2:])
+    world = jax.eval_shape(partial(at_rest, model), *started)
     obs = _abstract(family, "observe", task, world)
     _require_observation(family, "observe", obs)
-    _require(family, "reward", "a number", _abstract(family, "reward", task, world, vector(model.nu)), ())
+    _require(family, "reward", "a number", _abstract(family, "reward", task, world, vector(family.action_size)), ())
     _require(family, "terminates", "a bool", _abstract(family, "terminates", task, world), (), jnp.bool_)
 
 

@@ -74,7 +74,14 @@ class Domain(Pictured):
 
     @abc.abstractmethod
     def start(self, task: Task, key: Key) -> tuple[Array, ...]:
-        """Draw start positions (nq,) and velocities (nv,) of an episode, and what else a world carries."""
+        """Draw start positions (nq,) and velocities (nv,) of an episode.
+
+        A domain with memory of the episode returns it too, and then, if it moves bodies, their poses (nmocap, 7).
+        """
+
+    def control(self, task: Task, world: World, action: Array) -> tuple[World, Array]:
+        """Return the world with what an action (A,) sets in it, and the controls (nu,) of the step."""
+        return world, action
 
     @abc.abstractmethod
     def observe(self, task: Task, world: World) -> Array:
@@ -108,12 +115,12 @@ class Domain(Pictured):
 
         def once(_, carry: tuple[World, Array, Array]) -> tuple[World, Array, Array]:
             world, total, over = carry
-            world = self.simulator.step(task, world, action)
+            world = self.simulator.step(task, *self.control(task, world, action))
             total += jnp.where(over, 0.0, self.reward(task, world, action))
             return world, total, over | self.terminates(task, world)
 
         if self.repeat == 1:
-            world = self.simulator.step(task, state, action)
+            world = self.simulator.step(task, *self.control(task, state, action))
             reward, over = self.reward(task, world, action), self.terminates(task, world)
         else:
             world, reward, over = jax.lax.fori_loop(0, self.repeat, once, (state, jnp.float32(0), jnp.bool_(False)))
@@ -134,7 +141,8 @@ class Domain(Pictured):
     def set_physics(self, task: Task, state: World, qpos: Array, qvel: Array) -> World:
         """Return the same state with the given positions (nq,) and velocities (nv,)."""
         as_float = lambda x: jnp.asarray(x, jnp.float32)
-        return self.simulator.forward(task, as_float(qpos), as_float(qvel), None if state is None else state.extra)
+        kept = () if state is None else (state.extra, state.mocap)
+        return self.simulator.forward(task, as_float(qpos), as_float(qvel), *kept)
 
     def leaf(self, task: Task, name: str) -> Array:
         """Return a field of the task's compiled model by its name in MJX, such as "geom_size" (ngeom, 3)."""

@@ -11,7 +11,9 @@ from functools import lru_cache
 from typing import Any, NamedTuple, Protocol
 
 import jax
+import jax.numpy as jnp
 import mujoco
+import numpy as np
 
 from mtjax.types import Array, InputError, Task
 
@@ -26,13 +28,15 @@ class World(NamedTuple):
     warmstart: Array  # (nv,) last constrained acceleration, where the next solve starts
     sensors: Any  # (nsensordata,); None where the model has none
     extra: Any = None  # the domain's own memory of the episode; engines leave it alone
+    act: Any = None  # (na,) activations of actuators; None where the model has none
+    mocap: Any = None  # (nmocap, 7) position and quaternion of bodies that a domain moves; None where there are none
 
 
 class Engine(Protocol):
     """The physics of every task of one family. ``task`` selects the model; worlds are not batched."""
 
-    def forward(self, task: Task, qpos: Array, qvel: Array, extra: Any = None) -> World: ...
-    def place(self, task: Task, qpos: Array, qvel: Array, extra: Any = None) -> World: ...
+    def forward(self, task: Task, qpos: Array, qvel: Array, extra: Any = None, mocap: Any = None) -> World: ...
+    def place(self, task: Task, qpos: Array, qvel: Array, extra: Any = None, mocap: Any = None) -> World: ...
     def step(self, task: Task, world: World, ctrl: Array) -> World: ...
     def touching(self, task: Task, qpos: Array) -> Array: ...
 
@@ -83,14 +87,25 @@ def some(values: Array) -> Array | None:
     return values if values.size else None
 
 
+def at_rest(model: mujoco.MjModel, qpos: Array, qvel: Array, extra: Any = None, mocap: Any = None) -> World:
+    """Return a world without activations and sensor values. Bodies of motion capture are where the model has them."""
+    act = jnp.zeros(model.na, qpos.dtype) if model.na else None
+    if mocap is None and model.nmocap:
+        moved = model.body_mocapid >= 0
+        order = np.argsort(model.body_mocapid[moved])
+        mocap = np.float32(np.concatenate([model.body_pos[moved], model.body_quat[moved]], axis=1)[order])
+    sensors = some(jnp.zeros(model.nsensordata, qpos.dtype))
+    return World(qpos, qvel, jnp.zeros_like(qvel), sensors, extra, act, mocap)
+
+
 def require_plain(model: mujoco.MjModel) -> None:
-    """Refuse a model with more state than positions and velocities.
+    """Refuse a model with more state than positions, velocities, activations and motion capture.
 
     Raises:
-        InputError: the model has actuators with activations, delays, or a clock sensor.
+        InputError: the model has delays or a clock sensor.
     """
-    if model.na or model.nhistory or mujoco.mjtSensor.mjSENS_CLOCK in model.sensor_type:
+    if model.nhistory or mujoco.mjtSensor.mjSENS_CLOCK in model.sensor_type:
         raise InputError(
-            "a model must have no state but positions and velocities, and this one has actuators with activations or "
-            "delays, sensors with delays or a clock"
+            "a model must remember nothing but positions, velocities and activations, and this one has "
+            "actuators or sensors with delays, or a clock"
         )

@@ -14,7 +14,7 @@ import numpy as np
 from mujoco import batch
 
 from mtjax.envs.engines import host
-from mtjax.envs.engines.base import World, require_plain, some
+from mtjax.envs.engines.base import World, at_rest, require_plain, some
 from mtjax.types import Array, Task
 
 _MOST_BATCHES = 16  # kept of all engines; those that were not used for longest are dropped
@@ -35,28 +35,27 @@ class MujocoC:
     def __post_init__(self):
         require_plain(self.models[0])
 
-    def forward(self, task: Task, qpos: Array, qvel: Array, extra: Any = None) -> World:
+    def forward(self, task: Task, qpos: Array, qvel: Array, extra: Any = None, mocap: Any = None) -> World:
         """Put a world in a state without controls, and solve for its forces."""
-        zeros = jnp.zeros_like(qvel)
+        world = at_rest(self.models[0], qpos, qvel, extra, mocap)
         if not self.models[0].nsensor:
-            return World(qpos, qvel, zeros, None, extra)
-        sensors = self._call("solve", self.models[0].nsensordata, task, qpos, qvel, zeros)
-        return World(qpos, qvel, zeros, sensors, extra)
+            return world
+        return world._replace(sensors=self._call("solve", self.models[0].nsensordata, task, world))
 
     place = forward
 
     def step(self, task: Task, world: World, ctrl: Array) -> World:
         """Advance one control step under ``ctrl`` (nu,)."""
         model = self.models[0]
-        size = model.nq + 2 * model.nv
-        new = self._call("advance", size + model.nsensordata, task, world.qpos, world.qvel, world.warmstart, ctrl)
-        qpos, qvel, warmstart, sensors = jnp.split(new, (model.nq, model.nq + model.nv, size))
-        return World(qpos, qvel, warmstart, some(sensors), world.extra)
+        ends = np.cumsum([model.nq, model.nv, model.na, model.nv])
+        new = self._call("advance", int(ends[-1]) + model.nsensordata, task, world, ctrl)
+        qpos, qvel, act, warmstart, sensors = jnp.split(new, ends)
+        return World(qpos, qvel, warmstart, some(sensors), world.extra, some(act), world.mocap)
 
     def touching(self, task: Task, qpos: Array) -> Array:
         """Return whether any two colliding geoms overlap in the positions ``qpos`` (nq,)."""
-        zeros = jnp.zeros(self.models[0].nv, qpos.dtype)
-        return self._call("count", 1, task, qpos, zeros, zeros)[0] > 0
+        world = at_rest(self.models[0], qpos, jnp.zeros(self.models[0].nv, qpos.dtype))
+        return self._call("count", 1, task, world)[0] > 0
 
     # Calls of programs.
 
@@ -92,11 +91,12 @@ class MujocoC:
             content.update(repr(rows.setdefault(id(model), len(rows))).encode())
         return content.hexdigest()[:16]
 
-    def _call(self, act: str, width: int, task: Task, *state: Array) -> Array:
+    def _call(self, act: str, width: int, task: Task, world: World, ctrl: Array | None = None) -> Array:
         """Call the host with one array and return one array (width,). Each further array costs as much as a world."""
-        if len(state) == 3:
-            state = (*state, jnp.zeros(self.models[0].nu))
-        packed = jnp.concatenate([jnp.float32(task.row)[None], *(jnp.float32(x) for x in state)])
+        ctrl = jnp.zeros(self.models[0].nu) if ctrl is None else ctrl
+        state = [x for x in (world.qpos, world.qvel, world.act, world.warmstart, ctrl) if x is not None]
+        moved = [] if world.mocap is None else [jnp.ravel(world.mocap)]
+        packed = jnp.concatenate([jnp.float32(x) for x in (jnp.float32(task.row)[None], *state, *moved)])
         return host.call(self.provide(act), width, packed)
 
 
@@ -108,7 +108,7 @@ class _Worlds:
 
     def __init__(self, models: Sequence[mujoco.MjModel], num_substeps: int):
         self.models, self.lock = _without_reset(models), threading.Lock()
-        advance = partial(_advance, num_substeps, models[0].nq + 2 * models[0].nv)
+        advance = partial(_advance, num_substeps, models[0].nq + 2 * models[0].nv + models[0].na)
         self.acts = {"solve": _solve, "advance": advance, "count": _count_contacts}
 
     def run(self, act: str, packed: np.ndarray, result: np.ndarray) -> None:
@@ -116,7 +116,7 @@ class _Worlds:
         rows = packed.reshape(-1, packed.shape[-1])
         with self.lock:  # a batch serves one call at a time, and MuJoCo lets other threads run while it steps
             worlds = self.batch(rows[:, 0].astype(np.int32))
-            _state(worlds, rows.shape[1] - 1)[:] = rows[:, 1:]
+            _set_state(worlds, rows[:, 1:])
             result[:] = self.acts[act](worlds).reshape(result.shape)
 
     def batch(self, rows: np.ndarray) -> Any:
@@ -147,8 +147,17 @@ def _without_reset(models: Sequence[mujoco.MjModel]) -> list[mujoco.MjModel]:
 
 
 def _state(worlds: Any, size: int) -> np.ndarray:
-    """Return the first ``size`` of qpos, qvel, qacc_warmstart and ctrl (n, size), which follow the time in a state."""
+    """Return the first ``size`` of qpos, qvel, act, warm start and ctrl (n, size), which follow the time in a state."""
     return worlds.state[:, 1 : 1 + size]
+
+
+def _set_state(worlds: Any, values: np.ndarray) -> None:
+    """Set all that ``_state`` holds, and the poses of bodies of motion capture, which come last (n, 7 nmocap)."""
+    moved = worlds.model.nmocap
+    _state(worlds, values.shape[1] - 7 * moved)[:] = values[:, : values.shape[1] - 7 * moved]
+    if moved:
+        poses = values[:, -7 * moved :].reshape(-1, moved, 7)
+        worlds.bind("mocap_pos")[:], worlds.bind("mocap_quat")[:] = poses[..., :3], poses[..., 3:]
 
 
 def _advance(num_substeps: int, size: int, worlds: Any) -> np.ndarray:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mtjax.envs.engines.base import World, mjx_module, require_plain, some
+from mtjax.envs.engines.base import World, at_rest, mjx_module, require_plain
 from mtjax.types import Array, Task
 
 # Sensors that read more than poses and velocities of bodies: these need the whole position and velocity stages.
@@ -38,35 +38,42 @@ class Mjx:
     def _feels(self) -> bool:
         return mujoco.mjtStage.mjSTAGE_ACC in self.base.sensor_needstage
 
-    def _bind(self, task: Task, qpos: Array, qvel: Array | None = None) -> tuple[Any, Any]:
+    def _bind(self, task: Task, world: World) -> tuple[Any, Any]:
         """Return the task's model, and its data in the given state."""
         model, data = self._constants
         leaves = {name: leaf for name, leaf in task.model.items() if name != "site_size"}
-        return model.tree_replace(leaves), data.replace(qpos=qpos, qvel=data.qvel if qvel is None else qvel)
+        state = {"qpos": world.qpos, "qvel": world.qvel}
+        if world.act is not None:
+            state["act"] = world.act
+        if world.mocap is not None:
+            state |= {"mocap_pos": world.mocap[:, :3], "mocap_quat": world.mocap[:, 3:]}
+        return model.tree_replace(leaves), data.replace(**state)
 
-    def forward(self, task: Task, qpos: Array, qvel: Array, extra: Any = None) -> World:
+    def forward(self, task: Task, qpos: Array, qvel: Array, extra: Any = None, mocap: Any = None) -> World:
         """Put a world in a state without controls, and solve for its forces."""
         if not self._feels:
-            return self.place(task, qpos, qvel, extra)
-        model, data = self._bind(task, qpos, qvel)
+            return self.place(task, qpos, qvel, extra, mocap)
+        world = at_rest(self.base, qpos, qvel, extra, mocap)
+        model, data = self._bind(task, world)
         with jax.default_matmul_precision("highest"):
             data = self._feel(task, model, mjx_module().forward(model, data))
-        return World(qpos, qvel, jnp.zeros_like(qvel), data.sensordata, extra)
+        return world._replace(sensors=data.sensordata)
 
-    def place(self, task: Task, qpos: Array, qvel: Array, extra: Any = None) -> World:
+    def place(self, task: Task, qpos: Array, qvel: Array, extra: Any = None, mocap: Any = None) -> World:
         """Put a world in a state in which no force sensor is touched. It compiles much faster than ``forward``."""
-        sensors = some(jnp.zeros(self.base.nsensordata, qpos.dtype))
-        return self.sense(task, World(qpos, qvel, jnp.zeros_like(qvel), sensors, extra))
+        return self.sense(task, at_rest(self.base, qpos, qvel, extra, mocap))
 
     def step(self, task: Task, world: World, ctrl: Array) -> World:
         """Advance one control step under ``ctrl`` (nu,)."""
-        model, data = self._bind(task, world.qpos, world.qvel)
+        model, data = self._bind(task, world)
 
         def substep(_, world: World) -> World:
             now = data.replace(qpos=world.qpos, qvel=world.qvel, qacc_warmstart=world.warmstart, ctrl=ctrl)
+            now = now if world.act is None else now.replace(act=world.act)
             new = self._feel(task, model, mjx_module().step(model, now))
             sensors = new.sensordata if self._feels else world.sensors  # unread, they are never computed
-            return World(new.qpos, new.qvel, new.qacc_warmstart, sensors, world.extra)
+            act = None if world.act is None else new.act
+            return World(new.qpos, new.qvel, new.qacc_warmstart, sensors, world.extra, act, world.mocap)
 
         with jax.default_matmul_precision("highest"):
             world = jax.lax.fori_loop(0, self.num_substeps, substep, world)
@@ -75,7 +82,7 @@ class Mjx:
     def touching(self, task: Task, qpos: Array) -> Array:
         """Return whether any two colliding geoms overlap in the positions ``qpos`` (nq,)."""
         mjx = mjx_module()
-        model, data = self._bind(task, qpos)
+        model, data = self._bind(task, at_rest(self.base, qpos, jnp.zeros(self.base.nv, qpos.dtype)))
         with jax.default_matmul_precision("highest"):
             data = mjx.collision(model, mjx.com_pos(model, mjx.kinematics(model, data)))
         return jnp.any(data._impl.contact.dist < 0)
@@ -85,7 +92,7 @@ class Mjx:
         if np.all(self.base.sensor_needstage == mujoco.mjtStage.mjSTAGE_ACC):
             return world
         mjx = mjx_module()
-        model, data = self._bind(task, world.qpos, world.qvel)
+        model, data = self._bind(task, world)
         involved = np.any(np.isin(self.base.sensor_type, _INVOLVED))
         positions = mjx.fwd_position if involved else lambda m, d: mjx.com_pos(m, mjx.kinematics(m, d))
         velocities = mjx.fwd_velocity if involved else mjx.com_vel

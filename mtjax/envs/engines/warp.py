@@ -17,14 +17,15 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mtjax.envs.engines.base import World, mjx_module, some
+from mtjax.envs.engines.base import World, mjx_module
 from mtjax.envs.engines.mjx import Mjx
 from mtjax.types import Array, InputError, Task
 
 # Fields that no stage of a step reads, so that tasks may differ in them though Warp has room for one value only.
 _UNREAD = ("dof_M0",)
+_SPARE = 6  # rows of a weld, which Warp drops unless more than these are free
 _DOUBLED = 8  # pairs that may touch in two points where MJX-JAX finds one, at the same time in one world
-_STATE = ("qpos", "qvel", "qacc_warmstart")  # what a step begins with, beside controls, and what it ends with
+_MOVED = ("mocap_pos", "mocap_quat")  # poses that a domain sets
 ALONE = threading.Lock()  # Warp's choice of a device holds for all threads
 
 
@@ -32,10 +33,7 @@ class _Flat(NamedTuple):
     """All arrays that a step reads, with worlds along one leading axis."""
 
     leaves: dict[str, Array]
-    qpos: Array
-    qvel: Array
-    warmstart: Array
-    ctrl: Array
+    given: dict[str, Array]  # state and controls, by Warp's names
 
 
 class _Call(NamedTuple):
@@ -51,6 +49,7 @@ class _Place(NamedTuple):
 
     model: Any
     data: Any
+    all_move: Any  # (nbody,) a body's number of what it is fixed to, as if no body were fixed to the world
 
 
 def keep_streams(warp: Any) -> None:
@@ -98,13 +97,13 @@ class Warp:
         """Return the MJX engine, for everything but steps."""
         return Mjx(self.base, self.num_substeps)
 
-    def forward(self, task: Task, qpos: Array, qvel: Array, extra: Any = None) -> World:
+    def forward(self, task: Task, qpos: Array, qvel: Array, extra: Any = None, mocap: Any = None) -> World:
         """Put a world in a state without controls, and solve for its forces."""
-        return self.mjx.forward(task, qpos, qvel, extra)
+        return self.mjx.forward(task, qpos, qvel, extra, mocap)
 
-    def place(self, task: Task, qpos: Array, qvel: Array, extra: Any = None) -> World:
+    def place(self, task: Task, qpos: Array, qvel: Array, extra: Any = None, mocap: Any = None) -> World:
         """Put a world in a state in which no force sensor is touched."""
-        return self.mjx.place(task, qpos, qvel, extra)
+        return self.mjx.place(task, qpos, qvel, extra, mocap)
 
     def touching(self, task: Task, qpos: Array) -> Array:
         """Return whether any two colliding geoms overlap in the positions ``qpos`` (nq,)."""
@@ -113,10 +112,23 @@ class Warp:
     def step(self, task: Task, world: World, ctrl: Array) -> World:
         """Advance one control step under ``ctrl`` (nu,)."""
         leaves = {name: leaf for name, leaf in task.model.items() if self._varies(name)}
-        single = _Flat(leaves, world.qpos, world.qvel, world.warmstart, ctrl)
-        new = self._advance(jax.tree.map(lambda x: x[None], single))
-        qpos, qvel, warmstart, sensors = jax.tree.map(lambda x: x[0], new)
-        return self.mjx.sense(task, World(qpos, qvel, warmstart, some(sensors), world.extra))
+        given = {"qpos": world.qpos, "qvel": world.qvel, "qacc_warmstart": world.warmstart, "ctrl": ctrl}
+        if world.act is not None:
+            given["act"] = world.act
+        if world.mocap is not None:
+            given |= {"mocap_pos": world.mocap[:, :3], "mocap_quat": world.mocap[:, 3:]}
+        new = self._advance(jax.tree.map(lambda x: x[None], _Flat(leaves, given)))
+        new = jax.tree.map(lambda x: x[0], new)
+        moved = World(
+            new["qpos"],
+            new["qvel"],
+            new["qacc_warmstart"],
+            new.get("sensordata"),
+            world.extra,
+            new.get("act"),
+            world.mocap,
+        )
+        return self.mjx.sense(task, moved)
 
     def _varies(self, name: str) -> bool:
         """Return whether Warp needs the tasks' values of a field."""
@@ -133,14 +145,15 @@ class Warp:
         """Return the function that steps worlds along one leading axis. ``vmap`` extends that axis."""
 
         @jax.custom_batching.custom_vmap
-        def advance(flat: _Flat) -> tuple[Array, ...]:
+        def advance(flat: _Flat) -> dict[str, Array]:
             return self._call(flat)
 
         @advance.def_vmap
         def _(count: int, mapped: Any, flat: _Flat) -> tuple[Any, Any]:
             full = jax.tree.map(lambda x, m: x if m else jnp.broadcast_to(x, (count, *x.shape)), flat, mapped[0])
             new = advance(jax.tree.map(lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:]), full))
-            return jax.tree.map(lambda x: x.reshape(count, len(x) // count, *x.shape[1:]), new), (True,) * 4
+            apart = {name: x.reshape(count, len(x) // count, *x.shape[1:]) for name, x in new.items()}
+            return apart, dict.fromkeys(apart, True)
 
         return advance
 
@@ -158,14 +171,33 @@ class Warp:
     def _places(self) -> dict[Any, _Place]:
         return {}
 
-    def _call(self, flat: _Flat) -> tuple[Array, ...]:
-        """Take all substeps of worlds (W, ...); return positions, velocities, warm starts and sensors."""
-        count, names = len(flat.qpos), tuple(flat.leaves)
+    @cached_property
+    def _given(self) -> tuple[str, ...]:
+        """Return Warp's names of what a step begins with."""
+        return (
+            "qpos",
+            "qvel",
+            "qacc_warmstart",
+            "ctrl",
+            *["act"] * bool(self.base.na),
+            *_MOVED * bool(self.base.nmocap),
+        )
+
+    @cached_property
+    def _found(self) -> dict[str, int]:
+        """Return Warp's names of what a step ends with, and their sizes."""
+        model = self.base
+        sizes = {"qpos": model.nq, "qvel": model.nv, "qacc_warmstart": model.nv}
+        return sizes | {name: n for name, n in (("act", model.na), ("sensordata", model.nsensordata)) if n}
+
+    def _call(self, flat: _Flat) -> dict[str, Array]:
+        """Take all substeps of worlds (W, ...); return their new state and sensors by Warp's names."""
+        count, names = len(flat.given["qpos"]), tuple(flat.leaves)
         self.provide(count, names)
         call = self._calls[count, names]
         leaves = [leaf.reshape(like.shape) for leaf, like in zip(flat.leaves.values(), call.leaves, strict=True)]
-        found = call.function(flat.qpos, flat.qvel, flat.warmstart, flat.ctrl, *leaves)
-        return tuple(found) if self.base.nsensordata else (*found, jnp.zeros((count, 0)))
+        found = call.function(*(flat.given[name] for name in self._given), *leaves)
+        return dict(zip(self._found, found, strict=True))
 
     def targets(self) -> dict[str, Any]:
         """Return the arguments of ``provide`` for every call until now, by the call's name in programs."""
@@ -198,7 +230,7 @@ class Warp:
         counts = sorted(count for _, count in list(self._places))[:1]
         for count, device in itertools.product(counts, own_devices()):
             with ALONE, warp.ScopedDevice(device):
-                mujoco_warp.step(*self._places[device.alias, count])
+                mujoco_warp.step(*self._places[device.alias, count][:2])
                 warp.synchronize_device(device)
         return jax.default_backend() != "cpu"
 
@@ -214,7 +246,8 @@ class Warp:
             shared = self._models[device.alias]
             model = dataclasses.replace(shared, opt=dataclasses.replace(shared.opt))  # its fields will be of its worlds
             room = {"naconmax": max(count * contacts, 1), "njmax": max(rows, 1)}
-            return _Place(model, mujoco_warp.make_data(self.base, nworld=count, **room))
+            all_move = warp.full(self.base.nbody, 1, dtype=int)
+            return _Place(model, mujoco_warp.make_data(self.base, nworld=count, **room), all_move)
 
     def _make_model(self) -> Any:
         from mujoco.mjx.third_party import mujoco_warp
@@ -234,31 +267,30 @@ class Warp:
         like = jax.eval_shape(partial(mjx_module().make_data, self.base, jax.local_devices()[0], "jax"))._impl
         slots = like.contact.dist.shape[0]
         doubled = min(slots, _DOUBLED)
-        return slots + doubled, like.efc_J.shape[0] + 4 * doubled
+        return slots + doubled, like.efc_J.shape[0] + 4 * doubled + (_SPARE if self.base.neq else 0)
 
     def _make_call(self, model: Any, count: int, names: tuple[str, ...]) -> _Call:
         """Return the JAX function that steps a number of worlds in Warp."""
         import warp
 
-        outputs = {**dict.fromkeys(_STATE[:1], self.base.nq), **dict.fromkeys(_STATE[1:], self.base.nv)}
-        if self.base.nsensordata:
-            outputs["sensordata"] = self.base.nsensordata
-        kinds = {name: warp.array(dtype=float, ndim=2) for name in (*_STATE, "ctrl")}
+        vectors = {"mocap_pos": warp.vec3, "mocap_quat": warp.quat}
+        kinds = {name: warp.array(dtype=vectors.get(name, float), ndim=2) for name in self._given}
         kinds |= {_plain(name): warp.array(dtype=(x := attrgetter(name)(model)).dtype, ndim=x.ndim) for name in names}
-        kinds |= {f"new_{name}": warp.array(dtype=float, ndim=2) for name in outputs}
+        kinds |= {f"new_{name}": warp.array(dtype=float, ndim=2) for name in self._found}
         on_gpu = jax.default_backend() != "cpu"
         mode = warp.JaxCallableGraphMode.WARP if on_gpu else warp.JaxCallableGraphMode.NONE
-        step = _stepper(weakref.ref(self), count, names, tuple(outputs))
+        step = _stepper(weakref.ref(self), count, names)
         step.__qualname__ = f"step_{self._digest(count, names)}"  # the call's name is made of it
         target = warp.jax_callable(
             annotated(step, kinds),
-            num_outputs=len(outputs),
+            num_outputs=len(self._found),
             graph_mode=mode,
-            output_dims={f"new_{name}": (count, size) for name, size in outputs.items()},
+            output_dims={f"new_{name}": (count, size) for name, size in self._found.items()},
         )
         leaves = [_as_warp(count, attrgetter(name)(model)) for name in names]
-        sizes = (self.base.nq, self.base.nv, self.base.nv, self.base.nu)
-        given = [jax.ShapeDtypeStruct((count, size), jnp.float32) for size in sizes]
+        shapes = {name: (size,) for name, size in self._found.items()} | {"ctrl": (self.base.nu,)}
+        shapes |= {"mocap_pos": (self.base.nmocap, 3), "mocap_quat": (self.base.nmocap, 4)}
+        given = [jax.ShapeDtypeStruct((count, *shapes[name]), jnp.float32) for name in self._given]
 
         def function(*arrays: Array) -> Any:
             target.call_id = 0  # Warp's number of a trace, part of the program: each trace makes the same call
@@ -281,7 +313,7 @@ def own_devices() -> list[Any]:
     return [warp.device_from_jax(device) for device in jax.local_devices()]
 
 
-def _stepper(engine: Any, count: int, names: tuple[str, ...], outputs: tuple[str, ...]) -> Callable:
+def _stepper(engine: Any, count: int, names: tuple[str, ...]) -> Callable:
     """Return the function that Warp runs in a call: copy the state in, step, and copy the new state out.
 
     It holds a weak reference to the engine: Warp keeps such functions for good, but its memory must be freed.
@@ -289,22 +321,40 @@ def _stepper(engine: Any, count: int, names: tuple[str, ...], outputs: tuple[str
     import warp
     from mujoco.mjx.third_party import mujoco_warp
 
-    given = (*_STATE, "ctrl")
+    fixed = not {"body_pos", "body_quat", "geom_pos", "geom_quat"}.isdisjoint(names)
 
     def step(*arrays: Any) -> None:
         own = engine()
-        model, data = own._places[arrays[0].device.alias, count]
+        given, found = own._given, own._found
+        model, data, all_move = own._places[arrays[0].device.alias, count]
         for name, array in zip(names, arrays[len(given) :], strict=False):
             *path, field = name.split(".")
             setattr(attrgetter(*path)(model) if path else model, field, array)
         for name, array in zip(given, arrays, strict=False):
             warp.copy(getattr(data, name), array)
+        if fixed:
+            mujoco_warp.kinematics(model, data)
+            _place_geoms(model, data, all_move)
         for _ in range(own.num_substeps):
             mujoco_warp.step(model, data)
-        for name, array in zip(outputs, arrays[len(arrays) - len(outputs) :], strict=True):
+        for name, array in zip(found, arrays[len(arrays) - len(found) :], strict=True):
             warp.copy(array, getattr(data, name))
 
     return step
+
+
+def _place_geoms(model: Any, data: Any, all_move: Any) -> None:
+    """Put all geoms where their bodies are. Warp's kinematics leave those of bodies fixed to the world as they were."""
+    import warp
+    from mujoco.mjx.third_party.mujoco_warp._src import smooth
+
+    bodies = (model.body_rootid, all_move, model.body_mocapid, model.geom_bodyid, model.geom_pos, model.geom_quat)
+    warp.launch(
+        smooth._geom_local_to_global,
+        dim=(data.nworld, model.ngeom),
+        inputs=[*bodies, data.xpos, data.xquat],
+        outputs=[data.geom_xpos, data.geom_xmat],
+    )
 
 
 def annotated(function: Callable, kinds: dict[str, Any]) -> Callable:
