@@ -99,6 +99,17 @@ _DOMAINS: dict[str, Entry] = {
     "walker-walk": ("walker:WalkerWalk", {}),
 }
 
+# Further tasks on dm_control's bodies, with rewards of our own.
+_FURTHER: dict[str, Entry] = {
+    "ball-in-cup-spin": ("ball_in_cup:BallInCupSpin", {}),
+    "cheetah-jump": ("cheetah:CheetahJump", {}),
+    "cheetah-run-backward": ("cheetah:CheetahRunBackward", {}),
+    "hopper-hop-backward": ("hopper:HopperHopBackward", {}),
+    "pendulum-spin": ("pendulum:PendulumSpin", {}),
+    "walker-run-backward": ("walker:WalkerRunBackward", {}),
+    "walker-walk-backward": ("walker:WalkerWalkBackward", {}),
+}
+
 # HiP-BMDP's families (Zhang et al. 2021) with the values of MTEnv's models; `--split=hip-bmdp` for its held-out tasks.
 _HIP_BMDP: dict[str, Entry] = {
     "cartpole-swingup-vary-cart-mass": ("cartpole:CartpoleSwingup", {"vary": {"cart-mass": "1:5.5:10"}}),
@@ -181,7 +192,7 @@ PICTURES = ("pixels", "frames", "repeat", "grey", "state", "plain", "painter")
 
 _inside = lambda folder, table: {name: (f"{folder}.{place}", settings) for name, (place, settings) in table.items()}
 ENVS = Families(
-    _inside("mtjax.envs.dm_control", _DOMAINS | _HIP_BMDP | _GOALS)
+    _inside("mtjax.envs.dm_control", _DOMAINS | _FURTHER | _HIP_BMDP | _GOALS)
     | _inside("mtjax.envs.mtenv", _MTENV)
     | _inside("mtjax.envs", _BRAX)
 )

@@ -103,10 +103,19 @@ class HopperHop(HopperStand):
     """
 
     parameters: ClassVar = MappingProxyType({**HopperStand.parameters, "speed": Parameter("m/s", 2.0)})
+    heading: ClassVar[float] = 1.0  # -1 backwards
 
     def reward(self, task: Task, world: World, action: Array) -> Array:
-        speed = task.goal["speed"]
-        hopping = tolerance(
-            self.forward_velocity(task, world), speed, jnp.inf, speed / 2, "linear", value_at_margin=0.5
-        )
+        speed, velocity = task.goal["speed"], self.heading * self.forward_velocity(task, world)
+        hopping = tolerance(velocity, speed, jnp.inf, speed / 2, "linear", value_at_margin=0.5)
         return self.standing(task, world) * hopping
+
+
+@dataclasses.dataclass(frozen=True)
+class HopperHopBackward(HopperHop):
+    """Hop backwards at 2 m/s or faster, the torso high over the foot.
+
+    As HopperHop, but velocities backwards count. Not a task of dm_control: it has the same model, starts and episodes.
+    """
+
+    heading: ClassVar[float] = -1.0

@@ -106,14 +106,15 @@ class WalkerWalk(WalkerStand):
 
     parameters: ClassVar = MappingProxyType({**WalkerStand.parameters, "speed": Parameter("m/s", 1.0)})
     relabels: ClassVar[tuple[str, ...]] = ("speed",)
+    heading: ClassVar[float] = 1.0  # -1 backwards
 
     def reward(self, task: Task, world: World, action: Array) -> Array:
         return super().reward(task, world, action) * (5 * self.move(task, world) + 1) / 6
 
     def move(self, task: Task, world: World) -> Array:
         """Return the reward's factor () in [0, 1] for forward velocity."""
-        speed = task.goal["speed"]
-        return tolerance(self.forward_velocity(task, world), speed, jnp.inf, speed / 2, "linear", value_at_margin=0.5)
+        speed, velocity = task.goal["speed"], self.heading * self.forward_velocity(task, world)
+        return tolerance(velocity, speed, jnp.inf, speed / 2, "linear", value_at_margin=0.5)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,6 +122,23 @@ class WalkerRun(WalkerWalk):
     """Run: WalkerWalk at 8 m/s."""
 
     parameters: ClassVar = MappingProxyType({**WalkerStand.parameters, "speed": Parameter("m/s", 8.0)})
+
+
+@dataclasses.dataclass(frozen=True)
+class WalkerWalkBackward(WalkerWalk):
+    """Walk backwards at 1 m/s or faster, upright.
+
+    As WalkerWalk, but velocities backwards count. Not a task of dm_control: it has the same model, starts and episodes.
+    """
+
+    heading: ClassVar[float] = -1.0
+
+
+@dataclasses.dataclass(frozen=True)
+class WalkerRunBackward(WalkerRun):
+    """Run backwards: WalkerWalkBackward at 8 m/s."""
+
+    heading: ClassVar[float] = -1.0
 
 
 @dataclasses.dataclass(frozen=True)
