@@ -40,13 +40,14 @@ FASTEST = {"fish": 0.1, "swimmer": 1}  # beyond which water stops what is this l
 DYNAMICS = ("body_", "jnt_", "dof_", "geom_", "actuator_", "tendon_", "wrap_", "eq_", "qpos")
 # Read by a renderer or the broad phase alone; what touches what is compared by its outcome.
 NOT_DYNAMICS = ("bvh", "rgba", "matid", "contype", "conaffinity")
+TREES = ("cheetah", "hopper", "humanoid", "quadruped", "walker")
 EXCLUDED = {
     # Whether energy is computed: nothing reads it, and MJX refuses it.
     **{name: {"enableflags"} for name, (domain, _) in SUITE.items() if domain in ("acrobot", "cartpole", "pendulum")},
     # Whether islands of constraints are told apart: all bodies are one, whose motion is the same to rounding.
-    **{name: {"disableflags"} for name, (domain, _) in SUITE.items() if domain in ("cheetah", "hopper", "humanoid", "quadruped", "walker")},
-    # Bones are dropped and what touches is shown; the length of a joint's body decides when a body sleeps, and none does.
-    **{name: {"geom_group", "body_geomadr", "body_geomnum", "dof_length"} for name, (domain, _) in SUITE.items() if domain == "dog"},
+    **{name: {"disableflags"} for name, (domain, _) in SUITE.items() if domain in TREES},
+    # Bones are dropped and what touches is shown; "dof_length" decides when a body sleeps, and none does.
+    **{name: {"geom_group", "body_geomadr", "body_geomnum", "dof_length"} for name in SUITE if name.startswith("dog")},
     # dm_control resizes the target after compilation, so that its bounds stay those of the big one; it never collides.
     "reacher-hard": {"geom_rbound", "geom_aabb"},
 }
@@ -115,7 +116,7 @@ class Suite(NamedTuple):
         return self.observe(), self.task.get_reward(self.physics)
 
     def target(self):
-        """What our worlds carry beside the physical state, (2,) or (3,): the target; that of finger is from its hinge."""
+        """The target (2,) or (3,) that our worlds carry beside the physical state; that of finger is from its hinge."""
         model, data = self.physics.named.model, self.physics.named.data
         if self.axes:
             return model.geom_pos["target", list(self.axes)]
@@ -213,7 +214,7 @@ def test_model_and_timing_are_those_of_dm_control(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_step_gives_the_observation_and_reward_of_dm_control(name):
-    """Of 400 states, or of 100 for the dog, the 25 of highest reward and 25 others, to float32 rounding of the numbers that go into them."""
+    """Of 400 states, or 100 of the dog, the 25 of highest reward and 25 others, to rounding in float32."""
     env, theirs, random = make(name), load(name), np.random.default_rng(0)
     worlds = play(name, starts(name).state, random)
     states = len(worlds.qpos)
@@ -234,7 +235,9 @@ def test_what_touches_is_what_touches_in_dm_control(name):
     """In 600 random positions the same geoms meet: what we leave out of collision detection is never in reach."""
     model, physics, random = make(name).models[0], load(name).physics, np.random.default_rng(0)
     limits = np.tile([[-1.0], [1.0]], model.nq)  # of quaternions
-    for place, kind, limited, given in zip(model.jnt_qposadr, model.jnt_type, model.jnt_limited, model.jnt_range, strict=True):
+    for place, kind, limited, given in zip(
+        model.jnt_qposadr, model.jnt_type, model.jnt_limited, model.jnt_range, strict=True
+    ):
         free = np.pi if kind == mujoco.mjtJoint.mjJNT_HINGE else 0.25  # [rad or m]
         limits[:, place] = given if limited else [-free, free]
         if kind == mujoco.mjtJoint.mjJNT_FREE:
@@ -254,9 +257,9 @@ def test_what_touches_is_what_touches_in_dm_control(name):
 def test_starts_are_distributed_as_in_dm_control(name):
     """Joint positions, velocities, observations and targets of 1000 starts against 1000.
 
-    Two-sample Kolmogorov-Smirnov: equal laws exceed the bound in any column in one test in 10 000. Rank correlations have a
-    standard error of 0.04. Ends of the range differ by less than three times the expected tail of a hundredth. Where starts
-    come from a pool, it is the pool's size that counts, and it need not reach the ends.
+    Two-sample Kolmogorov-Smirnov: equal laws exceed the bound in any column in one test in 10 000. Rank correlations
+    have a standard error of 0.04. Ends of the range differ by less than three times the expected tail of a hundredth.
+    Where starts come from a pool, it is the pool's size that counts, and it need not reach the ends.
     """
     step, theirs = starts(name), load(name)
     ours = np.concatenate([step.state.qpos, step.state.qvel, step.obs, *polar(step.state.extra)], axis=1).T

@@ -60,6 +60,20 @@ def _set_back_foot_length(spec: mujoco.MjSpec, length: float) -> None:
     _weigh(spec)
 
 
+_BODY = {
+    "torso-length": Parameter("m", 0.5, _set_torso_length),
+    "foot-size": Parameter("m", 0.046, _set_foot_size),
+    "foot-position": Parameter("m", 0.5, _set_foot_position),
+    "back-foot-length": Parameter("m", 0.094, _set_back_foot_length),
+    "torso-mass": body_mass("torso"),
+    "mass": MASS,
+    "gravity": GRAVITY,
+    "friction": FRICTION,
+    "damping": DAMPING,
+    "gear": GEAR,
+}
+
+
 @dataclasses.dataclass(frozen=True)
 class CheetahRun(Domain):
     """Run: move forwards, the faster the better, up to 10 m/s.
@@ -90,21 +104,7 @@ class CheetahRun(Domain):
     other apart in an arbitrary direction, where MuJoCo C lets them pass.
     """
 
-    parameters: ClassVar = MappingProxyType(
-        {
-            "torso-length": Parameter("m", 0.5, _set_torso_length),
-            "foot-size": Parameter("m", 0.046, _set_foot_size),
-            "foot-position": Parameter("m", 0.5, _set_foot_position),
-            "back-foot-length": Parameter("m", 0.094, _set_back_foot_length),
-            "torso-mass": body_mass("torso"),
-            "mass": MASS,
-            "gravity": GRAVITY,
-            "friction": FRICTION,
-            "damping": DAMPING,
-            "gear": GEAR,
-            "speed": Parameter("m/s", 10.0),
-        }
-    )
+    parameters: ClassVar = MappingProxyType({**_BODY, "speed": Parameter("m/s", 10.0)})
     model_file: ClassVar[str] = "cheetah.xml"
     num_substeps: ClassVar[int] = 1
     episode_steps: ClassVar[int] = 1000
@@ -162,9 +162,7 @@ class CheetahJump(CheetahRun):
     Further parameter, in place of speed: height [m].
     """
 
-    parameters: ClassVar = MappingProxyType(
-        {**{name: p for name, p in CheetahRun.parameters.items() if name != "speed"}, "height": Parameter("m", 1.0, minimum=_STANDING)}
-    )
+    parameters: ClassVar = MappingProxyType({**_BODY, "height": Parameter("m", 1.0, minimum=_STANDING)})
 
     def reward(self, task: Task, world: World, action: Array) -> Array:
         asked, mass = task.goal["height"], self.leaf(task, "body_mass")

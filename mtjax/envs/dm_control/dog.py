@@ -27,6 +27,7 @@ _STANDING = 0.9  # of the heights in the model's own pose
 _UPRIGHT = math.cos(math.radians(30))
 _JOLT = 2.0  # [m/s and rad/s] standard deviation of the velocities at a start
 _OBJECT, _SENSOR = mujoco.mjtObj, mujoco.mjtSensor
+_PAWS = ("palm_L", "palm_R", "sole_L", "sole_R")
 _OF_FETCH = ("target", "wall_px", "wall_py", "wall_nx", "wall_ny")
 
 
@@ -145,7 +146,8 @@ class DogStand(Domain):
     def start(self, task: Task, key: Key) -> tuple[Array, Array]:
         turn_key, jolt_key = jax.random.split(key)
         model, half = self.models[0], jax.random.uniform(turn_key, maxval=math.pi)
-        qpos = jnp.asarray(model.qpos0, jnp.float32).at[jnp.array([3, 6])].set(jnp.stack([jnp.cos(half), jnp.sin(half)]))
+        turned = jnp.stack([jnp.cos(half), jnp.sin(half)])
+        qpos = jnp.asarray(model.qpos0, jnp.float32).at[jnp.array([3, 6])].set(turned)
         jolt = _JOLT * jax.random.normal(jolt_key, (3,))
         return qpos, jnp.zeros(model.nv).at[jnp.array([0, 1, 5])].set(jolt)
 
@@ -186,9 +188,6 @@ class DogStand(Domain):
         borne = jnp.sum(jnp.concatenate([sensed[name] for name in _PAWS]))
         firm = tolerance(borne, asked[2], jnp.inf, asked[2], "linear", value_at_margin=0.9)
         return jnp.prod(high) * jnp.prod(upright) * firm
-
-
-_PAWS = ("palm_L", "palm_R", "sole_L", "sole_R")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from types import MappingProxyType
 from typing import ClassVar
 
-import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -136,7 +135,7 @@ class QuadrupedRun(QuadrupedWalk):
 
 
 def _pose(model: mujoco.MjModel) -> np.ndarray:
-    """Return place (3), axes (9, each a row) and size (3) of all shapes but the floor, as the torso has them (G, 15)."""
+    """Return place (3), axes (9, each a row) and size (3) of all shapes but the floor (G, 15), from the torso."""
     data = mujoco.MjData(model)
     data.qpos[:3] = 0  # the torso's frame is then the world's
     mujoco.mj_kinematics(model, data)

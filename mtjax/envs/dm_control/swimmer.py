@@ -45,7 +45,7 @@ def _set_target_size(spec: mujoco.MjSpec, size: float) -> None:
 class Swimmer(Domain):
     """Swim: bring the nose of a chain of links to a target, which is somewhere else in every episode.
 
-    Observation (5 * links - 1,), all after the step: angles of the joints from the head on [rad]; x and y of the target
+    Observation (4 * links + 1,), all after the step: angles of the joints from the head on [rad]; x and y of the target
         as seen from the nose, in the head's frame [m]; then of every link its velocity along its own x and y [m/s] and
         about z [rad/s].
     Action (links - 1,): torques of the joints from the head on in [-1, 1]; gears of 0.0005 N m.
