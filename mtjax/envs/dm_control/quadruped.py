@@ -55,7 +55,8 @@ class QuadrupedWalk(Domain):
         speed: velocity [m/s] from which the reward for moving is 1.
 
     Differs from dm_control in: actions are scaled to the servos' ranges, where dm_control takes the angles themselves;
-    under MJX the constraint solver stops after ``solver_iterations``.
+    under MJX the constraint solver stops after ``solver_iterations``, and limbs that stand on the floor have another
+    friction (see ``humanoid.HumanoidStand``), in three states of random play in a thousand.
     """
 
     parameters: ClassVar = MappingProxyType(
