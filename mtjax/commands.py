@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+from mtjax import shipped
 from mtjax.agents import AGENTS
 from mtjax.envs import ENVS, outline, varied
 from mtjax.names import InputError, Notice, nearest_error
@@ -82,8 +83,9 @@ def catalogue() -> str:
         tasks, says = outline(name)
         varies = varied(name)
         lines.append(f"  {name:36} {tasks:3} task{'s' if tasks > 1 else ' '}  {says}{f' [{varies}]' * bool(varies)}")
-    lines.append("agents:")
-    return "\n".join(lines + [f"  {name:36} {preset.says}" for name, preset in AGENTS.items()])
+    lines += ["agents:", *(f"  {name:36} {preset.says}" for name, preset in AGENTS.items())]
+    lines += ["trained policies (python -m mtjax.evaluate --run=NAME, or mtjax.load(NAME)):"]
+    return "\n".join(lines + [f"  {name}" for name in shipped.names()])
 
 
 def overview() -> str:

@@ -81,6 +81,8 @@ class RunConfig:
     written without their dashes. Real numbers of the agent vary inside one program, beside the seeds. Other settings
     run as one program after another. The sweep's folder holds a table of all settings; --resume takes this folder."""
     points: Annotated[tuple[dict[str, float], ...], tyro.conf.Suppress] = ()
+    quick: bool = False
+    """Learn something in a minute on two CPU cores: a point mass reaches ten goals. Other flags change it."""
     config: str = ""
     """TOML file with flags; those on the command line override it. A key is a flag without its dashes. The table agent
     holds --agent.NAME, the table env holds --env.NAME; there, name is the agent or the environment itself."""

@@ -3,9 +3,8 @@
 import dataclasses
 import math
 from collections.abc import Sequence
-from pathlib import Path
 
-from mtjax import commands
+from mtjax import commands, shipped
 from mtjax.names import SPLITS, InputError, load, nearest_error
 
 _MOST_EPISODES, _LARGEST_SEED = 100_000, 2_000_000_000
@@ -19,7 +18,7 @@ class Request:
     """
 
     run: str = ""
-    """The run's folder."""
+    """The run's folder, or the name of a trained policy that comes with the package: --list of mtjax.train has them."""
     point: int = 0
     """Number of the setting in sweep.csv, if the run holds several settings of a sweep."""
     episodes: int = 10
@@ -37,8 +36,8 @@ class Request:
     video_seconds: float = 10.0
     """Seconds of an episode to film."""
     export: str = ""
-    """File that ends with .npz: write the first seed's policy into it, for ``mtjax/standalone.py``, which reads it with
-    NumPy or JAX alone."""
+    """File to write the first seed's policy into: one that ends with .npz for ``mtjax/standalone.py``, which reads it
+    with NumPy or JAX alone, or with .onnx for other runtimes."""
     diagnostics: bool = False
     """Measure conflicts between the tasks' gradients, and unused units of the networks, from the run's replay."""
 
@@ -76,7 +75,10 @@ def _parse(argv: Sequence[str]) -> tuple[Request, dict[str, str]]:
         raise InputError("--video-splits and --video-tasks say what to film; give --video as well")
     if vary and (request.video_splits or request.diagnostics):
         raise InputError("tasks of --env.vary belong to no split, and diagnostics are of the run's own tasks")
-    commands.require_run(Path(request.run))
+    folder = shipped.folder(request.run)
+    commands.require_run(folder)
+    if request.diagnostics and shipped.is_shipped(folder):
+        raise InputError(f"diagnostics need a run's replay, and {request.run!r} is a policy alone")
     return request, vary
 
 

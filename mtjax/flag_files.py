@@ -1,4 +1,4 @@
-"""Flags of a command line from a TOML file: ``--config=FILE.toml``."""
+"""Flags of a command line from a TOML file: ``--config=FILE.toml``, or ``--quick`` for the file of this package."""
 
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
@@ -7,6 +7,7 @@ from typing import Any
 
 from mtjax.names import InputError
 
+_QUICK = Path(__file__).parent / "quick.toml"
 _LEFT_OUT = {
     "import": "a file of settings runs no code; give --import on the command line",
     "resume": "--resume goes on with a run as it was",
@@ -15,7 +16,7 @@ _LEFT_OUT = {
 
 
 def expand(argv: Sequence[str]) -> list[str]:
-    """Put the flags of every --config=FILE.toml before the other words of a command line, which override them.
+    """Put the flags of --quick and of every --config=FILE.toml before the other words, which override them.
 
     A key is a flag without its dashes. Tables hold those with a dot: ``num-experts`` in the table ``agent`` is
     ``--agent.num-experts``. ``name`` in the tables ``env`` and ``agent`` is ``--env`` and ``--agent``.
@@ -26,7 +27,9 @@ def expand(argv: Sequence[str]) -> list[str]:
     given, rest, words = [], [], iter(argv)
     for word in words:
         flag, equals, value = word.partition("=")
-        if flag == "--config":
+        if word == "--quick":
+            given += _read(str(_QUICK))
+        elif flag == "--config":
             given += _read(value if equals else next(words, ""))
         else:
             rest.append(word)

@@ -548,6 +548,13 @@ actor_lr = 1e-4
     assert changed.learner.hidden == (9,) and changed.learner.actor_lr == 1 and changed.plan.steps == 5000
 
 
+def test_the_quick_start_is_a_file_of_flags():
+    """Those beside it change it."""
+    quick = cli.parse(flag_files.expand(["--quick", "--seeds=2"]))
+    assert (quick.env, quick.agent, quick.plan.seeds) == ("point-mass-vary-goal", "sac-conditioned", 2)
+    assert quick.plan.steps <= 250_000 and quick.learner.hidden == (64, 64)
+
+
 @pytest.mark.parametrize(
     "text, said",
     [

@@ -1,6 +1,7 @@
 """Policies in one file: by NumPy and by JAX alone, they act as the policy does on every task."""
 
 import ast
+import importlib.util
 import subprocess
 import sys
 from pathlib import Path
@@ -57,6 +58,21 @@ def test_both_forms_act_as_the_policy(name, tmp_path):
     found = np.stack([by_numpy(x, size=float(size)) for x, size in zip(obs, sizes, strict=True)])
     np.testing.assert_allclose(found, expected, atol=2e-5)
     assert np.ptp(expected, axis=0).max() > 1e-3
+    assert_onnx_acts(policy, tmp_path / "policy.onnx", obs, sizes, expected)
+
+
+def assert_onnx_acts(policy, file, obs, sizes, expected):
+    """By ONNX's own runtime, which knows nothing of this package."""
+    pytest.importorskip("onnx")
+    runtime = pytest.importorskip("onnxruntime")
+    session = runtime.InferenceSession(mtjax.export(policy, file))
+    known = {put.name for put in session.get_inputs()}
+    for x, size, action in zip(obs, sizes, expected, strict=True):
+        given = {"obs": x, "parameters": np.float32([size])}
+        (found,) = session.run(["action"], {name: given[name] for name in known})
+        np.testing.assert_allclose(found, action, atol=2e-5)
+    meta = session.get_modelmeta()
+    assert '"parameters": ["size"]' in meta.custom_metadata_map["mtjax"]
 
 
 def test_angles_of_goals_are_points_on_the_circle(tmp_path):
@@ -103,10 +119,19 @@ def test_what_the_reader_is_given_is_checked(tmp_path):
         policy(np.zeros(3), size=1.0)
 
 
-def test_what_cannot_be_exported_is_refused(tmp_path):
+def test_what_cannot_be_exported_is_refused(tmp_path, monkeypatch):
     """In a line, and nothing is overwritten."""
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"pip install 'mtjax\[onnx\]'"):
+        require_file(tmp_path / "x.onnx")
+    monkeypatch.undo()
     (tmp_path / "x.npz").touch()
-    for file, said in ((tmp_path / "x.npz", "exists already"), (tmp_path / "x.pt", "ends with .npz"), (3, "a path")):
+    for file, said in (
+        (tmp_path / "x.npz", "exists already"),
+        (tmp_path / "x.pt", "ends with .npz or .onnx"),
+        (3, "a path"),
+    ):
         with pytest.raises(InputError, match=said):
             require_file(file)
     with pytest.raises(InputError, match="export takes a policy"):

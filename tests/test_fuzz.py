@@ -31,7 +31,7 @@ VALUES = [*NUMBERS, "9" * 25, "9" * 5000, "", "=", "²", "٣", "true", "None", "
 RANGES = (
     "1:1:1 1:2:1000000000 2:1:3 1:2:0 1:2:-1 1:2:2.5 1:2 1:inf nan:1 1e308:1e309:3 :: 1:2:3:4 0.9:1.1:3 1,2,3".split()
 )
-ELSEWHERE = ("--runs", "--resume", "--from", "--list", "--sweep", "--config")  # read before a run's flags
+ELSEWHERE = ("--runs", "--resume", "--from", "--list", "--sweep", "--config", "--quick")  # read before a run's flags
 FLAGS = [flag for flag in cli.flags(cli.parse([])) if flag not in ELSEWHERE]
 FAMILIES = "finger-spin walker-walk bandit two-goal-maze control-cartpole point-mass-vary-goal".split()
 PARAMETERS = "size mass gravity torso-mass gear touch-size friction goal-x nonsense".split()

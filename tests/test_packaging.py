@@ -32,7 +32,7 @@ def built(tmp_path_factory):
 
 
 def package_files():
-    files = (path for path in (ROOT / "mtjax").rglob("*") if path.suffix in (".py", ".xml", ".toml"))
+    files = (path for path in (ROOT / "mtjax").rglob("*") if path.suffix in (".py", ".xml", ".toml", ".npz", ".json"))
     return {str(path.relative_to(ROOT)) for path in files}
 
 

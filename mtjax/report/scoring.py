@@ -9,6 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from mtjax import shipped
 from mtjax.config import from_json
 from mtjax.envs import Family
 from mtjax.evaluation import evaluate
@@ -49,7 +50,7 @@ def report(request: Any, vary: Mapping[str, str]) -> None:
         tasks = policy.env.tasks("all")
     chosen = films.choose(policy.env, request.video_splits, request.video_tasks) if request.video else ()
     scores = score(policy, request.episodes, request.seed, tasks)
-    directory = _new_folder(Path(run))
+    directory = _new_folder(_place(run))
     print(task_table(policy, scores, named))
     if policy.agent.unseen:
         print(f"unseen tasks: {policy.agent.unseen}")
@@ -86,7 +87,7 @@ def as_unseen(tasks: Task, trained: Task) -> Task:
 
 def _first_seed(run: str, point: int) -> int:
     """Return the first entry of S that belongs to a setting."""
-    config = from_json(Path(run) / "config.json")
+    config = from_json(shipped.folder(run) / "config.json")
     if not 0 <= point < max(len(config.points), 1):
         raise InputError(f"point must be from 0 to {max(len(config.points), 1) - 1}, not {point}")
     return point * config.plan.seeds
@@ -104,6 +105,15 @@ def score(policy: Policy, episodes: int, seed: int = 0, tasks: Task | None = Non
     scores = compile_lowered(trace(evaluate, env, policy.agent, episodes, *arguments).lower())(*arguments)
     returns = np.asarray(scores.returns)
     return {split: returns[:, np.asarray(env.tasks(split).id)] for split in SPLITS}
+
+
+def _place(run: str) -> Path:
+    """Return where a run's evaluations are written. Those of a policy of the package are with the user's own runs."""
+    if not shipped.is_shipped(shipped.folder(run)):
+        return Path(run)
+    place = Path("runs") / run.replace("/", "-")
+    place.mkdir(parents=True, exist_ok=True)
+    return place
 
 
 def _new_folder(run: Path) -> Path:

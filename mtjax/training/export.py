@@ -1,4 +1,4 @@
-"""Policies as one file that runs without this package: a compiled program for JAX, and a list of steps for NumPy."""
+"""Policies as one file that runs without this package: for JAX and NumPy, or as an ONNX model."""
 
 import json
 import os
@@ -17,6 +17,7 @@ from mtjax.envs import Family
 from mtjax.envs import name_of as env_name_of
 from mtjax.names import InputError
 from mtjax.standalone import OPERATIONS, SETTINGS
+from mtjax.training import onnx
 from mtjax.training.policy import Policy
 from mtjax.types import Array, Task
 
@@ -27,13 +28,13 @@ _CALLS = ("jit", "pjit", "closed_call", "core_call", "remat", "checkpoint", "cus
 def export(policy: Policy, file: str | Path) -> Path:
     """Write the mean action of a policy, with normaliser and task context, into one file.
 
-    ``mtjax.standalone`` reads it by NumPy alone, or by JAX alone.
-
     Args:
-        file: ends with .npz.
+        file: ends with .npz, which ``mtjax.standalone`` reads by NumPy alone or by JAX alone; or with .onnx, a model of
+            the inputs ``obs`` (O,) and ``parameters`` (P,), and the output ``action`` (A,).
 
     Raises:
-        InputError: the file exists, or the agent infers its task from memory, or it is of a mixture.
+        InputError: the file exists, or the agent infers its task from memory, or it is of a mixture, or the package
+            onnx is missing.
     """
     file = require_file(file)
     if not isinstance(policy, Policy):
@@ -53,11 +54,15 @@ def export(policy: Policy, file: str | Path) -> Path:
         "jax": jax.__version__,
     }
     program, constants = steps_of(jax.make_jaxpr(act)(obs, values))
-    text = lambda x: np.frombuffer(json.dumps(x).encode(), np.uint8)
-    arrays: dict[str, Any] = {f"constant_{i}": x for i, x in enumerate(constants)}
-    new = file.with_suffix(".new.npz")
+    new = file.with_suffix(f".new{file.suffix}")
     file.parent.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(new, meta=text(meta), program=text(program), exported=_serialised(act, obs, values), **arrays)
+    if file.suffix == ".onnx":
+        onnx.write(program, constants, meta, new)
+    else:
+        text = lambda x: np.frombuffer(json.dumps(x).encode(), np.uint8)
+        arrays: dict[str, Any] = {f"constant_{i}": x for i, x in enumerate(constants)}
+        exported = _serialised(act, obs, values)
+        np.savez_compressed(new, meta=text(meta), program=text(program), exported=exported, **arrays)
     os.replace(new, file)
     return file
 
@@ -66,11 +71,13 @@ def require_file(file: str | Path) -> Path:
     """Return the path of a file to export to.
 
     Raises:
-        InputError: it exists, or ends with something else than .npz.
+        InputError: it exists, or ends with something else than .npz or .onnx.
     """
     file = path(file, "file")
-    if file.suffix != ".npz":
-        raise InputError(f"a policy is exported to a file that ends with .npz, not to {str(file)!r}")
+    if file.suffix not in (".npz", ".onnx"):
+        raise InputError(f"a policy is exported to a file that ends with .npz or .onnx, not to {str(file)!r}")
+    if file.suffix == ".onnx":
+        onnx.require_onnx()
     if file.exists():
         raise InputError(f"{str(file)!r} exists already; give another name or remove it")
     return file

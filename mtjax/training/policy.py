@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax import loop
+from mtjax import loop, shipped
 from mtjax.agents import BaseAgent, name_of
 from mtjax.checks import path
 from mtjax.config import RunConfig, from_json
@@ -69,7 +69,8 @@ def load(directory: str | Path, seed: int = 0, checkpoint: int = 0) -> Policy:
     """Load the trained policy of a run.
 
     Args:
-        directory: the run's folder.
+        directory: the run's folder, or the name of a policy that comes with the package, such as
+            "finger-spin-vary-size/sac-conditioned"; ``python -m mtjax.train --list`` shows them.
         seed: which of the run's seeds, counted from 0. A run of a sweep has all its seeds for each of its points:
             number ``k`` is seed ``k % seeds`` of point ``k // seeds``. The policy then has the agent of that point.
         checkpoint: the iteration of a checkpoint that the run keeps; 0 takes the newest.
@@ -77,12 +78,24 @@ def load(directory: str | Path, seed: int = 0, checkpoint: int = 0) -> Policy:
     Raises:
         InputError: the folder is not a run, the run has no such seed, or its checkpoint is missing or damaged.
     """
-    directory = path(directory)
+    directory = shipped.folder(path(directory))
     config = from_json(directory / "config.json")
     _require_seed(seed, config.plan.seeds, len(config.points))
-    states = checkpoints.load_agent(directory / "checkpoints", state_shapes(config), checkpoint)
+    if shipped.is_shipped(directory):
+        states = _filled(directory, state_shapes(config).agent)
+    else:
+        states = checkpoints.load_agent(directory / "checkpoints", state_shapes(config), checkpoint)
     seeds = config.plan.seed + jnp.arange(config.plan.seeds)
     return policy_of(config.family, config.learner, config.points, seeds, states, seed, directory)
+
+
+def _filled(directory: Path, like: Any) -> Any:
+    """Return an agent's state with the arrays that acting reads from a folder, and zeros elsewhere."""
+    found, (leaves, form) = shipped.arrays(directory), jax.tree.flatten(like)
+    if any(i >= len(leaves) or leaves[i].shape[1:] != x.shape for i, x in found.items()):
+        raise InputError(f"{str(directory / shipped.FILE)!r} is of another agent than its config.json")
+    filled = [jnp.zeros(x.shape, x.dtype) if i not in found else found[i][None] for i, x in enumerate(leaves)]
+    return jax.tree.unflatten(form, map(jnp.asarray, filled))
 
 
 def policy_of(

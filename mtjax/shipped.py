@@ -1,0 +1,40 @@
+"""Trained policies that come with the package: a folder with config.json, and the arrays that acting reads."""
+
+from pathlib import Path
+
+import numpy as np
+
+from mtjax.names import InputError
+
+FOLDER = Path(__file__).parent / "pretrained"
+FILE = "policy.npz"  # in the folder of such a policy, beside config.json
+
+
+def names() -> list[str]:
+    """Return the names of all trained policies, such as "finger-spin-vary-size/sac-conditioned"."""
+    return sorted(file.parent.relative_to(FOLDER).as_posix() for file in FOLDER.glob(f"*/*/{FILE}"))
+
+
+def folder(run: str | Path) -> Path:
+    """Return the folder of a run, or that of a trained policy of this name if there is no such folder."""
+    if not Path(run).is_dir() and str(run) in names():
+        return FOLDER / run
+    return Path(run)
+
+
+def is_shipped(directory: Path) -> bool:
+    """Return whether a folder holds a policy alone, and no run."""
+    return (directory / FILE).is_file()
+
+
+def arrays(directory: Path) -> dict[int, np.ndarray]:
+    """Return those leaves of the agent's state that acting reads, by their number.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    try:
+        with open(directory / FILE, "rb") as file, np.load(file, allow_pickle=False) as found:
+            return {int(name): found[name] for name in found.files}
+    except Exception as error:
+        raise InputError(f"{str(directory / FILE)!r} cannot be read: {type(error).__name__}: {error}") from None

@@ -1,0 +1,74 @@
+"""Policies without what only training needs: settings, and those arrays of an agent's state that acting reads.
+
+``python -m mtjax.training.ship RUN ENV/AGENT`` adds the policy of a run's first seed to those of the package.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mtjax import commands, shipped
+from mtjax.config import RunConfig
+from mtjax.names import InputError
+from mtjax.training.export import steps_of
+from mtjax.training.policy import Policy, load
+
+_SETTINGS = "config.json"
+
+
+def write(run: str | Path, directory: Path) -> None:
+    """Write the policy of a run's first seed into a folder.
+
+    Raises:
+        InputError: the folder exists, or the run holds several settings of a sweep.
+    """
+    policy = load(run)
+    record = json.loads((Path(run) / _SETTINGS).read_text(encoding="utf-8"))
+    if record.get("points"):
+        raise InputError(f"{str(run)!r} holds several settings of a sweep; ship a run of one")
+    record["plan"]["seeds"], record["runs"] = 1, RunConfig.runs
+    leaves = jax.tree.leaves(policy.state)
+    arrays: Any = {str(i): np.asarray(leaves[i]) for i in read_by_acting(policy)}
+    directory.mkdir(parents=True)
+    np.savez_compressed(directory / shipped.FILE, **arrays)
+    (directory / _SETTINGS).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+
+
+def read_by_acting(policy: Policy) -> list[int]:
+    """Return the numbers of those leaves of an agent's state on which its action depends."""
+    leaves, form = jax.tree.flatten(policy.state)
+    task = jax.tree.map(lambda x: x[0], policy.env.tasks("train"))
+    obs = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), policy.env.spec.obs)
+
+    def act(*leaves: Any) -> Any:
+        state = jax.tree.unflatten(form, leaves)
+        return policy.agent.act(state, policy.agent.begin(state, task), obs, task, None).action
+
+    known = [x for x in leaves if not jnp.issubdtype(x.dtype, jax.dtypes.prng_key)]
+    assert len(known) == len(leaves), "an agent's state holds a key of random numbers"
+    program, constants = steps_of(jax.make_jaxpr(act)(*leaves))
+    needed = {program["result"]}
+    for _, arguments, results, _ in reversed(program["steps"]):
+        if needed.intersection(results):
+            needed.update(arguments)
+    return [i for i in range(len(leaves)) if i + len(constants) in needed]
+
+
+def main(argv: list[str]) -> None:
+    """Add the policy of a run to those of the package."""
+    if len(argv) != 2 or argv[1].count("/") != 1:
+        raise InputError("give a run and a name: python -m mtjax.training.ship RUN ENV/AGENT")
+    run, name = argv
+    target = shipped.FOLDER / name
+    if target.exists():
+        raise InputError(f"there is a policy {name!r} already; remove {str(target)!r} first")
+    write(run, target)
+    print(f"written to {target}: {sum(file.stat().st_size for file in target.iterdir()) / 1000:.0f} kB")
+
+
+if __name__ == "__main__":
+    commands.main(main)

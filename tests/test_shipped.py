@@ -1,0 +1,87 @@
+"""Policies that come with the package: they act as the runs they are of, and score what their page says."""
+
+import re
+import shutil
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from probes import slow_but, tiny
+from test_export import ENV, observations, policy_of
+
+import mtjax
+import mtjax.evaluate
+from mtjax import agents, shipped
+from mtjax.report.scoring import score
+from mtjax.training import ship
+from mtjax.types import InputError
+
+PAGE = Path(__file__).parents[1] / "docs/results/policies.md"
+
+
+@pytest.mark.parametrize("name", slow_but(agents.AGENTS, "care"))
+def test_an_action_depends_on_what_is_kept_alone(name):
+    """Whatever the other arrays of the state hold."""
+    policy = policy_of(tiny(name))
+    read = ship.read_by_acting(policy)
+    leaves, form = jax.tree.flatten(policy.state)
+    other = [x if i in read else jnp.full_like(x, 3) for i, x in enumerate(leaves)]
+    assert 0 < len(read) < len(leaves)
+    task = jax.tree.map(lambda x: x[0], ENV.tasks())
+    obs = observations(1)[0]
+    act = lambda state: policy.agent.act(state, policy.agent.begin(state, task), obs, task, None).action
+    np.testing.assert_array_equal(act(policy.state), act(jax.tree.unflatten(form, other)))
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    """An empty folder in place of the package's policies."""
+    monkeypatch.setattr(shipped, "FOLDER", tmp_path / "pretrained")
+    return tmp_path / "pretrained"
+
+
+@pytest.mark.slow
+def test_a_policy_is_shipped_and_acts_as_its_run(copied_run, package, tmp_path, monkeypatch, capsys):
+    """By its name, in Python and on the command line, which writes nothing into the package."""
+    ship.main([str(copied_run), "finger-spin/care"])
+    assert shipped.names() == ["finger-spin/care"]
+    ours, theirs = mtjax.load("finger-spin/care"), mtjax.load(copied_run)
+    tasks = theirs.env.tasks("all")
+    obs = np.ones((len(tasks.id), 9), np.float32)
+    np.testing.assert_array_equal(jax.vmap(ours)(obs, tasks), jax.vmap(theirs)(obs, tasks))
+    monkeypatch.chdir(tmp_path)
+    mtjax.evaluate.main(["--run=finger-spin/care", "--episodes=1"])
+    assert (tmp_path / "runs/finger-spin-care/evaluation-1/returns.csv").is_file()
+    assert sorted(file.name for file in (package / "finger-spin/care").iterdir()) == ["config.json", "policy.npz"]
+    with pytest.raises(InputError, match="is a policy alone"):
+        mtjax.evaluate.main(["--run=finger-spin/care", "--diagnostics"])
+    with pytest.raises(InputError, match="there is a policy 'finger-spin/care' already"):
+        ship.main([str(copied_run), "finger-spin/care"])
+
+
+def test_damaged_policies_are_refused(copied_run, package):
+    ship.write(copied_run, package / "a/b")
+    file = package / "a/b/policy.npz"
+    whole = file.read_bytes()
+    for content, said in ((whole[:-50], "cannot be read"), (b"", "cannot be read")):
+        file.write_bytes(content)
+        with pytest.raises(InputError, match=said):
+            mtjax.load("a/b")
+    np.savez(file, **{"0": np.zeros(77)})
+    with pytest.raises(InputError, match="is of another agent"):
+        mtjax.load("a/b")
+    shutil.rmtree(package / "a/b")
+    with pytest.raises(InputError, match="is not a run"):
+        mtjax.load("a/b")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", shipped.names())
+def test_a_policy_scores_what_its_page_says(name):
+    """The return on training tasks in the table, within what two other episodes of each task may differ."""
+    told = re.search(rf"^\| `{name}` \|.*?\| (\d+) \|", PAGE.read_text(), re.MULTILINE)
+    assert told, f"{PAGE.name} has no row of {name}"
+    found = score(mtjax.load(name), 2)["train"].mean()
+    assert abs(found - float(told[1])) < 0.05 * float(told[1]), found
