@@ -66,6 +66,7 @@ class FishUpright(Domain):
     )
     model_file: ClassVar[str] = "fish.xml"
     num_substeps: ClassVar[int] = 10
+    gpu_engine: ClassVar[str] = "mjx"  # nothing touches
     episode_steps: ClassVar[int] = 1000
     default_iterations: ClassVar[int] = 1  # nothing is constrained
     starts_untouched: ClassVar[bool] = True

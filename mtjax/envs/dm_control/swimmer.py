@@ -83,6 +83,7 @@ class Swimmer(Domain):
     )
     model_file: ClassVar[str] = "swimmer.xml"
     num_substeps: ClassVar[int] = 15
+    gpu_engine: ClassVar[str] = "mjx"  # nothing touches
     episode_steps: ClassVar[int] = 1000
     default_iterations: ClassVar[int] = 4
     starts_untouched: ClassVar[bool] = True
