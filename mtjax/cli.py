@@ -18,7 +18,7 @@ from mtjax.commands import (
     vary_flags,
 )
 from mtjax.config import NO_FINE_TUNING, RunConfig, from_json, own_files, with_preset
-from mtjax.envs import make, require_pictures
+from mtjax.envs import is_mixture, make, require_pictures
 from mtjax.envs.family import Family
 from mtjax.envs.mixtures import Mixture, require_family
 from mtjax.names import InputError
@@ -51,7 +51,7 @@ def parse(argv: Sequence[str]) -> RunConfig:
     of_family: dict[str, Any] = {
         name: value for name in ("combine", "split") if (value := flag_value(argv, _FAMILY_FLAGS[name], ""))
     }
-    if "+" in env_name:
+    if is_mixture(env_name):
         of_family, argv = _peel_shared(argv, make(env_name))
     deciding = {name: value for name in _DECIDING if (value := flag_value(argv, f"agent.{name}", ""))}
     default = with_preset(env_name, agent_name, preset_name, {**chosen, **deciding}, vary=vary, **of_family)

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 from mtjax import shipped
 from mtjax.agents import AGENTS
-from mtjax.envs import ENVS, outline, varied
+from mtjax.envs import BENCHMARKS, ENVS, members, outline, varied
 from mtjax.names import InputError, Notice, nearest_error
 
 PRESETS = ("auto", "cpu", "gpu")
@@ -83,6 +83,9 @@ def catalogue() -> str:
         tasks, says = outline(name)
         varies = varied(name)
         lines.append(f"  {name:36} {tasks:3} task{'s' if tasks > 1 else ' '}  {says}{f' [{varies}]' * bool(varies)}")
+    lines.append("benchmarks, which are mixtures of the above:")
+    for name, (says, families) in BENCHMARKS.items():
+        lines.append(f"  {name:36} {sum('held_out' not in s for s in families.values()):3} tasks  {says}")
     lines += ["agents:", *(f"  {name:36} {preset.says}" for name, preset in AGENTS.items())]
     lines += ["trained policies (python -m mtjax.evaluate --run=NAME, or mtjax.load(NAME)):"]
     return "\n".join(lines + [f"  {name}" for name in shipped.names()])
@@ -126,10 +129,12 @@ def check_names(argv: Sequence[str]) -> None:
     """
     for kind, flag, known in _KNOWN:
         given = flag_value(argv, flag, None)
-        names = () if given is None else given.split("+") if flag == "env" else (given,)  # several are a mixture
+        if given is None:
+            continue
+        names = [name for name, _ in members(given)] if flag == "env" else [given]  # a mixture has several
         wrong = next((name for name in names if name not in known), None)
         if wrong is not None:
-            raise nearest_error(kind, wrong, known)
+            raise nearest_error(kind, wrong, (*known, *BENCHMARKS) if flag == "env" else known)
     _check_numbers(argv)
     given = {word.split("=", 1)[0] for word in argv if word.startswith("--")}
     other = ", ".join(sorted(given - _MAY_CHANGE))

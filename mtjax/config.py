@@ -22,7 +22,7 @@ from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.values import VALUES
 from mtjax.checks import check_fields, require_values
 from mtjax.commands import is_imported, require_run
-from mtjax.envs import ENVS, make
+from mtjax.envs import ENVS, is_mixture, make, members
 from mtjax.envs.family import Tabled
 from mtjax.loop import Settings
 from mtjax.types import InputError
@@ -62,7 +62,8 @@ class RunConfig:
     env: str = "finger-spin-vary-size"
     """Name of the environment family. --list shows all names. --import=FILE.py runs a file that registers families,
     agents or parts of your own. NAME+NAME is a mixture of families: --engine, --split and --env.FIELD then hold for
-    every family that has such a flag, and --env.vary.NAME.PARAMETER=VALUES holds for the family NAME."""
+    every family that has such a flag, and --env.vary.NAME.PARAMETER=VALUES holds for the family NAME. Benchmarks, such
+    as mt10, are mixtures."""
     agent: str = "sac-conditioned"
     """Name of the agent. --list shows all names. Its parts are chosen by --agent.representation, --agent.encoder,
     --agent.gradients, --agent.value, --agent.scaling and --agent.sampler, each by name. A part adds its own flags."""
@@ -172,7 +173,7 @@ def require_value_range(agent: Any) -> None:
 def wants_gpu(env_name: str) -> bool:
     """Return whether a CPU was not seen to learn a family, or one of a mixture, within minutes."""
     slow = tomllib.loads((resources.files("mtjax") / "configs" / "default.toml").read_text())["wants_gpu"]
-    return not set(slow).isdisjoint(env_name.split("+"))
+    return not set(slow).isdisjoint(name for name, _ in members(env_name))
 
 
 def load_preset(env_name: str, name: str) -> dict[str, Any]:
@@ -280,7 +281,7 @@ def _with_import(error: InputError, run: str, record: Mapping[str, Any]) -> Inpu
         flags = shlex.join(f"--import={file}" for file in missing)
         return InputError(f"{run!r} uses code of your own: add {flags} (in Python: import that file first)")
     env, name = str(record.get("env")), str(record.get("agent"))
-    if (env not in ENVS and "+" not in env) or name not in AGENTS:
+    if (env not in ENVS and not is_mixture(env)) or name not in AGENTS:
         return InputError(f"{error}. If it is your own, give --import=FILE.py with the file that registers it")
     return error
 

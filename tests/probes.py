@@ -2,6 +2,7 @@
 
 import dataclasses
 from functools import lru_cache
+from importlib.util import find_spec
 from typing import ClassVar
 
 import jax
@@ -12,12 +13,20 @@ import pytest
 from mtjax import agents, loop
 from mtjax.agents.parts import trajectory
 from mtjax.config import configure
+from mtjax.envs import ENVS
 from mtjax.envs.probes import AFTER, LIMIT, RULES, SPEC, Probe, tasks_of
 from mtjax.experience import Replay
 from mtjax.networks import Params
 from mtjax.types import Acted, Spec, Task, Transition
 
 __all__ = ["AFTER", "LIMIT", "RULES", "SPEC", "Probe", "tasks_of"]
+
+# Families that can be made here, and those of them that stand for all where a test takes long. Meta-World's fifty share
+# one class but for rewards, and need files that are not always there.
+METAWORLD = [name for name in ENVS if name.startswith("metaworld-")]
+INSTALLED = [name for name in ENVS if name not in METAWORLD or find_spec("metaworld")]
+with_metaworld = pytest.mark.skipif(not find_spec("metaworld"), reason="Meta-World's scenes are not installed")
+FEW = [name for name in INSTALLED if name not in METAWORLD or name == "metaworld-reach"]
 
 # Tests compile much and run little; without LLVM's optimisations they take half as long.
 QUICK = {"xla_backend_optimization_level": 0}

@@ -17,7 +17,7 @@ import jax
 import numpy as np
 import pytest
 from conftest import SHORT_RUN
-from probes import OFF_POLICY, one_in
+from probes import FEW, OFF_POLICY, one_in
 
 import mtjax.evaluate
 import mtjax.train
@@ -27,7 +27,7 @@ from mtjax.agents import settings as settings_of
 from mtjax.agents.choices import CHOICES
 from mtjax.agents.parts.representations import DeepMDP
 from mtjax.config import from_json, load_preset, to_json, wants_gpu, with_preset
-from mtjax.envs import ENVS
+from mtjax.envs import BENCHMARKS, ENVS
 from mtjax.loop import Settings
 from mtjax.names import notice
 from mtjax.training import launch
@@ -106,7 +106,7 @@ def test_last_of_a_repeated_name_counts():
     assert (program.agent, program.learner.heads, program.plan.steps) == ("multi-head", "per-task", 2)
 
 
-PAIRS = [(env, "sac") for env in ENVS] + [("finger-spin", agent) for agent in AGENTS]
+PAIRS = [(env, "sac") for env in FEW] + [("finger-spin", agent) for agent in AGENTS]
 
 
 @pytest.mark.parametrize("env, agent", one_in(3, PAIRS))
@@ -243,7 +243,7 @@ def test_list_names_every_family_and_agent(capsys):
     mtjax.train.main(["--list"])
     lines = capsys.readouterr().out.splitlines()
     names = {line.split()[0] for line in lines if line.startswith("  ")}
-    assert names == {*ENVS, *AGENTS}
+    assert names == {*ENVS, *BENCHMARKS, *AGENTS}
     assert all(len(line.split()) > 3 for line in lines if line.startswith("  "))
 
 

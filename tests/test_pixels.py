@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from probes import METAWORLD, with_metaworld
 
 import mtjax
 from mtjax.envs import ENVS
@@ -153,7 +154,8 @@ def test_own_models_are_seen_whole():
     assert abs(rows.mean() - 7.5) < 2 and abs(columns.mean() - 7.5) < 2
 
 
-MUJOCO = sorted({family for name in ENVS if issubclass((family := ENVS[name][0]), Domain)}, key=lambda f: f.__name__)
+SEEN = {family for name in ENVS if issubclass((family := ENVS[name][0]), Domain) and name not in METAWORLD}
+MUJOCO = sorted(SEEN, key=lambda f: f.__name__)
 
 
 @pytest.mark.parametrize("family", MUJOCO, ids=lambda f: f.__name__)
@@ -171,6 +173,7 @@ def test_every_mujoco_family_has_a_scene(family):
     [
         ("brax-ant", {"pixels": 64}, "no MuJoCo model, which pixels needs; take a family such as cheetah-run"),
         ("tabular-mdp", {"repeat": 2}, "no MuJoCo model, which repeat needs"),
+        pytest.param("metaworld-reach", {"pixels": 64}, "leave out --env.pixels", marks=with_metaworld),
         ("finger-spin", {"pixels": 63}, "an even number from 16 to 512, not 63"),
         ("finger-spin", {"pixels": 8}, "an even number from 16"),
         ("finger-spin", {"frames": 0}, "frames must be from 1 to 16"),

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import SHORT_RUN
-from probes import slow_but
+from probes import FEW, INSTALLED, slow_but
 
 import mtjax
 import mtjax.evaluate
@@ -31,8 +31,8 @@ STEPS = 200
 # Classes that differ in their reward alone have one family here.
 alike = lambda cls: (cls.__module__, cls.start, cls.observe) if issubclass(cls, Domain) else cls
 FIRST = {alike(cls): name for name, (cls, _) in reversed(list(ENVS.items()))}.values()
-QUICK = [name for name in FIRST if not name.startswith("brax-")]  # each of which takes some ten seconds to compile
-NAMES = [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow]) for name in ENVS]
+QUICK = [name for name in FIRST if name in FEW and not name.startswith("brax-")]  # Brax's take ten seconds each
+NAMES = [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow]) for name in INSTALLED]
 
 
 def ends(env):
@@ -77,7 +77,9 @@ def test_family_steps_at_the_ends_of_its_range(name):
         np.testing.assert_array_equal(plain(one), plain(other))  # after its end a world may be anything, but the same
 
 
-@pytest.mark.parametrize("name", ENVS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name in FEW else [pytest.mark.slow]) for name in INSTALLED]
+)
 def test_family_round_trips_its_tasks(name):
     """A task is found again by its number, has its own name, and is unlike every other of its family."""
     env = mtjax.make(name)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from mujoco import mjx
+from probes import FEW, INSTALLED
 
 import mtjax
 from mtjax import cli, commands
@@ -98,7 +99,7 @@ def test_a_run_of_the_c_engine_imports_no_other(tmp_path):
     assert imported == ["mujoco"]
 
 
-@pytest.mark.parametrize("env, agent", [(env, "sac") for env in ENVS] + [("finger-spin", agent) for agent in AGENTS])
+@pytest.mark.parametrize("env, agent", [(env, "sac") for env in FEW] + [("finger-spin", agent) for agent in AGENTS])
 def test_no_flag_is_refused_that_there_is(env, agent, ours):
     """Of any family or agent, before either is known."""
     flags = cli.flags(with_preset(env, agent, "cpu"))
@@ -119,7 +120,7 @@ def test_a_class_of_the_users_own_may_have_any_flag(ours, monkeypatch):
     commands.check_flags(["--env.springiness=3"])
 
 
-@pytest.mark.parametrize("name", ENVS)
+@pytest.mark.parametrize("name", INSTALLED)
 def test_outline_is_what_the_family_says(name):
     """Tasks are counted without its class, and the sentence is read without running its file."""
     count, says = outline(name)

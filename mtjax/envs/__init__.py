@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from mtjax.checks import OF_TRAIN, checked
 from mtjax.envs import variation
+from mtjax.envs.metaworld.names import BENCHMARKS, FAMILIES
 from mtjax.names import InputError, first_sentence, frozen, lazily, load, nearest_error
 
 if TYPE_CHECKING:
@@ -22,13 +23,16 @@ if TYPE_CHECKING:
     from mtjax.envs.stacked import stacked
 
 __all__ = [
+    "BENCHMARKS",
     "ENVS",
     "Domain",
     "Family",
     "Mixture",
     "Parameter",
     "World",
+    "is_mixture",
     "make",
+    "members",
     "mixture",
     "name_of",
     "outline",
@@ -49,7 +53,8 @@ __getattr__ = lazily(
     },
 )
 
-Entry = tuple[Any, dict[str, Any]]  # a family's class, or the place that it is imported from; and its settings
+Settings = dict[str, Any]
+Entry = tuple[Any, Settings]  # a family's class, or the place that it is imported from; and its settings
 
 
 class Families(UserDict[str, Entry]):
@@ -194,12 +199,15 @@ _inside = lambda folder, table: {name: (f"{folder}.{place}", settings) for name,
 ENVS = Families(
     _inside("mtjax.envs.dm_control", _DOMAINS | _FURTHER | _HIP_BMDP | _GOALS)
     | _inside("mtjax.envs.mtenv", _MTENV)
+    | _inside("mtjax.envs.metaworld", FAMILIES)
     | _inside("mtjax.envs", _BRAX)
 )
 
 
 def make(name: str, vary: Mapping[str, Any] | tuple = (), **settings: Any) -> Any:
-    """Return the family called ``name``, or the mixture "NAME+NAME", with any of its fields replaced.
+    """Return the family called ``name``, or a mixture, with any of its fields replaced.
+
+    A mixture is "NAME+NAME", or a benchmark such as "mt10".
 
     Args:
         vary: values of parameters, {"mass": "0.5:1.5:10"}, beside those that the family varies by itself. A single
@@ -211,10 +219,10 @@ def make(name: str, vary: Mapping[str, Any] | tuple = (), **settings: Any) -> An
     """
     if not isinstance(name, str):
         raise InputError(f"an environment is chosen by name, such as 'finger-spin', not by {name!r}")
-    if "+" in name:
-        return _make_mixture(tuple(name.split("+")), _pairs(vary), dict(settings))
+    if is_mixture(name):
+        return _make_mixture(members(name), _pairs(vary), dict(settings))
     if name not in ENVS:
-        raise nearest_error("environment", name, ENVS)
+        raise nearest_error("environment", name, (*ENVS, *BENCHMARKS))
     family, defaults = ENVS[name]
     fields = [field.name for field in dataclasses.fields(family)]
     unknown = next((s for s in (*settings, *defaults) if s not in fields), None)
@@ -223,6 +231,17 @@ def make(name: str, vary: Mapping[str, Any] | tuple = (), **settings: Any) -> An
         raise _unknown_setting(name, family, unknown, settings.get(unknown))
     settings = checked(family, defaults | frozen(settings))
     return family(**{**settings, "vary": dict(defaults.get("vary", {})) | _pairs(vary)})
+
+
+def is_mixture(name: str) -> bool:
+    """Return whether a name is that of a mixture: "NAME+NAME" or a benchmark."""
+    return "+" in name or name in BENCHMARKS
+
+
+def members(name: str) -> tuple[tuple[str, Settings], ...]:
+    """Return the families that a name of ``make`` stands for, each with the settings that a benchmark has for it."""
+    parts = [BENCHMARKS[part][1] if part in BENCHMARKS else {part: {}} for part in name.split("+")]
+    return tuple(pair for part in parts for pair in part.items())
 
 
 def _pairs(vary: Any) -> dict[str, Any]:
@@ -285,7 +304,8 @@ def name_of(family: Any) -> str:
     """Return the name of a family in ``make``, or else the name of its class."""
     cls = type(family)
     if cls is load("mtjax.envs.mixtures:Mixture"):
-        return "+".join(family.names)
+        known = (name for name, (_, own) in BENCHMARKS.items() if tuple(own) == family.names and make(name) == family)
+        return next(known, "+".join(family.names))
     place = f"{cls.__module__}:{cls.__name__}"
     known = [name for name, (home, _) in ENVS.data.items() if home is cls or home == place]
     exact = [name for name in known if make(name) == family]
@@ -294,9 +314,9 @@ def name_of(family: Any) -> str:
     return next(iter((*exact, *plain, *known)), of_class)
 
 
-def _make_mixture(names: tuple[str, ...], vary: dict[str, Any], settings: dict[str, Any]) -> "Mixture":
-    """Make a mixture from names of families, and values of parameters by "NAME.PARAMETER"."""
-    cls = load("mtjax.envs.mixtures:Mixture")
+def _make_mixture(own: tuple[tuple[str, Settings], ...], vary: Settings, settings: Settings) -> "Mixture":
+    """Make a mixture from its families' own settings, and values of parameters by "NAME.PARAMETER"."""
+    cls, names = load("mtjax.envs.mixtures:Mixture"), tuple(name for name, _ in own)
     recorded = settings.pop("families", None)
     if recorded is not None:  # of config.json
         return cls(tuple(make(n.partition("#")[0], **each) for n, each in zip(names, recorded, strict=True)), names)
@@ -305,19 +325,19 @@ def _make_mixture(names: tuple[str, ...], vary: dict[str, Any], settings: dict[s
         known = dict.fromkeys(field.name for family in plain for field in dataclasses.fields(family))
         if given not in known:
             raise nearest_error("setting of these families", given, known)
-    own: dict[str, dict[str, Any]] = {name: {} for name in names}
+    chosen: dict[str, dict[str, Any]] = {name: {} for name in names}
     for given, values in vary.items():
         name, dot, parameter = given.rpartition(".")
-        if not dot or name not in own:
+        if not dot or name not in chosen:
             raise InputError(
                 f"in a mixture, say which family's {parameter} varies: one of "
-                f"{', '.join(f'{known}.{parameter}' for known in own)}; not {given}"
+                f"{', '.join(f'{known}.{parameter}' for known in names)}; not {given}"
             )
-        own[name][parameter] = values
+        chosen[name][parameter] = values
     made = []
-    for name, family in zip(names, plain, strict=True):
+    for (name, fixed), family in zip(own, plain, strict=True):
         mine = {key: value for key, value in settings.items() if key in family.__dataclass_fields__}
-        made.append(make(name, vary=own[name], **mine))
+        made.append(make(name, vary=chosen[name], **fixed | mine))
     return cls(tuple(made), names)
 
 

@@ -95,6 +95,10 @@ class Domain(Pictured):
         """Return whether () an episode ends in this world, with no rewards after it. By default only time ends one."""
         return jnp.bool_(False)
 
+    def metrics(self, task: Task, world: World, action: Array) -> dict[str, Array]:
+        """Return further numbers () of a world after the step, such as success. Evaluations report them."""
+        return {}
+
     def recall(self, task: Task, obs: Array) -> World:
         """Return a world with the observation ``obs``, exact in all that the reward reads. ``relabel`` needs it."""
         raise NotImplementedError(f"{type(self).__name__} does not say which world an observation shows")
@@ -124,7 +128,7 @@ class Domain(Pictured):
             reward, over = self.reward(task, world, action), self.terminates(task, world)
         else:
             world, reward, over = jax.lax.fori_loop(0, self.repeat, once, (state, jnp.float32(0), jnp.bool_(False)))
-        return Step(world, self.look_at(task, world), reward, over)
+        return Step(world, self.look_at(task, world), reward, over, self.metrics(task, world, action))
 
     def look_at(self, task: Task, world: World) -> Any:
         """Return what the agent observes: the state (O,), pictures, or both."""

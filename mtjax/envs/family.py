@@ -5,6 +5,7 @@ Tables are built on the host. Compiled programs never loop over tasks.
 
 import abc
 import dataclasses
+import math
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Annotated, Any, ClassVar, NamedTuple, Self
@@ -249,7 +250,7 @@ class Family(Flat, Tabled):
         found = self.variation
         parts = [found.rows[split] for split in SPLITS]
         if found.draws is not None:
-            parts.append(found.draws.reshape(-1, len(found.names)))
+            parts.append(np.concatenate(list(found.draws)))
         return dict(zip(found.names, np.concatenate(parts).T, strict=True))
 
     @property
@@ -261,16 +262,17 @@ class Family(Flat, Tabled):
     def count(self) -> int:
         """Return the number of rows of the table."""
         listed = sum(len(rows) for rows in self.variation.rows.values())
-        return listed if self.variation.draws is None else listed + self.train_count * self.num_draws
+        return listed if self.variation.draws is None else listed + math.prod(self.variation.draws.shape[:2])
 
     @cached_property
     def table(self) -> Table:
         """Return all tasks of all splits, and the draws of continuous ranges."""
         sizes = [len(self.variation.rows[split]) for split in SPLITS]
         listed, draws = sum(sizes), None
-        if self.count > listed:  # held-out tasks stay what they are
+        if self.count > listed:  # the first tasks draw; others, such as held-out ones, stay what they are
             draws = np.repeat(np.arange(listed)[:, None], self.num_draws, axis=1)
-            draws[: self.train_count] = np.arange(listed, self.count).reshape(-1, self.num_draws)
+            drawn = np.arange(listed, self.count).reshape(-1, self.num_draws)
+            draws[: len(drawn)] = drawn
         leaves: dict[str, Any] = {
             "id": np.arange(self.count, dtype=np.int32),
             "row": np.arange(self.count, dtype=np.int32),

@@ -29,7 +29,7 @@ class Variation(NamedTuple):
 
     names: tuple[str, ...]
     rows: Mapping[str, np.ndarray]  # split -> (R, names)
-    draws: np.ndarray | None  # (T, P, names) values; each episode of a training task takes one
+    draws: np.ndarray | None  # (T, P, names) values for the first tasks of all; each episode of one takes one
     low: np.ndarray  # (names,) ends of the training range
     high: np.ndarray
 

@@ -11,7 +11,7 @@ from mtjax.agents.choices import flag_names
 from mtjax.agents.choices import settings as settings_of
 from mtjax.checks import path
 from mtjax.config import Plan, RunConfig, configure, from_json, own_files, to_json, with_preset
-from mtjax.envs import ENVS, make, name_of
+from mtjax.envs import BENCHMARKS, ENVS, is_mixture, make, members, name_of
 from mtjax.envs.family import Family, Tabled
 from mtjax.loop import Settings
 from mtjax.names import InputError, nearest_error
@@ -163,17 +163,19 @@ def _configured(
     learner, training = configure(config.learner, base, rest)
     config = dataclasses.replace(config, training=training, learner=learner, start=_place_of(start))
     config = dataclasses.replace(config, plan=dataclasses.replace(config.plan, **plan))
-    return dataclasses.replace(config, imports=own_files(config)) if env_name in ENVS or "+" in env_name else config
+    named = env_name in ENVS or is_mixture(env_name)
+    return dataclasses.replace(config, imports=own_files(config)) if named else config
 
 
 def _family(env: str | Tabled, start: Policy | None, given: dict[str, Any]) -> tuple[Tabled, dict[str, Any]]:
     """Return the family, and what of ``given`` is not a field of it."""
     if not isinstance(env, str):
         return env, given
-    unknown = next((name for name in env.split("+") if name not in ENVS), None)
+    names = [name for name, _ in members(env)]
+    unknown = next((name for name in names if name not in ENVS), None)
     if unknown is not None:
-        raise nearest_error("environment", unknown, ENVS)
-    own = {name for part in env.split("+") for name in _names(ENVS[part][0])}
+        raise nearest_error("environment", unknown, (*ENVS, *BENCHMARKS))
+    own = {name for part in names for name in _names(ENVS[part][0])}
     family = make(env, **{name: value for name, value in given.items() if name in own})
     if start is not None and isinstance(family, Family) and isinstance(start.env, Family):
         family = family.scaled_as(start.env)

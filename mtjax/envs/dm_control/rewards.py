@@ -20,7 +20,7 @@ def tolerance(
 
     Args:
         x: () or any shape; the bounds and the margin may be arrays. A margin of 0 gives 0 outside the bounds.
-        sigmoid: shape of the fall: "gaussian", "long-tail", "linear" or "quadratic". The last two reach 0 and stay
+        sigmoid: shape of the fall: "gaussian", "long_tail", "linear" or "quadratic". The last two reach 0 and stay
             there.
     """
     outside = jnp.maximum(jnp.maximum(lower - x, x - upper), 0.0)
@@ -34,7 +34,7 @@ def _gaussian(distance: Array, value: float) -> Array:
 
 
 def _long_tail(distance: Array, value: float) -> Array:
-    return 1 / (1 + jnp.square(distance) * (1 / value - 1))
+    return 1 / (jnp.square(distance) * (1 / value - 1) + 1)
 
 
 def _linear(distance: Array, value: float) -> Array:
@@ -45,4 +45,4 @@ def _quadratic(distance: Array, value: float) -> Array:
     return jnp.maximum(1 - jnp.square(distance) * (1 - value), 0.0)
 
 
-_SIGMOIDS = {"gaussian": _gaussian, "long-tail": _long_tail, "linear": _linear, "quadratic": _quadratic}
+_SIGMOIDS = {"gaussian": _gaussian, "long_tail": _long_tail, "linear": _linear, "quadratic": _quadratic}

@@ -136,4 +136,4 @@ class Swimmer(Domain):
 
     def reward(self, task: Task, world: World, action: Array) -> Array:
         size = self.leaf(task, "geom_size")[self.models[0].geom("target").id, 0]
-        return tolerance(jnp.linalg.norm(self.way(world)), 0.0, size, 5 * size, "long-tail")
+        return tolerance(jnp.linalg.norm(self.way(world)), 0.0, size, 5 * size, "long_tail")

@@ -1,0 +1,53 @@
+"""Meta-World's basketball, to drop into a basket."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+
+from mtjax.envs.metaworld.at import At
+from mtjax.envs.metaworld.host import Host
+from mtjax.envs.metaworld.rewards import caging, distance, hamacher, near
+from mtjax.envs.metaworld.sawyer import Sawyer
+from mtjax.types import Array
+
+
+@dataclasses.dataclass(frozen=True)
+class Basketball(Sawyer):
+    """Bring a ball to just above a hoop (Meta-World's basketball-v3).
+
+    Reward: 10 on success; else the product of the caging reward and a long tail of the ball's way to a point above the
+        hoop, at a height of 0.3 m; once the ball is lifted in the gripper, its caging counts as 1, and 1 and 5 times
+        that tail are added.
+    Success: the ball is within 0.08 m of that point, where z counts twice.
+    """
+
+    scene: ClassVar[str] = "sawyer_basketball"
+    drawn: ClassVar = ((-0.1, 0.6, 0.0299, -0.1, 0.85, 0.0), (0.1, 0.7, 0.0301, 0.1, 0.9 + 1e-7, 0.0))
+    goal_low: ClassVar = (-0.1, 0.85 - 0.083, 0.2499)
+    goal_high: ClassVar = (0.1, 0.9 + 1e-7 - 0.083, 0.2501)
+    watched: ClassVar = {"ball": "body:bsktball"}
+
+    def allowed(self, vec: np.ndarray) -> bool:
+        return bool(np.linalg.norm(vec[:2] - vec[3:5]) >= 0.15)
+
+    def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
+        ball = np.append(vec[:2], 0.03)
+        host.move("basket_goal", vec[3:])
+        host.place_free(ball)
+        return {"target": host.site("goal"), "obj_init": ball}
+
+    def objects(self, at: At) -> tuple[Array, ...]:
+        return at.position["ball"], at.quat["ball"]
+
+    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+        ball, start, weight = at.obs[4:7], began["obj_init"], jnp.array([1.0, 1.0, 2.0])
+        target = began["target"].at[2].set(0.3)
+        left = distance(ball * weight, target * weight)
+        in_place = near(left, 0.08, distance(start * weight, target * weight))
+        caged = caging(at, began, ball, obj_radius=0.025, pad_success_thresh=0.06, xz_thresh=0.005, high_density=True)
+        held = (distance(ball, at.tcp) < 0.035) & (at.obs[3] > 0) & (ball[2] - 0.01 > start[2])
+        reward = hamacher(jnp.where(held, 1.0, caged), in_place) + jnp.where(held, 1 + 5 * in_place, 0.0)
+        return jnp.where(left < 0.08, 10.0, reward), left <= 0.08

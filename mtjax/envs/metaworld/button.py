@@ -1,0 +1,124 @@
+"""Meta-World's button on a box, to press from the front or from above, with a wall in the way or without."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+
+from mtjax.envs.metaworld.at import At
+from mtjax.envs.metaworld.host import Host
+from mtjax.envs.metaworld.rewards import distance, hamacher, near
+from mtjax.envs.metaworld.sawyer import Sawyer
+from mtjax.types import Array
+
+_JOINT = 9  # the place of the button's joint in qpos and qvel
+
+
+def _arrange(host: Host, vec: np.ndarray, axis: int) -> dict[str, np.ndarray]:
+    """Put the box at ``vec``; the button is to be pressed along ``axis`` until it is in its hole."""
+    host.move("box", vec)
+    host.forward()
+    target = host.site("hole")
+    return {"target": target, "obj_to_target_init": np.abs(target[axis] - host.site("buttonStart")[axis])}
+
+
+def press(at: At, began: Mapping[str, Array], depth: Array | float) -> tuple[Array, Array]:
+    """Return the reward () for pressing a button along y with an open gripper, and how far () [m] it has to go."""
+    button = at.obs[4:7]
+    away, left = distance(button, at.tcp), jnp.abs(began["target"][1] - button[1])
+    ready = hamacher(jnp.maximum(at.obs[3], 0.0), near(away, 0.05, distance(button, began["init_tcp"])))
+    return 2 * ready + jnp.where(away <= 0.05, 8 * near(left, 0.005, depth), 0.0), left
+
+
+@dataclasses.dataclass(frozen=True)
+class ButtonPress(Sawyer):
+    """Press a button from the front (Meta-World's button-press-v3).
+
+    Reward: 2 times the product of how far the gripper is open and how near the tool centre is to the button; with
+        that within 0.05 m, and 8 times a long tail of the way that the button has to go.
+    Success: along y, the button is within 0.02 m of its hole.
+    """
+
+    scene: ClassVar[str] = "sawyer_button_press"
+    hand_start: ClassVar = (0.0, 0.4, 0.2)
+    drawn: ClassVar = ((-0.1, 0.85, 0.115), (0.1, 0.9, 0.115))
+    goal_low: ClassVar = Sawyer.hand_low
+    goal_high: ClassVar = Sawyer.hand_high
+    watched: ClassVar = {"button": "body:button"}
+
+    def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
+        host.data.qpos[_JOINT] = host.data.qvel[_JOINT] = 0
+        return _arrange(host, vec, axis=1)
+
+    def objects(self, at: At) -> tuple[Array, ...]:
+        return at.position["button"] + jnp.array([0.0, -0.193, 0.0]), at.quat["button"]
+
+    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+        reward, left = press(at, began, began["obj_to_target_init"])
+        return reward, left <= 0.02
+
+
+@dataclasses.dataclass(frozen=True)
+class ButtonPressWall(ButtonPress):
+    """Press a button over a wall (Meta-World's button-press-wall-v3).
+
+    Reward: with the tool centre beyond 0.07 m of the button, 2 times the product of how far the gripper is closed (0.5
+        closed, 0 open) and how near they are; else 2, and 2 to 4 for an open gripper, and 4 times the square of a
+        long tail of the way that the button has to go.
+    Success: along y, the button is within 0.03 m of its hole.
+    """
+
+    scene: ClassVar[str] = "sawyer_button_press_wall"
+    drawn: ClassVar = ((-0.05, 0.85, 0.1149), (0.05, 0.9, 0.1151))
+
+    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+        button, opened = at.obs[4:7], at.obs[3]
+        away, left = distance(button, at.tcp), jnp.abs(began["target"][1] - button[1])
+        ready = hamacher((1 - opened) / 2, near(away, 0.01, distance(button, began["init_tcp"])))
+        pressed = near(left, 0.005, began["obj_to_target_init"])
+        return jnp.where(away > 0.07, 2 * ready, 2 + 2 * (1 + opened) + 4 * pressed**2), left <= 0.03
+
+
+@dataclasses.dataclass(frozen=True)
+class ButtonPressTopdown(Sawyer):
+    """Press a button from above (Meta-World's button-press-topdown-v3).
+
+    Reward: 5 times the product of how far the gripper is closed and how near the tool centre is to the button; with
+        that within 0.03 m, and 5 times a long tail of the way that the button has to go.
+    Success: along z, the button is within 0.024 m of its hole.
+    """
+
+    scene: ClassVar[str] = "sawyer_button_press_topdown"
+    hand_start: ClassVar = (0.0, 0.4, 0.2)
+    drawn: ClassVar = ((-0.1, 0.8, 0.115), (0.1, 0.9, 0.115))
+    goal_low: ClassVar = Sawyer.hand_low
+    goal_high: ClassVar = Sawyer.hand_high
+    watched: ClassVar = {"button": "body:button"}
+    presses_open: ClassVar[bool] = False
+
+    def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
+        return _arrange(host, vec, axis=2)
+
+    def objects(self, at: At) -> tuple[Array, ...]:
+        return at.position["button"] + jnp.array([0.0, 0.0, 0.193]), at.quat["button"]
+
+    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+        button, opened = at.obs[4:7], at.obs[3]
+        away, left = distance(button, at.tcp), jnp.abs(began["target"][2] - button[2])
+        hand = opened if self.presses_open else 1 - opened
+        ready = hamacher(hand, near(away, 0.01, distance(button, began["init_tcp"])))
+        pressed = near(left, 0.005, began["obj_to_target_init"])
+        return 5 * ready + jnp.where(away <= 0.03, 5 * pressed, 0.0), left <= 0.024
+
+
+@dataclasses.dataclass(frozen=True)
+class ButtonPressTopdownWall(ButtonPressTopdown):
+    """Press a button from above, over a wall (Meta-World's button-press-topdown-wall-v3).
+
+    Reward and success: as ``ButtonPressTopdown``'s, but the gripper should be open.
+    """
+
+    scene: ClassVar[str] = "sawyer_button_press_topdown_wall"
+    presses_open: ClassVar[bool] = True

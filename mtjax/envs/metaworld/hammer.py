@@ -1,0 +1,54 @@
+"""The hammer of Meta-World."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+
+from mtjax.envs.metaworld.at import At
+from mtjax.envs.metaworld.host import Host
+from mtjax.envs.metaworld.rewards import caging, distance, near
+from mtjax.envs.metaworld.sawyer import Sawyer
+from mtjax.types import Array
+
+_NAIL = 16  # in qpos, after the free hammer
+
+
+@dataclasses.dataclass(frozen=True)
+class Hammer(Sawyer):
+    """Hammer: pick up the hammer and drive the nail into the block.
+
+    Reward: 2 for caging the handle, 0.6 for a lifted hammer, 5.4 for its head at the nail's final place; all times how
+        level the hammer lies, from 1 down to 0. 10 if the nail is driven in and the reward exceeds 5.
+    Success: the nail is in by more than 0.09 m.
+    Start: the hammer at the drawn place, the block always at the same one.
+
+    The handle is caged at the hand's x wherever the hand is within 0.07 m of its middle.
+    """
+
+    scene: ClassVar[str] = "sawyer_hammer"
+    hand_start: ClassVar = (0.0, 0.4, 0.2)
+    drawn: ClassVar = ((-0.1, 0.4, 0.0), (0.1, 0.5, 0.0))
+    goal_low: ClassVar = (0.2399, 0.7399, 0.109)
+    goal_high: ClassVar = (0.2401, 0.7401, 0.111)
+    watched: ClassVar = {"hammer": "body:hammer", "nail": "body:nail_link"}
+
+    def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
+        host.place_free(vec)
+        return {"target": host.site("goal"), "obj_init": vec}
+
+    def objects(self, at: At) -> tuple[Array, ...]:
+        return at.position["hammer"], at.quat["hammer"], at.position["nail"], at.quat["nail"]
+
+    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+        hand, hammer = at.obs[:3], at.obs[4:7]
+        level = jnp.maximum(1 - jnp.linalg.norm(at.obs[7:11] - jnp.array([1.0, 0.0, 0.0, 0.0])) / 0.4, 0.0)
+        handle = hammer.at[0].set(jnp.where(abs(hammer[0] - hand[0]) < 0.07, hand[0], hammer[0]))
+        caged = caging(at, began, handle, obj_radius=0.015, pad_success_thresh=0.02, xz_thresh=0.01, high_density=True)
+        head = hammer + jnp.array([0.16, 0.06, 0.0])
+        in_place = 0.1 * (head[2] > 0.02) + 0.9 * near(distance(began["target"], head), 0.02, 0.2)
+        reward = (2 * caged + 6 * in_place) * level
+        success = at.qpos[_NAIL] > 0.09
+        return jnp.where(success & (reward > 5), 10.0, reward), success

@@ -1,0 +1,128 @@
+"""Handles of Meta-World: a lever on a box that is pressed down or pulled up."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+
+from mtjax.envs.metaworld.at import At
+from mtjax.envs.metaworld.host import Host
+from mtjax.envs.metaworld.rewards import caging, distance, hamacher, near
+from mtjax.envs.metaworld.sawyer import Sawyer
+from mtjax.types import Array
+
+_PRESSED = 0.02  # [m] within which a pressed handle is at its target
+_PULLED = 0.05  # [m] the same of a pulled one
+
+
+def _slide(host: Host, height: float) -> None:
+    """Put the handle at a height [m] below its upper end, at rest."""
+    host.data.qpos[9], host.data.qvel[9] = height, 0
+    host.forward()
+
+
+@dataclasses.dataclass(frozen=True)
+class HandlePress(Sawyer):
+    """Handle press: press the handle down.
+
+    Reward: 10 times the Hamacher product of the tool centre at the handle and the handle at the target's height; 10
+        within 0.02 m of that height.
+    Success: the handle is within 0.02 m of the target's height.
+    Start: the box at the drawn place, its handle up.
+    """
+
+    scene: ClassVar[str] = "sawyer_handle_press"
+    drawn: ClassVar = ((-0.1, 0.8, -0.001), (0.1, 0.9, 0.001))
+    goal_low: ClassVar = (-0.1, 0.55, 0.04)
+    goal_high: ClassVar = (0.1, 0.7, 0.08)
+    watched: ClassVar = {"handle": "site:handleStart"}
+
+    def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
+        host.move("box", vec)
+        _slide(host, -0.001)
+        return {"target": host.site("goalPress"), "handle_init_pos": host.site("handleStart"), "obj_init": vec}
+
+    def objects(self, at: At) -> tuple[Array, ...]:
+        return at.position["handle"], jnp.zeros(4)
+
+    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+        handle, start, target = at.position["handle"], began["handle_init_pos"], began["target"]
+        away = abs(handle[2] - target[2])
+        in_place = near(away, _PRESSED, abs(abs(start[2] - target[2]) - _PRESSED))
+        reach = near(distance(handle, at.tcp), 0.02, abs(distance(start, began["init_tcp"]) - 0.02))
+        success = away <= _PRESSED
+        return 10 * jnp.where(success, 1.0, hamacher(reach, in_place)), success
+
+
+@dataclasses.dataclass(frozen=True)
+class HandlePressSide(HandlePress):
+    """Handle press side: press down a handle that stands to the left and points to the right.
+
+    Reward, success and start: as HandlePress.
+    """
+
+    scene: ClassVar[str] = "sawyer_handle_press_sideways"
+    drawn: ClassVar = ((-0.35, 0.65, -0.001), (-0.25, 0.75, 0.001))
+    goal_low: ClassVar = HandlePress.hand_low
+    goal_high: ClassVar = HandlePress.hand_high
+
+
+@dataclasses.dataclass(frozen=True)
+class HandlePull(HandlePress):
+    """Handle pull: pull the handle up.
+
+    Reward: the Hamacher product of caging the handle and the handle at the target's height; 1 and 5 times the latter
+        more while the open gripper is within 0.035 m of the handle; 10 within 0.05 m of the target's height.
+    Success: the handle is within 0.05 m of the target's height.
+    Start: the box at the drawn place, its handle down.
+
+    Meta-World asks here whether the handle's y exceeds the height of the box by 0.01 m, which it always does. It also
+    takes the handle's start in the caging and in the margin to be the box's place.
+    """
+
+    goal_high: ClassVar = (0.1, 0.7, 0.18)
+    watched: ClassVar = {"handle": "site:handleRight"}
+
+    def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
+        host.move("box", vec)
+        _slide(host, -0.1)
+        return {"target": host.site("goalPull"), "obj_init": vec}
+
+    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+        handle, start, target = at.obs[4:7], began["obj_init"], began["target"]
+        away = abs(handle[2] - target[2])
+        in_place = near(away, _PULLED, abs(start[2] - target[2]))
+        caged = caging(at, began, handle, obj_radius=0.022, pad_success_thresh=0.05, xz_thresh=0.01, high_density=True)
+        held = (distance(handle, at.tcp) < 0.035) & (at.obs[3] > 0) & (handle[1] - 0.01 > start[2])
+        reward = hamacher(caged, in_place) + jnp.where(held, 1 + 5 * in_place, 0.0)
+        return jnp.where(away < _PULLED, 10.0, reward), away <= _PULLED
+
+
+@dataclasses.dataclass(frozen=True)
+class HandlePullSide(HandlePressSide):
+    """Handle pull side: pull up a handle that stands to the left and points to the right.
+
+    Reward: as HandlePull, with the distance to the target in place of the height, and held only if the handle rose by
+        0.01 m.
+    Success: the handle is within 0.08 m of the target.
+    Start: as HandlePull.
+    """
+
+    drawn: ClassVar = ((-0.35, 0.65, 0.0), (-0.25, 0.75, 0.0))
+    watched: ClassVar = {"handle": "site:handleCenter"}
+
+    def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
+        host.move("box", vec)
+        _slide(host, -0.1)
+        return {"target": host.site("goalPull"), "obj_init": host.site("handleCenter")}
+
+    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+        handle, start, target = at.obs[4:7], began["obj_init"], began["target"]
+        away = distance(handle, target)
+        in_place = near(away, _PULLED, distance(start, target))
+        caged = caging(at, began, handle, obj_radius=0.032, pad_success_thresh=0.06, xz_thresh=0.01, high_density=True)
+        held = (distance(handle, at.tcp) < 0.035) & (at.obs[3] > 0) & (handle[2] - 0.01 > start[2])
+        reward = hamacher(caged, in_place) + jnp.where(held, 1 + 5 * in_place, 0.0)
+        return jnp.where(away < _PULLED, 10.0, reward), away <= 0.08

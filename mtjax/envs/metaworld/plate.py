@@ -1,0 +1,107 @@
+"""Plates of Meta-World: a plate is slid over the table, into a goal or out of it."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+
+from mtjax.envs.metaworld.at import At, scalar_last
+from mtjax.envs.metaworld.host import Host
+from mtjax.envs.metaworld.rewards import distance, hamacher, near
+from mtjax.envs.metaworld.sawyer import Sawyer
+from mtjax.types import Array
+
+_RADIUS = 0.05  # [m] of the target in the reward
+
+
+@dataclasses.dataclass(frozen=True)
+class PlateSlide(Sawyer):
+    """Plate slide: slide the plate forward into the goal.
+
+    Reward: 8 times the Hamacher product of the tool centre at the plate and the plate at the target; 10 within 0.05 m
+        of the target.
+    Success: the plate is within 0.07 m of the target.
+    Start: the plate at its place, the goal at the drawn one.
+    """
+
+    scene: ClassVar[str] = "sawyer_plate_slide"
+    drawn: ClassVar = ((0.0, 0.6, 0.0, -0.1, 0.85, 0.0), (0.0, 0.6, 0.0, 0.1, 0.9, 0.0))
+    goal_low: ClassVar = drawn[0][3:]
+    goal_high: ClassVar = drawn[1][3:]
+    watched: ClassVar = {"plate": "geom:puck"}
+    slid: ClassVar = (0.0, 0.0)  # x and y [m] of the plate at the start, from its place in the scene
+    goal_at: ClassVar[slice | None] = slice(3, 6)  # where the drawn vector has the place of the goal's net
+
+    def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
+        if self.goal_at is not None:
+            host.move("puck_goal", vec[self.goal_at])
+        host.data.qpos[9:11] = self.slid
+        host.forward()
+        return {"target": vec[3:], "obj_init": vec[:3]}
+
+    def objects(self, at: At) -> tuple[Array, ...]:
+        return at.position["plate"], scalar_last(at.quat["plate"])
+
+    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+        plate, start, target = at.obs[4:7], began["obj_init"], began["target"]
+        away = distance(plate, target)
+        in_place = near(away, _RADIUS, distance(start, target))
+        reach = near(distance(plate, at.tcp), _RADIUS, distance(start, began["init_tcp"]))
+        return jnp.where(away < _RADIUS, 10.0, 8 * hamacher(reach, in_place)), away <= 0.07
+
+
+@dataclasses.dataclass(frozen=True)
+class PlateSlideBack(PlateSlide):
+    """Plate slide back: slide the plate back out of the goal, towards the robot.
+
+    Reward: 1.5 times the tool centre at the plate; instead 2, and 7 times the plate at the target, while the tool
+        centre is below 0.03 m and within 0.07 m of the plate; 10 within 0.05 m of the target.
+    Success: the plate is within 0.07 m of the target.
+    Start: the plate 0.15 m forward. The goal's net stays where the scene has it.
+    """
+
+    drawn: ClassVar = ((0.0, 0.85, 0.0, -0.1, 0.6, 0.015), (0.0, 0.85, 0.0, 0.1, 0.6, 0.015))
+    goal_low: ClassVar = drawn[0][3:]
+    goal_high: ClassVar = drawn[1][3:]
+    slid: ClassVar = (0.0, 0.15)
+    goal_at: ClassVar[slice | None] = None
+
+    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+        plate, start, target = at.obs[4:7], began["obj_init"], began["target"]
+        away, reached = distance(plate, target), distance(plate, at.tcp)
+        in_place = near(away, _RADIUS, distance(start, target) - _RADIUS)
+        reach = near(reached, _RADIUS, distance(start, began["init_tcp"]) - _RADIUS)
+        reward = jnp.where((at.tcp[2] <= 0.03) & (reached < 0.07), 2 + 7 * in_place, 1.5 * reach)
+        return jnp.where(away < _RADIUS, 10.0, reward), away <= 0.07
+
+
+@dataclasses.dataclass(frozen=True)
+class PlateSlideSide(PlateSlideBack):
+    """Plate slide side: slide the plate to the left into the goal.
+
+    Reward and success: as PlateSlideBack.
+    Start: the plate at its place. The goal's net stays where the scene has it, wherever the target is.
+    """
+
+    scene: ClassVar[str] = "sawyer_plate_slide_sideway"
+    drawn: ClassVar = ((0.0, 0.6, 0.0, -0.3, 0.54, 0.0), (0.0, 0.6, 0.0, -0.25, 0.66, 0.0))
+    goal_low: ClassVar = drawn[0][3:]
+    goal_high: ClassVar = drawn[1][3:]
+    slid: ClassVar = (0.0, 0.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class PlateSlideBackSide(PlateSlideSide):
+    """Plate slide back side: slide the plate to the right out of the goal.
+
+    Reward and success: as PlateSlideBack.
+    Start: the goal's net at the drawn place of the plate, and the plate 0.1 m to the right of it.
+    """
+
+    drawn: ClassVar = ((-0.25, 0.6, 0.0, -0.05, 0.6, 0.015), (-0.25, 0.6, 0.0, 0.15, 0.6, 0.015))
+    goal_low: ClassVar = drawn[0][3:]
+    goal_high: ClassVar = drawn[1][3:]
+    slid: ClassVar = (-0.15, 0.0)
+    goal_at: ClassVar[slice | None] = slice(0, 3)

@@ -1,0 +1,243 @@
+"""What Meta-World's fifty tasks share: a Sawyer arm whose hand follows a moved body, and starts that have settled."""
+
+import abc
+import dataclasses
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property, partial
+from types import MappingProxyType
+from typing import Any, ClassVar, NamedTuple
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from mtjax.envs.domain import Domain, stack_differing
+from mtjax.envs.engines.base import World
+from mtjax.envs.metaworld import scene
+from mtjax.envs.metaworld.at import At
+from mtjax.envs.metaworld.host import SUBSTEPS, Host
+from mtjax.envs.variation import Variation
+from mtjax.types import SPLITS, Array, InputError, Key, Step, Task
+
+_STEP = 0.01  # [m] that an action of 1 moves the hand's target
+_DOWN = (1.0, 0.0, 1.0, 0.0)
+_MOST_DRAWS = 1000
+_OBJECTS = 14  # entries of an observation for objects
+_HALF_LOW = np.array([-0.525, 0.348, -0.0525, -1.0, *[-np.inf] * _OBJECTS], np.float32)
+_HALF_HIGH = np.array([0.525, 1.025, 0.7, 1.0, *[np.inf] * _OBJECTS], np.float32)
+
+
+class Start(NamedTuple):
+    """How an episode of one goal begins."""
+
+    model: mujoco.MjModel
+    began: dict[str, np.ndarray]  # what the reward compares with
+    state: dict[str, np.ndarray]  # of the physics, by its name in World
+
+
+@dataclasses.dataclass(frozen=True)
+class Sawyer(Domain):
+    """A task of Meta-World. Subclasses give a scene, goals, the arrangement of things, and the reward.
+
+    Observation (39,): the hand (3) [m], how far the gripper is open (1, from 0 to 1), the task's things (14: position
+        [m] and orientation of each, then zeros), all of these once more as of the step before, and the goal (3) [m];
+        clipped to Meta-World's ranges.
+    Action (4,) in [-1, 1]: the way of the hand's target in x, y and z, of 0.01 m at most, inside the task's box; and
+        the force that closes the gripper.
+    Reward: Meta-World's second version, from 0 to 10.
+    Metrics: success (0 or 1) after the step.
+    Start: the settled hand, and the things as one of ``num_draws`` goals has them; each episode draws a goal.
+    Episode: 500 steps of 0.0125 s (five substeps); it never terminates.
+    """
+
+    num_draws: int = 50
+    """Number of goals. Each episode draws one of them."""
+    goal_hidden: bool = False
+    """Observe zeros in place of the goal, as in the benchmarks of meta-learning."""
+    held_out: bool = False
+    """Do not train on this task: it is in the split extrapolation."""
+
+    scene: ClassVar[str]  # a file in the package's assets/sawyer_xyz, without .xml
+    hand_low: ClassVar[tuple[float, ...]] = (-0.5, 0.4, 0.05)  # [m] the box of the hand's target
+    hand_high: ClassVar[tuple[float, ...]] = (0.5, 1.0, 0.5)
+    hand_start: ClassVar[tuple[float, ...]] = (0.0, 0.6, 0.2)
+    drawn: ClassVar[tuple[tuple[float, ...], tuple[float, ...]]]  # least and greatest vector of an episode's goal
+    goal_low: ClassVar[tuple[float, ...]]  # to which the goal in observations is clipped
+    goal_high: ClassVar[tuple[float, ...]]
+    watched: ClassVar[Mapping[str, str]] = MappingProxyType({})  # short name -> "body:NAME", "site:NAME", "geom:NAME"
+    pressed: ClassVar[str] = ""  # a geom, if success needs that both pads press on it
+
+    parameters: ClassVar = MappingProxyType({})
+    action_size: ClassVar[int] = 4  # type: ignore
+    num_substeps: ClassVar[int] = SUBSTEPS
+    episode_steps: ClassVar[int] = 500
+    default_iterations: ClassVar[int] = 50
+
+    def __post_init__(self):
+        scene.folder()
+        if self.vary:
+            raise InputError(f"Meta-World's tasks vary in their goals only, not in {next(iter(dict(self.vary)))}")
+        super().__post_init__()
+        if self.pixels:
+            raise InputError("Meta-World's scenes are read without what is only seen; leave out --env.pixels")
+        if self.engine == "mjx":
+            raise InputError("engine 'mjx' cannot compute Meta-World's cylinders on boxes; use --engine=c or warp")
+
+    # What a task gives.
+
+    def allowed(self, vec: np.ndarray) -> bool:
+        """Return whether a drawn vector is a goal. Another is drawn if not. It runs on the host."""
+        return True
+
+    @abc.abstractmethod
+    def arrange(self, host: Host, vec: np.ndarray) -> dict[str, Any]:
+        """Put the things of an episode in place, after the hand has settled. It runs on the host, twice a goal.
+
+        Returns:
+            What the reward compares with, by name: "target" (3,), "obj_init" (3,) for ``caging``, and whatever else.
+            "init_tcp" (3,) is added if it is not given. Meta-World's ``init_left_pad`` and ``init_right_pad`` are
+            views that move with the pads: read ``at.left_pad`` in their place. So is any result of its
+            ``get_body_com`` that it does not copy.
+        """
+
+    @abc.abstractmethod
+    def objects(self, at: At) -> tuple[Array, ...]:
+        """Return what fills the observation's entries for objects: position (3,), orientation (4,), position, ..."""
+
+    @abc.abstractmethod
+    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+        """Return reward () and success () bool of a world after a step. ``began`` is what ``arrange`` returned."""
+
+    # Starts.
+
+    @cached_property
+    def variation(self) -> Variation:
+        """Return the one task, and room for the goals that its episodes draw."""
+        rows = {name: np.zeros((int(name == self._split), 0)) for name in SPLITS}
+        return Variation((), rows, np.zeros((1, self.num_draws, 0)), np.zeros(0), np.zeros(0))
+
+    @property
+    def _split(self) -> str:
+        return "extrapolation" if self.held_out else "train"
+
+    def vectors(self) -> np.ndarray:
+        """Draw the vectors (P, K) of all goals.
+
+        Raises:
+            RuntimeError: hardly any vector is allowed.
+        """
+        random, (low, high) = np.random.default_rng(self.task_seed), np.asarray(self.drawn)
+        found: list[np.ndarray] = []
+        for _ in range(_MOST_DRAWS * self.num_draws):
+            vec = random.uniform(low, high)
+            if self.allowed(vec):
+                found.append(vec)
+            if len(found) == self.num_draws:
+                return np.stack(found)
+        raise RuntimeError(f"{type(self).__name__} allows hardly any goal")
+
+    @cached_property
+    def starts_of_goals(self) -> tuple[Start, ...]:
+        """Return how episodes begin, for every goal."""
+        settled = Host(self._compile({})).settle(self.hand_start)
+        with ThreadPoolExecutor() as pool:
+            return tuple(pool.map(partial(self.begin, settled, settled.content()), self.vectors()))
+
+    def begin(self, settled: Host, content: bytes, vec: np.ndarray) -> Start:
+        """Begin an episode as Meta-World does, which resets twice: the second time, moved things are in place.
+
+        Args:
+            settled: the scene with nothing moved, whose hand has settled.
+            content: its model.
+        """
+        host, model = settled.copy(), settled.model
+        self.arrange(host, vec)
+        if host.content() == content:
+            host = settled.copy()
+        else:
+            host, model = host.settle(self.hand_start), host.model
+        tcp, data = host.tcp(), host.data
+        began = {"init_tcp": tcp} | {name: np.asarray(x, np.float64) for name, x in self.arrange(host, vec).items()}
+        state = {"qpos": data.qpos, "qvel": data.qvel, "warmstart": data.qacc_warmstart, "sensors": data.sensordata}
+        state["mocap"] = np.concatenate([data.mocap_pos, data.mocap_quat], axis=1)
+        return Start(model, began, {name: x.copy() for name, x in state.items()})
+
+    @cached_property
+    def models(self) -> tuple[mujoco.MjModel, ...]:
+        """Return the model of every row of the table: the task's, which is that of its first goal, and the goals'."""
+        return tuple(start.model for start in self._of_rows)
+
+    @property
+    def _of_rows(self) -> tuple[Start, ...]:
+        starts = self.starts_of_goals
+        return (starts[0], *starts)
+
+    def build(self) -> dict[str, dict[str, Any]]:
+        starts = self._of_rows
+        stacked = lambda trees: {name: np.float32(np.stack([tree[name] for tree in trees])) for name in trees[0]}
+        states = {f"start_{name}": x for name, x in stacked([start.state for start in starts]).items()}
+        model = {name: np.float32(leaf) for name, leaf in stack_differing(self.models).items()}
+        return {"model": model, "goal": stacked([start.began for start in starts]) | states}
+
+    def compile_spec(self, values: Mapping[str, float] | None = None) -> mujoco.MjSpec:
+        return scene.read(self.scene, self.watched, self.pressed)
+
+    # Steps.
+
+    def start(self, task: Task, key: Key) -> tuple[Array, ...]:
+        began = task.goal
+        return began["start_qpos"], began["start_qvel"], jnp.zeros(4 + _OBJECTS), began["start_mocap"]
+
+    def reset(self, task: Task, key: Key) -> Step:
+        """Begin an episode at the goal's settled start. Nothing is simulated."""
+        names = ("qpos", "qvel", "warmstart", "sensors", "mocap")
+        world = World(extra=None, **{name: task.goal[f"start_{name}"] for name in names})
+        world = world._replace(extra=self._half(world))
+        seen = self._unclipped(task, world)
+        return Step(world, seen, jnp.float32(0), jnp.bool_(False), {"success": jnp.float32(0)})
+
+    def control(self, task: Task, world: World, action: Array) -> tuple[World, Array]:
+        """Return the world with the hand's target moved and its observation kept, and the forces on the fingers."""
+        way = jnp.clip(action[:3], -1.0, 1.0) * _STEP
+        target = jnp.clip(world.mocap[0, :3] + way, jnp.array(self.hand_low), jnp.array(self.hand_high))
+        mocap = jnp.concatenate([target, jnp.array(_DOWN)])[None]
+        return world._replace(mocap=mocap, extra=self._half(world)), jnp.stack([action[3], -action[3]])
+
+    def observe(self, task: Task, world: World) -> Array:
+        low = jnp.concatenate([_HALF_LOW, _HALF_LOW, jnp.float32(self.goal_low)])
+        high = jnp.concatenate([_HALF_HIGH, _HALF_HIGH, jnp.float32(self.goal_high)])
+        seen = jnp.clip(self._unclipped(task, world), low, high)
+        return seen.at[36:].set(0) if self.goal_hidden else seen
+
+    def reward(self, task: Task, world: World, action: Array) -> Array:
+        return self.evaluate(self.at(task, world, action), task.goal)[0]
+
+    def metrics(self, task: Task, world: World, action: Array) -> dict[str, Array]:
+        return {"success": self.evaluate(self.at(task, world, action), task.goal)[1].astype(jnp.float32)}
+
+    def at(self, task: Task, world: World, action: Array) -> At:
+        """Return what a world shows."""
+        return self._shown(world)._replace(obs=self.observe(task, world), action=action)
+
+    def _unclipped(self, task: Task, world: World) -> Array:
+        """Return the observation (39,) as it is at a reset."""
+        goal = jnp.zeros(3) if self.goal_hidden else task.goal["target"]
+        return jnp.concatenate([self._half(world), world.extra, goal])
+
+    def _half(self, world: World) -> Array:
+        """Return hand, gripper and objects (18,)."""
+        hand, left, right = world.sensors[:9].reshape(3, 3)
+        opened = jnp.clip(jnp.linalg.norm(right - left) / 0.1, 0.0, 1.0)
+        things = jnp.concatenate(self.objects(self._shown(world)))
+        return jnp.concatenate([hand, opened[None], things, jnp.zeros(_OBJECTS - things.size)])
+
+    def _shown(self, world: World) -> At:
+        """Return the places of the gripper and of watched things, from the sensors of ``scene.read``."""
+        left_pad, right_pad, left, right = world.sensors[9:21].reshape(4, 3)
+        poses, press = jnp.split(world.sensors[21:], [7 * len(self.watched)])
+        poses = poses.reshape(-1, 7)
+        position = dict(zip(self.watched, poses[:, :3], strict=True))
+        quat = dict(zip(self.watched, poses[:, 3:], strict=True))
+        nothing = jnp.zeros(0)
+        return At(nothing, nothing, (left + right) / 2, left_pad, right_pad, position, quat, world.qpos, press[::3])

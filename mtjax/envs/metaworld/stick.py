@@ -1,0 +1,121 @@
+"""Tasks of Meta-World with a stick and a thermos flask."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+
+from mtjax.envs.metaworld.at import At, scalar_last
+from mtjax.envs.metaworld.host import Host
+from mtjax.envs.metaworld.rewards import caging, distance, hamacher, near
+from mtjax.envs.metaworld.sawyer import Sawyer
+from mtjax.types import Array
+
+_RADIUS = 0.12  # [m] of both targets for the flask
+
+
+@dataclasses.dataclass(frozen=True)
+class StickPush(Sawyer):
+    """Stick push: pick up the stick and push the flask with it.
+
+    Reward: caging the stick. While the stick is held and lifted by 0.01 m, instead 2, 5 times the stick at the target
+        and 3 times the flask at the target; then 10 within 0.12 m of the target.
+    Success: the flask is within 0.12 m of the target while the stick is lifted by 0.01 m and both pads press on it.
+    Start: the stick at the drawn x and y, the flask always at the same place; the target at the drawn x and y, at the
+        height of the flask's handle.
+
+    Forces on the pads are those of the last substep. Meta-World computes them once more, of the state after it.
+    """
+
+    scene: ClassVar[str] = "sawyer_stick_obj"
+    drawn: ClassVar = ((-0.08, 0.58, 0.0, 0.399, 0.55, 0.1319), (-0.03, 0.62, 0.001, 0.401, 0.6, 0.1321))
+    goal_low: ClassVar = drawn[0][3:]
+    goal_high: ClassVar = drawn[1][3:]
+    watched: ClassVar = {"stick": "body:stick", "handle": "site:insertion"}
+    pressed: ClassVar[str] = "objGeom"
+    flask_at: ClassVar = (0.0, 0.0)  # x and y [m] of the flask at the start, from its place in the scene
+    to_flask: ClassVar = (0.0, 0.09, 0.0)  # [m] from the handle to what the observation shows
+
+    def allowed(self, vec: np.ndarray) -> bool:
+        return bool(np.linalg.norm(vec[:2] - vec[3:5]) >= 0.1)
+
+    def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
+        stick = np.array([*vec[:2], 0.02])
+        height = self.target_height(host)
+        host.data.qpos[16:18], host.data.qvel[16:18] = self.flask_at, 0
+        host.place_free(stick)
+        return {"target": np.array([*vec[3:5], height]), "stick_init_pos": stick, "obj_init": host.body("object")}
+
+    def target_height(self, host: Host) -> float:
+        """Return the height [m] of the target."""
+        return host.site("insertion")[2]
+
+    def objects(self, at: At) -> tuple[Array, ...]:
+        flask = at.position["handle"] + jnp.array(self.to_flask)
+        return at.position["stick"], scalar_last(at.quat["stick"]), flask, jnp.zeros(4)
+
+    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+        stick, flask, target = at.obs[4:7] + jnp.array([0.015, 0.0, 0.0]), at.obs[11:14], began["target"]
+        away = distance(flask, target)
+        stick_in_place = near(distance(stick, target), _RADIUS, distance(began["stick_init_pos"], target) - _RADIUS)
+        flask_in_place = near(away, _RADIUS, distance(began["obj_init"], target) - _RADIUS)
+        caged = caging(
+            at,
+            began,
+            stick,
+            obj_radius=0.04,
+            pad_success_thresh=0.05,
+            xz_thresh=0.01,
+            high_density=True,
+            obj_init=began["stick_init_pos"],
+        )
+        lifted = (at.obs[3] > 0) & (stick[2] - 0.01 > began["stick_init_pos"][2])
+        reward = jnp.where(away <= _RADIUS, 10.0, 2 + 5 * stick_in_place + 3 * flask_in_place)
+        reward = jnp.where(lifted & (distance(stick, at.tcp) < 0.02), reward, caged)
+        return reward, lifted & (away <= _RADIUS) & jnp.all(at.press != 0)
+
+
+@dataclasses.dataclass(frozen=True)
+class StickPull(StickPush):
+    """Stick pull: pick up the stick, put it through the flask's handle and pull the flask with it.
+
+    Reward: the Hamacher product of caging the stick and the stick at the flask, where z counts twice. While the stick
+        is held and lifted by 0.01 m, caging counts as 1, and 1 and 5 times the stick at the flask come on top; or, once
+        the stick is through the handle, 6, twice the stick at the target and the flask at the target; then 10 with the
+        handle within 0.12 m of the target.
+    Success: the handle is within 0.12 m of the target, and the stick through it.
+    Start: the stick at the drawn x and y, the flask always at the same place; the target at the drawn x and y.
+
+    The caging takes the flask's place at the start for that of the stick.
+    """
+
+    hand_low: ClassVar = (-0.5, 0.35, 0.05)
+    drawn: ClassVar = ((-0.1, 0.55, 0.0, 0.35, 0.45, 0.0199), (0.0, 0.65, 0.001, 0.45, 0.55, 0.0201))
+    goal_low: ClassVar = drawn[0][3:]
+    goal_high: ClassVar = drawn[1][3:]
+    watched: ClassVar = {**StickPush.watched, "end": "site:stick_end"}
+    flask_at: ClassVar = (0.0, 0.09)
+    to_flask: ClassVar = (0.0, 0.0, 0.0)
+
+    def target_height(self, host: Host) -> float:
+        return 0.02
+
+    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+        stick, handle, target = at.obs[4:7], at.obs[11:14], began["target"]
+        to_flask, scale = jnp.array([0.05, 0.0, 0.0]), jnp.array([1.0, 1.0, 2.0])
+        flask, flask_init, stick_init = handle + to_flask, began["obj_init"], began["stick_init_pos"]
+        margin = jnp.linalg.norm((stick_init - flask_init - to_flask) * scale)
+        at_flask = near(jnp.linalg.norm((stick - flask) * scale), 0.05, margin)
+        stick_in_place = near(distance(stick, target), 0.05, distance(stick_init, target))
+        flask_in_place = near(distance(flask, target), 0.05, distance(flask_init, target))
+        caged = caging(at, began, stick, obj_radius=0.014, pad_success_thresh=0.05, xz_thresh=0.01, high_density=True)
+
+        gap = abs(at.position["end"] - handle)
+        through = (at.position["end"][0] >= handle[0]) & (gap[1] <= 0.04) & (gap[2] <= 0.06)
+        near_target = distance(handle, target) <= _RADIUS
+        pulled = jnp.where(near_target, 10.0, 6 + at_flask + 2 * stick_in_place + flask_in_place)
+        held = (distance(stick, at.tcp) < 0.02) & (at.obs[3] > 0) & (stick[2] - 0.01 > stick_init[2])
+        lifted = jnp.where(through, pulled, 1 + 6 * at_flask)  # a product with 1 changes nothing
+        return jnp.where(held, lifted, hamacher(caged, at_flask)), near_target & through

@@ -1,0 +1,77 @@
+"""Windows of Meta-World: a frame that slides sideways."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+
+from mtjax.envs.dm_control.rewards import tolerance
+from mtjax.envs.metaworld.at import At
+from mtjax.envs.metaworld.host import Host
+from mtjax.envs.metaworld.rewards import distance, hamacher, near
+from mtjax.envs.metaworld.sawyer import Sawyer
+from mtjax.types import Array
+
+_RADIUS = 0.05  # [m] of the target, along x
+
+
+@dataclasses.dataclass(frozen=True)
+class WindowOpen(Sawyer):
+    """Window open: slide the window to the right by its handle.
+
+    Reward: 10 times the Hamacher product of the tool centre at the handle and the handle at the target along x.
+    Success: the handle is within 0.05 m of the target along x.
+    Start: the window at the drawn place, closed. The target is 0.2 m to the right of the window's centre.
+
+    The handle's way is measured from the window's centre and not from the handle itself.
+    """
+
+    scene: ClassVar[str] = "sawyer_window_horizontal"
+    hand_start: ClassVar = (0.0, 0.4, 0.2)
+    drawn: ClassVar = ((-0.1, 0.7, 0.16), (0.1, 0.9, 0.16))
+    goal_low: ClassVar = Sawyer.hand_low
+    goal_high: ClassVar = Sawyer.hand_high
+    watched: ClassVar = {"handle": "site:handleOpenStart"}
+    way_from: ClassVar[str] = "obj_init"  # from where the handle's way to the target is measured
+    reach_shape: ClassVar[str] = "long_tail"
+
+    def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
+        host.move("window", vec)
+        handle = host.site("handleOpenStart")
+        host.data.qpos[9] = 0.0
+        return {"target": vec + np.array([0.2, 0.0, 0.0]), "obj_init": vec, "window_handle_pos_init": handle}
+
+    def objects(self, at: At) -> tuple[Array, ...]:
+        return at.position["handle"], jnp.zeros(4)
+
+    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+        handle = at.position["handle"]
+        away = abs(handle[0] - began["target"][0])
+        way = abs(began[self.way_from][0] - began["target"][0])
+        in_place = near(away, _RADIUS, abs(way - _RADIUS))
+        margin = abs(distance(began["window_handle_pos_init"], began["init_tcp"]) - 0.02)
+        reach = tolerance(distance(handle, at.tcp), 0.0, 0.02, margin, self.reach_shape)
+        return 10 * hamacher(reach, in_place), away <= _RADIUS
+
+
+@dataclasses.dataclass(frozen=True)
+class WindowClose(WindowOpen):
+    """Window close: slide the window to the left by its handle.
+
+    Reward and success: as WindowOpen, but the reward for reaching the handle falls as a Gaussian, and the handle's way
+        is measured from the handle.
+    Start: the window at the drawn place, open by 0.2 m. The target is the window's centre.
+    """
+
+    drawn: ClassVar = ((0.0, 0.75, 0.2), (0.0, 0.9, 0.2))
+    watched: ClassVar = {"handle": "site:handleCloseStart"}
+    way_from: ClassVar[str] = "window_handle_pos_init"
+    reach_shape: ClassVar[str] = "gaussian"
+
+    def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
+        host.move("window", vec)
+        handle = host.site("handleCloseStart") + np.array([0.2, 0.0, 0.0])
+        host.data.qpos[9] = 0.2
+        return {"target": vec, "obj_init": vec, "window_handle_pos_init": handle}

@@ -1,0 +1,206 @@
+"""Meta-World's tasks as environments: steps against recorded ones, the hand, goals, and benchmarks as mixtures."""
+
+import importlib.util
+from functools import cache
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from probes import with_metaworld as with_scenes
+
+import mtjax
+from mtjax import cli
+from mtjax.config import from_json, to_json
+from mtjax.envs import BENCHMARKS, name_of
+from mtjax.envs.metaworld import scene
+from mtjax.envs.metaworld.names import TASKS
+from mtjax.names import load
+from mtjax.types import InputError
+
+DATA = Path(__file__).parent / "data" / "metaworld"
+QUICK = ("drawer-close", "push")
+one_or_all = pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in TASKS]
+)
+
+
+@cache
+def made(name):
+    """Return a task's family whose goals are the two recorded ones, and the recorded arrays."""
+    with np.load(DATA / f"{name}.npz") as file:
+        recorded = dict(file)
+    cls = load(f"mtjax.envs.metaworld.{TASKS[name]}")
+    given = type(cls.__name__, (cls,), {"vectors": lambda self: recorded["rand_vec"]})
+    return given(num_draws=2, engine="c"), recorded
+
+
+def goals(env):
+    """Return the tasks of a family's goals, leaves (P, ...)."""
+    return jax.tree.map(lambda x: jnp.asarray(x[0]), env.tasks().draws)
+
+
+def begin(env):
+    """Return the goals, and a first step of each."""
+    tasks = goals(env)
+    return tasks, jax.jit(jax.vmap(env.reset))(tasks, jax.random.split(jax.random.key(0), len(tasks.id)))
+
+
+@with_scenes
+@one_or_all
+def test_a_step_is_that_of_the_original(name):
+    """From every recorded state: physics, observation, reward and success after one step.
+
+    MuJoCo 3.17 solves contacts a little unlike 3.3. A reward with a threshold may fall on its other side.
+    """
+    env, recorded = made(name)
+    tasks, start = begin(env)
+    np.testing.assert_allclose(start.obs, recorded["start_obs"], atol=4e-3)
+    np.testing.assert_array_equal(start.obs[:, :18], start.obs[:, 18:36])
+    episode, time = recorded["episode"], recorded["time"]
+    before = np.flatnonzero((episode[:-1] == episode[1:]) & (time[:-1] + 1 == time[1:]))
+    part = lambda key, rows: jnp.asarray(recorded[key][rows])
+
+    def step(task, qpos, qvel, mocap, seen, action):
+        return env.step(task, env.simulator.forward(task, qpos, qvel, seen[:18], mocap[None]), action)
+
+    states = [part(key, before) for key in ("qpos", "qvel", "mocap", "obs")]
+    each = jax.tree.map(lambda x: x[episode[before]], tasks)
+    after = jax.jit(jax.vmap(step))(each, *states, part("action", before + 1))
+    expected = np.concatenate([part("obs", before + 1)[:, :18], states[3][:, :18], part("obs", before + 1)[:, 18:]], 1)
+    np.testing.assert_allclose(after.obs, expected, atol=2e-2)
+    assert np.mean(np.abs(after.obs - expected).max(1)) < 4e-3
+    off = np.abs(after.reward - recorded["reward"][before + 1])
+    assert np.median(off) < 5e-3 and np.sum(off > 0.2) <= 3
+    np.testing.assert_array_equal(after.metrics["success"], recorded["success"][before + 1])
+
+
+@with_scenes
+def test_the_hand_follows_its_target_inside_the_box():
+    """At most 0.01 m a step, and the gripper closes as the action says."""
+    env, _ = made("push")
+    tasks, start = begin(env)
+    actions = jnp.repeat(jnp.array([[3.0, 0.5, -1.0, 1.0], [0.0, 0.0, 0.0, 1.0]]), jnp.array([20, 40]), axis=0)
+    drive = lambda task, state: jax.lax.scan(lambda state, a: (env.step(task, state, a).state, state), state, actions)
+    last, before = jax.jit(jax.vmap(drive))(tasks, start.state)
+    way = np.diff(before.mocap[:, :, 0, :3], axis=1)
+    np.testing.assert_allclose(way[:, 0], [[0.01, 0.005, -0.01]] * 2, atol=1e-6)
+    np.testing.assert_allclose(last.mocap[:, 0, :3], [[0.2, 0.7, env.hand_low[2]]] * 2, atol=1e-5)
+    assert np.abs(last.sensors[:, :3] - last.mocap[:, 0, :3]).max() < 0.02
+    opened = jax.vmap(env.observe)(tasks, last)[:, 3]
+    assert np.all(start.obs[:, 3] > 0.99) and np.all(opened < 0.3)
+
+
+@with_scenes
+def test_a_fixed_body_that_is_moved_is_felt_where_it_is():
+    """Two worlds press the place of the first one's button. The other's box is elsewhere."""
+    env = mtjax.make("metaworld-button-press-topdown", num_draws=8, engine="c")
+    tasks = goals(env)
+    x = np.asarray(tasks.goal["target"][:, 0])
+    chosen = np.array([x.argmin(), x.argmax()])
+    assert np.ptp(x[chosen]) > 0.1
+    tasks = jax.tree.map(lambda leaf: leaf[chosen], tasks)
+    target = tasks.goal["target"][0]
+
+    def press(task):
+        def step(state, _):
+            hand = state.sensors[:3]
+            aside = jnp.linalg.norm((target - hand)[:2]) > 0.02
+            aim = target.at[2].set(jnp.where(aside, 0.4, 0.1))
+            after = env.step(task, state, jnp.append(jnp.clip(10 * (aim - hand), -1, 1), 1.0))
+            return after.state, after.metrics["success"]
+
+        return jax.lax.scan(step, env.reset(task, jax.random.key(0)).state, length=150)[1]
+
+    success = np.asarray(jax.jit(jax.vmap(press))(tasks))
+    assert success[0].any() and not success[1].any()
+
+
+@with_scenes
+def test_goals_differ_by_the_seed_of_tasks_and_may_be_hidden():
+    one, other = (mtjax.make("metaworld-reach", num_draws=3, task_seed=seed, engine="c") for seed in (0, 1))
+    assert not np.intersect1d(one.vectors()[:, 3:], other.vectors()[:, 3:]).size
+    hidden = mtjax.make("metaworld-reach", num_draws=3, goal_hidden=True, engine="c")
+    tasks, start = begin(hidden)
+    after = jax.jit(jax.vmap(hidden.step))(tasks, start.state, jnp.zeros((3, 4)))
+    for step in (start, after):
+        assert not step.obs[:, 36:].any() and step.obs[:, :18].any()
+    np.testing.assert_allclose(tasks.goal["target"], one.vectors()[:, 3:], atol=1e-6)
+    assert np.ptp(after.reward) > 0
+    table = one.table
+    assert table.draws.shape == (1, 3) and one.train_count == 1
+    assert len({id(model) for model in one.models}) == 1  # nothing fixed is moved
+
+
+@with_scenes
+def test_refused_settings_are_named():
+    with pytest.raises(InputError, match="mjx"):
+        mtjax.make("metaworld-reach", engine="mjx")
+    with pytest.raises(InputError, match="goals only, not in mass"):
+        mtjax.make("metaworld-reach", vary={"mass": "1:2:3"})
+
+
+def test_the_package_is_asked_for_by_its_command(monkeypatch):
+    """Before anything compiles, and for a benchmark too."""
+    monkeypatch.setattr(scene.importlib.util, "find_spec", lambda name: None)
+    for name in ("metaworld-reach", "mt10"):
+        with pytest.raises(InputError, match=r"pip install --no-deps metaworld==3\.1\.1"):
+            mtjax.make(name)
+
+
+def test_benchmarks_have_the_tasks_of_the_original():
+    counts = {
+        name: (len(own), sum("held_out" in each for each in own.values())) for name, (_, own) in BENCHMARKS.items()
+    }
+    assert counts == {"mt10": (10, 0), "mt25": (25, 0), "mt50": (50, 0), "ml10": (15, 5), "ml45": (50, 5)}
+    assert all(name.removeprefix("metaworld-") in TASKS for _, own in BENCHMARKS.values() for name in own)
+    source = importlib.util.find_spec("metaworld")
+    if source is None:
+        return
+    text = (Path(source.submodule_search_locations[0]) / "env_dict.py").read_text()
+    of = lambda part: [word.strip(' ",').removesuffix("-v3") for word in part.splitlines() if "-v3" in word]
+    listed = {name: of(text.split(f"\n{name.upper()}_V3 = ")[1].split("\n)\n")[0]) for name in ("mt10", "mt25", "ml10")}
+    assert set(of(text.split("ALL_V3_ENVIRONMENTS = ")[1].split("\n)\n")[0])) == set(TASKS)
+    for name, expected in listed.items():
+        assert [family.removeprefix("metaworld-") for family in BENCHMARKS[name][1]] == expected
+
+
+@with_scenes
+def test_a_benchmark_is_a_mixture_by_a_name(tmp_path):
+    """Its record is read back, its settings are each family's, and flags apply to all."""
+    program = cli.parse(["--env=ml10", "--agent=sac-conditioned", "--env.num-draws=2", "--engine=c"])
+    env = program.family
+    assert program.env == "ml10" and len(env.families) == 15 and env.train_count == 10
+    assert all(family.goal_hidden and family.num_draws == 2 for family in env.families)
+    assert [family.held_out for family in env.families] == [False] * 10 + [True] * 5
+    (tmp_path / "config.json").write_text(to_json(program, {"command": "x"}))
+    assert from_json(tmp_path / "config.json") == program
+    assert name_of(mtjax.make("mt10")) == "mt10" and name_of(env).startswith("metaworld-reach+")
+    with pytest.raises(InputError, match="did you mean 'mt10'"):
+        mtjax.make("mt1O")
+
+
+@with_scenes
+@pytest.mark.slow
+def test_held_out_tasks_are_evaluated_and_an_agent_learns(tmp_path):
+    """A few steps of ml10, with success at the end and at any step of each task's episodes."""
+    run = mtjax.train(
+        mtjax.make("ml10", num_draws=2, engine="c"),
+        "sac-conditioned",
+        steps=10 * 40,
+        num_envs=1,
+        chunk_steps=20,
+        warmup_steps=5,
+        batch_size=4,
+        replay_size=50,
+        eval_episodes=1,
+        hidden=(8,),
+        critic_hidden=(8,),
+        directory=tmp_path,
+    )
+    found = run.evaluations
+    assert found.returns["train"].shape[2] == 10 and found.returns["extrapolation"].shape[2] == 5
+    for split in ("train", "extrapolation"):
+        assert np.all(np.isfinite(found.returns[split]))
+        assert np.all(found.metrics["success_ever"][split] >= found.metrics["success"][split])
