@@ -1,6 +1,7 @@
 """What tests run agents and loops on: the package's probes, some that break on purpose, and compiled programs."""
 
 import dataclasses
+import importlib.util
 from functools import lru_cache
 from typing import ClassVar
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from mtjax import agents, loop
+from mtjax.agents.base import CONDITIONINGS
 from mtjax.agents.parts import trajectory
 from mtjax.config import configure
 from mtjax.envs.probes import AFTER, LIMIT, RULES, SPEC, Probe, tasks_of
@@ -18,6 +20,9 @@ from mtjax.networks import Params
 from mtjax.types import Acted, Spec, Task, Transition
 
 __all__ = ["AFTER", "LIMIT", "RULES", "SPEC", "Probe", "tasks_of"]
+
+# The ways to tell a task that can be tried here: reading needs scikit-learn.
+TELLING = tuple(x for x in CONDITIONINGS if x != "text" or importlib.util.find_spec("sklearn"))
 
 # Tests compile much and run little; without LLVM's optimisations they take half as long.
 QUICK = {"xla_backend_optimization_level": 0}

@@ -124,7 +124,10 @@ def play(name, seed, noise):
     """Return the start of an episode and its steps up to a little after the first success."""
     env, obs, fresh = begin(name, draw_vec(name, seed))
     start = {"rand_vec": env._last_rand_vec, "start_qpos": env.data.qpos, "start_qvel": env.data.qvel}
-    start = {key: np.copy(value) for key, value in start.items()} | {"start_mocap": mocap(env), "start_obs": np.copy(obs)}
+    start = {key: np.copy(value) for key, value in start.items()} | {
+        "start_mocap": mocap(env),
+        "start_obs": np.copy(obs),
+    }
     consts, live = constants(env, fresh)
     policy, random, watched = ENV_POLICY_MAP[name](), np.random.default_rng(seed), watch(name)
     steps, left = [], LONGEST

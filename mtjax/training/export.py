@@ -98,7 +98,7 @@ def acting(policy: Policy) -> Callable[[Array, Array], Array]:
 
 
 def _task(env: Family, first: Task, trained: Task, values: Array) -> Task:
-    """Return the task with the values (P,) of its parameters. One that trained has its number, others one beyond."""
+    """Return the task with the values (P,) of its parameters. One that trained has its number, others one beyond all."""
     columns = []
     for i, (name, low, high) in enumerate(env.ranges):
         if name in env.parameters and env.parameters[name].direction:
@@ -107,7 +107,7 @@ def _task(env: Family, first: Task, trained: Task, values: Array) -> Task:
             columns.append((values[i] - (low + high) / 2) / ((high - low) / 2 or 1.0))
     context = jnp.stack(columns) if columns else jnp.zeros(1)
     same = jnp.all(jnp.abs(trained.context - context) < 1e-5, axis=1)
-    number = jnp.where(jnp.any(same), jnp.argmax(same), len(same)).astype(jnp.int32)
+    number = jnp.where(jnp.any(same), jnp.argmax(same), len(env.tasks("all").id)).astype(jnp.int32)
     return first._replace(id=number, context=context.astype(jnp.float32))
 
 

@@ -19,7 +19,7 @@ class At(NamedTuple):
     position: Mapping[str, Array]  # (3,) [m] of each watched thing, by its short name
     quat: Mapping[str, Array]  # (4,) w x y z of each watched thing
     qpos: Array  # (nq,)
-    press: Array = ()  # (2,) [N] force of the left and the right pad on the geom ``pressed``, if the task names one
+    press: Array | None = None  # (2,) [N] forces of the pads on the task's ``pressed``, if it is felt
 
 
 def scalar_last(quat: Array) -> Array:
