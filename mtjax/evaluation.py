@@ -15,11 +15,14 @@ from mtjax.rollout import Worlds, reset_envs, step_envs
 from mtjax.types import SPLITS, Agent, Array, Env, InputError, Task
 
 
+_EVER = "success_ever"  # the metric that success was 1 at any step of an episode
+
+
 class Scores(NamedTuple):
     """Holds every episode of one evaluation."""
 
     returns: Any  # (S, T, episodes) undiscounted
-    metrics: dict[str, Any]  # (S, T, episodes) each, such as success: values at the episode's last step
+    metrics: dict[str, Any]  # (S, T, episodes) each, such as success: values at the episode's last step, and _EVER
 
 
 class Evaluations(NamedTuple):
@@ -105,14 +108,22 @@ def evaluate(env: Env, agent: Agent, episodes: int, state: Any, tasks: Task, see
         worlds, scores, alive = carry
         worlds, env_step = step_envs(env, agent, state, tasks, worlds, None)
         reward = jnp.where(alive, env_step.transition.reward, 0.0)  # rewards after an episode's end may not be finite
-        latest = lambda new, old: jnp.where(alive, new, old)
-        scores = Scores(scores.returns + reward, jax.tree.map(latest, env_step.metrics, scores.metrics))
+        scores = Scores(scores.returns + reward, _latest(env_step.metrics, scores.metrics, alive))
         return (worlds, scores, alive & ~env_step.transition.ended), None
 
     worlds = reset_envs(env, agent, state, tasks, keys)
     env_step = jax.eval_shape(lambda worlds: step_envs(env, agent, state, tasks, worlds, None)[1], worlds)
-    nothing = Scores(jnp.zeros(shape), jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), env_step.metrics))
+    metrics = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), env_step.metrics)
+    metrics |= {_EVER: metrics["success"]} if "success" in metrics else {}
+    nothing = Scores(jnp.zeros(shape), metrics)
     return jax.lax.scan(step, (worlds, nothing, jnp.ones(shape, bool)), length=env.episode_length)[0][1]
+
+
+def _latest(new: dict[str, Array], old: dict[str, Array], alive: Array) -> dict[str, Array]:
+    """Return the metrics of episodes after a step. Those of ended episodes stay."""
+    if _EVER in old:
+        new = new | {_EVER: jnp.maximum(new["success"], old[_EVER])}
+    return {name: jnp.where(alive, x, old[name]) for name, x in new.items()}
 
 
 class Recording(NamedTuple):

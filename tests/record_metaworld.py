@@ -36,6 +36,7 @@ from metaworld.policies import ENV_POLICY_MAP
 
 FOLDER = Path(__file__).parent / "data" / "metaworld"
 WINDOWS, WINDOW = 6, 4
+PRESSED = ("stick-push-v3",)
 NOISE = (0.0, 0.3)
 LONGEST = 300
 ALWAYS = ("_target_pos", "obj_init_pos", "init_tcp")
@@ -107,6 +108,13 @@ def pose(env, watched):
     return np.concatenate([thing.xpos, thing.xquat if kind == "body" else quat])
 
 
+def press(env):
+    """Return the normal forces (2,) of the left and the right pad on the main object, as ``touching_object`` does."""
+    pads, thing = [env.data.geom(f"{side}pad_geom").id for side in ("left", "right")], env._get_id_main_object()
+    touching = [[x for x in env.data.contact if {pad, thing} == {x.geom1, x.geom2}] for pad in pads]
+    return np.array([sum(env.data.efc_force[x.efc_address] for x in contacts) for contacts in touching], np.float64)
+
+
 def boxes(name):
     """Return the least and greatest hand's target, goal in observations, and drawn vector (2, 6 + n)."""
     env = ALL_V3_ENVIRONMENTS[name]()
@@ -132,7 +140,7 @@ def play(name, seed, noise):
     policy, random, watched = ENV_POLICY_MAP[name](), np.random.default_rng(seed), watch(name)
     steps, left = [], LONGEST
     while left:
-        action = policy.get_action(obs) + noise * random.normal(size=4)
+        action = policy.get_action(np.copy(obs)) + noise * random.normal(size=4)  # some policies write into it
         action = np.float32(np.clip(action, -1, 1))
         obs, reward, _, _, info = env.step(action)
         steps.append(
@@ -151,6 +159,8 @@ def play(name, seed, noise):
                 "success": bool(info["success"]),
             }
         )
+        if name in PRESSED:
+            steps[-1]["press"] = press(env)
         if len(steps) == 1:
             consts = constants(env, fresh)[0] | consts
         left = min(left - 1, 4) if info["success"] else left - 1

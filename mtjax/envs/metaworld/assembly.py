@@ -18,12 +18,21 @@ _FLAT = (0.707, 0.0, 0.0, 0.707)  # the nut's orientation as it lies on the tabl
 _HALF_HANDLE = 0.01  # [m]
 
 
-def _grasp(at: At, began: Mapping[str, Array], **density: bool) -> Array:
+def _grasp(at: At, began: Mapping[str, Array], high_density: bool) -> Array:
     """Return the caging reward () for the handle: held anywhere along its length, it counts as held in its middle."""
     hand, handle = at.obs[0], at.obs[4:7]
     along = jnp.where(jnp.abs(handle[0] - hand) < _HALF_HANDLE, hand, handle[0])
-    sizes = {"obj_radius": 0.015, "pad_success_thresh": 0.02, "xz_thresh": 0.01, "object_reach_radius": 0.01}
-    return caging(at, began, handle.at[0].set(along), **sizes, **density)
+    return caging(
+        at,
+        began,
+        handle.at[0].set(along),
+        obj_radius=0.015,
+        pad_success_thresh=0.02,
+        xz_thresh=0.01,
+        object_reach_radius=0.01,
+        high_density=high_density,
+        medium_density=not high_density,
+    )
 
 
 def _flat(at: At) -> Array:
@@ -67,7 +76,7 @@ class Assembly(Sawyer):
         weight = jnp.array([1.0, 1.0, 3.0])
         lifted = (centre[2] > 0.02) | (radius < neck)
         in_place = 0.1 * lifted + 0.9 * near(distance(over_peg * weight, centre * weight), 0.02, 0.4)
-        reward = (2 * _grasp(at, began, medium_density=True) + 6 * in_place) * _flat(at)
+        reward = (2 * _grasp(at, began, high_density=False) + 6 * in_place) * _flat(at)
         return jnp.where(success, 10.0, reward), success
 
 

@@ -47,8 +47,7 @@ class Basketball(Sawyer):
         target = began["target"].at[2].set(0.3)
         left = distance(ball * weight, target * weight)
         in_place = near(left, 0.08, distance(start * weight, target * weight))
-        sizes = {"obj_radius": 0.025, "pad_success_thresh": 0.06, "xz_thresh": 0.005, "object_reach_radius": 0.01}
+        caged = caging(at, began, ball, obj_radius=0.025, pad_success_thresh=0.06, xz_thresh=0.005, high_density=True)
         held = (distance(ball, at.tcp) < 0.035) & (at.obs[3] > 0) & (ball[2] - 0.01 > start[2])
-        grasped = jnp.where(held, 1.0, caging(at, began, ball, **sizes, high_density=True))
-        reward = hamacher(grasped, in_place) + jnp.where(held, 1 + 5 * in_place, 0.0)
+        reward = hamacher(jnp.where(held, 1.0, caged), in_place) + jnp.where(held, 1 + 5 * in_place, 0.0)
         return jnp.where(left < 0.08, 10.0, reward), left <= 0.08

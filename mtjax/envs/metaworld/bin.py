@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import mujoco
@@ -35,7 +35,7 @@ class BinPicking(Sawyer):
     goal_high: ClassVar = (0.1201, 0.701, 0.001)
     watched: ClassVar = {"cube": "body:obj"}
 
-    def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
+    def arrange(self, host: Host, vec: np.ndarray) -> dict[str, Any]:
         cube, target = np.append(vec[:2], host.body("obj")[2]), host.body("bin_goal")
         host.place_free(cube)
         later = host.copy()

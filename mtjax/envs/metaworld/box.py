@@ -18,7 +18,7 @@ from mtjax.types import Array
 
 @dataclasses.dataclass(frozen=True)
 class BoxClose(Sawyer):
-    """Put a lid on a box (Meta-World's box-close-v3).
+    """Put the lid on an open box (Meta-World's box-close-v3).
 
     Reward: 10 on success; else 8 times how well the lid is lifted to the box, and 2 times the product of how firmly the
         gripper closes (1 closing, 0 opening) and how well the hand comes to the lid: near it and above a funnel about
