@@ -98,7 +98,7 @@ def acting(policy: Policy) -> Callable[[Array, Array], Array]:
 
 
 def _task(env: Family, first: Task, trained: Task, values: Array) -> Task:
-    """Return the task with the values (P,) of its parameters. One that trained has its number, others one beyond all."""
+    """Return the task with the values (P,) of its parameters. One that trained has its number, others one beyond."""
     columns = []
     for i, (name, low, high) in enumerate(env.ranges):
         if name in env.parameters and env.parameters[name].direction:

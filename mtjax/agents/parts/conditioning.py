@@ -15,7 +15,7 @@ def features(conditioning: str, num_tasks: int, index: Array, context: Array, ve
 
     Args:
         conditioning: the agent's.
-        index: () number of the task if it is a training task, else of the nearest one. Of sentences all splits have one.
+        index: () number of the task if it is a training task, else of the nearest one. Of sentences all have one.
         context: (C,) the task's own parameters.
         vectors: (T, V) of the training tasks, or of all splits' sentences.
     """

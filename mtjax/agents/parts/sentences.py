@@ -32,7 +32,7 @@ def encode(encoder: str, sentences: tuple[str, ...]) -> np.ndarray:
 
 def _hash(encoder: str, sentences: Sequence[str]) -> np.ndarray:
     try:
-        from sklearn.feature_extraction.text import HashingVectorizer
+        from sklearn.feature_extraction.text import HashingVectorizer  # type: ignore
     except ImportError:
         raise InputError("text=hashing needs scikit-learn: pip install 'mtjax[text]'") from None
     return HashingVectorizer(n_features=_SIZE, ngram_range=(1, 2), token_pattern=_WORD).transform(sentences).toarray()
@@ -40,7 +40,7 @@ def _hash(encoder: str, sentences: Sequence[str]) -> np.ndarray:
 
 def _embed(encoder: str, sentences: Sequence[str]) -> np.ndarray:
     try:
-        from sentence_transformers import SentenceTransformer
+        from sentence_transformers import SentenceTransformer  # type: ignore
     except ImportError:
         raise InputError(f"text={encoder} needs sentence-transformers: pip install 'mtjax[sentences]'") from None
     try:
