@@ -7,7 +7,9 @@ so it runs in an environment of its own and imports nothing of mtjax:
 
 Each task has two episodes of its scripted policy, the second with noise on its actions. Every environment is new and
 has been reset once, so that no earlier episode is felt. Windows of a few steps in a row are kept, evenly from the start
-to just after the first success. A file holds, with E episodes and K kept steps:
+to just after the first success. Then come states that are posed, not simulated: things at the goal or about where they
+are, the hand near them, any action; for what a scripted policy never does. A file holds, with E episodes and K kept
+steps and poses:
 
     rand_vec (E, n) float64: the vector that Meta-World draws for an episode's goal
     start_qpos, start_qvel, start_mocap (E, 7: position and quaternion), start_obs (E, 39): after the reset
@@ -16,7 +18,7 @@ to just after the first success. A file holds, with E episodes and K kept steps:
     boxes (2, 6 + n) float64: least and greatest place of the hand's target (3), goal in observations (3), and rand_vec
     live (n,): the constants that are views of the simulator's arrays and so change with every step
     watched (W,): "body:NAME", "site:NAME" or "geom:NAME" of all that the task's class reads, but for the robot
-    episode, time (K,): which step is kept; time 1 is the first after the start
+    episode, time (K,): which step is kept; time 1 is the first after the start, time -1 a pose
     action (K, 4); and after that step: qpos, qvel, mocap (K, 7), obs (K, 21: entries 0 to 18 of the observation and the
     goal, without the step before), tcp, left_pad, right_pad (K, 3), pose (K, W, 7: position and quaternion w x y z),
     reward, success (K,)
@@ -35,7 +37,7 @@ from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 from metaworld.policies import ENV_POLICY_MAP
 
 FOLDER = Path(__file__).parent / "data" / "metaworld"
-WINDOWS, WINDOW = 6, 4
+WINDOWS, WINDOW, POSES = 5, 3, 11
 PRESSED = ("stick-push-v3",)
 NOISE = (0.0, 0.3)
 LONGEST = 300
@@ -128,8 +130,65 @@ def mocap(env):
     return np.concatenate([env.data.mocap_pos[0], env.data.mocap_quat[0]])
 
 
+def show(env, name, time, action, obs, reward, info):
+    """Return what is kept of the environment as it is, by name."""
+    shown = {
+        "time": time,
+        "action": action,
+        "qpos": np.copy(env.data.qpos),
+        "qvel": np.copy(env.data.qvel),
+        "mocap": mocap(env),
+        "obs": np.concatenate([obs[:18], obs[36:]]),
+        "tcp": env.tcp_center,
+        "left_pad": np.copy(env.get_body_com("leftpad")),
+        "right_pad": np.copy(env.get_body_com("rightpad")),
+        "pose": np.stack([pose(env, x) for x in watch(name)]),
+        "reward": reward,
+        "success": bool(info["success"]),
+    }
+    return shown | {"press": press(env)} if name in PRESSED else shown
+
+
+def put(env, name, random):
+    """Pose the environment at random, and return what is kept of it."""
+    model, data = env.model, env.data
+    data.qvel[:] = 0
+    for joint in range(model.njnt):
+        at, (low, high) = model.jnt_qposadr[joint], model.jnt_range[joint]
+        if model.joint(joint).name.startswith("right_j"):
+            continue
+        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
+            places = (env._target_pos, env.obj_init_pos, np.add(env.obj_init_pos, [0, 0, 0.05]))
+            data.qpos[at : at + 3] = places[random.integers(3)] + random.normal(size=3) * 0.03
+            data.qpos[at + 3 : at + 7] += random.normal(size=4) * random.choice([0.003, 0.05])
+        elif model.jnt_limited[joint]:
+            data.qpos[at] = random.choice([low, high, random.uniform(low, high)])
+        else:
+            data.qpos[at] = random.normal() * 0.1
+    mujoco.mj_normalizeQuat(model, data.qpos)
+    mujoco.mj_forward(model, data)
+    reach(model, data, env._get_pos_objects()[:3] + random.normal(size=3) * random.choice([0.01, 0.03, 0.1]))
+    obs = np.clip(env._get_obs(), env.sawyer_observation_space.low, env.sawyer_observation_space.high)
+    action = np.float32(random.uniform(-1, 1, size=4))
+    return show(env, name, -1, action, obs, *env.evaluate_state(obs, action))
+
+
+def reach(model, data, place):
+    """Turn the arm until the tool centre is at a place, if it can be."""
+    arm = [model.joint(f"right_j{i}") for i in range(7)]
+    angles, speeds = ([joint.qposadr[0] for joint in arm], [joint.dofadr[0] for joint in arm])
+    ends = [data.site(f"{side}EndEffector") for side in ("left", "right")]
+    for _ in range(40):
+        turns = np.zeros((2, 3, model.nv))
+        for end, turn in zip(ends, turns, strict=True):
+            mujoco.mj_jacSite(model, data, turn, None, end.id)
+        turn, left = turns.mean(0)[:, speeds], place - (ends[0].xpos + ends[1].xpos) / 2
+        data.qpos[angles] += turn.T @ np.linalg.solve(turn @ turn.T + 1e-3 * np.eye(3), left)
+        mujoco.mj_forward(model, data)
+
+
 def play(name, seed, noise):
-    """Return the start of an episode and its steps up to a little after the first success."""
+    """Return the start of an episode, its kept steps up to a little after the first success, and poses after it."""
     env, obs, fresh = begin(name, draw_vec(name, seed))
     start = {"rand_vec": env._last_rand_vec, "start_qpos": env.data.qpos, "start_qvel": env.data.qvel}
     start = {key: np.copy(value) for key, value in start.items()} | {
@@ -137,34 +196,18 @@ def play(name, seed, noise):
         "start_obs": np.copy(obs),
     }
     consts, live = constants(env, fresh)
-    policy, random, watched = ENV_POLICY_MAP[name](), np.random.default_rng(seed), watch(name)
+    policy, random = ENV_POLICY_MAP[name](), np.random.default_rng(seed)
     steps, left = [], LONGEST
     while left:
         action = policy.get_action(np.copy(obs)) + noise * random.normal(size=4)  # some policies write into it
         action = np.float32(np.clip(action, -1, 1))
         obs, reward, _, _, info = env.step(action)
-        steps.append(
-            {
-                "time": len(steps) + 1,
-                "action": action,
-                "qpos": np.copy(env.data.qpos),
-                "qvel": np.copy(env.data.qvel),
-                "mocap": mocap(env),
-                "obs": np.concatenate([obs[:18], obs[36:]]),
-                "tcp": env.tcp_center,
-                "left_pad": np.copy(env.get_body_com("leftpad")),
-                "right_pad": np.copy(env.get_body_com("rightpad")),
-                "pose": np.stack([pose(env, x) for x in watched]),
-                "reward": reward,
-                "success": bool(info["success"]),
-            }
-        )
-        if name in PRESSED:
-            steps[-1]["press"] = press(env)
+        steps.append(show(env, name, len(steps) + 1, action, obs, reward, info))
         if len(steps) == 1:
             consts = constants(env, fresh)[0] | consts
         left = min(left - 1, 4) if info["success"] else left - 1
-    return start | {f"const_{key}": value for key, value in consts.items()}, steps, live
+    posed = [put(env, name, random) for _ in range(POSES)]
+    return start | {f"const_{key}": value for key, value in consts.items()}, keep(steps), posed, len(steps), live
 
 
 def keep(steps):
@@ -178,10 +221,10 @@ def record(name):
     """Record a task and return how it went, in words."""
     starts, kept, ended = [], [], []
     for episode, noise in enumerate(NOISE):
-        start, steps, live = play(name, 10 + episode, noise)
+        start, steps, posed, count, live = play(name, 10 + episode, noise)
         starts.append(start)
-        kept += [{"episode": episode} | step for step in keep(steps)]
-        ended.append(f"{len(steps)} steps{', success' * steps[-1]['success']}")
+        kept += [{"episode": episode} | step for step in (*steps, *posed)]
+        ended.append(f"{count} steps{', success' * steps[-1]['success']}")
     data = {key: np.stack([np.asarray(start[key]) for start in starts]) for key in starts[0]}
     data |= {key: np.stack([np.asarray(step[key]) for step in kept]) for key in kept[0]}
     small = {np.dtype(np.float64): np.float32, np.dtype(np.int64): np.int16}
