@@ -48,6 +48,7 @@ class BallInCup(Domain):
     it can pass it), and under MJX the constraint solver stops after ``solver_iterations``.
     """
 
+    asks: ClassVar[str] = "Catch the ball in the cup."
     parameters: ClassVar = MappingProxyType(
         {
             "string-length": Parameter("m", 0.3, _set_string_length, minimum=0.29),

@@ -104,6 +104,7 @@ class CheetahRun(Domain):
     other apart in an arbitrary direction, where MuJoCo C lets them pass.
     """
 
+    asks: ClassVar[str] = "Make the cheetah run forwards as fast as it can."
     parameters: ClassVar = MappingProxyType({**_BODY, "speed": Parameter("m/s", 10.0)})
     model_file: ClassVar[str] = "cheetah.xml"
     num_substeps: ClassVar[int] = 1
@@ -181,6 +182,8 @@ class CheetahSpeed(CheetahRun):
     same range of rewards. The observation does not show the velocity asked for: the task's context does.
     """
 
+    asks: ClassVar[str] = "Make the cheetah run at the given speed."
+
     def reward(self, task: Task, world: World, action: Array) -> Array:
         speed = task.goal["speed"]
         return tolerance(self.forward_velocity(task, world), speed, speed, speed, "linear", value_at_margin=0)
@@ -194,6 +197,7 @@ class CheetahDirection(CheetahRun):
     The observation does not show the direction: the task's context does.
     """
 
+    asks: ClassVar[str] = "Make the cheetah run in the given direction."
     parameters: ClassVar = MappingProxyType(
         {**CheetahRun.parameters, "direction": Parameter("1", 1.0, minimum=-2.0, maximum=1.0)}
     )

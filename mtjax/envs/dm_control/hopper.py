@@ -57,6 +57,7 @@ class HopperStand(Domain):
             rad/s in the one case that was seen, and two states of random play in ten thousand are such.
     """
 
+    asks: ClassVar[str] = "Make the hopper stand."
     parameters: ClassVar = MappingProxyType(
         {
             "foot-length": Parameter("1", 1.0, _scale_foot),
@@ -102,6 +103,7 @@ class HopperHop(HopperStand):
     Further parameter: speed [m/s].
     """
 
+    asks: ClassVar[str] = "Make the hopper hop forwards."
     parameters: ClassVar = MappingProxyType({**HopperStand.parameters, "speed": Parameter("m/s", 2.0)})
     heading: ClassVar[float] = 1.0  # -1 backwards
 

@@ -47,6 +47,7 @@ class PendulumSwingup(Domain):
     Differs from dm_control in: nothing.
     """
 
+    asks: ClassVar[str] = "Swing the pendulum up and hold it upright."
     parameters: ClassVar = MappingProxyType(
         {
             "mass": Parameter("kg", 1.0, _set_mass),

@@ -53,6 +53,7 @@ class WalkerStand(Domain):
     Differs from dm_control in: under MJX the constraint solver stops after ``solver_iterations``.
     """
 
+    asks: ClassVar[str] = "Make the walker stand upright."
     parameters: ClassVar = MappingProxyType(
         {
             "friction": Parameter("1", 0.7, _set_friction),
@@ -104,6 +105,7 @@ class WalkerWalk(WalkerStand):
     Further parameter: speed [m/s].
     """
 
+    asks: ClassVar[str] = "Make the walker walk forwards."
     parameters: ClassVar = MappingProxyType({**WalkerStand.parameters, "speed": Parameter("m/s", 1.0)})
     relabels: ClassVar[tuple[str, ...]] = ("speed",)
     heading: ClassVar[float] = 1.0  # -1 backwards
@@ -121,6 +123,7 @@ class WalkerWalk(WalkerStand):
 class WalkerRun(WalkerWalk):
     """Run: WalkerWalk at 8 m/s."""
 
+    asks: ClassVar[str] = "Make the walker run forwards."
     parameters: ClassVar = MappingProxyType({**WalkerStand.parameters, "speed": Parameter("m/s", 8.0)})
 
 
@@ -149,6 +152,8 @@ class WalkerSpeed(WalkerWalk):
     WalkerWalk's own, whoever masters the fastest task has mastered them all.) The observation does not show the
     velocity asked for: the task's context does.
     """
+
+    asks: ClassVar[str] = "Make the walker move at the given speed."
 
     def move(self, task: Task, world: World) -> Array:
         speed = task.goal["speed"]
