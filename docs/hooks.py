@@ -29,6 +29,7 @@ PICTURE = "../../benchmarks/results/"  # as pages name it, so that it is found o
 GROUPS = {  # title -> whether a family belongs there; the first that fits
     "Brax": lambda name, module: module.endswith("envs.brax"),
     "MTEnv's own": lambda name, module: ".mtenv." in module,
+    "Meta-World": lambda name, module: ".metaworld." in module,
     "One physics, several goals": lambda name, module: name in envs._GOALS,
     "Further tasks on dm_control's bodies": lambda name, module: name in envs._FURTHER,
     "HiP-BMDP's families": lambda name, module: name in envs._HIP_BMDP,
@@ -87,6 +88,10 @@ def families_page() -> str:
         for name in names:
             count, says = envs.outline(name)
             text += f"| [{name}]({name}.md) | {count} | {says} |\n"
+    text += "\n## Benchmarks\n\nMixtures of the families above, by a name.\n\n"
+    text += "| benchmark | training tasks | |\n|---|---|---|\n"
+    for name, (says, own) in envs.BENCHMARKS.items():
+        text += f"| `{name}` | {sum('held_out' not in settings for settings in own.values())} | {says} |\n"
     return text
 
 

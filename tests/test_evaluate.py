@@ -125,7 +125,7 @@ class Fatal(Walk):
         step = super().step(task, state, action)
         over = (state.obs[0] % 1 < 0.5) & (state.age > 2)
         reward = jnp.where(over, jnp.nan, step.reward + action[0])
-        return step._replace(reward=reward, metrics={"steps": step.state.age})
+        return step._replace(reward=reward, metrics={"steps": step.state.age, "success": step.state.age == 2.0})
 
 
 class Leaning(Stub):
@@ -149,12 +149,17 @@ def test_evaluation_is_a_plain_loop_over_single_worlds():
             task = pick(tasks, i)
             for e in range(episodes):
                 world, total, age = reset(task, keys[i, e]), 0.0, 0
+                ever = False
                 while not world.terminated and age < task.horizon:
                     action = agent.act(states[s], (), world.obs, task, None).action
                     world, age = step(task, world.state, action), age + 1
                     total += float(world.reward)
+                    ever |= bool(world.metrics["success"])
                 np.testing.assert_allclose(found.returns[s, i, e], total, rtol=1e-5)
                 assert found.metrics["steps"][s, i, e] == age
+                assert (
+                    found.metrics["success"][s, i, e] == (age == 2) and found.metrics["success_ever"][s, i, e] == ever
+                )
                 lengths.add(age)
     assert lengths == {2, 3, 4, 6}  # both ways to end, in one batch
 

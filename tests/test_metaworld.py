@@ -17,6 +17,7 @@ from mtjax.envs import BENCHMARKS, name_of
 from mtjax.envs.metaworld import scene
 from mtjax.envs.metaworld.names import TASKS
 from mtjax.names import load
+from mtjax.report.tables import split_table
 from mtjax.types import InputError
 
 DATA = Path(__file__).parent / "data" / "metaworld"
@@ -204,3 +205,5 @@ def test_held_out_tasks_are_evaluated_and_an_agent_learns(tmp_path):
     for split in ("train", "extrapolation"):
         assert np.all(np.isfinite(found.returns[split]))
         assert np.all(found.metrics["success_ever"][split] >= found.metrics["success"][split])
+    table = split_table(found._replace(metrics={**found.metrics, "success_ever": {"train": np.ones((1, 1, 10, 1))}}))
+    assert "success, at any step" in table and table.splitlines()[1].split()[-1] == "1.00"

@@ -18,19 +18,30 @@ def _interval(scores: np.ndarray) -> str:
 
 
 def split_table(evaluations: Evaluations, parts: Sequence[Part] = ()) -> str:
-    """Return a run's last evaluation as text: mean and worst task's return by split; of a mixture also by family."""
-    last = {split: x[:, -1].mean(axis=-1) for split, x in evaluations.returns.items() if x.size}  # (S, T)
-    lines = [f"{'split':15} {'tasks':>5} {'return':>7}  worst task"]
-    lines += [_split_line(split, scores) for split, scores in last.items()]
+    """Return a run's last evaluation as text: mean and worst task's return by split; of a mixture also by family.
+
+    Where tasks tell success, its share at the end of episodes and at any step follow.
+    """
+    scores = [evaluations.returns, *(evaluations.metrics.get(name, {}) for name in ("success", "success_ever"))]
+    last = {  # each (S, T)
+        split: [x[split][:, -1].mean(axis=-1) for x in scores if split in x]
+        for split, returns in evaluations.returns.items()
+        if returns.size
+    }
+    told = "  success, at any step" if evaluations.metrics.get("success") else ""
+    lines = [f"{'split':15} {'tasks':>5} {'return':>7}  worst task{told}"]
+    lines += [_split_line(split, *found) for split, found in last.items()]
     for part in parts if len(parts) > 1 else ():
         lines.append(part.name)
-        found = {split: scores[:, part.places[split]] for split, scores in last.items()}
-        lines += [_split_line(split, scores) for split, scores in found.items() if scores.size]
+        own = {split: [x[:, part.places[split]] for x in found] for split, found in last.items()}
+        lines += [_split_line(split, *found) for split, found in own.items() if found[0].size]
     return "\n".join(lines)
 
 
-def _split_line(split: str, scores: np.ndarray) -> str:
-    return f"{split:15} {scores.shape[1]:5} {_interval(scores):>7}  {scores.mean(axis=0).min():.0f}"
+def _split_line(split: str, returns: np.ndarray, *success: np.ndarray) -> str:
+    line = f"{split:15} {returns.shape[1]:5} {_interval(returns):>7}  {returns.mean(axis=0).min():<10.0f}"
+    known = [x[np.isfinite(x)] for x in success]  # of a mixture, some families may not tell
+    return line.rstrip() if not known or not known[0].size else line + "".join(f"  {x.mean():7.2f}" for x in known)
 
 
 def task_table(policy: Policy, episodes: dict[str, np.ndarray], named: Mapping[str, str] = MappingProxyType({})) -> str:
