@@ -14,7 +14,7 @@ import mtjax
 from mtjax import cli
 from mtjax.config import from_json, to_json
 from mtjax.envs import BENCHMARKS, name_of
-from mtjax.envs.metaworld import scene
+from mtjax.envs.metaworld import sawyer, scene
 from mtjax.envs.metaworld.names import TASKS
 from mtjax.names import load
 from mtjax.report.tables import split_table
@@ -70,7 +70,7 @@ def test_a_step_is_that_of_the_original(name):
     each = jax.tree.map(lambda x: x[episode[before]], tasks)
     after = jax.jit(jax.vmap(step))(each, *states, part("action", before + 1))
     expected = np.concatenate([part("obs", before + 1)[:, :18], states[3][:, :18], part("obs", before + 1)[:, 18:]], 1)
-    np.testing.assert_allclose(after.obs, expected, atol=2e-2)
+    np.testing.assert_allclose(after.obs, expected, atol=3e-2)
     assert np.mean(np.abs(after.obs - expected).max(1)) < 4e-3
     off = np.abs(after.reward - recorded["reward"][before + 1])
     assert np.median(off) < 5e-3 and np.sum(off > 0.2) <= 3
@@ -135,11 +135,14 @@ def test_goals_differ_by_the_seed_of_tasks_and_may_be_hidden():
 
 
 @with_scenes
-def test_refused_settings_are_named():
+def test_refused_settings_are_named(monkeypatch):
     with pytest.raises(InputError, match="mjx"):
         mtjax.make("metaworld-reach", engine="mjx")
     with pytest.raises(InputError, match="goals only, not in mass"):
         mtjax.make("metaworld-reach", vary={"mass": "1:2:3"})
+    monkeypatch.setattr(sawyer, "choose_engine", lambda *_: "mjx")  # as on a GPU without Warp
+    with pytest.raises(InputError, match="mjx"):
+        _ = mtjax.make("metaworld-reach").engine_name
 
 
 def test_the_package_is_asked_for_by_its_command(monkeypatch):

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from mtjax.envs.domain import Domain, stack_differing
-from mtjax.envs.engines.base import World
+from mtjax.envs.engines.base import World, choose_engine
 from mtjax.envs.metaworld import scene
 from mtjax.envs.metaworld.at import At
 from mtjax.envs.metaworld.host import SUBSTEPS, Host
@@ -23,6 +23,10 @@ from mtjax.types import SPLITS, Array, InputError, Key, Step, Task
 _STEP = 0.01  # [m] that an action of 1 moves the hand's target
 _DOWN = (1.0, 0.0, 1.0, 0.0)
 _MOST_DRAWS = 1000
+_NOT_MJX = (
+    "engine 'mjx' cannot compute Meta-World's cylinders on boxes; use --engine=c on a CPU, or warp on an NVIDIA GPU "
+    "(pip install 'mtjax[warp]')"
+)
 _OBJECTS = 14  # entries of an observation for objects
 _HALF_LOW = np.array([-0.525, 0.348, -0.0525, -1.0, *[-np.inf] * _OBJECTS], np.float32)
 _HALF_HIGH = np.array([0.525, 1.025, 0.7, 1.0, *[np.inf] * _OBJECTS], np.float32)
@@ -82,7 +86,19 @@ class Sawyer(Domain):
         if self.pixels:
             raise InputError("Meta-World's scenes are read without what is only seen; leave out --env.pixels")
         if self.engine == "mjx":
-            raise InputError("engine 'mjx' cannot compute Meta-World's cylinders on boxes; use --engine=c or warp")
+            raise InputError(_NOT_MJX)
+
+    @property
+    def engine_name(self) -> str:
+        """Return the name of the engine that runs this family on this device.
+
+        Raises:
+            InputError: only MJX could run here.
+        """
+        chosen = choose_engine(self.engine, "warp")
+        if chosen == "mjx":
+            raise InputError(_NOT_MJX)
+        return chosen
 
     # What a task gives.
 
