@@ -171,7 +171,7 @@ def row(env: str, agent: str, curve: np.ndarray, evaluations, mark: float) -> li
     """Return the cells of one run's line: last evaluation by split, times, rate."""
     scores = last_scores(evaluations)
     cells = [env, agent]
-    cells += [_cell(seed_interval(scores[split], iqm)) if split in scores else "-" for split in SPLITS]
+    cells += [cell(seed_interval(scores[split], iqm)) if split in scores else "-" for split in SPLITS]
     cells.append(f"{scores['train'].mean(axis=0).min():.0f}")
     steps, seconds, wall, returns = np.moveaxis(curve[:, :, 1:], -1, 0).mean(axis=-1)
     reached = np.flatnonzero(returns >= mark)
@@ -186,9 +186,9 @@ def difference_rows(env: str, found: dict[str, dict[str, np.ndarray]], baseline:
     for agent, scores in found.items():
         for split in scores if agent != baseline and baseline in found else ():
             pair = scores[split], found[baseline][split]
-            paired = _cell(paired_difference(*pair, iqm), "+.1f") if len(pair[0]) == len(pair[1]) else "-"
-            improvement = _cell(probability_of_improvement(*pair), ".2f")
-            lines.append([env, agent, split, paired, _cell(unpaired_difference(*pair, iqm), "+.1f"), improvement])
+            paired = cell(paired_difference(*pair, iqm), "+.1f") if len(pair[0]) == len(pair[1]) else "-"
+            improvement = cell(probability_of_improvement(*pair), ".2f")
+            lines.append([env, agent, split, paired, cell(unpaired_difference(*pair, iqm), "+.1f"), improvement])
     return lines
 
 
@@ -208,7 +208,8 @@ def last_scores(evaluations) -> dict[str, np.ndarray]:
     return {split: x[:, -1].mean(axis=-1) for split, x in evaluations.returns.items() if x.size}
 
 
-def _cell(interval: Interval, form: str = ".0f") -> str:
+def cell(interval: Interval, form: str = ".0f") -> str:
+    """Return an estimate with its interval, if it has one."""
     point, low, high = (format(x, form) for x in interval)
     return f"{point} [{low}, {high}]" if np.isfinite(interval.low) else point
 

@@ -31,6 +31,7 @@ GROUPS = {  # title -> whether a family belongs there; the first that fits
     "MTEnv's own": lambda name, module: ".mtenv." in module,
     "Meta-World": lambda name, module: ".metaworld." in module,
     "One physics, several goals": lambda name, module: name in envs._GOALS,
+    "Further tasks on dm_control's bodies": lambda name, module: name in envs._FURTHER,
     "HiP-BMDP's families": lambda name, module: name in envs._HIP_BMDP,
     "dm_control's tasks": lambda name, module: True,
 }

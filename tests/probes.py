@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from mtjax import agents, loop
+from mtjax.agents.base import CONDITIONINGS
 from mtjax.agents.parts import trajectory
 from mtjax.config import configure
 from mtjax.envs import ENVS
@@ -27,6 +28,8 @@ METAWORLD = [name for name in ENVS if name.startswith("metaworld-")]
 INSTALLED = [name for name in ENVS if name not in METAWORLD or find_spec("metaworld")]
 with_metaworld = pytest.mark.skipif(not find_spec("metaworld"), reason="Meta-World's scenes are not installed")
 FEW = [name for name in INSTALLED if name not in METAWORLD or name == "metaworld-reach"]
+# The ways to tell a task that can be tried here: reading needs scikit-learn.
+TELLING = tuple(x for x in CONDITIONINGS if x != "text" or find_spec("sklearn"))
 
 # Tests compile much and run little; without LLVM's optimisations they take half as long.
 QUICK = {"xla_backend_optimization_level": 0}

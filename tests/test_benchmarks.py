@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 import mtjax
+from mtjax.envs import BENCHMARKS
+from mtjax.evaluation import Evaluations, save_evaluations
 from mtjax.training.log import append_rows
 
 FOLDER = Path(__file__).parent.parent / "benchmarks"
@@ -27,7 +29,7 @@ def script(monkeypatch):
         return module
 
     yield load
-    for name in ("report", "training", "returns", "update_cost"):
+    for name in ("report", "training", "returns", "update_cost", "learning"):
         sys.modules.pop(name, None)
 
 
@@ -152,3 +154,47 @@ def test_time_that_two_operations_share_counts_once(script):
 def test_memory_that_grows_to_the_end_is_not_flat(script, samples, flat):
     """By the medians of the second and the last third of a run."""
     assert script("soak").judge(samples)[1] == flat
+
+
+def evaluations_of(returns, **metrics):
+    """Evaluations of training tasks (S, V, T, episodes); other splits are empty."""
+    splits = lambda x: {
+        "train": np.asarray(x),
+        **dict.fromkeys(("interpolation", "extrapolation"), np.asarray(x)[:, :, :0]),
+    }
+    steps, values = (
+        np.arange(np.shape(returns)[1]),
+        {name: np.arange(x.shape[2]) for name, x in splits(returns).items()},
+    )
+    return Evaluations(steps, splits(returns), values, {name: splits(x) for name, x in metrics.items()})
+
+
+def test_a_suite_reports_success_and_what_sharing_is_worth(script, tmp_path):
+    """Of the last evaluation, over tasks and episodes, with intervals over seeds."""
+    suite = script("suite")
+    tasks = "walker-walk", "walker-run"
+    together, shape = "+".join(tasks), (3, 2, 2, 4)
+    returns = np.zeros(shape)
+    returns[:, 1] = np.array([10.0, 30.0])[:, None]
+    success = np.zeros(shape)
+    success[:, 1, 1, :2] = 1
+    found = {together: evaluations_of(returns, success=success, success_ever=np.ones(shape))}
+    found |= {name: evaluations_of(np.full((3, 2, 1, 4), 25.0)) for name in tasks}
+    for env, evaluations in found.items():
+        (tmp_path / env).mkdir()
+        save_evaluations(tmp_path / env / "brc.npz", evaluations)
+    table = suite.tabulate(tmp_path, suite.Suite("", (together,), ("brc",), 1, together=together))
+    assert "| 2 families | brc | 3 | 20 [20, 20] | 0.250 [0.250, 0.250] | 1.000 [1.000, 1.000] |" in table
+    assert "| walker-run | brc | 3 | 25 [25, 25] | - | - |" in table
+    sharing = (tmp_path / "sharing.md").read_text()
+    assert "| walker-walk | brc | 10 [10, 10] | 25 [25, 25] | -15 [-15, -15] |" in sharing
+    assert "| walker-run | brc | 30 [30, 30] | 25 [25, 25] | +5 [+5, +5] |" in sharing
+    assert len((tmp_path / "tasks.csv").read_text().splitlines()) == 1 + 3 * 4
+
+
+def test_suites_name_only_what_there_is(script):
+    suite = script("suite")
+    for each in suite.SUITES.values():
+        assert set(each.agents) <= set(mtjax.AGENTS)
+        names = {name for env in each.envs for name in env.split("+")}
+        assert names <= {*mtjax.ENVS, *BENCHMARKS}

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from probes import quick
+from probes import quick, slow_but
 
 from mtjax import envs
 from mtjax.envs.engines import base as physics
@@ -33,17 +33,24 @@ VARIED = {
     "ball-in-cup-catch": {"mass": "0.8,1.2"},
     "cartpole-swingup": {"pole-length": "0.9,1.2"},
     "cheetah-run": {"torso-length": "0.5,0.6"},
+    "dog-walk": {"torso-mass": "0.8,1.2"},
     "finger-spin": {"size": "0.95,1.05"},
     "finger-turn-easy": {"size": "0.95,1.05"},
+    "fish-swim": {"fin-size": "0.9,1.1"},
     "hopper-hop": {"foot-length": "0.9,1.1"},
+    "humanoid-walk": {"shin-length": "0.28,0.32"},
     "pendulum-swingup": {"length": "0.4,0.6"},
     "point-mass-easy": {"mass": "0.8,1.2"},
+    "quadruped-walk": {"foot-length": "0.2,0.3"},
     "reacher-easy": {"mass": "0.8,1.2"},
+    "swimmer-swimmer6": {"link-length": "0.09,0.11"},
     "walker-walk": {"foot-length": "0.08,0.12"},
 }
 DOMAINS, SLOW = list(VARIED), pytest.mark.slow
 # MJX takes ten seconds to compile a domain with contact.
 QUICK_DOMAINS = ("pendulum-swingup",)
+ALIKE = [name for name in DOMAINS if name != "dog-walk"]  # MJX and Warp step another dog: tests/test_bodies.py
+HEAVY = ("dog-walk", "humanoid-walk")  # whose play takes seconds
 # Bounds on each world's largest error in velocity, by quantile, relative to the domain's fastest velocity. MJX and Warp
 # count in float32, whose relative rounding of 6e-8 ten substeps and the mass matrix's condition amplify up to tenfold;
 # in contact the solver stops where float32 sees no more progress, which is a hundred times sooner in elliptic cones.
@@ -51,7 +58,11 @@ FREE = {0.5: 1e-6, 1: 1e-5}
 TOUCHING = {0.5: 3e-5, 0.9: 3e-4, 1: 1e-2}
 # In states of all ages MJX may be off by more than this, relative as above, in such a share of worlds: 0 elsewhere.
 OFF = 1e-3
-MAY_BE_OFF = {"hopper-hop": 0.013}  # limbs that cross, as in 4 of 384 states: see the domain
+# Limbs that cross, as in 4 of the hopper's 384 states, or that stand on the floor, as in 21 of the humanoid's and in 1
+# of the quadruped's: see the domains.
+MAY_BE_OFF = {"hopper-hop": 0.013, "humanoid-walk": 0.07, "quadruped-walk": 0.003}
+# Factors of these bounds: such limbs, and fifteen substeps of links that weigh 10 g.
+ROUGHER = {"humanoid-walk": 3, "swimmer-swimmer6": 3}
 
 
 class Play(NamedTuple):
@@ -59,7 +70,7 @@ class Play(NamedTuple):
 
     tasks: Task
     world: World
-    action: np.ndarray
+    action: np.ndarray  # as controls of the model
     step: object  # C's
 
 
@@ -78,11 +89,12 @@ def plays(name):
         world = world._replace(qpos=jnp.where(caught, jnp.array([0, 0, 0, 0.335]), world.qpos))
     actions = np.random.RandomState(1).uniform(-1, 1, (max(AGES) // 5 + 1, COUNT, env.spec.action_size))
     step, found = jax.jit(jax.vmap(env.step)), {}
+    control = jax.jit(lambda *given: jax.vmap(env.control)(*given)[1])
     for age in range(max(AGES) + 1):
         action = np.float32(actions[age // 5])
         new = step(tasks, world, action)
         if age in AGES:
-            found[age] = Play(tasks, world, action, new)
+            found[age] = Play(tasks, world, control(tasks, world, action), new)
         world = new.state
     return found
 
@@ -95,8 +107,8 @@ def alone(engine, task, world, action):
     """One world's step by plain MuJoCo calls: the state that is handed on, and what is sensed in it."""
     model = engine.models[int(task.row)]
     data = mujoco.MjData(model)
-    state = np.concatenate([world.qpos, world.qvel, world.warmstart])
     data.qpos[:], data.qvel[:], data.qacc_warmstart[:], data.ctrl[:] = *world[:3], action
+    data.act[:] = [] if world.act is None else world.act
     for _ in range(engine.num_substeps):
         mujoco.mj_step(model, data)
     state = np.float32(np.concatenate([data.qpos, data.qvel, data.qacc_warmstart]))
@@ -105,7 +117,7 @@ def alone(engine, task, world, action):
     return state, np.float32(data.sensordata)
 
 
-@pytest.mark.parametrize("name", DOMAINS)
+@pytest.mark.parametrize("name", slow_but(DOMAINS, *[name for name in DOMAINS if name not in HEAVY]))
 def test_c_steps_as_plain_mujoco_does(name):
     """Bit for bit in every world, for three steps of which the later ones go on from the batch's own state."""
     tasks, world, action, _ = played(name)
@@ -136,24 +148,25 @@ def assert_agreement(name, new):
     found = errors(play, new)
     for bounds, worlds in ((FREE, ~touching), (TOUCHING, touching)):
         measured = {q: float(np.quantile(found[worlds], q)) for q in bounds if np.any(worlds)}
-        assert all(measured[q] <= bounds[q] for q in measured), (name, measured, int(worlds.sum()))
+        rough = ROUGHER.get(name, 1)
+        assert all(measured[q] <= rough * bounds[q] for q in measured), (name, measured, int(worlds.sum()))
     if new.sensors is not None:
         sensed = np.max(np.abs(play.step.state.sensors - new.sensors), axis=1)
-        assert np.quantile(sensed, 0.5) <= 1e-6 * max(1, np.max(np.abs(new.sensors)))
+        assert np.quantile(sensed, 0.5) <= ROUGHER.get(name, 1) * 1e-6 * max(1, np.max(np.abs(new.sensors)))
     other = play.tasks._replace(row=1 - play.tasks.row)
     wrong = jax.vmap(engine.step)(other, play.world, play.action)
     assert np.median(errors(play, wrong)) > 10 * np.median(found)
 
 
 def compiled_step(name, env, play):
-    """Compile a step in little time; the hopper's takes ten seconds more, and runs in 0.1 s where it took 20."""
-    if name != "hopper-hop":
+    """Compile a step in little time; that of some takes ten seconds more, and runs in 0.1 s where it took 20."""
+    if name not in ("hopper-hop", "humanoid-walk", "quadruped-walk"):
         return quick(jax.vmap(env.simulator.step), *play[:3])
     some = {"xla_backend_optimization_level": 1}
     return jax.jit(jax.vmap(env.simulator.step)).lower(*play[:3]).compile(compiler_options=some)
 
 
-@pytest.mark.parametrize("name", [pytest.param(x, marks=[] if x in QUICK_DOMAINS else SLOW) for x in DOMAINS])
+@pytest.mark.parametrize("name", slow_but(ALIKE, *QUICK_DOMAINS))
 def test_mjx_steps_as_c_does(name):
     """With solver iterations to spare, in all but a stated share of the states of play; and rewards are those of C."""
     env, play = family(name, engine="mjx", solver_iterations=10), played(name)
@@ -171,7 +184,7 @@ def test_mjx_steps_as_c_does(name):
 
 
 @SLOW
-@pytest.mark.parametrize("name", DOMAINS)
+@pytest.mark.parametrize("name", ALIKE)
 def test_warp_steps_as_c_does(name):
     """Under a map of a map, which picks every world's own model."""
     pytest.importorskip("warp")

@@ -280,8 +280,8 @@ def test_other_values_are_scored_as_the_run_scores_them(copied_run, capsys):
     assert {(row["split"], row["size"]) for row in rows} == {("given", x) for x in ("0.9", "1", "1.1", "1.2")}
     policy = mtjax.load(copied_run)
     family = scoring.on_values(policy.env, {"size": "0.9,1,1.2"})
-    tasks = scoring.as_unseen(family.tasks("all"), policy.env.tasks())
-    assert np.asarray(tasks.id).tolist() == [2, 0, 1]
+    tasks = scoring.as_unseen(family.tasks("all"), policy.env)
+    assert np.asarray(tasks.id).tolist() == [len(policy.env.tasks("all").id), 0, 1]
     np.testing.assert_allclose(tasks.context[:, 0], [-2, -1, 1], atol=1e-5)
 
 

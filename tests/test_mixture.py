@@ -125,7 +125,7 @@ def test_tasks_lie_family_after_family_in_every_split():
     assert tasks["train"].row.tolist() == [0, 1, 2, 9] and tasks["interpolation"].row.tolist() == [3, 4]
     assert tasks["train"].horizon.tolist() == [4, 4, 4, 7] and BOTH.episode_length == 7
     assert tasks["train"].action_mask.tolist() == [[1, 0]] * 3 + [[1, 1]]
-    assert BOTH.spec == Spec(jax.ShapeDtypeStruct((3,), jnp.float32), 2, 3, True)
+    assert BOTH.spec._replace(sentences=()) == Spec(jax.ShapeDtypeStruct((3,), jnp.float32), 2, 3, True)
     assert tasks["all"].blocks.runs == ((0, 3), (1, 1), (0, 6))
 
 

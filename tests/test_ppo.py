@@ -7,10 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import Walk, mean_actions, of_task, one_in, only_seed, pick, quick, random_past, tiny, train
+from probes import TELLING, Walk, mean_actions, of_task, one_in, only_seed, pick, quick, random_past, tiny, train
 
 from mtjax import agents, normalize
-from mtjax.agents.base import CONDITIONINGS
 from mtjax.agents.parts.encoders import ENCODERS
 from mtjax.agents.parts.gradients.surgery import RULES
 from mtjax.agents.parts.samplers import SAMPLERS
@@ -21,7 +20,7 @@ from mtjax.envs.probes import Probe, tasks_of
 from mtjax.networks import log_density
 from mtjax.types import InputError, Spec, Transition
 
-SPEC, LENGTH, ENVS = Spec.vector(3, 2, 1), 4, 2
+SPEC, LENGTH, ENVS = Spec.vector(3, 2, 1)._replace(sentences=("Walk.", "Run.", "Hop.")), 4, 2
 TASKS = tasks_of("one-step", (1.0, -0.5, 0.3))
 KEY = jax.random.key(2)
 
@@ -342,7 +341,7 @@ def pairs(**choices):
 
 
 COMBINED = pairs(
-    conditioning=CONDITIONINGS,
+    conditioning=TELLING,
     encoder=list(ENCODERS),
     heads=["shared", "per-task", "disjoint"],
     gradients=list(RULES),
@@ -368,7 +367,7 @@ COMBINED = [row for row in COMBINED if allowed(row)]
 def test_most_combinations_are_allowed():
     assert len(COMBINED) > 50
     encoders = set(ENCODERS) - {"batch-norm"}  # whose statistics PPO does not keep
-    for kind, table in (("encoder", encoders), ("gradients", RULES), ("conditioning", CONDITIONINGS)):
+    for kind, table in (("encoder", encoders), ("gradients", RULES), ("conditioning", TELLING)):
         assert {row[kind] for row in COMBINED if kind in row} == set(table)
 
 

@@ -13,7 +13,7 @@ import tyro
 from mtjax import frames, normalize
 from mtjax.agents import parts
 from mtjax.agents.choices import FLAT, PARTS, kinds_of
-from mtjax.agents.parts import conditioning, trajectory
+from mtjax.agents.parts import conditioning, sentences, trajectory
 from mtjax.agents.parts.encoders import Encoder
 from mtjax.agents.parts.gradients import descent, surgery
 from mtjax.agents.parts.representations import REPRESENTATIONS, Place, Representation
@@ -25,7 +25,7 @@ from mtjax.experience import Replay, multistep
 from mtjax.networks import Network, Params
 from mtjax.types import Acted, Array, Env, InputError, Key, Metrics, Outcome, Spec, Task, Transition
 
-Conditioning = Literal["none", "one-hot", "embedding", "parameters", "vectors", "inferred"]
+Conditioning = Literal["none", "one-hot", "embedding", "parameters", "vectors", "text", "inferred"]
 CONDITIONINGS = get_args(Conditioning)
 Heads = Literal["shared", "per-task", "disjoint"]
 Tune = Literal["all", "heads", "embedding"]
@@ -112,8 +112,9 @@ class BaseAgent(abc.ABC):
     """Use layer normalisation in the actor."""
     conditioning: Conditioning = "none"
     """Features of the task that the networks take as inputs: none, one-hot, embedding (learned), parameters (the task's
-    context), vectors (rows of a file) or inferred (from the last steps, by a trajectory encoder). With one-hot,
-    embedding and vectors, an unseen task uses those of the nearest training task."""
+    context), vectors (rows of a file), text (what the task asks for, in a sentence) or inferred (from the last steps,
+    by a trajectory encoder). With one-hot, embedding and vectors, an unseen task uses those of the nearest training
+    task; with text, tasks of the run's own splits have their own sentences."""
     context_limit: float = 0.0
     """Clip every parameter of the task to at most this size before networks see it, 0 for no limit. Training tasks lie
     in [-1, 1], so that 1 shows a task beyond them as the end of the range."""
@@ -123,6 +124,9 @@ class BaseAgent(abc.ABC):
     """Scale learned task embeddings to length 1."""
     vectors: str = ""
     """A .npy file of task vectors (T, V), one row for each training task, for conditioning=vectors."""
+    text: str = "hashing"
+    """Encoder of sentences for conditioning=text: hashing (256 numbers from words and pairs of words, by
+    scikit-learn), or a model of sentence-transformers, by its name or the folder that it is in."""
     inferred_from: int = 8
     """Number of last steps from which the task is inferred; they are stored with every transition."""
     heads: Heads = "shared"
@@ -176,6 +180,8 @@ class BaseAgent(abc.ABC):
         """Refuse parts that do not go together."""
         if (self.conditioning == "vectors") != bool(self.vectors):
             raise InputError("conditioning=vectors and vectors=FILE.npy go together; give both or neither")
+        if self.text != "hashing" and self.conditioning != "text":
+            raise InputError(f"text={self.text} needs conditioning=text, not {self.conditioning}")
         if self.tune == "embedding" and self.conditioning != "embedding":
             raise InputError(f"tune=embedding needs conditioning=embedding, not {self.conditioning}")
         encoder, rule = (parts.name_of(PARTS[kind], getattr(self, kind)) for kind in ("encoder", "gradients"))
@@ -291,7 +297,7 @@ class BaseAgent(abc.ABC):
         """Initialise the fields that all agents' states have, by name, for the training ``tasks`` (T, ...)."""
         self._require_sight(spec)
         num_tasks = len(tasks.id)
-        vectors, moments = self.load_vectors(num_tasks), self.init_moments(spec, num_tasks)
+        vectors, moments = self.load_vectors(spec, num_tasks), self.init_moments(spec, num_tasks)
         features = conditioning.features(self.conditioning, num_tasks, jnp.int32(0), tasks.context[0], vectors)
         obs, action = self.example(spec, moments), jnp.zeros(spec.action_size)
         basis = self.placed_representation.init(num_tasks, features, obs, action, key)
@@ -355,8 +361,14 @@ class BaseAgent(abc.ABC):
         past = trajectory.begin(self.history_length, spec.obs_size, spec.action_size) if self.history_length else None
         return self.see(moments, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), frames.seen(spec)), past)
 
-    def load_vectors(self, num_tasks: int) -> Array | None:
-        """Read the task vectors (T, V) from their file; None if there is none."""
+    def load_vectors(self, spec: Spec, num_tasks: int) -> Array | None:
+        """Return the given task vectors: (T, V) from their file, or of all splits' sentences; None if there are none.
+
+        Raises:
+            InputError: the file has no such vectors, the tasks have no sentences, or a library is missing.
+        """
+        if self.conditioning == "text":
+            return jnp.asarray(sentences.encode(self.text, spec.sentences))
         return conditioning.load_vectors(self.vectors, num_tasks) if self.vectors else None
 
     def known_task(self, state: Any, task: Task) -> Array:
@@ -374,8 +386,10 @@ class BaseAgent(abc.ABC):
 
     def features(self, state: Any, task: Task) -> Array:
         """Return the features (Z,) of one task that networks take as inputs."""
-        known, context = self.known_task(state, task), self.limited(task.context)
-        return conditioning.features(self.conditioning, len(state.contexts), known, context, state.vectors)
+        number, context = self.known_task(state, task), self.limited(task.context)
+        if self.conditioning == "text":
+            number = jnp.where(task.id < len(state.vectors), task.id, number)
+        return conditioning.features(self.conditioning, len(state.contexts), number, context, state.vectors)
 
     def limited(self, context: Array) -> Array:
         """Return contexts (..., C) as networks see them."""

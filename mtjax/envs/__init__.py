@@ -77,18 +77,42 @@ _DOMAINS: dict[str, Entry] = {
     "cartpole-swingup": ("cartpole:CartpoleSwingup", {}),
     "cartpole-swingup-sparse": ("cartpole:CartpoleSwingup", {"sparse": True}),
     "cheetah-run": ("cheetah:CheetahRun", {}),
+    "dog-run": ("dog:DogRun", {}),
+    "dog-stand": ("dog:DogStand", {}),
+    "dog-trot": ("dog:DogTrot", {}),
+    "dog-walk": ("dog:DogWalk", {}),
     "finger-spin": ("finger:FingerSpin", {}),
     "finger-turn-easy": ("finger:FingerTurn", {}),
     "finger-turn-hard": ("finger:FingerTurn", {"vary": {"target-size": "0.03"}}),
+    "fish-swim": ("fish:FishSwim", {}),
+    "fish-upright": ("fish:FishUpright", {}),
     "hopper-hop": ("hopper:HopperHop", {}),
     "hopper-stand": ("hopper:HopperStand", {}),
+    "humanoid-run": ("humanoid:HumanoidRun", {}),
+    "humanoid-stand": ("humanoid:HumanoidStand", {}),
+    "humanoid-walk": ("humanoid:HumanoidWalk", {}),
     "pendulum-swingup": ("pendulum:PendulumSwingup", {}),
     "point-mass-easy": ("point_mass:PointMass", {}),
+    "quadruped-run": ("quadruped:QuadrupedRun", {}),
+    "quadruped-walk": ("quadruped:QuadrupedWalk", {}),
     "reacher-easy": ("reacher:Reacher", {}),
     "reacher-hard": ("reacher:Reacher", {"vary": {"target-size": "0.015"}}),
+    "swimmer-swimmer6": ("swimmer:Swimmer", {}),
+    "swimmer-swimmer15": ("swimmer:Swimmer", {"links": 15}),
     "walker-run": ("walker:WalkerRun", {}),
     "walker-stand": ("walker:WalkerStand", {}),
     "walker-walk": ("walker:WalkerWalk", {}),
+}
+
+# Further tasks on dm_control's bodies, with rewards of our own.
+_FURTHER: dict[str, Entry] = {
+    "ball-in-cup-spin": ("ball_in_cup:BallInCupSpin", {}),
+    "cheetah-jump": ("cheetah:CheetahJump", {}),
+    "cheetah-run-backward": ("cheetah:CheetahRunBackward", {}),
+    "hopper-hop-backward": ("hopper:HopperHopBackward", {}),
+    "pendulum-spin": ("pendulum:PendulumSpin", {}),
+    "walker-run-backward": ("walker:WalkerRunBackward", {}),
+    "walker-walk-backward": ("walker:WalkerWalkBackward", {}),
 }
 
 # HiP-BMDP's families (Zhang et al. 2021) with the values of MTEnv's models; `--split=hip-bmdp` for its held-out tasks.
@@ -173,7 +197,7 @@ PICTURES = ("pixels", "frames", "repeat", "grey", "state", "plain", "painter")
 
 _inside = lambda folder, table: {name: (f"{folder}.{place}", settings) for name, (place, settings) in table.items()}
 ENVS = Families(
-    _inside("mtjax.envs.dm_control", _DOMAINS | _HIP_BMDP | _GOALS)
+    _inside("mtjax.envs.dm_control", _DOMAINS | _FURTHER | _HIP_BMDP | _GOALS)
     | _inside("mtjax.envs.mtenv", _MTENV)
     | _inside("mtjax.envs.metaworld", FAMILIES)
     | _inside("mtjax.envs", _BRAX)

@@ -42,6 +42,19 @@ NAMES = (
 _REFUSED = {
     "swimmer": "its fluid forces call jax.numpy.clip with an argument, a_min, that no jax of version 0.10 or later has",
 }
+_ASKS = {
+    "ant": "Make the ant run to the right.",
+    "fast": "Do anything.",
+    "halfcheetah": "Make the half-cheetah run forwards.",
+    "hopper": "Make the one-legged hopper hop forwards.",
+    "humanoid": "Make the humanoid run forwards.",
+    "humanoidstandup": "Make the humanoid stand up.",
+    "inverted_double_pendulum": "Balance two poles on top of each other on the cart.",
+    "inverted_pendulum": "Balance the pole on the cart.",
+    "pusher": "Push the object to the goal with the arm.",
+    "reacher": "Reach the target with the arm.",
+    "walker2d": "Make the two-legged walker walk forwards.",
+}
 _SPEED_CONTROL_COST = 0.05
 # What a step of MJX reads from the last state. It computes everything else anew.
 _MJX_KEPT = ("x", "qpos", "qvel", "qacc_warmstart")
@@ -99,6 +112,11 @@ class Brax(Family):
             raise InputError(f"backend {self.backend} distorts masses; to vary the mass use generalized or mjx")
         if find_spec("brax") is None:
             raise InputError("Brax is not installed; pip install brax")
+
+    @property
+    def instruction(self) -> str:
+        """Return what all tasks ask for."""
+        return _ASKS[self.environment] if type(self) is Brax else super().instruction
 
     def reset(self, task: Task, key: Key) -> Step:
         """Begin an episode of ``task`` in a fresh random state."""
@@ -194,6 +212,7 @@ class BraxAntDirection(Brax):
     other weights: survival 0.05, control 0.005.
     """
 
+    asks: ClassVar[str] = "Make the ant run in the given direction."
     parameters: ClassVar[Mapping[str, Parameter]] = MappingProxyType(
         {**Brax.parameters, "direction": Parameter("rad", 0.0, minimum=-np.pi, maximum=np.pi)}
     )
@@ -221,6 +240,7 @@ class BraxHalfcheetahSpeed(Brax):
 
     environment: str = "halfcheetah"
 
+    asks: ClassVar[str] = "Make the half-cheetah run at the given speed."
     parameters: ClassVar[Mapping[str, Parameter]] = MappingProxyType(
         {**Brax.parameters, "speed": Parameter("m/s", 1.0)}
     )

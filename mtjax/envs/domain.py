@@ -305,9 +305,21 @@ def _first_unlike(column: Sequence[Any]) -> int | None:
 
 
 def start_joints(model: mujoco.MjModel, key: Key) -> Array:
-    """Draw joint positions (nq,) as dm_control does: limited joints in their range, free hinges in [-pi, pi]."""
-    limited = model.jnt_limited.astype(bool)
-    hinge = model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
-    default = np.stack([model.qpos0, model.qpos0], axis=-1)
-    ends = np.where(limited[:, None], model.jnt_range, np.where(hinge[:, None], [-np.pi, np.pi], default))
-    return jax.random.uniform(key, (model.nq,), jnp.float32, *jnp.asarray(ends.T, jnp.float32))
+    """Draw joint positions (nq,) as dm_control does: limited joints in their range, free hinges in [-pi, pi].
+
+    Free joints stay in their place, turned by a quaternion of four numbers in [0, 1].
+    """
+    kinds = mujoco.mjtJoint
+    ends, turned = np.stack([model.qpos0, model.qpos0], axis=-1), []
+    for place, kind, limited, limits in zip(
+        model.jnt_qposadr, model.jnt_type, model.jnt_limited, model.jnt_range, strict=True
+    ):
+        if kind == kinds.mjJNT_FREE:
+            turned.append(slice(place + 3, place + 7))
+            ends[turned[-1]] = [0, 1]
+        elif limited or kind == kinds.mjJNT_HINGE:
+            ends[place] = limits if limited else [-np.pi, np.pi]
+    qpos = jax.random.uniform(key, (model.nq,), jnp.float32, *jnp.asarray(ends.T, jnp.float32))
+    for quat in turned:
+        qpos = qpos.at[quat].divide(jnp.linalg.norm(qpos[quat]))
+    return qpos

@@ -18,6 +18,7 @@ from mtjax.checks import require_values
 from mtjax.envs import variation
 from mtjax.envs.parameters import Parameter
 from mtjax.maps import Flat
+from mtjax.names import first_sentence
 from mtjax.types import SPLITS, Array, InputError, Key, Spec, Step, Task, Transition
 
 _MAX_DRAWS = 1000
@@ -114,6 +115,15 @@ class Tabled(abc.ABC):
     @abc.abstractmethod
     def where_worlds(self, mask: Array, new: Any, old: Any) -> Any: ...
 
+    @abc.abstractmethod
+    def sentence(self, row: int) -> str:
+        """Return what a task asks for, such as "Spin the body with the finger, with size 0.95."."""
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """Return what the tasks of all splits ask for, in the order of their numbers."""
+        return tuple(self.sentence(row) for split in SPLITS for row in self.table.rows[split].tolist())
+
     def params(self, split: str) -> dict[str, Any]:
         """Return the values (T,) of the parameters of a split's tasks; of a mixture their names as ``task_name``."""
         params = self.tasks(split).params
@@ -181,6 +191,7 @@ class Family(Flat, Tabled):
     action_size: ClassVar[int]
     episode_steps: ClassVar[int]
     relabels: ClassVar[tuple[str, ...]] = ()  # the parameters, goals all of them, that ``relabel`` can exchange
+    asks: ClassVar[str] = ""  # what its tasks ask for, in a sentence; empty: the documentation's first one
     fresh_goals: ClassVar[bool] = False  # every episode draws a goal of its own, whatever its task
 
     def __post_init__(self):
@@ -341,6 +352,25 @@ class Family(Flat, Tabled):
         params = self.table.tasks.params
         return ",".join(f"{name}={params[name][row]:.4g}" for name in self.varied) or f"task={row}"
 
+    @property
+    def instruction(self) -> str:
+        """Return what all tasks ask for, in a sentence."""
+        return vars(type(self)).get("asks") or first_sentence(type(self).__doc__).split(" (")[0] + "."
+
+    def sentence(self, row: int) -> str:
+        """Return what a task asks for, and the parameters that are given."""
+        found = self.variation
+        if not found.names:
+            return self.instruction
+        drawn = found.draws is not None and row < self.train_count
+        told = []
+        for i, name in enumerate(found.names):
+            value, unit = self.values[name][row], self.every_parameter[name].unit
+            ranged = drawn and np.ptp(found.draws[row, :, i]) > 0  # type: ignore
+            number = f"from {found.low[i]:.3g} to {found.high[i]:.3g}" if ranged else f"{value:.3g}"
+            told.append(f"{name.replace('-', ' ')} {number}" + f" {unit}" * (unit != "1"))
+        return f"{self.instruction.removesuffix('.')}, with {' and '.join(told)}."
+
     def labels(self, split: str) -> list[str]:
         """Return a short name for every task of a split: its ``task_values``."""
         return [f"{value:.4g}" for value in self.task_values(split)]
@@ -403,7 +433,7 @@ class Family(Flat, Tabled):
     def _spec(self) -> Spec:
         task = jax.tree.map(lambda x: x[0], self.table.tasks)
         step = jax.eval_shape(self.reset, task, jax.eval_shape(jax.random.key, 0))
-        return Spec(step.obs, self.action_size, task.context.shape[0])
+        return Spec(step.obs, self.action_size, task.context.shape[0], sentences=self.sentences)
 
 
 def draw_until(accepted: Callable[[Array], Array], draw: Callable[[Key], Array], key: Key) -> Array:

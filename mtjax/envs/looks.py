@@ -40,6 +40,7 @@ class Look(NamedTuple):
     light: tuple[float, float, float] = (0.0, 0.0, 2.0)  # position [m] of a lamp that shines down
     sun: bool = False  # whether the light is directional
     follow: str = ""  # the body whose centre of mass camera and light follow; their positions are from its frame
+    fovy: float = 45.0  # [deg] angle of view
     colours: tuple[tuple[str, tuple[float, ...]], ...] = ()  # of geoms that are not as the model has them
 
 
@@ -64,7 +65,7 @@ def dress(spec: mujoco.MjSpec, look: Look | None, plain: bool) -> None:
     body = spec.body(look.follow) if look.follow else spec.worldbody
     follow = {"mode": _FOLLOW} if look.follow else {}
     if not spec.cameras:
-        body.add_camera(name="eye", pos=look.camera, quat=_about("x", look.tilt), **follow)
+        body.add_camera(name="eye", pos=look.camera, quat=_about("x", look.tilt), fovy=look.fovy, **follow)
     if not spec.lights:
         kind = _LIGHT.mjLIGHT_DIRECTIONAL if look.sun else _LIGHT.mjLIGHT_SPOT
         body.add_light(name="light", pos=look.light, type=kind, diffuse=[0.6 if look.sun else 0.7] * 3, **follow)

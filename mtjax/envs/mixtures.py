@@ -193,7 +193,7 @@ class Mixture(Tabled):
         specs = [family.spec for family in self.families]
         obs_size, action_size = max(spec.obs_size for spec in specs), max(spec.action_size for spec in specs)
         spec = Spec.vector(obs_size, action_size, self._context().shape[1])
-        return spec._replace(mixed=len(self.families) > 1)
+        return spec._replace(mixed=len(self.families) > 1, sentences=self.sentences)
 
     @property
     def episode_length(self) -> int:
@@ -311,6 +311,17 @@ class Mixture(Tabled):
     def apart(self, states: States) -> tuple[Any, ...]:
         """Return the states of each part."""
         return states.families
+
+    def sentence(self, row: int) -> str:
+        """Return what a task asks for."""
+        i, own = self._place(row)
+        return self.families[i].sentence(own)
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """Return what the tasks of all splits ask for. It needs no table, for which the sizes have to be known."""
+        rows = [(f, row) for split in SPLITS for f in self.families for row in f.table.rows[split].tolist()]
+        return tuple(family.sentence(row) for family, row in rows)
 
     def own_row(self, row: int) -> int:
         """Return the row of the family's own table for a row of this table."""

@@ -67,6 +67,16 @@ def _scale_gear(spec: mujoco.MjSpec, scale: float) -> None:
         actuator.gear = actuator.gear * scale
 
 
+def _scale_strength(spec: mujoco.MjSpec, scale: float) -> None:
+    """Scale gain and bias together, so that servos pull to the same positions."""
+    for actuator in spec.actuators:
+        actuator.gainprm, actuator.biasprm = actuator.gainprm * scale, actuator.biasprm * scale
+
+
+def _set_density(spec: mujoco.MjSpec, value: float) -> None:
+    spec.option.density = value
+
+
 def body_mass(name: str) -> Parameter:
     """Return a parameter that scales mass and inertia of one body."""
     return Parameter("1", 1.0, lambda spec, scale: _scale_body(spec.body(name), scale))
@@ -77,3 +87,5 @@ GRAVITY = Parameter("m/s^2", 9.81, _set_gravity)
 FRICTION = Parameter("1", 1.0, _scale_friction)  # scale of the sliding friction of all geoms
 DAMPING = Parameter("1", 1.0, _scale_damping)  # scale of the damping of all joints
 GEAR = Parameter("1", 1.0, _scale_gear)  # scale of the strength of all actuators
+STRENGTH = Parameter("1", 1.0, _scale_strength)  # scale of the force of all actuators, servos among them
+WATER = Parameter("kg/m^3", 0.0, _set_density)  # density of what bodies move in

@@ -45,7 +45,7 @@ def report(request: Any, vary: Mapping[str, str]) -> None:
         trained = policy.env
         policy = dataclasses.replace(policy, env=on_values(trained, vary))
         print(f"trained on {trained.ends or 'one task'}; scored on {policy.env.ends or 'one task'}")  # type: ignore
-        tasks = as_unseen(policy.env.tasks("all"), trained.tasks("train"))
+        tasks = as_unseen(policy.env.tasks("all"), trained)
     else:
         tasks = policy.env.tasks("all")
     chosen = films.choose(policy.env, request.video_splits, request.video_tasks) if request.video else ()
@@ -76,10 +76,14 @@ def on_values(env: Any, vary: Mapping[str, Any]) -> Any:
     return made.scaled_as(env)
 
 
-def as_unseen(tasks: Task, trained: Task) -> Task:
-    """Number tasks (T,) for an agent that learned others: a task that it learned by its number, others beyond these."""
+def as_unseen(tasks: Task, env: Any) -> Task:
+    """Number tasks (T,) for an agent that learned in ``env``: a task that it learned by its number, others beyond all.
+
+    The numbers between are those of the held-out tasks of ``env``, which have sentences of their own.
+    """
+    trained, count = env.tasks("train"), len(env.tasks("all").id)
     same = np.all(np.isclose(np.asarray(tasks.context)[:, None], np.asarray(trained.context), atol=1e-5), axis=-1)
-    known, count = same.any(axis=1), len(trained.id)
+    known = same.any(axis=1)
     return tasks._replace(
         id=jnp.asarray(np.where(known, same.argmax(axis=1), count + np.arange(len(known))), jnp.int32)
     )

@@ -7,7 +7,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from mtjax.agents.parts.conditioning import load_vectors
 from mtjax.config import RunConfig, require_value_range, wants_gpu
 from mtjax.envs import Family
 from mtjax.parallel import hosts, mesh
@@ -40,8 +39,8 @@ def check(config: RunConfig, start: Policy | None = None) -> None:
         if start is not None:
             require_fit(start, family, learner)
     begins = start is not None or bool(config.start)
-    if config.learner.vectors:
-        load_vectors(config.learner.vectors, family.train_count)
+    if config.learner.conditioning in ("vectors", "text"):
+        config.learner.load_vectors(family.spec, family.train_count)
     tune = config.learner.tune
     if tune != "all" and not begins:
         raise InputError(f"--tune={tune} leaves the rest as a run left it; say which run: --from=RUN")

@@ -15,16 +15,16 @@ def features(conditioning: str, num_tasks: int, index: Array, context: Array, ve
 
     Args:
         conditioning: the agent's.
-        index: () number of the task if it is a training task, else of the nearest one.
+        index: () number of the task if it is a training task, else of the nearest one. Of sentences all have one.
         context: (C,) the task's own parameters.
-        vectors: (T, V) of the training tasks, for conditioning on vectors.
+        vectors: (T, V) of the training tasks, or of all splits' sentences.
     """
     match conditioning:
         case "one-hot":
             return jax.nn.one_hot(index, num_tasks)
         case "parameters":
             return context
-        case "vectors":
+        case "vectors" | "text":
             assert vectors is not None
             return vectors[index]
     return jnp.zeros(0)

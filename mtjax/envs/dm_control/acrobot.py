@@ -40,6 +40,7 @@ class AcrobotSwingup(Domain):
     sparse: bool = False
     """Give a reward of 1 at the goal and 0 elsewhere."""
 
+    asks: ClassVar[str] = "Swing the acrobot up and balance it upright."
     parameters: ClassVar = MappingProxyType(
         {
             "upper-mass": body_mass("upper_arm"),

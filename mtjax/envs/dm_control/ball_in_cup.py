@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
+from mtjax.envs.dm_control.rewards import tolerance
 from mtjax.envs.domain import Domain
 from mtjax.envs.engines.base import World
 from mtjax.envs.looks import Look
@@ -15,6 +16,7 @@ from mtjax.envs.parameters import DAMPING, FRICTION, GEAR, GRAVITY, MASS, Parame
 from mtjax.envs.pixels import Mark
 from mtjax.types import Array, Key, Task
 
+_TAUT = 5 / 6  # of the string's length, from which a spin counts
 _START_LOW, _START_HIGH = (-0.2, 0.2), (0.2, 0.5)  # [m] x and z of the ball's joints
 
 
@@ -46,6 +48,7 @@ class BallInCup(Domain):
     it can pass it), and under MJX the constraint solver stops after ``solver_iterations``.
     """
 
+    asks: ClassVar[str] = "Catch the ball in the cup."
     parameters: ClassVar = MappingProxyType(
         {
             "string-length": Parameter("m", 0.3, _set_string_length, minimum=0.29),
@@ -73,15 +76,17 @@ class BallInCup(Domain):
         spec.tendon("string").rgba = [0, 0, 0, 0]
 
     def marks(self, task: Task, world: World) -> dict[str, Mark]:
+        cup, ball = self.ends(task, world)
+        length = jnp.maximum(jnp.linalg.norm(ball - cup), 1e-6)
+        size = jnp.stack([jnp.float32(self.models[0].tendon_width[0]), length / 2, jnp.float32(0)])
+        return {"string": Mark((cup + ball) / 2, size, (ball - cup) / length)}
+
+    def ends(self, task: Task, world: World) -> tuple[Array, Array]:
+        """Return the places (3,) [m] of the string's ends, at the cup and at the ball."""
         model, bodies, sites = self.models[0], self.leaf(task, "body_pos"), self.leaf(task, "site_pos")
-        ends = []
-        for i, name in enumerate(("cup", "ball")):
-            x, z = world.qpos[2 * i], world.qpos[2 * i + 1]
-            ends.append(bodies[model.body(name).id] + sites[model.site(name).id] + jnp.stack([x, jnp.float32(0), z]))
-        apart = ends[1] - ends[0]
-        length = jnp.maximum(jnp.linalg.norm(apart), 1e-6)
-        size = jnp.stack([jnp.float32(model.tendon_width[0]), length / 2, jnp.float32(0)])
-        return {"string": Mark((ends[0] + ends[1]) / 2, size, apart / length)}
+        moved = [jnp.stack([x, jnp.float32(0), z]) for x, z in world.qpos.reshape(2, 2)]
+        places = [bodies[model.body(name).id] + sites[model.site(name).id] for name in ("cup", "ball")]
+        return places[0] + moved[0], places[1] + moved[1]
 
     def start(self, task: Task, key: Key) -> tuple[Array, Array]:
         low, high = jnp.array([_START_LOW, _START_HIGH]).T
@@ -96,3 +101,27 @@ class BallInCup(Domain):
         room = self.leaf(task, "site_size")[self.models[0].site("target").id] - radius
         inside = jnp.abs(world.sensors) < room
         return (inside[0] & inside[2]).astype(jnp.float32)
+
+
+@dataclasses.dataclass(frozen=True)
+class BallInCupSpin(BallInCup):
+    """Spin: swing the ball round and round the cup at 3 m/s or faster.
+
+    As BallInCup, but for the reward, the product of two factors in [0, 1]: one is 1 where the ball goes round the cup's
+    bottom from x towards z at ``speed`` or faster as the cup sees it, and falls linearly to 0 at rest; the other is 1
+    where the ball is 5/6 of the string's length or more from there, and falls linearly to 0 at 2/3. Not a task of
+    dm_control: it has the same model, starts and episodes.
+
+    Further parameter: speed [m/s].
+    """
+
+    parameters: ClassVar = MappingProxyType({**BallInCup.parameters, "speed": Parameter("m/s", 3.0)})
+
+    def reward(self, task: Task, world: World, action: Array) -> Array:
+        cup, ball = self.ends(task, world)
+        apart, velocity = ball - cup, world.qvel[2:] - world.qvel[:2]
+        distance = jnp.maximum(jnp.linalg.norm(apart), 1e-6)
+        around = (apart[0] * velocity[1] - apart[2] * velocity[0]) / distance
+        speed, length = task.goal["speed"], self.leaf(task, "tendon_range")[0, 1]
+        spinning = tolerance(around, speed, jnp.inf, speed, "linear", value_at_margin=0)
+        return spinning * tolerance(distance, _TAUT * length, jnp.inf, length / 6, "linear", value_at_margin=0)

@@ -57,6 +57,7 @@ class CartpoleBalance(Domain):
     sparse: bool = False
     """Give a reward of 1 at the goal and 0 elsewhere."""
 
+    asks: ClassVar[str] = "Balance the pole on the cart."
     parameters: ClassVar = MappingProxyType(
         {
             "cart-mass": Parameter("kg", 1.0, _set_cart_mass),
@@ -101,6 +102,8 @@ class CartpoleSwingup(CartpoleBalance):
     Start: cart normal about the middle and pole normal about straight down, with deviations of 0.01 m and 0.01 rad;
         both velocities normal with deviation 0.01.
     """
+
+    asks: ClassVar[str] = "Swing the pole on the cart up and balance it."
 
     def start(self, task: Task, key: Key) -> tuple[Array, Array]:
         position, velocity = 0.01 * jax.random.normal(key, (2, 2))

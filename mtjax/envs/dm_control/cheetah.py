@@ -20,6 +20,7 @@ from mtjax.types import Array, Key, Task
 _TOTAL_MASS = 14.0  # [kg]
 _LEGS = ("bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot")
 _BACK_FOOT_GAP = 0.003  # [m] from the ankle to the upper end of the back foot's axis
+_STANDING = 0.45  # [m] height of the centre of mass of one that stands still
 _SETTLING_STEPS = 200
 _POOL = 1024  # start states of all models together, as far as each has between 8 and 64
 
@@ -59,6 +60,20 @@ def _set_back_foot_length(spec: mujoco.MjSpec, length: float) -> None:
     _weigh(spec)
 
 
+_BODY = {
+    "torso-length": Parameter("m", 0.5, _set_torso_length),
+    "foot-size": Parameter("m", 0.046, _set_foot_size),
+    "foot-position": Parameter("m", 0.5, _set_foot_position),
+    "back-foot-length": Parameter("m", 0.094, _set_back_foot_length),
+    "torso-mass": body_mass("torso"),
+    "mass": MASS,
+    "gravity": GRAVITY,
+    "friction": FRICTION,
+    "damping": DAMPING,
+    "gear": GEAR,
+}
+
+
 @dataclasses.dataclass(frozen=True)
 class CheetahRun(Domain):
     """Run: move forwards, the faster the better, up to 10 m/s.
@@ -89,28 +104,16 @@ class CheetahRun(Domain):
     other apart in an arbitrary direction, where MuJoCo C lets them pass.
     """
 
-    parameters: ClassVar = MappingProxyType(
-        {
-            "torso-length": Parameter("m", 0.5, _set_torso_length),
-            "foot-size": Parameter("m", 0.046, _set_foot_size),
-            "foot-position": Parameter("m", 0.5, _set_foot_position),
-            "back-foot-length": Parameter("m", 0.094, _set_back_foot_length),
-            "torso-mass": body_mass("torso"),
-            "mass": MASS,
-            "gravity": GRAVITY,
-            "friction": FRICTION,
-            "damping": DAMPING,
-            "gear": GEAR,
-            "speed": Parameter("m/s", 10.0),
-        }
-    )
+    asks: ClassVar[str] = "Make the cheetah run forwards as fast as it can."
+    parameters: ClassVar = MappingProxyType({**_BODY, "speed": Parameter("m/s", 10.0)})
     model_file: ClassVar[str] = "cheetah.xml"
     num_substeps: ClassVar[int] = 1
     episode_steps: ClassVar[int] = 1000
     default_iterations: ClassVar[int] = 4
     warp_iterations: ClassVar[int] = 4
     starts_untouched: ClassVar[bool] = True  # it has no force sensors
-    relabels: ClassVar[tuple[str, ...]] = ("speed", "direction")
+    relabels: ClassVar[tuple[str, ...]] = ("speed", "direction", "height")
+    heading: ClassVar[float] = 1.0  # -1 backwards
     look: ClassVar = Look((0, -3, 0), 90, follow="torso")
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
@@ -135,8 +138,38 @@ class CheetahRun(Domain):
         return World(jnp.pad(obs[: -len(qvel)], (1, 0)), qvel, jnp.zeros_like(qvel), None)  # wherever along x
 
     def reward(self, task: Task, world: World, action: Array) -> Array:
-        speed = task.goal["speed"]
-        return tolerance(self.forward_velocity(task, world), speed, jnp.inf, speed, "linear", value_at_margin=0)
+        speed, velocity = task.goal["speed"], self.heading * self.forward_velocity(task, world)
+        return tolerance(velocity, speed, jnp.inf, speed, "linear", value_at_margin=0)
+
+
+@dataclasses.dataclass(frozen=True)
+class CheetahRunBackward(CheetahRun):
+    """Run backwards, the faster the better, up to 10 m/s.
+
+    As CheetahRun, but velocities backwards count. Not a task of dm_control: it has the same model, starts and episodes.
+    """
+
+    heading: ClassVar[float] = -1.0
+
+
+@dataclasses.dataclass(frozen=True)
+class CheetahJump(CheetahRun):
+    """Jump: have the body high over the ground.
+
+    As CheetahRun, but for the reward: 1 where the whole body's centre of mass is ``height`` or more over the ground,
+    falling linearly to 0 at the 0.45 m of a cheetah that stands still. Not a task of dm_control: it has the same model,
+    starts and episodes.
+
+    Further parameter, in place of speed: height [m].
+    """
+
+    parameters: ClassVar = MappingProxyType({**_BODY, "height": Parameter("m", 1.0, minimum=_STANDING)})
+
+    def reward(self, task: Task, world: World, action: Array) -> Array:
+        asked, mass = task.goal["height"], self.leaf(task, "body_mass")
+        heights = self.planar(task, world).centre[:, 1]
+        height = jnp.dot(mass, heights, precision="highest") / jnp.sum(mass)
+        return tolerance(height, asked, jnp.inf, asked - _STANDING, "linear", value_at_margin=0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -148,6 +181,8 @@ class CheetahSpeed(CheetahRun):
     (Finn et al. 2017) mean the same and reward minus the distance from the velocity asked for; here every task has the
     same range of rewards. The observation does not show the velocity asked for: the task's context does.
     """
+
+    asks: ClassVar[str] = "Make the cheetah run at the given speed."
 
     def reward(self, task: Task, world: World, action: Array) -> Array:
         speed = task.goal["speed"]
@@ -162,6 +197,7 @@ class CheetahDirection(CheetahRun):
     The observation does not show the direction: the task's context does.
     """
 
+    asks: ClassVar[str] = "Make the cheetah run in the given direction."
     parameters: ClassVar = MappingProxyType(
         {**CheetahRun.parameters, "direction": Parameter("1", 1.0, minimum=-2.0, maximum=1.0)}
     )

@@ -74,6 +74,7 @@ class FingerSpin(Domain):
     fingertip passes it), and under MJX the constraint solver stops after ``solver_iterations``.
     """
 
+    asks: ClassVar[str] = "Spin the body with the finger."
     parameters: ClassVar = MappingProxyType(
         {
             "size": Parameter("1", 1.0, _scale_links),
@@ -128,6 +129,7 @@ class FingerTurn(FingerSpin):
     Differs from dm_control as FingerSpin does.
     """
 
+    asks: ClassVar[str] = "Turn the body with the finger until its tip is in the target."
     parameters: ClassVar = MappingProxyType(
         {
             **FingerSpin.parameters,
@@ -204,6 +206,7 @@ class FingerTurnTarget(FingerTurn):
     Further parameter: target-angle [rad], 0 up and positive towards x.
     """
 
+    asks: ClassVar[str] = "Turn the body with the finger until its tip is in the target."
     parameters: ClassVar = MappingProxyType(
         {**FingerTurn.parameters, "target-angle": Parameter("rad", 0.0, minimum=-math.inf)}
     )

@@ -57,6 +57,7 @@ class HopperStand(Domain):
             rad/s in the one case that was seen, and two states of random play in ten thousand are such.
     """
 
+    asks: ClassVar[str] = "Make the hopper stand."
     parameters: ClassVar = MappingProxyType(
         {
             "foot-length": Parameter("1", 1.0, _scale_foot),
@@ -102,11 +103,21 @@ class HopperHop(HopperStand):
     Further parameter: speed [m/s].
     """
 
+    asks: ClassVar[str] = "Make the hopper hop forwards."
     parameters: ClassVar = MappingProxyType({**HopperStand.parameters, "speed": Parameter("m/s", 2.0)})
+    heading: ClassVar[float] = 1.0  # -1 backwards
 
     def reward(self, task: Task, world: World, action: Array) -> Array:
-        speed = task.goal["speed"]
-        hopping = tolerance(
-            self.forward_velocity(task, world), speed, jnp.inf, speed / 2, "linear", value_at_margin=0.5
-        )
+        speed, velocity = task.goal["speed"], self.heading * self.forward_velocity(task, world)
+        hopping = tolerance(velocity, speed, jnp.inf, speed / 2, "linear", value_at_margin=0.5)
         return self.standing(task, world) * hopping
+
+
+@dataclasses.dataclass(frozen=True)
+class HopperHopBackward(HopperHop):
+    """Hop backwards at 2 m/s or faster, the torso high over the foot.
+
+    As HopperHop, but velocities backwards count. Not a task of dm_control: it has the same model, starts and episodes.
+    """
+
+    heading: ClassVar[float] = -1.0

@@ -50,6 +50,7 @@ class PointMass(Domain):
     it acts only where the ball meets a wall.
     """
 
+    asks: ClassVar[str] = "Move the ball to the goal."
     parameters: ClassVar = MappingProxyType(
         {
             "goal-x": Parameter("m", 0.0, _move_target(0), -_ARENA, _ARENA),
@@ -102,6 +103,7 @@ class PointMassNavigate(PointMass):
     Episode: 100 steps of 0.1 s (five substeps of 0.02 s); a corner of the arena is some 32 steps away.
     """
 
+    asks: ClassVar[str] = "Move the ball to its goal."
     num_substeps: ClassVar[int] = 5
     episode_steps: ClassVar[int] = 100
     hides: ClassVar[tuple[str, ...]] = ("target",)

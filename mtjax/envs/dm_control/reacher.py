@@ -47,6 +47,7 @@ class Reacher(Domain):
     it acts only at the ends of the wrist's range.
     """
 
+    asks: ClassVar[str] = "Hold the end of the arm on the target."
     parameters: ClassVar = MappingProxyType(
         {
             "target-size": Parameter("m", 0.05, _set_target_size),
@@ -123,6 +124,7 @@ class ReacherTarget(Reacher):
         target-radius: its distance from the shoulder [m]; the finger reaches to 0.24.
     """
 
+    asks: ClassVar[str] = "Hold the end of the arm on the target."
     parameters: ClassVar = MappingProxyType(
         {
             **Reacher.parameters,

@@ -53,6 +53,7 @@ class WalkerStand(Domain):
     Differs from dm_control in: under MJX the constraint solver stops after ``solver_iterations``.
     """
 
+    asks: ClassVar[str] = "Make the walker stand upright."
     parameters: ClassVar = MappingProxyType(
         {
             "friction": Parameter("1", 0.7, _set_friction),
@@ -104,23 +105,43 @@ class WalkerWalk(WalkerStand):
     Further parameter: speed [m/s].
     """
 
+    asks: ClassVar[str] = "Make the walker walk forwards."
     parameters: ClassVar = MappingProxyType({**WalkerStand.parameters, "speed": Parameter("m/s", 1.0)})
     relabels: ClassVar[tuple[str, ...]] = ("speed",)
+    heading: ClassVar[float] = 1.0  # -1 backwards
 
     def reward(self, task: Task, world: World, action: Array) -> Array:
         return super().reward(task, world, action) * (5 * self.move(task, world) + 1) / 6
 
     def move(self, task: Task, world: World) -> Array:
         """Return the reward's factor () in [0, 1] for forward velocity."""
-        speed = task.goal["speed"]
-        return tolerance(self.forward_velocity(task, world), speed, jnp.inf, speed / 2, "linear", value_at_margin=0.5)
+        speed, velocity = task.goal["speed"], self.heading * self.forward_velocity(task, world)
+        return tolerance(velocity, speed, jnp.inf, speed / 2, "linear", value_at_margin=0.5)
 
 
 @dataclasses.dataclass(frozen=True)
 class WalkerRun(WalkerWalk):
     """Run: WalkerWalk at 8 m/s."""
 
+    asks: ClassVar[str] = "Make the walker run forwards."
     parameters: ClassVar = MappingProxyType({**WalkerStand.parameters, "speed": Parameter("m/s", 8.0)})
+
+
+@dataclasses.dataclass(frozen=True)
+class WalkerWalkBackward(WalkerWalk):
+    """Walk backwards at 1 m/s or faster, upright.
+
+    As WalkerWalk, but velocities backwards count. Not a task of dm_control: it has the same model, starts and episodes.
+    """
+
+    heading: ClassVar[float] = -1.0
+
+
+@dataclasses.dataclass(frozen=True)
+class WalkerRunBackward(WalkerRun):
+    """Run backwards: WalkerWalkBackward at 8 m/s."""
+
+    heading: ClassVar[float] = -1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,6 +152,8 @@ class WalkerSpeed(WalkerWalk):
     WalkerWalk's own, whoever masters the fastest task has mastered them all.) The observation does not show the
     velocity asked for: the task's context does.
     """
+
+    asks: ClassVar[str] = "Make the walker move at the given speed."
 
     def move(self, task: Task, world: World) -> Array:
         speed = task.goal["speed"]

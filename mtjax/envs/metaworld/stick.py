@@ -74,7 +74,8 @@ class StickPush(Sawyer):
         lifted = (at.obs[3] > 0) & (stick[2] - 0.01 > began["stick_init_pos"][2])
         reward = jnp.where(away <= _RADIUS, 10.0, 2 + 5 * stick_in_place + 3 * flask_in_place)
         reward = jnp.where(lifted & (distance(stick, at.tcp) < 0.02), reward, caged)
-        return reward, lifted & (away <= _RADIUS) & jnp.all(at.press != 0)
+        pressed = True if at.press is None else jnp.all(at.press != 0)
+        return reward, lifted & (away <= _RADIUS) & pressed
 
 
 @dataclasses.dataclass(frozen=True)

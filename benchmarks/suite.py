@@ -1,0 +1,219 @@
+"""Run a suite of tasks by its name, with its protocol: agents, seeds, steps, and the figures that the field reports.
+
+    python benchmarks/suite.py mt10|mt50|dynamics|goals|domains|hard [--agents NAME ...] [--seeds N]
+                               [--steps-per-task N] [--training NAME=N ...] [--out DIR]
+
+``--list`` prints the protocols. Every pair of environment and agent writes ``DIR/ENV/AGENT.csv`` (training over steps
+and seconds) and ``AGENT.npz`` (every episode of every evaluation: returns and, where tasks have it, success). Finished
+pairs are not run again, so that a long suite runs in parts. All results in DIR together give ``scores.md`` (means over
+tasks with 95% intervals over seeds), ``tasks.csv`` (every task and seed of the last evaluation) and, for suites that
+compare one agent for all tasks with one for each, ``sharing.md``.
+
+Success is that of the last evaluation: at the episode's last step, and at any step. Both are shares of episodes.
+"""
+
+import argparse
+import dataclasses
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import learning
+import numpy as np
+from report import markdown
+
+import mtjax
+from mtjax.evaluation import Evaluations, load_evaluations
+from mtjax.names import InputError
+from mtjax.report.stats import seed_interval, unpaired_difference
+from mtjax.training.log import append_rows
+from mtjax.training.programs import enable_compile_cache
+
+_HARD = ("dog-stand", "dog-walk", "dog-trot", "dog-run", "humanoid-stand", "humanoid-walk", "humanoid-run")
+_DOMAINS = (
+    *("acrobot-swingup", "ball-in-cup-catch", "cartpole-swingup", "cheetah-run", "finger-spin"),
+    *("hopper-hop", "pendulum-swingup", "point-mass-easy", "reacher-easy", "walker-walk"),
+)
+_DYNAMICS = (
+    *("cartpole-swingup-vary-pole-mass", "cheetah-run-vary-torso-length", "finger-spin-vary-size"),
+    *("walker-run-vary-friction", "walker-walk-vary-foot-length"),
+)
+_GOALS = (
+    *("cheetah-run-vary-speed", "cheetah-vary-direction", "finger-turn-vary-target"),
+    *("point-mass-vary-goal", "reacher-vary-goal", "walker-vary-speed"),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Suite:
+    """Environments, and how agents learn them."""
+
+    says: str  # where the protocol is from
+    envs: tuple[str, ...]
+    agents: tuple[str, ...]
+    steps_per_task: int
+    seeds: int = 10
+    split: str | None = None
+    together: str = ""  # the environment of all tasks, where others are its tasks alone
+
+
+SUITES = {
+    "mt10": Suite(
+        "Meta-World's ten tasks, 50 goals each, second rewards, 500 steps an episode (Yu et al. 2019; Sodhani et al. "
+        "2021): success of one agent for all after 2M steps a task",
+        ("mt10",),
+        ("sac-conditioned", "multi-head", "pcgrad", "care", "brc"),
+        2_000_000,
+    ),
+    "mt50": Suite(
+        "Meta-World's fifty tasks, as mt10", ("mt50",), ("sac-conditioned", "multi-head", "care", "brc"), 1_000_000, 3
+    ),
+    "dynamics": Suite(
+        "families whose bodies differ, on HiP-BMDP's split (Zhang et al. 2021): four tasks train, six are unseen",
+        _DYNAMICS,
+        ("sac", "sac-conditioned", "multi-head", "care", "pcgrad", "deepmdp", "hip-bmdp", "brc"),
+        500_000,
+        split="hip-bmdp",
+    ),
+    "goals": Suite(
+        "families whose goals differ: told, not told, and with heads or surgery",
+        _GOALS,
+        ("sac", "sac-conditioned", "multi-head", "care", "pcgrad", "brc"),
+        200_000,
+    ),
+    "domains": Suite(
+        "ten of dm_control's domains in one mixture, padded to one size",
+        ("+".join(_DOMAINS),),
+        ("sac-conditioned", "multi-head", "care", "pcgrad", "brc"),
+        500_000,
+        5,
+    ),
+    "hard": Suite(
+        "seven tasks of dog and humanoid: one agent for all against one for each, 1M steps a task (as BRC, Nauman et "
+        "al. 2025)",
+        ("+".join(_HARD), *_HARD),
+        ("brc",),
+        1_000_000,
+        5,
+        together="+".join(_HARD),
+    ),
+}
+
+
+class Last(NamedTuple):
+    """Holds the last evaluation of a run's training tasks."""
+
+    labels: list[str]  # (T,)
+    returns: np.ndarray  # (S, T)
+    success: np.ndarray | None  # (S, T) at the last step of episodes
+    ever: np.ndarray | None  # (S, T) at any step
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("suite", choices=list(SUITES), nargs="?")
+    parser.add_argument("--list", action="store_true", help="print every suite's protocol")
+    parser.add_argument("--agents", nargs="*", metavar="NAME", help="by default the suite's")
+    parser.add_argument("--envs", nargs="*", metavar="NAME", help="some of the suite's environments")
+    parser.add_argument("--seeds", type=int, help="by default the suite's")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--steps-per-task", type=int, help="by default the suite's")
+    parser.add_argument("--preset", default="auto")
+    parser.add_argument("--training", nargs="*", default=[], metavar="NAME=N", help="such as num_envs=64")
+    parser.add_argument("--evaluations", type=int, default=4)
+    parser.add_argument("--eval-episodes", type=int, default=50, help="of each task; Meta-World's tasks have 50 goals")
+    parser.add_argument("--out", type=Path)
+    arguments = parser.parse_args()
+    if arguments.list or not arguments.suite:
+        print("\n".join(map(describe, SUITES)))
+        return
+    enable_compile_cache()
+    suite = SUITES[arguments.suite]
+    out = arguments.out or Path("runs") / f"{arguments.suite}-{time.strftime('%Y%m%d-%H%M%S')}"
+    for env in arguments.envs or suite.envs:
+        for agent in suite.agents if arguments.agents is None else arguments.agents:
+            if not (out / env / f"{agent}.npz").exists():
+                learning.learn(request(arguments, suite, env, out), env, agent)
+    print(tabulate(out, suite))
+
+
+def describe(name: str) -> str:
+    """Return a suite's protocol in a line."""
+    suite = SUITES[name]
+    return f"{name:10} {suite.says}; {suite.seeds} seeds; agents {', '.join(suite.agents)}"
+
+
+def request(arguments: argparse.Namespace, suite: Suite, env: str, out: Path) -> argparse.Namespace:
+    """Return what ``learning.learn`` reads: the suite's protocol, and what was given beside it."""
+    steps = (arguments.steps_per_task or suite.steps_per_task) * mtjax.make(env).train_count
+    given = {"seeds": arguments.seeds or suite.seeds, "steps": steps, "split": suite.split, "vary": [], "out": out}
+    return argparse.Namespace(**{**vars(arguments), **given})
+
+
+def last_of(env: str, evaluations: Evaluations) -> Last:
+    """Return the last evaluation, averaged over episodes."""
+    mean = lambda x: np.asarray(x["train"])[:, -1].mean(axis=-1)
+    of = lambda name: mean(evaluations.metrics[name]) if name in evaluations.metrics else None
+    return Last(mtjax.make(env).labels("train"), mean(evaluations.returns), of("success"), of("success_ever"))
+
+
+def found(out: Path) -> Iterator[tuple[str, str, Last]]:
+    """Return environment, agent and last evaluation of every finished pair."""
+    for path in sorted(out.glob("*/*.npz")):
+        yield path.parent.name, path.stem, last_of(path.parent.name, load_evaluations(path))
+
+
+def tabulate(out: Path, suite: Suite) -> str:
+    """Write the tables of all finished pairs, and return that of scores."""
+    lines, rows = [], []
+    for env, agent, last in found(out):
+        cells = [score(x, form) for x, form in ((last.returns, ".0f"), (last.success, ".3f"), (last.ever, ".3f"))]
+        lines.append([short(env), agent, str(len(last.returns)), *cells])
+        rows += [
+            {"env": env, "agent": agent, "task": label, "seed": s, "return": f"{last.returns[s, t]:.1f}"}
+            | {name: x[s, t] for name, x in (("success", last.success), ("success_ever", last.ever)) if x is not None}
+            for s in range(len(last.returns))
+            for t, label in enumerate(last.labels)
+        ]
+    table = markdown(["environment", "agent", "seeds", "return", "success at the end", "success at any step"], lines)
+    (out / "scores.md").write_text(table + "\n")
+    (out / "tasks.csv").unlink(missing_ok=True)
+    append_rows(out / "tasks.csv", rows)
+    if suite.together:
+        (out / "sharing.md").write_text(sharing(out, suite) + "\n")
+    return table
+
+
+def sharing(out: Path, suite: Suite) -> str:
+    """Return a table of every task: one agent for all tasks against one for this task."""
+    pairs = {(env, agent): last for env, agent, last in found(out)}
+    lines = []
+    for agent in suite.agents:
+        for task in suite.together.split("+"):
+            shared, alone = pairs.get((suite.together, agent)), pairs.get((task, agent))
+            if shared is None or alone is None:
+                continue
+            ours = shared.returns[:, [shared.labels.index(task)]]
+            gain = learning.cell(unpaired_difference(ours, alone.returns), "+.0f")
+            lines.append([task, agent, score(ours, ".0f"), score(alone.returns, ".0f"), gain])
+    return markdown(["task", "agent", "one agent for all", "one for this task", "difference"], lines)
+
+
+def score(values: np.ndarray | None, form: str) -> str:
+    """Return the mean of values (S, T) with its interval over seeds."""
+    if values is None or not np.all(np.isfinite(values)):
+        return "-"
+    return learning.cell(seed_interval(values), form)
+
+
+def short(env: str) -> str:
+    """Return the name of an environment, or how many families its mixture has."""
+    return env if "+" not in env else f"{env.count('+') + 1} families"
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except (InputError, FileExistsError) as error:
+        raise SystemExit(f"error: {error}") from None
