@@ -385,6 +385,7 @@ def test_theta_of_an_unseen_task(strategy):
     )
 
 
+@pytest.mark.slow
 def test_theta_of_an_unseen_task_is_inferred_from_its_last_steps():
     """The guess takes theta's place there, follows the steps, and leaves training tasks alone."""
     agent = make("hip-bmdp", **INFERRED)

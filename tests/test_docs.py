@@ -46,6 +46,7 @@ def test_links_lead_to_files(page):
     assert [path for path in paths if not path.exists() and path not in MADE] == []
 
 
+@pytest.mark.slow
 def test_commands_of_the_documentation_parse():
     """Every whole training command in README and docs names what exists."""
     found = [each for page in PAGES for each in commands(page.read_text())]

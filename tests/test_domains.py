@@ -79,7 +79,8 @@ READINGS = {  # where a compiled model shows the value of a parameter
 }
 STARTS, STATES = 1000, 400
 FEWER_STATES = {"dog": 100}
-SLOW = ("dog-run", "dog-stand", "dog-trot", "humanoid-run", "humanoid-stand", "quadruped-run", "swimmer-swimmer15")
+SLOW = ("dog-run", "dog-stand", "dog-trot", "dog-walk", "humanoid-run", "humanoid-stand")
+SLOW += ("humanoid-walk", "quadruped-run", "swimmer-swimmer15")
 NAMES = slow_but(SUITE, *[name for name in SUITE if name not in SLOW])
 STARTED = slow_but(SUITE, *[name for name in SUITE if name not in SLOW and not name.startswith("quadruped")])
 

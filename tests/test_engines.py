@@ -266,6 +266,7 @@ INVOLVED = """<tendonpos tendon="t"/><tendonvel tendon="t"/><actuatorpos actuato
 <accelerometer site="s"/>"""
 
 
+@pytest.mark.slow
 def test_rare_sensors_read_as_in_c():
     """Those of motors and tendons after the step, and those of forces, before which MJX stops without constraints."""
     base = mujoco.MjModel.from_xml_string(ROD % INVOLVED)

@@ -216,7 +216,7 @@ def test_keys_decide_starts(sizes, programs, starts):
 
 def test_sizes_of_the_interface(sizes):
     """Nine observations, two actions, one context; a thousand steps, or 20 seconds, an episode."""
-    assert sizes.spec == Spec.vector(9, 2, 1)
+    assert sizes.spec._replace(sentences=()) == Spec.vector(9, 2, 1)
     seconds = sizes.episode_length * sizes.num_substeps * sizes.models[0].opt.timestep
     assert sizes.episode_length == 1000 and seconds == pytest.approx(20)
 

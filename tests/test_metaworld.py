@@ -14,6 +14,7 @@ import mtjax
 from mtjax import cli
 from mtjax.config import from_json, to_json
 from mtjax.envs import BENCHMARKS, name_of
+from mtjax.envs.engines.base import at_rest
 from mtjax.envs.metaworld import sawyer, scene
 from mtjax.envs.metaworld.names import TASKS
 from mtjax.names import load
@@ -210,3 +211,29 @@ def test_held_out_tasks_are_evaluated_and_an_agent_learns(tmp_path):
         assert np.all(found.metrics["success_ever"][split] >= found.metrics["success"][split])
     table = split_table(found._replace(metrics={**found.metrics, "success_ever": {"train": np.ones((1, 1, 10, 1))}}))
     assert "success, at any step" in table and table.splitlines()[1].split()[-1] == "1.00"
+
+
+@with_scenes
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["pick-place", "peg-insert-side"])
+def test_a_grip_holds_on_warp_as_on_c(name):
+    """From recorded states in which the gripper is closed round a thing: the hand rises by ten centimetres."""
+    pytest.importorskip("warp")
+    from mtjax.envs.engines.warp import Warp
+
+    env, recorded = made(name)
+    task = jax.tree.map(lambda x: x[0], goals(env))
+    held = np.flatnonzero((recorded["time"] > 10) & (recorded["action"][:, 3] > 0.5))
+    qpos, qvel, mocap = (jnp.float32(recorded[key][held]) for key in ("qpos", "qvel", "mocap"))
+
+    def lifted(engine):
+        rest = lambda qpos, qvel, mocap: at_rest(env.models[1], qpos, qvel, None, mocap[None])
+        world, step = jax.vmap(rest)(qpos, qvel, mocap), jax.jit(jax.vmap(engine.step, (None, 0, 0)))
+        for _ in range(25):
+            world = world._replace(mocap=world.mocap.at[:, 0, 2].add(0.004))
+            world = step(task, world, jnp.tile(jnp.array([1.0, -1.0]), (len(held), 1)))
+        return np.asarray(world.qpos)[:, 9:12]
+
+    exact, found = lifted(env.simulator), lifted(Warp(env._base(env.warp_iterations), env.num_substeps))
+    assert np.mean(exact[:, 2] - qpos[:, 11] > 0.05) > 0.5
+    assert np.mean(np.abs(found - exact).max(axis=1) < 5e-3) > 0.9

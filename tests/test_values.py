@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import LEARNING, Probe, one_in, only_seed, tasks_of, tiny, train, values
+from probes import LEARNING, Probe, only_seed, tasks_of, tiny, train, values
 
 import mtjax
 from mtjax.agents import agent
@@ -175,7 +175,8 @@ def test_a_range_that_is_given_or_scaled_to_is_taken():
     require_value_range(parse(words).learner)
 
 
-@pytest.mark.parametrize(("kind", "critic_reduction"), one_in(2, [("c51", "min"), ("hl-gauss", "mean")]))
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "critic_reduction"), [("c51", "min"), ("hl-gauss", "mean")])
 def test_distributional_critics_learn_known_values(kind, critic_reduction):
     """Two steps, of which the second earns 1 or -0.5: Q(1) = scale, Q(0) = 0.9 scale."""
     learner = tiny(

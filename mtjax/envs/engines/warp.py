@@ -1,5 +1,6 @@
 """MuJoCo Warp: MuJoCo on NVIDIA GPUs, with its own kernels that XLA calls. On a CPU it runs slowly."""
 
+import copy
 import dataclasses
 import hashlib
 import importlib
@@ -23,6 +24,7 @@ from mtjax.types import Array, InputError, Task
 
 # Fields that no stage of a step reads, so that tasks may differ in them though Warp has room for one value only.
 _UNREAD = ("dof_M0",)
+_ROOM = (96, 384)  # contacts and constraint rows of a world, where MJX cannot count them: Meta-World's have 54 and 221
 _SPARE = 6  # rows of a weld, which Warp drops unless more than these are free
 _DOUBLED = 8  # pairs that may touch in two points where MJX-JAX finds one, at the same time in one world
 _MOVED = ("mocap_pos", "mocap_quat")  # poses that a domain sets
@@ -72,7 +74,7 @@ def keep_streams(warp: Any) -> None:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Warp:
-    """An engine that steps by MuJoCo Warp. MJX computes start states, contacts, and position and velocity sensors.
+    """An engine that steps by MuJoCo Warp. MJX computes start states, and position and velocity sensors.
 
     XLA passes positions, velocities, warm starts, controls and the differing leaves of tasks to one call. This call
     takes all substeps in Warp's own memory. MJX would pass all of Warp's arrays through XLA at every substep. That is
@@ -94,8 +96,15 @@ class Warp:
 
     @cached_property
     def mjx(self) -> Mjx:
-        """Return the MJX engine, for everything but steps."""
+        """Return the MJX engine, for contacts of start states."""
         return Mjx(self.base, self.num_substeps)
+
+    @cached_property
+    def _unhindered(self) -> Mjx:
+        """Return the MJX engine of the model without collisions. It also places bodies whose contacts MJX refuses."""
+        model = copy.copy(self.base)
+        model.geom_contype[:] = model.geom_conaffinity[:] = 0
+        return Mjx(model, self.num_substeps)
 
     def forward(self, task: Task, qpos: Array, qvel: Array, extra: Any = None, mocap: Any = None) -> World:
         """Put a world in a state without controls, and solve for its forces."""
@@ -103,7 +112,7 @@ class Warp:
 
     def place(self, task: Task, qpos: Array, qvel: Array, extra: Any = None, mocap: Any = None) -> World:
         """Put a world in a state in which no force sensor is touched."""
-        return self.mjx.place(task, qpos, qvel, extra, mocap)
+        return self._unhindered.place(task, qpos, qvel, extra, mocap)
 
     def touching(self, task: Task, qpos: Array) -> Array:
         """Return whether any two colliding geoms overlap in the positions ``qpos`` (nq,)."""
@@ -128,7 +137,7 @@ class Warp:
             new.get("act"),
             world.mocap,
         )
-        return self.mjx.sense(task, moved)
+        return self._unhindered.sense(task, moved)
 
     def _varies(self, name: str) -> bool:
         """Return whether Warp needs the tasks' values of a field."""
@@ -264,7 +273,10 @@ class Warp:
 
         They are the sizes of MJX's arrays, but some pairs of shapes touch in twice as many points in Warp.
         """
-        like = jax.eval_shape(partial(mjx_module().make_data, self.base, jax.local_devices()[0], "jax"))._impl
+        try:
+            like = jax.eval_shape(partial(mjx_module().make_data, self.base, jax.local_devices()[0], "jax"))._impl
+        except (NotImplementedError, ValueError):
+            return _ROOM
         slots = like.contact.dist.shape[0]
         doubled = min(slots, _DOUBLED)
         return slots + doubled, like.efc_J.shape[0] + 4 * doubled + (_SPARE if self.base.neq else 0)
