@@ -57,7 +57,7 @@ def main() -> None:
     parser.add_argument("--goals", type=int, default=20, help="of each task, with one episode each")
     parser.add_argument("--envs", type=int, default=16, help="environments of each task, in speed")
     parser.add_argument("--processes", type=int, default=2, help="of the original, in speed")
-    parser.add_argument("--out", type=Path, default=Path("metaworld_policies.csv"))
+    parser.add_argument("--out", type=Path, default=Path("metaworld-policies.csv"))
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     original = Original(arguments.original)

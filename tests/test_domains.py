@@ -36,7 +36,7 @@ SUITE = {f"{domain}-{task}".replace("_", "-"): (domain, task) for domain in TASK
 TOUCHING = ("ball-in-cup-catch", "cheetah-run", "finger-spin", "hopper-stand", "humanoid-stand", "walker-walk")
 # Tasks whose target is a geom, by the beginnings of their names, and the axes along which it is put.
 TARGETS = {"reacher": "xy", "swimmer": "xy", "fish-swim": "xyz"}
-FASTEST = {"fish": 0.1, "swimmer": 1}  # beyond which water stops what is this light within a step; elsewhere 10
+FASTEST = {"fish": 0.1, "swimmer": 0.1}  # beyond which water stops what is this light within a step; elsewhere 10
 DYNAMICS = ("body_", "jnt_", "dof_", "geom_", "actuator_", "tendon_", "wrap_", "eq_", "qpos")
 # Read by a renderer or the broad phase alone; what touches what is compared by its outcome.
 NOT_DYNAMICS = ("bvh", "rgba", "matid", "contype", "conaffinity")

@@ -1,6 +1,5 @@
 """MuJoCo Warp: MuJoCo on NVIDIA GPUs, with its own kernels that XLA calls. On a CPU it runs slowly."""
 
-import copy
 import dataclasses
 import hashlib
 import importlib
@@ -102,7 +101,7 @@ class Warp:
     @cached_property
     def _unhindered(self) -> Mjx:
         """Return the MJX engine of the model without collisions. It also places bodies whose contacts MJX refuses."""
-        model = copy.copy(self.base)
+        model = self.base.__copy__()
         model.geom_contype[:] = model.geom_conaffinity[:] = 0
         return Mjx(model, self.num_substeps)
 
