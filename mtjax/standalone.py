@@ -66,24 +66,34 @@ def load_jax(file: Any) -> Callable:
 # The operations of a program, by their names in JAX.
 
 
-def _dot_general(a, b, dimension_numbers):
+def product_equation(a: int, b: int, dimension_numbers: Any) -> str:
+    """Return the product of arrays with ``a`` and ``b`` axes as an equation of ``einsum``."""
     (over_a, over_b), (batch_a, batch_b) = dimension_numbers
     letters = iter("abcdefghijklmnopqrstuvwxyz")
-    of_a = [next(letters) for _ in range(a.ndim)]
-    of_b = [next(letters) for _ in range(b.ndim)]
+    of_a = [next(letters) for _ in range(a)]
+    of_b = [next(letters) for _ in range(b)]
     for i, j in (*zip(over_a, over_b, strict=True), *zip(batch_a, batch_b, strict=True)):
         of_b[j] = of_a[i]
     kept = [of_a[i] for i in batch_a]
     kept += [x for i, x in enumerate(of_a) if i not in (*over_a, *batch_a)]
     kept += [x for i, x in enumerate(of_b) if i not in (*over_b, *batch_b)]
-    return np.einsum(f"{''.join(of_a)},{''.join(of_b)}->{''.join(kept)}", a, b)
+    return f"{''.join(of_a)},{''.join(of_b)}->{''.join(kept)}"
+
+
+def spread_sizes(x: Any, axes: int, broadcast_dimensions: Any) -> list[int]:
+    """Return the shape of an array whose axes are put among ``axes``, where the others have size 1."""
+    sizes = [1] * axes
+    for i, dimension in enumerate(broadcast_dimensions):
+        sizes[dimension] = x.shape[i]
+    return sizes
+
+
+def _dot_general(a, b, dimension_numbers):
+    return np.einsum(product_equation(a.ndim, b.ndim, dimension_numbers), a, b)
 
 
 def _broadcast_in_dim(x, shape, broadcast_dimensions):
-    sizes = [1] * len(shape)
-    for i, dimension in enumerate(broadcast_dimensions):
-        sizes[dimension] = x.shape[i]
-    return np.broadcast_to(np.reshape(x, sizes), shape)
+    return np.broadcast_to(np.reshape(x, spread_sizes(x, len(shape), broadcast_dimensions)), shape)
 
 
 def _dynamic_slice(x, *starts, slice_sizes):

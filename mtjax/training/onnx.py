@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mtjax.names import InputError
-from mtjax.standalone import OPERATIONS
+from mtjax.standalone import OPERATIONS, product_equation, spread_sizes
 
 _OPSET = 18  # of ONNX's operators: the first whose reductions all take their axes as inputs
 _IR = 8  # the file format that came with it, so that older runtimes read the file
@@ -153,9 +153,7 @@ class _Graph:
 
 
 def _broadcast(graph: _Graph, names, values, result, shape, broadcast_dimensions):
-    sizes = [1] * len(shape)
-    for i, dimension in enumerate(broadcast_dimensions):
-        sizes[dimension] = values[0].shape[i]
+    sizes = spread_sizes(values[0], len(shape), broadcast_dimensions)
     placed = graph.node("Reshape", [names[0], graph.indices(sizes)])
     return graph.node("Expand", [placed, graph.indices(shape)])
 
@@ -190,14 +188,8 @@ def _dynamic_slice(graph: _Graph, names, values, result, slice_sizes):
 
 
 def _dot(graph: _Graph, names, values, result, dimension_numbers):
-    (over_a, over_b), (batch_a, batch_b) = dimension_numbers
-    letters = iter("abcdefghijklmnopqrstuvwxyz")
-    of_a, of_b = ([next(letters) for _ in range(x.ndim)] for x in values)
-    for i, j in (*zip(over_a, over_b, strict=True), *zip(batch_a, batch_b, strict=True)):
-        of_b[j] = of_a[i]
-    kept = [of_a[i] for i in batch_a] + [x for i, x in enumerate(of_a) if i not in (*over_a, *batch_a)]
-    kept += [x for i, x in enumerate(of_b) if i not in (*over_b, *batch_b)]
-    return graph.node("Einsum", names, equation=f"{''.join(of_a)},{''.join(of_b)}->{''.join(kept)}")
+    a, b = (x.ndim for x in values)
+    return graph.node("Einsum", names, equation=product_equation(a, b, dimension_numbers))
 
 
 def _extreme(kind: str) -> Callable:

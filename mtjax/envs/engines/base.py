@@ -98,6 +98,16 @@ def at_rest(model: mujoco.MjModel, qpos: Array, qvel: Array, extra: Any = None, 
     return World(qpos, qvel, jnp.zeros_like(qvel), sensors, extra, act, mocap)
 
 
+def state_of(world: World) -> dict[str, Array]:
+    """Return positions, velocities, activations and poses of moved bodies, by MuJoCo's names of them."""
+    state = {"qpos": world.qpos, "qvel": world.qvel}
+    if world.act is not None:
+        state["act"] = world.act
+    if world.mocap is not None:
+        state |= {"mocap_pos": world.mocap[:, :3], "mocap_quat": world.mocap[:, 3:]}
+    return state
+
+
 def require_plain(model: mujoco.MjModel) -> None:
     """Refuse a model with more state than positions, velocities, activations and motion capture.
 

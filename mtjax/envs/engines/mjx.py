@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mtjax.envs.engines.base import World, at_rest, mjx_module, require_plain
+from mtjax.envs.engines.base import World, at_rest, mjx_module, require_plain, state_of
 from mtjax.types import Array, Task
 
 # Sensors that read more than poses and velocities of bodies: these need the whole position and velocity stages.
@@ -42,12 +42,7 @@ class Mjx:
         """Return the task's model, and its data in the given state."""
         model, data = self._constants
         leaves = {name: leaf for name, leaf in task.model.items() if name != "site_size"}
-        state = {"qpos": world.qpos, "qvel": world.qvel}
-        if world.act is not None:
-            state["act"] = world.act
-        if world.mocap is not None:
-            state |= {"mocap_pos": world.mocap[:, :3], "mocap_quat": world.mocap[:, 3:]}
-        return model.tree_replace(leaves), data.replace(**state)
+        return model.tree_replace(leaves), data.replace(**state_of(world))
 
     def forward(self, task: Task, qpos: Array, qvel: Array, extra: Any = None, mocap: Any = None) -> World:
         """Put a world in a state without controls, and solve for its forces."""

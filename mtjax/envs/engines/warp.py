@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mtjax.envs.engines.base import World, mjx_module
+from mtjax.envs.engines.base import World, mjx_module, state_of
 from mtjax.envs.engines.mjx import Mjx
 from mtjax.types import Array, InputError, Task
 
@@ -120,11 +120,7 @@ class Warp:
     def step(self, task: Task, world: World, ctrl: Array) -> World:
         """Advance one control step under ``ctrl`` (nu,)."""
         leaves = {name: leaf for name, leaf in task.model.items() if self._varies(name)}
-        given = {"qpos": world.qpos, "qvel": world.qvel, "qacc_warmstart": world.warmstart, "ctrl": ctrl}
-        if world.act is not None:
-            given["act"] = world.act
-        if world.mocap is not None:
-            given |= {"mocap_pos": world.mocap[:, :3], "mocap_quat": world.mocap[:, 3:]}
+        given = state_of(world) | {"qacc_warmstart": world.warmstart, "ctrl": ctrl}
         new = self._advance(jax.tree.map(lambda x: x[None], _Flat(leaves, given)))
         new = jax.tree.map(lambda x: x[0], new)
         moved = World(

@@ -9,7 +9,7 @@ import numpy as np
 
 from mtjax.envs.metaworld.at import At
 from mtjax.envs.metaworld.host import Host
-from mtjax.envs.metaworld.rewards import caging, distance, hamacher, near
+from mtjax.envs.metaworld.rewards import caging, distance, hamacher, in_hand, near
 from mtjax.envs.metaworld.sawyer import Sawyer
 from mtjax.types import Array
 
@@ -48,6 +48,6 @@ class Basketball(Sawyer):
         left = distance(ball * weight, target * weight)
         in_place = near(left, 0.08, distance(start * weight, target * weight))
         caged = caging(at, began, ball, obj_radius=0.025, pad_success_thresh=0.06, xz_thresh=0.005, high_density=True)
-        held = (distance(ball, at.tcp) < 0.035) & (at.obs[3] > 0) & (ball[2] - 0.01 > start[2])
+        held = in_hand(at, ball, 0.035) & (ball[2] - 0.01 > start[2])
         reward = hamacher(jnp.where(held, 1.0, caged), in_place) + jnp.where(held, 1 + 5 * in_place, 0.0)
         return jnp.where(left < 0.08, 10.0, reward), left <= 0.08

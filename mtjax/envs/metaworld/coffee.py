@@ -10,7 +10,7 @@ import numpy as np
 from mtjax.envs.metaworld.at import At, scalar_last
 from mtjax.envs.metaworld.button import press
 from mtjax.envs.metaworld.host import Host
-from mtjax.envs.metaworld.rewards import caging, distance, hamacher, near
+from mtjax.envs.metaworld.rewards import caging, distance, hamacher, in_hand, near
 from mtjax.envs.metaworld.sawyer import Sawyer
 from mtjax.types import Array
 
@@ -104,7 +104,7 @@ class CoffeePull(Sawyer):
             desired_gripper_effort=0.7,
             medium_density=True,
         )
-        held = (distance(mug, at.tcp) < 0.04) & (at.obs[3] > 0)
+        held = in_hand(at, mug, 0.04)
         reward = hamacher(grasped, in_place) + jnp.where(held, 1 + 5 * in_place, 0.0)
         return jnp.where(left < 0.05, 10.0, reward), distance(mug, target) <= 0.07
 

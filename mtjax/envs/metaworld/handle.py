@@ -9,7 +9,7 @@ import numpy as np
 
 from mtjax.envs.metaworld.at import At
 from mtjax.envs.metaworld.host import Host
-from mtjax.envs.metaworld.rewards import caging, distance, hamacher, near
+from mtjax.envs.metaworld.rewards import caging, distance, hamacher, in_hand, near
 from mtjax.envs.metaworld.sawyer import Sawyer
 from mtjax.types import Array
 
@@ -95,7 +95,7 @@ class HandlePull(HandlePress):
         away = abs(handle[2] - target[2])
         in_place = near(away, _PULLED, abs(start[2] - target[2]))
         caged = caging(at, began, handle, obj_radius=0.022, pad_success_thresh=0.05, xz_thresh=0.01, high_density=True)
-        held = (distance(handle, at.tcp) < 0.035) & (at.obs[3] > 0) & (handle[1] - 0.01 > start[2])
+        held = in_hand(at, handle, 0.035) & (handle[1] - 0.01 > start[2])
         reward = hamacher(caged, in_place) + jnp.where(held, 1 + 5 * in_place, 0.0)
         return jnp.where(away < _PULLED, 10.0, reward), away <= _PULLED
 
@@ -123,6 +123,6 @@ class HandlePullSide(HandlePressSide):
         away = distance(handle, target)
         in_place = near(away, _PULLED, distance(start, target))
         caged = caging(at, began, handle, obj_radius=0.032, pad_success_thresh=0.06, xz_thresh=0.01, high_density=True)
-        held = (distance(handle, at.tcp) < 0.035) & (at.obs[3] > 0) & (handle[2] - 0.01 > start[2])
+        held = in_hand(at, handle, 0.035) & (handle[2] - 0.01 > start[2])
         reward = hamacher(caged, in_place) + jnp.where(held, 1 + 5 * in_place, 0.0)
         return jnp.where(away < _PULLED, 10.0, reward), away <= 0.08

@@ -9,7 +9,7 @@ import numpy as np
 
 from mtjax.envs.metaworld.at import At
 from mtjax.envs.metaworld.host import Host
-from mtjax.envs.metaworld.rewards import caging, distance, hamacher, near
+from mtjax.envs.metaworld.rewards import caging, distance, hamacher, in_hand, near
 from mtjax.envs.metaworld.sawyer import Sawyer
 from mtjax.types import Array
 
@@ -48,7 +48,7 @@ class HandInsert(Sawyer):
         away = distance(block, target)
         in_place = near(away, _RADIUS, distance(began["obj_init"], target))
         caged = caging(at, began, block, obj_radius=0.015, pad_success_thresh=0.05, xz_thresh=0.005, high_density=True)
-        held = (distance(block, at.tcp) < 0.02) & (at.obs[3] > 0)
+        held = in_hand(at, block, 0.02)
         reward = hamacher(caged, in_place) + jnp.where(held, 1 + 7 * in_place, 0.0)
         return jnp.where(away < _RADIUS, 10.0, reward), away <= _RADIUS
 

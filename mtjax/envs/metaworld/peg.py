@@ -9,7 +9,7 @@ import numpy as np
 
 from mtjax.envs.metaworld.at import At, scalar_last
 from mtjax.envs.metaworld.host import Host
-from mtjax.envs.metaworld.rewards import caging, distance, hamacher, near
+from mtjax.envs.metaworld.rewards import caging, distance, hamacher, in_hand, near
 from mtjax.envs.metaworld.sawyer import Sawyer
 from mtjax.types import Array
 
@@ -71,7 +71,7 @@ class PegInsertSide(Sawyer):
         free = hamacher(_inside_box(head, above), _inside_box(head, below))
         in_place = hamacher(near(away, _RADIUS, jnp.linalg.norm((began["peg_head_pos_init"] - target) * scale)), free)
         caged = caging(at, began, peg, obj_radius=0.0075, pad_success_thresh=0.03, xz_thresh=0.005, high_density=True)
-        held = (distance(peg, at.tcp) < 0.08) & (at.obs[3] > 0) & (peg[2] - 0.01 > began["obj_init"][2])
+        held = in_hand(at, peg, 0.08) & (peg[2] - 0.01 > began["obj_init"][2])
         reward = jnp.where(held, 1 + 6 * in_place, hamacher(caged, in_place))  # a product with 1 changes nothing
         success = away <= _RADIUS
         return jnp.where(success, 10.0, reward), success

@@ -10,7 +10,7 @@ import numpy as np
 from mtjax.envs.metaworld.at import At
 from mtjax.envs.metaworld.host import Host
 from mtjax.envs.metaworld.push import PAST_WALL, RADIUS, Push
-from mtjax.envs.metaworld.rewards import caging, distance, hamacher, near, pads_caging
+from mtjax.envs.metaworld.rewards import caging, distance, hamacher, in_hand, near, pads_caging
 from mtjax.types import Array
 
 
@@ -41,8 +41,7 @@ class PickPlace(Push):
     def lifted(self, at: At, began: Mapping[str, Array], height: float) -> Array:
         """Return whether () the gripper has the puck and it is higher than at the start."""
         puck = at.position["puck"]
-        holding = (distance(puck, at.tcp) < 0.02) & (at.obs[3] > 0)
-        return holding & (puck[2] - height > began["obj_init"][2])
+        return in_hand(at, puck, 0.02) & (puck[2] - height > began["obj_init"][2])
 
 
 @dataclasses.dataclass(frozen=True)

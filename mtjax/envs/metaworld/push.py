@@ -9,7 +9,7 @@ import numpy as np
 
 from mtjax.envs.metaworld.at import At, scalar_last
 from mtjax.envs.metaworld.host import Host
-from mtjax.envs.metaworld.rewards import caging, distance, hamacher, near, pads_caging
+from mtjax.envs.metaworld.rewards import caging, distance, hamacher, in_hand, near, pads_caging
 from mtjax.envs.metaworld.sawyer import Sawyer
 from mtjax.types import Array
 
@@ -47,8 +47,7 @@ class Push(Sawyer):
     def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
         puck, away, in_place = self.progress(at, began)
         held = self.held(at, began)
-        touching = (distance(puck, at.tcp) < 0.02) & (at.obs[3] > 0)
-        reward = 2 * held + jnp.where(touching, 1 + 2 * held + 5 * in_place, 0.0)
+        reward = 2 * held + jnp.where(in_hand(at, puck, 0.02), 1 + 2 * held + 5 * in_place, 0.0)
         return jnp.where(away < RADIUS, 10.0, reward), away <= RADIUS
 
     def progress(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array, Array]:
@@ -83,9 +82,8 @@ class PushWall(Push):
         begun = distance(began["obj_init"] * wide, middle * wide)
         aside = near(distance(puck * wide, middle * wide), RADIUS, begun)
         held = 2 * self.held(at, began)
-        touching = (distance(puck, at.tcp) < 0.02) & (at.obs[3] > 0)
         reward = jnp.where(puck[1] > PAST_WALL, held + 5 + 3 * in_place, held + 1 + 4 * aside)
-        reward = jnp.where(touching, reward, held)
+        reward = jnp.where(in_hand(at, puck, 0.02), reward, held)
         return jnp.where(away < RADIUS, 10.0, reward), away <= 0.07
 
 

@@ -32,6 +32,11 @@ def effort(at: At, desired: float = 1.0) -> Array:
     return jnp.clip(at.action[3], 0.0, desired) / desired
 
 
+def in_hand(at: At, thing: Array, within: float) -> Array:
+    """Return whether () the tool centre is within a distance [m] of a thing (3,), and the fingers are apart."""
+    return (distance(thing, at.tcp) < within) & (at.obs[3] > 0)
+
+
 def caging(
     at: At,
     began: Mapping[str, Array],

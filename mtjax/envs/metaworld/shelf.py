@@ -9,7 +9,7 @@ import numpy as np
 
 from mtjax.envs.metaworld.at import At, scalar_last
 from mtjax.envs.metaworld.host import Host
-from mtjax.envs.metaworld.rewards import caging, distance, hamacher, near
+from mtjax.envs.metaworld.rewards import caging, distance, hamacher, in_hand, near
 from mtjax.envs.metaworld.sawyer import Sawyer
 from mtjax.types import Array
 
@@ -61,6 +61,6 @@ class ShelfPlace(Sawyer):
         lost = jnp.where(before, hamacher(jnp.clip(way, 0, 1), jnp.clip(below, 0, 1)), 0.0)
         in_place = jnp.where(low & (block[1] > target[1]), 0.0, jnp.clip(in_place - lost, 0.0, 1.0))
 
-        held = (distance(block, at.tcp) < 0.025) & (at.obs[3] > 0) & (block[2] - 0.01 > start[2])
+        held = in_hand(at, block, 0.025) & (block[2] - 0.01 > start[2])
         reward += jnp.where(held, 1 + 5 * in_place, 0.0)
         return jnp.where(away < _RADIUS, 10.0, reward), away <= 0.07

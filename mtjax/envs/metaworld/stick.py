@@ -9,7 +9,7 @@ import numpy as np
 
 from mtjax.envs.metaworld.at import At, scalar_last
 from mtjax.envs.metaworld.host import Host
-from mtjax.envs.metaworld.rewards import caging, distance, hamacher, near
+from mtjax.envs.metaworld.rewards import caging, distance, hamacher, in_hand, near
 from mtjax.envs.metaworld.sawyer import Sawyer
 from mtjax.types import Array
 
@@ -117,6 +117,6 @@ class StickPull(StickPush):
         through = (at.position["end"][0] >= handle[0]) & (gap[1] <= 0.04) & (gap[2] <= 0.06)
         near_target = distance(handle, target) <= _RADIUS
         pulled = jnp.where(near_target, 10.0, 6 + at_flask + 2 * stick_in_place + flask_in_place)
-        held = (distance(stick, at.tcp) < 0.02) & (at.obs[3] > 0) & (stick[2] - 0.01 > stick_init[2])
+        held = in_hand(at, stick, 0.02) & (stick[2] - 0.01 > stick_init[2])
         lifted = jnp.where(through, pulled, 1 + 6 * at_flask)  # a product with 1 changes nothing
         return jnp.where(held, lifted, hamacher(caged, at_flask)), near_target & through
