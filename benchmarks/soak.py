@@ -3,8 +3,9 @@
     python benchmarks/soak.py [--minutes N] [--json FILE] [-- --env=... --agent=...]
 
 One process trains with many evaluations and checkpoints, and with whatever flags follow ``--``. Memory is read twice a
-second. It may grow while programs compile and the replay fills. It is flat if the median of the run's last third is at
-most 2 % (and at least 20 MB) above that of its second third. Otherwise the exit code is 1.
+second. In the first minute it may grow, while programs compile and the replay fills. The time after that is cut into
+ten equal parts. Memory is flat if the median of the last part is at most 2 % (and at least 20 MB) above that of the
+first part. Otherwise the exit code is 1.
 """
 
 import argparse
@@ -25,6 +26,7 @@ _RUN = (
     "--env=finger-spin-vary-size --agent=sac-conditioned --num-envs=4 --replay-size=2000 --chunk-steps=50 "
     "--eval-every=4000 --eval-episodes=1 --steps=1000000000 --agent.hidden 64 64"
 ).split()
+_RATE, _WARM_UP, _PARTS = 2, 60, 10  # readings a second, seconds that do not count, parts of the time after them
 _SHARE, _LEAST = 0.02, 20  # of growth that passes for flat: a share, or MB
 
 
@@ -34,14 +36,20 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     parser.add_argument("flags", nargs="*", metavar="-- FLAGS", help="flags of the run")
     arguments = parser.parse_args()
-    samples, saved = soak(arguments.minutes * 60, [*_RUN, *arguments.flags])
+    if arguments.minutes < 2:
+        parser.error("--minutes must be at least 2, as the first one does not count")
+    flags = [*_RUN, *arguments.flags]
+    samples, saved = soak(arguments.minutes * 60, flags)
     medians, flat = judge(samples)
-    growth = medians[2] - medians[1]
-    thirds = [[name, f"{x:.0f}"] for name, x in zip(("first", "second", "last"), medians, strict=True)]
-    print(markdown(["third of the run", "median of resident memory, MB"], thirds))
-    print(f"{'flat' if flat else 'NOT FLAT'}: {growth:+.1f} MB from the second third to the last; checkpoints: {saved}")
+    growth = medians[-1] - medians[0]
+    part = (len(samples) / _RATE - _WARM_UP) / _PARTS
+    minutes = [f"{(_WARM_UP + i * part) / 60:.1f} to {(_WARM_UP + (i + 1) * part) / 60:.1f}" for i in range(_PARTS)]
+    table = [[span, f"{median:.0f}"] for span, median in zip(minutes, medians, strict=True)]
+    print(markdown(["minutes", "median of resident memory, MB"], table))
+    print(f"{'flat' if flat else 'NOT FLAT'}: {growth:+.1f} MB from the first part to the last; checkpoints: {saved}")
     if arguments.json:
-        report = {"machine": machine(), "rows": [{"thirds": medians, "flat": flat, "samples": samples[::20]}]}
+        rows = [{"medians": medians, "flat": flat, "checkpoints": saved, "samples": samples[:: 10 * _RATE]}]
+        report = {"benchmark": "soak.py", "machine": machine(), "flags": flags, "rows": rows}
         arguments.json.write_text(json.dumps(report, indent=1) + "\n")
     sys.exit(0 if flat else 1)
 
@@ -56,7 +64,7 @@ def soak(seconds: float, flags: list[str]) -> tuple[list[float], int]:
         while time.monotonic() < end and process.poll() is None:
             samples.append(int(Path(f"/proc/{process.pid}/statm").read_text().split()[1]) * _PAGE / 1e6)
             seen |= {str(path) for path in Path(runs).glob("*/checkpoints/*") if path.name.isdigit()}
-            time.sleep(0.5)
+            time.sleep(1 / _RATE)
         process.send_signal(signal.SIGTERM)
         if process.wait(300) != 128 + signal.SIGTERM:
             sys.exit(f"the run ended by itself with code {process.returncode}")
@@ -64,10 +72,11 @@ def soak(seconds: float, flags: list[str]) -> tuple[list[float], int]:
 
 
 def judge(samples: list[float]) -> tuple[list[float], bool]:
-    """Return the median of each third of the samples, and whether memory is flat after the first."""
-    third = len(samples) // 3
-    medians = [statistics.median(samples[i * third : (i + 1) * third]) for i in range(3)]
-    return medians, medians[2] <= medians[1] + max(_SHARE * medians[1], _LEAST)
+    """Return the medians of ten equal parts of the readings after the first minute, and whether memory stays flat."""
+    counted = samples[_WARM_UP * _RATE :]
+    size = len(counted) // _PARTS
+    medians = [statistics.median(counted[i * size : (i + 1) * size]) for i in range(_PARTS)]
+    return medians, medians[-1] <= medians[0] + max(_SHARE * medians[0], _LEAST)
 
 
 if __name__ == "__main__":
