@@ -7,6 +7,7 @@ import shlex
 import sys
 from functools import partial
 from pathlib import Path
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +23,7 @@ from mtjax import cli, commands, register
 from mtjax.agents import AGENTS, PARTS
 from mtjax.config import to_json
 from mtjax.envs import ENVS, Domain, Parameter, declared
+from mtjax.envs.brax import Brax
 from mtjax.tasks import episode_task
 from mtjax.training import api
 from mtjax.training.folder import to_flags
@@ -255,6 +257,62 @@ def test_a_family_that_steps_itself_is_checked_too(forget):
         register("mine", Mine)
     with pytest.raises(InputError, match="Family cannot be made"):
         register("mine", mtjax.envs.Family)
+
+
+def shortened(self, task, state, action):
+    """A step with a number less to observe."""
+    step = Brax.step(self, task, state, action)
+    return step._replace(obs=step.obs[:-1])
+
+
+def look_for_link(self, task, metrics, reward, action):
+    """A reward that looks for a link by a wrong name."""
+    return reward * self.original.sys.link_names.index("pol")
+
+
+WRONG_OF_BRAX = [
+    ({"step": shortened}, r"Mine: reset and step return a different obs: .*\(4,\) float32 and .*\(3,\) float32"),
+    ({"reward": lambda s, t, m, r, a: jnp.zeros(2)}, r"reward must return a number of shape \(\), not \(2,\)"),
+    ({"reward": lambda s, t, m, r, a: None}, "reward must return a number as an array of float, not None"),
+    ({"reward": lambda s, t, m: 0}, "reward: TypeError: .* takes 3 positional arguments"),
+    ({"reward": lambda s, t, m, r, a: m["height"]}, "reward: .*metric of Brax's inverted_pendulum 'height'"),
+    ({"reward": lambda s, t, m, r, a: t.goal["gravty"]}, "reward: unknown goal of the task 'gravty'; did .* 'gravity'"),
+    ({"reward": look_for_link}, "reward: unknown link of the model 'pol'; did you mean 'pole'.* cart, pole$"),
+    ({"action_size": 3}, "action_size must be 1, as Brax's inverted_pendulum has, not 3"),
+    ({"parameters": {"x": Parameter("1", 1.0, set_missing)}}, r"parameters\['x'\]: Brax takes no edits of its models"),
+    ({"names": ("ant",)}, "unknown Brax environment 'inverted_pendulum'"),
+]
+
+
+@pytest.mark.parametrize("given, said", WRONG_OF_BRAX, ids=range(len(WRONG_OF_BRAX)))
+def test_a_wrong_method_of_a_brax_family_is_named_when_it_is_registered(given, said, forget):
+    """In a line; the name stays free, and without the harm the same class is accepted."""
+    of_pendulum = {"environment": "inverted_pendulum", "__annotations__": {"environment": str}}
+    mine = dataclasses.dataclass(frozen=True)(type("Mine", (Brax,), of_pendulum | given))
+    with pytest.raises(InputError, match=said) as error:
+        register("mine", mine)
+    assert "\n" not in str(error.value) and "mine" not in ENVS
+
+
+def test_a_brax_family_with_a_reward_of_its_own_is_accepted(forget):
+    """Which reads a goal, a metric and the place of a link."""
+
+    @dataclasses.dataclass(frozen=True)
+    class Mine(Brax):
+        environment: str = "reacher"
+        parameters: ClassVar = {**Brax.parameters, "ease": Parameter("1", 1.0)}
+
+        def reward(self, task, metrics, reward, action):
+            assert self.original.sys.link_names.index("body0") == 0
+            return task.goal["ease"] * metrics["reward_dist"] + reward
+
+    register("mine", Mine, vary={"ease": "1,2", "gravity": 5})
+    assert mtjax.make("mine").train_count == 2 and type(mtjax.make("mine").original.sys.link_names) is list
+
+
+@pytest.mark.parametrize("name", slow_but([name for name in ENVS if name.startswith("brax-")], "brax-fast"))
+def test_every_family_of_brax_passes_the_check(name):
+    declared.check(mtjax.make(name))
 
 
 @pytest.mark.parametrize("name", [name for name in QUICK if name not in METAWORLD])  # whose model is no file of ours

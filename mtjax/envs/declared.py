@@ -1,5 +1,6 @@
 """Checks of a family that is registered: its methods are called with abstract arrays, and wrong ones are named."""
 
+import copy
 import dataclasses
 import itertools
 from collections.abc import Callable, Mapping
@@ -10,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
+from mtjax.envs.brax import Brax
 from mtjax.envs.domain import Domain
 from mtjax.envs.engines.base import at_rest
 from mtjax.envs.family import Family
@@ -36,6 +38,8 @@ def check(family: Any) -> None:
     small = _of_one_task(family)
     task = _call(family, "build", lambda: jax.tree.map(lambda x: x[0], small.table.tasks))
     key = jax.eval_shape(jax.random.key, 0)
+    if isinstance(small, Brax):
+        _check_brax(small, task, key)
     check_methods = _check_domain if isinstance(small, Domain) else _check_steps
     check_methods(small, task, key)  # type: ignore
 
@@ -147,34 +151,29 @@ def _abstract(family: Family, method: str, task: Task, *arguments: Any) -> Any:
     Raises:
         InputError: the method fails, or reads a goal that there is not.
     """
-    task = task._replace(goal=_Goals(task.goal), params=_Goals(task.params))
-    told = {**task.goal, **task.params}
-    try:
-        return jax.eval_shape(lambda *xs: getattr(family, method)(*xs), task, *arguments)
-    except _NoGoal as error:
-        wrong = nearest_error("goal of the task", str(error), told) if told else f"tasks have no goal {error}"
-        raise InputError(f"{type(family).__name__}.{method}: {wrong}") from None
-    except Exception as error:
-        raise InputError(f"{type(family).__name__}.{method}: {_reason(error)}") from None
-
-
-class _NoGoal(Exception):
-    """A goal that a task does not have."""
+    task = task._replace(goal=_Told("goal of the task", task.goal), params=_Told("parameter of the task", task.params))
+    called = lambda: jax.eval_shape(lambda *xs: getattr(family, method)(*xs), task, *arguments)
+    return _call(family, method, called)
 
 
 @jax.tree_util.register_pytree_node_class
-class _Goals(dict):
-    """The goals of a task; one that there is not raises ``_NoGoal``."""
+class _Told(dict):
+    """What a method is told by name, such as goals. A name that there is not raises an error with those there are."""
+
+    def __init__(self, kind: str, told: Mapping[str, Any]):
+        super().__init__(told)
+        self.kind = kind
 
     def __missing__(self, name: Any):
-        raise _NoGoal(name)
+        raise nearest_error(self.kind, str(name), self) if self else InputError(f"there is no {self.kind} {name!r}")
 
     def tree_flatten(self):
-        return tuple(self.values()), tuple(self)
+        return tuple(self.values()), (self.kind, tuple(self))
 
     @classmethod
-    def tree_unflatten(cls, names, values):
-        return cls(zip(names, values, strict=True))
+    def tree_unflatten(cls, about, values):
+        kind, names = about
+        return cls(kind, dict(zip(names, values, strict=True)))
 
 
 def _require(
@@ -211,6 +210,35 @@ def _require_observation(family: Family, method: str, obs: Any) -> None:
         raise InputError(f"{type(family).__name__}.{method} must return one vector (O,), not shape {shape}")
     for leaf in jax.tree.leaves(obs):
         _require(family, method, "an observation", leaf, leaf.shape)
+
+
+class _Links(list):
+    """Names of Brax's links. The place of one that there is not raises an error with those there are."""
+
+    def index(self, name: str, *ends: Any) -> int:
+        if name not in self:
+            raise nearest_error("link of the model", name, self)
+        return super().index(name, *ends)
+
+
+def _check_brax(family: Brax, task: Task, key: Any) -> None:
+    """Check what a family adds to an environment of Brax. ``_check_steps`` does the rest."""
+    edited = next((name for name, parameter in family.parameters.items() if parameter.edit is not None), None)
+    if edited is not None:
+        raise InputError(
+            f"{type(family).__name__}.parameters[{edited!r}]: Brax takes no edits of its models; leave the edit out, "
+            f"and read task.goal[{edited!r}] in reward"
+        )
+    original = _call(family, "original", lambda: copy.copy(family.original))
+    if hasattr(original, "sys"):  # as all have but "fast"
+        original.sys = original.sys.replace(link_names=_Links(original.sys.link_names))
+    object.__setattr__(family, "original", original)  # of this copy alone, which nobody keeps
+    if family.action_size != original.action_size:
+        told = f"{original.action_size}, as Brax's {family.environment} has, not {family.action_size}"
+        raise InputError(f"{type(family).__name__}.action_size must be {told}")
+    metrics = _Told(f"metric of Brax's {family.environment}", jax.eval_shape(original.reset, key).metrics)
+    number, action = jax.ShapeDtypeStruct((), jnp.float32), jax.ShapeDtypeStruct((family.action_size,), jnp.float32)
+    _require(family, "reward", "a number", _abstract(family, "reward", task, metrics, number, action), ())
 
 
 def _check_steps(family: Family, task: Task, key: Any) -> None:
