@@ -247,6 +247,15 @@ def test_video_films_some_tasks_of_each_split_in_one_grid(copied_run, capsys, fi
     assert "filming 1 of 6: train size=1, return " in out and "filmed film: 6 tasks" in out
 
 
+def test_a_caption_needs_no_more_width_than_its_picture():
+    """It goes on in the next line, after a space or a comma."""
+    frames = np.full((1, 90, 120, 3), 128, np.uint8)
+    short, long = (films.captioned(frames, text)[0] for text in ("train size=1", "train size=1,mass=2.25, return 998"))
+    assert np.any(short[:13] > 200) and np.all(short[13:] == 128)
+    assert np.any(long[13:26] > 200) and np.all(long[26:] == 128)
+    assert not np.any(long[:26, -3:]) and np.all(films.captioned(frames, "long words " * 40)[0, :, -3:] == 0)
+
+
 def test_chosen_tasks_are_filmed(copied_run, filmed):
     """By split and number."""
     words = ["--video", "--video-splits", "extrapolation", "--video-tasks", "3", "1"]
@@ -349,8 +358,10 @@ def test_train_prints_where_the_run_is_and_how_it_scored(short_family, tmp_path,
     assert lines[3].startswith("memory: ")
     assert [x.split()[0] for x in lines if " of 600 steps" in x] == ["100", "200", "300", "400", "500", "600"]
     assert [x.split()[2] for x in lines if x.startswith("evaluation at")] == ["200", "400", "600"]
-    assert [x.split()[0] for x in lines[-5:-1]] == ["split", "train", "interpolation", "extrapolation"]
-    assert lines[-1].startswith("done in ") and lines[-1].endswith(f"run: {directory}")
+    assert [x.split()[0] for x in lines[-6:-2]] == ["split", "train", "interpolation", "extrapolation"]
+    assert lines[-2].startswith("done in ") and lines[-2].endswith(f"run: {directory}")
+    assert lines[-1].startswith(f"look at it: python -m mtjax.evaluate --run={directory} --import=")
+    assert lines[-1].endswith("conftest.py --video")
 
 
 def test_resume_extends_and_the_hint_goes_on(finished_run, copied_run, capsys, monkeypatch):

@@ -1,6 +1,7 @@
 """Films of several tasks side by side, with split, parameters and return written on each."""
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,6 +22,7 @@ from mtjax.types import SPLITS, Task
 _FPS = 25
 _WIDTHS = ((4, 320), (9, 240))  # of a tile, for up to so many tasks; beyond, the narrowest
 _NARROWEST = 160
+_WORDS = re.compile("[^ ,]+[ ,]*")  # after which a caption may go on in the next line
 
 
 class Chosen(NamedTuple):
@@ -113,13 +115,19 @@ def _tile(
 
 
 def captioned(frames: np.ndarray, text: str) -> np.ndarray:
-    """Write a text into the upper left corner of frames (F, height, width, 3)."""
+    """Write a text into the upper left corner of frames (F, height, width, 3), on as many lines as it needs."""
     width = frames.shape[2]
-    font = ImageFont.load_default(max(width // 22, 9))
-    strip = Image.new("RGB", (width, max(width // 14, 13)), "black")
-    ImageDraw.Draw(strip).text((3, 1), text, fill="white", font=font)
+    font, height = ImageFont.load_default(max(width // 22, 9)), max(width // 14, 13)
+    lines = [""]
+    for word in _WORDS.findall(text):
+        if lines[-1] and font.getlength(lines[-1] + word.rstrip()) > width - 6:
+            lines.append("")
+        lines[-1] += word
+    strip = Image.new("RGB", (width, height * len(lines)), "black")
+    for i, line in enumerate(lines):
+        ImageDraw.Draw(strip).text((3, 1 + height * i), line, fill="white", font=font)
     written = frames.copy()
-    written[:, : strip.height] = np.asarray(strip)
+    written[:, : strip.height] = np.asarray(strip)[: frames.shape[1]]
     return written
 
 

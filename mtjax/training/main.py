@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from mtjax.config import RunConfig, import_flags
+from mtjax.envs.domain import Domain
 from mtjax.parallel import hosts
 from mtjax.report.tables import split_table
 from mtjax.training import checkpoint, lock, memory, sweep
@@ -71,3 +72,6 @@ def _conclude(config: RunConfig, result: Result, directory: Path) -> None:
         f"done in {duration(result.total_seconds)}: compiled in {duration(result.compile_seconds)}, trained in "
         f"{duration(result.trained_seconds)}, evaluated and saved in {duration(rest)}; run: {directory}"
     )
+    words = [f"--run={directory}", *import_flags(config)]
+    words += ["--video"] * any(isinstance(part.family, Domain) for part in config.family.parts)
+    print(f"look at it: python -m mtjax.evaluate {shlex.join(words)}")
