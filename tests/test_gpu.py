@@ -1,6 +1,13 @@
 """On an NVIDIA GPU: that it computes what the CPU does. ``pytest -m gpu -n 8`` there; elsewhere they are left out."""
 
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
 from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -8,17 +15,20 @@ import mujoco
 import numpy as np
 import pytest
 from probes import random_batch
+from test_kills import outcome
 from test_painters import SIZE, similarity, states_of
 
 import mtjax
-from mtjax import rollout
+from mtjax import loop, rollout
 from mtjax.agents import AGENTS
 from mtjax.agents.choices import replace
 from mtjax.agents.ppo import Taken
+from mtjax.config import configure
 from mtjax.envs.engines.base import World
 from mtjax.envs.engines.mjx import Mjx
 from mtjax.envs.mixtures import States
 from mtjax.envs.probes import tasks_of
+from mtjax.training import checkpoint
 from mtjax.types import Spec
 
 pytestmark = [
@@ -30,6 +40,13 @@ SPEC = Spec.vector(9, 2, 1)
 SHAPES = {"ten-seeds": (10, 8, 5), "evaluation": (1, 10, 10), "training": (1, 4, 64)}
 SEEDS = {"one-seed": 1, "ten-seeds": 10}
 QUICK = {"xla_backend_optimization_level": 0}  # of the CPU's program alone, which takes minutes otherwise
+PENDULUM = {"vary": {"length": "0.4,0.6"}, "split": "none", "engine": "mjx"}
+MJX_SAVE = 50  # iterations between two checkpoints of MJX_RUN
+MJX_RUN = (
+    "--env=pendulum-swingup --env.vary.length=0.4,0.6 --split=none --engine=mjx --agent=sac-conditioned --seeds=2 "
+    "--num-envs=4 --batch-size=8 --replay-size=2000 --warmup-steps=5 --chunk-steps=50 --eval-every=400 "
+    "--eval-episodes=1 --steps=12000 --agent.hidden 8 8"
+).split()
 DOMAINS = {
     "acrobot-swingup": {"gravity": "8,11"},
     "ball-in-cup-catch": {"mass": "0.8,1.2"},
@@ -216,7 +233,7 @@ def test_a_mixture_steps_as_its_families(num_envs):
 
 def test_a_run_goes_on_bit_for_bit(tmp_path):
     """On MJX-JAX; MuJoCo Warp adds up in another order each time."""
-    env = mtjax.make("pendulum-swingup", vary={"length": "0.4,0.6"}, split="none", engine="mjx")
+    env = mtjax.make("pendulum-swingup", **PENDULUM)
     settings = {"num_envs": 4, "batch_size": 8, "replay_size": 200, "warmup_steps": 5, "chunk_steps": 25}
     agent = mtjax.agent("sac-conditioned", hidden=(8, 8))
     run = partial(mtjax.train, env, agent, seeds=2, eval_every=4000, eval_episodes=1, directory=tmp_path, **settings)
@@ -225,6 +242,74 @@ def test_a_run_goes_on_bit_for_bit(tmp_path):
     whole = mtjax.train(env, agent, seeds=2, steps=8000, eval_every=4000, eval_episodes=1, **settings)
     for one, other in zip(*(jax.tree.leaves(jax.device_get(x.state.agent.actor)) for x in (whole, again)), strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+def bytes_of(tree):
+    """A copy of every leaf, so that nothing can overwrite it."""
+    plain = lambda x: jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x
+    return [np.asarray(plain(x)).tobytes() for x in jax.tree.leaves(tree)]
+
+
+def test_a_checkpoint_is_the_state_of_when_it_was_saved(tmp_path, monkeypatch, request):
+    """The chunks that follow take over its buffers and end before the checkpoint is sealed."""
+    gate, seal = threading.Event(), checkpoint._finish
+    request.addfinalizer(gate.set)  # or else a failure would wait for it
+    monkeypatch.setattr(checkpoint, "_finish", lambda *given: gate.wait(600) and seal(*given))
+    given = {"num_envs": 4, "batch_size": 8, "replay_size": 50_000, "warmup_steps": 5, "chunk_steps": 25}
+    agent, settings = configure(mtjax.agent("sac-conditioned", hidden=(8, 8)), loop.Settings(), given)
+    env = mtjax.make("pendulum-swingup", **PENDULUM)
+    tasks, writer = env.tasks(), checkpoint.Writer(tmp_path)
+    chunk = lambda state: loop.run_chunk(env, agent, settings, tasks, state)[0]
+    state = chunk(loop.init(env, agent, settings, tasks, jnp.arange(2)))
+    expected = bytes_of(jax.tree.map(jnp.copy, state))  # as a buffer that NumPy has seen is not taken over
+    writer.save(state)
+    after = chunk(state)
+    taken = all(x.is_deleted() for x in jax.tree.leaves((state.agent.actor, state.data.ring.rows)))
+    assert taken or jax.default_backend() == "cpu"  # where the host's copy is the buffer, which therefore stays
+    after = jax.block_until_ready(chunk(chunk(after)))
+    assert not (tmp_path / "25").exists()
+    gate.set()
+    writer.wait()
+    saved = checkpoint.load(tmp_path, after)
+    assert bytes_of(saved) == expected != bytes_of(after)
+    assert bytes_of(chunk(chunk(chunk(saved)))) == bytes_of(after)
+
+
+def test_a_run_that_is_killed_ends_as_any_other(tmp_path):
+    """To the byte on MJX. Both runs execute the programs that the first of them compiled."""
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(Path(mtjax.__file__).parents[1]),
+        "MTJAX_CACHE": str(tmp_path / "cache"),
+        "XLA_PYTHON_CLIENT_PREALLOCATE": "false",  # this process has memory of the same device
+    }
+
+    def start(*words):
+        with (tmp_path / "out").open("a") as file:
+            command = [sys.executable, "-m", "mtjax.train", *words]
+            return subprocess.Popen(command, env=environment, stdout=file, stderr=subprocess.STDOUT)
+
+    def folder_in(runs):
+        return next(iter(runs.glob("pendulum-*")), None)
+
+    def saved(runs):
+        names = [path.name for path in runs.glob("pendulum-*/checkpoints/*")]
+        return max((int(name) for name in names if name.isdigit()), default=0)
+
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    assert start(*MJX_RUN, f"--runs={whole}").wait(900) == 0, (tmp_path / "out").read_text()[-3000:]
+    words = [*MJX_RUN, f"--runs={broken}"]
+    for delay in (0.0, 0.05):  # from a checkpoint's seal until the process is killed: beside the next chunk, or save
+        process, before, until = start(*words), saved(broken), time.monotonic() + 600
+        while saved(broken) < before + 2 * MJX_SAVE:
+            assert process.poll() is None and time.monotonic() < until, (tmp_path / "out").read_text()[-3000:]
+            time.sleep(0.002)
+        time.sleep(delay)
+        process.kill()
+        assert process.wait(60) == -signal.SIGKILL
+        words = [f"--resume={folder_in(broken)}"]
+    assert start(*words).wait(900) == 0, (tmp_path / "out").read_text()[-3000:]
+    assert outcome(folder_in(broken)) == outcome(folder_in(whole))
 
 
 @pytest.mark.parametrize("name", ["ball-in-cup-catch", "cheetah-run", "finger-turn-easy", "walker-walk"])
