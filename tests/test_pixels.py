@@ -172,8 +172,8 @@ def test_every_mujoco_family_has_a_scene(family):
 @pytest.mark.parametrize(
     ("name", "settings", "message"),
     [
-        ("brax-ant", {"pixels": 64}, "no MuJoCo model, which pixels needs; take a family such as cheetah-run"),
-        ("tabular-mdp", {"repeat": 2}, "no MuJoCo model, which repeat needs"),
+        ("brax-ant", {"pixels": 64}, "no scene to draw, which pixels needs; take a family such as cheetah-run"),
+        ("tabular-mdp", {"repeat": 2}, "no scene to draw, which repeat needs"),
         pytest.param("metaworld-reach", {"pixels": 64}, "leave out --env.pixels", marks=with_metaworld),
         ("finger-spin", {"pixels": 63}, "an even number from 16 to 512, not 63"),
         ("finger-spin", {"pixels": 8}, "an even number from 16"),
