@@ -13,6 +13,7 @@ from probes import METAWORLD, with_metaworld
 import mtjax
 from mtjax.envs import ENVS
 from mtjax.envs.domain import Domain
+from mtjax.envs.pixels import Pictured
 from mtjax.types import InputError
 
 SIZE = 16
@@ -155,13 +156,13 @@ def test_own_models_are_seen_whole():
 
 
 UNSEEN = {*METAWORLD, *(name for name in ENVS if name.startswith("dog-"))}  # refused in words, which others test
-SEEN = {family for name in ENVS if issubclass((family := ENVS[name][0]), Domain) and name not in UNSEEN}
-MUJOCO = sorted(SEEN, key=lambda f: f.__name__)
+SEEN = {family for name in ENVS if issubclass((family := ENVS[name][0]), Pictured) and name not in UNSEEN}
+SCENES = sorted(SEEN, key=lambda f: f.__name__)
 
 
-@pytest.mark.parametrize("family", MUJOCO, ids=lambda f: f.__name__)
-def test_every_mujoco_family_has_a_scene(family):
-    env = family(pixels=SIZE, engine="c")
+@pytest.mark.parametrize("family", SCENES, ids=lambda f: f.__name__)
+def test_every_family_that_can_be_seen_has_a_scene(family):
+    env = family(pixels=SIZE, **({"engine": "c"} if issubclass(family, Domain) else {}))
     model = env.scene.model
     assert model.ncam and model.nlight and len(env.scene.shown) > 1
     task = jax.tree.map(lambda x: x[0], env.table.tasks)

@@ -109,7 +109,7 @@ def _look(model: mujoco.MjModel, eye: Pose | None) -> None:
     """Put the first camera where an episode has decided. It belongs to the world's body."""
     if eye is not None:
         model.cam_pos[0] = eye.position
-        mujoco.mju_mat2Quat(model.cam_quat[0], np.float64(eye.axes).T.ravel())
+        mujoco.mju_mat2Quat(model.cam_quat[0], np.array(eye.axes, np.float64).T.ravel())
 
 
 def _open_renderer(

@@ -4,6 +4,7 @@ Cells are squares of 1 m. Cell (i, j) is at i <= x < i + 1 and j <= y < j + 1. A
 leads to any other.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -28,23 +29,23 @@ class Ways(NamedTuple):
 
 def make_layout(number: float, cells: int, balls: int) -> Layout:
     """Return the maze of a number: the same one always, another for every number."""
-    random = np.random.default_rng([int(number < 0), abs(round(float(number) * _PARTS))])
-    walls = _carve(cells, random)
-    places = random.choice(cells * cells, balls, replace=False)
-    return Layout(walls, np.stack(np.divmod(places, cells), axis=1) + 0.5)
+    bits = np.random.PCG64([int(number < 0), abs(round(float(number) * _PARTS))])
+    draw = lambda count: int(bits.random_raw() % count)  # NumPy promises these bits for good, and no more than these
+    walls, left = _carve(cells, draw), list(np.ndindex(cells, cells))
+    return Layout(walls, np.array([left.pop(draw(len(left))) for _ in range(balls)]) + 0.5)
 
 
-def _carve(cells: int, random: np.random.Generator) -> np.ndarray:
+def _carve(cells: int, draw: Callable[[int], int]) -> np.ndarray:
     """Return the walls of a maze made by a depth-first search, which favours long corridors."""
     walls = np.ones((2, cells + 1, cells), bool)
-    way = [tuple(random.integers(cells, size=2).tolist())]
+    way = [(draw(cells), draw(cells))]
     visited = set(way)
     while way:
         beside = [cell for cell in _beside(way[-1], cells) if cell not in visited]
         if not beside:
             way.pop()
             continue
-        chosen = beside[random.integers(len(beside))]
+        chosen = beside[draw(len(beside))]
         walls[_wall(way[-1], chosen)] = False
         visited.add(chosen)
         way.append(chosen)

@@ -14,7 +14,6 @@ import numpy as np
 
 from mtjax.envs.corridors.layouts import Layout, find_ways, make_layout
 from mtjax.envs.looks import Look
-from mtjax.envs.painters.base import Painter
 from mtjax.envs.painters.grid import GridCaster
 from mtjax.envs.painters.poses import Pose
 from mtjax.envs.parameters import Parameter
@@ -63,10 +62,9 @@ class CorridorMaze(Pictured):
             what an agent does in a maze that it has never seen. ``0:1000`` gives every episode a maze of its own.
         goal-colour: red (0), green (1) or blue (2). Observations do not tell it; the context does.
 
-    The reward is sparse as in the navigation mazes of DeepMind Lab (Beattie et al. 2016) and MiniWorld
-    (Chevalier-Boisvert et al. 2023); colours name goals as in the Memory Maze (Pasukonis et al. 2023). ``dense`` rewards
-    progress as PointGoal navigation in Habitat does (Savva et al. 2019). The way is measured along both axes, from
-    cell to cell.
+    The reward is sparse as in the mazes of DeepMind Lab (Beattie et al. 2016) and MiniWorld (Chevalier-Boisvert et al.
+    2023); colours name goals as in the Memory Maze (Pasukonis et al. 2023). ``dense`` rewards progress as PointGoal
+    navigation in Habitat does (Savva et al. 2019); the way is measured along both axes, from cell to cell.
 
     ``painter=auto`` is a ray caster in plain JAX that knows the grid, on all devices. The general ones, ``caster`` and
     ``warp``, draw the same walls as boxes; ``caster`` does so up to 5 x 5 cells.
@@ -111,7 +109,7 @@ class CorridorMaze(Pictured):
     def build(self) -> dict[str, dict[str, Any]]:
         """Return walls, balls and, if they are rewarded, ways to the goal (R, ...) of every row of the table."""
         layouts = self.for_rows(self.layout, ("layout",))
-        goal = self.goals() | {"balls": np.float32([layout.balls for layout in layouts])}
+        goal = self.goals() | {"balls": np.stack([layout.balls for layout in layouts]).astype(np.float32)}
         if self.dense:
             ways = self.for_rows(self._ways, ("layout", "goal-colour"))
             goal |= {"ahead": np.stack([way.ahead for way in ways]), "rest": np.stack([way.rest for way in ways])}
@@ -194,7 +192,7 @@ class CorridorMaze(Pictured):
         return super().scenic if self.painter == "auto" else ("layout", *super().scenic)
 
     @cached_property
-    def artist(self) -> Painter:
+    def artist(self) -> Any:
         """Return the painter of this family on this device."""
         return GridCaster(self.scene, self.pixels) if self.painter == "auto" else super().artist
 

@@ -1,7 +1,7 @@
 """The ray caster for mazes on a grid, whose walls are not tested one by one.
 
-The eye is level, so that all pixels of a column look along one line of the plan. Each column meets the lines of the grid,
-and a table says where on a line there is a wall. So the cost hardly depends on how many walls there are.
+The eye is level, so that all pixels of a column look along one line of the plan. Each column meets the lines of the
+grid, and a table says where on a line there is a wall. So the cost hardly depends on how many walls there are.
 """
 
 import dataclasses
