@@ -11,7 +11,7 @@ from probes import QUICK
 
 import mtjax
 from mtjax.envs.corridors.layouts import find_ways, make_layout
-from mtjax.envs.corridors.maze import CorridorMaze, WalkerState
+from mtjax.envs.corridors.maze import CorridorMaze, WalkerState, metres_left
 from mtjax.report import render
 from mtjax.types import InputError
 
@@ -204,6 +204,32 @@ def test_dense_rewards_add_up_to_the_way():
     assert step.terminated
 
 
+def test_who_follows_the_ways_arrives():
+    """From 64 starts in four mazes: turn to the next cell's middle, and walk when it is ahead. Rewards add up."""
+    env = CorridorMaze(vary={"layout": "0:3:4"}, dense=True)
+    tasks = jax.tree.map(lambda x: jnp.repeat(x, 16, axis=0), env.tasks())
+
+    def play(task, key):
+        def step(state, _):
+            i, j = jnp.floor(state.place).astype(jnp.int32)
+            left = task.goal["ahead"][i, j] - state.place
+            error = jnp.arctan2(left[1], left[0]) - state.heading
+            error = jnp.arctan2(jnp.sin(error), jnp.cos(error))
+            after = env.step(task, state, jnp.stack([jnp.abs(error) < 0.2, error / 0.3]))
+            return after.state, (after.reward, after.terminated)
+
+        state = env.reset(task, key).state
+        return metres_left(task, state.place), jax.lax.scan(step, state, length=400)[1]
+
+    way, (rewards, ended) = jax.jit(jax.vmap(play), compiler_options=QUICK)(
+        tasks, jax.random.split(jax.random.key(0), 64)
+    )
+    lengths = np.argmax(ended, axis=1) + 1
+    assert np.all(np.any(ended, axis=1)) and np.all(lengths < 2 + 12 * np.asarray(way))
+    total = [np.sum(rewards[i, : lengths[i]]) for i in range(64)]
+    assert np.all(np.asarray(way) + 1 - total > 0) and np.all(np.asarray(way) + 1 - total < 0.6)
+
+
 def test_episodes_start_anywhere_but_in_the_goal_s_cell():
     starts = jax.jit(jax.vmap(MAZE.reset, (None, 0)), compiler_options=QUICK)(
         task_of(), jax.random.split(jax.random.key(0), 2000)
@@ -300,6 +326,7 @@ def test_a_ball_is_seen_unless_a_wall_hides_it():
         assert abs(bright[None] - np.pi * radius**2) < 5 and bright[4] == bright[None] and bright[3] == 0
 
 
+@pytest.mark.slow
 def test_the_grid_s_caster_draws_what_the_general_one_draws():
     """Which tests every wall as a box of 4 cm, of two layouts; tiles, sky and shades included."""
     grid, general = (CorridorMaze(cells=2, vary={"layout": "0,1"}, pixels=SIZE, painter=p) for p in ("auto", "caster"))

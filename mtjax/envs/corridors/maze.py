@@ -139,7 +139,7 @@ class CorridorMaze(Pictured):
         heading = jnp.remainder(state.heading + turn * _TURN * self.step_seconds + math.pi, 2 * math.pi) - math.pi
         move = speed * _SPEED * self.step_seconds * jnp.stack([jnp.cos(heading), jnp.sin(heading)])
         place = _walk(task.model["walls"], state.place, move)
-        gained = _metres_left(task, state.place) - _metres_left(task, place) if self.dense else jnp.float32(0)
+        gained = metres_left(task, state.place) - metres_left(task, place) if self.dense else jnp.float32(0)
         arrived = self.terminates(task, state)
         return jax.tree.map(lambda new, old: jnp.where(arrived, old, new), WalkerState(place, heading, gained), state)
 
@@ -218,7 +218,7 @@ def _goal(task: Task) -> Array:
     return task.goal["balls"][task.goal["goal-colour"].astype(jnp.int32)]
 
 
-def _metres_left(task: Task, place: Array) -> Array:
+def metres_left(task: Task, place: Array) -> Array:
     """Return the way () to the goal, along both axes from cell to cell."""
     i, j = jnp.floor(place).astype(jnp.int32)
     return jnp.sum(jnp.abs(place - task.goal["ahead"][i, j])) + task.goal["rest"][i, j]
