@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from mtjax.config import RunConfig, import_flags
-from mtjax.envs.domain import Domain
+from mtjax.envs.pixels import Pictured
 from mtjax.parallel import hosts
 from mtjax.report.tables import split_table
 from mtjax.training import checkpoint, lock, memory, sweep
@@ -73,5 +73,5 @@ def _conclude(config: RunConfig, result: Result, directory: Path) -> None:
         f"{duration(result.trained_seconds)}, evaluated and saved in {duration(rest)}; run: {directory}"
     )
     words = [f"--run={directory}", *import_flags(config)]
-    words += ["--video"] * any(isinstance(part.family, Domain) for part in config.family.parts)
+    words += ["--video"] * any(isinstance(part.family, Pictured) for part in config.family.parts)
     print(f"look at it: python -m mtjax.evaluate {shlex.join(words)}")
