@@ -187,16 +187,13 @@ class Replay:
             ring = rings.weigh(ring, jnp.minimum(count, self.host_slots(steps.reward.shape[3] * collectives.count())))
         return Buffer(ring, count, data.key)
 
-    def exchange(self, data: Buffer, segments: Any, count: int) -> tuple[Buffer, Any]:
-        """Write recalled segments, leaves (S, T, F L, E, ...) or None for none, and take out the latest steps.
+    def newest(self, data: Buffer, count: int) -> Any:
+        """Return the latest steps of every environment in the order of time, leaves (S, T, count, E, ...)."""
+        return jax.vmap(partial(rings.newest, count=count), (OVER_SEEDS,))(data.ring)
 
-        Returns:
-            the data, and ``count`` steps of every environment in the order of time, leaves (S, T, count, E, ...).
-        """
-        latest = jax.vmap(partial(rings.newest, count=count), (OVER_SEEDS,))(data.ring)
-        if segments is not None:
-            data = data._replace(ring=jax.vmap(rings.recall, (OVER_SEEDS, 0), OVER_SEEDS)(data.ring, segments))
-        return data, latest
+    def recall(self, data: Buffer, segments: Any) -> Buffer:
+        """Write recalled segments, leaves (S, T, F L, E, ...), over the oldest."""
+        return data._replace(ring=jax.vmap(rings.recall, (OVER_SEEDS, 0), OVER_SEEDS)(data.ring, segments))
 
     def keep(self, data: Buffer) -> Buffer:
         """Return all of the data."""

@@ -77,13 +77,17 @@ def recall(ring: Ring, segments: Any) -> Ring:
     assert ring.recalled is not None
     count, length = ring.recalled.slots.shape
     new = jax.tree.leaves(segments)[0].shape[1] // length
-    places = (ring.recalled.next + jnp.arange(new)) % count
-    slots = ring.recalled.slots[places].reshape(-1)
+    places = ring.recalled.slots[(ring.recalled.next + jnp.arange(new)) % count, 0]
+
+    def write(i: Array, rows: Any) -> Any:  # which writes in place, as a scatter may not
+        one = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, i * length, length, axis=1), segments)
+        put = lambda rows, new: jax.lax.dynamic_update_slice_in_dim(rows, new, places[i], axis=1)
+        return jax.tree.map(put, rows, one)
+
     recalled = ring.recalled._replace(
         next=(ring.recalled.next + new) % count, filled=jnp.minimum(ring.recalled.filled + new, count)
     )
-    rows = jax.tree.map(lambda rows, new: rows.at[:, slots].set(new), ring.rows, segments)
-    return ring._replace(rows=rows, recalled=recalled)
+    return ring._replace(rows=jax.lax.fori_loop(0, new, write, ring.rows), recalled=recalled)
 
 
 def weigh(ring: Ring, stored: Array) -> Ring:

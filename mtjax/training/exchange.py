@@ -51,11 +51,11 @@ class Exchange:
         """Exchange steps once the devices have done a chunk, for which this does not wait."""
         if not self.num_slots:
             return state
-        data, latest = self._program(state.data, self.pending.result())
+        latest, segments = self._newest(state.data), self.pending.result()
         for x in jax.tree.leaves(latest):
             x.copy_to_host_async()
         self.pending = self.thread.submit(self._keep, latest)
-        return state._replace(data=data)
+        return state if segments is None else state._replace(data=self._recall(state.data, segments))
 
     def finish(self, iteration: int) -> None:
         """Wait until all steps up to a checkpoint are in the run's folder, and drop those that none needs any more.
@@ -90,14 +90,22 @@ class Exchange:
         return jax.device_put(found, None if self.mesh is None else NamedSharding(self.mesh, rows))
 
     @cached_property
-    def _program(self) -> Callable:
-        """Return the program that exchanges steps on the devices; each of them exchanges its own."""
-        exchange = lambda data, segments: self.experience.exchange(data, segments, self.chunk)
-        if self.mesh is not None:
-            specs = self.experience.sharding
-            places = specs, specs.ring.rows
-            exchange = jax.shard_map(exchange, mesh=self.mesh, in_specs=places, out_specs=places, check_vma=False)
-        return jax.jit(exchange, donate_argnums=0)
+    def _newest(self) -> Callable:
+        """Return the program that takes a chunk's steps out of the replay."""
+        return jax.jit(self._split(lambda data: self.experience.newest(data, self.chunk), 0, out=1))
+
+    @cached_property
+    def _recall(self) -> Callable:
+        """Return the program that writes segments into the replay, in place. One for both would copy the replay."""
+        return jax.jit(self._split(self.experience.recall, 0, 1, out=0), donate_argnums=0)
+
+    def _split(self, program: Callable, *inputs: int, out: int) -> Callable:
+        """Let each device run a program on what it holds of arguments and result: 0 for the replay, 1 for steps."""
+        if self.mesh is None:
+            return program
+        specs = self.experience.sharding, self.experience.sharding.ring.rows
+        places = tuple(specs[i] for i in inputs)
+        return jax.shard_map(program, mesh=self.mesh, in_specs=places, out_specs=specs[out], check_vma=False)
 
 
 class Files:
