@@ -9,12 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import SHORT_RUN
 from probes import Stub, Walk, tiny
 from test_pictures import Episodes
 from test_run import bytes_of
 
 import mtjax
-from mtjax import loop
+from mtjax import cli, loop
 from mtjax.config import configure
 from mtjax.envs.probes import Pictured
 from mtjax.experience import Replay, pictures, store
@@ -23,6 +24,7 @@ from mtjax.experience.store import Store
 from mtjax.loop import Settings
 from mtjax.names import Notice
 from mtjax.training import checkpoint, memory, run
+from mtjax.training.policy import state_shapes
 from mtjax.types import InputError, Transition
 
 SEEDS, TASKS, ENVS = 2, 2, 3
@@ -309,26 +311,27 @@ def needs(monkeypatch, device, host=1e12, seeds=5, backend="gpu", **given):
     state = jax.eval_shape(partial(loop.init, env, agent, settings), tasks, key)
     found = memory.Needs.of(state, env, agent, settings)
     memory.require_room(found, env)
-    told = memory.tell(state, found, agent.experience.describe(2), seeds)
+    told = memory.tell(state.data, found, agent.experience.describe(2), seeds)
     return state, found, told
 
 
 def test_memory_is_told_by_seed_for_device_and_host(monkeypatch):
-    """Both grow with their sizes; a round of the exchange counts on both."""
-    rows = lambda state: sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(state.data.ring.rows))
+    """Both grow with their sizes; a round of the exchange counts on both, and a CPU holds both."""
     state, alone, told = needs(monkeypatch, 1e12, replay_size=4000)
-    assert alone.host == 0 and len(told) == 1 and "(4,000 transitions a task)" in told[0]
-    spilled, both, told = needs(monkeypatch, 1e12, replay_size=4000, host_replay_size=40_000)
-    assert rows(spilled) == rows(state)
-    each, moved = rows(state) / 2000, 10 + 64  # slots that a round takes, and brings back in two segments of 32
-    on_gpu = both.device
-    assert both.host == (20_000 + moved) * each and both.data - alone.data == pytest.approx(moved * each, abs=10_000)
-    assert "(4,000 transitions a task, and 40,000 on the host)" in told[0]
-    assert told[1].startswith(
-        f"memory of the host: {both.host / 1e6:,.0f} MB of replay; {both.host / 5e6:,.0f} MB a seed"
+    assert (alone.moved, alone.host, alone.device) == (0, 0, alone.state)
+    assert len(told) == 1 and "(4,000 transitions a task)" in told[0]
+    both_sizes = {"replay_size": 4000, "host_replay_size": 40_000}
+    spilled, both, told = needs(monkeypatch, 1e12, **both_sizes)
+    slot, rows = (checkpoint.size_of(x.data.ring.rows) / 2000 for x in (state, spilled))
+    moved = 10 + 64  # steps that a round takes, and brings back in two segments of 32
+    assert slot == rows and (both.moved, both.host) == (moved * slot, (20_000 + moved) * slot)
+    assert both.device == both.state + both.moved and both.state == pytest.approx(alone.state, rel=0.001)
+    assert f"(4,000 transitions a task, and 40,000 on the host); {both.state / 5e6:,.0f} MB a seed" in told[0]
+    by_seed = (
+        f"memory of the host: {both.host / 1e6:,.0f} MB of replay; {both.host / 5e6:,.0f} MB a seed; a round moves"
     )
-    _, on_cpu, _ = needs(monkeypatch, 1e12, backend="cpu", replay_size=4000, host_replay_size=40_000)
-    assert on_cpu.device == on_gpu + both.host
+    assert told[1].startswith(by_seed)
+    assert needs(monkeypatch, 1e12, backend="cpu", **both_sizes)[1].device == both.state + both.moved + both.host
 
 
 SMALLER = "and there are 0.1 GB; lower --replay-size, --num-envs or --seeds"
@@ -363,3 +366,18 @@ def test_it_is_refused_before_anything_compiles(monkeypatch):
     monkeypatch.setattr(run, "compile_lowered", None)
     with pytest.raises(InputError, match=r"the run needs 0.0 GB .* of worlds and data"):
         play(None, 1)
+
+
+def test_seeds_run_in_rounds_that_fit_on_device_and_host(monkeypatch, short_family):
+    """Of five seeds two at a time, where either has room for two and a half."""
+    config = cli.parse([*SHORT_RUN, "--seeds=5", "--host-replay-size=400"])
+    shapes = state_shapes(config)
+    stored = memory.Needs.of(shapes, config.family, config.learner, config.training).host
+    monkeypatch.setattr(memory, "state_shapes", lambda _: shapes)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    state = memory.required_bytes(config)
+    for device, host, rounds in ((9, 9, [5]), (9, 0.5, [2, 2, 1]), (0.5, 9, [2, 2, 1])):
+        monkeypatch.setattr(memory, "host_bytes", lambda host=host: host / 0.9 * stored)
+        monkeypatch.setattr(memory, "available_bytes", lambda device=device: device / 0.9 * state)
+        assert memory.seeds_exceed_memory(config) == (len(rounds) > 1)
+        assert [part.plan.seeds for part in memory.split_to_fit(config, memory.available_bytes())] == rounds

@@ -306,5 +306,5 @@ def require_space(directory: Path, state: Any, beside: int = 0) -> None:
     if needed > free:
         raise InputError(
             f"checkpoints need {needed / 1e6:.0f} MB and {str(directory)!r} has {free / 1e6:.0f} MB free; "
-            "lower --replay-size or choose another place with --runs"
+            f"lower --replay-size{' and --host-replay-size' if beside else ''} or choose another place with --runs"
         )

@@ -54,8 +54,9 @@ class Needs(NamedTuple):
     """Holds the bytes that a run needs with all its seeds."""
 
     agent: int  # networks and optimisers
-    data: int  # worlds and replay on the devices, with what a round of the exchange with the host takes
-    host: int  # the replay's store in the host's memory, with what a round takes; 0 for none
+    data: int  # worlds and replay on the devices
+    moved: int  # steps that a round of the exchange with the host holds on either side; 0 for no exchange
+    host: int  # the replay's store in the host's memory, with ``moved``
 
     @staticmethod
     def of(state: TrainState, env: Env, agent: Agent, settings: Settings) -> "Needs":
@@ -64,28 +65,37 @@ class Needs(NamedTuple):
         networks, slots = checkpoint.size_of(state.agent), experience.host_slots(settings.num_envs)
         data = checkpoint.size_of(state) - networks
         if not slots:
-            return Needs(networks, data, 0)
+            return Needs(networks, data, 0, 0)
         rows = state.data.ring.rows
         each = checkpoint.size_of(rows) // jax.tree.leaves(rows)[0].shape[2]
         count, length = experience.segments(env.spec, settings.num_envs)
-        taken = settings.chunk_steps + recalled_rows(settings.chunk_steps, count, length) * length
-        return Needs(networks, data + taken * each, (slots + taken) * each)
+        moved = settings.chunk_steps + recalled_rows(settings.chunk_steps, count, length) * length
+        return Needs(networks, data, moved * each, (slots + moved) * each)
+
+    @property
+    def state(self) -> int:
+        """Bytes of the training state."""
+        return self.agent + self.data
 
     @property
     def device(self) -> int:
         """Bytes on the devices; of a CPU, where the store lies in the same memory, all."""
-        beside = self.host if jax.default_backend() == "cpu" else 0
-        return self.agent + self.data + beside
+        return self.state + self.moved + (self.host if jax.default_backend() == "cpu" else 0)
+
+
+def _needs(config: RunConfig) -> Needs:
+    """Return what one point of a run needs."""
+    state = state_shapes(dataclasses.replace(config, points=config.points[:1]))
+    return Needs.of(state, config.family, config.learner, config.training)
 
 
 def required_bytes(config: RunConfig) -> int:
-    """Return roughly the bytes that one point takes with all its seeds: its state and an update's copies.
+    """Return roughly the bytes on devices that one point takes with all its seeds: its state and an update's copies.
 
     On a CPU the state that is being saved lies in the same memory.
     """
-    state = state_shapes(dataclasses.replace(config, points=config.points[:1]))
-    saved = checkpoint.size_of(state) if jax.default_backend() == "cpu" else 0
-    needs = Needs.of(state, config.family, config.learner, config.training)
+    needs = _needs(config)
+    saved = needs.state if jax.default_backend() == "cpu" else 0
     return needs.device + saved + _AGENT_COPIES * needs.agent
 
 
@@ -99,8 +109,8 @@ def require_room(needs: Needs, env: Env) -> None:
     if needs.device > limit:
         parts = [
             (needs.agent, "networks"),
-            (needs.data, "worlds and data"),
-            (needs.device - needs.agent - needs.data, "the host's replay"),
+            (needs.data + needs.moved, "worlds and data"),
+            (needs.device - needs.state - needs.moved, "the host's replay"),
         ]
         told = ", ".join(f"{gigabytes(size)} of {name}" for size, name in parts if size)
         much = 2 * needs.agent > needs.device
@@ -129,18 +139,15 @@ def _grey(env: Env) -> str:
     return "; with --env.grey pictures take a third" if coloured else ""
 
 
-def tell(state: TrainState, needs: Needs, kind: str, seeds: int) -> list[str]:
-    """Return lines on the memory that a run takes, and each of several seeds. Its data are of a ``kind``."""
-    held, data = checkpoint.size_of(state), checkpoint.size_of(state.data)
+def tell(data: Any, needs: Needs, kind: str, seeds: int) -> list[str]:
+    """Return lines on the memory that a run takes, and each of several seeds. Its ``data`` are of a ``kind``."""
     megabytes = lambda size: f"{size / 1e6:,.0f} MB"
     each = lambda size: f"; {megabytes(size / seeds)} a seed" if seeds > 1 else ""
-    lines = [f"memory: {megabytes(held)} of state, of which {megabytes(data)} {kind}{each(held)}"]
-    if needs.host:
-        moved = needs.agent + needs.data - held
-        lines += [
-            f"memory of the host: {megabytes(needs.host)} of replay{each(needs.host)}; a round moves {megabytes(moved)}"
-        ]
-    return lines
+    state = (
+        f"{megabytes(needs.state)} of state, of which {megabytes(checkpoint.size_of(data))} {kind}{each(needs.state)}"
+    )
+    host = f"{megabytes(needs.host)} of replay{each(needs.host)}; a round moves {megabytes(needs.moved)}"
+    return [f"memory: {state}"] + [f"memory of the host: {host}"] * (needs.host > 0)
 
 
 @contextlib.contextmanager
@@ -162,15 +169,22 @@ def explaining() -> Iterator[None]:
 
 def seeds_exceed_memory(config: RunConfig) -> bool:
     """Return whether several seeds do not fit into memory together. A single seed is always tried."""
-    return (
-        config.plan.seeds > 1 and not config.distributed and required_bytes(config) > available_bytes() * _USABLE_SHARE
-    )
+    seeds = config.plan.seeds
+    return seeds > 1 and not config.distributed and _fitting(config, available_bytes()) < seeds
+
+
+def _fitting(config: RunConfig, limit: float) -> int:
+    """Return how many seeds of any points fit at once into ``limit`` bytes, and their stores into the host's memory."""
+    needs, shares = _needs(config), [limit / required_bytes(config)]
+    if needs.host and jax.default_backend() != "cpu":
+        shares.append(host_bytes() / needs.host)
+    return math.floor(min(shares) * _USABLE_SHARE * config.plan.seeds)
 
 
 def split_to_fit(config: RunConfig, limit: float) -> list[RunConfig]:
     """Split a program into parts that fit into ``limit`` bytes: fewer points each, or fewer seeds of one point."""
     points, seeds = config.points or ({},), config.plan.seeds
-    fitting = max(math.floor(limit * _USABLE_SHARE * seeds / required_bytes(config)), 1)  # seeds of any points at once
+    fitting = max(_fitting(config, limit), 1)
     if fitting < seeds:
         alone = [dataclasses.replace(config, points=config.points and (point,)) for point in points]
         return [part for one in alone for part in _split_seeds(one, fitting)]

@@ -216,7 +216,7 @@ class _Run:
         needs = memory.Needs.of(shapes, self.env, self.agent, self.settings)
         memory.require_room(needs, self.env)
         kind = self.agent.experience.describe(self.settings.num_envs)
-        for line in memory.tell(shapes, needs, kind, len(self.seeds)):
+        for line in memory.tell(shapes.data, needs, kind, len(self.seeds)):
             self.console.say(line)
         if line := meshes.describe(self.mesh, len(self.seeds), self.settings.num_envs):
             self.console.say(line)
