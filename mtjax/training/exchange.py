@@ -121,10 +121,10 @@ class Files:
             np.savez(file, *jax.tree.leaves(items))
 
     def read(self, store: Store) -> None:
-        """Fill a store with the steps before its first, as far back as there are whole files. Drop later steps."""
-        for number in self._numbers():
-            if number > store.count:
-                self._path(number).unlink()
+        """Fill a store with the steps before its first, as far back as there are whole files.
+
+        Files of later steps are left from a run that did not reach its next checkpoint; this one writes them anew.
+        """
         form, oldest = jax.tree.structure(store.rows), max(store.count - store.num_slots, 0)
         shapes = lambda leaves: [(*x.shape[:2], *x.shape[3:]) for x in leaves]
         while store.begun > oldest:
@@ -137,9 +137,9 @@ class Files:
 
     def drop(self, count: int) -> None:
         """Remove the files with no step after number ``count``."""
-        for number in self._numbers():
-            if number <= count:
-                self._path(number).unlink(missing_ok=True)
+        for path in self.folder.glob("*.npz"):
+            if path.stem.isdigit() and int(path.stem) <= count:
+                path.unlink(missing_ok=True)
 
     def _leaves(self, count: int) -> list[np.ndarray] | None:
         """Return what a file holds; None if it is missing or damaged."""
@@ -151,6 +151,3 @@ class Files:
 
     def _path(self, count: int) -> Path:
         return self.folder / f"{count}.npz"
-
-    def _numbers(self) -> list[int]:
-        return [int(path.stem) for path in self.folder.glob("*.npz") if path.stem.isdigit()]
