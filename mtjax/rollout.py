@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from mtjax import frames
 from mtjax.maps import over_learners, where_worlds
 from mtjax.parallel import collectives
-from mtjax.tasks import episode_task
+from mtjax.tasks import contexts_vary, episode_task
 from mtjax.types import Acted, Agent, Array, Env, Key, Task, Transition
 
 
@@ -109,7 +109,7 @@ def step_envs(
         discount=1.0 - step.terminated,
         next_obs=obs,
         ended=step.terminated | (age >= each.horizon),
-        context=None if worlds.task is None else worlds.task.context,
+        context=worlds.task.context if contexts_vary(tasks) else None,  # type: ignore
         extras=acted.extras,
     )
     memory = acted.memory

@@ -47,4 +47,10 @@ def episode_task(task: Task, key: Key) -> Task:
     if task.draws is None:
         return task
     choice = jax.random.randint(key, (), 0, len(task.draws.id))
-    return jax.tree.map(lambda x: x[choice], task.draws)._replace(id=task.id)
+    drawn = jax.tree.map(lambda x: x[choice], task.draws)._replace(id=task.id)
+    return drawn if contexts_vary(task) else drawn._replace(context=task.context)
+
+
+def contexts_vary(tasks: Task) -> bool:
+    """Return whether episodes of one task have different contexts."""
+    return tasks.draws is not None and tasks.draws.context is not None

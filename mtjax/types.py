@@ -28,7 +28,8 @@ class Task(NamedTuple):
     model: dict[str, Array]  # only those leaves of the physics model that differ between tasks
     goal: dict[str, Array]  # reward and reset parameters
     horizon: Array  # () int32, time limit of an episode in steps
-    draws: Any = None  # a Task with leaves (P, ...); each episode draws one of them; None: every episode is this task
+    draws: Any = None  # a Task with leaves (P, ...); each episode draws one of them; None: every episode is this task;
+    # the draws have no context (None) where all have the task's own
     action_mask: Array | None = None  # (A,) 1 for actions that the task has, else 0; None: it has all
     blocks: Any = None  # in a mixture, which tasks belong to which family; static, without leaves
     scene: dict[str, Array] | None = None  # only what differs between tasks in what is seen; None without pixels
@@ -70,7 +71,7 @@ class Transition(NamedTuple):
     discount: Array  # () = 1 - terminated
     next_obs: Any  # (O,) from before any reset
     ended: Any = None  # () bool: the episode ended, terminated or by its time limit
-    context: Array | None = None  # (C,) of the episode's task, if episodes draw their tasks
+    context: Array | None = None  # (C,) of the episode's task, if episodes draw tasks of other contexts
     extras: Any = None  # data that the agent stores when it acts
 
 
@@ -170,7 +171,8 @@ class Experience(Protocol):
     def updates_in(self, steps: int) -> int: ...  # updates, or calls of ``learn``, in so many steps of all environments
     @property
     def sharding(self) -> Any: ...  # of the data, as a tree of PartitionSpec
-    def check(self, env: Env, num_envs: int) -> None: ...  # raises InputError
+    def check(self, env: Env, num_envs: int, chunk_steps: int = 0) -> None: ...  # raises InputError
+    def host_slots(self, num_envs: int) -> int: ...  # steps of every environment that the host keeps beside the data
     def describe(self, num_envs: int) -> str: ...
     def init(self, item: Transition, spec: Spec, num_tasks: int, num_envs: int, keys: Key) -> Any: ...  # keys (S,)
     def explore(self, data: Any, action: Array, step: Array) -> Array: ...  # actions (S, T, E, A) to take at a step ()

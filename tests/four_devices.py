@@ -110,6 +110,21 @@ def test_checkpoint_goes_on_with_other_devices(alone, halfway, tmp_path, use, co
     assert_same(result, alone)
 
 
+def test_devices_share_what_comes_back_from_the_host(tmp_path, use):
+    """Two seeds of two devices each bring back what one device does. A run may go on with another number."""
+    settings = WIDE | {"host_replay_size": 200, "n_step": 2}
+    wide = lambda directory, chunks, **changes: play(directory, Walk(), chunks, settings=settings, seeds=2, **changes)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(meshes, "LEAST_WORLDS", 1)
+        result = wide(tmp_path / "four", 8)
+        wide(tmp_path / "other", 6)
+    use(1)
+    alone, other = wide(tmp_path / "one", 8), wide(tmp_path / "other", 8, resume=True)
+    assert (devices_of(result), devices_of(alone)) == (4, 1) and float(alone.state.data.ring.recalled.share) > 0.5
+    assert_same(result, alone, chunks=8)
+    assert_same(other, alone, chunks=8)
+
+
 @pytest.mark.nightly
 def test_checkpoint_of_one_device_goes_on_with_four(alone, tmp_path, use):
     """The other way round."""

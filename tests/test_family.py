@@ -309,6 +309,17 @@ def test_environments_are_equal_when_their_settings_are():
         assert dataclasses.replace(one, **{name: value}) != one
 
 
+def test_draws_have_no_context_where_all_have_that_of_their_task():
+    """As of goals that agents do not see: an episode has its task's context, and its own parameters."""
+    told = envs.make("finger-spin", {"size": "0.95:1.15"}, num_draws=20)
+    tasks = dataclasses.replace(told, context_ranges=()).tasks()
+    assert told.tasks().draws.context.shape == (1, 20, 1) and tasks.draws.context is None
+    drawn = jax.vmap(episode_task, (None, 0))(
+        jax.tree.map(lambda x: x[0], tasks), jax.random.split(jax.random.key(0), 9)
+    )
+    assert drawn.context.tolist() == [tasks.context[0].tolist()] * 9 and np.ptp(drawn.params["size"]) > 0.01
+
+
 def test_environments_are_frozen():
     """A setting cannot change under a compiled program."""
     with pytest.raises(dataclasses.FrozenInstanceError):

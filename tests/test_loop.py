@@ -1,6 +1,7 @@
 """The loop by what it stores and reports, mostly with an agent that learns nothing and writes down what it is given."""
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -312,6 +313,15 @@ class Drifting(Walk):
         scales = jnp.linspace(1.0, 2.0, 50)[None] + 10 * jnp.arange(len(tasks.id))[:, None]
         draws = jax.tree.map(lambda x: jnp.broadcast_to(x[:, None], (*x.shape[:1], 50, *x.shape[1:])), tasks)
         return tasks._replace(draws=draws._replace(context=scales[..., None], goal=draws.goal | {"scale": scales}))
+
+
+def test_contexts_are_stored_only_where_those_of_a_task_differ():
+    """Else every transition of a task would hold the same numbers."""
+    (agent, settings), tasks = configure(Recorder(), Settings(), SETTINGS), Drifting().tasks()
+    hidden = tasks._replace(draws=tasks.draws._replace(context=None))
+    shapes = [jax.eval_shape(partial(loop.init, Walk(), agent, settings), x, jnp.uint32([0])) for x in (tasks, hidden)]
+    stored = [state.data.ring.rows.context for state in shapes]
+    assert stored[0].shape == (1, 2, 50, ENVS, 1) and stored[1] is None
 
 
 class Sees(Recorder):

@@ -20,7 +20,7 @@ SIDE = 3
 
 def picture(number):
     """A picture whose pixels tell which step of which episode it is."""
-    return np.full((SIDE, SIDE, 2), number, np.uint8)
+    return np.full((SIDE, SIDE, 2), divmod(number, 256), np.uint8)
 
 
 class Episodes:

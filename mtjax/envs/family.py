@@ -159,7 +159,12 @@ class Tabled(abc.ABC):
             raise InputError(f"unknown split {split!r}; choose from {', '.join(splits)}")
         take = lambda rows: jax.device_put(jax.tree.map(lambda x: x[rows], table.tasks))  # jnp.asarray would compile
         tasks = take(splits[split])
-        return tasks if table.draws is None else tasks._replace(draws=take(table.draws[splits[split]]))
+        if table.draws is None:
+            return tasks
+        rows, contexts = table.draws[splits[split]], table.tasks.context
+        alike = np.all(contexts[rows] == contexts[splits[split], None])  # as of hidden goals, so nothing stores them
+        draws = take(rows)
+        return tasks._replace(draws=draws._replace(context=None) if alike else draws)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import tyro
 from jax.sharding import PartitionSpec
 
-from mtjax.experience import hindsight, pictures
+from mtjax.experience import hindsight, pictures, store
 from mtjax.experience import ring as rings
 from mtjax.experience.ring import OVER_SEEDS, Ring
 from mtjax.frames import PICTURES, shown
@@ -19,6 +19,9 @@ from mtjax.parallel import collectives
 from mtjax.types import Array, Env, InputError, Key, Metrics, Spec, Task, Transition
 
 _FLAG = tyro.conf.arg(prefix_name=False)  # --batch-size, not --agent.batch-size
+
+
+_MAY_BE_NONE = ("updates_per_step", "reset_every", "hindsight", "host_replay_size")
 
 
 class Buffer(NamedTuple):
@@ -47,7 +50,11 @@ class Replay:
     batch_size: Annotated[int, _FLAG] = 64
     """Transitions of each task in an update."""
     replay_size: Annotated[int, _FLAG] = 100_000
-    """Transitions that each task's replay holds."""
+    """Transitions that each task's replay holds on the device."""
+    host_replay_size: Annotated[int, _FLAG] = 0
+    """Transitions of each task that the host's memory keeps, if more than replay-size; 0 keeps none there. Then half of
+    replay-size holds the latest transitions, and half is renewed from the host after every chunk, so that batches come
+    from all of them."""
     warmup_steps: Annotated[int, _FLAG] = 100
     """Steps of every environment under random actions before learning starts."""
     warmup_hold: Annotated[int, _FLAG] = 10
@@ -64,7 +71,7 @@ class Replay:
         if not 0 <= self.hindsight <= 1:
             raise InputError(f"hindsight is a share from 0 to 1, not {self.hindsight}")
         for field in dataclasses.fields(self):
-            least = 0 if field.name in ("updates_per_step", "reset_every", "hindsight") else 1
+            least = 0 if field.name in _MAY_BE_NONE else 1
             if getattr(self, field.name) < least:
                 flag = field.name.replace("_", "-")
                 raise InputError(f"{flag} must be at least {least}, not {getattr(self, field.name)}")
@@ -74,8 +81,8 @@ class Replay:
                 f"{self.n_step - 1}, not {self.warmup_steps}"
             )
 
-    def check(self, env: Env, num_envs: int) -> None:
-        """Check that the settings fit the environment.
+    def check(self, env: Env, num_envs: int, chunk_steps: int = 0) -> None:
+        """Check that the settings fit the environment, and chunks of so many steps of every environment.
 
         Raises:
             InputError: the replay does not hold enough steps of every environment, or hindsight cannot relabel the
@@ -90,10 +97,32 @@ class Replay:
             raise InputError(f"replay-size ({self.replay_size}) must hold {steps} of num-envs ({num_envs})")
         if self.hindsight:
             hindsight.require(env)
+        if self.host_replay_size:
+            self._check_host(env.spec, num_envs, chunk_steps)
+
+    def _check_host(self, spec: Spec, num_envs: int, chunk_steps: int) -> None:
+        if self.host_replay_size <= self.replay_size:
+            raise InputError(
+                f"host-replay-size ({self.host_replay_size}) must be more than replay-size ({self.replay_size}); "
+                "with 0 the device keeps all"
+            )
+        if jax.process_count() > 1:
+            raise InputError("host-replay-size takes one process; leave out --distributed")
+        count, length = self.segments(spec, num_envs)
+        if not count:
+            least = 2 * math.ceil(max(self.window(spec), 1) / self.steps) * self.steps * num_envs
+            raise InputError(f"with host-replay-size, replay-size must be at least {least}, not {self.replay_size}")
+        latest = self.capacity(num_envs) // num_envs - count * length
+        if chunk_steps > latest:
+            raise InputError(
+                f"with host-replay-size the device keeps the latest {latest} steps of every environment until a chunk "
+                f"ends, and one takes {chunk_steps}; lower --chunk-steps or raise --replay-size"
+            )
 
     def describe(self, num_envs: int) -> str:
         """Return a description of its size."""
-        return f"replay ({self.capacity(num_envs):,} transitions a task)"
+        beside = f", and {self.host_slots(num_envs) * num_envs:,} on the host" if self.host_replay_size else ""
+        return f"replay ({self.capacity(num_envs):,} transitions a task{beside})"
 
     def window(self, spec: Spec) -> int:
         """Return how many consecutive steps to draw for each transition; 0 if transitions are single steps."""
@@ -115,20 +144,31 @@ class Replay:
         stored = self.steps * num_envs
         return self.replay_size // stored * stored
 
+    def host_slots(self, num_envs: int) -> int:
+        """Return how many steps of every environment the host keeps."""
+        return self.host_replay_size // num_envs
+
+    def segments(self, spec: Spec, num_envs: int) -> tuple[int, int]:
+        """Return rows K and length L of the recalled segments on the device."""
+        if not self.host_replay_size:
+            return 0, 0
+        return store.segments(self.capacity(num_envs) // num_envs, self.window(spec), self.steps)
+
     @property
     def sharding(self) -> Buffer:
         """How devices share the data: by the axes of seeds and of environments."""
         seeds, whole = PartitionSpec("seeds"), PartitionSpec()
         rows = PartitionSpec("seeds", None, None, collectives.AXIS)
-        return Buffer(Ring(rows, whole, whole), whole, seeds)  # type: ignore
+        return Buffer(Ring(rows, whole, whole, whole), whole, seeds)  # type: ignore
 
     # Data.
 
     def init(self, item: Transition, spec: Spec, num_tasks: int, num_envs: int, keys: Key) -> Buffer:
         """Return an empty replay for transitions like ``item`` (no leading axes) and seeds with ``keys`` (S,)."""
         item = pictures.compress(item, spec.obs[PICTURES].shape[-1]) if shown(spec.obs) else item
-        own, slots = num_envs // collectives.count(), self.capacity(num_envs) // num_envs
-        blank = lambda _: rings.init(item, num_tasks, slots, own)
+        own, segments = num_envs // collectives.count(), self.segments(spec, num_envs)
+        latest = self.capacity(num_envs) // num_envs - math.prod(segments)
+        blank = lambda _: rings.init(item, num_tasks, latest, own, segments)
         return Buffer(jax.vmap(blank, out_axes=OVER_SEEDS)(keys), jnp.int32(0), keys)
 
     def explore(self, data: Buffer, action: Array, step: Array) -> Array:
@@ -142,8 +182,18 @@ class Replay:
         """Store the latest steps of every environment, leaves (S, T, H, E, ...)."""
         kept = data.ring.rows.obs
         steps = pictures.compress(steps, kept[PICTURES].shape[-1]) if shown(kept) else steps
-        ring = jax.vmap(rings.add, (OVER_SEEDS, 0), OVER_SEEDS)(data.ring, steps)
-        return Buffer(ring, data.count + self.steps, data.key)
+        ring, count = jax.vmap(rings.add, (OVER_SEEDS, 0), OVER_SEEDS)(data.ring, steps), data.count + self.steps
+        if self.host_replay_size:
+            ring = rings.weigh(ring, jnp.minimum(count, self.host_slots(steps.reward.shape[3] * collectives.count())))
+        return Buffer(ring, count, data.key)
+
+    def newest(self, data: Buffer, count: int) -> Any:
+        """Return the latest steps of every environment in the order of time, leaves (S, T, count, E, ...)."""
+        return jax.vmap(partial(rings.newest, count=count), (OVER_SEEDS,))(data.ring)
+
+    def recall(self, data: Buffer, segments: Any) -> Buffer:
+        """Write recalled segments, leaves (S, T, F L, E, ...), over the oldest."""
+        return data._replace(ring=jax.vmap(rings.recall, (OVER_SEEDS, 0), OVER_SEEDS)(data.ring, segments))
 
     def keep(self, data: Buffer) -> Buffer:
         """Return all of the data."""

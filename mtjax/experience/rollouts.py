@@ -36,8 +36,12 @@ class Rollouts:
         """Count the calls of ``learn`` in a run of so many steps of every environment."""
         return steps // self.unroll
 
-    def check(self, env: Env, num_envs: int) -> None:
+    def check(self, env: Env, num_envs: int, chunk_steps: int = 0) -> None:
         """Accept every environment."""
+
+    def host_slots(self, num_envs: int) -> int:
+        """Return 0, as the host keeps no steps."""
+        return 0
 
     def describe(self, num_envs: int) -> str:
         """Return a description of its size."""

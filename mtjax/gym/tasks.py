@@ -8,6 +8,7 @@ import numpy as np
 from gymnasium import spaces
 
 from mtjax.names import nearest_error
+from mtjax.tasks import contexts_vary
 from mtjax.types import Env, InputError, Task
 
 TASK_OBS = ("context", "id", "none")
@@ -97,7 +98,9 @@ def _with_draws(listed: Task) -> Task:
     if listed.draws is None:
         return listed
     drawn = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), listed.draws)
-    drawn = drawn._replace(id=np.repeat(listed.id, len(drawn.id) // len(listed.id)))
+    of_tasks = lambda x: np.repeat(x, len(drawn.id) // len(listed.id), axis=0)
+    context = drawn.context if contexts_vary(listed) else of_tasks(listed.context)
+    drawn = drawn._replace(id=of_tasks(listed.id), context=context)
     return jax.tree.map(lambda *x: np.concatenate(x), listed._replace(draws=None), drawn)
 
 

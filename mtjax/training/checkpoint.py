@@ -296,15 +296,15 @@ def size_of(state: Any) -> int:
     return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(state))
 
 
-def require_space(directory: Path, state: Any) -> None:
-    """Check that the disk has room for the checkpoints of a run.
+def require_space(directory: Path, state: Any, beside: int = 0) -> None:
+    """Check that the disk has room for the checkpoints of a run, and for so many bytes ``beside`` them.
 
     Raises:
         InputError: it has too little.
     """
-    needed, free = (_KEPT + 1) * size_of(state), shutil.disk_usage(directory).free
+    needed, free = (_KEPT + 1) * size_of(state) + beside, shutil.disk_usage(directory).free
     if needed > free:
         raise InputError(
             f"checkpoints need {needed / 1e6:.0f} MB and {str(directory)!r} has {free / 1e6:.0f} MB free; "
-            "lower --replay-size or choose another place with --runs"
+            f"lower --replay-size{' and --host-replay-size' if beside else ''} or choose another place with --runs"
         )

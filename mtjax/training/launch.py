@@ -16,7 +16,7 @@ from mtjax.training.finetune import require_fit
 from mtjax.training.folder import short_name
 from mtjax.training.policy import Policy, load
 from mtjax.training.result import Result
-from mtjax.training.run import train
+from mtjax.training.run import fit_chunk, train
 from mtjax.types import InputError
 
 
@@ -33,7 +33,9 @@ def check(config: RunConfig, start: Policy | None = None) -> None:
     sinks.require_libraries(config.tensorboard, config.wandb)
     _ = family.engine_name, family.table
     mesh.mesh_for(config.plan.seeds, family.train_count, config.training.num_envs)
-    config.learner.experience.check(family, config.training.num_envs)
+    experience = config.learner.experience
+    played = fit_chunk(config.training, family.train_count, config.plan.steps, experience.steps)
+    experience.check(family, played.num_envs, played.chunk_steps)
     for learner in points.agents_at(config.learner, config.points):
         require_value_range(learner)
         if start is not None:

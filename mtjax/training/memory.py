@@ -6,15 +6,18 @@ import math
 import os
 import re
 from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from mtjax.config import RunConfig
-from mtjax.loop import TrainState
+from mtjax.experience.store import recalled_rows
+from mtjax.frames import PICTURES, shown
+from mtjax.loop import Settings, TrainState
 from mtjax.training import checkpoint
 from mtjax.training.policy import state_shapes
-from mtjax.types import InputError
+from mtjax.types import Agent, Env, InputError
 
 _USABLE_SHARE = 0.9  # of the available memory, for one program
 _EXHAUSTED = re.compile("RESOURCE_EXHAUSTED|[Oo]ut of memory|allocate memory")
@@ -39,34 +42,112 @@ def available_bytes() -> float:
 def physical_bytes() -> float:
     """Return the memory of this process's devices in bytes, on a CPU the machine's."""
     known = [(device.memory_stats() or {}).get("bytes_limit", 0) for device in jax.local_devices()]
-    return sum(known) or os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return sum(known) or host_bytes()
+
+
+def host_bytes() -> float:
+    """Return the machine's memory in bytes."""
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+
+
+class Needs(NamedTuple):
+    """Holds the bytes that a run needs with all its seeds."""
+
+    agent: int  # networks and optimisers
+    data: int  # worlds and replay on the devices
+    moved: int  # steps that a round of the exchange with the host holds on either side; 0 for no exchange
+    host: int  # the replay's store in the host's memory, with ``moved``
+
+    @staticmethod
+    def of(state: TrainState, env: Env, agent: Agent, settings: Settings) -> "Needs":
+        """Return what a training state, or its shapes, needs."""
+        experience: Any = agent.experience
+        networks, slots = checkpoint.size_of(state.agent), experience.host_slots(settings.num_envs)
+        data = checkpoint.size_of(state) - networks
+        if not slots:
+            return Needs(networks, data, 0, 0)
+        rows = state.data.ring.rows
+        each = checkpoint.size_of(rows) // jax.tree.leaves(rows)[0].shape[2]
+        count, length = experience.segments(env.spec, settings.num_envs)
+        moved = settings.chunk_steps + recalled_rows(settings.chunk_steps, count, length) * length
+        return Needs(networks, data, moved * each, (slots + moved) * each)
+
+    @property
+    def state(self) -> int:
+        """Bytes of the training state."""
+        return self.agent + self.data
+
+    @property
+    def device(self) -> int:
+        """Bytes on the devices; of a CPU, where the store lies in the same memory, all."""
+        return self.state + self.moved + (self.host if jax.default_backend() == "cpu" else 0)
+
+
+def _needs(config: RunConfig) -> Needs:
+    """Return what one point of a run needs."""
+    state = state_shapes(dataclasses.replace(config, points=config.points[:1]))
+    return Needs.of(state, config.family, config.learner, config.training)
 
 
 def required_bytes(config: RunConfig) -> int:
-    """Return roughly the bytes that one point takes with all its seeds: its state and an update's copies.
+    """Return roughly the bytes on devices that one point takes with all its seeds: its state and an update's copies.
 
     On a CPU the state that is being saved lies in the same memory.
     """
-    state = state_shapes(dataclasses.replace(config, points=config.points[:1]))
-    saved = checkpoint.size_of(state) if jax.default_backend() == "cpu" else 0
-    return checkpoint.size_of(state) + saved + _AGENT_COPIES * checkpoint.size_of(state.agent)
+    needs = _needs(config)
+    saved = needs.state if jax.default_backend() == "cpu" else 0
+    return needs.device + saved + _AGENT_COPIES * needs.agent
 
 
-def require_room(state: TrainState) -> None:
-    """Check that a training state fits into memory at all.
+def require_room(needs: Needs, env: Env) -> None:
+    """Check that a run fits into memory at all.
 
     Raises:
-        InputError: it is larger than the memory of all devices.
+        InputError: it is larger than the memory of all devices, or its store than that of the host.
     """
-    held, agent = checkpoint.size_of(state), checkpoint.size_of(state.agent)
-    limit = physical_bytes() * jax.process_count()
-    if held <= limit:
-        return
-    fix = "--agent.hidden or --seeds" if 2 * agent > held else "--replay-size, --num-envs or --seeds"
-    raise InputError(
-        f"the run needs {held / 1e9:,.1f} GB ({agent / 1e9:,.1f} GB of networks, {(held - agent) / 1e9:,.1f} GB of "
-        f"worlds and data) and there are {limit / 1e9:,.1f} GB; lower {fix}"
+    limit, gigabytes = physical_bytes() * jax.process_count(), lambda x: f"{x / 1e9:,.1f} GB"
+    if needs.device > limit:
+        parts = [
+            (needs.agent, "networks"),
+            (needs.data + needs.moved, "worlds and data"),
+            (needs.device - needs.state - needs.moved, "the host's replay"),
+        ]
+        told = ", ".join(f"{gigabytes(size)} of {name}" for size, name in parts if size)
+        much = 2 * needs.agent > needs.device
+        fix = "--agent.hidden or --seeds" if much else "--replay-size, --num-envs or --seeds" + _further(needs, env)
+        raise InputError(
+            f"the run needs {gigabytes(needs.device)} ({told}) and there are {gigabytes(limit)}; lower {fix}"
+        )
+    if needs.host > host_bytes():
+        raise InputError(
+            f"the replay on the host needs {gigabytes(needs.host)} and the machine has {gigabytes(host_bytes())}; "
+            f"lower --host-replay-size, --seeds or --chunk-steps{_grey(env)}"
+        )
+
+
+def _further(needs: Needs, env: Env) -> str:
+    """Return clauses on what else makes room for a replay."""
+    apart = not needs.host and jax.default_backend() != "cpu"
+    moved = "; with --host-replay-size=N the host keeps N transitions beside a smaller replay" if apart else ""
+    shorter = ", or --chunk-steps and --host-replay-size" if needs.host else ""
+    return shorter + _grey(env) + moved
+
+
+def _grey(env: Env) -> str:
+    """Return a clause on smaller pictures, if the family has coloured ones."""
+    coloured = shown(env.spec.obs) and env.spec.obs[PICTURES].shape[-1] == 3
+    return "; with --env.grey pictures take a third" if coloured else ""
+
+
+def tell(data: Any, needs: Needs, kind: str, seeds: int) -> list[str]:
+    """Return lines on the memory that a run takes, and each of several seeds. Its ``data`` are of a ``kind``."""
+    megabytes = lambda size: f"{size / 1e6:,.0f} MB"
+    each = lambda size: f"; {megabytes(size / seeds)} a seed" if seeds > 1 else ""
+    state = (
+        f"{megabytes(needs.state)} of state, of which {megabytes(checkpoint.size_of(data))} {kind}{each(needs.state)}"
     )
+    host = f"{megabytes(needs.host)} of replay{each(needs.host)}; a round moves {megabytes(needs.moved)}"
+    return [f"memory: {state}"] + [f"memory of the host: {host}"] * (needs.host > 0)
 
 
 @contextlib.contextmanager
@@ -88,15 +169,22 @@ def explaining() -> Iterator[None]:
 
 def seeds_exceed_memory(config: RunConfig) -> bool:
     """Return whether several seeds do not fit into memory together. A single seed is always tried."""
-    return (
-        config.plan.seeds > 1 and not config.distributed and required_bytes(config) > available_bytes() * _USABLE_SHARE
-    )
+    seeds = config.plan.seeds
+    return seeds > 1 and not config.distributed and _fitting(config, available_bytes()) < seeds
+
+
+def _fitting(config: RunConfig, limit: float) -> int:
+    """Return how many seeds of any points fit at once into ``limit`` bytes, and their stores into the host's memory."""
+    needs, shares = _needs(config), [limit / required_bytes(config)]
+    if needs.host and jax.default_backend() != "cpu":
+        shares.append(host_bytes() / needs.host)
+    return math.floor(min(shares) * _USABLE_SHARE * config.plan.seeds)
 
 
 def split_to_fit(config: RunConfig, limit: float) -> list[RunConfig]:
     """Split a program into parts that fit into ``limit`` bytes: fewer points each, or fewer seeds of one point."""
     points, seeds = config.points or ({},), config.plan.seeds
-    fitting = max(math.floor(limit * _USABLE_SHARE * seeds / required_bytes(config)), 1)  # seeds of any points at once
+    fitting = max(_fitting(config, limit), 1)
     if fitting < seeds:
         alone = [dataclasses.replace(config, points=config.points and (point,)) for point in points]
         return [part for one in alone for part in _split_seeds(one, fitting)]

@@ -23,6 +23,7 @@ from mtjax.parallel import hosts
 from mtjax.parallel import mesh as meshes
 from mtjax.training import checkpoint, finetune, lock, log, memory, points
 from mtjax.training.console import Clock, Console, describe_rounding, describe_running, describe_warmup, duration
+from mtjax.training.exchange import Exchange
 from mtjax.training.points import Point, Sweep, SweptAgent
 from mtjax.training.policy import Policy
 from mtjax.training.programs import Programs, compile_lowered, jit_programs, load_kernels, sharded_shapes, trace
@@ -82,8 +83,8 @@ def train(
     require_libraries(tensorboard, wandb)
     started = time.monotonic()
     tasks = env.tasks("train")
-    agent.experience.check(env, settings.num_envs)
     settings = fit_chunk(settings, len(tasks.id), steps, agent.experience.steps)
+    agent.experience.check(env, settings.num_envs, settings.chunk_steps)
     plain, length = agent, _played(settings, len(tasks.id), steps)
     agent = agent.planned(length)  # type: ignore
     learner = SweptAgent(agent) if found else agent  # type: ignore
@@ -108,6 +109,8 @@ def train(
         if start is not None and not resume:
             begun = run.adopt(start, tasks, hosts.gather(state.agent))
             state = state._replace(agent=meshes.shard_by_seed(mesh, begun))
+        held.callback(run.exchange.close)
+        run.exchange.begin(state)
         hosts.wait_for_all()
         compile_seconds = time.monotonic() - started
         console.say(f"compiled in {duration(compile_seconds)}")
@@ -177,6 +180,10 @@ class _Run:
         return Records(self.directory)
 
     @cached_property
+    def exchange(self) -> Exchange:
+        return Exchange(self.env, self.agent, self.settings, self.mesh, self.directory)
+
+    @cached_property
     def steps_per_iteration(self) -> int:
         """Return the number of environments, summed over tasks: environment steps of one iteration."""
         return len(self.env.tasks("train").id) * self.settings.num_envs
@@ -206,16 +213,15 @@ class _Run:
         return programs, self.records.restore(shapes) if make is None else make.result()(tasks, seeds, knobs)
 
     def _describe(self, shapes: TrainState) -> None:
-        memory.require_room(shapes)
-        data = checkpoint.size_of(shapes.data) / 1e6
-        self.console.say(
-            f"memory: {checkpoint.size_of(shapes) / 1e6:,.0f} MB of state, of which {data:,.0f} MB "
-            f"{self.agent.experience.describe(self.settings.num_envs)}"
-        )
+        needs = memory.Needs.of(shapes, self.env, self.agent, self.settings)
+        memory.require_room(needs, self.env)
+        kind = self.agent.experience.describe(self.settings.num_envs)
+        for line in memory.tell(shapes.data, needs, kind, len(self.seeds)):
+            self.console.say(line)
         if line := meshes.describe(self.mesh, len(self.seeds), self.settings.num_envs):
             self.console.say(line)
         if self.directory is not None:
-            checkpoint.require_space(self.directory, shapes)
+            checkpoint.require_space(self.directory, shapes, needs.host)
 
     def _open_sinks(self, steps: int) -> list[Sink]:
         """Return where metrics go beside metrics.csv, in a run that is at a step."""
@@ -280,6 +286,7 @@ class _Run:
                 with self._profile_chunk(len(rows), steps):
                     before = time.monotonic()
                     state, metrics = programs.chunk(state)
+                    state = self.exchange.after_chunk(state)
                     metrics = hosts.gather(metrics)
                     elapsed = time.monotonic() - before
                 seconds += elapsed
@@ -345,6 +352,7 @@ class _Run:
         """Save a checkpoint, unless the last update has spoiled an agent: then the checkpoint before it must stay."""
         if not self.points:
             require_finite_parameters(state.agent, iteration, self.records.last)
+        self.exchange.finish(iteration)
         self.records.save(state)
 
     def _evaluate(self, program: Callable, state: TrainState, past: Evaluations, steps: int, diverged) -> Evaluations:
