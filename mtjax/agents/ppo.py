@@ -205,11 +205,11 @@ class PPO(BaseAgent):
             units=Units(jnp.float32(0), jnp.zeros(num_tasks), jnp.ones(num_tasks)),
         )
 
-    def init_networks(self, num_tasks: int, features: Array, obs: Any, action: Array, key: Key) -> Pair:
+    def init_networks(self, num_tasks: int, inputs: Pair, action: Array, key: Key) -> Pair:
         actor_key, critic_key = jax.random.split(key)
         first = jnp.repeat(jnp.array([0.0, outputs_for(self.initial_std)]), len(action))
-        actor = scale_head(self.actor.init(actor_key, num_tasks, 2 * len(action), features, obs), first)
-        return Pair(actor, scale_head(self.critic.init(critic_key, num_tasks, 1, features, obs), jnp.zeros(1)))
+        actor = scale_head(self.actor.init(actor_key, num_tasks, 2 * len(action), *inputs.actor), first)
+        return Pair(actor, scale_head(self.critic.init(critic_key, num_tasks, 1, *inputs.critic), jnp.zeros(1)))
 
     # Acting.
 
