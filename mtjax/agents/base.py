@@ -216,8 +216,12 @@ class BaseAgent(abc.ABC):
                 f"reset-every begins the optimisers anew, and lr-schedule={self.lr_schedule} with them; use constant"
             )
 
-    def _require_sight(self, spec: Spec) -> None:
-        """Refuse observations that no part can encode."""
+    def require_sight(self, spec: Spec) -> None:
+        """Check that the representation can take a family's observations.
+
+        Raises:
+            InputError: it cannot, or tasks would have to be inferred from pictures.
+        """
         self.representation.require(spec.obs)
         if frames.shown(spec.obs) and self.history_length:
             raise InputError("tasks cannot be inferred from pictures; choose another conditioning")
@@ -298,7 +302,7 @@ class BaseAgent(abc.ABC):
 
     def init_common(self, spec: Spec, tasks: Task, key: Key) -> dict[str, Any]:
         """Initialise the fields that all agents' states have, by name, for the training ``tasks`` (T, ...)."""
-        self._require_sight(spec)
+        self.require_sight(spec)
         num_tasks = len(tasks.id)
         vectors, moments = self.load_vectors(spec, num_tasks), self.init_moments(spec, num_tasks)
         features = conditioning.features(self.conditioning, num_tasks, jnp.int32(0), tasks.context[0], vectors)

@@ -91,7 +91,7 @@ class Replay:
         if self.hindsight:
             hindsight.require(env)
 
-    def describe(self, num_envs: int) -> str:
+    def describe(self, spec: Spec, num_envs: int) -> str:
         """Return a description of its size."""
         return f"replay ({self.capacity(num_envs):,} transitions a task)"
 

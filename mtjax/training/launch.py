@@ -36,6 +36,7 @@ def check(config: RunConfig, start: Policy | None = None) -> None:
     config.learner.experience.check(family, config.training.num_envs)
     for learner in points.agents_at(config.learner, config.points):
         require_value_range(learner)
+        learner.require_sight(family.spec)
         if start is not None:
             require_fit(start, family, learner)
     begins = start is not None or bool(config.start)

@@ -54,8 +54,8 @@ class Policy:
         obs = {name: x for name, x in obs.items() if name in wanted} if frames.shown(obs) else obs
         shape = jax.tree.map(np.shape, obs)
         if shape != wanted:
-            stacks = "; mtjax.stacked(env) stacks pictures" if frames.shown(wanted) else ""
-            raise InputError(f"the policy takes one observation of shape {wanted}, not {shape}; use jax.vmap for many{stacks}")
+            fix = "use jax.vmap for many" + ", and mtjax.stacked(env) for stacks of pictures" * frames.shown(wanted)
+            raise InputError(f"the policy takes an observation of shape {wanted}, not {shape}; {fix}")
         memory = self.begin(task) if memory is None else memory
         return self.agent.act(self.state, memory, obs, task, key).action
 

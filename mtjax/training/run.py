@@ -210,7 +210,7 @@ class _Run:
         data = checkpoint.size_of(shapes.data) / 1e6
         self.console.say(
             f"memory: {checkpoint.size_of(shapes) / 1e6:,.0f} MB of state, of which {data:,.0f} MB "
-            f"{self.agent.experience.describe(self.settings.num_envs)}"
+            f"{self.agent.experience.describe(self.env.spec, self.settings.num_envs)}"
         )
         if line := meshes.describe(self.mesh, len(self.seeds), self.settings.num_envs):
             self.console.say(line)
