@@ -171,8 +171,9 @@ RUN = dict(pixels=16, state="also", frames=2, engine="c", repeat=100, hidden=(8,
 RUN |= dict(representation="asymmetric", batch_size=4, replay_size=100, warmup_steps=10, chunk_steps=10, n_step=1)
 
 
+@pytest.mark.slow
 def test_a_policy_that_was_trained_beside_the_state_acts_by_pictures_alone(tmp_path, capsys):
-    """Whole runs: checkpoint, load, evaluate, and a longer run that resumes."""
+    """A whole run: its checkpoint is loaded and evaluated."""
     folder = tmp_path / "run"
     plan = dict(eval_episodes=1, directory=folder, normalize_observations=True)
     mtjax.train("pendulum-swingup", "drq", steps=40, **plan, **RUN)

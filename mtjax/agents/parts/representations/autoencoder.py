@@ -25,7 +25,7 @@ class Autoencoder(Encoded):
     where the mean is over pixels, lambda is ``latent_decay`` and theta_g are the decoder's parameters. Of vectors, s is
     the observation, and g has the encoder's widths the other way round.
 
-    phibar moves by ``encoder_tau`` with its projection.
+    phibar, with its projection, moves by ``encoder_tau``.
 
     Differs from the paper: one optimiser steps encoder, decoder and critics together, at every update; the decay of the
     decoder is a part of the loss.

@@ -42,8 +42,8 @@ class Encoded(Seeing):
     trains it, and the actor's input is sg(phi(s)). Of pictures, phi is convolutions f (``vision``), and a projection: a
     linear layer, layer normalisation and tanh. The critics' loss trains f and the critics' projection. The actor has a
     projection of its own on sg(f(s)), which its loss trains. A state that is observed beside pictures is appended to
-    the latent state. Target critics see phibar(s), the target encoder. It moves by ``encoder_tau``; at 1 it is phi.
-    The target copy of the projection moves by ``tau``, as the critics' other layers do.
+    the latent state. Target critics see phibar(s), the target encoder. It moves by ``encoder_tau``; of pictures this is
+    f alone, and the projection's target copy moves by ``tau``, as those of the critics' other layers do.
 
     In every update from the replay each picture of the batch is shifted at random by up to ``shift`` pixels, those of s
     and of s' on their own (Yarats, Kostrikov and Fergus 2021, DrQ; Yarats et al. 2022, DrQ-v2). PPO shifts none.
@@ -51,8 +51,9 @@ class Encoded(Seeing):
     The vectors of conditioning=embedding, and the trajectory encoder of conditioning=inferred, belong to this
     representation: all networks use the same, which critics train, and the actor does not.
 
-    Differs from DrQ-v2: the learner is SAC, with tuned temperatures, and not DDPG with scheduled noise; shifts are by
-    whole pixels; weights of linear layers begin by LeCun's initialisation, there orthogonal.
+    With encoder_tau=1 f, projections and target copies are those of DrQ-v2. Differs from it: the learner is SAC, with
+    tuned temperatures, and not DDPG with scheduled noise; the actor's loss sees f after the critics' step, there before
+    it; weights of linear layers begin by LeCun's initialisation, there they are orthogonal.
     """
 
     encoder_tau: float = 0.05
