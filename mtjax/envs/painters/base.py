@@ -1,4 +1,4 @@
-"""The interface of painters, and the choice of one: MuJoCo Warp's ray tracer on NVIDIA GPUs, the caster anywhere."""
+"""The interface of painters, and the choice of one: a ray caster in plain JAX, or MuJoCo Warp's ray tracer."""
 
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -23,14 +23,13 @@ class Painter(Protocol):
 
 
 def choose_painter(name: str) -> Any:
-    """Return the class of a painter.
+    """Return the class of a painter. "auto" is the caster: on an H200 too it draws dm_control's scenes faster.
 
     Raises:
         InputError: this device cannot run it, or Warp is not installed.
     """
-    able = is_nvidia() and warp_installed()
     if name == "warp" and not is_nvidia():
         raise InputError("painter 'warp' needs an NVIDIA GPU; use --env.painter=caster")
-    if name == "warp" and not able:
+    if name == "warp" and not warp_installed():
         raise InputError("painter 'warp' needs Warp, which is not installed: pip install 'mtjax[warp]'")
-    return WarpPainter if name == "warp" or (name == "auto" and able) else Caster
+    return WarpPainter if name == "warp" else Caster
