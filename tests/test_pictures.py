@@ -225,3 +225,16 @@ def test_presets_of_a_part_do_not_apply_to_another():
 def test_pictures_need_warm_up_steps_for_a_window():
     with pytest.raises(InputError, match="warmup-steps of at least 6"):
         mtjax.train(Pictured(), mtjax.agent("drq"), steps=100, warmup_steps=5)
+
+
+@pytest.mark.parametrize("name", probes.slow_but(probes.OFF_POLICY, "sac", "distral", "care", "xqc", "hip-bmdp"))
+def test_every_agent_can_be_asymmetric(name):
+    """Shapes alone: what one batch of pictures and states makes of a state is a state."""
+    agent = probes.tiny(name, representation="asymmetric", n_step=1)
+    spec, tasks = BESIDE.spec, BESIDE.tasks()
+    batch = probes.random_batch(0, len(tasks.id), 4, spec)
+    state = jax.eval_shape(lambda: agent.init(spec, tasks, KEY))
+    after, _ = jax.eval_shape(lambda state: agent.update(state, batch, tasks, KEY), state)
+    assert jax.tree.map(lambda x: x.shape, after) == jax.tree.map(lambda x: x.shape, state)
+    assert any("sight" in place or "sight" in place.get("distilled", ()) for place in state.actor)
+    assert not any("sight" in place or "latent" in place for place in state.critic)

@@ -202,7 +202,7 @@ class Mixture(Tabled):
     def _spec(self) -> Spec:
         specs = [family.spec for family in self.families]
         self._require_one_look(specs)
-        widest = jax.ShapeDtypeStruct((max(map(frames.state_size, specs)),), jnp.float32)
+        widest: Any = jax.ShapeDtypeStruct((max(map(frames.state_size, specs)),), jnp.float32)
         return Spec(
             obs=frames.with_state(lambda _: widest, specs[0].obs),
             action_size=max(spec.action_size for spec in specs),

@@ -40,7 +40,7 @@ class Policy:
         shapes = f"observation {tuple(getattr(spec.obs, 'shape', ()))}, action ({spec.action_size},)"
         return f"Policy({names}: {shapes}, one of {len(self.seeds)} seed{'s' * (len(self.seeds) > 1)})"
 
-    def __call__(self, obs: Array, task: Task, key: Key | None = None, memory: Any = None) -> Array:
+    def __call__(self, obs: Any, task: Task, key: Key | None = None, memory: Any = None) -> Array:
         """Return the mean action (A,), or a sampled one if a key is given.
 
         Args:
