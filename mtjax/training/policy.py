@@ -55,7 +55,7 @@ class Policy:
         shape = jax.tree.map(np.shape, obs)
         if shape != wanted:
             fix = "use jax.vmap for many" + ", and mtjax.stacked(env) for stacks of pictures" * frames.shown(wanted)
-            raise InputError(f"the policy takes an observation of shape {wanted}, not {shape}; {fix}")
+            raise InputError(f"an observation for this policy has shape {wanted}, not {shape}; {fix}")
         memory = self.begin(task) if memory is None else memory
         return self.agent.act(self.state, memory, obs, task, key).action
 
