@@ -5,7 +5,7 @@ A network is a body and a linear head. It is applied to the data of one task; th
 
 import dataclasses
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
 
 import flax.linen as nn
@@ -29,6 +29,10 @@ class Params(NamedTuple):
     def beside(self, others: "Params") -> "Params":
         """Return the union of both; no two parts may have the same name."""
         return Params({**self.shared, **others.shared}, {**self.own, **others.own})
+
+    def of_first(self) -> "Params":
+        """Return the parameters that the first task uses."""
+        return Params(self.shared, jax.tree.map(lambda x: x[0], self.own))
 
     def without(self, names: Collection[str]) -> "Params":
         """Return all parts but those with the given names."""
@@ -86,12 +90,13 @@ class Network:
     """Applies a body and a linear head; each is shared by all tasks, or every task has its own."""
 
     body: nn.Module
-    own: tuple[str, ...] = ()  # those of "trajectory", "body" and "head" that every task has for itself
+    own: tuple[str, ...] = ()  # those of "trajectory", "sight", "body" and "head" that every task has for itself
     embedding_size: int = 0  # of each task's learned vector, in place of features; 0 for none
     unit_embedding: bool = False  # scale those vectors to length 1
     front: nn.Module | None = None  # maps observations before the body; every task's own
     trajectory: nn.Module | None = None  # maps observation and past, a ``Seen``, to features
     unit_head: bool = False  # keep the head's weights of each output at length 1
+    sight: nn.Module | None = None  # maps observations with pictures to vectors, before the body
 
     def init(self, key: Key, num_tasks: int, out: int, features: Array, *inputs: Array) -> Params:
         """Initialise parameters for ``num_tasks`` tasks, ``out`` outputs, and inputs of the given shapes."""
@@ -104,6 +109,9 @@ class Network:
             parts["trajectory"] = (self.trajectory.init, jax.random.fold_in(key, 4), inputs[0])
             features = self.trajectory.init_with_output(key, inputs[0])[0]  # type: ignore
             inputs = (inputs[0].obs, *inputs[1:])  # type: ignore
+        if self.sight is not None and isinstance(inputs[0], Mapping):
+            parts["sight"] = (self.sight.init, jax.random.fold_in(key, 5), inputs[0])
+            inputs = (self.sight.init_with_output(key, inputs[0])[0], *inputs[1:])  # type: ignore
         if self.front is not None:
             params.own["front"] = self.for_each_task(self.front.init, front_key, num_tasks, inputs[0])
             first = jax.tree.map(lambda x: x[0], params.own["front"])
@@ -160,7 +168,9 @@ class Network:
         if self.trajectory is not None:
             features = self.trajectory.apply(parts["trajectory"], inputs[0])  # type: ignore
             inputs = (inputs[0].obs, *inputs[1:])  # type: ignore
-        obs: Any = inputs[0] if self.front is None else self.front.apply(parts["front"], inputs[0])
+        obs: Any = inputs[0]
+        for name, module in (("sight", self.sight), ("front", self.front)):
+            obs = module.apply(parts[name], obs) if module is not None and name in parts else obs
         variables = parts["body"] | {name: parts[name] for name in (STATISTICS,) if name in parts}
         return self.body.apply(variables, obs, features, *inputs[1:], mutable=mutable)
 

@@ -17,6 +17,7 @@ from mtjax.config import configure
 from mtjax.envs import ENVS
 from mtjax.envs.probes import AFTER, LIMIT, RULES, SPEC, Probe, tasks_of
 from mtjax.experience import Replay
+from mtjax.frames import seen
 from mtjax.networks import Params
 from mtjax.types import Acted, Spec, Task, Transition
 
@@ -198,8 +199,17 @@ def quick(function, *arguments):
     return jax.jit(function).lower(*arguments).compile(QUICK)
 
 
+@dataclasses.dataclass(frozen=True)
+class Named:
+    """A spec that is a key: pictures lie in dicts, which are none."""
+
+    text: str
+    spec: Spec = dataclasses.field(compare=False)
+
+
 @lru_cache
-def _agent_programs(agent, spec: Spec, num_tasks: int, batch_size: int):
+def _agent_programs(agent, named: Named, num_tasks: int, batch_size: int):
+    spec = named.spec
     tasks, key = tasks_of("one-step", np.ones(num_tasks)), jax.random.key(0)
     init = lambda tasks, key: agent.init(spec, tasks, key)
     batch = random_batch(0, num_tasks, batch_size, spec, agent.history_length)
@@ -208,7 +218,7 @@ def _agent_programs(agent, spec: Spec, num_tasks: int, batch_size: int):
 
 def learner(agent, tasks: Task, batch_size: int, spec: Spec = SPEC):
     """Compile an agent: ``init(tasks, key)`` and ``update(state, batch, tasks, key)``."""
-    return _agent_programs(agent, spec, len(tasks.id), batch_size)
+    return _agent_programs(agent, Named(str(spec), spec), len(tasks.id), batch_size)
 
 
 def pick(tree, index):
@@ -254,12 +264,14 @@ def random_batch(seed: int, num_tasks: int, batch_size: int, spec: Spec = SPEC, 
     """A batch (T, B, ...) in which every field is random and about one discount in four is 0."""
     random = np.random.default_rng(seed)
     normal = lambda *shape: jnp.float32(random.normal(size=(num_tasks, batch_size, *shape)))
+    numbers = lambda shape: jnp.uint8(random.integers(256, size=(num_tasks, batch_size, *shape)))
+    see = lambda: jax.tree.map(lambda x: numbers(x.shape) if x.dtype == jnp.uint8 else normal(*x.shape), seen(spec))
     batch = Transition(
-        obs=normal(spec.obs_size),
+        obs=see(),
         action=jnp.tanh(normal(spec.action_size)),
         reward=normal(),
         discount=jnp.float32(random.random((num_tasks, batch_size)) < 0.75),
-        next_obs=normal(spec.obs_size),
+        next_obs=see(),
     )
     return batch._replace(extras=random_past(random, (num_tasks, batch_size, history), spec)) if history else batch
 

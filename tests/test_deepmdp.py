@@ -26,7 +26,8 @@ from probes import values as values_of
 
 from mtjax import agents
 from mtjax.agents.parts.gradients.balancing import FAMO
-from mtjax.agents.parts.representations.deepmdp import ENCODERS, ModelTargets
+from mtjax.agents.parts.representations.deepmdp import ModelTargets
+from mtjax.agents.parts.representations.encoded import ENCODERS
 from mtjax.agents.parts.trajectory import Past, Seen, append
 from mtjax.agents.ppo import Taken
 from mtjax.agents.sac import Batch

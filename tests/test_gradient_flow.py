@@ -12,6 +12,9 @@ from mtjax.networks import Params
 from mtjax.types import Spec
 
 SPEC, BATCH = Spec.vector(3, 2, 1), 4
+PICTURE = {"pixels": jax.ShapeDtypeStruct((16, 16, 1), jnp.uint8)}
+SEEN = SPEC._replace(obs=PICTURE, frames=2)
+BESIDE = SEEN._replace(obs=PICTURE | {"state": SPEC.obs})
 SCALES = (1.0, -0.5, 0.3)
 TASKS = tasks_of("one-step", SCALES)
 
@@ -25,6 +28,7 @@ MODELS = {"shared/transition", "shared/reward"}
 LATENT = {"actor": TRUNK, "critic": TRUNK | {"shared/latent"} | MODELS, "target": TRUNK | {"shared/latent"}}
 ENCODED = {"actor": TRUNK, "critic": TRUNK | {"shared/latent"}, "target": TRUNK | {"shared/latent"}}
 REBUILT = ENCODED | {"critic": ENCODED["critic"] | {"shared/decoder"}}
+SIGHT = {part: parts | {"shared/projection"} for part, parts in ENCODED.items()} | {"actor": TRUNK | {"shared/sight"}}
 WITH_THETA = {**LATENT, **{who: LATENT[who] | {"own/embedding"} for who in ("critic", "target")}}
 WHOLE_CARE = CARE | {"shared/body/after"}
 CARE_ON_LATENT = {who: (parts - TRUNK) | WHOLE_CARE for who, parts in LATENT.items()}
@@ -57,7 +61,14 @@ PARTS = {
     "simba-v2": ("simba-v2", {"value": "hl-gauss"}, HYPERSPHERE | {"shared/head"}),
     "xqc": ("xqc", {"value": "hl-gauss"}, BATCH_NORM | {"shared/head", "own/batch_stats"}),
     "drq": ("drq", {"n_step": 1}, ENCODED),
+    "drq-pictures": ("drq", {"n_step": 1}, SIGHT),
+    "asymmetric": (
+        "drq",
+        {"n_step": 1, "representation": "asymmetric"},
+        {"actor": TRUNK | {"shared/sight"}, "critic": TRUNK, "target": TRUNK},
+    ),
     "sac-ae": ("sac-ae", {}, REBUILT),
+    "sac-ae-pictures": ("sac-ae", {}, SIGHT | {"critic": SIGHT["critic"] | {"shared/decoder"}}),
     "deepmdp": ("deepmdp", {}, LATENT),
     "hip-bmdp": ("hip-bmdp", {}, WITH_THETA),
     "care-deepmdp": ("care", {"representation": "deepmdp"}, CARE_ON_LATENT),
@@ -67,21 +78,23 @@ PARTS = {
     "famo": ("famo", {}, TRUNK),
 }
 ALIKE = ("cagrad", "gradnorm", "famo", "drq")  # with pcgrad's networks, or sac-ae's but for the decoder
+SPECS = {"drq-pictures": SEEN, "asymmetric": BESIDE, "sac-ae-pictures": SEEN}  # what agents see, if not vectors
 QUICK = [case for case in PARTS if case in OFF_POLICY and case not in ALIKE]  # others are variants of these
+QUICK += ["drq-pictures", "asymmetric"]
 EVERY_AGENT = pytest.mark.parametrize("case", slow_but(PARTS, *QUICK))
 
 
 def start(case, seed=0):
     """The agent's state and its compiled update."""
     name, settings, _ = PARTS[case]
-    init, update = learner(tiny(name, **settings), TASKS, BATCH, SPEC)
+    init, update = learner(tiny(name, **settings), TASKS, BATCH, SPECS.get(case, SPEC))
     return init(TASKS, jax.random.key(seed)), update
 
 
-def batch_of(case, seed, spec=SPEC):
+def batch_of(case, seed):
     """A random batch of what the agent sees."""
     name, settings, _ = PARTS[case]
-    return random_batch(seed, 3, BATCH, spec, tiny(name, **settings).history_length)
+    return random_batch(seed, 3, BATCH, SPECS.get(case, SPEC), tiny(name, **settings).history_length)
 
 
 def leaves_of(params):
@@ -99,6 +112,7 @@ def parts_of(case, network):
 
 ONE_OF_A_KIND = {
     "shared/latent",
+    "shared/projection",
     "shared/transition",
     "shared/reward",
     "shared/decoder",
@@ -151,7 +165,7 @@ FLOW = {
 _ON_ENCODED = {"critic": ((), ("actor",)), "reward": ((), ("actor", "critic", "target"))}
 _ON_LATENT = {"critic": ((), ("actor",)), "target": ((), ("critic",)), "reward": ((), ("actor", "critic", "target"))}
 FLOW_OF = {
-    **dict.fromkeys(("drq", "sac-ae"), _ON_ENCODED),
+    **dict.fromkeys(("drq", "sac-ae", "drq-pictures", "sac-ae-pictures"), _ON_ENCODED),
     **dict.fromkeys(("deepmdp", "hip-bmdp", "care-deepmdp"), _ON_LATENT),
     "brc": {"log_temperature": ((), ("actor",))},
     "xqc": {"actor": ((), ("critic", "target", "log_temperature"))},
@@ -193,7 +207,8 @@ def test_losses_reach_their_own_parameters_alone(case):
 
 def tau_of(agent, part):
     """How fast the slow copy of a part follows."""
-    return agent.tau if part in ("body", "head") else getattr(agent.representation, "encoder_tau", agent.tau)
+    own = ("body", "head") if agent.representation.models else ("body", "head", "projection")
+    return agent.tau if part in own else getattr(agent.representation, "encoder_tau", agent.tau)
 
 
 @EVERY_AGENT
@@ -213,6 +228,22 @@ def test_the_slow_critic_is_what_bootstraps(case):
     expected = jax.tree.map(mix, taus, slow, new, is_leaf=lambda x: isinstance(x, float))
     for a, b in zip(jax.tree.leaves(expected), jax.tree.leaves(other.target), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7)
+
+
+def test_critics_that_see_the_state_see_no_picture():
+    """And the actor sees no state: it reaches the actor through the critics' values only."""
+    state, update = start("asymmetric")
+    batch, key = batch_of("asymmetric", 0)._replace(discount=jnp.zeros((3, BATCH))), jax.random.key(1)
+    see = lambda name: batch._replace(obs=batch.obs | {name: batch_of("asymmetric", 1).obs[name]})
+    plain, other_picture, other_state = (update(state, x, TASKS, key)[0] for x in (batch, see("pixels"), see("state")))
+    assert same(learned(plain, "critic"), learned(other_picture, "critic"))
+    assert not same(learned(plain, "actor"), learned(other_picture, "actor"))
+    assert not same(learned(plain, "critic"), learned(other_state, "critic"))
+    assert not same(learned(plain, "actor"), learned(other_state, "actor"))
+    agent = tiny("drq", **PARTS["asymmetric"][1])
+    task, obs = pick(TASKS, 0), pick(batch.obs, (0, 0))
+    alone = {"pixels": obs["pixels"]}
+    np.testing.assert_array_equal(act_once(agent, state, alone, task, None), act_once(agent, state, obs, task, None))
 
 
 # What CARE detaches.

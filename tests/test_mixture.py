@@ -8,6 +8,7 @@ from typing import ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import probes
 import pytest
 from probes import OFF_POLICY, one_in, slow_but
 
@@ -113,6 +114,42 @@ def spread(tasks: Task, envs: int = 2) -> Task:
 
 def pick(tree, index):
     return jax.tree.map(lambda x: x[index], tree)
+
+
+@dataclasses.dataclass(frozen=True)
+class Shown(Aim):
+    """An aim that shows what it observes as a picture, with or without the numbers beside it."""
+
+    side: int = 16
+    state: str = "hidden"
+
+    @property
+    def spec(self):
+        picture = jax.ShapeDtypeStruct((self.side, self.side, 1), jnp.uint8)
+        beside = {"state": jax.ShapeDtypeStruct((self.obs_size,), jnp.float32)} if self.state == "also" else {}
+        return super().spec._replace(obs={"pixels": picture} | beside, frames=2)
+
+    def show(self, step):
+        picture = jnp.full((self.side, self.side, 1), jnp.clip(50 * step.obs[0] + 100, 0, 255)).astype(jnp.uint8)
+        return step._replace(obs={"pixels": picture} | ({"state": step.obs} if self.state == "also" else {}))
+
+    def reset(self, task, key):
+        return self.show(super().reset(task, key))
+
+    def step(self, task, state, action):
+        return self.show(super().step(task, state, action))
+
+
+@dataclasses.dataclass(frozen=True)
+class WideShown(Shown):
+    """The same with three numbers to see, and longer episodes."""
+
+    obs_size: ClassVar[int] = 3
+    episode_steps: ClassVar[int] = 7
+
+
+def shown(**settings):
+    return mixture([Shown(vary={"goal": "-1,1"}, split="none", **settings), WideShown(**settings)])
 
 
 # Tasks.
@@ -585,3 +622,51 @@ def test_a_mixture_is_not_fine_tuned(run):
 def test_names_of_many_families_are_shortened():
     assert short_name("bandit+tabular-mdp") == "bandit+tabular-mdp"
     assert short_name("+".join(f"family-number-{i}" for i in range(9))) == "mixture-of-9"
+
+
+# Pictures.
+
+
+def test_families_with_pictures_of_one_shape_mix():
+    """Pictures are each family's own, and the numbers beside them are padded."""
+    env = shown(state="also")
+    assert {name: x.shape for name, x in env.spec.obs.items()} == {"pixels": (16, 16, 1), "state": (3,)}
+    assert (env.spec.frames, env.spec.mixed, shown().spec.obs.keys()) == (2, True, {"pixels"})
+    tasks, keys = env.tasks(), keys_of(env.tasks())
+    start = env.reset_worlds(spread(tasks)._replace(blocks=tasks.blocks), keys)
+    step = env.step_worlds(spread(tasks)._replace(blocks=tasks.blocks), start.state, jnp.ones((1, 3, 2, 1)))
+    for place, family in zip((slice(0, 2), slice(2, 3)), env.families, strict=True):
+        own = spread(family.tasks())
+        theirs = family.reset_worlds(own, keys[:, place])
+        then = family.step_worlds(own, theirs.state, jnp.ones((*own.id.shape, 1)))
+        for ours, alone in ((start, theirs), (step, then)):
+            np.testing.assert_array_equal(ours.obs["pixels"][:, place], alone.obs["pixels"])
+            np.testing.assert_array_equal(ours.obs["state"][:, place][..., : family.obs_size], alone.obs["state"])
+            assert not np.any(ours.obs["state"][:, place][..., family.obs_size :])
+
+
+def test_families_that_look_otherwise_do_not_mix():
+    with pytest.raises(InputError, match=r"shown shows 2 pictures \(16, 16, 1\) and wide-shown 2 .*18, 18"):
+        _ = mixture([Shown(), WideShown(side=18)]).spec
+    with pytest.raises(InputError, match="and aim no pictures; give all the same pixels"):
+        _ = mixture([Shown(), AIM]).spec
+    with pytest.raises(InputError, match="beside a state"):
+        _ = mixture([Shown(), WideShown(state="also")]).spec
+    with pytest.raises(InputError, match="is a mixture; take one family"):
+        mtjax.stacked(shown())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [("drq", {}), ("drq", {"representation": "asymmetric"}), ("ppo", {"representation": "encoded"})],
+)
+def test_agents_learn_a_mixture_of_pictures(monkeypatch, name, settings):
+    """Every task's own best action, which its number in the context tells."""
+    monkeypatch.setattr(probes, "QUICK", {"xla_backend_optimization_level": 2})  # else convolutions are slow
+    env = shown(state="also" if settings.get("representation") == "asymmetric" else "hidden")
+    agent = agents.agent(name, latent_widths=(8,), hidden=(32,), actor_lr=3e-3, critic_lr=3e-3, **settings)
+    given = {"unroll": 4, "minibatches": 2} if name == "ppo" else {"replay_size": 1000, "batch_size": 8, "n_step": 1}
+    _, history = probes.train(env, agent, {"num_envs": 4, "chunk_steps": 100, **given}, chunks=5)
+    first, last = (np.mean(x["return"]) for x in (history[0], history[-1]))
+    assert last > first / 2, (first, last)

@@ -5,13 +5,15 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+import probes
 import pytest
 
 import mtjax
+import mtjax.evaluate
 from mtjax import frames
 from mtjax.agents.parts import vision
-from mtjax.envs.probes import Pictured
-from mtjax.experience import pictures
+from mtjax.envs.probes import Pictured, Probe
+from mtjax.experience import Rollouts, pictures
 from mtjax.types import InputError, Transition
 
 KEY = jax.random.key(0)
@@ -127,8 +129,112 @@ def test_agents_learn_what_only_pictures_show(name):
     assert float(result.rows[-1]["return"]) > -0.15
 
 
-def test_pictures_need_an_agent_that_sees():
-    with pytest.raises(InputError, match="use --agent=drq or"):
-        mtjax.train(Pictured(), mtjax.agent("sac"), steps=100)
+@pytest.fixture
+def fast_convolutions(monkeypatch):
+    """Compile programs as users get them."""
+    monkeypatch.setattr(probes, "QUICK", {"xla_backend_optimization_level": 2})
+
+
+BESIDE = Pictured("by-both", state="also")
+
+
+def test_an_actor_learns_from_pictures_under_critics_that_see_the_state(fast_convolutions):
+    """Without seeing, the best mean return is -0.625."""
+    agent = mtjax.agent("drq", representation="asymmetric", shift=1, n_step=1)
+    _, history = probes.train(BESIDE, agent, SMALL | FAST, chunks=3)
+    assert np.mean(history[-1]["return"]) > -0.15
+
+
+ON_POLICY = dict(hidden=(32, 32), latent_widths=(16,), num_envs=16, unroll=4, minibatches=2, chunk_steps=40)
+ON_POLICY |= dict(actor_lr=3e-3, critic_lr=3e-3, entropy_cost=0.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("representation", ["encoded", "asymmetric"])
+def test_ppo_learns_what_only_pictures_show(fast_convolutions, representation):
+    env = Pictured("by-both") if representation == "encoded" else BESIDE
+    agent = mtjax.agent("ppo", representation=representation)
+    state, history = probes.train(env, agent, ON_POLICY, chunks=6)
+    assert np.mean(history[-1]["return"]) > -0.3
+    assert ("latent" in state.agent.critic.shared) == (representation == "encoded")
+    assert "sight" in state.agent.actor.shared
+
+
+def test_rollouts_tell_what_their_pictures_take():
+    """Two stacks of 2 x 16 x 16 bytes a step; vectors take so little that it is not told."""
+    text = Rollouts(unroll=100).describe(Pictured(frames=2).spec, 10)
+    assert "1,000 transitions" in text and "1 MB of pictures a task" in text
+    assert "MB" not in Rollouts(unroll=100).describe(Probe().spec, 10)
+
+
+RUN = dict(pixels=16, state="also", frames=2, engine="c", repeat=100, hidden=(8,), latent_widths=(4,), num_envs=2)
+RUN |= dict(representation="asymmetric", batch_size=4, replay_size=100, warmup_steps=10, chunk_steps=10, n_step=1)
+
+
+@pytest.mark.slow
+def test_a_policy_that_was_trained_beside_the_state_acts_by_pictures_alone(tmp_path, capsys):
+    """A whole run: its checkpoint is loaded and evaluated."""
+    folder = tmp_path / "run"
+    plan = dict(eval_episodes=1, directory=folder, normalize_observations=True)
+    mtjax.train("pendulum-swingup", "drq", steps=40, **plan, **RUN)
+    policy = mtjax.load(folder)
+    assert policy.agent == mtjax.agent("drq", **mtjax.agents.settings(policy.agent))
+    task = jax.tree.map(lambda x: x[0], policy.env.tasks())
+    stacks = mtjax.stacked(policy.env).reset(task, KEY).obs
+    assert set(stacks) == {"pixels", "state"}
+    alone = policy({"pixels": stacks["pixels"]}, task)
+    np.testing.assert_array_equal(policy(stacks, task), alone)
+    assert np.any(policy({"pixels": 255 - stacks["pixels"]}, task) != alone)
+    with pytest.raises(InputError, match=r"shape .*16, 16, 6.* not .*16, 16, 3.*mtjax.stacked"):
+        policy(policy.env.reset(task, KEY).obs, task)
+    mtjax.evaluate.main([f"--run={folder}", "--episodes=1"])
+    assert "train" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("env", "agent", "message"),
+    [
+        (Pictured(), mtjax.agent("sac"), "use --agent=drq or"),
+        (Pictured(), mtjax.agent("drq", representation="asymmetric"), "give --env.pixels=64 --env.state=also"),
+        (Probe(), mtjax.agent("ppo", representation="asymmetric"), "give --env.pixels=64 --env.state=also"),
+        (BESIDE, mtjax.agent("deepmdp"), "leave out --env.state=also"),
+        (Pictured(), mtjax.agent("drq", conditioning="inferred"), "cannot be inferred from pictures"),
+    ],
+)
+def test_observations_that_no_part_takes_are_refused(env, agent, message):
+    with pytest.raises(InputError, match=message):
+        mtjax.train(env, agent, steps=100)
+
+
+def test_a_run_is_refused_before_its_folder_is_made(tmp_path):
+    with pytest.raises(InputError, match=r"give --env.pixels=64 --env.state=also"):
+        mtjax.train("pendulum-swingup", "drq", representation="asymmetric", directory=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_presets_of_a_part_do_not_apply_to_another():
+    """And those of the agent and of other parts stay."""
+    agent = mtjax.agent("drq", representation="asymmetric")
+    assert (agent.experience.n_step, agent.tau) == (3, 0.01)
+    agent = mtjax.agent("drq", encoder="film")
+    assert (agent.experience.n_step, agent.representation.encoder_tau) == (3, 1.0)
+    with pytest.raises(InputError, match="encoder_tau"):
+        mtjax.agent("drq", representation="asymmetric", encoder_tau=0.5)
+
+
+def test_pictures_need_warm_up_steps_for_a_window():
     with pytest.raises(InputError, match="warmup-steps of at least 6"):
         mtjax.train(Pictured(), mtjax.agent("drq"), steps=100, warmup_steps=5)
+
+
+@pytest.mark.parametrize("name", probes.slow_but(probes.OFF_POLICY, "sac", "distral", "care", "xqc", "hip-bmdp"))
+def test_every_agent_can_be_asymmetric(name):
+    """Shapes alone: what one batch of pictures and states makes of a state is a state."""
+    agent = probes.tiny(name, representation="asymmetric", n_step=1)
+    spec, tasks = BESIDE.spec, BESIDE.tasks()
+    batch = probes.random_batch(0, len(tasks.id), 4, spec)
+    state = jax.eval_shape(lambda: agent.init(spec, tasks, KEY))
+    after, _ = jax.eval_shape(lambda state: agent.update(state, batch, tasks, KEY), state)
+    assert jax.tree.map(lambda x: x.shape, after) == jax.tree.map(lambda x: x.shape, state)
+    assert any("sight" in place or "sight" in place.get("distilled", ()) for place in state.actor)
+    assert not any("sight" in place or "latent" in place for place in state.critic)

@@ -14,7 +14,7 @@ from mtjax.agents.parts.encoders import ENCODERS
 from mtjax.agents.parts.gradients.surgery import RULES
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
-from mtjax.agents.ppo import Batch, Taken, Units, advantages, take_steps
+from mtjax.agents.ppo import Batch, Taken, Units, advantages, in_parts, take_steps
 from mtjax.config import with_preset
 from mtjax.envs.probes import Probe, tasks_of
 from mtjax.networks import log_density
@@ -78,6 +78,17 @@ def test_advantages_are_those_of_a_plain_loop():
                 if ended[k, e]:
                     break
             assert found[t, e] == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize("parts", (1, 3, 4))
+def test_values_in_parts_are_those_of_one_call(parts):
+    """For counts that the parts do not divide, and features of tasks or of every step."""
+    random = np.random.default_rng(0)
+    obs = {"pixels": jnp.float32(random.normal(size=(2, 7, 3, 1)))}
+    scale = lambda features, place: features[..., place] if features.ndim == 3 else features[:, None, place]
+    whole = lambda features, obs: scale(features, 0) * jnp.sum(obs["pixels"], axis=(2, 3)) + scale(features, 1)
+    for features in (jnp.float32(random.normal(size=shape)) for shape in ((2, 2), (2, 7, 2))):
+        np.testing.assert_allclose(in_parts(whole, features, obs, parts), whole(features, obs), rtol=1e-6)
 
 
 def test_every_task_has_its_own_discount():

@@ -83,10 +83,7 @@ def agent(name: str, **given: Any) -> "BaseAgent":
         InputError: no agent has that name, no setting has one of the given names, or a value is not allowed.
     """
     preset = preset_of(name)
-    defaults = dict(preset.defaults)
-    if "encoder" in given:  # the preset's settings of another encoder do not apply
-        defaults = {k: v for k, v in defaults.items() if k in preset.cls.__dataclass_fields__}
-    return load("mtjax.agents.choices:build")(name, preset.cls, {**defaults, **given})
+    return load("mtjax.agents.choices:build")(name, preset.cls, preset.defaults, given)
 
 
 def preset_of(name: str) -> Preset:

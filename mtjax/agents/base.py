@@ -157,8 +157,13 @@ class BaseAgent(abc.ABC):
         """Return the initial state for the training ``tasks`` (T, ...)."""
 
     @abc.abstractmethod
-    def init_networks(self, num_tasks: int, features: Array, obs: Any, action: Array, key: Key) -> Pair:
-        """Initialise actor and critics for features (Z,), an observation (O,) and an action (A,) of these shapes."""
+    def init_networks(self, num_tasks: int, inputs: Pair, action: Array, key: Key) -> Pair:
+        """Initialise actor and critics for inputs of these shapes.
+
+        Args:
+            inputs: features (Z,) and an observation (O,), those of the actor and those of the critics.
+            action: (A,).
+        """
 
     @abc.abstractmethod
     def act(self, state: Any, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
@@ -192,7 +197,7 @@ class BaseAgent(abc.ABC):
             raise InputError(
                 f"{encoder} needs an agent that keeps running statistics, such as xqc; use another encoder"
             )
-        if self.representation.learns and self.encoder.front() is not None:
+        if self.representation.sees_pictures and self.encoder.front() is not None:
             name = parts.name_of(REPRESENTATIONS, self.representation)
             raise InputError(
                 f"{encoder} maps observations, and with representation={name} networks see a latent state; "
@@ -211,20 +216,21 @@ class BaseAgent(abc.ABC):
                 f"reset-every begins the optimisers anew, and lr-schedule={self.lr_schedule} with them; use constant"
             )
 
-    def _require_sight(self, spec: Spec) -> None:
-        """Refuse pictures where no part encodes them."""
-        if not frames.shown(spec.obs):
-            return
-        if not self.representation.sees_pictures:
-            raise InputError("networks take vectors; for pictures use --agent=drq or --agent.representation=encoded")
-        if self.history_length:
+    def require_sight(self, spec: Spec) -> None:
+        """Check that the representation can take a family's observations.
+
+        Raises:
+            InputError: it cannot, or tasks would have to be inferred from pictures.
+        """
+        self.representation.require(spec.obs)
+        if frames.shown(spec.obs) and self.history_length:
             raise InputError("tasks cannot be inferred from pictures; choose another conditioning")
 
     # Networks.
 
     def network(self, hidden: tuple[int, ...], layer_norm: bool) -> Network:
         """Return a network of the body and heads that the settings ask for."""
-        own = {"shared": (), "per-task": ("head",), "disjoint": ("trajectory", "body", "head")}[self.heads]
+        own = {"shared": (), "per-task": ("head",), "disjoint": ("trajectory", "sight", "body", "head")}[self.heads]
         body = self.encoder.body(hidden, layer_norm)
         if self.representation.learns:  # it also holds the task embeddings of all networks
             return Network(body, own)
@@ -239,7 +245,8 @@ class BaseAgent(abc.ABC):
 
     @property
     def actor(self) -> Network:
-        return self.network(self.widths.actor, self.actor_layer_norm)
+        network = self.network(self.widths.actor, self.actor_layer_norm)
+        return dataclasses.replace(network, sight=self.representation.sight)
 
     @property
     def critic(self) -> Network:
@@ -259,7 +266,7 @@ class BaseAgent(abc.ABC):
 
     def actor_inputs(self, critic: Params, features: Array, obs: Any) -> tuple[Array, Any]:
         """Return features (Z,) and inputs (..., O) of one task's actor; no gradient reaches the representation."""
-        return jax.lax.stop_gradient(self.placed_representation.perceive(critic, features, obs))
+        return jax.lax.stop_gradient(self.placed_representation.actor_inputs(critic, features, obs))
 
     @property
     def network_optimizers(self) -> Pair:
@@ -295,14 +302,17 @@ class BaseAgent(abc.ABC):
 
     def init_common(self, spec: Spec, tasks: Task, key: Key) -> dict[str, Any]:
         """Initialise the fields that all agents' states have, by name, for the training ``tasks`` (T, ...)."""
-        self._require_sight(spec)
+        self.require_sight(spec)
         num_tasks = len(tasks.id)
         vectors, moments = self.load_vectors(spec, num_tasks), self.init_moments(spec, num_tasks)
         features = conditioning.features(self.conditioning, num_tasks, jnp.int32(0), tasks.context[0], vectors)
         obs, action = self.example(spec, moments), jnp.zeros(spec.action_size)
-        basis = self.placed_representation.init(num_tasks, features, obs, action, key)
-        actor, critic = self.init_networks(num_tasks, basis.features, basis.obs, action, basis.key)
-        critic = critic.beside(basis.params)
+        representation = self.placed_representation
+        params, key = representation.init(num_tasks, features, obs, action, key)
+        one = params.of_first()
+        inputs = Pair(representation.actor_inputs(one, features, obs), representation.perceive(one, features, obs))
+        actor, critic = self.init_networks(num_tasks, inputs, action, key)
+        critic = critic.beside(params)
         rule_memory = lambda rule, params: surgery.init(rule, params, num_tasks, self.per_layer)
         return {
             "actor": actor,

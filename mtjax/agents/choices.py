@@ -75,17 +75,22 @@ def replace(agent: Any, given: Mapping[str, Any]) -> Any:
     return dataclasses.replace(agent, **checked(agent, rest), **chosen)
 
 
-def build(name: str, cls: type, given: Mapping[str, Any]) -> Any:
-    """Make the agent called ``name`` from a flat table of settings.
+def build(name: str, cls: type, defaults: Mapping[str, Any], given: Mapping[str, Any]) -> Any:
+    """Make the agent called ``name`` from flat tables of settings: those of its preset, and those given.
+
+    The preset's settings of a part do not apply to another part that is given in its place.
 
     Raises:
         InputError: a setting is neither the agent's nor one of its parts', or its value is not allowed.
     """
-    rest = frozen(given)
     fields = {field.name: field for field in dataclasses.fields(cls)}
-    chosen = {}
-    for kind in kinds_of(cls):
-        part = parts.choose(kind, PARTS[kind], rest.pop(kind, None) or fields[kind].default_factory())  # type: ignore
+    choose = lambda kind, table: parts.choose(kind, PARTS[kind], table.get(kind) or fields[kind].default_factory())  # type: ignore
+    usual = {kind: choose(kind, defaults) for kind in kinds_of(cls)}
+    chosen = {kind: choose(kind, {**defaults, **given}) for kind in usual}
+    replaced = {x for kind, part in usual.items() for x in parts.settings(part).keys() - parts.settings(chosen[kind])}
+    rest = frozen({**{k: v for k, v in defaults.items() if k not in replaced}, **given})
+    for kind, part in chosen.items():
+        rest.pop(kind, None)
         chosen[kind] = parts.take(rest, part)
     unknown = next((name for name in rest if name not in fields), None)
     if unknown in OF_TRAIN:

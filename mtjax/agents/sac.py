@@ -147,10 +147,10 @@ class SAC(BaseAgent):
             optimizers=Optimizers(*(o.init(p) for o, p in zip(self.optimizers, parameters, strict=True))),
         )
 
-    def init_networks(self, num_tasks: int, features: Array, obs: Any, action: Array, key: Key) -> Pair:
+    def init_networks(self, num_tasks: int, inputs: Pair, action: Array, key: Key) -> Pair:
         actor_key, critic_key = jax.random.split(key)
-        actor = self.actor.init(actor_key, num_tasks, 2 * len(action), features, obs)
-        init_critic = lambda k: self.critic.init(k, num_tasks, self.value.outputs, features, obs, action)
+        actor = self.actor.init(actor_key, num_tasks, 2 * len(action), *inputs.actor)
+        init_critic = lambda k: self.critic.init(k, num_tasks, self.value.outputs, *inputs.critic, action)
         keys = jax.random.split(critic_key, self.num_critics)
         return Pair(actor, jax.vmap(init_critic, out_axes=Params(shared=0, own=1))(keys))  # type: ignore
 

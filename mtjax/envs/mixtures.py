@@ -1,7 +1,7 @@
 """Mixtures: families with different observations, actions, horizons and physics, as one environment.
 
 A mixture has the tasks of its families, one family after another in every split. Each family steps its own worlds in a
-separate call. Observations are padded with zeros to one size, and actions beyond a family's own are masked.
+separate call. Observed vectors are padded with zeros to one size, and actions beyond a family's own are masked.
 """
 
 import dataclasses
@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
+from mtjax import frames
 from mtjax.envs.family import Family, Part, Table, Tabled
 from mtjax.types import SPLITS, Array, InputError, Key, Spec, Step, Task
 
@@ -56,6 +57,14 @@ class Blocks:
         return jnp.all(contexts[:, : self.marks] == context[: self.marks], axis=-1)
 
 
+def _look(spec: Spec) -> str:
+    """Return what an observation shows, as text."""
+    if not frames.shown(spec.obs):
+        return "no pictures"
+    beside = "" if frames.state(spec.obs) is None else " beside a state"
+    return f"{spec.frames} pictures {spec.obs[frames.PICTURES].shape}{beside}"
+
+
 def _joined(parts: list[Array]) -> Array:
     return parts[0] if len(parts) == 1 else jnp.concatenate(parts, axis=1)
 
@@ -71,7 +80,8 @@ class States(NamedTuple):
 class Mixture(Tabled):
     """An environment with the tasks of several families, from ``mtjax.mixture`` or ``mtjax.make("NAME+NAME")``.
 
-    Observation (O,): the family's own, padded with zeros to that of the widest family.
+    Observation (O,): the family's own, padded with zeros to that of the widest family. Pictures are not padded: either
+        no family shows any, or all show pictures of one shape, with or without a state (O,) beside them.
     Action (A,): as many as the widest family has. A task's ``action_mask`` says which of them are its own.
     Context (C,): the family as one-hot, then one slot per family. The task's own slot holds its context in that family;
         other slots are zero. A family whose contexts are all zero, because it has a single task, has no slot. The
@@ -191,9 +201,27 @@ class Mixture(Tabled):
     @cached_property
     def _spec(self) -> Spec:
         specs = [family.spec for family in self.families]
-        obs_size, action_size = max(spec.obs_size for spec in specs), max(spec.action_size for spec in specs)
-        spec = Spec.vector(obs_size, action_size, self._context().shape[1])
-        return spec._replace(mixed=len(self.families) > 1, sentences=self.sentences)
+        self._require_one_look(specs)
+        widest: Any = jax.ShapeDtypeStruct((max(map(frames.state_size, specs)),), jnp.float32)
+        return Spec(
+            obs=frames.with_state(lambda _: widest, specs[0].obs),
+            action_size=max(spec.action_size for spec in specs),
+            context_size=self._context().shape[1],
+            mixed=len(self.families) > 1,
+            frames=specs[0].frames,
+            sentences=self.sentences,
+        )
+
+    def _require_one_look(self, specs: list[Spec]) -> None:
+        """Refuse families of which some show pictures and others do not, or pictures of another shape."""
+        looks = {name: _look(spec) for name, spec in zip(self.names, specs, strict=True)}
+        (first, look), *rest = looks.items()
+        other = next((name for name, found in rest if found != look), None)
+        if other is not None:
+            raise InputError(
+                f"families of a mixture are seen alike: {first} shows {look} and {other} {looks[other]}; "
+                "give all the same pixels, frames, grey and state"
+            )
 
     @property
     def episode_length(self) -> int:
@@ -237,11 +265,12 @@ class Mixture(Tabled):
         steps = {i: act(self.families[i], self._own(tasks, i), i) for i in dict.fromkeys(i for i, _ in blocks.runs)}
         states = tuple(steps[i].state if i in steps else None for i in range(len(self.families)))
         join = lambda of: blocks.join({i: of(step) for i, step in steps.items()})
+        padded = [self.pad(step.obs) for step in steps.values()]
         names = sorted({name for step in steps.values() for name in step.metrics})
         unknown = lambda step: jnp.full(step.reward.shape, jnp.nan)
         return Step(
             state=States(blocks, states),
-            obs=join(lambda step: self.pad(step.obs)),
+            obs=jax.tree.map(lambda *x: blocks.join(dict(zip(steps, x, strict=True))), *padded),
             reward=join(lambda step: step.reward),
             terminated=join(lambda step: step.terminated),
             metrics={name: join(lambda step, name=name: step.metrics.get(name, unknown(step))) for name in names},
@@ -254,10 +283,11 @@ class Mixture(Tabled):
         # A compiler that sees constants divides by them otherwise than by numbers that it does not know.
         return jax.lax.optimization_barrier(own)
 
-    def pad(self, obs: Array) -> Array:
-        """Pad a family's observations (..., O') with zeros to the mixture's (..., O)."""
-        missing = self.spec.obs_size - obs.shape[-1]
-        return jnp.pad(obs, [(0, 0)] * (obs.ndim - 1) + [(0, missing)]) if missing else obs
+    def pad(self, obs: Any) -> Any:
+        """Pad the vectors (..., O') in a family's observations with zeros to the mixture's (..., O)."""
+        size = frames.state_size(self.spec)
+        wide = lambda x: jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, size - x.shape[-1])]) if x.shape[-1] < size else x
+        return frames.with_state(wide, obs)
 
     # A single world, outside of compiled programs.
 

@@ -134,14 +134,18 @@ PIXELS = 16
 
 @dataclasses.dataclass(frozen=True)
 class Pictured(Probe):
-    """A probe that shows its observation: the left half of a picture is as bright as it is positive, else the right."""
+    """A probe that shows its observation: the left half of a picture is as bright as it is positive, else the right.
+
+    With ``state="also"`` the observation itself comes beside the picture.
+    """
 
     frames: int = 2
+    state: str = "hidden"
 
     @property
     def spec(self) -> Spec:
-        shape = jax.ShapeDtypeStruct((PIXELS, PIXELS, 1), jnp.uint8)
-        return SPEC._replace(obs={"pixels": shape}, frames=self.frames)
+        shown = {"pixels": jax.ShapeDtypeStruct((PIXELS, PIXELS, 1), jnp.uint8)}
+        return SPEC._replace(obs=shown | ({"state": SPEC.obs} if self.state == "also" else {}), frames=self.frames)
 
     def reset(self, task: Task, key: Key) -> Step:
         return self.show(super().reset(task, key))
@@ -150,8 +154,9 @@ class Pictured(Probe):
         return self.show(super().step(task, state, action))
 
     def show(self, step: Step) -> Step:
-        """Return the step with a picture in place of its observation."""
+        """Return the step with a picture in place of its observation, or beside it."""
         left = jnp.arange(PIXELS) < PIXELS // 2
         bright = jnp.where(left, jnp.maximum(step.obs, 0.0), jnp.maximum(-step.obs, 0.0))
         picture = jnp.clip(200.0 * bright, 0, 255).astype(jnp.uint8)
-        return step._replace(obs={"pixels": jnp.broadcast_to(picture[None, :, None], (PIXELS, PIXELS, 1))})
+        shown = {"pixels": jnp.broadcast_to(picture[None, :, None], (PIXELS, PIXELS, 1))}
+        return step._replace(obs=shown | ({"state": step.obs} if self.state == "also" else {}))

@@ -4,6 +4,7 @@ import dataclasses
 from typing import Any, NamedTuple
 
 from mtjax import frames
+from mtjax.envs.mixtures import require_family
 from mtjax.envs.pixels import Pictured
 from mtjax.maps import Flat
 from mtjax.types import Array, InputError, Key, Spec, Step, Task
@@ -26,6 +27,7 @@ class Stacked(Flat):
     family: Pictured
 
     def __post_init__(self):
+        require_family(self.family, "pictures are stacked for one family")
         if not self.family.pixels:
             raise InputError("there is nothing to stack without pictures; give pixels=64")
 

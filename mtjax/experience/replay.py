@@ -119,7 +119,7 @@ class Replay:
                 f"ends, and one takes {chunk_steps}; lower --chunk-steps or raise --replay-size"
             )
 
-    def describe(self, num_envs: int) -> str:
+    def describe(self, spec: Spec, num_envs: int) -> str:
         """Return a description of its size."""
         beside = f", and {self.host_slots(num_envs) * num_envs:,} on the host" if self.host_replay_size else ""
         return f"replay ({self.capacity(num_envs):,} transitions a task{beside})"

@@ -1,10 +1,12 @@
 """Rollouts hold the latest steps, from which on-policy agents learn once."""
 
 import dataclasses
+import math
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
 
+from mtjax import frames
 from mtjax.maps import over_seeds
 from mtjax.types import Array, Env, InputError, Key, Metrics, Spec, Task, Transition
 
@@ -43,9 +45,13 @@ class Rollouts:
         """Return 0, as the host keeps no steps."""
         return 0
 
-    def describe(self, num_envs: int) -> str:
-        """Return a description of its size."""
-        return f"rollouts ({self.unroll * num_envs:,} transitions a task, not kept)"
+    def describe(self, spec: Spec, num_envs: int) -> str:
+        """Return a description of its size, with the memory that stacks of pictures take while it is learned from."""
+        count, told = self.unroll * num_envs, ""
+        if frames.shown(spec.obs):
+            each = 2 * math.prod(frames.seen(spec)[frames.PICTURES].shape)  # before and after the step
+            told = f"; while in use {count * each / 1e6:,.0f} MB of pictures a task and seed"
+        return f"rollouts ({count:,} transitions a task, not kept{told})"
 
     def init(self, item: Transition, spec: Spec, num_tasks: int, num_envs: int, keys: Key) -> tuple[()]:
         """Return (), as no data is kept between iterations."""

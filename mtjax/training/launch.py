@@ -38,6 +38,7 @@ def check(config: RunConfig, start: Policy | None = None) -> None:
     experience.check(family, played.num_envs, played.chunk_steps)
     for learner in points.agents_at(config.learner, config.points):
         require_value_range(learner)
+        learner.require_sight(family.spec)
         if start is not None:
             require_fit(start, family, learner)
     begins = start is not None or bool(config.start)

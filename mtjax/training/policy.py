@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax import loop, shipped
+from mtjax import frames, loop, shipped
 from mtjax.agents import BaseAgent, name_of
 from mtjax.checks import path
 from mtjax.config import RunConfig, from_json
@@ -40,18 +40,22 @@ class Policy:
         shapes = f"observation {tuple(getattr(spec.obs, 'shape', ()))}, action ({spec.action_size},)"
         return f"Policy({names}: {shapes}, one of {len(self.seeds)} seed{'s' * (len(self.seeds) > 1)})"
 
-    def __call__(self, obs: Array, task: Task, key: Key | None = None, memory: Any = None) -> Array:
+    def __call__(self, obs: Any, task: Task, key: Key | None = None, memory: Any = None) -> Array:
         """Return the mean action (A,), or a sampled one if a key is given.
 
         Args:
+            obs: as the agent sees it: with pictures, the stack of the last ones, as ``mtjax.stacked`` shows them.
             memory: the agent's memory of the episode, from ``begin`` and ``remember``. Only agents that infer their
                 task need it. None means that the episode has just begun.
         """
         if np.ndim(task.id):
             raise InputError(f"policy(obs, task) takes one task, not {task!r}: jax.tree.map(lambda x: x[0], tasks)")
-        shape, wanted = jax.tree.map(np.shape, obs), jax.tree.map(lambda x: x.shape, self.env.spec.obs)
+        wanted = jax.tree.map(lambda x: x.shape, self.agent.representation.acts_on(frames.seen(self.env.spec)))
+        obs = {name: x for name, x in obs.items() if name in wanted} if frames.shown(obs) else obs
+        shape = jax.tree.map(np.shape, obs)
         if shape != wanted:
-            raise InputError(f"an observation of this family has shape {wanted}, not {shape}; use jax.vmap for many")
+            fix = "use jax.vmap for many" + ", and mtjax.stacked(env) for stacks of pictures" * frames.shown(wanted)
+            raise InputError(f"an observation for this policy has shape {wanted}, not {shape}; {fix}")
         memory = self.begin(task) if memory is None else memory
         return self.agent.act(self.state, memory, obs, task, key).action
 

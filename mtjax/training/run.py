@@ -215,7 +215,7 @@ class _Run:
     def _describe(self, shapes: TrainState) -> None:
         needs = memory.Needs.of(shapes, self.env, self.agent, self.settings)
         memory.require_room(needs, self.env)
-        kind = self.agent.experience.describe(self.settings.num_envs)
+        kind = self.agent.experience.describe(self.env.spec, self.settings.num_envs)
         for line in memory.tell(shapes.data, needs, kind, len(self.seeds)):
             self.console.say(line)
         if line := meshes.describe(self.mesh, len(self.seeds), self.settings.num_envs):

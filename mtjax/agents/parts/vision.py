@@ -3,12 +3,13 @@
 Pictures are uint8, (..., H, W, K) for K channels of all stacked pictures. Networks see values in [-0.5, 0.5].
 """
 
-from typing import Literal
+from typing import Any, Literal
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from mtjax import frames
 from mtjax.types import Array, Key
 
 Vision = Literal["drq", "impala"]
@@ -53,6 +54,35 @@ class Residual(nn.Module):
 
 
 NETWORKS: dict[str, type[nn.Module]] = {"drq": Convolutions, "impala": Residual}
+
+
+def project(features: Array, size: int) -> Array:
+    """Map features (..., F) to latent states (..., D) in (-1, 1), by new layers of the module that calls this."""
+    return jnp.tanh(nn.LayerNorm()(nn.Dense(size)(features)))
+
+
+class Projection(nn.Module):
+    """Maps features of pictures to latent states (..., D), to which a state that is seen beside them is appended."""
+
+    size: int
+
+    @nn.compact
+    def __call__(self, obs: Any) -> Array:
+        """Map an observation with features (..., F) in place of pictures."""
+        latent, state = project(obs[frames.PICTURES], self.size), frames.state(obs)
+        return latent if state is None else jnp.concatenate([latent, state], axis=-1)
+
+
+class Sight(nn.Module):
+    """Maps pictures to latent states (..., D): convolutions and a projection of their own."""
+
+    size: int
+    vision: Vision
+
+    @nn.compact
+    def __call__(self, obs: Any) -> Array:
+        """Map an observation; a state beside the pictures is not seen."""
+        return project(NETWORKS[self.vision]()(obs[frames.PICTURES]), self.size)
 
 
 class Decoder(nn.Module):

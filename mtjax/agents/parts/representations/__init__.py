@@ -1,5 +1,6 @@
 """Representations, by name, encode the inputs of an agent's networks. To add one, add a file, and a line here."""
 
+from mtjax.agents.parts.representations.asymmetric import Asymmetric
 from mtjax.agents.parts.representations.autoencoder import Autoencoder
 from mtjax.agents.parts.representations.base import Place, Plain
 from mtjax.agents.parts.representations.deepmdp import DeepMDP
@@ -11,9 +12,20 @@ Representation = Plain
 REPRESENTATIONS: dict[str, type[Representation]] = {
     "plain": Plain,
     "encoded": Encoded,
+    "asymmetric": Asymmetric,
     "autoencoder": Autoencoder,
     "deepmdp": DeepMDP,
     "hip-bmdp": HiPBMDP,
 }
 
-__all__ = ["REPRESENTATIONS", "Autoencoder", "DeepMDP", "Encoded", "HiPBMDP", "Place", "Plain", "Representation"]
+__all__ = [
+    "REPRESENTATIONS",
+    "Asymmetric",
+    "Autoencoder",
+    "DeepMDP",
+    "Encoded",
+    "HiPBMDP",
+    "Place",
+    "Plain",
+    "Representation",
+]

@@ -25,8 +25,10 @@ class Autoencoder(Encoded):
     where the mean is over pixels, lambda is ``latent_decay`` and theta_g are the decoder's parameters. Of vectors, s is
     the observation, and g has the encoder's widths the other way round.
 
-    Differs from the paper: the linear layer after the convolutions is shared by actor and critics; one optimiser steps
-    encoder, decoder and critics together, at every update; the decay of the decoder is a part of the loss.
+    phibar, with its projection, moves by ``encoder_tau``.
+
+    Differs from the paper: one optimiser steps encoder, decoder and critics together, at every update; the decay of the
+    decoder is a part of the loss.
     """
 
     shift: int = 0
@@ -39,6 +41,7 @@ class Autoencoder(Encoded):
     """Weight of the squared length of the decoder's parameters."""
 
     names: ClassVar[tuple[str, ...]] = (*Encoded.names, "decoder")
+    slow: ClassVar[tuple[str, ...]] = Encoded.names
     models: ClassVar[tuple[str, ...]] = ("decoder",)
 
     def __post_init__(self):
@@ -66,7 +69,7 @@ class Autoencoder(Encoded):
 
     def join(self, loss: Array, metrics: Metrics, params: Params, batch: Any) -> tuple[Array, Metrics]:
         obs = without_past(batch.obs)
-        latent = self.apply(params, "latent", obs)[..., : self.latent_widths[-1]]
+        latent = self.encode(params, obs)[..., : self.latent_widths[-1]]
         weights = {**params.shared, **params.own}["decoder"]
         rebuilt: Any = self.decoder(obs).apply(weights, latent)
         wanted = vision.coarse(obs[frames.PICTURES], batch.model_targets) if frames.shown(obs) else obs

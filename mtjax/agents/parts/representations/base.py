@@ -4,12 +4,14 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple, Self
 
+import flax.linen as nn
 import jax
 
+from mtjax import frames
 from mtjax.agents import parts
 from mtjax.agents.parts.trajectory import Seen
 from mtjax.networks import Params
-from mtjax.types import Array, Key, Metrics, Transition
+from mtjax.types import Array, InputError, Key, Metrics, Transition
 
 
 class Place(NamedTuple):
@@ -23,12 +25,10 @@ class Place(NamedTuple):
 
 
 class Basis(NamedTuple):
-    """Holds a representation's initial parameters, and example inputs for the networks on top of it."""
+    """Holds a representation's initial parameters, and a key for the networks on top of it."""
 
     params: Params
-    features: Array  # (Z,) zeros
-    obs: Any  # zeros
-    key: Key  # for initialising the networks
+    key: Key
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,7 +37,8 @@ class Plain:
 
     Every representation is a class with these methods. Its parameters lie beside the critics', under its ``names``. The
     critics' loss trains them, together with losses of the representation's own, which ``join`` adds; the actor's loss
-    does not. Agents use a copy that knows its ``place``. Parameters are those of one task unless stated otherwise.
+    does not. What the actor's loss trains is the module ``sight``, which lies in the actor. Agents use a copy that
+    knows its ``place``. Parameters are those of one task unless stated otherwise.
     """
 
     names: ClassVar[tuple[str, ...]] = ()  # of its parameters
@@ -70,11 +71,33 @@ class Plain:
 
     def init(self, num_tasks: int, features: Array, obs: Any, action: Array, key: Key) -> Basis:
         """Initialise for features (Z,), an observation (O,) and an action (A,) of these shapes."""
-        return Basis(Params({}, {}), features, obs, key)
+        return Basis(Params({}, {}), key)
+
+    def require(self, obs: Any) -> None:
+        """Check that networks can take observations of these shapes.
+
+        Raises:
+            InputError: they cannot.
+        """
+        if frames.shown(obs):
+            raise InputError("networks take vectors; for pictures use --agent=drq or --agent.representation=encoded")
+
+    def acts_on(self, obs: Any) -> Any:
+        """Return those entries of an observation, or of its shapes, that acting needs."""
+        return obs
 
     def perceive(self, params: Params, features: Array, obs: Any) -> tuple[Array, Any]:
-        """Return the networks' inputs: task features (Z,) or (B, Z), and what replaces observations (B, O)."""
+        """Return the critics' inputs: task features (Z,) or (B, Z), and what replaces observations (B, O)."""
         return features, obs
+
+    def actor_inputs(self, params: Params, features: Array, obs: Any) -> tuple[Array, Any]:
+        """Return the actor's inputs, as ``perceive`` does the critics'."""
+        return self.perceive(params, features, obs)
+
+    @property
+    def sight(self) -> nn.Module | None:
+        """Return a module of the actor's own, which maps its observations with pictures to vectors; None for none."""
+        return None
 
     def augment(self, batch: Transition, key: Key) -> Transition:
         """Return a batch of transitions (T, B, ...) with observations changed at random, as losses should see them."""

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 
 from mtjax import frames
 from mtjax.agents import parts
-from mtjax.agents.parts.representations.base import Basis, without_past
-from mtjax.agents.parts.representations.encoded import ENCODERS, Encoded
+from mtjax.agents.parts.representations.base import without_past
+from mtjax.agents.parts.representations.encoded import Encoded
 from mtjax.networks import OVER_TASKS, Params, Trunk
 from mtjax.types import Array, InputError, Key, Metrics
 
@@ -47,7 +47,8 @@ class DeepMDP(Encoded):
     a) in SAC and V(h, z) in PPO:
         L_T = mean_d ((mu - sg(phibar(s')))^2 / (2 sigma^2) + log sigma)             (transition loss)
         L_R = (R(h~, z) - r)^2,  h~ = mu + sigma noise                               (reward loss)
-    All of them train phi. The actor's input is sg(phi(s)), so its loss does not train phi. With
+    All of them train phi. The actor's input is sg(phi(s)), so its loss does not train phi; from pictures the actor has
+    a projection of its own, as in ``Encoded``. With
     transition=deterministic, sigma is 1 and h~ is mu. phi ends in layer normalisation and tanh, as in SAC-AE (Yarats et
     al. 2021), because L_T alone would shrink latent states to a point. phibar is the target encoder, which SAC's target
     critics use; it moves by ``encoder_tau``. In PPO, which has no target networks, it is phi from before the update.
@@ -68,7 +69,8 @@ class DeepMDP(Encoded):
     model_coefficient: float = 1.0
     """Weight of transition and reward loss relative to the critics' loss."""
 
-    names: ClassVar[tuple[str, ...]] = (*ENCODERS, "transition", "reward")
+    names: ClassVar[tuple[str, ...]] = (*Encoded.names, "transition", "reward")
+    slow: ClassVar[tuple[str, ...]] = Encoded.names
     models: ClassVar[tuple[str, ...]] = ("transition", "reward")
     predicts: ClassVar[bool] = True
 
@@ -88,10 +90,9 @@ class DeepMDP(Encoded):
     def model_inputs(self, latent: Array, features: Array, action: Array) -> dict[str, tuple]:
         return {"transition": (latent, features, action), "reward": (latent, features)}
 
-    def init(self, num_tasks: int, features: Array, obs: Any, action: Array, key: Key) -> Basis:
+    def require(self, obs: Any) -> None:
         if frames.shown(obs) and frames.state(obs) is not None:
             raise InputError("this representation predicts latent states of pictures alone; leave out --env.state=also")
-        return super().init(num_tasks, features, obs, action, key)
 
     def predict(self, params: Params, features: Array, latent: Array, action: Array) -> tuple[Array, Array]:
         """Predict the mean and standard deviation (..., D) of the next latent state."""
@@ -105,8 +106,7 @@ class DeepMDP(Encoded):
     # Losses.
 
     def targets(self, params: Params, target_params: Params, next_obs: Any, key: Key) -> tuple[ModelTargets, Key]:
-        encode = lambda target_params, obs: self.apply(target_params, "latent", obs)
-        latent = jax.vmap(encode, (OVER_TASKS, 0))(target_params, without_past(next_obs))
+        latent = jax.vmap(self.encode, (OVER_TASKS, 0))(target_params, without_past(next_obs))
         keys = jax.vmap(jax.random.split)(jax.random.split(key, len(latent)))  # (T, 2): for critics, and for models
         draw = lambda key: jax.random.normal(key, latent.shape[1:])
         drawn = self.transition == "probabilistic"

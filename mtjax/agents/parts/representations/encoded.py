@@ -9,71 +9,66 @@ import jax.numpy as jnp
 
 from mtjax import frames
 from mtjax.agents import parts
-from mtjax.agents.parts.representations.base import Basis, Plain, without_past
+from mtjax.agents.parts.representations.base import Basis, without_past
+from mtjax.agents.parts.representations.seeing import Seeing
 from mtjax.agents.parts.trajectory import TrajectoryEncoder
-from mtjax.agents.parts.vision import NETWORKS, Vision, shifted
+from mtjax.agents.parts.vision import NETWORKS, Projection, Vision, project
 from mtjax.networks import MLP, Network, Params, join
-from mtjax.types import Array, Key, Transition
+from mtjax.types import Array, Key
 
 ENCODERS = ("latent", "trajectory", "embedding")
+PROJECTION = "projection"
 
 
 class Latent(nn.Module):
-    """Encodes observations (..., O), or pictures with or without a state, as latent states (..., D) in (-1, 1)."""
+    """Encodes vectors (..., O) as latent states (..., D) in (-1, 1), or pictures as features (..., F)."""
 
     widths: tuple[int, ...]
-    vision: str = "drq"
+    vision: Vision = "drq"
 
     @nn.compact
     def __call__(self, obs: Any) -> Array:
+        if frames.shown(obs):
+            return NETWORKS[self.vision]()(obs[frames.PICTURES])
         *inner, size = self.widths
-        end = lambda x: jnp.tanh(nn.LayerNorm()(nn.Dense(size)(x)))
-        if not frames.shown(obs):
-            return end(MLP(tuple(inner))(obs))
-        seen = end(NETWORKS[self.vision]()(obs[frames.PICTURES]))
-        state = frames.state(obs)
-        return seen if state is None else jnp.concatenate([seen, state], axis=-1)
+        return project(MLP(tuple(inner))(obs), size)
 
 
 @dataclasses.dataclass(frozen=True)
-class Encoded(Plain):
+class Encoded(Seeing):
     """Encoded is an encoder phi that all critics train and share with the actor, above all for pictures.
 
-    The critics' loss trains phi; the actor's input is sg(phi(s)). phi ends in layer normalisation and tanh (Yarats et
-    al. 2021, SAC-AE). Pictures pass convolutions first (``vision``). A state that is observed beside them is appended
-    to the latent state. Target critics see phibar(s), the target encoder. It moves by ``encoder_tau``; at 1 it is phi.
+    Of vectors, phi is an MLP that ends in layer normalisation and tanh (Yarats et al. 2021, SAC-AE). The critics' loss
+    trains it, and the actor's input is sg(phi(s)). Of pictures, phi is convolutions f (``vision``), and a projection: a
+    linear layer, layer normalisation and tanh. The critics' loss trains f and the critics' projection. The actor has a
+    projection of its own on sg(f(s)), which its loss trains. A state that is observed beside pictures is appended to
+    the latent state. Target critics see phibar(s), the target encoder. It moves by ``encoder_tau``; of pictures this is
+    f alone, and the projection's target copy moves by ``tau``, as those of the critics' other layers do.
 
-    In every update each picture of the batch is shifted at random by up to ``shift`` pixels, those of s and of s' on
-    their own (Yarats, Kostrikov and Fergus 2021, DrQ; Yarats et al. 2022, DrQ-v2).
+    In every update from the replay each picture of the batch is shifted at random by up to ``shift`` pixels, those of s
+    and of s' on their own (Yarats, Kostrikov and Fergus 2021, DrQ; Yarats et al. 2022, DrQ-v2). PPO shifts none.
 
     The vectors of conditioning=embedding, and the trajectory encoder of conditioning=inferred, belong to this
     representation: all networks use the same, which critics train, and the actor does not.
 
-    Differs from DrQ-v2: the linear layer after the convolutions is shared too, where there actor and critics have their
-    own; shifts are by whole pixels.
+    With encoder_tau=1 f, projections and target copies are those of DrQ-v2. Differs from it: the learner is SAC, with
+    tuned temperatures, and not DDPG with scheduled noise; the actor's loss sees f after the critics' step, there before
+    it; weights of linear layers begin by LeCun's initialisation, there they are orthogonal.
     """
 
-    latent_widths: tuple[int, ...] = (256, 50)
-    """Widths of the encoder's layers; the last is the size of the latent state. Of pictures only the last counts."""
     encoder_tau: float = 0.05
     """Step of the target encoder towards the new encoder at each update, as a share of the distance."""
-    vision: Vision = "drq"
-    """Convolutions for pictures: drq (four, as in SAC-AE and DrQ) or impala (fifteen in residual blocks)."""
-    shift: int = 4
-    """Shift pictures of a batch by up to so many pixels at random; 0 for none."""
 
-    names: ClassVar[tuple[str, ...]] = ENCODERS
-    sees_pictures: ClassVar[bool] = True
+    names: ClassVar[tuple[str, ...]] = (*ENCODERS, PROJECTION)
+    slow: ClassVar[tuple[str, ...]] = ENCODERS  # those whose target copies move by encoder_tau
 
     def __post_init__(self):
         super().__post_init__()
-        parts.require_layers(self, "latent_widths")
         parts.require_rates(self, "encoder_tau")
-        parts.require_not_negative(self, "shift")
 
     @property
     def rates(self) -> dict[str, float]:
-        return dict.fromkeys(ENCODERS, self.encoder_tau)
+        return dict.fromkeys(self.slow, self.encoder_tau)
 
     # Networks: each is used by all N critics and by the actor.
 
@@ -103,12 +98,18 @@ class Encoded(Plain):
         return found | ({"trajectory": self.trajectory} if self.infers else {})
 
     @property
+    def sight(self) -> nn.Module:
+        """Return a projection, which critics and actor each have of their own."""
+        return Projection(self.latent_widths[-1])
+
+    @property
     def trajectory(self) -> TrajectoryEncoder:
         return TrajectoryEncoder(self.place.embedding_size, layer_norm=self.place.layer_norm)
 
     def apply(self, params: Params, name: str, *inputs: Any) -> Array:
         """Map one task's inputs by an encoder or a model."""
-        return self.modules[name].apply({**params.shared, **params.own}[name], *inputs)  # type: ignore
+        module = self.sight if name == PROJECTION else self.modules[name]
+        return module.apply({**params.shared, **params.own}[name], *inputs)  # type: ignore
 
     def init(self, num_tasks: int, features: Array, obs: Any, action: Array, key: Key) -> Basis:
         key, theta_key, *keys = jax.random.split(key, 2 + len(self.modules))
@@ -120,7 +121,10 @@ class Encoded(Plain):
             self.init_part(params, name, module, part_key, num_tasks, *inputs.get(name, (obs,)))
         if self.has_theta:
             params.own["embedding"] = jax.random.normal(theta_key, (num_tasks, size))
-        return Basis(params, features, latent, key)
+        if frames.shown(obs):
+            convolved = self.convolve(params.of_first(), obs)
+            self.init_part(params, PROJECTION, self.sight, jax.random.fold_in(key, 1), num_tasks, convolved)
+        return Basis(params, key)
 
     def init_part(self, params: Params, name: str, module: nn.Module, key: Key, num_tasks: int, *inputs: Any) -> None:
         """Add the initial parameters of an encoder or a model: one for all tasks, or every task's own."""
@@ -138,19 +142,31 @@ class Encoded(Plain):
 
     def perceive(self, params: Params, features: Array, obs: Any) -> tuple[Array, Array]:
         """Return features of the task (Z,) or (..., Z), and latent states (..., D)."""
+        return self.task_features(params, features, obs), self.encode(params, without_past(obs))
+
+    def actor_inputs(self, params: Params, features: Array, obs: Any) -> tuple[Array, Any]:
+        """Return features of the task, and latent states; of pictures what the actor's own projection takes."""
+        if not frames.shown(obs):
+            return self.perceive(params, features, obs)
+        return self.task_features(params, features, obs), self.convolve(params, obs)
+
+    def task_features(self, params: Params, features: Array, obs: Any) -> Array:
+        """Return features of the task (Z,) or (..., Z), with those that are learned or inferred."""
         if self.infers:
             features = self.apply(params, "trajectory", obs)
-        features = join(features, task=self.theta(params)) if self.has_theta else features
-        return features, self.apply(params, "latent", without_past(obs))
+        return join(features, task=self.theta(params)) if self.has_theta else features
+
+    def encode(self, params: Params, obs: Any) -> Array:
+        """Return the critics' latent states (..., D)."""
+        if not frames.shown(obs):
+            return self.apply(params, "latent", obs)
+        return self.apply(params, PROJECTION, self.convolve(params, obs))
+
+    def convolve(self, params: Params, obs: Any) -> Any:
+        """Return observations with the features (..., F) of convolutions in place of pictures."""
+        return obs | {frames.PICTURES: self.apply(params, "latent", obs)}
 
     def theta(self, params: Params) -> Array:
         """Return a task's learned vector (Z,)."""
         theta = params.own["embedding"]
         return theta / jnp.maximum(jnp.linalg.norm(theta), 1e-6) if self.place.unit_embedding else theta
-
-    def augment(self, batch: Transition, key: Key) -> Transition:
-        if not self.shift or not frames.shown(batch.obs):
-            return batch
-        keys = jax.random.split(key)
-        move = lambda obs, key: obs | {frames.PICTURES: shifted(obs[frames.PICTURES], key, self.shift)}
-        return batch._replace(obs=move(batch.obs, keys[0]), next_obs=move(batch.next_obs, keys[1]))
