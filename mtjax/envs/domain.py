@@ -7,6 +7,7 @@ only the leaves that differ between tasks are stacked.
 import abc
 import copy
 import dataclasses
+import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
 from importlib import resources
@@ -99,6 +100,10 @@ class Domain(Pictured):
         """Return further numbers () of a world after the step, such as success. Evaluations report them."""
         return {}
 
+    def judge(self, task: Task, world: World, action: Array) -> tuple[Array, dict[str, Array]]:
+        """Return reward and metrics. A domain that computes them together gives both here."""
+        return self.reward(task, world, action), self.metrics(task, world, action)
+
     def recall(self, task: Task, obs: Array) -> World:
         """Return a world with the observation ``obs``, exact in all that the reward reads. ``relabel`` needs it."""
         raise NotImplementedError(f"{type(self).__name__} does not say which world an observation shows")
@@ -124,11 +129,14 @@ class Domain(Pictured):
             return world, total, over | self.terminates(task, world)
 
         if self.repeat == 1:
-            world = self.simulator.step(task, *self.control(task, state, action))
-            reward, over = self.reward(task, world, action), self.terminates(task, world)
-        else:
-            world, reward, over = jax.lax.fori_loop(0, self.repeat, once, (state, jnp.float32(0), jnp.bool_(False)))
-        return Step(world, self.look_at(task, world), reward, over, self.metrics(task, world, action))
+            return self.outcome(task, self.simulator.step(task, *self.control(task, state, action)), action)
+        world, reward, over = jax.lax.fori_loop(0, self.repeat, once, (state, jnp.float32(0), jnp.bool_(False)))
+        return Step(world, self.look_at(task, world), reward, over, self.judge(task, world, action)[1])
+
+    def outcome(self, task: Task, world: World, action: Array) -> Step:
+        """Return what a control step of the simulator has led to."""
+        reward, metrics = self.judge(task, world, action)
+        return Step(world, self.look_at(task, world), reward, self.terminates(task, world), metrics)
 
     def look_at(self, task: Task, world: World) -> Any:
         """Return what the agent observes: the state (O,), pictures, or both."""
@@ -244,6 +252,28 @@ class Domain(Pictured):
         if self.engine_name == "warp":
             return Warp(self._base(self.warp_iterations), self.num_substeps)
         return self.mjx
+
+    @cached_property
+    def structure(self) -> tuple[Any, ...] | None:
+        """Return what domains must have in common for one engine to step all of them; None to stay alone.
+
+        Their models may differ in numbers only, as those of tasks.
+        """
+        if self.repeat != 1:  # each of the repeated control steps has its reward
+            return None
+        model = self.models[0] if isinstance(self.simulator, MujocoC) else self.simulator.base
+        fixed = hashlib.sha256()
+        for name in FIXED:
+            field = np.asarray(attrgetter(name)(model))
+            fixed.update(repr((name, field.shape)).encode() + field.tobytes())
+        return self.engine_name, self.num_substeps, fixed.digest()
+
+    def join_simulator(self, models: Sequence[mujoco.MjModel]) -> Engine:
+        """Return the engine of several domains of this structure, with the models of all their rows; this one's first.
+
+        MuJoCo C holds the models. MJX and Warp receive the fields in which they differ with every step.
+        """
+        return MujocoC(models, self.num_substeps) if self.engine_name == "c" else self.simulator
 
     @property
     def outside(self) -> Warp | MujocoC | None:

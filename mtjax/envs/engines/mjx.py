@@ -1,6 +1,7 @@
 """MJX, MuJoCo's JAX port, which runs on any device."""
 
 import dataclasses
+from collections.abc import Iterable
 from functools import cached_property
 from typing import Any
 
@@ -73,6 +74,9 @@ class Mjx:
         with jax.default_matmul_precision("highest"):
             world = jax.lax.fori_loop(0, self.num_substeps, substep, world)
         return self.sense(task, world)
+
+    def require_variable(self, names: Iterable[str]) -> None:
+        """Do nothing, as tasks may differ in all fields that vary."""
 
     def touching(self, task: Task, qpos: Array) -> Array:
         """Return whether any two colliding geoms overlap in the positions ``qpos`` (nq,)."""

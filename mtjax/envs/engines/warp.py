@@ -7,7 +7,7 @@ import inspect
 import itertools
 import threading
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property, partial
 from operator import attrgetter
 from typing import Any, NamedTuple
@@ -133,6 +133,15 @@ class Warp:
             world.mocap,
         )
         return self._unhindered.sense(task, moved)
+
+    def require_variable(self, names: Iterable[str]) -> None:
+        """Refuse tasks that differ in a field of which Warp holds one value only.
+
+        Raises:
+            InputError: there is such a field.
+        """
+        for name in names:
+            self._varies(name)
 
     def _varies(self, name: str) -> bool:
         """Return whether Warp needs the tasks' values of a field."""

@@ -43,7 +43,7 @@ class CoffeeButton(Sawyer):
     drawn: ClassVar = ((-0.1, 0.8, -0.001), (0.1, 0.9, 0.001))
     goal_low: ClassVar = (-0.101, 0.61, 0.298)
     goal_high: ClassVar = (0.101, 0.71, 0.302)
-    watched: ClassVar = {"button": "site:buttonStart"}
+    watched: ClassVar = {"button": "site:buttonStart", "mug": "body:obj", "shape": "geom:mug"}
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
         host.move("coffee_machine", vec)
@@ -74,7 +74,7 @@ class CoffeePull(Sawyer):
     drawn: ClassVar = ((-0.05, 0.7, -0.001, -0.1, 0.55, -0.001), (0.05, 0.75, 0.001, 0.1, 0.65, 0.001))
     goal_low: ClassVar = (-0.1, 0.55, -0.001)
     goal_high: ClassVar = (0.1, 0.65, 0.001)
-    watched: ClassVar = {"mug": "body:obj", "shape": "geom:mug"}
+    watched: ClassVar = CoffeeButton.watched
     to_machine: ClassVar[bool] = False
 
     def allowed(self, vec: np.ndarray) -> bool:

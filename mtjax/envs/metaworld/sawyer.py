@@ -69,7 +69,8 @@ class Sawyer(Domain):
     drawn: ClassVar[tuple[tuple[float, ...], tuple[float, ...]]]  # least and greatest vector of an episode's goal
     goal_low: ClassVar[tuple[float, ...]]  # to which the goal in observations is clipped
     goal_high: ClassVar[tuple[float, ...]]
-    watched: ClassVar[Mapping[str, str]] = MappingProxyType({})  # short name -> "body:NAME", "site:NAME", "geom:NAME"
+    # Short name -> "body:NAME", "site:NAME" or "geom:NAME". Tasks of a scene that watch the same can step together.
+    watched: ClassVar[Mapping[str, str]] = MappingProxyType({})
     pressed: ClassVar[str] = ""  # a geom, if success needs that both pads press on it
 
     parameters: ClassVar = MappingProxyType({})
@@ -226,11 +227,15 @@ class Sawyer(Domain):
         seen = jnp.clip(self._unclipped(task, world), low, high)
         return seen.at[36:].set(0) if self.goal_hidden else seen
 
+    def judge(self, task: Task, world: World, action: Array) -> tuple[Array, dict[str, Array]]:
+        reward, success = self.evaluate(self.at(task, world, action), task.goal)
+        return reward, {"success": success.astype(jnp.float32)}
+
     def reward(self, task: Task, world: World, action: Array) -> Array:
-        return self.evaluate(self.at(task, world, action), task.goal)[0]
+        return self.judge(task, world, action)[0]
 
     def metrics(self, task: Task, world: World, action: Array) -> dict[str, Array]:
-        return {"success": self.evaluate(self.at(task, world, action), task.goal)[1].astype(jnp.float32)}
+        return self.judge(task, world, action)[1]
 
     def at(self, task: Task, world: World, action: Array) -> At:
         """Return what a world shows."""
