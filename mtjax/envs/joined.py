@@ -56,7 +56,7 @@ class Joined:
     @cached_property
     def _leaves(self) -> dict[str, np.ndarray]:
         """Return the fields (R, ...) in which models differ: the rows of all members' tables, one after another."""
-        return {name: np.float32(leaf) for name, leaf in stack_differing(self._models).items()}
+        return {name: np.asarray(leaf, np.float32) for name, leaf in stack_differing(self._models).items()}
 
     @cached_property
     def _first(self) -> dict[int, int]:

@@ -104,6 +104,10 @@ class Pictured(Family):
         """Return the geoms of the scene whose places this episode has decided."""
         return {}
 
+    def seen_spec(self, values: Mapping[str, float]) -> mujoco.MjSpec:
+        """Return the editable model of what is seen, before it is dressed. By default it is that of the physics."""
+        return self.compile_spec(values)
+
     # What every domain gives.
 
     def compile_spec(self, values: Mapping[str, float] | None = None) -> mujoco.MjSpec:
@@ -120,7 +124,7 @@ class Pictured(Family):
     def compile_scene(self, values: Mapping[str, float] | None = None) -> mujoco.MjSpec:
         """Return the editable model of what is seen with these parameter values."""
         given = dict(values or {})
-        spec = self.compile_spec(given)
+        spec = self.seen_spec(given)
         self.add_marks(spec)
         looks.dress(spec, self.look, self.plain)
         for name, value in given.items():
@@ -128,6 +132,10 @@ class Pictured(Family):
             if parameter.looks and parameter.edit is not None:
                 parameter.edit(spec, float(value))
         return spec
+
+    def scene_model(self, row: int) -> mujoco.MjModel:
+        """Return the compiled model of what is seen of the task in a row of the table."""
+        return self.compile_scene({name: values[row] for name, values in self.values.items()}).compile()
 
     def for_rows(self, make: Callable[[dict[str, float]], Any], names: Iterable[str]) -> tuple[Any, ...]:
         """Return what ``make`` returns for every row of the table. Rows with equal values of ``names`` share it."""
@@ -142,7 +150,7 @@ class Pictured(Family):
     @cached_property
     def scene(self) -> Scene:
         """Return what no task changes of the scene."""
-        return Scene(self._observed({name: values[0] for name, values in self.values.items()}))
+        return Scene(observed(self.scene_model(0), self.hides))
 
     @cached_property
     def artist(self) -> Painter:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,6 +19,8 @@ from mtjax.envs.dm_control.rewards import tolerance
 from mtjax.envs.domain import Domain
 from mtjax.envs.engines.base import World
 from mtjax.envs.looks import Look
+from mtjax.envs.painters.base import MESHES, choose_painter
+from mtjax.envs.painters.caster import Caster
 from mtjax.envs.parameters import DAMPING, FRICTION, GRAVITY, MASS, STRENGTH, Parameter, body_mass
 from mtjax.types import Array, InputError, Key, Step, Task
 
@@ -31,12 +33,8 @@ _PAWS = ("palm_L", "palm_R", "sole_L", "sole_R")
 _OF_FETCH = ("target", "wall_px", "wall_py", "wall_nx", "wall_ny")
 
 
-@lru_cache
-def _read_dog() -> mujoco.MjSpec:
-    """Read the model of an installed dm_control, without what physics does not need.
-
-    The bones are meshes that touch nothing. They give the bodies their mass and inertia, which are written down before
-    the bones are dropped.
+def _whole_dog() -> mujoco.MjSpec:
+    """Read the model of an installed dm_control, without what is fetched, cameras and lights.
 
     Raises:
         InputError: dm_control is not installed.
@@ -46,8 +44,21 @@ def _read_dog() -> mujoco.MjSpec:
         raise InputError("the dog's model is a part of dm_control, which is not installed: pip install dm_control")
     spec = mujoco.MjSpec.from_file(str(Path(found.submodule_search_locations[0]) / "suite" / "dog.xml"))
     fetched = [spec.body("ball"), *(spec.geom(name) for name in _OF_FETCH)]
-    for each in (*fetched, *spec.cameras, *spec.lights, *spec.skins):
+    for each in (*fetched, *spec.cameras, *spec.lights):
         spec.delete(each)
+    return spec
+
+
+@lru_cache
+def _read_dog() -> mujoco.MjSpec:
+    """Read the dog without what physics does not need.
+
+    The bones are meshes that touch nothing. They give the bodies their mass and inertia, which are written down before
+    the bones are dropped.
+    """
+    spec = _whole_dog()
+    for skin in spec.skins:
+        spec.delete(skin)
     whole = spec.compile()
     for body in spec.bodies[1:]:
         i = whole.body(body.name).id
@@ -61,7 +72,7 @@ def _read_dog() -> mujoco.MjSpec:
     for each in (*bones, *spec.meshes, *spec.materials, *spec.textures):
         spec.delete(each)
     for geom in spec.geoms:
-        geom.material, geom.group = "", 0  # films show the shapes that touch
+        geom.material = ""
     for name in ("skull", "pelvis"):
         spec.add_sensor(name=name, type=_SENSOR.mjSENS_FRAMEQUAT, objtype=_OBJECT.mjOBJ_XBODY, objname=name)
     spec.add_sensor(name="height", type=_SENSOR.mjSENS_FRAMEPOS, objtype=_OBJECT.mjOBJ_XBODY, objname="pelvis")
@@ -88,8 +99,8 @@ class DogStand(Domain):
         standard deviation of 2 m/s and 2 rad/s; activations uniform in [-1, 1].
     Episode: 1000 steps of 0.015 s (three substeps of 0.005 s); it never terminates.
 
-    The model is read from an installed dm_control (``pip install dm_control``). It cannot be seen through ``pixels``:
-    it has more shapes than the painters draw, and its bones are meshes. Films show the shapes that touch.
+    The model is read from an installed dm_control (``pip install dm_control``). Films show its skin. Through
+    ``pixels`` painter warp shows its bones, and painter caster refuses, as it draws no meshes.
 
     Parameters that can vary:
         torso-mass: scale of mass and inertia of the torso.
@@ -120,11 +131,16 @@ class DogStand(Domain):
 
     def __post_init__(self):
         super().__post_init__()
-        if self.pixels:
-            raise InputError("the dog cannot be seen: painters draw no meshes; leave pixels out, or take another body")
+        if self.pixels and choose_painter(self.painter) is Caster:
+            raise InputError(f"the dog's bones are meshes; {MESHES}")
 
     def _read_model(self) -> mujoco.MjSpec:
         return _read_dog().copy()
+
+    def seen_spec(self, values: Mapping[str, float]) -> mujoco.MjSpec:
+        spec = _whole_dog()
+        self.prepare(spec)
+        return spec
 
     def _base(self, iterations: int) -> mujoco.MjModel:
         """Return the model of MJX or Warp, in which all but the teeth touch the floor, and nothing touches itself."""

@@ -17,7 +17,7 @@ from mtjax.envs.engines import host
 from mtjax.envs.engines.base import World, at_rest, require_plain, some
 from mtjax.types import Array, Task
 
-_MOST_BATCHES = 16  # kept of all engines; those that were not used for longest are dropped
+_MOST_BATCHES = 64  # kept of all engines (mt50 steps 32); those that were not used for longest are dropped
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

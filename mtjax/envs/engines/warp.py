@@ -106,8 +106,13 @@ class Warp:
         return Mjx(model, self.num_substeps)
 
     def forward(self, task: Task, qpos: Array, qvel: Array, extra: Any = None, mocap: Any = None) -> World:
-        """Put a world in a state without controls, and solve for its forces."""
-        return self.mjx.forward(task, qpos, qvel, extra, mocap)
+        """Put a world in a state without controls, and solve for its forces if sensors feel them.
+
+        If MJX refuses the model's contacts, its force sensors read 0 until the next step.
+        """
+        feels = mujoco.mjtStage.mjSTAGE_ACC in self.base.sensor_needstage
+        engine = self.mjx if feels and self._like is not None else self._unhindered
+        return engine.forward(task, qpos, qvel, extra, mocap)
 
     def place(self, task: Task, qpos: Array, qvel: Array, extra: Any = None, mocap: Any = None) -> World:
         """Put a world in a state in which no force sensor is touched."""
@@ -272,14 +277,21 @@ class Warp:
         return model
 
     @cached_property
+    def _like(self) -> Any:
+        """Return the shapes of MJX's data of the model; None if MJX refuses it."""
+        try:
+            return jax.eval_shape(partial(mjx_module().make_data, self.base, jax.local_devices()[0], "jax"))._impl
+        except (NotImplementedError, ValueError):
+            return None
+
+    @cached_property
     def _room(self) -> tuple[int, int]:
         """Return the most contacts and constraint rows that one world can have.
 
         They are the sizes of MJX's arrays, but some pairs of shapes touch in twice as many points in Warp.
         """
-        try:
-            like = jax.eval_shape(partial(mjx_module().make_data, self.base, jax.local_devices()[0], "jax"))._impl
-        except (NotImplementedError, ValueError):
+        like = self._like
+        if like is None:
             return _ROOM
         slots = like.contact.dist.shape[0]
         doubled = min(slots, _DOUBLED)

@@ -17,6 +17,9 @@ from mtjax.envs.engines.base import World, choose_engine
 from mtjax.envs.metaworld import scene
 from mtjax.envs.metaworld.at import At
 from mtjax.envs.metaworld.host import SUBSTEPS, Host
+from mtjax.envs.painters.base import MESHES, choose_painter
+from mtjax.envs.painters.caster import Caster
+from mtjax.envs.pixels import Mark
 from mtjax.envs.variation import Variation
 from mtjax.types import SPLITS, Array, InputError, Key, Step, Task
 
@@ -27,6 +30,7 @@ _NOT_MJX = (
     "engine 'mjx' cannot compute Meta-World's cylinders on boxes; use --engine=c on a CPU, or warp on an NVIDIA GPU "
     "(pip install 'mtjax[warp]')"
 )
+_GOAL = "mtjax-goal"  # a geom of pictures
 _OBJECTS = 14  # entries of an observation for objects
 _HALF_LOW = np.array([-0.525, 0.348, -0.0525, -1.0, *[-np.inf] * _OBJECTS], np.float32)
 _HALF_HIGH = np.array([0.525, 1.025, 0.7, 1.0, *[np.inf] * _OBJECTS], np.float32)
@@ -63,6 +67,7 @@ class Sawyer(Domain):
     """Do not train on this task: it is in the split extrapolation."""
 
     scene: ClassVar[str]  # a file in the package's assets/sawyer_xyz, without .xml
+    hides: ClassVar = (_GOAL,)
     hand_low: ClassVar[tuple[float, ...]] = (-0.5, 0.4, 0.05)  # [m] the box of the hand's target
     hand_high: ClassVar[tuple[float, ...]] = (0.5, 1.0, 0.5)
     hand_start: ClassVar[tuple[float, ...]] = (0.0, 0.6, 0.2)
@@ -84,8 +89,8 @@ class Sawyer(Domain):
         if self.vary:
             raise InputError(f"Meta-World's tasks vary in their goals only, not in {next(iter(dict(self.vary)))}")
         super().__post_init__()
-        if self.pixels:
-            raise InputError("Meta-World's scenes are read without what is only seen; leave out --env.pixels")
+        if self.pixels and choose_painter(self.painter) is Caster:
+            raise InputError(f"Meta-World's scenes are meshes; {MESHES}")
         if self.engine == "mjx":
             raise InputError(_NOT_MJX)
 
@@ -200,6 +205,26 @@ class Sawyer(Domain):
     def compile_spec(self, values: Mapping[str, float] | None = None) -> mujoco.MjSpec:
         return scene.read(self.scene, self.watched, self.pressed)
 
+    # Pictures.
+
+    def seen_spec(self, values: Mapping[str, float]) -> mujoco.MjSpec:
+        return scene.pictured(self.scene)
+
+    def scene_model(self, row: int) -> mujoco.MjModel:
+        model = super().scene_model(row)
+        model.body_pos[:] = self.models[row].body_pos  # where the goal has moved them
+        return model
+
+    def scene_leaves(self) -> dict[str, np.ndarray]:
+        places = np.float32(np.stack([model.body_pos for model in self.models]))
+        return {"body_pos": places} if np.any(places != places[0]) else {}
+
+    def add_marks(self, spec: mujoco.MjSpec) -> None:
+        spec.worldbody.add_geom(name=_GOAL, size=[0.02, 0, 0], rgba=[0, 0.8, 0, 0.6], contype=0, conaffinity=0)
+
+    def marks(self, task: Task, world: World) -> Mapping[str, Mark]:
+        return {_GOAL: Mark(task.goal["target"])}
+
     # Steps.
 
     def start(self, task: Task, key: Key) -> tuple[Array, ...]:
@@ -211,7 +236,7 @@ class Sawyer(Domain):
         names = ("qpos", "qvel", "warmstart", "sensors", "mocap")
         world = World(extra=None, **{name: task.goal[f"start_{name}"] for name in names})
         world = world._replace(extra=self._half(world))
-        seen = self._unclipped(task, world)
+        seen = self.look_at(task, world) if self.pixels else self._unclipped(task, world)
         return Step(world, seen, jnp.float32(0), jnp.bool_(False), {"success": jnp.float32(0)})
 
     def control(self, task: Task, world: World, action: Array) -> tuple[World, Array]:

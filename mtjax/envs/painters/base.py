@@ -11,6 +11,7 @@ from mtjax.envs.painters.warp import WarpPainter
 from mtjax.types import Array, InputError
 
 PAINTERS = ("auto", "caster", "warp")
+MESHES = "only painter 'warp' draws these: --env.painter=warp on an NVIDIA GPU, or leave out --env.pixels"
 
 
 class Painter(Protocol):
