@@ -62,6 +62,7 @@ class Pictured(Family):
     GPU if it is installed, and caster elsewhere."""
 
     look: ClassVar[looks.Look | None] = None  # camera and light; None: the model's own, or a view of all of it
+    meshes: ClassVar[bool] = False  # whether the scene is of meshes, which only Warp draws
     hides: ClassVar[tuple[str, ...]] = ()  # geoms that films show and observations do not, such as a hidden goal
 
     def __post_init__(self):
@@ -86,7 +87,7 @@ class Pictured(Family):
     def _require_pictures(self) -> None:
         """Refuse what only pictures show, where there are none, and a painter that cannot run here."""
         if self.pixels:
-            choose_painter(self.painter)
+            choose_painter(self.painter, self.meshes)
             return
         shown = [name for name, _ in self.vary if self.every_parameter[name].looks]
         shown += [
@@ -155,7 +156,7 @@ class Pictured(Family):
     @cached_property
     def artist(self) -> Painter:
         """Return the painter of this family on this device."""
-        return choose_painter(self.painter)(self.scene, self.pixels)
+        return choose_painter(self.painter, self.meshes)(self.scene, self.pixels)
 
     @property
     def outside_painter(self) -> WarpPainter | None:

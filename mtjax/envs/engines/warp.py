@@ -111,8 +111,8 @@ class Warp:
         If MJX refuses the model's contacts, its force sensors read 0 until the next step.
         """
         feels = mujoco.mjtStage.mjSTAGE_ACC in self.base.sensor_needstage
-        engine = self.mjx if feels and self._like is not None else self._unhindered
-        return engine.forward(task, qpos, qvel, extra, mocap)
+        put = self.mjx.forward if feels and self._like is not None else self.place
+        return put(task, qpos, qvel, extra, mocap)
 
     def place(self, task: Task, qpos: Array, qvel: Array, extra: Any = None, mocap: Any = None) -> World:
         """Put a world in a state in which no force sensor is touched."""

@@ -38,7 +38,7 @@ class CoffeeButton(Sawyer):
     The observation has the orientation 1, 0, 0, 0 for the button.
     """
 
-    scene: ClassVar[str] = "sawyer_coffee"
+    scene_file: ClassVar[str] = "sawyer_coffee"
     hand_start: ClassVar = (0.0, 0.4, 0.2)
     drawn: ClassVar = ((-0.1, 0.8, -0.001), (0.1, 0.9, 0.001))
     goal_low: ClassVar = (-0.101, 0.61, 0.298)
@@ -69,7 +69,7 @@ class CoffeePull(Sawyer):
     The observation has the mug's orientation as x, y, z, w.
     """
 
-    scene: ClassVar[str] = "sawyer_coffee"
+    scene_file: ClassVar[str] = "sawyer_coffee"
     hand_start: ClassVar = (0.0, 0.4, 0.2)
     drawn: ClassVar = ((-0.05, 0.7, -0.001, -0.1, 0.55, -0.001), (0.05, 0.75, 0.001, 0.1, 0.65, 0.001))
     goal_low: ClassVar = (-0.1, 0.55, -0.001)

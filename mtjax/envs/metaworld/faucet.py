@@ -29,7 +29,7 @@ class FaucetOpen(Sawyer):
     The handle's end is taken 0.04 m to the left and 0.03 m above where the observation shows it.
     """
 
-    scene: ClassVar[str] = "sawyer_faucet"
+    scene_file: ClassVar[str] = "sawyer_faucet"
     hand_low: ClassVar = (-0.5, 0.4, -0.15)
     hand_start: ClassVar = (0.0, 0.4, 0.2)
     drawn: ClassVar = ((-0.05, 0.8, 0.0), (0.05, 0.85, 0.0))

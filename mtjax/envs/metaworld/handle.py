@@ -33,7 +33,7 @@ class HandlePress(Sawyer):
     Start: the box at the drawn place, its handle up.
     """
 
-    scene: ClassVar[str] = "sawyer_handle_press"
+    scene_file: ClassVar[str] = "sawyer_handle_press"
     drawn: ClassVar = ((-0.1, 0.8, -0.001), (0.1, 0.9, 0.001))
     goal_low: ClassVar = (-0.1, 0.55, 0.04)
     goal_high: ClassVar = (0.1, 0.7, 0.08)
@@ -64,7 +64,7 @@ class HandlePressSide(HandlePress):
     Reward, success and start: as HandlePress.
     """
 
-    scene: ClassVar[str] = "sawyer_handle_press_sideways"
+    scene_file: ClassVar[str] = "sawyer_handle_press_sideways"
     drawn: ClassVar = ((-0.35, 0.65, -0.001), (-0.25, 0.75, 0.001))
     goal_low: ClassVar = HandlePress.hand_low
     goal_high: ClassVar = HandlePress.hand_high

@@ -29,7 +29,7 @@ class DoorLock(Sawyer):
     Success: along z, the lock is within 0.02 m of the goal.
     """
 
-    scene: ClassVar[str] = "sawyer_door_lock"
+    scene_file: ClassVar[str] = "sawyer_door_lock"
     hand_low: ClassVar = (-0.5, 0.4, -0.15)
     drawn: ClassVar = ((-0.1, 0.8, 0.15), (0.1, 0.85, 0.15))
     goal_low: ClassVar = hand_low
@@ -64,7 +64,7 @@ class DoorUnlock(Sawyer):
     Success: along x, the lock is within 0.02 m of the goal.
     """
 
-    scene: ClassVar[str] = "sawyer_door_lock"
+    scene_file: ClassVar[str] = "sawyer_door_lock"
     hand_low: ClassVar = DoorLock.hand_low
     drawn: ClassVar = DoorLock.drawn
     goal_low: ClassVar = (0.0, 0.64, 0.21)

@@ -17,8 +17,6 @@ from mtjax.envs.engines.base import World, choose_engine
 from mtjax.envs.metaworld import scene
 from mtjax.envs.metaworld.at import At
 from mtjax.envs.metaworld.host import SUBSTEPS, Host
-from mtjax.envs.painters.base import MESHES, choose_painter
-from mtjax.envs.painters.caster import Caster
 from mtjax.envs.pixels import Mark
 from mtjax.envs.variation import Variation
 from mtjax.types import SPLITS, Array, InputError, Key, Step, Task
@@ -66,7 +64,8 @@ class Sawyer(Domain):
     held_out: bool = False
     """Do not train on this task: it is in the split extrapolation."""
 
-    scene: ClassVar[str]  # a file in the package's assets/sawyer_xyz, without .xml
+    scene_file: ClassVar[str]  # a file in the package's assets/sawyer_xyz, without .xml
+    meshes: ClassVar[bool] = True
     hides: ClassVar = (_GOAL,)
     hand_low: ClassVar[tuple[float, ...]] = (-0.5, 0.4, 0.05)  # [m] the box of the hand's target
     hand_high: ClassVar[tuple[float, ...]] = (0.5, 1.0, 0.5)
@@ -89,8 +88,6 @@ class Sawyer(Domain):
         if self.vary:
             raise InputError(f"Meta-World's tasks vary in their goals only, not in {next(iter(dict(self.vary)))}")
         super().__post_init__()
-        if self.pixels and choose_painter(self.painter) is Caster:
-            raise InputError(f"Meta-World's scenes are meshes; {MESHES}")
         if self.engine == "mjx":
             raise InputError(_NOT_MJX)
 
@@ -203,12 +200,12 @@ class Sawyer(Domain):
         return {"model": model, "goal": stacked([start.began for start in starts]) | states}
 
     def compile_spec(self, values: Mapping[str, float] | None = None) -> mujoco.MjSpec:
-        return scene.read(self.scene, self.watched, self.pressed)
+        return scene.read(self.scene_file, self.watched, self.pressed)
 
     # Pictures.
 
     def seen_spec(self, values: Mapping[str, float]) -> mujoco.MjSpec:
-        return scene.pictured(self.scene)
+        return scene.pictured(self.scene_file)
 
     def scene_model(self, row: int) -> mujoco.MjModel:
         model = super().scene_model(row)

@@ -29,7 +29,7 @@ class StickPush(Sawyer):
     Forces on the pads are those of the last substep. Meta-World computes them once more, of the state after it.
     """
 
-    scene: ClassVar[str] = "sawyer_stick_obj"
+    scene_file: ClassVar[str] = "sawyer_stick_obj"
     drawn: ClassVar = ((-0.08, 0.58, 0.0, 0.399, 0.55, 0.1319), (-0.03, 0.62, 0.001, 0.401, 0.6, 0.1321))
     goal_low: ClassVar = drawn[0][3:]
     goal_high: ClassVar = drawn[1][3:]

@@ -28,7 +28,7 @@ class WindowOpen(Sawyer):
     The handle's way is measured from the window's centre and not from the handle itself.
     """
 
-    scene: ClassVar[str] = "sawyer_window_horizontal"
+    scene_file: ClassVar[str] = "sawyer_window_horizontal"
     hand_start: ClassVar = (0.0, 0.4, 0.2)
     drawn: ClassVar = ((-0.1, 0.7, 0.16), (0.1, 0.9, 0.16))
     goal_low: ClassVar = Sawyer.hand_low

@@ -11,7 +11,6 @@ from mtjax.envs.painters.warp import WarpPainter
 from mtjax.types import Array, InputError
 
 PAINTERS = ("auto", "caster", "warp")
-MESHES = "only painter 'warp' draws these: --env.painter=warp on an NVIDIA GPU, or leave out --env.pixels"
 
 
 class Painter(Protocol):
@@ -23,13 +22,21 @@ class Painter(Protocol):
     def paint(self, leaf: Callable[[str], Array], poses: Poses) -> Array: ...  # (H, W, 3) uint8
 
 
-def choose_painter(name: str) -> Any:
+def choose_painter(name: str, meshes: bool = False) -> Any:
     """Return the class of a painter.
 
+    Args:
+        meshes: whether it has to draw meshes.
+
     Raises:
-        InputError: this device cannot run it, or Warp is not installed.
+        InputError: it cannot draw meshes, this device cannot run it, or Warp is not installed.
     """
     able = is_nvidia() and warp_installed()
+    if meshes and (name == "caster" or not able):
+        raise InputError(
+            "this scene is of meshes, which only painter 'warp' draws, on an NVIDIA GPU with Warp installed "
+            "(--env.painter=warp); or leave out --env.pixels"
+        )
     if name == "warp" and not is_nvidia():
         raise InputError("painter 'warp' needs an NVIDIA GPU; use --env.painter=caster")
     if name == "warp" and not able:
