@@ -12,7 +12,10 @@ from mtjax.types import InputError
 INSTALL = "pip install --no-deps metaworld==3.1.1"
 _HAND = ("body:hand", "body:leftclaw", "body:rightclaw", "body:leftpad", "body:rightpad")
 _HAND += ("site:leftEndEffector", "site:rightEndEffector")
-_EYE, _SEEN = np.array([0.85, 1.35, 0.85]), np.array([0.0, 0.6, 0.08])  # [m] where pictures are taken from, and their middle
+_EYE, _SEEN = (
+    np.array([0.85, 1.35, 0.85]),
+    np.array([0.0, 0.6, 0.08]),
+)  # [m] where pictures are taken from, and their middle
 _PADS = ("leftpad_geom", "rightpad_geom")
 _STRONGEST_FORCE = [1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 2, 1]  # (3,) of two geoms' contacts, normal first
 _KINDS = {
@@ -80,10 +83,10 @@ def read(name: str, watched: Mapping[str, str], pressed: str = "") -> mujoco.MjS
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MULTICCD  # MuJoCo 3.3, which Meta-World has, had no such
     position, turn = mujoco.mjtSensor.mjSENS_FRAMEPOS, mujoco.mjtSensor.mjSENS_FRAMEQUAT
     for place in _HAND:
-        _add_sensor(spec, position, place.partition(":")[2], place)
+        add_sensor(spec, position, place.partition(":")[2], place)
     for short, place in watched.items():
-        _add_sensor(spec, position, f"position:{short}", place)
-        _add_sensor(spec, turn, f"quat:{short}", place)
+        add_sensor(spec, position, f"position:{short}", place)
+        add_sensor(spec, turn, f"quat:{short}", place)
     for pad in _PADS if pressed else ():
         contact = spec.add_sensor(name=f"press:{pad}", type=mujoco.mjtSensor.mjSENS_CONTACT, intprm=_STRONGEST_FORCE)
         contact.objtype = contact.reftype = mujoco.mjtObj.mjOBJ_GEOM
@@ -91,7 +94,8 @@ def read(name: str, watched: Mapping[str, str], pressed: str = "") -> mujoco.MjS
     return spec
 
 
-def _add_sensor(spec: mujoco.MjSpec, kind: mujoco.mjtSensor, name: str, place: str) -> None:
+def add_sensor(spec: mujoco.MjSpec, kind: mujoco.mjtSensor, name: str, place: str) -> None:
+    """Add a sensor of a place, "body:NAME", "site:NAME" or "geom:NAME"."""
     of, _, thing = place.partition(":")
     spec.add_sensor(name=name, type=kind, objtype=_KINDS[of], objname=thing)
 
