@@ -42,7 +42,8 @@ def physics(env: Any, worlds_per_task: int, steps: int, resets: bool) -> Any:
     Args:
         resets: whether episodes end and begin anew as in training, where a tenth of the worlds does so at a time.
     """
-    tasks, agent, learners = env.tasks(), Random(env.spec.action_size), jnp.zeros(1)
+    agent: Any = Random(env.spec.action_size)
+    tasks, learners = env.tasks(), jnp.zeros(1)
     shape = (1, len(tasks.id), worlds_per_task)
 
     def begin(tasks: Any) -> Any:
@@ -54,9 +55,9 @@ def physics(env: Any, worlds_per_task: int, steps: int, resets: bool) -> Any:
     def step(carry: Any, _: Any) -> tuple[Any, Any]:
         worlds, keys = carry
         keys, act_keys, reset_keys = split_keys(keys, 3)
-        worlds, env_step = step_envs(env, agent, learners, tasks, worlds, world_keys(act_keys, shape))  # type: ignore
+        worlds, env_step = step_envs(env, agent, learners, tasks, worlds, world_keys(act_keys, shape))
         if resets:
-            worlds = reset_ended(env, agent, learners, tasks, worlds, env_step.transition.ended, reset_keys)  # type: ignore
+            worlds = reset_ended(env, agent, learners, tasks, worlds, env_step.transition.ended, reset_keys)
         seen = jnp.sum(env_step.transition.reward) + jnp.sum(env_step.transition.next_obs)
         return (worlds, keys), seen
 

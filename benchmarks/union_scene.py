@@ -23,7 +23,7 @@ from steps_per_second import Contestant
 
 import mtjax
 from mtjax.envs.domain import stack_differing
-from mtjax.envs.engines.base import ENGINES, World, at_rest
+from mtjax.envs.engines.base import World, at_rest
 from mtjax.envs.engines.c import MujocoC
 from mtjax.envs.engines.warp import Warp
 from mtjax.envs.metaworld import scene
@@ -38,6 +38,7 @@ _OTHERS = {  # scene -> the bodies that are its task's
     "sawyer_peg_insertion_side": ("peg", "box"),
     "sawyer_window_horizontal": ("window",),
 }
+_FREE = mujoco.mjtJoint.mjJNT_FREE
 _ARM = 9  # numbers of qpos
 _FAR = 10.0  # [m] between parked things
 _LIGHT = 1e-6  # of the weight, that is held up though the thing is used: MuJoCo counts bodies that are held up
@@ -54,9 +55,7 @@ class Simulated(NamedTuple):
 def main() -> None:
     on_cpu = jax.default_backend() == "cpu"
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "--engine", default="c" if on_cpu else "warp", choices=[e for e in ENGINES if e in ("c", "warp")]
-    )
+    parser.add_argument("--engine", default="c" if on_cpu else "warp", choices=("c", "warp"))
     parser.add_argument("--worlds", type=int, default=160 if on_cpu else 4096, help="of all ten tasks")
     parser.add_argument("--steps", type=int, default=200, help="control steps in a timed call")
     parser.add_argument("--rounds", type=int, default=5)
@@ -122,7 +121,7 @@ def compose() -> mujoco.MjSpec:
         for body in bodies:
             spec.worldbody.add_frame().attach_body(other.body(body), f"{name}/", "")
             thing = spec.body(f"{name}/{body}")
-            thing.gravcomp = _LIGHT if any(joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in thing.joints) else 0
+            thing.gravcomp = _LIGHT if any(joint.type == _FREE for joint in thing.joints) else 0
             scene.add_sensor(spec, mujoco.mjtSensor.mjSENS_FRAMEPOS, f"position:{name}/{body}", f"body:{name}/{body}")
             scene.add_sensor(spec, mujoco.mjtSensor.mjSENS_FRAMEQUAT, f"quat:{name}/{body}", f"body:{name}/{body}")
     return spec
@@ -139,16 +138,14 @@ def in_union(base: mujoco.MjModel, family: Sawyer) -> tuple[mujoco.MjModel, Worl
     for i, (owner, body) in enumerate(things):
         thing = base.body(owner + body).id
         joints = np.flatnonzero(base.body_rootid[base.jnt_bodyid] == thing)
-        widths = [{0: 7, 1: 4}.get(int(base.jnt_type[j]), 1) for j in joints]
-        places = np.concatenate(
-            [base.jnt_qposadr[j] + np.arange(n) for j, n in zip(joints, widths, strict=True)] or [[]]
-        )
+        begins = [base.jnt_qposadr[j] + np.arange(7 if base.jnt_type[j] == _FREE else 1) for j in joints]
+        places = np.concatenate([[], *begins]).astype(int)
         if owner == prefix:
             model.body_pos[thing] = start.model.body(body).pos
-            qpos[places.astype(int)] = start.state["qpos"][used : used + len(places)]
+            qpos[places] = start.state["qpos"][used : used + len(places)]
             used += len(places)
         elif base.body_gravcomp[thing]:
-            qpos[places[:3].astype(int)], model.body_gravcomp[thing] = [_FAR * (i + 1), 0, 1], 1
+            qpos[places[:3]], model.body_gravcomp[thing] = [_FAR * (i + 1), 0, 1], 1
         else:
             model.body_pos[thing] = [_FAR * (i + 1), 0, 0.5]
     mocap = jnp.float32(start.state["mocap"])

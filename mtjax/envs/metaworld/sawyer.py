@@ -213,7 +213,7 @@ class Sawyer(Domain):
         return model
 
     def scene_leaves(self) -> dict[str, np.ndarray]:
-        places = np.float32(np.stack([model.body_pos for model in self.models]))
+        places = np.stack([model.body_pos for model in self.models]).astype(np.float32)
         return {"body_pos": places} if np.any(places != places[0]) else {}
 
     def add_marks(self, spec: mujoco.MjSpec) -> None:

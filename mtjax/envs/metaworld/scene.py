@@ -12,10 +12,7 @@ from mtjax.types import InputError
 INSTALL = "pip install --no-deps metaworld==3.1.1"
 _HAND = ("body:hand", "body:leftclaw", "body:rightclaw", "body:leftpad", "body:rightpad")
 _HAND += ("site:leftEndEffector", "site:rightEndEffector")
-_EYE, _SEEN = (
-    np.array([0.85, 1.35, 0.85]),
-    np.array([0.0, 0.6, 0.08]),
-)  # [m] where pictures are taken from, and their middle
+_EYE, _SEEN = np.array([0.85, 1.35, 0.85]), np.array([0.0, 0.6, 0.08])  # [m] of pictures: camera and middle
 _PADS = ("leftpad_geom", "rightpad_geom")
 _STRONGEST_FORCE = [1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 2, 1]  # (3,) of two geoms' contacts, normal first
 _KINDS = {
