@@ -7,6 +7,7 @@ and half another, so that a step which takes its model from the wrong row is off
 import gc
 import importlib.util
 from functools import lru_cache, partial
+from threading import Thread
 from typing import NamedTuple
 
 import jax
@@ -309,6 +310,39 @@ def test_warp_is_refused_where_it_cannot_run(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "tpu")
     with pytest.raises(InputError, match="needs an NVIDIA GPU"):
         physics.choose_engine("warp")
+
+
+@pytest.mark.slow
+def test_warp_compiles_all_kernels_of_a_step_before_it(monkeypatch, tmp_path):
+    """With contacts, a loop over solver iterations, and launches of another thread meanwhile."""
+    warp = pytest.importorskip("warp")
+    from mujoco.mjx.third_party import mujoco_warp
+
+    from mtjax.envs.engines.kernels import compile_kernels
+    from mtjax.envs.engines.warp import Warp
+
+    engine = Warp(envs.make("hopper-stand", engine="mjx").mjx.base, 1)
+    engine.provide(3, ())
+    monkeypatch.setattr(warp.config, "kernel_cache_dir", str(tmp_path))
+    before, loaded, load = (warp.Module.load, warp.capture_while), [], warp.Module.load
+    elsewhere = warp.zeros(3, dtype=float)
+    other = Thread(target=lambda: warp.map(lambda x: x + 1.0, elsewhere, out=elsewhere))
+    place = engine._places["cpu", 3]
+
+    def launch():
+        other.start()
+        other.join()
+        mujoco_warp.step(place.model, place.data)
+
+    qpos = place.data.qpos.numpy()
+    compile_kernels("cpu", launch)
+    assert (warp.Module.load, warp.capture_while) == before
+    np.testing.assert_array_equal(elsewhere.numpy(), 1)
+    np.testing.assert_array_equal(place.data.qpos.numpy(), qpos)
+    monkeypatch.setattr(warp.Module, "load", lambda *given: (loaded.append(not given[0].execs), load(*given))[1])
+    mujoco_warp.step(place.model, place.data)
+    assert len(loaded) > 20 and not any(loaded)
+    assert np.all(place.data.time.numpy() > 0)
 
 
 def test_warp_refuses_tasks_that_differ_in_the_size_of_sites():

@@ -58,8 +58,8 @@ class Pictured(Family):
     plain: bool = False
     """Draw floor and sky in one colour each."""
     painter: str = "auto"
-    """What draws: auto, caster (plain JAX, any device) or warp (MuJoCo Warp, NVIDIA GPUs). auto is warp on an NVIDIA
-    GPU if it is installed, and caster elsewhere."""
+    """What draws: caster (plain JAX, any device) or warp (MuJoCo Warp's ray tracer, NVIDIA GPUs). auto is the caster,
+    which is the faster one."""
 
     look: ClassVar[looks.Look | None] = None  # camera and light; None: the model's own, or a view of all of it
     meshes: ClassVar[bool] = False  # whether the scene is of meshes, which only Warp draws

@@ -18,6 +18,7 @@ import mujoco
 import numpy as np
 
 from mtjax.envs.engines.base import World, mjx_module, state_of
+from mtjax.envs.engines.kernels import compile_kernels
 from mtjax.envs.engines.mjx import Mjx
 from mtjax.types import Array, InputError, Task
 
@@ -242,14 +243,12 @@ class Warp:
             whether programs record CUDA graphs when they first run. XLA must then compile nothing at the same time: it
             tries kernels out on the device, and both fail.
         """
-        import warp
         from mujoco.mjx.third_party import mujoco_warp
 
         counts = sorted(count for _, count in list(self._places))[:1]
         for count, device in itertools.product(counts, own_devices()):
-            with ALONE, warp.ScopedDevice(device):
-                mujoco_warp.step(*self._places[device.alias, count][:2])
-                warp.synchronize_device(device)
+            with ALONE:
+                compile_kernels(device, partial(mujoco_warp.step, *self._places[device.alias, count][:2]))
         return jax.default_backend() != "cpu"
 
     def _make_place(self, device: Any, count: int) -> _Place:

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from mtjax.envs.engines.kernels import compile_kernels
 from mtjax.envs.engines.warp import ALONE, annotated, keep_streams, own_devices
 from mtjax.envs.painters.poses import Poses
 from mtjax.envs.painters.scene import GROUPS, Scene
@@ -134,14 +135,11 @@ class WarpPainter:
         Returns:
             whether programs record CUDA graphs when they first run.
         """
-        import warp
         from mujoco.mjx.third_party import mujoco_warp
 
         for (alias, _), place in list(self._places.items()):
-            with ALONE, warp.ScopedDevice(alias):
-                mujoco_warp.refit_bvh(*place)
-                mujoco_warp.render(*place)
-                warp.synchronize_device(alias)
+            with ALONE:
+                compile_kernels(alias, lambda place=place: (mujoco_warp.refit_bvh(*place), mujoco_warp.render(*place)))
         return jax.default_backend() != "cpu"
 
     def _make_place(self, device: Any, count: int) -> _Place:
