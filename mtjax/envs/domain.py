@@ -259,7 +259,7 @@ class Domain(Pictured):
 
         Their models may differ in numbers only, as those of tasks.
         """
-        if self.repeat != 1:  # each of the repeated control steps has its reward
+        if self.repeat != 1 or type(self).step is not Domain.step:  # more than control, physics and outcome
             return None
         model = self.models[0] if isinstance(self.simulator, MujocoC) else self.simulator.base
         fixed = hashlib.sha256()
