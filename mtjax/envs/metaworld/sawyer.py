@@ -197,7 +197,8 @@ class Sawyer(Domain):
         stacked = lambda trees: {name: np.float32(np.stack([tree[name] for tree in trees])) for name in trees[0]}
         states = {f"start_{name}": x for name, x in stacked([start.state for start in starts]).items()}
         model = {name: np.float32(leaf) for name, leaf in stack_differing(self.models).items()}
-        return {"model": model, "goal": stacked([start.began for start in starts]) | states}
+        seen = {"scene": self.scene_leaves()} if self.pixels else {}
+        return {"model": model, "goal": stacked([start.began for start in starts]) | states, **seen}
 
     def compile_spec(self, values: Mapping[str, float] | None = None) -> mujoco.MjSpec:
         return scene.read(self.scene_file, self.watched, self.pressed)
