@@ -124,7 +124,10 @@ def play(names: list[str], engine: str, goals: int) -> list[tuple[str, np.ndarra
     each = jax.tree.map(lambda x: jnp.asarray(x)[None], tasks.draws)._replace(blocks=tasks.blocks)
     keys = jax.random.split(jax.random.key(0), (1, len(names), goals))
     start = jax.jit(env.reset_worlds)(each, keys)
-    step = jax.jit(env.step_worlds, donate_argnums=1)  # in place, so that Warp records a step once
+    nothing = jnp.zeros((1, len(names), goals, 4))
+    lowered = jax.jit(env.step_worlds, donate_argnums=1).lower(each, start.state, nothing)  # in place: recorded once
+    env.load_kernels()
+    step = lowered.compile()
     state, obs, found = jax.tree.map(jnp.copy, start.state), np.asarray(start.obs), []
     for i in range(env.episode_length):
         taken = [metaworld_policies.actions(policies[name], obs[0, t]) for t, name in enumerate(names)]

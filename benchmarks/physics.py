@@ -61,8 +61,10 @@ def physics(env: Any, worlds_per_task: int, steps: int, resets: bool) -> Any:
         seen = jnp.sum(env_step.transition.reward) + jnp.sum(env_step.transition.next_obs)
         return (worlds, keys), seen
 
-    program = jax.jit(lambda carry: jax.lax.scan(step, carry, length=steps), donate_argnums=0)
     held = [jax.tree.map(jnp.copy, jax.jit(begin)(tasks))]  # some of its arrays are one, which cannot be donated twice
+    lowered = jax.jit(lambda carry: jax.lax.scan(step, carry, length=steps), donate_argnums=0).lower(held[0])
+    env.load_kernels()
+    program = lowered.compile()
 
     def run() -> Any:
         held[0], seen = program(held[0])

@@ -176,8 +176,12 @@ def program(parts: list[Simulated], per_task: int, steps: int) -> Any:
 
         return jax.lax.scan(once, worlds, jax.random.split(key, steps))
 
-    compiled, key = jax.jit(play), jax.random.key(0)
+    key = jax.random.key(0)
     tasks, worlds = map(list, zip(*map(begin, parts), strict=True))
+    lowered = jax.jit(play).lower(tasks, worlds, key)
+    for part in parts:
+        part.engine.load_kernels()
+    compiled = lowered.compile()
 
     def run() -> Any:
         moved, seen = compiled(tasks, worlds, key)  # always from the start, so that all rounds have the same contacts
