@@ -18,17 +18,18 @@ import jax.numpy as jnp
 from report import publish
 
 import mtjax
-from mtjax.envs import Domain
+from mtjax.envs.pixels import Pictured
 from mtjax.types import InputError
 
 DOMAINS = {"finger": "finger-spin", "cheetah": "cheetah-run", "walker": "walker-walk", "cartpole": "cartpole-swingup"}
+DOMAINS |= {"corridor": "corridor-maze", "two-goal": "two-goal-maze"}
 _ON_CPU = jax.default_backend() == "cpu"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--domains", nargs="+", default=list(DOMAINS)[:3], choices=DOMAINS)
-    parser.add_argument("--painters", nargs="+", default=["caster"] if _ON_CPU else ["caster", "warp"])
+    parser.add_argument("--painters", nargs="+", default=["caster"] if _ON_CPU else ["caster", "warp"])  # or auto
     parser.add_argument("--sizes", nargs="+", type=int, default=[64], help="pixels a side")
     parser.add_argument("--worlds", type=int, default=128 if _ON_CPU else 4096)
     parser.add_argument("--steps", type=int, default=20, help="steps of every environment in a timed call")
@@ -78,13 +79,13 @@ def timed(run: Callable[[], Any]) -> float:
     return time.perf_counter() - start
 
 
-def begin(env: Domain, count: int) -> tuple[Any, Any]:
+def begin(env: Pictured, count: int) -> tuple[Any, Any]:
     """Return tasks and first steps of so many worlds."""
     task = jax.tree.map(lambda x: jnp.broadcast_to(x[0], (count, *x.shape[1:])), env.tasks())
     return task, jax.jit(jax.vmap(env.reset))(task, jax.random.split(jax.random.key(0), count))
 
 
-def drawing(env: Domain, arguments: argparse.Namespace) -> tuple[Callable[[], Any], float]:
+def drawing(env: Pictured, arguments: argparse.Namespace) -> tuple[Callable[[], Any], float]:
     """Return a call that draws all worlds as often as there are steps, and the seconds of its first call."""
     task, first = begin(env, arguments.worlds)
 
@@ -92,8 +93,9 @@ def drawing(env: Domain, arguments: argparse.Namespace) -> tuple[Callable[[], An
     def draw(states):
         def again(states, _):
             picture = jax.vmap(env.draw)(task, states)
-            moved = states.qpos + 1e-6 * picture[:, 0, 0, :1]  # so that no picture is drawn once for all
-            return states._replace(qpos=moved), picture[:, 0, 0]
+            nudge = 1e-6 * picture[:, 0, 0, 0]  # so that no picture is drawn once for all
+            move = lambda x: x + nudge.reshape(-1, *[1] * (x.ndim - 1)) if jnp.issubdtype(x.dtype, jnp.floating) else x
+            return jax.tree.map(move, states), picture[:, 0, 0]
 
         return jax.lax.scan(again, states, length=arguments.steps)[1]
 
@@ -101,7 +103,7 @@ def drawing(env: Domain, arguments: argparse.Namespace) -> tuple[Callable[[], An
     return run, timed(run)
 
 
-def stepping(env: Domain, arguments: argparse.Namespace) -> tuple[Callable[[], Any], float]:
+def stepping(env: Pictured, arguments: argparse.Namespace) -> tuple[Callable[[], Any], float]:
     """Return a call that steps all worlds, and the seconds of its first call."""
     task, first = begin(env, arguments.worlds)
 

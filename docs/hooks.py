@@ -29,6 +29,7 @@ PICTURE = "../../benchmarks/results/"  # as pages name it, so that it is found o
 GROUPS = {  # title -> whether a family belongs there; the first that fits
     "Brax": lambda name, module: module.endswith("envs.brax"),
     "MTEnv's own": lambda name, module: ".mtenv." in module,
+    "Mazes seen from within": lambda name, module: ".corridors." in module,
     "Meta-World": lambda name, module: ".metaworld." in module,
     "One physics, several goals": lambda name, module: name in envs._GOALS,
     "Further tasks on dm_control's bodies": lambda name, module: name in envs._FURTHER,

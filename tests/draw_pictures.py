@@ -1,4 +1,4 @@
-"""Draw every domain by MuJoCo's own renderer, as the reference of ``test_painters.py``: MUJOCO_GL=osmesa or egl.
+"""Draw every domain and maze by MuJoCo's own renderer, the reference of ``test_painters.py``: MUJOCO_GL=osmesa or egl.
 
     python tests/draw_pictures.py [--check]
 
@@ -19,14 +19,14 @@ except Exception as error:  # every OpenGL backend without libraries fails with 
 
 import numpy as np
 from PIL import Image
-from test_painters import DOMAINS, PICTURES, SIZE, family, similarity, states_of
+from test_painters import DOMAINS, MAZES, PICTURES, SIZE, family, similarity, states_of
 
 from mtjax.report import render
 from mtjax.types import InputError
 
 
 def draw(name: str) -> np.ndarray:
-    """The two states of a domain, drawn (2, H, W, 3)."""
+    """The two states of a domain or maze, drawn (2, H, W, 3)."""
     return render.film(family(name), 0, jax.tree.map(np.asarray, states_of(name)), SIZE, SIZE)
 
 
@@ -42,7 +42,7 @@ def keep(name: str, i: int, picture: np.ndarray) -> None:
 if __name__ == "__main__":
     act = check if "--check" in sys.argv else keep
     try:
-        drawn = {name: draw(name) for name in DOMAINS}
+        drawn = {name: draw(name) for name in DOMAINS + MAZES}
     except InputError as error:
         sys.exit(str(error))
     for name, pictures in drawn.items():

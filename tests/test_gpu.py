@@ -289,3 +289,22 @@ def test_warp_draws_what_the_caster_draws(name):
     for one, other in zip(ours, theirs, strict=True):
         for place in np.ndindex(one.shape[:-3]):
             assert similarity(one[place], other[place]) > 0.9  # the cup's string is thinner than a pixel: 0.948
+
+
+@pytest.mark.parametrize("name", ["corridor-maze-vary-layout", "two-goal-maze"])
+def test_mazes_move_and_are_drawn_as_on_the_cpu(name):
+    """Eight starts of every task, and a step from each; edges of shapes may fall on the next pixel."""
+    env = mtjax.make(name, pixels=SIZE, state="also")
+    keys = jax.random.split(jax.random.key(0), (env.train_count, 8))
+    action = jnp.ones(env.action_size)
+
+    def play(tasks, keys):
+        start = jax.vmap(jax.vmap(env.reset, (None, 0)))(tasks, keys)
+        after = jax.vmap(jax.vmap(env.step, (None, 0, None)), (0, 0, None))(tasks, start.state, action)
+        return start.obs, after.obs
+
+    cpu, gpu = both(play, env.tasks(), keys)
+    for one, other in zip(cpu, gpu, strict=True):
+        np.testing.assert_allclose(one["state"], other["state"], atol=1e-4)
+        apart = np.abs(np.int32(one["pixels"]) - np.int32(other["pixels"])).max(axis=-1)
+        assert np.mean(apart > 3) < 2e-3

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import tiny
+from probes import QUICK, tiny
 
 from mtjax import loop
 from mtjax.config import configure
@@ -188,9 +188,11 @@ def test_both_tasks_and_nothing_between():
     assert specs == [Spec.vector(4, 3, 1), Spec.vector(8, 3, 1)]
     assert [len(MAZE.tasks(split).id) for split in ("train", "interpolation", "extrapolation")] == [2, 0, 0]
     np.testing.assert_array_equal(TwoGoalMaze().tasks().goal["goal-box"], [0])
-    for vary in ({"goal-box": "0,1"}, {"goal-box": "0.5"}, {"goal-box": "0:1"}):
-        with pytest.raises(InputError, match=r"goal-box is 0 \(blue\) or 1 \(red\), not 0\.\d+"):
-            TwoGoalMaze(vary=vary)
+    named = TwoGoalMaze(vary={"goal-box": "blue,red"})
+    assert [named.describe(i) for i in (0, 1)] == ["goal-box=blue", "goal-box=red"] and named.count == 2
+    for values in ("0.5", "0:1"):
+        with pytest.raises(InputError, match=rf"goal-box is one of 0 \(blue\), 1 \(red\); .*; not {values}"):
+            TwoGoalMaze(vary={"goal-box": values})
 
 
 def test_an_agent_trains_on_it():
@@ -202,3 +204,51 @@ def test_an_agent_trains_on_it():
     state = jax.eval_shape(lambda: loop.init(MAZE, agent, settings, MAZE.tasks(), jnp.arange(1)))
     after, _ = jax.eval_shape(lambda state: loop.run_chunk(MAZE, agent, settings, MAZE.tasks(), state), state)
     assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
+
+
+# Pictures.
+
+
+SEEN = TwoGoalMaze(vary={"goal-box": "0,1"}, split="none", pixels=64)
+
+
+@pytest.fixture(scope="module")
+def draw():
+    return jax.jit(SEEN.draw, compiler_options=QUICK)
+
+
+def middle(mask):
+    """Where in the maze, x and z, the middle of a mask (64, 64) is, 0.4 m above the floor."""
+    rows, columns = np.nonzero(mask)
+    return (np.array([columns.mean(), rows.mean()]) - 31.5) * 10.6 * 2 * math.tan(math.radians(22.5)) / 64
+
+
+@pytest.mark.parametrize(("turns", "goal"), [(EAST, 1), (WEST, 0), (WEST, 1)])
+def test_pictures_show_the_maze_from_above(draw, turns, goal):
+    """The walker, both boxes, and before the west wall the colour of the goal, while the walker faces it."""
+    world = state((1.5, -2.0), turns, ((-2.0, 1.0), (2.0, 2.0)))
+    picture = np.int32(draw(task(goal), world))
+    red, green, blue = np.moveaxis(picture, -1, 0)
+    west = np.arange(64) < 12
+    masks = {"blue": (blue > 200) & (red < 150), "red": (red > 200) & (blue < 150) & (green < 150)}
+    for i, mask in enumerate(masks.values()):
+        assert np.all(np.abs(middle(mask & ~west) - world.boxes[i]) < 0.15)
+        assert np.any(mask & west) == (turns == WEST and i == goal)
+    walker = (red > 200) & (green > 200) & (blue < 150)
+    assert np.all(np.abs(middle(walker) - world.position) < 0.2)
+    beside = np.hypot(*(np.indices((64, 64)) - np.argwhere(walker).mean(axis=0)[:, None, None])) < 8
+    dark = middle(beside & (picture.max(axis=-1) < 60))
+    assert (dark[0] > world.position[0]) == (turns == EAST)
+
+
+def test_pictures_change_nothing_else(step):
+    """The state beside them is that without them, at the start and after a step."""
+    env = TwoGoalMaze(vary={"goal-box": "0,1"}, split="none", pixels=16, state="also", repeat=2, grey=True)
+    begin = jax.jit(lambda key: env.reset(task(1), key).obs["state"], compiler_options=QUICK)  # draws nothing
+    key = jax.random.key(4)
+    plain = MAZE.reset(task(1), key)
+    np.testing.assert_array_equal(begin(key), plain.obs)
+    after = jax.jit(env.step, compiler_options=QUICK)(task(1), plain.state, LEFT)
+    twice = step(task(1), step(task(1), plain.state, LEFT).state, LEFT)
+    np.testing.assert_allclose(after.obs["state"], twice.obs, atol=1e-6)
+    assert after.obs["pixels"].shape == (16, 16, 1) and env.episode_length == 100

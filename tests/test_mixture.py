@@ -516,7 +516,7 @@ def test_a_run_is_scored_family_by_family(run, capsys):
     (folder,) = run.glob("evaluation-*")
     assert {"returns.csv", "return_by_task.png", "diagnostics.json"} <= {file.name for file in folder.iterdir()}
     assert "train,aim goal=-1,0,0," in (folder / "returns.csv").read_text()
-    with pytest.raises(InputError, match="only MuJoCo families can be filmed"):
+    with pytest.raises(InputError, match="only families that show pictures can be filmed"):
         mtjax.evaluate.main([f"--run={run}", "--video"])
 
 

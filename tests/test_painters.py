@@ -40,7 +40,8 @@ DOMAINS = (
     "swimmer-swimmer6",
     "walker-walk",
 )
-QUICK = ("cartpole-swingup", "cheetah-run", "finger-turn-easy")
+MAZES = ("corridor-maze", "two-goal-maze")
+QUICK = ("cartpole-swingup", "cheetah-run", "corridor-maze", "finger-turn-easy")
 TARGETS = {  # in the two states
     "finger-turn-easy": [[0.1, 0.07], [-0.05, 0.1]],
     "fish-swim": [[0.1, 0.1, 0.2], [-0.2, 0.1, 0.1]],
@@ -72,7 +73,10 @@ def family(name):
 
 
 def states_of(name):
-    """Two states of a domain away from where it rests."""
+    """Two states of a domain away from where it rests, or of a maze at two starts."""
+    if name in MAZES:
+        env, keys = mtjax.make(name), jax.random.split(jax.random.key(3), 2)
+        return jax.vmap(env.reset, (None, 0))(jax.tree.map(lambda x: x[0], env.tasks()), keys).state
     env = family(name)
     model = env.scene.model
     random = np.random.default_rng(0)
@@ -95,7 +99,9 @@ def drawn(name):
     return np.asarray(jax.jit(jax.vmap(env.draw, (None, 0)))(task, states_of(name)))
 
 
-@pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in DOMAINS])
+@pytest.mark.parametrize(
+    "name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in DOMAINS + MAZES]
+)
 def test_pictures_are_those_of_mujocos_renderer(name):
     """Its pictures have shadows and smooth edges, which the caster has not; a shifted picture is less alike."""
     for i, picture in enumerate(drawn(name)):

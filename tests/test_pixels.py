@@ -13,6 +13,7 @@ from probes import METAWORLD, with_metaworld
 import mtjax
 from mtjax.envs import ENVS
 from mtjax.envs.domain import Domain
+from mtjax.envs.pixels import Pictured
 from mtjax.types import InputError
 
 SIZE = 16
@@ -155,13 +156,13 @@ def test_own_models_are_seen_whole():
 
 
 UNSEEN = {*METAWORLD, *(name for name in ENVS if name.startswith("dog-"))}  # refused in words, which others test
-SEEN = {family for name in ENVS if issubclass((family := ENVS[name][0]), Domain) and name not in UNSEEN}
-MUJOCO = sorted(SEEN, key=lambda f: f.__name__)
+SEEN = {family for name in ENVS if issubclass((family := ENVS[name][0]), Pictured) and name not in UNSEEN}
+SCENES = sorted(SEEN, key=lambda f: f.__name__)
 
 
-@pytest.mark.parametrize("family", MUJOCO, ids=lambda f: f.__name__)
-def test_every_mujoco_family_has_a_scene(family):
-    env = family(pixels=SIZE, engine="c")
+@pytest.mark.parametrize("family", SCENES, ids=lambda f: f.__name__)
+def test_every_family_that_can_be_seen_has_a_scene(family):
+    env = family(pixels=SIZE, **({"engine": "c"} if issubclass(family, Domain) else {}))
     model = env.scene.model
     assert model.ncam and model.nlight and len(env.scene.shown) > 1
     task = jax.tree.map(lambda x: x[0], env.table.tasks)
@@ -172,8 +173,8 @@ def test_every_mujoco_family_has_a_scene(family):
 @pytest.mark.parametrize(
     ("name", "settings", "message"),
     [
-        ("brax-ant", {"pixels": 64}, "no MuJoCo model, which pixels needs; take a family such as cheetah-run"),
-        ("tabular-mdp", {"repeat": 2}, "no MuJoCo model, which repeat needs"),
+        ("brax-ant", {"pixels": 64}, "no scene to draw, which pixels needs; take a family such as cheetah-run"),
+        ("tabular-mdp", {"repeat": 2}, "no scene to draw, which repeat needs"),
         pytest.param("metaworld-reach", {"pixels": 64}, "leave out --env.pixels", marks=with_metaworld),
         ("finger-spin", {"pixels": 63}, "an even number from 16 to 512, not 63"),
         ("finger-spin", {"pixels": 8}, "an even number from 16"),

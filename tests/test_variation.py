@@ -11,6 +11,7 @@ PARAMETERS = {
     "a": Parameter("1", 1.0),
     "b": Parameter("1", 1.0),
     "c": Parameter("1", 0.0, minimum=-np.inf, maximum=2.5),
+    "d": Parameter("1", 0.0, minimum=-1.0, maximum=2.0, names=("low", "mid", "high")),
 }
 
 
@@ -33,6 +34,21 @@ def test_paired_values_go_together():
     assert found["train"] == [[4, 0], [5, 1], [6, 2]]
     assert found["interpolation"] == [[4.5, 0.5], [5.5, 1.5]]
     assert found["extrapolation"] == [[2, -2], [3, -1]]  # c = 3 and 4 exceed its maximum
+
+
+def test_between_and_beyond_names_there_is_nothing():
+    """Held-out tasks have the named values of training, or, beyond another parameter's end, the middle one."""
+    found = rows({"a": "2,3", "d": "low,high"})
+    assert found["train"] == [[2, 0], [2, 2], [3, 0], [3, 2]]
+    assert found["interpolation"] == [[2.5, 0], [2.5, 2]] and found["extrapolation"] == [[1, 0], [4, 0], [5, 0]]
+    for given, combine in (({"d": "0:2:3"}, "grid"), ({"a": "2,3", "d": "0,1"}, "paired")):
+        assert [len(x) for x in rows(given, combine).values()] == [3 if combine == "grid" else 2, 0, 0]
+    assert rows({"a": "2,3", "d": "high"}, "paired")["interpolation"] == [[2.5, 2]]
+    for text in ("0:2", "0,0.5", "low:high"):
+        with pytest.raises(InputError, match=r"d is one of 0 \(low\), 1 \(mid\), 2 \(high\); .*low,mid; not"):
+            rows({"d": text})
+    with pytest.raises(InputError, match="combine=random draws between values, and d has names"):
+        rows({"a": "2,3", "d": "0,1"}, "random")
 
 
 def test_a_single_value_pairs_with_any_number():

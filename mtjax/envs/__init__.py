@@ -173,6 +173,13 @@ _MTENV: dict[str, Entry] = {
     "two-goal-maze-seen": ("maze:TwoGoalMaze", {"vary": {"goal-box": "0,1"}, "split": "none", "observe_boxes": True}),
 }
 
+# Mazes seen from within.
+_CORRIDORS: dict[str, Entry] = {
+    "corridor-maze": ("maze:CorridorMaze", {}),
+    "corridor-maze-vary-goal": ("maze:CorridorMaze", {"vary": {"goal-colour": "0,1,2"}}),
+    "corridor-maze-vary-layout": ("maze:CorridorMaze", {"vary": {"layout": "0:9:10"}}),
+}
+
 _BRAX_NAMES = (
     "ant",
     "fast",
@@ -193,12 +200,13 @@ _BRAX: dict[str, Entry] = {
 }
 
 PICTURES = ("pixels", "frames", "repeat", "grey", "state", "plain", "painter")
-"""Settings that only families with a MuJoCo model have."""
+"""Settings that only families with a scene have: those of MuJoCo models, and mazes."""
 
 _inside = lambda folder, table: {name: (f"{folder}.{place}", settings) for name, (place, settings) in table.items()}
 ENVS = Families(
     _inside("mtjax.envs.dm_control", _DOMAINS | _FURTHER | _HIP_BMDP | _GOALS)
     | _inside("mtjax.envs.mtenv", _MTENV)
+    | _inside("mtjax.envs.corridors", _CORRIDORS)
     | _inside("mtjax.envs.metaworld", FAMILIES)
     | _inside("mtjax.envs", _BRAX)
 )
@@ -270,10 +278,10 @@ def require_pictures(name: str, setting: str) -> None:
     """Refuse a setting of pictures for a family that does not have it.
 
     Raises:
-        InputError: the setting belongs to families with a MuJoCo model only.
+        InputError: the setting belongs to families with a scene only.
     """
     if setting in PICTURES:
-        raise InputError(f"{name} has no MuJoCo model, which {setting} needs; take a family such as cheetah-run")
+        raise InputError(f"{name} has no scene to draw, which {setting} needs; take a family such as cheetah-run")
 
 
 def mixture(families: "Sequence[str | Family | Mixture]") -> "Mixture":

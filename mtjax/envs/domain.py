@@ -84,26 +84,6 @@ class Domain(Pictured):
         """Return the world with what an action (A,) sets in it, and the controls (nu,) of the step."""
         return world, action
 
-    @abc.abstractmethod
-    def observe(self, task: Task, world: World) -> Array:
-        """Return the observation (O,) of a world."""
-
-    @abc.abstractmethod
-    def reward(self, task: Task, world: World, action: Array) -> Array:
-        """Return the reward () of a world after the step."""
-
-    def terminates(self, task: Task, world: World) -> Array:
-        """Return whether () an episode ends in this world, with no rewards after it. By default only time ends one."""
-        return jnp.bool_(False)
-
-    def metrics(self, task: Task, world: World, action: Array) -> dict[str, Array]:
-        """Return further numbers () of a world after the step, such as success. Evaluations report them."""
-        return {}
-
-    def judge(self, task: Task, world: World, action: Array) -> tuple[Array, dict[str, Array]]:
-        """Return reward and metrics. A domain that computes them together gives both here."""
-        return self.reward(task, world, action), self.metrics(task, world, action)
-
     def recall(self, task: Task, obs: Array) -> World:
         """Return a world with the observation ``obs``, exact in all that the reward reads. ``relabel`` needs it."""
         raise NotImplementedError(f"{type(self).__name__} does not say which world an observation shows")
@@ -116,34 +96,13 @@ class Domain(Pictured):
         world = put(task, *self.start(task, key))
         return Step(world, self.look_at(task, world), jnp.float32(0), jnp.bool_(False))
 
-    def step(self, task: Task, state: World, action: Array) -> Step:
-        """Advance ``repeat`` control steps under ``action`` (A,) in [-1, 1]; observation and reward are those after it.
+    def advance(self, task: Task, state: World, action: Array) -> World:
+        """Return the world after one control step under ``action`` (A,)."""
+        return self.simulator.step(task, *self.control(task, state, action))
 
-        Rewards of repeated steps are summed, up to one that terminates the episode.
-        """
-
-        def once(_, carry: tuple[World, Array, Array]) -> tuple[World, Array, Array]:
-            world, total, over = carry
-            world = self.simulator.step(task, *self.control(task, world, action))
-            total += jnp.where(over, 0.0, self.reward(task, world, action))
-            return world, total, over | self.terminates(task, world)
-
-        if self.repeat == 1:
-            return self.outcome(task, self.simulator.step(task, *self.control(task, state, action)), action)
-        world, reward, over = jax.lax.fori_loop(0, self.repeat, once, (state, jnp.float32(0), jnp.bool_(False)))
-        return Step(world, self.look_at(task, world), reward, over, self.judge(task, world, action)[1])
-
-    def outcome(self, task: Task, world: World, action: Array) -> Step:
-        """Return what a control step of the simulator has led to."""
-        reward, metrics = self.judge(task, world, action)
-        return Step(world, self.look_at(task, world), reward, self.terminates(task, world), metrics)
-
-    def look_at(self, task: Task, world: World) -> Any:
-        """Return what the agent observes: the state (O,), pictures, or both."""
-        if not self.pixels:
-            return self.observe(task, world)
-        shown = {"pixels": self.draw(task, world)}
-        return shown | {"state": self.observe(task, world)} if self.state == "also" else shown
+    def joints(self, state: World) -> Array:
+        """Return the positions (nq,) of the model's joints."""
+        return state.qpos
 
     def relabel(self, task: Task, transition: Transition, key: Key) -> Transition:
         """Return another task's transition with the reward of ``task``. Observations must not show the goal."""
@@ -234,9 +193,9 @@ class Domain(Pictured):
         return self.models[0].nu
 
     @property
-    def seconds_per_step(self) -> float:
-        """Return the length of a step of the environment [s]."""
-        return self.models[0].opt.timestep * self.num_substeps * self.repeat
+    def step_seconds(self) -> float:  # type: ignore
+        """Return the length of a control step [s]."""
+        return self.models[0].opt.timestep * self.num_substeps
 
     @property
     def engine_name(self) -> str:
@@ -259,7 +218,8 @@ class Domain(Pictured):
 
         Their models may differ in numbers only, as those of tasks.
         """
-        if self.repeat != 1 or type(self).step is not Domain.step:  # more than control, physics and outcome
+        plain = type(self).step is Domain.step and type(self).advance is Domain.advance
+        if self.repeat != 1 or not plain:  # more than control, physics and outcome
             return None
         model = self.models[0] if isinstance(self.simulator, MujocoC) else self.simulator.base
         fixed = hashlib.sha256()

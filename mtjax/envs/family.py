@@ -350,7 +350,8 @@ class Family(Flat, Tabled):
     def describe(self, row: int) -> str:
         """Return a task's varied parameters as text, such as "size=0.95"."""
         params = self.table.tasks.params
-        return ",".join(f"{name}={params[name][row]:.4g}" for name in self.varied) or f"task={row}"
+        tell = lambda name: self.every_parameter[name].tell(float(params[name][row]), 4)
+        return ",".join(f"{name}={tell(name)}" for name in self.varied) or f"task={row}"
 
     @property
     def instruction(self) -> str:
@@ -365,15 +366,17 @@ class Family(Flat, Tabled):
         drawn = found.draws is not None and row < self.train_count
         told = []
         for i, name in enumerate(found.names):
-            value, unit = self.values[name][row], self.every_parameter[name].unit
+            parameter = self.every_parameter[name]
             ranged = drawn and np.ptp(found.draws[row, :, i]) > 0  # type: ignore
-            number = f"from {found.low[i]:.3g} to {found.high[i]:.3g}" if ranged else f"{value:.3g}"
-            told.append(f"{name.replace('-', ' ')} {number}" + f" {unit}" * (unit != "1"))
+            value = parameter.tell(float(self.values[name][row]), 3)
+            number = f"from {found.low[i]:.3g} to {found.high[i]:.3g}" if ranged else value
+            told.append(f"{name.replace('-', ' ')} {number}" + f" {parameter.unit}" * (parameter.unit != "1"))
         return f"{self.instruction.removesuffix('.')}, with {' and '.join(told)}."
 
     def labels(self, split: str) -> list[str]:
         """Return a short name for every task of a split: its ``task_values``."""
-        return [f"{value:.4g}" for value in self.task_values(split)]
+        tell = self.every_parameter[self.varied[0]].tell if len(self.varied) == 1 else Parameter("", 0.0).tell
+        return [tell(float(value), 4) for value in self.task_values(split)]
 
     @property
     def parts(self) -> tuple[Part, ...]:

@@ -19,11 +19,16 @@ class Parameter(NamedTuple):
     minimum: float = 0.0  # values must be greater than this
     maximum: float = math.inf  # and not greater than this
     looks: bool = False  # whether it edits what is seen, and not the physics
+    names: tuple[str, ...] = ()  # what its values 0, 1, ... are called; nothing lies between two of them
 
     @property
     def direction(self) -> bool:
         """Whether it is an angle of a goal, which networks see as a point on the circle."""
         return self.unit == "rad" and self.edit is None
+
+    def tell(self, value: float, digits: int) -> str:
+        """Return a value as text: its name, or so many digits."""
+        return self.names[round(value)] if self.names else f"{value:.{digits}g}"
 
 
 def _scale_geom(geom: mujoco.MjsGeom, scale: float) -> None:

@@ -1,10 +1,11 @@
-"""Pictures as observations, for every family with a MuJoCo model.
+"""Pictures as observations, for every family whose worlds can be drawn as a scene of MuJoCo's shapes.
 
 An observation holds the newest picture alone, so that a replay keeps each picture once. Whoever needs the last few
 stacks them: rollouts for agents, a replay when it draws a batch, and ``mtjax.stacked`` for everyone else. All repeat
 the first picture where an episode is younger than the stack (``mtjax.frames``).
 """
 
+import abc
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property, partial
@@ -16,13 +17,13 @@ import mujoco
 import numpy as np
 
 from mtjax.envs import looks
-from mtjax.envs.engines.base import World
-from mtjax.envs.family import Family
 from mtjax.envs.painters.base import PAINTERS, Painter, choose_painter
 from mtjax.envs.painters.poses import Pose, Poses, locate
 from mtjax.envs.painters.scene import LEAVES, Scene, observed
 from mtjax.envs.painters.warp import WarpPainter
 from mtjax.envs.parameters import Parameter
+from mtjax.envs.stepped import Stepped
+from mtjax.frames import PICTURES, STATE
 from mtjax.names import nearest_error
 from mtjax.types import Array, InputError, Spec, Task
 
@@ -41,7 +42,7 @@ class Mark(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Pictured(Family):
+class Pictured(Stepped):
     """A family that can be seen: its observations are pictures if ``pixels`` is set."""
 
     pixels: int = 0
@@ -49,8 +50,6 @@ class Pictured(Family):
     camera-angle [deg], hue, floor-hue [deg] and light (a scale) can vary: --env.vary.hue=0:300:10."""
     frames: int = 3
     """How many of the last pictures an agent sees at once."""
-    repeat: int = 1
-    """Take every action for so many control steps and sum their rewards. Episodes last as long as before."""
     grey: bool = False
     """Observe brightness alone."""
     state: str = "hidden"
@@ -75,13 +74,6 @@ class Pictured(Family):
             raise InputError(f"pixels must be 0 or an even number from {_LEAST} to {_MOST}, not {self.pixels}")
         if not 1 <= self.frames <= _MOST_FRAMES:
             raise InputError(f"frames must be from 1 to {_MOST_FRAMES}, not {self.frames}")
-        if self.repeat != 1 and (self.repeat < 1 or self.episode_steps % self.repeat):
-            near = [n for n in range(1, self.episode_steps + 1) if self.episode_steps % n == 0]
-            few = sorted(sorted(near, key=lambda n: abs(n - self.repeat))[:4])
-            raise InputError(
-                f"repeat must divide the {self.episode_steps} steps of an episode, such as "
-                f"{', '.join(map(str, few))}; not {self.repeat}"
-            )
         self._require_pictures()
 
     def _require_pictures(self) -> None:
@@ -96,12 +88,22 @@ class Pictured(Family):
         if shown:
             raise InputError(f"{shown[0]} changes only what is seen; add --env.pixels=64")
 
-    # What a domain may give.
+    # What a family gives.
+
+    @abc.abstractmethod
+    def compile_spec(self, values: Mapping[str, float] | None = None) -> mujoco.MjSpec:
+        """Return the editable model of what there is to see, with these parameter values."""
+
+    # What a family may give.
+
+    def joints(self, state: Any) -> Array:
+        """Return the positions (nq,) of the scene's joints. By default it has none."""
+        return jnp.zeros(0)
 
     def add_marks(self, spec: mujoco.MjSpec) -> None:
         """Add geoms to the scene that the physics does not have."""
 
-    def marks(self, task: Task, world: World) -> Mapping[str, Mark]:
+    def marks(self, task: Task, state: Any) -> Mapping[str, Mark]:
         """Return the geoms of the scene whose places this episode has decided."""
         return {}
 
@@ -109,11 +111,14 @@ class Pictured(Family):
         """Return the editable model of what is seen, before it is dressed. By default it is that of the physics."""
         return self.compile_spec(values)
 
-    # What every domain gives.
+    def eye(self, task: Task, state: Any) -> Pose | None:
+        """Return where the camera is, if the world decides that. None: where the scene has it."""
+        return None
 
-    def compile_spec(self, values: Mapping[str, float] | None = None) -> mujoco.MjSpec:
-        """Return the editable model of the physics with these parameter values."""
-        raise NotImplementedError
+    @property
+    def scenic(self) -> tuple[str, ...]:
+        """Return the parameters in which scenes of tasks may differ."""
+        return tuple(name for name, parameter in self.every_parameter.items() if parameter.edit is not None)
 
     # Scenes.
 
@@ -170,11 +175,18 @@ class Pictured(Family):
             model = self._observed(values)
             return {name: np.asarray(getattr(model, name), np.float32) for name in LEAVES}
 
-        rows = self.for_rows(fields, [name for name, p in self.every_parameter.items() if p.edit is not None])
+        rows = self.for_rows(fields, self.scenic)
         columns = {name: np.stack([row[name] for row in rows]) for name in LEAVES}
         return {name: column for name, column in columns.items() if np.any(column != column[0])}
 
     # Observations.
+
+    def look_at(self, task: Task, state: Any) -> Any:
+        """Return what the agent observes: the state (O,), pictures, or both."""
+        if not self.pixels:
+            return super().look_at(task, state)
+        shown = {PICTURES: self.draw(task, state)}
+        return shown | {STATE: self.observe(task, state)} if self.state == "also" else shown
 
     def scene_leaf(self, task: Task, name: str) -> Array:
         """Return a field of the task's scene by its name in MuJoCo."""
@@ -182,24 +194,25 @@ class Pictured(Family):
             return task.scene[name]
         return jnp.asarray(getattr(self.scene.model, name), jnp.float32)
 
-    def see(self, task: Task, world: World) -> Poses:
+    def see(self, task: Task, state: Any) -> Poses:
         """Return the poses of all that a picture of the world shows."""
-        poses = locate(self.scene.model, partial(self.scene_leaf, task), world.qpos)
-        geoms = poses.geoms
-        for name, mark in self.marks(task, world).items():
+        poses = locate(self.scene.model, partial(self.scene_leaf, task), self.joints(state))
+        geoms, eye = poses.geoms, self.eye(task, state)
+        for name, mark in self.marks(task, state).items():
             i = self.scene.model.geom(name).id
             put = lambda numbers, number, i=i: numbers.at[i].set(number)
             axes = geoms.axes if mark.along is None else jax.tree.map(put, geoms.axes, _frame(mark.along))
             geoms = Pose(jax.tree.map(put, geoms.position, tuple(mark.position)), axes)
-        return poses._replace(geoms=geoms)
+        return poses._replace(geoms=geoms, camera=poses.camera if eye is None else eye)
 
-    def draw(self, task: Task, world: World) -> Array:
+    def draw(self, task: Task, state: Any) -> Array:
         """Return a picture (H, W, 3), or grey (H, W, 1), uint8 of a world."""
-        sized = {name: mark.size for name, mark in self.marks(task, world).items() if mark.size is not None}
-        leaves = {name: self.scene_leaf(task, name) for name in LEAVES}
-        for name, size in sized.items():
-            leaves["geom_size"] = leaves["geom_size"].at[self.scene.model.geom(name).id].set(size)
-        picture = self.artist.paint(leaves.__getitem__, self.see(task, world))
+        sizes = self.scene_leaf(task, "geom_size")
+        for name, mark in self.marks(task, state).items():
+            if mark.size is not None:
+                sizes = sizes.at[self.scene.model.geom(name).id].set(mark.size)
+        leaf = lambda name: sizes if name == "geom_size" else self.scene_leaf(task, name)
+        picture = self.artist.paint(leaf, self.see(task, state))
         if not self.grey:
             return picture
         return jnp.round(picture @ jnp.float32(_GREY))[..., None].astype(jnp.uint8)
@@ -208,11 +221,6 @@ class Pictured(Family):
     def spec(self) -> Spec:
         """Return the sizes of observation, action and context, and how many pictures agents should see at once."""
         return self._spec._replace(frames=self.frames) if self.pixels else self._spec
-
-    @property
-    def episode_length(self) -> int:
-        """Return the steps after which an episode is cut off."""
-        return self.episode_steps // self.repeat
 
 
 def _frame(z: Array) -> Any:

@@ -22,6 +22,12 @@ class Axis(NamedTuple):
 
     points: np.ndarray  # (n,), or the two ends of a range
     continuous: bool
+    named: bool  # values are numbers of names, and held-out tasks have no others
+
+    @property
+    def between(self) -> bool:
+        """Return whether values lie between two others."""
+        return len(self.points) > 1 and not self.named
 
 
 class Variation(NamedTuple):
@@ -51,13 +57,13 @@ def read_axis(name: str, text: str, parameter: Parameter) -> Axis:
     """Read "lo:hi:n", "lo:hi" or "a,b,c".
 
     Raises:
-        InputError: the text is none of these, or a value is outside the parameter's range.
+        InputError: the text is none of these, or a value is outside the parameter's range or has no name.
     """
     if not text.strip():
         raise InputError(f"{name} has no values; give {_FORMS}")
     parts = text.split(":")
     try:
-        numbers = [float(x) for x in (text.split(",") if len(parts) == 1 else parts[:2])]
+        numbers = [_number(x, parameter) for x in (text.split(",") if len(parts) == 1 else parts[:2])]
         count = int(parts[2]) if len(parts) == 3 else len(numbers)
         if len(parts) > 3:
             raise ValueError
@@ -73,10 +79,19 @@ def read_axis(name: str, text: str, parameter: Parameter) -> Axis:
         most = min(parameter.maximum, _LARGEST)
         limit = f" and at most {most:g}" if most < _LARGEST or not wrong <= most else ""
         raise InputError(f"{name} must be greater than {parameter.minimum:g}{limit}, not {wrong:g}")
-    axis = Axis(np.linspace(numbers[0], numbers[1], count) if len(parts) == 3 else np.array(numbers), len(parts) == 2)
-    if len(parts) > 1 and float(parts[1]) <= float(parts[0]) and axis.points.size > 1:
+    points = np.linspace(numbers[0], numbers[1], count) if len(parts) == 3 else np.array(numbers)
+    if parameter.names and (len(parts) == 2 or np.any(points % 1)):
+        told = ", ".join(f"{i} ({called})" for i, called in enumerate(parameter.names))
+        raise InputError(f"{name} is one of {told}; list them, such as {','.join(parameter.names[:2])}; not {text}")
+    axis = Axis(points, len(parts) == 2, bool(parameter.names))
+    if len(parts) > 1 and numbers[1] <= numbers[0] and axis.points.size > 1:
         raise InputError(f"the range of {name} must go from low to high, not {text}")
     return axis
+
+
+def _number(text: str, parameter: Parameter) -> float:
+    """Return a value that is given as a number or by its name."""
+    return float(parameter.names.index(text.strip()) if text.strip() in parameter.names else text)
 
 
 def _allowed(value: Any, parameter: Parameter) -> bool:
@@ -163,6 +178,9 @@ def _random_rows(axes, limits, num_tasks: int, split: str, random: np.random.Gen
         raise InputError(f"combine=random needs num-tasks of at least 1, not {num_tasks}")
     if split == "hip-bmdp":
         raise InputError("split hip-bmdp numbers listed tasks; with combine=random use --split=dense or none")
+    named = next((name for name, axis in axes.items() if axis.named and len(axis.points) > 1), None)
+    if named is not None:
+        raise InputError(f"combine=random draws between values, and {named} has names; use --env.combine=grid")
     low, high = (np.array([end(axis.points) for axis in axes.values()]) for end in (np.min, np.max))
     if not np.any(high > low):
         raise InputError("combine=random needs a parameter with more than one value; use --env.combine=grid")
@@ -189,8 +207,13 @@ def _listed_rows(axes: Mapping[str, Axis], limits, combine: str, split: str) -> 
         return {name: train[list(indices)] for name, indices in _HIP_BMDP.items()}
     if split == "none":
         return {"train": train, "interpolation": train[:0], "extrapolation": train[:0]}
-    between = _between_rows(train) if combine == "paired" else _between_grid(list(axes.values()))
-    beyond = _beyond_rows(train) if combine == "paired" else _beyond_grid(list(axes.values()))
+    every = list(axes.values())
+    if combine == "grid":
+        between, beyond = _between_grid(every), _beyond_grid(every)
+    elif any(axis.named and len(axis.points) > 1 for axis in every):
+        between, beyond = [], []
+    else:
+        between, beyond = _between_rows(train), _beyond_rows(train)
     beyond = [row for row in beyond if all(_allowed(x, limit) for x, limit in zip(row, limits, strict=True))]
     width = train.shape[1]
     return {"train": train, "interpolation": _stack(between, width), "extrapolation": _stack(beyond, width)}
@@ -233,7 +256,7 @@ def _beyond_rows(train: np.ndarray) -> list[np.ndarray]:
 
 def _between_grid(axes: list[Axis]) -> np.ndarray:
     """Return the midpoints of all cells of the grid; of a continuous range, five values inside it."""
-    if not any(len(axis.points) > 1 for axis in axes):
+    if not any(axis.between for axis in axes):
         return np.zeros((0, len(axes)))
     return np.stack([x.ravel() for x in np.meshgrid(*map(_inside, axes), indexing="ij")], axis=1)
 
@@ -241,7 +264,7 @@ def _between_grid(axes: list[Axis]) -> np.ndarray:
 def _inside(axis: Axis) -> np.ndarray:
     if axis.continuous:
         return np.linspace(axis.points[0], axis.points[1], 7)[1:-1]
-    return _between_rows(axis.points) if len(axis.points) > 1 else axis.points
+    return _between_rows(axis.points) if axis.between else axis.points
 
 
 def _beyond_grid(axes: list[Axis]) -> list[np.ndarray]:
@@ -250,7 +273,7 @@ def _beyond_grid(axes: list[Axis]) -> list[np.ndarray]:
     rows = []
     for i, axis in enumerate(axes):
         steps = np.linspace(axis.points[0], axis.points[1], 11) if axis.continuous else axis.points
-        for value in _beyond_rows(steps):
+        for value in [] if axis.named else _beyond_rows(steps):
             rows.append(np.where(np.arange(len(axes)) == i, value, middle))
     return rows
 

@@ -9,8 +9,8 @@ import numpy as np
 from gymnasium import spaces
 
 from mtjax import envs
-from mtjax.envs.domain import Domain
 from mtjax.envs.mixtures import require_family
+from mtjax.envs.pixels import Pictured
 from mtjax.gym.tasks import TaskStream, TaskTable, read_options
 from mtjax.names import nearest_error
 from mtjax.report import render
@@ -107,7 +107,7 @@ def make(
         name: a name of ``mtjax.make``, or one of ``MTENV_IDS``.
         tasks: the split from which tasks are drawn: train, interpolation, extrapolation or all.
         task_obs: the observation of the task: "context", "id" or "none".
-        render_mode: "rgb_array" for families that MuJoCo simulates, or None.
+        render_mode: "rgb_array" for families that show pictures, or None.
         settings: fields of the family.
 
     Raises:
@@ -194,7 +194,7 @@ class FamilyEnv(TaskStream, gymnasium.Env):
 
 
 def _metadata(family: Env) -> dict[str, Any]:
-    if not isinstance(family, Domain):
+    if not isinstance(family, Pictured):
         return {"render_modes": []}
     return {
         "render_modes": ["rgb_array"],

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from mtjax.envs.domain import Domain
 from mtjax.envs.family import Part, Tabled
+from mtjax.envs.pixels import Pictured
 from mtjax.evaluation import Recording, record
 from mtjax.names import InputError
 from mtjax.report import render
@@ -33,9 +33,9 @@ class Chosen(NamedTuple):
 
 
 def require(env: Tabled) -> None:
-    """Raise InputError unless a model can be filmed."""
-    if not any(isinstance(part.family, Domain) for part in env.parts):
-        raise InputError("only MuJoCo families can be filmed; leave out --video")
+    """Raise InputError unless a family can be filmed."""
+    if not any(isinstance(part.family, Pictured) for part in env.parts):
+        raise InputError("only families that show pictures can be filmed; leave out --video")
 
 
 def choose(env: Tabled, splits: Sequence[str], tasks: Sequence[int]) -> list[Chosen]:
@@ -45,7 +45,7 @@ def choose(env: Tabled, splits: Sequence[str], tasks: Sequence[int]) -> list[Cho
         InputError: no family has such a task.
     """
     found, most = [], 0
-    for part in (part for part in env.parts if isinstance(part.family, Domain)):
+    for part in (part for part in env.parts if isinstance(part.family, Pictured)):
         for split in splits or SPLITS:
             rows = part.family.table.rows[split]
             most = max(most, len(rows))

@@ -6,15 +6,15 @@ import operator
 import os
 import platform
 from pathlib import Path
+from typing import Any
 
 import jax
 import mujoco
 import numpy as np
 from PIL import Image
 
-from mtjax.envs.domain import Domain
-from mtjax.envs.engines.base import World
-from mtjax.envs.pixels import Mark
+from mtjax.envs.painters.poses import Pose
+from mtjax.envs.pixels import Mark, Pictured
 from mtjax.types import InputError
 
 _GIF_FPS = 50  # browsers slow down frames that are shorter than 0.02 s
@@ -36,7 +36,7 @@ def choose_backend() -> str:
     return os.environ.get("MUJOCO_GL", "")
 
 
-def film(env: Domain, task_row: int, states: World, width: int = 320, height: int = 240) -> np.ndarray:
+def film(env: Pictured, task_row: int, states: Any, width: int = 320, height: int = 240) -> np.ndarray:
     """Draw the task in row ``task_row`` of ``env.table`` in each of the states, leaves (H, ...).
 
     The scene is that of observations from pixels, with shadows, and with goals that the agent does not see.
@@ -51,14 +51,15 @@ def film(env: Domain, task_row: int, states: World, width: int = 320, height: in
         raise InputError(f"there is no task {task_row}; this family has tasks 0 to {env.count - 1}")
     model = env.scene_model(task_row)
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height
-    data, qpos = mujoco.MjData(model), np.asarray(states.qpos)
-    task = jax.tree.map(lambda x: x[task_row], env.table.tasks)
-    marks = jax.tree.map(np.asarray, jax.vmap(env.marks, (None, 0))(task, states))
-    frames = np.empty((len(qpos), height, width, 3), np.uint8)
+    data, task = mujoco.MjData(model), jax.tree.map(lambda x: x[task_row], env.table.tasks)
+    of_each = lambda state: (env.joints(state), env.marks(task, state), env.eye(task, state))
+    shown = jax.tree.map(np.asarray, jax.vmap(of_each)(states))
+    frames = np.empty((len(shown[0]), height, width, 3), np.uint8)
     with _open_renderer(model, width, height) as renderer:
         for i, frame in enumerate(frames):
-            _place(model, jax.tree.map(operator.itemgetter(i), marks))
-            data.qpos[:] = qpos[i]
+            data.qpos[:], marks, eye = jax.tree.map(operator.itemgetter(i), shown)
+            _place(model, marks)
+            _look(model, eye)
             mujoco.mj_forward(model, data)
             renderer.update_scene(data, 0)
             renderer.render(out=frame)
@@ -97,6 +98,13 @@ def _place(model: mujoco.MjModel, marks: dict[str, Mark]) -> None:
             model.geom_size[geom] = mark.size
         if mark.along is not None:
             mujoco.mju_quatZ2Vec(model.geom_quat[geom], np.float64(mark.along))
+
+
+def _look(model: mujoco.MjModel, eye: Pose | None) -> None:
+    """Put the first camera where an episode has decided. It belongs to the world's body."""
+    if eye is not None:
+        model.cam_pos[0] = eye.position
+        mujoco.mju_mat2Quat(model.cam_quat[0], np.array(eye.axes, np.float64).T.ravel())
 
 
 def _open_renderer(

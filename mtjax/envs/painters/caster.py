@@ -40,6 +40,7 @@ class View(NamedTuple):
     lights: tuple[tuple[Vector, Vector], ...]  # position and direction of each
     strength: Array  # (lights, 3)
     up: Vector  # the world's z axis
+    grid: Any = ()  # walls that are no bodies
 
 
 class Group(NamedTuple):
@@ -63,7 +64,7 @@ class Caster:
     size: int
 
     def __post_init__(self):
-        kinds = [int(self.scene.model.geom_type[geom]) for geom in self.scene.shown]
+        kinds = [int(self.scene.model.geom_type[geom]) for geom in self.shown]
         odd = next((kind for kind in kinds if kind not in SHAPES), None)
         if odd is not None:
             shape = mujoco.mjtGeom(odd).name.removeprefix("mjGEOM_").lower()
@@ -83,6 +84,11 @@ class Caster:
         return jnp.stack([(picture >> shift).astype(jnp.uint8) for shift in (0, 8, 16)], axis=-1)
 
     @cached_property
+    def shown(self) -> tuple[int, ...]:
+        """Return the geoms that are drawn."""
+        return self.scene.shown
+
+    @cached_property
     def _draw(self) -> Callable:
         """Return the function that draws all worlds, first what is nearest in each pixel and then its colour.
 
@@ -99,7 +105,7 @@ class Caster:
     @cached_property
     def _groups(self) -> tuple[Group, ...]:
         model, scene, found = self.scene.model, self.scene, {}
-        for place, geom in enumerate(scene.shown):
+        for place, geom in enumerate(self.shown):
             kind = int(model.geom_type[geom])
             endless = (bool(model.geom_size[geom, 0] <= 0), bool(model.geom_size[geom, 1] <= 0))
             alone = geom if geom in scene.tiles else -1
@@ -110,7 +116,7 @@ class Caster:
         )
 
     def _view(self, leaf: Callable[[str], Array], poses: Poses) -> View:
-        eye, shown, model = poses.camera, np.array(self.scene.shown), self.scene.model
+        eye, shown, model = poses.camera, np.array(self.shown), self.scene.model
         chosen = jax.tree.map(lambda x: x[shown], poses.geoms)
         geoms, sizes = _seen_from(eye, chosen), leaf("geom_size")[shown].T
         round_ones = np.isin(model.geom_type[shown], _ROUND)
@@ -141,12 +147,12 @@ class Caster:
         Positive floating-point numbers are in the order of their bits.
         """
         sky = jnp.full(self._rays.u.shape, MISSED / 2, jnp.float32)  # nearer than geoms that a ray misses
-        nearest = _tag(sky, _MOST)
+        nearest = tag(sky, _MOST)
         for group in self._groups:
 
             def nearer(nearest: Array, geom: tuple[Body, Array], group: Group = group) -> tuple[Array, None]:
                 distance = group.shape.distance(self._rays, geom[0]._replace(endless=group.endless))
-                return jnp.minimum(nearest, _tag(distance, geom[1])), None
+                return jnp.minimum(nearest, tag(distance, geom[1])), None
 
             bodies = jax.tree.map(lambda x, group=group: x[group.places], view.bodies)
             nearest, _ = jax.lax.scan(nearer, nearest, (bodies, jnp.int32(group.places)))
@@ -169,7 +175,7 @@ class Caster:
 
     def _chosen(self, view: View, group: Group, number: Array) -> tuple[Body, Vector, Array]:
         """Return body, colour and gloss of the geom in each pixel, if it is of this group."""
-        gloss = jnp.float32(self.scene.gloss[list(self.scene.shown)])
+        gloss = jnp.float32(self.scene.gloss[list(self.shown)])
         numbers = (view.bodies, tuple(view.colours.T), gloss)
         first, *rest = group.places
         chosen = jax.tree.map(lambda x: x[first], numbers)
@@ -236,7 +242,7 @@ class Caster:
         return tuple(c * d + gloss * b for c, d, b in zip(colour, diffuse, bright, strict=True))
 
 
-def _tag(distance: Array, number: Any) -> Array:
+def tag(distance: Array, number: Any) -> Array:
     """Return a distance as an integer with a geom's number in the last bits."""
     return (jax.lax.bitcast_convert_type(distance, jnp.int32) & ~_MOST) | number
 

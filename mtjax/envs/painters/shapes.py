@@ -65,7 +65,8 @@ def _root(square: Array) -> Array:
     return jnp.sqrt(jnp.maximum(square, 0.0))
 
 
-def _apart_from_zero(x: Array) -> Array:
+def apart_from_zero(x: Array) -> Array:
+    """Return numbers of which those near 0 are a tiny one, so that one can divide by them."""
     return jnp.where(jnp.abs(x) > _TINY, x, _TINY)
 
 
@@ -144,7 +145,7 @@ def _cylinder_distance(rays: Rays, body: Body) -> Array:
     outside = across * rise * rise - 2 * aim * rise * lift + wide * lift * lift
     above = (jnp.abs(tall) > half) & (outside <= 0)
     hit = above | (beside & (room > 0))
-    return _where(hit, jnp.where(above, rise, way) / jnp.where(above, _apart_from_zero(lift), across))
+    return _where(hit, jnp.where(above, rise, way) / jnp.where(above, apart_from_zero(lift), across))
 
 
 def _cylinder_normal(point: Vector, body: Body) -> Vector:
@@ -178,7 +179,7 @@ def _box_distance(rays: Rays, body: Body) -> Array:
     """A ray passes three faces on the eye's side. It meets the last one, if it has not passed a far face before."""
     near, far = -MISSED, MISSED
     for i, axis in enumerate(body.axes):
-        inverse = 1 / _apart_from_zero(along(rays, axis))
+        inverse = 1 / apart_from_zero(along(rays, axis))
         middle, reach = dot(body.centre, axis) * inverse, jnp.abs(inverse) * body.size[i]
         near, far = jnp.maximum(near, middle - reach), jnp.minimum(far, middle + reach)
     return _where(near <= far, near)

@@ -1,0 +1,1 @@
+"""Mazes of corridors, seen by whoever walks in them."""
