@@ -3,7 +3,6 @@
 It runs in an environment of its own with metaworld==3.1.1 and all that this needs, and imports nothing of mtjax. It
 reads one JSON object from each line of standard input, and answers each with one line:
 
-    {"do": "policy", "task": NAME, "obs": [(39,), ...]}: actions of the task's scripted policy
     {"do": "play", "task": NAME, "vectors": [(n,), ...]}: success at the end and at any step of an episode of each goal
     {"do": "time", "tasks": [NAME, ...], "processes": N, "steps": N}: control steps a second under random actions, of
         processes that share the tasks and send nothing to each other
@@ -82,7 +81,7 @@ def rate(tasks, processes, steps):
 
 
 if __name__ == "__main__":
-    DO = {"policy": policy, "play": play, "time": rate}
+    DO = {"play": play, "time": rate}
     answers = sys.stdout
     sys.stdout = sys.stderr  # where Meta-World prints
     for line in sys.stdin:

@@ -1,19 +1,24 @@
-"""Measure Meta-World's tasks against the original: success of its scripted policies, and speed.
+"""Measure Meta-World's tasks: success of the original's scripted policies, and the speed of mt10's physics.
 
-    python benchmarks/metaworld_parity.py success --original=PYTHON [--tasks NAME ...] [--goals 20] [--out FILE.csv]
-    python benchmarks/metaworld_parity.py speed --original=PYTHON [--envs 16] [--processes 2] [--json FILE]
+    python benchmarks/metaworld_parity.py success [--engine warp] [--tasks NAME ...] [--goals 20] [--out FILE.csv]
+    python benchmarks/metaworld_parity.py speed [--engine warp] [--worlds 4096] [--json FILE]
 
-PYTHON is the interpreter of an environment with metaworld==3.1.1 and its own dependencies (MuJoCo 3.3, Gymnasium),
-which cannot stand beside mtjax's. It plays the original, and is asked for the actions of the scripted policies.
+``--original=PYTHON`` compares with the original: PYTHON is the interpreter of an environment with metaworld==3.1.1 and
+its own dependencies (MuJoCo 3.3, Gymnasium), which cannot stand beside mtjax's.
 
-``success`` plays an episode of 500 steps from each of the same goals in both, by the same policy. A success counts at
-the end of the episode and at any step. ``speed`` times ten tasks (mt10) under random actions, with resets, in turn:
-one program here, and there processes that send nothing to each other, which is more than any learner could use.
+``success`` plays an episode of 500 steps from each goal, by the policies of the installed package. A success counts at
+the end of the episode and at any step. ``--together`` tasks are one program. A task that has a line in the file is not
+played again. The original plays the same goals.
+
+``speed`` times ten tasks (mt10) under random actions inside one scan, in turn: with families of a scene joined into one
+simulator and apart, with resets as in training and without. The original runs in processes that send nothing to each
+other, which is more than any learner could use.
 """
 
 import argparse
 import csv
 import json
+import operator
 import statistics
 import subprocess
 import time
@@ -22,14 +27,19 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import metaworld_policies
 import numpy as np
-from report import machine
+from physics import Apart, physics
+from report import publish
+from steps_per_second import Contestant
 
 import mtjax
+from mtjax.envs.engines.base import ENGINES
 from mtjax.envs.metaworld.names import BENCHMARKS, TASKS
-from mtjax.rollout import broadcast_tasks
+from mtjax.names import load
+from mtjax.types import InputError
 
-_ROUNDS = 5
+_HEAD = "task engine goals end any_step original_end original_any_step goals_that_differ".split()
 _STEPS = 500
 
 
@@ -50,105 +60,130 @@ class Original:
 
 
 def main() -> None:
+    on_cpu = jax.default_backend() == "cpu"
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("success", "speed"))
-    parser.add_argument("--original", required=True, metavar="PYTHON")
-    parser.add_argument("--tasks", nargs="+", default=list(TASKS), choices=TASKS, metavar="NAME")
-    parser.add_argument("--goals", type=int, default=20, help="of each task, with one episode each")
-    parser.add_argument("--envs", type=int, default=16, help="environments of each task, in speed")
-    parser.add_argument("--processes", type=int, default=2, help="of the original, in speed")
+    parser.add_argument("--original", metavar="PYTHON")
+    parser.add_argument("--engine", default="auto", choices=ENGINES)
+    parser.add_argument("--tasks", nargs="+", default=list(TASKS), choices=TASKS, metavar="NAME", help="of success")
+    parser.add_argument("--goals", type=int, default=20, help="of each task, with one episode each, in success")
+    parser.add_argument("--together", type=int, default=2 if on_cpu else 25, help="tasks of a program, in success")
     parser.add_argument("--out", type=Path, default=Path("metaworld-policies.csv"))
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--worlds", type=int, default=160 if on_cpu else 4096, help="of all tasks, in speed")
+    parser.add_argument("--steps", type=int, default=_STEPS, help="of a timed call, in speed")
+    parser.add_argument("--rounds", type=int, default=5, help="in speed")
+    parser.add_argument("--processes", type=int, default=2, help="of the original, in speed")
+    parser.add_argument("--json")
     arguments = parser.parse_args()
-    original = Original(arguments.original)
-    if arguments.what == "success":
-        compare(original, arguments)
-    else:
-        race(original, arguments)
+    original = Original(arguments.original) if arguments.original else None
+    (compare if arguments.what == "success" else race)(original, arguments)
 
 
 # Success of scripted policies.
 
 
-def compare(original: Original, arguments: argparse.Namespace) -> None:
-    """Write a line for each task."""
-    with arguments.out.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["task", "goals", "end", "original_end", "any_step", "original_any_step", "goals_that_differ"])
-        for name in arguments.tasks:
-            ours, vectors = play(original, name, arguments.goals)
-            theirs = np.array(original.ask(do="play", task=name, vectors=vectors.tolist()))
-            differ = int(np.sum(ours[:, 1] != theirs[:, 1]))
-            means = [f"{x:.3g}" for pair in zip(ours.mean(0), theirs.mean(0), strict=True) for x in pair]
-            writer.writerow([name, len(vectors), *means, differ])
-            file.flush()
-            print(name, *means, differ, flush=True)
+def compare(original: Original | None, arguments: argparse.Namespace) -> None:
+    """Add a line for each task that has none."""
+    done = read(arguments.out)
+    scene_of = lambda name: load(f"mtjax.envs.metaworld.{TASKS[name]}").scene_file
+    left = sorted((name for name in arguments.tasks if name not in done), key=scene_of)  # whose simulators join
+    if not arguments.out.exists():
+        arguments.out.write_text(",".join(_HEAD) + "\n")
+    for begin in range(0, len(left), arguments.together):
+        names = left[begin : begin + arguments.together]
+        for name, success, vectors in play(names, arguments.engine, arguments.goals):
+            row = [name, arguments.engine, len(vectors), *(f"{x:.3g}" for x in success.mean(0))]
+            if original is not None:
+                theirs = np.array(original.ask(do="play", task=name, vectors=vectors.tolist()))
+                row += [*(f"{x:.3g}" for x in theirs.mean(0)), int(np.sum(success[:, 1] != theirs[:, 1]))]
+            with arguments.out.open("a", newline="") as file:
+                csv.writer(file).writerow(row + [""] * (len(_HEAD) - len(row)))
+            print(*row, flush=True)
 
 
-def play(original: Original, name: str, goals: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return success (goals, 2) at the end and at any step, and the goals' vectors."""
-    env = mtjax.make(f"metaworld-{name}", num_draws=goals)
-    tasks = jax.tree.map(lambda x: jnp.asarray(x[0]), env.tasks().draws)
-    start = jax.jit(jax.vmap(env.reset))(tasks, jax.random.split(jax.random.key(0), goals))
-    step = jax.jit(jax.vmap(env.step))
-    state, obs, found = start.state, start.obs, []
-    for _ in range(env.episode_length):
-        actions = original.ask(do="policy", task=name, obs=np.asarray(obs, np.float64).tolist())
-        after = step(tasks, state, jnp.float32(actions))
-        state, obs = after.state, after.obs
-        found.append(np.asarray(after.metrics["success"]))
-    return np.stack([found[-1], np.max(found, axis=0)], axis=1), env.vectors()
+def read(path: Path) -> set[str]:
+    """Return the tasks that have a line in a file, which may not exist."""
+    if not path.exists():
+        return set()
+    with path.open(newline="") as file:
+        rows = csv.DictReader(file)
+        if rows.fieldnames != _HEAD:
+            raise SystemExit(f"{path} has other columns; give another --out")
+        return {row["task"] for row in rows}
+
+
+def play(names: list[str], engine: str, goals: int) -> list[tuple[str, np.ndarray, np.ndarray]]:
+    """Play an episode from each goal of some tasks in one program.
+
+    Returns:
+        for each task its name, success (goals, 2) at the end and at any step, and the goals' vectors.
+    """
+    before, policies = time.perf_counter(), metaworld_policies.load()
+    env = mtjax.mixture([mtjax.make(f"metaworld-{name}", num_draws=goals, engine=engine) for name in names])
+    tasks = env.tasks()
+    each = jax.tree.map(lambda x: jnp.asarray(x)[None], tasks.draws)._replace(blocks=tasks.blocks)
+    keys = jax.random.split(jax.random.key(0), (1, len(names), goals))
+    start = jax.jit(env.reset_worlds)(each, keys)
+    nothing = jnp.zeros((1, len(names), goals, 4))
+    lowered = jax.jit(env.step_worlds, donate_argnums=1).lower(each, start.state, nothing)  # in place: recorded once
+    env.load_kernels()
+    step = lowered.compile()
+    state, obs, found = jax.tree.map(jnp.copy, start.state), np.asarray(start.obs), []
+    for i in range(env.episode_length):
+        taken = [metaworld_policies.actions(policies[name], obs[0, t]) for t, name in enumerate(names)]
+        after = step(each, state, jnp.asarray(np.stack(taken)[None]))
+        state, obs = after.state, np.asarray(after.obs)
+        found.append(np.asarray(after.metrics["success"])[0])
+        if not i:
+            print(f"{len(names)} tasks compiled after {time.perf_counter() - before:.0f} s", flush=True)
+    print(f"{len(names)} tasks played after {time.perf_counter() - before:.0f} s", flush=True)
+    success = np.stack([found[-1], np.max(found, axis=0)], axis=-1)
+    return [(name, success[t], env.families[t].vectors()) for t, name in enumerate(names)]
 
 
 # Speed.
 
 
-def race(original: Original, arguments: argparse.Namespace) -> None:
-    """Time both in turn, and print medians over the rounds."""
-    ours = program(arguments.envs)
-    names = [name.removeprefix("metaworld-") for name in BENCHMARKS["mt10"][1]]
-    rounds = []
-    for _ in range(_ROUNDS):
-        before = time.perf_counter()
-        jax.block_until_ready(ours())
-        mine = len(names) * arguments.envs * _STEPS / (time.perf_counter() - before)
-        theirs = original.ask(do="time", tasks=names, processes=arguments.processes, steps=_STEPS)
-        rounds.append((mine, theirs))
-    median = lambda values: statistics.median(values)
-    result = {
-        "steps_per_second": median(mine for mine, _ in rounds),
-        "original_steps_per_second": median(theirs for _, theirs in rounds),
-        "ratio": median(mine / theirs for mine, theirs in rounds),
-        "envs": arguments.envs,
-        "processes": arguments.processes,
-        "rounds": rounds,
-        "machine": machine(),
-    }
-    print(json.dumps(result, indent=2))
-    if arguments.json is not None:
-        arguments.json.write_text(json.dumps(result, indent=2) + "\n")
-
-
-def program(envs: int) -> Any:
-    """Return a function that plays 500 steps of every world of mt10 from a reset."""
-    env = mtjax.make("mt10")
-    tasks = env.tasks()
-    shape = (1, len(tasks.id), envs)
-    each = broadcast_tasks(tasks, shape)._replace(blocks=tasks.blocks)
-    keys = jax.random.split(jax.random.key(0), shape)
-
-    @jax.jit
-    def run(each: Any, keys: Any) -> Any:
-        def step(states: Any, i: Any) -> tuple[Any, Any]:
-            actions = jax.random.uniform(jax.random.fold_in(jax.random.key(1), i), (*shape, 4), minval=-1.0)
-            after = env.step_worlds(each, states, actions)
-            return after.state, after.reward.mean()
-
-        return jax.lax.scan(step, env.reset_worlds(each, keys).state, jnp.arange(_STEPS))[1]
-
-    jax.block_until_ready(run(each, keys))
-    return lambda: run(each, keys)
+def race(original: Original | None, arguments: argparse.Namespace) -> None:
+    """Time all contestants in turn, and print medians over the rounds."""
+    env = mtjax.make("mt10", engine=arguments.engine)
+    per_task = -(-arguments.worlds // len(env.families))
+    contestants = []
+    for label, mixture in (("joined", env), ("apart", Apart(env.families, env.names))):
+        for suffix, resets in ((", resets as in training", True), (", no resets", False)):
+            make = lambda mixture=mixture, resets=resets: physics(mixture, per_task, arguments.steps, resets)
+            name = f"{label} ({len(mixture.groups)} simulators){suffix}"
+            contestants.append(Contestant(name, per_task * len(env.families), arguments.steps, make))
+            print(f"{name}: compiled in {contestants[-1].first_call_seconds:.0f} s", flush=True)
+    theirs = []
+    tasks = [name.removeprefix("metaworld-") for name in BENCHMARKS["mt10"][1]]
+    for _ in range(arguments.rounds):
+        for contestant in contestants:
+            contestant.time()
+        if original is not None:
+            theirs.append(original.ask(do="time", tasks=tasks, processes=arguments.processes, steps=_STEPS))
+    rows = [
+        {
+            "contestant": each.name,
+            "engine": env.engine_name,
+            "worlds": each.worlds,
+            "steps_per_second": statistics.median(each.rates),
+            "slowest": min(each.rates),
+            "fastest": max(each.rates),
+            "over_original": statistics.median(map(operator.truediv, each.rates, theirs)) if theirs else None,
+            "first_call_seconds": each.first_call_seconds,
+        }
+        for each in contestants
+    ]
+    if theirs:
+        rows.append({"contestant": "original", "worlds": len(tasks), "steps_per_second": statistics.median(theirs)})
+    for row in rows:
+        print(f"{row['contestant']:44} {row['worlds']:6} {row['steps_per_second']:12,.0f} steps/s")
+    publish(arguments, rows)
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except InputError as error:
+        raise SystemExit(f"error: {error}") from None

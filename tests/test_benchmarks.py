@@ -8,12 +8,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from probes import with_metaworld as with_scenes
 
 import mtjax
 from mtjax.envs import BENCHMARKS
+from mtjax.envs.metaworld.names import TASKS
 from mtjax.evaluation import Evaluations, save_evaluations
 from mtjax.training.log import append_rows
 
+_OF_META_WORLD = ("physics", "steps_per_second", "metaworld_policies")
 FOLDER = Path(__file__).parent.parent / "benchmarks"
 
 
@@ -29,7 +32,7 @@ def script(monkeypatch):
         return module
 
     yield load
-    for name in ("report", "training", "returns", "update_cost", "learning"):
+    for name in ("report", "training", "returns", "update_cost", "learning", *_OF_META_WORLD):
         sys.modules.pop(name, None)
 
 
@@ -199,3 +202,39 @@ def test_suites_name_only_what_there_is(script):
         assert set(each.agents) <= set(mtjax.AGENTS)
         names = {name for env in each.envs for name in env.split("+")}
         assert names <= {*mtjax.ENVS, *BENCHMARKS}
+
+
+@with_scenes
+def test_scripted_policies_need_numpy_alone(script, monkeypatch):
+    """The package's own imports, such as Gymnasium's environments, stay out."""
+    policies = script("metaworld_policies")
+    for name in [name for name in sys.modules if name.split(".")[0] == "metaworld"]:
+        monkeypatch.delitem(sys.modules, name)
+    before = set(sys.modules)
+    found = policies.load()
+    assert set(found) == set(TASKS)
+    new = {name for name in set(sys.modules) - before if not name.startswith("metaworld")}
+    assert not new & {"gymnasium", "metaworld.sawyer_xyz_env", "scipy"}
+    obs = np.zeros((2, 3, 39))
+    obs[..., 36:39] = [0.1, 0.0, 0.0]  # reach goes to the goal, five times as fast as it is far
+    np.testing.assert_allclose(policies.actions(found["reach"], obs)[1, 2, :3], [0.5, 0, 0], atol=1e-6)
+    for name in [name for name in sys.modules if name.split(".")[0] == "metaworld"]:
+        del sys.modules[name]
+
+
+def test_tasks_with_a_line_are_not_played_again(script, tmp_path, monkeypatch):
+    parity = script("metaworld_parity")
+    played = []
+
+    def play(names, engine, goals):
+        played.append(names)
+        return [(name, np.ones((goals, 2)), np.zeros((goals, 3))) for name in names]
+
+    monkeypatch.setattr(parity, "play", play)
+    given = SimpleNamespace(out=tmp_path / "x.csv", engine="warp", goals=4, together=2)
+    for tasks in (["reach"], ["drawer-open", "reach", "soccer", "drawer-close"]):
+        parity.compare(None, SimpleNamespace(**vars(given), tasks=tasks))
+    assert played == [["reach"], ["drawer-open", "drawer-close"], ["soccer"]]  # tasks of a scene side by side
+    assert parity.read(given.out) == {"reach", "drawer-open", "drawer-close", "soccer"}
+    assert given.out.read_text().splitlines()[1] == "reach,warp,4,1,1,,,"
+    assert parity.read(FOLDER / "results" / "metaworld-policies.csv") == set(TASKS)

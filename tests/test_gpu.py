@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 import pytest
 from probes import random_batch, with_metaworld
+from test_joined import require_as_alone
 from test_kills import outcome
 from test_painters import SIZE, similarity, states_of
 
@@ -262,6 +263,15 @@ def test_a_mixture_steps_as_its_families(num_envs):
         alone = play(part.family, part.family.tasks(), state, own)
         error = np.abs(np.asarray(alone.qpos) - np.asarray(together[i].qpos)).max(axis=-1)
         assert np.quantile(error, 0.9) < 1e-3 and np.all(np.isfinite(error)), part.name
+
+
+@with_metaworld
+@pytest.mark.parametrize("names", [("reach", "push", "pick-place"), ("window-open", "window-close")])
+def test_tasks_of_a_scene_step_together_as_they_do_alone(names):
+    """Warp adds up in another order each time."""
+    env = mtjax.mixture([mtjax.make(f"metaworld-{name}", num_draws=2, engine="warp") for name in names])
+    assert len(env.groups) == 1
+    require_as_alone(env, atol=2e-3)
 
 
 def test_a_run_goes_on_bit_for_bit(tmp_path):

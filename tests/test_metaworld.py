@@ -237,3 +237,51 @@ def test_a_grip_holds_on_warp_as_on_c(name):
     exact, found = lifted(env.simulator), lifted(Warp(env._base(env.warp_iterations), env.num_substeps))
     assert np.mean(exact[:, 2] - qpos[:, 11] > 0.05) > 0.5
     assert np.mean(np.abs(found - exact).max(axis=1) < 5e-3) > 0.9
+
+
+@with_scenes
+def test_films_show_meshes_and_things_where_the_goal_has_them():
+    env, _ = made("drawer-close")
+    physics, seen = env.models[2], env.scene_model(2)
+    assert seen.nmesh > physics.nmesh + 10 and seen.nmat > 0 and seen.ntex > 1
+    names = [[model.body(i).name for i in range(model.nbody)] for model in (physics, seen)]
+    assert names[0] == names[1] and np.ptp([model.body("drawer").pos[0] for model in env.models]) > 0
+    np.testing.assert_array_equal(physics.body_pos, seen.body_pos)
+    tasks, start = begin(env)
+    marks = jax.vmap(env.marks)(tasks, start.state)
+    ((name, mark),) = marks.items()
+    np.testing.assert_allclose(mark.position, tasks.goal["target"])
+    assert seen.geom(name).group == 0 and name in env.hides
+
+
+@with_scenes
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["push", "stick-push"])  # the second one feels forces
+def test_physics_are_set_on_warp_as_on_c(name):
+    pytest.importorskip("warp")
+    found = []
+    for engine in ("c", "warp"):
+        env = mtjax.make(f"metaworld-{name}", num_draws=1, engine=engine)
+        task = jax.tree.map(lambda x: x[0], goals(env))
+        state = env.reset(task, jax.random.key(0)).state
+        world = jax.jit(env.set_physics)(task, state, state.qpos + 0.01, state.qvel)
+        found.append((world, jax.jit(env.step)(task, world, jnp.array([0.5, 0.2, -0.3, 0.5]))))
+    (exact, after), (world, other) = found
+    np.testing.assert_allclose(world.sensors[:21], exact.sensors[:21], atol=1e-5)
+    np.testing.assert_allclose(other.obs, after.obs, atol=2e-3)
+
+
+@with_scenes
+@pytest.mark.slow
+def test_warp_draws_meshes(monkeypatch):
+    """On a CPU, where only tests draw by Warp: the arm is red, and the drawer is where its goal has it."""
+    pytest.importorskip("warp")
+    from mtjax.envs import pixels
+    from mtjax.envs.painters.warp import WarpPainter
+
+    monkeypatch.setattr(pixels, "choose_painter", lambda *_: WarpPainter)
+    env = mtjax.make("metaworld-drawer-close", num_draws=2, engine="c", pixels=64)
+    drawn = np.asarray(begin(env)[1].obs["pixels"], int)
+    red = drawn[..., 0] > 2 * np.max(drawn[..., 1:], axis=-1)
+    assert drawn.shape == (2, 64, 64, 3) and np.all(np.mean(red, axis=(1, 2)) > 0.02)
+    assert np.mean(np.any(drawn[0] != drawn[1], axis=-1)) > 0.01

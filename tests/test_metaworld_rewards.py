@@ -45,7 +45,8 @@ def load(name):
 def seen(recorded, task):
     """Return what rewards read of the recorded steps (K, ...), and the constants of their episodes."""
     column = {place: i for i, place in enumerate(recorded["watched"])}
-    poses = {short: recorded["pose"][:, column[place]] for short, place in task.watched.items()}
+    read = {short: place for short, place in task.watched.items() if place in column}  # others are of its scene
+    poses = {short: recorded["pose"][:, column[place]] for short, place in read.items()}
     position, quat = ({short: pose[:, part] for short, pose in poses.items()} for part in (np.s_[:3], np.s_[3:]))
     obs = np.insert(recorded["obs"], [18] * 18, 0, axis=1)  # rewards do not read the step before
     places = (recorded[key] for key in ("tcp", "left_pad", "right_pad"))

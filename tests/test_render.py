@@ -61,16 +61,15 @@ def test_backend_that_the_user_chose_is_kept(monkeypatch):
         render.film(FINGER, 0, STATES)
 
 
-def test_camera_and_size_limits_do_not_depend_on_the_row():
-    models = [render._scene(FINGER, row, 1920, 1080) for row in range(2)]
+def test_the_camera_does_not_depend_on_the_row():
+    models = [FINGER.scene_model(row) for row in range(2)]
     np.testing.assert_array_equal(models[0].cam_pos, models[1].cam_pos)
-    for model in models:
-        assert (model.vis.global_.offwidth, model.vis.global_.offheight, model.nlight) == (1920, 1080, 1)
+    assert [model.nlight for model in models] == [1, 1]
 
 
 def test_film_puts_targets_where_the_episode_has_them():
     family = FingerTurn()
-    model, place = render._scene(family, 0, 160, 120), np.array([0.1, -0.05], np.float32)
+    model, place = family.scene_model(0), np.array([0.1, -0.05], np.float32)
     task = jax.tree.map(lambda x: x[0], family.table.tasks)
     render._place(model, family.marks(task, STATES._replace(extra=place)))
     data = mujoco.MjData(model)

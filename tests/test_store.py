@@ -311,7 +311,7 @@ def needs(monkeypatch, device, host=1e12, seeds=5, backend="gpu", **given):
     state = jax.eval_shape(partial(loop.init, env, agent, settings), tasks, key)
     found = memory.Needs.of(state, env, agent, settings)
     memory.require_room(found, env)
-    told = memory.tell(state.data, found, agent.experience.describe(2), seeds)
+    told = memory.tell(state.data, found, agent.experience.describe(env.spec, 2), seeds)
     return state, found, told
 
 

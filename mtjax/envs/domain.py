@@ -7,6 +7,7 @@ only the leaves that differ between tasks are stacked.
 import abc
 import copy
 import dataclasses
+import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
 from importlib import resources
@@ -210,6 +211,29 @@ class Domain(Pictured):
         if self.engine_name == "warp":
             return Warp(self._base(self.warp_iterations), self.num_substeps)
         return self.mjx
+
+    @cached_property
+    def structure(self) -> tuple[Any, ...] | None:
+        """Return what domains must have in common for one engine to step all of them; None to stay alone.
+
+        Their models may differ in numbers only, as those of tasks.
+        """
+        plain = type(self).step is Domain.step and type(self).advance is Domain.advance
+        if self.repeat != 1 or not plain:  # more than control, physics and outcome
+            return None
+        model = self.models[0] if isinstance(self.simulator, MujocoC) else self.simulator.base
+        fixed = hashlib.sha256()
+        for name in FIXED:
+            field = np.asarray(attrgetter(name)(model))
+            fixed.update(repr((name, field.shape)).encode() + field.tobytes())
+        return self.engine_name, self.num_substeps, fixed.digest()
+
+    def join_simulator(self, models: Sequence[mujoco.MjModel]) -> Engine:
+        """Return the engine of several domains of this structure, with the models of all their rows; this one's first.
+
+        MuJoCo C holds the models. MJX and Warp receive the fields in which they differ with every step.
+        """
+        return MujocoC(models, self.num_substeps) if self.engine_name == "c" else self.simulator
 
     @property
     def outside(self) -> Warp | MujocoC | None:

@@ -423,6 +423,11 @@ class Family(Flat, Tabled):
         return None
 
     @property
+    def structure(self) -> Any:
+        """Return what families must have in common to share a simulator in a mixture; None for one that stays alone."""
+        return None
+
+    @property
     def outside_painter(self) -> Any:
         """Return the painter of its observations if it runs outside XLA, else None."""
         return None

@@ -1,7 +1,8 @@
 """Mixtures: families with different observations, actions, horizons and physics, as one environment.
 
-A mixture has the tasks of its families, one family after another in every split. Each family steps its own worlds in a
-separate call. Observed vectors are padded with zeros to one size, and actions beyond a family's own are masked.
+A mixture has the tasks of its families, one family after another in every split. Families whose models have the same
+structure step together (``joined``), and every other family steps its own worlds in a separate call. Observed vectors
+are padded with zeros to one size, and actions beyond a family's own are masked.
 """
 
 import dataclasses
@@ -16,6 +17,7 @@ import tyro
 
 from mtjax import frames
 from mtjax.envs.family import Family, Part, Table, Tabled
+from mtjax.envs.joined import Alone, Joined, grouped, take
 from mtjax.types import SPLITS, Array, InputError, Key, Spec, Step, Task
 
 
@@ -230,21 +232,26 @@ class Mixture(Tabled):
 
     # Worlds, leaves (S, T, E, ...).
 
+    @cached_property
+    def groups(self) -> tuple[Alone | Joined, ...]:
+        """Return the families by what steps them: one simulator for several, or each its own."""
+        return grouped(self.families)
+
     def reset_worlds(self, tasks: Task, keys: Key) -> Step:
         """Begin an episode in every world."""
-        blocks = self._require(tasks)
-        begin = lambda family, own, i: family.reset_worlds(own, blocks.take(keys, i))
-        return self._each(tasks, begin)
+        own = self._apart(tasks)
+        steps = {i: self.families[i].reset_worlds(each, tasks.blocks.take(keys, i)) for i, each in own.items()}
+        return self._whole(tasks.blocks, steps)
 
     def step_worlds(self, tasks: Task, states: States, actions: Array) -> Step:
         """Step every world by its action (S, T, E, A)."""
-        blocks = self._require(tasks)
-
-        def advance(family: Family, own: Task, i: int) -> Step:
-            action = blocks.take(actions, i)[..., : family.spec.action_size]
-            return family.step_worlds(own, states.families[i], action)
-
-        return self._each(tasks, advance)
+        own, steps = self._apart(tasks), {}
+        given = {i: tasks.blocks.take(actions, i)[..., : self.families[i].spec.action_size] for i in own}
+        for group in self.groups:
+            here = [i for i in group.members if i in own]  # a split may have no task of a family
+            of = lambda parts, here=here: {i: parts[i] for i in here}
+            steps |= group.step_worlds(of(own), of(states.families), of(given)) if here else {}
+        return self._whole(tasks.blocks, steps)
 
     def where_worlds(self, mask: Array, new: States, old: States) -> States:
         """Choose states by ``mask`` (S, T, E)."""
@@ -254,15 +261,16 @@ class Mixture(Tabled):
         ]
         return new._replace(families=tuple(chosen))
 
-    def _require(self, tasks: Task) -> Blocks:
-        if tasks.blocks is None or tasks.blocks.count != tasks.id.shape[1]:
+    def _apart(self, tasks: Task) -> dict[int, Task]:
+        """Return the tasks of each family in that family's own form."""
+        blocks = tasks.blocks
+        if blocks is None or blocks.count != tasks.id.shape[1]:
             raise InputError("the worlds of a mixture are those of a whole split: env.tasks(split), and not some of it")
-        return tasks.blocks
+        rows = {i: blocks.take(tasks.row, i) - int(self._first[i]) for i in dict.fromkeys(i for i, _ in blocks.runs)}
+        return {i: take(self.families[i].table.tasks, each) for i, each in rows.items()}
 
-    def _each(self, tasks: Task, act: Any) -> Step:
-        """Call a function for every family on its own tasks, and join the steps."""
-        blocks: Blocks = tasks.blocks
-        steps = {i: act(self.families[i], self._own(tasks, i), i) for i in dict.fromkeys(i for i, _ in blocks.runs)}
+    def _whole(self, blocks: Blocks, steps: dict[int, Step]) -> Step:
+        """Join the steps of the families."""
         states = tuple(steps[i].state if i in steps else None for i in range(len(self.families)))
         join = lambda of: blocks.join({i: of(step) for i, step in steps.items()})
         padded = [self.pad(step.obs) for step in steps.values()]
@@ -275,13 +283,6 @@ class Mixture(Tabled):
             terminated=join(lambda step: step.terminated),
             metrics={name: join(lambda step, name=name: step.metrics.get(name, unknown(step))) for name in names},
         )
-
-    def _own(self, tasks: Task, i: int) -> Task:
-        """Return the tasks of one family in that family's own form."""
-        rows = tasks.blocks.take(tasks.row, i) - int(self._first[i])
-        own = jax.tree.map(lambda x: jnp.take(jnp.asarray(x), rows, axis=0, mode="clip"), self.families[i].table.tasks)
-        # A compiler that sees constants divides by them otherwise than by numbers that it does not know.
-        return jax.lax.optimization_barrier(own)
 
     def pad(self, obs: Any) -> Any:
         """Pad the vectors (..., O') in a family's observations with zeros to the mixture's (..., O)."""
@@ -337,6 +338,11 @@ class Mixture(Tabled):
             }
             found.append(Part(name, family, places))
         return tuple(found)
+
+    @property
+    def _outside(self) -> list[Any]:
+        own = super()._outside
+        return own + [group.outside for group in self.groups if group.outside not in own]
 
     def apart(self, states: States) -> tuple[Any, ...]:
         """Return the states of each part."""

@@ -61,6 +61,7 @@ class Pictured(Stepped):
     which is the faster one."""
 
     look: ClassVar[looks.Look | None] = None  # camera and light; None: the model's own, or a view of all of it
+    meshes: ClassVar[bool] = False  # whether the scene is of meshes, which only Warp draws
     hides: ClassVar[tuple[str, ...]] = ()  # geoms that films show and observations do not, such as a hidden goal
 
     def __post_init__(self):
@@ -78,7 +79,7 @@ class Pictured(Stepped):
     def _require_pictures(self) -> None:
         """Refuse what only pictures show, where there are none, and a painter that cannot run here."""
         if self.pixels:
-            choose_painter(self.painter)
+            choose_painter(self.painter, self.meshes)
             return
         shown = [name for name, _ in self.vary if self.every_parameter[name].looks]
         shown += [
@@ -106,6 +107,10 @@ class Pictured(Stepped):
         """Return the geoms of the scene whose places this episode has decided."""
         return {}
 
+    def seen_spec(self, values: Mapping[str, float]) -> mujoco.MjSpec:
+        """Return the editable model of what is seen, before it is dressed. By default it is that of the physics."""
+        return self.compile_spec(values)
+
     def eye(self, task: Task, state: Any) -> Pose | None:
         """Return where the camera is, if the world decides that. None: where the scene has it."""
         return None
@@ -125,7 +130,7 @@ class Pictured(Stepped):
     def compile_scene(self, values: Mapping[str, float] | None = None) -> mujoco.MjSpec:
         """Return the editable model of what is seen with these parameter values."""
         given = dict(values or {})
-        spec = self.compile_spec(given)
+        spec = self.seen_spec(given)
         self.add_marks(spec)
         looks.dress(spec, self.look, self.plain)
         for name, value in given.items():
@@ -133,6 +138,10 @@ class Pictured(Stepped):
             if parameter.looks and parameter.edit is not None:
                 parameter.edit(spec, float(value))
         return spec
+
+    def scene_model(self, row: int) -> mujoco.MjModel:
+        """Return the compiled model of what is seen of the task in a row of the table."""
+        return self.compile_scene({name: values[row] for name, values in self.values.items()}).compile()
 
     def for_rows(self, make: Callable[[dict[str, float]], Any], names: Iterable[str]) -> tuple[Any, ...]:
         """Return what ``make`` returns for every row of the table. Rows with equal values of ``names`` share it."""
@@ -147,12 +156,12 @@ class Pictured(Stepped):
     @cached_property
     def scene(self) -> Scene:
         """Return what no task changes of the scene."""
-        return Scene(self._observed({name: values[0] for name, values in self.values.items()}))
+        return Scene(observed(self.scene_model(0), self.hides))
 
     @cached_property
     def artist(self) -> Painter:
         """Return the painter of this family on this device."""
-        return choose_painter(self.painter)(self.scene, self.pixels)
+        return choose_painter(self.painter, self.meshes)(self.scene, self.pixels)
 
     @property
     def outside_painter(self) -> WarpPainter | None:

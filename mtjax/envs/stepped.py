@@ -54,6 +54,10 @@ class Stepped(Family):
         """Return further numbers () of a world after the step, such as success. Evaluations report them."""
         return {}
 
+    def judge(self, task: Task, state: Any, action: Array) -> tuple[Array, dict[str, Array]]:
+        """Return reward and metrics. A family that computes them together gives both here."""
+        return self.reward(task, state, action), self.metrics(task, state, action)
+
     # What every family does.
 
     def step(self, task: Task, state: Any, action: Array) -> Step:
@@ -69,11 +73,14 @@ class Stepped(Family):
             return state, total, over | self.terminates(task, state)
 
         if self.repeat == 1:
-            state = self.advance(task, state, action)
-            reward, over = self.reward(task, state, action), self.terminates(task, state)
-        else:
-            state, reward, over = jax.lax.fori_loop(0, self.repeat, once, (state, jnp.float32(0), jnp.bool_(False)))
-        return Step(state, self.look_at(task, state), reward, over, self.metrics(task, state, action))
+            return self.outcome(task, self.advance(task, state, action), action)
+        state, reward, over = jax.lax.fori_loop(0, self.repeat, once, (state, jnp.float32(0), jnp.bool_(False)))
+        return Step(state, self.look_at(task, state), reward, over, self.judge(task, state, action)[1])
+
+    def outcome(self, task: Task, state: Any, action: Array) -> Step:
+        """Return what a control step has led to."""
+        reward, metrics = self.judge(task, state, action)
+        return Step(state, self.look_at(task, state), reward, self.terminates(task, state), metrics)
 
     def look_at(self, task: Task, state: Any) -> Any:
         """Return what the agent observes of a world."""

@@ -49,7 +49,8 @@ def film(env: Pictured, task_row: int, states: Any, width: int = 320, height: in
     """
     if not 0 <= task_row < env.count:
         raise InputError(f"there is no task {task_row}; this family has tasks 0 to {env.count - 1}")
-    model = _scene(env, task_row, width, height)
+    model = env.scene_model(task_row)
+    model.vis.global_.offwidth, model.vis.global_.offheight = width, height
     data, task = mujoco.MjData(model), jax.tree.map(lambda x: x[task_row], env.table.tasks)
     of_each = lambda state: (env.joints(state), env.marks(task, state), env.eye(task, state))
     shown = jax.tree.map(np.asarray, jax.vmap(of_each)(states))
@@ -85,12 +86,6 @@ def write_video(path_stem: str | Path, frames: np.ndarray, fps: float) -> Path:
     else:
         _write_gif(path, frames, fps)
     return path
-
-
-def _scene(env: Pictured, task_row: int, width: int, height: int) -> mujoco.MjModel:
-    spec = env.compile_scene({name: values[task_row] for name, values in env.values.items()})
-    spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
-    return spec.compile()
 
 
 def _place(model: mujoco.MjModel, marks: dict[str, Mark]) -> None:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -31,12 +31,8 @@ _PAWS = ("palm_L", "palm_R", "sole_L", "sole_R")
 _OF_FETCH = ("target", "wall_px", "wall_py", "wall_nx", "wall_ny")
 
 
-@lru_cache
-def _read_dog() -> mujoco.MjSpec:
-    """Read the model of an installed dm_control, without what physics does not need.
-
-    The bones are meshes that touch nothing. They give the bodies their mass and inertia, which are written down before
-    the bones are dropped.
+def _whole_dog() -> mujoco.MjSpec:
+    """Read the model of an installed dm_control, without what is fetched, cameras and lights.
 
     Raises:
         InputError: dm_control is not installed.
@@ -46,8 +42,21 @@ def _read_dog() -> mujoco.MjSpec:
         raise InputError("the dog's model is a part of dm_control, which is not installed: pip install dm_control")
     spec = mujoco.MjSpec.from_file(str(Path(found.submodule_search_locations[0]) / "suite" / "dog.xml"))
     fetched = [spec.body("ball"), *(spec.geom(name) for name in _OF_FETCH)]
-    for each in (*fetched, *spec.cameras, *spec.lights, *spec.skins):
+    for each in (*fetched, *spec.cameras, *spec.lights):
         spec.delete(each)
+    return spec
+
+
+@lru_cache
+def _read_dog() -> mujoco.MjSpec:
+    """Read the dog without what physics does not need.
+
+    The bones are meshes that touch nothing. They give the bodies their mass and inertia, which are written down before
+    the bones are dropped.
+    """
+    spec = _whole_dog()
+    for skin in spec.skins:
+        spec.delete(skin)
     whole = spec.compile()
     for body in spec.bodies[1:]:
         i = whole.body(body.name).id
@@ -61,7 +70,7 @@ def _read_dog() -> mujoco.MjSpec:
     for each in (*bones, *spec.meshes, *spec.materials, *spec.textures):
         spec.delete(each)
     for geom in spec.geoms:
-        geom.material, geom.group = "", 0  # films show the shapes that touch
+        geom.material = ""
     for name in ("skull", "pelvis"):
         spec.add_sensor(name=name, type=_SENSOR.mjSENS_FRAMEQUAT, objtype=_OBJECT.mjOBJ_XBODY, objname=name)
     spec.add_sensor(name="height", type=_SENSOR.mjSENS_FRAMEPOS, objtype=_OBJECT.mjOBJ_XBODY, objname="pelvis")
@@ -88,8 +97,8 @@ class DogStand(Domain):
         standard deviation of 2 m/s and 2 rad/s; activations uniform in [-1, 1].
     Episode: 1000 steps of 0.015 s (three substeps of 0.005 s); it never terminates.
 
-    The model is read from an installed dm_control (``pip install dm_control``). It cannot be seen through ``pixels``:
-    it has more shapes than the painters draw, and its bones are meshes. Films show the shapes that touch.
+    The model is read from an installed dm_control (``pip install dm_control``). Films show its skin. Through
+    ``pixels`` painter warp shows its bones, and painter caster refuses, as it draws no meshes.
 
     Parameters that can vary:
         torso-mass: scale of mass and inertia of the torso.
@@ -116,15 +125,18 @@ class DogStand(Domain):
     episode_steps: ClassVar[int] = 1000
     default_iterations: ClassVar[int] = 6
     floor: ClassVar[float] = 15.0  # [m] half a side
+    meshes: ClassVar[bool] = True
     look: ClassVar = Look((0, -1.5, 0.8), 59.036, (0, 0, 3), follow="torso")
-
-    def __post_init__(self):
-        super().__post_init__()
-        if self.pixels:
-            raise InputError("the dog cannot be seen: painters draw no meshes; leave pixels out, or take another body")
 
     def _read_model(self) -> mujoco.MjSpec:
         return _read_dog().copy()
+
+    def seen_spec(self, values: Mapping[str, float]) -> mujoco.MjSpec:
+        spec = _whole_dog()
+        self.prepare(spec)
+        for geom in spec.geoms if self.pixels else ():  # Warp draws no skin: bones come into view
+            geom.group = 0 if geom.type == mujoco.mjtGeom.mjGEOM_MESH else geom.group
+        return spec
 
     def _base(self, iterations: int) -> mujoco.MjModel:
         """Return the model of MJX or Warp, in which all but the teeth touch the floor, and nothing touches itself."""

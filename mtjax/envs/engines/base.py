@@ -7,6 +7,7 @@ dm_control does. Force sensors (touch) keep the values of the last substep. Worl
 import contextlib
 import importlib.util
 import io
+from collections.abc import Iterable
 from functools import lru_cache
 from typing import Any, NamedTuple, Protocol
 
@@ -39,6 +40,7 @@ class Engine(Protocol):
     def place(self, task: Task, qpos: Array, qvel: Array, extra: Any = None, mocap: Any = None) -> World: ...
     def step(self, task: Task, world: World, ctrl: Array) -> World: ...
     def touching(self, task: Task, qpos: Array) -> Array: ...
+    def require_variable(self, names: Iterable[str]) -> None: ...  # raises InputError if tasks may not differ in these
 
 
 def choose_engine(engine: str, preferred: str = "mjx") -> str:

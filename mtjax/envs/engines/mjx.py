@@ -1,6 +1,7 @@
 """MJX, MuJoCo's JAX port, which runs on any device."""
 
 import dataclasses
+from collections.abc import Iterable
 from functools import cached_property
 from typing import Any
 
@@ -13,8 +14,8 @@ from mtjax.envs.engines.base import World, at_rest, mjx_module, require_plain, s
 from mtjax.types import Array, Task
 
 # Sensors that read more than poses and velocities of bodies: these need the whole position and velocity stages.
-_INVOLVED = [getattr(mujoco.mjtSensor, f"mjSENS_{x}") for x in "TENDONPOS TENDONVEL ACTUATORPOS ACTUATORVEL".split()]
-_INVOLVED += [mujoco.mjtSensor.mjSENS_CONTACT, mujoco.mjtSensor.mjSENS_CAMPROJECTION]
+INVOLVED = [getattr(mujoco.mjtSensor, f"mjSENS_{x}") for x in "TENDONPOS TENDONVEL ACTUATORPOS ACTUATORVEL".split()]
+INVOLVED += [mujoco.mjtSensor.mjSENS_CONTACT, mujoco.mjtSensor.mjSENS_CAMPROJECTION]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -74,6 +75,9 @@ class Mjx:
             world = jax.lax.fori_loop(0, self.num_substeps, substep, world)
         return self.sense(task, world)
 
+    def require_variable(self, names: Iterable[str]) -> None:
+        """Do nothing, as tasks may differ in all fields that vary."""
+
     def touching(self, task: Task, qpos: Array) -> Array:
         """Return whether any two colliding geoms overlap in the positions ``qpos`` (nq,)."""
         mjx = mjx_module()
@@ -88,7 +92,7 @@ class Mjx:
             return world
         mjx = mjx_module()
         model, data = self._bind(task, world)
-        involved = np.any(np.isin(self.base.sensor_type, _INVOLVED))
+        involved = np.any(np.isin(self.base.sensor_type, INVOLVED))
         positions = mjx.fwd_position if involved else lambda m, d: mjx.com_pos(m, mjx.kinematics(m, d))
         velocities = mjx.fwd_velocity if involved else mjx.com_vel
         with jax.default_matmul_precision("highest"):

@@ -7,7 +7,7 @@ import inspect
 import itertools
 import threading
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property, partial
 from operator import attrgetter
 from typing import Any, NamedTuple
@@ -19,7 +19,7 @@ import numpy as np
 
 from mtjax.envs.engines.base import World, mjx_module, state_of
 from mtjax.envs.engines.kernels import compile_kernels
-from mtjax.envs.engines.mjx import Mjx
+from mtjax.envs.engines.mjx import INVOLVED, Mjx
 from mtjax.types import Array, InputError, Task
 
 # Fields that no stage of a step reads, so that tasks may differ in them though Warp has room for one value only.
@@ -74,7 +74,7 @@ def keep_streams(warp: Any) -> None:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Warp:
-    """An engine that steps by MuJoCo Warp. MJX computes start states, and position and velocity sensors.
+    """An engine that steps by MuJoCo Warp. MJX computes start states.
 
     XLA passes positions, velocities, warm starts, controls and the differing leaves of tasks to one call. This call
     takes all substeps in Warp's own memory. MJX would pass all of Warp's arrays through XLA at every substep. That is
@@ -107,8 +107,13 @@ class Warp:
         return Mjx(model, self.num_substeps)
 
     def forward(self, task: Task, qpos: Array, qvel: Array, extra: Any = None, mocap: Any = None) -> World:
-        """Put a world in a state without controls, and solve for its forces."""
-        return self.mjx.forward(task, qpos, qvel, extra, mocap)
+        """Put a world in a state without controls, and solve for its forces if sensors feel them.
+
+        If MJX refuses the model's contacts, its force sensors read 0 until the next step.
+        """
+        feels = mujoco.mjtStage.mjSTAGE_ACC in self.base.sensor_needstage
+        put = self.mjx.forward if feels and self._like is not None else self.place
+        return put(task, qpos, qvel, extra, mocap)
 
     def place(self, task: Task, qpos: Array, qvel: Array, extra: Any = None, mocap: Any = None) -> World:
         """Put a world in a state in which no force sensor is touched."""
@@ -124,7 +129,7 @@ class Warp:
         given = state_of(world) | {"qacc_warmstart": world.warmstart, "ctrl": ctrl}
         new = self._advance(jax.tree.map(lambda x: x[None], _Flat(leaves, given)))
         new = jax.tree.map(lambda x: x[0], new)
-        moved = World(
+        return World(
             new["qpos"],
             new["qvel"],
             new["qacc_warmstart"],
@@ -133,7 +138,15 @@ class Warp:
             new.get("act"),
             world.mocap,
         )
-        return self._unhindered.sense(task, moved)
+
+    def require_variable(self, names: Iterable[str]) -> None:
+        """Refuse tasks that differ in a field of which Warp holds one value only.
+
+        Raises:
+            InputError: there is such a field.
+        """
+        for name in names:
+            self._varies(name)
 
     def _varies(self, name: str) -> bool:
         """Return whether Warp needs the tasks' values of a field."""
@@ -262,14 +275,21 @@ class Warp:
         return model
 
     @cached_property
+    def _like(self) -> Any:
+        """Return the shapes of MJX's data of the model; None if MJX refuses it."""
+        try:
+            return jax.eval_shape(partial(mjx_module().make_data, self.base, jax.local_devices()[0], "jax"))._impl
+        except (NotImplementedError, ValueError):
+            return None
+
+    @cached_property
     def _room(self) -> tuple[int, int]:
         """Return the most contacts and constraint rows that one world can have.
 
         They are the sizes of MJX's arrays, but some pairs of shapes touch in twice as many points in Warp.
         """
-        try:
-            like = jax.eval_shape(partial(mjx_module().make_data, self.base, jax.local_devices()[0], "jax"))._impl
-        except (NotImplementedError, ValueError):
+        like = self._like
+        if like is None:
             return _ROOM
         slots = like.contact.dist.shape[0]
         doubled = min(slots, _DOUBLED)
@@ -343,10 +363,26 @@ def _stepper(engine: Any, count: int, names: tuple[str, ...]) -> Callable:
             _place_geoms(model, data, all_move)
         for _ in range(own.num_substeps):
             mujoco_warp.step(model, data)
+        _sense(own.base, model, data)
         for name, array in zip(found, arrays[len(arrays) - len(found) :], strict=True):
             warp.copy(array, getattr(data, name))
 
     return step
+
+
+def _sense(base: mujoco.MjModel, model: Any, data: Any) -> None:
+    """Update position and velocity sensors to the state after the last substep. Force sensors stay as they are."""
+    from mujoco.mjx.third_party.mujoco_warp._src import forward, sensor, smooth
+
+    if np.all(base.sensor_needstage == mujoco.mjtStage.mjSTAGE_ACC):
+        return
+    involved = np.any(np.isin(base.sensor_type, INVOLVED))
+    forward.fwd_kinematics(model, data)
+    if involved:
+        smooth.transmission(model, data)
+    sensor.sensor_pos(model, data)
+    (forward.fwd_velocity if involved else smooth.com_vel)(model, data)
+    sensor.sensor_vel(model, data)
 
 
 def _place_geoms(model: Any, data: Any, all_move: Any) -> None:

@@ -49,7 +49,7 @@ class Assembly(Sawyer):
     Success: in x and y, nut and peg are within 0.02 m, and the nut is below the peg's top.
     """
 
-    scene: ClassVar[str] = "sawyer_assembly_peg"
+    scene_file: ClassVar[str] = "sawyer_assembly_peg"
     drawn: ClassVar = ((0.0, 0.6, 0.02, -0.1, 0.75, 0.1), (0.0, 0.6, 0.02, 0.1, 0.85, 0.1))
     goal_low: ClassVar = (-0.1, 0.75, 0.1)
     goal_high: ClassVar = (0.1, 0.85, 0.1)
@@ -91,7 +91,7 @@ class Disassemble(Sawyer):
     The goal is 0.15 m above the nut's start; the place that is drawn for it is not used.
     """
 
-    scene: ClassVar[str] = "sawyer_assembly_peg"
+    scene_file: ClassVar[str] = "sawyer_assembly_peg"
     hand_start: ClassVar = (0.0, 0.4, 0.2)
     drawn: ClassVar = ((0.0, 0.6, 0.025, -0.1, 0.6, 0.1699), (0.1, 0.75, 0.02501, 0.1, 0.75, 0.1701))
     goal_low: ClassVar = (-0.1, 0.6, 0.1749)

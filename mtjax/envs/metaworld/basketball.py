@@ -24,7 +24,7 @@ class Basketball(Sawyer):
     Success: the ball is within 0.08 m of that point, where z counts twice.
     """
 
-    scene: ClassVar[str] = "sawyer_basketball"
+    scene_file: ClassVar[str] = "sawyer_basketball"
     drawn: ClassVar = ((-0.1, 0.6, 0.0299, -0.1, 0.85, 0.0), (0.1, 0.7, 0.0301, 0.1, 0.9 + 1e-7, 0.0))
     goal_low: ClassVar = (-0.1, 0.85 - 0.083, 0.2499)
     goal_high: ClassVar = (0.1, 0.9 + 1e-7 - 0.083, 0.2501)

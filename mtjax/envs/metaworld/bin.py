@@ -28,7 +28,7 @@ class BinPicking(Sawyer):
     The goal never moves. The tail's margin is the cube's way after the first step of an episode.
     """
 
-    scene: ClassVar[str] = "sawyer_bin_picking"
+    scene_file: ClassVar[str] = "sawyer_bin_picking"
     hand_low: ClassVar = (-0.5, 0.4, 0.07)
     drawn: ClassVar = ((-0.21, 0.65, 0.02, 0.1199, 0.699, -0.001), (-0.03, 0.75, 0.02, 0.1201, 0.701, 0.001))
     goal_low: ClassVar = (0.1199, 0.699, -0.001)

@@ -26,7 +26,7 @@ class BoxClose(Sawyer):
     Success: the lid is within 0.08 m of the goal.
     """
 
-    scene: ClassVar[str] = "sawyer_box"
+    scene_file: ClassVar[str] = "sawyer_box"
     drawn: ClassVar = ((-0.05, 0.5, 0.02, -0.1, 0.7, 0.133), (0.05, 0.55, 0.02, 0.1, 0.8, 0.133))
     goal_low: ClassVar = (-0.1, 0.7, 0.133)
     goal_high: ClassVar = (0.1, 0.8, 0.133)

@@ -41,7 +41,7 @@ class ButtonPress(Sawyer):
     Success: along y, the button is within 0.02 m of its hole.
     """
 
-    scene: ClassVar[str] = "sawyer_button_press"
+    scene_file: ClassVar[str] = "sawyer_button_press"
     hand_start: ClassVar = (0.0, 0.4, 0.2)
     drawn: ClassVar = ((-0.1, 0.85, 0.115), (0.1, 0.9, 0.115))
     goal_low: ClassVar = Sawyer.hand_low
@@ -70,7 +70,7 @@ class ButtonPressWall(ButtonPress):
     Success: along y, the button is within 0.03 m of its hole.
     """
 
-    scene: ClassVar[str] = "sawyer_button_press_wall"
+    scene_file: ClassVar[str] = "sawyer_button_press_wall"
     drawn: ClassVar = ((-0.05, 0.85, 0.1149), (0.05, 0.9, 0.1151))
 
     def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
@@ -90,7 +90,7 @@ class ButtonPressTopdown(Sawyer):
     Success: along z, the button is within 0.024 m of its hole.
     """
 
-    scene: ClassVar[str] = "sawyer_button_press_topdown"
+    scene_file: ClassVar[str] = "sawyer_button_press_topdown"
     hand_start: ClassVar = (0.0, 0.4, 0.2)
     drawn: ClassVar = ((-0.1, 0.8, 0.115), (0.1, 0.9, 0.115))
     goal_low: ClassVar = Sawyer.hand_low
@@ -120,5 +120,5 @@ class ButtonPressTopdownWall(ButtonPressTopdown):
     Reward and success: as ``ButtonPressTopdown``'s, but the gripper should be open.
     """
 
-    scene: ClassVar[str] = "sawyer_button_press_topdown_wall"
+    scene_file: ClassVar[str] = "sawyer_button_press_topdown_wall"
     presses_open: ClassVar[bool] = True

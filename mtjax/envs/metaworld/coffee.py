@@ -38,12 +38,12 @@ class CoffeeButton(Sawyer):
     The observation has the orientation 1, 0, 0, 0 for the button.
     """
 
-    scene: ClassVar[str] = "sawyer_coffee"
+    scene_file: ClassVar[str] = "sawyer_coffee"
     hand_start: ClassVar = (0.0, 0.4, 0.2)
     drawn: ClassVar = ((-0.1, 0.8, -0.001), (0.1, 0.9, 0.001))
     goal_low: ClassVar = (-0.101, 0.61, 0.298)
     goal_high: ClassVar = (0.101, 0.71, 0.302)
-    watched: ClassVar = {"button": "site:buttonStart"}
+    watched: ClassVar = {"button": "site:buttonStart", "mug": "body:obj", "shape": "geom:mug"}
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
         host.move("coffee_machine", vec)
@@ -69,12 +69,12 @@ class CoffeePull(Sawyer):
     The observation has the mug's orientation as x, y, z, w.
     """
 
-    scene: ClassVar[str] = "sawyer_coffee"
+    scene_file: ClassVar[str] = "sawyer_coffee"
     hand_start: ClassVar = (0.0, 0.4, 0.2)
     drawn: ClassVar = ((-0.05, 0.7, -0.001, -0.1, 0.55, -0.001), (0.05, 0.75, 0.001, 0.1, 0.65, 0.001))
     goal_low: ClassVar = (-0.1, 0.55, -0.001)
     goal_high: ClassVar = (0.1, 0.65, 0.001)
-    watched: ClassVar = {"mug": "body:obj", "shape": "geom:mug"}
+    watched: ClassVar = CoffeeButton.watched
     to_machine: ClassVar[bool] = False
 
     def allowed(self, vec: np.ndarray) -> bool:

@@ -28,7 +28,7 @@ class DialTurn(Sawyer):
     Success: the mark is within 0.07 m of the goal.
     """
 
-    scene: ClassVar[str] = "sawyer_dial"
+    scene_file: ClassVar[str] = "sawyer_dial"
     drawn: ClassVar = ((-0.1, 0.7, 0.0), (0.1, 0.8, 0.0))
     goal_low: ClassVar = (-0.1, 0.73, 0.0299)
     goal_high: ClassVar = (0.1, 0.83, 0.0301)

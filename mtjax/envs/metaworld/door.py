@@ -40,7 +40,7 @@ class DoorOpen(Sawyer):
     The observation has the handle's orientation as x, y, z, w.
     """
 
-    scene: ClassVar[str] = "sawyer_door_pull"
+    scene_file: ClassVar[str] = "sawyer_door_pull"
     drawn: ClassVar = ((0.0, 0.85, 0.15), (0.1, 0.95, 0.15))
     goal_low: ClassVar = (-0.3, 0.4, 0.1499)
     goal_high: ClassVar = (-0.2, 0.5, 0.1501)
@@ -73,7 +73,7 @@ class DoorClose(Sawyer):
     The observation has the handle's orientation as x, y, z, w.
     """
 
-    scene: ClassVar[str] = "sawyer_door_pull"
+    scene_file: ClassVar[str] = "sawyer_door_pull"
     hand_start: ClassVar = (-0.5, 0.6, 0.2)
     drawn: ClassVar = DoorOpen.drawn
     goal_low: ClassVar = (0.2, 0.65, 0.1499)

@@ -28,7 +28,7 @@ class DrawerOpen(Sawyer):
     Success: the handle is within 0.03 m of the goal.
     """
 
-    scene: ClassVar[str] = "sawyer_drawer"
+    scene_file: ClassVar[str] = "sawyer_drawer"
     drawn: ClassVar = ((-0.1, 0.9, 0.0), (0.1, 0.9, 0.0))
     goal_low: ClassVar = Sawyer.hand_low
     goal_high: ClassVar = Sawyer.hand_high
@@ -61,7 +61,7 @@ class DrawerClose(Sawyer):
     The observation has zeros for the drawer's orientation. The handle of the closed drawer is 0.051 m from the goal.
     """
 
-    scene: ClassVar[str] = "sawyer_drawer"
+    scene_file: ClassVar[str] = "sawyer_drawer"
     drawn: ClassVar = DrawerOpen.drawn
     goal_low: ClassVar = Sawyer.hand_low
     goal_high: ClassVar = Sawyer.hand_high

@@ -29,13 +29,18 @@ class FaucetOpen(Sawyer):
     The handle's end is taken 0.04 m to the left and 0.03 m above where the observation shows it.
     """
 
-    scene: ClassVar[str] = "sawyer_faucet"
+    scene_file: ClassVar[str] = "sawyer_faucet"
     hand_low: ClassVar = (-0.5, 0.4, -0.15)
     hand_start: ClassVar = (0.0, 0.4, 0.2)
     drawn: ClassVar = ((-0.05, 0.8, 0.0), (0.05, 0.85, 0.0))
     goal_low: ClassVar = hand_low
     goal_high: ClassVar = Sawyer.hand_high
-    watched: ClassVar = {"handle": "site:handleStartOpen", "base": "body:faucetBase"}
+    watched: ClassVar = {
+        "opens": "site:handleStartOpen",
+        "closes": "site:handleStartClose",
+        "base": "body:faucetBase",
+    }
+    handle: ClassVar[str] = "opens"  # the thing watched that the hand turns
     to_target: ClassVar = (0.175, 0.0, 0.125)  # [m] from the faucet
     to_end: ClassVar = (-0.04, 0.0, 0.03)  # [m] from the handle in the observation
 
@@ -44,7 +49,7 @@ class FaucetOpen(Sawyer):
         return {"target": vec + self.to_target, "obj_init": vec}
 
     def objects(self, at: At) -> tuple[Array, ...]:
-        return at.position["handle"] - jnp.array([0.0, 0.0, 0.01]), at.quat["base"]
+        return at.position[self.handle] - jnp.array([0.0, 0.0, 0.01]), at.quat["base"]
 
     def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
         end, target = at.obs[4:7] + jnp.array(self.to_end), began["target"]
@@ -64,6 +69,6 @@ class FaucetClose(FaucetOpen):
     """
 
     drawn: ClassVar = ((-0.1, 0.8, 0.0), (0.1, 0.85, 0.0))
-    watched: ClassVar = {"handle": "site:handleStartClose", "base": "body:faucetBase"}
+    handle: ClassVar[str] = "closes"
     to_target: ClassVar = (-0.175, 0.0, 0.125)
     to_end: ClassVar = (0.0, 0.0, 0.0)

@@ -28,7 +28,7 @@ class Hammer(Sawyer):
     The handle is caged at the hand's x wherever the hand is within 0.07 m of its middle.
     """
 
-    scene: ClassVar[str] = "sawyer_hammer"
+    scene_file: ClassVar[str] = "sawyer_hammer"
     hand_start: ClassVar = (0.0, 0.4, 0.2)
     drawn: ClassVar = ((-0.1, 0.4, 0.0), (0.1, 0.5, 0.0))
     goal_low: ClassVar = (0.2399, 0.7399, 0.109)

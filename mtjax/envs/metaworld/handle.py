@@ -33,11 +33,12 @@ class HandlePress(Sawyer):
     Start: the box at the drawn place, its handle up.
     """
 
-    scene: ClassVar[str] = "sawyer_handle_press"
+    scene_file: ClassVar[str] = "sawyer_handle_press"
     drawn: ClassVar = ((-0.1, 0.8, -0.001), (0.1, 0.9, 0.001))
     goal_low: ClassVar = (-0.1, 0.55, 0.04)
     goal_high: ClassVar = (0.1, 0.7, 0.08)
-    watched: ClassVar = {"handle": "site:handleStart"}
+    watched: ClassVar = {"start": "site:handleStart", "right": "site:handleRight"}
+    handle: ClassVar[str] = "start"  # the thing watched that is the handle's place
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
         host.move("box", vec)
@@ -45,10 +46,10 @@ class HandlePress(Sawyer):
         return {"target": host.site("goalPress"), "handle_init_pos": host.site("handleStart"), "obj_init": vec}
 
     def objects(self, at: At) -> tuple[Array, ...]:
-        return at.position["handle"], jnp.zeros(4)
+        return at.position[self.handle], jnp.zeros(4)
 
     def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
-        handle, start, target = at.position["handle"], began["handle_init_pos"], began["target"]
+        handle, start, target = at.position[self.handle], began["handle_init_pos"], began["target"]
         away = abs(handle[2] - target[2])
         in_place = near(away, _PRESSED, abs(abs(start[2] - target[2]) - _PRESSED))
         reach = near(distance(handle, at.tcp), 0.02, abs(distance(start, began["init_tcp"]) - 0.02))
@@ -63,10 +64,11 @@ class HandlePressSide(HandlePress):
     Reward, success and start: as HandlePress.
     """
 
-    scene: ClassVar[str] = "sawyer_handle_press_sideways"
+    scene_file: ClassVar[str] = "sawyer_handle_press_sideways"
     drawn: ClassVar = ((-0.35, 0.65, -0.001), (-0.25, 0.75, 0.001))
     goal_low: ClassVar = HandlePress.hand_low
     goal_high: ClassVar = HandlePress.hand_high
+    watched: ClassVar = {"start": "site:handleStart", "centre": "site:handleCenter"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,7 +85,7 @@ class HandlePull(HandlePress):
     """
 
     goal_high: ClassVar = (0.1, 0.7, 0.18)
-    watched: ClassVar = {"handle": "site:handleRight"}
+    handle: ClassVar[str] = "right"
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
         host.move("box", vec)
@@ -111,7 +113,7 @@ class HandlePullSide(HandlePressSide):
     """
 
     drawn: ClassVar = ((-0.35, 0.65, 0.0), (-0.25, 0.75, 0.0))
-    watched: ClassVar = {"handle": "site:handleCenter"}
+    handle: ClassVar[str] = "centre"
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
         host.move("box", vec)

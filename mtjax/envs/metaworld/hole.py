@@ -26,12 +26,12 @@ class HandInsert(Sawyer):
     Start: the block at the drawn place, dropped from 0.05 m.
     """
 
-    scene: ClassVar[str] = "sawyer_table_with_hole"
+    scene_file: ClassVar[str] = "sawyer_table_with_hole"
     hand_low: ClassVar = (-0.5, 0.4, -0.15)
     drawn: ClassVar = ((-0.1, 0.6, 0.05, -0.04, 0.8, -0.0201), (0.1, 0.7, 0.05, 0.04, 0.88, -0.0199))
     goal_low: ClassVar = drawn[0][3:]
     goal_high: ClassVar = drawn[1][3:]
-    watched: ClassVar = {"block": "body:obj"}
+    watched: ClassVar = {"block": "body:obj", "shape": "geom:objGeom"}
 
     def allowed(self, vec: np.ndarray) -> bool:
         return bool(np.linalg.norm(vec[:2] - vec[3:5]) >= 0.15)
@@ -66,7 +66,8 @@ class PickOutOfHole(HandInsert):
     The gripper closes with full effort already at an action of 0.1.
     """
 
-    scene: ClassVar[str] = "sawyer_pick_out_of_hole"
+    scene_file: ClassVar[str] = "sawyer_pick_out_of_hole"
+    watched: ClassVar = {"block": "body:obj"}
     hand_low: ClassVar = (-0.5, 0.4, -0.05)
     drawn: ClassVar = ((0.0, 0.75, 0.02, -0.1, 0.5, 0.15), (0.0, 0.75, 0.02, 0.1, 0.6, 0.3))
     goal_low: ClassVar = drawn[0][3:]

@@ -37,7 +37,7 @@ class LeverPull(Sawyer):
     so that this frame differs between MuJoCo's versions; here it is that of Meta-World's own, 3.3.0.
     """
 
-    scene: ClassVar[str] = "sawyer_lever_pull"
+    scene_file: ClassVar[str] = "sawyer_lever_pull"
     hand_low: ClassVar = (-0.5, 0.4, -0.15)
     hand_start: ClassVar = (0.0, 0.4, 0.2)
     drawn: ClassVar = ((-0.1, 0.7, 0.0), (0.1, 0.8, 0.0))

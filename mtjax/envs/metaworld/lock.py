@@ -29,12 +29,16 @@ class DoorLock(Sawyer):
     Success: along z, the lock is within 0.02 m of the goal.
     """
 
-    scene: ClassVar[str] = "sawyer_door_lock"
+    scene_file: ClassVar[str] = "sawyer_door_lock"
     hand_low: ClassVar = (-0.5, 0.4, -0.15)
     drawn: ClassVar = ((-0.1, 0.8, 0.15), (0.1, 0.85, 0.15))
     goal_low: ClassVar = hand_low
     goal_high: ClassVar = Sawyer.hand_high
-    watched: ClassVar = {"lock": "site:lockStartLock", "door": "body:door_link"}
+    watched: ClassVar = {
+        "lock": "site:lockStartLock",
+        "unlock": "site:lockStartUnlock",
+        "door": "body:door_link",
+    }
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
         host.move("door", vec)
@@ -60,12 +64,12 @@ class DoorUnlock(Sawyer):
     Success: along x, the lock is within 0.02 m of the goal.
     """
 
-    scene: ClassVar[str] = "sawyer_door_lock"
+    scene_file: ClassVar[str] = "sawyer_door_lock"
     hand_low: ClassVar = DoorLock.hand_low
     drawn: ClassVar = DoorLock.drawn
     goal_low: ClassVar = (0.0, 0.64, 0.21)
     goal_high: ClassVar = (0.2, 0.7, 0.2111)
-    watched: ClassVar = {"lock": "site:lockStartUnlock", "door": "body:door_link"}
+    watched: ClassVar = DoorLock.watched
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
         host.move("door", vec)
@@ -75,7 +79,7 @@ class DoorUnlock(Sawyer):
         return {"target": start + np.array([0.1, -0.04, 0.0]), "obj_init": start}
 
     def objects(self, at: At) -> tuple[Array, ...]:
-        return at.position["lock"], at.quat["door"]
+        return at.position["unlock"], at.quat["door"]
 
     def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
         lock, weight, shoulder = at.obs[4:7], jnp.array(_WEIGHT), jnp.array([0.0, 0.055, 0.07])

@@ -45,7 +45,7 @@ class PegInsertSide(Sawyer):
     The margin for the head is measured from where the head is before the peg is put to the drawn place.
     """
 
-    scene: ClassVar[str] = "sawyer_peg_insertion_side"
+    scene_file: ClassVar[str] = "sawyer_peg_insertion_side"
     drawn: ClassVar = ((0.0, 0.5, 0.02, -0.35, 0.4, -0.001), (0.2, 0.7, 0.02, -0.25, 0.7, 0.001))
     goal_low: ClassVar = (-0.32, 0.4, 0.129)
     goal_high: ClassVar = (-0.22, 0.7, 0.131)
@@ -89,7 +89,7 @@ class PegUnplugSide(Sawyer):
         fell; only its place, direction and velocity are set.
     """
 
-    scene: ClassVar[str] = "sawyer_peg_unplug_side"
+    scene_file: ClassVar[str] = "sawyer_peg_unplug_side"
     drawn: ClassVar = ((-0.25, 0.6, -0.001), (-0.15, 0.8, 0.001))
     goal_low: ClassVar = (-0.056, 0.6, 0.13)
     goal_high: ClassVar = (0.044, 0.8, 0.132)

@@ -23,7 +23,7 @@ class PickPlace(Push):
     Success: the puck is within 0.07 m of the goal.
     """
 
-    scene: ClassVar[str] = "sawyer_pick_place_v3"
+    scene_file: ClassVar[str] = "sawyer_pick_place_v3"
     drawn: ClassVar = ((-0.1, 0.6, 0.02, -0.1, 0.8, 0.05), (0.1, 0.7, 0.02, 0.1, 0.9, 0.3))
     goal_low: ClassVar = (-0.1, 0.8, 0.05)
     goal_high: ClassVar = (0.1, 0.9, 0.3)
@@ -54,7 +54,7 @@ class PickPlaceWall(PickPlace):
     Success: the puck is within 0.07 m of the goal.
     """
 
-    scene: ClassVar[str] = "sawyer_pick_place_wall_v3"
+    scene_file: ClassVar[str] = "sawyer_pick_place_wall_v3"
     drawn: ClassVar = ((-0.05, 0.6, 0.015, -0.05, 0.85, 0.05), (0.05, 0.65, 0.015, 0.05, 0.9, 0.3))
     goal_low: ClassVar = (-0.05, 0.85, 0.05)
     goal_high: ClassVar = (0.05, 0.9, 0.3)

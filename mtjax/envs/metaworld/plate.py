@@ -26,7 +26,7 @@ class PlateSlide(Sawyer):
     Start: the plate at its place, the goal at the drawn one.
     """
 
-    scene: ClassVar[str] = "sawyer_plate_slide"
+    scene_file: ClassVar[str] = "sawyer_plate_slide"
     drawn: ClassVar = ((0.0, 0.6, 0.0, -0.1, 0.85, 0.0), (0.0, 0.6, 0.0, 0.1, 0.9, 0.0))
     goal_low: ClassVar = drawn[0][3:]
     goal_high: ClassVar = drawn[1][3:]
@@ -85,7 +85,7 @@ class PlateSlideSide(PlateSlideBack):
     Start: the plate at its place. The goal's net stays where the scene has it, wherever the target is.
     """
 
-    scene: ClassVar[str] = "sawyer_plate_slide_sideway"
+    scene_file: ClassVar[str] = "sawyer_plate_slide_sideway"
     drawn: ClassVar = ((0.0, 0.6, 0.0, -0.3, 0.54, 0.0), (0.0, 0.6, 0.0, -0.25, 0.66, 0.0))
     goal_low: ClassVar = drawn[0][3:]
     goal_high: ClassVar = drawn[1][3:]

@@ -26,7 +26,7 @@ class Push(Sawyer):
     Success: the puck is within 0.05 m of the goal.
     """
 
-    scene: ClassVar[str] = "sawyer_push_v3"
+    scene_file: ClassVar[str] = "sawyer_push_v3"
     drawn: ClassVar = ((-0.1, 0.6, 0.02, -0.1, 0.8, 0.01), (0.1, 0.7, 0.02, 0.1, 0.9, 0.02))
     goal_low: ClassVar = (-0.1, 0.8, 0.01)
     goal_high: ClassVar = (0.1, 0.9, 0.02)
@@ -71,7 +71,7 @@ class PushWall(Push):
     Success: the puck is within 0.07 m of the goal.
     """
 
-    scene: ClassVar[str] = "sawyer_push_wall_v3"
+    scene_file: ClassVar[str] = "sawyer_push_wall_v3"
     drawn: ClassVar = ((-0.05, 0.6, 0.015, -0.05, 0.85, 0.01), (0.05, 0.65, 0.015, 0.05, 0.9, 0.02))
     goal_low: ClassVar = (-0.05, 0.85, 0.01)
     goal_high: ClassVar = (0.05, 0.9, 0.02)
@@ -96,7 +96,7 @@ class PushBack(Push):
     Success: the puck is within 0.07 m of the goal.
     """
 
-    scene: ClassVar[str] = "sawyer_push_back_v3"
+    scene_file: ClassVar[str] = "sawyer_push_back_v3"
     drawn: ClassVar = ((-0.1, 0.8, 0.02, -0.1, 0.6, 0.0199), (0.1, 0.85, 0.02, 0.1, 0.7, 0.0201))
     goal_low: ClassVar = (-0.1, 0.6, 0.0199)
     goal_high: ClassVar = (0.1, 0.7, 0.0201)

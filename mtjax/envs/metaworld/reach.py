@@ -23,7 +23,7 @@ class Reach(Sawyer):
     Success: the tool centre is within 0.05 m of the goal.
     """
 
-    scene: ClassVar[str] = "sawyer_reach_v3"
+    scene_file: ClassVar[str] = "sawyer_reach_v3"
     drawn: ClassVar = ((-0.1, 0.6, 0.02, -0.1, 0.8, 0.05), (0.1, 0.7, 0.02, 0.1, 0.9, 0.3))
     goal_low: ClassVar = (-0.1, 0.8, 0.05)
     goal_high: ClassVar = (0.1, 0.9, 0.3)
@@ -52,7 +52,7 @@ class ReachWall(Reach):
     Reward and success: as ``Reach``'s.
     """
 
-    scene: ClassVar[str] = "sawyer_reach_wall_v3"
+    scene_file: ClassVar[str] = "sawyer_reach_wall_v3"
     drawn: ClassVar = ((-0.05, 0.6, 0.015, -0.05, 0.85, 0.05), (0.05, 0.65, 0.015, 0.05, 0.9, 0.3))
     goal_low: ClassVar = (-0.05, 0.85, 0.05)
     goal_high: ClassVar = (0.05, 0.9, 0.3)

@@ -17,6 +17,7 @@ from mtjax.envs.engines.base import World, choose_engine
 from mtjax.envs.metaworld import scene
 from mtjax.envs.metaworld.at import At
 from mtjax.envs.metaworld.host import SUBSTEPS, Host
+from mtjax.envs.pixels import Mark
 from mtjax.envs.variation import Variation
 from mtjax.types import SPLITS, Array, InputError, Key, Step, Task
 
@@ -27,6 +28,7 @@ _NOT_MJX = (
     "engine 'mjx' cannot compute Meta-World's cylinders on boxes; use --engine=c on a CPU, or warp on an NVIDIA GPU "
     "(pip install 'mtjax[warp]')"
 )
+_GOAL = "mtjax-goal"  # a geom of pictures
 _OBJECTS = 14  # entries of an observation for objects
 _HALF_LOW = np.array([-0.525, 0.348, -0.0525, -1.0, *[-np.inf] * _OBJECTS], np.float32)
 _HALF_HIGH = np.array([0.525, 1.025, 0.7, 1.0, *[np.inf] * _OBJECTS], np.float32)
@@ -62,14 +64,17 @@ class Sawyer(Domain):
     held_out: bool = False
     """Do not train on this task: it is in the split extrapolation."""
 
-    scene: ClassVar[str]  # a file in the package's assets/sawyer_xyz, without .xml
+    scene_file: ClassVar[str]  # a file in the package's assets/sawyer_xyz, without .xml
+    meshes: ClassVar[bool] = True
+    hides: ClassVar = (_GOAL,)
     hand_low: ClassVar[tuple[float, ...]] = (-0.5, 0.4, 0.05)  # [m] the box of the hand's target
     hand_high: ClassVar[tuple[float, ...]] = (0.5, 1.0, 0.5)
     hand_start: ClassVar[tuple[float, ...]] = (0.0, 0.6, 0.2)
     drawn: ClassVar[tuple[tuple[float, ...], tuple[float, ...]]]  # least and greatest vector of an episode's goal
     goal_low: ClassVar[tuple[float, ...]]  # to which the goal in observations is clipped
     goal_high: ClassVar[tuple[float, ...]]
-    watched: ClassVar[Mapping[str, str]] = MappingProxyType({})  # short name -> "body:NAME", "site:NAME", "geom:NAME"
+    # Short name -> "body:NAME", "site:NAME" or "geom:NAME". Tasks of a scene that watch the same can step together.
+    watched: ClassVar[Mapping[str, str]] = MappingProxyType({})
     pressed: ClassVar[str] = ""  # a geom, if success needs that both pads press on it
 
     parameters: ClassVar = MappingProxyType({})
@@ -83,8 +88,6 @@ class Sawyer(Domain):
         if self.vary:
             raise InputError(f"Meta-World's tasks vary in their goals only, not in {next(iter(dict(self.vary)))}")
         super().__post_init__()
-        if self.pixels:
-            raise InputError("Meta-World's scenes are read without what is only seen; leave out --env.pixels")
         if self.engine == "mjx":
             raise InputError(_NOT_MJX)
 
@@ -194,10 +197,31 @@ class Sawyer(Domain):
         stacked = lambda trees: {name: np.float32(np.stack([tree[name] for tree in trees])) for name in trees[0]}
         states = {f"start_{name}": x for name, x in stacked([start.state for start in starts]).items()}
         model = {name: np.float32(leaf) for name, leaf in stack_differing(self.models).items()}
-        return {"model": model, "goal": stacked([start.began for start in starts]) | states}
+        seen = {"scene": self.scene_leaves()} if self.pixels else {}
+        return {"model": model, "goal": stacked([start.began for start in starts]) | states, **seen}
 
     def compile_spec(self, values: Mapping[str, float] | None = None) -> mujoco.MjSpec:
-        return scene.read(self.scene, self.watched, self.pressed)
+        return scene.read(self.scene_file, self.watched, self.pressed)
+
+    # Pictures.
+
+    def seen_spec(self, values: Mapping[str, float]) -> mujoco.MjSpec:
+        return scene.pictured(self.scene_file)
+
+    def scene_model(self, row: int) -> mujoco.MjModel:
+        model = super().scene_model(row)
+        model.body_pos[:] = self.models[row].body_pos  # where the goal has moved them
+        return model
+
+    def scene_leaves(self) -> dict[str, np.ndarray]:
+        places = np.stack([model.body_pos for model in self.models]).astype(np.float32)
+        return {"body_pos": places} if np.any(places != places[0]) else {}
+
+    def add_marks(self, spec: mujoco.MjSpec) -> None:
+        spec.worldbody.add_geom(name=_GOAL, size=[0.02, 0, 0], rgba=[0, 0.8, 0, 0.6], contype=0, conaffinity=0)
+
+    def marks(self, task: Task, world: World) -> Mapping[str, Mark]:
+        return {_GOAL: Mark(task.goal["target"])}
 
     # Steps.
 
@@ -210,7 +234,7 @@ class Sawyer(Domain):
         names = ("qpos", "qvel", "warmstart", "sensors", "mocap")
         world = World(extra=None, **{name: task.goal[f"start_{name}"] for name in names})
         world = world._replace(extra=self._half(world))
-        seen = self._unclipped(task, world)
+        seen = self.look_at(task, world) if self.pixels else self._unclipped(task, world)
         return Step(world, seen, jnp.float32(0), jnp.bool_(False), {"success": jnp.float32(0)})
 
     def control(self, task: Task, world: World, action: Array) -> tuple[World, Array]:
@@ -226,11 +250,15 @@ class Sawyer(Domain):
         seen = jnp.clip(self._unclipped(task, world), low, high)
         return seen.at[36:].set(0) if self.goal_hidden else seen
 
+    def judge(self, task: Task, world: World, action: Array) -> tuple[Array, dict[str, Array]]:
+        reward, success = self.evaluate(self.at(task, world, action), task.goal)
+        return reward, {"success": success.astype(jnp.float32)}
+
     def reward(self, task: Task, world: World, action: Array) -> Array:
-        return self.evaluate(self.at(task, world, action), task.goal)[0]
+        return self.judge(task, world, action)[0]
 
     def metrics(self, task: Task, world: World, action: Array) -> dict[str, Array]:
-        return {"success": self.evaluate(self.at(task, world, action), task.goal)[1].astype(jnp.float32)}
+        return self.judge(task, world, action)[1]
 
     def at(self, task: Task, world: World, action: Array) -> At:
         """Return what a world shows."""

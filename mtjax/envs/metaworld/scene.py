@@ -12,6 +12,7 @@ from mtjax.types import InputError
 INSTALL = "pip install --no-deps metaworld==3.1.1"
 _HAND = ("body:hand", "body:leftclaw", "body:rightclaw", "body:leftpad", "body:rightpad")
 _HAND += ("site:leftEndEffector", "site:rightEndEffector")
+_EYE, _SEEN = np.array([0.85, 1.35, 0.85]), np.array([0.0, 0.6, 0.08])  # [m] of pictures: camera and middle
 _PADS = ("leftpad_geom", "rightpad_geom")
 _STRONGEST_FORCE = [1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 2, 1]  # (3,) of two geoms' contacts, normal first
 _KINDS = {
@@ -33,6 +34,34 @@ def folder() -> Path:
     return Path(found.submodule_search_locations[0]) / "assets" / "sawyer_xyz"
 
 
+def whole(name: str) -> mujoco.MjSpec:
+    """Return the editable scene of a task as Meta-World has it.
+
+    Raises:
+        InputError: there is no such file.
+    """
+    path = folder() / f"{name}.xml"
+    if not path.is_file():
+        raise InputError(f"Meta-World's package has no scene {name}; mtjax reads that of another version: {INSTALL}")
+    return mujoco.MjSpec.from_file(str(path))
+
+
+def pictured(name: str) -> mujoco.MjSpec:
+    """Return the editable scene of a task with its meshes and textures, and one camera across the table from the arm.
+
+    Meta-World's own cameras look at the table from above, some upside down, or move with the hand.
+    """
+    spec = whole(name)
+    for camera in spec.cameras:
+        spec.delete(camera)
+    back = (_EYE - _SEEN) / np.linalg.norm(_EYE - _SEEN)
+    right = np.cross([0, 0, 1], back) / np.linalg.norm(np.cross([0, 0, 1], back))
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, np.stack([right, np.cross(back, right), back], axis=1).ravel())
+    spec.worldbody.add_camera(name="eye", pos=_EYE, quat=quat, fovy=45)
+    return spec
+
+
 def read(name: str, watched: Mapping[str, str], pressed: str = "") -> mujoco.MjSpec:
     """Return the editable scene of a task, with sensors of the hand and of what is watched.
 
@@ -41,10 +70,7 @@ def read(name: str, watched: Mapping[str, str], pressed: str = "") -> mujoco.MjS
         watched: a short name, and "body:NAME", "site:NAME" or "geom:NAME".
         pressed: a geom, whose contacts with the pads are then felt; or none.
     """
-    path = folder() / f"{name}.xml"
-    if not path.is_file():
-        raise InputError(f"Meta-World's package has no scene {name}; mtjax reads that of another version: {INSTALL}")
-    spec = mujoco.MjSpec.from_file(str(path))
+    spec = whole(name)
     weighs = range(spec.compiler.inertiagrouprange[0], spec.compiler.inertiagrouprange[1] + 1)
     _strip(spec, weighs, {place.partition(":")[2] for place in watched.values() if place.startswith("geom:")})
     _shrink(spec, weighs)
@@ -54,10 +80,10 @@ def read(name: str, watched: Mapping[str, str], pressed: str = "") -> mujoco.MjS
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MULTICCD  # MuJoCo 3.3, which Meta-World has, had no such
     position, turn = mujoco.mjtSensor.mjSENS_FRAMEPOS, mujoco.mjtSensor.mjSENS_FRAMEQUAT
     for place in _HAND:
-        _add_sensor(spec, position, place.partition(":")[2], place)
+        add_sensor(spec, position, place.partition(":")[2], place)
     for short, place in watched.items():
-        _add_sensor(spec, position, f"position:{short}", place)
-        _add_sensor(spec, turn, f"quat:{short}", place)
+        add_sensor(spec, position, f"position:{short}", place)
+        add_sensor(spec, turn, f"quat:{short}", place)
     for pad in _PADS if pressed else ():
         contact = spec.add_sensor(name=f"press:{pad}", type=mujoco.mjtSensor.mjSENS_CONTACT, intprm=_STRONGEST_FORCE)
         contact.objtype = contact.reftype = mujoco.mjtObj.mjOBJ_GEOM
@@ -65,7 +91,8 @@ def read(name: str, watched: Mapping[str, str], pressed: str = "") -> mujoco.MjS
     return spec
 
 
-def _add_sensor(spec: mujoco.MjSpec, kind: mujoco.mjtSensor, name: str, place: str) -> None:
+def add_sensor(spec: mujoco.MjSpec, kind: mujoco.mjtSensor, name: str, place: str) -> None:
+    """Add a sensor of a place, "body:NAME", "site:NAME" or "geom:NAME"."""
     of, _, thing = place.partition(":")
     spec.add_sensor(name=name, type=kind, objtype=_KINDS[of], objname=thing)
 

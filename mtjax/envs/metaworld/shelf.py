@@ -30,7 +30,7 @@ class ShelfPlace(Sawyer):
         drawn target.
     """
 
-    scene: ClassVar[str] = "sawyer_shelf_placing"
+    scene_file: ClassVar[str] = "sawyer_shelf_placing"
     drawn: ClassVar = ((-0.1, 0.5, 0.019, -0.1, 0.8, 0.299), (0.1, 0.6, 0.021, 0.1, 0.9, 0.301))
     goal_low: ClassVar = drawn[0][3:]
     goal_high: ClassVar = drawn[1][3:]

@@ -28,7 +28,7 @@ class Soccer(Sawyer):
     The margin for the ball is how far the ball is from its start now, so that it grows as the ball rolls.
     """
 
-    scene: ClassVar[str] = "sawyer_soccer"
+    scene_file: ClassVar[str] = "sawyer_soccer"
     drawn: ClassVar = ((-0.1, 0.6, 0.03, -0.1, 0.8, 0.0), (0.1, 0.7, 0.03, 0.1, 0.9, 0.0))
     goal_low: ClassVar = drawn[0][3:]
     goal_high: ClassVar = drawn[1][3:]

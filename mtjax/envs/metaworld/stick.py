@@ -29,11 +29,11 @@ class StickPush(Sawyer):
     Forces on the pads are those of the last substep. Meta-World computes them once more, of the state after it.
     """
 
-    scene: ClassVar[str] = "sawyer_stick_obj"
+    scene_file: ClassVar[str] = "sawyer_stick_obj"
     drawn: ClassVar = ((-0.08, 0.58, 0.0, 0.399, 0.55, 0.1319), (-0.03, 0.62, 0.001, 0.401, 0.6, 0.1321))
     goal_low: ClassVar = drawn[0][3:]
     goal_high: ClassVar = drawn[1][3:]
-    watched: ClassVar = {"stick": "body:stick", "handle": "site:insertion"}
+    watched: ClassVar = {"stick": "body:stick", "handle": "site:insertion", "end": "site:stick_end"}
     pressed: ClassVar[str] = "objGeom"
     flask_at: ClassVar = (0.0, 0.0)  # x and y [m] of the flask at the start, from its place in the scene
     to_flask: ClassVar = (0.0, 0.09, 0.0)  # [m] from the handle to what the observation shows
@@ -96,7 +96,6 @@ class StickPull(StickPush):
     drawn: ClassVar = ((-0.1, 0.55, 0.0, 0.35, 0.45, 0.0199), (0.0, 0.65, 0.001, 0.45, 0.55, 0.0201))
     goal_low: ClassVar = drawn[0][3:]
     goal_high: ClassVar = drawn[1][3:]
-    watched: ClassVar = {**StickPush.watched, "end": "site:stick_end"}
     flask_at: ClassVar = (0.0, 0.09)
     to_flask: ClassVar = (0.0, 0.0, 0.0)
 

@@ -26,7 +26,7 @@ class Sweep(Sawyer):
     Start: the block at the drawn x and y; the target is at the table's edge, x = 0.5 m, at the same y.
     """
 
-    scene: ClassVar[str] = "sawyer_sweep_v3"
+    scene_file: ClassVar[str] = "sawyer_sweep_v3"
     drawn: ClassVar = ((-0.1, 0.6, 0.02), (0.1, 0.7, 0.02))
     goal_low: ClassVar = (0.49, 0.6, 0.0)
     goal_high: ClassVar = (0.51, 0.7, 0.02)
@@ -63,7 +63,7 @@ class SweepInto(Sweep):
     Start: the block at the drawn x and y, at the height where it lay while the hand settled. The target is the hole.
     """
 
-    scene: ClassVar[str] = "sawyer_table_with_hole"
+    scene_file: ClassVar[str] = "sawyer_table_with_hole"
     drawn: ClassVar = ((-0.1, 0.6, 0.02, -0.001, 0.8399, 0.0199), (0.1, 0.7, 0.02, 0.001, 0.8401, 0.0201))
     goal_low: ClassVar = drawn[0][3:]
     goal_high: ClassVar = drawn[1][3:]

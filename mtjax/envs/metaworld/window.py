@@ -28,12 +28,13 @@ class WindowOpen(Sawyer):
     The handle's way is measured from the window's centre and not from the handle itself.
     """
 
-    scene: ClassVar[str] = "sawyer_window_horizontal"
+    scene_file: ClassVar[str] = "sawyer_window_horizontal"
     hand_start: ClassVar = (0.0, 0.4, 0.2)
     drawn: ClassVar = ((-0.1, 0.7, 0.16), (0.1, 0.9, 0.16))
     goal_low: ClassVar = Sawyer.hand_low
     goal_high: ClassVar = Sawyer.hand_high
-    watched: ClassVar = {"handle": "site:handleOpenStart"}
+    watched: ClassVar = {"opens": "site:handleOpenStart", "closes": "site:handleCloseStart"}
+    handle: ClassVar[str] = "opens"  # the thing watched that the hand pushes
     way_from: ClassVar[str] = "obj_init"  # from where the handle's way to the target is measured
     reach_shape: ClassVar[str] = "long_tail"
 
@@ -44,10 +45,10 @@ class WindowOpen(Sawyer):
         return {"target": vec + np.array([0.2, 0.0, 0.0]), "obj_init": vec, "window_handle_pos_init": handle}
 
     def objects(self, at: At) -> tuple[Array, ...]:
-        return at.position["handle"], jnp.zeros(4)
+        return at.position[self.handle], jnp.zeros(4)
 
     def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
-        handle = at.position["handle"]
+        handle = at.position[self.handle]
         away = abs(handle[0] - began["target"][0])
         way = abs(began[self.way_from][0] - began["target"][0])
         in_place = near(away, _RADIUS, abs(way - _RADIUS))
@@ -66,7 +67,7 @@ class WindowClose(WindowOpen):
     """
 
     drawn: ClassVar = ((0.0, 0.75, 0.2), (0.0, 0.9, 0.2))
-    watched: ClassVar = {"handle": "site:handleCloseStart"}
+    handle: ClassVar[str] = "closes"
     way_from: ClassVar[str] = "window_handle_pos_init"
     reach_shape: ClassVar[str] = "gaussian"
 

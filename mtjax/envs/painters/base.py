@@ -22,14 +22,22 @@ class Painter(Protocol):
     def paint(self, leaf: Callable[[str], Array], poses: Poses) -> Array: ...  # (H, W, 3) uint8
 
 
-def choose_painter(name: str) -> Any:
+def choose_painter(name: str, meshes: bool = False) -> Any:
     """Return the class of a painter. "auto" is the caster: on an H200 too it draws dm_control's scenes faster.
 
+    Args:
+        meshes: whether the scene is of meshes, which only Warp draws.
+
     Raises:
-        InputError: this device cannot run it, or Warp is not installed.
+        InputError: it cannot draw meshes, this device cannot run it, or Warp is not installed.
     """
+    if meshes and (name == "caster" or not (is_nvidia() and warp_installed())):
+        raise InputError(
+            "this scene is of meshes, which only painter 'warp' draws, on an NVIDIA GPU with Warp installed "
+            "(--env.painter=warp); or leave out --env.pixels"
+        )
     if name == "warp" and not is_nvidia():
         raise InputError("painter 'warp' needs an NVIDIA GPU; use --env.painter=caster")
     if name == "warp" and not warp_installed():
         raise InputError("painter 'warp' needs Warp, which is not installed: pip install 'mtjax[warp]'")
-    return WarpPainter if name == "warp" else Caster
+    return WarpPainter if name == "warp" or meshes else Caster

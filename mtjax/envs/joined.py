@@ -1,0 +1,136 @@
+"""Simulators that the families of a mixture share.
+
+Domains whose models have the same structure differ in numbers only, as the tasks of one domain do. So one engine can
+hold the models of all their tasks, and step all their worlds in one call.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from functools import cached_property, partial
+from typing import Any, ClassVar, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mtjax.envs.domain import Domain, stack_differing
+from mtjax.envs.engines.base import Engine, World
+from mtjax.envs.engines.mjx import Mjx
+from mtjax.envs.family import Family
+from mtjax.maps import over_worlds
+from mtjax.types import Array, InputError, Step, Task
+
+T = TypeVar("T")
+Of = dict[int, T]  # of families by their numbers in a mixture
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Alone:
+    """A family that steps its own worlds."""
+
+    members: Mapping[int, Family]  # the only one, by its number in the mixture
+    outside: ClassVar[None] = None  # what it calls outside XLA is the family's
+
+    def step_worlds(self, tasks: Of[Task], states: Of[Any], actions: Of[Array]) -> Of[Step]:
+        """Return the next step of all worlds, leaves (S, T, E, ...)."""
+        return {i: self.members[i].step_worlds(task, states[i], actions[i]) for i, task in tasks.items()}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Joined:
+    """Domains whose worlds one simulator steps. Each domain sets its controls before, and observes after that.
+
+    Raises:
+        InputError: the models differ in a field that must be the same for the engine.
+    """
+
+    members: Mapping[int, Domain]  # by their numbers in the mixture
+
+    def __post_init__(self):
+        self.simulator.require_variable(self._leaves)
+
+    @cached_property
+    def _models(self) -> list[Any]:
+        return [model for domain in self.members.values() for model in domain.models]
+
+    @cached_property
+    def _leaves(self) -> dict[str, np.ndarray]:
+        """Return the fields (R, ...) in which models differ: the rows of all members' tables, one after another."""
+        return {name: np.asarray(leaf, np.float32) for name, leaf in stack_differing(self._models).items()}
+
+    @cached_property
+    def _first(self) -> dict[int, int]:
+        """Return the row at which each member's models begin."""
+        counts = [len(domain.models) for domain in self.members.values()]
+        return dict(zip(self.members, np.cumsum([0, *counts[:-1]]).tolist(), strict=True))
+
+    @cached_property
+    def simulator(self) -> Engine:
+        """Return the engine of all models."""
+        return next(iter(self.members.values())).join_simulator(self._models)
+
+    @property
+    def outside(self) -> Any:
+        """Return the engine if it runs outside XLA, as all but MJX do."""
+        return None if isinstance(self.simulator, Mjx) else self.simulator
+
+    def step_worlds(self, tasks: Of[Task], states: Of[World], actions: Of[Array]) -> Of[Step]:
+        """Return the next step of all worlds, leaves (S, T, E, ...). Members without tasks are left out."""
+        controlled = {
+            i: over_worlds(partial(_control, self.members[i]))(tasks[i], states[i], actions[i]) for i in tasks
+        }
+        rows = _join([task.row + self._first[i] for i, task in tasks.items()])
+        given = _join([(world._replace(extra=None), ctrl) for world, ctrl in controlled.values()])
+        moved = over_worlds(partial(_advance, self.simulator))(rows, take(self._leaves, rows), *given)
+        counts, steps, begin = {i: task.row.shape[1] for i, task in tasks.items()}, {}, 0
+        for i, count in counts.items():
+            world = jax.tree.map(lambda x, place=slice(begin, begin + count): x[:, place], moved)
+            world = world._replace(extra=controlled[i][0].extra)
+            steps[i] = over_worlds(partial(_outcome, self.members[i]))(tasks[i], world, actions[i])
+            begin += count
+        return steps
+
+
+def grouped(families: Sequence[Family]) -> tuple[Alone | Joined, ...]:
+    """Return all families, those in one group that can share a simulator."""
+    alike: dict[Any, dict[int, Any]] = {}
+    for i, family in enumerate(families):
+        alike.setdefault(i if family.structure is None else family.structure, {})[i] = family
+    return tuple(group for members in alike.values() for group in _group(members))
+
+
+def _group(members: dict[int, Any]) -> list[Alone | Joined]:
+    alone: list[Alone | Joined] = [Alone({i: family}) for i, family in members.items()]
+    if len(members) == 1:
+        return alone
+    try:
+        return [Joined(members)]
+    except InputError:  # the engine has one value of a field in which they differ
+        return alone
+
+
+def take(table: Any, rows: Array) -> Any:
+    """Return those rows (S, T, E) of a table, leaves (R, ...)."""
+    # A compiler that sees constants divides by them otherwise than by numbers that it does not know.
+    hidden = jax.tree.map(lambda x: jax.lax.optimization_barrier(jnp.asarray(x)), table)
+    return jax.tree.map(lambda x: jnp.take(x, rows, axis=0, mode="clip"), hidden)
+
+
+def _join(trees: Sequence[Any]) -> Any:
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=1), *trees)
+
+
+@partial(jax.jit, static_argnums=0)  # traced once for all programs, as families' own steps are
+def _control(domain: Domain, task: Task, world: World, action: Array) -> tuple[World, Array]:
+    return domain.control(task, world, action)
+
+
+@partial(jax.jit, static_argnums=0)
+def _advance(simulator: Engine, row: Array, model: dict[str, Array], world: World, ctrl: Array) -> World:
+    task = Task(id=row, row=row, context=row, params={}, model=model, goal={}, horizon=row)
+    return simulator.step(task, world, ctrl)
+
+
+@partial(jax.jit, static_argnums=0)
+def _outcome(domain: Domain, task: Task, world: World, action: Array) -> Step:
+    return domain.outcome(task, world, action)
