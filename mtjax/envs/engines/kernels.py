@@ -27,10 +27,13 @@ def _only_noting(warp: Any) -> Iterator[dict[tuple[Any, int], None]]:
 
     What depends on data that nothing computes is launched once: bodies of loops, both sides of branches.
     """
-    noted, thread = {}, threading.get_ident()
+    noted, thread, load = {}, threading.get_ident(), warp.Module.load
 
-    def note(module: Any, device: Any, block_dim: Any = None) -> None:
+    def note(module: Any, device: Any, block_dim: Any = None) -> Any:
+        if block_dim is None:  # no launch: Warp asks what the device can run
+            return load(module, device)
         noted[module, block_dim] = None
+        return None
 
     def loop(condition: Any, while_body: Callable, stream: Any = None, **more: Any) -> None:
         while_body(**more)
