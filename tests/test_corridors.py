@@ -355,7 +355,7 @@ def test_films_look_through_the_walker_s_eye_at_the_walls_of_the_task():
     """Camera and balls of MuJoCo's scene are where an episode has them; of all walls those of the task stand up."""
     env, row = CorridorMaze(vary={"layout": "0:3:4"}), 2
     task, state = jax.tree.map(lambda x: x[row], env.tasks()), at((1.25, 2.5), 0.7)
-    model = render._scene(env, row, 64, 48)
+    model = env.scene_model(row)
     render._place(model, env.marks(task, state))
     render._look(model, env.eye(task, state))
     data = mujoco.MjData(model)

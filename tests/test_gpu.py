@@ -322,7 +322,7 @@ def test_a_run_that_is_killed_ends_as_any_other(tmp_path):
     """To the byte on MJX. Both runs execute the programs that the first of them compiled."""
     environment = {
         **os.environ,
-        "PYTHONPATH": str(Path(mtjax.__file__).parents[1]),
+        "PYTHONPATH": os.pathsep.join([str(Path(mtjax.__file__).parents[1]), os.environ.get("PYTHONPATH", "")]),
         "MTJAX_CACHE": str(tmp_path / "cache"),
         "XLA_PYTHON_CLIENT_PREALLOCATE": "false",  # this process has memory of the same device
     }
