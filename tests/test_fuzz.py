@@ -190,7 +190,7 @@ def test_any_edited_record_is_read_or_refused(record, tmp_path):
             require_read_or_refused(edited(record, path, new), tmp_path)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_every_edited_record_is_read_or_refused(record, tmp_path):
     """Every place with every other value."""
     for path in places(record):
