@@ -215,7 +215,7 @@ class Mixture(Tabled):
         )
 
     def _require_one_look(self, specs: list[Spec]) -> None:
-        """Refuse families of which some show pictures and others do not, or pictures of another shape."""
+        """Refuse to mix families with and without pictures, or with pictures of several shapes."""
         looks = {name: _look(spec) for name, spec in zip(self.names, specs, strict=True)}
         (first, look), *rest = looks.items()
         other = next((name for name, found in rest if found != look), None)

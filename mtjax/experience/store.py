@@ -71,7 +71,7 @@ class Store:
         self.begun -= kept
 
     def _write(self, items: Any, end: int) -> None:
-        """Write steps (S, T, H, E, ...), of which the last has the number ``end`` - 1."""
+        """Write steps (S, T, H, E, ...). The last one has the number ``end`` - 1."""
         given = jax.tree.leaves(items)[0].shape[2]
         place = (end - given) % self.num_slots
         head = min(given, self.num_slots - place)

@@ -94,7 +94,10 @@ def required_bytes(config: RunConfig) -> int:
 
     On a CPU the state that is being saved lies in the same memory.
     """
-    needs = _needs(config)
+    return _with_copies(_needs(config))
+
+
+def _with_copies(needs: Needs) -> int:
     saved = needs.state if jax.default_backend() == "cpu" else 0
     return needs.device + saved + _AGENT_COPIES * needs.agent
 
@@ -175,7 +178,8 @@ def seeds_exceed_memory(config: RunConfig) -> bool:
 
 def _fitting(config: RunConfig, limit: float) -> int:
     """Return how many seeds of any points fit at once into ``limit`` bytes, and their stores into the host's memory."""
-    needs, shares = _needs(config), [limit / required_bytes(config)]
+    needs = _needs(config)
+    shares = [limit / _with_copies(needs)]
     if needs.host and jax.default_backend() != "cpu":
         shares.append(host_bytes() / needs.host)
     return math.floor(min(shares) * _USABLE_SHARE * config.plan.seeds)

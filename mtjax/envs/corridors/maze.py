@@ -1,4 +1,4 @@
-"""A maze of corridors with coloured balls, one of which is the goal."""
+"""A maze of corridors with coloured balls. One of them is the goal."""
 
 import dataclasses
 import math
@@ -164,7 +164,7 @@ class CorridorMaze(Pictured):
     # What is seen.
 
     def compile_spec(self, values: Mapping[str, float] | None = None) -> mujoco.MjSpec:
-        """Return floor, light, balls, and a box for every wall that there may be; those that are not are below."""
+        """Return floor, light, balls, and a box for every possible wall. Boxes of missing walls lie below the floor."""
         spec, geom = mujoco.MjSpec(), mujoco.mjtGeom
         spec.stat.extent = 2.0  # nothing is drawn within a hundredth of it
         n, add = self.cells, spec.worldbody.add_geom

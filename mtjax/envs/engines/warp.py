@@ -140,10 +140,10 @@ class Warp:
         )
 
     def require_variable(self, names: Iterable[str]) -> None:
-        """Refuse tasks that differ in a field of which Warp holds one value only.
+        """Check that Warp can hold a value of each task in these fields.
 
         Raises:
-            InputError: there is such a field.
+            InputError: it holds only one value of a field.
         """
         for name in names:
             self._varies(name)

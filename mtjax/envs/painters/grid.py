@@ -32,7 +32,7 @@ class Grid(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class GridCaster(Caster):
-    """Draws the scene of a maze, all boxes of which are walls of one height, thin and alike.
+    """Draws the scene of a maze. All its boxes are thin walls of one height.
 
     It draws walls without thickness, where the field "walls" of a task's scene says. The scene's first box is the wall
     along x = 0, and the eye is lower than the walls.

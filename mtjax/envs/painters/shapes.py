@@ -66,7 +66,7 @@ def _root(square: Array) -> Array:
 
 
 def apart_from_zero(x: Array) -> Array:
-    """Return numbers of which those near 0 are a tiny one, so that one can divide by them."""
+    """Replace numbers near 0 by a tiny one, so that one can divide by them."""
     return jnp.where(jnp.abs(x) > _TINY, x, _TINY)
 
 

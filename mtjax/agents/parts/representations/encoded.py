@@ -151,7 +151,7 @@ class Encoded(Seeing):
         return self.task_features(params, features, obs), self.convolve(params, obs)
 
     def task_features(self, params: Params, features: Array, obs: Any) -> Array:
-        """Return features of the task (Z,) or (..., Z), with those that are learned or inferred."""
+        """Return features of the task (Z,) or (..., Z). Some representations add learned or inferred ones."""
         if self.infers:
             features = self.apply(params, "trajectory", obs)
         return join(features, task=self.theta(params)) if self.has_theta else features
