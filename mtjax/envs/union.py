@@ -8,6 +8,7 @@ things of its own scene. All others are parked: far away, and far from each othe
 import dataclasses
 from collections.abc import Iterable, Sequence
 from functools import cached_property
+from itertools import combinations, product
 from operator import attrgetter
 from typing import NamedTuple
 
@@ -163,14 +164,19 @@ def compose(families: Sequence[Domain]) -> Union:
     sensors = list(dict.fromkeys(sensor for scene in scenes for sensor in scene.sensors))
     for sensor in sensors:
         _add_sensor(spec, union, *sensor)
+    for one, other in combinations(kinds, 2):
+        if not any(one in scene.things and other in scene.things for scene in scenes):
+            _keep_apart(spec, union, union.things[one], union.things[other])
     whole = Scene(spec.compile())
     begins = dict(zip(sensors, whole.model.sensor_adr.tolist(), strict=True))
     return Union(whole.model, *_park(whole), tuple(_places(scene, whole, begins) for scene in scenes))
 
 
 def _bare(family: Domain) -> mujoco.MjSpec:
-    """Return a family's editable scene without its sensors."""
+    """Return a family's editable scene without its sensors. All bodies have names."""
     spec = family.compile_spec()
+    for i, body in enumerate(spec.bodies):
+        body.name = body.name or f"body {i}"
     for sensor in spec.sensors:
         spec.delete(sensor)
     return spec
@@ -182,6 +188,13 @@ def _add_sensor(spec: mujoco.MjSpec, union: Scene, kind: int, of: tuple, to: tup
     sensor = spec.add_sensor(type=kind, intprm=list(given), cutoff=cut, objtype=of[0], objname=name(of))
     if to is not None:
         sensor.reftype, sensor.refname = to[0], name(to)
+
+
+def _keep_apart(spec: mujoco.MjSpec, union: Scene, *things: Thing) -> None:
+    """Exclude contacts of two things that no scene has both of, so that engines need not look for them."""
+    solid = [[body for body in thing.parts["body"] if union.model.body_geomnum[body]] for thing in things]
+    for one, other in product(*solid):
+        spec.add_exclude(bodyname1=union.model.body(one).name, bodyname2=union.model.body(other).name)
 
 
 def _park(union: Scene) -> tuple[np.ndarray, np.ndarray]:
