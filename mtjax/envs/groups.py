@@ -6,7 +6,7 @@ from typing import Any
 from mtjax.envs.domain import Domain
 from mtjax.envs.family import Family
 from mtjax.envs.joined import Alone, Joined
-from mtjax.envs.union import Scene
+from mtjax.envs.things import Scene
 from mtjax.envs.united import United
 from mtjax.types import InputError
 
@@ -46,6 +46,7 @@ def _unions(families: Mapping[int, Family], scenes: str) -> list[dict[int, Domai
         if isinstance(family, Domain) and _may_unite(family, scenes):
             scene = Scene(family.models[0])
             try:
+                _ = scene.sensors
                 alike.setdefault((_settings(family), scene.frame), {})[i] = family, scene
             except InputError:  # the scene stays by itself
                 continue

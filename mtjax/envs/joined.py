@@ -76,7 +76,9 @@ class Joined:
 
     def step_worlds(self, tasks: Of[Task], states: Of[World], actions: Of[Array]) -> Of[Step]:
         """Return the next step of all worlds, leaves (S, T, E, ...). Members without tasks are left out."""
-        controlled = {i: over_worlds(partial(_control, self.members[i]))(tasks[i], states[i], actions[i]) for i in tasks}
+        controlled = {
+            i: over_worlds(partial(_control, self.members[i]))(tasks[i], states[i], actions[i]) for i in tasks
+        }
         rows = _join([task.row + self._first[i] for i, task in tasks.items()])
         given = _join([(self.enter(i, world)._replace(extra=None), ctrl) for i, (world, ctrl) in controlled.items()])
         moved = over_worlds(partial(_advance, self.simulator))(rows, take(self._leaves, rows), *given)

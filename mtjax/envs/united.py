@@ -72,7 +72,8 @@ class United(Joined):
         if isinstance(first.simulator, MujocoC):
             return MujocoC(self._models, first.num_substeps)
         base, own = copy.copy(self.union.model), first.simulator.base.opt
-        base.opt.iterations, base.opt.ls_iterations, base.opt.integrator = own.iterations, own.ls_iterations, own.integrator
+        for setting in ("iterations", "ls_iterations", "integrator"):
+            setattr(base.opt, setting, getattr(own, setting))
         return Warp(base, first.num_substeps)
 
     def enter(self, i: int, world: World) -> World:
