@@ -251,12 +251,11 @@ def test_episodes_begin_anew_in_the_union_as_in_joined_scenes(steps=4, worlds=3)
 
 @with_scenes
 @pytest.mark.slow
-def test_the_union_steps_on_warp_as_on_c():
+def test_the_union_steps_on_warp_as_joined_scenes_do():
+    """By default there. Warp solves to less than C does, so a thing that slips is 1e-5 m off."""
     pytest.importorskip("warp")
     env = mtjax.make("mt10", num_draws=2, engine="warp")
-    assert [type(group) for group in env.groups] == [United]
-    exact = mtjax.make("mt10", num_draws=2, engine="c")
-    (obs, rewards, _), (expected, exact_rewards, _) = (played(each, "train") for each in (env, exact))
-    np.testing.assert_allclose(obs, expected, atol=2e-3)
-    np.testing.assert_allclose(rewards, exact_rewards, atol=0.05)
-    assert np.mean(np.abs(obs - expected) < 1e-4) > 0.98
+    assert [type(group) for group in env.groups] == [United] and env.groups[0].outside in env._outside
+    own, found = (played(mixture, "train") for mixture in (dataclasses.replace(env, scenes="joined"), env))
+    np.testing.assert_allclose(found[0], own[0], atol=1e-4)
+    np.testing.assert_allclose(found[1], own[1], atol=1e-2)

@@ -65,7 +65,7 @@ class Scene:
         """Return the things by kind, in the order of their bodies. Further ones of a kind count as other kinds."""
         found: dict[bytes, Thing] = {}
         for body in np.flatnonzero(self.model.body_parentid[1:] == 0) + 1:
-            parts = _parts(self.model, body)
+            parts = _parts(self.model, int(body))
             kind = _kind(self.model, parts)
             while kind in found:
                 kind += b"again"
