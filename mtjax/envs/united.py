@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mtjax.envs.engines.base import Engine, World
+from mtjax.envs.engines.base import Engine, World, some
 from mtjax.envs.engines.c import MujocoC
 from mtjax.envs.engines.warp import Warp
 from mtjax.envs.joined import Joined
@@ -79,20 +79,21 @@ class United(Joined):
     def enter(self, i: int, world: World) -> World:
         """Return worlds of the union, with a member's things as they are in its worlds (S, T, E, ...)."""
         union, places = self.union, self._places[i]
-        qpos, qvel = _put(union.qpos, places.qpos, world.qpos), _put(0 * union.warmstart, places.qvel, world.qvel)
         return world._replace(
-            qpos=qpos, qvel=qvel, warmstart=_put(union.warmstart, places.qvel, world.warmstart), sensors=None
+            qpos=_put(union.qpos, places.qpos, world.qpos),
+            qvel=_put(np.zeros(union.model.nv), places.qvel, world.qvel),
+            warmstart=_put(union.warmstart, places.qvel, world.warmstart),
+            sensors=None,
         )
 
     def leave(self, i: int, world: World) -> World:
         """Return worlds of a member's own scene."""
         places = self._places[i]
-        take = lambda values, where: values[..., where]
         return world._replace(
-            qpos=take(world.qpos, places.qpos),
-            qvel=take(world.qvel, places.qvel),
-            warmstart=take(world.warmstart, places.qvel),
-            sensors=take(world.sensors, places.sensors),
+            qpos=world.qpos[..., places.qpos],
+            qvel=world.qvel[..., places.qvel],
+            warmstart=world.warmstart[..., places.qvel],
+            sensors=None if world.sensors is None else some(world.sensors[..., places.sensors]),
         )
 
 
