@@ -104,8 +104,9 @@ def _about(env: Family, name: str, shape: tuple[int, ...]) -> str:
     if name != frames.PICTURES:
         return f"{name} {shape} float32: a vector as the family observes it. It is normalised inside."
     picture, count = env.spec.obs[name].shape, env.spec.frames
-    channels = {1: f"1 channel, the rounded brightness {_BRIGHTNESS}", 3: "the channels red, green and blue"}
-    each = f"Row 0 of a picture is its top, and it has {channels.get(picture[-1], f'{picture[-1]} channels')}, from 0 to 255."
+    known = {1: f"1 channel, the rounded brightness {_BRIGHTNESS}", 3: "the channels red, green and blue"}
+    channels = known.get(picture[-1], f"{picture[-1]} channels")
+    each = f"Row 0 of a picture is its top, and it has {channels}, from 0 to 255."
     if count == 1:
         return f"{name} {shape} uint8: the newest picture. {each}"
     return (
