@@ -334,19 +334,22 @@ def test_memory_is_told_by_seed_for_device_and_host(monkeypatch):
     assert needs(monkeypatch, 1e12, backend="cpu", **both_sizes)[1].device == both.state + both.moved + both.host
 
 
-def test_pictures_of_rollouts_count(monkeypatch):
-    """Two stacks of three pictures with three channels, of each step of every seed, task and environment."""
+def test_pictures_of_rollouts_count(monkeypatch, short_family):
+    """Two stacks of three pictures with three channels, of each step of every seed, task and environment.
+
+    They decide whether a run fits at all, and how many of its seeds run at once.
+    """
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     env, settings = Coloured(frames=3), Settings(num_envs=4)
     rollout = 5 * 2 * 4 * 10 * 2 * (16 * 16 * 9)
 
-    def of(experience):
-        agent = mtjax.agent("ppo", representation="encoded", hidden=(8,), latent_widths=(4,), **experience)
+    def of(unroll):
+        agent = mtjax.agent("ppo", representation="encoded", hidden=(8,), latent_widths=(4,), unroll=unroll)
         state = jax.eval_shape(partial(loop.init, env, agent, settings), env.tasks(), jnp.arange(5))
         return memory.Needs.of(state, env, agent, settings)
 
-    short, long = of({"unroll": 10}), of({"unroll": 20})
-    assert (short.rollout, long.rollout) == (rollout, 2 * rollout)
+    short, long = of(10), of(200)
+    assert (short.rollout, long.rollout) == (rollout, 20 * rollout)
     assert short.state == long.state and short.device == short.state + rollout
     monkeypatch.setattr(memory, "physical_bytes", lambda: long.device - 1)
     memory.require_room(short, env)
@@ -354,18 +357,11 @@ def test_pictures_of_rollouts_count(monkeypatch):
         InputError, match=r"of rollouts\) and .* lower --agent.unroll, --num-envs or --seeds; with --env"
     ):
         memory.require_room(long, env)
-
-
-def test_seeds_of_rollouts_run_in_rounds_that_fit(monkeypatch):
-    """Of five seeds two at a time, where pictures alone leave no room for three."""
-    words = "--env=corridor-maze --env.pixels=16 --agent=ppo --agent.representation=encoded --agent.hidden 4 --seeds=5"
-    config = cli.parse([*words.split(), "--agent.latent-widths", "4", "--num-envs=64", "--agent.unroll=100"])
-    shapes = state_shapes(config)
-    monkeypatch.setattr(memory, "state_shapes", lambda _: shapes)
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    pictures = 5 * 64 * 100 * 2 * (16 * 16 * 9)
-    assert pictures > 0.8 * memory.required_bytes(config)
-    assert [part.plan.seeds for part in memory.split_to_fit(config, 0.6 * pictures)] == [2, 2, 1]
+    config = cli.parse([*SHORT_RUN, "--seeds=5"])
+    for needs, rounds in ((long, [2, 2, 1]), (short, [5])):
+        monkeypatch.setattr(memory, "_needs", lambda _, needs=needs: needs)
+        parts = memory.split_to_fit(config, 0.6 * long.device)
+        assert [part.plan.seeds for part in parts] == rounds
 
 
 SMALLER = "and there are 0.1 GB; lower --replay-size, --num-envs or --seeds"
