@@ -98,7 +98,10 @@ def load(file: Any) -> Policy:
 
 
 def load_jax(file: Any) -> Callable:
-    """Load a policy as a JAX function: observations (B, O), values (B, P) of the parameters -> actions (B, A)."""
+    """Load a policy as a JAX function: observations (B, O), values (B, P) of the parameters -> actions (B, A).
+
+    A policy that sees pictures takes a dict of exactly ``shapes_of(policy.meta)``, with a leading B.
+    """
     from jax import export
 
     with np.load(file, allow_pickle=False) as arrays:
