@@ -10,13 +10,14 @@ its own dependencies (MuJoCo 3.3, Gymnasium), which cannot stand beside mtjax's.
 the end of the episode and at any step. ``--together`` tasks are one program. A task that has a line in the file is not
 played again. The original plays the same goals.
 
-``speed`` times ten tasks (mt10) under random actions inside one scan, in turn: with families of a scene joined into one
-simulator and apart, with resets as in training and without. The original runs in processes that send nothing to each
-other, which is more than any learner could use.
+``speed`` times ten tasks (mt10) under random actions inside one scan, in turn: with one union of all scenes, with
+families of a scene joined into one simulator, and apart; with resets as in training and without. The original runs in
+processes that send nothing to each other, which is more than any learner could use.
 """
 
 import argparse
 import csv
+import dataclasses
 import json
 import operator
 import statistics
@@ -29,12 +30,13 @@ import jax
 import jax.numpy as jnp
 import metaworld_policies
 import numpy as np
-from physics import Apart, physics
+from physics import physics
 from report import publish
 from steps_per_second import Contestant
 
 import mtjax
 from mtjax.envs.engines.base import ENGINES
+from mtjax.envs.groups import SCENES
 from mtjax.envs.metaworld.names import BENCHMARKS, TASKS
 from mtjax.names import load
 from mtjax.types import InputError
@@ -149,7 +151,8 @@ def race(original: Original | None, arguments: argparse.Namespace) -> None:
     env = mtjax.make("mt10", engine=arguments.engine)
     per_task = -(-arguments.worlds // len(env.families))
     contestants = []
-    for label, mixture in (("joined", env), ("apart", Apart(env.families, env.names))):
+    for label in SCENES[1:]:
+        mixture = dataclasses.replace(env, scenes=label)  # of the same families, which have begun their episodes once
         for suffix, resets in ((", resets as in training", True), (", no resets", False)):
             make = lambda mixture=mixture, resets=resets: physics(mixture, per_task, arguments.steps, resets)
             name = f"{label} ({len(mixture.groups)} simulators){suffix}"

@@ -1,26 +1,14 @@
-"""Programs of physics without learning, for benchmarks: families joined or apart, with resets and without."""
+"""Programs of physics without learning, for benchmarks: with resets and without."""
 
 import dataclasses
-from functools import cached_property
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from mtjax.envs.joined import Alone
-from mtjax.envs.mixtures import Mixture
 from mtjax.loop import PHASES
 from mtjax.rollout import reset_ended, reset_envs, split_keys, step_envs, world_keys
 from mtjax.types import Acted
-
-
-@dataclasses.dataclass(frozen=True)
-class Apart(Mixture):
-    """A mixture whose families step one after another, each by its own simulator."""
-
-    @cached_property
-    def groups(self) -> tuple[Alone, ...]:
-        return tuple(Alone({i: family}) for i, family in enumerate(self.families))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -136,7 +136,7 @@ def flags(config: Any, prefix: str = "--") -> list[str]:
             names += [f"--{flag}" for flag in flag_names(value).values()]
             continue
         if isinstance(value, Mixture):
-            shared = [f.name for family in value.families for f in shared_fields(family)]
+            shared = ["scenes", *(f.name for family in value.families for f in shared_fields(family))]
             names += [_family_flag(each) for each in dict.fromkeys(shared)]
             continue
         group = {"plan": "--", "training": "--", "family": "--env."}.get(field.name)

@@ -29,8 +29,10 @@ from mtjax.config import configure
 from mtjax.envs.engines.base import World
 from mtjax.envs.engines.c import MujocoC
 from mtjax.envs.engines.mjx import Mjx
+from mtjax.envs.joined import Joined
 from mtjax.envs.mixtures import States
 from mtjax.envs.probes import tasks_of
+from mtjax.envs.united import United
 from mtjax.training import checkpoint
 from mtjax.types import Spec
 
@@ -266,12 +268,47 @@ def test_a_mixture_steps_as_its_families(num_envs):
 
 
 @with_metaworld
-@pytest.mark.parametrize("names", [("reach", "push", "pick-place"), ("window-open", "window-close")])
-def test_tasks_of_a_scene_step_together_as_they_do_alone(names):
+@pytest.mark.parametrize(
+    "names, kind",
+    [
+        (("reach", "push", "pick-place"), Joined),
+        (("window-open", "window-close"), Joined),
+        (("push", "door-open", "drawer-close", "drawer-open", "window-open"), United),
+        (("stick-push", "button-press", "plate-slide"), United),  # the first one feels forces
+    ],
+)
+def test_tasks_step_together_as_they_do_alone(names, kind):
     """Warp adds up in another order each time."""
     env = mtjax.mixture([mtjax.make(f"metaworld-{name}", num_draws=2, engine="warp") for name in names])
-    assert len(env.groups) == 1
+    assert [type(group) for group in env.groups] == [kind]
     require_as_alone(env, atol=2e-3)
+
+
+@with_metaworld
+@pytest.mark.parametrize("name", ["mt10", "mt50"])
+def test_worlds_of_a_union_go_on_on_warp_as_on_c(name, count=16, steps=30):
+    """One step, from worlds in which MuJoCo has played at random in each task's own scene."""
+    env = mtjax.make(name, engine="warp", num_draws=4, solver_iterations=50)
+    assert {type(group) for group in env.groups} == {United}
+    exact = mtjax.mixture([dataclasses.replace(family) for family in env.families], scenes="apart")
+    for family in exact.families:
+        family.__dict__["simulator"] = MujocoC(family.models, family.num_substeps)
+    shape = (1, len(env.families), count)
+    action = np.random.default_rng(0).uniform(-1, 1, (steps // 5 + 1, *shape, 4)).astype(np.float32)
+    with on("cpu"):
+        tasks = jax.device_get(exact.tasks())
+        rows = tasks.draws.row[:, np.arange(count) % 4][None]
+        tasks = rollout.broadcast_tasks(tasks, shape)._replace(row=jnp.asarray(rows), blocks=tasks.blocks)
+        reset, step = (jax.jit(f, compiler_options=QUICK) for f in (exact.reset_worlds, exact.step_worlds))
+        state = reset(tasks, jax.random.split(jax.random.key(0), shape)).state
+        for i in range(steps):
+            state = step(tasks, state, action[i // 5]).state
+        tasks, state, expected = jax.device_get((tasks, state, step(tasks, state, action[-1])))
+    found = jax.device_get(jax.jit(env.step_worlds)(tasks, state, action[-1]))
+    for part, ours, theirs in zip(env.parts, found.state.families, expected.state.families, strict=True):
+        error = np.abs(ours.qvel - theirs.qvel).max(axis=-1) / np.abs(theirs.qvel).max()
+        assert np.median(error) < 5e-3 and np.quantile(error, 0.9) < 5e-2, (part.name, np.sort(error.ravel()))
+    assert np.quantile(np.abs(found.obs - expected.obs), 0.9) < 1e-3
 
 
 def test_a_run_goes_on_bit_for_bit(tmp_path):

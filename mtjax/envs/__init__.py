@@ -284,11 +284,14 @@ def require_pictures(name: str, setting: str) -> None:
         raise InputError(f"{name} has no scene to draw, which {setting} needs; take a family such as cheetah-run")
 
 
-def mixture(families: "Sequence[str | Family | Mixture]") -> "Mixture":
+def mixture(families: "Sequence[str | Family | Mixture]", scenes: str = "auto") -> "Mixture":
     """Return a mixture of families, each given by name or as returned by ``make``.
 
     Families may share a model or a name if their tasks differ, such as a walker with varied friction and a walker with
     varied feet.
+
+    Args:
+        scenes: how many simulators step families of different scenes (``Mixture.scenes``).
 
     Raises:
         InputError: there is no family of a name, or a family is in the mixture twice.
@@ -305,7 +308,7 @@ def mixture(families: "Sequence[str | Family | Mixture]") -> "Mixture":
     for name, _ in named:
         again = sum(other == name or other.startswith(f"{name}#") for other in names)
         names.append(f"{name}#{again + 1}" if again else name)
-    return cls(tuple(family for _, family in named), tuple(names))
+    return cls(tuple(family for _, family in named), tuple(names), scenes)
 
 
 def name_of(family: Any) -> str:
@@ -325,12 +328,13 @@ def name_of(family: Any) -> str:
 def _make_mixture(own: tuple[tuple[str, Settings], ...], vary: Settings, settings: Settings) -> "Mixture":
     """Make a mixture from its families' own settings, and values of parameters by "NAME.PARAMETER"."""
     cls, names = load("mtjax.envs.mixtures:Mixture"), tuple(name for name, _ in own)
-    recorded = settings.pop("families", None)
+    recorded, scenes = settings.pop("families", None), settings.pop("scenes", "auto")
     if recorded is not None:  # of config.json
-        return cls(tuple(make(n.partition("#")[0], **each) for n, each in zip(names, recorded, strict=True)), names)
+        made = [make(name.partition("#")[0], **each) for name, each in zip(names, recorded, strict=True)]
+        return cls(tuple(made), names, scenes)
     plain = [make(name) for name in names]
     for given in settings:
-        known = dict.fromkeys(field.name for family in plain for field in dataclasses.fields(family))
+        known = dict.fromkeys(["scenes", *(field.name for family in plain for field in dataclasses.fields(family))])
         if given not in known:
             raise nearest_error("setting of these families", given, known)
     chosen: dict[str, dict[str, Any]] = {name: {} for name in names}
@@ -346,7 +350,7 @@ def _make_mixture(own: tuple[tuple[str, Settings], ...], vary: Settings, setting
     for (name, fixed), family in zip(own, plain, strict=True):
         mine = {key: value for key, value in settings.items() if key in family.__dataclass_fields__}
         made.append(make(name, vary=chosen[name], **fixed | mine))
-    return cls(tuple(made), names)
+    return cls(tuple(made), names, scenes)
 
 
 def register(name: str, family: "type[Family]", **settings: Any) -> None:

@@ -54,6 +54,7 @@ class Domain(Pictured):
     default_iterations: ClassVar[int]  # of MJX, where each costs about as much as the rest of a step
     warp_iterations: ClassVar[int] = 10  # of Warp, where they are cheap
     gpu_engine: ClassVar[str] = "warp"  # what "auto" is on an NVIDIA GPU, as measured: mjx or warp
+    unites: ClassVar[bool] = False  # its scene may be part of a union of scenes (``union.compose``)
     starts_untouched: ClassVar[bool] = False  # no force sensor feels anything at a start: it need not be solved for
 
     def __post_init__(self):

@@ -1,4 +1,4 @@
-"""Simulators that the families of a mixture share.
+"""A simulator that several families of a mixture share.
 
 Domains whose models have the same structure differ in numbers only, as the tasks of one domain do. So one engine can
 hold the models of all their tasks, and step all their worlds in one call.
@@ -18,7 +18,7 @@ from mtjax.envs.engines.base import Engine, World
 from mtjax.envs.engines.mjx import Mjx
 from mtjax.envs.family import Family
 from mtjax.maps import over_worlds
-from mtjax.types import Array, InputError, Step, Task
+from mtjax.types import Array, Step, Task
 
 T = TypeVar("T")
 Of = dict[int, T]  # of families by their numbers in a mixture
@@ -80,33 +80,23 @@ class Joined:
             i: over_worlds(partial(_control, self.members[i]))(tasks[i], states[i], actions[i]) for i in tasks
         }
         rows = _join([task.row + self._first[i] for i, task in tasks.items()])
-        given = _join([(world._replace(extra=None), ctrl) for world, ctrl in controlled.values()])
+        given = _join([(self.enter(i, world)._replace(extra=None), ctrl) for i, (world, ctrl) in controlled.items()])
         moved = over_worlds(partial(_advance, self.simulator))(rows, take(self._leaves, rows), *given)
         counts, steps, begin = {i: task.row.shape[1] for i, task in tasks.items()}, {}, 0
         for i, count in counts.items():
             world = jax.tree.map(lambda x, place=slice(begin, begin + count): x[:, place], moved)
-            world = world._replace(extra=controlled[i][0].extra)
+            world = self.leave(i, world)._replace(extra=controlled[i][0].extra)
             steps[i] = over_worlds(partial(_outcome, self.members[i]))(tasks[i], world, actions[i])
             begin += count
         return steps
 
+    def enter(self, i: int, world: World) -> World:
+        """Return the simulator's worlds (S, T, E, ...) for those of a member."""
+        return world
 
-def grouped(families: Sequence[Family]) -> tuple[Alone | Joined, ...]:
-    """Return all families, those in one group that can share a simulator."""
-    alike: dict[Any, dict[int, Any]] = {}
-    for i, family in enumerate(families):
-        alike.setdefault(i if family.structure is None else family.structure, {})[i] = family
-    return tuple(group for members in alike.values() for group in _group(members))
-
-
-def _group(members: dict[int, Any]) -> list[Alone | Joined]:
-    alone: list[Alone | Joined] = [Alone({i: family}) for i, family in members.items()]
-    if len(members) == 1:
-        return alone
-    try:
-        return [Joined(members)]
-    except InputError:  # the engine has one value of a field in which they differ
-        return alone
+    def leave(self, i: int, world: World) -> World:
+        """Return a member's worlds (S, T, E, ...) for those of the simulator."""
+        return world
 
 
 def take(table: Any, rows: Array) -> Any:

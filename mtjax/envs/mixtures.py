@@ -1,8 +1,8 @@
 """Mixtures: families with different observations, actions, horizons and physics, as one environment.
 
 A mixture has the tasks of its families, one family after another in every split. Families whose models have the same
-structure step together (``joined``), and every other family steps its own worlds in a separate call. Observed vectors
-are padded with zeros to one size, and actions beyond a family's own are masked.
+structure, or whose things fit into one scene, step together (``groups``). Every other family steps its own worlds in a
+separate call. Observed vectors are padded with zeros to one size, and actions beyond a family's own are masked.
 """
 
 import dataclasses
@@ -17,7 +17,9 @@ import tyro
 
 from mtjax import frames
 from mtjax.envs.family import Family, Part, Table, Tabled
-from mtjax.envs.joined import Alone, Joined, grouped, take
+from mtjax.envs.groups import SCENES, Group, grouped
+from mtjax.envs.joined import take
+from mtjax.names import nearest_error
 from mtjax.types import SPLITS, Array, InputError, Key, Spec, Step, Task
 
 
@@ -96,10 +98,17 @@ class Mixture(Tabled):
 
     families: Annotated[tuple[Family, ...], tyro.conf.Suppress]
     names: Annotated[tuple[str, ...], tyro.conf.Suppress]
+    scenes: str = "auto"
+    """How many simulators step families of different scenes, such as Meta-World's: union (one scene holds the things of
+    several families), joined (one simulator for each scene) or apart (one for each family). auto is union on engine
+    warp, where a step costs nearly the same for any number of worlds, and joined elsewhere. Families that cannot be
+    united are joined, or apart."""
 
     def __post_init__(self):
         if not self.families or len(self.names) != len(self.families):
             raise InputError("a mixture needs at least one family, and a name for each")
+        if self.scenes not in SCENES:
+            raise nearest_error("scenes", self.scenes, SCENES)
         for i, (name, family) in enumerate(zip(self.names, self.families, strict=True)):
             if not isinstance(family, Family):
                 raise InputError(f"a mixture is of families, and {family!r} is none")
@@ -233,9 +242,9 @@ class Mixture(Tabled):
     # Worlds, leaves (S, T, E, ...).
 
     @cached_property
-    def groups(self) -> tuple[Alone | Joined, ...]:
+    def groups(self) -> tuple[Group, ...]:
         """Return the families by what steps them: one simulator for several, or each its own."""
-        return grouped(self.families)
+        return grouped(self.families, self.scenes)
 
     def reset_worlds(self, tasks: Task, keys: Key) -> Step:
         """Begin an episode in every world."""

@@ -18,6 +18,7 @@ from mtjax.agents import settings
 from mtjax.agents.choices import flag_names
 from mtjax.config import RunConfig, from_json, import_flags, to_json
 from mtjax.envs.family import Family, Tabled
+from mtjax.envs.mixtures import Mixture
 from mtjax.names import replacing
 from mtjax.types import InputError
 
@@ -121,7 +122,7 @@ def _fields(family: Any) -> dict[str, Any]:
 
 
 def _family_settings(env: Tabled) -> dict[str, Any]:
-    """Return the settings of a family; of a mixture, its families' common settings and varied parameters."""
+    """Return the settings of a family; of a mixture its own, its families' common ones and varied parameters."""
     if isinstance(env, Family):
         return _fields(env)
     each = {part.name: _fields(part.family) for part in env.parts}
@@ -129,7 +130,8 @@ def _family_settings(env: Tabled) -> dict[str, Any]:
     held = {name: [own[name] for own in each.values() if name in own] for name in names if name != "vary"}
     alike = {name: values[0] for name, values in held.items() if values.count(values[0]) == len(values)}
     vary = [(f"{name}.{parameter}", values) for name, own in each.items() for parameter, values in own["vary"]]
-    return {"vary": tuple(vary), **alike}
+    own = {"scenes": env.scenes} if isinstance(env, Mixture) else {}
+    return {"vary": tuple(vary), **own, **alike}
 
 
 def _flag(prefix: str, name: str, value: object) -> list[str]:

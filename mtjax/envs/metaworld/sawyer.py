@@ -66,6 +66,7 @@ class Sawyer(Domain):
 
     scene_file: ClassVar[str]  # a file in the package's assets/sawyer_xyz, without .xml
     meshes: ClassVar[bool] = True
+    unites: ClassVar[bool] = True
     hides: ClassVar = (_GOAL,)
     hand_low: ClassVar[tuple[float, ...]] = (-0.5, 0.4, 0.05)  # [m] the box of the hand's target
     hand_high: ClassVar[tuple[float, ...]] = (0.5, 1.0, 0.5)
