@@ -3,7 +3,14 @@
     policy = load("policy.npz")
     action = policy(obs, size=1.05)  # (A,) in [-1, 1]; the task's parameters by name
 
-``load_jax`` returns the same policy as a compiled JAX function of batches, which needs JAX and nothing else.
+A policy that sees pictures takes a stack of the last ones, which ``begin`` and ``push`` keep:
+
+    stack = begin(picture, policy.meta["frames"])  # (H, W, N C) uint8, at the start of an episode
+    action = policy({"pixels": stack}, size=1.05)
+    stack = push(stack, next_picture)  # after every action
+
+``policy.meta["about"]`` says what it observes. ``load_jax`` returns the same policy as a compiled JAX function of
+batches, which needs JAX and nothing else.
 """
 
 import json
@@ -12,26 +19,35 @@ from typing import Any
 
 import numpy as np
 
+PICTURES = "pixels"
+"""The entry of an observation that holds pictures, uint8. Vectors are float32."""
+
 
 class Policy:
     """A policy of one family of tasks: observation normaliser, networks and the task's context are inside."""
 
     def __init__(self, file: Any):
         with np.load(file, allow_pickle=False) as arrays:
-            self.meta = json.loads(bytes(arrays["meta"]))
-            self.program = json.loads(bytes(arrays["program"]))
+            meta, program = (json.loads(bytes(arrays[name])) for name in ("meta", "program"))
+            self.meta = {"obs": {"obs": [meta.get("obs_size")]}} | meta  # files from before pictures give a size alone,
+            self.program = {"reads": [0, 1]} | program  # and do not say what is read
             self.constants = [arrays[f"constant_{i}"] for i in range(self.program["constants"])]
 
     def __repr__(self) -> str:
-        told = f"observation ({self.meta['obs_size']},), action ({self.meta['action_size']},)"
+        seen = ", ".join(f"{name} {shape}" for name, shape in shapes_of(self.meta).items()).removeprefix("obs ")
+        told = f"observation {seen}, action ({self.meta['action_size']},)"
         return f"Policy({self.meta['agent']} on {self.meta['env']}: {told}, parameters {self.meta['parameters']})"
 
     def __call__(self, obs: Any, **parameters: float) -> np.ndarray:
-        """Return the mean action (A,) for an observation (O,) of the task with these parameters."""
-        obs = np.asarray(obs, np.float32)
-        if obs.shape != (self.meta["obs_size"],):
-            raise ValueError(f"an observation has shape ({self.meta['obs_size']},), not {obs.shape}")
-        return self._run(obs, values_of(self.meta, parameters))
+        """Return the mean action (A,) of the task with these parameters.
+
+        Args:
+            obs: an observation (O,); or of a policy that sees pictures {"pixels": (H, W, N C) uint8}, beside which may
+                be "state": (O,).
+            parameters: the task's parameters. A policy that reads none takes them or leaves them out.
+        """
+        seen = observed(self.meta, obs)
+        return self._run(*seen, values_of(self.meta, parameters, len(seen) in self.program["reads"]))
 
     def _run(self, *inputs: np.ndarray) -> np.ndarray:
         known: dict[int, np.ndarray] = dict(enumerate((*self.constants, *inputs)))
@@ -42,9 +58,35 @@ class Policy:
         return np.array(known[self.program["result"]])
 
 
-def values_of(meta: dict[str, Any], parameters: dict[str, float]) -> np.ndarray:
-    """Return the values (P,) of the task's parameters in their order."""
+def shapes_of(meta: dict[str, Any]) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of what a policy observes, by name. A vector alone is called obs."""
+    return {name: tuple(shape) for name, shape in meta["obs"].items()}
+
+
+def observed(meta: dict[str, Any], obs: Any) -> list[np.ndarray]:
+    """Return the arrays that a policy takes of an observation, in their order."""
+    shapes, given = shapes_of(meta), obs if isinstance(obs, dict) else {"obs": obs}
+    if not shapes.keys() <= given.keys():
+        raise ValueError(f"an observation is a dict of {shapes}; policy.meta['about'] says what they are")
+    return [_entry(name, shape, given[name]) for name, shape in shapes.items()]
+
+
+def _entry(name: str, shape: tuple[int, ...], value: Any) -> np.ndarray:
+    seen = name == PICTURES
+    x = np.asarray(value, None if seen else np.float32)
+    if x.shape != shape:
+        fix = "; begin and push make stacks of pictures" if seen else ""
+        raise ValueError(f"{name} has shape {shape}, not {x.shape}{fix}")
+    if seen and x.dtype != np.uint8:
+        raise ValueError(f"pictures are uint8, from 0 to 255, not {x.dtype}")
+    return x
+
+
+def values_of(meta: dict[str, Any], parameters: dict[str, float], needed: bool = True) -> np.ndarray:
+    """Return the values (P,) of the task's parameters in their order; zeros if they are not needed and not given."""
     given = {name.replace("_", "-"): value for name, value in parameters.items()}
+    if not needed and not given:
+        given = dict.fromkeys(meta["parameters"], 0.0)
     if set(given) != set(meta["parameters"]):
         raise ValueError(f"give the task's parameters {meta['parameters']}, not {sorted(given)}")
     return np.array([given[name] for name in meta["parameters"]], np.float32)
@@ -56,11 +98,27 @@ def load(file: Any) -> Policy:
 
 
 def load_jax(file: Any) -> Callable:
-    """Load a policy as a JAX function: observations (B, O), values (B, P) of the parameters -> actions (B, A)."""
+    """Load a policy as a JAX function: observations (B, O), values (B, P) of the parameters -> actions (B, A).
+
+    A policy that sees pictures takes a dict of exactly ``shapes_of(policy.meta)``, with a leading B.
+    """
     from jax import export
 
     with np.load(file, allow_pickle=False) as arrays:
         return export.deserialize(bytearray(arrays["exported"])).call
+
+
+# The last pictures of an episode, (..., H, W, N C) for N pictures of C channels, oldest first.
+
+
+def begin(picture: np.ndarray, frames: int) -> np.ndarray:
+    """Return the stack at the start of an episode: its first picture (..., H, W, C), repeated ``frames`` times."""
+    return np.concatenate([picture] * frames, axis=-1)
+
+
+def push(stack: np.ndarray, picture: np.ndarray) -> np.ndarray:
+    """Return the stack after a step: without its oldest picture, and with the next one at the end."""
+    return np.concatenate([stack[..., np.shape(picture)[-1] :], picture], axis=-1)
 
 
 # The operations of a program, by their names in JAX.
@@ -120,6 +178,31 @@ def _iota(dtype, shape, dimension):
     return np.broadcast_to(np.arange(shape[dimension], dtype=dtype).reshape(sizes), shape)
 
 
+def _windows(x, sizes, strides, padding, dilation, fill):
+    """Return windows of an array: the axes of their places, then those of their entries."""
+    padded = np.pad(x, padding, constant_values=fill)
+    spans = [(size - 1) * apart + 1 for size, apart in zip(sizes, dilation, strict=True)]
+    windows = np.lib.stride_tricks.sliding_window_view(padded, spans)
+    return windows[tuple(slice(None, None, step) for step in (*strides, *dilation))]
+
+
+def _conv_general_dilated(x, kernel, window_strides, padding, rhs_dilation, dimension_numbers):
+    """Convolve by a product of windows, a row each, with kernels (window, output)."""
+    of_x, of_kernel, of_result = ((first, *space, second) for first, second, *space in dimension_numbers)
+    x = np.transpose(x, of_x)
+    kernel = np.transpose(kernel, (*of_kernel[1:], of_kernel[0]))
+    sizes, strides = (1, *kernel.shape[:-1]), (1, *window_strides, 1)
+    windows = _windows(x, sizes, strides, [(0, 0), *padding, (0, 0)], (1, *rhs_dilation, 1), 0)
+    rows = windows.reshape(-1, kernel[..., 0].size)
+    result = (rows @ kernel.reshape(rows.shape[1], -1)).reshape(*windows.shape[: x.ndim - 1], -1)
+    return np.transpose(result, np.argsort(of_result))
+
+
+def _reduce_window_max(x, window_dimensions, window_strides, padding, window_dilation):
+    windows = _windows(x, window_dimensions, window_strides, padding, window_dilation, -np.inf)
+    return windows.max(axis=tuple(range(x.ndim, 2 * x.ndim)))
+
+
 OPERATIONS: dict[str, Callable] = {
     **{name: getattr(np, name) for name in ("sign", "floor", "sqrt", "exp", "log", "log1p", "sin", "cos", "tanh")},
     **{name: getattr(np, name) for name in ("abs", "square")},
@@ -167,12 +250,16 @@ OPERATIONS: dict[str, Callable] = {
     "slice": _slice,
     "dynamic_slice": _dynamic_slice,
     "dot_general": _dot_general,
+    "conv_general_dilated": _conv_general_dilated,
+    "reduce_window_max": _reduce_window_max,
     "iota": _iota,
     "top_k": _top_k,
     "clamp": lambda low, x, high: np.clip(x, low, high),
 }
 SETTINGS = {  # of operations, that programs keep; others only say how a device computes
     "dot_general": ("dimension_numbers",),
+    "conv_general_dilated": ("window_strides", "padding", "rhs_dilation", "dimension_numbers"),
+    "reduce_window_max": ("window_dimensions", "window_strides", "padding", "window_dilation"),
     "broadcast_in_dim": ("shape", "broadcast_dimensions"),
     "convert_element_type": ("new_dtype",),
     "integer_pow": ("y",),

@@ -173,6 +173,7 @@ class Experience(Protocol):
     def sharding(self) -> Any: ...  # of the data, as a tree of PartitionSpec
     def check(self, env: Env, num_envs: int, chunk_steps: int = 0) -> None: ...  # raises InputError
     def host_slots(self, num_envs: int) -> int: ...  # steps of every environment that the host keeps beside the data
+    def rollout_bytes(self, spec: Spec, num_envs: int) -> int: ...  # of a task's steps that are learned from, not kept
     def describe(self, spec: Spec, num_envs: int) -> str: ...
     def init(self, item: Transition, spec: Spec, num_tasks: int, num_envs: int, keys: Key) -> Any: ...  # keys (S,)
     def explore(self, data: Any, action: Array, step: Array) -> Array: ...  # actions (S, T, E, A) to take at a step ()

@@ -15,8 +15,9 @@ from probes import slow_but, tiny
 import mtjax
 import mtjax.evaluate
 from mtjax import agents, standalone
-from mtjax.training.export import require_file, steps_of
+from mtjax.training.export import require_file
 from mtjax.training.policy import Policy
+from mtjax.training.steps import steps_of
 from mtjax.types import InputError
 
 ENV = mtjax.make("finger-spin", vary={"size": "1:1.2:3"})

@@ -285,7 +285,7 @@ def test_a_family_written_as_itself_is_the_same():
         ("--agent.encoder=mlp", "goes on with the run's encoder, identity, not with mlp"),
         ("--agent.hidden 4", r"hidden is the run's, \(8,\), and cannot be \(4,\); what may change is actor-lr"),
         ("--agent.embedding-size=4", "embedding-size is the run's, 3"),
-        ("--env=aim-wide", "map 2 observed numbers to 1 actions; the new tasks have 2 and 2"),
+        ("--env=aim-wide", "map 2 observed numbers to 1 actions; the new tasks have 2 observed numbers and 2 actions$"),
         ("--tune=head", "head"),
         ("--reset-every=5", "throws away what --from takes"),
     ],
@@ -313,6 +313,26 @@ def test_flags_that_mean_nothing_are_refused(tmp_path, monkeypatch, words, said)
     with pytest.raises(InputError, match=said):
         mtjax.train.main(["--env=aim", "--agent=sac", *words.split()])
     assert not list(tmp_path.iterdir())
+
+
+SEEN = {"pixels": 16, "frames": 3, "state": "also"}
+
+
+@pytest.mark.parametrize(
+    ("seen", "said"),
+    [
+        (SEEN | {"pixels": 32}, r"pictures \(32, 32, 9\) with 4 observed numbers and 2 actions; give --env.pixels"),
+        (SEEN | {"frames": 2}, r"pictures \(16, 16, 6\) with 4 observed numbers"),
+        (SEEN | {"state": "hidden"}, r"pictures \(16, 16, 9\) and 2 actions"),
+        ({}, "the new tasks have 4 observed numbers and 2 actions; give --env.pixels"),
+    ],
+)
+def test_other_pictures_are_refused(seen, said):
+    """By what networks see, which is a stack."""
+    made = agent("drq", hidden=(4,))
+    start = mtjax.training.policy.Policy(mtjax.make("corridor-maze", **SEEN), made, None, None, jnp.arange(1))
+    with pytest.raises(InputError, match=rf"map pictures \(16, 16, 9\) with 4 observed numbers to 2 .*{said}"):
+        finetune.require_fit(start, mtjax.make("corridor-maze", **seen), made)
 
 
 def test_contexts_of_another_scale_are_refused(learned):

@@ -93,3 +93,11 @@ def test_rows_are_means_over_tasks_and_each_tasks_return():
 def test_numbers_have_seven_digits(given, text):
     """What is not a number is left empty; what is infinite is not."""
     assert log.number(given) == text
+
+
+def test_rows_are_kept_as_they_were_given():
+    given = [{"seed": s, "steps": 10, "tau": 0.5, "return": text} for s, text in enumerate(["", "1.5", 'x,"y"'])]
+    rows = log.Rows()
+    rows.extend(given[:1])
+    rows.extend(given[1:])
+    assert list(rows) == given and rows[-1] == given[-1] and rows[1:] == given[1:] and len(rows) == 3

@@ -397,7 +397,7 @@ def test_finished_run_has_nothing_to_resume(play, whole, tmp_path):
     """Resuming it changes nothing."""
     shutil.copytree(whole.directory, tmp_path, dirs_exist_ok=True)
     result = play(tmp_path, resume=True)
-    assert result.finished and result.rows == []
+    assert result.finished and not result.rows
     assert_same_run(result, whole)
 
 

@@ -334,6 +334,36 @@ def test_memory_is_told_by_seed_for_device_and_host(monkeypatch):
     assert needs(monkeypatch, 1e12, backend="cpu", **both_sizes)[1].device == both.state + both.moved + both.host
 
 
+def test_pictures_of_rollouts_count(monkeypatch, short_family):
+    """Two stacks of three pictures with three channels, of each step of every seed, task and environment.
+
+    They decide whether a run fits at all, and how many of its seeds run at once.
+    """
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    env, settings = Coloured(frames=3), Settings(num_envs=4)
+    rollout = 5 * 2 * 4 * 10 * 2 * (16 * 16 * 9)
+
+    def of(unroll):
+        agent = mtjax.agent("ppo", representation="encoded", hidden=(8,), latent_widths=(4,), unroll=unroll)
+        state = jax.eval_shape(partial(loop.init, env, agent, settings), env.tasks(), jnp.arange(5))
+        return memory.Needs.of(state, env, agent, settings)
+
+    short, long = of(10), of(200)
+    assert (short.rollout, long.rollout) == (rollout, 20 * rollout)
+    assert short.state == long.state and short.device == short.state + rollout
+    monkeypatch.setattr(memory, "physical_bytes", lambda: long.device - 1)
+    memory.require_room(short, env)
+    with pytest.raises(
+        InputError, match=r"of rollouts\) and .* lower --agent.unroll, --num-envs or --seeds; with --env"
+    ):
+        memory.require_room(long, env)
+    config = cli.parse([*SHORT_RUN, "--seeds=5"])
+    for needs, rounds in ((long, [2, 2, 1]), (short, [5])):
+        monkeypatch.setattr(memory, "_needs", lambda _, needs=needs: needs)
+        parts = memory.split_to_fit(config, 0.6 * long.device)
+        assert [part.plan.seeds for part in parts] == rounds
+
+
 SMALLER = "and there are 0.1 GB; lower --replay-size, --num-envs or --seeds"
 
 

@@ -30,7 +30,8 @@ from mtjax.types import Array, InputError, Spec, Task
 STATES = ("hidden", "also")
 _LEAST, _MOST = 16, 512
 _MOST_FRAMES = 16
-_GREY = (0.299, 0.587, 0.114)
+GREY = (0.299, 0.587, 0.114)
+"""Weights of red, green and blue in the brightness of grey pictures."""
 
 
 class Mark(NamedTuple):
@@ -215,7 +216,7 @@ class Pictured(Stepped):
         picture = self.artist.paint(leaf, self.see(task, state))
         if not self.grey:
             return picture
-        return jnp.round(picture @ jnp.float32(_GREY))[..., None].astype(jnp.uint8)
+        return jnp.round(picture @ jnp.float32(GREY))[..., None].astype(jnp.uint8)
 
     @property
     def spec(self) -> Spec:

@@ -148,6 +148,10 @@ class Replay:
         """Return how many steps of every environment the host keeps."""
         return self.host_replay_size // num_envs
 
+    def rollout_bytes(self, spec: Spec, num_envs: int) -> int:
+        """Return 0, as all steps that are learned from lie in the data."""
+        return 0
+
     def segments(self, spec: Spec, num_envs: int) -> tuple[int, int]:
         """Return rows K and length L of the recalled segments on the device."""
         if not self.host_replay_size:

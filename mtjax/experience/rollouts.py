@@ -4,6 +4,7 @@ import dataclasses
 import math
 from typing import Any, ClassVar
 
+import jax
 import jax.numpy as jnp
 
 from mtjax import frames
@@ -45,13 +46,16 @@ class Rollouts:
         """Return 0, as the host keeps no steps."""
         return 0
 
+    def rollout_bytes(self, spec: Spec, num_envs: int) -> int:
+        """Return the bytes of a task's observations, before and after every step, while they are learned from."""
+        seen = jax.tree.leaves(frames.seen(spec))
+        return 2 * self.unroll * num_envs * sum(math.prod(x.shape) * x.dtype.itemsize for x in seen)
+
     def describe(self, spec: Spec, num_envs: int) -> str:
         """Return a description of its size, with the memory that stacks of pictures take while it is learned from."""
-        count, told = self.unroll * num_envs, ""
-        if frames.shown(spec.obs):
-            each = 2 * math.prod(frames.seen(spec)[frames.PICTURES].shape)  # before and after the step
-            told = f"; while in use {count * each / 1e6:,.0f} MB of pictures a task and seed"
-        return f"rollouts ({count:,} transitions a task, not kept{told})"
+        told = f"; while in use {self.rollout_bytes(spec, num_envs) / 1e6:,.0f} MB of pictures a task and seed"
+        told *= frames.shown(spec.obs)
+        return f"rollouts ({self.unroll * num_envs:,} transitions a task, not kept{told})"
 
     def init(self, item: Transition, spec: Spec, num_tasks: int, num_envs: int, keys: Key) -> tuple[()]:
         """Return (), as no data is kept between iterations."""

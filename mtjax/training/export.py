@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,19 +10,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax import __version__
-from mtjax.agents import name_of
+from mtjax import __version__, frames
+from mtjax.agents import BaseAgent, name_of
 from mtjax.checks import path
 from mtjax.envs import Family
 from mtjax.envs import name_of as env_name_of
+from mtjax.envs.pixels import GREY
+from mtjax.envs.stepped import Stepped
 from mtjax.names import InputError
-from mtjax.standalone import OPERATIONS, SETTINGS
 from mtjax.training import onnx
 from mtjax.training.policy import Policy
+from mtjax.training.steps import steps_of
 from mtjax.types import Array, Task
 
 _PLATFORMS = ("cpu", "cuda")
-_CALLS = ("jit", "pjit", "closed_call", "core_call", "remat", "checkpoint", "custom_jvp_call", "custom_vjp_call")
+_BRIGHTNESS = " + ".join(f"{weight:g} {colour}" for weight, colour in zip(GREY, ("red", "green", "blue"), strict=True))
 
 
 def export(policy: Policy, file: str | Path) -> Path:
@@ -30,7 +32,8 @@ def export(policy: Policy, file: str | Path) -> Path:
 
     Args:
         file: ends with .npz, which ``mtjax.standalone`` reads by NumPy alone or by JAX alone; or with .onnx, a model of
-            the inputs ``obs`` (O,) and ``parameters`` (P,), and the output ``action`` (A,).
+            the inputs ``obs`` (O,) and ``parameters`` (P,), and the output ``action`` (A,). Of a policy that sees
+            pictures the inputs are ``pixels`` (H, W, N C), a stack of pictures, and ``state`` (O,) if it sees that too.
 
     Raises:
         InputError: the file exists, or the agent infers its task from memory, or it is of a mixture, or the package
@@ -39,25 +42,15 @@ def export(policy: Policy, file: str | Path) -> Path:
     file = require_file(file)
     if not isinstance(policy, Policy):
         raise InputError(f"export takes a policy, from mtjax.load or result.policy(), not a {type(policy).__name__}")
-    env, act = policy.env, acting(policy)
+    env, act, obs = policy.env, acting(policy), policy.takes
     assert isinstance(env, Family)
-    obs, values = (jax.ShapeDtypeStruct((size,), jnp.float32) for size in (env.spec.obs_size, len(env.ranges)))
-    meta = {
-        "env": env_name_of(env),
-        "agent": name_of(policy.agent),
-        "obs_size": env.spec.obs_size,
-        "action_size": env.spec.action_size,
-        "parameters": [name for name, _, _ in env.ranges],
-        "trained_from": [low for _, low, _ in env.ranges],
-        "trained_to": [high for _, _, high in env.ranges],
-        "mtjax": __version__,
-        "jax": jax.__version__,
-    }
+    values = jax.ShapeDtypeStruct((len(env.ranges),), jnp.float32)
     program, constants = steps_of(jax.make_jaxpr(act)(obs, values))
+    meta = _meta(env, policy.agent, _by_name(obs))
     new = file.with_suffix(f".new{file.suffix}")
     file.parent.mkdir(parents=True, exist_ok=True)
     if file.suffix == ".onnx":
-        onnx.write(program, constants, meta, new)
+        onnx.write(program, constants, _by_name(obs) | {"parameters": values}, meta, new)
     else:
         text = lambda x: np.frombuffer(json.dumps(x).encode(), np.uint8)
         arrays: dict[str, Any] = {f"constant_{i}": x for i, x in enumerate(constants)}
@@ -83,8 +76,48 @@ def require_file(file: str | Path) -> Path:
     return file
 
 
-def acting(policy: Policy) -> Callable[[Array, Array], Array]:
-    """Return the function from an observation (O,) and the parameters' values (P,) to the mean action (A,).
+def _by_name(obs: Any) -> dict[str, Any]:
+    """Return the parts of an observation, or of its shapes, in the order of their names. A vector is called obs."""
+    return {name: obs[name] for name in sorted(obs)} if isinstance(obs, Mapping) else {"obs": obs}
+
+
+def _meta(env: Family, agent: BaseAgent, obs: dict[str, Any]) -> dict[str, Any]:
+    """Return what a file tells of its policy, which takes ``obs`` of these shapes."""
+    return {
+        "env": env_name_of(env),
+        "agent": name_of(agent),
+        "obs": {name: x.shape for name, x in obs.items()},
+        "frames": env.spec.frames,
+        "seconds": env.seconds_per_step if isinstance(env, Stepped) else None,  # between two actions
+        "about": " ".join(_about(env, name, x.shape) for name, x in obs.items()),
+        "action_size": env.spec.action_size,
+        "parameters": [name for name, _, _ in env.ranges],
+        "trained_from": [low for _, low, _ in env.ranges],
+        "trained_to": [high for _, _, high in env.ranges],
+        "mtjax": __version__,
+        "jax": jax.__version__,
+    }
+
+
+def _about(env: Family, name: str, shape: tuple[int, ...]) -> str:
+    """Return sentences on a part of the observation, for whoever makes it elsewhere."""
+    if name != frames.PICTURES:
+        return f"{name} {shape} float32: a vector as the family observes it. It is normalised inside."
+    picture, count = env.spec.obs[name].shape, env.spec.frames
+    known = {1: f"1 channel, the rounded brightness {_BRIGHTNESS}", 3: "the channels red, green and blue"}
+    channels = known.get(picture[-1], f"{picture[-1]} channels")
+    each = f"Row 0 of a picture is its top, and it has {channels}, from 0 to 255."
+    if count == 1:
+        return f"{name} {shape} uint8: the newest picture. {each}"
+    return (
+        f"{name} {shape} uint8: the last {count} pictures {picture}, joined along the last axis, oldest first. An "
+        f"episode begins with its first picture {count} times. After every action the oldest goes and the newest "
+        f"comes. {each}"
+    )
+
+
+def acting(policy: Policy) -> Callable[[Any, Array], Array]:
+    """Return the function from an observation, as ``policy.takes``, and the parameters' values (P,) to the action (A,).
 
     Raises:
         InputError: as ``export``.
@@ -97,7 +130,7 @@ def acting(policy: Policy) -> Callable[[Array, Array], Array]:
     trained = env.tasks("train")
     first = jax.tree.map(lambda x: x[0], trained)._replace(draws=None)
 
-    def act(obs: Array, values: Array) -> Array:
+    def act(obs: Any, values: Array) -> Array:
         task = _task(env, first, trained, values)
         return agent.act(state, agent.begin(state, task), obs, task, None).action
 
@@ -121,77 +154,10 @@ def _task(env: Family, first: Task, trained: Task, values: Array) -> Task:
 def _serialised(act: Callable, obs: Any, values: Any) -> np.ndarray:
     """Return the program for batches of any size, as bytes."""
     (size,) = jax.export.symbolic_shape("batch")
-    batch = lambda x: jax.ShapeDtypeStruct((size, *x.shape), x.dtype)
-    exported = jax.export.export(jax.jit(jax.vmap(act)), platforms=_PLATFORMS)(batch(obs), batch(values))
+    batches = jax.tree.map(lambda x: jax.ShapeDtypeStruct((size, *x.shape), x.dtype), (obs, values))
+    write = lambda act: jax.export.export(jax.jit(act), platforms=_PLATFORMS)(*batches)
+    try:
+        exported = write(jax.vmap(act))
+    except NotImplementedError:  # a convolution takes one kernel, and here each task has its own
+        exported = write(lambda obs, values: jax.lax.map(lambda each: act(*each), (obs, values)))
     return np.frombuffer(bytes(exported.serialize()), np.uint8)
-
-
-# Programs for NumPy.
-
-
-def steps_of(closed: Any) -> tuple[dict[str, Any], list[np.ndarray]]:
-    """Return a traced function of one result as a list of steps, and its constants.
-
-    Raises:
-        InputError: it uses an operation that ``standalone`` lacks.
-    """
-    writer = _Writer(len(closed.jaxpr.invars))
-    (result,) = writer.write(closed.jaxpr, closed.consts, list(range(len(closed.jaxpr.invars))))
-    count = len(writer.constants)
-    number = lambda i: -i - 1 if i < 0 else i + count  # the constants come first, then the inputs
-    steps = [[name, [*map(number, x)], [*map(number, y)], kept] for name, x, y, kept in writer.steps]
-    return {"constants": count, "steps": steps, "result": number(result)}, writer.constants
-
-
-class _Writer:
-    """Collects the steps of a traced function and of those that it calls. Constants have negative numbers."""
-
-    def __init__(self, inputs: int):
-        self.count, self.steps, self.constants = inputs, [], []
-        self.known: dict[int, int] = {}
-
-    def write(self, jaxpr: Any, consts: Any, arguments: list[int]) -> list[int]:
-        """Write the steps of a function of these arguments, and return the numbers of its results."""
-        numbers = dict(zip(jaxpr.constvars, map(self._constant, consts), strict=True))
-        numbers |= dict(zip(jaxpr.invars, arguments, strict=True))
-        read = lambda atom: self._constant(atom.val) if hasattr(atom, "val") else numbers[atom]
-        for equation in jaxpr.eqns:
-            inputs, called = list(map(read, equation.invars)), _called(equation)
-            if called is None:
-                outputs = self._step(equation, inputs)
-            else:
-                outputs = self.write(getattr(called, "jaxpr", called), getattr(called, "consts", ()), inputs)
-            numbers.update(zip(equation.outvars, outputs, strict=True))
-        return list(map(read, jaxpr.outvars))
-
-    def _step(self, equation: Any, inputs: list[int]) -> list[int]:
-        name = equation.primitive.name
-        if name not in OPERATIONS:
-            raise InputError(f"export to NumPy knows no operation {name!r}")
-        outputs = list(range(self.count, self.count + len(equation.outvars)))
-        self.count += len(outputs)
-        kept = {key: _plain(equation.params[key]) for key in SETTINGS.get(name, ())}
-        self.steps.append((name, inputs, outputs, kept))
-        return outputs
-
-    def _constant(self, value: Any) -> int:
-        if id(value) not in self.known:
-            self.constants.append(np.asarray(value))
-            self.known[id(value)] = -len(self.constants)
-        return self.known[id(value)]
-
-
-def _called(equation: Any) -> Any:
-    """Return the function that an operation calls, or None."""
-    if equation.primitive.name not in _CALLS:
-        return None
-    return next(equation.params[name] for name in ("jaxpr", "call_jaxpr", "fun_jaxpr") if name in equation.params)
-
-
-def _plain(value: Any) -> Any:
-    """Return a setting as JSON has it."""
-    if isinstance(value, tuple | list):
-        return [_plain(x) for x in value]
-    if isinstance(value, np.dtype) or isinstance(value, type):
-        return np.dtype(value).name
-    return int(value) if isinstance(value, np.integer) else value

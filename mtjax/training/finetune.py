@@ -7,13 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mtjax import frames
 from mtjax.agents import BaseAgent, parts, settings
 from mtjax.config import NO_FINE_TUNING
 from mtjax.envs import Family
 from mtjax.envs.mixtures import require_family
 from mtjax.networks import Params
 from mtjax.training.policy import Policy
-from mtjax.types import Array, Env, InputError, Task
+from mtjax.types import Array, Env, InputError, Spec, Task
 
 _FRESH = ("optimizers", "contexts", "vectors", "surgery", "progress")  # fields that belong to the new tasks alone
 _BY_TASK = ("log_temperature", "scales", "units")  # leaves (T, ...), or shared by all tasks
@@ -38,15 +39,24 @@ def require_fit(start: Policy, env: Env, agent: BaseAgent) -> None:
         )
     family, known = env, start.env
     theirs, ours = known.spec, family.spec
-    if theirs[:2] != ours[:2]:
+    if frames.seen(theirs) != frames.seen(ours) or theirs.action_size != ours.action_size:
+        pictures = frames.shown(theirs.obs) or frames.shown(ours.obs)
+        fix = "; give --env.pixels, --env.frames, --env.grey and --env.state as the run has them" * pictures
         raise InputError(
-            f"the run's networks map {theirs.obs_size} observed numbers to {theirs.action_size} actions; "
-            f"the new tasks have {ours.obs_size} and {ours.action_size}"
+            f"the run's networks map {_sizes(theirs)} to {theirs.action_size} actions; "
+            f"the new tasks have {_sizes(ours)} and {ours.action_size} actions{fix}"
         )
     alike = not isinstance(family, Family) or not isinstance(known, Family) or family.ranges == known.ranges
     if theirs.context_size != ours.context_size or not alike:
         raise InputError("the context of these tasks is not written as the run's; give env.scaled_as(policy.env)")
     _require_numbers(start, env, agent)
+
+
+def _sizes(spec: Spec) -> str:
+    """Return what networks see of tasks, as text."""
+    seen, size = frames.seen(spec), frames.state_size(spec)
+    pictures = [f"pictures {seen[frames.PICTURES].shape}"] if frames.shown(seen) else []
+    return " with ".join(pictures + [f"{size} observed numbers"] * (size > 0))
 
 
 def _learned(agent: BaseAgent) -> dict[str, Any]:

@@ -1,8 +1,10 @@
 """Metrics of a run as rows of a CSV file."""
 
 import csv
+import json
 import re
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,31 @@ from mtjax.names import naming, notice, replacing
 _OF_EACH_TASK = ("td_error", "critic_gradient_norm", "actor_gradient_norm")  # beside the return
 
 
-def append_rows(path: Path, rows: list[dict[str, Any]]) -> None:
+class Rows(Sequence):
+    """The rows of a run's metrics, alike in their names. Each is kept as one text, a sixth of the memory of a dict."""
+
+    def __init__(self):
+        self._names: list[str] = []
+        self._texts: list[str] = []
+
+    def extend(self, rows: Sequence[dict[str, Any]]) -> None:
+        """Add rows, whose values are numbers and text."""
+        self._names = self._names or list(rows[0])
+        self._texts += [json.dumps(list(row.values())) for row in rows]
+
+    def __len__(self) -> int:
+        return len(self._texts)
+
+    def __getitem__(self, place: Any) -> Any:
+        if isinstance(place, slice):
+            return [self[i] for i in range(*place.indices(len(self)))]
+        return dict(zip(self._names, json.loads(self._texts[place]), strict=True))
+
+    def __repr__(self) -> str:
+        return f"Rows({len(self)} of {len(self._names)} values)"
+
+
+def append_rows(path: Path, rows: Sequence[dict[str, Any]]) -> None:
     """Append rows to a CSV file. A new file gets a header; an old file keeps its columns."""
     is_new = not path.exists() or not path.stat().st_size
     names = list(rows[0]) if is_new else _columns(path)

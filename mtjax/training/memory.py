@@ -55,6 +55,7 @@ class Needs(NamedTuple):
 
     agent: int  # networks and optimisers
     data: int  # worlds and replay on the devices
+    rollout: int  # steps that are learned from and not kept; 0 for a replay
     moved: int  # steps that a round of the exchange with the host holds on either side; 0 for no exchange
     host: int  # the replay's store in the host's memory, with ``moved``
 
@@ -64,13 +65,15 @@ class Needs(NamedTuple):
         experience: Any = agent.experience
         networks, slots = checkpoint.size_of(state.agent), experience.host_slots(settings.num_envs)
         data = checkpoint.size_of(state) - networks
+        seeds, tasks = state.worlds.age.shape[:2]
+        rollout = seeds * tasks * experience.rollout_bytes(env.spec, settings.num_envs)
         if not slots:
-            return Needs(networks, data, 0, 0)
+            return Needs(networks, data, rollout, 0, 0)
         rows = state.data.ring.rows
         each = checkpoint.size_of(rows) // jax.tree.leaves(rows)[0].shape[2]
         count, length = experience.segments(env.spec, settings.num_envs)
         moved = settings.chunk_steps + recalled_rows(settings.chunk_steps, count, length) * length
-        return Needs(networks, data, moved * each, (slots + moved) * each)
+        return Needs(networks, data, rollout, moved * each, (slots + moved) * each)
 
     @property
     def state(self) -> int:
@@ -80,7 +83,7 @@ class Needs(NamedTuple):
     @property
     def device(self) -> int:
         """Bytes on the devices; of a CPU, where the store lies in the same memory, all."""
-        return self.state + self.moved + (self.host if jax.default_backend() == "cpu" else 0)
+        return self.state + self.rollout + self.moved + (self.host if jax.default_backend() == "cpu" else 0)
 
 
 def _needs(config: RunConfig) -> Needs:
@@ -90,7 +93,7 @@ def _needs(config: RunConfig) -> Needs:
 
 
 def required_bytes(config: RunConfig) -> int:
-    """Return roughly the bytes on devices that one point takes with all its seeds: its state and an update's copies.
+    """Return roughly the bytes on devices that one point takes with all its seeds: state, rollouts, an update's copies.
 
     On a CPU the state that is being saved lies in the same memory.
     """
@@ -113,19 +116,28 @@ def require_room(needs: Needs, env: Env) -> None:
         parts = [
             (needs.agent, "networks"),
             (needs.data + needs.moved, "worlds and data"),
-            (needs.device - needs.state - needs.moved, "the host's replay"),
+            (needs.rollout, "rollouts"),
+            (needs.device - needs.state - needs.rollout - needs.moved, "the host's replay"),
         ]
         told = ", ".join(f"{gigabytes(size)} of {name}" for size, name in parts if size)
-        much = 2 * needs.agent > needs.device
-        fix = "--agent.hidden or --seeds" if much else "--replay-size, --num-envs or --seeds" + _further(needs, env)
         raise InputError(
-            f"the run needs {gigabytes(needs.device)} ({told}) and there are {gigabytes(limit)}; lower {fix}"
+            f"the run needs {gigabytes(needs.device)} ({told}) and there are {gigabytes(limit)}; lower "
+            + _smaller(needs, env)
         )
     if needs.host > host_bytes():
         raise InputError(
             f"the replay on the host needs {gigabytes(needs.host)} and the machine has {gigabytes(host_bytes())}; "
             f"lower --host-replay-size, --seeds or --chunk-steps{_grey(env)}"
         )
+
+
+def _smaller(needs: Needs, env: Env) -> str:
+    """Return the settings that make most of a run smaller."""
+    if 2 * needs.agent > needs.device:
+        return "--agent.hidden or --seeds"
+    if needs.rollout:
+        return "--agent.unroll, --num-envs or --seeds" + _grey(env)
+    return "--replay-size, --num-envs or --seeds" + _further(needs, env)
 
 
 def _further(needs: Needs, env: Env) -> str:

@@ -29,11 +29,14 @@ def require_onnx() -> None:
         raise InputError("a policy is exported to ONNX by the package onnx: pip install 'mtjax[onnx]'")
 
 
-def write(program: dict[str, Any], constants: Sequence[np.ndarray], meta: dict[str, Any], file: Path) -> None:
-    """Write the steps of a policy, as ``export.steps_of`` returns them, as an ONNX model.
+def write(
+    program: dict[str, Any], constants: Sequence[np.ndarray], inputs: dict[str, Any], meta: dict[str, Any], file: Path
+) -> None:
+    """Write the steps of a policy, as ``steps.steps_of`` returns them, as an ONNX model.
 
-    Inputs are ``obs`` (O,) and, where tasks have parameters, ``parameters`` (P,), in float32; the output is ``action``
-    (A,). The model's metadata holds ``meta``.
+    Args:
+        inputs: shapes and types by name, in their order. Those that the policy does not read are left out.
+        meta: the model's metadata. Its ``about`` is also the model's description.
 
     Raises:
         InputError: an operation has no counterpart in ONNX.
@@ -41,22 +44,23 @@ def write(program: dict[str, Any], constants: Sequence[np.ndarray], meta: dict[s
     import onnx
     from onnx import helper
 
-    sizes = {"obs": meta["obs_size"], "parameters": len(meta["parameters"])}
-    graph = _Graph(program, constants, [np.zeros(size, np.float32) for size in sizes.values()])
-    put = lambda name, size: helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [size])
+    graph = _Graph(program, constants, inputs)
+    put = lambda name, x: helper.make_tensor_value_info(name, helper.np_dtype_to_tensor_dtype(x.dtype), x.shape)
     graph.node("Identity", [graph.name(program["result"])], "action")
     used = {name for node in graph.nodes for name in node.input}
     model = helper.make_model(
         helper.make_graph(
             graph.nodes,
             f"{meta['agent']} on {meta['env']}",
-            [put(name, size) for name, size in sizes.items() if name == "obs" or (size and name in used)],
-            [put("action", meta["action_size"])],
-            graph.tensors,
+            [put(name, x) for name, x in inputs.items() if name in used],
+            [put("action", np.zeros(meta["action_size"], np.float32))],
+            [tensor for tensor in graph.tensors if tensor.name in used],
+            doc_string=meta["about"],
         ),
         opset_imports=[helper.make_opsetid("", _OPSET)],
         ir_version=_IR,
         producer_name="mtjax",
+        doc_string=meta["about"],
     )
     helper.set_model_props(model, {"mtjax": json.dumps(meta)})
     onnx.checker.check_model(model, full_check=True)
@@ -66,10 +70,11 @@ def write(program: dict[str, Any], constants: Sequence[np.ndarray], meta: dict[s
 class _Graph:
     """Collects the nodes of a model. What does not depend on the inputs is computed here, once."""
 
-    def __init__(self, program: dict[str, Any], constants: Sequence[np.ndarray], inputs: Sequence[np.ndarray]):
+    def __init__(self, program: dict[str, Any], constants: Sequence[np.ndarray], inputs: dict[str, Any]):
         self.nodes, self.tensors, self.shown = [], [], {}
-        self.values = dict(enumerate((*constants, *inputs)))  # of the inputs' successors only shapes and types matter
-        self.names = {len(constants): "obs", len(constants) + 1: "parameters"}
+        zeros = (np.zeros(x.shape, x.dtype) for x in inputs.values())
+        self.values = dict(enumerate((*constants, *zeros)))  # of the inputs' successors only shapes and types matter
+        self.names = dict(enumerate(inputs, len(constants)))
         for operation, arguments, results, settings in program["steps"]:
             self._step(operation, arguments, results, settings)
 
@@ -113,6 +118,12 @@ class _Graph:
         self.nodes.append(helper.make_node(kind, inputs, outputs, **attributes))
         return outputs
 
+    def transposed(self, name: str, value: np.ndarray, order: Sequence[int]) -> str:
+        """Return the name of a value with its axes in another order. Of a constant this is another constant."""
+        if name in self.shown.values():
+            return self.constant(np.transpose(value, order))
+        return self.node("Transpose", [name], perm=list(order))
+
     def cast(self, name: str, dtype: Any) -> str:
         from onnx import helper
 
@@ -139,11 +150,11 @@ class _Graph:
             return [self.node(_LOGICAL[operation], names)]
         if operation in _SAME:
             return [self.node(_SAME[operation], names)]
+        if operation in _OTHERS:
+            return [_OTHERS[operation](self, names, values, result, **settings)]
         if operation.startswith("reduce_"):
             return [self._reduced(operation.removeprefix("reduce_"), names[0], values[0].dtype, settings["axes"])]
-        if operation not in _OTHERS:
-            raise InputError(f"export to ONNX knows no operation {operation!r}")
-        return [_OTHERS[operation](self, names, values, result, **settings)]
+        raise InputError(f"export to ONNX knows no operation {operation!r}")
 
     def _reduced(self, kind: str, name: str, dtype: Any, axes: Sequence[int]) -> str:
         if kind in ("and", "or"):
@@ -192,6 +203,30 @@ def _dot(graph: _Graph, names, values, result, dimension_numbers):
     return graph.node("Einsum", names, equation=product_equation(a, b, dimension_numbers))
 
 
+def _convolution(graph: _Graph, names, values, result, window_strides, padding, rhs_dilation, dimension_numbers):
+    of_x, of_kernel, of_result = dimension_numbers  # each puts channels before space, as ONNX does
+    given = graph.transposed(names[0], values[0], of_x), graph.transposed(names[1], values[1], of_kernel)
+    sides = [side for both in zip(*padding, strict=True) for side in both]  # all beginnings, then all ends
+    found = graph.node("Conv", given, strides=window_strides, pads=sides, dilations=rhs_dilation)
+    return graph.node("Transpose", [found], perm=np.argsort(of_result).tolist())
+
+
+def _largest_in_windows(
+    graph: _Graph, names, values, result, window_dimensions, window_strides, padding, window_dilation
+):
+    settings = list(zip(window_dimensions, window_strides, padding, window_dilation, strict=True))
+    space = [i for i, (size, step, *_) in enumerate(settings) if (size, step) != (1, 1)]
+    order = [i for i in range(len(settings)) if i not in space] + space
+    apart = lambda shape: [1, -1, *(shape[i] for i in space)]
+    found = graph.node("Transpose", names, perm=order)
+    found = graph.node("Reshape", [found, graph.indices(apart(values[0].shape))])
+    sizes, steps, sides, gaps = zip(*(settings[i] for i in space), strict=True)
+    sides = [side for both in zip(*sides, strict=True) for side in both]
+    found = graph.node("MaxPool", [found], kernel_shape=sizes, strides=steps, pads=sides, dilations=gaps)
+    found = graph.node("Reshape", [found, graph.indices([result.shape[i] for i in order])])
+    return graph.node("Transpose", [found], perm=np.argsort(order).tolist())
+
+
 def _extreme(kind: str) -> Callable:
     def emit(graph: _Graph, names, values, result, axes, index_dtype):
         number = graph.cast(names[0], np.int32) if values[0].dtype == bool else names[0]
@@ -224,6 +259,8 @@ _OTHERS: dict[str, Callable] = {
     "slice": _slice,
     "dynamic_slice": _dynamic_slice,
     "dot_general": _dot,
+    "conv_general_dilated": _convolution,
+    "reduce_window_max": _largest_in_windows,
     "argmax": _extreme("ArgMax"),
     "argmin": _extreme("ArgMin"),
 }

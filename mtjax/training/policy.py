@@ -36,8 +36,8 @@ class Policy:
     directory: Path | None = None  # of the run
 
     def __repr__(self) -> str:
-        spec, names = self.env.spec, f"{name_of(self.agent)} on {env_name_of(self.env)}"
-        shapes = f"observation {tuple(getattr(spec.obs, 'shape', ()))}, action ({spec.action_size},)"
+        names, seen = f"{name_of(self.agent)} on {env_name_of(self.env)}", jax.tree.map(lambda x: x.shape, self.takes)
+        shapes = f"observation {seen}, action ({self.env.spec.action_size},)"
         return f"Policy({names}: {shapes}, one of {len(self.seeds)} seed{'s' * (len(self.seeds) > 1)})"
 
     def __call__(self, obs: Any, task: Task, key: Key | None = None, memory: Any = None) -> Array:
@@ -50,7 +50,7 @@ class Policy:
         """
         if np.ndim(task.id):
             raise InputError(f"policy(obs, task) takes one task, not {task!r}: jax.tree.map(lambda x: x[0], tasks)")
-        wanted = jax.tree.map(lambda x: x.shape, self.agent.representation.acts_on(frames.seen(self.env.spec)))
+        wanted = jax.tree.map(lambda x: x.shape, self.takes)
         obs = {name: x for name, x in obs.items() if name in wanted} if frames.shown(obs) else obs
         shape = jax.tree.map(np.shape, obs)
         if shape != wanted:
@@ -58,6 +58,11 @@ class Policy:
             raise InputError(f"an observation for this policy has shape {wanted}, not {shape}; {fix}")
         memory = self.begin(task) if memory is None else memory
         return self.agent.act(self.state, memory, obs, task, key).action
+
+    @property
+    def takes(self) -> Any:
+        """The shapes of an observation that it acts on: with pictures, those of the stack of the last ones."""
+        return self.agent.representation.acts_on(frames.seen(self.env.spec))
 
     def begin(self, task: Task) -> Any:
         """Return the memory at the start of an episode."""

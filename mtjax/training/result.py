@@ -1,5 +1,6 @@
 """The result of a run in Python: its state, evaluations, metrics and policies."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,7 +22,7 @@ class Result(NamedTuple):
 
     state: TrainState
     evaluations: Evaluations
-    rows: list[dict[str, Any]]  # the lines of metrics.csv
+    rows: Sequence[dict[str, Any]]  # the lines of metrics.csv
     seconds: float  # of training, without compiling and evaluating; of a resumed run, with those before
     compile_seconds: float  # from the start until the first chunk could begin
     finished: bool  # False if a signal stopped it

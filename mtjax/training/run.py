@@ -277,7 +277,7 @@ class _Run:
         steps = iteration * self.steps_per_iteration
         evaluations = self.records.earlier_evaluations(steps, steps >= self.eval_every, self._no_evaluations())
         earlier = seconds = self.records.earlier_seconds(iteration)
-        rows, stop = [], 0
+        rows, stop = log.Rows(), 0
         diverged = np.zeros(len(self.seeds), bool)
         with stop_signals() as received, self.records.closing():
             while steps < self.plan.steps and not stop:
@@ -300,7 +300,7 @@ class _Run:
                 }
                 lines = log.metric_rows(metrics, np.asarray(self.seeds), common)
                 new = [{"seed": row["seed"], **self.point(k), **row} for k, row in enumerate(lines)]
-                rows += new
+                rows.extend(new)
                 self.records.add_rows(new)
                 write_rows(found, lines, [self._name(k) for k in range(len(lines))])
                 rate = (steps - steps_before) * len(self.seeds) / elapsed

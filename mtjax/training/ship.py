@@ -14,8 +14,8 @@ import numpy as np
 from mtjax import commands, shipped
 from mtjax.config import RunConfig
 from mtjax.names import InputError
-from mtjax.training.export import steps_of
 from mtjax.training.policy import Policy, load
+from mtjax.training.steps import steps_of
 
 _SETTINGS = "config.json"
 
@@ -42,7 +42,7 @@ def read_by_acting(policy: Policy) -> list[int]:
     """Return the numbers of those leaves of an agent's state on which its action depends."""
     leaves, form = jax.tree.flatten(policy.state)
     task = jax.tree.map(lambda x: x[0], policy.env.tasks("train"))
-    obs = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), policy.env.spec.obs)
+    obs = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), policy.takes)
 
     def act(*leaves: Any) -> Any:
         state = jax.tree.unflatten(form, leaves)
@@ -50,12 +50,7 @@ def read_by_acting(policy: Policy) -> list[int]:
 
     known = [x for x in leaves if not jnp.issubdtype(x.dtype, jax.dtypes.prng_key)]
     assert len(known) == len(leaves), "an agent's state holds a key of random numbers"
-    program, constants = steps_of(jax.make_jaxpr(act)(*leaves))
-    needed = {program["result"]}
-    for _, arguments, results, _ in reversed(program["steps"]):
-        if needed.intersection(results):
-            needed.update(arguments)
-    return [i for i in range(len(leaves)) if i + len(constants) in needed]
+    return steps_of(jax.make_jaxpr(act)(*leaves))[0]["reads"]
 
 
 def main(argv: list[str]) -> None:
