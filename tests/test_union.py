@@ -15,6 +15,7 @@ from test_metaworld import made
 
 import mtjax
 from mtjax import cli, rollout
+from mtjax.config import from_json, to_json
 from mtjax.envs import groups
 from mtjax.envs.joined import Alone, Joined
 from mtjax.envs.metaworld.names import BENCHMARKS, TASKS
@@ -113,11 +114,13 @@ def test_things_are_equal_wherever_they_stand():
         _ = world(more="<sensor><clock/></sensor>").sensors
 
 
-def test_scenes_is_a_setting_of_mixtures():
+def test_scenes_is_a_setting_of_mixtures(tmp_path):
+    """A run's record and its command keep it."""
     program = cli.parse(["--env=bandit+tabular-mdp", "--agent=brc", "--env.scenes=union"])
     assert program.family == mtjax.make("bandit+tabular-mdp", scenes="union")
     assert program.family == mtjax.mixture(["bandit", "tabular-mdp"], "union") != mtjax.make("bandit+tabular-mdp")
-    assert cli.parse(to_flags(program)) == program
+    (tmp_path / "config.json").write_text(to_json(program, {"command": "x"}))
+    assert from_json(tmp_path / "config.json") == cli.parse(to_flags(program)) == program
     with pytest.raises(InputError, match="unknown scenes 'onion'; did you mean 'union'"):
         cli.parse(["--env=bandit+tabular-mdp", "--agent=brc", "--env.scenes=onion"])
     with pytest.raises(InputError, match=r"unknown flag '--env\.scenes'"):
@@ -205,6 +208,9 @@ def test_held_out_tasks_step_in_the_union_as_alone():
     )
     assert [type(group) for group in env.groups] == [United]
     require_as_alone(env, "extrapolation", atol=ATOL)
+    calls = {name: about for name, about in env.targets().items() if name.startswith("mujoco_advance")}
+    again = make(*names, held_out=held_out, scenes="union")
+    assert calls and all(again.provide(*about) == name for name, about in calls.items())  # as another process does
 
 
 @dataclasses.dataclass(frozen=True)
