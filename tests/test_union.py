@@ -203,9 +203,8 @@ def require_parked(model, data, used):
 @with_scenes
 def test_held_out_tasks_step_in_the_union_as_alone():
     """A split has tasks of some families, in a union with others."""
-    env = make(
-        "push", "door-open", "drawer-close", "window-open", held_out=("door-open", "window-open"), scenes="union"
-    )
+    names, held_out = ("push", "door-open", "drawer-close", "window-open"), ("door-open", "window-open")
+    env = make(*names, held_out=held_out, scenes="union")
     assert [type(group) for group in env.groups] == [United]
     require_as_alone(env, "extrapolation", atol=ATOL)
     calls = {name: about for name, about in env.targets().items() if name.startswith("mujoco_advance")}
