@@ -20,7 +20,6 @@ from mtjax.envs import groups
 from mtjax.envs.joined import Alone, Joined
 from mtjax.envs.metaworld.names import BENCHMARKS, TASKS
 from mtjax.envs.things import Scene
-from mtjax.envs.union import FAR
 from mtjax.envs.united import United
 from mtjax.training.folder import to_flags
 from mtjax.types import Acted, InputError
@@ -28,6 +27,7 @@ from mtjax.types import Acted, InputError
 # The solver stops by a tolerance that counts the whole scene's degrees of freedom and mean inertia. Meta-World's worlds
 # go on bit for bit, but for a few in which a thing slips or rolls: these were 4e-6 m off after a step.
 ATOL = 2e-5
+APART = 5.0  # [m] at least, between a parked thing and anything else
 MT10 = tuple(name.removeprefix("metaworld-") for name in BENCHMARKS["mt10"][1])
 small_and_large = pytest.mark.parametrize(
     "names", [pytest.param(MT10, id="mt10"), pytest.param(tuple(TASKS), id="mt50", marks=pytest.mark.slow)]
@@ -194,10 +194,10 @@ def require_parked(model, data, used):
     roots = np.flatnonzero(model.body_parentid[1:] == 0) + 1
     for body in np.setdiff1d(roots, used):
         others = [middle(other) for other in roots if other != body]
-        assert np.linalg.norm(middle(body) - others, axis=1).min() > FAR / 2
+        assert np.linalg.norm(middle(body) - others, axis=1).min() > APART
     solid = (model.geom_contype | model.geom_conaffinity) > 0
     away = np.linalg.norm(data.geom_xpos[~own & solid], axis=1) - model.geom_rbound[~own & solid]
-    assert away.min() > FAR / 2
+    assert away.min() > APART
 
 
 @with_scenes

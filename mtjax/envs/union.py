@@ -15,7 +15,7 @@ from mtjax.envs.domain import Domain
 from mtjax.envs.things import Scene, Sensor, Thing
 from mtjax.types import InputError
 
-FAR = 10.0  # [m] between parked things, and from the world's middle
+_FAR = 10.0  # [m] between parked things, and from the world's middle
 
 
 class Places(NamedTuple):
@@ -103,7 +103,7 @@ def _park(union: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Put all things far away; return positions (nq,) and accelerations (nv,) of the free and of the hinged ones."""
     model, qpos = union.model, union.model.qpos0.copy()
     for i, thing in enumerate(union.things.values(), 1):
-        place = [FAR * i, 0, FAR]
+        place = [_FAR * i, 0, _FAR]
         model.body_pos[thing.parts["body"][0]] = place
         if thing.free:
             qpos[thing.parts["qpos"][:3]] = place
