@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize, nnls
 
-from mtjax.agents.parts.gradients import rules
+from mtjax.agents.parts.gradients import quadratic, rules
 from mtjax.agents.parts.gradients.quadratic import RIDGE
 from mtjax.agents.parts.gradients.surgery import RULES, gram_matrix
 from mtjax.types import InputError
@@ -408,3 +408,13 @@ def test_a_radius_that_makes_no_sense_is_refused(radius):
     """CAGrad's promise to descend the mean needs c < 1."""
     with pytest.raises(InputError, match=r"cagrad-radius must be in \(0, 1\), not"):
         rules.CAGrad(radius)
+
+
+@pytest.mark.parametrize("size", [1, 3, 10, 11])
+def test_small_systems_are_solved_as_lapack_does(size):
+    random = np.random.default_rng(size)
+    factor = random.normal(size=(5, size, size))
+    matrix = factor @ factor.swapaxes(1, 2) + 0.1 * np.eye(size)
+    sides = random.normal(size=(5, size, 2))
+    found = jax.vmap(quadratic.solve)(jnp.float32(matrix), jnp.float32(sides))
+    assert found == pytest.approx(np.linalg.solve(matrix, sides), rel=1e-3, abs=1e-3)

@@ -21,7 +21,7 @@ import mujoco
 import numpy as np
 import tyro
 
-from mtjax.envs.engines.base import ENGINES, Engine, World, choose_engine
+from mtjax.envs.engines.base import ENGINES, Blank, Engine, World, choose_engine
 from mtjax.envs.engines.c import MujocoC
 from mtjax.envs.engines.mjx import Mjx
 from mtjax.envs.engines.warp import Warp
@@ -30,7 +30,7 @@ from mtjax.envs.fields import FIXED, VARIABLE
 from mtjax.envs.pixels import Pictured
 from mtjax.envs.planar import Planar, is_planar, locate
 from mtjax.names import nearest_error
-from mtjax.types import Array, InputError, Key, Step, Task, Transition
+from mtjax.types import Array, InputError, Key, Spec, Step, Task, Transition
 
 INTEGRATORS = ("model", "euler")
 
@@ -235,6 +235,14 @@ class Domain(Pictured):
         MuJoCo C holds the models. MJX and Warp receive the fields in which they differ with every step.
         """
         return MujocoC(models, self.num_substeps) if self.engine_name == "c" else self.simulator
+
+    @cached_property
+    def _spec(self) -> Spec:
+        """Return the sizes of an observation. To trace the engine for them would take seconds."""
+        _ = self.table  # once, and not in the copy again
+        blank = copy.copy(self)
+        vars(blank)["simulator"] = Blank(self.models[0])
+        return super(Domain, blank)._spec
 
     @property
     def outside(self) -> Warp | MujocoC | None:

@@ -5,6 +5,7 @@ dm_control does. Force sensors (touch) keep the values of the last substep. Worl
 """
 
 import contextlib
+import dataclasses
 import importlib.util
 import io
 from collections.abc import Iterable
@@ -41,6 +42,30 @@ class Engine(Protocol):
     def step(self, task: Task, world: World, ctrl: Array) -> World: ...
     def touching(self, task: Task, qpos: Array) -> Array: ...
     def require_variable(self, names: Iterable[str]) -> None: ...  # raises InputError if tasks may not differ in these
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Blank:
+    """An engine that computes nothing. Worlds have their shapes, and to trace it takes no time."""
+
+    base: mujoco.MjModel
+
+    def forward(self, task: Task, qpos: Array, qvel: Array, extra: Any = None, mocap: Any = None) -> World:
+        """Return the world without forces."""
+        return at_rest(self.base, qpos, qvel, extra, mocap)
+
+    place = forward
+
+    def step(self, task: Task, world: World, ctrl: Array) -> World:
+        """Return the same world."""
+        return world
+
+    def touching(self, task: Task, qpos: Array) -> Array:
+        """Return that nothing touches."""
+        return jnp.bool_(False)
+
+    def require_variable(self, names: Iterable[str]) -> None:
+        """Allow tasks to differ in all fields."""
 
 
 def choose_engine(engine: str, preferred: str = "mjx") -> str:

@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from mtjax.agents.parts.gradients.quadratic import RIDGE, cosines, minimise
+from mtjax.agents.parts.gradients.quadratic import RIDGE, cosines, minimise, solve
 from mtjax.types import Array, InputError, Key
 
 NEWTON_STEPS = 25
@@ -151,15 +151,15 @@ class CAGrad(OfGram):
             x = minimise(matrix, slope, multiplier * budget)
             return x, jnp.sqrt(x @ matrix @ x)
 
-        def narrow(bracket: Array) -> tuple[Array, Array, Array]:
+        def narrow(bracket: Array, _) -> tuple[Array, tuple[Array, Array]]:
             multipliers = jnp.geomspace(bracket[0], bracket[1], CAGRAD_GRID)
             x, reach = jax.vmap(at)(multipliers)
             high = jnp.clip(jnp.sum(reach > radius), 1, CAGRAD_GRID - 1)
             pair = jnp.stack([high - 1, high])
-            return multipliers[pair], x[pair], reach[pair]
+            return multipliers[pair], (x[pair], reach[pair])
 
         widest = jnp.stack([jnp.float32(1e-3), jnp.max(lengths) / shortest]) / radius
-        _, x, reach = narrow(narrow(widest)[0])
+        _, (x, reach) = jax.tree.map(lambda x: x[-1], jax.lax.scan(narrow, widest, length=2))
         share = jnp.clip((reach[0] - radius) / jnp.maximum(reach[0] - reach[1], 1e-12), 0.0, 1.0)
         x = (1 - share) * x[0] + share * x[1]
         return (1 / len(gram) + length * present * x / norms) / (1 + radius**2)
@@ -211,7 +211,7 @@ class NashMTL(OfGram):
 
         def newton(y: Array, _) -> tuple[Array, None]:
             scaled = y[:, None] * matrix * y
-            step = jnp.linalg.solve(scaled + jnp.eye(len(y)), 1 - jnp.sum(scaled, axis=1))
+            step = solve(scaled + jnp.eye(len(y)), 1 - jnp.sum(scaled, axis=1)[:, None])[:, 0]
             return y * (1 + step / (1 + jnp.max(jnp.abs(step)))), None
 
         y, _ = jax.lax.scan(newton, jnp.ones(len(gram)), length=NEWTON_STEPS)
