@@ -134,9 +134,7 @@ def _family_figures(name: str) -> str:
     if rows := _rows(RESULTS / "h200-returns" / "table.md", 0, name):
         text += "\n### One H200, three seeds\n\n" + rows
         text += "\nThe [command](../results/returns.md#returns-within-minutes-of-training-on-one-h200-three-seeds).\n"
-    if rows := _rows(RESULTS / "h200-hip-bmdp" / "table.md", 0, name):
-        text += "\n### HiP-BMDP's split, one H200, ten seeds\n\n" + rows
-        text += "\nThe [command](../results/methods.md#every-agent-on-hip-bmdps-split-in-the-making).\n"
+    text += _methods(0, name)
     last = [row for row in _cpu_runs() if row["family"] == name][-1:]
     for row in last:
         text += f"\n### Two CPU cores, one seed\n\nsac-conditioned had a return of {float(row['return']):.0f} after "
@@ -195,6 +193,15 @@ def _settings(agent: Any) -> str:
     return text
 
 
+def _methods(column: int, name: str) -> str:
+    """Return the rows of the tables of all agents whose family (column 0) or agent (1) is ``name``."""
+    text = ""
+    for folder, title, place in _METHODS:
+        if rows := _rows(RESULTS / folder / "table.md", column, name):
+            text += f"\n### {title}\n\n{rows}\nThe [command](../results/methods.md#{place}).\n"
+    return text
+
+
 def _fields(cls: type) -> dict[str, str]:
     """Return the documentation of a dataclass's fields, its bases' included."""
     found: dict[str, str] = {}
@@ -215,9 +222,7 @@ def _agent_figures(name: str) -> str:
     if rows := _rows(RESULTS / "h200-returns" / "table.md", 1, name.upper()):
         text += "\n### One H200, three seeds\n\n" + rows
         text += "\nThe [command](../results/returns.md#returns-within-minutes-of-training-on-one-h200-three-seeds).\n"
-    if rows := _rows(RESULTS / "h200-hip-bmdp" / "table.md", 1, name):
-        text += "\n### HiP-BMDP's split, one H200, ten seeds\n\n" + rows
-        text += "\nThe [command](../results/methods.md#every-agent-on-hip-bmdps-split-in-the-making).\n"
+    text += _methods(1, name)
     costs = {machine: _cost(file, name) for machine, file in _COSTS.items()}
     if any(costs.values()):
         told = ", ".join(f"{cost:.2f} times sac on {machine}" for machine, cost in costs.items() if cost)
@@ -226,6 +231,14 @@ def _agent_figures(name: str) -> str:
     return f"\n## Figures\n{text}" if text else ""
 
 
+_METHODS = (
+    ("h200-methods", "All agents, one H200, ten seeds", "every-agent-with-its-preset-ten-seeds-one-h200"),
+    (
+        "h200-hip-bmdp",
+        "HiP-BMDP's split, one H200, ten seeds, shorter runs",
+        "an-earlier-shorter-table-on-hip-bmdps-split",
+    ),
+)
 _COSTS = {"one H200": "update-cost-h200-10-tasks.json", "two CPU cores": "update-cost-cpu.json"}
 
 

@@ -177,16 +177,16 @@ def wants_gpu(env_name: str) -> bool:
 
 
 def load_preset(env_name: str, name: str) -> dict[str, Any]:
-    """Read the tables of a preset from the family's file, else the domain's file, else the default file.
+    """Read the tables of a preset: those of the family's file, else its domain's, and others of the default file.
 
-    Mixtures use the default file.
+    Mixtures without a name use the default file.
     """
     folder = resources.files("mtjax") / "configs"
     words = [] if "+" in env_name else env_name.split("-")
     names = ["-".join(words[:n]) for n in range(len(words), 0, -1)]
-    file = next((f for n in [*names, "default"] if (f := folder / f"{n}.toml").is_file()), None)
-    assert file is not None, "the package lacks configs/default.toml"
-    return tomllib.loads(file.read_text())[name]
+    own = next((file for n in names if (file := folder / f"{n}.toml").is_file()), None)
+    read = lambda file: tomllib.loads(file.read_text()).get(name, {})
+    return read(folder / "default.toml") | ({} if own is None else read(own))
 
 
 def _device_preset() -> str:

@@ -165,7 +165,7 @@ def test_presets_name_only_what_there_is(file):
     """A word that is misspelt in a preset would otherwise be left out without a sign."""
     preset = tomllib.loads(file.read_text())
     assert set(preset.pop("wants_gpu", ())) <= set(ENVS)
-    assert set(preset) == {"cpu", "gpu"}
+    assert preset and set(preset) <= {"cpu", "gpu"}
     fields = lambda cls: {field.name for field in dataclasses.fields(cls)}
     known = {"plan": fields(Plan), "agent": set(settings_of(mtjax.agent("sac")))}
     known["training"] = known["agent"] | fields(Settings)
@@ -176,10 +176,18 @@ def test_presets_name_only_what_there_is(file):
 
 
 def test_preset_files_are_of_families_that_exist():
-    """Each is named after a family, its first words, or all families."""
-    words = [name.split("-") for name in ENVS]
+    """Each is named after a family, its first words, a benchmark, or all families."""
+    words = [name.split("-") for name in (*ENVS, *BENCHMARKS)]
     names = {"-".join(w[:n]) for w in words for n in range(1, len(w) + 1)} | {"default"}
     assert {file.name.removesuffix(".toml") for file in PRESET_FILES} <= names
+
+
+def test_a_familys_preset_adds_to_that_of_all():
+    own, common = load_preset("mt10", "gpu"), load_preset("+", "gpu")
+    assert own["brc"] != common["brc"] and {name: own[name] for name in common if name != "brc"} == {
+        name: tables for name, tables in common.items() if name != "brc"
+    }
+    assert load_preset("mt10", "cpu") == load_preset("+", "cpu")
 
 
 @pytest.mark.parametrize("preset", ("cpu", "gpu"))
