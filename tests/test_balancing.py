@@ -232,15 +232,23 @@ def softmax(x):
     return np.exp(x) / np.exp(x).sum()
 
 
-def test_famo_by_hand():
-    """Two tasks and three, over four updates, by the paper's formulas with z's slope written as a matrix."""
+@pytest.mark.parametrize("rate", [1.0, 0.3])
+def test_famo_by_hand(rate):
+    """Two tasks and three, over four updates, by the paper's formulas with z's slope written as a matrix.
+
+    At a rate of 1 weights are the paper's, else of running means that begin with the first losses.
+    """
+    update = quick(lambda memory, losses: FAMO(famo_rate=rate).weigh(memory, None, losses, KEY))  # type: ignore
     for num_tasks in (2, 3):
         before, after = np.random.default_rng(num_tasks).uniform(0.1, 3, (2, 4, num_tasks))
         memory, logits, adam = FAMO().init(num_tasks), np.zeros(num_tasks), Adam(0.025)
+        means = before[0]
         for old, new in zip(before, after, strict=True):
             z = softmax(logits)
-            weights = weigh(memory, jnp.float32(old))
-            np.testing.assert_allclose(weights, z / old / np.sum(z / old), rtol=1e-4)
+            means = means + rate * (old - means)
+            weights, memory = update(memory, jnp.float32(old))
+            np.testing.assert_allclose(weights, z / means / np.sum(z / means), rtol=1e-4)
+            np.testing.assert_allclose(memory.losses, means, rtol=1e-5)
             slope = (np.diag(z) - np.outer(z, z)) @ (np.log(old) - np.log(new)) + 1e-3 * logits
             logits = logits + adam(slope)
             memory = adapt(memory, jnp.float32(old), jnp.float32(new))
@@ -257,9 +265,34 @@ def test_famo_s_weights_by_hand():
     np.testing.assert_allclose(weigh(memory, jnp.float32([1, 1])), [1 / (1 + ratio), ratio / (1 + ratio)], rtol=1e-5)
 
 
+def test_famo_learns_what_rare_batches_say():
+    """Two tasks estimate a mean of 0.05 from batches: one in twenty is 1, the others 0, and the ones never coincide.
+
+    Weights by a batch's own losses pass over the ones, as their loss is the largest.
+    """
+    targets = np.zeros((4000, 2), np.float32)
+    targets[0::20, 0] = targets[10::20, 1] = 1
+
+    def estimate(rate):
+        rule = FAMO(famo_rate=rate)
+
+        def update(carry, target):
+            point, memory = carry
+            loss = lambda point: 1e-4 + jnp.square(point - target)
+            weights, memory = rule.weigh(memory, None, loss(point), KEY)  # type: ignore
+            moved = point - 0.01 * weights * 2 * (point - target)
+            return (moved, rule.adapt(memory, loss(point), loss(moved))), moved
+
+        run = quick(lambda: jax.lax.scan(update, (jnp.zeros(2), rule.init(2)), targets))
+        return np.mean(run()[1][-1000:], axis=0)
+
+    np.testing.assert_allclose(estimate(FAMO().famo_rate), 0.05, atol=0.01)
+    assert np.all(estimate(1.0) < 0.01)
+
+
 def test_famo_lowers_log_losses_at_one_rate():
     """Losses x^2 and y^2 from (1, 3) fall as z / x^2 and z / y^2: nine to one at first, alike once z is as they are."""
-    rule = FAMO(weight_lr=0.005, famo_decay=0.0)
+    rule = FAMO(weight_lr=0.005, famo_decay=0.0, famo_rate=1.0)
 
     def update(carry, _):
         point, memory = carry
@@ -299,7 +332,7 @@ def test_famo_does_not_depend_on_scale_or_order():
 
 
 def test_an_absent_task_has_no_say_in_famo():
-    """A loss of zero has no weight, and does not learn; others' weights are those they have alone."""
+    """A loss of zero has no weight, and is not learned from; others' weights are those they have alone."""
     before, after = jnp.float32([1, 3]), jnp.float32([0.9, 2.0])
     alone = adapt(FAMO().init(2), before, after)
     memory = FAMO().init(3)._replace(logits=jnp.float32([0, 0.7, 0]))
@@ -307,6 +340,8 @@ def test_an_absent_task_has_no_say_in_famo():
     np.testing.assert_allclose(with_absent.logits, [alone.logits[0], 0.7, alone.logits[1]], rtol=1e-4)
     weights = weigh(with_absent, jnp.float32([1, 0, 3]))
     np.testing.assert_allclose(weights, np.insert(weigh(alone, before), 1, 0), rtol=1e-4)
+    _, memory = FAMO().weigh(memory._replace(losses=jnp.full(3, 2.0)), None, jnp.zeros(3), KEY)  # type: ignore
+    np.testing.assert_array_equal(memory.losses, 2)  # its running mean waits for it
 
 
 def test_famo_without_losses_is_the_mean():
@@ -341,6 +376,7 @@ def test_an_actor_s_losses_are_averaged_under_famo():
         (FAMO, {"weight_lr": float("nan")}, "weight-lr must be greater than 0, not nan"),
         (GradNorm, {"gradnorm_asymmetry": -0.1}, "gradnorm-asymmetry must be at least 0, not -0.1"),
         (FAMO, {"famo_decay": -1.0}, "famo-decay must be at least 0, not -1.0"),
+        (FAMO, {"famo_rate": 0.0}, r"famo-rate must be in \(0, 1\], not 0.0"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(rule, settings, message):

@@ -35,6 +35,7 @@ class Logits(NamedTuple):
 
     logits: Array  # (T,)
     optimizer: Any  # state of their optimiser
+    losses: Array  # (T,) running means; 0 before the first
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,37 +115,51 @@ class GradNorm(_Learned):
 class FAMO(_Learned):
     """FAMO learns weights that lower all losses' logarithms at one rate (Liu et al. 2023, algorithm 1).
 
-    With the losses l of a batch before the update and l' after it, and logits x:
-        z = softmax(x),  w_i = (z_i / l_i) / sum_j (z_j / l_j)                     (weights of the update)
+    With the losses l of a batch before the update and l' after it, running means m of l, and logits x:
+        m <- m + rate (l - m),  at first m = l
+        z = softmax(x),  w_i = (z_i / m_i) / sum_j (z_j / m_j)                     (weights of the update)
         x descends  z_i (d_i - z . d) + decay x_i,  d = log l - log l'             (the losses' part: d by z's slope)
     It needs no gradients of single tasks. Losses are counted from their lower bound, as in its authors' code. The
     actor's losses have no such bound, and are averaged.
 
-    Differs from the paper: x descends by Adam, as in its authors' code; algorithm 1 has a plain step of the same size,
-    which would leave z nearly uniform, as a critic's losses change slowly. Parameters of one task are not weighted.
+    Differs from the paper: w divides by running means of the losses. Algorithm 1 divides by the losses l of all data,
+    and its authors' code by those of a batch (``famo_rate`` = 1). Where rewards are rare, a batch with a reward has a
+    loss hundreds of times that of others, so it would get almost no weight, and the critic would not learn of rewards.
+    MINE divides by a running mean for the same reason (Belghazi et al. 2018, section 3.2): the gradient of the
+    logarithm of a batch's mean is biased. x descends by Adam, as in the authors' code; algorithm 1 has a plain step of
+    the same size, which would leave z nearly uniform, as a critic's losses change slowly. Parameters of one task are
+    not weighted.
     """
 
     needs = "losses"
     famo_decay: float = 1e-3
     """How strongly FAMO's weights return to equal ones. Its authors: 1e-3 for MT10."""
+    famo_rate: float = 0.01
+    """Step of the losses' running means towards a batch's losses; 1 weighs by the batch's alone, as its authors do."""
 
     def __post_init__(self):
         super().__post_init__()
         parts.require_not_negative(self, "famo_decay")
+        parts.require_rates(self, "famo_rate")
 
     def init(self, num_tasks: int) -> Logits:
         logits = jnp.zeros(num_tasks)
-        return Logits(logits, self.optimizer.init(logits))
+        return Logits(logits, self.optimizer.init(logits), jnp.zeros(num_tasks))
 
     def weigh(self, memory: Logits, gram: Array, losses: Array, key: Key) -> tuple[Array, Logits]:
-        return jax.nn.softmax(jnp.where(losses > 0, memory.logits - _log(losses), NEVER)), memory
+        present = losses > 0
+        rate = jnp.where(memory.losses > 0, self.famo_rate, 1.0)
+        means = jnp.where(present, (1 - rate) * memory.losses + rate * losses, memory.losses)
+        weights = jax.nn.softmax(jnp.where(present, memory.logits - _log(means), NEVER))
+        return weights, memory._replace(losses=means)
 
     def adapt(self, memory: Logits, before: Array, after: Array) -> Logits:
         present = (before > 0) & (after > 0)
         z = jax.nn.softmax(jnp.where(present, memory.logits, NEVER))
         gain = jnp.where(present, _log(before) - _log(after), 0.0)
         slope = z * (gain - jnp.sum(z * gain)) + self.famo_decay * memory.logits
-        return Logits(*self.step(memory.logits, slope, memory.optimizer, present))
+        logits, optimizer = self.step(memory.logits, slope, memory.optimizer, present)
+        return memory._replace(logits=logits, optimizer=optimizer)
 
     @property
     def for_actor(self) -> Mean:
