@@ -1,7 +1,7 @@
 """Measure how well and how fast agents learn: every agent on every family, many seeds in one program each.
 
     python benchmarks/learning.py [--envs NAME ...] [--agents NAME ...] [--seeds 10] [--steps N] [--split NAME]
-                                  [--baseline NAME] [--out DIR]
+                                  [--env NAME=VALUE ...] [--baseline NAME] [--out DIR]
 
 Without further flags it is the whole table: every agent on six families with its preset, on the splits and for the
 steps of ``FAMILIES``; agents whose subject is pictures are left out. Every pair of family and agent writes
@@ -27,6 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 from report import markdown
+from returns import value
 
 import mtjax
 from mtjax.evaluation import load_evaluations, save_evaluations
@@ -81,6 +82,7 @@ def main() -> None:
     parser.add_argument("--split", help="by default that of FAMILIES, else the family's")
     parser.add_argument("--evaluations", type=int, default=4)
     parser.add_argument("--eval-episodes", type=int, default=10)
+    parser.add_argument("--env", nargs="*", default=[], metavar="NAME=VALUE", help="settings of families: pixels=64")
     parser.add_argument("--vary", nargs="*", default=[], metavar="NAME=VALUES", help="besides what the family varies")
     parser.add_argument("--training", nargs="*", default=[], metavar="NAME=N", help="such as num_envs=64")
     parser.add_argument("--mark", type=float, default=900.0, help="the return whose time is told")
@@ -101,7 +103,8 @@ def learn(arguments: argparse.Namespace, env: str, agent: str) -> None:
     trial = FAMILIES.get(env, Trial())
     split = arguments.split or trial.split
     settings = {"vary": dict(pair.split("=", 1) for pair in arguments.vary)} | ({"split": split} if split else {})
-    program = mtjax.preset(env, agent, arguments.preset, **settings)
+    settings |= {name: value(x) for name, x in (pair.split("=", 1) for pair in arguments.env)}
+    program = mtjax.preset(env, agent, arguments.preset, _seeing(agent, settings), **settings)
     given = trial.replay_steps if isinstance(program.learner.experience, Replay) else trial.rollout_steps
     steps = arguments.steps or given or program.plan.steps
     training = {name: int(value) for name, value in (pair.split("=", 1) for pair in arguments.training)}
@@ -120,6 +123,12 @@ def learn(arguments: argparse.Namespace, env: str, agent: str) -> None:
     if not result.finished:
         raise SystemExit(f"stopped before {agent} on {env} was finished; the same command goes on with it")
     save(arguments.out / env, agent, result)
+
+
+def _seeing(agent: str, settings: dict) -> dict[str, str]:
+    """Return the settings by which an agent learns from pictures, if it has to and does not by itself."""
+    plain = mtjax.agent(agent).representation == mtjax.agent("sac").representation
+    return {"representation": "encoded"} if "pixels" in settings and plain else {}
 
 
 def save(folder: Path, agent: str, result: Result) -> None:

@@ -1,13 +1,13 @@
 """Run a suite of tasks by its name, with its protocol: agents, seeds, steps, and the figures that the field reports.
 
-    python benchmarks/suite.py mt10|mt50|dynamics|goals|domains|hard [--agents NAME ...] [--seeds N]
-                               [--steps-per-task N] [--training NAME=N ...] [--out DIR]
+    python benchmarks/suite.py mt10|mt50|dynamics|goals|domains|hard|pixels [--agents NAME ...] [--seeds N]
+                               [--steps-per-task N] [--training NAME=N ...] [--env NAME=VALUE ...] [--out DIR]
 
 ``--list`` prints the protocols. Every pair of environment and agent writes ``DIR/ENV/AGENT.csv`` (training over steps
 and seconds) and ``AGENT.npz`` (every episode of every evaluation: returns and, where tasks have it, success). Finished
 pairs are not run again, so that a long suite runs in parts. All results in DIR together give ``scores.md`` (means over
-tasks with 95% intervals over seeds), ``tasks.csv`` (every task and seed of the last evaluation) and, for suites that
-compare one agent for all tasks with one for each, ``sharing.md``.
+tasks with 95% intervals over seeds, for every split), ``tasks.csv`` (every training task and seed of the last
+evaluation) and, for suites that compare one agent for all tasks with one for each, ``sharing.md``.
 
 Success is that of the last evaluation: at the episode's last step, and at any step. Both are shares of episodes.
 """
@@ -29,6 +29,7 @@ from mtjax.names import InputError
 from mtjax.report.stats import seed_interval, unpaired_difference
 from mtjax.training.log import append_rows
 from mtjax.training.programs import enable_compile_cache
+from mtjax.types import SPLITS
 
 _HARD = ("dog-stand", "dog-walk", "dog-trot", "dog-run", "humanoid-stand", "humanoid-walk", "humanoid-run")
 _DOMAINS = (
@@ -56,6 +57,8 @@ class Suite:
     seeds: int = 10
     split: str | None = None
     together: str = ""  # the environment of all tasks, where others are its tasks alone
+    settings: tuple[str, ...] = ()  # of the environments
+    training: tuple[str, ...] = ()  # of the loop and the agents, in place of the presets'
 
 
 SUITES = {
@@ -98,16 +101,28 @@ SUITES = {
         5,
         together="+".join(_HARD),
     ),
+    "pixels": Suite(
+        "two families from pictures of 64 x 64, three frames, actions for two steps, on HiP-BMDP's split (Zhang et al. "
+        "2021 learned the same families from pictures)",
+        ("finger-spin-vary-size", "cheetah-run-vary-torso-length"),
+        ("drq", "sac-ae", "deepmdp", "hip-bmdp", "care"),
+        500_000,
+        3,
+        split="hip-bmdp",
+        settings=("pixels=64", "frames=3", "repeat=2"),
+        training=("num_envs=64", "updates_per_step=4", "batch_size=64", "replay_size=100000"),
+    ),
 }
 
 
 class Last(NamedTuple):
-    """Holds the last evaluation of a run's training tasks."""
+    """Holds the last evaluation of a run: of its training tasks, and returns of all."""
 
     labels: list[str]  # (T,)
     returns: np.ndarray  # (S, T)
     success: np.ndarray | None  # (S, T) at the last step of episodes
     ever: np.ndarray | None  # (S, T) at any step
+    splits: dict[str, np.ndarray]  # (S, T) returns by split, without empty ones
 
 
 def main() -> None:
@@ -121,6 +136,7 @@ def main() -> None:
     parser.add_argument("--steps-per-task", type=int, help="by default the suite's")
     parser.add_argument("--preset", default="auto")
     parser.add_argument("--training", nargs="*", default=[], metavar="NAME=N", help="such as num_envs=64")
+    parser.add_argument("--env", nargs="*", default=[], metavar="NAME=VALUE", help="settings of families: pixels=64")
     parser.add_argument("--evaluations", type=int, default=4)
     parser.add_argument("--eval-episodes", type=int, default=50, help="of each task; Meta-World's tasks have 50 goals")
     parser.add_argument("--out", type=Path)
@@ -148,14 +164,22 @@ def request(arguments: argparse.Namespace, suite: Suite, env: str, out: Path) ->
     """Return what ``learning.learn`` reads: the suite's protocol, and what was given beside it."""
     steps = (arguments.steps_per_task or suite.steps_per_task) * mtjax.make(env).train_count
     given = {"seeds": arguments.seeds or suite.seeds, "steps": steps, "split": suite.split, "vary": [], "out": out}
+    given |= {"env": [*suite.settings, *arguments.env], "training": [*suite.training, *arguments.training]}
     return argparse.Namespace(**{**vars(arguments), **given})
 
 
 def last_of(env: str, evaluations: Evaluations) -> Last:
     """Return the last evaluation, averaged over episodes."""
-    mean = lambda x: np.asarray(x["train"])[:, -1].mean(axis=-1)
-    of = lambda name: mean(evaluations.metrics[name]) if name in evaluations.metrics else None
-    return Last(mtjax.make(env).labels("train"), mean(evaluations.returns), of("success"), of("success_ever"))
+    metrics = evaluations.metrics
+    of = lambda name: np.asarray(metrics[name]["train"])[:, -1].mean(axis=-1) if name in metrics else None
+    splits = learning.last_scores(evaluations)
+    return Last(labels(env, splits["train"].shape[1]), splits["train"], of("success"), of("success_ever"), splits)
+
+
+def labels(env: str, count: int) -> list[str]:
+    """Return the names of an environment's training tasks, or their numbers if a split gave it fewer."""
+    found = mtjax.make(env).labels("train")
+    return found if len(found) == count else [str(t) for t in range(count)]
 
 
 def found(out: Path) -> Iterator[tuple[str, str, Last]]:
@@ -168,7 +192,8 @@ def tabulate(out: Path, suite: Suite) -> str:
     """Write the tables of all finished pairs, and return that of scores."""
     lines, rows = [], []
     for env, agent, last in found(out):
-        cells = [score(x, form) for x, form in ((last.returns, ".0f"), (last.success, ".3f"), (last.ever, ".3f"))]
+        cells = [score(last.splits.get(split), ".0f") for split in SPLITS]
+        cells += [score(x, ".3f") for x in (last.success, last.ever)]
         lines.append([short(env), agent, str(len(last.returns)), *cells])
         rows += [
             {"env": env, "agent": agent, "task": label, "seed": s, "return": f"{last.returns[s, t]:.1f}"}
@@ -176,7 +201,8 @@ def tabulate(out: Path, suite: Suite) -> str:
             for s in range(len(last.returns))
             for t, label in enumerate(last.labels)
         ]
-    table = markdown(["environment", "agent", "seeds", "return", "success at the end", "success at any step"], lines)
+    head = ["environment", "agent", "seeds", "return", *SPLITS[1:], "success at the end", "success at any step"]
+    table = markdown(head, lines)
     (out / "scores.md").write_text(table + "\n")
     (out / "tasks.csv").unlink(missing_ok=True)
     append_rows(out / "tasks.csv", rows)

@@ -188,8 +188,8 @@ def test_a_suite_reports_success_and_what_sharing_is_worth(script, tmp_path):
         (tmp_path / env).mkdir()
         save_evaluations(tmp_path / env / "brc.npz", evaluations)
     table = suite.tabulate(tmp_path, suite.Suite("", (together,), ("brc",), 1, together=together))
-    assert "| 2 families | brc | 3 | 20 [20, 20] | 0.250 [0.250, 0.250] | 1.000 [1.000, 1.000] |" in table
-    assert "| walker-run | brc | 3 | 25 [25, 25] | - | - |" in table
+    assert "| 2 families | brc | 3 | 20 [20, 20] | - | - | 0.250 [0.250, 0.250] | 1.000 [1.000, 1.000] |" in table
+    assert "| walker-run | brc | 3 | 25 [25, 25] | - | - | - | - |" in table
     sharing = (tmp_path / "sharing.md").read_text()
     assert "| walker-walk | brc | 10 [10, 10] | 25 [25, 25] | -15 [-15, -15] |" in sharing
     assert "| walker-run | brc | 30 [30, 30] | 25 [25, 25] | +5 [+5, +5] |" in sharing

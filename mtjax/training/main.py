@@ -21,6 +21,7 @@ from mtjax.types import InputError
 
 def main(argv: Sequence[str], parse: Callable[[Sequence[str]], RunConfig]) -> None:
     """Start or resume a run or a sweep. ``parse`` reads the command line."""
+    memory.share_arenas()
     if "--distributed" in argv:
         hosts.initialise()  # before anything looks at the devices
     if sweep.is_sweep(argv):

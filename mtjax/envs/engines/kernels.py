@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-_MOST_THREADS = 8
+_MOST_THREADS = 16
 
 
 def compile_kernels(device: Any, launch: Callable[[], Any]) -> None:
@@ -16,7 +16,7 @@ def compile_kernels(device: Any, launch: Callable[[], Any]) -> None:
 
     with warp.ScopedDevice(device), _only_noting(warp) as noted:
         launch()
-    with ThreadPoolExecutor(min(_MOST_THREADS, os.cpu_count() or 1)) as pool:
+    with ThreadPoolExecutor(min(_MOST_THREADS, len(os.sched_getaffinity(0)))) as pool:
         for done in [pool.submit(module.load, device, block_dim) for module, block_dim in noted]:
             done.result()
 
