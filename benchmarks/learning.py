@@ -104,7 +104,7 @@ def learn(arguments: argparse.Namespace, env: str, agent: str) -> None:
     split = arguments.split or trial.split
     settings = {"vary": dict(pair.split("=", 1) for pair in arguments.vary)} | ({"split": split} if split else {})
     settings |= {name: value(x) for name, x in (pair.split("=", 1) for pair in arguments.env)}
-    program = mtjax.preset(env, agent, arguments.preset, _seeing(agent, settings), **settings)
+    program = mtjax.preset(env, agent, arguments.preset, seeing(agent, settings), **settings)
     given = trial.replay_steps if isinstance(program.learner.experience, Replay) else trial.rollout_steps
     steps = arguments.steps or given or program.plan.steps
     training = {name: int(value) for name, value in (pair.split("=", 1) for pair in arguments.training)}
@@ -125,7 +125,7 @@ def learn(arguments: argparse.Namespace, env: str, agent: str) -> None:
     save(arguments.out / env, agent, result)
 
 
-def _seeing(agent: str, settings: dict) -> dict[str, str]:
+def seeing(agent: str, settings: dict) -> dict[str, str]:
     """Return the settings by which an agent learns from pictures, if it has to and does not by itself."""
     plain = mtjax.agent(agent).representation == mtjax.agent("sac").representation
     return {"representation": "encoded"} if "pixels" in settings and plain else {}

@@ -204,6 +204,17 @@ def test_suites_name_only_what_there_is(script):
         assert names <= {*mtjax.ENVS, *BENCHMARKS}
 
 
+@pytest.mark.parametrize("agent", ["drq", "sac-ae", "deepmdp", "hip-bmdp", "care", "ppo"])
+def test_a_suites_agents_see_its_pictures(script, agent):
+    """Agents whose subject is something else encode the pictures."""
+    suite, learning = script("suite"), script("learning")
+    pixels = suite.SUITES["pixels"]
+    settings = {name: script("returns").value(x) for name, x in (pair.split("=") for pair in pixels.settings)}
+    program = mtjax.preset(pixels.envs[0], agent, "gpu", learning.seeing(agent, settings), **settings)
+    program.learner.require_sight(program.family.spec)
+    assert program.learner.representation.sees_pictures
+
+
 @with_scenes
 def test_scripted_policies_need_numpy_alone(script, monkeypatch):
     """The package's own imports, such as Gymnasium's environments, stay out."""
