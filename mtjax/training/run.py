@@ -354,6 +354,7 @@ class _Run:
             require_finite_parameters(state.agent, iteration, self.records.last)
         self.exchange.finish(iteration)
         self.records.save(state)
+        memory.give_back_pages()
 
     def _evaluate(self, program: Callable, state: TrainState, past: Evaluations, steps: int, diverged) -> Evaluations:
         """Evaluate on all splits, and append the result to the run's evaluations."""
