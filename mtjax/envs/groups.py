@@ -1,4 +1,4 @@
-"""Which families of a mixture share a simulator."""
+"""The families of a mixture in groups that share a simulator."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -16,7 +16,7 @@ _MOST_DOFS = 32  # of a union: beyond them Warp's matrices are sparse, and its f
 
 
 def grouped(families: Sequence[Family], scenes: str = "auto") -> tuple[Group, ...]:
-    """Return all families, those in one group that share a simulator (``Mixture.scenes``)."""
+    """Return all families in groups. Those of one group share a simulator (``Mixture.scenes``)."""
     rest = dict(enumerate(families))
     if scenes == "apart":
         return tuple(Alone({i: family}) for i, family in rest.items())
@@ -40,7 +40,7 @@ def _try(kind: type[Joined], members: Mapping[int, Any]) -> list[Group]:
 
 
 def _unions(families: Mapping[int, Family], scenes: str) -> list[dict[int, Domain]]:
-    """Return the families of each union: those with the same frame, as many as have room."""
+    """Return the families of each union: some that have the same frame, as many as it has room for."""
     alike: dict[Any, dict[int, tuple[Domain, Scene]]] = {}
     for i, family in families.items():
         if isinstance(family, Domain) and _may_unite(family, scenes):
@@ -72,7 +72,7 @@ def _settings(family: Domain) -> Any:
 
 
 def _shared_out(candidates: Mapping[int, tuple[Domain, Scene]]) -> list[dict[int, Domain]]:
-    """Share families out among unions, each into the one that it makes the least larger."""
+    """Share families out among unions, each into the one that grows least by it."""
     unions: list[tuple[dict[int, Domain], dict[bytes, int]]] = []
     for i, (family, scene) in candidates.items():
         dofs = {kind: len(thing.parts["dof"]) for kind, thing in scene.things.items()}

@@ -16,7 +16,7 @@ import numpy as np
 from mtjax.envs.fields import FIXED, VARIABLE
 from mtjax.types import InputError
 
-_REFERENCES = ("actuator_trnid", "eq_obj1id", "eq_obj2id")  # numbers of things, which scenes count each in its own way
+_REFERENCES = ("actuator_trnid", "eq_obj1id", "eq_obj2id")  # numbers of parts, which every scene counts in its own way
 _of = lambda names, *firsts: [name for name in names if name.replace(".", "_").split("_")[0] in firsts]
 _NUMBERS = [name for name in _of(VARIABLE, "body", "jnt", "dof", "geom", "site") if name != "geom_matid"]
 _STRUCTURE = """
@@ -40,12 +40,12 @@ class Thing(NamedTuple):
     """A body of the world and all that hangs on it, in one scene."""
 
     kind: bytes  # equal for things that differ in nothing but their place
-    parts: dict[str, np.ndarray]  # "body", "jnt", "dof", "geom", "site", "qpos" -> their numbers in the scene
+    parts: dict[str, np.ndarray]  # numbers in the scene of its "body", "jnt", "dof", "geom", "site" and "qpos"
     free: bool  # whether it moves without a joint that holds it
 
 
 class Sensor(NamedTuple):
-    """A sensor by what it is of, and not by the numbers that one scene gives to this."""
+    """A sensor, told by the thing and the part that it reads, as their numbers differ between scenes."""
 
     kind: int
     of: tuple[int, Address]  # the kind of MuJoCo's object, and where it is
@@ -62,7 +62,7 @@ class Scene:
 
     @cached_property
     def things(self) -> dict[bytes, Thing]:
-        """Return the things by kind, in the order of their bodies. Further ones of a kind count as other kinds."""
+        """Return the things by kind, in the order of their bodies. A second one of a kind counts as another kind."""
         found: dict[bytes, Thing] = {}
         for body in np.flatnonzero(self.model.body_parentid[1:] == 0) + 1:
             parts = _parts(self.model, int(body))

@@ -1,4 +1,4 @@
-"""One scene with the things of several, and the places of each scene's numbers in it.
+"""One scene with the things of several scenes, and the places of each scene's numbers in it.
 
 Scenes share the things of one kind (``things``). So the arm and the table are there once, and two tasks with the same
 door have one door. A world uses the things of its own scene. All others are parked: far away, and far from each other.
@@ -40,7 +40,7 @@ def compose(families: Sequence[Domain]) -> Union:
     """Compose the union of families' scenes that have the same ``Scene.frame``.
 
     Raises:
-        InputError: MuJoCo makes something else of a thing in the union than in its own scene.
+        InputError: MuJoCo compiles a thing to other numbers in the union than in its own scene.
     """
     scenes = [Scene(family.models[0]) for family in families]
     spec, kinds = _gather(families, scenes)
@@ -100,7 +100,7 @@ def _keep_apart(spec: mujoco.MjSpec, model: mujoco.MjModel, *things: Thing) -> N
 
 
 def _park(union: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Put all things far away; return positions (nq,) and accelerations (nv,) of the free and of the hinged ones."""
+    """Put all things far away, and return their positions (nq,) and accelerations (nv,) there."""
     model, qpos = union.model, union.model.qpos0.copy()
     for i, thing in enumerate(union.things.values(), 1):
         place = [_FAR * i, 0, _FAR]

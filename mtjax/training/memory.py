@@ -29,8 +29,8 @@ _M_ARENA_MAX, _ARENAS = -8, 2  # of glibc's mallopt
 def share_arenas() -> None:
     """Let all threads of this process share two arenas of glibc's allocator.
 
-    By default each of XLA's and orbax's threads may have one, and keeps its free pages. A run's memory then grows for
-    half an hour, to twice the size. $MALLOC_ARENA_MAX, which glibc reads itself, holds if it is set.
+    By default each of XLA's and orbax's threads may have an arena of its own, which keeps its free pages. Then a run's
+    memory grows for half an hour, to twice the size. $MALLOC_ARENA_MAX, which glibc reads itself, holds if it is set.
     """
     if "MALLOC_ARENA_MAX" not in os.environ:
         with contextlib.suppress(OSError, AttributeError):  # another C library

@@ -118,7 +118,7 @@ class FAMO(_Learned):
     With the losses l of a batch before the update and l' after it, running means m of l, and logits x:
         m <- m + rate (l - m),  at first m = l
         z = softmax(x),  w_i = (z_i / m_i) / sum_j (z_j / m_j)                     (weights of the update)
-        x descends  z_i (d_i - z . d) + decay x_i,  d = log l - log l'             (the losses' part: d by z's slope)
+        x descends  z_i (d_i - z . d) + decay x_i,  d = log l - log l'             (first the gradient of z . d)
     It needs no gradients of single tasks. Losses are counted from their lower bound, as in its authors' code. The
     actor's losses have no such bound, and are averaged.
 

@@ -28,14 +28,14 @@ def solve(matrix: Array, sides: Array) -> Array:
     """Solve matrix x = sides for a symmetric, positive definite matrix (T, T) and sides (T, K).
 
     Elimination needs no pivots then. For few unknowns it is unrolled into arithmetic on single numbers, which a
-    compiler fuses into one kernel. LAPACK's counterpart on a GPU launches many, each longer than its work.
+    compiler fuses into one kernel. A GPU's library launches many kernels, which take longer to launch than to run.
     """
     size = len(matrix)
     if size > UNROLLED:
         return jnp.linalg.solve(matrix, sides)
     rows = [[*matrix[i], *sides[i]] for i in range(size)]
     for k, row in enumerate(rows):
-        for i in range(k + 1, size):  # what is left of the diagonal is known by symmetry
+        for i in range(k + 1, size):  # entries below the diagonal are known by symmetry
             factor = row[i] / row[k]
             rows[i][i:] = [x - factor * y for x, y in zip(rows[i][i:], row[i:], strict=True)]
     found: list[list[Array]] = []
