@@ -57,8 +57,9 @@ def on_files(files: Files, config: Any) -> Files:
     pages |= {"families/index.md": families_page(), "agents/index.md": agents_page()}
     for place, text in pages.items():
         files.append(File.generated(config, place, content=text))
-    for plot in RESULTS.glob("*.png"):
-        files.append(File.generated(config, f"results/plots/{plot.name}", abs_src_path=str(plot)))
+    for plot in RESULTS.rglob("*.png"):
+        place = plot.relative_to(RESULTS).as_posix()
+        files.append(File.generated(config, f"results/plots/{place}", abs_src_path=str(plot)))
     return files
 
 

@@ -18,6 +18,24 @@ _SECTIONS = (16, 32, 32)  # IMPALA's channels
 _ORTHOGONAL = nn.initializers.orthogonal(2**0.5)
 
 
+def orthogonal(key: Key, shape: Any, dtype: Any = jnp.float32) -> Array:
+    """Draw an orthogonal kernel of this shape; under ``vmap`` one after another.
+
+    JAX's QR decomposition of a batch waits for threads of the pool that it runs in. Two such batches at once, as of two
+    layers, wait for ever on two CPU cores (seen with jax 0.10.2).
+    """
+
+    @jax.custom_batching.custom_vmap
+    def draw(key: Key) -> Array:
+        return _ORTHOGONAL(key, shape, dtype)
+
+    @draw.def_vmap
+    def _(count: int, mapped: Any, keys: Key) -> tuple[Array, bool]:
+        return jax.lax.map(draw, keys), True
+
+    return draw(key)
+
+
 def as_numbers(pictures: Array) -> Array:
     """Return uint8 pictures as numbers in [-0.5, 0.5]."""
     return pictures.astype(jnp.float32) / 255.0 - 0.5
@@ -31,7 +49,7 @@ class Convolutions(nn.Module):
         """Map pictures (..., H, W, K) to features (..., F)."""
         x = as_numbers(pictures)
         for stride in (2, 1, 1, 1):
-            conv = nn.Conv(_FILTERS, (3, 3), (stride, stride), "VALID", kernel_init=_ORTHOGONAL)
+            conv = nn.Conv(_FILTERS, (3, 3), (stride, stride), "VALID", kernel_init=orthogonal)
             x = nn.relu(conv(x))
         return x.reshape(*x.shape[:-3], -1)
 
