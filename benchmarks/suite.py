@@ -168,30 +168,25 @@ def request(arguments: argparse.Namespace, suite: Suite, env: str, out: Path) ->
     return argparse.Namespace(**{**vars(arguments), **given})
 
 
-def last_of(env: str, evaluations: Evaluations) -> Last:
+def last_of(env: str, split: str | None, evaluations: Evaluations) -> Last:
     """Return the last evaluation, averaged over episodes."""
+    labels = mtjax.make(env, **({"split": split} if split else {})).labels("train")
     metrics = evaluations.metrics
     of = lambda name: np.asarray(metrics[name]["train"])[:, -1].mean(axis=-1) if name in metrics else None
     splits = learning.last_scores(evaluations)
-    return Last(labels(env, splits["train"].shape[1]), splits["train"], of("success"), of("success_ever"), splits)
+    return Last(labels, splits["train"], of("success"), of("success_ever"), splits)
 
 
-def labels(env: str, count: int) -> list[str]:
-    """Return the names of an environment's training tasks, or their numbers if a split gave it fewer."""
-    found = mtjax.make(env).labels("train")
-    return found if len(found) == count else [str(t) for t in range(count)]
-
-
-def found(out: Path) -> Iterator[tuple[str, str, Last]]:
+def found(out: Path, suite: Suite) -> Iterator[tuple[str, str, Last]]:
     """Return environment, agent and last evaluation of every finished pair."""
     for path in sorted(out.glob("*/*.npz")):
-        yield path.parent.name, path.stem, last_of(path.parent.name, load_evaluations(path))
+        yield path.parent.name, path.stem, last_of(path.parent.name, suite.split, load_evaluations(path))
 
 
 def tabulate(out: Path, suite: Suite) -> str:
     """Write the tables of all finished pairs, and return that of scores."""
     lines, rows = [], []
-    for env, agent, last in found(out):
+    for env, agent, last in found(out, suite):
         cells = [score(last.splits.get(split), ".0f") for split in SPLITS]
         cells += [score(x, ".3f") for x in (last.success, last.ever)]
         lines.append([short(env), agent, str(len(last.returns)), *cells])
@@ -213,7 +208,7 @@ def tabulate(out: Path, suite: Suite) -> str:
 
 def sharing(out: Path, suite: Suite) -> str:
     """Return a table of every task: one agent for all tasks against one for this task."""
-    pairs = {(env, agent): last for env, agent, last in found(out)}
+    pairs = {(env, agent): last for env, agent, last in found(out, suite)}
     lines = []
     for agent in suite.agents:
         for task in suite.together.split("+"):

@@ -185,8 +185,8 @@ def load_preset(env_name: str, name: str) -> dict[str, Any]:
     words = [] if "+" in env_name else env_name.split("-")
     names = ["-".join(words[:n]) for n in range(len(words), 0, -1)]
     own = next((file for n in names if (file := folder / f"{n}.toml").is_file()), None)
-    read = lambda file: tomllib.loads(file.read_text()).get(name, {})
-    return read(folder / "default.toml") | ({} if own is None else read(own))
+    read = lambda file: tomllib.loads(file.read_text())
+    return read(folder / "default.toml")[name] | ({} if own is None else read(own).get(name, {}))
 
 
 def _device_preset() -> str:

@@ -9,7 +9,7 @@ import pytest
 ALLOCATE = """
 import ctypes, re, sys, tempfile, threading
 if sys.argv[1] == "shared":
-    from mtjax.training.memory import share_arenas
+    from mtjax.training.allocator import share_arenas
     share_arenas()
 libc = ctypes.CDLL(None)
 libc.malloc.restype, libc.malloc.argtypes, libc.fopen.restype = ctypes.c_void_p, [ctypes.c_size_t], ctypes.c_void_p

@@ -158,7 +158,7 @@ def _kind(model: mujoco.MjModel, parts: dict[str, np.ndarray]) -> bytes:
 
 
 def _fields(model: mujoco.MjModel, parts: dict[str, np.ndarray], names: Iterable[str]) -> dict[str, np.ndarray]:
-    """Return the numbers of parts in some fields, and the meshes of those that are geoms."""
+    """Return some fields of a thing's parts, by name, and the corners of its meshes."""
     fields = {name: getattr(model, name)[parts[name.split("_")[0]]] for name in names}
     for i, geom in enumerate(parts["geom"]):
         if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:

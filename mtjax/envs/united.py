@@ -59,11 +59,12 @@ class United(Joined):
     def _models(self) -> list[mujoco.MjModel]:
         """Return the union's model of every row. Rows whose bodies are in the same places share one."""
         made: dict[bytes, mujoco.MjModel] = {}
-        for row in self._body_pos:
-            if row.tobytes() not in made:
-                made[row.tobytes()] = copy.copy(self.union.model)
-                made[row.tobytes()].body_pos[:] = row
-        return [made[row.tobytes()] for row in self._body_pos]
+        places = [row.tobytes() for row in self._body_pos]
+        for place, row in zip(places, self._body_pos, strict=True):
+            if place not in made:
+                made[place] = copy.copy(self.union.model)
+                made[place].body_pos[:] = row
+        return [made[place] for place in places]
 
     @cached_property
     def simulator(self) -> Engine:

@@ -1,7 +1,6 @@
 """Memory: how much a program needs, and how to split it into rounds that fit."""
 
 import contextlib
-import ctypes
 import dataclasses
 import math
 import os
@@ -23,24 +22,6 @@ from mtjax.types import Agent, Env, InputError
 _USABLE_SHARE = 0.9  # of the available memory, for one program
 _EXHAUSTED = re.compile("RESOURCE_EXHAUSTED|[Oo]ut of memory|allocate memory")
 _AGENT_COPIES = 3  # of the agent beside its state: gradients, steps, and the new state
-_M_ARENA_MAX, _ARENAS = -8, 2  # of glibc's mallopt
-
-
-def share_arenas() -> None:
-    """Let all threads of this process share two arenas of glibc's allocator.
-
-    By default each of XLA's and orbax's threads may have an arena of its own, which keeps its free pages. Then a run's
-    memory grows for half an hour, to twice the size. $MALLOC_ARENA_MAX, which glibc reads itself, holds if it is set.
-    """
-    if "MALLOC_ARENA_MAX" not in os.environ:
-        with contextlib.suppress(OSError, AttributeError):  # another C library
-            ctypes.CDLL(None).mallopt(_M_ARENA_MAX, _ARENAS)
-
-
-def give_back_pages() -> None:
-    """Give the allocator's free pages back to the system. Compiling leaves hundreds of megabytes of them."""
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).malloc_trim(0)
 
 
 def available_bytes() -> float:

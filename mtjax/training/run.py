@@ -21,7 +21,7 @@ from mtjax.evaluation import Evaluations
 from mtjax.loop import Settings, TrainState
 from mtjax.parallel import hosts
 from mtjax.parallel import mesh as meshes
-from mtjax.training import checkpoint, finetune, lock, log, memory, points
+from mtjax.training import allocator, checkpoint, finetune, lock, log, memory, points
 from mtjax.training.console import Clock, Console, describe_rounding, describe_running, describe_warmup, duration
 from mtjax.training.exchange import Exchange
 from mtjax.training.points import Point, Sweep, SweptAgent
@@ -354,7 +354,7 @@ class _Run:
             require_finite_parameters(state.agent, iteration, self.records.last)
         self.exchange.finish(iteration)
         self.records.save(state)
-        memory.give_back_pages()
+        allocator.give_back_pages()
 
     def _evaluate(self, program: Callable, state: TrainState, past: Evaluations, steps: int, diverged) -> Evaluations:
         """Evaluate on all splits, and append the result to the run's evaluations."""

@@ -16,7 +16,8 @@ def compile_kernels(device: Any, launch: Callable[[], Any]) -> None:
 
     with warp.ScopedDevice(device), _only_noting(warp) as noted:
         launch()
-    with ThreadPoolExecutor(min(_MOST_THREADS, len(os.sched_getaffinity(0)))) as pool:
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    with ThreadPoolExecutor(min(_MOST_THREADS, cores)) as pool:
         for done in [pool.submit(module.load, device, block_dim) for module, block_dim in noted]:
             done.result()
 
