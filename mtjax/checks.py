@@ -130,6 +130,6 @@ def path(value: Any, name: str = "directory") -> Path:
     Raises:
         InputError: the value is no path.
     """
-    if not isinstance(value, str | os.PathLike):
+    if not isinstance(value, str | os.PathLike) or not os.fspath(value):  # Path("") would be the working directory
         raise InputError(f"{name} must be a path, not {_shown(value)}")
     return Path(value)

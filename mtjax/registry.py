@@ -28,6 +28,8 @@ def register(name: str, thing: "type | str", **defaults: Any) -> None:
     if isinstance(thing, str):
         known, home = agents.preset_of(thing), sys._getframe(1).f_globals.get("__file__", "")
         return _register_agent(name, known._replace(defaults={**known.defaults, **defaults}, home=home))
+    if not isinstance(thing, type):
+        raise InputError(f"register takes a class, or the name of an agent, not {thing!r}")
     if issubclass(thing, Family):
         return envs.register(name, thing, **defaults)
     if issubclass(thing, BaseAgent):

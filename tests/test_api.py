@@ -115,6 +115,11 @@ WRONG = [
     ((ENV, "sac"), {"stagger": 1}, "stagger must be True or False, not 1"),
     ((ENV, "sac"), {"encoder": 3}, "encoder must be a name or a part of that kind, not 3"),
     ((ENV, "sac"), {"directory": 3}, "directory must be a path, not 3"),
+    ((ENV, "sac"), {"directory": ""}, "directory must be a path, not ''"),
+    ((ENV, "sac"), {"resume": "x", "directory": "x"}, "resume must be True or False, not 'x'"),
+    ((ENV, "sac"), {"quiet": "no"}, "quiet must be True or False, not 'no'"),
+    ((ENV, "sac"), {"wandb": True, "directory": "x"}, "wandb must be a text, not True"),
+    ((ENV, "sac"), {"vary": {"size": {}}}, "the values of size are lo:hi:n"),
     ((ENV, "sac"), {"resume": True}, "give directory as well"),
     ((ENV, "sac"), {"tensorboard": True}, "give directory as well"),
     ((ENV, "sac"), {"settings": {"num_envs": 3}}, "settings is a mtjax.Settings, not a dict"),
@@ -148,6 +153,13 @@ def test_wrong_arguments_are_refused_in_a_line(words, given, said, tmp_path, mon
         (lambda: mtjax.agent("sac", batch_size="7"), "batch_size must be a whole number, not '7'"),
         (lambda: mtjax.agent(3), "an agent is chosen by name"),
         (lambda: mtjax.load(3), "directory must be a path, not 3"),
+        (lambda: mtjax.make(ENV, vary={"size": [[1, 2], [3, 4]]}), "the values of size are"),
+        (lambda: mtjax.make(ENV, vary={"size": None}), "the values of size are"),
+        (lambda: mtjax.mixture("bandit"), "a mixture takes a list of families"),
+        (lambda: mtjax.mixture(3), "a mixture takes a list of families"),
+        (lambda: mtjax.stacked(mtjax.make("bandit")), "there is nothing to stack without pictures"),
+        (lambda: mtjax.stacked(3), "there is nothing to stack without pictures"),
+        (lambda: mtjax.register("mine", 3), "register takes a class, or the name of an agent, not 3"),
     ],
 )
 def test_other_functions_say_it_alike(make, said):
@@ -206,8 +218,9 @@ def test_a_policy_takes_one_task_and_one_observation(result):
     policy = result.policy()
     tasks = policy.env.tasks()
     one = jax.tree.map(lambda x: x[0], tasks)
-    with pytest.raises(InputError, match="takes one task, not Task"):
-        policy(np.zeros(9), tasks)
+    for wrong, said in ((tasks, "takes one task, not Task"), (None, "takes one task, not None")):
+        with pytest.raises(InputError, match=said):
+            policy(np.zeros(9), wrong)
     with pytest.raises(InputError, match=r"has shape \(9,\), not \(3, 9\); use jax.vmap for many"):
         policy(np.zeros((3, 9)), one)
     assert jax.vmap(policy, (0, None))(np.zeros((3, 9)), one).shape == (3, 2)

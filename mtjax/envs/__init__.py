@@ -4,7 +4,7 @@ import ast
 import dataclasses
 import re
 from collections import UserDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
@@ -297,6 +297,8 @@ def mixture(families: "Sequence[str | Family | Mixture]", scenes: str = "auto") 
         InputError: there is no family of a name, or a family is in the mixture twice.
     """
     cls = load("mtjax.envs.mixtures:Mixture")
+    if isinstance(families, str) or not isinstance(families, Iterable):
+        raise InputError(f"a mixture takes a list of families, such as ['bandit', 'finger-spin'], not {families!r}")
     named: list[tuple[str, Any]] = []
     for given in families:
         found = make(given) if isinstance(given, str) else given

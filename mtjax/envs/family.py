@@ -201,7 +201,7 @@ class Family(Flat, Tabled):
 
     def __post_init__(self):
         pairs = self.vary.items() if isinstance(self.vary, Mapping) else self.vary
-        object.__setattr__(self, "vary", tuple((str(n), variation.write_values(v)) for n, v in pairs))
+        object.__setattr__(self, "vary", tuple((str(n), variation.write_values(v, str(n))) for n, v in pairs))
         if self.context_ranges is not None:
             ranges = tuple((str(name), float(low), float(high)) for name, low, high in self.context_ranges)
             object.__setattr__(self, "context_ranges", ranges)

@@ -28,7 +28,7 @@ class Stacked(Flat):
 
     def __post_init__(self):
         require_family(self.family, "pictures are stacked for one family")
-        if not self.family.pixels:
+        if not getattr(self.family, "pixels", 0):
             raise InputError("there is nothing to stack without pictures; give pixels=64")
 
     def tasks(self, split: str = "train") -> Task:

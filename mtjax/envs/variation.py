@@ -45,11 +45,20 @@ class Variation(NamedTuple):
         return tuple(name for name, low, high in zip(self.names, self.low, self.high, strict=True) if low < high)
 
 
-def write_values(given: str | float | Sequence[float]) -> str:
-    """Return a parameter's values in the notation of the command line."""
+def write_values(given: str | float | Sequence[float], name: str = "a parameter") -> str:
+    """Return a parameter's values in the notation of the command line.
+
+    Raises:
+        InputError: they are neither text nor numbers.
+    """
     if isinstance(given, str):
         return given
-    points = np.atleast_1d(np.asarray(given, np.float64))
+    try:
+        points = np.atleast_1d(np.array(given, np.float64)) if given is not None else None
+    except (TypeError, ValueError):
+        points = None
+    if points is None or points.ndim > 1:
+        raise InputError(f"the values of {name} are {_FORMS}, or numbers; not {given!r}")
     return ",".join(repr(float(x)) for x in points)
 
 

@@ -9,21 +9,33 @@ from mtjax import agents
 from mtjax.agents import BaseAgent
 from mtjax.agents.choices import flag_names
 from mtjax.agents.choices import settings as settings_of
-from mtjax.checks import path
-from mtjax.config import Plan, RunConfig, configure, from_json, own_files, to_json, with_preset
+from mtjax.checks import checked, path
+from mtjax.config import Plan, RunConfig, configure, from_json, own_files, with_preset
 from mtjax.envs import BENCHMARKS, ENVS, is_mixture, make, members, name_of
 from mtjax.envs.family import Family, Tabled
 from mtjax.loop import Settings
 from mtjax.names import InputError, nearest_error
 from mtjax.parallel import hosts
 from mtjax.training import points
-from mtjax.training.folder import record_steps, require_unused, run_metadata
+from mtjax.training.folder import record_steps, require_unused, write_config
 from mtjax.training.launch import check, draw, launch
 from mtjax.training.points import Point, Sweep
 from mtjax.training.policy import Policy, load
 from mtjax.training.result import Result
 from mtjax.training.run import train as train_bare
 from mtjax.types import Agent, Env
+
+
+@dataclasses.dataclass(frozen=True)
+class _Told:
+    """Holds the types of those arguments of ``train`` that no configuration checks."""
+
+    resume: bool
+    profile: bool
+    tensorboard: bool
+    wandb: str
+    quiet: bool
+    label: str
 
 
 def train(
@@ -96,7 +108,8 @@ def train(
     found = points.grid(sweep)
     if on_chunk is not None and not callable(on_chunk):
         raise InputError(f"on_chunk is a function of a row of metrics, not {_kind(on_chunk)}")
-    told = {"quiet": quiet, "label": label, "on_chunk": on_chunk}
+    checked(_Told, {"resume": resume, "profile": profile, "tensorboard": tensorboard, "wandb": wandb})
+    told = {**checked(_Told, {"quiet": quiet, "label": label}), "on_chunk": on_chunk}
     if not isinstance(env, str | Tabled) or not isinstance(agent, str | BaseAgent):
         _require_learning(env, agent, directory)
         agent, settings = configure(agent, settings or Settings(), given)
@@ -230,7 +243,7 @@ def _prepare(config: RunConfig, directory: Path, resume: bool) -> Path:
     _require_names(config)
     require_unused(directory)
     directory.mkdir(parents=True, exist_ok=True)
-    file.write_text(to_json(config, run_metadata(config)))
+    write_config(directory, config)
     return directory
 
 

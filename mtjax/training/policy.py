@@ -48,7 +48,7 @@ class Policy:
             memory: the agent's memory of the episode, from ``begin`` and ``remember``. Only agents that infer their
                 task need it. None means that the episode has just begun.
         """
-        if np.ndim(task.id):
+        if not isinstance(task, Task) or np.ndim(task.id):
             raise InputError(f"policy(obs, task) takes one task, not {task!r}: jax.tree.map(lambda x: x[0], tasks)")
         wanted = jax.tree.map(lambda x: x.shape, self.takes)
         obs = {name: x for name, x in obs.items() if name in wanted} if frames.shown(obs) else obs
