@@ -180,6 +180,8 @@ def check_flags(argv: Sequence[str]) -> None:
 
 def unknown_flag(flag: str, known: Iterable[str]) -> InputError:
     """Return an error for an unknown flag. It names the nearest flag and points to --help for the rest."""
+    if flag == _VARY.removesuffix("."):
+        return InputError(f"{flag} needs the name of a parameter: {_VARY}NAME=VALUES; --list says what varies")
     return InputError(str(nearest_error("flag", flag, known)).split("choose from")[0] + "--help lists the flags")
 
 
@@ -289,7 +291,16 @@ def parse_with_tyro(cls: type[P], argv: Sequence[str], default: P, name: str) ->
         message = re.sub(r"^Error parsing ((plan|training|family|learner)[.\w]*: )?", "", _unframed(output.getvalue()))
         negated = r"^Unrecognized options: (--(\w+\.)*)no-(\S+).*"
         message = re.sub(negated, r"\1\3 is no switch that could be off; give it a value", message)
+        message = re.sub(r"^Unrecognized options: (?!-)(\S+).*", lambda found: _unread(found[1], argv), message)
         raise InputError(message or "the command line cannot be read; --help lists the flags") from None
+
+
+def _unread(value: str, argv: Sequence[str]) -> str:
+    """Return what is wrong with a word that belongs to no flag: a switch came with a value, or there is no flag."""
+    switch = next((word.split("=")[0] for word in argv if word.startswith("--") and word.endswith(f"={value}")), None)
+    if switch is not None:
+        return f"{switch} is a switch and takes no value; leave out {'=' + value!r}"
+    return f"{value!r} belongs to no flag; write --NAME=VALUE, and --help lists the names"
 
 
 def _unframed(text: str) -> str:

@@ -50,6 +50,8 @@ def main(argv: Sequence[str]) -> None:
 
 def _parse(argv: Sequence[str]) -> tuple[Request, dict[str, str]]:
     """Return the request, and the values of --env.vary.NAME=VALUES by name."""
+    if argv and not argv[0].startswith("-"):
+        raise InputError(f"say which run to evaluate by --run={argv[0]}")
     vary, argv = commands.vary_flags(commands.import_files(argv))
     names = [f.name.replace("_", "-") for f in dataclasses.fields(Request)]
     known = [*(f"--{name}" for name in names), "--no-video", "--no-diagnostics", "--help", "-h"]

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mtjax.names import InputError
+from mtjax.names import InputError, nearest_error
 
 FOLDER = Path(__file__).parent / "pretrained"
 FILE = "policy.npz"  # in the folder of such a policy, beside config.json
@@ -16,10 +16,17 @@ def names() -> list[str]:
 
 
 def folder(run: str | Path) -> Path:
-    """Return the folder of a run, or that of a trained policy of this name if there is no such folder."""
-    if not Path(run).is_dir() and str(run) in names():
+    """Return the folder of a run, or that of a trained policy of this name if there is no such folder.
+
+    Raises:
+        InputError: there is neither, and the name can only be meant for a trained policy.
+    """
+    place = Path(run)
+    if not place.is_dir() and str(run) in names():
         return FOLDER / run
-    return Path(run)
+    if len(place.parts) == 2 and not place.parent.exists():
+        raise nearest_error("run or trained policy", str(run), names())
+    return place
 
 
 def is_shipped(directory: Path) -> bool:

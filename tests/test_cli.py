@@ -278,7 +278,9 @@ def test_list_names_every_family_and_agent(capsys):
         ("--steps", "--steps"),
         ("--env", "--env needs a value"),
         ("--no-steps", "--steps is no switch"),
-        ("finger-spin", "finger-spin"),
+        ("finger-spin", "'finger-spin' belongs to no flag; write --NAME=VALUE"),
+        ("--profile=3", "--profile is a switch and takes no value; leave out '=3'"),
+        ("--env.vary=3", "--env.vary needs the name of a parameter: --env.vary.NAME=VALUES"),
         ("-x", "-x"),
         ("--agent.hidden wide", "wide"),
         ("--agent.hidden", "at least one layer"),
@@ -347,6 +349,7 @@ def test_messages_do_not_depend_on_the_terminal(complaint, monkeypatch, encoding
     [
         ("", "say which run to evaluate: --run=DIR"),
         ("--run=nowhere", "'nowhere' is not a run"),
+        ("runs/x --video", "say which run to evaluate by --run=runs/x"),
         ("--runs=x", "unknown flag '--runs'; did you mean '--run'?"),
         ("--run=x --episodes=0", "episodes must be at least 1"),
         ("--run=x --episodes=1000000", "and at most 100000, not 1000000"),
@@ -438,7 +441,7 @@ def test_running_out_of_memory_is_one_line():
 def test_place_that_cannot_be_written_is_refused(complaint, tmp_path):
     """A file where the folder of runs should be."""
     (tmp_path / "taken").write_text("")
-    assert "taken" in complaint("train", *SHORT_RUN, f"--runs={tmp_path / 'taken'}")
+    assert "taken' is a file, and runs need a folder" in complaint("train", *SHORT_RUN, f"--runs={tmp_path / 'taken'}")
 
 
 def test_full_disk_is_refused(complaint, tmp_path, monkeypatch):

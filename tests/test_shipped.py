@@ -73,7 +73,8 @@ def test_damaged_policies_are_refused(copied_run, package):
     with pytest.raises(InputError, match="is of another agent"):
         mtjax.load("a/b")
     shutil.rmtree(package / "a/b")
-    with pytest.raises(InputError, match="is not a run"):
+    ship.write(copied_run, package / "a/c")
+    with pytest.raises(InputError, match="unknown run or trained policy 'a/b'; did you mean 'a/c'"):
         mtjax.load("a/b")
 
 

@@ -210,6 +210,7 @@ class Family(Flat, Tabled):
             raise InputError("num-tasks and num-draws must be at least 1")
         if self.task_seed < 0:
             raise InputError(f"task-seed must be at least 0, not {self.task_seed}")
+        variation.require_known(self.combine, self.split)  # also where a family has tasks of its own making
         _ = self.variation
 
     # What a family gives.

@@ -133,9 +133,6 @@ def vary(
     Raises:
         InputError: a name is unknown, or the values do not fit each other or the split.
     """
-    for kind, value, allowed in (("combine", combine, COMBINATIONS), ("split", split, SCHEMES)):
-        if value not in allowed:
-            raise nearest_error(kind, value, allowed)
     for name in given:
         if not parameters:
             raise InputError(f"unknown parameter {name!r}; this family has none")
@@ -153,6 +150,13 @@ def vary(
     continuous = [i for i, axis in enumerate(axes.values()) if axis.continuous and combine != "random"]
     draws = _draw(rows["train"], continuous, low, high, num_draws, random) if continuous else None
     return Variation(names, rows, draws, low, high)
+
+
+def require_known(combine: str, split: str) -> None:
+    """Raise InputError unless parameters combine, and tasks are split, in a way that there is."""
+    for kind, value, allowed in (("combine", combine, COMBINATIONS), ("split", split, SCHEMES)):
+        if value not in allowed:
+            raise nearest_error(kind, value, allowed)
 
 
 def count_tasks(settings: Mapping[str, Any]) -> int:

@@ -51,7 +51,9 @@ def read(pattern: str | Path | Iterable[str | Path]) -> list[Found]:
     folders = [folder for each in given for folder in _folders(str(path(each, "runs")))]
     done = [folder for folder in dict.fromkeys(folders) if (folder / "evaluations.npz").exists()]
     if not done:
-        raise InputError(f"there is no run with an evaluation in {', '.join(map(str, given)) or 'an empty list'}")
+        above = next((each for each in map(str, given) if any(Path(each).glob("*/config.json"))), None)
+        hint = "" if above is None else f"; its folders hold runs: {str(Path(above) / '*')!r}"
+        raise InputError(f"there is no run with an evaluation in {', '.join(map(str, given)) or 'an empty list'}{hint}")
     return [_read(folder) for folder in done]
 
 

@@ -29,6 +29,8 @@ _LONGEST = 80
 def new_directory(root: Path, name: str) -> Path:
     """Make a new folder called ``name`` and the time, and return it."""
     stamp = time.strftime("%Y%m%d-%H%M%S")
+    if root.is_file():
+        raise InputError(f"{str(root)!r} is a file, and runs need a folder; choose another place with --runs")
     root.mkdir(parents=True, exist_ok=True)
     for attempt in range(1000):
         directory = root / (f"{name}-{stamp}" + (f"-{attempt}" if attempt else ""))
