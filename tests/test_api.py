@@ -16,7 +16,7 @@ import mtjax.train
 from mtjax import agents, checks, cli, envs
 from mtjax.config import Plan, from_json, with_preset
 from mtjax.loop import Settings
-from mtjax.training import api
+from mtjax.training import api, launch
 from mtjax.types import InputError
 
 SMALL = {"num_envs": 2, "chunk_steps": 25, "batch_size": 4, "replay_size": 200, "warmup_steps": 5, "hidden": (8, 8)}
@@ -42,6 +42,15 @@ def test_a_run_of_python_is_that_of_the_command_line(result, finished_run):
     ]
     names = lambda folder: {path.name for path in folder.iterdir()}
     assert names(result.directory) == names(finished_run)
+
+
+def test_its_curve_shades_random_actions(result, monkeypatch, tmp_path):
+    """Five steps of two environments of each task."""
+    drawn = []
+    monkeypatch.setattr(launch.figures, "learning_curve", lambda *given: drawn.append(given))
+    config = from_json(result.directory / "config.json")
+    launch.draw(config, result, tmp_path)
+    assert [given[-1] for given in drawn] == [5 * 2 * config.family.train_count]
 
 
 def test_its_folder_is_loaded_evaluated_and_resumed(result, copied_run, capsys):

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import errno
 import os
 import shlex
 import signal
@@ -23,7 +24,7 @@ from mtjax import loop
 from mtjax.config import from_json
 from mtjax.evaluation import Evaluations, evaluate, load_evaluations
 from mtjax.report import films, render, scoring
-from mtjax.report.tables import split_table
+from mtjax.report.tables import split_table, task_table
 from mtjax.training import checkpoint, launch
 from mtjax.types import InputError
 
@@ -340,6 +341,31 @@ def test_table_of_a_run_shows_splits_and_the_worst_task():
     assert split_table(Evaluations(np.arange(2), two, {})).splitlines()[1].split() == ["train", "2", "115", "25"]
     three = {"train": np.concatenate([two["train"], returns["train"] + 20])}
     assert "120  [110, 130]" in split_table(Evaluations(np.arange(2), three, {}))
+
+
+def test_tasks_of_several_parameters_are_told_by_their_values():
+    """In the table and in the file, not by numbers alone."""
+    env = mtjax.make("finger-spin", vary={"size": [1.0, 1.1], "mass": [0.5, 2.0]}, split="none")
+    scores = {"train": np.arange(4.0).reshape(1, 4, 1)}
+    head, *lines = task_table(types.SimpleNamespace(env=env), scores).splitlines()  # type: ignore
+    assert head.split()[:2] == ["split", "task"]
+    assert [line.split()[1:3] for line in lines[:2]] == [["size=1,mass=0.5", "0"], ["size=1,mass=2", "1"]]
+    assert lines[-1].split() == ["train", "all", "2"]
+    assert scoring._columns(env, "train")[2] == {"task": "2", "size": "1.1", "mass": "0.5"}
+    assert scoring._columns(mtjax.make("finger-spin", vary={"size": [1.0, 1.1]}), "train")[1] == {"size": "1.1"}
+
+
+def test_scores_are_printed_where_they_cannot_be_written(copied_run, capsys, monkeypatch):
+    """As in the run of a colleague."""
+
+    def refuse(run):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(run))
+
+    monkeypatch.setattr(scoring, "_new_folder", refuse)
+    monkeypatch.setattr(scoring, "score", lambda *_: {split: np.ones((2, len(x), 1)) for split, x in VALUES.items()})
+    with pytest.raises(PermissionError):
+        mtjax.evaluate.main([f"--run={copied_run}", "--episodes=1"])
+    assert "train" in capsys.readouterr().out
 
 
 # Training by the program.

@@ -86,6 +86,14 @@ def test_learning_curve_shows_means_bands_and_axes(drawn, tmp_path):
     assert axes.get_title() == "finger-spin"
 
 
+def test_random_actions_are_shaded(drawn, tmp_path):
+    """From the first step to where learning begins, and the legend says what that is."""
+    plot.learning_curve(tmp_path / "figure.png", STEPS, {"train": random_returns(1, 3, 1, 1)}, "", warmup=50)
+    (shade,) = drawn[0].patches
+    assert (shade.get_x(), shade.get_width()) == (0, 50)
+    assert drawn[0].get_legend_handles_labels()[1] == ["train (1 task)", "random actions"]
+
+
 def test_colour_of_a_split_does_not_depend_on_which_are_empty(drawn, tmp_path):
     draw_learning_curve(tmp_path / "one.png", 1)
     full = {split: random_returns(1, 3, 1, 1) for split in ("train", "interpolation", "extrapolation")}

@@ -104,6 +104,14 @@ def test_returns_lie_over_the_parameter_in_order(runs, tmp_path):
     assert axes.get_xlabel() == "size"
 
 
+def test_numbered_tasks_are_not_joined_by_a_line(make_run):
+    """As neighbours in number are none in the plane of two goals."""
+    axes = report.return_by_parameter(make_run("g", "point-mass-vary-goal", "sac"))
+    assert axes.get_xlabel() == "task [number]" and not axes.collections
+    assert all(line.get_linestyle() == "None" for line in axes.lines)
+    assert axes.get_legend_handles_labels()[1] == ["sac (3 seeds)"]
+
+
 def test_aggregates_are_those_of_all_tasks_of_all_families(runs, make_run):
     """Against the functions that compute them; an agent that lacks a family is refused."""
     found = collect.learned(runs)
@@ -169,6 +177,13 @@ def test_wrong_words_are_refused(words, said):
     with pytest.raises(InputError) as error:
         mtjax.plot.main(words)
     assert said in str(error.value)
+
+
+def test_a_folder_of_runs_is_told_how_to_give_them(runs):
+    """Which is what one types first."""
+    folder = runs.removesuffix("/*")
+    with pytest.raises(InputError, match=r"in \S+/runs; its folders hold runs: '\S+/runs/\*'"):
+        mtjax.plot.main([folder])
 
 
 def test_runs_are_tables(runs, make_run):

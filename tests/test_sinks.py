@@ -1,5 +1,6 @@
 """Metrics for TensorBoard and Weights & Biases, beside metrics.csv."""
 
+import re
 import sys
 import types
 
@@ -65,10 +66,12 @@ def test_tensorboard_writes_files_that_its_reader_reads(tmp_path):
     """By the real library."""
     pytest.importorskip("tensorboardX")
     found = sinks.open_sinks(tmp_path, True, "", 0, {})
-    sinks.write_rows(found, [{"seed": 0, "steps": 5, "return": "2.5", "loss": ""}], ["seed-0"])
+    row = {"seed": 0, "steps": 5, "return": "2.5", "loss": "", "td_error_0": "1", "td_error_12": "2"}
+    sinks.write_rows(found, [row], ["seed-0"])
     found[0].close()
     (file,) = (tmp_path / "tensorboard" / "seed-0").iterdir()
     assert b"return" in file.read_bytes() and b"loss" not in file.read_bytes()
+    assert {*re.findall(rb"td_error\w*/\d+", file.read_bytes())} == {b"td_error_by_task/0", b"td_error_by_task/12"}
 
 
 @pytest.mark.slow

@@ -25,7 +25,9 @@ _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")  # one more than colours, so
 DOTS_PER_INCH = 120
 
 
-def learning_curve(path: str | Path, steps: np.ndarray, returns: Mapping[str, np.ndarray], title: str) -> None:
+def learning_curve(
+    path: str | Path, steps: np.ndarray, returns: Mapping[str, np.ndarray], title: str, warmup: int = 0
+) -> None:
     """Draw return over environment steps, one line per split: the mean over seeds, tasks and episodes.
 
     Args:
@@ -33,11 +35,14 @@ def learning_curve(path: str | Path, steps: np.ndarray, returns: Mapping[str, np
         steps: (V,) environment steps at the evaluations.
         returns: split -> (S, V, T, E); an empty array is left out.
         title: title of the figure.
+        warmup: steps under random actions before learning begins, which are shaded.
     """
     figure, axes = _new_figure()
     for index, (split, values) in enumerate(returns.items()):
         if np.size(values):
             draw_curve(axes, steps, values, f"{split} ({_count(np.shape(values)[2], 'task')})", index)
+    if warmup:
+        axes.axvspan(0, warmup, color="0.93", zorder=0, label="random actions")
     label_steps(axes)
     axes.set_title(title)
     _save(figure, axes, path)

@@ -64,7 +64,8 @@ def families(runs: Any = "runs/*", split: str = "train") -> "list[Axes]":
 def return_by_parameter(runs: Any = "runs/*", ax: "Axes | None" = None) -> "Axes":
     """Draw each task's last mean return over its parameter, all splits in one line for each agent.
 
-    Training tasks are filled, held-out tasks are open. The range of training is shaded.
+    Training tasks are filled, held-out tasks are open. The range of training is shaded. Where several parameters vary,
+    tasks are numbered, and no line joins them.
     """
     found = _of_split(runs, "train")
     _require_one_family(found, "return_by_parameter", None)
@@ -73,8 +74,11 @@ def return_by_parameter(runs: Any = "runs/*", ax: "Axes | None" = None) -> "Axes
         splits = [split for split in SPLITS if one.returns[split].size]
         values = np.concatenate([one.values[split] for split in splits])
         scores = np.concatenate([one.final(split) for split in splits], axis=1)
-        order = np.argsort(values)
-        colour = figures.draw_line(axes, values[order], scores[:, order], _label(one), index, marker="")
+        order, colour = np.argsort(values), figures.colour(index)
+        if one.axis == ("task", "number"):
+            axes.plot([], [], "o", color=colour, label=_label(one))
+        else:
+            figures.draw_line(axes, values[order], scores[:, order], _label(one), index, marker="")
         for split in splits:
             filled = {"markerfacecolor": colour if split == "train" else "white", "color": colour, "markersize": 5}
             axes.plot(one.values[split], one.final(split).mean(axis=0), "o", **filled)

@@ -50,10 +50,10 @@ def report(request: Any, vary: Mapping[str, str]) -> None:
         tasks = policy.env.tasks("all")
     chosen = films.choose(policy.env, request.video_splits, request.video_tasks) if request.video else ()
     scores = score(policy, request.episodes, request.seed, tasks)
-    directory = _new_folder(_place(run))
-    print(task_table(policy, scores, named))
+    print(task_table(policy, scores, named), flush=True)
     if policy.agent.unseen:
         print(f"unseen tasks: {policy.agent.unseen}")
+    directory = _new_folder(_place(run))  # only now, as the run may be in a folder that others own
     _write(policy, {named.get(split, split): x for split, x in scores.items()}, directory, named)
     if found is not None:
         print(diagnostics.table(policy, found))
@@ -129,19 +129,27 @@ def _new_folder(run: Path) -> Path:
 
 
 def _write(policy: Policy, episodes: dict[str, np.ndarray], directory: Path, named: Mapping[str, str]) -> None:
-    env, (name, unit), many = policy.env, policy.env.task_axis, len(policy.env.parts) > 1
-    values = {named.get(split, split): env.task_values(split) for split in SPLITS}
-    labels = {split: list(map(number, x)) for split, x in values.items()}
-    labels = {named.get(split, split): env.labels(split) for split in SPLITS} if many else labels
+    env, (name, unit), called = policy.env, policy.env.task_axis, lambda split: named.get(split, split)
+    tasks = {called(split): _columns(env, split) for split in SPLITS}
     rows = [
-        {"split": split, name: label, "seed": int(seed), "episode": e, "return": number(x)}
+        {"split": split, **task, "seed": int(seed), "episode": e, "return": number(x)}
         for split, returns in episodes.items()
         for seed, of_seed in zip(policy.seeds, returns, strict=True)
-        for label, of_task in zip(labels[split], of_seed, strict=True)
+        for task, of_task in zip(tasks[split], of_seed, strict=True)
         for e, x in enumerate(of_task)
     ]
     append_rows(directory / "returns.csv", rows)
     file = directory / f"return_by_{name.replace('-', '_')}.png"
-    if many:
-        return figures.return_by_task(file, labels, episodes)
+    if len(env.parts) > 1:
+        return figures.return_by_task(file, {called(split): env.labels(split) for split in SPLITS}, episodes)
+    values = {called(split): env.task_values(split) for split in SPLITS}
     figures.return_by_parameter(file, name, unit, values, episodes)
+
+
+def _columns(env: Any, split: str) -> list[dict[str, str]]:
+    """Return what names each task of a split in a file: its value or number, and all values where several vary."""
+    if len(env.parts) > 1:
+        return [{env.task_axis[0]: label} for label in env.labels(split)]
+    values = env.params(split) if len(env.varied) > 1 else {}
+    found = [{env.task_axis[0]: number(x)} for x in env.task_values(split)]
+    return [one | {name: number(x[t]) for name, x in values.items()} for t, one in enumerate(found)]

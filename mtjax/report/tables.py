@@ -5,7 +5,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from mtjax.envs.family import Part
+from mtjax.envs.family import Family, Part
 from mtjax.evaluation import Evaluations
 from mtjax.report.stats import seed_interval
 from mtjax.training.policy import Policy
@@ -55,20 +55,29 @@ def task_table(policy: Policy, episodes: dict[str, np.ndarray], named: Mapping[s
     lines = []
     for part in parts:
         lines += [part.name] if part.name else []
-        lines.append(f"{'split':15} {part.family.task_axis[0]:>10} {'return':>7}   episodes from, to")
+        names = {split: _task_names(part.family, split) for split in episodes}
+        width = max(10, *(len(name) for own in names.values() for name in own))
+        lines.append(f"{'split':15} {part.family.task_axis[0]:>{width}} {'return':>7}   episodes from, to")
         for split, returns in episodes.items():
             own = returns[:, part.places[split]]
             if not own.size:
                 continue
-            for label, task in zip(part.family.labels(split), np.moveaxis(own, 1, 0), strict=True):
+            for name, task in zip(names[split], np.moveaxis(own, 1, 0), strict=True):
                 mean = _interval(task.mean(axis=-1, keepdims=True))
-                lines.append(f"{called(split):15} {label:>10} {mean:>7}   {task.min():.0f}, {task.max():.0f}")
-            lines.append(_all_line(called(split), own))
+                lines.append(f"{called(split):15} {name:>{width}} {mean:>7}   {task.min():.0f}, {task.max():.0f}")
+            lines.append(_all_line(called(split), own, width))
     if len(parts) > 1:
         lines.append("all families")
         lines += [_all_line(called(split), returns) for split, returns in episodes.items() if returns.size]
     return "\n".join(lines)
 
 
-def _all_line(split: str, returns: np.ndarray) -> str:
-    return f"{split:15} {'all':>10} {_interval(returns.mean(axis=-1)):>7}"
+def _all_line(split: str, returns: np.ndarray, width: int = 10) -> str:
+    return f"{split:15} {'all':>{width}} {_interval(returns.mean(axis=-1)):>7}"
+
+
+def _task_names(family: Family, split: str) -> list[str]:
+    """Return the value of the varied parameter in every task of a split; of several, each with its name."""
+    if len(family.varied) < 2:
+        return family.labels(split)
+    return [family.describe(row) for row in family.table.rows[split].tolist()]

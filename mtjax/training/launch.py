@@ -119,7 +119,12 @@ def draw(config: RunConfig, result: Result, directory: Path) -> None:
     known = {name: x for name, x in curves.items() if np.isfinite(x).all()}
     if known:
         title = f"{config.agent} on {short_name(config.env)}"
-        figures.learning_curve(directory / "curve.png", evaluations.steps, known, title)
+        figures.learning_curve(directory / "curve.png", evaluations.steps, known, title, warmup_of(config))
+
+
+def warmup_of(config: RunConfig) -> int:
+    """Return the environment steps of a run under random actions, before learning begins."""
+    return config.learner.experience.warmup_steps * config.family.train_count * config.training.num_envs
 
 
 def _origin(config: RunConfig) -> str:

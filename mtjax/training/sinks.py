@@ -1,6 +1,7 @@
 """Metrics of a run for TensorBoard and Weights & Biases, beside metrics.csv. Each seed is a run of its own there."""
 
 import importlib
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
@@ -8,6 +9,7 @@ from typing import Any, Protocol
 from mtjax.names import InputError
 
 _COUNTS = ("seed", "iteration", "steps")
+_OF_TASK = re.compile(r"(\w+)_(\d+)")  # a column of metrics.csv that is of one task
 
 
 class Sink(Protocol):
@@ -104,8 +106,12 @@ def open_sinks(
 
 
 def write_rows(sinks: Sequence[Sink], rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> None:
-    """Write rows of metrics, one for each of the runs in ``names``, to every sink. Empty entries are left out."""
+    """Write rows of metrics, one for each of the runs in ``names``, to every sink. Empty entries are left out.
+
+    Those of tasks are in a group for each metric: ``return_3`` is ``return_by_task/3``.
+    """
+    grouped = lambda key: _OF_TASK.sub(r"\1_by_task/\2", key)
     for sink in sinks:
         for name, row in zip(names, rows, strict=True):
-            numbers = {key: float(x) for key, x in row.items() if key not in _COUNTS and x != ""}
+            numbers = {grouped(key): float(x) for key, x in row.items() if key not in _COUNTS and x != ""}
             sink.write(name, int(row["steps"]), numbers)

@@ -25,7 +25,7 @@ from mtjax.report import figures
 from mtjax.report.stats import seed_interval
 from mtjax.training import checkpoint, lock, memory, points
 from mtjax.training.folder import new_directory, record_steps, resumed_config, short_name, write_config
-from mtjax.training.launch import check, launch, load_start
+from mtjax.training.launch import check, launch, load_start, warmup_of
 from mtjax.training.log import append_rows, number
 from mtjax.training.programs import enable_compile_cache
 from mtjax.types import SPLITS, InputError
@@ -246,9 +246,8 @@ def _draw(config: RunConfig, run: Path) -> None:
         if np.isfinite(returns).all():
             curves[", ".join(f"{name} {value}" for name, value in _values(config, point).items())] = returns
     if curves:
-        figures.learning_curve(
-            run / "curve.png", evaluations.steps, curves, f"{config.agent} on {short_name(config.env)}"
-        )
+        title = f"{config.agent} on {short_name(config.env)}"
+        figures.learning_curve(run / "curve.png", evaluations.steps, curves, title, warmup_of(config))
 
 
 def final_evaluations(config: RunConfig, run: Path) -> Evaluations | None:
