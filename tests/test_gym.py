@@ -250,7 +250,7 @@ def test_mtenvs_names_are_understood():
 @pytest.mark.parametrize(
     ("name", "settings", "message"),
     [
-        ("MT-MetaWorld-MT10-v0", {}, "Meta-World families are not part of mtjax yet"),
+        ("MT-MetaWorld-MT10-v0", {}, "each task of Meta-World is an environment here, such as 'metaworld-reach'"),
         ("MT-Acrobot-v0", {}, "did you mean 'MT-Acrobat-v0'"),
         ("finger-spn", {}, "did you mean 'finger-spin'"),
         ("finger-spin", {"sizes": 3}, "unknown setting of finger-spin 'sizes'"),

@@ -90,7 +90,7 @@ def read_action(action: Any, space: spaces.Space) -> np.ndarray:
 def family_named(name: str, settings: dict[str, Any]) -> Env:
     """Return the family with a name of mtjax or of MTEnv."""
     if name.startswith(_METAWORLD):
-        raise InputError(f"{name}: the Meta-World families are not part of mtjax yet")
+        raise InputError(f"{name}: each task of Meta-World is an environment here, such as 'metaworld-reach'")
     if name.startswith("MT-") and name not in MTENV_IDS:
         raise nearest_error("environment of MTEnv", name, MTENV_IDS)
     family = envs.make(MTENV_IDS.get(name, name), **settings)
