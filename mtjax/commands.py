@@ -8,6 +8,7 @@ import itertools
 import re
 import sys
 import textwrap
+import traceback
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -231,7 +232,7 @@ def import_files(argv: Sequence[str]) -> list[str]:
     Such a file calls ``mtjax.register`` for the user's own classes.
 
     Raises:
-        InputError: there is no such file.
+        InputError: there is no such file, or it fails. The message names the line.
     """
     files, rest = imports_of(argv)
     for file in files:
@@ -268,9 +269,19 @@ def _import(path: Path) -> None:
     sys.modules[path.stem] = module = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
-    except Exception:
+    except InputError:
         del sys.modules[path.stem]
         raise
+    except Exception as error:  # of the user's own code
+        del sys.modules[path.stem]
+        raise InputError(f"{str(path)!r}{_line_of(error, path)}: {type(error).__name__}: {error}") from error
+
+
+def _line_of(error: Exception, path: Path) -> str:
+    """Return the line of a file in which an error arose, as ", line 3"; empty if it is unknown."""
+    lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
+    lines += [error.lineno] if isinstance(error, SyntaxError) and error.filename == str(path) else []
+    return f", line {lines[-1]}" if lines else ""
 
 
 def parse_with_tyro(cls: type[P], argv: Sequence[str], default: P, name: str) -> P:

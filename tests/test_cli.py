@@ -336,6 +336,21 @@ def test_train_says_what_is_wrong(complaint, monkeypatch, tmp_path, words, said)
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    "text, said",
+    [
+        ("\ndef mine(:\n", "mine.py', line 2: SyntaxError: invalid syntax"),
+        ("import nothing_of_this_name\n", "line 1: ModuleNotFoundError: No module named 'nothing_of_this_name'"),
+        ("def f():\n    return [][0]\n\nf()\n", "line 2: IndexError: list index out of range"),
+    ],
+)
+def test_a_file_of_ones_own_that_fails_is_told_with_its_line(complaint, tmp_path, text, said):
+    """And the file can be imported once it is mended."""
+    (tmp_path / "mine.py").write_text(text)
+    assert said in complaint("train", f"--import={tmp_path / 'mine.py'}", "--list")
+    assert "mine" not in sys.modules
+
+
 @pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
 def test_messages_do_not_depend_on_the_terminal(complaint, monkeypatch, encoding):
     """Tyro frames its errors in ASCII where standard output is not UTF-8."""
