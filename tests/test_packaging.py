@@ -1,5 +1,6 @@
 """What a user installs, and that the places which name a version agree."""
 
+import os
 import re
 import subprocess
 import sys
@@ -18,9 +19,14 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 
 
 @pytest.fixture(scope="module")
-def built(tmp_path_factory):
+def place(tmp_path_factory):
+    """Where archive and wheel are built."""
+    return tmp_path_factory.mktemp("dist")
+
+
+@pytest.fixture(scope="module")
+def built(place):
     """The names of the files in the source archive and in the wheel that is made from it."""
-    place = tmp_path_factory.mktemp("dist")
     command = [sys.executable, "-m", "build", "--no-isolation", "--skip-dependency-check", "--outdir", place, ROOT]
     done = subprocess.run(command, capture_output=True, text=True, cwd=place)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -52,6 +58,27 @@ def test_source_archive_holds_what_a_contributor_needs(built):
     tops = {"mtjax", "tests", "benchmarks", "docs", "examples", "notebooks"}
     assert {name.split("/")[0] for name in source if "/" in name} <= tops
     assert not [name for name in source if "__pycache__" in name]
+
+
+@pytest.mark.slow
+def test_the_wheel_works_by_itself(built, place, tmp_path):
+    """Installed where nothing of the repository is: its command lists all, and a policy that came with it acts."""
+    (wheel,) = place.glob("*.whl")
+    pip = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-index", "--target", tmp_path / "lib", wheel]
+    subprocess.run(pip, check=True, cwd=tmp_path, timeout=300)
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path / "lib"), "JAX_PLATFORMS": "cpu", "MTJAX_CACHE": "0"}
+
+    def run(*words):
+        done = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    assert "point-mass-vary-goal/sac-conditioned" in run(tmp_path / "lib" / "bin" / "mtjax-train", "--list")
+    acts = """import jax, mtjax
+policy = mtjax.load("point-mass-vary-goal/sac-conditioned")
+task = jax.tree.map(lambda x: x[0], policy.env.tasks())
+print(mtjax.__file__, policy(policy.env.reset(task, jax.random.key(0)).obs, task).shape)"""
+    assert run(sys.executable, "-c", acts).split() == [str(tmp_path / "lib" / "mtjax" / "__init__.py"), "(2,)"]
 
 
 def test_wheel_says_its_version_and_commands(built):
