@@ -362,6 +362,28 @@ def test_a_sweep_leaves_a_table_of_all_settings(swept):
     assert "2 of 2 seeds diverged" in text and "highest on training tasks" in text and len(text.splitlines()) == 5
 
 
+ALL_FOUR = [
+    ("bandit", "sac", "10"),
+    ("bandit", "care", "20"),
+    ("walker-walk", "sac", "900"),
+    ("walker-walk", "care", "1"),
+]
+
+
+def test_environments_are_no_contest():
+    """Each has a highest setting of its own, if it has several."""
+    row = {"run": "run-1", "number": 0, "seeds": 1, "diverged": 0, "train_low": "", "train_high": ""}
+    made = [row | {"env": env, "agent": agent, "train": x} for env, agent, x in ALL_FOUR]
+    names = ("run", "number", "env", "agent", "seeds", "diverged", "train", "train_low", "train_high")
+    lines = sweep.table([{name: each[name] for name in names} for each in made]).splitlines()
+    assert [line.split(" (")[0] for line in lines[-2:]] == [
+        "highest on training tasks of bandit: agent care",
+        "highest on training tasks of walker-walk: agent sac",
+    ]
+    (line,) = sweep.table([{name: made[0][name] for name in names}]).splitlines()[1:]
+    assert line.split() == ["run-1", "bandit", "sac", "10"]
+
+
 def test_the_table_is_there_when_a_sweep_is_stopped(swept):
     """With what was evaluated until then."""
     with (swept / "stopped.csv").open(newline="") as file:

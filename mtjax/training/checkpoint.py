@@ -305,6 +305,6 @@ def require_space(directory: Path, state: Any, beside: int = 0) -> None:
     needed, free = (_KEPT + 1) * size_of(state) + beside, shutil.disk_usage(directory).free
     if needed > free:
         raise InputError(
-            f"checkpoints need {needed / 1e6:.0f} MB and {str(directory)!r} has {free / 1e6:.0f} MB free; "
+            f"checkpoints need {needed / 1e6:,.1f} MB and {str(directory)!r} has {free / 1e6:,.1f} MB free; "
             f"lower --replay-size{' and --host-replay-size' if beside else ''} or choose another place with --runs"
         )

@@ -333,12 +333,18 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
         lines.append([*(str(row[name]) for name in settings), *(_cell(row, split) for split in splits)])
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     text = "\n".join("  ".join(x.rjust(w) for x, w in zip(line, widths, strict=True)) for line in lines)
-    known = [row for row in rows if row.get("train")]
-    if len(known) < 2:
-        return text
-    best = max(known, key=lambda row: float(row["train"]))
-    named = ", ".join(f"{name} {best[name]}" for name in settings if name != "run")
-    return f"{text}\nhighest on training tasks: {named} ({best['run']}, number {best['number']})"
+    groups: dict[str, list[Mapping[str, Any]]] = {}
+    for row in (row for row in rows if row.get("train")):
+        groups.setdefault(row.get("env", ""), []).append(row)  # returns of different environments are no contest
+    return "\n".join([text, *(_highest(env, own, settings) for env, own in groups.items() if len(own) > 1)])
+
+
+def _highest(env: str, rows: Sequence[Mapping[str, Any]], settings: Sequence[str]) -> str:
+    """Return a line on the setting with the highest return on the training tasks of an environment."""
+    best = max(rows, key=lambda row: float(row["train"]))
+    named = ", ".join(f"{name} {best[name]}" for name in settings if name not in ("run", "env"))
+    of = f" of {env}" * bool(env)
+    return f"highest on training tasks{of}: {named} ({best['run']}, number {best['number']})"
 
 
 def _cell(row: Mapping[str, Any], split: str) -> str:
