@@ -134,6 +134,7 @@ WRONG = [
     ((ENV, "sac"), {"settings": {"num_envs": 3}}, "settings is a mtjax.Settings, not a dict"),
     ((ENV, "sac"), {"sweep": {"actor_lr": 1e-3}}, "sweep gives each number a list of values"),
     ((ENV, "sac"), {"sweep": {"actor_lr": ["x"]}}, "actor_lr is a number, and 'x' is none"),
+    ((ENV, "sac"), {"sweep": {"num_critics": [1, 2]}}, "num_critics cannot vary inside one program; train once"),
     ((ENV, "sac"), {"start": "nowhere"}, "'nowhere' is not a run"),
     ((ENV, "sac"), {"on_chunk": 3}, "on_chunk is a function of a row of metrics, not 3"),
     ((Probe("delayed"), tiny("sac")), {"directory": "x"}, "an environment derived from Family"),

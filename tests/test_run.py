@@ -371,6 +371,17 @@ def test_lost_evaluations_are_told(play, whole, tmp_path):
         assert play(tmp_path, resume=True).evaluations.steps.tolist() == [600]
 
 
+def test_damaged_evaluations_do_not_stop_a_resumed_run(play, whole, tmp_path):
+    """It goes on without them, says so, and keeps the file."""
+    shutil.copytree(whole.directory, tmp_path, dirs_exist_ok=True)
+    shutil.rmtree(tmp_path / "checkpoints" / "150")
+    (tmp_path / "evaluations.npz").write_bytes(b"half")
+    with pytest.warns(Notice, match=r"evaluations\.npz', which is damaged: .*; the run goes on without .* kept as"):
+        assert play(tmp_path, resume=True).evaluations.steps.tolist() == [600]
+    assert (tmp_path / "evaluations.damaged.npz").read_bytes() == b"half"
+    assert load_evaluations(tmp_path / "evaluations.npz").steps.tolist() == [600]
+
+
 def test_evaluations_of_another_run_are_refused(play, whole, tmp_path):
     """As they would be joined with this run's."""
     shutil.copytree(whole.directory, tmp_path, dirs_exist_ok=True)

@@ -56,7 +56,7 @@ def test_seeds_lie_side_by_side_in_each_point():
     [
         ({"actor_lr": [1e-3, -1.0]}, "actor-lr must be greater than 0, not -1.0"),
         ({"gamma": [0.9, 1.5]}, "gamma must be in [0, 1]"),
-        ({"num_critics": [1, 2]}, "unknown number of this agent 'num_critics'"),
+        ({"num_critics": [1, 2]}, "num_critics cannot vary inside one program"),
         ({"actor_l": [1e-3]}, "did you mean 'actor_lr'?"),
         ({"cagrad_radius": [0.5, 2.0]}, "cagrad-radius must be in (0, 1), not 2.0"),
         ({"tau": []}, "no values to tau"),

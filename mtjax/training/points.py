@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mtjax.agents import BaseAgent, parts
-from mtjax.agents.choices import kinds_of
+from mtjax.agents.choices import kinds_of, settings
 from mtjax.names import nearest_error
 from mtjax.types import Acted, Array, Env, Experience, InputError, Key, Metrics, Outcome, Spec, Task, Transition
 
@@ -98,6 +98,8 @@ def agent_at(agent: BaseAgent, point: Point) -> BaseAgent:
     """
     known = sweepable(agent)
     unknown = next((name for name in point if name not in known), None)
+    if unknown in settings(agent):
+        raise InputError(f"{unknown} cannot vary inside one program; train once for each value, as --sweep does")
     if unknown is not None:
         raise nearest_error("number of this agent", unknown, known)
     return _replace_values(agent, point, dataclasses.replace)

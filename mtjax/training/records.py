@@ -54,10 +54,10 @@ class Records:
 
         Args:
             due: whether there should be any.
-            empty: those of a run that has none.
+            empty: those of a run that has none. It is also returned where a file cannot be read, which is renamed.
 
         Raises:
-            InputError: they cannot be read, or are of other tasks or seeds.
+            InputError: they are of other tasks or seeds.
         """
         if not steps or self.directory is None:
             return empty
@@ -66,7 +66,14 @@ class Records:
             if due:
                 notice(f"{str(file)!r} is missing; the run goes on without its earlier evaluations")
             return empty
-        past = load_evaluations(file)
+        try:
+            past = load_evaluations(file)
+        except InputError as error:
+            aside = file.with_suffix(".damaged.npz")
+            if self.writes:
+                file.replace(aside)
+            notice(f"{error}; the run goes on without its earlier evaluations, and the file is kept as {aside.name!r}")
+            return empty
         shape = lambda each: {split: (x.shape[0], *x.shape[2:]) for split, x in each.returns.items()}
         if shape(past) != shape(empty):
             raise InputError(
