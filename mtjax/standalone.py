@@ -27,11 +27,11 @@ class Policy:
     """A policy of one family of tasks: observation normaliser, networks and the task's context are inside."""
 
     def __init__(self, file: Any):
-        with np.load(file, allow_pickle=False) as arrays:
-            meta, program = (json.loads(bytes(arrays[name])) for name in ("meta", "program"))
-            self.meta = {"obs": {"obs": [meta.get("obs_size")]}} | meta  # files from before pictures give a size alone,
-            self.program = {"reads": [0, 1]} | program  # and do not say what is read
-            self.constants = [arrays[f"constant_{i}"] for i in range(self.program["constants"])]
+        arrays = _arrays(file)
+        meta, program = (json.loads(bytes(arrays[name])) for name in ("meta", "program"))
+        self.meta = {"obs": {"obs": [meta.get("obs_size")]}} | meta  # files from before pictures give a size alone,
+        self.program = {"reads": [0, 1]} | program  # and do not say what is read
+        self.constants = [arrays[f"constant_{i}"] for i in range(self.program["constants"])]
 
     def __repr__(self) -> str:
         seen = ", ".join(f"{name} {shape}" for name, shape in shapes_of(self.meta).items()).removeprefix("obs ")
@@ -92,8 +92,25 @@ def values_of(meta: dict[str, Any], parameters: dict[str, float], needed: bool =
     return np.array([given[name] for name in meta["parameters"]], np.float32)
 
 
+def _arrays(file: Any) -> dict[str, np.ndarray]:
+    """Return the arrays of a path or of an open file."""
+    if not hasattr(file, "read"):
+        with open(file, "rb") as opened:  # as NumPy leaves a damaged archive open
+            return _arrays(opened)
+    try:
+        with np.load(file, allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in {"meta", "program", *arrays.files}}
+    except Exception as error:  # a damaged archive may raise anything
+        name = getattr(file, "name", "the file")
+        raise ValueError(f"{name} is no .npz file of mtjax.export, or damaged ({type(error).__name__})") from None
+
+
 def load(file: Any) -> Policy:
-    """Load a policy that acts by NumPy."""
+    """Load a policy that acts by NumPy.
+
+    Raises:
+        ValueError: the file is damaged, or another one.
+    """
     return Policy(file)
 
 
@@ -104,8 +121,7 @@ def load_jax(file: Any) -> Callable:
     """
     from jax import export
 
-    with np.load(file, allow_pickle=False) as arrays:
-        return export.deserialize(bytearray(arrays["exported"])).call
+    return export.deserialize(bytearray(_arrays(file)["exported"])).call
 
 
 # The last pictures of an episode, (..., H, W, N C) for N pictures of C channels, oldest first.

@@ -120,6 +120,23 @@ def test_what_the_reader_is_given_is_checked(tmp_path):
         policy(np.zeros(3), size=1.0)
 
 
+@pytest.mark.parametrize("content", ["empty", "text", "half", "flipped", "other"])
+def test_a_file_that_holds_no_policy_is_refused(content, tmp_path):
+    """Whatever it is, and nobody is advised to run what is in it."""
+    file = mtjax.export(policy_of(tiny("sac-conditioned")), tmp_path / "x.npz")
+    whole = file.read_bytes()
+    place = len(whole) // 2
+    changed = {"empty": b"", "text": b"text", "half": whole[:place]}
+    changed["flipped"] = whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :]
+    file.write_bytes(changed.get(content, b""))
+    if content == "other":
+        np.savez(file, weights=np.zeros(3))
+    for load in (standalone.load, standalone.load_jax):
+        with pytest.raises(ValueError, match=r"x\.npz is no \.npz file of mtjax\.export, or damaged") as caught:
+            load(file)
+        assert "pickle" not in str(caught.value)
+
+
 def test_what_cannot_be_exported_is_refused(tmp_path, monkeypatch):
     """In a line, and nothing is overwritten."""
     monkeypatch.setitem(sys.modules, "onnx", None)
