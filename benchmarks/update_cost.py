@@ -1,4 +1,4 @@
-"""Measure the time of an update of every agent, compared with plain SAC.
+"""Measure the time of an update of every agent that learns from replay, compared with plain SAC.
 
     python benchmarks/update_cost.py [--agents NAME ...] [--tasks 10 50] [--seeds 1 10] [--json FILE]
 
@@ -19,6 +19,7 @@ import numpy as np
 from report import markdown, publish
 
 import mtjax
+from mtjax.experience.replay import Replay
 from mtjax.maps import over_seeds
 from mtjax.types import InputError, Spec, Task, Transition
 
@@ -28,7 +29,8 @@ _ON_CPU = jax.default_backend() == "cpu"
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--agents", nargs="+", default=list(mtjax.AGENTS), choices=list(mtjax.AGENTS))
+    agents = [name for name in mtjax.AGENTS if isinstance(mtjax.agent(name).experience, Replay)]
+    parser.add_argument("--agents", nargs="+", default=agents, choices=agents)
     parser.add_argument("--tasks", type=int, nargs="+", default=[10])
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])
     parser.add_argument("--batch", type=int, default=128, help="transitions a task")

@@ -102,11 +102,11 @@ def device_events(file: Path) -> list[tuple[str, float, float]]:
 
 def by_name(events: list[tuple[str, float, float]], updates: int) -> dict[str, dict[str, float]]:
     """Return microseconds and calls of each kernel in one update, the longest first."""
-    spent, calls = collections.Counter(), collections.Counter()
+    found = collections.defaultdict(list)
     for name, _, duration in events:
-        spent[name] += duration / 1e3 / updates
-        calls[name] += 1 / updates
-    return {name: {"microseconds": time, "calls": calls[name]} for name, time in spent.most_common()}
+        found[name].append(duration / 1e3)
+    rows = {name: {"microseconds": sum(x) / updates, "calls": len(x) / updates} for name, x in found.items()}
+    return dict(sorted(rows.items(), key=lambda row: -row[1]["microseconds"]))
 
 
 def is_product(kernel: str) -> bool:

@@ -41,12 +41,13 @@ def save_evaluations(path: Path, evaluations: Evaluations) -> None:
         np.savez(file, steps=evaluations.steps, **evaluations.returns, **values, **metrics)  # type: ignore
 
 
-def load_evaluations(path: Path) -> Evaluations:
+def load_evaluations(path: str | Path) -> Evaluations:
     """Read a file that ``save_evaluations`` wrote. The checksums inside the file tell whether it is damaged.
 
     Raises:
         InputError: the file cannot be read, or its arrays do not fit together.
     """
+    path = Path(path)
     try:
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             named = {name.removeprefix("train_") for name in file if name.startswith("train_")} - {"values"}

@@ -24,6 +24,7 @@ import mtjax
 from mtjax import loop, rollout
 from mtjax.agents import AGENTS
 from mtjax.agents.choices import replace
+from mtjax.agents.parts.values import C51
 from mtjax.agents.ppo import Taken
 from mtjax.config import configure
 from mtjax.envs.engines.base import World
@@ -164,6 +165,23 @@ def test_agents_learn_as_on_the_cpu(name, seeds):
         if ".mu" in jax.tree_util.keystr(path) and one.size:
             difference, size = (np.linalg.norm(x.reshape(num_seeds, -1), axis=1) for x in (one - other, one))
             assert np.all(difference <= 0.05 * size + 1e-7), (jax.tree_util.keystr(path), difference / size)
+
+
+def test_a_distribution_is_projected_in_a_kernel_of_its_own(rows=1280):
+    """Beside a softmax in one kernel it is many times slower, and XLA takes minutes to compile it."""
+    value = C51()
+    random = np.random.default_rng(0)
+    logits, next_logits = np.float32(random.normal(size=(2, 2, rows, value.num_bins)))
+    reward, discount, bonus = np.float32(random.uniform(size=(3, rows)))
+
+    def loss(logits):
+        target = value.target(next_logits, False, reward, discount, bonus)
+        return jnp.mean(value.loss(logits, target))
+
+    kernels = jax.jit(jax.grad(loss)).lower(logits).compile().as_text().split("\n}\n")
+    projecting = [kernel for kernel in kernels if f"{value.num_bins},{value.num_bins}]" in kernel]
+    assert projecting
+    assert not [kernel for kernel in projecting if " exponential(" in kernel]
 
 
 # Physics.

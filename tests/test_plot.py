@@ -101,6 +101,15 @@ def test_colour_of_a_split_does_not_depend_on_which_are_empty(drawn, tmp_path):
     assert drawn[0].lines[1].get_color() == drawn[1].lines[2].get_color()
 
 
+@pytest.mark.parametrize("offset", [0, -400, -2000])
+def test_all_returns_are_within_the_axes(drawn, tmp_path, offset):
+    returns = random_returns(3, 3, 1, 1) + offset
+    plot.learning_curve(tmp_path / "figure.png", STEPS, {"train": returns}, "")
+    bottom, top = drawn[0].get_ylim()
+    means = returns.mean(axis=(0, 2, 3))
+    assert bottom <= 0 and bottom < means.min() and top > means.max()
+
+
 @pytest.mark.parametrize("seeds", [1, 2])
 def test_few_seeds_have_no_band_and_no_bars(drawn, tmp_path, seeds):
     draw_learning_curve(tmp_path / "figure.png", seeds)

@@ -273,6 +273,12 @@ def label_steps(axes: "Axes") -> None:
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
 
 
+def show_from_zero(axes: "Axes") -> None:
+    """Let the axis of returns begin at zero, or below negative returns, and leave room above."""
+    low, high = axes.dataLim.intervaly
+    axes.set_ylim(min(0.0, 1.05 * low), 1.05 * high if high > 0 else None)
+
+
 def _count(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
@@ -280,6 +286,6 @@ def _count(number: int, noun: str) -> str:
 def _save(figure: "Figure", axes: "Axes", path: str | Path, beside: bool = False) -> None:
     if not axes.get_legend_handles_labels()[1]:
         raise InputError(f"there is nothing to draw in {path}: every array of returns is empty")
-    axes.set_ylim(bottom=0)
+    show_from_zero(axes)
     axes.legend(frameon=False, **({"loc": "center left", "bbox_to_anchor": (1, 0.5)} if beside else {}))
     figure.savefig(path, dpi=DOTS_PER_INCH)

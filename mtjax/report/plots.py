@@ -53,7 +53,7 @@ def families(runs: Any = "runs/*", split: str = "train") -> "list[Axes]":
             figures.draw_curve(axes, one.steps, one.returns[split], one.agent, agents.index(one.agent))
         figures.label_steps(axes)
         axes.set_title(name)
-        axes.set_ylim(bottom=0)
+        figures.show_from_zero(axes)
     for axes in grid[len(names) :]:
         axes.set_visible(False)
     handles = {h.get_label(): h for axes in grid for h in axes.get_lines()}
@@ -221,6 +221,6 @@ def _name_rows(axes: "Axes", names: list[str]) -> None:
 
 
 def _finish(axes: "Axes") -> "Axes":
-    axes.set_ylim(bottom=0)
+    figures.show_from_zero(axes)
     axes.legend(frameon=False)
     return axes

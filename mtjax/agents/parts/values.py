@@ -112,8 +112,10 @@ class C51(Scalar):
         """Split each of the probabilities p (B, K) at places (B, K) between the two nearest atoms: (B, K)."""
         spacing = (self.value_high - self.value_low) / (self.num_bins - 1)
         position = (jnp.clip(places, self.value_low, self.value_high) - self.value_low) / spacing
+        apart = jax.lax.optimization_barrier  # else XLA puts this, the softmax and the loss into one slow GPU kernel
+        p, position = apart((p, position))
         shares = jnp.maximum(1 - jnp.abs(position[:, :, None] - jnp.arange(self.num_bins)), 0.0)  # (B, K, K)
-        return jnp.einsum("bk,bkj->bj", p, shares, precision=jax.lax.Precision.HIGHEST)
+        return apart(jnp.einsum("bk,bkj->bj", p, shares, precision=jax.lax.Precision.HIGHEST))
 
     def loss(self, outputs: Array, target: Array) -> Array:
         return -jnp.sum(target * jax.nn.log_softmax(outputs), axis=-1)
