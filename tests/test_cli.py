@@ -266,7 +266,12 @@ def test_list_names_every_family_and_agent(capsys):
         ("--agent carr", "unknown agent 'carr'; did you mean 'care'?"),
         ("--preset=gpus", "unknown preset 'gpus'; did you mean 'gpu'?"),
         ("--num-env=3", "unknown flag '--num-env'; did you mean '--num-envs'?"),
-        ("--agent.num-experts=3 --agent=sac", "unknown flag '--agent.num-experts'"),
+        (
+            "--agent.num-experts=3 --agent=sac",
+            "'--agent.num-experts' of sac; it belongs to --agent.encoder=care, --agent.en",
+        ),
+        ("--batch-size=3 --agent=ppo", "unknown flag '--batch-size' of ppo; it belongs to agents with a replay"),
+        ("--agent.unroll=3 --agent=sac", "it belongs to agents that learn from rollouts, such as ppo"),
         ("--split=dens", "unknown split 'dens'; did you mean 'dense'?"),
         ("--engine=cpp", "unknown engine 'cpp'"),
         ("--env.vary.colour=1,2", "unknown parameter 'colour'; choose from: size, touch-size"),
