@@ -9,6 +9,7 @@ import dataclasses
 import inspect
 import json
 import re
+import tempfile
 import textwrap
 from collections.abc import Iterable, Iterator
 from functools import lru_cache
@@ -16,15 +17,18 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from mkdocs.structure.files import File, Files
 
 from mtjax import agents, envs
 from mtjax.agents.choices import PARTS, flag_names, kinds_of, settings
 from mtjax.agents.parts import name_of
 from mtjax.names import first_sentence
+from mtjax.report import figures
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
+PICTURES = Path(__file__).parent / "pictures" / "families"
 PICTURE = "../../benchmarks/results/"  # as pages name it, so that it is found on the site and in the repository
 GROUPS = {  # title -> whether a family belongs there; the first that fits
     "Brax": lambda name, module: module.endswith("envs.brax"),
@@ -60,6 +64,8 @@ def on_files(files: Files, config: Any) -> Files:
     for plot in RESULTS.rglob("*.png"):
         place = plot.relative_to(RESULTS).as_posix()
         files.append(File.generated(config, f"results/plots/{place}", abs_src_path=str(plot)))
+    for place, curves in _curves().items():
+        files.append(File.generated(config, f"{place}.png", content=_drawn(curves)))
     return files
 
 
@@ -101,7 +107,8 @@ def family_page(name: str) -> str:
     """Return the page of one family: command, docstring, parameters, tasks and figures."""
     cls, _ = envs.ENVS[name]
     family = envs.make(name)
-    text = f"# {name}\n\n```bash\npython -m mtjax.train --env={name}\n```\n\n{to_markdown(cls.__doc__)}\n"
+    text = f"# {name}\n\n{_picture(name)}```bash\npython -m mtjax.train --env={name}\n```\n\n"
+    text += f"{to_markdown(cls.__doc__)}\n"
     if family.parameters:
         text += "\n## Parameters\n\n| parameter | unit | nominal | in this family |\n|---|---|---|---|\n"
         vary = dict(family.vary)
@@ -130,6 +137,12 @@ def _row(flag: str, default: Any, text: str) -> str:
     return f"| {flag} | {shown} | {text.replace('|', '&#124;')} |\n"
 
 
+def _picture(name: str) -> str:
+    """Return a film or a still of a family's tasks, if there is one."""
+    found = [file for file in PICTURES.glob(f"{name}.*") if file.stem == name]
+    return "".join(f"![tasks of {name}](../pictures/families/{file.name})\n\n" for file in found)
+
+
 def _family_figures(name: str) -> str:
     text = ""
     if rows := _rows(RESULTS / "h200-returns" / "table.md", 0, name):
@@ -141,6 +154,7 @@ def _family_figures(name: str) -> str:
         text += f"\n### Two CPU cores, one seed\n\nsac-conditioned had a return of {float(row['return']):.0f} after "
         text += f"{row['seconds']} seconds ({int(row['steps']):,} steps). The "
         text += "[command](../results/returns.md#twenty-four-families-on-two-cpu-cores-seven-minutes-one-seed).\n"
+        text += f"\n![return over steps]({name}.png)\n"
     return f"\n## Figures\n{text}" if text else ""
 
 
@@ -224,6 +238,8 @@ def _agent_figures(name: str) -> str:
         text += "\n### One H200, three seeds\n\n" + rows
         text += "\nThe [command](../results/returns.md#returns-within-minutes-of-training-on-one-h200-three-seeds).\n"
     text += _methods(1, name)
+    if f"agents/{name}" in _curves():
+        text += f"\n![return of training episodes over steps, ten seeds]({name}.png)\n"
     costs = {machine: _cost(file, name) for machine, file in _COSTS.items()}
     if any(costs.values()):
         told = ", ".join(f"{cost:.2f} times sac on {machine}" for machine, cost in costs.items() if cost)
@@ -247,6 +263,36 @@ _COSTS = {"one H200": "update-cost-h200-10-tasks.json", "two CPU cores": "update
 def _cost(file: str, name: str) -> float | None:
     rows = json.loads((RESULTS / file).read_text())["rows"]
     return next((row["over_sac"] for row in rows if row["agent"] == name), None)
+
+
+# Curves.
+
+
+@lru_cache
+def _curves() -> dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]:
+    """Return what is drawn, by the place of the drawing: lines by name, of steps (V,) and returns (S, V, 1, 1)."""
+    found: dict[str, dict[str, Any]] = {}
+    for name in sorted({row["family"] for row in _cpu_runs()}):
+        found[f"families/{name}"] = {"sac-conditioned": _curve([r for r in _cpu_runs() if r["family"] == name])}
+    for file in sorted((RESULTS / "h200-methods").glob("*/*.csv")):
+        with file.open() as lines:
+            found.setdefault(f"agents/{file.stem}", {})[file.parent.name] = _curve(list(csv.DictReader(lines)))
+    return {place: curves for place, curves in found.items() if place.split("/")[1] in (*envs.ENVS, *agents.AGENTS)}
+
+
+def _curve(rows: list[dict[str, str]]) -> tuple[np.ndarray, np.ndarray]:
+    seeds = len({row.get("seed") for row in rows})
+    steps, returns = (
+        np.array([float(row[x] or "nan") for row in rows]).reshape(-1, seeds) for x in ("steps", "return")
+    )
+    known = np.all(np.isfinite(returns), axis=1)
+    return steps[known, 0], returns[known].T[:, :, None, None]
+
+
+def _drawn(curves: dict[str, tuple[np.ndarray, np.ndarray]]) -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        figures.compare(file := Path(folder) / "curves.png", curves, "return of training episodes")
+        return file.read_bytes()
 
 
 # Text.

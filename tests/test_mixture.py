@@ -193,6 +193,12 @@ def test_the_nearest_training_task_is_of_the_same_family():
     assert np.argmax(train.context[known(far)][:, :2], axis=1).tolist() == families.tolist()
 
 
+@pytest.mark.parametrize("name", ["finger-spin+", "+", "finger-spin++cheetah-run"])
+def test_a_name_that_lacks_a_family_is_refused(name):
+    with pytest.raises(InputError, match="lacks a family; a mixture is NAME"):
+        make(name)
+
+
 def test_names_of_families_and_tasks():
     env = mixture([make("walker-walk", vary={"friction": "0.7,1"}), "bandit", AIM])
     assert env.names == ("walker-walk", "bandit", "aim")

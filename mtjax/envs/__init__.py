@@ -247,7 +247,13 @@ def is_mixture(name: str) -> bool:
 
 
 def members(name: str) -> tuple[tuple[str, Settings], ...]:
-    """Return the families that a name of ``make`` stands for, each with the settings that a benchmark has for it."""
+    """Return the families that a name of ``make`` stands for, each with the settings that a benchmark has for it.
+
+    Raises:
+        InputError: a mixture's name lacks a family.
+    """
+    if name and not all(name.split("+")):
+        raise InputError(f"{name!r} lacks a family; a mixture is NAME+NAME")
     parts = [BENCHMARKS[part][1] if part in BENCHMARKS else {part: {}} for part in name.split("+")]
     return tuple(pair for part in parts for pair in part.items())
 

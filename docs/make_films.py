@@ -1,0 +1,77 @@
+"""Draw the pictures on the pages of families: three of its tasks, at their start or as a trained policy plays them.
+
+    python docs/make_films.py [NAME ...]
+
+Families of which the package has a trained policy are films, the others that MuJoCo steps are stills. Both are of the
+first, the middle and the last training task. They go to docs/pictures/families. Meta-World's scenes are not drawn, as
+they are another package's.
+"""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from PIL import Image
+
+import mtjax
+from mtjax import shipped
+from mtjax.envs.pixels import Pictured
+from mtjax.evaluation import record
+from mtjax.report import render
+
+FOLDER = Path(__file__).parent / "pictures" / "families"
+SIZE = (160, 120)
+SKIPPED = 150  # steps of a long episode before a film of it, in which the body gets going
+FRAMES, STRIDE, DURATION = 30, 2, 40  # of a film: frames, steps from one to the next, milliseconds that each is shown
+
+
+def draw(name: str) -> None:
+    """Draw one family, if it can be seen."""
+    trained = [known for known in shipped.names() if known.startswith(f"{name}/")]
+    if trained:
+        frames = play(trained[0])
+        rest = {"append_images": frames[1:], "duration": DURATION, "loop": 0, "optimize": True}
+        frames[0].save(FOLDER / f"{name}.gif", save_all=True, **rest)
+    elif isinstance(mtjax.make(name), Pictured) and not name.startswith("metaworld-"):
+        start(name).save(FOLDER / f"{name}.png", optimize=True)
+
+
+def play(trained: str) -> list[Image.Image]:
+    """Return the frames of a film of a trained policy."""
+    policy = mtjax.load(trained)
+    env: Any = policy.env
+    tasks = jax.tree.map(lambda x: x[few(len(x))], env.tasks("train"))
+    played = record(env, policy.agent, policy.state, tasks, jnp.int32(0))
+    first = min(SKIPPED, env.episode_length // 10)
+    shown = slice(first, first + FRAMES * STRIDE, STRIDE)
+    states = jax.tree.map(lambda x: x[:, shown], played.states)
+    films = [render.film(env, int(row), each(states, i), *SIZE) for i, row in enumerate(played.rows)]
+    return [Image.fromarray(frame).quantize(64) for frame in np.concatenate(films, axis=2)]
+
+
+def start(name: str) -> Image.Image:
+    """Return a picture of tasks at their start."""
+    env = mtjax.make(name)
+    tasks = jax.tree.map(lambda x: x[few(len(x))], env.tasks("train"))
+    states = jax.jit(jax.vmap(env.reset))(tasks, jax.random.split(jax.random.key(0), len(tasks.row))).state
+    stills = [render.film(env, int(row), each(states, slice(i, i + 1)), *SIZE)[0] for i, row in enumerate(tasks.row)]
+    return Image.fromarray(np.concatenate(stills, axis=1)).quantize(64)
+
+
+def few(count: int) -> np.ndarray:
+    """Return the numbers of the first, the middle and the last task."""
+    return np.unique([0, count // 2, count - 1])
+
+
+def each(states: Any, index: Any) -> Any:
+    return jax.tree.map(lambda x: x[index], states)
+
+
+if __name__ == "__main__":
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    for name in sys.argv[1:] or mtjax.ENVS:
+        draw(name)
+        print(name, flush=True)
