@@ -1,10 +1,10 @@
 """Draw the pictures on the pages of families: three of its tasks, at their start or as a trained policy plays them.
 
-    python docs/make_films.py [NAME ...]
+    python docs/make_films.py [NAME | RUN ...]
 
-Families of which the package has a trained policy are films, the others that MuJoCo steps are stills. Both are of the
-first, the middle and the last training task. They go to docs/pictures/families. Meta-World's scenes are not drawn, as
-they are another package's.
+A run's folder becomes the film of its family, and so does a family of which the package has a trained policy. Other
+families that MuJoCo steps become stills. Both are of the first, the middle and the last training task. They go to
+docs/pictures/families. Meta-World's scenes are not drawn, as they are another package's.
 """
 
 import sys
@@ -18,9 +18,11 @@ from PIL import Image
 
 import mtjax
 from mtjax import shipped
+from mtjax.envs import name_of
 from mtjax.envs.pixels import Pictured
 from mtjax.evaluation import record
 from mtjax.report import render
+from mtjax.training.policy import Policy
 
 FOLDER = Path(__file__).parent / "pictures" / "families"
 SIZE = (160, 120)
@@ -29,19 +31,25 @@ FRAMES, STRIDE, DURATION = 30, 2, 40  # of a film: frames, steps from one to the
 
 
 def draw(name: str) -> None:
-    """Draw one family, if it can be seen."""
+    """Draw a run's family, or a family by its name, if it can be seen."""
     trained = [known for known in shipped.names() if known.startswith(f"{name}/")]
-    if trained:
-        frames = play(trained[0])
-        rest = {"append_images": frames[1:], "duration": DURATION, "loop": 0, "optimize": True}
-        frames[0].save(FOLDER / f"{name}.gif", save_all=True, **rest)
+    if Path(name).is_dir() or trained:
+        policy = mtjax.load(trained[0] if trained else name)
+        save(name_of(policy.env), play(policy))
     elif isinstance(mtjax.make(name), Pictured) and not name.startswith("metaworld-"):
-        start(name).save(FOLDER / f"{name}.png", optimize=True)
+        save(name, [start(name)])
 
 
-def play(trained: str) -> list[Image.Image]:
+def save(name: str, frames: list[Image.Image]) -> None:
+    """Write a film, or a still if it is one frame, in place of what was there."""
+    for old in FOLDER.glob(f"{name}.*"):
+        old.unlink()
+    rest = {"append_images": frames[1:], "save_all": True, "duration": DURATION, "loop": 0}
+    frames[0].save(FOLDER / f"{name}.{'gif' if frames[1:] else 'png'}", optimize=True, **(rest if frames[1:] else {}))
+
+
+def play(policy: Policy) -> list[Image.Image]:
     """Return the frames of a film of a trained policy."""
-    policy = mtjax.load(trained)
     env: Any = policy.env
     tasks = jax.tree.map(lambda x: x[few(len(x))], env.tasks("train"))
     played = record(env, policy.agent, policy.state, tasks, jnp.int32(0))
