@@ -4,8 +4,8 @@
     python benchmarks/compile_for_gpu.py [--agents NAME ...] [--tasks 4] [--seeds 10] [--hidden 256 256] [--json FILE]
 
 XLA compiles for a GPU that it is told of (``_H200``), so that slow compiling and odd kernels are found without one. It
-cannot try kernels out, which on a GPU takes more time. So matrix products are cuBLAS's here, and some
-are XLA's own on a GPU.
+cannot try kernels out, which takes more time on a GPU. So matrix products are cuBLAS's here, not
+XLA's own.
 
 "kernels" are those of one update, "MB" what they read and write by their shapes. "numbers a thread" is the most that a
 thread of one of XLA's tiled kernels holds at once. Above some 200 it has no registers for them: the kernel is slow, and
@@ -27,12 +27,10 @@ os.environ["XLA_FLAGS"] = (
 import jax
 from jax.experimental import topologies
 from jax.sharding import NamedSharding, PartitionSpec
-from report import markdown, publish
-from update_cost import SPEC, random_batch, tasks_of
+from report import markdown, publish, run_main
+from update_cost import AGENTS, SPEC, random_batch, tasks_of, updates
 
 import mtjax
-from mtjax.experience.replay import Replay
-from mtjax.maps import over_seeds
 from mtjax.types import InputError
 
 _H200 = """
@@ -71,8 +69,7 @@ _TILED = re.compile(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    agents = [name for name in mtjax.AGENTS if isinstance(mtjax.agent(name).experience, Replay)]
-    parser.add_argument("--agents", nargs="+", default=agents, choices=agents)
+    parser.add_argument("--agents", nargs="+", default=AGENTS, choices=AGENTS)
     parser.add_argument("--tasks", type=int, default=4)
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--batch", type=int, default=64, help="transitions a task")
@@ -104,9 +101,7 @@ def measure(name: str, arguments: argparse.Namespace, place: NamedSharding) -> d
     state = jax.eval_shape(jax.vmap(lambda seed: agent.init(SPEC, tasks, jax.random.key(seed))), seeds)
 
     def learn(state: Any, seeds: Any, batch: Any, tasks: Any) -> Any:
-        update = lambda state, key: agent.update(state, batch, tasks, key)
-        of_seed = lambda state, seed: jax.lax.scan(update, state, jax.random.split(jax.random.key(seed), 2))[0]
-        return over_seeds(of_seed, 0, 0)(state, seeds)
+        return updates(agent, tasks, batch, 2)(state, jax.vmap(jax.random.key)(seeds))
 
     there = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place)
     given = jax.tree.map(there, (state, seeds, batch, tasks))
@@ -172,7 +167,4 @@ def table(rows: list[dict]) -> str:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except InputError as error:
-        raise SystemExit(f"error: {error}") from None
+    run_main(main)

@@ -20,11 +20,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-from report import markdown, publish
+from report import markdown, publish, run_main
 from update_cost import SPEC, Contestant, random_batch, tasks_of
 
 import mtjax
-from mtjax.types import InputError
 
 _ON_CPU = jax.default_backend() == "cpu"
 _PRODUCT = re.compile(r"gemm|nvjet|cutlass|cublas|(^|_)dot|matmul|custom-call", re.IGNORECASE)
@@ -150,7 +149,4 @@ def slowest(operations: list[Operation], arguments: argparse.Namespace) -> str:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except InputError as error:
-        raise SystemExit(f"error: {error}") from None
+    run_main(main)

@@ -31,7 +31,7 @@ import jax.numpy as jnp
 import metaworld_policies
 import numpy as np
 from physics import physics
-from report import publish
+from report import publish, run_main
 from steps_per_second import Contestant
 
 import mtjax
@@ -39,7 +39,6 @@ from mtjax.envs.engines.base import ENGINES
 from mtjax.envs.groups import SCENES
 from mtjax.envs.metaworld.names import BENCHMARKS, TASKS
 from mtjax.names import load
-from mtjax.types import InputError
 
 _HEAD = "task engine goals end any_step original_end original_any_step goals_that_differ".split()
 _STEPS = 500
@@ -186,7 +185,4 @@ def race(original: Original | None, arguments: argparse.Namespace) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except InputError as error:
-        raise SystemExit(f"error: {error}") from None
+    run_main(main)

@@ -6,13 +6,22 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import mujoco
 
 import mtjax
+from mtjax.types import InputError
+
+
+def run_main(main: Callable[[], None]) -> None:
+    """Run a benchmark. Wrong input ends it with one line."""
+    try:
+        main()
+    except InputError as error:
+        raise SystemExit(f"error: {error}") from None
 
 
 def machine() -> dict[str, Any]:

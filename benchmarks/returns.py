@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-from report import markdown
+from report import markdown, run_main
 
 from mtjax.agents.choices import replace
 from mtjax.config import configure, with_preset
@@ -31,7 +31,7 @@ from mtjax.report.stats import seed_interval
 from mtjax.training.log import append_rows
 from mtjax.training.programs import enable_compile_cache
 from mtjax.training.run import Result, train
-from mtjax.types import SPLITS, Agent, InputError
+from mtjax.types import SPLITS, Agent
 
 _GEAR = {"gear": "0.8:1.2:10"}
 
@@ -201,7 +201,4 @@ def tabulate(out: Path) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except InputError as error:
-        raise SystemExit(f"error: {error}") from None
+    run_main(main)

@@ -19,13 +19,12 @@ from pathlib import Path
 
 import jax
 from matplotlib.figure import Figure
-from report import markdown, publish
+from report import markdown, publish, run_main
 from training import Training
 
 import mtjax
 from mtjax.config import RunConfig, configure
 from mtjax.envs import Family
-from mtjax.types import InputError
 
 _ON_CPU = jax.default_backend() == "cpu"
 AXES = {
@@ -150,7 +149,4 @@ def draw(path: Path, axis: str, rows: list[dict]) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except InputError as error:
-        raise SystemExit(f"error: {error}") from None
+    run_main(main)

@@ -19,14 +19,14 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from mujoco import batch
-from report import publish
+from report import publish, run_main
 
 import mtjax
 from mtjax.envs import ENVS, Domain
 from mtjax.envs.engines.base import Engine, World
 from mtjax.envs.engines.c import MujocoC
 from mtjax.envs.engines.mjx import Mjx
-from mtjax.types import InputError, Task
+from mtjax.types import Task
 
 SETTINGS = ("1/2", "1/4", "2/4", "2/8", "3/6", "4/8", "6/12", "10/20")
 _HELD = 5  # control steps for which random play holds an action
@@ -174,7 +174,4 @@ def line(row: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except InputError as problem:
-        raise SystemExit(f"error: {problem}") from None
+    run_main(main)

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from report import publish
+from report import publish, run_main
 from training import Training
 
 import mtjax
@@ -246,7 +246,4 @@ def table(rows: list[dict], domain: str) -> str:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except InputError as error:
-        raise SystemExit(f"error: {error}") from None
+    run_main(main)

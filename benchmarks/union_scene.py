@@ -14,13 +14,12 @@ import time
 
 import jax
 from physics import physics
-from report import publish
+from report import publish, run_main
 from steps_per_second import Contestant
 
 import mtjax
 from mtjax.envs import BENCHMARKS
 from mtjax.envs.groups import SCENES
-from mtjax.types import InputError
 
 
 def main() -> None:
@@ -66,7 +65,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except InputError as error:
-        raise SystemExit(f"error: {error}") from None
+    run_main(main)

@@ -11,26 +11,27 @@ times are medians over rounds, ratios medians of each round's ratio to ``sac``.
 import argparse
 import statistics
 import time
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from report import markdown, publish
+from report import markdown, publish, run_main
 
 import mtjax
 from mtjax.experience.replay import Replay
 from mtjax.maps import over_seeds
-from mtjax.types import InputError, Spec, Task, Transition
+from mtjax.types import Spec, Task, Transition
 
 SPEC = Spec.vector(obs_size=9, action_size=2, context_size=1)
+AGENTS = [name for name in mtjax.AGENTS if isinstance(mtjax.agent(name).experience, Replay)]
 _ON_CPU = jax.default_backend() == "cpu"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    agents = [name for name in mtjax.AGENTS if isinstance(mtjax.agent(name).experience, Replay)]
-    parser.add_argument("--agents", nargs="+", default=agents, choices=agents)
+    parser.add_argument("--agents", nargs="+", default=AGENTS, choices=AGENTS)
     parser.add_argument("--tasks", type=int, nargs="+", default=[10])
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])
     parser.add_argument("--batch", type=int, default=128, help="transitions a task")
@@ -70,11 +71,7 @@ class Contestant:
         self.state = jax.jit(jax.vmap(lambda key: agent.init(SPEC, tasks, key)))(keys)
         self.num_parameters = size_of((self.state.actor, self.state.critic)) // num_seeds
 
-        def learn(state: Any, keys: jax.Array) -> Any:
-            update = lambda state, key: agent.update(state, batch, tasks, key)
-            return jax.lax.scan(update, state, jax.random.split(keys, arguments.updates))[0]
-
-        self.learn = over_seeds(learn, 0, 0)
+        self.learn = updates(agent, tasks, batch, arguments.updates)
         before = time.perf_counter()
         self.run = jax.jit(self.learn, donate_argnums=0).lower(self.state, keys).compile()
         self.compile_seconds, self.keys = time.perf_counter() - before, keys
@@ -99,6 +96,12 @@ class Contestant:
             "parameters": self.num_parameters,
             "compile_seconds": round(self.compile_seconds, 1),
         }
+
+
+def updates(agent: Any, tasks: Task, batch: Transition, count: int) -> Callable:
+    """Return a function of states (S, ...) and keys (S,), which makes so many updates of every seed in a scan."""
+    update = lambda state, key: agent.update(state, batch, tasks, key)
+    return over_seeds(lambda state, key: jax.lax.scan(update, state, jax.random.split(key, count))[0], 0, 0)
 
 
 def tasks_of(num_tasks: int) -> Task:
@@ -132,7 +135,4 @@ def table(rows: list[dict]) -> str:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except InputError as error:
-        raise SystemExit(f"error: {error}") from None
+    run_main(main)

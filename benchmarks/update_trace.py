@@ -20,19 +20,16 @@ from typing import Any
 import jax
 from jax.extend.core import jaxprs_in_params
 from jax.profiler import ProfileData
-from report import markdown, publish
-from update_cost import Contestant
-
-import mtjax
-from mtjax.types import InputError
+from report import markdown, publish, run_main
+from update_cost import AGENTS, Contestant
 
 # Parts of the names of kernels that multiply matrices: cuBLAS's, CUTLASS's and XLA's own by Triton.
-_PRODUCTS = ("gemm", "cutlass", "nvjet", "cublas", "triton_gemm")
+_PRODUCTS = ("gemm", "cutlass", "nvjet", "cublas")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--agents", nargs="+", default=["sac", "care", "brc"], choices=list(mtjax.AGENTS))
+    parser.add_argument("--agents", nargs="+", default=["sac", "care", "brc"], choices=AGENTS)
     parser.add_argument("--tasks", type=int, default=10)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--batch", type=int, default=128, help="transitions a task")
@@ -143,7 +140,4 @@ def table(rows: list[dict]) -> str:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except InputError as error:
-        raise SystemExit(f"error: {error}") from None
+    run_main(main)

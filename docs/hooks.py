@@ -139,7 +139,7 @@ def _row(flag: str, default: Any, text: str) -> str:
 
 def _picture(name: str) -> str:
     """Return a film or a still of a family's tasks, if there is one."""
-    found = [file for file in PICTURES.glob(f"{name}.*") if file.stem == name]
+    found = PICTURES.glob(f"{name}.*")
     return "".join(f"![tasks of {name}](../pictures/families/{file.name})\n\n" for file in found)
 
 
