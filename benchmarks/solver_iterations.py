@@ -65,8 +65,9 @@ def main() -> None:
 
 
 def domains() -> list[str]:
-    """Return the first family's name of every MuJoCo model."""
-    families = {name: family for name, (family, _) in ENVS.items() if issubclass(family, Domain)}
+    """Return the first family's name of every MuJoCo model of this package."""
+    own = lambda family: issubclass(family, Domain) and hasattr(family, "model_file")  # Meta-World's are not
+    families = {name: family for name, (family, _) in ENVS.items() if own(family)}
     first = {family.model_file: name for name, family in reversed(families.items())}
     return list(first.values())
 
