@@ -139,8 +139,12 @@ def _row(flag: str, default: Any, text: str) -> str:
 
 def _picture(name: str) -> str:
     """Return a film or a still of a family's tasks, if there is one."""
-    found = PICTURES.glob(f"{name}.*")
-    return "".join(f"![tasks of {name}](../pictures/families/{file.name})\n\n" for file in found)
+    text = ""
+    for file in PICTURES.glob(f"{name}.*"):
+        last = _runs_of(_ON_GPU, name)[-1:] if file.suffix == ".gif" else []
+        text += f"![tasks of {name}](../pictures/families/{file.name})\n\n"
+        text += "".join(f"As {r['agent']} plays with a return of {float(r['return']):.0f}.\n\n" for r in last)
+    return text
 
 
 def _family_figures(name: str) -> str:
@@ -149,19 +153,33 @@ def _family_figures(name: str) -> str:
         text += "\n### One H200, three seeds\n\n" + rows
         text += "\nThe [command](../results/returns.md#returns-within-minutes-of-training-on-one-h200-three-seeds).\n"
     text += _methods(0, name)
-    last = [row for row in _cpu_runs() if row["family"] == name][-1:]
-    for row in last:
-        text += f"\n### Two CPU cores, one seed\n\nsac-conditioned had a return of {float(row['return']):.0f} after "
-        text += f"{row['seconds']} seconds ({int(row['steps']):,} steps). The "
-        text += "[command](../results/returns.md#twenty-four-families-on-two-cpu-cores-seven-minutes-one-seed).\n"
-        text += f"\n![return over steps]({name}.png)\n"
+    for runs, (title, place) in _ONE_SEED.items():
+        for row in _runs_of(runs, name)[-1:]:
+            text += f"\n### {title}\n\n{row['agent']} had a return of {float(row['return']):.0f} after "
+            text += f"{float(row['seconds']):.0f} seconds ({int(row['steps']):,} steps). The "
+            text += f"[command](../results/returns.md#{place}).\n\n![return over steps]({name}-{runs}.png)\n"
     return f"\n## Figures\n{text}" if text else ""
 
 
+_ON_GPU = "h200-families"
+_ONE_SEED = {  # runs -> their title, and where their command stands
+    _ON_GPU: (
+        "One H200 that six runs share, one seed",
+        "twenty-four-families-for-a-few-minutes-each-on-a-shared-h200-one-seed",
+    ),
+    "cpu-families": ("Two CPU cores, one seed", "twenty-four-families-on-two-cpu-cores-seven-minutes-one-seed"),
+}
+
+
 @lru_cache
-def _cpu_runs() -> list[dict[str, str]]:
-    with (RESULTS / "cpu-families.csv").open() as file:
+def _all_runs(runs: str) -> list[dict[str, str]]:
+    with (RESULTS / f"{runs}.csv").open() as file:
         return list(csv.DictReader(file))
+
+
+def _runs_of(runs: str, name: str) -> list[dict[str, str]]:
+    """Return the lines of a family's run in a file of runs of one seed."""
+    return [row for row in _all_runs(runs) if row["family"] == name]
 
 
 # Agents.
@@ -272,12 +290,15 @@ def _cost(file: str, name: str) -> float | None:
 def _curves() -> dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]:
     """Return what is drawn, by the place of the drawing: lines by name, of steps (V,) and returns (S, V, 1, 1)."""
     found: dict[str, dict[str, Any]] = {}
-    for name in sorted({row["family"] for row in _cpu_runs()}):
-        found[f"families/{name}"] = {"sac-conditioned": _curve([r for r in _cpu_runs() if r["family"] == name])}
+    for runs in _ONE_SEED:
+        for name in sorted({row["family"] for row in _all_runs(runs)} & set(envs.ENVS)):
+            rows = _runs_of(runs, name)
+            found[f"families/{name}-{runs}"] = {rows[0]["agent"]: _curve(rows)}
     for file in sorted((RESULTS / "h200-methods").glob("*/*.csv")):
-        with file.open() as lines:
-            found.setdefault(f"agents/{file.stem}", {})[file.parent.name] = _curve(list(csv.DictReader(lines)))
-    return {place: curves for place, curves in found.items() if place.split("/")[1] in (*envs.ENVS, *agents.AGENTS)}
+        if file.stem in agents.AGENTS:
+            with file.open() as lines:
+                found.setdefault(f"agents/{file.stem}", {})[file.parent.name] = _curve(list(csv.DictReader(lines)))
+    return found
 
 
 def _curve(rows: list[dict[str, str]]) -> tuple[np.ndarray, np.ndarray]:

@@ -53,11 +53,18 @@ def play(policy: Policy) -> list[Image.Image]:
     env: Any = policy.env
     tasks = jax.tree.map(lambda x: x[few(len(x))], env.tasks("train"))
     played = record(env, policy.agent, policy.state, tasks, jnp.int32(0))
-    first = min(SKIPPED, env.episode_length // 10)
-    shown = slice(first, first + FRAMES * STRIDE, STRIDE)
-    states = jax.tree.map(lambda x: x[:, shown], played.states)
+    film = frames_from(env, played, min(SKIPPED, env.episode_length // 10))
+    moves = np.any(film[1:] != film[:-1], axis=(1, 2, 3))
+    if np.mean(moves) < 0.5:  # a goal that is reached already
+        film = frames_from(env, played, 0)
+    return [Image.fromarray(frame).quantize(64) for frame in film]
+
+
+def frames_from(env: Any, played: Any, first: int) -> np.ndarray:
+    """Return the frames (FRAMES, height, width, 3) of all tasks beside each other, from a step on."""
+    states = jax.tree.map(lambda x: x[:, first : first + FRAMES * STRIDE : STRIDE], played.states)
     films = [render.film(env, int(row), each(states, i), *SIZE) for i, row in enumerate(played.rows)]
-    return [Image.fromarray(frame).quantize(64) for frame in np.concatenate(films, axis=2)]
+    return np.concatenate(films, axis=2)
 
 
 def start(name: str) -> Image.Image:
