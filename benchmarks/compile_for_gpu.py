@@ -59,7 +59,8 @@ dnn_version_info { major: 9 minor: 10 }
 runtime_version { major: 13 minor: 0 patch: 0 }
 device_description_str: "NVIDIA H200"
 """
-_BYTES = {"pred": 1, "s8": 1, "u8": 1, "f16": 2, "bf16": 2, "f64": 8, "s64": 8, "u64": 8}  # of a number; else 4
+# Of a number; else 4. Those of s8 are the workspaces of cuBLAS, which no agent's data have the type of.
+_BYTES = {"pred": 1, "s8": 0, "u8": 1, "f16": 2, "bf16": 2, "f64": 8, "s64": 8, "u64": 8}
 _SHAPE = re.compile(r"\b([a-z]+\d*)\[([\d,]*)\]")
 _INSTRUCTION = re.compile(r"\s+(?:ROOT )?%([\w.\-]+) = (.+?) ([\w\-]+)\((.*)")
 _TILED = re.compile(
