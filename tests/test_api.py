@@ -71,6 +71,14 @@ def test_its_folder_is_loaded_evaluated_and_resumed(result, copied_run, capsys):
     assert "800 of 800 steps" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("changed", [{"seeds": 3}, {"seed": 1}, {"eval_every": 300}, {"eval_episodes": 2}])
+def test_a_run_goes_on_with_its_own_plan(result, changed):
+    """Only steps may differ: seeds would bear wrong numbers, and evaluations would not be alike."""
+    given = {"directory": result.directory, "resume": True, "steps": 600, **PLAN, **SMALL, **changed}
+    with pytest.raises(InputError, match=f"had another {next(iter(changed))}; resume it with the same"):
+        mtjax.train("finger-short", "sac-conditioned", **given)
+
+
 def test_nothing_is_overwritten(result, short_family, tmp_path):
     """Neither a run nor what else lies in a folder; and another agent does not go on with a run."""
     before = (result.directory / "metrics.csv").read_bytes()

@@ -23,26 +23,27 @@ def test_header_is_written_once(tmp_path):
 
 
 def test_truncation_keeps_an_iteration_and_what_is_before_it(tmp_path):
-    """And tells the seconds of training up to there."""
+    """And tells the seconds of training and of the wall clock up to there."""
     path = tmp_path / "metrics.csv"
-    rows = [{"seed": s, "iteration": i, "seconds": f"{i / 10}", "x": ""} for i in (10, 20, 30) for s in (0, 1)]
+    clocks = lambda i: {"seconds": f"{i / 10}", "wall_seconds": f"{i}.5"}
+    rows = [{"seed": s, "iteration": i, **clocks(i), "x": ""} for i in (10, 20, 30) for s in (0, 1)]
     log.append_rows(path, rows)
-    assert log.truncate_rows(path, 20) == 2.0
+    assert log.truncate_rows(path, 20) == (2.0, 20.5)
     assert read(path) == [{k: str(v) for k, v in row.items()} for row in rows[:4]]
-    assert log.truncate_rows(path, 0) == 0.0 and read(path) == []
+    assert log.truncate_rows(path, 0) == (0, 0) and read(path) == []
     log.append_rows(path, rows[:1])
     assert len(read(path)) == 1 and list(tmp_path.iterdir()) == [path]
 
 
 def test_a_missing_file_is_told(tmp_path):
     """Unless the run was resumed before its first row."""
-    assert log.truncate_rows(tmp_path / "metrics.csv", 0) == 0.0
+    assert log.truncate_rows(tmp_path / "metrics.csv", 0) == (0, 0)
     with pytest.warns(Notice, match=r"metrics.csv' is missing; the run goes on without its earlier rows"):
-        assert log.truncate_rows(tmp_path / "metrics.csv", 3) == 0.0
+        assert log.truncate_rows(tmp_path / "metrics.csv", 3) == (0, 0)
     assert not list(tmp_path.iterdir())
 
 
-LINES = "seed,iteration,seconds,x", "0,10,1.5,3", "0,20,2.5,4", "0,30,3.5,5"
+LINES = "seed,iteration,seconds,wall_seconds,x", "0,10,1.5,9,3", "0,20,2.5,9,4", "0,30,3.5,9,5"
 
 
 @pytest.mark.parametrize(
@@ -55,8 +56,9 @@ LINES = "seed,iteration,seconds,x", "0,10,1.5,3", "0,20,2.5,4", "0,30,3.5,5"
         (b"seed,iteration\n0,10\n0,20\n", 0),
         (b"x" * 200_000, 0),
         ("\n".join([*LINES[:2], "0,20," + "9" * 200_000, ""]).encode(), 1),
-        ("\n".join([LINES[0], "0,10,fast,3", *LINES[2:]]).encode(), 1),
-        ("\n".join([LINES[0], "0,\u00b2,1.5,3", *LINES[2:]]).encode(), 1),
+        ("\n".join([LINES[0], "0,10,fast,9,3", *LINES[2:]]).encode(), 1),
+        ("\n".join([LINES[0], "0,10,1.5,late,3", *LINES[2:]]).encode(), 1),
+        ("\n".join([LINES[0], "0,\u00b2,1.5,9,3", *LINES[2:]]).encode(), 1),
         ("\n".join([*LINES[:2], "0,2"]).encode(), 1),
     ],
 )
@@ -67,9 +69,10 @@ def test_what_can_be_read_of_a_damaged_file_is_kept(tmp_path, content, left):
     with pytest.warns(Notice, match=f"is damaged: {left} rows .* kept as 'metrics.damaged.csv'"):
         log.truncate_rows(path, 20)
     assert (tmp_path / "metrics.damaged.csv").read_bytes() == content
-    log.append_rows(path, [{"seed": 0, "iteration": 30, "seconds": "3.5", "x": 5}])
+    row = dict(zip(LINES[0].split(","), LINES[-1].split(","), strict=True))
+    log.append_rows(path, [row])
     rows = read(path)
-    assert len(rows) == left + 1 and rows[-1] == {"seed": "0", "iteration": "30", "seconds": "3.5", "x": "5"}
+    assert len(rows) == left + 1 and rows[-1] == row
 
 
 def test_rows_are_means_over_tasks_and_each_tasks_return():

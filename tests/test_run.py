@@ -404,6 +404,18 @@ def test_finished_run_can_be_extended(play, whole, tmp_path):
     assert_same_run(play(tmp_path, resume=True), whole)
 
 
+def test_both_clocks_go_on(play, tmp_path):
+    """Though another process resumes the run."""
+    play(tmp_path, steps=400)
+    file = tmp_path / "metrics.csv"
+    with file.open(newline="") as opened:
+        rows = [{**row, "seconds": "1000.0", "wall_seconds": "2000.0"} for row in csv.DictReader(opened)]
+    file.unlink()
+    log.append_rows(file, rows)
+    last = play(tmp_path, resume=True).rows[-1]
+    assert 1000 < float(last["seconds"]) < 1500 and 2000 < float(last["wall_seconds"]) < 2500
+
+
 def test_finished_run_has_nothing_to_resume(play, whole, tmp_path):
     """Resuming it changes nothing."""
     shutil.copytree(whole.directory, tmp_path, dirs_exist_ok=True)

@@ -86,7 +86,8 @@ def train(
             is given up: its returns become NaN, and the other seeds continue.
         directory: the run's folder, which is made if it is absent: config.json, metrics, evaluations, checkpoints and
             curve.png, for ``mtjax.load``, ``python -m mtjax.evaluate`` and ``--resume``. None writes nothing.
-        resume: continue from the newest checkpoint in ``directory``. The number of devices may have changed.
+        resume: continue from the newest checkpoint in ``directory``, with the settings of its run; only ``steps`` may
+            differ. The number of devices may have changed.
         profile: write a trace of one chunk by ``jax.profiler`` into ``directory``/profile.
         tensorboard: write metrics for TensorBoard into ``directory``/tensorboard.
         wandb: name of a Weights & Biases project to log to.
@@ -265,9 +266,10 @@ def _require_names(config: RunConfig) -> None:
 
 
 def _require_same(config: RunConfig, recorded: RunConfig, directory: Path) -> None:
-    """Refuse to resume a run with other settings than it had."""
-    for part in ("family", "learner", "training", "points"):
-        if getattr(config, part) != getattr(recorded, part):
+    """Refuse to resume a run with other settings than it had, apart from its steps."""
+    now, then = ({**vars(each), **vars(each.plan)} for each in (config, recorded))
+    for part in ("family", "learner", "training", "points", "seeds", "seed", "eval_every", "eval_episodes"):
+        if now[part] != then[part]:
             raise InputError(
                 f"the run in {str(directory)!r} had another {part}; resume it with the same, or "
                 f"start a new run in another directory"

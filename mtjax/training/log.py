@@ -13,6 +13,7 @@ import numpy as np
 from mtjax.names import naming, notice, replacing
 
 _OF_EACH_TASK = ("td_error", "critic_gradient_norm", "actor_gradient_norm")  # beside the return
+_CLOCKS = ("seconds", "wall_seconds")
 
 
 class Rows(Sequence):
@@ -55,18 +56,18 @@ def _columns(path: Path) -> list[str]:
         return next(csv.reader(file))
 
 
-def truncate_rows(path: Path, iteration: int) -> float:
+def truncate_rows(path: Path, iteration: int) -> tuple[float, float]:
     """Drop the rows of metrics after an iteration, because a resumed run writes them again.
 
     What can be read of a damaged file is kept. The file itself is then kept beside it, and a notice says so.
 
     Returns:
-        the seconds of training up to that iteration.
+        the seconds of training up to that iteration, and those of the wall clock.
     """
     if not path.exists():
         if iteration:
             notice(f"{str(path)!r} is missing; the run goes on without its earlier rows")
-        return 0.0
+        return 0.0, 0.0
     names, rows = _read_rows(path)
     good = [row for row in rows if _is_whole(row)]
     kept = [row for row in good if int(row["iteration"]) <= iteration]
@@ -80,7 +81,8 @@ def truncate_rows(path: Path, iteration: int) -> float:
             writer = csv.DictWriter(file, fieldnames=names)
             writer.writeheader()
             writer.writerows(kept)
-    return max((float(row["seconds"]) for row in kept), default=0.0)
+    seconds, wall = (max((float(row[name]) for row in kept), default=0.0) for name in _CLOCKS)
+    return seconds, wall
 
 
 def _read_rows(path: Path) -> tuple[list[str], list[dict[str, Any]]]:
@@ -99,10 +101,10 @@ def _read_rows(path: Path) -> tuple[list[str], list[dict[str, Any]]]:
 
 def _is_whole(row: dict[Any, Any]) -> bool:
     """Return whether a line of metrics is complete. A killed process may leave half of one."""
-    iteration, seconds = str(row.get("iteration")), str(row.get("seconds"))
+    iteration, clocks = str(row.get("iteration")), [str(row.get(name)) for name in _CLOCKS]
     if None in row or None in row.values() or not (iteration.isascii() and iteration.isdigit()):
         return False
-    return re.fullmatch(r"[0-9]+(\.[0-9]+)?", seconds) is not None
+    return all(re.fullmatch(r"[0-9]+(\.[0-9]+)?", clock) for clock in clocks)
 
 
 def metric_rows(metrics: dict[str, np.ndarray], seeds: np.ndarray, common: dict[str, Any]) -> list[dict[str, Any]]:

@@ -45,9 +45,9 @@ class Records:
             checkpoint.set_aside(self.checkpoints, int(state.iteration))
         return state
 
-    def earlier_seconds(self, iteration: int) -> float:
-        """Return the training seconds up to an iteration, and drop the lines of metrics after it."""
-        return log.truncate_rows(self._path("metrics.csv"), iteration) if self.writes else 0.0
+    def earlier_seconds(self, iteration: int) -> tuple[float, float]:
+        """Return the seconds of training and of the wall clock up to an iteration, and drop the lines after it."""
+        return log.truncate_rows(self._path("metrics.csv"), iteration) if self.writes else (0.0, 0.0)
 
     def earlier_evaluations(self, steps: int, due: bool, empty: Evaluations) -> Evaluations:
         """Return the evaluations up to a step.

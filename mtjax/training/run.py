@@ -276,7 +276,8 @@ class _Run:
         iteration, clock = int(state.iteration), self.console.clock
         steps = iteration * self.steps_per_iteration
         evaluations = self.records.earlier_evaluations(steps, steps >= self.eval_every, self._no_evaluations())
-        earlier = seconds = self.records.earlier_seconds(iteration)
+        earlier, wall = self.records.earlier_seconds(iteration)
+        seconds = earlier
         rows, stop = log.Rows(), 0
         diverged = np.zeros(len(self.seeds), bool)
         with stop_signals() as received, self.records.closing():
@@ -296,7 +297,7 @@ class _Run:
                     "iteration": steps // self.steps_per_iteration,
                     "steps": steps,
                     "seconds": f"{seconds:.3f}",
-                    "wall_seconds": f"{time.monotonic() - started:.3f}",
+                    "wall_seconds": f"{wall + time.monotonic() - started:.3f}",
                 }
                 lines = log.metric_rows(metrics, np.asarray(self.seeds), common)
                 new = [{"seed": row["seed"], **self.point(k), **row} for k, row in enumerate(lines)]
