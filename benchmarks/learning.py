@@ -1,15 +1,20 @@
 """Measure how well and how fast agents learn: every agent on every family, many seeds in one program each.
 
     python benchmarks/learning.py [--envs NAME ...] [--agents NAME ...] [--seeds 10] [--steps N] [--split NAME]
-                                  [--env NAME=VALUE ...] [--baseline NAME] [--out DIR]
+                                  [--env NAME=VALUE ...] [--baseline NAME] [--unfinished] [--out DIR]
 
 Without further flags it is the whole table: every agent on six families with its preset, on the splits and for the
 steps of ``FAMILIES``; agents whose subject is pictures are left out. Every pair of family and agent writes
 ``DIR/ENV/AGENT.csv`` (training returns over steps and seconds, one line per chunk and seed) and ``AGENT.npz`` (every
-episode of every evaluation). Finished pairs are not run again, so several processes can make a long table in parts. All
-results in DIR together give ``table.md``, ``differences.md``, ``conflicts.md`` (cosines between the tasks' gradients,
-of the agents that log them), ``evaluations.csv`` and a figure for each family. ``--agents`` without a name runs nothing
-and only makes these.
+episode of every evaluation). Finished pairs are not run again, so several processes can make a long table in parts. If
+the command is given again with the same DIR, a pair that was stopped goes on where it was, and one that was killed from
+its last evaluation. Until a pair is finished its run is in ``DIR/ENV/AGENT``. Its checkpoints need room for three
+training states: 0.1 GB for PPO, and 1 to 6 GB for agents with a replay (gpu presets, ten seeds).
+
+All results in DIR together give ``table.md``, ``differences.md``, ``conflicts.md`` (cosines between the tasks'
+gradients, of the agents that log them), ``evaluations.csv`` and a figure for each family. ``--agents`` without a name
+runs nothing and only makes these. ``table.md`` names unfinished pairs, and ``--unfinished`` gives them lines of their
+last evaluation, marked with its steps.
 
 Scores are interquartile means over seeds and tasks of the last evaluation (never the best one) under the mean action,
 with 95% bootstrap intervals over whole seeds. "s to 900" is the seconds of training, without compiling and evaluating,
@@ -19,18 +24,21 @@ of the agent earns more than one of the baseline on a task drawn at random (Agar
 """
 
 import argparse
-import csv
+import itertools
+import json
+import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from report import markdown
+from report import markdown, read_lines, run_main, write_lines
+from resumable import train
 from returns import value
 
 import mtjax
-from mtjax.evaluation import load_evaluations, save_evaluations
+from mtjax.evaluation import Evaluations, load_evaluations, save_evaluations
 from mtjax.experience.replay import Replay
 from mtjax.report import figures as plot
 from mtjax.report.stats import (
@@ -41,10 +49,19 @@ from mtjax.report.stats import (
     seed_interval,
     unpaired_difference,
 )
-from mtjax.training.log import append_rows
 from mtjax.training.programs import enable_compile_cache
 from mtjax.training.run import Result
-from mtjax.types import SPLITS, InputError
+from mtjax.types import SPLITS
+
+
+class Pair(NamedTuple):
+    """Holds the results of an agent on a family."""
+
+    env: str
+    agent: str  # says so, with its steps, if the pair is not finished
+    metrics: Path
+    evaluations: Evaluations
+    finished: bool = True
 
 
 class Trial(NamedTuple):
@@ -65,6 +82,7 @@ FAMILIES = {
     "cheetah-vary-direction": Trial(None, 500_000, 10_000_000),
     "reacher-vary-goal": Trial(None, 1_000_000, 20_000_000),
 }
+UNFINISHED = "show the last evaluation of unfinished pairs too, marked with its steps"
 _FROM_PICTURES = ("drq", "sac-ae")  # from vectors they are plain conditioning
 _KEPT = ("seed", "steps", "seconds", "wall_seconds", "return")
 _CONFLICTS = ("critic_cosine", "critic_conflict", "actor_cosine", "actor_conflict")
@@ -87,19 +105,26 @@ def main() -> None:
     parser.add_argument("--training", nargs="*", default=[], metavar="NAME=N", help="such as num_envs=64")
     parser.add_argument("--mark", type=float, default=900.0, help="the return whose time is told")
     parser.add_argument("--baseline", default="sac-conditioned", metavar="NAME", help="what differences are against")
+    parser.add_argument("--unfinished", action="store_true", help=UNFINISHED)
     parser.add_argument("--out", type=Path, default=Path("runs") / f"learning-{time.strftime('%Y%m%d-%H%M%S')}")
     arguments = parser.parse_args()
     enable_compile_cache()
     for env in arguments.envs:
         for agent in arguments.agents:
-            if not (arguments.out / env / f"{agent}.npz").exists():
-                learn(arguments, env, agent)
-    tabulate(arguments.out, arguments.mark, arguments.baseline)
+            learn(arguments, env, agent)
+    tabulate(arguments.out, arguments.mark, arguments.baseline, arguments.unfinished)
 
 
 def learn(arguments: argparse.Namespace, env: str, agent: str) -> None:
-    """Train one agent on one family with its preset, and save the run."""
-    print(f"{agent} on {env}", flush=True)
+    """Write the results of one agent on one family, unless they are there already."""
+    folder = arguments.out / env / agent
+    if not (arguments.out / env / f"{agent}.npz").exists():
+        save(arguments.out / env, agent, trained(arguments, env, agent, folder))
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def trained(arguments: argparse.Namespace, env: str, agent: str, folder: Path) -> Result:
+    """Train one agent on one family with its preset, or go on with the run that was stopped in the folder."""
     trial = FAMILIES.get(env, Trial())
     split = arguments.split or trial.split
     settings = {"vary": dict(pair.split("=", 1) for pair in arguments.vary)} | ({"split": split} if split else {})
@@ -108,7 +133,8 @@ def learn(arguments: argparse.Namespace, env: str, agent: str) -> None:
     given = trial.replay_steps if isinstance(program.learner.experience, Replay) else trial.rollout_steps
     steps = arguments.steps or given or program.plan.steps
     training = {name: int(value) for name, value in (pair.split("=", 1) for pair in arguments.training)}
-    result = mtjax.train(
+    return train(
+        folder,
         program.family,
         program.learner,
         steps=steps,
@@ -120,9 +146,6 @@ def learn(arguments: argparse.Namespace, env: str, agent: str) -> None:
         **training,
         quiet=False,
     )
-    if not result.finished:
-        raise SystemExit(f"stopped before {agent} on {env} was finished; the same command goes on with it")
-    save(arguments.out / env, agent, result)
 
 
 def seeing(agent: str, settings: dict) -> dict[str, str]:
@@ -135,20 +158,54 @@ def save(folder: Path, agent: str, result: Result) -> None:
     """Save one run. The evaluations come last, because they mark it as complete."""
     folder.mkdir(parents=True, exist_ok=True)
     kept = [name for name in (*_KEPT, *_CONFLICTS) if name in result.rows[-1]]
-    (folder / f"{agent}.csv").unlink(missing_ok=True)
-    append_rows(folder / f"{agent}.csv", [{name: row[name] for name in kept} for row in result.rows])
+    write_lines(folder / f"{agent}.csv", [{name: row[name] for name in kept} for row in result.rows])
     save_evaluations(folder / f"{agent}.npz", result.evaluations)
 
 
-def tabulate(out: Path, mark: float, baseline: str) -> None:
+def stopped(out: Path) -> Iterator[tuple[Path, str]]:
+    """Return the folders of unfinished pairs, and their agents with the steps of their last evaluations."""
+    for file in sorted(out.glob("*/*/config.json")):
+        folder, evaluated = file.parent, file.with_name("evaluations.npz")
+        if not folder.with_name(f"{folder.name}.npz").exists():
+            steps = load_evaluations(evaluated).steps[-1] if evaluated.exists() else 0
+            planned = json.loads(file.read_text())["plan"]["steps"]
+            yield folder, f"{folder.name}, unfinished: evaluated after {steps:,} of {planned:,} steps"
+
+
+def list_stopped(out: Path) -> str:
+    """Return a list of the unfinished pairs, for the end of a table; empty if there are none."""
+    found = [f"\n- {folder.parent.name}: {agent}" for folder, agent in stopped(out)]
+    return "\n" * bool(found) + "".join(found)
+
+
+def pairs(out: Path, unfinished: bool = False) -> list[Pair]:
+    """Return all finished pairs by family, in the order of agents; if asked, also others that were evaluated."""
+    found = [Pair(x.parent.name, x.stem, x.with_suffix(".csv"), load_evaluations(x)) for x in out.glob("*/*.npz")]
+    for folder, agent in stopped(out) if unfinished else ():
+        if (evaluated := folder / "evaluations.npz").exists():
+            evaluations = load_evaluations(evaluated)
+            found.append(Pair(folder.parent.name, agent, folder / "metrics.csv", evaluations, finished=False))
+    known = {name: place for place, name in enumerate(mtjax.AGENTS)}
+    return sorted(found, key=lambda pair: (pair.env, known.get(pair.agent.split(",")[0], len(known)), pair.agent))
+
+
+def curve_of(pair: Pair) -> np.ndarray:
+    """Return the lines (V, S) of ``_KEPT`` up to the last evaluation of a pair."""
+    found = np.array([[float(line[name] or "nan") for name in _KEPT] for line in read_lines(pair.metrics)])
+    found = found[found[:, 1] <= pair.evaluations.steps[-1]]
+    return found.reshape(-1, len(pair.evaluations.returns["train"]), len(_KEPT))
+
+
+def tabulate(out: Path, mark: float, baseline: str, unfinished: bool = False) -> None:
     """Make tables and figures of all runs in a folder."""
     head = ["family", "agent", *(f"{split}, IQM" for split in SPLITS), "worst task", f"s to {mark:.0f}"]
     head += ["training s", "wall s", "steps/s, all seeds"]
     lines, rows, differences = [], [], []
-    for env in sorted({path.parent.name for path in out.glob("*/*.npz")}):
+    for env, of_env in itertools.groupby(pairs(out, unfinished), lambda pair: pair.env):
         curves, found = {}, {}
-        for agent, curve, evaluations in runs(out / env):
-            found[agent] = last_scores(evaluations)
+        for pair in of_env:
+            agent, evaluations, curve = pair.agent, pair.evaluations, curve_of(pair)
+            found |= {agent: last_scores(evaluations)} if pair.finished else {}
             known = curve[np.all(np.isfinite(curve[:, :, -1]), axis=1)]  # chunks in which episodes ended
             if len(known):
                 curves[agent] = (known[:, 0, 1], known[:, :, -1].T[:, :, None, None])
@@ -157,27 +214,14 @@ def tabulate(out: Path, mark: float, baseline: str) -> None:
         differences += difference_rows(env, found, baseline)
         if curves:
             plot.compare(out / f"{env}.png", curves, f"return on training tasks of {env}")
-    table = markdown(head, lines)
+    table = markdown(head, lines) + list_stopped(out)
     (out / "table.md").write_text(table + "\n")
     head = ["family", "agent", "split", f"IQM less {baseline}'s, seeds in pairs", "seeds not in pairs"]
     (out / "differences.md").write_text(markdown([*head, "probability of improvement"], differences) + "\n")
     head = ["family", "agent", *(name.replace("_", " ") for name in _CONFLICTS)]
     (out / "conflicts.md").write_text(markdown(head, conflict_rows(out)) + "\n")
-    (out / "evaluations.csv").unlink(missing_ok=True)
-    append_rows(out / "evaluations.csv", rows)
+    write_lines(out / "evaluations.csv", rows)
     print(table)
-
-
-def runs(folder: Path) -> Iterator[tuple]:
-    """Return the runs of a family: agent, curve (lines (V, S) of ``_KEPT``) and evaluations."""
-    known = list(mtjax.AGENTS)
-    order = lambda path: known.index(path.stem) if path.stem in known else len(known)
-    for path in sorted(folder.glob("*.npz"), key=order):
-        with path.with_suffix(".csv").open(newline="") as file:
-            lines = [[float(line[name] or "nan") for name in _KEPT] for line in csv.DictReader(file)]
-        curve = np.array(lines)
-        seeds = len(np.unique(curve[:, 0]))
-        yield path.stem, curve.reshape(-1, seeds, len(_KEPT)), load_evaluations(path)
 
 
 def row(env: str, agent: str, curve: np.ndarray, evaluations, mark: float) -> list[str]:
@@ -209,8 +253,7 @@ def conflict_rows(out: Path) -> list[list[str]]:
     """Return the mean cosine and share of conflicting pairs of every agent that logs them, over its run and seeds."""
     lines = []
     for path in sorted(out.glob("*/*.csv")):
-        with path.open(newline="") as file:
-            rows = [line for line in csv.DictReader(file) if line.get(_CONFLICTS[0])]
+        rows = [line for line in read_lines(path) if line.get(_CONFLICTS[0])]
         means = [np.nanmean([float(line[name]) for line in rows]) for name in _CONFLICTS] if rows else []
         lines += [[path.parent.name, path.stem, *(f"{x:.2f}" for x in means)]] if rows else []
     return lines
@@ -239,7 +282,4 @@ def evaluation_rows(env: str, agent: str, evaluations) -> list[dict]:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except (InputError, FileExistsError) as error:
-        raise SystemExit(f"error: {error}") from None
+    run_main(main)

@@ -10,25 +10,26 @@ of learning together. ``--given`` are settings of the agent or the loop that hol
 Each call writes ``DIR/FAMILY/AGENT-NAME.csv``: a line for each point with the mean return of the training episodes in
 the last tenth of the run, over seeds, the least and the largest of a seed, the mean over the whole run (which is higher
 if learning is faster), and seconds. ``DIR/FAMILY.md`` ranks the points of all files. A point with a seed that diverged
-stands last.
+stands last. If the command is given again, a grid that was stopped goes on where it was, and one that was killed from
+its last checkpoint, of which there are four; until it is finished its run is in ``DIR/FAMILY/AGENT-NAME``.
 """
 
 import argparse
-import csv
 import itertools
+import shutil
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from report import markdown
+from report import markdown, read_lines, run_main, write_lines
+from resumable import train
 from returns import FAMILIES, value
 
 from mtjax.config import configure, with_preset
-from mtjax.training.log import append_rows
 from mtjax.training.points import Point
 from mtjax.training.programs import enable_compile_cache
-from mtjax.training.run import Result, train
+from mtjax.training.run import Result
 
 _RATES = ("actor_lr", "critic_lr", "temperature_lr")
 
@@ -72,7 +73,8 @@ def sweep(arguments: argparse.Namespace) -> None:
     config = with_preset(family, arguments.agent, arguments.preset, engine=arguments.engine, **varied)
     given = {name: value(x) for name, x in (word.split("=", 1) for word in arguments.given)}
     agent, settings = configure(config.learner, config.training, given)
-    began, last = time.monotonic(), [0.0]
+    folder, steps = arguments.out / family / f"{arguments.agent}-{arguments.name}", arguments.steps or config.plan.steps
+    last = [0.0]
 
     def show(row: dict[str, Any]) -> None:
         if time.monotonic() - last[0] > 10:
@@ -80,22 +82,21 @@ def sweep(arguments: argparse.Namespace) -> None:
             print(f"{row['seconds']} s, {row['steps']} steps, first seed {row['return'] or '-'}", flush=True)
 
     result = train(
+        folder,
         config.family,
         agent,
-        steps=arguments.steps or config.plan.steps,
+        steps=steps,
         seeds=arguments.seeds,
-        eval_every=10**15,
+        eval_every=-(-steps // 4),
         eval_episodes=1,
         settings=settings,
         sweep=[as_point(agent, named) for named in found],
         on_chunk=show,
     )
     lines = rows(result, found, arguments.seeds)
-    shared = {"given": " ".join(arguments.given), "wall_seconds": round(time.monotonic() - began, 1)}
-    file = arguments.out / family / f"{arguments.agent}-{arguments.name}.csv"
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.unlink(missing_ok=True)
-    append_rows(file, [{**line, **shared} for line in lines])
+    shared = {"given": " ".join(arguments.given), "wall_seconds": result.rows[-1]["wall_seconds"]}
+    write_lines(folder.with_name(f"{folder.name}.csv"), [{**line, **shared} for line in lines])
+    shutil.rmtree(folder)
 
 
 def rows(result: Result, found: list[dict[str, float]], seeds: int) -> list[dict[str, Any]]:
@@ -127,8 +128,7 @@ def tabulate(folder: Path) -> None:
     """Rank the points of all files of a family."""
     lines = []
     for path in folder.glob("*.csv"):
-        with path.open(newline="") as file:
-            lines += [{"agent": path.stem, **line} for line in csv.DictReader(file)]
+        lines += [{"agent": path.stem, **line} for line in read_lines(path)]
     rank = lambda line: np.inf if line["return"] in ("", "nan") else -float(line["return"])
     head = ["agent", "given", "point", "return", "least", "largest", "whole_run", "steps", "seconds", "seeds"]
     table = markdown(head, [[line[name] for name in head] for line in sorted(lines, key=rank)])
@@ -137,4 +137,4 @@ def tabulate(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

@@ -1,26 +1,29 @@
-"""Helpers of all benchmarks: the description of the machine, tables and JSON reports."""
+"""Helpers of all benchmarks: the description of the machine, tables, lines of metrics and JSON reports."""
 
 import argparse
+import csv
 import json
 import os
 import platform
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
 import mujoco
 
 import mtjax
+from mtjax.training.log import append_rows
 from mtjax.types import InputError
 
 
 def run_main(main: Callable[[], None]) -> None:
-    """Run a benchmark. Wrong input ends it with one line."""
+    """Run a benchmark. Wrong input, also a file in the place of a folder, ends it with one line."""
     try:
         main()
-    except InputError as error:
+    except (InputError, FileExistsError, NotADirectoryError) as error:
         raise SystemExit(f"error: {error}") from None
 
 
@@ -44,6 +47,19 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Return a table in Markdown."""
     line = lambda cells: "| " + " | ".join(cells) + " |"
     return "\n".join([line(head), "|" + "---|" * len(head), *map(line, rows)])
+
+
+def read_lines(path: Path) -> list[dict[str, str]]:
+    """Return the lines of a CSV file by the names of its columns, without what a killed process left half written."""
+    with path.open(newline="") as file:
+        return [line for line in csv.DictReader(file) if None not in line.values()]
+
+
+def write_lines(path: Path, rows: Sequence[dict[str, Any]]) -> None:
+    """Write a CSV file anew. Without rows there is none."""
+    path.unlink(missing_ok=True)
+    if rows:
+        append_rows(path, rows)
 
 
 def publish(arguments: argparse.Namespace, rows: list[dict]) -> None:

@@ -4,8 +4,10 @@
 
 Every family is trained in one program with all seeds, and writes ``OUT/NAME.csv`` (one line of metrics per chunk and
 seed), ``NAME.npz`` (every episode of every evaluation) and ``NAME.json`` (the row of the table below). A family with a
-``NAME.json`` is not run again, so the families can be run in parts, in any order. Further words replace settings of the
-preset, for the agent or the loop: ``epochs=8 num_envs=512 hidden=[256,256]``.
+``NAME.json`` is not run again, so the families can be run in parts, in any order. If the command is given again, a
+family that was stopped goes on where it was, and one that was killed from its last evaluation; until it is finished its
+run is in ``OUT/NAME.run``. Further words replace settings of the preset, for the agent or the loop: ``epochs=8
+num_envs=512 hidden=[256,256]``.
 
 Steps are of each seed, summed over its ten tasks; steps a second are of all seeds, without compiling and evaluating.
 The return is the mean of the last evaluation under the mean action, over tasks and episodes; its interval is the 95%
@@ -16,21 +18,22 @@ by the same policies with ``context_limit=1``, which shows them a task beyond th
 import argparse
 import dataclasses
 import json
-import time
+import shutil
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-from report import markdown, run_main
+from report import markdown, run_main, write_lines
+from resumable import train
 
 from mtjax.agents.choices import replace
 from mtjax.config import configure, with_preset
 from mtjax.envs.family import Tabled
 from mtjax.evaluation import evaluate, save_evaluations
+from mtjax.names import replacing
 from mtjax.report.stats import seed_interval
-from mtjax.training.log import append_rows
 from mtjax.training.programs import enable_compile_cache
-from mtjax.training.run import Result, train
+from mtjax.training.run import Result
 from mtjax.types import SPLITS, Agent
 
 _GEAR = {"gear": "0.8:1.2:10"}
@@ -80,6 +83,7 @@ def main() -> None:
     for family in arguments.family or FAMILIES:
         if not (arguments.out / f"{family}.json").exists():
             learn(arguments, family)
+        shutil.rmtree(arguments.out / f"{family}.run", ignore_errors=True)
     tabulate(arguments.out)
 
 
@@ -100,8 +104,8 @@ def learn(arguments: argparse.Namespace, family: str) -> None:
             rest = ", ".join(f"{name} {float(row[name]):.3g}" for name in _SHOWN if name in row)
             print(f"{last[0]:7.1f} s  {int(row['steps']):12,} steps  return {row['return'] or '-'}, {rest}", flush=True)
 
-    began = time.monotonic()
     result = train(
+        arguments.out / f"{family}.run",
         config.family,
         agent,
         steps=steps,
@@ -112,16 +116,13 @@ def learn(arguments: argparse.Namespace, family: str) -> None:
         settings=settings,
         on_chunk=show,
     )
-    if not result.finished:
-        raise SystemExit(f"stopped before {family} was finished; the same command goes on with it")
-    file.unlink(missing_ok=True)
-    append_rows(file, result.rows)
+    write_lines(file, result.rows)
     save_evaluations(file.with_suffix(".npz"), result.evaluations)
-    wall = round(time.monotonic() - began, 1)
     found = row(family, result, arguments.seeds) | {"limited": limited(config.family, agent, result, arguments)}
-    found |= {"aim": aim.least, "wall_seconds": wall}
+    found |= {"aim": aim.least, "wall_seconds": round(float(result.rows[-1]["wall_seconds"]), 1)}
     record = {**found, "agent": str(agent), "settings": dataclasses.asdict(settings)}
-    file.with_suffix(".json").write_text(json.dumps(record, indent=2) + "\n")
+    with replacing(file.with_suffix(".json")) as new:  # which marks the family as finished
+        new.write_text(json.dumps(record, indent=2) + "\n")
     print({**found}, flush=True)
 
 

@@ -1,13 +1,17 @@
 """Run a suite of tasks by its name, with its protocol: agents, seeds, steps, and the figures that the field reports.
 
     python benchmarks/suite.py mt10|mt50|dynamics|goals|domains|hard|pixels [--agents NAME ...] [--seeds N]
-                               [--steps-per-task N] [--training NAME=N ...] [--env NAME=VALUE ...] [--out DIR]
+                               [--steps-per-task N] [--training NAME=N ...] [--env NAME=VALUE ...] [--unfinished]
+                               [--out DIR]
 
 ``--list`` prints the protocols. Every pair of environment and agent writes ``DIR/ENV/AGENT.csv`` (training over steps
 and seconds) and ``AGENT.npz`` (every episode of every evaluation: returns and, where tasks have it, success). Finished
-pairs are not run again, so that a long suite runs in parts. All results in DIR together give ``scores.md`` (means over
-tasks with 95% intervals over seeds, for every split), ``tasks.csv`` (every training task and seed of the last
-evaluation) and, for suites that compare one agent for all tasks with one for each, ``sharing.md``.
+pairs are not run again, so that a long suite runs in parts. A pair that was stopped or killed goes on as in
+``learning.py``; its checkpoints need up to 45 GB in ``mt10``, ``hard`` and ``pixels``. All results in DIR together give
+``scores.md`` (means over tasks with 95% intervals over seeds, for every split), ``tasks.csv`` (every training task and
+seed of the last evaluation) and, for suites that compare one agent for all tasks with one for each, ``sharing.md``.
+``scores.md`` names unfinished pairs. ``--unfinished`` adds their last evaluation, marked with its steps, to it and to
+``tasks.csv``.
 
 Success is that of the last evaluation: at the episode's last step, and at any step. Both are shares of episodes.
 """
@@ -21,13 +25,11 @@ from typing import NamedTuple
 
 import learning
 import numpy as np
-from report import markdown
+from report import markdown, run_main, write_lines
 
 import mtjax
-from mtjax.evaluation import Evaluations, load_evaluations
-from mtjax.names import InputError
+from mtjax.evaluation import Evaluations
 from mtjax.report.stats import seed_interval, unpaired_difference
-from mtjax.training.log import append_rows
 from mtjax.training.programs import enable_compile_cache
 from mtjax.types import SPLITS
 
@@ -139,6 +141,7 @@ def main() -> None:
     parser.add_argument("--env", nargs="*", default=[], metavar="NAME=VALUE", help="settings of families: pixels=64")
     parser.add_argument("--evaluations", type=int, default=4)
     parser.add_argument("--eval-episodes", type=int, default=50, help="of each task; Meta-World's tasks have 50 goals")
+    parser.add_argument("--unfinished", action="store_true", help=learning.UNFINISHED)
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
     if arguments.list or not arguments.suite:
@@ -149,9 +152,8 @@ def main() -> None:
     out = arguments.out or Path("runs") / f"{arguments.suite}-{time.strftime('%Y%m%d-%H%M%S')}"
     for env in arguments.envs or suite.envs:
         for agent in suite.agents if arguments.agents is None else arguments.agents:
-            if not (out / env / f"{agent}.npz").exists():
-                learning.learn(request(arguments, suite, env, out), env, agent)
-    print(tabulate(out, suite))
+            learning.learn(request(arguments, suite, env, out), env, agent)
+    print(tabulate(out, suite, arguments.unfinished))
 
 
 def describe(name: str) -> str:
@@ -177,16 +179,16 @@ def last_of(env: str, split: str | None, evaluations: Evaluations) -> Last:
     return Last(labels, splits["train"], of("success"), of("success_ever"), splits)
 
 
-def found(out: Path, suite: Suite) -> Iterator[tuple[str, str, Last]]:
-    """Return environment, agent and last evaluation of every finished pair."""
-    for path in sorted(out.glob("*/*.npz")):
-        yield path.parent.name, path.stem, last_of(path.parent.name, suite.split, load_evaluations(path))
+def found(out: Path, suite: Suite, unfinished: bool = False) -> Iterator[tuple[str, str, Last]]:
+    """Return environment, agent and last evaluation of every finished pair; if asked, of others too."""
+    for pair in learning.pairs(out, unfinished):
+        yield pair.env, pair.agent, last_of(pair.env, suite.split, pair.evaluations)
 
 
-def tabulate(out: Path, suite: Suite) -> str:
-    """Write the tables of all finished pairs, and return that of scores."""
+def tabulate(out: Path, suite: Suite, unfinished: bool = False) -> str:
+    """Write the tables of all finished pairs, if asked of others too, and return that of scores."""
     lines, rows = [], []
-    for env, agent, last in found(out, suite):
+    for env, agent, last in found(out, suite, unfinished):
         cells = [score(last.splits.get(split), ".0f") for split in SPLITS]
         cells += [score(x, ".3f") for x in (last.success, last.ever)]
         lines.append([short(env), agent, str(len(last.returns)), *cells])
@@ -197,10 +199,9 @@ def tabulate(out: Path, suite: Suite) -> str:
             for t, label in enumerate(last.labels)
         ]
     head = ["environment", "agent", "seeds", "return", *SPLITS[1:], "success at the end", "success at any step"]
-    table = markdown(head, lines)
+    table = markdown(head, lines) + learning.list_stopped(out)
     (out / "scores.md").write_text(table + "\n")
-    (out / "tasks.csv").unlink(missing_ok=True)
-    append_rows(out / "tasks.csv", rows)
+    write_lines(out / "tasks.csv", rows)
     if suite.together:
         (out / "sharing.md").write_text(sharing(out, suite) + "\n")
     return table
@@ -234,7 +235,4 @@ def short(env: str) -> str:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except (InputError, FileExistsError) as error:
-        raise SystemExit(f"error: {error}") from None
+    run_main(main)

@@ -1,11 +1,15 @@
 """What benchmarks make of their figures; what they measure is no matter of tests."""
 
+import csv
 import importlib.util
 import json
+import os
+import signal
 import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
 from probes import with_metaworld as with_scenes
@@ -13,8 +17,10 @@ from probes import with_metaworld as with_scenes
 import mtjax
 from mtjax.envs import BENCHMARKS
 from mtjax.envs.metaworld.names import TASKS
-from mtjax.evaluation import Evaluations, save_evaluations
+from mtjax.evaluation import Evaluations, load_evaluations, save_evaluations
 from mtjax.training.log import append_rows
+from mtjax.training.records import Records
+from mtjax.types import InputError
 
 _OF_META_WORLD = ("physics", "steps_per_second", "metaworld_policies")
 FOLDER = Path(__file__).parent.parent / "benchmarks"
@@ -32,7 +38,7 @@ def script(monkeypatch):
         return module
 
     yield load
-    for name in ("report", "training", "returns", "update_cost", "learning", *_OF_META_WORLD):
+    for name in ("report", "training", "returns", "update_cost", "resumable", "learning", *_OF_META_WORLD):
         sys.modules.pop(name, None)
 
 
@@ -83,6 +89,127 @@ def test_a_recorded_report_is_as_fast_as_itself(script, name, capsys, monkeypatc
     source = (FOLDER / report["benchmark"]).read_text()
     flags = [word.split("=")[0] for word in compare.words(dict(report["settings"])) if word.startswith("--")]
     assert flags and all(f'"{flag}"' in source for flag in flags if flag != "--")
+
+
+# Runs that are stopped.
+
+PAIR = ["--preset=cpu", "--seeds=2", "--steps=2000"]  # four chunks of 500 steps
+SMALL = ["num_envs=2", "chunk_steps=25", "batch_size=4", "replay_size=200", "warmup_steps=5"]
+FILES = {
+    "learning": ["point-mass-vary-goal/sac.csv", "point-mass-vary-goal/sac.npz", "evaluations.csv"],
+    "presets": ["point-mass-vary-goal/sac-grid.csv"],
+}
+
+
+@pytest.fixture
+def run(script, monkeypatch):
+    """A function that runs a benchmark of one small pair in a folder, as its command does."""
+    monkeypatch.setenv("MTJAX_CACHE", "0")
+    flags = {
+        "learning": ["--envs", "point-mass-vary-goal", "--agents", "sac", "--evaluations=2", "--training", *SMALL],
+        "presets": ["--family=point-mass-vary-goal", "--agent=sac", "--grid", "tau=0.01,0.02", "--given", *SMALL],
+    }
+
+    def run(name, out, *more):
+        monkeypatch.setattr(sys, "argv", [name, *PAIR, *flags[name], *more, f"--out={out}"])
+        script(name).main()
+
+    return run
+
+
+def terminate(*_):
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+def die(*_):
+    raise ZeroDivisionError
+
+
+def in_third_chunk(act):
+    """``Records.add_rows`` that acts after the third chunk, hence after the first evaluation."""
+    add = Records.add_rows
+    return lambda records, rows: (add(records, rows), act() if rows[0]["steps"] == 1500 else None)
+
+
+def lines_of(path):
+    return list(csv.DictReader(path.read_text().splitlines()))
+
+
+def results(out, name):
+    """What a benchmark writes, apart from clocks."""
+    found = {}
+    for path in (out / file for file in FILES[name]):
+        if path.suffix == ".npz":
+            found[path.name] = load_evaluations(path)
+        else:
+            found[path.name] = [
+                {name: x for name, x in line.items() if not name.endswith("seconds")} for line in lines_of(path)
+            ]
+    return found
+
+
+@pytest.fixture(scope="module")
+def unstopped():
+    """Results that are found once, by the name of the benchmark."""
+    return {}
+
+
+@pytest.mark.parametrize("name", list(FILES))
+@pytest.mark.parametrize("end", [terminate, die])
+def test_a_stopped_pair_goes_on_to_the_same_results(run, unstopped, tmp_path, monkeypatch, name, end):
+    """It is in no table before, and leaves nothing but results."""
+    if name not in unstopped:
+        run(name, tmp_path / "whole")
+        unstopped[name] = results(tmp_path / "whole", name)
+    out = tmp_path / "parts"
+    with monkeypatch.context() as patch, pytest.raises((SystemExit, ZeroDivisionError)):
+        patch.setattr(Records, "add_rows", in_third_chunk(end))
+        run(name, out)
+    assert not [file for file in FILES[name] if (out / file).exists()]
+    trained = []
+    add = Records.add_rows
+    monkeypatch.setattr(Records, "add_rows", lambda *given: (trained.append(given[1][0]["steps"]), add(*given)))
+    run(name, out)
+    assert trained == ([2000] if end is terminate else [1500, 2000])
+    jax.tree.map(np.testing.assert_array_equal, results(out, name), unstopped[name])
+    assert not list(out.rglob("checkpoints"))
+
+
+def test_an_unfinished_pair_is_told_and_goes_on_with_its_settings_only(run, script, tmp_path, monkeypatch):
+    """Tables name it; if asked they show its last evaluation, and curves up to there."""
+    with monkeypatch.context() as patch, pytest.raises(SystemExit, match=r"stopped: the run is in .*sac, and the same"):
+        patch.setattr(Records, "add_rows", in_third_chunk(terminate))
+        run("learning", tmp_path)
+    with pytest.raises(InputError, match="had another training"):
+        run("learning", tmp_path, "--training", *SMALL, "num_envs=3")
+    with pytest.raises(InputError, match="had another eval_every"):
+        run("learning", tmp_path, "--steps=4000")
+    with (tmp_path / "point-mass-vary-goal" / "sac" / "metrics.csv").open("a") as file:
+        file.write("0,100,20")  # as of a killed process
+    learning, suite = script("learning"), script("suite")
+    small = suite.Suite("", ("point-mass-vary-goal",), ("sac",), 1)
+    learning.tabulate(tmp_path, 900, "sac")
+    for table in ((tmp_path / "table.md").read_text(), suite.tabulate(tmp_path, small)):
+        assert "| sac" not in table
+        assert table.strip().endswith("\n- point-mass-vary-goal: sac, unfinished: evaluated after 1,000 of 2,000 steps")
+    learning.tabulate(tmp_path, 900, "sac", unfinished=True)
+    for table in ((tmp_path / "table.md").read_text(), suite.tabulate(tmp_path, small, unfinished=True)):
+        assert "| point-mass-vary-goal | sac, unfinished: evaluated after 1,000 of 2,000 steps |" in table
+    assert learning.curve_of(*learning.pairs(tmp_path, unfinished=True))[:, 0, 1].tolist() == [500, 1000]
+
+
+def test_a_pair_whose_results_were_not_written_is_not_trained_again(run, tmp_path, monkeypatch):
+    """And what a process left that died before it could clean up is removed."""
+    with monkeypatch.context() as patch, pytest.raises(ZeroDivisionError):
+        patch.setattr("mtjax.evaluation.save_evaluations", die)  # by which the script marks a pair as finished
+        patch.setattr("mtjax.training.records.save_evaluations", save_evaluations)
+        run("learning", tmp_path)
+    monkeypatch.setattr(Records, "add_rows", die)
+    run("learning", tmp_path)
+    assert [line["steps"] for line in lines_of(tmp_path / FILES["learning"][0])[::2]] == ["500", "1000", "1500", "2000"]
+    (tmp_path / "point-mass-vary-goal" / "sac").mkdir()
+    run("learning", tmp_path)
+    assert not (tmp_path / "point-mass-vary-goal" / "sac").exists()
 
 
 def test_returns_are_those_of_whole_chunks(script, tmp_path):

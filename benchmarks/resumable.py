@@ -1,0 +1,29 @@
+"""Training that a stopped benchmark does not lose: a run lies in a folder until its results are written."""
+
+from pathlib import Path
+from typing import Any
+
+from report import read_lines
+
+import mtjax
+from mtjax.training.result import Result
+from mtjax.types import Agent, Env
+
+
+def train(folder: Path, family: Env, agent: Agent, **given: Any) -> Result:
+    """Train by ``mtjax.train`` in a folder, or go on with the run that was stopped there.
+
+    Checkpoints are written after evaluations and after a signal. The disk needs room for three training states, replay
+    included. The caller removes the folder once the results are written.
+
+    Returns:
+        the result, with the lines of metrics from before the stop too.
+
+    Raises:
+        InputError: the run in the folder had other settings.
+        SystemExit: a signal has stopped the run.
+    """
+    result = mtjax.train(family, agent, directory=folder, resume=(folder / "config.json").exists(), **given)
+    if not result.finished:
+        raise SystemExit(f"stopped: the run is in {folder}, and the same command with the same --out goes on with it")
+    return result._replace(rows=read_lines(folder / "metrics.csv"))
