@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mtjax.agents import PARTS, settings
-from mtjax.agents.choices import CHOICES, flag_names
+from mtjax.agents import settings
+from mtjax.agents.choices import CHOICES, flag_names, owners
 from mtjax.commands import (
     check_names,
     flag_value,
@@ -156,19 +156,7 @@ def _check_flags(argv: Sequence[str], config: RunConfig) -> None:
         flag = word.split("=", 1)[0].replace("_", "-")
         if flag.startswith("--") and flag not in (*known, "--help"):
             require_pictures(config.env, flag.removeprefix("--env."))
-            owners = _owners(flag)
-            if owners:
-                raise InputError(f"unknown flag {flag!r} of {config.agent}; it belongs to {', '.join(owners)}")
+            name = flag.removeprefix("--").removeprefix("agent.").replace("-", "_")
+            if found := owners(name, "--agent.{}={}"):
+                raise InputError(f"unknown flag {flag!r} of {config.agent}; it belongs to {found}")
             raise unknown_flag(flag, known)
-
-
-def _owners(flag: str) -> list[str]:
-    """Return which parts or agents have a flag."""
-    name = flag.removeprefix("--").removeprefix("agent.").replace("-", "_")
-    has = lambda cls: any(field.name == name for field in dataclasses.fields(cls))
-    parts = [f"--agent.{kind}={part}" for kind in CHOICES for part, cls in PARTS[kind].items() if has(cls)]
-    learn_from = {
-        "replay": "agents with a replay, such as sac",
-        "rollouts": "agents that learn from rollouts, such as ppo",
-    }
-    return parts or [told for kind, told in learn_from.items() if has(PARTS["experience"][kind])]

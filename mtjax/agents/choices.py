@@ -1,7 +1,7 @@
 """Which parts agents have, and their settings in flat tables by name."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, get_type_hints
 
 import tyro
@@ -71,7 +71,7 @@ def replace(agent: Any, given: Mapping[str, Any]) -> Any:
         chosen[kind] = parts.take(rest, part)
     unknown = next((name for name in rest if name not in fields), None)
     if unknown is not None:
-        raise nearest_error("setting", unknown, [*settings(agent), *OF_TRAIN])
+        raise unknown_setting("setting", unknown, [*settings(agent), *OF_TRAIN])
     return dataclasses.replace(agent, **checked(agent, rest), **chosen)
 
 
@@ -97,5 +97,26 @@ def build(name: str, cls: type, defaults: Mapping[str, Any], given: Mapping[str,
         raise InputError(f"{unknown} is no setting of an agent; give it to mtjax.train({unknown}=...)")
     if unknown is not None:
         known = [*fields, *(name for part in chosen.values() for name in parts.settings(part))]
-        raise nearest_error(f"setting of {name}", unknown, known)
+        raise unknown_setting(f"setting of {name}", unknown, known)
     return cls(**checked(cls, rest), **chosen)
+
+
+def unknown_setting(kind: str, name: str, known: Iterable[str]) -> InputError:
+    """Return an error for a setting that an agent lacks. It names who has that setting, else the nearest match."""
+    found = owners(name, "{}={!r}")
+    return InputError(f"unknown {kind} {name!r}; it belongs to {found}") if found else nearest_error(kind, name, known)
+
+
+def owners(name: str, form: str) -> str:
+    """Return which parts or agents have a setting of that name; an empty string if none has.
+
+    Args:
+        form: how to write the choice of a part, given its kind and its name.
+    """
+    has = lambda cls: any(field.name == name for field in dataclasses.fields(cls))
+    found = [form.format(kind, part) for kind in CHOICES for part, cls in PARTS[kind].items() if has(cls)]
+    learn_from = {
+        "replay": "agents with a replay, such as sac",
+        "rollouts": "agents that learn from rollouts, such as ppo",
+    }
+    return ", ".join(found or [told for kind, told in learn_from.items() if has(EXPERIENCES[kind])])

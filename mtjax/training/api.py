@@ -7,7 +7,7 @@ from typing import Any
 
 from mtjax import agents
 from mtjax.agents import BaseAgent
-from mtjax.agents.choices import flag_names
+from mtjax.agents.choices import flag_names, unknown_setting
 from mtjax.agents.choices import settings as settings_of
 from mtjax.checks import checked, path
 from mtjax.config import Plan, RunConfig, configure, from_json, own_files, with_preset
@@ -216,7 +216,7 @@ def _require_known(given: Mapping[str, Any], agent: Any, env_name: str, family: 
         raise InputError(f"{unknown} is a parameter of {env_name}, not a setting: {where}")
     if unknown in _names(type(family)):
         raise InputError(f"{unknown} is a setting of the environment: use mtjax.make({env_name!r}, {unknown}=...)")
-    raise nearest_error("setting", unknown, [*_names(Settings), *_names(Plan), *sorted(known)])
+    raise unknown_setting("setting", unknown, [*_names(Settings), *_names(Plan), *sorted(known)])
 
 
 def _kinds(agent: Any) -> set[str]:
