@@ -382,6 +382,16 @@ def test_damaged_evaluations_do_not_stop_a_resumed_run(play, whole, tmp_path):
     assert load_evaluations(tmp_path / "evaluations.npz").steps.tolist() == [600]
 
 
+def test_damaged_evaluations_of_a_finished_run_are_made_again(play, whole, tmp_path):
+    """From its last state."""
+    shutil.copytree(whole.directory, tmp_path, dirs_exist_ok=True)
+    (tmp_path / "evaluations.npz").write_bytes(b"half")
+    with pytest.warns(Notice, match="the run goes on without its earlier evaluations"):
+        found = play(tmp_path, resume=True).evaluations
+    assert found.steps.tolist() == load_evaluations(tmp_path / "evaluations.npz").steps.tolist() == [600]
+    assert np.isfinite(found.returns["train"]).all()
+
+
 def test_evaluations_of_another_run_are_refused(play, whole, tmp_path):
     """As they would be joined with this run's."""
     shutil.copytree(whole.directory, tmp_path, dirs_exist_ok=True)

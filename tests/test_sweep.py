@@ -21,6 +21,7 @@ from mtjax.agents import settings as settings_of
 from mtjax.config import configure, from_json, to_json
 from mtjax.evaluation import load_evaluations
 from mtjax.loop import Settings
+from mtjax.names import Notice
 from mtjax.training import memory, points, sweep
 from mtjax.training.console import Console
 from mtjax.training.folder import to_flags
@@ -420,6 +421,32 @@ def test_a_finished_sweep_has_nothing_left_to_do(swept, capsys):
     mtjax.train.main([f"--resume={swept}"])
     said = capsys.readouterr().out
     assert "compiled" not in said and "actor-lr" in said
+
+
+def test_damaged_evaluations_do_not_stop_a_sweep(swept, tmp_path, capsys):
+    """Those of a finished run are made again from its last state, and the file is kept."""
+    folder = shutil.copytree(swept, tmp_path / "sweep")
+    (folder / "run-1" / "evaluations.npz").write_bytes(b"half")
+    with pytest.warns(Notice, match=r"run-1/evaluations\.npz', which is damaged: .* kept as 'evaluations.damaged.npz'"):
+        mtjax.train.main([f"--resume={folder}"])
+    assert (folder / "run-1" / "evaluations.damaged.npz").read_bytes() == b"half"
+    assert (folder / "sweep.csv").read_bytes() == (swept / "sweep.csv").read_bytes()
+    capsys.readouterr()
+    mtjax.train.main([f"--resume={folder}"])
+    assert "compiled" not in capsys.readouterr().out
+
+
+def test_evaluations_of_diverged_points_stay_none(tmp_path):
+    """Also where they are lost, and made again from the last state."""
+    given = {"steps": 240, "eval_every": 240, "eval_episodes": 2, "sweep": {"actor_lr": [1e-3, 1e38]}, **SMALL}
+    train(Walk(), tiny("sac"), **given, directory=tmp_path)
+    before = (tmp_path / "evaluations.npz").read_bytes()
+    returns = load_evaluations(tmp_path / "evaluations.npz").returns["train"]
+    assert np.isfinite(returns[0]).all() and np.isnan(returns[1]).all()
+    (tmp_path / "evaluations.npz").write_bytes(before[:100])
+    with pytest.warns(Notice, match="which is damaged"):
+        train(Walk(), tiny("sac"), **given, directory=tmp_path, resume=True)
+    assert (tmp_path / "evaluations.npz").read_bytes() == before
 
 
 def test_policies_are_those_of_a_point(swept):

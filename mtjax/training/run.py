@@ -30,7 +30,7 @@ from mtjax.training.programs import Programs, compile_lowered, jit_programs, loa
 from mtjax.training.records import Records
 from mtjax.training.result import Result
 from mtjax.training.sinks import Sink, open_sinks, require_libraries, write_rows
-from mtjax.training.stops import require_finite, require_finite_parameters, stop_signals
+from mtjax.training.stops import finite_seeds, require_finite, require_finite_parameters, stop_signals
 from mtjax.types import SPLITS, Agent, Env, InputError
 
 
@@ -280,6 +280,9 @@ class _Run:
         seconds = earlier
         rows, stop = log.Rows(), 0
         diverged = np.zeros(len(self.seeds), bool)
+        if steps >= self.plan.steps and not len(evaluations.steps):  # they were lost after the run's end
+            spoiled = diverged | ~finite_seeds(getattr(state.agent, "learner", state.agent))
+            evaluations = self._evaluate(programs.evaluate, state, evaluations, steps, spoiled)
         with stop_signals() as received, self.records.closing():
             while steps < self.plan.steps and not stop:
                 self.records.check()

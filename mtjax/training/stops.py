@@ -67,13 +67,18 @@ def require_finite_parameters(state: Any, iteration: int, last: Callable[[], str
     Raises:
         FloatingPointError: actor or critics hold numbers that are not finite.
     """
-    parameters = [getattr(state, name) for name in ("actor", "critic") if hasattr(state, name)]
-    finite = hosts.gather(_finite_seeds(parameters)) if parameters else np.ones(1, bool)
+    finite = finite_seeds(state)
     if not np.all(finite):
         raise FloatingPointError(
             f"parameters stopped being finite in the update before step {iteration} (number {np.argmin(finite)} of the "
             f"run's seeds); {last()}. {_HINT}"
         )
+
+
+def finite_seeds(state: Any) -> np.ndarray:
+    """Return which seeds (S,) of an agent's state, leaves (S, ...), have finite actors and critics."""
+    parameters = [getattr(state, name) for name in ("actor", "critic") if hasattr(state, name)]
+    return hosts.gather(_finite_seeds(parameters)) if parameters else np.ones(1, bool)
 
 
 @jax.jit

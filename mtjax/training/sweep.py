@@ -257,10 +257,11 @@ def final_evaluations(config: RunConfig, run: Path) -> Evaluations | None:
 
 
 def _latest_evaluations(run: Path) -> Evaluations | None:
-    """Return the evaluations of a run; None if it has none yet."""
-    if not (run / "evaluations.npz").exists():
+    """Return the evaluations of a run; None if it has none yet, or a damaged file, which the resumed run replaces."""
+    try:
+        found = load_evaluations(run / "evaluations.npz")
+    except InputError:
         return None
-    found = load_evaluations(run / "evaluations.npz")
     return found if len(found.steps) else None
 
 
