@@ -227,17 +227,17 @@ def from_json(path: Path) -> RunConfig:
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{str(path)!r} does not describe a run: {type(error).__name__}: {error}") from None
+        text = f"{str(path)!r} does not describe a run: {type(error).__name__}: {error}"
+        raise InputError(text + _with_copy(path)) from None
     try:
         return _from_record(record)
     except InputError as error:
         asked = _with_import(error, str(path.parent), record)
-        if asked is not error:
-            raise asked from None
-        raise InputError(f"{str(path)!r}: {error}{_other_version(record)}") from None
+        text = f"{str(path)!r}: {error}{_other_version(record)}" if asked is error else str(asked)
+        raise InputError(text + _with_copy(path)) from None
     except Exception as error:  # whatever an edited record makes of the classes it is read into
         text = f"{str(path)!r} does not describe a run: {type(error).__name__}: {str(error)[:150]}"
-        raise InputError(text + _other_version(record)) from None
+        raise InputError(text + _other_version(record) + _with_copy(path)) from None
 
 
 def _from_record(record: Any) -> RunConfig:
@@ -284,6 +284,13 @@ def _with_import(error: InputError, run: str, record: Mapping[str, Any]) -> Inpu
     if (env not in ENVS and not is_mixture(env)) or name not in AGENTS:
         return InputError(f"{error}. If it is your own, give --import=FILE.py with the file that registers it")
     return error
+
+
+def _with_copy(path: Path) -> str:
+    """Return a clause that names the newest checkpoint's copy of a record if the record has changed since then."""
+    copies = (file for file in path.parent.glob(f"checkpoints/*/{path.name}") if file.parent.name.isdecimal())
+    newest = max(copies, key=lambda file: int(file.parent.name), default=path)
+    return "" if newest.read_bytes() == path.read_bytes() else f"; {str(newest)!r} holds it as it was"
 
 
 def _other_version(record: Any) -> str:

@@ -10,10 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import mtjax.train
 from mtjax import loop
 from mtjax.config import from_json
 from mtjax.names import Notice
 from mtjax.training import checkpoint
+from mtjax.training.folder import record_steps, tell_edits
 from mtjax.types import InputError
 
 
@@ -150,10 +152,64 @@ def test_every_flipped_bit_is_noticed(copied_run):
         file = files[number % len(files)]
         before = file.read_bytes()
         place, bit = random.integers(len(before)), random.integers(8)
-        file.write_bytes(before[:place] + bytes([before[place] ^ (1 << bit)]) + before[place + 1 :])
+        file.write_bytes(flipped(before, place, bit))
         assert checkpoint._damage(folder, ("agent", "loop")), (file, place, bit)
         file.write_bytes(before)
     assert checkpoint._damage(folder, ("agent", "loop")) == ""
+
+
+def flipped(content, place, bit):
+    return content[:place] + bytes([content[place] ^ (1 << bit)]) + content[place + 1 :]
+
+
+def test_every_flipped_bit_of_a_record_is_noticed(copied_run):
+    """300 of them. A record that cannot be read is refused, with the place of the copy; any other is told."""
+    file, copy = copied_run / "config.json", copied_run / "checkpoints" / "150" / "config.json"
+    whole, refused, random = file.read_bytes(), 0, np.random.default_rng(0)
+    assert copy.read_bytes() == whole
+    for number in range(300):
+        file.write_bytes(flipped(whole, random.integers(len(whole)), number % 8))
+        try:
+            from_json(file)
+        except InputError as error:
+            refused += 1
+            assert f"{str(copy)!r} holds it as it was" in str(error)
+        else:
+            with pytest.warns(Notice, match="was edited or damaged, and is used as it is; unlike in"):
+                tell_edits(file, copy)
+    assert 0 < refused < 300
+
+
+def test_what_changed_in_a_record_is_told(copied_run):
+    """By name, and where the run's state is read; nothing is said of more steps, nor where there is no copy."""
+    file = copied_run / "config.json"
+    record_steps(file, 800)
+    mtjax.load(copied_run)
+    file.write_text(file.read_text().replace('"actor_lr": 0.002', '"actor_lr": 0.006'))
+    with pytest.warns(Notice, match=r"unlike in '.*150/config.json', learner.actor_lr is 0.006, not 0.002$"):
+        assert mtjax.load(copied_run).agent.actor_lr == 0.006
+    with pytest.warns(Notice, match="learner.actor_lr is 0.006, not 0.002"):
+        mtjax.train.main([f"--resume={copied_run}"])
+    assert mtjax.load(copied_run).agent.actor_lr == 0.006  # its new checkpoint has it
+    file.write_text(file.read_text().replace('"steps": 800', '"steps": 900'))
+    with pytest.warns(Notice, match="plan.steps is 900, not 800$"):
+        mtjax.load(copied_run)
+    for copy in (copied_run / "checkpoints").glob("*/config.json"):
+        sums = copy.with_name("checksums.txt")
+        sums.write_text("".join(x for x in sums.read_text().splitlines(True) if not x.endswith("  config.json\n")))
+        copy.unlink()
+    mtjax.load(copied_run)
+
+
+def test_a_record_that_changes_during_a_run_is_told(state, tmp_path):
+    """The copies are of the file as it was when the run began."""
+    (tmp_path / "config.json").write_text('{"plan": {"steps": 3}, "device": "cpu"}')
+    writer = checkpoint.Writer(tmp_path / "checkpoints")
+    (tmp_path / "config.json").write_text('{"plan": {"steps": 3}, "device": "cqu"}')
+    writer.save(state)
+    writer.wait()
+    with pytest.warns(Notice, match='device is "cqu", not "cpu"$'):
+        checkpoint.load_agent(tmp_path / "checkpoints", state)
 
 
 def test_stray_folders_are_ignored(copied_run, shapes):

@@ -331,10 +331,10 @@ def run_of(copied_run):
         state = checkpoint.load(checkpoints, shapes)
         init = jax.vmap(lambda key: learner.init(program.family.spec, tasks, key))
         fresh = jax.jit(init, compiler_options=QUICK)(jax.random.split(KEY, 2))
-        shutil.rmtree(checkpoints)
-        checkpoint.save(checkpoints, state._replace(agent=fresh))
         program = dataclasses.replace(program, agent=name, learner=learner)
         (copied_run / "config.json").write_text(to_json(program, {}))
+        shutil.rmtree(checkpoints)
+        checkpoint.save(checkpoints, state._replace(agent=fresh))
 
     return remake
 

@@ -2,8 +2,9 @@
 
 A run's ``checkpoints`` folder holds the newest two, each in a folder named after its iteration. A checkpoint is written
 under another name, and gets its own name last: whatever ends a run, a folder with a number for a name is whole. Disks
-and copies damage files later. The checksums tell, and then the checkpoint before is used. A resumed run continues bit
-for bit, but on MuJoCo Warp.
+and copies damage files later. The checksums tell, and then the checkpoint before is used. Every checkpoint holds a copy
+of the run's config.json, which tells whether that was edited or damaged. A resumed run continues bit for bit, but on
+MuJoCo Warp.
 """
 
 import errno
@@ -23,9 +24,11 @@ from mtjax.experience.ring import Ring
 from mtjax.loop import TrainState
 from mtjax.names import notice
 from mtjax.parallel import hosts
+from mtjax.training.folder import tell_edits
 from mtjax.types import InputError
 
 _KEPT = 2
+_RECORD = "config.json"  # beside the folder of checkpoints
 _SUMS = "checksums.txt"  # as of sha256sum, by which users can check them too
 _LINE = re.compile(r"([0-9a-f]{64})  (.+)")
 _UNFINISHED = ("*.new", "*.orbax-checkpoint-tmp")  # what a killed process leaves
@@ -37,11 +40,14 @@ _UNKNOWN = (errno.EOPNOTSUPP, errno.EINVAL)  # of a file system that reserves no
 class Writer:
     """Writes checkpoints into a folder, one at a time, while training goes on.
 
-    The state is copied to the host before ``save`` returns, so that the next chunk may overwrite it.
+    The state is copied to the host before ``save`` returns, so that the next chunk may overwrite it. Copies of the
+    run's config.json are as it was when the run began, whatever happens to the file meanwhile.
     """
 
     def __init__(self, directory: Path):
         self.directory, self.pending = directory, None
+        record = directory.parent / _RECORD
+        self.record = record.read_bytes() if record.is_file() else None
         self.thread = ThreadPoolExecutor(1, "checkpoint")
 
     def save(self, state: TrainState) -> None:
@@ -51,7 +57,7 @@ class Writer:
             OSError: that checkpoint could not be written, or this one cannot be begun.
         """
         self.wait()
-        self.pending = _begin(self.directory / str(int(state.iteration)), state, self.thread)
+        self.pending = _begin(self.directory / str(int(state.iteration)), state, self.record, self.thread)
 
     def wait(self) -> None:
         """Wait until the last checkpoint is written.
@@ -71,7 +77,7 @@ def save(directory: Path, state: TrainState) -> None:
     writer.wait()
 
 
-def _begin(folder: Path, state: TrainState, thread: ThreadPoolExecutor) -> Future[None] | None:
+def _begin(folder: Path, state: TrainState, record: bytes | None, thread: ThreadPoolExecutor) -> Future[None] | None:
     """Copy the state to the host, and let the thread write it. Every process writes what its devices hold."""
     from orbax.checkpoint import v1 as ocp
 
@@ -89,7 +95,7 @@ def _begin(folder: Path, state: TrainState, thread: ThreadPoolExecutor) -> Futur
         written = ocp.save_checkpointables_async(str(new.absolute()), parts)
     except (OSError, ValueError) as error:
         raise _as_oserror(error, new) from None
-    return thread.submit(_finish, written, new, folder)
+    return thread.submit(_finish, written, record, new, folder)
 
 
 def _shortage(folder: Path, size: int) -> int:
@@ -112,12 +118,14 @@ def _shortage(folder: Path, size: int) -> int:
     return 0
 
 
-def _finish(written: Any, new: Path, folder: Path) -> None:
-    """Seal a written checkpoint: add checksums, give it its name, and drop what is older than the last two."""
+def _finish(written: Any, record: bytes | None, new: Path, folder: Path) -> None:
+    """Seal a written checkpoint: add config.json and checksums, give it its name, and drop all but the last two."""
     try:
         written.result()
         if not hosts.is_first():
             return
+        if record is not None:
+            (new / _RECORD).write_bytes(record)
         names = sorted(_files(new))
         (new / _SUMS).write_text("".join(f"{digest}  {name}\n" for name, digest in _digests(new, names).items()))
         new.rename(folder)
@@ -172,7 +180,10 @@ def load(directory: Path, like: TrainState) -> TrainState:
         InputError: there is no whole checkpoint, or it is of another agent or family.
     """
     like_parts = {"agent": like.agent, "loop": like._replace(agent=None)}
-    read = _read(hosts.broadcast_path(lambda: _newest_whole(directory, like_parts)), like_parts)
+    folder = hosts.broadcast_path(lambda: _newest_whole(directory, like_parts))
+    if hosts.is_first():
+        tell_edits(directory.parent / _RECORD, folder / _RECORD)
+    read = _read(folder, like_parts)
     return read["loop"]._replace(agent=read["agent"])
 
 
@@ -184,6 +195,7 @@ def load_agent(directory: Path, like: TrainState, iteration: int = 0) -> Any:
     """
     parts = {"agent": like.agent}
     folder = _of_iteration(directory, iteration, parts) if iteration else _newest_whole(directory, parts)
+    tell_edits(directory.parent / _RECORD, folder / _RECORD)
     return _read(folder, parts)["agent"]
 
 

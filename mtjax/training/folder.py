@@ -5,8 +5,9 @@ import itertools
 import json
 import platform
 import shlex
+import textwrap
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -19,11 +20,12 @@ from mtjax.agents.choices import flag_names
 from mtjax.config import RunConfig, from_json, import_flags, to_json
 from mtjax.envs.family import Family, Tabled
 from mtjax.envs.mixtures import Mixture
-from mtjax.names import replacing
+from mtjax.names import notice, replacing
 from mtjax.types import InputError
 
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
 _LONGEST = 80
+_MOST_TOLD = 3
 
 
 def new_directory(root: Path, name: str) -> Path:
@@ -77,14 +79,43 @@ def write_config(directory: Path, config: RunConfig) -> None:
 def record_steps(file: Path, steps: int) -> None:
     """Write the new number of steps into config.json, so that the next resume uses it too."""
     record = json.loads(file.read_text())
-    before = record["plan"].get("steps")  # an edited record may lack it
-    if before == steps:
-        return
+    if record["plan"].get("steps") != steps:  # an edited record may lack it
+        with replacing(file) as new:
+            new.write_text(json.dumps(_with_steps(record, steps), indent=2) + "\n")
+
+
+def _with_steps(record: Mapping[str, Any], steps: Any) -> dict[str, Any]:
+    """Return a record of another number of steps, also in its command."""
+    changed = {**record, "plan": {**record["plan"], "steps": steps}}
     if isinstance(record.get("command"), str):
-        record["command"] = record["command"].replace(f" --steps={before} ", f" --steps={steps} ")
-    record["plan"]["steps"] = steps
-    with replacing(file) as new:
-        new.write_text(json.dumps(record, indent=2) + "\n")
+        before = record["plan"].get("steps")
+        changed["command"] = record["command"].replace(f" --steps={before} ", f" --steps={steps} ")
+    return changed
+
+
+def tell_edits(file: Path, copy: Path) -> None:
+    """Warn if a run's config.json differs from the copy in its checkpoint by more than ``record_steps`` wrote.
+
+    The warning names the entries. Runs of earlier versions have no copy.
+    """
+    if not copy.is_file() or not file.is_file():
+        return
+    now, then = (json.loads(each.read_text(encoding="utf-8")) for each in (file, copy))
+    longer = _with_steps(then, now["plan"].get("steps"))
+    values, before = _entries(now), _entries(longer if longer.get("command") == now.get("command") else then)
+    names = [name for name in {**before, **values} if values.get(name) != before.get(name)]
+    if not names:
+        return
+    short = lambda value: textwrap.shorten(json.dumps(value), _LONGEST)
+    told = [f"{name} is {short(values.get(name))}, not {short(before.get(name))}" for name in names[:_MOST_TOLD]]
+    told += [f"and {len(names) - _MOST_TOLD} more"] * (len(names) > _MOST_TOLD)
+    notice(f"{str(file)!r} was edited or damaged, and is used as it is; unlike in {str(copy)!r}, {'; '.join(told)}")
+
+
+def _entries(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of a record by name, such as learner.actor_lr."""
+    inner = lambda name, x: {f"{name}.{key}": each for key, each in x.items()} if isinstance(x, dict) else {name: x}
+    return {name: value for outer, x in record.items() for name, value in inner(outer, x).items()}
 
 
 def run_metadata(config: RunConfig) -> dict:
