@@ -1,6 +1,8 @@
 """Lines of metrics in their file."""
 
 import csv
+import itertools
+import warnings
 
 import numpy as np
 import pytest
@@ -73,6 +75,43 @@ def test_what_can_be_read_of_a_damaged_file_is_kept(tmp_path, content, left):
     log.append_rows(path, [row])
     rows = read(path)
     assert len(rows) == left + 1 and rows[-1] == row
+
+
+WHOLE = "".join(f"{line}\r\n" for line in LINES).encode()
+
+
+def flipped_rows(tmp_path, place, bit):
+    """What is left of the rows up to iteration 20 of a file with one flipped bit, and whether that was told."""
+    path = tmp_path / "metrics.csv"
+    path.write_bytes(WHOLE[:place] + bytes([WHOLE[place] ^ (1 << bit)]) + WHOLE[place + 1 :])
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        log.truncate_rows(path, 20, LINES[0].split(","))
+    return read(path), bool(told)
+
+
+def test_a_flipped_bit_costs_its_own_line_at_most(tmp_path):
+    """Any one of the file; two lines if it joins them. What is left is of numbers, and what is lost is told."""
+    rows = [dict(zip(LINES[0].split(","), line.split(","), strict=True)) for line in LINES[1:3]]
+    for place, bit in itertools.product(range(len(WHOLE)), range(8)):
+        left, told = flipped_rows(tmp_path, place, bit)
+        line = WHOLE[:place].count(b"\n")
+        spoiled = {line, line + 1} if WHOLE[place] == ord("\n") else {line}
+        assert all(row in left for k, row in enumerate(rows, 1) if k not in spoiled), (place, bit)
+        assert all(float(value) >= 0 for row in left for value in row.values()), (place, bit)
+        assert told or len(left) >= 2, (place, bit)
+
+
+def test_a_damaged_first_line_is_replaced(tmp_path):
+    """By the columns that the run writes; those of a file of another version stay."""
+    path = tmp_path / "metrics.csv"
+    path.write_bytes(WHOLE.replace(b"seconds,x", b"seconds.x"))
+    with pytest.warns(Notice, match="is damaged: 2 rows up to step 20 are left"):
+        assert log.truncate_rows(path, 20, LINES[0].split(",")) == (2.5, 9.0)
+    assert read(path)[1] == {"seed": "0", "iteration": "20", "seconds": "2.5", "wall_seconds": "9", "x": "4"}
+    path.write_bytes(WHOLE)
+    assert log.truncate_rows(path, 30, [*LINES[0].split(","), "new"]) == (3.5, 9.0)
+    assert path.read_bytes() == WHOLE
 
 
 def test_rows_are_means_over_tasks_and_each_tasks_return():

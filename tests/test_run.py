@@ -392,6 +392,20 @@ def test_damaged_evaluations_of_a_finished_run_are_made_again(play, whole, tmp_p
     assert np.isfinite(found.returns["train"]).all()
 
 
+def test_damaged_metrics_do_not_stop_a_resumed_run(play, whole, tmp_path):
+    """It goes on with the lines that can be read, under the columns that it writes."""
+    shutil.copytree(whole.directory, tmp_path, dirs_exist_ok=True)
+    shutil.rmtree(tmp_path / "checkpoints" / "150")
+    content = (tmp_path / "metrics.csv").read_bytes().replace(b"actor_loss", b"actor_lo\xf3s", 1)
+    lines = [*content.splitlines(keepends=True), b"0,75,300,0.5\n", b"0,nonsense,1\n"]
+    lines[3] = lines[3].replace(b",", b',"', 1)
+    (tmp_path / "metrics.csv").write_bytes(b"".join(lines))
+    with pytest.warns(Notice, match=r"metrics\.csv' is damaged: 7 rows up to step 100 are left"):
+        play(tmp_path, resume=True)
+    rows = rows_of(whole.directory)
+    assert rows_of(tmp_path) == rows[:2] + rows[3:]
+
+
 def test_evaluations_of_another_run_are_refused(play, whole, tmp_path):
     """As they would be joined with this run's."""
     shutil.copytree(whole.directory, tmp_path, dirs_exist_ok=True)
@@ -434,9 +448,9 @@ def test_finished_run_has_nothing_to_resume(play, whole, tmp_path):
     assert_same_run(result, whole)
 
 
-@pytest.mark.parametrize("torn", ["0,", "0,1", "0,75,300,0.5\n", "0,nonsense,1\n"])
+@pytest.mark.parametrize("torn", ["0,", "0,1", "0,75,300,0.5", "0,nonsense"])
 def test_torn_metrics_do_not_stop_a_resumed_run(play, whole, tmp_path, torn):
-    """What a killed process left of its last line is no row."""
+    """What a killed process left of its last line is no row. It has no end."""
     shutil.copytree(whole.directory, tmp_path, dirs_exist_ok=True)
     shutil.rmtree(tmp_path / "checkpoints" / "150")
     with (tmp_path / "metrics.csv").open("a") as file:

@@ -12,6 +12,7 @@ import numpy as np
 
 from mtjax.names import naming, notice, replacing
 
+_NUMBER = re.compile(r"(-?([0-9]+(\.[0-9]+)?(e[+-][0-9]+)?|inf))?")  # or nothing
 _OF_EACH_TASK = ("td_error", "critic_gradient_norm", "actor_gradient_norm")  # beside the return
 _CLOCKS = ("seconds", "wall_seconds")
 
@@ -56,10 +57,14 @@ def _columns(path: Path) -> list[str]:
         return next(csv.reader(file))
 
 
-def truncate_rows(path: Path, iteration: int) -> tuple[float, float]:
+def truncate_rows(path: Path, iteration: int, columns: Sequence[str] = ()) -> tuple[float, float]:
     """Drop the rows of metrics after an iteration, because a resumed run writes them again.
 
-    What can be read of a damaged file is kept. The file itself is then kept beside it, and a notice says so.
+    Every line is read by itself. If some cannot be read, the file is kept beside the rows that can, and a notice says
+    so. A digit that has changed is not noticed.
+
+    Args:
+        columns: the columns that the run writes. They take the place of a damaged first line.
 
     Returns:
         the seconds of training up to that iteration, and those of the wall clock.
@@ -68,11 +73,13 @@ def truncate_rows(path: Path, iteration: int) -> tuple[float, float]:
         if iteration:
             notice(f"{str(path)!r} is missing; the run goes on without its earlier rows")
         return 0.0, 0.0
-    names, rows = _read_rows(path)
-    good = [row for row in rows if _is_whole(row)]
-    kept = [row for row in good if int(row["iteration"]) <= iteration]
+    first, *lines = map(_values, path.read_bytes().decode("utf-8", "replace").split("\n")[:-1] or [""])
+    names = list(columns) if columns and any(len(line) == len(columns) for line in lines) else first
+    rows = [dict(zip(names, line, strict=True)) for line in lines if _is_whole(names, line)]
+    kept = [row for row in rows if int(row["iteration"]) <= iteration]
+    order = [int(row["iteration"]) for row in rows]
     last = max((int(row["iteration"]) for row in kept), default=0)
-    if iteration and (last < iteration or any(not _is_whole(row) for row in rows[:-1])):
+    if iteration and (names != first or len(rows) < len(lines) or order != sorted(order) or last < iteration):
         aside = path.with_suffix(".damaged.csv")
         shutil.copyfile(path, aside)
         notice(f"{str(path)!r} is damaged: {len(kept)} rows up to step {last} are left; it is kept as {aside.name!r}")
@@ -85,26 +92,19 @@ def truncate_rows(path: Path, iteration: int) -> tuple[float, float]:
     return seconds, wall
 
 
-def _read_rows(path: Path) -> tuple[list[str], list[dict[str, Any]]]:
-    """Return the columns and rows of a CSV file as far as they can be read."""
-    rows = []
-    with path.open(newline="", encoding="utf-8", errors="replace") as file:
-        reader = csv.DictReader(file)
-        try:
-            names = list(reader.fieldnames or ())
-            rows.extend(reader)
-        except csv.Error:  # a line without end
-            names = list(reader.fieldnames or ()) if rows else []
-            rows.append({})
-    return names, rows
+def _values(line: str) -> list[str]:
+    """Return the values of a line of a CSV file; none if it cannot be read."""
+    try:
+        return next(csv.reader([line]), [])
+    except csv.Error:  # a line without end
+        return []
 
 
-def _is_whole(row: dict[Any, Any]) -> bool:
-    """Return whether a line of metrics is complete. A killed process may leave half of one."""
-    iteration, clocks = str(row.get("iteration")), [str(row.get(name)) for name in _CLOCKS]
-    if None in row or None in row.values() or not (iteration.isascii() and iteration.isdigit()):
-        return False
-    return all(re.fullmatch(r"[0-9]+(\.[0-9]+)?", clock) for clock in clocks)
+def _is_whole(names: Sequence[str], line: Sequence[str]) -> bool:
+    """Return whether a line holds a number, or nothing, in every column, and when it was written."""
+    row = dict(zip(names, line, strict=False))
+    when = row.get("iteration", "").isdecimal() and all(row.get(name, "")[:1].isdecimal() for name in _CLOCKS)
+    return when and len(names) == len(line) and all(map(_NUMBER.fullmatch, line))
 
 
 def metric_rows(metrics: dict[str, np.ndarray], seeds: np.ndarray, common: dict[str, Any]) -> list[dict[str, Any]]:

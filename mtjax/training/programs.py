@@ -30,6 +30,7 @@ class Programs(NamedTuple):
 
     chunk: Callable  # state -> state, metrics
     evaluate: Callable  # agents' state, number of the evaluation -> returns
+    metrics: Any  # the shapes of a chunk's metrics
 
 
 def _specs(agent: Agent) -> TrainState:

@@ -33,6 +33,8 @@ from mtjax.training.sinks import Sink, open_sinks, require_libraries, write_rows
 from mtjax.training.stops import finite_seeds, require_finite, require_finite_parameters, stop_signals
 from mtjax.types import SPLITS, Agent, Env, InputError
 
+_WHEN = ("iteration", "steps", "seconds", "wall_seconds")  # columns of metrics.csv
+
 
 def train(
     env: Env,
@@ -207,7 +209,7 @@ class _Run:
         score = pool.submit(lambda: compile_lowered(played(np.int32(0)).lower()))
         pool.shutdown(wait=False)
         evaluate = lambda agents, number: score.result()(agents, everything, seeds, np.int32(number))
-        programs = Programs(partial(compile_lowered(chunk.lower()), tasks), evaluate)
+        programs = Programs(partial(compile_lowered(chunk.lower()), tasks), evaluate, chunk.out_info[1])
         if kernels.result():  # else the first chunk would wait for them
             score.result()
         return programs, self.records.restore(shapes) if make is None else make.result()(tasks, seeds, knobs)
@@ -276,7 +278,8 @@ class _Run:
         iteration, clock = int(state.iteration), self.console.clock
         steps = iteration * self.steps_per_iteration
         evaluations = self.records.earlier_evaluations(steps, steps >= self.eval_every, self._no_evaluations())
-        earlier, wall = self.records.earlier_seconds(iteration)
+        columns = self._columns(programs.metrics) if iteration else ()
+        earlier, earlier_wall = self.records.earlier_seconds(iteration, columns)
         seconds = earlier
         rows, stop = log.Rows(), 0
         diverged = np.zeros(len(self.seeds), bool)
@@ -296,13 +299,9 @@ class _Run:
                 seconds += elapsed
                 diverged |= self._find_diverged(metrics["bad_step"], steps_before // self.steps_per_iteration, diverged)
                 steps += self.settings.chunk_steps * self.steps_per_iteration
-                common = {
-                    "iteration": steps // self.steps_per_iteration,
-                    "steps": steps,
-                    "seconds": f"{seconds:.3f}",
-                    "wall_seconds": f"{wall + time.monotonic() - started:.3f}",
-                }
-                lines = log.metric_rows(metrics, np.asarray(self.seeds), common)
+                wall = earlier_wall + time.monotonic() - started
+                when = (steps // self.steps_per_iteration, steps, f"{seconds:.3f}", f"{wall:.3f}")
+                lines = log.metric_rows(metrics, np.asarray(self.seeds), dict(zip(_WHEN, when, strict=True)))
                 new = [{"seed": row["seed"], **self.point(k), **row} for k, row in enumerate(lines)]
                 rows.extend(new)
                 self.records.add_rows(new)
@@ -329,6 +328,11 @@ class _Run:
         return Result(state, evaluations, rows, seconds, 0.0, finished, self.directory)._replace(
             trained_seconds=seconds - earlier, signal=0 if finished else stop
         )
+
+    def _columns(self, metrics: Any) -> list[str]:
+        """Return the columns of metrics.csv, given the shapes of a chunk's metrics."""
+        empty = jax.tree.map(lambda x: np.zeros(x.shape), metrics)
+        return list({"seed": 0, **self.point(0), **log.metric_rows(empty, np.zeros(1), dict.fromkeys(_WHEN))[0]})
 
     @contextlib.contextmanager
     def _profile_chunk(self, rows: int, steps: int) -> Iterator[None]:
