@@ -87,5 +87,7 @@ def clip_to(norm: Any) -> optax.GradientTransformation:
 
 def descend(optimizer: optax.GradientTransformation, gradients: Any, memory: Any, params: Any) -> tuple[Any, Any]:
     """Apply one optimiser step, and return the parameters and the optimiser's state."""
+    # Else XLA moves the transposes of gradients into Adam, and on a GPU that copies parameters and moments.
+    gradients = jax.tree.map(jax.lax.optimization_barrier, gradients)
     updates, memory = optimizer.update(gradients, memory, params)
     return optax.apply_updates(params, updates), memory
