@@ -371,4 +371,5 @@ def minimum(values: Array) -> Array:
     The gradient of ``jnp.min`` looks for values that equal the minimum. Where XLA computes the values twice and rounds
     them differently it finds none, and the gradient is 0 / 0.
     """
-    return jnp.take_along_axis(values, jnp.argmin(values, axis=0, keepdims=True), axis=0)[0]
+    lowest = jnp.arange(len(values))[:, None] == jnp.argmin(values, axis=0)
+    return jnp.sum(jnp.where(lowest, values, 0), axis=0)
