@@ -87,7 +87,8 @@ def clip_to(norm: Any) -> optax.GradientTransformation:
 
 def descend(optimizer: optax.GradientTransformation, gradients: Any, memory: Any, params: Any) -> tuple[Any, Any]:
     """Apply one optimiser step, and return the parameters and the optimiser's state."""
-    # Else XLA moves the transposes of gradients into Adam, and on a GPU that copies parameters and moments.
-    gradients = jax.tree.map(jax.lax.optimization_barrier, gradients)
+    # XLA would move the transpose of a batched product's gradient into Adam, and copy parameters and moments on a GPU.
+    apart = lambda x: jax.lax.optimization_barrier(x) if x.ndim > 2 else x
+    gradients = jax.tree.map(apart, gradients)
     updates, memory = optimizer.update(gradients, memory, params)
     return optax.apply_updates(params, updates), memory
