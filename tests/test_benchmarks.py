@@ -376,3 +376,23 @@ def test_tasks_with_a_line_are_not_played_again(script, tmp_path, monkeypatch):
     assert parity.read(given.out) == {"reach", "drawer-open", "drawer-close", "soccer"}
     assert given.out.read_text().splitlines()[1] == "reach,warp,4,1,1,,,"
     assert parity.read(FOLDER / "results" / "metaworld-policies.csv") == set(TASKS)
+
+
+def test_a_curve_is_thinned_to_its_last_line(script):
+    """Lines in which no episode ended are left out."""
+    metrics = [{"seconds": k, "steps": 10 * k, "return": "" if k < 3 else f"{k}.04"} for k in range(100)]
+    found = script("families").curve("pendulum-swingup", "ppo", metrics)
+    assert [x["seconds"] for x in found] == list(range(3, 100, 3))
+    assert found[-1] == dict(family="pendulum-swingup", agent="ppo", seconds=99, steps=990, **{"return": "99.0"})
+
+
+@pytest.mark.slow
+def test_a_family_leaves_a_policy_and_is_not_run_again(script, tmp_path, monkeypatch):
+    """Its run ends with its time, and is removed."""
+    families = script("families")
+    monkeypatch.setattr(sys, "argv", ["families.py", "point-mass-easy", "--seconds=0.01", f"--out={tmp_path}"])
+    families.main()
+    assert sorted(x.name for x in (tmp_path / "point-mass-easy").iterdir()) == ["curve.csv", "policy"]
+    assert mtjax.load(tmp_path / "point-mass-easy" / "policy").env.spec.action_size == 2
+    monkeypatch.setattr(families, "learn", None)
+    families.main()

@@ -1,0 +1,110 @@
+"""Train families for a few minutes each, one seed: a curve of each, and the policies that the films of docs show.
+
+    python benchmarks/families.py [NAME ...] [--seconds 400] [--out DIR]
+    python docs/make_films.py DIR/*/policy
+
+``TRAINED`` says which agent learns a family, by its preset, and for how many steps; a run also ends after ``--seconds``
+of training. Every family writes ``DIR/NAME/curve.csv`` (the mean return of the training episodes, at most forty lines)
+and ``DIR/NAME/policy``, which ``mtjax.load`` takes. All curves in DIR together are ``DIR/families.csv``. Families that
+have a policy are not run again, and one that was killed goes on from its last checkpoint.
+"""
+
+import argparse
+import os
+import shutil
+import signal
+import time
+from pathlib import Path
+
+from report import read_lines, run_main, write_lines
+
+import mtjax
+from mtjax.names import nearest_error
+from mtjax.training import ship
+from mtjax.training.programs import enable_compile_cache
+
+_M = 1_000_000
+TRAINED = {  # family -> agent and steps
+    **{f"cartpole-{name}": ("ppo", 10 * _M) for name in ("balance", "balance-sparse")},
+    **{f"cartpole-swingup{name}": ("ppo", 15 * _M) for name in ("", "-vary-cart-mass", "-vary-pole-mass")},
+    **{f"cheetah-{name}": ("ppo", 20 * _M) for name in ("run", "jump", "run-backward", "vary-direction")},
+    **{f"cheetah-run-vary-{name}": ("ppo", 20 * _M) for name in ("speed", "back-foot-length", "foot-position")},
+    **{f"walker-{name}": ("ppo", 15 * _M) for name in ("stand", "walk", "walk-backward", "vary-speed")},
+    **{f"walker-walk-vary-{name}": ("ppo", 15 * _M) for name in ("friction", "foot-length")},
+    **{f"walker-run{name}": ("brc", 3 * _M) for name in ("", "-backward", "-vary-friction", "-vary-foot-length")},
+    **{f"reacher-{name}": ("ppo", 20 * _M) for name in ("easy", "hard", "vary-goal")},
+    **{f"finger-{name}": ("ppo", 15 * _M) for name in ("spin", "spin-vary-touch-size")},
+    **{f"finger-turn-{name}": ("ppo", 60 * _M) for name in ("easy", "hard", "vary-target")},
+    **{f"swimmer-{name}": ("ppo", 15 * _M) for name in ("swimmer6", "swimmer15")},
+    **{f"fish-{name}": ("ppo", 20 * _M) for name in ("upright", "swim")},
+    **{f"hopper-{name}": ("brc", 4 * _M) for name in ("hop", "hop-backward", "stand")},
+    **{f"humanoid-{name}": ("brc", 4 * _M) for name in ("stand", "walk", "run")},
+    **{f"dog-{name}": ("brc", 4 * _M) for name in ("stand", "walk", "trot", "run")},
+    **{f"quadruped-{name}": ("brc", 2 * _M) for name in ("walk", "run")},
+    **{f"acrobot-swingup{name}": ("brc", 5 * _M) for name in ("", "-sparse")},
+    "ball-in-cup-catch": ("brc", _M),
+    "ball-in-cup-spin": ("ppo", 5 * _M),
+    "cartpole-swingup-sparse": ("brc", _M),
+    "cheetah-run-vary-foot-size": ("ppo", 20 * _M),
+    "pendulum-spin": ("ppo", 10 * _M),
+    "pendulum-swingup": ("brc", 3 * _M),
+    "point-mass-easy": ("ppo", 10 * _M),
+    "two-goal-maze-seen": ("ppo", 10 * _M),
+}
+_LINES = 40
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("families", nargs="*", metavar="NAME", help="by default all of TRAINED")
+    parser.add_argument("--seconds", type=float, default=400.0, help="of training, after which a run ends")
+    parser.add_argument("--out", type=Path, default=Path("runs") / f"families-{time.strftime('%Y%m%d-%H%M%S')}")
+    arguments = parser.parse_args()
+    for name in arguments.families:
+        if name not in TRAINED:
+            raise nearest_error("family", name, list(TRAINED))
+    enable_compile_cache()
+    for name in arguments.families or TRAINED:
+        if not (arguments.out / name / "policy").is_dir():
+            learn(name, *TRAINED[name], arguments.out / name, arguments.seconds)
+    lines = [line for file in sorted(arguments.out.glob("*/curve.csv")) for line in read_lines(file)]
+    write_lines(arguments.out / "families.csv", lines)
+
+
+def learn(name: str, agent: str, steps: int, folder: Path, seconds: float) -> None:
+    """Train a family until it has made its steps or its time is over; keep the curve and the policy."""
+    run = folder / "run"
+
+    def stop_in_time(line: dict) -> None:
+        if float(line["seconds"]) > seconds:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    program = mtjax.preset(name, agent)
+    mtjax.train(
+        program.family,
+        program.learner,
+        steps=steps,
+        eval_every=steps,
+        eval_episodes=5,
+        settings=program.training,
+        directory=run,
+        resume=(run / "config.json").exists(),
+        on_chunk=stop_in_time,
+        quiet=False,
+    )
+    write_lines(folder / "curve.csv", curve(name, agent, read_lines(run / "metrics.csv")))
+    ship.write(run, folder / "policy")
+    shutil.rmtree(run)
+
+
+def curve(name: str, agent: str, metrics: list[dict]) -> list[dict]:
+    """Return lines in which episodes ended, evenly thinned and with the last one."""
+    known = [line for line in metrics if line["return"]]
+    every = -(-len(known) // _LINES) or 1
+    kept = known[::-1][::every][::-1]
+    numbers = [{"seconds": x["seconds"], "steps": x["steps"], "return": f"{float(x['return']):.1f}"} for x in kept]
+    return [{"family": name, "agent": agent, **x} for x in numbers]
+
+
+if __name__ == "__main__":
+    run_main(main)
