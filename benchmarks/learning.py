@@ -7,9 +7,9 @@ Without further flags it is the whole table: every agent on six families with it
 steps of ``FAMILIES``; agents whose subject is pictures are left out. Every pair of family and agent writes
 ``DIR/ENV/AGENT.csv`` (training returns over steps and seconds, one line per chunk and seed) and ``AGENT.npz`` (every
 episode of every evaluation). Finished pairs are not run again, so several processes can make a long table in parts. If
-the command is given again with the same DIR, a pair that was stopped goes on where it was, and one that was killed from
-its last evaluation. Until a pair is finished its run is in ``DIR/ENV/AGENT``. Its checkpoints need room for three
-training states: 0.1 GB for PPO, and 1 to 6 GB for agents with a replay (gpu presets, ten seeds).
+the command is given again with the same DIR, a pair that was stopped goes on where it was, and one that was killed goes
+on from its last evaluation. Until a pair is finished its run is in ``DIR/ENV/AGENT``. Its checkpoints need room for
+three training states: 0.1 GB for PPO, and 1 to 6 GB for agents with a replay (gpu presets, ten seeds).
 
 All results in DIR together give ``table.md``, ``differences.md``, ``conflicts.md`` (cosines between the tasks'
 gradients, of the agents that log them), ``evaluations.csv`` and a figure for each family. ``--agents`` without a name
@@ -72,8 +72,8 @@ class Trial(NamedTuple):
     rollout_steps: int | None = None
 
 
-# Ten seeds of four tasks then train for about half a minute on an H200. On-policy steps cost less, so there are more.
-# Most agents then make 12,000 to 31,000 updates.
+# Ten seeds of plain conditioning then train for half a minute on an H200; on walker-run for longer. On-policy steps
+# cost less, so there are more. Most agents then make 12,000 to 31,000 updates.
 FAMILIES = {
     "finger-spin-vary-size": Trial("hip-bmdp", 2_560_000, 20_000_000),
     "cheetah-run-vary-torso-length": Trial("hip-bmdp", 1_000_000, 20_000_000),

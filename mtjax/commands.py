@@ -143,6 +143,8 @@ def check_names(argv: Sequence[str]) -> None:
         raise InputError(f"--resume goes on with a run as it was; only --steps may change, not {other}")
     for flag in () if {"--resume", "--sweep"} <= given else ("resume", "from"):
         folder = flag_value(argv, flag, None)
+        if folder in shipped.names() and not Path(folder).is_dir():
+            raise InputError(f"{folder!r} is a policy without critics and replay, so it cannot go on learning")
         if folder is not None and not (flag == "resume" and any(Path(folder).glob("run-*"))):  # the runs of a sweep
             require_run(Path(folder))
 

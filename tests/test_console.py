@@ -69,6 +69,11 @@ def test_rounding_is_said():
     assert not consoles.describe_rounding(640_000, 640_000, 160_000)
 
 
+def test_a_resumed_run_says_where_it_goes_on():
+    assert consoles.describe_resumption(320, 6400) == "goes on at step 320 of 6,400"
+    assert consoles.describe_resumption(6400, 6400).startswith("the run has made all its 6,400 steps; --steps=N")
+
+
 def test_evaluations_name_splits_and_worst_tasks(capsys):
     """A split without tasks is left out, and a single task is not its own worst."""
     returns = {"train": np.array([[[1.0, 3.0], [10.0, 10.0]]]), "interpolation": np.zeros((1, 0, 2))}

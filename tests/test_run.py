@@ -440,10 +440,11 @@ def test_both_clocks_go_on(play, tmp_path):
     assert 1000 < float(last["seconds"]) < 1500 and 2000 < float(last["wall_seconds"]) < 2500
 
 
-def test_finished_run_has_nothing_to_resume(play, whole, tmp_path):
-    """Resuming it changes nothing."""
+def test_finished_run_has_nothing_to_resume(play, whole, tmp_path, capsys):
+    """Resuming it changes nothing, and a line says what would go on."""
     shutil.copytree(whole.directory, tmp_path, dirs_exist_ok=True)
-    result = play(tmp_path, resume=True)
+    result = play(tmp_path, resume=True, quiet=False)
+    assert "the run has made all its" in capsys.readouterr().out
     assert result.finished and not result.rows
     assert_same_run(result, whole)
 

@@ -14,6 +14,7 @@ from test_export import ENV, observations, policy_of
 import mtjax
 import mtjax.evaluate
 from mtjax import agents, shipped
+from mtjax.cli import parse
 from mtjax.report.scoring import score
 from mtjax.training import ship
 from mtjax.types import InputError
@@ -76,6 +77,12 @@ def test_damaged_policies_are_refused(copied_run, package):
     ship.write(copied_run, package / "a/c")
     with pytest.raises(InputError, match="unknown run or trained policy 'a/b'; did you mean 'a/c'"):
         mtjax.load("a/b")
+
+
+@pytest.mark.parametrize("flag", ["resume", "from"])
+def test_a_policy_of_the_package_cannot_go_on_learning(flag):
+    with pytest.raises(InputError, match="is a policy without critics and replay"):
+        parse([f"--{flag}=reacher-vary-goal/ppo"])
 
 
 @pytest.mark.slow

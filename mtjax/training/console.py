@@ -130,6 +130,13 @@ def describe_warmup(steps: int, total: int) -> list[str]:
     return lines
 
 
+def describe_resumption(steps: int, total: int) -> str:
+    """Return a line on where a resumed run goes on, if it does."""
+    if steps >= total:
+        return f"the run has made all its {steps:,} steps; --steps=N with a larger N goes on"
+    return f"goes on at step {steps:,} of {total:,}"
+
+
 def describe_rounding(steps: int, total: int, chunk: int) -> list[str]:
     """Return a line if a run's steps are rounded up to whole chunks."""
     return [f"{steps:,} steps are rounded up to {total:,}, whole chunks of {chunk:,}"] if total > steps else []

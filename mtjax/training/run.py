@@ -22,7 +22,15 @@ from mtjax.loop import Settings, TrainState
 from mtjax.parallel import hosts
 from mtjax.parallel import mesh as meshes
 from mtjax.training import allocator, checkpoint, finetune, lock, log, memory, points
-from mtjax.training.console import Clock, Console, describe_rounding, describe_running, describe_warmup, duration
+from mtjax.training.console import (
+    Clock,
+    Console,
+    describe_resumption,
+    describe_rounding,
+    describe_running,
+    describe_warmup,
+    duration,
+)
 from mtjax.training.exchange import Exchange
 from mtjax.training.points import Point, Sweep, SweptAgent
 from mtjax.training.policy import Policy
@@ -116,6 +124,8 @@ def train(
         hosts.wait_for_all()
         compile_seconds = time.monotonic() - started
         console.say(f"compiled in {duration(compile_seconds)}")
+        if resume:
+            console.say(describe_resumption(int(state.iteration) * run.steps_per_iteration, total))
         result = run.run_chunks(programs, state, started, total)
     named = {"env": env, "agent": plain, "seeds": tuple(range(seed, seed + seeds))}
     return result._replace(
