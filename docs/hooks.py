@@ -18,12 +18,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 
 from mtjax import agents, envs
 from mtjax.agents.choices import PARTS, flag_names, kinds_of, settings
 from mtjax.agents.parts import name_of
-from mtjax.names import first_sentence
+from mtjax.names import InputError, first_sentence
 from mtjax.report import figures
 
 ROOT = Path(__file__).parent.parent
@@ -56,7 +57,10 @@ def on_config(config: Any) -> Any:
 
 def on_files(files: Files, config: Any) -> Files:
     """Add the made pages, and the plots that pages on results show."""
-    pages = {f"families/{name}.md": family_page(name) for name in envs.ENVS}
+    try:
+        pages = {f"families/{name}.md": family_page(name) for name in envs.ENVS}
+    except InputError as error:  # Meta-World's scenes are another package's
+        raise PluginError(str(error)) from None
     pages |= {f"agents/{name}.md": agent_page(name) for name in agents.AGENTS}
     pages |= {"families/index.md": families_page(), "agents/index.md": agents_page()}
     for place, text in pages.items():

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 # Okabe and Ito's palette, which colour-blind readers can tell apart, without its yellow.
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+_MOST_INSIDE = 4  # names within the axes; more stand beside them
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")  # one more than colours, so that later pairs differ too
 DOTS_PER_INCH = 120
 
@@ -108,15 +109,15 @@ def compare(
         label: label of the axis of returns.
     """
     figure, axes = _new_figure()
-    many = len(curves) > len(_COLOURS)
-    if many:
-        figure.set_size_inches(9, 6)
+    beside = len(curves) > _MOST_INSIDE
+    if beside:
+        figure.set_size_inches(9, max(4.5, 0.28 * len(curves)))
     for index, (agent, (steps, returns)) in enumerate(curves.items()):
         if np.size(returns):
             draw_curve(axes, steps, returns, f"{agent} ({_count(len(returns), 'seed')})", index)
     label_steps(axes)
     axes.set_ylabel(label)
-    _save(figure, axes, path, beside=many)
+    _save(figure, axes, path, beside=beside)
 
 
 def interference(
