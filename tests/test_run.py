@@ -327,7 +327,8 @@ def test_a_checkpoint_that_cannot_be_written_ends_the_run(play, whole, tmp_path,
 def test_a_checkpoint_that_fails_later_is_told_all_the_same(play, tmp_path, monkeypatch):
     """By the next chunk, or at the end: no run ends well whose last checkpoint is missing."""
 
-    def breaks(*_):
+    def breaks(written, *_):
+        written.result()  # else it goes on beside the tests that follow, which forbid large files
         raise OSError(errno.EIO, "checkpoint not written", "somewhere")
 
     monkeypatch.setattr(checkpoint, "_finish", breaks)
