@@ -4,8 +4,7 @@
     python benchmarks/compile_for_gpu.py [--agents NAME ...] [--tasks 4] [--seeds 10] [--hidden 256 256] [--json FILE]
 
 XLA compiles for a GPU that it is told of (``_H200``), so that slow compiling and odd kernels are found without one. It
-cannot try kernels out, which takes more time on a GPU. So matrix products are cuBLAS's here, not
-XLA's own.
+cannot try kernels out, which takes more time on a GPU. So matrix products are cuBLAS's here, not XLA's own.
 
 "kernels" are those of one update, "MB" what they read and write by their shapes. "numbers a thread" is the most that a
 thread of one of XLA's tiled kernels holds at once. Above some 200 it has no registers for them: the kernel is slow, and

@@ -6,17 +6,17 @@
 ``TRAINED`` says which agent learns a family, by its preset, and for how many steps; a run also ends after ``--seconds``
 of training. Every family writes ``DIR/NAME/curve.csv`` (the mean return of the training episodes, at most forty lines)
 and ``DIR/NAME/policy``, which ``mtjax.load`` takes. All curves in DIR together are ``DIR/families.csv``. Families that
-have a policy are not run again, and one that was killed goes on from its last checkpoint.
+have a policy are not run again. A signal ends the program, and the same command with the same DIR goes on.
 """
 
 import argparse
-import os
 import shutil
-import signal
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from report import read_lines, run_main, write_lines
+from resumable import train
 
 import mtjax
 from mtjax.names import nearest_error
@@ -28,7 +28,8 @@ TRAINED = {  # family -> agent and steps
     **{f"cartpole-{name}": ("ppo", 10 * _M) for name in ("balance", "balance-sparse")},
     **{f"cartpole-swingup{name}": ("ppo", 15 * _M) for name in ("", "-vary-cart-mass", "-vary-pole-mass")},
     **{f"cheetah-{name}": ("ppo", 20 * _M) for name in ("run", "jump", "run-backward", "vary-direction")},
-    **{f"cheetah-run-vary-{name}": ("ppo", 20 * _M) for name in ("speed", "back-foot-length", "foot-position")},
+    **{f"cheetah-run-vary-{name}": ("ppo", 20 * _M) for name in ("speed", "back-foot-length")},
+    **{f"cheetah-run-vary-foot-{name}": ("ppo", 20 * _M) for name in ("position", "size")},
     **{f"walker-{name}": ("ppo", 15 * _M) for name in ("stand", "walk", "walk-backward", "vary-speed")},
     **{f"walker-walk-vary-{name}": ("ppo", 15 * _M) for name in ("friction", "foot-length")},
     **{f"walker-run{name}": ("brc", 3 * _M) for name in ("", "-backward", "-vary-friction", "-vary-foot-length")},
@@ -45,7 +46,6 @@ TRAINED = {  # family -> agent and steps
     "ball-in-cup-catch": ("brc", _M),
     "ball-in-cup-spin": ("ppo", 5 * _M),
     "cartpole-swingup-sparse": ("brc", _M),
-    "cheetah-run-vary-foot-size": ("ppo", 20 * _M),
     "pendulum-spin": ("ppo", 10 * _M),
     "pendulum-swingup": ("brc", 3 * _M),
     "point-mass-easy": ("ppo", 10 * _M),
@@ -73,31 +73,24 @@ def main() -> None:
 
 def learn(name: str, agent: str, steps: int, folder: Path, seconds: float) -> None:
     """Train a family until it has made its steps or its time is over; keep the curve and the policy."""
-    run = folder / "run"
-
-    def stop_in_time(line: dict) -> None:
-        if float(line["seconds"]) > seconds:
-            os.kill(os.getpid(), signal.SIGINT)
-
-    program = mtjax.preset(name, agent)
-    mtjax.train(
+    run, program = folder / "run", mtjax.preset(name, agent)
+    result = train(
+        run,
         program.family,
         program.learner,
+        seconds,
         steps=steps,
         eval_every=steps,
         eval_episodes=5,
         settings=program.training,
-        directory=run,
-        resume=(run / "config.json").exists(),
-        on_chunk=stop_in_time,
         quiet=False,
     )
-    write_lines(folder / "curve.csv", curve(name, agent, read_lines(run / "metrics.csv")))
+    write_lines(folder / "curve.csv", curve(name, agent, result.rows))
     ship.write(run, folder / "policy")
     shutil.rmtree(run)
 
 
-def curve(name: str, agent: str, metrics: list[dict]) -> list[dict]:
+def curve(name: str, agent: str, metrics: Sequence[dict]) -> list[dict]:
     """Return lines in which episodes ended, evenly thinned and with the last one."""
     known = [line for line in metrics if line["return"]]
     every = -(-len(known) // _LINES) or 1

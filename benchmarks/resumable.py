@@ -1,5 +1,8 @@
 """Training that a stopped benchmark does not lose: a run lies in a folder until its results are written."""
 
+import math
+import os
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +13,14 @@ from mtjax.training.result import Result
 from mtjax.types import Agent, Env
 
 
-def train(folder: Path, family: Env, agent: Agent, **given: Any) -> Result:
+def train(folder: Path, family: Env, agent: Agent, seconds: float = math.inf, **given: Any) -> Result:
     """Train by ``mtjax.train`` in a folder, or go on with the run that was stopped there.
 
     Checkpoints are written after evaluations and after a signal. The disk needs room for three training states, replay
     included. The caller removes the folder once the results are written.
+
+    Args:
+        seconds: of training, after which the run is enough; then ``on_chunk`` cannot be given.
 
     Returns:
         the result, with the lines of metrics from before the stop too.
@@ -23,7 +29,14 @@ def train(folder: Path, family: Env, agent: Agent, **given: Any) -> Result:
         InputError: the run in the folder had other settings.
         SystemExit: a signal has stopped the run.
     """
+
+    def stop_in_time(line: dict[str, Any]) -> None:
+        if float(line["seconds"]) > seconds:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    if seconds < math.inf:
+        given["on_chunk"] = stop_in_time
     result = mtjax.train(family, agent, directory=folder, resume=(folder / "config.json").exists(), **given)
-    if not result.finished:
+    if not result.finished and result.seconds <= seconds:
         raise SystemExit(f"stopped: the run is in {folder}, and the same command with the same --out goes on with it")
     return result._replace(rows=read_lines(folder / "metrics.csv"))

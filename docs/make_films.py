@@ -4,8 +4,8 @@
 
 A run's folder becomes the film of its family, and so does a family of which the package has a trained policy
 (``benchmarks/families.py`` trains policies for films). Other families that MuJoCo steps become stills, unless they have
-a film. Both are of the first, the middle and the last training task. They go to
-docs/pictures/families. Meta-World's scenes are not drawn, as they are another package's.
+a film. Both are of the first, the middle and the last training task. They go to docs/pictures/families. Meta-World's
+scenes are not drawn, as they are another package's.
 """
 
 import sys
@@ -37,9 +37,10 @@ def draw(name: str) -> None:
     if Path(name).is_dir() or trained:
         policy = mtjax.load(trained[0] if trained else name)
         save(name_of(policy.env), play(policy))
-    elif not (FOLDER / f"{name}.gif").exists() and not name.startswith("metaworld-"):
-        if isinstance(mtjax.make(name), Pictured):
-            save(name, [start(name)])
+    elif name.startswith("metaworld-") or (FOLDER / f"{name}.gif").exists():
+        return
+    elif isinstance(mtjax.make(name), Pictured):
+        save(name, [start(name)])
 
 
 def save(name: str, frames: list[Image.Image]) -> None:

@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import sys
+import threading
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,6 +19,7 @@ import mtjax
 from mtjax.envs import BENCHMARKS
 from mtjax.envs.metaworld.names import TASKS
 from mtjax.evaluation import Evaluations, load_evaluations, save_evaluations
+from mtjax.training.console import Console
 from mtjax.training.log import append_rows
 from mtjax.training.records import Records
 from mtjax.types import InputError
@@ -396,3 +398,21 @@ def test_a_family_leaves_a_policy_and_is_not_run_again(script, tmp_path, monkeyp
     assert mtjax.load(tmp_path / "point-mass-easy" / "policy").env.spec.action_size == 2
     monkeypatch.setattr(families, "learn", None)
     families.main()
+
+
+@pytest.mark.slow
+def test_a_signal_of_the_user_is_not_the_end_of_a_familys_time(script, tmp_path, monkeypatch):
+    """The program ends; its run stays, to go on with."""
+    families = script("families")
+    say = Console.say
+
+    def interrupt(self, line):
+        say(self, line)
+        if line.startswith("compiled in"):
+            threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start()
+
+    monkeypatch.setattr(Console, "say", interrupt)
+    monkeypatch.setattr(sys, "argv", ["families.py", "point-mass-easy", f"--out={tmp_path}"])
+    with pytest.raises(SystemExit, match="the same command with the same --out goes on"):
+        families.main()
+    assert [x.name for x in (tmp_path / "point-mass-easy").iterdir()] == ["run"]

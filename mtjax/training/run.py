@@ -124,8 +124,6 @@ def train(
         hosts.wait_for_all()
         compile_seconds = time.monotonic() - started
         console.say(f"compiled in {duration(compile_seconds)}")
-        if resume:
-            console.say(describe_resumption(int(state.iteration) * run.steps_per_iteration, total))
         result = run.run_chunks(programs, state, started, total)
     named = {"env": env, "agent": plain, "seeds": tuple(range(seed, seed + seeds))}
     return result._replace(
@@ -277,6 +275,8 @@ class _Run:
     def run_chunks(self, programs: Programs, state: TrainState, started: float, total: int) -> Result:
         """Run chunks until all steps are done or a signal asks to stop."""
         steps = int(state.iteration) * self.steps_per_iteration
+        if steps:
+            self.console.say(describe_resumption(steps, total))
         self.console.clock = self._clock(steps, total)
         with contextlib.ExitStack() as opened:
             found = self._open_sinks(steps)
