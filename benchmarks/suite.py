@@ -60,7 +60,6 @@ class Suite:
     split: str | None = None
     together: str = ""  # the environment of all tasks, where others are its tasks alone
     settings: tuple[str, ...] = ()  # of the environments
-    training: tuple[str, ...] = ()  # of the loop and the agents, in place of the presets'
 
 
 SUITES = {
@@ -112,7 +111,6 @@ SUITES = {
         3,
         split="hip-bmdp",
         settings=("pixels=64", "frames=3", "repeat=2"),
-        training=("num_envs=64", "updates_per_step=4", "batch_size=64", "replay_size=100000"),
     ),
 }
 
@@ -166,7 +164,7 @@ def request(arguments: argparse.Namespace, suite: Suite, env: str, out: Path) ->
     """Return what ``learning.learn`` reads: the suite's protocol, and what was given beside it."""
     steps = (arguments.steps_per_task or suite.steps_per_task) * mtjax.make(env).train_count
     given = {"seeds": arguments.seeds or suite.seeds, "steps": steps, "split": suite.split, "vary": [], "out": out}
-    given |= {"env": [*suite.settings, *arguments.env], "training": [*suite.training, *arguments.training]}
+    given |= {"env": [*suite.settings, *arguments.env]}
     return argparse.Namespace(**{**vars(arguments), **given})
 
 

@@ -51,6 +51,9 @@ def parse(argv: Sequence[str]) -> RunConfig:
     of_family: dict[str, Any] = {
         name: value for name in ("combine", "split") if (value := flag_value(argv, _FAMILY_FLAGS[name], ""))
     }
+    pixels = flag_value(argv, "env.pixels", "")
+    if pixels.isdecimal():  # from pictures, agents have other defaults
+        of_family["pixels"] = int(pixels)
     if is_mixture(env_name):
         of_family, argv = _peel_shared(argv, make(env_name))
     deciding = {name: value for name in _DECIDING if (value := flag_value(argv, f"agent.{name}", ""))}

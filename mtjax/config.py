@@ -130,9 +130,11 @@ def with_preset(
     made = make(env_name, **family_settings) if family is None else family
     device = _device_preset() if preset_name == "auto" else preset_name
     preset, common = load_preset(env_name, device), load_preset("+", device)
-    chosen = common.get(agent_name, {}) | preset.get(agent_name, {})
+    table = lambda name: common.get(name, {}) | preset.get(name, {})
+    chosen = table(agent_name)
     if preset_of(agent_name).cls.common_presets:
-        chosen = preset.get("training", {}) | preset.get("agent", {}) | chosen
+        from_pictures = table("pictures") if _sees_pictures(made) else {}
+        chosen = preset.get("training", {}) | preset.get("agent", {}) | from_pictures | chosen
     take = lambda cls: {name: chosen.pop(name) for name in list(chosen) if name in cls.__dataclass_fields__}
     planned, played = preset.get("plan", {}) | take(Plan), take(Settings)
     return RunConfig(
@@ -187,6 +189,10 @@ def load_preset(env_name: str, name: str) -> dict[str, Any]:
     own = next((file for n in names if (file := folder / f"{n}.toml").is_file()), None)
     read = lambda file: tomllib.loads(file.read_text())
     return read(folder / "default.toml")[name] | ({} if own is None else read(own).get(name, {}))
+
+
+def _sees_pictures(family: Tabled) -> bool:
+    return any(getattr(part.family, "pixels", 0) for part in family.parts)
 
 
 def _device_preset() -> str:

@@ -169,6 +169,7 @@ def test_presets_name_only_what_there_is(file):
     fields = lambda cls: {field.name for field in dataclasses.fields(cls)}
     known = {"plan": fields(Plan), "agent": set(settings_of(mtjax.agent("sac")))}
     known["training"] = known["agent"] | fields(Settings)
+    known["pictures"] = known["training"] | fields(Plan)
     known |= {name: set(settings_of(mtjax.agent(name))) | fields(Settings) | fields(Plan) for name in AGENTS}
     for tables in preset.values():
         for table, settings in tables.items():
@@ -203,6 +204,20 @@ def test_every_preset_makes_a_program(env, agent, preset):
     assert set(expected) <= set(found)
     for name, value in expected.items():
         assert found[name] == (tuple(value) if isinstance(value, list) else value)
+
+
+@pytest.mark.parametrize("agent", ["drq", "sac-ae", "deepmdp"])
+def test_pictures_have_a_preset_of_their_own(agent):
+    """It holds for every agent with a replay, from Python as on the command line."""
+    expected = load_preset("+", "gpu")["pictures"] | load_preset("finger-spin", "gpu")["pictures"]
+    program = with_preset("finger-spin", agent, "gpu", pixels=64)
+    found = settings_of(program.learner) | dataclasses.asdict(program.training) | dataclasses.asdict(program.plan)
+    assert {name: found[name] for name in expected} == expected
+    assert program != with_preset("finger-spin", agent, "gpu")
+    flags = ["--env=finger-spin", f"--agent={agent}", "--preset=gpu", "--env.pixels=64"]
+    assert cli.parse(flags) == program
+    mixed = cli.parse([*flags, "--env=finger-spin+cheetah-run"])
+    assert mixed.learner.actor_lr == load_preset("+", "gpu")["pictures"]["actor_lr"]
 
 
 def test_auto_preset_is_that_of_the_device(monkeypatch):
