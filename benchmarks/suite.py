@@ -162,15 +162,21 @@ def describe(name: str) -> str:
 
 def request(arguments: argparse.Namespace, suite: Suite, env: str, out: Path) -> argparse.Namespace:
     """Return what ``learning.learn`` reads: the suite's protocol, and what was given beside it."""
-    steps = (arguments.steps_per_task or suite.steps_per_task) * mtjax.make(env).train_count
+    learned = mtjax.make(env, **split_of(suite.split)).train_count
+    steps = (arguments.steps_per_task or suite.steps_per_task) * learned
     given = {"seeds": arguments.seeds or suite.seeds, "steps": steps, "split": suite.split, "vary": [], "out": out}
     given |= {"env": [*suite.settings, *arguments.env]}
     return argparse.Namespace(**{**vars(arguments), **given})
 
 
+def split_of(name: str | None) -> dict[str, str]:
+    """Return the setting of families that chooses a split; None is the family's own."""
+    return {"split": name} if name else {}
+
+
 def last_of(env: str, split: str | None, evaluations: Evaluations) -> Last:
     """Return the last evaluation, averaged over episodes."""
-    labels = mtjax.make(env, **({"split": split} if split else {})).labels("train")
+    labels = mtjax.make(env, **split_of(split)).labels("train")
     metrics = evaluations.metrics
     of = lambda name: np.asarray(metrics[name]["train"])[:, -1].mean(axis=-1) if name in metrics else None
     splits = learning.last_scores(evaluations)

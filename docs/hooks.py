@@ -168,8 +168,8 @@ def _family_figures(name: str) -> str:
 _ON_GPU = "h200-families"
 _ONE_SEED = {  # runs -> their title, and where their command stands
     _ON_GPU: (
-        "One H200 that six runs share, one seed",
-        "twenty-four-families-for-a-few-minutes-each-on-a-shared-h200-one-seed",
+        "One H200 that six to nine runs share, one seed",
+        "fifty-families-for-a-few-minutes-each-on-a-shared-h200-one-seed",
     ),
     "cpu-families": ("Two CPU cores, one seed", "twenty-four-families-on-two-cpu-cores-seven-minutes-one-seed"),
 }

@@ -141,6 +141,15 @@ def test_compare_names_agents_and_seeds(drawn, tmp_path):
     np.testing.assert_allclose(drawn[0].lines[1].get_ydata(), curves["care"][1].mean(axis=(0, 2, 3)))
 
 
+@pytest.mark.parametrize("last, scale", [(3_000, "linear"), (20_000, "log")])
+def test_agents_with_far_more_steps_make_the_axis_logarithmic(last, scale, drawn, tmp_path):
+    """Else the curves of the others are a line upwards."""
+    returns = np.arange(4.0).reshape(1, 2, 2, 1)
+    curves = {"sac": (np.array([500, 1_000]), returns), "ppo": (np.array([1_000, last]), returns)}
+    plot.compare(tmp_path / "figure.png", curves)
+    assert drawn[0].get_xscale() == scale
+
+
 def test_single_evaluation_of_zero_return(tmp_path):
     plot.learning_curve(tmp_path / "figure.png", np.array([0]), {"train": np.zeros((1, 1, 1, 1))}, "")
     assert (tmp_path / "figure.png").exists()

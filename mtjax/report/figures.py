@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 # Okabe and Ito's palette, which colour-blind readers can tell apart, without its yellow.
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _MOST_INSIDE = 4  # names within the axes; more stand beside them
+_FAR_MORE = 4  # times the steps of another agent, from which on the axis of steps is logarithmic
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")  # one more than colours, so that later pairs differ too
 DOTS_PER_INCH = 120
 
@@ -101,7 +102,7 @@ def return_by_task(path: str | Path, labels: Mapping[str, Sequence[str]], return
 def compare(
     path: str | Path, curves: Mapping[str, tuple[np.ndarray, np.ndarray]], label: str = "return on training tasks"
 ) -> None:
-    """Draw several agents' returns over environment steps.
+    """Draw several agents' returns over environment steps, on a logarithmic axis if some took far more than others.
 
     Args:
         path: the PNG file to write.
@@ -115,7 +116,8 @@ def compare(
     for index, (agent, (steps, returns)) in enumerate(curves.items()):
         if np.size(returns):
             draw_curve(axes, steps, returns, f"{agent} ({_count(len(returns), 'seed')})", index)
-    label_steps(axes)
+    ends = [max(steps) for steps, returns in curves.values() if np.size(returns)]
+    label_steps(axes, log=bool(ends) and max(ends) > _FAR_MORE * min(ends))
     axes.set_ylabel(label)
     _save(figure, axes, path, beside=beside)
 
@@ -265,12 +267,17 @@ def _intervals(scores: np.ndarray) -> np.ndarray:
     return np.array([seed_interval(column) for column in scores.T]).T
 
 
-def label_steps(axes: "Axes") -> None:
+def label_steps(axes: "Axes", log: bool = False) -> None:
     """Label the axis of environment steps."""
-    from matplotlib.ticker import EngFormatter, MaxNLocator
+    from matplotlib.ticker import EngFormatter, LogLocator, MaxNLocator
 
     axes.set_xlabel("environment steps")
-    axes.xaxis.set_major_locator(MaxNLocator("auto", steps=[1, 2, 5, 10], integer=True, min_n_ticks=1))
+    if log:
+        axes.set_xscale("log")
+        axes.xaxis.set_major_locator(LogLocator(subs=[1, 2, 5]))
+        axes.xaxis.minorticks_off()
+    else:
+        axes.xaxis.set_major_locator(MaxNLocator("auto", steps=[1, 2, 5, 10], integer=True, min_n_ticks=1))
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
 
 
