@@ -30,6 +30,10 @@ class Params(NamedTuple):
         """Return the union of both; no two parts may have the same name."""
         return Params({**self.shared, **others.shared}, {**self.own, **others.own})
 
+    def filled(self, others: "Params") -> "Params":
+        """Return these parts, and those of ``others`` that are missing here."""
+        return Params({**others.shared, **self.shared}, {**others.own, **self.own})
+
     def of_first(self) -> "Params":
         """Return the parameters that the first task uses."""
         return Params(self.shared, jax.tree.map(lambda x: x[0], self.own))

@@ -29,6 +29,7 @@ LATENT = {"actor": TRUNK, "critic": TRUNK | {"shared/latent"} | MODELS, "target"
 ENCODED = {"actor": TRUNK, "critic": TRUNK | {"shared/latent"}, "target": TRUNK | {"shared/latent"}}
 REBUILT = ENCODED | {"critic": ENCODED["critic"] | {"shared/decoder"}}
 SIGHT = {part: parts | {"shared/projection"} for part, parts in ENCODED.items()} | {"actor": TRUNK | {"shared/sight"}}
+once = lambda parts: parts | {"target": parts["target"] - {"shared/latent"}}  # an encoder that is its own target
 WITH_THETA = {**LATENT, **{who: LATENT[who] | {"own/embedding"} for who in ("critic", "target")}}
 WHOLE_CARE = CARE | {"shared/body/after"}
 CARE_ON_LATENT = {who: (parts - TRUNK) | WHOLE_CARE for who, parts in LATENT.items()}
@@ -60,8 +61,8 @@ PARTS = {
     "brc": ("brc", {"value": "hl-gauss"}, BRONET | {"shared/head", "own/embedding"}),
     "simba-v2": ("simba-v2", {"value": "hl-gauss"}, HYPERSPHERE | {"shared/head"}),
     "xqc": ("xqc", {"value": "hl-gauss"}, BATCH_NORM | {"shared/head", "own/batch_stats"}),
-    "drq": ("drq", {"n_step": 1}, ENCODED),
-    "drq-pictures": ("drq", {"n_step": 1}, SIGHT),
+    "drq": ("drq", {"n_step": 1}, once(ENCODED)),
+    "drq-pictures": ("drq", {"n_step": 1}, once(SIGHT)),
     "asymmetric": (
         "drq",
         {"n_step": 1, "representation": "asymmetric"},

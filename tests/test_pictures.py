@@ -1,5 +1,6 @@
 """Stacks of pictures: in rollouts, in the replay and in agents. ``envs/probes.py`` has a probe that is seen."""
 
+import re
 from functools import partial
 
 import jax
@@ -14,6 +15,7 @@ from mtjax import frames
 from mtjax.agents.parts import vision
 from mtjax.envs.probes import Pictured, Probe
 from mtjax.experience import Rollouts, pictures
+from mtjax.networks import Params
 from mtjax.types import InputError, Transition
 
 KEY = jax.random.key(0)
@@ -220,6 +222,19 @@ def test_presets_of_a_part_do_not_apply_to_another():
     assert (agent.experience.n_step, agent.representation.encoder_tau) == (3, 1.0)
     with pytest.raises(InputError, match="encoder_tau"):
         mtjax.agent("drq", representation="asymmetric", encoder_tau=0.5)
+
+
+def test_an_encoder_that_is_its_own_target_sees_the_next_pictures_once():
+    """With a copy of it as the target encoder an update gives the same numbers by four convolutions more."""
+    agent, family = probes.tiny("drq", n_step=1), Pictured()
+    tasks = family.tasks()
+    state, batch = agent.init(family.spec, tasks, KEY), probes.random_batch(0, len(tasks.id), 4, family.spec)
+    copied = state._replace(target=state.target.filled(Params({"latent": state.critic.shared["latent"]}, {})))
+    compiled = [jax.jit(agent.update).lower(each, batch, tasks, KEY).compile() for each in (state, copied)]
+    once, twice = (len(re.findall(r" convolution\(|custom-call.*onvolution", each.as_text())) for each in compiled)
+    assert twice == once + 4
+    (after, _), (other, _) = compiled[0](state, batch, tasks, KEY), compiled[1](copied, batch, tasks, KEY)
+    jax.tree.map(np.testing.assert_array_equal, (after.actor, after.critic), (other.actor, other.critic))
 
 
 def test_pictures_need_warm_up_steps_for_a_window():

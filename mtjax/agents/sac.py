@@ -142,7 +142,7 @@ class SAC(BaseAgent):
         parameters = (common["actor"], common["critic"], log_temperature)
         return SACState(
             **common,
-            target=jax.tree.map(jnp.copy, common["critic"].without(self.representation.models)),
+            target=jax.tree.map(jnp.copy, common["critic"].without(self.representation.without_target)),
             log_temperature=log_temperature,
             optimizers=Optimizers(*(o.init(p) for o, p in zip(self.optimizers, parameters, strict=True))),
         )
@@ -340,9 +340,10 @@ class SAC(BaseAgent):
 
     def critic_problem(self, state: SACState, batch: Batch, key: Key) -> tuple[Callable, Any]:
         """Return the critic's loss of one task, and the data of all tasks (T, ...), for ``surgery.gradient``."""
-        model_targets, keys = self.placed_representation.targets(state.critic, state.target, batch.next_obs, key)
+        slow = state.target.filled(state.critic)
+        model_targets, keys = self.placed_representation.targets(state.critic, slow, batch.next_obs, key)
         bootstrap = jax.vmap(self.critic_target, (OVER_TASKS, OVER_TASKS, OVER_TASKS, 0, 0))
-        target = bootstrap(state.actor, state.critic, state.target, batch, keys)
+        target = bootstrap(state.actor, state.critic, slow, batch, keys)
         return self.above_least(self.critic_loss), (batch._replace(model_targets=model_targets), target)
 
     def actor_problem(self, critic: Params, batch: Batch, key: Key) -> tuple[Callable, Any]:

@@ -42,7 +42,7 @@ class Plain:
     """
 
     names: ClassVar[tuple[str, ...]] = ()  # of its parameters
-    models: ClassVar[tuple[str, ...]] = ()  # names of parameters that need no target copy
+    models: ClassVar[tuple[str, ...]] = ()  # names of parameters that no target is computed with
     sees_pictures: ClassVar[bool] = False  # whether it encodes pictures
     predicts: ClassVar[bool] = False  # whether its models predict what a single step leads to
     place: ClassVar[Place]
@@ -63,6 +63,11 @@ class Plain:
     def looks_back(self) -> bool:
         """Whether it needs the last steps, whatever the conditioning."""
         return False
+
+    @property
+    def without_target(self) -> tuple[str, ...]:
+        """Names of parameters that need no target copy: models, and what is its own target."""
+        return self.models
 
     @property
     def rates(self) -> Mapping[str, float]:

@@ -57,7 +57,8 @@ class Encoded(Seeing):
     """
 
     encoder_tau: float = 0.05
-    """Step of the target encoder towards the new encoder at each update, as a share of the distance."""
+    """Step of the target encoder towards the new encoder at each update, as a share of the distance. With 1 there is no
+    target encoder, and the pictures of s' are encoded once for actor and critics."""
 
     names: ClassVar[tuple[str, ...]] = (*ENCODERS, PROJECTION)
     slow: ClassVar[tuple[str, ...]] = ENCODERS  # those whose target copies move by encoder_tau
@@ -69,6 +70,10 @@ class Encoded(Seeing):
     @property
     def rates(self) -> dict[str, float]:
         return dict.fromkeys(self.slow, self.encoder_tau)
+
+    @property
+    def without_target(self) -> tuple[str, ...]:
+        return (*self.models, *self.slow) if self.encoder_tau == 1 else self.models
 
     # Networks: each is used by all N critics and by the actor.
 
