@@ -2,6 +2,7 @@
 
 import ast
 import contextlib
+import gc
 import importlib.util
 import io
 import itertools
@@ -19,6 +20,7 @@ from mtjax.agents import AGENTS
 from mtjax.envs import BENCHMARKS, ENVS, members, outline, varied
 from mtjax.names import InputError, Notice, nearest_error
 
+_ALLOCATIONS = 10_000  # before Python looks for garbage. By its default a tenth of a start goes there, for nothing.
 PRESETS = ("auto", "cpu", "gpu")
 _KNOWN = (("environment", "env", ENVS), ("agent", "agent", AGENTS), ("preset", "preset", PRESETS))
 _OVERVIEW = (  # titles, and the classes whose fields are flags of every run
@@ -37,6 +39,7 @@ P = TypeVar("P")
 
 def main(run: Any) -> None:
     """Run a command's entry point. A mistake of the user prints one line and exits with code 2."""
+    gc.set_threshold(_ALLOCATIONS)
     try:
         with _plain_notices():
             run(sys.argv[1:])

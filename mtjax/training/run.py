@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -91,44 +91,21 @@ def train(
     if (profile or tensorboard or wandb) and directory is None:
         raise InputError("profile, tensorboard and wandb write into the run's folder; give directory as well")
     require_libraries(tensorboard, wandb)
-    started = time.monotonic()
-    tasks = env.tasks("train")
-    settings = fit_chunk(settings, len(tasks.id), steps, agent.experience.steps)
+    started, num_tasks = time.monotonic(), len(env.tasks("train").id)
+    settings = fit_chunk(settings, num_tasks, steps, agent.experience.steps)
     agent.experience.check(env, settings.num_envs, settings.chunk_steps)
-    plain, length = agent, _played(settings, len(tasks.id), steps)
-    agent = agent.planned(length)  # type: ignore
-    learner = SweptAgent(agent) if found else agent  # type: ignore
-    mesh = meshes.mesh_for(seeds * max(len(found), 1), len(tasks.id), settings.num_envs)
-    total = length * len(tasks.id) * settings.num_envs
-    console = Console(total, quiet or not hosts.is_first(), label)
+    length = _played(settings, num_tasks, steps)
+    planned = agent.planned(length)  # type: ignore
+    console = Console(length * num_tasks * settings.num_envs, quiet or not hosts.is_first(), label)
     run = _Run(
-        *(env, learner, settings, plan, directory, console, found, mesh),
+        *(env, SweptAgent(planned) if found else planned, settings, plan, directory, console, found),
+        meshes.mesh_for(seeds * max(len(found), 1), num_tasks, settings.num_envs),
         *(profile, tensorboard, wandb, on_chunk, on_evaluation),
     )
-    with contextlib.ExitStack() as held:
-        held.callback(console.close)
-        held.enter_context(memory.explaining())
-        if directory is not None:
-            hosts.broadcast_path(lambda: held.enter_context(lock.hold(directory)))
-        asked, resume = resume, run.records.found(resume)
-        if asked and not resume:
-            console.say("there is no checkpoint yet, so the run starts over")
-        if not resume:
-            run.introduce(total)
-        programs, state = run.prepare(resume)
-        if start is not None and not resume:
-            begun = run.adopt(start, tasks, hosts.gather(state.agent))
-            state = state._replace(agent=meshes.shard_by_seed(mesh, begun))
-        held.callback(run.exchange.close)
-        run.exchange.begin(state)
-        hosts.wait_for_all()
-        compile_seconds = time.monotonic() - started
-        console.say(f"compiled in {duration(compile_seconds)}")
-        result = run.run_chunks(programs, state, started, total)
-    named = {"env": env, "agent": plain, "seeds": tuple(range(seed, seed + seeds))}
-    return result._replace(
-        compile_seconds=compile_seconds, total_seconds=time.monotonic() - started, points=found, **named
-    )
+    with contextlib.closing(console), memory.explaining():
+        result = run.train(start, resume, started)
+    own = {"env": env, "agent": agent, "seeds": tuple(range(seed, seed + seeds)), "points": found}
+    return result._replace(total_seconds=time.monotonic() - started, **own)
 
 
 def fit_chunk(settings: Settings, num_tasks: int, steps: int, grain: int = 1) -> Settings:
@@ -142,6 +119,17 @@ def _played(settings: Settings, num_tasks: int, steps: int) -> int:
     """Count the steps of every environment in a run, which are whole chunks."""
     chunk = settings.chunk_steps
     return math.ceil(steps / (num_tasks * settings.num_envs * chunk)) * chunk
+
+
+class _Progress(NamedTuple):
+    """Holds what changes from chunk to chunk."""
+
+    state: TrainState
+    steps: int  # environment steps of each seed
+    seconds: float  # of training, with those before the run was resumed
+    wall: float  # seconds of the run before it was resumed
+    evaluations: Evaluations
+    diverged: np.ndarray  # (S,) bool, the seeds that are given up
 
 
 @dataclasses.dataclass(frozen=True)
@@ -192,6 +180,27 @@ class _Run:
     @cached_property
     def exchange(self) -> Exchange:
         return Exchange(self.env, self.agent, self.settings, self.mesh, self.directory)
+
+    def train(self, start: Policy | None, resume: bool, started: float) -> Result:
+        """Prepare the run, and play its chunks; ``started`` is the clock when the user began to wait."""
+        with contextlib.ExitStack() as held:
+            if (folder := self.directory) is not None:
+                hosts.broadcast_path(lambda: held.enter_context(lock.hold(folder)))
+            resumed = self.records.found(resume)
+            if resume and not resumed:
+                self.console.say("there is no checkpoint yet, so the run starts over")
+            if not resumed:
+                self.introduce()
+            programs, state = self.prepare(resumed)
+            if start is not None and not resumed:
+                begun = self.adopt(start, self.env.tasks("train"), hosts.gather(state.agent))
+                state = state._replace(agent=meshes.shard_by_seed(self.mesh, begun))
+            held.callback(self.exchange.close)
+            self.exchange.begin(state)
+            hosts.wait_for_all()
+            compile_seconds = time.monotonic() - started
+            self.console.say(f"compiled in {duration(compile_seconds)}")
+            return self.run_chunks(programs, state, started)._replace(compile_seconds=compile_seconds)
 
     @cached_property
     def steps_per_iteration(self) -> int:
@@ -251,17 +260,21 @@ class _Run:
         values = [f"{name}={value:g}" for name, value in self.point(k).items()]
         return "-".join([*values, f"seed-{self.seeds[k]}"])
 
-    def introduce(self, total: int) -> None:
+    @property
+    def steps_per_chunk(self) -> int:
+        return self.settings.chunk_steps * self.steps_per_iteration
+
+    def introduce(self) -> None:
         """Say how many steps a new run takes, and what the first of them are."""
-        chunk = self.settings.chunk_steps * self.steps_per_iteration
+        chunk, total = self.steps_per_chunk, self.console.total
         warmup = self.agent.experience.warmup_steps * self.steps_per_iteration
         for line in (*describe_rounding(self.plan.steps, total, chunk), *describe_warmup(warmup, total)):
             self.console.say(line)
 
-    def _clock(self, steps: int, total: int) -> Clock:
+    def _clock(self, steps: int) -> Clock:
         """Return a clock that counts the chunks and evaluations to come."""
-        chunk = self.settings.chunk_steps * self.steps_per_iteration
-        ends = range(steps + chunk, total + chunk, chunk)
+        chunk = self.steps_per_chunk
+        ends = range(steps + chunk, self.console.total + chunk, chunk)
         due = sum(end // self.eval_every > (end - chunk) // self.eval_every or end >= self.plan.steps for end in ends)
         return Clock(len(ends), due)
 
@@ -272,72 +285,89 @@ class _Run:
         totals, ages, counted = jax.device_get((state.total, state.worlds.age, state.counted))
         return describe_running(totals, ages, counted, self.env.episode_length)
 
-    def run_chunks(self, programs: Programs, state: TrainState, started: float, total: int) -> Result:
+    def run_chunks(self, programs: Programs, state: TrainState, started: float) -> Result:
         """Run chunks until all steps are done or a signal asks to stop."""
         steps = int(state.iteration) * self.steps_per_iteration
         if steps:
-            self.console.say(describe_resumption(steps, total))
-        self.console.clock = self._clock(steps, total)
+            self.console.say(describe_resumption(steps, self.console.total))
+        self.console.clock = self._clock(steps)
         with contextlib.ExitStack() as opened:
-            found = self._open_sinks(steps)
-            for sink in found:
+            sinks = self._open_sinks(steps)
+            for sink in sinks:
                 opened.callback(sink.close)
-            return self._run_chunks(programs, state, started, found)
+            return self._run_chunks(programs, self._begin(programs, state, steps), started, sinks)
 
-    def _run_chunks(self, programs: Programs, state: TrainState, started: float, found: list[Sink]) -> Result:
-        iteration, clock = int(state.iteration), self.console.clock
-        steps = iteration * self.steps_per_iteration
+    def _begin(self, programs: Programs, state: TrainState, steps: int) -> _Progress:
+        """Return where a new or resumed run is."""
+        iteration = int(state.iteration)
         evaluations = self.records.earlier_evaluations(steps, steps >= self.eval_every, self._no_evaluations())
-        columns = self._columns(programs.metrics) if iteration else ()
-        earlier, earlier_wall = self.records.earlier_seconds(iteration, columns)
-        seconds = earlier
-        rows, stop = log.Rows(), 0
-        diverged = np.zeros(len(self.seeds), bool)
-        if steps >= self.plan.steps and not len(evaluations.steps):  # they were lost after the run's end
-            spoiled = diverged | ~finite_seeds(getattr(state.agent, "learner", state.agent))
-            evaluations = self._evaluate(programs.evaluate, state, evaluations, steps, spoiled)
+        seconds, wall = self.records.earlier_seconds(iteration, self._columns(programs.metrics) if iteration else ())
+        now = _Progress(state, steps, seconds, wall, evaluations, np.zeros(len(self.seeds), bool))
+        if steps < self.plan.steps or len(evaluations.steps):
+            return now
+        spoiled = ~finite_seeds(getattr(state.agent, "learner", state.agent))
+        again = self._evaluate(programs.evaluate, now._replace(diverged=spoiled))  # they were lost after the run's end
+        return now._replace(evaluations=again)
+
+    def _run_chunks(self, programs: Programs, now: _Progress, started: float, sinks: list[Sink]) -> Result:
+        rows, stop, earlier = log.Rows(), 0, now.seconds
         with stop_signals() as received, self.records.closing():
-            while steps < self.plan.steps and not stop:
+            while now.steps < self.plan.steps and not stop:
                 self.records.check()
-                steps_before = steps
-                with self._profile_chunk(len(rows), steps):
-                    before = time.monotonic()
-                    state, metrics = programs.chunk(state)
-                    state = self.exchange.after_chunk(state)
-                    metrics = hosts.gather(metrics)
-                    elapsed = time.monotonic() - before
-                seconds += elapsed
-                diverged |= self._find_diverged(metrics["bad_step"], steps_before // self.steps_per_iteration, diverged)
-                steps += self.settings.chunk_steps * self.steps_per_iteration
-                wall = earlier_wall + time.monotonic() - started
-                when = (steps // self.steps_per_iteration, steps, f"{seconds:.3f}", f"{wall:.3f}")
-                lines = log.metric_rows(metrics, np.asarray(self.seeds), dict(zip(_WHEN, when, strict=True)))
-                new = [{"seed": row["seed"], **self.point(k), **row} for k, row in enumerate(lines)]
-                rows.extend(new)
-                self.records.add_rows(new)
-                write_rows(found, lines, [self._name(k) for k in range(len(lines))])
-                rate = (steps - steps_before) * len(self.seeds) / elapsed
-                clock.chunk(elapsed)
-                running = self._running(state, metrics["return"])
-                self.console.progress(steps, time.monotonic() - started, rate, metrics["return"], running)
-                if self.on_chunk is not None:
-                    self.on_chunk(new[0])
-                due = steps // self.eval_every > steps_before // self.eval_every or steps >= self.plan.steps
+                last = now
+                now, metrics = self._play(programs.chunk, last, len(rows) // len(self.seeds))
+                rows.extend(self._log(metrics, last, now, started, sinks))
                 before = time.monotonic()
+                due = self._is_due(last.steps, now.steps)
                 if due:
-                    self.console.doing(f"{steps:,} steps  evaluating")
-                    evaluations = self._evaluate(programs.evaluate, state, evaluations, steps, diverged)
-                    write_rows(found, *self._evaluation_rows(evaluations))
+                    self.console.doing(f"{now.steps:,} steps  evaluating")
+                    now = now._replace(evaluations=self._evaluate(programs.evaluate, now))
+                    write_rows(sinks, *self._evaluation_rows(now.evaluations))
                 stop = hosts.largest(received[0] if received else 0)
                 if due or stop:
-                    self._save(state, steps // self.steps_per_iteration)
-                    clock.evaluation(time.monotonic() - before)
-                    if self.on_evaluation is not None and due:
-                        self.on_evaluation(evaluations)
-        finished = steps >= self.plan.steps
-        return Result(state, evaluations, rows, seconds, 0.0, finished, self.directory)._replace(
-            trained_seconds=seconds - earlier, signal=0 if finished else stop
+                    self._save(now.state, now.steps // self.steps_per_iteration)
+                    self.console.clock.evaluation(time.monotonic() - before)
+                if due and self.on_evaluation is not None:
+                    self.on_evaluation(now.evaluations)
+        finished = now.steps >= self.plan.steps
+        return Result(now.state, now.evaluations, rows, now.seconds, 0.0, finished, self.directory)._replace(
+            trained_seconds=now.seconds - earlier, signal=0 if finished else stop
         )
+
+    def _is_due(self, before: int, steps: int) -> bool:
+        """Return whether an evaluation is due after a chunk that went from one step to another."""
+        return steps // self.eval_every > before // self.eval_every or steps >= self.plan.steps
+
+    def _play(self, chunk: Callable, now: _Progress, done: int) -> tuple[_Progress, dict[str, Any]]:
+        """Run one chunk, of which this process has ``done`` some, and return its metrics too."""
+        with self._profile_chunk(done, now.steps):
+            before = time.monotonic()
+            state, metrics = chunk(now.state)
+            state = self.exchange.after_chunk(state)
+            metrics = hosts.gather(metrics)
+            elapsed = time.monotonic() - before
+        iteration = now.steps // self.steps_per_iteration
+        diverged = now.diverged | self._find_diverged(metrics["bad_step"], iteration, now.diverged)
+        steps, seconds = now.steps + self.steps_per_chunk, now.seconds + elapsed
+        return now._replace(state=state, steps=steps, seconds=seconds, diverged=diverged), metrics
+
+    def _log(
+        self, metrics: dict[str, Any], last: _Progress, now: _Progress, started: float, sinks: list[Sink]
+    ) -> list[dict[str, Any]]:
+        """Write a chunk's metrics wherever they go, and return them: a row for each entry of S."""
+        passed, elapsed = time.monotonic() - started, now.seconds - last.seconds
+        iteration = now.steps // self.steps_per_iteration
+        when = (iteration, now.steps, f"{now.seconds:.3f}", f"{now.wall + passed:.3f}")
+        lines = log.metric_rows(metrics, np.asarray(self.seeds), dict(zip(_WHEN, when, strict=True)))
+        new = [{"seed": row["seed"], **self.point(k), **row} for k, row in enumerate(lines)]
+        self.records.add_rows(new)
+        write_rows(sinks, lines, [self._name(k) for k in range(len(lines))])
+        self.console.clock.chunk(elapsed)
+        rate = (now.steps - last.steps) * len(self.seeds) / elapsed
+        self.console.progress(now.steps, passed, rate, metrics["return"], self._running(now.state, metrics["return"]))
+        if self.on_chunk is not None:
+            self.on_chunk(new[0])
+        return new
 
     def _columns(self, metrics: Any) -> list[str]:
         """Return the columns of metrics.csv, given the shapes of a chunk's metrics."""
@@ -345,10 +375,10 @@ class _Run:
         return list({"seed": 0, **self.point(0), **log.metric_rows(empty, np.zeros(1), dict.fromkeys(_WHEN))[0]})
 
     @contextlib.contextmanager
-    def _profile_chunk(self, rows: int, steps: int) -> Iterator[None]:
+    def _profile_chunk(self, done: int, steps: int) -> Iterator[None]:
         """Trace the run's second, warm chunk, or its only one, if ``profile`` asks for it."""
-        only = steps + self.settings.chunk_steps * self.steps_per_iteration >= self.plan.steps
-        if not (self.profile and self.records.writes and (rows == len(self.seeds) or (only and not rows))):
+        only = not done and steps + self.steps_per_chunk >= self.plan.steps
+        if not (self.profile and self.records.writes and (done == 1 or only)):
             yield
             return
         place = self.directory / "profile"  # type: ignore
@@ -374,9 +404,10 @@ class _Run:
         self.records.save(state)
         allocator.give_back_pages()
 
-    def _evaluate(self, program: Callable, state: TrainState, past: Evaluations, steps: int, diverged) -> Evaluations:
+    def _evaluate(self, program: Callable, now: _Progress) -> Evaluations:
         """Evaluate on all splits, and append the result to the run's evaluations."""
-        scores = hosts.gather(program(state.agent, len(past.steps)))
+        past, diverged = now.evaluations, now.diverged
+        scores = hosts.gather(program(now.state.agent, len(past.steps)))
         rows = {split: np.asarray(self.env.tasks(split).id) for split in SPLITS}
 
         def append(old: Mapping[str, np.ndarray], new: np.ndarray) -> dict[str, np.ndarray]:
@@ -387,10 +418,10 @@ class _Run:
         none = {split: np.zeros((len(diverged), 0, *x.shape[2:]), np.float32) for split, x in past.returns.items()}
         metrics = {name: append(past.metrics.get(name, none), x) for name, x in scores.metrics.items()}
         returns = append(past.returns, scores.returns)
-        evaluations = Evaluations(np.append(past.steps, steps), returns, past.values, metrics)
+        evaluations = Evaluations(np.append(past.steps, now.steps), returns, past.values, metrics)
         self.records.save_evaluations(evaluations)
         if not diverged.all():
-            self.console.evaluation(steps, {split: x[~diverged, -1] for split, x in returns.items()})
+            self.console.evaluation(now.steps, {split: x[~diverged, -1] for split, x in returns.items()})
         return evaluations
 
     def _evaluation_rows(self, evaluations: Evaluations) -> tuple[list[dict[str, Any]], list[str]]:

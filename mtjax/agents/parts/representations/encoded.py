@@ -73,7 +73,8 @@ class Encoded(Seeing):
 
     @property
     def without_target(self) -> tuple[str, ...]:
-        return (*self.models, *self.slow) if self.encoder_tau == 1 else self.models
+        swept = isinstance(self.encoder_tau, jax.Array)
+        return (*self.models, *self.slow) if not swept and self.encoder_tau == 1 else self.models
 
     # Networks: each is used by all N critics and by the actor.
 
