@@ -1,17 +1,17 @@
 """Run a suite of tasks by its name, with its protocol: agents, seeds, steps, and the figures that the field reports.
 
-    python benchmarks/suite.py mt10|mt50|dynamics|goals|domains|hard|pixels [--agents NAME ...] [--seeds N]
+    python benchmarks/suite.py mt10|mt50|dynamics|goals|domains|hard|pixels|looks [--agents NAME ...] [--seeds N]
                                [--steps-per-task N] [--training NAME=N ...] [--env NAME=VALUE ...] [--unfinished]
                                [--out DIR]
 
 ``--list`` prints the protocols. Every pair of environment and agent writes ``DIR/ENV/AGENT.csv`` (training over steps
 and seconds) and ``AGENT.npz`` (every episode of every evaluation: returns and, where tasks have it, success). Finished
 pairs are not run again, so that a long suite runs in parts. A pair that was stopped or killed goes on as in
-``learning.py``; its checkpoints need up to 45 GB in ``mt10``, ``hard`` and ``pixels``. All results in DIR together give
-``scores.md`` (means over tasks with 95% intervals over seeds, for every split), ``tasks.csv`` (every training task and
-seed of the last evaluation) and, for suites that compare one agent for all tasks with one for each, ``sharing.md``.
-``scores.md`` names unfinished pairs. ``--unfinished`` adds their last evaluation, marked with its steps, to it and to
-``tasks.csv``.
+``learning.py``; its checkpoints need up to 45 GB in ``mt10``, ``hard``, ``pixels`` and ``looks``. All results in DIR
+together give ``scores.md`` (means over tasks with 95% intervals over seeds, for every split), ``tasks.csv`` (every
+training task and seed of the last evaluation) and, for suites that compare one agent for all tasks with one for each,
+``sharing.md``. ``scores.md`` names unfinished pairs. ``--unfinished`` adds their last evaluation, marked with its
+steps, to it and to ``tasks.csv``.
 
 Success is that of the last evaluation: at the episode's last step, and at any step. Both are shares of episodes.
 """
@@ -26,12 +26,13 @@ from typing import NamedTuple
 import learning
 import numpy as np
 from report import markdown, run_main, write_lines
+from returns import value
 
 import mtjax
 from mtjax.evaluation import Evaluations
 from mtjax.report.stats import seed_interval, unpaired_difference
 from mtjax.training.programs import enable_compile_cache
-from mtjax.types import SPLITS
+from mtjax.types import SPLITS, Env
 
 _HARD = ("dog-stand", "dog-walk", "dog-trot", "dog-run", "humanoid-stand", "humanoid-walk", "humanoid-run")
 _DOMAINS = (
@@ -46,6 +47,7 @@ _GOALS = (
     *("cheetah-run-vary-speed", "cheetah-vary-direction", "finger-turn-vary-target"),
     *("point-mass-vary-goal", "reacher-vary-goal", "walker-vary-speed"),
 )
+_SEEN = ("pixels=64", "frames=3", "repeat=2")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,6 +62,7 @@ class Suite:
     split: str | None = None
     together: str = ""  # the environment of all tasks, where others are its tasks alone
     settings: tuple[str, ...] = ()  # of the environments
+    vary: tuple[str, ...] = ()  # what tasks differ in, besides what the families vary
 
 
 SUITES = {
@@ -110,7 +113,17 @@ SUITES = {
         500_000,
         3,
         split="hip-bmdp",
-        settings=("pixels=64", "frames=3", "repeat=2"),
+        settings=_SEEN,
+    ),
+    "looks": Suite(
+        "as pixels, but tasks differ in the camera's angle alone (Stone et al. 2021, the Distracting Control Suite)",
+        ("finger-spin", "cheetah-run"),
+        ("drq", "sac-ae", "deepmdp", "care"),
+        500_000,
+        3,
+        split="hip-bmdp",
+        settings=_SEEN,
+        vary=("camera-angle=-20:20:10",),
     ),
 }
 
@@ -162,23 +175,24 @@ def describe(name: str) -> str:
 
 def request(arguments: argparse.Namespace, suite: Suite, env: str, out: Path) -> argparse.Namespace:
     """Return what ``learning.learn`` reads: the suite's protocol, and what was given beside it."""
-    learned = mtjax.make(env, **split_of(suite.split)).train_count
-    steps = (arguments.steps_per_task or suite.steps_per_task) * learned
-    given = {"seeds": arguments.seeds or suite.seeds, "steps": steps, "split": suite.split, "vary": [], "out": out}
-    given |= {"env": [*suite.settings, *arguments.env]}
+    steps = (arguments.steps_per_task or suite.steps_per_task) * family_of(suite, env).train_count
+    given = {"seeds": arguments.seeds or suite.seeds, "steps": steps, "split": suite.split, "out": out}
+    given |= {"env": [*suite.settings, *arguments.env], "vary": [*suite.vary]}
     return argparse.Namespace(**{**vars(arguments), **given})
 
 
-def split_of(name: str | None) -> dict[str, str]:
-    """Return the setting of families that chooses a split; None is the family's own."""
-    return {"split": name} if name else {}
+def family_of(suite: Suite, env: str) -> Env:
+    """Return a suite's environment, with its split and what its tasks differ in."""
+    settings: dict = {name: value(x) for name, x in (pair.split("=", 1) for pair in suite.settings)}
+    settings |= {"vary": dict(pair.split("=", 1) for pair in suite.vary)} if suite.vary else {}
+    return mtjax.make(env, **settings, **({"split": suite.split} if suite.split else {}))
 
 
-def last_of(env: str, split: str | None, evaluations: Evaluations) -> Last:
+def last_of(suite: Suite, env: str, evaluations: Evaluations) -> Last:
     """Return the last evaluation, averaged over episodes."""
-    labels = mtjax.make(env, **split_of(split)).labels("train")
-    metrics = evaluations.metrics
+    labels = family_of(suite, env).labels("train")
     of = lambda name: np.asarray(metrics[name]["train"])[:, -1].mean(axis=-1) if name in metrics else None
+    metrics = evaluations.metrics
     splits = learning.last_scores(evaluations)
     return Last(labels, splits["train"], of("success"), of("success_ever"), splits)
 
@@ -186,7 +200,7 @@ def last_of(env: str, split: str | None, evaluations: Evaluations) -> Last:
 def found(out: Path, suite: Suite, unfinished: bool = False) -> Iterator[tuple[str, str, Last]]:
     """Return environment, agent and last evaluation of every finished pair; if asked, of others too."""
     for pair in learning.pairs(out, unfinished):
-        yield pair.env, pair.agent, last_of(pair.env, suite.split, pair.evaluations)
+        yield pair.env, pair.agent, last_of(suite, pair.env, pair.evaluations)
 
 
 def tabulate(out: Path, suite: Suite, unfinished: bool = False) -> str:

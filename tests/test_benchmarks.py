@@ -333,12 +333,14 @@ def test_suites_name_only_what_there_is(script):
         assert names <= {*mtjax.ENVS, *BENCHMARKS}
 
 
-def test_a_suites_steps_are_those_of_the_tasks_that_its_split_trains_on(script, tmp_path):
-    """Four of the ten sizes of HiP-BMDP's split."""
+@pytest.mark.parametrize("name, env", [("dynamics", "finger-spin-vary-size"), ("looks", "finger-spin")])
+def test_a_suites_steps_are_those_of_the_tasks_that_its_split_trains_on(script, name, env, tmp_path):
+    """Four of the ten sizes, and of the ten angles, of HiP-BMDP's split."""
     suite = script("suite")
     given = SimpleNamespace(steps_per_task=100, seeds=None, env=[])
-    found = suite.request(given, suite.SUITES["dynamics"], "finger-spin-vary-size", tmp_path)
-    assert found.steps == 400 and found.split == "hip-bmdp"
+    found = suite.request(given, suite.SUITES[name], env, tmp_path)
+    assert found.steps == 400 and found.split == "hip-bmdp" and found.vary == [*suite.SUITES[name].vary]
+    assert len(suite.family_of(suite.SUITES[name], env).labels("train")) == 4
 
 
 @pytest.mark.parametrize("agent", ["drq", "sac-ae", "deepmdp", "hip-bmdp", "care", "ppo"])
