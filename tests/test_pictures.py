@@ -6,6 +6,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import probes
 import pytest
 
@@ -15,7 +16,7 @@ from mtjax import frames
 from mtjax.agents.parts import vision
 from mtjax.envs.probes import Pictured, Probe
 from mtjax.experience import Rollouts, pictures
-from mtjax.networks import Params
+from mtjax.networks import OVER_TASKS, Params
 from mtjax.types import InputError, Transition
 
 KEY = jax.random.key(0)
@@ -235,6 +236,28 @@ def test_an_encoder_that_is_its_own_target_sees_the_next_pictures_once():
     assert twice == once + 4
     (after, _), (other, _) = compiled[0](state, batch, tasks, KEY), compiled[1](copied, batch, tasks, KEY)
     jax.tree.map(np.testing.assert_array_equal, (after.actor, after.critic), (other.actor, other.critic))
+
+
+def test_the_actor_learns_on_the_encoder_that_critics_had_before_their_step():
+    """Its step is Adam's on the loss with the old encoder and the new critics, as in DrQ-v2; not with the new one."""
+    agent, family = probes.tiny("drq", n_step=1, critic_lr=0.1), Pictured()
+    tasks = family.tasks()
+    state, batch = agent.init(family.spec, tasks, KEY), probes.random_batch(0, len(tasks.id), 4, family.spec)
+    after, _ = jax.jit(agent.update)(state, batch, tasks, KEY)
+    actor_key = jax.random.split(KEY, 4)[1]
+    _, seen = agent.prepare(state, agent.placed_representation.augment(batch, jax.random.fold_in(KEY, 1)), tasks)
+
+    @jax.jit
+    def step(critic):
+        loss, data = agent.actor_problem(critic, seen, actor_key)
+        mean = lambda actor: jnp.mean(jax.vmap(loss, (OVER_TASKS, 0))(actor, data)[0])
+        slope, optimizer = jax.grad(mean)(state.actor), agent.optimizers.actor
+        return optax.apply_updates(state.actor, optimizer.update(slope, state.optimizers.actor, state.actor)[0])
+
+    gaps = lambda actor: jax.tree.map(lambda a, b: jnp.max(jnp.abs(a - b)), actor, after.actor)
+    distance = lambda actor: max(map(float, jax.tree.leaves(gaps(actor))))
+    assert distance(step(after.critic.without(("latent",)).filled(state.critic))) < 1e-6
+    assert distance(step(after.critic)) > 1e-4
 
 
 def test_pictures_need_warm_up_steps_for_a_window():

@@ -293,7 +293,8 @@ class SAC(BaseAgent):
         self, state: SACState, critic: Params, batch: Batch, combine: Callable, key: Key, order: Key
     ) -> tuple[SACState, Metrics]:
         """Take one gradient step of the actor under a critic, and one of the temperatures."""
-        loss, data = self.actor_problem(critic, batch, key)
+        seen = self.placed_representation.for_actor(critic, state.critic)
+        loss, data = self.actor_problem(seen, batch, key)
         step = combine(self.gradients.for_actor, loss, state.actor, data, state.surgery.actor, order)
         actor, actor_memory = descent.descend(
             self.optimizers.actor, step.gradients, state.optimizers.actor, state.actor

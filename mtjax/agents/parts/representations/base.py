@@ -104,6 +104,10 @@ class Plain:
         """Return a module of the actor's own, which maps its observations with pictures to vectors; None for none."""
         return None
 
+    def for_actor(self, critic: Params, before: Params) -> Params:
+        """Return the critics' parameters in the actor's loss, given those before the critics' step too."""
+        return critic
+
     def augment(self, batch: Transition, key: Key) -> Transition:
         """Return a batch of transitions (T, B, ...) with observations changed at random, as losses should see them."""
         return batch

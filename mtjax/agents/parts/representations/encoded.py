@@ -51,14 +51,14 @@ class Encoded(Seeing):
     The vectors of conditioning=embedding, and the trajectory encoder of conditioning=inferred, belong to this
     representation: all networks use the same, which critics train, and the actor does not.
 
-    With encoder_tau=1 f, projections and target copies are those of DrQ-v2. Differs from it: the learner is SAC, with
-    tuned temperatures, and not DDPG with scheduled noise; the actor's loss sees f after the critics' step, there before
-    it; weights of linear layers begin by LeCun's initialisation, there they are orthogonal.
+    With encoder_tau=1 the target encoder is phi itself, and the actor's loss sees phi as it was before the critics'
+    step, as in DrQ-v2. Differs from DrQ-v2: the learner is SAC, with tuned temperatures, and not DDPG with scheduled
+    noise; weights of linear layers begin by LeCun's initialisation, there they are orthogonal.
     """
 
     encoder_tau: float = 0.05
-    """Step of the target encoder towards the new encoder at each update, as a share of the distance. With 1 there is no
-    target encoder, and the pictures of s' are encoded once for actor and critics."""
+    """Step of the target encoder towards the new encoder at each update, as a share of the distance. With 1 an update
+    encodes s and s' once each, for critics, targets and actor."""
 
     names: ClassVar[tuple[str, ...]] = (*ENCODERS, PROJECTION)
     slow: ClassVar[tuple[str, ...]] = ENCODERS  # those whose target copies move by encoder_tau
@@ -72,9 +72,17 @@ class Encoded(Seeing):
         return dict.fromkeys(self.slow, self.encoder_tau)
 
     @property
-    def without_target(self) -> tuple[str, ...]:
+    def own_target(self) -> tuple[str, ...]:
+        """Names of encoders that are their own targets."""
         swept = isinstance(self.encoder_tau, jax.Array)
-        return (*self.models, *self.slow) if not swept and self.encoder_tau == 1 else self.models
+        return self.slow if not swept and self.encoder_tau == 1 else ()
+
+    @property
+    def without_target(self) -> tuple[str, ...]:
+        return (*self.models, *self.own_target)
+
+    def for_actor(self, critic: Params, before: Params) -> Params:
+        return critic.without(self.own_target).filled(before)
 
     # Networks: each is used by all N critics and by the actor.
 
