@@ -43,6 +43,7 @@ TRAINED = {  # family -> agent and steps
     **{f"dog-{name}": ("brc", 4 * _M) for name in ("stand", "walk", "trot", "run")},
     **{f"quadruped-{name}": ("brc", 2 * _M) for name in ("walk", "run")},
     **{f"acrobot-swingup{name}": ("brc", 5 * _M) for name in ("", "-sparse")},
+    **{f"corridor-maze{name}": ("ppo", 20 * _M) for name in ("", "-vary-goal", "-vary-layout")},
     "ball-in-cup-catch": ("brc", _M),
     "ball-in-cup-spin": ("ppo", 5 * _M),
     "cartpole-swingup-sparse": ("brc", _M),

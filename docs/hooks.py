@@ -145,10 +145,17 @@ def _picture(name: str) -> str:
     """Return a film or a still of a family's tasks, if there is one."""
     text = ""
     for file in PICTURES.glob(f"{name}.*"):
-        last = _runs_of(_ON_GPU, name)[-1:] if file.suffix == ".gif" else []
+        filmed = [row for runs in _FILMED for row in _runs_of(runs, name)]
+        last = filmed[-1:] if file.suffix == ".gif" else []
         text += f"![tasks of {name}](../pictures/families/{file.name})\n\n"
-        text += "".join(f"As {r['agent']} plays with a return of {float(r['return']):.0f}.\n\n" for r in last)
+        text += "".join(f"As {r['agent']} plays with a return of {_score(r)}.\n\n" for r in last)
     return text
+
+
+def _score(row: dict[str, str]) -> str:
+    """Return a run's return as text; those of mazes are 1 at most."""
+    value = float(row["return"])
+    return f"{value:.0f}" if abs(value) >= 10 else f"{value:.1f}"
 
 
 def _family_figures(name: str) -> str:
@@ -159,16 +166,20 @@ def _family_figures(name: str) -> str:
     text += _methods(0, name)
     for runs, (title, place) in _ONE_SEED.items():
         for row in _runs_of(runs, name)[-1:]:
-            text += f"\n### {title}\n\n{row['agent']} had a return of {float(row['return']):.0f} after "
+            text += f"\n### {title}\n\n{row['agent']} had a return of {_score(row)} after "
             text += f"{float(row['seconds']):.0f} seconds ({int(row['steps']):,} steps). The "
             text += f"[command](../results/returns.md#{place}).\n\n![return over steps]({name}-{runs}.png)\n"
     return f"\n## Figures\n{text}" if text else ""
 
 
-_ON_GPU = "h200-families"
+_ON_GPU, _ON_CPU = _FILMED = "h200-families", "cpu-films"  # runs whose policies the films show
 _ONE_SEED = {  # runs -> their title, and where their command stands
     _ON_GPU: (
         "One H200 that six to nine runs share, one seed",
+        "fifty-families-for-a-few-minutes-each-on-a-shared-h200-one-seed",
+    ),
+    _ON_CPU: (
+        "Two CPU cores beside other programs, one seed",
         "fifty-families-for-a-few-minutes-each-on-a-shared-h200-one-seed",
     ),
     "cpu-families": ("Two CPU cores, one seed", "twenty-four-families-on-two-cpu-cores-seven-minutes-one-seed"),
