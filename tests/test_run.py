@@ -33,6 +33,7 @@ from mtjax.evaluation import load_evaluations, save_evaluations
 from mtjax.loop import Settings
 from mtjax.names import Notice
 from mtjax.training import checkpoint, log, run, traced
+from mtjax.training.console import Clock
 from mtjax.training.folder import new_directory
 from mtjax.training.programs import enable_compile_cache
 from mtjax.training.records import Records
@@ -182,13 +183,14 @@ def test_runs_of_one_second_have_folders_of_their_own(tmp_path, monkeypatch):
 
 
 def test_no_directory_writes_nothing_and_prints_nothing(play, tmp_path, monkeypatch, capsys):
-    """The library does not surprise: a chunk's first row goes to on_chunk alone."""
+    """The library does not surprise: a chunk's first row goes to on_chunk alone, and an evaluation to on_evaluation."""
     monkeypatch.chdir(tmp_path)
-    seen = []
-    result = play(None, steps=200, on_chunk=seen.append)
+    seen, evaluated = [], []
+    result = play(None, steps=200, on_chunk=seen.append, on_evaluation=lambda found: evaluated.append(found.steps))
     assert not list(tmp_path.iterdir()) and capsys.readouterr() == ("", "")
     assert seen == result.rows[::2] and [row["seed"] for row in result.rows] == [0, 1, 0, 1]
     assert result.finished and result.directory is None and result.evaluations.steps.tolist() == [200]
+    assert [steps.tolist() for steps in evaluated] == [[200]]
 
 
 def test_profile_is_of_one_warm_chunk(play, tmp_path, capsys):
@@ -202,6 +204,23 @@ def test_profile_is_of_one_warm_chunk(play, tmp_path, capsys):
     compiled = next(line for line in lines if line.startswith("compiled in "))
     assert compiled == f"compiled in {result.compile_seconds:.1f} s" and result.compile_seconds > 0
     assert result.seconds == pytest.approx(float(result.rows[-1]["seconds"]), abs=1e-3)
+
+
+def test_the_clock_counts_down_to_the_end(play, tmp_path, monkeypatch):
+    """Of a run and of the rest of one: its chunks, and its evaluations, the last of which is at no multiple.
+
+    Seconds and rates are those of a chunk, for all seeds.
+    """
+    made, rates = [], []
+    monkeypatch.setattr(run, "Clock", lambda *given: made.append((given, Clock(*given))) or made[-1][1])
+    monkeypatch.setattr(run.Console, "progress", lambda console, steps, passed, rate, *_: rates.append(rate))
+    results = play(tmp_path, steps=500), play(tmp_path, steps=800, resume=True)
+    assert [given for given, _ in made] == [(5, 3), (3, 2)]
+    clocks = [clock for _, clock in made]
+    assert [(clock.chunks, clock.evaluations) for clock in clocks] == [(0, 0)] * 2
+    seconds = [sum(clock.chunk_seconds) for clock in clocks]
+    assert seconds == pytest.approx([result.trained_seconds for result in results])
+    assert rates == pytest.approx([2 * CHUNK / each for clock in clocks for each in clock.chunk_seconds])
 
 
 def test_profile_needs_a_folder(play):
@@ -248,17 +267,27 @@ def test_a_seed_among_many_is_that_seed_alone(short_family, whole):
 # Stopping and going on.
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_stopped_run_goes_on_to_the_bit(play, whole, tmp_path, number):
-    """A signal ends the run after its chunk, with a checkpoint; resumed, nothing tells it from an unbroken one."""
+@pytest.mark.parametrize("number, chunks", [(signal.SIGINT, 3), (signal.SIGTERM, 1)])
+def test_stopped_run_goes_on_to_the_bit(play, whole, tmp_path, number, chunks):
+    """A signal ends the run after its chunk, with a checkpoint; resumed, nothing tells it from an unbroken one.
+
+    Where it stops before its first evaluation, none is missed.
+    """
     before = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
-    stopped = play(tmp_path, on_chunk=after(3, lambda: os.kill(os.getpid(), number)))
+    stopped = play(tmp_path, on_chunk=after(chunks, lambda: os.kill(os.getpid(), number)))
     assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] == before
-    assert not stopped.finished and len(rows_of(tmp_path)) == 6
-    assert (tmp_path / "checkpoints" / "75").is_dir()
+    assert not stopped.finished and len(rows_of(tmp_path)) == 2 * chunks
+    assert (tmp_path / "checkpoints" / str(25 * chunks)).is_dir()
     resumed = play(tmp_path, resume=True)
-    assert resumed.finished and [row["steps"] for row in resumed.rows] == [400, 400, 500, 500, 600, 600]
+    steps = [CHUNK * chunk for chunk in range(chunks + 1, 7)]
+    assert resumed.finished and [row["steps"] for row in resumed.rows[::2]] == steps
     assert_same_run(resumed, whole)
+
+
+def test_a_signal_in_the_last_chunk_stops_nothing(play):
+    """The run is finished, and says so."""
+    result = play(None, steps=100, on_chunk=after(1, lambda: os.kill(os.getpid(), signal.SIGINT)))
+    assert (result.finished, result.signal) == (True, 0)
 
 
 def test_broken_run_goes_on_from_its_last_checkpoint(play, whole, tmp_path):
@@ -336,6 +365,21 @@ def test_a_checkpoint_that_fails_later_is_told_all_the_same(play, tmp_path, monk
         play(tmp_path, steps=100)
 
 
+def test_every_chunk_asks_first_whether_the_last_checkpoint_was_written(play, tmp_path, monkeypatch):
+    """A run whose checkpoints fail does not train on until the next one."""
+    asked = []
+
+    def lost(records):
+        asked.append(len(rows_of(tmp_path)) if asked else 0)
+        if len(asked) == 4:
+            raise OSError(errno.EIO, "checkpoint not written", "somewhere")
+
+    monkeypatch.setattr(Records, "check", lost)
+    with pytest.raises(OSError, match="checkpoint not written"):
+        play(tmp_path)
+    assert asked == [0, 2, 4, 6] and len(rows_of(tmp_path)) == 6
+
+
 @contextlib.contextmanager
 def files_of_at_most(size):
     """Make the system refuse longer files, as a full disk does."""
@@ -363,13 +407,12 @@ def test_a_full_disk_leaves_the_file_before(whole, tmp_path):
     assert_same_evaluations(load_evaluations(file), whole.evaluations)
 
 
-def test_lost_evaluations_are_told(play, whole, tmp_path):
-    """The run goes on without those before."""
-    shutil.copytree(whole.directory, tmp_path, dirs_exist_ok=True)
-    shutil.rmtree(tmp_path / "checkpoints" / "150")
+def test_lost_evaluations_are_told(play, tmp_path):
+    """The run goes on without those before, from the first one on."""
+    play(tmp_path, steps=200)
     (tmp_path / "evaluations.npz").unlink()
     with pytest.warns(Notice, match=r"evaluations.npz' is missing; the run goes on"):
-        assert play(tmp_path, resume=True).evaluations.steps.tolist() == [600]
+        assert play(tmp_path, resume=True).evaluations.steps.tolist() == [400, 600]
 
 
 def test_damaged_evaluations_do_not_stop_a_resumed_run(play, whole, tmp_path):
@@ -437,8 +480,10 @@ def test_both_clocks_go_on(play, tmp_path):
         rows = [{**row, "seconds": "1000.0", "wall_seconds": "2000.0"} for row in csv.DictReader(opened)]
     file.unlink()
     log.append_rows(file, rows)
-    last = play(tmp_path, resume=True).rows[-1]
+    result = play(tmp_path, resume=True)
+    last = result.rows[-1]
     assert 1000 < float(last["seconds"]) < 1500 and 2000 < float(last["wall_seconds"]) < 2500
+    assert result.trained_seconds == pytest.approx(result.seconds - 1000)  # those of this process
 
 
 def test_finished_run_has_nothing_to_resume(play, whole, tmp_path, capsys):

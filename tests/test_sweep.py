@@ -26,7 +26,7 @@ from mtjax.training import memory, points, sweep
 from mtjax.training.console import Console
 from mtjax.training.folder import to_flags
 from mtjax.training.points import SweptAgent
-from mtjax.training.run import Plan, _Run, train
+from mtjax.training.run import Plan, _Progress, _Run, train
 from mtjax.types import InputError, Outcome, Spec
 
 SMALL = {"num_envs": 4, "batch_size": 8, "replay_size": 200, "warmup_steps": 5, "chunk_steps": 20}
@@ -164,6 +164,21 @@ def test_one_point_that_diverges_does_not_end_the_others():
     returns = result.evaluations.returns["train"]
     assert returns.shape[0] == 4
     assert np.isfinite(returns[:2]).all() and np.isnan(returns[2:, -1]).all()
+
+
+def test_a_seed_that_diverged_stays_given_up(capsys):
+    """It is told once, also if later numbers are finite; the run ends when every seed has diverged at some time."""
+    agent, settings = configure(tiny("sac"), Settings(), SMALL)
+    swept = tuple({"tau": tau} for tau in (0.1, 0.2, 0.3))
+    run = _Run(Walk(), SweptAgent(agent), settings, Plan(), None, Console(1), swept)
+    now = _Progress(None, 0, 0.0, 0.0, None, np.zeros(3, bool))
+    chunk = lambda bad: lambda state: (state, {"bad_step": np.array(bad)[:, None]})
+    for bad in ([-1, 4, -1], [-1, -1, -1], [-1, 4, -1]):
+        now, _ = run._play(chunk(bad), now, 0)
+        assert now.diverged.tolist() == [False, True, False]
+    assert capsys.readouterr().out.splitlines() == ["seed 0 of tau=0.2 diverged and is given up"]
+    with pytest.raises(FloatingPointError, match="number 0 of the run's seeds"):
+        run._play(chunk([4, -1, 4]), now, 0)
 
 
 # The command line.
