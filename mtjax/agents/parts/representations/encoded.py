@@ -128,7 +128,7 @@ class Encoded(Seeing):
     def init(self, num_tasks: int, features: Array, obs: Any, action: Array, key: Key) -> Basis:
         key, theta_key, *keys = jax.random.split(key, 2 + len(self.modules))
         size, params = self.place.embedding_size, Params({}, {})
-        latent = jnp.zeros(self.latent_size(without_past(obs)))
+        latent = jnp.zeros(self.latent_widths[-1])  # models see no state beside pictures
         features = jnp.zeros(len(features) + size * (self.has_theta + self.infers))
         inputs = {"latent": (without_past(obs),), **self.model_inputs(latent, features, action)}
         for (name, module), part_key in zip(self.modules.items(), keys, strict=True):
@@ -146,11 +146,6 @@ class Encoded(Seeing):
             params.own[name] = Network.for_each_task(module.init, key, num_tasks, *inputs)
         else:
             params.shared[name] = module.init(key, *inputs)
-
-    def latent_size(self, obs: Any) -> int:
-        """Return the size D of latent states, to which a state beside pictures is appended."""
-        state = frames.state(obs) if frames.shown(obs) else None
-        return self.latent_widths[-1] + (0 if state is None else state.shape[-1])
 
     # Inputs of networks, for one task: features (Z,) or (B, Z), observations (..., O).
 
