@@ -188,6 +188,14 @@ def test_the_losses_add_up():
     np.testing.assert_allclose(loss, expected, rtol=1e-5)
 
 
+@pytest.mark.parametrize("unit, length", [(False, 5), (True, 1)])
+def test_vectors_of_tasks_have_length_one_if_the_agent_says_so(unit, length):
+    """One of length 0 stays as it is."""
+    theta_of = make("hip-bmdp", unit_embedding=unit).placed_representation.theta
+    found = [theta_of(Params({}, {"embedding": jnp.array(theta)})) for theta in ([3.0, 0.0, 4.0], [0.0] * 3)]
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), (length, 0), rtol=1e-6)
+
+
 @pytest.mark.parametrize("transition", ["deterministic", "probabilistic"])
 def test_theta_loss(transition):
     """Per sample: the distance of two vectors against that of the two predictions, in mean and deviation."""

@@ -14,6 +14,7 @@ import mtjax
 import mtjax.evaluate
 from mtjax import frames
 from mtjax.agents.parts import vision
+from mtjax.agents.parts.representations.encoded import Encoded
 from mtjax.envs.probes import Pictured, Probe
 from mtjax.experience import Rollouts, pictures
 from mtjax.networks import OVER_TASKS, Params
@@ -83,6 +84,15 @@ def test_windows_become_the_transitions_of_a_plain_list(count, n_step):
             np.testing.assert_array_equal(found.next_obs["pixels"][i], after)
 
 
+def test_a_replay_keeps_the_newest_picture_and_all_of_what_comes_beside():
+    """No picture of what follows, which the next step holds."""
+    stack, state = jnp.arange(6, dtype=jnp.uint8).reshape(1, 1, 6), jnp.ones(3)
+    obs, after = {"pixels": stack, "state": state}, {"pixels": stack, "state": 2 * state}
+    kept = pictures.compress(Transition(obs, state, state, state, after), 2)
+    assert kept.obs["pixels"].tolist() == [[[4, 5]]] and set(kept.next_obs) == {"state"}
+    np.testing.assert_array_equal((kept.obs["state"], kept.next_obs["state"]), (state, 2 * state))
+
+
 def test_a_rollout_repeats_the_first_picture_and_then_moves_on():
     first = {"pixels": jnp.ones((2, 2, 1), jnp.uint8), "state": jnp.zeros(3)}
     then = {"pixels": 2 * jnp.ones((2, 2, 1), jnp.uint8), "state": jnp.ones(3)}
@@ -101,6 +111,61 @@ def test_shifts_move_whole_pictures_by_whole_pixels():
     allowed = {padded[y : y + 6, x : x + 6].tobytes() for y in range(5) for x in range(5)}
     found = np.asarray(vision.shifted(jnp.broadcast_to(grid, (20, 25, 6, 6, 1)), KEY, 2))
     assert {one.tobytes() for one in found.reshape(-1, 6, 6, 1)} == allowed
+
+
+def test_pictures_before_and_after_a_step_are_shifted_on_their_own():
+    """At the same time; what is seen beside them stays, and a shift of 0 changes nothing."""
+    obs = {"pixels": jnp.broadcast_to(jnp.arange(36, dtype=jnp.uint8).reshape(6, 6, 1), (2, 20, 6, 6, 1))}
+    obs["state"] = jnp.ones((2, 20, 3))
+    batch = Transition(obs, jnp.zeros((2, 20, 1)), jnp.zeros((2, 20)), jnp.ones((2, 20)), obs)
+    found = Encoded(shift=1).augment(batch, KEY)
+    moved = [np.any(x["pixels"] != obs["pixels"], axis=(2, 3, 4)).mean() for x in (found.obs, found.next_obs)]
+    assert min(moved) > 0.6  # 8 in 9 are to be expected
+    assert np.any(found.obs["pixels"] != found.next_obs["pixels"], axis=(2, 3, 4)).mean() > 0.6
+    np.testing.assert_array_equal(found.obs["state"], obs["state"])
+    assert Encoded(shift=0).augment(batch, KEY) is batch
+
+
+def test_brightness_becomes_a_number_around_zero():
+    """For networks as it is, and for decoders as one of 32 levels with noise that fills each."""
+    levels = jnp.broadcast_to(jnp.arange(256, dtype=jnp.uint8), (50, 256))
+    np.testing.assert_allclose(vision.as_numbers(levels[0]), np.linspace(-0.5, 0.5, 256), atol=1e-6)
+    found = (np.asarray(vision.coarse(levels, KEY)) + 0.5) * 32
+    np.testing.assert_array_equal(np.floor(found), levels // 8)
+    noise = found % 1
+    assert noise.min() < 0.01 and noise.max() > 0.99 and noise.mean() == pytest.approx(0.5, abs=0.02)
+
+
+def test_networks_have_the_sizes_of_their_papers():
+    """DrQ: 35 x 35 x 32 features of 84 x 84 pixels. IMPALA: 11 x 11 x 32."""
+    seen = jax.ShapeDtypeStruct((84, 84, 9), jnp.uint8)
+    size = lambda network: jax.eval_shape(lambda x: network.init_with_output(KEY, x)[0], seen).shape
+    assert {name: size(network()) for name, network in vision.NETWORKS.items()} == {
+        "drq": (35 * 35 * 32,),
+        "impala": (11 * 11 * 32,),
+    }
+
+
+def test_residual_blocks_that_give_nothing_pass_on_what_they_got():
+    seen = np.random.default_rng(0).integers(256, size=(16, 16, 2), dtype=np.uint8)
+    network = vision.NETWORKS["impala"]()
+    layers = network.init(KEY, seen)["params"]
+    silent = {name: jax.tree.map(jnp.zeros_like, x) for name, x in layers.items() if int(name.split("_")[1]) % 5}
+    assert len(silent) == 12
+    assert np.ptp(network.apply({"params": layers | silent}, seen)) > 0
+
+
+def test_a_projection_is_bounded_and_leaves_the_state_beside_it():
+    """And it is the same for features of any scale, by its layer normalisation."""
+    random = np.random.default_rng(0)
+    obs = {"pixels": jnp.float32(random.normal(size=(7, 5))), "state": jnp.float32(random.normal(size=(7, 3)))}
+    projection = vision.Projection(4)
+    params = projection.init(KEY, obs)
+    latent = projection.apply(params, obs)
+    assert np.abs(latent[:, :4]).max() < 1
+    np.testing.assert_array_equal(latent[:, 4:], obs["state"])
+    scaled = projection.apply(params, obs | {"pixels": 100 * obs["pixels"]})
+    np.testing.assert_allclose(scaled, latent, atol=1e-3)
 
 
 @pytest.mark.parametrize("name", vision.NETWORKS)

@@ -206,6 +206,11 @@ def test_profile_is_of_one_warm_chunk(play, tmp_path, capsys):
     assert result.seconds == pytest.approx(float(result.rows[-1]["seconds"]), abs=1e-3)
 
 
+def test_profile_of_a_run_of_one_chunk_is_of_that(play, tmp_path):
+    play(tmp_path, steps=100, profile=True)
+    assert list(tmp_path.glob("profile/plugins/profile/*/*.trace.json.gz"))
+
+
 def test_the_clock_counts_down_to_the_end(play, tmp_path, monkeypatch):
     """Of a run and of the rest of one: its chunks, and its evaluations, the last of which is at no multiple.
 
@@ -605,6 +610,12 @@ def test_chunks_are_no_longer_than_the_run():
     """Whole iterations, at least as many as the steps need."""
     assert fit_chunk(Settings(num_envs=2, chunk_steps=1000), 3, 601).chunk_steps == 101
     assert fit_chunk(Settings(num_envs=2, chunk_steps=10), 3, 601).chunk_steps == 10
+
+
+@pytest.mark.parametrize("plan, every", [(Plan(5), 1), (Plan(101), 11), (Plan(100), 10), (Plan(100, eval_every=7), 7)])
+def test_there_are_ten_evaluations_unless_told(plan, every):
+    """No more, whatever the number of steps."""
+    assert run._Run(*[None] * 3, plan, *[None] * 2).eval_every == every
 
 
 def test_steps_are_rounded_up_to_whole_chunks(play):

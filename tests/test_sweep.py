@@ -19,8 +19,8 @@ from mtjax import cli, loop
 from mtjax.agents import PARTS
 from mtjax.agents import settings as settings_of
 from mtjax.config import configure, from_json, to_json
-from mtjax.evaluation import load_evaluations
-from mtjax.loop import Settings
+from mtjax.evaluation import Scores, load_evaluations
+from mtjax.loop import Settings, TrainState
 from mtjax.names import Notice
 from mtjax.training import memory, points, sweep
 from mtjax.training.console import Console
@@ -179,6 +179,21 @@ def test_a_seed_that_diverged_stays_given_up(capsys):
     assert capsys.readouterr().out.splitlines() == ["seed 0 of tau=0.2 diverged and is given up"]
     with pytest.raises(FloatingPointError, match="number 0 of the run's seeds"):
         run._play(chunk([4, -1, 4]), now, 0)
+
+
+def test_the_evaluation_that_is_told_is_of_the_seeds_that_go_on(capsys):
+    """If none does, nothing is told."""
+    swept = tuple({"tau": tau} for tau in (0.1, 0.2, 0.3))
+    run = _Run(Walk(), SweptAgent(tiny("sac")), Settings(), Plan(eval_episodes=1), None, Console(1), swept)
+    scores = lambda agent, number: Scores(np.full((3, len(Walk().tasks("all").id), 1), 7.0), {})
+    now = _Progress(
+        TrainState(*[None] * len(TrainState._fields)), 20, 0.0, 0.0, run._no_evaluations(), np.zeros(3, bool)
+    )
+    for diverged in ([False, True, False], [True, True, True]):
+        found = run._evaluate(scores, now._replace(diverged=np.array(diverged)))
+        np.testing.assert_array_equal(np.isnan(found.returns["train"][:, 0, 0, 0]), diverged)
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line.startswith("evaluation at 20 steps: train 7 (worst task 7)")
 
 
 # The command line.
