@@ -220,8 +220,17 @@ def test_pictures_have_a_preset_of_their_own(agent):
     assert mixed.learner.actor_lr == load_preset("+", "gpu")["pictures"]["actor_lr"]
 
 
+def test_what_is_tuned_for_an_agent_holds_with_pictures_too():
+    """Before what is tuned for pictures."""
+    rate = lambda agent: with_preset("cheetah-run", agent, "gpu", pixels=64).learner.actor_lr
+    common = load_preset("+", "gpu")
+    assert (rate("drq"), rate("xqc")) == (common["pictures"]["actor_lr"], common["xqc"]["actor_lr"])
+    assert rate("drq") != rate("xqc")
+
+
 def test_auto_preset_is_that_of_the_device(monkeypatch):
-    """A GPU takes the gpu preset."""
+    """A GPU takes the gpu preset. A record says auto all the same."""
+    assert with_preset("finger-spin", "sac").preset == "auto"
     assert cli.parse([]).training == with_preset("finger-spin", "sac", "cpu").training
     monkeypatch.setattr("jax.default_backend", lambda: "gpu")
     assert cli.parse([]).training == with_preset("finger-spin", "sac", "gpu").training

@@ -22,7 +22,7 @@ import mtjax.evaluate
 import mtjax.train
 from mtjax import loop
 from mtjax.config import from_json
-from mtjax.evaluation import Evaluations, evaluate, load_evaluations
+from mtjax.evaluation import Evaluations, evaluate, load_evaluations, record
 from mtjax.report import films, render, scoring
 from mtjax.report.tables import split_table, task_table
 from mtjax.training import checkpoint, launch
@@ -163,6 +163,38 @@ def test_evaluation_is_a_plain_loop_over_single_worlds():
                 )
                 lengths.add(age)
     assert lengths == {2, 3, 4, 6}  # both ways to end, in one batch
+
+
+def test_a_recorded_episode_is_that_of_a_plain_loop():
+    """Its return and length are those up to its end; the states of all steps are there."""
+    env, agent, state = Fatal(), Leaning(), jnp.float32([0.3])
+    tasks = tasks_of("one-step", (1.0, -0.5, 2.0, 0.5) * 3)._replace(horizon=jnp.int32([6, 4, 2, 6] * 3))
+    found, lengths = record(env, agent, state, tasks, jnp.int32(8)), set()
+    keys = jax.random.split(jax.random.fold_in(jax.random.key(8), 0xF11), (1, 12, 1))[0, :, 0]
+    for i in range(12):
+        task = pick(tasks, i)
+        world, total, age = env.reset(task, keys[i]), 0.0, 0
+        while not world.terminated and age < task.horizon:
+            action = agent.act(state, (), world.obs, task, None).action
+            world = env.step(task, world.state, action)
+            np.testing.assert_allclose(found.states.obs[i, age], world.state.obs, rtol=1e-6)
+            total, age = total + float(world.reward), age + 1
+        np.testing.assert_allclose(found.returns[i], total, rtol=1e-5)
+        assert (found.lengths[i], found.rows[i]) == (age, tasks.row[i])
+        lengths.add(age)
+    assert lengths == {2, 3, 4, 6}
+
+
+def test_a_recorded_episode_names_the_task_that_it_drew():
+    tasks = Walk().tasks()
+    rows = 100 * jnp.arange(len(tasks.id))[:, None] + jnp.arange(50)
+    draws = jax.tree.map(lambda x: jnp.broadcast_to(x[:, None], (*rows.shape, *x.shape[1:])), tasks)
+    draws = draws._replace(row=rows, goal={"scale": jnp.float32(rows + 1)})
+    found = record(Walk(), Leaning(), jnp.float32([0.3]), tasks._replace(draws=draws), jnp.int32(8))
+    for i, length in enumerate(found.lengths):
+        before = found.states.obs[i, :length, 0] - 1
+        np.testing.assert_allclose(found.returns[i], (found.rows[i] + 1) * np.sum(before), rtol=1e-5)
+    assert np.all(found.rows // 100 == tasks.id)
 
 
 # The program.

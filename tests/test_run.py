@@ -39,7 +39,7 @@ from mtjax.training.programs import enable_compile_cache
 from mtjax.training.records import Records
 from mtjax.training.run import fit_chunk, train
 from mtjax.training.stops import require_finite, stop_signals
-from mtjax.types import InputError
+from mtjax.types import SPLITS, InputError
 
 CLOCKS = {"seconds", "wall_seconds"}
 CHUNK = 100  # environment steps of a seed in a chunk of SHORT_RUN
@@ -663,6 +663,10 @@ def damaged_evaluations(name, whole, harm):
             np.savez(file, **{**arrays, "steps": np.array(["a"])})
         case "other shapes":
             np.savez(file, **{**arrays, "train": arrays["train"][:, :1]})
+        case "other seeds":
+            np.savez(file, **{**arrays, "train": arrays["train"][:1]})
+        case "other metrics":
+            np.savez(file, **arrays, **{f"{split}_success": arrays[split][:, :1] for split in SPLITS})
         case "no steps":
             np.savez(file, **{k: x for k, x in arrays.items() if k != "steps"})
     return file.getvalue()
@@ -670,7 +674,10 @@ def damaged_evaluations(name, whole, harm):
 
 @pytest.mark.parametrize(
     "name",
-    [*"empty junk zeroed truncated flipped pickle objects text".split(), "one array", "other shapes", "no steps"],
+    [
+        *"empty junk zeroed truncated flipped pickle objects text".split(),
+        *("one array", "other shapes", "other seeds", "other metrics", "no steps"),
+    ],
 )
 def test_damaged_evaluations_are_an_input_error(whole, tmp_path, name):
     """One line that names the file; no code in it runs, and nobody advises to let it."""
