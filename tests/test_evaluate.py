@@ -25,6 +25,7 @@ from mtjax.config import from_json
 from mtjax.evaluation import Evaluations, evaluate, load_evaluations, record
 from mtjax.report import films, render, scoring
 from mtjax.report.tables import split_table, task_table
+from mtjax.tasks import episode_task
 from mtjax.training import checkpoint, launch
 from mtjax.types import InputError
 
@@ -186,14 +187,20 @@ def test_a_recorded_episode_is_that_of_a_plain_loop():
 
 
 def test_a_recorded_episode_names_the_task_that_it_drew():
-    tasks = Walk().tasks()
+    """And begins by a key of its own: where it begins does not depend on what was drawn."""
+    env, tasks = Walk(), Walk().tasks()
     rows = 100 * jnp.arange(len(tasks.id))[:, None] + jnp.arange(50)
     draws = jax.tree.map(lambda x: jnp.broadcast_to(x[:, None], (*rows.shape, *x.shape[1:])), tasks)
     draws = draws._replace(row=rows, goal={"scale": jnp.float32(rows + 1)})
-    found = record(Walk(), Leaning(), jnp.float32([0.3]), tasks._replace(draws=draws), jnp.int32(8))
+    tasks = tasks._replace(draws=draws)
+    found = record(env, Leaning(), jnp.float32([0.3]), tasks, jnp.int32(8))
+    keys = jax.random.split(jax.random.fold_in(jax.random.key(8), 0xF11), (1, len(rows), 1))[0, :, 0]
     for i, length in enumerate(found.lengths):
+        task_key, key = jax.random.split(keys[i])
         before = found.states.obs[i, :length, 0] - 1
+        np.testing.assert_allclose(before[0], env.reset(pick(tasks, i), key).obs[0], rtol=1e-5)
         np.testing.assert_allclose(found.returns[i], (found.rows[i] + 1) * np.sum(before), rtol=1e-5)
+        assert found.rows[i] == episode_task(pick(tasks, i), task_key).row
     assert np.all(found.rows // 100 == tasks.id)
 
 

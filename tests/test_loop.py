@@ -15,8 +15,8 @@ from mtjax.config import configure
 from mtjax.experience import Replay
 from mtjax.loop import Settings
 from mtjax.maps import over_learners, over_worlds
-from mtjax.rollout import broadcast_tasks
-from mtjax.types import InputError, Spec
+from mtjax.rollout import broadcast_tasks, reset_envs, step_envs
+from mtjax.types import Acted, InputError, Spec
 
 ENVS, BATCH, WARMUP, HOLD, CHUNK, UPDATES = 4, 8, 8, 3, 13, 2
 SETTINGS = {
@@ -132,6 +132,30 @@ def test_warmup_acts_at_random_and_then_the_agent_does(walk):
     assert abs(held.mean()) < 0.3 and abs(held.var() - 1 / 3) < 0.15
     np.testing.assert_array_equal(chosen[:, 0], 2.0)
     np.testing.assert_array_equal(chosen[:, 1], 3.0)
+
+
+class Noting(Stub):
+    """Counts its acts, and remembers ten times that."""
+
+    def begin(self, state, task):
+        return jnp.int32(0)
+
+    def act(self, state, memory, obs, task, key):
+        return Acted(jnp.zeros(1), None, memory + 1)
+
+    def remember(self, state, memory, transition, task):
+        return 10 * memory
+
+
+def test_a_step_keeps_to_a_tasks_actions_and_to_what_the_agent_noted():
+    """Whatever explores; and memory passes through acting to remembering."""
+    env, agent, learners = Walk(), Noting(), jnp.zeros((1, 1))
+    tasks = env.tasks()._replace(action_mask=jnp.array([[1.0], [0.0]]))
+    worlds = reset_envs(env, agent, learners, tasks, jax.random.split(jax.random.key(0), (1, 2, 3)))
+    for count in (10, 110):
+        worlds, step = step_envs(env, agent, learners, tasks, worlds, None, lambda action: action + 5)
+        np.testing.assert_array_equal(step.transition.action[0, :, :, 0], [[5] * 3, [0] * 3])
+        assert np.all(worlds.memory == count) and worlds.memory.shape == (1, 2, 3)
 
 
 def test_updates_begin_after_the_warmup_and_each_has_its_own_batch(walk):
