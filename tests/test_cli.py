@@ -228,6 +228,12 @@ def test_what_is_tuned_for_an_agent_holds_with_pictures_too():
     assert rate("drq") != rate("xqc")
 
 
+def test_what_is_given_goes_before_what_is_tuned():
+    given = {"actor_lr": 0.5, "critic_lr": 0.25}
+    learner = with_preset("cheetah-run", "xqc", "gpu", agent_settings=given).learner
+    assert (learner.actor_lr, learner.critic_lr) == (0.5, 0.25)
+
+
 def test_auto_preset_is_that_of_the_device(monkeypatch):
     """A GPU takes the gpu preset. A record says auto all the same."""
     assert with_preset("finger-spin", "sac").preset == "auto"
