@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
+from probes import slow_but
 from probes import with_metaworld as with_scenes
 
 import mtjax
@@ -156,7 +157,7 @@ def unstopped():
     return {}
 
 
-@pytest.mark.parametrize("name", list(FILES))
+@pytest.mark.parametrize("name", slow_but(FILES, "learning"))
 @pytest.mark.parametrize("end", [terminate, die])
 def test_a_stopped_pair_goes_on_to_the_same_results(run, unstopped, tmp_path, monkeypatch, name, end):
     """It is in no table before, and leaves nothing but results."""

@@ -206,6 +206,7 @@ def fast_convolutions(monkeypatch):
 BESIDE = Pictured("by-both", state="also")
 
 
+@pytest.mark.slow
 def test_an_actor_learns_from_pictures_under_critics_that_see_the_state(fast_convolutions):
     """Without seeing, the best mean return is -0.625."""
     agent = mtjax.agent("drq", representation="asymmetric", shift=1, n_step=1)
