@@ -28,9 +28,9 @@ import itertools
 import json
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from report import markdown, read_lines, run_main, write_lines
@@ -127,8 +127,7 @@ def trained(arguments: argparse.Namespace, env: str, agent: str, folder: Path) -
     """Train one agent on one family with its preset, or go on with the run that was stopped in the folder."""
     trial = FAMILIES.get(env, Trial())
     split = arguments.split or trial.split
-    settings = {"vary": dict(pair.split("=", 1) for pair in arguments.vary)} | ({"split": split} if split else {})
-    settings |= {name: value(x) for name, x in (pair.split("=", 1) for pair in arguments.env)}
+    settings = family_settings(arguments.env, arguments.vary, split)
     program = mtjax.preset(env, agent, arguments.preset, seeing(agent, settings), **settings)
     given = trial.replay_steps if isinstance(program.learner.experience, Replay) else trial.rollout_steps
     steps = arguments.steps or given or program.plan.steps
@@ -146,6 +145,12 @@ def trained(arguments: argparse.Namespace, env: str, agent: str, folder: Path) -
         **training,
         quiet=False,
     )
+
+
+def family_settings(given: Sequence[str], vary: Sequence[str], split: str | None) -> dict[str, Any]:
+    """Return the settings of a family from words such as pixels=64, from what it varies, and from its split."""
+    settings: dict[str, Any] = {"vary": dict(pair.split("=", 1) for pair in vary)} | ({"split": split} if split else {})
+    return settings | {name: value(x) for name, x in (pair.split("=", 1) for pair in given)}
 
 
 def seeing(agent: str, settings: dict) -> dict[str, str]:

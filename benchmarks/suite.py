@@ -26,7 +26,6 @@ from typing import NamedTuple
 import learning
 import numpy as np
 from report import markdown, run_main, write_lines
-from returns import value
 
 import mtjax
 from mtjax.evaluation import Evaluations
@@ -183,16 +182,13 @@ def request(arguments: argparse.Namespace, suite: Suite, env: str, out: Path) ->
 
 def family_of(suite: Suite, env: str) -> Env:
     """Return a suite's environment, with its split and what its tasks differ in."""
-    settings: dict = {name: value(x) for name, x in (pair.split("=", 1) for pair in suite.settings)}
-    settings |= {"vary": dict(pair.split("=", 1) for pair in suite.vary)} if suite.vary else {}
-    return mtjax.make(env, **settings, **({"split": suite.split} if suite.split else {}))
+    return mtjax.make(env, **learning.family_settings(suite.settings, suite.vary, suite.split))
 
 
 def last_of(suite: Suite, env: str, evaluations: Evaluations) -> Last:
     """Return the last evaluation, averaged over episodes."""
-    labels = family_of(suite, env).labels("train")
+    labels, metrics = family_of(suite, env).labels("train"), evaluations.metrics
     of = lambda name: np.asarray(metrics[name]["train"])[:, -1].mean(axis=-1) if name in metrics else None
-    metrics = evaluations.metrics
     splits = learning.last_scores(evaluations)
     return Last(labels, splits["train"], of("success"), of("success_ever"), splits)
 

@@ -275,8 +275,7 @@ class _Run:
         """Return a clock that counts the chunks and evaluations to come."""
         chunk = self.steps_per_chunk
         ends = range(steps + chunk, self.console.total + chunk, chunk)
-        due = sum(end // self.eval_every > (end - chunk) // self.eval_every or end >= self.plan.steps for end in ends)
-        return Clock(len(ends), due)
+        return Clock(len(ends), sum(self._is_due(end - chunk, end) for end in ends))
 
     def _running(self, state: TrainState, returns: np.ndarray) -> str:
         """Return a text on first episodes that still run, if no episode has ended."""
@@ -339,7 +338,7 @@ class _Run:
         return steps // self.eval_every > before // self.eval_every or steps >= self.plan.steps
 
     def _play(self, chunk: Callable, now: _Progress, done: int) -> tuple[_Progress, dict[str, Any]]:
-        """Run one chunk, of which this process has ``done`` some, and return its metrics too."""
+        """Run one chunk, and return its metrics too. ``done`` counts the chunks before it in this process."""
         with self._profile_chunk(done, now.steps):
             before = time.monotonic()
             state, metrics = chunk(now.state)
