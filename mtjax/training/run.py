@@ -275,7 +275,7 @@ class _Run:
         """Return a clock that counts the chunks and evaluations to come."""
         chunk = self.steps_per_chunk
         ends = range(steps + chunk, self.console.total + chunk, chunk)
-        return Clock(len(ends), sum(self._is_due(end - chunk, end) for end in ends))
+        return Clock(len(ends), sum(map(self._is_due, ends)))
 
     def _running(self, state: TrainState, returns: np.ndarray) -> str:
         """Return a text on first episodes that still run, if no episode has ended."""
@@ -313,11 +313,11 @@ class _Run:
         with stop_signals() as received, self.records.closing():
             while now.steps < self.plan.steps and not stop:
                 self.records.check()
-                last = now
-                now, metrics = self._play(programs.chunk, last, len(rows) // len(self.seeds))
-                rows.extend(self._log(metrics, last, now, started, sinks))
+                seconds = now.seconds
+                now, metrics = self._play(programs.chunk, now, len(rows) // len(self.seeds))
+                rows.extend(self._log(metrics, now.seconds - seconds, now, started, sinks))
                 before = time.monotonic()
-                due = self._is_due(last.steps, now.steps)
+                due = self._is_due(now.steps)
                 if due:
                     self.console.doing(f"{now.steps:,} steps  evaluating")
                     now = now._replace(evaluations=self._evaluate(programs.evaluate, now))
@@ -333,8 +333,9 @@ class _Run:
             trained_seconds=now.seconds - earlier, signal=0 if finished else stop
         )
 
-    def _is_due(self, before: int, steps: int) -> bool:
-        """Return whether an evaluation is due after a chunk that went from one step to another."""
+    def _is_due(self, steps: int) -> bool:
+        """Return whether an evaluation is due after the chunk that ends at a step."""
+        before = steps - self.steps_per_chunk
         return steps // self.eval_every > before // self.eval_every or steps >= self.plan.steps
 
     def _play(self, chunk: Callable, now: _Progress, done: int) -> tuple[_Progress, dict[str, Any]]:
@@ -351,10 +352,10 @@ class _Run:
         return now._replace(state=state, steps=steps, seconds=seconds, diverged=diverged), metrics
 
     def _log(
-        self, metrics: dict[str, Any], last: _Progress, now: _Progress, started: float, sinks: list[Sink]
+        self, metrics: dict[str, Any], elapsed: float, now: _Progress, started: float, sinks: list[Sink]
     ) -> list[dict[str, Any]]:
-        """Write a chunk's metrics wherever they go, and return them: a row for each entry of S."""
-        passed, elapsed = time.monotonic() - started, now.seconds - last.seconds
+        """Write the metrics of a chunk that took ``elapsed`` seconds, and return them: a row for each entry of S."""
+        passed = time.monotonic() - started
         iteration = now.steps // self.steps_per_iteration
         when = (iteration, now.steps, f"{now.seconds:.3f}", f"{now.wall + passed:.3f}")
         lines = log.metric_rows(metrics, np.asarray(self.seeds), dict(zip(_WHEN, when, strict=True)))
@@ -362,7 +363,7 @@ class _Run:
         self.records.add_rows(new)
         write_rows(sinks, lines, [self._name(k) for k in range(len(lines))])
         self.console.clock.chunk(elapsed)
-        rate = (now.steps - last.steps) * len(self.seeds) / elapsed
+        rate = self.steps_per_chunk * len(self.seeds) / elapsed
         self.console.progress(now.steps, passed, rate, metrics["return"], self._running(now.state, metrics["return"]))
         if self.on_chunk is not None:
             self.on_chunk(new[0])
