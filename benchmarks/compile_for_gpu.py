@@ -1,14 +1,17 @@
 """Compile the update of every agent with a replay for an H200, on a machine without one: seconds, kernels and bytes.
 
     pip install 'jax[cuda13]'
-    python benchmarks/compile_for_gpu.py [--agents NAME ...] [--tasks 4] [--seeds 10] [--hidden 256 256] [--json FILE]
+    python benchmarks/compile_for_gpu.py [--agents NAME ...] [--tasks 4] [--seeds 10] [--hidden 256 256]
+                                         [--pictures 64] [--json FILE]
 
 XLA compiles for a GPU that it is told of (``_H200``), so that slow compiling and odd kernels are found without one. It
 cannot try kernels out, which takes more time on a GPU. So matrix products are cuBLAS's here, not XLA's own.
 
 "kernels" are those of one update, "MB" what they read and write by their shapes. "numbers a thread" is the most that a
 thread of one of XLA's tiled kernels holds at once. Above some 200 it has no registers for them: the kernel is slow, and
-slow to compile.
+slow to compile. With ``--pictures`` agents see stacks of three square pictures of this side. Then "convolutions" are
+those of one update, and "window" is the side of the largest window of one: 3 is a layer's, and one as large as a
+picture has no fast kernel.
 """
 
 import argparse
@@ -27,7 +30,7 @@ import jax
 from jax.experimental import topologies
 from jax.sharding import NamedSharding, PartitionSpec
 from report import markdown, publish, run_main
-from update_cost import AGENTS, SPEC, random_batch, tasks_of, updates
+from update_cost import AGENTS, random_batch, seeing, tasks_of, updates
 
 import mtjax
 from mtjax.types import InputError
@@ -62,6 +65,7 @@ device_description_str: "NVIDIA H200"
 _BYTES = {"pred": 1, "s8": 0, "u8": 1, "f16": 2, "bf16": 2, "f64": 8, "s64": 8, "u64": 8}
 _SHAPE = re.compile(r"\b([a-z]+\d*)\[([\d,]*)\]")
 _INSTRUCTION = re.compile(r"\s+(?:ROOT )?%([\w.\-]+) = (.+?) ([\w\-]+)\((.*)")
+_WINDOW = re.compile(r"custom-call\(.*window=\{size=(\d+)x.*__cudnn\$conv")
 _TILED = re.compile(
     r'calls=%([\w.\-]+).*"kind":"__triton",.*"num_warps":"(\d+)","output_tiles":\[\{"sizes":\[([^\]]*)\]'
 )
@@ -74,6 +78,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--batch", type=int, default=64, help="transitions a task")
     parser.add_argument("--hidden", type=int, nargs="+", default=[256, 256])
+    parser.add_argument("--pictures", type=int, help="the side of pictures that agents see in place of numbers")
     parser.add_argument("--json", help="write the figures to this file too")
     arguments = parser.parse_args()
     place, rows = h200(), []
@@ -96,9 +101,10 @@ def h200() -> NamedSharding:
 def measure(name: str, arguments: argparse.Namespace, place: NamedSharding) -> dict:
     """Compile two updates in a scan, for all seeds."""
     agent, tasks = mtjax.agent(name, hidden=arguments.hidden), tasks_of(arguments.tasks)
-    batch = random_batch(SPEC, arguments.tasks, arguments.batch)
+    spec = seeing(arguments.pictures)
+    batch = random_batch(spec, arguments.tasks, arguments.batch)
     seeds = jax.numpy.arange(arguments.seeds, dtype=jax.numpy.uint32)
-    state = jax.eval_shape(jax.vmap(lambda seed: agent.init(SPEC, tasks, jax.random.key(seed))), seeds)
+    state = jax.eval_shape(jax.vmap(lambda seed: agent.init(spec, tasks, jax.random.key(seed))), seeds)
 
     def learn(state: Any, seeds: Any, batch: Any, tasks: Any) -> Any:
         return updates(agent, tasks, batch, 2)(state, jax.vmap(jax.random.key)(seeds))
@@ -109,13 +115,14 @@ def measure(name: str, arguments: argparse.Namespace, place: NamedSharding) -> d
     before = time.perf_counter()
     text = lowered.compile().as_text() or ""
     seconds = time.perf_counter() - before
-    touched = kernels(text)
+    touched, windows = kernels(text), [int(side) for side in _WINDOW.findall(text)]
     return {
         "agent": name,
         "compile_seconds": round(seconds, 1),
         "kernels": len(touched),
         "megabytes": round(sum(touched) / 1e6, 1),
         "numbers_a_thread": numbers_a_thread(text),
+        **({"convolutions": len(windows), "window": max(windows, default=0)} if arguments.pictures else {}),
     }
 
 
@@ -161,9 +168,8 @@ def num_bytes(text: str) -> float:
 
 
 def table(rows: list[dict]) -> str:
-    return markdown(
-        ["agent", "compiled in", "kernels", "MB", "numbers a thread"], [[*map(str, x.values())] for x in rows]
-    )
+    head = ["agent", "compiled in", "kernels", "MB", "numbers a thread", "convolutions", "window"]
+    return markdown(head[: len(rows[0])], [[*map(str, row.values())] for row in rows])
 
 
 if __name__ == "__main__":

@@ -1,11 +1,12 @@
 """Measure the time of an update of every agent that learns from replay, compared with plain SAC.
 
-    python benchmarks/update_cost.py [--agents NAME ...] [--tasks 10 50] [--seeds 1 10] [--json FILE]
+    python benchmarks/update_cost.py [--agents NAME ...] [--tasks 10 50] [--seeds 1 10] [--pictures 64] [--json FILE]
 
 One update: 10 tasks, 128 transitions a task, hidden layers of 3 x 400 in actor and critics, on the observations of the
 finger (9 numbers, 2 actions); the same for all. Updates run in a scan, as they do in training. All agents of a setting
 are compiled first and then timed in turn, round after round, so that what else the machine does falls on all of them:
-times are medians over rounds, ratios medians of each round's ratio to ``sac``.
+times are medians over rounds, ratios medians of each round's ratio to ``sac``. With ``--pictures`` agents see stacks of
+three square pictures of this side, and ratios are to ``drq``.
 """
 
 import argparse
@@ -20,6 +21,7 @@ import numpy as np
 from report import markdown, publish, run_main
 
 import mtjax
+from mtjax import frames
 from mtjax.experience.replay import Replay
 from mtjax.maps import over_seeds
 from mtjax.types import Spec, Task, Transition
@@ -36,6 +38,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])
     parser.add_argument("--batch", type=int, default=128, help="transitions a task")
     parser.add_argument("--hidden", type=int, nargs="+", default=[400, 400, 400])
+    parser.add_argument("--pictures", type=int, help="the side of pictures that agents see in place of numbers")
     parser.add_argument("--updates", type=int, default=3 if _ON_CPU else 100, help="in a timed call")
     parser.add_argument("--repeats", type=int, default=7, help="rounds")
     parser.add_argument("--json", help="write the figures to this file too")
@@ -50,8 +53,10 @@ def main() -> None:
 
 def compare(arguments: argparse.Namespace, num_tasks: int, num_seeds: int) -> list[dict]:
     """Time all agents in turn, and return their rows."""
-    names = ["sac", *(name for name in arguments.agents if name != "sac")]
-    contestants = [Contestant(name, arguments, num_tasks, num_seeds) for name in names]
+    first = "drq" if arguments.pictures else "sac"
+    names = [first, *(name for name in arguments.agents if name != first)]
+    spec = seeing(arguments.pictures)
+    contestants = [Contestant(name, arguments, num_tasks, num_seeds, spec) for name in names]
     for _ in range(arguments.repeats):
         for contestant in contestants:
             contestant.time()
@@ -62,13 +67,13 @@ def compare(arguments: argparse.Namespace, num_tasks: int, num_seeds: int) -> li
 class Contestant:
     """One agent's compiled updates, and the seconds that an update took in each round."""
 
-    def __init__(self, name: str, arguments: argparse.Namespace, num_tasks: int, num_seeds: int):
+    def __init__(self, name: str, arguments: Any, num_tasks: int, num_seeds: int, spec: Spec = SPEC):
         self.name, self.updates, self.seconds = name, arguments.updates, []
         self.num_tasks, self.num_seeds = num_tasks, num_seeds
         agent = mtjax.agent(name, hidden=arguments.hidden)
         tasks, keys = tasks_of(num_tasks), jax.random.split(jax.random.key(0), num_seeds)
-        batch = random_batch(SPEC, num_tasks, arguments.batch)
-        self.state = jax.jit(jax.vmap(lambda key: agent.init(SPEC, tasks, key)))(keys)
+        batch = random_batch(spec, num_tasks, arguments.batch)
+        self.state = jax.jit(jax.vmap(lambda key: agent.init(spec, tasks, key)))(keys)
         self.num_parameters = size_of((self.state.actor, self.state.critic)) // num_seeds
 
         self.learn = updates(agent, tasks, batch, arguments.updates)
@@ -110,10 +115,20 @@ def tasks_of(num_tasks: int) -> Task:
     return Task(row, row, jnp.linspace(-1, 1, num_tasks)[:, None], {}, {}, {}, horizon)
 
 
+def seeing(side: int | None) -> Spec:
+    """Return the spec of agents that see numbers, or stacks of three pictures of this side."""
+    picture = {frames.PICTURES: jax.ShapeDtypeStruct((side, side, 3), jnp.uint8)}
+    return SPEC._replace(obs=picture, frames=3) if side else SPEC
+
+
 def random_batch(spec: Spec, num_tasks: int, batch_size: int) -> Transition:
-    random = np.random.default_rng(0)
-    normal = lambda *shape: jnp.float32(random.normal(size=(num_tasks, batch_size, *shape)))
-    obs, action, next_obs = normal(spec.obs_size), jnp.tanh(normal(spec.action_size)), normal(spec.obs_size)
+    random, lead = np.random.default_rng(0), (num_tasks, batch_size)
+    normal = lambda *shape: jnp.float32(random.normal(size=(*lead, *shape)))
+    draw = lambda x: (
+        jnp.uint8(random.integers(256, size=(*lead, *x.shape))) if x.dtype == jnp.uint8 else normal(*x.shape)
+    )
+    observe = lambda: jax.tree.map(draw, frames.seen(spec))
+    obs, action, next_obs = observe(), jnp.tanh(normal(spec.action_size)), observe()
     return Transition(obs, action, normal(), jnp.ones((num_tasks, batch_size)), next_obs)
 
 

@@ -1,10 +1,11 @@
 """Measure where an update's time goes on a GPU: its kernels, and the share of the chip's matrix rate.
 
-    python benchmarks/update_trace.py [--agents NAME ...] [--tasks 10] [--seeds 1] [--hidden 400 400 400] [--json FILE]
+    python benchmarks/update_trace.py [--agents NAME ...] [--tasks 10] [--seeds 1] [--hidden 400 400 400]
+                                      [--pictures 64] [--json FILE]
 
 Updates like those of ``update_cost.py`` run in a scan under JAX's profiler. From its trace are, for one update: the
 kernels and their time, of which matrix products, and the time in which no kernel ran. The multiplications and additions
-of matrix products are counted in the program as it is traced (two for each). Their share is of the chip's rate for the
+of matrix products and convolutions are counted in the program as it is traced (two for each). Their share is of the
 precision that products have by default (``--peak``, TFLOP/s; of an H200, 495 in TF32 without sparsity, by its data
 sheet).
 """
@@ -21,10 +22,12 @@ import jax
 from jax.extend.core import jaxprs_in_params
 from jax.profiler import ProfileData
 from report import markdown, publish, run_main
-from update_cost import AGENTS, Contestant
+from update_cost import AGENTS, Contestant, seeing
 
-# Parts of the names of kernels that multiply matrices: cuBLAS's, CUTLASS's and XLA's own by Triton.
-_PRODUCTS = ("gemm", "cutlass", "nvjet", "cublas")
+# Parts of the names of kernels that multiply matrices or convolve: cuBLAS's, cuDNN's, CUTLASS's and XLA's by Triton.
+_PRODUCTS = ("gemm", "cutlass", "nvjet", "cublas", "conv", "fprop", "dgrad", "wgrad")
+# Convolutions, and where their features are among the arrays that they take and give.
+_FEATURES = {"conv_general_dilated": 2, "conv_to_pictures": 0, "conv_to_filters": 1}
 
 
 def main() -> None:
@@ -34,6 +37,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--batch", type=int, default=128, help="transitions a task")
     parser.add_argument("--hidden", type=int, nargs="+", default=[400, 400, 400])
+    parser.add_argument("--pictures", type=int, help="the side of pictures that agents see in place of numbers")
     parser.add_argument("--updates", type=int, default=20, help="in the trace")
     parser.add_argument("--peak", type=float, default=495.0, help="TFLOP/s of the chip")
     parser.add_argument("--kernels", type=int, default=12, help="so many of the longest are printed")
@@ -52,7 +56,7 @@ def main() -> None:
 
 def trace(name: str, arguments: argparse.Namespace) -> dict:
     """Return the figures of one agent's update."""
-    contestant = Contestant(name, arguments, arguments.tasks, arguments.seeds)
+    contestant = Contestant(name, arguments, arguments.tasks, arguments.seeds, seeing(arguments.pictures))
     contestant.time()
     flops = matrix_flops(jax.make_jaxpr(contestant.learn)(contestant.state, contestant.keys)) / arguments.updates
     with tempfile.TemporaryDirectory() as folder:
@@ -78,9 +82,13 @@ def trace(name: str, arguments: argparse.Namespace) -> dict:
 
 
 def matrix_flops(program: Any) -> float:
-    """Count the multiplications and additions of matrix products in a traced program, with its loops."""
+    """Count the multiplications and additions of products and convolutions in a traced program, with its loops."""
     total = 0.0
     for equation in program.eqns:
+        name, given = equation.primitive.name, [*equation.invars, *equation.outvars]
+        if name in _FEATURES:
+            features = math.prod(given[_FEATURES[name]].aval.shape[:-1])
+            total += 2 * features * math.prod(equation.params["filters_shape"])
         if equation.primitive.name == "dot_general":
             (contracted, _), _ = equation.params["dimension_numbers"]
             depth = math.prod(equation.invars[0].aval.shape[i] for i in contracted)

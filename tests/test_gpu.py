@@ -152,6 +152,11 @@ def test_agents_learn_as_on_the_cpu(name, seeds):
     agent, states = learned(name, num_seeds, tasks)
     with on("cpu"):
         data, keys = experience(agent, num_seeds, num_tasks), jax.random.split(jax.random.key(1), num_seeds)
+    assert_learns_alike(agent, states, data, tasks, keys)
+
+
+def assert_learns_alike(agent, states, data, tasks, keys):
+    """Hold an update's metrics, and its gradients by what Adam remembers, on a GPU against those on the CPU."""
     update = lambda states, data, tasks, keys: jax.vmap(lambda s, d, k: agent.update(s, d, tasks, k))(
         states, data, keys
     )
@@ -163,8 +168,21 @@ def test_agents_learn_as_on_the_cpu(name, seeds):
     )
     for (path, one), other in leaves:
         if ".mu" in jax.tree_util.keystr(path) and one.size:
-            difference, size = (np.linalg.norm(x.reshape(num_seeds, -1), axis=1) for x in (one - other, one))
+            difference, size = (np.linalg.norm(x.reshape(len(keys), -1), axis=1) for x in (one - other, one))
             assert np.all(difference <= 0.05 * size + 1e-7), (jax.tree_util.keystr(path), difference / size)
+
+
+@pytest.mark.parametrize("vision", ["drq", "impala"])
+@pytest.mark.parametrize("name", ["drq", "sac-ae"])
+def test_agents_learn_from_pictures_as_on_the_cpu(name, vision):
+    """Three seeds, whose convolutions follow one another."""
+    agent = mtjax.agent(name, hidden=(64, 64), vision=vision)
+    spec = SPEC._replace(obs={"pixels": jax.ShapeDtypeStruct((SIZE, SIZE, 3), jnp.uint8)}, frames=3)
+    with on("cpu"):
+        tasks, keys = tasks_of("one-step", np.linspace(-1, 1, 2)), jax.random.split(jax.random.key(0), 3)
+        states = jax.device_get(jax.vmap(lambda key: agent.init(spec, tasks, key))(keys))
+        data = jax.tree.map(lambda *x: np.stack(x), *(random_batch(seed, 2, 8, spec) for seed in range(3)))
+    assert_learns_alike(agent, states, data, tasks, keys)
 
 
 def test_a_distribution_is_projected_in_a_kernel_of_its_own(rows=1280):

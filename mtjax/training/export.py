@@ -155,9 +155,5 @@ def _serialised(act: Callable, obs: Any, values: Any) -> np.ndarray:
     """Return the program for batches of any size, as bytes."""
     (size,) = jax.export.symbolic_shape("batch")
     batches = jax.tree.map(lambda x: jax.ShapeDtypeStruct((size, *x.shape), x.dtype), (obs, values))
-    write = lambda act: jax.export.export(jax.jit(act), platforms=_PLATFORMS)(*batches)
-    try:
-        exported = write(jax.vmap(act))
-    except NotImplementedError:  # a convolution takes one kernel, and here each task has its own
-        exported = write(lambda obs, values: jax.lax.map(lambda each: act(*each), (obs, values)))
+    exported = jax.export.export(jax.jit(jax.vmap(act)), platforms=_PLATFORMS)(*batches)
     return np.frombuffer(bytes(exported.serialize()), np.uint8)

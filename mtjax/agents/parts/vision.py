@@ -3,6 +3,7 @@
 Pictures are uint8, (..., H, W, K) for K channels of all stacked pictures. Networks see values in [-0.5, 0.5].
 """
 
+from functools import partial
 from typing import Any, Literal
 
 import flax.linen as nn
@@ -10,11 +11,13 @@ import jax
 import jax.numpy as jnp
 
 from mtjax import frames
+from mtjax.agents.parts.convolution import Transposed, convolve
 from mtjax.types import Array, Key
 
 Vision = Literal["drq", "impala"]
 _FILTERS = 32
 _SECTIONS = (16, 32, 32)  # IMPALA's channels
+_Conv = partial(nn.Conv, conv_general_dilated=convolve)
 _ORTHOGONAL = nn.initializers.orthogonal(2**0.5)
 
 
@@ -49,8 +52,7 @@ class Convolutions(nn.Module):
         """Map pictures (..., H, W, K) to features (..., F)."""
         x = as_numbers(pictures)
         for stride in (2, 1, 1, 1):
-            conv = nn.Conv(_FILTERS, (3, 3), (stride, stride), "VALID", kernel_init=orthogonal)
-            x = nn.relu(conv(x))
+            x = nn.relu(_Conv(_FILTERS, (3, 3), (stride, stride), "VALID", kernel_init=orthogonal)(x))
         return x.reshape(*x.shape[:-3], -1)
 
 
@@ -64,10 +66,10 @@ class Residual(nn.Module):
         lead = x.shape[:-3]
         x = x.reshape(-1, *x.shape[-3:])  # pooling takes one leading axis
         for filters in _SECTIONS:
-            x = nn.max_pool(nn.Conv(filters, (3, 3))(x), (3, 3), (2, 2), "SAME")
+            x = nn.max_pool(_Conv(filters, (3, 3))(x), (3, 3), (2, 2), "SAME")
             for _ in range(2):
-                inner = nn.Conv(filters, (3, 3))(nn.relu(x))
-                x = x + nn.Conv(filters, (3, 3))(nn.relu(inner))
+                inner = _Conv(filters, (3, 3))(nn.relu(x))
+                x = x + _Conv(filters, (3, 3))(nn.relu(inner))
         return nn.relu(x).reshape(*lead, -1)
 
 
@@ -114,9 +116,9 @@ class Decoder(nn.Module):
         """Map latent states (..., D) to pictures (..., H, W, K) of numbers in about [-0.5, 0.5]."""
         side = self.side // 2 - 1 - 6
         x = nn.relu(nn.Dense(side * side * _FILTERS)(latent)).reshape(*latent.shape[:-1], side, side, _FILTERS)
-        for _ in range(3):
-            x = nn.relu(nn.ConvTranspose(_FILTERS, (3, 3), padding="VALID")(x))
-        return nn.ConvTranspose(self.channels, (3, 3), (2, 2), padding=((2, 3), (2, 3)))(x)
+        for larger in (side + 2, side + 4, side + 6):
+            x = nn.relu(Transposed((larger, larger, _FILTERS))(x))
+        return Transposed((self.side, self.side, self.channels), stride=2)(x)
 
 
 def coarse(pictures: Array, key: Key) -> Array:
