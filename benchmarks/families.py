@@ -50,8 +50,10 @@ TRAINED = {  # family -> agent and steps
     "pendulum-spin": ("ppo", 10 * _M),
     "pendulum-swingup": ("brc", 3 * _M),
     "point-mass-easy": ("ppo", 10 * _M),
+    "two-goal-maze": ("drq", 4 * _M),
     "two-goal-maze-seen": ("ppo", 10 * _M),
 }
+SEEN = {"two-goal-maze": {"pixels": 64}}  # families that are learned from pictures, as nothing else tells the goal
 _LINES = 40
 
 
@@ -74,7 +76,7 @@ def main() -> None:
 
 def learn(name: str, agent: str, steps: int, folder: Path, seconds: float) -> None:
     """Train a family until it has made its steps or its time is over; keep the curve and the policy."""
-    run, program = folder / "run", mtjax.preset(name, agent)
+    run, program = folder / "run", mtjax.preset(name, agent, **SEEN.get(name, {}))
     result = train(
         run,
         program.family,
