@@ -318,7 +318,7 @@ def test_warp_compiles_all_kernels_of_a_step_before_it(monkeypatch, tmp_path):
     warp = pytest.importorskip("warp")
     from mujoco.mjx.third_party import mujoco_warp
 
-    from mtjax.envs.engines.kernels import compile_kernels
+    from mtjax.envs.engines.kernels import compile_kernels, note_kernels
     from mtjax.envs.engines.warp import Warp
 
     engine = Warp(envs.make("hopper-stand", engine="mjx").mjx.base, 1)
@@ -335,7 +335,7 @@ def test_warp_compiles_all_kernels_of_a_step_before_it(monkeypatch, tmp_path):
         mujoco_warp.step(place.model, place.data)
 
     qpos = place.data.qpos.numpy()
-    compile_kernels("cpu", launch)
+    compile_kernels("cpu", note_kernels("cpu", launch))
     assert (warp.Module.load, warp.capture_while) == before
     np.testing.assert_array_equal(elsewhere.numpy(), 1)
     np.testing.assert_array_equal(place.data.qpos.numpy(), qpos)
@@ -343,6 +343,27 @@ def test_warp_compiles_all_kernels_of_a_step_before_it(monkeypatch, tmp_path):
     mujoco_warp.step(place.model, place.data)
     assert len(loaded) > 20 and not any(loaded)
     assert np.all(place.data.time.numpy() > 0)
+
+
+def test_warp_compiles_kernels_while_programs_are_traced(monkeypatch):
+    """To note which kernels there are keeps others from making a place, but not from using one."""
+    pytest.importorskip("warp")
+    from mtjax.envs.engines import warp as engines
+
+    engine, compiled = engines.Warp(envs.make("hopper-stand", engine="mjx").mjx.base, 1), []
+    engine.provide(3, ())
+
+    def can_provide(count):
+        other = Thread(target=engine.provide, args=(count, ()), daemon=True)
+        other.start()
+        other.join(60)
+        return not other.is_alive()
+
+    monkeypatch.setattr(engines, "compile_kernels", lambda _, kernels: compiled.append((kernels, can_provide(4))))
+    engine.load_kernels()
+    assert compiled[0][1] and len(compiled[0][0]) > 20
+    with engines.ALONE:
+        assert can_provide(3)
 
 
 def test_warp_refuses_tasks_that_differ_in_the_size_of_sites():

@@ -155,9 +155,9 @@ def _number(name: str, value: Any) -> float:
         raise InputError(f"{name} is a number, and {value!r} is none") from None
 
 
-def seed_axis(points: Sequence[Point], seeds: Array) -> tuple[Array, dict[str, Array] | None]:
+def seed_axis(points: Sequence[Point], seeds: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray] | None]:
     """Return seeds (S,) and swept values (S,) by name for all points; without points, the seeds and None."""
     if not points:
         return seeds, None
     column = lambda name: np.repeat(np.asarray([point[name] for point in points], np.float32), len(seeds))
-    return jnp.tile(seeds, len(points)), {name: jnp.asarray(column(name)) for name in points[0]}
+    return np.tile(seeds, len(points)), {name: column(name) for name in points[0]}

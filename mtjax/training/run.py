@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
@@ -151,12 +150,13 @@ class _Run:
     on_evaluation: Callable[[Evaluations], None] | None = None
 
     @cached_property
-    def seed_axis(self) -> tuple[jax.Array, dict[str, jax.Array] | None]:
+    def seed_axis(self) -> tuple[np.ndarray, dict[str, np.ndarray] | None]:
         """Return the seeds (S,) of all points, and the swept values (S,) by name."""
-        return points.seed_axis(self.points, self.plan.seed + jnp.arange(self.plan.seeds))
+        first = self.plan.seed
+        return points.seed_axis(self.points, np.arange(first, first + self.plan.seeds, dtype=np.int32))
 
     @property
-    def seeds(self) -> jax.Array:
+    def seeds(self) -> np.ndarray:
         return self.seed_axis[0]
 
     def point(self, number: int) -> Point:

@@ -3,22 +3,31 @@
 import contextlib
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 _MOST_THREADS = 16
+Kernels = Iterable[tuple[Any, int]]  # modules, and the sizes of blocks for which they are compiled
 
 
-def compile_kernels(device: Any, launch: Callable[[], Any]) -> None:
-    """Compile or load all kernels that ``launch`` launches on a device of Warp. It computes nothing meanwhile."""
+def note_kernels(device: Any, launch: Callable[[], Any]) -> Kernels:
+    """Return the kernels that ``launch`` launches on a device of Warp. It computes nothing meanwhile.
+
+    Warp's choice of a device holds for all threads, so only one thread at a time may do this.
+    """
     import warp
 
     with warp.ScopedDevice(device), _only_noting(warp) as noted:
         launch()
+    return noted
+
+
+def compile_kernels(device: Any, kernels: Kernels) -> None:
+    """Compile or load kernels for a device of Warp, of which no other thread may do the same meanwhile."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     with ThreadPoolExecutor(min(_MOST_THREADS, cores)) as pool:
-        for done in [pool.submit(module.load, device, block_dim) for module, block_dim in noted]:
+        for done in [pool.submit(module.load, device, block_dim) for module, block_dim in kernels]:
             done.result()
 
 

@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 
 from mtjax.envs.engines.base import World, mjx_module, state_of
-from mtjax.envs.engines.kernels import compile_kernels
+from mtjax.envs.engines.kernels import compile_kernels, note_kernels
 from mtjax.envs.engines.mjx import INVOLVED, Mjx
 from mtjax.types import Array, InputError, Task
 
@@ -226,7 +226,10 @@ class Warp:
 
         A program that was traced in another process can then run in this one.
         """
-        key, devices = (count, tuple(names)), own_devices()
+        key = count, tuple(names)
+        if key in self._calls:  # also while another thread notes kernels
+            return self._calls[key].name
+        devices = own_devices()
         with ALONE:
             for device in devices:  # not while it runs, when Warp records and cannot make room
                 if (device.alias, count) not in self._places:
@@ -247,7 +250,8 @@ class Warp:
         counts = sorted(count for _, count in list(self._places))[:1]
         for count, device in itertools.product(counts, own_devices()):
             with ALONE:
-                compile_kernels(device, partial(mujoco_warp.step, *self._places[device.alias, count][:2]))
+                kernels = note_kernels(device, partial(mujoco_warp.step, *self._places[device.alias, count][:2]))
+            compile_kernels(device, kernels)  # meanwhile other threads make places and trace, which launches none
         return jax.default_backend() != "cpu"
 
     def _make_place(self, device: Any, count: int) -> _Place:

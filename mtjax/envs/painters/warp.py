@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mtjax.envs.engines.kernels import compile_kernels
+from mtjax.envs.engines.kernels import compile_kernels, note_kernels
 from mtjax.envs.engines.warp import ALONE, annotated, keep_streams, own_devices
 from mtjax.envs.painters.poses import Poses
 from mtjax.envs.painters.scene import GROUPS, Scene
@@ -138,8 +138,9 @@ class WarpPainter:
         from mujoco.mjx.third_party import mujoco_warp
 
         for (alias, _), place in list(self._places.items()):
-            with ALONE:
-                compile_kernels(alias, lambda place=place: (mujoco_warp.refit_bvh(*place), mujoco_warp.render(*place)))
+            with ALONE:  # to make a place launches some of them
+                draw = lambda place=place: (mujoco_warp.refit_bvh(*place), mujoco_warp.render(*place))
+                compile_kernels(alias, note_kernels(alias, draw))
         return jax.default_backend() != "cpu"
 
     def _make_place(self, device: Any, count: int) -> _Place:
