@@ -20,7 +20,9 @@ from mtjax.agents import AGENTS
 from mtjax.envs import BENCHMARKS, ENVS, members, outline, varied
 from mtjax.names import InputError, Notice, nearest_error
 
-_ALLOCATIONS = 10_000  # before Python looks for garbage. By its default a tenth of a start goes there, for nothing.
+# Python looks for garbage after so many allocations, and after so many of these looks among older objects too. By its
+# defaults a quarter of a start with Warp goes there, for nothing: imports and programs make objects that stay.
+_ALLOCATIONS, _LOOKS = 10_000, 100
 PRESETS = ("auto", "cpu", "gpu")
 _KNOWN = (("environment", "env", ENVS), ("agent", "agent", AGENTS), ("preset", "preset", PRESETS))
 _OVERVIEW = (  # titles, and the classes whose fields are flags of every run
@@ -39,7 +41,7 @@ P = TypeVar("P")
 
 def main(run: Any) -> None:
     """Run a command's entry point. A mistake of the user prints one line and exits with code 2."""
-    gc.set_threshold(_ALLOCATIONS)
+    gc.set_threshold(_ALLOCATIONS, _LOOKS)
     try:
         with _plain_notices():
             run(sys.argv[1:])
