@@ -25,6 +25,9 @@ def main(argv: Sequence[str]) -> None:
     if "--list" in words:
         print(commands.catalogue())
         return
+    load("mtjax.training.allocator:share_arenas")()  # before there are threads
+    if "--distributed" not in words:  # else all processes find their devices together
+        load("mtjax.parallel.hosts:find_devices")()
     load("mtjax.training.main:main")(argv, load("mtjax.cli:parse"))
 
 

@@ -6,13 +6,14 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from threading import Event
 
 import pytest
 from mujoco import mjx
 from probes import FEW, INSTALLED
 
 import mtjax
-from mtjax import cli, commands
+from mtjax import cli, commands, names, train
 from mtjax.agents import AGENTS
 from mtjax.config import with_preset
 from mtjax.envs import ENVS, fields, outline
@@ -97,6 +98,26 @@ def test_a_run_of_the_c_engine_imports_no_other(tmp_path):
     code, output, imported = run("mtjax.train", words, (*ENGINES, "mujoco"), tmp_path)
     assert code == 0 and "done in" in output
     assert imported == ["mujoco"]
+
+
+def test_devices_are_found_while_the_rest_is_imported(monkeypatch):
+    """A driver that takes long keeps nobody waiting who needs no device, and tells its errors to who needs one."""
+    asked, imported, answered, waited = Event(), Event(), Event(), []
+
+    def devices():
+        asked.set()
+        waited.append(imported.wait(60))
+        answered.set()
+        raise RuntimeError("no device")
+
+    def load(place):
+        rest = lambda *_: (asked.wait(60), imported.set())
+        return rest if place == "mtjax.training.main:main" else names.load(place)
+
+    monkeypatch.setattr("jax.devices", devices)
+    monkeypatch.setattr(train, "load", load)
+    train.main(["--env=finger-spin"])
+    assert answered.wait(60) and waited == [True]
 
 
 @pytest.mark.parametrize("env, agent", [(env, "sac") for env in FEW] + [("finger-spin", agent) for agent in AGENTS])

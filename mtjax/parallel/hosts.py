@@ -1,8 +1,10 @@
 """Several processes of one run, on one host or on many, joined by ``jax.distributed``."""
 
+import contextlib
 import os
 from collections.abc import Callable
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import jax
@@ -20,6 +22,16 @@ _LAUNCHERS = (
 )  # variables of launchers that JAX recognises
 _LONGEST_PATH = 4096
 _PATIENCE = 60  # seconds that a process waits for the others at its end before it stops them
+
+
+def find_devices() -> None:
+    """Let JAX find the devices of a single process in a thread. Drivers take long, and Python imports meanwhile."""
+
+    def find() -> None:
+        with contextlib.suppress(RuntimeError):  # which the first to ask for a device meets again
+            jax.devices()
+
+    Thread(target=find, name="devices").start()
 
 
 def initialise() -> None:

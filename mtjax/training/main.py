@@ -10,7 +10,7 @@ from mtjax.config import RunConfig, import_flags
 from mtjax.envs.pixels import Pictured
 from mtjax.parallel import hosts
 from mtjax.report.tables import split_table
-from mtjax.training import allocator, checkpoint, lock, memory, sweep
+from mtjax.training import checkpoint, lock, memory, sweep
 from mtjax.training.console import duration
 from mtjax.training.folder import new_directory, record_steps, resumed_config, short_name, write_config
 from mtjax.training.launch import check, draw, launch, load_start
@@ -21,7 +21,6 @@ from mtjax.types import InputError
 
 def main(argv: Sequence[str], parse: Callable[[Sequence[str]], RunConfig]) -> None:
     """Start or resume a run or a sweep. ``parse`` reads the command line."""
-    allocator.share_arenas()
     if "--distributed" in argv:
         hosts.initialise()  # before anything looks at the devices
     if sweep.is_sweep(argv):
