@@ -14,6 +14,7 @@ from mtjax.commands import (
     imports_of,
     parse_with_tyro,
     split_flags,
+    switched_off,
     unknown_flag,
     vary_flags,
 )
@@ -89,8 +90,8 @@ def _peel_parts(argv: Sequence[str]) -> tuple[dict[str, str], list[str]]:
 def _peel_shared(argv: Sequence[str], mixture: Mixture) -> tuple[dict[str, Any], list[str]]:
     """Take the flags that hold for every family of a mixture out of a command line, and read their values."""
     fields = {f.name: (f.type, getattr(family, f.name)) for family in mixture.families for f in shared_fields(family)}
-    known = {_family_flag(name): name for name in fields}
-    known |= {_negated(flag): name for flag, name in known.items()}
+    known = {family_flag(name): name for name in fields}
+    known |= {switched_off(flag): name for flag, name in known.items()}
     given, words, rest = {}, [], []
     name = None
     for word in argv:
@@ -113,51 +114,41 @@ def shared_fields(family: Family) -> list[dataclasses.Field]:
     return [field for field in dataclasses.fields(family) if field.name not in ("vary", "context_ranges")]
 
 
-def _family_flag(name: str) -> str:
+def family_flag(name: str) -> str:
+    """Return the command-line flag of a family's field."""
     flag = name.replace("_", "-")
     return f"--{flag}" if flag in ("split", "engine") else f"--env.{flag}"
 
 
-def _negated(flag: str) -> str:
-    group, dot, name = flag.removeprefix("--").rpartition(".")
-    return f"--{group}{dot}no-{name}"
-
-
-def flags(config: Any, prefix: str = "--") -> list[str]:
-    """Return every flag of a configuration."""
-    names = []
+def flags(config: Any, prefix: str = "--") -> dict[str, bool]:
+    """Return every flag of a configuration, and whether it is a switch."""
+    found: dict[str, bool] = {}
     for field in dataclasses.fields(config):
         value, name = getattr(config, field.name), field.name.replace("_", "-")
-        if name in (
-            "vary",
-            "context-ranges",
-            "points",
-            "imports",
-        ):  # a flag for each parameter, taken out before; and no flags
+        if name in _NO_FLAGS:
             continue
         if name == "learner":
-            names += [f"--{flag}" for flag in flag_names(value).values()]
+            found |= {f"--{flag}": isinstance(settings(value)[name], bool) for name, flag in flag_names(value).items()}
             continue
         if isinstance(value, Mixture):
-            shared = ["scenes", *(f.name for family in value.families for f in shared_fields(family))]
-            names += [_family_flag(each) for each in dict.fromkeys(shared)]
+            shared = {f.name: getattr(family, f.name) for family in value.families for f in shared_fields(family)}
+            found |= {family_flag(each): isinstance(x, bool) for each, x in {"scenes": "", **shared}.items()}
             continue
         group = {"plan": "--", "training": "--", "family": "--env."}.get(field.name)
         if group is not None:
-            names += flags(value, group)
+            found |= flags(value, group)
         else:
             name = "from" if name == "start" else name
-            names.append(f"--{name}" if name in ("split", "engine") else f"{prefix}{name}")
-    return names
+            found[f"--{name}" if name in ("split", "engine") else f"{prefix}{name}"] = isinstance(value, bool)
+    return found
 
 
 def _check_flags(argv: Sequence[str], config: RunConfig) -> None:
-    known = flags(config)
-    known += [flag.replace("--", "--no-", 1) for flag in known]
-    known += ["".join((*flag.rpartition(".")[:2], "no-", flag.rpartition(".")[2])) for flag in known if "." in flag]
+    known = {**flags(config), "--help": False, "--import": False}
+    allowed = {*known, *map(switched_off, known)}  # what is no switch is refused by name when it is parsed
     for word in argv:
         flag = word.split("=", 1)[0].replace("_", "-")
-        if flag.startswith("--") and flag not in (*known, "--help"):
+        if flag.startswith("--") and flag not in allowed:
             require_pictures(config.env, flag.removeprefix("--env."))
             name = flag.removeprefix("--").removeprefix("agent.").replace("-", "_")
             if found := owners(name, "--agent.{}={}"):

@@ -2,6 +2,7 @@
 
 import ast
 import contextlib
+import difflib
 import gc
 import importlib.util
 import io
@@ -11,12 +12,12 @@ import sys
 import textwrap
 import traceback
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 from mtjax import shipped
-from mtjax.agents import AGENTS
+from mtjax.agents import AGENTS, CHOICES
 from mtjax.envs import BENCHMARKS, ENVS, members, outline, varied
 from mtjax.names import InputError, Notice, nearest_error
 
@@ -35,7 +36,11 @@ _MAY_CHANGE = {  # the only flags beside --resume
 }
 _VARY = "--env.vary."
 _LONGEST = 600  # letters of a message
-_FIELD = re.compile(r"^    (\w+): ", re.MULTILINE)  # a line of a class that may be a setting
+_SETTING = re.compile(  # the name and type of a class's setting, which has a default and a documentation
+    r'^    ([a-z]\w*): (?!ClassVar|.*Suppress)(.+) = .+\n    """', re.MULTILINE
+)
+_HOMES = {"config.py": "--", "loop.py": "--", "envs": "--env.", "agents": "--agent.", "experience": "--agent."}
+_UNPREFIXED = ("prefix_name=False", "_FLAG")  # in the types of settings whose flags are in no group
 P = TypeVar("P")
 
 
@@ -120,7 +125,7 @@ def _fields(file: str, cls: str) -> Iterator[tuple[str, str, str, str]]:
     body = next(node.body for node in tree.body if isinstance(node, ast.ClassDef) and node.name == cls)
     for field, text in itertools.pairwise(body):
         if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
-            flag = ast.unparse(field.target).replace("_", "-").replace("start", "from")
+            flag = _as_flag(ast.unparse(field.target))
             default = ast.literal_eval(field.value) if field.value is not None else ""
             plain = isinstance(default, bool) or default in ("", ())
             says = " ".join(str(text.value.value).split())
@@ -176,21 +181,57 @@ def check_flags(argv: Sequence[str]) -> None:
     places = (*(place for place, _ in ENVS.data.values()), *(preset.place for preset in AGENTS.values()))
     if not all(isinstance(place, str) for place in places):  # the user's own classes have further settings
         return
-    files = Path(__file__).parent.rglob("*.py")  # read as text, because importing the classes would import JAX
-    fields = itertools.chain.from_iterable(_FIELD.findall(file.read_text(encoding="utf-8")) for file in files)
-    known = {*(field.replace("_", "-") for field in fields), "from", "help"}
+    known = all_flags()
     for word in argv:
         flag = word.split("=", 1)[0].replace("_", "-")
-        group, name = re.fullmatch(r"(--(?:\w+\.)*)?(.*)", flag, re.DOTALL).groups("")  # type: ignore
-        if group and not flag.startswith("--env.vary.") and not {name, name.removeprefix("no-")} & known:
-            raise unknown_flag(flag, [group + other for other in sorted(known)])
+        if flag.startswith("--") and not flag.startswith(_VARY) and not {flag, _switched_on(flag)} & known.keys():
+            raise unknown_flag(flag, known)
 
 
-def unknown_flag(flag: str, known: Iterable[str]) -> InputError:
-    """Return an error for an unknown flag. It names the nearest flag and points to --help for the rest."""
+def all_flags() -> dict[str, bool]:
+    """Return every flag that some family or agent has, and whether it is a switch.
+
+    They are read from the classes' source, because importing the classes would import JAX.
+    """
+    found = {"--help": False, "--import": False, **{f"--agent.{kind}": False for kind in CHOICES}}
+    for home, group in _HOMES.items():
+        place = Path(__file__).parent / home
+        for file in [place] if place.is_file() else place.rglob("*.py"):
+            for name, kind in _SETTING.findall(file.read_text(encoding="utf-8")):
+                prefix = "--" if any(mark in kind for mark in _UNPREFIXED) else group
+                found[prefix + _as_flag(name)] = kind == "bool"
+    return found
+
+
+def _as_flag(name: str) -> str:
+    """Return the flag, without dashes and group, of a field."""
+    return "from" if name == "start" else name.replace("_", "-")
+
+
+def _switched_on(flag: str) -> str:
+    """Return the flag that --no-NAME or --GROUP.no-NAME switches off."""
+    return re.sub(r"^(--(?:[\w-]+\.)*)no-", r"\1", flag)
+
+
+def switched_off(flag: str) -> str:
+    """Return the flag that switches off --NAME or --GROUP.NAME."""
+    return re.sub(r"^(--(?:[\w-]+\.)*)", r"\1no-", flag)
+
+
+def unknown_flag(flag: str, known: Mapping[str, bool]) -> InputError:
+    """Return an error for an unknown flag. It names the nearest flag and points to --help for the rest.
+
+    Args:
+        known: all flags, and whether each is a switch.
+    """
     if flag == _VARY.removesuffix("."):
         return InputError(f"{flag} needs the name of a parameter: {_VARY}NAME=VALUES; --list says what varies")
-    return InputError(str(nearest_error("flag", flag, known)).split("choose from")[0] + "--help lists the flags")
+    every = sorted([*known, *(switched_off(other) for other, is_switch in known.items() if is_switch)])
+    end = re.sub(r"^--([\w-]+\.)*", "-", flag)
+    same_end = [other for other in every if other.replace(".", "-").endswith(end)]  # the name is right, or its end
+    near = difflib.get_close_matches(flag, same_end, 1, 0) or difflib.get_close_matches(flag, every, 1)
+    hint = f"did you mean {near[0]!r}? " if near else ""
+    return InputError(f"unknown flag {flag!r}; {hint}--help lists the flags")
 
 
 def require_run(folder: Path) -> None:

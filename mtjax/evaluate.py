@@ -57,7 +57,7 @@ def _parse(argv: Sequence[str]) -> tuple[Request, dict[str, str]]:
     known = [*(f"--{name}" for name in names), "--no-video", "--no-diagnostics", "--help", "-h"]
     for word in argv:
         if word.startswith("--") and word.split("=")[0].replace("_", "-") not in known:
-            raise nearest_error("flag", word.split("=")[0], [*known, "--env.vary.NAME"])
+            raise nearest_error("flag", word.split("=")[0], [*known, "--env.vary.NAME", "--import"])
     request = commands.parse_with_tyro(Request, argv, Request(), "python -m mtjax.evaluate")
     if not request.run:
         raise InputError("say which run to evaluate: --run=DIR")

@@ -35,7 +35,7 @@ def main(argv: Sequence[str]) -> None:
     known = [*(f"--{f.name}" for f in dataclasses.fields(Request)), "--help", "-h"]
     for word in argv:
         if word.startswith("-") and word.split("=")[0] not in known:
-            raise nearest_error("flag", word.split("=")[0], known)
+            raise nearest_error("flag", word.split("=")[0], [*known, "--import"])
     runs, flags = _apart(argv)
     request = commands.parse_with_tyro(Request, flags, Request(), "python -m mtjax.plot RUN ...")
     if not runs:

@@ -296,6 +296,11 @@ def test_list_names_every_family_and_agent(capsys):
         ("--agent carr", "unknown agent 'carr'; did you mean 'care'?"),
         ("--preset=gpus", "unknown preset 'gpus'; did you mean 'gpu'?"),
         ("--num-env=3", "unknown flag '--num-env'; did you mean '--num-envs'?"),
+        ("--nam=x", "unknown flag '--nam'; did you mean '--env'?"),
+        ("--lr=3", "unknown flag '--lr'; did you mean '--agent.actor-lr'?"),
+        ("--agent.steps=3", "unknown flag '--agent.steps'; did you mean '--steps'?"),
+        ("--no-stager", "unknown flag '--no-stager'; did you mean '--no-stagger'?"),
+        ("--foo.bar=2", "unknown flag '--foo.bar'; --help lists the flags"),
         (
             "--agent.num-experts=3 --agent=sac",
             "'--agent.num-experts' of sac; it belongs to --agent.encoder=care, --agent.en",

@@ -1,6 +1,8 @@
 """What each command imports: answers that need names alone come without JAX, and MuJoCo C without the other engines."""
 
+import contextlib
 import dataclasses
+import itertools
 import json
 import os
 import subprocess
@@ -14,7 +16,8 @@ from probes import FEW, INSTALLED
 
 import mtjax
 from mtjax import cli, commands, names, train
-from mtjax.agents import AGENTS
+from mtjax.agents import AGENTS, CHOICES, PARTS, settings
+from mtjax.agents.choices import flag_names
 from mtjax.config import with_preset
 from mtjax.envs import ENVS, fields, outline
 from mtjax.envs.brax import NAMES
@@ -125,6 +128,30 @@ def test_no_flag_is_refused_that_there_is(env, agent, ours):
     """Of any family or agent, before either is known."""
     flags = cli.flags(with_preset(env, agent, "cpu"))
     commands.check_flags([*flags, *(f"{flag}=1" for flag in flags)])
+
+
+def test_flags_of_all_families_and_agents_are_known_without_jax(ours):
+    """All of them and no other name, with which of them are switches: what is misspelt is answered with a flag."""
+    choices = [{kind: name} for kind in CHOICES for name in PARTS[kind]]
+    real = {"--help": False, "--import": False} | {f"--agent.{kind}": False for kind in CHOICES}
+    real |= cli.flags(mtjax.preset("cartpole-swingup+finger-spin", "sac"))
+    for cls in {cls for cls, _ in ENVS.values()}:
+        fields = cli.shared_fields(cls)
+        real |= {cli.family_flag(field.name): isinstance(field.default, bool) for field in fields}
+    for agent, given in itertools.product(("sac", "distral", "brc", "simba-v2", "xqc", "ppo"), [{}, *choices]):
+        with contextlib.suppress(InputError):  # which this agent does not go with
+            made = mtjax.agent(agent, **given)
+            real |= {f"--{flag}": isinstance(settings(made)[name], bool) for name, flag in flag_names(made).items()}
+    assert commands.all_flags() == real
+
+
+@pytest.mark.parametrize(
+    "given, meant", [("--nam=x", "--env"), ("--no-stager", "--no-stagger"), ("--tau=1", "--agent.tau")]
+)
+def test_an_unknown_flag_is_answered_with_a_real_one(ours, given, meant):
+    """Other names in the classes' source are no flags."""
+    with pytest.raises(InputError, match=f"did you mean '{meant}'"):
+        commands.check_flags([given])
 
 
 def test_no_way_to_write_a_flag_is_refused(ours):

@@ -28,6 +28,9 @@ class Preset(NamedTuple):
         return load(self.place)
 
 
+CHOICES = ("representation", "encoder", "gradients", "value", "scaling", "sampler")
+"""The kinds of parts that a user chooses by name, as --agent.KIND=NAME."""
+
 _PARAMS = {"conditioning": "parameters"}
 
 AGENTS: dict[str, Preset] = {
@@ -109,4 +112,4 @@ def name_of(agent: Any) -> str:
     return max(found, key=lambda name: len(presets[name].defaults), default=next(iter(presets), cls.__name__))
 
 
-__all__ = ["AGENTS", "PARTS", "SAC", "BaseAgent", "Preset", "agent", "name_of", "preset_of", "settings"]
+__all__ = ["AGENTS", "CHOICES", "PARTS", "SAC", "BaseAgent", "Preset", "agent", "name_of", "preset_of", "settings"]

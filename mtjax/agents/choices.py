@@ -6,7 +6,7 @@ from typing import Any, get_type_hints
 
 import tyro
 
-from mtjax.agents import parts
+from mtjax.agents import CHOICES, parts
 from mtjax.agents.parts.encoders import ENCODERS
 from mtjax.agents.parts.gradients import surgery
 from mtjax.agents.parts.representations import REPRESENTATIONS
@@ -24,10 +24,8 @@ PARTS: dict[str, Mapping[str, type]] = {
     "value": VALUES,
     "scaling": SCALINGS,
     "sampler": SAMPLERS,
-    "experience": EXPERIENCES,
+    "experience": EXPERIENCES,  # follows from the agent; all others are choices
 }
-CHOICES = tuple(kind for kind in PARTS if kind != "experience")
-"""The kinds of parts that a user chooses by name; the kind of experience follows from the agent."""
 FLAT = tyro.conf.arg(name="")  # a part's fields become flags of the agent; the part is chosen before tyro parses
 
 
