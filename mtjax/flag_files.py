@@ -1,5 +1,8 @@
 """Flags of a command line from a TOML file: ``--config=FILE.toml``, or ``--quick`` for the file of this package."""
 
+import contextlib
+import itertools
+import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -24,16 +27,45 @@ def expand(argv: Sequence[str]) -> list[str]:
     Raises:
         InputError: there is no such file, or it cannot be read.
     """
-    given, rest, words = [], [], iter(argv)
+    given, rest = _apart(argv)
+    return [*itertools.chain(*given.values()), *rest]
+
+
+@contextlib.contextmanager
+def naming(argv: Sequence[str]) -> Iterator[None]:
+    """Name the file in errors about a flag or value that comes from a file of a command line."""
+    try:
+        yield
+    except InputError as error:
+        (given, rest), message = _apart(argv), str(error)
+        file = next((file for file, words in given.items() if _is_about(message, words)), None)
+        if file is None or _is_about(message, rest):
+            raise
+        raise InputError(f"{file}: {message}") from None
+
+
+def _is_about(message: str, words: Sequence[str]) -> bool:
+    """Return whether a message names a flag of a command line with its dashes, or its value, or begins with it."""
+    for flag, _, value in (word.partition("=") for word in words if word.startswith("--")):
+        begins = message.startswith(f"{flag.removeprefix('--').rpartition('.')[2]} ")
+        if begins or re.search(rf"{re.escape(flag)}(?![\w.-])", message) or (value and repr(value) in message):
+            return True
+    return False
+
+
+def _apart(argv: Sequence[str]) -> tuple[dict[str, list[str]], list[str]]:
+    """Return the flags of every file, by how a message calls the file, and the other words of a command line."""
+    given, rest, words = {}, [], iter(argv)
     for word in words:
         flag, equals, value = word.partition("=")
         if word == "--quick":
-            given += _read(str(_QUICK))
+            given[word] = _read(str(_QUICK))
         elif flag == "--config":
-            given += _read(value if equals else next(words, ""))
+            file = value if equals else next(words, "")
+            given[repr(file)] = _read(file)
         else:
             rest.append(word)
-    return [*given, *rest]
+    return given, rest
 
 
 def _read(file: str) -> list[str]:

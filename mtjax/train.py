@@ -14,7 +14,12 @@ if TYPE_CHECKING:
 
 def main(argv: Sequence[str]) -> None:
     """Check names and flags first, then import the training code and run the command line."""
-    argv = flag_files.expand(argv)
+    flags = flag_files.expand(argv)
+    with flag_files.naming(argv):
+        _run(flags)
+
+
+def _run(argv: Sequence[str]) -> None:
     words = commands.import_files(argv)
     commands.check_names(words)
     if len(words) == len(argv):  # else the full parser checks the flags of the user's own classes

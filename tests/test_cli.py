@@ -632,12 +632,25 @@ def test_the_quick_start_is_a_file_of_flags():
         ("steps = 2020-01-01", "gives steps a value that no flag takes"),
         ("steps = 1.5", "--steps must be a whole number, not '1.5'"),
         ('[agent]\nname = "care"\nnum-expert = 3', "did you mean '--agent.num-experts'?"),
+        ('agent = "carr"', "unknown agent 'carr'"),
+        ("[env]\npixels = -1", "pixels"),
+        ("[agent]\ngamma = 1.5", "gamma must be in [0, 1]"),
+        ('[env.vary]\nsize = "a"', "cannot read the values 'a' of size"),
     ],
 )
 def test_wrong_files_of_flags_are_refused(text, said, complaint, tmp_path):
-    """In a line, like a command line."""
+    """In a line that names the file, like a command line."""
     (tmp_path / "x.toml").write_text(text)
-    assert said in complaint("train", f"--config={tmp_path / 'x.toml'}")
+    told = complaint("train", f"--config={tmp_path / 'x.toml'}")
+    assert said in told and told.count("x.toml'") == 1
+
+
+def test_what_is_wrong_beside_a_file_of_flags_is_not_the_files(complaint, tmp_path):
+    """Nor is what the command line gives in place of the file's. A switch for the package's file is named itself."""
+    (tmp_path / "x.toml").write_text("steps = 5\nseeds = 0")
+    for words in (["--stepz=3"], ["--agent=carr"], ["--seeds=-1"]):
+        assert "x.toml" not in complaint("train", "--config=x.toml", *words)
+    assert complaint("train", "--quick", "--agent=ppo").startswith("error: --quick: unknown flag '--")
 
 
 def test_a_missing_file_of_flags_is_refused(complaint):
