@@ -18,7 +18,8 @@ class Request:
     """
 
     run: str = ""
-    """The run's folder, or the name of a trained policy that comes with the package: --list of mtjax.train has them."""
+    """The run's folder, in which a new folder takes returns and a plot. Or the name of a trained policy that comes with
+    the package, as --list of mtjax.train shows: then nothing is written, except with --video into a folder in runs/."""
     point: int = 0
     """Number of the setting in sweep.csv, if the run holds several settings of a sweep."""
     episodes: int = 10

@@ -15,6 +15,7 @@ import mtjax
 import mtjax.evaluate
 from mtjax import agents, shipped
 from mtjax.cli import parse
+from mtjax.report import films
 from mtjax.report.scoring import score
 from mtjax.training import ship
 from mtjax.types import InputError
@@ -45,7 +46,7 @@ def package(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_a_policy_is_shipped_and_acts_as_its_run(copied_run, package, tmp_path, monkeypatch, capsys):
-    """By its name, in Python and on the command line, which writes nothing into the package."""
+    """By its name, in Python and on the command line, which writes nothing but what goes with a film."""
     ship.main([str(copied_run), "finger-spin/care"])
     assert shipped.names() == ["finger-spin/care"]
     ours, theirs = mtjax.load("finger-spin/care"), mtjax.load(copied_run)
@@ -54,6 +55,9 @@ def test_a_policy_is_shipped_and_acts_as_its_run(copied_run, package, tmp_path, 
     np.testing.assert_array_equal(jax.vmap(ours)(obs, tasks), jax.vmap(theirs)(obs, tasks))
     monkeypatch.chdir(tmp_path)
     mtjax.evaluate.main(["--run=finger-spin/care", "--episodes=1"])
+    assert not (tmp_path / "runs").exists()
+    monkeypatch.setattr(films, "write", lambda *_: None)
+    mtjax.evaluate.main(["--run=finger-spin/care", "--episodes=1", "--video"])
     assert (tmp_path / "runs/finger-spin-care/evaluation-1/returns.csv").is_file()
     assert sorted(file.name for file in (package / "finger-spin/care").iterdir()) == ["config.json", "policy.npz"]
     with pytest.raises(InputError, match="is a policy alone"):

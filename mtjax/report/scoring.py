@@ -27,6 +27,8 @@ _FIRST_NUMBER = 1_000_000  # beyond the numbers of a run's own evaluations, so t
 def report(request: Any, vary: Mapping[str, str]) -> None:
     """Score a run, print the table, and write table, plot and film into a new folder inside the run's folder.
 
+    Of a policy that comes with the package the table is printed. The rest is only written beside a film, into runs/.
+
     Args:
         request: the settings of ``mtjax.evaluate``.
         vary: values of parameters for tasks of its own, by name; without any, the run's tasks are scored.
@@ -53,6 +55,8 @@ def report(request: Any, vary: Mapping[str, str]) -> None:
     print(task_table(policy, scores, named), flush=True)
     if policy.agent.unseen:
         print(f"unseen tasks: {policy.agent.unseen}")
+    if shipped.is_shipped(shipped.folder(run)) and not chosen:
+        return
     directory = _new_folder(_place(run))  # only now, as the run may be in a folder that others own
     _write(policy, {named.get(split, split): x for split, x in scores.items()}, directory, named)
     if found is not None:
