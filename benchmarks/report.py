@@ -15,8 +15,8 @@ import jax
 import mujoco
 
 import mtjax
+from mtjax.names import InputError, NoRoomError
 from mtjax.training.log import append_rows
-from mtjax.types import InputError
 
 
 def run_main(main: Callable[[], None]) -> None:
@@ -24,6 +24,8 @@ def run_main(main: Callable[[], None]) -> None:
     try:
         main()
     except (InputError, FileExistsError, NotADirectoryError) as error:
+        if isinstance(error, NoRoomError):
+            error.place = "--out"
         raise SystemExit(f"error: {error}") from None
 
 

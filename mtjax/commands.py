@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 from mtjax import shipped
 from mtjax.agents import AGENTS, CHOICES
 from mtjax.envs import BENCHMARKS, ENVS, members, outline, varied
-from mtjax.names import InputError, Notice, nearest_error
+from mtjax.names import InputError, NoRoomError, Notice, nearest_error
 
 # Python looks for garbage after so many allocations, and after so many of these looks among older objects too. By its
 # defaults a quarter of a start with Warp goes there, for nothing: imports and programs make objects that stay.
@@ -51,6 +51,8 @@ def main(run: Any) -> None:
         with _plain_notices():
             run(sys.argv[1:])
     except InputError as error:
+        if isinstance(error, NoRoomError):
+            error.place = "--runs"
         print(f"error: {one_line(error)}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:

@@ -39,9 +39,9 @@ def naming(argv: Sequence[str]) -> Iterator[None]:
     except InputError as error:
         (given, rest), message = _apart(argv), str(error)
         file = next((file for file, words in given.items() if _is_about(message, words)), None)
-        if file is None or _is_about(message, rest):
-            raise
-        raise InputError(f"{file}: {message}") from None
+        if file is not None and not _is_about(message, rest):
+            error.args = (f"{file}: {error.args[0]}",)
+        raise
 
 
 def _is_about(message: str, words: Sequence[str]) -> bool:

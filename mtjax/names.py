@@ -21,6 +21,16 @@ class InputError(ValueError):
     """The user gave something that cannot be used. The message says what was given and what is allowed."""
 
 
+class NoRoomError(InputError):
+    """A disk has no room for a new run. The message ends with what takes another place."""
+
+    place = "directory"
+    """The argument of ``mtjax.train``; commands put their flag here."""
+
+    def __str__(self) -> str:
+        return f"{super().__str__()} or choose another place with {self.place}"
+
+
 class Notice(UserWarning):
     """Something was amiss, and the command went on. The message says how."""
 

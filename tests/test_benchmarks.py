@@ -20,6 +20,7 @@ import mtjax
 from mtjax.envs import BENCHMARKS
 from mtjax.envs.metaworld.names import TASKS
 from mtjax.evaluation import Evaluations, load_evaluations, save_evaluations
+from mtjax.names import NoRoomError
 from mtjax.training.console import Console
 from mtjax.training.log import append_rows
 from mtjax.training.records import Records
@@ -397,6 +398,16 @@ def test_a_curve_is_thinned_to_its_last_line(script):
     found = script("families").curve("pendulum-swingup", "ppo", metrics)
     assert [x["seconds"] for x in found] == list(range(3, 100, 3))
     assert found[-1] == dict(family="pendulum-swingup", agent="ppo", seconds=99, steps=990, **{"return": "99.0"})
+
+
+def test_a_full_disk_is_told_with_the_flag_of_benchmarks(script):
+    """Their folders are those of --out."""
+
+    def main():
+        raise NoRoomError("too little is free; lower --replay-size")
+
+    with pytest.raises(SystemExit, match=r"error: too little is free; lower --replay-size or .* place with --out$"):
+        script("report").run_main(main)
 
 
 @pytest.mark.slow

@@ -286,5 +286,17 @@ def test_space_is_for_one_more_than_is_kept(tmp_path, monkeypatch):
     monkeypatch.setattr("shutil.disk_usage", lambda _: usage._replace(free=3000))
     checkpoint.require_space(tmp_path, state)
     monkeypatch.setattr("shutil.disk_usage", lambda _: usage._replace(free=2999))
-    with pytest.raises(InputError, match="free"):
+    with pytest.raises(InputError, match=r"free; lower --replay-size or choose another place with directory$"):
         checkpoint.require_space(tmp_path, state)
+
+
+def test_a_run_to_resume_needs_no_space_for_what_it_has(tmp_path, monkeypatch):
+    """Where that is not enough, neither its settings nor its place can change."""
+    usage = shutil.disk_usage(tmp_path)
+    (tmp_path / "checkpoints" / "25").mkdir(parents=True)
+    (tmp_path / "checkpoints" / "25" / "data").write_bytes(bytes(2000))
+    monkeypatch.setattr("shutil.disk_usage", lambda _: usage._replace(free=1000))
+    checkpoint.require_space(tmp_path, np.zeros(1000, np.int8))
+    with pytest.raises(InputError, match="free; make room there") as caught:
+        checkpoint.require_space(tmp_path, np.zeros(1001, np.int8))
+    assert "choose" not in str(caught.value)

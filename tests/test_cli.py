@@ -503,7 +503,13 @@ def test_full_disk_is_refused(complaint, tmp_path, monkeypatch):
     """A run that cannot be kept is not begun."""
     usage = shutil.disk_usage(tmp_path)._replace(free=0)
     monkeypatch.setattr("shutil.disk_usage", lambda _: usage)
-    assert "MB free" in complaint("train", *SHORT_RUN, "--runs=runs")
+    said = complaint("train", *SHORT_RUN, "--runs=runs")
+    assert "MB free; lower --replay-size or choose another place with --runs" in said
+    of_ppo = complaint("train", "--env=finger-short", "--agent=ppo", "--agent.hidden=8", "--num-envs=2")
+    assert "lower --num-envs or choose" in of_ppo
+    (tmp_path / "x.toml").write_text("replay-size = 200")
+    words = [word for word in SHORT_RUN if not word.startswith("--replay-size")]
+    assert "choose another place with --runs" in complaint("train", *words, "--config=x.toml")
     assert not list(tmp_path.glob("runs/*/metrics.csv"))
 
 

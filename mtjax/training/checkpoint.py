@@ -13,7 +13,7 @@ import logging
 import os
 import re
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ import jax
 
 from mtjax.experience.ring import Ring
 from mtjax.loop import TrainState
-from mtjax.names import notice
+from mtjax.names import NoRoomError, notice
 from mtjax.parallel import hosts
 from mtjax.training.folder import tell_edits
 from mtjax.types import InputError
@@ -308,15 +308,22 @@ def size_of(state: Any) -> int:
     return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(state))
 
 
-def require_space(directory: Path, state: Any, beside: int = 0) -> None:
+def require_space(directory: Path, state: Any, beside: int = 0, larger: Sequence[str] = ("replay-size",)) -> None:
     """Check that the disk has room for the checkpoints of a run, and for so many bytes ``beside`` them.
 
+    Args:
+        directory: the run's folder. What a run to resume has there already needs no further room.
+        larger: the settings that make a run's state large.
+
     Raises:
-        InputError: it has too little.
+        InputError: it has too little; for a new run a ``NoRoomError``.
     """
-    needed, free = (_KEPT + 1) * size_of(state) + beside, shutil.disk_usage(directory).free
-    if needed > free:
-        raise InputError(
-            f"checkpoints need {needed / 1e6:,.1f} MB and {str(directory)!r} has {free / 1e6:,.1f} MB free; "
-            f"lower --replay-size{' and --host-replay-size' if beside else ''} or choose another place with --runs"
-        )
+    files = (file for part in ("checkpoints", "store") for file in (directory / part).rglob("*"))
+    held = sum(file.stat().st_size for file in files if file.is_file())
+    needed, free = (_KEPT + 1) * size_of(state) + beside - held, shutil.disk_usage(directory).free
+    if needed <= free:
+        return
+    told = f"checkpoints need {needed / 1e6:,.1f} MB and {str(directory)!r} has {free / 1e6:,.1f} MB free; "
+    if held:
+        raise InputError(f"{told}make room there, as the run goes on with the settings it had")
+    raise NoRoomError(f"{told}lower {' and '.join(f'--{name}' for name in larger)}")

@@ -240,7 +240,9 @@ class _Run:
         if line := meshes.describe(self.mesh, len(self.seeds), self.settings.num_envs):
             self.console.say(line)
         if self.directory is not None:
-            checkpoint.require_space(self.directory, shapes, needs.host)
+            larger = [name for name in ("replay_size", "host_replay_size") if getattr(self.agent.experience, name, 0)]
+            flags = [name.replace("_", "-") for name in larger or ["num_envs"]]
+            checkpoint.require_space(self.directory, shapes, needs.host, flags)
 
     def _open_sinks(self, steps: int) -> list[Sink]:
         """Return where metrics go beside metrics.csv, in a run that is at a step."""
