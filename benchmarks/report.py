@@ -20,13 +20,16 @@ from mtjax.training.log import append_rows
 
 
 def run_main(main: Callable[[], None]) -> None:
-    """Run a benchmark. Wrong input, also a file in the place of a folder, ends it with one line."""
+    """Run a benchmark. Wrong input, also a file in the place of a folder, ends it with one line, as Ctrl-C does."""
     try:
         main()
     except (InputError, FileExistsError, NotADirectoryError) as error:
         if isinstance(error, NoRoomError):
             error.place = "--out"
         raise SystemExit(f"error: {error}") from None
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        raise SystemExit(130) from None
 
 
 def machine() -> dict[str, Any]:

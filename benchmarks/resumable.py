@@ -1,8 +1,6 @@
 """Training that a stopped benchmark does not lose: a run lies in a folder until its results are written."""
 
 import math
-import os
-import signal
 from pathlib import Path
 from typing import Any
 
@@ -30,13 +28,9 @@ def train(folder: Path, family: Env, agent: Agent, seconds: float = math.inf, **
         SystemExit: a signal has stopped the run.
     """
 
-    def stop_in_time(line: dict[str, Any]) -> None:
-        if float(line["seconds"]) > seconds:
-            os.kill(os.getpid(), signal.SIGINT)
-
     if seconds < math.inf:
-        given["on_chunk"] = stop_in_time
+        given["on_chunk"] = lambda line: float(line["seconds"]) > seconds
     result = mtjax.train(family, agent, directory=folder, resume=(folder / "config.json").exists(), **given)
-    if not result.finished and result.seconds <= seconds:
+    if result.signal:
         raise SystemExit(f"stopped: the run is in {folder}, and the same command with the same --out goes on with it")
     return result._replace(rows=read_lines(folder / "metrics.csv"))

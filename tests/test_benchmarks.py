@@ -4,6 +4,7 @@ import csv
 import importlib.util
 import json
 import os
+import shutil
 import signal
 import sys
 import threading
@@ -438,3 +439,34 @@ def test_a_signal_of_the_user_is_not_the_end_of_a_familys_time(script, tmp_path,
     with pytest.raises(SystemExit, match="the same command with the same --out goes on"):
         families.main()
     assert [x.name for x in (tmp_path / "point-mass-easy").iterdir()] == ["run"]
+
+
+@pytest.mark.slow
+def test_a_signal_of_the_user_when_a_familys_time_is_over_ends_the_program(script, tmp_path, monkeypatch):
+    """As it does at another time, whichever of the two comes first."""
+    families = script("families")
+    folder = tmp_path / "point-mass-easy"
+    for method in (Console.progress, Records.save):  # before the time is known to be over, and after that
+
+        def interrupt(self, *arguments, method=method):
+            method(self, *arguments)
+            os.kill(os.getpid(), signal.SIGINT)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Console if method is Console.progress else Records, method.__name__, interrupt)
+            patch.setattr(sys, "argv", ["families.py", "point-mass-easy", "--seconds=0.01", f"--out={tmp_path}"])
+            with pytest.raises(SystemExit, match="the same command with the same --out goes on"):
+                families.main()
+        assert [x.name for x in folder.iterdir()] == ["run"] and (folder / "run" / "checkpoints").is_dir()
+        shutil.rmtree(folder)
+
+
+def test_an_interrupted_benchmark_ends_without_a_traceback(script, capsys):
+    """Where no run is to be saved."""
+
+    def main():
+        raise KeyboardInterrupt
+
+    with pytest.raises((SystemExit, KeyboardInterrupt)) as stop:  # an interrupt let through would end pytest
+        script("report").run_main(main)
+    assert getattr(stop.value, "code", None) == 130 and capsys.readouterr().err == "interrupted\n"

@@ -289,10 +289,18 @@ def test_stopped_run_goes_on_to_the_bit(play, whole, tmp_path, number, chunks):
     assert_same_run(resumed, whole)
 
 
-def test_a_signal_in_the_last_chunk_stops_nothing(play):
+def test_a_signal_in_the_last_chunk_stops_what_follows_alone(play):
     """The run is finished, and says so."""
     result = play(None, steps=100, on_chunk=after(1, lambda: os.kill(os.getpid(), signal.SIGINT)))
-    assert (result.finished, result.signal) == (True, 0)
+    assert (result.finished, result.signal) == (True, signal.SIGINT)
+
+
+def test_a_run_is_stopped_from_within(play, whole, tmp_path):
+    """By True alone, as functions may return anything else; there is a checkpoint, and no signal."""
+    seen = []
+    stopped = play(tmp_path, on_chunk=lambda line: seen.append(line) or [1, True][len(seen) == 2])
+    assert (stopped.finished, stopped.signal, len(seen)) == (False, 0, 2)
+    assert_same_run(play(tmp_path, resume=True), whole)
 
 
 def test_broken_run_goes_on_from_its_last_checkpoint(play, whole, tmp_path):

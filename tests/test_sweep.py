@@ -4,6 +4,8 @@ import csv
 import dataclasses
 import itertools
 import shutil
+import signal
+import types
 
 import jax
 import jax.numpy as jnp
@@ -451,6 +453,27 @@ def test_a_finished_sweep_has_nothing_left_to_do(swept, capsys):
     mtjax.train.main([f"--resume={swept}"])
     said = capsys.readouterr().out
     assert "compiled" not in said and "actor-lr" in said
+
+
+def test_a_signal_in_a_runs_last_chunk_stops_the_sweep_before_the_next(swept, tmp_path, monkeypatch, capsys):
+    """But not after the last run, when all is done."""
+    folder = shutil.copytree(swept, tmp_path / "sweep")
+    for file in ("run-1/evaluations.npz", "run-2/diverged.txt"):
+        (folder / file).unlink()
+    done = []
+
+    def finish(config, run, *_, **__):
+        done.append(run.name)
+        shutil.copy(swept / "run-1" / "evaluations.npz", run)
+        return types.SimpleNamespace(finished=True, signal=signal.SIGINT)
+
+    monkeypatch.setattr(sweep, "launch", finish)
+    with pytest.raises(SystemExit) as stop:
+        sweep.run_unfinished(folder)
+    assert stop.value.code == 130 and done == ["run-1"] and (folder / "run-1" / "curve.png").exists()
+    assert f"--resume={folder}" in capsys.readouterr().out
+    sweep.run_unfinished(folder)
+    assert done == ["run-1", "run-2"]
 
 
 def test_damaged_evaluations_do_not_stop_a_sweep(swept, tmp_path, capsys):

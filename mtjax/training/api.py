@@ -57,7 +57,7 @@ def train(
     wandb: str = "",
     quiet: bool = True,
     label: str = "",
-    on_chunk: Callable[[dict[str, Any]], None] | None = None,
+    on_chunk: Callable[[dict[str, Any]], Any] | None = None,
     **given: Any,
 ) -> Result:
     """Train an agent on a family of tasks.
@@ -93,7 +93,8 @@ def train(
         wandb: name of a Weights & Biases project to log to.
         quiet: print nothing.
         label: the first words of progress lines.
-        on_chunk: a function that is called with each chunk's first row of metrics.
+        on_chunk: a function that is called with each chunk's first row of metrics. If it returns True, the run stops
+            after the chunk, with a checkpoint.
         given: any setting of ``Settings``, of the agent or of its parts, and of an environment that is given by name:
             ``num_envs=64, batch_size=128, vary={"size": "0.9:1.1:5"}``.
 

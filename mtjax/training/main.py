@@ -42,7 +42,7 @@ def main(argv: Sequence[str], parse: Callable[[Sequence[str]], RunConfig]) -> No
     result = launch(config, directory, start, resume)
     if hosts.is_first():
         _conclude(config, result, directory)
-    if result.signal:
+    if result.signal and not result.finished:
         sys.exit(128 + result.signal)
 
 

@@ -25,14 +25,14 @@ class Result(NamedTuple):
     rows: Sequence[dict[str, Any]]  # the lines of metrics.csv
     seconds: float  # of training, without compiling and evaluating; of a resumed run, with those before
     compile_seconds: float  # from the start until the first chunk could begin
-    finished: bool  # False if a signal stopped it
+    finished: bool  # False if a signal or ``on_chunk`` stopped it
     directory: Path | None
     points: tuple[Point, ...] = ()  # of a sweep: entry k of S is seed k % seeds of point k // seeds
     env: Any = None
     agent: Any = None
     seeds: tuple[int, ...] = ()  # of each point
     trained_seconds: float = 0.0  # of ``seconds``, those since this start
-    signal: int = 0  # the signal that stopped it
+    signal: int = 0  # the signal that came, if any; it stops what would follow a finished run too
     total_seconds: float = 0.0  # from the start to the end: compiling, training, evaluating and saving
 
     def __repr__(self) -> str:

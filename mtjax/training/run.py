@@ -62,7 +62,7 @@ def train(
     wandb: str = "",
     quiet: bool = True,
     label: str = "",
-    on_chunk: Callable[[dict[str, Any]], None] | None = None,
+    on_chunk: Callable[[dict[str, Any]], Any] | None = None,
     on_evaluation: Callable[[Evaluations], None] | None = None,
     **given: Any,
 ) -> Result:
@@ -146,7 +146,7 @@ class _Run:
     profile: bool = False
     tensorboard: bool = False
     wandb: str = ""
-    on_chunk: Callable[[dict[str, Any]], None] | None = None
+    on_chunk: Callable[[dict[str, Any]], Any] | None = None
     on_evaluation: Callable[[Evaluations], None] | None = None
 
     @cached_property
@@ -311,28 +311,31 @@ class _Run:
         return now._replace(evaluations=again)
 
     def _run_chunks(self, programs: Programs, now: _Progress, started: float, sinks: list[Sink]) -> Result:
-        rows, stop, earlier = log.Rows(), 0, now.seconds
+        rows, stop, earlier = log.Rows(), False, now.seconds
         with stop_signals() as received, self.records.closing():
             while now.steps < self.plan.steps and not stop:
                 self.records.check()
                 seconds = now.seconds
                 now, metrics = self._play(programs.chunk, now, len(rows) // len(self.seeds))
-                rows.extend(self._log(metrics, now.seconds - seconds, now, started, sinks))
+                new = self._log(metrics, now.seconds - seconds, now, started, sinks)
+                rows.extend(new)
+                enough = self.on_chunk is not None and self.on_chunk(new[0]) is True
                 before = time.monotonic()
                 due = self._is_due(now.steps)
                 if due:
                     self.console.doing(f"{now.steps:,} steps  evaluating")
                     now = now._replace(evaluations=self._evaluate(programs.evaluate, now))
                     write_rows(sinks, *self._evaluation_rows(now.evaluations))
-                stop = hosts.largest(received[0] if received else 0)
+                stop = bool(hosts.largest(int(enough or bool(received))))
                 if due or stop:
                     self._save(now.state, now.steps // self.steps_per_iteration)
                     self.console.clock.evaluation(time.monotonic() - before)
                 if due and self.on_evaluation is not None:
                     self.on_evaluation(now.evaluations)
+            signal = hosts.largest(received[0] if received else 0)  # also one that came during the last save
         finished = now.steps >= self.plan.steps
         return Result(now.state, now.evaluations, rows, now.seconds, 0.0, finished, self.directory)._replace(
-            trained_seconds=now.seconds - earlier, signal=0 if finished else stop
+            trained_seconds=now.seconds - earlier, signal=signal
         )
 
     def _is_due(self, steps: int) -> bool:
@@ -367,8 +370,6 @@ class _Run:
         self.console.clock.chunk(elapsed)
         rate = self.steps_per_chunk * len(self.seeds) / elapsed
         self.console.progress(now.steps, passed, rate, metrics["return"], self._running(now.state, metrics["return"]))
-        if self.on_chunk is not None:
-            self.on_chunk(new[0])
         return new
 
     def _columns(self, metrics: Any) -> list[str]:

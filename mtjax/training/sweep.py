@@ -214,18 +214,21 @@ def run_unfinished(folder: Path) -> None:
             continue
         label, resume = f"run {i + 1} of {len(runs)}", checkpoint.newest(run / "checkpoints") is not None
         start = None if resume else load_start(config)
+        signal = 0
         try:
             grow = lambda _: _write_table(folder, runs)
             result = launch(config, run, start, resume, label, on_evaluation=grow)
-            if not result.finished:
-                words = shlex.join([f"--resume={folder}", *import_flags(config)])
-                print(f"{table(rows(runs))}\nstopped; the state is saved. Go on with:\n  python -m mtjax.train {words}")
-                sys.exit(128 + result.signal)
-            _draw(config, run)
+            if result.finished:
+                _draw(config, run)
+            signal = 0 if result.finished and run == runs[-1] else result.signal
         except FloatingPointError as error:
             print(f"{label}: {error}", flush=True)
             (run / _DIVERGED).write_text(f"{error}\n")
         _write_table(folder, runs)
+        if signal:
+            words = shlex.join([f"--resume={folder}", *import_flags(config)])
+            print(f"{table(rows(runs))}\nstopped; the state is saved. Go on with:\n  python -m mtjax.train {words}")
+            sys.exit(128 + signal)
     print(f"{table(rows(runs))}\nsweep: {folder}")
 
 
