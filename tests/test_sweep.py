@@ -24,7 +24,8 @@ from mtjax.config import configure, from_json, to_json
 from mtjax.evaluation import Scores, load_evaluations
 from mtjax.loop import Settings, TrainState
 from mtjax.names import Notice
-from mtjax.training import memory, points, sweep
+from mtjax.training import memory, points, stops, sweep
+from mtjax.training import run as run_module
 from mtjax.training.console import Console
 from mtjax.training.folder import to_flags
 from mtjax.training.points import SweptAgent
@@ -487,6 +488,32 @@ def test_damaged_evaluations_do_not_stop_a_sweep(swept, tmp_path, capsys):
     capsys.readouterr()
     mtjax.train.main([f"--resume={folder}"])
     assert "compiled" not in capsys.readouterr().out
+
+
+def test_a_seed_that_the_last_update_spoiled_is_given_up(capsys):
+    """Its losses were still finite. It scores nothing, and the others go on; without any other, nothing is saved."""
+    agent, settings = configure(tiny("sac"), Settings(), SMALL)
+    swept = tuple({"tau": tau} for tau in (0.1, 0.2, 0.3))
+    run = _Run(Walk(), SweptAgent(agent), settings, Plan(), None, Console(1), swept)
+
+    def given_up(actor, *before):
+        learner = types.SimpleNamespace(actor={"weights": jnp.asarray(actor)[:, None]})
+        state = types.SimpleNamespace(agent=types.SimpleNamespace(learner=learner))
+        return run._give_up_spoiled(_Progress(state, 120, 0.0, 0.0, None, np.array(before))).diverged.tolist()
+
+    assert given_up([0.0, np.nan, 1.0], False, False, True) == [False, True, True]
+    assert capsys.readouterr().out.splitlines() == ["seed 0 of tau=0.2 diverged and is given up"]
+    with pytest.raises(FloatingPointError, match=r"parameters stopped being finite in the update before step"):
+        given_up([np.inf, np.nan, 1.0], False, False, True)
+
+
+def test_a_spoiled_seed_is_not_evaluated(monkeypatch):
+    """As it would do nothing, which has a return too."""
+    real = stops.finite_seeds
+    monkeypatch.setattr(run_module, "finite_seeds", lambda state: real(state) & [True, False])
+    given = {"steps": 240, "eval_every": 240, "eval_episodes": 2, "sweep": {"actor_lr": [1e-3, 1e-4]}, **SMALL}
+    returns = train(Walk(), tiny("sac"), **given).evaluations.returns["train"]
+    assert np.isfinite(returns[0]).all() and np.isnan(returns[1]).all()
 
 
 def test_evaluations_of_diverged_points_stay_none(tmp_path):

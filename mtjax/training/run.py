@@ -313,6 +313,7 @@ class _Run:
     def _run_chunks(self, programs: Programs, now: _Progress, started: float, sinks: list[Sink]) -> Result:
         rows, stop, earlier = log.Rows(), False, now.seconds
         with stop_signals() as received, self.records.closing():
+            asked = lambda enough: bool(hosts.largest(int(enough or bool(received))))
             while now.steps < self.plan.steps and not stop:
                 self.records.check()
                 seconds = now.seconds
@@ -321,12 +322,14 @@ class _Run:
                 rows.extend(new)
                 enough = self.on_chunk is not None and self.on_chunk(new[0]) is True
                 before = time.monotonic()
-                due = self._is_due(now.steps)
+                stop, due = asked(enough), self._is_due(now.steps)
+                if due or stop:
+                    now = self._give_up_spoiled(now)
                 if due:
                     self.console.doing(f"{now.steps:,} steps  evaluating")
                     now = now._replace(evaluations=self._evaluate(programs.evaluate, now))
                     write_rows(sinks, *self._evaluation_rows(now.evaluations))
-                stop = bool(hosts.largest(int(enough or bool(received))))
+                    stop = asked(stop)
                 if due or stop:
                     self._save(now.state, now.steps // self.steps_per_iteration)
                     self.console.clock.evaluation(time.monotonic() - before)
@@ -394,15 +397,29 @@ class _Run:
         broken = np.any(bad_step >= 0, axis=1)
         if not self.points or np.all(broken | diverged):
             require_finite(bad_step, first_step, self.records.last)
-        for k in np.flatnonzero(broken & ~diverged):
-            values = ", ".join(f"{name}={value:g}" for name, value in self.point(int(k)).items())
-            self.console.say(f"seed {self.seeds[k]} of {values} diverged and is given up")
+        self._tell_given_up(broken & ~diverged)
         return broken
 
+    def _give_up_spoiled(self, now: _Progress) -> _Progress:
+        """Give up the seeds that the chunk's last update has spoiled, as none of its losses has seen that.
+
+        Raises:
+            FloatingPointError: no seed is left, or the run is no sweep. The checkpoint before must stay.
+        """
+        agents = getattr(now.state.agent, "learner", now.state.agent)
+        spoiled = ~finite_seeds(agents)
+        if not self.points or np.all(spoiled | now.diverged):
+            require_finite_parameters(agents, now.steps // self.steps_per_iteration, self.records.last)
+        self._tell_given_up(spoiled & ~now.diverged)
+        return now._replace(diverged=now.diverged | spoiled)
+
+    def _tell_given_up(self, seeds: np.ndarray) -> None:
+        for k in np.flatnonzero(seeds):
+            values = ", ".join(f"{name}={value:g}" for name, value in self.point(int(k)).items())
+            self.console.say(f"seed {self.seeds[k]} of {values} diverged and is given up")
+
     def _save(self, state: TrainState, iteration: int) -> None:
-        """Save a checkpoint, unless the last update has spoiled an agent: then the checkpoint before it must stay."""
-        if not self.points:
-            require_finite_parameters(state.agent, iteration, self.records.last)
+        """Save a checkpoint."""
         self.exchange.finish(iteration)
         self.records.save(state)
         allocator.give_back_pages()
