@@ -103,6 +103,12 @@ def named(tree):
     return {jax.tree_util.keystr(path): np.asarray(x) for path, x in jax.tree.leaves_with_path(tree)}
 
 
+def bits(tree):
+    """The bytes of all arrays, keys of random numbers too."""
+    plain = lambda x: jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x
+    return [np.asarray(plain(x)).tobytes() for x in jax.tree.leaves(tree)]
+
+
 def inherited(states, seeds, nearest=NEAREST):
     """Actor and critics of new tasks as a run's states (S, ...) leave them."""
     leaves = {**named({"actor": states.actor}), **named({"critic": states.critic})}
@@ -182,6 +188,25 @@ def test_a_fine_tuned_run_goes_on(learned, tuned, capsys):
     assert f"from {from_json(directory / 'config.json').start}: heads" in capsys.readouterr().out
     for path, leaf in named(mtjax.load(directory).states.actor).items():
         assert np.array_equal(leaf, before[path]) == ("head" not in path), path
+
+
+@pytest.mark.parametrize("chunks, sweep", [(1, ()), (2, {"actor_lr": [1e-3, 1e-4]})])
+def test_a_stopped_fine_tuning_goes_on_to_the_bit(learned, base, tmp_path, chunks, sweep):
+    """Before or after its first evaluation: the run that it is from gives nothing more to one that has begun."""
+    given = {"vary": {"goal": [0.9, -0.8]}, "split": "none", "seeds": 3, "steps": 240, "eval_every": 160, "num_envs": 2}
+    given |= {"eval_episodes": 1, "batch_size": 4, "replay_size": 100, "warmup_steps": 2, "chunk_steps": 20}
+    given |= {"tune": "heads", "sweep": sweep}
+    whole = mtjax.train("aim", start=learned, directory=tmp_path / "whole", **given)
+    lines = []
+    stop = lambda line: lines.append(line) or len(lines) == chunks
+    stopped = mtjax.train("aim", start=base, directory=tmp_path / "run", on_chunk=stop, **given)
+    assert (stopped.finished, stopped.rows[-1]["steps"]) == (False, 80 * chunks)
+    resumed = mtjax.train("aim", start=base, directory=tmp_path / "run", resume=True, **given)
+    assert resumed.finished and resumed.rows[0]["steps"] == 80 * (chunks + 1)
+    assert bits((resumed.state, resumed.evaluations)) == bits((whole.state, whole.evaluations))
+    assert bits(stopped.state) != bits(whole.state)
+    evaluations = [(tmp_path / name / "evaluations.npz").read_bytes() for name in ("run", "whole")]
+    assert evaluations[0] == evaluations[1]
 
 
 @pytest.mark.slow
