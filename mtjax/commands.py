@@ -156,7 +156,7 @@ def check_names(argv: Sequence[str]) -> None:
     for flag in () if {"--resume", "--sweep"} <= given else ("resume", "from"):
         folder = flag_value(argv, flag, None)
         if folder in shipped.names() and not Path(folder).is_dir():
-            raise InputError(f"{folder!r} is a policy without critics and replay, so it cannot go on learning")
+            raise shipped.not_learning(folder)
         if folder is not None and not (flag == "resume" and any(Path(folder).glob("run-*"))):  # the runs of a sweep
             require_run(Path(folder))
 

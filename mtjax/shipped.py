@@ -34,6 +34,11 @@ def is_shipped(directory: Path) -> bool:
     return (directory / FILE).is_file()
 
 
+def not_learning(name: str) -> InputError:
+    """Return an error for a trained policy that should go on learning."""
+    return InputError(f"{name!r} is a policy without critics and replay, so it cannot go on learning")
+
+
 def arrays(directory: Path) -> dict[int, np.ndarray]:
     """Return those leaves of the agent's state that acting reads, by their number.
 

@@ -89,6 +89,19 @@ def test_a_policy_of_the_package_cannot_go_on_learning(flag):
         parse([f"--{flag}=reacher-vary-goal/ppo"])
 
 
+def test_nor_can_it_from_python():
+    """Its critics would be zeros."""
+    for start in ("reacher-vary-goal/ppo", mtjax.load("reacher-vary-goal/ppo")):
+        with pytest.raises(InputError, match="reacher-vary-goal/ppo' is a policy without critics and replay"):
+            mtjax.train("reacher-vary-goal", start=start, steps=10, chunk_steps=1, num_envs=1)
+
+
+def test_a_policy_of_the_package_has_no_checkpoints_to_choose_from():
+    """A number is not left unread."""
+    with pytest.raises(InputError, match="is a policy alone, without checkpoints; leave out checkpoint"):
+        mtjax.load("reacher-vary-goal/ppo", checkpoint=5)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", shipped.names())
 def test_a_policy_scores_what_its_page_says(name):

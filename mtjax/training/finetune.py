@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax import frames
+from mtjax import frames, shipped
 from mtjax.agents import BaseAgent, parts, settings
 from mtjax.config import NO_FINE_TUNING
 from mtjax.envs import Family
@@ -24,8 +24,11 @@ def require_fit(start: Policy, env: Env, agent: BaseAgent) -> None:
     """Check that an agent can fine-tune a run's networks on the tasks of ``env``.
 
     Raises:
-        InputError: the agent differs from the run's, or the tasks have other sizes or another context.
+        InputError: the agent differs from the run's, the tasks have other sizes or another context, or the policy comes
+            with the package.
     """
+    if start.directory is not None and shipped.is_shipped(start.directory):
+        raise shipped.not_learning(str(start.directory))
     for each in (env, start.env):
         require_family(each, NO_FINE_TUNING)
     had, given = _learned(start.agent), _learned(agent)

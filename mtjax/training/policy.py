@@ -91,6 +91,8 @@ def load(directory: str | Path, seed: int = 0, checkpoint: int = 0) -> Policy:
     config = from_json(directory / "config.json")
     _require_seed(seed, config.plan.seeds, len(config.points))
     if shipped.is_shipped(directory):
+        if checkpoint:
+            raise InputError(f"{str(directory)!r} is a policy alone, without checkpoints; leave out checkpoint")
         states = _filled(directory, state_shapes(config).agent)
     else:
         states = checkpoints.load_agent(directory / "checkpoints", state_shapes(config), checkpoint)
