@@ -89,7 +89,7 @@ def _checked(name: str, kind: Any, value: Any) -> Any:
         return value
     words, accepts, convert = wanted
     if not accepts(value):
-        raise InputError(f"{name} must be {words}, not {_shown(value)}{_hint(kind, value)}")
+        raise InputError(f"{name} must be {words}, not {shown(value)}{_hint(kind, value)}")
     return convert(value)
 
 
@@ -119,7 +119,8 @@ def _hint(kind: Any, value: Any) -> str:
     return ""
 
 
-def _shown(value: Any) -> str:
+def shown(value: Any) -> str:
+    """Return a value as text for a message, or the name of its type if that is long."""
     text = repr(value)
     return text if len(text) <= 60 else f"a {type(value).__name__}"
 
@@ -131,5 +132,5 @@ def path(value: Any, name: str = "directory") -> Path:
         InputError: the value is no path.
     """
     if not isinstance(value, str | os.PathLike) or not os.fspath(value):  # Path("") would be the working directory
-        raise InputError(f"{name} must be a path, not {_shown(value)}")
+        raise InputError(f"{name} must be a path, not {shown(value)}")
     return Path(value)

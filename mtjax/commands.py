@@ -2,6 +2,7 @@
 
 import ast
 import contextlib
+import dataclasses
 import difflib
 import gc
 import importlib.util
@@ -205,6 +206,21 @@ def all_flags() -> dict[str, bool]:
     return found
 
 
+def check_flags_of(cls: type, argv: Sequence[str]) -> None:
+    """Refuse a flag that is no field of a dataclass, which holds all flags of a command but --help and --import.
+
+    Raises:
+        InputError: there is no such flag.
+    """
+    known = {f"--{_as_flag(field.name)}": isinstance(field.default, bool) for field in dataclasses.fields(cls)}
+    known |= {"--help": False, "--import": False}
+    allowed = {*known, *map(switched_off, known), "-h"}
+    for word in argv:
+        flag = word.split("=", 1)[0].replace("_", "-")
+        if flag.startswith("-") and flag not in allowed and not re.match(r"-\.?\d", flag):
+            raise unknown_flag(flag, known)
+
+
 def _as_flag(name: str) -> str:
     """Return the flag, without dashes and group, of a field."""
     return "from" if name == "start" else name.replace("_", "-")
@@ -237,9 +253,14 @@ def unknown_flag(flag: str, known: Mapping[str, bool]) -> InputError:
 
 
 def require_run(folder: Path) -> None:
-    """Raise InputError unless a folder holds a run."""
-    if not (folder / "config.json").is_file():
-        raise InputError(f"{str(folder)!r} is not a run: it has no config.json")
+    """Raise InputError unless a folder holds a run. The message names the newest of the runs inside it, if any."""
+    if (folder / "config.json").is_file():
+        return
+    if not folder.is_dir():
+        raise InputError(f"{str(folder)!r} is not a run: there is no such folder")
+    inside = max(folder.glob("*/config.json"), key=lambda file: file.stat().st_mtime, default=None)
+    hint = "" if inside is None else f"; it holds runs, the newest is {str(inside.parent)!r}"
+    raise InputError(f"{str(folder)!r} is not a run: it has no config.json{hint}")
 
 
 def flag_value(argv: Sequence[str], name: str, default: P) -> str | P:
@@ -300,7 +321,9 @@ def imports_of(argv: Sequence[str]) -> tuple[list[str], list[str]]:
             files.append(word.split("=", 1)[1])
         else:
             rest.append(word)
-    return [str(Path(file).resolve()) if file else "" for file in dict.fromkeys(files)], rest
+    if "" in files:
+        raise InputError("--import needs a Python file")
+    return [str(Path(file).resolve()) for file in dict.fromkeys(files)], rest
 
 
 def is_imported(path: Path) -> bool:

@@ -21,10 +21,11 @@ from mtjax.agents.parts import name_of
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.values import VALUES
 from mtjax.checks import check_fields, require_values
-from mtjax.commands import is_imported, require_run
+from mtjax.commands import PRESETS, is_imported, require_run
 from mtjax.envs import ENVS, is_mixture, make, members
 from mtjax.envs.family import Tabled
 from mtjax.loop import Settings
+from mtjax.names import nearest_error
 from mtjax.types import InputError
 
 _MOST_STEPS, _MOST_SEEDS, _MOST_EPISODES = 10**15, 10**5, 10**5
@@ -128,6 +129,8 @@ def with_preset(
         InputError: a name or setting is unknown.
     """
     made = make(env_name, **family_settings) if family is None else family
+    if preset_name not in PRESETS:
+        raise nearest_error("preset", str(preset_name), PRESETS)
     device = _device_preset() if preset_name == "auto" else preset_name
     preset, common = load_preset(env_name, device), load_preset("+", device)
     table = lambda name: common.get(name, {}) | preset.get(name, {})

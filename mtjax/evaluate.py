@@ -54,11 +54,7 @@ def _parse(argv: Sequence[str]) -> tuple[Request, dict[str, str]]:
     if argv and not argv[0].startswith("-"):
         raise InputError(f"say which run to evaluate by --run={argv[0]}")
     vary, argv = commands.vary_flags(commands.import_files(argv))
-    names = [f.name.replace("_", "-") for f in dataclasses.fields(Request)]
-    known = [*(f"--{name}" for name in names), "--no-video", "--no-diagnostics", "--help", "-h"]
-    for word in argv:
-        if word.startswith("--") and word.split("=")[0].replace("_", "-") not in known:
-            raise nearest_error("flag", word.split("=")[0], [*known, "--env.vary.NAME", "--import"])
+    commands.check_flags_of(Request, argv)
     request = commands.parse_with_tyro(Request, argv, Request(), "python -m mtjax.evaluate")
     if not request.run:
         raise InputError("say which run to evaluate: --run=DIR")

@@ -66,14 +66,21 @@ def replacing(path: Path) -> Iterator[Path]:
 def nearest_error(kind: str, given: str, allowed: Iterable[str]) -> InputError:
     """Return an error for an unknown name, with the nearest match and the allowed names.
 
-    Of more than 20 allowed names the message lists only similar ones.
+    Of more than 20 allowed names the message lists only similar ones: those written alike, whatever the capitals, or
+    else those that end with what was given.
     """
     allowed = list(allowed)
-    near = difflib.get_close_matches(given, allowed, n=6, cutoff=0.5)
+    plain = {_plain(name): name for name in allowed}
+    near = difflib.get_close_matches(_plain(given), plain, n=6, cutoff=0.5)
+    near = [plain[name] for name in near or plain if near or name.endswith(f"-{_plain(given)}")]
     hint = f"did you mean {near[0]!r}? " if near else ""
     few = len(allowed) <= _MANY
     shown = ", ".join(allowed if few else near or allowed[:6]) + ("" if few else f", ... ({len(allowed)} in all)")
     return InputError(f"unknown {kind} {given!r}; {hint}choose from: {shown}")
+
+
+def _plain(name: Any) -> str:
+    return str(name).lower().replace("_", "-")
 
 
 def first_sentence(text: str | None) -> str:

@@ -32,10 +32,7 @@ class Request:
 def main(argv: Sequence[str]) -> None:
     """Read the command line first, then import the code that draws."""
     argv = commands.import_files(argv)
-    known = [*(f"--{f.name}" for f in dataclasses.fields(Request)), "--help", "-h"]
-    for word in argv:
-        if word.startswith("-") and word.split("=")[0] not in known:
-            raise nearest_error("flag", word.split("=")[0], [*known, "--import"])
+    commands.check_flags_of(Request, argv)
     runs, flags = _apart(argv)
     request = commands.parse_with_tyro(Request, flags, Request(), "python -m mtjax.plot RUN ...")
     if not runs:

@@ -1,12 +1,14 @@
 """Registration of a user's own families, agents and parts of agents under names."""
 
 import dataclasses
+import re
 import sys
 from typing import Any
 
 from mtjax import agents, envs
 from mtjax.agents.base import BaseAgent
 from mtjax.agents.choices import CHOICES, PARTS
+from mtjax.checks import shown
 from mtjax.envs.family import Family
 from mtjax.names import InputError, first_sentence
 
@@ -25,11 +27,13 @@ def register(name: str, thing: "type | str", **defaults: Any) -> None:
     Raises:
         InputError: the name is taken, the class has none of these bases, or a default is not allowed.
     """
+    if not isinstance(name, str) or not re.fullmatch(r"\w[\w.-]*", name):  # "+" joins the names of a mixture
+        raise InputError(f"a name is of letters, digits, -, _ and ., such as 'my-own', not {shown(name)}")
     if isinstance(thing, str):
         known, home = agents.preset_of(thing), sys._getframe(1).f_globals.get("__file__", "")
         return _register_agent(name, known._replace(defaults={**known.defaults, **defaults}, home=home))
     if not isinstance(thing, type):
-        raise InputError(f"register takes a class, or the name of an agent, not {thing!r}")
+        raise InputError(f"register takes a class, or the name of an agent, not {shown(thing)}")
     if issubclass(thing, Family):
         return envs.register(name, thing, **defaults)
     if issubclass(thing, BaseAgent):

@@ -19,13 +19,14 @@ def folder(run: str | Path) -> Path:
     """Return the folder of a run, or that of a trained policy of this name if there is no such folder.
 
     Raises:
-        InputError: there is neither, and the name can only be meant for a trained policy.
+        InputError: there is neither, and the name is like that of a trained policy.
     """
     place = Path(run)
     if not place.is_dir() and str(run) in names():
         return FOLDER / run
-    if len(place.parts) == 2 and not place.parent.exists():
-        raise nearest_error("run or trained policy", str(run), names())
+    part_of_one = [name for name in names() if str(run) in name.split("/")]  # a family or an agent alone
+    if not place.exists() and (part_of_one or (len(place.parts) == 2 and not place.parent.exists())):
+        raise nearest_error("run or trained policy", str(run), part_of_one or names())
     return place
 
 

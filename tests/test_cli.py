@@ -294,6 +294,8 @@ def test_list_names_every_family_and_agent(capsys):
     [
         ("--env=finger-spn", "unknown environment 'finger-spn'; did you mean 'finger-spin'?"),
         ("--agent carr", "unknown agent 'carr'; did you mean 'care'?"),
+        ("--agent=SAC", "unknown agent 'SAC'; did you mean 'sac'?"),
+        ("--import", "--import needs a Python file\n"),
         ("--preset=gpus", "unknown preset 'gpus'; did you mean 'gpu'?"),
         ("--num-env=3", "unknown flag '--num-env'; did you mean '--num-envs'?"),
         ("--nam=x", "unknown flag '--nam'; did you mean '--env'?"),
@@ -403,7 +405,10 @@ def test_messages_do_not_depend_on_the_terminal(complaint, monkeypatch, encoding
     "words, said",
     [
         ("", "say which run to evaluate: --run=DIR"),
-        ("--run=nowhere", "'nowhere' is not a run"),
+        ("--run=nowhere", "'nowhere' is not a run: there is no such folder"),
+        ("--run=brc", "unknown run or trained policy 'brc'; choose from: finger-spin-vary-size/brc"),
+        ("--run=x --env.combine=grid", "unknown flag '--env.combine'; --help lists the flags"),
+        ("--run=x --env.vary", "--env.vary needs the name of a parameter"),
         ("runs/x --video", "say which run to evaluate by --run=runs/x"),
         ("--runs=x", "unknown flag '--runs'; did you mean '--run'?"),
         ("--run=x --episodes=0", "episodes must be at least 1"),
@@ -415,6 +420,16 @@ def test_messages_do_not_depend_on_the_terminal(complaint, monkeypatch, encoding
 def test_evaluate_says_what_is_wrong(complaint, words, said):
     """In one line, with exit code 2."""
     assert said in complaint("evaluate", *words.split())
+
+
+def test_the_newest_run_inside_a_folder_is_named(complaint, tmp_path):
+    """Where the folder itself is none."""
+    for i, name in enumerate(("a", "b")):
+        (tmp_path / "runs" / name).mkdir(parents=True)
+        (tmp_path / "runs" / name / "config.json").touch()
+        os.utime(tmp_path / "runs" / name / "config.json", (i, i))
+    for command, flag in (("train", "resume"), ("evaluate", "run")):
+        assert "has no config.json; it holds runs, the newest is 'runs/b'" in complaint(command, f"--{flag}=runs")
 
 
 def test_vectors_of_another_number_of_tasks_are_refused(complaint, tmp_path):

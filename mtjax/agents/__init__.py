@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from mtjax.checks import shown
 from mtjax.names import InputError, frozen, lazily, load, nearest_error
 
 if TYPE_CHECKING:
@@ -96,7 +97,7 @@ def preset_of(name: str) -> Preset:
         InputError: no agent has that name.
     """
     if not isinstance(name, str):
-        raise InputError(f"an agent is chosen by name, such as 'care', not by {name!r}")
+        raise InputError(f"an agent is chosen by name, such as 'care', not by {shown(name)}")
     if name not in AGENTS:
         raise nearest_error("agent", name, AGENTS)
     return AGENTS[name]

@@ -9,7 +9,7 @@ from functools import lru_cache
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
-from mtjax.checks import OF_TRAIN, checked
+from mtjax.checks import OF_TRAIN, checked, shown
 from mtjax.envs import variation
 from mtjax.envs.metaworld.names import BENCHMARKS, FAMILIES
 from mtjax.names import InputError, first_sentence, frozen, lazily, load, nearest_error
@@ -226,7 +226,8 @@ def make(name: str, vary: Mapping[str, Any] | tuple = (), **settings: Any) -> An
         InputError: there is no such family or field, or a value is out of range.
     """
     if not isinstance(name, str):
-        raise InputError(f"an environment is chosen by name, such as 'finger-spin', not by {name!r}")
+        several = "; mtjax.mixture takes several" if isinstance(name, list | tuple) else ""
+        raise InputError(f"an environment is chosen by name, such as 'finger-spin', not by {shown(name)}{several}")
     if is_mixture(name):
         return _make_mixture(members(name), _pairs(vary), dict(settings))
     if name not in ENVS:

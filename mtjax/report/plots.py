@@ -179,7 +179,7 @@ def _of_split(runs: Any, split: str) -> list[Learned]:
         raise nearest_error("split", split, SPLITS)
     found = [one for one in collect.learned(runs) if one.returns[split].size and len(one.steps)]
     if not found:
-        raise InputError(f"no run has {split} tasks")
+        raise InputError(f"no run was given that has {split} tasks")
     return found
 
 

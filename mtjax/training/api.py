@@ -137,7 +137,8 @@ def train(
 def _require_learning(env: Any, agent: Any, directory: Any) -> None:
     """Refuse what is neither a name nor an environment or agent, and a folder for those that no name makes again."""
     if not isinstance(env, str) and (isinstance(env, type) or not hasattr(env, "reset_worlds")):
-        raise InputError(f"env is the name of a family, or what mtjax.make returns; not {_kind(env)}")
+        several = "; mtjax.mixture takes several" if isinstance(env, list | tuple) else ""
+        raise InputError(f"env is the name of a family, or what mtjax.make returns; not {_kind(env)}{several}")
     if not isinstance(agent, str) and (isinstance(agent, type) or not hasattr(agent, "learn")):
         raise InputError(f"agent is a name such as 'care', or what mtjax.agent returns; not {_kind(agent)}")
     if directory is not None or isinstance(env, str) or isinstance(agent, str):

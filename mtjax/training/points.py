@@ -14,6 +14,7 @@ import numpy as np
 
 from mtjax.agents import BaseAgent, parts
 from mtjax.agents.choices import kinds_of, settings
+from mtjax.checks import shown
 from mtjax.names import nearest_error
 from mtjax.types import Acted, Array, Env, Experience, InputError, Key, Metrics, Outcome, Spec, Task, Transition
 
@@ -152,7 +153,7 @@ def _number(name: str, value: Any) -> float:
     try:
         return float(value)
     except (TypeError, ValueError):
-        raise InputError(f"{name} is a number, and {value!r} is none") from None
+        raise InputError(f"a sweep gives numbers to {name}, and {shown(value)} is none") from None
 
 
 def seed_axis(points: Sequence[Point], seeds: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray] | None]:
