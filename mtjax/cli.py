@@ -8,6 +8,7 @@ from typing import Any
 from mtjax.agents import settings
 from mtjax.agents.choices import CHOICES, flag_names, owners
 from mtjax.commands import (
+    all_flags,
     check_names,
     flag_value,
     import_files,
@@ -15,6 +16,7 @@ from mtjax.commands import (
     parse_with_tyro,
     split_flags,
     switched_off,
+    switched_on,
     unknown_flag,
     vary_flags,
 )
@@ -153,4 +155,7 @@ def _check_flags(argv: Sequence[str], config: RunConfig) -> None:
             name = flag.removeprefix("--").removeprefix("agent.").replace("-", "_")
             if found := owners(name, "--agent.{}={}"):
                 raise InputError(f"unknown flag {flag!r} of {config.agent}; it belongs to {found}")
+            if switched_on(flag) in all_flags():
+                holder = config.agent if flag.startswith("--agent.") else config.env
+                raise InputError(f"{holder} has no flag {flag}; --env, --agent and --help with them list those it has")
             raise unknown_flag(flag, known)

@@ -187,7 +187,7 @@ def check_flags(argv: Sequence[str]) -> None:
     known = all_flags()
     for word in argv:
         flag = word.split("=", 1)[0].replace("_", "-")
-        if flag.startswith("--") and not flag.startswith(_VARY) and not {flag, _switched_on(flag)} & known.keys():
+        if flag.startswith("--") and not flag.startswith(_VARY) and not {flag, switched_on(flag)} & known.keys():
             raise unknown_flag(flag, known)
 
 
@@ -226,7 +226,7 @@ def _as_flag(name: str) -> str:
     return "from" if name == "start" else name.replace("_", "-")
 
 
-def _switched_on(flag: str) -> str:
+def switched_on(flag: str) -> str:
     """Return the flag that --no-NAME or --GROUP.no-NAME switches off."""
     return re.sub(r"^(--(?:[\w-]+\.)*)no-", r"\1", flag)
 
@@ -375,7 +375,11 @@ def parse_with_tyro(cls: type[P], argv: Sequence[str], default: P, name: str) ->
         message = re.sub(r"^Error parsing ((plan|training|family|learner)[.\w]*: )?", "", _unframed(output.getvalue()))
         negated = r"^Unrecognized options: (--(\w+\.)*)no-(\S+).*"
         message = re.sub(negated, r"\1\3 is no switch that could be off; give it a value", message)
-        message = re.sub(r"^Unrecognized options: (?!-)(\S+).*", lambda found: _unread(found[1], argv), message)
+        single = r"^Unrecognized options: (-[^-]\S*).*"
+        message = re.sub(single, r"'\1' has one dash, and flags have two: -\1", message)
+        message = re.sub(r"^Unrecognized options: (?!-)(\S+?),?( .*)?$", lambda found: _unread(found[1], argv), message)
+        spaced = r"\1 takes values with spaces between them, such as \1 8 8"
+        message = re.sub(r"^(--\S+): Could not find valid parse for arguments: \['[\d\s,]*'\]$", spaced, message)
         raise InputError(message or "the command line cannot be read; --help lists the flags") from None
 
 

@@ -323,7 +323,11 @@ def test_list_names_every_family_and_agent(capsys):
         ("finger-spin", "'finger-spin' belongs to no flag; write --NAME=VALUE"),
         ("--profile=3", "--profile is a switch and takes no value; leave out '=3'"),
         ("--env.vary=3", "--env.vary needs the name of a parameter: --env.vary.NAME=VALUES"),
-        ("-x", "-x"),
+        ("-x", "'-x' has one dash, and flags have two: --x"),
+        ("-env=bandit", "'-env=bandit' has one dash, and flags have two: --env=bandit"),
+        ("--env=bandit --engine=c", "bandit has no flag --engine; "),
+        ("--agent.hidden=8,8", "--agent.hidden takes values with spaces between them, such as --agent.hidden 8 8\n"),
+        ("--env.vary.size 1 2 3", "'2' belongs to no flag"),
         ("--agent.hidden wide", "wide"),
         ("--agent.hidden", "at least one layer"),
         ("--agent.conditioning=onehot", "onehot"),
@@ -512,6 +516,8 @@ def test_place_that_cannot_be_written_is_refused(complaint, tmp_path):
     """A file where the folder of runs should be."""
     (tmp_path / "taken").write_text("")
     assert "taken' is a file, and runs need a folder" in complaint("train", *SHORT_RUN, f"--runs={tmp_path / 'taken'}")
+    said = complaint("train", *SHORT_RUN, f"--runs={tmp_path / 'taken/x'}")
+    assert "taken/x' cannot take a run (Not a directory); choose another place with --runs" in said
 
 
 def test_full_disk_is_refused(complaint, tmp_path, monkeypatch):

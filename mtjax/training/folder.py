@@ -1,5 +1,6 @@
 """The folder of a run, and its config.json: settings, versions, device and command."""
 
+import contextlib
 import dataclasses
 import itertools
 import json
@@ -33,14 +34,16 @@ def new_directory(root: Path, name: str) -> Path:
     stamp = time.strftime("%Y%m%d-%H%M%S")
     if root.is_file():
         raise InputError(f"{str(root)!r} is a file, and runs need a folder; choose another place with --runs")
-    root.mkdir(parents=True, exist_ok=True)
-    for attempt in range(1000):
-        directory = root / (f"{name}-{stamp}" + (f"-{attempt}" if attempt else ""))
-        try:
-            directory.mkdir()
-            return directory
-        except FileExistsError:
-            continue
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        for attempt in range(1000):
+            directory = root / (f"{name}-{stamp}" + (f"-{attempt}" if attempt else ""))
+            with contextlib.suppress(FileExistsError):
+                directory.mkdir()
+                return directory
+    except OSError as error:
+        fix = "choose another place with --runs"
+        raise InputError(f"{str(root)!r} cannot take a run ({error.strerror}); {fix}") from None
     raise InputError(f"cannot find a new name for a run in {str(root)!r}")
 
 
