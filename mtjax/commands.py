@@ -342,9 +342,9 @@ def _import(path: Path) -> None:
     sys.modules[path.stem] = module = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
-    except InputError:
+    except InputError as error:
         del sys.modules[path.stem]
-        raise
+        raise InputError(f"{str(path)!r}{_line_of(error, path)}: {error}") from error
     except Exception as error:  # of the user's own code
         del sys.modules[path.stem]
         raise InputError(f"{str(path)!r}{_line_of(error, path)}: {type(error).__name__}: {error}") from error

@@ -293,6 +293,8 @@ def test_list_names_every_family_and_agent(capsys):
     "words, said",
     [
         ("--env=finger-spn", "unknown environment 'finger-spn'; did you mean 'finger-spin'?"),
+        ("--env=finger-spin,walker-walk", "'finger-spin,walker-walk' has commas; a mixture is NAME+NAME"),
+        ("--runs=", "--runs needs a folder; that of the command is --runs=."),
         ("--agent carr", "unknown agent 'carr'; did you mean 'care'?"),
         ("--agent=SAC", "unknown agent 'SAC'; did you mean 'sac'?"),
         ("--import", "--import needs a Python file\n"),
@@ -387,6 +389,7 @@ def test_train_says_what_is_wrong(complaint, monkeypatch, tmp_path, words, said)
     [
         ("\ndef mine(:\n", "mine.py', line 2: SyntaxError: invalid syntax"),
         ("import nothing_of_this_name\n", "line 1: ModuleNotFoundError: No module named 'nothing_of_this_name'"),
+        ("import mtjax\n\nmtjax.register('mine', 3)\n", "mine.py', line 3: register takes a class, or the name of"),
         ("def f():\n    return [][0]\n\nf()\n", "line 2: IndexError: list index out of range"),
     ],
 )

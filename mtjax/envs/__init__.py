@@ -251,8 +251,10 @@ def members(name: str) -> tuple[tuple[str, Settings], ...]:
     """Return the families that a name of ``make`` stands for, each with the settings that a benchmark has for it.
 
     Raises:
-        InputError: a mixture's name lacks a family.
+        InputError: a mixture's name lacks a family, or has commas.
     """
+    if "," in name:
+        raise InputError(f"{name!r} has commas; a mixture is NAME+NAME")
     if name and not all(name.split("+")):
         raise InputError(f"{name!r} lacks a family; a mixture is NAME+NAME")
     parts = [BENCHMARKS[part][1] if part in BENCHMARKS else {part: {}} for part in name.split("+")]

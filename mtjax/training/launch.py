@@ -30,6 +30,8 @@ def check(config: RunConfig, start: Policy | None = None) -> None:
         InputError: family, agent, devices and flags do not go together.
     """
     family = config.family
+    if not config.runs:  # Path("") would be the working directory
+        raise InputError("--runs needs a folder; that of the command is --runs=.")
     sinks.require_libraries(config.tensorboard, config.wandb)
     _ = family.engine_name, family.table
     mesh.mesh_for(config.plan.seeds, family.train_count, config.training.num_envs)
