@@ -252,3 +252,14 @@ def test_pictures_change_nothing_else(step):
     twice = step(task(1), step(task(1), plain.state, LEFT).state, LEFT)
     np.testing.assert_allclose(after.obs["state"], twice.obs, atol=1e-6)
     assert after.obs["pixels"].shape == (16, 16, 1) and env.episode_length == 100
+
+
+def test_a_repeated_action_leaves_the_walker_at_the_box(step):
+    """Where the first of two steps has ended the episode: neither observation nor place are of a step after the end."""
+    env = TwoGoalMaze(vary={"goal-box": "0,1"}, split="none", repeat=2)
+    begun = state((0.0, 0.0), boxes=((2.4, 0), (-2, 2)))
+    once, again = step(task(0), begun, AHEAD), step(task(0), step(task(0), begun, AHEAD).state, AHEAD)
+    both = jax.jit(env.step)(task(0), begun, AHEAD)
+    assert once.terminated and both.terminated and both.reward == once.reward == 1
+    np.testing.assert_array_equal(both.obs, once.obs)
+    assert np.any(again.obs != once.obs)

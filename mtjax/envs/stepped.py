@@ -63,12 +63,14 @@ class Stepped(Family):
     def step(self, task: Task, state: Any, action: Array) -> Step:
         """Advance ``repeat`` control steps under ``action`` (A,) in [-1, 1]; observation and reward are those after it.
 
-        Rewards of repeated steps are summed, up to one that terminates the episode.
+        Rewards of repeated steps are summed, up to one that terminates the episode. There the world stands still, so
+        that observation and metrics are those of its end.
         """
 
         def once(_, carry: tuple[Any, Array, Array]) -> tuple[Any, Array, Array]:
-            state, total, over = carry
-            state = self.advance(task, state, action)
+            before, total, over = carry
+            moved = self.advance(task, before, action)
+            state = jax.tree.map(lambda new, old: jnp.where(over, old, new), moved, before)
             total += jnp.where(over, 0.0, self.reward(task, state, action))
             return state, total, over | self.terminates(task, state)
 

@@ -134,14 +134,13 @@ class CorridorMaze(Pictured):
         return Step(state, self.look_at(task, state), jnp.float32(0), jnp.bool_(False))
 
     def advance(self, task: Task, state: WalkerState, action: Array) -> WalkerState:
-        """Return the state after a turn and then a step. A walker at the goal stays there."""
+        """Return the state after a turn and then a step."""
         speed, turn = jnp.clip(action, -1.0, 1.0)
         heading = jnp.remainder(state.heading + turn * _TURN * self.step_seconds + math.pi, 2 * math.pi) - math.pi
         move = speed * _SPEED * self.step_seconds * jnp.stack([jnp.cos(heading), jnp.sin(heading)])
         place = _walk(task.model["walls"], state.place, move)
         gained = metres_left(task, state.place) - metres_left(task, place) if self.dense else jnp.float32(0)
-        arrived = self.terminates(task, state)
-        return jax.tree.map(lambda new, old: jnp.where(arrived, old, new), WalkerState(place, heading, gained), state)
+        return WalkerState(place, heading, gained)
 
     def reward(self, task: Task, state: WalkerState, action: Array) -> Array:
         """Return 1 at the goal, and with ``dense`` the metres gained, ()."""
