@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from dm_control import suite
 from PIL import Image
 
 import mtjax
@@ -21,6 +22,7 @@ from mtjax.envs.painters.caster import Caster
 from mtjax.envs.painters.poses import locate
 from mtjax.envs.painters.scene import Scene, observed
 from mtjax.envs.painters.shapes import SHAPES as KINDS
+from mtjax.report import render
 from mtjax.types import InputError
 
 DOMAINS = (
@@ -108,6 +110,47 @@ def test_pictures_are_those_of_mujocos_renderer(name):
         reference = np.asarray(Image.open(PICTURES / f"{name}-{i}.png"))
         assert similarity(picture, reference) > LEAST.get(name, 0.9)
         assert similarity(np.roll(picture, 3, axis=1), reference) < similarity(picture, reference) - 0.02
+
+
+# dm_control's task, and the camera that its pictures are published from: 0 but for the quadruped (DrQ-v2).
+SUITE = {name: (name.replace("ball-in-cup", "ball_in_cup").replace("point-mass", "point_mass"), 0) for name in DOMAINS}
+SUITE |= {"quadruped-walk": ("quadruped-walk", 2), "swimmer-swimmer15": ("swimmer-swimmer15", 0)}
+
+
+@pytest.mark.parametrize("name", SUITE)
+def test_cameras_and_lights_are_those_of_dm_control(name):
+    """In a state of play: places and directions, angles of view, and brightness. Targets have lights of their own."""
+    title, eye = SUITE[name]
+    domain, _, task = title.partition("-")
+    theirs = suite.load(domain, task.replace("-", "_"), {"random": 0}).physics
+    model = mtjax.make(name, engine="c").scene_model(0)
+    data = mujoco.MjData(model)
+    with theirs.reset_context():
+        theirs.data.qpos[7 if theirs.model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE else 0 :] += 0.1
+    data.qpos[:] = theirs.data.qpos
+    mujoco.mj_forward(model, data)
+    close = lambda ours, wanted: np.testing.assert_allclose(ours, wanted, atol=2e-3)
+    close(data.cam_xpos[0], theirs.data.cam_xpos[eye])
+    close(data.cam_xmat[0], theirs.data.cam_xmat[eye])
+    assert model.cam_fovy[0] == theirs.model.cam_fovy[eye] and model.nlight == theirs.model.nlight
+    for i in range(model.nlight):
+        height = slice(2 if theirs.model.id2name(i, "light") == "target_light" else 0, 3)  # above where the target is
+        close(data.light_xpos[i, height], theirs.data.light_xpos[i, height])
+        close(data.light_xdir[i], theirs.data.light_xdir[i])
+        for field in ("type", "diffuse", "specular", "ambient", "cutoff", "exponent"):
+            close(getattr(model, f"light_{field}")[i], getattr(theirs.model, f"light_{field}")[i])
+
+
+def test_a_target_s_light_hangs_above_it():
+    """In observations and in films."""
+    env = family("swimmer-swimmer6")
+    task, states = jax.tree.map(lambda x: x[0], env.tasks()), states_of("swimmer-swimmer6")
+    world = jax.tree.map(lambda x: x[0], states)
+    lamp = env.scene.model.light("target").id
+    np.testing.assert_allclose(env.see(task, world).lights[lamp][0], [*world.extra, 1.5])
+    model = env.scene_model(0)
+    render._place(model, env.marks(task, world))
+    np.testing.assert_allclose(model.light_pos[lamp], [*world.extra, 1.5])
 
 
 SHAPES = """

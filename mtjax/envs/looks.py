@@ -37,9 +37,12 @@ class Look(NamedTuple):
 
     camera: tuple[float, float, float]  # position [m]; it looks along +y, or down
     tilt: float  # [deg] up from looking straight down
+    turn: float = 0.0  # [deg] of the camera about z, to the left
     light: tuple[float, float, float] = (0.0, 0.0, 2.0)  # position [m] of a lamp that shines down
+    diffuse: float = 0.7  # of the light
     sun: bool = False  # whether the light is directional
     follow: str = ""  # the body whose centre of mass camera and light follow; their positions are from its frame
+    mounted: bool = False  # whether the light is mounted on that body, and turns with it
     fovy: float = 45.0  # [deg] angle of view
     colours: tuple[tuple[str, tuple[float, ...]], ...] = ()  # of geoms that are not as the model has them
 
@@ -65,10 +68,12 @@ def dress(spec: mujoco.MjSpec, look: Look | None, plain: bool) -> None:
     body = spec.body(look.follow) if look.follow else spec.worldbody
     follow = {"mode": _FOLLOW} if look.follow else {}
     if not spec.cameras:
-        body.add_camera(name="eye", pos=look.camera, quat=_about("x", look.tilt), fovy=look.fovy, **follow)
+        quat = _turned(_about("x", look.tilt), look.turn)
+        body.add_camera(name="eye", pos=look.camera, quat=quat, fovy=look.fovy, **follow)
     if not spec.lights:
         kind = _LIGHT.mjLIGHT_DIRECTIONAL if look.sun else _LIGHT.mjLIGHT_SPOT
-        body.add_light(name="light", pos=look.light, type=kind, diffuse=[0.6 if look.sun else 0.7] * 3, **follow)
+        follow = {} if look.mounted else follow
+        body.add_light(name="light", pos=look.light, type=kind, diffuse=[look.diffuse] * 3, **follow)
 
 
 def _paint_background(spec: mujoco.MjSpec, plain: bool) -> None:
@@ -97,7 +102,8 @@ def _survey(spec: mujoco.MjSpec) -> Look:
     slope = math.atan(0.5)
     away = _DISTANCE * model.stat.extent
     camera = centre + away * np.array([0, -math.cos(slope), math.sin(slope)])
-    return Look(tuple(camera), 90 - math.degrees(slope), tuple(np.add(centre, [0, 0, 2 * model.stat.extent])), sun=True)
+    above = centre + np.array([0, 0, 2 * model.stat.extent])
+    return Look(tuple(camera), 90 - math.degrees(slope), light=tuple(above), diffuse=0.6, sun=True)
 
 
 def _about(axis: str, degrees: float) -> np.ndarray:
@@ -106,19 +112,25 @@ def _about(axis: str, degrees: float) -> np.ndarray:
     return quat
 
 
+def _turned(quat: np.ndarray, degrees: float) -> np.ndarray:
+    """Return a rotation, turned about z."""
+    turned = np.zeros(4)
+    mujoco.mju_mulQuat(turned, _about("z", degrees), quat)
+    return turned
+
+
 # Parameters of looks. They edit scenes and never the physics.
 
 
 def _turn_camera(spec: mujoco.MjSpec, degrees: float) -> None:
-    camera, turned = spec.cameras[0], np.zeros(4)
+    camera = spec.cameras[0]
     quat = camera.quat
     if camera.alt.type != mujoco.mjtOrientation.mjORIENTATION_QUAT:
         quat = spec.copy().compile().cam_quat[0]
         camera.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
-    mujoco.mju_mulQuat(turned, _about("z", degrees), quat)
     cos, sin = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     x, y, z = camera.pos
-    camera.quat, camera.pos = turned, [cos * x - sin * y, sin * x + cos * y, z]
+    camera.quat, camera.pos = _turned(quat, degrees), [cos * x - sin * y, sin * x + cos * y, z]
 
 
 def _turn_hues(chosen: Callable[[mujoco.MjsGeom], bool]) -> Callable[[mujoco.MjSpec, float], None]:

@@ -35,7 +35,7 @@ GREY = (0.299, 0.587, 0.114)
 
 
 class Mark(NamedTuple):
-    """A geom of the scene whose place an episode decides, such as a target."""
+    """A geom of the scene whose place an episode decides, such as a target. A light of its name stays above it."""
 
     position: Array  # (3,) [m]
     size: Array | None = None  # (3,) None: the model's
@@ -102,7 +102,7 @@ class Pictured(Stepped):
         return jnp.zeros(0)
 
     def add_marks(self, spec: mujoco.MjSpec) -> None:
-        """Add geoms to the scene that the physics does not have."""
+        """Add geoms and lights to the scene that the physics does not have."""
 
     def marks(self, task: Task, state: Any) -> Mapping[str, Mark]:
         """Return the geoms of the scene whose places this episode has decided."""
@@ -132,8 +132,8 @@ class Pictured(Stepped):
         """Return the editable model of what is seen with these parameter values."""
         given = dict(values or {})
         spec = self.seen_spec(given)
-        self.add_marks(spec)
         looks.dress(spec, self.look, self.plain)
+        self.add_marks(spec)
         for name, value in given.items():
             parameter = self.every_parameter[name]
             if parameter.looks and parameter.edit is not None:
@@ -198,13 +198,17 @@ class Pictured(Stepped):
     def see(self, task: Task, state: Any) -> Poses:
         """Return the poses of all that a picture of the world shows."""
         poses = locate(self.scene.model, partial(self.scene_leaf, task), self.joints(state))
-        geoms, eye = poses.geoms, self.eye(task, state)
+        geoms, lights, eye = poses.geoms, dict(enumerate(poses.lights)), self.eye(task, state)
         for name, mark in self.marks(task, state).items():
             i = self.scene.model.geom(name).id
             put = lambda numbers, number, i=i: numbers.at[i].set(number)
             axes = geoms.axes if mark.along is None else jax.tree.map(put, geoms.axes, _frame(mark.along))
             geoms = Pose(jax.tree.map(put, geoms.position, tuple(mark.position)), axes)
-        return poses._replace(geoms=geoms, camera=poses.camera if eye is None else eye)
+            lamp = mujoco.mj_name2id(self.scene.model, mujoco.mjtObj.mjOBJ_LIGHT, name)
+            if lamp >= 0:
+                (_, _, height), direction = lights[lamp]
+                lights[lamp] = (*mark.position[:2], height), direction
+        return Poses(geoms, poses.camera if eye is None else eye, tuple(lights.values()))
 
     def draw(self, task: Task, state: Any) -> Array:
         """Return a picture (H, W, 3), or grey (H, W, 1), uint8 of a world."""

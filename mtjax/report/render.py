@@ -89,7 +89,7 @@ def write_video(path_stem: str | Path, frames: np.ndarray, fps: float) -> Path:
 
 
 def _place(model: mujoco.MjModel, marks: dict[str, Mark]) -> None:
-    """Put the geoms whose places an episode decides where they are. They belong to the world's body."""
+    """Put the geoms whose places an episode decides, and their lights, where they are. The world's body has them."""
     for name, mark in marks.items():
         geom = model.geom(name).id
         model.geom_sameframe[geom] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE  # else its place is not read
@@ -98,6 +98,9 @@ def _place(model: mujoco.MjModel, marks: dict[str, Mark]) -> None:
             model.geom_size[geom] = mark.size
         if mark.along is not None:
             mujoco.mju_quatZ2Vec(model.geom_quat[geom], np.float64(mark.along))
+        lamp = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_LIGHT, name)
+        if lamp >= 0:
+            model.light_pos[lamp, :2] = mark.position[:2]
 
 
 def _look(model: mujoco.MjModel, eye: Pose | None) -> None:

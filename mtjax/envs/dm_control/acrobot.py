@@ -56,7 +56,7 @@ class AcrobotSwingup(Domain):
     gpu_engine: ClassVar[str] = "mjx"
     default_iterations: ClassVar[int] = 1
     starts_untouched: ClassVar[bool] = True
-    look: ClassVar = Look((0, -6, 2), 90, (0, 0, 6), colours=(("lower_arm", SELF),))
+    look: ClassVar = Look((0, -6, 2), 90, light=(0, 0, 6), colours=(("lower_arm", SELF),))
 
     def start(self, task: Task, key: Key) -> tuple[Array, Array]:
         return start_joints(self.models[0], key), jnp.zeros(2)

@@ -65,7 +65,7 @@ class BallInCup(Domain):
     episode_steps: ClassVar[int] = 1000
     default_iterations: ClassVar[int] = 2
     starts_untouched: ClassVar[bool] = True
-    look: ClassVar = Look((0, -1, 0.8), 63.435, sun=True)
+    look: ClassVar = Look((0, -1, 0.8), 63.435, diffuse=0.6, sun=True)
 
     def add_marks(self, spec: mujoco.MjSpec) -> None:
         """Add the string as a thin capsule, since the physics has a tendon."""

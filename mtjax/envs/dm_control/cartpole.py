@@ -73,7 +73,7 @@ class CartpoleBalance(Domain):
     episode_steps: ClassVar[int] = 1000
     default_iterations: ClassVar[int] = 2
     starts_untouched: ClassVar[bool] = True
-    look: ClassVar = Look((0, -4, 1), 90, (0, 0, 6))
+    look: ClassVar = Look((0, -4, 1), 90, light=(0, 0, 6))
 
     def start(self, task: Task, key: Key) -> tuple[Array, Array]:
         position_key, velocity_key = jax.random.split(key)

@@ -126,7 +126,7 @@ class DogStand(Domain):
     default_iterations: ClassVar[int] = 6
     floor: ClassVar[float] = 15.0  # [m] half a side
     meshes: ClassVar[bool] = True
-    look: ClassVar = Look((0, -1.5, 0.8), 59.036, (0, 0, 3), follow="torso")
+    look: ClassVar = Look((0, -1.5, 0.8), 59.036, light=(0, 0, 3), follow="torso")
 
     def _read_model(self) -> mujoco.MjSpec:
         return _read_dog().copy()

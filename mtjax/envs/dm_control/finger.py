@@ -93,7 +93,7 @@ class FingerSpin(Domain):
     default_iterations: ClassVar[int] = 2
     warp_iterations: ClassVar[int] = 4
     starts_untouched: ClassVar[bool] = True
-    look: ClassVar = Look((0, -1, 0.8), 63.435, sun=True)
+    look: ClassVar = Look((0, -1, 0.8), 63.435, diffuse=0.6, sun=True)
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
         _set_spinner_damping(spec, 0.03)

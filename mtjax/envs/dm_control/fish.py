@@ -70,7 +70,7 @@ class FishUpright(Domain):
     episode_steps: ClassVar[int] = 1000
     default_iterations: ClassVar[int] = 1  # nothing is constrained
     starts_untouched: ClassVar[bool] = True
-    look: ClassVar = Look((0, 0, 0.9), 0, (0, 0, 0.4), follow="torso")
+    look: ClassVar = Look((0, 0, 0.9), 0, light=(0, 0, 0.5), diffuse=0.6, follow="torso")
 
     def start(self, task: Task, key: Key) -> tuple[Array, ...]:
         turn_key, joint_key = jax.random.split(key)

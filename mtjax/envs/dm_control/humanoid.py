@@ -75,7 +75,7 @@ class HumanoidStand(Domain):
     episode_steps: ClassVar[int] = 1000
     default_iterations: ClassVar[int] = 6
     starts_untouched: ClassVar[bool] = True  # it has no force sensors
-    look: ClassVar = Look((0, -3, 1), 63.435, follow="torso")
+    look: ClassVar = Look((-3, 0, 1), 63.435, turn=-90, follow="torso")
 
     def start(self, task: Task, key: Key) -> tuple[Array, Array]:
         model = self.models[0]

@@ -67,7 +67,7 @@ class PointMass(Domain):
     default_iterations: ClassVar[int] = 2
     starts_untouched: ClassVar[bool] = True
     relabels: ClassVar[tuple[str, ...]] = ("goal-x", "goal-y")
-    look: ClassVar = Look((0, 0, 0.75), 0, (0, 0, 1))
+    look: ClassVar = Look((0, 0, 0.75), 0, light=(0, 0, 1))
 
     def start(self, task: Task, key: Key) -> tuple[Array, Array]:
         return start_joints(self.models[0], key), jnp.zeros(2)

@@ -75,7 +75,7 @@ class QuadrupedWalk(Domain):
     num_substeps: ClassVar[int] = 4
     episode_steps: ClassVar[int] = 1000
     default_iterations: ClassVar[int] = 6
-    look: ClassVar = Look((0, -4, 2), 63.435, (0, 0, 4), follow="torso")
+    look: ClassVar = Look((0, 4, 2), 63.435, turn=180, light=(0, 0, 4), follow="torso")
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
         """Make the floor as long as a run at the family's own speed."""

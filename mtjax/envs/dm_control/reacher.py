@@ -64,7 +64,7 @@ class Reacher(Domain):
     starts_untouched: ClassVar[bool] = True
     relabels: ClassVar[tuple[str, ...]] = ("target-size", "target-angle", "target-radius")
     fresh_goals: ClassVar[bool] = True
-    look: ClassVar = Look((0, 0, 0.75), 0, (0, 0, 1))
+    look: ClassVar = Look((0, 0, 0.75), 0, light=(0, 0, 1))
 
     def start(self, task: Task, key: Key) -> tuple[Array, Array, Array]:
         """Draw positions and velocities of the joints, and the place of the target (2,) [m]."""

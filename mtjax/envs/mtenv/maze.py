@@ -97,7 +97,7 @@ class TwoGoalMaze(Pictured):
     episode_steps: ClassVar[int] = 200
     action_size: ClassVar[int] = 3
     step_seconds: ClassVar[float] = 0.2
-    look: ClassVar[Look | None] = Look(camera=(0.0, 0.0, 11.0), tilt=0.0, light=(0.0, 0.0, 8.0), sun=True)
+    look: ClassVar[Look | None] = Look(camera=(0.0, 0.0, 11.0), tilt=0.0, light=(0.0, 0.0, 8.0), diffuse=0.6, sun=True)
 
     def reset(self, task: Task, key: Key) -> Step:
         blue_key, red_key, walker_key, turn_key = jax.random.split(key, 4)
