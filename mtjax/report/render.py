@@ -36,10 +36,12 @@ def choose_backend() -> str:
     return os.environ.get("MUJOCO_GL", "")
 
 
-def film(env: Pictured, task_row: int, states: Any, width: int = 320, height: int = 240) -> np.ndarray:
+def film(
+    env: Pictured, task_row: int, states: Any, width: int = 320, height: int = 240, shadows: bool = True
+) -> np.ndarray:
     """Draw the task in row ``task_row`` of ``env.table`` in each of the states, leaves (H, ...).
 
-    The scene is that of observations from pixels, with shadows, and with goals that the agent does not see.
+    The scene is that of observations from pixels, by default with shadows, and with goals that the agent does not see.
 
     Returns:
         Frames (H, height, width, 3) uint8.
@@ -51,6 +53,7 @@ def film(env: Pictured, task_row: int, states: Any, width: int = 320, height: in
         raise InputError(f"there is no task {task_row}; this family has tasks 0 to {env.count - 1}")
     model = env.scene_model(task_row)
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+    model.light_castshadow &= shadows
     data, task = mujoco.MjData(model), jax.tree.map(lambda x: x[task_row], env.table.tasks)
     of_each = lambda state: (env.joints(state), env.marks(task, state), env.eye(task, state))
     shown = jax.tree.map(np.asarray, jax.vmap(of_each)(states))
