@@ -16,7 +16,7 @@ import mtjax.train
 from mtjax import agents, checks, cli, envs
 from mtjax.config import Plan, from_json, with_preset
 from mtjax.loop import Settings
-from mtjax.training import api, launch
+from mtjax.training import api, launch, memory
 from mtjax.types import InputError
 
 SMALL = {"num_envs": 2, "chunk_steps": 25, "batch_size": 4, "replay_size": 200, "warmup_steps": 5, "hidden": (8, 8)}
@@ -90,6 +90,15 @@ def test_nothing_is_overwritten(result, short_family, tmp_path):
     (tmp_path / "metrics.csv").write_text("mine")
     with pytest.raises(InputError, match=r"holds metrics\.csv"):
         mtjax.train("finger-short", "sac", directory=tmp_path)
+
+
+def test_a_refused_run_leaves_no_folder(short_family, tmp_path, monkeypatch):
+    """So that the same command with smaller numbers finds none in its way."""
+    monkeypatch.setattr(memory, "physical_bytes", lambda: 1e4)
+    for _ in range(2):
+        with pytest.raises(InputError, match="lower --"):
+            mtjax.train("finger-short", "sac", steps=1000, directory=tmp_path / "run")
+    assert not list(tmp_path.iterdir())
 
 
 def test_names_bring_the_tuned_settings_and_objects_their_own(monkeypatch):

@@ -331,6 +331,12 @@ def test_pictures_need_warm_up_steps_for_a_window():
         mtjax.train(Pictured(), mtjax.agent("drq"), steps=100, warmup_steps=5)
 
 
+def test_pictures_need_episodes_of_two_steps():
+    """The picture after a step that a time limit cuts off is nowhere, so of single steps none could be drawn."""
+    with pytest.raises(InputError, match=r"takes two steps; lower --env.repeat"):
+        mtjax.train("pendulum-swingup", "drq", pixels=16, repeat=1000, steps=20, num_envs=2, warmup_steps=10)
+
+
 @pytest.mark.parametrize("name", probes.slow_but(probes.OFF_POLICY, "sac", "distral", "care", "xqc", "hip-bmdp"))
 def test_every_agent_can_be_asymmetric(name):
     """Shapes alone: what one batch of pictures and states makes of a state is a state."""

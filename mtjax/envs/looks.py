@@ -153,6 +153,6 @@ LOOKS: Mapping[str, Parameter] = MappingProxyType(
         "camera-angle": Parameter("deg", 0.0, _turn_camera, -180.0, 180.0, looks=True),
         "hue": Parameter("deg", 0.0, _turn_hues(lambda geom: not _is_floor(geom)), -360.0, 360.0, looks=True),
         "floor-hue": Parameter("deg", 0.0, _turn_hues(_is_floor), -360.0, 360.0, looks=True),
-        "light": Parameter("1", 1.0, _scale_lights, -1e-9, looks=True),
+        "light": Parameter("1", 1.0, _scale_lights, looks=True),
     }
 )

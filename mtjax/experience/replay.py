@@ -91,6 +91,8 @@ class Replay:
         window = self.window(env.spec)
         if shown(env.spec.obs) and window > self.warmup_steps:
             raise InputError(f"{window} steps tell one transition of pictures; use warmup-steps of at least {window}")
+        if shown(env.spec.obs) and env.episode_length < 2:
+            raise InputError("the picture after an episode's last step is lost: it takes two steps; lower --env.repeat")
         if self.capacity(num_envs) < max(window, self.update_every) * num_envs:
             least = math.ceil(max(window, 1) / self.update_every) * self.update_every
             steps = "one step" if least == 1 else f"{least} steps"

@@ -57,6 +57,13 @@ def require_unused(directory: Path) -> None:
         raise InputError(f"{str(directory)!r} {holds}; give another directory, or resume=True to continue that run")
 
 
+def remove_unused(directory: Path) -> None:
+    """Remove the folder of a run that was refused before it began, so that it holds config.json alone."""
+    if [file.name for file in directory.iterdir()] == ["config.json"]:
+        (directory / "config.json").unlink()
+        directory.rmdir()
+
+
 def short_name(env_name: str) -> str:
     """Return an environment's name for folders and titles, shortened for mixtures of many families."""
     count = env_name.count("+") + 1

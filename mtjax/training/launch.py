@@ -13,7 +13,7 @@ from mtjax.parallel import hosts, mesh
 from mtjax.report import figures
 from mtjax.training import points, sinks
 from mtjax.training.finetune import require_fit
-from mtjax.training.folder import short_name
+from mtjax.training.folder import remove_unused, short_name
 from mtjax.training.policy import Policy, load
 from mtjax.training.result import Result
 from mtjax.training.run import fit_chunk, train
@@ -74,22 +74,27 @@ def launch(
     """Print what a run does, and train it in ``directory`` from the start or from its newest checkpoint."""
     if hosts.is_first() and not quiet:
         print(_introduction(config, directory, resume, label), flush=True)
-    return train(
-        config.family,
-        config.learner,
-        **dataclasses.asdict(config.plan),
-        settings=config.training,
-        start=start,
-        sweep=config.points,
-        directory=directory,
-        resume=resume,
-        profile=config.profile,
-        tensorboard=config.tensorboard,
-        wandb=config.wandb,
-        label=label,
-        quiet=quiet,
-        **hooks,
-    )
+    try:
+        return train(
+            config.family,
+            config.learner,
+            **dataclasses.asdict(config.plan),
+            settings=config.training,
+            start=start,
+            sweep=config.points,
+            directory=directory,
+            resume=resume,
+            profile=config.profile,
+            tensorboard=config.tensorboard,
+            wandb=config.wandb,
+            label=label,
+            quiet=quiet,
+            **hooks,
+        )
+    except InputError:
+        if directory is not None and not resume and hosts.is_first():
+            remove_unused(directory)
+        raise
 
 
 def _introduction(config: RunConfig, directory: Path | None, resume: bool, label: str) -> str:
