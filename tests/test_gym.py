@@ -241,10 +241,19 @@ def test_a_new_task_needs_a_reset():
 
 def test_mtenvs_names_are_understood():
     """MTEnv's finger family is the one of touch sizes, which it calls "size"."""
-    env = mtjax.gym.make("MT-HiPBMDP-Finger-Spin-vary-size-v0", engine="c")
+    env = mtjax.gym.make("MT-HiPBMDP-Finger-Spin-vary-size-v0", engine="c", pixels=0, repeat=1)
     assert env.reset()[1]["params"] == {"touch-size": pytest.approx(0.025)}
     known = {name for name in mtjax.gym.MTENV_IDS.values() if name in mtjax.ENVS}
     assert "finger-spin-vary-touch-size" in known and len(mtjax.gym.MTENV_IDS) == 8
+
+
+def test_families_of_hip_bmdp_are_seen_as_mtenv_shows_them():
+    """Three pictures of 84 x 84 pixels, and 500 steps of two control steps; without pictures the same steps."""
+    env = mtjax.gym.make("MT-HiPBMDP-Walker-Walk-vary-len-v0")
+    assert env.observation_space["env_obs"].shape == (84, 84, 9)
+    assert (env.family.repeat, env.family.episode_length) == (2, 500)
+    plain = mtjax.gym.make("MT-HiPBMDP-Walker-Walk-vary-len-v0", pixels=0)
+    assert plain.observation_space["env_obs"].shape == (24,) and plain.family.repeat == 2
 
 
 @pytest.mark.parametrize(

@@ -26,6 +26,7 @@ MTENV_IDS = {
     "MT-HiPBMDP-Walker-Walk-vary-friction-v0": "walker-walk-vary-friction",
     "MT-HiPBMDP-Walker-Walk-vary-len-v0": "walker-walk-vary-foot-length",
 }
+_SEEN, _AS_SEEN = "MT-HiPBMDP-", {"pixels": 84, "frames": 3, "repeat": 2}  # as MTEnv shows these families
 _METAWORLD = "MT-MetaWorld-"
 
 
@@ -88,12 +89,12 @@ def read_action(action: Any, space: spaces.Space) -> np.ndarray:
 
 
 def family_named(name: str, settings: dict[str, Any]) -> Env:
-    """Return the family with a name of mtjax or of MTEnv."""
+    """Return the family with a name of mtjax, or of MTEnv and then with its settings."""
     if name.startswith(_METAWORLD):
         raise InputError(f"{name}: each task of Meta-World is an environment here, such as 'metaworld-reach'")
     if name.startswith("MT-") and name not in MTENV_IDS:
         raise nearest_error("environment of MTEnv", name, MTENV_IDS)
-    family = envs.make(MTENV_IDS.get(name, name), **settings)
+    family = envs.make(MTENV_IDS.get(name, name), **(_AS_SEEN if name.startswith(_SEEN) else {}) | settings)
     require_family(family, "Gymnasium's environments have one space of observations and one of actions")
     return family
 
@@ -104,7 +105,8 @@ def make(
     """Return a family as a Gymnasium environment.
 
     Args:
-        name: a name of ``mtjax.make``, or one of ``MTENV_IDS``.
+        name: a name of ``mtjax.make``, or one of ``MTENV_IDS``. As in MTEnv, the families of HiP-BMDP then show
+            pictures of 84 x 84 and take each action for two steps; ``pixels=0`` shows the state.
         tasks: the split from which tasks are drawn: train, interpolation, extrapolation or all.
         task_obs: the observation of the task: "context", "id" or "none".
         render_mode: "rgb_array" for families that show pictures, or None.

@@ -48,7 +48,7 @@ def make_vec(
     """Return many worlds of a family as a Gymnasium vector environment.
 
     Args:
-        name: a name of ``mtjax.make``, or one of ``MTENV_IDS``.
+        name: a name of ``mtjax.make``, or one of ``MTENV_IDS`` (see ``mtjax.gym.make``).
         num_envs: number of worlds, spread evenly over the tasks.
         tasks: the split of the worlds' tasks: train, interpolation, extrapolation or all.
         task_obs: the observation of the task: "context", "id" or "none".
