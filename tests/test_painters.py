@@ -20,7 +20,7 @@ import mtjax
 from mtjax.envs.engines.base import World
 from mtjax.envs.painters.caster import Caster
 from mtjax.envs.painters.poses import locate
-from mtjax.envs.painters.scene import Scene, observed
+from mtjax.envs.painters.scene import Scene, field, observed
 from mtjax.envs.painters.shapes import SHAPES as KINDS
 from mtjax.report import render
 from mtjax.types import InputError
@@ -43,7 +43,7 @@ DOMAINS = (
     "walker-walk",
 )
 FURTHER = ("finger-turn-hard", "reacher-hard", "swimmer-swimmer15", "cheetah-run-looks")  # other sizes and colours
-LOOKS = {"hue": "0,100", "floor-hue": "0,80", "light": "1,0.5", "camera-angle": "0,25"}
+LOOKS = {"hue": "0,100", "floor-hue": "0,80", "sky-hue": "0,-60", "light": "1,0.5", "camera-angle": "0,25"}
 MAZES = ("corridor-maze", "two-goal-maze")
 QUICK = ("cartpole-swingup", "cheetah-run", "corridor-maze", "finger-turn-easy")
 TARGETS = {  # in states that are not of play
@@ -158,8 +158,8 @@ def test_cameras_and_lights_are_those_of_dm_control(name):
         height = slice(2 if theirs.model.id2name(i, "light") == "target_light" else 0, 3)  # above where the target is
         close(data.light_xpos[i, height], theirs.data.light_xpos[i, height])
         close(data.light_xdir[i], theirs.data.light_xdir[i])
-        for field in ("type", "diffuse", "specular", "ambient", "cutoff", "exponent"):
-            close(getattr(model, f"light_{field}")[i], getattr(theirs.model, f"light_{field}")[i])
+        for name in ("type", "diffuse", "specular", "ambient", "cutoff", "exponent"):
+            close(getattr(model, f"light_{name}")[i], getattr(theirs.model, f"light_{name}")[i])
 
 
 def test_a_target_s_light_hangs_above_it():
@@ -201,7 +201,7 @@ def moved_shapes(seed):
 
 
 def leaf_of(model):
-    return lambda name: jnp.asarray(getattr(model, name), jnp.float32)
+    return lambda name: jnp.asarray(field(model, name))
 
 
 @pytest.mark.parametrize("name", ["all-joints", "cheetah-run", "reacher-easy"])

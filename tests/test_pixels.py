@@ -97,14 +97,15 @@ def test_looks_change_what_is_seen_and_nothing_of_the_physics():
     assert env.varied == tuple(name for name, _ in vary) and tasks.context.shape == (2, 5)
 
 
-@pytest.mark.parametrize("name", ["hue", "camera-angle", "floor-hue", "light"])
+@pytest.mark.parametrize("name", ["hue", "camera-angle", "floor-hue", "sky-hue", "light"])
 def test_every_look_is_seen(name):
     env = pictured(vary=((name, "0.2:0.9:2" if name == "light" else "10:60:2"),), split="none")
     seen = dict(zip(env.tasks().scene, env.tasks().scene.values(), strict=True))
-    changed = {"hue": "geom_rgba", "floor-hue": "geom_rgba", "camera-angle": "cam_quat", "light": "light_diffuse"}
-    assert changed[name] in seen and not env.tasks().model
+    changed = {"camera-angle": "cam_quat", "sky-hue": "sky", "light": "light_diffuse"}
+    assert changed.get(name, "geom_rgba") in seen and not env.tasks().model
+    assert ("sky" in seen) == (name == "sky-hue")
     floor = env.scene.model.geom("ground").id
-    if name.endswith("hue"):
+    if changed.get(name) is None:
         rgba = np.asarray(seen["geom_rgba"])
         moved = np.any(rgba[0] != rgba[1], axis=-1)
         assert moved[floor] == (name == "floor-hue") and np.any(np.delete(moved, floor)) == (name == "hue")
@@ -121,6 +122,15 @@ def test_grey_and_plain_pictures():
     grey = play(pictured(grey=True), ())[0].obs["pixels"]
     assert grey.shape == (SIZE, SIZE, 1) and np.std(grey) > 1
     assert not pictured(plain=True).scene.tiles and pictured().scene.tiles
+
+
+def test_painter_warp_has_one_sky(monkeypatch):
+    """And a sky of another colour than the model's, if it is the same for all tasks."""
+    for name in ("is_nvidia", "warp_installed"):
+        monkeypatch.setattr(f"mtjax.envs.painters.base.{name}", lambda: True)
+    with pytest.raises(InputError, match=r"one sky for all tasks; use --env.painter=caster"):
+        pictured(painter="warp", vary=(("sky-hue", "0,90"),))
+    assert pictured(painter="warp", vary=(("sky-hue", "90"),)).values["sky-hue"][0] == 90
 
 
 def test_hidden_goals_are_not_drawn():

@@ -21,6 +21,7 @@ SELF, EFFECTOR, DECORATION, TARGET = (
     (0.3, 0.5, 0.7, 1.0),
     (0.6, 0.3, 0.3, 1.0),
 )
+SKY_HUE = "sky-hue"
 HIDDEN = 3  # a group that MuJoCo does not show unless asked to
 _FLOORS = ("ground", "floor")
 _FLOOR = (0.2, 0.3, 0.4)  # brighter tiles of the floor
@@ -136,10 +137,20 @@ def _turn_camera(spec: mujoco.MjSpec, degrees: float) -> None:
 def _turn_hues(chosen: Callable[[mujoco.MjsGeom], bool]) -> Callable[[mujoco.MjSpec, float], None]:
     def edit(spec: mujoco.MjSpec, degrees: float) -> None:
         for geom in filter(chosen, spec.geoms):
-            hue, saturation, value = colorsys.rgb_to_hsv(*geom.rgba[:3])
-            geom.rgba = [*colorsys.hsv_to_rgb((hue + degrees / 360) % 1, saturation, value), geom.rgba[3]]
+            geom.rgba = [*_turn_hue(geom.rgba[:3], degrees), geom.rgba[3]]
 
     return edit
+
+
+def _turn_sky(spec: mujoco.MjSpec, degrees: float) -> None:
+    for texture in spec.textures:
+        if texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX:
+            texture.rgb1, texture.rgb2 = _turn_hue(texture.rgb1, degrees), _turn_hue(texture.rgb2, degrees)
+
+
+def _turn_hue(rgb: np.ndarray, degrees: float) -> tuple[float, float, float]:
+    hue, saturation, value = colorsys.rgb_to_hsv(*rgb)
+    return colorsys.hsv_to_rgb((hue + degrees / 360) % 1, saturation, value)
 
 
 def _scale_lights(spec: mujoco.MjSpec, scale: float) -> None:
@@ -153,6 +164,7 @@ LOOKS: Mapping[str, Parameter] = MappingProxyType(
         "camera-angle": Parameter("deg", 0.0, _turn_camera, -180.0, 180.0, looks=True),
         "hue": Parameter("deg", 0.0, _turn_hues(lambda geom: not _is_floor(geom)), -360.0, 360.0, looks=True),
         "floor-hue": Parameter("deg", 0.0, _turn_hues(_is_floor), -360.0, 360.0, looks=True),
+        SKY_HUE: Parameter("deg", 0.0, _turn_sky, -360.0, 360.0, looks=True),
         "light": Parameter("1", 1.0, _scale_lights, looks=True),
     }
 )

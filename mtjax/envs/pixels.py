@@ -19,7 +19,7 @@ import numpy as np
 from mtjax.envs import looks
 from mtjax.envs.painters.base import PAINTERS, Painter, choose_painter
 from mtjax.envs.painters.poses import Pose, Poses, locate
-from mtjax.envs.painters.scene import LEAVES, Scene, observed
+from mtjax.envs.painters.scene import LEAVES, Scene, field, observed
 from mtjax.envs.painters.warp import WarpPainter
 from mtjax.envs.parameters import Parameter
 from mtjax.envs.stepped import Stepped
@@ -48,7 +48,7 @@ class Pictured(Stepped):
 
     pixels: int = 0
     """Observe pictures of so many pixels a side, such as 64 or 84, in place of the state. 0 observes the state. Then
-    camera-angle [deg], hue, floor-hue [deg] and light (a scale) can vary: --env.vary.hue=0:300:10."""
+    camera-angle [deg], hue, floor-hue, sky-hue [deg] and light (a scale) can vary: --env.vary.hue=0:300:10."""
     frames: int = 3
     """How many of the last pictures an agent sees at once."""
     grey: bool = False
@@ -80,7 +80,8 @@ class Pictured(Stepped):
     def _require_pictures(self) -> None:
         """Refuse what only pictures show, where there are none, and a painter that cannot run here."""
         if self.pixels:
-            choose_painter(self.painter, self.meshes)
+            if choose_painter(self.painter, self.meshes) is WarpPainter and looks.SKY_HUE in self.varied:
+                raise InputError("painter 'warp' has one sky for all tasks; use --env.painter=caster, or no sky-hue")
             return
         shown = [name for name, _ in self.vary if self.every_parameter[name].looks]
         shown += [
@@ -174,7 +175,7 @@ class Pictured(Stepped):
 
         def fields(values: dict[str, float]) -> dict[str, np.ndarray]:  # alone, as models hold textures
             model = self._observed(values)
-            return {name: np.asarray(getattr(model, name), np.float32) for name in LEAVES}
+            return {name: field(model, name) for name in LEAVES}
 
         rows = self.for_rows(fields, self.scenic)
         columns = {name: np.stack([row[name] for row in rows]) for name in LEAVES}
@@ -193,7 +194,7 @@ class Pictured(Stepped):
         """Return a field of the task's scene by its name in MuJoCo."""
         if task.scene is not None and name in task.scene:
             return task.scene[name]
-        return jnp.asarray(getattr(self.scene.model, name), jnp.float32)
+        return jnp.asarray(self.scene.field(name))
 
     def see(self, task: Task, state: Any) -> Poses:
         """Return the poses of all that a picture of the world shows."""

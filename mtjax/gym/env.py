@@ -26,7 +26,8 @@ MTENV_IDS = {
     "MT-HiPBMDP-Walker-Walk-vary-friction-v0": "walker-walk-vary-friction",
     "MT-HiPBMDP-Walker-Walk-vary-len-v0": "walker-walk-vary-foot-length",
 }
-_SEEN, _AS_SEEN = "MT-HiPBMDP-", {"pixels": 84, "frames": 3, "repeat": 2}  # as MTEnv shows these families
+_SEEN = "MT-HiPBMDP-"
+_AS_SEEN: dict[str, Any] = {"pixels": 84, "frames": 3, "repeat": 2}  # as MTEnv shows these families
 _METAWORLD = "MT-MetaWorld-"
 
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from mtjax.envs.painters.batch import flat_batch, in_chunks
 from mtjax.envs.painters.poses import Pose, Poses, Vector
-from mtjax.envs.painters.scene import Scene, Tiles
+from mtjax.envs.painters.scene import SKY, Scene, Tiles
 from mtjax.envs.painters.shapes import MISSED, SHAPES, Body, Rays, Shape, along, at, dot
 from mtjax.types import Array, InputError
 
@@ -40,6 +40,7 @@ class View(NamedTuple):
     lights: tuple[tuple[Vector, Vector], ...]  # position and direction of each
     strength: Array  # (lights, 3)
     up: Vector  # the world's z axis
+    sky: Array  # (degree + 1, 3) polynomials of the sine of the elevation, for the colours of the sky
     grid: Any = ()  # walls that are no bodies
 
 
@@ -128,7 +129,7 @@ class Caster:
             lights.append((place.position, place.axes[2]))
         up: Any = tuple(axis[2] for axis in eye.axes)
         bodies = Body(geoms.position, geoms.axes, size)
-        return View(bodies, leaf("geom_rgba")[shown, :3], tuple(lights), leaf("light_diffuse"), up)
+        return View(bodies, leaf("geom_rgba")[shown, :3], tuple(lights), leaf("light_diffuse"), up, leaf(SKY))
 
     @property
     def _pixel(self) -> float:
@@ -187,11 +188,11 @@ class Caster:
         return chosen
 
     def _sky(self, view: View) -> Vector:
-        """Return the colour of the sky, whose fits are polynomials of the sine of the elevation."""
+        """Return the colour of the sky."""
         height = along(self._rays, view.up) * (1 / np.sqrt(self._rays.square))
         colour = [jnp.float32(0)] * 3
-        for powers in self.scene.sky:
-            colour = [c * height + p for c, p in zip(colour, powers, strict=True)]
+        for i in range(len(view.sky)):
+            colour = [colour[c] * height + view.sky[i, c] for c in range(3)]
         return tuple(colour)
 
     def _paint(self, rgb: Vector, group: Group, body: Body, distance: Array) -> Vector:

@@ -11,8 +11,9 @@ import numpy as np
 
 from mtjax.envs.painters.poses import FIELDS, require_known
 
+SKY = "sky"
 # The fields in which the scenes of tasks may differ.
-LEAVES = (*FIELDS, "geom_size", "geom_rgba", "light_diffuse")
+LEAVES = (*FIELDS, "geom_size", "geom_rgba", "light_diffuse", SKY)
 GROUPS = 3  # MuJoCo shows geoms of the groups 0, 1 and 2
 _DEGREE = 7  # of the polynomials that the colours of the sky are fitted to
 _UNSET = np.array([0.5, 0.5, 0.5, 1], np.float32)  # MuJoCo's colour of a geom that takes its material's
@@ -36,6 +37,14 @@ class Scene:
     def __post_init__(self):
         require_known(self.model)
 
+    def field(self, name: str) -> np.ndarray:
+        """Return a field by its name in MuJoCo, or its "sky"."""
+        return self._sky if name == SKY else field(self.model, name)
+
+    @cached_property
+    def _sky(self) -> np.ndarray:
+        return field(self.model, SKY)
+
     @cached_property
     def shown(self) -> tuple[int, ...]:
         """Return the geoms that can be seen."""
@@ -46,27 +55,6 @@ class Scene:
         """Return how much of a light's highlight each geom shows (ngeom,), all with MuJoCo's default shininess."""
         model = self.model
         return np.where(model.geom_matid >= 0, np.append(model.mat_specular, 0.5)[model.geom_matid], 0.5)
-
-    @cached_property
-    def sky(self) -> np.ndarray:
-        """Return polynomials (degree + 1, 3) of the sine of the elevation, for the colours of the sky."""
-        model = self.model
-        found = np.flatnonzero(model.tex_type == _TEXTURE.mjTEXTURE_SKYBOX)
-        if not len(found):
-            return np.zeros((1, 3), np.float32)
-        texels = _texels(model, int(found[0]))
-        width = texels.shape[1]
-        line = (np.arange(width) + 0.5) / width * 2 - 1
-        faces = np.split(texels, len(texels) // width) if len(texels) > width else [texels] * 6
-        heights, colours = [], []
-        for i, face in enumerate(faces):
-            column, row = np.meshgrid(line, line)
-            up = {2: 1.0, 3: -1.0}.get(i)
-            sine = (-row if up is None else up) / np.sqrt(1 + column**2 + row**2)
-            heights.append(np.broadcast_to(sine, row.shape).ravel())
-            colours.append(face.reshape(-1, 3))
-        powers = np.vander(np.concatenate(heights), _DEGREE + 1)
-        return np.linalg.lstsq(powers, np.concatenate(colours), rcond=None)[0].astype(np.float32)
 
     @cached_property
     def tiles(self) -> Mapping[int, Tiles]:
@@ -104,6 +92,31 @@ def observed(model: mujoco.MjModel, hides: tuple[str, ...] = ()) -> mujoco.MjMod
         if model.geom_rgba[geom, 3] == 0 or model.geom(geom).name in hides:
             model.geom_group[geom] = GROUPS
     return model
+
+
+def field(model: mujoco.MjModel, name: str) -> np.ndarray:
+    """Return a field of a scene by its name in MuJoCo, or its "sky"."""
+    return np.asarray(_fit_sky(model) if name == SKY else getattr(model, name), np.float32)
+
+
+def _fit_sky(model: mujoco.MjModel) -> np.ndarray:
+    """Return polynomials (degree + 1, 3) of the sine of the elevation, for the colours of the sky."""
+    found = np.flatnonzero(model.tex_type == _TEXTURE.mjTEXTURE_SKYBOX)
+    if not len(found):
+        return np.zeros((1, 3), np.float32)
+    texels = _texels(model, int(found[0]))
+    width = texels.shape[1]
+    line = (np.arange(width) + 0.5) / width * 2 - 1
+    faces = np.split(texels, len(texels) // width) if len(texels) > width else [texels] * 6
+    heights, colours = [], []
+    for i, face in enumerate(faces):
+        column, row = np.meshgrid(line, line)
+        up = {2: 1.0, 3: -1.0}.get(i)
+        sine = (-row if up is None else up) / np.sqrt(1 + column**2 + row**2)
+        heights.append(np.broadcast_to(sine, row.shape).ravel())
+        colours.append(face.reshape(-1, 3))
+    powers = np.vander(np.concatenate(heights), _DEGREE + 1)
+    return np.linalg.lstsq(powers, np.concatenate(colours), rcond=None)[0]
 
 
 def _texels(model: mujoco.MjModel, texture: int) -> np.ndarray:
