@@ -1,5 +1,6 @@
 """Stacks of pictures: in rollouts, in the replay and in agents. ``envs/probes.py`` has a probe that is seen."""
 
+import dataclasses
 import re
 from functools import partial
 
@@ -82,6 +83,70 @@ def test_windows_become_the_transitions_of_a_plain_list(count, n_step):
         np.testing.assert_allclose([found.reward[i], found.discount[i]], [reward, discount], rtol=1e-6)
         if after is not None:
             np.testing.assert_array_equal(found.next_obs["pixels"][i], after)
+
+
+@dataclasses.dataclass(frozen=True)
+class SeenWalk(probes.Walk):
+    """A walk whose picture tells the episode, which is one of 250, and its age."""
+
+    @property
+    def spec(self):
+        return super().spec._replace(obs=jax.eval_shape(self.show, super().spec.obs), frames=3)
+
+    def start(self, task, key):
+        return jax.random.randint(key, (1,), 0, 250) / 256.0
+
+    def show(self, obs):
+        told = jnp.stack([obs[0] % 1 * 256, obs[0] // 1]).astype(jnp.uint8)
+        return {"pixels": jnp.broadcast_to(told, (2, 2, 2)), "state": obs}
+
+    def reset(self, task, key):
+        step = super().reset(task, key)
+        return step._replace(obs=self.show(step.obs))
+
+    def step(self, task, state, action):
+        step = super().step(task, state, action)
+        return step._replace(obs=self.show(step.obs))
+
+
+@dataclasses.dataclass(frozen=True)
+class SightAuditor(probes.Stub):
+    """Notes how far drawn transitions are from those of the walks that their states name."""
+
+    n: int = 3
+
+    def init(self, spec, tasks, key):
+        return jnp.float32(0.5)  # its discount
+
+    def join_steps(self, state, steps, tasks, join):
+        return jax.vmap(lambda steps: join(steps, state))(steps)
+
+    def unlike(self, obs, place):
+        """How far the pictures of a stack (..., 2, 2, 6) are from those of the last steps up to a place (...)."""
+        ages = jnp.maximum(place[..., None] // 1 - jnp.array([2, 1, 0]), 0)
+        expected = jnp.stack([jnp.broadcast_to(place[..., None] % 1 * 256, ages.shape), ages], axis=-1)
+        return jnp.max(jnp.abs(obs["pixels"].reshape(*place.shape, 4, 3, 2) - expected[..., None, :, :]), (-3, -2, -1))
+
+    def update(self, state, batch, tasks, key):
+        place, after = batch.obs["state"][..., 0], batch.next_obs["state"][..., 0]
+        count = jnp.round(after - place)
+        powers = jnp.where(jnp.arange(self.n) < count[..., None], state ** jnp.arange(self.n), 0)
+        reward = jnp.sum(powers * (place[..., None] + jnp.arange(self.n)), axis=-1) * tasks.goal["scale"][:, None]
+        terminated = (place % 1 < 0.5) & (after // 1 == 3)
+        wrong = jnp.abs(batch.reward - reward) + (count > self.n) + (after >= 5)  # the last picture is lost
+        wrong += jnp.abs(batch.discount - jnp.where(terminated, 0, state ** (count - 1)))
+        wrong += self.unlike(batch.obs, place) + jnp.where(terminated, 0, self.unlike(batch.next_obs, after))
+        return state, {"wrong": jnp.max(wrong, axis=1), "first": jnp.mean(place < 1, axis=1)}
+
+
+@pytest.mark.parametrize("n_step", (1, 3))
+def test_the_loop_draws_the_stacks_that_agents_have_seen(n_step):
+    """Over two seeds, a ring that wraps around, and staggered episodes that terminate or are cut off."""
+    settings = {"num_envs": 4, "batch_size": 32, "replay_size": 44, "warmup_steps": 7, "chunk_steps": 40}
+    env, agent = SeenWalk(), SightAuditor(n=n_step)
+    _, (metrics,) = probes.train(env, agent, {**settings, "n_step": n_step, "stagger": True}, seeds=(0, 1))
+    np.testing.assert_allclose(metrics["wrong"], 0, atol=1e-4)
+    assert np.all((metrics["first"] > 0.1) & (metrics["first"] < 0.5))
 
 
 def test_a_replay_keeps_the_newest_picture_and_all_of_what_comes_beside():
