@@ -429,7 +429,9 @@ def test_a_run_that_is_killed_ends_as_any_other(tmp_path):
     assert outcome(folder_in(broken)) == outcome(folder_in(whole))
 
 
-@pytest.mark.parametrize("name", ["ball-in-cup-catch", "cheetah-run", "finger-turn-easy", "walker-walk"])
+@pytest.mark.parametrize(
+    "name", ["ball-in-cup-catch", "cheetah-run", "finger-turn-easy", "swimmer-swimmer6", "walker-walk"]
+)
 def test_warp_draws_what_the_caster_draws(name):
     """Every task with a colour and a camera of its own, inside a scan that also draws the starts of episodes."""
     vary = {"hue": "0,90", "camera-angle": "-20,20"}

@@ -296,15 +296,16 @@ def test_a_shape_that_the_caster_does_not_know_is_refused():
 
 @pytest.mark.slow
 @pytest.mark.skipif(find_spec("warp") is None, reason="Warp is not installed")
-def test_warp_draws_what_the_caster_draws():
-    """On a CPU, where Warp is slow; nested maps, and tasks with colours and cameras of their own."""
+@pytest.mark.parametrize("name", ["finger-turn-easy", "swimmer-swimmer6"])
+def test_warp_draws_what_the_caster_draws(name):
+    """On a CPU, where Warp is slow; nested maps, tasks with colours and cameras of their own, a light that moves."""
     from mtjax.envs.painters.warp import WarpPainter
 
     varied = {"hue": "0,90", "camera-angle": "-20,20"}
-    env = mtjax.make("finger-turn-easy", pixels=SIZE, vary=varied, combine="paired", split="none")
+    env = mtjax.make(name, pixels=SIZE, vary=varied, combine="paired", split="none")
     other = dataclasses.replace(env, frames=4)  # unequal, so that it is traced anew
     other.__dict__["artist"] = WarpPainter(env.scene, SIZE)
-    states = jax.tree.map(lambda x: jnp.stack([x, x[::-1]]), states_of("finger-turn-easy"))
+    states = jax.tree.map(lambda x: jnp.stack([x, x[::-1]]), states_of(name))
     ours, theirs = (np.asarray(jax.jit(jax.vmap(jax.vmap(e.draw, (None, 0))))(e.tasks(), states)) for e in (env, other))
     for i in np.ndindex(2, 2):
         assert similarity(ours[i], theirs[i]) > 0.95

@@ -71,7 +71,10 @@ class Caster:
             shape = mujoco.mjtGeom(odd).name.removeprefix("mjGEOM_").lower()
             raise InputError(f"painter 'caster' knows no {shape}; use --env.painter=warp on an NVIDIA GPU")
         if len(kinds) > _MOST:
-            raise InputError(f"painter 'caster' draws at most {_MOST} geoms, and this scene has {len(kinds)}")
+            raise InputError(
+                f"painter 'caster' draws at most {_MOST} geoms, and this scene has {len(kinds)}; "
+                "use --env.painter=auto in a maze, elsewhere --env.painter=warp on an NVIDIA GPU"
+            )
 
     def paint(self, leaf: Callable[[str], Array], poses: Poses) -> Array:
         """Return the picture (H, W, 3) uint8 of one world.
