@@ -27,8 +27,9 @@ class Autoencoder(Encoded):
 
     phibar, with its projection, moves by ``encoder_tau``.
 
-    Differs from the paper: one optimiser steps encoder, decoder and critics together, at every update; the decay of the
-    decoder is a part of the loss.
+    Differs from the paper: one optimiser steps encoder, decoder and critics together, at every update, and actor and
+    targets move at every update, there at every second; the decay of the decoder is a part of the loss; batches and
+    rates are those of all agents here, where the paper has batches of 128 and temperatures that begin at 0.1.
     """
 
     shift: int = 0
