@@ -16,7 +16,8 @@ class Stepped(Family):
     """A family that says how a world moves, and what of it is observed and rewarded. An action may be repeated."""
 
     repeat: int = 1
-    """Take every action for so many control steps and sum their rewards. Episodes last as long as before."""
+    """Take every action for so many control steps and sum their rewards. Episodes last as long as before. Agents
+    discount once for all of these steps, and success is that after the last."""
 
     step_seconds: ClassVar[float]  # length of a control step [s]
 
