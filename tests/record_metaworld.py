@@ -5,6 +5,10 @@ so it runs in an environment of its own and imports nothing of mtjax:
 
     python tests/record_metaworld.py [NAME ...]
 
+NAME may be ``goals``, and then writes tests/data/metaworld-goals.npz: the first and the last goal (T, 2, 6) that each
+benchmark of BENCHMARKS draws for its seed, of every task in the benchmark's order, training tasks first. A vector of
+three numbers ends with zeros. MT1-push is a single task's.
+
 Each task has two episodes of its scripted policy, the second with noise on its actions. Every environment is new and
 has been reset once, so that no earlier episode is felt. Windows of a few steps in a row are kept, evenly from the start
 to just after the first success. Then come states that are posed, not simulated: things at the goal or about where they
@@ -41,6 +45,7 @@ WINDOWS, WINDOW, POSES = 5, 3, 11
 PRESSED = ("stick-push-v3",)
 NOISE = (0.0, 0.3)
 LONGEST = 300
+BENCHMARKS = {"MT10": 0, "MT25": 1, "MT50": 1, "ML10": 3, "ML45": 1}  # and their seeds
 ALWAYS = ("_target_pos", "obj_init_pos", "init_tcp")
 UNREAD = "init_(qpos|qvel)|_?prev_obs|_last_rand_vec|max[A-Z]|.*[hH]eight|target_reward"  # but by the first rewards
 ROBOT = {"leftpad", "rightpad", "rightEndEffector", "leftEndEffector", "hand", "mocap"}
@@ -235,7 +240,27 @@ def record(name):
     return f"{len(kept)} steps kept of " + " and ".join(ended) + f"; {file.stat().st_size / 1000:.1f} kB; live: {live}"
 
 
+def record_goals():
+    """Record the benchmarks' goals and return how many tasks they have, in words."""
+    found = {f"{name.lower()}-{seed}": getattr(metaworld, name)(seed=seed) for name, seed in BENCHMARKS.items()}
+    found["push-3"] = metaworld.MT1("push-v3", seed=3)
+    data = {name: np.concatenate([ends(of.train_tasks), ends(of.test_tasks)]) for name, of in found.items()}
+    np.savez_compressed(FOLDER.parent / "metaworld-goals.npz", **data)
+    return ", ".join(f"{name} {len(goals)}" for name, goals in data.items())
+
+
+def ends(tasks):
+    """Return the first and the last of every environment's goals (T, 2, 6)."""
+    goals = {}
+    for task in tasks:
+        vec = pickle.loads(task.data)["rand_vec"]
+        goals.setdefault(task.env_name, []).append(np.pad(vec, (0, 6 - len(vec))))
+    return np.array([[of[0], of[-1]] for of in goals.values()]).reshape(-1, 2, 6)
+
+
 if __name__ == "__main__":
     FOLDER.mkdir(parents=True, exist_ok=True)
+    if sys.argv[1:] == ["goals"]:
+        sys.exit(print(record_goals()))
     for task in sys.argv[1:] or [name.removesuffix("-v3") for name in ALL_V3_ENVIRONMENTS]:
         print(f"{task}: {record(f'{task}-v3')}", flush=True)

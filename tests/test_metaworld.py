@@ -136,6 +136,35 @@ def test_goals_differ_by_the_seed_of_tasks_and_may_be_hidden():
 
 
 @with_scenes
+@pytest.mark.parametrize("name, seed", [("mt10", 0), ("mt25", 1), ("mt50", 1), ("ml10", 3), ("ml45", 1)])
+def test_goals_are_those_of_the_originals_benchmark_for_a_seed(name, seed):
+    """Number for number: the first and the last goal of every task, which depend on all that were drawn before."""
+    with np.load(DATA.parent / "metaworld-goals.npz") as file:
+        recorded = file[f"{name}-{seed}"]
+    families = mtjax.make(name, task_seed=seed).families
+    assert len(recorded) == len(families)
+    for family, expected in zip(families, recorded, strict=True):
+        vectors = family.vectors()
+        size = vectors.shape[1]
+        np.testing.assert_array_equal(vectors[[0, -1]], expected[:, :size])
+        assert vectors.shape == (50, size) and not expected[:, size:].any()
+
+
+@with_scenes
+def test_goals_of_a_task_alone_are_those_of_mt1():
+    with np.load(DATA.parent / "metaworld-goals.npz") as file:
+        alone, tasks_of_mt10 = file["push-3"][0], file["mt10-0"]
+    push = mtjax.make("metaworld-push", task_seed=3)
+    np.testing.assert_array_equal(push.vectors()[[0, -1]], alone)
+    of_benchmark = mtjax.make("metaworld-push", benchmark="mt10", task_seed=0)  # its second task
+    np.testing.assert_array_equal(of_benchmark.vectors()[[0, -1]], tasks_of_mt10[1])
+    with pytest.raises(InputError, match="did you mean 'mt10'"):
+        mtjax.make("metaworld-push", benchmark="mt1O")
+    with pytest.raises(InputError, match="ml10 does not have the task soccer"):
+        mtjax.make("metaworld-soccer", benchmark="ml10")
+
+
+@with_scenes
 def test_refused_settings_are_named(monkeypatch):
     with pytest.raises(InputError, match="mjx"):
         mtjax.make("metaworld-reach", engine="mjx")
@@ -165,10 +194,10 @@ def test_benchmarks_have_the_tasks_of_the_original():
         return
     text = (Path(source.submodule_search_locations[0]) / "env_dict.py").read_text()
     of = lambda part: [word.strip(' ",').removesuffix("-v3") for word in part.splitlines() if "-v3" in word]
-    listed = {name: of(text.split(f"\n{name.upper()}_V3 = ")[1].split("\n)\n")[0]) for name in ("mt10", "mt25", "ml10")}
-    assert set(of(text.split("ALL_V3_ENVIRONMENTS = ")[1].split("\n)\n")[0])) == set(TASKS)
-    for name, expected in listed.items():
-        assert [family.removeprefix("metaworld-") for family in BENCHMARKS[name][1]] == expected
+    for name, (_, own) in BENCHMARKS.items():  # in the same order, as one stream draws all goals
+        table = "ALL_V3_ENVIRONMENTS" if name == "mt50" else f"{name.upper()}_V3"
+        expected = of(text.split(f"\n{table} = ")[1].split("\n)\n")[0])
+        assert [family.removeprefix("metaworld-") for family in own] == expected
 
 
 @with_scenes
@@ -181,6 +210,7 @@ def test_a_benchmark_is_a_mixture_by_a_name(tmp_path):
     assert [family.held_out for family in env.families] == [False] * 10 + [True] * 5
     (tmp_path / "config.json").write_text(to_json(program, {"command": "x"}))
     assert from_json(tmp_path / "config.json") == program
+    assert env.labels("train")[0] == "metaworld-reach" and env.describe(0) == "metaworld-reach"  # draws are no tasks
     assert name_of(mtjax.make("mt10")) == "mt10" and name_of(env).startswith("metaworld-reach+")
     with pytest.raises(InputError, match="did you mean 'mt10'"):
         mtjax.make("mt1O")

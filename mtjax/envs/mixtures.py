@@ -386,15 +386,14 @@ class Mixture(Tabled):
         found = [""] * len(self.table.rows[split])
         for part in self.parts:
             own, axis = part.family.labels(split), part.family.task_axis[0]
-            alone = len(part.family.table.tasks.id) == 1
             for place, label in zip(part.places[split], own, strict=True):
-                found[place] = part.name if alone else f"{part.name} {axis}={label}"
+                found[place] = part.name if _has_one_task(part.family) else f"{part.name} {axis}={label}"
         return found
 
     def describe(self, row: int) -> str:
         """Return the task of a row as text: its family and its varied parameters."""
         i, own = self._place(row)
-        alone = len(self.families[i].table.tasks.id) == 1
+        alone = _has_one_task(self.families[i])
         return self.names[i] if alone else f"{self.names[i]} {self.families[i].describe(own)}"
 
     @property
@@ -425,6 +424,11 @@ def require_family(env: Any, reason: str) -> None:
     """
     if isinstance(env, Mixture):
         raise InputError(f"{reason}, and {'+'.join(env.names)} is a mixture; take one family")
+
+
+def _has_one_task(family: Family) -> bool:
+    """Return whether a family's name says which of its tasks is meant. Goals that episodes draw are no tasks."""
+    return not family.varied and sum(map(len, family.table.rows.values())) == 1
 
 
 def _merged(runs: list[tuple[int, int]]) -> tuple[tuple[int, int], ...]:

@@ -16,14 +16,16 @@ from mtjax.envs.domain import Domain, stack_differing
 from mtjax.envs.engines.base import World, choose_engine
 from mtjax.envs.metaworld import scene
 from mtjax.envs.metaworld.at import At
+from mtjax.envs.metaworld.goals import draw_goals
 from mtjax.envs.metaworld.host import SUBSTEPS, Host
+from mtjax.envs.metaworld.names import TASKS, listed_with
 from mtjax.envs.pixels import Mark
 from mtjax.envs.variation import Variation
+from mtjax.names import load
 from mtjax.types import SPLITS, Array, InputError, Key, Step, Task
 
 _STEP = 0.01  # [m] that an action of 1 moves the hand's target
 _DOWN = (1.0, 0.0, 1.0, 0.0)
-_MOST_DRAWS = 1000
 _NOT_MJX = (
     "engine 'mjx' cannot compute Meta-World's cylinders on boxes; use --engine=c on a CPU, or warp on an NVIDIA GPU "
     "(pip install 'mtjax[warp]')"
@@ -53,12 +55,16 @@ class Sawyer(Domain):
         the force that closes the gripper.
     Reward: Meta-World's second version, from 0 to 10.
     Metrics: success (0 or 1) after the step.
-    Start: the settled hand, and the things as one of ``num_draws`` goals has them; each episode draws a goal.
+    Start: the settled hand, and the things as one of ``num_draws`` goals has them; each episode draws a goal. With 50
+        they are the goals of Meta-World's benchmark of the seed ``task_seed``, number for number.
     Episode: 500 steps of 0.0125 s (five substeps); it never terminates.
     """
 
     num_draws: int = 50
     """Number of goals. Each episode draws one of them."""
+    benchmark: str = ""
+    """The benchmark whose goals these are: mt10, mt25, mt50, ml10 or ml45. Each has other goals of the same seed.
+    Without a name they are those of Meta-World's MT1, and of ML1's training; of ML1's test with ``task_seed`` + 1."""
     goal_hidden: bool = False
     """Observe zeros in place of the goal, as in the benchmarks of meta-learning."""
     held_out: bool = False
@@ -88,6 +94,8 @@ class Sawyer(Domain):
         scene.folder()
         if self.vary:
             raise InputError(f"Meta-World's tasks vary in their goals only, not in {next(iter(dict(self.vary)))}")
+        if self.benchmark:
+            listed_with(self.benchmark, self._task)
         super().__post_init__()
         if self.engine == "mjx":
             raise InputError(_NOT_MJX)
@@ -142,20 +150,18 @@ class Sawyer(Domain):
         return "extrapolation" if self.held_out else "train"
 
     def vectors(self) -> np.ndarray:
-        """Draw the vectors (P, K) of all goals.
+        """Return the vectors (P, K) of all goals."""
+        if not self.benchmark:
+            return draw_goals((self,), self.task_seed, self.num_draws)[0]
+        names = listed_with(self.benchmark, self._task)
+        tasks = tuple(load(f"mtjax.envs.metaworld.{TASKS[name]}")() for name in names)
+        return draw_goals(tasks, self.task_seed, self.num_draws)[names.index(self._task)]
 
-        Raises:
-            RuntimeError: hardly any vector is allowed.
-        """
-        random, (low, high) = np.random.default_rng(self.task_seed), np.asarray(self.drawn)
-        found: list[np.ndarray] = []
-        for _ in range(_MOST_DRAWS * self.num_draws):
-            vec = random.uniform(low, high)
-            if self.allowed(vec):
-                found.append(vec)
-            if len(found) == self.num_draws:
-                return np.stack(found)
-        raise RuntimeError(f"{type(self).__name__} allows hardly any goal")
+    @property
+    def _task(self) -> str:
+        """Return the task's name in Meta-World."""
+        place = f"{type(self).__module__.rpartition('.')[2]}:{type(self).__name__}"
+        return next((name for name, known in TASKS.items() if known == place), type(self).__name__)
 
     @cached_property
     def starts_of_goals(self) -> tuple[Start, ...]:
