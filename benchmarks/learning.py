@@ -102,7 +102,7 @@ def main() -> None:
     parser.add_argument("--eval-episodes", type=int, default=10)
     parser.add_argument("--env", nargs="*", default=[], metavar="NAME=VALUE", help="settings of families: pixels=64")
     parser.add_argument("--vary", nargs="*", default=[], metavar="NAME=VALUES", help="besides what the family varies")
-    parser.add_argument("--training", nargs="*", default=[], metavar="NAME=N", help="such as num_envs=64")
+    parser.add_argument("--training", nargs="*", default=[], metavar="NAME=VALUE", help="of the loop or all agents")
     parser.add_argument("--mark", type=float, default=900.0, help="the return whose time is told")
     parser.add_argument("--baseline", default="sac-conditioned", metavar="NAME", help="what differences are against")
     parser.add_argument("--unfinished", action="store_true", help=UNFINISHED)
@@ -131,7 +131,7 @@ def trained(arguments: argparse.Namespace, env: str, agent: str, folder: Path) -
     program = mtjax.preset(env, agent, arguments.preset, seeing(agent, settings), **settings)
     given = trial.replay_steps if isinstance(program.learner.experience, Replay) else trial.rollout_steps
     steps = arguments.steps or given or program.plan.steps
-    training = {name: int(value) for name, value in (pair.split("=", 1) for pair in arguments.training)}
+    training = {name: value(x) for name, x in (pair.split("=", 1) for pair in arguments.training)}
     return train(
         folder,
         program.family,

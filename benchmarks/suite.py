@@ -1,7 +1,7 @@
 """Run a suite of tasks by its name, with its protocol: agents, seeds, steps, and the figures that the field reports.
 
     python benchmarks/suite.py mt10|mt50|dynamics|goals|domains|hard|pixels|looks [--agents NAME ...] [--seeds N]
-                               [--steps-per-task N] [--training NAME=N ...] [--env NAME=VALUE ...] [--unfinished]
+                               [--steps-per-task N] [--training NAME=VALUE ...] [--env NAME=VALUE ...] [--unfinished]
                                [--out DIR]
 
 ``--list`` prints the protocols. Every pair of environment and agent writes ``DIR/ENV/AGENT.csv`` (training over steps
@@ -14,6 +14,8 @@ training task and seed of the last evaluation) and, for suites that compare one 
 steps, to it and to ``tasks.csv``.
 
 Success is that of the last evaluation: at the episode's last step, and at any step. Both are shares of episodes.
+``care`` is told its task as all agents are, in Meta-World by its number. As published it reads what the task asks for:
+``--agents care --training conditioning=text text=MODEL``, for a model of sentence-transformers.
 """
 
 import argparse
@@ -147,7 +149,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps-per-task", type=int, help="by default the suite's")
     parser.add_argument("--preset", default="auto")
-    parser.add_argument("--training", nargs="*", default=[], metavar="NAME=N", help="such as num_envs=64")
+    parser.add_argument("--training", nargs="*", default=[], metavar="NAME=VALUE", help="of the loop or all agents")
     parser.add_argument("--env", nargs="*", default=[], metavar="NAME=VALUE", help="settings of families: pixels=64")
     parser.add_argument("--evaluations", type=int, default=4)
     parser.add_argument("--eval-episodes", type=int, default=50, help="of each task; Meta-World's tasks have 50 goals")
@@ -159,6 +161,7 @@ def main() -> None:
         return
     enable_compile_cache()
     suite = SUITES[arguments.suite]
+    suite = dataclasses.replace(suite, settings=(*suite.settings, *arguments.env))
     out = arguments.out or Path("runs") / f"{arguments.suite}-{time.strftime('%Y%m%d-%H%M%S')}"
     for env in arguments.envs or suite.envs:
         for agent in suite.agents if arguments.agents is None else arguments.agents:
@@ -176,7 +179,7 @@ def request(arguments: argparse.Namespace, suite: Suite, env: str, out: Path) ->
     """Return what ``learning.learn`` reads: the suite's protocol, and what was given beside it."""
     steps = (arguments.steps_per_task or suite.steps_per_task) * family_of(suite, env).train_count
     given = {"seeds": arguments.seeds or suite.seeds, "steps": steps, "split": suite.split, "out": out}
-    given |= {"env": [*suite.settings, *arguments.env], "vary": [*suite.vary]}
+    given |= {"env": [*suite.settings], "vary": [*suite.vary]}
     return argparse.Namespace(**{**vars(arguments), **given})
 
 
@@ -225,7 +228,7 @@ def sharing(out: Path, suite: Suite) -> str:
     """Return a table of every task: one agent for all tasks against one for this task."""
     pairs = {(env, agent): last for env, agent, last in found(out, suite)}
     lines = []
-    for agent in suite.agents:
+    for agent in dict.fromkeys(agent for _, agent in pairs):
         for task in suite.together.split("+"):
             shared, alone = pairs.get((suite.together, agent)), pairs.get((task, agent))
             if shared is None or alone is None:

@@ -326,6 +326,10 @@ def test_a_suite_reports_success_and_what_sharing_is_worth(script, tmp_path):
     assert "| walker-walk | brc | 10 [10, 10] | 25 [25, 25] | -15 [-15, -15] |" in sharing
     assert "| walker-run | brc | 30 [30, 30] | 25 [25, 25] | +5 [+5, +5] |" in sharing
     assert len((tmp_path / "tasks.csv").read_text().splitlines()) == 1 + 3 * 4
+    for env, evaluations in found.items():  # of an agent that the suite does not have by itself
+        save_evaluations(tmp_path / env / "sac.npz", evaluations)
+    suite.tabulate(tmp_path, suite.Suite("", (together,), ("brc",), 1, together=together))
+    assert "| walker-run | sac | 30 [30, 30] |" in (tmp_path / "sharing.md").read_text()
 
 
 def test_suites_name_only_what_there_is(script):
@@ -344,6 +348,24 @@ def test_a_suites_steps_are_those_of_the_tasks_that_its_split_trains_on(script, 
     found = suite.request(given, suite.SUITES[name], env, tmp_path)
     assert found.steps == 400 and found.split == "hip-bmdp" and found.vary == [*suite.SUITES[name].vary]
     assert len(suite.family_of(suite.SUITES[name], env).labels("train")) == 4
+
+
+def test_a_suite_counts_the_tasks_that_its_flags_ask_for(script, tmp_path, monkeypatch):
+    """Three goals in place of ten: in the steps of a run and in the tables. Settings may be words."""
+    suite, asked = script("suite"), []
+    words = ["--agents", "sac", "--seeds=2", "--steps-per-task=100", "--env", "num_tasks=3", "combine=random"]
+    small = ["--training", "tau=0.1", "conditioning=none", f"--out={tmp_path}"]
+    monkeypatch.setattr(sys, "argv", ["suite", "goals", "--envs", "point-mass-vary-goal", *words, *small])
+
+    def trained(folder, family, agent, **given):
+        asked.append((given["steps"], family.train_count, given["tau"], given["conditioning"]))
+        return SimpleNamespace(rows=lines, evaluations=evaluations_of(np.arange(24.0).reshape(2, 1, 3, 4)))
+
+    lines = [{"seed": 0, "steps": 300, "seconds": 1, "wall_seconds": 1, "return": 1.0}]
+    monkeypatch.setattr(sys.modules["learning"], "train", trained)
+    suite.main()
+    assert asked == [(300, 3, 0.1, "none")]
+    assert len((tmp_path / "tasks.csv").read_text().splitlines()) == 1 + 2 * 3
 
 
 @pytest.mark.parametrize("agent", ["drq", "sac-ae", "deepmdp", "hip-bmdp", "care", "ppo"])

@@ -63,9 +63,11 @@ class CARE(Identity):
 
     Differs from the paper: inner products are divided by tau, by default the square root of the encoding's size, as
     otherwise the attention is nearly one-hot from the start and learning is slow (``attention_temperature=1`` is the
-    paper's). The context comes from the conditioning, by default the task's physical parameters, where the paper embeds
-    a sentence; conditioning=vectors allows that too. Actor and critics have a mixture each, trained by their own loss;
-    MTRL shares some of the actor's parameters with the critic and leaves others at their initial values.
+    paper's). The context comes from the conditioning, by default the task's physical parameters, and in a mixture which
+    family it is of. The paper embeds a description of the task by a frozen language model, as ``conditioning="text"``
+    does with ``text=MODEL``. Actor and critics have a mixture and a context encoder each, trained by their own loss. In
+    the paper one context encoder learns from all losses; MTRL shares some of the actor's parameters with the critic and
+    leaves others at their initial values.
     """
 
     needs_features: ClassVar[bool] = True
