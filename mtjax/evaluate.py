@@ -26,6 +26,8 @@ class Request:
     """Episodes of each task and seed."""
     seed: int = 0
     """Seed of the starting states."""
+    task_seed: int = -1
+    """Seed of other goals than the run's, or other tasks, where they are drawn; -1 takes the run's own."""
     checkpoint: int = 0
     """Iteration of the checkpoint to evaluate, as its folder in checkpoints/ is called; 0 takes the newest."""
     video: bool = False
@@ -62,6 +64,8 @@ def _parse(argv: Sequence[str]) -> tuple[Request, dict[str, str]]:
         raise InputError(f"episodes must be at least 1 and at most {_MOST_EPISODES}, not {request.episodes}")
     if not 0 <= request.seed <= _LARGEST_SEED:
         raise InputError(f"seed must be at least 0 and at most {_LARGEST_SEED}, not {request.seed}")
+    if not -1 <= request.task_seed <= _LARGEST_SEED:
+        raise InputError(f"task-seed must be at least 0 and at most {_LARGEST_SEED}, not {request.task_seed}")
     if request.checkpoint < 0:
         raise InputError(f"checkpoint must be at least 0, not {request.checkpoint}")
     if not 0 < request.video_seconds < math.inf:
@@ -74,6 +78,8 @@ def _parse(argv: Sequence[str]) -> tuple[Request, dict[str, str]]:
         raise InputError("--video-splits and --video-tasks say what to film; give --video as well")
     if vary and (request.video_splits or request.diagnostics):
         raise InputError("tasks of --env.vary belong to no split, and diagnostics are of the run's own tasks")
+    if request.task_seed >= 0 and (vary or request.diagnostics):
+        raise InputError("--task-seed draws other tasks; leave out --env.vary, and diagnostics of the run's own tasks")
     folder = shipped.folder(request.run)
     commands.require_run(folder)
     if request.diagnostics and shipped.is_shipped(folder):

@@ -1,6 +1,6 @@
 """Evaluation plays whole episodes under the mean action, on any tasks, with keys of its own."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -22,6 +22,11 @@ class Scores(NamedTuple):
 
     returns: Any  # (S, T, episodes) undiscounted
     metrics: dict[str, Any]  # (S, T, episodes) each, such as success: values at the episode's last step, and _EVER
+
+
+def of_tasks(scores: Scores, places: Sequence[int] | np.ndarray) -> Scores:
+    """Return the scores of some tasks, by their places along T."""
+    return jax.tree.map(lambda x: np.asarray(x)[:, places], scores)
 
 
 class Evaluations(NamedTuple):

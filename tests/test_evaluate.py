@@ -22,7 +22,7 @@ import mtjax.evaluate
 import mtjax.train
 from mtjax import loop
 from mtjax.config import from_json
-from mtjax.evaluation import Evaluations, evaluate, load_evaluations, record
+from mtjax.evaluation import Evaluations, Scores, evaluate, load_evaluations, record
 from mtjax.report import films, render, scoring
 from mtjax.report.tables import split_table, task_table
 from mtjax.tasks import episode_task
@@ -112,7 +112,7 @@ def test_last_evaluation_of_a_run_is_of_its_last_policy(finished_run, policy):
 def test_scores_are_of_episodes_that_the_run_never_saw(finished_run, policy):
     """Though policy and tasks are those of its last evaluation."""
     past = load_evaluations(finished_run / "evaluations.npz")
-    for split, returns in scoring.score(policy, 1).items():
+    for split, (returns, _) in scoring.score(policy, 1).items():
         assert returns.shape == (2, len(VALUES[split]), 1)
         assert not np.intersect1d(returns, past.returns[split]).size
 
@@ -343,6 +343,8 @@ def test_other_values_are_scored_as_the_run_scores_them(copied_run, capsys):
         (["--env.vary.size=1,2", "--diagnostics"], "diagnostics are of the run's own tasks"),
         (["--checkpoint=7"], "has no checkpoint 7; it has 100, 150"),
         (["--checkpoint=-7"], "checkpoint must be at least 0"),
+        (["--task-seed=-2"], "task-seed must be at least 0"),
+        (["--task-seed=2", "--env.vary.size=1,2"], "leave out --env.vary"),
     ],
 )
 def test_wrong_values_and_checkpoints_are_refused(copied_run, words, said):
@@ -385,13 +387,26 @@ def test_table_of_a_run_shows_splits_and_the_worst_task():
 def test_tasks_of_several_parameters_are_told_by_their_values():
     """In the table and in the file, not by numbers alone."""
     env = mtjax.make("finger-spin", vary={"size": [1.0, 1.1], "mass": [0.5, 2.0]}, split="none")
-    scores = {"train": np.arange(4.0).reshape(1, 4, 1)}
+    scores = {"train": Scores(np.arange(4.0).reshape(1, 4, 1), {})}
     head, *lines = task_table(types.SimpleNamespace(env=env), scores).splitlines()  # type: ignore
     assert head.split()[:2] == ["split", "task"]
     assert [line.split()[1:3] for line in lines[:2]] == [["size=1,mass=0.5", "0"], ["size=1,mass=2", "1"]]
     assert lines[-1].split() == ["train", "all", "2"]
     assert scoring._columns(env, "train")[2] == {"task": "2", "size": "1.1", "mass": "0.5"}
     assert scoring._columns(mtjax.make("finger-spin", vary={"size": [1.0, 1.1]}), "train")[1] == {"size": "1.1"}
+
+
+def test_success_is_told_beside_returns():
+    """At the end of episodes and at any step, by task and over all; not for tasks that do not tell it."""
+    env = mtjax.make("finger-spin", vary={"size": [1.0, 1.1]}, split="none")
+    returns, end = np.arange(4.0).reshape(1, 2, 2), np.array([[[0.0, 0.0], [0.0, 1.0]]])
+    scores = {"train": Scores(returns, {"success": end, "success_ever": np.maximum(end, [1, 0])})}
+    head, *lines = task_table(types.SimpleNamespace(env=env), scores).splitlines()  # type: ignore
+    assert head.split()[2:7] == ["return", "success,", "at", "any", "step"]
+    shown = [line.split()[3:] for line in lines]
+    assert shown == [["0.00", "0.50", "0,", "1"], ["0.50", "1.00", "2,", "3"], ["0.25", "0.75"]]
+    scores = {"train": Scores(returns, {"success": np.full((1, 2, 2), np.nan)})}
+    assert "success" not in task_table(types.SimpleNamespace(env=env), scores)  # type: ignore
 
 
 def test_scores_are_printed_where_they_cannot_be_written(copied_run, capsys, monkeypatch):
@@ -401,7 +416,8 @@ def test_scores_are_printed_where_they_cannot_be_written(copied_run, capsys, mon
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(run))
 
     monkeypatch.setattr(scoring, "_new_folder", refuse)
-    monkeypatch.setattr(scoring, "score", lambda *_: {split: np.ones((2, len(x), 1)) for split, x in VALUES.items()})
+    scores = {split: Scores(np.ones((2, len(x), 1)), {}) for split, x in VALUES.items()}
+    monkeypatch.setattr(scoring, "score", lambda *_: scores)
     with pytest.raises(PermissionError):
         mtjax.evaluate.main([f"--run={copied_run}", "--episodes=1"])
     assert "train" in capsys.readouterr().out

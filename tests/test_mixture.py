@@ -1,5 +1,6 @@
 """Mixtures: every family as it is alone, padding that changes nothing, and whole runs."""
 
+import csv
 import dataclasses
 import types
 from pathlib import Path
@@ -20,7 +21,7 @@ from mtjax.agents.sac import Batch, action_sizes
 from mtjax.config import from_json, to_json
 from mtjax.envs import ENVS, Family, Mixture, make, mixture
 from mtjax.envs.parameters import Parameter
-from mtjax.evaluation import evaluate, record
+from mtjax.evaluation import Scores, evaluate, record
 from mtjax.experience.replay import Replay
 from mtjax.loop import Settings
 from mtjax.networks import Params
@@ -559,6 +560,11 @@ def test_a_run_is_scored_family_by_family(run, capsys):
     (folder,) = run.glob("evaluation-*")
     assert {"returns.csv", "return_by_task.png", "diagnostics.json"} <= {file.name for file in folder.iterdir()}
     assert "train,aim goal=-1,0,0," in (folder / "returns.csv").read_text()
+    with (folder / "returns.csv").open() as file:
+        told = {line["task"].split()[0]: (line["success"], line["success_ever"]) for line in csv.DictReader(file)}
+    assert told["aim"] == ("", "") and all(told["wide-aim"])  # of the family that has it
+    heads = {name: f"\n{said}".split(f"\n{name}\n")[1].splitlines()[0] for name in ("aim", "wide-aim")}
+    assert "success" not in heads["aim"] and "success, at any step" in heads["wide-aim"]
     with pytest.raises(InputError, match="only families that show pictures can be filmed"):
         mtjax.evaluate.main([f"--run={run}", "--video"])
 
@@ -571,7 +577,7 @@ def test_a_run_and_its_policy_are_read_back(run):
     task = pick(policy.env.tasks(), 0)
     action = policy(policy.env.reset(task, jax.random.key(0)).obs, task)
     assert action.shape == (2,) and action[1] == 0
-    assert "aim" in task_table(policy, {"train": np.zeros((1, 4, 2))})
+    assert "aim" in task_table(policy, {"train": Scores(np.zeros((1, 4, 2)), {})})
 
 
 def test_a_run_goes_on_bit_for_bit(tmp_path):

@@ -12,7 +12,7 @@ import numpy as np
 from mtjax import shipped
 from mtjax.config import from_json
 from mtjax.envs import Family
-from mtjax.evaluation import evaluate
+from mtjax.evaluation import Scores, evaluate, of_tasks
 from mtjax.report import diagnostics, figures, films
 from mtjax.report.tables import task_table
 from mtjax.training.export import export
@@ -42,11 +42,16 @@ def report(request: Any, vary: Mapping[str, str]) -> None:
     if request.export:
         print(f"exported to {export(policy, request.export)}", flush=True)
     found = diagnostics.diagnose(policy, *load_experience(run, first)) if request.diagnostics else None
-    named = {"train": "given"} if vary else {}
+    named = {"train": "given"} if vary or request.task_seed >= 0 else {}
     if vary:
         trained = policy.env
         policy = dataclasses.replace(policy, env=on_values(trained, vary))
         print(f"trained on {trained.ends or 'one task'}; scored on {policy.env.ends or 'one task'}")  # type: ignore
+        tasks = as_unseen(policy.env.tasks("all"), trained)
+    elif request.task_seed >= 0:
+        trained = policy.env
+        policy = dataclasses.replace(policy, env=drawn_anew(trained, request.task_seed))
+        print(f"tasks and goals are drawn by the seed {request.task_seed}")
         tasks = as_unseen(policy.env.tasks("all"), trained)
     else:
         tasks = policy.env.tasks("all")
@@ -80,6 +85,13 @@ def on_values(env: Any, vary: Mapping[str, Any]) -> Any:
     return made.scaled_as(env)
 
 
+def drawn_anew(env: Any, seed: int) -> Any:
+    """Return a family, or a mixture, whose goals or tasks another seed draws, with contexts scaled as before."""
+    if isinstance(env, Family):
+        return dataclasses.replace(env, task_seed=seed).scaled_as(env)
+    return dataclasses.replace(env, families=tuple(drawn_anew(family, seed) for family in env.families))
+
+
 def as_unseen(tasks: Task, env: Any) -> Task:
     """Number tasks (T,) for an agent that learned in ``env``: a task that it learned by its number, others beyond all.
 
@@ -101,8 +113,8 @@ def _first_seed(run: str, point: int) -> int:
     return point * config.plan.seeds
 
 
-def score(policy: Policy, episodes: int, seed: int = 0, tasks: Task | None = None) -> dict[str, np.ndarray]:
-    """Return the returns (S, T, episodes) of each split, in episodes that no training run has seen.
+def score(policy: Policy, episodes: int, seed: int = 0, tasks: Task | None = None) -> dict[str, Scores]:
+    """Return the scores (S, T, episodes) of each split, in episodes that no training run has seen.
 
     Args:
         tasks: all tasks of the policy's environment, if they are numbered anew.
@@ -110,9 +122,8 @@ def score(policy: Policy, episodes: int, seed: int = 0, tasks: Task | None = Non
     env = policy.env
     tasks = env.tasks("all") if tasks is None else tasks
     arguments = policy.states, tasks, policy.seeds, jnp.int32(_FIRST_NUMBER + seed)
-    scores = compile_lowered(trace(evaluate, env, policy.agent, episodes, *arguments).lower())(*arguments)
-    returns = np.asarray(scores.returns)
-    return {split: returns[:, np.asarray(env.tasks(split).id)] for split in SPLITS}
+    found = compile_lowered(trace(evaluate, env, policy.agent, episodes, *arguments).lower())(*arguments)
+    return {split: of_tasks(found, np.asarray(env.tasks(split).id)) for split in SPLITS}
 
 
 def _place(run: str) -> Path:
@@ -132,22 +143,23 @@ def _new_folder(run: Path) -> Path:
     raise InputError(f"{str(run)!r} is full of evaluations; move some away")
 
 
-def _write(policy: Policy, episodes: dict[str, np.ndarray], directory: Path, named: Mapping[str, str]) -> None:
+def _write(policy: Policy, scores: dict[str, Scores], directory: Path, named: Mapping[str, str]) -> None:
     env, (name, unit), called = policy.env, policy.env.task_axis, lambda split: named.get(split, split)
     tasks = {called(split): _columns(env, split) for split in SPLITS}
     rows = [
-        {"split": split, **task, "seed": int(seed), "episode": e, "return": number(x)}
-        for split, returns in episodes.items()
-        for seed, of_seed in zip(policy.seeds, returns, strict=True)
-        for task, of_task in zip(tasks[split], of_seed, strict=True)
-        for e, x in enumerate(of_task)
+        {"split": split, **task, "seed": int(seed), "episode": e, "return": number(found.returns[s, t, e])}
+        | {metric: number(x[s, t, e]) for metric, x in found.metrics.items()}
+        for split, found in scores.items()
+        for s, seed in enumerate(policy.seeds)
+        for t, task in enumerate(tasks[split])
+        for e in range(found.returns.shape[2])
     ]
     append_rows(directory / "returns.csv", rows)
-    file = directory / f"return_by_{name.replace('-', '_')}.png"
+    file, returns = directory / f"return_by_{name.replace('-', '_')}.png", {x: of.returns for x, of in scores.items()}
     if len(env.parts) > 1:
-        return figures.return_by_task(file, {called(split): env.labels(split) for split in SPLITS}, episodes)
+        return figures.return_by_task(file, {called(split): env.labels(split) for split in SPLITS}, returns)
     values = {called(split): env.task_values(split) for split in SPLITS}
-    figures.return_by_parameter(file, name, unit, values, episodes)
+    figures.return_by_parameter(file, name, unit, values, returns)
 
 
 def _columns(env: Any, split: str) -> list[dict[str, str]]:

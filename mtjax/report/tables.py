@@ -6,9 +6,12 @@ from types import MappingProxyType
 import numpy as np
 
 from mtjax.envs.family import Family, Part
-from mtjax.evaluation import Evaluations
+from mtjax.evaluation import Evaluations, Scores, of_tasks
 from mtjax.report.stats import seed_interval
 from mtjax.training.policy import Policy
+
+_SUCCESS = ("success", "success_ever")  # at the end of episodes, and at any step
+_TOLD = "  success, at any step"
 
 
 def _interval(scores: np.ndarray) -> str:
@@ -22,13 +25,13 @@ def split_table(evaluations: Evaluations, parts: Sequence[Part] = ()) -> str:
 
     Where tasks tell success, its share at the end of episodes and at any step follow.
     """
-    scores = [evaluations.returns, *(evaluations.metrics.get(name, {}) for name in ("success", "success_ever"))]
+    scores = [evaluations.returns, *(evaluations.metrics.get(name, {}) for name in _SUCCESS)]
     last = {  # each (S, T)
         split: [x[split][:, -1].mean(axis=-1) for x in scores if split in x]
         for split, returns in evaluations.returns.items()
         if returns.size
     }
-    told = "  success, at any step" if evaluations.metrics.get("success") else ""
+    told = _TOLD if evaluations.metrics.get("success") else ""
     lines = [f"{'split':15} {'tasks':>5} {'return':>7}  worst task{told}"]
     lines += [_split_line(split, *found) for split, found in last.items()]
     for part in parts if len(parts) > 1 else ():
@@ -44,8 +47,8 @@ def _split_line(split: str, returns: np.ndarray, *success: np.ndarray) -> str:
     return line.rstrip() if not known or not known[0].size else line + "".join(f"  {x.mean():7.2f}" for x in known)
 
 
-def task_table(policy: Policy, episodes: dict[str, np.ndarray], named: Mapping[str, str] = MappingProxyType({})) -> str:
-    """Return a table of returns (S, T, episodes) by family, split and task.
+def task_table(policy: Policy, scores: dict[str, Scores], named: Mapping[str, str] = MappingProxyType({})) -> str:
+    """Return a table of returns by family, split and task, and of success where tasks tell it.
 
     Args:
         named: other names of splits.
@@ -55,25 +58,32 @@ def task_table(policy: Policy, episodes: dict[str, np.ndarray], named: Mapping[s
     lines = []
     for part in parts:
         lines += [part.name] if part.name else []
-        names = {split: _task_names(part.family, split) for split in episodes}
+        names = {split: _task_names(part.family, split) for split in scores}
         width = max(10, *(len(name) for own in names.values() for name in own))
-        lines.append(f"{'split':15} {part.family.task_axis[0]:>{width}} {'return':>7}   episodes from, to")
-        for split, returns in episodes.items():
-            own = returns[:, part.places[split]]
-            if not own.size:
-                continue
-            for name, task in zip(names[split], np.moveaxis(own, 1, 0), strict=True):
-                mean = _interval(task.mean(axis=-1, keepdims=True))
-                lines.append(f"{called(split):15} {name:>{width}} {mean:>7}   {task.min():.0f}, {task.max():.0f}")
-            lines.append(_all_line(called(split), own, width))
+        own = {split: of_tasks(found, part.places[split]) for split, found in scores.items()}
+        told = _TOLD if any(map(_success, own.values())) else ""
+        head = f"{'split':15} {part.family.task_axis[0]:>{width}} {'return':>7}{told}"
+        lines.append(f"{head}   episodes from, to")
+        for split, found in own.items():
+            for t, name in enumerate(names[split]):
+                task = of_tasks(found, [t])
+                ends = f"{task.returns.min():.0f}, {task.returns.max():.0f}"
+                lines.append(f"{_mean_line(called(split), name, task, width):<{len(head)}}   {ends}")
+            lines += [_mean_line(called(split), "all", found, width)] if found.returns.size else []
     if len(parts) > 1:
         lines.append("all families")
-        lines += [_all_line(called(split), returns) for split, returns in episodes.items() if returns.size]
+        lines += [_mean_line(called(split), "all", found) for split, found in scores.items() if found.returns.size]
     return "\n".join(lines)
 
 
-def _all_line(split: str, returns: np.ndarray, width: int = 10) -> str:
-    return f"{split:15} {'all':>{width}} {_interval(returns.mean(axis=-1)):>7}"
+def _mean_line(split: str, name: str, scores: Scores, width: int = 10) -> str:
+    return f"{split:15} {name:>{width}} {_interval(scores.returns.mean(axis=-1)):>7}{_success(scores)}"
+
+
+def _success(scores: Scores) -> str:
+    """Return the shares of success as text. Of a mixture some families may not tell it."""
+    known = [x[np.isfinite(x)] for name in _SUCCESS if (x := scores.metrics.get(name)) is not None]
+    return "".join(f"  {x.mean():7.2f}" for x in known if x.size)
 
 
 def _task_names(family: Family, split: str) -> list[str]:
