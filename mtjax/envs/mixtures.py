@@ -89,7 +89,7 @@ class Mixture(Tabled):
     Action (A,): as many as the widest family has. A task's ``action_mask`` says which of them are its own.
     Context (C,): the family as one-hot, then one slot per family. The task's own slot holds its context in that family;
         other slots are zero. A family whose contexts are all zero, because it has a single task, has no slot. The
-        nearest training task of an unseen task is in its own family.
+        nearest training task of an unseen task is in its own family; of a family that does not train it is the first.
     Metrics: those of all families. They are NaN for a family that has no such metric.
     Reward, start, termination and time limit are each family's own.
 

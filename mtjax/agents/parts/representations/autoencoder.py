@@ -23,7 +23,8 @@ class Autoencoder(Encoded):
     Beside the critics' loss, this one trains phi and g; s are stacked pictures of 32 brightnesses with noise:
         L_AE = mean (g(h) - s)^2 + lambda |h|^2 / 2 + decay |theta_g|^2 / 2,  h = phi(s)       (reconstruction loss)
     where the mean is over pixels, lambda is ``latent_decay`` and theta_g are the decoder's parameters. Of vectors, s is
-    the observation, and g has the encoder's widths the other way round.
+    the observation, and g has the encoder's widths the other way round; in a mixture the mean is over padding too, so
+    that a task that observes few numbers counts less.
 
     phibar, with its projection, moves by ``encoder_tau``.
 
