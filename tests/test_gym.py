@@ -10,6 +10,7 @@ from pathlib import Path
 
 import gymnasium
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -462,6 +463,30 @@ def test_worlds_step_as_single_ones_do():
             state[i] = single.state
         ended = terminated
     assert restarts >= 8
+
+
+@dataclasses.dataclass(frozen=True)
+class Telling(CartPole):
+    """A pole that tells how far its cart is."""
+
+    def step(self, task, state, action):
+        step = super().step(task, state, action)
+        return step._replace(metrics={"success": jnp.abs(step.obs[0])})
+
+
+def test_info_tells_a_familys_metrics_after_every_step():
+    """Of a world that begins anew they are 0, though a reset has none."""
+    family = Telling(vary={"force": FORCES})
+    env, worlds = FamilyEnv(family), FamilyVectorEnv(family, 4)
+    assert "success" not in env.reset(seed=0)[1] and "success" not in worlds.reset(seed=0)[1]
+    obs, *_, info = env.step(np.ones(1))
+    assert info["success"] == abs(obs["env_obs"][0]) and isinstance(info["success"], float)
+    ended, restarts = np.zeros(4, bool), 0
+    for _ in range(30):
+        obs, _, terminated, _, info = worlds.step(np.ones((4, 1)))
+        np.testing.assert_array_equal(info["success"], np.where(ended, 0, np.abs(obs["env_obs"][:, 0])))
+        restarts, ended = restarts + ended.sum(), terminated
+    assert restarts >= 4
 
 
 def test_worlds_are_cut_off_by_the_time_limit_and_begin_again():

@@ -129,7 +129,8 @@ class FamilyEnv(TaskStream, gymnasium.Env):
         of the split. After a change of the task call ``reset`` before ``step``.
     Random streams: ``reset(seed=...)`` seeds that of the environment; ``seed_task(seed)`` or
         ``reset(options={"task_seed": seed})`` seeds that of the tasks. Unseeded streams start from fresh entropy.
-    Info: ``task_id`` is the task's number, ``params`` its parameters in SI units.
+    Info: ``task_id`` is the task's number, ``params`` its parameters in SI units. After a step it has the family's
+        metrics too, such as ``success``.
     """
 
     def __init__(self, family: Env, tasks: str = "train", task_obs: str = "context", render_mode: str | None = None):
@@ -160,7 +161,7 @@ class FamilyEnv(TaskStream, gymnasium.Env):
         step = self._programs.step(self._task, self._step.state, read_action(action, self.action_space))
         self._step, self._elapsed = step, self._elapsed + 1
         truncated = self._elapsed >= self.family.episode_length
-        info = self._table.describe(self._row)
+        info = self._table.describe(self._row) | {name: float(x) for name, x in step.metrics.items()}
         return self._observe(), float(step.reward), bool(step.terminated), truncated, info
 
     def render(self) -> np.ndarray | None:

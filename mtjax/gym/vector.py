@@ -122,7 +122,8 @@ class FamilyVectorEnv(TaskStream, VectorEnv):
         reward, terminated = np.array(step.reward), np.array(step.terminated)
         truncated = self._elapsed >= self.family.episode_length
         self._ended = terminated | truncated
-        return self._observe(step), reward, terminated, truncated, self._table.describe(self._rows)
+        info = self._table.describe(self._rows) | {name: np.array(x) for name, x in step.metrics.items()}
+        return self._observe(step), reward, terminated, truncated, info
 
     def get_task_obs(self) -> np.ndarray:
         """Return the observation of the current tasks."""
@@ -159,7 +160,9 @@ class FamilyVectorEnv(TaskStream, VectorEnv):
             self._enter(rows)
         fresh = self._programs.reset(self._tasks, draw_seeds(self.np_random, self.num_envs))
         self._elapsed = np.where(worlds, 0, self._elapsed)
-        return fresh if step is None else _where(worlds, fresh, step)
+        if step is None:
+            return fresh
+        return _where(worlds, fresh._replace(metrics=jax.tree.map(jnp.zeros_like, step.metrics)), step)
 
     def _observe(self, step: Step) -> dict[str, Any]:
         return {"env_obs": observed(step.obs), "task_obs": self.get_task_obs()}
