@@ -79,6 +79,9 @@ def test_evaluations_name_splits_and_worst_tasks(capsys):
     returns = {"train": np.array([[[1.0, 3.0], [10.0, 10.0]]]), "interpolation": np.zeros((1, 0, 2))}
     Console(10).evaluation(5, {**returns, "extrapolation": np.ones((1, 1, 2))})
     assert capsys.readouterr().out == "evaluation at 5 steps: train 6 (worst task 2), extrapolation 1\n"
+    success = {"train": np.array([[[1.0, 0.0], [np.nan, np.nan]]]), "extrapolation": np.full((1, 1, 2), np.nan)}
+    Console(10).evaluation(5, {**returns, "extrapolation": np.ones((1, 1, 2))}, success)
+    assert capsys.readouterr().out == "evaluation at 5 steps: train 6 (worst task 2), success 0.50, extrapolation 1\n"
 
 
 def test_quiet_console_is_quiet(capsys):

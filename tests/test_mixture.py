@@ -580,10 +580,17 @@ def test_a_run_and_its_policy_are_read_back(run):
     assert "aim" in task_table(policy, {"train": Scores(np.zeros((1, 4, 2)), {})})
 
 
-def test_a_run_goes_on_bit_for_bit(tmp_path):
+def test_a_run_goes_on_bit_for_bit(tmp_path, monkeypatch):
+    """And tells its sinks the returns of evaluations, and the success of tasks that have it."""
     agent, plan = tiny("sac", normalize_observations=True), {**PLAN, "eval_every": 40}
-    drawn = mixture([Aim(vary={"goal": "-1:1"}, num_draws=5), WIDE])
-    whole = mtjax.train(drawn, agent, **plan, steps=80)
+    drawn, told = mixture([Aim(vary={"goal": "-1:1"}, num_draws=5), WIDE]), []
+    with monkeypatch.context() as patch:
+        patch.setattr("mtjax.training.run.write_rows", lambda sinks, rows, names: told.extend(rows))
+        whole = mtjax.train(drawn, agent, **plan, steps=80)
+    found, logged = whole.evaluations, [row for row in told if "evaluation/train" in row]
+    for scores, name in ((found.returns, ""), (found.metrics["success"], "/success")):
+        expected = np.nanmean(scores["train"], axis=(0, 2, 3))
+        assert [float(row[f"evaluation/train{name}"]) for row in logged] == pytest.approx(expected, rel=1e-5)
     mtjax.train(drawn, agent, **plan, steps=40, directory=tmp_path)
     rest = mtjax.train(drawn, agent, **plan, steps=80, directory=tmp_path, resume=True)
     for ours, theirs in zip(jax.tree.leaves(rest.state), jax.tree.leaves(whole.state), strict=True):

@@ -83,9 +83,17 @@ class Console:
             when = f"{duration(seconds)}{', ' * bool(left)}{left}"
             self.say(f"{self.label}{steps:,} of {self.total:,} steps  {when}  {rate:,.0f} steps/s  {told}")
 
-    def evaluation(self, steps: int, returns: Mapping[str, np.ndarray]) -> None:
-        """Show an evaluation's mean return and worst task by split. ``returns`` are (S, T, episodes) by split."""
-        told = ", ".join(_of_split(split, x) for split, x in returns.items() if x.size)
+    def evaluation(
+        self, steps: int, returns: Mapping[str, np.ndarray], success: Mapping[str, np.ndarray] | None = None
+    ) -> None:
+        """Show an evaluation's mean return, worst task, and success at the end if tasks tell it.
+
+        Args:
+            returns: (S, T, episodes) by split.
+            success: of the same shapes; NaN where a task does not tell it.
+        """
+        shares = success or {}
+        told = ", ".join(_of_split(split, x) + _share(shares.get(split)) for split, x in returns.items() if x.size)
         self.say(f"{self.label}evaluation at {steps:,} steps: {told}")
         means = ", ".join(f"{split} {x.mean():.0f}" for split, x in returns.items() if x.size)
         self.evaluated = f"  evaluated {means}"
@@ -145,6 +153,11 @@ def describe_rounding(steps: int, total: int, chunk: int) -> list[str]:
 def _of_split(split: str, returns: np.ndarray) -> str:
     worst = f" (worst task {returns.mean(axis=(0, 2)).min():.0f})" if returns.shape[1] > 1 else ""
     return f"{split} {returns.mean():.0f}{worst}"
+
+
+def _share(success: np.ndarray | None) -> str:
+    known = np.zeros(0) if success is None else success[np.isfinite(success)]
+    return f", success {known.mean():.2f}" if known.size else ""
 
 
 def duration(seconds: float) -> str:

@@ -441,15 +441,20 @@ class _Run:
         evaluations = Evaluations(np.append(past.steps, now.steps), returns, past.values, metrics)
         self.records.save_evaluations(evaluations)
         if not diverged.all():
-            self.console.evaluation(now.steps, {split: x[~diverged, -1] for split, x in returns.items()})
+            last = lambda scores: {split: x[~diverged, -1] for split, x in scores.items()}
+            self.console.evaluation(now.steps, last(returns), last(metrics.get("success", {})))
         return evaluations
 
     def _evaluation_rows(self, evaluations: Evaluations) -> tuple[list[dict[str, Any]], list[str]]:
-        """Return a row for each entry of S with the last evaluation's mean return by split, and its name."""
-        last = {split: x[:, -1] for split, x in evaluations.returns.items() if x.size}
-        score = lambda x: log.number(x.mean())
+        """Return a row for each entry of S with the last evaluation's means by split, and its name.
+
+        Means are of returns and of metrics, such as success, over the tasks that tell them.
+        """
+        scores = {"": evaluations.returns, **{f"/{name}": x for name, x in evaluations.metrics.items()}}
+        last = {f"{split}{name}": x[:, -1] for name, of in scores.items() for split, x in of.items() if x.size}
+        mean = lambda x: log.number(x[np.isfinite(x)].mean() if np.isfinite(x).any() else np.nan)
         rows = [{"steps": evaluations.steps[-1]} for _ in self.seeds]
-        rows = [row | {f"evaluation/{split}": score(x[k]) for split, x in last.items()} for k, row in enumerate(rows)]
+        rows = [row | {f"evaluation/{name}": mean(x[k]) for name, x in last.items()} for k, row in enumerate(rows)]
         return rows, [self._name(k) for k in range(len(rows))]
 
     def _no_evaluations(self) -> Evaluations:
