@@ -23,6 +23,8 @@ class Request:
     (probability of improvement over a baseline), or all that the runs allow."""
     split: str = "train"
     """train, interpolation or extrapolation: whose returns are drawn."""
+    metric: str = "return"
+    """return, or what else evaluations have, such as success (at the end of episodes) or success_ever (at any step)."""
     baseline: str = ""
     """The agent that improvement compares with; by default the first run's."""
     out: str = ""

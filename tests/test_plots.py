@@ -35,7 +35,8 @@ def make_run(tmp_path):
         draw = lambda split: np.float32(shift + random.uniform(0, 100, (seeds, 3, count(split), 2)))
         returns = {split: draw(split) for split in SPLITS}
         values = {split: config.family.task_values(split) for split in SPLITS}
-        save_evaluations(folder / "evaluations.npz", Evaluations(STEPS, returns, values))
+        metrics = {"success": {split: np.float32(x > 50) for split, x in returns.items()}}
+        save_evaluations(folder / "evaluations.npz", Evaluations(STEPS, returns, values, metrics))
         return folder
 
     return make_run
@@ -154,6 +155,26 @@ def test_all_figures_at_once(runs, tmp_path, capsys, monkeypatch):
     names = ("families", "iqm", "profile", "improvement")
     assert {path.name for path in tmp_path.glob("*.png")} == {f"runs-{name}.png" for name in names}
     assert "curves: left out, as learning_curves is of one family" in capsys.readouterr().out
+
+
+def test_a_metric_is_drawn_in_the_place_of_returns(runs, make_run, tmp_path, monkeypatch):
+    """Of joined seeds too, with its own words; one that a run or a task does not have is refused."""
+    found = collect.of_metric(runs, "success")
+    for one, returned in zip(found, collect.learned(runs), strict=True):
+        np.testing.assert_array_equal(one.returns["train"], returned.returns["train"] > 50)
+    axes = report.learning_curves([one for one in found if one.env.startswith("finger")])
+    assert (
+        axes.get_ylabel() == "success at the end" and report.learning_curves(runs[:-1] + "b").get_ylabel() == "return"
+    )
+    drawn = []
+    monkeypatch.setattr(plots, "save", lambda axes, path: drawn.append(axes))
+    mtjax.plot.main([runs, "--figure=iqm", "--metric=success"])
+    assert drawn[0].get_xlabel() == "interquartile mean of the success at the end, train"
+    with pytest.raises(InputError, match=r"unknown metric .*; did you mean 'success'"):
+        mtjax.plot.main([runs, "--metric=sucess"])
+    scores = {"success": {split: np.full_like(x, np.nan) for split, x in found[0].returns.items()}}
+    with pytest.raises(InputError, match="not all tasks of finger-spin-vary-size tell success"):
+        collect.of_metric([found[0]._replace(metrics=scores)], "success")
 
 
 def test_every_figure_has_a_name():

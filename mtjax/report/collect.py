@@ -4,6 +4,7 @@ import glob
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,7 +14,9 @@ from mtjax.checks import path
 from mtjax.config import RunConfig, from_json
 from mtjax.envs import name_of as env_name_of
 from mtjax.evaluation import Evaluations, load_evaluations
-from mtjax.names import InputError
+from mtjax.names import InputError, nearest_error
+
+_WORDS = {"success": "success at the end", "success_ever": "success at any step"}
 
 
 class Found(NamedTuple):
@@ -35,6 +38,8 @@ class Learned(NamedTuple):
     values: Mapping[str, np.ndarray]  # split -> (T,) of the varied parameter, or task numbers
     axis: tuple[str, str]  # name and unit of ``values``
     seeds: tuple[int, ...] = ()
+    metrics: Mapping[str, Mapping[str, np.ndarray]] = MappingProxyType({})  # name -> as returns
+    score: str = "return"  # what ``returns`` are, in words
 
     def final(self, split: str = "train") -> np.ndarray:
         """Return the last evaluation's mean returns (S, T)."""
@@ -108,8 +113,19 @@ def _of_result(result: Any) -> list[Learned]:
     made = []
     for p, point in enumerate(result.points or ({},)):
         name = ", ".join([name_of(result.agent), *(f"{k.replace('_', '-')} {_short(x)}" for k, x in point.items())])
-        returns = {split: x[p * count : (p + 1) * count] for split, x in found.returns.items()}
-        made.append(Learned(env_name_of(env), name, found.steps, returns, found.values, env.task_axis, result.seeds))
+        of_point = _rows(found, slice(p * count, (p + 1) * count))
+        made.append(
+            Learned(
+                env_name_of(env),
+                name,
+                found.steps,
+                of_point.returns,
+                found.values,
+                env.task_axis,
+                result.seeds,
+                of_point.metrics,
+            )
+        )
     return made
 
 
@@ -118,16 +134,17 @@ def _points(found: Found) -> Iterable[tuple[Any, dict[str, Any], Learned]]:
     config, evaluations = found.config, found.evaluations
     count, family = config.plan.seeds, config.family
     for p, point in enumerate(config.points or ({},)):
-        mine = slice(p * count, (p + 1) * count)
+        mine = _rows(evaluations, slice(p * count, (p + 1) * count))
         own = {**settings(config.learner), **vars(config.training), **point}
         one = Learned(
             config.env,
             config.agent,
             evaluations.steps,
-            {split: x[mine] for split, x in evaluations.returns.items()},
+            mine.returns,
             evaluations.values,
             family.task_axis,
             tuple(range(config.plan.seed, config.plan.seed + count)),
+            mine.metrics,
         )
         shape = (evaluations.steps.tolist(), config.plan.eval_episodes, config.start)
         yield (config.env, config.agent, family, sorted(own.items(), key=str), shape), own, one
@@ -139,8 +156,34 @@ def _join(parts: list[Learned]) -> Learned:
     for part in parts:
         for i, seed in enumerate(part.seeds):
             seeds.setdefault(seed, (part, i))
-    stack = lambda split: np.stack([part.returns[split][i] for part, i in seeds.values()])
-    return parts[0]._replace(returns={split: stack(split) for split in parts[0].returns}, seeds=tuple(seeds))
+    stack = lambda of: {split: np.stack([of(part)[split][i] for part, i in seeds.values()]) for split in of(parts[0])}
+    known = [name for name in parts[0].metrics if all(name in part.metrics for part in parts)]
+    metrics = {name: stack(lambda part, name=name: part.metrics[name]) for name in known}
+    return parts[0]._replace(returns=stack(lambda part: part.returns), seeds=tuple(seeds), metrics=metrics)
+
+
+def _rows(evaluations: Evaluations, seeds: slice) -> Evaluations:
+    """Return the evaluations of some entries of S."""
+    of = lambda scores: {split: x[seeds] for split, x in scores.items()}
+    metrics = {name: of(scores) for name, scores in evaluations.metrics.items()}
+    return evaluations._replace(returns=of(evaluations.returns), metrics=metrics)
+
+
+def of_metric(runs: Any, metric: str) -> list[Learned]:
+    """Return what was learned in runs, with a metric in the place of returns, such as "success" or "success_ever".
+
+    Raises:
+        InputError: a run does not have the metric, or some of its tasks do not.
+    """
+    found = []
+    for one in learned(runs):
+        if metric not in one.metrics:
+            raise nearest_error(f"metric of {one.env}", metric, ("return", *one.metrics))
+        scores = one.metrics[metric]
+        if not all(np.isfinite(x).all() for x in scores.values()):
+            raise InputError(f"not all tasks of {one.env} tell {metric}")
+        found.append(one._replace(returns=scores, score=_WORDS.get(metric, metric)))
+    return found
 
 
 def _named(found: list[tuple[dict[str, Any], Learned]]) -> list[Learned]:

@@ -7,14 +7,15 @@ from mtjax.names import InputError
 from mtjax.report import collect, plots
 
 
-def draw(runs: Sequence[str], figure: str, split: str, baseline: str, out: str) -> None:
+def draw(runs: Sequence[str], figure: str, split: str, metric: str, baseline: str, out: str) -> None:
     """Draw a figure of runs, or all that these runs allow, and print the files.
 
     Args:
         figure: a name of ``plots.FIGURES``, or "all".
+        metric: "return", or another score of evaluations.
         out: the file to write; of all figures, the ending counts and the names follow from the stem.
     """
-    found = collect.learned(runs)
+    found = collect.learned(runs) if metric == "return" else collect.of_metric(runs, metric)
     names = list(plots.FIGURES) if figure == "all" else [figure]
     path = Path(out or ("runs.png" if figure == "all" else f"{figure}.png"))
     drawn = 0

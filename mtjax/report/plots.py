@@ -32,6 +32,7 @@ def learning_curves(runs: Any = "runs/*", split: str = "train", ax: "Axes | None
     for index, one in enumerate(found):
         figures.draw_curve(axes, one.steps, one.returns[split], _label(one), index)
     figures.label_steps(axes)
+    axes.set_ylabel(found[0].score)
     axes.set_title(found[0].env)
     return _finish(axes)
 
@@ -52,6 +53,7 @@ def families(runs: Any = "runs/*", split: str = "train") -> "list[Axes]":
         for one in (one for one in found if one.env == name):
             figures.draw_curve(axes, one.steps, one.returns[split], one.agent, agents.index(one.agent))
         figures.label_steps(axes)
+        axes.set_ylabel(found[0].score)
         axes.set_title(name)
         figures.show_from_zero(axes)
     for axes in grid[len(names) :]:
@@ -85,33 +87,34 @@ def return_by_parameter(runs: Any = "runs/*", ax: "Axes | None" = None) -> "Axes
     trained = found[0].values["train"]
     axes.axvspan(float(np.min(trained)), float(np.max(trained)), color="0.95", zorder=0)
     axes.set_xlabel(figures.axis_label(*found[0].axis))
+    axes.set_ylabel(found[0].score)
     axes.set_title(found[0].env)
     return _finish(axes)
 
 
 def iqm(runs: Any = "runs/*", split: str = "train", ax: "Axes | None" = None) -> "Axes":
     """Draw each agent's interquartile mean of the last returns, over seeds and the tasks of all families."""
-    scores = _scores(runs, split)
+    scores, score = _scores(runs, split)
     axes = ax if ax is not None else figures.new_axes()
     for index, (agent, x) in enumerate(scores.items()):
         mean, low, high = seed_interval(x, iqm_of)
         bars = figures.bars_of(*np.array([[mean], [low], [high]]))
         axes.errorbar([mean], [index], xerr=bars, fmt="o", color=figures.colour(index), capsize=4, label=agent)
     _name_rows(axes, list(scores))
-    axes.set_xlabel(f"interquartile mean of returns, {split}")
+    axes.set_xlabel(f"interquartile mean of the {score}, {split}")
     return axes
 
 
 def performance_profile(runs: Any = "runs/*", split: str = "train", ax: "Axes | None" = None) -> "Axes":
     """Draw the share of seeds and tasks whose last return is above each value, a line for each agent."""
-    scores = _scores(runs, split)
+    scores, score = _scores(runs, split)
     axes = ax if ax is not None else figures.new_axes()
     best = max(float(x.max()) for x in scores.values())
     thresholds = np.linspace(0, best or 1.0, _THRESHOLDS)
     for index, (agent, x) in enumerate(scores.items()):
         above = np.mean(x[:, :, None] > thresholds, axis=1)  # (S, thresholds)
         figures.draw_line(axes, thresholds, above, agent, index, marker="")
-    axes.set_xlabel(f"return, {split}")
+    axes.set_xlabel(f"{score}, {split}")
     axes.set_ylabel("share of seeds and tasks above")
     return _finish(axes)
 
@@ -127,7 +130,7 @@ def improvement(
     Raises:
         InputError: there is only one agent, or no baseline of that name.
     """
-    scores = _scores(runs, split)
+    scores, _ = _scores(runs, split)
     first = next(iter(scores)) if baseline is None else baseline
     if first not in scores:
         raise nearest_error("agent", first, scores)
@@ -183,8 +186,8 @@ def _of_split(runs: Any, split: str) -> list[Learned]:
     return found
 
 
-def _scores(runs: Any, split: str) -> dict[str, np.ndarray]:
-    """Return each agent's last returns (S, T) on the tasks of all families.
+def _scores(runs: Any, split: str) -> tuple[dict[str, np.ndarray], str]:
+    """Return each agent's last returns (S, T) on the tasks of all families, and what these are in words.
 
     Raises:
         InputError: an agent lacks a family that another has.
@@ -199,7 +202,7 @@ def _scores(runs: Any, split: str) -> dict[str, np.ndarray]:
             raise InputError(f"{agent} has no run on {missing[0]}, so that agents cannot be compared over all families")
         seeds = min(map(len, own.values()))
         scores[agent] = np.concatenate([own[name][:seeds] for name in names], axis=1)
-    return scores
+    return scores, found[0].score
 
 
 def _require_one_family(found: list[Learned], function: str, instead: str | None) -> None:
