@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 SPLITS = ("train", "interpolation", "extrapolation")
+CHOICES = ("representation", "encoder", "gradients", "value", "scaling", "sampler")
+"""The kinds of parts that a user chooses by name, as --agent.KIND=NAME."""
 BEGAN = time.time()
 """When this process began to import the package, in seconds since 1970."""
 _MANY = 20

@@ -19,6 +19,7 @@ import mtjax.evaluate
 from mtjax import loop
 from mtjax.agents.parts.encoders import ENCODERS
 from mtjax.config import from_json, to_json
+from mtjax.evaluation import Scores
 from mtjax.networks import Params, tanh_normal
 from mtjax.report import diagnostics, scoring
 from mtjax.report import figures as plot
@@ -342,7 +343,7 @@ def run_of(copied_run):
 @pytest.fixture
 def no_episodes(monkeypatch):
     """Leaves out what an evaluation does besides, which compiles for ten seconds."""
-    empty = lambda policy, episodes, seed, tasks: {"train": np.zeros((len(policy.seeds), 2, 1))}
+    empty = lambda policy, episodes, seed, tasks: {"train": Scores(np.zeros((len(policy.seeds), 2, 1)), {})}
     monkeypatch.setattr(scoring, "score", empty)
 
 

@@ -236,7 +236,7 @@ def test_gymnasium_and_fine_tuning_take_one_family():
         gym.make("bandit+control-acrobot")
     from mtjax.training.finetune import require_fit
 
-    start = types.SimpleNamespace(env=AIM, agent=tiny())
+    start = types.SimpleNamespace(env=AIM, agent=tiny(), directory=None)
     with pytest.raises(InputError, match=r"aim\+wide-aim is a mixture; take one family"):
         require_fit(start, BOTH, tiny())  # type: ignore
 

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from dm_control import suite
 from PIL import Image
 
 import mtjax
@@ -143,6 +142,7 @@ def test_cameras_and_lights_are_those_of_dm_control(name):
     """In a state of play: places and directions, angles of view, and brightness. Targets have lights of their own."""
     title, eye = SUITE[name]
     domain, _, task = title.partition("-")
+    suite = pytest.importorskip("dm_control.suite")
     theirs = suite.load(domain, task.replace("-", "_"), {"random": 0}).physics
     model = mtjax.make(name, engine="c").scene_model(0)
     data = mujoco.MjData(model)

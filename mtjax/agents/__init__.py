@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mtjax.checks import shown
-from mtjax.names import InputError, frozen, lazily, load, nearest_error
+from mtjax.names import CHOICES, InputError, frozen, lazily, load, nearest_error
 
 if TYPE_CHECKING:
     from mtjax.agents.base import BaseAgent
@@ -28,9 +28,6 @@ class Preset(NamedTuple):
         """The class of agents."""
         return load(self.place)
 
-
-CHOICES = ("representation", "encoder", "gradients", "value", "scaling", "sampler")
-"""The kinds of parts that a user chooses by name, as --agent.KIND=NAME."""
 
 _PARAMS = {"conditioning": "parameters"}
 

@@ -6,7 +6,7 @@ from typing import Any, get_type_hints
 
 import tyro
 
-from mtjax.agents import CHOICES, parts
+from mtjax.agents import parts
 from mtjax.agents.parts.encoders import ENCODERS
 from mtjax.agents.parts.gradients import surgery
 from mtjax.agents.parts.representations import REPRESENTATIONS
@@ -15,7 +15,7 @@ from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.values import VALUES
 from mtjax.checks import OF_TRAIN, checked
 from mtjax.experience import EXPERIENCES
-from mtjax.names import InputError, frozen, nearest_error
+from mtjax.names import CHOICES, InputError, frozen, nearest_error
 
 PARTS: dict[str, Mapping[str, type]] = {
     "representation": REPRESENTATIONS,

@@ -156,5 +156,6 @@ def load_experience(directory: str | Path, seed: int = 0) -> tuple[Ring, int]:
 def state_shapes(config: RunConfig) -> loop.TrainState:
     """Return the shapes of a run's training state."""
     env, agent = config.family, points.SweptAgent(config.learner) if config.points else config.learner
-    axis = points.seed_axis(config.points, config.plan.seed + jnp.arange(config.plan.seeds))
+    seeds = config.plan.seed + np.arange(config.plan.seeds, dtype=np.int32)
+    axis = points.seed_axis(config.points, seeds)
     return trace(loop.init, env, agent, config.training, env.tasks("train"), *axis).out_info  # type: ignore
