@@ -122,3 +122,11 @@ def test_transposed_layer_is_flax_s_with_its_filters_turned(side, stride):
 def test_transposed_layers_begin_as_large_as_flax_s():
     kernel = Transposed((30, 30, 9), 1).init(jax.random.key(0), normal(1, 28, 28, 32))["params"]["kernel"]
     np.testing.assert_allclose(jnp.std(kernel), (9 * 32) ** -0.5, rtol=0.05)
+
+
+@pytest.mark.parametrize(
+    "settings", [{"kernel_dilation": (2, 2)}, {"input_dilation": (2, 2)}, {"feature_group_count": 3}]
+)
+def test_dilation_and_groups_are_refused(settings):
+    with pytest.raises(NotImplementedError, match="dilation or groups"):
+        _IN_TURN(3, (3, 3), **settings).init(jax.random.key(0), normal(1, 12, 12, 3))

@@ -29,7 +29,7 @@ _UNROLLED = 16  # more filters, such as those of every world, are taken in a loo
 
 
 def convolve(pictures: Array, filters: Array, strides: Sequence[int], padding: Any, **given: Any) -> Array:
-    """Do what ``jax.lax.conv_general_dilated`` does, for ``flax.linen.Conv``.
+    """Do what ``jax.lax.conv_general_dilated`` does, for a ``flax.linen.Conv`` without dilation and groups.
 
     Args:
         pictures: (N, H, W, C).
@@ -37,7 +37,14 @@ def convolve(pictures: Array, filters: Array, strides: Sequence[int], padding: A
 
     Returns:
         (N, H', W', F).
+
+    Raises:
+        NotImplementedError: it has dilation or groups.
     """
+    if given.get("feature_group_count", 1) != 1 or any(
+        step != 1 for name in ("lhs_dilation", "rhs_dilation") for step in given.get(name) or ()
+    ):
+        raise NotImplementedError("a convolution with dilation or groups has no gradient here; take JAX's own")
     if isinstance(padding, str):
         padding = jax.lax.padtype_to_pads(pictures.shape[1:3], filters.shape[:2], strides, padding)
     shapes = {"picture_shape": pictures.shape[1:], "filters_shape": filters.shape}
