@@ -67,7 +67,7 @@ def compare(arguments: argparse.Namespace, num_tasks: int, num_seeds: int) -> li
 class Contestant:
     """One agent's compiled updates, and the seconds that an update took in each round."""
 
-    def __init__(self, name: str, arguments: Any, num_tasks: int, num_seeds: int, spec: Spec = SPEC):
+    def __init__(self, name: str, arguments: argparse.Namespace, num_tasks: int, num_seeds: int, spec: Spec = SPEC):
         self.name, self.updates, self.seconds = name, arguments.updates, []
         self.num_tasks, self.num_seeds = num_tasks, num_seeds
         agent = mtjax.agent(name, hidden=arguments.hidden)

@@ -89,7 +89,7 @@ def matrix_flops(program: Any) -> float:
         if name in _FEATURES:
             features = math.prod(given[_FEATURES[name]].aval.shape[:-1])
             total += 2 * features * math.prod(equation.params["filters_shape"])
-        if equation.primitive.name == "dot_general":
+        if name == "dot_general":
             (contracted, _), _ = equation.params["dimension_numbers"]
             depth = math.prod(equation.invars[0].aval.shape[i] for i in contracted)
             total += 2 * depth * math.prod(equation.outvars[0].aval.shape)

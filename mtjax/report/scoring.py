@@ -42,19 +42,15 @@ def report(request: Any, vary: Mapping[str, str]) -> None:
     if request.export:
         print(f"exported to {export(policy, request.export)}", flush=True)
     found = diagnostics.diagnose(policy, *load_experience(run, first)) if request.diagnostics else None
-    named = {"train": "given"} if vary or request.task_seed >= 0 else {}
+    trained, named = policy.env, {"train": "given"} if vary or request.task_seed >= 0 else {}
     if vary:
-        trained = policy.env
         policy = dataclasses.replace(policy, env=on_values(trained, vary))
         print(f"trained on {trained.ends or 'one task'}; scored on {policy.env.ends or 'one task'}")  # type: ignore
-        tasks = as_unseen(policy.env.tasks("all"), trained)
     elif request.task_seed >= 0:
-        trained = policy.env
         policy = dataclasses.replace(policy, env=drawn_anew(trained, request.task_seed))
         print(f"tasks and goals are drawn by the seed {request.task_seed}")
-        tasks = as_unseen(policy.env.tasks("all"), trained)
-    else:
-        tasks = policy.env.tasks("all")
+    tasks = policy.env.tasks("all")
+    tasks = as_unseen(tasks, trained) if named else tasks
     chosen = films.choose(policy.env, request.video_splits, request.video_tasks) if request.video else ()
     scores = score(policy, request.episodes, request.seed, tasks)
     print(task_table(policy, scores, named), flush=True)

@@ -24,7 +24,7 @@ def note_kernels(device: Any, launch: Callable[[], Any]) -> Kernels:
 
 
 def compile_kernels(device: Any, kernels: Kernels) -> None:
-    """Compile or load kernels for a device of Warp, of which no other thread may do the same meanwhile."""
+    """Compile or load kernels for a device of Warp. No other thread may do so for that device meanwhile."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     with ThreadPoolExecutor(min(_MOST_THREADS, cores)) as pool:
         for done in [pool.submit(module.load, device, block_dim) for module, block_dim in kernels]:

@@ -29,7 +29,7 @@ def draw_goals(tasks: tuple[Drawn, ...], seed: int, count: int) -> tuple[np.ndar
 
 
 def _allowed(task: Drawn, random: np.random.RandomState) -> Iterator[np.ndarray]:
-    """Draw vectors without end, and yield those that are goals."""
+    """Yield goals without end. Drawn vectors that are no goals are left out."""
     while True:
         if task.allowed(vec := random.uniform(*task.drawn)):
             yield vec
