@@ -55,6 +55,11 @@ class Plan:
         if self.seed + self.seeds > 2**31:
             raise InputError(f"seeds must end below 2^31, and {self.seed} + {self.seeds} does not")
 
+    @property
+    def all_seeds(self) -> range:
+        """Return the seeds that are trained at once."""
+        return range(self.seed, self.seed + self.seeds)
+
 
 @dataclasses.dataclass(frozen=True)
 class RunConfig:

@@ -143,7 +143,7 @@ def _points(found: Found) -> Iterable[tuple[Any, dict[str, Any], Learned]]:
             mine.returns,
             evaluations.values,
             family.task_axis,
-            tuple(range(config.plan.seed, config.plan.seed + count)),
+            tuple(config.plan.all_seeds),
             mine.metrics,
         )
         shape = (evaluations.steps.tolist(), config.plan.eval_episodes, config.start)

@@ -78,6 +78,6 @@ def runs(pattern: str | Path | Iterable[str | Path] = "runs/*") -> Any:
     for found in collect.read(pattern):
         config = found.config
         fixed = {"run": str(found.directory), "env": config.env, "agent": config.agent, **found.settings}
-        seeds = range(config.plan.seed, config.plan.seed + config.plan.seeds)
+        seeds = config.plan.all_seeds
         made.append(frame_of(config.family, found.evaluations, seeds, config.points, **fixed))
     return pandas().concat(made, ignore_index=True)

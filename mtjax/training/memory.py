@@ -210,7 +210,7 @@ def split_to_fit(config: RunConfig, limit: float) -> list[RunConfig]:
 
 def _split_seeds(config: RunConfig, fitting: int) -> list[RunConfig]:
     plan = config.plan
-    parts = _even_parts(range(plan.seed, plan.seed + plan.seeds), fitting)
+    parts = _even_parts(plan.all_seeds, fitting)
     plans = [dataclasses.replace(plan, seed=int(part[0]), seeds=len(part)) for part in parts]
     return [dataclasses.replace(config, plan=each) for each in plans]
 

@@ -96,7 +96,7 @@ def load(directory: str | Path, seed: int = 0, checkpoint: int = 0) -> Policy:
         states = _filled(directory, state_shapes(config).agent)
     else:
         states = checkpoints.load_agent(directory / "checkpoints", state_shapes(config), checkpoint)
-    seeds = config.plan.seed + jnp.arange(config.plan.seeds)
+    seeds = jnp.asarray(np.asarray(config.plan.all_seeds, np.int32))
     return policy_of(config.family, config.learner, config.points, seeds, states, seed, directory)
 
 
@@ -156,6 +156,5 @@ def load_experience(directory: str | Path, seed: int = 0) -> tuple[Ring, int]:
 def state_shapes(config: RunConfig) -> loop.TrainState:
     """Return the shapes of a run's training state."""
     env, agent = config.family, points.SweptAgent(config.learner) if config.points else config.learner
-    seeds = config.plan.seed + np.arange(config.plan.seeds, dtype=np.int32)
-    axis = points.seed_axis(config.points, seeds)
+    axis = points.seed_axis(config.points, np.asarray(config.plan.all_seeds, np.int32))
     return trace(loop.init, env, agent, config.training, env.tasks("train"), *axis).out_info  # type: ignore

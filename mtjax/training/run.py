@@ -152,8 +152,7 @@ class _Run:
     @cached_property
     def seed_axis(self) -> tuple[np.ndarray, dict[str, np.ndarray] | None]:
         """Return the seeds (S,) of all points, and the swept values (S,) by name."""
-        first = self.plan.seed
-        return points.seed_axis(self.points, np.arange(first, first + self.plan.seeds, dtype=np.int32))
+        return points.seed_axis(self.points, np.asarray(self.plan.all_seeds, np.int32))
 
     @property
     def seeds(self) -> np.ndarray:
