@@ -253,7 +253,7 @@ SMALL = dict(hidden=(32, 32), latent_widths=(16,), num_envs=2, batch_size=8, war
 FAST = dict(actor_lr=3e-3, critic_lr=3e-3, initial_temperature=0.01, updates_per_step=1, chunk_steps=100)
 
 
-@pytest.mark.slow  # convolutions are slow under the tests' flags of the compiler
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["drq", pytest.param("sac-ae", marks=pytest.mark.nightly)])
 def test_agents_learn_what_only_pictures_show(name):
     """The best action is the task's scale times a sign that the picture shows: 0 reward, and about -1 without it."""
@@ -262,17 +262,11 @@ def test_agents_learn_what_only_pictures_show(name):
     assert float(result.rows[-1]["return"]) > -0.15
 
 
-@pytest.fixture
-def fast_convolutions(monkeypatch):
-    """Compile programs as users get them."""
-    monkeypatch.setattr(probes, "QUICK", {"xla_backend_optimization_level": 2})
-
-
 BESIDE = Pictured("by-both", state="also")
 
 
 @pytest.mark.slow
-def test_an_actor_learns_from_pictures_under_critics_that_see_the_state(fast_convolutions):
+def test_an_actor_learns_from_pictures_under_critics_that_see_the_state():
     """Without seeing, the best mean return is -0.625."""
     agent = mtjax.agent("drq", representation="asymmetric", shift=1, n_step=1)
     _, history = probes.train(BESIDE, agent, SMALL | FAST, chunks=3)
@@ -285,7 +279,7 @@ ON_POLICY |= dict(actor_lr=3e-3, critic_lr=3e-3, entropy_cost=0.0)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("representation", ["encoded", "asymmetric"])
-def test_ppo_learns_what_only_pictures_show(fast_convolutions, representation):
+def test_ppo_learns_what_only_pictures_show(representation):
     env = Pictured("by-both") if representation == "encoded" else BESIDE
     agent = mtjax.agent("ppo", representation=representation)
     state, history = probes.train(env, agent, ON_POLICY, chunks=6)
