@@ -153,10 +153,13 @@ def family_settings(given: Sequence[str], vary: Sequence[str], split: str | None
     return settings | {name: value(x) for name, x in (pair.split("=", 1) for pair in given)}
 
 
-def seeing(agent: str, settings: dict) -> dict[str, str]:
-    """Return the settings by which an agent learns from pictures, if it has to and does not by itself."""
-    plain = mtjax.agent(agent).representation == mtjax.agent("sac").representation
-    return {"representation": "encoded"} if "pixels" in settings and plain else {}
+def seeing(agent: str, settings: dict) -> dict[str, Any]:
+    """Return the settings by which an agent learns from pictures as ``drq`` does, if it has to and does not by itself."""
+    own, drq = mtjax.agents.settings(mtjax.agent(agent)), mtjax.AGENTS["drq"].defaults
+    if "pixels" not in settings or own["representation"] != "plain":
+        return {}
+    names = ("representation", "encoder_tau", "n_step") if "n_step" in own else ("representation",)
+    return {name: drq[name] for name in names}
 
 
 def save(folder: Path, agent: str, result: Result) -> None:

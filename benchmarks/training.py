@@ -36,7 +36,7 @@ class Training:
         self.seconds: list[float] = []
         jax.clear_caches()  # of the programs of others, which may be the same
         before = time.perf_counter()
-        init = compile_lowered(programs.init.lower(env, agent, settings, tasks, numbers, None), once=True)
+        init = compile_lowered(programs.init.lower(env, agent, settings, tasks, numbers, None), "once")
         self.state = init(tasks, numbers, None)
         chunk = compile_lowered(programs.chunk.lower(env, agent, settings, tasks, self.state))
         self.compile_seconds = time.perf_counter() - before

@@ -322,7 +322,7 @@ def test_a_policy_that_was_trained_beside_the_state_acts_by_pictures_alone(tmp_p
 @pytest.mark.parametrize(
     ("env", "agent", "message"),
     [
-        (Pictured(), mtjax.agent("sac"), "use --agent=drq or"),
+        (Pictured(), mtjax.agent("sac"), "use --agent=drq or, with another agent, --agent.representation=encoded"),
         (Pictured(), mtjax.agent("drq", representation="asymmetric"), "give --env.pixels=64 --env.state=also"),
         (Probe(), mtjax.agent("ppo", representation="asymmetric"), "give --env.pixels=64 --env.state=also"),
         (BESIDE, mtjax.agent("deepmdp"), "leave out --env.state=also"),

@@ -118,7 +118,7 @@ def score(policy: Policy, episodes: int, seed: int = 0, tasks: Task | None = Non
     env = policy.env
     tasks = env.tasks("all") if tasks is None else tasks
     arguments = policy.states, tasks, policy.seeds, jnp.int32(_FIRST_NUMBER + seed)
-    found = compile_lowered(trace(evaluate, env, policy.agent, episodes, *arguments).lower())(*arguments)
+    found = compile_lowered(trace(evaluate, env, policy.agent, episodes, *arguments).lower(), "seldom")(*arguments)
     return {split: of_tasks(found, np.asarray(env.tasks(split).id)) for split in SPLITS}
 
 

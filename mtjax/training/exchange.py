@@ -3,6 +3,9 @@
 While a chunk runs, a thread fetches what the chunk before it has taken, writes it to the run's folder, and collects the
 segments that go back to the devices after this chunk. So a draw knows the steps up to one chunk before. It depends on
 the seed and on the step alone, and a resumed run draws what it would have drawn.
+
+The thread puts nothing on the devices: a copy waits for XLA's stream, and MuJoCo Warp fails if that happens while it
+records a CUDA graph on it.
 """
 
 from collections.abc import Callable
@@ -55,7 +58,7 @@ class Exchange:
         for x in jax.tree.leaves(latest):
             x.copy_to_host_async()
         self.pending = self.thread.submit(self._keep, latest)
-        return state if segments is None else state._replace(data=self._recall(state.data, segments))
+        return state if segments is None else state._replace(data=self._recall(state.data, self._put(segments)))
 
     def finish(self, iteration: int) -> None:
         """Wait until all steps up to a checkpoint are in the run's folder, and drop those that none needs any more.
@@ -82,12 +85,12 @@ class Exchange:
         return self._collect()
 
     def _collect(self) -> Any:
-        """Return segments on the devices for the end of the next chunk; None if there are too few steps."""
-        found = self.store.draw(self.keys, self.chunk, self.latest, self.number, self.length)
-        if found is None:
-            return None
+        """Return segments for the end of the next chunk; None if there are too few steps."""
+        return self.store.draw(self.keys, self.chunk, self.latest, self.number, self.length)
+
+    def _put(self, segments: Any) -> Any:
         rows = self.experience.sharding.ring.rows
-        return jax.device_put(found, None if self.mesh is None else NamedSharding(self.mesh, rows))
+        return jax.device_put(segments, None if self.mesh is None else NamedSharding(self.mesh, rows))
 
     @cached_property
     def _newest(self) -> Callable:

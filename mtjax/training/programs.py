@@ -4,7 +4,7 @@ import os
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 from jax.sharding import Mesh, NamedSharding
@@ -15,6 +15,13 @@ from mtjax.loop import TrainState, init, run_chunk
 from mtjax.parallel.mesh import BY_SEED, BY_WORLD, REPLICATED
 from mtjax.training import traced
 from mtjax.types import Agent
+
+Runs = Literal["once", "seldom", "often"]
+_CUBLAS = {"xla_gpu_enable_triton_gemm": False}
+_FLAGS: dict[str, dict[Runs, dict[str, Any]]] = {  # XLA's, by the device and by how often a program runs
+    "cpu": {runs: {"xla_backend_optimization_level": int(runs != "once")} for runs in get_args(Runs)},
+    "gpu": {"once": _CUBLAS, "seldom": _CUBLAS},
+}
 
 
 class Jitted(NamedTuple):
@@ -95,17 +102,15 @@ def sharded_shapes(mesh: Mesh | None, agent: Agent, shapes: TrainState) -> Train
     return jax.tree.map(put, _specs(agent), shapes)
 
 
-def compile_lowered(program: Any, once: bool = False) -> Any:
-    """Compile a lowered program.
+def compile_lowered(program: Any, runs: Runs = "often") -> Any:
+    """Compile a lowered program, in less time if it runs seldom.
 
-    On a CPU, LLVM's later passes are left out: they take a quarter of the compile time and make nothing faster.
-
-    Args:
-        once: the program runs only once and briefly, so compile it as fast as possible.
+    On a CPU, LLVM's later passes are left out: they take a quarter of the compile time and make nothing faster. On a
+    GPU, matrix products of programs that run seldom are cuBLAS's: XLA tries dozens of kernels of its own for each.
     """
-    flag = "xla_backend_optimization_level"
-    chosen = jax.default_backend() != "cpu" or flag in os.environ.get("XLA_FLAGS", "")
-    return program.compile(None if chosen else {flag: 0 if once else 1})
+    flags = _FLAGS.get(jax.default_backend(), {}).get(runs, {})
+    given = os.environ.get("XLA_FLAGS", "")
+    return program.compile({name: value for name, value in flags.items() if name not in given} or None)
 
 
 def enable_compile_cache() -> None:
