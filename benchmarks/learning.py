@@ -216,7 +216,8 @@ def tabulate(out: Path, mark: float, baseline: str, unfinished: bool = False) ->
             found |= {agent: last_scores(evaluations)} if pair.finished else {}
             known = curve[np.all(np.isfinite(curve[:, :, -1]), axis=1)]  # chunks in which episodes ended
             if len(known):
-                curves[agent] = (known[:, 0, 1], known[:, :, -1].T[:, :, None, None])
+                label = agent.split(":")[0]  # without the steps of an unfinished one
+                curves[label] = (known[:, 0, 1], known[:, :, -1].T[:, :, None, None])
             lines.append(row(env, agent, curve, evaluations, mark))
             rows += evaluation_rows(env, agent, evaluations)
         differences += difference_rows(env, found, baseline)
