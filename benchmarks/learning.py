@@ -154,7 +154,7 @@ def family_settings(given: Sequence[str], vary: Sequence[str], split: str | None
 
 
 def seeing(agent: str, settings: dict) -> dict[str, Any]:
-    """Return the settings by which an agent learns from pictures as ``drq`` does, if it has to and does not by itself."""
+    """Return the settings by which an agent learns from pictures as ``drq`` does, if it has none of its own."""
     own, drq = mtjax.agents.settings(mtjax.agent(agent)), mtjax.AGENTS["drq"].defaults
     if "pixels" not in settings or own["representation"] != "plain":
         return {}

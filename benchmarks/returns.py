@@ -28,7 +28,7 @@ from resumable import train
 
 from mtjax.agents.choices import replace
 from mtjax.config import configure, with_preset
-from mtjax.envs.family import Tabled
+from mtjax.envs.tabled import Tabled
 from mtjax.evaluation import evaluate, save_evaluations
 from mtjax.names import replacing
 from mtjax.report.stats import seed_interval

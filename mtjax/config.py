@@ -23,7 +23,7 @@ from mtjax.agents.parts.values import VALUES
 from mtjax.checks import check_fields, require_values
 from mtjax.commands import PRESETS, is_imported, require_run
 from mtjax.envs import ENVS, is_mixture, make, members
-from mtjax.envs.family import Tabled
+from mtjax.envs.tabled import Tabled
 from mtjax.loop import Settings
 from mtjax.names import nearest_error
 from mtjax.types import InputError

@@ -1,4 +1,4 @@
-"""Map functions over seeds, worlds and agents, and apply them when it is their turn."""
+"""Map functions over seeds, worlds and agents, or apply them to parts of a batch or when it is their turn."""
 
 import math
 from collections.abc import Callable
@@ -51,6 +51,28 @@ def over_learners(function: Callable) -> Callable:
         return over_seeds(of_seed, 0, None, *world)(states, tasks, *arguments)
 
     return mapped
+
+
+def in_parts(function: Callable, features: Array, obs: Any, parts: int) -> Array:
+    """Apply a function of features and observations (T, B, ...) to ``parts`` of B, one after another.
+
+    The result (T, B) is as of one call; less memory is in use at once.
+
+    Args:
+        features: (T, Z), or (T, B, Z) where each step has its own.
+    """
+    count = jax.tree.leaves(obs)[0].shape[1]
+    size = -(-count // parts)
+    starts = jnp.minimum(jnp.arange(parts) * size, count - size)  # the last part may overlap the one before it
+
+    def one(start: Array) -> Array:
+        take = lambda x: jax.lax.dynamic_slice_in_dim(x, start, size, axis=1)
+        return function(take(features) if features.ndim == 3 else features, jax.tree.map(take, obs))
+
+    found = jax.lax.map(one, starts)  # (parts, T, size)
+    place = jnp.arange(count)
+    part = place // size
+    return found[part, :, place - starts[part]].T
 
 
 def when(due: Array, function: Callable, state: Any) -> tuple[Any, Any]:

@@ -27,15 +27,16 @@ def init(size: int) -> Moments:
 def update(moments: Moments, batch: Array) -> Moments:
     """Add a batch (..., O) to the moments."""
     batch = batch.reshape(-1, batch.shape[-1])
-    count, mean = moments.count + len(batch), jnp.mean(batch, axis=0)
-    shift = mean - moments.mean
-    return Moments(
-        count=count,
-        mean=moments.mean + shift * len(batch) / count,
-        deviation=moments.deviation
-        + jnp.sum(jnp.square(batch - mean), axis=0)
-        + jnp.square(shift) * moments.count * len(batch) / count,
-    )
+    mean = jnp.mean(batch, axis=0)
+    return merge(moments, Moments(jnp.float32(len(batch)), mean, jnp.sum(jnp.square(batch - mean), axis=0)))
+
+
+def merge(moments: Moments, others: Moments) -> Moments:
+    """Combine the moments of two sets of observations, the second of which is not empty."""
+    count, shift = moments.count + others.count, others.mean - moments.mean
+    share = others.count / count
+    deviation = moments.deviation + others.deviation + jnp.square(shift) * moments.count * share
+    return Moments(count, moments.mean + shift * share, deviation)
 
 
 def apply(moments: Moments, x: Array) -> Array:

@@ -14,9 +14,10 @@ from mtjax.agents.parts.encoders import ENCODERS
 from mtjax.agents.parts.gradients.surgery import RULES
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
-from mtjax.agents.ppo import Batch, Taken, Units, advantages, in_parts, take_steps
+from mtjax.agents.ppo import Batch, Taken, Units, advantages, take_steps
 from mtjax.config import with_preset
 from mtjax.envs.probes import Probe, tasks_of
+from mtjax.maps import in_parts
 from mtjax.networks import log_density
 from mtjax.types import InputError, Spec, Transition
 

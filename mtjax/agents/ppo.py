@@ -17,6 +17,7 @@ from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.trajectory import Past, append
 from mtjax.experience import Rollouts
+from mtjax.maps import in_parts
 from mtjax.networks import (
     OVER_TASKS,
     STD_RANGE,
@@ -28,6 +29,7 @@ from mtjax.networks import (
     tanh_normal,
 )
 from mtjax.parallel import collectives
+from mtjax.parallel.collectives import mean_and_variance
 from mtjax.types import Acted, Array, InputError, Key, Metrics, Spec, Task, Transition
 
 LOG_RATIO_LIMIT = 20.0
@@ -360,7 +362,7 @@ class PPO(BaseAgent):
         count = (found.shape[1] if mixed else found.shape[0] * found.shape[1]) * collectives.count()
         mean, variance = (x.reshape(moments.mean.shape) for x in mean_and_variance(found, 1 if mixed else (0, 1)))
         one = normalize.Moments(jnp.full_like(moments.count, count), mean, count * variance)
-        return jax.vmap(merge)(moments, one) if mixed else merge(moments, one)
+        return jax.vmap(normalize.merge)(moments, one) if mixed else normalize.merge(moments, one)
 
     def minibatch_indices(self, count: int, key: Key) -> Array:
         """Split ``count`` steps at random into the minibatches of all epochs: indices (U, B)."""
@@ -436,28 +438,6 @@ def advantages(
     return jax.lax.scan(back, jnp.zeros_like(delta[0]), (delta, decay), reverse=True)[1]
 
 
-def in_parts(function: Callable, features: Array, obs: Any, parts: int) -> Array:
-    """Apply a function of features and observations (T, B, ...) to ``parts`` of B, one after another.
-
-    The result (T, B) is as of one call; less memory is in use at once.
-
-    Args:
-        features: (T, Z), or (T, B, Z) where each step has its own.
-    """
-    count = jax.tree.leaves(obs)[0].shape[1]
-    size = -(-count // parts)
-    starts = jnp.minimum(jnp.arange(parts) * size, count - size)  # the last part may overlap the one before it
-
-    def one(start: Array) -> Array:
-        take = lambda x: jax.lax.dynamic_slice_in_dim(x, start, size, axis=1)
-        return function(take(features) if features.ndim == 3 else features, jax.tree.map(take, obs))
-
-    found = jax.lax.map(one, starts)  # (parts, T, size)
-    place = jnp.arange(count)
-    part = place // size
-    return found[part, :, place - starts[part]].T
-
-
 def take_steps(batch: Batch, index: Array) -> Batch:
     """Take the steps at ``index`` (B,) of every task's batch."""
     rows = lambda x: x[:, index]
@@ -475,18 +455,3 @@ def scale_head(params: Params, bias: Array) -> Params:
         return {**part, "head": {"kernel": HEAD_SCALE * head["kernel"], "bias": head["bias"] + bias}}
 
     return Params(scaled(params.shared), scaled(params.own))
-
-
-def mean_and_variance(x: Array, axes: int | tuple[int, ...]) -> tuple[Array, Array]:
-    """Return mean and variance along axes, which keep length 1, over all devices that share the data."""
-    mean_of = lambda x: collectives.total(jnp.mean(x, axis=axes, keepdims=True)) / collectives.count()
-    mean = mean_of(x)
-    return mean, mean_of(jnp.square(x - mean))
-
-
-def merge(moments: normalize.Moments, others: normalize.Moments) -> normalize.Moments:
-    """Combine moments of two sets of data (Chan et al. 1979)."""
-    count, shift = moments.count + others.count, others.mean - moments.mean
-    share = others.count / count
-    deviation = moments.deviation + others.deviation + jnp.square(shift) * moments.count * share
-    return normalize.Moments(count, moments.mean + shift * share, deviation)

@@ -43,6 +43,13 @@ def total(tree: Any) -> Any:
     return tree if count() == 1 else jax.lax.psum(tree, AXIS)
 
 
+def mean_and_variance(x: Array, axes: int | tuple[int, ...]) -> tuple[Array, Array]:
+    """Return mean and variance along axes, which keep length 1, over all devices that share the data."""
+    mean_of = lambda x: total(jnp.mean(x, axis=axes, keepdims=True)) / count()
+    mean = mean_of(x)
+    return mean, mean_of(jnp.square(x - mean))
+
+
 def pick(tree: Any, holder: Array) -> Any:
     """Take each row of leaves (*holder.shape, ...) from the device whose number is in ``holder`` (...)."""
     if count() == 1:

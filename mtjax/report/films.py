@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from mtjax.envs.family import Part, Tabled
 from mtjax.envs.pixels import Pictured
+from mtjax.envs.tabled import Part, Tabled
 from mtjax.evaluation import Recording, record
 from mtjax.names import InputError
 from mtjax.report import render

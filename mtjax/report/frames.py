@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mtjax.envs.family import Tabled
+from mtjax.envs.tabled import Tabled
 from mtjax.evaluation import Evaluations
 from mtjax.names import InputError
 from mtjax.report import collect

@@ -5,7 +5,8 @@ from types import MappingProxyType
 
 import numpy as np
 
-from mtjax.envs.family import Family, Part
+from mtjax.envs.family import Family
+from mtjax.envs.tabled import Part
 from mtjax.evaluation import Evaluations, Scores, of_tasks
 from mtjax.report.stats import seed_interval
 from mtjax.training.policy import Policy

@@ -12,7 +12,8 @@ from mtjax.agents.choices import settings as settings_of
 from mtjax.checks import checked, path
 from mtjax.config import Plan, RunConfig, configure, from_json, own_files, with_preset
 from mtjax.envs import BENCHMARKS, ENVS, is_mixture, make, members, name_of
-from mtjax.envs.family import Family, Tabled
+from mtjax.envs.family import Family
+from mtjax.envs.tabled import Tabled
 from mtjax.loop import Settings
 from mtjax.names import InputError, nearest_error
 from mtjax.parallel import hosts

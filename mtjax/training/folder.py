@@ -19,8 +19,9 @@ from mtjax import __version__
 from mtjax.agents import settings
 from mtjax.agents.choices import flag_names
 from mtjax.config import RunConfig, from_json, import_flags, to_json
-from mtjax.envs.family import Family, Tabled
+from mtjax.envs.family import Family
 from mtjax.envs.mixtures import Mixture
+from mtjax.envs.tabled import Tabled
 from mtjax.names import notice, replacing
 from mtjax.types import InputError
 

@@ -14,7 +14,7 @@ from mtjax.agents import BaseAgent, name_of
 from mtjax.checks import path
 from mtjax.config import RunConfig, from_json
 from mtjax.envs import name_of as env_name_of
-from mtjax.envs.family import Tabled
+from mtjax.envs.tabled import Tabled
 from mtjax.experience import Replay
 from mtjax.experience.ring import Ring
 from mtjax.training import checkpoint as checkpoints

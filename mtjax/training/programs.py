@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import jax
 from jax.sharding import Mesh, NamedSharding
 
-from mtjax.envs.family import Tabled
+from mtjax.envs.tabled import Tabled
 from mtjax.evaluation import evaluate
 from mtjax.loop import TrainState, init, run_chunk
 from mtjax.parallel.mesh import BY_SEED, BY_WORLD, REPLICATED

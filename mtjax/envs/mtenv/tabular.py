@@ -11,8 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.envs.family import Family, Table
+from mtjax.envs.family import Family
 from mtjax.envs.parameters import Parameter
+from mtjax.envs.tabled import Table
 from mtjax.types import SPLITS, Array, InputError, Key, Step, Task
 
 _MOST_HELD_OUT = 10
