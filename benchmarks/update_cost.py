@@ -117,8 +117,9 @@ def tasks_of(num_tasks: int) -> Task:
 
 def seeing(side: int | None) -> Spec:
     """Return the spec of agents that see numbers, or stacks of three pictures of this side."""
-    picture = {frames.PICTURES: jax.ShapeDtypeStruct((side, side, 3), jnp.uint8)}
-    return SPEC._replace(obs=picture, frames=3) if side else SPEC
+    if side is None:
+        return SPEC
+    return SPEC._replace(obs={frames.PICTURES: jax.ShapeDtypeStruct((side, side, 3), jnp.uint8)}, frames=3)
 
 
 def random_batch(spec: Spec, num_tasks: int, batch_size: int) -> Transition:

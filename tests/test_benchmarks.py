@@ -379,6 +379,12 @@ def test_a_suites_agents_see_its_pictures(script, agent):
     assert program.learner.representation.sees_pictures
 
 
+def test_agents_that_are_timed_see_numbers_or_pictures(script):
+    cost = script("update_cost")
+    assert cost.seeing(None) is cost.SPEC
+    assert {name: x.shape for name, x in cost.seeing(16).obs.items()} == {"pixels": (16, 16, 3)}
+
+
 @with_scenes
 def test_scripted_policies_need_numpy_alone(script, monkeypatch):
     """The package's own imports, such as Gymnasium's environments, stay out."""
