@@ -5,15 +5,12 @@ Tables are built on the host. Compiled programs never loop over tasks.
 
 import abc
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from mtjax.types import SPLITS, Array, InputError, Key, Spec, Step, Task
-
-if TYPE_CHECKING:
-    from mtjax.envs.family import Family
 
 
 class Table(NamedTuple):
@@ -28,7 +25,7 @@ class Part(NamedTuple):
     """A family, and the places of its tasks among those of an environment."""
 
     name: str  # empty for a single family
-    family: "Family"
+    family: Any  # a Family
     places: Mapping[str, np.ndarray]  # split, or "all" -> which of that split's tasks are the family's
 
 
