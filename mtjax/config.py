@@ -180,10 +180,14 @@ def require_value_range(agent: Any) -> None:
             raise InputError(f"value={name_of(VALUES, agent.value)} {reason}")
 
 
-def wants_gpu(env_name: str) -> bool:
-    """Return whether a CPU was not seen to learn a family, or one of a mixture, within minutes."""
-    slow = tomllib.loads((resources.files("mtjax") / "configs" / "default.toml").read_text())["wants_gpu"]
-    return not set(slow).isdisjoint(name for name, _ in members(env_name))
+def slow_on_cpu(env_name: str) -> dict[str, str]:
+    """Return those of an environment's families that a CPU was not seen to learn in minutes with the default agent.
+
+    Returns:
+        family -> the agent that did learn it there, or "" if none was seen to.
+    """
+    slow = tomllib.loads((resources.files("mtjax") / "configs" / "default.toml").read_text())["slow_on_cpu"]
+    return {name: slow[name] for name, _ in members(env_name) if name in slow}
 
 
 def load_preset(env_name: str, name: str) -> dict[str, Any]:

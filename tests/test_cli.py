@@ -26,7 +26,7 @@ from mtjax.agents import AGENTS
 from mtjax.agents import settings as settings_of
 from mtjax.agents.choices import CHOICES
 from mtjax.agents.parts.representations import DeepMDP
-from mtjax.config import from_json, load_preset, to_json, wants_gpu, with_preset
+from mtjax.config import from_json, load_preset, slow_on_cpu, to_json, with_preset
 from mtjax.envs import BENCHMARKS, ENVS
 from mtjax.loop import Settings
 from mtjax.names import notice
@@ -164,7 +164,8 @@ def test_repeating_flags_name_the_file_of_vectors(tmp_path):
 def test_presets_name_only_what_there_is(file):
     """A word that is misspelt in a preset would otherwise be left out without a sign."""
     preset = tomllib.loads(file.read_text())
-    assert set(preset.pop("wants_gpu", ())) <= set(ENVS)
+    slow = preset.pop("slow_on_cpu", {})
+    assert set(slow) <= set(ENVS) and set(slow.values()) <= {"", *mtjax.AGENTS}
     assert preset and set(preset) <= {"cpu", "gpu"}
     fields = lambda cls: {field.name for field in dataclasses.fields(cls)}
     known = {"plan": fields(Plan), "agent": set(settings_of(mtjax.agent("sac")))}
@@ -612,9 +613,10 @@ def test_unusable_names_are_input_errors_in_the_library():
 
 
 def test_a_family_that_a_cpu_does_not_learn_is_known():
-    """Alone and in a mixture."""
-    assert wants_gpu("hopper-hop") and not wants_gpu("finger-spin")
-    assert wants_gpu("finger-spin+hopper-hop") and not wants_gpu("finger-spin+cheetah-run")
+    """Alone and in a mixture, and by which agent it does."""
+    assert slow_on_cpu("hopper-hop") == slow_on_cpu("finger-spin+hopper-hop") == {"hopper-hop": ""}
+    assert slow_on_cpu("finger-spin+cheetah-run") == {}
+    assert slow_on_cpu("cartpole-swingup-sparse") == {"cartpole-swingup-sparse": "ppo"}
 
 
 # Files of flags.

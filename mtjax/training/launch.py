@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from mtjax.config import RunConfig, require_value_range, wants_gpu
+from mtjax.config import RunConfig, require_value_range, slow_on_cpu
 from mtjax.envs import Family
 from mtjax.parallel import hosts, mesh
 from mtjax.report import figures
@@ -107,11 +107,18 @@ def _introduction(config: RunConfig, directory: Path | None, resume: bool, label
     lines += [] if directory is None else [f"run: {directory}"]
     if resume and "warp" in config.family.engine_name:
         lines.append("MuJoCo Warp does not repeat bit for bit: the run goes on from its state, in other numbers")
-    if jax.default_backend() == "cpu" and wants_gpu(config.env):
-        lines.append(f"{config.env} wants a GPU: two CPU cores were not seen to learn it in seven minutes")
+    if jax.default_backend() == "cpu":
+        lines += [_warning(family, agent) for family, agent in slow_on_cpu(config.env).items() if agent != config.agent]
     if resume and config.learner.lr_schedule != "constant" and not config.learner.lr_updates:
         lines.append(f"learning rates go on along the schedule of a run of {plan.steps:,} steps")
     return "\n".join(lines)
+
+
+def _warning(family: str, agent: str) -> str:
+    """Return what to say of a family that a CPU is slow to learn, given the agent that did learn it there, if any."""
+    if agent:
+        return f"{family} wants a GPU or --agent={agent}, by which one CPU core learned it in five minutes"
+    return f"{family} wants a GPU: two CPU cores were not seen to learn it in seven minutes"
 
 
 def draw(config: RunConfig, result: Result, directory: Path) -> None:
