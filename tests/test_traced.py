@@ -19,7 +19,7 @@ import pytest
 
 import mtjax
 from mtjax.envs.mixtures import Blocks, States
-from mtjax.training import traced
+from mtjax.training import programs, traced
 
 # Runs a command and says, as the last line of its output, how often the steps of programs were traced.
 SCRIPT = """
@@ -295,3 +295,20 @@ def test_a_second_run_traces_nothing(tmp_path, env):
     assert written[0] == written[1] == written[2]
     evaluate = ["mtjax.evaluate", f"--run={next(runs[0].iterdir())}", "--episodes=2"]
     assert command(evaluate, caches[1]) > 0 and command(evaluate, caches[1]) == 0
+
+
+@pytest.mark.parametrize(
+    ("backend", "flags", "asked"),
+    [
+        ("gpu", "", [{"xla_gpu_enable_triton_gemm": False}, {"xla_gpu_enable_triton_gemm": False}, None]),
+        ("gpu", "--xla_gpu_enable_triton_gemm=true", [None, None, None]),
+        ("cpu", "", [{"xla_backend_optimization_level": level} for level in (0, 1, 1)]),
+        ("tpu", "", [None, None, None]),
+    ],
+)
+def test_a_program_compiles_sooner_if_it_runs_seldom(monkeypatch, backend, flags, asked):
+    """Unless the user's flags say otherwise; and no device sees another's flags."""
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    monkeypatch.setenv("XLA_FLAGS", flags)
+    lowered = types.SimpleNamespace(compile=lambda options: options)
+    assert [programs.compile_lowered(lowered, runs) for runs in ("once", "seldom", "often")] == asked
