@@ -32,7 +32,7 @@ def update(moments: Moments, batch: Array) -> Moments:
 
 
 def merge(moments: Moments, others: Moments) -> Moments:
-    """Combine the moments of two sets of observations, the second of which is not empty."""
+    """Combine the moments of two sets of observations. The second set must not be empty."""
     count, shift = moments.count + others.count, others.mean - moments.mean
     share = others.count / count
     deviation = moments.deviation + others.deviation + jnp.square(shift) * moments.count * share

@@ -361,17 +361,15 @@ def test_a_run_goes_on_bit_for_bit(tmp_path):
         np.testing.assert_array_equal(one, other)
 
 
-def test_steps_on_the_host_are_moved_while_warp_records():
+@pytest.mark.parametrize("name", ["finger-spin-vary-size", "walker-walk-vary-friction"])
+def test_steps_on_the_host_are_moved_while_warp_records(name):
     """Warp records CUDA graphs when a program first runs, as the evaluation does beside an exchange of many steps."""
+    env, agent = mtjax.make(name, engine="warp"), mtjax.agent("sac-conditioned", hidden=(8, 8))
+    steps = 64 * 250 * env.train_count * 8
     settings = {"num_envs": 64, "batch_size": 8, "warmup_steps": 5, "chunk_steps": 250}
     replay = {"replay_size": 64 * 600, "host_replay_size": 64 * 4000}
-    for name in ("finger-spin-vary-size", "walker-walk-vary-friction"):
-        env = mtjax.make(name, engine="warp")
-        steps = 64 * 250 * len(env.tasks("train").id) * 8
-        agent = mtjax.agent("sac-conditioned", hidden=(8, 8))
-        plan = {"steps": steps, "eval_every": steps // 2, "eval_episodes": 1}
-        found = mtjax.train(env, agent, **plan, **settings, **replay)
-        assert found.finished and len(found.evaluations.steps) == 2
+    found = mtjax.train(env, agent, steps=steps, eval_every=steps // 2, eval_episodes=1, **settings, **replay)
+    assert found.finished and len(found.evaluations.steps) == 2
 
 
 def bytes_of(tree):

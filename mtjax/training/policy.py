@@ -96,7 +96,7 @@ def load(directory: str | Path, seed: int = 0, checkpoint: int = 0) -> Policy:
         states = _filled(directory, state_shapes(config).agent)
     else:
         states = checkpoints.load_agent(directory / "checkpoints", state_shapes(config), checkpoint)
-    seeds = jnp.asarray(np.asarray(config.plan.all_seeds, np.int32))
+    seeds = jnp.asarray(config.plan.all_seeds, jnp.int32)
     return policy_of(config.family, config.learner, config.points, seeds, states, seed, directory)
 
 

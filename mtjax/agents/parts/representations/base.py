@@ -85,8 +85,8 @@ class Plain:
             InputError: they cannot.
         """
         if frames.shown(obs):
-            also = "--agent.representation=encoded --agent.encoder-tau=1 --n-step=3"
-            raise InputError(f"networks take vectors; for pictures use --agent=drq or, with another agent, {also}")
+            other = "--agent.representation=encoded, and --agent.encoder-tau=1 --n-step=3 if it has a replay"
+            raise InputError(f"networks take vectors; for pictures use --agent=drq or, with another agent, {other}")
 
     def acts_on(self, obs: Any) -> Any:
         """Return those entries of an observation, or of its shapes, that acting needs."""
