@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from mtjax import shipped
+from mtjax import shipped, xla_flags
 from mtjax.agents import AGENTS, CHOICES
 from mtjax.envs import BENCHMARKS, ENVS, members, outline, varied
 from mtjax.names import InputError, NoRoomError, Notice, nearest_error
@@ -48,6 +48,7 @@ P = TypeVar("P")
 def main(run: Any) -> None:
     """Run a command's entry point. A mistake of the user prints one line and exits with code 2."""
     gc.set_threshold(_ALLOCATIONS, _LOOKS)
+    xla_flags.try_few_tilings()
     try:
         with _plain_notices():
             run(sys.argv[1:])

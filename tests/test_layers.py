@@ -34,7 +34,7 @@ LAYERS = (
     [GROUND],
     [("envs",), ("experience",), ("agents",)],
     [("rollout", "loop", "evaluation")],
-    [("parallel", "commands", "flag_files", "shipped", "config", "registry")],
+    [("parallel", "commands", "flag_files", "shipped", "config", "registry", "xla_flags")],
     [("training", "report")],
     [("cli",), ("gym",)],
     [("train",), ("evaluate",), ("plot",)],

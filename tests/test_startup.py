@@ -9,13 +9,14 @@ import subprocess
 import sys
 from pathlib import Path
 from threading import Event
+from types import SimpleNamespace
 
 import pytest
 from mujoco import mjx
 from probes import FEW, INSTALLED
 
 import mtjax
-from mtjax import cli, commands, names, train
+from mtjax import cli, commands, names, train, xla_flags
 from mtjax.agents import AGENTS, CHOICES, PARTS, settings
 from mtjax.agents.choices import flag_names
 from mtjax.config import with_preset
@@ -23,6 +24,7 @@ from mtjax.envs import ENVS, fields, outline
 from mtjax.envs.brax import NAMES
 from mtjax.names import InputError
 
+TILINGS = "xla_gpu_experimental_cost_model_gemm_tiling_options"
 HEAVY = ("jax", "flax", "optax", "mujoco", "orbax", "brax", "warp", "matplotlib", "mtjax.config")
 ENGINES = ("mujoco.mjx", "warp", "brax")
 # Runs a command and says, as the last line of its output, which of some modules were imported.
@@ -209,3 +211,32 @@ def test_fields_of_models_are_those_of_mjx():
                 (traced if "Array" in str(field.type) else static).add(prefix + field.name)
     assert set(fields.VARIABLE) == traced | {"site_size"}
     assert set(fields.FIXED) == static - {"site_size"}
+
+
+@pytest.mark.parametrize(
+    ("version", "gpu", "given", "expected"),
+    [
+        ("0.11.2", True, "", f"--{TILINGS}=top=4,top_from_default=1"),
+        ("0.10.2", True, "--xla_dump_to=x", f"--xla_dump_to=x --{TILINGS}=top=4,top_from_default=1"),
+        ("0.11.0.dev3", True, "", f"--{TILINGS}=top=4,top_from_default=1"),
+        ("0.11.2", True, f"--{TILINGS}=top=1", f"--{TILINGS}=top=1"),
+        ("0.11.2", False, "", ""),
+        ("0.10.1", True, "", ""),
+        ("0.12.0", True, "", ""),
+    ],
+)
+def test_xla_is_given_only_a_flag_that_it_knows(monkeypatch, version, gpu, given, expected):
+    """XLA ends the process at others."""
+    monkeypatch.setenv("XLA_FLAGS", given)
+    monkeypatch.setattr(xla_flags, "metadata", SimpleNamespace(version=lambda package: version))
+    monkeypatch.setattr(xla_flags, "util", SimpleNamespace(find_spec=lambda name: object() if gpu else None))
+    xla_flags.try_few_tilings()
+    assert os.environ["XLA_FLAGS"] == expected
+
+
+def test_this_xla_knows_the_flag():
+    """A program computes under it, on any device."""
+    program = "from mtjax import xla_flags; xla_flags._has_gpu = lambda: True; xla_flags.try_few_tilings()\n"
+    program += "import os, jax; print('gemm_tiling' in os.environ['XLA_FLAGS'], float(jax.numpy.ones(3).sum()))"
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert run.stdout.split() == ["True", "3.0"]
