@@ -10,8 +10,8 @@ pairs are not run again, so that a long suite runs in parts. A pair that was sto
 ``learning.py``; its checkpoints need up to 45 GB in ``mt10``, ``hard``, ``pixels`` and ``looks``. All results in DIR
 together give ``scores.md`` (means over tasks with 95% intervals over seeds, for every split), ``tasks.csv`` (every
 training task and seed of the last evaluation) and, for suites that compare one agent for all tasks with one for each,
-``sharing.md``. ``scores.md`` names unfinished pairs. ``--unfinished`` adds their last evaluation, marked with its
-steps, to it and to ``tasks.csv``.
+``sharing.md``, which compares them after as many steps a task. ``scores.md`` names unfinished pairs. ``--unfinished``
+adds their last evaluation, marked with its steps, to it and to ``tasks.csv``, and their evaluations to ``sharing.md``.
 
 Success is that of the last evaluation: at the episode's last step, and at any step. Both are shares of episodes.
 ``care`` is told its task as all agents are, in Meta-World by its number. As published it reads what the task asks for:
@@ -220,23 +220,46 @@ def tabulate(out: Path, suite: Suite, unfinished: bool = False) -> str:
     (out / "scores.md").write_text(table + "\n")
     write_lines(out / "tasks.csv", rows)
     if suite.together:
-        (out / "sharing.md").write_text(sharing(out, suite) + "\n")
+        (out / "sharing.md").write_text(sharing(out, suite, unfinished) + "\n")
     return table
 
 
-def sharing(out: Path, suite: Suite) -> str:
-    """Return a table of every task: one agent for all tasks against one for this task."""
-    pairs = {(env, agent): last for env, agent, last in found(out, suite)}
+def sharing(out: Path, suite: Suite, unfinished: bool = False) -> str:
+    """Return a table of every task: one agent for all tasks against one for this task, after as many steps a task."""
+    pairs = {(pair.env, pair.agent.split(",")[0]): pair.evaluations for pair in learning.pairs(out, unfinished)}
+    tasks, labels = suite.together.split("+"), family_of(suite, suite.together).labels("train")
     lines = []
     for agent in dict.fromkeys(agent for _, agent in pairs):
-        for task in suite.together.split("+"):
-            shared, alone = pairs.get((suite.together, agent)), pairs.get((task, agent))
-            if shared is None or alone is None:
-                continue
-            ours = shared.returns[:, [shared.labels.index(task)]]
-            gain = learning.cell(unpaired_difference(ours, alone.returns), "+.0f")
-            lines.append([task, agent, score(ours, ".0f"), score(alone.returns, ".0f"), gain])
-    return markdown(["task", "agent", "one agent for all", "one for this task", "difference"], lines)
+        if (shared := pairs.get((suite.together, agent))) is None:
+            continue
+        own = [task for task in tasks if (task, agent) in pairs]
+        lines += [[task, agent, *compare(shared, labels.index(task), pairs[task, agent])] for task in own]
+    head = ["task", "agent", "steps a task", "one agent for all", "one for this task", "difference"]
+    return markdown(head, lines)
+
+
+def compare(shared: Evaluations, row: int, alone: Evaluations) -> list[str]:
+    """Return the steps a task that both have made, and the returns after these of a shared agent and of a task's own.
+
+    Chunks round steps, so that an evaluation of one may come a little sooner than that of the other.
+    """
+    made = min(steps_a_task(shared)[-1], steps_a_task(alone)[-1])
+    if made < max(steps_a_task(shared)[0], steps_a_task(alone)[0]):
+        return [f"{made:,.0f}", "-", "-", "-"]
+    ours, theirs = returns_after(shared, made)[:, [row]], returns_after(alone, made)
+    gain = learning.cell(unpaired_difference(ours, theirs), "+.0f")
+    return [f"{made:,.0f}", *(score(x, ".0f") for x in (ours, theirs)), gain]
+
+
+def steps_a_task(evaluations: Evaluations) -> np.ndarray:
+    """Return the steps of each training task before each evaluation (V,)."""
+    return evaluations.steps / evaluations.returns["train"].shape[2]
+
+
+def returns_after(evaluations: Evaluations, steps: float) -> np.ndarray:
+    """Return the training tasks' mean returns (S, T) of the last evaluation within so many steps a task."""
+    last = np.flatnonzero(steps_a_task(evaluations) <= steps)[-1]
+    return evaluations.returns["train"][:, last].mean(axis=-1)
 
 
 def score(values: np.ndarray | None, form: str) -> str:

@@ -315,7 +315,8 @@ def test_a_suite_reports_success_and_what_sharing_is_worth(script, tmp_path):
     success = np.zeros(shape)
     success[:, 1, 1, :2] = 1
     found = {together: evaluations_of(returns, success=success, success_ever=np.ones(shape))}
-    found |= {name: evaluations_of(np.full((3, 2, 1, 4), 25.0)) for name in tasks}
+    found[together] = found[together]._replace(steps=np.array([100, 200]))
+    found |= {name: evaluations_of(np.full((3, 2, 1, 4), 25.0))._replace(steps=np.array([50, 100])) for name in tasks}
     for env, evaluations in found.items():
         (tmp_path / env).mkdir()
         save_evaluations(tmp_path / env / "brc.npz", evaluations)
@@ -323,13 +324,29 @@ def test_a_suite_reports_success_and_what_sharing_is_worth(script, tmp_path):
     assert "| 2 families | brc | 3 | 20 [20, 20] | - | - | 0.250 [0.250, 0.250] | 1.000 [1.000, 1.000] |" in table
     assert "| walker-run | brc | 3 | 25 [25, 25] | - | - | - | - |" in table
     sharing = (tmp_path / "sharing.md").read_text()
-    assert "| walker-walk | brc | 10 [10, 10] | 25 [25, 25] | -15 [-15, -15] |" in sharing
-    assert "| walker-run | brc | 30 [30, 30] | 25 [25, 25] | +5 [+5, +5] |" in sharing
+    assert "| walker-walk | brc | 100 | 10 [10, 10] | 25 [25, 25] | -15 [-15, -15] |" in sharing
+    assert "| walker-run | brc | 100 | 30 [30, 30] | 25 [25, 25] | +5 [+5, +5] |" in sharing
     assert len((tmp_path / "tasks.csv").read_text().splitlines()) == 1 + 3 * 4
     for env, evaluations in found.items():  # of an agent that the suite does not have by itself
         save_evaluations(tmp_path / env / "sac.npz", evaluations)
     suite.tabulate(tmp_path, suite.Suite("", (together,), ("brc",), 1, together=together))
-    assert "| walker-run | sac | 30 [30, 30] |" in (tmp_path / "sharing.md").read_text()
+    assert "| walker-run | sac | 100 | 30 [30, 30] |" in (tmp_path / "sharing.md").read_text()
+
+
+def test_sharing_is_compared_after_as_many_steps_a_task(script, tmp_path):
+    """A task's own agent was evaluated more often, one was stopped before the first evaluation of the shared one."""
+    suite = script("suite")
+    together = "walker-walk+walker-run"
+    both = evaluations_of(np.array([[10.0, 20.0], [30.0, 40.0]])[None, ..., None])._replace(steps=[160, 240])
+    own = evaluations_of(np.array([1.0, 2.0, 3.0])[None, :, None, None])._replace(steps=[40, 110, 200])
+    early = evaluations_of(np.full((1, 1, 1, 1), 5.0))._replace(steps=[40])
+    for env, evaluations in {together: both, "walker-walk": own, "walker-run": early}.items():
+        (tmp_path / env).mkdir()
+        save_evaluations(tmp_path / env / "brc.npz", evaluations._replace(steps=np.array(evaluations.steps)))
+    suite.tabulate(tmp_path, suite.Suite("", (together,), ("brc",), 1, together=together))
+    sharing = (tmp_path / "sharing.md").read_text()
+    assert "| walker-walk | brc | 120 | 30 | 2 | +28 |" in sharing
+    assert "| walker-run | brc | 40 | - | - | - |" in sharing
 
 
 def test_suites_name_only_what_there_is(script):
