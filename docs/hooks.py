@@ -175,7 +175,7 @@ def _family_figures(name: str) -> str:
 _ON_GPU, _ON_CPU = _FILMED = "h200-families", "cpu-films"  # runs whose policies the films show
 _ONE_SEED = {  # runs -> their title, and where their command stands
     _ON_GPU: (
-        "One H200 that six to nine runs share, one seed",
+        "One H200 that six to ten runs share, one seed",
         "fifty-families-for-a-few-minutes-each-on-a-shared-h200-one-seed",
     ),
     _ON_CPU: (
