@@ -1,5 +1,6 @@
 """Families of a mixture that share a simulator: every one steps as it does alone."""
 
+import re
 from functools import partial
 
 import jax
@@ -36,7 +37,9 @@ def played(env, split, places=None):
             after = env.step_worlds(each, state, action[..., : env.spec.action_size])
             return after.state, (after.obs, after.reward, after.metrics)
 
-        return jax.lax.scan(step, env.reset_worlds(each, keys).state, actions)[1]
+        first = env.reset_worlds(each, keys)
+        obs, *rest = jax.lax.scan(step, first.state, actions)[1]
+        return jnp.concatenate([first.obs[None], obs]), *rest
 
     return play(each, keys, actions)
 
@@ -66,6 +69,17 @@ def test_families_of_one_structure_share_a_simulator():
     assert len(calls) == 2 + 2  # the mixture's, and those of joined families alone
     again = mtjax.mixture([*families, mtjax.make("acrobot-swingup", engine="c")])
     assert all(again.provide(*about) == name for name, about in calls.items())  # as another process does
+
+
+def test_starts_of_one_structure_are_solved_for_together():
+    """In one call, which feels the weight of each dog; a start of its own remains the family's."""
+    dogs = [mtjax.make(name, {"mass": mass}, engine="c") for name, mass in (("dog-stand", "0.8,1.2"), ("dog-run", "1"))]
+    env = mtjax.mixture(dogs)
+    require_as_alone(env)
+    shape = (1, len(env.tasks().id), WORLDS)
+    each = broadcast_tasks(env.tasks(), shape)._replace(blocks=env.tasks().blocks)
+    program = str(jax.make_jaxpr(env.reset_worlds)(each, jax.random.split(jax.random.key(0), shape)))
+    assert len(re.findall("mujoco_solve", program)) == 1
 
 
 def test_settings_of_physics_keep_families_apart():

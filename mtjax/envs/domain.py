@@ -94,7 +94,10 @@ class Domain(Pictured):
     def reset(self, task: Task, key: Key) -> Step:
         """Begin an episode of ``task`` in a fresh random state."""
         put = self.simulator.place if self.starts_untouched else self.simulator.forward
-        world = put(task, *self.start(task, key))
+        return self.first_step(task, put(task, *self.start(task, key)), key)
+
+    def first_step(self, task: Task, world: World, key: Key) -> Step:
+        """Return the first step of an episode, from a start whose sensors are known and the key of ``reset``."""
         return Step(world, self.look_at(task, world), jnp.float32(0), jnp.bool_(False))
 
     def advance(self, task: Task, state: World, action: Array) -> World:

@@ -14,11 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from mtjax.envs.domain import Domain, stack_differing
-from mtjax.envs.engines.base import Engine, World
+from mtjax.envs.engines.base import Engine, World, at_rest
 from mtjax.envs.engines.mjx import Mjx
 from mtjax.envs.family import Family
 from mtjax.maps import over_worlds
-from mtjax.types import Array, Step, Task
+from mtjax.types import Array, Key, Step, Task
 
 T = TypeVar("T")
 Of = dict[int, T]  # of families by their numbers in a mixture
@@ -30,6 +30,10 @@ class Alone:
 
     members: Mapping[int, Family]  # the only one, by its number in the mixture
     outside: ClassVar[None] = None  # what it calls outside XLA is the family's
+
+    def reset_worlds(self, tasks: Of[Task], keys: Of[Key]) -> Of[Step]:
+        """Begin an episode in every world (S, T, E)."""
+        return reset_apart(self.members, tasks, keys)
 
     def step_worlds(self, tasks: Of[Task], states: Of[Any], actions: Of[Array]) -> Of[Step]:
         """Return the next step of all worlds, leaves (S, T, E, ...)."""
@@ -74,6 +78,32 @@ class Joined:
         """Return the engine if it runs outside XLA, as all but MJX do."""
         return None if isinstance(self.simulator, Mjx) else self.simulator
 
+    @cached_property
+    def _begin_alike(self) -> bool:
+        """Return whether all members begin episodes as ``Domain.reset`` does, and with the same sensors solved for."""
+        plain = all(type(domain).reset is Domain.reset for domain in self.members.values())
+        return plain and len({domain.starts_untouched for domain in self.members.values()}) == 1
+
+    def reset_worlds(self, tasks: Of[Task], keys: Of[Key]) -> Of[Step]:
+        """Begin an episode in every world (S, T, E). Members without tasks are left out.
+
+        The simulator puts all worlds into their states at once, so that XLA compiles this once and not for each member.
+        """
+        if not self._begin_alike:
+            return reset_apart(self.members, tasks, keys)
+        started = {i: over_worlds(partial(_start, self.members[i]))(task, keys[i]) for i, task in tasks.items()}
+        rows = _join([task.row + self._first[i] for i, task in tasks.items()])
+        given = _join([world._replace(extra=None) for world in started.values()])
+        untouched = next(iter(self.members.values())).starts_untouched
+        put = over_worlds(partial(_put, self.simulator, untouched))(rows, take(self._leaves, rows), given)
+        worlds = self._apart(tasks, put)
+        return {
+            i: over_worlds(partial(_first_step, self.members[i]))(
+                tasks[i], worlds[i]._replace(extra=started[i].extra), keys[i]
+            )
+            for i in tasks
+        }
+
     def step_worlds(self, tasks: Of[Task], states: Of[World], actions: Of[Array]) -> Of[Step]:
         """Return the next step of all worlds, leaves (S, T, E, ...). Members without tasks are left out."""
         controlled = {
@@ -82,13 +112,17 @@ class Joined:
         rows = _join([task.row + self._first[i] for i, task in tasks.items()])
         given = _join([(self.enter(i, world)._replace(extra=None), ctrl) for i, (world, ctrl) in controlled.items()])
         moved = over_worlds(partial(_advance, self.simulator))(rows, take(self._leaves, rows), *given)
-        counts, steps, begin = {i: task.row.shape[1] for i, task in tasks.items()}, {}, 0
-        for i, count in counts.items():
-            world = jax.tree.map(lambda x, place=slice(begin, begin + count): x[:, place], moved)
+        steps = {}
+        for i, world in self._apart(tasks, moved).items():
             world = self.leave(i, world)._replace(extra=controlled[i][0].extra)
             steps[i] = over_worlds(partial(_outcome, self.members[i]))(tasks[i], world, actions[i])
-            begin += count
         return steps
+
+    def _apart(self, tasks: Of[Task], worlds: World) -> Of[World]:
+        """Return each member's worlds out of all, leaves (S, T, E, ...)."""
+        ends = np.cumsum([0, *(task.row.shape[1] for task in tasks.values())]).tolist()
+        places = dict(zip(tasks, map(slice, ends, ends[1:]), strict=False))
+        return {i: jax.tree.map(lambda x, place=place: x[:, place], worlds) for i, place in places.items()}
 
     def enter(self, i: int, world: World) -> World:
         """Return the simulator's worlds (S, T, E, ...) for those of a member."""
@@ -97,6 +131,11 @@ class Joined:
     def leave(self, i: int, world: World) -> World:
         """Return a member's worlds (S, T, E, ...) for those of the simulator."""
         return world
+
+
+def reset_apart(members: Mapping[int, Family], tasks: Of[Task], keys: Of[Key]) -> Of[Step]:
+    """Begin an episode in every world (S, T, E), each family by itself."""
+    return {i: members[i].reset_worlds(task, keys[i]) for i, task in tasks.items()}
 
 
 def take(table: Any, rows: Array) -> Any:
@@ -111,16 +150,36 @@ def _join(trees: Sequence[Any]) -> Any:
 
 
 @partial(jax.jit, static_argnums=0)  # traced once for all programs, as families' own steps are
+def _start(domain: Domain, task: Task, key: Key) -> World:
+    return at_rest(domain.models[0], *domain.start(task, key))
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _put(simulator: Engine, untouched: bool, row: Array, model: dict[str, Array], world: World) -> World:
+    put = simulator.place if untouched else simulator.forward
+    return put(_task_of(row, model), world.qpos, world.qvel, None, world.mocap)
+
+
+@partial(jax.jit, static_argnums=0)
+def _first_step(domain: Domain, task: Task, world: World, key: Key) -> Step:
+    return domain.first_step(task, world, key)
+
+
+@partial(jax.jit, static_argnums=0)
 def _control(domain: Domain, task: Task, world: World, action: Array) -> tuple[World, Array]:
     return domain.control(task, world, action)
 
 
 @partial(jax.jit, static_argnums=0)
 def _advance(simulator: Engine, row: Array, model: dict[str, Array], world: World, ctrl: Array) -> World:
-    task = Task(id=row, row=row, context=row, params={}, model=model, goal={}, horizon=row)
-    return simulator.step(task, world, ctrl)
+    return simulator.step(_task_of(row, model), world, ctrl)
 
 
 @partial(jax.jit, static_argnums=0)
 def _outcome(domain: Domain, task: Task, world: World, action: Array) -> Step:
     return domain.outcome(task, world, action)
+
+
+def _task_of(row: Array, model: dict[str, Array]) -> Task:
+    """Return all that an engine reads of a task."""
+    return Task(id=row, row=row, context=row, params={}, model=model, goal={}, horizon=row)

@@ -6,7 +6,7 @@ separate call. Observed vectors are padded with zeros to one size, and actions b
 """
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
 from typing import Annotated, Any, NamedTuple
 
@@ -250,18 +250,24 @@ class Mixture(Tabled):
     def reset_worlds(self, tasks: Task, keys: Key) -> Step:
         """Begin an episode in every world."""
         own = self._apart(tasks)
-        steps = {i: self.families[i].reset_worlds(each, tasks.blocks.take(keys, i)) for i, each in own.items()}
+        given = {i: tasks.blocks.take(keys, i) for i in own}
+        steps = self._by_group(own, lambda group, of: group.reset_worlds(of(own), of(given)))
         return self._whole(tasks.blocks, steps)
 
     def step_worlds(self, tasks: Task, states: States, actions: Array) -> Step:
         """Step every world by its action (S, T, E, A)."""
-        own, steps = self._apart(tasks), {}
+        own = self._apart(tasks)
         given = {i: tasks.blocks.take(actions, i)[..., : self.families[i].spec.action_size] for i in own}
+        move = lambda group, of: group.step_worlds(of(own), of(states.families), of(given))
+        return self._whole(tasks.blocks, self._by_group(own, move))
+
+    def _by_group(self, own: dict[int, Task], play: Callable) -> dict[int, Step]:
+        """Return the steps of all families, by ``play(group, of)``. ``of`` picks the parts of the group's families."""
+        steps = {}
         for group in self.groups:
             here = [i for i in group.members if i in own]  # a split may have no task of a family
-            of = lambda parts, here=here: {i: parts[i] for i in here}
-            steps |= group.step_worlds(of(own), of(states.families), of(given)) if here else {}
-        return self._whole(tasks.blocks, steps)
+            steps |= play(group, lambda parts, here=here: {i: parts[i] for i in here}) if here else {}
+        return steps
 
     def where_worlds(self, mask: Array, new: States, old: States) -> States:
         """Choose states by ``mask`` (S, T, E)."""

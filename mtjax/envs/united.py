@@ -12,9 +12,9 @@ import numpy as np
 from mtjax.envs.engines.base import Engine, World, some
 from mtjax.envs.engines.c import MujocoC
 from mtjax.envs.engines.warp import Warp
-from mtjax.envs.joined import Joined
+from mtjax.envs.joined import Joined, Of, reset_apart
 from mtjax.envs.union import Places, Union, compose
-from mtjax.types import Array
+from mtjax.types import Array, Key, Step, Task
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -76,6 +76,10 @@ class United(Joined):
         for setting in ("iterations", "ls_iterations", "integrator"):
             setattr(base.opt, setting, getattr(own, setting))
         return Warp(base, first.num_substeps)
+
+    def reset_worlds(self, tasks: Of[Task], keys: Of[Key]) -> Of[Step]:
+        """Begin an episode in every world (S, T, E), each in its own scene."""
+        return reset_apart(self.members, tasks, keys)
 
     def enter(self, i: int, world: World) -> World:
         """Return worlds of the union, with a member's things as they are in its worlds (S, T, E, ...)."""

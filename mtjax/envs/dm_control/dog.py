@@ -156,20 +156,17 @@ class DogStand(Domain):
         return np.stack([asked[id(model)] for model in models])
 
     def start(self, task: Task, key: Key) -> tuple[Array, Array]:
-        turn_key, jolt_key = jax.random.split(key)
+        turn_key, jolt_key = jax.random.split(jax.random.split(key)[1])
         model, half = self.models[0], jax.random.uniform(turn_key, maxval=math.pi)
         turned = jnp.stack([jnp.cos(half), jnp.sin(half)])
         qpos = jnp.asarray(model.qpos0, jnp.float32).at[jnp.array([3, 6])].set(turned)
         jolt = _JOLT * jax.random.normal(jolt_key, (3,))
         return qpos, jnp.zeros(model.nv).at[jnp.array([0, 1, 5])].set(jolt)
 
-    def reset(self, task: Task, key: Key) -> Step:
+    def first_step(self, task: Task, world: World, key: Key) -> Step:
         """Begin an episode. Sensors are those of a dog whose motors do not act yet, as in dm_control."""
-        act_key, key = jax.random.split(key)
-        step = super().reset(task, key)
-        act = jax.random.uniform(act_key, step.state.act.shape, minval=-1.0)
-        world = step.state._replace(act=act)
-        return step._replace(state=world, obs=self.look_at(task, world))
+        act = jax.random.uniform(jax.random.split(key)[0], (self.models[0].na,), minval=-1.0)
+        return super().first_step(task, world._replace(act=act), key)
 
     def _read(self, world: World) -> dict[str, Array]:
         """Return the values of all sensors by name."""
