@@ -42,7 +42,7 @@ class Alone:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Joined:
-    """Domains whose worlds one simulator steps. Each domain sets its controls before, and observes after that.
+    """Domains whose worlds one simulator begins and steps. Each sets its start or controls before, and observes after.
 
     Raises:
         InputError: the models differ in a field that must be the same for the engine.
@@ -95,14 +95,12 @@ class Joined:
         rows = _join([task.row + self._first[i] for i, task in tasks.items()])
         given = _join([world._replace(extra=None) for world in started.values()])
         untouched = next(iter(self.members.values())).starts_untouched
-        put = over_worlds(partial(_put, self.simulator, untouched))(rows, take(self._leaves, rows), given)
-        worlds = self._apart(tasks, put)
-        return {
-            i: over_worlds(partial(_first_step, self.members[i]))(
-                tasks[i], worlds[i]._replace(extra=started[i].extra), keys[i]
-            )
-            for i in tasks
-        }
+        begun = over_worlds(partial(_put, self.simulator, untouched))(rows, take(self._leaves, rows), given)
+        steps = {}
+        for i, world in self._apart(tasks, begun).items():
+            world = world._replace(extra=started[i].extra)
+            steps[i] = over_worlds(partial(_first_step, self.members[i]))(tasks[i], world, keys[i])
+        return steps
 
     def step_worlds(self, tasks: Of[Task], states: Of[World], actions: Of[Array]) -> Of[Step]:
         """Return the next step of all worlds, leaves (S, T, E, ...). Members without tasks are left out."""
