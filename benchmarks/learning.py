@@ -6,7 +6,8 @@
 Without further flags it is the whole table: every agent on six families with its preset, on the splits and for the
 steps of ``FAMILIES``; agents whose subject is pictures are left out. Every pair of family and agent writes
 ``DIR/ENV/AGENT.csv`` (training returns over steps and seconds, one line per chunk and seed) and ``AGENT.npz`` (every
-episode of every evaluation). Finished pairs are not run again, so several processes can make a long table in parts. If
+episode of every evaluation), and the policy of its first seed, ``DIR/policies/ENV/AGENT``, which ``mtjax.load`` and
+``docs/make_films.py`` take. Finished pairs are not run again, so several processes can make a long table in parts. If
 the command is given again with the same DIR, a pair that was stopped goes on where it was, and one that was killed goes
 on from its last evaluation. Until a pair is finished its run is in ``DIR/ENV/AGENT``. Its checkpoints need room for
 three training states: 0.1 GB for PPO, and 1 to 6 GB for agents with a replay (gpu presets, ten seeds).
@@ -49,6 +50,7 @@ from mtjax.report.stats import (
     seed_interval,
     unpaired_difference,
 )
+from mtjax.training import ship
 from mtjax.training.programs import enable_compile_cache
 from mtjax.training.run import Result
 from mtjax.types import SPLITS
@@ -116,11 +118,19 @@ def main() -> None:
 
 
 def learn(arguments: argparse.Namespace, env: str, agent: str) -> None:
-    """Write the results of one agent on one family, unless they are there already."""
+    """Write the results of one agent on one family, unless they are there already. Then remove its run."""
     folder = arguments.out / env / agent
     if not (arguments.out / env / f"{agent}.npz").exists():
         save(arguments.out / env, agent, trained(arguments, env, agent, folder))
+    if (folder / "config.json").exists():
+        keep_policy(folder, arguments.out / "policies" / env / agent)
     shutil.rmtree(folder, ignore_errors=True)
+
+
+def keep_policy(run: Path, place: Path) -> None:
+    """Write the policy of the first seed, in place of one that a killed process may have half written."""
+    shutil.rmtree(place, ignore_errors=True)
+    ship.write(run, place)
 
 
 def trained(arguments: argparse.Namespace, env: str, agent: str, folder: Path) -> Result:

@@ -5,13 +5,14 @@
                                [--out DIR]
 
 ``--list`` prints the protocols. Every pair of environment and agent writes ``DIR/ENV/AGENT.csv`` (training over steps
-and seconds) and ``AGENT.npz`` (every episode of every evaluation: returns and, where tasks have it, success). Finished
-pairs are not run again, so that a long suite runs in parts. A pair that was stopped or killed goes on as in
-``learning.py``; its checkpoints need up to 45 GB in ``mt10``, ``hard``, ``pixels`` and ``looks``. All results in DIR
-together give ``scores.md`` (means over tasks with 95% intervals over seeds, for every split), ``tasks.csv`` (every
-training task and seed of the last evaluation) and, for suites that compare one agent for all tasks with one for each,
-``sharing.md``, which compares them after as many steps a task. ``scores.md`` names unfinished pairs. ``--unfinished``
-adds their last evaluation, marked with its steps, to it and to ``tasks.csv``, and their evaluations to ``sharing.md``.
+and seconds) and ``AGENT.npz`` (every episode of every evaluation: returns and, where tasks have it, success), and the
+policy of its first seed, ``DIR/policies/ENV/AGENT``, which ``mtjax.load`` takes. Finished pairs are not run again, so
+that a long suite runs in parts. A pair that was stopped or killed goes on as in ``learning.py``; its checkpoints need
+up to 45 GB in ``mt10``, ``hard``, ``pixels`` and ``looks``. All results in DIR together give ``scores.md`` (means over
+tasks with 95% intervals over seeds, for every split), ``tasks.csv`` (every training task and seed of the last
+evaluation) and, for suites that compare one agent for all tasks with one for each, ``sharing.md``, which compares them
+after as many steps a task. ``scores.md`` names unfinished pairs. ``--unfinished`` adds their last evaluation, marked
+with its steps, to it and to ``tasks.csv``, and their evaluations to ``sharing.md``.
 
 Success is that of the last evaluation: at the episode's last step, and at any step. Both are shares of episodes.
 ``care`` is told its task as all agents are, in Meta-World by its number. As published it reads what the task asks for:

@@ -212,6 +212,9 @@ def test_a_pair_whose_results_were_not_written_is_not_trained_again(run, tmp_pat
     monkeypatch.setattr(Records, "add_rows", die)
     run("learning", tmp_path)
     assert [line["steps"] for line in lines_of(tmp_path / FILES["learning"][0])[::2]] == ["500", "1000", "1500", "2000"]
+    policy = mtjax.load(tmp_path / "policies" / "point-mass-vary-goal" / "sac")
+    task = jax.tree.map(lambda x: x[0], policy.env.tasks("train"))
+    assert policy(np.zeros(policy.takes.shape, np.float32), task).shape == (2,)
     (tmp_path / "point-mass-vary-goal" / "sac").mkdir()
     run("learning", tmp_path)
     assert not (tmp_path / "point-mass-vary-goal" / "sac").exists()
