@@ -8,7 +8,7 @@ _FIRST, _BEYOND = (0, 10, 2), (0, 12)  # versions of jaxlib: both ends of what i
 
 
 def try_few_tilings() -> None:
-    """Let XLA try out four kernels for each matrix product on a GPU, and not dozens: a cold start takes a third less.
+    """Let XLA try out four kernels for each matrix product on a GPU, and not dozens, so that it compiles sooner.
 
     They are those that its model of costs likes best. XLA ends the process at flags that it does not know, so versions
     of jaxlib that were not tried are left alone, and so is what the user's own $XLA_FLAGS says of this.
