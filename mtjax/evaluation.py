@@ -98,6 +98,8 @@ def _require_fit(path: Path, found: Evaluations) -> None:
 def evaluate(env: Env, agent: Agent, episodes: int, state: Any, tasks: Task, seeds: Array, number: Array) -> Scores:
     """Play whole episodes under the mean action.
 
+    An episode whose world is lost (``step_envs``) keeps what it had before.
+
     Args:
         state: agent states with leading S.
         tasks: (T, ...), training tasks or not.
@@ -113,7 +115,7 @@ def evaluate(env: Env, agent: Agent, episodes: int, state: Any, tasks: Task, see
         worlds, scores, alive = carry
         worlds, env_step = step_envs(env, agent, state, tasks, worlds, None)
         reward = jnp.where(alive, env_step.transition.reward, 0.0)  # rewards after an episode's end may not be finite
-        scores = Scores(scores.returns + reward, _latest(env_step.metrics, scores.metrics, alive))
+        scores = Scores(scores.returns + reward, _latest(env_step.metrics, scores.metrics, alive & ~env_step.lost))
         return (worlds, scores, alive & ~env_step.transition.ended), None
 
     worlds = reset_envs(env, agent, state, tasks, keys)

@@ -22,6 +22,9 @@ from mtjax.types import Agent, Array, Env, InputError, Key, Metrics, Outcome, So
 PHASES = 10
 """Largest number of different first ages, as each causes a separate reset in every episode."""
 
+_MOST_LOST = 1e-4
+"""Largest share of a task's steps in a chunk at which worlds may be lost."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
@@ -107,7 +110,9 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
     Returns:
         the new state, and metrics: "return" and "episodes" (S, T), mean return and number of ended episodes; the
         environment's (S, T), as means over these episodes' last steps; the agent's, as means (S, T) or (S,) over the
-        chunk; "bad_step" (S, T), the first step whose numbers were not finite, or -1.
+        chunk; "lost" (S, T), how often a world was lost (``step_envs``), whose episode does not count; "bad_step"
+        (S, T), the first step whose numbers were not finite, or -1. Worlds that are lost at more than one in 10,000
+        steps of a task count as such numbers.
     """
     experience = agent.experience
 
@@ -119,7 +124,8 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
         return state._replace(agent=learners, data=experience.keep(data), key=key), seen | {"losses": losses}
 
     state, history = jax.lax.scan(iterate, state, length=settings.chunk_steps // experience.steps)
-    return state._replace(agent=collectives.agreed(state.agent)), _summarise(history)
+    count = settings.num_envs * settings.chunk_steps
+    return state._replace(agent=collectives.agreed(state.agent)), _summarise(history, count)
 
 
 def _collect(env, agent, tasks, state: TrainState, keys: Key, reset_keys: Key) -> tuple[TrainState, Transition, Any]:
@@ -163,28 +169,34 @@ def _step(env, agent, tasks, state: TrainState, keys: Key, reset_keys: Key):
 def _reduce_step(env_step: EnvStep, total: Array, counted: Array) -> dict[str, Any]:
     """Reduce a step to the statistics for metrics, leaves (S, T)."""
     transition = env_step.transition
-    finished = transition.ended & counted
+    finished = transition.ended & counted & ~env_step.lost
     over_envs = lambda x: jnp.sum(finished * x, axis=2)
     finite = lambda x: jnp.all(jnp.isfinite(x), axis=tuple(range(2, x.ndim)))
     numbers = [x for x in jax.tree.leaves(transition.next_obs) if jnp.issubdtype(x.dtype, jnp.floating)]
     return {
         "finished": jnp.sum(finished, axis=2),
+        "lost": jnp.sum(env_step.lost, axis=2),
         "total": over_envs(total),
         "finite": jnp.all(jnp.stack([finite(x) for x in (*numbers, transition.reward)]), axis=0),
-        "metrics": {name: over_envs(x) for name, x in env_step.metrics.items()},
+        "metrics": {name: jnp.sum(jnp.where(finished, x, 0.0), axis=2) for name, x in env_step.metrics.items()},
     }
 
 
-def _summarise(history: dict) -> Metrics:
-    """Reduce the statistics of all steps, leaves (iterations, steps, S, ...), to one line of metrics."""
+def _summarise(history: dict, count: int) -> Metrics:
+    """Reduce the statistics of all steps, leaves (iterations, steps, S, ...), to one line of metrics.
+
+    Args:
+        count: the steps of a task in the chunk.
+    """
     losses = dict(history["losses"])
     learning = losses.pop("learning")
     mean = lambda x: jnp.sum(x, axis=0) / jnp.maximum(jnp.sum(learning), 1)
     over_steps = lambda x: jnp.sum(x, axis=(0, 1))
     finished, total, metrics = (jax.tree.map(over_steps, history[name]) for name in ("finished", "total", "metrics"))
-    bad = jnp.int32(~history["finite"])
-    episodes, total, metrics, bad = collectives.total((finished, total, metrics, bad))
-    bad = bad > 0
+    bad, lost = jnp.int32(~history["finite"]), history["lost"]
+    episodes, total, metrics, bad, lost = collectives.total((finished, total, metrics, bad, lost))
+    often = over_steps(lost) > _MOST_LOST * count
+    bad = (bad > 0) | (often & (lost > 0))
     # A bad step of one task spoils the losses of all that share its networks; then only that task is reported.
     blameless = ~jnp.any(bad, axis=3, keepdims=True)
     for loss in jax.tree.leaves(losses):
@@ -195,5 +207,6 @@ def _summarise(history: dict) -> Metrics:
         "episodes": episodes,
         "return": total / episodes,
         **{name: x / episodes for name, x in metrics.items()},
+        "lost": over_steps(lost),
         "bad_step": jnp.where(jnp.any(bad, axis=0), jnp.argmax(bad, axis=0), -1),
     }

@@ -12,6 +12,9 @@ from mtjax.parallel import collectives
 from mtjax.tasks import contexts_vary, episode_task
 from mtjax.types import Acted, Agent, Array, Env, Key, Task, Transition
 
+_LARGEST = 1e10
+"""Largest number in an observation: MuJoCo's own bound of positions and velocities (``mjMAXVAL``)."""
+
 
 class Worlds(NamedTuple):
     """Holds the state of every world; leaves (S, T, E, ...)."""
@@ -78,6 +81,7 @@ class EnvStep(NamedTuple):
 
     transition: Transition
     metrics: dict[str, Array]  # of the environment
+    lost: Array  # bool: the numbers of the world's observation are not finite, or beyond ``_LARGEST``
 
 
 def step_envs(
@@ -91,6 +95,9 @@ def step_envs(
 ) -> tuple[Worlds, EnvStep]:
     """Act in every world and step it; episodes that end are not reset.
 
+    Physics sometimes blows up, as where a grip forces a body into another. Such a world is lost: its episode is cut off
+    with a reward of 0, and its last observation stays.
+
     Args:
         keys: (S, T, E) for sampling actions; None takes the mean ones.
         explore: a function from the agent's actions (S, T, E, A) to the actions that the worlds take.
@@ -100,15 +107,16 @@ def step_envs(
     action = explore(acted.action)
     action = action if each.action_mask is None else action * each.action_mask
     step = env.step_worlds(each, worlds.state, action)
-    obs = frames.push(worlds.obs, step.obs)
-    age = worlds.age + 1
+    lost = ~_bounded(step.obs)
+    obs = where_worlds(lost, worlds.obs, frames.push(worlds.obs, step.obs))
+    terminated, age = step.terminated & ~lost, worlds.age + 1
     transition = Transition(
         obs=worlds.obs,
         action=action,
-        reward=step.reward,
-        discount=1.0 - step.terminated,
+        reward=jnp.where(lost, 0.0, step.reward),
+        discount=1.0 - terminated,
         next_obs=obs,
-        ended=step.terminated | (age >= each.horizon),
+        ended=terminated | lost | (age >= each.horizon),
         context=worlds.task.context if contexts_vary(tasks) else None,  # type: ignore
         extras=acted.extras,
     )
@@ -116,7 +124,14 @@ def step_envs(
     if jax.tree.leaves(memory):
         note = lambda learner, task, memory, transition: agent.remember(learner, memory, transition, task)
         memory = over_learners(note)(learners, tasks, memory, transition)
-    return Worlds(step.state, worlds.task, obs, memory, age), EnvStep(transition, step.metrics)
+    return Worlds(step.state, worlds.task, obs, memory, age), EnvStep(transition, step.metrics, lost)
+
+
+def _bounded(obs: Any) -> Array:
+    """Return which worlds (S, T, E) have observations, leaves (S, T, E, ...), of finite numbers within the bound."""
+    floats = [x for x in jax.tree.leaves(obs) if jnp.issubdtype(x.dtype, jnp.floating)]
+    within = [jnp.all(jnp.abs(x) <= _LARGEST, axis=tuple(range(3, x.ndim))) for x in floats]
+    return jnp.all(jnp.stack(within), axis=0) if within else jnp.ones(jax.tree.leaves(obs)[0].shape[:3], bool)
 
 
 def reset_ended(env: Env, agent: Agent, learners: Any, tasks: Task, worlds: Worlds, ended: Array, keys: Key) -> Worlds:

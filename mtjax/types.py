@@ -70,7 +70,7 @@ class Transition(NamedTuple):
     reward: Array  # ()
     discount: Array  # () = 1 - terminated
     next_obs: Any  # (O,) from before any reset
-    ended: Any = None  # () bool: the episode ended, terminated or by its time limit
+    ended: Any = None  # () bool: the episode ended, terminated or by its time limit, or because its world was lost
     context: Array | None = None  # (C,) of the episode's task, if episodes draw tasks of other contexts
     extras: Any = None  # data that the agent stores when it acts
 
@@ -100,7 +100,7 @@ class Outcome(NamedTuple):
 
     reward: Array
     total: Array  # sum of the episode's rewards so far
-    ended: Array  # bool: the episode ended, terminated or by its time limit
+    ended: Array  # bool: the episode ended, terminated or by its time limit, or because its world was lost
     terminated: Array  # bool: the episode reached a terminal state
     age: Array  # int32, steps of the episode so far
     memory: Any = None  # the agent's memory of the episode, with this step

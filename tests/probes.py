@@ -1,6 +1,7 @@
 """What tests run agents and loops on: the package's probes, some that break on purpose, and compiled programs."""
 
 import dataclasses
+import math
 from functools import lru_cache
 from importlib.util import find_spec
 from typing import ClassVar
@@ -61,6 +62,22 @@ class Broken(Walk):
     def rules(self, task, state, action):
         wrong = (task.goal["scale"] < 0) & (state.age == self.broken_age)
         return jnp.where(wrong, jnp.nan, 1.0), state.obs[0] + 1, False
+
+
+@dataclasses.dataclass(frozen=True)
+class Lost(Walk):
+    """A walk that is lost in its second step from starts below a share, in tasks with a negative scale.
+
+    Then reward and observation are not numbers, or beyond all bounds, and it seems to terminate.
+    """
+
+    share: float = 0.3
+    value: float = math.nan
+
+    def rules(self, task, state, action):
+        wrong = (task.goal["scale"] < 0) & (state.age == 1) & (state.obs[0] % 1 < self.share)
+        obs = jnp.where(wrong, self.value, state.obs[0] + 1)
+        return task.goal["scale"] * obs, obs, ~(obs < 100)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,7 +14,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 from conftest import SHORT_RUN
-from probes import Stub, Walk, pick, tasks_of
+from probes import Lost, Stub, Walk, pick, tasks_of
 from probes import act as act_once
 
 import mtjax
@@ -164,6 +164,27 @@ def test_evaluation_is_a_plain_loop_over_single_worlds():
                 )
                 lengths.add(age)
     assert lengths == {2, 3, 4, 6}  # both ways to end, in one batch
+
+
+@dataclasses.dataclass(frozen=True)
+class Counting(Lost):
+    """A walk that may be lost, and counts its steps."""
+
+    def step(self, task, state, action):
+        step = super().step(task, state, action)
+        return step._replace(metrics={"steps": step.state.age})
+
+
+def test_an_episode_whose_world_is_lost_keeps_what_it_had():
+    """Return and metrics are those of before; others go on."""
+    tasks, episodes = tasks_of("one-step", (1.0, -1.0))._replace(horizon=jnp.int32([5, 5])), 12
+    found = evaluate(Counting(), Leaning(), episodes, jnp.float32([0.3]), tasks, jnp.asarray([3]), jnp.int32(0))
+    returns, steps = np.asarray(found.returns)[0], np.asarray(found.metrics["steps"])[0]
+    lost = steps == 1
+    assert np.all(np.isin(steps, [1, 5])) and not lost[0].any() and 0 < lost[1].sum() < episodes
+    starts = np.where(lost, 0, (np.abs(returns) - 15) / 5)  # an episode earns five times its start, and 1 + ... + 5
+    np.testing.assert_array_less(starts, 1)
+    assert np.all(starts[1][~lost[1]] >= Lost.share) and np.all(returns[1][lost[1]] > -1 - Lost.share)
 
 
 def test_a_recorded_episode_is_that_of_a_plain_loop():

@@ -115,18 +115,21 @@ def test_a_damaged_first_line_is_replaced(tmp_path):
 
 
 def test_rows_are_means_over_tasks_and_each_tasks_return():
-    """A task without an episode is left empty, and left out of the mean; losses without tasks are as they are."""
+    """A task without an episode is left empty, and left out of the mean; losses without tasks are as they are.
+
+    Lost worlds are counted over all tasks.
+    """
     metrics = {
         "return": np.array([[1.0, np.nan], [np.nan, np.nan]]),
         "loss": np.array([[1.0, 3.0], [5.0, 7.0]]),
         "cosine": np.array([0.25, 0.123456789]),
+        "lost": np.array([[2, 1], [0, 0]]),
         "bad_step": np.array([[-1, -1], [-1, -1]]),
     }
     rows = log.metric_rows(metrics, np.array([7, 8]), {"steps": 100})
-    assert rows == [
-        {"seed": 7, "steps": 100, "return": "1", "loss": "2", "cosine": "0.25", "return_0": "1", "return_1": ""},
-        {"seed": 8, "steps": 100, "return": "", "loss": "6", "cosine": "0.1234568", "return_0": "", "return_1": ""},
-    ]
+    first = {"return": "1", "loss": "2", "cosine": "0.25", "lost": "3", "return_0": "1", "return_1": ""}
+    second = {"return": "", "loss": "6", "cosine": "0.1234568", "lost": "0", "return_0": "", "return_1": ""}
+    assert rows == [{"seed": 7, "steps": 100, **first}, {"seed": 8, "steps": 100, **second}]
 
 
 @pytest.mark.parametrize(

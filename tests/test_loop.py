@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import Broken, Probe, Stub, Walk, tasks_of, tiny, train
+from probes import Broken, Lost, Probe, Stub, Walk, tasks_of, tiny, train
 
 import mtjax
 from mtjax import loop
@@ -194,6 +194,30 @@ def test_a_bad_reward_is_not_blamed_on_the_tasks_that_share_the_networks():
     assert second == env.broken_age < first
 
 
+@pytest.mark.parametrize("value", [np.nan, -np.inf, 2e10])
+def test_the_episode_of_a_lost_world_is_cut_off(monkeypatch, value):
+    """It leaves a step without reward that goes nowhere and bootstraps. Its return does not count; another begins."""
+    monkeypatch.setattr(loop, "_MOST_LOST", 1.0)
+    state, (metrics,) = train(Lost(value=value), Recorder(), {**SETTINGS, "stagger": False})
+    rows = jax.tree.map(lambda x: np.moveaxis(np.asarray(x)[0, :, :CHUNK], 1, 2), state.data.ring.rows)  # (T, E, H)
+    lost = (np.floor(rows.obs[..., 0]) == 1) & (rows.obs[..., 0] % 1 < Lost.share)
+    lost[0] = False
+    assert 0 < lost.sum() < 12 and all(np.all(np.isfinite(x)) for x in jax.tree.leaves((rows, state.worlds.obs)))
+    np.testing.assert_array_equal(rows.next_obs[lost], rows.obs[lost])
+    np.testing.assert_array_equal(rows.reward[lost], 0)
+    np.testing.assert_array_equal(rows.discount, 1)
+    assert np.all(rows.obs[..., 1:, 0][lost[..., :-1]] < 1)
+    np.testing.assert_array_equal(metrics["lost"], lost.sum(axis=(1, 2))[None])
+    np.testing.assert_array_equal(metrics["episodes"], np.sum(np.floor(rows.obs[..., 0]) == 4, axis=(1, 2))[None])
+    np.testing.assert_array_equal(metrics["bad_step"], [[-1, -1]])
+
+
+def test_worlds_that_are_lost_often_are_a_bad_step():
+    """More than once in 10,000 steps: at the first time, of their task alone."""
+    _, (metrics,) = train(Lost(share=0.9), Recorder(), {**SETTINGS, "stagger": False})
+    np.testing.assert_array_equal(metrics["bad_step"], [[-1, 1]])
+
+
 # With an agent that learns.
 
 SMALL = dict(num_envs=2, batch_size=4, replay_size=12, warmup_steps=4, chunk_steps=4)  # one chunk of warm-up
@@ -271,7 +295,7 @@ def test_chunks_compile_once_and_take_over_the_memory_of_the_state():
 def test_collecting_without_learning_is_allowed():
     """No updates: no losses, and the agent stays."""
     state, (metrics,) = train(Walk(), Recorder(), {**SETTINGS, "updates_per_step": 0})
-    assert set(metrics) == {"return", "episodes", "bad_step"}
+    assert set(metrics) == {"return", "episodes", "lost", "bad_step"}
     assert state.agent["updates"] == 0 and state.iteration == CHUNK
 
 

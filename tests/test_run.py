@@ -141,7 +141,8 @@ def test_metrics_have_a_row_a_seed_a_chunk(finished_run):
         (str(seed), str(25 * chunk), str(CHUNK * chunk)) for chunk in range(1, 7) for seed in (0, 1)
     ]
     learned = {"actor_loss", "critic_loss", "entropy", "temperature", "value", "td_error", "td_error_0", "td_error_1"}
-    assert set(rows[0]) == {"seed", "iteration", "steps", "return", "episodes", "return_0", "return_1"} | learned
+    played = {"return", "episodes", "lost", "return_0", "return_1"}
+    assert set(rows[0]) == {"seed", "iteration", "steps"} | played | learned
     for row in rows:
         assert float(row["return"]) == pytest.approx((float(row["return_0"]) + float(row["return_1"])) / 2, rel=1e-5)
         assert 0 < float(row["return"]) < 45
@@ -555,6 +556,20 @@ def diverged_critic(state):
     """Values in seed 1 whose square is beyond 32 bits; every task meets them at once."""
     critic = jax.tree.map(lambda x: x.at[1].multiply(1e10), state.agent.critic)
     return state._replace(agent=state.agent._replace(critic=critic))
+
+
+def test_lost_worlds_are_told(play, monkeypatch, capsys):
+    """On the console by their tasks, and by their number in the metrics of their seed."""
+    chunk = run._Run._play
+
+    def lose(self, *given):
+        now, metrics = chunk(self, *given)
+        return now, metrics | {"lost": np.array([[0, 2], [0, 1]])}
+
+    monkeypatch.setattr(run._Run, "_play", lose)
+    result = play(steps=50, quiet=False)
+    assert "3 worlds (task 1) blew up; new episodes began there\n" in capsys.readouterr().out
+    assert [row["lost"] for row in result.rows] == ["2", "1"]
 
 
 @pytest.mark.parametrize("poison, task", [(lost_world, 1), (diverged_critic, 0)])

@@ -108,11 +108,17 @@ def _is_whole(names: Sequence[str], line: Sequence[str]) -> bool:
 
 
 def metric_rows(metrics: dict[str, np.ndarray], seeds: np.ndarray, common: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return one row per seed of a chunk's metrics (S, T) or (S,): means over tasks, and some for each task."""
+    """Return one row per seed of a chunk's metrics (S, T) or (S,): means over tasks, and some for each task.
+
+    "lost" is the sum.
+    """
+    over_tasks = lambda name, x: np.sum(x) if name == "lost" else _mean(x)
     rows = []
     for s, seed in enumerate(seeds):
         row = {"seed": int(seed), **common, "return": number(_mean(metrics["return"][s]))}
-        row |= {name: number(_mean(x[s])) for name, x in metrics.items() if name not in ("return", "bad_step")}
+        row |= {
+            name: number(over_tasks(name, x[s])) for name, x in metrics.items() if name not in ("return", "bad_step")
+        }
         for name in (*_OF_EACH_TASK, "return"):
             row |= {f"{name}_{t}": number(x) for t, x in enumerate(metrics[name][s] if name in metrics else ())}
         rows.append(row)

@@ -370,9 +370,17 @@ class _Run:
         self.records.add_rows(new)
         write_rows(sinks, lines, [self._name(k) for k in range(len(lines))])
         self.console.clock.chunk(elapsed)
+        self._tell_lost(metrics["lost"])
         rate = self.steps_per_chunk * len(self.seeds) / elapsed
         self.console.progress(now.steps, passed, rate, metrics["return"], self._running(now.state, metrics["return"]))
         return new
+
+    def _tell_lost(self, lost: np.ndarray) -> None:
+        """Tell how often worlds (S, T) were lost in a chunk, and of which tasks, if any were."""
+        if count := int(lost.sum()):
+            tasks = ", ".join(map(str, np.flatnonzero(lost.sum(axis=0))))
+            worlds = "1 world" if count == 1 else f"{count} worlds"
+            self.console.say(f"{worlds} (task {tasks}) blew up; new episodes began there")
 
     def _columns(self, metrics: Any) -> list[str]:
         """Return the columns of metrics.csv, given the shapes of a chunk's metrics."""
