@@ -172,7 +172,8 @@ def _family_figures(name: str) -> str:
     return f"\n## Figures\n{text}" if text else ""
 
 
-_ON_GPU, _ON_CPU = _FILMED = "h200-families", "cpu-films"  # runs whose policies the films show
+_ON_GPU, _ON_CPU = "h200-families", "cpu-films"
+_FILMED = _ON_GPU, _ON_CPU, "h200-hard/films"  # runs whose policies the films show; the last one of a family
 _ONE_SEED = {  # runs -> their title, and where their command stands
     _ON_GPU: (
         "One H200 that six to ten runs share, one seed",

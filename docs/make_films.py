@@ -2,13 +2,14 @@
 
     python docs/make_films.py [NAME | RUN ...]
 
-A run's folder becomes the film of its family, and so does a family of which the package has a trained policy
+A run's folder becomes the films of its families, and so does a family of which the package has a trained policy
 (``benchmarks/families.py`` trains policies for films). Other families that MuJoCo steps become stills, unless they have
 a film. Both are of the first, the middle and the last training task. They go to docs/pictures/families. Meta-World's
 scenes are not drawn, as they are another package's.
 """
 
 import sys
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +36,8 @@ def draw(name: str) -> None:
     """Draw a run's family, or a family by its name, if it can be seen."""
     trained = [known for known in shipped.names() if known.startswith(f"{name}/")]
     if Path(name).is_dir() or trained:
-        policy = mtjax.load(trained[0] if trained else name)
-        save(name_of(policy.env), play(policy))
+        for family, frames in play(mtjax.load(trained[0] if trained else name)):
+            save(name_of(family), frames)
     elif name.startswith("metaworld-") or (FOLDER / f"{name}.gif").exists():
         return
     elif isinstance(mtjax.make(name), Pictured):
@@ -51,23 +52,25 @@ def save(name: str, frames: list[Image.Image]) -> None:
     frames[0].save(FOLDER / f"{name}.{'gif' if frames[1:] else 'png'}", optimize=True, **(rest if frames[1:] else {}))
 
 
-def play(policy: Policy) -> list[Image.Image]:
-    """Return the frames of a film of a trained policy."""
+def play(policy: Policy) -> Iterator[tuple[Any, list[Image.Image]]]:
+    """Return every family of a trained policy, and the frames of its film."""
     env: Any = policy.env
-    tasks = jax.tree.map(lambda x: x[few(len(x))], env.tasks("train"))
-    played = record(env, policy.agent, policy.state, tasks, jnp.int32(0))
-    film = frames_from(env, played, min(SKIPPED, env.episode_length // 10))
-    moves = np.any(film[1:] != film[:-1], axis=(1, 2, 3))
-    if np.mean(moves) < 0.5:  # a goal that is reached already
-        film = frames_from(env, played, 0)
-    return [Image.fromarray(frame).quantize(64) for frame in film]
+    played = record(env, policy.agent, policy.state, env.tasks("train"), jnp.int32(0))
+    for part, states in zip(env.parts, env.apart(played.states), strict=True):
+        family, places = part.family, part.places["train"]
+        shown = few(len(places))
+        rows = [env.own_row(int(played.rows[place])) for place in places[shown]]
+        film = frames_from(family, rows, each(states, shown), min(SKIPPED, family.episode_length // 10))
+        moves = np.any(film[1:] != film[:-1], axis=(1, 2, 3))
+        if np.mean(moves) < 0.5:  # a goal that is reached already
+            film = frames_from(family, rows, each(states, shown), 0)
+        yield family, [Image.fromarray(frame).quantize(64) for frame in film]
 
 
-def frames_from(env: Any, played: Any, first: int) -> np.ndarray:
-    """Return the frames (FRAMES, height, width, 3) of all tasks beside each other, from a step on."""
-    states = jax.tree.map(lambda x: x[:, first : first + FRAMES * STRIDE : STRIDE], played.states)
-    films = [render.film(env, int(row), each(states, i), *SIZE) for i, row in enumerate(played.rows)]
-    return np.concatenate(films, axis=2)
+def frames_from(family: Any, rows: Sequence[int], states: Any, first: int) -> np.ndarray:
+    """Return the frames (FRAMES, height, width, 3) of tasks beside each other, from a step of states (T, H, ...) on."""
+    seen = jax.tree.map(lambda x: x[:, first : first + FRAMES * STRIDE : STRIDE], states)
+    return np.concatenate([render.film(family, row, each(seen, i), *SIZE) for i, row in enumerate(rows)], axis=2)
 
 
 def start(name: str) -> Image.Image:
