@@ -316,6 +316,21 @@ def test_physics_are_set_on_warp_as_on_c(name):
 
 @with_scenes
 @pytest.mark.slow
+@pytest.mark.parametrize("speed", [1.0, np.nan])
+def test_a_step_on_warp_depends_on_the_state_alone(speed):
+    """And not on what was simulated in the same place before, or was lost there."""
+    pytest.importorskip("warp")
+    env = mtjax.make("metaworld-peg-unplug-side", num_draws=1, engine="warp")
+    task, step = jax.tree.map(lambda x: x[0], goals(env)), jax.jit(env.step)
+    state, action = env.reset(task, jax.random.key(0)).state, jnp.array([0.5, 0.2, -0.3, 0.5])
+    first = step(task, state, action)
+    other = step(task, state._replace(qvel=state.qvel + speed), action)
+    assert not np.array_equal(other.obs, first.obs)
+    np.testing.assert_array_equal(step(task, state, action).obs, first.obs)
+
+
+@with_scenes
+@pytest.mark.slow
 def test_warp_draws_meshes(monkeypatch):
     """On a CPU, where only tests draw by Warp: the arm is red, and the drawer is where its goal has it."""
     pytest.importorskip("warp")

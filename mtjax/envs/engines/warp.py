@@ -362,9 +362,13 @@ def _stepper(engine: Any, count: int, names: tuple[str, ...]) -> Callable:
             setattr(attrgetter(*path)(model) if path else model, field, array)
         for name, array in zip(given, arrays, strict=False):
             warp.copy(getattr(data, name), array)
-        if fixed:
+        if fixed or own.base.neq:
             mujoco_warp.kinematics(model, data)
+        if fixed:
             _place_geoms(model, data, all_move)
+        if own.base.neq:  # before Warp computes velocities of bodies, its welds read those of the step before
+            mujoco_warp.com_pos(model, data)
+            mujoco_warp.com_vel(model, data)
         for _ in range(own.num_substeps):
             mujoco_warp.step(model, data)
         _sense(own.base, model, data)
