@@ -60,10 +60,11 @@ def play(policy: Policy) -> Iterator[tuple[Any, list[Image.Image]]]:
         family, places = part.family, part.places["train"]
         shown = few(len(places))
         rows = [env.own_row(int(played.rows[place])) for place in places[shown]]
-        film = frames_from(family, rows, each(states, shown), min(SKIPPED, family.episode_length // 10))
+        states = each(states, shown)
+        film = frames_from(family, rows, states, min(SKIPPED, family.episode_length // 10))
         moves = np.any(film[1:] != film[:-1], axis=(1, 2, 3))
         if np.mean(moves) < 0.5:  # a goal that is reached already
-            film = frames_from(family, rows, each(states, shown), 0)
+            film = frames_from(family, rows, states, 0)
         yield family, [Image.fromarray(frame).quantize(64) for frame in film]
 
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from mtjax.checks import check_fields
 from mtjax.maps import over_seeds
 from mtjax.parallel import collectives
-from mtjax.rollout import EnvStep, Worlds, reset_ended, reset_envs, split_keys, step_envs, world_keys
+from mtjax.rollout import EnvStep, Worlds, bounded_worlds, reset_ended, reset_envs, split_keys, step_envs, world_keys
 from mtjax.types import Agent, Array, Env, InputError, Key, Metrics, Outcome, Sometimes, Task, Transition
 
 PHASES = 10
@@ -170,15 +170,13 @@ def _reduce_step(env_step: EnvStep, total: Array, counted: Array) -> dict[str, A
     """Reduce a step to the statistics for metrics, leaves (S, T)."""
     transition = env_step.transition
     finished = transition.ended & counted & ~env_step.lost
-    over_envs = lambda x: jnp.sum(finished * x, axis=2)
-    finite = lambda x: jnp.all(jnp.isfinite(x), axis=tuple(range(2, x.ndim)))
-    numbers = [x for x in jax.tree.leaves(transition.next_obs) if jnp.issubdtype(x.dtype, jnp.floating)]
+    over_envs = lambda x: jnp.sum(jnp.where(finished, x, 0.0), axis=2)  # what is not finished may not be finite
     return {
         "finished": jnp.sum(finished, axis=2),
         "lost": jnp.sum(env_step.lost, axis=2),
         "total": over_envs(total),
-        "finite": jnp.all(jnp.stack([finite(x) for x in (*numbers, transition.reward)]), axis=0),
-        "metrics": {name: jnp.sum(jnp.where(finished, x, 0.0), axis=2) for name, x in env_step.metrics.items()},
+        "finite": jnp.all(bounded_worlds(transition.next_obs) & jnp.isfinite(transition.reward), axis=2),
+        "metrics": {name: over_envs(x) for name, x in env_step.metrics.items()},
     }
 
 

@@ -107,7 +107,7 @@ def step_envs(
     action = explore(acted.action)
     action = action if each.action_mask is None else action * each.action_mask
     step = env.step_worlds(each, worlds.state, action)
-    lost = ~_bounded(step.obs)
+    lost = ~bounded_worlds(step.obs)
     obs = where_worlds(lost, worlds.obs, frames.push(worlds.obs, step.obs))
     terminated, age = step.terminated & ~lost, worlds.age + 1
     transition = Transition(
@@ -127,7 +127,7 @@ def step_envs(
     return Worlds(step.state, worlds.task, obs, memory, age), EnvStep(transition, step.metrics, lost)
 
 
-def _bounded(obs: Any) -> Array:
+def bounded_worlds(obs: Any) -> Array:
     """Return which worlds (S, T, E) have observations, leaves (S, T, E, ...), of finite numbers within the bound."""
     floats = [x for x in jax.tree.leaves(obs) if jnp.issubdtype(x.dtype, jnp.floating)]
     within = [jnp.all(jnp.abs(x) <= _LARGEST, axis=tuple(range(3, x.ndim))) for x in floats]

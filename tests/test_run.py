@@ -546,18 +546,6 @@ def test_signals_are_left_alone_outside_the_main_thread():
 # Numbers that are not finite.
 
 
-def lost_world(state):
-    """An observation of seed 1, task 1 that is not a number."""
-    worlds = state.worlds._replace(obs=state.worlds.obs.at[1, 1, 0, 3].set(jnp.nan))
-    return state._replace(worlds=worlds)
-
-
-def diverged_critic(state):
-    """Values in seed 1 whose square is beyond 32 bits; every task meets them at once."""
-    critic = jax.tree.map(lambda x: x.at[1].multiply(1e10), state.agent.critic)
-    return state._replace(agent=state.agent._replace(critic=critic))
-
-
 def test_lost_worlds_are_told(play, monkeypatch, capsys):
     """On the console by their tasks, and by their number in the metrics of their seed."""
     chunk = run._Run._play
@@ -570,6 +558,18 @@ def test_lost_worlds_are_told(play, monkeypatch, capsys):
     result = play(steps=50, quiet=False)
     assert "3 worlds (task 1) blew up; new episodes began there\n" in capsys.readouterr().out
     assert [row["lost"] for row in result.rows] == ["2", "1"]
+
+
+def lost_world(state):
+    """An observation of seed 1, task 1 that is not a number."""
+    worlds = state.worlds._replace(obs=state.worlds.obs.at[1, 1, 0, 3].set(jnp.nan))
+    return state._replace(worlds=worlds)
+
+
+def diverged_critic(state):
+    """Values in seed 1 whose square is beyond 32 bits; every task meets them at once."""
+    critic = jax.tree.map(lambda x: x.at[1].multiply(1e10), state.agent.critic)
+    return state._replace(agent=state.agent._replace(critic=critic))
 
 
 @pytest.mark.parametrize("poison, task", [(lost_world, 1), (diverged_critic, 0)])

@@ -14,6 +14,7 @@ from mtjax.names import naming, notice, replacing
 
 _NUMBER = re.compile(r"(-?([0-9]+(\.[0-9]+)?(e[+-][0-9]+)?|inf))?")  # or nothing
 _OF_EACH_TASK = ("td_error", "critic_gradient_norm", "actor_gradient_norm")  # beside the return
+_APART = ("return", "lost", "bad_step")  # metrics that have a place of their own in a row, or none
 _CLOCKS = ("seconds", "wall_seconds")
 
 
@@ -110,15 +111,13 @@ def _is_whole(names: Sequence[str], line: Sequence[str]) -> bool:
 def metric_rows(metrics: dict[str, np.ndarray], seeds: np.ndarray, common: dict[str, Any]) -> list[dict[str, Any]]:
     """Return one row per seed of a chunk's metrics (S, T) or (S,): means over tasks, and some for each task.
 
-    "lost" is the sum.
+    Lost worlds are counted over all tasks.
     """
-    over_tasks = lambda name, x: np.sum(x) if name == "lost" else _mean(x)
     rows = []
     for s, seed in enumerate(seeds):
         row = {"seed": int(seed), **common, "return": number(_mean(metrics["return"][s]))}
-        row |= {
-            name: number(over_tasks(name, x[s])) for name, x in metrics.items() if name not in ("return", "bad_step")
-        }
+        row |= {name: number(_mean(x[s])) for name, x in metrics.items() if name not in _APART}
+        row["lost"] = number(np.sum(metrics["lost"][s]))
         for name in (*_OF_EACH_TASK, "return"):
             row |= {f"{name}_{t}": number(x) for t, x in enumerate(metrics[name][s] if name in metrics else ())}
         rows.append(row)

@@ -376,7 +376,7 @@ class _Run:
         return new
 
     def _tell_lost(self, lost: np.ndarray) -> None:
-        """Tell how often worlds (S, T) were lost in a chunk, and of which tasks, if any were."""
+        """Print how many worlds (S, T) a chunk has lost, and their tasks. Print nothing if there are none."""
         if count := int(lost.sum()):
             tasks = ", ".join(map(str, np.flatnonzero(lost.sum(axis=0))))
             worlds = "1 world" if count == 1 else f"{count} worlds"
