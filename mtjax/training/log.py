@@ -14,7 +14,7 @@ from mtjax.names import naming, notice, replacing
 
 _NUMBER = re.compile(r"(-?([0-9]+(\.[0-9]+)?(e[+-][0-9]+)?|inf))?")  # or nothing
 _OF_EACH_TASK = ("td_error", "critic_gradient_norm", "actor_gradient_norm")  # beside the return
-_APART = ("return", "lost", "bad_step")  # metrics that have a place of their own in a row, or none
+_OVER_TASKS = {"lost": np.sum}  # how a row holds metrics, if not by their means
 _CLOCKS = ("seconds", "wall_seconds")
 
 
@@ -116,8 +116,9 @@ def metric_rows(metrics: dict[str, np.ndarray], seeds: np.ndarray, common: dict[
     rows = []
     for s, seed in enumerate(seeds):
         row = {"seed": int(seed), **common, "return": number(_mean(metrics["return"][s]))}
-        row |= {name: number(_mean(x[s])) for name, x in metrics.items() if name not in _APART}
-        row["lost"] = number(np.sum(metrics["lost"][s]))
+        for name, x in metrics.items():
+            if name not in ("return", "bad_step"):
+                row[name] = number(_OVER_TASKS.get(name, _mean)(x[s]))
         for name in (*_OF_EACH_TASK, "return"):
             row |= {f"{name}_{t}": number(x) for t, x in enumerate(metrics[name][s] if name in metrics else ())}
         rows.append(row)
