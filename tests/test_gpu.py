@@ -341,11 +341,24 @@ def test_worlds_of_a_union_go_on_on_warp_as_on_c(name, count=16, steps=30):
             state = step(tasks, state, action[i // 5]).state
         tasks, state, expected = jax.device_get((tasks, state, step(tasks, state, action[-1])))
     found = jax.device_get(jax.jit(env.step_worlds)(tasks, state, action[-1]))
-    pairs = zip(found.state.families, expected.state.families, strict=True)
-    errors = [np.abs(ours.qvel - theirs.qvel).max(axis=-1) / np.abs(theirs.qvel).max() for ours, theirs in pairs]
-    middle = sorted(zip(map(np.median, errors), env.names, strict=True), reverse=True)
-    assert middle[0][0] < 1e-2 and np.quantile(errors, 0.9) < 5e-2, middle[:5]  # a puck on its flat side
+    errors, steady = [], []
+    for family, ours, theirs in zip(env.families, found.state.families, expected.state.families, strict=True):
+        error = np.abs(ours.qvel - theirs.qvel) / np.abs(theirs.qvel).max()
+        errors.append(error.max(axis=-1))
+        steady.append(np.delete(error, tilting(family.models[0]), axis=-1).max(axis=-1))
+    middle = sorted(zip(map(np.median, steady), env.names, strict=True), reverse=True)
+    assert middle[0][0] < 1e-3 and np.quantile(steady, 0.9) < 1e-3, middle[:5]
+    assert max(map(np.median, errors)) < 2e-2 and np.quantile(errors, 0.9) < 5e-2  # rocking too
     assert np.quantile(np.abs(found.obs - expected.obs), 0.9) < 1e-3
+
+
+def tilting(model):
+    """The degrees of freedom by which free things tilt. A puck on its flat side rocks on one point of its rim.
+
+    Which point it is, single precision does not say: contact normals are off by 1e-4 rad.
+    """
+    free = model.jnt_dofadr[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
+    return np.concatenate([free + 3, free + 4])
 
 
 def test_a_run_goes_on_bit_for_bit(tmp_path):
