@@ -173,7 +173,7 @@ def _family_figures(name: str) -> str:
 
 
 _ON_GPU, _ON_CPU = "h200-families", "cpu-films"
-_FILMED = _ON_GPU, _ON_CPU, "h200-hard/films"  # runs whose policies the films show; the last one of a family
+_FILMED = _ON_GPU, _ON_CPU, "h100-hard/films"  # runs whose policies the films show; the last one of a family
 _ONE_SEED = {  # runs -> their title, and where their command stands
     _ON_GPU: (
         "One H200 that six to ten runs share, one seed",
