@@ -1,9 +1,10 @@
-"""Play Meta-World's own environments and scripted policies, for ``benchmarks/metaworld_parity.py``.
+"""Step Meta-World's own environments, for ``benchmarks/metaworld_parity.py``.
 
 It runs in an environment of its own with metaworld==3.1.1 and all that this needs, and imports nothing of mtjax. It
 reads one JSON object from each line of standard input, and answers each with one line:
 
-    {"do": "play", "task": NAME, "vectors": [(n,), ...]}: success at the end and at any step of an episode of each goal
+    {"do": "begin", "task": NAME, "vectors": [(n,), ...]}: begin an episode of each goal; observations (G, 39)
+    {"do": "step", "actions": [(4,), ...]}: take a step of each episode; observations (G, 39), and successes (G,)
     {"do": "time", "tasks": [NAME, ...], "processes": N, "steps": N}: control steps a second under random actions, of
         processes that share the tasks and send nothing to each other
 """
@@ -16,36 +17,23 @@ import time
 
 import numpy as np
 from metaworld.env_dict import ALL_V3_ENVIRONMENTS
-from metaworld.policies import ENV_POLICY_MAP
 from metaworld.types import Task
 
-
-def begin(name, vector):
-    """Return an environment of a task with a goal, and the first observation."""
-    cls = ALL_V3_ENVIRONMENTS[f"{name}-v3"]
-    env = cls()
-    given = {"env_cls": cls, "rand_vec": np.asarray(vector), "partially_observable": False}
-    env.set_task(Task(name, pickle.dumps(given)))
-    return env, env.reset()[0]
+PLAYED = []  # an environment of each goal
 
 
-def policy(task, obs):
-    policy = ENV_POLICY_MAP[f"{task}-v3"]()
-    actions = [policy.get_action(np.array(each)) for each in obs]  # a policy may write into what it is shown
-    return np.clip(actions, -1, 1).tolist()
+def begin(task, vectors):
+    cls = ALL_V3_ENVIRONMENTS[f"{task}-v3"]
+    PLAYED[:] = [cls() for _ in vectors]
+    for env, vector in zip(PLAYED, vectors, strict=True):
+        given = {"env_cls": cls, "rand_vec": np.asarray(vector), "partially_observable": False}
+        env.set_task(Task(task, pickle.dumps(given)))
+    return [env.reset()[0].tolist() for env in PLAYED]
 
 
-def play(task, vectors):
-    found = []
-    for vector in vectors:
-        env, obs = begin(task, vector)
-        successes = []
-        for _ in range(env.max_path_length):
-            (action,) = policy(task, [obs])
-            obs, _, _, _, info = env.step(np.float32(action))
-            successes.append(bool(info["success"]))
-        found.append((successes[-1], any(successes)))
-    return found
+def step(actions):
+    steps = [env.step(np.float32(action)) for env, action in zip(PLAYED, actions, strict=True)]
+    return [obs.tolist() for obs, *_ in steps], [bool(info["success"]) for *_, info in steps]
 
 
 def draw(name):
@@ -81,7 +69,7 @@ def rate(tasks, processes, steps):
 
 
 if __name__ == "__main__":
-    DO = {"play": play, "time": rate}
+    DO = {"begin": begin, "step": step, "time": rate}
     answers = sys.stdout
     sys.stdout = sys.stderr  # where Meta-World prints
     for line in sys.stdin:

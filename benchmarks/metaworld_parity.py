@@ -1,14 +1,15 @@
-"""Measure Meta-World's tasks: success of the original's scripted policies, and the speed of mt10's physics.
+"""Measure Meta-World's tasks: success of the original's scripted policies or a trained one, and mt10's speed.
 
-    python benchmarks/metaworld_parity.py success [--engine warp] [--tasks NAME ...] [--goals 20] [--out FILE.csv]
+    python benchmarks/metaworld_parity.py success [--run RUN] [--engine warp] [--tasks NAME ...] [--goals 20]
+                                                  [--out FILE.csv]
     python benchmarks/metaworld_parity.py speed [--engine warp] [--worlds 4096] [--json FILE]
 
 ``--original=PYTHON`` compares with the original: PYTHON is the interpreter of an environment with metaworld==3.1.1 and
-its own dependencies (MuJoCo 3.3, Gymnasium), which cannot stand beside mtjax's.
+its own dependencies (MuJoCo 3.3, Gymnasium with its "packaging"), which cannot stand beside mtjax's.
 
-``success`` plays an episode of 500 steps from each goal, by the policies of the installed package. A success counts at
-the end of the episode and at any step. ``--together`` tasks are one program. A task that has a line in the file is not
-played again. The original plays the same goals.
+``success`` plays an episode of 500 steps from each goal, by the policies of the installed package, or by the policy
+that a run trained. A success counts at the end of the episode and at any step. ``--together`` tasks are one program. A
+task that has a line in the file is not played again. The same policies play the same goals in the original.
 
 ``speed`` times ten tasks (mt10) under random actions inside one scan, in turn: with one union of all scenes, with
 families of a scene joined into one simulator, and apart; with resets as in training and without. The original runs in
@@ -23,6 +24,7 @@ import operator
 import statistics
 import subprocess
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +44,7 @@ from mtjax.names import load
 
 _HEAD = "task engine goals end any_step original_end original_any_step goals_that_differ".split()
 _STEPS = 500
+Player = Callable[[list[str], np.ndarray], np.ndarray]  # tasks and observations (T, G, 39) -> actions (T, G, 4)
 
 
 class Original:
@@ -66,7 +69,8 @@ def main() -> None:
     parser.add_argument("what", choices=("success", "speed"))
     parser.add_argument("--original", metavar="PYTHON")
     parser.add_argument("--engine", default="auto", choices=ENGINES)
-    parser.add_argument("--tasks", nargs="+", default=list(TASKS), choices=TASKS, metavar="NAME", help="of success")
+    parser.add_argument("--run", help="of a trained policy, in success; by default the scripted ones play")
+    parser.add_argument("--tasks", nargs="+", choices=TASKS, metavar="NAME", help="of success; by default all")
     parser.add_argument("--goals", type=int, default=20, help="of each task, with one episode each, in success")
     parser.add_argument("--together", type=int, default=2 if on_cpu else 25, help="tasks of a program, in success")
     parser.add_argument("--out", type=Path, default=Path("metaworld-policies.csv"))
@@ -80,22 +84,25 @@ def main() -> None:
     (compare if arguments.what == "success" else race)(original, arguments)
 
 
-# Success of scripted policies.
+# Success.
 
 
 def compare(original: Original | None, arguments: argparse.Namespace) -> None:
     """Add a line for each task that has none."""
+    known, player = trained(arguments.run) if arguments.run else scripted()
+    engine = mtjax.make("metaworld-reach", engine=arguments.engine).engine_name
     done = read(arguments.out)
     scene_of = lambda name: load(f"mtjax.envs.metaworld.{TASKS[name]}").scene_file
-    left = sorted((name for name in arguments.tasks if name not in done), key=scene_of)  # whose simulators join
+    left = [name for name in arguments.tasks or known if name not in done]
+    left.sort(key=scene_of)  # whose simulators join
     if not arguments.out.exists():
         arguments.out.write_text(",".join(_HEAD) + "\n")
     for begin in range(0, len(left), arguments.together):
         names = left[begin : begin + arguments.together]
-        for name, success, vectors in play(names, arguments.engine, arguments.goals):
-            row = [name, arguments.engine, len(vectors), *(f"{x:.3g}" for x in success.mean(0))]
+        for name, success, vectors in play(names, engine, arguments.goals, player):
+            row = [name, engine, len(vectors), *(f"{x:.3g}" for x in success.mean(0))]
             if original is not None:
-                theirs = np.array(original.ask(do="play", task=name, vectors=vectors.tolist()))
+                theirs = play_original(original, name, vectors, player)
                 row += [*(f"{x:.3g}" for x in theirs.mean(0)), int(np.sum(success[:, 1] != theirs[:, 1]))]
             with arguments.out.open("a", newline="") as file:
                 csv.writer(file).writerow(row + [""] * (len(_HEAD) - len(row)))
@@ -113,13 +120,47 @@ def read(path: Path) -> set[str]:
         return {row["task"] for row in rows}
 
 
-def play(names: list[str], engine: str, goals: int) -> list[tuple[str, np.ndarray, np.ndarray]]:
+def scripted() -> tuple[list[str], Player]:
+    """Return the names of all tasks, and what plays them by the installed package's policies."""
+    policies = metaworld_policies.load()
+    act = lambda name, obs: metaworld_policies.actions(policies[name], obs)
+    return list(TASKS), lambda names, obs: np.stack(list(map(act, names, obs)))
+
+
+def trained(run: str) -> tuple[list[str], Player]:
+    """Return the names of a run's tasks, and what plays them by its policy's mean actions."""
+    policy = mtjax.load(run)
+    act = jax.jit(jax.vmap(policy, (0, None)))
+    names, tasks = [x.removeprefix("metaworld-") for x in policy.env.labels("train")], policy.env.tasks("train")
+    if not set(names) <= set(TASKS):
+        raise SystemExit(f"{run} is not of a mixture of Meta-World's tasks: it has {', '.join(names)}")
+    task = {name: jax.tree.map(lambda x, i=i: x[i], tasks) for i, name in enumerate(names)}
+    one = lambda name, obs: np.asarray(act(np.float32(obs), task[name]))
+    return names, lambda names, obs: np.stack(list(map(one, names, obs)))
+
+
+def play_original(original: Original, name: str, vectors: np.ndarray, player: Player) -> np.ndarray:
+    """Play an episode from each goal of a task in the original; return success (goals, 2) as ``play`` does."""
+    obs, found = original.ask(do="begin", task=name, vectors=vectors.tolist()), []
+    for _ in range(_STEPS):
+        (actions,) = player([name], np.array([obs]))
+        obs, success = original.ask(do="step", actions=actions.tolist())
+        found.append(success)
+    return at_end_and_ever(np.array(found))
+
+
+def at_end_and_ever(success: np.ndarray) -> np.ndarray:
+    """Return the success (..., 2) of episodes, at the end and at any step, from that of their steps (H, ...)."""
+    return np.stack([success[-1], success.max(axis=0)], axis=-1)
+
+
+def play(names: list[str], engine: str, goals: int, player: Player) -> list[tuple[str, np.ndarray, np.ndarray]]:
     """Play an episode from each goal of some tasks in one program.
 
     Returns:
         for each task its name, success (goals, 2) at the end and at any step, and the goals' vectors.
     """
-    before, policies = time.perf_counter(), metaworld_policies.load()
+    before = time.perf_counter()
     env = mtjax.mixture([mtjax.make(f"metaworld-{name}", num_draws=goals, engine=engine) for name in names])
     tasks = env.tasks()
     each = jax.tree.map(lambda x: jnp.asarray(x)[None], tasks.draws)._replace(blocks=tasks.blocks)
@@ -131,14 +172,13 @@ def play(names: list[str], engine: str, goals: int) -> list[tuple[str, np.ndarra
     step = lowered.compile()
     state, obs, found = jax.tree.map(jnp.copy, start.state), np.asarray(start.obs), []
     for i in range(env.episode_length):
-        taken = [metaworld_policies.actions(policies[name], obs[0, t]) for t, name in enumerate(names)]
-        after = step(each, state, jnp.asarray(np.stack(taken)[None]))
+        after = step(each, state, jnp.asarray(player(names, obs[0])[None]))
         state, obs = after.state, np.asarray(after.obs)
         found.append(np.asarray(after.metrics["success"])[0])
         if not i:
             print(f"{len(names)} tasks compiled after {time.perf_counter() - before:.0f} s", flush=True)
     print(f"{len(names)} tasks played after {time.perf_counter() - before:.0f} s", flush=True)
-    success = np.stack([found[-1], np.max(found, axis=0)], axis=-1)
+    success = at_end_and_ever(np.array(found))
     return [(name, success[t], env.families[t].vectors()) for t, name in enumerate(names)]
 
 

@@ -427,18 +427,61 @@ def test_tasks_with_a_line_are_not_played_again(script, tmp_path, monkeypatch):
     parity = script("metaworld_parity")
     played = []
 
-    def play(names, engine, goals):
+    def play(names, engine, goals, player):
         played.append(names)
         return [(name, np.ones((goals, 2)), np.zeros((goals, 3))) for name in names]
 
     monkeypatch.setattr(parity, "play", play)
-    given = SimpleNamespace(out=tmp_path / "x.csv", engine="warp", goals=4, together=2)
+    monkeypatch.setattr(parity, "scripted", lambda: (list(TASKS), None))
+    given = SimpleNamespace(out=tmp_path / "x.csv", engine="c", goals=4, together=2, run=None)
     for tasks in (["reach"], ["drawer-open", "reach", "soccer", "drawer-close"]):
         parity.compare(None, SimpleNamespace(**vars(given), tasks=tasks))
     assert played == [["reach"], ["drawer-open", "drawer-close"], ["soccer"]]  # tasks of a scene side by side
     assert parity.read(given.out) == {"reach", "drawer-open", "drawer-close", "soccer"}
-    assert given.out.read_text().splitlines()[1] == "reach,warp,4,1,1,,,"
+    assert given.out.read_text().splitlines()[1] == "reach,c,4,1,1,,,"
     assert parity.read(FOLDER / "results" / "metaworld-policies.csv") == set(TASKS)
+
+
+def test_a_policy_sees_and_steps_the_originals_worlds(script):
+    """Two goals: one is reached at the end, the other before it and lost again."""
+    parity = script("metaworld_parity")
+    asked, steps = [], iter(range(1, 501))
+
+    def ask(do, **given):
+        asked.append((do, given))
+        if do == "begin":
+            return [[0.0] * 39, [1.0] * 39]
+        i = next(steps)
+        return [[float(i)] * 39] * 2, [i == 500, i == 7]
+
+    found = parity.play_original(
+        SimpleNamespace(ask=ask), "reach", np.zeros((2, 6)), lambda names, obs: obs[..., :4] / 500
+    )
+    assert found.tolist() == [[True, True], [False, True]] and len(asked) == 501
+    assert asked[0] == ("begin", {"task": "reach", "vectors": [[0.0] * 6] * 2})
+    assert asked[1] == ("step", {"actions": [[0.0] * 4, [1 / 500] * 4]})
+    assert asked[-1] == ("step", {"actions": [[499 / 500] * 4] * 2})
+
+
+def test_a_policy_of_other_tasks_does_not_play_meta_world(script):
+    parity = script("metaworld_parity")
+    with pytest.raises(SystemExit, match="finger-spin-vary-size/sac-conditioned is not of a mixture of Meta-World"):
+        parity.trained("finger-spin-vary-size/sac-conditioned")
+
+
+@with_scenes
+@pytest.mark.slow
+def test_a_trained_policy_plays_meta_world_as_it_acts(script, tmp_path):
+    env = mtjax.make("metaworld-window-open+metaworld-reach", num_draws=2)
+    settings = {"num_envs": 1, "batch_size": 2, "replay_size": 100, "warmup_steps": 2, "chunk_steps": 5}
+    agent = mtjax.agent("sac-conditioned", hidden=(8, 8))
+    mtjax.train(env, agent, steps=10, eval_episodes=1, directory=tmp_path / "run", **settings)
+    names, player = script("metaworld_parity").trained(str(tmp_path / "run"))
+    assert names == ["window-open", "reach"]
+    policy, task = mtjax.load(tmp_path / "run"), jax.tree.map(lambda x: x[1], env.tasks())
+    obs = np.random.default_rng(0).normal(size=(2, 3, 39))
+    np.testing.assert_allclose(player(names, obs)[1, 2], policy(np.float32(obs[1, 2]), task), atol=1e-6)
+    np.testing.assert_array_equal(player(["reach"], obs[1:])[0], player(names, obs)[1])
 
 
 def test_a_curve_is_thinned_to_its_last_line(script):
