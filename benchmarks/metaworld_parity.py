@@ -73,7 +73,7 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", choices=TASKS, metavar="NAME", help="of success; by default all")
     parser.add_argument("--goals", type=int, default=20, help="of each task, with one episode each, in success")
     parser.add_argument("--together", type=int, default=2 if on_cpu else 25, help="tasks of a program, in success")
-    parser.add_argument("--out", type=Path, default=Path("metaworld-policies.csv"))
+    parser.add_argument("--out", type=Path, help="by default metaworld-policies.csv, with --run metaworld-trained.csv")
     parser.add_argument("--worlds", type=int, default=160 if on_cpu else 4096, help="of all tasks, in speed")
     parser.add_argument("--steps", type=int, default=_STEPS, help="of a timed call, in speed")
     parser.add_argument("--rounds", type=int, default=5, help="in speed")
@@ -90,13 +90,16 @@ def main() -> None:
 def compare(original: Original | None, arguments: argparse.Namespace) -> None:
     """Add a line for each task that has none."""
     known, player = trained(arguments.run) if arguments.run else scripted()
+    out = arguments.out or Path("metaworld-trained.csv" if arguments.run else "metaworld-policies.csv")
     engine = mtjax.make("metaworld-reach", engine=arguments.engine).engine_name
-    done = read(arguments.out)
+    done = read(out)
+    if unknown := set(arguments.tasks or ()) - set(known):
+        raise SystemExit(f"{arguments.run} has not trained on {', '.join(sorted(unknown))}")
     scene_of = lambda name: load(f"mtjax.envs.metaworld.{TASKS[name]}").scene_file
     left = [name for name in arguments.tasks or known if name not in done]
     left.sort(key=scene_of)  # whose simulators join
-    if not arguments.out.exists():
-        arguments.out.write_text(",".join(_HEAD) + "\n")
+    if not out.exists():
+        out.write_text(",".join(_HEAD) + "\n")
     for begin in range(0, len(left), arguments.together):
         names = left[begin : begin + arguments.together]
         for name, success, vectors in play(names, engine, arguments.goals, player):
@@ -104,7 +107,7 @@ def compare(original: Original | None, arguments: argparse.Namespace) -> None:
             if original is not None:
                 theirs = play_original(original, name, vectors, player)
                 row += [*(f"{x:.3g}" for x in theirs.mean(0)), int(np.sum(success[:, 1] != theirs[:, 1]))]
-            with arguments.out.open("a", newline="") as file:
+            with out.open("a", newline="") as file:
                 csv.writer(file).writerow(row + [""] * (len(_HEAD) - len(row)))
             print(*row, flush=True)
 
@@ -123,20 +126,24 @@ def read(path: Path) -> set[str]:
 def scripted() -> tuple[list[str], Player]:
     """Return the names of all tasks, and what plays them by the installed package's policies."""
     policies = metaworld_policies.load()
-    act = lambda name, obs: metaworld_policies.actions(policies[name], obs)
-    return list(TASKS), lambda names, obs: np.stack(list(map(act, names, obs)))
+    return list(TASKS), of_each(lambda name, obs: metaworld_policies.actions(policies[name], obs))
 
 
 def trained(run: str) -> tuple[list[str], Player]:
     """Return the names of a run's tasks, and what plays them by its policy's mean actions."""
     policy = mtjax.load(run)
-    act = jax.jit(jax.vmap(policy, (0, None)))
     names, tasks = [x.removeprefix("metaworld-") for x in policy.env.labels("train")], policy.env.tasks("train")
-    if not set(names) <= set(TASKS):
-        raise SystemExit(f"{run} is not of a mixture of Meta-World's tasks: it has {', '.join(names)}")
+    shown = not any(getattr(part.family, "goal_hidden", False) for part in policy.env.parts)
+    if not shown or not set(names) <= set(TASKS) or jax.tree.map(np.shape, policy.takes) != (39,):
+        raise SystemExit(f"{run} is not of a mixture of Meta-World's tasks that shows their goals, such as mt10")
+    act = jax.jit(jax.vmap(policy, (0, None)))
     task = {name: jax.tree.map(lambda x, i=i: x[i], tasks) for i, name in enumerate(names)}
-    one = lambda name, obs: np.asarray(act(np.float32(obs), task[name]))
-    return names, lambda names, obs: np.stack(list(map(one, names, obs)))
+    return names, of_each(lambda name, obs: np.asarray(act(np.float32(obs), task[name])))
+
+
+def of_each(act: Callable[[str, np.ndarray], np.ndarray]) -> Player:
+    """Return what plays several tasks, from what acts (G, 4) in one."""
+    return lambda names, obs: np.stack([act(name, seen) for name, seen in zip(names, obs, strict=True)])
 
 
 def play_original(original: Original, name: str, vectors: np.ndarray, player: Player) -> np.ndarray:

@@ -469,6 +469,14 @@ def test_a_policy_of_other_tasks_does_not_play_meta_world(script):
         parity.trained("finger-spin-vary-size/sac-conditioned")
 
 
+def test_a_policy_plays_only_what_it_was_trained_on(script, tmp_path, monkeypatch):
+    parity = script("metaworld_parity")
+    monkeypatch.setattr(parity, "trained", lambda run: (["reach"], None))
+    given = SimpleNamespace(run="mine", tasks=["reach", "push"], out=tmp_path / "x.csv", engine="c")
+    with pytest.raises(SystemExit, match="mine has not trained on push"):
+        parity.compare(None, given)
+
+
 @with_scenes
 @pytest.mark.slow
 def test_a_trained_policy_plays_meta_world_as_it_acts(script, tmp_path):
