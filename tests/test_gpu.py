@@ -346,7 +346,7 @@ def test_worlds_of_a_union_go_on_on_warp_as_on_c(name, count=16, steps=30):
         error = np.abs(ours.qvel - theirs.qvel) / np.abs(theirs.qvel).max()
         errors.append(error.max(axis=-1))
         steady.append(np.delete(error, tilting(family.models[0]), axis=-1).max(axis=-1))
-    for found_errors, median, nine_in_ten in ((steady, 1e-3, 1e-3), (errors, 2e-2, 5e-2)):
+    for found_errors, median, nine_in_ten in ((steady, 1e-3, 1e-3), (errors, 1e-2, 5e-2)):
         middle = sorted(zip(map(np.median, found_errors), env.names, strict=True), reverse=True)
         assert middle[0][0] < median and np.quantile(found_errors, 0.9) < nine_in_ten, middle[:5]
     assert np.quantile(np.abs(found.obs - expected.obs), 0.9) < 1e-3

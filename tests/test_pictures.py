@@ -274,17 +274,17 @@ def test_an_actor_learns_from_pictures_under_critics_that_see_the_state():
 
 
 ON_POLICY = dict(hidden=(32, 32), latent_widths=(16,), num_envs=16, unroll=4, minibatches=2, chunk_steps=40)
-ON_POLICY |= dict(actor_lr=3e-3, critic_lr=3e-3, entropy_cost=0.0)
+ON_POLICY |= dict(actor_lr=1.5e-3, critic_lr=1.5e-3, entropy_cost=0.0)  # twice as fast it unlearns at times
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("representation", ["encoded", "asymmetric"])
 def test_ppo_learns_what_only_pictures_show(representation):
-    """Without seeing, the best mean return is -0.625. Such rates unlearn at times, on some CPUs in the last chunk."""
+    """Without seeing, the best mean return is -0.625."""
     env = Pictured("by-both") if representation == "encoded" else BESIDE
     agent = mtjax.agent("ppo", representation=representation)
     state, history = probes.train(env, agent, ON_POLICY, chunks=6)
-    assert max(np.mean(chunk["return"]) for chunk in history) > -0.1
+    assert np.mean(history[-1]["return"]) > -0.3
     assert ("latent" in state.agent.critic.shared) == (representation == "encoded")
     assert "sight" in state.agent.actor.shared
 
