@@ -1,5 +1,6 @@
 """PPO: advantages, losses, minibatches and units against numbers worked by hand, and probes learned by the loop."""
 
+import dataclasses
 import itertools
 import math
 
@@ -14,11 +15,11 @@ from mtjax.agents.parts.encoders import ENCODERS
 from mtjax.agents.parts.gradients.surgery import RULES
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
-from mtjax.agents.ppo import Batch, Taken, Units, advantages, take_steps
+from mtjax.agents.ppo import PPO, Batch, Taken, Units, advantages, take_steps
 from mtjax.config import with_preset
 from mtjax.envs.probes import Probe, tasks_of
 from mtjax.maps import in_parts
-from mtjax.networks import log_density
+from mtjax.networks import OVER_TASKS, log_density
 from mtjax.types import InputError, Spec, Transition
 
 SPEC, LENGTH, ENVS = Spec.vector(3, 2, 1)._replace(sentences=("Walk.", "Run.", "Hop.")), 4, 2
@@ -114,7 +115,7 @@ def batch_of(agent, state, **fields):
     random = np.random.default_rng(1)
     normal = lambda *size: jnp.float32(random.normal(size=(4, *size)))
     features = agent.features(state, pick(TASKS, 0))
-    blank = dict.fromkeys(("log_prob", "advantage", "value", "target"), jnp.zeros(4))
+    blank = dict.fromkeys(("log_prob", "advantage", "output", "target"), jnp.zeros(4))
     batch = Batch(**{"obs": normal(3), "raw": normal(2), "features": features, "mask": None, **blank, **fields})
     return batch, of_task(state.actor, 0), of_task(state.critic, 0)
 
@@ -160,8 +161,8 @@ def test_critic_loss_worked_by_hand():
     agent, free = small(value_clip=0.5), small()
     state = agent.init(SPEC, TASKS, KEY)
     batch, _, critic = batch_of(agent, state)
-    value = agent.critic.apply(critic, batch.features, batch.obs)[..., 0]
-    batch = batch._replace(value=value - jnp.array([0.2, 1.0, -1.0, 1.0]), target=value + jnp.array([1.0, 1, 1, -1]))
+    now = agent.critic.apply(critic, batch.features, batch.obs)[..., 0]
+    batch = batch._replace(output=now - jnp.array([0.2, 1.0, -1.0, 1.0]), target=now + jnp.array([1.0, 1, 1, -1]))
     assert free.critic_loss(critic, batch)[0] == pytest.approx(0.5, abs=1e-5)
     # The second value may only be 0.5 above the old one, which is 1.5 from its target; and so on.
     expected = np.mean([1.0, 1.5**2, 1.0, 1.0]) / 2
@@ -271,6 +272,19 @@ def test_units_are_moments_of_all_targets_at_first(kind):
     np.testing.assert_allclose(moved.mean, 0.9 * state.units.mean + 0.1 * targets[0].mean(axis=1), rtol=1e-4)
 
 
+@pytest.mark.parametrize("kind", ["none", "running", "popart"])
+def test_targets_are_in_the_units_in_which_outputs_are_read(kind):
+    """Those that this rollout has moved, while values of the rollout are in those from before."""
+    agent = small(value_normalization=kind, advantage_normalization="none")
+    state = agent.init(SPEC, TASKS, KEY)
+    for seed in range(3):
+        steps, before = random_steps(agent, seed=seed), state
+        state, batch, _ = agent.prepare(state, steps._replace(reward=10 + 5 * seed * steps.reward), TASKS)
+        value = agent.values(before, batch.features, batch.obs)
+        np.testing.assert_allclose(state.units.rewards(batch.target), value + batch.advantage, rtol=1e-4, atol=1e-3)
+    assert (kind == "none") == bool(jnp.all(state.units.mean == before.units.mean))
+
+
 def test_popart_gives_the_critic_alone_a_head_for_every_task():
     agent = small(value_normalization="popart")
     state = agent.init(SPEC, TASKS, KEY)
@@ -299,6 +313,51 @@ def test_moments_are_those_of_all_observations():
 
 
 # Updates.
+
+
+class Ratios(PPO):
+    """Tells how far the ratio of policies is from 1 at most."""
+
+    def actor_loss(self, actor, data):
+        loss, metrics = super().actor_loss(actor, data)
+        batch, _ = data
+        ratio = jnp.exp(log_density(self.actor.apply(actor, batch.features, batch.obs), batch.raw) - batch.log_prob)
+        return loss, metrics | {"ratio": jnp.max(jnp.abs(ratio - 1))}
+
+
+RATIOS = [
+    {},
+    {"kl_limit": 0.01, "value_normalization": "popart"},
+    {"representation": "deepmdp", "critic_lr": 0.1},
+    {"conditioning": "inferred", "inferred_from": 3},
+]
+
+
+@pytest.mark.parametrize("row", one_in(2, RATIOS), ids=lambda row: "-".join(map(str, row.values())))
+def test_the_ratio_is_one_before_the_first_step(row):
+    """With one gradient step a rollout every ratio is one before the first: moments and units may not move until then,
+    nor may the representation. The walk's observations go up, so that the moments of every rollout are others."""
+    agent = small(epochs=1, minibatches=1, **row)
+    agent = Ratios(**{field.name: getattr(agent, field.name) for field in dataclasses.fields(agent)})
+    state, history = train(Walk(episode_length=40), agent, {"num_envs": 4, "unroll": 5, "chunk_steps": 60})
+    assert history[0]["ratio"].max() < 1e-5 and history[0]["clip_fraction"].max() == 0
+    assert state.agent.moments.count == 2 * 4 * 60 and state.agent.moments.mean > 1
+
+
+@pytest.mark.parametrize("kind", ["none", "running", "popart"])
+def test_values_are_clipped_around_the_outputs_from_before_the_update(kind):
+    """In the units that the critic's outputs have by then: at first the units change from 1, later from others."""
+    agent = small(value_normalization=kind, value_clip=0.2)
+    state = agent.init(SPEC, TASKS, KEY)
+    for seed in range(3):
+        steps = random_steps(agent, seed=seed)
+        steps = steps._replace(reward=100 + 50 * seed * steps.reward)
+        state, batch, _ = agent.prepare(state, steps, TASKS)
+        now = agent.outputs(state, batch.features, batch.obs)
+        np.testing.assert_allclose(batch.output, now, rtol=1e-3, atol=1e-4)
+        slope = jax.vmap(jax.grad(lambda critic, batch: agent.critic_loss(critic, batch)[0]), (OVER_TASKS, 0))
+        slopes = jax.tree.leaves(slope(state.critic, batch))
+        assert min(float(jnp.max(jnp.abs(x[task]))) for x in slopes for task in range(3)) > 0
 
 
 def test_the_actor_rests_once_it_is_too_far_away():

@@ -51,6 +51,14 @@ class Units(NamedTuple):
     def std(self) -> Array:
         return jnp.maximum(jnp.sqrt(self.variance), MIN_STD)
 
+    def rewards(self, outputs: Array) -> Array:
+        """Return the values in units of reward for which the critic's outputs (T, B) stand."""
+        return self.mean[:, None] + self.std[:, None] * outputs
+
+    def outputs(self, values: Array) -> Array:
+        """Return the critic's outputs that stand for values (T, B) in units of reward."""
+        return (values - self.mean[:, None]) / self.std[:, None]
+
 
 class PPOState(NamedTuple):
     """Holds everything that PPO learns, and what it remembers of the training tasks."""
@@ -82,8 +90,8 @@ class Batch(NamedTuple):
     raw: Array  # (B, A) actions before the tanh
     log_prob: Array  # (B,) their log-probabilities under the policy that took them
     advantage: Array  # (B,)
-    value: Array  # (B,) the critic's values before the update, in its units
-    target: Array  # (B,) the critic's targets, in its units
+    output: Array  # (B,) the critic's outputs before the update
+    target: Array  # (B,) what the critic's outputs should be
     features: Array  # (Z,) or (B, Z) features of the task, which networks take as inputs
     mask: Array | None  # (A,) 1 for actions that the task has, else 0; None: it has all
     # For a representation that learns.
@@ -108,8 +116,9 @@ class PPO(BaseAgent):
         L_V = (V(s) - y)^2 / 2                                                              (critic loss)
     averaged over a task's minibatch, then over tasks. Advantages are scaled to mean 0 and standard deviation 1 in each
     task. The critic's output V' is in units of each task, V = m_i + s_i V', with moving estimates m_i and s_i of the
-    mean and the standard deviation of the task's targets. With PopArt the heads are rescaled when these move, so that V
-    does not change (van Hasselt et al. 2016, Hessel et al. 2019):
+    mean and the standard deviation of the task's targets. These move before the critic learns, and targets are in the
+    new units. With PopArt the heads are rescaled then, so that V does not change (van Hasselt et al. 2016, Hessel et
+    al. 2019):
         kernel' = kernel s / s',  bias' = (s bias + m - m') / s'
 
     The policy is a tanh-squashed Gaussian; its entropy is estimated from one sample. With a ``kl_limit``, the actor is
@@ -123,9 +132,12 @@ class PPO(BaseAgent):
     target encoder is the encoder from before the update, as values are the critic's from before the update; so
     ``encoder_tau`` has no effect here.
 
+    Observations are normalised by moments of the rollouts before this one, in acting and in learning, so that the ratio
+    is 1 before the first step of an update. The rollout joins the moments after the update. A representation's steps
+    change the policy too, and the ratio counts that.
+
     Differs from the paper: actor and critic share no parameters, so that the critic's loss needs no weight; advantages
-    and values are normalised; time limits bootstrap; observations are normalised by moments that include the rollout's
-    own. The ratio counts that last change, and a representation's steps, as changes of the policy.
+    and values are normalised; time limits bootstrap; observations are normalised by moments of the rollouts.
     """
 
     adjustable: ClassVar[tuple[str, ...]] = (
@@ -246,16 +258,16 @@ class PPO(BaseAgent):
         return loss, {"actor_loss": loss, "entropy": entropy, "kl": kl, "clip_fraction": beyond}
 
     def critic_loss(self, critic: Params, batch: Batch) -> tuple[Array, Metrics]:
-        value = self.value(critic, batch.features, batch.obs)
-        error = jnp.square(value - batch.target)
+        output = self.output(critic, batch.features, batch.obs)
+        error = jnp.square(output - batch.target)
         if not parts.is_zero(self.value_clip):
-            clipped = batch.value + jnp.clip(value - batch.value, -self.value_clip, self.value_clip)
+            clipped = batch.output + jnp.clip(output - batch.output, -self.value_clip, self.value_clip)
             error = jnp.maximum(error, jnp.square(clipped - batch.target))
         loss = jnp.mean(error) / 2
         return self.placed_representation.join(loss, {"critic_loss": loss}, critic, batch)
 
-    def value(self, critic: Params, features: Array, obs: Any) -> Array:
-        """Return the critic's values (B,) of observations (B, ...), in its units."""
+    def output(self, critic: Params, features: Array, obs: Any) -> Array:
+        """Return the critic's outputs (B,) for observations (B, ...)."""
         features, inputs = self.placed_representation.perceive(critic, features, obs)
         return self.critic.apply(critic.without(self.placed_representation.names), features, inputs)[..., 0]
 
@@ -270,31 +282,32 @@ class PPO(BaseAgent):
         (state, _), metrics = jax.lax.scan(
             minibatch_step, (state, jnp.bool_(True)), (indices, jax.random.split(key, len(indices)))
         )
+        state = state._replace(moments=self.fit_moments(state.moments, steps.obs))
         return state, jax.tree.map(lambda x: jnp.mean(x, axis=0), metrics) | statistics
 
     def prepare(self, state: PPOState, steps: Transition, tasks: Task) -> tuple[PPOState, Batch, Metrics]:
-        """Fit the normalisers to rollouts (T, H, E, ...), and return the batch (T, H E, ...) for the losses."""
+        """Fit the units to rollouts (T, H, E, ...), and return the batch (T, H E, ...) for the losses."""
         flat: Transition = jax.tree.map(lambda x: x.reshape(x.shape[0], -1, *x.shape[3:]), steps)
         taken: Taken = flat.extras
         next_past = None if taken.past is None else append(taken.past, flat.obs, flat.action, flat.reward)
-        state = state._replace(moments=self.fit_moments(state.moments, flat.obs))
         features, obs = self.features_of_batch(state, flat, tasks), self.see_batch(state.moments, flat.obs, taken.past)
         next_obs = self.see_batch(state.moments, flat.next_obs, next_past)
-        value, next_value = (self.values(state, features, inputs) for inputs in (obs, next_obs))
+        output = self.outputs(state, features, obs)
+        value, next_value = state.units.rewards(output), self.values(state, features, next_obs)
         reward = self.rewards(state, flat, tasks)
         advantage = self.advantages(flat._replace(reward=reward), tasks, steps.reward.shape, value, next_value)
         target = value + advantage
         scales, _ = self.scaling.renew(state.scales, target, ())
-        state = self.renew(state, target)._replace(scales=scales)
-        in_units = lambda x: (x - state.units.mean[:, None]) / state.units.std[:, None]
+        old, state = state.units, self.renew(state, target)._replace(scales=scales)
+        factor, offset = (x[:, None] for x in self.follows(old, state.units))
         models = {"action": flat.action, "reward": reward, "next_obs": next_obs} if self.representation.learns else {}
         batch = Batch(
             obs=obs,
             raw=taken.raw,
             log_prob=taken.log_prob,
             advantage=self.normalize_advantages(advantage),
-            value=in_units(value),
-            target=in_units(target),
+            output=factor * output + offset,
+            target=state.units.outputs(target),
             features=features,
             mask=tasks.action_mask,
             **models,
@@ -316,12 +329,14 @@ class PPO(BaseAgent):
 
     def values(self, state: PPOState, features: Array, obs: Any) -> Array:
         """Return the critic's values (T, B) of observations (T, B, ...), in units of reward."""
-        of_tasks = jax.vmap(self.value, (OVER_TASKS, 0, 0))
+        return state.units.rewards(self.outputs(state, features, obs))
+
+    def outputs(self, state: PPOState, features: Array, obs: Any) -> Array:
+        """Return the critic's outputs (T, B) for observations (T, B, ...)."""
+        of_tasks = partial(jax.vmap(self.output, (OVER_TASKS, 0, 0)), state.critic)
         if frames.shown(obs):  # all at once they would fill the memory
-            out = in_parts(partial(of_tasks, state.critic), features, obs, self.minibatches)
-        else:
-            out = of_tasks(state.critic, features, obs)
-        return state.units.mean[:, None] + state.units.std[:, None] * out
+            return in_parts(of_tasks, features, obs, self.minibatches)
+        return of_tasks(features, obs)
 
     def normalize_advantages(self, advantage: Array) -> Array:
         """Scale advantages (T, B) to mean 0 and standard deviation 1, as the settings say."""
@@ -343,22 +358,27 @@ class PPO(BaseAgent):
         return state._replace(units=new, critic=self.follow(state.critic, old, new))
 
     def follow(self, critic: Params, old: Units, new: Units) -> Params:
-        """Rescale the critic's heads to new units, so that its values do not change; the first units change nothing."""
+        """Rescale the critic's heads to new units, as ``follows`` says."""
         if self.value_normalization != "popart":
             return critic
-        known = old.count > 0
-        ratio = jnp.where(known, old.std / new.std, 1.0)
-        shift = jnp.where(known, (old.mean - new.mean) / new.std, 0.0)
-        head = critic.own["head"]  # kernel (T, D, 1), bias (T, 1)
-        head = {"kernel": ratio[:, None, None] * head["kernel"], "bias": ratio[:, None] * head["bias"] + shift[:, None]}
-        return Params(critic.shared, {**critic.own, "head": head})
+        (factor, offset), head = self.follows(old, new), critic.own["head"]  # kernel (T, D, 1), bias (T, 1)
+        kernel, bias = factor[:, None, None] * head["kernel"], factor[:, None] * head["bias"] + offset[:, None]
+        return Params(critic.shared, {**critic.own, "head": {"kernel": kernel, "bias": bias}})
+
+    def follows(self, old: Units, new: Units) -> tuple[Array, Array]:
+        """Return by which factor and offset (T,) the critic's outputs change when its units do.
+
+        With PopArt they change so that values do not, but for the first units, which change nothing.
+        """
+        known = (old.count > 0) & (self.value_normalization == "popart")
+        return jnp.where(known, old.std / new.std, 1.0), jnp.where(known, (old.mean - new.mean) / new.std, 0.0)
 
     def fit_moments(self, moments: normalize.Moments, obs: Any) -> normalize.Moments:
-        """Add the vectors (T, B, O) in observations to the moments, with those on other devices."""
+        """Add the vectors (T, ..., O) in observations to the moments, with those on other devices."""
         found = frames.state(obs)
         if not self.normalize_observations or found is None:
             return moments
-        mixed = moments.mean.ndim > 1
+        mixed, found = moments.mean.ndim > 1, found.reshape(len(found), -1, found.shape[-1])
         count = (found.shape[1] if mixed else found.shape[0] * found.shape[1]) * collectives.count()
         mean, variance = (x.reshape(moments.mean.shape) for x in mean_and_variance(found, 1 if mixed else (0, 1)))
         one = normalize.Moments(jnp.full_like(moments.count, count), mean, count * variance)
@@ -391,10 +411,10 @@ class PPO(BaseAgent):
             )
             minibatch = minibatch._replace(model_targets=model_targets)
         sample_keys = jax.random.split(sample_key, len(batch.advantage))
-        critic_loss = self.above_least(self.critic_loss)
-        state, critic_metrics = self.descend("critic", self.gradients, critic_loss, state, minibatch, critic_order)
         features, obs = jax.vmap(self.actor_inputs, (OVER_TASKS, 0, 0))(state.critic, minibatch.features, minibatch.obs)
         data = (minibatch._replace(features=features, obs=obs, model_targets=None), sample_keys)
+        critic_loss = self.above_least(self.critic_loss)
+        state, critic_metrics = self.descend("critic", self.gradients, critic_loss, state, minibatch, critic_order)
         moved, actor_metrics = self.descend(
             "actor", self.gradients.for_actor, self.actor_loss, state, data, actor_order
         )
