@@ -8,6 +8,9 @@ import jax.numpy as jnp
 
 from mtjax.types import Env, InputError, Key, Task
 
+SAME_CONTEXT = 1e-5
+"""Contexts that are no farther apart are those of one task, which rounding may bring apart."""
+
 
 def n_tasks(env: Env, n: int, key: Key, split: str = "train") -> Task:
     """Draw a fixed bag of ``n`` tasks of a split, with leading axis ``n``.

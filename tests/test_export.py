@@ -4,23 +4,27 @@ import ast
 import importlib.util
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import slow_but, tiny
+from probes import FEW, pick, slow_but, tiny
 
 import mtjax
 import mtjax.evaluate
 from mtjax import agents, standalone
-from mtjax.training.export import require_file
+from mtjax.tasks import SAME_CONTEXT
+from mtjax.training.export import require_file, task_at
 from mtjax.training.policy import Policy
 from mtjax.training.steps import steps_of
 from mtjax.types import InputError
 
 ENV = mtjax.make("finger-spin", vary={"size": "1:1.2:3"})
+TIES = mtjax.make("finger-spin-vary-size")  # whose held-out tasks are midway between two that trained
 
 
 def policy_of(agent, env=ENV):
@@ -39,20 +43,23 @@ def observations(count, env=ENV):
 
 CASES = {name: {} for name in agents.AGENTS} | {
     "care": {"normalize_observations": True},
+    "text": {"conditioning": "text"},
     "input-map": {"encoder": "input-map", "conditioning": "parameters"},
     "hypernetwork": {"encoder": "hypernetwork", "conditioning": "parameters"},
     "one-hot": {"conditioning": "one-hot"},
 }
 
 
-@pytest.mark.parametrize("name", slow_but(CASES, "care"))
-def test_both_forms_act_as_the_policy(name, tmp_path):
+@pytest.mark.parametrize("name", slow_but(CASES, "care", "multi-head", "text"))
+def test_all_forms_act_as_the_policy(name, tmp_path):
     """On tasks that trained and on others, whose context and nearest task are found inside."""
+    if name == "text":
+        pytest.importorskip("sklearn")
     given = CASES[name]
-    policy = policy_of(tiny(name if name in agents.AGENTS else "sac", **given))
+    policy = policy_of(tiny(name if name in agents.AGENTS else "sac", **given), TIES)
     file = mtjax.export(policy, tmp_path / "policy.npz")
     by_numpy, by_jax = standalone.load(file), standalone.load_jax(file)
-    tasks, obs = ENV.tasks("all"), observations(len(ENV.tasks("all").id))
+    tasks, obs = TIES.tasks("all"), observations(len(TIES.tasks("all").id))
     expected = np.asarray(jax.jit(jax.vmap(policy))(obs, tasks))
     sizes = np.asarray(tasks.params["size"])
     np.testing.assert_allclose(by_jax(obs, sizes[:, None]), expected, atol=2e-5)
@@ -60,6 +67,31 @@ def test_both_forms_act_as_the_policy(name, tmp_path):
     np.testing.assert_allclose(found, expected, atol=2e-5)
     assert np.ptp(expected, axis=0).max() > 1e-3
     assert_onnx_acts(policy, tmp_path / "policy.onnx", obs, sizes, expected)
+
+
+@pytest.mark.parametrize("name", [name for name in FEW if "vary" in name])
+def test_a_file_knows_every_listed_task_by_its_parameters(name):
+    """By the number and by the context that the family gives it; an unlisted one has no number of theirs."""
+    env = mtjax.make(name)
+    listed = env.tasks("all")
+    values = np.stack([np.asarray(listed.params[name]) for name, _, _ in env.ranges], axis=1)
+    found = jax.jit(jax.vmap(partial(task_at, env, listed._replace(draws=None))))(values)
+    np.testing.assert_array_equal(found.id, listed.id)
+    np.testing.assert_allclose(found.context, listed.context, atol=SAME_CONTEXT)
+    assert task_at(env, listed._replace(draws=None), jnp.asarray(values[0] + 0.003)).id == len(listed.id)
+
+
+def test_an_equally_near_task_is_the_lower_one_however_it_is_rounded():
+    """Among 200 tasks, all that lie midway between two; a file's contexts differ from the family's by rounding."""
+    env = mtjax.make("finger-spin", vary={"size": "0.95:1.13:200"})
+    contexts = env.tasks().context
+    agent, random = tiny("sac"), np.random.default_rng(0)
+    midway = (contexts[1:] + contexts[:-1]) / 2
+    noise = random.uniform(-SAME_CONTEXT / 2, SAME_CONTEXT / 2, (5, *midway.shape))
+    unseen = pick(env.tasks(), 0)._replace(id=jnp.int32(500))
+    nearest = lambda context: agent.known_task(SimpleNamespace(contexts=contexts), unseen._replace(context=context))
+    found = jax.vmap(jax.vmap(nearest))(midway + jnp.float32(noise))
+    np.testing.assert_array_equal(found, np.broadcast_to(np.arange(199), (5, 199)))
 
 
 def assert_onnx_acts(policy, file, obs, sizes, expected):

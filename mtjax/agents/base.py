@@ -23,6 +23,7 @@ from mtjax.agents.parts.trajectory import Past, Seen, TrajectoryEncoder
 from mtjax.checks import require_values
 from mtjax.experience import Replay, multistep
 from mtjax.networks import Network, Params
+from mtjax.tasks import SAME_CONTEXT
 from mtjax.types import Acted, Array, Env, InputError, Key, Metrics, Outcome, Spec, Task, Transition
 
 Conditioning = Literal["none", "one-hot", "embedding", "parameters", "vectors", "text", "inferred"]
@@ -382,11 +383,14 @@ class BaseAgent(abc.ABC):
         return conditioning.load_vectors(self.vectors, num_tasks) if self.vectors else None
 
     def known_task(self, state: Any, task: Task) -> Array:
-        """Return the number () int32 of ``task`` if it is a training task, else of the nearest training task."""
-        distance = jnp.sum(jnp.square(state.contexts - task.context), axis=-1)
+        """Return the number () int32 of ``task`` if it is a training task, else of the nearest training task.
+
+        Of training tasks that are equally near, up to rounding, it is the lowest number.
+        """
+        distance = jnp.sqrt(jnp.sum(jnp.square(state.contexts - task.context), axis=-1))
         if task.blocks is not None:  # only a task of the same family can be nearest
             distance = jnp.where(task.blocks.related(state.contexts, task.context), distance, jnp.inf)
-        nearest = jnp.argmin(distance).astype(jnp.int32)
+        nearest = jnp.argmax(distance <= jnp.min(distance) + 2 * SAME_CONTEXT).astype(jnp.int32)
         return jnp.where(task.id < len(state.contexts), task.id, nearest)
 
     def nearest_tasks(self, state: Any, tasks: Task) -> Array:

@@ -18,6 +18,7 @@ from mtjax.envs import name_of as env_name_of
 from mtjax.envs.pixels import GREY
 from mtjax.envs.stepped import Stepped
 from mtjax.names import InputError
+from mtjax.tasks import SAME_CONTEXT
 from mtjax.training import onnx
 from mtjax.training.policy import Policy
 from mtjax.training.steps import steps_of
@@ -127,18 +128,17 @@ def acting(policy: Policy) -> Callable[[Any, Array], Array]:
         raise InputError("export takes a policy of one family, and this one is of a mixture")
     if agent.history_length:
         raise InputError("export takes agents that act by what they see, and this one infers its task from memory")
-    trained = env.tasks("train")
-    first = jax.tree.map(lambda x: x[0], trained)._replace(draws=None)
+    listed = env.tasks("all")._replace(draws=None)
 
     def act(obs: Any, values: Array) -> Array:
-        task = _task(env, first, trained, values)
+        task = task_at(env, listed, values)
         return agent.act(state, agent.begin(state, task), obs, task, None).action
 
     return act
 
 
-def _task(env: Family, first: Task, trained: Task, values: Array) -> Task:
-    """Return the task with the values (P,) of its parameters. One that trained has its number, others one beyond."""
+def task_at(env: Family, listed: Task, values: Array) -> Task:
+    """Return the task with the values (P,) of its parameters. One of the family's has its number, others one beyond."""
     columns = []
     for i, (name, low, high) in enumerate(env.ranges):
         if name in env.parameters and env.parameters[name].direction:
@@ -146,8 +146,9 @@ def _task(env: Family, first: Task, trained: Task, values: Array) -> Task:
         else:
             columns.append((values[i] - (low + high) / 2) / ((high - low) / 2 or 1.0))
     context = jnp.stack(columns) if columns else jnp.zeros(1)
-    same = jnp.all(jnp.abs(trained.context - context) < 1e-5, axis=1)
-    number = jnp.where(jnp.any(same), jnp.argmax(same), len(env.tasks("all").id)).astype(jnp.int32)
+    same = jnp.all(jnp.abs(listed.context - context) <= SAME_CONTEXT, axis=1)
+    number = jnp.where(jnp.any(same), jnp.argmax(same), len(listed.id)).astype(jnp.int32)
+    first = jax.tree.map(lambda x: x[0], listed)
     return first._replace(id=number, context=context.astype(jnp.float32))
 
 
