@@ -289,6 +289,25 @@ def test_ppo_learns_what_only_pictures_show(representation):
     assert "sight" in state.agent.actor.shared
 
 
+@pytest.mark.parametrize("name", probes.slow_but(["drq", "deepmdp", "hip-bmdp"], "deepmdp"))
+def test_what_follows_a_terminal_step_in_the_replay_changes_nothing(name):
+    """It is the first picture of another episode. What follows other steps is what models predict."""
+    spec, tasks = Pictured().spec, Pictured().tasks()
+    agent = probes.tiny(name, n_step=1)
+    init, update = probes.learner(agent, tasks, 6, spec)
+    batch = probes.random_batch(0, len(tasks.id), 6, spec)
+    batch = batch._replace(discount=jnp.tile(jnp.float32([1, 0, 1, 1, 0, 1]), (len(tasks.id), 1)))
+
+    def learned(place):
+        after = {"pixels": batch.next_obs["pixels"].at[:, place].add(77)}
+        state, _ = update(init(tasks, KEY), batch._replace(next_obs=after), tasks, KEY)
+        return np.concatenate([np.ravel(x) for x in jax.tree.leaves((state.actor, state.critic, state.target))])
+
+    as_it_is = learned(np.array([], int))
+    np.testing.assert_array_equal(learned(np.array([1, 4])), as_it_is)
+    assert not np.array_equal(learned(np.array([0])), as_it_is)
+
+
 def test_rollouts_tell_what_their_pictures_take():
     """Two stacks of 2 x 16 x 16 bytes a step; vectors take so little that it is not told."""
     text = Rollouts(unroll=100).describe(Pictured(frames=2).spec, 10)

@@ -99,6 +99,7 @@ class Batch(NamedTuple):
     reward: Array | None = None  # (B,) in the task's units
     next_obs: Any = None  # (B, O)
     model_targets: Any = None  # targets of its models
+    followed: None = None  # as a rollout keeps what followed every step
 
 
 @dataclasses.dataclass(frozen=True)

@@ -19,7 +19,7 @@ from mtjax.agents.parts.representations import REPRESENTATIONS
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.trajectory import append
 from mtjax.agents.parts.values import VALUES, Value
-from mtjax.experience import Replay
+from mtjax.experience import Replay, pictures
 from mtjax.experience.multistep import Ends
 from mtjax.maps import when
 from mtjax.networks import OVER_TASKS, Network, Params, tanh_normal
@@ -62,6 +62,7 @@ class Batch(NamedTuple):
     temperature: Array  # ()
     mask: Array | None  # (A,) 1 for actions that the task has, else 0; None: it has all
     model_targets: Any = None  # targets of the representation's models
+    followed: Array | None = None  # (B,) bool: next_obs is what followed; None: it always is
 
 
 class Sample(NamedTuple):
@@ -331,6 +332,7 @@ class SAC(BaseAgent):
             features=self.features_of_batch(state, batch, tasks),
             temperature=jnp.broadcast_to(jnp.exp(state.log_temperature), len(tasks.id)),
             mask=tasks.action_mask,
+            followed=pictures.followed(batch),
         )
 
     def update_target(self, critic: Params, target: Params) -> Params:

@@ -3,7 +3,8 @@
 The ring of a task holds the newest picture of every step's observation, and none of what follows: the picture after a
 step is that of the next slot. After a time limit the next slot holds a new episode, and the true last picture is lost.
 So a transition that a time limit cut off is not drawn, and a multi-step return stops before it; where an episode
-terminated, the picture after it does not matter. Both cost one step of an episode.
+terminated, the picture after it does not matter to values, and ``followed`` keeps it from models. Both cost one step of
+an episode.
 """
 
 import jax
@@ -11,7 +12,7 @@ import jax.numpy as jnp
 
 from mtjax.experience import multistep
 from mtjax.experience.multistep import at
-from mtjax.frames import PICTURES
+from mtjax.frames import PICTURES, shown
 from mtjax.types import Array, Transition
 
 
@@ -42,6 +43,14 @@ def join(rows: Transition, gamma: float | Array, *, frames: int, n_step: int) ->
     joined = multistep.join(body, gamma) if n_step > 1 else jax.tree.map(lambda x: jnp.take(x, 0, now.ndim), body)
     see = lambda place: {PICTURES: stack(rows.obs[PICTURES], rows.ended, place, frames)}
     return joined._replace(obs=joined.obs | see(now), next_obs=joined.next_obs | see(after))
+
+
+def followed(batch: Transition) -> Array | None:
+    """Return for which transitions (...) of a replay ``next_obs`` is what followed; None for all.
+
+    After a step that terminated, the next slot holds the first picture of another episode.
+    """
+    return batch.discount > 0 if shown(batch.obs) else None
 
 
 def stack(pictures: Array, ended: Array, place: Array, frames: int) -> Array:

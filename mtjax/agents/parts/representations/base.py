@@ -127,7 +127,8 @@ class Plain:
         """Add the representation's losses to the critics' loss, and its metrics to theirs.
 
         Args:
-            batch: has obs, action, reward, features, and in ``model_targets`` a result of ``targets``.
+            batch: has obs, action, reward, features, in ``model_targets`` a result of ``targets``, and in ``followed``
+                (B,) whether these are of what followed; None if they always are.
         """
         return loss, metrics
 

@@ -59,7 +59,8 @@ class DeepMDP(Encoded):
     Differs from the papers: targets come from the target encoder, which is more stable than the sg(phi(s')) of Zhang et
     al. and MTRL; R takes the predicted state, as theirs does (Gelada et al.: R(h, a)), and also z; L_T is their
     likelihood and not a Wasserstein distance; sigma is in [0.01, 1] where MTRL's is in [1e-4, 10], as the gradient of
-    L_T grows with 1 / sigma^2. From pictures there is no decoder.
+    L_T grows with 1 / sigma^2. From pictures there is no decoder, and L_T leaves out steps with which an episode
+    terminated, as the replay keeps no picture after these.
     """
 
     model_widths: tuple[int, ...] = (512,)
@@ -116,7 +117,7 @@ class DeepMDP(Encoded):
         features, latent = self.perceive(params, batch.features, batch.obs)
         mean, deviation = self.predict(params, features, latent, batch.action)
         error = (mean - jax.lax.stop_gradient(batch.model_targets.latent)) / deviation
-        transition_loss = jnp.mean(0.5 * jnp.square(error) + jnp.log(deviation))
+        transition_loss = mean_of_rows(0.5 * jnp.square(error) + jnp.log(deviation), batch.followed)
         reward = self.apply(params, "reward", mean + deviation * batch.model_targets.noise, features)[..., 0]
         reward_loss = jnp.mean(jnp.square(reward - batch.reward))
         metrics = {**metrics, "transition_loss": transition_loss, "reward_loss": reward_loss}
@@ -127,3 +128,10 @@ class DeepMDP(Encoded):
         """The losses of an exact reward, and of an exact latent state with the smallest standard deviation."""
         least = math.log(DEVIATIONS[0]) if self.transition == "probabilistic" else 0.0
         return self.model_coefficient * least
+
+
+def mean_of_rows(x: Array, mask: Array | None) -> Array:
+    """Return the mean of those rows of x (B, D) that a mask (B,) names, 0 if it names none; without a mask, of all."""
+    if mask is None:
+        return jnp.mean(x)
+    return jnp.sum(jnp.where(mask[:, None], x, 0.0)) / jnp.maximum(jnp.sum(mask) * x.shape[1], 1)
