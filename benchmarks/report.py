@@ -2,21 +2,25 @@
 
 import argparse
 import csv
+import datetime
+import importlib.metadata
 import json
 import os
 import platform
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
-import mujoco
 
 import mtjax
 from mtjax.names import InputError, NoRoomError
 from mtjax.training.log import append_rows
+
+_LIBRARIES = ("jax", "jaxlib", "flax", "optax", "numpy", "mujoco", "mujoco-mjx", "warp-lang", "brax", "playground")
+_FLAGS = ("XLA_FLAGS", "CUDA_VISIBLE_DEVICES", "JAX_PLATFORMS", "JAX_DEFAULT_MATMUL_PRECISION", "NVIDIA_TF32_OVERRIDE")
 
 
 def run_main(main: Callable[[], None]) -> None:
@@ -33,19 +37,54 @@ def run_main(main: Callable[[], None]) -> None:
 
 
 def machine() -> dict[str, Any]:
-    """Return the machine, the versions and the commit of the figures."""
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=os.path.dirname(__file__) or "."
-    )
+    """Return the machine, the versions, the commit and the date of figures.
+
+    ``MTJAX_COMMIT`` names the commit where a copy without its history runs. "+" marks changes beyond the commit.
+    """
+    devices = jax.devices()
     return {
-        "device": jax.devices()[0].device_kind,
+        "device": devices[0].device_kind,
+        "devices": len(devices),
         "cores": os.cpu_count(),
+        "system": platform.platform(),
         "python": platform.python_version(),
-        "jax": jax.__version__,
-        "mujoco": mujoco.__version__,
+        **{name.replace("-", "_"): version(name) for name in _LIBRARIES},
         "mtjax": mtjax.__version__,
-        "commit": commit.stdout.strip() or None,
+        "commit": os.environ.get("MTJAX_COMMIT") or commit(),
+        "date": datetime.date.today().isoformat(),
+        "flags": {name: os.environ[name] for name in _FLAGS if name in os.environ},
     }
+
+
+def version(library: str) -> str | None:
+    """Return the version of a library, or None if it is not installed."""
+    try:
+        return importlib.metadata.version(library)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def commit() -> str | None:
+    """Return the commit of this copy, with "+" if tracked files differ from it; None without a history."""
+    git = lambda *words: subprocess.run(["git", *words], capture_output=True, text=True, cwd=Path(__file__).parent)
+    head = git("rev-parse", "--short", "HEAD").stdout.strip()
+    return head + "+" * bool(git("status", "--porcelain", "--untracked-files=no").stdout.strip()) if head else None
+
+
+def record(arguments: argparse.Namespace, figures: Mapping[str, Any]) -> dict[str, Any]:
+    """Return figures with what made them: the benchmark, its settings, the machine, the versions and the commit."""
+    settings = {name: value for name, value in vars(arguments).items() if name not in ("json", "plots")}
+    made = {"benchmark": os.path.basename(sys.argv[0]), "machine": machine(), "settings": settings}
+    return {**made, **figures}
+
+
+def note_origin(arguments: argparse.Namespace, out: Path) -> None:
+    """Write what makes the figures in a folder to ``OUT/origin.json``: a line for each call that differs in it."""
+    out.mkdir(parents=True, exist_ok=True)
+    file, made = out / "origin.json", json.dumps(record(arguments, {}), default=str)
+    known = file.read_text().splitlines() if file.exists() else []
+    if made not in known:
+        file.write_text("\n".join([*known, made]) + "\n")
 
 
 def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -69,8 +108,7 @@ def write_lines(path: Path, rows: Sequence[dict[str, Any]]) -> None:
 
 def publish(arguments: argparse.Namespace, rows: list[dict]) -> None:
     """Print the figures as JSON, and write them to ``--json`` if that was given."""
-    settings = {name: value for name, value in vars(arguments).items() if name not in ("json", "plots")}
-    report = {"benchmark": os.path.basename(sys.argv[0]), "machine": machine(), "settings": settings, "rows": rows}
+    report = record(arguments, {"rows": rows})
     print(json.dumps(report, default=str))
     if arguments.json:
         with open(arguments.json, "x") as file:

@@ -1,0 +1,111 @@
+"""Benchmarks that compare in parts: which parts run, and what tables make of their results."""
+
+import argparse
+import importlib
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).parent.parent / "benchmarks"
+_SCRIPT = """
+import sys, pathlib, time, os
+sys.path.insert(0, {folder!r})
+import parts
+name, out = sys.argv[1:]
+if name == "fails":
+    raise SystemExit("no")
+if name == "lasts":
+    time.sleep(60)
+parts.write_result(pathlib.Path(out) / (name + ".json"), {{"name": name, "device": os.environ["CUDA_VISIBLE_DEVICES"]}})
+"""
+
+
+@pytest.fixture
+def module(monkeypatch):
+    """A benchmark's module, by name."""
+    monkeypatch.syspath_prepend(str(FOLDER))
+    before = set(sys.modules)
+    yield importlib.import_module
+    for name in set(sys.modules) - before:
+        if getattr(sys.modules[name], "__file__", None) and str(FOLDER) in str(sys.modules[name].__file__):
+            sys.modules.pop(name)
+
+
+def flags(**given):
+    return argparse.Namespace(**{"seconds": 30.0, "within": float("inf"), "devices": ["0", "1"], **given})
+
+
+def test_parts_without_a_result_run_and_others_do_not(module, tmp_path, capfd):
+    """One that fails keeps no other from running, and is left."""
+    parts, script = module("parts"), tmp_path / "script.py"
+    script.write_text(_SCRIPT.format(folder=str(FOLDER)))
+    out = tmp_path / "out"
+    of_all = [parts.Part(name, [name, str(out)]) for name in ("fails", "a", "b", "c")]
+    parts.write_result(out / "a.json", {"name": "a", "device": "old"})
+    assert parts.run_parts(str(script), of_all, out, flags()) == ["fails"]
+    found = {x["name"]: x["device"] for x in parts.read_results(out)}
+    assert found["a"] == "old" and set(found) == {"a", "b", "c"} and {found["b"], found["c"]} <= {"0", "1"}
+    assert "no" in (out / "fails.log").read_text() and "fails: no result" in capfd.readouterr().out
+
+
+def test_a_part_is_stopped_when_the_time_is_over(module, tmp_path):
+    """And those after it are not begun."""
+    parts, script = module("parts"), tmp_path / "script.py"
+    script.write_text(_SCRIPT.format(folder=str(FOLDER)))
+    of_all = [parts.Part(name, [name, str(tmp_path)]) for name in ("lasts", "a")]
+    assert parts.run_parts(str(script), of_all, tmp_path, flags(within=0.5, devices=["0"])) == ["lasts", "a"]
+
+
+def peer_result(side, seed, times, returns, cold, compiling=30.0):
+    """Times of training at which a side has returns, each after another million of steps."""
+    curve = [
+        {"steps": k * 1_000_000, "process": compiling + t, "training": t, "mean": x}
+        for k, (t, x) in enumerate(zip(times, returns, strict=True))
+    ]
+    choices = {"gradient_steps_per_million": 500.0, "substeps": 2, "worlds": 1, "passes": 4, "engine": "c"}
+    choices |= dict.fromkeys(("samples_per_gradient_step", "substep_seconds", "imported_after"), 1)
+    return {
+        **{"env": "CheetahRun", "side": side, "seed": seed, "cold": cold, "curve": curve, "choices": choices},
+        "machine": {"device": "card"},
+    }
+
+
+def test_seconds_to_a_return_are_of_the_first_evaluation_that_has_it(module, tmp_path):
+    """In training over all seeds, from the start of the process over cold ones."""
+    peer, parts = module("ppo_peer"), module("parts")
+    for result in (
+        peer_result("mtjax", 0, [0, 1, 2, 3], [10, 400, 600, 500], cold=True),
+        peer_result("mtjax", 1, [0, 2, 4, 6], [10, 500, 600, 800], cold=False, compiling=5.0),
+        peer_result("playground-jax", 0, [0, 7, 14, 21], [10, 20, 30, 501], cold=True),
+    ):
+        parts.write_result(tmp_path / "CheetahRun" / f"{result['side']}-{result['seed']}.json", result)
+    lines = peer.tabulate(tmp_path, [500]).splitlines()
+    ours, theirs = ([cell.strip() for cell in line.split("|")[1:-1]] for line in lines[2:4])
+    # task, side, seeds, card, best, cold start, then training and cold to 500 and to 630, then four rates
+    assert ours[4:10] == ["700", "30.0", "2.0 [2.0, 2.0]", "32.0", "-", "-"]
+    assert theirs[4:10] == ["501", "30.0", "21.0", "51.0", "-", "-"]
+    assert ours[10:] == ["750,000", "1,500,000", "375", "500"]
+    assert "CheetahRun 630" in lines[-2]
+
+
+def test_the_first_interval_counts_as_the_median_of_the_others(module):
+    """As it compiles, which is no training."""
+    peer = module("ppo_peer")
+    points = [peer.Reached(k, seconds, None, 0.0) for k, seconds in enumerate((50.0, 150.0, 157.0, 164.0))]
+    assert [x.training for x in peer.without_compiling(points)] == [0.0, 7.0, 14.0, 21.0]
+    assert peer.without_compiling(points[:2]) == points[:2]
+
+
+def test_figures_have_their_origin(module, tmp_path, monkeypatch):
+    """Settings, versions, commit and date; a folder keeps those of every call that differs."""
+    monkeypatch.setenv("MTJAX_COMMIT", "abc")
+    report = module("report")
+    made = report.record(argparse.Namespace(steps=3, json="x"), {"rows": []})
+    assert made["settings"] == {"steps": 3} and made["machine"]["commit"] == "abc" and made["rows"] == []
+    assert {"jax", "mujoco", "device", "devices", "date"} <= set(made["machine"])
+    for steps in (3, 3, 4):
+        report.note_origin(argparse.Namespace(steps=steps), tmp_path)
+    lines = [json.loads(line) for line in (tmp_path / "origin.json").read_text().splitlines()]
+    assert [line["settings"]["steps"] for line in lines] == [3, 4]
