@@ -1,16 +1,24 @@
 """Measure how well and how fast agents learn: every agent on every family, many seeds in one program each.
 
     python benchmarks/learning.py [--envs NAME ...] [--agents NAME ...] [--seeds 10] [--steps N] [--split NAME]
-                                  [--env NAME=VALUE ...] [--baseline NAME] [--unfinished] [--out DIR]
+                                  [--env NAME=VALUE ...] [--baseline NAME] [--best] [--unfinished] [--devices 0 1 ...]
+                                  [--out DIR]
 
-Without further flags it is the whole table: every agent on six families with its preset, on the splits and for the
-steps of ``FAMILIES``; agents whose subject is pictures are left out. Every pair of family and agent writes
+Without further flags it is the whole table: every agent on six families, on the splits and for the steps of
+``FAMILIES``; agents whose subject is pictures are left out. Agents with a replay all have the worlds, updates a step,
+batch, replay and warm-up of the baseline's preset, and other settings of their own. ``--best`` gives each its own
+preset in all; then agents may differ in updates and experience. PPO has its own preset and its own number of steps.
+``care-text`` is ``care`` as published: it reads a sentence that says what the task asks for.
+
+Every pair of family and agent writes
 ``DIR/ENV/AGENT.csv`` (training returns over steps and seconds, one line per chunk and seed) and ``AGENT.npz`` (every
 episode of every evaluation), and the policy of its first seed, ``DIR/policies/ENV/AGENT``, which ``mtjax.load`` and
 ``docs/make_films.py`` take. Finished pairs are not run again, so several processes can make a long table in parts. If
 the command is given again with the same DIR, a pair that was stopped goes on where it was, and one that was killed goes
 on from its last evaluation. Until a pair is finished its run is in ``DIR/ENV/AGENT``. Its checkpoints need room for
-three training states: 0.1 GB for PPO, and 1 to 6 GB for agents with a replay (gpu presets, ten seeds).
+three training states: 0.1 GB for PPO, and 1 to 6 GB for agents with a replay (gpu presets, ten seeds). With
+``--devices`` every pair is a process of its own, on one of these GPUs; ``--within`` ends the call after some seconds.
+``AGENT.json`` has the settings of agent and loop, and ``origin.json`` machine, versions and commit of every call.
 
 All results in DIR together give ``table.md``, ``differences.md``, ``conflicts.md`` (cosines between the tasks'
 gradients, of the agents that log them), ``evaluations.csv`` and a figure for each family. ``--agents`` without a name
@@ -19,33 +27,41 @@ last evaluation, marked with its steps.
 
 Scores are interquartile means over seeds and tasks of the last evaluation (never the best one) under the mean action,
 with 95% bootstrap intervals over whole seeds. "s to 900" is the seconds of training, without compiling and evaluating,
-after which the training policy's mean return over tasks and seeds first reached 900. Differences are those of
-scores against the baseline's, with the seeds of both in pairs and without; beside them is the probability that a seed
-of the agent earns more than one of the baseline on a task drawn at random (Agarwal et al. 2021).
+after which the training policy's mean return over tasks and seeds first reached 900. Differences are those of scores
+from the baseline's, with intervals over pairs of seeds with the same number, and over the seeds of each apart. Their p
+is that of a t-test of these pairs, each seed's mean over tasks, by Holm's method for all differences of the table.
+Beside them is the probability that a seed of the agent earns more than one of the baseline on a task drawn at random
+(Agarwal et al. 2021).
 """
 
 import argparse
+import dataclasses
 import itertools
 import json
 import shutil
+import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from report import markdown, read_lines, run_main, write_lines
+from parts import Part, add_flags, is_part, require_all, run_parts, write_result
+from report import markdown, note_origin, read_lines, record, run_main, write_lines
 from resumable import train
 from returns import value
 
 import mtjax
+from mtjax.config import RunConfig, configure
 from mtjax.evaluation import Evaluations, load_evaluations, save_evaluations
 from mtjax.experience.replay import Replay
 from mtjax.report import figures as plot
 from mtjax.report.stats import (
     Interval,
+    holm,
     iqm,
     paired_difference,
+    paired_p_value,
     probability_of_improvement,
     seed_interval,
     unpaired_difference,
@@ -74,16 +90,19 @@ class Trial(NamedTuple):
     rollout_steps: int | None = None
 
 
-# Ten seeds of plain conditioning then train for half a minute on an H200; on walker-run for longer. On-policy steps
-# cost less, so there are more. Most agents then make 12,000 to 31,000 updates.
+# Ten seeds of plain conditioning then train for half a minute on an H200; on walker-run for longer, and on the finger
+# for some four minutes, as there curves climb until then. On-policy steps cost less, so there are more.
 FAMILIES = {
-    "finger-spin-vary-size": Trial("hip-bmdp", 2_560_000, 20_000_000),
+    "finger-spin-vary-size": Trial("hip-bmdp", 20_480_000, 20_000_000),
     "cheetah-run-vary-torso-length": Trial("hip-bmdp", 1_000_000, 20_000_000),
     "walker-run-vary-friction": Trial("hip-bmdp", 1_000_000, 5_000_000),
     "cartpole-swingup-vary-pole-mass": Trial("hip-bmdp", 1_000_000, 20_000_000),
     "cheetah-vary-direction": Trial(None, 500_000, 10_000_000),
     "reacher-vary-goal": Trial(None, 1_000_000, 20_000_000),
 }
+VARIANTS = {"care-text": ("care", {"conditioning": "text"})}  # name -> the agent, and its settings
+_SHARED = ("num_envs", "chunk_steps", "updates_per_step", "batch_size", "replay_size", "warmup_steps")
+_MOST_LINES = 7  # of a figure
 UNFINISHED = "show the last evaluation of unfinished pairs too, marked with its steps"
 _FROM_PICTURES = ("drq", "sac-ae")  # from vectors they are plain conditioning
 _KEPT = ("seed", "steps", "seconds", "wall_seconds", "return")
@@ -94,7 +113,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--envs", nargs="*", default=list(FAMILIES), metavar="NAME")
     agents = [name for name in mtjax.AGENTS if name not in _FROM_PICTURES]
-    parser.add_argument("--agents", nargs="*", default=agents, choices=list(mtjax.AGENTS), metavar="NAME")
+    parser.add_argument("--agents", nargs="*", default=agents, choices=[*mtjax.AGENTS, *VARIANTS], metavar="NAME")
+    parser.add_argument("--best", action="store_true", help="every agent with its own preset")
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", type=int, help="by default those of FAMILIES, else the preset's")
@@ -109,19 +129,46 @@ def main() -> None:
     parser.add_argument("--baseline", default="sac-conditioned", metavar="NAME", help="what differences are against")
     parser.add_argument("--unfinished", action="store_true", help=UNFINISHED)
     parser.add_argument("--out", type=Path, default=Path("runs") / f"learning-{time.strftime('%Y%m%d-%H%M%S')}")
+    add_flags(parser)
     arguments = parser.parse_args()
-    enable_compile_cache()
-    for env in arguments.envs:
-        for agent in arguments.agents:
-            learn(arguments, env, agent)
-    tabulate(arguments.out, arguments.mark, arguments.baseline, arguments.unfinished)
+    arguments.equal_to = "" if arguments.best else arguments.baseline
+    named = [(env, agent) for env in arguments.envs for agent in arguments.agents]
+    left = learn_all(arguments, __file__, named, lambda _: arguments)
+    if not is_part():
+        tabulate(arguments.out, arguments.mark, arguments.baseline, arguments.unfinished)
+    require_all(left)
+
+
+def learn_all(
+    arguments: argparse.Namespace,
+    script: str,
+    named: Sequence[tuple[str, str]],
+    request: Callable[[str], argparse.Namespace],
+) -> list[str]:
+    """Write the results of pairs of family and agent, here or each in a process of its own, and return what is left.
+
+    Args:
+        request: the arguments of ``learn`` for a family.
+    """
+    if arguments.devices == [""]:
+        enable_compile_cache()
+        for env, agent in named:
+            learn(request(env), env, agent)
+        return []
+    words = [*sys.argv[1:], "--devices", "", "--out", str(arguments.out)]  # the folder may be named after the clock
+    of_all = [Part(f"{env}/{agent}", [*words, "--envs", env, "--agents", agent], ending=".npz") for env, agent in named]
+    return run_parts(script, of_all, arguments.out, arguments)
 
 
 def learn(arguments: argparse.Namespace, env: str, agent: str) -> None:
     """Write the results of one agent on one family, unless they are there already. Then remove its run."""
     folder = arguments.out / env / agent
     if not (arguments.out / env / f"{agent}.npz").exists():
-        save(arguments.out / env, agent, trained(arguments, env, agent, folder))
+        note_origin(arguments, arguments.out)
+        result = trained(arguments, env, agent, folder)
+        (arguments.out / env).mkdir(parents=True, exist_ok=True)
+        write_result(arguments.out / env / f"{agent}.json", record(arguments, settings_used(result, folder)))
+        save(arguments.out / env, agent, result)
     if (folder / "config.json").exists():
         keep_policy(folder, arguments.out / "policies" / env / agent)
     shutil.rmtree(folder, ignore_errors=True)
@@ -134,11 +181,9 @@ def keep_policy(run: Path, place: Path) -> None:
 
 
 def trained(arguments: argparse.Namespace, env: str, agent: str, folder: Path) -> Result:
-    """Train one agent on one family with its preset, or go on with the run that was stopped in the folder."""
+    """Train one agent on one family, or go on with the run that was stopped in the folder."""
+    program = program_of(arguments, env, agent)
     trial = FAMILIES.get(env, Trial())
-    split = arguments.split or trial.split
-    settings = family_settings(arguments.env, arguments.vary, split)
-    program = mtjax.preset(env, agent, arguments.preset, seeing(agent, settings), **settings)
     given = trial.replay_steps if isinstance(program.learner.experience, Replay) else trial.rollout_steps
     steps = arguments.steps or given or program.plan.steps
     training = {name: value(x) for name, x in (pair.split("=", 1) for pair in arguments.training)}
@@ -155,6 +200,26 @@ def trained(arguments: argparse.Namespace, env: str, agent: str, folder: Path) -
         **training,
         quiet=False,
     )
+
+
+def program_of(arguments: argparse.Namespace, env: str, agent: str) -> RunConfig:
+    """Return an agent's preset on a family, and for one with a replay the loop and replay of ``equal_to``, if given."""
+    settings = family_settings(arguments.env, arguments.vary, arguments.split or FAMILIES.get(env, Trial()).split)
+    name, own = VARIANTS.get(agent, (agent, {}))
+    program = mtjax.preset(env, name, arguments.preset, {**seeing(name, settings), **own}, **settings)
+    if not arguments.equal_to or not isinstance(program.learner.experience, Replay):
+        return program
+    other = mtjax.preset(env, arguments.equal_to, arguments.preset, family=program.family)
+    held = {**dataclasses.asdict(other.training), **dataclasses.asdict(other.learner.experience)}
+    learner, training = configure(program.learner, program.training, {name: held[name] for name in _SHARED})
+    return dataclasses.replace(program, learner=learner, training=training)
+
+
+def settings_used(result: Result, folder: Path) -> dict[str, Any]:
+    """Return the settings of a run's agent and loop, and its clocks."""
+    config = json.loads((folder / "config.json").read_text())
+    clocks = {"training_seconds": result.seconds, "compile_seconds": result.compile_seconds}
+    return {"config": config, **clocks, "wall_seconds": result.rows[-1]["wall_seconds"]}
 
 
 def family_settings(given: Sequence[str], vary: Sequence[str], split: str | None) -> dict[str, Any]:
@@ -197,14 +262,18 @@ def list_stopped(out: Path) -> str:
 
 
 def pairs(out: Path, unfinished: bool = False) -> list[Pair]:
-    """Return all finished pairs by family, in the order of agents; if asked, also others that were evaluated."""
+    """Return all finished pairs by family, the best agent first; if asked, also others that were evaluated."""
     found = [Pair(x.parent.name, x.stem, x.with_suffix(".csv"), load_evaluations(x)) for x in out.glob("*/*.npz")]
     for folder, agent in stopped(out) if unfinished else ():
         if (evaluated := folder / "evaluations.npz").exists():
             evaluations = load_evaluations(evaluated)
             found.append(Pair(folder.parent.name, agent, folder / "metrics.csv", evaluations, finished=False))
-    known = {name: place for place, name in enumerate(mtjax.AGENTS)}
-    return sorted(found, key=lambda pair: (pair.env, known.get(pair.agent.split(",")[0], len(known)), pair.agent))
+    return sorted(found, key=lambda pair: (pair.env, -train_score(pair.evaluations), pair.agent))
+
+
+def train_score(evaluations: Evaluations) -> float:
+    """Return the interquartile mean on training tasks of the last evaluation, by which tables are sorted."""
+    return float(iqm(last_scores(evaluations)["train"]))
 
 
 def curve_of(pair: Pair) -> np.ndarray:
@@ -230,13 +299,14 @@ def tabulate(out: Path, mark: float, baseline: str, unfinished: bool = False) ->
                 curves[label] = (known[:, 0, 1], known[:, :, -1].T[:, :, None, None])
             lines.append(row(env, agent, curve, evaluations, mark))
             rows += evaluation_rows(env, agent, evaluations)
-        differences += difference_rows(env, found, baseline)
-        if curves:
-            plot.compare(out / f"{env}.png", curves, f"return on training tasks of {env}")
+        differences += differences_of(env, found, baseline)
+        for path, few in figures(out / f"{env}.png", curves, baseline):
+            plot.compare(path, few, f"return on training tasks of {env}")
     table = markdown(head, lines) + list_stopped(out)
     (out / "table.md").write_text(table + "\n")
-    head = ["family", "agent", "split", f"IQM less {baseline}'s, seeds in pairs", "seeds not in pairs"]
-    (out / "differences.md").write_text(markdown([*head, "probability of improvement"], differences) + "\n")
+    head = ["family", "agent", "split", f"IQM less {baseline}'s, over pairs of seeds", "p by Holm", "holds"]
+    head += ["over the seeds of each", "probability of improvement"]
+    (out / "differences.md").write_text(markdown(head, difference_rows(differences)) + "\n")
     head = ["family", "agent", *(name.replace("_", " ") for name in _CONFLICTS)]
     (out / "conflicts.md").write_text(markdown(head, conflict_rows(out)) + "\n")
     write_lines(out / "evaluations.csv", rows)
@@ -256,15 +326,49 @@ def row(env: str, agent: str, curve: np.ndarray, evaluations, mark: float) -> li
     return [*cells, f"{seconds[-1]:.1f}", f"{wall[-1]:.0f}", f"{rate:,.0f}"]
 
 
-def difference_rows(env: str, found: dict[str, dict[str, np.ndarray]], baseline: str) -> list[list[str]]:
-    """Return each agent's differences from the baseline, one line per split. Pairs need equal numbers of seeds."""
-    lines = []
+def figures(path: Path, curves: dict[str, Any], baseline: str) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """Return files and their curves, with few lines each: the baseline's, and those of others in their order."""
+    others, common = [name for name in curves if name != baseline], {baseline} & set(curves)
+    size = _MOST_LINES - len(common)
+    for k in range(0, max(len(others), len(common)), size):
+        shown = {*others[k : k + size], *common}
+        numbered = path if k == 0 else path.with_stem(f"{path.stem}-{k // size + 1}")
+        yield numbered, {name: curve for name, curve in curves.items() if name in shown}
+
+
+class Difference(NamedTuple):
+    """Holds the difference of an agent's scores from the baseline's on a split."""
+
+    env: str
+    agent: str
+    split: str
+    paired: Interval | None  # None if the numbers of seeds differ
+    p: float  # of a paired t-test over seeds; nan without pairs
+    unpaired: Interval
+    improvement: Interval
+
+
+def differences_of(env: str, found: dict[str, dict[str, np.ndarray]], baseline: str) -> list[Difference]:
+    """Return each agent's differences from the baseline, one for each split."""
+    differences = []
     for agent, scores in found.items():
         for split in scores if agent != baseline and baseline in found else ():
             pair = scores[split], found[baseline][split]
-            paired = cell(paired_difference(*pair, iqm), "+.1f") if len(pair[0]) == len(pair[1]) else "-"
-            improvement = cell(probability_of_improvement(*pair), ".2f")
-            lines.append([env, agent, split, paired, cell(unpaired_difference(*pair, iqm), "+.1f"), improvement])
+            paired = paired_difference(*pair, iqm) if len(pair[0]) == len(pair[1]) else None
+            p = paired_p_value(*pair) if paired else np.nan
+            apart = unpaired_difference(*pair, iqm), probability_of_improvement(*pair)
+            differences.append(Difference(env, agent, split, paired, p, *apart))
+    return differences
+
+
+def difference_rows(differences: Sequence[Difference]) -> list[list[str]]:
+    """Return a table's lines of differences, with p by Holm's method for all of them."""
+    adjusted = holm(np.array([x.p for x in differences]))
+    lines = []
+    for x, p in zip(differences, adjusted, strict=True):
+        paired = cell(x.paired, "+.1f") if x.paired else "-"
+        tested = ["-", "-"] if np.isnan(p) else [f"{p:.4f}", "yes" if p < 0.05 else "no"]
+        lines.append([x.env, x.agent, x.split, paired, *tested, cell(x.unpaired, "+.1f"), cell(x.improvement, ".2f")])
     return lines
 
 

@@ -1,7 +1,8 @@
 """Parts of a benchmark, each in a process of its own: finished ones are skipped, and a device runs one at a time.
 
-A part is a command line that ends by writing ``OUT/NAME.json``. One that was stopped or failed has no such file, and is
-started again by the next call. This module imports no JAX, so that the process of a part alone holds the device.
+A part is a command line that ends by writing ``OUT/NAME.json``, or a file with another ending. One that was stopped or
+failed has no such file, and is started again by the next call. This module imports no JAX, so that the process of a
+part alone holds the device.
 """
 
 import argparse
@@ -22,16 +23,18 @@ _GRACE = 60.0  # seconds between asking a process to stop and ending it
 
 
 class Part(NamedTuple):
-    """Holds a part's name, which its result has too, and the words after ``python SCRIPT``."""
+    """Holds a part's name, the words after ``python SCRIPT``, and the ending of its result's file."""
 
     name: str
     words: Sequence[str]
     environment: Mapping[str, str] = {}
+    ending: str = ".json"
 
 
-def add_flags(parser: argparse.ArgumentParser, seconds: float) -> None:
+def add_flags(parser: argparse.ArgumentParser, seconds: float | None = None) -> None:
     """Add the flags of every benchmark that runs in parts."""
-    parser.add_argument("--seconds", type=float, default=seconds, help="after which a part ends by itself")
+    if seconds:
+        parser.add_argument("--seconds", type=float, default=seconds, help="after which a part ends by itself")
     parser.add_argument("--within", type=float, default=float("inf"), help="seconds after which no part is begun")
     parser.add_argument(
         "--devices",
@@ -54,7 +57,7 @@ def run_parts(script: str, parts: Sequence[Part], out: Path, arguments: argparse
         if not result_of(out, part).exists():
             waiting.put(part)
     end = time.monotonic() + arguments.within
-    play = lambda device: _play_all(script, waiting, out, device, end, arguments.seconds)
+    play = lambda device: _play_all(script, waiting, out, device, end, getattr(arguments, "seconds", float("inf")))
     threads = [threading.Thread(target=play, args=(device,)) for device in arguments.devices]
     for thread in threads:
         thread.start()
@@ -74,7 +77,7 @@ def _play_all(script: str, waiting: queue.SimpleQueue, out: Path, device: str, e
 
 
 def _play(script: str, part: Part, out: Path, device: str, end: float) -> None:
-    log = result_of(out, part).with_suffix(".log")
+    log = out / f"{part.name}.log"
     log.parent.mkdir(parents=True, exist_ok=True)
     chosen = {"CUDA_VISIBLE_DEVICES": device} if device else {}
     before = time.time()
@@ -97,13 +100,24 @@ def _wait(process: subprocess.Popen, end: float) -> None:
     process.wait()
 
 
+def require_all(left: list[str]) -> None:
+    """End the program if some parts have no result."""
+    if left:
+        raise SystemExit(f"{len(left)} parts are left, which the same command runs: {' '.join(left)}")
+
+
+def is_part() -> bool:
+    """Return whether this process was started as a part."""
+    return STARTED in os.environ
+
+
 def since_start() -> float:
     """Return the seconds since this process was started as a part."""
     return time.time() - float(os.environ[STARTED])
 
 
 def result_of(out: Path, part: Part) -> Path:
-    return out / f"{part.name}.json"
+    return out / f"{part.name}{part.ending}"
 
 
 def write_result(path: Path, result: Mapping[str, Any]) -> None:

@@ -88,8 +88,7 @@ def main() -> None:
         of_all = [part(env, side, seed, Path(caches)) for env, side, seed in every]
         left = parts.run_parts(__file__, of_all, arguments.out, arguments)
     print(tabulate(arguments.out, arguments.marks))
-    if left:
-        raise SystemExit(f"{len(left)} parts are left, which the same command runs: {' '.join(left)}")
+    parts.require_all(left)
 
 
 def part(env: str, side: str, seed: int, caches: Path) -> parts.Part:

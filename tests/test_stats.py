@@ -5,8 +5,10 @@ import pytest
 
 from mtjax.report.stats import (
     Bootstrap,
+    holm,
     iqm,
     paired_difference,
+    paired_p_value,
     probability_of_improvement,
     seed_interval,
     unpaired_difference,
@@ -165,3 +167,24 @@ def test_fast_enough_to_call_for_every_evaluation():
     began = time.perf_counter()
     seed_interval(random_scores(10))
     assert time.perf_counter() - began < 0.5  # 0.005 s on an idle core
+
+
+def test_p_is_that_of_a_paired_t_test_over_seeds():
+    """Of each seed's mean; SciPy's own gives the same. Two tasks of a seed are no two samples."""
+    from scipy.stats import ttest_rel
+
+    a, b = random_scores(6), random_scores(6, seed=8) + 3
+    expected = ttest_rel(a.mean(axis=1), b.mean(axis=1)).pvalue
+    assert paired_p_value(a, b) == pytest.approx(expected, rel=1e-10)
+    assert paired_p_value(np.repeat(a, 2, axis=1), np.repeat(b, 2, axis=1)) == pytest.approx(expected, rel=1e-10)
+    assert paired_p_value(a, a) == 1.0 and paired_p_value(a, a + 1) < 1e-12
+    assert np.isnan(paired_p_value(a[:1], b[:1]))
+    with pytest.raises(ValueError, match="as many seeds"):
+        paired_p_value(a, b[:3])
+
+
+def test_holm_multiplies_the_smallest_by_their_number():
+    """The next by one less, and none is below one before it (Holm 1979)."""
+    assert holm(np.array([0.01, 0.04, 0.03, 0.005])) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert holm(np.array([0.4, np.nan, 0.3])) == pytest.approx([0.6, np.nan, 0.6], nan_ok=True)
+    assert holm(np.array([])).shape == (0,)

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import stdtr
 
 Statistic = Callable[..., np.ndarray]  # takes an array and ``axis``, as ``iqm`` and ``np.mean`` do
 
@@ -85,6 +86,40 @@ def unpaired_difference(
     return _difference(a, b, statistic, of_a, of_b, bootstrap)
 
 
+def paired_p_value(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the two-sided p of a t-test over pairs of seeds of ``a`` and ``b``, both (S, ...).
+
+    A seed's score is its mean. Row ``s`` of both is the same seed. Scores without any spread differ surely, or not at
+    all. Fewer than two seeds have none, which is nan.
+
+    Raises:
+        ValueError: the numbers of seeds differ.
+    """
+    if len(a) != len(b):
+        raise ValueError(f"pairs need as many seeds of one as of the other, not {len(a)} and {len(b)}")
+    gaps = _of_seeds(a) - _of_seeds(b)
+    if len(gaps) < 2:
+        return np.nan
+    spread = np.std(gaps, ddof=1) / np.sqrt(len(gaps))
+    if spread == 0:
+        return float(np.mean(gaps) == 0)
+    return float(2 * stdtr(len(gaps) - 1, -abs(np.mean(gaps)) / spread))
+
+
+def holm(p_values: np.ndarray) -> np.ndarray:
+    """Return p-values (N,) adjusted for their number by Holm's step-down method (1979).
+
+    Those that are nan stay so and do not count. If no two samples differ, the chance that any adjusted p is below 0.05
+    is at most 5 %.
+    """
+    known = np.flatnonzero(np.isfinite(p_values))
+    order = known[np.argsort(np.asarray(p_values)[known], kind="stable")]
+    factors = np.arange(len(order), 0, -1)
+    adjusted = np.full(len(p_values), np.nan)
+    adjusted[order] = np.minimum(np.maximum.accumulate(np.asarray(p_values)[order] * factors), 1.0)
+    return adjusted
+
+
 def probability_of_improvement(a: np.ndarray, b: np.ndarray, bootstrap: Bootstrap = DEFAULT) -> Interval:
     """Return the probability that a new seed of ``a`` scores higher than one of ``b`` on a random task.
 
@@ -110,6 +145,11 @@ def _draw(bootstrap: Bootstrap, *samples: np.ndarray) -> list[np.ndarray]:
     """Draw the seeds of every resample, with replacement: (resamples, S) for each of the samples (S, ...)."""
     random = np.random.default_rng(bootstrap.seed)
     return [random.integers(len(sample), size=(bootstrap.resamples, len(sample))) for sample in samples]
+
+
+def _of_seeds(scores: np.ndarray) -> np.ndarray:
+    """Return the mean score of every seed (S,)."""
+    return np.mean(np.asarray(scores, np.float64).reshape(len(scores), -1), axis=1)
 
 
 def _of_all(statistic: Statistic, scores: np.ndarray) -> float:
