@@ -1,8 +1,8 @@
 """Run a suite of tasks by its name, with its protocol: agents, seeds, steps, and the figures that the field reports.
 
     python benchmarks/suite.py mt10|mt50|dynamics|goals|domains|hard|pixels|looks [--agents NAME ...] [--seeds N]
-                               [--steps-per-task N] [--training NAME=VALUE ...] [--env NAME=VALUE ...] [--unfinished]
-                               [--out DIR]
+                               [--steps-per-task N] [--training NAME=VALUE ...] [--env NAME=VALUE ...] [--best]
+                               [--unfinished] [--devices 0 1 ...] [--within N] [--out DIR]
 
 ``--list`` prints the protocols. Every pair of environment and agent writes ``DIR/ENV/AGENT.csv`` (training over steps
 and seconds) and ``AGENT.npz`` (every episode of every evaluation: returns and, where tasks have it, success), and the
@@ -14,9 +14,14 @@ evaluation) and, for suites that compare one agent for all tasks with one for ea
 after as many steps a task. ``scores.md`` names unfinished pairs. ``--unfinished`` adds their last evaluation, marked
 with its steps, to it and to ``tasks.csv``, and their evaluations to ``sharing.md``.
 
+Where a suite compares agents, those with a replay all have the worlds, updates a step, batch, replay and warm-up of the
+preset of the agent that its protocol names; ``--best`` gives each its own preset in all. PPO always has its own. With
+``--devices`` every pair is a process of its own, on one of these GPUs; ``--within`` ends the call after some seconds.
+
 Success is that of the last evaluation: at the episode's last step, and at any step. Both are shares of episodes.
-``care`` is told its task as all agents are, in Meta-World by its number. As published it reads what the task asks for:
-``--agents care --training conditioning=text text=MODEL``, for a model of sentence-transformers.
+``care`` knows its task as other agents do, in Meta-World by its number. As published it reads a sentence that says what
+the task asks for: ``care-text``, by default with hashed words, and with ``--training text=MODEL`` by a model of
+sentence-transformers.
 """
 
 import argparse
@@ -28,12 +33,12 @@ from typing import NamedTuple
 
 import learning
 import numpy as np
+from parts import add_flags, is_part, require_all
 from report import markdown, run_main, write_lines
 
 import mtjax
 from mtjax.evaluation import Evaluations
 from mtjax.report.stats import seed_interval, unpaired_difference
-from mtjax.training.programs import enable_compile_cache
 from mtjax.types import SPLITS, Env
 
 _HARD = ("dog-stand", "dog-walk", "dog-trot", "dog-run", "humanoid-stand", "humanoid-walk", "humanoid-run")
@@ -49,6 +54,9 @@ _GOALS = (
     *("cheetah-run-vary-speed", "cheetah-vary-direction", "finger-turn-vary-target"),
     *("point-mass-vary-goal", "reacher-vary-goal", "walker-vary-speed"),
 )
+_OF_META_WORLD = (
+    *("sac-conditioned", "multi-head", "care-text", "pcgrad", "soft-modularization", "moore", "ppo", "brc", "care"),
+)
 _SEEN = ("pixels=64", "frames=3", "repeat=2")
 
 
@@ -61,6 +69,7 @@ class Suite:
     agents: tuple[str, ...]
     steps_per_task: int
     seeds: int = 10
+    equal_to: str = ""  # the agent whose worlds, updates, batch and replay all others with a replay have
     split: str | None = None
     together: str = ""  # the environment of all tasks, where others are its tasks alone
     settings: tuple[str, ...] = ()  # of the environments
@@ -70,26 +79,28 @@ class Suite:
 SUITES = {
     "mt10": Suite(
         "Meta-World's ten tasks, 50 goals each, second rewards, 500 steps an episode (Yu et al. 2019; Sodhani et al. "
-        "2021): success of one agent for all after 2M steps a task",
+        "2021): success of one agent for all after 1.02M steps a task",
         ("mt10",),
-        ("sac-conditioned", "multi-head", "pcgrad", "care", "brc"),
-        2_000_000,
+        _OF_META_WORLD,
+        1_024_000,
+        3,
+        equal_to="brc",
     ),
-    "mt50": Suite(
-        "Meta-World's fifty tasks, as mt10", ("mt50",), ("sac-conditioned", "multi-head", "care", "brc"), 1_000_000, 3
-    ),
+    "mt50": Suite("Meta-World's fifty tasks, as mt10", ("mt50",), _OF_META_WORLD, 1_024_000, 3, equal_to="brc"),
     "dynamics": Suite(
         "families whose bodies differ, on HiP-BMDP's split (Zhang et al. 2021): four tasks train, six are unseen",
         _DYNAMICS,
         ("sac", "sac-conditioned", "multi-head", "care", "pcgrad", "deepmdp", "hip-bmdp", "brc"),
         500_000,
+        equal_to="sac-conditioned",
         split="hip-bmdp",
     ),
     "goals": Suite(
-        "families whose goals differ: told, not told, and with heads or surgery",
+        "families whose goals differ: agents that see the goal, that do not, and with heads or surgery",
         _GOALS,
         ("sac", "sac-conditioned", "multi-head", "care", "pcgrad", "brc"),
         200_000,
+        equal_to="sac-conditioned",
     ),
     "domains": Suite(
         "ten of dm_control's domains in one mixture, padded to one size",
@@ -97,6 +108,7 @@ SUITES = {
         ("sac-conditioned", "multi-head", "care", "pcgrad", "brc"),
         500_000,
         5,
+        equal_to="sac-conditioned",
     ),
     "hard": Suite(
         "seven tasks of dog and humanoid: one agent for all against one for each, 1M steps a task (as BRC, Nauman et "
@@ -138,6 +150,9 @@ class Last(NamedTuple):
     success: np.ndarray | None  # (S, T) at the last step of episodes
     ever: np.ndarray | None  # (S, T) at any step
     splits: dict[str, np.ndarray]  # (S, T) returns by split, without empty ones
+    steps: float  # of each task
+    seconds: str  # of training, and by the clock; "-" without metrics
+    wall: str
 
 
 def main() -> None:
@@ -150,24 +165,28 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps-per-task", type=int, help="by default the suite's")
     parser.add_argument("--preset", default="auto")
+    parser.add_argument("--best", action="store_true", help="every agent with its own preset")
     parser.add_argument("--training", nargs="*", default=[], metavar="NAME=VALUE", help="of the loop or all agents")
     parser.add_argument("--env", nargs="*", default=[], metavar="NAME=VALUE", help="settings of families: pixels=64")
     parser.add_argument("--evaluations", type=int, default=4)
     parser.add_argument("--eval-episodes", type=int, default=50, help="of each task; Meta-World's tasks have 50 goals")
     parser.add_argument("--unfinished", action="store_true", help=learning.UNFINISHED)
     parser.add_argument("--out", type=Path)
+    add_flags(parser)
     arguments = parser.parse_args()
     if arguments.list or not arguments.suite:
         print("\n".join(map(describe, SUITES)))
         return
-    enable_compile_cache()
     suite = SUITES[arguments.suite]
     suite = dataclasses.replace(suite, settings=(*suite.settings, *arguments.env))
-    out = arguments.out or Path("runs") / f"{arguments.suite}-{time.strftime('%Y%m%d-%H%M%S')}"
-    for env in arguments.envs or suite.envs:
-        for agent in suite.agents if arguments.agents is None else arguments.agents:
-            learning.learn(request(arguments, suite, env, out), env, agent)
-    print(tabulate(out, suite, arguments.unfinished))
+    arguments.out = arguments.out or Path("runs") / f"{arguments.suite}-{time.strftime('%Y%m%d-%H%M%S')}"
+    arguments.equal_to = "" if arguments.best else suite.equal_to
+    agents = suite.agents if arguments.agents is None else arguments.agents
+    named = [(env, agent) for env in arguments.envs or suite.envs for agent in agents]
+    left = learning.learn_all(arguments, __file__, named, lambda env: request(arguments, suite, env, arguments.out))
+    if not is_part():
+        print(tabulate(arguments.out, suite, arguments.unfinished))
+    require_all(left)
 
 
 def describe(name: str) -> str:
@@ -189,18 +208,22 @@ def family_of(suite: Suite, env: str) -> Env:
     return mtjax.make(env, **learning.family_settings(suite.settings, suite.vary, suite.split))
 
 
-def last_of(suite: Suite, env: str, evaluations: Evaluations) -> Last:
+def last_of(suite: Suite, pair: learning.Pair) -> Last:
     """Return the last evaluation, averaged over episodes."""
-    labels, metrics = family_of(suite, env).labels("train"), evaluations.metrics
+    labels, evaluations = family_of(suite, pair.env).labels("train"), pair.evaluations
+    metrics, clocks = evaluations.metrics, ("-", "-")
+    if pair.metrics.exists() and len(curve := learning.curve_of(pair)):
+        clocks = (f"{x:.0f}" for x in curve[-1, :, 2:4].mean(axis=0))
     of = lambda name: np.asarray(metrics[name]["train"])[:, -1].mean(axis=-1) if name in metrics else None
     splits = learning.last_scores(evaluations)
-    return Last(labels, splits["train"], of("success"), of("success_ever"), splits)
+    made = steps_a_task(evaluations)[-1]
+    return Last(labels, splits["train"], of("success"), of("success_ever"), splits, made, *clocks)
 
 
 def found(out: Path, suite: Suite, unfinished: bool = False) -> Iterator[tuple[str, str, Last]]:
     """Return environment, agent and last evaluation of every finished pair; if asked, of others too."""
     for pair in learning.pairs(out, unfinished):
-        yield pair.env, pair.agent, last_of(suite, pair.env, pair.evaluations)
+        yield pair.env, pair.agent, last_of(suite, pair)
 
 
 def tabulate(out: Path, suite: Suite, unfinished: bool = False) -> str:
@@ -209,7 +232,7 @@ def tabulate(out: Path, suite: Suite, unfinished: bool = False) -> str:
     for env, agent, last in found(out, suite, unfinished):
         cells = [score(last.splits.get(split), ".0f") for split in SPLITS]
         cells += [score(x, ".3f") for x in (last.success, last.ever)]
-        lines.append([short(env), agent, str(len(last.returns)), *cells])
+        lines.append([short(env), agent, str(len(last.returns)), *cells, f"{last.steps:,.0f}", last.seconds, last.wall])
         rows += [
             {"env": env, "agent": agent, "task": label, "seed": s, "return": f"{last.returns[s, t]:.1f}"}
             | {name: x[s, t] for name, x in (("success", last.success), ("success_ever", last.ever)) if x is not None}
@@ -217,6 +240,7 @@ def tabulate(out: Path, suite: Suite, unfinished: bool = False) -> str:
             for t, label in enumerate(last.labels)
         ]
     head = ["environment", "agent", "seeds", "return", *SPLITS[1:], "success at the end", "success at any step"]
+    head += ["steps a task", "training s", "wall s"]
     table = markdown(head, lines) + learning.list_stopped(out)
     (out / "scores.md").write_text(table + "\n")
     write_lines(out / "tasks.csv", rows)

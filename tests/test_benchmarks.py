@@ -43,7 +43,7 @@ def script(monkeypatch):
         return module
 
     yield load
-    for name in ("report", "training", "returns", "update_cost", "resumable", "learning", *_OF_META_WORLD):
+    for name in ("report", "training", "returns", "update_cost", "resumable", "learning", "parts", *_OF_META_WORLD):
         sys.modules.pop(name, None)
 
 
@@ -234,14 +234,55 @@ def test_differences_are_against_the_baseline(script):
     """A line for every other agent and split, with no pairs where the numbers of seeds differ."""
     plain, better = np.array([[1.0], [2.0], [3.0]]), np.array([[11.0], [12.0], [13.0]])
     found = {"plain": {"train": plain}, "better": {"train": better}, "more": {"train": np.tile(better, (2, 1))}}
-    lines = script("learning").difference_rows("family", found, "plain")
+    learning = script("learning")
+    rows_of = lambda found, baseline="plain": learning.difference_rows(learning.differences_of("f", found, baseline))
+    lines = rows_of(found)
     pairs = "+10.0 [+10.0, +10.0]"
-    assert lines[0] == ["family", "better", "train", pairs, lines[0][4], "1.00 [1.00, 1.00]"]
-    assert lines[0][4].startswith("+10.0 [+8")
+    assert lines[0] == ["f", "better", "train", pairs, "0.0000", "yes", lines[0][6], "1.00 [1.00, 1.00]"]
+    assert lines[0][6].startswith("+10.0 [+8")
     few = {"plain": {"train": plain[:2]}, "better": {"train": better[:2]}}
-    assert script("learning").difference_rows("family", few, "plain")[0][3:] == ["+10.0", "+10.0", "1.00"]
-    assert lines[1][:4] == ["family", "more", "train", "-"] and len(lines) == 2
-    assert script("learning").difference_rows("family", found, "absent") == []
+    assert rows_of(few)[0][3:] == ["+10.0", "0.0000", "yes", "+10.0", "1.00"]
+    assert lines[1][:6] == ["f", "more", "train", "-", "-", "-"] and len(lines) == 2
+    assert rows_of(found, "absent") == []
+
+
+def test_differences_hold_by_all_of_their_table(script):
+    """A p of 0.02 alone is one of 0.04 beside another difference, and of 0.06 beside two."""
+    learning = script("learning")
+    none = learning.Interval(0.0, 0.0, 0.0)
+    of = lambda p: learning.Difference("f", "a", "train", none, p, none, none)
+    found = lambda *ps: [line[4:6] for line in learning.difference_rows([of(p) for p in ps])]
+    assert found(0.02) == [["0.0200", "yes"]]
+    assert found(0.02, 0.9) == [["0.0400", "yes"], ["0.9000", "no"]]
+    assert found(0.9, 0.02, 0.5)[1] == ["0.0600", "no"]
+
+
+def test_replay_agents_learn_from_as_much_as_the_baseline(script):
+    """The same worlds, updates and batches; all else, and what PPO does, is the preset's. Sentences are read."""
+    learning = script("learning")
+    given = {"env": [], "vary": [], "split": None, "preset": "gpu"}
+    of = lambda agent, equal_to: learning.program_of(
+        SimpleNamespace(**given, equal_to=equal_to), "finger-spin-vary-size", agent
+    )
+    loop = lambda x: (
+        x.training.num_envs,
+        *(getattr(x.learner.experience, name) for name in ("updates_per_step", "batch_size", "replay_size")),
+    )
+    assert loop(of("brc", "sac-conditioned")) == loop(of("sac-conditioned", "")) != loop(of("brc", ""))
+    assert of("brc", "sac-conditioned").learner.hidden == of("brc", "").learner.hidden
+    assert of("ppo", "sac-conditioned").training == of("ppo", "").training
+    assert of("care-text", "sac-conditioned").learner.conditioning == "text"
+    assert len(of("brc", "sac-conditioned").family.labels("train")) == 4  # HiP-BMDP's split
+
+
+def test_a_figure_has_few_lines_and_the_baselines_is_in_each(script):
+    figures = script("learning").figures
+    names = [f"agent-{k}" for k in range(10)]
+    found = list(figures(Path("x/env.png"), dict.fromkeys(["plain", *names]), "plain"))
+    assert [path.name for path, _ in found] == ["env.png", "env-2.png"]
+    assert list(found[0][1]) == ["plain", *names[:6]] and list(found[1][1]) == ["plain", *names[6:]]
+    assert [list(few) for _, few in figures(Path("env.png"), {"plain": 1}, "plain")] == [["plain"]]
+    assert list(figures(Path("env.png"), {}, "plain")) == []
 
 
 def test_a_grid_has_every_combination_and_lr_means_all_rates(script):
@@ -355,7 +396,7 @@ def test_sharing_is_compared_after_as_many_steps_a_task(script, tmp_path):
 def test_suites_name_only_what_there_is(script):
     suite = script("suite")
     for each in suite.SUITES.values():
-        assert set(each.agents) <= set(mtjax.AGENTS)
+        assert {*each.agents, each.equal_to or "brc"} <= {*mtjax.AGENTS, *script("learning").VARIANTS}
         names = {name for env in each.envs for name in env.split("+")}
         assert names <= {*mtjax.ENVS, *BENCHMARKS}
 
@@ -379,12 +420,18 @@ def test_a_suite_counts_the_tasks_that_its_flags_ask_for(script, tmp_path, monke
 
     def trained(folder, family, agent, **given):
         asked.append((given["steps"], family.train_count, given["tau"], given["conditioning"]))
-        return SimpleNamespace(rows=lines, evaluations=evaluations_of(np.arange(24.0).reshape(2, 1, 3, 4)))
+        folder.mkdir(parents=True)
+        (folder / "config.json").write_text("{}")
+        evaluations = evaluations_of(np.arange(24.0).reshape(2, 1, 3, 4))
+        return SimpleNamespace(rows=lines, evaluations=evaluations, seconds=1.0, compile_seconds=2.0)
 
     lines = [{"seed": 0, "steps": 300, "seconds": 1, "wall_seconds": 1, "return": 1.0}]
     monkeypatch.setattr(sys.modules["learning"], "train", trained)
+    monkeypatch.setattr(sys.modules["learning"], "keep_policy", lambda *_: None)
     suite.main()
     assert asked == [(300, 3, 0.1, "none")]
+    made = json.loads((tmp_path / "point-mass-vary-goal" / "sac.json").read_text())
+    assert made["machine"]["jax"] == jax.__version__ and made["settings"]["steps"] == 300
     assert len((tmp_path / "tasks.csv").read_text().splitlines()) == 1 + 2 * 3
 
 
