@@ -49,44 +49,68 @@ def run_parts(script: str, parts: Sequence[Part], out: Path, arguments: argparse
     """Run the parts that have no result yet, in their order, and return the names of those that wrote none.
 
     A process that is running when the time is over, or ``_GRACE`` after its own ``--seconds``, is asked to stop by
-    SIGTERM; what it has saved by then is its own matter.
+    SIGTERM, and so are all if this process is; what they have saved by then is their own matter.
     """
     out.mkdir(parents=True, exist_ok=True)
-    waiting: queue.SimpleQueue[Part] = queue.SimpleQueue()
+    runner = _Runner(script, out, time.monotonic() + arguments.within, getattr(arguments, "seconds", float("inf")))
     for part in parts:
         if not result_of(out, part).exists():
-            waiting.put(part)
-    end = time.monotonic() + arguments.within
-    play = lambda device: _play_all(script, waiting, out, device, end, getattr(arguments, "seconds", float("inf")))
-    threads = [threading.Thread(target=play, args=(device,)) for device in arguments.devices]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+            runner.waiting.put(part)
+    threads = [threading.Thread(target=runner.play_all, args=(device,)) for device in arguments.devices]
+    before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    try:
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    finally:
+        runner.stop()
+        signal.signal(signal.SIGTERM, before)
     return [part.name for part in parts if not result_of(out, part).exists()]
 
 
-def _play_all(script: str, waiting: queue.SimpleQueue, out: Path, device: str, end: float, seconds: float) -> None:
-    """Run waiting parts on one device until none is left or the time is over."""
-    while time.monotonic() < end:
-        try:
-            part = waiting.get_nowait()
-        except queue.Empty:
-            return
-        _play(script, part, out, device, min(end, time.monotonic() + seconds + _GRACE))
+class _Runner:
+    """Runs waiting parts, on each device one after another.
 
+    Args:
+        end: when, by the monotonic clock, the time is over.
+        seconds: after which a part should have ended by itself.
+    """
 
-def _play(script: str, part: Part, out: Path, device: str, end: float) -> None:
-    log = out / f"{part.name}.log"
-    log.parent.mkdir(parents=True, exist_ok=True)
-    chosen = {"CUDA_VISIBLE_DEVICES": device} if device else {}
-    before = time.time()
-    environment = {**os.environ, **chosen, **part.environment, STARTED: str(before)}
-    with log.open("w") as file:
-        process = subprocess.Popen([sys.executable, script, *part.words], env=environment, stdout=file, stderr=file)
-        _wait(process, end)
-    state = "done" if result_of(out, part).exists() else f"no result, see {log}"
-    print(f"{part.name}: {state} after {time.time() - before:.0f} s", flush=True)
+    def __init__(self, script: str, out: Path, end: float, seconds: float):
+        self.script, self.out, self.end, self.seconds = script, out, end, seconds
+        self.waiting: queue.SimpleQueue[Part] = queue.SimpleQueue()
+        self.running: set[subprocess.Popen] = set()
+
+    def stop(self) -> None:
+        """Begin no further part, and ask those that run to stop."""
+        self.end = 0.0
+        for process in list(self.running):
+            process.terminate()
+
+    def play_all(self, device: str) -> None:
+        """Run parts on one device until none is left or the time is over."""
+        while time.monotonic() < self.end:
+            try:
+                part = self.waiting.get_nowait()
+            except queue.Empty:
+                return
+            self.play(part, device)
+
+    def play(self, part: Part, device: str) -> None:
+        log, before = self.out / f"{part.name}.log", time.time()
+        log.parent.mkdir(parents=True, exist_ok=True)
+        chosen = {"CUDA_VISIBLE_DEVICES": device} if device else {}
+        environment = {**os.environ, **chosen, **part.environment, STARTED: str(before)}
+        end = min(self.end, time.monotonic() + self.seconds + _GRACE)
+        with log.open("w") as file:
+            words = [sys.executable, self.script, *part.words]
+            process = subprocess.Popen(words, env=environment, stdout=file, stderr=file)
+            self.running.add(process)
+            _wait(process, end)
+            self.running.discard(process)
+        state = "done" if result_of(self.out, part).exists() else f"no result, see {log}"
+        print(f"{part.name}: {state} after {time.time() - before:.0f} s", flush=True)
 
 
 def _wait(process: subprocess.Popen, end: float) -> None:

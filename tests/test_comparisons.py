@@ -3,7 +3,10 @@
 import argparse
 import importlib
 import json
+import signal
+import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -56,6 +59,23 @@ def test_a_part_is_stopped_when_the_time_is_over(module, tmp_path):
     script.write_text(_SCRIPT.format(folder=str(FOLDER)))
     of_all = [parts.Part(name, [name, str(tmp_path)]) for name in ("lasts", "a")]
     assert parts.run_parts(str(script), of_all, tmp_path, flags(within=0.5, devices=["0"])) == ["lasts", "a"]
+
+
+def test_parts_stop_with_the_program_that_started_them(module, tmp_path):
+    """On a signal, within a moment; nothing of them is left behind."""
+    script, driver = tmp_path / "script.py", tmp_path / "driver.py"
+    script.write_text(_SCRIPT.format(folder=str(FOLDER)))
+    driver.write_text(
+        f"import sys; sys.path.insert(0, {str(FOLDER)!r}); import argparse, pathlib, parts\n"
+        f"flags = argparse.Namespace(within=50.0, devices=['0'])\n"
+        f"of_all = [parts.Part(name, [name, {str(tmp_path)!r}]) for name in ('lasts', 'a')]\n"
+        f"parts.run_parts({str(script)!r}, of_all, pathlib.Path({str(tmp_path)!r}), flags)"
+    )
+    process = subprocess.Popen([sys.executable, str(driver)])
+    while not (tmp_path / "lasts.log").exists():
+        time.sleep(0.05)
+    process.terminate()
+    assert process.wait(20) == 128 + signal.SIGTERM and not (tmp_path / "a.log").exists()
 
 
 def peer_result(side, seed, times, returns, cold, compiling=30.0):
