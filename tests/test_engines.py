@@ -6,6 +6,7 @@ and half another, so that a step which takes its model from the wrong row is off
 
 import gc
 import importlib.util
+import weakref
 from functools import lru_cache, partial
 from threading import Thread
 from typing import NamedTuple
@@ -19,7 +20,7 @@ from probes import quick, slow_but
 
 from mtjax import envs
 from mtjax.envs.engines import base as physics
-from mtjax.envs.engines import host
+from mtjax.envs.engines import host, shared
 from mtjax.envs.engines.base import World
 from mtjax.envs.engines.c import MujocoC
 from mtjax.envs.engines.mjx import Mjx
@@ -393,3 +394,74 @@ def test_a_program_runs_after_its_environment_is_gone():
     jax.clear_caches()
     gc.collect()
     np.testing.assert_array_equal(program(jnp.ones(1)), before)
+
+
+class Owner:
+    """What a program calls."""
+
+
+def kept_program(owner):
+    """Compile a program that keeps an object, under maps and in a jitted function."""
+    inner = jax.jit(jax.vmap(lambda x: shared.keep(owner, {"x": 2 * x})["x"]))
+    return jax.jit(lambda x: jax.vmap(inner)(x)).lower(jnp.ones((2, 3))).compile()
+
+
+def test_a_program_keeps_what_it_calls_and_frees_it_at_its_own_end():
+    """Even if JAX forgets how it was traced."""
+    owner = Owner()
+    program, gone = kept_program(owner), weakref.ref(owner)
+    del owner
+    jax.clear_caches()
+    gc.collect()
+    assert gone() is not None
+    np.testing.assert_array_equal(program(jnp.ones((2, 3))), 2)
+    del program
+    gc.collect()
+    assert gone() is None
+
+
+def test_a_program_that_keeps_something_can_be_exported():
+    """A file holds nothing of this process; what a process runs from it is kept by whoever reads it."""
+    exported = jax.export.export(jax.jit(lambda x: shared.keep(Owner(), x)))(jnp.ones(3))
+    again = jax.export.deserialize(exported.serialize())
+    np.testing.assert_array_equal(again.call(jnp.ones(3)), 1)
+
+
+def test_equal_engines_are_one_until_the_last_is_gone():
+    """The calls of a name are made once, and then drop what they held of the engine."""
+    forgotten, one, other = [], Owner(), Owner()
+    assert shared.first_of("name", one, forgotten.append) is shared.first_of("name", other) is one
+    calls = [shared.call_of("name", about, object) for about in (1, 2, 1)]
+    assert calls[0] is calls[2] is not calls[1] and not forgotten
+    assert shared.living("name") is one
+    del one
+    gc.collect()
+    assert forgotten == calls[:2] and shared.first_of("name", other) is other
+    del shared._calls["name"]
+
+
+@pytest.mark.slow
+def test_programs_of_warp_run_after_their_families_are_gone():
+    """Ten families, each in two copies that are one engine; and nothing is left after the programs."""
+    pytest.importorskip("warp")
+
+    def swing(env, torque):
+        task = jax.tree.map(lambda x: x[0], env.tasks())
+        return env.step(task, env.reset(task, jax.random.key(0)).state, torque).obs
+
+    programs, engines = [], []
+    for mass in np.repeat(np.linspace(0.5, 1.5, 10), 2):
+        env = envs.make("pendulum-swingup", engine="warp", vary={"mass": mass})
+        programs.append(jax.jit(partial(swing, env)).lower(jnp.ones(1)).compile())
+        engines.append(weakref.ref(env.simulator))
+    del env
+    jax.clear_caches()
+    gc.collect()
+    assert [engine() is None for engine in engines] == [False, True] * 10
+    found = np.array([program(jnp.ones(1)) for program in programs])
+    np.testing.assert_array_equal(found[::2], found[1::2])
+    assert len(np.unique(found[::2, 2])) == 10
+    del programs
+    jax.clear_caches()
+    gc.collect()
+    assert all(engine() is None for engine in engines)

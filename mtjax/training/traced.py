@@ -34,6 +34,7 @@ from typing import Any, NamedTuple
 import jax
 from jax import export
 
+from mtjax.envs.engines.shared import keep
 from mtjax.names import BEGAN
 
 LIMIT = 500_000_000
@@ -80,6 +81,7 @@ def trace(env: Any, program: Any, donated: tuple[int, ...], static: tuple, argum
 
     def call(*arguments):
         leaves = kept.exported.call(*jax.tree.leaves(arguments))
+        leaves = keep(env, leaves) if kept.targets else leaves
         return jax.tree.map(lambda number: leaves[number], kept.result)
 
     call.__name__ = program.__name__

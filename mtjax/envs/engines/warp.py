@@ -6,7 +6,6 @@ import importlib
 import inspect
 import itertools
 import threading
-import weakref
 from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property, partial
 from operator import attrgetter
@@ -20,6 +19,7 @@ import numpy as np
 from mtjax.envs.engines.base import World, mjx_module, state_of
 from mtjax.envs.engines.kernels import compile_kernels, note_kernels
 from mtjax.envs.engines.mjx import INVOLVED, Mjx
+from mtjax.envs.engines.shared import call_of, first_of, keep, living
 from mtjax.types import Array, InputError, Task
 
 # Fields that no stage of a step reads, so that tasks may differ in them though Warp has room for one value only.
@@ -41,7 +41,7 @@ class _Flat(NamedTuple):
 class _Call(NamedTuple):
     """A call of Warp in JAX's programs."""
 
-    name: str  # XLA's name of it
+    target: Any  # Warp's, by whose name programs call it
     function: Callable
     leaves: list[jax.ShapeDtypeStruct]  # the shapes of the differing leaves in Warp
 
@@ -81,6 +81,8 @@ class Warp:
     slower, and wrong on GPUs if several such arrays start equal, because XLA 0.11 gives them one piece of memory.
 
     Warp picks a world's model by the world's number along one axis. Nested maps are therefore flattened into one axis.
+
+    Equal engines use the memory of the first of them, and programs keep that one when Python has no other reference.
 
     Raises:
         InputError: tasks differ in a model field for which Warp holds only one value.
@@ -178,6 +180,11 @@ class Warp:
     # What Warp runs.
 
     @cached_property
+    def _first(self) -> "Warp":
+        """Return the engine whose memory all equal engines use."""
+        return first_of(self._digest, self, lambda call: clear_graphs(call.target))
+
+    @cached_property
     def _calls(self) -> dict[Any, _Call]:
         return {}
 
@@ -214,12 +221,12 @@ class Warp:
         self.provide(count, names)
         call = self._calls[count, names]
         leaves = [leaf.reshape(like.shape) for leaf, like in zip(flat.leaves.values(), call.leaves, strict=True)]
-        found = call.function(*(flat.given[name] for name in self._given), *leaves)
+        found = keep(self._first, call.function(*(flat.given[name] for name in self._given), *leaves))
         return dict(zip(self._found, found, strict=True))
 
     def targets(self) -> dict[str, Any]:
         """Return the arguments of ``provide`` for every call until now, by the call's name in programs."""
-        return {call.name: [count, list(names)] for (count, names), call in list(self._calls.items())}
+        return {call.target.name: [count, list(names)] for (count, names), call in list(self._calls.items())}
 
     def provide(self, count: int, names: Sequence[str]) -> str:
         """Make the call that steps a number of worlds with these differing leaves; return its name in programs.
@@ -227,16 +234,11 @@ class Warp:
         A program that was traced in another process can then run in this one.
         """
         key = count, tuple(names)
-        if key in self._calls:  # also while another thread notes kernels
-            return self._calls[key].name
-        devices = own_devices()
-        with ALONE:
-            for device in devices:  # not while it runs, when Warp records and cannot make room
-                if (device.alias, count) not in self._places:
-                    self._places[device.alias, count] = self._make_place(device, count)
-            if key not in self._calls:
-                self._calls[key] = self._make_call(self._places[devices[0].alias, count].model, *key)
-        return self._calls[key].name
+        if key not in self._calls:  # else another thread may be noting kernels
+            with ALONE:
+                model = self._first._make_places(count)
+                self._calls[key] = call_of(self._digest, key, partial(self._make_call, model, *key))
+        return self._calls[key].target.name
 
     def load_kernels(self) -> bool:
         """Compile or load all kernels of a step, before programs run that would wait for them.
@@ -247,12 +249,24 @@ class Warp:
         """
         from mujoco.mjx.third_party import mujoco_warp
 
-        counts = sorted(count for _, count in list(self._places))[:1]
+        counts = sorted({count for count, _ in list(self._calls)})[:1]
         for count, device in itertools.product(counts, own_devices()):
             with ALONE:
-                kernels = note_kernels(device, partial(mujoco_warp.step, *self._places[device.alias, count][:2]))
+                place = self._first._places[device.alias, count]
+                kernels = note_kernels(device, partial(mujoco_warp.step, place.model, place.data))
             compile_kernels(device, kernels)  # meanwhile other threads make places and trace, which launches none
         return jax.default_backend() != "cpu"
+
+    def _make_places(self, count: int) -> Any:
+        """Make room for a number of worlds on every device; return the model of the first one.
+
+        This is not done when a program runs: Warp then records a graph, and cannot make room.
+        """
+        devices = own_devices()
+        for device in devices:
+            if (device.alias, count) not in self._places:
+                self._places[device.alias, count] = self._make_place(device, count)
+        return self._places[devices[0].alias, count].model
 
     def _make_place(self, device: Any, count: int) -> _Place:
         """Allocate Warp's memory for a number of worlds, with room for every possible contact."""
@@ -309,8 +323,8 @@ class Warp:
         kinds |= {f"new_{name}": warp.array(dtype=float, ndim=2) for name in self._found}
         on_gpu = jax.default_backend() != "cpu"
         mode = warp.JaxCallableGraphMode.WARP if on_gpu else warp.JaxCallableGraphMode.NONE
-        step = _stepper(weakref.ref(self), count, names)
-        step.__qualname__ = f"step_{self._digest(count, names)}"  # the call's name is made of it
+        step = _stepper(self._digest, count, names)
+        step.__qualname__ = f"step_{short_hash(self._digest, count, names)}"  # the call's name is made of it
         target = warp.jax_callable(
             annotated(step, kinds),
             num_outputs=len(self._found),
@@ -327,13 +341,29 @@ class Warp:
             return target(*arrays)
 
         jax.eval_shape(function, *given, *leaves)  # so that Warp knows the call if no program is traced
-        return _Call(target.name, function, leaves)
+        return _Call(target, function, leaves)
 
-    def _digest(self, count: int, names: tuple[str, ...]) -> str:
+    @cached_property
+    def _digest(self) -> str:
         """Return a short hash of all that decides a step, so that calls have the same names in every process."""
-        model = np.empty(mujoco.mj_sizeModel(self.base), np.uint8)
-        mujoco.mj_saveModel(self.base, None, model)
-        return hashlib.sha256(model.tobytes() + repr((self.num_substeps, count, names)).encode()).hexdigest()[:16]
+        return short_hash("step", saved(self.base), self.num_substeps)
+
+
+def saved(model: mujoco.MjModel) -> bytes:
+    """Return a model as MuJoCo saves it."""
+    content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, content)
+    return content.tobytes()
+
+
+def short_hash(*about: Any) -> str:
+    """Return a hash of plain values, the same in every process."""
+    return hashlib.sha256(repr(about).encode()).hexdigest()[:16]
+
+
+def clear_graphs(target: Any) -> None:
+    """Drop the CUDA graphs that Warp has recorded of a call. They use memory of an engine that is gone."""
+    target.captures.clear()
 
 
 def own_devices() -> list[Any]:
@@ -343,10 +373,10 @@ def own_devices() -> list[Any]:
     return [warp.device_from_jax(device) for device in jax.local_devices()]
 
 
-def _stepper(engine: Any, count: int, names: tuple[str, ...]) -> Callable:
+def _stepper(engine: str, count: int, names: tuple[str, ...]) -> Callable:
     """Return the function that Warp runs in a call: copy the state in, step, and copy the new state out.
 
-    It holds a weak reference to the engine: Warp keeps such functions for good, but its memory must be freed.
+    It finds the engine by its name. Warp keeps such functions for good, but an engine's memory must be freed.
     """
     import warp
     from mujoco.mjx.third_party import mujoco_warp
@@ -354,7 +384,7 @@ def _stepper(engine: Any, count: int, names: tuple[str, ...]) -> Callable:
     fixed = not {"body_pos", "body_quat", "geom_pos", "geom_quat"}.isdisjoint(names)
 
     def step(*arrays: Any) -> None:
-        own = engine()
+        own = living(engine)
         given, found = own._given, own._found
         model, data, all_move = own._places[arrays[0].device.alias, count]
         for name, array in zip(names, arrays[len(given) :], strict=False):

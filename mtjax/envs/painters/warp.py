@@ -1,10 +1,8 @@
 """MuJoCo Warp's ray tracer, for NVIDIA GPUs. On a CPU it works and is slow."""
 
 import dataclasses
-import hashlib
-import weakref
 from collections.abc import Callable
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -13,7 +11,8 @@ import mujoco
 import numpy as np
 
 from mtjax.envs.engines.kernels import compile_kernels, note_kernels
-from mtjax.envs.engines.warp import ALONE, annotated, keep_streams, own_devices
+from mtjax.envs.engines.shared import call_of, first_of, keep, living
+from mtjax.envs.engines.warp import ALONE, annotated, clear_graphs, keep_streams, own_devices, saved, short_hash
 from mtjax.envs.painters.poses import Poses
 from mtjax.envs.painters.scene import GROUPS, Scene
 from mtjax.types import Array
@@ -97,6 +96,11 @@ class WarpPainter:
     # What Warp runs.
 
     @cached_property
+    def _first(self) -> "WarpPainter":
+        """Return the painter whose memory all equal painters use."""
+        return first_of(self._digest, self, clear_graphs)
+
+    @cached_property
     def _places(self) -> dict[Any, _Place]:
         return {}
 
@@ -109,7 +113,7 @@ class WarpPainter:
         self.provide(count)
         target = self._targets[count]
         target.call_id = 0  # Warp's number of a trace, part of the program: each trace makes the same call
-        return target(*shot)[0]
+        return keep(self._first, target(*shot)[0])
 
     def targets(self) -> dict[str, list[int]]:
         """Return the arguments of ``provide`` for every call until now, by the call's name in programs."""
@@ -123,10 +127,10 @@ class WarpPainter:
         keep_streams(warp)
         with ALONE:
             for device in own_devices():
-                if (device.alias, count) not in self._places:
-                    self._places[device.alias, count] = self._make_place(device, count)
+                if (device.alias, count) not in self._first._places:
+                    self._first._places[device.alias, count] = self._make_place(device, count)
             if count not in self._targets:
-                self._targets[count] = self._make_target(count)
+                self._targets[count] = call_of(self._digest, count, partial(self._make_target, count))
         return self._targets[count].name
 
     def load_kernels(self) -> bool:
@@ -137,7 +141,7 @@ class WarpPainter:
         """
         from mujoco.mjx.third_party import mujoco_warp
 
-        for (alias, _), place in list(self._places.items()):
+        for (alias, _), place in list(self._first._places.items()):
             with ALONE:  # to make a place launches some of them
                 draw = lambda place=place: (mujoco_warp.refit_bvh(*place), mujoco_warp.render(*place))
                 compile_kernels(alias, note_kernels(alias, draw))
@@ -175,8 +179,8 @@ class WarpPainter:
         kinds["picture"] = warp.array(dtype=warp.uint32, ndim=2)
         on_gpu = jax.default_backend() != "cpu"
         mode = warp.JaxCallableGraphMode.WARP if on_gpu else warp.JaxCallableGraphMode.NONE
-        draw = _drawer(weakref.ref(self), count)
-        draw.__qualname__ = f"draw_{self._digest(count)}"  # the call's name is made of it
+        draw = _drawer(self._digest, count)
+        draw.__qualname__ = f"draw_{short_hash(self._digest, count)}"  # the call's name is made of it
         target = warp.jax_callable(
             annotated(draw, kinds),
             num_outputs=1,
@@ -192,22 +196,21 @@ class WarpPainter:
         jax.eval_shape(target, *given)  # so that Warp knows the call if no program is traced
         return target
 
-    def _digest(self, count: int) -> str:
+    @cached_property
+    def _digest(self) -> str:
         """Return a short hash of all that decides a picture, so that calls have the same names in every process."""
-        model = np.empty(mujoco.mj_sizeModel(self.scene.model), np.uint8)
-        mujoco.mj_saveModel(self.scene.model, None, model)
-        return hashlib.sha256(model.tobytes() + repr((self.size, count)).encode()).hexdigest()[:16]
+        return short_hash("draw", saved(self.scene.model), self.size)
 
 
-def _drawer(painter: Any, count: int) -> Callable:
+def _drawer(painter: str, count: int) -> Callable:
     """Return the function that Warp runs in a call.
 
-    It holds a weak reference to the painter: Warp keeps such functions for good, but its memory must be freed.
+    It finds the painter by its name. Warp keeps such functions for good, but a painter's memory must be freed.
     """
     from mujoco.mjx.third_party import mujoco_warp
 
     def draw(*arrays: Any) -> None:
-        model, data, context = painter()._places[arrays[0].device.alias, count]
+        model, data, context = living(painter)._places[arrays[0].device.alias, count]
         for name, array in zip(Shot._fields, arrays, strict=False):
             setattr(model if name in _FIELDS else data, name, array)
         context.rgb_data = arrays[-1]
