@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mtjax import envs
+from mtjax.envs import parameters
 from mtjax.envs.domain import stack_differing
 from mtjax.envs.engines.base import mjx_module
 from mtjax.tasks import episode_task
@@ -325,3 +326,44 @@ def test_environments_are_frozen():
     """A setting cannot change under a compiled program."""
     with pytest.raises(dataclasses.FrozenInstanceError):
         envs.make("finger-spin").num_tasks = 2
+
+
+PINNED = """
+<mujoco>
+  <compiler settotalmass="14"/>
+  <worldbody>
+    <body name="trunk"><freejoint/><geom name="trunk" size="0.1"/>
+      <body name="arm"><joint/><geom size="0.05" pos="1 0 0" mass="3"/></body>
+      <body name="leg"><joint/><inertial pos="0 0 0" mass="3" diaginertia="1 1 1"/></body>
+    </body>
+    <geom name="floor" type="plane" size="1 1 1"/>
+  </worldbody>
+  <contact><pair geom1="trunk" geom2="floor" friction="2 2 0.1 0.1 0.1"/></contact>
+</mujoco>
+"""
+
+
+@pytest.mark.filterwarnings("ignore:compiler attribute")
+@pytest.mark.parametrize("scale", [0.5, 1, 2])
+def test_masses_scale_where_the_model_pins_their_sum(scale):
+    """All of them to 7, 14 and 28 kg; and one body alone, without the others."""
+
+    def edited(parameter):
+        spec = mujoco.MjSpec.from_string(PINNED)
+        parameter.edit(spec, scale)
+        return spec.compile()
+
+    plain = mujoco.MjModel.from_xml_string(PINNED)
+    found = edited(parameters.MASS)
+    np.testing.assert_allclose(found.body_mass, scale * plain.body_mass)
+    np.testing.assert_allclose(found.body_inertia, scale * plain.body_inertia)
+    np.testing.assert_allclose(np.sum(found.body_mass), 14 * scale)
+    for name in ("trunk", "arm", "leg"):
+        expected = np.where(np.arange(4) == plain.body(name).id, scale, 1) * plain.body_mass
+        np.testing.assert_allclose(edited(parameters.body_mass(name)).body_mass, expected)
+
+
+def test_friction_scales_in_pairs_that_have_their_own():
+    spec = mujoco.MjSpec.from_string(PINNED)
+    parameters.FRICTION.edit(spec, 0.5)  # type: ignore
+    assert list(spec.pairs[0].friction) == [1, 1, 0.1, 0.1, 0.1]

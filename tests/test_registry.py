@@ -22,7 +22,7 @@ import mtjax.train
 from mtjax import cli, commands, register
 from mtjax.agents import AGENTS, PARTS
 from mtjax.config import to_json
-from mtjax.envs import ENVS, Domain, Parameter, declared
+from mtjax.envs import ENVS, Domain, Parameter, declared, effects
 from mtjax.envs.brax import Brax
 from mtjax.tasks import episode_task
 from mtjax.training import api
@@ -319,6 +319,62 @@ def test_every_family_of_brax_passes_the_check(name):
 def test_every_family_of_the_package_passes_the_check(name):
     """So that the check asks for nothing that a family need not have."""
     declared.check(mtjax.make(name))
+
+
+@pytest.mark.parametrize("name", [name for name in QUICK if name not in METAWORLD])
+def test_every_parameter_of_the_package_changes_something(name):
+    """But for one that changes nothing in MTEnv either, as its documentation says."""
+    if name != "control-acrobot":
+        return effects.require_effects(mtjax.make(name))
+    assert "It changes nothing" in (ENVS[name][0].__doc__ or "")
+    with pytest.raises(InputError, match=r"'link-length-2'\] changes nothing: reset and step do not read"):
+        effects.require_effects(mtjax.make(name))
+    return None
+
+
+def set_body_mass(spec, value):
+    """Set a mass that the body's geoms give instead."""
+    spec.body("cart").mass = value
+
+
+def set_colour(spec, value):
+    """Paint a geom."""
+    spec.geoms[0].rgba = [value, 0, 0, 1]
+
+
+IDLE = [
+    (Parameter("kg", 1.0, set_body_mass), r"'x'\] changes nothing: the compiled model has the same physics"),
+    (Parameter("1", 0.5, set_colour), r"'x'\] changes nothing: the compiled model .* has looks=True"),
+    (Parameter("1", 0.5), r"'x'\] changes nothing: reset and step do not read task.goal\['x'\]"),
+    (Parameter("1", 0.5, lambda spec, value: None, looks=True), r"'x'\] changes nothing: pictures are the same"),
+]
+
+
+@pytest.mark.parametrize("parameter, said", IDLE, ids=range(len(IDLE)))
+def test_a_parameter_that_changes_nothing_is_refused(parameter, said, spring):
+    """With its name, before anything varies it."""
+    parameters = {**spring.parameters, "x": parameter}
+    mine = dataclasses.dataclass(frozen=True)(type("Mine", (spring,), {"parameters": parameters}))
+    with pytest.raises(InputError, match=r"Mine\.parameters\[" + said):
+        register("mine", mine)
+    assert "mine" not in ENVS
+
+
+def test_parameters_that_only_a_method_or_a_picture_reads_are_accepted(spring):
+    """A goal that the start alone reads, and a colour that is said to be one."""
+
+    @dataclasses.dataclass(frozen=True)
+    class Mine(spring):
+        parameters: ClassVar = {
+            **spring.parameters,
+            "width": Parameter("m", 0.5),
+            "red": Parameter("1", 0.5, set_colour, looks=True),
+        }
+
+        def start(self, task, key):
+            return task.goal["width"] * jax.random.uniform(key, (1,)), jnp.zeros(1)
+
+    register("mine", Mine)
 
 
 def test_an_episode_ends_where_the_family_says(spring):

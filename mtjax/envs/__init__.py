@@ -375,13 +375,15 @@ def register(name: str, family: "type[Family]", **settings: Any) -> None:
         settings: values of its fields, such as ``vary={"mass": "0.5:2:10"}``.
 
     Raises:
-        InputError: the name is taken, a value is out of range, or a method is wrong.
+        InputError: the name is taken, a value is out of range, a method is wrong, or a parameter changes nothing.
     """
     if name in ENVS:
         raise InputError(f"there is an environment {name!r} already; choose another name")
     ENVS[name] = (family, settings)
     try:
-        load("mtjax.envs.declared:check")(make(name))
+        made = make(name)
+        load("mtjax.envs.declared:check")(made)
+        load("mtjax.envs.effects:require_effects")(made)
     except TypeError as error:  # an abstract method is missing
         del ENVS[name]
         raise InputError(f"{family.__name__} cannot be made: {error}") from None

@@ -3,7 +3,7 @@
 from __future__ import annotations  # annotations name MuJoCo, but listing the families must not import it
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
@@ -39,18 +39,29 @@ def _scale_geom(geom: mujoco.MjsGeom, scale: float) -> None:
         geom.mass *= scale
 
 
-def _scale_body(body: mujoco.MjsBody, scale: float) -> None:
-    for geom in body.geoms:
-        _scale_geom(geom, scale)
-    if body.explicitinertial:
-        body.mass *= scale
-        body.inertia = body.inertia * scale
-        body.fullinertia = body.fullinertia * scale
+def _given_mass(spec: mujoco.MjSpec) -> float:
+    """Return the mass of all bodies before MuJoCo scales them to ``settotalmass``."""
+    plain = spec.copy()
+    plain.compiler.settotalmass = -1
+    return float(plain.compile().body_mass.sum())
+
+
+def _scale_bodies(spec: mujoco.MjSpec, bodies: Sequence[mujoco.MjsBody], scale: float) -> None:
+    pinned = spec.compiler.settotalmass > 0  # MuJoCo then scales all masses to one sum, which has to change as they do
+    before = _given_mass(spec) if pinned else 0.0
+    for body in bodies:
+        for geom in body.geoms:
+            _scale_geom(geom, scale)
+        if body.explicitinertial:
+            body.mass *= scale
+            body.inertia = body.inertia * scale
+            body.fullinertia = body.fullinertia * scale
+    if pinned:
+        spec.compiler.settotalmass *= _given_mass(spec) / before
 
 
 def _scale_mass(spec: mujoco.MjSpec, scale: float) -> None:
-    for body in spec.bodies:
-        _scale_body(body, scale)
+    _scale_bodies(spec, spec.bodies, scale)
 
 
 def _set_gravity(spec: mujoco.MjSpec, value: float) -> None:
@@ -60,6 +71,8 @@ def _set_gravity(spec: mujoco.MjSpec, value: float) -> None:
 def _scale_friction(spec: mujoco.MjSpec, scale: float) -> None:
     for geom in spec.geoms:
         geom.friction = [geom.friction[0] * scale, *geom.friction[1:]]
+    for pair in spec.pairs:  # geoms that touch with a friction of their own
+        pair.friction = [*(pair.friction[:2] * scale), *pair.friction[2:]]
 
 
 def _scale_damping(spec: mujoco.MjSpec, scale: float) -> None:
@@ -84,12 +97,12 @@ def _set_density(spec: mujoco.MjSpec, value: float) -> None:
 
 def body_mass(name: str) -> Parameter:
     """Return a parameter that scales mass and inertia of one body."""
-    return Parameter("1", 1.0, lambda spec, scale: _scale_body(spec.body(name), scale))
+    return Parameter("1", 1.0, lambda spec, scale: _scale_bodies(spec, [spec.body(name)], scale))
 
 
 MASS = Parameter("1", 1.0, _scale_mass)  # scale of all masses and inertias
 GRAVITY = Parameter("m/s^2", 9.81, _set_gravity)
-FRICTION = Parameter("1", 1.0, _scale_friction)  # scale of the sliding friction of all geoms
+FRICTION = Parameter("1", 1.0, _scale_friction)  # scale of the sliding friction of all contacts
 DAMPING = Parameter("1", 1.0, _scale_damping)  # scale of the damping of all joints
 GEAR = Parameter("1", 1.0, _scale_gear)  # scale of the strength of all actuators
 STRENGTH = Parameter("1", 1.0, _scale_strength)  # scale of the force of all actuators, servos among them
