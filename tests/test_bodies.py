@@ -69,7 +69,7 @@ def test_actions_span_the_ranges_of_the_servos():
     env = envs.make("quadruped-walk", engine="c")
     low, high = env.models[0].actuator_ctrlrange.T
     for action, expected in ((-1, low), (1, high), (0, (low + high) / 2)):
-        _, found = env.control(None, None, jnp.full(12, float(action)))
+        _, found = env.control(env.tasks(), None, jnp.full(12, float(action)))
         np.testing.assert_allclose(found, expected, atol=1e-6)
 
 

@@ -82,8 +82,15 @@ class Domain(Pictured):
         """
 
     def control(self, task: Task, world: World, action: Array) -> tuple[World, Array]:
-        """Return the world with what an action (A,) sets in it, and the controls (nu,) of the step."""
-        return world, action
+        """Return the world with what an action (A,) sets in it, and the controls (nu,) of the step.
+
+        By default [-1, 1] spans each actuator's ctrlrange. An actuator without one receives the action as it is.
+        """
+        limited = self.models[0].actuator_ctrllimited[:, None] == 1
+        if "actuator_ctrlrange" not in task.model and np.all(~limited | (self.models[0].actuator_ctrlrange == [-1, 1])):
+            return world, action
+        low, high = jnp.where(limited, self.leaf(task, "actuator_ctrlrange"), jnp.array([-1.0, 1.0])).T
+        return world, (low + high) / 2 + (high - low) / 2 * action
 
     def recall(self, task: Task, obs: Array) -> World:
         """Return a world with the observation ``obs``, exact in all that the reward reads. ``relabel`` needs it."""

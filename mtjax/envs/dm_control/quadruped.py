@@ -82,10 +82,6 @@ class QuadrupedWalk(Domain):
         length = _SECONDS * self.parameters["speed"].nominal
         spec.geom("floor").size = [length, length, 0.5]
 
-    def control(self, task: Task, world: World, action: Array) -> tuple[World, Array]:
-        low, high = jnp.asarray(self.models[0].actuator_ctrlrange.T, jnp.float32)
-        return world, (low + high) / 2 + (high - low) / 2 * action
-
     def starts(self, models: Sequence[mujoco.MjModel], random: np.random.Generator) -> np.ndarray:
         """Return places, axes and sizes (R, G, 15) of all shapes in the torso's frame, in the model's own pose."""
         posed = {id(model): model for model in models}
