@@ -31,8 +31,8 @@ def folder(run: str | Path) -> Path:
 
 
 def is_shipped(directory: Path) -> bool:
-    """Return whether a folder holds a policy alone, and no run."""
-    return (directory / FILE).is_file()
+    """Return whether a folder holds a policy alone. A run may have one beside its checkpoints: it stays a run."""
+    return (directory / FILE).is_file() and not (directory / "checkpoints").exists()
 
 
 def not_learning(name: str) -> InputError:

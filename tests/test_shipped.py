@@ -17,7 +17,7 @@ from mtjax import agents, shipped
 from mtjax.cli import parse
 from mtjax.report import films
 from mtjax.report.scoring import score
-from mtjax.training import ship
+from mtjax.training import finetune, ship
 from mtjax.types import InputError
 
 PAGE = Path(__file__).parents[1] / "docs/results/policies.md"
@@ -64,6 +64,15 @@ def test_a_policy_is_shipped_and_acts_as_its_run(copied_run, package, tmp_path, 
         mtjax.evaluate.main(["--run=finger-spin/care", "--diagnostics"])
     with pytest.raises(InputError, match="there is a policy 'finger-spin/care' already"):
         ship.main([str(copied_run), "finger-spin/care"])
+
+
+def test_a_run_with_a_policy_inside_stays_a_run(copied_run):
+    """As an exported one may be put there."""
+    before = mtjax.load(copied_run)
+    np.savez(copied_run / "policy.npz", meta=np.zeros(3))
+    after = mtjax.load(copied_run)
+    assert jax.tree.structure(after.states) == jax.tree.structure(before.states)
+    finetune.require_fit(after, after.env, after.agent)
 
 
 def test_damaged_policies_are_refused(copied_run, package):
