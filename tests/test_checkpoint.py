@@ -1,6 +1,7 @@
 """Checkpoints: they hold everything, two are kept, and what is damaged is said in a line."""
 
 import gc
+import os
 import resource
 import shutil
 import threading
@@ -14,8 +15,8 @@ import mtjax.train
 from mtjax import loop
 from mtjax.config import from_json
 from mtjax.names import Notice
-from mtjax.training import checkpoint
-from mtjax.training.folder import record_steps, tell_edits
+from mtjax.training import arrays, checkpoint
+from mtjax.training.folder import new_directory, record_steps, require_unused, tell_edits
 from mtjax.types import InputError
 
 
@@ -74,6 +75,59 @@ def test_two_newest_are_kept(state, tmp_path):
         assert len(list(tmp_path.iterdir())) <= 2
     assert {path.name for path in tmp_path.iterdir()} == {"50", "75"}
     assert int(checkpoint.load(tmp_path, state).iteration) == 75
+
+
+@pytest.mark.parametrize("name", ["lr[1]", "proj [v2]", "a*", "a?", "50%", "a\nb", "é", "-a", "~", "{a}", "a:b", '"a"'])
+def test_a_folder_may_have_any_name(state, tmp_path, name):
+    """No character of it is a pattern, also beside a folder that such a pattern matches."""
+    for folder, iteration in ((tmp_path / "ab", 25), (tmp_path / "1", 25), (tmp_path / name, 50)):
+        folder.mkdir()
+        checkpoint.save(folder / "checkpoints", at(state, iteration))
+    assert_equal(checkpoint.load(tmp_path / name / "checkpoints", state), at(state, 50))
+
+
+@pytest.mark.parametrize("name", ["a\\b", os.fsdecode(b"a\xff")])
+def test_names_that_cannot_hold_a_checkpoint_are_refused(state, tmp_path, name):
+    """They would be written elsewhere."""
+    refused = (
+        lambda place: new_directory(place, "run"),
+        require_unused,
+        lambda place: checkpoint.require_space(place, state),
+        lambda place: checkpoint.save(place / "checkpoints", state),
+    )
+    for use in refused:
+        with pytest.raises(InputError, match="must be UTF-8 without backslashes"):
+            use(tmp_path / name)
+    assert not list(tmp_path.glob("*/*/*"))
+
+
+def test_a_checkpoint_that_cannot_be_read_back_takes_no_others_place(state, tmp_path, monkeypatch):
+    """A writer that lost the data without an error ends the run with the reason."""
+    for iteration in (25, 50):
+        checkpoint.save(tmp_path, at(state, iteration))
+
+    def lose(written):
+        written_well(written)
+        for path in tmp_path.glob("75.new/loop/d/*"):
+            path.unlink()
+        shutil.rmtree(tmp_path / "75.new" / "agent" / "ocdbt.process_0")
+
+    written_well = arrays.Written.wait
+    monkeypatch.setattr(arrays.Written, "wait", lose)
+    with pytest.raises(OSError, match="the one before it stays") as caught:
+        checkpoint.save(tmp_path, at(state, 75))
+    assert caught.value.filename == str(tmp_path / "75")
+    assert {path.name for path in tmp_path.iterdir()} == {"25", "50"}
+
+
+def test_arrays_that_are_missing_are_counted(state, tmp_path):
+    """The reader of a folder without data finds none, and raises no error by itself."""
+    checkpoint.save(tmp_path, state)
+    part, count = {"agent": state.agent}, len(jax.tree.leaves(state.agent))
+    arrays.require_readable(tmp_path / "150", part)
+    (tmp_path / "150" / "agent" / "manifest.ocdbt").unlink()
+    with pytest.raises(OSError, match=f"0 of {count} arrays of agent can be read back"):
+        arrays.require_readable(tmp_path / "150", part)
 
 
 def test_agent_is_read_without_the_rest(copied_run, state, shapes):

@@ -272,6 +272,18 @@ def test_a_sweep_is_read_with_its_runs(make_run, tmp_path):
     ]
 
 
+@pytest.mark.parametrize(("name", "matched"), [("lr[1]", 1), ("a*", 2), ("a?", 2)])
+def test_a_folder_of_any_name_is_read(make_run, tmp_path, name, matched):
+    """A folder goes before the pattern that its name would be."""
+    folder, other = (make_run(f"{each}/run", "finger-spin-vary-size", "sac") for each in (name, "ab"))
+    of = lambda pattern: [found.directory for found in collect.read(pattern)]
+    assert of(folder) == [folder] and of(other) == [other]
+    with pytest.raises(InputError, match="its folders hold runs") as caught:
+        of(folder.parent)
+    assert of(str(caught.value).split("runs: ")[-1].strip("'")) == [folder]
+    assert len(of(str(tmp_path / "runs" / f"{name[0]}?*" / "run"))) == matched
+
+
 def test_without_pandas_the_error_says_what_to_install(monkeypatch, make_run):
     """In a line."""
     monkeypatch.setitem(__import__("sys").modules, "pandas", None)

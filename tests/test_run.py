@@ -371,7 +371,7 @@ def test_a_checkpoint_that_fails_later_is_told_all_the_same(play, tmp_path, monk
     """By the next chunk, or at the end: no run ends well whose last checkpoint is missing."""
 
     def breaks(written, *_):
-        written.result()  # else it goes on beside the tests that follow, which forbid large files
+        written.wait()  # else it goes on beside the tests that follow, which forbid large files
         raise OSError(errno.EIO, "checkpoint not written", "somewhere")
 
     monkeypatch.setattr(checkpoint, "_finish", breaks)

@@ -57,13 +57,14 @@ def read(pattern: str | Path | Iterable[str | Path]) -> list[Found]:
     done = [folder for folder in dict.fromkeys(folders) if (folder / "evaluations.npz").exists()]
     if not done:
         above = next((each for each in map(str, given) if any(Path(each).glob("*/config.json"))), None)
-        hint = "" if above is None else f"; its folders hold runs: {str(Path(above) / '*')!r}"
+        hint = "" if above is None else f"; its folders hold runs: {str(Path(glob.escape(above)) / '*')!r}"
         raise InputError(f"there is no run with an evaluation in {', '.join(map(str, given)) or 'an empty list'}{hint}")
     return [_read(folder) for folder in done]
 
 
 def _folders(pattern: str) -> list[Path]:
-    places = sorted(map(Path, glob.glob(pattern)))
+    """Return the runs in a folder of this name, or else in those that a pattern matches."""
+    places = [Path(pattern)] if Path(pattern).exists() else sorted(map(Path, glob.glob(pattern)))
     number = lambda run: int(re.sub(r"\D", "", run.name) or 0)
     inside = [[place, *sorted(place.glob("run-*"), key=number)] for place in places]
     return [folder for group in inside for folder in group if (folder / "config.json").is_file()]

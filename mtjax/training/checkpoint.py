@@ -9,7 +9,6 @@ MuJoCo Warp.
 
 import errno
 import hashlib
-import logging
 import os
 import re
 import shutil
@@ -24,6 +23,7 @@ from mtjax.experience.ring import Ring
 from mtjax.loop import TrainState
 from mtjax.names import NoRoomError, notice
 from mtjax.parallel import hosts
+from mtjax.training import arrays
 from mtjax.training.folder import tell_edits
 from mtjax.types import InputError
 
@@ -79,23 +79,18 @@ def save(directory: Path, state: TrainState) -> None:
 
 def _begin(folder: Path, state: TrainState, record: bytes | None, thread: ThreadPoolExecutor) -> Future[None] | None:
     """Copy the state to the host, and let the thread write it. Every process writes what its devices hold."""
-    from orbax.checkpoint import v1 as ocp
-
     if folder.exists():
         return None
     new = folder.with_suffix(".new")
     shortage = hosts.largest(_shortage(folder, size_of(state)) if hosts.is_first() else 0)
     if shortage:
-        raise OSError(
-            shortage, f"checkpoint not written ({os.strerror(shortage)}); the one before it stays", str(folder)
-        )
-    _silence_orbax()
+        raise _not_written(OSError(shortage, os.strerror(shortage)), folder)
+    parts = {"agent": state.agent, "loop": state._replace(agent=None)}
     try:
-        parts = {"agent": state.agent, "loop": state._replace(agent=None)}
-        written = ocp.save_checkpointables_async(str(new.absolute()), parts)
-    except (OSError, ValueError) as error:
-        raise _as_oserror(error, new) from None
-    return thread.submit(_finish, written, record, new, folder)
+        written = arrays.write(new, parts)
+    except OSError as error:
+        raise _not_written(error, folder) from None
+    return thread.submit(_finish, written, record, new, folder, _shapes(parts))
 
 
 def _shortage(folder: Path, size: int) -> int:
@@ -118,41 +113,36 @@ def _shortage(folder: Path, size: int) -> int:
     return 0
 
 
-def _finish(written: Any, record: bytes | None, new: Path, folder: Path) -> None:
-    """Seal a written checkpoint: add config.json and checksums, give it its name, and drop all but the last two."""
+def _finish(written: arrays.Written, record: bytes | None, new: Path, folder: Path, parts: dict[str, Any]) -> None:
+    """Seal a written checkpoint: add config.json and checksums, give it its name, and drop all but the last two.
+
+    Before, it is read back, given the shapes of its parts.
+    """
     try:
-        written.result()
+        written.wait()
         if not hosts.is_first():
             return
+        arrays.require_readable(new, parts)
         if record is not None:
             (new / _RECORD).write_bytes(record)
         names = sorted(_files(new))
         (new / _SUMS).write_text("".join(f"{digest}  {name}\n" for name, digest in _digests(new, names).items()))
         new.rename(folder)
-    except (OSError, ValueError) as error:
+    except OSError as error:
         remove_unfinished(folder.parent)
-        raise _as_oserror(error, new) from None
+        raise _not_written(error, folder) from None
     for old in _folders(folder.parent)[_KEPT:]:
         shutil.rmtree(old, ignore_errors=True)
 
 
-def _as_oserror(error: Exception, place: Path) -> OSError:
-    """Return an error of orbax or of the system as one that names the place."""
-    known = re.search(r"os_error_code='(\d+)'", str(error))
-    number = int(known[1]) if known else getattr(error, "errno", None) or errno.EIO
-    reason = os.strerror(number) if number != errno.EIO else str(error).strip().splitlines()[0][:150]
-    return OSError(number, f"checkpoint not written ({reason}); the one before it stays", str(place.with_suffix("")))
+def _shapes(tree: Any) -> Any:
+    """Return a tree without its numbers, which the next chunk overwrites."""
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), tree)
 
 
-def _silence_orbax() -> None:
-    """Keep orbax from logging pages about what it also raises."""
-    logger = logging.getLogger("absl")
-    if not any(each is _not_of_orbax for each in logger.filters):
-        logger.addFilter(_not_of_orbax)
-
-
-def _not_of_orbax(record: logging.LogRecord) -> bool:
-    return "orbax" not in record.pathname
+def _not_written(error: OSError, folder: Path) -> OSError:
+    """Return an error of a checkpoint as one that says what is left."""
+    return OSError(error.errno, f"checkpoint not written ({error.strerror}); the one before it stays", str(folder))
 
 
 def remove_unfinished(directory: Path) -> None:
@@ -183,7 +173,7 @@ def load(directory: Path, like: TrainState) -> TrainState:
     folder = hosts.broadcast_path(lambda: _newest_whole(directory, like_parts))
     if hosts.is_first():
         tell_edits(directory.parent / _RECORD, folder / _RECORD)
-    read = _read(folder, like_parts)
+    read = arrays.read(folder, like_parts)
     return read["loop"]._replace(agent=read["agent"])
 
 
@@ -196,7 +186,7 @@ def load_agent(directory: Path, like: TrainState, iteration: int = 0) -> Any:
     parts = {"agent": like.agent}
     folder = _of_iteration(directory, iteration, parts) if iteration else _newest_whole(directory, parts)
     tell_edits(directory.parent / _RECORD, folder / _RECORD)
-    return _read(folder, parts)["agent"]
+    return arrays.read(folder, parts)["agent"]
 
 
 def _of_iteration(directory: Path, iteration: int, parts: Iterable[str]) -> Path:
@@ -213,7 +203,7 @@ def _of_iteration(directory: Path, iteration: int, parts: Iterable[str]) -> Path
 def load_ring(directory: Path, like: TrainState) -> Ring:
     """Read only the replay's ring buffer, without the worlds and the agent."""
     parts = {"loop": {"data": {"ring": like.data.ring}}}
-    return _read(_newest_whole(directory, parts), parts, partial=True)["loop"]["data"]["ring"]
+    return arrays.read(_newest_whole(directory, parts), parts, partial=True)["loop"]["data"]["ring"]
 
 
 def set_aside(directory: Path, iteration: int) -> None:
@@ -283,23 +273,6 @@ def _digests(folder: Path, names: list[str]) -> Mapping[str, str]:
         return dict(zip(names, pool.map(digest, names), strict=True))
 
 
-def _read(folder: Path, like: dict[str, Any], partial: bool = False) -> dict[str, Any]:
-    from orbax.checkpoint import v1 as ocp
-
-    first = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
-    place = lambda x: getattr(x, "sharding", None) or first
-    like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place(x)), like)
-    context = ocp.Context()
-    context.pytree.loading.partial_load = partial
-    _silence_orbax()
-    try:
-        with context:
-            return ocp.load_checkpointables(str(folder.absolute()), like)
-    except (ValueError, KeyError, OSError) as error:
-        reason = str(error).strip().splitlines()[0][:150]
-        raise InputError(f"the checkpoint {str(folder)!r} cannot be read: {reason}") from None
-
-
 # Sizes.
 
 
@@ -316,8 +289,9 @@ def require_space(directory: Path, state: Any, beside: int = 0, larger: Sequence
         larger: the settings that make a run's state large.
 
     Raises:
-        InputError: it has too little; for a new run a ``NoRoomError``.
+        InputError: it has too little; for a new run a ``NoRoomError``. Or the folder's path can hold none.
     """
+    arrays.require_place(directory)
     files = (file for part in ("checkpoints", "store") for file in (directory / part).rglob("*"))
     held = sum(file.stat().st_size for file in files if file.is_file())
     needed, free = (_KEPT + 1) * size_of(state) + beside - held, shutil.disk_usage(directory).free

@@ -23,6 +23,7 @@ from mtjax.envs.family import Family
 from mtjax.envs.mixtures import Mixture
 from mtjax.envs.tabled import Tabled
 from mtjax.names import notice, replacing
+from mtjax.training.arrays import require_place
 from mtjax.types import InputError
 
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
@@ -35,6 +36,7 @@ def new_directory(root: Path, name: str) -> Path:
     stamp = time.strftime("%Y%m%d-%H%M%S")
     if root.is_file():
         raise InputError(f"{str(root)!r} is a file, and runs need a folder; choose another place with --runs")
+    require_place(root)
     try:
         root.mkdir(parents=True, exist_ok=True)
         for attempt in range(1000):
@@ -50,6 +52,7 @@ def new_directory(root: Path, name: str) -> Path:
 
 def require_unused(directory: Path) -> None:
     """Raise InputError if a folder holds a run, or files of one, so that nothing is overwritten."""
+    require_place(directory)
     held = [
         name for name in ("config.json", "metrics.csv", "evaluations.npz", "checkpoints") if (directory / name).exists()
     ]
