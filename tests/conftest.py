@@ -13,6 +13,7 @@ import probes
 import pytest
 
 import mtjax.train
+from mtjax import xla_flags
 from mtjax.envs import ENVS
 from mtjax.envs.dm_control.finger import FingerSpin
 
@@ -25,11 +26,12 @@ if jax.__version_info__ < (0, 11):  # later ones end the process at a flag that 
 
 def pytest_configure(config):
     """Compile quickly, here and in processes that tests start, and never twice: workers share what they compiled."""
-    if config.option.markexpr == "gpu":  # programs as users get them
-        return
-    given = os.environ.get("XLA_FLAGS", "")
-    added = [f"--{name}={value}" for name, value in QUICK_FLAGS.items() if name not in given]
-    os.environ["XLA_FLAGS"] = " ".join([given, *added]).strip()
+    if config.option.markexpr == "gpu":
+        use_gpu(config)
+    else:
+        given = os.environ.get("XLA_FLAGS", "")
+        added = [f"--{name}={value}" for name, value in QUICK_FLAGS.items() if name not in given]
+        os.environ["XLA_FLAGS"] = " ".join([given, *added]).strip()
     cache = getattr(config, "cache", None)
     if cache is not None:
         keep = {
@@ -42,10 +44,33 @@ def pytest_configure(config):
             jax.config.update(name, value)
 
 
+def use_gpu(config):
+    """Compile programs as commands do, share the GPU's memory, and give every worker one test after another."""
+    xla_flags.try_few_tilings()
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    config.option.dist, config.option.maxschedchunk = "load", 1
+    if not hasattr(config, "workerinput"):
+        config.pluginmanager.register(Durations(config), "durations")
+
+
+class Durations:
+    """Tells how long each test took as soon as it ends, so that a run that is cut off has told it too."""
+
+    def __init__(self, config):
+        self.config, self.seconds = config, {}
+
+    def pytest_runtest_logreport(self, report):
+        self.seconds[report.nodeid] = self.seconds.get(report.nodeid, 0.0) + report.duration
+        if report.when == "teardown":
+            terminal = self.config.pluginmanager.get_plugin("terminalreporter")
+            terminal.write_line(f"{self.seconds.pop(report.nodeid):7.1f} s {report.nodeid}")
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers(config):
-    """Use every core that this process may, but no more than four: each worker takes some two gigabytes."""
-    return min(4, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+    """Use every core that this process may, but no more than four without a GPU: each worker takes two gigabytes."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(16 if config.option.markexpr == "gpu" else 4, cores)
 
 
 class Worlds(NamedTuple):

@@ -1,4 +1,7 @@
-"""On an NVIDIA GPU: that it computes what the CPU does. ``pytest -m gpu -n 8`` there; elsewhere they are left out."""
+"""On an NVIDIA GPU: that it computes what the CPU does. ``pytest -m gpu`` there; elsewhere they are left out.
+
+Workers take one test after another in the order of this file. Those that take longest come first.
+"""
 
 import dataclasses
 import os
@@ -35,6 +38,7 @@ from mtjax.envs.mixtures import States
 from mtjax.envs.probes import tasks_of
 from mtjax.envs.united import United
 from mtjax.training import checkpoint
+from mtjax.training.programs import compile_lowered
 from mtjax.types import Spec
 
 pytestmark = [
@@ -42,9 +46,13 @@ pytestmark = [
     pytest.mark.skipif(jax.default_backend() != "gpu", reason="there is no GPU"),
 ]
 SPEC = Spec.vector(9, 2, 1)
-# Acting: (S, T, E) of evaluation with ten seeds, of evaluation with one, and of training.
-SHAPES = {"ten-seeds": (10, 8, 5), "evaluation": (1, 10, 10), "training": (1, 4, 64)}
-SEEDS = {"one-seed": 1, "ten-seeds": 10}
+# Acting: (S, T, E), and how often such a program runs in a run.
+SHAPES = {
+    "evaluation of ten seeds": ((10, 8, 5), "seldom"),
+    "evaluation": ((1, 10, 10), "seldom"),
+    "training": ((1, 4, 64), "often"),
+}
+SEEDS = 10
 QUICK = {"xla_backend_optimization_level": 0}  # of the CPU's program alone, which takes minutes otherwise
 PENDULUM = {"vary": {"length": "0.4,0.6"}, "split": "none", "engine": "mjx"}
 MJX_SAVE = 50  # iterations between two checkpoints of MJX_RUN
@@ -75,20 +83,28 @@ def on(platform):
     return jax.default_device(jax.devices(platform)[0])
 
 
-def both(function, *arguments):
-    """What the CPU and the GPU make of the same arguments, at full float32 precision."""
-    found = []
-    for platform in ("cpu", "gpu"):
-        device = jax.devices(platform)[0]
-        given = jax.device_put(arguments, device)
-        with jax.default_device(device), jax.default_matmul_precision("highest"):
-            compiled = jax.jit(function).lower(*given).compile(QUICK if platform == "cpu" else None)
-            found.append(jax.device_get(compiled(*given)))
-    return found
+def run_on(platform, function, *arguments, runs="often"):
+    """What a device makes of the arguments, at full float32 precision. A GPU's program is compiled as those of runs."""
+    device = jax.devices(platform)[0]
+    given = jax.device_put(arguments, device)
+    with jax.default_device(device), jax.default_matmul_precision("highest"):
+        lowered = jax.jit(function).lower(*given)
+        compiled = lowered.compile(QUICK) if platform == "cpu" else compile_lowered(lowered, runs)
+        return jax.device_get(compiled(*given))
 
 
-def learned(name, num_seeds, tasks):
-    """The agent called ``name`` by its preset for GPUs, and states whose networks are not as they began.
+def both(function, *arguments, runs="often"):
+    """What the CPU and the GPU make of the same arguments."""
+    return [run_on(platform, function, *arguments, runs=runs) for platform in ("cpu", "gpu")]
+
+
+def first(count, tree):
+    """The first rows of every leaf."""
+    return jax.tree.map(lambda x: x[:count], tree)
+
+
+def learned(name, tasks):
+    """The agent called ``name`` by its preset for GPUs, and ``SEEDS`` states whose networks are not as they began.
 
     An update is one gradient step: each further step of Adam magnifies rounding.
     """
@@ -99,110 +115,15 @@ def learned(name, num_seeds, tasks):
     shake = lambda x: x + np.float32(0.1 * random.normal(size=x.shape)) if x.dtype == np.float32 else x
     with on("cpu"):
         init = jax.jit(jax.vmap(lambda key: agent.init(SPEC, tasks, key)), compiler_options=QUICK)
-        states = jax.device_get(init(jax.random.split(jax.random.key(0), num_seeds)))
+        states = jax.device_get(init(jax.random.split(jax.random.key(0), SEEDS)))
     return agent, states._replace(actor=jax.tree.map(shake, states.actor))
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("name", AGENTS)
-def test_agents_act_as_on_the_cpu(name, shape):
-    """The mean actions in worlds whose tasks were seen and in others."""
-    shape = SHAPES[shape]
-    with on("cpu"):
-        tasks, worlds = (
-            tasks_of("one-step", np.linspace(-1, 1, 4)),
-            tasks_of("one-step", np.linspace(-1.3, 1.3, shape[1])),
-        )
-    agent, states = learned(name, shape[0], tasks)
-    obs = np.random.default_rng(1).normal(size=(*shape, SPEC.obs_size)).astype(np.float32)
-
-    def act(states, worlds, obs):
-        age = jnp.zeros(shape, jnp.int32)
-        begin = lambda state, task: agent.begin(state, task)
-        memory = jax.vmap(jax.vmap(jax.vmap(begin, (None, 0)), (None, 0)), (0, None))(
-            states, jax.tree.map(lambda x: jnp.broadcast_to(x[:, None], (*shape[1:], *x.shape[1:])), worlds)
-        )
-        return rollout.act(agent, states, worlds, rollout.Worlds((), None, obs, memory, age), None).action
-
-    expected, found = both(act, states, worlds, obs)
-    error = np.abs(expected - found).max(axis=(0, 2, 3))
-    assert error.max() < 1e-3, error
-
-
-def experience(agent, num_seeds, num_tasks):
-    """Batches (S, T, B, ...), or rollouts (S, T, H, E, ...) for agents that learn from these."""
-    batches = [random_batch(seed, num_tasks, 64, SPEC, agent.history_length) for seed in range(num_seeds)]
-    batch = jax.tree.map(lambda *x: np.stack(x), *batches)
-    if hasattr(agent, "critic_target"):
-        return batch
-    steps = jax.tree.map(lambda x: x.reshape(*x.shape[:2], 8, 8, *x.shape[3:]), batch)
-    random = np.random.default_rng(0)
-    raw = np.arctanh(np.clip(steps.action, -0.99, 0.99))
-    ended = random.random(steps.reward.shape) < 0.1
-    return steps._replace(ended=ended, extras=Taken(raw, random.normal(size=ended.shape).astype(np.float32) - 2, None))
-
-
-@pytest.mark.parametrize("seeds", SEEDS)
-@pytest.mark.parametrize("name", AGENTS)
-def test_agents_learn_as_on_the_cpu(name, seeds):
-    """Losses of an update, and its gradients by what Adam remembers, seed by seed."""
-    num_seeds, num_tasks = SEEDS[seeds], 10
-    with on("cpu"):
-        tasks = tasks_of("one-step", np.linspace(-1, 1, num_tasks))
-    agent, states = learned(name, num_seeds, tasks)
-    with on("cpu"):
-        data, keys = experience(agent, num_seeds, num_tasks), jax.random.split(jax.random.key(1), num_seeds)
-    assert_learns_alike(agent, states, data, tasks, keys)
-
-
-def assert_learns_alike(agent, states, data, tasks, keys):
-    """Hold an update's metrics, and its gradients by what Adam remembers, on a GPU against those on the CPU."""
-    update = lambda states, data, tasks, keys: jax.vmap(lambda s, d, k: agent.update(s, d, tasks, k))(
-        states, data, keys
-    )
-    (expected, metrics), (found, measured) = both(update, states, data, tasks, keys)
-    for key, value in metrics.items():
-        assert np.abs(value - measured[key]).max() <= 0.02 * np.abs(value).max() + 1e-4, key
-    leaves = zip(
-        jax.tree_util.tree_leaves_with_path(expected.optimizers), jax.tree.leaves(found.optimizers), strict=True
-    )
-    for (path, one), other in leaves:
-        if ".mu" in jax.tree_util.keystr(path) and one.size:
-            difference, size = (np.linalg.norm(x.reshape(len(keys), -1), axis=1) for x in (one - other, one))
-            assert np.all(difference <= 0.05 * size + 1e-7), (jax.tree_util.keystr(path), difference / size)
-
-
-@pytest.mark.parametrize("vision", ["drq", "impala"])
-@pytest.mark.parametrize("name", ["drq", "sac-ae"])
-def test_agents_learn_from_pictures_as_on_the_cpu(name, vision):
-    """Three seeds, whose convolutions follow one another."""
-    agent = mtjax.agent(name, hidden=(64, 64), vision=vision)
-    spec = SPEC._replace(obs={"pixels": jax.ShapeDtypeStruct((SIZE, SIZE, 3), jnp.uint8)}, frames=3)
-    with on("cpu"):
-        tasks, keys = tasks_of("one-step", np.linspace(-1, 1, 2)), jax.random.split(jax.random.key(0), 3)
-        states = jax.device_get(jax.vmap(lambda key: agent.init(spec, tasks, key))(keys))
-        data = jax.tree.map(lambda *x: np.stack(x), *(random_batch(seed, 2, 8, spec) for seed in range(3)))
-    assert_learns_alike(agent, states, data, tasks, keys)
-
-
-def test_a_distribution_is_projected_in_a_kernel_of_its_own(rows=1280):
-    """Beside a softmax in one kernel it is many times slower, and XLA takes minutes to compile it."""
-    value = C51()
-    random = np.random.default_rng(0)
-    logits, next_logits = np.float32(random.normal(size=(2, 2, rows, value.num_bins)))
-    reward, discount, bonus = np.float32(random.uniform(size=(3, rows)))
-
-    def loss(logits):
-        target = value.target(next_logits, False, reward, discount, bonus)
-        return jnp.mean(value.loss(logits, target))
-
-    kernels = jax.jit(jax.grad(loss)).lower(logits).compile().as_text().split("\n}\n")
-    projecting = [kernel for kernel in kernels if f"{value.num_bins},{value.num_bins}]" in kernel]
-    assert projecting
-    assert not [kernel for kernel in projecting if " exponential(" in kernel]
-
-
-# Physics.
+def exactly(family):
+    """The family with MuJoCo itself as its engine, which steps on the CPU."""
+    exact = dataclasses.replace(family)
+    exact.__dict__["simulator"] = MujocoC(exact.models, exact.num_substeps)
+    return exact
 
 
 def played(env, count=64, steps=40):
@@ -212,7 +133,7 @@ def played(env, count=64, steps=40):
     with on("cpu"):
         each = jax.tree.map(lambda x: x[np.arange(count) % len(tasks.id)], tasks)
         keys = jax.random.split(jax.random.key(0), count)
-        starts = jax.device_get(jax.jit(jax.vmap(env.reset), compiler_options=QUICK)(each, keys).state)
+        starts = jax.device_get(jax.jit(jax.vmap(exactly(env).reset), compiler_options=QUICK)(each, keys).state)
     for i in range(count):
         model = env.models[each.row[i]]
         data = mujoco.MjData(model)
@@ -228,107 +149,16 @@ def played(env, count=64, steps=40):
     return each, [np.stack(x) for x in zip(*found, strict=True)]
 
 
-@pytest.mark.parametrize("engine", ["warp", "mjx"])
-@pytest.mark.parametrize("name", DOMAINS)
-def test_engines_step_as_mujoco_does(name, engine):
-    """One control step from states of play: nearly all worlds to rounding, with solver iterations to spare."""
-    from mtjax.envs.engines.warp import Warp
-
-    env = mtjax.make(name, vary=DOMAINS[name], split="none", engine="mjx", solver_iterations=50)
-    tasks, (qpos, qvel, warmstart, ctrl, new_qpos, new_qvel) = played(env)
-    simulator = env.simulator if engine == "mjx" else Warp(env.mjx.base, env.num_substeps)
-    assert isinstance(simulator, Mjx | Warp)
-    sensors = np.zeros((len(qpos), env.models[0].nsensordata), np.float32)
-    world = World(qpos, qvel, warmstart, sensors if sensors.size else None)
-    new = jax.device_get(jax.jit(jax.vmap(simulator.step))(tasks, world, ctrl))
-    error = np.abs(new.qvel - new_qvel).max(axis=1) / np.abs(new_qvel).max()
-    assert np.median(error) < 1e-4 and np.quantile(error, 0.9) < 1e-2, np.sort(error)[-8:]
-    assert np.quantile(np.abs(new.qpos - new_qpos).max(axis=1), 0.9) < 1e-3
-
-
-@pytest.mark.parametrize(
-    "name", [*BODIES, *(pytest.param(f"metaworld-{name}", marks=with_metaworld) for name in SCENES)]
-)
-def test_worlds_go_on_on_warp_as_on_c(name, count=64, steps=30):
-    """One step, from worlds in which MuJoCo has played at random: all that a world holds is taken over."""
-    env = mtjax.make(name, engine="warp", solver_iterations=50)
-    exact = dataclasses.replace(env)
-    exact.__dict__["simulator"] = MujocoC(env.models, env.num_substeps)
-    action = np.random.default_rng(0).uniform(-1, 1, (steps // 5 + 1, count, env.action_size)).astype(np.float32)
-    with on("cpu"):
-        tasks = env.tasks()
-        tasks = tasks if tasks.draws is None else jax.tree.map(lambda x: x[0], tasks.draws)
-        chosen = np.arange(count) % len(tasks.id)
-        tasks = jax.device_get(jax.tree.map(lambda x: x[chosen], tasks))
-        reset, step = (jax.jit(jax.vmap(function)) for function in (exact.reset, exact.step))
-        world = reset(tasks, jax.random.split(jax.random.key(0), count)).state
-        for i in range(steps):
-            world = step(tasks, world, action[i // 5]).state
-        world, expected = jax.device_get((world, step(tasks, world, action[-1])))
-    found = jax.device_get(jax.jit(jax.vmap(env.step))(tasks, world, action[-1]))
-    error = np.abs(found.state.qvel - expected.state.qvel).max(axis=1) / np.abs(expected.state.qvel).max()
-    assert np.median(error) < 2e-3 and np.quantile(error, 0.9) < 5e-2, np.sort(error)[-16:]  # a puck on its flat side
-    assert np.quantile(np.abs(found.obs - expected.obs), 0.9) < 1e-3
-    for one, other in ((found.state.act, expected.state.act), (found.state.mocap, expected.state.mocap)):
-        np.testing.assert_allclose(np.asarray(one, float), np.asarray(other, float), atol=1e-5)
-
-
-@pytest.mark.parametrize("num_envs", [64, 512])
-def test_a_mixture_steps_as_its_families(num_envs):
-    """Ten models in one program, each in memory of its own."""
-    env = mtjax.mixture([mtjax.make(name, vary=vary, engine="warp") for name, vary in DOMAINS.items()])
-    shape = lambda tasks: (1, len(tasks.id), num_envs)
-    keys = lambda tasks: jax.random.split(jax.random.key(0), shape(tasks))
-    begin = lambda family, tasks: jax.jit(
-        lambda tasks, keys: family.reset_worlds(rollout.broadcast_tasks(tasks, keys.shape), keys).state
-    )(tasks, keys(tasks))
-    tasks = env.tasks()
-    states = [begin(part.family, part.family.tasks()) for part in env.parts]
-    action = jax.random.uniform(jax.random.key(1), (3, *shape(tasks), env.spec.action_size), minval=-1.0)
-
-    @partial(jax.jit, static_argnums=0)
-    def play(family, tasks, state, action):
-        step = lambda state, action: (
-            family.step_worlds(rollout.broadcast_tasks(tasks, action.shape[:3]), state, action).state,
-            None,
-        )
-        return jax.lax.scan(step, state, action)[0]
-
-    together = play(env, tasks, States(tasks.blocks, tuple(states)), action).families
-    for i, (part, state) in enumerate(zip(env.parts, states, strict=True)):
-        places = [place for owner, place in tasks.blocks.slices() if owner == i]
-        own = jnp.concatenate([action[:, :, place] for place in places], axis=2)[..., : part.family.spec.action_size]
-        alone = play(part.family, part.family.tasks(), state, own)
-        error = np.abs(np.asarray(alone.qpos) - np.asarray(together[i].qpos)).max(axis=-1)
-        assert np.quantile(error, 0.9) < 1e-3 and np.all(np.isfinite(error)), part.name
+# What takes longest.
 
 
 @with_metaworld
-@pytest.mark.parametrize(
-    "names, kind",
-    [
-        (("reach", "push", "pick-place"), Joined),
-        (("window-open", "window-close"), Joined),
-        (("push", "door-open", "drawer-close", "drawer-open", "window-open"), United),
-        (("stick-push", "button-press", "plate-slide"), United),  # the first one feels forces
-    ],
-)
-def test_tasks_step_together_as_they_do_alone(names, kind):
-    """Warp adds up in another order each time."""
-    env = mtjax.mixture([mtjax.make(f"metaworld-{name}", num_draws=2, engine="warp") for name in names])
-    assert [type(group) for group in env.groups] == [kind]
-    require_as_alone(env, atol=2e-3)
-
-
-@with_metaworld
-@pytest.mark.parametrize("name", ["mt10", "mt50"])
+@pytest.mark.parametrize("name", ["mt50", "mt10"])
 def test_worlds_of_a_union_go_on_on_warp_as_on_c(name, count=16, steps=30):
     """One step, from worlds in which MuJoCo has played at random in each task's own scene."""
     env = mtjax.make(name, engine="warp", num_draws=count, solver_iterations=50)
     assert {type(group) for group in env.groups} == {United}
-    exact = mtjax.mixture([dataclasses.replace(family) for family in env.families], scenes="apart")
-    for family in exact.families:
-        family.__dict__["simulator"] = MujocoC(family.models, family.num_substeps)
+    exact = mtjax.mixture([exactly(family) for family in env.families], scenes="apart")
     shape = (1, len(env.families), count)
     action = np.random.default_rng(0).uniform(-1, 1, (steps // 5 + 1, *shape, 4)).astype(np.float32)
     with on("cpu"):
@@ -359,6 +189,79 @@ def tilting(model):
     """
     free = model.jnt_dofadr[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
     return np.concatenate([free + 3, free + 4])
+
+
+def test_a_mixture_steps_as_its_families(sizes=(512, 64)):
+    """Ten models in one program, each in memory of its own, with as many worlds of each task as in a run and fewer."""
+    env = mtjax.mixture([mtjax.make(name, vary=vary, engine="warp") for name, vary in DOMAINS.items()])
+    tasks = env.tasks()
+    shape = lambda tasks: (1, len(tasks.id), max(sizes))
+
+    def begin(family):
+        tasks = family.tasks()
+        reset = lambda tasks, keys: exactly(family).reset_worlds(rollout.broadcast_tasks(tasks, keys.shape), keys).state
+        with on("cpu"):
+            keys = jax.random.split(jax.random.key(0), shape(tasks))
+            return jax.device_get(jax.jit(reset, compiler_options=QUICK)(jax.device_get(tasks), keys))
+
+    @partial(jax.jit, static_argnums=0)
+    def play(family, tasks, state, action):
+        step = lambda state, action: (
+            family.step_worlds(rollout.broadcast_tasks(tasks, action.shape[:3]), state, action).state,
+            None,
+        )
+        return jax.lax.scan(step, state, action)[0]
+
+    states = [begin(part.family) for part in env.parts]
+    actions = jax.random.uniform(jax.random.key(1), (3, *shape(tasks), env.spec.action_size), minval=-1.0)
+    for count in sizes:
+        few, action = jax.tree.map(lambda x, count=count: x[:, :, :count], states), actions[:, :, :, :count]
+        together = play(env, tasks, States(tasks.blocks, tuple(few)), action).families
+        for i, (part, state) in enumerate(zip(env.parts, few, strict=True)):
+            places = [place for owner, place in tasks.blocks.slices() if owner == i]
+            own = jnp.concatenate([action[:, :, place] for place in places], axis=2)[
+                ..., : part.family.spec.action_size
+            ]
+            alone = play(part.family, part.family.tasks(), state, own)
+            error = np.abs(np.asarray(alone.qpos) - np.asarray(together[i].qpos)).max(axis=-1)
+            assert np.quantile(error, 0.9) < 1e-3 and np.all(np.isfinite(error)), (part.name, count)
+
+
+def test_a_run_that_is_killed_ends_as_any_other(tmp_path):
+    """To the byte on MJX. Both runs execute the programs that the first of them compiled."""
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(Path(mtjax.__file__).parents[1]), os.environ.get("PYTHONPATH", "")]),
+        "MTJAX_CACHE": str(tmp_path / "cache"),
+        "XLA_PYTHON_CLIENT_PREALLOCATE": "false",  # this process has memory of the same device
+    }
+
+    def start(*words):
+        with (tmp_path / "out").open("a") as file:
+            command = [sys.executable, "-m", "mtjax.train", *words]
+            return subprocess.Popen(command, env=environment, stdout=file, stderr=subprocess.STDOUT)
+
+    def folder_in(runs):
+        return next(iter(runs.glob("pendulum-*")), None)
+
+    def saved(runs):
+        names = [path.name for path in runs.glob("pendulum-*/checkpoints/*")]
+        return max((int(name) for name in names if name.isdigit()), default=0)
+
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    assert start(*MJX_RUN, f"--runs={whole}").wait(900) == 0, (tmp_path / "out").read_text()[-3000:]
+    words = [*MJX_RUN, f"--runs={broken}"]
+    for delay in (0.0, 0.05):  # from a checkpoint's seal until the process is killed: beside the next chunk, or save
+        process, before, until = start(*words), saved(broken), time.monotonic() + 600
+        while saved(broken) < before + 2 * MJX_SAVE:
+            assert process.poll() is None and time.monotonic() < until, (tmp_path / "out").read_text()[-3000:]
+            time.sleep(0.002)
+        time.sleep(delay)
+        process.kill()
+        assert process.wait(60) == -signal.SIGKILL
+        words = [f"--resume={folder_in(broken)}"]
+    assert start(*words).wait(900) == 0, (tmp_path / "out").read_text()[-3000:]
+    assert outcome(folder_in(broken)) == outcome(folder_in(whole))
 
 
 def test_a_run_goes_on_bit_for_bit(tmp_path):
@@ -416,43 +319,6 @@ def test_a_checkpoint_is_the_state_of_when_it_was_saved(tmp_path, monkeypatch, r
     assert bytes_of(chunk(chunk(chunk(saved)))) == bytes_of(after)
 
 
-def test_a_run_that_is_killed_ends_as_any_other(tmp_path):
-    """To the byte on MJX. Both runs execute the programs that the first of them compiled."""
-    environment = {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join([str(Path(mtjax.__file__).parents[1]), os.environ.get("PYTHONPATH", "")]),
-        "MTJAX_CACHE": str(tmp_path / "cache"),
-        "XLA_PYTHON_CLIENT_PREALLOCATE": "false",  # this process has memory of the same device
-    }
-
-    def start(*words):
-        with (tmp_path / "out").open("a") as file:
-            command = [sys.executable, "-m", "mtjax.train", *words]
-            return subprocess.Popen(command, env=environment, stdout=file, stderr=subprocess.STDOUT)
-
-    def folder_in(runs):
-        return next(iter(runs.glob("pendulum-*")), None)
-
-    def saved(runs):
-        names = [path.name for path in runs.glob("pendulum-*/checkpoints/*")]
-        return max((int(name) for name in names if name.isdigit()), default=0)
-
-    whole, broken = tmp_path / "whole", tmp_path / "broken"
-    assert start(*MJX_RUN, f"--runs={whole}").wait(900) == 0, (tmp_path / "out").read_text()[-3000:]
-    words = [*MJX_RUN, f"--runs={broken}"]
-    for delay in (0.0, 0.05):  # from a checkpoint's seal until the process is killed: beside the next chunk, or save
-        process, before, until = start(*words), saved(broken), time.monotonic() + 600
-        while saved(broken) < before + 2 * MJX_SAVE:
-            assert process.poll() is None and time.monotonic() < until, (tmp_path / "out").read_text()[-3000:]
-            time.sleep(0.002)
-        time.sleep(delay)
-        process.kill()
-        assert process.wait(60) == -signal.SIGKILL
-        words = [f"--resume={folder_in(broken)}"]
-    assert start(*words).wait(900) == 0, (tmp_path / "out").read_text()[-3000:]
-    assert outcome(folder_in(broken)) == outcome(folder_in(whole))
-
-
 @pytest.mark.parametrize(
     "name", ["ball-in-cup-catch", "cheetah-run", "finger-turn-easy", "swimmer-swimmer6", "walker-walk"]
 )
@@ -493,3 +359,172 @@ def test_mazes_move_and_are_drawn_as_on_the_cpu(name):
         np.testing.assert_allclose(one["state"], other["state"], atol=1e-4)
         apart = np.abs(np.int32(one["pixels"]) - np.int32(other["pixels"])).max(axis=-1)
         assert np.mean(apart > 3) < 2e-3
+
+
+# Physics.
+
+
+@pytest.mark.parametrize("engine", ["warp", "mjx"])
+@pytest.mark.parametrize("name", DOMAINS)
+def test_engines_step_as_mujoco_does(name, engine):
+    """One control step from states of play: nearly all worlds to rounding, with solver iterations to spare."""
+    from mtjax.envs.engines.warp import Warp
+
+    env = mtjax.make(name, vary=DOMAINS[name], split="none", engine="mjx", solver_iterations=50)
+    tasks, (qpos, qvel, warmstart, ctrl, new_qpos, new_qvel) = played(env)
+    simulator = env.simulator if engine == "mjx" else Warp(env.mjx.base, env.num_substeps)
+    assert isinstance(simulator, Mjx | Warp)
+    sensors = np.zeros((len(qpos), env.models[0].nsensordata), np.float32)
+    world = World(qpos, qvel, warmstart, sensors if sensors.size else None)
+    new = jax.device_get(jax.jit(jax.vmap(simulator.step))(tasks, world, ctrl))
+    error = np.abs(new.qvel - new_qvel).max(axis=1) / np.abs(new_qvel).max()
+    assert np.median(error) < 1e-4 and np.quantile(error, 0.9) < 1e-2, np.sort(error)[-8:]
+    assert np.quantile(np.abs(new.qpos - new_qpos).max(axis=1), 0.9) < 1e-3
+
+
+@pytest.mark.parametrize(
+    "name", [*BODIES, *(pytest.param(f"metaworld-{name}", marks=with_metaworld) for name in SCENES)]
+)
+def test_worlds_go_on_on_warp_as_on_c(name, count=64, steps=30):
+    """One step, from worlds in which MuJoCo has played at random: all that a world holds is taken over."""
+    env = mtjax.make(name, engine="warp", solver_iterations=50)
+    exact = exactly(env)
+    action = np.random.default_rng(0).uniform(-1, 1, (steps // 5 + 1, count, env.action_size)).astype(np.float32)
+    with on("cpu"):
+        tasks = env.tasks()
+        tasks = tasks if tasks.draws is None else jax.tree.map(lambda x: x[0], tasks.draws)
+        chosen = np.arange(count) % len(tasks.id)
+        tasks = jax.device_get(jax.tree.map(lambda x: x[chosen], tasks))
+        reset, step = (jax.jit(jax.vmap(f), compiler_options=QUICK) for f in (exact.reset, exact.step))
+        world = reset(tasks, jax.random.split(jax.random.key(0), count)).state
+        for i in range(steps):
+            world = step(tasks, world, action[i // 5]).state
+        world, expected = jax.device_get((world, step(tasks, world, action[-1])))
+    found = jax.device_get(jax.jit(jax.vmap(env.step))(tasks, world, action[-1]))
+    error = np.abs(found.state.qvel - expected.state.qvel).max(axis=1) / np.abs(expected.state.qvel).max()
+    assert np.median(error) < 2e-3 and np.quantile(error, 0.9) < 5e-2, np.sort(error)[-16:]  # a puck on its flat side
+    assert np.quantile(np.abs(found.obs - expected.obs), 0.9) < 1e-3
+    for one, other in ((found.state.act, expected.state.act), (found.state.mocap, expected.state.mocap)):
+        np.testing.assert_allclose(np.asarray(one, float), np.asarray(other, float), atol=1e-5)
+
+
+@with_metaworld
+@pytest.mark.parametrize(
+    "names, kind",
+    [
+        (("reach", "push", "pick-place"), Joined),
+        (("window-open", "window-close"), Joined),
+        (("push", "door-open", "drawer-close", "drawer-open", "window-open"), United),
+        (("stick-push", "button-press", "plate-slide"), United),  # the first one feels forces
+    ],
+)
+def test_tasks_step_together_as_they_do_alone(names, kind):
+    """Warp adds up in another order each time."""
+    env = mtjax.mixture([mtjax.make(f"metaworld-{name}", num_draws=2, engine="warp") for name in names])
+    assert [type(group) for group in env.groups] == [kind]
+    require_as_alone(env, atol=2e-3)
+
+
+# Agents.
+
+
+def experience(agent, num_seeds, num_tasks):
+    """Batches (S, T, B, ...), or rollouts (S, T, H, E, ...) for agents that learn from these."""
+    batches = [random_batch(seed, num_tasks, 64, SPEC, agent.history_length) for seed in range(num_seeds)]
+    batch = jax.tree.map(lambda *x: np.stack(x), *batches)
+    if hasattr(agent, "critic_target"):
+        return batch
+    steps = jax.tree.map(lambda x: x.reshape(*x.shape[:2], 8, 8, *x.shape[3:]), batch)
+    random = np.random.default_rng(0)
+    raw = np.arctanh(np.clip(steps.action, -0.99, 0.99))
+    ended = random.random(steps.reward.shape) < 0.1
+    return steps._replace(ended=ended, extras=Taken(raw, random.normal(size=ended.shape).astype(np.float32) - 2, None))
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_agents_learn_as_on_the_cpu(name, num_tasks=10):
+    """Losses of an update, and its gradients by what Adam remembers, seed by seed; of all seeds and of one alone."""
+    with on("cpu"):
+        tasks = tasks_of("one-step", np.linspace(-1, 1, num_tasks))
+    agent, states = learned(name, tasks)
+    with on("cpu"):
+        given = states, experience(agent, SEEDS, num_tasks), jax.random.split(jax.random.key(1), SEEDS)
+    update = updating(agent)
+    expected = run_on("cpu", update, *given, tasks)
+    for count in (SEEDS, 1):
+        require_alike(first(count, expected), run_on("gpu", update, *first(count, given), tasks))
+
+
+def updating(agent):
+    """An update of every seed."""
+    return lambda states, data, keys, tasks: jax.vmap(lambda s, d, k: agent.update(s, d, tasks, k))(states, data, keys)
+
+
+def require_alike(expected, found):
+    """Hold an update's metrics, and its gradients by what Adam remembers, on a GPU against those on the CPU."""
+    (expected, metrics), (found, measured) = expected, found
+    for key, value in metrics.items():
+        assert np.abs(value - measured[key]).max() <= 0.02 * np.abs(value).max() + 1e-4, (len(value), key)
+    leaves = zip(
+        jax.tree_util.tree_leaves_with_path(expected.optimizers), jax.tree.leaves(found.optimizers), strict=True
+    )
+    for (path, one), other in leaves:
+        if ".mu" in jax.tree_util.keystr(path) and one.size:
+            difference, size = (np.linalg.norm(x.reshape(len(x), -1), axis=1) for x in (one - other, one))
+            assert np.all(difference <= 0.05 * size + 1e-7), (jax.tree_util.keystr(path), difference / size)
+
+
+@pytest.mark.parametrize("vision", ["drq", "impala"])
+@pytest.mark.parametrize("name", ["drq", "sac-ae"])
+def test_agents_learn_from_pictures_as_on_the_cpu(name, vision):
+    """Three seeds, whose convolutions follow one another."""
+    agent = mtjax.agent(name, hidden=(64, 64), vision=vision)
+    spec = SPEC._replace(obs={"pixels": jax.ShapeDtypeStruct((SIZE, SIZE, 3), jnp.uint8)}, frames=3)
+    with on("cpu"):
+        tasks, keys = tasks_of("one-step", np.linspace(-1, 1, 2)), jax.random.split(jax.random.key(0), 3)
+        init = jax.jit(jax.vmap(lambda key: agent.init(spec, tasks, key)), compiler_options=QUICK)
+        states = jax.device_get(init(keys))
+        data = jax.tree.map(lambda *x: np.stack(x), *(random_batch(seed, 2, 8, spec) for seed in range(3)))
+    require_alike(*both(updating(agent), states, data, keys, tasks))
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_agents_act_as_on_the_cpu(name):
+    """The mean actions in worlds whose tasks were seen and in others."""
+    with on("cpu"):
+        tasks = tasks_of("one-step", np.linspace(-1, 1, 4))
+    agent, learners = learned(name, tasks)
+
+    def act(states, worlds, obs):
+        shape = obs.shape[:3]
+        age = jnp.zeros(shape, jnp.int32)
+        begin = lambda state, task: agent.begin(state, task)
+        memory = jax.vmap(jax.vmap(jax.vmap(begin, (None, 0)), (None, 0)), (0, None))(
+            states, jax.tree.map(lambda x: jnp.broadcast_to(x[:, None], (*shape[1:], *x.shape[1:])), worlds)
+        )
+        return rollout.act(agent, states, worlds, rollout.Worlds((), None, obs, memory, age), None).action
+
+    for what, (shape, runs) in SHAPES.items():
+        with on("cpu"):
+            worlds = tasks_of("one-step", np.linspace(-1.3, 1.3, shape[1]))
+        obs = np.random.default_rng(1).normal(size=(*shape, SPEC.obs_size)).astype(np.float32)
+        expected, found = both(act, first(shape[0], learners), worlds, obs, runs=runs)
+        error = np.abs(expected - found).max(axis=(0, 2, 3))
+        assert error.max() < 1e-3, (what, error)
+
+
+def test_a_distribution_is_projected_in_a_kernel_of_its_own(rows=1280):
+    """Beside a softmax in one kernel it is many times slower, and XLA takes minutes to compile it."""
+    value = C51()
+    random = np.random.default_rng(0)
+    logits, next_logits = np.float32(random.normal(size=(2, 2, rows, value.num_bins)))
+    reward, discount, bonus = np.float32(random.uniform(size=(3, rows)))
+
+    def loss(logits):
+        target = value.target(next_logits, False, reward, discount, bonus)
+        return jnp.mean(value.loss(logits, target))
+
+    kernels = jax.jit(jax.grad(loss)).lower(logits).compile().as_text().split("\n}\n")
+    projecting = [kernel for kernel in kernels if f"{value.num_bins},{value.num_bins}]" in kernel]
+    assert projecting
+    assert not [kernel for kernel in projecting if " exponential(" in kernel]
