@@ -20,7 +20,7 @@ from mtjax.commands import (
     unknown_flag,
     vary_flags,
 )
-from mtjax.config import NO_FINE_TUNING, RunConfig, from_json, own_files, with_preset
+from mtjax.config import NO_FINE_TUNING, RunConfig, fit_length, from_json, own_files, with_preset
 from mtjax.envs import is_mixture, make, require_pictures
 from mtjax.envs.family import Family
 from mtjax.envs.mixtures import Mixture, require_family
@@ -54,9 +54,10 @@ def parse(argv: Sequence[str]) -> RunConfig:
     of_family: dict[str, Any] = {
         name: value for name in ("combine", "split") if (value := flag_value(argv, _FAMILY_FLAGS[name], ""))
     }
-    pixels = flag_value(argv, "env.pixels", "")
-    if pixels.isdecimal():  # from pictures, agents have other defaults
-        of_family["pixels"] = int(pixels)
+    for name in ("pixels", "num_tasks"):  # from pictures agents have other defaults, and with other numbers of tasks
+        value = flag_value(argv, f"env.{name.replace('_', '-')}", "")
+        if value.isdecimal():
+            of_family[name] = int(value)
     if is_mixture(env_name):
         of_family, argv = _peel_shared(argv, make(env_name))
     deciding = {name: value for name in _DECIDING if (value := flag_value(argv, f"agent.{name}", ""))}
@@ -65,8 +66,14 @@ def parse(argv: Sequence[str]) -> RunConfig:
         default = _fine_tuning(default, source, start, chosen)
     _check_flags(argv, default)
     config = parse_with_tyro(RunConfig, argv, default, "python -m mtjax.train")
+    config = fit_length(config, {name for word in argv if (name := _name(word))})
     config = dataclasses.replace(config, imports=tuple(files))
     return dataclasses.replace(config, imports=own_files(config))
+
+
+def _name(word: str) -> str:
+    """Return the setting of a flag, such as chunk_steps of --chunk-steps=100; an empty string for other words."""
+    return word.split("=", 1)[0].removeprefix("--").replace("-", "_") if word.startswith("--") else ""
 
 
 def _fine_tuning(config: RunConfig, source: RunConfig, start: str, chosen: Mapping[str, str]) -> RunConfig:

@@ -2,10 +2,11 @@
 
 import dataclasses
 import json
+import math
 import shlex
 import sys
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from importlib import resources
 from pathlib import Path
 from types import MappingProxyType
@@ -24,10 +25,15 @@ from mtjax.checks import check_fields, require_values
 from mtjax.commands import PRESETS, is_imported, require_run
 from mtjax.envs import ENVS, is_mixture, make, members
 from mtjax.envs.tabled import Tabled
+from mtjax.experience import Replay
 from mtjax.loop import Settings
 from mtjax.names import nearest_error
 from mtjax.types import InputError
 
+TUNED_TASKS = 10
+"""How many tasks a preset was tuned with if its file does not say so."""
+_EVALUATED = 3  # the most steps that all evaluations play, in steps of the run
+_LEAST = {"num_envs": 1, "batch_size": 4}  # of each task, however many tasks there are
 _MOST_STEPS, _MOST_SEEDS, _MOST_EPISODES = 10**15, 10**5, 10**5
 NO_FINE_TUNING = "fine-tuning takes the networks of one family's tasks to other tasks of the same shapes"
 
@@ -37,13 +43,14 @@ class Plan:
     """How long a run lasts, over which seeds, and when it is evaluated."""
 
     steps: int = 1_000_000
-    """Environment steps of each seed, summed over tasks. They are rounded up to whole chunks."""
+    """Environment steps of each seed, summed over tasks. They are rounded up to whole chunks, all of one length."""
     seed: int = 0
     """The first seed."""
     seeds: int = 1
     """How many seeds to train at once, in one program."""
     eval_every: int = 0
-    """Environment steps between evaluations, rounded up to whole chunks. 0 means ten evaluations in the run."""
+    """Environment steps between evaluations, rounded up to whole chunks. 0 means ten evaluations in the run, and fewer
+    in a short one."""
     eval_episodes: int = 10
     """Episodes of each task in every evaluation."""
 
@@ -143,6 +150,7 @@ def with_preset(
     if preset_of(agent_name).cls.common_presets:
         from_pictures = table("pictures") if _sees_pictures(made) else {}
         chosen = preset.get("training", {}) | preset.get("agent", {}) | from_pictures | chosen
+    chosen = for_tasks(chosen, made.train_count)
     take = lambda cls: {name: chosen.pop(name) for name in list(chosen) if name in cls.__dataclass_fields__}
     planned, played = preset.get("plan", {}) | take(Plan), take(Settings)
     return RunConfig(
@@ -154,6 +162,50 @@ def with_preset(
         family=made,
         learner=agent(agent_name, **{**chosen, **agent_settings}),
     )
+
+
+def for_tasks(preset: Mapping[str, Any], count: int) -> dict[str, Any]:
+    """Return a preset's settings for ``count`` tasks; ``tuned_tasks`` says with how many it was tuned.
+
+    An on-policy agent needs as many worlds for one task as for many, so its preset gives ``worlds``, of all tasks
+    together. An agent with a replay learns from few worlds of one task sooner than from many, as each step of its
+    worlds is followed by as many updates. So its ``num_envs`` and ``batch_size`` hold for each task, up to the tuned
+    number of tasks. With more tasks, all tasks together have as many as there, so that updates are as frequent.
+    docs/results/task-counts.md has the runs.
+    """
+    chosen = dict(preset)
+    tuned = chosen.pop("tuned_tasks", TUNED_TASKS)
+    share = lambda whole, least: max(math.ceil(whole / count), least)
+    if "worlds" in chosen:
+        return chosen | {"num_envs": share(chosen.pop("worlds"), 1)}
+    if count <= tuned:
+        return chosen
+    return chosen | {name: share(chosen[name] * tuned, least) for name, least in _LEAST.items() if name in chosen}
+
+
+def fit_length(config: RunConfig, given: Collection[str]) -> RunConfig:
+    """Return a configuration whose warm-up, chunks and evaluations fit a short run.
+
+    Random actions take at most a tenth of the run, and so does a chunk. All evaluations together play at most three
+    times as many steps on training tasks as the run, but there is one at the end.
+
+    Args:
+        given: names of settings that somebody chose, which stay as they are.
+    """
+    plan, training, experience = config.plan, config.training, config.learner.experience
+    count = config.family.train_count
+    tenth = plan.steps // (10 * count * training.num_envs)
+    if "chunk_steps" not in given:
+        training = dataclasses.replace(training, chunk_steps=min(training.chunk_steps, max(tenth, experience.steps)))
+    if "eval_every" not in given and not plan.eval_every:
+        each = count * plan.eval_episodes * config.family.episode_length
+        often = min(max(_EVALUATED * plan.steps // each, 1), 10)
+        plan = dataclasses.replace(plan, eval_every=0 if often == 10 else math.ceil(plan.steps / often))
+    learner = config.learner
+    if isinstance(experience, Replay) and "warmup_steps" not in given:
+        least = max(experience.window(config.family.spec), 1)
+        learner = replace(learner, {"warmup_steps": min(experience.warmup_steps, max(tenth, least))})
+    return dataclasses.replace(config, plan=plan, training=training, learner=learner)
 
 
 def configure(agent: Any, settings: Settings, given: Mapping[str, Any]) -> tuple[Any, Settings]:

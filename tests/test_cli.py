@@ -26,7 +26,7 @@ from mtjax.agents import AGENTS
 from mtjax.agents import settings as settings_of
 from mtjax.agents.choices import CHOICES
 from mtjax.agents.parts.representations import DeepMDP
-from mtjax.config import from_json, load_preset, slow_on_cpu, to_json, with_preset
+from mtjax.config import for_tasks, from_json, load_preset, slow_on_cpu, to_json, with_preset
 from mtjax.envs import BENCHMARKS, ENVS
 from mtjax.loop import Settings
 from mtjax.names import notice
@@ -171,7 +171,8 @@ def test_presets_name_only_what_there_is(file):
     known = {"plan": fields(Plan), "agent": set(settings_of(mtjax.agent("sac")))}
     known["training"] = known["agent"] | fields(Settings)
     known["pictures"] = known["training"] | fields(Plan)
-    known |= {name: set(settings_of(mtjax.agent(name))) | fields(Settings) | fields(Plan) for name in AGENTS}
+    of_agents = fields(Settings) | fields(Plan) | {"worlds", "tuned_tasks"}
+    known |= {name: set(settings_of(mtjax.agent(name))) | of_agents for name in AGENTS}
     for tables in preset.values():
         for table, settings in tables.items():
             assert set(settings) <= known[table], table
@@ -201,10 +202,51 @@ def test_every_preset_makes_a_program(env, agent, preset):
     expected = load_preset("+", preset).get(agent, {}) | tables.get(agent, {})
     if agent != "ppo":  # the tables of all agents are tuned for replay
         expected = tables["training"] | tables["agent"] | expected
+    expected = for_tasks(expected, program.family.train_count)
     found = settings_of(program.learner) | dataclasses.asdict(program.training) | dataclasses.asdict(program.plan)
     assert set(expected) <= set(found)
     for name, value in expected.items():
         assert found[name] == (tuple(value) if isinstance(value, list) else value)
+
+
+@pytest.mark.parametrize(
+    "count, worlds, by_task, tuned_with_fifty",
+    [
+        (1, 2048, (16, 32), (16, 32)),
+        (10, 205, (16, 32), (16, 32)),
+        (50, 41, (4, 7), (16, 32)),
+        (200, 11, (1, 4), (4, 8)),
+    ],
+)
+def test_a_preset_is_fitted_to_the_number_of_tasks(count, worlds, by_task, tuned_with_fifty):
+    """What PPO's preset gives is of the whole; what a replay's gives is of a task, up to the tuned number of tasks."""
+    sizes = {"num_envs": 16, "batch_size": 32}
+    assert for_tasks({"worlds": 2048, "epochs": 4}, count) == {"num_envs": worlds, "epochs": 4}
+    assert tuple(for_tasks(sizes, count).values()) == by_task
+    assert tuple(for_tasks({**sizes, "tuned_tasks": 50}, count).values()) == tuned_with_fifty
+
+
+def test_the_number_of_tasks_decides_however_it_is_given():
+    ranges = cli.parse(["--env=finger-spin", "--env.vary.size=0.9:1.1:50"])
+    drawn = cli.parse(["--env=point-mass-vary-goal", "--env.num-tasks=50"])
+    mixed = cli.parse(["--env=finger-spin+cheetah-run", "--env.vary.finger-spin.size=0.9:1.1:49"])
+    for program in (ranges, drawn, mixed):
+        assert program.family.train_count == 50
+        assert (program.training.num_envs, program.learner.experience.batch_size) == (4, 7)
+
+
+def test_a_short_run_is_not_all_warm_up():
+    """A tenth of it is, and it has a line of metrics for each tenth; what is given holds."""
+    flags = ["--env=finger-spin-vary-size", "--steps=100000"]
+    short = cli.parse(flags)
+    assert (short.learner.experience.warmup_steps, short.training.chunk_steps) == (62, 62)  # of 625
+    assert short.plan.eval_every == 33_334  # three evaluations play as many steps as the run, each
+    given = cli.parse([*flags, "--warmup-steps=500", "--chunk-steps=400", "--eval-every=20000"])
+    assert (given.learner.experience.warmup_steps, given.training.chunk_steps) == (500, 400)
+    assert given.plan.eval_every == 20_000
+    assert cli.parse([*flags, "--n-step=100"]).learner.experience.warmup_steps == 100
+    whole = cli.parse(flags[:1])
+    assert (whole.learner.experience.warmup_steps, whole.training.chunk_steps, whole.plan.eval_every) == (2000, 500, 0)
 
 
 @pytest.mark.parametrize("agent", ["drq", "sac-ae", "deepmdp"])

@@ -633,6 +633,8 @@ def test_chunks_are_no_longer_than_the_run():
     """Whole iterations, at least as many as the steps need."""
     assert fit_chunk(Settings(num_envs=2, chunk_steps=1000), 3, 601).chunk_steps == 101
     assert fit_chunk(Settings(num_envs=2, chunk_steps=10), 3, 601).chunk_steps == 10
+    assert fit_chunk(Settings(num_envs=2, chunk_steps=60), 3, 601).chunk_steps == 51  # two chunks of 101 steps
+    assert fit_chunk(Settings(num_envs=2, chunk_steps=60), 3, 601, grain=32).chunk_steps == 64
 
 
 @pytest.mark.parametrize("plan, every", [(Plan(5), 1), (Plan(101), 11), (Plan(100), 10), (Plan(100, eval_every=7), 7)])

@@ -10,7 +10,7 @@ from mtjax.agents import BaseAgent
 from mtjax.agents.choices import flag_names, unknown_setting
 from mtjax.agents.choices import settings as settings_of
 from mtjax.checks import checked, path
-from mtjax.config import Plan, RunConfig, configure, from_json, own_files, with_preset
+from mtjax.config import Plan, RunConfig, configure, fit_length, from_json, own_files, with_preset
 from mtjax.envs import BENCHMARKS, ENVS, is_mixture, make, members, name_of
 from mtjax.envs.family import Family
 from mtjax.envs.tabled import Tabled
@@ -180,6 +180,9 @@ def _configured(
     learner, training = configure(config.learner, base, rest)
     config = dataclasses.replace(config, training=training, learner=learner, start=_place_of(start))
     config = dataclasses.replace(config, plan=dataclasses.replace(config.plan, **plan))
+    if isinstance(agent, str):
+        chosen = {name for name in plan if plan[name] != getattr(Plan, name)}
+        config = fit_length(config, {*given, *chosen, *(_names(Settings) if settings is not None else ())})
     named = env_name in ENVS or is_mixture(env_name)
     return dataclasses.replace(config, imports=own_files(config)) if named else config
 

@@ -103,6 +103,7 @@ def _introduction(config: RunConfig, directory: Path | None, resume: bool, label
     lines = [f"{label}: {' '.join(config.sweep)}"] if config.sweep else []
     seeds = f"seeds {plan.seed} to {plan.seed + plan.seeds - 1}" if plan.seeds > 1 else f"seed {plan.seed}"
     lines.append(f"{config.agent} on {config.env}: {config.family.summary}, {seeds}")
+    lines.append(_sizes(config))
     lines += [line for line in (_origin(config),) if line]
     lines += [] if directory is None else [f"run: {directory}"]
     if resume and "warp" in config.family.engine_name:
@@ -112,6 +113,14 @@ def _introduction(config: RunConfig, directory: Path | None, resume: bool, label
     if resume and config.learner.lr_schedule != "constant" and not config.learner.lr_updates:
         lines.append(f"learning rates go on along the schedule of a run of {plan.steps:,} steps")
     return "\n".join(lines)
+
+
+def _sizes(config: RunConfig) -> str:
+    """Return a line on how many worlds and transitions of a batch a task has, and all tasks together."""
+    count, experience = config.family.train_count, config.learner.experience
+    sizes = {"worlds": config.training.num_envs, "transitions in a batch": getattr(experience, "batch_size", 0)}
+    told = lambda size: f"{size:,}" if count == 1 else f"{size:,} a task, {count * size:,} in all"
+    return "; ".join(f"{name}: {told(size)}" for name, size in sizes.items() if size)
 
 
 def _warning(family: str, agent: str) -> str:

@@ -108,9 +108,10 @@ def train(
 
 
 def fit_chunk(settings: Settings, num_tasks: int, steps: int, grain: int = 1) -> Settings:
-    """Return settings whose chunks are no longer than the run, rounded up to a multiple of ``grain`` steps."""
+    """Return settings whose chunks divide the run evenly, each a multiple of ``grain`` steps."""
     whole_run = math.ceil(steps / (num_tasks * settings.num_envs))
-    chunk = math.ceil(min(settings.chunk_steps, whole_run) / grain) * grain
+    longest = math.ceil(min(settings.chunk_steps, whole_run) / grain) * grain
+    chunk = math.ceil(whole_run / math.ceil(whole_run / longest) / grain) * grain
     return dataclasses.replace(settings, chunk_steps=chunk)
 
 
