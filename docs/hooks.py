@@ -13,7 +13,7 @@ import tempfile
 import textwrap
 from collections.abc import Iterable, Iterator
 from functools import lru_cache
-from itertools import pairwise
+from itertools import pairwise, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,9 @@ from mkdocs.structure.files import File, Files
 from mtjax import agents, envs
 from mtjax.agents.choices import PARTS, flag_names, kinds_of, settings
 from mtjax.agents.parts import name_of
+from mtjax.envs.domain import Domain
+from mtjax.envs.family import Family
+from mtjax.envs.pixels import Pictured
 from mtjax.names import InputError, first_sentence
 from mtjax.report import figures
 
@@ -31,6 +34,7 @@ ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
 PICTURES = Path(__file__).parent / "pictures" / "families"
 PICTURE = "../../benchmarks/results/"  # as pages name it, so that it is found on the site and in the repository
+_UNSEARCHED = "{ data-search-exclude }"  # of a heading whose tables, repeated on every page, would drown the search
 GROUPS = {  # title -> whether a family belongs there; the first that fits
     "Brax": lambda name, module: module.endswith("envs.brax"),
     "MTEnv's own": lambda name, module: ".mtenv." in module,
@@ -112,7 +116,7 @@ def family_page(name: str) -> str:
     cls, _ = envs.ENVS[name]
     family = envs.make(name)
     text = f"# {name}\n\n{_picture(name)}```bash\npython -m mtjax.train --env={name}\n```\n\n"
-    text += f"{to_markdown(cls.__doc__)}\n"
+    text += f"{to_markdown(cls.__doc__)}\n" + "".join(_inherited(base) for base in _described_bases(cls))
     if family.parameters:
         text += "\n## Parameters\n\n| parameter | unit | nominal | in this family |\n|---|---|---|---|\n"
         vary = dict(family.vary)
@@ -124,9 +128,19 @@ def family_page(name: str) -> str:
     return text + _family_settings(family)
 
 
+def _described_bases(cls: type) -> list[type]:
+    """Return the classes that a family is made from, up to those that all families are made from."""
+    bases = takewhile(lambda base: base not in (Domain, Pictured, Family), cls.__mro__[1:])
+    return [base for base in bases if base.__doc__ and base.__module__.startswith("mtjax")]
+
+
+def _inherited(base: type) -> str:
+    return f"\n## {base.__name__}\n\nThe text above says what differs from this.\n\n{to_markdown(base.__doc__)}\n"
+
+
 def _family_settings(family: Any) -> str:
     documented = _fields(type(family))
-    text = f"\n## Settings\n\nFields of `{type(family).__module__}.{type(family).__name__}`.\n\n"
+    text = f"\n## Settings {_UNSEARCHED}\n\nFields of `{type(family).__module__}.{type(family).__name__}`.\n\n"
     text += "| flag | default | |\n|---|---|---|\n"
     for field in dataclasses.fields(family):
         if field.name not in ("vary", "context_ranges"):
@@ -236,7 +250,7 @@ def agent_page(name: str) -> str:
 def _settings(agent: Any) -> str:
     holders = [agent, *(getattr(agent, kind) for kind in kinds_of(agent)), agent.experience]
     documented = {name: text for holder in reversed(holders) for name, text in _fields(type(holder)).items()}
-    values, text = settings(agent), "\n## Settings\n\n| flag | default | |\n|---|---|---|\n"
+    values, text = settings(agent), f"\n## Settings {_UNSEARCHED}\n\n| flag | default | |\n|---|---|---|\n"
     for name, flag in flag_names(agent).items():
         text += _row(f"`--{flag}`", values[name], documented.get(name, "a part, chosen by name"))
     return text
@@ -365,11 +379,24 @@ def _blocks(lines: Iterable[str]) -> Iterator[tuple[str, list[str]]]:
 
 
 def _block(text: str, below: list[str]) -> str:
-    if text.endswith(":") and below:
-        if not any(re.match(r"[\w, -]+: ", line) for line in below):
-            return f"{text}\n\n```text\n{chr(10).join(below)}\n```"
-        joined = re.sub(r"\n +", " ", "\n".join(below)).splitlines()
-        items = [re.sub(r"^([\w, -]+?):", r"**\1**:", line) for line in joined]
+    if below and text.endswith(":") and any(re.match(r"[\w, -]+: ", line) for line in below):
+        items = [re.sub(r"^([\w, -]+?):", r"**\1**:", line) for line in _items(below)]
         return f"**{text}**\n\n" + "\n".join(f"- {item}" for item in items)
+    if below and not re.match(_LABEL, text) and re.search(r" (=|<-) ", below[0]):
+        return f"{text}\n\n```text\n{chr(10).join(below)}\n```"
     whole = " ".join([text, *(line.strip() for line in below)])
-    return re.sub(r"^([A-Z][\w ]*?(?: \([^)]*\))?(?:,[^:.]*)?): ", r"**\1**: ", whole)
+    return re.sub(_LABEL, r"**\1**: ", whole)
+
+
+def _items(lines: list[str]) -> list[str]:
+    """Join the lines of each item. An item goes on in lines that are indented, or that follow an open sentence."""
+    items: list[str] = []
+    for line in lines:
+        if items and (line.startswith(" ") or not items[-1].endswith((".", ";"))):
+            items[-1] += f" {line.strip()}"
+        else:
+            items.append(line)
+    return items
+
+
+_LABEL = r"^([A-Z][\w ]*?(?: \([^)]*\))?(?:,[^:.]*)?): "
