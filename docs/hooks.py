@@ -34,7 +34,7 @@ ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
 PICTURES = Path(__file__).parent / "pictures" / "families"
 PICTURE = "../../benchmarks/results/"  # as pages name it, so that it is found on the site and in the repository
-_UNSEARCHED = "{ data-search-exclude }"  # of a heading whose tables, repeated on every page, would drown the search
+_UNSEARCHED = "{ data-search-exclude }"  # of a heading whose text is on many pages, and would drown the search
 GROUPS = {  # title -> whether a family belongs there; the first that fits
     "Brax": lambda name, module: module.endswith("envs.brax"),
     "MTEnv's own": lambda name, module: ".mtenv." in module,
@@ -135,7 +135,8 @@ def _described_bases(cls: type) -> list[type]:
 
 
 def _inherited(base: type) -> str:
-    return f"\n## {base.__name__}\n\nThe text above says what differs from this.\n\n{to_markdown(base.__doc__)}\n"
+    title = f"\n## {base.__name__} {_UNSEARCHED}\n\nThe text above says what differs from this.\n\n"
+    return f"{title}{to_markdown(base.__doc__)}\n"
 
 
 def _family_settings(family: Any) -> str:
@@ -175,12 +176,12 @@ def _score(row: dict[str, str]) -> str:
 def _family_figures(name: str) -> str:
     text = ""
     if rows := _rows(RESULTS / "h200-returns" / "table.md", 0, name):
-        text += "\n### One H200, three seeds\n\n" + rows
+        text += f"\n### One H200, three seeds {_UNSEARCHED}\n\n{rows}"
         text += "\nThe [command](../results/returns.md#returns-within-minutes-of-training-on-one-h200-three-seeds).\n"
     text += _methods(0, name)
     for runs, (title, place) in _ONE_SEED.items():
         for row in _runs_of(runs, name)[-1:]:
-            text += f"\n### {title}\n\n{row['agent']} had a return of {_score(row)} after "
+            text += f"\n### {title} {_UNSEARCHED}\n\n{row['agent']} had a return of {_score(row)} after "
             text += f"{float(row['seconds']):.0f} seconds ({int(row['steps']):,} steps). The "
             text += f"[command](../results/returns.md#{place}).\n\n![return over steps]({name}-{runs}.png)\n"
     return f"\n## Figures\n{text}" if text else ""
@@ -261,7 +262,7 @@ def _methods(column: int, name: str) -> str:
     text = ""
     for folder, title, place in _METHODS:
         if rows := _rows(RESULTS / folder / "table.md", column, name):
-            text += f"\n### {title}\n\n{rows}\nThe [command](../results/methods.md#{place}).\n"
+            text += f"\n### {title} {_UNSEARCHED}\n\n{rows}\nThe [command](../results/methods.md#{place}).\n"
     return text
 
 
@@ -283,7 +284,7 @@ def _fields(cls: type) -> dict[str, str]:
 def _agent_figures(name: str) -> str:
     text = ""
     if rows := _rows(RESULTS / "h200-returns" / "table.md", 1, name.upper()):
-        text += "\n### One H200, three seeds\n\n" + rows
+        text += f"\n### One H200, three seeds {_UNSEARCHED}\n\n{rows}"
         text += "\nThe [command](../results/returns.md#returns-within-minutes-of-training-on-one-h200-three-seeds).\n"
     text += _methods(1, name)
     if f"agents/{name}" in _curves():
@@ -291,7 +292,7 @@ def _agent_figures(name: str) -> str:
     costs = {machine: _cost(file, name) for machine, file in _COSTS.items()}
     if any(costs.values()):
         told = ", ".join(f"{cost:.2f} times sac on {machine}" for machine, cost in costs.items() if cost)
-        text += f"\n### Cost of an update\n\n{told}, ten tasks. "
+        text += f"\n### Cost of an update {_UNSEARCHED}\n\n{told}, ten tasks. "
         text += "The [command](../results/speed.md#what-an-update-of-every-agent-costs).\n"
     return f"\n## Figures\n{text}" if text else ""
 

@@ -53,9 +53,9 @@ def test_links_lead_to_files(page):
 @pytest.mark.slow
 def test_commands_of_the_documentation_parse():
     """Every whole training command in README and docs names what exists."""
-    found = [each for page in PAGES for each in commands(page.read_text())]
+    found = {tuple(each) for page in PAGES for each in commands(page.read_text())}
     assert len(found) >= 5
-    for each in found:
+    for each in sorted(found):
         parse([word for word in each if word != "&"])
 
 
@@ -63,6 +63,38 @@ def test_examples_in_the_pages_exist():
     """Files that pages include are files of the repository."""
     included = [name for page in DOCS for name in re.findall(r'--8<-- "([^"]+)"', page.read_text())]
     assert included and all((ROOT / name).is_file() for name in included)
+
+
+@pytest.fixture(scope="module")
+def hooks():
+    """Return the module that makes pages of the site."""
+    pytest.importorskip("mkdocs", reason="needs the extra docs")
+    spec = importlib.util.spec_from_file_location("hooks", ROOT / "docs" / "hooks.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_items_of_a_docstring_stay_whole(hooks):
+    """An item of a list goes on in the next line, indented or not, until its sentence ends."""
+    items = ["Size: two blocks of", "4096.", "Rate: it falls to", "    5e-5.", "``C51`` says more."]
+    made = hooks.to_markdown("Learns.\n\nDiffers in:\n    " + "\n    ".join(items))
+    joined = ["**Size**: two blocks of 4096.", "**Rate**: it falls to 5e-5.", "``C51`` says more."]
+    assert made.splitlines()[4:] == [f"- {item}" for item in joined]
+
+
+def test_equation_below_a_sentence_is_code(hooks):
+    """An indented equation is set apart, and an indented line that goes on with a label's text is not."""
+    made = hooks.to_markdown("Learns.\n\nLayers compute\n    x <- W x\n\nStart: at rest, with\n    angle = 0.")
+    assert made == "Learns.\n\nLayers compute\n\n```text\nx <- W x\n```\n\n**Start**: at rest, with angle = 0."
+
+
+def test_pages_of_families_name_their_reward(hooks):
+    """A family that changes another one shows that one's text too, up to the reward and the observation."""
+    for name in ("walker-run", "cartpole-swingup", "hopper-hop-backward"):
+        page = hooks.family_page(name)
+        assert "**Reward**: " in page and "**Observation (" in page
 
 
 @pytest.mark.slow
