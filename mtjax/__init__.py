@@ -1,9 +1,32 @@
 """Multi-task reinforcement learning in JAX: tasks as data, physics and learning in one compiled loop."""
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mtjax.names import lazily
+
+if TYPE_CHECKING:  # for editors, which do not run __getattr__
+    from mtjax import report as report
+    from mtjax.agents import AGENTS as AGENTS
+    from mtjax.agents import agent as agent
+    from mtjax.config import with_preset as preset  # noqa: F401
+    from mtjax.envs import ENVS as ENVS
+    from mtjax.envs import make as make
+    from mtjax.envs import mixture as mixture
+    from mtjax.envs import stacked as stacked
+    from mtjax.loop import Settings as Settings
+    from mtjax.names import InputError as InputError
+    from mtjax.registry import register as register
+    from mtjax.report.drawing import plot as plot
+    from mtjax.report.frames import runs as runs
+    from mtjax.report.scoring import evaluate as evaluate
+    from mtjax.training.api import train as train
+    from mtjax.training.export import export as export
+    from mtjax.training.policy import load as load
+    from mtjax.training.result import Result as Result
+    from mtjax.types import Step as Step
+    from mtjax.types import Task as Task
+    from mtjax.types import Transition as Transition
 
 __version__ = "0.1.0"
 
@@ -17,26 +40,22 @@ _HOME = {
     "Task": "mtjax.types",
     "Transition": "mtjax.types",
     "agent": "mtjax.agents",
+    "evaluate": "mtjax.report.scoring",
     "export": "mtjax.training.export",
     "load": "mtjax.training.policy",
     "make": "mtjax.envs",
     "mixture": "mtjax.envs",
+    "plot": "mtjax.report.drawing",
     "preset": "mtjax.config:with_preset",
     "register": "mtjax.registry",
     "runs": "mtjax.report.frames",
     "stacked": "mtjax.envs",
+    "train": "mtjax.training.api",
 }
-_MODULES = ("report", "train")  # the module train has the name of the function, and can be called
-__all__ = [*_HOME, *_MODULES]
-
-
-_find = lazily(__name__, _HOME)
+__all__ = [*_HOME, "report"]
+_find, __dir__ = lazily(__name__, _HOME)
 
 
 def __getattr__(name: str) -> Any:
     """Import a public name when it is first used, so that ``import mtjax`` takes no time."""
-    return import_module(f"mtjax.{name}") if name in _MODULES else _find(name)
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return import_module("mtjax.report") if name == "report" else _find(name)

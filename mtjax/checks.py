@@ -15,6 +15,7 @@ from mtjax.names import InputError
 OF_TRAIN = ("steps", "seed", "seeds", "eval_every", "eval_episodes", "num_envs", "chunk_steps", "stagger")
 """The settings of ``mtjax.train`` that are neither the agent's nor the environment's."""
 _LARGEST, _LARGEST_FLOAT = 2**31 - 1, 3.4e38  # of 32 bits
+_MOST_EPISODES, _LARGEST_SEED = 100_000, 2_000_000_000
 
 
 def checked(cls: Any, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -123,6 +124,25 @@ def shown(value: Any) -> str:
     """Return a value as text for a message, or the name of its type if that is long."""
     text = repr(value)
     return text if len(text) <= 60 else f"a {type(value).__name__}"
+
+
+def require_episodes(episodes: Any, seed: Any, task_seed: Any, checkpoint: Any) -> None:
+    """Check the numbers of an evaluation; ``task_seed`` may be None.
+
+    Raises:
+        InputError: one is no whole number, or out of its bounds.
+    """
+    _require_whole("episodes", episodes, 1, _MOST_EPISODES)
+    _require_whole("seed", seed, 0, _LARGEST_SEED)
+    _require_whole("task-seed", 0 if task_seed is None else task_seed, 0, _LARGEST_SEED)
+    _require_whole("checkpoint", checkpoint, 0, _LARGEST)
+
+
+def _require_whole(name: str, value: Any, least: int, most: int) -> None:
+    if not _is_whole(value):
+        raise InputError(f"{name} must be a whole number, not {shown(value)}{_hint(int, value)}")
+    if not least <= value <= most:
+        raise InputError(f"{name} must be at least {least} and at most {most}, not {value}")
 
 
 def path(value: Any, name: str = "directory") -> Path:

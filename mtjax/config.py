@@ -27,7 +27,7 @@ from mtjax.envs import ENVS, is_mixture, make, members
 from mtjax.envs.tabled import Tabled
 from mtjax.experience import Replay
 from mtjax.loop import Settings
-from mtjax.names import nearest_error
+from mtjax.names import nearest_error, public
 from mtjax.types import InputError
 
 TUNED_TASKS = 10
@@ -122,6 +122,7 @@ class RunConfig:
     learner: Annotated[BaseAgent, tyro.conf.arg(name="agent")] = dataclasses.field(default_factory=lambda: agent("sac"))
 
 
+@public
 def with_preset(
     env_name: str,
     agent_name: str,

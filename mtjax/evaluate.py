@@ -5,9 +5,8 @@ import math
 from collections.abc import Sequence
 
 from mtjax import commands, shipped
-from mtjax.names import SPLITS, InputError, load, nearest_error
-
-_MOST_EPISODES, _LARGEST_SEED = 100_000, 2_000_000_000
+from mtjax.checks import require_episodes
+from mtjax.names import SPLITS, InputError, become, load, nearest_error
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,6 +43,11 @@ class Request:
     diagnostics: bool = False
     """Measure conflicts between the tasks' gradients, and unused units of the networks, from the run's replay."""
 
+    @property
+    def drawn(self) -> int | None:
+        """The seed of other tasks than the run's, if any."""
+        return None if self.task_seed == -1 else self.task_seed
+
 
 def main(argv: Sequence[str]) -> None:
     """Read the command line first, then import the evaluation code and score the run."""
@@ -60,14 +64,7 @@ def _parse(argv: Sequence[str]) -> tuple[Request, dict[str, str]]:
     request = commands.parse_with_tyro(Request, argv, Request(), "python -m mtjax.evaluate")
     if not request.run:
         raise InputError("say which run to evaluate: --run=DIR")
-    if not 1 <= request.episodes <= _MOST_EPISODES:
-        raise InputError(f"episodes must be at least 1 and at most {_MOST_EPISODES}, not {request.episodes}")
-    if not 0 <= request.seed <= _LARGEST_SEED:
-        raise InputError(f"seed must be at least 0 and at most {_LARGEST_SEED}, not {request.seed}")
-    if not -1 <= request.task_seed <= _LARGEST_SEED:
-        raise InputError(f"task-seed must be at least 0 and at most {_LARGEST_SEED}, not {request.task_seed}")
-    if request.checkpoint < 0:
-        raise InputError(f"checkpoint must be at least 0, not {request.checkpoint}")
+    require_episodes(request.episodes, request.seed, request.drawn, request.checkpoint)
     if not 0 < request.video_seconds < math.inf:
         raise InputError(f"video-seconds must be greater than 0, not {request.video_seconds:g}")
     for split in request.video_splits:
@@ -78,7 +75,7 @@ def _parse(argv: Sequence[str]) -> tuple[Request, dict[str, str]]:
         raise InputError("--video-splits and --video-tasks say what to film; give --video as well")
     if vary and (request.video_splits or request.diagnostics):
         raise InputError("tasks of --env.vary belong to no split, and diagnostics are of the run's own tasks")
-    if request.task_seed >= 0 and (vary or request.diagnostics):
+    if request.drawn is not None and (vary or request.diagnostics):
         raise InputError("--task-seed draws other tasks; leave out --env.vary, and diagnostics of the run's own tasks")
     folder = shipped.folder(request.run)
     commands.require_run(folder)
@@ -94,3 +91,5 @@ def run() -> None:
 
 if __name__ == "__main__":
     run()
+else:
+    become(__name__, "mtjax.report.scoring:evaluate")

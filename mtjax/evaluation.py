@@ -95,7 +95,16 @@ def _require_fit(path: Path, found: Evaluations) -> None:
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
-def evaluate(env: Env, agent: Agent, episodes: int, state: Any, tasks: Task, seeds: Array, number: Array) -> Scores:
+def evaluate(
+    env: Env,
+    agent: Agent,
+    episodes: int,
+    state: Any,
+    tasks: Task,
+    seeds: Array,
+    number: Array,
+    places: Array | None = None,
+) -> Scores:
     """Play whole episodes under the mean action.
 
     An episode whose world is lost (``step_envs``) keeps what it had before.
@@ -105,11 +114,14 @@ def evaluate(env: Env, agent: Agent, episodes: int, state: Any, tasks: Task, see
         tasks: (T, ...), training tasks or not.
         seeds: (S,) the runs' seeds.
         number: () number of the evaluation in the run; each has fresh keys, independent of training.
+        places: (T,) of ``tasks`` among all tasks of ``env``, whose episodes they then play; None: they are all tasks.
     """
 
     shape = (len(seeds), len(tasks.id), episodes)
     fresh = lambda seed: jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), 0x7E57), number)
-    keys = jax.vmap(lambda seed: jax.random.split(fresh(seed), shape[1:]))(seeds)
+    drawn = shape[1:] if places is None else (len(env.tasks("all").id), episodes)
+    keys = jax.vmap(lambda seed: jax.random.split(fresh(seed), drawn))(seeds)
+    keys = keys if places is None else keys[:, places]
 
     def step(carry, _):
         worlds, scores, alive = carry

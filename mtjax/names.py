@@ -2,6 +2,7 @@
 
 import contextlib
 import difflib
+import functools
 import os
 import sys
 import time
@@ -9,7 +10,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 SPLITS = ("train", "interpolation", "extrapolation")
 CHOICES = ("representation", "encoder", "gradients", "value", "scaling", "sampler")
@@ -17,6 +18,8 @@ CHOICES = ("representation", "encoder", "gradients", "value", "scaling", "sample
 BEGAN = time.time()
 """When this process began to import the package, in seconds since 1970."""
 _MANY = 20
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 class InputError(ValueError):
@@ -103,8 +106,10 @@ def load(place: Any) -> Any:
     return getattr(import_module(module), name)
 
 
-def lazily(module: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
-    """Return a ``__getattr__`` for a module that imports each name when it is first used.
+def lazily(module: str, homes: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """Return ``__getattr__`` and ``__dir__`` for a module that imports each name when it is first used.
+
+    Completion shows the names of its ``__all__``.
 
     Args:
         homes: name -> the module that defines it, or "module:other" if it has another name there.
@@ -118,4 +123,37 @@ def lazily(module: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
         setattr(sys.modules[module], name, found)
         return found
 
-    return find
+    return find, lambda: sorted(vars(sys.modules[module])["__all__"])
+
+
+def become(module: str, place: str) -> None:
+    """Let ``import mtjax.NAME`` give the function ``mtjax.NAME``, where a command's module has a function's name.
+
+    The function gets what the module defines as attributes.
+
+    Args:
+        module: the module, which is imported and not run.
+        place: the function, as for ``load``.
+    """
+    held, function = vars(sys.modules[module]), load(place)
+    vars(function).update({name: held[name] for name in held if not name.startswith("_") or name == "__spec__"})
+    sys.modules[module] = function
+
+
+def public(function: Callable[P, R]) -> Callable[P, R]:
+    """Let a user's mistake end at the user's own line: an InputError passes without the frames of this package.
+
+    ``MTJAX_TRACEBACK=full`` keeps them.
+    """
+
+    @functools.wraps(function)
+    def called(*args: P.args, **kwargs: P.kwargs) -> R:
+        __tracebackhide__ = True  # which IPython and pytest read
+        try:
+            return function(*args, **kwargs)
+        except InputError as error:
+            if os.environ.get("MTJAX_TRACEBACK") == "full":
+                raise
+            raise error.with_traceback(None) from error.__cause__
+
+    return called

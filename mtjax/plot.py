@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 
 from mtjax import commands
-from mtjax.names import SPLITS, InputError, load, nearest_error
+from mtjax.names import SPLITS, InputError, become, load, nearest_error
 
 FIGURES = ("curves", "families", "parameter", "iqm", "profile", "improvement", "all")
 ENDINGS = (".png", ".pdf", ".svg")
@@ -67,3 +67,5 @@ def run() -> None:
 
 if __name__ == "__main__":
     run()
+else:
+    become(__name__, "mtjax.report.drawing:plot")

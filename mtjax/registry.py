@@ -10,9 +10,10 @@ from mtjax.agents.base import BaseAgent
 from mtjax.agents.choices import CHOICES, PARTS
 from mtjax.checks import shown
 from mtjax.envs.family import Family
-from mtjax.names import InputError, first_sentence
+from mtjax.names import InputError, first_sentence, public
 
 
+@public
 def register(name: str, thing: "type | str", **defaults: Any) -> None:
     """Register your own class under a name that Python, notebooks and the command line accept.
 
@@ -30,7 +31,7 @@ def register(name: str, thing: "type | str", **defaults: Any) -> None:
     if not isinstance(name, str) or not re.fullmatch(r"\w[\w.-]*", name):  # "+" joins the names of a mixture
         raise InputError(f"a name is of letters, digits, -, _ and ., such as 'my-own', not {shown(name)}")
     if isinstance(thing, str):
-        known, home = agents.preset_of(thing), sys._getframe(1).f_globals.get("__file__", "")
+        known, home = agents.preset_of(thing), sys._getframe(2).f_globals.get("__file__", "")
         return _register_agent(name, known._replace(defaults={**known.defaults, **defaults}, home=home))
     if not isinstance(thing, type):
         raise InputError(f"register takes a class, or the name of an agent, not {shown(thing)}")

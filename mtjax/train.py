@@ -1,15 +1,9 @@
 """``python -m mtjax.train``: train an agent on a family of tasks, and write the results to a folder."""
 
-import sys
-import types
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from mtjax import commands, flag_files
-from mtjax.names import load
-
-if TYPE_CHECKING:
-    from mtjax.training.run import Result
+from mtjax.names import become, load
 
 
 def main(argv: Sequence[str]) -> None:
@@ -36,19 +30,12 @@ def _run(argv: Sequence[str]) -> None:
     load("mtjax.training.main:main")(argv, load("mtjax.cli:parse"))
 
 
-class _CallableModule(types.ModuleType):
-    """A module that can be called: ``mtjax.train(...)`` works even after ``import mtjax.train``."""
-
-    def __call__(self, *args, **kwargs) -> "Result":
-        return load("mtjax.training.api:train")(*args, **kwargs)
-
-
 def run() -> None:
     """Run the command line."""
     commands.main(main)
 
 
-sys.modules[__name__].__class__ = _CallableModule
-
 if __name__ == "__main__":
     run()
+else:
+    become(__name__, "mtjax.training.api:train")

@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import errno
+import inspect
 import os
 import shlex
 import signal
@@ -502,6 +503,6 @@ def test_train_is_a_function_and_a_module():
     """Importing the program does not take the function's name away."""
     import mtjax.train as module
 
-    assert callable(mtjax.train) and module is mtjax.train
+    assert callable(mtjax.train) and module is mtjax.train and inspect.isfunction(module.main)
     with pytest.raises(InputError, match="steps must be at least 1"):
         mtjax.train(mtjax.make("finger-spin"), mtjax.agent("sac"), steps=0)

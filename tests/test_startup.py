@@ -120,7 +120,7 @@ def test_devices_are_found_while_the_rest_is_imported(monkeypatch):
         return rest if place == "mtjax.training.main:main" else names.load(place)
 
     monkeypatch.setattr("jax.devices", devices)
-    monkeypatch.setattr(train, "load", load)
+    monkeypatch.setitem(train.main.__globals__, "load", load)
     train.main(["--env=finger-spin"])
     assert answered.wait(60) and waited == [True]
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mtjax.checks import shown
-from mtjax.names import CHOICES, InputError, frozen, lazily, load, nearest_error
+from mtjax.names import CHOICES, InputError, frozen, lazily, load, nearest_error, public
 
 if TYPE_CHECKING:
     from mtjax.agents.base import BaseAgent
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from mtjax.agents.sac import SAC
 
 _PLACES = {"PARTS": "choices", "settings": "choices", "BaseAgent": "base", "SAC": "sac"}
-__getattr__ = lazily(__name__, {name: f"mtjax.agents.{place}" for name, place in _PLACES.items()})
+__getattr__, __dir__ = lazily(__name__, {name: f"mtjax.agents.{place}" for name, place in _PLACES.items()})
 
 
 class Preset(NamedTuple):
@@ -77,6 +77,7 @@ AGENTS: dict[str, Preset] = {
 }
 
 
+@public
 def agent(name: str, **given: Any) -> "BaseAgent":
     """Return the agent called ``name``, with any of its settings, or those of its parts, replaced.
 

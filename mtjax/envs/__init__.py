@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from mtjax.checks import OF_TRAIN, checked, shown
 from mtjax.envs import variation
 from mtjax.envs.metaworld.names import BENCHMARKS, FAMILIES
-from mtjax.names import InputError, first_sentence, frozen, lazily, load, nearest_error
+from mtjax.names import InputError, first_sentence, frozen, lazily, load, nearest_error, public
 
 if TYPE_CHECKING:
     from mtjax.envs.domain import Domain
@@ -41,7 +41,7 @@ __all__ = [
     "stacked",
 ]
 
-__getattr__ = lazily(
+__getattr__, __dir__ = lazily(
     __name__,
     {
         "Domain": "mtjax.envs.domain",
@@ -212,6 +212,7 @@ ENVS = Families(
 )
 
 
+@public
 def make(name: str, vary: Mapping[str, Any] | tuple = (), **settings: Any) -> Any:
     """Return the family called ``name``, or a mixture, with any of its fields replaced.
 
@@ -293,6 +294,7 @@ def require_pictures(name: str, setting: str) -> None:
         raise InputError(f"{name} has no scene to draw, which {setting} needs; take a family such as cheetah-run")
 
 
+@public
 def mixture(families: "Sequence[str | Family | Mixture]", scenes: str = "auto") -> "Mixture":
     """Return a mixture of families, each given by name or as returned by ``make``.
 

@@ -7,6 +7,7 @@ from mtjax import frames
 from mtjax.envs.mixtures import require_family
 from mtjax.envs.pixels import Pictured
 from mtjax.maps import Flat
+from mtjax.names import public
 from mtjax.types import Array, InputError, Key, Spec, Step, Task
 
 
@@ -64,6 +65,7 @@ class Stacked(Flat):
         return step._replace(obs=seen, state=Remembered(step.state, seen))
 
 
+@public
 def stacked(family: Any) -> Any:
     """Return a family whose observations hold its last ``family.frames`` pictures at once.
 

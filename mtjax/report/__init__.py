@@ -3,5 +3,5 @@
 from mtjax.names import lazily
 
 _FIGURES = ("families", "improvement", "iqm", "learning_curves", "performance_profile", "return_by_parameter", "save")
-__getattr__ = lazily(__name__, {name: "mtjax.report.plots" for name in _FIGURES})
+__getattr__, __dir__ = lazily(__name__, {name: "mtjax.report.plots" for name in _FIGURES})
 __all__ = [*_FIGURES]

@@ -1,10 +1,45 @@
-"""The command ``python -m mtjax.plot``: draw figures of runs into files."""
+"""Figures of runs: ``mtjax.plot`` in Python, and the command, which writes them into files."""
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from mtjax.names import InputError
+from mtjax.names import InputError, nearest_error, public
 from mtjax.report import collect, plots
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+@public
+def plot(
+    runs: Any = "runs/*",
+    figure: str = "curves",
+    *,
+    split: str = "train",
+    metric: str = "return",
+    baseline: str = "",
+    out: str | Path = "",
+) -> "Axes | list[Axes]":
+    """Draw a figure of runs, as ``python -m mtjax.plot`` does, and return Matplotlib's axes.
+
+    Args:
+        runs: folders, or patterns such as "runs/*"; or results of ``mtjax.train``, also by name in a mapping.
+        figure: curves, families (of which there are several axes), parameter, iqm, profile or improvement.
+        split: train, interpolation or extrapolation: whose returns are drawn.
+        metric: "return", or what else evaluations have, such as "success".
+        baseline: the agent that improvement compares with; by default the first run's.
+        out: a file to write too, which ends with .png, .pdf or .svg.
+
+    Raises:
+        InputError: there is no such figure or run, or the runs do not allow it.
+    """
+    if figure not in plots.FIGURES:
+        raise nearest_error("figure", figure, plots.FIGURES)
+    axes = _draw(figure, _learned(runs, metric), split, baseline)
+    if out:
+        plots.save(axes, out)
+    return axes
 
 
 def draw(runs: Sequence[str], figure: str, split: str, metric: str, baseline: str, out: str) -> None:
@@ -15,7 +50,7 @@ def draw(runs: Sequence[str], figure: str, split: str, metric: str, baseline: st
         metric: "return", or another score of evaluations.
         out: the file to write; of all figures, the ending counts and the names follow from the stem.
     """
-    found = collect.learned(runs) if metric == "return" else collect.of_metric(runs, metric)
+    found = _learned(runs, metric)
     names = list(plots.FIGURES) if figure == "all" else [figure]
     path = Path(out or ("runs.png" if figure == "all" else f"{figure}.png"))
     drawn = 0
@@ -34,7 +69,11 @@ def draw(runs: Sequence[str], figure: str, split: str, metric: str, baseline: st
         raise InputError("there was nothing to draw")
 
 
-def _draw(name: str, found: list[collect.Learned], split: str, baseline: str):
+def _learned(runs: Any, metric: str) -> list[collect.Learned]:
+    return collect.learned(runs) if metric == "return" else collect.of_metric(runs, metric)
+
+
+def _draw(name: str, found: list[collect.Learned], split: str, baseline: str) -> "Axes | list[Axes]":
     given = {} if name == "parameter" else {"split": split}
     given |= {"baseline": baseline} if name == "improvement" and baseline else {}
     return plots.FIGURES[name](found, **given)

@@ -9,7 +9,7 @@ import numpy as np
 
 from mtjax.envs.tabled import Tabled
 from mtjax.evaluation import Evaluations
-from mtjax.names import InputError
+from mtjax.names import InputError, public
 from mtjax.report import collect
 from mtjax.training.points import Point
 
@@ -65,6 +65,7 @@ def metrics_frame(rows: Iterable[Mapping[str, Any]]) -> Any:
     return pandas().DataFrame(made)
 
 
+@public
 def runs(pattern: str | Path | Iterable[str | Path] = "runs/*") -> Any:
     """Return all evaluations of runs as one table, with the columns run, env, agent and swept settings first.
 

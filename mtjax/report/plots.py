@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mtjax.names import InputError, nearest_error
+from mtjax.names import InputError, nearest_error, public
 from mtjax.report import collect, figures
 from mtjax.report.collect import Learned
 from mtjax.report.stats import iqm as iqm_of
@@ -24,6 +24,7 @@ ENDINGS = (".png", ".pdf", ".svg")
 _THRESHOLDS = 101
 
 
+@public
 def learning_curves(runs: Any = "runs/*", split: str = "train", ax: "Axes | None" = None) -> "Axes":
     """Draw the mean return of a split over environment steps, a line for each agent, of runs of one family."""
     found = _of_split(runs, split)
@@ -37,6 +38,7 @@ def learning_curves(runs: Any = "runs/*", split: str = "train", ax: "Axes | None
     return _finish(axes)
 
 
+@public
 def families(runs: Any = "runs/*", split: str = "train") -> "list[Axes]":
     """Draw learning curves of several families in a grid, and return the axes of each."""
     from matplotlib.figure import Figure
@@ -63,6 +65,7 @@ def families(runs: Any = "runs/*", split: str = "train") -> "list[Axes]":
     return list(grid[: len(names)])
 
 
+@public
 def return_by_parameter(runs: Any = "runs/*", ax: "Axes | None" = None) -> "Axes":
     """Draw each task's last mean return over its parameter, all splits in one line for each agent.
 
@@ -92,6 +95,7 @@ def return_by_parameter(runs: Any = "runs/*", ax: "Axes | None" = None) -> "Axes
     return _finish(axes)
 
 
+@public
 def iqm(runs: Any = "runs/*", split: str = "train", ax: "Axes | None" = None) -> "Axes":
     """Draw each agent's interquartile mean of the last returns, over seeds and the tasks of all families."""
     scores, score = _scores(runs, split)
@@ -105,6 +109,7 @@ def iqm(runs: Any = "runs/*", split: str = "train", ax: "Axes | None" = None) ->
     return axes
 
 
+@public
 def performance_profile(runs: Any = "runs/*", split: str = "train", ax: "Axes | None" = None) -> "Axes":
     """Draw the share of seeds and tasks whose last return is above each value, a line for each agent."""
     scores, score = _scores(runs, split)
@@ -119,6 +124,7 @@ def performance_profile(runs: Any = "runs/*", split: str = "train", ax: "Axes | 
     return _finish(axes)
 
 
+@public
 def improvement(
     runs: Any = "runs/*", baseline: str | None = None, split: str = "train", ax: "Axes | None" = None
 ) -> "Axes":
@@ -159,6 +165,7 @@ FIGURES = {
 }
 
 
+@public
 def save(axes: "Axes | list[Axes]", path: str | Path) -> Path:
     """Write the figure of some axes as PNG, PDF or SVG, by the file's ending, and return the path.
 

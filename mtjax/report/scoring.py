@@ -1,27 +1,143 @@
-"""The command ``python -m mtjax.evaluate``: score, plot and film a trained run on every task of every split."""
+"""Evaluation of a trained run: ``mtjax.evaluate`` in Python, and the command, which also writes, plots and films."""
 
 import contextlib
 import dataclasses
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax import shipped
+from mtjax import evaluation, shipped
+from mtjax.checks import path, require_episodes
 from mtjax.config import from_json
 from mtjax.envs import Family
-from mtjax.evaluation import Scores, evaluate, of_tasks
+from mtjax.envs.pixels import Pictured
+from mtjax.envs.tabled import Tabled
+from mtjax.evaluation import Scores, of_tasks
+from mtjax.names import nearest_error, public
 from mtjax.report import diagnostics, figures, films
+from mtjax.report.frames import pandas
 from mtjax.report.tables import task_table
 from mtjax.training.export import export
 from mtjax.training.log import append_rows, number
 from mtjax.training.policy import Policy, load, load_experience
 from mtjax.training.programs import compile_lowered, enable_compile_cache, trace
+from mtjax.training.result import Result
 from mtjax.types import SPLITS, InputError, Task
 
 _FIRST_NUMBER = 1_000_000  # beyond the numbers of a run's own evaluations, so that the episodes are new
+_GIVEN = "given"  # the split of tasks that are not the run's own
+
+
+class Evaluation(NamedTuple):
+    """Holds every episode of an evaluation. Tasks of ``vary`` or ``task_seed`` are the split "given"."""
+
+    returns: dict[str, np.ndarray]  # split -> (S, T, episodes), undiscounted
+    metrics: dict[str, dict[str, np.ndarray]]  # name -> split -> (S, T, episodes), such as success
+    values: dict[str, np.ndarray]  # split -> (T,) value of the varying parameter
+    seeds: tuple[int, ...]  # (S,)
+    env: Tabled  # whose tasks were played
+
+    def __repr__(self) -> str:
+        """Return a line: the mean return of every split."""
+        means = [f"{split} {x.mean():.0f} ({x.shape[1]} tasks)" for split, x in self.returns.items() if x.size]
+        return f"Evaluation(return {', '.join(means)}; {len(self.seeds)} seed{'s' * (len(self.seeds) > 1)})"
+
+    @public
+    def frame(self) -> Any:
+        """Return a pandas table with a row for each episode: seed, split, task and its parameters, return, metrics.
+
+        Raises:
+            InputError: pandas is missing.
+        """
+        rows = []
+        for split, returns in self.returns.items():
+            own = "train" if split == _GIVEN else split
+            params, scores = self.env.params(own), {"return": returns} | {k: x[split] for k, x in self.metrics.items()}
+            for s, t, e in np.ndindex(*returns.shape):
+                row = {"seed": self.seeds[s], "split": split, "task": t, **{name: x[t] for name, x in params.items()}}
+                rows.append(row | {"episode": e} | {name: float(x[s, t, e]) for name, x in scores.items()})
+        return pandas().DataFrame(rows)
+
+
+@public
+def evaluate(
+    run: Result | Policy | str | Path,
+    *,
+    vary: Mapping[str, Any] | None = None,
+    split: str | None = None,
+    episodes: int = 10,
+    seed: int = 0,
+    task_seed: int | None = None,
+    point: int = 0,
+    checkpoint: int = 0,
+) -> Evaluation:
+    """Play episodes that no training has seen, as ``python -m mtjax.evaluate`` does, and return every return.
+
+    Args:
+        run: a result of ``mtjax.train``; a run's folder; the name of a policy that comes with the package, such as
+            "finger-spin-vary-size/sac-conditioned"; or a policy of ``mtjax.load``, which plays alone. All others play
+            with all their seeds.
+        vary: other values of parameters than the run's, by name: ``{"size": "0.9:1.3:5"}`` or a list.
+        split: the split to play: train, interpolation or extrapolation. None plays all.
+        episodes: of each task and seed.
+        seed: seed of the starting states.
+        task_seed: seed of other goals than the run's, or other tasks, where they are drawn.
+        point: number of the setting, if the run holds several settings of a sweep.
+        checkpoint: iteration of the checkpoint, if ``run`` is a folder; 0 takes the newest.
+
+    Raises:
+        InputError: there is no such run, or an argument cannot be used.
+    """
+    require_episodes(episodes, seed, task_seed, checkpoint)
+    if split is not None and split not in SPLITS:
+        raise nearest_error("split", str(split), SPLITS)
+    if split is not None and (vary or task_seed is not None):
+        raise InputError("tasks of vary and task_seed belong to no split of the run; leave out split")
+    if vary and task_seed is not None:
+        raise InputError("task_seed draws other tasks; leave out vary")
+    policy, tasks, named = _with_tasks(_policy(run, point, checkpoint), vary or {}, task_seed)
+    if split is not None and not len(policy.env.tasks(split).id):
+        raise InputError(f"this run has no tasks of the split {split}")
+    scores = score(policy, episodes, seed, tasks, split or "all")
+    found = {named.get(name, name): (name, one) for name, one in scores.items() if one.returns.size}
+    metrics = list(next(iter(scores.values())).metrics)
+    return Evaluation(
+        {split: np.asarray(one.returns) for split, (_, one) in found.items()},
+        {name: {split: np.asarray(one.metrics[name]) for split, (_, one) in found.items()} for name in metrics},
+        {split: policy.env.task_values(own) for split, (own, _) in found.items()},
+        tuple(np.asarray(policy.seeds).tolist()),
+        policy.env,
+    )
+
+
+def _policy(run: Any, point: int, checkpoint: int) -> Policy:
+    """Return the policy of a run's first seed, with the states of all its seeds; a policy stays one of one seed."""
+    if not isinstance(run, Result | Policy):
+        folder = path(run, "run")
+        return load(folder, _first_seed(str(folder), point), checkpoint)
+    if checkpoint:
+        raise InputError("checkpoint is of a run's folder; give that, or mtjax.load(folder, checkpoint=...)")
+    if not isinstance(run.env, Tabled):
+        raise InputError(f"evaluate plays families of tasks, not a {type(run.env).__name__}")
+    if isinstance(run, Policy):
+        return run.alone()
+    _require_point(point, len(run.points))
+    return run.policy(point * len(run.seeds))
+
+
+def _with_tasks(
+    policy: Policy, vary: Mapping[str, Any], task_seed: int | None
+) -> tuple[Policy, Task | None, dict[str, str]]:
+    """Return a policy with the tasks to play, those tasks if they are not the run's, and their split's other name."""
+    trained = policy.env
+    if not vary and task_seed is None:
+        return policy, None, {}
+    env = on_values(trained, vary) if vary else drawn_anew(trained, task_seed or 0)
+    return dataclasses.replace(policy, env=env), as_unseen(env.tasks("all"), trained), {"train": _GIVEN}
 
 
 def report(request: Any, vary: Mapping[str, str]) -> None:
@@ -42,21 +158,21 @@ def report(request: Any, vary: Mapping[str, str]) -> None:
     if request.export:
         print(f"exported to {export(policy, request.export)}", flush=True)
     found = diagnostics.diagnose(policy, *load_experience(run, first)) if request.diagnostics else None
-    trained, named = policy.env, {"train": "given"} if vary or request.task_seed >= 0 else {}
+    trained = policy.env
+    policy, tasks, named = _with_tasks(policy, vary, request.drawn)
     if vary:
-        policy = dataclasses.replace(policy, env=on_values(trained, vary))
         print(f"trained on {trained.ends or 'one task'}; scored on {policy.env.ends or 'one task'}")  # type: ignore
-    elif request.task_seed >= 0:
-        policy = dataclasses.replace(policy, env=drawn_anew(trained, request.task_seed))
+    elif named:
         print(f"tasks and goals are drawn by the seed {request.task_seed}")
-    tasks = policy.env.tasks("all")
-    tasks = as_unseen(tasks, trained) if named else tasks
+    tasks = policy.env.tasks("all") if tasks is None else tasks
     chosen = films.choose(policy.env, request.video_splits, request.video_tasks) if request.video else ()
     scores = score(policy, request.episodes, request.seed, tasks)
     print(task_table(policy, scores, named), flush=True)
     if policy.agent.unseen:
         print(f"unseen tasks: {policy.agent.unseen}")
     if shipped.is_shipped(shipped.folder(run)) and not chosen:
+        if any(isinstance(part.family, Pictured) for part in policy.env.parts):
+            print(f"look at it: python -m mtjax.evaluate {shlex.join([f'--run={run}', '--video'])}")
         return
     directory = _new_folder(_place(run))  # only now, as the run may be in a folder that others own
     _write(policy, {named.get(split, split): x for split, x in scores.items()}, directory, named)
@@ -104,22 +220,32 @@ def as_unseen(tasks: Task, env: Any) -> Task:
 def _first_seed(run: str, point: int) -> int:
     """Return the first entry of S that belongs to a setting."""
     config = from_json(shipped.folder(run) / "config.json")
-    if not 0 <= point < max(len(config.points), 1):
-        raise InputError(f"point must be from 0 to {max(len(config.points), 1) - 1}, not {point}")
+    _require_point(point, len(config.points))
     return point * config.plan.seeds
 
 
-def score(policy: Policy, episodes: int, seed: int = 0, tasks: Task | None = None) -> dict[str, Scores]:
+def _require_point(point: Any, count: int) -> None:
+    last = max(count, 1) - 1
+    if not isinstance(point, int | np.integer) or not 0 <= point <= last:
+        raise InputError(f"point must be from 0 to {last}, not {point}")
+
+
+def score(
+    policy: Policy, episodes: int, seed: int = 0, tasks: Task | None = None, split: str = "all"
+) -> dict[str, Scores]:
     """Return the scores (S, T, episodes) of each split, in episodes that no training run has seen.
 
     Args:
         tasks: all tasks of the policy's environment, if they are numbered anew.
+        split: the split to play alone, in the same episodes; or "all".
     """
     env = policy.env
-    tasks = env.tasks("all") if tasks is None else tasks
-    arguments = policy.states, tasks, policy.seeds, jnp.int32(_FIRST_NUMBER + seed)
-    found = compile_lowered(trace(evaluate, env, policy.agent, episodes, *arguments).lower(), "seldom")(*arguments)
-    return {split: of_tasks(found, np.asarray(env.tasks(split).id)) for split in SPLITS}
+    rows = {name: np.asarray(env.tasks(name).id) for name in (SPLITS if split == "all" else [split])}
+    arguments = policy.states, env.tasks(split) if tasks is None else tasks, policy.seeds
+    arguments += (jnp.int32(_FIRST_NUMBER + seed), *([] if split == "all" else [jnp.asarray(rows[split])]))
+    program = trace(evaluation.evaluate, env, policy.agent, episodes, *arguments)
+    found = compile_lowered(program.lower(), "seldom")(*arguments)
+    return {split: found} if split in rows else {name: of_tasks(found, places) for name, places in rows.items()}
 
 
 def _place(run: str) -> Path:

@@ -15,7 +15,7 @@ from mtjax.envs import BENCHMARKS, ENVS, is_mixture, make, members, name_of
 from mtjax.envs.family import Family
 from mtjax.envs.tabled import Tabled
 from mtjax.loop import Settings
-from mtjax.names import InputError, nearest_error
+from mtjax.names import InputError, nearest_error, public
 from mtjax.parallel import hosts
 from mtjax.training import points
 from mtjax.training.folder import record_steps, require_unused, write_config
@@ -39,6 +39,7 @@ class _Told:
     label: str
 
 
+@public
 def train(
     env: str | Env,
     agent: str | Agent | None = None,

@@ -17,7 +17,7 @@ from mtjax.envs import Family
 from mtjax.envs import name_of as env_name_of
 from mtjax.envs.pixels import GREY
 from mtjax.envs.stepped import Stepped
-from mtjax.names import InputError
+from mtjax.names import InputError, public
 from mtjax.tasks import SAME_CONTEXT
 from mtjax.training import onnx
 from mtjax.training.policy import Policy
@@ -28,6 +28,7 @@ _PLATFORMS = ("cpu", "cuda")
 _BRIGHTNESS = " + ".join(f"{weight:g} {colour}" for weight, colour in zip(GREY, ("red", "green", "blue"), strict=True))
 
 
+@public
 def export(policy: Policy, file: str | Path) -> Path:
     """Write the mean action of a policy, with normaliser and task context, into one file.
 

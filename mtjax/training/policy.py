@@ -17,6 +17,7 @@ from mtjax.envs import name_of as env_name_of
 from mtjax.envs.tabled import Tabled
 from mtjax.experience import Replay
 from mtjax.experience.ring import Ring
+from mtjax.names import public
 from mtjax.training import checkpoint as checkpoints
 from mtjax.training import points
 from mtjax.training.points import Point
@@ -34,12 +35,14 @@ class Policy:
     states: Any  # of every seed, leading S; of a sweep, those of one point
     seeds: Array  # (S,)
     directory: Path | None = None  # of the run
+    number: int = 0  # of the seed among ``seeds``
 
     def __repr__(self) -> str:
         names, seen = f"{name_of(self.agent)} on {env_name_of(self.env)}", jax.tree.map(lambda x: x.shape, self.takes)
         shapes = f"observation {seen}, action ({self.env.spec.action_size},)"
         return f"Policy({names}: {shapes}, one of {len(self.seeds)} seed{'s' * (len(self.seeds) > 1)})"
 
+    @public
     def __call__(self, obs: Any, task: Task, key: Key | None = None, memory: Any = None) -> Array:
         """Return the mean action (A,), or a sampled one if a key is given.
 
@@ -59,6 +62,11 @@ class Policy:
         memory = self.begin(task) if memory is None else memory
         return self.agent.act(self.state, memory, obs, task, key).action
 
+    def alone(self) -> "Policy":
+        """Return the policy without the run's other seeds."""
+        state, own = jax.tree.map(lambda x: x[None], self.state), self.seeds[self.number : self.number + 1]
+        return dataclasses.replace(self, states=state, seeds=own, number=0)
+
     @property
     def takes(self) -> Any:
         """The shapes of an observation that it acts on: with pictures, those of the stack of the last ones."""
@@ -74,6 +82,7 @@ class Policy:
         return self.agent.remember(self.state, memory, step, task)
 
 
+@public
 def load(directory: str | Path, seed: int = 0, checkpoint: int = 0) -> Policy:
     """Load the trained policy of a run.
 
@@ -122,7 +131,8 @@ def policy_of(
     if found:
         agent = points.agent_at(agent, found[seed // count])
         states = jax.tree.map(lambda x: x[_point_rows(count, seed)], states.learner)
-    return Policy(env, agent, jax.tree.map(lambda x: x[seed % count], states), states, seeds, directory)
+    own = seed % count
+    return Policy(env, agent, jax.tree.map(lambda x: x[own], states), states, seeds, directory, own)
 
 
 def _require_seed(seed: int, seeds: int, num_points: int) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from mtjax.evaluation import Evaluations
 from mtjax.loop import TrainState
-from mtjax.names import nearest_error
+from mtjax.names import nearest_error, public
 from mtjax.parallel import hosts
 from mtjax.report.frames import frame_of, metrics_frame
 from mtjax.training.points import Point
@@ -43,6 +43,7 @@ class Result(NamedTuple):
         place = "" if self.directory is None else f", in {str(self.directory)!r}"
         return f"Result({steps}, return {scores or '-'}{'' if self.finished else ', stopped'}{place})"
 
+    @public
     def policy(self, seed: int = 0) -> Policy:
         """Return the trained policy of a seed, counted from 0; in a sweep of entry ``seed`` of S, as ``mtjax.load``.
 
@@ -54,6 +55,7 @@ class Result(NamedTuple):
         states = jax.tree.map(jnp.asarray, hosts.gather(self.state.agent))
         return policy_of(self.env, self.agent, self.points, jnp.asarray(self.seeds), states, seed, self.directory)
 
+    @public
     def frame(self, of: str = "evaluations") -> Any:
         """Return the run as a pandas table: its evaluations by task, or with "metrics" the lines of metrics.csv.
 
