@@ -44,6 +44,24 @@ def test_a_run_of_python_is_that_of_the_command_line(result, finished_run):
     assert names(result.directory) == names(finished_run)
 
 
+def test_progress_is_shown_unless_it_should_be_quiet(short_family, capsys):
+    """Without being asked for, from the first seconds, in lines that need no terminal."""
+    given = {"steps": 100, **PLAN, **SMALL}
+    mtjax.train("finger-short", "sac-conditioned", **given)
+    lines = capsys.readouterr().out.splitlines()
+    begins = (
+        "sac-conditioned on finger-short: ",
+        "compiling",
+        "compiled in ",
+        "100 of 100 steps ",
+        "evaluation at 100",
+    )
+    assert all(any(line.startswith(begin) for line in lines) for begin in begins)
+    assert not any(mark in "".join(lines) for mark in "\x1b\r")
+    mtjax.train("finger-short", "sac-conditioned", quiet=True, **given)
+    assert capsys.readouterr().out == ""
+
+
 def test_its_curve_shades_random_actions(result, monkeypatch, tmp_path):
     """Five steps of two environments of each task."""
     drawn = []

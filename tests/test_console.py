@@ -11,8 +11,9 @@ from mtjax.training.console import Clock, Console
 
 def test_a_line_says_steps_time_left_rate_and_what_the_range_is(capsys):
     """Of tasks, not of seeds; episodes that still run speak for themselves."""
-    clock = Clock(chunks=4, evaluations=1)
+    clock = Clock(chunks=4, evaluations=2)
     console = Console(2000, clock=clock)
+    clock.evaluation(1.0)
     clock.chunk(2.0)
     console.progress(500, 30.0, 512.3, np.array([[np.nan, np.nan]]), "first episodes run")
     clock.evaluation(5.0)
@@ -20,7 +21,7 @@ def test_a_line_says_steps_time_left_rate_and_what_the_range_is(capsys):
     console.progress(1000, 75.0, 512.3, np.array([[np.nan, 10.0], [20.0, 60.4]]))
     console.close()
     assert capsys.readouterr().out.splitlines() == [
-        "500 of 2,000 steps  30 s, 6.0 s left  512 steps/s  first episodes run",
+        "500 of 2,000 steps  30 s, 7.0 s left  512 steps/s  first episodes run",
         "1,000 of 2,000 steps  1 min 15 s, 4.0 s left  512 steps/s  return 30 (worst task 20, best 35)",
     ]
 
@@ -31,16 +32,42 @@ def test_one_task_has_no_worst_one():
     assert consoles.describe_returns(np.full((2, 3), np.nan)) == ""
 
 
-def test_the_first_evaluation_waits_for_its_program_and_counts_only_until_the_second():
-    """The time left is that of chunks and evaluations to come."""
-    clock = Clock(chunks=10, evaluations=3)
-    assert clock.left is None
+def test_random_actions_tell_nothing_of_the_time_that_learning_takes():
+    """Nor does a chunk in which learning begins; and while no evaluation is timed, they may take longer."""
+    clock = Clock(chunks=5, evaluations=2, warmup=2)
+    said = []
+    for seconds in (0.1, 3.0, 20.0):
+        said.append(clock.left)
+        clock.chunk(seconds)
+    assert said == ["warming up"] * 3 and clock.left == "at least 40 s left"
+    clock.evaluation(5.0)
+    assert clock.left == "45 s left"
+    clock.chunk(10.0)
+    assert clock.left == "20 s left"
+    clock.chunk(10.0)
+    clock.evaluation(5.0)
+    assert clock.left == "0.0 s left"
+
+
+def test_a_run_of_random_actions_alone_has_no_time_to_tell():
+    """Nothing is left to learn after its last chunk."""
+    clock = Clock(chunks=1, evaluations=1, warmup=1)
+    assert clock.left == "warming up"
     clock.chunk(1.0)
-    assert clock.left == 9
-    clock.evaluation(40.0)
-    assert clock.left == 9 + 2 * 40
-    clock.evaluation(2.0)
-    assert clock.left == 9 + 2
+    assert clock.left == ""
+
+
+def test_plain_lines_are_some_fifty_in_a_run_and_never_far_apart(capsys):
+    """The first and the last are among them, so that files and notebooks are readable."""
+    console = Console(1000)
+    for i in range(1000):
+        console.progress(i + 1, 0.01 * i, 9.0, np.array([[1.0]]))
+    lines = capsys.readouterr().out.splitlines()
+    assert 45 <= len(lines) <= 55 and lines[0].startswith("1 of") and lines[-1].startswith("1,000 of")
+    console = Console(10**9)
+    for i in range(10):
+        console.progress(i + 1, 10.0 * i, 9.0, np.array([[1.0]]))
+    assert len(capsys.readouterr().out.splitlines()) == 5
 
 
 def test_running_episodes_count_if_they_began_at_age_zero():

@@ -55,6 +55,8 @@ def test_a_policy_is_shipped_and_acts_as_its_run(copied_run, package, tmp_path, 
     np.testing.assert_array_equal(jax.vmap(ours)(obs, tasks), jax.vmap(theirs)(obs, tasks))
     monkeypatch.chdir(tmp_path)
     mtjax.evaluate.main(["--run=finger-spin/care", "--episodes=1"])
+    told = capsys.readouterr().out.splitlines()[-1]
+    assert told == "look at it: python -m mtjax.evaluate --run=finger-spin/care --video"
     assert not (tmp_path / "runs").exists()
     monkeypatch.setattr(films, "write", lambda *_: None)
     mtjax.evaluate.main(["--run=finger-spin/care", "--episodes=1", "--video"])

@@ -57,7 +57,7 @@ def train(
     profile: bool = False,
     tensorboard: bool = False,
     wandb: str = "",
-    quiet: bool = True,
+    quiet: bool = False,
     label: str = "",
     on_chunk: Callable[[dict[str, Any]], Any] | None = None,
     **given: Any,
@@ -93,7 +93,7 @@ def train(
         profile: write a trace of one chunk by ``jax.profiler`` into ``directory``/profile.
         tensorboard: write metrics for TensorBoard into ``directory``/tensorboard.
         wandb: name of a Weights & Biases project to log to.
-        quiet: print nothing.
+        quiet: print nothing. Else progress is a bar on a terminal, and lines elsewhere, as in notebooks.
         label: the first words of progress lines.
         on_chunk: a function that is called with each chunk's first row of metrics. If it returns True, the run stops
             after the chunk, with a checkpoint.

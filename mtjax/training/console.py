@@ -1,18 +1,24 @@
 """Progress of a run: a bar on a terminal, plain lines elsewhere."""
 
+import math
 import sys
 from collections.abc import Mapping
 
 import numpy as np
 
 _SHARE = 1 / 3  # of a run under random actions from which a warning is due
+_LINES, _SECONDS = 50, 15.0  # plain lines in a run, and the longest time without one
 
 
 class Clock:
-    """Estimates the seconds that a run still takes: its chunks, and its evaluations with their checkpoints."""
+    """Estimates the seconds that a run still takes: chunks that learn, and evaluations with their checkpoints.
 
-    def __init__(self, chunks: int, evaluations: int):
+    Random actions are faster than learning, so that chunks of the warm-up tell nothing of those to come.
+    """
+
+    def __init__(self, chunks: int, evaluations: int, warmup: int = 0):
         self.chunks, self.evaluations = chunks, evaluations  # that are still to come
+        self.warmup = warmup  # chunks, the first ones, in which some actions are random
         self.chunk_seconds: list[float] = []
         self.evaluation_seconds: list[float] = []
 
@@ -22,18 +28,20 @@ class Clock:
         self.chunk_seconds.append(seconds)
 
     def evaluation(self, seconds: float) -> None:
-        """Note an evaluation. The first one may have waited for its program, so later ones count alone."""
+        """Note an evaluation, without what it waited for its program."""
         self.evaluations -= 1
         self.evaluation_seconds.append(seconds)
 
     @property
-    def left(self) -> float | None:
-        """Return the seconds that are left, by the last ten chunks; None before the first one."""
-        if not self.chunk_seconds:
-            return None
-        warm = self.evaluation_seconds[1:] or self.evaluation_seconds
-        each = float(np.mean(self.chunk_seconds[-10:])), float(np.mean(warm)) if warm else 0.0
-        return max(self.chunks, 0) * each[0] + max(self.evaluations, 0) * each[1]
+    def left(self) -> str:
+        """Return the time that is left as text: by the last ten chunks, and at least, while no evaluation is timed."""
+        learning = self.chunk_seconds[self.warmup :]
+        if self.chunks > 0 and not learning:
+            return "warming up"
+        each, score = (float(np.mean(x[-10:])) if x else 0.0 for x in (learning, self.evaluation_seconds))
+        seconds = max(self.chunks, 0) * each + max(self.evaluations, 0) * score
+        known = self.evaluation_seconds or self.evaluations <= 0
+        return f"{duration(seconds)} left" if known else f"at least {duration(seconds)} left" if seconds else ""
 
 
 class Console:
@@ -42,7 +50,7 @@ class Console:
     def __init__(self, total_steps: int, quiet: bool = False, label: str = "", clock: Clock | None = None):
         self.total, self.quiet, self.bar = total_steps, quiet, None
         self.label, self.clock = f"{label}  " if label else "", clock or Clock(0, 0)
-        self.evaluated = ""
+        self.evaluated, self.shown = "", (0, -math.inf)  # steps and seconds of the last line
         if quiet or not sys.stdout.isatty():
             return
         from rich.progress import BarColumn, Progress, TextColumn
@@ -74,14 +82,19 @@ class Console:
         """
         if self.quiet:
             return
-        left = "" if self.clock.left is None else f"{duration(self.clock.left)} left"
+        left = self.clock.left
         told = describe_returns(returns) or running or "no episode has ended"
         if self.bar is not None:  # whose end a narrow terminal cuts off
             text = f"{self.label}{steps:,} of {self.total:,}  {left}  {rate:,.0f} steps/s  {told}{self.evaluated}"
             self.bar.update(self.task, completed=steps, description=text)
-        else:
-            when = f"{duration(seconds)}{', ' * bool(left)}{left}"
+        elif self._is_due(steps, seconds):
+            self.shown, when = (steps, seconds), f"{duration(seconds)}{', ' * bool(left)}{left}"
             self.say(f"{self.label}{steps:,} of {self.total:,} steps  {when}  {rate:,.0f} steps/s  {told}")
+
+    def _is_due(self, steps: int, seconds: float) -> bool:
+        """Return whether a plain line is due: the first, the last, and after a share of the run or some seconds."""
+        before, then = self.shown
+        return steps - before >= self.total / _LINES or seconds - then >= _SECONDS or steps >= self.total
 
     def evaluation(
         self, steps: int, returns: Mapping[str, np.ndarray], success: Mapping[str, np.ndarray] | None = None

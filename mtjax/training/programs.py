@@ -38,6 +38,7 @@ class Programs(NamedTuple):
     chunk: Callable  # state -> state, metrics
     evaluate: Callable  # agents' state, number of the evaluation -> returns
     metrics: Any  # the shapes of a chunk's metrics
+    ready: Callable[[], Any] = lambda: None  # waits until ``evaluate`` is compiled
 
 
 def _specs(agent: Agent) -> TrainState:

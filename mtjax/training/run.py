@@ -219,6 +219,7 @@ class _Run:
         fresh = trace(lazy.init, env, agent, settings, tasks, seeds, knobs)
         shapes = sharded_shapes(self.mesh, agent, fresh.out_info)
         self._describe(shapes)
+        self.console.say("compiling")
         kernels = pool.submit(load_kernels, env)
         make = None if resume else pool.submit(lambda: compile_lowered(fresh.lower(), "once"))
         chunk = trace(lazy.chunk, env, agent, settings, tasks, shapes)
@@ -226,7 +227,8 @@ class _Run:
         score = pool.submit(lambda: compile_lowered(played(np.int32(0)).lower(), "seldom"))
         pool.shutdown(wait=False)
         evaluate = lambda agents, number: score.result()(agents, everything, seeds, np.int32(number))
-        programs = Programs(partial(compile_lowered(chunk.lower()), tasks), evaluate, chunk.out_info[1])
+        play = partial(compile_lowered(chunk.lower()), tasks)
+        programs = Programs(play, evaluate, chunk.out_info[1], score.result)
         if kernels.result():  # else the first chunk would wait for them
             score.result()
         return programs, self.records.restore(shapes) if make is None else make.result()(tasks, seeds, knobs)
@@ -266,18 +268,22 @@ class _Run:
     def steps_per_chunk(self) -> int:
         return self.settings.chunk_steps * self.steps_per_iteration
 
+    @property
+    def warmup(self) -> int:
+        """Return the environment steps under random actions, before learning begins."""
+        return self.agent.experience.warmup_steps * self.steps_per_iteration
+
     def introduce(self) -> None:
         """Say how many steps a new run takes, and what the first of them are."""
         chunk, total = self.steps_per_chunk, self.console.total
-        warmup = self.agent.experience.warmup_steps * self.steps_per_iteration
-        for line in (*describe_rounding(self.plan.steps, total, chunk), *describe_warmup(warmup, total)):
+        for line in (*describe_rounding(self.plan.steps, total, chunk), *describe_warmup(self.warmup, total)):
             self.console.say(line)
 
     def _clock(self, steps: int) -> Clock:
         """Return a clock that counts the chunks and evaluations to come."""
         chunk = self.steps_per_chunk
         ends = range(steps + chunk, self.console.total + chunk, chunk)
-        return Clock(len(ends), sum(map(self._is_due, ends)))
+        return Clock(len(ends), sum(map(self._is_due, ends)), sum(end - chunk < self.warmup for end in ends))
 
     def _running(self, state: TrainState, returns: np.ndarray) -> str:
         """Return a text on first episodes that still run, if no episode has ended."""
@@ -321,8 +327,10 @@ class _Run:
                 new = self._log(metrics, now.seconds - seconds, now, started, sinks)
                 rows.extend(new)
                 enough = self.on_chunk is not None and self.on_chunk(new[0]) is True
-                before = time.monotonic()
                 stop, due = asked(enough), self._is_due(now.steps)
+                if due:
+                    programs.ready()
+                before = time.monotonic()
                 if due or stop:
                     now = self._give_up_spoiled(now)
                 if due:
