@@ -39,15 +39,21 @@ class Policy:
         return f"Policy({self.meta['agent']} on {self.meta['env']}: {told}, parameters {self.meta['parameters']})"
 
     def __call__(self, obs: Any, **parameters: float) -> np.ndarray:
-        """Return the mean action (A,) of the task with these parameters.
+        """Return the mean action (A,) of the task with these parameters, or (B, A) of a batch of observations.
 
         Args:
             obs: an observation (O,); or of a policy that sees pictures {"pixels": (H, W, N C) uint8}, beside which may
-                be "state": (O,).
-            parameters: the task's parameters. A policy that reads none takes them or leaves them out.
+                be "state": (O,). All of a batch have a leading B.
+            parameters: the task's parameters; in a batch each may be (B,). A policy that reads none takes them or
+                leaves them out.
         """
-        seen = observed(self.meta, obs)
-        return self._run(*seen, values_of(self.meta, parameters, len(seen) in self.program["reads"]))
+        seen, size = observed(self.meta, obs)
+        given = ordered(self.meta["parameters"], parameters, len(seen) in self.program["reads"], size)
+        values = np.array(np.broadcast_arrays(*given), np.float32).T if given else np.zeros(0, np.float32)
+        if size is None:
+            return self._run(*seen, values)
+        values = np.broadcast_to(values, (size, len(given)))
+        return np.stack([self._run(*(x[i] for x in seen), values[i]) for i in range(size)])
 
     def _run(self, *inputs: np.ndarray) -> np.ndarray:
         known: dict[int, np.ndarray] = dict(enumerate((*self.constants, *inputs)))
@@ -63,33 +69,53 @@ def shapes_of(meta: dict[str, Any]) -> dict[str, tuple[int, ...]]:
     return {name: tuple(shape) for name, shape in meta["obs"].items()}
 
 
-def observed(meta: dict[str, Any], obs: Any) -> list[np.ndarray]:
-    """Return the arrays that a policy takes of an observation, in their order."""
+def observed(meta: dict[str, Any], obs: Any) -> tuple[list[np.ndarray], int | None]:
+    """Return the arrays that a policy takes of an observation, in their order, and the size B if it is a batch."""
     shapes, given = shapes_of(meta), obs if isinstance(obs, dict) else {"obs": obs}
+    arrays = {name: np.asarray(x, None if name == PICTURES else np.float32) for name, x in given.items()}
+    size = batch_size(shapes, {name: x.shape for name, x in arrays.items()})
+    require_bytes(arrays)
+    return [arrays[name] for name in shapes], size
+
+
+def require_bytes(obs: dict[str, Any]) -> None:
+    """Raise ValueError if an observation has pictures that are not of bytes."""
+    if PICTURES in obs and obs[PICTURES].dtype != np.uint8:
+        raise ValueError(f"pictures are uint8, from 0 to 255, not {obs[PICTURES].dtype}")
+
+
+def batch_size(shapes: dict[str, tuple[int, ...]], given: dict[str, tuple[int, ...]]) -> int | None:
+    """Return the size B of a batch by the shapes of observations that were given, or None if it is a single one.
+
+    Raises:
+        ValueError: they are neither of the shapes of an observation nor of a batch.
+    """
     if not shapes.keys() <= given.keys():
-        raise ValueError(f"an observation is a dict of {shapes}; policy.meta['about'] says what they are")
-    return [_entry(name, shape, given[name]) for name, shape in shapes.items()]
+        raise ValueError(f"an observation is a dict of {shapes}")
+    before = {name: given[name][: len(given[name]) - len(shape)] for name, shape in shapes.items()}
+    for name, shape in shapes.items():
+        if given[name] != before[name] + shape or before[name] != next(iter(before.values())) or len(before[name]) > 1:
+            fix = "begin and push make stacks of pictures" if name == PICTURES else "a batch has one axis before it"
+            raise ValueError(f"{name} has shape {shape}, not {given[name]}; {fix}")
+    return next((leading[0] for leading in before.values() if leading), None)
 
 
-def _entry(name: str, shape: tuple[int, ...], value: Any) -> np.ndarray:
-    seen = name == PICTURES
-    x = np.asarray(value, None if seen else np.float32)
-    if x.shape != shape:
-        fix = "; begin and push make stacks of pictures" if seen else ""
-        raise ValueError(f"{name} has shape {shape}, not {x.shape}{fix}")
-    if seen and x.dtype != np.uint8:
-        raise ValueError(f"pictures are uint8, from 0 to 255, not {x.dtype}")
-    return x
+def ordered(names: list[str], parameters: dict[str, Any], needed: bool, size: int | None) -> list[Any]:
+    """Return the values of the task's parameters in their order; zeros if they are not needed and not given.
 
-
-def values_of(meta: dict[str, Any], parameters: dict[str, float], needed: bool = True) -> np.ndarray:
-    """Return the values (P,) of the task's parameters in their order; zeros if they are not needed and not given."""
+    Raises:
+        ValueError: there are other names, or a value is neither a number nor, in a batch of a size B, (B,).
+    """
     given = {name.replace("_", "-"): value for name, value in parameters.items()}
     if not needed and not given:
-        given = dict.fromkeys(meta["parameters"], 0.0)
-    if set(given) != set(meta["parameters"]):
-        raise ValueError(f"give the task's parameters {meta['parameters']}, not {sorted(given)}")
-    return np.array([given[name] for name in meta["parameters"]], np.float32)
+        given = dict.fromkeys(names, 0.0)
+    if set(given) != set(names):
+        raise ValueError(f"give the task's parameters {names}, not {sorted(given)}")
+    for name, value in given.items():
+        if np.shape(value) not in ((), (size,)):
+            of_batch = "" if size is None else f", or an array ({size},) as there are {size} observations"
+            raise ValueError(f"{name} is a number{of_batch}, not of shape {np.shape(value)}")
+    return [given[name] for name in names]
 
 
 def _arrays(file: Any) -> dict[str, np.ndarray]:

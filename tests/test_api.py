@@ -278,16 +278,20 @@ def test_what_is_printed_is_a_line(result):
     assert repr(result).startswith("Result(600 steps, return train ") and "\n" not in repr(result)
 
 
-def test_a_policy_takes_one_task_and_one_observation(result):
-    """And says how to give several."""
+def test_a_policy_takes_one_task(result):
+    """And says how to give it; observations may be many."""
     policy = result.policy()
     tasks = policy.env.tasks()
     one = jax.tree.map(lambda x: x[0], tasks)
-    for wrong, said in ((tasks, "takes one task, not Task"), (None, "takes one task, not None")):
-        with pytest.raises(InputError, match=said):
+    for wrong in (tasks, 3):
+        with pytest.raises(InputError, match="takes one task, not"):
             policy(np.zeros(9), wrong)
-    with pytest.raises(InputError, match=r"has shape \(9,\), not \(3, 9\); use jax.vmap for many"):
-        policy(np.zeros((3, 9)), one)
+    with pytest.raises(InputError, match=r"give a task, or its parameters .*, not both"):
+        policy(np.zeros(9), one, size=1.0)
+    with pytest.raises(InputError, match=r"has shape \(9,\), not \(4, 3, 9\); a batch has one axis before it"):
+        policy(np.zeros((4, 3, 9)), one)
+    many = policy(np.ones((3, 9)), one)
+    np.testing.assert_allclose(many, np.tile(policy(np.ones(9), one), (3, 1)), rtol=1e-6)
     assert jax.vmap(policy, (0, None))(np.zeros((3, 9)), one).shape == (3, 2)
     with pytest.raises(InputError, match="seed must be from 0 to 1"):
         result.policy(2)

@@ -4,7 +4,6 @@ import ast
 import importlib.util
 import subprocess
 import sys
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,7 +17,7 @@ import mtjax
 import mtjax.evaluate
 from mtjax import agents, standalone
 from mtjax.tasks import SAME_CONTEXT
-from mtjax.training.export import require_file, task_at
+from mtjax.training.export import require_file
 from mtjax.training.policy import Policy
 from mtjax.training.steps import steps_of
 from mtjax.types import InputError
@@ -75,10 +74,11 @@ def test_a_file_knows_every_listed_task_by_its_parameters(name):
     env = mtjax.make(name)
     listed = env.tasks("all")
     values = np.stack([np.asarray(listed.params[name]) for name, _, _ in env.ranges], axis=1)
-    found = jax.jit(jax.vmap(partial(task_at, env, listed._replace(draws=None))))(values)
+    policy = policy_of(tiny("sac"), env)
+    found = jax.jit(jax.vmap(policy.task_of))(values)
     np.testing.assert_array_equal(found.id, listed.id)
     np.testing.assert_allclose(found.context, listed.context, atol=SAME_CONTEXT)
-    assert task_at(env, listed._replace(draws=None), jnp.asarray(values[0] + 0.003)).id == len(listed.id)
+    assert policy.task_of(jnp.asarray(values[0] + 0.003)).id == len(listed.id)
 
 
 def test_an_equally_near_task_is_the_lower_one_however_it_is_rounded():
@@ -92,6 +92,54 @@ def test_an_equally_near_task_is_the_lower_one_however_it_is_rounded():
     nearest = lambda context: agent.known_task(SimpleNamespace(contexts=contexts), unseen._replace(context=context))
     found = jax.vmap(jax.vmap(nearest))(midway + jnp.float32(noise))
     np.testing.assert_array_equal(found, np.broadcast_to(np.arange(199), (5, 199)))
+
+
+@pytest.mark.parametrize("name", ["sac-conditioned", "multi-head"])
+def test_a_file_is_called_as_the_policy_is(name, tmp_path):
+    """Alone and in batches, by the same names of parameters, also where the nearest task lends its head."""
+    policy = policy_of(tiny(name))
+    by_numpy = standalone.load(mtjax.export(policy, tmp_path / "policy.npz"))
+    tasks, obs = ENV.tasks("all"), observations(len(ENV.tasks("all").id))
+    sizes, few = np.asarray(tasks.params["size"]), {"atol": 2e-5}
+    expected = np.asarray(jax.jit(jax.vmap(policy))(obs, tasks))
+    for act in (policy, by_numpy):
+        np.testing.assert_allclose(act(obs, size=sizes), expected, **few)
+        np.testing.assert_allclose(act(obs[0].tolist(), size=float(sizes[0])), expected[0], **few)
+        alike = [act(x, size=1.1) for x in obs]
+        np.testing.assert_allclose(act(obs, size=1.1), alike, **few)
+    sampled = policy(obs, key=jax.random.key(0), size=1.1)
+    assert sampled.shape == expected.shape and np.all(np.abs(sampled - np.stack(alike)).sum(axis=1) > 0)
+
+
+WRONG = {
+    "name": ((np.zeros(9),), {"mass": 1.0}, r"give the task's parameters \['size'\], not \['mass'\]"),
+    "none": ((np.zeros(9),), {}, r"give the task's parameters \['size'\], not \[\]"),
+    "shape": ((np.zeros(3),), {"size": 1.0}, r"obs has shape \(9,\), not \(3,\); a batch has one axis before it"),
+    "values": (
+        (np.zeros((2, 9)),),
+        {"size": np.ones(3)},
+        r"size is a number, or an array \(2,\) .* shape \(3,\)",
+    ),
+    "single": ((np.zeros(9),), {"size": np.ones(2)}, r"size is a number, not of shape \(2,\)"),
+    "dict": (({"pixels": np.zeros(3)},), {"size": 1.0}, r"an observation is a dict of {'obs': \(9,\)}"),
+}
+
+
+@pytest.mark.parametrize("given, parameters, said", WRONG.values(), ids=WRONG)
+def test_policy_and_file_refuse_the_same(given, parameters, said, tmp_path):
+    """In the same words."""
+    policy = policy_of(tiny("sac-conditioned"))
+    file = standalone.load(mtjax.export(policy, tmp_path / "x.npz"))
+    for act, kind in ((policy, InputError), (file, ValueError)):
+        with pytest.raises(kind, match=said):
+            act(*given, **parameters)
+
+
+def test_a_policy_that_reads_no_parameter_needs_none(tmp_path):
+    """Though it may be given them."""
+    policy, obs = policy_of(tiny("sac")), observations(2)
+    for act in (policy, standalone.load(mtjax.export(policy, tmp_path / "x.npz"))):
+        np.testing.assert_array_equal(act(obs), act(obs, size=1.1))
 
 
 def assert_onnx_acts(policy, file, obs, sizes, expected):
@@ -141,15 +189,6 @@ def test_the_reader_needs_numpy_alone(tmp_path):
     assert {getattr(node, "module", None) or node.names[0].name for node in top} == {
         "json", "collections.abc", "typing", "numpy"
     }  # fmt: skip
-
-
-def test_what_the_reader_is_given_is_checked(tmp_path):
-    """In the words of the file."""
-    policy = standalone.load(mtjax.export(policy_of(tiny("sac-conditioned")), tmp_path / "x.npz"))
-    with pytest.raises(ValueError, match=r"give the task's parameters \['size'\], not \['mass'\]"):
-        policy(np.zeros(9), mass=1.0)
-    with pytest.raises(ValueError, match=r"shape \(9,\), not \(3,\)"):
-        policy(np.zeros(3), size=1.0)
 
 
 @pytest.mark.parametrize("content", ["empty", "text", "half", "flipped", "other"])

@@ -76,6 +76,7 @@ def raised(call):
         lambda: mtjax.register("mine", int),
         lambda: mtjax.mixture(["finger-spin", "finger-spn"]),
         lambda: report.iqm("nowhere"),
+        lambda: mtjax.load("finger-spin-vary-size/sac-conditioned")(np.zeros(2)),
     ],
 )
 def test_a_mistake_ends_at_the_users_line(call):

@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +18,10 @@ from mtjax.envs import name_of as env_name_of
 from mtjax.envs.pixels import GREY
 from mtjax.envs.stepped import Stepped
 from mtjax.names import InputError, public
-from mtjax.tasks import SAME_CONTEXT
 from mtjax.training import onnx
-from mtjax.training.policy import Policy
+from mtjax.training.policy import Policy, by_name
 from mtjax.training.steps import steps_of
-from mtjax.types import Array, Task
+from mtjax.types import Array
 
 _PLATFORMS = ("cpu", "cuda")
 _BRIGHTNESS = " + ".join(f"{weight:g} {colour}" for weight, colour in zip(GREY, ("red", "green", "blue"), strict=True))
@@ -48,11 +47,11 @@ def export(policy: Policy, file: str | Path) -> Path:
     assert isinstance(env, Family)
     values = jax.ShapeDtypeStruct((len(env.ranges),), jnp.float32)
     program, constants = steps_of(jax.make_jaxpr(act)(obs, values))
-    meta = _meta(env, policy.agent, _by_name(obs))
+    meta = _meta(env, policy.agent, by_name(obs))
     new = file.with_suffix(f".new{file.suffix}")
     file.parent.mkdir(parents=True, exist_ok=True)
     if file.suffix == ".onnx":
-        onnx.write(program, constants, _by_name(obs) | {"parameters": values}, meta, new)
+        onnx.write(program, constants, by_name(obs) | {"parameters": values}, meta, new)
     else:
         text = lambda x: np.frombuffer(json.dumps(x).encode(), np.uint8)
         arrays: dict[str, Any] = {f"constant_{i}": x for i, x in enumerate(constants)}
@@ -76,11 +75,6 @@ def require_file(file: str | Path) -> Path:
     if file.exists():
         raise InputError(f"{str(file)!r} exists already; give another name or remove it")
     return file
-
-
-def _by_name(obs: Any) -> dict[str, Any]:
-    """Return the parts of an observation, or of its shapes, in the order of their names. A vector is called obs."""
-    return {name: obs[name] for name in sorted(obs)} if isinstance(obs, Mapping) else {"obs": obs}
 
 
 def _meta(env: Family, agent: BaseAgent, obs: dict[str, Any]) -> dict[str, Any]:
@@ -129,28 +123,12 @@ def acting(policy: Policy) -> Callable[[Any, Array], Array]:
         raise InputError("export takes a policy of one family, and this one is of a mixture")
     if agent.history_length:
         raise InputError("export takes agents that act by what they see, and this one infers its task from memory")
-    listed = env.tasks("all")._replace(draws=None)
 
     def act(obs: Any, values: Array) -> Array:
-        task = task_at(env, listed, values)
+        task = policy.task_of(values)
         return agent.act(state, agent.begin(state, task), obs, task, None).action
 
     return act
-
-
-def task_at(env: Family, listed: Task, values: Array) -> Task:
-    """Return the task with the values (P,) of its parameters. One of the family's has its number, others one beyond."""
-    columns = []
-    for i, (name, low, high) in enumerate(env.ranges):
-        if name in env.parameters and env.parameters[name].direction:
-            columns += [jnp.sin(values[i]), jnp.cos(values[i])]
-        else:
-            columns.append((values[i] - (low + high) / 2) / ((high - low) / 2 or 1.0))
-    context = jnp.stack(columns) if columns else jnp.zeros(1)
-    same = jnp.all(jnp.abs(listed.context - context) <= SAME_CONTEXT, axis=1)
-    number = jnp.where(jnp.any(same), jnp.argmax(same), len(listed.id)).astype(jnp.int32)
-    first = jax.tree.map(lambda x: x[0], listed)
-    return first._replace(id=number, context=context.astype(jnp.float32))
 
 
 def _serialised(act: Callable, obs: Any, values: Any) -> np.ndarray:

@@ -1,7 +1,8 @@
 """Trained policies, read from the folder of a run."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -9,25 +10,31 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax import frames, loop, shipped
+from mtjax import frames, loop, shipped, standalone
 from mtjax.agents import BaseAgent, name_of
 from mtjax.checks import path
 from mtjax.config import RunConfig, from_json
 from mtjax.envs import name_of as env_name_of
+from mtjax.envs.family import Family
 from mtjax.envs.tabled import Tabled
 from mtjax.experience import Replay
 from mtjax.experience.ring import Ring
 from mtjax.names import public
+from mtjax.tasks import SAME_CONTEXT
 from mtjax.training import checkpoint as checkpoints
 from mtjax.training import points
 from mtjax.training.points import Point
 from mtjax.training.programs import trace
+from mtjax.training.steps import steps_of
 from mtjax.types import Array, InputError, Key, Task, Transition
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Policy:
-    """A trained policy: ``action = policy(obs, task)`` for a single observation (O,). Use ``vmap`` for many."""
+    """A trained policy: ``action = policy(obs, size=1.05)``, or ``policy(obs, task)``.
+
+    Observations are (O,), or (B, O) in a batch. Files of ``mtjax.export`` are called by the same names.
+    """
 
     env: Tabled
     agent: BaseAgent
@@ -43,24 +50,80 @@ class Policy:
         return f"Policy({names}: {shapes}, one of {len(self.seeds)} seed{'s' * (len(self.seeds) > 1)})"
 
     @public
-    def __call__(self, obs: Any, task: Task, key: Key | None = None, memory: Any = None) -> Array:
-        """Return the mean action (A,), or a sampled one if a key is given.
+    def __call__(
+        self, obs: Any, task: Task | None = None, key: Key | None = None, memory: Any = None, **parameters: Any
+    ) -> Array:
+        """Return the mean action (A,), or a sampled one if a key is given; (B, A) for a batch of observations.
 
         Args:
             obs: as the agent sees it: with pictures, the stack of the last ones, as ``mtjax.stacked`` shows them.
+            task: one task of the family; else its parameters are given by name.
             memory: the agent's memory of the episode, from ``begin`` and ``remember``. Only agents that infer their
-                task need it. None means that the episode has just begun.
+                task need it. None means that the episode has just begun. In a batch it has a leading B.
+            parameters: the task's parameters, in their own units; in a batch each may be (B,). A policy that reads none
+                takes them or leaves them out.
+
+        Raises:
+            InputError: shapes or names are others, or the task is not one task.
         """
-        if not isinstance(task, Task) or np.ndim(task.id):
+        if task is not None and (not isinstance(task, Task) or np.ndim(task.id)):
             raise InputError(f"policy(obs, task) takes one task, not {task!r}: jax.tree.map(lambda x: x[0], tasks)")
-        wanted = jax.tree.map(lambda x: x.shape, self.takes)
-        obs = {name: x for name, x in obs.items() if name in wanted} if frames.shown(obs) else obs
-        shape = jax.tree.map(np.shape, obs)
-        if shape != wanted:
-            fix = "use jax.vmap for many" + ", and mtjax.stacked(env) for stacks of pictures" * frames.shown(wanted)
-            raise InputError(f"an observation for this policy has shape {wanted}, not {shape}; {fix}")
+        if task is not None and parameters:
+            raise InputError(f"give a task, or its parameters {sorted(parameters)} by name, not both")
+        wanted, given = by_name(self.takes), by_name(obs)
+        try:
+            size = standalone.batch_size(*({k: np.shape(x) for k, x in each.items()} for each in (wanted, given)))
+            standalone.require_bytes(given)
+            task, each = (task, False) if task is not None else self._task(parameters, size)
+        except ValueError as error:
+            stacks = "; mtjax.stacked(env) observes stacks of pictures" * frames.shown(self.takes)
+            raise InputError(f"{error}{stacks}") from None
+        seen = {name: jnp.asarray(given[name]) for name in wanted} if frames.shown(self.takes) else jnp.asarray(obs)
+        if size is None:
+            return self._act(seen, task, key, memory)
+        keys = None if key is None else jax.random.split(key, size)
+        axes = 0, 0 if each else None, None if key is None else 0, None if memory is None else 0
+        return jax.vmap(self._act, axes)(seen, task, keys, memory)
+
+    def _act(self, obs: Any, task: Task, key: Key | None, memory: Any) -> Array:
         memory = self.begin(task) if memory is None else memory
         return self.agent.act(self.state, memory, obs, task, key).action
+
+    def _task(self, parameters: dict[str, Any], size: int | None) -> tuple[Task, bool]:
+        """Return the task with these parameters, and whether it is one for each of ``size`` observations."""
+        if not isinstance(self.env, Family):
+            raise InputError("a policy of a mixture takes a task: policy(obs, task)")
+        names = [name for name, _, _ in self.env.ranges]
+        values = standalone.ordered(names, parameters, bool(parameters) or self._reads_parameters, size)
+        each = any(map(np.ndim, values))
+        values = jnp.stack(jnp.broadcast_arrays(*map(jnp.float32, values)), axis=-1) if values else jnp.zeros(0)
+        return (jax.vmap(self.task_of) if each else self.task_of)(values), each
+
+    @cached_property
+    def _reads_parameters(self) -> bool:
+        """Return whether actions depend on the task's parameters."""
+        assert isinstance(self.env, Family)
+        act = lambda values, obs: self._act(obs, self.task_of(values), None, None)
+        program, _ = steps_of(jax.make_jaxpr(act)(jnp.zeros(len(self.env.ranges)), self.takes))
+        return 0 in program["reads"]
+
+    def task_of(self, values: Array) -> Task:
+        """Return the task with the values (P,) of the family's parameters, in the order of its ranges.
+
+        One of the family's has its number, others one beyond.
+        """
+        env, columns = self.env, []
+        assert isinstance(env, Family)
+        for i, (name, low, high) in enumerate(env.ranges):
+            if name in env.parameters and env.parameters[name].direction:
+                columns += [jnp.sin(values[i]), jnp.cos(values[i])]
+            else:
+                columns.append((values[i] - (low + high) / 2) / ((high - low) / 2 or 1.0))
+        context, listed = jnp.stack(columns) if columns else jnp.zeros(1), env.tasks("all")._replace(draws=None)
+        same = jnp.all(jnp.abs(listed.context - context) <= SAME_CONTEXT, axis=1)
+        number = jnp.where(jnp.any(same), jnp.argmax(same), len(listed.id)).astype(jnp.int32)
+        first = jax.tree.map(lambda x: x[0], listed)
+        return first._replace(id=number, context=context.astype(jnp.float32))
 
     def alone(self) -> "Policy":
         """Return the policy without the run's other seeds."""
@@ -80,6 +143,11 @@ class Policy:
         """Return the memory after one step."""
         step = Transition(obs, action, reward, jnp.float32(1), next_obs)
         return self.agent.remember(self.state, memory, step, task)
+
+
+def by_name(obs: Any) -> dict[str, Any]:
+    """Return the parts of an observation, or of its shapes, in the order of their names. A vector is called obs."""
+    return {name: obs[name] for name in sorted(obs)} if isinstance(obs, Mapping) else {"obs": obs}
 
 
 @public
