@@ -15,6 +15,7 @@ from mtjax.agents.parts.encoders import ENCODERS
 from mtjax.agents.parts.gradients.surgery import RULES
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
+from mtjax.agents.parts.trajectory import Past, Seen
 from mtjax.agents.ppo import PPO, Batch, Taken, Units, advantages, take_steps
 from mtjax.config import with_preset
 from mtjax.envs.probes import Probe, tasks_of
@@ -107,6 +108,24 @@ def test_every_task_has_its_own_discount():
     np.testing.assert_allclose(batch.advantage, expected, rtol=1e-4, atol=1e-5)
 
 
+def test_a_target_infers_the_task_from_the_past_with_the_step_in_it():
+    """As the policy will, that acts at the next observation."""
+    settings = {"value_normalization": "none", "advantage_normalization": "none", "normalize_observations": False}
+    agent = small(conditioning="inferred", inferred_from=3, gae_lambda=0.0, **settings)
+    state, steps = agent.init(SPEC, TASKS, KEY), random_steps(agent)
+    head = jax.tree.map(lambda x: 1e3 * x, state.critic.shared["head"])
+    state = state._replace(critic=state.critic._replace(shared=state.critic.shared | {"head": head}))
+    _, batch, _ = agent.prepare(state, steps, TASKS)
+    flat = jax.tree.map(lambda x: np.reshape(x, (3, -1, *x.shape[3:])), steps)
+    past, latest = flat.extras.past, Past(flat.obs, flat.action, flat.reward, np.ones_like(flat.reward))
+    later = Past(*(np.concatenate([x[:, :, 1:], y[:, :, None]], axis=2) for x, y in zip(past, latest, strict=True)))
+    value = lambda obs, past: agent.values(state, jnp.zeros((3, 0)), Seen(obs, past))
+    now, following = value(flat.obs, past), value(flat.next_obs, later)
+    expected = flat.reward + agent.gamma * flat.discount * following - now
+    np.testing.assert_allclose(batch.advantage, expected, rtol=1e-4, atol=1e-3)
+    assert np.abs(following - value(flat.next_obs, past)).max() > 0.1
+
+
 # Losses.
 
 
@@ -184,6 +203,19 @@ def test_actions_that_a_task_lacks_count_for_nothing():
     steps = random_steps(agent)
     _, batch, _ = agent.prepare(state, steps, tasks)
     np.testing.assert_array_equal(take_steps(batch, jnp.arange(2)).mask, tasks.action_mask)
+
+
+def test_a_loss_counts_only_the_actions_that_its_task_has():
+    """Ratio and entropy are those of the first action alone, and no gradient reaches the outputs of the second."""
+    agent = small(entropy_cost=0.5)
+    state = agent.init(SPEC, TASKS, KEY)
+    batch, actor, _ = batch_of(agent, state, advantage=jnp.arange(4.0), mask=jnp.array([1.0, 0.0]))
+    outputs = agent.actor.apply(actor, batch.features, batch.obs)
+    batch = batch._replace(log_prob=log_density(outputs[:, ::2], batch.raw[:, :1]))
+    slope, metrics = jax.grad(agent.actor_loss, has_aux=True)(actor, (batch, KEY))
+    assert metrics["kl"] < 1e-6 and metrics["clip_fraction"] == 0
+    bias = np.asarray(slope.shared["head"]["bias"])
+    assert np.all(bias[1::2] == 0) and np.all(bias[::2] != 0)
 
 
 def test_policies_begin_wide_and_alike():
@@ -501,8 +533,21 @@ def test_updates_are_finite_and_the_key_decides(row):
 def test_numbers_out_of_range_are_refused(name, value):
     with pytest.raises(InputError, match=name.replace("_", "-")):
         agents.agent("ppo", **{name: value})
-    with pytest.raises(InputError, match="sampler=temperature"):
-        agents.agent("ppo", sampler="temperature")
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"sampler": "temperature"}, "sampler=temperature needs an agent with temperatures"),
+        ({"scaling": "ars"}, "scaling=ars renews its factors where networks are reset, and here none are"),
+        ({"scaling": "popart"}, "use value-normalization=popart"),
+        ({"representation": "encoded", "encoder_tau": 0.5}, "encoder-tau=0.5 is of updates from a replay"),
+        ({"representation": "asymmetric", "shift": 2}, "shift=2 is of updates from a replay"),
+    ],
+)
+def test_what_would_do_nothing_in_ppo_is_refused(settings, message):
+    with pytest.raises(InputError, match=message):
+        agents.agent("ppo", **settings)
 
 
 @pytest.mark.parametrize("family", ["finger-spin", "cheetah-run", "point-mass-vary-goal"])

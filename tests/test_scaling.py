@@ -109,6 +109,20 @@ def test_returns_are_scaled_to_their_range():
     np.testing.assert_allclose(units(ReturnScaling(), flipped), units(ReturnScaling(), memory))
 
 
+def test_returns_from_a_step_fit_the_range_or_exceed_it_by_less_than_gamma_times():
+    """They fit where rewards stay or rise within an episode, and not where these fall or change their sign."""
+    gamma, ages = 0.95, np.arange(80)
+    fits = [np.ones(80), ages / 80, np.float32(ages > 70), np.float32(ages == 9)]
+    others = [gamma**ages, np.float32(ages < 9), 1 - 2.0 * (ages // 9 % 2), np.random.default_rng(0).normal(size=80)]
+    exceeding = []
+    for rewards in fits + others:
+        memory = watch(ReturnScaling(), stream(rewards[:, None, None], ends=(79,), gamma=gamma), num_tasks=1)
+        from_steps = [np.sum(gamma ** ages[: 80 - t] * rewards[t:]) for t in range(80)]
+        exceeding.append(np.max(np.abs(from_steps)) * units(ReturnScaling(), memory, gamma=gamma)[0, 0] / 10)
+    assert max(exceeding[: len(fits)]) < 1 + 1e-5 and max(exceeding) < 1 + gamma
+    assert exceeding[len(fits)] > 1.2  # a reward that falls as gamma^t
+
+
 def test_what_lies_beyond_a_time_limit_counts_and_beyond_an_end_does_not():
     """Two steps of reward 1 go on for ever if they were cut off: 1 / (1 - gamma) with gamma 0.9, against 1.9."""
     rewards, scaling = np.ones((2, 2, 1)), ReturnScaling(return_range=2.0)
@@ -302,6 +316,7 @@ def test_agents_without_statistics_do_not_watch():
         ({"scaling": "reward", "variance_rate": 0.0}, r"variance-rate must be in \(0, 1\], not 0.0"),
         ({"scaling": "popart", "heads": "per-task", "target_rate": 1.5}, "target-rate must be"),
         ({"scaling": "ars", "least_mean_reward": 0.0}, "least-mean-reward must be greater than 0"),
+        ({"scaling": "ars"}, "scaling=ars renews its factors where networks are reset, and here none are"),
         ({"scaling": "pop-art"}, "unknown scaling 'pop-art'; did you mean 'popart'"),
     ],
 )
@@ -380,7 +395,7 @@ def test_resets_come_at_multiples_of_their_period_after_the_warmup(every, expect
 
 def test_a_reset_renews_all_that_learns_and_nothing_else():
     """What it renews is as if just initialised; statistics of the data, and who the tasks are, stay."""
-    scaled = tiny("sac-conditioned", scaling="ars", sampler="hardest", normalize_observations=True)
+    scaled = tiny("sac-conditioned", scaling="ars", reset_every=9, sampler="hardest", normalize_observations=True)
     init, update = learner(scaled, TASKS, BATCH, SPEC)
     state = init(TASKS, KEY)
     rewards = np.full((3, 3, 2), [[5.0], [1.0], [90.0]])
@@ -405,7 +420,7 @@ def test_a_reset_renews_all_that_learns_and_nothing_else():
 def test_resets_work_in_the_loop_with_seeds():
     """ARS under two seeds: the factors of the last reset, from the mean rewards of that time."""
     settings = BRIEF | {"reset_every": 8, "warmup_steps": 2}
-    state, _ = train(Probe("one-step"), tiny("sac", scaling="ars", hidden=(8,)), settings, seeds=(3, 5))
+    state, _ = train(Probe("one-step"), tiny("sac", scaling="ars", reset_every=8, hidden=(8,)), settings, seeds=(3, 5))
     np.testing.assert_allclose(state.agent.scales.mean, np.tile([1.0, -0.5], (2, 1)), rtol=1e-5)
     np.testing.assert_allclose(state.agent.scales.factor, np.tile([1.0, 100.0], (2, 1)), rtol=1e-5)
     np.testing.assert_array_equal(state.agent.optimizers[0][1][0].count, 2)  # updates since step 8 of 10

@@ -109,11 +109,29 @@ def test_a_run_that_goes_on_for_longer_says_so(short_family, tmp_path, capsys):
     np.testing.assert_array_equal(counts(policy.states.optimizers)["critic"], [70, 70])  # 75 steps, 5 of them random
 
 
+def test_rates_of_what_learns_at_every_fourth_update_fall_with_the_updates():
+    """Of a constant gradient Adam's step is the rate: after 10 of its own steps the actor is 40 updates on its way."""
+    agent = tiny("sac", lr_schedule="linear", lr_warmup=8, lr_updates=100, experience=Replay(policy_delay=4))
+    rates = {"actor": agent.actor_lr, "critic": agent.critic_lr, "temperature": agent.temperature_lr}
+    for name, delay in (("actor", 4), ("critic", 1), ("temperature", 4)):
+        optimizer, params = getattr(agent.optimizers, name), {"x": jnp.ones(1)}
+        memory, steps = optimizer.init(params), []
+        for _ in range(11):
+            step, memory = optimizer.update(params, memory, params)
+            steps.append(-step["x"][0] / rates[name])
+        warmup, count = 8 / delay, np.arange(11)
+        rising = np.minimum((count + 1) / warmup, 1)
+        expected = rising * (1 - np.clip((count - warmup) / (100 / delay - warmup), 0, 1))
+        np.testing.assert_allclose(steps, expected, rtol=1e-4)
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
         ({"lr_schedule": "line"}, "unknown lr-schedule 'line'; did you mean 'linear'"),
         ({"lr_final": 1.5}, r"lr-final must be in \[0, 1\], not 1.5"),
+        ({"lr_final": 0.1}, "lr-final=0.1 is where a schedule ends, and lr-schedule=constant is none"),
+        ({"lr_updates": 9}, "lr-updates=9 is where a schedule ends, and lr-schedule=constant is none"),
         ({"lr_warmup": -1}, "lr-warmup must be at least 0, not -1"),
         ({"lr_updates": -1}, "lr-updates must be at least 0, not -1"),
         (

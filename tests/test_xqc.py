@@ -34,6 +34,25 @@ def both_ends(made, state, batch, key):
     return np.concatenate([np.concatenate(end, axis=-1) for end in ends], axis=1)
 
 
+def test_targets_are_normalised_by_both_ends_of_the_batch_and_not_by_running_statistics():
+    """So they depend on the rest of the batch, and not on what the target critics have seen before."""
+    made, state, _ = started()
+    batch = random_batch(1, 3, BATCH, SPEC)._replace(discount=jnp.ones((3, BATCH)))
+
+    @jax.jit
+    def target(state, batch):
+        state, seen = made.prepare(state, batch, TASKS)
+        return made.critic_problem(state, seen, KEY)[1][1].target
+
+    as_it_is = np.asarray(target(state, batch))
+    other = {name: jax.tree.map(lambda x: 3 * x + 1, x) for name, x in state.target.own.items() if name == STATISTICS}
+    assert other
+    moved = state._replace(target=state.target._replace(own=state.target.own | other))
+    np.testing.assert_array_equal(target(moved, batch), as_it_is)
+    mates = batch._replace(obs=batch.obs.at[:, 1].add(2.0))
+    assert np.abs(target(state, mates)[:, 0] - as_it_is[:, 0]).max() > 1e-4
+
+
 def test_a_layer_normalises_by_the_batch_by_hand():
     """Inputs 1, 2, 3, 6: mean 3 and variance 3.5; running ones move by a hundredth, and are what acting uses."""
     network = Network(BatchNorm().body((1,), layer_norm=False))

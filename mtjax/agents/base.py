@@ -212,6 +212,22 @@ class BaseAgent(abc.ABC):
             raise InputError(f"gradient-scope=per-layer needs gradients of every task, which {rule} does not use")
         if parts.name_of(SCALINGS, self.scaling) == "return" and self.gamma == 1:
             raise InputError("scaling=return needs discounted returns, which have bounds; use gamma below 1")
+        if self.scaling.follows_resets and not self.experience.reset_every:
+            name = parts.name_of(SCALINGS, self.scaling)
+            raise InputError(
+                f"scaling={name} renews its factors where networks are reset, and here none are; use scaling=reward, "
+                "or give reset-every to an agent that has a replay"
+            )
+        if self.lr_schedule == "constant" and (self.lr_final or self.lr_updates):
+            given = f"lr-final={self.lr_final}" if self.lr_final else f"lr-updates={self.lr_updates}"
+            raise InputError(
+                f"{given} is where a schedule ends, and lr-schedule=constant is none; use linear or cosine"
+            )
+        if self.context_limit and self.conditioning != "parameters":
+            raise InputError(
+                f"context-limit={self.context_limit} clips parameters that networks see, and with "
+                f"conditioning={self.conditioning} they see none; use conditioning=parameters"
+            )
         if self.lr_schedule != "constant" and self.experience.reset_every:
             raise InputError(
                 f"reset-every begins the optimisers anew, and lr-schedule={self.lr_schedule} with them; use constant"

@@ -130,15 +130,18 @@ class PPO(BaseAgent):
     74 kB a step, so that ten tasks take 6 GB with H = 32 and E = 256. A run prints how much it is.
 
     A representation that learns (``representation``) is trained by L_V and its own losses on the same minibatches. Its
-    target encoder is the encoder from before the update, as values are the critic's from before the update; so
-    ``encoder_tau`` has no effect here.
+    target encoder is the encoder from before the update, as values are the critic's from before the update; so there is
+    no ``encoder_tau`` here, and no ``shift`` of pictures.
 
     Observations are normalised by moments of the rollouts before this one, in acting and in learning, so that the ratio
     is 1 before the first step of an update. The rollout joins the moments after the update. A representation's steps
     change the policy too, and the ratio counts that.
 
     Differs from the paper: actor and critic share no parameters, so that the critic's loss needs no weight; advantages
-    and values are normalised; time limits bootstrap; observations are normalised by moments of the rollouts.
+    and values are normalised; time limits bootstrap; observations are normalised by moments of the rollouts. Differs
+    from the authors' code (OpenAI Baselines), where Adam's epsilon is 1e-5, here 1e-8; where advantages are normalised
+    in every minibatch, here once a rollout; where values are clipped, here only with ``value_clip``; and where networks
+    begin orthogonal, the critic's head at full size. Here they begin by LeCun's initialisation, both heads at 0.01.
     """
 
     adjustable: ClassVar[tuple[str, ...]] = (
@@ -200,6 +203,11 @@ class PPO(BaseAgent):
             raise InputError("scaling=popart is for critics of actions; use value-normalization=popart")
         if parts.name_of(SAMPLERS, self.sampler) == "temperature":
             raise InputError("sampler=temperature needs an agent with temperatures; use another sampler")
+        given, usual = (parts.settings(x) for x in (self.representation, type(self.representation)()))
+        for name in ("encoder_tau", "shift"):
+            if given.get(name) != usual.get(name):
+                flag = name.replace("_", "-")
+                raise InputError(f"{flag}={given[name]} is of updates from a replay, and ppo has none; leave it out")
 
     def updates_in(self, steps: int) -> int:
         return super().updates_in(steps) * self.epochs * self.minibatches

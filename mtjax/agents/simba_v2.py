@@ -26,6 +26,8 @@ class SimbaV2(SAC):
 
     Differs from the authors' code:
         Rates: by default learning rates stay at 1e-4; there they fall to 5e-5 (lr_schedule=linear, lr_final=0.5).
+        Discount: by default gamma is 0.99 for all tasks; there it is 1 - 5 / h for h decisions in an episode, within
+        [0.95, 0.995] (discounting=horizon), which is 0.99 for their 500.
         Size: actor and critics have the widths ``hidden``; there, critics have two blocks of 512 and the actor one of
         128 (critic_hidden=(512, 512), actor_hidden=(128,)).
         Critics: the mean of two critics bootstraps and guides the actor. There it is the minimum where episodes

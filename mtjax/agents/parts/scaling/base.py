@@ -1,7 +1,7 @@
 """``NoScaling`` is the interface of scalings, and the one that changes nothing."""
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 
@@ -13,6 +13,8 @@ from mtjax.types import Array, Transition
 @dataclasses.dataclass(frozen=True)
 class NoScaling(parts.Watcher):
     """Leaves rewards as they are. Every scaling is a class with these methods."""
+
+    follows_resets: ClassVar[bool] = False  # whether its units are renewed by resets of networks alone
 
     def units(self, memory: Any, gamma: float | Array, bonus: Array) -> tuple[Array, Array] | None:
         """Return each task's factor and offset (T,); None for 1 and 0.

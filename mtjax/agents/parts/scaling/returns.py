@@ -17,7 +17,7 @@ class _OfReturns(NoScaling):
 
     watches = True
     return_range: float = 10.0
-    """Largest |discounted return| after scaling; with value=c51 or hl-gauss, the range of their bins."""
+    """Largest |discounted sum of rewards so far| after scaling; with value=c51 or hl-gauss, the range of their bins."""
 
     def __post_init__(self):
         parts.require_positive(self, "return_range")
@@ -39,7 +39,7 @@ class LargestReturns(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class ReturnScaling(_OfReturns):
-    """Divides so that the task's largest discounted return just fits a range (BRC; Nauman et al. 2025).
+    """Divides by the task's largest discounted sum of rewards, to fit returns to a range (BRC; Nauman et al. 2025).
 
     With G the largest |return| so far, horizon h = 1 / (1 - gamma), temperature a and target entropy H, the
     factor is range / (G + h a |H| / 2); the second term leaves room for the bonus of entropy.
@@ -47,8 +47,9 @@ class ReturnScaling(_OfReturns):
     Differs from the authors' code, which keeps whole episodes, and takes G over the return from every step, plus h
     times the episode's mean reward beyond a time limit. Here G is the larger of two: the
     largest sum that discounts backwards, r_t + gamma r_(t-1) + ..., which needs no whole episodes and is the same for
-    constant rewards; and h times the mean reward of an episode that a time limit cut off. Before there is any reward
-    the factor is 1.
+    constant rewards; and h times the mean reward of an episode that a time limit cut off. So returns just fit where
+    rewards stay or rise within an episode. Where they fall, as after a catch that is lost, the return from a step may
+    exceed the range, and is less than (1 + gamma) times as large. Before there is any reward the factor is 1.
     """
 
     def init(self, num_tasks: int) -> LargestReturns:
@@ -83,12 +84,14 @@ class ReturnNormalization(_OfReturns):
         factor = 1 / max(std(G), max |G| / range)
     over all steps of training so far. Before there is any reward the factor is 1.
 
-    Differs from the authors' code: every task has its own statistics; no small number is added to the variance, as the
-    range already bounds the factor. As there, the bonus of entropy has no room in the range.
+    Differs from the authors' code: every task has its own statistics; G begins at 0 in every episode and counts up to
+    its last step, where there the last step's G is its reward alone, with which the next episode begins; no small
+    number is added to the variance, as the range already bounds the factor. As there, the bonus of entropy has no room
+    in the range.
     """
 
     return_range: float = 5.0
-    """Largest |discounted return| after scaling; with value=c51 or hl-gauss, the range of their bins."""
+    """Largest |discounted sum of rewards so far| after scaling; with value=c51 or hl-gauss, the range of their bins."""
 
     def init(self, num_tasks: int) -> SpreadOfReturns:
         return SpreadOfReturns(normalize.init(num_tasks), jnp.zeros(num_tasks))

@@ -55,7 +55,7 @@ class AdaptiveScaling(NoScaling):
     """Scales all tasks' mean rewards to the largest one, anew at each reset of networks (Cho et al. 2025, "ARS").
 
     With r_i the task's mean reward so far, and at least 0.01, factor_i = max_j r_j / r_i. Factors are set when learning
-    begins and whenever networks are reset, as critics cannot follow rewards whose scale changes. So use it with
+    begins and whenever networks are reset, as critics cannot follow rewards whose scale changes. So it needs
     ``--reset-every``: its authors reset 4 times in a run on MT10 and 6 times on MT50.
 
     Differs from the authors' code: means are over all rewards so far, where theirs are over the replay; no extra
@@ -63,6 +63,7 @@ class AdaptiveScaling(NoScaling):
     """
 
     watches = True
+    follows_resets = True
     least_mean_reward: float = 0.01
     """Lower bound of mean rewards, which limits how much a task's rewards are scaled up."""
 
