@@ -62,7 +62,7 @@ TRACED = [
     *some([("sac-conditioned", {"gradients": rule, "gradient_scope": "per-layer"}) for rule in RULES], 5),
     *some([("sac-conditioned", {"encoder": name}) for name in ENCODERS], 1),
     *some([(name, {"value": value}) for value in VALUES for name in ("sac-conditioned", "deepmdp")], 1),
-    *some([("multi-head", {"scaling": scaling}) for scaling in SCALINGS], 1),
+    *some([("multi-head", {"scaling": scaling, "reset_every": 100}) for scaling in SCALINGS], 1),
     *some([("sac-conditioned", {"sampler": sampler}) for sampler in SAMPLERS], 1),
 ]
 # Those that are also run, as compiling takes seconds: every agent, and every way to tell the task.
@@ -384,6 +384,8 @@ REFUSED = [
     ("sac", {"conditioning": "embedding", "embedding_size": 0}, "embedding-size"),
     ("sac", {"conditioning": "vectors"}, "conditioning=vectors and vectors=FILE.npy go together"),
     ("sac", {"vectors": "x.npy"}, "conditioning=vectors and vectors=FILE.npy go together"),
+    ("sac", {"context_limit": 1.0}, "context-limit=1.0 clips parameters .* conditioning=none they see none"),
+    ("sac", {"temperature_momentum": 1.0}, r"temperature-momentum must be in \[0, 1\), not 1.0"),
     ("care", {"conditioning": "none"}, "conditioning cannot be none; use parameters"),
     ("care", {"variant": "papers"}, "unknown variant 'papers'; did you mean 'paper'"),
     ("care", {"num_experts": 0}, "at least one expert"),

@@ -16,9 +16,11 @@ import mtjax.evaluate
 from mtjax import frames
 from mtjax.agents.parts import vision
 from mtjax.agents.parts.representations.encoded import Encoded
+from mtjax.config import with_preset
 from mtjax.envs.probes import Pictured, Probe
 from mtjax.experience import Rollouts, pictures
 from mtjax.networks import OVER_TASKS, Params
+from mtjax.training.launch import check
 from mtjax.types import InputError, Transition
 
 KEY = jax.random.key(0)
@@ -352,6 +354,16 @@ def test_a_policy_that_was_trained_beside_the_state_acts_by_pictures_alone(tmp_p
 def test_observations_that_no_part_takes_are_refused(env, agent, message):
     with pytest.raises(InputError, match=message):
         mtjax.train(env, agent, steps=100)
+
+
+@pytest.mark.parametrize("agent", ["drq", "sac-ae", mtjax.agent("drq")], ids=["drq", "sac-ae", "made"])
+def test_agents_for_pictures_do_not_learn_from_states_in_silence(agent):
+    """Refused with what to do. The encoder of states that is named there is allowed."""
+    name = agent if isinstance(agent, str) else "drq"
+    said = f"{name} learns from pictures, and pendulum-swingup shows none: give --env.pixels=64, or for states use"
+    with pytest.raises(InputError, match=said):
+        mtjax.train("pendulum-swingup", agent, steps=100)
+    check(with_preset("pendulum-swingup", "sac-conditioned", agent_settings={"representation": "encoded"}))
 
 
 def test_a_run_is_refused_before_its_folder_is_made(tmp_path):

@@ -128,15 +128,16 @@ def _run(env, agent, seeds, knobs=None, chunks=2):
 
 _NAMES = ("actor_lr", "critic_lr", "temperature_lr", "gamma", "tau", "initial_temperature", "target_entropy")
 _NAMES = (*_NAMES, "weight_decay", "max_gradient_norm", "return_range", "lr_final", "context_limit")
+_NAMES = (*_NAMES, "temperature_momentum")
 POINTS = (
-    dict(zip(_NAMES, (1e-3, 2e-3, 1e-3, 0.9, 0.01, 0.1, -0.5, 0.0, 0.0, 10.0, 1.0, 0.0), strict=True)),
-    dict(zip(_NAMES, (1e-2, 1e-3, 3e-3, 0.5, 0.1, 1.0, 0.5, 0.1, 0.1, 5.0, 0.2, 0.5), strict=True)),
+    dict(zip(_NAMES, (1e-3, 2e-3, 1e-3, 0.9, 0.01, 0.1, -0.5, 0.0, 0.0, 10.0, 1.0, 0.0, 0.9), strict=True)),
+    dict(zip(_NAMES, (1e-2, 1e-3, 3e-3, 0.5, 0.1, 1.0, 0.5, 0.1, 0.1, 5.0, 0.2, 0.5, 0.5), strict=True)),
 )
 
 
 def test_a_point_trains_as_the_run_with_its_values():
     """Both seeds of two points, one with clipping and decay and one without, against plain runs of the same seeds."""
-    agent = tiny("sac", scaling="return", lr_schedule="linear", lr_updates=20)
+    agent = tiny("sac-conditioned", scaling="return", lr_schedule="linear", lr_updates=20)
     assert set(_NAMES) == set(points.sweepable(agent))
     env, seeds = Walk(), jnp.arange(2, dtype=jnp.uint32)
     state, metrics = _run(env, SweptAgent(agent), *points.seed_axis(POINTS, seeds))

@@ -22,6 +22,7 @@ class Preset(NamedTuple):
     defaults: Mapping[str, Any] = {}
     place: "str | type[BaseAgent]" = "mtjax.agents.sac:SAC"  # the class, or where it is, to be imported when it is used
     home: str = ""  # the file that registered it, if it is the user's own
+    sees_pictures: bool = False  # whether it is for pictures alone
 
     @property
     def cls(self) -> "type[BaseAgent]":
@@ -62,10 +63,12 @@ AGENTS: dict[str, Preset] = {
     "drq": Preset(
         "SAC from pictures that are shifted at random (Yarats et al. 2022)",
         {"representation": "encoded", "encoder_tau": 1.0, "n_step": 3, "tau": 0.01, **_PARAMS},
+        sees_pictures=True,
     ),
     "sac-ae": Preset(
         "SAC from pictures, with a decoder (Yarats et al. 2021)",
-        {"representation": "autoencoder", "tau": 0.01, **_PARAMS},
+        {"representation": "autoencoder", "tau": 0.01, "target_entropy": -1.0, "temperature_momentum": 0.5, **_PARAMS},
+        sees_pictures=True,
     ),
     "ppo": Preset(
         "Proximal policy optimisation (Schulman et al. 2017), sees its task", _PARAMS, "mtjax.agents.ppo:PPO"

@@ -19,7 +19,7 @@ class BRC(SAC):
         Q_n(s, a, e_i / |e_i|) and pi(s, e_i / |e_i|) are residual, layer-normalised networks    (encoder=bronet)
         Q_n is a distribution over returns in [-10, 10], fitted by its cross-entropy             (value=c51)
         the mean of both critics' distributions bootstraps, and its mean guides the actor        (critic_reduction=mean)
-        rewards are divided so that the task's largest return fits the range                     (scaling=return)
+        rewards are divided by the task's largest discounted sum, to fit returns to the range    (scaling=return)
     with one temperature, a target entropy of -A/2 and AdamW. Each part's class has its equations.
 
     Differs from the authors' code:
@@ -30,7 +30,7 @@ class BRC(SAC):
         Batch: every update draws ``batch_size`` transitions of each task; there, 1024 at random from all tasks.
         Embeddings: the actor and each critic learn their own, whose initial length is about the square root of their
         size; there, all share one of initial length about 1, which the actor's loss does not train.
-        Temperature: its Adam has a first decay of 0.9; there, 0.5.
+        Temperature: its Adam has a first decay of 0.9; there, 0.5 (temperature_momentum).
         Mixtures: each task's target entropy counts its own actions; there, padded ones too.
         ``BroNet`` describes the initial weights of the body, and ``ReturnScaling`` the largest return.
     """

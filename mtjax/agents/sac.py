@@ -89,9 +89,14 @@ class SAC(BaseAgent):
     is -A/2 and each task has its own temperature; a tanh brings log standard deviations into [-5, 2].
     """
 
-    adjustable: ClassVar[tuple[str, ...]] = (*BaseAgent.adjustable, "temperature_lr", "tau", "target_entropy")
+    adjustable: ClassVar[tuple[str, ...]] = (
+        *BaseAgent.adjustable,
+        *("temperature_lr", "temperature_momentum", "tau", "target_entropy"),
+    )
     temperature_lr: float = 1e-3
     """Adam's learning rate of the temperatures."""
+    temperature_momentum: float = 0.9
+    """First decay rate of the temperatures' Adam; 0.5 in SAC-AE and BRC."""
     tau: float = 0.005
     """Step of the target critic towards the new critic at each update, as a share of the distance."""
     num_critics: int = 2
@@ -114,6 +119,8 @@ class SAC(BaseAgent):
             raise InputError(f"gamma must be in [0, 1] and tau in (0, 1], not {self.gamma} and {self.tau}")
         super()._check_numbers()
         parts.require_positive(self, "temperature_lr", "num_critics", "initial_temperature")
+        if not 0 <= self.temperature_momentum < 1:
+            raise InputError(f"temperature-momentum must be in [0, 1), not {self.temperature_momentum}")
 
     def _check_combination(self) -> None:
         super()._check_combination()
@@ -168,7 +175,7 @@ class SAC(BaseAgent):
     @property
     def optimizers(self) -> Optimizers:
         temperature_lr = self.scheduled(self.temperature_lr, self.experience.policy_delay)
-        return Optimizers(*self.network_optimizers, optax.adam(temperature_lr))
+        return Optimizers(*self.network_optimizers, optax.adam(temperature_lr, self.temperature_momentum))
 
     # Acting.
 

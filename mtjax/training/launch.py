@@ -7,6 +7,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from mtjax import frames
+from mtjax.agents import preset_of
 from mtjax.config import RunConfig, require_value_range, slow_on_cpu
 from mtjax.envs import Family
 from mtjax.parallel import hosts, mesh
@@ -43,6 +45,7 @@ def check(config: RunConfig, start: Policy | None = None) -> None:
         learner.require_sight(family.spec)
         if start is not None:
             require_fit(start, family, learner)
+    require_pictures(config)
     begins = start is not None or bool(config.start)
     if config.learner.conditioning in ("vectors", "text"):
         config.learner.load_vectors(family.spec, family.train_count)
@@ -51,6 +54,20 @@ def check(config: RunConfig, start: Policy | None = None) -> None:
         raise InputError(f"--tune={tune} leaves the rest as a run left it; say which run: --from=RUN")
     if begins and config.learner.experience.reset_every:
         raise InputError("--reset-every throws away what --from takes from a run; give one of them")
+
+
+def require_pictures(config: RunConfig) -> None:
+    """Refuse an agent for pictures in a family that shows none.
+
+    Raises:
+        InputError: that is so.
+    """
+    if not preset_of(config.agent).sees_pictures or frames.shown(config.family.spec.obs):
+        return
+    raise InputError(
+        f"{config.agent} learns from pictures, and {config.env} shows none: give --env.pixels=64, or for states use "
+        "--agent=sac-conditioned, to which --agent.representation=encoded adds an encoder"
+    )
 
 
 def load_start(config: RunConfig) -> Policy | None:

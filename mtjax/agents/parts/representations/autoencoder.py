@@ -28,9 +28,13 @@ class Autoencoder(Encoded):
 
     phibar, with its projection, moves by ``encoder_tau``.
 
-    Differs from the paper: one optimiser steps encoder, decoder and critics together, at every update, and actor and
-    targets move at every update, there at every second; the decay of the decoder is a part of the loss; batches and
-    rates are those of all agents here, where the paper has batches of 128 and temperatures that begin at 0.1.
+    As in the paper, temperatures of the agent sac-ae begin at 0.1 and are tuned to an entropy of -A, by an Adam whose
+    first decay rate is 0.5.
+
+    Differs from the paper: the encoder takes pictures as numbers from -0.5 to 0.5, there from 0 to 1; one optimiser
+    steps encoder, decoder and critics together, at every update, and actor and targets move at every update, there at
+    every second; the decay of the decoder is a part of the loss; batches and rates are those of all agents here, where
+    the paper has batches of 128.
     """
 
     shift: int = 0
