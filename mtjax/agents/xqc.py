@@ -45,7 +45,7 @@ class XQC(SAC):
         of 256 (critic_hidden=(512, 512, 512, 512), actor_hidden=(256, 256, 256, 256)).
         Tasks: networks see the task's parameters, and every task has its own temperature and statistics; there is one
         task there.
-        Rewards: the largest return fits the range too; there, the standard deviation alone divides.
+        Rewards: the largest sum of rewards fits the range too; there, the standard deviation alone divides.
         Actor: log standard deviations lie in [-5, 2] by a tanh; there, they are clipped to [-10, 2].
         ``BatchNorm`` describes how the task enters, and the initial weights.
     """
