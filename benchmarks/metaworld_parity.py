@@ -34,7 +34,7 @@ import metaworld_policies
 import numpy as np
 from physics import physics
 from report import publish, run_main
-from steps_per_second import Contestant
+from steps_per_second import Contestant, physics_of_family
 
 import mtjax
 from mtjax.envs.engines.base import ENGINES
@@ -202,7 +202,8 @@ def race(original: Original | None, arguments: argparse.Namespace) -> None:
         for suffix, resets in ((", resets as in training", True), (", no resets", False)):
             make = lambda mixture=mixture, resets=resets: physics(mixture, per_task, arguments.steps, resets)
             name = f"{label} ({len(mixture.groups)} simulators){suffix}"
-            contestants.append(Contestant(name, per_task * len(env.families), arguments.steps, make))
+            worlds, of_step = per_task * len(env.families), physics_of_family(env.families[0])
+            contestants.append(Contestant(name, worlds, arguments.steps, of_step, make))
             print(f"{name}: compiled in {contestants[-1].first_call_seconds:.0f} s", flush=True)
     theirs = []
     tasks = [name.removeprefix("metaworld-") for name in BENCHMARKS["mt10"][1]]
@@ -217,6 +218,7 @@ def race(original: Original | None, arguments: argparse.Namespace) -> None:
             "engine": env.engine_name,
             "worlds": each.worlds,
             "steps_per_second": statistics.median(each.rates),
+            "substeps_per_second": statistics.median(each.rates) * each.physics.substeps,
             "slowest": min(each.rates),
             "fastest": max(each.rates),
             "over_original": statistics.median(map(operator.truediv, each.rates, theirs)) if theirs else None,

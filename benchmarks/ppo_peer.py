@@ -34,6 +34,7 @@ import os
 import statistics
 import sys
 import tempfile
+import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -75,7 +76,7 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=128, help="of each evaluation")
     parser.add_argument("--marks", type=float, nargs="+", default=[500, 700, 850])
     parser.add_argument("--smaller", type=int, default=1, help="divide worlds and batches by this, to try the script")
-    parser.add_argument("--out", type=Path, default=Path("runs") / "ppo-peer")
+    parser.add_argument("--out", type=Path, default=Path("runs") / f"ppo-peer-{time.strftime('%Y%m%d-%H%M%S')}")
     parser.add_argument("--part", nargs=3, metavar=("TASK", "SIDE", "SEED"), help="run this part in this process")
     parts.add_flags(parser, seconds=300)
     arguments = parser.parse_args()
@@ -85,17 +86,17 @@ def main() -> None:
         return
     every = [(env, side, seed) for seed in range(arguments.seeds) for env in arguments.envs for side in arguments.sides]
     with tempfile.TemporaryDirectory() as caches:
-        of_all = [part(env, side, seed, Path(caches)) for env, side, seed in every]
+        of_all = [part(env, side, seed, Path(caches), arguments.out) for env, side, seed in every]
         left = parts.run_parts(__file__, of_all, arguments.out, arguments)
     print(tabulate(arguments.out, arguments.marks))
     parts.require_all(left)
 
 
-def part(env: str, side: str, seed: int, caches: Path) -> parts.Part:
+def part(env: str, side: str, seed: int, caches: Path, out: Path) -> parts.Part:
     """Return a part, which shares its caches of compiled programs and kernels with other seeds only."""
     cache = caches / env / side
     folders = {_CACHE: cache / "xla", "JAX_COMPILATION_CACHE_DIR": cache / "xla", "WARP_CACHE_PATH": cache / "warp"}
-    words = [*sys.argv[1:], "--part", env, side, str(seed)]
+    words = [*sys.argv[1:], "--out", str(out), "--part", env, side, str(seed)]
     return parts.Part(f"{env}/{side}-{seed}", words, {name: str(folder) for name, folder in folders.items()})
 
 

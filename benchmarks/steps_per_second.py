@@ -7,13 +7,17 @@ other load on the machine affects all of them. Figures are medians over the roun
 round's ratio. There are ten tasks, random actions, and fresh random starts every 1000 steps. "no resets" is the same
 program with endless episodes. Playground 0.2 (pip install playground==0.2.0) runs one task, in its own wrapper for
 training, whose automatic reset returns to one stored state. Compile time is reported separately.
+
+A step is one of control. Both sides choose how many substeps of physics it takes, and by which integrator; where
+Playground takes more or fewer than we do, "our substeps" is its environment with the length of ours. Every row has its
+substeps a second too, and ratios are given by both.
 """
 
 import argparse
 import statistics
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -37,6 +41,7 @@ DOMAINS = {
 }
 # Where Playground integrates by Euler, with one solver iteration, what dm_control does by Runge and Kutta.
 _EULER = ("cartpole",)
+_OVER = "over_playground"
 _ON_CPU = jax.default_backend() == "cpu"
 
 
@@ -55,18 +60,26 @@ def main() -> None:
     rows = []
     for domain in arguments.domains:
         rows += compare(domain, arguments)
-        print(table(rows[-8:], domain), flush=True)
+        print(table(rows, domain), flush=True)
     if arguments.agent != "none":
         rows.append(training_rate(arguments))
         print(f"training {arguments.agent}: {rows[-1]['steps_per_second']:,.0f} env-steps/s", flush=True)
     publish(arguments, rows)
 
 
-class Contestant:
-    """A compiled program that takes ``steps`` steps of ``worlds`` worlds at each call."""
+class Physics(NamedTuple):
+    """Holds what one step of control is made of."""
 
-    def __init__(self, name: str, worlds: int, steps: int, make: Callable[[], Callable[[], Any]]):
-        self.name, self.worlds, self.steps = name, worlds, steps
+    substeps: int
+    substep_seconds: float
+    integrator: str
+
+
+class Contestant:
+    """A compiled program that takes ``steps`` steps of ``worlds`` worlds at each call, with some physics in each."""
+
+    def __init__(self, name: str, worlds: int, steps: int, physics: Physics, make: Callable[[], Callable[[], Any]]):
+        self.name, self.worlds, self.steps, self.physics = name, worlds, steps, physics
         self.rates: list[float] = []
         before = time.perf_counter()
         self.run = make()
@@ -84,9 +97,9 @@ def compare(domain: str, arguments: argparse.Namespace) -> list[dict]:
     name, vary, other = DOMAINS[domain]
     contestants = []
 
-    def enter(label: str, worlds: int, steps: int, make: Callable[[], Callable[[], Any]]) -> None:
+    def enter(label: str, worlds: int, steps: int, physics: Physics, make: Callable[[], Callable[[], Any]]) -> None:
         try:
-            contestants.append(Contestant(label, worlds, steps, make))
+            contestants.append(Contestant(label, worlds, steps, physics, make))
         except (InputError, ImportError) as error:
             print(f"{domain}: {label} left out: {error}", flush=True)
 
@@ -98,17 +111,18 @@ def compare(domain: str, arguments: argparse.Namespace) -> list[dict]:
             kinds.append((", euler/1", {**settings, "integrator": "euler", "solver_iterations": 1}, True))
         for suffix, chosen, resets in kinds:
             make = lambda chosen=chosen, resets=resets: ours(name, chosen, per_task, arguments.steps, resets)
-            enter(f"mtjax {engine}{suffix}", 10 * per_task, arguments.steps, make)
-    short = max(arguments.steps // 5, 1)
+            enter(f"mtjax {engine}{suffix}", 10 * per_task, arguments.steps, physics_of(name, chosen), make)
+    short, own = max(arguments.steps // 5, 1), physics_of(name, {"vary": vary})
     if _ON_CPU:
-        enter("mujoco.batch alone", 10 * per_task, short, lambda: batch_alone(name, vary, per_task, short))
+        enter("mujoco.batch alone", 10 * per_task, short, own, lambda: batch_alone(name, vary, per_task, short))
     for impl in () if arguments.no_playground else ("jax",) if _ON_CPU else ("jax", "warp"):
-        make = lambda impl=impl: playground(other, impl, arguments.worlds, short)
-        enter(f"playground {impl}", arguments.worlds, short, make)
+        for suffix, chosen, physics in playground_physics(other, own):
+            make = lambda chosen=chosen, impl=impl: playground(other, {**chosen, "impl": impl}, arguments.worlds, short)
+            enter(f"playground {impl}{suffix}", arguments.worlds, short, physics, make)
     for _ in range(arguments.repeats):
         for contestant in contestants:
             contestant.time()
-    against = [c for c in contestants if c.name.startswith("playground")]
+    against = [c for c in contestants if c.name in ("playground jax", "playground warp")]
     best = max(against, key=lambda c: statistics.median(c.rates)) if against else None
     return [_row(domain, c, best) for c in contestants]
 
@@ -124,9 +138,42 @@ def _row(domain: str, contestant: Contestant, best: Contestant | None) -> dict:
         "steps_per_second": statistics.median(contestant.rates),
         "slowest": min(contestant.rates),
         "fastest": max(contestant.rates),
-        "over_playground": ratio,
+        _OVER: ratio,
+        "over_playground_by_substep": ratio and best and ratio * contestant.physics.substeps / best.physics.substeps,
+        **contestant.physics._asdict(),
+        "substeps_per_second": statistics.median(contestant.rates) * contestant.physics.substeps,
         "first_call_seconds": contestant.first_call_seconds,
     }
+
+
+def physics_of(name: str, settings: dict) -> Physics:
+    """Return the physics of a step of one of our families, by its name and settings."""
+    return physics_of_family(mtjax.make(name, **settings))
+
+
+def physics_of_family(env: Any) -> Physics:
+    assert isinstance(env, Domain)
+    return Physics(env.num_substeps, env.models[0].opt.timestep, integrator_of(env.models[0]))
+
+
+def playground_physics(name: str, own: Physics) -> list[tuple[str, dict, Physics]]:
+    """Return label, settings and physics of Playground's environment, and of one with our substeps if they differ."""
+    try:
+        from mujoco_playground import registry  # type: ignore  # not a dependency of this package
+    except ImportError as error:
+        print(f"playground left out: {error}", flush=True)
+        return []
+    of = lambda chosen: registry.load(name, config_overrides={"impl": "jax", **chosen})
+    physics = lambda env: Physics(env.n_substeps, env.sim_dt, integrator_of(env.mj_model))
+    found = [("", {}, physics(of({})))]
+    if found[0][2].substep_seconds != own.substep_seconds:
+        chosen = {"sim_dt": own.substep_seconds}
+        found.append((", our substeps", chosen, physics(of(chosen))))
+    return found
+
+
+def integrator_of(model: mujoco.MjModel) -> str:
+    return mujoco.mjtIntegrator(model.opt.integrator).name.removeprefix("mjINT_").lower()
 
 
 def ours(name: str, settings: dict, per_task: int, steps: int, resets: bool) -> Callable[[], Any]:
@@ -187,11 +234,11 @@ def batch_alone(name: str, vary: dict, per_task: int, steps: int) -> Callable[[]
     return run
 
 
-def playground(name: str, impl: str, worlds: int, steps: int) -> Callable[[], Any]:
-    """Return Playground's environment in its training wrapper, with its default configuration but for the engine."""
+def playground(name: str, chosen: dict, worlds: int, steps: int) -> Callable[[], Any]:
+    """Return Playground's environment in its training wrapper, with its default configuration but for the chosen."""
     from mujoco_playground import registry, wrapper  # type: ignore  # not a dependency of this package
 
-    env = registry.load(name, config_overrides={"impl": impl})
+    env = registry.load(name, config_overrides=chosen)
     env = wrapper.wrap_for_brax_training(env, episode_length=1000, action_repeat=1)
 
     def play(carry):
@@ -228,19 +275,25 @@ def training_rate(arguments: argparse.Namespace) -> dict:
         "steps_per_second": statistics.median(training.rates),
         "slowest": min(training.rates),
         "fastest": max(training.rates),
+        **physics_of("finger-spin-vary-size", {})._asdict(),
+        "substeps_per_second": statistics.median(training.rates) * physics_of("finger-spin-vary-size", {}).substeps,
         "updates_per_second": training.updates / statistics.median(training.seconds),
         "first_call_seconds": training.compile_seconds,
     }
 
 
 def table(rows: list[dict], domain: str) -> str:
-    lines = [f"{domain:28} {'worlds':>6} {'steps/s':>12} {'range':>25} {'over Playground':>16} {'first call':>11}"]
+    lines = [
+        f"{domain:34} {'worlds':>6} {'steps/s':>12} {'range':>25} {'substeps':>16} {'substeps/s':>12} "
+        f"{'over Playground':>16} {'by substep':>11} {'first call':>11}"
+    ]
     for row in (row for row in rows if row["domain"] == domain):
         span = f"{row['slowest']:,.0f} to {row['fastest']:,.0f}"
-        ratio = f"{row['over_playground']:.2f}" if row["over_playground"] else "-"
+        ratio, by_substep = (f"{x:.2f}" if x else "-" for x in (row[_OVER], row[f"{_OVER}_by_substep"]))
+        physics = f"{row['substeps']} x {1000 * row['substep_seconds']:g} ms {row['integrator']}"
         lines.append(
-            f"  {row['contestant']:26} {row['worlds']:6} {row['steps_per_second']:12,.0f} {span:>25} {ratio:>16} "
-            f"{row['first_call_seconds']:9.1f} s"
+            f"  {row['contestant']:32} {row['worlds']:6} {row['steps_per_second']:12,.0f} {span:>25} {physics:>16} "
+            f"{row['substeps_per_second']:12,.0f} {ratio:>16} {by_substep:>11} {row['first_call_seconds']:9.1f} s"
         )
     return "\n".join(lines)
 

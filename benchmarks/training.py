@@ -31,6 +31,8 @@ class Training:
         tasks = meshes.replicate(mesh, env.tasks())
         self.num_devices = 1 if mesh is None else mesh.size
         self.worlds = num_tasks * settings.num_envs
+        self.family = family  # which programs on some engines need for as long as they run
+        self.substeps: int = getattr(family, "num_substeps", 1)  # of a step of control
         self.steps = seeds * settings.chunk_steps * self.worlds
         self.updates = seeds * settings.chunk_steps // experience.steps * getattr(experience, "updates_per_step", 0)
         self.seconds: list[float] = []

@@ -15,7 +15,7 @@ import time
 import jax
 from physics import physics
 from report import publish, run_main
-from steps_per_second import Contestant
+from steps_per_second import Contestant, physics_of_family
 
 import mtjax
 from mtjax.envs import BENCHMARKS
@@ -41,7 +41,8 @@ def main() -> None:
         name = f"{scenes}, {len(env.groups)} simulators"
         grouping[name] = time.perf_counter() - before
         make = lambda env=env: physics(env, per_task, arguments.steps, True)
-        contestants.append(Contestant(name, per_task * made.train_count, arguments.steps, make))
+        worlds, of_step = per_task * made.train_count, physics_of_family(made.families[0])
+        contestants.append(Contestant(name, worlds, arguments.steps, of_step, make))
         print(f"{name}: compiled in {contestants[-1].first_call_seconds:.0f} s", flush=True)
     for _ in range(arguments.rounds):
         for contestant in contestants:
@@ -52,6 +53,7 @@ def main() -> None:
             "engine": arguments.engine,
             "worlds": each.worlds,
             "steps_per_second": statistics.median(each.rates),
+            "substeps_per_second": statistics.median(each.rates) * each.physics.substeps,
             "slowest": min(each.rates),
             "fastest": max(each.rates),
             "first_call_seconds": each.first_call_seconds,

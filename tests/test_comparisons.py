@@ -129,3 +129,32 @@ def test_figures_have_their_origin(module, tmp_path, monkeypatch):
         report.note_origin(argparse.Namespace(steps=steps), tmp_path)
     lines = [json.loads(line) for line in (tmp_path / "origin.json").read_text().splitlines()]
     assert [line["settings"]["steps"] for line in lines] == [3, 4]
+
+
+def test_scaling_has_a_row_for_every_result_and_begins_parts_with_their_settings(module, tmp_path, monkeypatch):
+    """Each names its folder, also where that is named after the clock, and the device whose values it takes."""
+    scaling, parts = module("scaling"), module("parts")
+    arguments = argparse.Namespace(axes=["seeds"], on="cpu", out=tmp_path, plots=tmp_path / "plots", json=None)
+    monkeypatch.setattr(sys, "argv", ["scaling.py", "--axes", "seeds"])
+    of_all = [scaling.part(*each, arguments) for each in scaling.settings(arguments)]
+    assert [x.name for x in of_all] == ["seeds-1", "seeds-2", "seeds-4"]
+    assert of_all[1].words[2:] == ["--on", "cpu", "--out", str(tmp_path), "--part", "seeds", "2"]
+    line = {"axis": "seeds", "worlds": 8, "steps_per_second": 1000, "substeps_per_second": 2000, "slowest": 1}
+    line |= {"fastest": 2, "updates_per_second": 3.0, "compile_seconds": 4.0}
+    for value, cost in ((2, 1.5), (1, 1.0)):
+        rows = [{**line, "value": value, "cost": cost}]
+        parts.write_result(tmp_path / f"seeds-{value}.json", {"machine": {}, "rows": rows})
+    scaling.tabulate(arguments)
+    lines = (tmp_path / "table.md").read_text().splitlines()
+    assert [x.split("|")[7].strip() for x in lines[2:]] == ["1.00", "1.50"]
+    assert (tmp_path / "plots" / "scaling-seeds.png").exists()
+
+
+def test_playground_has_a_second_row_where_its_substeps_differ(module):
+    """At the length of ours."""
+    pytest.importorskip("mujoco_playground")
+    steps = module("steps_per_second")
+    own = steps.Physics(2, 0.01, "euler")
+    default, ours = steps.playground_physics("FingerSpin", own)
+    assert default[2].substeps == 4 and ours[2] == own and ours[1] == {"sim_dt": 0.01}
+    assert len(steps.playground_physics("CheetahRun", steps.Physics(1, 0.01, "euler"))) == 1
