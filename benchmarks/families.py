@@ -5,7 +5,8 @@
 
 ``TRAINED`` says which agent learns a family, by its preset, and for how many steps; a run also ends after ``--seconds``
 of training. Every family writes ``DIR/NAME/curve.csv`` (the mean return of the training episodes, at most forty lines)
-and ``DIR/NAME/policy``, which ``mtjax.load`` takes. All curves in DIR together are ``DIR/families.csv``. Families that
+and ``DIR/NAME/policy``, which ``mtjax.load`` takes. All curves in DIR together are ``DIR/families.csv``;
+``DIR/origin.json`` has machine, versions and commit. Families that
 have a policy are not run again. A signal ends the program, and the same command with the same DIR goes on.
 """
 
@@ -15,7 +16,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from report import read_lines, run_main, write_lines
+from report import note_origin, read_lines, run_main, write_lines
 from resumable import train
 
 import mtjax
@@ -67,6 +68,7 @@ def main() -> None:
         if name not in TRAINED:
             raise nearest_error("family", name, list(TRAINED))
     enable_compile_cache()
+    note_origin(arguments, arguments.out)
     for name in arguments.families or TRAINED:
         if not (arguments.out / name / "policy").is_dir():
             learn(name, *TRAINED[name], arguments.out / name, arguments.seconds)

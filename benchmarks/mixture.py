@@ -25,7 +25,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from report import machine, markdown
+from report import markdown, record
 
 import mtjax
 from mtjax.envs.mixtures import States
@@ -77,8 +77,7 @@ def main() -> None:
             left.append(name)
             continue
         print(name, flush=True)
-        found = {**run(), "machine": machine(), "settings": {k: str(v) for k, v in vars(arguments).items()}}
-        file.write_text(json.dumps(found, indent=1) + "\n")
+        file.write_text(json.dumps(record(arguments, run()), indent=1, default=str) + "\n")
         summarise(arguments)
     print(summarise(arguments))
     if left:
@@ -235,8 +234,8 @@ def summarise(arguments: argparse.Namespace) -> str:
         text += "\n\n" + markdown(["family", "engine", "ms a step of all its worlds"], each)
         text += f"\n\nThe mixture's step takes {price['ratio']:.2f} of the sum of its parts."
     (arguments.out / "table.md").write_text(text + "\n")
-    report = {"benchmark": "mixture.py", "machine": machine(), "returns": rows, "parts": found, "cost": price}
-    (arguments.out / "mixture.json").write_text(json.dumps(report, indent=1) + "\n")
+    report = record(arguments, {"returns": rows, "parts": found, "cost": price})
+    (arguments.out / "mixture.json").write_text(json.dumps(report, indent=1, default=str) + "\n")
     return text
 
 

@@ -10,8 +10,9 @@ of learning together. ``--given`` are settings of the agent or the loop that hol
 Each call writes ``DIR/FAMILY/AGENT-NAME.csv``: a line for each point with the mean return of the training episodes in
 the last tenth of the run, over seeds, the least and the largest of a seed, the mean over the whole run (which is higher
 if learning is faster), and seconds. ``DIR/FAMILY.md`` ranks the points of all files. A point with a seed that diverged
-stands last. If the command is given again, a grid that was stopped goes on where it was, and one that was killed from
-its last checkpoint, of which there are four; until it is finished its run is in ``DIR/FAMILY/AGENT-NAME``.
+stands last. ``DIR/FAMILY/origin.json`` has the settings, machine, versions and commit of every call. If the command is
+given again, a grid that was stopped goes on where it was, and one that was killed from its last checkpoint, of which
+there are four; until it is finished its run is in ``DIR/FAMILY/AGENT-NAME``.
 """
 
 import argparse
@@ -22,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from report import markdown, read_lines, run_main, write_lines
+from report import markdown, note_origin, read_lines, run_main, write_lines
 from resumable import train
 from returns import FAMILIES, value
 
@@ -49,6 +50,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs") / "presets")
     arguments = parser.parse_args()
     enable_compile_cache()
+    note_origin(arguments, arguments.out / arguments.family)
     sweep(arguments)
     tabulate(arguments.out / arguments.family)
 

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-from report import markdown, run_main, write_lines
+from report import markdown, record, run_main, write_lines
 from resumable import train
 
 from mtjax.agents.choices import replace
@@ -120,9 +120,9 @@ def learn(arguments: argparse.Namespace, family: str) -> None:
     save_evaluations(file.with_suffix(".npz"), result.evaluations)
     found = row(family, result, arguments.seeds) | {"limited": limited(config.family, agent, result, arguments)}
     found |= {"aim": aim.least, "wall_seconds": round(float(result.rows[-1]["wall_seconds"]), 1)}
-    record = {**found, "agent": str(agent), "settings": dataclasses.asdict(settings)}
+    made = record(arguments, {**found, "agent": str(agent), "loop": dataclasses.asdict(settings)})
     with replacing(file.with_suffix(".json")) as new:  # which marks the family as finished
-        new.write_text(json.dumps(record, indent=2) + "\n")
+        new.write_text(json.dumps(made, indent=2, default=str) + "\n")
     print({**found}, flush=True)
 
 

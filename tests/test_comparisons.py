@@ -158,3 +158,19 @@ def test_playground_has_a_second_row_where_its_substeps_differ(module):
     default, ours = steps.playground_physics("FingerSpin", own)
     assert default[2].substeps == 4 and ours[2] == own and ours[1] == {"sim_dt": 0.01}
     assert len(steps.playground_physics("CheetahRun", steps.Physics(1, 0.01, "euler"))) == 1
+
+
+def test_a_family_is_learned_by_its_share_of_what_is_published(module):
+    """Of its nominal task, in the last tenth of a run; of 1000 where nothing is known."""
+    published = module("published")
+    runs = {"walker-run": [600, 400, 504], "walker-run-vary-friction": [0, 0, 506], "fish-swim": [0, 0, 599]}
+    lines = [
+        {"family": family, "seconds": str(seconds), "return": str(x)}
+        for family, values in runs.items()
+        for seconds, x in zip((10, 50, 100), values, strict=True)
+    ]
+    lines.append({"family": "fish-swim", "seconds": "100", "return": ""})
+    returns = published.last_returns(lines)
+    assert returns == {"walker-run": 504, "walker-run-vary-friction": 506, "fish-swim": 599}
+    assert [published.is_learned(*each) for each in returns.items()] == [False, True, False]  # 0.6 of 842 and of 1000
+    assert published.tabulate(returns).endswith("1 of 3 are learned: their share is at least 0.6.")

@@ -188,3 +188,18 @@ def test_holm_multiplies_the_smallest_by_their_number():
     assert holm(np.array([0.01, 0.04, 0.03, 0.005])) == pytest.approx([0.03, 0.06, 0.06, 0.02])
     assert holm(np.array([0.4, np.nan, 0.3])) == pytest.approx([0.6, np.nan, 0.6], nan_ok=True)
     assert holm(np.array([])).shape == (0,)
+
+
+@pytest.mark.parametrize(("seeds", "low", "high"), [(3, 0.70, 0.80), (5, 0.80, 0.88), (10, 0.87, 0.93)])
+def test_intervals_of_few_seeds_hold_less_than_they_say(seeds, low, high):
+    """Those of 95 % hold the mean of normal scores as often as ``seed_interval`` says, by the samples of 1,000 runs."""
+    samples = np.random.default_rng(0).normal(size=(1000, seeds))
+    few = Bootstrap(resamples=500)
+    held = [interval.low <= 0 <= interval.high for interval in (seed_interval(x, np.mean, few) for x in samples)]
+    assert low < np.mean(held) < high
+
+
+def test_the_interval_of_three_seeds_is_their_range():
+    """From the worst to the best one, whatever lies between."""
+    interval = seed_interval(np.array([3.0, 9.0, 4.0]))
+    assert (interval.low, interval.high) == (3.0, 9.0)
