@@ -2,7 +2,7 @@
 
     python benchmarks/published.py FILE.csv ...
 
-FILE has lines of family, seconds, steps and return, as ``families.py`` and ``benchmarks/results/cpu-families.csv`` have.
+FILE has lines of family, seconds, steps and return, as that of ``families.py`` has, or ``results/cpu-families.csv``.
 A run's return is the mean of its lines in the last tenth of its seconds. A family is learned from ``SHARE`` of the best
 published return on its nominal task on, and where none is known, of 1000, which is the most that dm_control pays.
 """
