@@ -174,3 +174,16 @@ def test_a_family_is_learned_by_its_share_of_what_is_published(module):
     assert returns == {"walker-run": 504, "walker-run-vary-friction": 506, "fish-swim": 599}
     assert [published.is_learned(*each) for each in returns.items()] == [False, True, False]  # 0.6 of 842 and of 1000
     assert published.tabulate(returns).endswith("1 of 3 are learned: their share is at least 0.6.")
+
+
+def test_whole_runs_are_compared_by_the_seeds_that_they_train(module, tmp_path):
+    """Steps a second are of all seeds, and the range is that of their returns."""
+    peer, parts = module("rejax_peer"), module("parts")
+    result = {"machine": {"device": "card"}, "settings": {"steps": 100}, "compile_seconds": 1.0}
+    for side, seconds in (("mtjax", 2.0), ("rejax", 4.0)):
+        own = {"side": side, "seeds": 2, "seconds": seconds, "returns": [1.0, 3.0], "gradient_steps_per_million": 5.0}
+        parts.write_result(tmp_path / f"{side}-2.json", {**result, **own})
+    lines = peer.tabulate(tmp_path).splitlines()[2:]
+    assert lines[0] == "| rejax | 2 | card | 2 | 1 to 3 | 1.0 | 4.0 | 2.00 | 50 | 5 |"
+    assert lines[1] == "| mtjax | 2 | card | 2 | 1 to 3 | 1.0 | 2.0 | 1.00 | 100 | 5 |"
+    assert peer.gradient_steps(9, 2, 1024) == pytest.approx(17_578, rel=1e-4)
