@@ -6,7 +6,7 @@
     mtjax-as-rejax    ours with the same worlds, steps of a rollout, passes, minibatches, rates and discounts
     mtjax             ours with its preset
 
-Needs rejax==0.1.3, which needs gymnax, distrax and tfp-nightly. Both sides step Brax's hopper with Brax's own backend
+Needs rejax==0.1.3 with gymnax==0.0.9 (later ones do not fit it), distrax and tfp-nightly. Both sides step Brax's hopper with Brax's own backend
 "generalized", for as many steps of every seed, and are evaluated once, at the end, by 128 episodes of each seed under
 the mean action (ours) or sampled actions (rejax's evaluation draws them). Seconds are those of the compiled run with
 this evaluation; compiling is apart. Networks differ: rejax's are two layers of 64 with tanh.
@@ -80,6 +80,7 @@ def theirs(steps: int, seeds: int) -> dict[str, Any]:
     seconds = time.perf_counter() - compiled
     last = returns[:, -1].mean(axis=-1)
     return {
+        "steps": steps,
         "compile_seconds": compiled - before,
         "seconds": seconds,
         "returns": [float(x) for x in last],
@@ -107,6 +108,7 @@ def ours(steps: int, seeds: int, side: str) -> dict[str, Any]:
     )
     returns = result.evaluations.returns["train"][:, -1].mean(axis=(1, 2))
     return {
+        "steps": int(result.evaluations.steps[-1]),  # whole chunks
         "compile_seconds": result.compile_seconds,
         "seconds": result.total_seconds - result.compile_seconds,
         "returns": [float(x) for x in returns],
@@ -129,7 +131,7 @@ def tabulate(out: Path) -> str:
     lines = []
     for x in sorted(parts.read_results(out), key=lambda x: (x["seeds"], SIDES.index(x["side"]))):
         returns = np.array(x["returns"])
-        rate = x["settings"]["steps"] * x["seeds"] / x["seconds"]
+        rate = x["steps"] * x["seeds"] / x["seconds"]
         cells = [x["side"], str(x["seeds"]), x["machine"]["device"], f"{returns.mean():.0f}"]
         cells += [f"{returns.min():.0f} to {returns.max():.0f}", f"{x['compile_seconds']:.1f}", f"{x['seconds']:.1f}"]
         lines.append(

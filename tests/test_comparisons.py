@@ -179,7 +179,7 @@ def test_a_family_is_learned_by_its_share_of_what_is_published(module):
 def test_whole_runs_are_compared_by_the_seeds_that_they_train(module, tmp_path):
     """Steps a second are of all seeds, and the range is that of their returns."""
     peer, parts = module("rejax_peer"), module("parts")
-    result = {"machine": {"device": "card"}, "settings": {"steps": 100}, "compile_seconds": 1.0}
+    result = {"machine": {"device": "card"}, "steps": 100, "compile_seconds": 1.0}
     for side, seconds in (("mtjax", 2.0), ("rejax", 4.0)):
         own = {"side": side, "seeds": 2, "seconds": seconds, "returns": [1.0, 3.0], "gradient_steps_per_million": 5.0}
         parts.write_result(tmp_path / f"{side}-2.json", {**result, **own})
