@@ -6,10 +6,10 @@
     mtjax-as-rejax    ours with the same worlds, steps of a rollout, passes, minibatches, rates and discounts
     mtjax             ours with its preset
 
-Needs rejax==0.1.3 with gymnax==0.0.9 (later ones do not fit it), distrax and tfp-nightly. Both sides step Brax's hopper with Brax's own backend
-"generalized", for as many steps of every seed, and are evaluated once, at the end, by 128 episodes of each seed under
-the mean action (ours) or sampled actions (rejax's evaluation draws them). Seconds are those of the compiled run with
-this evaluation; compiling is apart. Networks differ: rejax's are two layers of 64 with tanh.
+Needs rejax==0.1.3 with gymnax==0.0.9 (later ones do not fit it), distrax and tfp-nightly. Both sides step Brax's hopper
+with Brax's own backend "generalized", for as many steps of every seed, and are evaluated once, at the end, by 128
+episodes of each seed under the mean action (ours) or sampled actions (rejax's evaluation draws them). Seconds are those
+of the compiled run with this evaluation; compiling is apart. Networks differ: rejax's are two layers of 64 with tanh.
 
 Every side and number of seeds is a process of its own, which writes ``OUT/SIDE-SEEDS.json``; ``parts.py`` says how an
 interrupted comparison goes on. All results in OUT give ``OUT/table.md``.
