@@ -5,6 +5,7 @@ import dataclasses
 import errno
 import inspect
 import os
+import re
 import shlex
 import signal
 import types
@@ -294,9 +295,10 @@ def test_video_films_some_tasks_of_each_split_in_one_grid(copied_run, capsys, fi
     """The first, the middle and the last; each tile names its task."""
     mtjax.evaluate.main([f"--run={copied_run}", "--episodes=1", "--video", "--video-seconds=0.2"])
     frames, fps = filmed["film"]
-    assert fps == 25 and frames.shape == (5, 2 * 180, 3 * 240, 3)
+    high = 180 + 2 * 17  # two lines above each picture
+    assert fps == 25 and frames.shape == (5, 2 * high, 3 * 240, 3)
     assert filmed["drawn"] == [(row, (5, 3)) for row in (0, 1, 2, 3, 5, 6)]
-    assert [int(frames[0, 90 + 180 * i, 120 + 240 * j, 0]) for i in range(2) for j in range(3)] == [
+    assert [int(frames[0, 34 + high * i, 120 + 240 * j, 0]) for i in range(2) for j in range(3)] == [
         10,
         11,
         12,
@@ -306,16 +308,17 @@ def test_video_films_some_tasks_of_each_split_in_one_grid(copied_run, capsys, fi
     ]
     assert np.any(frames[0, :15, :240] > 200)  # the caption
     out = capsys.readouterr().out
-    assert "filming 1 of 6: train size=1, return " in out and "filmed film: 6 tasks" in out
+    assert re.search(r"filming 1 of 6: train, return \d+, size=1\n", out) and "filmed film: 6 tasks" in out
 
 
-def test_a_caption_needs_no_more_width_than_its_picture():
-    """It goes on in the next line, after a space or a comma."""
-    frames = np.full((1, 90, 120, 3), 128, np.uint8)
-    short, long = (films.captioned(frames, text)[0] for text in ("train size=1", "train size=1,mass=2.25, return 998"))
-    assert np.any(short[:13] > 200) and np.all(short[13:] == 128)
-    assert np.any(long[13:26] > 200) and np.all(long[26:] == 128)
-    assert not np.any(long[:26, -3:]) and np.all(films.captioned(frames, "long words " * 40)[0, :, -3:] == 0)
+def test_a_caption_covers_nothing_and_needs_no_more_width_than_its_picture():
+    """It goes on in the next line, after a space or a comma; tiles beside each other stay equally high."""
+    tiles = [np.full((frames, 90, 120, 3), 128, np.uint8) for frames in (1, 2)]
+    captions = ("train", "size=1"), ("train, return 998", "size=1,mass=2.25,friction=0.125")
+    short, long = films.captioned(tiles, captions)
+    assert short.shape == (1, 39 + 90, 120, 3) and long.shape == (2, 39 + 90, 120, 3)
+    assert all(np.all(tile[:, 39:] == 128) and not np.any(tile[:, :39, -3:]) for tile in (short, long))
+    assert np.any(short[0, 13:26] > 200) and not np.any(short[0, 26:39]) and np.any(long[0, 26:39] > 200)
 
 
 def test_chosen_tasks_are_filmed(copied_run, filmed):

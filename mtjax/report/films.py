@@ -85,22 +85,22 @@ def write(
     width = next((width for most, width in _WIDTHS if len(chosen) <= most), _NARROWEST)
     count, tiles = max(round(seconds * _FPS), 1), []
     for i, one in enumerate(chosen):
-        print(f"filming {i + 1} of {len(chosen)}: {_caption(env, one, played, named)}", flush=True)
-        tiles.append(_tile(env, one, played, by_name[one.part.name], count, width, named))
-    path = render.write_video(stem, grid(tiles), _FPS)
+        print(f"filming {i + 1} of {len(chosen)}: {', '.join(_caption(env, one, played, named))}", flush=True)
+        tiles.append(_tile(env, one, played, by_name[one.part.name], count, width))
+    captions = [_caption(env, one, played, named) for one in chosen]
+    path = render.write_video(stem, grid(captioned(tiles, captions)), _FPS)
     print(f"filmed {path.name}: {len(chosen)} tasks")
     return path
 
 
-def _caption(env: Tabled, one: Chosen, played: Recording, named: Mapping[str, str]) -> str:
+def _caption(env: Tabled, one: Chosen, played: Recording, named: Mapping[str, str]) -> tuple[str, str]:
+    """Return the lines on a task: its split and return, and its parameters."""
     row = int(played.rows[one.place])  # continuous ranges have a row for each episode
     split = named.get(one.split, one.split)
-    return f"{split} {env.describe(row)}, return {float(played.returns[one.place]):.0f}"
+    return f"{split}, return {float(played.returns[one.place]):.0f}", env.describe(row)
 
 
-def _tile(
-    env: Tabled, one: Chosen, played: Recording, states: Any, count: int, width: int, named: Mapping[str, str]
-) -> np.ndarray:
+def _tile(env: Tabled, one: Chosen, played: Recording, states: Any, count: int, width: int) -> np.ndarray:
     """Return the frames (F, height, width, 3) of one task, at most ``count``."""
     family: Any = one.part.family
     row = env.own_row(int(played.rows[one.place]))
@@ -110,25 +110,35 @@ def _tile(
     shown = jax.tree.map(lambda x: np.asarray(x[one.own])[steps], states)
     drawn = render.film(family, row, shown, width, width * 3 // 4)
     frames = drawn[np.searchsorted(steps, np.minimum(times.astype(int), length - 1))]
-    moving = max(int(np.sum(times < length)), 1)
-    return captioned(frames[:moving], _caption(env, one, played, named))
+    return frames[: max(int(np.sum(times < length)), 1)]
 
 
-def captioned(frames: np.ndarray, text: str) -> np.ndarray:
-    """Write a text into the upper left corner of frames (F, height, width, 3), on as many lines as it needs."""
-    width = frames.shape[2]
+def captioned(tiles: Sequence[np.ndarray], captions: Sequence[Sequence[str]]) -> list[np.ndarray]:
+    """Return tiles (F, height, width, 3) with their captions above, so that nothing of a picture is covered.
+
+    A caption's line takes as many lines as it needs; all tiles become equally high.
+    """
+    width = tiles[0].shape[2]
     font, height = ImageFont.load_default(max(width // 22, 9)), max(width // 14, 13)
+    texts = [[part for line in caption for part in _wrapped(line, width - 6, font)] for caption in captions]
+    most, made = max(map(len, texts)), []
+    for tile, lines in zip(tiles, texts, strict=True):
+        strip = Image.new("RGB", (width, height * most), "black")
+        for i, line in enumerate(lines):
+            ImageDraw.Draw(strip).text((3, 1 + height * i), line, fill="white", font=font)
+        above = np.broadcast_to(np.asarray(strip), (len(tile), *np.asarray(strip).shape))
+        made.append(np.concatenate([above, tile], axis=1))
+    return made
+
+
+def _wrapped(text: str, width: float, font: Any) -> list[str]:
+    """Return the lines of a text that is no wider than ``width`` pixels, where a word's width allows."""
     lines = [""]
     for word in _WORDS.findall(text):
-        if lines[-1] and font.getlength(lines[-1] + word.rstrip()) > width - 6:
+        if lines[-1] and font.getlength(lines[-1] + word.rstrip()) > width:
             lines.append("")
         lines[-1] += word
-    strip = Image.new("RGB", (width, height * len(lines)), "black")
-    for i, line in enumerate(lines):
-        ImageDraw.Draw(strip).text((3, 1 + height * i), line, fill="white", font=font)
-    written = frames.copy()
-    written[:, : strip.height] = np.asarray(strip)[: frames.shape[1]]
-    return written
+    return lines
 
 
 def grid(tiles: Sequence[np.ndarray]) -> np.ndarray:
