@@ -113,6 +113,27 @@ def test_numbered_tasks_are_not_joined_by_a_line(make_run):
     assert axes.get_legend_handles_labels()[1] == ["sac (3 seeds)"]
 
 
+def test_aggregates_name_their_families_and_are_as_high_as_their_rows(runs, tmp_path):
+    """A figure of two points is no empty page."""
+    two = "finger-spin-vary-size\nwalker-walk-vary-friction"
+    for figure, rows in ((report.iqm, 2), (report.improvement, 1)):
+        axes = figure(runs)
+        assert axes.get_title() == two and axes.figure.get_size_inches()[1] == pytest.approx(1.4 + 0.4 * rows)
+    assert report.performance_profile(runs).get_title() == two
+    assert report.iqm(str(tmp_path / "runs" / "a*")).get_title() == "finger-spin-vary-size"
+
+
+def test_python_draws_what_the_command_draws(runs, tmp_path):
+    """And writes it if a file is named; one figure is asked for by its name."""
+    axes = mtjax.plot(runs, "iqm", out=tmp_path / "x.svg")
+    assert (tmp_path / "x.svg").is_file() and axes.get_xlabel() == report.iqm(runs).get_xlabel()
+    assert mtjax.plot(runs, "iqm", metric="success").get_xlabel().startswith("interquartile mean of the success")
+    assert len(mtjax.plot(runs, "families")) == 2
+    for given, said in (({"figure": "curve"}, "did you mean 'curves'"), ({"split": "test"}, "unknown split 'test'")):
+        with pytest.raises(InputError, match=said):
+            mtjax.plot(runs, **given)
+
+
 def test_aggregates_are_those_of_all_tasks_of_all_families(runs, make_run):
     """Against the functions that compute them; an agent that lacks a family is refused."""
     found = collect.learned(runs)

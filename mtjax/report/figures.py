@@ -198,11 +198,11 @@ def _label_tasks(axis: "Axis", labels: list[str], name: str) -> None:
     axis.set_label_text(name)
 
 
-def new_axes() -> "Axes":
-    """Return the axes of a new figure that no window shows."""
+def new_axes(height: float = 4) -> "Axes":
+    """Return the axes of a new figure, of a height in inches, that no window shows."""
     from matplotlib.figure import Figure
 
-    axes = Figure(figsize=(6, 4), dpi=DOTS_PER_INCH, layout="constrained").add_subplot()
+    axes = Figure(figsize=(6, height), dpi=DOTS_PER_INCH, layout="constrained").add_subplot()
     style(axes)
     return axes
 

@@ -5,6 +5,7 @@ intervals over whole seeds; fewer than three seeds have none. ``save`` writes PN
 """
 
 import math
+from collections.abc import Sized
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
 ENDINGS = (".png", ".pdf", ".svg")
 _THRESHOLDS = 101
+_MOST_NAMED = 3  # families in a title
 
 
 @public
@@ -98,21 +100,22 @@ def return_by_parameter(runs: Any = "runs/*", ax: "Axes | None" = None) -> "Axes
 @public
 def iqm(runs: Any = "runs/*", split: str = "train", ax: "Axes | None" = None) -> "Axes":
     """Draw each agent's interquartile mean of the last returns, over seeds and the tasks of all families."""
-    scores, score = _scores(runs, split)
-    axes = ax if ax is not None else figures.new_axes()
+    scores, score, title = _scores(runs, split)
+    axes = ax if ax is not None else _row_axes(scores)
     for index, (agent, x) in enumerate(scores.items()):
         mean, low, high = seed_interval(x, iqm_of)
         bars = figures.bars_of(*np.array([[mean], [low], [high]]))
         axes.errorbar([mean], [index], xerr=bars, fmt="o", color=figures.colour(index), capsize=4, label=agent)
     _name_rows(axes, list(scores))
     axes.set_xlabel(f"interquartile mean of the {score}, {split}")
+    axes.set_title(title)
     return axes
 
 
 @public
 def performance_profile(runs: Any = "runs/*", split: str = "train", ax: "Axes | None" = None) -> "Axes":
     """Draw the share of seeds and tasks whose last return is above each value, a line for each agent."""
-    scores, score = _scores(runs, split)
+    scores, score, title = _scores(runs, split)
     axes = ax if ax is not None else figures.new_axes()
     best = max(float(x.max()) for x in scores.values())
     thresholds = np.linspace(0, best or 1.0, _THRESHOLDS)
@@ -121,6 +124,7 @@ def performance_profile(runs: Any = "runs/*", split: str = "train", ax: "Axes | 
         figures.draw_line(axes, thresholds, above, agent, index, marker="")
     axes.set_xlabel(f"{score}, {split}")
     axes.set_ylabel("share of seeds and tasks above")
+    axes.set_title(title)
     return _finish(axes)
 
 
@@ -136,14 +140,14 @@ def improvement(
     Raises:
         InputError: there is only one agent, or no baseline of that name.
     """
-    scores, _ = _scores(runs, split)
+    scores, _, title = _scores(runs, split)
     first = next(iter(scores)) if baseline is None else baseline
     if first not in scores:
         raise nearest_error("agent", first, scores)
     others = [agent for agent in scores if agent != first]
     if not others:
         raise InputError(f"improvement compares agents, and there is only {first}")
-    axes = ax if ax is not None else figures.new_axes()
+    axes = ax if ax is not None else _row_axes(others)
     for index, agent in enumerate(others):
         mean, low, high = probability_of_improvement(scores[agent], scores[first])
         bars, colour = figures.bars_of(*np.array([[mean], [low], [high]])), figures.colour(list(scores).index(agent))
@@ -152,6 +156,7 @@ def improvement(
     axes.set_xlim(0, 1)
     _name_rows(axes, others)
     axes.set_xlabel(f"probability of improvement over {first}, {split}")
+    axes.set_title(title)
     return axes
 
 
@@ -193,8 +198,8 @@ def _of_split(runs: Any, split: str) -> list[Learned]:
     return found
 
 
-def _scores(runs: Any, split: str) -> tuple[dict[str, np.ndarray], str]:
-    """Return each agent's last returns (S, T) on the tasks of all families, and what these are in words.
+def _scores(runs: Any, split: str) -> tuple[dict[str, np.ndarray], str, str]:
+    """Return each agent's last returns (S, T) on the tasks of all families, what these are, and a title of families.
 
     Raises:
         InputError: an agent lacks a family that another has.
@@ -209,7 +214,12 @@ def _scores(runs: Any, split: str) -> tuple[dict[str, np.ndarray], str]:
             raise InputError(f"{agent} has no run on {missing[0]}, so that agents cannot be compared over all families")
         seeds = min(map(len, own.values()))
         scores[agent] = np.concatenate([own[name][:seeds] for name in names], axis=1)
-    return scores, found[0].score
+    return scores, found[0].score, "\n".join(names) if len(names) <= _MOST_NAMED else f"{len(names)} families"
+
+
+def _row_axes(rows: Sized) -> "Axes":
+    """Return axes that have room for rows with a point each, and no more."""
+    return figures.new_axes(height=1.4 + 0.4 * len(rows))
 
 
 def _require_one_family(found: list[Learned], function: str, instead: str | None) -> None:
