@@ -8,6 +8,7 @@ import gc
 import importlib.util
 import io
 import itertools
+import os
 import re
 import sys
 import textwrap
@@ -62,6 +63,9 @@ def main(run: Any) -> None:
         sys.exit(130)
     except FloatingPointError as error:
         print(f"error: {error}", file=sys.stderr)
+        sys.exit(1)
+    except BrokenPipeError:  # whoever read has seen enough, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else Python complains as it ends
         sys.exit(1)
     except OSError as error:
         print(f"error: {error.strerror or error}: {error.filename or ''}".rstrip(": "), file=sys.stderr)

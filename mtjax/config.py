@@ -96,7 +96,7 @@ class RunConfig:
     run as one program after another. The sweep's folder holds a table of all settings; --resume takes this folder."""
     points: Annotated[tuple[dict[str, float], ...], tyro.conf.Suppress] = ()
     quick: bool = False
-    """Learn something in a minute on two CPU cores: a point mass reaches ten goals. Other flags change it."""
+    """Learn something in some 35 seconds of processor time: a point mass reaches ten goals. Other flags change it."""
     config: str = ""
     """TOML file with flags; those on the command line override it. A key is a flag without its dashes. The table agent
     holds --agent.NAME, the table env holds --env.NAME; there, name is the agent or the environment itself."""

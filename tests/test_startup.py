@@ -93,6 +93,16 @@ def test_names_are_answered_without_jax(tmp_path, module, words, code, said):
     assert (found, imported) == (code, []) and said in output
 
 
+def test_a_reader_may_stop_early(tmp_path):
+    """As ``head`` does; nothing is said of it."""
+    environment = {**os.environ, "PYTHONPATH": str(Path(mtjax.__file__).parents[1])}
+    command = [sys.executable, "-m", "mtjax.train", "--list"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(command, cwd=tmp_path, env=environment, text=True, **pipes) as process:
+        process.stdout.close()
+        assert process.stderr.read() == "" and process.wait(60) == 1
+
+
 @pytest.mark.slow
 def test_a_run_of_the_c_engine_imports_no_other(tmp_path):
     """From the command line to the last evaluation."""
