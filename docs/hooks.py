@@ -383,7 +383,7 @@ def _block(text: str, below: list[str]) -> str:
     if below and text.endswith(":") and any(re.match(r"[\w, -]+: ", line) for line in below):
         items = [re.sub(r"^([\w, -]+?):", r"**\1**:", line) for line in _items(below)]
         return f"**{text}**\n\n" + "\n".join(f"- {item}" for item in items)
-    if below and not re.match(_LABEL, text) and re.search(r" (=|<-) ", below[0]):
+    if below and not re.match(_LABEL, text) and (text.endswith(":") or re.search(r" (=|<-) ", below[0])):
         return f"{text}\n\n```text\n{chr(10).join(below)}\n```"
     whole = " ".join([text, *(line.strip() for line in below)])
     return re.sub(_LABEL, r"**\1**: ", whole)
@@ -400,4 +400,4 @@ def _items(lines: list[str]) -> list[str]:
     return items
 
 
-_LABEL = r"^([A-Z][\w ]*?(?: \([^)]*\))?(?:,[^:.]*)?): "
+_LABEL = r"^(?!As )([A-Z][\w ]*?(?: \([^)]*\))?(?:,[^:.]*)?): "
