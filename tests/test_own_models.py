@@ -4,11 +4,14 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 
+import mtjax
+import mtjax.train
+from mtjax import envs
 from mtjax.envs import Domain, Parameter
+from mtjax.types import InputError
 
 
 class Plain(Domain):
@@ -80,3 +83,83 @@ def test_actions_span_the_range_of_every_task():
     tasks, action = env.tasks(), jnp.ones(1)
     controls = jax.vmap(lambda task: env.control(task, env.reset(task, jax.random.key(0)).state, action)[1])(tasks)
     np.testing.assert_array_equal(controls, [[1], [2]])
+
+
+FALL = """<mujoco><option %s/><worldbody>%s<body name="b" pos="0 0 1"><freejoint name="f"/>
+<geom name="g" type="box" size="0.1 0.2 0.05" mass="1" %s/></body>
+<body name="c" pos="3 0 0"><joint name="j" %s/><geom size="0.1" mass="1"/><site name="s" size="0.1"/></body></worldbody>
+<tendon><fixed name="t"><joint joint="j" coef="1"/></fixed></tendon>
+<actuator>%s</actuator>%s</mujoco>"""
+MOTOR = '<motor joint="j" ctrlrange="-1 1"/>'
+
+
+def falling(option="", world="", geom="", joint="", actuator=MOTOR, rest=""):
+    return FALL % (option, world, geom, joint, actuator, rest)
+
+
+MJX_REFUSES = [
+    (falling('density="1000"', geom='fluidshape="ellipsoid"'), "fluid forces on ellipsoids"),
+    (falling(joint='stiffness="1 2 3"'), "nonlinear stiffness or damping"),
+    (falling(joint='damping="1 2 3"'), "nonlinear stiffness or damping"),
+    (falling(actuator='<position joint="j" damping="2"/>'), "damping or armature of actuators"),
+    (falling(actuator='<general joint="j" dyntype="filter" dynprm="0.1" actearly="true"/>'), "actearly"),
+    (falling('actuatorgroupdisable="1"', actuator='<motor joint="j" group="1"/>'), "a disabled group"),
+    (falling('noslip_iterations="3"'), "noslip_iterations"),
+    (falling('integrator="discrete"'), "the discrete integrator"),
+    (falling(rest='<option><flag sleep="enable"/></option>'), "sleeping bodies"),
+    (falling(world='<geom type="cylinder" size="1 0.1"/>'), r"collisions not implemented"),
+    (falling('integrator="implicit"'), "mjINT_IMPLICIT"),
+]
+
+
+@pytest.mark.parametrize("model, said", MJX_REFUSES, ids=range(len(MJX_REFUSES)))
+def test_mjx_refuses_what_it_would_leave_out(model, said):
+    """In one line that names the engines that have it; and those run it."""
+    env = own(model, engine="mjx")
+    with pytest.raises(InputError, match=f"engine 'mjx' cannot run this model: .*{said}.*; use --engine=c or") as error:
+        _ = env.simulator
+    assert "\n" not in str(error.value)
+    assert np.all(np.isfinite(play(own(model), np.zeros(1), 2)))
+
+
+def test_a_model_that_mjx_cannot_run_leaves_no_folder(tmp_path, monkeypatch):
+    """The command says so before it makes one."""
+    cls = type(own(MJX_REFUSES[0][0]))
+    monkeypatch.setitem(envs.ENVS.data, "falling", (cls, {}))
+    with pytest.raises(InputError, match="engine 'mjx' cannot run this model"):
+        mtjax.train.main(["--env=falling", "--engine=mjx", "--steps=100", f"--runs={tmp_path / 'runs'}"])
+    assert not list(tmp_path.iterdir())
+
+
+def set_water(spec, value):
+    """Fill the world with something thick."""
+    spec.option.density = value
+
+
+def set_friction(spec, value):
+    """Set the friction of a joint."""
+    spec.joint("j").frictionloss = value
+
+
+VARIED = {
+    "water": (set_water, falling(), "0,5000"),
+    "joint-friction": (set_friction, falling(joint='pos="1 0 0"'), "0,3"),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", VARIED)
+def test_mjx_steps_tasks_that_have_what_the_first_has_not(name):
+    """Water, or friction: what a program leaves out if nothing has it."""
+    edit, model, values = VARIED[name]
+    words = {"vary": {name: values}, "parameters": {name: Parameter("1", 0.0, edit, minimum=-1)}}
+    found = []
+    for engine in ("c", "mjx"):
+        env = own(model, engine, **words)
+        tasks, step = env.tasks(), jax.jit(jax.vmap(env.step))
+        state = jax.vmap(env.reset, (0, None))(tasks, jax.random.key(0)).state
+        for _ in range(20):
+            state = step(tasks, state, jnp.ones((2, 1))).state
+        found.append(np.asarray(state.qpos))
+    np.testing.assert_allclose(found[1], found[0], atol=1e-4)
+    assert np.max(np.abs(found[0][0] - found[0][1])) > 1e-2

@@ -33,6 +33,8 @@ from mtjax.names import nearest_error
 from mtjax.types import Array, InputError, Key, Spec, Step, Task, Transition
 
 INTEGRATORS = ("model", "euler")
+_DECIDING = ("dof_frictionloss", "tendon_frictionloss", "opt.density", "opt.viscosity")
+"""Fields that decide by being 0 what MJX and Warp make programs of."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -216,11 +218,16 @@ class Domain(Pictured):
 
     @cached_property
     def simulator(self) -> Engine:
-        """Return the engine that runs this family. MuJoCo C keeps the model's own solver settings."""
+        """Return the engine that runs this family. MuJoCo C keeps the model's own solver settings.
+
+        Raises:
+            InputError: the engine cannot run the model.
+        """
         if self.engine_name == "c":
             return MujocoC(self.models, self.num_substeps)
         if self.engine_name == "warp":
             return Warp(self._base(self.warp_iterations), self.num_substeps)
+        self.mjx.require_runnable()
         return self.mjx
 
     @cached_property
@@ -237,6 +244,8 @@ class Domain(Pictured):
         for name in FIXED:
             field = np.asarray(attrgetter(name)(model))
             fixed.update(repr((name, field.shape)).encode() + field.tobytes())
+        if not isinstance(self.simulator, MujocoC):
+            fixed.update(repr([np.asarray(attrgetter(path)(model) > 0).tolist() for path in _DECIDING]).encode())
         return self.engine_name, self.num_substeps, fixed.digest()
 
     def join_simulator(self, models: Sequence[mujoco.MjModel]) -> Engine:
@@ -265,8 +274,15 @@ class Domain(Pictured):
         return Mjx(self._base(self.default_iterations), self.num_substeps)
 
     def _base(self, iterations: int) -> mujoco.MjModel:
-        """Return the first task's model with the solver settings of MJX or Warp."""
+        """Return the first task's model with the solver settings of MJX or Warp.
+
+        What they leave out of a program if the model has none of it is there if any task has it.
+        """
         base = copy.copy(self.models[0])
+        for path in _DECIDING:
+            largest = np.max([attrgetter(path)(model) for model in self.models], axis=0)
+            *owner, field = path.split(".")
+            setattr(attrgetter(*owner)(base) if owner else base, field, largest)
         base.opt.iterations = self.solver_iterations or iterations
         base.opt.ls_iterations = 2 * base.opt.iterations
         if self.integrator == "euler":
@@ -296,9 +312,9 @@ def stack_differing(models: Sequence[mujoco.MjModel]) -> dict[str, np.ndarray]:
             task = first[id(unique[odd])]
             raise InputError(f"task {task} changes {name}, which must be the same in every task")
         differing[name] = np.stack(column)[places]
-    loss = differing.get("dof_frictionloss")
-    if loss is not None:  # MJX solves a friction row of exactly 0 as a rigid joint
-        differing["dof_frictionloss"] = np.where(np.any(loss > 0, axis=0), np.maximum(loss, 1e-8), loss)
+    for name in {"dof_frictionloss", "tendon_frictionloss"} & set(differing):
+        loss = differing[name]  # MJX solves a friction row of exactly 0 as a rigid joint
+        differing[name] = np.where(np.any(loss > 0, axis=0), np.maximum(loss, 1e-8), loss)
     return differing
 
 

@@ -35,7 +35,7 @@ def check(config: RunConfig, start: Policy | None = None) -> None:
     if not config.runs:  # Path("") would be the working directory
         raise InputError("--runs needs a folder; that of the command is --runs=.")
     sinks.require_libraries(config.tensorboard, config.wandb)
-    _ = family.engine_name, family.table
+    _ = family.engine_name, family.table, family.targets()  # its engine refuses a model that it cannot run
     mesh.mesh_for(config.plan.seeds, family.train_count, config.training.num_envs)
     experience = config.learner.experience
     played = fit_chunk(config.training, family.train_count, config.plan.steps, experience.steps)

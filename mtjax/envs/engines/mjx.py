@@ -1,8 +1,9 @@
 """MJX, MuJoCo's JAX port, which runs on any device."""
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from functools import cached_property
+from operator import attrgetter
 from typing import Any
 
 import jax
@@ -11,11 +12,26 @@ import mujoco
 import numpy as np
 
 from mtjax.envs.engines.base import World, at_rest, mjx_module, require_plain, state_of
-from mtjax.types import Array, Task
+from mtjax.types import Array, InputError, Task
 
 # Sensors that read more than poses and velocities of bodies: these need the whole position and velocity stages.
 INVOLVED = [getattr(mujoco.mjtSensor, f"mjSENS_{x}") for x in "TENDONPOS TENDONVEL ACTUATORPOS ACTUATORVEL".split()]
 INVOLVED += [mujoco.mjtSensor.mjSENS_CONTACT, mujoco.mjtSensor.mjSENS_CAMPROJECTION]
+
+_RANGEFINDER, _TACTILE = mujoco.mjtSensor.mjSENS_RANGEFINDER, mujoco.mjtSensor.mjSENS_TACTILE
+# What MJX leaves out without a word, and the fields that are not 0 where a model has it.
+_LEFT_OUT = {
+    "fluid forces on ellipsoids (fluidshape)": ("geom_fluid",),
+    "nonlinear stiffness or damping": ("jnt_stiffnesspoly", "dof_dampingpoly")
+    + ("tendon_stiffnesspoly", "tendon_dampingpoly", "actuator_dampingpoly"),
+    "damping or armature of actuators": ("actuator_damping", "actuator_armature"),
+    "actuators that act early (actearly)": ("actuator_actearly",),
+    "actuators of a disabled group": ("opt.disableactuator",),
+    "velocities of surfaces": ("flg_surfacevel",),
+    "adhesion of geoms": ("flg_adhesion",),
+    "iterations against slip (noslip_iterations)": ("opt.noslip_iterations",),
+    "plugins": ("nplugin",),
+}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -34,6 +50,20 @@ class Mjx:
         with jax.ensure_compile_time_eval():
             own = jax.local_devices()[0]  # the first of all may be another process's
             return mjx.put_model(self.base, own, "jax"), mjx.make_data(self.base, own, "jax")
+
+    def require_runnable(self) -> None:
+        """Refuse a model that MJX cannot run, or of which it would leave something out.
+
+        Raises:
+            InputError: the message says what it is, and which engines have it.
+        """
+        wrong = next(left_out(self.base), None)
+        try:
+            _ = self._constants
+        except (NotImplementedError, ValueError) as error:
+            wrong = str(error).split("\n")[0].rstrip(".")
+        if wrong is not None:
+            raise InputError(f"engine 'mjx' cannot run this model: {wrong}; use --engine=c or --engine=warp")
 
     @cached_property
     def _feels(self) -> bool:
@@ -107,3 +137,19 @@ class Mjx:
         if self._feels and data._impl.efc_J.size == 0:  # MJX returns early where nothing constrains the motion
             return mjx_module().sensor_acc(model, data)
         return data
+
+
+def left_out(model: mujoco.MjModel) -> Iterator[str]:
+    """Yield what a model has and MJX would leave out."""
+    for what, fields in _LEFT_OUT.items():
+        if any(np.any(attrgetter(field)(model)) for field in fields):
+            yield what
+    if model.opt.integrator == mujoco.mjtIntegrator.mjINT_DISCRETE:
+        yield "the discrete integrator"
+    if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
+        yield "sleeping bodies"
+    if np.any(model.actuator_ctrlnum != 1) or np.any(model.actuator_outnum != 1):
+        yield "actuators of several controls or forces"
+    of_cameras = (model.sensor_type == _RANGEFINDER) & (model.sensor_objtype != mujoco.mjtObj.mjOBJ_SITE)
+    if np.any(of_cameras) or np.any(model.sensor_type == _TACTILE):
+        yield "tactile sensors and range finders of cameras"
