@@ -111,8 +111,8 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
         the new state, and metrics: "return" and "episodes" (S, T), mean return and number of ended episodes; the
         environment's (S, T), as means over these episodes' last steps; the agent's, as means (S, T) or (S,) over the
         chunk; "lost" (S, T), how often a world was lost (``step_envs``), whose episode does not count; "bad_step"
-        (S, T), the first step whose numbers were not finite, or -1. Worlds that are lost at more than one in 10,000
-        steps of a task count as such numbers.
+        (S, T), the first step whose numbers were not finite, or -1; "bad_reward" (S, T) that whose reward was not.
+        Worlds that are lost at more than one in 10,000 steps of a task count as numbers that are not finite.
     """
     experience = agent.experience
 
@@ -176,6 +176,7 @@ def _reduce_step(env_step: EnvStep, total: Array, counted: Array) -> dict[str, A
         "lost": jnp.sum(env_step.lost, axis=2),
         "total": over_envs(total),
         "finite": jnp.all(bounded_worlds(transition.next_obs) & jnp.isfinite(transition.reward), axis=2),
+        "rewarded": jnp.all(jnp.isfinite(transition.reward), axis=2),
         "metrics": {name: over_envs(x) for name, x in env_step.metrics.items()},
     }
 
@@ -191,20 +192,27 @@ def _summarise(history: dict, count: int) -> Metrics:
     mean = lambda x: jnp.sum(x, axis=0) / jnp.maximum(jnp.sum(learning), 1)
     over_steps = lambda x: jnp.sum(x, axis=(0, 1))
     finished, total, metrics = (jax.tree.map(over_steps, history[name]) for name in ("finished", "total", "metrics"))
-    bad, lost = jnp.int32(~history["finite"]), history["lost"]
-    episodes, total, metrics, bad, lost = collectives.total((finished, total, metrics, bad, lost))
+    bad, unrewarded, lost = jnp.int32(~history["finite"]), jnp.int32(~history["rewarded"]), history["lost"]
+    counts = collectives.total((finished, total, metrics, bad, unrewarded, lost))
+    episodes, total, metrics, bad, unrewarded, lost = counts
     often = over_steps(lost) > _MOST_LOST * count
     bad = (bad > 0) | (often & (lost > 0))
     # A bad step of one task spoils the losses of all that share its networks; then only that task is reported.
     blameless = ~jnp.any(bad, axis=3, keepdims=True)
     for loss in jax.tree.leaves(losses):
         bad |= blameless & ~jnp.isfinite(loss).reshape(len(loss), 1, loss.shape[1], -1)
-    bad = bad.reshape(-1, *bad.shape[2:])  # (H, S, T)
     means = jax.tree.map(mean, losses)
     return {name: x.value / x.weight if isinstance(x, Sometimes) else x for name, x in means.items()} | {
         "episodes": episodes,
         "return": total / episodes,
         **{name: x / episodes for name, x in metrics.items()},
         "lost": over_steps(lost),
-        "bad_step": jnp.where(jnp.any(bad, axis=0), jnp.argmax(bad, axis=0), -1),
+        "bad_step": _first(bad),
+        "bad_reward": _first(unrewarded > 0),
     }
+
+
+def _first(bad: Array) -> Array:
+    """Return the first step (S, T) at which ``bad`` (iterations, steps, S, T) is true, or -1."""
+    of_steps = bad.reshape(-1, *bad.shape[2:])
+    return jnp.where(jnp.any(of_steps, axis=0), jnp.argmax(of_steps, axis=0), -1)

@@ -125,6 +125,7 @@ def test_rows_are_means_over_tasks_and_each_tasks_return():
         "cosine": np.array([0.25, 0.123456789]),
         "lost": np.array([[2, 1], [0, 0]]),
         "bad_step": np.array([[-1, -1], [-1, -1]]),
+        "bad_reward": np.array([[-1, -1], [-1, -1]]),
     }
     rows = log.metric_rows(metrics, np.array([7, 8]), {"steps": 100})
     first = {"return": "1", "loss": "2", "cosine": "0.25", "lost": "3", "return_0": "1", "return_1": ""}

@@ -295,7 +295,7 @@ def test_chunks_compile_once_and_take_over_the_memory_of_the_state():
 def test_collecting_without_learning_is_allowed():
     """No updates: no losses, and the agent stays."""
     state, (metrics,) = train(Walk(), Recorder(), {**SETTINGS, "updates_per_step": 0})
-    assert set(metrics) == {"return", "episodes", "lost", "bad_step"}
+    assert set(metrics) == {"return", "episodes", "lost", "bad_step", "bad_reward"}
     assert state.agent["updates"] == 0 and state.iteration == CHUNK
 
 

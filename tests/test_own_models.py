@@ -1,6 +1,8 @@
 """Models of a user's own: what actions reach, what engines refuse, and where files are looked for."""
 
 import dataclasses
+import importlib
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -99,8 +101,8 @@ def falling(option="", world="", geom="", joint="", actuator=MOTOR, rest=""):
 
 MJX_REFUSES = [
     (falling('density="1000"', geom='fluidshape="ellipsoid"'), "fluid forces on ellipsoids"),
-    (falling(joint='stiffness="1 2 3"'), "nonlinear stiffness or damping"),
-    (falling(joint='damping="1 2 3"'), "nonlinear stiffness or damping"),
+    (falling(joint='stiffness="1 2 3"'), "nonlinear stiffness of joints"),
+    (falling(joint='damping="1 2 3"'), "nonlinear damping"),
     (falling(actuator='<position joint="j" damping="2"/>'), "damping or armature of actuators"),
     (falling(actuator='<general joint="j" dyntype="filter" dynprm="0.1" actearly="true"/>'), "actearly"),
     (falling('actuatorgroupdisable="1"', actuator='<motor joint="j" group="1"/>'), "a disabled group"),
@@ -163,3 +165,31 @@ def test_mjx_steps_tasks_that_have_what_the_first_has_not(name):
         found.append(np.asarray(state.qpos))
     np.testing.assert_allclose(found[1], found[0], atol=1e-4)
     assert np.max(np.abs(found[0][0] - found[0][1])) > 1e-2
+
+
+def test_a_model_file_is_looked_for_beside_the_class(tmp_path, monkeypatch):
+    """Wherever the command runs; and a subclass in another file finds it too."""
+    (tmp_path / "robot.xml").write_text(falling())
+    head = "import dataclasses\nfrom tests_own_base import Plain\n"
+    (tmp_path / "own_robot.py").write_text(f"{head}class Robot(Plain):\n    model_file = 'robot.xml'\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(sys.modules, "tests_own_base", sys.modules[__name__])
+    robot = dataclasses.dataclass(frozen=True)(importlib.import_module("own_robot").Robot)
+    sub = dataclasses.dataclass(frozen=True)(type("Sub", (robot,), {"__module__": __name__}))
+    assert robot(engine="c").models[0].nu == sub(engine="c").models[0].nu == 1
+    with pytest.raises(InputError, match=r"there is no model file .*tests.*none\.xml"):
+        _ = own("none.xml", __module__=__name__).models
+    assert envs.make("walker-walk").models[0].nu == 6
+
+
+def log_of_height(self, task, world, action):
+    """A reward that is not finite at once."""
+    return -jnp.log(0 * world.qpos[0])
+
+
+def test_a_reward_that_is_not_finite_is_named():
+    """Rather than learning rates."""
+    env = own(falling(), reward=log_of_height)
+    said = r"the reward is not finite at step 0 of task 0 \(number 0 .*\. Mend what the environment computes"
+    with pytest.raises(FloatingPointError, match=said):
+        mtjax.train(env, "sac", steps=40, num_envs=2, batch_size=4, replay_size=100, chunk_steps=10, hidden=(8,))

@@ -602,7 +602,7 @@ def test_spoiled_parameters_are_not_saved(play, tmp_path, monkeypatch):
 def test_before_the_first_checkpoint_there_is_none_to_name(tmp_path):
     """The message says so."""
     with pytest.raises(FloatingPointError, match=r"step 12 of task 0 .*; there is no checkpoint from before it"):
-        require_finite(np.array([[2, -1]]), 10, Records(tmp_path).last)
+        require_finite(np.array([[2, -1]]), np.array([[-1, -1]]), 10, Records(tmp_path).last)
 
 
 @pytest.mark.parametrize("number, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

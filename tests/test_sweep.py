@@ -176,7 +176,7 @@ def test_a_seed_that_diverged_stays_given_up(capsys):
     swept = tuple({"tau": tau} for tau in (0.1, 0.2, 0.3))
     run = _Run(Walk(), SweptAgent(agent), settings, Plan(), None, Console(1), swept)
     now = _Progress(None, 0, 0.0, 0.0, None, np.zeros(3, bool))
-    chunk = lambda bad: lambda state: (state, {"bad_step": np.array(bad)[:, None]})
+    chunk = lambda bad: lambda state: (state, dict.fromkeys(("bad_step", "bad_reward"), np.array(bad)[:, None]))
     for bad in ([-1, 4, -1], [-1, -1, -1], [-1, 4, -1]):
         now, _ = run._play(chunk(bad), now, 0)
         assert now.diverged.tolist() == [False, True, False]

@@ -74,7 +74,7 @@ def _check_edits(family: Domain) -> None:
     """Edit the model by every parameter, each alone, and compile it."""
     if not isinstance(getattr(family, "model_file", None), str):
         raise InputError(
-            f"{type(family).__name__}.model_file is a file in mtjax/envs/models, a path, or the MJCF itself"
+            f"{type(family).__name__}.model_file is a file beside the class's own, a path, or the MJCF itself"
         )
     _call(family, "model_file", family._read_model)
     _call(family, "prepare", lambda: family.prepare(family._read_model()), family.prepare, family)

@@ -8,6 +8,7 @@ import abc
 import copy
 import dataclasses
 import hashlib
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
 from importlib import resources
@@ -51,7 +52,7 @@ class Domain(Pictured):
     integrator: str = "model"
     """Integrator of MJX and Warp: that of the model (rk4 for cartpole and acrobot), or the faster, less exact euler."""
 
-    model_file: ClassVar[str]  # a file in mtjax/envs/models, a path, or the MJCF itself
+    model_file: ClassVar[str]  # a file beside the class's own, else in mtjax/envs/models; a path; or the MJCF itself
     num_substeps: ClassVar[int]
     default_iterations: ClassVar[int]  # of MJX, where each costs about as much as the rest of a step
     warp_iterations: ClassVar[int] = 10  # of Warp, where they are cheap
@@ -154,10 +155,12 @@ class Domain(Pictured):
     def _read_model(self) -> mujoco.MjSpec:
         if self.model_file.lstrip().startswith("<"):
             return mujoco.MjSpec.from_string(self.model_file)
-        path = Path(str(resources.files("mtjax.envs") / "models")) / self.model_file  # an absolute path stands alone
-        if not path.is_file():
-            raise InputError(f"there is no model file {str(path)!r}")
-        return mujoco.MjSpec.from_file(str(path))
+        folders = [_folder_of(type(self)), Path(str(resources.files("mtjax.envs") / "models"))]
+        paths = [folder / self.model_file for folder in folders]  # an absolute path stands alone
+        found = next((path for path in paths if path.is_file()), None)
+        if found is None:
+            raise InputError(f"there is no model file {str(paths[0])!r}")
+        return mujoco.MjSpec.from_file(str(found))
 
     def compile_spec(self, values: Mapping[str, float] | None = None) -> mujoco.MjSpec:
         """Return the editable model with these parameter values. Other parameters keep the model's own."""
@@ -288,6 +291,13 @@ class Domain(Pictured):
         if self.integrator == "euler":
             base.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
         return base
+
+
+def _folder_of(family: type) -> Path:
+    """Return the folder of the file in which a class gives its model; in a notebook the working directory."""
+    cls = next(cls for cls in family.__mro__ if "model_file" in vars(cls))
+    file = getattr(sys.modules.get(cls.__module__), "__file__", None)
+    return Path(file).parent if file else Path.cwd()
 
 
 def stack_differing(models: Sequence[mujoco.MjModel]) -> dict[str, np.ndarray]:

@@ -117,7 +117,7 @@ def metric_rows(metrics: dict[str, np.ndarray], seeds: np.ndarray, common: dict[
     for s, seed in enumerate(seeds):
         row = {"seed": int(seed), **common, "return": number(_mean(metrics["return"][s]))}
         for name, x in metrics.items():
-            if name not in ("return", "bad_step"):
+            if name not in ("return", "bad_step", "bad_reward"):
                 row[name] = number(_OVER_TASKS.get(name, _mean)(x[s]))
         for name in (*_OF_EACH_TASK, "return"):
             row |= {f"{name}_{t}": number(x) for t, x in enumerate(metrics[name][s] if name in metrics else ())}

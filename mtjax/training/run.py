@@ -363,7 +363,7 @@ class _Run:
             metrics = hosts.gather(metrics)
             elapsed = time.monotonic() - before
         iteration = now.steps // self.steps_per_iteration
-        diverged = now.diverged | self._find_diverged(metrics["bad_step"], iteration, now.diverged)
+        diverged = now.diverged | self._find_diverged(metrics, iteration, now.diverged)
         steps, seconds = now.steps + self.steps_per_chunk, now.seconds + elapsed
         return now._replace(state=state, steps=steps, seconds=seconds, diverged=diverged), metrics
 
@@ -408,11 +408,11 @@ class _Run:
             yield
         self.console.say(f"profile of one chunk: {place} (xprof --logdir={place}, or its *.trace.json.gz in Perfetto)")
 
-    def _find_diverged(self, bad_step: np.ndarray, first_step: int, diverged: np.ndarray) -> np.ndarray:
+    def _find_diverged(self, metrics: dict[str, Any], first_step: int, diverged: np.ndarray) -> np.ndarray:
         """Return which seeds (S,) have diverged in this chunk. In a sweep the other seeds continue."""
-        broken = np.any(bad_step >= 0, axis=1)
+        broken = np.any(metrics["bad_step"] >= 0, axis=1)
         if not self.points or np.all(broken | diverged):
-            require_finite(bad_step, first_step, self.records.last)
+            require_finite(metrics["bad_step"], metrics["bad_reward"], first_step, self.records.last)
         self._tell_given_up(broken & ~diverged)
         return broken
 

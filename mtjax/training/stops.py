@@ -13,6 +13,7 @@ from mtjax.parallel import hosts
 from mtjax.types import Array
 
 _HINT = "Try lower learning rates or max-gradient-norm"
+_HINT_REWARD = "Mend what the environment computes, such as a logarithm of 0"
 
 
 @contextlib.contextmanager
@@ -37,11 +38,12 @@ def stop_signals() -> Iterator[list[int]]:
             signal.signal(number, handler)
 
 
-def require_finite(bad_step: np.ndarray, first_step: int, last: Callable[[], str]) -> None:
+def require_finite(bad_step: np.ndarray, bad_reward: np.ndarray, first_step: int, last: Callable[[], str]) -> None:
     """Check that all numbers of a chunk are finite.
 
     Args:
         bad_step: (S, T), the first step of the chunk with a number that is not, or -1.
+        bad_reward: (S, T), the first step of the chunk with a reward that is not, or -1.
         first_step: the steps of every environment before the chunk.
         last: returns a clause on the run's last checkpoint.
 
@@ -52,9 +54,11 @@ def require_finite(bad_step: np.ndarray, first_step: int, last: Callable[[], str
         return
     step = int(np.min(bad_step[bad_step >= 0]))
     seed, task = (int(i) for i in np.argwhere(bad_step == step)[0])
+    of_reward = np.argwhere(bad_reward == step)
+    seed, task = (int(i) for i in of_reward[0]) if len(of_reward) else (seed, task)
+    what, hint = ("the reward is not", _HINT_REWARD) if len(of_reward) else ("numbers stopped being", _HINT)
     raise FloatingPointError(
-        f"numbers stopped being finite at step {first_step + step} of task {task} (number {seed} of the run's seeds); "
-        f"{last()}. {_HINT}"
+        f"{what} finite at step {first_step + step} of task {task} (number {seed} of the run's seeds); {last()}. {hint}"
     )
 
 

@@ -22,8 +22,8 @@ _RANGEFINDER, _TACTILE = mujoco.mjtSensor.mjSENS_RANGEFINDER, mujoco.mjtSensor.m
 # What MJX leaves out without a word, and the fields that are not 0 where a model has it.
 _LEFT_OUT = {
     "fluid forces on ellipsoids (fluidshape)": ("geom_fluid",),
-    "nonlinear stiffness or damping": ("jnt_stiffnesspoly", "dof_dampingpoly")
-    + ("tendon_stiffnesspoly", "tendon_dampingpoly", "actuator_dampingpoly"),
+    "nonlinear stiffness of joints or tendons": ("jnt_stiffnesspoly", "tendon_stiffnesspoly"),
+    "nonlinear damping": ("dof_dampingpoly", "tendon_dampingpoly", "actuator_dampingpoly"),
     "damping or armature of actuators": ("actuator_damping", "actuator_armature"),
     "actuators that act early (actearly)": ("actuator_actearly",),
     "actuators of a disabled group": ("opt.disableactuator",),
