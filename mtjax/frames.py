@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mtjax.types import Array, Spec
+from mtjax.types import Array, InputError, Spec
 
 PICTURES = "pixels"
 """The entry of an observation that holds pictures, uint8."""
@@ -21,6 +21,24 @@ STATE = "state"
 def shown(obs: Any) -> bool:
     """Return whether an observation, or its shapes, holds pictures."""
     return isinstance(obs, Mapping) and PICTURES in obs
+
+
+def require_known(obs: Any) -> None:
+    """Check that networks can be built for observations of these shapes.
+
+    Raises:
+        InputError: they are neither a vector of floats, nor pictures, nor both.
+    """
+    vector = lambda x: getattr(x, "ndim", 0) == 1 and jnp.issubdtype(x.dtype, jnp.floating)
+    picture = lambda x: getattr(x, "ndim", 0) == 3 and x.dtype == jnp.uint8
+    kinds = {PICTURES: picture, STATE: vector}
+    known = all(name in kinds and kinds[name](x) for name, x in obs.items()) if shown(obs) else vector(obs)
+    if not known:
+        told = jax.tree.map(lambda x: f"{x.dtype}{list(x.shape)}", obs)
+        raise InputError(
+            f"agents take a vector of floats (O,), or a dictionary of 'pixels', uint8 (H, W, C), and a vector 'state' "
+            f"if there is one; not {told}"
+        )
 
 
 def begin(obs: Any, frames: int) -> Any:

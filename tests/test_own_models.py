@@ -13,7 +13,17 @@ import mtjax
 import mtjax.train
 from mtjax import envs
 from mtjax.envs import Domain, Parameter
+from mtjax.envs.corridors.maze import CorridorMaze
 from mtjax.types import InputError
+
+
+@pytest.fixture
+def forget():
+    """Forget what a test registers."""
+    before = set(envs.ENVS)
+    yield
+    for name in set(envs.ENVS) - before:
+        del envs.ENVS[name]
 
 
 class Plain(Domain):
@@ -193,3 +203,46 @@ def test_a_reward_that_is_not_finite_is_named():
     said = r"the reward is not finite at step 0 of task 0 \(number 0 .*\. Mend what the environment computes"
     with pytest.raises(FloatingPointError, match=said):
         mtjax.train(env, "sac", steps=40, num_envs=2, batch_size=4, replay_size=100, chunk_steps=10, hidden=(8,))
+
+
+SEEN = {  # what a family may observe, and whether agents take it
+    "vector": (lambda qpos: qpos, True),
+    "map": (lambda qpos: jnp.zeros((3, 4)), False),
+    "integers": (lambda qpos: jnp.zeros(5, jnp.int32), False),
+    "dictionary": (lambda qpos: {"arm": qpos[:2], "rest": {"counts": jnp.zeros(2, jnp.int8)}}, False),
+    "picture": (lambda qpos: {"pixels": jnp.zeros((16, 16, 3), jnp.uint8)}, True),
+    "both": (lambda qpos: {"pixels": jnp.zeros((16, 16, 3), jnp.uint8), "state": qpos}, True),
+    "other picture": (lambda qpos: {"pixels": jnp.zeros((16, 16, 3))}, False),
+    "more": (lambda qpos: {"pixels": jnp.zeros((16, 16, 3), jnp.uint8), "depth": jnp.zeros((16, 16, 1))}, False),
+}
+
+
+@pytest.mark.parametrize("kind", SEEN)
+def test_observations_are_trees_of_any_shape_and_dtype(kind, forget):
+    """They can be registered and stepped; and an agent says in one line what it takes."""
+    observe, taken = SEEN[kind]
+    base = type(own(falling()))
+    seen = lambda self, task, world: observe(world.qpos)
+    cls = dataclasses.dataclass(frozen=True)(type("Seen", (base,), {"observe": seen}))
+    mtjax.register("seen", cls)
+    env = mtjax.make("seen", engine="c")
+    step = jax.jit(env.step)(first_task(env), env.reset(first_task(env), jax.random.key(0)).state, jnp.zeros(1))
+    assert jax.tree.map(lambda x: (x.shape, x.dtype), step.obs) == jax.tree.map(
+        lambda x: (x.shape, x.dtype), env.spec.obs
+    )
+    if taken:
+        return mtjax.agent("drq").require_sight(env.spec)
+    for agent in ("sac", "ppo", "drq"):
+        with pytest.raises(InputError, match=r"agents take a vector of floats \(O,\), or .*; not ") as error:
+            mtjax.train("seen", agent, steps=100, engine="c")
+        assert "\n" not in str(error.value)
+    return None
+
+
+@pytest.mark.slow
+def test_a_family_that_is_registered_with_pictures_is_learned(forget):
+    """By an agent that sees."""
+    mtjax.register("own-corridor", CorridorMaze, pixels=16)
+    small = {"batch_size": 2, "replay_size": 50, "chunk_steps": 10, "warmup_steps": 10, "hidden": (4,)}
+    result = mtjax.train("own-corridor", "drq", steps=40, num_envs=2, eval_episodes=1, **small)
+    assert np.all(np.isfinite(result.evaluations.returns["train"]))

@@ -234,11 +234,12 @@ class BaseAgent(abc.ABC):
             )
 
     def require_sight(self, spec: Spec) -> None:
-        """Check that the representation can take a family's observations.
+        """Check that networks and representation can take a family's observations.
 
         Raises:
-            InputError: it cannot, or tasks would have to be inferred from pictures.
+            InputError: they cannot, or tasks would have to be inferred from pictures.
         """
+        frames.require_known(spec.obs)
         self.representation.require(spec.obs)
         if frames.shown(spec.obs) and self.history_length:
             raise InputError("tasks cannot be inferred from pictures; choose another conditioning")

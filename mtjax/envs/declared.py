@@ -205,11 +205,10 @@ def _check_domain(family: Domain, task: Task, key: Any) -> None:
 
 
 def _require_observation(family: Family, method: str, obs: Any) -> None:
-    shape = getattr(obs, "shape", None)
-    if shape is not None and len(shape) != 1:
-        raise InputError(f"{type(family).__name__}.{method} must return one vector (O,), not shape {shape}")
-    for leaf in jax.tree.leaves(obs):
-        _require(family, method, "an observation", leaf, leaf.shape)
+    """Require a tree of arrays of numbers, such as a vector, a picture, or a dictionary of both."""
+    numbers = lambda leaf: any(jnp.issubdtype(leaf.dtype, kind) for kind in (jnp.number, jnp.bool_))
+    if not jax.tree.leaves(obs) or not all(map(numbers, jax.tree.leaves(obs))):
+        raise InputError(f"{type(family).__name__}.{method} must return an observation of numbers, not {obs}")
 
 
 class _Links(list):
