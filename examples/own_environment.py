@@ -35,13 +35,13 @@ class Spring(Domain):
         <actuator><motor joint="slide" gear="10" ctrllimited="true" ctrlrange="-1 1"/></actuator>
       </mujoco>"""
     parameters: ClassVar = {
-        "stiffness": Parameter("N/m", 0.0, set_stiffness),
+        "stiffness": Parameter("N/m", 0.0, set_stiffness, minimum=0.0),
         "mass": MASS,
         "goal": Parameter("m", 0.0, minimum=-1.0, maximum=1.0),  # no edit: it reaches the reward as task.goal["goal"]
     }
     num_substeps: ClassVar[int] = 2  # of the physics in a step of the agent
     episode_steps: ClassVar[int] = 100  # the time limit, which truncates: values are bootstrapped beyond it
-    default_iterations: ClassVar[int] = 1  # of the solver in MJX; where things touch or have limits, try 4 or more
+    default_iterations: ClassVar[int] = 1  # of the solver in MJX, as nothing touches or has limits here; else 8
     starts_untouched: ClassVar[bool] = True  # no force sensor feels anything in a start: resets need not solve for it
 
     def start(self, task, key):

@@ -246,3 +246,38 @@ def test_a_family_that_is_registered_with_pictures_is_learned(forget):
     small = {"batch_size": 2, "replay_size": 50, "chunk_steps": 10, "warmup_steps": 10, "hidden": (4,)}
     result = mtjax.train("own-corridor", "drq", steps=40, num_envs=2, eval_episodes=1, **small)
     assert np.all(np.isfinite(result.evaluations.returns["train"]))
+
+
+def test_a_family_needs_five_words(forget):
+    """All others have a default."""
+
+    @dataclasses.dataclass(frozen=True)
+    class Least(Domain):
+        model_file = falling()
+        episode_steps = 10
+        start, observe, reward = Plain.start, Plain.observe, Plain.reward
+
+    mtjax.register("least", Least)
+    env = mtjax.make("least", engine="c")
+    assert (env.num_substeps, env.default_iterations, dict(env.parameters)) == (1, 8, {})
+
+
+def set_wind(spec, value):
+    """Let the wind blow along x."""
+    spec.option.wind[0] = value
+
+
+def set_damping(spec, value):
+    """Set the damping of a joint."""
+    spec.joint("j").damping[0] = value
+
+
+def test_values_may_be_negative_where_physics_has_such():
+    """A wind may; a damping may not, and says how to leave it out."""
+    windy = own(falling('density="1"'), vary={"wind": "-1:1:3"}, parameters={"wind": Parameter("m/s", 0.0, set_wind)})
+    assert [float(m.opt.wind[0]) for m in windy.models[:3]] == [-1, 0, 1]
+    damped = {"vary": {"damping": "1:3:3"}, "parameters": {"damping": Parameter("N m s/rad", 1.0, set_damping)}}
+    with pytest.raises(InputError, match=r"damping=-1 has a dof_damping below 0; give the parameter minimum=0\.0"):
+        _ = own(falling(), **damped).models
+    positive = damped | {"parameters": {"damping": Parameter("N m s/rad", 1.0, set_damping, minimum=0.0)}}
+    assert min(model.dof_damping[-1] for model in own(falling(), **positive).models) > 0

@@ -8,8 +8,8 @@ from mtjax.envs.variation import scale, vary, write_values
 from mtjax.types import InputError
 
 PARAMETERS = {
-    "a": Parameter("1", 1.0),
-    "b": Parameter("1", 1.0),
+    "a": Parameter("1", 1.0, minimum=0.0),
+    "b": Parameter("1", 1.0, minimum=0.0),
     "c": Parameter("1", 0.0, minimum=-np.inf, maximum=2.5),
     "d": Parameter("1", 0.0, minimum=-1.0, maximum=2.0, names=("low", "mid", "high")),
 }

@@ -21,7 +21,7 @@ import numpy as np
 
 from mtjax.envs.engines.base import mjx_module
 from mtjax.envs.family import Family
-from mtjax.envs.parameters import Parameter
+from mtjax.envs.parameters import Parameter, positive
 from mtjax.names import nearest_error
 from mtjax.types import Array, InputError, Key, Step, Task
 
@@ -90,7 +90,7 @@ class Brax(Family):
     """Brax's physics: generalized, positional, spring or mjx."""
 
     parameters: ClassVar[Mapping[str, Parameter]] = MappingProxyType(
-        {"mass": Parameter("1", 1.0), "gravity": Parameter("m/s^2", 9.81), "friction": Parameter("1", 1.0)}
+        {"mass": positive("1", 1.0), "gravity": positive("m/s^2", 9.81), "friction": positive("1", 1.0)}
     )
     episode_steps: ClassVar[int] = 1000
     names: ClassVar[tuple[str, ...]] = NAMES
@@ -241,9 +241,7 @@ class BraxHalfcheetahSpeed(Brax):
     environment: str = "halfcheetah"
 
     asks: ClassVar[str] = "Make the half-cheetah run at the given speed."
-    parameters: ClassVar[Mapping[str, Parameter]] = MappingProxyType(
-        {**Brax.parameters, "speed": Parameter("m/s", 1.0)}
-    )
+    parameters: ClassVar[Mapping[str, Parameter]] = MappingProxyType({**Brax.parameters, "speed": positive("m/s", 1.0)})
     names: ClassVar[tuple[str, ...]] = ("halfcheetah",)
 
     def reward(self, task: Task, metrics: Mapping[str, Array], reward: Array, action: Array) -> Array:

@@ -34,6 +34,10 @@ from mtjax.names import nearest_error
 from mtjax.types import Array, InputError, Key, Spec, Step, Task, Transition
 
 INTEGRATORS = ("model", "euler")
+_RESISTANCES = ("damping", "frictionloss", "armature")
+_UNSIGNED = ("body_mass", "geom_friction", "pair_friction", "jnt_stiffness", "tendon_stiffness", "opt.density")
+_UNSIGNED += ("opt.viscosity", *(f"{part}_{x}" for part in ("dof", "tendon") for x in _RESISTANCES))
+"""Fields in which MuJoCo takes negative numbers, and physics does not."""
 _DECIDING = ("dof_frictionloss", "tendon_frictionloss", "opt.density", "opt.viscosity")
 """Fields that decide by being 0 what MJX and Warp make programs of."""
 
@@ -53,8 +57,8 @@ class Domain(Pictured):
     """Integrator of MJX and Warp: that of the model (rk4 for cartpole and acrobot), or the faster, less exact euler."""
 
     model_file: ClassVar[str]  # a file beside the class's own, else in mtjax/envs/models; a path; or the MJCF itself
-    num_substeps: ClassVar[int]
-    default_iterations: ClassVar[int]  # of MJX, where each costs about as much as the rest of a step
+    num_substeps: ClassVar[int] = 1  # steps of the physics in a control step
+    default_iterations: ClassVar[int] = 8  # of MJX, where each costs about as much as the rest of a step
     warp_iterations: ClassVar[int] = 10  # of Warp, where they are cheap
     gpu_engine: ClassVar[str] = "warp"  # what "auto" is on an NVIDIA GPU, as measured: mjx or warp
     unites: ClassVar[bool] = False  # its scene may be part of a union of scenes (``union.compose``)
@@ -182,7 +186,7 @@ class Domain(Pictured):
         """Return the compiled model with these parameter values.
 
         Raises:
-            InputError: MuJoCo refuses them, or the model has numbers beyond 32 bits.
+            InputError: MuJoCo refuses them, or the model has numbers beyond 32 bits or ones that nature does not have.
         """
         given = ", ".join(f"{name}={value:g}" for name, value in values.items()) or "its own values"
         try:
@@ -194,6 +198,10 @@ class Domain(Pictured):
             field = np.asarray(attrgetter(name)(model))
             if np.any(np.isfinite(field) & (np.abs(field) > np.finfo(np.float32).max)) or np.any(np.isnan(field)):
                 raise InputError(f"{type(self).__name__} with {given} has a {name} beyond 32-bit numbers")
+        negative = next((name for name in _UNSIGNED if np.any(np.asarray(attrgetter(name)(model)) < 0)), None)
+        if negative is not None:
+            told = "give the parameter minimum=0.0, or leave such values out (of held-out tasks by --split=none)"
+            raise InputError(f"{type(self).__name__} with {given} has a {negative} below 0; {told}")
         return model
 
     def build(self) -> dict[str, dict[str, Any]]:

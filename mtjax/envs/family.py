@@ -5,6 +5,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from functools import cached_property
+from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Self
 
 import jax
@@ -48,7 +49,7 @@ class Family(Flat, Tabled):
     """Parameters of the context, and the ranges that are scaled to [-1, 1]: ((name, low, high), ...). ``scaled_as``
     sets them to another family's. None takes the parameters that vary in training."""
 
-    parameters: ClassVar[Mapping[str, Parameter]]
+    parameters: ClassVar[Mapping[str, Parameter]] = MappingProxyType({})
     action_size: ClassVar[int]
     episode_steps: ClassVar[int]
     relabels: ClassVar[tuple[str, ...]] = ()  # the parameters, goals all of them, that ``relabel`` can exchange

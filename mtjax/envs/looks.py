@@ -13,7 +13,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from mtjax.envs.parameters import Parameter
+from mtjax.envs.parameters import Parameter, positive
 
 SELF, EFFECTOR, DECORATION, TARGET = (
     (0.7, 0.5, 0.3, 1.0),
@@ -165,6 +165,6 @@ LOOKS: Mapping[str, Parameter] = MappingProxyType(
         "hue": Parameter("deg", 0.0, _turn_hues(lambda geom: not _is_floor(geom)), -360.0, 360.0, looks=True),
         "floor-hue": Parameter("deg", 0.0, _turn_hues(_is_floor), -360.0, 360.0, looks=True),
         SKY_HUE: Parameter("deg", 0.0, _turn_sky, -360.0, 360.0, looks=True),
-        "light": Parameter("1", 1.0, _scale_lights, looks=True),
+        "light": positive("1", 1.0, _scale_lights, looks=True),
     }
 )

@@ -4,7 +4,7 @@ from __future__ import annotations  # annotations name MuJoCo, but listing the f
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
     import mujoco
@@ -16,7 +16,7 @@ class Parameter(NamedTuple):
     unit: str
     nominal: float  # the value in the unedited model, or of a goal that does not vary
     edit: Callable[[mujoco.MjSpec, float], None] | None = None  # writes the value into a spec; None: ``Task.goal``
-    minimum: float = 0.0  # values must be greater than this
+    minimum: float = -math.inf  # values must be greater than this
     maximum: float = math.inf  # and not greater than this
     looks: bool = False  # whether it edits what is seen, and not the physics
     names: tuple[str, ...] = ()  # what its values 0, 1, ... are called; nothing lies between two of them
@@ -29,6 +29,11 @@ class Parameter(NamedTuple):
     def tell(self, value: float, digits: int) -> str:
         """Return a value as text: its name, or so many digits."""
         return self.names[round(value)] if self.names else f"{value:.{digits}g}"
+
+
+def positive(unit: str, nominal: float, edit: Any = None, **about: Any) -> Parameter:
+    """Return a parameter whose values are greater than 0, such as a mass or a size."""
+    return Parameter(unit, nominal, edit, minimum=0.0, **about)
 
 
 def _scale_geom(geom: mujoco.MjsGeom, scale: float) -> None:
@@ -97,13 +102,13 @@ def _set_density(spec: mujoco.MjSpec, value: float) -> None:
 
 def body_mass(name: str) -> Parameter:
     """Return a parameter that scales mass and inertia of one body."""
-    return Parameter("1", 1.0, lambda spec, scale: _scale_bodies(spec, [spec.body(name)], scale))
+    return positive("1", 1.0, lambda spec, scale: _scale_bodies(spec, [spec.body(name)], scale))
 
 
-MASS = Parameter("1", 1.0, _scale_mass)  # scale of all masses and inertias
-GRAVITY = Parameter("m/s^2", 9.81, _set_gravity)
-FRICTION = Parameter("1", 1.0, _scale_friction)  # scale of the sliding friction of all contacts
-DAMPING = Parameter("1", 1.0, _scale_damping)  # scale of the damping of all joints
-GEAR = Parameter("1", 1.0, _scale_gear)  # scale of the strength of all actuators
-STRENGTH = Parameter("1", 1.0, _scale_strength)  # scale of the force of all actuators, servos among them
-WATER = Parameter("kg/m^3", 0.0, _set_density)  # density of what bodies move in
+MASS = positive("1", 1.0, _scale_mass)  # scale of all masses and inertias
+GRAVITY = positive("m/s^2", 9.81, _set_gravity)
+FRICTION = positive("1", 1.0, _scale_friction)  # scale of the sliding friction of all contacts
+DAMPING = positive("1", 1.0, _scale_damping)  # scale of the damping of all joints
+GEAR = positive("1", 1.0, _scale_gear)  # scale of the strength of all actuators
+STRENGTH = positive("1", 1.0, _scale_strength)  # scale of the force of all actuators, servos among them
+WATER = positive("kg/m^3", 0.0, _set_density)  # density of what bodies move in

@@ -12,7 +12,7 @@ from mtjax.envs.dm_control.rewards import tolerance
 from mtjax.envs.domain import Domain
 from mtjax.envs.engines.base import World
 from mtjax.envs.looks import Look
-from mtjax.envs.parameters import DAMPING, FRICTION, GEAR, GRAVITY, MASS, Parameter, body_mass
+from mtjax.envs.parameters import DAMPING, FRICTION, GEAR, GRAVITY, MASS, Parameter, body_mass, positive
 from mtjax.envs.pixels import Mark
 from mtjax.types import Array, Key, Task
 
@@ -115,7 +115,7 @@ class BallInCupSpin(BallInCup):
     Further parameter: speed [m/s].
     """
 
-    parameters: ClassVar = MappingProxyType({**BallInCup.parameters, "speed": Parameter("m/s", 3.0)})
+    parameters: ClassVar = MappingProxyType({**BallInCup.parameters, "speed": positive("m/s", 3.0)})
 
     def reward(self, task: Task, world: World, action: Array) -> Array:
         cup, ball = self.ends(task, world)

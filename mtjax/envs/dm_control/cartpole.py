@@ -12,7 +12,7 @@ from mtjax.envs.dm_control.rewards import tolerance
 from mtjax.envs.domain import Domain
 from mtjax.envs.engines.base import World
 from mtjax.envs.looks import Look
-from mtjax.envs.parameters import DAMPING, GEAR, GRAVITY, Parameter
+from mtjax.envs.parameters import DAMPING, GEAR, GRAVITY, positive
 from mtjax.types import Array, Key, Task
 
 
@@ -60,9 +60,9 @@ class CartpoleBalance(Domain):
     asks: ClassVar[str] = "Balance the pole on the cart."
     parameters: ClassVar = MappingProxyType(
         {
-            "cart-mass": Parameter("kg", 1.0, _set_cart_mass),
-            "pole-mass": Parameter("kg", 0.1, _set_pole_mass),
-            "pole-length": Parameter("m", 1.0, _set_pole_length),
+            "cart-mass": positive("kg", 1.0, _set_cart_mass),
+            "pole-mass": positive("kg", 0.1, _set_pole_mass),
+            "pole-length": positive("m", 1.0, _set_pole_length),
             "gravity": GRAVITY,
             "damping": DAMPING,
             "gear": GEAR,

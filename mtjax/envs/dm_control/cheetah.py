@@ -14,7 +14,7 @@ from mtjax.envs.dm_control.rewards import tolerance
 from mtjax.envs.domain import Domain
 from mtjax.envs.engines.base import World
 from mtjax.envs.looks import Look
-from mtjax.envs.parameters import DAMPING, FRICTION, GEAR, GRAVITY, MASS, Parameter, body_mass
+from mtjax.envs.parameters import DAMPING, FRICTION, GEAR, GRAVITY, MASS, Parameter, body_mass, positive
 from mtjax.types import Array, Key, Task
 
 _TOTAL_MASS = 14.0  # [kg]
@@ -61,10 +61,10 @@ def _set_back_foot_length(spec: mujoco.MjSpec, length: float) -> None:
 
 
 _BODY = {
-    "torso-length": Parameter("m", 0.5, _set_torso_length),
-    "foot-size": Parameter("m", 0.046, _set_foot_size),
-    "foot-position": Parameter("m", 0.5, _set_foot_position),
-    "back-foot-length": Parameter("m", 0.094, _set_back_foot_length),
+    "torso-length": positive("m", 0.5, _set_torso_length),
+    "foot-size": positive("m", 0.046, _set_foot_size),
+    "foot-position": positive("m", 0.5, _set_foot_position),
+    "back-foot-length": positive("m", 0.094, _set_back_foot_length),
     "torso-mass": body_mass("torso"),
     "mass": MASS,
     "gravity": GRAVITY,
@@ -105,7 +105,7 @@ class CheetahRun(Domain):
     """
 
     asks: ClassVar[str] = "Make the cheetah run forwards as fast as it can."
-    parameters: ClassVar = MappingProxyType({**_BODY, "speed": Parameter("m/s", 10.0)})
+    parameters: ClassVar = MappingProxyType({**_BODY, "speed": positive("m/s", 10.0)})
     model_file: ClassVar[str] = "cheetah.xml"
     num_substeps: ClassVar[int] = 1
     episode_steps: ClassVar[int] = 1000

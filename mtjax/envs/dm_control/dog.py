@@ -19,7 +19,7 @@ from mtjax.envs.dm_control.rewards import tolerance
 from mtjax.envs.domain import Domain
 from mtjax.envs.engines.base import World
 from mtjax.envs.looks import Look
-from mtjax.envs.parameters import DAMPING, FRICTION, GRAVITY, MASS, STRENGTH, Parameter, body_mass
+from mtjax.envs.parameters import DAMPING, FRICTION, GRAVITY, MASS, STRENGTH, body_mass, positive
 from mtjax.types import Array, InputError, Key, Step, Task
 
 _SECONDS = 15.0  # of an episode, in which the floor must not end
@@ -210,7 +210,7 @@ class DogWalk(DogStand):
     Further parameter: speed [m/s].
     """
 
-    parameters: ClassVar = MappingProxyType({**DogStand.parameters, "speed": Parameter("m/s", 1.0)})
+    parameters: ClassVar = MappingProxyType({**DogStand.parameters, "speed": positive("m/s", 1.0)})
 
     def reward(self, task: Task, world: World, action: Array) -> Array:
         speed, velocity = task.goal["speed"], self._read(world)["torso_linvel"]
@@ -223,7 +223,7 @@ class DogWalk(DogStand):
 class DogTrot(DogWalk):
     """Trot: DogWalk at 3 to 6 m/s."""
 
-    parameters: ClassVar = MappingProxyType({**DogStand.parameters, "speed": Parameter("m/s", 3.0)})
+    parameters: ClassVar = MappingProxyType({**DogStand.parameters, "speed": positive("m/s", 3.0)})
     floor: ClassVar[float] = 3 * _SECONDS
 
 
@@ -231,7 +231,7 @@ class DogTrot(DogWalk):
 class DogRun(DogWalk):
     """Run: DogWalk at 9 to 18 m/s."""
 
-    parameters: ClassVar = MappingProxyType({**DogStand.parameters, "speed": Parameter("m/s", 9.0)})
+    parameters: ClassVar = MappingProxyType({**DogStand.parameters, "speed": positive("m/s", 9.0)})
     floor: ClassVar[float] = 9 * _SECONDS
 
 

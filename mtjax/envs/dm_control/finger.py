@@ -12,7 +12,7 @@ import mujoco
 from mtjax.envs.domain import Domain, start_joints
 from mtjax.envs.engines.base import World
 from mtjax.envs.looks import TARGET, Look
-from mtjax.envs.parameters import DAMPING, FRICTION, GEAR, MASS, Parameter
+from mtjax.envs.parameters import DAMPING, FRICTION, GEAR, MASS, Parameter, positive
 from mtjax.envs.pixels import Mark
 from mtjax.types import Array, Key, Task, Transition
 
@@ -77,10 +77,10 @@ class FingerSpin(Domain):
     asks: ClassVar[str] = "Spin the body with the finger."
     parameters: ClassVar = MappingProxyType(
         {
-            "size": Parameter("1", 1.0, _scale_links),
-            "touch-size": Parameter("m", 0.025, _widen_touch),
-            "spinner-frictionloss": Parameter("N m", 0.1, _set_spinner_frictionloss),
-            "spinner-damping": Parameter("N m s/rad", 0.03, _set_spinner_damping),
+            "size": positive("1", 1.0, _scale_links),
+            "touch-size": positive("m", 0.025, _widen_touch),
+            "spinner-frictionloss": positive("N m", 0.1, _set_spinner_frictionloss),
+            "spinner-damping": positive("N m s/rad", 0.03, _set_spinner_damping),
             "mass": MASS,
             "friction": FRICTION,
             "damping": DAMPING,
@@ -133,8 +133,8 @@ class FingerTurn(FingerSpin):
     parameters: ClassVar = MappingProxyType(
         {
             **FingerSpin.parameters,
-            "spinner-damping": Parameter("N m s/rad", 0.5, _set_spinner_damping),
-            "target-size": Parameter("m", 0.07),
+            "spinner-damping": positive("N m s/rad", 0.5, _set_spinner_damping),
+            "target-size": positive("m", 0.07),
         }
     )
     relabels: ClassVar[tuple[str, ...]] = ("target-size", "target-angle")

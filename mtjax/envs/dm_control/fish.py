@@ -13,7 +13,7 @@ from mtjax.envs.dm_control.rewards import tolerance
 from mtjax.envs.domain import Domain
 from mtjax.envs.engines.base import World
 from mtjax.envs.looks import Look
-from mtjax.envs.parameters import DAMPING, MASS, STRENGTH, WATER, Parameter, body_mass
+from mtjax.envs.parameters import DAMPING, MASS, STRENGTH, WATER, body_mass, positive
 from mtjax.envs.pixels import Mark
 from mtjax.types import Array, Key, Task
 
@@ -56,7 +56,7 @@ class FishUpright(Domain):
 
     parameters: ClassVar = MappingProxyType(
         {
-            "fin-size": Parameter("1", 1.0, _scale_fins),
+            "fin-size": positive("1", 1.0, _scale_fins),
             "torso-mass": body_mass("torso"),
             "water-density": WATER._replace(nominal=5000.0),
             "mass": MASS,
@@ -108,7 +108,7 @@ class FishSwim(FishUpright):
     """
 
     parameters: ClassVar = MappingProxyType(
-        {**FishUpright.parameters, "target-size": Parameter("m", 0.04, _set_target_size)}
+        {**FishUpright.parameters, "target-size": positive("m", 0.04, _set_target_size)}
     )
     fresh_goals: ClassVar[bool] = True
 

@@ -11,7 +11,7 @@ from mtjax.envs.dm_control.rewards import tolerance
 from mtjax.envs.domain import Domain, start_joints
 from mtjax.envs.engines.base import World
 from mtjax.envs.looks import Look
-from mtjax.envs.parameters import DAMPING, FRICTION, GEAR, GRAVITY, MASS, Parameter, body_mass
+from mtjax.envs.parameters import DAMPING, FRICTION, GEAR, GRAVITY, MASS, body_mass, positive
 from mtjax.types import Array, Key, Task
 
 _HEIGHTS = (0.6, 2.0)  # [m]
@@ -60,7 +60,7 @@ class HopperStand(Domain):
     asks: ClassVar[str] = "Make the hopper stand."
     parameters: ClassVar = MappingProxyType(
         {
-            "foot-length": Parameter("1", 1.0, _scale_foot),
+            "foot-length": positive("1", 1.0, _scale_foot),
             "torso-mass": body_mass("torso"),
             "mass": MASS,
             "gravity": GRAVITY,
@@ -104,7 +104,7 @@ class HopperHop(HopperStand):
     """
 
     asks: ClassVar[str] = "Make the hopper hop forwards."
-    parameters: ClassVar = MappingProxyType({**HopperStand.parameters, "speed": Parameter("m/s", 2.0)})
+    parameters: ClassVar = MappingProxyType({**HopperStand.parameters, "speed": positive("m/s", 2.0)})
     heading: ClassVar[float] = 1.0  # -1 backwards
 
     def reward(self, task: Task, world: World, action: Array) -> Array:

@@ -12,7 +12,7 @@ from mtjax.envs.dm_control.rewards import tolerance
 from mtjax.envs.domain import Domain, start_joints
 from mtjax.envs.engines.base import World
 from mtjax.envs.looks import Look
-from mtjax.envs.parameters import DAMPING, FRICTION, GEAR, GRAVITY, MASS, Parameter, body_mass
+from mtjax.envs.parameters import DAMPING, FRICTION, GEAR, GRAVITY, MASS, body_mass, positive
 from mtjax.types import Array, Key, Task
 
 _STAND_HEIGHT = 1.4  # [m] of the head
@@ -61,7 +61,7 @@ class HumanoidStand(Domain):
 
     parameters: ClassVar = MappingProxyType(
         {
-            "shin-length": Parameter("m", 0.3, _set_shin_length),
+            "shin-length": positive("m", 0.3, _set_shin_length),
             "torso-mass": body_mass("torso"),
             "mass": MASS,
             "gravity": GRAVITY,
@@ -110,7 +110,7 @@ class HumanoidWalk(HumanoidStand):
     Further parameter: speed [m/s].
     """
 
-    parameters: ClassVar = MappingProxyType({**HumanoidStand.parameters, "speed": Parameter("m/s", 1.0)})
+    parameters: ClassVar = MappingProxyType({**HumanoidStand.parameters, "speed": positive("m/s", 1.0)})
 
     def moving(self, task: Task, velocity: Array) -> Array:
         speed = task.goal["speed"]
@@ -122,4 +122,4 @@ class HumanoidWalk(HumanoidStand):
 class HumanoidRun(HumanoidWalk):
     """Run: HumanoidWalk at 10 m/s."""
 
-    parameters: ClassVar = MappingProxyType({**HumanoidStand.parameters, "speed": Parameter("m/s", 10.0)})
+    parameters: ClassVar = MappingProxyType({**HumanoidStand.parameters, "speed": positive("m/s", 10.0)})

@@ -12,7 +12,7 @@ from mtjax.envs.dm_control.rewards import tolerance
 from mtjax.envs.domain import Domain, start_joints
 from mtjax.envs.engines.base import World
 from mtjax.envs.looks import Look
-from mtjax.envs.parameters import DAMPING, GEAR, GRAVITY, Parameter
+from mtjax.envs.parameters import DAMPING, GEAR, GRAVITY, positive
 from mtjax.types import Array, Key, Task
 
 _UPRIGHT = math.cos(math.radians(8))
@@ -50,8 +50,8 @@ class PendulumSwingup(Domain):
     asks: ClassVar[str] = "Swing the pendulum up and hold it upright."
     parameters: ClassVar = MappingProxyType(
         {
-            "mass": Parameter("kg", 1.0, _set_mass),
-            "length": Parameter("m", 0.5, _set_length),
+            "mass": positive("kg", 1.0, _set_mass),
+            "length": positive("m", 0.5, _set_length),
             "gravity": GRAVITY,
             "damping": DAMPING,
             "gear": GEAR,
@@ -86,7 +86,7 @@ class PendulumSpin(PendulumSwingup):
     Further parameter: speed [rad/s].
     """
 
-    parameters: ClassVar = MappingProxyType({**PendulumSwingup.parameters, "speed": Parameter("rad/s", 6.0)})
+    parameters: ClassVar = MappingProxyType({**PendulumSwingup.parameters, "speed": positive("rad/s", 6.0)})
 
     def reward(self, task: Task, world: World, action: Array) -> Array:
         speed = task.goal["speed"]

@@ -14,7 +14,7 @@ from mtjax.envs.dm_control.rewards import tolerance
 from mtjax.envs.domain import Domain
 from mtjax.envs.engines.base import World
 from mtjax.envs.looks import Look
-from mtjax.envs.parameters import DAMPING, FRICTION, GRAVITY, MASS, STRENGTH, Parameter, body_mass
+from mtjax.envs.parameters import DAMPING, FRICTION, GRAVITY, MASS, STRENGTH, body_mass, positive
 from mtjax.types import Array, Key, Task
 
 _SECONDS = 20.0  # of an episode, in which the floor must not end
@@ -61,14 +61,14 @@ class QuadrupedWalk(Domain):
 
     parameters: ClassVar = MappingProxyType(
         {
-            "foot-length": Parameter("m", 0.25, _set_foot_length),
+            "foot-length": positive("m", 0.25, _set_foot_length),
             "torso-mass": body_mass("torso"),
             "mass": MASS,
             "gravity": GRAVITY,
             "friction": FRICTION,
             "damping": DAMPING,
             "strength": STRENGTH,
-            "speed": Parameter("m/s", 0.5),
+            "speed": positive("m/s", 0.5),
         }
     )
     model_file: ClassVar[str] = "quadruped.xml"
@@ -128,7 +128,7 @@ class QuadrupedWalk(Domain):
 class QuadrupedRun(QuadrupedWalk):
     """Run: QuadrupedWalk at 5 m/s."""
 
-    parameters: ClassVar = MappingProxyType({**QuadrupedWalk.parameters, "speed": Parameter("m/s", 5.0)})
+    parameters: ClassVar = MappingProxyType({**QuadrupedWalk.parameters, "speed": positive("m/s", 5.0)})
 
 
 def _pose(model: mujoco.MjModel) -> np.ndarray:

@@ -13,7 +13,7 @@ from mtjax.envs.dm_control.rewards import tolerance
 from mtjax.envs.domain import Domain, start_joints
 from mtjax.envs.engines.base import World
 from mtjax.envs.looks import Look
-from mtjax.envs.parameters import DAMPING, GEAR, MASS, Parameter
+from mtjax.envs.parameters import DAMPING, GEAR, MASS, Parameter, positive
 from mtjax.envs.pixels import Mark
 from mtjax.types import Array, Key, Task, Transition
 
@@ -50,7 +50,7 @@ class Reacher(Domain):
     asks: ClassVar[str] = "Hold the end of the arm on the target."
     parameters: ClassVar = MappingProxyType(
         {
-            "target-size": Parameter("m", 0.05, _set_target_size),
+            "target-size": positive("m", 0.05, _set_target_size),
             "mass": MASS,
             "damping": DAMPING,
             "gear": GEAR,
@@ -129,7 +129,7 @@ class ReacherTarget(Reacher):
         {
             **Reacher.parameters,
             "target-angle": Parameter("rad", 0.0, minimum=-math.inf),
-            "target-radius": Parameter("m", 0.15, maximum=0.24),
+            "target-radius": positive("m", 0.15, maximum=0.24),
         }
     )
     fresh_goals: ClassVar[bool] = False

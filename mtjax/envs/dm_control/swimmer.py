@@ -12,7 +12,7 @@ from mtjax.envs.dm_control.rewards import tolerance
 from mtjax.envs.domain import Domain, start_joints
 from mtjax.envs.engines.base import World
 from mtjax.envs.looks import Look
-from mtjax.envs.parameters import GEAR, MASS, WATER, Parameter
+from mtjax.envs.parameters import GEAR, MASS, WATER, positive
 from mtjax.envs.pixels import Mark
 from mtjax.types import Array, InputError, Key, Task
 
@@ -74,8 +74,8 @@ class Swimmer(Domain):
 
     parameters: ClassVar = MappingProxyType(
         {
-            "link-length": Parameter("m", _LINK_LENGTH, _set_link_length),
-            "target-size": Parameter("m", 0.1, _set_target_size),
+            "link-length": positive("m", _LINK_LENGTH, _set_link_length),
+            "target-size": positive("m", 0.1, _set_target_size),
             "water-density": WATER._replace(nominal=3000.0),
             "mass": MASS,
             "gear": GEAR,

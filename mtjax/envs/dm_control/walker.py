@@ -11,7 +11,7 @@ from mtjax.envs.dm_control.rewards import tolerance
 from mtjax.envs.domain import Domain, start_joints
 from mtjax.envs.engines.base import World
 from mtjax.envs.looks import Look
-from mtjax.envs.parameters import DAMPING, GEAR, GRAVITY, MASS, Parameter, body_mass
+from mtjax.envs.parameters import DAMPING, GEAR, GRAVITY, MASS, body_mass, positive
 from mtjax.types import Array, Key, Task
 
 _STAND_HEIGHT = 1.2  # [m]
@@ -56,8 +56,8 @@ class WalkerStand(Domain):
     asks: ClassVar[str] = "Make the walker stand upright."
     parameters: ClassVar = MappingProxyType(
         {
-            "friction": Parameter("1", 0.7, _set_friction),
-            "foot-length": Parameter("m", 0.1, _set_foot_length),
+            "friction": positive("1", 0.7, _set_friction),
+            "foot-length": positive("m", 0.1, _set_foot_length),
             "torso-mass": body_mass("torso"),
             "mass": MASS,
             "gravity": GRAVITY,
@@ -106,7 +106,7 @@ class WalkerWalk(WalkerStand):
     """
 
     asks: ClassVar[str] = "Make the walker walk forwards."
-    parameters: ClassVar = MappingProxyType({**WalkerStand.parameters, "speed": Parameter("m/s", 1.0)})
+    parameters: ClassVar = MappingProxyType({**WalkerStand.parameters, "speed": positive("m/s", 1.0)})
     relabels: ClassVar[tuple[str, ...]] = ("speed",)
     heading: ClassVar[float] = 1.0  # -1 backwards
 
@@ -124,7 +124,7 @@ class WalkerRun(WalkerWalk):
     """Run: WalkerWalk at 8 m/s."""
 
     asks: ClassVar[str] = "Make the walker run forwards."
-    parameters: ClassVar = MappingProxyType({**WalkerStand.parameters, "speed": Parameter("m/s", 8.0)})
+    parameters: ClassVar = MappingProxyType({**WalkerStand.parameters, "speed": positive("m/s", 8.0)})
 
 
 @dataclasses.dataclass(frozen=True)

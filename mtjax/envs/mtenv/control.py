@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mtjax.envs.family import Family
-from mtjax.envs.parameters import Parameter
+from mtjax.envs.parameters import Parameter, positive
 from mtjax.types import Array, Key, Step, Task
 
 _TRACK = 2.4  # [m] from the centre to either end
@@ -75,10 +75,10 @@ class CartPole(Family):
 
     parameters: ClassVar[Mapping[str, Parameter]] = MappingProxyType(
         {
-            "gravity": Parameter("m/s^2", 9.8),
-            "cart-mass": Parameter("kg", 1.0),
-            "pole-mass": Parameter("kg", 0.1),
-            "pole-length": Parameter("m", 0.5),
+            "gravity": positive("m/s^2", 9.8),
+            "cart-mass": positive("kg", 1.0),
+            "pole-mass": positive("kg", 0.1),
+            "pole-length": positive("m", 0.5),
             "force": Parameter("N", 10.0, minimum=-math.inf),
         }
     )
@@ -138,10 +138,10 @@ class Acrobot(Family):
 
     parameters: ClassVar[Mapping[str, Parameter]] = MappingProxyType(
         {
-            "link-length-1": Parameter("m", 1.0),
-            "link-length-2": Parameter("m", 1.0),
-            "link-mass-1": Parameter("kg", 1.0),
-            "link-mass-2": Parameter("kg", 1.0),
+            "link-length-1": positive("m", 1.0),
+            "link-length-2": positive("m", 1.0),
+            "link-mass-1": positive("kg", 1.0),
+            "link-mass-2": positive("kg", 1.0),
             "torque-sign": Parameter("1", 1.0, minimum=-math.inf),
         }
     )
