@@ -95,6 +95,11 @@ def where_worlds(mask: Array, new: Any, old: Any) -> Any:
 class Flat:
     """Provides the methods of all worlds (S, T, E, ...) for environments with ``reset`` and ``step`` of one world."""
 
+    @property
+    def ends_early(self) -> bool:
+        """Return whether episodes may end before their time limits. It decides how resets are computed, not what."""
+        return True
+
     def reset_worlds(self, tasks: Task, keys: Key) -> Step:
         """Begin an episode in every world."""
         return over_worlds(partial(_reset, self))(tasks, keys)

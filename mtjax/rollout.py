@@ -7,13 +7,16 @@ import jax
 import jax.numpy as jnp
 
 from mtjax import frames
-from mtjax.maps import over_learners, where_worlds
+from mtjax.maps import Flat, over_learners, where_worlds
 from mtjax.parallel import collectives
 from mtjax.tasks import contexts_vary, episode_task
 from mtjax.types import Acted, Agent, Array, Env, Key, Task, Transition
 
 _LARGEST = 1e10
 """Largest number in an observation: MuJoCo's own bound of positions and velocities (``mjMAXVAL``)."""
+
+_SHARES = 16
+"""The batches in which all worlds are reset, if episodes end early."""
 
 
 class Worlds(NamedTuple):
@@ -53,9 +56,14 @@ def reset_envs(env: Env, agent: Agent, learners: Any, tasks: Task, keys: Key) ->
         each = jax.vmap(jax.vmap(of_task), (None, 0))(tasks, task_keys)
     start = env.reset_worlds(each._replace(blocks=tasks.blocks), keys)
     age = jnp.zeros(keys.shape, jnp.int32)
-    memory = over_learners(lambda learner, task, _: agent.begin(learner, task))(learners, tasks, age)
     obs = frames.begin(start.obs, env.spec.frames)
+    memory = begin_memory(agent, learners, tasks, age)
     return Worlds(start.state, None if tasks.draws is None else each, obs, memory, age)
+
+
+def begin_memory(agent: Agent, learners: Any, tasks: Task, age: Array) -> Any:
+    """Return the memory with which agents begin an episode in every world, of ages (S, T, E)."""
+    return over_learners(lambda learner, task, _: agent.begin(learner, task))(learners, tasks, age)
 
 
 def tasks_of_worlds(tasks: Task, worlds: Worlds) -> Task:
@@ -135,11 +143,53 @@ def bounded_worlds(obs: Any) -> Array:
 
 
 def reset_ended(env: Env, agent: Agent, learners: Any, tasks: Task, worlds: Worlds, ended: Array, keys: Key) -> Worlds:
-    """Begin new episodes, with keys (S,), where ``ended`` (S, T, E); a branch skips this if no episode has ended."""
+    """Begin new episodes, with keys (S,), where ``ended`` (S, T, E); a branch skips this if no episode has ended.
+
+    Every episode starts in a state of its own, drawn with its world's own key. If episodes end early, at any step, only
+    ended worlds are reset: some at a time, as often as it takes. If all end by their time limits, many do at once, and
+    all worlds are reset. Both give the same states.
+    """
 
     def restart(worlds: Worlds) -> Worlds:
         fresh = reset_envs(env, agent, learners, tasks, world_keys(keys, ended.shape))
         rest = where_worlds(ended, fresh._replace(state=()), worlds._replace(state=()))
         return rest._replace(state=env.where_worlds(ended, fresh.state, worlds.state))
 
-    return jax.lax.cond(jnp.any(ended), restart, lambda worlds: worlds, worlds)
+    def restart_some(worlds: Worlds) -> Worlds:
+        age = jnp.where(ended, 0, worlds.age)
+        memory = where_worlds(ended, begin_memory(agent, learners, tasks, age), worlds.memory)
+        begun = _reset_some(env, tasks, worlds, ended, world_keys(keys, ended.shape))
+        return begun._replace(memory=memory, age=age)
+
+    some = isinstance(env, Flat) and env.ends_early and tasks.blocks is None
+    return jax.lax.cond(jnp.any(ended), restart_some if some else restart, lambda worlds: worlds, worlds)
+
+
+def _reset_some(env: Env, tasks: Task, worlds: Worlds, ended: Array, keys: Key) -> Worlds:
+    """Return the worlds with new states, tasks and observations where ``ended`` (S, T, E), from keys (S, T, E).
+
+    Worlds are reset in batches of at most one in ``_SHARES`` of all.
+    """
+    _, num_tasks, num_envs = ended.shape
+    count, size = ended.size, -(-ended.size // _SHARES)
+    flat_keys = keys.reshape(count)
+
+    def reset(carry: tuple[Array, Any]) -> tuple[Array, Any]:
+        left, old = carry
+        chosen = jnp.nonzero(left, size=size, fill_value=count)[0]  # what is beyond the last world is dropped again
+        own, own_keys = chosen // num_envs % num_tasks, flat_keys[jnp.minimum(chosen, count - 1)]
+        each = jax.tree.map(lambda x: x[own], tasks._replace(draws=None))
+        if tasks.draws is not None:
+            task_keys, own_keys = jax.vmap(jax.random.split, out_axes=1)(own_keys)
+            each = jax.vmap(lambda i, key: episode_task(jax.tree.map(lambda x: x[i], tasks), key))(own, task_keys)
+        start = env.reset_worlds(*jax.tree.map(lambda x: x[None, None], (each, own_keys)))
+        state, obs = jax.tree.map(lambda x: x[0, 0], (start.state, frames.begin(start.obs, env.spec.frames)))
+        put = lambda x, y: x.at[chosen].set(y, mode="drop")
+        new = state, None if tasks.draws is None else each, obs
+        return left.at[chosen].set(False, mode="drop"), jax.tree.map(put, old, new)
+
+    old = worlds.state, worlds.task, worlds.obs
+    flat = jax.tree.map(lambda x: x.reshape(count, *x.shape[3:]), old)
+    _, new = jax.lax.while_loop(lambda carry: jnp.any(carry[0]), reset, (ended.reshape(count), flat))
+    state, task, obs = jax.tree.map(lambda x: x.reshape(*ended.shape, *x.shape[1:]), new)
+    return worlds._replace(state=state, task=task, obs=obs)

@@ -90,6 +90,11 @@ class Stepped(Family):
         return self.observe(task, state)
 
     @property
+    def ends_early(self) -> bool:
+        """Return whether the family says where episodes end."""
+        return type(self).terminates is not Stepped.terminates
+
+    @property
     def episode_length(self) -> int:
         """Return the steps after which an episode is cut off."""
         return self.episode_steps // self.repeat
