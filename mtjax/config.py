@@ -25,9 +25,10 @@ from mtjax.checks import check_fields, require_values
 from mtjax.commands import PRESETS, is_imported, require_run
 from mtjax.envs import ENVS, is_mixture, make, members
 from mtjax.envs.tabled import Tabled
+from mtjax.evaluation import Evaluations, load_evaluations, no_evaluations, require_same_run
 from mtjax.experience import Replay
 from mtjax.loop import Settings
-from mtjax.names import nearest_error, public
+from mtjax.names import SPLITS, nearest_error, public
 from mtjax.types import InputError
 
 TUNED_TASKS = 10
@@ -309,6 +310,19 @@ def from_json(path: Path) -> RunConfig:
     except Exception as error:  # whatever an edited record makes of the classes it is read into
         text = f"{str(path)!r} does not describe a run: {type(error).__name__}: {str(error)[:150]}"
         raise InputError(text + _other_version(record) + _with_copy(path)) from None
+
+
+def evaluations_of(config: RunConfig, directory: Path) -> Evaluations:
+    """Read the evaluations of a run, given its configuration.
+
+    Raises:
+        InputError: the file is missing or damaged, or of another run.
+    """
+    file, values = directory / "evaluations.npz", {split: config.family.task_values(split) for split in SPLITS}
+    found = load_evaluations(file)
+    seeds = [*config.plan.all_seeds] * max(len(config.points), 1)
+    require_same_run(file, found, no_evaluations(seeds, values, config.plan.eval_episodes))
+    return found
 
 
 def _from_record(record: Any) -> RunConfig:

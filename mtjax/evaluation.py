@@ -36,14 +36,44 @@ class Evaluations(NamedTuple):
     returns: dict[str, np.ndarray]  # split -> (S, V, T, episodes)
     values: dict[str, np.ndarray]  # split -> (T,) value of the varying parameter
     metrics: Mapping[str, dict[str, np.ndarray]] = MappingProxyType({})  # name -> split -> (S, V, T, episodes)
+    seeds: np.ndarray | tuple[()] = ()  # (S,); unknown of runs of earlier versions
+
+
+def no_evaluations(seeds: Sequence[int] | np.ndarray, values: Mapping[str, np.ndarray], episodes: int) -> Evaluations:
+    """Return the evaluations of a run that has not begun: of seeds (S,), and of tasks by their values (T,) by split."""
+    seeds = np.asarray(seeds, np.int64)
+    returns = {split: np.zeros((len(seeds), 0, len(x), episodes), np.float32) for split, x in values.items()}
+    return Evaluations(np.zeros(0, np.int64), returns, dict(values), seeds=seeds)
+
+
+def require_same_run(path: Path, found: Evaluations, expected: Evaluations) -> None:
+    """Check that evaluations of a file are of the seeds, tasks and episodes of a run.
+
+    Raises:
+        InputError: they are not. The message says what differs.
+    """
+    (seeds, episodes), (own_seeds, own_episodes) = (each.returns["train"].shape[::3] for each in (found, expected))
+    same = lambda x, y: x.shape == y.shape and np.allclose(x, y, rtol=1e-5)
+    differences = {
+        f"{seeds} seeds, not {own_seeds}": seeds != own_seeds,
+        "other seeds": len(found.seeds) > 0 and not np.array_equal(found.seeds, expected.seeds),
+        f"{episodes} episodes of a task, not {own_episodes}": episodes != own_episodes,
+        **{f"other {split} tasks": not same(found.values[split], expected.values[split]) for split in SPLITS},
+    }
+    difference = next((text for text, differs in differences.items() if differs), "")
+    if difference:
+        raise InputError(f"{str(path)!r} is of another run than config.json beside it: it has {difference}")
 
 
 def save_evaluations(path: Path, evaluations: Evaluations) -> None:
-    """Write every episode: ``steps`` (V,), and for each split returns, metrics (S, V, T, episodes) and values (T,)."""
+    """Write every episode: for each split returns and metrics (S, V, T, episodes) and values (T,).
+
+    Beside them are ``steps`` (V,) and ``seeds`` (S,).
+    """
     values = {f"{split}_values": x for split, x in evaluations.values.items()}
     metrics = {f"{split}_{name}": x for name, splits in evaluations.metrics.items() for split, x in splits.items()}
     with replacing(path) as new, new.open("wb") as file:
-        np.savez(file, steps=evaluations.steps, **evaluations.returns, **values, **metrics)  # type: ignore
+        np.savez(file, steps=evaluations.steps, seeds=evaluations.seeds, **evaluations.returns, **values, **metrics)  # type: ignore
 
 
 def load_evaluations(path: str | Path) -> Evaluations:
@@ -61,6 +91,7 @@ def load_evaluations(path: str | Path) -> Evaluations:
                 {split: file[split] for split in SPLITS},
                 {split: file[f"{split}_values"] for split in SPLITS},
                 {name: {split: file[f"{split}_{name}"] for split in SPLITS} for name in sorted(named)},
+                file["seeds"] if "seeds" in file else (),
             )
     except FileNotFoundError:
         raise InputError(f"there is no file {str(path)!r}") from None

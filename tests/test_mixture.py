@@ -689,3 +689,17 @@ def test_agents_learn_a_mixture_of_pictures(monkeypatch, name, settings):
     _, history = probes.train(env, agent, {"num_envs": 4, "chunk_steps": 100, **given}, chunks=5)
     first, last = (np.mean(x["return"]) for x in (history[0], history[-1]))
     assert last > first / 2, (first, last)
+
+
+@pytest.mark.parametrize(
+    "name", ["bandit", "tabular-mdp", "point-mass-vary-goal", "cartpole-swingup-vary-pole-mass", "bandit+tabular-mdp"]
+)
+def test_tasks_are_numbered_without_building_them(name):
+    """Through the splits, in families and in mixtures; a single parameter tells its values."""
+    env = make(name)
+    for split in SPLITS:
+        tasks, values = env.tasks(split), env.task_values(split)
+        told = tasks.params[env.varied[0]] if isinstance(env, Family) and len(env.varied) == 1 else tasks.id
+        np.testing.assert_array_equal(env.numbers(split), tasks.id)
+        np.testing.assert_array_equal(values, told)
+        assert values.dtype == told.dtype and env.counts[split] == len(tasks.id)

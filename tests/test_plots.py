@@ -24,7 +24,7 @@ def make_run(tmp_path):
 
     def make_run(name, env, agent, seed=0, seeds=3, shift=0.0, **given):
         config = mtjax.preset(env, agent)
-        plan = dataclasses.replace(config.plan, seed=seed, seeds=seeds)
+        plan = dataclasses.replace(config.plan, seed=seed, seeds=seeds, eval_episodes=2)
         learner = mtjax.agents.choices.replace(config.learner, given)
         config = dataclasses.replace(config, plan=plan, learner=learner)
         folder = tmp_path / "runs" / name

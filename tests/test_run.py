@@ -28,10 +28,11 @@ from conftest import SHORT_RUN
 import mtjax
 import mtjax.train
 from mtjax import cli, commands, loop
-from mtjax.config import Plan, from_json
+from mtjax.config import Plan, evaluations_of, from_json
 from mtjax.evaluation import load_evaluations, save_evaluations
 from mtjax.loop import Settings
 from mtjax.names import Notice
+from mtjax.report import collect
 from mtjax.training import checkpoint, log, run, traced
 from mtjax.training.console import Clock
 from mtjax.training.folder import new_directory
@@ -464,13 +465,46 @@ def test_damaged_metrics_do_not_stop_a_resumed_run(play, whole, tmp_path):
     assert rows_of(tmp_path) == rows[:2] + rows[3:]
 
 
-def test_evaluations_of_another_run_are_refused(play, whole, tmp_path):
-    """As they would be joined with this run's."""
+def another_file(folder, **changed):
+    """Change arrays of a run's evaluations; a function of the old one gives the new one."""
+    with np.load(folder / "evaluations.npz") as file:
+        arrays = {name: changed.get(name, lambda x: x)(file[name]) for name in file}
+    np.savez(folder / "evaluations.npz", **arrays)
+
+
+OTHER_RUNS = [
+    (dict.fromkeys([*SPLITS, "seeds"], lambda x: x[:1]), "it has 1 seeds, not 2"),
+    ({"seeds": lambda x: x + 1}, "it has other seeds"),
+    (dict.fromkeys(SPLITS, lambda x: x.repeat(2, -1)), "it has 2 episodes of a task, not 1"),
+    ({"interpolation_values": lambda x: x + 0.001}, "it has other interpolation tasks"),
+    ({name: lambda x: np.repeat(x, 2, x.ndim // 2) for name in ("train", "train_values")}, "it has other train tasks"),
+]
+
+
+@pytest.mark.parametrize(("changed", "said"), OTHER_RUNS)
+def test_evaluations_of_another_run_are_refused(finished_run, copied_run, changed, said):
+    """As they would be joined with this run's, and drawn under its name."""
+    another_file(copied_run, **changed)
+    config = from_json(finished_run / "config.json")
+    evaluations_of(config, finished_run)
+    with pytest.raises(InputError, match=f"is of another run than config.json beside it: {said}$"):
+        evaluations_of(config, copied_run)
+    with pytest.raises(InputError, match=said):
+        collect.read(copied_run)
+
+
+def test_evaluations_of_another_run_are_not_gone_on_with(play, whole, tmp_path):
     shutil.copytree(whole.directory, tmp_path, dirs_exist_ok=True)
-    with np.load(whole.directory / "evaluations.npz") as file:
-        np.savez(tmp_path / "evaluations.npz", **{k: x[:1] if x.ndim == 4 else x for k, x in file.items()})
-    with pytest.raises(InputError, match="of other tasks, seeds or episodes; move it away"):
+    another_file(tmp_path, seeds=lambda x: x + 1)
+    with pytest.raises(InputError, match="it has other seeds; move it away to go on"):
         play(tmp_path, resume=True)
+
+
+def test_evaluations_without_their_seeds_are_those_of_earlier_versions(finished_run, copied_run):
+    another_file(copied_run, seeds=lambda x: x[:0])
+    config = from_json(finished_run / "config.json")
+    old, new = evaluations_of(config, copied_run), evaluations_of(config, finished_run)
+    assert_same_evaluations(old._replace(seeds=np.arange(2)), new)
 
 
 def test_evaluations_after_the_checkpoint_are_dropped(play, whole, tmp_path):

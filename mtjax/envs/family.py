@@ -128,9 +128,9 @@ class Family(Flat, Tabled):
         return dict(zip(found.names, np.concatenate(parts).T, strict=True))
 
     @property
-    def train_count(self) -> int:
-        """Return the number of training tasks."""
-        return len(self.variation.rows["train"])
+    def counts(self) -> dict[str, int]:
+        """Return the number of tasks of each split."""
+        return {split: len(rows) for split, rows in self.variation.rows.items()}
 
     @cached_property
     def count(self) -> int:
@@ -199,9 +199,11 @@ class Family(Flat, Tabled):
         return self.variation.varied
 
     def task_values(self, split: str) -> np.ndarray:
-        """Return the values (T,) that tell the tasks of a split apart: the only varied parameter, or task numbers."""
-        tasks = self.tasks(split)
-        return np.asarray(tasks.params[self.varied[0]] if len(self.varied) == 1 else tasks.id)
+        """Return the values (T,) that tell the tasks of a split apart: the only varied parameter, or task numbers.
+
+        No task is built for them.
+        """
+        return np.float32(self.variation.rows[split][:, 0]) if len(self.varied) == 1 else self.numbers(split)
 
     @property
     def task_axis(self) -> tuple[str, str]:

@@ -119,9 +119,9 @@ class Mixture(Tabled):
     # Tasks.
 
     @property
-    def train_count(self) -> int:
-        """Return the number of training tasks."""
-        return sum(family.train_count for family in self.families)
+    def counts(self) -> dict[str, int]:
+        """Return the number of tasks of each split."""
+        return {split: sum(family.counts[split] for family in self.families) for split in SPLITS}
 
     @cached_property
     def table(self) -> Table:
@@ -381,7 +381,7 @@ class Mixture(Tabled):
 
     def task_values(self, split: str) -> np.ndarray:
         """Return the numbers (T,) of a split's tasks."""
-        return np.asarray(self.tasks(split).id)
+        return self.numbers(split)
 
     @property
     def task_axis(self) -> tuple[str, str]:

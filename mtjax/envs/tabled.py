@@ -39,8 +39,18 @@ class Tabled(abc.ABC):
 
     @property
     @abc.abstractmethod
+    def counts(self) -> dict[str, int]:
+        """Return the number of tasks of each split."""
+
+    @property
     def train_count(self) -> int:
         """Return the number of training tasks."""
+        return self.counts["train"]
+
+    def numbers(self, split: str) -> np.ndarray:
+        """Return the numbers (T,) of a split's tasks, which are counted through the splits."""
+        first = sum(self.counts[before] for before in SPLITS[: SPLITS.index(split)])
+        return np.arange(first, first + self.counts[split], dtype=np.int32)
 
     @property
     @abc.abstractmethod

@@ -11,9 +11,9 @@ import numpy as np
 
 from mtjax.agents import name_of, settings
 from mtjax.checks import path
-from mtjax.config import RunConfig, from_json
+from mtjax.config import RunConfig, evaluations_of, from_json
 from mtjax.envs import name_of as env_name_of
-from mtjax.evaluation import Evaluations, load_evaluations
+from mtjax.evaluation import Evaluations
 from mtjax.names import InputError, nearest_error
 
 _WORDS = {"success": "success at the end", "success_ever": "success at any step"}
@@ -74,7 +74,7 @@ def _read(directory: Path) -> Found:
     config = from_json(directory / "config.json")
     named = (word.removeprefix("agent.").partition("=")[::2] for word in config.sweep)
     outside = {name: values for name, values in named if name.replace("-", "_") not in _swept(config)}
-    return Found(directory, config, load_evaluations(directory / "evaluations.npz"), outside)
+    return Found(directory, config, evaluations_of(config, directory), outside)
 
 
 def _swept(config: RunConfig) -> set[str]:
@@ -167,7 +167,7 @@ def _rows(evaluations: Evaluations, seeds: slice) -> Evaluations:
     """Return the evaluations of some entries of S."""
     of = lambda scores: {split: x[seeds] for split, x in scores.items()}
     metrics = {name: of(scores) for name, scores in evaluations.metrics.items()}
-    return evaluations._replace(returns=of(evaluations.returns), metrics=metrics)
+    return evaluations._replace(returns=of(evaluations.returns), metrics=metrics, seeds=evaluations.seeds[seeds])
 
 
 def of_metric(runs: Any, metric: str) -> list[Learned]:

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from mtjax.evaluation import Evaluations, load_evaluations, save_evaluations
+from mtjax.evaluation import Evaluations, load_evaluations, require_same_run, save_evaluations
 from mtjax.loop import TrainState
 from mtjax.names import notice
 from mtjax.parallel import hosts
@@ -74,15 +74,14 @@ class Records:
                 file.replace(aside)
             notice(f"{error}; the run goes on without its earlier evaluations, and the file is kept as {aside.name!r}")
             return empty
-        shape = lambda each: {split: (x.shape[0], *x.shape[2:]) for split, x in each.returns.items()}
-        if shape(past) != shape(empty):
-            raise InputError(
-                f"{str(file)!r} holds evaluations of other tasks, seeds or episodes; move it away to go on"
-            )
+        try:
+            require_same_run(file, past, empty)
+        except InputError as error:
+            raise InputError(f"{error}; move it away to go on") from None
         kept = past.steps <= steps
         upto = lambda splits: {split: x[:, kept] for split, x in splits.items()}
         metrics = {name: upto(splits) for name, splits in past.metrics.items()}
-        return Evaluations(past.steps[kept], upto(past.returns), past.values, metrics)
+        return empty._replace(steps=past.steps[kept], returns=upto(past.returns), metrics=metrics)
 
     def add_rows(self, rows: list[dict[str, Any]]) -> None:
         """Append rows to metrics.csv."""

@@ -16,7 +16,7 @@ from jax.sharding import Mesh
 
 from mtjax.agents import settings as settings_of
 from mtjax.config import Plan, configure, require_value_range
-from mtjax.evaluation import Evaluations
+from mtjax.evaluation import Evaluations, no_evaluations
 from mtjax.loop import Settings, TrainState
 from mtjax.parallel import hosts
 from mtjax.parallel import mesh as meshes
@@ -454,7 +454,7 @@ class _Run:
         none = {split: np.zeros((len(diverged), 0, *x.shape[2:]), np.float32) for split, x in past.returns.items()}
         metrics = {name: append(past.metrics.get(name, none), x) for name, x in scores.metrics.items()}
         returns = append(past.returns, scores.returns)
-        evaluations = Evaluations(np.append(past.steps, now.steps), returns, past.values, metrics)
+        evaluations = past._replace(steps=np.append(past.steps, now.steps), returns=returns, metrics=metrics)
         self.records.save_evaluations(evaluations)
         if not diverged.all():
             last = lambda scores: {split: x[~diverged, -1] for split, x in scores.items()}
@@ -475,10 +475,5 @@ class _Run:
 
     def _no_evaluations(self) -> Evaluations:
         """Return the evaluations of a run that has not begun."""
-        tables = {split: self.env.tasks(split) for split in SPLITS}
-        empty = lambda table: np.zeros((len(self.seeds), 0, len(table.id), self.plan.eval_episodes), np.float32)
-        return Evaluations(
-            steps=np.zeros(0, np.int64),
-            returns={split: empty(table) for split, table in tables.items()},
-            values={split: self.env.task_values(split) for split in SPLITS},
-        )
+        values = {split: self.env.task_values(split) for split in SPLITS}
+        return no_evaluations(self.seeds, values, self.plan.eval_episodes)

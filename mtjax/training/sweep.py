@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mtjax.agents import AGENTS, PARTS
-from mtjax.config import RunConfig, from_json, import_flags
-from mtjax.evaluation import Evaluations, load_evaluations
+from mtjax.config import RunConfig, evaluations_of, from_json, import_flags
+from mtjax.evaluation import Evaluations
 from mtjax.report import figures
 from mtjax.report.stats import seed_interval
 from mtjax.training import checkpoint, lock, memory, points
@@ -242,7 +242,7 @@ def _write_table(folder: Path, runs: Sequence[Path]) -> None:
 
 def _draw(config: RunConfig, run: Path) -> None:
     """Draw training return over steps, one line per setting. Settings with a diverged seed are left out."""
-    evaluations, count = load_evaluations(run / "evaluations.npz"), config.plan.seeds
+    evaluations, count = evaluations_of(config, run), config.plan.seeds
     curves = {}
     for p, point in enumerate(config.points or ({},)):
         returns = evaluations.returns["train"][p * count : (p + 1) * count]
@@ -255,14 +255,17 @@ def _draw(config: RunConfig, run: Path) -> None:
 
 def final_evaluations(config: RunConfig, run: Path) -> Evaluations | None:
     """Return the evaluations of a finished run; None if it is not finished."""
-    found = _latest_evaluations(run)
+    found = _latest_evaluations(config, run)
     return found if found and found.steps[-1] >= config.plan.steps else None
 
 
-def _latest_evaluations(run: Path) -> Evaluations | None:
-    """Return the evaluations of a run; None if it has none yet, or a damaged file, which the resumed run replaces."""
+def _latest_evaluations(config: RunConfig, run: Path) -> Evaluations | None:
+    """Return the evaluations of a run; None if it has none yet, or a damaged file, which the resumed run replaces.
+
+    A file of another run is none either; the resumed run refuses it.
+    """
     try:
-        found = load_evaluations(run / "evaluations.npz")
+        found = evaluations_of(config, run)
     except InputError:
         return None
     return found if len(found.steps) else None
@@ -276,7 +279,7 @@ def rows(runs: Sequence[Path]) -> list[dict[str, Any]]:
     found: dict[tuple, list[_Part]] = {}
     for run in runs:
         config = from_json(run / "config.json")
-        evaluations, count = _latest_evaluations(run), config.plan.seeds
+        evaluations, count = _latest_evaluations(config, run), config.plan.seeds
         for p, point in enumerate(config.points or ({},)):
             mine = slice(p * count, (p + 1) * count)
             returns = evaluations and {split: x[mine, -1] for split, x in evaluations.returns.items() if x.size}

@@ -57,9 +57,10 @@ class DrawnTasks(Family):
         return Task(**leaves, params={}, model={})
 
     @property
-    def train_count(self) -> int:
-        """Return the number of training tasks."""
-        return self.num_tasks
+    def counts(self) -> dict[str, int]:
+        """Return the number of tasks of each split."""
+        held_out = min(self.num_tasks, _MOST_HELD_OUT) if self.split == "dense" else 0
+        return dict(zip(SPLITS, (self.num_tasks, held_out, 0), strict=True))
 
     @cached_property
     def count(self) -> int:
@@ -69,8 +70,7 @@ class DrawnTasks(Family):
     @cached_property
     def table(self) -> Table:
         """Return all tasks of all splits."""
-        held_out = min(self.num_tasks, _MOST_HELD_OUT) if self.split == "dense" else 0
-        counts = dict(zip(SPLITS, (self.num_tasks, held_out, 0), strict=True))
+        counts = self.counts
         seeds = [(self.task_seed, kind, i) for kind, count in enumerate(counts.values()) for i in range(count)]
         tasks = [self._host_task(self.draw(np.random.default_rng(seed)), row) for row, seed in enumerate(seeds)]
         ends = np.cumsum(list(counts.values()))
