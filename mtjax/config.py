@@ -297,10 +297,9 @@ def from_json(path: Path) -> RunConfig:
     """
     require_run(path.parent)
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        text = f"{str(path)!r} does not describe a run: {type(error).__name__}: {error}"
-        raise InputError(text + _with_copy(path)) from None
+        record = read_record(path)
+    except InputError as error:
+        raise InputError(f"{error}{_with_copy(path)}") from None
     try:
         return _from_record(record)
     except InputError as error:
@@ -323,6 +322,21 @@ def evaluations_of(config: RunConfig, directory: Path) -> Evaluations:
     seeds = [*config.plan.all_seeds] * max(len(config.points), 1)
     require_same_run(file, found, no_evaluations(seeds, values, config.plan.eval_episodes))
     return found
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """Read what a config.json holds, whose entry "plan" holds entries too; the others may be anything.
+
+    Raises:
+        InputError: it cannot be read, or is not of this form.
+    """
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{str(path)!r} does not describe a run: {type(error).__name__}: {error}") from None
+    if not isinstance(record, dict) or not isinstance(record.get("plan"), dict):
+        raise InputError(f"{str(path)!r} does not describe a run: it has no entry called plan")
+    return record
 
 
 def _from_record(record: Any) -> RunConfig:

@@ -1,6 +1,7 @@
 """Checkpoints: they hold everything, two are kept, and what is damaged is said in a line."""
 
 import gc
+import hashlib
 import os
 import resource
 import shutil
@@ -253,6 +254,22 @@ def test_what_changed_in_a_record_is_told(copied_run):
         sums.write_text("".join(x for x in sums.read_text().splitlines(True) if not x.endswith("  config.json\n")))
         copy.unlink()
     mtjax.load(copied_run)
+
+
+@pytest.mark.parametrize("content", ["[]", '"x"', "{}", '{"plan": 3}', "[" * 100_000, "1" * 5000, "\udcff", ""])
+def test_a_copy_of_a_record_that_is_none_is_told(copied_run, shapes, content):
+    """In a line; whatever its checksum says, it only tells of edits."""
+    folder = copied_run / "checkpoints" / "150"
+    content = content.encode(errors="surrogateescape")
+    (folder / "config.json").write_bytes(content)
+    sums = (folder / "checksums.txt").read_text().splitlines()
+    sums = [f"{hashlib.sha256(content).hexdigest()}  config.json" if x.endswith(" config.json") else x for x in sums]
+    (folder / "checksums.txt").write_text("\n".join(sums) + "\n")
+    with pytest.warns(Notice, match=r"150/config.json' does not describe a run: .* it is used as it is$"):
+        assert int(checkpoint.load(copied_run / "checkpoints", shapes).iteration) == 150
+    (copied_run / "config.json").write_bytes(content)
+    with pytest.raises(InputError, match=r"config\.json' does not describe a run"):
+        record_steps(copied_run / "config.json", 3)
 
 
 def test_a_record_that_changes_during_a_run_is_told(state, tmp_path):

@@ -203,7 +203,8 @@ class Family(Flat, Tabled):
 
         No task is built for them.
         """
-        return np.float32(self.variation.rows[split][:, 0]) if len(self.varied) == 1 else self.numbers(split)
+        rows = self.variation.rows[split]
+        return rows[:, 0].astype(np.float32) if len(self.varied) == 1 else self.numbers(split)
 
     @property
     def task_axis(self) -> tuple[str, str]:

@@ -18,7 +18,7 @@ import jax
 from mtjax import __version__
 from mtjax.agents import settings
 from mtjax.agents.choices import flag_names
-from mtjax.config import RunConfig, from_json, import_flags, to_json
+from mtjax.config import RunConfig, from_json, import_flags, read_record, to_json
 from mtjax.envs.family import Family
 from mtjax.envs.mixtures import Mixture
 from mtjax.envs.tabled import Tabled
@@ -92,7 +92,7 @@ def write_config(directory: Path, config: RunConfig) -> None:
 
 def record_steps(file: Path, steps: int) -> None:
     """Write the new number of steps into config.json, so that the next resume uses it too."""
-    record = json.loads(file.read_text())
+    record = read_record(file)
     if record["plan"].get("steps") != steps:  # an edited record may lack it
         with replacing(file) as new:
             new.write_text(json.dumps(_with_steps(record, steps), indent=2) + "\n")
@@ -114,7 +114,10 @@ def tell_edits(file: Path, copy: Path) -> None:
     """
     if not copy.is_file() or not file.is_file():
         return
-    now, then = (json.loads(each.read_text(encoding="utf-8")) for each in (file, copy))
+    try:
+        now, then = read_record(file), read_record(copy)
+    except InputError as error:
+        return notice(f"{error}. So it is unknown whether {str(file)!r} was edited; it is used as it is")
     longer = _with_steps(then, now["plan"].get("steps"))
     values, before = _entries(now), _entries(longer if longer.get("command") == now.get("command") else then)
     names = [name for name in {**before, **values} if values.get(name) != before.get(name)]

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mtjax import commands, shipped
-from mtjax.config import RunConfig
+from mtjax.config import RunConfig, read_record
 from mtjax.names import InputError
 from mtjax.training.policy import Policy, load
 from mtjax.training.steps import steps_of
@@ -27,7 +27,7 @@ def write(run: str | Path, directory: Path) -> None:
         InputError: the folder exists, or the run holds several settings of a sweep.
     """
     policy = load(run)
-    record = json.loads((Path(run) / _SETTINGS).read_text(encoding="utf-8"))
+    record = read_record(Path(run) / _SETTINGS)
     if record.get("points"):
         raise InputError(f"{str(run)!r} holds several settings of a sweep; ship a run of one")
     record["plan"]["seeds"], record["runs"] = 1, RunConfig.runs
