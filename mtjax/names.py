@@ -62,6 +62,7 @@ def replacing(path: Path) -> Iterator[Path]:
     new = path.with_name(f"{path.name}.new")
     try:
         with naming(path):
+            new.unlink(missing_ok=True)  # it may be a link
             yield new
             os.replace(new, path)
     finally:

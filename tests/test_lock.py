@@ -3,6 +3,7 @@
 import errno
 import fcntl
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -12,7 +13,7 @@ import pytest
 
 import mtjax
 from mtjax import commands
-from mtjax.names import Notice
+from mtjax.names import Notice, replacing
 from mtjax.train import main
 from mtjax.training import lock
 from mtjax.types import InputError
@@ -96,3 +97,43 @@ def test_a_sweep_in_use_is_not_resumed(tmp_path, finished_run):
     (tmp_path / "run-1").symlink_to(finished_run)
     with lock.hold(tmp_path), pytest.raises(InputError, match="is in use"):
         main([f"--resume={tmp_path}"])
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("lock", "config.json", "config.json.new", "metrics.csv", "metrics.damaged.csv", "evaluations.npz.new"),
+        *("curve.png", "checkpoints", "checkpoints/200.new", "store/9.npz", "tensorboard", "sweep.csv", "run-1"),
+    ],
+)
+@pytest.mark.parametrize("target", ["file", "nothing"])
+def test_nothing_is_written_through_a_link(tmp_path, name, target):
+    """A folder from elsewhere could name any file of the user."""
+    (tmp_path / "file").write_text("mine")
+    link = tmp_path / "run" / name
+    link.parent.mkdir(parents=True)
+    link.symlink_to(tmp_path / target)
+    with pytest.raises(InputError, match=re.escape(f"{str(link)!r} is a link")), lock.hold(tmp_path / "run"):
+        pass
+    assert (tmp_path / "file").read_text() == "mine" and not (tmp_path / "nothing").exists()
+
+
+def test_other_links_are_left_alone(tmp_path):
+    """A run's folder may be one, and users put their own beside its files."""
+    (tmp_path / "run" / "wandb").mkdir(parents=True)
+    (tmp_path / "run" / "wandb" / "latest-run").symlink_to(tmp_path)
+    (tmp_path / "run" / "notes").symlink_to(tmp_path)
+    (tmp_path / "latest").symlink_to(tmp_path / "run")
+    with lock.hold(tmp_path / "latest"):
+        assert (tmp_path / "run" / "lock").exists()
+
+
+def test_a_file_is_not_replaced_through_a_link(tmp_path):
+    """Neither one at its place nor one where it is written first."""
+    (tmp_path / "mine").write_text("mine")
+    for name in ("a", "a.new"):
+        (tmp_path / name).symlink_to(tmp_path / "mine")
+    with replacing(tmp_path / "a") as new:
+        new.write_text("new")
+    assert (tmp_path / "a").read_text() == "new" and (tmp_path / "mine").read_text() == "mine"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "mine"]

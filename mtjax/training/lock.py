@@ -4,6 +4,7 @@ import contextlib
 import fcntl
 import os
 import platform
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +12,10 @@ from mtjax.names import notice
 from mtjax.types import InputError
 
 _NAME = "lock"
+_FOLDERS = ("checkpoints", "store", "tensorboard")
+_WRITTEN = re.compile(  # the files and folders of runs and sweeps, also half-written and damaged ones
+    rf"({_NAME}|config|metrics|evaluations|curve|profile|wandb|sweep|diverged|run-\d+|{'|'.join(_FOLDERS)})(\..*)?"
+)
 
 
 @contextlib.contextmanager
@@ -22,8 +27,9 @@ def hold(directory: Path) -> Iterator[Path]:
     Others refuse locks; then a notice says that nothing keeps two processes apart.
 
     Raises:
-        InputError: another process holds the lock.
+        InputError: another process holds the lock, or a file that a run writes is a link.
     """
+    _require_no_links(directory)
     path = directory / _NAME
     while True:
         file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
@@ -41,6 +47,15 @@ def hold(directory: Path) -> Iterator[Path]:
     finally:
         path.unlink(missing_ok=True)
         os.close(file)
+
+
+def _require_no_links(directory: Path) -> None:
+    """Refuse links in the place of what a run writes: a folder from elsewhere could have it write anywhere."""
+    inside = [path for name in _FOLDERS for path in (directory / name).glob("*")]
+    links = [path for path in directory.glob("*") if _WRITTEN.fullmatch(path.name)] + inside
+    link = next((path for path in sorted(links) if path.is_symlink()), None)
+    if link is not None:
+        raise InputError(f"{str(link)!r} is a link, through which a run writes nothing; put what it points to there")
 
 
 def _lock(file: int, directory: Path) -> bool:
