@@ -92,9 +92,9 @@ def test_a_run_in_use_is_not_resumed(copied_run, capsys, monkeypatch, words):
     assert f"process {os.getpid()}" in said.err
 
 
-def test_a_sweep_in_use_is_not_resumed(tmp_path, finished_run):
+def test_a_sweep_in_use_is_not_resumed(tmp_path, copied_run):
     """Nor one whose runs are each free."""
-    (tmp_path / "run-1").symlink_to(finished_run)
+    copied_run.rename(tmp_path / "run-1")
     with lock.hold(tmp_path), pytest.raises(InputError, match="is in use"):
         main([f"--resume={tmp_path}"])
 
