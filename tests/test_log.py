@@ -77,6 +77,52 @@ def test_what_can_be_read_of_a_damaged_file_is_kept(tmp_path, content, left):
     assert len(rows) == left + 1 and rows[-1] == row
 
 
+TWO_SEEDS = [LINES[0], *(f"{seed},{i}0,{i}.5,9,3" for i in range(1, 6) for seed in (0, 1))]
+
+
+@pytest.mark.parametrize(
+    ("lost", "said"),
+    [
+        ([], None),
+        ([4], "lacks rows of the run: 7 up to step 40 are left"),  # of one seed
+        ([3, 4], "lacks rows of the run: 6 up to step 40 are left"),  # of both
+        ([1, 2], "lacks rows of the run: 6 up to step 40 are left"),
+        ([5, 6], "lacks rows of the run: 6 up to step 40 are left"),
+        ([7, 8], "is damaged: 6 rows up to step 30 are left"),
+        ([10], None),  # after the checkpoint, as of a run that was killed
+    ],
+)
+def test_rows_that_are_gone_are_told(tmp_path, lost, said):
+    """Of one seed or of all, at either end and in the middle; chunks may be shorter at first."""
+    path = tmp_path / "metrics.csv"
+    path.write_text("".join(f"{line}\n" for k, line in enumerate(TWO_SEEDS) if k not in lost))
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        log.truncate_rows(path, 40, LINES[0].split(","), 2, 10)
+    assert [str(each.message).split("metrics.csv' ")[1].split(";")[0] for each in told] == ([said] if said else [])
+
+
+@pytest.mark.parametrize(("rows", "told"), [(8, True), (10, False)])
+def test_a_line_without_its_end_is_told_if_it_is_of_the_checkpoint(tmp_path, rows, told):
+    """A kill tears the last line; the file is kept if that cost a row that will not be written again."""
+    path = tmp_path / "metrics.csv"
+    path.write_text("\n".join(TWO_SEEDS[: rows + 1])[:-1])
+    with warnings.catch_warnings(record=True) as notices:
+        warnings.simplefilter("always")
+        log.truncate_rows(path, 40, LINES[0].split(","), 2, 10)
+    assert len(read(path)) == (7 if told else 8)
+    assert ["is damaged: 7 rows" in str(each.message) for each in notices] == [True] * told
+    assert (tmp_path / "metrics.damaged.csv").exists() == told
+
+
+def test_chunks_of_a_run_that_was_extended_may_be_shorter(tmp_path):
+    path = tmp_path / "metrics.csv"
+    path.write_text("".join(f"{line}\n" for line in [LINES[0], "0,5,1.5,9,3", "0,15,1.5,9,3", "0,25,1.5,9,3"]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        log.truncate_rows(path, 25, LINES[0].split(","), 1, 10)
+
+
 WHOLE = "".join(f"{line}\r\n" for line in LINES).encode()
 
 

@@ -1,9 +1,11 @@
 """Metrics of a run as rows of a CSV file."""
 
 import csv
+import itertools
 import json
 import re
 import shutil
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -58,14 +60,18 @@ def _columns(path: Path) -> list[str]:
         return next(csv.reader(file))
 
 
-def truncate_rows(path: Path, iteration: int, columns: Sequence[str] = ()) -> tuple[float, float]:
+def truncate_rows(
+    path: Path, iteration: int, columns: Sequence[str] = (), each: int = 0, longest: int = 0
+) -> tuple[float, float]:
     """Drop the rows of metrics after an iteration, because a resumed run writes them again.
 
     Every line is read by itself. If some cannot be read, the file is kept beside the rows that can, and a notice says
-    so. A digit that has changed is not noticed.
+    so. Another tells of rows that are gone without a trace. A digit that has changed is not noticed.
 
     Args:
         columns: the columns that the run writes. They take the place of a damaged first line.
+        each: how many rows every chunk has, and
+        longest: its iterations at most; 0 if that is unknown.
 
     Returns:
         the seconds of training up to that iteration, and those of the wall clock.
@@ -74,16 +80,21 @@ def truncate_rows(path: Path, iteration: int, columns: Sequence[str] = ()) -> tu
         if iteration:
             notice(f"{str(path)!r} is missing; the run goes on without its earlier rows")
         return 0.0, 0.0
-    first, *lines = map(_values, path.read_bytes().decode("utf-8", "replace").split("\n")[:-1] or [""])
+    *whole, torn = path.read_bytes().decode("utf-8", "replace").split("\n")
+    first, *lines = map(_values, whole or [""])
     names = list(columns) if columns and any(len(line) == len(columns) for line in lines) else first
     rows = [dict(zip(names, line, strict=True)) for line in lines if _is_whole(names, line)]
     kept = [row for row in rows if int(row["iteration"]) <= iteration]
     order = [int(row["iteration"]) for row in rows]
     last = max((int(row["iteration"]) for row in kept), default=0)
-    if iteration and (names != first or len(rows) < len(lines) or order != sorted(order) or last < iteration):
+    complete = last >= iteration and _is_complete([int(row["iteration"]) for row in kept], each, longest)
+    spoiled = names != first or len(rows) < len(lines) or order != sorted(order) or last < iteration
+    if iteration and (spoiled or (torn and not complete)):
         aside = path.with_suffix(".damaged.csv")
         shutil.copyfile(path, aside)
         notice(f"{str(path)!r} is damaged: {len(kept)} rows up to step {last} are left; it is kept as {aside.name!r}")
+    elif iteration and not complete:
+        notice(f"{str(path)!r} lacks rows of the run: {len(kept)} up to step {last} are left")
     with replacing(path) as new, new.open("w", newline="") as file:
         if kept:
             writer = csv.DictWriter(file, fieldnames=names)
@@ -91,6 +102,13 @@ def truncate_rows(path: Path, iteration: int, columns: Sequence[str] = ()) -> tu
             writer.writerows(kept)
     seconds, wall = (max((float(row[name]) for row in kept), default=0.0) for name in _CLOCKS)
     return seconds, wall
+
+
+def _is_complete(iterations: Sequence[int], each: int, longest: int) -> bool:
+    """Return whether no row is missing between others: every chunk has as many, and none is longer than it may be."""
+    counts = Counter(iterations)
+    long = longest and any(b - a > longest for a, b in itertools.pairwise([0, *sorted(counts)]))
+    return not long and (not each or set(counts.values()) <= {each})
 
 
 def _values(line: str) -> list[str]:

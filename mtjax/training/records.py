@@ -1,7 +1,7 @@
 """The files of a run: metrics, evaluations and checkpoints, as it writes them and as a resumed run finds them."""
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -45,9 +45,13 @@ class Records:
             checkpoint.set_aside(self.checkpoints, int(state.iteration))
         return state
 
-    def earlier_seconds(self, iteration: int, columns: Sequence[str]) -> tuple[float, float]:
-        """Return the seconds of training and of the wall clock up to an iteration, and drop the lines after it."""
-        return log.truncate_rows(self._path("metrics.csv"), iteration, columns) if self.writes else (0.0, 0.0)
+    def earlier_seconds(self, iteration: int, *form: Any) -> tuple[float, float]:
+        """Return the seconds of training and of the wall clock up to an iteration, and drop the lines after it.
+
+        Args:
+            form: what ``log.truncate_rows`` is told of the lines.
+        """
+        return log.truncate_rows(self._path("metrics.csv"), iteration, *form) if self.writes else (0.0, 0.0)
 
     def earlier_evaluations(self, steps: int, due: bool, empty: Evaluations) -> Evaluations:
         """Return the evaluations up to a step.

@@ -91,6 +91,7 @@ def train(
         raise InputError("profile, tensorboard and wandb write into the run's folder; give directory as well")
     require_libraries(tensorboard, wandb)
     started, num_tasks = time.monotonic(), len(env.tasks("train").id)
+    longest = fit_chunk(settings, 1, settings.num_envs * settings.chunk_steps, agent.experience.steps).chunk_steps
     settings = fit_chunk(settings, num_tasks, steps, agent.experience.steps)
     agent.experience.check(env, settings.num_envs, settings.chunk_steps)
     length = _played(settings, num_tasks, steps)
@@ -99,7 +100,7 @@ def train(
     run = _Run(
         *(env, SweptAgent(planned) if found else planned, settings, plan, directory, console, found),
         meshes.mesh_for(seeds * max(len(found), 1), num_tasks, settings.num_envs),
-        *(profile, tensorboard, wandb, on_chunk, on_evaluation),
+        *(profile, tensorboard, wandb, on_chunk, on_evaluation, longest),
     )
     with contextlib.closing(console), memory.explaining():
         result = run.train(start, resume, started)
@@ -149,6 +150,7 @@ class _Run:
     wandb: str = ""
     on_chunk: Callable[[dict[str, Any]], Any] | None = None
     on_evaluation: Callable[[Evaluations], None] | None = None
+    longest: int = 0  # iterations of a chunk, were the run of many steps
 
     @cached_property
     def seed_axis(self) -> tuple[np.ndarray, dict[str, np.ndarray] | None]:
@@ -308,7 +310,8 @@ class _Run:
         """Return where a new or resumed run is."""
         iteration = int(state.iteration)
         evaluations = self.records.earlier_evaluations(steps, steps >= self.eval_every, self._no_evaluations())
-        seconds, wall = self.records.earlier_seconds(iteration, self._columns(programs.metrics) if iteration else ())
+        form = (self._columns(programs.metrics), len(self.seeds), self.longest) if iteration else ()
+        seconds, wall = self.records.earlier_seconds(iteration, *form)
         now = _Progress(state, steps, seconds, wall, evaluations, np.zeros(len(self.seeds), bool))
         if steps < self.plan.steps or len(evaluations.steps):
             return now
