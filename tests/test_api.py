@@ -92,8 +92,9 @@ def test_its_folder_is_loaded_evaluated_and_resumed(result, copied_run, capsys):
 @pytest.mark.parametrize("changed", [{"seeds": 3}, {"seed": 1}, {"eval_every": 300}, {"eval_episodes": 2}])
 def test_a_run_goes_on_with_its_own_plan(result, changed):
     """Only steps may differ: seeds would bear wrong numbers, and evaluations would not be alike."""
+    ((name, value),) = changed.items()
     given = {"directory": result.directory, "resume": True, "steps": 600, **PLAN, **SMALL, **changed}
-    with pytest.raises(InputError, match=f"had another {next(iter(changed))}; resume it with the same"):
+    with pytest.raises(InputError, match=rf"had {name}=.*, not {value}; resume it with the same"):
         mtjax.train("finger-short", "sac-conditioned", **given)
 
 
@@ -102,8 +103,13 @@ def test_nothing_is_overwritten(result, short_family, tmp_path):
     before = (result.directory / "metrics.csv").read_bytes()
     with pytest.raises(InputError, match=r"holds config\.json of a run already; give another directory"):
         mtjax.train("finger-short", "sac", directory=result.directory)
-    with pytest.raises(InputError, match="had another learner"):
+    with pytest.raises(InputError, match=r"had gamma=0\.99, not 0\.5; resume it with the same"):
         mtjax.train("finger-short", "sac-conditioned", directory=result.directory, resume=True, gamma=0.5, **SMALL)
+    with pytest.raises(InputError, match="had agent='sac-conditioned', not 'sac'"):
+        mtjax.train("finger-short", "sac", directory=result.directory, resume=True, **SMALL)
+    with pytest.raises(InputError, match=r"had num_envs=2, not 3"):
+        given = {**PLAN, **SMALL, "num_envs": 3}
+        mtjax.train("finger-short", "sac-conditioned", directory=result.directory, resume=True, **given)
     assert (result.directory / "metrics.csv").read_bytes() == before
     (tmp_path / "metrics.csv").write_text("mine")
     with pytest.raises(InputError, match=r"holds metrics\.csv"):

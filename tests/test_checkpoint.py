@@ -14,6 +14,7 @@ import pytest
 
 import mtjax.train
 from mtjax import loop
+from mtjax.agents.choices import replace
 from mtjax.config import from_json
 from mtjax.names import Notice
 from mtjax.training import arrays, checkpoint
@@ -281,6 +282,24 @@ def test_a_record_that_changes_during_a_run_is_told(state, tmp_path):
     writer.wait()
     with pytest.warns(Notice, match='device is "cqu", not "cpu"$'):
         checkpoint.load_agent(tmp_path / "checkpoints", state)
+
+
+@pytest.mark.parametrize(
+    ("settings", "seeds", "said"),
+    [
+        ({"hidden": (16, 8)}, 2, r"agent\.actor.* is of shape .* there, and of shape .* here; \d+ more differ"),
+        ({"num_critics": 3}, 2, r"agent\.critic.* is of shape .* there, and of shape .* here; \d+ more differ"),
+        ({}, 3, r"agent\..* is of shape \(2,.* there, and of shape \(3,.* here; \d+ more differ"),
+        ({"shared_temperature": True}, 2, r"agent\..*temperature.* is .* there, and .* here"),
+    ],
+)
+def test_a_checkpoint_of_another_run_is_told_by_name(finished_run, settings, seeds, said):
+    """What differs, not which class of the reader could not read it."""
+    program = from_json(finished_run / "config.json")
+    agent, tasks = replace(program.learner, settings), program.family.tasks("train")
+    like = jax.eval_shape(lambda: loop.init(program.family, agent, program.training, tasks, jnp.arange(seeds)))
+    with pytest.raises(InputError, match=f"150' is of another run: {said}"):
+        checkpoint.load(finished_run / "checkpoints", like)
 
 
 def test_stray_folders_are_ignored(copied_run, shapes):

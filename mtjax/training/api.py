@@ -1,6 +1,7 @@
 """``mtjax.train``: names or objects and keyword settings become the configuration of a run, which is then launched."""
 
 import dataclasses
+from collections import ChainMap
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from mtjax import agents
 from mtjax.agents import BaseAgent
 from mtjax.agents.choices import flag_names, unknown_setting
 from mtjax.agents.choices import settings as settings_of
-from mtjax.checks import checked, path
+from mtjax.checks import checked, path, shown
 from mtjax.config import Plan, RunConfig, configure, fit_length, from_json, own_files, with_preset
 from mtjax.envs import BENCHMARKS, ENVS, is_mixture, make, members, name_of
 from mtjax.envs.family import Family
@@ -274,10 +275,14 @@ def _require_names(config: RunConfig) -> None:
 
 def _require_same(config: RunConfig, recorded: RunConfig, directory: Path) -> None:
     """Refuse to resume a run with other settings than it had, apart from its steps."""
-    now, then = ({**vars(each), **vars(each.plan)} for each in (config, recorded))
-    for part in ("family", "learner", "training", "points", "seeds", "seed", "eval_every", "eval_episodes"):
-        if now[part] != then[part]:
-            raise InputError(
-                f"the run in {str(directory)!r} had another {part}; resume it with the same, or "
-                f"start a new run in another directory"
-            )
+    fields = lambda held: {name: getattr(held, name) for name in _names(type(held))}
+    alone = lambda config: {"env": config.env, "agent": config.agent, "sweep": config.points}
+    parts = lambda config: (config.family, config.training, config.plan)
+    every = lambda config: {**alone(config), **settings_of(config.learner), **ChainMap(*map(fields, parts(config)))}
+    now, then = ({**every(each), "steps": None} for each in (config, recorded))
+    name = next((name for name in {**now, **then} if now.get(name) != then.get(name)), None)
+    if name is not None:
+        raise InputError(
+            f"the run in {str(directory)!r} had {name}={shown(then.get(name))}, not {shown(now.get(name))}; "
+            "resume it with the same, or start a new run in another directory"
+        )

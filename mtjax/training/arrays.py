@@ -2,6 +2,7 @@
 
 import errno
 import glob
+import json
 import logging
 import os
 import re
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from mtjax.types import InputError
 
@@ -71,12 +73,47 @@ def read(folder: Path, like: Mapping[str, Any], partial: bool = False) -> dict[s
     first = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
     place = lambda x: getattr(x, "sharding", None) or first
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place(x)), dict(like))
+    if not partial and (difference := _difference(folder, like)):
+        raise InputError(f"the checkpoint {str(folder)!r} is of another run: {difference}")
     _silence()
     try:
         with _context(partial):
             return ocp.load_checkpointables(_place(folder), shapes)
     except (ValueError, KeyError, OSError) as error:
-        raise InputError(f"{str(folder)!r} cannot be read: {_first_line(error)}") from None
+        raise InputError(f"the checkpoint {str(folder)!r} cannot be read: {_first_line(error)}") from None
+
+
+def _difference(folder: Path, parts: Mapping[str, Any]) -> str:
+    """Return in which array of some trees a folder differs from them; empty if in none, or if it cannot be read."""
+    shape = lambda x: jax.eval_shape(jax.random.key_data, x).shape if _is_key(x) else x.shape
+    name = lambda path: jax.tree_util.keystr(path, simple=True, separator=".")
+    for part, tree in parts.items():
+        try:
+            entries, names = _entries(folder, part)
+            headers = {x.removesuffix(_HEADER).decode(): entries.read(x).result().value for x in names if _HEADER in x}
+            there = {array: tuple(json.loads(header)["shape"]) for array, header in headers.items()}
+        except ValueError:
+            return ""
+        here = {name(path): shape(x) for path, x in jax.tree.leaves_with_path(tree)}
+        different = [array for array in {**here, **there} if here.get(array) != there.get(array)]
+        if different:
+            told = lambda shapes, array: f"of shape {shapes[array]}" if array in shapes else "missing"
+            first = f"{part}.{different[0]} is {told(there, different[0])} there, and {told(here, different[0])} here"
+            return first + f"; {len(different) - 1} more differ" * (len(different) > 1)
+    return ""
+
+
+def _is_key(x: Any) -> bool:
+    return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
+def _entries(folder: Path, part: str) -> tuple[Any, list[bytes]]:
+    """Return what is stored of a tree, and the names in it. A folder without arrays has none."""
+    import tensorstore
+
+    base = {"driver": "file", "path": f"{_place(folder)}/{part}/"}
+    entries = tensorstore.KvStore.open({"driver": "ocdbt", "base": base}).result()
+    return entries, entries.list().result()
 
 
 def require_readable(folder: Path, parts: Mapping[str, Any]) -> None:
@@ -85,13 +122,9 @@ def require_readable(folder: Path, parts: Mapping[str, Any]) -> None:
     Raises:
         OSError: an array is missing, or one cannot be read.
     """
-    import tensorstore
-
     for part, tree in parts.items():
-        base = {"driver": "file", "path": f"{_place(folder)}/{part}/"}
         try:
-            entries = tensorstore.KvStore.open({"driver": "ocdbt", "base": base}).result()
-            names = entries.list().result()
+            entries, names = _entries(folder, part)
             for name in names:
                 entries.read(name).result()
         except ValueError as error:
