@@ -56,7 +56,8 @@ def require_values(holder: Any, **largest: int) -> None:
         for each in value if items and not rule else [value]:
             rule = rule or _broken_rule(int if items else kind, each, largest.get(name, _LARGEST))
         if rule:
-            raise InputError(f"{name.replace('_', '-')} {rule}, not {str(value)[:40]}")
+            told = str(value)[:40] if isinstance(value, str) or len(shown(value)) > 40 else shown(value)
+            raise InputError(f"{name.replace('_', '-')} {rule}, not {told}")
 
 
 def _broken_rule(kind: Any, value: Any, largest: int) -> str:
@@ -83,7 +84,7 @@ def _types(cls: type) -> dict[str, Any]:
 
 def _checked(name: str, kind: Any, value: Any) -> Any:
     kind = get_args(kind)[0] if get_origin(kind) is Annotated else kind
-    if get_origin(kind) is tuple and isinstance(value, list | tuple | np.ndarray):
+    if get_origin(kind) is tuple and isinstance(value, list | tuple | np.ndarray) and getattr(value, "ndim", 1):
         return tuple(_checked(name, get_args(kind)[0], x) for x in value)
     wanted = _WANTED.get(tuple if get_origin(kind) is tuple else kind)
     if wanted is None:
@@ -91,7 +92,10 @@ def _checked(name: str, kind: Any, value: Any) -> Any:
     words, accepts, convert = wanted
     if not accepts(value):
         raise InputError(f"{name} must be {words}, not {shown(value)}{_hint(kind, value)}")
-    return convert(value)
+    try:
+        return convert(value)
+    except OverflowError:
+        raise InputError(f"{name} must be at most {_LARGEST_FLOAT:g}, not {shown(value)}") from None
 
 
 def _is_number(value: Any) -> bool:
@@ -122,7 +126,10 @@ def _hint(kind: Any, value: Any) -> str:
 
 def shown(value: Any) -> str:
     """Return a value as text for a message, or the name of its type if that is long."""
-    text = repr(value)
+    try:
+        text = repr(value)
+    except ValueError:  # Python writes no whole number of more than 4,300 digits
+        return "a number of thousands of digits"
     return text if len(text) <= 60 else f"a {type(value).__name__}"
 
 
@@ -145,12 +152,23 @@ def _require_whole(name: str, value: Any, least: int, most: int) -> None:
         raise InputError(f"{name} must be at least {least} and at most {most}, not {value}")
 
 
+def require_text(value: Any, name: str) -> None:
+    """Check that a value is text, such as a name, before it is looked up.
+
+    Raises:
+        InputError: it is not.
+    """
+    if not isinstance(value, str):
+        raise InputError(f"{name} must be a text, not {shown(value)}")
+
+
 def path(value: Any, name: str = "directory") -> Path:
     """Return a path.
 
     Raises:
         InputError: the value is no path.
     """
-    if not isinstance(value, str | os.PathLike) or not os.fspath(value):  # Path("") would be the working directory
+    text = os.fspath(value) if isinstance(value, str | os.PathLike) else ""
+    if not isinstance(text, str) or not text or "\0" in text:  # Path("") would be the working directory
         raise InputError(f"{name} must be a path, not {shown(value)}")
     return Path(value)

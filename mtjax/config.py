@@ -21,7 +21,7 @@ from mtjax.agents.choices import kinds_of, replace
 from mtjax.agents.parts import name_of
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.values import VALUES
-from mtjax.checks import check_fields, require_values
+from mtjax.checks import check_fields, require_text, require_values
 from mtjax.commands import PRESETS, is_imported, require_run
 from mtjax.envs import ENVS, is_mixture, make, members
 from mtjax.envs.tabled import Tabled
@@ -143,8 +143,10 @@ def with_preset(
         InputError: a name or setting is unknown.
     """
     made = make(env_name, **family_settings) if family is None else family
+    require_text(agent_name, "agent")
+    require_text(preset_name, "preset")
     if preset_name not in PRESETS:
-        raise nearest_error("preset", str(preset_name), PRESETS)
+        raise nearest_error("preset", preset_name, PRESETS)
     device = _device_preset() if preset_name == "auto" else preset_name
     preset, common = load_preset(env_name, device), load_preset("+", device)
     table = lambda name: common.get(name, {}) | preset.get(name, {})

@@ -73,11 +73,11 @@ def _read(file: str) -> list[str]:
     if path.suffix != ".toml" or not path.is_file():
         raise InputError(f"--config needs a TOML file, and {file!r} is none")
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        flags = list(_flat(tomllib.loads(path.read_text(encoding="utf-8"))))
+    except (ValueError, RecursionError) as error:  # also a number of thousands of digits
         raise InputError(f"{file!r} cannot be read as TOML: {error}") from None
     words = []
-    for flag, value in _flat(table):
+    for flag, value in flags:
         if flag in _LEFT_OUT:
             raise InputError(f"{file!r} gives {flag}: {_LEFT_OUT[flag]}")
         words += _words(flag, value, file)

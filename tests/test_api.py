@@ -16,6 +16,7 @@ import mtjax.train
 from mtjax import agents, checks, cli, envs
 from mtjax.config import Plan, from_json, with_preset
 from mtjax.loop import Settings
+from mtjax.report import collect
 from mtjax.training import api, launch, memory
 from mtjax.types import InputError
 
@@ -314,3 +315,47 @@ def test_a_sweep_of_python_leaves_a_run_too(short_family, tmp_path):
     assert swept.policy(3).agent.actor_lr == mtjax.load(tmp_path / "x", 3).agent.actor_lr == 1e-2
     with pytest.raises(InputError, match="seed must be from 0 to 3"):
         swept.policy(4)
+
+
+WRONG = [
+    *({}, {"a": 1}, {1: 2}, [], ["cpu"], [[[]]], ("a",), set(), np.zeros(3), np.zeros(()), np.array(["a"]), 1.5, b"x"),
+    *(object(), type, float("nan"), "a\0b", 10**5000),
+]
+TAKERS = {
+    "preset's environment": lambda x: mtjax.preset(x, "sac"),
+    "preset's agent": lambda x: mtjax.preset("bandit", x),
+    "preset's name": lambda x: mtjax.preset("bandit", "sac", x),
+    "environment": mtjax.make,
+    "agent": mtjax.agent,
+    "part": lambda x: mtjax.agent("sac", representation=x),
+    "choice": lambda x: mtjax.agent("sac", conditioning=x),
+    "split": lambda x: mtjax.make("finger-spin", split=x),
+    "values of mixtures": lambda x: mtjax.train(mtjax.mixture(["bandit"]), "sac", steps=1, vary={"x": x}),
+    "run": mtjax.load,
+    "seed": lambda x: mtjax.load("reacher-vary-goal/ppo", seed=x),
+    "checkpoint": lambda x: mtjax.load("reacher-vary-goal/ppo", checkpoint=x),
+    "train's environment": lambda x: mtjax.train(x, "sac", steps=1),
+    "train's agent": lambda x: mtjax.train("bandit", x, steps=1),
+    "start": lambda x: mtjax.train("bandit", "sac", start=x, steps=1),
+    "settings": lambda x: mtjax.train("bandit", "sac", settings=x, steps=1),
+    "batch-size": lambda x: mtjax.train("bandit", "sac", batch_size=x, steps=1),
+    "file": lambda x: mtjax.export(None, x),
+    "runs to draw": collect.read,
+    "split of tasks": lambda x: mtjax.make("bandit").tasks(x),
+}
+
+
+@pytest.mark.parametrize("taker", TAKERS)
+def test_whatever_python_gives_is_used_or_refused(taker):
+    """By an InputError of a line or two, before anything compiles."""
+    for value in WRONG:
+        with pytest.raises(InputError) as caught:
+            TAKERS[taker](value)
+        assert len(str(caught.value)) < 1000
+
+
+@pytest.mark.parametrize("vary", [{1: 2}, {"x": 2}, {"bandit.x": 10**5000}, 3])
+def test_what_varies_in_a_mixture_is_named_by_text(vary):
+    for train in (mtjax.make, lambda env, **given: mtjax.train(env, "sac", steps=1, **given)):
+        with pytest.raises(InputError):
+            train("bandit+tabular-mdp", vary=vary)

@@ -719,6 +719,16 @@ def test_wrong_files_of_flags_are_refused(text, said, complaint, tmp_path):
     assert said in told and told.count("x.toml'") == 1
 
 
+@pytest.mark.parametrize(
+    "text",
+    ["a = " + "[" * 100_000, "a = " + "9" * 5000, f"[a{'.b' * 5000}]\nx = 1", 'runs = "a\\u0000b"'],
+)
+def test_files_of_flags_of_any_depth_and_length_are_refused(text, complaint, tmp_path):
+    (tmp_path / "a.toml").write_text(text)
+    said = complaint("train", *SHORT_RUN, f"--config={tmp_path / 'a.toml'}")
+    assert said.startswith("error: ") and len(said) < 700
+
+
 def test_what_is_wrong_beside_a_file_of_flags_is_not_the_files(complaint, tmp_path):
     """Nor is what the command line gives in place of the file's. A switch for the package's file is named itself."""
     (tmp_path / "x.toml").write_text("steps = 5\nseeds = 0")

@@ -3,6 +3,7 @@ import time
 import numpy as np
 import pytest
 
+from mtjax.names import InputError
 from mtjax.report.stats import (
     Bootstrap,
     holm,
@@ -203,3 +204,24 @@ def test_the_interval_of_three_seeds_is_their_range():
     """From the worst to the best one, whatever lies between."""
     interval = seed_interval(np.array([3.0, 9.0, 4.0]))
     assert (interval.low, interval.high) == (3.0, 9.0)
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        iqm,
+        lambda x: iqm(x, axis=0),
+        seed_interval,
+        lambda x: seed_interval(x, iqm),
+        lambda x: paired_difference(x, np.zeros((4, 2))),
+        lambda x: unpaired_difference(np.zeros((4, 2)), x),
+        lambda x: probability_of_improvement(np.zeros((4, 2)), x),
+    ],
+)
+def test_scores_that_are_no_numbers_are_refused(use):
+    """A seed that diverged is left out by whoever compares, not in silence."""
+    scores = np.arange(8.0).reshape(4, 2)
+    use(scores)
+    scores[1] = np.nan
+    with pytest.raises(InputError, match="2 of 8 scores are NaN, as of seeds that diverged; leave out those seeds"):
+        use(scores)

@@ -82,7 +82,9 @@ def build(name: str, cls: type, defaults: Mapping[str, Any], given: Mapping[str,
         InputError: a setting is neither the agent's nor one of its parts', or its value is not allowed.
     """
     fields = {field.name: field for field in dataclasses.fields(cls)}
-    choose = lambda kind, table: parts.choose(kind, PARTS[kind], table.get(kind) or fields[kind].default_factory())  # type: ignore
+    of_class = lambda kind: fields[kind].default_factory()  # type: ignore
+    pick = lambda kind, part: parts.choose(kind, PARTS[kind], of_class(kind) if part is None else part)
+    choose = lambda kind, table: pick(kind, table.get(kind))
     usual = {kind: choose(kind, defaults) for kind in kinds_of(cls)}
     chosen = {kind: choose(kind, {**defaults, **given}) for kind in usual}
     replaced = {x for kind, part in usual.items() for x in parts.settings(part).keys() - parts.settings(chosen[kind])}

@@ -9,7 +9,7 @@ from functools import lru_cache
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
-from mtjax.checks import OF_TRAIN, checked, shown
+from mtjax.checks import OF_TRAIN, checked, require_text, shown
 from mtjax.envs import variation
 from mtjax.envs.metaworld.names import BENCHMARKS, FAMILIES
 from mtjax.names import InputError, first_sentence, frozen, lazily, load, nearest_error, public
@@ -271,7 +271,9 @@ def _pairs(vary: Any) -> dict[str, Any]:
     try:
         return dict(vary)
     except (TypeError, ValueError):
-        raise InputError(f"vary maps parameters to values, such as {{'size': '0.9:1.1:5'}}; not {vary!r}") from None
+        raise InputError(
+            f"vary maps parameters to values, such as {{'size': '0.9:1.1:5'}}; not {shown(vary)}"
+        ) from None
 
 
 def _unknown_setting(name: str, family: Any, unknown: str, value: Any) -> InputError:
@@ -308,8 +310,10 @@ def mixture(families: "Sequence[str | Family | Mixture]", scenes: str = "auto") 
         InputError: there is no family of a name, or a family is in the mixture twice.
     """
     cls = load("mtjax.envs.mixtures:Mixture")
-    if isinstance(families, str) or not isinstance(families, Iterable):
-        raise InputError(f"a mixture takes a list of families, such as ['bandit', 'finger-spin'], not {families!r}")
+    if isinstance(families, str) or not isinstance(families, Iterable) or not getattr(families, "ndim", 1):
+        raise InputError(
+            f"a mixture takes a list of families, such as ['bandit', 'finger-spin'], not {shown(families)}"
+        )
     named: list[tuple[str, Any]] = []
     for given in families:
         found = make(given) if isinstance(given, str) else given
@@ -352,6 +356,7 @@ def _make_mixture(own: tuple[tuple[str, Settings], ...], vary: Settings, setting
             raise nearest_error("setting of these families", given, known)
     chosen: dict[str, dict[str, Any]] = {name: {} for name in names}
     for given, values in vary.items():
+        require_text(given, "the name of a parameter")
         name, dot, parameter = given.rpartition(".")
         if not dot or name not in chosen:
             raise InputError(

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from mtjax.checks import require_text
 from mtjax.types import SPLITS, Array, InputError, Key, Spec, Step, Task
 
 
@@ -151,6 +152,7 @@ class Tabled(abc.ABC):
 
     def tasks(self, split: str = "train") -> Task:
         """Return the tasks of a split: "train", "interpolation", "extrapolation", or "all" in this order."""
+        require_text(split, "split")
         table = self.table
         splits = {**table.rows, "all": np.concatenate(list(table.rows.values()))}
         if split not in splits:

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mtjax.checks import shown
 from mtjax.envs.parameters import Parameter
 from mtjax.names import InputError, nearest_error
 
@@ -55,10 +56,10 @@ def write_values(given: str | float | Sequence[float], name: str = "a parameter"
         return given
     try:
         points = np.atleast_1d(np.array(given, np.float64)) if given is not None else None
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         points = None
     if points is None or points.ndim > 1:
-        raise InputError(f"the values of {name} are {_FORMS}, or numbers; not {given!r}")
+        raise InputError(f"the values of {name} are {_FORMS}, or numbers; not {shown(given)}")
     return ",".join(repr(float(x)) for x in points)
 
 

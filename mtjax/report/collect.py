@@ -52,7 +52,8 @@ def read(pattern: str | Path | Iterable[str | Path]) -> list[Found]:
     Raises:
         InputError: there is no run with an evaluation, or a file of one cannot be read.
     """
-    given = [pattern] if isinstance(pattern, str | Path) or not isinstance(pattern, Iterable) else list(pattern)
+    several = isinstance(pattern, Iterable) and not isinstance(pattern, str | Path) and getattr(pattern, "ndim", 1)
+    given: list[Any] = list(pattern) if several else [pattern]  # type: ignore
     folders = [folder for each in given for folder in _folders(str(path(each, "runs")))]
     done = [folder for folder in dict.fromkeys(folders) if (folder / "evaluations.npz").exists()]
     if not done:

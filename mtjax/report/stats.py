@@ -13,6 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import stdtr
 
+from mtjax.names import InputError
+
 Statistic = Callable[..., np.ndarray]  # takes an array and ``axis``, as ``iqm`` and ``np.mean`` do
 
 
@@ -41,7 +43,7 @@ def iqm(scores: np.ndarray, axis: int | None = None) -> np.ndarray:
 
     It is over all entries, or along ``axis``, and equals rliable's ``aggregate_iqm`` (SciPy's 25 % trimmed mean).
     """
-    ordered = np.sort(scores, axis=axis)
+    ordered = np.sort(_known(scores), axis=axis)
     axis = -1 if axis is None else axis
     size = ordered.shape[axis]
     middle = np.arange(size // 4, size - size // 4)
@@ -126,11 +128,23 @@ def probability_of_improvement(a: np.ndarray, b: np.ndarray, bootstrap: Bootstra
     It is the share of pairs of a seed of ``a`` (S, T) and one of ``b`` (S', T) in which the first is higher, averaged
     over tasks. A tie counts half. The interval draws the seeds of each apart.
     """
-    first, second = np.asarray(a)[:, None], np.asarray(b)[None]
+    first, second = _known(a)[:, None], _known(b)[None]
     wins = np.mean((first > second) + 0.5 * (first == second), axis=-1)  # (S, S')
     of_a, of_b = _draw(bootstrap, a, b)
     resampled = np.mean(wins[of_a[:, :, None], of_b[:, None, :]], axis=(1, 2))
     return _interval(float(np.mean(wins)), resampled, bootstrap, min(wins.shape))
+
+
+def _known(scores: np.ndarray) -> np.ndarray:
+    """Return scores as numbers of 64 bits.
+
+    Raises:
+        InputError: some are NaN, as those of seeds that diverged. To leave them out in silence would favour an agent.
+    """
+    scores = np.asarray(scores, np.float64)
+    if unknown := int(np.isnan(scores).sum()):
+        raise InputError(f"{unknown} of {scores.size} scores are NaN, as of seeds that diverged; leave out those seeds")
+    return scores
 
 
 def _difference(
@@ -153,7 +167,7 @@ def _of_seeds(scores: np.ndarray) -> np.ndarray:
 
 
 def _of_all(statistic: Statistic, scores: np.ndarray) -> float:
-    return float(statistic(np.asarray(scores, np.float64), axis=None))
+    return float(statistic(_known(scores), axis=None))
 
 
 def _of_each(statistic: Statistic, scores: np.ndarray, draws: np.ndarray) -> np.ndarray:

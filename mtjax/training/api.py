@@ -151,7 +151,7 @@ def _require_learning(env: Any, agent: Any, directory: Any) -> None:
 def _kind(value: Any) -> str:
     if isinstance(value, type):
         return f"the class {value.__name__} itself"
-    return repr(value) if isinstance(value, str | int | float | None) else f"a {type(value).__name__}"
+    return shown(value) if isinstance(value, str | int | float | None) else f"a {type(value).__name__}"
 
 
 def _configured(

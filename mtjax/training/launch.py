@@ -9,6 +9,7 @@ import numpy as np
 
 from mtjax import frames
 from mtjax.agents import preset_of
+from mtjax.checks import path
 from mtjax.config import RunConfig, require_value_range, slow_on_cpu
 from mtjax.envs import Family
 from mtjax.parallel import hosts, mesh
@@ -34,6 +35,7 @@ def check(config: RunConfig, start: Policy | None = None) -> None:
     family = config.family
     if not config.runs:  # Path("") would be the working directory
         raise InputError("--runs needs a folder; that of the command is --runs=.")
+    path(config.runs, "--runs")
     sinks.require_libraries(config.tensorboard, config.wandb)
     _ = family.engine_name, family.table, family.targets()  # its engine refuses a model that it cannot run
     mesh.mesh_for(config.plan.seeds, family.train_count, config.training.num_envs)

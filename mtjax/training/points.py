@@ -134,7 +134,7 @@ def grid(sweep: Sweep) -> tuple[dict[str, float], ...]:
     listed_all = isinstance(sweep, Mapping) and all(isinstance(x, Iterable) for x in sweep.values())
     points = isinstance(sweep, Sequence) and all(isinstance(point, Mapping) for point in sweep)
     if not (listed_all or points):
-        raise InputError(f"sweep gives each number a list of values, {{'actor_lr': [1e-4, 1e-3]}}; not {sweep!r}")
+        raise InputError(f"sweep gives each number a list of values, {{'actor_lr': [1e-4, 1e-3]}}; not {shown(sweep)}")
     if isinstance(sweep, Mapping):
         sweep = {name: list(values) for name, values in sweep.items()}
         empty = next((name for name, values in sweep.items() if not len(values)), None)
@@ -152,7 +152,7 @@ def grid(sweep: Sweep) -> tuple[dict[str, float], ...]:
 def _number(name: str, value: Any) -> float:
     try:
         return float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InputError(f"a sweep gives numbers to {name}, and {shown(value)} is none") from None
 
 

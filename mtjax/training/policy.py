@@ -12,7 +12,7 @@ import numpy as np
 
 from mtjax import frames, loop, shipped, standalone
 from mtjax.agents import BaseAgent, name_of
-from mtjax.checks import path
+from mtjax.checks import path, shown
 from mtjax.config import RunConfig, from_json
 from mtjax.envs import name_of as env_name_of
 from mtjax.envs.family import Family
@@ -164,6 +164,8 @@ def load(directory: str | Path, seed: int = 0, checkpoint: int = 0) -> Policy:
     Raises:
         InputError: the folder is not a run, the run has no such seed, or its checkpoint is missing or damaged.
     """
+    if not isinstance(checkpoint, int | np.integer) or checkpoint < 0:
+        raise InputError(f"checkpoint must be a whole number of at least 0, not {shown(checkpoint)}")
     directory = shipped.folder(path(directory))
     config = from_json(directory / "config.json")
     _require_seed(seed, config.plan.seeds, len(config.points))
@@ -206,7 +208,7 @@ def policy_of(
 def _require_seed(seed: int, seeds: int, num_points: int) -> None:
     last = seeds * max(num_points, 1) - 1
     if not isinstance(seed, int | np.integer) or not 0 <= seed <= last:
-        raise InputError(f"seed must be from 0 to {last}, counted from the run's first, not {seed!r}")
+        raise InputError(f"seed must be from 0 to {last}, counted from the run's first, not {shown(seed)}")
 
 
 def _point_rows(count: int, seed: int) -> slice:

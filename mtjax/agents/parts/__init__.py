@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Literal, TypeVar, get_args, get_origin
 import jax
 import jax.numpy as jnp
 
-from mtjax.checks import checked
+from mtjax.checks import checked, require_text, shown
 from mtjax.names import frozen, nearest_error
 from mtjax.types import InputError, Outcome
 
@@ -43,7 +43,7 @@ def choose(kind: str, table: Mapping[str, type[P]], given: Any) -> P:
     if isinstance(given, tuple(table.values())):
         return given
     if not isinstance(given, str):
-        raise InputError(f"{kind} must be a name or a part of that kind, not {given!r}")
+        raise InputError(f"{kind} must be a name or a part of that kind, not {shown(given)}")
     if given not in table:
         raise nearest_error(kind, given, table)
     return table[given]()
@@ -90,8 +90,11 @@ def require_choices(holder: Any) -> None:
     """Require every setting of ``Literal`` type to be one of its choices."""
     for field in dataclasses.fields(holder):
         allowed = get_args(field.type) if get_origin(field.type) is Literal else ()
-        if allowed and getattr(holder, field.name) not in allowed:
-            raise nearest_error(_flag(field.name), getattr(holder, field.name), allowed)
+        value = getattr(holder, field.name)
+        if allowed:
+            require_text(value, field.name)
+        if allowed and value not in allowed:
+            raise nearest_error(_flag(field.name), value, allowed)
 
 
 def require_positive(holder: Any, *names: str) -> None:
