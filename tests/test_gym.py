@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import importlib
 import json
+import pickle
 import re
 import sys
 from pathlib import Path
@@ -600,3 +601,31 @@ def test_random_tasks_are_drawn_inside_a_program():
 
     rows, obs = start(jax.random.split(jax.random.key(0), 60))
     assert set(np.asarray(rows)) == set(range(6)) and obs.shape == (60, 5)
+
+
+@pytest.mark.parametrize(
+    "made", [lambda: gymnasium.make("mtjax/bandit"), lambda: mtjax.gym.make_vec("point-mass-vary-goal", 2)]
+)
+def test_environments_are_copied_between_processes(made):
+    """A pickled one goes on from where it was, with streams of its own."""
+    env = made()
+    env.action_space.seed(0)
+    env.reset(seed=1)
+    env.step(env.action_space.sample())
+    other = pickle.loads(pickle.dumps(env))
+    for _ in range(3):
+        action = env.action_space.sample()
+        ours, theirs = env.step(action), other.step(action)
+        np.testing.assert_array_equal(ours[0]["env_obs"], theirs[0]["env_obs"])
+        np.testing.assert_array_equal(ours[1], theirs[1])
+    np.testing.assert_array_equal(env.reset()[0]["env_obs"], other.reset()[0]["env_obs"])
+
+
+@pytest.mark.parametrize("made", [lambda: gymnasium.make("mtjax/bandit"), lambda: mtjax.gym.make_vec("bandit", 2)])
+def test_a_forked_process_is_refused_with_the_fix(made, monkeypatch):
+    """JAX's threads are missing there, as in the workers of Gymnasium's asynchronous vectors: a call would hang."""
+    env = made()
+    monkeypatch.setattr("os.getpid", lambda: -1)
+    for use in (made, env.reset):
+        with pytest.raises(InputError, match=r"vector_kwargs=\{'context': 'spawn'\}"):
+            use()

@@ -4,6 +4,7 @@ Tables are built on the host. Compiled programs never loop over tasks.
 """
 
 import abc
+import dataclasses
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -32,6 +33,10 @@ class Part(NamedTuple):
 
 class Tabled(abc.ABC):
     """An environment with a table of tasks: a family or a mixture. Configurations, reports and films use it."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the fields alone: tables, engines and programs are made again where a copy is unpickled."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}  # type: ignore
 
     @property
     @abc.abstractmethod

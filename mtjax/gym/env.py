@@ -1,5 +1,6 @@
 """A Gymnasium environment of one world of a family, with MTEnv's interface."""
 
+import os
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -36,6 +37,25 @@ class Programs(NamedTuple):
 
     reset: Any  # task, seed (2,) uint32 -> Step
     step: Any  # task, state, action -> Step
+
+
+@lru_cache
+def _home() -> int:
+    """Return the process that first made an environment, also in its forks."""
+    return os.getpid()
+
+
+def require_no_fork() -> None:
+    """Refuse a fork of a process in which JAX runs: its threads are missing there, and the first call would hang.
+
+    Raises:
+        InputError: this process is one.
+    """
+    if _home() != os.getpid():
+        raise InputError(
+            "JAX hangs in a forked process: give vectorization_mode='vector_entry_point', which steps all worlds in "
+            "one program, or vector_kwargs={'context': 'spawn'} beside 'async'"
+        )
 
 
 def begin(family: Env, task: Task, seed: Array) -> Step:
@@ -134,6 +154,7 @@ class FamilyEnv(TaskStream, gymnasium.Env):
     """
 
     def __init__(self, family: Env, tasks: str = "train", task_obs: str = "context", render_mode: str | None = None):
+        require_no_fork()
         self.family, self.render_mode, self._programs = family, render_mode, _programs(played(family))
         self.metadata = _metadata(family)
         if render_mode not in (None, *self.metadata["render_modes"]):
@@ -145,8 +166,15 @@ class FamilyEnv(TaskStream, gymnasium.Env):
         self._elapsed = 0
         self.set_task_state(self._table.first)
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "_programs"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, _programs=_programs(played(state["family"])))
+
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
         """Begin an episode of the current task. The only option is ``task_seed``."""
+        require_no_fork()
         super().reset(seed=seed)
         options = read_options(options, ("task_seed",))
         if "task_seed" in options:

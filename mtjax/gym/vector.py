@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from mtjax.gym.env import begin, draw_seeds, family_named, observed, played, read_action, spaces_of
+from mtjax.gym.env import begin, draw_seeds, family_named, observed, played, read_action, require_no_fork, spaces_of
 from mtjax.gym.tasks import TaskStream, TaskTable, read_options
 from mtjax.types import Array, Env, InputError, Step
 
@@ -82,6 +82,7 @@ class FamilyVectorEnv(TaskStream, VectorEnv):
     ):
         if num_envs < 1:
             raise InputError(f"num_envs must be at least 1, not {num_envs}")
+        require_no_fork()
         self.family, self.num_envs, self._resample = family, num_envs, resample_tasks
         self._programs = _programs(played(family))
         self.metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": []}
@@ -91,11 +92,18 @@ class FamilyVectorEnv(TaskStream, VectorEnv):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.set_task_state(self._table.chosen[np.arange(num_envs) * len(self._table.chosen) // num_envs])
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "_programs"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, _programs=_programs(played(state["family"])))
+
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
         """Begin an episode in every world, or in the worlds of the option ``reset_mask`` (num_envs,) bool.
 
         The other option is ``task_seed``.
         """
+        require_no_fork()
         super().reset(seed=seed)
         options = read_options(options, ("task_seed", "reset_mask"))
         if "task_seed" in options:
