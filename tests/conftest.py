@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import probes
 import pytest
+from needs import count_skips, require, skip_without_packages
 
 import mtjax.train
 from mtjax import xla_flags
@@ -51,6 +52,15 @@ def use_gpu(config):
     config.option.dist, config.option.maxschedchunk = "load", 1
     if not hasattr(config, "workerinput"):
         config.pluginmanager.register(Durations(config), "durations")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item):
+    skip_without_packages(item)
+
+
+def pytest_terminal_summary(terminalreporter):
+    count_skips(terminalreporter)
 
 
 class Durations:
@@ -112,9 +122,7 @@ def programs():
 @pytest.fixture(scope="session")
 def suite_finger():
     """dm_control's own finger-spin environment, after the reset that sets the hinge's damping."""
-    from dm_control import suite
-
-    environment = suite.load("finger", "spin", task_kwargs={"random": 0})
+    environment = require("dm_control.suite").load("finger", "spin", task_kwargs={"random": 0})
     environment.reset()
     return environment
 

@@ -3,16 +3,15 @@
 import dataclasses
 import math
 from functools import lru_cache
-from importlib.util import find_spec
 from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from needs import needs
 
 from mtjax import agents, loop
-from mtjax.agents.base import CONDITIONINGS
 from mtjax.agents.parts import trajectory
 from mtjax.config import configure
 from mtjax.envs import ENVS
@@ -24,14 +23,15 @@ from mtjax.types import Acted, Spec, Task, Transition
 
 __all__ = ["AFTER", "LIMIT", "RULES", "SPEC", "Probe", "tasks_of"]
 
-# Families that can be made here, and those of them that stand for all where a test takes long. Meta-World's fifty share
-# one class but for rewards, and need files that are not always there.
+# Families that stand for all where a test takes long: Meta-World's fifty share one class but for rewards.
 METAWORLD = [name for name in ENVS if name.startswith("metaworld-")]
-INSTALLED = [name for name in ENVS if name not in METAWORLD or find_spec("metaworld")]
-with_metaworld = pytest.mark.skipif(not find_spec("metaworld"), reason="Meta-World's scenes are not installed")
-FEW = [name for name in INSTALLED if name not in METAWORLD or name == "metaworld-reach"]
-# The ways to tell a task that can be tried here: reading needs scikit-learn.
-TELLING = tuple(x for x in CONDITIONINGS if x != "text" or find_spec("sklearn"))
+FEW = [name for name in ENVS if name not in METAWORLD or name == "metaworld-reach"]
+# Families, and a way to tell a task, that read or import what is not installed with mtjax.
+_PACKAGES = {
+    **dict.fromkeys(METAWORLD, "metaworld"),
+    **{name: "dm_control" for name in ENVS if name.startswith("dog-")},
+    "text": "sklearn",
+}
 
 # Tests compile much and run little; without LLVM's optimisations they take half as long.
 QUICK = {"xla_backend_optimization_level": 0}
@@ -146,15 +146,22 @@ OFF_POLICY = [name for name, preset in agents.AGENTS.items() if issubclass(prese
 """The agents that learn from batches of a replay; ``test_ppo`` is of the one that does not."""
 
 
+def param(case, slow=False):
+    """A case, or several values in a tuple, as a test's parameters, marked with the packages that they need."""
+    values = case if isinstance(case, tuple) else (case,)
+    words = [word for value in values for word in (value.values() if isinstance(value, dict) else (value,))]
+    packages = [_PACKAGES[word] for word in words if isinstance(word, str) and word in _PACKAGES]
+    return pytest.param(*values, marks=[*map(needs, packages), *([pytest.mark.slow] if slow else [])])
+
+
 def one_in(count, cases):
     """All cases as a test's parameters, marked slow but for one in ``count``."""
-    values = lambda case: case if isinstance(case, tuple) else (case,)
-    return [pytest.param(*values(x), marks=[pytest.mark.slow] if i % count else []) for i, x in enumerate(cases)]
+    return [param(case, slow=i % count > 0) for i, case in enumerate(cases)]
 
 
 def slow_but(names, *quick):
     """All names as a test's parameters, marked slow but for the ``quick``."""
-    return [pytest.param(name, marks=[] if name in quick else [pytest.mark.slow]) for name in names]
+    return [param(name, slow=name not in quick) for name in names]
 
 
 # The loop and the replay with which SAC learns what a probe asks for.

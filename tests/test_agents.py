@@ -6,11 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from probes import OFF_POLICY, TELLING, learner, pick, quick, random_batch, random_past, tasks_of, tiny
+from probes import OFF_POLICY, learner, one_in, pick, quick, random_batch, random_past, tasks_of, tiny
 from probes import act as act_once
 
 from mtjax import normalize
 from mtjax.agents import AGENTS, agent
+from mtjax.agents.base import CONDITIONINGS
 from mtjax.agents.parts.conditioning import load_vectors
 from mtjax.agents.parts.encoders import ENCODERS
 from mtjax.agents.parts.gradients.surgery import RULES
@@ -41,7 +42,10 @@ def valid(name, **settings):
 
 
 VALID = [
-    (name, conditioning) for name in OFF_POLICY for conditioning in TELLING if valid(name, conditioning=conditioning)
+    (name, conditioning)
+    for name in OFF_POLICY
+    for conditioning in CONDITIONINGS
+    if valid(name, conditioning=conditioning)
 ]
 SURGERY = [("embedding" if name == "sac" else "parameters", name) for name in OFF_POLICY]
 
@@ -49,8 +53,7 @@ SURGERY = [("embedding" if name == "sac" else "parameters", name) for name in OF
 def some(cases, every):
     """Cases of which one in so many is traced by default and all by .ci/run, less those that cannot be."""
     cases = [(name, settings) for name, settings in cases if valid(name, **settings)]
-    mark = lambda i: [pytest.mark.slow] if i % every else []
-    return [pytest.param(*case, marks=mark(i)) for i, case in enumerate(cases)]
+    return one_in(every, cases)
 
 
 # Each tells tasks apart in its own way, and pcgrad must compose with every network that tasks share. Seven
@@ -182,7 +185,7 @@ def test_a_world_among_many_is_that_world_alone(name):
     np.testing.assert_allclose(together, apart, atol=1e-5 if jax.default_backend() == "cpu" else 0.02)
 
 
-@pytest.mark.parametrize("conditioning", [x for x in TELLING if x != "text"])
+@pytest.mark.parametrize("conditioning", [x for x in CONDITIONINGS if x != "text"])
 def test_what_the_networks_see_of_a_task(conditioning, vectors):
     """Features (Z,) of the second task."""
     agent = make("sac", {"conditioning": conditioning}, vectors)

@@ -14,8 +14,8 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
+from needs import needs
 from probes import slow_but
-from probes import with_metaworld as with_scenes
 
 import mtjax
 from mtjax.envs import BENCHMARKS
@@ -452,7 +452,7 @@ def test_agents_that_are_timed_see_numbers_or_pictures(script):
     assert {name: x.shape for name, x in cost.seeing(16).obs.items()} == {"pixels": (16, 16, 3)}
 
 
-@with_scenes
+@needs("metaworld")
 def test_scripted_policies_need_numpy_alone(script, monkeypatch):
     """The package's own imports, such as Gymnasium's environments, stay out."""
     policies = script("metaworld_policies")
@@ -470,6 +470,7 @@ def test_scripted_policies_need_numpy_alone(script, monkeypatch):
         del sys.modules[name]
 
 
+@needs("metaworld")
 def test_tasks_with_a_line_are_not_played_again(script, tmp_path, monkeypatch):
     parity = script("metaworld_parity")
     played = []
@@ -516,6 +517,7 @@ def test_a_policy_of_other_tasks_does_not_play_meta_world(script):
         parity.trained("finger-spin-vary-size/sac-conditioned")
 
 
+@needs("metaworld")
 def test_a_policy_plays_only_what_it_was_trained_on(script, tmp_path, monkeypatch):
     parity = script("metaworld_parity")
     monkeypatch.setattr(parity, "trained", lambda run: (["reach"], None))
@@ -524,7 +526,7 @@ def test_a_policy_plays_only_what_it_was_trained_on(script, tmp_path, monkeypatc
         parity.compare(None, given)
 
 
-@with_scenes
+@needs("metaworld")
 @pytest.mark.slow
 def test_a_trained_policy_plays_meta_world_as_it_acts(script, tmp_path):
     env = mtjax.make("metaworld-window-open+metaworld-reach", num_draws=2)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from dm_control.suite import swimmer
+from needs import require
 
 from mtjax import envs
 from mtjax.envs.dm_control import attitude, dog
@@ -17,6 +17,7 @@ from mtjax.types import InputError
 @pytest.mark.parametrize("links", [3, 10])
 def test_a_swimmer_may_have_any_number_of_links(links):
     """The links are those of dm_control's own swimmers: the same inertia in the same pose."""
+    swimmer = require("dm_control.suite.swimmer")
     ours, theirs = envs.make("swimmer-swimmer6", links=links).models[0], swimmer.swimmer(links).physics.model.ptr
     for field in ("body_mass", "body_pos", "body_inertia", "jnt_range", "jnt_pos", "dof_M0", "actuator_gear"):
         np.testing.assert_allclose(getattr(ours, field), getattr(theirs, field), rtol=1e-12)

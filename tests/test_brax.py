@@ -12,13 +12,14 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from needs import require
 
 import mtjax.envs.brax as adapter
 from mtjax.envs.brax import BACKENDS, NAMES, Brax, BraxAntDirection, BraxHalfcheetahSpeed
 from mtjax.envs.parameters import FRICTION, GRAVITY, MASS
 from mtjax.types import InputError
 
-pytest.importorskip("brax")
+require("brax")
 
 STEPS = 20
 slow = pytest.mark.slow  # an ant or a half-cheetah takes a minute to compile; pendulums stand for them by default

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from dm_control import suite
+from needs import require
 
 from mtjax.envs.dm_control import cheetah
 from mtjax.envs.dm_control.cheetah import CheetahDirection, CheetahRun, CheetahSpeed
@@ -31,7 +31,7 @@ def test_shapes_change_where_the_weight_is_and_not_how_much(shape):
 
 def test_settled_states_are_those_of_dm_control():
     """From the same poses the same states after the same 200 steps, as far as chaos lets last bits pass."""
-    physics = suite.load("cheetah", "run").physics
+    physics = require("dm_control.suite").load("cheetah", "run").physics
     limited = physics.model.jnt_limited.astype(bool)
     states = cheetah._settle(CheetahRun().models * 16, np.random.default_rng(0))
     poses, expected = np.random.default_rng(0).uniform(*physics.model.jnt_range[limited].T, (16, 6)), []

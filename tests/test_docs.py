@@ -1,6 +1,5 @@
 """The documentation: its links, its names and commands, and the site that is built from it."""
 
-import importlib.util
 import json
 import re
 import shlex
@@ -9,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from needs import needs
 
 from mtjax.agents import AGENTS
 from mtjax.cli import parse
@@ -21,7 +21,6 @@ MADE = {
     *(ROOT / "docs" / "families" / f"{name}.md" for name in ["index", *ENVS]),
     *(ROOT / "docs" / "agents" / f"{name}.md" for name in ["index", *AGENTS]),
 }
-NEEDED = ("mkdocs", "material", "mkdocstrings", "mkdocstrings_handlers")
 
 
 def identify(page: Path) -> str:
@@ -98,11 +97,12 @@ def test_pages_of_families_name_their_reward(hooks):
 
 
 @pytest.mark.slow
+@needs("mkdocs")
+@needs("material")
+@needs("mkdocstrings")
+@needs("mkdocstrings_handlers")
 def test_site_builds_without_a_broken_link(tmp_path):
     """Strict, so that a link or an anchor that leads nowhere is an error; with a page for every family and agent."""
-    missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
-    if missing:
-        pytest.skip(f"needs the extra docs: {', '.join(missing)} is not installed")
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -8,13 +8,14 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from dm_control import suite
+from needs import require
 from probes import slow_but
 
 from mtjax import envs
 from mtjax.envs.domain import Domain
 from mtjax.envs.engines.base import World
 
+suite = require("dm_control.suite")
 TASKS = {
     "acrobot": ("swingup", "swingup_sparse"),
     "ball_in_cup": ("catch",),

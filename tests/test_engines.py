@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from needs import needs
 from probes import quick, slow_but
 
 from mtjax import envs
@@ -187,9 +188,9 @@ def test_mjx_steps_as_c_does(name):
 
 @SLOW
 @pytest.mark.parametrize("name", ALIKE)
+@needs("warp")
 def test_warp_steps_as_c_does(name):
     """Under a map of a map, which picks every world's own model."""
-    pytest.importorskip("warp")
     from mtjax.envs.engines.warp import Warp
 
     play, mjx = played(name), family(name, engine="mjx", solver_iterations=50).mjx
@@ -314,9 +315,10 @@ def test_warp_is_refused_where_it_cannot_run(monkeypatch):
 
 
 @pytest.mark.slow
+@needs("warp")
 def test_warp_compiles_all_kernels_of_a_step_before_it(monkeypatch, tmp_path):
     """With contacts, a loop over solver iterations, and launches of another thread meanwhile."""
-    warp = pytest.importorskip("warp")
+    import warp
     from mujoco.mjx.third_party import mujoco_warp
 
     from mtjax.envs.engines.kernels import compile_kernels, note_kernels
@@ -346,9 +348,9 @@ def test_warp_compiles_all_kernels_of_a_step_before_it(monkeypatch, tmp_path):
     assert np.all(place.data.time.numpy() > 0)
 
 
+@needs("warp")
 def test_warp_compiles_kernels_while_programs_are_traced(monkeypatch):
     """To note which kernels there are keeps others from making a place, but not from using one."""
-    pytest.importorskip("warp")
     from mtjax.envs.engines import warp as engines
 
     engine, compiled = engines.Warp(envs.make("hopper-stand", engine="mjx").mjx.base, 1), []
@@ -367,9 +369,9 @@ def test_warp_compiles_kernels_while_programs_are_traced(monkeypatch):
         assert can_provide(3)
 
 
+@needs("warp")
 def test_warp_refuses_tasks_that_differ_in_the_size_of_sites():
     """Warp holds one value of it for all worlds."""
-    pytest.importorskip("warp")
     from mtjax.envs.engines.warp import Warp
 
     env = envs.make("finger-spin-vary-touch-size", engine="mjx")

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from needs import require
 from probes import FEW, pick, slow_but, tiny
 
 import mtjax
@@ -53,7 +54,7 @@ CASES = {name: {} for name in agents.AGENTS} | {
 def test_all_forms_act_as_the_policy(name, tmp_path):
     """On tasks that trained and on others, whose context and nearest task are found inside."""
     if name == "text":
-        pytest.importorskip("sklearn")
+        require("sklearn")
     given = CASES[name]
     policy = policy_of(tiny(name if name in agents.AGENTS else "sac", **given), TIES)
     file = mtjax.export(policy, tmp_path / "policy.npz")
@@ -144,8 +145,8 @@ def test_a_policy_that_reads_no_parameter_needs_none(tmp_path):
 
 def assert_onnx_acts(policy, file, obs, sizes, expected):
     """By ONNX's own runtime, which knows nothing of this package."""
-    pytest.importorskip("onnx")
-    runtime = pytest.importorskip("onnxruntime")
+    require("onnx")
+    runtime = require("onnxruntime")
     session = runtime.InferenceSession(mtjax.export(policy, file))
     known = {put.name for put in session.get_inputs()}
     for x, size, action in zip(obs, sizes, expected, strict=True):

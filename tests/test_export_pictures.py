@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from needs import require
 from probes import slow_but, tiny
 from test_export import policy_of
 
@@ -35,7 +36,7 @@ def episode(env):
 
 def by_onnx(file, obs, hue):
     """The actions of ONNX's own runtime, and the names of the model's inputs."""
-    session = pytest.importorskip("onnxruntime").InferenceSession(file)
+    session = require("onnxruntime").InferenceSession(file)
     names = [put.name for put in session.get_inputs()]
     given = lambda i: {name: obs[name][i] for name in names if name in obs} | {"parameters": np.float32([hue])}
     count = len(obs["pixels"])
@@ -63,7 +64,7 @@ def test_every_form_acts_as_the_policy(name, tmp_path):
     policy, obs = policy_of(tiny(agent, **settings), env), episode(env)
     file = mtjax.export(policy, tmp_path / "policy.npz")
     by_numpy, by_jax = standalone.load(file), standalone.load_jax(file)
-    pytest.importorskip("onnx")
+    require("onnx")
     model = mtjax.export(policy, tmp_path / "policy.onnx")
     taken = {name: obs[name] for name in by_numpy.meta["obs"]}
     assert set(taken) == ({"pixels"} if name == "asymmetric" else set(env.spec.obs))
@@ -115,7 +116,7 @@ def test_parameters_that_are_not_read_may_be_left_out(file, tmp_path):
     np.testing.assert_array_equal(policy(obs), policy(obs, hue=100.0))
     with pytest.raises(ValueError, match=r"give the task's parameters \['hue'\], not \['light'\]"):
         policy(obs, light=1.0)
-    pytest.importorskip("onnx")
+    require("onnx")
     model = mtjax.export(policy_of(tiny("drq", conditioning="none"), BESIDE), tmp_path / "x.onnx")
     assert by_onnx(model, episode(BESIDE), 0.0)[1] == {"pixels", "state"}
 
@@ -194,8 +195,8 @@ def test_convolutions_and_pooling_are_those_of_jax(name, tmp_path):
     reader = standalone.Policy.__new__(standalone.Policy)
     reader.program, reader.constants = json.loads(json.dumps(program)), constants
     np.testing.assert_allclose(reader._run(x), expected, atol=1e-4)
-    pytest.importorskip("onnx")
-    runtime = pytest.importorskip("onnxruntime")
+    require("onnx")
+    runtime = require("onnxruntime")
     meta = {"agent": "one", "env": "none", "about": "", "action_size": expected.size}
     onnx.write(program, constants, {"x": jax.ShapeDtypeStruct(shape, jnp.float32)}, meta, tmp_path / "x.onnx")
     (found,) = runtime.InferenceSession(tmp_path / "x.onnx").run(["action"], {"x": x})

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from dm_control.suite import finger as suite_module
+from needs import require
 
 from mtjax import envs
 from mtjax.envs.dm_control.finger import FingerSpin, FingerTurn, FingerTurnTarget
@@ -50,10 +50,11 @@ def sizes():
 @pytest.fixture(scope="module")
 def suite_starts(suite_finger):
     """Start positions as dm_control draws them."""
+    joints = require("dm_control.suite.finger")
     random, physics = np.random.RandomState(3), suite_finger.physics
     starts = np.empty((3000, 3))
     for start in starts:
-        suite_module._set_random_joint_angles(physics, random)
+        joints._set_random_joint_angles(physics, random)
         start[:] = physics.data.qpos
     return starts
 

@@ -8,9 +8,11 @@ import json
 import math
 import string
 
-import hypothesis.strategies as st
 import pytest
 from conftest import SHORT_RUN
+from needs import require
+
+st = require("hypothesis.strategies")
 from hypothesis import HealthCheck, given, settings
 
 from mtjax import cli, commands, flag_files

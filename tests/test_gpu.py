@@ -18,7 +18,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from probes import random_batch, with_metaworld
+from needs import needs
+from probes import random_batch
 from test_joined import require_as_alone
 from test_kills import outcome
 from test_painters import SIZE, similarity, states_of
@@ -152,7 +153,7 @@ def played(env, count=64, steps=40):
 # What takes longest.
 
 
-@with_metaworld
+@needs("metaworld")
 @pytest.mark.parametrize("name", ["mt50", "mt10"])
 def test_worlds_of_a_union_go_on_on_warp_as_on_c(name, count=16, steps=30):
     """One step, from worlds in which MuJoCo has played at random in each task's own scene."""
@@ -383,7 +384,7 @@ def test_engines_step_as_mujoco_does(name, engine):
 
 
 @pytest.mark.parametrize(
-    "name", [*BODIES, *(pytest.param(f"metaworld-{name}", marks=with_metaworld) for name in SCENES)]
+    "name", [*BODIES, *(pytest.param(f"metaworld-{name}", marks=needs("metaworld")) for name in SCENES)]
 )
 def test_worlds_go_on_on_warp_as_on_c(name, count=64, steps=30):
     """One step, from worlds in which MuJoCo has played at random: all that a world holds is taken over."""
@@ -408,7 +409,7 @@ def test_worlds_go_on_on_warp_as_on_c(name, count=64, steps=30):
         np.testing.assert_allclose(np.asarray(one, float), np.asarray(other, float), atol=1e-5)
 
 
-@with_metaworld
+@needs("metaworld")
 @pytest.mark.parametrize(
     "names, kind",
     [

@@ -9,11 +9,13 @@ import re
 import sys
 from pathlib import Path
 
-import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from needs import require
+
+gymnasium = require("gymnasium")
 from gymnasium import spaces
 from gymnasium.utils import seeding
 from gymnasium.utils.env_checker import check_env

@@ -4,8 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from dm_control.mujoco import wrapper
-from dm_control.suite import common
+from needs import require
 
 from mtjax import envs
 
@@ -56,6 +55,7 @@ def differing(ours, theirs):
 def test_tasks_are_the_published_ones_in_their_order(name):
     """The compiled models of the first, second, sixth and last task agree in every field of the dynamics."""
     file, pattern, edited = PUBLISHED[name]
+    common, wrapper = require("dm_control.suite.common"), require("dm_control.mujoco.wrapper")
     models, original = envs.make(name, split="none").models, common.read_model(file).decode()
     assert len(models) == 10
     for i in (0, 1, 5, 9):

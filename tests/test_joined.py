@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import with_metaworld as with_scenes
+from needs import needs
 
 import mtjax
 from mtjax.envs.joined import Alone, Joined
@@ -93,7 +93,7 @@ def test_settings_of_physics_keep_families_apart():
     ]
 
 
-@with_scenes
+@needs("metaworld")
 def test_meta_worlds_tasks_of_one_scene_step_together():
     """Goals move the window in both. One split has a task of the second family alone."""
     settings = {"num_draws": 2, "engine": "c"}
@@ -103,7 +103,7 @@ def test_meta_worlds_tasks_of_one_scene_step_together():
     require_as_alone(mtjax.mixture([windows[0], held]), "extrapolation")
 
 
-@with_scenes
+@needs("metaworld")
 def test_ten_tasks_of_meta_world_are_six_simulators():
     assert members(mtjax.make("mt10", num_draws=1, engine="c")) == [
         ["reach", "push", "pick-place"],
@@ -116,19 +116,17 @@ def test_ten_tasks_of_meta_world_are_six_simulators():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ["mjx", "warp"])
+@pytest.mark.parametrize("engine", ["mjx", pytest.param("warp", marks=needs("warp"))])
 def test_families_step_together_on_every_engine(engine):
-    if engine == "warp":
-        pytest.importorskip("warp")
     env = mtjax.mixture([mtjax.make(name, vary, engine=engine) for name, vary in PENDULUMS.items()])
     assert len(env.groups) == 1
     require_as_alone(env, atol=1e-5)
 
 
-@with_scenes
+@needs("metaworld")
 @pytest.mark.slow
+@needs("warp")
 def test_meta_world_steps_together_on_warp():
-    pytest.importorskip("warp")
     settings = {"num_draws": 2, "engine": "warp"}
     env = mtjax.mixture([mtjax.make(f"metaworld-{name}", **settings) for name in ("reach", "push", "pick-place")])
     assert len(env.groups) == 1 and jnp.size(env.tasks().id) == 3

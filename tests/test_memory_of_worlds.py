@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from needs import needs
 
 from mtjax.envs.domain import stack_differing
 from mtjax.envs.engines.base import World, at_rest
@@ -104,8 +105,8 @@ def test_mjx_steps_as_c_does(model, task, start, ctrl):
 
 
 @pytest.mark.slow
+@needs("warp")
 def test_warp_steps_as_c_does(model, task, start, ctrl):
-    pytest.importorskip("warp")
     from mtjax.envs.engines.warp import Warp
 
     agree(Warp(model, SUBSTEPS), model, task, start, ctrl)
@@ -123,11 +124,9 @@ FLOORS = """
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["c", "mjx", "warp"])
+@pytest.mark.parametrize("name", ["c", "mjx", pytest.param("warp", marks=needs("warp"))])
 def test_things_rest_on_the_floor_of_their_own_task(name):
     """Bodies that are fixed to the world collide where each task has them: a ball falls half a metre, or none."""
-    if name == "warp":
-        pytest.importorskip("warp")
     models = [mujoco.MjModel.from_xml_string(FLOORS) for _ in range(2)]
     models[1].body("floor").pos[2] = 0.47
     task = Task(*[jnp.arange(2)] * 2, jnp.zeros((2, 1)), {}, stack_differing(models), {}, jnp.full(2, 10))  # type: ignore

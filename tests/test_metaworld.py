@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import with_metaworld as with_scenes
+from needs import needs
 
 import mtjax
 from mtjax import cli
@@ -50,7 +50,7 @@ def begin(env):
     return tasks, jax.jit(jax.vmap(env.reset))(tasks, jax.random.split(jax.random.key(0), len(tasks.id)))
 
 
-@with_scenes
+@needs("metaworld")
 @one_or_all
 def test_a_step_is_that_of_the_original(name):
     """From every recorded state: physics, observation, reward and success after one step.
@@ -79,7 +79,7 @@ def test_a_step_is_that_of_the_original(name):
     np.testing.assert_array_equal(after.metrics["success"], recorded["success"][before + 1])
 
 
-@with_scenes
+@needs("metaworld")
 def test_the_hand_follows_its_target_inside_the_box():
     """At most 0.01 m a step, and the gripper closes as the action says."""
     env, _ = made("push")
@@ -95,7 +95,7 @@ def test_the_hand_follows_its_target_inside_the_box():
     assert np.all(start.obs[:, 3] > 0.99) and np.all(opened < 0.3)
 
 
-@with_scenes
+@needs("metaworld")
 def test_a_fixed_body_that_is_moved_is_felt_where_it_is():
     """Two worlds press the place of the first one's button. The other's box is elsewhere."""
     env = mtjax.make("metaworld-button-press-topdown", num_draws=8, engine="c")
@@ -120,7 +120,7 @@ def test_a_fixed_body_that_is_moved_is_felt_where_it_is():
     assert success[0].any() and not success[1].any()
 
 
-@with_scenes
+@needs("metaworld")
 def test_goals_differ_by_the_seed_of_tasks_and_may_be_hidden():
     one, other = (mtjax.make("metaworld-reach", num_draws=3, task_seed=seed, engine="c") for seed in (0, 1))
     assert not np.intersect1d(one.vectors()[:, 3:], other.vectors()[:, 3:]).size
@@ -136,7 +136,7 @@ def test_goals_differ_by_the_seed_of_tasks_and_may_be_hidden():
     assert len({id(model) for model in one.models}) == 1  # nothing fixed is moved
 
 
-@with_scenes
+@needs("metaworld")
 @pytest.mark.parametrize("name, seed", [("mt10", 0), ("mt25", 1), ("mt50", 1), ("ml10", 3), ("ml45", 1)])
 def test_goals_are_those_of_the_originals_benchmark_for_a_seed(name, seed):
     """Number for number: the first and the last goal of every task, which depend on all that were drawn before."""
@@ -151,7 +151,7 @@ def test_goals_are_those_of_the_originals_benchmark_for_a_seed(name, seed):
         assert vectors.shape == (50, size) and not expected[:, size:].any()
 
 
-@with_scenes
+@needs("metaworld")
 def test_goals_of_a_task_alone_are_those_of_mt1():
     with np.load(DATA.parent / "metaworld-goals.npz") as file:
         alone, tasks_of_mt10 = file["push-3"][0], file["mt10-0"]
@@ -165,7 +165,7 @@ def test_goals_of_a_task_alone_are_those_of_mt1():
         mtjax.make("metaworld-soccer", benchmark="ml10")
 
 
-@with_scenes
+@needs("metaworld")
 def test_an_evaluation_may_draw_other_goals():
     """Those of ML1's test are of the next seed. Tasks keep their numbers, as their contexts are the same."""
     for name in ("metaworld-push", "metaworld-push+metaworld-reach"):
@@ -177,7 +177,7 @@ def test_an_evaluation_may_draw_other_goals():
         np.testing.assert_array_equal(again.id, env.tasks("all").id)
 
 
-@with_scenes
+@needs("metaworld")
 def test_refused_settings_are_named(monkeypatch):
     with pytest.raises(InputError, match="mjx"):
         mtjax.make("metaworld-reach", engine="mjx")
@@ -213,7 +213,7 @@ def test_benchmarks_have_the_tasks_of_the_original():
         assert [family.removeprefix("metaworld-") for family in own] == expected
 
 
-@with_scenes
+@needs("metaworld")
 def test_a_benchmark_is_a_mixture_by_a_name(tmp_path):
     """Its record is read back, its settings are each family's, and flags apply to all."""
     program = cli.parse(["--env=ml10", "--agent=sac-conditioned", "--env.num-draws=2", "--engine=c"])
@@ -229,7 +229,7 @@ def test_a_benchmark_is_a_mixture_by_a_name(tmp_path):
         mtjax.make("mt1O")
 
 
-@with_scenes
+@needs("metaworld")
 @pytest.mark.slow
 def test_held_out_tasks_are_evaluated_and_an_agent_learns(tmp_path):
     """A few steps of ml10, with success at the end and at any step of each task's episodes."""
@@ -256,12 +256,12 @@ def test_held_out_tasks_are_evaluated_and_an_agent_learns(tmp_path):
     assert "success, at any step" in table and table.splitlines()[1].split()[-1] == "1.00"
 
 
-@with_scenes
+@needs("metaworld")
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["pick-place", "peg-insert-side"])
+@needs("warp")
 def test_a_grip_holds_on_warp_as_on_c(name):
     """From recorded states in which the gripper is closed round a thing: the hand rises by ten centimetres."""
-    pytest.importorskip("warp")
     from mtjax.envs.engines.warp import Warp
 
     env, recorded = made(name)
@@ -282,7 +282,7 @@ def test_a_grip_holds_on_warp_as_on_c(name):
     assert np.mean(np.abs(found - exact).max(axis=1) < 5e-3) > 0.9
 
 
-@with_scenes
+@needs("metaworld")
 def test_films_show_meshes_and_things_where_the_goal_has_them():
     env, _ = made("drawer-close")
     physics, seen = env.models[2], env.scene_model(2)
@@ -297,11 +297,11 @@ def test_films_show_meshes_and_things_where_the_goal_has_them():
     assert seen.geom(name).group == 0 and name in env.hides
 
 
-@with_scenes
+@needs("metaworld")
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["push", "stick-push"])  # the second one feels forces
+@needs("warp")
 def test_physics_are_set_on_warp_as_on_c(name):
-    pytest.importorskip("warp")
     found = []
     for engine in ("c", "warp"):
         env = mtjax.make(f"metaworld-{name}", num_draws=1, engine=engine)
@@ -314,12 +314,12 @@ def test_physics_are_set_on_warp_as_on_c(name):
     np.testing.assert_allclose(other.obs, after.obs, atol=2e-3)
 
 
-@with_scenes
+@needs("metaworld")
 @pytest.mark.slow
 @pytest.mark.parametrize("speed", [1.0, np.nan])
+@needs("warp")
 def test_a_step_on_warp_depends_on_the_state_alone(speed):
     """And not on what was simulated in the same place before, or was lost there."""
-    pytest.importorskip("warp")
     env = mtjax.make("metaworld-peg-unplug-side", num_draws=1, engine="warp")
     task, step = jax.tree.map(lambda x: x[0], goals(env)), jax.jit(env.step)
     state, action = env.reset(task, jax.random.key(0)).state, jnp.array([0.5, 0.2, -0.3, 0.5])
@@ -329,11 +329,11 @@ def test_a_step_on_warp_depends_on_the_state_alone(speed):
     np.testing.assert_array_equal(step(task, state, action).obs, first.obs)
 
 
-@with_scenes
+@needs("metaworld")
 @pytest.mark.slow
+@needs("warp")
 def test_warp_draws_meshes(monkeypatch):
     """On a CPU, where only tests draw by Warp: the arm is red, and the drawer is where its goal has it."""
-    pytest.importorskip("warp")
     from mtjax.envs import pixels
     from mtjax.envs.painters.warp import WarpPainter
 

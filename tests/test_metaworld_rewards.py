@@ -3,7 +3,6 @@
 What is observed, rewarded and called success follows from recorded poses; starts are played again with the real scenes.
 """
 
-import importlib.util
 from importlib import import_module
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from needs import needs
 
 from mtjax.envs.engines.base import World
 from mtjax.envs.metaworld import names
@@ -20,7 +20,6 @@ from mtjax.envs.metaworld.host import Host
 FOLDER = Path(__file__).parent / "data" / "metaworld"
 QUICK = ("assembly", "bin-picking", "coffee-pull", "door-open", "reach")
 LOOSE = ("bin-picking", "door-close")  # a cube begins inside a wall, which throws it out; the hand still swings
-INSTALLED = importlib.util.find_spec("metaworld") is not None
 
 
 def find(place):
@@ -33,7 +32,6 @@ TASKS = {name: find(place) for name, place in names.TASKS.items()}
 quick_or_slow = pytest.mark.parametrize(
     "name", [pytest.param(x, marks=() if x in QUICK else pytest.mark.slow) for x in sorted(TASKS)]
 )
-with_scenes = pytest.mark.skipif(not INSTALLED, reason="Meta-World's scenes are not installed")
 
 
 def load(name):
@@ -83,7 +81,7 @@ def test_goals_are_drawn_and_the_hand_moves_in_the_boxes_of_the_original(name):
     assert all(task.allowed(vec) for vec in recorded["rand_vec"])
 
 
-@with_scenes
+@needs("metaworld")
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(TASKS))
 def test_episodes_begin_as_those_of_the_original(name):

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import probes
 import pytest
+from needs import needs
 from probes import OFF_POLICY, one_in, slow_but
 
 import mtjax
@@ -230,8 +231,10 @@ def test_what_makes_no_mixture_is_refused_with_the_reason(make_it, said):
         make_it()
 
 
+@needs("gymnasium")
 def test_gymnasium_and_fine_tuning_take_one_family():
-    gym = pytest.importorskip("mtjax.gym")
+    import mtjax.gym as gym
+
     with pytest.raises(InputError, match="one space of observations"):
         gym.make("bandit+control-acrobot")
     from mtjax.training.finetune import require_fit

@@ -4,6 +4,7 @@ import ast
 from pathlib import Path
 
 import pytest
+from needs import require
 
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 LARGEST = 200_000  # bytes, pictures included
@@ -12,7 +13,7 @@ LARGEST = 200_000  # bytes, pictures included
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_shows_its_results(path):
     """Every cell was run in order, without an error; a picture and a check of the conclusion are among them."""
-    nbformat = pytest.importorskip("nbformat")
+    nbformat = require("nbformat")
     notebook = nbformat.read(path, as_version=4)
     cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
     assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1))
@@ -29,8 +30,7 @@ def test_notebook_shows_its_results(path):
 @pytest.mark.filterwarnings("ignore")  # the kernel's own machinery, in this process, is not ours
 def test_notebook_runs(path):
     """Every cell executes as it stands, the check of the conclusion too."""
-    import nbformat
-    from nbclient import NotebookClient
-
-    notebook = nbformat.read(path, as_version=4)
-    NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(path.parent)}}).execute()
+    notebook = require("nbformat").read(path, as_version=4)
+    require("nbclient").NotebookClient(
+        notebook, timeout=600, resources={"metadata": {"path": str(path.parent)}}
+    ).execute()

@@ -5,7 +5,6 @@ import os
 import subprocess
 import sys
 from functools import lru_cache, partial
-from importlib.util import find_spec
 from pathlib import Path
 
 import jax
@@ -13,6 +12,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from needs import needs, require
 from PIL import Image
 
 import mtjax
@@ -142,7 +142,7 @@ def test_cameras_and_lights_are_those_of_dm_control(name):
     """In a state of play: places and directions, angles of view, and brightness. Targets have lights of their own."""
     title, eye = SUITE[name]
     domain, _, task = title.partition("-")
-    suite = pytest.importorskip("dm_control.suite")
+    suite = require("dm_control.suite")
     theirs = suite.load(domain, task.replace("-", "_"), {"random": 0}).physics
     model = mtjax.make(name, engine="c").scene_model(0)
     data = mujoco.MjData(model)
@@ -295,7 +295,7 @@ def test_a_shape_that_the_caster_does_not_know_is_refused():
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(find_spec("warp") is None, reason="Warp is not installed")
+@needs("warp")
 @pytest.mark.parametrize("name", ["finger-turn-easy", "swimmer-swimmer6"])
 def test_warp_draws_what_the_caster_draws(name):
     """On a CPU, where Warp is slow; nested maps, tasks with colours and cameras of their own, a light that moves."""

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from probes import METAWORLD, with_metaworld
+from needs import needs
+from probes import METAWORLD
 
 import mtjax
 from mtjax.agents.parts import vision
@@ -187,7 +188,7 @@ def test_every_family_that_can_be_seen_has_a_scene(family):
     [
         ("brax-ant", {"pixels": 64}, "no scene to draw, which pixels needs; take a family such as cheetah-run"),
         ("tabular-mdp", {"repeat": 2}, "no scene to draw, which repeat needs"),
-        pytest.param("metaworld-reach", {"pixels": 64}, "leave out --env.pixels", marks=with_metaworld),
+        pytest.param("metaworld-reach", {"pixels": 64}, "leave out --env.pixels", marks=needs("metaworld")),
         ("finger-spin", {"pixels": 63}, "an even number from 16 to 512, not 63"),
         ("finger-spin", {"pixels": 8}, "an even number from 16"),
         ("finger-spin", {"frames": 0}, "frames must be from 1 to 16"),
@@ -212,8 +213,10 @@ def test_agents_of_vectors_and_hindsight_refuse_pictures():
 
 
 @pytest.mark.slow
+@needs("gymnasium")
 def test_gymnasium_shows_stacks():
-    gym = pytest.importorskip("mtjax.gym")
+    import mtjax.gym as gym
+
     env = gym.make("pendulum-swingup", pixels=SIZE, engine="c", repeat=4)
     obs, _ = env.reset(seed=0)
     assert obs["env_obs"].shape == (SIZE, SIZE, 9) and env.observation_space.contains(obs)

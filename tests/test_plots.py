@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+from needs import needs
 
 import mtjax
 import mtjax.plot
@@ -228,9 +229,9 @@ def test_a_folder_of_runs_is_told_how_to_give_them(runs):
         mtjax.plot.main([folder])
 
 
+@needs("pandas")
 def test_runs_are_tables(runs, make_run):
     """A row for each seed, evaluation and task, with the task's parameter."""
-    pytest.importorskip("pandas")
     table = mtjax.runs(runs)
     assert list(table.columns[:8]) == ["run", "env", "agent", "seed", "steps", "split", "task", "size"]
     (one,) = collect.learned(make_run("z", "finger-spin-vary-size", "film"))
@@ -241,9 +242,9 @@ def test_runs_are_tables(runs, make_run):
     assert len(mine) == 3 * 3 * 23
 
 
+@needs("pandas")
 def test_a_result_is_a_table(make_run):
     """As is its folder, and the lines of its metrics."""
-    pytest.importorskip("pandas")
     from mtjax.evaluation import load_evaluations
     from mtjax.training.result import Result
 

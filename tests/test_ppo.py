@@ -8,9 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import TELLING, Walk, mean_actions, of_task, one_in, only_seed, pick, quick, random_past, tiny, train
+from probes import Walk, mean_actions, of_task, one_in, only_seed, pick, quick, random_past, tiny, train
 
 from mtjax import agents, normalize
+from mtjax.agents.base import CONDITIONINGS
 from mtjax.agents.parts.encoders import ENCODERS
 from mtjax.agents.parts.gradients.surgery import RULES
 from mtjax.agents.parts.samplers import SAMPLERS
@@ -444,7 +445,7 @@ def pairs(**choices):
 
 
 COMBINED = pairs(
-    conditioning=TELLING,
+    conditioning=CONDITIONINGS,
     encoder=list(ENCODERS),
     heads=["shared", "per-task", "disjoint"],
     gradients=list(RULES),
@@ -470,7 +471,7 @@ COMBINED = [row for row in COMBINED if allowed(row)]
 def test_most_combinations_are_allowed():
     assert len(COMBINED) > 50
     encoders = set(ENCODERS) - {"batch-norm"}  # whose statistics PPO does not keep
-    for kind, table in (("encoder", encoders), ("gradients", RULES), ("conditioning", TELLING)):
+    for kind, table in (("encoder", encoders), ("gradients", RULES), ("conditioning", CONDITIONINGS)):
         assert {row[kind] for row in COMBINED if kind in row} == set(table)
 
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import SHORT_RUN
-from probes import FEW, INSTALLED, METAWORLD, slow_but
+from probes import FEW, METAWORLD, param, slow_but
 
 import mtjax
 import mtjax.evaluate
@@ -34,7 +34,6 @@ STEPS = 200
 alike = lambda cls: (cls.__module__, cls.start, cls.observe) if issubclass(cls, Domain) else cls
 FIRST = {alike(cls): name for name, (cls, _) in reversed(list(ENVS.items()))}.values()
 QUICK = [name for name in FIRST if name in FEW and not name.startswith("brax-")]  # Brax's take ten seconds each
-NAMES = [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow]) for name in INSTALLED]
 
 
 def ends(env):
@@ -58,7 +57,7 @@ def play(env, tasks, keys):
     return start, *jax.lax.scan(step, start.state, jnp.arange(STEPS))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", slow_but(ENVS, *QUICK))
 def test_family_steps_at_the_ends_of_its_range(name):
     """200 random steps: sizes as declared, all finite until an episode ends, starts that differ, and the same again."""
     env = mtjax.make(name)
@@ -79,9 +78,7 @@ def test_family_steps_at_the_ends_of_its_range(name):
         np.testing.assert_array_equal(plain(one), plain(other))  # after its end a world may be anything, but the same
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[] if name in FEW else [pytest.mark.slow]) for name in INSTALLED]
-)
+@pytest.mark.parametrize("name", slow_but(ENVS, *FEW))
 def test_family_round_trips_its_tasks(name):
     """A task is found again by its number, has its own name, and is unlike every other of its family."""
     env = mtjax.make(name)
@@ -316,7 +313,9 @@ def test_every_family_of_brax_passes_the_check(name):
     declared.check(mtjax.make(name))
 
 
-@pytest.mark.parametrize("name", [name for name in QUICK if name not in METAWORLD])  # whose model is no file of ours
+@pytest.mark.parametrize(
+    "name", [param(name) for name in QUICK if name not in METAWORLD]
+)  # whose model is no file of ours
 def test_every_family_of_the_package_passes_the_check(name):
     """So that the check asks for nothing that a family need not have."""
     declared.check(mtjax.make(name))

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from needs import require
 from probes import pick, tasks_of, tiny
 
 import mtjax
@@ -21,7 +22,7 @@ SPEC = Spec.vector(3, 2, 1)._replace(sentences=("Walk.", "Run.", "Walk with size
 
 @pytest.fixture
 def hashing():
-    pytest.importorskip("sklearn")
+    require("sklearn")
     return lambda *said: sentences.encode("hashing", said)
 
 

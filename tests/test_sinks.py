@@ -5,6 +5,7 @@ import sys
 import types
 
 import pytest
+from needs import needs
 
 import mtjax
 from mtjax.training import sinks
@@ -62,9 +63,9 @@ def test_every_number_is_logged_at_its_step(library, given, short_family, tmp_pa
     assert scores == pytest.approx(result.evaluations.returns["train"][1].mean(axis=(1, 2)), rel=1e-5)
 
 
+@needs("tensorboardX")
 def test_tensorboard_writes_files_that_its_reader_reads(tmp_path):
     """By the real library."""
-    pytest.importorskip("tensorboardX")
     found = sinks.open_sinks(tmp_path, True, "", 0, {})
     row = {"seed": 0, "steps": 5, "return": "2.5", "loss": "", "td_error_0": "1", "td_error_12": "2"}
     sinks.write_rows(found, [row], ["seed-0"])
@@ -75,9 +76,9 @@ def test_tensorboard_writes_files_that_its_reader_reads(tmp_path):
 
 
 @pytest.mark.slow
+@needs("wandb")
 def test_wandb_logs_offline(tmp_path, monkeypatch):
     """By the real library, without a network."""
-    pytest.importorskip("wandb")
     monkeypatch.setenv("WANDB_MODE", "offline")
     found = sinks.open_sinks(tmp_path, False, "project", 0, {"steps": 5})
     rows = [{"seed": seed, "steps": 5, "return": "2.5"} for seed in range(2)]

@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 from mujoco import mjx
-from probes import FEW, INSTALLED
+from probes import FEW, param
 
 import mtjax
 from mtjax import cli, commands, names, train, xla_flags
@@ -135,7 +135,10 @@ def test_devices_are_found_while_the_rest_is_imported(monkeypatch):
     assert answered.wait(60) and waited == [True]
 
 
-@pytest.mark.parametrize("env, agent", [(env, "sac") for env in FEW] + [("finger-spin", agent) for agent in AGENTS])
+PAIRS = [*((env, "sac") for env in FEW), *(("finger-spin", agent) for agent in AGENTS)]
+
+
+@pytest.mark.parametrize("env, agent", map(param, PAIRS))
 def test_no_flag_is_refused_that_there_is(env, agent, ours):
     """Of any family or agent, before either is known."""
     flags = cli.flags(with_preset(env, agent, "cpu"))
@@ -180,7 +183,7 @@ def test_a_class_of_the_users_own_may_have_any_flag(ours, monkeypatch):
     commands.check_flags(["--env.springiness=3"])
 
 
-@pytest.mark.parametrize("name", INSTALLED)
+@pytest.mark.parametrize("name", map(param, ENVS))
 def test_outline_is_what_the_family_says(name):
     """Tasks are counted without its class, and the sentence is read without running its file."""
     count, says = outline(name)

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from needs import needs
 from probes import QUICK
-from probes import with_metaworld as with_scenes
 from test_joined import members, played, require_as_alone
 from test_metaworld import made
 
@@ -51,7 +51,7 @@ def make(*names, held_out=(), **settings):
 # What is united.
 
 
-@with_scenes
+@needs("metaworld")
 def test_the_setting_decides_how_many_simulators_there_are():
     env = mtjax.make("mt10", num_draws=1, engine="c")
     groups_of = lambda scenes: [type(group) for group in dataclasses.replace(env, scenes=scenes).groups]
@@ -61,7 +61,7 @@ def test_the_setting_decides_how_many_simulators_there_are():
     assert (whole.nv, whole.nu, whole.neq, whole.nmocap) == (25, 2, 1, 1)  # the arm's 9, two free things, four hinges
 
 
-@with_scenes
+@needs("metaworld")
 def test_unions_have_room_for_so_many_degrees_of_freedom(monkeypatch):
     """Each of these has one beyond the arm's nine, or six. Tasks of one scene stay together."""
     names = ("door-open", "drawer-open", "push", "window-open", "drawer-close")
@@ -72,7 +72,7 @@ def test_unions_have_room_for_so_many_degrees_of_freedom(monkeypatch):
     assert [type(group) for group in env.groups] == [United, Alone, Alone]
 
 
-@with_scenes
+@needs("metaworld")
 def test_what_cannot_be_united_goes_its_own_way():
     """Other settings of physics, more than one step at a time, and domains whose scenes are no scenes of things."""
     family = partial(mtjax.make, num_draws=1, engine="c")
@@ -130,7 +130,7 @@ def test_scenes_is_a_setting_of_mixtures(tmp_path):
 # How it steps.
 
 
-@with_scenes
+@needs("metaworld")
 @small_and_large
 def test_a_step_is_that_of_the_own_scene(names, count=24):
     """From recorded states of scripted play, with both goals: all that worlds hold, observation, reward and success."""
@@ -168,7 +168,7 @@ def test_a_step_is_that_of_the_own_scene(names, count=24):
     assert same > 0.9, same
 
 
-@with_scenes
+@needs("metaworld")
 @small_and_large
 def test_parked_things_touch_nothing_and_are_far_in_every_row(names):
     """As episodes begin, and after a control step in which nothing holds the parked ones."""
@@ -200,7 +200,7 @@ def require_parked(model, data, used):
     assert away.min() > APART
 
 
-@with_scenes
+@needs("metaworld")
 def test_held_out_tasks_step_in_the_union_as_alone():
     """A split has tasks of some families, in a union with others."""
     names, held_out = ("push", "door-open", "drawer-close", "window-open"), ("door-open", "window-open")
@@ -223,7 +223,7 @@ class Waving:
         return Acted(jax.random.uniform(key, (4,), minval=-1.0), None, memory)
 
 
-@with_scenes
+@needs("metaworld")
 def test_episodes_begin_anew_in_the_union_as_in_joined_scenes(steps=4, worlds=3):
     """Goals differ between worlds, and every world's episode ends once, each at another step."""
     found, agent, learners = [], Waving(), jnp.zeros(1)
@@ -254,11 +254,11 @@ def test_episodes_begin_anew_in_the_union_as_in_joined_scenes(steps=4, worlds=3)
     assert np.all(np.ptp(targets, axis=(0, 3)).max(-1) > 0)
 
 
-@with_scenes
+@needs("metaworld")
 @pytest.mark.slow
+@needs("warp")
 def test_the_union_steps_on_warp_as_joined_scenes_do():
     """By default there. Warp solves to less than C does, so a thing that slips is 1e-5 m off."""
-    pytest.importorskip("warp")
     env = mtjax.make("mt10", num_draws=2, engine="warp")
     assert [type(group) for group in env.groups] == [United] and env.groups[0].outside in env._outside
     own, found = (played(mixture, "train") for mixture in (dataclasses.replace(env, scenes="joined"), env))
