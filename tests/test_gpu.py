@@ -23,6 +23,7 @@ from probes import random_batch
 from test_joined import require_as_alone
 from test_kills import outcome
 from test_painters import SIZE, similarity, states_of
+from test_rocking import ROCKING, tilting
 
 import mtjax
 from mtjax import loop, rollout
@@ -156,7 +157,13 @@ def played(env, count=64, steps=40):
 @needs("metaworld")
 @pytest.mark.parametrize("name", ["mt50", "mt10"])
 def test_worlds_of_a_union_go_on_on_warp_as_on_c(name, count=16, steps=30):
-    """One step, from worlds in which MuJoCo has played at random in each task's own scene."""
+    """One step, from worlds in which MuJoCo has played at random in each task's own scene.
+
+    All velocities have a bound of 1e-3 but those by which a thing rocks. A puck on its flat side touches the table in
+    one point of its rim, and Warp's contact normals, in single precision, are off by up to 1e-4 rad. MuJoCo itself,
+    with a normal that is off by so much, rocks the puck otherwise by a median of 1.4 to 2.0 % of the largest velocity
+    (``test_rocking.py``). The bound of medians is below that.
+    """
     env = mtjax.make(name, engine="warp", num_draws=count, solver_iterations=50)
     assert {type(group) for group in env.groups} == {United}
     exact = mtjax.mixture([exactly(family) for family in env.families], scenes="apart")
@@ -177,19 +184,10 @@ def test_worlds_of_a_union_go_on_on_warp_as_on_c(name, count=16, steps=30):
         error = np.abs(ours.qvel - theirs.qvel) / np.abs(theirs.qvel).max()
         errors.append(error.max(axis=-1))
         steady.append(np.delete(error, tilting(family.models[0]), axis=-1).max(axis=-1))
-    for found_errors, median, nine_in_ten in ((steady, 1e-3, 1e-3), (errors, 1e-2, 5e-2)):
+    for found_errors, median, nine_in_ten in ((steady, 1e-3, 1e-3), (errors, ROCKING, 5e-2)):
         middle = sorted(zip(map(np.median, found_errors), env.names, strict=True), reverse=True)
         assert middle[0][0] < median and np.quantile(found_errors, 0.9) < nine_in_ten, middle[:5]
     assert np.quantile(np.abs(found.obs - expected.obs), 0.9) < 1e-3
-
-
-def tilting(model):
-    """The degrees of freedom by which free things tilt, if their own axis z stands upright.
-
-    A puck on its flat side rocks on one point of its rim. Contact normals, off by 1e-4 rad, do not say which it is.
-    """
-    free = model.jnt_dofadr[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
-    return np.concatenate([free + 3, free + 4])
 
 
 def test_a_mixture_steps_as_its_families(sizes=(512, 64)):
