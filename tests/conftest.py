@@ -14,7 +14,6 @@ import pytest
 from needs import count_skips, require, skip_without_packages
 
 import mtjax.train
-from mtjax import xla_flags
 from mtjax.envs import ENVS
 from mtjax.envs.dm_control.finger import FingerSpin
 
@@ -46,8 +45,13 @@ def pytest_configure(config):
 
 
 def use_gpu(config):
-    """Compile programs as commands do, share the GPU's memory, and give every worker one test after another."""
-    xla_flags.try_few_tilings()
+    """Share a GPU: take memory as it is needed, do not tune, and give every worker one test after another.
+
+    Tuning tries out dozens of kernels for each matrix product, which takes minutes on a GPU that all workers use. XLA
+    compares those kernels with each other by itself. The wrong fusion that these tests once found was wrong either way.
+    """
+    if "xla_gpu_autotune_level" not in os.environ.get("XLA_FLAGS", ""):
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_gpu_autotune_level=0".strip()
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     config.option.dist, config.option.maxschedchunk = "load", 1
     if not hasattr(config, "workerinput"):
