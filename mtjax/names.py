@@ -137,7 +137,8 @@ def become(module: str, place: str) -> None:
         place: the function, as for ``load``.
     """
     held, function = vars(sys.modules[module]), load(place)
-    vars(function).update({name: held[name] for name in held if not name.startswith("_") or name == "__spec__"})
+    kept = ("__spec__", "__file__")  # by which Python finds the source of what is defined there
+    vars(function).update({name: held[name] for name in held if not name.startswith("_") or name in kept})
     sys.modules[module] = function
 
 

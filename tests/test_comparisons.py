@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
+from needs import require
 
 FOLDER = Path(__file__).parent.parent / "benchmarks"
 _SCRIPT = """
@@ -152,7 +153,7 @@ def test_scaling_has_a_row_for_every_result_and_begins_parts_with_their_settings
 
 def test_playground_has_a_second_row_where_its_substeps_differ(module):
     """At the length of ours."""
-    pytest.importorskip("mujoco_playground")
+    require("mujoco_playground")
     steps = module("steps_per_second")
     own = steps.Physics(2, 0.01, "euler")
     default, ours = steps.playground_physics("FingerSpin", own)

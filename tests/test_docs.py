@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from needs import needs
+from needs import needs, require
 
 from mtjax.agents import AGENTS
 from mtjax.cli import parse
@@ -67,7 +67,7 @@ def test_examples_in_the_pages_exist():
 @pytest.fixture(scope="module")
 def hooks():
     """Return the module that makes pages of the site."""
-    pytest.importorskip("mkdocs", reason="needs the extra docs")
+    require("mkdocs")
     spec = importlib.util.spec_from_file_location("hooks", ROOT / "docs" / "hooks.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from needs import needs
+from needs import needs, require
 from probes import quick, slow_but
 
 from mtjax import envs
@@ -445,7 +445,7 @@ def test_equal_engines_are_one_until_the_last_is_gone():
 @pytest.mark.slow
 def test_programs_of_warp_run_after_their_families_are_gone():
     """Ten families, each in two copies that are one engine; and nothing is left after the programs."""
-    pytest.importorskip("warp")
+    require("warp")
 
     def swing(env, torque):
         task = jax.tree.map(lambda x: x[0], env.tasks())

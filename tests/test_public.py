@@ -12,6 +12,7 @@ import jax
 import numpy as np
 import pytest
 from conftest import ShortFinger
+from needs import require
 
 import mtjax
 from mtjax import report
@@ -143,7 +144,7 @@ def test_an_evaluation_is_that_of_the_command(result, found, tmp_path):
     main([f"--run={result.directory}", "--episodes=2"])
     with next(result.directory.glob("evaluation-*/returns.csv")).open() as file:
         rows = list(csv.DictReader(file))
-    pytest.importorskip("pandas")
+    require("pandas")
     table = found.frame()
     assert list(table.columns) == ["seed", "split", "task", "size", "episode", "return"]
     key = lambda split, size, seed, episode: (split, round(float(size), 6), int(seed), int(episode))

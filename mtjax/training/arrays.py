@@ -16,7 +16,7 @@ import jax.numpy as jnp
 
 from mtjax.types import InputError
 
-_HEADER = b"/zarr.json"  # ends the name of the entry that every array has, whatever its size
+_HEADER = re.compile(rb"(?:(.*)/)?zarr\.json")  # the entry of every array, by its name; a tree may be one array
 
 
 class Written:
@@ -90,7 +90,8 @@ def _difference(folder: Path, parts: Mapping[str, Any]) -> str:
     for part, tree in parts.items():
         try:
             entries, names = _entries(folder, part)
-            headers = {x.removesuffix(_HEADER).decode(): entries.read(x).result().value for x in names if _HEADER in x}
+            found = [match for match in map(_HEADER.fullmatch, names) if match]
+            headers = {(x[1] or b"").decode(): entries.read(x[0]).result().value for x in found}
             there = {array: tuple(json.loads(header)["shape"]) for array, header in headers.items()}
         except ValueError:
             return ""
@@ -129,7 +130,7 @@ def require_readable(folder: Path, parts: Mapping[str, Any]) -> None:
                 entries.read(name).result()
         except ValueError as error:
             raise _as_oserror(error, folder) from None
-        found, expected = sum(name.endswith(_HEADER) for name in names), len(jax.tree.leaves(tree))
+        found, expected = sum(map(bool, map(_HEADER.fullmatch, names))), len(jax.tree.leaves(tree))
         if found != expected:
             raise OSError(errno.EIO, f"{found} of {expected} arrays of {part} can be read back", str(folder))
 
