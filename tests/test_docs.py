@@ -1,5 +1,6 @@
 """The documentation: its links, its names and commands, and the site that is built from it."""
 
+import importlib.util
 import json
 import re
 import shlex
@@ -8,7 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from needs import needs, require
+from needs import needs
 
 from mtjax.agents import AGENTS
 from mtjax.cli import parse
@@ -67,7 +68,6 @@ def test_examples_in_the_pages_exist():
 @pytest.fixture(scope="module")
 def hooks():
     """Return the module that makes pages of the site."""
-    require("mkdocs")
     spec = importlib.util.spec_from_file_location("hooks", ROOT / "docs" / "hooks.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -75,6 +75,7 @@ def hooks():
     return module
 
 
+@needs("mkdocs")
 def test_items_of_a_docstring_stay_whole(hooks):
     """An item of a list goes on in the next line, indented or not, until its sentence ends."""
     items = ["Size: two blocks of", "4096.", "Rate: it falls to", "    5e-5.", "``C51`` says more."]
@@ -83,12 +84,14 @@ def test_items_of_a_docstring_stay_whole(hooks):
     assert made.splitlines()[4:] == [f"- {item}" for item in joined]
 
 
+@needs("mkdocs")
 def test_equation_below_a_sentence_is_code(hooks):
     """An indented equation is set apart, and an indented line that goes on with a label's text is not."""
     made = hooks.to_markdown("Learns.\n\nLayers compute\n    x <- W x\n\nStart: at rest, with\n    angle = 0.")
     assert made == "Learns.\n\nLayers compute\n\n```text\nx <- W x\n```\n\n**Start**: at rest, with angle = 0."
 
 
+@needs("mkdocs")
 def test_pages_of_families_name_their_reward(hooks):
     """A family that changes another one shows that one's text too, up to the reward and the observation."""
     for name in ("walker-run", "cartpole-swingup", "hopper-hop-backward"):
