@@ -52,7 +52,7 @@ FAMILIES: dict[str, Range | None] = {
     "reacher-vary-goal": Range("target-angle", -2, 2),
     "point-mass-vary-goal": None,  # a goal for each task, drawn at random
 }
-_CALIBRATION_CHUNKS = 4
+_CALIBRATION = 6.0  # seconds of training that tell how many steps --seconds are
 _GPU = "MTJAX_TASK_COUNTS_GPU"  # tells a part which GPU it shares
 
 
@@ -135,7 +135,8 @@ def measure(arguments: argparse.Namespace, name: str, tasks: int) -> None:
     with alone(arguments.out):
         steps = arguments.steps
         if arguments.seconds:
-            tried = run(steps=_CALIBRATION_CHUNKS * chunk, eval_every=10**15)
+            enough = lambda row: float(row["seconds"]) > _CALIBRATION
+            tried = run(steps=10**14, eval_every=10**15, on_chunk=enough)
             learned = [float(row["seconds"]) for row in tried.rows]
             steps = round(arguments.seconds * chunk * (len(learned) - 1) / (learned[-1] - learned[0]))
         result = run(steps=steps, eval_every=-(-steps // arguments.evaluations))
