@@ -171,10 +171,10 @@ def with_preset(
 def for_tasks(preset: Mapping[str, Any], count: int) -> dict[str, Any]:
     """Return a preset's settings for ``count`` tasks; ``tuned_tasks`` says with how many it was tuned.
 
-    An on-policy agent needs as many worlds for one task as for many, so its preset gives ``worlds``, of all tasks
-    together. An agent with a replay learns from few worlds of one task sooner than from many, as each step of its
-    worlds is followed by as many updates. So its ``num_envs`` and ``batch_size`` hold for each task, up to the tuned
-    number of tasks. With more tasks, all tasks together have as many as there, so that updates are as frequent.
+    A GPU steps thousands of worlds as fast as few, so PPO's preset gives ``worlds`` there, of all tasks together.
+    Elsewhere an agent learns from few worlds of one task sooner than from many, as each step of its worlds is followed
+    by as many updates. So ``num_envs`` and ``batch_size`` hold for each task, up to the tuned number of tasks. With
+    more tasks, all tasks together have as many as there, so that updates are as frequent.
     docs/results/task-counts.md has the runs.
     """
     chosen = dict(preset)
