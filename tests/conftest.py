@@ -1,6 +1,7 @@
 """What several test files share. Compiled programs live for the whole session: an MJX step costs ten seconds."""
 
 import dataclasses
+import gc
 import os
 import shutil
 from functools import lru_cache
@@ -16,6 +17,8 @@ from needs import count_skips, require, skip_without_packages
 import mtjax.train
 from mtjax.envs import ENVS
 from mtjax.envs.dm_control.finger import FingerSpin
+from mtjax.envs.engines import c
+from mtjax.training.allocator import give_back_pages
 
 # Tests compile much and run little: without LLVM's optimisations and by XLA's plain emitters a program is made in a
 # fifth of the time. One thread a program is enough, as pytest runs several processes.
@@ -110,12 +113,25 @@ def compiled(env) -> Programs:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def forget_programs():
-    """Drop a file's compiled programs after it: a process has room for some thousands, and dies of more."""
+def forget_programs(request):
+    """Drop what a file has compiled and cached after it: a process has room for some thousands of programs.
+
+    What is free by then goes back to the system. A worker kept gigabytes of it.
+    """
     yield
-    for cached in (compiled, probes._programs, probes._agent_programs):
-        cached.cache_clear()
+    own = [x for x in vars(request.module).values() if getattr(x, "__module__", None) == request.module.__name__]
+    for cached in (compiled, probes._programs, probes._agent_programs, *own):
+        getattr(cached, "cache_clear", lambda: None)()
     jax.clear_caches()
+    gc.collect()
+    give_back_pages()
+
+
+@pytest.fixture(autouse=True)
+def forget_worlds():
+    """Drop the worlds of MuJoCo's C engine after a test: thousands of each family take gigabytes together."""
+    yield
+    c._batches.clear()
 
 
 @pytest.fixture(scope="session")
