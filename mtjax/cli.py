@@ -14,6 +14,7 @@ from mtjax.commands import (
     import_files,
     imports_of,
     parse_with_tyro,
+    plain_values,
     split_flags,
     switched_off,
     switched_on,
@@ -40,7 +41,7 @@ def parse(argv: Sequence[str]) -> RunConfig:
         InputError: a name, flag or value cannot be used.
     """
     files, _ = imports_of(argv)
-    argv = import_files(argv)
+    argv = plain_values(import_files(argv))
     check_names(argv)
     env_name = flag_value(argv, "env", RunConfig.env)
     start = flag_value(argv, "from", "")

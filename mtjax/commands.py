@@ -42,6 +42,7 @@ _SETTING = re.compile(  # the name and type of a class's setting, which has a de
     r'^    ([a-z]\w*): (?!ClassVar|.*Suppress)(.+) = .+\n    """', re.MULTILINE
 )
 _HOMES = {"config.py": "--", "loop.py": "--", "envs": "--env.", "agents": "--agent.", "experience": "--agent."}
+_WHOLE = re.compile(r"[+-]?\d+(_\d+)*")
 _UNPREFIXED = ("prefix_name=False", "_FLAG")  # in the types of settings whose flags are in no group
 P = TypeVar("P")
 
@@ -169,13 +170,45 @@ def check_names(argv: Sequence[str]) -> None:
 
 def _check_numbers(argv: Sequence[str]) -> None:
     """Refuse a value that is no whole number where a flag of every run takes one."""
-    for flag, kind, *_ in itertools.chain.from_iterable(_fields(file, cls) for _, file, cls in _OVERVIEW):
-        value = flag_value(argv, flag, None) if kind == "int" else None
-        if value is None or re.fullmatch(r"[+-]?\d+(_\d+)*", value):
-            continue
-        meant = re.fullmatch(r"\d+(\.\d*)?[eE]\+?\d", value)
-        hint = f"; write {int(float(value))}" if meant and float(value).is_integer() else ""
-        raise InputError(f"--{flag} must be a whole number, not {value!r}{hint}")
+    for flag in _whole_flags():
+        value = flag_value(argv, flag, None)
+        if value is not None and not _WHOLE.fullmatch(_in_digits(value)):
+            raise InputError(f"--{flag} must be a whole number, not {value!r}")
+
+
+def _whole_flags() -> set[str]:
+    """Return the flags of every run, without dashes, that take whole numbers."""
+    fields = itertools.chain.from_iterable(_fields(file, cls) for _, file, cls in _OVERVIEW)
+    return {flag for flag, kind, *_ in fields if kind == "int"}
+
+
+def _in_digits(value: str) -> str:
+    """Return a whole number such as 1e6 in digits, and other text as it is."""
+    real = re.fullmatch(r"\d+(\.\d*)?([eE]\+?\d\d?)?", value)
+    if _WHOLE.fullmatch(value) or not real or not float(value).is_integer():
+        return value
+    return str(int(float(value)))
+
+
+def plain_values(argv: Sequence[str]) -> list[str]:
+    """Return a command line in which --SWITCH=true, --SWITCH=false and whole numbers such as 1e6 are as tyro has them.
+
+    Switches of the user's own classes stay as they are.
+    """
+    switches, whole = all_flags(), {f"--{flag}" for flag in _whole_flags()}
+    words, before = [], ""
+    for word in argv:
+        flag, _, value = word.partition("=")
+        name, truth = flag.replace("_", "-"), value.lower()
+        if truth in ("true", "false") and switches.get(name):
+            word = name if truth == "true" else switched_off(name)
+        elif name in whole and value:
+            word = f"{flag}={_in_digits(value)}"
+        elif before in whole:
+            word = _in_digits(word)
+        words.append(word)
+        before = name
+    return words
 
 
 def check_flags(argv: Sequence[str]) -> None:
@@ -391,6 +424,8 @@ def parse_with_tyro(cls: type[P], argv: Sequence[str], default: P, name: str) ->
 def _unread(value: str, argv: Sequence[str]) -> str:
     """Return what is wrong with a word that belongs to no flag: a switch came with a value, or there is no flag."""
     switch = next((word.split("=")[0] for word in argv if word.startswith("--") and word.endswith(f"={value}")), None)
+    if switch is not None and value.lower() == "false":
+        return f"{switch} is a switch and takes no value; write {switched_off(switch)}"
     if switch is not None:
         return f"{switch} is a switch and takes no value; leave out {'=' + value!r}"
     return f"{value!r} belongs to no flag; write --NAME=VALUE, and --help lists the names"

@@ -100,6 +100,22 @@ def test_flags_may_be_written_in_three_ways(words):
     assert program.learner.shared_temperature
 
 
+@pytest.mark.parametrize(
+    ("words", "plain"),
+    [
+        ("--steps=1e6", "--steps=1000000"),
+        ("--steps 2.5e5 --seeds=3.0", "--steps=250000 --seeds=3"),
+        ("--eval_every=1E+3", "--eval-every=1000"),
+        ("--stagger=False", "--no-stagger"),
+        ("--stagger=true --profile=false", "--stagger --no-profile"),
+        ("--agent.shared_temperature=True", "--agent.shared-temperature"),
+        ("--env=bandit+tabular-mdp --stagger=false", "--env=bandit+tabular-mdp --no-stagger"),
+    ],
+)
+def test_numbers_and_switches_may_be_written_as_in_python(words, plain):
+    assert cli.parse(words.split()) == cli.parse(plain.split())
+
+
 def test_last_of_a_repeated_name_counts():
     """As it does for every other flag."""
     program = cli.parse(["--agent=care", "--steps=1", "--agent", "multi-head", "--steps=2"])
@@ -361,7 +377,9 @@ def test_list_names_every_family_and_agent(capsys):
         ("--env.vary.size=", "--env.vary.size needs values"),
         ("--env.vary.size=a", "cannot read the values 'a' of size"),
         ("--steps=many", "many"),
-        ("--steps=1e6", "not '1e6'; write 1000000"),
+        ("--steps=1.5", "--steps must be a whole number, not '1.5'"),
+        ("--steps=1e-6", "--steps must be a whole number, not '1e-6'"),
+        ("--steps=1e99", "steps must be at most"),
         ("--steps", "--steps"),
         ("--env", "--env needs a value"),
         ("--no-steps", "--steps is no switch"),
