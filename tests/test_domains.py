@@ -221,7 +221,8 @@ def test_a_step_gives_the_observation_and_reward_of_dm_control(name):
     worlds = play(name, starts(name).state, random)
     states = len(worlds.qpos)
     actions = np.float32(random.uniform(-1, 1, (states, env.action_size)))
-    controls = np.asarray(jax.vmap(partial(env.control, None, None))(actions)[1])
+    task = jax.tree.map(lambda x: x[0], env.tasks())
+    controls = np.asarray(jax.vmap(partial(env.control, task, None))(actions)[1])
     after = jax.device_get(jax.jit(jax.vmap(env.step))(repeat(env, states), worlds, actions))
     best, rest = np.split(np.argsort(-after.reward, kind="stable"), [25])
     chosen = [*best, *random.choice(rest, 25, replace=False)]

@@ -91,7 +91,9 @@ def set_range(spec, value):
 
 def test_actions_span_the_range_of_every_task():
     """If a parameter changes it."""
-    env = own(SERVO % SPREAD[0][0], vary={"range": "1,2"}, parameters={"range": Parameter("rad", 3.0, set_range)})
+    env = own(
+        SERVO % SPREAD[0][0], vary={"range": "1,2"}, parameters={"range": Parameter("rad", 3.0, set_range, minimum=0.0)}
+    )
     tasks, action = env.tasks(), jnp.ones(1)
     controls = jax.vmap(lambda task: env.control(task, env.reset(task, jax.random.key(0)).state, action)[1])(tasks)
     np.testing.assert_array_equal(controls, [[1], [2]])

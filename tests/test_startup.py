@@ -147,7 +147,7 @@ def test_no_flag_is_refused_that_there_is(env, agent, ours):
 
 def test_flags_of_all_families_and_agents_are_known_without_jax(ours):
     """All of them and no other name, with which of them are switches: what is misspelt is answered with a flag."""
-    choices = [{kind: name} for kind in CHOICES for name in PARTS[kind]]
+    choices = [{kind: name} for kind in CHOICES for name in PARTS[kind]] + [{"scaling": "ars", "reset_every": 100}]
     real = {"--help": False, "--import": False} | {f"--agent.{kind}": False for kind in CHOICES}
     real |= cli.flags(mtjax.preset("cartpole-swingup+finger-spin", "sac"))
     for cls in {cls for cls, _ in ENVS.values()}:
