@@ -15,7 +15,7 @@ import jax
 import numpy as np
 import pytest
 from needs import needs
-from probes import slow_but
+from probes import one_in, slow_but
 
 import mtjax
 from mtjax.envs import BENCHMARKS
@@ -160,7 +160,7 @@ def unstopped():
 
 
 @pytest.mark.parametrize("name", slow_but(FILES, "learning"))
-@pytest.mark.parametrize("end", [terminate, die])
+@pytest.mark.parametrize("end", slow_but([terminate, die], terminate))
 def test_a_stopped_pair_goes_on_to_the_same_results(run, unstopped, tmp_path, monkeypatch, name, end):
     """It is in no table before, and leaves nothing but results."""
     if name not in unstopped:
@@ -435,7 +435,7 @@ def test_a_suite_counts_the_tasks_that_its_flags_ask_for(script, tmp_path, monke
     assert len((tmp_path / "tasks.csv").read_text().splitlines()) == 1 + 2 * 3
 
 
-@pytest.mark.parametrize("agent", ["drq", "sac-ae", "deepmdp", "hip-bmdp", "care", "ppo"])
+@pytest.mark.parametrize("agent", one_in(3, ["drq", "sac-ae", "deepmdp", "ppo", "hip-bmdp", "care"]))
 def test_a_suites_agents_see_its_pictures(script, agent):
     """Agents whose subject is something else encode the pictures."""
     suite, learning = script("suite"), script("learning")

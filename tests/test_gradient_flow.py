@@ -78,10 +78,21 @@ PARTS = {
     "gradnorm": ("gradnorm", {}, TRUNK),
     "famo": ("famo", {}, TRUNK),
 }
-ALIKE = ("cagrad", "gradnorm", "famo", "drq")  # with pcgrad's networks, or sac-ae's but for the decoder
 SPECS = {"drq-pictures": SEEN, "asymmetric": BESIDE, "sac-ae-pictures": SEEN}  # what agents see, if not vectors
-QUICK = [case for case in PARTS if case in OFF_POLICY and case not in ALIKE]  # others are variants of these
-QUICK += ["drq-pictures", "asymmetric"]
+QUICK = [
+    "sac",
+    "multi-head",
+    "distral",
+    "care",
+    "moe",
+    "moore",
+    "brc",
+    "simba-v2",
+    "xqc",
+    "deepmdp",
+    "hip-bmdp",
+    "drq-pictures",
+]
 EVERY_AGENT = pytest.mark.parametrize("case", slow_but(PARTS, *QUICK))
 
 

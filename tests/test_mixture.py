@@ -494,7 +494,7 @@ def test_every_agent_learns_a_mixture(name):
     assert action.shape == (4, 2) and metrics["td_error"].shape == (4,)
 
 
-@pytest.mark.parametrize("name", one_in(2, ["distral", "hip-bmdp", "brc", "simba-v2", "xqc", "pcgrad"]))
+@pytest.mark.parametrize("name", one_in(3, ["distral", "hip-bmdp", "brc", "xqc", "simba-v2", "pcgrad"]))
 def test_an_update_is_finite_and_acts_where_there_are_actions(name):
     agent = tiny(name, normalize_observations=True, discounting="horizon")
     run = lambda *arguments: init_and_update(agent, *arguments)
