@@ -15,6 +15,7 @@ import shutil
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from report import note_origin, read_lines, run_main, write_lines
 from resumable import train
@@ -54,7 +55,8 @@ TRAINED = {  # family -> agent and steps
     "two-goal-maze": ("drq", 4 * _M),
     "two-goal-maze-seen": ("ppo", 10 * _M),
 }
-SEEN = {"two-goal-maze": {"pixels": 64}}  # families that are learned from pictures, as nothing else tells the goal
+SEEN: dict[str, dict[str, Any]] = {"two-goal-maze": {"pixels": 64}}
+"""Settings of families that are learned from pictures, as nothing else tells the goal."""
 _LINES = 40
 
 

@@ -102,7 +102,7 @@ def learn(arguments: argparse.Namespace, env_name: str, agent: str) -> dict[str,
     """Train one agent. A task alone uses the preset of the mixture, not its own tuned preset."""
     config = mtjax.preset("+".join(arguments.tasks), agent, arguments.preset)
     family = mtjax.make(env_name, **engine(arguments, env_name))
-    given = {name: int(value) for name, value in (pair.split("=", 1) for pair in arguments.training)}
+    given: dict[str, Any] = {name: int(value) for name, value in (pair.split("=", 1) for pair in arguments.training)}
     steps = arguments.steps * family.train_count
     result = mtjax.train(
         family,
@@ -129,7 +129,7 @@ def learn(arguments: argparse.Namespace, env_name: str, agent: str) -> dict[str,
     }
 
 
-def engine(arguments: argparse.Namespace, env_name: str) -> dict[str, str]:
+def engine(arguments: argparse.Namespace, env_name: str) -> dict[str, Any]:
     """Return the setting of the engine, if families have one."""
     families = [mtjax.make(name) for name in env_name.split("+")]
     return {"engine": arguments.engine} if any("engine" in vars(family) for family in families) else {}

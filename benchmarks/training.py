@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents import BaseAgent
-from mtjax.envs import Family
+from mtjax.envs.tabled import Tabled
 from mtjax.loop import Settings
 from mtjax.parallel import mesh as meshes
 from mtjax.training.programs import compile_lowered, jit_programs
@@ -23,7 +23,7 @@ class Training:
     """
 
     def __init__(
-        self, family: Family, agent: BaseAgent, settings: Settings, seeds: int = 1, most_devices: int | None = None
+        self, family: Tabled, agent: BaseAgent, settings: Settings, seeds: int = 1, most_devices: int | None = None
     ):
         env, num_tasks, experience = family, family.train_count, agent.experience
         mesh = meshes.mesh_for(seeds, num_tasks, settings.num_envs, most_devices)
