@@ -653,6 +653,17 @@ def test_a_stopped_run_exits_with_the_signal(short_family, tmp_path, monkeypatch
     assert [path.name for path in (directory / "checkpoints").iterdir()] == ["25"]
 
 
+def test_a_stopped_run_draws_the_curve_so_far(short_family, tmp_path, monkeypatch):
+    """If there was an evaluation."""
+    monkeypatch.setattr(sys, "argv", ["train", *SHORT_RUN, "--eval-every=100", f"--runs={tmp_path}"])
+    metrics, pid = log.metric_rows, os.getpid()
+    monkeypatch.setattr(log, "metric_rows", lambda *given: (os.kill(pid, signal.SIGINT), metrics(*given))[1])
+    with pytest.raises(SystemExit):
+        commands.main(mtjax.train.main)
+    (directory,) = tmp_path.iterdir()
+    assert (directory / "evaluations.npz").exists() and (directory / "curve.png").exists()
+
+
 # Arguments.
 
 

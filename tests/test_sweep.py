@@ -229,6 +229,7 @@ def test_sweeps_are_read_out_of_a_command_line(words, found, rest):
         (["--sweep", "agent.tau"], "--sweep needs values, not 'agent.tau'"),
         (["--sweep", "agent.tau=0.1,"], "--sweep needs values"),
         (["--sweep", "agent.tau=0.1,0.1"], "a value of agent.tau twice"),
+        (["--sweep", "agent.actor-lr=1e-3,0.001"], "a value of agent.actor-lr twice"),
         (["--sweep", "agent.tau=0.1", "agent.tau=0.2"], "gives agent.tau twice"),
         (["--sweep", "seed=0,1"], "cannot vary seed"),
         (["--sweep", "agent.tau=0.1,big"], "agent.tau is a number, and 'big' is none"),

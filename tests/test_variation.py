@@ -91,6 +91,7 @@ def test_split_none_holds_nothing_out():
     [
         ({"a": "1,2", "b": "1,2,3"}, "paired", "dense", r"as many values of each parameter, not \[2, 3\]"),
         ({"a": "1,2,1"}, "paired", "dense", "two tasks have the same values"),
+        ({"a": "1,1.00000000001"}, "grid", "dense", "two tasks have the same values"),
         ({"c": "2,3"}, "grid", "dense", "c must be greater than -inf and at most 2.5, not 3"),
         ({"a": "1:2"}, "random", "hip-bmdp", "combine=random"),
         ({"a": ""}, "grid", "dense", "a has no values; give lo:hi:n"),

@@ -252,8 +252,8 @@ def _combine(points: list[np.ndarray], combine: str) -> np.ndarray:
         rows = (
             np.stack([x.ravel() for x in np.meshgrid(*points, indexing="ij")], axis=1) if points else np.zeros((1, 0))
         )
-    if len(np.unique(rows, axis=0)) < len(rows):
-        raise InputError("two tasks have the same values")
+    if len(np.unique(np.float32(rows), axis=0)) < len(rows):
+        raise InputError("two tasks have the same values, as numbers of single precision")
     return rows
 
 

@@ -58,11 +58,11 @@ def _prepare(config: RunConfig, directory: Path | None) -> Path:
 
 
 def _conclude(config: RunConfig, result: Result, directory: Path) -> None:
+    draw(config, result, directory)
     if not result.finished:
         words = [f"--resume={directory}", *import_flags(config)]
         print(f"stopped; the state is saved. Go on with:\n  python -m mtjax.train {shlex.join(words)}")
         return
-    draw(config, result, directory)
     if len(result.evaluations.steps):
         print(split_table(result.evaluations, config.family.parts))
         if config.learner.unseen:

@@ -93,11 +93,19 @@ def _axis(word: str) -> Axis:
     flag, values = flag.replace("_", "-"), tuple(value.strip() for value in text.split(","))
     if not all(values):
         raise InputError(f"--sweep needs values, not {word!r}; write FLAG=VALUE,VALUE such as agent.actor-lr=1e-4,1e-3")
-    if len(set(values)) < len(values):
+    if len({_as_number(value) for value in values}) < len(values):
         raise InputError(f"--sweep gives a value of {flag} twice: {text}")
     if flag in _FIXED:
         raise InputError(f"--sweep cannot vary {flag}; give --{flag} once" + (" for all" if flag != "sweep" else ""))
     return Axis(flag, values)
+
+
+def _as_number(text: str) -> float | str:
+    """Return a number of a text, such as 0.001 of 1e-3; other texts stay as they are."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
 
 
 def _is_agent_number(axis: Axis) -> bool:
