@@ -653,6 +653,24 @@ def test_a_stopped_run_exits_with_the_signal(short_family, tmp_path, monkeypatch
     assert [path.name for path in (directory / "checkpoints").iterdir()] == ["25"]
 
 
+def test_a_run_writes_its_record_again(short_family, tmp_path, monkeypatch):
+    """If somebody removes config.json while it runs; without its folder it ends with the reason."""
+    metrics, gone = log.metric_rows, []
+
+    def remove(*given):
+        (directory,) = tmp_path.iterdir()
+        shutil.rmtree(directory) if gone else (directory / "config.json").unlink()
+        gone.append(directory)
+        return metrics(*given)
+
+    monkeypatch.setattr(log, "metric_rows", remove)
+    with (
+        pytest.warns(Notice, match=r"config\.json' was removed while the run went on, and is written again"),
+        pytest.raises(OSError, match=r"folder was removed while it ran|No such file"),
+    ):
+        mtjax.train.main([*SHORT_RUN, f"--runs={tmp_path}"])
+
+
 def test_a_stopped_run_draws_the_curve_so_far(short_family, tmp_path, monkeypatch):
     """If there was an evaluation."""
     monkeypatch.setattr(sys, "argv", ["train", *SHORT_RUN, "--eval-every=100", f"--runs={tmp_path}"])

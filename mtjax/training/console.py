@@ -84,8 +84,8 @@ class Console:
             return
         left = self.clock.left
         told = describe_returns(returns) or running or "no episode has ended"
-        if self.bar is not None:  # whose end a narrow terminal cuts off
-            text = f"{self.label}{steps:,} of {self.total:,}  {left}  {rate:,.0f} steps/s  {told}{self.evaluated}"
+        if self.bar is not None:  # whose end a narrow terminal cuts off, so that what matters most comes first
+            text = f"{self.label}{told}  {left}  {steps:,} of {self.total:,}  {rate:,.0f} steps/s{self.evaluated}"
             self.bar.update(self.task, completed=steps, description=text)
         elif self._is_due(steps, seconds):
             self.shown, when = (steps, seconds), f"{duration(seconds)}{', ' * bool(left)}{left}"

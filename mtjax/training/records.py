@@ -1,13 +1,14 @@
 """The files of a run: metrics, evaluations and checkpoints, as it writes them and as a resumed run finds them."""
 
 import contextlib
+import errno
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from mtjax.evaluation import Evaluations, load_evaluations, require_same_run, save_evaluations
 from mtjax.loop import TrainState
-from mtjax.names import notice
+from mtjax.names import notice, replacing
 from mtjax.parallel import hosts
 from mtjax.training import checkpoint, log
 from mtjax.types import InputError
@@ -103,9 +104,25 @@ class Records:
             self.writer.save(state)
 
     def check(self) -> None:
-        """Raise the OSError of a checkpoint that could not be written, as soon as it is known."""
+        """Check that the run can go on in its folder. A config.json that is gone is written again.
+
+        Raises:
+            OSError: the folder is gone, or a checkpoint could not be written.
+        """
+        if self.writes:
+            self._keep_config()
         if self.writer is not None and self.writer.pending is not None and self.writer.pending.done():
             self.writer.wait()
+
+    def _keep_config(self) -> None:
+        assert self.directory is not None and self.writer is not None
+        if not self.directory.is_dir():
+            raise OSError(errno.ENOENT, "the run's folder was removed while it ran", str(self.directory))
+        file, record = self.directory / "config.json", self.writer.record
+        if record is not None and not file.exists():
+            with replacing(file) as new:
+                new.write_bytes(record)
+            notice(f"{str(file)!r} was removed while the run went on, and is written again")
 
     def wait(self) -> None:
         """Wait until the last checkpoint is written."""
