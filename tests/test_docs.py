@@ -28,15 +28,19 @@ def identify(page: Path) -> str:
     return str(page.relative_to(ROOT))
 
 
-def commands(text: str) -> list[list[str]]:
-    """Return the words behind ``python -m mtjax.train`` in a page's shell blocks, where they are whole commands."""
+def training(text: str) -> list[list[str]]:
+    """Return the words behind each ``python -m mtjax.train`` in a page's shell blocks."""
     blocks = "\n".join(re.findall(r"```bash\n(.*?)```", text, re.DOTALL)).replace("\\\n", " ")
     lines = [line.partition("python -m mtjax.train")[2] for line in blocks.splitlines() if "mtjax.train " in line]
-    words = [shlex.split(line, comments=True) for line in lines]
+    return [[word for word in shlex.split(line, comments=True) if word != "&"] for line in lines]
+
+
+def commands(text: str) -> list[list[str]]:
+    """Return those of a page's training commands that are whole."""
     not_here = ("--list", "--help", "--distributed", "--sweep")  # they do more than parse
     return [
         each
-        for each in words
+        for each in training(text)
         if not any(w in not_here or "..." in w or "$" in w or w.startswith("--import") for w in each)
     ]
 
@@ -56,7 +60,7 @@ def test_commands_of_the_documentation_parse():
     found = {tuple(each) for page in PAGES for each in commands(page.read_text())}
     assert len(found) >= 5
     for each in sorted(found):
-        parse([word for word in each if word != "&"])
+        parse(list(each))
 
 
 def test_examples_in_the_pages_exist():

@@ -1,0 +1,109 @@
+"""Every training command in README and docs, and README's example in Python, learns: the last return beats the first.
+
+A new command needs a line in ``MARKS``: by how much it must learn, or why it is not run here.
+"""
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from test_docs import PAGES, ROOT, training
+
+from mtjax.evaluation import load_evaluations
+
+
+class Learns(NamedTuple):
+    """By how much a command's last return on training tasks must beat its first, with flags that make it shorter."""
+
+    gain: float
+    flags: str = ""
+
+
+_GPU = "takes hours without a GPU"
+_OTHER = "needs a file or a run of the reader's own"
+_HELP = "prints flags and trains nothing"
+_MANY = "trains as many agents as the points of a sweep; tests/test_sweep.py has smaller ones"
+_HOSTS = "takes several processes; tests/test_devices.py has such runs"
+_FINGER = "ten fingers still have a return of 0 to 2 after 300,000 steps, which take two minutes of a CPU core"
+_WALKER = "a walker takes several minutes on two CPU cores, docs/results/returns.md"
+_ONE = "--env.vary.size=1.1 --split=none --steps=250000"  # finger of the ten
+_LOOP = "--env=point-mass-vary-goal --agent=multi-head"  # one pair of the loop around the command
+
+MARKS: dict[str, Learns | str] = {
+    "--quick": Learns(25),
+    "--import=examples/own_environment.py --env=spring --agent=care --steps=200000": Learns(30),
+    "'--env=$env' '--agent=$agent' --seeds=3 --steps=400000 --chunk-steps=250 --runs=runs/first": Learns(20, _LOOP),
+    "--env=finger-spin-vary-size --agent=sac-conditioned": Learns(5, _ONE),
+    "--env=cartpole-swingup+finger-spin+walker-walk-vary-friction --agent=multi-head": Learns(5, "--steps=400000"),
+    "--agent=care --agent.num-experts=4 --agent.gradients=pcgrad --seeds=10": _FINGER,
+    "--env=finger-spin-vary-size --agent=sac-conditioned --agent.encoder=moe --agent.mode=ensemble": _FINGER,
+    "--import=examples/own_encoder.py --agent.encoder=gated --agent.gate-widths 32": _FINGER,
+    "--import=examples/own_agent.py --agent=best-of --agent.candidates=8": _FINGER,
+    "--env=cartpole-swingup+walker-walk --env.vary.walker-walk.friction=0.7:1.6:4 --split=none": _WALKER,
+    "--env=walker-walk --env.vary.torso-mass=0.5:1.5:10 --env.vary.gravity=5:15": _WALKER,
+    "--env=walker-walk-vary-friction --split=hip-bmdp --seeds=5": _WALKER,
+    "--env=mt10 --agent=multi-head": _GPU,
+    "--env=mt10 --agent=care --agent.num-experts=4 --agent.conditioning=text --agent.text=all-MiniLM-L6-v2 "
+    "--batch-size=128 --steps=20000000 --seed=1": _GPU,
+    "--env=finger-spin-vary-size --agent=drq --env.pixels=64 --env.frames=3 --env.repeat=2": _GPU,
+    "--env=finger-spin-vary-size --agent=care --agent.representation=encoded --env.pixels=64 --n-step=3 "
+    "--agent.encoder-tau=1 --env.repeat=2": _GPU,
+    "--env=cheetah-run --agent=drq --env.pixels=64 --seeds=10 --replay-size=100000 --host-replay-size=1000000 "
+    "--chunk-steps=100": _GPU,
+    "--env=finger-spin-vary-size --agent=pcgrad --help": _HELP,
+    "--env=finger-spin-vary-size --agent=care --help": _HELP,
+    "--config=settings.toml --steps=2000000": _OTHER,
+    "--resume=runs/...": _OTHER,
+    "--resume=runs/... --steps=8000000": _OTHER,
+    "--env=finger-spin-vary-size --env.vary.size=1.15:1.2:4 --split=none --from=runs/... --tune=all": _OTHER,
+    "--import=lever.py --env=lever --agent=sac-conditioned --steps=400000": _OTHER,
+    "--seeds=5 --sweep agent.actor-lr=1e-4,3e-4,1e-3 agent.num-critics=2,4": _MANY,
+    "--seeds=3 --steps=400000 --sweep env=point-mass-vary-goal,reacher-vary-goal agent=sac,multi-head": _MANY,
+    "--seeds=8 --distributed --runs=/shared/runs": _HOSTS,
+    "--env=pendulum-swingup --engine=mjx --seeds=2 --distributed": _HOSTS,
+}
+QUICK = list(MARKS)[:2]
+LEARNING = {command: mark for command, mark in MARKS.items() if isinstance(mark, Learns)}
+ENVIRONMENT = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}  # programs as users get them
+
+
+def test_every_training_command_has_a_mark():
+    """And every mark is of a command that is there."""
+    found = {shlex.join(words) for page in PAGES for words in training(page.read_text())}
+    assert found == set(MARKS)
+
+
+def run(*words):
+    pipes = {"stdin": subprocess.DEVNULL, "capture_output": True, "text": True}
+    done = subprocess.run([sys.executable, *words], cwd=ROOT, env=ENVIRONMENT, **pipes)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
+
+
+@pytest.mark.slow
+def test_readmes_example_in_python_learns(gain=15):
+    """The array that it prints is the mean return of each evaluation."""
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    (block,) = [block for block in blocks if "mtjax.train(" in block]
+    printed = re.findall(r"\[([\d.\s]+)\]", run("-c", block))[-1]
+    returns = np.array(printed.split(), float)
+    assert len(returns) == 10 and returns[-1] - returns[0] > gain, returns
+
+
+@pytest.mark.parametrize(
+    "command",
+    [pytest.param(x, marks=pytest.mark.slow if x in QUICK else pytest.mark.nightly) for x in LEARNING],
+)
+def test_a_command_learns(command, tmp_path):
+    """Of all that a page trains, nothing may stay where it begins."""
+    gain, flags = LEARNING[command]
+    run("-m", "mtjax.train", *shlex.split(command), *shlex.split(flags), f"--runs={tmp_path}")
+    (folder,) = Path(tmp_path).iterdir()
+    returns = load_evaluations(folder / "evaluations.npz").returns["train"].mean(axis=(0, 2, 3))
+    assert returns[-1] - returns[0] > gain, returns
