@@ -460,8 +460,9 @@ def test_train_prints_where_the_run_is_and_how_it_scored(short_family, tmp_path,
     assert lines[0] == (
         "sac-conditioned on finger-short: 2 training tasks, size 1 to 1.2, split dense, engine c, seeds 0 to 1"
     )
-    assert lines[1] == f"run: {directory}" and lines[2] == "random actions until step 20; learning begins there"
-    assert lines[3].startswith("memory: ")
+    assert lines[1] == "worlds: 2 a task, 4 in all; transitions in a batch: 4 a task, 8 in all"
+    assert lines[2] == f"run: {directory}" and lines[3] == "random actions until step 20; learning begins there"
+    assert lines[4].startswith("memory: ")
     assert [x.split()[0] for x in lines if " of 600 steps" in x] == ["100", "200", "300", "400", "500", "600"]
     assert [x.split()[2] for x in lines if x.startswith("evaluation at")] == ["200", "400", "600"]
     assert [x.split()[0] for x in lines[-6:-2]] == ["split", "train", "interpolation", "extrapolation"]
