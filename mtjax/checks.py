@@ -15,7 +15,9 @@ from mtjax.names import InputError
 OF_TRAIN = ("steps", "seed", "seeds", "eval_every", "eval_episodes", "num_envs", "chunk_steps", "stagger")
 """The settings of ``mtjax.train`` that are neither the agent's nor the environment's."""
 _LARGEST, _LARGEST_FLOAT = 2**31 - 1, 3.4e38  # of 32 bits
-_MOST_EPISODES, _LARGEST_SEED = 100_000, 2_000_000_000
+MOST_EPISODES = 100_000
+"""Episodes of a task in one evaluation."""
+_LARGEST_SEED = 2_000_000_000
 
 
 def checked(cls: Any, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -139,13 +141,18 @@ def require_episodes(episodes: Any, seed: Any, task_seed: Any, checkpoint: Any) 
     Raises:
         InputError: one is no whole number, or out of its bounds.
     """
-    _require_whole("episodes", episodes, 1, _MOST_EPISODES)
-    _require_whole("seed", seed, 0, _LARGEST_SEED)
-    _require_whole("task-seed", 0 if task_seed is None else task_seed, 0, _LARGEST_SEED)
-    _require_whole("checkpoint", checkpoint, 0, _LARGEST)
+    require_whole("episodes", episodes, 1, MOST_EPISODES)
+    require_whole("seed", seed, 0, _LARGEST_SEED)
+    require_whole("task-seed", 0 if task_seed is None else task_seed, 0, _LARGEST_SEED)
+    require_whole("checkpoint", checkpoint, 0)
 
 
-def _require_whole(name: str, value: Any, least: int, most: int) -> None:
+def require_whole(name: str, value: Any, least: int, most: int = _LARGEST) -> None:
+    """Check that a value is a whole number in a range.
+
+    Raises:
+        InputError: it is not.
+    """
     if not _is_whole(value):
         raise InputError(f"{name} must be a whole number, not {shown(value)}{_hint(int, value)}")
     if not least <= value <= most:

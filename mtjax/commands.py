@@ -4,6 +4,7 @@ import ast
 import contextlib
 import dataclasses
 import difflib
+import functools
 import gc
 import importlib.util
 import io
@@ -176,10 +177,11 @@ def _check_numbers(argv: Sequence[str]) -> None:
             raise InputError(f"--{flag} must be a whole number, not {value!r}")
 
 
-def _whole_flags() -> set[str]:
+@functools.cache
+def _whole_flags() -> frozenset[str]:
     """Return the flags of every run, without dashes, that take whole numbers."""
     fields = itertools.chain.from_iterable(_fields(file, cls) for _, file, cls in _OVERVIEW)
-    return {flag for flag, kind, *_ in fields if kind == "int"}
+    return frozenset(flag for flag, kind, *_ in fields if kind == "int")
 
 
 def _in_digits(value: str) -> str:
@@ -229,7 +231,8 @@ def check_flags(argv: Sequence[str]) -> None:
             raise unknown_flag(flag, known)
 
 
-def all_flags() -> dict[str, bool]:
+@functools.cache
+def all_flags() -> Mapping[str, bool]:
     """Return every flag that some family or agent has, and whether it is a switch.
 
     They are read from the classes' source, because importing the classes would import JAX.

@@ -21,7 +21,7 @@ from mtjax.agents.choices import kinds_of, replace
 from mtjax.agents.parts import name_of
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.values import VALUES
-from mtjax.checks import check_fields, require_text, require_values
+from mtjax.checks import MOST_EPISODES, check_fields, require_text, require_values
 from mtjax.commands import PRESETS, is_imported, require_run
 from mtjax.envs import ENVS, is_mixture, make, members
 from mtjax.envs.tabled import Tabled
@@ -35,7 +35,7 @@ TUNED_TASKS = 10
 """How many tasks a preset was tuned with if its file does not say so."""
 _EVALUATED = 3  # the most steps that all evaluations play, in steps of the run
 _LEAST = {"num_envs": 1, "batch_size": 4}  # of each task, however many tasks there are
-_MOST_STEPS, _MOST_SEEDS, _MOST_EPISODES = 10**15, 10**5, 10**5
+_MOST_STEPS, _MOST_SEEDS = 10**15, 10**5
 NO_FINE_TUNING = "fine-tuning takes the networks of one family's tasks to other tasks of the same shapes"
 
 
@@ -56,7 +56,7 @@ class Plan:
     """Episodes of each task in every evaluation."""
 
     def __post_init__(self):
-        check_fields(self, steps=_MOST_STEPS, eval_every=_MOST_STEPS, seeds=_MOST_SEEDS, eval_episodes=_MOST_EPISODES)
+        check_fields(self, steps=_MOST_STEPS, eval_every=_MOST_STEPS, seeds=_MOST_SEEDS, eval_episodes=MOST_EPISODES)
         for field, least in (("steps", 1), ("seeds", 1), ("seed", 0), ("eval_every", 0), ("eval_episodes", 1)):
             if getattr(self, field) < least:
                 raise InputError(f"{field.replace('_', '-')} must be at least {least}, not {getattr(self, field)}")

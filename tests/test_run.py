@@ -520,6 +520,24 @@ def test_finished_run_can_be_extended(play, whole, tmp_path):
     assert_same_run(play(tmp_path, resume=True), whole)
 
 
+def test_the_clock_counts_without_going_through_the_chunks():
+    """As many chunks, evaluations and chunks with random actions as one by one; at once if there are billions."""
+    random = np.random.default_rng(0)
+    for _ in range(300):
+        chunk, count, begun, every, warmup = (int(random.integers(1, most)) for most in (40, 30, 30, 300, 200))
+        total = chunk * count
+        plan = types.SimpleNamespace(steps=int(random.integers(total - chunk + 1, total + 1)))
+        console = types.SimpleNamespace(total=total)
+        one = types.SimpleNamespace(steps_per_chunk=chunk, eval_every=every, console=console, warmup=warmup, plan=plan)
+        steps = chunk * min(begun - 1, count)
+        ends = range(steps + chunk, total + chunk, chunk)
+        clock, due = run._Run._clock(one, steps), [run._Run._is_due(one, end) for end in ends]
+        expected = len(ends), sum(due), sum(end - chunk < warmup for end in ends)
+        assert (clock.chunks, clock.evaluations, clock.warmup) == expected
+    one.console.total = one.plan.steps = 10**15 * one.steps_per_chunk
+    assert run._Run._clock(one, 0).chunks == 10**15
+
+
 def test_both_clocks_go_on(play, tmp_path):
     """Though another process resumes the run."""
     play(tmp_path, steps=400)

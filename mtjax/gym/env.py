@@ -1,7 +1,7 @@
 """A Gymnasium environment of one world of a family, with MTEnv's interface."""
 
 import os
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -155,7 +155,7 @@ class FamilyEnv(TaskStream, gymnasium.Env):
 
     def __init__(self, family: Env, tasks: str = "train", task_obs: str = "context", render_mode: str | None = None):
         require_no_fork()
-        self.family, self.render_mode, self._programs = family, render_mode, _programs(played(family))
+        self.family, self.render_mode = family, render_mode
         self.metadata = _metadata(family)
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise InputError(
@@ -166,11 +166,9 @@ class FamilyEnv(TaskStream, gymnasium.Env):
         self._elapsed = 0
         self.set_task_state(self._table.first)
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name != "_programs"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state, _programs=_programs(played(state["family"])))
+    @cached_property
+    def _programs(self) -> Programs:
+        return _programs(played(self.family))
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
         """Begin an episode of the current task. The only option is ``task_seed``."""

@@ -15,9 +15,15 @@ TASK_OBS = ("context", "id", "none")
 
 
 class TaskStream:
-    """A random stream for tasks, separate from Gymnasium's own stream for environments."""
+    """A random stream for tasks, separate from Gymnasium's own stream for environments.
+
+    Environments derived from it can be pickled: ``_programs``, a cached property, is made again in the copy.
+    """
 
     _np_random_task: np.random.Generator | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "_programs"}
 
     @property
     def np_random_task(self) -> np.random.Generator:

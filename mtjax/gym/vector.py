@@ -1,7 +1,7 @@
 """A Gymnasium vector environment of many worlds of a family, stepped by one compiled program."""
 
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -84,7 +84,6 @@ class FamilyVectorEnv(TaskStream, VectorEnv):
             raise InputError(f"num_envs must be at least 1, not {num_envs}")
         require_no_fork()
         self.family, self.num_envs, self._resample = family, num_envs, resample_tasks
-        self._programs = _programs(played(family))
         self.metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": []}
         self._table = TaskTable(family, tasks, task_obs)
         self.single_observation_space, self.single_action_space = spaces_of(played(family), self._table)
@@ -92,11 +91,9 @@ class FamilyVectorEnv(TaskStream, VectorEnv):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.set_task_state(self._table.chosen[np.arange(num_envs) * len(self._table.chosen) // num_envs])
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name != "_programs"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state, _programs=_programs(played(state["family"])))
+    @cached_property
+    def _programs(self) -> Programs:
+        return _programs(played(self.family))
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
         """Begin an episode in every world, or in the worlds of the option ``reset_mask`` (num_envs,) bool.

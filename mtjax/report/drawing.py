@@ -25,7 +25,7 @@ def plot(
 
     Args:
         runs: folders, or patterns such as "runs/*"; or results of ``mtjax.train``, also by name in a mapping.
-        figure: curves, families (of which there are several axes), parameter, iqm, profile or improvement.
+        figure: curves, families (which returns several axes), parameter, iqm, profile or improvement.
         split: train, interpolation or extrapolation: whose returns are drawn.
         metric: "return", or what else evaluations have, such as "success".
         baseline: the agent that improvement compares with; by default the first run's.

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import stdtr
 
 from mtjax.names import InputError
 
@@ -105,6 +104,8 @@ def paired_p_value(a: np.ndarray, b: np.ndarray) -> float:
     spread = np.std(gaps, ddof=1) / np.sqrt(len(gaps))
     if spread == 0:
         return float(np.mean(gaps) == 0)
+    from scipy.special import stdtr  # here, as training imports this module and has no time for SciPy
+
     return float(2 * stdtr(len(gaps) - 1, -abs(np.mean(gaps)) / spread))
 
 

@@ -47,7 +47,7 @@ def check(config: RunConfig, start: Policy | None = None) -> None:
         learner.require_sight(family.spec)
         if start is not None:
             require_fit(start, family, learner)
-    require_pictures(config)
+    _require_pictures(config)
     begins = start is not None or bool(config.start)
     if config.learner.conditioning in ("vectors", "text"):
         config.learner.load_vectors(family.spec, family.train_count)
@@ -58,7 +58,7 @@ def check(config: RunConfig, start: Policy | None = None) -> None:
         raise InputError("--reset-every throws away what --from takes from a run; give one of them")
 
 
-def require_pictures(config: RunConfig) -> None:
+def _require_pictures(config: RunConfig) -> None:
     """Refuse an agent for pictures in a family that shows none.
 
     Raises:

@@ -12,7 +12,7 @@ import numpy as np
 
 from mtjax import frames, loop, shipped, standalone
 from mtjax.agents import BaseAgent, name_of
-from mtjax.checks import path, shown
+from mtjax.checks import path, require_whole, shown
 from mtjax.config import RunConfig, from_json
 from mtjax.envs import name_of as env_name_of
 from mtjax.envs.family import Family
@@ -164,8 +164,7 @@ def load(directory: str | Path, seed: int = 0, checkpoint: int = 0) -> Policy:
     Raises:
         InputError: the folder is not a run, the run has no such seed, or its checkpoint is missing or damaged.
     """
-    if not isinstance(checkpoint, int | np.integer) or checkpoint < 0:
-        raise InputError(f"checkpoint must be a whole number of at least 0, not {shown(checkpoint)}")
+    require_whole("checkpoint", checkpoint, 0)
     directory = shipped.folder(path(directory))
     config = from_json(directory / "config.json")
     _require_seed(seed, config.plan.seeds, len(config.points))

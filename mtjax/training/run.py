@@ -282,10 +282,12 @@ class _Run:
             self.console.say(line)
 
     def _clock(self, steps: int) -> Clock:
-        """Return a clock that counts the chunks and evaluations to come."""
-        chunk = self.steps_per_chunk
-        ends = range(steps + chunk, self.console.total + chunk, chunk)
-        return Clock(len(ends), sum(map(self._is_due, ends)), sum(end - chunk < self.warmup for end in ends))
+        """Return a clock that counts the chunks and evaluations to come, however many there are."""
+        chunk, every = self.steps_per_chunk, self.eval_every
+        count = max(-(-(self.console.total - steps) // chunk), 0)
+        last = steps + (count - 1) * chunk  # where the last chunk begins
+        evaluations = max(count - 1 if chunk >= every else last // every - steps // every, 0) + (count > 0)
+        return Clock(count, evaluations, min(max(-(-(self.warmup - steps) // chunk), 0), count))
 
     def _running(self, state: TrainState, returns: np.ndarray) -> str:
         """Return a text on first episodes that still run, if no episode has ended."""

@@ -149,10 +149,10 @@ def configurations(argv: Sequence[str], parse: Parse) -> list[RunConfig]:
 
 
 def _number(axis: Axis, text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise InputError(f"{axis.flag} is a number, and {text!r} is none") from None
+    number = _as_number(text)
+    if isinstance(number, str):
+        raise InputError(f"{axis.flag} is a number, and {text!r} is none")
+    return number
 
 
 # Running.

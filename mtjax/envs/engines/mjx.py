@@ -52,7 +52,7 @@ class Mjx:
             return mjx.put_model(self.base, own, "jax"), mjx.make_data(self.base, own, "jax")
 
     def require_runnable(self) -> None:
-        """Refuse a model that MJX cannot run, or of which it would leave something out.
+        """Refuse a model that MJX cannot run, or would run only in part.
 
         Raises:
             InputError: the message says what it is, and which engines have it.
