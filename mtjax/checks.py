@@ -156,7 +156,7 @@ def require_whole(name: str, value: Any, least: int, most: int = _LARGEST) -> No
     if not _is_whole(value):
         raise InputError(f"{name} must be a whole number, not {shown(value)}{_hint(int, value)}")
     if not least <= value <= most:
-        raise InputError(f"{name} must be at least {least} and at most {most}, not {value}")
+        raise InputError(f"{name} must be at least {least} and at most {most}, not {shown(value)}")
 
 
 def require_text(value: Any, name: str) -> None:
