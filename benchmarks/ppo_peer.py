@@ -12,10 +12,10 @@ Needs playground==0.2.0. Every task, side and seed is a process of its own, whic
 ``parts.py`` says how an interrupted comparison goes on. All results in OUT give ``OUT/table.md`` and
 ``OUT/settings.md``. ``--seeds 0 --out DIR`` runs nothing and only makes these.
 
-Both sides learn for the same number of steps, or until ``--seconds`` of the process are over. Both are evaluated after
-every ``--evaluate-every`` steps, by as many episodes under the mean action. What differs is what each side chooses:
-physics substeps, passes over a batch, networks, starts of episodes, and the time at which episodes end. The table has
-steps, substeps and gradient steps beside each other.
+Both sides learn for the same number of steps, until ``--seconds`` of the process are over, or until an evaluation has
+reached ``--enough``. Both are evaluated after every ``--evaluate-every`` steps, by as many episodes under the mean
+action. What differs is what each side chooses: physics substeps, passes over a batch, networks, starts of episodes, and
+the time at which episodes end. The table has steps, substeps and gradient steps beside each other.
 
 Times are of the first evaluation that reached a return, and evaluations themselves are left out of them. "training"
 leaves out importing and compiling too: for ours as it is measured; for theirs the first interval, which compiles,
@@ -63,7 +63,7 @@ class Reached(NamedTuple):
 
 
 class Enough(Exception):
-    """Training is stopped because its time is over."""
+    """Training is stopped because its time is over, or because it has reached enough."""
 
 
 def main() -> None:
@@ -75,6 +75,7 @@ def main() -> None:
     parser.add_argument("--evaluate-every", type=float, default=2e6)
     parser.add_argument("--episodes", type=int, default=128, help="of each evaluation")
     parser.add_argument("--marks", type=float, nargs="+", default=[500, 700, 850])
+    parser.add_argument("--enough", type=float, default=float("inf"), help="a return that ends a run")
     parser.add_argument("--smaller", type=int, default=1, help="divide worlds and batches by this, to try the script")
     parser.add_argument("--out", type=Path, default=Path("runs") / f"ppo-peer-{time.strftime('%Y%m%d-%H%M%S')}")
     parser.add_argument("--part", nargs=3, metavar=("TASK", "SIDE", "SEED"), help="run this part in this process")
@@ -139,7 +140,7 @@ def theirs(arguments: argparse.Namespace, name: str, side: str, seed: int) -> tu
         now = parts.since_start()
         points.append(Reached(int(steps), now - spent[0], None, float(metrics["eval/episode_reward"])))
         show(side, points[-1])
-        if now > arguments.seconds:
+        if now > arguments.seconds or points[-1].mean >= arguments.enough:
             raise Enough
 
     try:
@@ -196,7 +197,7 @@ def ours(arguments: argparse.Namespace, name: str, side: str, seed: int) -> tupl
 
     def begin(row: dict[str, Any]) -> bool:
         seconds[:] = float(row["seconds"]), parts.since_start()
-        return seconds[1] > arguments.seconds
+        return seconds[1] > arguments.seconds or any(point.mean >= arguments.enough for point in points)
 
     def note(evaluations: Any) -> None:
         mean = float(evaluations.returns["train"][:, -1].mean())
