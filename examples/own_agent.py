@@ -32,16 +32,15 @@ class BestOf(SAC):
         require_counts(self, "candidates")
         require_not_negative(self, "imitation")
 
-    def actor_loss(self, actor, data):
-        loss, metrics = super().actor_loss(actor, data)
-        batch, critic, key = data
-        outputs = self.policy(actor, critic, batch.features, batch.obs)
+    def actor_loss(self, nets, batch, key):
+        loss, aux = super().actor_loss(nets, batch, key)
+        outputs = self.policy(nets, batch.features, batch.obs)
         draw = lambda key: jax.lax.stop_gradient(tanh_normal(outputs, key, batch.mask)[0])
         drawn = jax.vmap(draw)(jax.random.split(key, self.candidates))  # (K, B, A)
-        worth = jax.vmap(lambda a: jnp.min(self.values(critic, batch.features, batch.obs, a), axis=0))(drawn)  # (K, B)
+        worth = jax.vmap(lambda a: jnp.min(self.values(nets, batch.features, batch.obs, a), axis=0))(drawn)  # (K, B)
         best = jnp.take_along_axis(drawn, jnp.argmax(worth, axis=0)[None, :, None], axis=0)[0]
         distance = jnp.mean(jnp.square(tanh_normal(outputs, None, batch.mask)[0] - best))
-        return loss + self.imitation * distance, metrics | {"imitation": distance}
+        return loss + self.imitation * distance, aux._replace(metrics=aux.metrics | {"imitation": distance})
 
 
 mtjax.register("best-of", BestOf, conditioning="parameters")

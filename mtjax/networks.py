@@ -26,9 +26,10 @@ class Params(NamedTuple):
     shared: Any  # used by every task
     own: Any  # leaves (T, ...): used by one task each, such as heads or embeddings
 
-    def beside(self, others: "Params") -> "Params":
-        """Return the union of both; no two parts may have the same name."""
-        return Params({**self.shared, **others.shared}, {**self.own, **others.own})
+    @property
+    def parts(self) -> dict[str, Any]:
+        """The named parts of one task's network, whether shared or its own."""
+        return {**self.shared, **self.own}
 
     def filled(self, others: "Params") -> "Params":
         """Return these parts, and those of ``others`` that are missing here."""

@@ -255,9 +255,16 @@ def only_seed(tree):
     return pick(tree, 0)
 
 
-def of_task(params: Params, index: int) -> Params:
-    """The parameters that one task uses."""
-    return Params(params.shared, pick(params.own, index))
+def of_task(nets, index: int):
+    """What one task uses of a network, ``Params``, or of networks by name."""
+    if isinstance(nets, dict):
+        return {name: of_task(net, index) for name, net in nets.items()}
+    return Params(nets.shared, pick(nets.own, index))
+
+
+def with_nets(state, **nets):
+    """A state with other networks."""
+    return state._replace(nets=state.nets | nets)
 
 
 def values(agent, state, tasks: Task, obs, action) -> np.ndarray:
@@ -266,7 +273,7 @@ def values(agent, state, tasks: Task, obs, action) -> np.ndarray:
     rows = []
     for i in range(len(tasks.id)):
         features = agent.features(state, pick(tasks, i))
-        rows.append(agent.values(of_task(state.critic, i), features, obs, action))
+        rows.append(agent.values(of_task(state.nets, i), features, obs, action))
     return np.stack(rows)
 
 

@@ -13,6 +13,7 @@ import tyro
 from mtjax import frames, normalize
 from mtjax.agents import parts
 from mtjax.agents.choices import FLAT, PARTS, kinds_of
+from mtjax.agents.fit import Fit, Fitted, learned
 from mtjax.agents.parts import conditioning, sentences, trajectory
 from mtjax.agents.parts.encoders import Encoder
 from mtjax.agents.parts.gradients import descent, surgery
@@ -20,9 +21,10 @@ from mtjax.agents.parts.representations import REPRESENTATIONS, Place, Represent
 from mtjax.agents.parts.samplers import Sampler
 from mtjax.agents.parts.scaling import SCALINGS, Scaling
 from mtjax.agents.parts.trajectory import Past, Seen, TrajectoryEncoder
+from mtjax.agents.state import AgentState, Nets, of_task
 from mtjax.checks import require_values
 from mtjax.experience import Replay, multistep
-from mtjax.networks import Network, Params
+from mtjax.networks import OVER_TASKS, Network, Params
 from mtjax.tasks import SAME_CONTEXT
 from mtjax.types import Acted, Array, Env, InputError, Key, Metrics, Outcome, Spec, Task, Transition
 
@@ -39,24 +41,16 @@ class Memory(NamedTuple):
     scaling: Any  # memory of the scaling of rewards
 
 
-class Pair(NamedTuple):
-    """Holds one thing for the actor, and the same for the critics."""
-
-    actor: Any
-    critic: Any
-
-
 @dataclasses.dataclass(frozen=True)
 class BaseAgent(abc.ABC):
     """Provides the settings and methods of every agent; a subclass adds networks, losses and updates.
 
-    The state of an agent is a NamedTuple with at least these fields:
-        actor, critic: parameters; those of the representation lie beside the critic's.
-        moments: of observations; in a mixture one for each task, leaves (T, O).
-        contexts: (T, C) of the training tasks.
-        vectors: (T, V) given task vectors, or None.
-        surgery, scales, progress: memories of the rules of gradient surgery, of the scaling of rewards and of the
-            sampler of tasks.
+    The networks of every agent, by name:
+        actor, critic: what learns, beside the nets of a subclass.
+        representation: of observations. The critics' loss trains it.
+        tasks: what is known of the training tasks: their contexts (T, C), and given vectors (T, V), if any.
+        inputs: the moments of observations; in a mixture one for each task, leaves (T, O).
+        scaling, sampler: the memories of the scaling of rewards and of the sampler of tasks.
     """
 
     adjustable: ClassVar[tuple[str, ...]] = (
@@ -74,6 +68,8 @@ class BaseAgent(abc.ABC):
         "context_limit",
     )
     """Settings that fine-tuning may change: they say how an agent learns, not what its networks are."""
+    devices_differ: ClassVar[bool] = False
+    """Whether devices that share a seed learn from other data each; with a replay all learn from the same."""
     common_presets: ClassVar[bool] = True
     """Whether the tables of presets that name no agent hold for it. They are tuned for learning from replay."""
     fits_statistics: ClassVar[bool] = False
@@ -154,20 +150,16 @@ class BaseAgent(abc.ABC):
         self._check_combination()
 
     @abc.abstractmethod
-    def init(self, spec: Spec, tasks: Task, key: Key) -> Any:
-        """Return the initial state for the training ``tasks`` (T, ...)."""
-
-    @abc.abstractmethod
-    def init_networks(self, num_tasks: int, inputs: Pair, action: Array, key: Key) -> Pair:
-        """Initialise actor and critics for inputs of these shapes.
+    def init_networks(self, num_tasks: int, actor_inputs: tuple, critic_inputs: tuple, action: Array, key: Key) -> Nets:
+        """Initialise actor, critics, and what else the agent has.
 
         Args:
-            inputs: features (Z,) and an observation (O,), those of the actor and those of the critics.
+            actor_inputs, critic_inputs: features (Z,) and an observation (O,) of these shapes.
             action: (A,).
         """
 
     @abc.abstractmethod
-    def act(self, state: Any, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
+    def act(self, state: AgentState, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
         """Choose an action (A,) for one observation (O,) of one task; without a key, the mean action."""
 
     # Settings that cannot be used.
@@ -204,7 +196,7 @@ class BaseAgent(abc.ABC):
                 f"{encoder} maps observations, and with representation={name} networks see a latent state; "
                 "choose another encoder"
             )
-        for hidden in self.widths:
+        for hidden in (self.actor_widths, self.critic_widths):
             self.encoder.body(hidden, layer_norm=False)  # which refuses widths that it cannot take
         if self.heads == "disjoint" and rule != "mean":
             raise InputError(f"heads=disjoint leaves no parameters that tasks share for gradients={rule}; use mean")
@@ -257,18 +249,23 @@ class BaseAgent(abc.ABC):
         return Network(body, own, embedding, self.unit_embedding, self.encoder.front(), inference)
 
     @property
-    def widths(self) -> Pair:
-        """Widths of the hidden layers in actor and critics."""
-        return Pair(self.actor_hidden or self.hidden, self.critic_hidden or self.hidden)
+    def actor_widths(self) -> tuple[int, ...]:
+        """Widths of the hidden layers in the actor."""
+        return self.actor_hidden or self.hidden
+
+    @property
+    def critic_widths(self) -> tuple[int, ...]:
+        """Widths of the hidden layers in the critics."""
+        return self.critic_hidden or self.hidden
 
     @property
     def actor(self) -> Network:
-        network = self.network(self.widths.actor, self.actor_layer_norm)
+        network = self.network(self.actor_widths, self.actor_layer_norm)
         return dataclasses.replace(network, sight=self.representation.sight)
 
     @property
     def critic(self) -> Network:
-        return self.network(self.widths.critic, self.critic_layer_norm)
+        return self.network(self.critic_widths, self.critic_layer_norm)
 
     @property
     def placed_representation(self) -> Representation:
@@ -282,16 +279,25 @@ class BaseAgent(abc.ABC):
         )
         return self.representation.at(place)
 
-    def actor_inputs(self, critic: Params, features: Array, obs: Any) -> tuple[Array, Any]:
-        """Return features (Z,) and inputs (..., O) of one task's actor; no gradient reaches the representation."""
-        return jax.lax.stop_gradient(self.placed_representation.actor_inputs(critic, features, obs))
+    def actor_inputs(self, nets: Nets, features: Array, obs: Any) -> tuple[Array, Any]:
+        """Return features (Z,) and inputs (..., O) of one task's actor."""
+        return self.placed_representation.actor_inputs(nets["representation"], features, obs)
 
     @property
-    def network_optimizers(self) -> Pair:
-        """Optimisers for the actor, and for the critics with their representation."""
-        chosen = partial(descent.adam, weight_decay=self.weight_decay, max_norm=self.max_gradient_norm, tune=self.tune)
-        actor_lr = self.scheduled(self.actor_lr, self.experience.policy_delay)
-        return Pair(chosen(actor_lr), chosen(self.scheduled(self.critic_lr)))
+    def fits(self) -> dict[str, Fit]:
+        """The gradient steps of the agent, by name: which networks learn together, and how."""
+        optimizer = partial(
+            descent.adam, weight_decay=self.weight_decay, max_norm=self.max_gradient_norm, tune=self.tune
+        )
+        actor_lr, critic_lr = (
+            self.scheduled(self.actor_lr, self.experience.policy_delay),
+            self.scheduled(self.critic_lr),
+        )
+        fit = partial(Fit, per_layer=self.gradient_scope == "per-layer", over_devices=self.devices_differ)
+        return {
+            "critic": fit(("critic", "representation"), optimizer(critic_lr), self.gradients),
+            "actor": fit(("actor",), optimizer(actor_lr), self.gradients.for_actor),
+        }
 
     def scheduled(self, rate: Any, delay: int = 1) -> Any:
         """Return a learning rate, or its schedule, for parameters that learn at every ``delay``-th update."""
@@ -318,35 +324,38 @@ class BaseAgent(abc.ABC):
         """Count the critics' updates in a run of so many steps of every environment."""
         return self.experience.updates_in(steps)
 
-    def init_common(self, spec: Spec, tasks: Task, key: Key) -> dict[str, Any]:
-        """Initialise the fields that all agents' states have, by name, for the training ``tasks`` (T, ...)."""
+    def init(self, spec: Spec, tasks: Task, key: Key) -> AgentState:
+        """Return the initial state for the training ``tasks`` (T, ...)."""
         self.require_sight(spec)
-        num_tasks = len(tasks.id)
-        vectors, moments = self.load_vectors(spec, num_tasks), self.init_moments(spec, num_tasks)
+        num_tasks, vectors = len(tasks.id), self.load_vectors(spec, len(tasks.id))
+        inputs = self.init_inputs(spec, num_tasks)
         features = conditioning.features(self.conditioning, num_tasks, jnp.int32(0), tasks.context[0], vectors)
-        obs, action = self.example(spec, moments), jnp.zeros(spec.action_size)
+        obs, action = self.example(spec, inputs), jnp.zeros(spec.action_size)
         representation = self.placed_representation
         params, key = representation.init(num_tasks, features, obs, action, key)
         one = params.of_first()
-        inputs = Pair(representation.actor_inputs(one, features, obs), representation.perceive(one, features, obs))
-        actor, critic = self.init_networks(num_tasks, inputs, action, key)
-        critic = critic.beside(params)
-        rule_memory = lambda rule, params: surgery.init(rule, params, num_tasks, self.per_layer)
-        return {
-            "actor": actor,
-            "critic": critic,
-            "moments": moments,
-            "contexts": tasks.context,
-            "vectors": vectors,
-            "surgery": Pair(rule_memory(self.gradients.for_actor, actor), rule_memory(self.gradients, critic)),
-            "scales": self.scaling.init(num_tasks),
-            "progress": self.sampler.init(num_tasks),
+        seen = representation.actor_inputs(one, features, obs), representation.perceive(one, features, obs)
+        nets = {
+            "tasks": Params({} if vectors is None else {"vectors": vectors}, {"context": tasks.context}),
+            "inputs": inputs,
+            "representation": params,
+            "scaling": Params({}, self.scaling.init(num_tasks)),
+            "sampler": Params({}, self.sampler.init(num_tasks)),
+            **self.init_networks(num_tasks, *seen, action, key),
         }
+        fits = {name: fit.init(nets, num_tasks) for name, fit in self.fits.items()}
+        return AgentState(nets, self.init_slow(nets), fits)
 
-    @property
-    def per_layer(self) -> bool:
-        """Whether gradients are combined layer by layer."""
-        return self.gradient_scope == "per-layer"
+    def init_slow(self, nets: Nets) -> Nets:
+        """Return the slow copies of networks; none by default."""
+        return {}
+
+    def reset_networks(self, state: AgentState, spec: Spec, tasks: Task, key: Key) -> AgentState:
+        """Return a state in which all that some fit trains begins anew; what is counted is kept."""
+        fresh = self.init(spec, tasks, key)
+        nets = {name: fresh.nets[name] for name in learned(self.fits.values())}
+        nets |= {"scaling": Params({}, self.scaling.reset(state.nets["scaling"].own))}
+        return fresh._replace(nets=state.nets | nets)
 
     # Inputs of the networks: observations, and features of the task.
 
@@ -355,39 +364,37 @@ class BaseAgent(abc.ABC):
         """Number of past steps that the networks take beside each observation."""
         return self.inferred_from if self.conditioning == "inferred" or self.representation.looks_back else 0
 
-    def init_moments(self, spec: Spec, num_tasks: int) -> normalize.Moments:
+    def init_inputs(self, spec: Spec, num_tasks: int) -> Params:
         """Return moments of no observations; in a mixture each task has its own, leaves (T, O)."""
         moments = normalize.init(max(frames.state_size(spec), 1))  # checkpoints hold no empty arrays
-        return jax.tree.map(lambda x: jnp.stack([x] * num_tasks), moments) if spec.mixed else moments
+        if not spec.mixed:
+            return Params({"moments": moments}, {})
+        return Params({}, {"moments": jax.tree.map(lambda x: jnp.stack([x] * num_tasks), moments)})
 
-    def fit_moments(self, moments: normalize.Moments, obs: Array) -> normalize.Moments:
+    def fit_inputs(self, inputs: Params, obs: Array) -> Params:
         """Add observations (T, B, O) of training tasks to the moments, if observations are normalised."""
-        if not self.normalize_observations:
-            return moments
-        update = jax.vmap(normalize.update) if moments.mean.ndim > 1 else normalize.update
         found = frames.state(obs)
-        return moments if found is None else update(moments, found)
+        if not self.normalize_observations or found is None:
+            return inputs
+        if inputs.own:
+            return Params({}, {"moments": jax.vmap(normalize.update)(inputs.own["moments"], found)})
+        return Params({"moments": normalize.update(inputs.shared["moments"], found)}, {})
 
-    def see(self, moments: normalize.Moments, obs: Array, past: Past | None = None) -> Any:
+    def see(self, inputs: Params, obs: Array, past: Past | None = None) -> Any:
         """Return observations (..., O) of one task as networks take them: normalised, and with the past if given."""
-        scale = partial(normalize.apply, moments) if self.normalize_observations else lambda x: x
+        scale = partial(normalize.apply, inputs.parts["moments"]) if self.normalize_observations else lambda x: x
         scaled = lambda obs: frames.with_state(scale, obs)
         return scaled(obs) if past is None else Seen(scaled(obs), past._replace(obs=scaled(past.obs)))
 
-    def see_batch(self, moments: normalize.Moments, obs: Array, past: Past | None = None) -> Any:
+    def see_batch(self, inputs: Params, obs: Array, past: Past | None = None) -> Any:
         """Return observations (T, B, O) of all training tasks as networks take them."""
-        return (jax.vmap(self.see) if moments.mean.ndim > 1 else self.see)(moments, obs, past)
+        return jax.vmap(self.see, (OVER_TASKS, 0, 0))(inputs, obs, past) if inputs.own else self.see(inputs, obs, past)
 
-    def moments_of(self, state: Any, known: Array) -> normalize.Moments:
-        """Return the moments of one training task's observations."""
-        mixed = state.moments.mean.ndim > 1
-        return jax.tree.map(lambda x: x[known], state.moments) if mixed else state.moments
-
-    def example(self, spec: Spec, moments: normalize.Moments) -> Any:
+    def example(self, spec: Spec, inputs: Params) -> Any:
         """Return an input of networks that is all zero."""
-        moments = jax.tree.map(lambda x: x[0], moments) if spec.mixed else moments
         past = trajectory.begin(self.history_length, spec.obs_size, spec.action_size) if self.history_length else None
-        return self.see(moments, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), frames.seen(spec)), past)
+        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), frames.seen(spec))
+        return self.see(inputs.of_first(), zeros, past)
 
     def load_vectors(self, spec: Spec, num_tasks: int) -> Array | None:
         """Return the given task vectors: (T, V) from their file, or of all splits' sentences; None if there are none.
@@ -399,28 +406,30 @@ class BaseAgent(abc.ABC):
             return jnp.asarray(sentences.encode(self.text, spec.sentences))
         return conditioning.load_vectors(self.vectors, num_tasks) if self.vectors else None
 
-    def known_task(self, state: Any, task: Task) -> Array:
+    def known_task(self, state: AgentState, task: Task) -> Array:
         """Return the number () int32 of ``task`` if it is a training task, else of the nearest training task.
 
         Of training tasks that are equally near, up to rounding, it is the lowest number.
         """
-        distance = jnp.sqrt(jnp.sum(jnp.square(state.contexts - task.context), axis=-1))
+        contexts = state.nets["tasks"].own["context"]
+        distance = jnp.sqrt(jnp.sum(jnp.square(contexts - task.context), axis=-1))
         if task.blocks is not None:  # only a task of the same family can be nearest
-            distance = jnp.where(task.blocks.related(state.contexts, task.context), distance, jnp.inf)
+            distance = jnp.where(task.blocks.related(contexts, task.context), distance, jnp.inf)
         nearest = jnp.argmax(distance <= jnp.min(distance) + 2 * SAME_CONTEXT).astype(jnp.int32)
-        return jnp.where(task.id < len(state.contexts), task.id, nearest)
+        return jnp.where(task.id < len(contexts), task.id, nearest)
 
-    def nearest_tasks(self, state: Any, tasks: Task) -> Array:
+    def nearest_tasks(self, state: AgentState, tasks: Task) -> Array:
         """Return the training tasks (T,) nearest to ``tasks`` (T, ...), for training tasks too by their contexts."""
-        unseen = tasks._replace(id=jnp.full_like(tasks.id, len(state.contexts)))
+        unseen = tasks._replace(id=jnp.full_like(tasks.id, state.num_tasks))
         return jax.vmap(partial(self.known_task, state))(unseen)
 
-    def features(self, state: Any, task: Task) -> Array:
+    def features(self, state: AgentState, task: Task) -> Array:
         """Return the features (Z,) of one task that networks take as inputs."""
         number, context = self.known_task(state, task), self.limited(task.context)
+        vectors = state.nets["tasks"].shared.get("vectors")
         if self.conditioning == "text":
-            number = jnp.where(task.id < len(state.vectors), task.id, number)
-        return conditioning.features(self.conditioning, len(state.contexts), number, context, state.vectors)
+            number = jnp.where(task.id < len(vectors), task.id, number)
+        return conditioning.features(self.conditioning, state.num_tasks, number, context, vectors)
 
     def limited(self, context: Array) -> Array:
         """Return contexts (..., C) as networks see them."""
@@ -429,23 +438,19 @@ class BaseAgent(abc.ABC):
         limit = parts.or_infinite(self.context_limit)
         return jnp.clip(context, -limit, limit)
 
-    def features_of_batch(self, state: Any, batch: Transition, tasks: Task) -> Array:
+    def features_of_batch(self, state: AgentState, batch: Transition, tasks: Task) -> Array:
         """Return the features of a batch's tasks: (T, Z), or (T, B, Z) where each episode has its own."""
         if batch.context is not None and self.conditioning == "parameters":
             return self.limited(batch.context)
         return jax.vmap(partial(self.features, state))(tasks)
 
-    def of_task(self, state: Any, task: Task, *networks: Params) -> tuple[Params, ...]:
-        """Select one task's parameters from networks of all tasks."""
-        known = self.known_task(state, task)
-        return tuple(Params(net.shared, jax.tree.map(lambda x: x[known], net.own)) for net in networks)
-
-    def acting_inputs(self, state: Any, memory: Memory, obs: Any, task: Task) -> tuple[Params, Params, Array, Any]:
-        """Return what one task needs to act: actor, critics, task features (Z,) and the observation (O,) as input."""
-        actor, critic = self.of_task(state, task, state.actor, state.critic)
-        inputs = self.see(self.moments_of(state, self.known_task(state, task)), obs, memory.past)
-        critic = self.placed_representation.stand_in(critic, state.critic, task.id < len(state.contexts), inputs)
-        return actor, critic, self.features(state, task), inputs
+    def acting_inputs(self, state: AgentState, memory: Memory, obs: Any, task: Task) -> tuple[Nets, Array, Any]:
+        """Return what one task needs to act: its networks, its features (Z,) and the observation (O,) as input."""
+        nets = of_task(state.nets, self.known_task(state, task))
+        inputs, of_all = self.see(nets["inputs"], obs, memory.past), state.nets["representation"]
+        trained = task.id < state.num_tasks
+        own = self.placed_representation.stand_in(nets["representation"], of_all, trained, inputs)
+        return nets | {"representation": own}, self.features(state, task), inputs
 
     def discounts(self, tasks: Task) -> float | Array:
         """Return the discount of each task (T,), or one for all."""
@@ -479,18 +484,18 @@ class BaseAgent(abc.ABC):
 
     # Memory of an episode, and statistics of all episodes.
 
-    def begin(self, state: Any, task: Task) -> Memory:
+    def begin(self, state: AgentState, task: Task) -> Memory:
         """Return the memory with which an episode begins."""
-        sizes = (state.moments.mean.shape[-1], self.action_size(state)) if self.history_length else ()
+        moments = state.nets["inputs"].parts["moments"]
+        sizes = (moments.mean.shape[-1], self.action_size(state)) if self.history_length else ()
         past = trajectory.begin(self.history_length, *sizes) if self.history_length else None
         return Memory(past, self.scaling.begin())
 
-    def action_size(self, state: Any) -> int:
+    def action_size(self, state: AgentState) -> int:
         """Return the size A of actions; the actor's head has 2 A outputs."""
-        head = {**state.actor.shared, **state.actor.own}["head"]
-        return head["bias"].shape[-1] // 2
+        return state.nets["actor"].parts["head"]["bias"].shape[-1] // 2
 
-    def remember(self, state: Any, memory: Memory, transition: Transition, task: Task) -> Memory:
+    def remember(self, state: AgentState, memory: Memory, transition: Transition, task: Task) -> Memory:
         """Return the memory after a step."""
         past = memory.past
         if past is not None:
@@ -507,10 +512,11 @@ class BaseAgent(abc.ABC):
         """Whether ``observe`` has to be called with the outcomes of every step."""
         return self.scaling.watches or self.sampler.watches
 
-    def observe(self, state: Any, outcome: Outcome) -> Any:
+    def observe(self, state: AgentState, outcome: Outcome) -> AgentState:
         """Update the statistics by the outcomes of one step of every environment, leaves (T, E)."""
-        scales = self.scaling.observe(state.scales, outcome)
-        return state._replace(scales=scales, progress=self.sampler.observe(state.progress, outcome))
+        watched = {"scaling": self.scaling, "sampler": self.sampler}
+        new = {name: Params({}, part.observe(state.nets[name].own, outcome)) for name, part in watched.items()}
+        return state._replace(nets=state.nets | new)
 
     # Learning.
 
@@ -522,11 +528,31 @@ class BaseAgent(abc.ABC):
     def above_least(self, critic_loss: Callable) -> Callable:
         """Subtract the lower bound from a critic loss of one task, for rules of surgery that compare losses."""
 
-        def loss(critic: Params, data: Any) -> tuple[Array, Metrics]:
-            value, metrics = critic_loss(critic, data)
-            return value - self.least_loss, metrics
+        def loss(nets: Nets, *data: Any) -> tuple[Array, Any]:
+            value, aux = critic_loss(nets, *data)
+            return value - self.least_loss, aux
 
         return loss
+
+    def descend(
+        self,
+        state: AgentState,
+        name: str,
+        loss: Callable,
+        data: tuple,
+        key: Key,
+        importance: Array | None = None,
+        seen: Nets | None = None,
+    ) -> tuple[AgentState, Fitted]:
+        """Take the gradient step called ``name`` for a loss of one task on data (T, ...).
+
+        Args:
+            seen: networks that the loss sees in place of the state's.
+        """
+        found = self.fits[name].step(state.fits[name], loss, state.nets | (seen or {}), data, key, importance)
+        found = found._replace(metrics={f"{name}_{key}": value for key, value in found.metrics.items()})
+        fits = state.fits | {name: found.state}
+        return state._replace(nets=state.nets | found.nets, fits=fits), found
 
     def learn(self, env: Env, states: Any, data: Any, tasks: Task, keys: Key) -> tuple[Any, Metrics]:
         """Update the agents of all seeds, leaves (S, ...), from their experience."""

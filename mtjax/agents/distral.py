@@ -9,9 +9,10 @@ import jax.numpy as jnp
 from mtjax.agents import parts
 from mtjax.agents.base import Heads
 from mtjax.agents.choices import PARTS
-from mtjax.agents.sac import SAC, Batch, Sample
+from mtjax.agents.sac import SAC, ActorAux, Batch, Sample
+from mtjax.agents.state import Nets
 from mtjax.networks import Network, Params, divergence, log_density, sample_raw
-from mtjax.types import Array, InputError, Key, Metrics
+from mtjax.types import Array, InputError, Key
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,22 +99,22 @@ class Distral(SAC):
         network = super().actor
         return Policies(**{field.name: getattr(network, field.name) for field in dataclasses.fields(network)})
 
-    def behaviour(self, trained: Array, actor: Params, critic: Params, features: Array, obs: Array) -> Array:
-        own = self.policy(actor, critic, features, obs)
-        return jnp.where(trained, own, self.actor.apply_distilled(actor, features, obs))
+    def behaviour(self, trained: Array, nets: Nets, features: Array, obs: Array) -> Array:
+        own = self.policy(nets, features, obs)
+        return jnp.where(trained, own, self.actor.apply_distilled(nets["actor"], features, obs))
 
-    def sample(self, actor: Params, critic: Params, batch: Batch, obs: Any, key: Key) -> Sample:
-        raw, log_prob = sample_raw(self.policy(actor, critic, batch.features, obs), key, batch.mask)
-        distilled = self.actor.apply_distilled(jax.lax.stop_gradient(actor), batch.features, obs)
+    def sample(self, nets: Nets, batch: Batch, obs: Any, key: Key) -> Sample:
+        raw, log_prob = sample_raw(self.policy(nets, batch.features, obs), key, batch.mask)
+        distilled = self.actor.apply_distilled(jax.lax.stop_gradient(nets["actor"]), batch.features, obs)
         cost = log_prob - self.distral_alpha * log_density(distilled, raw, batch.mask)
         action = jnp.tanh(raw)
         return Sample(action if batch.mask is None else action * batch.mask, log_prob, cost)
 
-    def actor_loss(self, actor: Params, data: tuple[Batch, Params, Key]) -> tuple[Array, Metrics]:
-        loss, metrics = super().actor_loss(actor, data)
-        batch, critic, key = data
-        own = self.policy(actor, critic, batch.features, batch.obs)
+    def actor_loss(self, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:
+        loss, aux = super().actor_loss(nets, batch, key)
+        own = self.policy(nets, batch.features, batch.obs)
         raw, _ = sample_raw(own, key)  # the actions of that loss
-        distilled = self.actor.apply_distilled(actor, batch.features, batch.obs)
+        distilled = self.actor.apply_distilled(nets["actor"], batch.features, batch.obs)
         fit = jnp.mean(log_density(distilled, jax.lax.stop_gradient(raw), batch.mask))
-        return loss - fit, {**metrics, "kl": jnp.mean(divergence(own, distilled, batch.mask))}
+        kl = jnp.mean(divergence(own, distilled, batch.mask))
+        return loss - fit, aux._replace(metrics=aux.metrics | {"kl": kl})

@@ -1,7 +1,6 @@
 """PPO trains by proximal policy optimisation on many tasks at once."""
 
 import dataclasses
-from collections.abc import Callable
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
@@ -10,16 +9,17 @@ import jax.numpy as jnp
 
 from mtjax import frames, normalize
 from mtjax.agents import parts
-from mtjax.agents.base import BaseAgent, Memory, Pair
+from mtjax.agents.base import BaseAgent, Memory
 from mtjax.agents.choices import FLAT
-from mtjax.agents.parts.gradients import descent, surgery
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
+from mtjax.agents.parts.scaling.base import Moments
+from mtjax.agents.parts.scaling.popart import rescale_heads
 from mtjax.agents.parts.trajectory import Past, append
+from mtjax.agents.state import AgentState, Nets, axes_of
 from mtjax.experience import Rollouts
 from mtjax.maps import in_parts
 from mtjax.networks import (
-    OVER_TASKS,
     STD_RANGE,
     Network,
     Params,
@@ -30,7 +30,7 @@ from mtjax.networks import (
 )
 from mtjax.parallel import collectives
 from mtjax.parallel.collectives import mean_and_variance
-from mtjax.types import Acted, Array, InputError, Key, Metrics, Spec, Task, Transition
+from mtjax.types import Acted, Array, InputError, Key, Metrics, Task, Transition
 
 LOG_RATIO_LIMIT = 20.0
 """Bound of |log ratio| of two policies, so that its exponential stays finite."""
@@ -44,35 +44,28 @@ class Units(NamedTuple):
     """Holds the units of the critic: a value is mean + std times its output."""
 
     count: Array  # () number of rollouts so far
-    mean: Array  # (T,)
-    variance: Array  # (T,)
+    moments: Moments  # of targets, (T,)
+
+    @staticmethod
+    def of(params: Params) -> "Units":
+        """Return the units that a network of the agent's holds."""
+        return Units(params.shared["count"], params.own)
+
+    def params(self) -> Params:
+        """Return the units as a network of the agent's."""
+        return Params({"count": self.count}, self.moments)
 
     @property
     def std(self) -> Array:
-        return jnp.maximum(jnp.sqrt(self.variance), MIN_STD)
+        return jnp.maximum(jnp.sqrt(self.moments.variance), MIN_STD)
 
     def rewards(self, outputs: Array) -> Array:
         """Return the values in units of reward for which the critic's outputs (T, B) stand."""
-        return self.mean[:, None] + self.std[:, None] * outputs
+        return self.moments.mean[:, None] + self.std[:, None] * outputs
 
     def outputs(self, values: Array) -> Array:
         """Return the critic's outputs that stand for values (T, B) in units of reward."""
-        return (values - self.mean[:, None]) / self.std[:, None]
-
-
-class PPOState(NamedTuple):
-    """Holds everything that PPO learns, and what it remembers of the training tasks."""
-
-    actor: Params
-    critic: Params  # beside it the representation
-    optimizers: Pair
-    moments: normalize.Moments
-    contexts: Array  # (T, C) of the training tasks; an unseen task finds its nearest among them
-    vectors: Array | None  # (T, V) given task vectors, if conditioned on them
-    surgery: Pair
-    scales: Any  # memory of the scaling of rewards
-    progress: Any  # memory of the sampler of tasks
-    units: Units
+        return (values - self.moments.mean[:, None]) / self.std[:, None]
 
 
 class Taken(NamedTuple):
@@ -81,6 +74,13 @@ class Taken(NamedTuple):
     raw: Array  # (A,) the action before the tanh
     log_prob: Array  # () its log-probability under the policy that took it
     past: Past | None  # the steps before it, if the agent infers the task from them
+
+
+class ActorAux(NamedTuple):
+    """Holds what the actor loss finds beside the loss."""
+
+    metrics: Metrics
+    kl: Array  # () an estimate of KL(pi_old | pi)
 
 
 class Batch(NamedTuple):
@@ -149,6 +149,7 @@ class PPO(BaseAgent):
         *("gae_lambda", "epochs", "minibatches", "clip_range", "value_clip", "entropy_cost", "kl_limit", "value_rate"),
     )
     common_presets: ClassVar[bool] = False
+    devices_differ: ClassVar[bool] = True
     actor_lr: float = 3e-4
     """Adam's learning rate for the actor."""
     critic_lr: float = 1e-3
@@ -221,28 +222,20 @@ class PPO(BaseAgent):
             return network
         return dataclasses.replace(network, own=(*network.own, "head"))
 
-    def init(self, spec: Spec, tasks: Task, key: Key) -> PPOState:
-        """Return the initial state for the training ``tasks`` (T, ...)."""
-        num_tasks, common = len(tasks.id), self.init_common(spec, tasks, key)
-        optimizers = self.network_optimizers
-        return PPOState(
-            **common,
-            optimizers=Pair(optimizers.actor.init(common["actor"]), optimizers.critic.init(common["critic"])),
-            units=Units(jnp.float32(0), jnp.zeros(num_tasks), jnp.ones(num_tasks)),
-        )
-
-    def init_networks(self, num_tasks: int, inputs: Pair, action: Array, key: Key) -> Pair:
+    def init_networks(self, num_tasks: int, actor_inputs: tuple, critic_inputs: tuple, action: Array, key: Key) -> Nets:
         actor_key, critic_key = jax.random.split(key)
         first = jnp.repeat(jnp.array([0.0, outputs_for(self.initial_std)]), len(action))
-        actor = scale_head(self.actor.init(actor_key, num_tasks, 2 * len(action), *inputs.actor), first)
-        return Pair(actor, scale_head(self.critic.init(critic_key, num_tasks, 1, *inputs.critic), jnp.zeros(1)))
+        return {
+            "actor": scale_head(self.actor.init(actor_key, num_tasks, 2 * len(action), *actor_inputs), first),
+            "critic": scale_head(self.critic.init(critic_key, num_tasks, 1, *critic_inputs), jnp.zeros(1)),
+            "units": Units(jnp.float32(0), Moments.begin(num_tasks)).params(),
+        }
 
     # Acting.
 
-    def act(self, state: PPOState, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
+    def act(self, state: AgentState, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
         """Choose an action (A,) for one observation (O,) of one task; without a key, the mean action."""
-        actor, critic, features, inputs = self.acting_inputs(state, memory, obs, task)
-        outputs = self.actor.apply(actor, *self.actor_inputs(critic, features, inputs))
+        outputs = self.policy(*self.acting_inputs(state, memory, obs, task))
         if key is None:
             return Acted(tanh_normal(outputs, None, task.action_mask)[0], None, memory)
         raw, log_prob = sample_raw(outputs, key, task.action_mask)
@@ -252,10 +245,12 @@ class PPO(BaseAgent):
 
     # Losses of one task.
 
-    def actor_loss(self, actor: Params, data: tuple[Batch, Key]) -> tuple[Array, Metrics]:
-        """Compute the actor loss on a batch whose features and observations are the actor's inputs."""
-        batch, key = data
-        outputs = self.actor.apply(actor, batch.features, batch.obs)
+    def policy(self, nets: Nets, features: Array, obs: Any) -> Array:
+        """Return the policy's outputs (..., 2A)."""
+        return self.actor.apply(nets["actor"], *self.actor_inputs(nets, features, obs))
+
+    def actor_loss(self, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:
+        outputs = self.policy(nets, batch.features, batch.obs)
         log_ratio = log_density(outputs, batch.raw, batch.mask) - batch.log_prob
         log_ratio = jnp.clip(log_ratio, -LOG_RATIO_LIMIT, LOG_RATIO_LIMIT)
         ratio = jnp.exp(log_ratio)
@@ -264,51 +259,53 @@ class PPO(BaseAgent):
         entropy = -jnp.mean(sample_raw(outputs, key, batch.mask)[1])
         loss = -gain - self.entropy_cost * entropy
         kl, beyond = jnp.mean(ratio - 1 - log_ratio), jnp.mean(ratio != clipped)
-        return loss, {"actor_loss": loss, "entropy": entropy, "kl": kl, "clip_fraction": beyond}
+        return loss, ActorAux({"actor_loss": loss, "entropy": entropy, "kl": kl, "clip_fraction": beyond}, kl)
 
-    def critic_loss(self, critic: Params, batch: Batch) -> tuple[Array, Metrics]:
-        output = self.output(critic, batch.features, batch.obs)
+    def critic_loss(self, nets: Nets, batch: Batch) -> tuple[Array, Metrics]:
+        output = self.output(nets, batch.features, batch.obs)
         error = jnp.square(output - batch.target)
         if not parts.is_zero(self.value_clip):
             clipped = batch.output + jnp.clip(output - batch.output, -self.value_clip, self.value_clip)
             error = jnp.maximum(error, jnp.square(clipped - batch.target))
         loss = jnp.mean(error) / 2
-        return self.placed_representation.join(loss, {"critic_loss": loss}, critic, batch)
+        return self.placed_representation.join(loss, {"critic_loss": loss}, nets["representation"], batch)
 
-    def output(self, critic: Params, features: Array, obs: Any) -> Array:
+    def output(self, nets: Nets, features: Array, obs: Any) -> Array:
         """Return the critic's outputs (B,) for observations (B, ...)."""
-        features, inputs = self.placed_representation.perceive(critic, features, obs)
-        return self.critic.apply(critic.without(self.placed_representation.names), features, inputs)[..., 0]
+        features, inputs = self.placed_representation.perceive(nets["representation"], features, obs)
+        return self.critic.apply(nets["critic"], features, inputs)[..., 0]
 
     # Update of all tasks.
 
-    def update(self, state: PPOState, steps: Transition, tasks: Task, key: Key) -> tuple[PPOState, Metrics]:
+    def update(self, state: AgentState, steps: Transition, tasks: Task, key: Key) -> tuple[AgentState, Metrics]:
         """Learn from the rollouts (T, H, E, ...) of the training tasks; metrics are (T,)."""
         order_key, key = jax.random.split(key)
         state, batch, statistics = self.prepare(state, steps, tasks)
         indices = self.minibatch_indices(batch.advantage.shape[1], order_key)
-        minibatch_step = partial(self.minibatch_step, batch, state.critic)
+        minibatch_step = partial(self.minibatch_step, batch, state.nets["representation"])
         (state, _), metrics = jax.lax.scan(
             minibatch_step, (state, jnp.bool_(True)), (indices, jax.random.split(key, len(indices)))
         )
-        state = state._replace(moments=self.fit_moments(state.moments, steps.obs))
+        inputs = self.fit_inputs(state.nets["inputs"], steps.obs)
+        state = state._replace(nets=state.nets | {"inputs": inputs})
         return state, jax.tree.map(lambda x: jnp.mean(x, axis=0), metrics) | statistics
 
-    def prepare(self, state: PPOState, steps: Transition, tasks: Task) -> tuple[PPOState, Batch, Metrics]:
+    def prepare(self, state: AgentState, steps: Transition, tasks: Task) -> tuple[AgentState, Batch, Metrics]:
         """Fit the units to rollouts (T, H, E, ...), and return the batch (T, H E, ...) for the losses."""
         flat: Transition = jax.tree.map(lambda x: x.reshape(x.shape[0], -1, *x.shape[3:]), steps)
         taken: Taken = flat.extras
         next_past = None if taken.past is None else append(taken.past, flat.obs, flat.action, flat.reward)
-        features, obs = self.features_of_batch(state, flat, tasks), self.see_batch(state.moments, flat.obs, taken.past)
-        next_obs = self.see_batch(state.moments, flat.next_obs, next_past)
-        output = self.outputs(state, features, obs)
-        value, next_value = state.units.rewards(output), self.values(state, features, next_obs)
+        features, see = self.features_of_batch(state, flat, tasks), partial(self.see_batch, state.nets["inputs"])
+        obs, next_obs = see(flat.obs, taken.past), see(flat.next_obs, next_past)
+        old, output = Units.of(state.nets["units"]), self.outputs(state, features, obs)
+        value, next_value = old.rewards(output), self.values(state, features, next_obs)
         reward = self.rewards(state, flat, tasks)
         advantage = self.advantages(flat._replace(reward=reward), tasks, steps.reward.shape, value, next_value)
         target = value + advantage
-        scales, _ = self.scaling.renew(state.scales, target, ())
-        old, state = state.units, self.renew(state, target)._replace(scales=scales)
-        factor, offset = (x[:, None] for x in self.follows(old, state.units))
+        scaling, _ = self.scaling.renew(state.nets["scaling"].own, target, ())
+        state = self.renew(state._replace(nets=state.nets | {"scaling": Params({}, scaling)}), target)
+        units = Units.of(state.nets["units"])
+        factor, offset = (x[:, None] for x in self.follows(old, units))
         models = {"action": flat.action, "reward": reward, "next_obs": next_obs} if self.representation.learns else {}
         batch = Batch(
             obs=obs,
@@ -316,7 +313,7 @@ class PPO(BaseAgent):
             log_prob=taken.log_prob,
             advantage=self.normalize_advantages(advantage),
             output=factor * output + offset,
-            target=state.units.outputs(target),
+            target=units.outputs(target),
             features=features,
             mask=tasks.action_mask,
             **models,
@@ -325,10 +322,10 @@ class PPO(BaseAgent):
         explained = 1 - residual_variance / jnp.maximum(target_variance, MIN_STD**2)
         return state, batch, {"value": mean_and_variance(value, 1)[0][:, 0], "explained_variance": explained}
 
-    def rewards(self, state: PPOState, flat: Transition, tasks: Task) -> Array:
+    def rewards(self, state: AgentState, flat: Transition, tasks: Task) -> Array:
         """Return the rewards (T, H E) of steps in the task's units."""
         gamma = jnp.broadcast_to(self.discounts(tasks), len(tasks.id))
-        return self.reward_scale * self.scaling.rewards(state.scales, flat, gamma, jnp.zeros(len(gamma)))
+        return self.reward_scale * self.scaling.rewards(state.nets["scaling"].own, flat, gamma, jnp.zeros(len(gamma)))
 
     def advantages(self, flat: Transition, tasks: Task, shape: Any, value: Array, next_value: Array) -> Array:
         """Compute advantages (T, H E) of steps (T, H E) that were played in the ``shape`` (T, H, E)."""
@@ -336,13 +333,13 @@ class PPO(BaseAgent):
         played = (x.reshape(shape) for x in (flat.reward, flat.discount, flat.ended, value, next_value))
         return jax.vmap(partial(advantages, lambda_=self.gae_lambda))(*played, gamma=gamma).reshape(value.shape)
 
-    def values(self, state: PPOState, features: Array, obs: Any) -> Array:
+    def values(self, state: AgentState, features: Array, obs: Any) -> Array:
         """Return the critic's values (T, B) of observations (T, B, ...), in units of reward."""
-        return state.units.rewards(self.outputs(state, features, obs))
+        return Units.of(state.nets["units"]).rewards(self.outputs(state, features, obs))
 
-    def outputs(self, state: PPOState, features: Array, obs: Any) -> Array:
+    def outputs(self, state: AgentState, features: Array, obs: Any) -> Array:
         """Return the critic's outputs (T, B) for observations (T, B, ...)."""
-        of_tasks = partial(jax.vmap(self.output, (OVER_TASKS, 0, 0)), state.critic)
+        of_tasks = partial(jax.vmap(self.output, (axes_of(state.nets), 0, 0)), state.nets)
         if frames.shown(obs):  # all at once they would fill the memory
             return in_parts(of_tasks, features, obs, self.minibatches)
         return of_tasks(features, obs)
@@ -354,25 +351,18 @@ class PPO(BaseAgent):
         mean, variance = mean_and_variance(advantage, 1 if self.advantage_normalization == "task" else (0, 1))
         return (advantage - mean) / jnp.maximum(jnp.sqrt(variance), MIN_STD)
 
-    def renew(self, state: PPOState, target: Array) -> PPOState:
-        """Update the critic's units by targets (T, B)."""
+    def renew(self, state: AgentState, target: Array) -> AgentState:
+        """Update the critic's units by targets (T, B), and with PopArt rescale its heads to them."""
         if self.value_normalization == "none":
             return state
-        old, count = state.units, state.units.count + 1
-        rate = jnp.maximum(self.value_rate, 1 / count)  # the first rollouts have equal weights
+        old = Units.of(state.nets["units"])
+        rate = jnp.maximum(self.value_rate, 1 / (old.count + 1))  # the first rollouts have equal weights
         mean, variance = (x[:, 0] for x in mean_and_variance(target, 1))
-        drift = mean - old.mean
-        variance = (1 - rate) * old.variance + rate * variance + rate * (1 - rate) * jnp.square(drift)
-        new = Units(count, old.mean + rate * drift, variance)
-        return state._replace(units=new, critic=self.follow(state.critic, old, new))
-
-    def follow(self, critic: Params, old: Units, new: Units) -> Params:
-        """Rescale the critic's heads to new units, as ``follows`` says."""
-        if self.value_normalization != "popart":
-            return critic
-        (factor, offset), head = self.follows(old, new), critic.own["head"]  # kernel (T, D, 1), bias (T, 1)
-        kernel, bias = factor[:, None, None] * head["kernel"], factor[:, None] * head["bias"] + offset[:, None]
-        return Params(critic.shared, {**critic.own, "head": {"kernel": kernel, "bias": bias}})
+        new = Units(old.count + 1, old.moments.moved(rate, mean - old.moments.mean, variance))
+        nets = state.nets | {"units": new.params()}
+        if self.value_normalization == "popart":
+            nets |= {"critic": rescale_heads(state.nets["critic"], *self.follows(old, new))}
+        return state._replace(nets=nets)
 
     def follows(self, old: Units, new: Units) -> tuple[Array, Array]:
         """Return by which factor and offset (T,) the critic's outputs change when its units do.
@@ -380,18 +370,23 @@ class PPO(BaseAgent):
         With PopArt they change so that values do not, but for the first units, which change nothing.
         """
         known = (old.count > 0) & (self.value_normalization == "popart")
-        return jnp.where(known, old.std / new.std, 1.0), jnp.where(known, (old.mean - new.mean) / new.std, 0.0)
+        return jnp.where(known, old.std / new.std, 1.0), jnp.where(
+            known, (old.moments.mean - new.moments.mean) / new.std, 0.0
+        )
 
-    def fit_moments(self, moments: normalize.Moments, obs: Any) -> normalize.Moments:
+    def fit_inputs(self, inputs: Params, obs: Any) -> Params:
         """Add the vectors (T, ..., O) in observations to the moments, with those on other devices."""
         found = frames.state(obs)
         if not self.normalize_observations or found is None:
-            return moments
-        mixed, found = moments.mean.ndim > 1, found.reshape(len(found), -1, found.shape[-1])
+            return inputs
+        moments, mixed = inputs.parts["moments"], bool(inputs.own)
+        found = found.reshape(len(found), -1, found.shape[-1])
         count = (found.shape[1] if mixed else found.shape[0] * found.shape[1]) * collectives.count()
         mean, variance = (x.reshape(moments.mean.shape) for x in mean_and_variance(found, 1 if mixed else (0, 1)))
         one = normalize.Moments(jnp.full_like(moments.count, count), mean, count * variance)
-        return jax.vmap(normalize.merge)(moments, one) if mixed else normalize.merge(moments, one)
+        if mixed:
+            return Params({}, {"moments": jax.vmap(normalize.merge)(moments, one)})
+        return Params({"moments": normalize.merge(moments, one)}, {})
 
     def minibatch_indices(self, count: int, key: Key) -> Array:
         """Split ``count`` steps at random into the minibatches of all epochs: indices (U, B)."""
@@ -402,54 +397,33 @@ class PPO(BaseAgent):
         return indices[:, : size * self.minibatches].reshape(-1, size)
 
     def minibatch_step(
-        self, batch: Batch, old_critic: Params, carry: tuple[PPOState, Array], given: tuple[Array, Key]
+        self, batch: Batch, slow: Params, carry: tuple[AgentState, Array], given: tuple[Array, Key]
     ) -> tuple[Any, Metrics]:
         """Take a gradient step of critic and actor on one minibatch, steps (B,) of every task.
 
         Args:
-            old_critic: the critic, and the representation, from before the update.
+            slow: the representation from before the update.
             carry: the state, and whether KL(pi_old | pi) has stayed within ``kl_limit`` so far ().
             given: indices of steps (B,), and a key.
         """
         (state, within_limit), (index, key) = carry, given
         sample_key, actor_order, critic_order = jax.random.split(key, 3)
-        minibatch = take_steps(batch, index)
+        minibatch, representation = take_steps(batch, index), state.nets["representation"]
         if self.representation.learns:
-            model_targets, _ = self.placed_representation.targets(
-                state.critic, old_critic, minibatch.next_obs, jax.random.fold_in(key, 3)
-            )
-            minibatch = minibatch._replace(model_targets=model_targets)
-        sample_keys = jax.random.split(sample_key, len(batch.advantage))
-        features, obs = jax.vmap(self.actor_inputs, (OVER_TASKS, 0, 0))(state.critic, minibatch.features, minibatch.obs)
-        data = (minibatch._replace(features=features, obs=obs, model_targets=None), sample_keys)
-        critic_loss = self.above_least(self.critic_loss)
-        state, critic_metrics = self.descend("critic", self.gradients, critic_loss, state, minibatch, critic_order)
-        moved, actor_metrics = self.descend(
-            "actor", self.gradients.for_actor, self.actor_loss, state, data, actor_order
-        )
+            models_key = jax.random.fold_in(key, 3)
+            targets, _ = self.placed_representation.targets(representation, slow, minibatch.next_obs, models_key)
+            minibatch = minibatch._replace(model_targets=targets)
+        importance = self.sampler.weights(state.nets["sampler"].own, jnp.ones(state.num_tasks))
+        loss, samples = self.above_least(self.critic_loss), jax.random.split(sample_key, state.num_tasks)
+        state, critic = self.descend(state, "critic", loss, (minibatch,), critic_order, importance)
+        data, seen = (minibatch._replace(model_targets=None), samples), {"representation": representation}
+        moved, actor = self.descend(state, "actor", self.actor_loss, data, actor_order, importance, seen)
+        metrics = critic.aux | critic.metrics | actor.aux.metrics | actor.metrics
         if parts.is_zero(self.kl_limit):
-            return (moved, within_limit), critic_metrics | actor_metrics
-        limit = jnp.where(self.kl_limit > 0, self.kl_limit, jnp.inf)
-        within_limit &= jnp.mean(actor_metrics["kl"]) <= limit
+            return (moved, within_limit), metrics
+        within_limit &= jnp.mean(actor.aux.kl) <= jnp.where(self.kl_limit > 0, self.kl_limit, jnp.inf)
         state = jax.tree.map(partial(jnp.where, within_limit), moved, state)
-        return (state, within_limit), critic_metrics | actor_metrics
-
-    def descend(
-        self, name: str, rule: surgery.Rule, loss: Callable, state: PPOState, data: Any, key: Key
-    ) -> tuple[PPOState, Metrics]:
-        """Take a gradient step of the network called ``name`` on data (T, ...) for a loss of one task."""
-        loss, params = surgery.over_devices(loss), getattr(state, name)
-        importance = self.sampler.weights(state.progress, jnp.ones(len(state.contexts)))
-        memory = getattr(state.surgery, name)
-        step = surgery.gradient(rule, loss, params, data, memory, key, importance, self.per_layer)
-        memory = getattr(state.optimizers, name)
-        params, memory = descent.descend(getattr(self.network_optimizers, name), step.gradients, memory, params)
-        state = state._replace(
-            **{name: params},
-            optimizers=state.optimizers._replace(**{name: memory}),
-            surgery=state.surgery._replace(**{name: surgery.adapt_rule(rule, loss, params, data, step)}),
-        )
-        return state, step.aux | {f"{name}_{key}": value for key, value in step.metrics.items()}
+        return (state, within_limit), metrics
 
 
 def advantages(

@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Callable
-from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import jax
@@ -10,44 +9,20 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from mtjax import normalize
 from mtjax.agents import parts
-from mtjax.agents.base import BaseAgent, Memory, Pair
+from mtjax.agents.base import BaseAgent, Memory
 from mtjax.agents.choices import FLAT
-from mtjax.agents.parts.gradients import descent, surgery
+from mtjax.agents.fit import Fit
 from mtjax.agents.parts.representations import REPRESENTATIONS
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.trajectory import append
 from mtjax.agents.parts.values import VALUES, Value
+from mtjax.agents.state import AgentState, Nets, axes_of
 from mtjax.experience import Replay, pictures
 from mtjax.experience.multistep import Ends
 from mtjax.maps import when
-from mtjax.networks import OVER_TASKS, Network, Params, tanh_normal
-from mtjax.types import Acted, Array, InputError, Key, Metrics, Sometimes, Spec, Task, Transition
-
-
-class Optimizers(NamedTuple):
-    """Holds the optimisers' states."""
-
-    actor: Any
-    critic: Any
-    temperature: Any
-
-
-class SACState(NamedTuple):
-    """Holds everything that SAC learns, and what it remembers of the training tasks."""
-
-    actor: Params
-    critic: Params  # shared leaves (N, ...), own leaves (T, N, ...); beside them the representation, without N
-    target: Params  # the target critic: a slow copy of the critic
-    log_temperature: Array  # (T,), or (1,) if shared
-    optimizers: Optimizers
-    moments: normalize.Moments
-    contexts: Array  # (T, C) of the training tasks; an unseen task finds its nearest among them
-    vectors: Array | None  # (T, V) given task vectors, if conditioned on them
-    surgery: Pair
-    scales: Any  # memory of the scaling of rewards
-    progress: Any  # memory of the sampler of tasks
+from mtjax.networks import Network, Params, tanh_normal
+from mtjax.types import Acted, Array, InputError, Key, Metrics, Sometimes, Task, Transition
 
 
 class Batch(NamedTuple):
@@ -71,6 +46,22 @@ class Sample(NamedTuple):
     action: Array  # (B, A)
     log_prob: Array  # (B,)
     cost: Array  # (B,) what the temperature weighs: log pi, in Distral less a share of log pi_0
+
+
+class CriticAux(NamedTuple):
+    """Holds what a critic loss finds beside the loss."""
+
+    metrics: Metrics
+    expected: Array  # (B,) the values that the critics are fitted to
+    statistics: Any = {}  # new running statistics of the critics' bodies  # noqa: RUF012
+
+
+class ActorAux(NamedTuple):
+    """Holds what an actor loss finds beside the loss."""
+
+    metrics: Metrics
+    entropy: Array  # () of the policy
+    statistics: Any = {}  # new running statistics of the actor's body  # noqa: RUF012
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,122 +132,105 @@ class SAC(BaseAgent):
     def network(self, hidden: tuple[int, ...], layer_norm: bool) -> Network:
         return dataclasses.replace(super().network(hidden, layer_norm), unit_head=self.unit_head)
 
-    def init(self, spec: Spec, tasks: Task, key: Key) -> SACState:
-        """Return the initial state for the training ``tasks`` (T, ...)."""
-        common = self.init_common(spec, tasks, key)
-        log = jnp.log if isinstance(self.initial_temperature, Array) else np.log
-        log_temperature = jnp.full(1 if self.shared_temperature else len(tasks.id), log(self.initial_temperature))
-        log_temperature = log_temperature.astype(jnp.float32)
-        parameters = (common["actor"], common["critic"], log_temperature)
-        return SACState(
-            **common,
-            target=jax.tree.map(jnp.copy, common["critic"].without(self.representation.without_target)),
-            log_temperature=log_temperature,
-            optimizers=Optimizers(*(o.init(p) for o, p in zip(self.optimizers, parameters, strict=True))),
-        )
-
-    def init_networks(self, num_tasks: int, inputs: Pair, action: Array, key: Key) -> Pair:
+    def init_networks(self, num_tasks: int, actor_inputs: tuple, critic_inputs: tuple, action: Array, key: Key) -> Nets:
         actor_key, critic_key = jax.random.split(key)
-        actor = self.actor.init(actor_key, num_tasks, 2 * len(action), *inputs.actor)
-        init_critic = lambda k: self.critic.init(k, num_tasks, self.value.outputs, *inputs.critic, action)
+        init_critic = lambda k: self.critic.init(k, num_tasks, self.value.outputs, *critic_inputs, action)
         keys = jax.random.split(critic_key, self.num_critics)
-        return Pair(actor, jax.vmap(init_critic, out_axes=Params(shared=0, own=1))(keys))  # type: ignore
+        log = jnp.log if isinstance(self.initial_temperature, Array) else np.log
+        temperature = jnp.full(1 if self.shared_temperature else num_tasks, log(self.initial_temperature))
+        temperature = {"log": temperature.astype(jnp.float32)}
+        return {
+            "actor": self.actor.init(actor_key, num_tasks, 2 * len(action), *actor_inputs),
+            "critic": jax.vmap(init_critic, out_axes=Params(shared=0, own=1))(keys),  # type: ignore
+            "temperature": Params(temperature, {}) if self.shared_temperature else Params({}, temperature),
+        }
 
-    def reset_networks(self, state: SACState, spec: Spec, tasks: Task, key: Key) -> SACState:
-        """Return a state with new networks, optimisers, temperatures and surgery; statistics of the data are kept."""
-        return self.init(spec, tasks, key)._replace(
-            moments=state.moments,
-            contexts=state.contexts,
-            vectors=state.vectors,
-            scales=self.scaling.reset(state.scales),
-            progress=state.progress,
-        )
+    def init_slow(self, nets: Nets) -> Nets:
+        copied = nets["representation"].without(self.representation.without_target)
+        return jax.tree.map(jnp.copy, {"critic": nets["critic"], "representation": copied})
 
     @property
-    def optimizers(self) -> Optimizers:
-        temperature_lr = self.scheduled(self.temperature_lr, self.experience.policy_delay)
-        return Optimizers(*self.network_optimizers, optax.adam(temperature_lr, self.temperature_momentum))
+    def fits(self) -> dict[str, Fit]:
+        rate = self.scheduled(self.temperature_lr, self.experience.policy_delay)
+        return super().fits | {"temperature": Fit(("temperature",), optax.adam(rate, self.temperature_momentum))}
 
     # Acting.
 
-    def act(self, state: SACState, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
+    def act(self, state: AgentState, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
         """Choose an action (A,) for one observation (O,) of one task; without a key, the mean action."""
-        trained = task.id < len(state.contexts)
-        outputs = self.behaviour(trained, *self.acting_inputs(state, memory, obs, task))
+        outputs = self.behaviour(task.id < state.num_tasks, *self.acting_inputs(state, memory, obs, task))
         return Acted(tanh_normal(outputs, key, task.action_mask)[0], memory.past, memory)
 
-    def behaviour(self, trained: Array, actor: Params, critic: Params, features: Array, obs: Any) -> Array:
+    def behaviour(self, trained: Array, nets: Nets, features: Array, obs: Any) -> Array:
         """Return the outputs (2A,) of the policy that acts; ``trained`` () says whether the task was trained on."""
-        return self.policy(actor, critic, features, obs)
+        return self.policy(nets, features, obs)
 
     # Losses of one task.
 
-    def policy(self, actor: Params, critic: Params, features: Array, obs: Any) -> Array:
-        """Return the policy's outputs (..., 2A). The representation's parameters lie beside the critics'."""
-        return self.actor.apply(actor, *self.actor_inputs(critic, features, obs))
+    def policy(self, nets: Nets, features: Array, obs: Any) -> Array:
+        """Return the policy's outputs (..., 2A)."""
+        return self.actor.apply(nets["actor"], *self.actor_inputs(nets, features, obs))
 
-    def sample(self, actor: Params, critic: Params, batch: Batch, obs: Any, key: Key) -> Sample:
+    def sample(self, nets: Nets, batch: Batch, obs: Any, key: Key) -> Sample:
         """Sample the policy's actions at observations (B, O) of a batch."""
-        action, log_prob = tanh_normal(self.policy(actor, critic, batch.features, obs), key, batch.mask)
+        action, log_prob = tanh_normal(self.policy(nets, batch.features, obs), key, batch.mask)
         return Sample(action, log_prob, log_prob)
 
-    def q(self, critic: Params, features: Array, obs: Any, action: Array) -> Array:
+    def q(self, nets: Nets, features: Array, obs: Any, action: Array) -> Array:
         """Return every critic's outputs (N, B, outputs)."""
-        return self.of_critics(self.critic.apply, critic, features, obs, action)
+        return self.of_critics(self.critic.apply, nets, features, obs, action)
 
-    def values(self, critic: Params, features: Array, obs: Any, action: Array) -> Array:
+    def values(self, nets: Nets, features: Array, obs: Any, action: Array) -> Array:
         """Return every critic's estimate of the value (N, B)."""
-        return self.value.mean(self.q(critic, features, obs, action))
+        return self.value.mean(self.q(nets, features, obs, action))
 
-    def of_critics(self, apply: Callable, critic: Params, features: Array, obs: Any, action: Array) -> Any:
+    def of_critics(self, apply: Callable, nets: Nets, features: Array, obs: Any, action: Array) -> Any:
         """Apply ``apply``, a function with the signature of ``Network.apply``, to every critic: (N, ...)."""
-        features, inputs = self.placed_representation.perceive(critic, features, obs)
-        critics = critic.without(self.placed_representation.names)
-        return jax.vmap(apply, (0, None, None, None))(critics, features, inputs, action)
+        features, inputs = self.placed_representation.perceive(nets["representation"], features, obs)
+        return jax.vmap(apply, (0, None, None, None))(nets["critic"], features, inputs, action)
 
-    def critic_target(self, actor: Params, critic: Params, target_critic: Params, batch: Batch, key: Key) -> Any:
+    def critic_target(self, nets: Nets, slow: Nets, batch: Batch, key: Key) -> Any:
         """Compute the critic target y (B, ...), in the form that ``value.loss`` takes."""
-        action, _, cost = self.sample(actor, critic, batch, batch.next_obs, key)
-        return self.bootstrap(self.q(target_critic, batch.features, batch.next_obs, action), batch, cost)
+        action, _, cost = self.sample(nets, batch, batch.next_obs, key)
+        return self.bootstrap(self.q(slow, batch.features, batch.next_obs, action), batch, cost)
 
     def bootstrap(self, outputs: Array, batch: Batch, cost: Array) -> Any:
         """Compute the critic target from the target critics' ``outputs`` (N, B, outputs) at the next states."""
         bonus = -batch.temperature * cost
         return self.value.target(outputs, self.critic_reduction == "min", batch.reward, batch.discount, bonus)
 
-    def critic_loss(self, critic: Params, data: tuple[Batch, Any]) -> tuple[Array, Metrics]:
-        batch, target = data
-        return self.fitting_loss(self.q(critic, batch.features, batch.obs, batch.action), target, critic, batch)
+    def critic_loss(self, nets: Nets, batch: Batch, target: Any) -> tuple[Array, CriticAux]:
+        return self.fitting_loss(self.q(nets, batch.features, batch.obs, batch.action), target, nets, batch)
 
-    def fitting_loss(self, outputs: Array, target: Any, critic: Params, batch: Batch) -> tuple[Array, Metrics]:
+    def fitting_loss(self, outputs: Array, target: Any, nets: Nets, batch: Batch) -> tuple[Array, CriticAux]:
         """Compute the critic loss of ``outputs`` (N, B, outputs) for a result of ``bootstrap``."""
         loss = jnp.mean(jnp.sum(self.value.loss(outputs, target), axis=0))
         values, expected = self.value.mean(outputs), self.value.expected(target)
         td_error = jnp.mean(jnp.abs(values - expected))
         metrics = {"critic_loss": loss, "value": jnp.mean(values), "td_error": td_error}
-        metrics |= {"target": expected}  # ``update`` hands it to the scaling
-        return self.placed_representation.join(loss, metrics, critic, batch)
+        loss, metrics = self.placed_representation.join(loss, metrics, nets["representation"], batch)
+        return loss, CriticAux(metrics, expected)
 
-    def actor_loss(self, actor: Params, data: tuple[Batch, Params, Key]) -> tuple[Array, Metrics]:
-        batch, critic, key = data
-        return self.policy_loss(self.sample(actor, critic, batch, batch.obs, key), critic, batch)
+    def actor_loss(self, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:
+        return self.policy_loss(self.sample(nets, batch, batch.obs, key), nets, batch)
 
-    def policy_loss(self, sample: Sample, critic: Params, batch: Batch) -> tuple[Array, Metrics]:
+    def policy_loss(self, sample: Sample, nets: Nets, batch: Batch) -> tuple[Array, ActorAux]:
         """Compute the actor loss of actions sampled at a batch's observations."""
         action, log_prob, cost = sample
-        values = self.values(critic, batch.features, batch.obs, action)
+        values = self.values(nets, batch.features, batch.obs, action)
         value = minimum(values) if self.critic_reduction == "min" else jnp.mean(values, axis=0)
-        loss = jnp.mean(batch.temperature * cost - value)
-        return loss, {"actor_loss": loss, "entropy": -jnp.mean(log_prob)}
+        loss, entropy = jnp.mean(batch.temperature * cost - value), -jnp.mean(log_prob)
+        return loss, ActorAux({"actor_loss": loss, "entropy": entropy}, entropy)
 
-    def temperature_loss(self, log_temperature: Array, entropy: Array, action_size: int | Array) -> Array:
-        return jnp.mean(jnp.exp(log_temperature) * (entropy - self.target_entropy * action_size))
+    def temperature_loss(self, temperature: Params, entropy: Array, action_size: int | Array) -> Array:
+        """Compute the loss of all tasks' temperatures, by the entropies (T,) of their policies."""
+        return jnp.mean(jnp.exp(temperature.parts["log"]) * (entropy - self.target_entropy * action_size))
 
     # Update of all tasks.
 
     def update(
-        self, state: SACState, transitions: Transition, tasks: Task, key: Key, actor_turn: Array | None = None
-    ) -> tuple[SACState, Metrics]:
+        self, state: AgentState, transitions: Transition, tasks: Task, key: Key, actor_turn: Array | None = None
+    ) -> tuple[AgentState, Metrics]:
         """Take one gradient step on a batch (T, B, ...) of the training tasks; metrics are (T,).
 
         Args:
@@ -265,110 +239,97 @@ class SAC(BaseAgent):
         target_key, actor_key, critic_order, actor_order = jax.random.split(key, 4)
         transitions = self.placed_representation.augment(transitions, jax.random.fold_in(key, 1))
         state, batch = self.prepare(state, transitions, tasks)
-        importance = self.sampler.weights(state.progress, batch.temperature)
-        combine = partial(surgery.gradient, importance=importance, per_layer=self.per_layer)
-
-        loss, data = self.critic_problem(state, batch, target_key)
-        critic_step = combine(self.gradients, loss, state.critic, data, state.surgery.critic, critic_order)
-        critic, critic_memory = descent.descend(
-            self.optimizers.critic, critic_step.gradients, state.optimizers.critic, state.critic
+        importance, before = (
+            self.sampler.weights(state.nets["sampler"].own, batch.temperature),
+            state.nets["representation"],
         )
-        critic = with_statistics(critic, critic_step.aux)
-        critic_rule = surgery.adapt_rule(self.gradients, loss, critic, data, critic_step)
 
-        improve = lambda state: self.improve(state, critic, batch, combine, actor_key, actor_order)
+        data, loss = self.critic_data(state, batch, target_key), self.above_least(self.critic_loss)
+        state, fitted = self.descend(state, "critic", loss, data, critic_order, importance)
+        state = with_statistics(state, "critic", fitted.aux.statistics)
+
+        seen = {"representation": self.placed_representation.for_actor(state.nets["representation"], before)}
+        improve = lambda state: self.improve(state, batch, seen, actor_key, actor_order, importance)
         if actor_turn is None:
             state, actor_metrics = improve(state)
         else:
             state, actor_metrics = when(actor_turn, improve, state)
             actor_metrics = Sometimes.over(actor_metrics, actor_turn)
 
-        metrics = {**critic_step.aux, **actor_metrics, "temperature": batch.temperature}
-        target_critic = self.update_target(critic, state.target)
-        scales, (critic, target_critic) = self.scaling.renew(
-            state.scales, metrics.pop("target"), (critic, target_critic)
-        )
-        state = state._replace(
-            critic=critic,
-            target=target_critic,
-            optimizers=state.optimizers._replace(critic=critic_memory),
-            surgery=state.surgery._replace(critic=critic_rule),
-            scales=scales,
-        )
-        return state, metrics | {f"critic_{name}": x for name, x in critic_step.metrics.items()}
+        state = self.renew_scales(self.update_target(state), fitted.aux.expected)
+        return state, fitted.aux.metrics | actor_metrics | {"temperature": batch.temperature} | fitted.metrics
 
     def improve(
-        self, state: SACState, critic: Params, batch: Batch, combine: Callable, key: Key, order: Key
-    ) -> tuple[SACState, Metrics]:
-        """Take one gradient step of the actor under a critic, and one of the temperatures."""
-        seen = self.placed_representation.for_actor(critic, state.critic)
-        loss, data = self.actor_problem(seen, batch, key)
-        step = combine(self.gradients.for_actor, loss, state.actor, data, state.surgery.actor, order)
-        actor, actor_memory = descent.descend(
-            self.optimizers.actor, step.gradients, state.optimizers.actor, state.actor
-        )
-        actor = with_statistics(actor, step.aux)
+        self, state: AgentState, batch: Batch, seen: Nets, key: Key, order: Key, importance: Array | None
+    ) -> tuple[AgentState, Metrics]:
+        """Take one gradient step of the actor, and one of the temperatures.
 
-        action_size = action_sizes(batch.action, batch.mask)
-        slope = jax.grad(self.temperature_loss)(state.log_temperature, step.aux["entropy"], action_size)
-        log_temperature, temperature_memory = descent.descend(
-            self.optimizers.temperature, slope, state.optimizers.temperature, state.log_temperature
+        Args:
+            seen: the networks that the actor's loss sees in place of the state's.
+        """
+        data = (batch, jax.random.split(key, len(batch.temperature)))
+        state, improved = self.descend(state, "actor", self.actor_loss, data, order, importance, seen)
+        state = with_statistics(state, "actor", improved.aux.statistics)
+        action_size, fit, memory = (
+            action_sizes(batch.action, batch.mask),
+            self.fits["temperature"],
+            state.fits["temperature"],
         )
-        state = state._replace(
-            actor=actor,
-            log_temperature=log_temperature,
-            optimizers=state.optimizers._replace(actor=actor_memory, temperature=temperature_memory),
-            surgery=state.surgery._replace(actor=step.memory),
-        )
-        return state, {**step.aux, **{f"actor_{name}": x for name, x in step.metrics.items()}}
+        slope = jax.grad(self.temperature_loss)(state.nets["temperature"], improved.aux.entropy, action_size)
+        nets, optimizer = fit.descend(memory, {"temperature": slope}, state.nets)
+        fits = state.fits | {"temperature": memory._replace(optimizer=optimizer)}
+        return state._replace(nets=state.nets | nets, fits=fits), improved.aux.metrics | improved.metrics
 
-    def prepare(self, state: SACState, batch: Transition, tasks: Task) -> tuple[SACState, Batch]:
+    def prepare(self, state: AgentState, batch: Transition, tasks: Task) -> tuple[AgentState, Batch]:
         """Fit the normalisers to transitions (T, B, ...), and return the batch (T, ...) for the losses."""
-        state = state._replace(moments=self.fit_moments(state.moments, batch.obs))
+        inputs = self.fit_inputs(state.nets["inputs"], batch.obs)
+        state = state._replace(nets=state.nets | {"inputs": inputs})
         past, last = batch.extras if isinstance(batch.extras, Ends) else (batch.extras, batch)
         next_past = None if past is None else append(last.extras, last.obs, last.action, last.reward)
         action_size = action_sizes(batch.action, tasks.action_mask)
-        bonus = jnp.exp(state.log_temperature) * abs(self.target_entropy) * action_size / 2
+        temperature = jnp.exp(state.nets["temperature"].parts["log"])
+        bonus = temperature * abs(self.target_entropy) * action_size / 2
         gamma = self.discounts(tasks)
         return state, Batch(
-            obs=self.see_batch(state.moments, batch.obs, past),
+            obs=self.see_batch(inputs, batch.obs, past),
             action=batch.action,
-            reward=self.scaling.rewards(state.scales, batch, gamma, bonus),
+            reward=self.scaling.rewards(state.nets["scaling"].own, batch, gamma, bonus),
             discount=(gamma[:, None] if jnp.ndim(gamma) else gamma) * batch.discount,  # type: ignore
-            next_obs=self.see_batch(state.moments, batch.next_obs, next_past),
+            next_obs=self.see_batch(inputs, batch.next_obs, next_past),
             features=self.features_of_batch(state, batch, tasks),
-            temperature=jnp.broadcast_to(jnp.exp(state.log_temperature), len(tasks.id)),
+            temperature=jnp.broadcast_to(temperature, len(tasks.id)),
             mask=tasks.action_mask,
             followed=pictures.followed(batch),
         )
 
-    def update_target(self, critic: Params, target: Params) -> Params:
-        """Move the target critic, and its representation, a step towards the new critic."""
+    def critic_data(self, state: AgentState, batch: Batch, key: Key) -> tuple[Batch, Any]:
+        """Return the data of the critics' loss for all tasks (T, ...): the batch, and the targets."""
+        slow = state.nets | state.slow
+        slow |= {"representation": slow["representation"].filled(state.nets["representation"])}
+        of_both = (state.nets["representation"], slow["representation"])
+        model_targets, keys = self.placed_representation.targets(*of_both, batch.next_obs, key)
+        bootstrap = jax.vmap(self.critic_target, (axes_of(state.nets), axes_of(slow), 0, 0))
+        return batch._replace(model_targets=model_targets), bootstrap(state.nets, slow, batch, keys)
+
+    def update_target(self, state: AgentState) -> AgentState:
+        """Move the target critics, and their representation, a step towards the new ones."""
         rate = lambda name: self.representation.rates.get(name, self.tau)
         step = lambda new, old: {k: optax.incremental_update(new[k], old[k], rate(k)) for k in old}
-        return Params(step(critic.shared, target.shared), step(critic.own, target.own))
+        moved = lambda new, old: Params(step(new.shared, old.shared), step(new.own, old.own))
+        return state._replace(slow={name: moved(state.nets[name], old) for name, old in state.slow.items()})
 
-    def critic_problem(self, state: SACState, batch: Batch, key: Key) -> tuple[Callable, Any]:
-        """Return the critic's loss of one task, and the data of all tasks (T, ...), for ``surgery.gradient``."""
-        slow = state.target.filled(state.critic)
-        model_targets, keys = self.placed_representation.targets(state.critic, slow, batch.next_obs, key)
-        bootstrap = jax.vmap(self.critic_target, (OVER_TASKS, OVER_TASKS, OVER_TASKS, 0, 0))
-        target = bootstrap(state.actor, state.critic, slow, batch, keys)
-        return self.above_least(self.critic_loss), (batch._replace(model_targets=model_targets), target)
-
-    def actor_problem(self, critic: Params, batch: Batch, key: Key) -> tuple[Callable, Any]:
-        """Return the actor's loss of one task under a critic, and the data of all tasks (T, ...)."""
-
-        def loss(actor: Params, data) -> tuple[Array, Metrics]:
-            batch, own_critic, key = data
-            return self.actor_loss(actor, (batch, Params(critic.shared, own_critic), key))
-
-        return loss, (batch, critic.own, jax.random.split(key, len(batch.temperature)))
+    def renew_scales(self, state: AgentState, target: Array) -> AgentState:
+        """Update the scaling of rewards by the critics' targets (T, B), and rescale critics to the new units."""
+        critics = (state.nets["critic"], state.slow["critic"])
+        scaling, (critic, slow) = self.scaling.renew(state.nets["scaling"].own, target, critics)
+        nets = state.nets | {"scaling": Params({}, scaling), "critic": critic}
+        return state._replace(nets=nets, slow=state.slow | {"critic": slow})
 
 
-def with_statistics(params: Params, aux: Metrics) -> Params:
-    """Take the running statistics that a loss found, if any, out of ``aux``, and return parameters that have them."""
-    return params._replace(own=params.own | aux.pop("statistics", {}))  # type: ignore
+def with_statistics(state: AgentState, name: str, statistics: Any) -> AgentState:
+    """Return a state with the running statistics that a loss found for the bodies of a network, if any."""
+    net = state.nets[name]
+    return state._replace(nets=state.nets | {name: net._replace(own=net.own | statistics)})
 
 
 def action_sizes(action: Array, mask: Array | None) -> int | Array:

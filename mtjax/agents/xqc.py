@@ -11,9 +11,10 @@ from mtjax.agents.choices import FLAT
 from mtjax.agents.parts.encoders import BatchNorm, Encoder
 from mtjax.agents.parts.scaling import ReturnNormalization, Scaling
 from mtjax.agents.parts.values import C51, Value
-from mtjax.agents.sac import SAC, Batch, Sample
-from mtjax.networks import Params, tanh_normal
-from mtjax.types import Array, Key, Metrics
+from mtjax.agents.sac import SAC, ActorAux, Batch, CriticAux, Sample
+from mtjax.agents.state import Nets
+from mtjax.networks import tanh_normal
+from mtjax.types import Array, Key
 
 
 class Aim(NamedTuple):
@@ -63,7 +64,7 @@ class XQC(SAC):
 
     # Losses of one task.
 
-    def q_of_both(self, critic: Params, batch: Batch, next_action: Array) -> tuple[Array, Array, Any]:
+    def q_of_both(self, nets: Nets, batch: Batch, next_action: Array) -> tuple[Array, Array, Any]:
         """Apply every critic to both ends of the transitions as one batch.
 
         Returns:
@@ -72,24 +73,22 @@ class XQC(SAC):
         join = lambda now, later: jnp.concatenate([now, later])
         obs = jax.tree.map(join, batch.obs, batch.next_obs)
         features = join(batch.features, batch.features) if batch.features.ndim == 2 else batch.features
-        outputs, found = self.of_critics(self.critic.fit, critic, features, obs, join(batch.action, next_action))
+        outputs, found = self.of_critics(self.critic.fit, nets, features, obs, join(batch.action, next_action))
         now, later = jnp.split(outputs, 2, axis=1)
         return now, later, found
 
-    def critic_target(self, actor: Params, critic: Params, target_critic: Params, batch: Batch, key: Key) -> Aim:
-        action, _, cost = self.sample(actor, critic, batch, batch.next_obs, key)
-        _, outputs, _ = self.q_of_both(target_critic, batch, action)
+    def critic_target(self, nets: Nets, slow: Nets, batch: Batch, key: Key) -> Aim:
+        action, _, cost = self.sample(nets, batch, batch.next_obs, key)
+        _, outputs, _ = self.q_of_both(slow, batch, action)
         return Aim(self.bootstrap(outputs, batch, cost), action)
 
-    def critic_loss(self, critic: Params, data: tuple[Batch, Aim]) -> tuple[Array, Metrics]:
-        batch, aim = data
-        outputs, _, found = self.q_of_both(critic, batch, aim.next_action)
-        loss, metrics = self.fitting_loss(outputs, aim.target, critic, batch)
-        return loss, metrics | {"statistics": found}
+    def critic_loss(self, nets: Nets, batch: Batch, target: Aim) -> tuple[Array, CriticAux]:
+        outputs, _, found = self.q_of_both(nets, batch, target.next_action)
+        loss, aux = self.fitting_loss(outputs, target.target, nets, batch)
+        return loss, aux._replace(statistics=found)
 
-    def actor_loss(self, actor: Params, data: tuple[Batch, Params, Key]) -> tuple[Array, Metrics]:
-        batch, critic, key = data
-        outputs, found = self.actor.fit(actor, *self.actor_inputs(critic, batch.features, batch.obs))
+    def actor_loss(self, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:
+        outputs, found = self.actor.fit(nets["actor"], *self.actor_inputs(nets, batch.features, batch.obs))
         action, log_prob = tanh_normal(outputs, key, batch.mask)
-        loss, metrics = self.policy_loss(Sample(action, log_prob, log_prob), critic, batch)
-        return loss, metrics | {"statistics": found}
+        loss, aux = self.policy_loss(Sample(action, log_prob, log_prob), nets, batch)
+        return loss, aux._replace(statistics=found)

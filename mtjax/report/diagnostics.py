@@ -18,13 +18,15 @@ import numpy as np
 
 from mtjax import frames
 from mtjax.agents import SAC
+from mtjax.agents.fit import Problem
 from mtjax.agents.parts.gradients import surgery
+from mtjax.agents.state import Nets, axes_of
 from mtjax.experience import ring as rings
 from mtjax.experience.ring import Ring
 from mtjax.networks import Network, Params, ReLU
 from mtjax.report import figures
 from mtjax.training.policy import Policy
-from mtjax.types import Array, Env, InputError, Key, Metrics, Task, Transition
+from mtjax.types import Array, Env, InputError, Key, Task, Transition
 
 DRAWS = 16
 """Number of batches over which gradients and their statistics are averaged."""
@@ -94,7 +96,7 @@ def _summarise(agent: SAC, state: Any, gradients: Mapping, activity: Mapping) ->
     of = lambda name, network, params: Findings(
         **jax.device_get(gradients[name]), **utilisation(network, params, jax.device_get(activity[name]))
     )
-    critic, actor = of("critic", agent.critic, state.critic), of("actor", agent.actor, state.actor)
+    critic, actor = (of(x, getattr(agent, x), state.nets[x]) for x in ("critic", "actor"))
     return critic, actor, np.asarray(gradients["td_error"])
 
 
@@ -120,12 +122,15 @@ def compare_gradients(agent: SAC, state: Any, batch: Transition, tasks: Task, ke
     """
     target_key, actor_key = jax.random.split(key)
     state, seen = agent.prepare(state, batch, tasks)
-    critic, aux = _compare(state.critic, *agent.critic_problem(state, seen, target_key))
-    actor, _ = _compare(state.actor, *agent.actor_problem(state.critic, seen, actor_key))
-    return {"critic": critic, "actor": actor, "td_error": aux["td_error"]}
+    loss, data = agent.above_least(agent.critic_loss), agent.critic_data(state, seen, target_key)
+    critic, aux = _compare(agent.fits["critic"].problem(loss, state.nets, data))
+    data = (seen, jax.random.split(actor_key, state.num_tasks))
+    actor, _ = _compare(agent.fits["actor"].problem(agent.actor_loss, state.nets, data))
+    return {"critic": critic, "actor": actor, "td_error": aux.metrics["td_error"]}
 
 
-def _compare(params: Params, loss: Callable, data: Any) -> tuple[dict[str, Any], Metrics]:
+def _compare(problem: Problem) -> tuple[dict[str, Any], Any]:
+    loss, params, data = problem
     one_task = lambda shared, own, data: loss(Params(shared, own), data)
     differentiate = jax.vmap(jax.grad(one_task, argnums=(0, 1), has_aux=True), (None, 0, 0))
     (shared, own), aux = differentiate(params.shared, params.own, data)
@@ -161,14 +166,13 @@ def activity(agent: SAC, state: Any, batch: Transition, tasks: Task) -> dict[str
     given, shape = seen_batch.features, (*batch.reward.shape, seen_batch.features.shape[-1])
     features = jnp.broadcast_to(given if given.ndim == 3 else given[:, None], shape)
 
-    def one(actor: Params, critic: Params, features: Array, obs: Array, action: Array) -> dict[str, Activity]:
-        judging = agent.of_critics(partial(watch, agent.critic.apply), critic, features, obs, action)
-        acting = watch(agent.policy, actor, critic, features, obs)
+    def one(nets: Nets, features: Array, obs: Array, action: Array) -> dict[str, Activity]:
+        judging = agent.of_critics(partial(watch, agent.critic.apply), nets, features, obs, action)
+        acting = watch(agent.policy, nets, features, obs)
         return {"critic": judging, "actor": jax.tree.map(lambda x: x[None], acting)}
 
-    over_tasks = Params(shared=None, own=0)  # type: ignore
-    every = jax.vmap(jax.vmap(one, (None, None, 0, 0, 0)), (over_tasks, over_tasks, 0, 0, 0))
-    seen = every(state.actor, state.critic, features, seen_batch.obs, seen_batch.action)
+    every = jax.vmap(jax.vmap(one, (None, 0, 0, 0)), (axes_of(state.nets), 0, 0, 0))
+    seen = every(state.nets, features, seen_batch.obs, seen_batch.action)
     level = lambda x: jnp.mean(jnp.abs(x), axis=1).reshape(*x.shape[:1], x.shape[2], -1)
     return {name: Activity(jax.tree.map(level, x.layers), x.hidden) for name, x in seen.items()}
 

@@ -9,15 +9,15 @@ import numpy as np
 
 from mtjax import frames, shipped
 from mtjax.agents import BaseAgent, parts, settings
+from mtjax.agents.state import AgentState
 from mtjax.config import NO_FINE_TUNING
 from mtjax.envs import Family
 from mtjax.envs.mixtures import require_family
 from mtjax.networks import Params
 from mtjax.training.policy import Policy
-from mtjax.types import Array, Env, InputError, Spec, Task
+from mtjax.types import Env, InputError, Spec, Task
 
-_FRESH = ("optimizers", "contexts", "vectors", "surgery", "progress")  # fields that belong to the new tasks alone
-_BY_TASK = ("log_temperature", "scales", "units")  # leaves (T, ...), or shared by all tasks
+_FRESH = ("tasks", "sampler")  # networks that belong to the new tasks alone
 
 
 def require_fit(start: Policy, env: Env, agent: BaseAgent) -> None:
@@ -72,7 +72,7 @@ def _require_numbers(start: Policy, env: Env, agent: BaseAgent) -> None:
     """Refuse new tasks for networks that know tasks by number alone."""
     if agent.conditioning != "one-hot":
         return
-    nearest, count = np.asarray(agent.nearest_tasks(start.state, env.tasks("train"))), len(start.state.contexts)
+    nearest, count = np.asarray(agent.nearest_tasks(start.state, env.tasks("train"))), start.state.num_tasks
     if nearest.tolist() != list(range(count)):
         raise InputError(
             f"with conditioning=one-hot the run's networks know its {count} tasks by number, and the new ones are not "
@@ -91,7 +91,7 @@ def adopt(start: Policy, agent: BaseAgent, tasks: Task, fresh: Any) -> Any:
     Raises:
         InputError: the shapes of the networks differ.
     """
-    seeds = jnp.arange(len(fresh.contexts)) % len(start.seeds)
+    seeds = jnp.arange(len(jax.tree.leaves(fresh)[0])) % len(start.seeds)
     old = jax.tree.map(lambda x: x[seeds], start.states)
     state = jax.vmap(partial(_adopt, agent, tasks))(old, fresh)
     pairs = zip(jax.tree.leaves_with_path(state), jax.tree.leaves(fresh), strict=True)
@@ -102,18 +102,9 @@ def adopt(start: Policy, agent: BaseAgent, tasks: Task, fresh: Any) -> Any:
     return state
 
 
-def _adopt(agent: BaseAgent, tasks: Task, old: Any, fresh: Any) -> Any:
-    nearest, before, now = agent.nearest_tasks(old, tasks), len(old.contexts), len(tasks.id)
-
-    def by_task(x: Array, like: Array) -> Array:
-        return x[nearest] if x.shape[:1] == (before,) and like.shape[:1] == (now,) else x
-
-    def carry(name: str) -> Any:
-        learned = getattr(old, name)
-        if name in _BY_TASK:
-            return jax.tree.map(by_task, learned, getattr(fresh, name))
-        if isinstance(learned, Params):
-            return Params(learned.shared, jax.tree.map(lambda x: x[nearest], learned.own))
-        return learned
-
-    return fresh._replace(**{name: carry(name) for name in old._fields if name not in _FRESH})
+def _adopt(agent: BaseAgent, tasks: Task, old: AgentState, fresh: AgentState) -> AgentState:
+    nearest = agent.nearest_tasks(old, tasks)
+    carry = lambda net: Params(net.shared, jax.tree.map(lambda x: x[nearest], net.own))
+    nets = {name: carry(net) for name, net in old.nets.items() if name not in _FRESH}
+    slow = {name: carry(net) for name, net in old.slow.items()}
+    return fresh._replace(nets=fresh.nets | nets, slow=fresh.slow | slow)

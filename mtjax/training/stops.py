@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mtjax.agents.state import AgentState
 from mtjax.parallel import hosts
 from mtjax.types import Array
 
@@ -62,14 +63,14 @@ def require_finite(bad_step: np.ndarray, bad_reward: np.ndarray, first_step: int
     )
 
 
-def require_finite_parameters(state: Any, iteration: int, last: Callable[[], str]) -> None:
+def require_finite_parameters(state: AgentState, iteration: int, last: Callable[[], str]) -> None:
     """Check the parameters of an agent before they are saved, because a chunk's last update is in none of its losses.
 
     Args:
         state: the agent's, leaves (S, ...).
 
     Raises:
-        FloatingPointError: actor or critics hold numbers that are not finite.
+        FloatingPointError: networks hold numbers that are not finite.
     """
     finite = finite_seeds(state)
     if not np.all(finite):
@@ -79,10 +80,9 @@ def require_finite_parameters(state: Any, iteration: int, last: Callable[[], str
         )
 
 
-def finite_seeds(state: Any) -> np.ndarray:
-    """Return which seeds (S,) of an agent's state, leaves (S, ...), have finite actors and critics."""
-    parameters = [getattr(state, name) for name in ("actor", "critic") if hasattr(state, name)]
-    return hosts.gather(_finite_seeds(parameters)) if parameters else np.ones(1, bool)
+def finite_seeds(state: AgentState) -> np.ndarray:
+    """Return which seeds (S,) of an agent's state, leaves (S, ...), have finite networks."""
+    return hosts.gather(_finite_seeds(state.nets))
 
 
 @jax.jit

@@ -26,7 +26,7 @@ class Watcher:
     watches: ClassVar[bool] = False  # whether ``observe`` has to be called
 
     def init(self, num_tasks: int) -> Any:
-        """Return the memory before the first step."""
+        """Return the memory before the first step; leaves are (T, ...)."""
         return None
 
     def observe(self, memory: Any, outcome: Outcome) -> Any:

@@ -35,10 +35,10 @@ class Basis(NamedTuple):
 class Plain:
     """Passes observations on to the networks as they are.
 
-    Every representation is a class with these methods. Its parameters lie beside the critics', under its ``names``. The
-    critics' loss trains them, together with losses of the representation's own, which ``join`` adds; the actor's loss
-    does not. What the actor's loss trains is the module ``sight``, which lies in the actor. Agents use a copy that
-    knows its ``place``. Parameters are those of one task unless stated otherwise.
+    Every representation is a class with these methods. Its parameters are a network of the agent's, with parts of these
+    ``names``. The critics' loss trains them, together with losses of the representation's own, which ``join`` adds; the
+    actor's loss does not. What the actor's loss trains is the module ``sight``, which lies in the actor. Agents use a
+    copy that knows its ``place``. Parameters are those of one task unless stated otherwise.
     """
 
     names: ClassVar[tuple[str, ...]] = ()  # of its parameters
@@ -105,9 +105,9 @@ class Plain:
         """Return a module of the actor's own, which maps its observations with pictures to vectors; None for none."""
         return None
 
-    def for_actor(self, critic: Params, before: Params) -> Params:
-        """Return the critics' parameters in the actor's loss, given those before the critics' step too."""
-        return critic
+    def for_actor(self, params: Params, before: Params) -> Params:
+        """Return the parameters that the actor's loss sees, given those before the critics' step too."""
+        return params
 
     def augment(self, batch: Transition, key: Key) -> Transition:
         """Return a batch of transitions (T, B, ...) with observations changed at random, as losses should see them."""

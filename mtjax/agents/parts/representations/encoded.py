@@ -83,8 +83,8 @@ class Encoded(Seeing):
     def without_target(self) -> tuple[str, ...]:
         return (*self.models, *self.own_target)
 
-    def for_actor(self, critic: Params, before: Params) -> Params:
-        return critic.without(self.own_target).filled(before)
+    def for_actor(self, params: Params, before: Params) -> Params:
+        return params.without(self.own_target).filled(before)
 
     # Networks: each is used by all N critics and by the actor.
 

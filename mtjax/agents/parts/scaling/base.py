@@ -59,3 +59,8 @@ class Moments(NamedTuple):
     @staticmethod
     def begin(num_tasks: int) -> "Moments":
         return Moments(jnp.zeros(num_tasks), jnp.ones(num_tasks))
+
+    def moved(self, rate: float | Array, drift: Array, variance: Array) -> "Moments":
+        """Move by new numbers of weight ``rate``, with their variance (T,) and distance (T,) from the old mean."""
+        spread = (1 - rate) * self.variance + rate * variance + rate * (1 - rate) * jnp.square(drift)
+        return Moments(self.mean + rate * drift, spread)

@@ -37,26 +37,26 @@ class PopArt(NoScaling):
         return Moments.begin(num_tasks)
 
     @staticmethod
-    def std(memory: Moments) -> Array:
+    def std(moments: Moments) -> Array:
         """Return the standard deviation (T,) that divides targets."""
-        return jnp.clip(jnp.sqrt(memory.variance), 1e-4, 1e6)
+        return jnp.clip(jnp.sqrt(moments.variance), 1e-4, 1e6)
 
     def units(self, memory: Moments, gamma: float | Array, bonus: Array) -> tuple[Array, Array]:
         return 1 / self.std(memory), memory.mean
 
     def renew(self, memory: Moments, target: Array, critics: tuple[Params, ...]):
-        rate, std = self.target_rate, self.std(memory)
+        std = self.std(memory)
         drift = std * jnp.mean(target, axis=1)  # of the old mean, in reward
-        variance_now = jnp.square(std) * jnp.var(target, axis=1)
-        variance = (1 - rate) * memory.variance + rate * variance_now + rate * (1 - rate) * jnp.square(drift)
-        new = Moments(memory.mean + rate * drift, variance)
-        ratio = std / self.std(new)
-        shift = (new.mean - memory.mean) / self.std(new)  # by as much as the mean moved, rounding included
+        new = memory.moved(self.target_rate, drift, jnp.square(std) * jnp.var(target, axis=1))
+        factor = std / self.std(new)
+        offset = (memory.mean - new.mean) / self.std(new)  # by as much as the mean moved, rounding included
+        return new, tuple(rescale_heads(critic, factor, offset) for critic in critics)
 
-        def adapt(params: Params) -> Params:
-            head = params.own["head"]  # kernel (T, N, D, 1), bias (T, N, 1)
-            kernel = ratio[:, None, None, None] * head["kernel"]
-            bias = ratio[:, None, None] * head["bias"] - shift[:, None, None]
-            return Params(params.shared, {**params.own, "head": {"kernel": kernel, "bias": bias}})
 
-        return new, tuple(adapt(params) for params in critics)
+def rescale_heads(critic: Params, factor: Array, offset: Array) -> Params:
+    """Change the outputs of every task's own heads by a factor and an offset (T,)."""
+    head = critic.own["head"]  # kernel (T, ..., D, 1), bias (T, ..., 1)
+    each = lambda x, like: x.reshape(-1, *[1] * (like.ndim - 1))
+    kernel = each(factor, head["kernel"]) * head["kernel"]
+    bias = each(factor, head["bias"]) * head["bias"] + each(offset, head["bias"])
+    return Params(critic.shared, {**critic.own, "head": {"kernel": kernel, "bias": bias}})

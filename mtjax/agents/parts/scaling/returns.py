@@ -72,7 +72,7 @@ class ReturnScaling(_OfReturns):
 class SpreadOfReturns(NamedTuple):
     """Holds the moments of discounted returns, and the largest so far."""
 
-    moments: normalize.Moments  # count (), mean (T,), deviation (T,)
+    moments: normalize.Moments  # count (T,), mean (T,), deviation (T,)
     largest: Array  # (T,) largest |discounted sum of rewards|
 
 
@@ -94,7 +94,8 @@ class ReturnNormalization(_OfReturns):
     """Largest |discounted sum of rewards so far| after scaling; with value=c51 or hl-gauss, the range of their bins."""
 
     def init(self, num_tasks: int) -> SpreadOfReturns:
-        return SpreadOfReturns(normalize.init(num_tasks), jnp.zeros(num_tasks))
+        zeros = jnp.zeros(num_tasks)
+        return SpreadOfReturns(normalize.Moments(zeros, zeros, zeros), zeros)
 
     def observe(self, memory: SpreadOfReturns, outcome: Outcome) -> SpreadOfReturns:
         returns = outcome.memory.scaling  # (T, E)

@@ -1,0 +1,105 @@
+"""A fit is one gradient step of some networks over all tasks: surgery on the tasks' gradients, and an optimiser."""
+
+import dataclasses
+from collections.abc import Callable, Collection
+from typing import Any, NamedTuple
+
+import optax
+
+from mtjax.agents.parts.gradients import descent, surgery
+from mtjax.agents.state import FitState, Nets
+from mtjax.networks import Params
+from mtjax.types import Array, Key, Metrics
+
+
+class Fitted(NamedTuple):
+    """Holds what a gradient step returns."""
+
+    nets: Nets  # those that have learned
+    state: FitState
+    aux: Any  # of the loss, leaves (T, ...)
+    metrics: Metrics  # of the conflict between tasks
+
+
+class Problem(NamedTuple):
+    """Holds a loss as a function of those networks alone that learn."""
+
+    loss: Callable  # (Params of one task, data of one task) -> (loss, aux)
+    params: Params  # of all tasks, by the networks' names
+    data: Any  # leaves (T, ...)
+
+
+@dataclasses.dataclass(frozen=True)
+class Fit:
+    """One gradient step of the networks called ``names``.
+
+    A loss of one task, ``loss(nets, *data) -> (loss, aux)``, sees all networks. Only those that the fit names learn.
+
+    Args:
+        rule: combines the tasks' gradients.
+        per_layer: weigh the tasks for each layer by its own gradients, instead of once for all shared parameters.
+        over_devices: average over the devices, where each has other data.
+    """
+
+    names: tuple[str, ...]
+    optimizer: optax.GradientTransformation
+    rule: surgery.Rule = dataclasses.field(default_factory=surgery.Rule)
+    per_layer: bool = False
+    over_devices: bool = False
+
+    def init(self, nets: Nets, num_tasks: int) -> FitState:
+        """Return what is remembered before the first step."""
+        rule = surgery.init(self.rule, _stacked(self._learned(nets)), num_tasks, self.per_layer)
+        return FitState(self.optimizer.init(self._learned(nets)), rule)
+
+    def step(
+        self, state: FitState, loss: Callable, nets: Nets, data: tuple, key: Key, importance: Array | None = None
+    ) -> Fitted:
+        """Take a gradient step.
+
+        Args:
+            loss: of one task, see above.
+            nets: of all tasks.
+            data: leaves (T, ...).
+            key: for rules that draw.
+            importance: (T,) factors of the tasks' losses; None for 1.
+        """
+        loss, params, data = self.problem(loss, nets, data)
+        found = surgery.gradient(self.rule, loss, params, data, state.rule, key, importance, self.per_layer)
+        nets, optimizer = self.descend(state, _apart(found.gradients), nets)
+        rule = surgery.adapt_rule(self.rule, loss, _stacked(nets), data, found)
+        return Fitted(nets, FitState(optimizer, rule), found.aux, found.metrics)
+
+    def problem(self, loss: Callable, nets: Nets, data: tuple) -> Problem:
+        """Return the loss of one task as a function of the parameters that learn."""
+        rest = _stacked({name: net for name, net in nets.items() if name not in self.names})
+
+        def of_learned(params: Params, data: tuple) -> tuple[Array, Any]:
+            own, data = data
+            return loss(_apart(Params(rest.shared, own)) | _apart(params), *data)
+
+        found = surgery.over_devices(of_learned) if self.over_devices else of_learned
+        return Problem(found, _stacked(self._learned(nets)), (rest.own, data))
+
+    def descend(self, state: FitState, gradients: Nets, nets: Nets) -> tuple[Nets, Any]:
+        """Return the networks that learn after an optimiser's step along their gradients, and its new state."""
+        nets, optimizer = descent.descend(self.optimizer, gradients, state.optimizer, self._learned(nets))
+        return nets, optimizer
+
+    def _learned(self, nets: Nets) -> Nets:
+        return {name: nets[name] for name in self.names}
+
+
+def learned(fits: Collection[Fit]) -> tuple[str, ...]:
+    """Return the names of all networks that some fit names."""
+    return tuple(dict.fromkeys(name for fit in fits for name in fit.names))
+
+
+def _stacked(nets: Nets) -> Params:
+    """Return networks as one, divided by what tasks share."""
+    return Params({name: net.shared for name, net in nets.items()}, {name: net.own for name, net in nets.items()})
+
+
+def _apart(params: Params) -> Nets:
+    """Return networks by name again."""
+    return {name: Params(params.shared[name], params.own[name]) for name in params.shared}
