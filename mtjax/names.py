@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 SPLITS = ("train", "interpolation", "extrapolation")
-CHOICES = ("representation", "encoder", "gradients", "value", "scaling", "sampler")
+CHOICES = ("conditioning", "representation", "encoder", "gradients", "value", "scaling", "sampler")
 """The kinds of parts that a user chooses by name, as --agent.KIND=NAME."""
 BEGAN = time.time()
 """When this process began to import the package, in seconds since 1970."""

@@ -95,25 +95,15 @@ class Network:
     """Applies a body and a linear head; each is shared by all tasks, or every task has its own."""
 
     body: nn.Module
-    own: tuple[str, ...] = ()  # those of "trajectory", "sight", "body" and "head" that every task has for itself
-    embedding_size: int = 0  # of each task's learned vector, in place of features; 0 for none
-    unit_embedding: bool = False  # scale those vectors to length 1
+    own: tuple[str, ...] = ()  # those of "sight", "body" and "head" that every task has for itself
     front: nn.Module | None = None  # maps observations before the body; every task's own
-    trajectory: nn.Module | None = None  # maps observation and past, a ``Seen``, to features
     unit_head: bool = False  # keep the head's weights of each output at length 1
     sight: nn.Module | None = None  # maps observations with pictures to vectors, before the body
 
     def init(self, key: Key, num_tasks: int, out: int, features: Array, *inputs: Array) -> Params:
         """Initialise parameters for ``num_tasks`` tasks, ``out`` outputs, and inputs of the given shapes."""
-        body_key, head_key, embedding_key, front_key = jax.random.split(key, 4)
+        body_key, head_key, _, front_key = jax.random.split(key, 4)
         params, parts = Params({}, {}), {}
-        if self.embedding_size:
-            params.own["embedding"] = jax.random.normal(embedding_key, (num_tasks, self.embedding_size))
-            features = params.own["embedding"][0]
-        if self.trajectory is not None:
-            parts["trajectory"] = (self.trajectory.init, jax.random.fold_in(key, 4), inputs[0])
-            features = self.trajectory.init_with_output(key, inputs[0])[0]  # type: ignore
-            inputs = (inputs[0].obs, *inputs[1:])  # type: ignore
         if self.sight is not None and isinstance(inputs[0], Mapping):
             parts["sight"] = (self.sight.init, jax.random.fold_in(key, 5), inputs[0])
             inputs = (self.sight.init_with_output(key, inputs[0])[0], *inputs[1:])  # type: ignore
@@ -167,12 +157,6 @@ class Network:
 
     def _body(self, params: Params, features: Array, *inputs: Array, mutable: Any) -> Any:
         parts = {**params.shared, **params.own}
-        if "embedding" in parts:
-            features = parts["embedding"]
-            features = features / jnp.linalg.norm(features) if self.unit_embedding else features
-        if self.trajectory is not None:
-            features = self.trajectory.apply(parts["trajectory"], inputs[0])  # type: ignore
-            inputs = (inputs[0].obs, *inputs[1:])  # type: ignore
         obs: Any = inputs[0]
         for name, module in (("sight", self.sight), ("front", self.front)):
             obs = module.apply(parts[name], obs) if module is not None and name in parts else obs

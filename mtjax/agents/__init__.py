@@ -58,7 +58,7 @@ AGENTS: dict[str, Preset] = {
     ),
     "hip-bmdp": Preset(
         "DeepMDP with learned hidden parameters (Zhang et al. 2021)",
-        {"representation": "hip-bmdp", "conditioning": "embedding", "embedding_size": 50},
+        {"representation": "hip-bmdp", "theta_size": 50},
     ),
     "drq": Preset(
         "SAC from pictures that are shifted at random (Yarats et al. 2022)",

@@ -4,7 +4,7 @@ import abc
 import dataclasses
 from collections.abc import Callable
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, get_args
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
@@ -14,13 +14,13 @@ from mtjax import frames, normalize
 from mtjax.agents import parts
 from mtjax.agents.choices import FLAT, PARTS, kinds_of
 from mtjax.agents.fit import Fit, Fitted, learned
-from mtjax.agents.parts import conditioning, sentences, trajectory
 from mtjax.agents.parts.encoders import Encoder
 from mtjax.agents.parts.gradients import descent, surgery
-from mtjax.agents.parts.representations import REPRESENTATIONS, Place, Representation
+from mtjax.agents.parts.knowing import Knowing, last_steps
+from mtjax.agents.parts.knowing.last_steps import Past, Seen, without_past
+from mtjax.agents.parts.representations import REPRESENTATIONS, Representation
 from mtjax.agents.parts.samplers import Sampler
 from mtjax.agents.parts.scaling import SCALINGS, Scaling
-from mtjax.agents.parts.trajectory import Past, Seen, TrajectoryEncoder
 from mtjax.agents.state import AgentState, Nets, of_task
 from mtjax.checks import require_values
 from mtjax.experience import Replay, multistep
@@ -28,8 +28,6 @@ from mtjax.networks import OVER_TASKS, Network, Params
 from mtjax.tasks import SAME_CONTEXT
 from mtjax.types import Acted, Array, Env, InputError, Key, Metrics, Outcome, Spec, Task, Transition
 
-Conditioning = Literal["none", "one-hot", "embedding", "parameters", "vectors", "text", "inferred"]
-CONDITIONINGS = get_args(Conditioning)
 Heads = Literal["shared", "per-task", "disjoint"]
 Tune = Literal["all", "heads", "embedding"]
 
@@ -48,6 +46,7 @@ class BaseAgent(abc.ABC):
     The networks of every agent, by name:
         actor, critic: what learns, beside the nets of a subclass.
         representation: of observations. The critics' loss trains it.
+        knowing: of the task, which the critics' loss trains too.
         tasks: what is known of the training tasks: their contexts (T, C), and given vectors (T, V), if any.
         inputs: the moments of observations; in a mixture one for each task, leaves (T, O).
         scaling, sampler: the memories of the scaling of rewards and of the sampler of tasks.
@@ -107,25 +106,6 @@ class BaseAgent(abc.ABC):
     """Use layer normalisation in the critics."""
     actor_layer_norm: bool = False
     """Use layer normalisation in the actor."""
-    conditioning: Conditioning = "none"
-    """Features of the task that the networks take as inputs: none, one-hot, embedding (learned), parameters (the task's
-    context), vectors (rows of a file), text (what the task asks for, in a sentence) or inferred (from the last steps,
-    by a trajectory encoder). With one-hot, embedding and vectors, an unseen task uses those of the nearest training
-    task; with text, tasks of the run's own splits have their own sentences."""
-    context_limit: float = 0.0
-    """Clip every parameter of the task to at most this size before networks see it, 0 for no limit. Training tasks lie
-    in [-1, 1], so that 1 shows a task beyond them as the end of the range."""
-    embedding_size: int = 16
-    """Size of learned task embeddings, and of inferred features."""
-    unit_embedding: bool = False
-    """Scale learned task embeddings to length 1."""
-    vectors: str = ""
-    """A .npy file of task vectors (T, V), one row for each training task, for conditioning=vectors."""
-    text: str = "hashing"
-    """Encoder of sentences for conditioning=text: hashing (256 numbers from words and pairs of words, by
-    scikit-learn), or a model of sentence-transformers, by its name or the folder that it is in."""
-    inferred_from: int = 8
-    """Number of last steps from which the task is inferred; they are stored with every transition."""
     heads: Heads = "shared"
     """What each task has for itself: nothing (shared), output layers (per-task) or whole networks (disjoint)."""
     gradient_scope: Literal["shared", "per-layer"] = "shared"
@@ -133,6 +113,7 @@ class BaseAgent(abc.ABC):
     tune: Annotated[Tune, tyro.conf.arg(name="tune", prefix_name=False)] = "all"
     """Which parameters of actor and critics learn: all, heads (output layers) or embedding (learned task embeddings).
     The others keep their values from the run that --from names."""
+    conditioning: Annotated[Knowing, FLAT] = dataclasses.field(default_factory=Knowing)
     representation: Annotated[Representation, FLAT] = dataclasses.field(default_factory=Representation)
     encoder: Annotated[Encoder, FLAT] = dataclasses.field(default_factory=Encoder)
     gradients: Annotated[surgery.Rule, FLAT] = dataclasses.field(default_factory=surgery.Rule)
@@ -168,22 +149,21 @@ class BaseAgent(abc.ABC):
         parts.require_positive(self, "actor_lr", "critic_lr")
         if not self.max_gradient_norm >= 0:
             raise InputError(f"max-gradient-norm must be at least 0 (0 does not clip), not {self.max_gradient_norm}")
-        parts.require_not_negative(self, "weight_decay", "context_limit", "lr_warmup", "lr_updates")
+        parts.require_not_negative(self, "weight_decay", "lr_warmup", "lr_updates")
         parts.require_layers(self, "hidden")
         parts.require_widths(self, "actor_hidden", "critic_hidden")
         parts.require_shares(self, "gamma", "lr_final")
-        parts.require_counts(self, "embedding_size", "inferred_from")
 
     def _check_combination(self) -> None:
         """Refuse parts that do not go together."""
-        if (self.conditioning == "vectors") != bool(self.vectors):
-            raise InputError("conditioning=vectors and vectors=FILE.npy go together; give both or neither")
-        if self.text != "hashing" and self.conditioning != "text":
-            raise InputError(f"text={self.text} needs conditioning=text, not {self.conditioning}")
-        if self.tune == "embedding" and self.conditioning != "embedding":
-            raise InputError(f"tune=embedding needs conditioning=embedding, not {self.conditioning}")
         encoder, rule = (parts.name_of(PARTS[kind], getattr(self, kind)) for kind in ("encoder", "gradients"))
-        reason = self.encoder.refuses(self.conditioning)
+        reason = self.conditioning.refuses()
+        if reason:
+            raise InputError(reason)
+        if self.tune == "embedding" and not (self.conditioning.embeds or self.representation.embeds):
+            given = parts.name_of(PARTS["conditioning"], self.conditioning)
+            raise InputError(f"tune=embedding needs conditioning=embedding, not {given}")
+        reason = self.encoder.refuses(self.conditioning, self.representation.embeds)
         if reason:
             raise InputError(f"{encoder} {reason}")
         if self.encoder.has_statistics and not self.fits_statistics:
@@ -215,11 +195,6 @@ class BaseAgent(abc.ABC):
             raise InputError(
                 f"{given} is where a schedule ends, and lr-schedule=constant is none; use linear or cosine"
             )
-        if self.context_limit and self.conditioning != "parameters":
-            raise InputError(
-                f"context-limit={self.context_limit} clips parameters that networks see, and with "
-                f"conditioning={self.conditioning} they see none; use conditioning=parameters"
-            )
         if self.lr_schedule != "constant" and self.experience.reset_every:
             raise InputError(
                 f"reset-every begins the optimisers anew, and lr-schedule={self.lr_schedule} with them; use constant"
@@ -240,13 +215,9 @@ class BaseAgent(abc.ABC):
 
     def network(self, hidden: tuple[int, ...], layer_norm: bool) -> Network:
         """Return a network of the body and heads that the settings ask for."""
-        own = {"shared": (), "per-task": ("head",), "disjoint": ("trajectory", "sight", "body", "head")}[self.heads]
-        body = self.encoder.body(hidden, layer_norm)
-        if self.representation.learns:  # it also holds the task embeddings of all networks
-            return Network(body, own)
-        embedding = self.embedding_size if self.conditioning == "embedding" else 0
-        inference = TrajectoryEncoder(self.embedding_size, layer_norm=layer_norm) if self.history_length else None
-        return Network(body, own, embedding, self.unit_embedding, self.encoder.front(), inference)
+        own = {"shared": (), "per-task": ("head",), "disjoint": ("sight", "body", "head")}[self.heads]
+        front = None if self.representation.learns else self.encoder.front()
+        return Network(self.encoder.body(hidden, layer_norm), own, front)
 
     @property
     def actor_widths(self) -> tuple[int, ...]:
@@ -268,20 +239,26 @@ class BaseAgent(abc.ABC):
         return self.network(self.critic_widths, self.critic_layer_norm)
 
     @property
-    def placed_representation(self) -> Representation:
-        """A copy of the representation that knows the agent's settings."""
-        place = Place(
-            self.conditioning,
-            self.embedding_size,
-            self.unit_embedding,
-            layer_norm=self.critic_layer_norm,
-            own=self.heads == "disjoint",
-        )
-        return self.representation.at(place)
+    def knows_apart(self) -> bool:
+        """Whether every task has networks of its own by which it is known."""
+        return self.heads == "disjoint"
 
-    def actor_inputs(self, nets: Nets, features: Array, obs: Any) -> tuple[Array, Any]:
-        """Return features (Z,) and inputs (..., O) of one task's actor."""
-        return self.placed_representation.actor_inputs(nets["representation"], features, obs)
+    def know(self, nets: Nets, given: Array, seen: Any) -> tuple[Array, Any]:
+        """Return the features (Z,) or (..., Z) of one task, and observations (..., O) without the last steps.
+
+        Args:
+            given: features that need no learned parameters, (Z,) or (..., Z).
+            seen: observations as networks take them, with the last steps if features are made of these.
+        """
+        return self.conditioning.features(nets["knowing"].parts, given, seen), without_past(seen)
+
+    def actor_inputs(self, nets: Nets, given: Array, seen: Any) -> tuple[Array, Any]:
+        """Return features (Z,) and inputs (..., O) of one task's actor, from what ``know`` takes."""
+        return self.representation.actor_inputs(nets["representation"], *self.know(nets, given, seen))
+
+    def critic_inputs(self, nets: Nets, given: Array, seen: Any) -> tuple[Array, Any]:
+        """Return features (Z,) and inputs (..., O) of one task's critics, from what ``know`` takes."""
+        return self.representation.perceive(nets["representation"], *self.know(nets, given, seen))
 
     @property
     def fits(self) -> dict[str, Fit]:
@@ -295,7 +272,7 @@ class BaseAgent(abc.ABC):
         )
         fit = partial(Fit, per_layer=self.gradient_scope == "per-layer", over_devices=self.devices_differ)
         return {
-            "critic": fit(("critic", "representation"), optimizer(critic_lr), self.gradients),
+            "critic": fit(("critic", "representation", "knowing"), optimizer(critic_lr), self.gradients),
             "actor": fit(("actor",), optimizer(actor_lr), self.gradients.for_actor),
         }
 
@@ -327,22 +304,24 @@ class BaseAgent(abc.ABC):
     def init(self, spec: Spec, tasks: Task, key: Key) -> AgentState:
         """Return the initial state for the training ``tasks`` (T, ...)."""
         self.require_sight(spec)
-        num_tasks, vectors = len(tasks.id), self.load_vectors(spec, len(tasks.id))
-        inputs = self.init_inputs(spec, num_tasks)
-        features = conditioning.features(self.conditioning, num_tasks, jnp.int32(0), tasks.context[0], vectors)
-        obs, action = self.example(spec, inputs), jnp.zeros(spec.action_size)
-        representation = self.placed_representation
-        params, key = representation.init(num_tasks, features, obs, action, key)
-        one = params.of_first()
-        seen = representation.actor_inputs(one, features, obs), representation.perceive(one, features, obs)
+        num_tasks, vectors = len(tasks.id), self.conditioning.table(spec, len(tasks.id))
+        inputs, action = self.init_inputs(spec, num_tasks), jnp.zeros(spec.action_size)
+        seen, first = self.example(spec, inputs), jax.tree.map(lambda x: x[0], tasks._replace(blocks=None))
+        given = self.conditioning.given(jnp.int32(0), first, num_tasks, vectors)
+        knowing = self.conditioning.init(num_tasks, seen, self.knows_apart, jax.random.fold_in(key, 1))
         nets = {
             "tasks": Params({} if vectors is None else {"vectors": vectors}, {"context": tasks.context}),
             "inputs": inputs,
-            "representation": params,
+            "knowing": knowing,
             "scaling": Params({}, self.scaling.init(num_tasks)),
             "sampler": Params({}, self.sampler.init(num_tasks)),
-            **self.init_networks(num_tasks, *seen, action, key),
         }
+        known = self.know({"knowing": knowing.of_first()}, given, seen)
+        own = self.heads == "disjoint"
+        nets["representation"], key = self.representation.init(num_tasks, *known, seen, action, own, key)
+        one = {name: net.of_first() for name, net in nets.items()}
+        shapes = self.actor_inputs(one, given, seen), self.critic_inputs(one, given, seen)
+        nets |= self.init_networks(num_tasks, *shapes, action, key)
         fits = {name: fit.init(nets, num_tasks) for name, fit in self.fits.items()}
         return AgentState(nets, self.init_slow(nets), fits)
 
@@ -362,7 +341,7 @@ class BaseAgent(abc.ABC):
     @property
     def history_length(self) -> int:
         """Number of past steps that the networks take beside each observation."""
-        return self.inferred_from if self.conditioning == "inferred" or self.representation.looks_back else 0
+        return self.conditioning.history or self.representation.history
 
     def init_inputs(self, spec: Spec, num_tasks: int) -> Params:
         """Return moments of no observations; in a mixture each task has its own, leaves (T, O)."""
@@ -392,19 +371,9 @@ class BaseAgent(abc.ABC):
 
     def example(self, spec: Spec, inputs: Params) -> Any:
         """Return an input of networks that is all zero."""
-        past = trajectory.begin(self.history_length, spec.obs_size, spec.action_size) if self.history_length else None
+        past = last_steps.begin(self.history_length, spec.obs_size, spec.action_size) if self.history_length else None
         zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), frames.seen(spec))
         return self.see(inputs.of_first(), zeros, past)
-
-    def load_vectors(self, spec: Spec, num_tasks: int) -> Array | None:
-        """Return the given task vectors: (T, V) from their file, or of all splits' sentences; None if there are none.
-
-        Raises:
-            InputError: the file has no such vectors, the tasks have no sentences, or a library is missing.
-        """
-        if self.conditioning == "text":
-            return jnp.asarray(sentences.encode(self.text, spec.sentences))
-        return conditioning.load_vectors(self.vectors, num_tasks) if self.vectors else None
 
     def known_task(self, state: AgentState, task: Task) -> Array:
         """Return the number () int32 of ``task`` if it is a training task, else of the nearest training task.
@@ -424,24 +393,15 @@ class BaseAgent(abc.ABC):
         return jax.vmap(partial(self.known_task, state))(unseen)
 
     def features(self, state: AgentState, task: Task) -> Array:
-        """Return the features (Z,) of one task that networks take as inputs."""
-        number, context = self.known_task(state, task), self.limited(task.context)
+        """Return those features (Z,) of one task that need no learned parameters."""
         vectors = state.nets["tasks"].shared.get("vectors")
-        if self.conditioning == "text":
-            number = jnp.where(task.id < len(vectors), task.id, number)
-        return conditioning.features(self.conditioning, state.num_tasks, number, context, vectors)
-
-    def limited(self, context: Array) -> Array:
-        """Return contexts (..., C) as networks see them."""
-        if parts.is_zero(self.context_limit):
-            return context
-        limit = parts.or_infinite(self.context_limit)
-        return jnp.clip(context, -limit, limit)
+        return self.conditioning.given(self.known_task(state, task), task, state.num_tasks, vectors)
 
     def features_of_batch(self, state: AgentState, batch: Transition, tasks: Task) -> Array:
-        """Return the features of a batch's tasks: (T, Z), or (T, B, Z) where each episode has its own."""
-        if batch.context is not None and self.conditioning == "parameters":
-            return self.limited(batch.context)
+        """Return these features of a batch's tasks: (T, Z), or (T, B, Z) where each episode has its own."""
+        if batch.context is not None and self.conditioning.by_parameters:
+            of_episode = lambda task, context: self.features(state, task._replace(context=context))
+            return jax.vmap(jax.vmap(of_episode, (None, 0)))(tasks, batch.context)
         return jax.vmap(partial(self.features, state))(tasks)
 
     def acting_inputs(self, state: AgentState, memory: Memory, obs: Any, task: Task) -> tuple[Nets, Array, Any]:
@@ -449,7 +409,7 @@ class BaseAgent(abc.ABC):
         nets = of_task(state.nets, self.known_task(state, task))
         inputs, of_all = self.see(nets["inputs"], obs, memory.past), state.nets["representation"]
         trained = task.id < state.num_tasks
-        own = self.placed_representation.stand_in(nets["representation"], of_all, trained, inputs)
+        own = self.representation.stand_in(nets["representation"], of_all, trained, inputs)
         return nets | {"representation": own}, self.features(state, task), inputs
 
     def discounts(self, tasks: Task) -> float | Array:
@@ -473,7 +433,7 @@ class BaseAgent(abc.ABC):
         """Names of what a task that was not trained on uses of its nearest training task."""
         found = {"shared": [], "per-task": ["head"], "disjoint": ["networks"]}[self.heads]
         found += ["input layer"] * (self.encoder.front() is not None) + ["statistics"] * self.encoder.has_statistics
-        return self.representation.borrowed(found + conditioning.BORROWED.get(self.conditioning, []))
+        return [*found, *self.conditioning.borrowed, *self.representation.borrowed]
 
     @property
     def unseen(self) -> str:
@@ -488,7 +448,7 @@ class BaseAgent(abc.ABC):
         """Return the memory with which an episode begins."""
         moments = state.nets["inputs"].parts["moments"]
         sizes = (moments.mean.shape[-1], self.action_size(state)) if self.history_length else ()
-        past = trajectory.begin(self.history_length, *sizes) if self.history_length else None
+        past = last_steps.begin(self.history_length, *sizes) if self.history_length else None
         return Memory(past, self.scaling.begin())
 
     def action_size(self, state: AgentState) -> int:
@@ -499,13 +459,13 @@ class BaseAgent(abc.ABC):
         """Return the memory after a step."""
         past = memory.past
         if past is not None:
-            past = trajectory.append(past, transition.obs, transition.action, transition.reward)
+            past = last_steps.append(past, transition.obs, transition.action, transition.reward)
         return Memory(past, self.scaling.remember(memory.scaling, transition.reward, self.discounts(task)))
 
     def relabel(self, env: Env, task: Task, transition: Transition, key: Key) -> Transition:
         """Return a transition of another task as it would have been in ``task``; its past steps change too."""
         one = lambda transition: env.relabel(task, transition, key)  # type: ignore
-        return one(transition) if transition.extras is None else trajectory.relabel(one, transition)
+        return one(transition) if transition.extras is None else last_steps.relabel(one, transition)
 
     @property
     def watches(self) -> bool:

@@ -3,9 +3,9 @@
 import dataclasses
 from typing import Annotated, Literal
 
-from mtjax.agents.base import Conditioning
 from mtjax.agents.choices import FLAT
 from mtjax.agents.parts.encoders import BroNet, Encoder
+from mtjax.agents.parts.knowing import Embedding, Knowing
 from mtjax.agents.parts.scaling import ReturnScaling, Scaling
 from mtjax.agents.parts.values import C51, Value
 from mtjax.agents.sac import SAC
@@ -28,8 +28,7 @@ class BRC(SAC):
         Head: output layers begin by LeCun's initialisation; there they are orthogonal times sqrt 2, as all layers, and
         those of the log standard deviations, which lie in [-10, 2], orthogonal. Here these lie in [-5, 2].
         Batch: every update draws ``batch_size`` transitions of each task; there, 1024 at random from all tasks.
-        Embeddings: the actor and each critic learn their own, whose initial length is about the square root of their
-        size; there, all share one of initial length about 1, which the actor's loss does not train.
+        Embeddings begin with a length of about the square root of their size, there of about 1.
         Temperature: its Adam has a first decay of 0.9; there, 0.5 (temperature_momentum).
         Mixtures: each task's target entropy counts its own actions; there, padded ones too.
         ``BroNet`` describes the initial weights of the body, and ``ReturnScaling`` the largest return.
@@ -39,9 +38,9 @@ class BRC(SAC):
     critic_lr: float = 3e-4
     temperature_lr: float = 3e-4
     weight_decay: float = 1e-4
-    conditioning: Conditioning = "embedding"
-    embedding_size: int = 32
-    unit_embedding: bool = True
+    conditioning: Annotated[Knowing, FLAT] = dataclasses.field(
+        default_factory=lambda: Embedding(embedding_size=32, unit_embedding=True)
+    )
     critic_reduction: Literal["min", "mean"] = "mean"
     shared_temperature: bool = True
     encoder: Annotated[Encoder, FLAT] = dataclasses.field(default_factory=BroNet)

@@ -9,6 +9,7 @@ import tyro
 from mtjax.agents import parts
 from mtjax.agents.parts.encoders import ENCODERS
 from mtjax.agents.parts.gradients import surgery
+from mtjax.agents.parts.knowing import CONDITIONINGS
 from mtjax.agents.parts.representations import REPRESENTATIONS
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
@@ -18,6 +19,7 @@ from mtjax.experience import EXPERIENCES
 from mtjax.names import CHOICES, InputError, frozen, nearest_error
 
 PARTS: dict[str, Mapping[str, type]] = {
+    "conditioning": CONDITIONINGS,
     "representation": REPRESENTATIONS,
     "encoder": ENCODERS,
     "gradients": surgery.RULES,

@@ -99,13 +99,22 @@ class Distral(SAC):
         network = super().actor
         return Policies(**{field.name: getattr(network, field.name) for field in dataclasses.fields(network)})
 
+    @property
+    def knows_apart(self) -> bool:
+        """Whether every task has networks of its own by which it is known. The distilled policy needs shared ones."""
+        return False
+
+    def distilled(self, nets: Nets, features: Array, obs: Any) -> Array:
+        """Return the distilled policy's outputs (..., 2A)."""
+        return self.actor.apply_distilled(nets["actor"], *self.actor_inputs(nets, features, obs))
+
     def behaviour(self, trained: Array, nets: Nets, features: Array, obs: Array) -> Array:
         own = self.policy(nets, features, obs)
-        return jnp.where(trained, own, self.actor.apply_distilled(nets["actor"], features, obs))
+        return jnp.where(trained, own, self.distilled(nets, features, obs))
 
     def sample(self, nets: Nets, batch: Batch, obs: Any, key: Key) -> Sample:
         raw, log_prob = sample_raw(self.policy(nets, batch.features, obs), key, batch.mask)
-        distilled = self.actor.apply_distilled(jax.lax.stop_gradient(nets["actor"]), batch.features, obs)
+        distilled = self.distilled(nets | {"actor": jax.lax.stop_gradient(nets["actor"])}, batch.features, obs)
         cost = log_prob - self.distral_alpha * log_density(distilled, raw, batch.mask)
         action = jnp.tanh(raw)
         return Sample(action if batch.mask is None else action * batch.mask, log_prob, cost)
@@ -114,7 +123,7 @@ class Distral(SAC):
         loss, aux = super().actor_loss(nets, batch, key)
         own = self.policy(nets, batch.features, batch.obs)
         raw, _ = sample_raw(own, key)  # the actions of that loss
-        distilled = self.actor.apply_distilled(nets["actor"], batch.features, batch.obs)
+        distilled = self.distilled(nets, batch.features, batch.obs)
         fit = jnp.mean(log_density(distilled, jax.lax.stop_gradient(raw), batch.mask))
         kl = jnp.mean(divergence(own, distilled, batch.mask))
         return loss - fit, aux._replace(metrics=aux.metrics | {"kl": kl})

@@ -11,11 +11,12 @@ from mtjax import frames, normalize
 from mtjax.agents import parts
 from mtjax.agents.base import BaseAgent, Memory
 from mtjax.agents.choices import FLAT
+from mtjax.agents.fit import Fit
+from mtjax.agents.parts.knowing.last_steps import Past, append
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.scaling.base import Moments
 from mtjax.agents.parts.scaling.popart import rescale_heads
-from mtjax.agents.parts.trajectory import Past, append
 from mtjax.agents.state import AgentState, Nets, axes_of
 from mtjax.experience import Rollouts
 from mtjax.maps import in_parts
@@ -92,7 +93,7 @@ class Batch(NamedTuple):
     advantage: Array  # (B,)
     output: Array  # (B,) the critic's outputs before the update
     target: Array  # (B,) what the critic's outputs should be
-    features: Array  # (Z,) or (B, Z) features of the task, which networks take as inputs
+    features: Array  # (Z,) or (B, Z) features of the task that need no learned parameters
     mask: Array | None  # (A,) 1 for actions that the task has, else 0; None: it has all
     # For a representation that learns.
     action: Array | None = None  # (B, A)
@@ -231,6 +232,11 @@ class PPO(BaseAgent):
             "units": Units(jnp.float32(0), Moments.begin(num_tasks)).params(),
         }
 
+    @property
+    def fits(self) -> dict[str, Fit]:
+        found = super().fits
+        return found | {"actor": dataclasses.replace(found["actor"], names=("actor", "knowing"))}
+
     # Acting.
 
     def act(self, state: AgentState, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
@@ -268,11 +274,12 @@ class PPO(BaseAgent):
             clipped = batch.output + jnp.clip(output - batch.output, -self.value_clip, self.value_clip)
             error = jnp.maximum(error, jnp.square(clipped - batch.target))
         loss = jnp.mean(error) / 2
-        return self.placed_representation.join(loss, {"critic_loss": loss}, nets["representation"], batch)
+        known = batch._replace(features=self.know(nets, batch.features, batch.obs)[0])
+        return self.representation.join(loss, {"critic_loss": loss}, nets["representation"], known)
 
     def output(self, nets: Nets, features: Array, obs: Any) -> Array:
         """Return the critic's outputs (B,) for observations (B, ...)."""
-        features, inputs = self.placed_representation.perceive(nets["representation"], features, obs)
+        features, inputs = self.critic_inputs(nets, features, obs)
         return self.critic.apply(nets["critic"], features, inputs)[..., 0]
 
     # Update of all tasks.
@@ -411,7 +418,7 @@ class PPO(BaseAgent):
         minibatch, representation = take_steps(batch, index), state.nets["representation"]
         if self.representation.learns:
             models_key = jax.random.fold_in(key, 3)
-            targets, _ = self.placed_representation.targets(representation, slow, minibatch.next_obs, models_key)
+            targets, _ = self.representation.targets(representation, slow, minibatch.next_obs, models_key)
             minibatch = minibatch._replace(model_targets=targets)
         importance = self.sampler.weights(state.nets["sampler"].own, jnp.ones(state.num_tasks))
         loss, samples = self.above_least(self.critic_loss), jax.random.split(sample_key, state.num_tasks)

@@ -13,9 +13,9 @@ from mtjax.agents import parts
 from mtjax.agents.base import BaseAgent, Memory
 from mtjax.agents.choices import FLAT
 from mtjax.agents.fit import Fit
+from mtjax.agents.parts.knowing.last_steps import append
 from mtjax.agents.parts.representations import REPRESENTATIONS
 from mtjax.agents.parts.scaling import SCALINGS
-from mtjax.agents.parts.trajectory import append
 from mtjax.agents.parts.values import VALUES, Value
 from mtjax.agents.state import AgentState, Nets, axes_of
 from mtjax.experience import Replay, pictures
@@ -33,7 +33,7 @@ class Batch(NamedTuple):
     reward: Array  # (B,) in the task's units
     discount: Array  # (B,) gamma, or 0 where the episode terminated
     next_obs: Any  # (B, O)
-    features: Array  # (Z,) or (B, Z) features of the task, which networks take as inputs
+    features: Array  # (Z,) or (B, Z) features of the task that need no learned parameters
     temperature: Array  # ()
     mask: Array | None  # (A,) 1 for actions that the task has, else 0; None: it has all
     model_targets: Any = None  # targets of the representation's models
@@ -147,7 +147,8 @@ class SAC(BaseAgent):
 
     def init_slow(self, nets: Nets) -> Nets:
         copied = nets["representation"].without(self.representation.without_target)
-        return jax.tree.map(jnp.copy, {"critic": nets["critic"], "representation": copied})
+        followed = {"critic": nets["critic"], "knowing": nets["knowing"], "representation": copied}
+        return jax.tree.map(jnp.copy, followed)
 
     @property
     def fits(self) -> dict[str, Fit]:
@@ -186,7 +187,7 @@ class SAC(BaseAgent):
 
     def of_critics(self, apply: Callable, nets: Nets, features: Array, obs: Any, action: Array) -> Any:
         """Apply ``apply``, a function with the signature of ``Network.apply``, to every critic: (N, ...)."""
-        features, inputs = self.placed_representation.perceive(nets["representation"], features, obs)
+        features, inputs = self.critic_inputs(nets, features, obs)
         return jax.vmap(apply, (0, None, None, None))(nets["critic"], features, inputs, action)
 
     def critic_target(self, nets: Nets, slow: Nets, batch: Batch, key: Key) -> Any:
@@ -208,7 +209,8 @@ class SAC(BaseAgent):
         values, expected = self.value.mean(outputs), self.value.expected(target)
         td_error = jnp.mean(jnp.abs(values - expected))
         metrics = {"critic_loss": loss, "value": jnp.mean(values), "td_error": td_error}
-        loss, metrics = self.placed_representation.join(loss, metrics, nets["representation"], batch)
+        known = batch._replace(features=self.know(nets, batch.features, batch.obs)[0])
+        loss, metrics = self.representation.join(loss, metrics, nets["representation"], known)
         return loss, CriticAux(metrics, expected)
 
     def actor_loss(self, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:
@@ -237,7 +239,7 @@ class SAC(BaseAgent):
             actor_turn: () bool, whether actor and temperatures learn too; None if they always do.
         """
         target_key, actor_key, critic_order, actor_order = jax.random.split(key, 4)
-        transitions = self.placed_representation.augment(transitions, jax.random.fold_in(key, 1))
+        transitions = self.representation.augment(transitions, jax.random.fold_in(key, 1))
         state, batch = self.prepare(state, transitions, tasks)
         importance, before = (
             self.sampler.weights(state.nets["sampler"].own, batch.temperature),
@@ -248,7 +250,7 @@ class SAC(BaseAgent):
         state, fitted = self.descend(state, "critic", loss, data, critic_order, importance)
         state = with_statistics(state, "critic", fitted.aux.statistics)
 
-        seen = {"representation": self.placed_representation.for_actor(state.nets["representation"], before)}
+        seen = {"representation": self.representation.for_actor(state.nets["representation"], before)}
         improve = lambda state: self.improve(state, batch, seen, actor_key, actor_order, importance)
         if actor_turn is None:
             state, actor_metrics = improve(state)
@@ -307,7 +309,7 @@ class SAC(BaseAgent):
         slow = state.nets | state.slow
         slow |= {"representation": slow["representation"].filled(state.nets["representation"])}
         of_both = (state.nets["representation"], slow["representation"])
-        model_targets, keys = self.placed_representation.targets(*of_both, batch.next_obs, key)
+        model_targets, keys = self.representation.targets(*of_both, batch.next_obs, key)
         bootstrap = jax.vmap(self.critic_target, (axes_of(state.nets), axes_of(slow), 0, 0))
         return batch._replace(model_targets=model_targets), bootstrap(state.nets, slow, batch, keys)
 

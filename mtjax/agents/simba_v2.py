@@ -3,9 +3,9 @@
 import dataclasses
 from typing import Annotated, Literal
 
-from mtjax.agents.base import Conditioning
 from mtjax.agents.choices import FLAT
 from mtjax.agents.parts.encoders import Encoder, Hypersphere
+from mtjax.agents.parts.knowing import Knowing, Parameters
 from mtjax.agents.parts.scaling import ReturnNormalization, Scaling
 from mtjax.agents.parts.values import C51, Value
 from mtjax.agents.sac import SAC
@@ -46,7 +46,7 @@ class SimbaV2(SAC):
     temperature_lr: float = 1e-4
     initial_temperature: float = 0.01
     normalize_observations: bool = True
-    conditioning: Conditioning = "parameters"
+    conditioning: Annotated[Knowing, FLAT] = dataclasses.field(default_factory=Parameters)
     critic_reduction: Literal["min", "mean"] = "mean"
     unit_head: bool = True
     encoder: Annotated[Encoder, FLAT] = dataclasses.field(default_factory=Hypersphere)

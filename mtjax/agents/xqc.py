@@ -6,9 +6,9 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mtjax.agents.base import Conditioning
 from mtjax.agents.choices import FLAT
 from mtjax.agents.parts.encoders import BatchNorm, Encoder
+from mtjax.agents.parts.knowing import Knowing, Parameters
 from mtjax.agents.parts.scaling import ReturnNormalization, Scaling
 from mtjax.agents.parts.values import C51, Value
 from mtjax.agents.sac import SAC, ActorAux, Batch, CriticAux, Sample
@@ -56,7 +56,7 @@ class XQC(SAC):
     critic_lr: float = 3e-4
     temperature_lr: float = 3e-4
     initial_temperature: float = 0.01
-    conditioning: Conditioning = "parameters"
+    conditioning: Annotated[Knowing, FLAT] = dataclasses.field(default_factory=Parameters)
     unit_head: bool = True
     encoder: Annotated[Encoder, FLAT] = dataclasses.field(default_factory=BatchNorm)
     value: Annotated[Value, FLAT] = dataclasses.field(default_factory=lambda: C51(value_low=-5.0, value_high=5.0))

@@ -70,7 +70,7 @@ def _learned(agent: BaseAgent) -> dict[str, Any]:
 
 def _require_numbers(start: Policy, env: Env, agent: BaseAgent) -> None:
     """Refuse new tasks for networks that know tasks by number alone."""
-    if agent.conditioning != "one-hot":
+    if not agent.conditioning.by_number:
         return
     nearest, count = np.asarray(agent.nearest_tasks(start.state, env.tasks("train"))), start.state.num_tasks
     if nearest.tolist() != list(range(count)):

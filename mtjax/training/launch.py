@@ -49,8 +49,7 @@ def check(config: RunConfig, start: Policy | None = None) -> None:
             require_fit(start, family, learner)
     _require_pictures(config)
     begins = start is not None or bool(config.start)
-    if config.learner.conditioning in ("vectors", "text"):
-        config.learner.load_vectors(family.spec, family.train_count)
+    config.learner.conditioning.table(family.spec, family.train_count)
     tune = config.learner.tune
     if tune != "all" and not begins:
         raise InputError(f"--tune={tune} leaves the rest as a run left it; say which run: --from=RUN")
@@ -173,7 +172,7 @@ def _origin(config: RunConfig) -> str:
     """Return a line on the run that is fine-tuned, or an empty string."""
     if not config.start:
         return ""
-    family, told = config.family, config.learner.conditioning == "parameters"
+    family, told = config.family, config.learner.conditioning.by_parameters
     assert isinstance(family, Family)
     unseen = set(family.varied) - {name for name, _, _ in family.ranges} if told else ()
     blind = f"; its networks cannot be told {', '.join(sorted(unseen))}" if unseen else ""

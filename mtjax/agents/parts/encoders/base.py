@@ -6,6 +6,7 @@ from typing import ClassVar
 import flax.linen as nn
 
 from mtjax.agents import parts
+from mtjax.agents.parts.knowing import Knowing
 from mtjax.networks import MLP, Trunk, join
 from mtjax.types import Array
 
@@ -24,9 +25,13 @@ class Identity:
     def __post_init__(self):
         parts.require_choices(self)
 
-    def refuses(self, conditioning: str) -> str:
-        """Return why the encoder cannot work with a conditioning; empty if it can."""
-        has_features = conditioning != "none" or not self.needs_features
+    def refuses(self, conditioning: Knowing, otherwise: bool) -> str:
+        """Return why the encoder cannot work with a conditioning; empty if it can.
+
+        Args:
+            otherwise: whether features of the task come from the representation too.
+        """
+        has_features = conditioning.tells or otherwise or not self.needs_features
         return "" if has_features else "works by the task's features, so conditioning cannot be none; use parameters"
 
     def body(self, hidden: tuple[int, ...], layer_norm: bool) -> nn.Module:

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents.parts.encoders.base import Identity
+from mtjax.agents.parts.knowing import Knowing
 from mtjax.networks import MLP, ReLU, join
 from mtjax.types import Array, InputError
 
@@ -163,10 +164,10 @@ class MoE(Identity):
             last = self.num_experts - 1
             raise InputError(f"clusters must use every expert from 0 to {last} and no other, not {self.clusters}")
 
-    def refuses(self, conditioning: str) -> str:
-        if self.mode in _BY_NUMBER and conditioning != "one-hot":
+    def refuses(self, conditioning: Knowing, otherwise: bool) -> str:
+        if self.mode in _BY_NUMBER and not conditioning.by_number:
             return f"picks experts by the task's number under mode={self.mode}; use conditioning=one-hot"
-        return "" if self.mode == "ensemble" else super().refuses(conditioning)
+        return "" if self.mode == "ensemble" else super().refuses(conditioning, otherwise)
 
     def weights_by_number(self, features: Array) -> Array:
         """Return weights (..., K) for one-hot task numbers (..., T)."""

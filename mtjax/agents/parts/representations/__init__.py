@@ -2,7 +2,7 @@
 
 from mtjax.agents.parts.representations.asymmetric import Asymmetric
 from mtjax.agents.parts.representations.autoencoder import Autoencoder
-from mtjax.agents.parts.representations.base import Place, Plain
+from mtjax.agents.parts.representations.base import Plain
 from mtjax.agents.parts.representations.deepmdp import DeepMDP
 from mtjax.agents.parts.representations.encoded import Encoded
 from mtjax.agents.parts.representations.hip_bmdp import HiPBMDP
@@ -25,7 +25,6 @@ __all__ = [
     "DeepMDP",
     "Encoded",
     "HiPBMDP",
-    "Place",
     "Plain",
     "Representation",
 ]

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from mtjax import frames
 from mtjax.agents import parts
 from mtjax.agents.parts import vision
-from mtjax.agents.parts.representations.base import Basis, without_past
+from mtjax.agents.parts.knowing.last_steps import without_past
 from mtjax.agents.parts.representations.encoded import Encoded
 from mtjax.networks import MLP, Params
 from mtjax.types import Array, Key, Metrics
@@ -55,12 +55,15 @@ class Autoencoder(Encoded):
         parts.require_positive(self, "reconstruction")
         parts.require_not_negative(self, "latent_decay", "decoder_decay")
 
-    def init(self, num_tasks: int, features: Array, obs: Any, action: Array, key: Key) -> Basis:
-        basis = super().init(num_tasks, features, obs, action, key)
-        key, decoder_key = jax.random.split(basis.key)
-        decoder, latent = self.decoder(without_past(obs)), jnp.zeros(self.latent_widths[-1])
-        self.init_part(basis.params, "decoder", decoder, decoder_key, num_tasks, latent)
-        return basis._replace(key=key)
+    def init(
+        self, num_tasks: int, features: Array, obs: Any, seen: Any, action: Array, own: bool, key: Key
+    ) -> tuple[Params, Key]:
+        params, key = super().init(num_tasks, features, obs, seen, action, own, key)
+        key, decoder_key = jax.random.split(key)
+        self.init_part(
+            params, "decoder", self.decoder(obs), own, decoder_key, num_tasks, jnp.zeros(self.latent_widths[-1])
+        )
+        return params, key
 
     def decoder(self, obs: Any) -> nn.Module:
         """Return the decoder for observations like ``obs``."""

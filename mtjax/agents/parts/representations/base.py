@@ -2,33 +2,16 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar
 
 import flax.linen as nn
 import jax
 
 from mtjax import frames
 from mtjax.agents import parts
-from mtjax.agents.parts.trajectory import Seen
+from mtjax.agents.parts.knowing.last_steps import without_past
 from mtjax.networks import Params
 from mtjax.types import Array, InputError, Key, Metrics, Transition
-
-
-class Place(NamedTuple):
-    """Holds the agent's settings that a representation needs."""
-
-    conditioning: str
-    embedding_size: int  # of learned task embeddings, and of inferred features
-    unit_embedding: bool
-    layer_norm: bool  # of the critics
-    own: bool  # whether every task has networks of its own
-
-
-class Basis(NamedTuple):
-    """Holds a representation's initial parameters, and a key for the networks on top of it."""
-
-    params: Params
-    key: Key
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,32 +20,28 @@ class Plain:
 
     Every representation is a class with these methods. Its parameters are a network of the agent's, with parts of these
     ``names``. The critics' loss trains them, together with losses of the representation's own, which ``join`` adds; the
-    actor's loss does not. What the actor's loss trains is the module ``sight``, which lies in the actor. Agents use a
-    copy that knows its ``place``. Parameters are those of one task unless stated otherwise.
+    actor's loss does not. What the actor's loss trains is the module ``sight``, which lies in the actor. Parameters are
+    those of one task unless stated otherwise.
     """
 
     names: ClassVar[tuple[str, ...]] = ()  # of its parameters
     models: ClassVar[tuple[str, ...]] = ()  # names of parameters that no target is computed with
     sees_pictures: ClassVar[bool] = False  # whether it encodes pictures
     predicts: ClassVar[bool] = False  # whether its models predict what a single step leads to
-    place: ClassVar[Place]
+    embeds: ClassVar[bool] = False  # whether every task has a learned vector
 
     def __post_init__(self):
         parts.require_choices(self)
 
-    def at(self, place: Place) -> Self:
-        """Return a copy that knows its place."""
-        return parts.put(self, place=place)
-
     @property
     def learns(self) -> bool:
-        """Whether it has parameters; if so, it also holds the task embeddings, in place of the networks."""
+        """Whether it has parameters."""
         return bool(self.names)
 
     @property
-    def looks_back(self) -> bool:
-        """Whether it needs the last steps, whatever the conditioning."""
-        return False
+    def history(self) -> int:
+        """Number of last steps that it needs beside each observation."""
+        return 0
 
     @property
     def without_target(self) -> tuple[str, ...]:
@@ -74,9 +53,19 @@ class Plain:
         """Step sizes of target parameters, by name, where they are not the critics' ``tau``."""
         return {}
 
-    def init(self, num_tasks: int, features: Array, obs: Any, action: Array, key: Key) -> Basis:
-        """Initialise for features (Z,), an observation (O,) and an action (A,) of these shapes."""
-        return Basis(Params({}, {}), key)
+    def init(
+        self, num_tasks: int, features: Array, obs: Any, seen: Any, action: Array, own: bool, key: Key
+    ) -> tuple[Params, Key]:
+        """Initialise for features (Z,), an observation (O,) and an action (A,) of these shapes.
+
+        Args:
+            seen: the observation, with the last steps if there is a ``history``.
+            own: whether every task has networks of its own.
+
+        Returns:
+            the parameters, and a key for the networks on top of them.
+        """
+        return Params({}, {}), key
 
     def require(self, obs: Any) -> None:
         """Check that networks can take observations of these shapes.
@@ -149,16 +138,12 @@ class Plain:
         """
         return params
 
-    def borrowed(self, found: list[str]) -> list[str]:
-        """Return the names of what an unseen task uses of its nearest training task; ``found`` are its agent's."""
-        return found
+    @property
+    def borrowed(self) -> list[str]:
+        """Names of what an unseen task uses of its nearest training task."""
+        return []
 
     @property
     def replaced(self) -> str:
         """What an unseen task has that no training task has; empty for nothing."""
         return ""
-
-
-def without_past(obs: Any) -> Array:
-    """Return the observation without the past steps that may come with it."""
-    return obs.obs if isinstance(obs, Seen) else obs

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from mtjax import frames
 from mtjax.agents import parts
-from mtjax.agents.parts.representations.base import without_past
+from mtjax.agents.parts.knowing.last_steps import without_past
 from mtjax.agents.parts.representations.encoded import Encoded
 from mtjax.networks import OVER_TASKS, Params, Trunk
 from mtjax.types import Array, InputError, Key, Metrics
@@ -52,9 +52,6 @@ class DeepMDP(Encoded):
     transition=deterministic, sigma is 1 and h~ is mu. phi ends in layer normalisation and tanh, as in SAC-AE (Yarats et
     al. 2021), because L_T alone would shrink latent states to a point. phibar is the target encoder, which SAC's target
     critics use; it moves by ``encoder_tau``. In PPO, which has no target networks, it is phi from before the update.
-
-    The vectors of conditioning=embedding, and the trajectory encoder of conditioning=inferred, belong to this
-    representation: all networks use the same, which critics and models train, and the actor does not.
 
     Differs from the papers: targets come from the target encoder, which is more stable than the sg(phi(s')) of Zhang et
     al. and MTRL; R takes the predicted state, as theirs does (Gelada et al.: R(h, a)), and also z; L_T is their

@@ -9,14 +9,13 @@ import jax.numpy as jnp
 
 from mtjax import frames
 from mtjax.agents import parts
-from mtjax.agents.parts.representations.base import Basis, without_past
+from mtjax.agents.parts.knowing.last_steps import without_past
 from mtjax.agents.parts.representations.seeing import Seeing
-from mtjax.agents.parts.trajectory import TrajectoryEncoder
 from mtjax.agents.parts.vision import NETWORKS, Projection, Vision, project
-from mtjax.networks import MLP, Network, Params, join
+from mtjax.networks import MLP, Network, Params
 from mtjax.types import Array, Key
 
-ENCODERS = ("latent", "trajectory", "embedding")
+ENCODERS = ("latent",)
 PROJECTION = "projection"
 
 
@@ -47,9 +46,6 @@ class Encoded(Seeing):
 
     In every update from the replay each picture of the batch is shifted at random by up to ``shift`` pixels, those of s
     and of s' on their own (Yarats, Kostrikov and Fergus 2021, DrQ; Yarats et al. 2022, DrQ-v2). PPO shifts none.
-
-    The vectors of conditioning=embedding, and the trajectory encoder of conditioning=inferred, belong to this
-    representation: all networks use the same, which critics train, and the actor does not.
 
     With encoder_tau=1 the target encoder is phi itself, and the actor's loss sees phi as it was before the critics'
     step, as in DrQ-v2. Differs from DrQ-v2: the learner is SAC, with tuned temperatures, and not DDPG with scheduled
@@ -89,16 +85,6 @@ class Encoded(Seeing):
     # Networks: each is used by all N critics and by the actor.
 
     @property
-    def has_theta(self) -> bool:
-        """Whether every task has a learned vector."""
-        return self.place.conditioning == "embedding"
-
-    @property
-    def infers(self) -> bool:
-        """Whether task features are inferred from the last steps."""
-        return self.place.conditioning == "inferred"
-
-    @property
     def model_modules(self) -> dict[str, nn.Module]:
         """The models, by name."""
         return {}
@@ -110,41 +96,42 @@ class Encoded(Seeing):
     @property
     def modules(self) -> dict[str, nn.Module]:
         """The encoders and models, by name."""
-        found: dict[str, nn.Module] = {"latent": Latent(self.latent_widths, self.vision), **self.model_modules}
-        return found | ({"trajectory": self.trajectory} if self.infers else {})
+        return {"latent": Latent(self.latent_widths, self.vision), **self.model_modules}
 
     @property
     def sight(self) -> nn.Module:
         """Return a projection, which critics and actor each have of their own."""
         return Projection(self.latent_widths[-1])
 
-    @property
-    def trajectory(self) -> TrajectoryEncoder:
-        return TrajectoryEncoder(self.place.embedding_size, layer_norm=self.place.layer_norm)
-
     def apply(self, params: Params, name: str, *inputs: Any) -> Array:
         """Map one task's inputs by an encoder or a model."""
         module = self.sight if name == PROJECTION else self.modules[name]
         return module.apply({**params.shared, **params.own}[name], *inputs)  # type: ignore
 
-    def init(self, num_tasks: int, features: Array, obs: Any, action: Array, key: Key) -> Basis:
-        key, theta_key, *keys = jax.random.split(key, 2 + len(self.modules))
-        size, params = self.place.embedding_size, Params({}, {})
+    def init(
+        self, num_tasks: int, features: Array, obs: Any, seen: Any, action: Array, own: bool, key: Key
+    ) -> tuple[Params, Key]:
+        key, vector_key, *keys = jax.random.split(key, 2 + len(self.modules))
+        params = self.init_vectors(num_tasks, vector_key)
         latent = jnp.zeros(self.latent_widths[-1])  # models see no state beside pictures
-        features = jnp.zeros(len(features) + size * (self.has_theta + self.infers))
-        inputs = {"latent": (without_past(obs),), **self.model_inputs(latent, features, action)}
+        features = self.task_features(params.of_first(), features)
+        inputs = {"latent": (obs,), **self.model_inputs(latent, features, action)}
         for (name, module), part_key in zip(self.modules.items(), keys, strict=True):
-            self.init_part(params, name, module, part_key, num_tasks, *inputs.get(name, (obs,)))
-        if self.has_theta:
-            params.own["embedding"] = jax.random.normal(theta_key, (num_tasks, size))
+            self.init_part(params, name, module, own, part_key, num_tasks, *inputs.get(name, (seen,)))
         if frames.shown(obs):
             convolved = self.convolve(params.of_first(), obs)
-            self.init_part(params, PROJECTION, self.sight, jax.random.fold_in(key, 1), num_tasks, convolved)
-        return Basis(params, key)
+            self.init_part(params, PROJECTION, self.sight, own, jax.random.fold_in(key, 1), num_tasks, convolved)
+        return params, key
 
-    def init_part(self, params: Params, name: str, module: nn.Module, key: Key, num_tasks: int, *inputs: Any) -> None:
+    def init_vectors(self, num_tasks: int, key: Key) -> Params:
+        """Return the vectors that are learned for each task; none by default."""
+        return Params({}, {})
+
+    def init_part(
+        self, params: Params, name: str, module: nn.Module, own: bool, key: Key, num_tasks: int, *inputs: Any
+    ) -> None:
         """Add the initial parameters of an encoder or a model: one for all tasks, or every task's own."""
-        if self.place.own:
+        if own:
             params.own[name] = Network.for_each_task(module.init, key, num_tasks, *inputs)
         else:
             params.shared[name] = module.init(key, *inputs)
@@ -153,19 +140,17 @@ class Encoded(Seeing):
 
     def perceive(self, params: Params, features: Array, obs: Any) -> tuple[Array, Array]:
         """Return features of the task (Z,) or (..., Z), and latent states (..., D)."""
-        return self.task_features(params, features, obs), self.encode(params, without_past(obs))
+        return self.task_features(params, features), self.encode(params, without_past(obs))
 
     def actor_inputs(self, params: Params, features: Array, obs: Any) -> tuple[Array, Any]:
         """Return features of the task, and latent states; of pictures what the actor's own projection takes."""
         if not frames.shown(obs):
             return self.perceive(params, features, obs)
-        return self.task_features(params, features, obs), self.convolve(params, obs)
+        return self.task_features(params, features), self.convolve(params, obs)
 
-    def task_features(self, params: Params, features: Array, obs: Any) -> Array:
-        """Return features of the task (Z,) or (..., Z). Some representations add learned or inferred ones."""
-        if self.infers:
-            features = self.apply(params, "trajectory", obs)
-        return join(features, task=self.theta(params)) if self.has_theta else features
+    def task_features(self, params: Params, features: Array) -> Array:
+        """Return features of the task (Z,) or (..., Z), with those that a representation adds."""
+        return features
 
     def encode(self, params: Params, obs: Any) -> Array:
         """Return the critics' latent states (..., D)."""
@@ -176,8 +161,3 @@ class Encoded(Seeing):
     def convolve(self, params: Params, obs: Any) -> Any:
         """Return observations with the features (..., F) of convolutions in place of pictures."""
         return obs | {frames.PICTURES: self.apply(params, "latent", obs)}
-
-    def theta(self, params: Params) -> Array:
-        """Return a task's learned vector (Z,)."""
-        theta = params.own["embedding"]
-        return theta / jnp.maximum(jnp.linalg.norm(theta), 1e-6) if self.place.unit_embedding else theta

@@ -8,8 +8,10 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents import parts
+from mtjax.agents.parts.knowing.embedding import unit
+from mtjax.agents.parts.knowing.last_steps import TrajectoryEncoder
 from mtjax.agents.parts.representations.deepmdp import DeepMDP, ModelTargets
-from mtjax.networks import Params
+from mtjax.networks import Params, join
 from mtjax.types import Array, Key, Metrics
 
 STAND_INS = {
@@ -36,40 +38,56 @@ class HiPBMDP(DeepMDP):
     ``unseen_theta`` chooses the theta of a task that was not trained on: by default the mean of the training tasks'.
     "nearest" looks at the task's true parameters, which the method assumes to be hidden. (MTRL distinguishes a mean
     over all tasks from one over training tasks; here only training tasks have a theta.) "inferred" is a trajectory
-    encoder g of the last steps (``parts/trajectory.py``), fitted to training tasks by
+    encoder g of the last steps (``TrajectoryEncoder``), fitted to training tasks by
         L_g = mean |g(last steps) - sg(theta_i)|^2                                                     (guess loss)
 
-    Other features of ``conditioning`` are joined to theta; conditioning=embedding is theta itself.
+    Features of ``conditioning`` are joined to theta.
 
     Differs from the paper: both predictions start from the same state and action, as in MTRL. Differs from MTRL:
     distances are computed for each sample, where MTRL takes one norm over a batch; theta is a table, without a network
     on top, which could add nothing for T tasks.
     """
 
+    theta_size: int = 16
+    """Size of the vector theta of each task."""
+    unit_theta: bool = False
+    """Scale thetas to length 1."""
+    theta_from: int = 8
+    """Number of last steps from which the theta of an unseen task is inferred, with unseen_theta=inferred."""
     theta_coefficient: float = 0.01
     """Weight of the theta loss."""
     unseen_theta: Literal["nearest", "zero", "mean", "inferred"] = "mean"
     """Theta of an unseen task: the mean of all training tasks', zero, that of the nearest training task (by its true
     parameters), or inferred from the last steps."""
 
-    names: ClassVar[tuple[str, ...]] = (*DeepMDP.names, "guess")
+    names: ClassVar[tuple[str, ...]] = (*DeepMDP.names, "embedding", "guess")
+    slow: ClassVar[tuple[str, ...]] = (*DeepMDP.slow, "embedding")
+    embeds: ClassVar[bool] = True
     models: ClassVar[tuple[str, ...]] = (*DeepMDP.models, "guess")
 
     def __post_init__(self):
         super().__post_init__()
         parts.require_not_negative(self, "theta_coefficient")
+        parts.require_counts(self, "theta_size", "theta_from")
 
     @property
-    def has_theta(self) -> bool:
-        return True
-
-    @property
-    def looks_back(self) -> bool:
-        return self.unseen_theta == "inferred"
+    def history(self) -> int:
+        return self.theta_from if self.unseen_theta == "inferred" else 0
 
     @property
     def modules(self) -> dict[str, nn.Module]:
-        return super().modules | ({"guess": self.trajectory} if self.looks_back else {})
+        return super().modules | ({"guess": TrajectoryEncoder(self.theta_size)} if self.history else {})
+
+    def init_vectors(self, num_tasks: int, key: Key) -> Params:
+        return Params({}, {"embedding": jax.random.normal(key, (num_tasks, self.theta_size))})
+
+    def task_features(self, params: Params, features: Array) -> Array:
+        return join(features, task=self.theta(params))
+
+    def theta(self, params: Params) -> Array:
+        """Return a task's learned vector (Z,)."""
+        theta = params.own["embedding"]
+        return unit(theta) if self.unit_theta else theta
 
     # Tasks that were not trained on.
 
@@ -86,8 +104,9 @@ class HiPBMDP(DeepMDP):
                 return params
         return with_theta(params, jnp.where(known, params.own["embedding"], theta))
 
-    def borrowed(self, found: list[str]) -> list[str]:
-        return [part for part in found if part != "embedding"] + ["theta"] * (self.unseen_theta == "nearest")
+    @property
+    def borrowed(self) -> list[str]:
+        return ["theta"] * (self.unseen_theta == "nearest")
 
     @property
     def replaced(self) -> str:

@@ -1,14 +1,17 @@
-"""The trajectory encoder infers features of a hidden task from the last steps."""
+"""Features of a hidden task, which a trajectory encoder infers from the last steps."""
 
+import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from mtjax.networks import MLP
-from mtjax.types import Array, Transition
+from mtjax.agents import parts
+from mtjax.agents.parts.knowing.base import Nothing
+from mtjax.networks import MLP, Network, Params
+from mtjax.types import Array, Key, Transition
 
 
 class Past(NamedTuple):
@@ -59,6 +62,11 @@ def relabel(one: Callable[[Transition], Transition], transition: Transition) -> 
     return one(transition)._replace(extras=past)
 
 
+def without_past(seen: Any) -> Any:
+    """Return observations without the past steps that may come with them."""
+    return seen.obs if isinstance(seen, Seen) else seen
+
+
 class TrajectoryEncoder(nn.Module):
     """Encodes the last steps as features of the task.
 
@@ -69,13 +77,12 @@ class TrajectoryEncoder(nn.Module):
     averaged; PEARL's context encoder combines them by a product without order too (Rakelly et al. 2019, section 4.1).
     All steps are one batched product, where a recurrent network (Duan et al. 2016, "RL^2") takes H in sequence.
 
-    Differs from PEARL: z is a point and not a distribution; each network has its own encoder, trained by that network's
-    loss; the steps are those right before the observation, and not drawn from all of the task's.
+    Layers are normalised. Differs from PEARL: z is a point and not a distribution; the steps are those right before the
+    observation, and not drawn from all of the task's.
     """
 
     size: int  # number of features
     widths: tuple[int, ...] = (64, 64)
-    layer_norm: bool = False
 
     @nn.compact
     def __call__(self, seen: Seen) -> Array:
@@ -84,6 +91,37 @@ class TrajectoryEncoder(nn.Module):
         following = jnp.concatenate([past.obs[..., 1:, :], seen.obs[..., None, :]], axis=-2)
         steps = jnp.concatenate([past.obs, past.action, past.reward[..., None], following - past.obs], axis=-1)
         known = past.known[..., None]
-        encoded = MLP(self.widths, self.layer_norm)(steps * known)
+        encoded = MLP(self.widths, layer_norm=True)(steps * known)
         mean = jnp.sum(encoded * known, axis=-2) / jnp.maximum(jnp.sum(known, axis=-2), 1)
         return nn.Dense(self.size)(mean)
+
+
+@dataclasses.dataclass(frozen=True)
+class LastSteps(Nothing):
+    """Shows networks what a trajectory encoder infers of a hidden task from the last steps."""
+
+    embedding_size: int = 16
+    """Size of the features that are learned or inferred."""
+    inferred_from: int = 8
+    """Number of last steps from which the task is inferred; they are stored with every transition."""
+
+    tells: ClassVar[bool] = True
+
+    def __post_init__(self):
+        parts.require_counts(self, "embedding_size", "inferred_from")
+
+    @property
+    def history(self) -> int:
+        return self.inferred_from
+
+    @property
+    def encoder(self) -> TrajectoryEncoder:
+        return TrajectoryEncoder(self.embedding_size)
+
+    def init(self, num_tasks: int, seen: Any, own: bool, key: Key) -> Params:
+        if own:
+            return Params({}, {"trajectory": Network.for_each_task(self.encoder.init, key, num_tasks, seen)})
+        return Params({"trajectory": self.encoder.init(key, seen)}, {})
+
+    def features(self, params: dict[str, Any], given: Array, seen: Any) -> Array:
+        return self.encoder.apply(params["trajectory"], seen)  # type: ignore

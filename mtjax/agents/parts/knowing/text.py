@@ -1,15 +1,40 @@
-"""Vectors of sentences, made on the host before a run."""
+"""What a task asks for, in a sentence whose vector is made on the host before a run."""
 
+import dataclasses
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import ClassVar
 
+import jax.numpy as jnp
 import numpy as np
 
-from mtjax.types import InputError
+from mtjax.agents.parts.knowing.base import Nothing
+from mtjax.types import Array, InputError, Spec, Task
 
 HASHING = "hashing"
 _SIZE = 256  # entries of hashed sentences, enough for some hundred words to fall apart
 _WORD = r"(?:(?<!\w)-)?\w+(?:\.\w+)*"  # keeps the numbers 0.95 and -2
+
+
+@dataclasses.dataclass(frozen=True)
+class Text(Nothing):
+    """Shows networks the vector of a sentence that says what their task asks for.
+
+    Tasks of all of the run's splits have their own sentences.
+    """
+
+    text: str = HASHING
+    """Encoder of sentences: hashing (256 numbers from words and pairs of words, by scikit-learn), or a model of
+    sentence-transformers, by its name or the folder that it is in."""
+
+    tells: ClassVar[bool] = True
+
+    def table(self, spec: Spec, num_tasks: int) -> Array:
+        return jnp.asarray(encode(self.text, spec.sentences))
+
+    def given(self, number: Array, task: Task, num_tasks: int, table: Array | None) -> Array:
+        assert table is not None
+        return table[jnp.where(task.id < len(table), task.id, number)]
 
 
 @lru_cache

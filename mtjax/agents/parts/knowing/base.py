@@ -1,0 +1,68 @@
+"""``Nothing`` is the interface of ways to know a task, and the one that knows nothing."""
+
+import dataclasses
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+
+from mtjax.networks import Params
+from mtjax.types import Array, Key, Spec, Task
+
+
+@dataclasses.dataclass(frozen=True)
+class Nothing:
+    """Shows networks nothing of their task.
+
+    Every way of knowing a task is a class with these methods. What it learns is a network of the agent's, ``knowing``,
+    which the critics' loss trains. In agents that learn from rollouts the actor's loss trains it too.
+    """
+
+    borrowed: ClassVar[tuple[str, ...]] = ()  # names of what an unseen task uses of its nearest training task
+    tells: ClassVar[bool] = False  # whether networks see features of the task
+    by_number: ClassVar[bool] = False  # whether these are the number of a training task, one-hot
+    by_parameters: ClassVar[bool] = False  # whether these are the task's parameters
+    embeds: ClassVar[bool] = False  # whether every training task has a learned vector, called embedding
+
+    @property
+    def history(self) -> int:
+        """Number of last steps from which features are made."""
+        return 0
+
+    def refuses(self) -> str:
+        """Return why it cannot be used with these settings; empty if it can."""
+        return ""
+
+    def table(self, spec: Spec, num_tasks: int) -> Array | None:
+        """Return the vectors of tasks that are known before a run: (T, V), or of all splits' tasks; None for none.
+
+        Raises:
+            InputError: they cannot be had.
+        """
+        return None
+
+    def init(self, num_tasks: int, seen: Any, own: bool, key: Key) -> Params:
+        """Initialise what is learned.
+
+        Args:
+            seen: an observation (O,), with the last steps if there is a ``history``.
+            own: whether every task has networks of its own.
+        """
+        return Params({}, {})
+
+    def given(self, number: Array, task: Task, num_tasks: int, table: Array | None) -> Array:
+        """Return those features (Z,) of a task that need no learned parameters.
+
+        Args:
+            number: () of the task if it is a training task, else of the nearest one.
+        """
+        return jnp.zeros(0)
+
+    def features(self, params: dict[str, Any], given: Array, seen: Any) -> Array:
+        """Return the features (Z,) or (..., Z) of one task that networks take as inputs.
+
+        Args:
+            params: the named parts of ``knowing``, of this task.
+            given: from ``given``, (Z,) or (..., Z).
+            seen: observations (..., O), with the last steps if there is a ``history``.
+        """
+        return given
