@@ -79,8 +79,9 @@ class RunConfig:
     every family that has such a flag, and --env.vary.NAME.PARAMETER=VALUES holds for the family NAME. Benchmarks, such
     as mt10, are mixtures."""
     agent: str = "sac-conditioned"
-    """Name of the agent. --list shows all names. Its parts are chosen by --agent.representation, --agent.encoder,
-    --agent.gradients, --agent.value, --agent.scaling and --agent.sampler, each by name. A part adds its own flags."""
+    """Name of the agent. --list shows all names. Its parts are chosen by --agent.conditioning, --agent.representation,
+    --agent.encoder, --agent.gradients, --agent.value, --agent.scaling and --agent.sampler, each by name. A part adds
+    its own flags."""
     preset: Literal["auto", "cpu", "gpu"] = "auto"
     """Tuned defaults of the flags below for one kind of device. auto takes the device that JAX runs on."""
     runs: str = "runs"

@@ -12,7 +12,7 @@ import pytest
 from needs import needs
 
 from mtjax import agents, loop
-from mtjax.agents.parts import trajectory
+from mtjax.agents.parts.knowing import last_steps
 from mtjax.config import configure
 from mtjax.envs import ENVS
 from mtjax.envs.probes import AFTER, LIMIT, RULES, SPEC, Probe, tasks_of
@@ -190,7 +190,7 @@ SMALL = {  # of parts that have such settings
 
 def tiny(name: str, **settings):
     """Return the agent called ``name``, small enough to compile in a few seconds."""
-    made = agents.agent(name, **{"hidden": (16,), "embedding_size": 4, **settings})
+    made = agents.agent(name, **{"hidden": (16,), **settings})
     small = {k: v for k, v in SMALL.items() if k in agents.settings(made) and k not in settings}
     return agents.agent(name, **{**agents.settings(made), **small})
 
@@ -307,9 +307,9 @@ def random_batch(seed: int, num_tasks: int, batch_size: int, spec: Spec = SPEC, 
     return batch._replace(extras=random_past(random, (num_tasks, batch_size, history), spec)) if history else batch
 
 
-def random_past(random: np.random.Generator, shape: tuple[int, ...], spec: Spec = SPEC) -> trajectory.Past:
+def random_past(random: np.random.Generator, shape: tuple[int, ...], spec: Spec = SPEC) -> last_steps.Past:
     """Random last steps (..., H, x), ``shape`` being (..., H), of which the first half had not been taken yet."""
     known = np.broadcast_to(np.arange(shape[-1]) >= shape[-1] // 2, shape).astype(np.float32)
     normal = lambda size: jnp.float32(random.normal(size=(*shape, size)) * known[..., None])
     reward = jnp.float32(random.normal(size=shape) * known)
-    return trajectory.Past(normal(spec.obs_size), jnp.tanh(normal(spec.action_size)), reward, jnp.asarray(known))
+    return last_steps.Past(normal(spec.obs_size), jnp.tanh(normal(spec.action_size)), reward, jnp.asarray(known))

@@ -173,7 +173,7 @@ def test_repeating_flags_name_the_file_of_vectors(tmp_path):
     file = tmp_path / "my vectors.npy"
     program = cli.parse(["--agent=care", "--agent.conditioning=vectors", f"--agent.vectors={file}"])
     words = shlex.split(shlex.join(to_flags(program)))
-    assert cli.parse(words) == program and program.learner.vectors == str(file)
+    assert cli.parse(words) == program and program.learner.conditioning.vectors == str(file)
 
 
 @pytest.mark.parametrize("file", PRESET_FILES, ids=lambda file: file.name)
@@ -319,7 +319,13 @@ def test_help_mentions_every_flag_with_its_default(help_text):
         assert re.search(rf"{re.escape(flag)}[ ,]", help_text), flag
     assert help_text.count("(default: ") == len(cli.flags(program)) - len(CHOICES)  # which are read before
     learner = program.learner
-    for default in (program.plan.steps, learner.actor_lr, learner.conditioning, learner.encoder.variant):
+    for default in (
+        program.plan.steps,
+        learner.actor_lr,
+        learner.gamma,
+        learner.conditioning.context_limit,
+        learner.encoder.variant,
+    ):
         assert f"(default: {default})" in help_text
     for widths in (learner.hidden, learner.encoder.expert_widths):
         assert f"(default: {' '.join(map(str, widths))})" in help_text
@@ -410,7 +416,8 @@ def test_list_names_every_family_and_agent(capsys):
         ("--env=finger-spin-vary-size --env.vary.size=1:1.1:4 --split=hip-bmdp", "has 4; use --split=dense"),
         ("--agent=care --agent.conditioning=none", "conditioning cannot be none"),
         ("--agent.conditioning=vectors", "go together"),
-        ("--agent.vectors=x.npy", "go together"),
+        ("--agent.vectors=x.npy", "it belongs to conditioning='vectors'"),
+        ("--agent.conditioning=vectors", "go together"),
         ("--agent.conditioning=vectors --agent.vectors=missing.npy", "cannot read task vectors from 'missing.npy'"),
         ("--seeds=99999999999999999999", "seeds must be at most 100000, not 99999999999999999999"),
         ("--steps=99999999999999999999", "steps must be at most 1000000000000000"),

@@ -86,16 +86,6 @@ def test_heads_begin_differently_and_do_not_touch_each_other(data):
     assert difference[0] == difference[2] == 0 < difference[1]
 
 
-def test_an_embedding_stands_in_for_the_features(data):
-    """A network with embeddings is the plain one, given the embedding of the task."""
-    with_embedding, plain = Network(Trunk((6,)), embedding_size=3), Network(Trunk((6,)))
-    params = with_embedding.init(jax.random.key(0), TASKS, OUT, jnp.zeros(0), data[0][0])
-    assert params.own["embedding"].shape == (TASKS, 3)
-    found = jax.vmap(with_embedding.apply, (Params(None, 0), None, None))(params, jnp.zeros(0), data[0])
-    for i in range(TASKS):
-        close(found[i], plain.apply(Params(params.shared, {}), params.own["embedding"][i], data[0]))
-
-
 def plain_experts(params, x, num_experts):
     encodings = []
     for k in range(num_experts):

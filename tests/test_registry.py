@@ -21,6 +21,7 @@ import mtjax.evaluate
 import mtjax.train
 from mtjax import cli, commands, register
 from mtjax.agents import AGENTS, PARTS
+from mtjax.agents.parts.knowing import Parameters
 from mtjax.config import to_json
 from mtjax.envs import ENVS, Domain, Parameter, declared, effects
 from mtjax.envs.brax import Brax
@@ -163,7 +164,7 @@ def test_parts_and_agents_of_ones_own_are_trained(name, short_family, forget, tm
 def test_an_agent_is_another_with_other_defaults(forget):
     register("my-care", "care", num_experts=3, actor_lr=1e-2)
     agent = mtjax.agent("my-care")
-    assert agent.encoder.num_experts == 3 and agent.actor_lr == 1e-2 and agent.conditioning == "parameters"
+    assert agent.encoder.num_experts == 3 and agent.actor_lr == 1e-2 and agent.conditioning == Parameters()
 
 
 def test_what_cannot_be_registered_is_refused(forget):

@@ -154,8 +154,9 @@ def test_flags_of_all_families_and_agents_are_known_without_jax(ours):
         fields = cli.shared_fields(cls)
         real |= {cli.family_flag(field.name): isinstance(field.default, bool) for field in fields}
     for agent, given in itertools.product(("sac", "distral", "brc", "simba-v2", "xqc", "ppo"), [{}, *choices]):
+        needed = {"vectors": "file.npy"} if given == {"conditioning": "vectors"} else {}
         with contextlib.suppress(InputError):  # which this agent does not go with
-            made = mtjax.agent(agent, **given)
+            made = mtjax.agent(agent, **given, **needed)
             real |= {f"--{flag}": isinstance(settings(made)[name], bool) for name, flag in flag_names(made).items()}
     assert commands.all_flags() == real
 
