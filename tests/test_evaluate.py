@@ -382,7 +382,7 @@ def test_wrong_values_and_checkpoints_are_refused(copied_run, words, said):
 def test_an_earlier_checkpoint_is_evaluated(copied_run):
     """As in Python."""
     old, new = mtjax.load(copied_run, checkpoint=100), mtjax.load(copied_run)
-    same = jax.tree.map(lambda x, y: np.array_equal(x, y), old.state.actor, new.state.actor)
+    same = jax.tree.map(lambda x, y: np.array_equal(x, y), old.state.nets["actor"], new.state.nets["actor"])
     assert not all(jax.tree.leaves(same))
     mtjax.evaluate.main([f"--run={copied_run}", "--checkpoint=100", "--episodes=1"])
     assert (copied_run / "evaluation-1" / "returns.csv").exists()

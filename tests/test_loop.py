@@ -242,7 +242,7 @@ def test_seeds_do_not_touch_each_other():
         alone, _ = learn((seed,))
         for a, b in zip(each(both), each(alone), strict=True):
             np.testing.assert_allclose(a[i], b[0], rtol=1e-3, atol=1e-5)
-    kernel = both.agent.actor.shared["head"]["kernel"]
+    kernel = both.agent.nets["actor"].shared["head"]["kernel"]
     assert not np.allclose(kernel[0], kernel[1])
 
 
@@ -262,7 +262,7 @@ def test_the_agent_rests_through_the_warmup():
     bytes_of = lambda state: [x.tobytes() for x in leaves_of(state.agent)]
     assert bytes_of(start) == bytes_of(warm) != bytes_of(after)
     assert np.all(metrics["critic_loss"] == 0) and np.all(metrics["bad_step"] == -1)
-    np.testing.assert_array_equal(after.agent.optimizers[0][1][0].count, SMALL["chunk_steps"])
+    np.testing.assert_array_equal(after.agent.fits["actor"].optimizer[1][0].count, SMALL["chunk_steps"])
 
 
 @dataclasses.dataclass(frozen=True)

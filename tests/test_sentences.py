@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from needs import require
-from probes import pick, tasks_of, tiny
+from probes import pick, tasks_of, tiny, with_nets
 
 import mtjax
 from mtjax.agents.parts import sentences
 from mtjax.envs import ENVS
+from mtjax.networks import Params
 from mtjax.report import scoring
 from mtjax.types import InputError, Spec
 
@@ -136,7 +137,9 @@ def test_an_agent_reads_a_tasks_own_sentence_also_of_a_held_out_task(hashing):
     """A task of other splits' making has the sentence of the training task whose context is nearest."""
     agent, vectors = tiny("sac", conditioning="text"), hashing(*SPEC.sentences)
     state = jax.eval_shape(lambda: agent.init(SPEC, TASKS, KEY))
-    state = state._replace(contexts=TASKS.context, vectors=agent.load_vectors(SPEC, 2))
+    known = Params({"vectors": agent.load_vectors(SPEC, 2)}, {"context": TASKS.context})
+    assert jax.tree.structure(known) == jax.tree.structure(state.nets["tasks"])
+    state = with_nets(state, tasks=known)
     task = pick(TASKS, 0)
     for number, expected in ((0, 0), (1, 1), (2, 2), (3, 1)):
         seen = agent.features(state, task._replace(id=jnp.int32(number), context=TASKS.context[1]))
@@ -165,7 +168,7 @@ def test_a_run_reads_and_its_policy_acts_on_held_out_tasks(hashing, tmp_path):
         directory=tmp_path / "run",
     )
     policy = mtjax.load(tmp_path / "run")
-    vectors = policy.state.vectors
+    vectors = policy.state.nets["tasks"].shared["vectors"]
     np.testing.assert_allclose(vectors, hashing(*family.sentences), atol=1e-6)
     assert len(vectors) == len(family.tasks("all").id) > 2
     returns = scoring.score(policy, episodes=1)["extrapolation"].returns
