@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import slow_but
+from probes import slow_but, with_nets
 
 import mtjax.train
 from mtjax import cli
@@ -17,6 +17,7 @@ from mtjax.config import from_json
 from mtjax.envs import ENVS
 from mtjax.envs.family import Family
 from mtjax.envs.parameters import Parameter
+from mtjax.networks import Params
 from mtjax.training import finetune, run
 from mtjax.training.finetune import adopt
 from mtjax.training.folder import to_flags
@@ -109,10 +110,14 @@ def bits(tree):
     return [np.asarray(plain(x)).tobytes() for x in jax.tree.leaves(tree)]
 
 
+def networks(state):
+    """The parameters of actor and critics, with what these see observations by, by path."""
+    return named({name: state.nets[name] for name in ("actor", "critic", "representation")})
+
+
 def inherited(states, seeds, nearest=NEAREST):
     """Actor and critics of new tasks as a run's states (S, ...) leave them."""
-    leaves = {**named({"actor": states.actor}), **named({"critic": states.critic})}
-    picked = {path: x[np.asarray(seeds)] for path, x in leaves.items()}
+    picked = {path: x[np.asarray(seeds)] for path, x in networks(states).items()}
     return {path: x[:, nearest] if ".own" in path else x for path, x in picked.items()}
 
 
@@ -140,7 +145,7 @@ def test_what_is_tuned_moves_and_all_else_stays_to_the_bit(learned, tuned, tune)
     """From the networks of the run's seeds, and of the nearest tasks."""
     expected = inherited(learned.states, [0, 1, 0])
     after = mtjax.load(tuned(tune)).states
-    found = {**named({"actor": after.actor}), **named({"critic": after.critic})}
+    found = networks(after)
     assert found.keys() == expected.keys() and any(MOVES[tune] in path for path in found)
     for path, leaf in found.items():
         for seed in range(3):
@@ -154,7 +159,7 @@ def test_weights_of_length_one_stay_and_statistics_follow_the_data(name, tmp_pat
     begun = train(tmp_path, "--env=aim", "--split=none", f"--agent={name}", "--seeds=2", "--agent.hidden", "8")
     after = mtjax.load(train(tmp_path, *NEW, f"--from={begun}", "--tune=heads", "--seeds=3")).states
     expected = inherited(mtjax.load(begun).states, [0, 1, 0])
-    found = {**named({"actor": after.actor}), **named({"critic": after.critic})}
+    found = networks(after)
     assert found.keys() == expected.keys() and any("batch_stats" in path for path in found) == (name == "xqc")
     for path, leaf in found.items():
         for seed in range(3):
@@ -183,10 +188,10 @@ def test_recorded_command_repeats_the_program(tuned):
 def test_a_fine_tuned_run_goes_on(learned, tuned, capsys):
     """From its own checkpoint, with what stays still staying."""
     directory = tuned("heads")
-    before = named(mtjax.load(directory).states.actor)
+    before = named(mtjax.load(directory).states.nets["actor"])
     mtjax.train.main([f"--resume={directory}", "--steps=320"])
     assert f"from {from_json(directory / 'config.json').start}: heads" in capsys.readouterr().out
-    for path, leaf in named(mtjax.load(directory).states.actor).items():
+    for path, leaf in named(mtjax.load(directory).states.nets["actor"]).items():
         assert np.array_equal(leaf, before[path]) == ("head" not in path), path
 
 
@@ -215,7 +220,7 @@ def test_training_takes_a_policy(learned):
     env = mtjax.make("aim", {"goal": "0.9,-0.8"}).scaled_as(learned.env)
     settings = {"num_envs": 1, "updates_per_step": 0, "chunk_steps": 5, "replay_size": 10}
     result = run.train(env, learned.agent, start=learned, steps=10, eval_episodes=1, **settings)
-    found = {**named({"actor": result.state.agent.actor}), **named({"critic": result.state.agent.critic})}
+    found = networks(result.state.agent)
     for path, leaf in inherited(learned.states, [0]).items():
         np.testing.assert_array_equal(found[path], leaf)
 
@@ -237,20 +242,22 @@ def test_networks_temperatures_and_moments_go_on(learned, adopted):
     _, _, state = adopted
     was = learned.states
     for path, leaf in inherited(was, [0, 1, 0]).items():
-        np.testing.assert_array_equal({**named({"actor": state.actor}), **named({"critic": state.critic})}[path], leaf)
-    np.testing.assert_array_equal(state.log_temperature, was.log_temperature[jnp.array([0, 1, 0])][:, NEAREST])
-    np.testing.assert_array_equal(state.moments.mean, was.moments.mean[jnp.array([0, 1, 0])])
-    slow = named(was.target)[".own['head']['kernel']"]
-    np.testing.assert_array_equal(state.target.own["head"]["kernel"], slow[[0, 1, 0]][:, NEAREST])
-    assert len(np.unique(np.asarray(was.log_temperature))) == 6  # or nothing was shown
+        np.testing.assert_array_equal(networks(state)[path], leaf)
+    now, before = (np.asarray(x.nets["temperature"].own["log"]) for x in (state, was))
+    np.testing.assert_array_equal(now, before[[0, 1, 0]][:, NEAREST])
+    assert len(np.unique(before)) == 6  # or nothing was shown
+    now, before = (np.asarray(x.nets["inputs"].shared["moments"].mean) for x in (state, was))
+    np.testing.assert_array_equal(now, before[[0, 1, 0]])
+    now, before = (np.asarray(x.slow["critic"].own["head"]["kernel"]) for x in (state, was))
+    np.testing.assert_array_equal(now, before[[0, 1, 0]][:, NEAREST])
 
 
 def test_the_rest_is_fresh(adopted):
     """Optimisers, and the contexts among which the nearest is found from now on."""
     tasks, fresh, state = adopted
-    for one, other in zip(jax.tree.leaves(state.optimizers), jax.tree.leaves(fresh.optimizers), strict=True):
+    for one, other in zip(jax.tree.leaves(state.fits), jax.tree.leaves(fresh.fits), strict=True):
         np.testing.assert_array_equal(one, other)
-    np.testing.assert_array_equal(state.contexts, np.broadcast_to(tasks.context, (3, 2, 1)))
+    np.testing.assert_array_equal(state.nets["tasks"].own["context"], np.broadcast_to(tasks.context, (3, 2, 1)))
 
 
 def test_one_temperature_for_all_stays_one():
@@ -262,9 +269,11 @@ def test_one_temperature_for_all_stays_one():
         shapes = jax.eval_shape(lambda: made.init(env.spec, env.tasks(), jax.random.key(0)))
         return jax.tree.map(lambda x: jnp.zeros((1, *x.shape), x.dtype), shapes)
 
-    states = blank(old)._replace(log_temperature=jnp.float32([[0.7]]))
+    states = with_nets(blank(old), temperature=Params({"log": jnp.float32([[0.7]])}, {}))
     state = adopt(mtjax.training.policy.Policy(old, made, None, states, jnp.arange(1)), made, env.tasks(), blank(env))
-    np.testing.assert_array_equal(state.log_temperature, states.log_temperature)
+    now, before = (x.nets["temperature"].shared["log"] for x in (state, states))
+    np.testing.assert_array_equal(now, before)
+    assert jax.tree.structure(states) == jax.tree.structure(blank(old))
 
 
 # Contexts.
