@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from probes import with_nets
 
 import mtjax.train
 from mtjax import loop
@@ -52,7 +53,7 @@ def test_newest_checkpoint_has_every_shape_and_type(state, shapes):
     assert found == jax.tree.map(lambda x: (x.shape, x.dtype), shapes)
     assert int(state.iteration) == 150
     assert jnp.issubdtype(state.key.dtype, jax.dtypes.prng_key)
-    assert state.agent.vectors is None
+    assert "vectors" not in state.agent.nets["tasks"].shared
 
 
 def test_state_comes_back_as_it_went(state, tmp_path):
@@ -65,9 +66,11 @@ def test_state_comes_back_as_it_went(state, tmp_path):
 def test_task_vectors_come_back(state, tmp_path):
     """An agent that was given vectors keeps them, whatever becomes of their file."""
     vectors = jnp.arange(12.0).reshape(2, 2, 3)
-    state = state._replace(agent=state.agent._replace(vectors=vectors))
+    known = state.agent.nets["tasks"]
+    state = state._replace(agent=with_nets(state.agent, tasks=known._replace(shared={"vectors": vectors})))
     checkpoint.save(tmp_path, state)
-    np.testing.assert_array_equal(checkpoint.load_agent(tmp_path, state).vectors, vectors)
+    loaded = checkpoint.load_agent(tmp_path, state).nets["tasks"]
+    np.testing.assert_array_equal(loaded.shared["vectors"], vectors)
 
 
 def test_two_newest_are_kept(state, tmp_path):
@@ -287,8 +290,8 @@ def test_a_record_that_changes_during_a_run_is_told(state, tmp_path):
 @pytest.mark.parametrize(
     ("settings", "seeds", "said"),
     [
-        ({"hidden": (16, 8)}, 2, r"agent\.actor.* is of shape .* there, and of shape .* here; \d+ more differ"),
-        ({"num_critics": 3}, 2, r"agent\.critic.* is of shape .* there, and of shape .* here; \d+ more differ"),
+        ({"hidden": (16, 8)}, 2, r"agent\.nets\.actor.* is of shape .* there, and of shape .* here; \d+ more differ"),
+        ({"num_critics": 3}, 2, r"agent\.nets\.critic.* is of shape .* there, and of shape .* here; \d+ more differ"),
         ({}, 3, r"agent\..* is of shape \(2,.* there, and of shape \(3,.* here; \d+ more differ"),
         ({"shared_temperature": True}, 2, r"agent\..*temperature.* is .* there, and .* here"),
     ],
