@@ -5,18 +5,19 @@ import importlib.util
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from needs import require
-from probes import FEW, pick, slow_but, tiny
+from probes import FEW, pick, slow_but, tiny, with_nets
 
 import mtjax
 import mtjax.evaluate
 from mtjax import agents, standalone
+from mtjax.agents.state import AgentState
+from mtjax.networks import Params
 from mtjax.tasks import SAME_CONTEXT
 from mtjax.training.export import require_file
 from mtjax.training.policy import Policy
@@ -30,10 +31,9 @@ TIES = mtjax.make("finger-spin-vary-size")  # whose held-out tasks are midway be
 def policy_of(agent, env=ENV):
     """A policy that has not learned, with moments of observations that are not those at the start."""
     state = jax.jit(lambda key: agent.init(env.spec, env.tasks(), key))(jax.random.key(0))
-    if hasattr(state, "moments"):
-        random = np.random.default_rng(3)
-        shift = lambda x: jnp.asarray(np.float32(random.uniform(0.5, 2.0, x.shape)))
-        state = state._replace(moments=jax.tree.map(shift, state.moments))
+    random = np.random.default_rng(3)
+    shift = lambda x: jnp.asarray(np.float32(random.uniform(0.5, 2.0, x.shape)))
+    state = with_nets(state, inputs=jax.tree.map(shift, state.nets["inputs"]))
     return Policy(env, agent, state, None, jnp.arange(1))
 
 
@@ -90,7 +90,8 @@ def test_an_equally_near_task_is_the_lower_one_however_it_is_rounded():
     midway = (contexts[1:] + contexts[:-1]) / 2
     noise = random.uniform(-SAME_CONTEXT / 2, SAME_CONTEXT / 2, (5, *midway.shape))
     unseen = pick(env.tasks(), 0)._replace(id=jnp.int32(500))
-    nearest = lambda context: agent.known_task(SimpleNamespace(contexts=contexts), unseen._replace(context=context))
+    state = AgentState({"tasks": Params({}, {"context": contexts})}, {}, {})
+    nearest = lambda context: agent.known_task(state, unseen._replace(context=context))
     found = jax.vmap(jax.vmap(nearest))(midway + jnp.float32(noise))
     np.testing.assert_array_equal(found, np.broadcast_to(np.arange(199), (5, 199)))
 

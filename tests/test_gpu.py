@@ -20,7 +20,7 @@ import mujoco
 import numpy as np
 import pytest
 from needs import needs
-from probes import random_batch
+from probes import random_batch, with_nets
 from test_joined import require_as_alone
 from test_kills import outcome
 from test_painters import SIZE, similarity, states_of
@@ -119,7 +119,7 @@ def learned(name, tasks):
     with on("cpu"):
         init = jax.jit(jax.vmap(lambda key: agent.init(SPEC, tasks, key)), compiler_options=QUICK)
         states = jax.device_get(init(jax.random.split(jax.random.key(0), SEEDS)))
-    return agent, states._replace(actor=jax.tree.map(shake, states.actor))
+    return agent, with_nets(states, actor=jax.tree.map(shake, states.nets["actor"]))
 
 
 def exactly(family):
@@ -273,7 +273,8 @@ def test_a_run_goes_on_bit_for_bit(tmp_path):
     run(steps=4000)
     again = run(steps=8000, resume=True)
     whole = mtjax.train(env, agent, seeds=2, steps=8000, eval_every=4000, eval_episodes=1, **settings)
-    for one, other in zip(*(jax.tree.leaves(jax.device_get(x.state.agent.actor)) for x in (whole, again)), strict=True):
+    actors = (jax.device_get(x.state.agent.nets["actor"]) for x in (whole, again))
+    for one, other in zip(*map(jax.tree.leaves, actors), strict=True):
         np.testing.assert_array_equal(one, other)
 
 
@@ -297,7 +298,7 @@ def test_a_checkpoint_is_the_state_of_when_it_was_saved(tmp_path, monkeypatch, r
     expected = bytes_of(jax.tree.map(jnp.copy, state))  # as a buffer that NumPy has seen is not taken over
     writer.save(state)
     after = chunk(state)
-    taken = all(x.is_deleted() for x in jax.tree.leaves((state.agent.actor, state.data.ring.rows)))
+    taken = all(x.is_deleted() for x in jax.tree.leaves((state.agent.nets["actor"], state.data.ring.rows)))
     assert taken or jax.default_backend() == "cpu"  # where the host's copy is the buffer, which therefore stays
     after = jax.block_until_ready(chunk(chunk(after)))
     assert not (tmp_path / "25").exists()
@@ -351,9 +352,8 @@ def require_alike(expected, found):
     (expected, metrics), (found, measured) = expected, found
     for key, value in metrics.items():
         assert np.abs(value - measured[key]).max() <= 0.02 * np.abs(value).max() + 1e-4, (len(value), key)
-    leaves = zip(
-        jax.tree_util.tree_leaves_with_path(expected.optimizers), jax.tree.leaves(found.optimizers), strict=True
-    )
+    expected, found = ({name: fit.optimizer for name, fit in state.fits.items()} for state in (expected, found))
+    leaves = zip(jax.tree_util.tree_leaves_with_path(expected), jax.tree.leaves(found), strict=True)
     for (path, one), other in leaves:
         if ".mu" in jax.tree_util.keystr(path) and one.size:
             difference, size = (np.linalg.norm(x.reshape(len(x), -1), axis=1) for x in (one - other, one))

@@ -24,6 +24,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 from conftest import SHORT_RUN
+from probes import with_nets
 
 import mtjax
 import mtjax.train
@@ -620,8 +621,9 @@ def lost_world(state):
 
 def diverged_critic(state):
     """Values in seed 1 whose square is beyond 32 bits; every task meets them at once."""
-    critic = jax.tree.map(lambda x: x.at[1].multiply(1e10), state.agent.critic)
-    return state._replace(agent=state.agent._replace(critic=critic))
+    far = lambda name: jax.tree.map(lambda x: x.at[1].multiply(1e10), state.agent.nets[name])
+    agent = with_nets(state.agent, critic=far("critic"), representation=far("representation"))
+    return state._replace(agent=agent)
 
 
 @pytest.mark.parametrize("poison, task", [(lost_world, 1), (diverged_critic, 0)])
@@ -642,7 +644,8 @@ def test_not_finite_numbers_stop_the_run_and_spare_the_checkpoint(play, whole, t
 
 def test_spoiled_parameters_are_not_saved(play, tmp_path, monkeypatch):
     """Those of a chunk's last update, which none of its losses has seen."""
-    spoil = lambda agent: agent._replace(actor=jax.tree.map(lambda x: x.at[1].set(jnp.nan), agent.actor))
+    lose = lambda net: jax.tree.map(lambda x: x.at[1].set(jnp.nan), net)
+    spoil = lambda agent: with_nets(agent, actor=lose(agent.nets["actor"]))
     check = run.require_finite_parameters
     late = lambda agent, step, last: check(spoil(agent) if step == 100 else agent, step, last)
     monkeypatch.setattr(run, "require_finite_parameters", late)
