@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.agents.state import AgentState
 from mtjax.parallel import hosts
 from mtjax.types import Array
 
@@ -63,7 +62,7 @@ def require_finite(bad_step: np.ndarray, bad_reward: np.ndarray, first_step: int
     )
 
 
-def require_finite_parameters(state: AgentState, iteration: int, last: Callable[[], str]) -> None:
+def require_finite_parameters(state: Any, iteration: int, last: Callable[[], str]) -> None:
     """Check the parameters of an agent before they are saved, because a chunk's last update is in none of its losses.
 
     Args:
@@ -80,9 +79,10 @@ def require_finite_parameters(state: AgentState, iteration: int, last: Callable[
         )
 
 
-def finite_seeds(state: AgentState) -> np.ndarray:
-    """Return which seeds (S,) of an agent's state, leaves (S, ...), have finite networks."""
-    return hosts.gather(_finite_seeds(state.nets))
+def finite_seeds(state: Any) -> np.ndarray:
+    """Return which seeds (S,) of an agent's state, leaves (S, ...), have finite networks; (1,) if it names none."""
+    nets = getattr(state, "nets", None)
+    return hosts.gather(_finite_seeds(nets)) if nets else np.ones(1, bool)
 
 
 @jax.jit
