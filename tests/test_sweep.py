@@ -127,6 +127,7 @@ def _run(env, agent, seeds, knobs=None, chunks=2):
     return state, metrics
 
 
+_COMPARED = ("actor", "critic", "representation", "temperature", "scaling")
 _NAMES = ("actor_lr", "critic_lr", "temperature_lr", "gamma", "tau", "initial_temperature", "target_entropy")
 _NAMES = (*_NAMES, "weight_decay", "max_gradient_norm", "return_range", "lr_final", "context_limit")
 _NAMES = (*_NAMES, "temperature_momentum")
@@ -146,14 +147,13 @@ def test_a_point_trains_as_the_run_with_its_values():
     plain = [_run(env, points.agent_at(agent, point), seeds) for point in POINTS]
     for p, (alone, its_metrics) in enumerate(plain):
         rows = slice(2 * p, 2 * p + 2)
-        for part in ("actor", "critic", "target", "log_temperature", "scales"):
-            ours, theirs = getattr(learned, part), getattr(alone.agent, part)
-            same = lambda x, y, rows=rows: np.testing.assert_allclose(x[rows], y, rtol=2e-3, atol=2e-4)
-            jax.tree.map(same, ours, theirs)
+        compared = lambda state: ([state.nets[name] for name in _COMPARED], state.slow)
+        same = lambda x, y, rows=rows: np.testing.assert_allclose(x[rows], y, rtol=2e-3, atol=2e-4)
+        jax.tree.map(same, compared(learned), compared(alone.agent))
         discounted, of_alone = (x.worlds.memory.scaling for x in (state, alone))
         np.testing.assert_allclose(discounted[rows], of_alone, rtol=1e-4, atol=1e-5)
         np.testing.assert_allclose(metrics["return"][rows], its_metrics["return"], rtol=1e-4)
-    first, second = (plain[p][0].agent.critic for p in range(2))
+    first, second = (plain[p][0].agent.nets["critic"] for p in range(2))
     apart = jax.tree.map(lambda x, y: float(jnp.max(jnp.abs(x - y))), first, second)
     assert max(jax.tree.leaves(apart)) > 0.02  # the values matter by far more than the tolerance
 
@@ -540,8 +540,8 @@ def test_policies_are_those_of_a_point(swept):
     """The agent has its values, and the states are of its seeds."""
     first, third = mtjax.load(swept / "run-1", seed=1), mtjax.load(swept / "run-1", seed=2)
     assert first.agent.actor_lr == 1e-3 and third.agent.actor_lr == 1e-4 and third.agent.num_critics == 1
-    assert len(first.states.log_temperature) == 2 and list(third.seeds) == [0, 1]
-    leaf = lambda tree: np.asarray(jax.tree.leaves(tree.actor)[0])
+    assert len(first.states.nets["temperature"].own["log"]) == 2 and list(third.seeds) == [0, 1]
+    leaf = lambda tree: np.asarray(jax.tree.leaves(tree.nets["actor"])[0])
     np.testing.assert_array_equal(leaf(first.state), leaf(first.states)[1])
     assert np.any(leaf(first.states) != leaf(third.states))
     action = third(jnp.zeros(third.env.spec.obs_size), jax.tree.map(lambda x: x[0], third.env.tasks("train")))
@@ -567,8 +567,9 @@ def test_fine_tuning_begins_every_point_with_the_same_seeds(swept):
     fresh = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)._replace(knobs=knobs)
     state = run.adopt(start, tasks, fresh)
     np.testing.assert_array_equal(state.knobs["tau"], np.float32([0.1] * 3 + [0.2] * 3))
-    began = np.asarray(start.states.log_temperature)
-    np.testing.assert_array_equal(state.learner.log_temperature, began[[0, 1, 0, 0, 1, 0]])
+    began = np.asarray(start.states.nets["temperature"].own["log"])
+    adopted = state.learner.nets["temperature"].own["log"]
+    np.testing.assert_array_equal(adopted, began[[0, 1, 0, 0, 1, 0]])
     assert np.any(began[0] != began[1])
     assert jax.tree.structure(state) == jax.tree.structure(fresh)
 
