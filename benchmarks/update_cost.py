@@ -74,7 +74,8 @@ class Contestant:
         tasks, keys = tasks_of(num_tasks), jax.random.split(jax.random.key(0), num_seeds)
         batch = random_batch(spec, num_tasks, arguments.batch)
         self.state = jax.jit(jax.vmap(lambda key: agent.init(spec, tasks, key)))(keys)
-        self.num_parameters = size_of((self.state.nets["actor"], self.state.nets["critic"])) // num_seeds
+        networks = [self.state.nets[name] for name in ("actor", "critic", "representation")]
+        self.num_parameters = size_of(networks) // num_seeds
 
         self.learn = updates(agent, tasks, batch, arguments.updates)
         before = time.perf_counter()
