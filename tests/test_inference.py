@@ -11,7 +11,7 @@ from probes import Probe, Walk, learner, only_seed, pick, quick, random_batch, t
 import mtjax
 import mtjax.train
 from mtjax import evaluation
-from mtjax.agents.parts.trajectory import Past, Seen, TrajectoryEncoder, append
+from mtjax.agents.parts.knowing.last_steps import Past, Seen, TrajectoryEncoder, append
 from mtjax.types import Spec, Transition
 
 SPEC, STEPS = Spec.vector(3, 2, 1), 4
@@ -94,8 +94,10 @@ def test_the_encoder_averages_what_an_mlp_makes_of_the_known_steps():
         for t in np.flatnonzero(past.known):
             change = (past.obs[t + 1] if t + 1 < STEPS else seen.obs[i]) - past.obs[t]
             x = np.concatenate([past.obs[t], past.action[t], past.reward[t : t + 1], change])
-            for layer in ("Dense_0", "Dense_1"):
-                x = np.maximum(dense(x, layers["MLP_0"][layer]), 0)
+            for layer in range(2):
+                x = dense(x, layers["MLP_0"][f"Dense_{layer}"])
+                scale, bias = (layers["MLP_0"][f"LayerNorm_{layer}"][name] for name in ("scale", "bias"))
+                x = np.maximum(scale * (x - x.mean()) / np.sqrt(x.var() + 1e-6) + bias, 0)
             rows.append(x[None])
         mean = np.sum(np.concatenate(rows), axis=0) / max(len(rows) - 1, 1)
         np.testing.assert_allclose(found[i], dense(mean, layers["Dense_0"]), rtol=1e-4, atol=1e-4)
@@ -103,8 +105,8 @@ def test_the_encoder_averages_what_an_mlp_makes_of_the_known_steps():
 
 
 @pytest.mark.slow
-def test_every_network_has_an_encoder_of_trajectories_that_learns():
-    """All of its leaves move, in actor and critics; if tasks share nothing, they do not share it either."""
+def test_networks_share_an_encoder_of_trajectories_that_learns():
+    """All of its leaves move, and its slow copy's too; if tasks share nothing, they do not share it either."""
     agent, tasks = tiny("sac", normalize_observations=True, **INFERRED), tasks_of("one-step")
     init, update = learner(agent, tasks, 4, SPEC)
     before = state = init(tasks, jax.random.key(0))
@@ -114,20 +116,22 @@ def test_every_network_has_an_encoder_of_trajectories_that_learns():
         if not i:
             assert_scaled(agent, state, batch)
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves((state, metrics)))
-    for network in ("actor", "critic", "target"):
-        old, new = (getattr(x, network).shared["trajectory"] for x in (before, state))
+    for nets in ("nets", "slow"):
+        old, new = (getattr(x, nets)["knowing"].shared["trajectory"] for x in (before, state))
         moved = jax.tree.map(lambda a, b: not np.array_equal(a, b), old, new)
-        assert all(jax.tree.leaves(moved)), network
-    alone = jax.eval_shape(lambda: tiny("disjoint", **INFERRED).init(SPEC, tasks, jax.random.key(0)))
-    assert not alone.actor.shared and all(len(x) == 2 for x in jax.tree.leaves(alone.actor.own["trajectory"]))
+        assert all(jax.tree.leaves(moved)), nets
+    alone = jax.eval_shape(lambda: tiny("disjoint", **INFERRED).init(SPEC, tasks, jax.random.key(0))).nets
+    assert not alone["actor"].shared and not alone["knowing"].shared
+    assert all(len(x) == 2 for x in jax.tree.leaves(alone["knowing"].own["trajectory"]))
 
 
 def assert_scaled(agent, state, batch):
     """Present and past observations by the moments of present ones; actions, rewards and what is known as they are."""
     obs = np.asarray(batch.obs).reshape(-1, 3)
     scale = lambda x: (x - obs.mean(axis=0)) / obs.std(axis=0)
-    np.testing.assert_allclose(state.moments.mean, obs.mean(axis=0), rtol=1e-4, atol=1e-6)
-    seen, past = agent.see(state.moments, batch.obs, batch.extras), batch.extras
+    inputs, past = state.nets["inputs"], batch.extras
+    np.testing.assert_allclose(inputs.parts["moments"].mean, obs.mean(axis=0), rtol=1e-4, atol=1e-6)
+    seen = agent.see(inputs, batch.obs, past)
     np.testing.assert_allclose(seen.obs, scale(batch.obs), rtol=1e-3, atol=1e-4)
     np.testing.assert_allclose(seen.past.obs, scale(past.obs), rtol=1e-3, atol=1e-4)
     for field in ("action", "reward", "known"):
@@ -159,11 +163,10 @@ class Hidden(Probe):
 
 def learned(conditioning):
     """Train, and return agent, environment and the learner's states."""
-    inference = {"conditioning": conditioning, "embedding_size": 4}
+    inference = {"conditioning": conditioning}
+    inference |= {"embedding_size": 4, "inferred_from": 2} if conditioning == "inferred" else {}
     plain = {"initial_temperature": 1e-6, "temperature_lr": 1e-9, "gamma": 0.5, "tau": 0.3}
-    agent = tiny(
-        "sac", **inference, inferred_from=2, num_critics=1, hidden=(32,), actor_lr=3e-3, critic_lr=3e-3, **plain
-    )
+    agent = tiny("sac", **inference, num_critics=1, hidden=(32,), actor_lr=3e-3, critic_lr=3e-3, **plain)
     settings = {"num_envs": 8, "updates_per_step": 4, "batch_size": 64, "warmup_steps": 150, "warmup_hold": 1}
     return agent, Hidden(), train(Hidden(), agent, settings | {"chunk_steps": 400})[0].agent
 

@@ -11,7 +11,7 @@ from needs import require
 from probes import pick, tasks_of, tiny, with_nets
 
 import mtjax
-from mtjax.agents.parts import sentences
+from mtjax.agents.parts.knowing import text as sentences
 from mtjax.envs import ENVS
 from mtjax.networks import Params
 from mtjax.report import scoring
@@ -137,7 +137,7 @@ def test_an_agent_reads_a_tasks_own_sentence_also_of_a_held_out_task(hashing):
     """A task of other splits' making has the sentence of the training task whose context is nearest."""
     agent, vectors = tiny("sac", conditioning="text"), hashing(*SPEC.sentences)
     state = jax.eval_shape(lambda: agent.init(SPEC, TASKS, KEY))
-    known = Params({"vectors": agent.load_vectors(SPEC, 2)}, {"context": TASKS.context})
+    known = Params({"vectors": agent.conditioning.table(SPEC, 2)}, {"context": TASKS.context})
     assert jax.tree.structure(known) == jax.tree.structure(state.nets["tasks"])
     state = with_nets(state, tasks=known)
     task = pick(TASKS, 0)
@@ -147,7 +147,7 @@ def test_an_agent_reads_a_tasks_own_sentence_also_of_a_held_out_task(hashing):
 
 
 def test_a_text_needs_the_conditioning():
-    with pytest.raises(InputError, match="text=some-model needs conditioning=text, not parameters"):
+    with pytest.raises(InputError, match="unknown setting of sac 'text'; it belongs to conditioning='text'"):
         tiny("sac", conditioning="parameters", text="some-model")
 
 
