@@ -216,9 +216,9 @@ def test_devices_of_a_seed_agree_by_themselves(crowd, monkeypatch):
     programs, env = jit_programs(mesh := meshes.mesh_for(1, 2, 4), agent), Walk()
     tasks, seeds = meshes.replicate(mesh, env.tasks()), meshes.shard_by_seed(mesh, jnp.arange(1))
     start = programs.init(env, agent, settings, tasks, seeds, None)
-    first = jax.tree.map(np.asarray, start.agent.critic)
+    first = jax.tree.map(np.asarray, start.agent.nets["critic"])
     after, _ = programs.chunk(env, agent, settings, tasks, start)
-    assert not jax.tree.all(jax.tree.map(np.array_equal, first, after.agent.critic))
+    assert not jax.tree.all(jax.tree.map(np.array_equal, first, after.agent.nets["critic"]))
     for x in jax.tree.leaves((after.agent, after.data.ring.size, after.iteration)):
         assert len({np.asarray(part.data).tobytes() for part in x.addressable_shards}) == 1
 
