@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from probes import quick, random_batch, tasks_of
+from probes import quick, random_batch, tasks_of, with_nets
 
 from mtjax.agents.parts.encoders import Identity
-from mtjax.agents.sac import SAC, Batch, SACState
+from mtjax.agents.sac import SAC, Batch
+from mtjax.agents.state import AgentState
 from mtjax.networks import Params, join
 from mtjax.types import Spec, Transition
 
@@ -55,6 +56,7 @@ def head(kernel, bias):
 FEATURES = jnp.float32([0.1])
 ACTOR = head([[2.0, -0.5], [0.0, 0.0]], [0.0, 0.0])  # a = 2 s, log pi = -s / 2
 CRITICS = head([[[1.0], [0.5], [0.0]], [[2.0], [-0.5], [10.0]]], [[0.0], [0.0]])  # s + a / 2 and 2 s - a / 2 + 1
+NETS = {"actor": ACTOR, "critic": CRITICS, "representation": Params({}, {})}
 
 
 def rows(obs, action, reward, discount, next_obs):
@@ -72,21 +74,21 @@ def seen(batch, gamma=1.0, temperature=0.0):
 def test_critic_target(linear, discount, expected):
     """From s' = 3: a' = 6, log pi = -1.5, Q = 6 and 4; y = 1 + 0.9 d (4 + 0.2 1.5)."""
     batch = rows([0.0], [0.0], [1.0], [discount], [3.0])
-    target = LinearSAC().critic_target(ACTOR, CRITICS, CRITICS, seen(batch, 0.9, 0.2), jax.random.key(0))
+    target = LinearSAC().critic_target(NETS, NETS, seen(batch, 0.9, 0.2), jax.random.key(0))
     np.testing.assert_allclose(target, [expected], rtol=1e-6)
 
 
 def test_critic_target_takes_the_least_critic_at_each_transition(linear):
     """From s' = 3 the least is the second critic's 4, and from s' = -3 the first's -6."""
     batch = rows([0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [1.0, 1.0], [3.0, -3.0])
-    target = LinearSAC().critic_target(ACTOR, CRITICS, CRITICS, seen(batch), jax.random.key(0))
+    target = LinearSAC().critic_target(NETS, NETS, seen(batch), jax.random.key(0))
     np.testing.assert_allclose(target, [4.0, -6.0], rtol=1e-6)
 
 
 def test_critic_loss_sums_over_critics_and_averages_over_the_batch():
     """At (1, 2) Q = 2 and 2, at (0, 4) Q = 2 and -1; against 1 and 0: ((1 + 1) + (4 + 1)) / 2."""
     batch = rows([1.0, 0.0], [2.0, 4.0], [9.0, 9.0], [1.0, 1.0], [9.0, 9.0])
-    loss, metrics = LinearSAC().critic_loss(CRITICS, (seen(batch), jnp.float32([1.0, 0.0])))
+    loss, (metrics, *_) = LinearSAC().critic_loss(NETS, seen(batch), jnp.float32([1.0, 0.0]))
     np.testing.assert_allclose(loss, 3.5, rtol=1e-6)
     np.testing.assert_allclose((metrics["critic_loss"], metrics["value"]), (3.5, 1.25), rtol=1e-6)
 
@@ -94,7 +96,7 @@ def test_critic_loss_sums_over_critics_and_averages_over_the_batch():
 def test_actor_loss_weighs_entropy_by_temperature(linear):
     """At s = 3: 0.2 (-1.5) - 4 = -4.3; at s = -1: 0.2 0.5 - min(-2, 0) = 2.1; their mean is -1.1."""
     batch = rows([3.0, -1.0], [9.0, 9.0], [9.0, 9.0], [0.0, 1.0], [9.0, 9.0])
-    loss, metrics = LinearSAC().actor_loss(ACTOR, (seen(batch, temperature=0.2), CRITICS, jax.random.key(0)))
+    loss, (metrics, *_) = LinearSAC().actor_loss(NETS, seen(batch, temperature=0.2), jax.random.key(0))
     np.testing.assert_allclose(loss, -1.1, rtol=1e-6)
     np.testing.assert_allclose(metrics["entropy"], (1.5 - 0.5) / 2, rtol=1e-6)
 
@@ -102,7 +104,7 @@ def test_actor_loss_weighs_entropy_by_temperature(linear):
 def test_temperature_loss_and_the_sign_of_its_slope():
     """H = -1 for two actions; a policy with more entropy than that lowers its task's temperature, and conversely."""
     temperature, entropy = np.float32([0.5, 0.2]), np.float32([3.0, -2.5])
-    loss = lambda x: SAC(target_entropy=-0.5).temperature_loss(x, entropy, 2)
+    loss = lambda x: SAC(target_entropy=-0.5).temperature_loss(Params({}, {"log": x}), entropy, 2)
     expected = temperature * (entropy + 1) / 2
     np.testing.assert_allclose(loss(jnp.log(temperature)), expected.sum(), rtol=1e-5)
     slope = jax.grad(loss)(jnp.log(temperature))
@@ -120,12 +122,9 @@ def start(agent, tasks):
     """Networks with random parameters, the slow critic far from the critic, and temperatures of each task."""
     state, random = agent.init(SPEC, tasks, jax.random.key(0)), np.random.default_rng(5)
     draw = lambda tree: jax.tree.map(lambda x: jnp.float32(random.normal(size=x.shape)), tree)
-    return state._replace(
-        actor=draw(state.actor),
-        critic=draw(state.critic),
-        target=draw(state.target),
-        log_temperature=draw(state.log_temperature),
-    )
+    networks = {name: draw(state.nets[name]) for name in ("actor", "critic")}
+    slow = draw(state.slow)
+    return with_nets(state, **networks, temperature=draw(state.nets["temperature"]))._replace(slow=slow)
 
 
 def arrays(params):
@@ -137,14 +136,14 @@ def adam(rate, gradient):
     return -rate * gradient / (np.abs(gradient) + 1e-8)
 
 
-def plain_update(agent, state: SACState, batch: Transition, context):
+def plain_update(agent, state: AgentState, batch: Transition, context):
     """The gradients of critic, actor and temperature, and what they make of the parameters; loops, no autodiff."""
     num_tasks = len(context)
     share = 1 / (num_tasks * BATCH)
-    log_temperature = np.asarray(state.log_temperature)
+    log_temperature = np.asarray(state.nets["temperature"].parts["log"])
     temperature = np.broadcast_to(np.exp(log_temperature), num_tasks)
-    (actor, actor_bias), (target, target_bias) = arrays(state.actor), arrays(state.target)
-    critic, critic_bias = arrays(state.critic)
+    (actor, actor_bias), (target, target_bias) = arrays(state.nets["actor"]), arrays(state.slow["critic"])
+    critic, critic_bias = arrays(state.nets["critic"])
 
     def act(obs, task):
         return np.concatenate([obs, context[task]]) @ actor + actor_bias
@@ -202,16 +201,19 @@ def test_an_update_is_the_one_worked_out_in_numpy(linear, settings):
     )
     gradients, parameters, log_temperature = plain_update(agent, before, batch, np.asarray(tasks.context))
 
-    recorded = [optax.tree_utils.tree_get(memory, "mu") for memory in after.optimizers]  # a tenth, after one step
-    for who, found in zip(("actor", "critic"), recorded, strict=False):
-        for ours, theirs in zip(arrays(found), gradients[who], strict=True):
+    mean = lambda who: optax.tree_utils.tree_get(after.fits[who].optimizer, "mu")[who]  # a tenth, after one step
+    for who in ("actor", "critic"):
+        for ours, theirs in zip(arrays(mean(who)), gradients[who], strict=True):
             np.testing.assert_allclose(10 * ours, theirs, rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(10 * recorded[2], gradients["temperature"], rtol=1e-4, atol=1e-5)
+    recorded = mean("temperature").parts["log"]
+    np.testing.assert_allclose(10 * recorded, gradients["temperature"], rtol=1e-4, atol=1e-5)
+    networks = {"actor": after.nets["actor"], "critic": after.nets["critic"], "target": after.slow["critic"]}
     for who, expected in parameters.items():
-        for ours, theirs in zip(arrays(getattr(after, who)), expected, strict=True):
+        for ours, theirs in zip(arrays(networks[who]), expected, strict=True):
             np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(after.log_temperature, log_temperature, rtol=1e-4)
-    used = np.broadcast_to(np.exp(before.log_temperature), len(tasks.id))
+    log_temperatures = [state.nets["temperature"].parts["log"] for state in (before, after)]
+    np.testing.assert_allclose(log_temperatures[1], log_temperature, rtol=1e-4)
+    used = np.broadcast_to(np.exp(log_temperatures[0]), len(tasks.id))
     np.testing.assert_allclose(metrics["temperature"], used, rtol=1e-5)
 
 
@@ -219,12 +221,12 @@ def test_temperature_and_target_begin_as_set():
     """Temperatures at the given one, a task or in all; the slow critic at the critic, but in memory of its own."""
     tasks = tasks_of("one-step")
     state = LinearSAC(initial_temperature=0.3).init(SPEC, tasks, jax.random.key(0))
-    np.testing.assert_allclose(np.exp(state.log_temperature), [0.3, 0.3], rtol=1e-6)
+    np.testing.assert_allclose(np.exp(state.nets["temperature"].own["log"]), [0.3, 0.3], rtol=1e-6)
     shared = LinearSAC(initial_temperature=0.3, shared_temperature=True).init(SPEC, tasks, jax.random.key(0))
-    assert shared.log_temperature.shape == (1,)
-    kernel = state.critic.shared["head"]["kernel"]
-    np.testing.assert_array_equal(kernel, state.target.shared["head"]["kernel"])
-    assert kernel.unsafe_buffer_pointer() != state.target.shared["head"]["kernel"].unsafe_buffer_pointer()
+    assert shared.nets["temperature"].shared["log"].shape == (1,)
+    kernel, slow = (x["critic"].shared["head"]["kernel"] for x in (state.nets, state.slow))
+    np.testing.assert_array_equal(kernel, slow)
+    assert kernel.unsafe_buffer_pointer() != slow.unsafe_buffer_pointer()
     assert not np.allclose(kernel[0], kernel[1])
 
 

@@ -91,13 +91,13 @@ def test_weights_begin_and_stay_on_the_sphere(heads):
     for i in range(3):
         after, _ = update(after, random_batch(i, 3, BATCH, SPEC), TASKS, jax.random.key(i))
     for network in ("actor", "critic"):
-        old, new = (directions(getattr(state, network)) for state in (before, after))
+        old, new = (directions(state.nets[network]) for state in (before, after))
         assert len(old) == 5  # an embedding, a block of two, the last hidden layer and the head
         for path in old:
             np.testing.assert_allclose(lengths(old[path]), 1, rtol=1e-5, err_msg=path)
             np.testing.assert_allclose(lengths(new[path]), 1, rtol=1e-5, err_msg=path)
             assert np.abs(old[path] - new[path]).max() > 0.05
-    assert all(np.all(lengths(x) < 1 + 1e-5) for x in directions(after.target).values())
+    assert all(np.all(lengths(x) < 1 + 1e-5) for x in directions(after.slow["critic"]).values())
 
 
 def test_an_input_of_any_length_is_told_from_its_double():
