@@ -9,13 +9,14 @@ import numpy as np
 import optax
 import pytest
 import scipy.optimize
-from probes import QUICK, learner, of_task, one_in, pick, random_batch, slow_but, tasks_of, tiny
+from probes import QUICK, learner, of_task, one_in, pick, random_batch, slow_but, tasks_of, tiny, with_nets
 from probes import act as act_once
 
 from mtjax.agents import agent
 from mtjax.agents.distral import Distral
 from mtjax.agents.parts.gradients.descent import descend
 from mtjax.agents.sac import SAC, Batch
+from mtjax.agents.state import axes_of
 from mtjax.networks import Params, divergence, log_density, sample_raw, tanh_normal
 from mtjax.types import InputError, Spec
 
@@ -34,8 +35,8 @@ def scattered(tree, size=0.5):
 def state():
     """Policies, critics and the distilled policy far apart."""
     fresh = learner(tiny("distral"), TASKS, BATCH, SPEC)[0](TASKS, KEY)
-    networks = scattered((fresh.actor, fresh.critic, fresh.target))
-    return fresh._replace(**dict(zip(("actor", "critic", "target"), networks, strict=True)))
+    actor, critic, slow = scattered((fresh.nets["actor"], fresh.nets["critic"], fresh.slow))
+    return with_nets(fresh, actor=actor, critic=critic)._replace(slow=slow)
 
 
 @pytest.fixture(scope="module")
@@ -127,16 +128,11 @@ def test_divergence_is_the_mean_of_log_densities():
 ALPHA, TEMPERATURE = 0.3, 0.2
 
 
-def problem(state, task=1):
-    """A task's actor, critic, slow critic."""
-    return (of_task(x, task) for x in (state.actor, state.critic, state.target))
-
-
-def charged(made, actor, obs):
+def charged(made, nets, obs):
     """Actions before the tanh, and log pi_i - alpha log pi_0 of them in NumPy."""
-    own = made.policy(actor, actor, FEATURES, obs)
+    own = made.policy(nets, FEATURES, obs)
     raw, _ = sample_raw(own, KEY)
-    common = made.actor.apply_distilled(actor, FEATURES, obs)
+    common = made.actor.apply_distilled(nets["actor"], FEATURES, obs)
     densities = plain_log_density(own, raw), plain_log_density(common, raw)
     return raw, densities[0] - made.distral_alpha * densities[1], densities
 
@@ -150,34 +146,35 @@ def seen(rows, gamma=0.99):
 def test_critic_target(state, batch):
     """y = r + discount gamma (min Q - a (log pi_i - alpha log pi_0))."""
     made, rows = tiny("distral", distral_alpha=ALPHA, gamma=0.9), pick(batch, 1)
-    actor, critic, target = problem(state)
-    raw, cost, _ = charged(made, actor, rows.next_obs)
-    values = np.min(made.values(target, FEATURES, rows.next_obs, jnp.tanh(raw)), axis=0)
+    nets, slow = of_task(state.nets, 1), of_task(state.nets | state.slow, 1)
+    raw, cost, _ = charged(made, nets, rows.next_obs)
+    values = np.min(made.values(slow, FEATURES, rows.next_obs, jnp.tanh(raw)), axis=0)
     expected = np.asarray(rows.reward) + 0.9 * np.asarray(rows.discount) * (values - TEMPERATURE * cost)
-    found = made.critic_target(actor, critic, target, seen(rows, 0.9), KEY)
+    found = made.critic_target(nets, slow, seen(rows, 0.9), KEY)
     np.testing.assert_allclose(found, expected, rtol=1e-4)
-    plain = SAC.sample(made, actor, critic, seen(rows), rows.next_obs, KEY).log_prob
+    plain = SAC.sample(made, nets, seen(rows), rows.next_obs, KEY).log_prob
     assert np.all(np.abs(cost - plain) > 0.1)  # that the distilled policy has a say here
 
 
 def test_actor_loss(state, batch):
     """a (log pi_i - alpha log pi_0) - min Q of each policy, less log pi_0 of the distilled one."""
     made, rows = tiny("distral", distral_alpha=ALPHA), pick(batch, 1)
-    actor, critic, _ = problem(state)
-    raw, cost, (own, common) = charged(made, actor, rows.obs)
-    values = np.min(made.values(critic, FEATURES, rows.obs, jnp.tanh(raw)), axis=0)
-    loss, metrics = made.actor_loss(actor, (seen(rows), critic, KEY))
+    nets = of_task(state.nets, 1)
+    raw, cost, (own, common) = charged(made, nets, rows.obs)
+    values = np.min(made.values(nets, FEATURES, rows.obs, jnp.tanh(raw)), axis=0)
+    loss, (metrics, *_) = made.actor_loss(nets, seen(rows), KEY)
     policy_loss = np.mean(TEMPERATURE * cost - values)
     np.testing.assert_allclose(loss, policy_loss - np.mean(common), rtol=1e-4)
     np.testing.assert_allclose(metrics["actor_loss"], policy_loss, rtol=1e-4)
     np.testing.assert_allclose(metrics["entropy"], -np.mean(own), rtol=1e-4)
-    policies = made.policy(actor, actor, FEATURES, rows.obs), made.actor.apply_distilled(actor, FEATURES, rows.obs)
+    distilled = made.actor.apply_distilled(nets["actor"], FEATURES, rows.obs)
+    policies = made.policy(nets, FEATURES, rows.obs), distilled
     np.testing.assert_allclose(metrics["kl"], np.mean(plain_divergence(*policies)), rtol=1e-4)
 
 
-def slopes(made, actor, data, loss):
+def slopes(made, nets, rows, loss):
     """Gradients of a loss by what they are of: the task's policy, the distilled policy."""
-    found = jax.grad(lambda actor: loss(made, actor, data)[0])(actor)
+    found = jax.grad(lambda actor: loss(made, nets | {"actor": actor}, seen(rows), KEY)[0])(nets["actor"])
     own = {name: found.own[name] for name in ("body", "head")}
     return own, found.shared["distilled"]
 
@@ -185,15 +182,14 @@ def slopes(made, actor, data, loss):
 def test_each_loss_reaches_its_own_policy_alone(state, batch):
     """The policy's never the distilled parameters, and distillation these alone, by its actions too."""
     made, rows = tiny("distral", distral_alpha=ALPHA), pick(batch, 1)
-    actor, critic, _ = problem(state)
-    data = (seen(rows), critic, KEY)
-    own, distilled = slopes(made, actor, data, SAC.actor_loss)
-    both_own, both_distilled = slopes(made, actor, data, Distral.actor_loss)
+    nets = of_task(state.nets, 1)
+    own, distilled = slopes(made, nets, rows, SAC.actor_loss)
+    both_own, both_distilled = slopes(made, nets, rows, Distral.actor_loss)
     assert all(np.all(x == 0) for x in leaves(distilled))
     assert all(np.any(x != 0) for x in leaves((own, both_distilled)))
     assert same(own, both_own)
 
-    raw, _, _ = charged(made, actor, rows.obs)
+    actor, (raw, _, _) = nets["actor"], charged(made, nets, rows.obs)
 
     def fit(shared):
         outputs = made.actor.apply_distilled(Params({"distilled": shared}, actor.own), FEATURES, rows.obs)
@@ -206,11 +202,11 @@ def test_each_loss_reaches_its_own_policy_alone(state, batch):
 def test_the_action_carries_the_distilled_policys_slope(state, batch):
     """Numeric slopes in NumPy, under critics that say nothing, along the biases of mean and deviation."""
     made, rows = tiny("distral", distral_alpha=ALPHA), pick(batch, 1)
-    actor, critic, _ = problem(state)
-    mute = jax.tree.map(jnp.zeros_like, critic)
-    own, _ = slopes(made, actor, (seen(rows), mute, KEY), Distral.actor_loss)
-    outputs = np.asarray(made.policy(actor, actor, FEATURES, rows.obs), np.float64)
-    common = made.actor.apply_distilled(actor, FEATURES, rows.obs)
+    nets = of_task(state.nets, 1)
+    mute = nets | {"critic": jax.tree.map(jnp.zeros_like, nets["critic"])}
+    own, _ = slopes(made, mute, rows, Distral.actor_loss)
+    outputs = np.asarray(made.policy(nets, FEATURES, rows.obs), np.float64)
+    common = made.actor.apply_distilled(nets["actor"], FEATURES, rows.obs)
     noise = np.asarray(jax.random.normal(KEY, (BATCH, 2)), np.float64)
 
     def loss(bias):
@@ -231,8 +227,8 @@ def test_all_policies_begin_as_one(batch):
     init, update = learner(tiny("distral"), TASKS, BATCH, SPEC)
     fresh = init(TASKS, KEY)
     for i in range(3):
-        own = {name: pick(fresh.actor.own[name], i) for name in ("body", "head")}
-        assert same(own, fresh.actor.shared["distilled"])
+        own = {name: pick(fresh.nets["actor"].own[name], i) for name in ("body", "head")}
+        assert same(own, fresh.nets["actor"].shared["distilled"])
     _, metrics = update(fresh, batch, TASKS, KEY)
     np.testing.assert_allclose(metrics["kl"], 0, atol=1e-9)
 
@@ -242,18 +238,18 @@ def test_without_alpha_it_is_one_sac_for_every_task(state):
     distral = learner(tiny("distral", distral_alpha=0.0), TASKS, BATCH, SPEC)[1]
     init, disjoint = learner(tiny("disjoint"), TASKS, BATCH, SPEC)
     mine, theirs = state, init(TASKS, KEY)
-    own = lambda params: {name: params.own[name] for name in ("body", "head")}
-    theirs = theirs._replace(actor=Params({}, own(state.actor)), critic=state.critic, target=state.target)
+    own = lambda state: {name: state.nets["actor"].own[name] for name in ("body", "head")}
+    theirs = with_nets(theirs, actor=Params({}, own(state)), critic=state.nets["critic"])._replace(slow=state.slow)
     for i in range(5):
         rows = random_batch(i, 3, BATCH, SPEC)
         mine, metrics = distral(mine, rows, TASKS, jax.random.key(i))
         theirs, expected = disjoint(theirs, rows, TASKS, jax.random.key(i))
         for name in expected:
             np.testing.assert_allclose(metrics[name], expected[name], rtol=1e-3, atol=1e-4)
-    for part in (lambda x: own(x.actor), lambda x: (x.critic, x.target, x.log_temperature)):
+    for part in (own, lambda x: (x.nets["critic"], x.slow, x.nets["temperature"])):
         for found, wanted in zip(leaves(part(mine)), leaves(part(theirs)), strict=True):
             np.testing.assert_allclose(found, wanted, rtol=1e-3, atol=1e-4)
-    assert not same(mine.actor.shared, state.actor.shared)  # the distilled policy looks on, and learns
+    assert not same(mine.nets["actor"].shared, state.nets["actor"].shared)  # the distilled policy looks on, and learns
 
 
 def test_a_task_learns_from_its_own_data_alone(state, batch):
@@ -261,10 +257,11 @@ def test_a_task_learns_from_its_own_data_alone(state, batch):
     _, update = learner(tiny("distral"), TASKS, BATCH, SPEC)
     other = jax.tree.map(lambda x: x.at[1].multiply(0.5), batch)
     (plain, _), (moved, _) = (update(state, rows, TASKS, KEY) for rows in (batch, other))
-    learned = lambda x, i: pick((x.actor.own, x.critic.own, x.log_temperature, x.optimizers[1][1][0].mu.own), i)
+    slopes = lambda x: optax.tree_utils.tree_get(x.fits["critic"].optimizer, "mu")["critic"].own
+    learned = lambda x: ([x.nets[name].own for name in ("actor", "critic", "temperature")], slopes(x))
     for i in range(3):
-        assert same(learned(plain, i), learned(moved, i)) == (i != 1)
-    assert not same(plain.actor.shared, moved.actor.shared)
+        assert same(pick(learned(plain), i), pick(learned(moved), i)) == (i != 1)
+    assert not same(plain.nets["actor"].shared, moved.nets["actor"].shared)
 
 
 # A bandit: one step, rewards -sharpness (action - goal)^2 with goals to both sides of 0.
@@ -276,8 +273,8 @@ GOAL, SHARPNESS, HEAT = 0.4, 1.0, 0.2
 class KnownCritic(Distral):
     """Its critics are a goal, about which they are right."""
 
-    def values(self, critic, features, obs, action):
-        return -SHARPNESS * jnp.square(action[None, :, 0] - critic.own)
+    def values(self, nets, features, obs, action):
+        return -SHARPNESS * jnp.square(action[None, :, 0] - nets["critic"].own)
 
 
 def optimum(alpha):
@@ -310,15 +307,16 @@ def test_a_bandits_optimum(alpha):
     rows = jax.tree.map(jnp.zeros_like, random_batch(0, 2, 256, Spec.vector(1, 1, 1)))
     goals, temperature = jnp.float32([GOAL, -GOAL]), jnp.full(2, HEAT)
     own = Batch(rows.obs, rows.action, rows.reward, rows.discount, rows.next_obs, jnp.zeros((2, 0)), temperature, None)
-    of_tasks = jax.vmap(made.actor_loss, (Params(None, 0), (0, Params(None, 0), 0)))
+    nets = {"critic": Params({}, goals), "representation": Params({}, {})}
+    axes = axes_of(["actor", *nets])
 
     def learn(carry, key):
         actor, memory = carry
-        data = (own, Params({}, goals), jax.random.split(key, 2))
-        slope = jax.grad(lambda actor: jnp.mean(of_tasks(actor, data)[0]))(actor)
+        loss = lambda actor, keys: jax.vmap(made.actor_loss, (axes, 0, 0))(nets | {"actor": actor}, own, keys)[0]
+        slope = jax.grad(lambda actor: jnp.mean(loss(actor, jax.random.split(key, 2))))(actor)
         actor, memory = descend(optimizer, slope, memory, actor)
-        outputs = jax.vmap(lambda own: made.policy(Params({}, own), actor, FEATURES, jnp.zeros(1)))(actor.own)
-        return (actor, memory), outputs
+        policy = lambda nets: made.policy(nets, FEATURES, jnp.zeros(1))
+        return (actor, memory), jax.vmap(policy, (axes,))(nets | {"actor": actor})
 
     actor = made.actor.init(KEY, 2, 2, FEATURES, jnp.zeros(1))
     run = partial(jax.jit, compiler_options=QUICK)(
@@ -345,8 +343,8 @@ def test_training_tasks_play_their_own_policies_and_others_the_distilled_one(sta
     made, obs = tiny("distral"), jnp.float32([0.3, -1.0, 0.5])
     act = lambda task: np.asarray(act_once(made, state, obs, task, None))
     mean = lambda outputs: np.tanh(np.asarray(outputs)[:2])
-    own = [made.policy(of_task(state.actor, i), of_task(state.critic, i), FEATURES, obs) for i in range(3)]
-    common = made.actor.apply_distilled(of_task(state.actor, 0), FEATURES, obs)
+    own = [made.policy(of_task(state.nets, i), FEATURES, obs) for i in range(3)]
+    common = made.actor.apply_distilled(of_task(state.nets["actor"], 0), FEATURES, obs)
     for i in range(3):
         np.testing.assert_allclose(act(pick(TASKS, i)), mean(own[i]), rtol=1e-5)
     for number, context in ((3, 1.0), (9, -7.0)):

@@ -29,7 +29,7 @@ def both_ends(made, state, batch, key):
     """Inputs of the critics (T, 2 B, x) at both ends of the transitions, as the update with this key draws actions."""
     target_key = jax.random.split(key, 4)[0]
     state, seen = made.prepare(state, batch, TASKS)
-    _, (_, aim) = made.critic_problem(state, seen, target_key)
+    _, aim = made.critic_data(state, seen, target_key)
     ends = (batch.obs, batch.action), (batch.next_obs, aim.next_action)
     return np.concatenate([np.concatenate(end, axis=-1) for end in ends], axis=1)
 
@@ -42,12 +42,13 @@ def test_targets_are_normalised_by_both_ends_of_the_batch_and_not_by_running_sta
     @jax.jit
     def target(state, batch):
         state, seen = made.prepare(state, batch, TASKS)
-        return made.critic_problem(state, seen, KEY)[1][1].target
+        return made.critic_data(state, seen, KEY)[1].target
 
     as_it_is = np.asarray(target(state, batch))
-    other = {name: jax.tree.map(lambda x: 3 * x + 1, x) for name, x in state.target.own.items() if name == STATISTICS}
-    assert other
-    moved = state._replace(target=state.target._replace(own=state.target.own | other))
+    slow = state.slow["critic"]
+    other = {STATISTICS: jax.tree.map(lambda x: 3 * x + 1, slow.own[STATISTICS])}
+    assert jax.tree.leaves(other)
+    moved = state._replace(slow=state.slow | {"critic": slow._replace(own=slow.own | other)})
     np.testing.assert_array_equal(target(moved, batch), as_it_is)
     mates = batch._replace(obs=batch.obs.at[:, 1].add(2.0))
     assert np.abs(target(state, mates)[:, 0] - as_it_is[:, 0]).max() > 1e-4
@@ -106,17 +107,14 @@ def test_statistics_are_those_of_both_ends_of_every_tasks_own_batch(heads):
     after, _ = update(state, batch, TASKS, KEY)
     inputs = both_ends(made, state, batch, KEY)
     assert inputs.shape == (3, 2 * BATCH, 5)
-    for params, data in ((after.critic, inputs), (after.actor, np.asarray(batch.obs))):
+    for params, data in ((after.nets["critic"], inputs), (after.nets["actor"], np.asarray(batch.obs))):
         found = params.own[STATISTICS]["BatchNorm_0"]
         for key, start, moment in (("mean", 0.0, data.mean(axis=1)), ("var", 0.99, data.var(axis=1))):
             numbers = np.asarray(found[key]).reshape(3, -1, data.shape[-1])  # (T, N, inputs)
             expected = np.broadcast_to((start + 0.01 * moment)[:, None], numbers.shape)
             np.testing.assert_allclose(numbers, expected, rtol=1e-4, atol=1e-6)
-    assert STATISTICS not in after.critic.shared and after.critic.own[STATISTICS]["BatchNorm_1"]["var"].shape == (
-        3,
-        2,
-        16,
-    )
+    critic = after.nets["critic"]
+    assert STATISTICS not in critic.shared and critic.own[STATISTICS]["BatchNorm_1"]["var"].shape == (3, 2, 16)
 
 
 def test_statistics_are_no_other_tasks():
@@ -126,7 +124,7 @@ def test_statistics_are_no_other_tasks():
     other = batch._replace(obs=batch.obs.at[1].multiply(3.0), next_obs=batch.next_obs.at[1].add(2.0))
     first, second = (update(state, x, TASKS, KEY)[0] for x in (batch, other))
     for network in ("actor", "critic"):
-        pairs = zip(*(jax.tree.leaves(getattr(x, network).own[STATISTICS]) for x in (first, second)), strict=True)
+        pairs = zip(*(jax.tree.leaves(x.nets[network].own[STATISTICS]) for x in (first, second)), strict=True)
         for one, two in pairs:
             one, two = np.asarray(one), np.asarray(two)
             np.testing.assert_array_equal(one[[0, 2]], two[[0, 2]])
@@ -140,9 +138,9 @@ def test_no_slope_reaches_the_statistics():
     after, _ = update(state, batch, TASKS, KEY)
     _, same, plain_update = started()
     plain, _ = plain_update(same, batch, TASKS, KEY)
-    for one, two in zip(*(jax.tree.leaves(x.critic.own[STATISTICS]) for x in (after, plain)), strict=True):
+    for one, two in zip(*(jax.tree.leaves(x.nets["critic"].own[STATISTICS]) for x in (after, plain)), strict=True):
         np.testing.assert_array_equal(one, two)
-    for memory in (after.optimizers.actor, after.optimizers.critic):
+    for memory in (after.fits["actor"].optimizer, after.fits["critic"].optimizer):
         leaves = [
             x for path, x in jax.tree_util.tree_leaves_with_path(memory) if STATISTICS in jax.tree_util.keystr(path)
         ]
@@ -154,7 +152,7 @@ def test_weights_begin_and_stay_on_the_sphere(heads):
     """Of hidden layers and outputs; not those that add the task's features."""
     _, state, update = started(heads=heads, actor_lr=0.1, critic_lr=0.1)
     after, _ = update(state, random_batch(0, 3, BATCH, SPEC), TASKS, KEY)
-    for params in (state.actor, state.critic, after.actor, after.critic):
+    for params in (x.nets[network] for x in (state, after) for network in ("actor", "critic")):
         leaves = jax.tree_util.tree_leaves_with_path(params)
         directions = [x for path, x in leaves if path[-1].key == "direction"]
         assert len(directions) == 2 and sum("task_0" in jax.tree_util.keystr(path) for path, _ in leaves) == 1
@@ -170,7 +168,7 @@ def test_an_action_is_that_of_the_tasks_own_running_statistics():
     obs = jnp.float32([0.3, -1.0, 2.0])
     actions = np.stack([act(made, state, obs, pick(TASKS, i), None) for i in range(3)])
     for i in range(3):
-        outputs = made.actor.apply(of_task(state.actor, i), jnp.zeros(0), obs)
+        outputs = made.actor.apply(of_task(state.nets["actor"], i), jnp.zeros(0), obs)
         np.testing.assert_allclose(actions[i], np.tanh(outputs[:2]), rtol=1e-5)
     assert len(np.unique(actions, axis=0)) == 3
     unseen = pick(tasks_of("one-step", [0.25]), 0)._replace(id=jnp.int32(9))
@@ -192,10 +190,11 @@ def test_both_ends_are_normalised_together():
     made, state, _ = started()
     _, batch = made.prepare(state, random_batch(0, 3, BATCH, SPEC), TASKS)
     batch = pick(batch._replace(mask=None, model_targets=None), 0)
-    ends = quick(made.q_of_both, of_task(state.critic, 0), batch, batch.action)
-    now, later, found = ends(of_task(state.critic, 0), batch, batch.action)
+    nets = of_task(state.nets, 0)
+    ends = quick(made.q_of_both, nets, batch, batch.action)
+    now, later, found = ends(nets, batch, batch.action)
     assert now.shape == later.shape == (2, BATCH, 101) and found[STATISTICS]["BatchNorm_1"]["mean"].shape == (2, 16)
-    moved, _, _ = ends(of_task(state.critic, 0), batch._replace(next_obs=batch.next_obs + 1), batch.action)
+    moved, _, _ = ends(nets, batch._replace(next_obs=batch.next_obs + 1), batch.action)
     assert np.abs(now - moved).max() > 1e-3
     first, second = found[STATISTICS]["BatchNorm_1"]["var"]
     assert np.abs(first - second).max() > 1e-4
@@ -212,4 +211,4 @@ def test_another_body_has_no_statistics():
     """And learns as in any agent."""
     _, state, update = started(encoder="simba")
     after, metrics = update(state, random_batch(0, 3, BATCH, SPEC), TASKS, KEY)
-    assert STATISTICS not in after.critic.own and all(np.all(np.isfinite(x)) for x in metrics.values())
+    assert STATISTICS not in after.nets["critic"].own and all(np.all(np.isfinite(x)) for x in metrics.values())
