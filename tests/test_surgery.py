@@ -317,9 +317,10 @@ def test_agents_remember_their_weights(name):
     state = init(tasks, KEY)
     seen = []
     for i in range(3):
-        seen.append(np.ravel(state.surgery.critic[0]))
+        seen.append(np.ravel(state.fits["critic"].rule[0]))
         state, _ = update(state, random_batch(i, 3, 4, spec), tasks, jax.random.key(i))
     np.testing.assert_array_equal(seen[0], np.float32(name == "gradnorm"))
     assert not np.allclose(seen[0], seen[1]) and not np.allclose(seen[1], seen[2])
-    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves((state.surgery, state.critic)))
-    assert (state.surgery.actor is None) == (name == "famo")
+    rules = {name: fit.rule for name, fit in state.fits.items()}
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves((rules, state.nets["critic"])))
+    assert (rules["actor"] is None) == (name == "famo")

@@ -33,7 +33,7 @@ def test_every_so_many_updates_of_the_critics_are_the_actors(updates, delay, eve
     state, history = train(Walk(), tiny("sac"), given, seeds=(0, 1), chunks=2)
     done = updates * (12 // every - 2 // every)
     for name, expected in {"critic": done, "actor": done // delay, "temperature": done // delay}.items():
-        np.testing.assert_array_equal(count(getattr(state.agent.optimizers, name)), [expected, expected])
+        np.testing.assert_array_equal(count(state.agent.fits[name].optimizer), [expected, expected])
     assert all(np.all(np.isfinite(metrics["actor_loss"])) for metrics in history)
 
 
@@ -53,11 +53,12 @@ def test_an_update_in_the_actors_turn_is_the_whole_one_and_another_leaves_the_ac
     np.testing.assert_array_equal(sometimes["critic_loss"], metrics["critic_loss"])
 
     critics, others = in_turn(state, batch, TASKS, KEY, jnp.bool_(False))
-    for name in ("critic", "target", "moments"):
-        jax.tree.map(np.testing.assert_array_equal, getattr(critics, name), getattr(whole, name))
-    before = (state.actor, state.log_temperature, state.optimizers.actor, state.optimizers.temperature)
-    after = (critics.actor, critics.log_temperature, critics.optimizers.actor, critics.optimizers.temperature)
-    jax.tree.map(np.testing.assert_array_equal, after, before)
+    for name in ("critic", "representation", "inputs"):
+        jax.tree.map(np.testing.assert_array_equal, critics.nets[name], whole.nets[name])
+    jax.tree.map(np.testing.assert_array_equal, critics.slow, whole.slow)
+    for name in ("actor", "temperature"):
+        before, after = ((x.nets[name], x.fits[name].optimizer) for x in (state, critics))
+        jax.tree.map(np.testing.assert_array_equal, after, before)
     np.testing.assert_array_equal(others["actor_loss"].weight, 0)
 
 
@@ -66,7 +67,8 @@ def test_turns_pass_through_a_sweep():
     agent, batch = SweptAgent(tiny("sac")), random_batch(0, 2, 4, SPEC)
     state = agent.init(SPEC, TASKS, KEY, {"actor_lr": jnp.float32(0.1)})
     after, _ = quick(agent.update, state, batch, TASKS, KEY, jnp.bool_(False))(state, batch, TASKS, KEY, False)
-    assert count(after.learner.optimizers.critic) == 1 and count(after.learner.optimizers.actor) == 0
+    fits = after.learner.fits
+    assert count(fits["critic"].optimizer) == 1 and count(fits["actor"].optimizer) == 0
 
 
 def branches(jaxpr):
@@ -185,7 +187,8 @@ def test_joined_steps_and_rare_updates_go_together():
     """With the actor's turns as well."""
     given = {**SMALL, "chunk_steps": 12, "update_every": 3, "policy_delay": 2, "n_step": 3, "updates_per_step": 3}
     state, (metrics,) = train(Walk(), tiny("sac"), given)
-    assert count(state.agent.optimizers.critic) == 12 and count(state.agent.optimizers.actor) == 6
+    fits = state.agent.fits
+    assert count(fits["critic"].optimizer) == 12 and count(fits["actor"].optimizer) == 6
     assert np.all(metrics["bad_step"] == -1)
 
 
