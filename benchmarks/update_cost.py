@@ -74,7 +74,7 @@ class Contestant:
         tasks, keys = tasks_of(num_tasks), jax.random.split(jax.random.key(0), num_seeds)
         batch = random_batch(spec, num_tasks, arguments.batch)
         self.state = jax.jit(jax.vmap(lambda key: agent.init(spec, tasks, key)))(keys)
-        networks = [self.state.nets[net] for net in ("actor", "critic", "representation")]
+        networks = [self.state.nets[net] for net in ("actor", "critic", "representation", "knowing")]
         self.num_parameters = size_of(networks) // num_seeds
 
         self.learn = updates(agent, tasks, batch, arguments.updates)
