@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from probes import OFF_POLICY, learner, one_in, pick, quick, random_batch, random_past, tasks_of, tiny
+from probes import OFF_POLICY, learner, one_in, pick, quick, random_batch, random_past, tasks_of, tiny, with_nets
 from probes import act as act_once
 
 from mtjax import normalize
@@ -142,7 +142,7 @@ def test_agents_act_and_learn(name, settings, vectors):
 
     again, _ = update(init(TASKS, KEY), batch, TASKS, KEY)
     other, _ = update(state, batch, TASKS, jax.random.key(3))
-    leaves = [jax.tree.leaves(x.actor) for x in (after, again, other)]
+    leaves = [jax.tree.leaves(x.nets["actor"]) for x in (after, again, other)]
     assert all(np.array_equal(a, b) for a, b in zip(leaves[0], leaves[1], strict=True))
     assert not all(np.array_equal(a, b) for a, b in zip(leaves[0], leaves[2], strict=True))
 
@@ -167,7 +167,8 @@ def test_a_world_among_many_is_that_world_alone(name):
     init = lambda key: agent.init(SPEC, TASKS, key)
     states = quick(jax.vmap(init), jax.random.split(KEY, 10))(jax.random.split(KEY, 10))
     shake = lambda x: x + 0.2 * np.random.default_rng(0).normal(size=x.shape).astype(x.dtype) if x.dtype == "f" else x
-    states = states._replace(actor=jax.tree.map(shake, states.actor), critic=jax.tree.map(shake, states.critic))
+    shaken = {name: jax.tree.map(shake, states.nets[name]) for name in ("actor", "critic", "representation")}
+    states = with_nets(states, **shaken)
     obs = jnp.float32(np.random.default_rng(1).normal(size=(*shape, SPEC.obs_size)))
     places = jnp.stack(jnp.meshgrid(*map(jnp.arange, shape), indexing="ij"), axis=-1).reshape(-1, 3)
 
@@ -189,8 +190,9 @@ def test_a_world_among_many_is_that_world_alone(name):
 def test_what_the_networks_see_of_a_task(conditioning, vectors):
     """Features (Z,) of the second task."""
     agent = make("sac", {"conditioning": conditioning}, vectors)
-    state = jax.eval_shape(lambda: agent.init(SPEC, TASKS, KEY))._replace(contexts=TASKS.context, vectors=None)
-    state = state._replace(vectors=load_vectors(vectors, 3) if conditioning == "vectors" else None)
+    given = {"vectors": load_vectors(vectors, 3)} if conditioning == "vectors" else {}
+    known = Params(given, {"context": TASKS.context})
+    state = with_nets(jax.eval_shape(lambda: agent.init(SPEC, TASKS, KEY)), tasks=known)
     expected = {"one-hot": [0, 1, 0], "parameters": [-0.5], "vectors": np.load(vectors)[1]}.get(conditioning, [])
     np.testing.assert_allclose(agent.features(state, pick(TASKS, 1)), np.float32(expected))
 
@@ -201,7 +203,8 @@ def test_the_context_limit_shows_a_task_beyond_the_range_as_its_end():
     drawn = random_batch(0, 3, 4, SPEC)._replace(context=jnp.full((3, 4, 1), -1.7))
     for limit, expected in ((0.0, 1.7), (1.0, 1.0)):
         agent = tiny("sac", conditioning="parameters", context_limit=limit)
-        state = jax.eval_shape(lambda agent=agent: agent.init(SPEC, TASKS, KEY))._replace(contexts=TASKS.context)
+        shapes = jax.eval_shape(lambda agent=agent: agent.init(SPEC, TASKS, KEY))
+        state = with_nets(shapes, tasks=Params({}, {"context": TASKS.context}))
         np.testing.assert_allclose(agent.features(state, beyond), [expected], rtol=1e-6)
         np.testing.assert_allclose(agent.features_of_batch(state, drawn, TASKS), -expected, rtol=1e-6)
 
@@ -222,16 +225,17 @@ def test_observations_are_normalised_by_what_was_learned_from():
     state, batch = init(TASKS, KEY), random_batch(0, 3, BATCH, SPEC)
     batch = batch._replace(obs=batch.obs * 3 + 10, next_obs=batch.next_obs - 1000)
     after, metrics = update(state, batch, TASKS, KEY)
-    assert (state.moments.count, after.moments.count) == (0, 3 * BATCH)
-    np.testing.assert_allclose(after.moments.mean, batch.obs.mean(axis=(0, 1)), rtol=1e-5)
+    begun, moments = (x.nets["inputs"].shared["moments"] for x in (state, after))
+    assert (begun.count, moments.count) == (0, 3 * BATCH)
+    np.testing.assert_allclose(moments.mean, batch.obs.mean(axis=(0, 1)), rtol=1e-5)
     obs = observations()
-    scaled = normalize.apply(after.moments, obs)
+    scaled = normalize.apply(moments, obs)
     np.testing.assert_allclose(act(agent, after, obs, None), act(tiny("sac"), after, scaled, None), atol=1e-6)
     assert not np.allclose(act(agent, after, obs, None), act(agent, after, scaled, None), atol=1e-3)
 
     # The update itself learns from observations and next observations scaled by the new moments.
     plain_update = learner(tiny("sac"), TASKS, BATCH, SPEC)[1]
-    see = lambda x: normalize.apply(after.moments, x)
+    see = lambda x: normalize.apply(moments, x)
     _, expected = plain_update(state, batch._replace(obs=see(batch.obs), next_obs=see(batch.next_obs)), TASKS, KEY)
     np.testing.assert_allclose(metrics["critic_loss"], expected["critic_loss"], rtol=1e-3)
     np.testing.assert_allclose(metrics["actor_loss"], expected["actor_loss"], rtol=1e-3, atol=1e-4)
@@ -250,13 +254,13 @@ def test_every_method_says_what_differs_from_its_paper():
 def test_what_lies_far_from_what_was_learned_is_clipped(name):
     """What the networks see of observations and of the past, in acting and in learning; nothing if not normalised."""
     agent = tiny(name, normalize_observations=True, conditioning="inferred", inferred_from=2)
-    moments = agent.fit_moments(agent.init_moments(SPEC, 3), random_batch(0, 3, BATCH, SPEC).obs)
+    inputs = agent.fit_inputs(agent.init_inputs(SPEC, 3), random_batch(0, 3, BATCH, SPEC).obs)
     obs, past = jnp.full((3, BATCH, 3), 1e3), random_past(np.random.default_rng(0), (3, BATCH, 2), SPEC)
     past = past._replace(obs=jnp.full_like(past.obs, -1e3))
     for see in (agent.see, agent.see_batch):
-        seen = see(moments, obs, past)
+        seen = see(inputs, obs, past)
         assert np.all(seen.obs == 10) and np.all(seen.past.obs == -10)
-    plain = tiny(name, normalize_observations=False, conditioning="inferred", inferred_from=2).see(moments, obs, past)
+    plain = tiny(name, normalize_observations=False, conditioning="inferred", inferred_from=2).see(inputs, obs, past)
     assert np.all(plain.obs == 1e3) and np.all(plain.past.obs == -1e3)
 
 
@@ -264,7 +268,7 @@ def test_without_normalisation_moments_stay_empty():
     """Nothing is fitted that nobody asked for."""
     init, update = learner(tiny("sac"), TASKS, BATCH, SPEC)
     after, _ = update(init(TASKS, KEY), random_batch(0, 3, BATCH, SPEC), TASKS, KEY)
-    assert after.moments.count == 0
+    assert after.nets["inputs"].shared["moments"].count == 0
 
 
 def test_gradients_are_clipped_to_their_norm():
@@ -273,12 +277,15 @@ def test_gradients_are_clipped_to_their_norm():
     for limit in (0.0, 0.01):
         init, update = learner(tiny("sac", max_gradient_norm=limit), TASKS, BATCH, SPEC)
         after, _ = update(init(TASKS, KEY), batch, TASKS, KEY)
-        memories = [optax.tree_utils.tree_get(memory, "mu") for memory in after.optimizers]
-        recorded[limit] = [jax.flatten_util.ravel_pytree(mu)[0] * 10 for mu in memories]  # a tenth, after one step
-    for free, clipped, is_network in zip(recorded[0.0], recorded[0.01], (True, True, False), strict=True):
+        mean = lambda fit: optax.tree_utils.tree_get(fit.optimizer, "mu")  # a tenth, after one step
+        flat = {name: jax.flatten_util.ravel_pytree(mean(fit))[0] for name, fit in after.fits.items()}
+        recorded[limit] = {name: 10 * x for name, x in flat.items()}
+    assert set(recorded[0.0]) == {"actor", "critic", "temperature"}
+    for name, free in recorded[0.0].items():
+        clipped = recorded[0.01][name]
         norm = np.linalg.norm(free)
         assert norm > 0.02
-        if is_network:
+        if name != "temperature":
             np.testing.assert_allclose(np.linalg.norm(clipped), 0.01, rtol=1e-3)
             assert free @ clipped > 0.9 * norm * 0.01
         else:
@@ -288,8 +295,9 @@ def test_gradients_are_clipped_to_their_norm():
 def test_critics_and_heads_begin_apart():
     """Critics that began alike would stay alike, and their least would be no safeguard."""
     state = learner(tiny("multi-head"), TASKS, BATCH, SPEC)[0](TASKS, KEY)
-    kernel = state.critic.own["head"]["kernel"]
-    assert isinstance(state.critic, Params) and kernel.shape == (3, 2, 16, 1)
+    critic = state.nets["critic"]
+    kernel = critic.own["head"]["kernel"]
+    assert isinstance(critic, Params) and kernel.shape == (3, 2, 16, 1)
     flat = np.asarray(kernel).reshape(6, 16)
     assert len(np.unique(flat, axis=0)) == 6
 
@@ -302,7 +310,7 @@ def test_actor_and_critics_may_have_widths_of_their_own(name, settings):
 
     def shapes(**widths):
         state = jax.eval_shape(lambda: tiny(name, **settings, **widths).init(SPEC, TASKS, KEY))
-        return jax.tree.map(jnp.shape, (state.actor, state.critic))
+        return jax.tree.map(jnp.shape, (state.nets["actor"], state.nets["critic"]))
 
     (wide, narrow) = shapes(hidden=(6, 6)), shapes(hidden=(4,))
     assert shapes(hidden=(6, 6), actor_hidden=(4,)) == (narrow[0], wide[1])

@@ -40,12 +40,12 @@ def test_without_a_warmup_the_first_rate_is_the_whole_one():
     np.testing.assert_allclose([rate(jnp.int32(n)) for n in range(5)], [3, 2.25, 1.5, 0.75, 0], rtol=1e-6)
 
 
-def counts(optimizers):
+def counts(fits):
     """Updates of each optimiser, as Adam counts them, of all seeds."""
     found = {}
-    for name, memory in optimizers._asdict().items():
+    for name, fit in fits.items():
         is_adam = lambda x: isinstance(x, optax.ScaleByAdamState)
-        (adam,) = (x for x in jax.tree.leaves(memory, is_leaf=is_adam) if is_adam(x))
+        (adam,) = (x for x in jax.tree.leaves(fit.optimizer, is_leaf=is_adam) if is_adam(x))
         found[name] = np.asarray(adam.count)
     return found
 
@@ -63,13 +63,13 @@ def test_a_schedule_ends_with_the_run(name, chunk, given, expected):
     """All rates are 0 then, and not before: the last updates change what the next would not."""
     agent, settings = tiny(name, lr_schedule="linear"), {"eval_episodes": 1, "chunk_steps": chunk}
     result = run.train(Walk(), agent, steps=2 * 4 * 2 * chunk, seeds=2, **settings, **given)
-    found = counts(result.state.agent.optimizers)
+    found = counts(result.state.agent.fits)
     for key, number in expected.items():
         np.testing.assert_array_equal(found[key], [number, number])
 
     given = {**given, "chunk_steps": chunk, "lr_updates": expected["critic"]}
     soon, state, end = (train(Walk(), agent, given, chunks=chunks)[0] for chunks in (1, 2, 3))
-    networks = lambda state: (state.agent.actor, state.agent.critic, getattr(state.agent, "log_temperature", ()))
+    networks = lambda state: {net: state.agent.nets[net] for net in expected}
     jax.tree.map(np.testing.assert_array_equal, networks(end), networks(state))
     assert not any(jax.tree.leaves(jax.tree.map(np.array_equal, networks(soon), networks(state))))
 
@@ -92,7 +92,8 @@ def test_a_share_that_is_swept_is_the_one_of_each_point():
     twice, _ = update(once, batch, TASKS, KEY)
     for expected, found in ((once, ended[0.0]), (twice, ended[1.0])):
         close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
-        jax.tree.map(close, (found.actor, found.critic, found.log_temperature), (expected[0], expected[1], expected[3]))
+        for net in ("actor", "critic", "temperature"):
+            jax.tree.map(close, found.nets[net], expected.nets[net])
 
 
 @pytest.mark.slow
@@ -106,7 +107,7 @@ def test_a_run_that_goes_on_for_longer_says_so(short_family, tmp_path, capsys):
     assert "learning rates go on along the schedule of a run of 300 steps" in capsys.readouterr().out
     policy = mtjax.load(directory)
     assert (policy.agent.lr_schedule, policy.agent.lr_updates) == ("cosine", 0)
-    np.testing.assert_array_equal(counts(policy.states.optimizers)["critic"], [70, 70])  # 75 steps, 5 of them random
+    np.testing.assert_array_equal(counts(policy.states.fits)["critic"], [70, 70])  # 75 steps, 5 of them random
 
 
 def test_rates_of_what_learns_at_every_fourth_update_fall_with_the_updates():
@@ -114,7 +115,7 @@ def test_rates_of_what_learns_at_every_fourth_update_fall_with_the_updates():
     agent = tiny("sac", lr_schedule="linear", lr_warmup=8, lr_updates=100, experience=Replay(policy_delay=4))
     rates = {"actor": agent.actor_lr, "critic": agent.critic_lr, "temperature": agent.temperature_lr}
     for name, delay in (("actor", 4), ("critic", 1), ("temperature", 4)):
-        optimizer, params = getattr(agent.optimizers, name), {"x": jnp.ones(1)}
+        optimizer, params = agent.fits[name].optimizer, {"x": jnp.ones(1)}
         memory, steps = optimizer.init(params), []
         for _ in range(11):
             step, memory = optimizer.update(params, memory, params)
