@@ -2,20 +2,19 @@
 
 import dataclasses
 from functools import partial
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import QUICK
+from probes import QUICK, learner, random_batch, tasks_of
 
 from mtjax.agents.parts.gradients import surgery
 from mtjax.agents.parts.gradients.balancing import FAMO, Balance, GradNorm
 from mtjax.agents.parts.gradients.rules import Mean
-from mtjax.agents.sac import SAC, Batch
+from mtjax.agents.sac import SAC
 from mtjax.networks import Params
-from mtjax.types import InputError
+from mtjax.types import InputError, Spec
 
 KEY = jax.random.key(0)
 quick = partial(jax.jit, compiler_options=QUICK)
@@ -187,32 +186,60 @@ class Likelihood(SAC):
     def least_loss(self):
         return -self.below
 
-    def critic_target(self, actor, critic, target_critic, batch, key):
-        return jnp.float32(0)
-
-    def critic_loss(self, critic, data):
-        loss = 1 + jnp.square(data[0].reward * critic.shared) - self.below
+    def critic_loss(self, nets, batch, target):
+        loss = 1 + jnp.square(batch * nets["critic"].shared) - self.below
         return loss, {"critic_loss": loss}
 
 
 @pytest.mark.parametrize("rule", [FAMO(), GradNorm(weight_lr=0.3)], ids=["famo", "gradnorm"])
 def test_losses_are_counted_from_the_least_that_they_can_be(rule):
     """Updates in which losses fall, each at its rate: gradients are weighted as if none were below 0; metrics not."""
-    nothing, scales = Params({}, {}), jnp.float32([1.0, 2.0, 3.0])
-    state = SimpleNamespace(actor=nothing, critic=nothing, target=nothing)
-    batch = Batch(None, None, scales, None, jnp.zeros((3, 1, 1)), None, jnp.ones(3), None)  # type: ignore
+    scales = jnp.float32([1.0, 2.0, 3.0])
 
     def found(below):
-        loss, data = Likelihood(below=below).critic_problem(state, batch, KEY)  # type: ignore
+        agent = Likelihood(below=below)
+        loss = lambda critic, scale: agent.above_least(agent.critic_loss)({"critic": critic}, scale, None)
         memory, gradients = surgery.init(rule, Params(jnp.float32(1), {}), 3), []
         for place, after in ((1.0, 0.5), (0.5, 0.4), (0.4, 0.1), (0.1, 0.1)):
-            seen = surgery.gradient(rule, loss, Params(jnp.float32(place), {}), data, memory, KEY)
-            memory = surgery.adapt_rule(rule, loss, Params(jnp.float32(after), {}), data, seen)
+            seen = surgery.gradient(rule, loss, Params(jnp.float32(place), {}), scales, memory, KEY)
+            memory = surgery.adapt_rule(rule, loss, Params(jnp.float32(after), {}), scales, seen)
             gradients.append(seen.gradients.shared)
             np.testing.assert_allclose(seen.aux["critic_loss"], 1 + np.square(place * scales) - below, rtol=1e-5)
         return gradients
 
     np.testing.assert_allclose(found(20.0), found(0.0), rtol=1e-4)
+
+
+@dataclasses.dataclass(frozen=True)
+class Lowered(SAC):
+    """Its critics' losses are those of SAC, less a constant."""
+
+    below: float = 0.0
+
+    @property
+    def least_loss(self):
+        return -self.below
+
+    def critic_loss(self, nets, batch, target):
+        loss, aux = super().critic_loss(nets, batch, target)
+        return loss - self.below, aux
+
+
+@pytest.mark.parametrize("rule", [FAMO(), GradNorm(weight_lr=0.3)], ids=["famo", "gradnorm"])
+def test_updates_count_losses_from_the_least_that_they_can_be(rule):
+    """Rules remember the same of losses that a constant is taken from, and critics learn the same."""
+    spec, tasks = Spec.vector(3, 2, 1), tasks_of("one-step", (1.0, -0.5, 0.3))
+
+    def learned(below):
+        agent = Lowered(hidden=(8,), gradients=rule, below=below)
+        init, update = learner(agent, tasks, 4, spec)
+        state = init(tasks, KEY)
+        for i in range(3):
+            state, _ = update(state, random_batch(i, 3, 4, spec), tasks, KEY)
+        return state.fits["critic"].rule, state.nets["critic"]
+
+    same = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5)
+    jax.tree.map(same, learned(20.0), learned(0.0))
 
 
 # FAMO.
