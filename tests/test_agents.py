@@ -11,10 +11,10 @@ from probes import act as act_once
 
 from mtjax import normalize
 from mtjax.agents import AGENTS, agent
-from mtjax.agents.base import CONDITIONINGS
-from mtjax.agents.parts.conditioning import load_vectors
 from mtjax.agents.parts.encoders import ENCODERS
 from mtjax.agents.parts.gradients.surgery import RULES
+from mtjax.agents.parts.knowing import CONDITIONINGS
+from mtjax.agents.parts.knowing.vectors import load_vectors
 from mtjax.agents.parts.representations import REPRESENTATIONS
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
@@ -394,8 +394,8 @@ REFUSED = [
     ("sac", {"max_gradient_norm": -1.0}, "max-gradient-norm"),
     ("sac", {"conditioning": "embedding", "embedding_size": 0}, "embedding-size"),
     ("sac", {"conditioning": "vectors"}, "conditioning=vectors and vectors=FILE.npy go together"),
-    ("sac", {"vectors": "x.npy"}, "conditioning=vectors and vectors=FILE.npy go together"),
-    ("sac", {"context_limit": 1.0}, "context-limit=1.0 clips parameters .* conditioning=none they see none"),
+    ("sac", {"vectors": "x.npy"}, "unknown setting of sac 'vectors'; it belongs to conditioning='vectors'"),
+    ("sac", {"context_limit": 1.0}, "unknown setting of sac 'context_limit'; it belongs to conditioning='parameters'"),
     ("sac", {"temperature_momentum": 1.0}, r"temperature-momentum must be in \[0, 1\), not 1.0"),
     ("care", {"conditioning": "none"}, "conditioning cannot be none; use parameters"),
     ("care", {"variant": "papers"}, "unknown variant 'papers'; did you mean 'paper'"),

@@ -307,7 +307,7 @@ def test_a_bandits_optimum(alpha):
     rows = jax.tree.map(jnp.zeros_like, random_batch(0, 2, 256, Spec.vector(1, 1, 1)))
     goals, temperature = jnp.float32([GOAL, -GOAL]), jnp.full(2, HEAT)
     own = Batch(rows.obs, rows.action, rows.reward, rows.discount, rows.next_obs, jnp.zeros((2, 0)), temperature, None)
-    nets = {"critic": Params({}, goals), "representation": Params({}, {})}
+    nets = {"critic": Params({}, goals), "representation": Params({}, {}), "knowing": Params({}, {})}
     axes = axes_of(["actor", *nets])
 
     def learn(carry, key):

@@ -11,6 +11,7 @@ import pytest
 from probes import quick, random_batch, tasks_of, with_nets
 
 from mtjax.agents.parts.encoders import Identity
+from mtjax.agents.parts.knowing import Parameters
 from mtjax.agents.sac import SAC, Batch
 from mtjax.agents.state import AgentState
 from mtjax.networks import Params, join
@@ -32,7 +33,7 @@ class Bare(Identity):
 
 @dataclasses.dataclass(frozen=True)
 class LinearSAC(SAC):
-    conditioning: str = "parameters"
+    conditioning: Parameters = Parameters()  # noqa: RUF009
     encoder: Identity = dataclasses.field(default_factory=Bare)
 
 
