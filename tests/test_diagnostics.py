@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import matplotlib.image
 import numpy as np
 import pytest
-from probes import OFF_POLICY, QUICK, learner, of_task, one_in, pick, random_batch, slow_but, tasks_of, tiny
+from probes import OFF_POLICY, QUICK, learner, of_task, one_in, pick, random_batch, slow_but, tasks_of, tiny, with_nets
 
 import mtjax
 import mtjax.evaluate
@@ -56,7 +56,7 @@ def distance_to_reward(agent, state, batch):
     distances = []
     for i in range(3):
         one, features = pick(batch, i), agent.features(state, pick(TASKS, i))
-        estimates = agent.values(of_task(state.critic, i), features, one.obs, one.action)
+        estimates = agent.values(of_task(state.nets, i), features, one.obs, one.action)
         distances.append(np.mean(np.abs(estimates - one.reward)))
     return distances
 
@@ -68,26 +68,25 @@ def gradients_by_hand(agent, state, batch):
     """Each task's gradients of critics and actor (T, P) on shared parameters or, without any, on its own."""
     keys = jax.random.split(jax.random.split(KEY)[1], 3)
 
-    def critic_loss(critic, one, features):
-        estimates = agent.values(critic, features, one.obs, one.action)
+    def critic_loss(critic, nets, one, features):
+        estimates = agent.values(nets | {"critic": critic}, features, one.obs, one.action)
         return jnp.mean(jnp.sum((estimates - one.reward) ** 2, axis=0))
 
-    def actor_loss(actor, critic, one, features, log_temperature, key):
+    def actor_loss(actor, nets, one, features, key):
         action, log_prob = tanh_normal(agent.actor.apply(actor, features, one.obs), key)
-        estimates = agent.values(critic, features, one.obs, action)
-        return jnp.mean(jnp.exp(log_temperature) * log_prob - jnp.min(estimates, axis=0))
+        estimates = agent.values(nets, features, one.obs, action)
+        return jnp.mean(jnp.exp(nets["temperature"].own["log"]) * log_prob - jnp.min(estimates, axis=0))
 
     @partial(jax.jit, compiler_options=QUICK)
-    def slopes(actor, critic, one, task, log_temperature, key):
+    def slopes(nets, one, task, key):
         features = agent.features(state, task)
-        of_critic = jax.grad(critic_loss)(critic, one, features)
-        of_actor = jax.grad(actor_loss)(actor, critic, one, features, log_temperature, key)
+        of_critic = jax.grad(critic_loss)(nets["critic"], nets, one, features)
+        of_actor = jax.grad(actor_loss)(nets["actor"], nets, one, features, key)
         return [jax.flatten_util.ravel_pytree(slope.shared or slope.own)[0] for slope in (of_critic, of_actor)]
 
     rows = []
     for i in range(3):
-        one, task, temperature = pick((batch, TASKS, state.log_temperature), i)
-        rows.append(slopes(of_task(state.actor, i), of_task(state.critic, i), one, task, temperature, keys[i]))
+        rows.append(slopes(of_task(state.nets, i), *pick((batch, TASKS), i), keys[i]))
     return [np.float64(np.stack(x)) for x in zip(*rows, strict=True)]
 
 
@@ -167,9 +166,9 @@ def test_dead_units_are_counted():
     """Three of eight units in one layer of two are dead in all critics, one of four in the actor's last layer."""
     agent = tiny("sac-conditioned", hidden=(8, 8), critic_layer_norm=False)
     state = started(agent)
-    critic = constant_layers(state.critic, 1.0, [-1, 1, 2, 0, 1, 3, -2, 1])
-    actor = constant_layers(state.actor, [1, 1, 1, 1, 1, 1, 0, -1], 2.0)
-    seen = watched(agent, state._replace(critic=critic, actor=actor), random_batch(0, 3, BATCH, SPEC))
+    critic = constant_layers(state.nets["critic"], 1.0, [-1, 1, 2, 0, 1, 3, -2, 1])
+    actor = constant_layers(state.nets["actor"], [1, 1, 1, 1, 1, 1, 0, -1], 2.0)
+    seen = watched(agent, with_nets(state, critic=critic, actor=actor), random_batch(0, 3, BATCH, SPEC))
     found = utilisation(agent.critic, critic, seen["critic"])
     names = ["Trunk/MLP_0/ReLU_0", "Trunk/MLP_0/ReLU_1"]
     assert found["dormant_by_layer"] == {names[0]: 0, names[1]: 3 / 8} and found["dormant"] == 3 / 16
@@ -192,7 +191,7 @@ def test_unit_that_one_task_uses_is_not_dormant_if_it_is_shared():
     seen = Activity({"Trunk/ReLU_0": np.float32([[[1, 0]], [[0, 1]]])}, np.ones((2, 5, 1, 2), np.float32))
     for heads, share in (("shared", 0), ("per-task", 0), ("disjoint", 0.5)):
         agent = tiny("sac", heads=heads)
-        assert utilisation(agent.actor, shapes_of(agent).actor, seen)["dormant"] == share
+        assert utilisation(agent.actor, shapes_of(agent).nets["actor"], seen)["dormant"] == share
 
 
 def test_ranks_are_of_all_tasks_together_if_they_share_a_body():
@@ -201,7 +200,7 @@ def test_ranks_are_of_all_tasks_together_if_they_share_a_body():
     hidden[0, :, 0, 0] = hidden[1, :, 0, 1] = 1
     for heads, rank in (("shared", 2), ("disjoint", 1)):
         agent = tiny("sac", heads=heads)
-        found = utilisation(agent.actor, shapes_of(agent).actor, Activity({}, hidden))
+        found = utilisation(agent.actor, shapes_of(agent).nets["actor"], Activity({}, hidden))
         assert found["rank"] == rank and found["entropy_rank"] == pytest.approx(rank)
         assert np.isnan(found["dormant"])
 
@@ -232,12 +231,12 @@ def test_activity_is_that_of_the_networks():
     state, batch = started(agent), random_batch(1, 3, BATCH, SPEC)
     seen, (_, batch) = watched(agent, state, batch), agent.prepare(state, batch, TASKS)
     for i in range(3):
-        hidden = agent.actor.hidden(of_task(state.actor, i), batch.features[i], batch.obs[i])
+        hidden = agent.actor.hidden(of_task(state.nets["actor"], i), batch.features[i], batch.obs[i])
         np.testing.assert_allclose(seen["actor"].hidden[i, :, 0], hidden, rtol=1e-4, atol=1e-5)
         level = seen["actor"].layers["Trunk/MLP_0/ReLU_1"][i, 0]
         np.testing.assert_allclose(level, np.mean(hidden, axis=0), rtol=1e-4, atol=1e-5)
         for n in range(2):
-            params = pick(of_task(state.critic, i), n)
+            params = pick(of_task(state.nets["critic"], i), n)
             hidden = agent.critic.hidden(params, batch.features[i], batch.obs[i], batch.action[i])
             np.testing.assert_allclose(seen["critic"].hidden[i, :, n], hidden, rtol=1e-4, atol=1e-5)
 
@@ -257,7 +256,7 @@ def test_every_agent_has_diagnostics(name):
     agent = tiny(name)
     state, gradients, seen = trace(agent)
     for network in ("critic", "actor"):
-        matrix, params = gradients[network]["cosine"], getattr(state, network)
+        matrix, params = gradients[network]["cosine"], state.nets[network]
         assert matrix is None if not jax.tree.leaves(params.shared) else matrix.shape == (3, 3)
         assert gradients[network]["gradient_norm"].shape == (3,)
         assert seen[network].hidden.shape[:2] == (3, BATCH)
