@@ -4,11 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import OFF_POLICY, learner, pick, random_batch, slow_but, tasks_of, tiny
+from probes import OFF_POLICY, learner, pick, random_batch, slow_but, tasks_of, tiny, with_nets
 from probes import act as act_once
 
 from mtjax.agents.parts.encoders.care import Mixture
-from mtjax.networks import Params
 from mtjax.types import Spec
 
 SPEC, BATCH = Spec.vector(3, 2, 1), 4
@@ -25,16 +24,17 @@ BRONET = {f"shared/body/{kind}_{i}" for kind in ("Dense", "LayerNorm") for i in 
 HYPERSPHERE = {f"shared/body/{kind}_{i}" for kind, count in (("UnitDense", 4), ("Scaler", 4)) for i in range(count)}
 BATCH_NORM = {f"shared/body/{part}" for part in ("BatchNorm_0", "BatchNorm_1", "UnitDense_0", "task_0")}
 MODELS = {"shared/transition", "shared/reward"}
-LATENT = {"actor": TRUNK, "critic": TRUNK | {"shared/latent"} | MODELS, "target": TRUNK | {"shared/latent"}}
-ENCODED = {"actor": TRUNK, "critic": TRUNK | {"shared/latent"}, "target": TRUNK | {"shared/latent"}}
-REBUILT = ENCODED | {"critic": ENCODED["critic"] | {"shared/decoder"}}
-SIGHT = {part: parts | {"shared/projection"} for part, parts in ENCODED.items()} | {"actor": TRUNK | {"shared/sight"}}
-once = lambda parts: parts | {"target": parts["target"] - {"shared/latent"}}  # an encoder that is its own target
-WITH_THETA = {**LATENT, **{who: LATENT[who] | {"own/embedding"} for who in ("critic", "target")}}
+TRUNKS = {"actor": TRUNK, "critic": TRUNK}
+ENCODED = {"representation": {"shared/latent"}, "slow representation": {"shared/latent"}}
+LATENT = ENCODED | {"representation": {"shared/latent"} | MODELS}
+REBUILT = ENCODED | {"representation": {"shared/latent", "shared/decoder"}}
+SEES = {"actor": TRUNK | {"shared/sight"}, "critic": TRUNK}
+# An encoder that is its own target has no slow copy.
+once = lambda parts: parts | {"slow representation": parts["slow representation"] - {"shared/latent"}}
+also = lambda part, parts: {who: of_it | {part} for who, of_it in parts.items()}
 WHOLE_CARE = CARE | {"shared/body/after"}
-CARE_ON_LATENT = {who: (parts - TRUNK) | WHOLE_CARE for who, parts in LATENT.items()}
 body = lambda *parts: {f"shared/body/{part}" for part in parts} | {"shared/head"}
-# The parts of actor and critics, or of each, all of which their losses must move.
+# The parts of actor and critics, or of every network, that losses must move. Slow critics have those of critics.
 PARTS = {
     "sac": ("sac", {}, TRUNK),
     "sac-conditioned": ("sac-conditioned", {}, TRUNK),
@@ -44,7 +44,7 @@ PARTS = {
     "sac-hypernetwork": ("sac-conditioned", {"encoder": "hypernetwork"}, body("hypernetwork", "code", "trunk")),
     "multi-head": ("multi-head", {}, {"shared/body/MLP_0", "own/head"}),
     "disjoint": ("disjoint", {}, OWN),
-    "distral": ("distral", {}, {"actor": OWN | {"shared/distilled"}, "critic": OWN, "target": OWN}),
+    "distral": ("distral", {}, {"actor": OWN | {"shared/distilled"}, "critic": OWN}),
     "care": ("care", {}, WHOLE_CARE),
     "care-mtrl": ("care", {"variant": "mtrl"}, CARE | {"shared/body/gate", "shared/body/gate_out"}),
     "moe": ("moe", {}, body("experts", "gate", "trunk")),
@@ -61,18 +61,14 @@ PARTS = {
     "brc": ("brc", {"value": "hl-gauss"}, BRONET | {"shared/head", "own/embedding"}),
     "simba-v2": ("simba-v2", {"value": "hl-gauss"}, HYPERSPHERE | {"shared/head"}),
     "xqc": ("xqc", {"value": "hl-gauss"}, BATCH_NORM | {"shared/head", "own/batch_stats"}),
-    "drq": ("drq", {"n_step": 1}, once(ENCODED)),
-    "drq-pictures": ("drq", {"n_step": 1}, once(SIGHT)),
-    "asymmetric": (
-        "drq",
-        {"n_step": 1, "representation": "asymmetric"},
-        {"actor": TRUNK | {"shared/sight"}, "critic": TRUNK, "target": TRUNK},
-    ),
-    "sac-ae": ("sac-ae", {}, REBUILT),
-    "sac-ae-pictures": ("sac-ae", {}, SIGHT | {"critic": SIGHT["critic"] | {"shared/decoder"}}),
-    "deepmdp": ("deepmdp", {}, LATENT),
-    "hip-bmdp": ("hip-bmdp", {}, WITH_THETA),
-    "care-deepmdp": ("care", {"representation": "deepmdp"}, CARE_ON_LATENT),
+    "drq": ("drq", {"n_step": 1}, TRUNKS | once(ENCODED)),
+    "drq-pictures": ("drq", {"n_step": 1}, SEES | once(also("shared/projection", ENCODED))),
+    "asymmetric": ("drq", {"n_step": 1, "representation": "asymmetric"}, SEES),
+    "sac-ae": ("sac-ae", {}, TRUNKS | REBUILT),
+    "sac-ae-pictures": ("sac-ae", {}, SEES | also("shared/projection", REBUILT)),
+    "deepmdp": ("deepmdp", {}, TRUNKS | LATENT),
+    "hip-bmdp": ("hip-bmdp", {}, TRUNKS | also("own/embedding", LATENT)),
+    "care-deepmdp": ("care", {"representation": "deepmdp"}, {"actor": WHOLE_CARE, "critic": WHOLE_CARE} | LATENT),
     "pcgrad": ("pcgrad", {}, TRUNK),
     "cagrad": ("cagrad", {}, TRUNK),
     "gradnorm": ("gradnorm", {}, TRUNK),
@@ -119,23 +115,19 @@ def leaves_of(params):
 def parts_of(case, network):
     """What a network is made of."""
     parts = PARTS[case][2]
-    return parts[network] if isinstance(parts, dict) else parts
+    parts = parts if isinstance(parts, dict) else {"actor": parts, "critic": parts}
+    return {"slow critic": parts["critic"], **parts}.get(network, set())
 
 
-ONE_OF_A_KIND = {
-    "shared/latent",
-    "shared/projection",
-    "shared/transition",
-    "shared/reward",
-    "shared/decoder",
-}  # of which critics have one together
-
-
-def slices(case, path, leaf, is_critic):
+def slices(network, path, leaf):
     """A leaf by all that owns a part of it: tasks, then critics, then experts."""
-    theirs = "/".join(path.split("/")[:2]) not in ONE_OF_A_KIND and not case.startswith("hip-bmdp")
-    axes = path.startswith("own/") + (is_critic and theirs) + ("/experts/" in path)
+    axes = path.startswith("own/") + network.endswith("critic") + ("/experts/" in path)
     return leaf.reshape(-1, *leaf.shape[axes:]) if axes else leaf[None]
+
+
+def with_slow(state):
+    """All networks by name, also the slow ones."""
+    return state.nets | {f"slow {name}": net for name, net in state.slow.items()}
 
 
 def test_every_agent_is_in_the_table():
@@ -150,24 +142,25 @@ def test_everything_that_should_learn_does(case):
     after = before
     for i in range(10):
         after, _ = update(after, batch_of(case, i), TASKS, jax.random.key(i))
-    for network in ("actor", "critic", "target"):
-        old, new = leaves_of(getattr(before, network)), leaves_of(getattr(after, network))
+    for network in ("actor", "critic", "representation", "slow critic", "slow representation"):
+        old, new = (leaves_of(with_slow(state)[network]) for state in (before, after))
         deep = lambda path: path.startswith("shared/body/")
         assert {"/".join(path.split("/")[: 3 if deep(path) else 2]) for path in old} == parts_of(case, network)
         for path in old:
-            parts = (slices(case, path, leaves[path], network != "actor") for leaves in (old, new))
+            parts = (slices(network, path, leaves[path]) for leaves in (old, new))
             for i, (a, b) in enumerate(zip(*parts, strict=True)):
                 assert not np.array_equal(a, b), f"{network} {path}[{i}] stayed"
-    assert np.all(before.log_temperature != after.log_temperature)
+    temperatures = [state.nets["temperature"].parts["log"] for state in (before, after)]
+    assert np.all(temperatures[0] != temperatures[1])
 
 
 # With discount 0 the critic's target is the reward. What each input must leave alone, bit for bit, and what it moves.
 FLOW = {
-    "actor": (("critic", "target"), ("log_temperature",)),
-    "critic": (("log_temperature",), ("actor",)),
-    "target": (("actor", "critic", "log_temperature"), ()),
-    "log_temperature": (("critic", "target"), ("actor",)),
-    "reward": (("log_temperature",), ("actor", "critic", "target")),
+    "actor": (("critic", "target"), ("temperature",)),
+    "critic": (("temperature",), ("actor",)),
+    "target": (("actor", "critic", "temperature"), ()),
+    "temperature": (("critic", "target"), ("actor",)),
+    "reward": (("temperature",), ("actor", "critic", "target")),
 }
 
 
@@ -179,16 +172,26 @@ _ON_LATENT = {"critic": ((), ("actor",)), "target": ((), ("critic",)), "reward":
 FLOW_OF = {
     **dict.fromkeys(("drq", "sac-ae", "drq-pictures", "sac-ae-pictures"), _ON_ENCODED),
     **dict.fromkeys(("deepmdp", "hip-bmdp", "care-deepmdp"), _ON_LATENT),
-    "brc": {"log_temperature": ((), ("actor",))},
-    "xqc": {"actor": ((), ("critic", "target", "log_temperature"))},
+    "brc": {"temperature": ((), ("actor",))},
+    "xqc": {"actor": ((), ("critic", "target", "temperature"))},
 }
 
-OPTIMIZERS = {"actor": 0, "critic": 1, "log_temperature": 2}
+
+def networks(state, part):
+    """The networks that a loss trains, or all slow ones; the critics' loss trains the representation too."""
+    trained = ("critic", "representation") if part == "critic" else (part,)
+    return state.slow if part == "target" else {name: state.nets[name] for name in trained}
 
 
 def learned(state, part):
     """Parameters, and what their optimiser remembers of gradients: Adam's first step alone is little but a sign."""
-    return getattr(state, part), state.optimizers[OPTIMIZERS[part]] if part in OPTIMIZERS else ()
+    return networks(state, part), state.fits[part].optimizer if part in state.fits else ()
+
+
+def nudged(state, part):
+    """A state with other parameters."""
+    other = nudge(networks(state, part))
+    return state._replace(slow=other) if part == "target" else with_nets(state, **other)
 
 
 def nudge(tree):
@@ -210,7 +213,7 @@ def test_losses_reach_their_own_parameters_alone(case):
         if changed == "reward":
             after, _ = update(state, batch._replace(reward=nudge(batch.reward)), TASKS, key)
         else:
-            after, _ = update(state._replace(**{changed: nudge(getattr(state, changed))}), batch, TASKS, key)
+            after, _ = update(nudged(state, changed), batch, TASKS, key)
         for part in untouched:
             assert same(learned(after, part), learned(plain, part)), f"{changed} reached {part}"
         for part in moved:
@@ -228,18 +231,16 @@ def test_the_slow_critic_is_what_bootstraps(case):
     """With discount 1 it moves the critic; its own step is a share of the new critic and nothing else."""
     state, update = start(case)
     batch, key = batch_of(case, 0)._replace(discount=jnp.ones((3, BATCH))), jax.random.key(1)
-    slow = nudge(state.target)
-    plain, other = update(state, batch, TASKS, key)[0], update(state._replace(target=slow), batch, TASKS, key)[0]
-    assert not same(plain.critic, other.critic)
+    changed = nudged(state, "target")
+    plain, other = (update(x, batch, TASKS, key)[0] for x in (state, changed))
+    assert not same(networks(plain, "critic"), networks(other, "critic"))
     name, settings, _ = PARTS[case]
     agent = tiny(name, **settings)
-    kept = lambda new, old: {part: new[part] for part in old}  # models of the future have no slow copy
-    new = Params(*map(kept, other.critic, slow))
-    taus = Params(*({part: tau_of(agent, part) for part in parts} for parts in slow))
-    mix = lambda tau, old, new: jax.tree.map(lambda a, b: (1 - tau) * a + tau * np.asarray(b), old, new)
-    expected = jax.tree.map(mix, taus, slow, new, is_leaf=lambda x: isinstance(x, float))
-    for a, b in zip(jax.tree.leaves(expected), jax.tree.leaves(other.target), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7)
+    old, new, found = (leaves_of(x) for x in (changed.slow, other.nets, other.slow))
+    assert old.keys() == found.keys()
+    for path in old:  # models of the future have no slow copy
+        tau = tau_of(agent, path.split("/")[2])
+        np.testing.assert_allclose((1 - tau) * old[path] + tau * new[path], found[path], rtol=1e-5, atol=1e-7)
 
 
 def test_critics_that_see_the_state_see_no_picture():
@@ -357,9 +358,10 @@ def test_a_head_or_embedding_moves_the_action_of_its_task_alone():
     for case, part in (("multi-head", "head"), ("sac-embedding", "embedding")):
         name, settings, _ = PARTS[case]
         agent, state = tiny(name, **settings), start(case)[0]
-        own = jax.tree.map(lambda x: x.at[1].add(0.5), state.actor.own)
+        actor = state.nets["actor"]
+        own = jax.tree.map(lambda x: x.at[1].add(0.5), actor.own)
         assert set(own) == {part}
-        changed = state._replace(actor=state.actor._replace(own=own))
+        changed = with_nets(state, actor=actor._replace(own=own))
         acts = [
             np.stack([act_once(agent, s, OBS[0], pick(TASKS, i), None) for i in range(3)]) for s in (state, changed)
         ]
