@@ -9,15 +9,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import Walk, mean_actions, of_task, one_in, only_seed, pick, quick, random_past, tiny, train
+from probes import Walk, mean_actions, of_task, one_in, only_seed, pick, quick, random_past, tiny, train, with_nets
 
 from mtjax import agents, normalize
-from mtjax.agents.base import CONDITIONINGS
 from mtjax.agents.parts.encoders import ENCODERS
 from mtjax.agents.parts.gradients.surgery import RULES
+from mtjax.agents.parts.knowing import CONDITIONINGS
+from mtjax.agents.parts.knowing.last_steps import Past, Seen
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
-from mtjax.agents.parts.trajectory import Past, Seen
+from mtjax.agents.parts.scaling.base import Moments
 from mtjax.agents.ppo import PPO, Batch, Taken, Units, advantages, take_steps
 from mtjax.config import with_preset
 from mtjax.envs.probes import Probe, tasks_of
@@ -102,7 +103,7 @@ def test_every_task_has_its_own_discount():
     state = agent.init(SPEC, tasks, KEY)
     state, batch, _ = agent.prepare(state, steps, tasks)
     features = agent.features_of_batch(state, steps, tasks)
-    see = lambda obs: agent.see(state.moments, obs.reshape(3, -1, 3))
+    see = lambda obs: agent.see(state.nets["inputs"], obs.reshape(3, -1, 3))
     value, following = (agent.values(state, features, see(obs)) for obs in (steps.obs, steps.next_obs))
     gamma = np.array([0.975, 0.995, 0.96])[:, None]
     flat = lambda x: x.reshape(3, -1)
@@ -115,8 +116,9 @@ def test_a_target_infers_the_task_from_the_past_with_the_step_in_it():
     settings = {"value_normalization": "none", "advantage_normalization": "none", "normalize_observations": False}
     agent = small(conditioning="inferred", inferred_from=3, gae_lambda=0.0, **settings)
     state, steps = agent.init(SPEC, TASKS, KEY), random_steps(agent)
-    head = jax.tree.map(lambda x: 1e3 * x, state.critic.shared["head"])
-    state = state._replace(critic=state.critic._replace(shared=state.critic.shared | {"head": head}))
+    critic = state.nets["critic"]
+    head = jax.tree.map(lambda x: 1e3 * x, critic.shared["head"])
+    state = with_nets(state, critic=critic._replace(shared=critic.shared | {"head": head}))
     _, batch, _ = agent.prepare(state, steps, TASKS)
     flat = jax.tree.map(lambda x: np.reshape(x, (3, -1, *x.shape[3:])), steps)
     past, latest = flat.extras.past, Past(flat.obs, flat.action, flat.reward, np.ones_like(flat.reward))
@@ -132,13 +134,13 @@ def test_a_target_infers_the_task_from_the_past_with_the_step_in_it():
 
 
 def batch_of(agent, state, **fields):
-    """Four steps of the first task, with its parameters of actor and critic."""
+    """Four steps of the first task, with its networks."""
     random = np.random.default_rng(1)
     normal = lambda *size: jnp.float32(random.normal(size=(4, *size)))
     features = agent.features(state, pick(TASKS, 0))
     blank = dict.fromkeys(("log_prob", "advantage", "output", "target"), jnp.zeros(4))
     batch = Batch(**{"obs": normal(3), "raw": normal(2), "features": features, "mask": None, **blank, **fields})
-    return batch, of_task(state.actor, 0), of_task(state.critic, 0)
+    return batch, of_task(state.nets, 0)
 
 
 def test_actor_loss_worked_by_hand():
@@ -146,34 +148,33 @@ def test_actor_loss_worked_by_hand():
     agent = small(clip_range=0.2, entropy_cost=0.0)
     state = agent.init(SPEC, TASKS, KEY)
     ratio, advantage = jnp.array([1.5, 1.5, 0.5, 0.5]), jnp.array([1.0, -1.0, 1.0, -1.0])
-    batch, actor, _ = batch_of(agent, state, advantage=advantage)
-    now = log_density(agent.actor.apply(actor, batch.features, batch.obs), batch.raw)
+    batch, nets = batch_of(agent, state, advantage=advantage)
+    now = log_density(agent.policy(nets, batch.features, batch.obs), batch.raw)
     batch = batch._replace(log_prob=now - jnp.log(ratio))
-    loss, metrics = agent.actor_loss(actor, (batch, KEY))
+    loss, (metrics, kl) = agent.actor_loss(nets, batch, KEY)
     assert loss == pytest.approx(-(1.2 - 1.5 + 0.5 - 0.8) / 4, abs=1e-5)
     assert metrics["kl"] == pytest.approx(float(jnp.mean(ratio - 1 - jnp.log(ratio))), abs=1e-5)
-    assert metrics["clip_fraction"] == 1
+    assert metrics["clip_fraction"] == 1 and metrics["kl"] == kl
 
-    one = lambda i: (jax.tree.map(lambda x: x[i : i + 1] if x.shape[:1] == (4,) else x, batch), KEY)
-    slope = lambda i: sum(
-        float(jnp.sum(jnp.abs(x))) for x in jax.tree.leaves(jax.grad(lambda a: agent.actor_loss(a, one(i))[0])(actor))
-    )
+    one = lambda i: jax.tree.map(lambda x: x[i : i + 1] if x.shape[:1] == (4,) else x, batch)
+    slopes = lambda i: jax.grad(lambda actor: agent.actor_loss(nets | {"actor": actor}, one(i), KEY)[0])(nets["actor"])
+    slope = lambda i: sum(float(jnp.sum(jnp.abs(x))) for x in jax.tree.leaves(slopes(i)))
     assert [slope(i) > 0 for i in range(4)] == [False, True, True, False]
 
 
 def test_entropy_is_paid_for():
     agent, plain = small(entropy_cost=0.5), small(entropy_cost=0.0)
     state = agent.init(SPEC, TASKS, KEY)
-    batch, actor, _ = batch_of(agent, state)
-    (loss, metrics), (without, _) = (x.actor_loss(actor, (batch, KEY)) for x in (agent, plain))
+    batch, nets = batch_of(agent, state)
+    (loss, (metrics, _)), (without, _) = (x.actor_loss(nets, batch, KEY) for x in (agent, plain))
     assert loss == pytest.approx(float(without - 0.5 * metrics["entropy"]), abs=1e-5)
 
 
 def test_ratios_beyond_all_bounds_stay_finite():
     agent = small()
     state = agent.init(SPEC, TASKS, KEY)
-    batch, actor, _ = batch_of(agent, state, log_prob=jnp.full(4, -1e6), advantage=-jnp.ones(4))
-    (loss, _), slope = jax.value_and_grad(agent.actor_loss, has_aux=True)(actor, (batch, KEY))
+    batch, nets = batch_of(agent, state, log_prob=jnp.full(4, -1e6), advantage=-jnp.ones(4))
+    (loss, _), slope = jax.value_and_grad(agent.actor_loss, has_aux=True)(nets, batch, KEY)
     assert all(np.all(np.isfinite(x)) for x in (loss, *jax.tree.leaves(slope)))
 
 
@@ -181,13 +182,13 @@ def test_critic_loss_worked_by_hand():
     """A value that would leave its clipped range is held to the error at its edge, where that is larger."""
     agent, free = small(value_clip=0.5), small()
     state = agent.init(SPEC, TASKS, KEY)
-    batch, _, critic = batch_of(agent, state)
-    now = agent.critic.apply(critic, batch.features, batch.obs)[..., 0]
+    batch, nets = batch_of(agent, state)
+    now = agent.output(nets, batch.features, batch.obs)
     batch = batch._replace(output=now - jnp.array([0.2, 1.0, -1.0, 1.0]), target=now + jnp.array([1.0, 1, 1, -1]))
-    assert free.critic_loss(critic, batch)[0] == pytest.approx(0.5, abs=1e-5)
+    assert free.critic_loss(nets, batch)[0] == pytest.approx(0.5, abs=1e-5)
     # The second value may only be 0.5 above the old one, which is 1.5 from its target; and so on.
     expected = np.mean([1.0, 1.5**2, 1.0, 1.0]) / 2
-    assert agent.critic_loss(critic, batch)[0] == pytest.approx(expected, abs=1e-5)
+    assert agent.critic_loss(nets, batch)[0] == pytest.approx(expected, abs=1e-5)
 
 
 def test_actions_that_a_task_lacks_count_for_nothing():
@@ -198,7 +199,7 @@ def test_actions_that_a_task_lacks_count_for_nothing():
     act = lambda i, key=KEY: agent.act(state, agent.begin(state, pick(tasks, i)), obs, pick(tasks, i), key)
     acted, whole = act(0), act(1)
     assert acted.action[1] == 0 and acted.action[0] == whole.action[0] and act(2, None).action[0] == 0
-    outputs = agent.actor.apply(of_task(state.actor, 0), jnp.zeros(0), obs)
+    outputs = agent.policy(of_task(state.nets, 0), jnp.zeros(0), obs)
     density = lambda i: float(log_density(outputs[i::2], acted.extras.raw[i : i + 1]))
     assert acted.extras.log_prob == pytest.approx(density(0), abs=1e-5)
     assert whole.extras.log_prob == pytest.approx(density(0) + density(1), abs=1e-5)
@@ -211,19 +212,19 @@ def test_a_loss_counts_only_the_actions_that_its_task_has():
     """Ratio and entropy are those of the first action alone, and no gradient reaches the outputs of the second."""
     agent = small(entropy_cost=0.5)
     state = agent.init(SPEC, TASKS, KEY)
-    batch, actor, _ = batch_of(agent, state, advantage=jnp.arange(4.0), mask=jnp.array([1.0, 0.0]))
-    outputs = agent.actor.apply(actor, batch.features, batch.obs)
+    batch, nets = batch_of(agent, state, advantage=jnp.arange(4.0), mask=jnp.array([1.0, 0.0]))
+    outputs = agent.policy(nets, batch.features, batch.obs)
     batch = batch._replace(log_prob=log_density(outputs[:, ::2], batch.raw[:, :1]))
-    slope, metrics = jax.grad(agent.actor_loss, has_aux=True)(actor, (batch, KEY))
+    slope, (metrics, _) = jax.grad(agent.actor_loss, has_aux=True)(nets, batch, KEY)
     assert metrics["kl"] < 1e-6 and metrics["clip_fraction"] == 0
-    bias = np.asarray(slope.shared["head"]["bias"])
+    bias = np.asarray(slope["actor"].shared["head"]["bias"])
     assert np.all(bias[1::2] == 0) and np.all(bias[::2] != 0)
 
 
 def test_policies_begin_wide_and_alike():
     agent = small(initial_std=0.5)
     state = agent.init(SPEC, TASKS, KEY)
-    outputs = agent.actor.apply(of_task(state.actor, 0), TASKS.context[0], jnp.float32([[1, 2, 3], [-3, 0, 1]]))
+    outputs = agent.policy(of_task(state.nets, 0), TASKS.context[0], jnp.float32([[1, 2, 3], [-3, 0, 1]]))
     np.testing.assert_allclose(outputs[:, :2], 0, atol=0.1)
     at_mean = log_density(outputs, outputs[:, :2])
     np.testing.assert_allclose(at_mean, -2 * np.log(0.5 * np.sqrt(2 * np.pi)), atol=0.2)
@@ -292,18 +293,19 @@ def test_units_are_moments_of_all_targets_at_first(kind):
     state = agent.renew(state, targets[0])
     before = agent.values(state, TASKS.context, obs)
     state = agent.renew(state, targets[1])
+    units = Units.of(state.nets["units"])
     if kind == "none":
-        assert state.units.count == 0 and np.all(state.units.std == 1)
+        assert units.count == 0 and np.all(units.std == 1)
         return
     both = np.concatenate(targets, axis=1)
-    np.testing.assert_allclose(state.units.mean, both.mean(axis=1), rtol=1e-4)
-    np.testing.assert_allclose(state.units.variance, both.var(axis=1), rtol=1e-4)
+    np.testing.assert_allclose(units.moments.mean, both.mean(axis=1), rtol=1e-4)
+    np.testing.assert_allclose(units.moments.variance, both.var(axis=1), rtol=1e-4)
     after = agent.values(state, TASKS.context, obs)
     assert np.allclose(before, after, atol=1e-3) == (kind == "popart")
 
-    many = state._replace(units=state.units._replace(count=jnp.float32(500)))
-    moved = agent.renew(many, targets[0]).units
-    np.testing.assert_allclose(moved.mean, 0.9 * state.units.mean + 0.1 * targets[0].mean(axis=1), rtol=1e-4)
+    many = with_nets(state, units=units._replace(count=jnp.float32(500)).params())
+    moved = Units.of(agent.renew(many, targets[0]).nets["units"]).moments
+    np.testing.assert_allclose(moved.mean, 0.9 * units.moments.mean + 0.1 * targets[0].mean(axis=1), rtol=1e-4)
 
 
 @pytest.mark.parametrize("kind", ["none", "running", "popart"])
@@ -315,35 +317,36 @@ def test_targets_are_in_the_units_in_which_outputs_are_read(kind):
         steps, before = random_steps(agent, seed=seed), state
         state, batch, _ = agent.prepare(state, steps._replace(reward=10 + 5 * seed * steps.reward), TASKS)
         value = agent.values(before, batch.features, batch.obs)
-        np.testing.assert_allclose(state.units.rewards(batch.target), value + batch.advantage, rtol=1e-4, atol=1e-3)
-    assert (kind == "none") == bool(jnp.all(state.units.mean == before.units.mean))
+        units, old = (Units.of(x.nets["units"]) for x in (state, before))
+        np.testing.assert_allclose(units.rewards(batch.target), value + batch.advantage, rtol=1e-4, atol=1e-3)
+    assert (kind == "none") == bool(jnp.all(units.moments.mean == old.moments.mean))
 
 
 def test_popart_gives_the_critic_alone_a_head_for_every_task():
     agent = small(value_normalization="popart")
     state = agent.init(SPEC, TASKS, KEY)
-    assert "head" in state.critic.own and "head" in state.actor.shared
+    assert "head" in state.nets["critic"].own and "head" in state.nets["actor"].shared
     with pytest.raises(InputError, match="value-normalization=popart"):
         small(scaling="popart")
 
 
 def test_units_have_a_least_size():
-    assert np.all(np.asarray(Units(jnp.float32(1), jnp.zeros(2), jnp.zeros(2)).std) > 0)
+    assert np.all(np.asarray(Units(jnp.float32(1), Moments(jnp.zeros(2), jnp.zeros(2))).std) > 0)
 
 
 def test_moments_are_those_of_all_observations():
     """Of rollouts one after the other, as if they had come at once; in a mixture each task has its own."""
     agent, obs = small(), (np.random.default_rng(0).normal(size=(2, 3, 8, 3)) * 3 + 1).astype(np.float32)
     for mixed in (False, True):
-        moments = agent.init_moments(SPEC._replace(mixed=mixed), 3)
+        inputs = agent.init_inputs(SPEC._replace(mixed=mixed), 3)
         for batch in obs:
-            moments = agent.fit_moments(moments, jnp.asarray(batch))
+            inputs = agent.fit_inputs(inputs, jnp.asarray(batch))
         rows = np.moveaxis(obs, 1, 0).reshape(3, -1, 3) if mixed else np.asarray(obs).reshape(1, -1, 3)
         expected = [normalize.update(normalize.init(3), jnp.asarray(x)) for x in rows]
-        for found, wanted in zip(moments, map(jnp.stack, zip(*expected, strict=True)), strict=True):
+        for found, wanted in zip(inputs.parts["moments"], map(jnp.stack, zip(*expected, strict=True)), strict=True):
             np.testing.assert_allclose(found, wanted if mixed else wanted[0], rtol=1e-4)
     still = small(normalize_observations=False)
-    assert still.fit_moments(still.init_moments(SPEC, 3), obs[0]).count == 0
+    assert still.fit_inputs(still.init_inputs(SPEC, 3), obs[0]).parts["moments"].count == 0
 
 
 # Updates.
@@ -352,11 +355,10 @@ def test_moments_are_those_of_all_observations():
 class Ratios(PPO):
     """Tells how far the ratio of policies is from 1 at most."""
 
-    def actor_loss(self, actor, data):
-        loss, metrics = super().actor_loss(actor, data)
-        batch, _ = data
-        ratio = jnp.exp(log_density(self.actor.apply(actor, batch.features, batch.obs), batch.raw) - batch.log_prob)
-        return loss, metrics | {"ratio": jnp.max(jnp.abs(ratio - 1))}
+    def actor_loss(self, nets, batch, key):
+        loss, aux = super().actor_loss(nets, batch, key)
+        ratio = jnp.exp(log_density(self.policy(nets, batch.features, batch.obs), batch.raw) - batch.log_prob)
+        return loss, aux._replace(metrics=aux.metrics | {"ratio": jnp.max(jnp.abs(ratio - 1))})
 
 
 RATIOS = [
@@ -375,7 +377,8 @@ def test_the_ratio_is_one_before_the_first_step(row):
     agent = Ratios(**{field.name: getattr(agent, field.name) for field in dataclasses.fields(agent)})
     state, history = train(Walk(episode_length=40), agent, {"num_envs": 4, "unroll": 5, "chunk_steps": 60})
     assert history[0]["ratio"].max() < 1e-5 and history[0]["clip_fraction"].max() == 0
-    assert state.agent.moments.count == 2 * 4 * 60 and state.agent.moments.mean > 1
+    moments = state.agent.nets["inputs"].parts["moments"]
+    assert moments.count == 2 * 4 * 60 and moments.mean > 1
 
 
 @pytest.mark.parametrize("kind", ["none", "running", "popart"])
@@ -389,8 +392,9 @@ def test_values_are_clipped_around_the_outputs_from_before_the_update(kind):
         state, batch, _ = agent.prepare(state, steps, TASKS)
         now = agent.outputs(state, batch.features, batch.obs)
         np.testing.assert_allclose(batch.output, now, rtol=1e-3, atol=1e-4)
-        slope = jax.vmap(jax.grad(lambda critic, batch: agent.critic_loss(critic, batch)[0]), (OVER_TASKS, 0))
-        slopes = jax.tree.leaves(slope(state.critic, batch))
+        loss, params, data = agent.fits["critic"].problem(agent.critic_loss, state.nets, (batch,))
+        slope = jax.vmap(jax.grad(loss, has_aux=True), (OVER_TASKS, 0))
+        slopes = jax.tree.leaves(slope(params, data)[0])
         assert min(float(jnp.max(jnp.abs(x[task]))) for x in slopes for task in range(3)) > 0
 
 
@@ -399,11 +403,8 @@ def test_the_actor_rests_once_it_is_too_far_away():
     agent = small(kl_limit=1e-5, minibatches=4, epochs=2, normalize_observations=False, actor_lr=0.1)
     state = agent.init(SPEC, TASKS, KEY)
     steps = random_steps(agent)
-    outputs = jnp.zeros((3, LENGTH, ENVS, 4)) + agent.actor.apply(
-        of_task(state.actor, 0), TASKS.context[0], jnp.zeros(3)
-    )
     features = TASKS.context[:, None, None] * jnp.ones((3, LENGTH, ENVS, 1))
-    outputs = agent.actor.apply(of_task(state.actor, 0), features, steps.obs)
+    outputs = agent.policy(of_task(state.nets, 0), features, steps.obs)
     raw = steps.extras.raw * 0.5
     steps = steps._replace(extras=Taken(raw, log_density(outputs, raw), None))
     after, _ = jax.jit(agent.update)(state, steps, TASKS, KEY)
@@ -412,15 +413,16 @@ def test_the_actor_rests_once_it_is_too_far_away():
     renewed, batch, _ = agent.prepare(state, steps, TASKS)
     orders = agent.minibatch_indices(batch.advantage.shape[1], order_key)
     given = (orders[0], jax.random.split(key, len(orders))[0])
-    (first, within_limit), _ = jax.jit(agent.minibatch_step)(batch, renewed.critic, (renewed, jnp.bool_(True)), given)
+    slow, carry = renewed.nets["representation"], (renewed, jnp.bool_(True))
+    (first, within_limit), _ = jax.jit(agent.minibatch_step)(batch, slow, carry, given)
     assert within_limit
     close = lambda x, y: all(np.allclose(a, b, atol=1e-5) for a, b in zip(*map(jax.tree.leaves, (x, y)), strict=True))
-    assert close(after.actor, first.actor) and not close(after.actor, state.actor)
-    assert not close(after.critic, first.critic)
+    assert close(after.nets["actor"], first.nets["actor"]) and not close(after.nets["actor"], state.nets["actor"])
+    assert not close(after.nets["critic"], first.nets["critic"])
     far = small(kl_limit=1e9, minibatches=4, epochs=2, normalize_observations=False, actor_lr=0.1)
     free = small(minibatches=4, epochs=2, normalize_observations=False, actor_lr=0.1)
-    states = [jax.jit(x.update)(state, steps, TASKS, KEY)[0].actor for x in (far, free)]
-    assert close(*states) and not close(states[0], after.actor)
+    actors = [jax.jit(x.update)(state, steps, TASKS, KEY)[0].nets["actor"] for x in (far, free)]
+    assert close(*actors) and not close(actors[0], after.nets["actor"])
 
 
 def allowed(row):
@@ -518,7 +520,8 @@ def test_updates_are_finite_and_the_key_decides(row):
     update = quick(lambda state, key: agent.update(state, steps, TASKS, key), state, KEY)
     (after, metrics), (again, _), (other, _) = update(state, KEY), update(state, KEY), update(state, jax.random.key(3))
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves((after, metrics)))
-    leaves = [np.concatenate([np.ravel(x) for x in jax.tree.leaves(s.actor)]) for s in (state, after, again, other)]
+    policies = ((s.nets["actor"], s.nets["knowing"]) for s in (state, after, again, other))
+    leaves = [np.concatenate([np.ravel(x) for x in jax.tree.leaves(policy)]) for policy in policies]
     assert np.array_equal(leaves[1], leaves[2])
     assert not np.array_equal(leaves[0], leaves[1]) and not np.array_equal(leaves[1], leaves[3])
 
@@ -598,7 +601,7 @@ def test_probes_are_learned(kind):
     """Values of every task, and the best action where there is one."""
     agent, state, tasks, history = learned(kind)
     expected, obs, tolerance = KNOWN[kind]
-    seen = jax.vmap(lambda x: agent.see(state.moments, x[None]))(jnp.float32(obs))
+    seen = jax.vmap(lambda x: agent.see(state.nets["inputs"], x[None]))(jnp.float32(obs))
     found = agent.values(state, tasks.context, jnp.broadcast_to(seen, (2, *seen.shape)))
     for i, scale in enumerate(SCALES):
         wanted = [expected(scale, x) for x in obs]
@@ -615,7 +618,8 @@ def test_a_run_that_infers_its_task_stays_finite():
     agent = tiny("ppo", conditioning="inferred", inferred_from=4)
     state, history = train(Walk(), agent, {**LEARN, "chunk_steps": 80})
     assert history[0]["bad_step"].max() == -1
-    assert np.all(np.isfinite(np.concatenate([np.ravel(x) for x in jax.tree.leaves(state.agent.actor)])))
+    policy = state.agent.nets["actor"], state.agent.nets["knowing"]
+    assert np.all(np.isfinite(np.concatenate([np.ravel(x) for x in jax.tree.leaves(policy)])))
 
 
 @pytest.mark.slow
@@ -624,7 +628,6 @@ def test_seeds_are_alone():
     agent, given = tiny("ppo"), LEARN | {"chunk_steps": 40}
     both, _ = train(Walk(), agent, given, seeds=(3, 4))
     alone, _ = train(Walk(), agent, given, seeds=(4,))
-    for x, y in zip(
-        jax.tree.leaves(pick(both.agent.actor, 1)), jax.tree.leaves(pick(alone.agent.actor, 0)), strict=True
-    ):
+    actors = pick(both.agent.nets["actor"], 1), pick(alone.agent.nets["actor"], 0)
+    for x, y in zip(*map(jax.tree.leaves, actors), strict=True):
         np.testing.assert_allclose(x, y, atol=1e-4)
