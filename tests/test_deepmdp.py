@@ -20,15 +20,16 @@ from probes import (
     tasks_of,
     tiny,
     train,
+    with_nets,
 )
 from probes import act as act_once
 from probes import values as values_of
 
 from mtjax import agents
+from mtjax.agents.fit import learned
 from mtjax.agents.parts.gradients.balancing import FAMO
+from mtjax.agents.parts.knowing.last_steps import Past, Seen, append
 from mtjax.agents.parts.representations.deepmdp import ModelTargets
-from mtjax.agents.parts.representations.encoded import ENCODERS
-from mtjax.agents.parts.trajectory import Past, Seen, append
 from mtjax.agents.ppo import Taken
 from mtjax.agents.sac import Batch
 from mtjax.networks import Params
@@ -38,12 +39,19 @@ SPEC, BATCH = Spec.vector(3, 2, 1), 4
 TASKS = tasks_of("one-step", (1.0, -0.5, 0.3))
 KEY = jax.random.key(2)
 SMALL = {"latent_widths": (8, 6), "model_widths": (8,)}
-INFERRED = {"unseen_theta": "inferred", "inferred_from": 2}
+INFERRED = {"unseen_theta": "inferred", "theta_from": 2}
+OF_CRITICS = ("critic", "representation", "knowing")
 jit = partial(jax.jit, compiler_options=QUICK)
 
 
 def make(name, **settings):
-    return tiny(name, **{**SMALL, **settings})
+    theta = {"theta_size": 4} if "hip-bmdp" in (name, settings.get("representation")) else {}
+    return tiny(name, **{**SMALL, **theta, **settings})
+
+
+def of_critics(nets):
+    """Those networks that learn from the critics' loss."""
+    return {name: nets[name] for name in OF_CRITICS}
 
 
 def start(agent):
@@ -53,25 +61,24 @@ def start(agent):
 
 
 def random_params(agent, task=0):
-    """Actor and critics of one task, all random, so that no bias is zero."""
+    """Actor, critics and what they stand on, of one task, all random, so that no bias is zero."""
     state = jax.eval_shape(lambda: agent.init(SPEC, TASKS, KEY))
     random = np.random.default_rng(4)
     draw = lambda tree: jax.tree.map(lambda x: jnp.float32(random.normal(size=x.shape)), tree)
-    return tuple(of_task(draw(params), task) for params in (state.actor, state.critic))
+    return {name: of_task(draw(state.nets[name]), task) for name in ("actor", *OF_CRITICS)}
 
 
 def one_task(agent):
     """A batch of one task, as the losses see it, and what they fit, which is random: of the models, and of critics."""
     batch, random = pick(random_batch(1, 3, BATCH, SPEC, agent.history_length), 1), np.random.default_rng(6)
     next_past = append(batch.extras, batch.obs, batch.action, batch.reward) if agent.history_length else None
-    see = lambda obs, past: agent.see(None, obs, past)
+    see = lambda obs, past: agent.see(Params({}, {}), obs, past)
     normal = lambda *shape: jnp.float32(random.normal(size=shape))
-    width = {"parameters": 1, "one-hot": 3}.get(agent.conditioning, 0)
+    width = len(agent.conditioning.given(jnp.int32(0), pick(TASKS, 0), 3, None))
     drawn = agent.representation.transition == "probabilistic"
     value = normal(BATCH)
-    model_targets = ModelTargets(
-        normal(BATCH, 6), normal(BATCH, 6) if drawn else jnp.float32(0), normal(agent.embedding_size)
-    )
+    other_theta = normal(agent.representation.theta_size) if agent.representation.embeds else None
+    model_targets = ModelTargets(normal(BATCH, 6), normal(BATCH, 6) if drawn else jnp.float32(0), other_theta)
     seen = Batch(
         obs=see(batch.obs, batch.extras),
         action=batch.action,
@@ -111,10 +118,10 @@ def plain_model(params, *inputs):
     return dense(params["Dense_0"], np.maximum(norm(inner["LayerNorm_0"], dense(inner["Dense_0"], x)), 0))
 
 
-def plain_transition(agent, critic, features, batch):
+def plain_transition(agent, params, features, batch):
     """Mean and deviation of the next latent state."""
-    latent = plain_latent(critic.shared["latent"], np.asarray(batch.obs))
-    outputs = plain_model(critic.shared["transition"], latent, np.asarray(batch.action), features)
+    latent = plain_latent(params.shared["latent"], np.asarray(batch.obs))
+    outputs = plain_model(params.shared["transition"], latent, np.asarray(batch.action), features)
     if agent.representation.transition == "deterministic":
         return outputs, np.ones_like(outputs)
     mean, raw = np.split(outputs, 2, axis=-1)
@@ -126,14 +133,15 @@ def plain_transition(agent, critic, features, batch):
 def test_model_losses(name, transition):
     """The likelihood of the target encoder's next state, and the reward predicted from the state that is drawn."""
     agent = make(name, transition=transition)
-    _, critic = random_params(agent)
+    nets = random_params(agent)
+    params = nets["representation"]
     batch, value = one_task(agent)
     model_targets = batch.model_targets
-    features = np.asarray(critic.own["embedding"] if name == "hip-bmdp" else batch.features)
-    mean, deviation = plain_transition(agent, critic, features, batch)
+    features = np.asarray(params.own["embedding"] if name == "hip-bmdp" else batch.features)
+    mean, deviation = plain_transition(agent, params, features, batch)
     likelihood = 0.5 * ((mean - model_targets.latent) / deviation) ** 2 + np.log(deviation)
-    reward = plain_model(critic.shared["reward"], mean + deviation * np.asarray(model_targets.noise), features)[:, 0]
-    _, metrics = jit(agent.critic_loss)(critic, (batch, value))
+    reward = plain_model(params.shared["reward"], mean + deviation * np.asarray(model_targets.noise), features)[:, 0]
+    _, (metrics, *_) = jit(agent.critic_loss)(nets, batch, value)
     np.testing.assert_allclose(metrics["transition_loss"], likelihood.mean(), rtol=1e-4)
     np.testing.assert_allclose(metrics["reward_loss"], np.mean((reward - batch.reward) ** 2), rtol=1e-4)
 
@@ -145,12 +153,11 @@ def test_no_loss_is_less_than_the_least(name, transition, monkeypatch):
     without_theta = {"theta_coefficient": 0.0} if name == "hip-bmdp" else {}
     agent = make(name, transition=transition, model_coefficient=0.5, **without_theta)
     deviation = 0.01 if transition == "probabilistic" else 1.0
-    exact = lambda self, critic, features, latent, a: (jnp.full_like(latent, 0.3), jnp.full_like(latent, deviation))
+    exact = lambda self, params, features, latent, a: (jnp.full_like(latent, 0.3), jnp.full_like(latent, deviation))
     monkeypatch.setattr(type(agent.representation), "predict", exact)
-    _, critic = random_params(agent)
     batch, value = one_task(agent)
     model_targets = batch.model_targets._replace(latent=jnp.full_like(batch.model_targets.latent, 0.3))
-    loss, found = agent.critic_loss(critic, (batch._replace(model_targets=model_targets), value))
+    loss, (found, *_) = agent.critic_loss(random_params(agent), batch._replace(model_targets=model_targets), value)
     np.testing.assert_allclose(loss - agent.least_loss, found["critic_loss"] + 0.5 * found["reward_loss"], rtol=1e-4)
 
 
@@ -175,14 +182,13 @@ def test_rules_see_losses_from_the_least(name, transition, monkeypatch):
     state, found = jit(agent.update)(agent.init(SPEC, TASKS, KEY), batch, TASKS, KEY)
     surest = np.log(0.01) if transition == "probabilistic" else 0.0
     expected = found["critic_loss"] + 0.5 * (found["transition_loss"] + found["reward_loss"]) - 0.5 * surest
-    np.testing.assert_allclose(state.surgery.critic.logits, expected, rtol=1e-4)
+    np.testing.assert_allclose(state.fits["critic"].rule.logits, expected, rtol=1e-4)
 
 
 def test_the_losses_add_up():
     """Critics' loss, both models' by their coefficient, and theta's and the guess's."""
     agent = make("hip-bmdp", model_coefficient=0.5, theta_coefficient=0.3, **INFERRED)
-    _, critic = random_params(agent)
-    loss, found = jit(agent.critic_loss)(critic, one_task(agent))
+    loss, (found, *_) = jit(agent.critic_loss)(random_params(agent), *one_task(agent))
     models = 0.5 * (found["transition_loss"] + found["reward_loss"])
     expected = found["critic_loss"] + models + 0.3 * found["theta_loss"] + found["guess_loss"]
     np.testing.assert_allclose(loss, expected, rtol=1e-5)
@@ -191,7 +197,7 @@ def test_the_losses_add_up():
 @pytest.mark.parametrize("unit, length", [(False, 5), (True, 1)])
 def test_vectors_of_tasks_have_length_one_if_the_agent_says_so(unit, length):
     """One of length 0 stays as it is."""
-    theta_of = make("hip-bmdp", unit_embedding=unit).placed_representation.theta
+    theta_of = make("hip-bmdp", unit_theta=unit).representation.theta
     found = [theta_of(Params({}, {"embedding": jnp.array(theta)})) for theta in ([3.0, 0.0, 4.0], [0.0] * 3)]
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), (length, 0), rtol=1e-6)
 
@@ -200,18 +206,18 @@ def test_vectors_of_tasks_have_length_one_if_the_agent_says_so(unit, length):
 def test_theta_loss(transition):
     """Per sample: the distance of two vectors against that of the two predictions, in mean and deviation."""
     agent = make("hip-bmdp", transition=transition)
-    _, critic = random_params(agent)
+    params = random_params(agent)["representation"]
     batch, _ = one_task(agent)
-    theta, other_theta = np.asarray(critic.own["embedding"]), np.asarray(batch.model_targets.other_theta)
-    ours, theirs = (np.stack(plain_transition(agent, critic, x, batch)) for x in (theta, other_theta))
+    theta, other_theta = np.asarray(params.own["embedding"]), np.asarray(batch.model_targets.other_theta)
+    ours, theirs = (np.stack(plain_transition(agent, params, x, batch)) for x in (theta, other_theta))
     moved = np.sqrt(((ours - theirs) ** 2).sum(axis=(0, 2)))
-    loss = jit(agent.placed_representation.theta_loss)(critic, batch.features, batch.obs, batch.action, other_theta)
+    loss = jit(agent.representation.theta_loss)(params, batch.features, batch.obs, batch.action, other_theta)
     np.testing.assert_allclose(loss, (np.linalg.norm(theta - other_theta) - moved) ** 2, rtol=1e-4)
 
 
 def test_theta_loss_of_three_tasks_by_hand(monkeypatch):
     """Thetas 3, 4 and 5 apart, and a state s that moves predictions by s theta: (d - |s| d)^2 for each sample."""
-    representation = make("hip-bmdp", embedding_size=2).placed_representation
+    representation = make("hip-bmdp", theta_size=2).representation
     monkeypatch.setattr(
         type(representation), "predict", lambda self, p, features, latent, a: (latent * features, 0 * latent * features)
     )
@@ -219,8 +225,8 @@ def test_theta_loss_of_three_tasks_by_hand(monkeypatch):
     thetas = np.array([[0, 0], [3, 0], [3, 4]], np.float32)
     obs = jnp.float32([[0.0], [1.0], [-3.0]])
     for i, j, apart in ((0, 1, 3), (1, 2, 4), (2, 0, 5), (0, 0, 0)):
-        critic = Params({}, {"embedding": jnp.asarray(thetas[i])})
-        loss = representation.theta_loss(critic, jnp.zeros(0), obs, jnp.zeros((3, 1)), jnp.asarray(thetas[j]))
+        params = Params({}, {"embedding": jnp.asarray(thetas[i])})
+        loss = representation.theta_loss(params, jnp.zeros(0), obs, jnp.zeros((3, 1)), jnp.asarray(thetas[j]))
         np.testing.assert_allclose(loss, np.square([apart, 0.0, 2 * apart]), rtol=1e-5, atol=1e-5)
 
 
@@ -230,19 +236,19 @@ def test_a_rival_is_always_another_task():
     agent = make("hip-bmdp")
     state, batch, _ = start(agent)
     _, seen = agent.prepare(state, batch, TASKS)
-    rivals = jit(lambda key: agent.critic_problem(state, seen, key)[1][0].model_targets.other_theta)
-    thetas, turns = np.asarray(state.critic.own["embedding"]), set()
+    rivals = jit(lambda key: agent.critic_data(state, seen, key)[0].model_targets.other_theta)
+    thetas, turns = np.asarray(state.nets["representation"].own["embedding"]), set()
     for seed in range(12):
         found = np.asarray(rivals(jax.random.key(seed)))
         turns.add(tuple(int(np.flatnonzero((thetas == x).all(axis=1))[0]) for x in found))
     assert turns == {(1, 2, 0), (2, 0, 1)}
 
     first = lambda tree: jax.tree.map(lambda x: x[:1], tree)
-    state = state._replace(critic=Params(state.critic.shared, first(state.critic.own)))
-    state = state._replace(target=Params(state.target.shared, first(state.target.own)))
-    loss, data = agent.critic_problem(state, first(seen), KEY)
-    theta_loss = lambda critic: loss(critic, jax.tree.map(lambda x: x[0], data))[1]["theta_loss"]
-    value, slope = jit(jax.value_and_grad(theta_loss))(of_task(state.critic, 0))
+    alone = lambda nets: {name: Params(net.shared, first(net.own)) for name, net in nets.items()}
+    state = state._replace(nets=alone(state.nets), slow=alone(state.slow))
+    data = pick(agent.critic_data(state, first(seen), KEY), 0)
+    theta_loss = lambda nets: agent.critic_loss(nets, *data)[1].metrics["theta_loss"]
+    value, slope = jit(jax.value_and_grad(theta_loss))(of_critics(of_task(state.nets, 0)))
     np.testing.assert_allclose(value, 0, atol=1e-10)
     assert not any(np.any(x) for x in jax.tree.leaves(slope))
 
@@ -260,17 +266,17 @@ REACHES = {
 
 
 def reached(slopes):
-    """Parts of a network of which some leaf has a slope."""
-    parts = {**slopes.shared, **slopes.own}
-    return {name for name, part in parts.items() if any(np.any(x) for x in jax.tree.leaves(part))}
+    """Parts of networks of which some leaf has a slope."""
+    parts = [part for net in slopes.values() for part in (*net.shared.items(), *net.own.items())]
+    return {name for name, part in parts if any(np.any(x) for x in jax.tree.leaves(part))}
 
 
 def test_each_loss_reaches_its_own_parameters_alone():
     """Encoder and theta learn from critics and models, theta alone from its loss, and the guess by itself."""
     agent = make("hip-bmdp", transition="probabilistic", **INFERRED)
-    _, critic = random_params(agent)
-    data = one_task(agent)
-    jacobian = jit(jax.jacrev(lambda critic: {k: agent.critic_loss(critic, data)[1][k] for k in REACHES}))(critic)
+    nets, data = of_critics(random_params(agent)), one_task(agent)
+    metrics = lambda nets: agent.critic_loss(nets, *data)[1].metrics
+    jacobian = jit(jax.jacrev(lambda nets: {k: metrics(nets)[k] for k in REACHES}))(nets)
     for loss, expected in REACHES.items():
         assert reached(jacobian[loss]) == expected, loss
 
@@ -278,24 +284,27 @@ def test_each_loss_reaches_its_own_parameters_alone():
 def test_what_is_detached_stays():
     """The next state, the rival's theta, and whatever the actor stands on."""
     agent = make("hip-bmdp", transition="probabilistic", **INFERRED)
-    actor, critic = random_params(agent)
+    nets = random_params(agent)
     batch, value = one_task(agent)
     model_targets = batch.model_targets
-    model = lambda x: agent.critic_loss(critic, (batch._replace(model_targets=model_targets._replace(**x)), value))[0]
+    model = lambda x: agent.critic_loss(nets, batch._replace(model_targets=model_targets._replace(**x)), value)[0]
     slopes = jit(jax.grad(model))({"latent": model_targets.latent, "other_theta": model_targets.other_theta})
     assert not any(np.any(x) for x in jax.tree.leaves(slopes))
-    acted = lambda actor, critic: jnp.sum(agent.policy(actor, critic, batch.features, batch.obs) ** 2)
-    of_actor, of_critic = jit(jax.grad(acted, argnums=(0, 1)))(actor, critic)
-    assert reached(of_actor) == {"body", "head"} and reached(of_critic) == set()
+    acted = lambda nets, batch: (jnp.sum(agent.policy(nets, batch.features, batch.obs) ** 2), None)
+    loss, params, data = agent.fits["actor"].problem(acted, nets, (batch,))
+    slopes, _ = jit(jax.grad(loss, has_aux=True))(params, data)
+    assert set(slopes.shared) == set(slopes.own) == {"actor"}
+    assert reached({"actor": Params(slopes.shared["actor"], slopes.own["actor"])}) == {"body", "head"}
 
 
 def test_the_actor_does_not_move_the_critics_parameters():
     """With discount 0 another actor and other temperatures leave critics, encoder, models and theta bit for bit."""
     state, batch, update = start(make("hip-bmdp"))
     batch = batch._replace(discount=jnp.zeros((3, BATCH)))
-    other = state._replace(actor=jax.tree.map(lambda x: x * 1.5 + 0.05, state.actor), log_temperature=jnp.ones(3))
-    plain, moved = (update(x, batch, TASKS, KEY)[0] for x in (state, other))
-    for a, b in zip(jax.tree.leaves(plain.critic), jax.tree.leaves(moved.critic), strict=True):
+    actor = jax.tree.map(lambda x: x * 1.5 + 0.05, state.nets["actor"])
+    other = with_nets(state, actor=actor, temperature=Params({}, {"log": jnp.ones(3)}))
+    plain, moved = (of_critics(update(x, batch, TASKS, KEY)[0].nets) for x in (state, other))
+    for a, b in zip(jax.tree.leaves(plain), jax.tree.leaves(moved), strict=True):
         np.testing.assert_array_equal(a, b)
 
 
@@ -320,49 +329,50 @@ def test_everything_that_should_learn_does(name, settings):
         after, metrics = update(after, random_batch(i, 3, BATCH, SPEC, agent.history_length), TASKS, jax.random.key(i))
     assert jax.tree.map(jnp.shape, after) == jax.tree.map(jnp.shape, before)
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves((after, metrics)))
-    for network in ("actor", "critic", "target"):
-        old, new = (jax.tree_util.tree_leaves_with_path(getattr(x, network)) for x in (before, after))
-        for (path, a), (_, b) in zip(old, new, strict=True):
-            rows = range(3) if path[0].name == "own" else (slice(None),)
-            for i in rows:
-                assert not np.array_equal(a[i], b[i]), f"{network}{jax.tree_util.keystr(path)} stayed"
+    trained = learned(agent.fits.values())
+    assert {"actor", *OF_CRITICS} <= set(trained) and set(after.slow) == set(OF_CRITICS)
+    networks = lambda state: ({name: state.nets[name] for name in trained}, state.slow)
+    old, new = (jax.tree_util.tree_leaves_with_path(networks(x)) for x in (before, after))
+    for (path, a), (_, b) in zip(old, new, strict=True):
+        rows = range(3) if path[2].name == "own" else (slice(None),)
+        for i in rows:
+            assert not np.array_equal(a[i], b[i]), f"{jax.tree_util.keystr(path)} stayed"
 
 
 def test_the_slow_encoder_follows_at_its_own_rate():
     """And so does theta; body and head take ``tau``. Models have no slow copy."""
     agent = make("hip-bmdp")
     state, batch, update = start(agent)
-    moved = state._replace(target=jax.tree.map(lambda x: x * 1.5 + 0.05, state.target))
+    moved = state._replace(slow=jax.tree.map(lambda x: x * 1.5 + 0.05, state.slow))
     after, _ = update(moved, batch, TASKS, KEY)
-    assert set(after.target.shared) == {"body", "head", "latent"} and set(after.target.own) == {"embedding"}
-    for old, new, target in zip(moved.target, after.critic, after.target, strict=True):
-        for part, found in target.items():
-            rate = 0.05 if part in ENCODERS else 0.005
-            mixed = jax.tree.map(lambda a, b, rate=rate: (1 - rate) * a + rate * b, old[part], new[part])
+    of_critic, of_representation = after.slow["critic"], after.slow["representation"]
+    assert set(of_critic.shared) == {"body", "head"} and not of_critic.own
+    assert set(of_representation.shared) == {"latent"} and set(of_representation.own) == {"embedding"}
+    assert set(after.slow) == set(OF_CRITICS) and not after.slow["knowing"].parts
+    for name, rate in (("critic", 0.005), ("representation", 0.05)):
+        for part, found in after.slow[name].parts.items():
+            old, new = moved.slow[name].parts[part], after.nets[name].parts[part]
+            mixed = jax.tree.map(lambda a, b, rate=rate: (1 - rate) * a + rate * b, old, new)
             jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), found, mixed)
 
 
 def test_the_target_is_the_slow_encoders():
     """Next latent states come from the slow copy; the slow critics stand on it, too."""
     agent = make("deepmdp")
-    _, critic = random_params(agent)
+    nets = random_params(agent)
     batch, _ = one_task(agent)
-    target_critic = jax.tree.map(lambda x: x * 1.5 + 0.05, critic).without(agent.representation.models)
-    assert set(target_critic.shared) == {"body", "head", "latent"}
+    slow = jax.tree.map(lambda x: x * 1.5 + 0.05, agent.init_slow(nets))
+    assert set(slow["critic"].shared) == {"body", "head"} and set(slow["representation"].shared) == {"latent"}
     every = lambda tree: jax.tree.map(lambda x: x[None], tree)  # one task is all
     of_all = lambda params: params._replace(own=every(params.own))
-    model_targets, _ = jit(agent.placed_representation.targets)(
-        of_all(critic), of_all(target_critic), every(batch.next_obs), KEY
+    model_targets, _ = jit(agent.representation.targets)(
+        of_all(nets["representation"]), of_all(slow["representation"]), every(batch.next_obs), KEY
     )
-    expected = plain_latent(target_critic.shared["latent"], np.asarray(batch.next_obs))
+    expected = plain_latent(slow["representation"].shared["latent"], np.asarray(batch.next_obs))
     np.testing.assert_allclose(model_targets.latent[0], expected, rtol=1e-4, atol=1e-5)
-    features, latent = agent.placed_representation.perceive(target_critic, batch.features, batch.obs)
-    plain = jax.vmap(agent.critic.apply, (0, None, None, None))(
-        target_critic.without(agent.representation.names), features, latent, batch.action
-    )
-    np.testing.assert_allclose(
-        agent.values(target_critic, batch.features, batch.obs, batch.action), plain[..., 0], rtol=1e-5
-    )
+    features, latent = agent.representation.perceive(slow["representation"], batch.features, batch.obs)
+    plain = jax.vmap(agent.critic.apply, (0, None, None, None))(slow["critic"], features, latent, batch.action)
+    np.testing.assert_allclose(agent.values(slow, batch.features, batch.obs, batch.action), plain[..., 0], rtol=1e-5)
 
 
 # Tasks that were not trained on.
@@ -375,10 +385,11 @@ def test_theta_of_an_unseen_task(strategy):
     """It acts as a training task that had that theta would; training tasks keep their own."""
     agent, plain = make("hip-bmdp", unseen_theta=strategy), make("hip-bmdp")
     state, _, _ = start(plain)
-    thetas, obs = state.critic.own["embedding"], jnp.ones(3)
+    params, obs = state.nets["representation"], jnp.ones(3)
+    thetas = params.own["embedding"]
     act = jit(lambda state, task: act_once(agent, state, obs, task, None))
     stand_in = {"nearest": thetas[2], "zero": jnp.zeros(4), "mean": np.mean(thetas, axis=0)}[strategy]
-    given = state._replace(critic=state.critic._replace(own={"embedding": thetas.at[0].set(stand_in)}))
+    given = with_nets(state, representation=params._replace(own={"embedding": thetas.at[0].set(stand_in)}))
     np.testing.assert_allclose(act(state, STRANGER), act(given, pick(TASKS, 0)), atol=1e-6)
     for i in range(3):
         expected = act_once(plain, state, obs, pick(TASKS, i), None)
@@ -401,9 +412,10 @@ def test_theta_of_an_unseen_task_is_inferred_from_its_last_steps():
     state, batch, _ = start(agent)
     act = jit(lambda state, past, task: act_once(agent, state, batch.obs[0, 0], task, None, past))
     past = pick(batch.extras, (0, 0))
-    guess = agent.placed_representation.apply(state.critic, "guess", agent.see(state.moments, batch.obs[0, 0], past))
-    thetas = state.critic.own["embedding"]
-    given = state._replace(critic=state.critic._replace(own={"embedding": thetas.at[0].set(guess)}))
+    params = state.nets["representation"]
+    guess = agent.representation.apply(params, "guess", agent.see(state.nets["inputs"], batch.obs[0, 0], past))
+    thetas = params.own["embedding"]
+    given = with_nets(state, representation=params._replace(own={"embedding": thetas.at[0].set(guess)}))
     np.testing.assert_allclose(act(state, past, STRANGER), act(given, past, pick(TASKS, 0)), atol=1e-6)
     other = past._replace(reward=past.reward + 1.0)
     assert not np.allclose(act(state, past, STRANGER), act(state, other, STRANGER))
@@ -419,12 +431,12 @@ def test_the_guess_finds_the_theta_of_the_task_that_steps_were_taken_in():
     env = Probe("endless", episode_length=4)
     state, history = train(env, agent, given | {"warmup_hold": 1, "chunk_steps": 300})
     assert history[0]["guess_loss"].shape == (1, 2)
-    state = only_seed(state.agent)
-    thetas = state.critic.own["embedding"]
+    params = only_seed(state.agent).nets["representation"]
+    thetas = params.own["embedding"]
     reward = jnp.float32([1.0, -0.5])[:, None]  # of a step taken from 1, which comes second
     ones = jnp.ones((2, 2))
     past = Past(jnp.float32([[[0.0], [1.0]]] * 2), jnp.zeros((2, 2, 1)), jnp.concatenate([0 * reward, reward], 1), ones)
-    guess = agent.placed_representation.apply(state.critic, "guess", Seen(jnp.ones((2, 1)), past))
+    guess = agent.representation.apply(params, "guess", Seen(jnp.ones((2, 1)), past))
     distances = np.linalg.norm(guess[:, None] - thetas, axis=-1)
     assert np.all(np.diagonal(distances) < 0.3 * np.linalg.norm(thetas[0] - thetas[1]))
 
@@ -455,14 +467,14 @@ def test_the_transition_model_learns_linear_dynamics():
     assert np.all(last < 0.02 * first), (first, last)
     assert np.all(np.mean(history["reward_loss"][-50:], axis=0) < 0.02)
 
-    def predicted(critic: Params, batch):
+    def predicted(params: Params, batch):
         """The next latent states of one task, as predicted and as they are."""
-        features = critic.own["embedding"]
-        latent, then = (agent.placed_representation.apply(critic, "latent", x) for x in (batch.obs, batch.next_obs))
-        return agent.placed_representation.predict(critic, features, latent, batch.action)[0], then
+        features = params.own["embedding"]
+        latent, then = (agent.representation.apply(params, "latent", x) for x in (batch.obs, batch.next_obs))
+        return agent.representation.predict(params, features, latent, batch.action)[0], then
 
     fresh = experience(jax.random.key(9))
-    mean, then = jit(jax.vmap(predicted, (Params(None, 0), 0)))(state.critic, fresh)
+    mean, then = jit(jax.vmap(predicted, (Params(None, 0), 0)))(state.nets["representation"], fresh)
     error, spread = np.mean((mean - then) ** 2, axis=(1, 2)), np.mean(np.var(then, axis=1), axis=-1)
     # Not because all states look alike. Bounds are half as far again as the worst of three seeds, or further.
     assert np.all(spread > 0.01) and np.all(error < 0.2 * spread), (error, spread)
@@ -490,8 +502,8 @@ def test_values_are_learned_through_the_slow_encoder():
         2,
         [
             *({"conditioning": conditioning} for conditioning in ("one-hot", "embedding", "parameters", "inferred")),
-            {"conditioning": "embedding", "unit_embedding": True, "unseen_theta": "zero"},
-            {"conditioning": "inferred", **INFERRED},
+            {"conditioning": "embedding", "unit_embedding": True, "unit_theta": True, "unseen_theta": "zero"},
+            {"conditioning": "inferred", "inferred_from": 2, **INFERRED},
             {"encoder": "care"},
             {"value": "hl-gauss"},
             {"heads": "per-task", "gradients": "pcgrad", "gradient_scope": "per-layer"},
@@ -503,7 +515,7 @@ def test_values_are_learned_through_the_slow_encoder():
 @pytest.mark.parametrize("name", slow_but(["deepmdp", "hip-bmdp"], "hip-bmdp"))
 def test_parts_combine(name, settings):
     """Traced over two seeds, not run: an update keeps shapes and types, and there is an action for each world."""
-    settings = {k: v for k, v in settings.items() if name == "hip-bmdp" or k != "unseen_theta"}
+    settings = {k: v for k, v in settings.items() if name == "hip-bmdp" or "theta" not in k}
     agent, keys = make(name, **settings), jax.random.split(KEY, 2)
     batch = jax.tree.map(lambda x: jnp.stack([x, x]), random_batch(0, 3, BATCH, SPEC, agent.history_length))
     state = jax.eval_shape(jax.vmap(lambda key: agent.init(SPEC, TASKS, key)), keys)
@@ -520,8 +532,7 @@ def test_the_agents_are_sac_with_that_part():
     """And another representation in its place leaves SAC as it is."""
     assert agents.agent("deepmdp") == agents.agent("sac-conditioned", representation="deepmdp")
     assert agents.agent("deepmdp", representation="plain") == agents.agent("sac-conditioned")
-    theta = {"conditioning": "embedding", "embedding_size": 50}
-    assert agents.agent("hip-bmdp") == agents.agent("sac", representation="hip-bmdp", **theta)
+    assert agents.agent("hip-bmdp") == agents.agent("sac", representation="hip-bmdp", theta_size=50)
 
 
 @pytest.mark.parametrize("representation", slow_but(["deepmdp", "hip-bmdp"], "deepmdp"))
@@ -536,9 +547,10 @@ def test_other_agents_stand_on_it(name, representation):
     assert jax.tree.map(jnp.shape, after) == jax.tree.map(jnp.shape, state)
     assert metrics["transition_loss"].shape == metrics["reward_loss"].shape == (3,)
     place = "own" if name == "disjoint" else "shared"
-    for network, there in ((state.critic, {"latent", "transition", "reward"}), (state.target, {"latent"})):
-        assert {"latent", "transition", "reward"} & set(getattr(network, place)) == there
-    assert not set(agent.representation.names) & {*state.actor.shared, *state.actor.own}
+    for nets, there in ((state.nets, {"latent", "transition", "reward"}), (state.slow, {"latent"})):
+        assert {"latent", "transition", "reward"} & set(getattr(nets["representation"], place)) == there
+        assert not set(agent.representation.names) & set(nets["critic"].parts)
+    assert not set(agent.representation.names) & set(state.nets["actor"].parts)
     assert jax.eval_shape(lambda s: act_once(agent, s, jnp.ones(3), STRANGER, None), state).shape == (2,)
 
 
@@ -560,10 +572,11 @@ def rollouts(agent, seed=0):
 
 
 def of_first_task(agent, state, steps):
-    """The critic of the first task, and its steps as the losses see them."""
+    """What the critic's loss of the first task trains, and its steps as the losses see them."""
     _, batch, _ = agent.prepare(state, steps, TASKS)
-    model_targets, _ = agent.placed_representation.targets(state.critic, state.critic, batch.next_obs, KEY)
-    return of_task(state.critic, 0), pick(batch._replace(model_targets=model_targets), 0)
+    params = state.nets["representation"]
+    model_targets, _ = agent.representation.targets(params, params, batch.next_obs, KEY)
+    return of_critics(of_task(state.nets, 0)), pick(batch._replace(model_targets=model_targets), 0)
 
 
 @pytest.mark.slow
@@ -572,14 +585,14 @@ def test_ppos_critic_loss_reaches_the_representation():
     agent = make_ppo(representation="hip-bmdp", transition="probabilistic", **INFERRED)
     state = agent.init(SPEC, TASKS, KEY)
     draw = lambda x: x + 0.1 * jnp.float32(np.random.default_rng(4).normal(size=x.shape))  # heads begin near zero
-    state = state._replace(critic=jax.tree.map(draw, state.critic))
-    critic, batch = of_first_task(agent, state, rollouts(agent))
-    jacobian = jit(jax.jacrev(lambda critic: {k: agent.critic_loss(critic, batch)[1][k] for k in REACHES}))(critic)
+    state = with_nets(state, **jax.tree.map(draw, of_critics(state.nets)))
+    nets, batch = of_first_task(agent, state, rollouts(agent))
+    jacobian = jit(jax.jacrev(lambda nets: {k: agent.critic_loss(nets, batch)[1][k] for k in REACHES}))(nets)
     for loss, expected in REACHES.items():
         assert reached(jacobian[loss]) == expected, loss
-    whole = jit(jax.grad(lambda critic: agent.critic_loss(critic, batch)[0]))(critic)
+    whole = jit(jax.grad(lambda nets: agent.critic_loss(nets, batch)[0]))(nets)
     assert reached(whole) == set.union(*REACHES.values())
-    loss, found = jit(agent.critic_loss)(critic, batch)
+    loss, found = jit(agent.critic_loss)(nets, batch)
     models = found["transition_loss"] + found["reward_loss"]
     expected = found["critic_loss"] + models + 0.01 * found["theta_loss"] + found["guess_loss"]
     np.testing.assert_allclose(loss, expected, rtol=1e-5)
@@ -591,17 +604,18 @@ def test_ppos_actor_does_not_train_the_representation():
     agents_of = [make_ppo(representation="hip-bmdp", entropy_cost=cost) for cost in (0.0, 1.0)]
     steps = rollouts(agents_of[0])
     state = agents_of[0].init(SPEC, TASKS, KEY)
-    other = state._replace(actor=jax.tree.map(lambda x: x * 1.5 + 0.05, state.actor))
+    other = with_nets(state, actor=jax.tree.map(lambda x: x * 1.5 + 0.05, state.nets["actor"]))
     plain, *moved = (
-        jit(agent.update)(start, steps, TASKS, KEY)[0]
+        jit(agent.update)(start, steps, TASKS, KEY)[0].nets
         for agent, start in ((agents_of[0], state), (agents_of[1], state), (agents_of[0], other))
     )
     for after in moved:
-        for a, b in zip(jax.tree.leaves(plain.critic), jax.tree.leaves(after.critic), strict=True):
+        for a, b in zip(jax.tree.leaves(of_critics(plain)), jax.tree.leaves(of_critics(after)), strict=True):
             np.testing.assert_array_equal(a, b)
-        assert reached(jax.tree.map(jnp.subtract, plain.actor, after.actor)) == {"body", "head"}
+        actors = {"actor": plain["actor"]}, {"actor": after["actor"]}
+        assert reached(jax.tree.map(jnp.subtract, *actors)) == {"body", "head"}
     # And what the actor does depends on it: the same actor on another encoder acts otherwise.
-    blind = state._replace(critic=jax.tree.map(lambda x: x * 1.5 + 0.05, state.critic))
+    blind = with_nets(state, representation=jax.tree.map(lambda x: x * 1.5 + 0.05, state.nets["representation"]))
     seeing, other = (act_once(agents_of[0], x, jnp.ones(3), pick(TASKS, 0), None) for x in (state, blind))
     assert not np.array_equal(seeing, other)
 
@@ -611,13 +625,13 @@ def test_ppos_models_predict_what_the_encoder_saw_before_the_update():
     agent = make_ppo(representation="deepmdp")
     state = agent.init(SPEC, TASKS, KEY)
     state, batch, _ = agent.prepare(state, rollouts(agent), TASKS)
-    given = (jnp.arange(8), KEY)
-    step = jit(lambda target_critic: agent.minibatch_step(batch, target_critic, (state, jnp.bool_(True)), given)[1])
-    now, other = step(state.critic), step(jax.tree.map(lambda x: x * 1.5 + 0.05, state.critic))
+    given, params = (jnp.arange(8), KEY), state.nets["representation"]
+    step = jit(lambda slow: agent.minibatch_step(batch, slow, (state, jnp.bool_(True)), given)[1])
+    now, other = step(params), step(jax.tree.map(lambda x: x * 1.5 + 0.05, params))
     np.testing.assert_array_equal(now["critic_loss"], other["critic_loss"])
     assert np.all(np.asarray(now["transition_loss"]) != np.asarray(other["transition_loss"]))
-    critic, one = of_first_task(agent, state, rollouts(agent))
-    expected = plain_latent(critic.shared["latent"], np.asarray(one.next_obs))
+    nets, one = of_first_task(agent, state, rollouts(agent))
+    expected = plain_latent(nets["representation"].shared["latent"], np.asarray(one.next_obs))
     np.testing.assert_allclose(one.model_targets.latent, expected, rtol=1e-4, atol=1e-5)
 
 
@@ -629,7 +643,7 @@ def test_ppo_learns_a_model_of_its_rollouts():
     steps = steps._replace(next_obs=then, reward=then[..., 0])
     learn = lambda state, key: agent.update(state, steps, TASKS, key)
     after, history = jit(lambda state: jax.lax.scan(learn, state, jax.random.split(KEY, 300)))(before)
-    moved = jax.tree.map(jnp.subtract, after.critic, before.critic)
+    moved = jax.tree.map(jnp.subtract, of_critics(after.nets), of_critics(before.nets))
     assert reached(moved) == {"body", "head", "latent", "transition", "reward"}
     for name in ("transition_loss", "reward_loss"):
         assert np.all(history[name][-1] < 0.2 * history[name][0]), (name, history[name][-1] / history[name][0])
