@@ -22,6 +22,7 @@ from probes import (
     tiny,
     train,
     values,
+    with_nets,
 )
 
 from mtjax import normalize
@@ -271,16 +272,18 @@ def test_an_update_rescales_critic_and_target_beside_its_own_step():
     (init, update), (_, plain_update) = learner(scaled, TASKS, BATCH, SPEC), learner(plain, TASKS, BATCH, SPEC)
     state, batch = init(TASKS, KEY), random_batch(0, 3, BATCH, SPEC)
     after, metrics = update(state, batch, TASKS, KEY)
-    expected, _ = plain_update(state._replace(scales=None), batch, TASKS, KEY)
-    assert not np.allclose(after.scales.mean, state.scales.mean, atol=1e-6)
+    expected, _ = plain_update(with_nets(state, scaling=Params({}, None)), batch, TASKS, KEY)
+    scales = after.nets["scaling"].own
+    assert not np.allclose(scales.mean, state.nets["scaling"].own.mean, atol=1e-6)
     assert "target" not in metrics
-    factor, offset = units(scaled.scaling, after.scales)
-    for network in ("critic", "target"):
-        found, wanted = (getattr(x, network).own["head"] for x in (after, expected))
+    factor, offset = units(scaled.scaling, scales)
+    for kind in ("nets", "slow"):
+        found, wanted = (getattr(x, kind)["critic"].own["head"] for x in (after, expected))
         np.testing.assert_allclose(found["kernel"], wanted["kernel"] * factor[:, None, None, None], rtol=1e-5)
         biases = (wanted["bias"] - offset[:, None, None]) * factor[:, None, None]
         np.testing.assert_allclose(found["bias"], biases, rtol=1e-4, atol=1e-6)
-    np.testing.assert_array_equal(after.actor.own["head"]["kernel"], expected.actor.own["head"]["kernel"])
+    found, wanted = (x.nets["actor"].own["head"]["kernel"] for x in (after, expected))
+    np.testing.assert_array_equal(found, wanted)
 
 
 @pytest.mark.parametrize("name", ["reward", "return", "return-std"])
@@ -292,10 +295,11 @@ def test_statistics_change_by_what_is_observed_alone(name):
     state, batch = init(TASKS, KEY), random_batch(0, 3, BATCH, SPEC)
     seen = scaled.observe(state, next(stream(np.full((1, 3, 2), [[5.0], [1.0], [90.0]]))))
     same = lambda a, b: all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
-    assert not same(seen.scales, state.scales)
-    assert same(seen._replace(scales=None), state._replace(scales=None))
+    scales = lambda state: state.nets["scaling"]
+    assert not same(scales(seen), scales(state))
+    assert same(with_nets(seen, scaling=None), with_nets(state, scaling=None))
     (before, first), (after, second) = update(state, batch, TASKS, KEY), update(seen, batch, TASKS, KEY)
-    assert same(before.scales, state.scales) and same(after.scales, seen.scales)
+    assert same(scales(before), scales(state)) and same(scales(after), scales(seen))
     assert not np.allclose(first["critic_loss"], second["critic_loss"])
 
 
@@ -347,7 +351,7 @@ def test_values_are_known_in_reward_whatever_their_scale(name, settings):
     tasks = tasks_of("delayed", scales)
     state, history = train(Probe("delayed"), scaled, LEARNING, tasks=tasks)
     state = only_seed(state.agent)
-    factor, offset = units(scaled.scaling, state.scales, gamma=0.9)
+    factor, offset = units(scaled.scaling, state.nets["scaling"].own, gamma=0.9)
     found = values(scaled, state, tasks, [0.0, 1.0], [0.1, -0.6]) / factor[:, None, None] + offset[:, None, None]
     for estimates, scale in zip(found, scales, strict=True):
         np.testing.assert_allclose(estimates / scale, np.tile([0.9, 1.0], (2, 1)), atol=0.1)
@@ -404,15 +408,14 @@ def test_a_reset_renews_all_that_learns_and_nothing_else():
         state, _ = update(state, random_batch(i, 3, BATCH, SPEC), TASKS, jax.random.key(i))
     key = jax.random.key(7)
     fresh, anew = init(TASKS, key), jax.jit(partial(scaled.reset_networks, spec=SPEC, tasks=TASKS, key=key))(state)
-    kept = ("moments", "contexts", "progress")
-    for field in state._fields:
-        given = getattr(state if field in kept else fresh, field)
-        given = scaled.scaling.reset(state.scales) if field == "scales" else given
-        assert jax.tree.structure(given) == jax.tree.structure(getattr(anew, field))
-        for a, b in zip(jax.tree.leaves(given), jax.tree.leaves(getattr(anew, field)), strict=True):
-            np.testing.assert_allclose(a, b, rtol=1e-6, err_msg=field)
-    assert anew.moments.count == 3 * 3 * BATCH and np.all(anew.progress.known)
-    assert np.all(state.scales.factor > 0) and np.all(anew.scales.factor == 0) and np.all(anew.scales.count == 6)
+    kept = {name: state.nets[name] for name in ("inputs", "tasks", "sampler")}
+    before, after = (x.nets["scaling"].own for x in (state, anew))
+    given = with_nets(fresh, **kept, scaling=Params({}, scaled.scaling.reset(before)))
+    assert jax.tree.structure(given) == jax.tree.structure(anew)
+    for (path, a), b in zip(jax.tree_util.tree_leaves_with_path(given), jax.tree.leaves(anew), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-6, err_msg=jax.tree_util.keystr(path))
+    assert anew.nets["inputs"].shared["moments"].count == 3 * 3 * BATCH and np.all(anew.nets["sampler"].own.known)
+    assert np.all(before.factor > 0) and np.all(after.factor == 0) and np.all(after.count == 6)
     assert normalize.init(3).count == 0
 
 
@@ -421,9 +424,11 @@ def test_resets_work_in_the_loop_with_seeds():
     """ARS under two seeds: the factors of the last reset, from the mean rewards of that time."""
     settings = BRIEF | {"reset_every": 8, "warmup_steps": 2}
     state, _ = train(Probe("one-step"), tiny("sac", scaling="ars", reset_every=8, hidden=(8,)), settings, seeds=(3, 5))
-    np.testing.assert_allclose(state.agent.scales.mean, np.tile([1.0, -0.5], (2, 1)), rtol=1e-5)
-    np.testing.assert_allclose(state.agent.scales.factor, np.tile([1.0, 100.0], (2, 1)), rtol=1e-5)
-    np.testing.assert_array_equal(state.agent.optimizers[0][1][0].count, 2)  # updates since step 8 of 10
+    scales = state.agent.nets["scaling"].own
+    np.testing.assert_allclose(scales.mean, np.tile([1.0, -0.5], (2, 1)), rtol=1e-5)
+    np.testing.assert_allclose(scales.factor, np.tile([1.0, 100.0], (2, 1)), rtol=1e-5)
+    updates = state.agent.fits["actor"].optimizer[1][0].count
+    np.testing.assert_array_equal(updates, 2)  # since step 8 of 10
 
 
 def test_a_negative_period_is_refused():
