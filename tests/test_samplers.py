@@ -4,10 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import QUICK, learner, random_batch, tasks_of, tiny
+from probes import QUICK, learner, random_batch, tasks_of, tiny, with_nets
 
 from mtjax.agents import agent
 from mtjax.agents.parts.samplers import SAMPLERS, ByTemperature, Hardest, Progress, Uniform
+from mtjax.networks import Params
 from mtjax.types import InputError, Outcome, Spec
 
 ALIKE = jnp.full(3, 0.1)
@@ -123,10 +124,10 @@ def test_an_update_weighs_losses_by_the_temperatures_of_the_time():
     """Heads of their own move by their task's weight: first moments of Adam are the plain ones times it."""
     plain, weighed = tiny("multi-head"), tiny("multi-head", sampler="temperature", least_weight=0.0)
     (init, update), (_, weigh) = (learner(x, TASKS, BATCH, SPEC) for x in (plain, weighed))
-    log_temperature = jnp.log(jnp.float32([0.1, 0.4, 0.02]))
-    state, batch = init(TASKS, KEY)._replace(log_temperature=log_temperature), random_batch(0, 3, BATCH, SPEC)
+    temperature = Params({}, {"log": jnp.log(jnp.float32([0.1, 0.4, 0.02]))})
+    state, batch = with_nets(init(TASKS, KEY), temperature=temperature), random_batch(0, 3, BATCH, SPEC)
     (first, _), (second, _) = update(state, batch, TASKS, KEY), weigh(state, batch, TASKS, KEY)
-    heads = [x.optimizers[1][1][0].mu.own["head"]["kernel"] for x in (first, second)]
+    heads = [x.fits["critic"].optimizer[1][0].mu["critic"].own["head"]["kernel"] for x in (first, second)]
     weights = 3 * np.array([10, 2.5, 50]) / 62.5
     np.testing.assert_allclose(heads[1], heads[0] * weights[:, None, None, None], rtol=1e-4, atol=1e-8)
 
@@ -137,8 +138,8 @@ def test_an_agent_hands_its_sampler_what_it_observes():
     assert watching.watches
     state = learner(watching, TASKS, BATCH, SPEC)[0](TASKS, KEY)
     after = watching.observe(state, all_end([1, 2, 3]))
-    np.testing.assert_array_equal(after.progress.slow, [1, 2, 3])
-    assert after.actor is state.actor and after.critic is state.critic
+    np.testing.assert_array_equal(after.nets["sampler"].own.slow, [1, 2, 3])
+    assert all(after.nets[name] is state.nets[name] for name in ("actor", "critic"))
 
 
 @pytest.mark.parametrize(
