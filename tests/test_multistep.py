@@ -6,11 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import Goals, Stub, Walk, one_in, pick, quick, random_batch, random_past, tasks_of, tiny, train
+from probes import Goals, Stub, Walk, one_in, pick, quick, random_batch, random_past, tasks_of, tiny, train, with_nets
 
-from mtjax.agents.parts.trajectory import append
+from mtjax.agents.parts.knowing.last_steps import append
 from mtjax.experience import Replay, multistep
 from mtjax.experience import ring as rings
+from mtjax.networks import Params
 from mtjax.training.points import SweptAgent
 from mtjax.types import InputError, Spec, Transition
 
@@ -180,7 +181,8 @@ def test_units_of_a_task_scale_joined_rewards_as_its_values():
     agent, tasks, steps = tiny("multi-head", scaling="popart", gamma=0.9), tasks_of("one-step"), windows(2)
     state = agent.init(SPEC, tasks, jax.random.key(0))
     mean, std = jnp.float32([3.0, -2.0]), jnp.float32([0.5, 4.0])
-    state = state._replace(scales=state.scales._replace(mean=mean, variance=std**2))
+    scales = state.nets["scaling"].own._replace(mean=mean, variance=std**2)
+    state = with_nets(state, scaling=Params({}, scales))
     joined = agent.join_steps(state, steps, tasks)
     _, batch = agent.prepare(state, joined, tasks)
     value = 7.0
