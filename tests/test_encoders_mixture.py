@@ -293,7 +293,7 @@ def test_an_ensemble_needs_not_know_the_task():
     """The only mixture that an agent may have which is told nothing."""
     made = agent("sac", encoder="moe", mode="ensemble", hidden=(4,))
     state = jax.eval_shape(lambda: made.init(Spec.vector(3, 2, 1), tasks_of("one-step"), jax.random.key(0)))
-    assert set(state.actor.shared["body"]["params"]) == {"experts", "trunk"}
+    assert set(state.nets["actor"].shared["body"]["params"]) == {"experts", "trunk"}
 
 
 # FiLM.
@@ -475,10 +475,12 @@ def test_agents_learn_with_them(name):
     """Two updates, the second of which bootstraps from what the first moved, stay finite and move everything."""
     _, settings = AGENTS[name]
     tasks, spec = tasks_of("one-step", (1.0, -0.5, 0.3)), Spec.vector(3, 2, 1)
-    init, update = learner(tiny("sac", **settings), tasks, 4, spec)
+    made = tiny("sac", **settings)
+    init, update = learner(made, tasks, 4, spec)
     before = after = init(tasks, jax.random.key(0))
     for i in range(2):
         after, metrics = update(after, random_batch(i, 3, 4, spec), tasks, jax.random.key(i))
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves((after, metrics)))
-    pairs = zip(jax.tree.leaves(before.critic), jax.tree.leaves(after.critic), strict=True)
+    fitted = lambda state: [state.nets[name] for name in made.fits["critic"].names]
+    pairs = zip(jax.tree.leaves(fitted(before)), jax.tree.leaves(fitted(after)), strict=True)
     assert all(not np.array_equal(a, b) for a, b in pairs)
