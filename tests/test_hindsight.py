@@ -11,7 +11,7 @@ from conftest import compiled
 from probes import QUICK, Goals, Stub, one_in, pick, quick, tiny, train
 
 import mtjax.train
-from mtjax.agents.parts.trajectory import append, begin
+from mtjax.agents.parts.knowing.last_steps import append, begin
 from mtjax.envs import make
 from mtjax.experience import Replay, hindsight
 from mtjax.experience import ring as rings
