@@ -19,13 +19,14 @@ import mtjax.evaluate
 import mtjax.train
 from mtjax import agents, cli, networks, normalize, rollout
 from mtjax.agents.sac import Batch, action_sizes
+from mtjax.agents.state import AgentState
 from mtjax.config import from_json, to_json
 from mtjax.envs import ENVS, Family, Mixture, make, mixture
 from mtjax.envs.parameters import Parameter
 from mtjax.evaluation import Scores, evaluate, record
 from mtjax.experience.replay import Replay
 from mtjax.loop import Settings
-from mtjax.networks import Params
+from mtjax.networks import OVER_TASKS, Params
 from mtjax.report.tables import split_table, task_table
 from mtjax.training.folder import short_name, to_flags
 from mtjax.types import SPLITS, InputError, Spec, Step, Task, Transition
@@ -100,8 +101,10 @@ def tiny(name="sac-conditioned", **settings):
         "hypernetwork_widths": (8, 4),
         "latent_widths": (8, 8),
         "model_widths": (8,),
+        "embedding_size": 4,
+        "theta_size": 4,
     }
-    made = agents.agent(name, **{"hidden": (8,), "embedding_size": 4, **settings})
+    made = agents.agent(name, **{"hidden": (8,), **settings})
     small = {k: v for k, v in small.items() if k in agents.settings(made) and k not in settings}
     return agents.agent(name, **{**agents.settings(made), **small})
 
@@ -187,7 +190,8 @@ def test_a_mixture_of_one_has_that_familys_tasks_but_for_what_only_the_family_re
 def test_the_nearest_training_task_is_of_the_same_family():
     env = mixture([make("tabular-mdp", num_tasks=2), make("bandit", num_tasks=3)])
     train, held_out = env.tasks("train"), env.tasks("interpolation")
-    known = jax.vmap(lambda task: tiny("sac").known_task(types.SimpleNamespace(contexts=train.context), task))
+    state = AgentState({"tasks": Params({}, {"context": train.context})}, {}, {})
+    known = jax.vmap(lambda task: tiny("sac").known_task(state, task))
     nearest = np.asarray(known(held_out))
     families = np.argmax(held_out.context[:, :2], axis=1)
     assert np.argmax(train.context[nearest][:, :2], axis=1).tolist() == families.tolist() == [0] * 2 + [1] * 3
@@ -374,16 +378,17 @@ def test_target_entropy_counts_the_actions_that_there_are():
     tasks = BOTH.tasks()
     assert action_sizes(jnp.zeros((4, 5, 2)), tasks.action_mask).tolist() == [1, 1, 1, 2]
     agent = tiny(target_entropy=-2.0)
-    slope = jax.grad(agent.temperature_loss)(jnp.zeros(4), jnp.array([-2.0, -2.0, -2.0, -4.0]), jnp.array([1, 1, 1, 2]))
-    np.testing.assert_array_equal(slope, 0)  # each is at its own target
+    temperature, entropy = Params({}, {"log": jnp.zeros(4)}), jnp.array([-2.0, -2.0, -2.0, -4.0])
+    slope = jax.grad(agent.temperature_loss)(temperature, entropy, jnp.array([1, 1, 1, 2]))
+    np.testing.assert_array_equal(slope.own["log"], np.zeros(4))  # each is at its own target
 
 
 def test_every_task_has_its_own_normaliser_and_padding_stays_zero():
     agent, random = tiny(normalize_observations=True), np.random.default_rng(0)
     obs = jnp.float32(random.normal(size=(4, 50, 3)) * [[[1]], [[2]], [[5]], [[9]]])
     obs = obs.at[:3, :, 2].set(0.0)  # of the three tasks that see two numbers
-    moments = agent.fit_moments(agent.init_moments(BOTH.spec, 4), obs)
-    seen = quick(jax.vmap(agent.see), moments, obs)
+    inputs = agent.fit_inputs(agent.init_inputs(BOTH.spec, 4), obs)
+    seen = quick(jax.vmap(agent.see, (OVER_TASKS, 0)), inputs, obs)
     assert not np.any(seen[:3, :, 2])
     for i, width in enumerate((2, 2, 2, 3)):
         alone = normalize.update(normalize.init(width), obs[i, :, :width])
@@ -424,23 +429,23 @@ def test_losses_of_a_padded_task_are_those_of_the_task_alone(name, constants, mo
     wide = Batch(pad(obs, 4), pad(action, 3), next_obs=pad(next_obs, 4), mask=jnp.array([1.0, 0, 0]), **common)
     monkeypatch.undo()
     init = lambda o, a: quick(lambda key: agent.init(Spec.vector(o, a, 1), task, key), jax.random.key(0))
-    states = init(2, 1), init(4, 3)
-    alone = lambda params: Params(pick(params.shared, ...), pick(params.own, 0))
-    actors, critics = ([alone(getattr(s, network)) for s in states] for network in ("actor", "critic"))
+    of_small, of_wide = (probes.of_task(init(*sizes).nets, 0) for sizes in ((2, 1), (4, 3)))
     constant = np.arange(constants)  # what an encoder puts behind the inputs
     of_actor, of_critic = np.append([0, 1], 4 + constant), np.append([0, 1, 4], 7 + constant)
-    actors[1] = widened(actors[0], actors[1], of_actor, np.array([0, 3]))
-    critics[1] = widened(critics[0], critics[1], of_critic, None)
+    of_wide["actor"] = widened(of_small["actor"], of_wide["actor"], of_actor, np.array([0, 3]))
+    of_wide["critic"] = widened(of_small["critic"], of_wide["critic"], of_critic, None)
     monkeypatch.setattr(networks.jax.random, "normal", lambda key, shape: jnp.asarray(noise[: shape[0], : shape[1]]))
     key = jax.random.key(0)
 
-    def losses(actor, critic, batch):
-        target = agent.critic_target(actor, critic, critic, batch, key)
-        (critic_loss, _), critic_slope = jax.value_and_grad(agent.critic_loss, has_aux=True)(critic, (batch, target))
-        (actor_loss, seen), slope = jax.value_and_grad(agent.actor_loss, has_aux=True)(actor, (batch, critic, key))
-        return critic_loss, actor_loss, seen["entropy"], slope, critic_slope
+    def losses(nets, batch):
+        target = agent.critic_target(nets, nets, batch, key)
+        fit = lambda critic: agent.critic_loss(nets | {"critic": critic}, batch, target)
+        improve = lambda actor: agent.actor_loss(nets | {"actor": actor}, batch, key)
+        (critic_loss, _), critic_slope = jax.value_and_grad(fit, has_aux=True)(nets["critic"])
+        (actor_loss, seen), slope = jax.value_and_grad(improve, has_aux=True)(nets["actor"])
+        return critic_loss, actor_loss, seen.entropy, slope, critic_slope
 
-    found = [quick(losses, *of_one) for of_one in zip(actors, critics, (small, wide), strict=True)]
+    found = [quick(losses, *of_one) for of_one in ((of_small, small), (of_wide, wide))]
     np.testing.assert_allclose(found[1][:3], found[0][:3], rtol=1e-5)
     slopes = widened(found[0][3], found[1][3], of_actor, np.array([0, 3]))
     for ours, theirs in zip(jax.tree.leaves(found[1][3]), jax.tree.leaves(slopes), strict=True):
@@ -453,10 +458,11 @@ def test_losses_of_a_padded_task_are_those_of_the_task_alone(name, constants, mo
 def test_input_maps_begin_as_the_identity_and_are_every_tasks_own():
     agent = tiny("sac", encoder="input-map")
     state = quick(lambda key: agent.init(BOTH.spec, BOTH.tasks(), key), jax.random.key(0))
-    front = state.actor.own["front"]["params"]["map"]
+    actor = state.nets["actor"]
+    front = actor.own["front"]["params"]["map"]
     np.testing.assert_array_equal(front["kernel"], np.broadcast_to(np.eye(3), (4, 3, 3)))
     plain = tiny("sac")
-    without = state._replace(actor=Params(state.actor.shared, {}))
+    without = probes.with_nets(state, actor=Params(actor.shared, {}))
     obs, task = jnp.array([0.3, -2.0, 0.0]), pick(BOTH.tasks(), 1)
     ours, theirs = (a.act(s, a.begin(s, task), obs, task, None).action for a, s in ((agent, state), (plain, without)))
     np.testing.assert_allclose(ours, theirs, rtol=1e-6)
