@@ -24,7 +24,9 @@ BRONET = {f"shared/body/{kind}_{i}" for kind in ("Dense", "LayerNorm") for i in 
 HYPERSPHERE = {f"shared/body/{kind}_{i}" for kind, count in (("UnitDense", 4), ("Scaler", 4)) for i in range(count)}
 BATCH_NORM = {f"shared/body/{part}" for part in ("BatchNorm_0", "BatchNorm_1", "UnitDense_0", "task_0")}
 MODELS = {"shared/transition", "shared/reward"}
-TRUNKS = {"actor": TRUNK, "critic": TRUNK}
+both = lambda parts: {"actor": parts, "critic": parts}
+knows = lambda part: {"knowing": {part}, "slow knowing": {part}}
+TRUNKS = both(TRUNK)
 ENCODED = {"representation": {"shared/latent"}, "slow representation": {"shared/latent"}}
 LATENT = ENCODED | {"representation": {"shared/latent"} | MODELS}
 REBUILT = ENCODED | {"representation": {"shared/latent", "shared/decoder"}}
@@ -38,8 +40,8 @@ body = lambda *parts: {f"shared/body/{part}" for part in parts} | {"shared/head"
 PARTS = {
     "sac": ("sac", {}, TRUNK),
     "sac-conditioned": ("sac-conditioned", {}, TRUNK),
-    "sac-embedding": ("sac-conditioned", {"conditioning": "embedding"}, TRUNK | {"own/embedding"}),
-    "sac-inferred": ("sac", {"conditioning": "inferred", "inferred_from": 2}, TRUNK | {"shared/trajectory"}),
+    "sac-embedding": ("sac-conditioned", {"conditioning": "embedding"}, TRUNKS | knows("own/embedding")),
+    "sac-inferred": ("sac", {"conditioning": "inferred", "inferred_from": 2}, TRUNKS | knows("shared/trajectory")),
     "sac-input-map": ("sac-conditioned", {"encoder": "input-map"}, TRUNK | {"own/front"}),
     "sac-hypernetwork": ("sac-conditioned", {"encoder": "hypernetwork"}, body("hypernetwork", "code", "trunk")),
     "multi-head": ("multi-head", {}, {"shared/body/MLP_0", "own/head"}),
@@ -58,7 +60,7 @@ PARTS = {
         body("base_out", "modules_0", "modules_1", "routing", "task"),
     ),
     "paco": ("paco", {}, body("trunk", "weights")),
-    "brc": ("brc", {"value": "hl-gauss"}, BRONET | {"shared/head", "own/embedding"}),
+    "brc": ("brc", {"value": "hl-gauss"}, both(BRONET | {"shared/head"}) | knows("own/embedding")),
     "simba-v2": ("simba-v2", {"value": "hl-gauss"}, HYPERSPHERE | {"shared/head"}),
     "xqc": ("xqc", {"value": "hl-gauss"}, BATCH_NORM | {"shared/head", "own/batch_stats"}),
     "drq": ("drq", {"n_step": 1}, TRUNKS | once(ENCODED)),
@@ -115,7 +117,7 @@ def leaves_of(params):
 def parts_of(case, network):
     """What a network is made of."""
     parts = PARTS[case][2]
-    parts = parts if isinstance(parts, dict) else {"actor": parts, "critic": parts}
+    parts = parts if isinstance(parts, dict) else both(parts)
     return {"slow critic": parts["critic"], **parts}.get(network, set())
 
 
@@ -135,6 +137,9 @@ def test_every_agent_is_in_the_table():
     assert {name for name, _, _ in PARTS.values()} == set(OFF_POLICY)
 
 
+TRAINED = ("actor", "critic", "representation", "knowing")
+
+
 @EVERY_AGENT
 def test_everything_that_should_learn_does(case):
     """After ten updates no leaf is where it began: no task's, no critic's and no expert's part of it."""
@@ -142,7 +147,7 @@ def test_everything_that_should_learn_does(case):
     after = before
     for i in range(10):
         after, _ = update(after, batch_of(case, i), TASKS, jax.random.key(i))
-    for network in ("actor", "critic", "representation", "slow critic", "slow representation"):
+    for network in (*TRAINED, *(f"slow {name}" for name in TRAINED[1:])):
         old, new = (leaves_of(with_slow(state)[network]) for state in (before, after))
         deep = lambda path: path.startswith("shared/body/")
         assert {"/".join(path.split("/")[: 3 if deep(path) else 2]) for path in old} == parts_of(case, network)
@@ -164,22 +169,23 @@ FLOW = {
 }
 
 
-# Where the actor stands on the critic's representation, all that moves this moves the policy's entropy; and what the
+# Where the actor stands on what critics train, all that moves this moves the policy's entropy; and what the
 # slow encoder sees is what models predict. BRC scales rewards by what entropy pays. XQC's critics are normalised over
 # the policy's next actions too.
 _ON_ENCODED = {"critic": ((), ("actor",)), "reward": ((), ("actor", "critic", "target"))}
 _ON_LATENT = {"critic": ((), ("actor",)), "target": ((), ("critic",)), "reward": ((), ("actor", "critic", "target"))}
 FLOW_OF = {
     **dict.fromkeys(("drq", "sac-ae", "drq-pictures", "sac-ae-pictures"), _ON_ENCODED),
+    **dict.fromkeys(("sac-embedding", "sac-inferred"), _ON_ENCODED),
     **dict.fromkeys(("deepmdp", "hip-bmdp", "care-deepmdp"), _ON_LATENT),
-    "brc": {"temperature": ((), ("actor",))},
+    "brc": _ON_ENCODED | {"temperature": ((), ("actor",))},
     "xqc": {"actor": ((), ("critic", "target", "temperature"))},
 }
 
 
 def networks(state, part):
-    """The networks that a loss trains, or all slow ones; the critics' loss trains the representation too."""
-    trained = ("critic", "representation") if part == "critic" else (part,)
+    """The networks that a loss trains, or all slow ones; the critics' loss trains more than critics."""
+    trained = TRAINED[1:] if part == "critic" else (part,)
     return state.slow if part == "target" else {name: state.nets[name] for name in trained}
 
 
@@ -355,13 +361,12 @@ def test_an_unseen_task_acts_as_its_nearest_or_by_its_own_parameters(case):
 
 def test_a_head_or_embedding_moves_the_action_of_its_task_alone():
     """The actor looks up the parameters of the task that it is asked about."""
-    for case, part in (("multi-head", "head"), ("sac-embedding", "embedding")):
+    for case, net, part in (("multi-head", "actor", "head"), ("sac-embedding", "knowing", "embedding")):
         name, settings, _ = PARTS[case]
         agent, state = tiny(name, **settings), start(case)[0]
-        actor = state.nets["actor"]
-        own = jax.tree.map(lambda x: x.at[1].add(0.5), actor.own)
+        own = jax.tree.map(lambda x: x.at[1].add(0.5), state.nets[net].own)
         assert set(own) == {part}
-        changed = with_nets(state, actor=actor._replace(own=own))
+        changed = with_nets(state, **{net: state.nets[net]._replace(own=own)})
         acts = [
             np.stack([act_once(agent, s, OBS[0], pick(TASKS, i), None) for i in range(3)]) for s in (state, changed)
         ]
