@@ -263,17 +263,13 @@ class BaseAgent(abc.ABC):
     @property
     def fits(self) -> dict[str, Fit]:
         """The gradient steps of the agent, by name: which networks learn together, and how."""
-        optimizer = partial(
-            descent.adam, weight_decay=self.weight_decay, max_norm=self.max_gradient_norm, tune=self.tune
-        )
-        actor_lr, critic_lr = (
-            self.scheduled(self.actor_lr, self.experience.policy_delay),
-            self.scheduled(self.critic_lr),
-        )
+        adam = partial(descent.adam, weight_decay=self.weight_decay, max_norm=self.max_gradient_norm, tune=self.tune)
+        actor = adam(self.scheduled(self.actor_lr, self.experience.policy_delay))
+        critic = adam(self.scheduled(self.critic_lr))
         fit = partial(Fit, per_layer=self.gradient_scope == "per-layer", over_devices=self.devices_differ)
         return {
-            "critic": fit(("critic", "representation", "knowing"), optimizer(critic_lr), self.gradients),
-            "actor": fit(("actor",), optimizer(actor_lr), self.gradients.for_actor),
+            "critic": fit(("critic", "representation", "knowing"), critic, self.gradients),
+            "actor": fit(("actor",), actor, self.gradients.for_actor),
         }
 
     def scheduled(self, rate: Any, delay: int = 1) -> Any:
