@@ -8,6 +8,7 @@ from probes import SPEC, learner, of_task, pick, random_batch, tasks_of, tiny
 
 from mtjax.agents import PARTS
 from mtjax.agents.parts.knowing import CONDITIONINGS, Embedding
+from mtjax.types import InputError
 
 TASKS = tasks_of("one-step", np.linspace(0.5, 1.5, 3))
 BATCH, KEY = 6, jax.random.key(0)
@@ -94,3 +95,21 @@ def test_what_is_told_has_the_promised_attributes(name, tmp_path):
     assert obs.shape == SPEC.obs.shape
     assert made.conditioning.by_number == (name == "one-hot")
     assert made.conditioning.by_parameters == (name == "parameters")
+
+
+def test_slow_vectors_follow_at_the_critics_rate():
+    """Also beside a representation that has vectors of its own, which follow at another."""
+    made = tiny("hip-bmdp", conditioning="embedding")
+    state = made.init(SPEC, TASKS, KEY)
+    more = lambda nets: {name: jax.tree.map(lambda x: x + 1, nets[name]) for name in ("knowing", "representation")}
+    after = made.update_target(state._replace(nets=state.nets | more(state.nets)))
+    step = lambda net: after.slow[net].own["embedding"] - state.slow[net].own["embedding"]
+    np.testing.assert_allclose(step("knowing"), made.tau, rtol=1e-3)
+    np.testing.assert_allclose(step("representation"), made.representation.encoder_tau, rtol=1e-3)
+
+
+def test_one_past_has_one_length():
+    given = {"conditioning": "inferred", "inferred_from": 3, "unseen_theta": "inferred"}
+    with pytest.raises(InputError, match="inferred-from=3 and theta-from=2 are numbers of the same last steps"):
+        tiny("hip-bmdp", **given, theta_from=2)
+    assert tiny("hip-bmdp", **given, theta_from=3).history_length == 3

@@ -16,10 +16,11 @@ import mtjax.evaluate
 from mtjax import frames
 from mtjax.agents.parts import vision
 from mtjax.agents.parts.representations.encoded import Encoded
+from mtjax.agents.state import axes_of
 from mtjax.config import with_preset
 from mtjax.envs.probes import Pictured, Probe
 from mtjax.experience import Rollouts, pictures
-from mtjax.networks import OVER_TASKS, Params
+from mtjax.networks import Params
 from mtjax.training.launch import check
 from mtjax.types import InputError, Transition
 
@@ -251,6 +252,11 @@ def test_a_decoder_draws_pictures_of_the_size_that_it_saw():
     assert decoder.apply(decoder.init(KEY, latent[0]), latent).shape == (2, 64, 64, 9)
 
 
+def networks(state):
+    """All that is learned but temperatures."""
+    return {name: state.nets[name] for name in ("actor", "critic", "representation", "knowing")}
+
+
 SMALL = dict(hidden=(32, 32), latent_widths=(16,), num_envs=2, batch_size=8, warmup_steps=10, replay_size=1000)
 FAST = dict(actor_lr=3e-3, critic_lr=3e-3, initial_temperature=0.01, updates_per_step=1, chunk_steps=100)
 
@@ -287,8 +293,9 @@ def test_ppo_learns_what_only_pictures_show(representation):
     agent = mtjax.agent("ppo", representation=representation)
     state, history = probes.train(env, agent, ON_POLICY, chunks=6)
     assert np.mean(history[-1]["return"]) > -0.3
-    assert ("latent" in state.agent.critic.shared) == (representation == "encoded")
-    assert "sight" in state.agent.actor.shared
+    nets = state.agent.nets
+    assert ("latent" in nets["representation"].shared) == (representation == "encoded")
+    assert "sight" in nets["actor"].shared
 
 
 @pytest.mark.parametrize("name", probes.slow_but(["drq", "deepmdp", "hip-bmdp"], "deepmdp"))
@@ -303,7 +310,7 @@ def test_what_follows_a_terminal_step_in_the_replay_changes_nothing(name):
     def learned(place):
         after = {"pixels": batch.next_obs["pixels"].at[:, place].add(77)}
         state, _ = update(init(tasks, KEY), batch._replace(next_obs=after), tasks, KEY)
-        return np.concatenate([np.ravel(x) for x in jax.tree.leaves((state.actor, state.critic, state.target))])
+        return np.concatenate([np.ravel(x) for x in jax.tree.leaves((networks(state), state.slow))])
 
     as_it_is = learned(np.array([], int))
     np.testing.assert_array_equal(learned(np.array([1, 4])), as_it_is)
@@ -387,12 +394,13 @@ def test_an_encoder_that_is_its_own_target_sees_the_next_pictures_once():
     agent, family = probes.tiny("drq", n_step=1), Pictured()
     tasks = family.tasks()
     state, batch = agent.init(family.spec, tasks, KEY), probes.random_batch(0, len(tasks.id), 4, family.spec)
-    copied = state._replace(target=state.target.filled(Params({"latent": state.critic.shared["latent"]}, {})))
+    latent = Params({"latent": state.nets["representation"].shared["latent"]}, {})
+    copied = state._replace(slow=state.slow | {"representation": state.slow["representation"].filled(latent)})
     compiled = [jax.jit(agent.update).lower(each, batch, tasks, KEY).compile() for each in (state, copied)]
     once, twice = (len(re.findall(r" convolution\(|custom-call.*onvolution", each.as_text())) for each in compiled)
     assert twice == once + 4
     (after, _), (other, _) = compiled[0](state, batch, tasks, KEY), compiled[1](copied, batch, tasks, KEY)
-    jax.tree.map(np.testing.assert_array_equal, (after.actor, after.critic), (other.actor, other.critic))
+    jax.tree.map(np.testing.assert_array_equal, networks(after), networks(other))
 
 
 def test_the_actor_learns_on_the_encoder_that_critics_had_before_their_step():
@@ -402,19 +410,22 @@ def test_the_actor_learns_on_the_encoder_that_critics_had_before_their_step():
     state, batch = agent.init(family.spec, tasks, KEY), probes.random_batch(0, len(tasks.id), 4, family.spec)
     after, _ = jax.jit(agent.update)(state, batch, tasks, KEY)
     actor_key = jax.random.split(KEY, 4)[1]
-    _, seen = agent.prepare(state, agent.placed_representation.augment(batch, jax.random.fold_in(KEY, 1)), tasks)
+    _, seen = agent.prepare(state, agent.representation.augment(batch, jax.random.fold_in(KEY, 1)), tasks)
 
     @jax.jit
-    def step(critic):
-        loss, data = agent.actor_problem(critic, seen, actor_key)
-        mean = lambda actor: jnp.mean(jax.vmap(loss, (OVER_TASKS, 0))(actor, data)[0])
-        slope, optimizer = jax.grad(mean)(state.actor), agent.optimizers.actor
-        return optax.apply_updates(state.actor, optimizer.update(slope, state.optimizers.actor, state.actor)[0])
+    def step(representation):
+        nets, keys = after.nets | {"representation": representation}, jax.random.split(actor_key, len(tasks.id))
+        losses = jax.vmap(agent.actor_loss, (axes_of(nets), 0, 0))
+        mean = lambda actor: jnp.mean(losses(nets | actor, seen, keys)[0])
+        actor, optimizer = {"actor": state.nets["actor"]}, agent.fits["actor"].optimizer
+        steps, _ = optimizer.update(jax.grad(mean)(actor), state.fits["actor"].optimizer, actor)
+        return optax.apply_updates(actor, steps)["actor"]
 
-    gaps = lambda actor: jax.tree.map(lambda a, b: jnp.max(jnp.abs(a - b)), actor, after.actor)
+    gaps = lambda actor: jax.tree.map(lambda a, b: jnp.max(jnp.abs(a - b)), actor, after.nets["actor"])
     distance = lambda actor: max(map(float, jax.tree.leaves(gaps(actor))))
-    assert distance(step(after.critic.without(("latent",)).filled(state.critic))) < 1e-6
-    assert distance(step(after.critic)) > 1e-4
+    old, new = state.nets["representation"], after.nets["representation"]
+    assert distance(step(new.without(("latent",)).filled(old))) < 1e-6
+    assert distance(step(new)) > 1e-4
 
 
 def test_pictures_need_warm_up_steps_for_a_window():
@@ -437,5 +448,6 @@ def test_every_agent_can_be_asymmetric(name):
     state = jax.eval_shape(lambda: agent.init(spec, tasks, KEY))
     after, _ = jax.eval_shape(lambda state: agent.update(state, batch, tasks, KEY), state)
     assert jax.tree.map(lambda x: x.shape, after) == jax.tree.map(lambda x: x.shape, state)
-    assert any("sight" in place or "sight" in place.get("distilled", ()) for place in state.actor)
-    assert not any("sight" in place or "latent" in place for place in state.critic)
+    assert any("sight" in place or "sight" in place.get("distilled", ()) for place in state.nets["actor"])
+    of_critics = (*state.nets["critic"], *state.nets["representation"])
+    assert not any("sight" in place or "latent" in place for place in of_critics)

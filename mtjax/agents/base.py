@@ -190,6 +190,12 @@ class BaseAgent(abc.ABC):
                 f"scaling={name} renews its factors where networks are reset, and here none are; use scaling=reward, "
                 "or give reset-every to an agent that has a replay"
             )
+        lengths = self.conditioning.history, self.representation.history
+        if all(lengths) and len(set(lengths)) > 1:
+            raise InputError(
+                f"inferred-from={lengths[0]} and theta-from={lengths[1]} are numbers of the same last steps; give both "
+                "one value"
+            )
         if self.lr_schedule == "constant" and (self.lr_final or self.lr_updates):
             given = f"lr-final={self.lr_final}" if self.lr_final else f"lr-updates={self.lr_updates}"
             raise InputError(

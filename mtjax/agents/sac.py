@@ -241,10 +241,8 @@ class SAC(BaseAgent):
         target_key, actor_key, critic_order, actor_order = jax.random.split(key, 4)
         transitions = self.representation.augment(transitions, jax.random.fold_in(key, 1))
         state, batch = self.prepare(state, transitions, tasks)
-        importance, before = (
-            self.sampler.weights(state.nets["sampler"].own, batch.temperature),
-            state.nets["representation"],
-        )
+        before = state.nets["representation"]
+        importance = self.sampler.weights(state.nets["sampler"].own, batch.temperature)
 
         data, loss = self.critic_data(state, batch, target_key), self.above_least(self.critic_loss)
         state, fitted = self.descend(state, "critic", loss, data, critic_order, importance)
@@ -272,15 +270,15 @@ class SAC(BaseAgent):
         data = (batch, jax.random.split(key, len(batch.temperature)))
         state, improved = self.descend(state, "actor", self.actor_loss, data, order, importance, seen)
         state = with_statistics(state, "actor", improved.aux.statistics)
-        action_size, fit, memory = (
-            action_sizes(batch.action, batch.mask),
-            self.fits["temperature"],
-            state.fits["temperature"],
-        )
-        slope = jax.grad(self.temperature_loss)(state.nets["temperature"], improved.aux.entropy, action_size)
-        nets, optimizer = fit.descend(memory, {"temperature": slope}, state.nets)
+        return self.tune_temperature(state, improved.aux.entropy, batch), improved.aux.metrics | improved.metrics
+
+    def tune_temperature(self, state: AgentState, entropy: Array, batch: Batch) -> AgentState:
+        """Take one gradient step of the temperatures, by the entropies (T,) of the tasks' policies."""
+        memory, action_size = state.fits["temperature"], action_sizes(batch.action, batch.mask)
+        slope = jax.grad(self.temperature_loss)(state.nets["temperature"], entropy, action_size)
+        nets, optimizer = self.fits["temperature"].descend(memory, {"temperature": slope}, state.nets)
         fits = state.fits | {"temperature": memory._replace(optimizer=optimizer)}
-        return state._replace(nets=state.nets | nets, fits=fits), improved.aux.metrics | improved.metrics
+        return state._replace(nets=state.nets | nets, fits=fits)
 
     def prepare(self, state: AgentState, batch: Transition, tasks: Task) -> tuple[AgentState, Batch]:
         """Fit the normalisers to transitions (T, B, ...), and return the batch (T, ...) for the losses."""
@@ -315,10 +313,13 @@ class SAC(BaseAgent):
 
     def update_target(self, state: AgentState) -> AgentState:
         """Move the target critics, and their representation, a step towards the new ones."""
-        rate = lambda name: self.representation.rates.get(name, self.tau)
-        step = lambda new, old: {k: optax.incremental_update(new[k], old[k], rate(k)) for k in old}
-        moved = lambda new, old: Params(step(new.shared, old.shared), step(new.own, old.own))
-        return state._replace(slow={name: moved(state.nets[name], old) for name, old in state.slow.items()})
+
+        def follow(net: str, new: dict, old: dict) -> dict:
+            rates = self.representation.rates if net == "representation" else {}
+            return {k: optax.incremental_update(new[k], old[k], rates.get(k, self.tau)) for k in old}
+
+        moved = lambda net, new, old: Params(follow(net, new.shared, old.shared), follow(net, new.own, old.own))
+        return state._replace(slow={net: moved(net, state.nets[net], old) for net, old in state.slow.items()})
 
     def renew_scales(self, state: AgentState, target: Array) -> AgentState:
         """Update the scaling of rewards by the critics' targets (T, B), and rescale critics to the new units."""
