@@ -415,22 +415,21 @@ class PPO(BaseAgent):
         """
         (state, within_limit), (index, key) = carry, given
         sample_key, actor_order, critic_order = jax.random.split(key, 3)
-        minibatch, representation = take_steps(batch, index), state.nets["representation"]
-        if self.representation.learns:
-            models_key = jax.random.fold_in(key, 3)
-            targets, _ = self.representation.targets(representation, slow, minibatch.next_obs, models_key)
-            minibatch = minibatch._replace(model_targets=targets)
+        minibatch = take_steps(batch, index)
         importance = self.sampler.weights(state.nets["sampler"].own, jnp.ones(state.num_tasks))
-        loss, samples = self.above_least(self.critic_loss), jax.random.split(sample_key, state.num_tasks)
-        state, critic = self.descend(state, "critic", loss, (minibatch,), critic_order, importance)
-        data, seen = (minibatch._replace(model_targets=None), samples), {"representation": representation}
-        moved, actor = self.descend(state, "actor", self.actor_loss, data, actor_order, importance, seen)
-        metrics = critic.aux | critic.metrics | actor.aux.metrics | actor.metrics
-        if parts.is_zero(self.kl_limit):
-            return (moved, within_limit), metrics
-        within_limit &= jnp.mean(actor.aux.kl) <= jnp.where(self.kl_limit > 0, self.kl_limit, jnp.inf)
-        state = jax.tree.map(partial(jnp.where, within_limit), moved, state)
-        return (state, within_limit), metrics
+        # The actor is first, as pi_old was on what the critic's step moves too: the representation, and what is known.
+        data = (minibatch, jax.random.split(sample_key, state.num_tasks))
+        moved, actor = self.descend(state, "actor", self.actor_loss, data, actor_order, importance)
+        if not parts.is_zero(self.kl_limit):
+            within_limit &= jnp.mean(actor.aux.kl) <= jnp.where(self.kl_limit > 0, self.kl_limit, jnp.inf)
+            moved = jax.tree.map(partial(jnp.where, within_limit), moved, state)
+        if self.representation.learns:
+            both, models_key = (moved.nets["representation"], slow), jax.random.fold_in(key, 3)
+            targets, _ = self.representation.targets(*both, minibatch.next_obs, models_key)
+            minibatch = minibatch._replace(model_targets=targets)
+        loss = self.above_least(self.critic_loss)
+        state, critic = self.descend(moved, "critic", loss, (minibatch,), critic_order, importance)
+        return (state, within_limit), critic.aux | critic.metrics | actor.aux.metrics | actor.metrics
 
 
 def advantages(
