@@ -22,7 +22,7 @@ from resumable import train
 
 import mtjax
 from mtjax.names import nearest_error
-from mtjax.training import ship
+from mtjax.saved import ship
 from mtjax.training.programs import enable_compile_cache
 
 _M = 1_000_000

@@ -66,7 +66,7 @@ from mtjax.report.stats import (
     seed_interval,
     unpaired_difference,
 )
-from mtjax.training import ship
+from mtjax.saved import ship
 from mtjax.training.programs import enable_compile_cache
 from mtjax.training.run import Result
 from mtjax.types import SPLITS

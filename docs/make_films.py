@@ -19,11 +19,11 @@ import numpy as np
 from PIL import Image
 
 import mtjax
-from mtjax import shipped
 from mtjax.envs import name_of
 from mtjax.envs.pixels import Pictured
 from mtjax.evaluation import record
 from mtjax.report import render
+from mtjax.saved import shipped
 from mtjax.training.policy import Policy
 
 FOLDER = Path(__file__).parent / "pictures" / "families"

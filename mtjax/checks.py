@@ -179,3 +179,14 @@ def path(value: Any, name: str = "directory") -> Path:
     if not isinstance(text, str) or not text or "\0" in text:  # Path("") would be the working directory
         raise InputError(f"{name} must be a path, not {shown(value)}")
     return Path(value)
+
+
+def require_run(folder: Path) -> None:
+    """Raise InputError unless a folder holds a run. The message names the newest of the runs inside it, if any."""
+    if (folder / "config.json").is_file():
+        return
+    if not folder.is_dir():
+        raise InputError(f"{str(folder)!r} is not a run: there is no such folder")
+    inside = max(folder.glob("*/config.json"), key=lambda file: file.stat().st_mtime, default=None)
+    hint = "" if inside is None else f"; it holds runs, the newest is {str(inside.parent)!r}"
+    raise InputError(f"{str(folder)!r} is not a run: it has no config.json{hint}")

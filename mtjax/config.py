@@ -21,14 +21,13 @@ from mtjax.agents.choices import kinds_of, replace
 from mtjax.agents.parts import name_of
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.values import VALUES
-from mtjax.checks import MOST_EPISODES, check_fields, require_text, require_values
-from mtjax.commands import PRESETS, is_imported, require_run
+from mtjax.checks import MOST_EPISODES, check_fields, require_run, require_text, require_values
 from mtjax.envs import ENVS, is_mixture, make, members
 from mtjax.envs.tabled import Tabled
 from mtjax.evaluation import Evaluations, load_evaluations, no_evaluations, require_same_run
 from mtjax.experience import Replay
 from mtjax.loop import Settings
-from mtjax.names import SPLITS, nearest_error, public
+from mtjax.names import PRESETS, SPLITS, is_imported, nearest_error, public
 from mtjax.types import InputError
 
 TUNED_TASKS = 10

@@ -4,9 +4,10 @@ import dataclasses
 import math
 from collections.abc import Sequence
 
-from mtjax import commands, shipped
-from mtjax.checks import require_episodes
+from mtjax.checks import require_episodes, require_run
+from mtjax.command import imports, parsing, process, refusals, words
 from mtjax.names import SPLITS, InputError, become, load, nearest_error
+from mtjax.saved import shipped
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,9 +60,9 @@ def _parse(argv: Sequence[str]) -> tuple[Request, dict[str, str]]:
     """Return the request, and the values of --env.vary.NAME=VALUES by name."""
     if argv and not argv[0].startswith("-"):
         raise InputError(f"say which run to evaluate by --run={argv[0]}")
-    vary, argv = commands.vary_flags(commands.import_files(argv))
-    commands.check_flags_of(Request, argv)
-    request = commands.parse_with_tyro(Request, argv, Request(), "python -m mtjax.evaluate")
+    vary, argv = words.vary_flags(imports.import_files(argv))
+    refusals.check_flags_of(Request, argv)
+    request = parsing.parse_with_tyro(Request, argv, Request(), "python -m mtjax.evaluate")
     if not request.run:
         raise InputError("say which run to evaluate: --run=DIR")
     require_episodes(request.episodes, request.seed, request.drawn, request.checkpoint)
@@ -78,7 +79,7 @@ def _parse(argv: Sequence[str]) -> tuple[Request, dict[str, str]]:
     if request.drawn is not None and (vary or request.diagnostics):
         raise InputError("--task-seed draws other tasks; leave out --env.vary, and diagnostics of the run's own tasks")
     folder = shipped.folder(request.run)
-    commands.require_run(folder)
+    require_run(folder)
     if request.diagnostics and shipped.is_shipped(folder):
         raise InputError(f"diagnostics need a run's replay, and {request.run!r} is a policy alone")
     return request, vary
@@ -86,7 +87,7 @@ def _parse(argv: Sequence[str]) -> tuple[Request, dict[str, str]]:
 
 def run() -> None:
     """Run the command line."""
-    commands.main(main)
+    process.main(main)
 
 
 if __name__ == "__main__":

@@ -15,6 +15,8 @@ from typing import Any, ParamSpec, TypeVar
 SPLITS = ("train", "interpolation", "extrapolation")
 CHOICES = ("conditioning", "representation", "encoder", "gradients", "value", "scaling", "sampler")
 """The kinds of parts that a user chooses by name, as --agent.KIND=NAME."""
+PRESETS = ("auto", "cpu", "gpu")
+"""The kinds of devices for which settings were tuned, as --preset=NAME."""
 BEGAN = time.time()
 """When this process began to import the package, in seconds since 1970."""
 _MANY = 20
@@ -105,6 +107,12 @@ def load(place: Any) -> Any:
         return place
     module, name = place.split(":")
     return getattr(import_module(module), name)
+
+
+def is_imported(path: Path) -> bool:
+    """Return whether a Python file was imported by this process, as a module or by --import."""
+    known = (getattr(module, "__file__", None) for module in list(sys.modules.values()))
+    return any(file and Path(file).resolve() == path.resolve() for file in known)
 
 
 def lazily(module: str, homes: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 
-from mtjax import commands
+from mtjax.command import imports, parsing, process, refusals
 from mtjax.names import SPLITS, InputError, become, load, nearest_error
 
 FIGURES = ("curves", "families", "parameter", "iqm", "profile", "improvement", "all")
@@ -33,10 +33,10 @@ class Request:
 
 def main(argv: Sequence[str]) -> None:
     """Read the command line first, then import the code that draws."""
-    argv = commands.import_files(argv)
-    commands.check_flags_of(Request, argv)
+    argv = imports.import_files(argv)
+    refusals.check_flags_of(Request, argv)
     runs, flags = _apart(argv)
-    request = commands.parse_with_tyro(Request, flags, Request(), "python -m mtjax.plot RUN ...")
+    request = parsing.parse_with_tyro(Request, flags, Request(), "python -m mtjax.plot RUN ...")
     if not runs:
         raise InputError("say which runs to draw: python -m mtjax.plot runs/*")
     for name, value, allowed in (("figure", request.figure, FIGURES), ("split", request.split, SPLITS)):
@@ -62,7 +62,7 @@ def _apart(argv: Sequence[str]) -> tuple[list[str], list[str]]:
 
 def run() -> None:
     """Run the command line."""
-    commands.main(main)
+    process.main(main)
 
 
 if __name__ == "__main__":

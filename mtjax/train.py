@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from mtjax import commands, flag_files
+from mtjax.command import flag_files, help, imports, process, refusals
 from mtjax.names import become, load
 
 
@@ -14,25 +14,25 @@ def main(argv: Sequence[str]) -> None:
 
 
 def _run(argv: Sequence[str]) -> None:
-    words = commands.import_files(argv)
-    commands.check_names(words)
+    words = imports.import_files(argv)
+    refusals.check_names(words)
     if len(words) == len(argv):  # else the full parser checks the flags of the user's own classes
-        commands.check_flags(words)
+        refusals.check_flags(words)
     if words in (["--help"], ["-h"]):
-        print(commands.overview())
+        print(help.overview())
         return
     if "--list" in words:
-        print(commands.catalogue())
+        print(help.catalogue())
         return
     load("mtjax.training.allocator:share_arenas")()  # before there are threads
     if "--distributed" not in words:  # else all processes find their devices together
         load("mtjax.parallel.hosts:find_devices")()
-    load("mtjax.training.main:main")(argv, load("mtjax.cli:parse"))
+    load("mtjax.training.main:main")(argv, load("mtjax.command.run_config:parse"))
 
 
 def run() -> None:
     """Run the command line."""
-    commands.main(main)
+    process.main(main)
 
 
 if __name__ == "__main__":

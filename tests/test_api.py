@@ -13,7 +13,8 @@ from probes import Probe, tiny
 import mtjax
 import mtjax.evaluate
 import mtjax.train
-from mtjax import agents, checks, cli, envs
+from mtjax import agents, checks, envs
+from mtjax.command import run_config
 from mtjax.config import Plan, from_json, with_preset
 from mtjax.loop import Settings
 from mtjax.report import collect
@@ -82,7 +83,7 @@ def test_its_folder_is_loaded_evaluated_and_resumed(result, copied_run, capsys):
     mtjax.evaluate.main([f"--run={result.directory}", "--episodes=1"])
     words = shlex.split(json.loads((result.directory / "config.json").read_text())["command"])
     recorded = from_json(result.directory / "config.json")
-    assert cli.parse(words[3:]) == recorded
+    assert run_config.parse(words[3:]) == recorded
     more = mtjax.train("finger-short", "sac-conditioned", steps=700, directory=copied_run, resume=True, **PLAN, **SMALL)
     assert more.finished and more.rows[0]["steps"] == 700
     assert from_json(copied_run / "config.json").plan.steps == 700

@@ -21,15 +21,17 @@ from probes import FEW, OFF_POLICY, one_in
 
 import mtjax.evaluate
 import mtjax.train
-from mtjax import cli, commands, flag_files, shipped
 from mtjax.agents import AGENTS
 from mtjax.agents import settings as settings_of
 from mtjax.agents.choices import CHOICES
 from mtjax.agents.parts.representations import DeepMDP
+from mtjax.command import flag_files, process, run_config
+from mtjax.command.run_config import parse
 from mtjax.config import for_tasks, from_json, load_preset, slow_on_cpu, to_json, with_preset
 from mtjax.envs import BENCHMARKS, ENVS
 from mtjax.loop import Settings
 from mtjax.names import notice
+from mtjax.saved import shipped
 from mtjax.training import launch
 from mtjax.training.folder import to_flags
 from mtjax.training.memory import explaining
@@ -48,7 +50,7 @@ def complaint(monkeypatch, capsys, tmp_path, short_family):
     def complaint(command, *words):
         monkeypatch.setattr("sys.argv", [command, *map(str, words)])
         with pytest.raises(SystemExit) as stop:
-            commands.main(COMMANDS[command])
+            process.main(COMMANDS[command])
         said = capsys.readouterr().err
         assert stop.value.code == 2 and said.startswith("error: ") and said.count("\n") == 1
         assert len(said) < 400
@@ -67,7 +69,7 @@ def words_of(text):
 
 def test_names_choose_the_defaults():
     """What is given changes them, and nothing else."""
-    program = cli.parse(["--env=finger-spin-vary-size", "--agent=care", "--agent.num-experts=3", "--preset=gpu"])
+    program = parse(["--env=finger-spin-vary-size", "--agent=care", "--agent.num-experts=3", "--preset=gpu"])
     named = with_preset("finger-spin-vary-size", "care", "gpu")
     encoder = dataclasses.replace(named.learner.encoder, num_experts=3)
     assert program == dataclasses.replace(named, learner=dataclasses.replace(named.learner, encoder=encoder))
@@ -78,7 +80,7 @@ def test_names_choose_the_defaults():
 @pytest.mark.parametrize("agent", ["sac", "ppo"])
 def test_a_representation_brings_its_flags(agent, tmp_path):
     """Whatever the agent; and a record of them is read back."""
-    program = cli.parse([f"--agent={agent}", "--agent.representation=deepmdp", "--agent.latent-widths", "8", "4"])
+    program = parse([f"--agent={agent}", "--agent.representation=deepmdp", "--agent.latent-widths", "8", "4"])
     assert program.learner.representation == DeepMDP(latent_widths=(8, 4))
     assert settings_of(program.learner)["latent_widths"] == (8, 4)
     (tmp_path / "config.json").write_text(to_json(program, {"command": "x"}))
@@ -95,7 +97,7 @@ def test_a_representation_brings_its_flags(agent, tmp_path):
 )
 def test_flags_may_be_written_in_three_ways(words):
     """With an equals sign, with a space, and with underscores."""
-    program = cli.parse(words)
+    program = parse(words)
     assert (program.env, program.training.num_envs, program.learner.actor_lr) == ("finger-spin", 3, 0.5)
     assert program.learner.shared_temperature
 
@@ -113,12 +115,12 @@ def test_flags_may_be_written_in_three_ways(words):
     ],
 )
 def test_numbers_and_switches_may_be_written_as_in_python(words, plain):
-    assert cli.parse(words.split()) == cli.parse(plain.split())
+    assert parse(words.split()) == parse(plain.split())
 
 
 def test_last_of_a_repeated_name_counts():
     """As it does for every other flag."""
-    program = cli.parse(["--agent=care", "--steps=1", "--agent", "multi-head", "--steps=2"])
+    program = parse(["--agent=care", "--steps=1", "--agent", "multi-head", "--steps=2"])
     assert (program.agent, program.learner.heads, program.plan.steps) == ("multi-head", "per-task", 2)
 
 
@@ -133,7 +135,7 @@ def test_a_record_is_read_back_as_it_was(env, agent, tmp_path):
     given = {name: str(family.parameters[name].nominal) for name in names}
     vary = [f"--env.vary.{name}={values}" for name, values in given.items()]
     words = [f"--env={env}", f"--agent={agent}", "--agent.hidden", "7", "7", "--split=none", *vary]
-    program = cli.parse(words)
+    program = parse(words)
     assert given.items() <= dict(program.family.vary).items()
     (tmp_path / "config.json").write_text(to_json(program, {"command": "x"}))
     assert from_json(tmp_path / "config.json") == program
@@ -162,18 +164,18 @@ REPEATED = [
 @pytest.mark.parametrize(("agent", "settings"), REPEATED)
 def test_repeating_flags_give_the_same_program(agent, settings):
     """The command in config.json, word for word, and whatever the presets are by then."""
-    program = cli.parse([f"--agent={agent}", *settings.split()])
+    program = parse([f"--agent={agent}", *settings.split()])
     words = shlex.split(shlex.join(["python", "-m", "mtjax.train", *to_flags(program)]))[3:]
-    again = cli.parse([*words, "--preset=cpu"])
+    again = parse([*words, "--preset=cpu"])
     assert dataclasses.replace(again, preset=program.preset) == program
 
 
 def test_repeating_flags_name_the_file_of_vectors(tmp_path):
     """Also where its name has spaces."""
     file = tmp_path / "my vectors.npy"
-    program = cli.parse(["--agent=care", "--agent.conditioning=vectors", f"--agent.vectors={file}"])
+    program = parse(["--agent=care", "--agent.conditioning=vectors", f"--agent.vectors={file}"])
     words = shlex.split(shlex.join(to_flags(program)))
-    assert cli.parse(words) == program and program.learner.conditioning.vectors == str(file)
+    assert parse(words) == program and program.learner.conditioning.vectors == str(file)
 
 
 @pytest.mark.parametrize("file", PRESET_FILES, ids=lambda file: file.name)
@@ -243,9 +245,9 @@ def test_a_preset_is_fitted_to_the_number_of_tasks(count, worlds, by_task, tuned
 
 
 def test_the_number_of_tasks_decides_however_it_is_given():
-    ranges = cli.parse(["--env=finger-spin", "--env.vary.size=0.9:1.1:50"])
-    drawn = cli.parse(["--env=point-mass-vary-goal", "--env.num-tasks=50"])
-    mixed = cli.parse(["--env=finger-spin+cheetah-run", "--env.vary.finger-spin.size=0.9:1.1:49"])
+    ranges = parse(["--env=finger-spin", "--env.vary.size=0.9:1.1:50"])
+    drawn = parse(["--env=point-mass-vary-goal", "--env.num-tasks=50"])
+    mixed = parse(["--env=finger-spin+cheetah-run", "--env.vary.finger-spin.size=0.9:1.1:49"])
     for program in (ranges, drawn, mixed):
         assert program.family.train_count == 50
         assert (program.training.num_envs, program.learner.experience.batch_size) == (4, 7)
@@ -254,14 +256,14 @@ def test_the_number_of_tasks_decides_however_it_is_given():
 def test_a_short_run_is_not_all_warm_up():
     """A tenth of it is, and it has a line of metrics for each tenth; what is given holds."""
     flags = ["--env=finger-spin-vary-size", "--steps=100000"]
-    short = cli.parse(flags)
+    short = parse(flags)
     assert (short.learner.experience.warmup_steps, short.training.chunk_steps) == (62, 62)  # of 625
     assert short.plan.eval_every == 33_334  # three evaluations play as many steps as the run, each
-    given = cli.parse([*flags, "--warmup-steps=500", "--chunk-steps=400", "--eval-every=20000"])
+    given = parse([*flags, "--warmup-steps=500", "--chunk-steps=400", "--eval-every=20000"])
     assert (given.learner.experience.warmup_steps, given.training.chunk_steps) == (500, 400)
     assert given.plan.eval_every == 20_000
-    assert cli.parse([*flags, "--n-step=100"]).learner.experience.warmup_steps == 100
-    whole = cli.parse(flags[:1])
+    assert parse([*flags, "--n-step=100"]).learner.experience.warmup_steps == 100
+    whole = parse(flags[:1])
     assert (whole.learner.experience.warmup_steps, whole.training.chunk_steps, whole.plan.eval_every) == (2000, 500, 0)
 
 
@@ -274,8 +276,8 @@ def test_pictures_have_a_preset_of_their_own(agent):
     assert {name: found[name] for name in expected} == expected
     assert program != with_preset("finger-spin", agent, "gpu")
     flags = ["--env=finger-spin", f"--agent={agent}", "--preset=gpu", "--env.pixels=64"]
-    assert cli.parse(flags) == program
-    mixed = cli.parse([*flags, "--env=finger-spin+cheetah-run"])
+    assert parse(flags) == program
+    mixed = parse([*flags, "--env=finger-spin+cheetah-run"])
     assert mixed.learner.actor_lr == load_preset("+", "gpu")["pictures"]["actor_lr"]
 
 
@@ -296,9 +298,9 @@ def test_what_is_given_goes_before_what_is_tuned():
 def test_auto_preset_is_that_of_the_device(monkeypatch):
     """A GPU takes the gpu preset. A record says auto all the same."""
     assert with_preset("finger-spin", "sac").preset == "auto"
-    assert cli.parse([]).training == with_preset("finger-spin", "sac", "cpu").training
+    assert parse([]).training == with_preset("finger-spin", "sac", "cpu").training
     monkeypatch.setattr("jax.default_backend", lambda: "gpu")
-    assert cli.parse([]).training == with_preset("finger-spin", "sac", "gpu").training
+    assert parse([]).training == with_preset("finger-spin", "sac", "gpu").training
 
 
 # Help.
@@ -307,17 +309,17 @@ def test_auto_preset_is_that_of_the_device(monkeypatch):
 @pytest.fixture(scope="module")
 def help_text():
     with contextlib.redirect_stdout(io.StringIO()) as out, pytest.raises(SystemExit) as stop:
-        cli.parse(["--agent=care", "--help"])
+        parse(["--agent=care", "--help"])
     assert not stop.value.code
     return words_of(out.getvalue())
 
 
 def test_help_mentions_every_flag_with_its_default(help_text):
     """Of the agent and family that were named, as the preset leaves them."""
-    program = cli.parse(["--agent=care"])
-    for flag in cli.flags(program):
+    program = parse(["--agent=care"])
+    for flag in run_config.flags(program):
         assert re.search(rf"{re.escape(flag)}[ ,]", help_text), flag
-    assert help_text.count("(default: ") == len(cli.flags(program)) - len(CHOICES)  # which are read before
+    assert help_text.count("(default: ") == len(run_config.flags(program)) - len(CHOICES)  # which are read before
     learner = program.learner
     for default in (
         program.plan.steps,
@@ -516,7 +518,7 @@ def test_vectors_of_another_number_of_tasks_are_refused(complaint, tmp_path):
 
 def test_c_engine_is_for_the_cpu(complaint, monkeypatch):
     """There it is accepted; elsewhere it is refused before the run's folder is made."""
-    assert cli.parse(["--engine=c"]).family.engine == "c"
+    assert parse(["--engine=c"]).family.engine == "c"
     monkeypatch.setattr("jax.default_backend", lambda: "gpu")
     assert "use --engine=mjx" in complaint("train", "--engine=c")
 
@@ -620,19 +622,19 @@ def test_errors_of_a_run_are_one_line(capsys, error, code, said):
         raise error
 
     with pytest.raises((SystemExit, KeyboardInterrupt)) as stop:  # an interrupt let through would end pytest
-        commands.main(fails)
+        process.main(fails)
     assert getattr(stop.value, "code", None) == code and capsys.readouterr().err == said
 
 
 def test_what_is_overlong_is_shortened():
     """A message stays a line of readable length, with its beginning and its end."""
-    told = commands.one_line(InputError(f"unknown split {'9' * 5000!r};\nchoose from: dense"))
+    told = process.one_line(InputError(f"unknown split {'9' * 5000!r};\nchoose from: dense"))
     assert told.startswith("unknown split '999") and told.endswith("999'; choose from: dense") and len(told) < 620
 
 
 def test_notices_are_one_line(capsys):
     """On the error stream, without the place in the code."""
-    commands.main(lambda _: notice("the file is damaged"))
+    process.main(lambda _: notice("the file is damaged"))
     assert capsys.readouterr() == ("", "warning: the file is damaged\n")
 
 
@@ -643,7 +645,7 @@ def test_errors_of_ours_are_not_hidden():
         raise KeyError("ours")
 
     with pytest.raises(KeyError):
-        commands.main(fails)
+        process.main(fails)
 
 
 @pytest.mark.parametrize(
@@ -709,14 +711,14 @@ actor_lr = 1e-4
     )
     words = "--steps=5000 --num-envs=3 --no-stagger --env=finger-spin --agent=care --agent.num-experts=3".split()
     words += ["--env.vary.size=1,1.1,1.2", "--env.vary.touch-size=0.1:0.3:2", "--agent.hidden", "8", "8"]
-    assert cli.parse(flag_files.expand([f"--config={file}"])) == cli.parse([*words, "--agent.actor-lr=1e-4"])
-    changed = cli.parse(flag_files.expand(["--config", str(file), "--agent.hidden", "9", "--agent.actor-lr=1"]))
+    assert parse(flag_files.expand([f"--config={file}"])) == parse([*words, "--agent.actor-lr=1e-4"])
+    changed = parse(flag_files.expand(["--config", str(file), "--agent.hidden", "9", "--agent.actor-lr=1"]))
     assert changed.learner.hidden == (9,) and changed.learner.actor_lr == 1 and changed.plan.steps == 5000
 
 
 def test_the_quick_start_is_a_file_of_flags():
     """Those beside it change it."""
-    quick = cli.parse(flag_files.expand(["--quick", "--seeds=2"]))
+    quick = parse(flag_files.expand(["--quick", "--seeds=2"]))
     assert (quick.env, quick.agent, quick.plan.seeds) == ("point-mass-vary-goal", "sac-conditioned", 2)
     assert quick.plan.steps <= 250_000 and quick.learner.hidden == (64, 64)
 

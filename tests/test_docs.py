@@ -12,7 +12,7 @@ import pytest
 from needs import needs
 
 from mtjax.agents import AGENTS
-from mtjax.cli import parse
+from mtjax.command.run_config import parse
 from mtjax.envs import ENVS
 
 ROOT = Path(__file__).parents[1]

@@ -14,7 +14,8 @@ from test_export import policy_of
 import mtjax
 import mtjax.evaluate
 from mtjax import standalone
-from mtjax.training import onnx, ship
+from mtjax.saved import ship
+from mtjax.training import onnx
 from mtjax.training.steps import steps_of
 from mtjax.types import InputError
 

@@ -11,8 +11,8 @@ import pytest
 from probes import slow_but, with_nets
 
 import mtjax.train
-from mtjax import cli
 from mtjax.agents import agent
+from mtjax.command import run_config
 from mtjax.config import from_json
 from mtjax.envs import ENVS
 from mtjax.envs.family import Family
@@ -181,7 +181,7 @@ def test_a_run_records_where_it_comes_from(base, tuned):
 def test_recorded_command_repeats_the_program(tuned):
     """The run of --from included."""
     program = from_json(tuned("heads") / "config.json")
-    again = cli.parse([*to_flags(program), f"--runs={program.runs}", f"--preset={program.preset}"])
+    again = run_config.parse([*to_flags(program), f"--runs={program.runs}", f"--preset={program.preset}"])
     assert again == program
 
 

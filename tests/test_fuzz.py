@@ -15,9 +15,9 @@ from needs import require
 st = require("hypothesis.strategies")
 from hypothesis import HealthCheck, given, settings
 
-from mtjax import cli, commands, flag_files
 from mtjax.agents import AGENTS
 from mtjax.agents import settings as settings_of
+from mtjax.command import flag_files, process, refusals, run_config
 from mtjax.config import from_json, to_json
 from mtjax.names import InputError
 from mtjax.training import launch, sweep
@@ -34,7 +34,7 @@ RANGES = (
     "1:1:1 1:2:1000000000 2:1:3 1:2:0 1:2:-1 1:2:2.5 1:2 1:inf nan:1 1e308:1e309:3 :: 1:2:3:4 0.9:1.1:3 1,2,3".split()
 )
 ELSEWHERE = ("--runs", "--resume", "--from", "--list", "--sweep", "--config", "--quick")  # read before a run's flags
-FLAGS = [flag for flag in cli.flags(cli.parse([])) if flag not in ELSEWHERE]
+FLAGS = [flag for flag in run_config.flags(run_config.parse([])) if flag not in ELSEWHERE]
 FAMILIES = "finger-spin walker-walk bandit two-goal-maze control-cartpole point-mass-vary-goal".split()
 PARAMETERS = "size mass gravity torso-mass gear touch-size friction goal-x nonsense".split()
 
@@ -51,12 +51,12 @@ lines = st.lists(setting | varied | named | switch | value, min_size=1, max_size
 def require_use_or_refusal(words, folder):
     """What a command line or record says is refused in one line, or holds finite numbers and is recorded."""
     try:
-        commands.check_names(words)
-        commands.check_flags(words)
-        config = cli.parse(words)
+        refusals.check_names(words)
+        refusals.check_flags(words)
+        config = run_config.parse(words)
         launch.check(config)
     except InputError as error:
-        assert commands.one_line(error)
+        assert process.one_line(error)
         return
     assert config.plan.seed >= 0 and config.plan.seed + config.plan.seeds <= 2**31
     found = {**dataclasses.asdict(config.plan), **dataclasses.asdict(config.training), **settings_of(config.learner)}
@@ -112,7 +112,7 @@ def test_any_toml_file_is_used_or_refused(table, tmp_path):
     try:
         words = flag_files.expand([f"--config={file}"])
     except InputError as error:
-        assert commands.one_line(error)
+        assert process.one_line(error)
         return
     require_use_or_refusal(words, tmp_path)
 
@@ -134,9 +134,9 @@ def test_any_sweep_is_used_or_refused(words):
     """Axes and their values."""
     axes = [f"{flag.removeprefix('--')}={','.join(values)}" for flag, values in words]
     try:
-        sweep.configurations(["--sweep", *axes], cli.parse)
+        sweep.configurations(["--sweep", *axes], run_config.parse)
     except InputError as error:
-        assert commands.one_line(error)
+        assert process.one_line(error)
 
 
 def places(node, path=()):
@@ -168,7 +168,7 @@ JUNK += [float("nan"), float("inf"), ["1", "2"], [1, 2.5], "1:2:1000000000", "..
 
 @pytest.fixture(scope="module")
 def record(short_family):
-    config = cli.parse(SHORT_RUN)
+    config = run_config.parse(SHORT_RUN)
     return json.loads(to_json(config, run_metadata(config)))
 
 
@@ -181,7 +181,7 @@ def require_read_or_refused(record, folder):
         record_steps(file, 5)
         assert from_json(file).plan.steps == 5
     except InputError as error:
-        assert commands.one_line(error)
+        assert process.one_line(error)
 
 
 @pytest.mark.slow

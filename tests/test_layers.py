@@ -34,9 +34,9 @@ LAYERS = (
     [GROUND],
     [("envs",), ("experience",), ("agents",)],
     [("rollout", "loop", "evaluation")],
-    [("parallel", "commands", "flag_files", "shipped", "config", "registry", "xla_flags")],
-    [("training", "report")],
-    [("cli",), ("gym",)],
+    [("parallel", "config", "registry")],
+    [("training", "report", "saved")],
+    [("command",), ("gym",)],
     [("train",), ("evaluate",), ("plot",)],
 )
 BESIDE = {("agents", "experience")}  # the groups of one layer of which the first may import the second

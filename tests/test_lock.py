@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import mtjax
-from mtjax import commands
+from mtjax.command import process
 from mtjax.names import Notice, replacing
 from mtjax.train import main
 from mtjax.training import lock
@@ -85,7 +85,7 @@ def test_a_run_in_use_is_not_resumed(copied_run, capsys, monkeypatch, words):
     with lock.hold(copied_run):
         before = contents()
         with pytest.raises(SystemExit) as stop:
-            commands.main(main)
+            process.main(main)
         said = capsys.readouterr()
         assert contents() == before
     assert stop.value.code == 2 and said.err.startswith("error: ") and said.err.count("\n") == 1

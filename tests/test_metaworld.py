@@ -11,7 +11,7 @@ import pytest
 from needs import needs
 
 import mtjax
-from mtjax import cli
+from mtjax.command import run_config
 from mtjax.config import from_json, to_json
 from mtjax.envs import BENCHMARKS, name_of
 from mtjax.envs.engines.base import at_rest
@@ -216,7 +216,7 @@ def test_benchmarks_have_the_tasks_of_the_original():
 @needs("metaworld")
 def test_a_benchmark_is_a_mixture_by_a_name(tmp_path):
     """Its record is read back, its settings are each family's, and flags apply to all."""
-    program = cli.parse(["--env=ml10", "--agent=sac-conditioned", "--env.num-draws=2", "--engine=c"])
+    program = run_config.parse(["--env=ml10", "--agent=sac-conditioned", "--env.num-draws=2", "--engine=c"])
     env = program.family
     assert program.env == "ml10" and len(env.families) == 15 and env.train_count == 10
     assert all(family.goal_hidden and family.num_draws == 2 for family in env.families)

@@ -17,9 +17,10 @@ from probes import OFF_POLICY, one_in, slow_but
 import mtjax
 import mtjax.evaluate
 import mtjax.train
-from mtjax import agents, cli, networks, normalize, rollout
+from mtjax import agents, networks, normalize, rollout
 from mtjax.agents.sac import Batch, action_sizes
 from mtjax.agents.state import AgentState
+from mtjax.command import run_config
 from mtjax.config import from_json, to_json
 from mtjax.envs import ENVS, Family, Mixture, make, mixture
 from mtjax.envs.parameters import Parameter
@@ -581,7 +582,7 @@ def test_a_run_is_scored_family_by_family(run, capsys):
 def test_a_run_and_its_policy_are_read_back(run):
     config = from_json(run / "config.json")
     assert isinstance(config.family, Mixture) and config.family == make("aim+wide-aim")
-    assert cli.parse(to_flags(config)) == dataclasses.replace(config, runs="runs")
+    assert run_config.parse(to_flags(config)) == dataclasses.replace(config, runs="runs")
     policy = mtjax.load(run)
     task = pick(policy.env.tasks(), 0)
     action = policy(policy.env.reset(task, jax.random.key(0)).obs, task)
@@ -614,14 +615,14 @@ def test_a_run_goes_on_bit_for_bit(tmp_path, monkeypatch):
 
 def test_flags_of_families_hold_for_all_of_them(tmp_path):
     words = "--env=control-cartpole+tabular-mdp+cartpole-swingup --split=none --env.num-tasks 3 --engine=mjx --seeds=2"
-    config = cli.parse([*words.split(), "--env.vary.cartpole-swingup.pole-mass=0.1,0.2"])
+    config = run_config.parse([*words.split(), "--env.vary.cartpole-swingup.pole-mass=0.1,0.2"])
     pole, table, swingup = config.family.families  # type: ignore
     assert (pole.num_tasks, table.num_tasks, pole.split, table.split) == (3, 3, "none", "none")
     assert swingup.engine == "mjx" and swingup.train_count == 2 and config.plan.seeds == 2
     assert config.training == Settings(num_envs=16)  # the default preset's
     (tmp_path / "config.json").write_text(to_json(config, {}))
     assert from_json(tmp_path / "config.json") == config
-    assert cli.parse(to_flags(config)) == config
+    assert run_config.parse(to_flags(config)) == config
 
 
 @pytest.mark.parametrize(
@@ -637,14 +638,14 @@ def test_flags_of_families_hold_for_all_of_them(tmp_path):
 )
 def test_wrong_flags_are_refused(flag, said):
     with pytest.raises(InputError) as error:
-        config = cli.parse(["--env=bandit+control-cartpole", flag])
+        config = run_config.parse(["--env=bandit+control-cartpole", flag])
         config.learner.experience.check(config.family, 16)
     assert said in str(error.value)
 
 
 def test_a_mixture_is_not_fine_tuned(run):
     with pytest.raises(InputError, match="is a mixture; take one family"):
-        cli.parse(["--env=aim", f"--from={run}"])
+        run_config.parse(["--env=aim", f"--from={run}"])
 
 
 def test_names_of_many_families_are_shortened():

@@ -19,9 +19,10 @@ from probes import FEW, METAWORLD, param, slow_but
 import mtjax
 import mtjax.evaluate
 import mtjax.train
-from mtjax import cli, commands, register
+from mtjax import register
 from mtjax.agents import AGENTS, PARTS
 from mtjax.agents.parts.knowing import Parameters
+from mtjax.command import help, run_config
 from mtjax.config import to_json
 from mtjax.envs import ENVS, Domain, Parameter, declared, effects
 from mtjax.envs.brax import Brax
@@ -402,7 +403,7 @@ def forget_own():
 
 def test_all_files_of_a_run_are_recorded_and_asked_for_and_never_run_by_themselves(forget, tmp_path):
     """By evaluation, by resuming and in Python."""
-    config = cli.parse([OWN_FLAGS[0], "--import", str(OWN_FILES[1]), *OWN_WORDS])
+    config = run_config.parse([OWN_FLAGS[0], "--import", str(OWN_FILES[1]), *OWN_WORDS])
     assert [word for word in to_flags(config) if word.startswith("--import")] == OWN_FLAGS
     (tmp_path / "config.json").write_text(to_json(config, {"command": ""}))
     (tmp_path / "evaluations.npz").touch()
@@ -439,14 +440,14 @@ def test_an_agent_with_other_defaults_names_its_file(forget, tmp_path):
     file = tmp_path / "own_defaults.py"
     file.write_text('import mtjax\n\nmtjax.register("my-care", "care", num_experts=3)\n')
     flag = f"--import={file}"
-    config = cli.parse([flag, "--agent=my-care"])
+    config = run_config.parse([flag, "--agent=my-care"])
     assert config.imports == (str(file),) and flag in to_flags(config)
     assert api._configured("finger-spin", "my-care", {}, None, None, {}).imports == (str(file),)
 
 
 def test_unknown_names_of_a_run_mention_import(tmp_path):
     """If the run does not say which file, as it was registered in a notebook."""
-    record = json.loads(to_json(cli.parse([]), {"command": ""}))
+    record = json.loads(to_json(run_config.parse([]), {"command": ""}))
     (tmp_path / "config.json").write_text(json.dumps({**record, "env": "gone"}))
     with pytest.raises(InputError, match=r"unknown environment 'gone'.*give --import=FILE\.py with the file that"):
         mtjax.load(tmp_path)
@@ -454,6 +455,6 @@ def test_unknown_names_of_a_run_mention_import(tmp_path):
 
 def test_the_list_says_what_varies():
     """And the help how to import."""
-    lines = commands.catalogue().splitlines()
+    lines = help.catalogue().splitlines()
     assert any("finger-spin-vary-size " in line and "[size=0.95:1.13:10]" in line for line in lines)
-    assert "--import=FILE.py" in commands.overview()
+    assert "--import=FILE.py" in help.overview()

@@ -28,7 +28,8 @@ from probes import with_nets
 
 import mtjax
 import mtjax.train
-from mtjax import cli, commands, loop
+from mtjax import loop
+from mtjax.command import process, run_config
 from mtjax.config import Plan, evaluations_of, from_json
 from mtjax.evaluation import load_evaluations, save_evaluations
 from mtjax.loop import Settings
@@ -52,7 +53,7 @@ def play(short_family):
     """Train as SHORT_RUN does, apart from what is given."""
 
     def play(directory=None, settings=None, **changes):
-        program = cli.parse(SHORT_RUN)
+        program = run_config.parse(SHORT_RUN)
         settings = settings or program.training
         if directory is not None:
             directory.mkdir(exist_ok=True)
@@ -133,7 +134,7 @@ def test_recorded_command_repeats_the_program(finished_run):
     """The words after ``python -m mtjax.train`` parse to what the file records."""
     words = shlex.split(json.loads((finished_run / "config.json").read_text())["command"])
     recorded = from_json(finished_run / "config.json")
-    assert cli.parse([*words[3:], f"--runs={recorded.runs}"]) == recorded
+    assert run_config.parse([*words[3:], f"--runs={recorded.runs}"]) == recorded
 
 
 def test_metrics_have_a_row_a_seed_a_chunk(finished_run):
@@ -263,7 +264,7 @@ def test_seeds_differ(whole):
 @pytest.mark.slow
 def test_a_seed_among_many_is_that_seed_alone(short_family, whole):
     """Up to rounding: the same draws, so the first chunk is the same."""
-    program = cli.parse(SHORT_RUN)
+    program = run_config.parse(SHORT_RUN)
     fixed = (program.family, program.learner, program.training, program.family.tasks("train"))
     _, metrics = loop.run_chunk(*fixed, loop.init(*fixed, jnp.array([1])))
     row = whole.rows[1]
@@ -667,7 +668,7 @@ def test_a_stopped_run_exits_with_the_signal(short_family, tmp_path, monkeypatch
     metrics, pid = log.metric_rows, os.getpid()
     monkeypatch.setattr(log, "metric_rows", lambda *given: (os.kill(pid, number), metrics(*given))[1])
     with pytest.raises(SystemExit) as stop:
-        commands.main(mtjax.train.main)
+        process.main(mtjax.train.main)
     (directory,) = tmp_path.iterdir()
     assert stop.value.code == code and f"--resume={directory}" in capsys.readouterr().out
     assert {path.name for path in directory.iterdir()} == {"config.json", "metrics.csv", "checkpoints"}
@@ -698,7 +699,7 @@ def test_a_stopped_run_draws_the_curve_so_far(short_family, tmp_path, monkeypatc
     metrics, pid = log.metric_rows, os.getpid()
     monkeypatch.setattr(log, "metric_rows", lambda *given: (os.kill(pid, signal.SIGINT), metrics(*given))[1])
     with pytest.raises(SystemExit):
-        commands.main(mtjax.train.main)
+        process.main(mtjax.train.main)
     (directory,) = tmp_path.iterdir()
     assert (directory / "evaluations.npz").exists() and (directory / "curve.png").exists()
 

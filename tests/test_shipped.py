@@ -13,11 +13,13 @@ from test_export import ENV, observations, policy_of
 
 import mtjax
 import mtjax.evaluate
-from mtjax import agents, shipped
-from mtjax.cli import parse
+from mtjax import agents
+from mtjax.command import ship as command
+from mtjax.command.run_config import parse
 from mtjax.report import films
 from mtjax.report.scoring import score
-from mtjax.training import finetune, ship
+from mtjax.saved import ship, shipped
+from mtjax.training import finetune
 from mtjax.types import InputError
 
 PAGE = Path(__file__).parents[1] / "docs/results/policies.md"
@@ -47,7 +49,7 @@ def package(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_a_policy_is_shipped_and_acts_as_its_run(copied_run, package, tmp_path, monkeypatch, capsys):
     """By its name, in Python and on the command line, which writes nothing but what goes with a film."""
-    ship.main([str(copied_run), "finger-spin/care"])
+    command.main([str(copied_run), "finger-spin/care"])
     assert shipped.names() == ["finger-spin/care"]
     ours, theirs = mtjax.load("finger-spin/care"), mtjax.load(copied_run)
     tasks = theirs.env.tasks("all")
@@ -65,7 +67,7 @@ def test_a_policy_is_shipped_and_acts_as_its_run(copied_run, package, tmp_path, 
     with pytest.raises(InputError, match="is a policy alone"):
         mtjax.evaluate.main(["--run=finger-spin/care", "--diagnostics"])
     with pytest.raises(InputError, match="there is a policy 'finger-spin/care' already"):
-        ship.main([str(copied_run), "finger-spin/care"])
+        command.main([str(copied_run), "finger-spin/care"])
 
 
 def test_a_run_with_a_policy_inside_stays_a_run(copied_run):

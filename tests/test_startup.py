@@ -16,9 +16,10 @@ from mujoco import mjx
 from probes import FEW, param
 
 import mtjax
-from mtjax import cli, commands, names, train, xla_flags
+from mtjax import names, train
 from mtjax.agents import AGENTS, CHOICES, PARTS, settings
 from mtjax.agents.choices import flag_names
+from mtjax.command import help, refusals, run_config, sources, xla_flags
 from mtjax.config import with_preset
 from mtjax.envs import ENVS, fields, outline
 from mtjax.envs.brax import NAMES
@@ -141,24 +142,24 @@ PAIRS = [*((env, "sac") for env in FEW), *(("finger-spin", agent) for agent in A
 @pytest.mark.parametrize("env, agent", map(param, PAIRS))
 def test_no_flag_is_refused_that_there_is(env, agent, ours):
     """Of any family or agent, before either is known."""
-    flags = cli.flags(with_preset(env, agent, "cpu"))
-    commands.check_flags([*flags, *(f"{flag}=1" for flag in flags)])
+    flags = run_config.flags(with_preset(env, agent, "cpu"))
+    refusals.check_flags([*flags, *(f"{flag}=1" for flag in flags)])
 
 
 def test_flags_of_all_families_and_agents_are_known_without_jax(ours):
     """All of them and no other name, with which of them are switches: what is misspelt is answered with a flag."""
     choices = [{kind: name} for kind in CHOICES for name in PARTS[kind]] + [{"scaling": "ars", "reset_every": 100}]
     real = {"--help": False, "--import": False} | {f"--agent.{kind}": False for kind in CHOICES}
-    real |= cli.flags(mtjax.preset("cartpole-swingup+finger-spin", "sac"))
+    real |= run_config.flags(mtjax.preset("cartpole-swingup+finger-spin", "sac"))
     for cls in {cls for cls, _ in ENVS.values()}:
-        fields = cli.shared_fields(cls)
-        real |= {cli.family_flag(field.name): isinstance(field.default, bool) for field in fields}
+        fields = run_config.shared_fields(cls)
+        real |= {run_config.family_flag(field.name): isinstance(field.default, bool) for field in fields}
     for agent, given in itertools.product(("sac", "distral", "brc", "simba-v2", "xqc", "ppo"), [{}, *choices]):
         needed = {"vectors": "file.npy"} if given == {"conditioning": "vectors"} else {}
         with contextlib.suppress(InputError):  # which this agent does not go with
             made = mtjax.agent(agent, **given, **needed)
             real |= {f"--{flag}": isinstance(settings(made)[name], bool) for name, flag in flag_names(made).items()}
-    assert commands.all_flags() == real
+    assert sources.all_flags() == real
 
 
 @pytest.mark.parametrize(
@@ -167,21 +168,21 @@ def test_flags_of_all_families_and_agents_are_known_without_jax(ours):
 def test_an_unknown_flag_is_answered_with_a_real_one(ours, given, meant):
     """Other names in the classes' source are no flags."""
     with pytest.raises(InputError, match=f"did you mean '{meant}'"):
-        commands.check_flags([given])
+        refusals.check_flags([given])
 
 
 def test_no_way_to_write_a_flag_is_refused(ours):
     """With underscores, switched off, or by a name that only the command line knows; and values are no flags."""
     words = "--env.vary.mass=1:2:3 --agent.no-shared_temperature --num_envs=3 --no-profile --from=x --help -h 1 -3"
-    commands.check_flags(words.split())
+    refusals.check_flags(words.split())
 
 
 def test_a_class_of_the_users_own_may_have_any_flag(ours, monkeypatch):
     """What its settings are is known once the command line is read in full."""
     with pytest.raises(InputError, match=r"unknown flag '--env\.springiness'"):
-        commands.check_flags(["--env.springiness=3"])
+        refusals.check_flags(["--env.springiness=3"])
     monkeypatch.setitem(ENVS, "mine", ENVS["finger-spin"])
-    commands.check_flags(["--env.springiness=3"])
+    refusals.check_flags(["--env.springiness=3"])
 
 
 @pytest.mark.parametrize("name", map(param, ENVS))
@@ -212,7 +213,7 @@ def test_an_agent_may_be_given_as_a_class(monkeypatch):
     assert dataclasses.is_dataclass(cls) and cls.__name__ == "Distral"
     monkeypatch.setitem(AGENTS, "mine", AGENTS["sac"]._replace(place=cls))
     assert type(mtjax.agent("mine")) is cls
-    assert "mine" in commands.catalogue()
+    assert "mine" in help.catalogue()
 
 
 def test_fields_of_models_are_those_of_mjx():
@@ -250,7 +251,7 @@ def test_xla_is_given_only_a_flag_that_it_knows(monkeypatch, version, gpu, given
 
 def test_this_xla_knows_the_flag():
     """A program computes under it, on any device."""
-    program = "from mtjax import xla_flags; xla_flags._has_gpu = lambda: True; xla_flags.try_few_tilings()\n"
+    program = "from mtjax.command import xla_flags; xla_flags._has_gpu = lambda: True; xla_flags.try_few_tilings()\n"
     program += "import os, jax; print('gemm_tiling' in os.environ['XLA_FLAGS'], float(jax.numpy.ones(3).sum()))"
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert run.stdout.split() == ["True", "3.0"]

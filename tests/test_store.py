@@ -15,7 +15,8 @@ from test_pictures import Episodes
 from test_run import bytes_of
 
 import mtjax
-from mtjax import cli, loop
+from mtjax import loop
+from mtjax.command import run_config
 from mtjax.config import configure
 from mtjax.envs.probes import Pictured
 from mtjax.experience import Replay, pictures, store
@@ -357,7 +358,7 @@ def test_pictures_of_rollouts_count(monkeypatch, short_family):
         InputError, match=r"of rollouts\) and .* lower --agent.unroll, --num-envs or --seeds; with --env"
     ):
         memory.require_room(long, env)
-    config = cli.parse([*SHORT_RUN, "--seeds=5"])
+    config = run_config.parse([*SHORT_RUN, "--seeds=5"])
     for needs, rounds in ((long, [2, 2, 1]), (short, [5])):
         monkeypatch.setattr(memory, "_needs", lambda _, needs=needs: needs)
         parts = memory.split_to_fit(config, 0.6 * long.device)
@@ -400,7 +401,7 @@ def test_it_is_refused_before_anything_compiles(monkeypatch):
 
 def test_seeds_run_in_rounds_that_fit_on_device_and_host(monkeypatch, short_family):
     """Of five seeds two at a time, where either has room for two and a half."""
-    config = cli.parse([*SHORT_RUN, "--seeds=5", "--host-replay-size=400"])
+    config = run_config.parse([*SHORT_RUN, "--seeds=5", "--host-replay-size=400"])
     shapes = state_shapes(config)
     stored = memory.Needs.of(shapes, config.family, config.learner, config.training).host
     monkeypatch.setattr(memory, "state_shapes", lambda _: shapes)

@@ -17,9 +17,10 @@ from probes import QUICK, Walk, one_in, random_batch, tasks_of, tiny
 import mtjax
 import mtjax.evaluate
 import mtjax.train
-from mtjax import cli, loop
+from mtjax import loop
 from mtjax.agents import PARTS
 from mtjax.agents import settings as settings_of
+from mtjax.command import run_config
 from mtjax.config import configure, from_json, to_json
 from mtjax.evaluation import Scores, load_evaluations, save_evaluations
 from mtjax.loop import Settings, TrainState
@@ -253,7 +254,7 @@ def test_wrong_sweeps_are_refused(words, said, monkeypatch, tmp_path):
 def test_numbers_vary_inside_a_program_and_the_rest_between_programs():
     """Switches, names of parts and widths too; a part's own setting may come with the part."""
     axes = ["agent.gradients=mean,cagrad", "agent.tau=0.1,1", "agent.critic-layer-norm=true,false", "agent.gamma=0.5"]
-    found = sweep.configurations(["--agent=sac", "--sweep", *axes, "--agent.hidden", "8"], cli.parse)
+    found = sweep.configurations(["--agent=sac", "--sweep", *axes, "--agent.hidden", "8"], run_config.parse)
     told = [(type(p.learner.gradients).__name__, p.learner.critic_layer_norm) for p in found]
     assert told == [("Mean", True), ("Mean", False), ("CAGrad", True), ("CAGrad", False)]
     for program in found:
@@ -265,14 +266,14 @@ def test_numbers_vary_inside_a_program_and_the_rest_between_programs():
         "agent.tau=0.1,1",
         "agent.gamma=0.5",
     )
-    widths = sweep.configurations(["--agent=sac", "--sweep", "agent.hidden=8 8,16"], cli.parse)
+    widths = sweep.configurations(["--agent=sac", "--sweep", "agent.hidden=8 8,16"], run_config.parse)
     assert [p.learner.hidden for p in widths] == [(8, 8), (16,)] and not widths[0].points
 
 
 def test_the_command_of_a_run_repeats_its_part_of_the_sweep(tmp_path):
     """And its record is read back as it was."""
-    (program,) = sweep.configurations(["--sweep", "agent.tau=0.1,1", "agent.num-critics=3"], cli.parse)
-    (again,) = sweep.configurations(to_flags(program), cli.parse)
+    (program,) = sweep.configurations(["--sweep", "agent.tau=0.1,1", "agent.num-critics=3"], run_config.parse)
+    (again,) = sweep.configurations(to_flags(program), run_config.parse)
     assert again == program
     (tmp_path / "config.json").write_text(to_json(program, {}))
     assert from_json(tmp_path / "config.json") == program
@@ -281,7 +282,7 @@ def test_the_command_of_a_run_repeats_its_part_of_the_sweep(tmp_path):
 def test_points_that_do_not_fit_into_memory_are_run_in_rounds(monkeypatch):
     """As even as can be. $MTJAX_MEMORY is in GB."""
     (program,) = sweep.configurations(
-        ["--sweep", "agent.tau=0.1,0.2,0.3,0.4,0.5", "--seeds=2", "--replay-size=1000"], cli.parse
+        ["--sweep", "agent.tau=0.1,0.2,0.3,0.4,0.5", "--seeds=2", "--replay-size=1000"], run_config.parse
     )
     one, two = (memory.required_bytes(with_seeds(program, n)) for n in (1, 2))
     assert 1.9 < two / one < 2.1
@@ -300,7 +301,7 @@ def test_points_that_do_not_fit_into_memory_are_run_in_rounds(monkeypatch):
 def test_seeds_that_do_not_fit_into_memory_are_run_in_rounds(monkeypatch):
     """Those of each point by themselves; a single seed is tried whatever it takes."""
     (program,) = sweep.configurations(
-        ["--sweep", "agent.tau=0.1,0.2", "--seeds=5", "--seed=3", "--replay-size=1000"], cli.parse
+        ["--sweep", "agent.tau=0.1,0.2", "--seeds=5", "--seed=3", "--replay-size=1000"], run_config.parse
     )
     one = memory.required_bytes(program) / 5
     parts = lambda program, limit: [
@@ -329,7 +330,7 @@ def test_a_run_of_too_many_seeds_is_run_in_rounds(tmp_path, monkeypatch, capsys)
     """By the same command, with a table of all seeds, and gone on with by its folder."""
     small = "--num-envs=2 --batch-size=2 --replay-size=20 --warmup-steps=1 --eval-episodes=1 --agent.hidden 4".split()
     words = ["--env=bandit", "--agent=sac-conditioned", "--seeds=3", "--steps=40", f"--runs={tmp_path}", *small]
-    program = cli.parse(words)
+    program = run_config.parse(words)
     monkeypatch.setenv("MTJAX_MEMORY", f"{2.5 * memory.required_bytes(program) / 3 / 0.9 / 1e9:.12f}")
     mtjax.train.main(words)
     (folder,) = tmp_path.iterdir()
@@ -356,7 +357,7 @@ def swept(short_family, tmp_path_factory):
         "agent.actor-lr=1e-3,1e-4,1e38",
         "agent.num-critics=1",
     ]
-    (program,) = sweep.configurations(words, cli.parse)
+    (program,) = sweep.configurations(words, run_config.parse)
     real = sweep.launch
 
     def stop(program, directory, *rest, **hooks):
@@ -446,7 +447,7 @@ def test_the_table_grows_with_every_evaluation(swept, tmp_path, monkeypatch):
 
 def test_a_sweeps_folder_is_named_after_all_it_holds():
     """Or after their number, if they are many."""
-    two = sweep.configurations(["--sweep", "agent=sac,care", "--env=finger-spin"], cli.parse)
+    two = sweep.configurations(["--sweep", "agent=sac,care", "--env=finger-spin"], run_config.parse)
     assert sweep._folder_name(two, "sweep") == "finger-spin-sac+care-sweep"
     many = [dataclasses.replace(two[0], agent=f"{name}-of-a-long-name") for name in "abcdefgh"]
     assert sweep._folder_name(many, "sweep") == "finger-spin-8-agents-sweep"
@@ -553,7 +554,7 @@ def test_policies_are_those_of_a_point(swept):
 def test_a_run_of_several_points_is_not_fine_tuned_by_name(swept):
     """Which of them would be a guess."""
     with pytest.raises(InputError, match="holds 2 of a sweep"):
-        cli.parse([f"--from={swept / 'run-1'}", "--env=finger-short"])
+        run_config.parse([f"--from={swept / 'run-1'}", "--env=finger-short"])
 
 
 def test_fine_tuning_begins_every_point_with_the_same_seeds(swept):

@@ -14,7 +14,8 @@ from test_joined import members, played, require_as_alone
 from test_metaworld import made
 
 import mtjax
-from mtjax import cli, rollout
+from mtjax import rollout
+from mtjax.command import run_config
 from mtjax.config import from_json, to_json
 from mtjax.envs import groups
 from mtjax.envs.joined import Alone, Joined
@@ -116,15 +117,15 @@ def test_things_are_equal_wherever_they_stand():
 
 def test_scenes_is_a_setting_of_mixtures(tmp_path):
     """A run's record and its command keep it."""
-    program = cli.parse(["--env=bandit+tabular-mdp", "--agent=brc", "--env.scenes=union"])
+    program = run_config.parse(["--env=bandit+tabular-mdp", "--agent=brc", "--env.scenes=union"])
     assert program.family == mtjax.make("bandit+tabular-mdp", scenes="union")
     assert program.family == mtjax.mixture(["bandit", "tabular-mdp"], "union") != mtjax.make("bandit+tabular-mdp")
     (tmp_path / "config.json").write_text(to_json(program, {"command": "x"}))
-    assert from_json(tmp_path / "config.json") == cli.parse(to_flags(program)) == program
+    assert from_json(tmp_path / "config.json") == run_config.parse(to_flags(program)) == program
     with pytest.raises(InputError, match="unknown scenes 'onion'; did you mean 'union'"):
-        cli.parse(["--env=bandit+tabular-mdp", "--agent=brc", "--env.scenes=onion"])
+        run_config.parse(["--env=bandit+tabular-mdp", "--agent=brc", "--env.scenes=onion"])
     with pytest.raises(InputError, match=r"bandit has no flag --env\.scenes"):
-        cli.parse(["--env=bandit", "--agent=brc", "--env.scenes=union"])
+        run_config.parse(["--env=bandit", "--agent=brc", "--env.scenes=union"])
 
 
 # How it steps.

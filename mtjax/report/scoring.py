@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax import evaluation, shipped
+from mtjax import evaluation
 from mtjax.checks import path, require_episodes
 from mtjax.config import from_json
 from mtjax.envs import Family
@@ -21,6 +21,7 @@ from mtjax.names import nearest_error, public
 from mtjax.report import diagnostics, figures, films
 from mtjax.report.frames import pandas
 from mtjax.report.tables import task_table
+from mtjax.saved import shipped
 from mtjax.training.export import export
 from mtjax.training.log import append_rows, number
 from mtjax.training.policy import Policy, load, load_experience

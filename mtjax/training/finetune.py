@@ -7,13 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax import frames, shipped
+from mtjax import frames
 from mtjax.agents import BaseAgent, parts, settings
 from mtjax.agents.state import AgentState
 from mtjax.config import NO_FINE_TUNING
 from mtjax.envs import Family
 from mtjax.envs.mixtures import require_family
 from mtjax.networks import Params
+from mtjax.saved import shipped
 from mtjax.training.policy import Policy
 from mtjax.types import Env, InputError, Spec, Task
 

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax import frames, loop, shipped, standalone
+from mtjax import frames, loop, standalone
 from mtjax.agents import BaseAgent, name_of
 from mtjax.checks import path, require_whole, shown
 from mtjax.config import RunConfig, from_json
@@ -20,6 +20,7 @@ from mtjax.envs.tabled import Tabled
 from mtjax.experience import Replay
 from mtjax.experience.ring import Ring
 from mtjax.names import public
+from mtjax.saved import shipped
 from mtjax.tasks import SAME_CONTEXT
 from mtjax.training import checkpoint as checkpoints
 from mtjax.training import points

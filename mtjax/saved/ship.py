@@ -1,7 +1,4 @@
-"""Policies without what only training needs: settings, and those arrays of an agent's state that acting reads.
-
-``python -m mtjax.training.ship RUN ENV/AGENT`` adds the policy of a run's first seed to those of the package.
-"""
+"""Policies without what only training needs: settings, and those arrays of an agent's state that acting reads."""
 
 import json
 from pathlib import Path
@@ -11,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax import commands, shipped
 from mtjax.config import RunConfig, read_record
 from mtjax.names import InputError
+from mtjax.saved import shipped
 from mtjax.training.policy import Policy, load
 from mtjax.training.steps import steps_of
 
@@ -51,19 +48,3 @@ def read_by_acting(policy: Policy) -> list[int]:
     known = [x for x in leaves if not jnp.issubdtype(x.dtype, jax.dtypes.prng_key)]
     assert len(known) == len(leaves), "an agent's state holds a key of random numbers"
     return steps_of(jax.make_jaxpr(act)(*leaves))[0]["reads"]
-
-
-def main(argv: list[str]) -> None:
-    """Add the policy of a run to those of the package."""
-    if len(argv) != 2 or argv[1].count("/") != 1:
-        raise InputError("give a run and a name: python -m mtjax.training.ship RUN ENV/AGENT")
-    run, name = argv
-    target = shipped.FOLDER / name
-    if target.exists():
-        raise InputError(f"there is a policy {name!r} already; remove {str(target)!r} first")
-    write(run, target)
-    print(f"written to {target}: {sum(file.stat().st_size for file in target.iterdir()) / 1000:.0f} kB")
-
-
-if __name__ == "__main__":
-    commands.main(main)

@@ -1,4 +1,4 @@
-"""The command line of training: names choose the defaults, and typed flags override them."""
+"""The configuration of a run from a command line: names choose the defaults, and typed flags override them."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -7,20 +7,11 @@ from typing import Any
 
 from mtjax.agents import settings
 from mtjax.agents.choices import CHOICES, flag_names, owners
-from mtjax.commands import (
-    all_flags,
-    check_names,
-    flag_value,
-    import_files,
-    imports_of,
-    parse_with_tyro,
-    plain_values,
-    split_flags,
-    switched_off,
-    switched_on,
-    unknown_flag,
-    vary_flags,
-)
+from mtjax.command.imports import import_files, imports_of
+from mtjax.command.parsing import parse_with_tyro
+from mtjax.command.refusals import check_names, unknown_flag
+from mtjax.command.sources import all_flags
+from mtjax.command.words import flag_value, plain_values, split_flags, switched_off, switched_on, vary_flags
 from mtjax.config import NO_FINE_TUNING, RunConfig, fit_length, from_json, own_files, with_preset
 from mtjax.envs import is_mixture, make, require_pictures
 from mtjax.envs.family import Family

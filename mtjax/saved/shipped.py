@@ -6,7 +6,7 @@ import numpy as np
 
 from mtjax.names import InputError, nearest_error
 
-FOLDER = Path(__file__).parent / "pretrained"
+FOLDER = Path(__file__).parents[1] / "pretrained"
 FILE = "policy.npz"  # in the folder of such a policy, beside config.json
 
 

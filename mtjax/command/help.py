@@ -1,0 +1,40 @@
+"""What ``--help`` and ``--list`` print. This module needs no JAX."""
+
+import textwrap
+
+from mtjax.agents import AGENTS
+from mtjax.command.sources import OF_EVERY_RUN, documented_fields
+from mtjax.envs import BENCHMARKS, ENVS, outline, varied
+from mtjax.saved import shipped
+
+
+def catalogue() -> str:
+    """Return a list of families and agents, each with the first sentence of its documentation."""
+    lines = ["environments, and what varies between their tasks (more by --env.vary.NAME=VALUES):"]
+    for name in ENVS:
+        tasks, says = outline(name)
+        varies = varied(name)
+        lines.append(f"  {name:36} {tasks:3} task{'s' if tasks > 1 else ' '}  {says}{f' [{varies}]' * bool(varies)}")
+    lines.append("benchmarks, which are mixtures of the above:")
+    for name, (says, families) in BENCHMARKS.items():
+        lines.append(f"  {name:36} {sum('held_out' not in s for s in families.values()):3} tasks  {says}")
+    lines += ["agents:", *(f"  {name:36} {preset.says}" for name, preset in AGENTS.items())]
+    lines += ["trained policies (python -m mtjax.evaluate --run=NAME, or mtjax.load(NAME)):"]
+    return "\n".join(lines + [f"  {name}" for name in shipped.names()])
+
+
+def overview() -> str:
+    """Return what ``--help`` alone says: the flags of every run, read from the classes' source as JAX is not needed."""
+    lines = [
+        "usage: python -m mtjax.train [--env=NAME] [--agent=NAME] [FLAGS]",
+        "       python -m mtjax.train --env=NAME --agent=NAME --help    all flags of these, with defaults",
+        "       python -m mtjax.train --list                            all families and agents",
+        "       python -m mtjax.train --import=FILE.py ...              first run a file that registers your own",
+        "       python -m mtjax.train --resume=RUN                      go on with a run",
+    ]
+    for title, file, cls in OF_EVERY_RUN:
+        lines += ["", f"{title}:"]
+        for flag, _, default, text in documented_fields(file, cls):
+            lines.append(f"  --{flag + default}")
+            lines += textwrap.wrap(text, 110, initial_indent=" " * 6, subsequent_indent=" " * 6)
+    return "\n".join(lines)

@@ -1,0 +1,104 @@
+"""Words of a command line that are refused before JAX is imported: unknown names, flags and runs, and wrong numbers."""
+
+import dataclasses
+import difflib
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from mtjax.agents import AGENTS
+from mtjax.checks import require_run
+from mtjax.command.sources import all_flags, as_flag, whole_flags
+from mtjax.command.words import VARY, flag_value, is_whole, switched_off, switched_on
+from mtjax.envs import BENCHMARKS, ENVS, members
+from mtjax.names import PRESETS, InputError, nearest_error
+from mtjax.saved import shipped
+
+_KNOWN = (("environment", "env", ENVS), ("agent", "agent", AGENTS), ("preset", "preset", PRESETS))
+_MAY_CHANGE = {  # the only flags beside --resume
+    *("--resume", "--steps", "--import", "--distributed", "--profile", "--tensorboard", "--wandb")
+}
+
+
+def check_names(argv: Sequence[str]) -> None:
+    """Refuse an unknown environment, agent, preset or run, and numbers that are none, before JAX is imported.
+
+    Raises:
+        InputError: there is no such name or folder, or --resume came with flags that change the run.
+    """
+    for kind, flag, known in _KNOWN:
+        given = flag_value(argv, flag, None)
+        if given is None:
+            continue
+        names = [name for name, _ in members(given)] if flag == "env" else [given]  # a mixture has several
+        wrong = next((name for name in names if name not in known), None)
+        if wrong is not None:
+            raise nearest_error(kind, wrong, (*known, *BENCHMARKS) if flag == "env" else known)
+    _check_numbers(argv)
+    given = {word.split("=", 1)[0] for word in argv if word.startswith("--")}
+    other = ", ".join(sorted(given - _MAY_CHANGE))
+    if "--resume" in given and "--sweep" not in given and other:
+        raise InputError(f"--resume goes on with a run as it was; only --steps may change, not {other}")
+    for flag in () if {"--resume", "--sweep"} <= given else ("resume", "from"):
+        folder = flag_value(argv, flag, None)
+        if folder in shipped.names() and not Path(folder).is_dir():
+            raise shipped.not_learning(folder)
+        if folder is not None and not (flag == "resume" and any(Path(folder).glob("run-*"))):  # the runs of a sweep
+            require_run(Path(folder))
+
+
+def _check_numbers(argv: Sequence[str]) -> None:
+    """Refuse a value that is no whole number where a flag of every run takes one."""
+    for flag in whole_flags():
+        value = flag_value(argv, flag, None)
+        if value is not None and not is_whole(value):
+            raise InputError(f"--{flag} must be a whole number, not {value!r}")
+
+
+def check_flags(argv: Sequence[str]) -> None:
+    """Refuse a flag that no family and no agent has.
+
+    Whether the chosen ones have it is checked later, by the full parser.
+
+    Raises:
+        InputError: there is no such flag.
+    """
+    places = (*(place for place, _ in ENVS.data.values()), *(preset.place for preset in AGENTS.values()))
+    if not all(isinstance(place, str) for place in places):  # the user's own classes have further settings
+        return
+    known = all_flags()
+    for word in argv:
+        flag = word.split("=", 1)[0].replace("_", "-")
+        if flag.startswith("--") and not flag.startswith(VARY) and not {flag, switched_on(flag)} & known.keys():
+            raise unknown_flag(flag, known)
+
+
+def check_flags_of(cls: type, argv: Sequence[str]) -> None:
+    """Refuse a flag that is no field of a dataclass, which holds all flags of a command but --help and --import.
+
+    Raises:
+        InputError: there is no such flag.
+    """
+    known = {f"--{as_flag(field.name)}": isinstance(field.default, bool) for field in dataclasses.fields(cls)}
+    known |= {"--help": False, "--import": False}
+    allowed = {*known, *map(switched_off, known), "-h"}
+    for word in argv:
+        flag = word.split("=", 1)[0].replace("_", "-")
+        if flag.startswith("-") and flag not in allowed and not re.match(r"-\.?\d", flag):
+            raise unknown_flag(flag, known)
+
+
+def unknown_flag(flag: str, known: Mapping[str, bool]) -> InputError:
+    """Return an error for an unknown flag. It names the nearest flag and points to --help for the rest.
+
+    Args:
+        known: all flags, and whether each is a switch.
+    """
+    if flag == VARY.removesuffix("."):
+        return InputError(f"{flag} needs the name of a parameter: {VARY}NAME=VALUES; --list says what varies")
+    every = sorted([*known, *(switched_off(other) for other, is_switch in known.items() if is_switch)])
+    end = re.sub(r"^--([\w-]+\.)*", "-", flag)
+    same_end = [other for other in every if other.replace(".", "-").endswith(end)]  # the name is right, or its end
+    near = difflib.get_close_matches(flag, same_end, 1, 0) or difflib.get_close_matches(flag, every, 1)
+    hint = f"did you mean {near[0]!r}? " if near else ""
+    return InputError(f"unknown flag {flag!r}; {hint}--help lists the flags")
