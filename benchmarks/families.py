@@ -21,9 +21,9 @@ from report import note_origin, read_lines, run_main, write_lines
 from resumable import train
 
 import mtjax
+from mtjax.compiling.programs import enable_compile_cache
 from mtjax.names import nearest_error
 from mtjax.saved import ship
-from mtjax.training.programs import enable_compile_cache
 
 _M = 1_000_000
 TRAINED = {  # family -> agent and steps

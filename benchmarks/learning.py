@@ -52,6 +52,7 @@ from resumable import train
 from returns import value
 
 import mtjax
+from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import RunConfig, configure
 from mtjax.evaluation import Evaluations, load_evaluations, save_evaluations
 from mtjax.experience.replay import Replay
@@ -67,7 +68,6 @@ from mtjax.report.stats import (
     unpaired_difference,
 )
 from mtjax.saved import ship
-from mtjax.training.programs import enable_compile_cache
 from mtjax.training.run import Result
 from mtjax.types import SPLITS
 

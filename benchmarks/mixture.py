@@ -28,9 +28,9 @@ import numpy as np
 from report import markdown, record
 
 import mtjax
+from mtjax.compiling.programs import enable_compile_cache
 from mtjax.envs.mixtures import States
 from mtjax.rollout import broadcast_tasks
-from mtjax.training.programs import enable_compile_cache
 
 TASKS = (
     "cartpole-swingup",

@@ -199,8 +199,8 @@ def without_compiling(points: list[Reached]) -> list[Reached]:
 def ours(arguments: argparse.Namespace, name: str, side: str, seed: int) -> tuple[list[Reached], dict[str, Any]]:
     """Train by PPO on the task of ours, and return its evaluations and what it chose."""
     import mtjax
+    from mtjax.compiling.programs import enable_compile_cache
     from mtjax.config import configure
-    from mtjax.training.programs import enable_compile_cache
     from mtjax.training.run import train
 
     enable_compile_cache()

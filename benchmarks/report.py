@@ -17,7 +17,7 @@ import jax
 
 import mtjax
 from mtjax.names import InputError, NoRoomError
-from mtjax.training.log import append_rows
+from mtjax.saved.log import append_rows
 
 _LIBRARIES = ("jax", "jaxlib", "flax", "optax", "numpy", "mujoco", "mujoco-mjx", "warp-lang", "brax", "playground")
 _FLAGS = ("XLA_FLAGS", "CUDA_VISIBLE_DEVICES", "JAX_PLATFORMS", "JAX_DEFAULT_MATMUL_PRECISION", "NVIDIA_TF32_OVERRIDE")

@@ -7,7 +7,7 @@ from typing import Any
 from report import read_lines
 
 import mtjax
-from mtjax.training.result import Result
+from mtjax.saved.result import Result
 from mtjax.types import Agent, Env
 
 

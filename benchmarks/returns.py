@@ -27,12 +27,12 @@ from report import markdown, record, run_main, write_lines
 from resumable import train
 
 from mtjax.agents.choices import replace
+from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import configure, with_preset
 from mtjax.envs.tabled import Tabled
 from mtjax.evaluation import evaluate, save_evaluations
 from mtjax.names import replacing
 from mtjax.report.stats import seed_interval
-from mtjax.training.programs import enable_compile_cache
 from mtjax.training.run import Result
 from mtjax.types import SPLITS, Agent
 

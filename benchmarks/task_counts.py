@@ -26,8 +26,8 @@ import parts
 from report import markdown, record, run_main
 from returns import value
 
+from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import configure, with_preset
-from mtjax.training.programs import enable_compile_cache
 from mtjax.training.run import train
 
 

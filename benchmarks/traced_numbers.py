@@ -21,7 +21,7 @@ from report import machine, markdown
 
 import mtjax
 from mtjax.envs.probes import tasks_of
-from mtjax.training.points import SweptAgent, sweepable
+from mtjax.saved.points import SweptAgent, sweepable
 from mtjax.types import Spec, Transition
 
 TASKS, BATCH, UPDATES, ROUNDS = 10, 64, 20, 7

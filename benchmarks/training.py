@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents import BaseAgent
+from mtjax.compiling.programs import compile_lowered, jit_programs
 from mtjax.envs.tabled import Tabled
 from mtjax.loop import Settings
 from mtjax.parallel import mesh as meshes
-from mtjax.training.programs import compile_lowered, jit_programs
 
 
 class Training:

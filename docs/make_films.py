@@ -24,7 +24,7 @@ from mtjax.envs.pixels import Pictured
 from mtjax.evaluation import record
 from mtjax.report import render
 from mtjax.saved import shipped
-from mtjax.training.policy import Policy
+from mtjax.saved.policy import Policy
 
 FOLDER = Path(__file__).parent / "pictures" / "families"
 SIZE = (160, 120)

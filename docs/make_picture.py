@@ -21,7 +21,7 @@ from PIL import Image, ImageDraw
 import mtjax
 from mtjax.evaluation import record
 from mtjax.report import render
-from mtjax.training.policy import Policy
+from mtjax.saved.policy import Policy
 
 FRAMES = 24
 STRIDE = 3  # of the 0.02 s between steps

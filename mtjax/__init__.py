@@ -9,6 +9,7 @@ if TYPE_CHECKING:  # for editors, which do not run __getattr__
     from mtjax import report as report
     from mtjax.agents import AGENTS as AGENTS
     from mtjax.agents import agent as agent
+    from mtjax.command.keywords import train as train
     from mtjax.config import with_preset as preset  # noqa: F401
     from mtjax.envs import ENVS as ENVS
     from mtjax.envs import make as make
@@ -17,13 +18,12 @@ if TYPE_CHECKING:  # for editors, which do not run __getattr__
     from mtjax.loop import Settings as Settings
     from mtjax.names import InputError as InputError
     from mtjax.registry import register as register
+    from mtjax.report.collect import runs as runs
     from mtjax.report.drawing import plot as plot
-    from mtjax.report.frames import runs as runs
     from mtjax.report.scoring import evaluate as evaluate
-    from mtjax.training.api import train as train
-    from mtjax.training.export import export as export
-    from mtjax.training.policy import load as load
-    from mtjax.training.result import Result as Result
+    from mtjax.saved.export import export as export
+    from mtjax.saved.policy import load as load
+    from mtjax.saved.result import Result as Result
     from mtjax.types import Step as Step
     from mtjax.types import Task as Task
     from mtjax.types import Transition as Transition
@@ -34,23 +34,23 @@ _HOME = {
     "AGENTS": "mtjax.agents",
     "ENVS": "mtjax.envs",
     "InputError": "mtjax.names",
-    "Result": "mtjax.training.result",
+    "Result": "mtjax.saved.result",
     "Settings": "mtjax.loop",
     "Step": "mtjax.types",
     "Task": "mtjax.types",
     "Transition": "mtjax.types",
     "agent": "mtjax.agents",
     "evaluate": "mtjax.report.scoring",
-    "export": "mtjax.training.export",
-    "load": "mtjax.training.policy",
+    "export": "mtjax.saved.export",
+    "load": "mtjax.saved.policy",
     "make": "mtjax.envs",
     "mixture": "mtjax.envs",
     "plot": "mtjax.report.drawing",
     "preset": "mtjax.config:with_preset",
     "register": "mtjax.registry",
-    "runs": "mtjax.report.frames",
+    "runs": "mtjax.report.collect",
     "stacked": "mtjax.envs",
-    "train": "mtjax.training.api",
+    "train": "mtjax.command.keywords",
 }
 __all__ = [*_HOME, "report"]
 _find, __dir__ = lazily(__name__, _HOME)

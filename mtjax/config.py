@@ -122,6 +122,11 @@ class RunConfig:
     )
     learner: Annotated[BaseAgent, tyro.conf.arg(name="agent")] = dataclasses.field(default_factory=lambda: agent("sac"))
 
+    @property
+    def warmup(self) -> int:
+        """Return the environment steps of a run under random actions, before learning begins."""
+        return self.learner.experience.warmup_steps * self.family.train_count * self.training.num_envs
+
 
 @public
 def with_preset(

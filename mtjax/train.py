@@ -27,7 +27,7 @@ def _run(argv: Sequence[str]) -> None:
     load("mtjax.training.allocator:share_arenas")()  # before there are threads
     if "--distributed" not in words:  # else all processes find their devices together
         load("mtjax.parallel.hosts:find_devices")()
-    load("mtjax.training.main:main")(argv, load("mtjax.command.run_config:parse"))
+    load("mtjax.command.train:main")(argv)
 
 
 def run() -> None:
@@ -38,4 +38,4 @@ def run() -> None:
 if __name__ == "__main__":
     run()
 else:
-    become(__name__, "mtjax.training.api:train")
+    become(__name__, "mtjax.command.keywords:train")

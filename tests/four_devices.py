@@ -10,12 +10,12 @@ from jax.sharding import PartitionSpec
 from probes import Goals, Walk, tiny
 
 from mtjax import envs
+from mtjax.compiling.programs import jit_programs
 from mtjax.config import configure
 from mtjax.loop import Settings
 from mtjax.parallel import collectives as shares
 from mtjax.parallel import mesh as meshes
 from mtjax.training import run
-from mtjax.training.programs import jit_programs
 
 SETTINGS = {"num_envs": 2, "batch_size": 4, "replay_size": 40, "warmup_steps": 4, "chunk_steps": 10, "stagger": False}
 WIDE = SETTINGS | {"num_envs": 4, "replay_size": 100}  # half full in two chunks

@@ -14,11 +14,11 @@ import mtjax
 import mtjax.evaluate
 import mtjax.train
 from mtjax import agents, checks, envs
-from mtjax.command import run_config
+from mtjax.command import keywords, run_config
 from mtjax.config import Plan, from_json, with_preset
 from mtjax.loop import Settings
-from mtjax.report import collect
-from mtjax.training import api, launch, memory
+from mtjax.report import collect, curve
+from mtjax.training import launch, memory
 from mtjax.types import InputError
 
 SMALL = {"num_envs": 2, "chunk_steps": 25, "batch_size": 4, "replay_size": 200, "warmup_steps": 5, "hidden": (8, 8)}
@@ -67,7 +67,7 @@ def test_progress_is_shown_unless_it_should_be_quiet(short_family, capsys):
 def test_its_curve_shades_random_actions(result, monkeypatch, tmp_path):
     """Five steps of two environments of each task."""
     drawn = []
-    monkeypatch.setattr(launch.figures, "learning_curve", lambda *given: drawn.append(given))
+    monkeypatch.setattr(curve.figures, "learning_curve", lambda *given: drawn.append(given))
     config = from_json(result.directory / "config.json")
     launch.draw(config, result, tmp_path)
     assert [given[-1] for given in drawn] == [5 * 2 * config.family.train_count]
@@ -129,7 +129,7 @@ def test_a_refused_run_leaves_no_folder(short_family, tmp_path, monkeypatch):
 
 def test_names_bring_the_tuned_settings_and_objects_their_own(monkeypatch):
     """What is given by keyword changes them."""
-    configured = lambda *words, **given: api._configured(*words, {}, None, None, given)
+    configured = lambda *words, **given: keywords._configured(*words, {}, None, None, given)
     assert configured("finger-spin-vary-size", "care") == with_preset("finger-spin-vary-size", "care")
     env = mtjax.make("finger-spin-vary-size")
     tuned = configured(env, "care", num_envs=3, num_experts=2)

@@ -22,9 +22,9 @@ from mtjax.envs import BENCHMARKS
 from mtjax.envs.metaworld.names import TASKS
 from mtjax.evaluation import Evaluations, load_evaluations, save_evaluations
 from mtjax.names import NoRoomError
+from mtjax.saved.log import append_rows
+from mtjax.saved.records import Records
 from mtjax.training.console import Console
-from mtjax.training.log import append_rows
-from mtjax.training.records import Records
 from mtjax.types import InputError
 
 _OF_META_WORLD = ("physics", "steps_per_second", "metaworld_policies")
@@ -207,7 +207,7 @@ def test_a_pair_whose_results_were_not_written_is_not_trained_again(run, tmp_pat
     """And what a process left that died before it could clean up is removed."""
     with monkeypatch.context() as patch, pytest.raises(ZeroDivisionError):
         patch.setattr("mtjax.evaluation.save_evaluations", die)  # by which the script marks a pair as finished
-        patch.setattr("mtjax.training.records.save_evaluations", save_evaluations)
+        patch.setattr("mtjax.saved.records.save_evaluations", save_evaluations)
         run("learning", tmp_path)
     monkeypatch.setattr(Records, "add_rows", die)
     run("learning", tmp_path)

@@ -18,8 +18,8 @@ from mtjax import loop
 from mtjax.agents.choices import replace
 from mtjax.config import from_json
 from mtjax.names import Notice
-from mtjax.training import arrays, checkpoint
-from mtjax.training.folder import new_directory, record_steps, require_unused, tell_edits
+from mtjax.saved import arrays, checkpoint
+from mtjax.saved.folder import new_directory, record_steps, require_unused, tell_edits
 from mtjax.types import InputError
 
 

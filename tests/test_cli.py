@@ -32,8 +32,8 @@ from mtjax.envs import BENCHMARKS, ENVS
 from mtjax.loop import Settings
 from mtjax.names import notice
 from mtjax.saved import shipped
+from mtjax.saved.folder import to_flags
 from mtjax.training import launch
-from mtjax.training.folder import to_flags
 from mtjax.training.memory import explaining
 from mtjax.training.run import Plan
 from mtjax.types import InputError

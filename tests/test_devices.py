@@ -16,10 +16,10 @@ import pytest
 
 import mtjax
 import mtjax.train
+from mtjax.compiling.programs import jit_programs, sharded_shapes
 from mtjax.evaluation import load_evaluations
 from mtjax.parallel import hosts as processes
 from mtjax.parallel import mesh as meshes
-from mtjax.training.programs import jit_programs, sharded_shapes
 from mtjax.types import InputError
 
 HERE = Path(__file__).parent

@@ -24,8 +24,8 @@ from mtjax.networks import Params, tanh_normal
 from mtjax.report import diagnostics, scoring
 from mtjax.report import figures as plot
 from mtjax.report.diagnostics import Activity, activity, compare_gradients, dormant_share, effective_ranks, utilisation
-from mtjax.training import checkpoint, log
-from mtjax.training.policy import load_experience
+from mtjax.saved import checkpoint, log
+from mtjax.saved.policy import load_experience
 from mtjax.types import InputError, Spec
 
 TASKS, BATCH, KEY = tasks_of("one-step", (1.0, -0.5, 0.3)), 8, jax.random.key(5)

@@ -27,8 +27,9 @@ from mtjax.config import from_json
 from mtjax.evaluation import Evaluations, Scores, evaluate, load_evaluations, record
 from mtjax.report import films, render, scoring
 from mtjax.report.tables import split_table, task_table
+from mtjax.saved import checkpoint
 from mtjax.tasks import episode_task
-from mtjax.training import checkpoint, launch
+from mtjax.training import launch
 from mtjax.types import InputError
 
 VALUES = {"train": [1.0, 1.2], "interpolation": [1.1], "extrapolation": [0.6, 0.8, 1.4, 1.6]}

@@ -18,10 +18,10 @@ import mtjax.evaluate
 from mtjax import agents, standalone
 from mtjax.agents.state import AgentState
 from mtjax.networks import Params
+from mtjax.saved.export import require_file
+from mtjax.saved.policy import Policy
+from mtjax.saved.steps import steps_of
 from mtjax.tasks import SAME_CONTEXT
-from mtjax.training.export import require_file
-from mtjax.training.policy import Policy
-from mtjax.training.steps import steps_of
 from mtjax.types import InputError
 
 ENV = mtjax.make("finger-spin", vary={"size": "1:1.2:3"})

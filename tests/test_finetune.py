@@ -18,9 +18,9 @@ from mtjax.envs import ENVS
 from mtjax.envs.family import Family
 from mtjax.envs.parameters import Parameter
 from mtjax.networks import Params
+from mtjax.saved.folder import to_flags
 from mtjax.training import finetune, run
 from mtjax.training.finetune import adopt
-from mtjax.training.folder import to_flags
 from mtjax.types import InputError, Step
 
 
@@ -270,7 +270,7 @@ def test_one_temperature_for_all_stays_one():
         return jax.tree.map(lambda x: jnp.zeros((1, *x.shape), x.dtype), shapes)
 
     states = with_nets(blank(old), temperature=Params({"log": jnp.float32([[0.7]])}, {}))
-    state = adopt(mtjax.training.policy.Policy(old, made, None, states, jnp.arange(1)), made, env.tasks(), blank(env))
+    state = adopt(mtjax.saved.policy.Policy(old, made, None, states, jnp.arange(1)), made, env.tasks(), blank(env))
     now, before = (x.nets["temperature"].shared["log"] for x in (state, states))
     np.testing.assert_array_equal(now, before)
     assert jax.tree.structure(states) == jax.tree.structure(blank(old))
@@ -364,7 +364,7 @@ SEEN = {"pixels": 16, "frames": 3, "state": "also"}
 def test_other_pictures_are_refused(seen, said):
     """By what networks see, which is a stack."""
     made = agent("drq", hidden=(4,))
-    start = mtjax.training.policy.Policy(mtjax.make("corridor-maze", **SEEN), made, None, None, jnp.arange(1))
+    start = mtjax.saved.policy.Policy(mtjax.make("corridor-maze", **SEEN), made, None, None, jnp.arange(1))
     with pytest.raises(InputError, match=rf"map pictures \(16, 16, 9\) with 4 observed numbers to 2 .*{said}"):
         finetune.require_fit(start, mtjax.make("corridor-maze", **seen), made)
 
@@ -382,7 +382,7 @@ def test_networks_that_know_tasks_by_number_keep_them(goals, fits):
     """Task i must be nearest to the run's task i."""
     made, old = agent("sac", conditioning="one-hot", hidden=(4,)), mtjax.make("aim")
     state = jax.jit(lambda: made.init(old.spec, old.tasks(), jax.random.key(0)))()
-    start = mtjax.training.policy.Policy(old, made, state, jax.tree.map(lambda x: x[None], state), jnp.arange(1))
+    start = mtjax.saved.policy.Policy(old, made, state, jax.tree.map(lambda x: x[None], state), jnp.arange(1))
     env = mtjax.make("aim", {"goal": goals}).scaled_as(old)
     if fits:
         finetune.require_fit(start, env, made)

@@ -17,11 +17,11 @@ from hypothesis import HealthCheck, given, settings
 
 from mtjax.agents import AGENTS
 from mtjax.agents import settings as settings_of
-from mtjax.command import flag_files, process, refusals, run_config
+from mtjax.command import flag_files, process, refusals, run_config, sweep
 from mtjax.config import from_json, to_json
 from mtjax.names import InputError
-from mtjax.training import launch, sweep
-from mtjax.training.folder import record_steps, run_metadata
+from mtjax.saved.folder import record_steps, run_metadata
+from mtjax.training import launch
 
 QUIET = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
 quick = settings(max_examples=25, deadline=None, derandomize=True, suppress_health_check=QUIET)
@@ -134,7 +134,7 @@ def test_any_sweep_is_used_or_refused(words):
     """Axes and their values."""
     axes = [f"{flag.removeprefix('--')}={','.join(values)}" for flag, values in words]
     try:
-        sweep.configurations(["--sweep", *axes], run_config.parse)
+        sweep.configurations(["--sweep", *axes])
     except InputError as error:
         assert process.one_line(error)
 

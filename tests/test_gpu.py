@@ -32,6 +32,7 @@ from mtjax.agents import AGENTS
 from mtjax.agents.choices import replace
 from mtjax.agents.parts.values import C51
 from mtjax.agents.ppo import Taken
+from mtjax.compiling.programs import compile_lowered
 from mtjax.config import configure
 from mtjax.envs.engines.base import World
 from mtjax.envs.engines.c import MujocoC
@@ -40,8 +41,7 @@ from mtjax.envs.joined import Joined
 from mtjax.envs.mixtures import States
 from mtjax.envs.probes import tasks_of
 from mtjax.envs.united import United
-from mtjax.training import checkpoint
-from mtjax.training.programs import compile_lowered
+from mtjax.saved import checkpoint
 from mtjax.types import Spec
 
 pytestmark = [

@@ -17,8 +17,8 @@ import pytest
 import mtjax
 from mtjax.config import from_json
 from mtjax.evaluation import load_evaluations
-from mtjax.training import checkpoint
-from mtjax.training.policy import state_shapes
+from mtjax.saved import checkpoint
+from mtjax.saved.policy import state_shapes
 
 RUN = (
     "--env=bandit --agent=sac-conditioned --seeds=2 --num-envs=2 --batch-size=4 --replay-size=200 --warmup-steps=5 "

@@ -14,14 +14,14 @@ import pytest
 import mtjax
 from mtjax.command import process
 from mtjax.names import Notice, replacing
+from mtjax.saved import lock
 from mtjax.train import main
-from mtjax.training import lock
 from mtjax.types import InputError
 
 HOLDER = """
 import sys, time
 from pathlib import Path
-from mtjax.training import lock
+from mtjax.saved import lock
 with lock.hold(Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(600)

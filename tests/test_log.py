@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mtjax.names import Notice
-from mtjax.training import log
+from mtjax.saved import log
 
 
 def read(path):

@@ -29,7 +29,7 @@ from mtjax.experience.replay import Replay
 from mtjax.loop import Settings
 from mtjax.networks import OVER_TASKS, Params
 from mtjax.report.tables import split_table, task_table
-from mtjax.training.folder import short_name, to_flags
+from mtjax.saved.folder import short_name, to_flags
 from mtjax.types import SPLITS, InputError, Spec, Step, Task, Transition
 
 QUICK = {"xla_backend_optimization_level": 0}

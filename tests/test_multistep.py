@@ -12,7 +12,7 @@ from mtjax.agents.parts.knowing.last_steps import append
 from mtjax.experience import Replay, multistep
 from mtjax.experience import ring as rings
 from mtjax.networks import Params
-from mtjax.training.points import SweptAgent
+from mtjax.saved.points import SweptAgent
 from mtjax.types import InputError, Spec, Transition
 
 SPEC = Spec.vector(3, 2, 1)

@@ -246,7 +246,7 @@ def test_runs_are_tables(runs, make_run):
 def test_a_result_is_a_table(make_run):
     """As is its folder, and the lines of its metrics."""
     from mtjax.evaluation import load_evaluations
-    from mtjax.training.result import Result
+    from mtjax.saved.result import Result
 
     folder = make_run("x", "finger-spin-vary-size", "sac", seeds=2)
     evaluations, env = load_evaluations(folder / "evaluations.npz"), mtjax.make("finger-spin-vary-size")
@@ -263,7 +263,7 @@ def test_a_result_is_a_table(make_run):
 def test_results_are_drawn_like_runs(make_run):
     """Under names of one's own; every point of a sweep is a line."""
     from mtjax.evaluation import load_evaluations
-    from mtjax.training.result import Result
+    from mtjax.saved.result import Result
 
     folder = make_run("x", "finger-spin-vary-size", "sac", seeds=4)
     evaluations, env = load_evaluations(folder / "evaluations.npz"), mtjax.make("finger-spin-vary-size")

@@ -16,9 +16,9 @@ from needs import require
 
 import mtjax
 from mtjax import report
+from mtjax.command import keywords
 from mtjax.evaluate import main
 from mtjax.names import public
-from mtjax.training import api
 from mtjax.types import InputError
 
 FUNCTIONS = [name for name in mtjax.__all__ if inspect.isfunction(getattr(mtjax, name))]
@@ -208,4 +208,4 @@ def test_what_is_no_run_is_refused(run):
 
 def test_train_is_the_function_of_its_module():
     """So that it can be pickled by its name."""
-    assert mtjax.train is api.train
+    assert mtjax.train is keywords.train

@@ -22,13 +22,12 @@ import mtjax.train
 from mtjax import register
 from mtjax.agents import AGENTS, PARTS
 from mtjax.agents.parts.knowing import Parameters
-from mtjax.command import help, run_config
+from mtjax.command import help, keywords, run_config
 from mtjax.config import to_json
 from mtjax.envs import ENVS, Domain, Parameter, declared, effects
 from mtjax.envs.brax import Brax
+from mtjax.saved.folder import to_flags
 from mtjax.tasks import episode_task
-from mtjax.training import api
-from mtjax.training.folder import to_flags
 from mtjax.types import SPLITS, InputError
 
 STEPS = 200
@@ -442,7 +441,7 @@ def test_an_agent_with_other_defaults_names_its_file(forget, tmp_path):
     flag = f"--import={file}"
     config = run_config.parse([flag, "--agent=my-care"])
     assert config.imports == (str(file),) and flag in to_flags(config)
-    assert api._configured("finger-spin", "my-care", {}, None, None, {}).imports == (str(file),)
+    assert keywords._configured("finger-spin", "my-care", {}, None, None, {}).imports == (str(file),)
 
 
 def test_unknown_names_of_a_run_mention_import(tmp_path):

@@ -30,16 +30,18 @@ import mtjax
 import mtjax.train
 from mtjax import loop
 from mtjax.command import process, run_config
+from mtjax.compiling import traced
+from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import Plan, evaluations_of, from_json
 from mtjax.evaluation import load_evaluations, save_evaluations
 from mtjax.loop import Settings
 from mtjax.names import Notice
 from mtjax.report import collect
-from mtjax.training import checkpoint, log, run, traced
+from mtjax.saved import checkpoint, log
+from mtjax.saved.folder import new_directory
+from mtjax.saved.records import Records
+from mtjax.training import run
 from mtjax.training.console import Clock
-from mtjax.training.folder import new_directory
-from mtjax.training.programs import enable_compile_cache
-from mtjax.training.records import Records
 from mtjax.training.run import fit_chunk, train
 from mtjax.training.stops import require_finite, stop_signals
 from mtjax.types import SPLITS, InputError

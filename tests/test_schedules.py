@@ -11,8 +11,8 @@ from probes import Walk, quick, random_batch, tasks_of, tiny, train
 import mtjax.train
 from mtjax.agents.parts.gradients.descent import schedule
 from mtjax.experience import Replay
+from mtjax.saved.points import SweptAgent
 from mtjax.training import run
-from mtjax.training.points import SweptAgent
 from mtjax.types import InputError, Spec
 
 TASKS, SPEC, KEY = tasks_of("one-step"), Spec.vector(1, 1, 1), jax.random.key(0)

@@ -128,7 +128,7 @@ def test_devices_are_found_while_the_rest_is_imported(monkeypatch):
 
     def load(place):
         rest = lambda *_: (asked.wait(60), imported.set())
-        return rest if place == "mtjax.training.main:main" else names.load(place)
+        return rest if place == "mtjax.command.train:main" else names.load(place)
 
     monkeypatch.setattr("jax.devices", devices)
     monkeypatch.setitem(train.main.__globals__, "load", load)

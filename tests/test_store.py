@@ -24,8 +24,9 @@ from mtjax.experience import ring as rings
 from mtjax.experience.store import Store
 from mtjax.loop import Settings
 from mtjax.names import Notice
-from mtjax.training import checkpoint, memory, run
-from mtjax.training.policy import state_shapes
+from mtjax.saved import checkpoint
+from mtjax.saved.policy import state_shapes
+from mtjax.training import memory, run
 from mtjax.types import InputError, Transition
 
 SEEDS, TASKS, ENVS = 2, 2, 3

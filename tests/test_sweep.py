@@ -20,16 +20,17 @@ import mtjax.train
 from mtjax import loop
 from mtjax.agents import PARTS
 from mtjax.agents import settings as settings_of
-from mtjax.command import run_config
+from mtjax.command import run_config, sweep
 from mtjax.config import configure, from_json, to_json
 from mtjax.evaluation import Scores, load_evaluations, save_evaluations
 from mtjax.loop import Settings, TrainState
 from mtjax.names import Notice
-from mtjax.training import memory, points, stops, sweep
+from mtjax.saved import points
+from mtjax.saved.folder import to_flags
+from mtjax.saved.points import SweptAgent
+from mtjax.training import memory, stops
 from mtjax.training import run as run_module
 from mtjax.training.console import Console
-from mtjax.training.folder import to_flags
-from mtjax.training.points import SweptAgent
 from mtjax.training.run import Plan, _Progress, _Run, train
 from mtjax.types import InputError, Outcome, Spec
 
@@ -254,7 +255,7 @@ def test_wrong_sweeps_are_refused(words, said, monkeypatch, tmp_path):
 def test_numbers_vary_inside_a_program_and_the_rest_between_programs():
     """Switches, names of parts and widths too; a part's own setting may come with the part."""
     axes = ["agent.gradients=mean,cagrad", "agent.tau=0.1,1", "agent.critic-layer-norm=true,false", "agent.gamma=0.5"]
-    found = sweep.configurations(["--agent=sac", "--sweep", *axes, "--agent.hidden", "8"], run_config.parse)
+    found = sweep.configurations(["--agent=sac", "--sweep", *axes, "--agent.hidden", "8"])
     told = [(type(p.learner.gradients).__name__, p.learner.critic_layer_norm) for p in found]
     assert told == [("Mean", True), ("Mean", False), ("CAGrad", True), ("CAGrad", False)]
     for program in found:
@@ -266,14 +267,14 @@ def test_numbers_vary_inside_a_program_and_the_rest_between_programs():
         "agent.tau=0.1,1",
         "agent.gamma=0.5",
     )
-    widths = sweep.configurations(["--agent=sac", "--sweep", "agent.hidden=8 8,16"], run_config.parse)
+    widths = sweep.configurations(["--agent=sac", "--sweep", "agent.hidden=8 8,16"])
     assert [p.learner.hidden for p in widths] == [(8, 8), (16,)] and not widths[0].points
 
 
 def test_the_command_of_a_run_repeats_its_part_of_the_sweep(tmp_path):
     """And its record is read back as it was."""
-    (program,) = sweep.configurations(["--sweep", "agent.tau=0.1,1", "agent.num-critics=3"], run_config.parse)
-    (again,) = sweep.configurations(to_flags(program), run_config.parse)
+    (program,) = sweep.configurations(["--sweep", "agent.tau=0.1,1", "agent.num-critics=3"])
+    (again,) = sweep.configurations(to_flags(program))
     assert again == program
     (tmp_path / "config.json").write_text(to_json(program, {}))
     assert from_json(tmp_path / "config.json") == program
@@ -281,9 +282,7 @@ def test_the_command_of_a_run_repeats_its_part_of_the_sweep(tmp_path):
 
 def test_points_that_do_not_fit_into_memory_are_run_in_rounds(monkeypatch):
     """As even as can be. $MTJAX_MEMORY is in GB."""
-    (program,) = sweep.configurations(
-        ["--sweep", "agent.tau=0.1,0.2,0.3,0.4,0.5", "--seeds=2", "--replay-size=1000"], run_config.parse
-    )
+    (program,) = sweep.configurations(["--sweep", "agent.tau=0.1,0.2,0.3,0.4,0.5", "--seeds=2", "--replay-size=1000"])
     one, two = (memory.required_bytes(with_seeds(program, n)) for n in (1, 2))
     assert 1.9 < two / one < 2.1
     count = lambda limit: [len(part.points) for part in memory.split_to_fit(program, limit)]
@@ -300,9 +299,7 @@ def test_points_that_do_not_fit_into_memory_are_run_in_rounds(monkeypatch):
 
 def test_seeds_that_do_not_fit_into_memory_are_run_in_rounds(monkeypatch):
     """Those of each point by themselves; a single seed is tried whatever it takes."""
-    (program,) = sweep.configurations(
-        ["--sweep", "agent.tau=0.1,0.2", "--seeds=5", "--seed=3", "--replay-size=1000"], run_config.parse
-    )
+    (program,) = sweep.configurations(["--sweep", "agent.tau=0.1,0.2", "--seeds=5", "--seed=3", "--replay-size=1000"])
     one = memory.required_bytes(program) / 5
     parts = lambda program, limit: [
         (part.points, part.plan.seed, part.plan.seeds) for part in memory.split_to_fit(program, limit)
@@ -357,7 +354,7 @@ def swept(short_family, tmp_path_factory):
         "agent.actor-lr=1e-3,1e-4,1e38",
         "agent.num-critics=1",
     ]
-    (program,) = sweep.configurations(words, run_config.parse)
+    (program,) = sweep.configurations(words)
     real = sweep.launch
 
     def stop(program, directory, *rest, **hooks):
@@ -447,7 +444,7 @@ def test_the_table_grows_with_every_evaluation(swept, tmp_path, monkeypatch):
 
 def test_a_sweeps_folder_is_named_after_all_it_holds():
     """Or after their number, if they are many."""
-    two = sweep.configurations(["--sweep", "agent=sac,care", "--env=finger-spin"], run_config.parse)
+    two = sweep.configurations(["--sweep", "agent=sac,care", "--env=finger-spin"])
     assert sweep._folder_name(two, "sweep") == "finger-spin-sac+care-sweep"
     many = [dataclasses.replace(two[0], agent=f"{name}-of-a-long-name") for name in "abcdefgh"]
     assert sweep._folder_name(many, "sweep") == "finger-spin-8-agents-sweep"

@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 
 import mtjax
+from mtjax.compiling import programs, traced
 from mtjax.envs.mixtures import Blocks, States
-from mtjax.training import programs, traced
 
 # Runs a command and says, as the last line of its output, how often the steps of programs were traced.
 SCRIPT = """

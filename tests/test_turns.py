@@ -11,7 +11,7 @@ from probes import Stub, Walk, learner, one_in, quick, random_batch, tasks_of, t
 
 from mtjax.experience import Replay
 from mtjax.maps import when
-from mtjax.training.points import SweptAgent
+from mtjax.saved.points import SweptAgent
 from mtjax.types import InputError, Sometimes, Spec
 
 SMALL = {"num_envs": 4, "batch_size": 4, "replay_size": 200, "warmup_steps": 2}

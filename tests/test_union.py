@@ -22,7 +22,7 @@ from mtjax.envs.joined import Alone, Joined
 from mtjax.envs.metaworld.names import BENCHMARKS, TASKS
 from mtjax.envs.things import Scene
 from mtjax.envs.united import United
-from mtjax.training.folder import to_flags
+from mtjax.saved.folder import to_flags
 from mtjax.types import Acted, InputError
 
 # The solver stops by a tolerance that counts the whole scene's degrees of freedom and mean inertia. Meta-World's worlds

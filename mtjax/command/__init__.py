@@ -1,1 +1,1 @@
-"""The command line: reading words, flags and files of flags, refusing wrong ones, printing help, and exit codes."""
+"""What a user calls to train: the command line with its flags, help, sweeps and exit codes, and ``mtjax.train``."""

@@ -14,7 +14,8 @@ from mtjax.checks import path
 from mtjax.config import RunConfig, evaluations_of, from_json
 from mtjax.envs import name_of as env_name_of
 from mtjax.evaluation import Evaluations
-from mtjax.names import InputError, nearest_error
+from mtjax.names import InputError, nearest_error, public
+from mtjax.saved.tables import frame_of, pandas
 
 _WORDS = {"success": "success at the end", "success_ever": "success at any step"}
 
@@ -201,3 +202,22 @@ def _named(found: list[tuple[dict[str, Any], Learned]]) -> list[Learned]:
 
 def _short(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+@public
+def runs(pattern: str | Path | Iterable[str | Path] = "runs/*") -> Any:
+    """Return all evaluations of runs as one table, with the columns run, env, agent and swept settings first.
+
+    Args:
+        pattern: a folder, a pattern such as "runs/*", or several of them. Runs of sweeps are found inside.
+
+    Raises:
+        InputError: there is no such run, or pandas is missing.
+    """
+    made = []
+    for found in read(pattern):
+        config = found.config
+        fixed = {"run": str(found.directory), "env": config.env, "agent": config.agent, **found.settings}
+        seeds = config.plan.all_seeds
+        made.append(frame_of(config.family, found.evaluations, seeds, config.points, **fixed))
+    return pandas().concat(made, ignore_index=True)

@@ -25,7 +25,7 @@ from mtjax.experience import ring as rings
 from mtjax.experience.ring import Ring
 from mtjax.networks import Network, Params, ReLU
 from mtjax.report import figures
-from mtjax.training.policy import Policy
+from mtjax.saved.policy import Policy
 from mtjax.types import Array, Env, InputError, Key, Task, Transition
 
 DRAWS = 16

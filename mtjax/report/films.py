@@ -16,7 +16,7 @@ from mtjax.envs.tabled import Part, Tabled
 from mtjax.evaluation import Recording, record
 from mtjax.names import InputError
 from mtjax.report import render
-from mtjax.training.policy import Policy
+from mtjax.saved.policy import Policy
 from mtjax.types import SPLITS, Task
 
 _FPS = 25

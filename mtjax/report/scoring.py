@@ -12,6 +12,7 @@ import numpy as np
 
 from mtjax import evaluation
 from mtjax.checks import path, require_episodes
+from mtjax.compiling.programs import compile_lowered, enable_compile_cache, trace
 from mtjax.config import from_json
 from mtjax.envs import Family
 from mtjax.envs.pixels import Pictured
@@ -19,14 +20,13 @@ from mtjax.envs.tabled import Tabled
 from mtjax.evaluation import Scores, of_tasks
 from mtjax.names import nearest_error, public
 from mtjax.report import diagnostics, figures, films
-from mtjax.report.frames import pandas
 from mtjax.report.tables import task_table
 from mtjax.saved import shipped
-from mtjax.training.export import export
-from mtjax.training.log import append_rows, number
-from mtjax.training.policy import Policy, load, load_experience
-from mtjax.training.programs import compile_lowered, enable_compile_cache, trace
-from mtjax.training.result import Result
+from mtjax.saved.export import export
+from mtjax.saved.log import append_rows, number
+from mtjax.saved.policy import Policy, load, load_experience
+from mtjax.saved.result import Result
+from mtjax.saved.tables import pandas
 from mtjax.types import SPLITS, InputError, Task
 
 _FIRST_NUMBER = 1_000_000  # beyond the numbers of a run's own evaluations, so that the episodes are new

@@ -9,7 +9,7 @@ from mtjax.envs.family import Family
 from mtjax.envs.tabled import Part
 from mtjax.evaluation import Evaluations, Scores, of_tasks
 from mtjax.report.stats import seed_interval
-from mtjax.training.policy import Policy
+from mtjax.saved.policy import Policy
 
 _SUCCESS = ("success", "success_ever")  # at the end of episodes, and at any step
 _TOLD = "  success, at any step"

@@ -1,1 +1,1 @@
-"""What a run is on disk: its folder, its records and its policies."""
+"""What a run leaves: its folder, records, checkpoints and result, and policies that act, evaluate and are exported."""

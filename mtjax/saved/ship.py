@@ -11,8 +11,8 @@ import numpy as np
 from mtjax.config import RunConfig, read_record
 from mtjax.names import InputError
 from mtjax.saved import shipped
-from mtjax.training.policy import Policy, load
-from mtjax.training.steps import steps_of
+from mtjax.saved.policy import Policy, load
+from mtjax.saved.steps import steps_of
 
 _SETTINGS = "config.json"
 

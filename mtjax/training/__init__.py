@@ -1,1 +1,1 @@
-"""Training runs: the host loop, run folders, checkpoints, sweeps, fine-tuning and trained policies."""
+"""Training runs: the host loop, memory, metrics on their way to the user, and fine-tuning."""

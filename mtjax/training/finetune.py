@@ -15,7 +15,7 @@ from mtjax.envs import Family
 from mtjax.envs.mixtures import require_family
 from mtjax.networks import Params
 from mtjax.saved import shipped
-from mtjax.training.policy import Policy
+from mtjax.saved.policy import Policy
 from mtjax.types import Env, InputError, Spec, Task
 
 _FRESH = ("tasks", "sampler")  # networks that belong to the new tasks alone

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 
 from mtjax import frames
 from mtjax.agents import preset_of
@@ -13,12 +12,12 @@ from mtjax.checks import path
 from mtjax.config import RunConfig, require_value_range, slow_on_cpu
 from mtjax.envs import Family
 from mtjax.parallel import hosts, mesh
-from mtjax.report import figures
-from mtjax.training import points, sinks
+from mtjax.saved import points
+from mtjax.saved.folder import remove_unused
+from mtjax.saved.policy import Policy, load
+from mtjax.saved.result import Result
+from mtjax.training import sinks
 from mtjax.training.finetune import require_fit
-from mtjax.training.folder import remove_unused, short_name
-from mtjax.training.policy import Policy, load
-from mtjax.training.result import Result
 from mtjax.training.run import fit_chunk, train
 from mtjax.types import InputError
 
@@ -146,26 +145,6 @@ def _warning(family: str, agent: str) -> str:
     if agent:
         return f"{family} wants a GPU or --agent={agent}, by which one CPU core learned it in five minutes"
     return f"{family} wants a GPU: two CPU cores were not seen to learn it in seven minutes"
-
-
-def draw(config: RunConfig, result: Result, directory: Path) -> None:
-    """Draw a run's returns over its steps into curve.png, one line per split; of a sweep, one per point."""
-    evaluations, count = result.evaluations, config.plan.seeds
-    if not len(evaluations.steps) or not hosts.is_first():
-        return
-    curves = evaluations.returns
-    for p, point in enumerate(config.points):
-        named = ", ".join(f"{name} {value:g}" for name, value in point.items())
-        curves = {**(curves if p else {}), named: evaluations.returns["train"][p * count : (p + 1) * count]}
-    known = {name: x for name, x in curves.items() if np.isfinite(x).all()}
-    if known:
-        title = f"{config.agent} on {short_name(config.env)}"
-        figures.learning_curve(directory / "curve.png", evaluations.steps, known, title, warmup_of(config))
-
-
-def warmup_of(config: RunConfig) -> int:
-    """Return the environment steps of a run under random actions, before learning begins."""
-    return config.learner.experience.warmup_steps * config.family.train_count * config.training.num_envs
 
 
 def _origin(config: RunConfig) -> str:

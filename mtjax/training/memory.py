@@ -15,8 +15,8 @@ from mtjax.config import RunConfig
 from mtjax.experience.store import recalled_rows
 from mtjax.frames import PICTURES, shown
 from mtjax.loop import Settings, TrainState
-from mtjax.training import checkpoint
-from mtjax.training.policy import state_shapes
+from mtjax.saved import checkpoint
+from mtjax.saved.policy import state_shapes
 from mtjax.types import Agent, Env, InputError
 
 _USABLE_SHARE = 0.9  # of the available memory, for one program

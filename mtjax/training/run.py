@@ -15,12 +15,18 @@ import numpy as np
 from jax.sharding import Mesh
 
 from mtjax.agents import settings as settings_of
+from mtjax.compiling.programs import Programs, compile_lowered, jit_programs, load_kernels, sharded_shapes, trace
 from mtjax.config import Plan, configure, require_value_range
 from mtjax.evaluation import Evaluations, no_evaluations
 from mtjax.loop import Settings, TrainState
 from mtjax.parallel import hosts
 from mtjax.parallel import mesh as meshes
-from mtjax.training import allocator, checkpoint, finetune, lock, log, memory, points
+from mtjax.saved import checkpoint, lock, log, points
+from mtjax.saved.points import Point, Sweep, SweptAgent
+from mtjax.saved.policy import Policy
+from mtjax.saved.records import Records
+from mtjax.saved.result import Result
+from mtjax.training import allocator, finetune, memory
 from mtjax.training.console import (
     Clock,
     Console,
@@ -31,11 +37,6 @@ from mtjax.training.console import (
     duration,
 )
 from mtjax.training.exchange import Exchange
-from mtjax.training.points import Point, Sweep, SweptAgent
-from mtjax.training.policy import Policy
-from mtjax.training.programs import Programs, compile_lowered, jit_programs, load_kernels, sharded_shapes, trace
-from mtjax.training.records import Records
-from mtjax.training.result import Result
 from mtjax.training.sinks import Sink, open_sinks, require_libraries, write_rows
 from mtjax.training.stops import finite_seeds, require_finite, require_finite_parameters, stop_signals
 from mtjax.types import SPLITS, Agent, Env, InputError

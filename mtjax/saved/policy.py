@@ -13,6 +13,7 @@ import numpy as np
 from mtjax import frames, loop, standalone
 from mtjax.agents import BaseAgent, name_of
 from mtjax.checks import path, require_whole, shown
+from mtjax.compiling.programs import trace
 from mtjax.config import RunConfig, from_json
 from mtjax.envs import name_of as env_name_of
 from mtjax.envs.family import Family
@@ -20,13 +21,11 @@ from mtjax.envs.tabled import Tabled
 from mtjax.experience import Replay
 from mtjax.experience.ring import Ring
 from mtjax.names import public
-from mtjax.saved import shipped
+from mtjax.saved import checkpoint as checkpoints
+from mtjax.saved import points, shipped
+from mtjax.saved.points import Point
+from mtjax.saved.steps import steps_of
 from mtjax.tasks import SAME_CONTEXT
-from mtjax.training import checkpoint as checkpoints
-from mtjax.training import points
-from mtjax.training.points import Point
-from mtjax.training.programs import trace
-from mtjax.training.steps import steps_of
 from mtjax.types import Array, InputError, Key, Task, Transition
 
 

@@ -18,9 +18,9 @@ from mtjax.envs import name_of as env_name_of
 from mtjax.envs.pixels import GREY
 from mtjax.envs.stepped import Stepped
 from mtjax.names import InputError, public
-from mtjax.training import onnx
-from mtjax.training.policy import Policy, by_name
-from mtjax.training.steps import steps_of
+from mtjax.saved import onnx
+from mtjax.saved.policy import Policy, by_name
+from mtjax.saved.steps import steps_of
 from mtjax.types import Array
 
 _PLATFORMS = ("cpu", "cuda")

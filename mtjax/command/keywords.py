@@ -18,12 +18,13 @@ from mtjax.envs.tabled import Tabled
 from mtjax.loop import Settings
 from mtjax.names import InputError, nearest_error, public
 from mtjax.parallel import hosts
-from mtjax.training import points
-from mtjax.training.folder import record_steps, require_unused, write_config
-from mtjax.training.launch import check, draw, launch
-from mtjax.training.points import Point, Sweep
-from mtjax.training.policy import Policy, load
-from mtjax.training.result import Result
+from mtjax.report.curve import draw
+from mtjax.saved import points
+from mtjax.saved.folder import record_steps, require_unused, write_config
+from mtjax.saved.points import Point, Sweep
+from mtjax.saved.policy import Policy, load
+from mtjax.saved.result import Result
+from mtjax.training.launch import check, launch
 from mtjax.training.run import train as train_bare
 from mtjax.types import Agent, Env
 
@@ -130,7 +131,7 @@ def train(
         folder = path(directory)
         hosts.broadcast_path(lambda: _prepare(config, folder, resume))
         result = launch(config, folder, start, resume, **told)
-        draw(config, result, folder)
+        draw(config, result.evaluations, folder)
         return result
     if resume:
         raise InputError("resume=True continues the run in a folder; give directory as well")

@@ -1,17 +1,15 @@
-"""Runs and their evaluations as pandas tables, one row for each seed, evaluation and task."""
+"""Evaluations and metrics of a run as pandas tables."""
 
 import importlib
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mtjax.envs.tabled import Tabled
 from mtjax.evaluation import Evaluations
-from mtjax.names import InputError, public
-from mtjax.report import collect
-from mtjax.training.points import Point
+from mtjax.names import InputError
+from mtjax.saved.points import Point
 
 
 def pandas() -> Any:
@@ -63,22 +61,3 @@ def metrics_frame(rows: Iterable[Mapping[str, Any]]) -> Any:
     whole = ("seed", "iteration", "steps")
     made = [{name: int(x) if name in whole else number(x) for name, x in row.items()} for row in rows]
     return pandas().DataFrame(made)
-
-
-@public
-def runs(pattern: str | Path | Iterable[str | Path] = "runs/*") -> Any:
-    """Return all evaluations of runs as one table, with the columns run, env, agent and swept settings first.
-
-    Args:
-        pattern: a folder, a pattern such as "runs/*", or several of them. Runs of sweeps are found inside.
-
-    Raises:
-        InputError: there is no such run, or pandas is missing.
-    """
-    made = []
-    for found in collect.read(pattern):
-        config = found.config
-        fixed = {"run": str(found.directory), "env": config.env, "agent": config.agent, **found.settings}
-        seeds = config.plan.all_seeds
-        made.append(frame_of(config.family, found.evaluations, seeds, config.points, **fixed))
-    return pandas().concat(made, ignore_index=True)

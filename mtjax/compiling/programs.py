@@ -9,11 +9,11 @@ from typing import Any, Literal, NamedTuple, get_args
 import jax
 from jax.sharding import Mesh, NamedSharding
 
+from mtjax.compiling import traced
 from mtjax.envs.tabled import Tabled
 from mtjax.evaluation import evaluate
 from mtjax.loop import TrainState, init, run_chunk
 from mtjax.parallel.mesh import BY_SEED, BY_WORLD, REPLICATED
-from mtjax.training import traced
 from mtjax.types import Agent
 
 Runs = Literal["once", "seldom", "often"]

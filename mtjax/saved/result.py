@@ -12,9 +12,9 @@ from mtjax.evaluation import Evaluations
 from mtjax.loop import TrainState
 from mtjax.names import nearest_error, public
 from mtjax.parallel import hosts
-from mtjax.report.frames import frame_of, metrics_frame
-from mtjax.training.points import Point
-from mtjax.training.policy import Policy, policy_of
+from mtjax.saved.points import Point
+from mtjax.saved.policy import Policy, policy_of
+from mtjax.saved.tables import frame_of, metrics_frame
 
 
 class Result(NamedTuple):

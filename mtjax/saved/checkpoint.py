@@ -23,8 +23,8 @@ from mtjax.experience.ring import Ring
 from mtjax.loop import TrainState
 from mtjax.names import NoRoomError, notice
 from mtjax.parallel import hosts
-from mtjax.training import arrays
-from mtjax.training.folder import tell_edits
+from mtjax.saved import arrays
+from mtjax.saved.folder import tell_edits
 from mtjax.types import InputError
 
 _KEPT = 2

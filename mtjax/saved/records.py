@@ -10,7 +10,7 @@ from mtjax.evaluation import Evaluations, load_evaluations, require_same_run, sa
 from mtjax.loop import TrainState
 from mtjax.names import notice, replacing
 from mtjax.parallel import hosts
-from mtjax.training import checkpoint, log
+from mtjax.saved import checkpoint, log
 from mtjax.types import InputError
 
 

@@ -23,7 +23,7 @@ from mtjax.envs.family import Family
 from mtjax.envs.mixtures import Mixture
 from mtjax.envs.tabled import Tabled
 from mtjax.names import notice, replacing
-from mtjax.training.arrays import require_place
+from mtjax.saved.arrays import require_place
 from mtjax.types import InputError
 
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")

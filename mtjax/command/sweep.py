@@ -12,25 +12,26 @@ import os
 import re
 import shlex
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from mtjax.agents import AGENTS, PARTS
+from mtjax.command.run_config import parse
+from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import RunConfig, evaluations_of, from_json, import_flags
 from mtjax.evaluation import Evaluations
 from mtjax.report import figures
 from mtjax.report.stats import seed_interval
-from mtjax.training import checkpoint, lock, memory, points
-from mtjax.training.folder import new_directory, record_steps, resumed_config, short_name, write_config
-from mtjax.training.launch import check, launch, load_start, warmup_of
-from mtjax.training.log import append_rows, number
-from mtjax.training.programs import enable_compile_cache
+from mtjax.saved import checkpoint, lock, points
+from mtjax.saved.folder import new_directory, record_steps, resumed_config, short_name, write_config
+from mtjax.saved.log import append_rows, number
+from mtjax.training import memory
+from mtjax.training.launch import check, launch, load_start
 from mtjax.types import SPLITS, InputError
 
-Parse = Callable[[Sequence[str]], RunConfig]  # command line -> configuration
 _FIXED = ("seed", "seeds", "runs", "resume", "list", "import", "sweep", "from", "preset")
 _LONGEST = 100  # of a folder's name
 _DIVERGED = "diverged.txt"  # holds the error of a run whose seeds all diverged
@@ -127,7 +128,7 @@ def _to_flags(flag: str, value: str) -> list[str]:
     return [f"--{flag}", first, *others] if others else [f"--{flag}={value}"]
 
 
-def configurations(argv: Sequence[str], parse: Parse) -> list[RunConfig]:
+def configurations(argv: Sequence[str]) -> list[RunConfig]:
     """Return the configuration of every program of a sweep, with checked points, before memory splits them.
 
     Raises:
@@ -158,7 +159,7 @@ def _number(axis: Axis, text: str) -> float:
 # Running.
 
 
-def main(argv: Sequence[str], parse: Parse) -> None:
+def main(argv: Sequence[str]) -> None:
     """Start the sweep of ``--sweep``, or resume the sweep in the folder of ``--resume``."""
     enable_compile_cache()
     resume = next((Path(word.split("=", 1)[1]) for word in argv if word.startswith("--resume=")), None)
@@ -168,7 +169,7 @@ def main(argv: Sequence[str], parse: Parse) -> None:
                 record_steps(directory / "config.json", resumed_config(parse(argv), directory, argv).plan.steps)
             run_unfinished(resume)
         return
-    found = configurations(argv, parse)
+    found = configurations(argv)
     for config in found:
         check(config)
         load_start(config)
@@ -258,7 +259,7 @@ def _draw(config: RunConfig, run: Path) -> None:
             curves[", ".join(f"{name} {value}" for name, value in _values(config, point).items())] = returns
     if curves:
         title = f"{config.agent} on {short_name(config.env)}"
-        figures.learning_curve(run / "curve.png", evaluations.steps, curves, title, warmup_of(config))
+        figures.learning_curve(run / "curve.png", evaluations.steps, curves, title, config.warmup)
 
 
 def final_evaluations(config: RunConfig, run: Path) -> Evaluations | None:

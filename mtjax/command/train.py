@@ -2,31 +2,35 @@
 
 import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
+from mtjax.command import sweep
+from mtjax.command.run_config import parse
+from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import RunConfig, import_flags
 from mtjax.envs.pixels import Pictured
 from mtjax.parallel import hosts
+from mtjax.report.curve import draw
 from mtjax.report.tables import split_table
-from mtjax.training import checkpoint, lock, memory, sweep
+from mtjax.saved import checkpoint, lock
+from mtjax.saved.folder import new_directory, record_steps, resumed_config, short_name, write_config
+from mtjax.saved.result import Result
+from mtjax.training import memory
 from mtjax.training.console import duration
-from mtjax.training.folder import new_directory, record_steps, resumed_config, short_name, write_config
-from mtjax.training.launch import check, draw, launch, load_start
-from mtjax.training.programs import enable_compile_cache
-from mtjax.training.result import Result
+from mtjax.training.launch import check, launch, load_start
 from mtjax.types import InputError
 
 
-def main(argv: Sequence[str], parse: Callable[[Sequence[str]], RunConfig]) -> None:
-    """Start or resume a run or a sweep. ``parse`` reads the command line."""
+def main(argv: Sequence[str]) -> None:
+    """Start or resume a run or a sweep."""
     if "--distributed" in argv:
         hosts.initialise()  # before anything looks at the devices
     if sweep.is_sweep(argv):
         if "--distributed" in argv:
             raise InputError("a sweep runs in one process; leave out --distributed")
-        return sweep.main(argv, parse)
+        return sweep.main(argv)
     config = parse(argv)
     resume = any(word.split("=", 1)[0] == "--resume" for word in argv)
     directory = Path(config.resume) if resume else None
@@ -58,7 +62,7 @@ def _prepare(config: RunConfig, directory: Path | None) -> Path:
 
 
 def _conclude(config: RunConfig, result: Result, directory: Path) -> None:
-    draw(config, result, directory)
+    draw(config, result.evaluations, directory)
     if not result.finished:
         words = [f"--resume={directory}", *import_flags(config)]
         print(f"stopped; the state is saved. Go on with:\n  python -m mtjax.train {shlex.join(words)}")
