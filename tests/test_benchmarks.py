@@ -18,6 +18,7 @@ from needs import needs
 from probes import one_in, slow_but
 
 import mtjax
+from mtjax.agents.parts.knowing import Text
 from mtjax.envs import BENCHMARKS
 from mtjax.envs.metaworld.names import TASKS
 from mtjax.evaluation import Evaluations, load_evaluations, save_evaluations
@@ -271,7 +272,7 @@ def test_replay_agents_learn_from_as_much_as_the_baseline(script):
     assert loop(of("brc", "sac-conditioned")) == loop(of("sac-conditioned", "")) != loop(of("brc", ""))
     assert of("brc", "sac-conditioned").learner.hidden == of("brc", "").learner.hidden
     assert of("ppo", "sac-conditioned").training == of("ppo", "").training
-    assert of("care-text", "sac-conditioned").learner.conditioning == "text"
+    assert of("care-text", "sac-conditioned").learner.conditioning == Text()
     assert len(of("brc", "sac-conditioned").family.labels("train")) == 4  # HiP-BMDP's split
 
 

@@ -57,7 +57,7 @@ def head(kernel, bias):
 FEATURES = jnp.float32([0.1])
 ACTOR = head([[2.0, -0.5], [0.0, 0.0]], [0.0, 0.0])  # a = 2 s, log pi = -s / 2
 CRITICS = head([[[1.0], [0.5], [0.0]], [[2.0], [-0.5], [10.0]]], [[0.0], [0.0]])  # s + a / 2 and 2 s - a / 2 + 1
-NETS = {"actor": ACTOR, "critic": CRITICS, "representation": Params({}, {})}
+NETS = {"actor": ACTOR, "critic": CRITICS, "representation": Params({}, {}), "knowing": Params({}, {})}
 
 
 def rows(obs, action, reward, discount, next_obs):

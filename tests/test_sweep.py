@@ -502,7 +502,7 @@ def test_a_seed_that_the_last_update_spoiled_is_given_up(capsys):
     run = _Run(Walk(), SweptAgent(agent), settings, Plan(), None, Console(1), swept)
 
     def given_up(actor, *before):
-        learner = types.SimpleNamespace(actor={"weights": jnp.asarray(actor)[:, None]})
+        learner = types.SimpleNamespace(nets={"actor": jnp.asarray(actor)[:, None]})
         state = types.SimpleNamespace(agent=types.SimpleNamespace(learner=learner))
         return run._give_up_spoiled(_Progress(state, 120, 0.0, 0.0, None, np.array(before))).diverged.tolist()
 
