@@ -201,7 +201,7 @@ def ours(arguments: argparse.Namespace, name: str, side: str, seed: int) -> tupl
     import mtjax
     from mtjax.compiling.programs import enable_compile_cache
     from mtjax.config import configure
-    from mtjax.training.run import train
+    from mtjax.training.launch import train_objects
 
     enable_compile_cache()
     config = mtjax.preset(ENVS[name], "ppo", "gpu")
@@ -220,7 +220,7 @@ def ours(arguments: argparse.Namespace, name: str, side: str, seed: int) -> tupl
         spent[0] += parts.since_start() - seconds[1]
         show(side, points[-1])
 
-    train(
+    train_objects(
         *(config.family, agent),
         steps=int(arguments.steps),
         seed=seed,

@@ -28,7 +28,7 @@ from returns import value
 
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import configure, with_preset
-from mtjax.training.run import train
+from mtjax.training.launch import train_objects
 
 
 class Range(NamedTuple):
@@ -104,7 +104,7 @@ def measure(arguments: argparse.Namespace, name: str, tasks: int) -> None:
     config = with_preset(name, arguments.agent, arguments.preset, split="none", **tasks_of(name, tasks))
     given = {key: value(x) for key, x in (word.split("=", 1) for word in arguments.given)}
     agent, played = configure(config.learner, config.training, given)
-    run = lambda **more: train(
+    run = lambda **more: train_objects(
         *(config.family, agent), seed=arguments.seed, settings=played, eval_episodes=max(1, 20 // tasks), **more
     )
     chunk = played.chunk_steps * played.num_envs * tasks

@@ -7,6 +7,7 @@ import shlex
 import sys
 import tomllib
 from collections.abc import Collection, Mapping
+from functools import cached_property
 from importlib import resources
 from pathlib import Path
 from types import MappingProxyType
@@ -122,10 +123,20 @@ class RunConfig:
     )
     learner: Annotated[BaseAgent, tyro.conf.arg(name="agent")] = dataclasses.field(default_factory=lambda: agent("sac"))
 
+    @cached_property
+    def num_tasks(self) -> int:
+        """Return the number of training tasks."""
+        return len(self.family.tasks("train").id)
+
+    @property
+    def worlds(self) -> int:
+        """Return the number of environments of each seed, summed over tasks."""
+        return self.num_tasks * self.training.num_envs
+
     @property
     def warmup(self) -> int:
         """Return the environment steps of a run under random actions, before learning begins."""
-        return self.learner.experience.warmup_steps * self.family.train_count * self.training.num_envs
+        return self.learner.experience.warmup_steps * self.worlds
 
 
 @public
@@ -227,6 +238,24 @@ def configure(agent: Any, settings: Settings, given: Mapping[str, Any]) -> tuple
     loop_values = {name: value for name, value in given.items() if name in loop_names}
     rest = {name: value for name, value in given.items() if name not in loop_values}
     return replace(agent, rest), dataclasses.replace(settings, **loop_values)
+
+
+def of_objects(
+    env: Any, agent: Any, settings: Settings | None = None, points: tuple[dict[str, float], ...] = (), **given: Any
+) -> RunConfig:
+    """Return the configuration of a run of objects that no name makes again: its ``env`` and ``agent`` are empty.
+
+    Args:
+        given: any setting of ``Plan``, of ``Settings``, of the agent or of its parts; and profile, tensorboard, wandb.
+
+    Raises:
+        InputError: there is no such setting, or a value is not allowed.
+    """
+    take = lambda names: {name: given.pop(name) for name in list(given) if name in names}
+    plan = Plan(**take({field.name for field in dataclasses.fields(Plan)}))
+    written = take({"profile", "tensorboard", "wandb"})
+    agent, settings = configure(agent, settings or Settings(), given)
+    return RunConfig("", "", points=points, plan=plan, training=settings, family=env, learner=agent, **written)
 
 
 def require_value_range(agent: Any) -> None:

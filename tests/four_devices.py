@@ -15,7 +15,7 @@ from mtjax.config import configure
 from mtjax.loop import Settings
 from mtjax.parallel import collectives as shares
 from mtjax.parallel import mesh as meshes
-from mtjax.training import run
+from mtjax.training.launch import train_objects
 
 SETTINGS = {"num_envs": 2, "batch_size": 4, "replay_size": 40, "warmup_steps": 4, "chunk_steps": 10, "stagger": False}
 WIDE = SETTINGS | {"num_envs": 4, "replay_size": 100}  # half full in two chunks
@@ -26,7 +26,7 @@ def play(directory, env, chunks, agent=AGENT, settings=SETTINGS, **changes):
     directory.mkdir(exist_ok=True)
     chunk = len(env.tasks().id) * settings["num_envs"] * settings["chunk_steps"]  # environment steps of a seed
     steps = {"steps": chunks * chunk, "eval_every": 2 * chunk, "eval_episodes": 2}
-    return run.train(env, agent, directory=directory, **settings, **{"seeds": 4, **steps, **changes})
+    return train_objects(env, agent, directory=directory, **settings, **{"seeds": 4, **steps, **changes})
 
 
 @pytest.fixture
@@ -303,7 +303,7 @@ def test_rollouts_on_two_devices_are_learned_from_as_on_one(crowd, use, rule):
     states = []
     for count in (2, 1):
         use(count)
-        result = run.train(Walk(), agent, steps=2 * 4 * 16, seeds=1, eval_episodes=1, **given)
+        result = train_objects(Walk(), agent, steps=2 * 4 * 16, seeds=1, eval_episodes=1, **given)
         assert devices_of(result) == count
         states.append(jax.tree.leaves(plain(result.state.agent)))
     for x, y in zip(*states, strict=True):

@@ -476,8 +476,9 @@ def test_resume_extends_and_the_hint_goes_on(finished_run, copied_run, capsys, m
     """A run that is extended and stopped says how to go on, and the command that it prints does so."""
     train = launch.train
 
-    def stops(*arguments, **settings):
-        return train(*arguments, **settings, on_chunk=lambda _: os.kill(os.getpid(), signal.SIGINT))
+    def stops(*arguments):
+        *rest, hooks = arguments
+        return train(*rest, hooks._replace(on_chunk=lambda _: os.kill(os.getpid(), signal.SIGINT)))
 
     monkeypatch.setattr(launch, "train", stops)
     with pytest.raises(SystemExit) as stop:

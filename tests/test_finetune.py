@@ -19,8 +19,9 @@ from mtjax.envs.family import Family
 from mtjax.envs.parameters import Parameter
 from mtjax.networks import Params
 from mtjax.saved.folder import to_flags
-from mtjax.training import finetune, run
+from mtjax.training import finetune
 from mtjax.training.finetune import adopt
+from mtjax.training.launch import train_objects
 from mtjax.types import InputError, Step
 
 
@@ -219,7 +220,7 @@ def test_training_takes_a_policy(learned):
     """In Python; without updates, what was learned is all there is."""
     env = mtjax.make("aim", {"goal": "0.9,-0.8"}).scaled_as(learned.env)
     settings = {"num_envs": 1, "updates_per_step": 0, "chunk_steps": 5, "replay_size": 10}
-    result = run.train(env, learned.agent, start=learned, steps=10, eval_episodes=1, **settings)
+    result = train_objects(env, learned.agent, start=learned, steps=10, eval_episodes=1, **settings)
     found = networks(result.state.agent)
     for path, leaf in inherited(learned.states, [0]).items():
         np.testing.assert_array_equal(found[path], leaf)
@@ -373,7 +374,7 @@ def test_contexts_of_another_scale_are_refused(learned):
     """In Python, where the family is the caller's."""
     env = mtjax.make("aim", {"goal": "-2:2:3"})
     with pytest.raises(InputError, match=r"give env\.scaled_as"):
-        run.train(env, learned.agent, start=learned)
+        train_objects(env, learned.agent, start=learned)
     finetune.require_fit(learned, env.scaled_as(learned.env), learned.agent)
 
 

@@ -42,7 +42,8 @@ from mtjax.saved.folder import new_directory
 from mtjax.saved.records import Records
 from mtjax.training import run
 from mtjax.training.console import Clock
-from mtjax.training.run import fit_chunk, train
+from mtjax.training.launch import train_objects
+from mtjax.training.run import fit_chunk
 from mtjax.training.stops import require_finite, stop_signals
 from mtjax.types import SPLITS, InputError
 
@@ -59,7 +60,7 @@ def play(short_family):
         settings = settings or program.training
         if directory is not None:
             directory.mkdir(exist_ok=True)
-        return train(
+        return train_objects(
             program.family,
             program.learner,
             settings=settings,

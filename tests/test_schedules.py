@@ -12,7 +12,7 @@ import mtjax.train
 from mtjax.agents.parts.gradients.descent import schedule
 from mtjax.experience import Replay
 from mtjax.saved.points import SweptAgent
-from mtjax.training import run
+from mtjax.training.launch import train_objects
 from mtjax.types import InputError, Spec
 
 TASKS, SPEC, KEY = tasks_of("one-step"), Spec.vector(1, 1, 1), jax.random.key(0)
@@ -62,7 +62,7 @@ AGENTS = {
 def test_a_schedule_ends_with_the_run(name, chunk, given, expected):
     """All rates are 0 then, and not before: the last updates change what the next would not."""
     agent, settings = tiny(name, lr_schedule="linear"), {"eval_episodes": 1, "chunk_steps": chunk}
-    result = run.train(Walk(), agent, steps=2 * 4 * 2 * chunk, seeds=2, **settings, **given)
+    result = train_objects(Walk(), agent, steps=2 * 4 * 2 * chunk, seeds=2, **settings, **given)
     found = counts(result.state.agent.fits)
     for key, number in expected.items():
         np.testing.assert_array_equal(found[key], [number, number])
@@ -150,7 +150,7 @@ def test_what_cannot_be_right_is_refused(settings, message):
 def test_a_warmup_is_shorter_than_the_run():
     """Else the schedule would have no time to fall."""
     with pytest.raises(InputError, match="lr-warmup=20 leaves none of the run's 18 updates to lr-schedule=linear"):
-        run.train(Walk(), tiny("sac", lr_schedule="linear", lr_warmup=20), steps=2 * 4 * 20, **SMALL)
+        train_objects(Walk(), tiny("sac", lr_schedule="linear", lr_warmup=20), steps=2 * 4 * 20, **SMALL)
 
 
 def test_a_loop_without_a_plan_needs_a_number_of_updates():

@@ -27,6 +27,7 @@ from mtjax.names import Notice
 from mtjax.saved import checkpoint
 from mtjax.saved.policy import state_shapes
 from mtjax.training import memory, run
+from mtjax.training.launch import train_objects
 from mtjax.types import InputError, Transition
 
 SEEDS, TASKS, ENVS = 2, 2, 3
@@ -225,7 +226,7 @@ def play(directory, chunks, settings=SPILL, **changes):
     if directory is not None:
         directory.mkdir(exist_ok=True)
     steps = {"steps": 40 * chunks, "eval_every": 200, "eval_episodes": 1}
-    return run.train(Walk(), Reader(), directory=directory, **settings, **{"seeds": 2, **steps, **changes})
+    return train_objects(Walk(), Reader(), directory=directory, **settings, **{"seeds": 2, **steps, **changes})
 
 
 @pytest.fixture(scope="module")

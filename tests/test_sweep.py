@@ -31,7 +31,8 @@ from mtjax.saved.points import SweptAgent
 from mtjax.training import memory, stops
 from mtjax.training import run as run_module
 from mtjax.training.console import Console
-from mtjax.training.run import Plan, _Progress, _Run, train
+from mtjax.training.launch import train_objects
+from mtjax.training.run import Plan, _Progress, _Run
 from mtjax.types import InputError, Outcome, Spec
 
 SMALL = {"num_envs": 4, "batch_size": 8, "replay_size": 200, "warmup_steps": 5, "chunk_steps": 20}
@@ -72,7 +73,7 @@ def test_seeds_lie_side_by_side_in_each_point():
 def test_values_are_refused_by_name_before_anything_compiles(given, said):
     """By the constructors that refuse them when they are given plainly."""
     with pytest.raises(InputError) as error:
-        train(Walk(), tiny("cagrad"), steps=100, sweep=given)
+        train_objects(Walk(), tiny("cagrad"), steps=100, sweep=given)
     assert said in str(error.value)
 
 
@@ -163,7 +164,7 @@ def test_a_point_trains_as_the_run_with_its_values():
 def test_one_point_that_diverges_does_not_end_the_others():
     """Its returns are none; those of the others, whose numbers are apart, are there. Rows say which point they are."""
     settings = SMALL | {"chunk_steps": 15}
-    result = train(
+    result = train_objects(
         Walk(), tiny("sac"), steps=240, seeds=2, eval_episodes=2, **settings, sweep={"actor_lr": [1e-3, 1e38]}
     )
     assert result.finished and result.points == ({"actor_lr": 1e-3}, {"actor_lr": 1e38})
@@ -517,20 +518,20 @@ def test_a_spoiled_seed_is_not_evaluated(monkeypatch):
     real = stops.finite_seeds
     monkeypatch.setattr(run_module, "finite_seeds", lambda state: real(state) & [True, False])
     given = {"steps": 240, "eval_every": 240, "eval_episodes": 2, "sweep": {"actor_lr": [1e-3, 1e-4]}, **SMALL}
-    returns = train(Walk(), tiny("sac"), **given).evaluations.returns["train"]
+    returns = train_objects(Walk(), tiny("sac"), **given).evaluations.returns["train"]
     assert np.isfinite(returns[0]).all() and np.isnan(returns[1]).all()
 
 
 def test_evaluations_of_diverged_points_stay_none(tmp_path):
     """Also where they are lost, and made again from the last state."""
     given = {"steps": 240, "eval_every": 240, "eval_episodes": 2, "sweep": {"actor_lr": [1e-3, 1e38]}, **SMALL}
-    train(Walk(), tiny("sac"), **given, directory=tmp_path)
+    train_objects(Walk(), tiny("sac"), **given, directory=tmp_path)
     before = (tmp_path / "evaluations.npz").read_bytes()
     returns = load_evaluations(tmp_path / "evaluations.npz").returns["train"]
     assert np.isfinite(returns[0]).all() and np.isnan(returns[1]).all()
     (tmp_path / "evaluations.npz").write_bytes(before[:100])
     with pytest.warns(Notice, match="which is damaged"):
-        train(Walk(), tiny("sac"), **given, directory=tmp_path, resume=True)
+        train_objects(Walk(), tiny("sac"), **given, directory=tmp_path, resume=True)
     assert (tmp_path / "evaluations.npz").read_bytes() == before
 
 

@@ -24,8 +24,8 @@ from mtjax.saved.folder import record_steps, require_unused, write_config
 from mtjax.saved.points import Point, Sweep
 from mtjax.saved.policy import Policy, load
 from mtjax.saved.result import Result
-from mtjax.training.launch import check, launch
-from mtjax.training.run import train as train_bare
+from mtjax.training.launch import check, launch, train_objects
+from mtjax.training.run import Hooks
 from mtjax.types import Agent, Env
 
 
@@ -115,11 +115,11 @@ def train(
     if on_chunk is not None and not callable(on_chunk):
         raise InputError(f"on_chunk is a function of a row of metrics, not {_kind(on_chunk)}")
     checked(_Told, {"resume": resume, "profile": profile, "tensorboard": tensorboard, "wandb": wandb})
-    told = {**checked(_Told, {"quiet": quiet, "label": label}), "on_chunk": on_chunk}
+    checked(_Told, {"quiet": quiet, "label": label})
     if not isinstance(env, str | Tabled) or not isinstance(agent, str | BaseAgent):
         _require_learning(env, agent, directory)
-        agent, settings = configure(agent, settings or Settings(), given)
-        return train_bare(env, agent, **plan, settings=settings, start=start, sweep=found, **told)  # type: ignore
+        told = {"quiet": quiet, "label": label, "on_chunk": on_chunk}
+        return train_objects(env, agent, start=start, sweep=found, settings=settings, **plan, **told, **given)  # type: ignore
     config = _configured(env, agent, plan, settings, start, given)
     if tensorboard or wandb or profile:
         if directory is None:
@@ -127,15 +127,16 @@ def train(
         config = dataclasses.replace(config, profile=profile, tensorboard=tensorboard, wandb=wandb)
     config = dataclasses.replace(config, points=found, sweep=_written(config.learner, found))
     check(config, start)
+    hooks = Hooks(on_chunk, quiet=quiet, label=label)
     if directory is not None:
         folder = path(directory)
         hosts.broadcast_path(lambda: _prepare(config, folder, resume))
-        result = launch(config, folder, start, resume, **told)
+        result = launch(config, folder, start, resume, hooks)
         draw(config, result.evaluations, folder)
         return result
     if resume:
         raise InputError("resume=True continues the run in a folder; give directory as well")
-    return launch(config, None, start, resume, **told)
+    return launch(config, None, start, resume, hooks)
 
 
 def _require_learning(env: Any, agent: Any, directory: Any) -> None:

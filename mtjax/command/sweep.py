@@ -30,6 +30,7 @@ from mtjax.saved.folder import new_directory, record_steps, resumed_config, shor
 from mtjax.saved.log import append_rows, number
 from mtjax.training import memory
 from mtjax.training.launch import check, launch, load_start
+from mtjax.training.run import Hooks
 from mtjax.types import SPLITS, InputError
 
 _FIXED = ("seed", "seeds", "runs", "resume", "list", "import", "sweep", "from", "preset")
@@ -226,7 +227,7 @@ def run_unfinished(folder: Path) -> None:
         signal = 0
         try:
             grow = lambda _: _write_table(folder, runs)
-            result = launch(config, run, start, resume, label, on_evaluation=grow)
+            result = launch(config, run, start, resume, Hooks(on_evaluation=grow, label=label))
             if result.finished:
                 _draw(config, run)
             signal = 0 if result.finished and run == runs[-1] else result.signal

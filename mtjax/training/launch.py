@@ -1,6 +1,5 @@
 """Start a run from its configuration: check it, load the policy to fine-tune, print a summary, and train."""
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -9,21 +8,22 @@ import jax
 from mtjax import frames
 from mtjax.agents import preset_of
 from mtjax.checks import path
-from mtjax.config import RunConfig, require_value_range, slow_on_cpu
+from mtjax.config import RunConfig, of_objects, require_value_range, slow_on_cpu
 from mtjax.envs import Family
-from mtjax.parallel import hosts, mesh
+from mtjax.parallel import hosts
 from mtjax.saved import points
 from mtjax.saved.folder import remove_unused
+from mtjax.saved.points import Sweep
 from mtjax.saved.policy import Policy, load
 from mtjax.saved.result import Result
 from mtjax.training import sinks
 from mtjax.training.finetune import require_fit
-from mtjax.training.run import fit_chunk, train
-from mtjax.types import InputError
+from mtjax.training.run import NO_HOOKS, Hooks, mesh_of, played_by, train
+from mtjax.types import Agent, Env, InputError
 
 
 def check(config: RunConfig, start: Policy | None = None) -> None:
-    """Check a configuration as a whole, before a folder is made.
+    """Check a configuration as a whole, before a folder is made. Nothing after it checks again.
 
     Args:
         start: the policy to fine-tune, if it is loaded already.
@@ -32,27 +32,31 @@ def check(config: RunConfig, start: Policy | None = None) -> None:
         InputError: family, agent, devices and flags do not go together.
     """
     family = config.family
+    sinks.require_libraries(config.tensorboard, config.wandb)
+    if config.env:
+        _check_named(config, start is not None or bool(config.start))
+    mesh_of(config)
+    played, _ = played_by(config)
+    config.learner.experience.check(family, played.num_envs, played.chunk_steps)
+    for learner in points.agents_at(config.learner, config.points):
+        require_value_range(learner)
+        if start is not None:
+            require_fit(start, family, learner)
+
+
+def _check_named(config: RunConfig, begins: bool) -> None:
+    """Check what only families and agents with names have. ``begins``: whether a run is fine-tuned."""
+    family, learner = config.family, config.learner
     if not config.runs:  # Path("") would be the working directory
         raise InputError("--runs needs a folder; that of the command is --runs=.")
     path(config.runs, "--runs")
-    sinks.require_libraries(config.tensorboard, config.wandb)
     _ = family.engine_name, family.table, family.targets()  # its engine refuses a model that it cannot run
-    mesh.mesh_for(config.plan.seeds, family.train_count, config.training.num_envs)
-    experience = config.learner.experience
-    played = fit_chunk(config.training, family.train_count, config.plan.steps, experience.steps)
-    experience.check(family, played.num_envs, played.chunk_steps)
-    for learner in points.agents_at(config.learner, config.points):
-        require_value_range(learner)
-        learner.require_sight(family.spec)
-        if start is not None:
-            require_fit(start, family, learner)
+    learner.require_sight(family.spec)
     _require_pictures(config)
-    begins = start is not None or bool(config.start)
-    config.learner.conditioning.table(family.spec, family.train_count)
-    tune = config.learner.tune
-    if tune != "all" and not begins:
-        raise InputError(f"--tune={tune} leaves the rest as a run left it; say which run: --from=RUN")
-    if begins and config.learner.experience.reset_every:
+    learner.conditioning.table(family.spec, family.train_count)
+    if learner.tune != "all" and not begins:
+        raise InputError(f"--tune={learner.tune} leaves the rest as a run left it; say which run: --from=RUN")
+    if begins and learner.experience.reset_every:
         raise InputError("--reset-every throws away what --from takes from a run; give one of them")
 
 
@@ -81,37 +85,45 @@ def load_start(config: RunConfig) -> Policy | None:
 
 def launch(
     config: RunConfig,
-    directory: Path | None,
-    start: Policy | None,
-    resume: bool,
-    label: str = "",
-    quiet: bool = False,
-    **hooks: Any,
+    directory: Path | None = None,
+    start: Policy | None = None,
+    resume: bool = False,
+    hooks: Hooks = NO_HOOKS,
 ) -> Result:
     """Print what a run does, and train it in ``directory`` from the start or from its newest checkpoint."""
-    if hosts.is_first() and not quiet:
-        print(_introduction(config, directory, resume, label), flush=True)
+    if hosts.is_first() and not hooks.quiet and config.env:
+        print(_introduction(config, directory, resume, hooks.label), flush=True)
     try:
-        return train(
-            config.family,
-            config.learner,
-            **dataclasses.asdict(config.plan),
-            settings=config.training,
-            start=start,
-            sweep=config.points,
-            directory=directory,
-            resume=resume,
-            profile=config.profile,
-            tensorboard=config.tensorboard,
-            wandb=config.wandb,
-            label=label,
-            quiet=quiet,
-            **hooks,
-        )
+        return train(config, directory, start, resume, hooks)
     except InputError:
-        if directory is not None and not resume and hosts.is_first():
+        if config.env and directory is not None and not resume and hosts.is_first():
             remove_unused(directory)
         raise
+
+
+def train_objects(
+    env: Env,
+    agent: Agent,
+    directory: str | Path | None = None,
+    start: Policy | None = None,
+    resume: bool = False,
+    sweep: Sweep = (),
+    **given: Any,
+) -> Result:
+    """Train any agent in any environment, also those that no name makes again. Nothing is printed unless asked for.
+
+    Args:
+        given: the fields of ``Hooks``, and what ``config.of_objects`` takes.
+
+    Raises:
+        InputError: an argument cannot be used.
+    """
+    hooks = Hooks(**{"quiet": True, **{name: given.pop(name) for name in Hooks._fields if name in given}})
+    config = of_objects(env, agent, points=points.grid(sweep), **given)
+    if (config.profile or config.tensorboard or config.wandb) and directory is None:
+        raise InputError("profile, tensorboard and wandb write into the run's folder; give directory as well")
+    check(config, start)
+    return launch(config, None if directory is None else Path(directory), start, resume, hooks)
 
 
 def _introduction(config: RunConfig, directory: Path | None, resume: bool, label: str) -> str:

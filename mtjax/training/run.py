@@ -16,13 +16,13 @@ from jax.sharding import Mesh
 
 from mtjax.agents import settings as settings_of
 from mtjax.compiling.programs import Programs, compile_lowered, jit_programs, load_kernels, sharded_shapes, trace
-from mtjax.config import Plan, configure, require_value_range
+from mtjax.config import Plan, RunConfig
 from mtjax.evaluation import Evaluations, no_evaluations
 from mtjax.loop import Settings, TrainState
 from mtjax.parallel import hosts
 from mtjax.parallel import mesh as meshes
 from mtjax.saved import checkpoint, lock, log, points
-from mtjax.saved.points import Point, Sweep, SweptAgent
+from mtjax.saved.points import Point, SweptAgent
 from mtjax.saved.policy import Policy
 from mtjax.saved.records import Records
 from mtjax.saved.result import Result
@@ -37,76 +37,78 @@ from mtjax.training.console import (
     duration,
 )
 from mtjax.training.exchange import Exchange
-from mtjax.training.sinks import Sink, open_sinks, require_libraries, write_rows
+from mtjax.training.sinks import Sink, open_sinks, write_rows
 from mtjax.training.stops import finite_seeds, require_finite, require_finite_parameters, stop_signals
-from mtjax.types import SPLITS, Agent, Env, InputError
+from mtjax.types import SPLITS, Agent, Env
 
 _WHEN = ("iteration", "steps", "seconds", "wall_seconds")  # columns of metrics.csv
 
 
+class Hooks(NamedTuple):
+    """What a run has beside its configuration: functions that it calls, and what it prints."""
+
+    on_chunk: Callable[[dict[str, Any]], Any] | None = None
+    on_evaluation: Callable[[Evaluations], None] | None = None
+    quiet: bool = False
+    label: str = ""  # the first words of progress lines
+
+
+NO_HOOKS = Hooks()
+
+
 def train(
-    env: Env,
-    agent: Agent,
-    *,
-    steps: int = Plan.steps,
-    seeds: int = Plan.seeds,
-    seed: int = Plan.seed,
-    eval_every: int = Plan.eval_every,
-    eval_episodes: int = Plan.eval_episodes,
-    settings: Settings | None = None,
+    config: RunConfig,
+    directory: Path | None = None,
     start: Policy | None = None,
-    sweep: Sweep = (),
-    directory: str | Path | None = None,
     resume: bool = False,
-    profile: bool = False,
-    tensorboard: bool = False,
-    wandb: str = "",
-    quiet: bool = True,
-    label: str = "",
-    on_chunk: Callable[[dict[str, Any]], Any] | None = None,
-    on_evaluation: Callable[[Evaluations], None] | None = None,
-    **given: Any,
+    hooks: Hooks = NO_HOOKS,
 ) -> Result:
-    """Train an agent on a family of tasks. ``api.train`` says what the arguments mean; here all are objects.
+    """Train an agent on a family of tasks, by a configuration that ``launch.check`` accepts.
 
     Args:
         directory: an existing folder for metrics, evaluations and checkpoints; None writes nothing. Only one process
             at a time may write there.
+        start: the policy to fine-tune.
         resume: continue from the newest whole checkpoint in ``directory``, or start over if there is none yet.
 
     Raises:
-        InputError: an argument cannot be used.
+        InputError: the run in the folder is another, or memory or disk have no room.
         FloatingPointError: numbers stopped being finite (in a sweep: of every seed). The message names task, step and
             the last checkpoint.
         OSError: a file could not be written. The checkpoint before it stays.
     """
-    plan = Plan(steps, seed, seeds, eval_every, eval_episodes)
-    agent, settings = configure(agent, settings or Settings(), given)
-    found = points.grid(sweep)
-    for learner in points.agents_at(agent, found):
-        require_value_range(learner)
-        if start is not None:
-            finetune.require_fit(start, env, learner)  # type: ignore
-    directory = None if directory is None else Path(directory)
-    if (profile or tensorboard or wandb) and directory is None:
-        raise InputError("profile, tensorboard and wandb write into the run's folder; give directory as well")
-    require_libraries(tensorboard, wandb)
-    started, num_tasks = time.monotonic(), len(env.tasks("train").id)
-    longest = fit_chunk(settings, 1, settings.num_envs * settings.chunk_steps, agent.experience.steps).chunk_steps
-    settings = fit_chunk(settings, num_tasks, steps, agent.experience.steps)
-    agent.experience.check(env, settings.num_envs, settings.chunk_steps)
-    length = _played(settings, num_tasks, steps)
-    planned = agent.planned(length)  # type: ignore
-    console = Console(length * num_tasks * settings.num_envs, quiet or not hosts.is_first(), label)
+    started, env, agent, plan = time.monotonic(), config.family, config.learner, config.plan
+    played, length = played_by(config)
+    planned = agent.planned(length)
+    console = Console(length * config.worlds, hooks.quiet or not hosts.is_first(), hooks.label)
     run = _Run(
-        *(env, SweptAgent(planned) if found else planned, settings, plan, directory, console, found),
-        meshes.mesh_for(seeds * max(len(found), 1), num_tasks, settings.num_envs),
-        *(profile, tensorboard, wandb, on_chunk, on_evaluation, longest),
+        *(env, SweptAgent(planned) if config.points else planned, played, plan, directory, console, config.points),
+        mesh_of(config),
+        config,
+        hooks,
     )
     with contextlib.closing(console), memory.explaining():
         result = run.train(start, resume, started)
-    own = {"env": env, "agent": agent, "seeds": tuple(range(seed, seed + seeds)), "points": found}
+    own = {"env": env, "agent": agent, "seeds": tuple(plan.all_seeds), "points": config.points}
     return result._replace(total_seconds=time.monotonic() - started, **own)
+
+
+def mesh_of(config: RunConfig) -> Mesh | None:
+    """Return the devices of a run, or None for a single one.
+
+    Raises:
+        InputError: they cannot share its seeds and worlds evenly.
+    """
+    seeds = config.plan.seeds * max(len(config.points), 1)
+    return meshes.mesh_for(seeds, config.num_tasks, config.training.num_envs)
+
+
+def played_by(config: RunConfig) -> tuple[Settings, int]:
+    """Return a run's settings with the chunks that it plays, and how many steps of every environment these are."""
+    settings, steps = config.training, config.plan.steps
+    played = fit_chunk(settings, config.num_tasks, steps, config.learner.experience.steps)
+    chunk = played.chunk_steps
+    return played, math.ceil(steps / (config.worlds * chunk)) * chunk
 
 
 def fit_chunk(settings: Settings, num_tasks: int, steps: int, grain: int = 1) -> Settings:
@@ -115,12 +117,6 @@ def fit_chunk(settings: Settings, num_tasks: int, steps: int, grain: int = 1) ->
     longest = math.ceil(min(settings.chunk_steps, whole_run) / grain) * grain
     chunk = math.ceil(whole_run / math.ceil(whole_run / longest) / grain) * grain
     return dataclasses.replace(settings, chunk_steps=chunk)
-
-
-def _played(settings: Settings, num_tasks: int, steps: int) -> int:
-    """Count the steps of every environment in a run, which are whole chunks."""
-    chunk = settings.chunk_steps
-    return math.ceil(steps / (num_tasks * settings.num_envs * chunk)) * chunk
 
 
 class _Progress(NamedTuple):
@@ -146,12 +142,15 @@ class _Run:
     console: Console
     points: tuple[Point, ...] = ()
     mesh: Mesh | None = None
-    profile: bool = False
-    tensorboard: bool = False
-    wandb: str = ""
-    on_chunk: Callable[[dict[str, Any]], Any] | None = None
-    on_evaluation: Callable[[Evaluations], None] | None = None
-    longest: int = 0  # iterations of a chunk, were the run of many steps
+    config: RunConfig | None = None
+    hooks: Hooks = NO_HOOKS
+
+    @property
+    def longest(self) -> int:
+        """Return the iterations of a chunk, were the run of many steps."""
+        assert self.config is not None
+        settings = self.config.training
+        return fit_chunk(settings, 1, settings.num_envs * settings.chunk_steps, self.agent.experience.steps).chunk_steps
 
     @cached_property
     def seed_axis(self) -> tuple[np.ndarray, dict[str, np.ndarray] | None]:
@@ -253,9 +252,9 @@ class _Run:
         """Return where metrics go beside metrics.csv, in a run that is at a step."""
         if not self.records.writes:
             return []
-        assert self.directory is not None
+        assert self.directory is not None and self.config is not None
         config = {**dataclasses.asdict(self.plan), **dataclasses.asdict(self.settings), **settings_of(self.learner)}
-        return open_sinks(self.directory, self.tensorboard, self.wandb, steps, config)
+        return open_sinks(self.directory, self.config.tensorboard, self.config.wandb, steps, config)
 
     @property
     def learner(self) -> Any:
@@ -332,7 +331,7 @@ class _Run:
                 now, metrics = self._play(programs.chunk, now, len(rows) // len(self.seeds))
                 new = self._log(metrics, now.seconds - seconds, now, started, sinks)
                 rows.extend(new)
-                enough = self.on_chunk is not None and self.on_chunk(new[0]) is True
+                enough = self.hooks.on_chunk is not None and self.hooks.on_chunk(new[0]) is True
                 stop, due = asked(enough), self._is_due(now.steps)
                 if due:
                     programs.ready()
@@ -347,8 +346,8 @@ class _Run:
                 if due or stop:
                     self._save(now.state, now.steps // self.steps_per_iteration)
                     self.console.clock.evaluation(time.monotonic() - before)
-                if due and self.on_evaluation is not None:
-                    self.on_evaluation(now.evaluations)
+                if due and self.hooks.on_evaluation is not None:
+                    self.hooks.on_evaluation(now.evaluations)
             signal = hosts.largest(received[0] if received else 0)  # also one that came during the last save
         finished = now.steps >= self.plan.steps
         return Result(now.state, now.evaluations, rows, now.seconds, 0.0, finished, self.directory)._replace(
@@ -406,7 +405,7 @@ class _Run:
     def _profile_chunk(self, done: int, steps: int) -> Iterator[None]:
         """Trace the run's second, warm chunk, or its only one, if ``profile`` asks for it."""
         only = not done and steps + self.steps_per_chunk >= self.plan.steps
-        if not (self.profile and self.records.writes and (done == 1 or only)):
+        if not (self.config is not None and self.config.profile and self.records.writes and (done == 1 or only)):
             yield
             return
         place = self.directory / "profile"  # type: ignore
