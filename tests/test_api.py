@@ -18,7 +18,7 @@ from mtjax.command import keywords, run_config
 from mtjax.config import Plan, from_json, with_preset
 from mtjax.loop import Settings
 from mtjax.report import collect, curve
-from mtjax.training import launch, memory
+from mtjax.training import memory
 from mtjax.types import InputError
 
 SMALL = {"num_envs": 2, "chunk_steps": 25, "batch_size": 4, "replay_size": 200, "warmup_steps": 5, "hidden": (8, 8)}
@@ -69,7 +69,7 @@ def test_its_curve_shades_random_actions(result, monkeypatch, tmp_path):
     drawn = []
     monkeypatch.setattr(curve.figures, "learning_curve", lambda *given: drawn.append(given))
     config = from_json(result.directory / "config.json")
-    launch.draw(config, result, tmp_path)
+    curve.draw(config, result.evaluations, tmp_path)
     assert [given[-1] for given in drawn] == [5 * 2 * config.family.train_count]
 
 
