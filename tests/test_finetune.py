@@ -113,7 +113,7 @@ def bits(tree):
 
 def networks(state):
     """The parameters of actor and critics, with what these see observations by, by path."""
-    return named({name: state.nets[name] for name in ("actor", "critic", "representation")})
+    return named({name: state.nets[name] for name in ("actor", "critic", "representation", "knowing")})
 
 
 def inherited(states, seeds, nearest=NEAREST):
