@@ -83,8 +83,7 @@ class Fit:
 
     def descend(self, state: FitState, gradients: Nets, nets: Nets) -> tuple[Nets, Any]:
         """Return the networks that learn after an optimiser's step along their gradients, and its new state."""
-        nets, optimizer = descent.descend(self.optimizer, gradients, state.optimizer, self._learned(nets))
-        return nets, optimizer
+        return descent.descend(self.optimizer, gradients, state.optimizer, self._learned(nets))
 
     def _learned(self, nets: Nets) -> Nets:
         return {name: nets[name] for name in self.names}
