@@ -223,7 +223,7 @@ def fit_length(config: RunConfig, given: Collection[str]) -> RunConfig:
         plan = dataclasses.replace(plan, eval_every=0 if often == 10 else math.ceil(plan.steps / often))
     learner = config.learner
     if isinstance(experience, Replay) and "warmup_steps" not in given:
-        least = max(experience.window(config.family.spec), 1)
+        least = max(experience.length(config.family.spec), learner.unroll, 1)
         learner = replace(learner, {"warmup_steps": min(experience.warmup_steps, max(tenth, least))})
     return dataclasses.replace(config, plan=plan, training=training, learner=learner)
 

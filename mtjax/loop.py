@@ -14,10 +14,10 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.checks import check_fields
-from mtjax.maps import over_seeds
+from mtjax.maps import over_seeds, when
 from mtjax.parallel import collectives
 from mtjax.rollout import EnvStep, Worlds, bounded_worlds, reset_ended, reset_envs, split_keys, step_envs, world_keys
-from mtjax.types import Agent, Array, Env, InputError, Key, Metrics, Outcome, Sometimes, Task, Transition
+from mtjax.types import Agent, Array, Env, InputError, Key, Metrics, Sometimes, Task, Transition
 
 PHASES = 10
 """Largest number of different first ages, as each causes a separate reset in every episode."""
@@ -119,8 +119,10 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
     def iterate(state: TrainState, _) -> tuple[TrainState, Metrics]:
         key, act_key, reset_key, learn_key = split_keys(state.key, 4)
         state, steps, seen = _collect(env, agent, tasks, state, act_key, reset_key)
+        learners, steps = over_seeds(partial(agent.assess, tasks=tasks), 0, 0)(state.agent, steps)
         data = experience.add(state.data, steps)
-        learners, losses = agent.learn(env, state.agent, data, tasks, learn_key)
+        learners, losses = _learn(env, agent, tasks, learners, data, state.iteration, learn_key)
+        learners = over_seeds(partial(agent.observe, tasks=tasks), 0, 0)(learners, steps)
         return state._replace(agent=learners, data=experience.keep(data), key=key), seen | {"losses": losses}
 
     state, history = jax.lax.scan(iterate, state, length=settings.chunk_steps // experience.steps)
@@ -151,19 +153,65 @@ def _step(env, agent, tasks, state: TrainState, keys: Key, reset_keys: Key):
     worlds, env_step = step_envs(env, agent, state.agent, tasks, state.worlds, act_keys, explore)
     transition, total = env_step.transition, state.total + env_step.transition.reward
     ended = transition.ended
-    learners = state.agent
-    if agent.watches:
-        done = transition.discount == 0
-        outcome = Outcome(transition.reward, total, ended, done, worlds.age, worlds.memory)
-        learners = over_seeds(agent.observe, 0, 0)(learners, collectives.whole(outcome, axis=2))
     state = state._replace(
-        agent=learners,
         worlds=reset_ended(env, agent, state.agent, tasks, worlds, ended, reset_keys),
         total=jnp.where(ended, 0.0, total),
         counted=state.counted | ended,
         iteration=state.iteration + 1,
     )
     return state, (transition, _reduce_step(env_step, total, state.counted))
+
+
+def _learn(env, agent, tasks, learners: Any, data: Any, iteration: Array, keys: Key) -> tuple[Any, Metrics]:
+    """Update the agents of all seeds once the first random steps are over, which is at the same step for all seeds.
+
+    Returns:
+        their new states, and the means of the updates' metrics, with "learning" (): 1 if there were updates.
+    """
+    experience = agent.experience
+    if not experience.warmup_steps:
+        learners, metrics = _update(env, agent, tasks, learners, data, iteration, keys)
+        return learners, metrics | {"learning": jnp.float32(1)}
+    learning, metrics = iteration > experience.warmup_steps, {}
+    learners = _reset_networks(env, agent, tasks, learners, iteration, keys)
+    if experience.updates:
+        update = lambda learners: _update(env, agent, tasks, learners, data, iteration, keys)
+        learners, metrics = when(learning, update, learners)
+    return learners, metrics | {"learning": jnp.float32(learning)}
+
+
+@partial(jax.jit, static_argnums=(0, 1))  # so that it is traced once, though ``when`` needs its shapes too
+def _update(env, agent, tasks, learners: Any, data: Any, iteration: Array, keys: Key) -> tuple[Any, Metrics]:
+    """Make the updates that follow ``iteration`` () steps of every environment, one after another."""
+    experience = agent.experience
+    earlier = iteration // experience.steps - experience.warmup_steps // experience.steps - 1  # times of updates
+    numbers = earlier * experience.updates + jnp.arange(experience.updates)
+
+    def learn_one(learner: Any, data: Any, key: Key) -> tuple[Any, Metrics]:
+        batch_key, update_key = jax.random.split(key)
+        batches = experience.batches(env, agent, tasks, data, batch_key)
+
+        def update(learner: Any, given: tuple[Any, Key, Array]) -> tuple[Any, Metrics]:
+            batch, key, number = given
+            return agent.update(learner, experience.window(data, batch), tasks, key, number)
+
+        update_keys = jax.random.split(update_key, experience.updates)
+        learner, metrics = jax.lax.scan(update, learner, (batches, update_keys, numbers))
+        return learner, jax.tree.map(lambda x: jnp.mean(x, axis=0), metrics)
+
+    return over_seeds(learn_one, 0, experience.axes, 0)(learners, data, keys)
+
+
+def _reset_networks(env, agent, tasks, learners: Any, iteration: Array, keys: Key) -> Any:
+    """Begin networks anew if the experience's ``reset_every`` says so after ``iteration`` () steps."""
+    experience = agent.experience
+    if not experience.reset_every:
+        return learners
+    before = iteration - 1
+    passed = before // experience.reset_every > jnp.maximum(before - experience.steps, 0) // experience.reset_every
+    due = (before > experience.warmup_steps) & passed
+    one = lambda state, key: agent.reset_networks(state, env.spec, tasks, jax.random.fold_in(key, 1))
+    return jax.lax.cond(due, lambda states: over_seeds(one, 0, 0)(states, keys), lambda states: states, learners)
 
 
 def _reduce_step(env_step: EnvStep, total: Array, counted: Array) -> dict[str, Any]:

@@ -127,8 +127,9 @@ def step_envs(
         ended=terminated | lost | (age >= each.horizon),
         context=worlds.task.context if contexts_vary(tasks) else None,  # type: ignore
         extras=acted.extras,
+        memory=worlds.memory,
     )
-    memory = acted.memory
+    memory = worlds.memory
     if jax.tree.leaves(memory):
         note = lambda learner, task, memory, transition: agent.remember(learner, memory, transition, task)
         memory = over_learners(note)(learners, tasks, memory, transition)

@@ -63,7 +63,10 @@ class Step(NamedTuple):
 
 
 class Transition(NamedTuple):
-    """Holds one environment step for learning; a time limit leaves ``discount`` at 1."""
+    """Holds one environment step for learning; a time limit leaves ``discount`` at 1.
+
+    A window holds consecutive steps of one environment, leaves (..., L, ...).
+    """
 
     obs: Any  # (O,)
     action: Array  # (A,)
@@ -72,7 +75,8 @@ class Transition(NamedTuple):
     next_obs: Any  # (O,) from before any reset
     ended: Any = None  # () bool: the episode ended, terminated or by its time limit, or because its world was lost
     context: Array | None = None  # (C,) of the episode's task, if episodes draw tasks of other contexts
-    extras: Any = None  # data that the agent stores when it acts
+    extras: Any = None  # data that the agent stores when it acts, or adds when it assesses the step
+    memory: Any = None  # what the agent remembered of the episode before the step
 
 
 class Sometimes(NamedTuple):
@@ -91,19 +95,7 @@ class Acted(NamedTuple):
     """Holds an agent's action in one world."""
 
     action: Array  # (A,) in [-1, 1]
-    extras: Any  # data that learning needs, stored with the transition; None for none
-    memory: Any  # the agent's memory of the episode after the action
-
-
-class Outcome(NamedTuple):
-    """Holds the outcomes of one step of every environment; leaves (T, E)."""
-
-    reward: Array
-    total: Array  # sum of the episode's rewards so far
-    ended: Array  # bool: the episode ended, terminated or by its time limit, or because its world was lost
-    terminated: Array  # bool: the episode reached a terminal state
-    age: Array  # int32, steps of the episode so far
-    memory: Any = None  # the agent's memory of the episode, with this step
+    extras: Any = None  # data that learning needs, stored with the transition; None for none
 
 
 class Spec(NamedTuple):
@@ -161,14 +153,18 @@ class Experience(Protocol):
     """
 
     @property
-    def steps(self) -> int: ...  # of every environment between two calls of ``Agent.learn``
+    def steps(self) -> int: ...  # of every environment that are collected before the agent learns
+    @property
+    def updates(self) -> int: ...  # U, each time that the agent learns
     @property
     def policy_delay(self) -> int: ...  # the actor learns at every so many updates
     @property
     def warmup_steps(self) -> int: ...  # of every environment under random actions before learning starts
     @property
     def reset_every(self) -> int: ...  # steps of every environment between two resets of networks; 0 for never
-    def updates_in(self, steps: int) -> int: ...  # updates, or calls of ``learn``, in so many steps of all environments
+    def updates_in(self, steps: int) -> int: ...  # updates in so many steps of all environments
+    @property
+    def axes(self) -> Any: ...  # of the data under a map over seeds
     @property
     def sharding(self) -> Any: ...  # of the data, as a tree of PartitionSpec
     def check(self, env: Env, num_envs: int, chunk_steps: int = 0) -> None: ...  # raises InputError
@@ -178,6 +174,8 @@ class Experience(Protocol):
     def init(self, item: Transition, spec: Spec, num_tasks: int, num_envs: int, keys: Key) -> Any: ...  # keys (S,)
     def explore(self, data: Any, action: Array, step: Array) -> Array: ...  # actions (S, T, E, A) to take at a step ()
     def add(self, data: Any, steps: Transition) -> Any: ...  # leaves (S, T, H, E, ...)
+    def batches(self, env: Env, agent: Any, tasks: Task, data: Any, key: Key) -> Any: ...  # leaves (U, ...)
+    def window(self, data: Any, batch: Any) -> Transition: ...  # windows (T, B, L, ...) of one of the batches
     def keep(self, data: Any) -> Any: ...  # what the next iteration needs
 
 
@@ -187,10 +185,13 @@ class Agent(Protocol):
     @property
     def experience(self) -> Experience: ...
     @property
-    def watches(self) -> bool: ...  # whether ``observe`` has to be called
+    def unroll(self) -> int: ...  # steps L of the windows through which its memory learns; 0 if no memory does
     def init(self, spec: Spec, tasks: Task, key: Key) -> Any: ...
     def begin(self, state: Any, task: Task) -> Any: ...  # the memory with which an episode begins; () for none
     def act(self, state: Any, memory: Any, obs: Any, task: Task, key: Key | None) -> Acted: ...
     def remember(self, state: Any, memory: Any, transition: Transition, task: Task) -> Any: ...  # after a step
-    def observe(self, state: Any, outcome: Outcome) -> Any: ...
-    def learn(self, env: Env, states: Any, data: Any, tasks: Task, keys: Key) -> tuple[Any, Metrics]: ...  # all seeds
+    def relabel(self, env: Env, task: Task, transition: Transition, key: Key) -> Transition: ...  # as another task's
+    def assess(self, state: Any, steps: Transition, tasks: Task) -> tuple[Any, Transition]: ...  # (T, H, E, ...), once
+    def update(self, state: Any, window: Transition, tasks: Task, key: Key, number: Array) -> tuple[Any, Metrics]: ...
+    def observe(self, state: Any, steps: Transition, tasks: Task) -> Any: ...  # (T, H, E, ...), once, after learning
+    def reset_networks(self, state: Any, spec: Spec, tasks: Task, key: Key) -> Any: ...

@@ -18,15 +18,18 @@ from mtjax.agents.parts.encoders import Encoder
 from mtjax.agents.parts.gradients import descent, surgery
 from mtjax.agents.parts.knowing import Knowing, last_steps
 from mtjax.agents.parts.knowing.last_steps import Past, Seen, without_past
+from mtjax.agents.parts.knowing.recurrent import Following, Hidden, track
 from mtjax.agents.parts.representations import REPRESENTATIONS, Representation
 from mtjax.agents.parts.samplers import Sampler
 from mtjax.agents.parts.scaling import SCALINGS, Scaling
 from mtjax.agents.state import AgentState, Nets, of_task
 from mtjax.checks import require_values
-from mtjax.experience import Replay, multistep
+from mtjax.experience import Replay
 from mtjax.networks import OVER_TASKS, Network, Params
+from mtjax.parallel import collectives
+from mtjax.parallel.collectives import mean_and_variance
 from mtjax.tasks import SAME_CONTEXT
-from mtjax.types import Acted, Array, Env, InputError, Key, Metrics, Outcome, Spec, Task, Transition
+from mtjax.types import Acted, Array, Env, InputError, Key, Metrics, Spec, Task, Transition
 
 Heads = Literal["shared", "per-task", "disjoint"]
 Tune = Literal["all", "heads", "embedding"]
@@ -36,7 +39,9 @@ class Memory(NamedTuple):
     """Holds what an agent remembers of an episode."""
 
     past: Past | None  # the last steps, if the agent infers the task from them
-    scaling: Any  # memory of the scaling of rewards
+    hidden: Any = None  # the hidden state of a recurrent way to know the task
+    scaling: Any = None  # of the scaling of rewards
+    sampler: Any = None  # of the sampler of tasks
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,6 +148,16 @@ class BaseAgent(abc.ABC):
     def act(self, state: AgentState, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
         """Choose an action (A,) for one observation (O,) of one task; without a key, the mean action."""
 
+    @abc.abstractmethod
+    def update(
+        self, state: AgentState, window: Transition, tasks: Task, key: Key, number: Array
+    ) -> tuple[AgentState, Metrics]:
+        """Take one gradient step on windows (T, B, L, ...) of the training tasks; metrics are (T,).
+
+        Args:
+            number: () how many updates came before.
+        """
+
     # Settings that cannot be used.
 
     def _check_numbers(self) -> None:
@@ -196,6 +211,8 @@ class BaseAgent(abc.ABC):
                 f"inferred-from={lengths[0]} and theta-from={lengths[1]} are numbers of the same last steps; give both "
                 "one value"
             )
+        if self.conditioning.recurs and self.representation.history:
+            raise InputError("conditioning=recurrent and theta-from are two memories of an episode; use one of them")
         if self.lr_schedule == "constant" and (self.lr_final or self.lr_updates):
             given = f"lr-final={self.lr_final}" if self.lr_final else f"lr-updates={self.lr_updates}"
             raise InputError(
@@ -216,6 +233,8 @@ class BaseAgent(abc.ABC):
         self.representation.require(spec.obs)
         if frames.shown(spec.obs) and self.history_length:
             raise InputError("tasks cannot be inferred from pictures; choose another conditioning")
+        if frames.shown(spec.obs) and self.conditioning.recurs:
+            raise InputError("conditioning=recurrent reads vectors, not pictures; choose another conditioning")
 
     # Networks.
 
@@ -310,7 +329,7 @@ class BaseAgent(abc.ABC):
         inputs, action = self.init_inputs(spec, num_tasks), jnp.zeros(spec.action_size)
         seen, first = self.example(spec, inputs), jax.tree.map(lambda x: x[0], tasks._replace(blocks=None))
         given = self.conditioning.given(jnp.int32(0), first, num_tasks, vectors)
-        knowing = self.conditioning.init(num_tasks, seen, self.knows_apart, jax.random.fold_in(key, 1))
+        knowing = self.conditioning.init(num_tasks, seen, action, self.knows_apart, jax.random.fold_in(key, 1))
         nets = {
             "tasks": Params({} if vectors is None else {"vectors": vectors}, {"context": tasks.context}),
             "inputs": inputs,
@@ -352,28 +371,36 @@ class BaseAgent(abc.ABC):
             return Params({"moments": moments}, {})
         return Params({}, {"moments": jax.tree.map(lambda x: jnp.stack([x] * num_tasks), moments)})
 
-    def fit_inputs(self, inputs: Params, obs: Array) -> Params:
-        """Add observations (T, B, O) of training tasks to the moments, if observations are normalised."""
+    def fit_inputs(self, inputs: Params, obs: Any) -> Params:
+        """Add the vectors (T, ..., O) in observations to the moments, with those on other devices."""
         found = frames.state(obs)
         if not self.normalize_observations or found is None:
             return inputs
-        if inputs.own:
-            return Params({}, {"moments": jax.vmap(normalize.update)(inputs.own["moments"], found)})
-        return Params({"moments": normalize.update(inputs.shared["moments"], found)}, {})
+        moments, mixed = inputs.parts["moments"], bool(inputs.own)
+        found = found.reshape(len(found), -1, found.shape[-1])
+        count = (found.shape[1] if mixed else found.shape[0] * found.shape[1]) * collectives.count()
+        mean, variance = (x.reshape(moments.mean.shape) for x in mean_and_variance(found, 1 if mixed else (0, 1)))
+        one = normalize.Moments(jnp.full_like(moments.count, count), mean, count * variance)
+        if mixed:
+            return Params({}, {"moments": jax.vmap(normalize.merge)(moments, one)})
+        return Params({"moments": normalize.merge(moments, one)}, {})
 
-    def see(self, inputs: Params, obs: Array, past: Past | None = None) -> Any:
+    def see(self, inputs: Params, obs: Array, past: Any = None) -> Any:
         """Return observations (..., O) of one task as networks take them: normalised, and with the past if given."""
         scale = partial(normalize.apply, inputs.parts["moments"]) if self.normalize_observations else lambda x: x
         scaled = lambda obs: frames.with_state(scale, obs)
-        return scaled(obs) if past is None else Seen(scaled(obs), past._replace(obs=scaled(past.obs)))
+        if past is None:
+            return scaled(obs)
+        return Seen(scaled(obs), past._replace(obs=scaled(past.obs)) if "obs" in past._fields else past)
 
-    def see_batch(self, inputs: Params, obs: Array, past: Past | None = None) -> Any:
+    def see_batch(self, inputs: Params, obs: Array, past: Any = None) -> Any:
         """Return observations (T, B, O) of all training tasks as networks take them."""
         return jax.vmap(self.see, (OVER_TASKS, 0, 0))(inputs, obs, past) if inputs.own else self.see(inputs, obs, past)
 
     def example(self, spec: Spec, inputs: Params) -> Any:
         """Return an input of networks that is all zero."""
         past = last_steps.begin(self.history_length, spec.obs_size, spec.action_size) if self.history_length else None
+        past = Hidden(self.conditioning.begin()) if self.conditioning.recurs else past
         zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), frames.seen(spec))
         return self.see(inputs.of_first(), zeros, past)
 
@@ -409,7 +436,8 @@ class BaseAgent(abc.ABC):
     def acting_inputs(self, state: AgentState, memory: Memory, obs: Any, task: Task) -> tuple[Nets, Array, Any]:
         """Return what one task needs to act: its networks, its features (Z,) and the observation (O,) as input."""
         nets = of_task(state.nets, self.known_task(state, task))
-        inputs, of_all = self.see(nets["inputs"], obs, memory.past), state.nets["representation"]
+        past = memory.past if memory.hidden is None else Hidden(memory.hidden)
+        inputs, of_all = self.see(nets["inputs"], obs, past), state.nets["representation"]
         trained = task.id < state.num_tasks
         own = self.representation.stand_in(nets["representation"], of_all, trained, inputs)
         return nets | {"representation": own}, self.features(state, task), inputs
@@ -419,16 +447,6 @@ class BaseAgent(abc.ABC):
         if self.discounting == "gamma":
             return self.gamma
         return jnp.clip(1 - 5 / tasks.horizon, 0.95, 0.995)
-
-    def join_steps(
-        self, state: Any, steps: Transition, tasks: Task, join: Callable[..., Transition] = multistep.join
-    ) -> Transition:
-        """Join windows of consecutive steps (T, ..., n) to transitions (T, ...), by the tasks' discounts.
-
-        Args:
-            join: a function of one task's windows and its discount ().
-        """
-        return jax.vmap(join)(steps, jnp.broadcast_to(self.discounts(tasks), len(tasks.id)))
 
     @property
     def borrowed(self) -> list[str]:
@@ -451,7 +469,7 @@ class BaseAgent(abc.ABC):
         moments = state.nets["inputs"].parts["moments"]
         sizes = (moments.mean.shape[-1], self.action_size(state)) if self.history_length else ()
         past = last_steps.begin(self.history_length, *sizes) if self.history_length else None
-        return Memory(past, self.scaling.begin())
+        return Memory(past, self.conditioning.begin(), self.scaling.begin(), self.sampler.begin())
 
     def action_size(self, state: AgentState) -> int:
         """Return the size A of actions; the actor's head has 2 A outputs."""
@@ -459,28 +477,62 @@ class BaseAgent(abc.ABC):
 
     def remember(self, state: AgentState, memory: Memory, transition: Transition, task: Task) -> Memory:
         """Return the memory after a step."""
-        past = memory.past
+        past, hidden = memory.past, memory.hidden
         if past is not None:
             past = last_steps.append(past, transition.obs, transition.action, transition.reward)
-        return Memory(past, self.scaling.remember(memory.scaling, transition.reward, self.discounts(task)))
+        if hidden is not None:
+            nets = of_task(state.nets, self.known_task(state, task))
+            seen = transition._replace(obs=self.see(nets["inputs"], transition.obs))
+            hidden = self.conditioning.remember(nets["knowing"].parts, hidden, seen)
+        reward, gamma = transition.reward, self.discounts(task)
+        counts = (part.remember(memory_of, reward, gamma) for part, memory_of in self._watchers(memory))
+        return Memory(past, hidden, *counts)
+
+    def _watchers(self, memory: Memory) -> tuple[tuple[parts.Watcher, Any], ...]:
+        return (self.scaling, memory.scaling), (self.sampler, memory.sampler)
 
     def relabel(self, env: Env, task: Task, transition: Transition, key: Key) -> Transition:
         """Return a transition of another task as it would have been in ``task``; its past steps change too."""
         one = lambda transition: env.relabel(task, transition, key)  # type: ignore
-        return one(transition) if transition.extras is None else last_steps.relabel(one, transition)
-
-    @property
-    def watches(self) -> bool:
-        """Whether ``observe`` has to be called with the outcomes of every step."""
-        return self.scaling.watches or self.sampler.watches
-
-    def observe(self, state: AgentState, outcome: Outcome) -> AgentState:
-        """Update the statistics by the outcomes of one step of every environment, leaves (T, E)."""
-        watched = {"scaling": self.scaling, "sampler": self.sampler}
-        new = {name: Params({}, part.observe(state.nets[name].own, outcome)) for name, part in watched.items()}
-        return state._replace(nets=state.nets | new)
+        past = getattr(transition.memory, "past", None)
+        return one(transition) if past is None else last_steps.relabel(one, transition)
 
     # Learning.
+
+    @property
+    def unroll(self) -> int:
+        """Steps L of the windows through which a memory learns; 0 if none does."""
+        return self.conditioning.recurrent_steps if self.conditioning.recurs else 0  # type: ignore
+
+    def assess(self, state: AgentState, steps: Transition, tasks: Task) -> tuple[AgentState, Transition]:
+        """Compute what has to be known of collected steps (T, H, E, ...) before the agent learns from them: nothing."""
+        return state, steps
+
+    def observe(self, state: AgentState, steps: Transition, tasks: Task) -> AgentState:
+        """Count collected steps (T, H, E, ...), after learning: moments of observations, scaling and sampler."""
+        gamma = jnp.broadcast_to(self.discounts(tasks), len(tasks.id))[:, None]
+        told = Transition(None, None, steps.reward, steps.discount, None, steps.ended, memory=steps.memory)  # type: ignore
+        told = told._replace(memory=Memory(None, None, *steps.memory[2:]))
+        told = jax.tree.map(lambda x: x.reshape(len(x), -1), collectives.whole(told, axis=2))
+        new = {"inputs": self.fit_inputs(state.nets["inputs"], steps.obs)}
+        for name, (part, before) in zip(("scaling", "sampler"), self._watchers(told.memory), strict=True):
+            after = told._replace(memory=part.remember(before, told.reward, gamma))
+            new[name] = Params({}, part.observe(state.nets[name].own, after))
+        return state._replace(nets=state.nets | new)
+
+    def around(self, window: Transition, first: Transition, last: Transition) -> tuple[Any, Any]:
+        """Return what networks take of the steps before observations, and before the next ones; None for nothing.
+
+        Args:
+            window: (T, B, L, ...).
+            first, last: the first and the last steps (T, N, ...) of the transitions that are made of it.
+        """
+        if self.conditioning.recurs:
+            before = jax.vmap(track)(window, window.obs)
+            return before, Following(*before)
+        if not self.history_length:
+            return None, None
+        return first.memory.past, last_steps.append(last.memory.past, last.obs, last.action, last.reward)
 
     @property
     def least_loss(self) -> float | Array:
@@ -515,7 +567,3 @@ class BaseAgent(abc.ABC):
         found = found._replace(metrics={f"{name}_{key}": value for key, value in found.metrics.items()})
         fits = state.fits | {name: found.state}
         return state._replace(nets=state.nets | found.nets, fits=fits), found
-
-    def learn(self, env: Env, states: Any, data: Any, tasks: Task, keys: Key) -> tuple[Any, Metrics]:
-        """Update the agents of all seeds, leaves (S, ...), from their experience."""
-        return self.experience.learn(env, self, states, data, tasks, keys)

@@ -7,12 +7,11 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mtjax import frames, normalize
+from mtjax import frames
 from mtjax.agents import parts
 from mtjax.agents.base import BaseAgent, Memory
 from mtjax.agents.choices import FLAT
 from mtjax.agents.fit import Fit
-from mtjax.agents.parts.knowing.last_steps import Past, append
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.scaling.base import Moments
@@ -29,7 +28,6 @@ from mtjax.networks import (
     sample_raw,
     tanh_normal,
 )
-from mtjax.parallel import collectives
 from mtjax.parallel.collectives import mean_and_variance
 from mtjax.types import Acted, Array, InputError, Key, Metrics, Task, Transition
 
@@ -61,12 +59,14 @@ class Units(NamedTuple):
         return jnp.maximum(jnp.sqrt(self.moments.variance), MIN_STD)
 
     def rewards(self, outputs: Array) -> Array:
-        """Return the values in units of reward for which the critic's outputs (T, B) stand."""
-        return self.moments.mean[:, None] + self.std[:, None] * outputs
+        """Return the values in units of reward for which the critic's outputs (T, ...) stand."""
+        mean, std = (jnp.expand_dims(x, range(1, outputs.ndim)) for x in (self.moments.mean, self.std))
+        return mean + std * outputs
 
     def outputs(self, values: Array) -> Array:
-        """Return the critic's outputs that stand for values (T, B) in units of reward."""
-        return (values - self.moments.mean[:, None]) / self.std[:, None]
+        """Return the critic's outputs that stand for values (T, ...) in units of reward."""
+        mean, std = (jnp.expand_dims(x, range(1, values.ndim)) for x in (self.moments.mean, self.std))
+        return (values - mean) / std
 
 
 class Taken(NamedTuple):
@@ -74,7 +74,17 @@ class Taken(NamedTuple):
 
     raw: Array  # (A,) the action before the tanh
     log_prob: Array  # () its log-probability under the policy that took it
-    past: Past | None  # the steps before it, if the agent infers the task from them
+
+
+class Assessed(NamedTuple):
+    """Holds what is stored with an action once the rollout is over."""
+
+    raw: Array  # (A,)
+    log_prob: Array  # ()
+    advantage: Array  # (), normalised
+    value: Array  # () of the state before the action
+    output: Array  # () the critic's output before the update, in the new units
+    target: Array  # () what the critic's output should be
 
 
 class ActorAux(NamedTuple):
@@ -163,10 +173,6 @@ class PPO(BaseAgent):
     """Use layer normalisation in the critic."""
     gae_lambda: float = 0.95
     """Lambda of generalised advantages: 0 relies on the critic alone, 1 on the rewards of the rollout."""
-    epochs: int = 4
-    """Passes over the rollout in each update."""
-    minibatches: int = 8
-    """Minibatches in each pass; steps that do not divide evenly are left out, other ones in each pass."""
     clip_range: float = 0.2
     """Clip the ratio of policies to this distance from 1 (epsilon)."""
     value_clip: float = 0.0
@@ -191,7 +197,6 @@ class PPO(BaseAgent):
     def _check_numbers(self) -> None:
         super()._check_numbers()
         parts.require_shares(self, "gae_lambda")
-        parts.require_counts(self, "epochs", "minibatches")
         parts.require_positive(self, "clip_range", "reward_scale")
         parts.require_not_negative(self, "value_clip", "entropy_cost", "kl_limit")
         parts.require_rates(self, "value_rate")
@@ -211,8 +216,9 @@ class PPO(BaseAgent):
                 flag = name.replace("_", "-")
                 raise InputError(f"{flag}={given[name]} is of updates from a replay, and ppo has none; leave it out")
 
-    def updates_in(self, steps: int) -> int:
-        return super().updates_in(steps) * self.epochs * self.minibatches
+    @property
+    def unroll(self) -> int:
+        return self.experience.unroll if self.conditioning.recurs else 0
 
     # Networks.
 
@@ -230,7 +236,11 @@ class PPO(BaseAgent):
             "actor": scale_head(self.actor.init(actor_key, num_tasks, 2 * len(action), *actor_inputs), first),
             "critic": scale_head(self.critic.init(critic_key, num_tasks, 1, *critic_inputs), jnp.zeros(1)),
             "units": Units(jnp.float32(0), Moments.begin(num_tasks)).params(),
+            **({"limit": within(True)} if self.limits_kl else {}),
         }
+
+    def init_slow(self, nets: Nets) -> Nets:
+        return {"representation": jax.tree.map(jnp.copy, nets["representation"])} if self.representation.learns else {}
 
     @property
     def fits(self) -> dict[str, Fit]:
@@ -243,11 +253,11 @@ class PPO(BaseAgent):
         """Choose an action (A,) for one observation (O,) of one task; without a key, the mean action."""
         outputs = self.policy(*self.acting_inputs(state, memory, obs, task))
         if key is None:
-            return Acted(tanh_normal(outputs, None, task.action_mask)[0], None, memory)
+            return Acted(tanh_normal(outputs, None, task.action_mask)[0])
         raw, log_prob = sample_raw(outputs, key, task.action_mask)
         action = jnp.tanh(raw)
         action = action if task.action_mask is None else action * task.action_mask
-        return Acted(action, Taken(raw, log_prob, memory.past), memory)
+        return Acted(action, Taken(raw, log_prob))
 
     # Losses of one task.
 
@@ -284,61 +294,105 @@ class PPO(BaseAgent):
 
     # Update of all tasks.
 
-    def update(self, state: AgentState, steps: Transition, tasks: Task, key: Key) -> tuple[AgentState, Metrics]:
-        """Learn from the rollouts (T, H, E, ...) of the training tasks; metrics are (T,)."""
-        order_key, key = jax.random.split(key)
-        state, batch, statistics = self.prepare(state, steps, tasks)
-        indices = self.minibatch_indices(batch.advantage.shape[1], order_key)
-        minibatch_step = partial(self.minibatch_step, batch, state.nets["representation"])
-        (state, _), metrics = jax.lax.scan(
-            minibatch_step, (state, jnp.bool_(True)), (indices, jax.random.split(key, len(indices)))
-        )
-        inputs = self.fit_inputs(state.nets["inputs"], steps.obs)
-        state = state._replace(nets=state.nets | {"inputs": inputs})
-        return state, jax.tree.map(lambda x: jnp.mean(x, axis=0), metrics) | statistics
-
-    def prepare(self, state: AgentState, steps: Transition, tasks: Task) -> tuple[AgentState, Batch, Metrics]:
-        """Fit the units to rollouts (T, H, E, ...), and return the batch (T, H E, ...) for the losses."""
-        flat: Transition = jax.tree.map(lambda x: x.reshape(x.shape[0], -1, *x.shape[3:]), steps)
-        taken: Taken = flat.extras
-        next_past = None if taken.past is None else append(taken.past, flat.obs, flat.action, flat.reward)
-        features, see = self.features_of_batch(state, flat, tasks), partial(self.see_batch, state.nets["inputs"])
-        obs, next_obs = see(flat.obs, taken.past), see(flat.next_obs, next_past)
+    def assess(self, state: AgentState, steps: Transition, tasks: Task) -> tuple[AgentState, Transition]:
+        """Add advantages and targets to a rollout (T, H, E, ...), and fit the critic's units to it."""
+        windows = self.experience.windows(steps, self.unroll)
+        flat, features, obs, next_obs = self.inputs(state, windows, tasks)
         old, output = Units.of(state.nets["units"]), self.outputs(state, features, obs)
         value, next_value = old.rewards(output), self.values(state, features, next_obs)
-        reward = self.rewards(state, flat, tasks)
-        advantage = self.advantages(flat._replace(reward=reward), tasks, steps.reward.shape, value, next_value)
+        played = lambda x: self.experience.played(x, steps.reward.shape, self.unroll)
+        value, next_value, output = map(played, (value, next_value, output))
+        reward = played(self.rewards(state, flat, tasks))
+        advantage = self.advantages(steps._replace(reward=reward), tasks, value, next_value)
         target = value + advantage
-        scaling, _ = self.scaling.renew(state.nets["scaling"].own, target, ())
-        state = self.renew(state._replace(nets=state.nets | {"scaling": Params({}, scaling)}), target)
+        of_task = target.reshape(len(target), -1)
+        scaling, _ = self.scaling.renew(state.nets["scaling"].own, of_task, ())
+        state = self.renew(state._replace(nets=state.nets | {"scaling": Params({}, scaling)}), of_task)
         units = Units.of(state.nets["units"])
-        factor, offset = (x[:, None] for x in self.follows(old, units))
-        models = {"action": flat.action, "reward": reward, "next_obs": next_obs} if self.representation.learns else {}
-        batch = Batch(
-            obs=obs,
-            raw=taken.raw,
-            log_prob=taken.log_prob,
+        factor, offset = (x[:, None, None] for x in self.follows(old, units))
+        extras = Assessed(
+            raw=steps.extras.raw,
+            log_prob=steps.extras.log_prob,
             advantage=self.normalize_advantages(advantage),
+            value=value,
             output=factor * output + offset,
             target=units.outputs(target),
-            features=features,
-            mask=tasks.action_mask,
-            **models,
         )
-        residual_variance, target_variance = (mean_and_variance(x, 1)[1][:, 0] for x in (advantage, target))
-        explained = 1 - residual_variance / jnp.maximum(target_variance, MIN_STD**2)
-        return state, batch, {"value": mean_and_variance(value, 1)[0][:, 0], "explained_variance": explained}
+        if self.representation.learns:
+            state = state._replace(slow={"representation": state.nets["representation"]})
+        if self.limits_kl:
+            state = state._replace(nets=state.nets | {"limit": within(True)})
+        return state, steps._replace(extras=extras)
+
+    def inputs(self, state: AgentState, window: Transition, tasks: Task) -> tuple[Transition, Array, Any, Any]:
+        """Return the steps (T, B L, ...) of windows (T, B, L, ...), with features, observations and next ones."""
+        flat = jax.tree.map(lambda x: x.reshape(len(x), -1, *x.shape[3:]), window)
+        see, (past, next_past) = partial(self.see_batch, state.nets["inputs"]), self.around(window, flat, flat)
+        return flat, self.features_of_batch(state, flat, tasks), see(flat.obs, past), see(flat.next_obs, next_past)
+
+    def update(
+        self, state: AgentState, window: Transition, tasks: Task, key: Key, number: Array
+    ) -> tuple[AgentState, Metrics]:
+        """Take a gradient step of actor and critic on windows (T, B, L, ...) of a rollout; metrics are (T,)."""
+        sample_key, actor_order, critic_order = jax.random.split(key, 3)
+        batch = self.prepare(state, window, tasks)
+        importance = self.sampler.weights(state.nets["sampler"].own, jnp.ones(state.num_tasks))
+        # The actor is first, as pi_old was on what the critic's step moves too: the representation, and what is known.
+        data = (batch, jax.random.split(sample_key, state.num_tasks))
+        moved, actor = self.descend(state, "actor", self.actor_loss, data, actor_order, importance)
+        state = self.unless_far(moved, state, actor.aux.kl)
+        if self.representation.learns:
+            both, models_key = (state.nets["representation"], state.slow["representation"]), jax.random.fold_in(key, 3)
+            targets, _ = self.representation.targets(*both, batch.next_obs, models_key)
+            batch = batch._replace(model_targets=targets)
+        loss = self.above_least(self.critic_loss)
+        state, critic = self.descend(state, "critic", loss, (batch,), critic_order, importance)
+        told = self.explained(state, window.extras)
+        return state, critic.aux | critic.metrics | actor.aux.metrics | actor.metrics | told
+
+    def unless_far(self, moved: AgentState, state: AgentState, kl: Array) -> AgentState:
+        """Return the state that has moved, unless KL(pi_old | pi) (T,) has exceeded ``kl_limit`` in this rollout."""
+        if not self.limits_kl:
+            return moved
+        limit = parts.or_infinite(self.kl_limit)
+        near = state.nets["limit"].shared["within"] & (jnp.mean(kl) <= limit)
+        chosen = jax.tree.map(partial(jnp.where, near), moved, state)
+        return chosen._replace(nets=chosen.nets | {"limit": within(near)})
+
+    @property
+    def limits_kl(self) -> bool:
+        """Whether there may be a limit of KL(pi_old | pi)."""
+        return not parts.is_zero(self.kl_limit)
+
+    def explained(self, state: AgentState, assessed: "Assessed") -> Metrics:
+        """Return the mean value (T,) of steps, and which share of the variance of targets values explained."""
+        flat = lambda x: x.reshape(len(x), -1)
+        value, target = flat(assessed.value), Units.of(state.nets["units"]).rewards(flat(assessed.target))
+        residual, whole = (mean_and_variance(x, 1)[1][:, 0] for x in (target - value, target))
+        explained = 1 - residual / jnp.maximum(whole, MIN_STD**2)
+        return {"value": mean_and_variance(value, 1)[0][:, 0], "explained_variance": explained}
+
+    def prepare(self, state: AgentState, window: Transition, tasks: Task) -> Batch:
+        """Return the batch (T, ...) for the losses, of windows (T, B, L, ...) of an assessed rollout."""
+        flat, features, obs, next_obs = self.inputs(state, window, tasks)
+        models = {}
+        if self.representation.learns:
+            models = {"action": flat.action, "reward": self.rewards(state, flat, tasks), "next_obs": next_obs}
+        found: Assessed = flat.extras
+        kept = {"raw": found.raw, "log_prob": found.log_prob, "advantage": found.advantage}
+        kept |= {"output": found.output, "target": found.target}
+        return Batch(obs=obs, features=features, mask=tasks.action_mask, **kept, **models)
 
     def rewards(self, state: AgentState, flat: Transition, tasks: Task) -> Array:
         """Return the rewards (T, H E) of steps in the task's units."""
         gamma = jnp.broadcast_to(self.discounts(tasks), len(tasks.id))
         return self.reward_scale * self.scaling.rewards(state.nets["scaling"].own, flat, gamma, jnp.zeros(len(gamma)))
 
-    def advantages(self, flat: Transition, tasks: Task, shape: Any, value: Array, next_value: Array) -> Array:
-        """Compute advantages (T, H E) of steps (T, H E) that were played in the ``shape`` (T, H, E)."""
+    def advantages(self, steps: Transition, tasks: Task, value: Array, next_value: Array) -> Array:
+        """Compute the advantages (T, H, E) of a rollout."""
         gamma = jnp.broadcast_to(self.discounts(tasks), len(tasks.id))
-        played = (x.reshape(shape) for x in (flat.reward, flat.discount, flat.ended, value, next_value))
-        return jax.vmap(partial(advantages, lambda_=self.gae_lambda))(*played, gamma=gamma).reshape(value.shape)
+        played = steps.reward, steps.discount, steps.ended, value, next_value
+        return jax.vmap(partial(advantages, lambda_=self.gae_lambda))(*played, gamma=gamma)
 
     def values(self, state: AgentState, features: Array, obs: Any) -> Array:
         """Return the critic's values (T, B) of observations (T, B, ...), in units of reward."""
@@ -348,14 +402,14 @@ class PPO(BaseAgent):
         """Return the critic's outputs (T, B) for observations (T, B, ...)."""
         of_tasks = partial(jax.vmap(self.output, (axes_of(state.nets), 0, 0)), state.nets)
         if frames.shown(obs):  # all at once they would fill the memory
-            return in_parts(of_tasks, features, obs, self.minibatches)
+            return in_parts(of_tasks, features, obs, self.experience.minibatches)
         return of_tasks(features, obs)
 
     def normalize_advantages(self, advantage: Array) -> Array:
-        """Scale advantages (T, B) to mean 0 and standard deviation 1, as the settings say."""
+        """Scale advantages (T, H, E) to mean 0 and standard deviation 1, as the settings say."""
         if self.advantage_normalization == "none":
             return advantage
-        mean, variance = mean_and_variance(advantage, 1 if self.advantage_normalization == "task" else (0, 1))
+        mean, variance = mean_and_variance(advantage, (1, 2) if self.advantage_normalization == "task" else (0, 1, 2))
         return (advantage - mean) / jnp.maximum(jnp.sqrt(variance), MIN_STD)
 
     def renew(self, state: AgentState, target: Array) -> AgentState:
@@ -381,56 +435,6 @@ class PPO(BaseAgent):
             known, (old.moments.mean - new.moments.mean) / new.std, 0.0
         )
 
-    def fit_inputs(self, inputs: Params, obs: Any) -> Params:
-        """Add the vectors (T, ..., O) in observations to the moments, with those on other devices."""
-        found = frames.state(obs)
-        if not self.normalize_observations or found is None:
-            return inputs
-        moments, mixed = inputs.parts["moments"], bool(inputs.own)
-        found = found.reshape(len(found), -1, found.shape[-1])
-        count = (found.shape[1] if mixed else found.shape[0] * found.shape[1]) * collectives.count()
-        mean, variance = (x.reshape(moments.mean.shape) for x in mean_and_variance(found, 1 if mixed else (0, 1)))
-        one = normalize.Moments(jnp.full_like(moments.count, count), mean, count * variance)
-        if mixed:
-            return Params({}, {"moments": jax.vmap(normalize.merge)(moments, one)})
-        return Params({"moments": normalize.merge(moments, one)}, {})
-
-    def minibatch_indices(self, count: int, key: Key) -> Array:
-        """Split ``count`` steps at random into the minibatches of all epochs: indices (U, B)."""
-        size = count // self.minibatches
-        if not size:
-            raise InputError(f"minibatches ({self.minibatches}) must not be more than a rollout's {count} steps a task")
-        indices = jax.vmap(lambda key: jax.random.permutation(key, count))(jax.random.split(key, self.epochs))
-        return indices[:, : size * self.minibatches].reshape(-1, size)
-
-    def minibatch_step(
-        self, batch: Batch, slow: Params, carry: tuple[AgentState, Array], given: tuple[Array, Key]
-    ) -> tuple[Any, Metrics]:
-        """Take a gradient step of critic and actor on one minibatch, steps (B,) of every task.
-
-        Args:
-            slow: the representation from before the update.
-            carry: the state, and whether KL(pi_old | pi) has stayed within ``kl_limit`` so far ().
-            given: indices of steps (B,), and a key.
-        """
-        (state, within_limit), (index, key) = carry, given
-        sample_key, actor_order, critic_order = jax.random.split(key, 3)
-        minibatch = take_steps(batch, index)
-        importance = self.sampler.weights(state.nets["sampler"].own, jnp.ones(state.num_tasks))
-        # The actor is first, as pi_old was on what the critic's step moves too: the representation, and what is known.
-        data = (minibatch, jax.random.split(sample_key, state.num_tasks))
-        moved, actor = self.descend(state, "actor", self.actor_loss, data, actor_order, importance)
-        if not parts.is_zero(self.kl_limit):
-            within_limit &= jnp.mean(actor.aux.kl) <= jnp.where(self.kl_limit > 0, self.kl_limit, jnp.inf)
-            moved = jax.tree.map(partial(jnp.where, within_limit), moved, state)
-        if self.representation.learns:
-            both, models_key = (moved.nets["representation"], slow), jax.random.fold_in(key, 3)
-            targets, _ = self.representation.targets(*both, minibatch.next_obs, models_key)
-            minibatch = minibatch._replace(model_targets=targets)
-        loss = self.above_least(self.critic_loss)
-        state, critic = self.descend(moved, "critic", loss, (minibatch,), critic_order, importance)
-        return (state, within_limit), critic.aux | critic.metrics | actor.aux.metrics | actor.metrics
-
 
 def advantages(
     reward: Array, discount: Array, ended: Array, value: Array, next_value: Array, gamma: Array, lambda_: float | Array
@@ -447,11 +451,9 @@ def advantages(
     return jax.lax.scan(back, jnp.zeros_like(delta[0]), (delta, decay), reverse=True)[1]
 
 
-def take_steps(batch: Batch, index: Array) -> Batch:
-    """Take the steps at ``index`` (B,) of every task's batch."""
-    rows = lambda x: x[:, index]
-    features = rows(batch.features) if batch.features.ndim == 3 else batch.features
-    return jax.tree.map(rows, batch._replace(features=None, mask=None))._replace(features=features, mask=batch.mask)
+def within(near: bool | Array) -> Params:
+    """Return whether the policy is within the limit of its divergence, as a network of the agent's."""
+    return Params({"within": jnp.asarray(near)}, {})
 
 
 def scale_head(params: Params, bias: Array) -> Params:

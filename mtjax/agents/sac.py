@@ -13,13 +13,11 @@ from mtjax.agents import parts
 from mtjax.agents.base import BaseAgent, Memory
 from mtjax.agents.choices import FLAT
 from mtjax.agents.fit import Fit
-from mtjax.agents.parts.knowing.last_steps import append
 from mtjax.agents.parts.representations import REPRESENTATIONS
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.values import VALUES, Value
 from mtjax.agents.state import AgentState, Nets, axes_of
 from mtjax.experience import Replay, pictures
-from mtjax.experience.multistep import Ends
 from mtjax.maps import when
 from mtjax.networks import Network, Params, tanh_normal
 from mtjax.types import Acted, Array, InputError, Key, Metrics, Sometimes, Task, Transition
@@ -124,6 +122,14 @@ class SAC(BaseAgent):
         if self.representation.predicts and self.experience.n_step > 1:
             name = parts.name_of(REPRESENTATIONS, self.representation)
             raise InputError(f"{name} learns models of single steps; use n-step=1, not {self.experience.n_step}")
+        replay = self.experience
+        if self.conditioning.recurs and (replay.n_step > 1 or replay.hindsight or replay.host_replay_size):
+            raise InputError("conditioning=recurrent needs n-step=1, hindsight=0 and host-replay-size=0")
+        if self.unroll > self.experience.warmup_steps + 1:
+            raise InputError(
+                f"recurrent-steps={self.unroll} needs as many steps before the first update: warmup-steps of at least "
+                f"{self.unroll - 1}, not {self.experience.warmup_steps}"
+            )
         if scaling == "popart" and self.unit_head:
             raise InputError("scaling=popart rescales heads, which unit-head keeps at length 1; use one of them")
 
@@ -160,7 +166,7 @@ class SAC(BaseAgent):
     def act(self, state: AgentState, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
         """Choose an action (A,) for one observation (O,) of one task; without a key, the mean action."""
         outputs = self.behaviour(task.id < state.num_tasks, *self.acting_inputs(state, memory, obs, task))
-        return Acted(tanh_normal(outputs, key, task.action_mask)[0], memory.past, memory)
+        return Acted(tanh_normal(outputs, key, task.action_mask)[0])
 
     def behaviour(self, trained: Array, nets: Nets, features: Array, obs: Any) -> Array:
         """Return the outputs (2A,) of the policy that acts; ``trained`` () says whether the task was trained on."""
@@ -231,16 +237,15 @@ class SAC(BaseAgent):
     # Update of all tasks.
 
     def update(
-        self, state: AgentState, transitions: Transition, tasks: Task, key: Key, actor_turn: Array | None = None
+        self, state: AgentState, window: Transition, tasks: Task, key: Key, number: Array
     ) -> tuple[AgentState, Metrics]:
-        """Take one gradient step on a batch (T, B, ...) of the training tasks; metrics are (T,).
+        """Take one gradient step on windows (T, B, L, ...) of the training tasks; metrics are (T,).
 
         Args:
-            actor_turn: () bool, whether actor and temperatures learn too; None if they always do.
+            number: () how many updates came before; actor and temperatures learn at every ``policy_delay``-th.
         """
         target_key, actor_key, critic_order, actor_order = jax.random.split(key, 4)
-        transitions = self.representation.augment(transitions, jax.random.fold_in(key, 1))
-        state, batch = self.prepare(state, transitions, tasks)
+        batch = self.prepare(state, window, tasks, jax.random.fold_in(key, 1))
         before = state.nets["representation"]
         importance = self.sampler.weights(state.nets["sampler"].own, batch.temperature)
 
@@ -250,11 +255,13 @@ class SAC(BaseAgent):
 
         seen = {"representation": self.representation.for_actor(state.nets["representation"], before)}
         improve = lambda state: self.improve(state, batch, seen, actor_key, actor_order, importance)
-        if actor_turn is None:
+        delay = self.experience.policy_delay
+        if delay == 1:
             state, actor_metrics = improve(state)
         else:
-            state, actor_metrics = when(actor_turn, improve, state)
-            actor_metrics = Sometimes.over(actor_metrics, actor_turn)
+            turn = (number + 1) % delay == 0
+            state, actor_metrics = when(turn, improve, state)
+            actor_metrics = Sometimes.over(actor_metrics, turn)
 
         state = self.renew_scales(self.update_target(state), fitted.aux.expected)
         return state, fitted.aux.metrics | actor_metrics | {"temperature": batch.temperature} | fitted.metrics
@@ -280,17 +287,26 @@ class SAC(BaseAgent):
         fits = state.fits | {"temperature": memory._replace(optimizer=optimizer)}
         return state._replace(nets=state.nets | nets, fits=fits)
 
-    def prepare(self, state: AgentState, batch: Transition, tasks: Task) -> tuple[AgentState, Batch]:
-        """Fit the normalisers to transitions (T, B, ...), and return the batch (T, ...) for the losses."""
-        inputs = self.fit_inputs(state.nets["inputs"], batch.obs)
-        state = state._replace(nets=state.nets | {"inputs": inputs})
-        past, last = batch.extras if isinstance(batch.extras, Ends) else (batch.extras, batch)
-        next_past = None if past is None else append(last.extras, last.obs, last.action, last.reward)
+    def transitions(self, window: Transition, tasks: Task) -> Transition:
+        """Return the transitions (T, N, ...) that windows (T, B, L, ...) are made to: all steps, or one n-step each."""
+        if self.unroll:
+            return jax.tree.map(lambda x: x.reshape(len(x), -1, *x.shape[3:]), window._replace(memory=None))
+        return self.experience.joined(window, jnp.broadcast_to(self.discounts(tasks), len(tasks.id)))
+
+    def prepare(self, state: AgentState, window: Transition, tasks: Task, key: Key | None = None) -> Batch:
+        """Return the batch (T, ...) for the losses, of windows (T, B, L, ...).
+
+        Args:
+            key: for changing observations at random; None leaves them as they are.
+        """
+        batch, inputs = self.transitions(window, tasks), state.nets["inputs"]
+        batch = batch if key is None else self.representation.augment(batch, key)
+        past, next_past = self.around(window, batch, batch if batch.extras is None else batch.extras)
         action_size = action_sizes(batch.action, tasks.action_mask)
         temperature = jnp.exp(state.nets["temperature"].parts["log"])
         bonus = temperature * abs(self.target_entropy) * action_size / 2
         gamma = self.discounts(tasks)
-        return state, Batch(
+        return Batch(
             obs=self.see_batch(inputs, batch.obs, past),
             action=batch.action,
             reward=self.scaling.rewards(state.nets["scaling"].own, batch, gamma, bonus),

@@ -11,19 +11,12 @@ As there, nothing corrects for actions of an older policy. Of a soft value's bon
 window counts.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from mtjax.types import Array, Transition
-
-
-class Ends(NamedTuple):
-    """Holds the data that the agent stored with the first action of joined steps, and the whole last step."""
-
-    first: Any
-    last: Transition
 
 
 def length(ended: Array) -> Array:
@@ -46,8 +39,8 @@ def at(tree: Any, index: Array) -> Any:
 def join(steps: Transition, gamma: float | Array) -> Transition:
     """Join windows of consecutive steps (..., n) to one transition (...) each, for a discount () of one task.
 
-    Its reward is R. Its discount is gamma^(m-1) d, as agents multiply it by gamma once more. Where agents store data
-    with their actions, ``extras`` are ``Ends``.
+    Its reward is R. Its discount is gamma^(m-1) d, as agents multiply it by gamma once more. If there is a memory, the
+    ``extras`` are the whole last step, so that the memory after it can be told.
     """
     count = length(steps.ended)[..., None]
     index = jnp.arange(steps.reward.shape[-1])
@@ -60,5 +53,5 @@ def join(steps: Transition, gamma: float | Array) -> Transition:
         discount=powers[final.squeeze(-1)] * last.discount,
         next_obs=last.next_obs,
         ended=last.ended,
-        extras=None if steps.extras is None else Ends(first.extras, last),
+        extras=last if jax.tree.leaves(steps.memory) else None,
     )

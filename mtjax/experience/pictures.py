@@ -28,6 +28,11 @@ def window(frames: int, n_step: int) -> int:
     return frames + n_step + 1
 
 
+def frames(window: int, n_step: int) -> int:
+    """Return how many pictures a stack has, if so many steps tell a transition of ``n_step`` steps."""
+    return window - n_step - 1
+
+
 def join(rows: Transition, gamma: float | Array, *, frames: int, n_step: int) -> Transition:
     """Join windows of consecutive steps (..., W) to a transition (...) each, with stacks (..., H, W, N C) of pictures.
 

@@ -10,13 +10,12 @@ import jax.numpy as jnp
 import tyro
 from jax.sharding import PartitionSpec
 
-from mtjax.experience import hindsight, pictures, store
+from mtjax.experience import hindsight, multistep, pictures, store
 from mtjax.experience import ring as rings
 from mtjax.experience.ring import OVER_SEEDS, Ring
 from mtjax.frames import PICTURES, shown
-from mtjax.maps import over_seeds, when
 from mtjax.parallel import collectives
-from mtjax.types import Array, Env, InputError, Key, Metrics, Spec, Task, Transition
+from mtjax.types import Array, Env, InputError, Key, Spec, Task, Transition
 
 _FLAG = tyro.conf.arg(prefix_name=False)  # --batch-size, not --agent.batch-size
 
@@ -88,7 +87,7 @@ class Replay:
             InputError: the replay does not hold enough steps of every environment, or hindsight cannot relabel the
                 family.
         """
-        window = self.window(env.spec)
+        window = self.length(env.spec)
         if shown(env.spec.obs) and window > self.warmup_steps:
             raise InputError(f"{window} steps tell one transition of pictures; use warmup-steps of at least {window}")
         if shown(env.spec.obs) and env.episode_length < 2:
@@ -112,7 +111,7 @@ class Replay:
             raise InputError("host-replay-size takes one process; leave out --distributed")
         count, length = self.segments(spec, num_envs)
         if not count:
-            least = 2 * math.ceil(max(self.window(spec), 1) / self.steps) * self.steps * num_envs
+            least = 2 * math.ceil(max(self.length(spec), 1) / self.steps) * self.steps * num_envs
             raise InputError(f"with host-replay-size, replay-size must be at least {least}, not {self.replay_size}")
         latest = self.capacity(num_envs) // num_envs - count * length
         if chunk_steps > latest:
@@ -126,7 +125,7 @@ class Replay:
         beside = f", and {self.host_slots(num_envs) * num_envs:,} on the host" if self.host_replay_size else ""
         return f"replay ({self.capacity(num_envs):,} transitions a task{beside})"
 
-    def window(self, spec: Spec) -> int:
+    def length(self, spec: Spec) -> int:
         """Return how many consecutive steps to draw for each transition; 0 if transitions are single steps."""
         if shown(spec.obs):
             return pictures.window(spec.frames, self.n_step)
@@ -134,7 +133,7 @@ class Replay:
 
     @property
     def steps(self) -> int:
-        """Steps of every environment between two calls of ``learn``."""
+        """Steps of every environment before the agent learns again."""
         return self.update_every
 
     def updates_in(self, steps: int) -> int:
@@ -158,7 +157,7 @@ class Replay:
         """Return rows K and length L of the recalled segments on the device."""
         if not self.host_replay_size:
             return 0, 0
-        return store.segments(self.capacity(num_envs) // num_envs, self.window(spec), self.steps)
+        return store.segments(self.capacity(num_envs) // num_envs, self.length(spec), self.steps)
 
     @property
     def sharding(self) -> Buffer:
@@ -207,71 +206,49 @@ class Replay:
 
     # Learning.
 
-    def learn(self, env: Env, agent: Any, states: Any, data: Buffer, tasks: Task, keys: Key) -> tuple[Any, Metrics]:
-        """Update the agents of all seeds, leaves (S, ...), once the first random steps are over.
+    @property
+    def updates(self) -> int:
+        """The number U of updates each time that the agent learns."""
+        return self.updates_per_step
 
-        Returns:
-            their new states, and the means of the updates' metrics, with ``learning`` (): 1 if there were updates.
-        """
-        learning, metrics = data.count > self.warmup_steps, {}
-        states = self._renew(env, agent, states, data, tasks, keys)
-        if self.updates_per_step:
-            learn = lambda states: _learn(env, agent, self, tasks, states, data, keys)
-            states, metrics = when(learning, learn, states)  # all seeds begin to learn at the same step
-        return states, metrics | {"learning": jnp.float32(learning)}
+    @property
+    def axes(self) -> Ring:
+        """Axes of what ``batches`` takes under a map over seeds."""
+        return Buffer(OVER_SEEDS, None, 0)  # type: ignore
 
-    def _renew(self, env: Env, agent: Any, states: Any, data: Buffer, tasks: Task, keys: Key) -> Any:
-        """Reset the networks if ``reset_every`` says so at this step."""
-        if not self.reset_every:
-            return states
-        before = data.count - 1
-        passed = before // self.reset_every > jnp.maximum(before - self.steps, 0) // self.reset_every
-        due = (before > self.warmup_steps) & passed
-        one = lambda state, key: agent.reset_networks(state, env.spec, tasks, jax.random.fold_in(key, 1))
-        return jax.lax.cond(due, lambda states: over_seeds(one, 0, 0)(states, keys), lambda states: states, states)
-
-    def turns(self, count: Array) -> tuple[Array, ...]:
-        """Return in which updates (U,) after ``count`` () steps the actor learns; () if it learns in all.
-
-        They are the same for all seeds, so that each stays a branch.
-        """
-        if self.policy_delay == 1:
-            return ()
-        before = count // self.steps - self.warmup_steps // self.steps - 1  # earlier times of updates
-        number = before * self.updates_per_step + jnp.arange(self.updates_per_step)
-        return ((number + 1) % self.policy_delay == 0,)
-
-    def draw(self, env: Env, agent: Any, tasks: Task, ring: Ring, key: Key, state: Any = None) -> Transition:
-        """Draw the batches (U, T, B, ...) of one step's updates for one agent, by one gather, which is fastest.
-
-        Args:
-            state: the agent's, for multi-step returns.
-        """
+    def batches(self, env: Env, agent: Any, tasks: Task, data: Buffer, key: Key) -> Transition:
+        """Draw windows (U, T, B, L, ...) for one seed's updates, by one gather, which is fastest."""
         shape = (len(tasks.id), self.updates_per_step, self.batch_size)
-        window = self.window(env.spec)
         if self.hindsight:
-            rows = hindsight.sample(env, agent, tasks, self.hindsight, ring, key, shape, window)
+            length = self.length(env.spec)
+            rows = hindsight.sample(env, agent, tasks, self.hindsight, data.ring, key, shape, length)
+            rows = rows if length else _single(rows, 3)
         else:
-            rows = rings.sample(ring, key, math.prod(shape[1:]), window)
+            rows = self.draw(env.spec, agent, data.ring, key, math.prod(shape[1:]))
             rows = jax.tree.map(lambda x: x.reshape(*shape, *x.shape[2:]), rows)
-        return jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), self.joined(env.spec, agent, state, rows, tasks))
+        return jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), rows)
 
-    def joined(self, spec: Spec, agent: Any, state: Any, rows: Transition, tasks: Task) -> Transition:
-        """Return transitions (T, ...) from drawn rows, which are windows (T, ..., W) if ``window`` says so."""
-        if not self.window(spec):
-            return rows
-        of_pictures = [partial(pictures.join, frames=spec.frames, n_step=self.n_step)] if shown(spec.obs) else []
-        return agent.join_steps(state, rows, tasks, *of_pictures)
+    def draw(self, spec: Spec, agent: Any, ring: Ring, key: Key, count: int) -> Transition:
+        """Draw ``count`` windows of every task (T, count, L, ...), as long as the agent needs them."""
+        length = max(self.length(spec), agent.unroll)
+        rows = rings.sample(ring, key, count, length)
+        return rows if length else _single(rows, 2)
+
+    def window(self, data: Buffer, batch: Transition) -> Transition:
+        """Return the windows (T, B, L, ...) of one update."""
+        return batch
+
+    def joined(self, window: Transition, gamma: Array) -> Transition:
+        """Join windows (T, B, L, ...) to transitions (T, B, ...), for discounts (T,) of the tasks."""
+        length = window.reward.shape[2]
+        if shown(window.obs):
+            join = partial(pictures.join, frames=pictures.frames(length, self.n_step), n_step=self.n_step)
+            return jax.vmap(join)(window, gamma)
+        if length == 1:
+            return jax.tree.map(lambda x: x[:, :, 0], window)
+        return jax.vmap(multistep.join)(window, gamma)
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))  # so that it is traced once, though ``learn`` needs its shapes too
-def _learn(env: Env, agent: Any, replay: Replay, tasks: Task, states: Any, data: Buffer, keys: Key):
-    def learn_one(state, ring: Ring, key: Key) -> tuple[Any, Metrics]:
-        batch_key, update_key = jax.random.split(key)
-        batches = replay.draw(env, agent, tasks, ring, batch_key, state)
-        keys = jax.random.split(update_key, replay.updates_per_step)
-        update = lambda state, x: agent.update(state, x[0], tasks, *x[1:])
-        state, metrics = jax.lax.scan(update, state, (batches, keys, *replay.turns(data.count)))
-        return state, jax.tree.map(lambda x: jnp.mean(x, axis=0), metrics)
-
-    return over_seeds(learn_one, 0, OVER_SEEDS, 0)(states, data.ring, keys)
+def _single(rows: Transition, axis: int) -> Transition:
+    """Return single steps as windows of one step, whose axis is ``axis``."""
+    return jax.tree.map(lambda x: jnp.expand_dims(x, axis), rows)

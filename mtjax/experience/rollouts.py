@@ -1,25 +1,33 @@
-"""Rollouts hold the latest steps, from which on-policy agents learn once."""
+"""Rollouts hold the latest steps, from which on-policy agents learn and then drop them."""
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 
 from mtjax import frames
-from mtjax.maps import over_seeds
-from mtjax.types import Array, Env, InputError, Key, Metrics, Spec, Task, Transition
+from mtjax.types import Array, Env, InputError, Key, Spec, Task, Transition
 
 _LONGEST = 100_000
 
 
 @dataclasses.dataclass(frozen=True)
 class Rollouts:
-    """Gives the agent the latest ``unroll`` steps of every environment, and then drops them."""
+    """Gives the agent the latest ``unroll`` steps of every environment in minibatches, and then drops them.
+
+    In each epoch the rollout's windows are shuffled and split into minibatches, with the same number of every task. A
+    window is a single step, or for agents with a memory that learns, all of an environment's steps.
+    """
 
     unroll: int = 32
-    """Steps of every environment between two updates."""
+    """Steps of every environment between two times of updates."""
+    epochs: int = 4
+    """Passes over the rollout."""
+    minibatches: int = 8
+    """Minibatches in each pass; steps that do not divide evenly are left out, other ones in each pass."""
 
     sharding: ClassVar[Any] = ()
     policy_delay: ClassVar[int] = 1  # the actor learns in every update
@@ -29,15 +37,23 @@ class Rollouts:
     def __post_init__(self):
         if not 1 <= self.unroll <= _LONGEST:
             raise InputError(f"unroll must be at least 1 and at most {_LONGEST}, not {self.unroll}")
+        for name in ("epochs", "minibatches"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name} must be at least 1, not {getattr(self, name)}")
 
     @property
     def steps(self) -> int:
-        """Steps of every environment between two calls of ``learn``."""
+        """Steps of every environment before the agent learns again."""
         return self.unroll
 
+    @property
+    def updates(self) -> int:
+        """The number U of updates each time that the agent learns."""
+        return self.epochs * self.minibatches
+
     def updates_in(self, steps: int) -> int:
-        """Count the calls of ``learn`` in a run of so many steps of every environment."""
-        return steps // self.unroll
+        """Count the updates in a run of so many steps of every environment."""
+        return steps // self.unroll * self.updates
 
     def check(self, env: Env, num_envs: int, chunk_steps: int = 0) -> None:
         """Accept every environment."""
@@ -75,12 +91,38 @@ class Rollouts:
 
     # Learning.
 
-    def learn(self, env: Env, agent: Any, states: Any, data: Transition, tasks: Task, keys: Key) -> tuple[Any, Metrics]:
-        """Update the agents of all seeds, leaves (S, ...), by their steps, leaves (S, T, H, E, ...).
+    axes: ClassVar[int] = 0  # of the data under a map over seeds
 
-        Returns:
-            their new states, and their metrics, with ``learning`` () = 1.
+    def batches(self, env: Env, agent: Any, tasks: Task, data: Transition, key: Key) -> Array:
+        """Split one seed's windows at random into the minibatches of all epochs: indices (U, B, L) of steps.
+
+        Raises:
+            InputError: there are fewer windows than minibatches.
         """
-        update = lambda state, steps, key: agent.update(state, steps, tasks, key)
-        states, metrics = over_seeds(update, 0, 0, 0)(states, data, keys)
-        return states, metrics | {"learning": jnp.float32(1)}
+        num_envs, length = data.reward.shape[2], agent.unroll or 1  # then the first steps are the first num_envs
+        first = self.shuffled(self.unroll // length * num_envs, key)
+        return first[..., None] + num_envs * jnp.arange(length)
+
+    def shuffled(self, count: int, key: Key) -> Array:
+        """Split ``count`` windows at random into minibatches: (U, B)."""
+        size = count // self.minibatches
+        if not size:
+            raise InputError(f"minibatches ({self.minibatches}) must not be more than a rollout's {count} a task")
+        order = jax.vmap(lambda key: jax.random.permutation(key, count))(jax.random.split(key, self.epochs))
+        return order[:, : size * self.minibatches].reshape(-1, size)
+
+    def windows(self, steps: Transition, length: int) -> Transition:
+        """Return a rollout (T, H, E, ...) as windows (T, N, L, ...): single steps, or for L = H all of a world's."""
+        if not length:
+            return jax.tree.map(lambda x: x.reshape(len(x), -1, 1, *x.shape[3:]), steps)
+        return jax.tree.map(lambda x: jnp.swapaxes(x, 1, 2), steps)
+
+    def played(self, x: Array, shape: Sequence[int], length: int) -> Array:
+        """Return numbers (T, N L) of all windows in the order (T, H, E) in which they were played."""
+        if not length:
+            return x.reshape(shape)
+        return jnp.swapaxes(x.reshape(shape[0], shape[2], shape[1]), 1, 2)
+
+    def window(self, data: Transition, batch: Array) -> Transition:
+        """Take the windows (T, B, L, ...) of one minibatch, by the indices (B, L) of their steps."""
+        return jax.tree.map(lambda x: x.reshape(len(x), -1, *x.shape[3:])[:, batch], data)

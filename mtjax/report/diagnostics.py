@@ -21,7 +21,6 @@ from mtjax.agents import SAC
 from mtjax.agents.fit import Problem
 from mtjax.agents.parts.gradients import surgery
 from mtjax.agents.state import Nets, axes_of
-from mtjax.experience import ring as rings
 from mtjax.experience.ring import Ring
 from mtjax.networks import Network, Params, ReLU
 from mtjax.report import figures
@@ -79,13 +78,15 @@ def diagnose(policy: Policy, replay: Ring, batch_size: int) -> Diagnostics:
     tasks, agent = policy.env.tasks("train"), policy.agent
     if not isinstance(agent, SAC):
         raise InputError(f"diagnostics are of SAC and agents made from it, not of {type(agent).__name__}")
+    if agent.unroll:
+        raise InputError("diagnostics look at single transitions, and conditioning=recurrent learns from windows")
     found = []
     for s in range(len(policy.seeds)):
         state, rows = jax.tree.map(lambda x, s=s: x[s], (policy.states, replay.rows))
         gradient_key, sample_key = jax.random.split(jax.random.key(0))
         of_seed = replay._replace(rows=rows)
         gradients = _average_gradients(policy.env, agent, state, of_seed, tasks, gradient_key, batch_size)
-        activity = _sample_activity(agent, state, of_seed, tasks, sample_key)
+        activity = _sample_activity(policy.env, agent, state, of_seed, tasks, sample_key)
         found.append(_summarise(agent, state, gradients, activity))
     critic, actor, td_error = jax.tree.map(lambda *x: np.mean(x, axis=0), *found)
     critic, actor = (x._replace(width=int(x.width)) for x in (critic, actor))
@@ -107,21 +108,20 @@ def _summarise(agent: SAC, state: Any, gradients: Mapping, activity: Mapping) ->
 def _average_gradients(env: Env, agent: SAC, state: Any, replay: Ring, tasks: Task, key: Key, batch_size: int) -> dict:
     def draw(key: Key) -> dict:
         batch_key, loss_key = jax.random.split(key)
-        rows = rings.sample(replay, batch_key, batch_size, agent.experience.window(env.spec))
-        batch = agent.experience.joined(env.spec, agent, state, rows, tasks)
-        return compare_gradients(agent, state, batch, tasks, loss_key)
+        window = agent.experience.draw(env.spec, agent, replay, batch_key, batch_size)
+        return compare_gradients(agent, state, window, tasks, loss_key)
 
     return jax.tree.map(lambda x: jnp.mean(x, axis=0), jax.lax.map(draw, jax.random.split(key, DRAWS)))
 
 
-def compare_gradients(agent: SAC, state: Any, batch: Transition, tasks: Task, key: Key) -> dict[str, Any]:
-    """Differentiate the agent's losses on a batch (T, B, ...) for each task alone.
+def compare_gradients(agent: SAC, state: Any, window: Transition, tasks: Task, key: Key) -> dict[str, Any]:
+    """Differentiate the agent's losses on windows (T, B, L, ...) for each task alone.
 
     Returns:
         "critic" and "actor": gram, cosine, conflict and gradient_norm, as in ``Findings``; "td_error" (T,).
     """
     target_key, actor_key = jax.random.split(key)
-    state, seen = agent.prepare(state, batch, tasks)
+    seen = agent.prepare(state, window, tasks)
     loss, data = agent.above_least(agent.critic_loss), agent.critic_data(state, seen, target_key)
     critic, aux = _compare(agent.fits["critic"].problem(loss, state.nets, data))
     data = (seen, jax.random.split(actor_key, state.num_tasks))
@@ -151,19 +151,19 @@ class Activity(NamedTuple):
     hidden: Any  # (..., width), the layer on which heads stand
 
 
-@partial(jax.jit, static_argnums=0)
-def _sample_activity(agent: SAC, state: Any, replay: Ring, tasks: Task, key: Key) -> dict[str, Activity]:
-    return activity(agent, state, rings.sample(replay, key, SAMPLE), tasks)
+@partial(jax.jit, static_argnums=(0, 1))
+def _sample_activity(env: Env, agent: SAC, state: Any, replay: Ring, tasks: Task, key: Key) -> dict[str, Activity]:
+    return activity(agent, state, agent.experience.draw(env.spec, agent, replay, key, SAMPLE), tasks)
 
 
-def activity(agent: SAC, state: Any, batch: Transition, tasks: Task) -> dict[str, Activity]:
-    """Return the activity of "critic" and "actor" on a batch (T, B, ...). A representation counts as the actor's.
+def activity(agent: SAC, state: Any, window: Transition, tasks: Task) -> dict[str, Activity]:
+    """Return the activity of "critic" and "actor" on windows (T, B, L, ...). A representation counts as the actor's.
 
     Returns:
         mean activity over the batch (T, N, units), and hidden layers (T, B, N, width); N is 1 for the actor.
     """
-    state, seen_batch = agent.prepare(state, batch, tasks)
-    given, shape = seen_batch.features, (*batch.reward.shape, seen_batch.features.shape[-1])
+    seen_batch = agent.prepare(state, window, tasks)
+    given, shape = seen_batch.features, (*seen_batch.reward.shape, seen_batch.features.shape[-1])
     features = jnp.broadcast_to(given if given.ndim == 3 else given[:, None], shape)
 
     def one(nets: Nets, features: Array, obs: Array, action: Array) -> dict[str, Activity]:

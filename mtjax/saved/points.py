@@ -16,7 +16,7 @@ from mtjax.agents import BaseAgent, parts
 from mtjax.agents.choices import kinds_of, settings
 from mtjax.checks import shown
 from mtjax.names import nearest_error
-from mtjax.types import Acted, Array, Env, Experience, InputError, Key, Metrics, Outcome, Spec, Task, Transition
+from mtjax.types import Acted, Array, Env, Experience, InputError, Key, Metrics, Spec, Task, Transition
 
 Point = Mapping[str, float]
 Sweep = Mapping[str, Sequence[float]] | Sequence[Point]
@@ -41,8 +41,8 @@ class SweptAgent:
     agent: BaseAgent
 
     @property
-    def watches(self) -> bool:
-        return self.agent.watches
+    def unroll(self) -> int:
+        return self.agent.unroll
 
     @property
     def experience(self) -> Experience:
@@ -66,18 +66,18 @@ class SweptAgent:
     def relabel(self, env: Env, task: Task, transition: Transition, key: Key) -> Transition:
         return self.agent.relabel(env, task, transition, key)
 
-    def join_steps(self, state: SweptState, steps: Transition, tasks: Task, *join: Any) -> Transition:
-        return with_values(self.agent, state.knobs).join_steps(state.learner, steps, tasks, *join)
+    def assess(self, state: SweptState, steps: Transition, tasks: Task) -> tuple[SweptState, Transition]:
+        learner, steps = with_values(self.agent, state.knobs).assess(state.learner, steps, tasks)
+        return state._replace(learner=learner), steps
 
-    def learn(self, env: Env, states: SweptState, data: Any, tasks: Task, keys: Key) -> tuple[SweptState, Metrics]:
-        return self.experience.learn(env, self, states, data, tasks, keys)  # type: ignore
-
-    def update(self, state: SweptState, batch: Any, tasks: Task, key: Key, *turn: Array) -> tuple[SweptState, Metrics]:
-        learner, metrics = with_values(self.agent, state.knobs).update(state.learner, batch, tasks, key, *turn)
+    def update(
+        self, state: SweptState, window: Transition, tasks: Task, key: Key, number: Array
+    ) -> tuple[SweptState, Metrics]:
+        learner, metrics = with_values(self.agent, state.knobs).update(state.learner, window, tasks, key, number)
         return state._replace(learner=learner), metrics
 
-    def observe(self, state: SweptState, outcome: Outcome) -> SweptState:
-        return state._replace(learner=with_values(self.agent, state.knobs).observe(state.learner, outcome))
+    def observe(self, state: SweptState, steps: Transition, tasks: Task) -> SweptState:
+        return state._replace(learner=with_values(self.agent, state.knobs).observe(state.learner, steps, tasks))
 
     def reset_networks(self, state: SweptState, spec: Spec, tasks: Task, key: Key) -> SweptState:
         return state._replace(

@@ -7,30 +7,36 @@ An agent has one part of each kind. A part's fields are flags of the agent on th
 import copy
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, ClassVar, Literal, TypeVar, get_args, get_origin
+from typing import Any, Literal, TypeVar, get_args, get_origin
 
 import jax
 import jax.numpy as jnp
 
 from mtjax.checks import checked, require_text, shown
 from mtjax.names import frozen, nearest_error
-from mtjax.types import InputError, Outcome
+from mtjax.types import Array, InputError, Transition
 
 P = TypeVar("P")
 
 
 @dataclasses.dataclass(frozen=True)
 class Watcher:
-    """A watcher is a part that may keep statistics of the outcomes of all steps."""
-
-    watches: ClassVar[bool] = False  # whether ``observe`` has to be called
+    """A watcher is a part that may keep statistics of all steps, and a memory of each episode."""
 
     def init(self, num_tasks: int) -> Any:
         """Return the memory before the first step; leaves are (T, ...)."""
         return None
 
-    def observe(self, memory: Any, outcome: Outcome) -> Any:
-        """Update the memory by the outcomes of one step of every environment, leaves (T, E)."""
+    def begin(self) -> Any:
+        """Return the memory with which an episode begins; None for none."""
+        return None
+
+    def remember(self, episode: Any, reward: Array, gamma: float | Array) -> Any:
+        """Return the memory of an episode after a step."""
+        return episode
+
+    def observe(self, memory: Any, steps: Transition) -> Any:
+        """Update the memory by collected steps (T, N, ...), which hold the memories of episodes after each step."""
         return memory
 
 

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents import parts
-from mtjax.types import Array, InputError, Outcome
+from mtjax.types import Array, InputError, Transition
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,6 +39,20 @@ class _Unequal(Uniform):
         return self.least_weight + (1 - self.least_weight) * len(shares) * shares
 
 
+@dataclasses.dataclass(frozen=True)
+class _ByReturns(_Unequal):
+    """Weighs tasks by the returns of their episodes, whose memory is the sum of rewards so far."""
+
+    def begin(self) -> Array:
+        return jnp.float32(0)
+
+    def remember(self, episode: Array, reward: Array, gamma: float | Array) -> Array:
+        return episode + reward
+
+    def init(self, num_tasks: int) -> "Returns":
+        return Returns(jnp.zeros(num_tasks, bool), jnp.zeros(num_tasks), jnp.zeros(num_tasks))
+
+
 class Returns(NamedTuple):
     """Holds moving means (T,) of episodes' returns; they are valid for tasks that have ended an episode."""
 
@@ -47,10 +61,10 @@ class Returns(NamedTuple):
     slow: Array
 
 
-def _follow(memory: Returns, outcome: Outcome, fast: float, slow: float) -> Returns:
+def _follow(memory: Returns, steps: Transition, fast: float, slow: float) -> Returns:
     """Move the means towards the returns of ended episodes, at rates per episode; a task's first ones set them."""
-    count = jnp.sum(outcome.ended, axis=1)
-    mean = jnp.sum(jnp.where(outcome.ended, outcome.total, 0.0), axis=1) / jnp.maximum(count, 1)
+    count = jnp.sum(steps.ended, axis=1)
+    mean = jnp.sum(jnp.where(steps.ended, steps.memory, 0.0), axis=1) / jnp.maximum(count, 1)
 
     def moved(old: Array, rate: float) -> Array:
         return jnp.where(memory.known, old + (1 - (1 - rate) ** count) * (mean - old), mean)
@@ -59,7 +73,7 @@ def _follow(memory: Returns, outcome: Outcome, fast: float, slow: float) -> Retu
 
 
 @dataclasses.dataclass(frozen=True)
-class Progress(_Unequal):
+class Progress(_ByReturns):
     """Gives more weight to tasks whose return changes, up or down (learning progress; Matiisen et al. 2017).
 
     Progress is |fast - slow| / max(|fast|, |slow|), for two moving means of the task's returns at different rates, and
@@ -69,7 +83,6 @@ class Progress(_Unequal):
     does the opposite: its scheduler favours tasks that progress slowly.)
     """
 
-    watches = True
     progress_fast: float = 0.1
     """Weight of a new episode in the fast mean of returns."""
     progress_slow: float = 0.01
@@ -83,11 +96,8 @@ class Progress(_Unequal):
                 f"not {self.progress_slow} and {self.progress_fast}"
             )
 
-    def init(self, num_tasks: int) -> Returns:
-        return Returns(jnp.zeros(num_tasks, bool), jnp.zeros(num_tasks), jnp.zeros(num_tasks))
-
-    def observe(self, memory: Returns, outcome: Outcome) -> Returns:
-        return _follow(memory, outcome, self.progress_fast, self.progress_slow)
+    def observe(self, memory: Returns, steps: Transition) -> Returns:
+        return _follow(memory, steps, self.progress_fast, self.progress_slow)
 
     def weights(self, memory: Returns, temperature: Array) -> Array:
         size = jnp.maximum(jnp.abs(memory.fast), jnp.abs(memory.slow))
@@ -99,14 +109,13 @@ class Progress(_Unequal):
 
 
 @dataclasses.dataclass(frozen=True)
-class Hardest(_Unequal):
+class Hardest(_ByReturns):
     """Gives more weight to tasks of low return: shares are softmax(-hardness z), z the standardised returns.
 
     z is a moving mean of each task's returns minus the tasks' mean, over their standard deviation; 0 for a task that
     has ended no episode. It compares returns between tasks, so rewards of all tasks should have one scale.
     """
 
-    watches = True
     hardness: float = 1.0
     """How strongly low returns raise a task's weight; 0 weighs all tasks equally."""
     return_rate: float = 0.1
@@ -119,11 +128,8 @@ class Hardest(_Unequal):
                 f"hardness must be at least 0 and return-rate in (0, 1], not {self.hardness} and {self.return_rate}"
             )
 
-    def init(self, num_tasks: int) -> Returns:
-        return Returns(jnp.zeros(num_tasks, bool), jnp.zeros(num_tasks), jnp.zeros(num_tasks))
-
-    def observe(self, memory: Returns, outcome: Outcome) -> Returns:
-        return _follow(memory, outcome, self.return_rate, self.return_rate)
+    def observe(self, memory: Returns, steps: Transition) -> Returns:
+        return _follow(memory, steps, self.return_rate, self.return_rate)
 
     def weights(self, memory: Returns, temperature: Array) -> Array:
         count = jnp.maximum(jnp.sum(memory.known), 1)

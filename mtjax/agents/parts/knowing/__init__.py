@@ -5,6 +5,7 @@ from mtjax.agents.parts.knowing.embedding import Embedding
 from mtjax.agents.parts.knowing.last_steps import LastSteps
 from mtjax.agents.parts.knowing.one_hot import OneHot
 from mtjax.agents.parts.knowing.parameters import Parameters
+from mtjax.agents.parts.knowing.recurrent import Recurrent
 from mtjax.agents.parts.knowing.text import Text
 from mtjax.agents.parts.knowing.vectors import Vectors
 
@@ -18,6 +19,7 @@ CONDITIONINGS: dict[str, type[Knowing]] = {
     "vectors": Vectors,
     "text": Text,
     "inferred": LastSteps,
+    "recurrent": Recurrent,
 }
 
 __all__ = [
@@ -28,6 +30,7 @@ __all__ = [
     "Nothing",
     "OneHot",
     "Parameters",
+    "Recurrent",
     "Text",
     "Vectors",
 ]

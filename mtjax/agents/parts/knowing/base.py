@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 
 from mtjax.networks import Params
-from mtjax.types import Array, Key, Spec, Task
+from mtjax.types import Array, Key, Spec, Task, Transition
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,6 +22,7 @@ class Nothing:
     by_number: ClassVar[bool] = False  # whether these are the number of a training task, one-hot
     by_parameters: ClassVar[bool] = False  # whether these are the task's parameters
     embeds: ClassVar[bool] = False  # whether every training task has a learned vector, called embedding
+    recurs: ClassVar[bool] = False  # whether features are a memory that learns, through the steps of a window
 
     @property
     def history(self) -> int:
@@ -40,14 +41,27 @@ class Nothing:
         """
         return None
 
-    def init(self, num_tasks: int, seen: Any, own: bool, key: Key) -> Params:
+    def init(self, num_tasks: int, seen: Any, action: Array, own: bool, key: Key) -> Params:
         """Initialise what is learned.
 
         Args:
             seen: an observation (O,), with the last steps if there is a ``history``.
+            action: (A,).
             own: whether every task has networks of its own.
         """
         return Params({}, {})
+
+    def begin(self) -> Any:
+        """Return the memory with which an episode begins; None for none."""
+        return None
+
+    def remember(self, params: dict[str, Any], hidden: Any, step: Transition) -> Any:
+        """Return the memory after a step, whose observation is as networks take it.
+
+        Args:
+            params: the named parts of ``knowing``, of this task.
+        """
+        return hidden
 
     def given(self, number: Array, task: Task, num_tasks: int, table: Array | None) -> Array:
         """Return those features (Z,) of a task that need no learned parameters.

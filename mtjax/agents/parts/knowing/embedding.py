@@ -31,7 +31,7 @@ class Embedding(Nothing):
     def __post_init__(self):
         parts.require_counts(self, "embedding_size")
 
-    def init(self, num_tasks: int, seen: Any, own: bool, key: Key) -> Params:
+    def init(self, num_tasks: int, seen: Any, action: Array, own: bool, key: Key) -> Params:
         return Params({}, {"embedding": jax.random.normal(key, (num_tasks, self.embedding_size))})
 
     def features(self, params: dict[str, Any], given: Array, seen: Any) -> Array:

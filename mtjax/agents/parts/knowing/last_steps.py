@@ -48,18 +48,18 @@ def append(past: Past, obs: Array, action: Array, reward: Array) -> Past:
 
 def relabel(one: Callable[[Transition], Transition], transition: Transition) -> Transition:
     """Relabel a transition and its past as another task's by ``one``, which relabels single steps."""
-    past: Past = transition.extras
+    past: Past = transition.memory.past
     following = jnp.concatenate([past.obs[1:], transition.obs[None]])
 
     def step(obs: Array, action: Array, reward: Array, next_obs: Array) -> Transition:
-        return one(transition._replace(obs=obs, action=action, reward=reward, next_obs=next_obs, extras=None))
+        return one(transition._replace(obs=obs, action=action, reward=reward, next_obs=next_obs, memory=None))
 
     then = jax.vmap(step)(past.obs, past.action, past.reward, following)
     known = past.known > 0
     past = past._replace(
         obs=jnp.where(known[:, None], then.obs, past.obs), reward=jnp.where(known, then.reward, past.reward)
     )
-    return one(transition)._replace(extras=past)
+    return one(transition)._replace(memory=transition.memory._replace(past=past))
 
 
 def without_past(seen: Any) -> Any:
@@ -118,7 +118,7 @@ class LastSteps(Nothing):
     def encoder(self) -> TrajectoryEncoder:
         return TrajectoryEncoder(self.embedding_size)
 
-    def init(self, num_tasks: int, seen: Any, own: bool, key: Key) -> Params:
+    def init(self, num_tasks: int, seen: Any, action: Array, own: bool, key: Key) -> Params:
         if own:
             return Params({}, {"trajectory": Network.for_each_task(self.encoder.init, key, num_tasks, seen)})
         return Params({"trajectory": self.encoder.init(key, seen)}, {})

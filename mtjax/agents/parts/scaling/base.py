@@ -33,14 +33,6 @@ class NoScaling(parts.Watcher):
         gamma = gamma[:, None] if jnp.ndim(gamma) else gamma  # type: ignore
         return factor * (batch.reward - (1 - gamma * batch.discount) * offset)
 
-    def begin(self) -> Any:
-        """Return the memory with which an episode begins; None for none."""
-        return None
-
-    def remember(self, memory: Any, reward: Array, gamma: float | Array) -> Any:
-        """Return the memory of an episode after a step."""
-        return memory
-
     def renew(self, memory: Any, target: Array, critics: tuple[Params, ...]) -> tuple[Any, tuple[Params, ...]]:
         """Update the memory by the targets (T, B) of an update, and rescale the critics to the new units."""
         return memory, critics

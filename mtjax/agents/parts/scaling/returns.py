@@ -1,21 +1,20 @@
 """Scalings by discounted returns."""
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
 from mtjax import normalize
 from mtjax.agents import parts
 from mtjax.agents.parts.scaling.base import NoScaling
-from mtjax.types import Array, Outcome
+from mtjax.types import Array, Transition
 
 
 @dataclasses.dataclass(frozen=True)
 class _OfReturns(NoScaling):
     """Remembers the discounted sum of an episode's rewards, backwards: G_t = r_t + gamma G_(t-1)."""
 
-    watches = True
     return_range: float = 10.0
     """Largest |discounted sum of rewards so far| after scaling; with value=c51 or hl-gauss, the range of their bins."""
 
@@ -26,8 +25,16 @@ class _OfReturns(NoScaling):
         """Return 0, the sum before the first reward."""
         return jnp.float32(0)
 
-    def remember(self, memory: Array, reward: Array, gamma: float | Array) -> Array:
-        return gamma * memory + reward
+    def remember(self, episode: Any, reward: Array, gamma: float | Array) -> Any:
+        return gamma * episode + reward
+
+
+class Sums(NamedTuple):
+    """Holds the sums of an episode's rewards so far."""
+
+    discounted: Array  # backwards
+    total: Array
+    count: Array  # of rewards
 
 
 class LargestReturns(NamedTuple):
@@ -55,11 +62,18 @@ class ReturnScaling(_OfReturns):
     def init(self, num_tasks: int) -> LargestReturns:
         return LargestReturns(jnp.zeros(num_tasks), jnp.zeros(num_tasks))
 
-    def observe(self, memory: LargestReturns, outcome: Outcome) -> LargestReturns:
-        cut = outcome.ended & ~outcome.terminated
-        mean = jnp.where(cut, outcome.total / outcome.age, 0.0)
+    def begin(self) -> Sums:
+        return Sums(super().begin(), jnp.float32(0), jnp.float32(0))
+
+    def remember(self, episode: Sums, reward: Array, gamma: float | Array) -> Sums:
+        return Sums(super().remember(episode.discounted, reward, gamma), episode.total + reward, episode.count + 1)
+
+    def observe(self, memory: LargestReturns, steps: Transition) -> LargestReturns:
+        sums: Sums = steps.memory
+        cut = steps.ended & (steps.discount > 0)
+        mean = jnp.where(cut, sums.total / sums.count, 0.0)
         largest = lambda old, new: jnp.maximum(old, jnp.max(jnp.abs(new), axis=1))
-        return LargestReturns(largest(memory.discounted, outcome.memory.scaling), largest(memory.reward, mean))
+        return LargestReturns(largest(memory.discounted, sums.discounted), largest(memory.reward, mean))
 
     def units(self, memory: LargestReturns, gamma: float | Array, bonus: Array) -> tuple[Array, Array]:
         horizon = 1 / (1 - gamma)
@@ -97,8 +111,8 @@ class ReturnNormalization(_OfReturns):
         zeros = jnp.zeros(num_tasks)
         return SpreadOfReturns(normalize.Moments(zeros, zeros, zeros), zeros)
 
-    def observe(self, memory: SpreadOfReturns, outcome: Outcome) -> SpreadOfReturns:
-        returns = outcome.memory.scaling  # (T, E)
+    def observe(self, memory: SpreadOfReturns, steps: Transition) -> SpreadOfReturns:
+        returns = steps.memory  # (T, N)
         largest = jnp.maximum(memory.largest, jnp.max(jnp.abs(returns), axis=1))
         return SpreadOfReturns(normalize.update(memory.moments, returns.T), largest)
 

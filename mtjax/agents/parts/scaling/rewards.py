@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from mtjax.agents import parts
 from mtjax.agents.parts.scaling.base import Moments, NoScaling
 from mtjax.networks import Params
-from mtjax.types import Array, Outcome
+from mtjax.types import Array, Transition
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,7 +22,6 @@ class RewardScaling(NoScaling):
     the estimate of the time.
     """
 
-    watches = True
     variance_rate: float = 1e-3
     """Weight of a new reward in the moving estimate of the rewards' variance."""
 
@@ -32,10 +31,10 @@ class RewardScaling(NoScaling):
     def init(self, num_tasks: int) -> Moments:
         return Moments.begin(num_tasks)
 
-    def observe(self, memory: Moments, outcome: Outcome) -> Moments:
-        rate = 1 - (1 - self.variance_rate) ** outcome.reward.shape[1]
-        mean = memory.mean + rate * (jnp.mean(outcome.reward, axis=1) - memory.mean)
-        variance_now = jnp.mean(jnp.square(outcome.reward - mean[:, None]), axis=1)
+    def observe(self, memory: Moments, steps: Transition) -> Moments:
+        rate = 1 - (1 - self.variance_rate) ** steps.reward.shape[1]
+        mean = memory.mean + rate * (jnp.mean(steps.reward, axis=1) - memory.mean)
+        variance_now = jnp.mean(jnp.square(steps.reward - mean[:, None]), axis=1)
         return Moments(mean, memory.variance + rate * (variance_now - memory.variance))
 
     def units(self, memory: Moments, gamma: float | Array, bonus: Array) -> tuple[Array, Array]:
@@ -62,7 +61,6 @@ class AdaptiveScaling(NoScaling):
     updates follow a reset (there, 1000); where no task has a mean reward of 0.01, factors are 1.
     """
 
-    watches = True
     follows_resets = True
     least_mean_reward: float = 0.01
     """Lower bound of mean rewards, which limits how much a task's rewards are scaled up."""
@@ -73,10 +71,10 @@ class AdaptiveScaling(NoScaling):
     def init(self, num_tasks: int) -> MeanRewards:
         return MeanRewards(jnp.zeros(num_tasks), jnp.zeros(num_tasks), jnp.zeros(num_tasks))
 
-    def observe(self, memory: MeanRewards, outcome: Outcome) -> MeanRewards:
-        added = outcome.reward.shape[1]
+    def observe(self, memory: MeanRewards, steps: Transition) -> MeanRewards:
+        added = steps.reward.shape[1]
         count = memory.count + added
-        drift = jnp.mean(outcome.reward, axis=1) - memory.mean
+        drift = jnp.mean(steps.reward, axis=1) - memory.mean
         return memory._replace(count=count, mean=memory.mean + drift * added / count)
 
     def factors(self, memory: MeanRewards) -> Array:
