@@ -12,6 +12,7 @@ from mtjax.agents import parts
 from mtjax.agents.base import BaseAgent, Memory
 from mtjax.agents.choices import FLAT
 from mtjax.agents.fit import Fit
+from mtjax.agents.parts import targets
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.scaling.base import Moments
@@ -343,8 +344,8 @@ class PPO(BaseAgent):
         state = self.unless_far(moved, state, actor.aux.kl)
         if self.representation.learns:
             both, models_key = (state.nets["representation"], state.slow["representation"]), jax.random.fold_in(key, 3)
-            targets, _ = self.representation.targets(*both, batch.next_obs, models_key)
-            batch = batch._replace(model_targets=targets)
+            found, _ = self.representation.targets(*both, batch.next_obs, models_key)
+            batch = batch._replace(model_targets=found)
         loss = self.above_least(self.critic_loss)
         state, critic = self.descend(state, "critic", loss, (batch,), critic_order, importance)
         told = self.explained(state, window.extras)
@@ -391,8 +392,7 @@ class PPO(BaseAgent):
     def advantages(self, steps: Transition, tasks: Task, value: Array, next_value: Array) -> Array:
         """Compute the advantages (T, H, E) of a rollout."""
         gamma = jnp.broadcast_to(self.discounts(tasks), len(tasks.id))
-        played = steps.reward, steps.discount, steps.ended, value, next_value
-        return jax.vmap(partial(advantages, lambda_=self.gae_lambda))(*played, gamma=gamma)
+        return jax.vmap(partial(targets.gae, lambda_=self.gae_lambda))(steps, value, next_value, gamma)
 
     def values(self, state: AgentState, features: Array, obs: Any) -> Array:
         """Return the critic's values (T, B) of observations (T, B, ...), in units of reward."""
@@ -434,21 +434,6 @@ class PPO(BaseAgent):
         return jnp.where(known, old.std / new.std, 1.0), jnp.where(
             known, (old.moments.mean - new.moments.mean) / new.std, 0.0
         )
-
-
-def advantages(
-    reward: Array, discount: Array, ended: Array, value: Array, next_value: Array, gamma: Array, lambda_: float | Array
-) -> Array:
-    """Compute generalised advantages (H, E) of one task's steps (H, E) (Schulman et al. 2016)."""
-    delta = reward + gamma * discount * next_value - value
-    decay = gamma * lambda_ * ~ended
-
-    def back(later: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
-        delta, decay = step
-        advantage = delta + decay * later
-        return advantage, advantage
-
-    return jax.lax.scan(back, jnp.zeros_like(delta[0]), (delta, decay), reverse=True)[1]
 
 
 def within(near: bool | Array) -> Params:
