@@ -73,6 +73,14 @@ AGENTS: dict[str, Preset] = {
     "ppo": Preset(
         "Proximal policy optimisation (Schulman et al. 2017), sees its task", _PARAMS, "mtjax.agents.ppo:PPO"
     ),
+    "impala": Preset(
+        "Actor-critic corrected by V-trace, with PopArt (Espeholt et al. 2018)", _PARAMS, "mtjax.agents.impala:IMPALA"
+    ),
+    "rl2": Preset(
+        "PPO with a recurrent memory of its trial (Duan et al. 2016)",
+        {"conditioning": "recurrent"},
+        "mtjax.agents.ppo:PPO",
+    ),
     "pcgrad": Preset("Conflicting gradients projected (Yu et al. 2020)", {"gradients": "pcgrad", **_PARAMS}),
     "cagrad": Preset("Conflict-averse gradients (Liu et al. 2021)", {"gradients": "cagrad", **_PARAMS}),
     "gradnorm": Preset("Weights that even out learning rates (Chen et al. 2018)", {"gradients": "gradnorm", **_PARAMS}),

@@ -1,0 +1,303 @@
+"""``OnPolicy`` holds what agents share that learn from rollouts: a policy, a critic of states, and its units."""
+
+import abc
+import dataclasses
+from functools import partial
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from mtjax import frames
+from mtjax.agents import parts
+from mtjax.agents.base import BaseAgent, Memory
+from mtjax.agents.choices import FLAT
+from mtjax.agents.fit import Fit
+from mtjax.agents.parts.samplers import SAMPLERS
+from mtjax.agents.parts.scaling import SCALINGS
+from mtjax.agents.parts.scaling.popart import rescale_heads
+from mtjax.agents.state import AgentState, Nets, axes_of
+from mtjax.agents.units import MIN_STD, Units
+from mtjax.experience import Rollouts
+from mtjax.maps import in_parts
+from mtjax.networks import STD_RANGE, Network, Params, log_density, outputs_for, sample_raw, tanh_normal
+from mtjax.parallel.collectives import mean_and_variance
+from mtjax.types import Acted, Array, InputError, Key, Metrics, Task, Transition
+
+LOG_RATIO_LIMIT = 20.0
+"""Bound of |log ratio| of two policies, so that its exponential stays finite."""
+HEAD_SCALE = 0.01
+"""Factor of the output layers' initial weights: all policies begin nearly equal, and values near zero."""
+
+
+class Taken(NamedTuple):
+    """Holds what is stored with an action when it is taken."""
+
+    raw: Array  # (A,) the action before the tanh
+    log_prob: Array  # () its log-probability under the policy that took it
+
+
+class ActorAux(NamedTuple):
+    """Holds what the actor loss finds beside the loss."""
+
+    metrics: Metrics
+    kl: Array  # () an estimate of KL(pi_old | pi)
+
+
+class Batch(NamedTuple):
+    """Holds the data for the losses of one task; for all tasks, leaves are (T, ...)."""
+
+    obs: Any  # (B, O) as the networks take them
+    raw: Array  # (B, A) actions before the tanh
+    log_prob: Array  # (B,) their log-probabilities under the policy that took them
+    advantage: Array  # (B,)
+    value: Array  # (B,) before the update, in units of reward
+    target: Array  # (B,) what the critic's outputs should be
+    features: Array  # (Z,) or (B, Z) features of the task that need no learned parameters
+    mask: Array | None  # (A,) 1 for actions that the task has, else 0; None: it has all
+    output: Array | None = None  # (B,) the critic's outputs before the update, if it stays near these
+    # For a representation that learns.
+    action: Array | None = None  # (B, A)
+    reward: Array | None = None  # (B,) in the task's units
+    next_obs: Any = None  # (B, O)
+    model_targets: Any = None  # targets of its models
+    followed: None = None  # as a rollout keeps what followed every step
+
+
+@dataclasses.dataclass(frozen=True)
+class OnPolicy(BaseAgent):
+    """Provides the settings and methods of agents that learn from rollouts; a subclass adds advantages and losses."""
+
+    adjustable: ClassVar[tuple[str, ...]] = (
+        *BaseAgent.adjustable,
+        *("gae_lambda", "epochs", "minibatches", "entropy_cost", "value_rate"),
+    )
+    common_presets: ClassVar[bool] = False
+    devices_differ: ClassVar[bool] = True
+    actor_lr: float = 3e-4
+    """Adam's learning rate for the actor."""
+    critic_lr: float = 1e-3
+    """Adam's learning rate for the critic."""
+    normalize_observations: bool = True
+    """Scale observations to mean 0 and variance 1, by moments of training data alone, and clip them to +-10."""
+    max_gradient_norm: float = 1.0
+    """Clip the global norms of actor and critic gradients to this; 0 does not clip."""
+    critic_layer_norm: bool = False
+    """Use layer normalisation in the critic."""
+    gae_lambda: float = 0.95
+    """Lambda of advantages: 0 relies on the critic alone, 1 on the rewards of the rollout."""
+    entropy_cost: float = 1e-2
+    """Weight of the entropy in the actor loss (c), in standard deviations of the advantage."""
+    initial_std: float = 0.7
+    """Standard deviation of the initial policy's actions, before the tanh."""
+    reward_scale: float = 1.0
+    """Multiply all rewards by this."""
+    value_normalization: Literal["none", "running", "popart"] = "running"
+    """Units of the critic: none, or standard deviations of each task's targets from their mean (running). With popart
+    it also has a head for every task, which is rescaled when these estimates move."""
+    value_rate: float = 0.1
+    """Weight of a new rollout in the moving estimates of targets' mean and variance."""
+    experience: Annotated[Rollouts, FLAT] = dataclasses.field(default_factory=Rollouts)
+
+    @abc.abstractmethod
+    def prepare(self, state: AgentState, window: Transition, tasks: Task) -> tuple[AgentState, Batch]:
+        """Return the batch (T, ...) for the losses, of windows (T, B, L, ...), and the state with its units."""
+
+    @abc.abstractmethod
+    def gain(self, log_ratio: Array, batch: Batch) -> tuple[Array, Metrics]:
+        """Return the gain of each step (B,) that the actor maximises beside the entropy.
+
+        Args:
+            log_ratio: (B,) of the action's probability under the present policy to that under the one that took it.
+        """
+
+    def _check_numbers(self) -> None:
+        super()._check_numbers()
+        parts.require_shares(self, "gae_lambda")
+        parts.require_positive(self, "reward_scale")
+        parts.require_not_negative(self, "entropy_cost")
+        parts.require_rates(self, "value_rate")
+        low, high = STD_RANGE
+        if not low < self.initial_std < high:
+            raise InputError(f"initial-std must be between {low:.2g} and {high:.2g}, not {self.initial_std}")
+
+    def _check_combination(self) -> None:
+        super()._check_combination()
+        if parts.name_of(SCALINGS, self.scaling) == "popart":
+            raise InputError("scaling=popart is for critics of actions; use value-normalization=popart")
+        if parts.name_of(SAMPLERS, self.sampler) == "temperature":
+            raise InputError("sampler=temperature needs an agent with temperatures; use another sampler")
+        given, usual = (parts.settings(x) for x in (self.representation, type(self.representation)()))
+        for name in ("encoder_tau", "shift"):
+            if given.get(name) != usual.get(name):
+                flag, agent = name.replace("_", "-"), type(self).__name__.lower()
+                raise InputError(
+                    f"{flag}={given[name]} is of updates from a replay, and {agent} has none; leave it out"
+                )
+
+    # Networks.
+
+    @property
+    def unroll(self) -> int:
+        return self.experience.unroll if self.conditioning.recurs else 0
+
+    @property
+    def critic(self) -> Network:
+        network = super().critic
+        if self.value_normalization != "popart" or "head" in network.own:
+            return network
+        return dataclasses.replace(network, own=(*network.own, "head"))
+
+    def init_networks(self, num_tasks: int, actor_inputs: tuple, critic_inputs: tuple, action: Array, key: Key) -> Nets:
+        actor_key, critic_key = jax.random.split(key)
+        first = jnp.repeat(jnp.array([0.0, outputs_for(self.initial_std)]), len(action))
+        return {
+            "actor": scale_head(self.actor.init(actor_key, num_tasks, 2 * len(action), *actor_inputs), first),
+            "critic": scale_head(self.critic.init(critic_key, num_tasks, 1, *critic_inputs), jnp.zeros(1)),
+            "units": Units.begin(num_tasks).params(),
+        }
+
+    def init_slow(self, nets: Nets) -> Nets:
+        return {"representation": jax.tree.map(jnp.copy, nets["representation"])} if self.representation.learns else {}
+
+    @property
+    def fits(self) -> dict[str, Fit]:
+        found = super().fits
+        return found | {"actor": dataclasses.replace(found["actor"], names=("actor", "knowing"))}
+
+    # Acting.
+
+    def act(self, state: AgentState, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
+        """Choose an action (A,) for one observation (O,) of one task; without a key, the mean action."""
+        outputs = self.policy(*self.acting_inputs(state, memory, obs, task))
+        if key is None:
+            return Acted(tanh_normal(outputs, None, task.action_mask)[0])
+        raw, log_prob = sample_raw(outputs, key, task.action_mask)
+        action = jnp.tanh(raw)
+        action = action if task.action_mask is None else action * task.action_mask
+        return Acted(action, Taken(raw, log_prob))
+
+    # Losses of one task.
+
+    def policy(self, nets: Nets, features: Array, obs: Any) -> Array:
+        """Return the policy's outputs (..., 2A)."""
+        return self.actor.apply(nets["actor"], *self.actor_inputs(nets, features, obs))
+
+    def log_ratio(self, nets: Nets, features: Array, obs: Any, taken: Any, mask: Array | None) -> Array:
+        """Return how much likelier (B,) the actions that were ``taken`` are now, in logarithms."""
+        log_prob = log_density(self.policy(nets, features, obs), taken.raw, mask)
+        return jnp.clip(log_prob - taken.log_prob, -LOG_RATIO_LIMIT, LOG_RATIO_LIMIT)
+
+    def actor_loss(self, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:
+        outputs = self.policy(nets, batch.features, batch.obs)
+        log_ratio = log_density(outputs, batch.raw, batch.mask) - batch.log_prob
+        log_ratio = jnp.clip(log_ratio, -LOG_RATIO_LIMIT, LOG_RATIO_LIMIT)
+        gain, metrics = self.gain(log_ratio, batch)
+        entropy = -jnp.mean(sample_raw(outputs, key, batch.mask)[1])
+        loss = -jnp.mean(gain) - self.entropy_cost * entropy
+        kl = jnp.mean(jnp.exp(log_ratio) - 1 - log_ratio)
+        return loss, ActorAux({"actor_loss": loss, "entropy": entropy, "kl": kl, **metrics}, kl)
+
+    def critic_loss(self, nets: Nets, batch: Batch) -> tuple[Array, Metrics]:
+        loss = self.fitting_loss(self.output(nets, batch.features, batch.obs), batch)
+        known = batch._replace(features=self.know(nets, batch.features, batch.obs)[0])
+        return self.representation.join(loss, {"critic_loss": loss}, nets["representation"], known)
+
+    def fitting_loss(self, output: Array, batch: Batch) -> Array:
+        """Return the loss () of the critic's outputs (B,)."""
+        return jnp.mean(jnp.square(output - batch.target)) / 2
+
+    def output(self, nets: Nets, features: Array, obs: Any) -> Array:
+        """Return the critic's outputs (B,) for observations (B, ...)."""
+        features, inputs = self.critic_inputs(nets, features, obs)
+        return self.critic.apply(nets["critic"], features, inputs)[..., 0]
+
+    # Update of all tasks.
+
+    def update(
+        self, state: AgentState, window: Transition, tasks: Task, key: Key, number: Array
+    ) -> tuple[AgentState, Metrics]:
+        """Take a gradient step of actor and critic on windows (T, B, L, ...) of a rollout; metrics are (T,)."""
+        sample_key, actor_order, critic_order = jax.random.split(key, 3)
+        state, batch = self.prepare(state, window, tasks)
+        importance = self.sampler.weights(state.nets["sampler"].own, jnp.ones(state.num_tasks))
+        # The actor is first, as pi_old was on what the critic's step moves too: the representation, and what is known.
+        data = (batch, jax.random.split(sample_key, state.num_tasks))
+        moved, actor = self.descend(state, "actor", self.actor_loss, data, actor_order, importance)
+        state = self.accept(moved, state, actor.aux.kl)
+        if self.representation.learns:
+            both, models_key = (state.nets["representation"], state.slow["representation"]), jax.random.fold_in(key, 3)
+            batch = batch._replace(model_targets=self.representation.targets(*both, batch.next_obs, models_key)[0])
+        loss = self.above_least(self.critic_loss)
+        state, critic = self.descend(state, "critic", loss, (batch,), critic_order, importance)
+        told = self.explained(state, batch)
+        return state, critic.aux | critic.metrics | actor.aux.metrics | actor.metrics | told
+
+    def assess(self, state: AgentState, steps: Transition, tasks: Task) -> tuple[AgentState, Transition]:
+        """Keep the representation from before the updates, as a target of its models."""
+        if self.representation.learns:
+            state = state._replace(slow=state.slow | {"representation": state.nets["representation"]})
+        return state, steps
+
+    def accept(self, moved: AgentState, state: AgentState, kl: Array) -> AgentState:
+        """Return the state after an actor's step, which moved it, given KL(pi_old | pi) (T,) before the step."""
+        return moved
+
+    def inputs(self, state: AgentState, window: Transition, tasks: Task) -> tuple[Transition, Array, Any, Any]:
+        """Return the steps (T, B L, ...) of windows (T, B, L, ...), with features, observations and next ones."""
+        flat = jax.tree.map(lambda x: x.reshape(len(x), -1, *x.shape[3:]), window)
+        see, (past, next_past) = partial(self.see_batch, state.nets["inputs"]), self.around(window, flat, flat)
+        return flat, self.features_of_batch(state, flat, tasks), see(flat.obs, past), see(flat.next_obs, next_past)
+
+    def models(self, state: AgentState, flat: Transition, tasks: Task, next_obs: Any) -> dict[str, Any]:
+        """Return what a batch holds for a representation that learns."""
+        if not self.representation.learns:
+            return {}
+        return {"action": flat.action, "reward": self.rewards(state, flat, tasks), "next_obs": next_obs}
+
+    def rewards(self, state: AgentState, flat: Transition, tasks: Task) -> Array:
+        """Return the rewards (T, N) of steps in the task's units."""
+        gamma = jnp.broadcast_to(self.discounts(tasks), len(tasks.id))
+        return self.reward_scale * self.scaling.rewards(state.nets["scaling"].own, flat, gamma, jnp.zeros(len(gamma)))
+
+    def values(self, state: AgentState, features: Array, obs: Any) -> Array:
+        """Return the critic's values (T, B) of observations (T, B, ...), in units of reward."""
+        return Units.of(state.nets["units"]).rewards(self.outputs(state, features, obs))
+
+    def outputs(self, state: AgentState, features: Array, obs: Any) -> Array:
+        """Return the critic's outputs (T, B) for observations (T, B, ...)."""
+        of_tasks = partial(jax.vmap(self.output, (axes_of(state.nets), 0, 0)), state.nets)
+        if frames.shown(obs):  # all at once they would fill the memory
+            return in_parts(of_tasks, features, obs, self.experience.minibatches)
+        return of_tasks(features, obs)
+
+    def renew(self, state: AgentState, target: Array) -> AgentState:
+        """Move the critic's units by targets (T, N), and with PopArt rescale its heads to them."""
+        scaling, _ = self.scaling.renew(state.nets["scaling"].own, target, ())
+        nets = state.nets | {"scaling": Params({}, scaling)}
+        if self.value_normalization != "none":
+            old = Units.of(nets["units"])
+            new = old.moved(target, self.value_rate)
+            nets |= {"units": new.params()}
+            if self.value_normalization == "popart":
+                nets |= {"critic": rescale_heads(nets["critic"], *old.change(new))}
+        return state._replace(nets=nets)
+
+    def explained(self, state: AgentState, batch: Batch) -> Metrics:
+        """Return the mean value (T,) of steps, and which share of the variance of targets values explained."""
+        target = Units.of(state.nets["units"]).rewards(batch.target)
+        residual, whole = (mean_and_variance(x, 1)[1][:, 0] for x in (target - batch.value, target))
+        explained = 1 - residual / jnp.maximum(whole, MIN_STD**2)
+        return {"value": mean_and_variance(batch.value, 1)[0][:, 0], "explained_variance": explained}
+
+
+def scale_head(params: Params, bias: Array) -> Params:
+    """Shrink the weights of a network's head by ``HEAD_SCALE``, and add ``bias`` to its bias."""
+
+    def scaled(part: dict) -> dict:
+        if "head" not in part:
+            return part
+        head = part["head"]
+        return {**part, "head": {"kernel": HEAD_SCALE * head["kernel"], "bias": head["bias"] + bias}}
+
+    return Params(scaled(params.shared), scaled(params.own))
