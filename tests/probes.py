@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import ClassVar
 
 import jax
@@ -12,6 +12,7 @@ import pytest
 from needs import needs
 
 from mtjax import agents, loop
+from mtjax.agents.base import Memory
 from mtjax.agents.parts.knowing import last_steps
 from mtjax.config import configure
 from mtjax.envs import ENVS
@@ -111,7 +112,7 @@ class Stub:
 
     experience: Replay = dataclasses.field(default_factory=Replay)
 
-    watches: ClassVar[bool] = False
+    unroll: ClassVar[int] = 0
 
     def init(self, spec, tasks, key):
         return jnp.zeros(1)
@@ -120,7 +121,7 @@ class Stub:
         return ()
 
     def act(self, state, memory, obs, task, key):
-        return Acted(self.choose(state, obs, task, key), None, memory)
+        return Acted(self.choose(state, obs, task, key))
 
     def choose(self, state, obs, task, key):
         """The action (A,)."""
@@ -132,14 +133,14 @@ class Stub:
     def relabel(self, env, task, transition, key):
         return env.relabel(task, transition, key)
 
-    def observe(self, state, outcome):
-        return state
+    def assess(self, state, steps, tasks):
+        return state, steps
 
-    def update(self, state, batch, tasks, key):
+    def update(self, state, window, tasks, key, number):
         return state, {}
 
-    def learn(self, env, states, data, tasks, keys):
-        return self.experience.learn(env, self, states, data, tasks, keys)
+    def observe(self, state, steps, tasks):
+        return state
 
 
 OFF_POLICY = [name for name, preset in agents.AGENTS.items() if issubclass(preset.cls, agents.SAC)]
@@ -236,8 +237,58 @@ def _agent_programs(agent, named: Named, num_tasks: int, batch_size: int):
     spec = named.spec
     tasks, key = tasks_of("one-step", np.ones(num_tasks)), jax.random.key(0)
     init = lambda tasks, key: agent.init(spec, tasks, key)
-    batch = random_batch(0, num_tasks, batch_size, spec, agent.history_length)
-    return quick(init, tasks, key), quick(agent.update, jax.eval_shape(init, tasks, key), batch, tasks, key)
+    batch = with_memory(agent, random_batch(0, num_tasks, batch_size, spec, agent.history_length))
+    learn = partial(update, agent)
+    return quick(init, tasks, key), quick(learn, jax.eval_shape(init, tasks, key), batch, tasks, key)
+
+
+def windows(batch: Transition) -> Transition:
+    """Transitions (T, B, ...) as windows (T, B, 1, ...) of one step."""
+    return jax.tree.map(lambda x: jnp.expand_dims(x, 2), batch)
+
+
+def update(agent, state, batch: Transition, tasks: Task, key, number=0):
+    """Take a gradient step of an agent on transitions (T, B, ...)."""
+    return agent.update(state, windows(batch), tasks, key, jnp.int32(number))
+
+
+def prepare(agent, state, batch: Transition, tasks: Task):
+    """What an agent's losses take of transitions (T, B, ...)."""
+    return agent.prepare(state, windows(batch), tasks)
+
+
+def assessed(agent, state, steps: Transition, tasks: Task):
+    """A rollout (T, H, E, ...) assessed, and the batch (T, H E, ...) that the losses take of all its steps."""
+    state, steps = agent.assess(state, steps, tasks)
+    state, batch = agent.prepare(state, agent.experience.windows(steps, agent.unroll), tasks)
+    return state, batch, steps
+
+
+def learn(agent, state, steps: Transition, tasks: Task, key):
+    """All that an agent learns from one rollout (T, H, E, ...), as the loop does it."""
+    batch_key, update_key = jax.random.split(key)
+    state, steps = agent.assess(state, steps, tasks)
+    batches = agent.experience.batches(None, agent, tasks, steps, batch_key)
+
+    def step(state, given):
+        batch, key, number = given
+        return agent.update(state, agent.experience.window(steps, batch), tasks, key, number)
+
+    count = agent.experience.updates
+    state, metrics = jax.lax.scan(step, state, (batches, jax.random.split(update_key, count), jnp.arange(count)))
+    return agent.observe(state, steps, tasks), jax.tree.map(lambda x: jnp.mean(x, axis=0), metrics)
+
+
+def observe(agent, state, batch: Transition, tasks: Task):
+    """Count transitions (T, B, ...) as steps of B environments, whose episodes begin with them unless they say so."""
+    shape = (len(tasks.id), 1, batch.reward.shape[1])
+    steps = jax.tree.map(lambda x: jnp.expand_dims(x, 1), batch)
+    if batch.memory is None:
+        task = jax.tree.map(lambda x: x[0], tasks)
+        begun = jax.tree.map(lambda x: jnp.broadcast_to(x, (*shape, *x.shape)), agent.begin(state, task))
+        steps = steps._replace(memory=begun)
+    ended = jnp.zeros(shape, bool) if batch.ended is None else steps.ended
+    return agent.observe(state, steps._replace(ended=ended), tasks)
 
 
 def learner(agent, tasks: Task, batch_size: int, spec: Spec = SPEC):
@@ -304,7 +355,17 @@ def random_batch(seed: int, num_tasks: int, batch_size: int, spec: Spec = SPEC, 
         discount=jnp.float32(random.random((num_tasks, batch_size)) < 0.75),
         next_obs=see(),
     )
-    return batch._replace(extras=random_past(random, (num_tasks, batch_size, history), spec)) if history else batch
+    if not history:
+        return batch
+    return batch._replace(memory=Memory(random_past(random, (num_tasks, batch_size, history), spec)))
+
+
+def with_memory(agent, batch: Transition) -> Transition:
+    """A batch (T, B, ...) with random hidden states, if the agent has one."""
+    if not agent.unroll:
+        return batch
+    hidden = jax.random.normal(jax.random.key(0), (*batch.reward.shape, *agent.conditioning.begin().shape))
+    return batch._replace(memory=Memory(None, hidden), ended=batch.discount == 0)
 
 
 def random_past(random: np.random.Generator, shape: tuple[int, ...], spec: Spec = SPEC) -> last_steps.Past:

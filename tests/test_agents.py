@@ -5,6 +5,7 @@ import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import optax
+import probes
 import pytest
 from probes import OFF_POLICY, learner, one_in, pick, quick, random_batch, random_past, tasks_of, tiny, with_nets
 from probes import act as act_once
@@ -118,8 +119,8 @@ def test_every_combination_has_the_right_shapes(name, settings, vectors):
     """Traced, not run: an update keeps the state's shapes and types, and acting gives an action for each world."""
     agent = make(name, settings, vectors)
     state = jax.eval_shape(lambda: agent.init(SPEC, TASKS, KEY))
-    batch = random_batch(0, 3, BATCH, SPEC, agent.history_length)
-    after, metrics = jax.eval_shape(lambda state: agent.update(state, batch, TASKS, KEY), state)
+    batch = probes.with_memory(agent, random_batch(0, 3, BATCH, SPEC, agent.history_length))
+    after, metrics = jax.eval_shape(lambda state: probes.update(agent, state, batch, TASKS, KEY), state)
     assert shapes(after) == shapes(state)
     conflicts = CONFLICTS if agent.gradients.needs == "gradients" else set()
     assert set(metrics) >= SAC_METRICS | conflicts
@@ -218,13 +219,13 @@ def test_an_agent_that_is_told_nothing_acts_alike_in_all_tasks():
         assert (len(np.unique(np.asarray(actions), axis=0)) == 1) == (name == "sac")
 
 
-def test_observations_are_normalised_by_what_was_learned_from():
-    """Only an update fits the moments, and acting uses them as they are."""
+def test_observations_are_normalised_by_what_was_collected():
+    """Each step counts once, and neither acting nor updates change the moments."""
     agent = tiny("sac", normalize_observations=True)
     init, update = learner(agent, TASKS, BATCH, SPEC)
     state, batch = init(TASKS, KEY), random_batch(0, 3, BATCH, SPEC)
     batch = batch._replace(obs=batch.obs * 3 + 10, next_obs=batch.next_obs - 1000)
-    after, metrics = update(state, batch, TASKS, KEY)
+    after = probes.observe(agent, state, batch, TASKS)
     begun, moments = (x.nets["inputs"].shared["moments"] for x in (state, after))
     assert (begun.count, moments.count) == (0, 3 * BATCH)
     np.testing.assert_allclose(moments.mean, batch.obs.mean(axis=(0, 1)), rtol=1e-5)
@@ -233,7 +234,9 @@ def test_observations_are_normalised_by_what_was_learned_from():
     np.testing.assert_allclose(act(agent, after, obs, None), act(tiny("sac"), after, scaled, None), atol=1e-6)
     assert not np.allclose(act(agent, after, obs, None), act(agent, after, scaled, None), atol=1e-3)
 
-    # The update itself learns from observations and next observations scaled by the new moments.
+    # An update learns from observations and next observations scaled by these moments.
+    learned, metrics = update(after, batch, TASKS, KEY)
+    jax.tree.map(np.testing.assert_array_equal, learned.nets["inputs"], after.nets["inputs"])
     plain_update = learner(tiny("sac"), TASKS, BATCH, SPEC)[1]
     see = lambda x: normalize.apply(moments, x)
     _, expected = plain_update(state, batch._replace(obs=see(batch.obs), next_obs=see(batch.next_obs)), TASKS, KEY)

@@ -5,10 +5,12 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+import probes
 import pytest
 from probes import (
     QUICK,
     Probe,
+    assessed,
     learner,
     of_task,
     one_in,
@@ -26,11 +28,12 @@ from probes import act as act_once
 from probes import values as values_of
 
 from mtjax import agents
+from mtjax.agents.base import Memory
 from mtjax.agents.fit import learned
+from mtjax.agents.on_policy import Taken
 from mtjax.agents.parts.gradients.balancing import FAMO
 from mtjax.agents.parts.knowing.last_steps import Past, Seen, append
 from mtjax.agents.parts.representations.deepmdp import ModelTargets
-from mtjax.agents.ppo import Taken
 from mtjax.agents.sac import Batch
 from mtjax.networks import Params
 from mtjax.types import InputError, Spec, Transition
@@ -71,7 +74,8 @@ def random_params(agent, task=0):
 def one_task(agent):
     """A batch of one task, as the losses see it, and what they fit, which is random: of the models, and of critics."""
     batch, random = pick(random_batch(1, 3, BATCH, SPEC, agent.history_length), 1), np.random.default_rng(6)
-    next_past = append(batch.extras, batch.obs, batch.action, batch.reward) if agent.history_length else None
+    past = batch.memory.past if agent.history_length else None
+    next_past = append(past, batch.obs, batch.action, batch.reward) if agent.history_length else None
     see = lambda obs, past: agent.see(Params({}, {}), obs, past)
     normal = lambda *shape: jnp.float32(random.normal(size=shape))
     width = len(agent.conditioning.given(jnp.int32(0), pick(TASKS, 0), 3, None))
@@ -80,7 +84,7 @@ def one_task(agent):
     other_theta = normal(agent.representation.theta_size) if agent.representation.embeds else None
     model_targets = ModelTargets(normal(BATCH, 6), normal(BATCH, 6) if drawn else jnp.float32(0), other_theta)
     seen = Batch(
-        obs=see(batch.obs, batch.extras),
+        obs=see(batch.obs, past),
         action=batch.action,
         reward=batch.reward,
         discount=agent.gamma * batch.discount,
@@ -179,7 +183,8 @@ def test_rules_see_losses_from_the_least(name, transition, monkeypatch):
     settings = {"representation": "deepmdp", "transition": transition, "model_coefficient": 0.5, "gradients": "famo"}
     agent = make_ppo(**settings) if name == "ppo" else make(name, **settings)
     batch = rollouts(agent) if name == "ppo" else random_batch(0, 3, BATCH, SPEC, agent.history_length)
-    state, found = jit(agent.update)(agent.init(SPEC, TASKS, KEY), batch, TASKS, KEY)
+    take = probes.learn if name == "ppo" else probes.update
+    state, found = jit(partial(take, agent))(agent.init(SPEC, TASKS, KEY), batch, TASKS, KEY)
     surest = np.log(0.01) if transition == "probabilistic" else 0.0
     expected = found["critic_loss"] + 0.5 * (found["transition_loss"] + found["reward_loss"]) - 0.5 * surest
     np.testing.assert_allclose(state.fits["critic"].rule.logits, expected, rtol=1e-4)
@@ -235,7 +240,7 @@ def test_a_rival_is_always_another_task():
     """Over many keys every other task has its turn; one that is alone is its own, and learns nothing of it."""
     agent = make("hip-bmdp")
     state, batch, _ = start(agent)
-    _, seen = agent.prepare(state, batch, TASKS)
+    seen = probes.prepare(agent, state, batch, TASKS)
     rivals = jit(lambda key: agent.critic_data(state, seen, key)[0].model_targets.other_theta)
     thetas, turns = np.asarray(state.nets["representation"].own["embedding"]), set()
     for seed in range(12):
@@ -411,7 +416,7 @@ def test_theta_of_an_unseen_task_is_inferred_from_its_last_steps():
     agent = make("hip-bmdp", **INFERRED)
     state, batch, _ = start(agent)
     act = jit(lambda state, past, task: act_once(agent, state, batch.obs[0, 0], task, None, past))
-    past = pick(batch.extras, (0, 0))
+    past = pick(batch.memory.past, (0, 0))
     params = state.nets["representation"]
     guess = agent.representation.apply(params, "guess", agent.see(state.nets["inputs"], batch.obs[0, 0], past))
     thetas = params.own["embedding"]
@@ -459,7 +464,7 @@ def test_the_transition_model_learns_linear_dynamics():
         return random_batch(0, 3, 32, SPEC)._replace(obs=obs, action=action, next_obs=then, reward=then[..., 0])
 
     def learn(state, key):
-        return agent.update(state, experience(key), TASKS, key)
+        return probes.update(agent, state, experience(key), TASKS, key)
 
     state = agent.init(SPEC, TASKS, KEY)
     state, history = jit(lambda state: jax.lax.scan(learn, state, jax.random.split(KEY, 1500)))(state)
@@ -519,7 +524,7 @@ def test_parts_combine(name, settings):
     agent, keys = make(name, **settings), jax.random.split(KEY, 2)
     batch = jax.tree.map(lambda x: jnp.stack([x, x]), random_batch(0, 3, BATCH, SPEC, agent.history_length))
     state = jax.eval_shape(jax.vmap(lambda key: agent.init(SPEC, TASKS, key)), keys)
-    update = jax.vmap(lambda state, batch, key: agent.update(state, batch, TASKS, key))
+    update = jax.vmap(lambda state, batch, key: probes.update(agent, state, batch, TASKS, key))
     after, metrics = jax.eval_shape(update, state, batch, keys)
     types = lambda tree: jax.tree.map(lambda x: (x.shape, x.dtype), tree)
     assert types(after) == types(state)
@@ -543,7 +548,7 @@ def test_other_agents_stand_on_it(name, representation):
     """Traced, not run: actor and critics on latent states, one encoder and one of each model beside them."""
     agent, batch = make(name, representation=representation), random_batch(0, 3, BATCH, SPEC)
     state = jax.eval_shape(lambda: agent.init(SPEC, TASKS, KEY))
-    after, metrics = jax.eval_shape(lambda state: agent.update(state, batch, TASKS, KEY), state)
+    after, metrics = jax.eval_shape(lambda state: probes.update(agent, state, batch, TASKS, KEY), state)
     assert jax.tree.map(jnp.shape, after) == jax.tree.map(jnp.shape, state)
     assert metrics["transition_loss"].shape == metrics["reward_loss"].shape == (3,)
     place = "own" if name == "disjoint" else "shared"
@@ -558,7 +563,7 @@ def test_other_agents_stand_on_it(name, representation):
 
 
 def make_ppo(**settings):
-    return make("ppo", epochs=1, minibatches=1, normalize_observations=False, **settings)
+    return make("ppo", unroll=4, epochs=1, minibatches=1, normalize_observations=False, **settings)
 
 
 def rollouts(agent, seed=0):
@@ -567,13 +572,14 @@ def rollouts(agent, seed=0):
     normal = lambda *size: jnp.float32(random.normal(size=(*shape, *size)))
     past = random_past(random, (*shape, agent.history_length), SPEC) if agent.history_length else None
     raw, ended = normal(2), jnp.asarray(random.random(shape) < 0.5)
-    fields = {"reward": normal(), "discount": jnp.ones(shape), "ended": ended, "extras": Taken(raw, normal() - 2, past)}
+    fields = {"reward": normal(), "discount": jnp.ones(shape), "ended": ended, "extras": Taken(raw, normal() - 2)}
+    fields["memory"] = Memory(past)
     return Transition(obs=normal(3), action=jnp.tanh(raw), next_obs=normal(3), **fields)
 
 
 def of_first_task(agent, state, steps):
     """What the critic's loss of the first task trains, and its steps as the losses see them."""
-    _, batch, _ = agent.prepare(state, steps, TASKS)
+    _, batch, _ = assessed(agent, state, steps, TASKS)
     params = state.nets["representation"]
     model_targets, _ = agent.representation.targets(params, params, batch.next_obs, KEY)
     return of_critics(of_task(state.nets, 0)), pick(batch._replace(model_targets=model_targets), 0)
@@ -606,7 +612,7 @@ def test_ppos_actor_does_not_train_the_representation():
     state = agents_of[0].init(SPEC, TASKS, KEY)
     other = with_nets(state, actor=jax.tree.map(lambda x: x * 1.5 + 0.05, state.nets["actor"]))
     plain, *moved = (
-        jit(agent.update)(start, steps, TASKS, KEY)[0].nets
+        jit(partial(probes.learn, agent))(start, steps, TASKS, KEY)[0].nets
         for agent, start in ((agents_of[0], state), (agents_of[1], state), (agents_of[0], other))
     )
     for after in moved:
@@ -624,9 +630,10 @@ def test_ppos_models_predict_what_the_encoder_saw_before_the_update():
     """The critic's targets do not change with it, the transition loss does."""
     agent = make_ppo(representation="deepmdp")
     state = agent.init(SPEC, TASKS, KEY)
-    state, batch, _ = agent.prepare(state, rollouts(agent), TASKS)
-    given, params = (jnp.arange(8), KEY), state.nets["representation"]
-    step = jit(lambda slow: agent.minibatch_step(batch, slow, (state, jnp.bool_(True)), given)[1])
+    state, _, steps = assessed(agent, state, rollouts(agent), TASKS)
+    window, params = agent.experience.windows(steps, 0), state.nets["representation"]
+    before = lambda slow: state._replace(slow={"representation": slow})
+    step = jit(lambda slow: agent.update(before(slow), window, TASKS, KEY, jnp.int32(0))[1])
     now, other = step(params), step(jax.tree.map(lambda x: x * 1.5 + 0.05, params))
     np.testing.assert_array_equal(now["critic_loss"], other["critic_loss"])
     assert np.all(np.asarray(now["transition_loss"]) != np.asarray(other["transition_loss"]))
@@ -641,7 +648,7 @@ def test_ppo_learns_a_model_of_its_rollouts():
     before, steps = agent.init(SPEC, TASKS, KEY), rollouts(agent)
     then = 0.5 * steps.obs + jnp.pad(steps.action, [(0, 0)] * 3 + [(0, 1)])
     steps = steps._replace(next_obs=then, reward=then[..., 0])
-    learn = lambda state, key: agent.update(state, steps, TASKS, key)
+    learn = lambda state, key: probes.learn(agent, state, steps, TASKS, key)
     after, history = jit(lambda state: jax.lax.scan(learn, state, jax.random.split(KEY, 300)))(before)
     moved = jax.tree.map(jnp.subtract, of_critics(after.nets), of_critics(before.nets))
     assert reached(moved) == {"body", "head", "latent", "transition", "reward"}

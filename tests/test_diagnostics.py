@@ -11,6 +11,7 @@ import jax.flatten_util
 import jax.numpy as jnp
 import matplotlib.image
 import numpy as np
+import probes
 import pytest
 from probes import OFF_POLICY, QUICK, learner, of_task, one_in, pick, random_batch, slow_but, tasks_of, tiny, with_nets
 
@@ -42,7 +43,7 @@ def shapes_of(agent, spec=SPEC):
 
 def compare(agent, state, batch, tasks=TASKS):
     measure = jax.jit(partial(compare_gradients, agent), compiler_options=QUICK)
-    return jax.device_get(measure(state, batch, tasks, KEY))
+    return jax.device_get(measure(state, probes.windows(batch), tasks, KEY))
 
 
 def ended(seed=0):
@@ -148,7 +149,9 @@ def test_td_error_of_categorical_critics_is_in_units_of_reward(value):
 
 
 def watched(agent, state, batch, tasks=TASKS):
-    return jax.device_get(jax.jit(partial(activity, agent), compiler_options=QUICK)(state, batch, tasks))
+    return jax.device_get(
+        jax.jit(partial(activity, agent), compiler_options=QUICK)(state, probes.windows(batch), tasks)
+    )
 
 
 def constant_layers(params: Params, *levels):
@@ -229,7 +232,7 @@ def test_activity_is_that_of_the_networks():
     """Mean activity and hidden layers of every critic and of the actor are what the networks compute for each task."""
     agent = tiny("multi-head", hidden=(8, 4), normalize_observations=True)
     state, batch = started(agent), random_batch(1, 3, BATCH, SPEC)
-    seen, (_, batch) = watched(agent, state, batch), agent.prepare(state, batch, TASKS)
+    seen, batch = watched(agent, state, batch), probes.prepare(agent, state, batch, TASKS)
     for i in range(3):
         hidden = agent.actor.hidden(of_task(state.nets["actor"], i), batch.features[i], batch.obs[i])
         np.testing.assert_allclose(seen["actor"].hidden[i, :, 0], hidden, rtol=1e-4, atol=1e-5)
@@ -244,9 +247,9 @@ def test_activity_is_that_of_the_networks():
 def trace(agent):
     """What diagnostics of an agent would be: shapes alone."""
     state = shapes_of(agent)
-    batch = jax.eval_shape(lambda: random_batch(0, 3, BATCH, SPEC, agent.history_length))
-    gradients = jax.eval_shape(partial(compare_gradients, agent), state, batch, TASKS, KEY)
-    seen = jax.eval_shape(partial(activity, agent), state, batch, TASKS)
+    window = jax.eval_shape(lambda: probes.windows(random_batch(0, 3, BATCH, SPEC, agent.history_length)))
+    gradients = jax.eval_shape(partial(compare_gradients, agent), state, window, TASKS, KEY)
+    seen = jax.eval_shape(partial(activity, agent), state, window, TASKS)
     return state, gradients, seen
 
 

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import probes
 import pytest
 from probes import learner, one_in, quick, random_batch, tasks_of, tiny
 
@@ -465,7 +466,7 @@ def test_agents_of_these_parts_have_the_right_shapes(name):
     )
     made = agent(base, **{"gradients": "pcgrad", **settings})
     state = jax.eval_shape(jax.vmap(lambda key: made.init(spec, tasks, key)), keys)
-    update = jax.vmap(lambda state, key: made.update(state, random_batch(0, 3, 4, spec), tasks, key)[0])
+    update = jax.vmap(lambda state, key: probes.update(made, state, random_batch(0, 3, 4, spec), tasks, key)[0])
     after = jax.eval_shape(update, state, keys)
     assert jax.tree.map(lambda x: x.shape, after) == jax.tree.map(lambda x: x.shape, state)
 

@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import probes
 import pytest
 from needs import needs
 from probes import random_batch, with_nets
@@ -344,7 +345,9 @@ def test_agents_learn_as_on_the_cpu(name, num_tasks=10):
 
 def updating(agent):
     """An update of every seed."""
-    return lambda states, data, keys, tasks: jax.vmap(lambda s, d, k: agent.update(s, d, tasks, k))(states, data, keys)
+    return lambda states, data, keys, tasks: jax.vmap(lambda s, d, k: probes.update(agent, s, d, tasks, k))(
+        states, data, keys
+    )
 
 
 def require_alike(expected, found):

@@ -11,10 +11,12 @@ from conftest import compiled
 from probes import QUICK, Goals, Stub, one_in, pick, quick, tiny, train
 
 import mtjax.train
+from mtjax.agents.base import Memory
 from mtjax.agents.parts.knowing.last_steps import append, begin
 from mtjax.envs import make
 from mtjax.experience import Replay, hindsight
 from mtjax.experience import ring as rings
+from mtjax.experience.replay import Buffer
 from mtjax.types import InputError, Transition
 
 WORLDS = 256
@@ -101,7 +103,7 @@ def test_a_relabelled_past_is_that_of_the_other_task(name):
         obs, past, steps = env.observe(task, world), begin(3, env.spec.obs_size, env.spec.action_size), []
         for action in actions:
             after = step(task, world, action)
-            steps.append(Transition(obs, action, after.reward, jnp.float32(1), after.obs, extras=past))
+            steps.append(Transition(obs, action, after.reward, jnp.float32(1), after.obs, memory=Memory(past)))
             past, world, obs = append(past, obs, action, after.reward), after.state, after.obs
         return steps
 
@@ -113,7 +115,7 @@ def test_a_relabelled_past_is_that_of_the_other_task(name):
         found = again(ours[i])
         for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(theirs[i]), strict=True):
             np.testing.assert_allclose(a, b, atol=1e-6)
-        changed = zip(jax.tree.leaves(found.extras), jax.tree.leaves(ours[i].extras), strict=True)
+        changed = zip(jax.tree.leaves(found.memory), jax.tree.leaves(ours[i].memory), strict=True)
         assert not all(np.allclose(a, b) for a, b in changed)
 
 
@@ -184,7 +186,7 @@ def test_where_goals_are_drawn_a_tasks_own_steps_are_relabelled_too(env):
 def test_without_hindsight_batches_are_those_of_before():
     """To the bit: the same key draws the same rows as the replay alone does."""
     settings, replay = Replay(updates_per_step=BATCHES, batch_size=BATCH), filled()
-    found = settings.draw(Goals(), Auditor(), Goals().tasks(), replay, KEY)
+    found = settings.batches(Goals(), Auditor(), Goals().tasks(), Buffer(replay, replay.size, KEY), KEY)
     rows = rings.sample(replay, KEY, BATCHES * BATCH)
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(rows), strict=True):
         np.testing.assert_array_equal(np.moveaxis(a, 0, 1).reshape(b.shape), b)
@@ -200,7 +202,8 @@ class Auditor(Stub):
     def choose(self, state, obs, task, key):
         return jax.random.uniform(key, (1,))
 
-    def update(self, state, batch, tasks, key):
+    def update(self, state, window, tasks, key, number):
+        batch = jax.tree.map(lambda x: x[:, :, 0], window)
         scale = tasks.goal["scale"][:, None] if batch.context is None else batch.context[..., 0]
         wrong = jnp.abs(batch.reward - scale * batch.obs[..., 0])
         return state + 1, {"wrong": jnp.max(wrong, axis=1), "spread": jnp.std(scale * jnp.ones_like(wrong), axis=1)}

@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import probes
 import pytest
 from probes import Probe, Walk, learner, only_seed, pick, quick, random_batch, tasks_of, tiny, train
 
@@ -62,12 +63,12 @@ def test_the_loop_stores_what_was_seen():
     agent = tiny("sac", conditioning="inferred", inferred_from=3)
     state, _ = train(Walk(), agent, settings, seeds=(0, 1))
     rows = jax.tree.map(lambda x: np.moveaxis(np.asarray(x)[:, :, :20], 2, 3), state.data.ring.rows)  # (S, T, E, H, .)
-    then = jax.tree.map(np.asarray, append(rows.extras, rows.obs, rows.action, rows.reward))
+    then = jax.tree.map(np.asarray, append(rows.memory.past, rows.obs, rows.action, rows.reward))
     age = np.floor(rows.obs[..., 0])
-    np.testing.assert_array_equal(rows.extras.known.sum(axis=-1), np.minimum(age, 3))
+    np.testing.assert_array_equal(rows.memory.past.known.sum(axis=-1), np.minimum(age, 3))
     np.testing.assert_array_equal(then.known.sum(axis=-1), np.minimum(age + 1, 3))
     taken = (rows.obs, rows.action, rows.reward)
-    for past, first in ((rows.extras, 1), (then, 0)):
+    for past, first in ((rows.memory.past, 1), (then, 0)):
         for back in range(3):
             lag, place = back + first, 2 - back  # so many rows ago, and where it is remembered
             known = past.known[..., place][..., lag:] == 1
@@ -112,6 +113,7 @@ def test_networks_share_an_encoder_of_trajectories_that_learns():
     before = state = init(tasks, jax.random.key(0))
     for i in range(3):
         batch = random_batch(i, 2, 4, SPEC, STEPS)
+        state = probes.observe(agent, state, batch, tasks)
         state, metrics = update(state, batch, tasks, jax.random.key(i))
         if not i:
             assert_scaled(agent, state, batch)
@@ -129,7 +131,7 @@ def assert_scaled(agent, state, batch):
     """Present and past observations by the moments of present ones; actions, rewards and what is known as they are."""
     obs = np.asarray(batch.obs).reshape(-1, 3)
     scale = lambda x: (x - obs.mean(axis=0)) / obs.std(axis=0)
-    inputs, past = state.nets["inputs"], batch.extras
+    inputs, past = state.nets["inputs"], batch.memory.past
     np.testing.assert_allclose(inputs.parts["moments"].mean, obs.mean(axis=0), rtol=1e-4, atol=1e-6)
     seen = agent.see(inputs, batch.obs, past)
     np.testing.assert_allclose(seen.obs, scale(batch.obs), rtol=1e-3, atol=1e-4)

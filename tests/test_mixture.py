@@ -487,7 +487,7 @@ def random_batch(env, num_batch: int = 3) -> Transition:
 
 def init_and_update(agent, tasks: Task, batch: Transition, key):
     state = agent.init(BOTH.spec, tasks, key)
-    new, metrics = agent.update(state, batch, tasks, key)
+    new, metrics = probes.update(agent, state, batch, tasks, key)
     act = lambda task, obs: agent.act(new, agent.begin(new, task), obs, task, key).action
     return state, new, metrics, jax.vmap(act)(tasks, batch.obs[:, 0])
 

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from probes import Goals, Stub, Walk, one_in, pick, quick, random_batch, random_past, tasks_of, tiny, train, with_nets
 
+from mtjax.agents.base import Memory
 from mtjax.agents.parts.knowing.last_steps import append
 from mtjax.experience import Replay, multistep
 from mtjax.experience import ring as rings
+from mtjax.experience.replay import Buffer
 from mtjax.networks import Params
 from mtjax.saved.points import SweptAgent
 from mtjax.types import InputError, Spec, Transition
@@ -104,12 +106,10 @@ class Auditor(Stub):
     n: int = 3
 
     def init(self, spec, tasks, key):
-        return jnp.float32(0.5)  # its discount, which the replay must hand on
+        return jnp.float32(0.5)  # its discount
 
-    def join_steps(self, state, steps, tasks):
-        return jax.vmap(lambda steps: multistep.join(steps, state))(steps)
-
-    def update(self, state, batch, tasks, key):
+    def update(self, state, window, tasks, key, number):
+        batch = self.experience.joined(window, jnp.broadcast_to(state, len(tasks.id)))
         age, count = batch.obs[..., 0], jnp.round((batch.next_obs - batch.obs)[..., 0])
         powers = jnp.where(jnp.arange(self.n) < count[..., None], state ** jnp.arange(self.n), 0)
         scale = tasks.goal["scale"][:, None]
@@ -156,13 +156,13 @@ def windows(num_tasks, history=0):
 def test_each_task_has_its_own_discount():
     """By its horizon: 1 - 5 / 125 = 0.96 and 1 - 5 / 250 = 0.98; and the agent makes gamma^m of it."""
     tasks = tasks_of("one-step")._replace(horizon=jnp.int32([125, 250]))
-    agent, steps = tiny("sac-conditioned", discounting="horizon"), windows(2)
+    agent, steps = tiny("sac-conditioned", discounting="horizon", experience=Replay(n_step=3)), windows(2)
     state = agent.init(SPEC, tasks, jax.random.key(0))
-    joined = agent.join_steps(state, steps, tasks)
+    joined = agent.transitions(steps, tasks)
     for task, gamma in enumerate((0.96, 0.98)):
         each = [multistep.join(pick(steps, (task, b)), gamma) for b in range(4)]
         np.testing.assert_allclose(joined.reward[task], [x.reward for x in each], rtol=1e-6)
-        _, batch = agent.prepare(state, joined, tasks)
+        batch = agent.prepare(state, steps, tasks)
         count = np.asarray([next((k + 1 for k in range(3) if steps.ended[task, b, k]), 3) for b in range(4)])
         alive = np.asarray([not steps.ended[task, b].any() for b in range(4)])
         np.testing.assert_allclose(batch.discount[task], alive * gamma**count, rtol=1e-5)
@@ -170,21 +170,27 @@ def test_each_task_has_its_own_discount():
 
 def test_a_sweep_joins_by_the_swept_discount():
     """And not by that of the agent whose numbers are varied."""
-    agent, tasks, steps = SweptAgent(tiny("sac")), tasks_of("one-step"), windows(2)
-    state = agent.init(SPEC, tasks, jax.random.key(0), {"gamma": jnp.float32(0.5)})
-    plain = tiny("sac", gamma=0.5).join_steps(None, steps, tasks)
-    np.testing.assert_allclose(agent.join_steps(state, steps, tasks).reward, plain.reward, rtol=1e-6)
+    tasks, steps, key = tasks_of("one-step"), windows(2), jax.random.key(0)
+    replay, number = Replay(n_step=3), jnp.int32(0)
+    swept, plain = SweptAgent(tiny("sac", experience=replay)), tiny("sac", experience=replay, gamma=0.5)
+    state = swept.init(SPEC, tasks, key, {"gamma": jnp.float32(0.5)})
+    found = swept.update(state, steps, tasks, key, number)[1]["critic_loss"]
+    expected = plain.update(plain.init(SPEC, tasks, key), steps, tasks, key, number)[1]["critic_loss"]
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
 def test_units_of_a_task_scale_joined_rewards_as_its_values():
     """A value v is learned as f (v - o): then f (y - o) = f (R - (1 - gamma^m d) o) + gamma^m d f (v' - o)."""
-    agent, tasks, steps = tiny("multi-head", scaling="popart", gamma=0.9), tasks_of("one-step"), windows(2)
+    agent, tasks, steps = (
+        tiny("multi-head", scaling="popart", gamma=0.9, experience=Replay(n_step=3)),
+        tasks_of("one-step"),
+        windows(2),
+    )
     state = agent.init(SPEC, tasks, jax.random.key(0))
     mean, std = jnp.float32([3.0, -2.0]), jnp.float32([0.5, 4.0])
     scales = state.nets["scaling"].own._replace(mean=mean, variance=std**2)
     state = with_nets(state, scaling=Params({}, scales))
-    joined = agent.join_steps(state, steps, tasks)
-    _, batch = agent.prepare(state, joined, tasks)
+    joined, batch = agent.transitions(steps, tasks), agent.prepare(state, steps, tasks)
     value = 7.0
     target = batch.reward + batch.discount * (value - mean[:, None]) / std[:, None]
     expected = (joined.reward + batch.discount * value - mean[:, None]) / std[:, None]
@@ -193,17 +199,17 @@ def test_units_of_a_task_scale_joined_rewards_as_its_values():
 
 def test_the_past_at_the_bootstrap_is_that_of_the_windows_last_step():
     """An agent that infers its task sees the steps before s_(t+m), and not those of a joined step."""
-    agent = tiny("sac", conditioning="inferred", inferred_from=2)
+    agent = tiny("sac", conditioning="inferred", inferred_from=2, experience=Replay(n_step=3))
     tasks, steps = tasks_of("one-step"), windows(2)
-    steps = steps._replace(extras=random_past(np.random.default_rng(0), (2, 4, 3, 2), SPEC))
+    steps = steps._replace(memory=Memory(random_past(np.random.default_rng(0), (2, 4, 3, 2), SPEC)))
     state = agent.init(SPEC, tasks, jax.random.key(0))
-    _, batch = agent.prepare(state, agent.join_steps(state, steps, tasks), tasks)
+    batch = agent.prepare(state, steps, tasks)
     for task, b in np.ndindex(2, 4):
         final = next((k for k in range(3) if steps.ended[task, b, k]), 2)
         last = pick(steps, (task, b, final))
-        expected = append(last.extras, last.obs, last.action, last.reward)
+        expected = append(last.memory.past, last.obs, last.action, last.reward)
         found = batch.next_obs.past, batch.obs.past
-        for ours, theirs in zip(found, (expected, pick(steps.extras, (task, b, 0))), strict=True):
+        for ours, theirs in zip(found, (expected, pick(steps.memory.past, (task, b, 0))), strict=True):
             jax.tree.map(np.testing.assert_array_equal, pick(ours, (task, b)), theirs)
 
 
@@ -220,8 +226,9 @@ def test_an_agent_learns_from_joined_steps(settings):
 def test_single_steps_are_drawn_as_ever():
     """To the bit: n-step=1 draws rows and joins nothing."""
     ring = jax.tree.map(lambda x: x, filled(11))
-    draw = lambda ring, key: Replay(updates_per_step=2, batch_size=5).draw(
-        Walk(), None, tasks_of("one-step"), ring, key
+    buffer = lambda ring: Buffer(ring, ring.size, None)  # type: ignore
+    draw = lambda ring, key: Replay(updates_per_step=2, batch_size=5).batches(
+        Walk(), Stub(), tasks_of("one-step"), buffer(ring), key
     )
     found = quick(draw, ring, jax.random.key(3))(ring, jax.random.key(3))
     rows = rings.sample(ring, jax.random.key(3), 10)

@@ -121,16 +121,14 @@ class SightAuditor(probes.Stub):
     def init(self, spec, tasks, key):
         return jnp.float32(0.5)  # its discount
 
-    def join_steps(self, state, steps, tasks, join):
-        return jax.vmap(lambda steps: join(steps, state))(steps)
-
     def unlike(self, obs, place):
         """How far the pictures of a stack (..., 2, 2, 6) are from those of the last steps up to a place (...)."""
         ages = jnp.maximum(place[..., None] // 1 - jnp.array([2, 1, 0]), 0)
         expected = jnp.stack([jnp.broadcast_to(place[..., None] % 1 * 256, ages.shape), ages], axis=-1)
         return jnp.max(jnp.abs(obs["pixels"].reshape(*place.shape, 4, 3, 2) - expected[..., None, :, :]), (-3, -2, -1))
 
-    def update(self, state, batch, tasks, key):
+    def update(self, state, window, tasks, key, number):
+        batch = self.experience.joined(window, jnp.broadcast_to(state, len(tasks.id)))
         place, after = batch.obs["state"][..., 0], batch.next_obs["state"][..., 0]
         count = jnp.round(after - place)
         powers = jnp.where(jnp.arange(self.n) < count[..., None], state ** jnp.arange(self.n), 0)
@@ -396,7 +394,9 @@ def test_an_encoder_that_is_its_own_target_sees_the_next_pictures_once():
     state, batch = agent.init(family.spec, tasks, KEY), probes.random_batch(0, len(tasks.id), 4, family.spec)
     latent = Params({"latent": state.nets["representation"].shared["latent"]}, {})
     copied = state._replace(slow=state.slow | {"representation": state.slow["representation"].filled(latent)})
-    compiled = [jax.jit(agent.update).lower(each, batch, tasks, KEY).compile() for each in (state, copied)]
+    compiled = [
+        jax.jit(partial(probes.update, agent)).lower(each, batch, tasks, KEY).compile() for each in (state, copied)
+    ]
     once, twice = (len(re.findall(r" convolution\(|custom-call.*onvolution", each.as_text())) for each in compiled)
     assert twice == once + 4
     (after, _), (other, _) = compiled[0](state, batch, tasks, KEY), compiled[1](copied, batch, tasks, KEY)
@@ -408,9 +408,9 @@ def test_the_actor_learns_on_the_encoder_that_critics_had_before_their_step():
     agent, family = probes.tiny("drq", n_step=1, critic_lr=0.1), Pictured()
     tasks = family.tasks()
     state, batch = agent.init(family.spec, tasks, KEY), probes.random_batch(0, len(tasks.id), 4, family.spec)
-    after, _ = jax.jit(agent.update)(state, batch, tasks, KEY)
+    after, _ = jax.jit(partial(probes.update, agent))(state, batch, tasks, KEY)
     actor_key = jax.random.split(KEY, 4)[1]
-    _, seen = agent.prepare(state, agent.representation.augment(batch, jax.random.fold_in(KEY, 1)), tasks)
+    seen = probes.prepare(agent, state, agent.representation.augment(batch, jax.random.fold_in(KEY, 1)), tasks)
 
     @jax.jit
     def step(representation):
@@ -446,7 +446,7 @@ def test_every_agent_can_be_asymmetric(name):
     spec, tasks = BESIDE.spec, BESIDE.tasks()
     batch = probes.random_batch(0, len(tasks.id), 4, spec)
     state = jax.eval_shape(lambda: agent.init(spec, tasks, KEY))
-    after, _ = jax.eval_shape(lambda state: agent.update(state, batch, tasks, KEY), state)
+    after, _ = jax.eval_shape(lambda state: probes.update(agent, state, batch, tasks, KEY), state)
     assert jax.tree.map(lambda x: x.shape, after) == jax.tree.map(lambda x: x.shape, state)
     assert any("sight" in place or "sight" in place.get("distilled", ()) for place in state.nets["actor"])
     of_critics = (*state.nets["critic"], *state.nets["representation"])

@@ -3,15 +3,32 @@
 import dataclasses
 import itertools
 import math
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import Walk, mean_actions, of_task, one_in, only_seed, pick, quick, random_past, tiny, train, with_nets
+from probes import (
+    Walk,
+    assessed,
+    learn,
+    mean_actions,
+    of_task,
+    one_in,
+    only_seed,
+    pick,
+    quick,
+    random_past,
+    tiny,
+    train,
+    with_nets,
+)
 
 from mtjax import agents, normalize
+from mtjax.agents.base import Memory
+from mtjax.agents.on_policy import Batch, Taken
+from mtjax.agents.parts import targets
 from mtjax.agents.parts.encoders import ENCODERS
 from mtjax.agents.parts.gradients.surgery import RULES
 from mtjax.agents.parts.knowing import CONDITIONINGS
@@ -19,7 +36,8 @@ from mtjax.agents.parts.knowing.last_steps import Past, Seen
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.scaling.base import Moments
-from mtjax.agents.ppo import PPO, Batch, Taken, Units, advantages, take_steps
+from mtjax.agents.ppo import PPO, within
+from mtjax.agents.units import Units
 from mtjax.config import with_preset
 from mtjax.envs.probes import Probe, tasks_of
 from mtjax.maps import in_parts
@@ -32,7 +50,7 @@ KEY = jax.random.key(2)
 
 
 def small(**settings):
-    return tiny("ppo", **{"epochs": 1, "minibatches": 2, **settings})
+    return tiny("ppo", **{"epochs": 1, "minibatches": 2, "unroll": LENGTH, **settings})
 
 
 def random_steps(agent, num_tasks=3, spec=SPEC, seed=0):
@@ -42,6 +60,8 @@ def random_steps(agent, num_tasks=3, spec=SPEC, seed=0):
     raw, past = normal(spec.action_size), None
     if agent.history_length:
         past = random_past(random, (*shape, agent.history_length), spec)
+    begun = Memory(None, agent.conditioning.begin(), agent.scaling.begin(), agent.sampler.begin())
+    memory = jax.tree.map(lambda x: jnp.zeros((*shape, *x.shape)), begun)
     return Transition(
         obs=normal(spec.obs_size),
         action=jnp.tanh(raw),
@@ -49,7 +69,8 @@ def random_steps(agent, num_tasks=3, spec=SPEC, seed=0):
         discount=jnp.float32(random.random(shape) < 0.75),
         next_obs=normal(spec.obs_size),
         ended=jnp.asarray(random.random(shape) < 0.5),
-        extras=Taken(raw, normal() - 2, past),
+        extras=Taken(raw, normal() - 2),
+        memory=memory._replace(past=past),
     )
 
 
@@ -59,8 +80,9 @@ def random_steps(agent, num_tasks=3, spec=SPEC, seed=0):
 def test_advantages_worked_by_hand():
     """Terminated, cut off and going on; with gamma a half and lambda a half."""
     reward, value, next_value = jnp.ones((3, 1)), jnp.full((3, 1), 2.0), jnp.full((3, 1), 4.0)
-    find = lambda discount, ended: advantages(
-        reward, jnp.float32(discount)[:, None], jnp.array(ended)[:, None], value, next_value, jnp.float32(0.5), 0.5
+    steps = lambda discount, ended: Transition(None, None, reward, jnp.float32(discount)[:, None], None, ended)
+    find = lambda discount, ended: targets.gae(
+        steps(discount, jnp.array(ended)[:, None]), value, next_value, jnp.float32(0.5), 0.5
     )[:, 0]
     # Each error is 1 + 0.5 * 4 - 2 = 1, or 1 - 2 = -1 where an episode terminated.
     np.testing.assert_allclose(find([1, 1, 1], [False] * 3), [1 + 0.25 * 1.25, 1.25, 1])
@@ -75,7 +97,8 @@ def test_advantages_are_those_of_a_plain_loop():
         reward, value, next_value = random.normal(size=(3, length, envs))
         ended = random.random((length, envs)) < 0.3
         discount = 1.0 - ended * (random.random((length, envs)) < 0.5)
-        found = advantages(*map(jnp.asarray, (reward, discount, ended, value, next_value)), jnp.float32(gamma), 0.8)
+        steps = Transition(None, None, jnp.asarray(reward), jnp.asarray(discount), None, jnp.asarray(ended))
+        found = targets.gae(steps, jnp.asarray(value), jnp.asarray(next_value), jnp.float32(gamma), 0.8)
         error = reward + gamma * discount * next_value - value
         for t, e in np.ndindex(length, envs):
             expected = 0.0
@@ -101,7 +124,7 @@ def test_every_task_has_its_own_discount():
     agent = small(discounting="horizon", value_normalization="none", advantage_normalization="none", gae_lambda=0.0)
     tasks, steps = TASKS._replace(horizon=jnp.array([200, 1000, 125])), random_steps(agent)
     state = agent.init(SPEC, tasks, KEY)
-    state, batch, _ = agent.prepare(state, steps, tasks)
+    state, batch, _ = assessed(agent, state, steps, tasks)
     features = agent.features_of_batch(state, steps, tasks)
     see = lambda obs: agent.see(state.nets["inputs"], obs.reshape(3, -1, 3))
     value, following = (agent.values(state, features, see(obs)) for obs in (steps.obs, steps.next_obs))
@@ -119,9 +142,9 @@ def test_a_target_infers_the_task_from_the_past_with_the_step_in_it():
     critic = state.nets["critic"]
     head = jax.tree.map(lambda x: 1e3 * x, critic.shared["head"])
     state = with_nets(state, critic=critic._replace(shared=critic.shared | {"head": head}))
-    _, batch, _ = agent.prepare(state, steps, TASKS)
+    _, batch, _ = assessed(agent, state, steps, TASKS)
     flat = jax.tree.map(lambda x: np.reshape(x, (3, -1, *x.shape[3:])), steps)
-    past, latest = flat.extras.past, Past(flat.obs, flat.action, flat.reward, np.ones_like(flat.reward))
+    past, latest = flat.memory.past, Past(flat.obs, flat.action, flat.reward, np.ones_like(flat.reward))
     later = Past(*(np.concatenate([x[:, :, 1:], y[:, :, None]], axis=2) for x, y in zip(past, latest, strict=True)))
     value = lambda obs, past: agent.values(state, jnp.zeros((3, 0)), Seen(obs, past))
     now, following = value(flat.obs, past), value(flat.next_obs, later)
@@ -138,7 +161,7 @@ def batch_of(agent, state, **fields):
     random = np.random.default_rng(1)
     normal = lambda *size: jnp.float32(random.normal(size=(4, *size)))
     features = agent.features(state, pick(TASKS, 0))
-    blank = dict.fromkeys(("log_prob", "advantage", "output", "target"), jnp.zeros(4))
+    blank = dict.fromkeys(("log_prob", "advantage", "value", "output", "target"), jnp.zeros(4))
     batch = Batch(**{"obs": normal(3), "raw": normal(2), "features": features, "mask": None, **blank, **fields})
     return batch, of_task(state.nets, 0)
 
@@ -204,8 +227,8 @@ def test_actions_that_a_task_lacks_count_for_nothing():
     assert acted.extras.log_prob == pytest.approx(density(0), abs=1e-5)
     assert whole.extras.log_prob == pytest.approx(density(0) + density(1), abs=1e-5)
     steps = random_steps(agent)
-    _, batch, _ = agent.prepare(state, steps, tasks)
-    np.testing.assert_array_equal(take_steps(batch, jnp.arange(2)).mask, tasks.action_mask)
+    _, batch, _ = assessed(agent, state, steps, tasks)
+    np.testing.assert_array_equal(batch.mask, tasks.action_mask)
 
 
 def test_a_loss_counts_only_the_actions_that_its_task_has():
@@ -236,21 +259,23 @@ def test_policies_begin_wide_and_alike():
 def test_every_minibatch_has_as_many_steps_of_every_task():
     """An epoch deals out every step once; what does not divide is left out, other steps in every epoch."""
     agent = small(epochs=3, minibatches=4)
-    orders = np.asarray(agent.minibatch_indices(12, KEY))
+    orders = np.asarray(agent.experience.shuffled(12, KEY))
     assert orders.shape == (12, 3)
     for epoch in orders.reshape(3, -1):
         assert sorted(epoch) == list(range(12))
     assert not np.array_equal(orders[:4], orders[4:8])
-    uneven = np.asarray(agent.minibatch_indices(14, KEY)).reshape(3, -1)
+    uneven = np.asarray(agent.experience.shuffled(14, KEY)).reshape(3, -1)
     assert uneven.shape == (3, 12) and all(len(set(epoch)) == 12 for epoch in uneven)
     assert len({tuple(set(range(14)) - set(epoch)) for epoch in uneven}) > 1
 
-    batch = agent.prepare(agent.init(SPEC, TASKS, KEY), random_steps(agent), TASKS)[1]
-    chosen = take_steps(batch, jnp.array([5, 0, 3]))
-    assert chosen.advantage.shape == (3, 3) and chosen.features is batch.features
-    np.testing.assert_array_equal(chosen.obs, batch.obs[:, np.array([5, 0, 3])])
-    with pytest.raises(InputError, match=r"minibatches \(4\) must not be more than a rollout's 3 steps"):
-        agent.minibatch_indices(3, KEY)
+    state, batch, steps = assessed(agent, agent.init(SPEC, TASKS, KEY), random_steps(agent), TASKS)
+    window = agent.experience.window(steps, jnp.array([[5], [0], [3]]))
+    _, chosen = agent.prepare(state, window, TASKS)
+    assert window.reward.shape == (3, 3, 1) and chosen.advantage.shape == (3, 3)
+    for ours, theirs in ((chosen.obs, batch.obs), (chosen.advantage, batch.advantage), (chosen.raw, batch.raw)):
+        np.testing.assert_array_equal(ours, theirs[:, np.array([5, 0, 3])])
+    with pytest.raises(InputError, match=r"minibatches \(4\) must not be more than a rollout's 3 a task"):
+        agent.experience.shuffled(3, KEY)
 
 
 def test_steps_keep_their_contexts():
@@ -258,16 +283,17 @@ def test_steps_keep_their_contexts():
     agent = small()
     steps = random_steps(agent)
     context = steps.reward[..., None] * 2
-    batch = agent.prepare(agent.init(SPEC, TASKS, KEY), steps._replace(context=context), TASKS)[1]
+    state, _, steps = assessed(agent, agent.init(SPEC, TASKS, KEY), steps._replace(context=context), TASKS)
     order = jnp.array([1, 6])
-    np.testing.assert_array_equal(take_steps(batch, order).features, context.reshape(3, -1, 1)[:, order])
+    _, batch = agent.prepare(state, agent.experience.window(steps, order[:, None]), TASKS)
+    np.testing.assert_array_equal(batch.features, context.reshape(3, -1, 1)[:, order])
 
 
 @pytest.mark.parametrize("kind", ["none", "all", "task"])
 def test_advantages_are_brought_to_one_scale(kind):
     agent = small(advantage_normalization=kind)
     advantage = jnp.float32(np.random.default_rng(0).normal(size=(3, 50)) * [[1], [10], [100]] + 5)
-    found = agent.normalize_advantages(advantage)
+    found = agent.normalize_advantages(advantage.reshape(3, 10, 5)).reshape(3, 50)
     axis = {"none": (), "all": None, "task": 1}[kind]
     if kind == "none":
         np.testing.assert_array_equal(found, advantage)
@@ -277,7 +303,7 @@ def test_advantages_are_brought_to_one_scale(kind):
 
 
 def test_advantages_of_a_task_that_earns_nothing_are_nothing():
-    assert np.all(np.asarray(small().normalize_advantages(jnp.zeros((2, 5)))) == 0)
+    assert np.all(np.asarray(small().normalize_advantages(jnp.zeros((2, 5, 1)))) == 0)
 
 
 # Units of values.
@@ -315,7 +341,8 @@ def test_targets_are_in_the_units_in_which_outputs_are_read(kind):
     state = agent.init(SPEC, TASKS, KEY)
     for seed in range(3):
         steps, before = random_steps(agent, seed=seed), state
-        state, batch, _ = agent.prepare(state, steps._replace(reward=10 + 5 * seed * steps.reward), TASKS)
+        steps = steps._replace(reward=10 + 5 * seed * steps.reward)
+        state, batch, _ = assessed(agent, state, steps, TASKS)
         value = agent.values(before, batch.features, batch.obs)
         units, old = (Units.of(x.nets["units"]) for x in (state, before))
         np.testing.assert_allclose(units.rewards(batch.target), value + batch.advantage, rtol=1e-4, atol=1e-3)
@@ -389,7 +416,7 @@ def test_values_are_clipped_around_the_outputs_from_before_the_update(kind):
     for seed in range(3):
         steps = random_steps(agent, seed=seed)
         steps = steps._replace(reward=100 + 50 * seed * steps.reward)
-        state, batch, _ = agent.prepare(state, steps, TASKS)
+        state, batch, _ = assessed(agent, state, steps, TASKS)
         now = agent.outputs(state, batch.features, batch.obs)
         np.testing.assert_allclose(batch.output, now, rtol=1e-3, atol=1e-4)
         loss, params, data = agent.fits["critic"].problem(agent.critic_loss, state.nets, (batch,))
@@ -406,22 +433,23 @@ def test_the_actor_rests_once_it_is_too_far_away():
     features = TASKS.context[:, None, None] * jnp.ones((3, LENGTH, ENVS, 1))
     outputs = agent.policy(of_task(state.nets, 0), features, steps.obs)
     raw = steps.extras.raw * 0.5
-    steps = steps._replace(extras=Taken(raw, log_density(outputs, raw), None))
-    after, _ = jax.jit(agent.update)(state, steps, TASKS, KEY)
+    steps = steps._replace(extras=Taken(raw, log_density(outputs, raw)))
+    after, _ = jax.jit(partial(learn, agent))(state, steps, TASKS, KEY)
 
-    order_key, key = jax.random.split(KEY)
-    renewed, batch, _ = agent.prepare(state, steps, TASKS)
-    orders = agent.minibatch_indices(batch.advantage.shape[1], order_key)
-    given = (orders[0], jax.random.split(key, len(orders))[0])
-    slow, carry = renewed.nets["representation"], (renewed, jnp.bool_(True))
-    (first, within_limit), _ = jax.jit(agent.minibatch_step)(batch, slow, carry, given)
-    assert within_limit
+    batch_key, update_key = jax.random.split(KEY)
+    begun, rollout = agent.assess(with_nets(state, limit=within(False)), steps, TASKS)
+    batches = agent.experience.batches(Walk(), agent, TASKS, rollout, batch_key)
+    window, key = agent.experience.window(rollout, batches[0]), jax.random.split(update_key, len(batches))[0]
+    first, _ = jax.jit(agent.update)(begun, window, TASKS, key, jnp.int32(0))
+    assert first.nets["limit"].shared["within"] and not after.nets["limit"].shared["within"]
     close = lambda x, y: all(np.allclose(a, b, atol=1e-5) for a, b in zip(*map(jax.tree.leaves, (x, y)), strict=True))
     assert close(after.nets["actor"], first.nets["actor"]) and not close(after.nets["actor"], state.nets["actor"])
     assert not close(after.nets["critic"], first.nets["critic"])
     far = small(kl_limit=1e9, minibatches=4, epochs=2, normalize_observations=False, actor_lr=0.1)
     free = small(minibatches=4, epochs=2, normalize_observations=False, actor_lr=0.1)
-    actors = [jax.jit(x.update)(state, steps, TASKS, KEY)[0].nets["actor"] for x in (far, free)]
+    starts = (state, state._replace(nets={name: net for name, net in state.nets.items() if name != "limit"}))
+    learned_by = [jax.jit(partial(learn, x))(y, steps, TASKS, KEY)[0] for x, y in zip((far, free), starts, strict=True)]
+    actors = [x.nets["actor"] for x in learned_by]
     assert close(*actors) and not close(actors[0], after.nets["actor"])
 
 
@@ -491,7 +519,7 @@ def test_every_combination_keeps_its_shapes(row, tmp_path):
         row = {**row, "vectors": str(tmp_path / "tasks.npy")}
     agent = small(**row)
     state = jax.eval_shape(lambda: agent.init(SPEC, TASKS, KEY))
-    after, metrics = jax.eval_shape(lambda state: agent.update(state, random_steps(agent), TASKS, KEY), state)
+    after, metrics = jax.eval_shape(lambda state: learn(agent, state, random_steps(agent), TASKS, KEY), state)
     shapes = lambda tree: jax.tree.map(lambda x: (x.shape, str(x.dtype)), tree)
     assert shapes(after) == shapes(state)
     for name in ("actor_loss", "critic_loss", "entropy", "kl", "clip_fraction", "explained_variance", "value"):
@@ -517,7 +545,7 @@ def test_updates_are_finite_and_the_key_decides(row):
     steps = random_steps(agent)
     init = quick(lambda key: agent.init(SPEC, TASKS, key), KEY)
     state = init(KEY)
-    update = quick(lambda state, key: agent.update(state, steps, TASKS, key), state, KEY)
+    update = quick(lambda state, key: learn(agent, state, steps, TASKS, key), state, KEY)
     (after, metrics), (again, _), (other, _) = update(state, KEY), update(state, KEY), update(state, jax.random.key(3))
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves((after, metrics)))
     policies = ((s.nets["actor"], s.nets["knowing"]) for s in (state, after, again, other))
@@ -566,7 +594,7 @@ def test_presets_deal_out_every_step(family, preset):
     """No step is left out of an epoch, and a chunk is whole rollouts."""
     config = with_preset(family, "ppo", preset)
     agent, settings = config.learner, config.training
-    assert settings.num_envs * agent.experience.unroll % agent.minibatches == 0
+    assert settings.num_envs * agent.experience.unroll % agent.experience.minibatches == 0
     assert settings.chunk_steps % agent.experience.unroll == 0
 
 

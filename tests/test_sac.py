@@ -1,12 +1,14 @@
 """SAC's losses and its update against numbers worked out by hand, with networks that are linear."""
 
 import dataclasses
+from functools import partial
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+import probes
 import pytest
 from probes import quick, random_batch, tasks_of, with_nets
 
@@ -197,7 +199,7 @@ def test_an_update_is_the_one_worked_out_in_numpy(linear, settings):
     tasks = tasks_of("one-step", [0.4] if "gradients" in settings else [0.4, -0.8])
     batch = random_batch(3, len(tasks.id), BATCH, SPEC)
     before = start(agent, tasks)
-    after, metrics = quick(agent.update, before, batch, tasks, jax.random.key(1))(
+    after, metrics = quick(partial(probes.update, agent), before, batch, tasks, jax.random.key(1))(
         before, batch, tasks, jax.random.key(1)
     )
     gradients, parameters, log_temperature = plain_update(agent, before, batch, np.asarray(tasks.context))
@@ -238,6 +240,6 @@ def test_each_transition_is_seen_with_its_own_episodes_context(linear):
     before = start(agent, tasks)
     alike = batch._replace(context=jnp.broadcast_to(tasks.context[:, None], (2, BATCH, 1)))
     other = alike._replace(context=alike.context.at[0, 0].add(1.0))
-    plain, same, moved = (agent.update(before, x, tasks, key)[1]["critic_loss"] for x in (batch, alike, other))
+    plain, same, moved = (probes.update(agent, before, x, tasks, key)[1]["critic_loss"] for x in (batch, alike, other))
     np.testing.assert_allclose(plain, same, rtol=1e-5)
     assert abs(plain[0] - moved[0]) > 1e-3 and abs(plain[1] - moved[1]) < 1e-5

@@ -7,9 +7,10 @@ import pytest
 from probes import QUICK, learner, random_batch, tasks_of, tiny, with_nets
 
 from mtjax.agents import agent
+from mtjax.agents.base import Memory
 from mtjax.agents.parts.samplers import SAMPLERS, ByTemperature, Hardest, Progress, Uniform
 from mtjax.networks import Params
-from mtjax.types import InputError, Outcome, Spec
+from mtjax.types import InputError, Spec, Transition
 
 ALIKE = jnp.full(3, 0.1)
 SPEC, BATCH = Spec.vector(3, 2, 1), 4
@@ -18,10 +19,10 @@ KEY = jax.random.key(0)
 
 
 def episodes(returns, ended):
-    """One step of every environment (T, E), of which some end with these returns."""
+    """One step of every environment (T, E), of which some end with these returns, as a sampler remembers them."""
     returns, ended = jnp.float32(returns), jnp.asarray(ended)
     zeros = jnp.zeros_like(returns)
-    return Outcome(zeros, returns, ended, zeros > 0, zeros.astype(jnp.int32))
+    return Transition(None, None, zeros, zeros + 1, None, ended, memory=returns)
 
 
 def all_end(returns):
@@ -116,8 +117,8 @@ def test_weights_have_mean_one_and_a_floor(name):
 
 
 def test_uniform_weighs_nothing():
-    """And watches nothing."""
-    assert Uniform().weights(Uniform().init(3), ALIKE) is None and not tiny("sac").watches
+    """And remembers nothing."""
+    assert Uniform().weights(Uniform().init(3), ALIKE) is None and Uniform().begin() is None
 
 
 def test_an_update_weighs_losses_by_the_temperatures_of_the_time():
@@ -135,9 +136,11 @@ def test_an_update_weighs_losses_by_the_temperatures_of_the_time():
 def test_an_agent_hands_its_sampler_what_it_observes():
     """Its memory changes, and nothing else does."""
     watching = tiny("sac", sampler="hardest")
-    assert watching.watches
     state = learner(watching, TASKS, BATCH, SPEC)[0](TASKS, KEY)
-    after = watching.observe(state, all_end([1, 2, 3]))
+    reward, obs = jnp.float32([1, 2, 3]).reshape(3, 1, 1), jnp.zeros((3, 1, 1, 3))
+    memory = Memory(None, sampler=reward * 2)  # of the episodes before their last step
+    steps = Transition(obs, None, -reward, jnp.ones_like(reward), None, reward > 0, memory=memory)
+    after = watching.observe(state, steps, TASKS)
     np.testing.assert_array_equal(after.nets["sampler"].own.slow, [1, 2, 3])
     assert all(after.nets[name] is net for name, net in state.nets.items() if name not in ("sampler", "scaling"))
 

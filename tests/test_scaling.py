@@ -2,11 +2,11 @@
 
 import dataclasses
 from functools import partial
-from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import probes
 import pytest
 from probes import (
     LEARNING,
@@ -27,7 +27,6 @@ from probes import (
 
 from mtjax import normalize
 from mtjax.agents import agent
-from mtjax.agents.base import Memory
 from mtjax.agents.parts.scaling import (
     SCALINGS,
     AdaptiveScaling,
@@ -37,9 +36,10 @@ from mtjax.agents.parts.scaling import (
     ReturnScaling,
     RewardScaling,
 )
+from mtjax.agents.parts.scaling.returns import Sums
 from mtjax.experience import Replay
 from mtjax.networks import Params
-from mtjax.types import InputError, Outcome, Spec, Transition
+from mtjax.types import InputError, Spec, Transition
 
 SPEC, BATCH = Spec.vector(3, 2, 1), 4
 TASKS = tasks_of("one-step", (1.0, -0.5, 0.3))
@@ -48,24 +48,43 @@ NO_BONUS = jnp.zeros(1)
 
 
 def stream(rewards, *, ends=(), cuts=(), gamma=0.5):
-    """Outcomes of rewards (H, T, E) whose episodes all terminate after some steps and are cut off after others."""
+    """Steps with rewards (H, T, E) whose episodes all terminate after some and are cut off after others.
+
+    Their memories are after each step.
+    """
     rewards = np.float32(rewards)
     discounted = total = age = np.zeros(rewards.shape[1:], np.float32)
     for step, reward in enumerate(rewards):
         discounted, total, age = gamma * discounted + reward, total + reward, age + 1
         over = step in (*ends, *cuts)
         everywhere = lambda flag: jnp.full(rewards.shape[1:], flag)
-        outcome = (reward, total, everywhere(over), everywhere(step in ends), np.int32(age))
-        yield Outcome(*map(jnp.asarray, outcome), memory=Memory(None, jnp.asarray(discounted)))
+        sums = jax.tree.map(jnp.asarray, Sums(discounted, total, age))
+        yield steps(reward, everywhere(over), everywhere(step not in ends), sums)
         if over:
             discounted = total = age = np.zeros(rewards.shape[1:], np.float32)
 
 
-def watch(scaling, outcomes, num_tasks=2):
+def steps(reward, ended, discount, memory=None):
+    return Transition(None, None, *map(jnp.asarray, (reward, jnp.float32(discount))), None, ended, memory=memory)
+
+
+def memory_for(scaling, sums):
+    """What a scaling remembers of an episode."""
+    return {ReturnScaling: sums, ReturnNormalization: sums.discounted}.get(type(scaling))
+
+
+def watch(scaling, found, num_tasks=2):
     memory = scaling.init(num_tasks)
-    for outcome in outcomes:
-        memory = scaling.observe(memory, outcome)
+    for each in found:
+        memory = scaling.observe(memory, each._replace(memory=memory_for(scaling, each.memory)))
     return memory
+
+
+def observe(agent, state, rewards, ended=False):
+    """Show an agent the first steps (T, E) of episodes, which may be their last ones too."""
+    reward = jnp.float32(rewards)
+    found = steps(reward, jnp.full(reward.shape, ended), jnp.ones(reward.shape))
+    return probes.observe(agent, state, found._replace(obs=jnp.zeros((*reward.shape, 3))), TASKS)
 
 
 def units(scaling, memory, gamma=0.5, bonus=NO_BONUS):
@@ -155,9 +174,9 @@ def test_an_update_tells_the_scaling_what_entropy_is_worth():
     """Temperature 0.2, a target of -0.5 for each of two dimensions: half of 0.2 in a step, for two steps."""
     learner_ = agent("sac", scaling="return", gamma=0.5, initial_temperature=0.2, hidden=(4,))
     state = jax.jit(lambda: learner_.init(SPEC, TASKS, KEY), compiler_options=QUICK)()
-    state = learner_.observe(state, next(stream(np.full((1, 3, 2), 4.0))))
+    state = observe(learner_, state, np.full((3, 2), 4.0))
     batch = random_batch(0, 3, BATCH, SPEC)
-    seen = learner_.prepare(state, batch, TASKS)[1]
+    seen = probes.prepare(learner_, state, batch, TASKS)
     np.testing.assert_allclose(seen.reward, batch.reward * 10 / (4 + 2 * 0.1), rtol=1e-5)
 
 
@@ -290,10 +309,9 @@ def test_an_update_rescales_critic_and_target_beside_its_own_step():
 def test_statistics_change_by_what_is_observed_alone(name):
     """Not by learning and not by acting; and they decide what an update sees."""
     scaled = tiny("sac", scaling=name)
-    assert scaled.watches
     init, update = learner(scaled, TASKS, BATCH, SPEC)
     state, batch = init(TASKS, KEY), random_batch(0, 3, BATCH, SPEC)
-    seen = scaled.observe(state, next(stream(np.full((1, 3, 2), [[5.0], [1.0], [90.0]]))))
+    seen = observe(scaled, state, np.full((3, 2), [[5.0], [1.0], [90.0]]))
     same = lambda a, b: all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
     scales = lambda state: state.nets["scaling"]
     assert not same(scales(seen), scales(state))
@@ -303,9 +321,10 @@ def test_statistics_change_by_what_is_observed_alone(name):
     assert not np.allclose(first["critic_loss"], second["critic_loss"])
 
 
-def test_agents_without_statistics_do_not_watch():
+def test_agents_without_statistics_remember_nothing():
     """The loop saves itself the trouble."""
-    assert not tiny("sac").watches and not tiny("multi-head", scaling="popart").watches
+    for made in (tiny("sac"), tiny("multi-head", scaling="popart")):
+        assert made.scaling.begin() is None and made.sampler.begin() is None
     assert NoScaling().init(3) is None
 
 
@@ -367,15 +386,13 @@ BRIEF = {"num_envs": 2, "batch_size": 4, "replay_size": 40, "warmup_steps": 4, "
 class Diary(Stub):
     """Notes as bits in which of the steps it was reset, and how many updates it has taken since."""
 
-    watches: ClassVar[bool] = True
-
     def init(self, spec, tasks, key):
         return {"step": jnp.int32(0), "resets": jnp.int32(0), "updates": jnp.int32(0), "noise": jnp.float32(0)}
 
-    def observe(self, state, outcome):
-        return state | {"step": state["step"] + 1}
+    def assess(self, state, steps, tasks):
+        return state | {"step": state["step"] + 1}, steps
 
-    def update(self, state, batch, tasks, key):
+    def update(self, state, window, tasks, key, number):
         return state | {"updates": state["updates"] + 1}, {"updates": jnp.float32(state["updates"])}
 
     def reset_networks(self, state, spec, tasks, key):
@@ -403,8 +420,8 @@ def test_a_reset_renews_all_that_learns_and_nothing_else():
     init, update = learner(scaled, TASKS, BATCH, SPEC)
     state = init(TASKS, KEY)
     rewards = np.full((3, 3, 2), [[5.0], [1.0], [90.0]])
-    for i, outcome in enumerate(stream(rewards, ends=(1,))):
-        state = scaled.observe(state, outcome)
+    for i, reward in enumerate(rewards):
+        state = observe(scaled, state, reward, ended=i == 1)
         state, _ = update(state, random_batch(i, 3, BATCH, SPEC), TASKS, jax.random.key(i))
     key = jax.random.key(7)
     fresh, anew = init(TASKS, key), jax.jit(partial(scaled.reset_networks, spec=SPEC, tasks=TASKS, key=key))(state)
@@ -414,7 +431,7 @@ def test_a_reset_renews_all_that_learns_and_nothing_else():
     assert jax.tree.structure(given) == jax.tree.structure(anew)
     for (path, a), b in zip(jax.tree_util.tree_leaves_with_path(given), jax.tree.leaves(anew), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-6, err_msg=jax.tree_util.keystr(path))
-    assert anew.nets["inputs"].shared["moments"].count == 3 * 3 * BATCH and np.all(anew.nets["sampler"].own.known)
+    assert anew.nets["inputs"].shared["moments"].count == 3 * 3 * 2 and np.all(anew.nets["sampler"].own.known)
     assert np.all(before.factor > 0) and np.all(after.factor == 0) and np.all(after.count == 6)
     assert normalize.init(3).count == 0
 

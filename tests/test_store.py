@@ -212,14 +212,11 @@ class Reader(Stub):
     def init(self, spec, tasks, key):
         return jnp.zeros(len(tasks.id))
 
-    def join_steps(self, state, steps, tasks):
-        return jax.tree.map(lambda x: x[:, :, 0], steps)
-
     def planned(self, steps):
         return self
 
-    def update(self, state, batch, tasks, key):
-        return 0.9 * state + jnp.sum(batch.obs[..., 0], axis=1), {"seen": jnp.sum(state)}
+    def update(self, state, window, tasks, key, number):
+        return 0.9 * state + jnp.sum(window.obs[:, :, 0, 0], axis=1), {"seen": jnp.sum(state)}
 
 
 def play(directory, chunks, settings=SPILL, **changes):

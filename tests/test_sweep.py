@@ -10,6 +10,7 @@ import types
 import jax
 import jax.numpy as jnp
 import numpy as np
+import probes
 import pytest
 from conftest import SHORT_RUN
 from probes import QUICK, Walk, one_in, random_batch, tasks_of, tiny
@@ -33,7 +34,7 @@ from mtjax.training import run as run_module
 from mtjax.training.console import Console
 from mtjax.training.launch import train_objects
 from mtjax.training.run import Plan, _Progress, _Run
-from mtjax.types import InputError, Outcome, Spec
+from mtjax.types import InputError, Spec
 
 SMALL = {"num_envs": 4, "batch_size": 8, "replay_size": 200, "warmup_steps": 5, "chunk_steps": 20}
 
@@ -107,12 +108,12 @@ def test_every_number_can_vary(name, settings):
     def everything(knobs):
         varied, key = SweptAgent(agent), jax.random.key(0)
         state = varied.init(spec, tasks, key, knobs)
-        state, _ = varied.update(state, random_batch(0, 2, 4), tasks, key)
-        one = jnp.ones((2, 3))
+        state, _ = probes.update(varied, state, probes.with_memory(agent, random_batch(0, 2, 4)), tasks, key)
         task = jax.tree.map(lambda x: x[0], tasks)
         memory = varied.begin(state, task)
-        everywhere = jax.tree.map(lambda x: jnp.broadcast_to(x, (2, 3, *x.shape)), memory)
-        state = varied.observe(state, Outcome(one, one, one > 0, one < 0, jnp.int32(one), everywhere))
+        everywhere = jax.tree.map(lambda x: jnp.broadcast_to(x, (2, 1, 3, *x.shape)), memory)
+        steps = jax.tree.map(lambda x: x.reshape(2, 1, 3, *x.shape[2:]), random_batch(0, 2, 3))
+        state = varied.observe(state, steps._replace(ended=steps.discount == 0, memory=everywhere), tasks)
         state = varied.reset_networks(state, spec, tasks, key)
         return varied.act(state, memory, jnp.zeros(1), task, key).action
 
@@ -153,7 +154,7 @@ def test_a_point_trains_as_the_run_with_its_values():
         compared = lambda state: ([state.nets[name] for name in _COMPARED], state.slow)
         same = lambda x, y, rows=rows: np.testing.assert_allclose(x[rows], y, rtol=2e-3, atol=2e-4)
         jax.tree.map(same, compared(learned), compared(alone.agent))
-        discounted, of_alone = (x.worlds.memory.scaling for x in (state, alone))
+        discounted, of_alone = (x.worlds.memory.scaling.discounted for x in (state, alone))
         np.testing.assert_allclose(discounted[rows], of_alone, rtol=1e-4, atol=1e-5)
         np.testing.assert_allclose(metrics["return"][rows], its_metrics["return"], rtol=1e-4)
     first, second = (plain[p][0].agent.nets["critic"] for p in range(2))

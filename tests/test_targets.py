@@ -115,7 +115,7 @@ def test_vtrace_converges_to_the_value_of_the_clipped_policy():
     played = Transition(None, None, jnp.float32(rewards[states, actions]), jnp.ones((12, count)), None, states < 0)
     log_ratio = jnp.float32(np.log(pi[states, actions] / mu[states, actions]))
     value = np.zeros(3)
-    for i in range(400):
+    for _ in range(400):
         found = targets.vtrace(played, *(jnp.float32(value[x]) for x in (states, following)), log_ratio, gamma, 1.0)
         error = np.asarray(found.target) - value[states]
         value += [0.3 * error[states == s].mean() for s in range(3)]

@@ -1,14 +1,17 @@
 """Whose turn it is to learn: the actor at some updates of the critics, and the agent after some of the steps."""
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+import probes
 import pytest
 from probes import Stub, Walk, learner, one_in, quick, random_batch, tasks_of, tiny, train
 
+from mtjax import loop
 from mtjax.experience import Replay
 from mtjax.maps import when
 from mtjax.saved.points import SweptAgent
@@ -46,13 +49,14 @@ def test_an_update_in_the_actors_turn_is_the_whole_one_and_another_leaves_the_ac
     init, update = learner(agent, TASKS, 4, SPEC)
     state, batch = init(TASKS, KEY), random_batch(0, 2, 4, SPEC)
     whole, metrics = update(state, batch, TASKS, KEY)
-    in_turn = quick(agent.update, state, batch, TASKS, KEY, jnp.bool_(True))
-    again, sometimes = in_turn(state, batch, TASKS, KEY, jnp.bool_(True))
+    rare = tiny("sac", **settings, experience=Replay(policy_delay=2))
+    in_turn = quick(partial(probes.update, rare), state, batch, TASKS, KEY, jnp.int32(1))
+    again, sometimes = in_turn(state, batch, TASKS, KEY, jnp.int32(1))
     jax.tree.map(np.testing.assert_array_equal, again, whole)
     np.testing.assert_array_equal(sometimes["actor_loss"].value, metrics["actor_loss"])
     np.testing.assert_array_equal(sometimes["critic_loss"], metrics["critic_loss"])
 
-    critics, others = in_turn(state, batch, TASKS, KEY, jnp.bool_(False))
+    critics, others = in_turn(state, batch, TASKS, KEY, jnp.int32(2))
     for name in ("critic", "representation", "inputs"):
         jax.tree.map(np.testing.assert_array_equal, critics.nets[name], whole.nets[name])
     jax.tree.map(np.testing.assert_array_equal, critics.slow, whole.slow)
@@ -64,9 +68,10 @@ def test_an_update_in_the_actors_turn_is_the_whole_one_and_another_leaves_the_ac
 
 def test_turns_pass_through_a_sweep():
     """The swept agent hands them on."""
-    agent, batch = SweptAgent(tiny("sac")), random_batch(0, 2, 4, SPEC)
+    agent, batch = SweptAgent(tiny("sac", experience=Replay(policy_delay=2))), random_batch(0, 2, 4, SPEC)
     state = agent.init(SPEC, TASKS, KEY, {"actor_lr": jnp.float32(0.1)})
-    after, _ = quick(agent.update, state, batch, TASKS, KEY, jnp.bool_(False))(state, batch, TASKS, KEY, False)
+    update, first = partial(probes.update, agent), jnp.int32(0)
+    after, _ = quick(update, state, batch, TASKS, KEY, first)(state, batch, TASKS, KEY, first)
     fits = after.learner.fits
     assert count(fits["critic"].optimizer) == 1 and count(fits["actor"].optimizer) == 0
 
@@ -90,12 +95,13 @@ def test_the_actors_gradient_is_behind_a_branch_for_any_number_of_seeds(seeds):
         replay = Replay(updates_per_step=3, batch_size=4, replay_size=8, policy_delay=delay)
         agent = tiny("sac", experience=replay)
 
-        def learn(keys, agent=agent, replay=replay):
+        def learn(keys, iteration, agent=agent, replay=replay):
             item = jax.tree.map(lambda x: x[0, 0], random_batch(0, 2, 4, SPEC))
             states = jax.vmap(lambda key: agent.init(SPEC, TASKS, key))(keys)
-            return agent.learn(Walk(), states, replay.init(item, SPEC, 2, 4, keys), TASKS, keys)
+            data = replay.init(item, SPEC, 2, 4, keys)
+            return loop._learn(Walk(), agent, TASKS, states, data, iteration, keys)
 
-        found[delay] = branches(jax.make_jaxpr(learn)(jax.random.split(KEY, seeds)).jaxpr)
+        found[delay] = branches(jax.make_jaxpr(learn)(jax.random.split(KEY, seeds), jnp.int32(5)).jaxpr)
     assert found == {1: 1, 2: 2}  # whether to learn at all, and the actor's turn
 
 
@@ -103,11 +109,11 @@ def test_the_actors_gradient_is_behind_a_branch_for_any_number_of_seeds(seeds):
 class Turns(Stub):
     """Counts its updates, and reports the count as a metric of the actor's turns."""
 
-    def update(self, state, batch, tasks, key, turn=None):
-        number = state + 1
-        metrics = {"all": jnp.broadcast_to(number, len(tasks.id))}
+    def update(self, state, window, tasks, key, number):
+        turn = (number + 1) % self.experience.policy_delay == 0
+        metrics = {"all": jnp.broadcast_to(jnp.float32(number + 1), len(tasks.id))}
         _, own = when(turn, lambda state: (state, {"own": metrics["all"]}), state)
-        return number, metrics | Sometimes.over(own, turn)
+        return state + 1, metrics | Sometimes.over(own, turn)
 
     def init(self, spec, tasks, key):
         return jnp.float32(0)
@@ -140,7 +146,7 @@ class Recorder(Stub):
     def choose(self, state, obs, task, key):
         return jnp.full(1, 2.0)
 
-    def update(self, state, batch, tasks, key):
+    def update(self, state, window, tasks, key, number):
         return {**state, "updates": state["updates"] + 1}, {"loss": jnp.float32(tasks.id)}
 
     def reset_networks(self, state, spec, tasks, key):

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import probes
 import pytest
 from probes import act, learner, of_task, pick, quick, random_batch, slow_but, tasks_of, tiny
 
@@ -28,7 +29,7 @@ def started(**settings):
 def both_ends(made, state, batch, key):
     """Inputs of the critics (T, 2 B, x) at both ends of the transitions, as the update with this key draws actions."""
     target_key = jax.random.split(key, 4)[0]
-    state, seen = made.prepare(state, batch, TASKS)
+    seen = probes.prepare(made, state, batch, TASKS)
     _, aim = made.critic_data(state, seen, target_key)
     ends = (batch.obs, batch.action), (batch.next_obs, aim.next_action)
     return np.concatenate([np.concatenate(end, axis=-1) for end in ends], axis=1)
@@ -41,7 +42,7 @@ def test_targets_are_normalised_by_both_ends_of_the_batch_and_not_by_running_sta
 
     @jax.jit
     def target(state, batch):
-        state, seen = made.prepare(state, batch, TASKS)
+        seen = probes.prepare(made, state, batch, TASKS)
         return made.critic_data(state, seen, KEY)[1].target
 
     as_it_is = np.asarray(target(state, batch))
@@ -188,7 +189,7 @@ def test_a_task_is_seen_though_its_features_are_the_same_in_all_of_its_batch():
 def test_both_ends_are_normalised_together():
     """Outputs at the first end depend on the second, and each critic has its own statistics."""
     made, state, _ = started()
-    _, batch = made.prepare(state, random_batch(0, 3, BATCH, SPEC), TASKS)
+    batch = probes.prepare(made, state, random_batch(0, 3, BATCH, SPEC), TASKS)
     batch = pick(batch._replace(mask=None, model_targets=None), 0)
     nets = of_task(state.nets, 0)
     ends = quick(made.q_of_both, nets, batch, batch.action)

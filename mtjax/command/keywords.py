@@ -144,7 +144,7 @@ def _require_learning(env: Any, agent: Any, directory: Any) -> None:
     if not isinstance(env, str) and (isinstance(env, type) or not hasattr(env, "reset_worlds")):
         several = "; mtjax.mixture takes several" if isinstance(env, list | tuple) else ""
         raise InputError(f"env is the name of a family, or what mtjax.make returns; not {_kind(env)}{several}")
-    if not isinstance(agent, str) and (isinstance(agent, type) or not hasattr(agent, "learn")):
+    if not isinstance(agent, str) and (isinstance(agent, type) or not hasattr(agent, "update")):
         raise InputError(f"agent is a name such as 'care', or what mtjax.agent returns; not {_kind(agent)}")
     if directory is not None or isinstance(env, str) or isinstance(agent, str):
         raise InputError("names and a run's folder need an environment derived from Family and an agent from BaseAgent")

@@ -240,13 +240,12 @@ class Replay:
 
     def joined(self, window: Transition, gamma: Array) -> Transition:
         """Join windows (T, B, L, ...) to transitions (T, B, ...), for discounts (T,) of the tasks."""
-        length = window.reward.shape[2]
-        if shown(window.obs):
-            join = partial(pictures.join, frames=pictures.frames(length, self.n_step), n_step=self.n_step)
-            return jax.vmap(join)(window, gamma)
+        length, join = window.reward.shape[2], multistep.join
         if length == 1:
             return jax.tree.map(lambda x: x[:, :, 0], window)
-        return jax.vmap(multistep.join)(window, gamma)
+        if shown(window.obs):
+            join = partial(pictures.join, frames=pictures.frames(length, self.n_step), n_step=self.n_step)
+        return jax.vmap(join)(window, gamma)
 
 
 def _single(rows: Transition, axis: int) -> Transition:
