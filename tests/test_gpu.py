@@ -18,10 +18,9 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-import probes
 import pytest
 from needs import needs
-from probes import random_batch, with_nets
+from probes import learn, random_batch, update, with_memory, with_nets
 from test_joined import require_as_alone
 from test_kills import outcome
 from test_painters import SIZE, similarity, states_of
@@ -30,9 +29,10 @@ from test_rocking import ROCKING, tilting
 import mtjax
 from mtjax import loop, rollout
 from mtjax.agents import AGENTS
+from mtjax.agents.base import Memory
 from mtjax.agents.choices import replace
+from mtjax.agents.on_policy import Taken
 from mtjax.agents.parts.values import C51
-from mtjax.agents.ppo import Taken
 from mtjax.compiling.programs import compile_lowered
 from mtjax.config import configure
 from mtjax.envs.engines.base import World
@@ -114,7 +114,7 @@ def learned(name, tasks):
     """
     agent = mtjax.preset("finger-spin-vary-size", name, "gpu").learner
     if not hasattr(agent, "critic_target"):
-        agent = replace(agent, {"epochs": 1, "minibatches": 1})
+        agent = replace(agent, {"epochs": 1, "minibatches": 1, "unroll": 8})
     random = np.random.default_rng(0)
     shake = lambda x: x + np.float32(0.1 * random.normal(size=x.shape)) if x.dtype == np.float32 else x
     with on("cpu"):
@@ -316,14 +316,16 @@ def test_a_checkpoint_is_the_state_of_when_it_was_saved(tmp_path, monkeypatch, r
 def experience(agent, num_seeds, num_tasks):
     """Batches (S, T, B, ...), or rollouts (S, T, H, E, ...) for agents that learn from these."""
     batches = [random_batch(seed, num_tasks, 64, SPEC, agent.history_length) for seed in range(num_seeds)]
-    batch = jax.tree.map(lambda *x: np.stack(x), *batches)
+    batch = jax.tree.map(lambda *x: np.stack(x), *(with_memory(agent, batch) for batch in batches))
     if hasattr(agent, "critic_target"):
         return batch
     steps = jax.tree.map(lambda x: x.reshape(*x.shape[:2], 8, 8, *x.shape[3:]), batch)
     random = np.random.default_rng(0)
     raw = np.arctanh(np.clip(steps.action, -0.99, 0.99))
     ended = random.random(steps.reward.shape) < 0.1
-    return steps._replace(ended=ended, extras=Taken(raw, random.normal(size=ended.shape).astype(np.float32) - 2, None))
+    memory = Memory(None) if steps.memory is None else steps.memory
+    taken = Taken(raw, random.normal(size=ended.shape).astype(np.float32) - 2)
+    return steps._replace(ended=ended, extras=taken, memory=memory)
 
 
 @pytest.mark.parametrize("name", AGENTS)
@@ -344,10 +346,9 @@ def test_agents_learn_as_on_the_cpu(name, num_tasks=10):
 
 
 def updating(agent):
-    """An update of every seed."""
-    return lambda states, data, keys, tasks: jax.vmap(lambda s, d, k: probes.update(agent, s, d, tasks, k))(
-        states, data, keys
-    )
+    """An update of every seed, or for agents that learn from rollouts all that they learn from one."""
+    take = update if hasattr(agent, "critic_target") else learn
+    return lambda states, data, keys, tasks: jax.vmap(lambda s, d, k: take(agent, s, d, tasks, k))(states, data, keys)
 
 
 def require_alike(expected, found):

@@ -1,10 +1,12 @@
 """Targets against plain loops, and against each other where theory says that they are the same."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from mtjax.agents.parts import targets
+from mtjax.envs import make
 from mtjax.types import Transition
 
 GAMMA, LAMBDA = 0.9, 0.8
@@ -93,30 +95,31 @@ def test_retrace_cuts_by_the_ratio_of_the_next_action():
 
 
 def test_vtrace_converges_to_the_value_of_the_clipped_policy():
-    """On a process with known chances (Espeholt et al. 2018, theorem 1): mu acts, pi is asked for."""
-    random = np.random.default_rng(0)
-    chances = random.dirichlet(np.ones(3), size=(3, 2))  # (state, action, next state)
-    rewards, gamma = random.random((3, 2)), 0.8
-    pi, mu = (random.dirichlet(np.ones(2), size=3) for _ in range(2))
+    """On the tabular process, whose chances are known (Espeholt et al. 2018, theorem 1): mu acts, pi is asked for."""
+    random, gamma, length, count = np.random.default_rng(0), 0.8, 12, 4000
+    tables = jax.tree.map(lambda x: np.asarray(x[0], float), make("tabular-mdp", num_tasks=1).tasks().goal)
+    chances, rewards = tables["transitions"], tables["rewards"]  # (state, action, next state), (state, action)
+    num_states, num_actions = rewards.shape
+    pi, mu = (random.dirichlet(np.ones(num_actions), size=num_states) for _ in range(2))
     clipped = np.minimum(mu, pi)  # min(1, pi / mu) mu
     clipped /= clipped.sum(axis=1, keepdims=True)
     moves, gains = np.einsum("sa,sax->sx", clipped, chances), np.einsum("sa,sa->s", clipped, rewards)
-    exact = np.linalg.solve(np.eye(3) - gamma * moves, gains)
+    exact = np.linalg.solve(np.eye(num_states) - gamma * moves, gains)
 
-    count = 4000
-    states, actions = np.zeros((12, count), int), np.zeros((12, count), int)
-    states[0], following = random.integers(3, size=count), np.zeros((12, count), int)
-    for t in range(12):
-        actions[t] = random.random(count) < mu[states[t], 1]
-        chosen = chances[states[t], actions[t]].cumsum(axis=-1)
-        following[t] = np.minimum((random.random((count, 1)) > chosen).sum(axis=-1), 2)
-        if t < 11:
-            states[t + 1] = following[t]
-    played = Transition(None, None, jnp.float32(rewards[states, actions]), jnp.ones((12, count)), None, states < 0)
-    log_ratio = jnp.float32(np.log(pi[states, actions] / mu[states, actions]))
-    value = np.zeros(3)
+    draw = lambda shares: np.minimum(
+        (random.random((count, 1)) > shares.cumsum(axis=-1)).sum(axis=-1), shares.shape[1] - 1
+    )
+    now, played = random.integers(num_states, size=count), []
+    for _ in range(length):
+        action = draw(mu[now])
+        then = draw(chances[now, action])
+        played.append((now, action, then))
+        now = then
+    state, action, following = (np.stack(x) for x in zip(*played, strict=True))
+    steps = Transition(None, None, jnp.float32(rewards[state, action]), jnp.ones((length, count)), None, state < 0)
+    log_ratio, value = jnp.float32(np.log(pi[state, action] / mu[state, action])), np.zeros(num_states)
     for _ in range(400):
-        found = targets.vtrace(played, *(jnp.float32(value[x]) for x in (states, following)), log_ratio, gamma, 1.0)
-        error = np.asarray(found.target) - value[states]
-        value += [0.3 * error[states == s].mean() for s in range(3)]
+        found = targets.vtrace(steps, *(jnp.float32(value[x]) for x in (state, following)), log_ratio, gamma, 1.0)
+        error = np.asarray(found.target) - value[state]
+        value += [0.3 * error[state == s].mean() for s in range(num_states)]
     np.testing.assert_allclose(value, exact, rtol=0.02)

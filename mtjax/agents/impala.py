@@ -71,7 +71,7 @@ class IMPALA(OnPolicy):
         return nets | ({"lag": Params({"rollouts": jnp.int32(0)}, {})} if self.actor_lag else {})
 
     def init_slow(self, nets: Nets) -> Nets:
-        lagging = {name: nets[name] for name in ("actor", "knowing")} if self.actor_lag else {}
+        lagging = {name: nets[name] for name in ("actor", "knowing", "inputs")} if self.actor_lag else {}
         return super().init_slow(nets) | jax.tree.map(jnp.copy, lagging)
 
     def act(self, state: AgentState, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:

@@ -1,0 +1,149 @@
+"""A recurrent memory of the task: what it keeps, how it learns through windows, and what it is refused with."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from probes import Walk, of_task, pick, quick, tasks_of, tiny, train
+
+from mtjax import agents
+from mtjax.agents.base import Memory
+from mtjax.agents.on_policy import Taken
+from mtjax.agents.parts.knowing.recurrent import Following, Recurrent, Track
+from mtjax.agents.ppo import PPO
+from mtjax.types import InputError, Spec, Transition
+
+SPEC, LENGTH, ENVS, SIZE = Spec.vector(3, 2, 1), 6, 4, 5
+TASKS = tasks_of("one-step", (1.0, -0.5, 0.3))
+KEY = jax.random.key(2)
+RECURRENT = {"conditioning": "recurrent", "recurrent_size": SIZE}
+
+
+def rollout(seed=0):
+    """Rollouts (T, H, E, ...) in which every field is random; memories are told for the first step alone."""
+    random, shape = np.random.default_rng(seed), (3, LENGTH, ENVS)
+    normal = lambda *size: jnp.float32(random.normal(size=(*shape, *size)))
+    raw = normal(2)
+    return Transition(
+        obs=normal(3),
+        action=jnp.tanh(raw),
+        reward=normal(),
+        discount=jnp.ones(shape),
+        next_obs=normal(3),
+        ended=jnp.asarray(random.random(shape) < 0.3),
+        extras=Taken(raw, normal() - 2),
+        memory=Memory(None, normal(SIZE)),
+    )
+
+
+def test_states_over_a_window_are_those_of_steps_one_by_one():
+    """With what acting remembers, and anew after the end of an episode."""
+    knowing, steps = Recurrent(SIZE), pick(rollout(), 0)
+    params = knowing.init(3, jax.tree.map(lambda x: x[0, 0], steps), jnp.zeros(2), False, KEY).shared
+    window = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), steps)  # (E, H, ...)
+    flat = lambda x: x.reshape(-1, *x.shape[2:])
+    rest = (window.obs, window.action, window.reward, window.ended, window.ended)
+    track = Track(window.memory.hidden[:, 0], *map(flat, rest))
+    found = quick(knowing.over, params, track)(params, track)
+    before, after = (x.reshape(ENVS, LENGTH, SIZE) for x in found)
+    one = jax.jit(lambda hidden, step: knowing.remember(params, hidden, step))
+    for world in range(ENVS):
+        hidden = window.memory.hidden[world, 0]
+        for t in range(LENGTH):
+            np.testing.assert_allclose(before[world, t], hidden, atol=1e-5)
+            hidden = one(hidden, pick(window, (world, t)))
+            np.testing.assert_allclose(after[world, t], hidden, atol=1e-5)
+            hidden = jnp.where(window.ended[world, t], knowing.begin(), hidden)
+    features = lambda past: knowing.features(params, jnp.zeros(0), dataclasses.make_dataclass("Seen", ["past"])(past))
+    np.testing.assert_array_equal(features(track), found[0])
+    np.testing.assert_array_equal(features(Following(*track)), found[1])
+
+
+class Ratios(PPO):
+    """Tells how far the ratio of policies is from 1 at most."""
+
+    def gain(self, log_ratio, batch):
+        gain, metrics = super().gain(log_ratio, batch)
+        return gain, metrics | {"ratio": jnp.max(jnp.abs(jnp.exp(log_ratio) - 1))}
+
+
+def test_the_policy_that_learns_is_the_one_that_played():
+    """The states that a window tells are those with which its actions were drawn, so that every ratio begins at 1."""
+    agent = tiny("ppo", epochs=1, minibatches=1, **RECURRENT)
+    agent = Ratios(**{field.name: getattr(agent, field.name) for field in dataclasses.fields(agent)})
+    _, history = train(Walk(episode_length=7), agent, {"num_envs": 4, "unroll": 5, "chunk_steps": 60})
+    assert history[0]["ratio"].max() < 1e-5 and np.all(history[0]["bad_step"] == -1)
+
+
+def test_each_loss_trains_the_memory_that_it_sees():
+    """In PPO actor and critic, through all steps of a window; in SAC the critics alone."""
+    agent = tiny("ppo", unroll=LENGTH, epochs=1, minibatches=1, **RECURRENT)
+    state, steps = agent.init(SPEC, TASKS, KEY), rollout()
+    state, steps = agent.assess(state, steps, TASKS)
+    state, batch = agent.prepare(state, agent.experience.windows(steps, agent.unroll), TASKS)
+    nets, one = of_task(state.nets, 0), pick(batch._replace(mask=None), 0)
+    of_actor = jax.grad(lambda nets: agent.actor_loss(nets, one, KEY)[0])(nets)["knowing"]
+    of_critic = jax.grad(lambda nets: agent.critic_loss(nets, one)[0])(nets)["knowing"]
+    for slope in (of_actor, of_critic):
+        assert all(np.any(np.asarray(x) != 0) for x in jax.tree.leaves(slope))
+    assert agent.fits["actor"].names == ("actor", "knowing") and "knowing" in agent.fits["critic"].names
+    assert "knowing" not in tiny("sac", **RECURRENT).fits["actor"].names
+
+
+def test_values_at_the_end_of_a_window_know_the_last_step():
+    """What follows a step is judged with the state after it, also if the episode's memory begins anew there."""
+    agent = tiny("ppo", unroll=LENGTH, gae_lambda=0.0, advantage_normalization="none", **RECURRENT)
+    agent = dataclasses.replace(agent, value_normalization="none", normalize_observations=False)
+    state, steps = agent.init(SPEC, TASKS, KEY), rollout()
+    critic = state.nets["critic"]
+    wide = critic._replace(shared=critic.shared | {"head": jax.tree.map(lambda x: 1e3 * x, critic.shared["head"])})
+    state = state._replace(nets=state.nets | {"critic": wide})
+    _, found = agent.assess(state, steps, TASKS)
+    nets, knowing = of_task(state.nets, 0), agent.conditioning
+    for world in range(ENVS):
+        hidden = steps.memory.hidden[0, 0, world]
+        for t in range(LENGTH):
+            step = pick(steps, (0, t, world))
+            after = knowing.remember(nets["knowing"].parts, hidden, step)
+            value = lambda obs, features: agent.critic.apply(nets["critic"], features, obs)[0]
+            error = step.reward + agent.gamma * value(step.next_obs, after) - value(step.obs, hidden)
+            assert float(found.extras.advantage[0, t, world]) == pytest.approx(float(error), rel=1e-3, abs=1e-2)
+            hidden = jnp.where(step.ended, knowing.begin(), after)
+
+
+def test_sac_learns_from_windows_that_begin_with_the_stored_state():
+    """All steps of a window count, and another stored state gives other losses."""
+    agent = tiny("sac", recurrent_steps=4, **RECURRENT)
+    state = agent.init(SPEC, TASKS, KEY)
+    steps = jax.tree.map(lambda x: jnp.swapaxes(x, 1, 2)[:, :, :4], rollout()._replace(extras=None))  # (T, B, L, ...)
+    batch = agent.prepare(state, steps, TASKS)
+    assert batch.reward.shape == (3, ENVS * 4)
+    np.testing.assert_array_equal(batch.obs.past.state, steps.memory.hidden[:, :, 0])
+    update = jax.jit(lambda steps: agent.update(state, steps, TASKS, KEY, jnp.int32(0))[1]["critic_loss"])
+    other = steps._replace(memory=Memory(None, steps.memory.hidden + 1.0))
+    later = steps._replace(memory=Memory(None, steps.memory.hidden.at[:, :, 1:].add(1.0)))
+    assert not np.allclose(update(steps), update(other)) and np.allclose(update(steps), update(later))
+
+
+def test_a_run_with_a_recurrent_memory_stays_finite():
+    """With a replay, and as many steps as a window before the first update."""
+    given = {"num_envs": 2, "batch_size": 4, "replay_size": 60, "warmup_steps": 4, "chunk_steps": 16}
+    _, (metrics,) = train(Walk(), tiny("sac", recurrent_steps=4, **RECURRENT), given, seeds=(0, 1))
+    assert np.all(metrics["bad_step"] == -1) and np.all(np.isfinite(metrics["critic_loss"]))
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "message"),
+    [
+        ("sac", {"n_step": 3, "warmup_steps": 50}, "needs n-step=1"),
+        ("sac", {"hindsight": 0.5, "warmup_steps": 50}, "hindsight=0"),
+        ("sac", {"warmup_steps": 3, "recurrent_steps": 5}, "warmup-steps of at least 4, not 3"),
+        ("hip-bmdp", {"unseen_theta": "inferred"}, "two memories of an episode"),
+        ("ppo", {"recurrent_size": 0}, "recurrent-size must be at least 1"),
+    ],
+)
+def test_what_a_memory_cannot_do_is_refused(name, settings, message):
+    with pytest.raises(InputError, match=message):
+        agents.agent(name, conditioning="recurrent", **settings)
