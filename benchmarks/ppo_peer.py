@@ -201,7 +201,8 @@ def ours(arguments: argparse.Namespace, name: str, side: str, seed: int) -> tupl
     import mtjax
     from mtjax.compiling.programs import enable_compile_cache
     from mtjax.config import configure
-    from mtjax.training.launch import train_objects
+    from mtjax.training.launch import launch
+    from mtjax.training.run import Hooks
 
     enable_compile_cache()
     config = mtjax.preset(ENVS[name], "ppo", "gpu")
@@ -220,16 +221,11 @@ def ours(arguments: argparse.Namespace, name: str, side: str, seed: int) -> tupl
         spent[0] += parts.since_start() - seconds[1]
         show(side, points[-1])
 
-    train_objects(
-        *(config.family, agent),
-        steps=int(arguments.steps),
-        seed=seed,
-        eval_every=int(arguments.evaluate_every),
-        eval_episodes=arguments.episodes,
-        settings=settings,
-        on_chunk=begin,
-        on_evaluation=note,
-    )
+    plan = {"steps": int(arguments.steps), "eval_every": int(arguments.evaluate_every)}
+    plan = dataclasses.replace(config.plan, seed=seed, seeds=1, eval_episodes=arguments.episodes, **plan)
+    config = dataclasses.replace(config, plan=plan, training=settings, learner=agent)
+    config.check()
+    launch(config, Hooks(on_chunk=begin, on_evaluation=note, quiet=True))
     family, batch = config.family, settings.num_envs * agent.experience.unroll
     choices = {
         "worlds": settings.num_envs,

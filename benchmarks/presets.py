@@ -27,9 +27,9 @@ from report import markdown, note_origin, read_lines, run_main, write_lines
 from resumable import train
 from returns import FAMILIES, value
 
+from mtjax.agents.swept import Point
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import configure, with_preset
-from mtjax.saved.points import Point
 from mtjax.training.run import Result
 
 _RATES = ("actor_lr", "critic_lr", "temperature_lr")

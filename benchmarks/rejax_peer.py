@@ -93,7 +93,6 @@ def ours(steps: int, seeds: int, side: str) -> dict[str, Any]:
     """Train by PPO, all seeds in one program, and return seconds and final returns."""
     import mtjax
     from mtjax.config import configure
-    from mtjax.training.launch import train_objects
 
     config = mtjax.preset("brax-hopper", "ppo", "gpu")
     agent, settings = config.learner, config.training
@@ -102,9 +101,16 @@ def ours(steps: int, seeds: int, side: str) -> dict[str, Any]:
         rate = TUNED["learning_rate"]
         given |= {"actor_lr": rate, "critic_lr": rate, "gamma": TUNED["gamma"], "normalize_observations": True}
         agent, settings = configure(agent, settings, given)
-    result = train_objects(
+    result = mtjax.train(
         *(config.family, agent),
-        **{"steps": steps, "seeds": seeds, "eval_every": steps, "eval_episodes": _EPISODES, "settings": settings},
+        **{
+            "steps": steps,
+            "seeds": seeds,
+            "eval_every": steps,
+            "eval_episodes": _EPISODES,
+            "settings": settings,
+            "quiet": True,
+        },
     )
     returns = result.evaluations.returns["train"][:, -1].mean(axis=(1, 2))
     return {

@@ -26,9 +26,9 @@ import parts
 from report import markdown, record, run_main
 from returns import value
 
+import mtjax
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import configure, with_preset
-from mtjax.training.launch import train_objects
 
 
 class Range(NamedTuple):
@@ -104,8 +104,9 @@ def measure(arguments: argparse.Namespace, name: str, tasks: int) -> None:
     config = with_preset(name, arguments.agent, arguments.preset, split="none", **tasks_of(name, tasks))
     given = {key: value(x) for key, x in (word.split("=", 1) for word in arguments.given)}
     agent, played = configure(config.learner, config.training, given)
-    run = lambda **more: train_objects(
-        *(config.family, agent), seed=arguments.seed, settings=played, eval_episodes=max(1, 20 // tasks), **more
+    run = lambda **more: mtjax.train(
+        *(config.family, agent),
+        **{"seed": arguments.seed, "settings": played, "eval_episodes": max(1, 20 // tasks), "quiet": True, **more},
     )
     chunk = played.chunk_steps * played.num_envs * tasks
     begun = time.monotonic()

@@ -20,8 +20,8 @@ import numpy as np
 from report import machine, markdown
 
 import mtjax
+from mtjax.agents.swept import SweptAgent, sweepable
 from mtjax.envs.probes import tasks_of
-from mtjax.saved.points import SweptAgent, sweepable
 from mtjax.types import Spec, Transition
 
 TASKS, BATCH, UPDATES, ROUNDS = 10, 64, 20, 7

@@ -9,7 +9,7 @@ if TYPE_CHECKING:  # for editors, which do not run __getattr__
     from mtjax import report as report
     from mtjax.agents import AGENTS as AGENTS
     from mtjax.agents import agent as agent
-    from mtjax.command.keywords import train as train
+    from mtjax.command.api import train as train
     from mtjax.config import with_preset as preset  # noqa: F401
     from mtjax.envs import ENVS as ENVS
     from mtjax.envs import make as make
@@ -50,7 +50,7 @@ _HOME = {
     "register": "mtjax.registry",
     "runs": "mtjax.report.collect",
     "stacked": "mtjax.envs",
-    "train": "mtjax.command.keywords",
+    "train": "mtjax.command.api",
 }
 __all__ = [*_HOME, "report"]
 _find, __dir__ = lazily(__name__, _HOME)

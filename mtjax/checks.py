@@ -1,6 +1,7 @@
 """Checks of values that Python or a file gives. On a command line, tyro does the same."""
 
 import dataclasses
+import importlib
 import numbers
 import os
 from collections.abc import Mapping
@@ -190,3 +191,16 @@ def require_run(folder: Path) -> None:
     inside = max(folder.glob("*/config.json"), key=lambda file: file.stat().st_mtime, default=None)
     hint = "" if inside is None else f"; it holds runs, the newest is {str(inside.parent)!r}"
     raise InputError(f"{str(folder)!r} is not a run: it has no config.json{hint}")
+
+
+def require_library(module: str) -> Any:
+    """Import and return a library.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        extra = module.removesuffix("X")
+        raise InputError(f"--{extra} needs {module}: pip install 'mtjax[{extra}]'") from None

@@ -1,9 +1,7 @@
 """The configuration of a run: names, presets and settings, read from and written to JSON."""
 
 import dataclasses
-import json
 import math
-import shlex
 import sys
 import tomllib
 from collections.abc import Collection, Mapping
@@ -15,20 +13,22 @@ from typing import Annotated, Any, Literal
 
 import jax
 import tyro
+from jax.sharding import Mesh
 
-from mtjax import __version__
-from mtjax.agents import AGENTS, BaseAgent, agent, preset_of, settings
+from mtjax.agents import BaseAgent, agent, preset_of
 from mtjax.agents.choices import kinds_of, replace
 from mtjax.agents.parts import name_of
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.values import VALUES
-from mtjax.checks import MOST_EPISODES, check_fields, require_run, require_text, require_values
-from mtjax.envs import ENVS, is_mixture, make, members
+from mtjax.agents.swept import agents_at
+from mtjax.checks import MOST_EPISODES, check_fields, path, require_library, require_text
+from mtjax.envs import make, members
 from mtjax.envs.tabled import Tabled
-from mtjax.evaluation import Evaluations, load_evaluations, no_evaluations, require_same_run
 from mtjax.experience import Replay
+from mtjax.frames import shown
 from mtjax.loop import Settings
-from mtjax.names import PRESETS, SPLITS, is_imported, nearest_error, public
+from mtjax.names import PRESETS, nearest_error, public
+from mtjax.parallel.mesh import mesh_for
 from mtjax.types import InputError
 
 TUNED_TASKS = 10
@@ -67,6 +67,11 @@ class Plan:
     def all_seeds(self) -> range:
         """Return the seeds that are trained at once."""
         return range(self.seed, self.seed + self.seeds)
+
+    @property
+    def interval(self) -> int:
+        """Return the environment steps between evaluations."""
+        return self.eval_every or math.ceil(self.steps / 10)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,6 +143,66 @@ class RunConfig:
         """Return the environment steps of a run under random actions, before learning begins."""
         return self.learner.experience.warmup_steps * self.worlds
 
+    @cached_property
+    def played(self) -> Settings:
+        """Return the training settings with the chunks that are played, which divide the run evenly."""
+        return fit_chunk(self.training, self.num_tasks, self.plan.steps, self.learner.experience.steps)
+
+    @property
+    def steps_per_chunk(self) -> int:
+        """Return the environment steps of a chunk that is played, summed over tasks."""
+        return self.played.chunk_steps * self.worlds
+
+    @property
+    def length(self) -> int:
+        """Return the steps that every environment plays, in whole chunks."""
+        return math.ceil(self.plan.steps / self.steps_per_chunk) * self.played.chunk_steps
+
+    @property
+    def longest(self) -> int:
+        """Return the iterations of a chunk, were the run of many steps."""
+        many = self.training.num_envs * self.training.chunk_steps
+        return fit_chunk(self.training, 1, many, self.learner.experience.steps).chunk_steps
+
+    @cached_property
+    def mesh(self) -> Mesh | None:
+        """Return the devices of the run, or None for a single one.
+
+        Raises:
+            InputError: they cannot share its seeds and worlds evenly.
+        """
+        return mesh_for(self.plan.seeds * max(len(self.points), 1), self.num_tasks, self.training.num_envs)
+
+    def check(self) -> None:
+        """Check the configuration as a whole, before a folder is made. Nothing after it checks again.
+
+        Raises:
+            InputError: family, agent, devices and flags do not go together.
+        """
+        for module in ["tensorboardX"] * self.tensorboard + ["wandb"] * bool(self.wandb):
+            require_library(module)
+        if self.env:
+            self._check_named()
+        _ = self.mesh
+        self.learner.experience.check(self.family, self.played.num_envs, self.played.chunk_steps)
+        for learner in agents_at(self.learner, self.points):
+            require_value_range(learner)
+
+    def _check_named(self) -> None:
+        """Check what only families and agents with names have."""
+        family, learner = self.family, self.learner
+        if not self.runs:  # Path("") would be the working directory
+            raise InputError("--runs needs a folder; that of the command is --runs=.")
+        path(self.runs, "--runs")
+        _ = family.engine_name, family.table, family.targets()  # its engine refuses a model that it cannot run
+        learner.require_sight(family.spec)
+        if preset_of(self.agent).sees_pictures and not shown(family.spec.obs):
+            raise InputError(
+                f"{self.agent} learns from pictures, and {self.env} shows none: give --env.pixels=64, or for states "
+                "use --agent=sac-conditioned, to which --agent.representation=encoded adds an encoder"
+            )
+        learner.conditioning.table(family.spec, family.train_count)
+
 
 @public
 def with_preset(
@@ -203,6 +268,14 @@ def for_tasks(preset: Mapping[str, Any], count: int) -> dict[str, Any]:
     return chosen | {name: share(chosen[name] * tuned, least) for name, least in _LEAST.items() if name in chosen}
 
 
+def fit_chunk(settings: Settings, num_tasks: int, steps: int, grain: int = 1) -> Settings:
+    """Return settings whose chunks divide the run evenly, each a multiple of ``grain`` steps."""
+    whole_run = math.ceil(steps / (num_tasks * settings.num_envs))
+    longest = math.ceil(min(settings.chunk_steps, whole_run) / grain) * grain
+    chunk = math.ceil(whole_run / math.ceil(whole_run / longest) / grain) * grain
+    return dataclasses.replace(settings, chunk_steps=chunk)
+
+
 def fit_length(config: RunConfig, given: Collection[str]) -> RunConfig:
     """Return a configuration whose warm-up, chunks and evaluations fit a short run.
 
@@ -221,10 +294,10 @@ def fit_length(config: RunConfig, given: Collection[str]) -> RunConfig:
         each = count * plan.eval_episodes * config.family.episode_length
         often = min(max(_EVALUATED * plan.steps // each, 1), 10)
         plan = dataclasses.replace(plan, eval_every=0 if often == 10 else math.ceil(plan.steps / often))
-    learner = config.learner
     if isinstance(experience, Replay) and "warmup_steps" not in given:
-        least = max(experience.length(config.family.spec), learner.unroll, 1)
-        learner = replace(learner, {"warmup_steps": min(experience.warmup_steps, max(tenth, least))})
+        least = max(experience.length(config.family.spec), config.learner.unroll, 1)
+        experience = dataclasses.replace(experience, warmup_steps=min(experience.warmup_steps, max(tenth, least)))
+    learner = dataclasses.replace(config.learner, experience=experience)
     return dataclasses.replace(config, plan=plan, training=training, learner=learner)
 
 
@@ -238,24 +311,6 @@ def configure(agent: Any, settings: Settings, given: Mapping[str, Any]) -> tuple
     loop_values = {name: value for name, value in given.items() if name in loop_names}
     rest = {name: value for name, value in given.items() if name not in loop_values}
     return replace(agent, rest), dataclasses.replace(settings, **loop_values)
-
-
-def of_objects(
-    env: Any, agent: Any, settings: Settings | None = None, points: tuple[dict[str, float], ...] = (), **given: Any
-) -> RunConfig:
-    """Return the configuration of a run of objects that no name makes again: its ``env`` and ``agent`` are empty.
-
-    Args:
-        given: any setting of ``Plan``, of ``Settings``, of the agent or of its parts; and profile, tensorboard, wandb.
-
-    Raises:
-        InputError: there is no such setting, or a value is not allowed.
-    """
-    take = lambda names: {name: given.pop(name) for name in list(given) if name in names}
-    plan = Plan(**take({field.name for field in dataclasses.fields(Plan)}))
-    written = take({"profile", "tensorboard", "wandb"})
-    agent, settings = configure(agent, settings or Settings(), given)
-    return RunConfig("", "", points=points, plan=plan, training=settings, family=env, learner=agent, **written)
 
 
 def require_value_range(agent: Any) -> None:
@@ -301,11 +356,6 @@ def _device_preset() -> str:
     return "cpu" if jax.default_backend() == "cpu" else "gpu"
 
 
-def import_flags(config: RunConfig) -> list[str]:
-    """Return the --import flags that register the user's own families, agent and parts in another process."""
-    return [f"--import={file}" for file in config.imports]
-
-
 def own_files(config: RunConfig) -> tuple[str, ...]:
     """Return the files of --import, and those with the user's own classes that a configuration uses."""
     used = [*(part.family for part in config.family.parts), config.learner]
@@ -314,122 +364,3 @@ def own_files(config: RunConfig) -> tuple[str, ...]:
     own = [sys.modules.get(name) for name in modules if name.split(".")[0] != "mtjax"]
     files = [*(getattr(module, "__file__", None) for module in own), preset_of(config.agent).home]
     return tuple(dict.fromkeys([*config.imports, *(str(Path(file).resolve()) for file in files if file)]))
-
-
-# Configurations as JSON.
-
-
-def to_json(config: RunConfig, extra: dict[str, Any]) -> str:
-    """Return the configuration, and the entries of ``extra``, as JSON."""
-    record = {**dataclasses.asdict(config), "learner": settings(config.learner)}
-    return json.dumps({**record, **extra}, indent=2) + "\n"
-
-
-def from_json(path: Path) -> RunConfig:
-    """Read the configuration of a run from its config.json.
-
-    Raises:
-        InputError: there is no such file, or it does not describe a run.
-    """
-    require_run(path.parent)
-    try:
-        record = read_record(path)
-    except InputError as error:
-        raise InputError(f"{error}{_with_copy(path)}") from None
-    try:
-        return _from_record(record)
-    except InputError as error:
-        asked = _with_import(error, str(path.parent), record)
-        text = f"{str(path)!r}: {error}{_other_version(record)}" if asked is error else str(asked)
-        raise InputError(text + _with_copy(path)) from None
-    except Exception as error:  # whatever an edited record makes of the classes it is read into
-        text = f"{str(path)!r} does not describe a run: {type(error).__name__}: {str(error)[:150]}"
-        raise InputError(text + _other_version(record) + _with_copy(path)) from None
-
-
-def evaluations_of(config: RunConfig, directory: Path) -> Evaluations:
-    """Read the evaluations of a run, given its configuration.
-
-    Raises:
-        InputError: the file is missing or damaged, or of another run.
-    """
-    file, values = directory / "evaluations.npz", {split: config.family.task_values(split) for split in SPLITS}
-    found = load_evaluations(file)
-    seeds = [*config.plan.all_seeds] * max(len(config.points), 1)
-    require_same_run(file, found, no_evaluations(seeds, values, config.plan.eval_episodes))
-    return found
-
-
-def read_record(path: Path) -> dict[str, Any]:
-    """Read what a config.json holds, whose entry "plan" holds entries too; the others may be anything.
-
-    Raises:
-        InputError: it cannot be read, or is not of this form.
-    """
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{str(path)!r} does not describe a run: {type(error).__name__}: {error}") from None
-    if not isinstance(record, dict) or not isinstance(record.get("plan"), dict):
-        raise InputError(f"{str(path)!r} does not describe a run: it has no entry called plan")
-    return record
-
-
-def _from_record(record: Any) -> RunConfig:
-    config = RunConfig(
-        env=record["env"],
-        agent=record["agent"],
-        preset=record["preset"],
-        runs=record["runs"],
-        start=record.get("start", ""),
-        sweep=tuple(record.get("sweep", ())),
-        points=tuple(record.get("points", ())),
-        imports=_imports(record),
-        tensorboard=record.get("tensorboard", False),
-        wandb=record.get("wandb", ""),
-        plan=Plan(**record["plan"]),
-        training=Settings(**record["training"]),
-        family=make(record["env"], **record["family"]),
-        learner=agent(record["agent"], **record["learner"]),
-    )
-    require_values(config)
-    if not all(isinstance(word, str) for word in config.sweep):
-        raise InputError(f"sweep must be a list of texts, not {config.sweep}")
-    for point in config.points:
-        replace(config.learner, point)  # which checks the values
-    return config
-
-
-def _imports(record: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the user's own files that a run names. Its command holds them where no list does."""
-    words = [word for word in shlex.split(str(record.get("command", ""))) if word.startswith("--import=")]
-    return tuple(record.get("imports") or (word.removeprefix("--import=") for word in words))
-
-
-def _with_import(error: InputError, run: str, record: Mapping[str, Any]) -> InputError:
-    """Return an error that asks for the user's own files, if a run needs some that are not imported.
-
-    They are never run because a run's record names them.
-    """
-    missing = [file for file in _imports(record) if not is_imported(Path(file))]
-    if missing:
-        flags = shlex.join(f"--import={file}" for file in missing)
-        return InputError(f"{run!r} uses code of your own: add {flags} (in Python: import that file first)")
-    env, name = str(record.get("env")), str(record.get("agent"))
-    if (env not in ENVS and not is_mixture(env)) or name not in AGENTS:
-        return InputError(f"{error}. If it is your own, give --import=FILE.py with the file that registers it")
-    return error
-
-
-def _with_copy(path: Path) -> str:
-    """Return a clause that names the newest checkpoint's copy of a record if the record has changed since then."""
-    copies = (file for file in path.parent.glob(f"checkpoints/*/{path.name}") if file.parent.name.isdecimal())
-    newest = max(copies, key=lambda file: int(file.parent.name), default=path)
-    return "" if newest.read_bytes() == path.read_bytes() else f"; {str(newest)!r} holds it as it was"
-
-
-def _other_version(record: Any) -> str:
-    """Return a clause if another version of mtjax wrote a record, else an empty string."""
-    versions = record.get("versions") if isinstance(record, dict) else None
-    wrote = versions.get("mtjax") if isinstance(versions, dict) else None
-    return f" (mtjax {wrote} wrote it, and this is {__version__})" if wrote not in (None, __version__) else ""

@@ -38,4 +38,4 @@ def run() -> None:
 if __name__ == "__main__":
     run()
 else:
-    become(__name__, "mtjax.command.keywords:train")
+    become(__name__, "mtjax.command.api:train")

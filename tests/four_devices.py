@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.sharding import PartitionSpec
-from probes import Goals, Walk, tiny
+from probes import Goals, Walk, tiny, train_objects
 
 from mtjax import envs
 from mtjax.compiling.programs import jit_programs
@@ -15,7 +15,6 @@ from mtjax.config import configure
 from mtjax.loop import Settings
 from mtjax.parallel import collectives as shares
 from mtjax.parallel import mesh as meshes
-from mtjax.training.launch import train_objects
 
 SETTINGS = {"num_envs": 2, "batch_size": 4, "replay_size": 40, "warmup_steps": 4, "chunk_steps": 10, "stagger": False}
 WIDE = SETTINGS | {"num_envs": 4, "replay_size": 100}  # half full in two chunks

@@ -14,12 +14,15 @@ from needs import needs
 from mtjax import agents, loop
 from mtjax.agents.base import Memory
 from mtjax.agents.parts.knowing import last_steps
-from mtjax.config import configure
+from mtjax.command.keywords import configured
+from mtjax.config import Plan, configure
 from mtjax.envs import ENVS
 from mtjax.envs.probes import AFTER, LIMIT, RULES, SPEC, Probe, tasks_of
 from mtjax.experience import Replay
 from mtjax.frames import seen
 from mtjax.networks import Params
+from mtjax.training.launch import check, launch
+from mtjax.training.run import Hooks
 from mtjax.types import Acted, Spec, Task, Transition
 
 __all__ = ["AFTER", "LIMIT", "RULES", "SPEC", "Probe", "tasks_of"]
@@ -217,6 +220,16 @@ def train(env, agent, given: dict, *, tasks: Task | None = None, seeds=(0,), chu
         state, metrics = run_chunk(tasks, state)
         history.append(metrics)
     return state, history
+
+
+def train_objects(env, agent, **given):
+    """Train quietly, in a folder too, also what no name makes again. ``given`` are fields of hooks and settings."""
+    hooks = Hooks(**{"quiet": True, **{name: given.pop(name) for name in Hooks._fields if name in given}})
+    plan = {name: given.pop(name) for name in Plan.__dataclass_fields__ if name in given}
+    more = {name: given.pop(name) for name in ("settings", "sweep", "profile", "tensorboard", "wandb") if name in given}
+    config = configured(env, agent, given, plan=plan, start=hooks.start, **more)
+    check(config, hooks.start)
+    return launch(config, hooks)
 
 
 def quick(function, *arguments):

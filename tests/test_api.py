@@ -15,9 +15,10 @@ import mtjax.evaluate
 import mtjax.train
 from mtjax import agents, checks, envs
 from mtjax.command import keywords, run_config
-from mtjax.config import Plan, from_json, with_preset
+from mtjax.config import Plan, with_preset
 from mtjax.loop import Settings
 from mtjax.report import collect, curve
+from mtjax.saved.config_json import from_json
 from mtjax.training import memory
 from mtjax.types import InputError
 
@@ -129,7 +130,7 @@ def test_a_refused_run_leaves_no_folder(short_family, tmp_path, monkeypatch):
 
 def test_names_bring_the_tuned_settings_and_objects_their_own(monkeypatch):
     """What is given by keyword changes them."""
-    configured = lambda *words, **given: keywords._configured(*words, {}, None, None, given)
+    configured = lambda *words, **given: keywords.configured(*words, given, plan={})
     assert configured("finger-spin-vary-size", "care") == with_preset("finger-spin-vary-size", "care")
     env = mtjax.make("finger-spin-vary-size")
     tuned = configured(env, "care", num_envs=3, num_experts=2)

@@ -16,9 +16,9 @@ from probes import with_nets
 import mtjax.train
 from mtjax import loop
 from mtjax.agents.choices import replace
-from mtjax.config import from_json
 from mtjax.names import Notice
 from mtjax.saved import arrays, checkpoint
+from mtjax.saved.config_json import from_json
 from mtjax.saved.folder import new_directory, record_steps, require_unused, tell_edits
 from mtjax.types import InputError
 

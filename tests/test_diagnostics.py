@@ -19,13 +19,13 @@ import mtjax
 import mtjax.evaluate
 from mtjax import loop
 from mtjax.agents.parts.encoders import ENCODERS
-from mtjax.config import from_json, to_json
 from mtjax.evaluation import Scores
 from mtjax.networks import Params, tanh_normal
 from mtjax.report import diagnostics, scoring
 from mtjax.report import figures as plot
 from mtjax.report.diagnostics import Activity, activity, compare_gradients, dormant_share, effective_ranks, utilisation
 from mtjax.saved import checkpoint, log
+from mtjax.saved.config_json import from_json, to_json
 from mtjax.saved.policy import load_experience
 from mtjax.types import InputError, Spec
 

@@ -23,11 +23,11 @@ import mtjax
 import mtjax.evaluate
 import mtjax.train
 from mtjax import loop
-from mtjax.config import from_json
 from mtjax.evaluation import Evaluations, Scores, evaluate, load_evaluations, record
 from mtjax.report import films, render, scoring
 from mtjax.report.tables import split_table, task_table
 from mtjax.saved import checkpoint
+from mtjax.saved.config_json import from_json
 from mtjax.tasks import episode_task
 from mtjax.training import launch
 from mtjax.types import InputError
@@ -476,9 +476,8 @@ def test_resume_extends_and_the_hint_goes_on(finished_run, copied_run, capsys, m
     """A run that is extended and stopped says how to go on, and the command that it prints does so."""
     train = launch.train
 
-    def stops(*arguments):
-        *rest, hooks = arguments
-        return train(*rest, hooks._replace(on_chunk=lambda _: os.kill(os.getpid(), signal.SIGINT)))
+    def stops(config, hooks):
+        return train(config, hooks._replace(on_chunk=lambda _: os.kill(os.getpid(), signal.SIGINT)))
 
     monkeypatch.setattr(launch, "train", stops)
     with pytest.raises(SystemExit) as stop:

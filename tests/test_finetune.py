@@ -8,20 +8,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import slow_but, with_nets
+from probes import slow_but, train_objects, with_nets
 
 import mtjax.train
 from mtjax.agents import agent
 from mtjax.command import run_config
-from mtjax.config import from_json
 from mtjax.envs import ENVS
 from mtjax.envs.family import Family
 from mtjax.envs.parameters import Parameter
 from mtjax.networks import Params
-from mtjax.saved.folder import to_flags
+from mtjax.saved.config_json import from_json, to_flags
 from mtjax.training import finetune
 from mtjax.training.finetune import adopt
-from mtjax.training.launch import train_objects
 from mtjax.types import InputError, Step
 
 

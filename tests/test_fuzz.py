@@ -18,9 +18,9 @@ from hypothesis import HealthCheck, given, settings
 from mtjax.agents import AGENTS
 from mtjax.agents import settings as settings_of
 from mtjax.command import flag_files, process, refusals, run_config, sweep
-from mtjax.config import from_json, to_json
 from mtjax.names import InputError
-from mtjax.saved.folder import record_steps, run_metadata
+from mtjax.saved.config_json import from_json, run_metadata, to_json
+from mtjax.saved.folder import record_steps
 from mtjax.training import launch
 
 QUIET = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]

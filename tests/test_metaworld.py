@@ -12,7 +12,6 @@ from needs import needs
 
 import mtjax
 from mtjax.command import run_config
-from mtjax.config import from_json, to_json
 from mtjax.envs import BENCHMARKS, name_of
 from mtjax.envs.engines.base import at_rest
 from mtjax.envs.metaworld import sawyer, scene
@@ -20,6 +19,7 @@ from mtjax.envs.metaworld.names import TASKS
 from mtjax.names import load
 from mtjax.report import scoring
 from mtjax.report.tables import split_table
+from mtjax.saved.config_json import from_json, to_json
 from mtjax.types import InputError
 
 DATA = Path(__file__).parent / "data" / "metaworld"

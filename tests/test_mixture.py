@@ -21,7 +21,6 @@ from mtjax import agents, networks, normalize, rollout
 from mtjax.agents.sac import Batch, action_sizes
 from mtjax.agents.state import AgentState
 from mtjax.command import run_config
-from mtjax.config import from_json, to_json
 from mtjax.envs import ENVS, Family, Mixture, make, mixture
 from mtjax.envs.parameters import Parameter
 from mtjax.evaluation import Scores, evaluate, record
@@ -29,7 +28,8 @@ from mtjax.experience.replay import Replay
 from mtjax.loop import Settings
 from mtjax.networks import OVER_TASKS, Params
 from mtjax.report.tables import split_table, task_table
-from mtjax.saved.folder import short_name, to_flags
+from mtjax.saved.config_json import from_json, to_flags, to_json
+from mtjax.saved.folder import short_name
 from mtjax.types import SPLITS, InputError, Spec, Step, Task, Transition
 
 QUICK = {"xla_backend_optimization_level": 0}

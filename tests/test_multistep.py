@@ -10,11 +10,11 @@ from probes import Goals, Stub, Walk, one_in, pick, quick, random_batch, random_
 
 from mtjax.agents.base import Memory
 from mtjax.agents.parts.knowing.last_steps import append
+from mtjax.agents.swept import SweptAgent
 from mtjax.experience import Replay, multistep
 from mtjax.experience import ring as rings
 from mtjax.experience.replay import Buffer
 from mtjax.networks import Params
-from mtjax.saved.points import SweptAgent
 from mtjax.types import InputError, Spec, Transition
 
 SPEC = Spec.vector(3, 2, 1)

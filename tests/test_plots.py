@@ -10,10 +10,10 @@ from needs import needs
 import mtjax
 import mtjax.plot
 from mtjax import report
-from mtjax.config import to_json
 from mtjax.evaluation import Evaluations, save_evaluations
 from mtjax.report import collect, plots
 from mtjax.report.stats import iqm, probability_of_improvement, seed_interval
+from mtjax.saved.config_json import to_json
 from mtjax.types import SPLITS, InputError
 
 STEPS = np.array([100, 200, 300])

@@ -16,7 +16,7 @@ from needs import require
 
 import mtjax
 from mtjax import report
-from mtjax.command import keywords
+from mtjax.command import api
 from mtjax.evaluate import main
 from mtjax.names import public
 from mtjax.types import InputError
@@ -208,4 +208,4 @@ def test_what_is_no_run_is_refused(run):
 
 def test_train_is_the_function_of_its_module():
     """So that it can be pickled by its name."""
-    assert mtjax.train is keywords.train
+    assert mtjax.train is api.train

@@ -23,10 +23,9 @@ from mtjax import register
 from mtjax.agents import AGENTS, PARTS
 from mtjax.agents.parts.knowing import Parameters
 from mtjax.command import help, keywords, run_config
-from mtjax.config import to_json
 from mtjax.envs import ENVS, Domain, Parameter, declared, effects
 from mtjax.envs.brax import Brax
-from mtjax.saved.folder import to_flags
+from mtjax.saved.config_json import to_flags, to_json
 from mtjax.tasks import episode_task
 from mtjax.types import SPLITS, InputError
 
@@ -441,7 +440,7 @@ def test_an_agent_with_other_defaults_names_its_file(forget, tmp_path):
     flag = f"--import={file}"
     config = run_config.parse([flag, "--agent=my-care"])
     assert config.imports == (str(file),) and flag in to_flags(config)
-    assert keywords._configured("finger-spin", "my-care", {}, None, None, {}).imports == (str(file),)
+    assert keywords.configured("finger-spin", "my-care", {}, plan={}).imports == (str(file),)
 
 
 def test_unknown_names_of_a_run_mention_import(tmp_path):

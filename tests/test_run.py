@@ -24,7 +24,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 from conftest import SHORT_RUN
-from probes import with_nets
+from probes import train_objects, with_nets
 
 import mtjax
 import mtjax.train
@@ -32,18 +32,17 @@ from mtjax import loop
 from mtjax.command import process, run_config
 from mtjax.compiling import traced
 from mtjax.compiling.programs import enable_compile_cache
-from mtjax.config import Plan, evaluations_of, from_json
+from mtjax.config import Plan, fit_chunk
 from mtjax.evaluation import load_evaluations, save_evaluations
 from mtjax.loop import Settings
 from mtjax.names import Notice
 from mtjax.report import collect
 from mtjax.saved import checkpoint, log
-from mtjax.saved.folder import new_directory
+from mtjax.saved.config_json import from_json
+from mtjax.saved.folder import evaluations_of, new_directory
 from mtjax.saved.records import Records
 from mtjax.training import run
 from mtjax.training.console import Clock
-from mtjax.training.launch import train_objects
-from mtjax.training.run import fit_chunk
 from mtjax.training.stops import require_finite, stop_signals
 from mtjax.types import SPLITS, InputError
 
@@ -235,10 +234,10 @@ def test_the_clock_counts_down_to_the_end(play, tmp_path, monkeypatch):
     assert rates == pytest.approx([2 * CHUNK / each for clock in clocks for each in clock.chunk_seconds])
 
 
-def test_profile_needs_a_folder(play):
+def test_profile_needs_a_folder(short_family):
     """It is refused before anything compiles."""
-    with pytest.raises(InputError, match="write into the run's folder"):
-        play(None, profile=True)
+    with pytest.raises(InputError, match="profile, .* need the run's folder"):
+        mtjax.train("finger-short", "sac", profile=True)
 
 
 # Repeating.
@@ -531,15 +530,15 @@ def test_the_clock_counts_without_going_through_the_chunks():
     for _ in range(300):
         chunk, count, begun, every, warmup = (int(random.integers(1, most)) for most in (40, 30, 30, 300, 200))
         total = chunk * count
-        plan = types.SimpleNamespace(steps=int(random.integers(total - chunk + 1, total + 1)))
-        console = types.SimpleNamespace(total=total)
-        one = types.SimpleNamespace(steps_per_chunk=chunk, eval_every=every, console=console, warmup=warmup, plan=plan)
+        plan = Plan(steps=int(random.integers(total - chunk + 1, total + 1)), eval_every=every)
+        config = types.SimpleNamespace(steps_per_chunk=chunk, warmup=warmup, plan=plan)
+        one = types.SimpleNamespace(config=config, console=types.SimpleNamespace(total=total))
         steps = chunk * min(begun - 1, count)
         ends = range(steps + chunk, total + chunk, chunk)
         clock, due = run._Run._clock(one, steps), [run._Run._is_due(one, end) for end in ends]
         expected = len(ends), sum(due), sum(end - chunk < warmup for end in ends)
         assert (clock.chunks, clock.evaluations, clock.warmup) == expected
-    one.console.total = one.plan.steps = 10**15 * one.steps_per_chunk
+    one.console.total = 10**15 * chunk
     assert run._Run._clock(one, 0).chunks == 10**15
 
 
@@ -728,7 +727,7 @@ def test_chunks_are_no_longer_than_the_run():
 @pytest.mark.parametrize("plan, every", [(Plan(5), 1), (Plan(101), 11), (Plan(100), 10), (Plan(100, eval_every=7), 7)])
 def test_there_are_ten_evaluations_unless_told(plan, every):
     """No more, whatever the number of steps."""
-    assert run._Run(*[None] * 3, plan, *[None] * 2).eval_every == every
+    assert plan.interval == every
 
 
 def test_steps_are_rounded_up_to_whole_chunks(play):

@@ -6,13 +6,12 @@ import numpy as np
 import optax
 import pytest
 from conftest import SHORT_RUN
-from probes import Walk, quick, random_batch, tasks_of, tiny, train
+from probes import Walk, quick, random_batch, tasks_of, tiny, train, train_objects
 
 import mtjax.train
 from mtjax.agents.parts.gradients.descent import schedule
+from mtjax.agents.swept import SweptAgent
 from mtjax.experience import Replay
-from mtjax.saved.points import SweptAgent
-from mtjax.training.launch import train_objects
 from mtjax.types import InputError, Spec
 
 TASKS, SPEC, KEY = tasks_of("one-step"), Spec.vector(1, 1, 1), jax.random.key(0)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import SHORT_RUN
-from probes import Stub, Walk, tiny
+from probes import Stub, Walk, tiny, train_objects
 from test_pictures import Episodes
 from test_run import bytes_of
 
@@ -27,7 +27,6 @@ from mtjax.names import Notice
 from mtjax.saved import checkpoint
 from mtjax.saved.policy import state_shapes
 from mtjax.training import memory, run
-from mtjax.training.launch import train_objects
 from mtjax.types import InputError, Transition
 
 SEEDS, TASKS, ENVS = 2, 2, 3

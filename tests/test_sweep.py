@@ -13,7 +13,7 @@ import numpy as np
 import probes
 import pytest
 from conftest import SHORT_RUN
-from probes import QUICK, Walk, one_in, random_batch, tasks_of, tiny
+from probes import QUICK, Walk, one_in, random_batch, tasks_of, tiny, train_objects
 
 import mtjax
 import mtjax.evaluate
@@ -21,19 +21,18 @@ import mtjax.train
 from mtjax import loop
 from mtjax.agents import PARTS
 from mtjax.agents import settings as settings_of
+from mtjax.agents import swept as points
+from mtjax.agents.swept import SweptAgent
 from mtjax.command import run_config, sweep
-from mtjax.config import configure, from_json, to_json
+from mtjax.command.keywords import configured
+from mtjax.config import configure
 from mtjax.evaluation import Scores, load_evaluations, save_evaluations
 from mtjax.loop import Settings, TrainState
 from mtjax.names import Notice
-from mtjax.saved import points
-from mtjax.saved.folder import to_flags
-from mtjax.saved.points import SweptAgent
+from mtjax.saved.config_json import from_json, to_flags, to_json
 from mtjax.training import memory, stops
 from mtjax.training import run as run_module
-from mtjax.training.console import Console
-from mtjax.training.launch import train_objects
-from mtjax.training.run import Plan, _Progress, _Run
+from mtjax.training.run import Hooks, _Progress, _Run
 from mtjax.types import InputError, Spec
 
 SMALL = {"num_envs": 4, "batch_size": 8, "replay_size": 200, "warmup_steps": 5, "chunk_steps": 20}
@@ -175,11 +174,15 @@ def test_one_point_that_diverges_does_not_end_the_others():
     assert np.isfinite(returns[:2]).all() and np.isnan(returns[2:, -1]).all()
 
 
+def of_three_points(**plan):
+    """A configuration whose sweep has one seed of each of three points."""
+    sweep = {"tau": [0.1, 0.2, 0.3]}
+    return configured(Walk(), tiny("sac"), SMALL, plan=plan, sweep=sweep)
+
+
 def test_a_seed_that_diverged_stays_given_up(capsys):
     """It is told once, also if later numbers are finite; the run ends when every seed has diverged at some time."""
-    agent, settings = configure(tiny("sac"), Settings(), SMALL)
-    swept = tuple({"tau": tau} for tau in (0.1, 0.2, 0.3))
-    run = _Run(Walk(), SweptAgent(agent), settings, Plan(), None, Console(1), swept)
+    run = _Run(of_three_points())
     now = _Progress(None, 0, 0.0, 0.0, None, np.zeros(3, bool))
     chunk = lambda bad: lambda state: (state, dict.fromkeys(("bad_step", "bad_reward"), np.array(bad)[:, None]))
     for bad in ([-1, 4, -1], [-1, -1, -1], [-1, 4, -1]):
@@ -192,8 +195,7 @@ def test_a_seed_that_diverged_stays_given_up(capsys):
 
 def test_the_evaluation_that_is_told_is_of_the_seeds_that_go_on(capsys):
     """If none does, nothing is told."""
-    swept = tuple({"tau": tau} for tau in (0.1, 0.2, 0.3))
-    run = _Run(Walk(), SweptAgent(tiny("sac")), Settings(), Plan(eval_episodes=1), None, Console(1), swept)
+    run = _Run(of_three_points(eval_episodes=1))
     scores = lambda agent, number: Scores(np.full((3, len(Walk().tasks("all").id), 1), 7.0), {})
     now = _Progress(
         TrainState(*[None] * len(TrainState._fields)), 20, 0.0, 0.0, run._no_evaluations(), np.zeros(3, bool)
@@ -359,11 +361,11 @@ def swept(short_family, tmp_path_factory):
     (program,) = sweep.configurations(words)
     real = sweep.launch
 
-    def stop(program, directory, *rest, **hooks):
-        if directory.name == "run-2":
-            (directory / "checkpoints").mkdir()  # as a run that is killed before its first checkpoint leaves it
+    def stop(program, hooks):
+        if hooks.directory.name == "run-2":
+            (hooks.directory / "checkpoints").mkdir()  # as a run that is killed before its first checkpoint leaves it
             raise KeyboardInterrupt
-        return real(program, directory, *rest, **hooks)
+        return real(program, hooks)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MTJAX_MEMORY", f"{2.5 * memory.required_bytes(program) / 0.9 / 1e9:.12f}")
@@ -466,7 +468,8 @@ def test_a_signal_in_a_runs_last_chunk_stops_the_sweep_before_the_next(swept, tm
         (folder / file).unlink()
     done = []
 
-    def finish(config, run, *_, **__):
+    def finish(config, hooks):
+        run = hooks.directory
         done.append(run.name)
         count, made = config.plan.seeds * max(len(config.points), 1), load_evaluations(swept / "run-1/evaluations.npz")
         first = lambda scores: {name: x[:count] for name, x in scores.items()}
@@ -499,9 +502,7 @@ def test_damaged_evaluations_do_not_stop_a_sweep(swept, tmp_path, capsys):
 
 def test_a_seed_that_the_last_update_spoiled_is_given_up(capsys):
     """Its losses were still finite. It scores nothing, and the others go on; without any other, nothing is saved."""
-    agent, settings = configure(tiny("sac"), Settings(), SMALL)
-    swept = tuple({"tau": tau} for tau in (0.1, 0.2, 0.3))
-    run = _Run(Walk(), SweptAgent(agent), settings, Plan(), None, Console(1), swept)
+    run = _Run(of_three_points())
 
     def given_up(actor, *before):
         learner = types.SimpleNamespace(nets={"actor": jnp.asarray(actor)[:, None]})
@@ -559,13 +560,13 @@ def test_a_run_of_several_points_is_not_fine_tuned_by_name(swept):
 def test_fine_tuning_begins_every_point_with_the_same_seeds(swept):
     """Three seeds of each of two points, from a run of two seeds: 0, 1, 0 and again 0, 1, 0."""
     start = mtjax.load(swept / "run-1", seed=0)
-    found, tasks = ({"tau": 0.1}, {"tau": 0.2}), start.env.tasks("train")
-    plain, settings = configure(start.agent, Settings(), SMALL)
-    run = _Run(start.env, SweptAgent(plain), settings, Plan(seeds=3), None, Console(1, quiet=True), found)
+    tasks, sweep = start.env.tasks("train"), {"tau": [0.1, 0.2]}
+    config = configured(start.env, start.agent, SMALL, plan={"seeds": 3}, start=start, sweep=sweep)
+    run = _Run(config, Hooks(start=start, quiet=True))
     seeds, knobs = run.seed_axis
-    shapes = jax.eval_shape(lambda: loop.init(start.env, run.agent, settings, tasks, seeds, knobs)).agent
+    shapes = jax.eval_shape(lambda: loop.init(start.env, run.agent, config.training, tasks, seeds, knobs)).agent
     fresh = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)._replace(knobs=knobs)
-    state = run.adopt(start, tasks, fresh)
+    state = run.adopt(tasks, fresh)
     np.testing.assert_array_equal(state.knobs["tau"], np.float32([0.1] * 3 + [0.2] * 3))
     began = np.asarray(start.states.nets["temperature"].own["log"])
     adopted = state.learner.nets["temperature"].own["log"]

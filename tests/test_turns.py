@@ -12,9 +12,9 @@ import pytest
 from probes import Stub, Walk, learner, one_in, quick, random_batch, tasks_of, tiny, train
 
 from mtjax import loop
+from mtjax.agents.swept import SweptAgent
 from mtjax.experience import Replay
 from mtjax.maps import when
-from mtjax.saved.points import SweptAgent
 from mtjax.types import InputError, Sometimes, Spec
 
 SMALL = {"num_envs": 4, "batch_size": 4, "replay_size": 200, "warmup_steps": 2}

@@ -16,13 +16,12 @@ from test_metaworld import made
 import mtjax
 from mtjax import rollout
 from mtjax.command import run_config
-from mtjax.config import from_json, to_json
 from mtjax.envs import groups
 from mtjax.envs.joined import Alone, Joined
 from mtjax.envs.metaworld.names import BENCHMARKS, TASKS
 from mtjax.envs.things import Scene
 from mtjax.envs.united import United
-from mtjax.saved.folder import to_flags
+from mtjax.saved.config_json import from_json, to_flags, to_json
 from mtjax.types import Acted, InputError
 
 # The solver stops by a tolerance that counts the whole scene's degrees of freedom and mean inertia. Meta-World's worlds

@@ -12,11 +12,12 @@ from mtjax.command.parsing import parse_with_tyro
 from mtjax.command.refusals import check_names, unknown_flag
 from mtjax.command.sources import all_flags
 from mtjax.command.words import flag_value, plain_values, split_flags, switched_off, switched_on, vary_flags
-from mtjax.config import NO_FINE_TUNING, RunConfig, fit_length, from_json, own_files, with_preset
+from mtjax.config import NO_FINE_TUNING, RunConfig, fit_length, own_files, with_preset
 from mtjax.envs import is_mixture, make, require_pictures
 from mtjax.envs.family import Family
 from mtjax.envs.mixtures import Mixture, require_family
 from mtjax.names import InputError
+from mtjax.saved.config_json import from_json
 
 _NO_FLAGS = ("vary", "context-ranges", "points", "imports")  # vary has a flag for each parameter, taken out before
 _FAMILY_FLAGS = {"combine": "env.combine", "split": "split"}  # they decide which values are allowed

@@ -1,8 +1,8 @@
 """``python -m mtjax.train --sweep ...``: train every combination of settings, and write one table.
 
-Real numbers of the agent are points of one program (``points.py``). Each combination of other settings is a program of
-its own. A program that does not fit into memory is split into rounds (``memory.py``). Every program and round is a run
-in the sweep's folder: ``run-1``, ``run-2`` and so on. A plain run in rounds is a sweep of one setting.
+Real numbers of the agent are points of one program (``agents/swept.py``). Each combination of other settings is a
+program of its own. A program that does not fit into memory is split into rounds (``memory.py``). Every program and
+round is a run in the sweep's folder: ``run-1``, ``run-2`` and so on. A plain run in rounds is a sweep of one setting.
 """
 
 import contextlib
@@ -18,15 +18,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mtjax.agents import AGENTS, PARTS
+from mtjax.agents import AGENTS, PARTS, swept
 from mtjax.command.run_config import parse
 from mtjax.compiling.programs import enable_compile_cache
-from mtjax.config import RunConfig, evaluations_of, from_json, import_flags
+from mtjax.config import RunConfig
 from mtjax.evaluation import Evaluations
 from mtjax.report import figures
 from mtjax.report.stats import seed_interval
-from mtjax.saved import checkpoint, lock, points
-from mtjax.saved.folder import new_directory, record_steps, resumed_config, short_name, write_config
+from mtjax.saved import checkpoint, lock
+from mtjax.saved.config_json import from_json, import_flags
+from mtjax.saved.folder import evaluations_of, new_directory, record_steps, resumed_config, short_name, write_config
 from mtjax.saved.log import append_rows, number
 from mtjax.training import memory
 from mtjax.training.launch import check, launch, load_start
@@ -143,9 +144,9 @@ def configurations(argv: Sequence[str]) -> list[RunConfig]:
         chosen = [Axis(axis.flag, (value,)) for axis, value in zip(outside, values, strict=True)]
         config = parse([*rest, *itertools.chain(*(_to_flags(axis.flag, axis.values[0]) for axis in chosen))])
         sweep = tuple(f"{axis.flag}={','.join(axis.values)}" for axis in (*chosen, *inside))
-        points_of_it = points.grid({axis.setting: [_number(axis, x) for x in axis.values] for axis in inside})
+        points_of_it = swept.grid({axis.setting: [_number(axis, x) for x in axis.values] for axis in inside})
         for point in points_of_it:
-            points.agent_at(config.learner, point)
+            swept.agent_at(config.learner, point)
         found.append(dataclasses.replace(config, sweep=sweep, points=points_of_it))
     return found
 
@@ -172,8 +173,7 @@ def main(argv: Sequence[str]) -> None:
         return
     found = configurations(argv)
     for config in found:
-        check(config)
-        load_start(config)
+        check(config, load_start(config))
     run_all(found, "sweep")
 
 
@@ -227,7 +227,7 @@ def run_unfinished(folder: Path) -> None:
         signal = 0
         try:
             grow = lambda _: _write_table(folder, runs)
-            result = launch(config, run, start, resume, Hooks(on_evaluation=grow, label=label))
+            result = launch(config, Hooks(run, start, resume, on_evaluation=grow, label=label))
             if result.finished:
                 _draw(config, run)
             signal = 0 if result.finished and run == runs[-1] else result.signal

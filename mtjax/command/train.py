@@ -9,17 +9,19 @@ from pathlib import Path
 from mtjax.command import sweep
 from mtjax.command.run_config import parse
 from mtjax.compiling.programs import enable_compile_cache
-from mtjax.config import RunConfig, import_flags
+from mtjax.config import RunConfig
 from mtjax.envs.pixels import Pictured
 from mtjax.parallel import hosts
 from mtjax.report.curve import draw
 from mtjax.report.tables import split_table
 from mtjax.saved import checkpoint, lock
+from mtjax.saved.config_json import import_flags
 from mtjax.saved.folder import new_directory, record_steps, resumed_config, short_name, write_config
 from mtjax.saved.result import Result
 from mtjax.training import memory
 from mtjax.training.console import duration
 from mtjax.training.launch import check, launch, load_start
+from mtjax.training.run import Hooks
 from mtjax.types import InputError
 
 
@@ -37,13 +39,13 @@ def main(argv: Sequence[str]) -> None:
     if directory is not None:
         config = resumed_config(config, directory, argv)
     enable_compile_cache()
-    check(config)
     begun = directory is not None and checkpoint.newest(directory / "checkpoints") is not None
     start = None if begun else load_start(config)
+    check(config, start)
     if directory is None and memory.seeds_exceed_memory(config):
         return sweep.run_all([config], "rounds")
     directory = hosts.broadcast_path(partial(_prepare, config, directory))
-    result = launch(config, directory, start, resume)
+    result = launch(config, Hooks(directory, start, resume))
     if hosts.is_first():
         _conclude(config, result, directory)
     if result.signal and not result.finished:

@@ -11,10 +11,12 @@ import numpy as np
 
 from mtjax.agents import name_of, settings
 from mtjax.checks import path
-from mtjax.config import RunConfig, evaluations_of, from_json
+from mtjax.config import RunConfig
 from mtjax.envs import name_of as env_name_of
 from mtjax.evaluation import Evaluations
 from mtjax.names import InputError, nearest_error, public
+from mtjax.saved.config_json import from_json
+from mtjax.saved.folder import evaluations_of
 from mtjax.saved.tables import frame_of, pandas
 
 _WORDS = {"success": "success at the end", "success_ever": "success at any step"}

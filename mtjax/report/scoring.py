@@ -13,7 +13,6 @@ import numpy as np
 from mtjax import evaluation
 from mtjax.checks import path, require_episodes
 from mtjax.compiling.programs import compile_lowered, enable_compile_cache, trace
-from mtjax.config import from_json
 from mtjax.envs import Family
 from mtjax.envs.pixels import Pictured
 from mtjax.envs.tabled import Tabled
@@ -22,6 +21,7 @@ from mtjax.names import nearest_error, public
 from mtjax.report import diagnostics, figures, films
 from mtjax.report.tables import task_table
 from mtjax.saved import shipped
+from mtjax.saved.config_json import from_json
 from mtjax.saved.export import export
 from mtjax.saved.log import append_rows, number
 from mtjax.saved.policy import Policy, load, load_experience

@@ -2,28 +2,22 @@
 
 import contextlib
 import dataclasses
-import itertools
 import json
-import platform
-import shlex
 import textwrap
 import time
+from collections import ChainMap
 from collections.abc import Mapping, Sequence
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import jax
-
-from mtjax import __version__
-from mtjax.agents import settings
-from mtjax.agents.choices import flag_names
-from mtjax.config import RunConfig, from_json, import_flags, read_record, to_json
-from mtjax.envs.family import Family
-from mtjax.envs.mixtures import Mixture
-from mtjax.envs.tabled import Tabled
-from mtjax.names import notice, replacing
+from mtjax.agents import agent, settings
+from mtjax.checks import shown
+from mtjax.config import RunConfig
+from mtjax.envs import make
+from mtjax.evaluation import Evaluations, load_evaluations, no_evaluations, require_same_run
+from mtjax.names import SPLITS, notice, replacing
 from mtjax.saved.arrays import require_place
+from mtjax.saved.config_json import from_json, read_record, run_metadata, to_json
 from mtjax.types import InputError
 
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
@@ -48,6 +42,54 @@ def new_directory(root: Path, name: str) -> Path:
         fix = "choose another place with --runs"
         raise InputError(f"{str(root)!r} cannot take a run ({error.strerror}); {fix}") from None
     raise InputError(f"cannot find a new name for a run in {str(root)!r}")
+
+
+def prepare(config: RunConfig, directory: Path, resume: bool) -> Path:
+    """Make the folder of a new run with its config.json, or check that it holds the run to resume."""
+    file = directory / "config.json"
+    if resume:
+        _require_same(config, from_json(file), directory)
+        record_steps(file, config.plan.steps)
+        return directory
+    _require_names(config)
+    require_unused(directory)
+    directory.mkdir(parents=True, exist_ok=True)
+    write_config(directory, config)
+    return directory
+
+
+def _require_names(config: RunConfig) -> None:
+    """Refuse a family or an agent that its recorded name does not make again."""
+    if not config.env:
+        raise InputError("a run's folder needs an environment derived from Family and an agent from BaseAgent")
+    family: Any = config.family
+    again = {
+        "env": (family, lambda: make(config.env, **dataclasses.asdict(family))),
+        "agent": (config.learner, lambda: agent(config.agent, **settings(config.learner))),
+    }
+    for kind, (made, remake) in again.items():
+        try:
+            same = remake() == made
+        except InputError:
+            same = False
+        if not same:
+            name = type(made).__name__
+            raise InputError(f"a run's folder needs a name for {name}: mtjax.register('my-{kind}', {name}) gives one")
+
+
+def _require_same(config: RunConfig, recorded: RunConfig, directory: Path) -> None:
+    """Refuse to resume a run with other settings than it had, apart from its steps."""
+    fields = lambda held: {name: getattr(held, name) for name in held.__dataclass_fields__}
+    alone = lambda config: {"env": config.env, "agent": config.agent, "sweep": config.points}
+    parts = lambda config: (config.family, config.training, config.plan)
+    every = lambda config: {**alone(config), **settings(config.learner), **ChainMap(*map(fields, parts(config)))}
+    now, then = ({**every(each), "steps": None} for each in (config, recorded))
+    name = next((name for name in {**now, **then} if now.get(name) != then.get(name)), None)
+    if name is not None:
+        raise InputError(
+            f"the run in {str(directory)!r} had {name}={shown(then.get(name))}, not {shown(now.get(name))}; "
+            "resume it with the same, or start a new run in another directory"
+        )
 
 
 def require_unused(directory: Path) -> None:
@@ -135,64 +177,14 @@ def _entries(record: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for outer, x in record.items() for name, value in inner(outer, x).items()}
 
 
-def run_metadata(config: RunConfig) -> dict:
-    """Return what else decides a run's results: engine, device and versions; and the command that repeats it."""
-    versions = {"mtjax": __version__}
-    for package in _PACKAGES:
-        try:
-            versions[package] = version(package)
-        except PackageNotFoundError:
-            versions[package] = "not installed"
-    return {
-        "engine": config.family.engine_name,
-        "device": str(jax.devices()[0].device_kind),
-        "python": platform.python_version(),
-        "versions": versions,
-        "command": shlex.join(["python", "-m", "mtjax.train", *to_flags(config)]),
-    }
+def evaluations_of(config: RunConfig, directory: Path) -> Evaluations:
+    """Read the evaluations of a run, given its configuration.
 
-
-def to_flags(config: RunConfig) -> list[str]:
-    """Return every setting as a flag, so that the command keeps its meaning when presets change."""
-    words = [f"--env={config.env}", f"--agent={config.agent}", *import_flags(config)]
-    words += [f"--from={config.start}"] if config.start else []
-    words += ["--tensorboard"] * config.tensorboard + [f"--wandb={config.wandb}"] * bool(config.wandb)
-    found = {"--": {**_fields(config.plan), **_fields(config.training)}, "--env.": _family_settings(config.family)}
-    for prefix, items in found.items():
-        words += itertools.chain(*(_flag(prefix, name.replace("_", "-"), value) for name, value in items.items()))
-    names, values = flag_names(config.learner), settings(config.learner)
-    for name, flag in names.items():
-        group, dot, rest = flag.rpartition(".")
-        words += _flag(f"--{group}{dot}", rest, values[name])
-    return words + (["--sweep", *config.sweep] if config.sweep else [])
-
-
-def _fields(family: Any) -> dict[str, Any]:
-    return {field.name: getattr(family, field.name) for field in dataclasses.fields(family)}
-
-
-def _family_settings(env: Tabled) -> dict[str, Any]:
-    """Return the settings of a family; of a mixture its own, its families' common ones and varied parameters."""
-    if isinstance(env, Family):
-        return _fields(env)
-    each = {part.name: _fields(part.family) for part in env.parts}
-    names = dict.fromkeys(name for own in each.values() for name in own)
-    held = {name: [own[name] for own in each.values() if name in own] for name in names if name != "vary"}
-    alike = {name: values[0] for name, values in held.items() if values.count(values[0]) == len(values)}
-    vary = [(f"{name}.{parameter}", values) for name, own in each.items() for parameter, values in own["vary"]]
-    own = {"scenes": env.scenes} if isinstance(env, Mixture) else {}
-    return {"vary": tuple(vary), **own, **alike}
-
-
-def _flag(prefix: str, name: str, value: object) -> list[str]:
-    if name == "context-ranges":  # --from takes them from its run
-        return []
-    if name == "vary":
-        return [f"{prefix}vary.{parameter}={values}" for parameter, values in value]  # type: ignore
-    prefix = "--" if name in ("split", "engine") else prefix
-    match value:
-        case bool():
-            return [f"{prefix}{name}" if value else f"{prefix}no-{name}"]
-        case tuple():
-            return [f"{prefix}{name}", *map(str, value)] if value else []
-    return [f"{prefix}{name}={value}"] if value != "" else []
+    Raises:
+        InputError: the file is missing or damaged, or of another run.
+    """
+    file, values = directory / "evaluations.npz", {split: config.family.task_values(split) for split in SPLITS}
+    found = load_evaluations(file)
+    seeds = [*config.plan.all_seeds] * max(len(config.points), 1)
+    require_same_run(file, found, no_evaluations(seeds, values, config.plan.eval_episodes))
+    return found

@@ -11,10 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from mtjax import frames, loop, standalone
-from mtjax.agents import BaseAgent, name_of
+from mtjax.agents import BaseAgent, name_of, swept
+from mtjax.agents.swept import Point, SweptAgent
 from mtjax.checks import path, require_whole, shown
 from mtjax.compiling.programs import trace
-from mtjax.config import RunConfig, from_json
+from mtjax.config import RunConfig
 from mtjax.envs import name_of as env_name_of
 from mtjax.envs.family import Family
 from mtjax.envs.tabled import Tabled
@@ -22,8 +23,8 @@ from mtjax.experience import Replay
 from mtjax.experience.ring import Ring
 from mtjax.names import public
 from mtjax.saved import checkpoint as checkpoints
-from mtjax.saved import points, shipped
-from mtjax.saved.points import Point
+from mtjax.saved import shipped
+from mtjax.saved.config_json import from_json
 from mtjax.saved.steps import steps_of
 from mtjax.tasks import SAME_CONTEXT
 from mtjax.types import Array, InputError, Key, Task, Transition
@@ -198,7 +199,7 @@ def policy_of(
     count = len(seeds)
     _require_seed(seed, count, len(found))
     if found:
-        agent = points.agent_at(agent, found[seed // count])
+        agent = swept.agent_at(agent, found[seed // count])
         states = jax.tree.map(lambda x: x[_point_rows(count, seed)], states.learner)
     own = seed % count
     return Policy(env, agent, jax.tree.map(lambda x: x[own], states), states, seeds, directory, own)
@@ -234,6 +235,6 @@ def load_experience(directory: str | Path, seed: int = 0) -> tuple[Ring, int]:
 
 def state_shapes(config: RunConfig) -> loop.TrainState:
     """Return the shapes of a run's training state."""
-    env, agent = config.family, points.SweptAgent(config.learner) if config.points else config.learner
-    axis = points.seed_axis(config.points, np.asarray(config.plan.all_seeds, np.int32))
+    env, agent = config.family, SweptAgent(config.learner) if config.points else config.learner
+    axis = swept.seed_axis(config.points, np.asarray(config.plan.all_seeds, np.int32))
     return trace(loop.init, env, agent, config.training, env.tasks("train"), *axis).out_info  # type: ignore

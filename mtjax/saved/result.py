@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mtjax.agents.swept import Point
 from mtjax.evaluation import Evaluations
 from mtjax.loop import TrainState
 from mtjax.names import nearest_error, public
 from mtjax.parallel import hosts
-from mtjax.saved.points import Point
 from mtjax.saved.policy import Policy, policy_of
 from mtjax.saved.tables import frame_of, metrics_frame
 

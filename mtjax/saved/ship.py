@@ -8,9 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.config import RunConfig, read_record
+from mtjax.config import RunConfig
 from mtjax.names import InputError
 from mtjax.saved import shipped
+from mtjax.saved.config_json import read_record
 from mtjax.saved.policy import Policy, load
 from mtjax.saved.steps import steps_of
 

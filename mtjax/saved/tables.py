@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from mtjax.agents.swept import Point
 from mtjax.envs.tabled import Tabled
 from mtjax.evaluation import Evaluations
 from mtjax.names import InputError
-from mtjax.saved.points import Point
 
 
 def pandas() -> Any:

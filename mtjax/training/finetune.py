@@ -10,7 +10,8 @@ import numpy as np
 from mtjax import frames
 from mtjax.agents import BaseAgent, parts, settings
 from mtjax.agents.state import AgentState
-from mtjax.config import NO_FINE_TUNING
+from mtjax.agents.swept import agents_at
+from mtjax.config import NO_FINE_TUNING, RunConfig
 from mtjax.envs import Family
 from mtjax.envs.mixtures import require_family
 from mtjax.networks import Params
@@ -19,6 +20,23 @@ from mtjax.saved.policy import Policy
 from mtjax.types import Env, InputError, Spec, Task
 
 _FRESH = ("tasks", "sampler")  # networks that belong to the new tasks alone
+
+
+def require_start(config: RunConfig, start: Policy | None) -> None:
+    """Check that a run can begin from a policy, or without one.
+
+    Raises:
+        InputError: it cannot.
+    """
+    learner = config.learner
+    begins = start is not None or config.start
+    if learner.tune != "all" and not begins:
+        raise InputError(f"--tune={learner.tune} leaves the rest as a run left it; say which run: --from=RUN")
+    if learner.experience.reset_every and begins:
+        raise InputError("--reset-every throws away what --from takes from a run; give one of them")
+    if start is not None:
+        for each in agents_at(learner, config.points):
+            require_fit(start, config.family, each)
 
 
 def require_fit(start: Policy, env: Env, agent: BaseAgent) -> None:

@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -12,17 +11,17 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jax.sharding import Mesh
 
 from mtjax.agents import settings as settings_of
+from mtjax.agents import swept
+from mtjax.agents.swept import Point, SweptAgent
 from mtjax.compiling.programs import Programs, compile_lowered, jit_programs, load_kernels, sharded_shapes, trace
-from mtjax.config import Plan, RunConfig
+from mtjax.config import RunConfig
 from mtjax.evaluation import Evaluations, no_evaluations
-from mtjax.loop import Settings, TrainState
+from mtjax.loop import TrainState
 from mtjax.parallel import hosts
 from mtjax.parallel import mesh as meshes
-from mtjax.saved import checkpoint, lock, log, points
-from mtjax.saved.points import Point, SweptAgent
+from mtjax.saved import checkpoint, lock, log
 from mtjax.saved.policy import Policy
 from mtjax.saved.records import Records
 from mtjax.saved.result import Result
@@ -39,37 +38,32 @@ from mtjax.training.console import (
 from mtjax.training.exchange import Exchange
 from mtjax.training.sinks import Sink, open_sinks, write_rows
 from mtjax.training.stops import finite_seeds, require_finite, require_finite_parameters, stop_signals
-from mtjax.types import SPLITS, Agent, Env
+from mtjax.types import SPLITS
 
 _WHEN = ("iteration", "steps", "seconds", "wall_seconds")  # columns of metrics.csv
 
 
 class Hooks(NamedTuple):
-    """What a run has beside its configuration: functions that it calls, and what it prints."""
+    """What a run has beside its configuration: where it begins and is written, whom it calls, and what it prints."""
 
+    directory: Path | None = None
+    """An existing folder for metrics, evaluations and checkpoints, in which no other process writes; None for none."""
+    start: Policy | None = None
+    """The policy to fine-tune."""
+    resume: bool = False
+    """Continue from the newest whole checkpoint in ``directory``, or start over if there is none yet."""
     on_chunk: Callable[[dict[str, Any]], Any] | None = None
     on_evaluation: Callable[[Evaluations], None] | None = None
     quiet: bool = False
-    label: str = ""  # the first words of progress lines
+    label: str = ""
+    """The first words of progress lines."""
 
 
 NO_HOOKS = Hooks()
 
 
-def train(
-    config: RunConfig,
-    directory: Path | None = None,
-    start: Policy | None = None,
-    resume: bool = False,
-    hooks: Hooks = NO_HOOKS,
-) -> Result:
+def train(config: RunConfig, hooks: Hooks = NO_HOOKS) -> Result:
     """Train an agent on a family of tasks, by a configuration that ``launch.check`` accepts.
-
-    Args:
-        directory: an existing folder for metrics, evaluations and checkpoints; None writes nothing. Only one process
-            at a time may write there.
-        start: the policy to fine-tune.
-        resume: continue from the newest whole checkpoint in ``directory``, or start over if there is none yet.
 
     Raises:
         InputError: the run in the folder is another, or memory or disk have no room.
@@ -77,46 +71,17 @@ def train(
             the last checkpoint.
         OSError: a file could not be written. The checkpoint before it stays.
     """
-    started, env, agent, plan = time.monotonic(), config.family, config.learner, config.plan
-    played, length = played_by(config)
-    planned = agent.planned(length)
-    console = Console(length * config.worlds, hooks.quiet or not hosts.is_first(), hooks.label)
-    run = _Run(
-        *(env, SweptAgent(planned) if config.points else planned, played, plan, directory, console, config.points),
-        mesh_of(config),
-        config,
-        hooks,
+    started = time.monotonic()
+    run = _Run(config, hooks)
+    with contextlib.closing(run.console), memory.explaining():
+        result = run.train(started)
+    return result._replace(
+        total_seconds=time.monotonic() - started,
+        env=config.family,
+        agent=config.learner,
+        seeds=tuple(config.plan.all_seeds),
+        points=config.points,
     )
-    with contextlib.closing(console), memory.explaining():
-        result = run.train(start, resume, started)
-    own = {"env": env, "agent": agent, "seeds": tuple(plan.all_seeds), "points": config.points}
-    return result._replace(total_seconds=time.monotonic() - started, **own)
-
-
-def mesh_of(config: RunConfig) -> Mesh | None:
-    """Return the devices of a run, or None for a single one.
-
-    Raises:
-        InputError: they cannot share its seeds and worlds evenly.
-    """
-    seeds = config.plan.seeds * max(len(config.points), 1)
-    return meshes.mesh_for(seeds, config.num_tasks, config.training.num_envs)
-
-
-def played_by(config: RunConfig) -> tuple[Settings, int]:
-    """Return a run's settings with the chunks that it plays, and how many steps of every environment these are."""
-    settings, steps = config.training, config.plan.steps
-    played = fit_chunk(settings, config.num_tasks, steps, config.learner.experience.steps)
-    chunk = played.chunk_steps
-    return played, math.ceil(steps / (config.worlds * chunk)) * chunk
-
-
-def fit_chunk(settings: Settings, num_tasks: int, steps: int, grain: int = 1) -> Settings:
-    """Return settings whose chunks divide the run evenly, each a multiple of ``grain`` steps."""
-    whole_run = math.ceil(steps / (num_tasks * settings.num_envs))
-    longest = math.ceil(min(settings.chunk_steps, whole_run) / grain) * grain
-    chunk = math.ceil(whole_run / math.ceil(whole_run / longest) / grain) * grain
-    return dataclasses.replace(settings, chunk_steps=chunk)
 
 
 class _Progress(NamedTuple):
@@ -132,30 +97,26 @@ class _Progress(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class _Run:
-    """The fixed parts of one run."""
+    """Trains by one configuration."""
 
-    env: Env
-    agent: Agent
-    settings: Settings
-    plan: Plan
-    directory: Path | None
-    console: Console
-    points: tuple[Point, ...] = ()
-    mesh: Mesh | None = None
-    config: RunConfig | None = None
+    config: RunConfig
     hooks: Hooks = NO_HOOKS
 
-    @property
-    def longest(self) -> int:
-        """Return the iterations of a chunk, were the run of many steps."""
-        assert self.config is not None
-        settings = self.config.training
-        return fit_chunk(settings, 1, settings.num_envs * settings.chunk_steps, self.agent.experience.steps).chunk_steps
+    @cached_property
+    def agent(self) -> Any:
+        """Return the agent as it is trained: with its schedule's length, and of a sweep with traced numbers."""
+        planned = self.config.learner.planned(self.config.length)
+        return SweptAgent(planned) if self.config.points else planned
+
+    @cached_property
+    def console(self) -> Console:
+        total = self.config.length * self.config.worlds
+        return Console(total, self.hooks.quiet or not hosts.is_first(), self.hooks.label)
 
     @cached_property
     def seed_axis(self) -> tuple[np.ndarray, dict[str, np.ndarray] | None]:
         """Return the seeds (S,) of all points, and the swept values (S,) by name."""
-        return points.seed_axis(self.points, np.asarray(self.plan.all_seeds, np.int32))
+        return swept.seed_axis(self.config.points, np.asarray(self.config.plan.all_seeds, np.int32))
 
     @property
     def seeds(self) -> np.ndarray:
@@ -163,40 +124,41 @@ class _Run:
 
     def point(self, number: int) -> Point:
         """Return the swept values of one entry of S."""
-        return self.points[number // self.plan.seeds] if self.points else {}
+        config = self.config
+        return config.points[number // config.plan.seeds] if config.points else {}
 
-    def adopt(self, start: Policy, tasks: Any, fresh: Any) -> Any:
+    def adopt(self, tasks: Any, fresh: Any) -> Any:
         """Return the agent's state with the values of the run to fine-tune. Every point starts from the same seeds."""
         if not isinstance(self.agent, SweptAgent):
-            return finetune.adopt(start, self.agent, tasks, fresh)  # type: ignore
-        apart = lambda x: x.reshape(len(self.points), self.plan.seeds, *x.shape[1:])
+            return finetune.adopt(self.hooks.start, self.agent, tasks, fresh)  # type: ignore
+        apart = lambda x: x.reshape(len(self.config.points), self.config.plan.seeds, *x.shape[1:])
         together = lambda x: x.reshape(-1, *x.shape[2:])
-        adopt = partial(finetune.adopt, start, self.agent.agent, tasks)
+        adopt = partial(finetune.adopt, self.hooks.start, self.agent.agent, tasks)  # type: ignore
         learner = jax.tree.map(together, jax.vmap(adopt)(jax.tree.map(apart, fresh.learner)))
         return fresh._replace(learner=learner)
 
     @cached_property
     def records(self) -> Records:
-        return Records(self.directory)
+        return Records(self.hooks.directory)
 
     @cached_property
     def exchange(self) -> Exchange:
-        return Exchange(self.env, self.agent, self.settings, self.mesh, self.directory)
+        return Exchange(self.config.family, self.agent, self.config.played, self.config.mesh, self.hooks.directory)
 
-    def train(self, start: Policy | None, resume: bool, started: float) -> Result:
+    def train(self, started: float) -> Result:
         """Prepare the run, and play its chunks; ``started`` is the clock when the user began to wait."""
         with contextlib.ExitStack() as held:
-            if (folder := self.directory) is not None:
+            if (folder := self.hooks.directory) is not None:
                 hosts.broadcast_path(lambda: held.enter_context(lock.hold(folder)))
-            resumed = self.records.found(resume)
-            if resume and not resumed:
+            resumed = self.records.found(self.hooks.resume)
+            if self.hooks.resume and not resumed:
                 self.console.say("there is no checkpoint yet, so the run starts over")
             if not resumed:
                 self.introduce()
             programs, state = self.prepare(resumed)
-            if start is not None and not resumed:
-                begun = self.adopt(start, self.env.tasks("train"), hosts.gather(state.agent))
-                state = state._replace(agent=meshes.shard_by_seed(self.mesh, begun))
+            if self.hooks.start is not None and not resumed:
+                begun = self.adopt(self.config.family.tasks("train"), hosts.gather(state.agent))
+                state = state._replace(agent=meshes.shard_by_seed(self.config.mesh, begun))
             held.callback(self.exchange.close)
             self.exchange.begin(state)
             hosts.wait_for_all()
@@ -204,28 +166,20 @@ class _Run:
             self.console.say(f"compiled in {duration(compile_seconds)}")
             return self.run_chunks(programs, state, started)._replace(compile_seconds=compile_seconds)
 
-    @cached_property
-    def steps_per_iteration(self) -> int:
-        """Return the number of environments, summed over tasks: environment steps of one iteration."""
-        return len(self.env.tasks("train").id) * self.settings.num_envs
-
-    @property
-    def eval_every(self) -> int:
-        return self.plan.eval_every or math.ceil(self.plan.steps / 10)
-
     def prepare(self, resume: bool) -> tuple[Programs, TrainState]:
         """Compile all programs in parallel, and make or restore the state. Evaluation may be ready later."""
-        env, agent, settings, lazy = self.env, self.agent, self.settings, jit_programs(self.mesh, self.agent)
-        tasks, everything = (meshes.replicate(self.mesh, env.tasks(split)) for split in ("train", "all"))
-        (seeds, knobs), pool = meshes.shard_by_seed(self.mesh, self.seed_axis), ThreadPoolExecutor(3)
+        env, agent, settings = self.config.family, self.agent, self.config.played
+        lazy, episodes = jit_programs(self.config.mesh, agent), self.config.plan.eval_episodes
+        tasks, everything = (meshes.replicate(self.config.mesh, env.tasks(split)) for split in ("train", "all"))
+        (seeds, knobs), pool = meshes.shard_by_seed(self.config.mesh, self.seed_axis), ThreadPoolExecutor(3)
         fresh = trace(lazy.init, env, agent, settings, tasks, seeds, knobs)
-        shapes = sharded_shapes(self.mesh, agent, fresh.out_info)
+        shapes = sharded_shapes(self.config.mesh, agent, fresh.out_info)
         self._describe(shapes)
         self.console.say("compiling")
         kernels = pool.submit(load_kernels, env)
         make = None if resume else pool.submit(lambda: compile_lowered(fresh.lower(), "once"))
         chunk = trace(lazy.chunk, env, agent, settings, tasks, shapes)
-        played = partial(trace, lazy.evaluate, env, agent, self.plan.eval_episodes, shapes.agent, everything, seeds)
+        played = partial(trace, lazy.evaluate, env, agent, episodes, shapes.agent, everything, seeds)
         score = pool.submit(lambda: compile_lowered(played(np.int32(0)).lower(), "seldom"))
         pool.shutdown(wait=False)
         evaluate = lambda agents, number: score.result()(agents, everything, seeds, np.int32(number))
@@ -236,25 +190,27 @@ class _Run:
         return programs, self.records.restore(shapes) if make is None else make.result()(tasks, seeds, knobs)
 
     def _describe(self, shapes: TrainState) -> None:
-        needs = memory.Needs.of(shapes, self.env, self.agent, self.settings)
-        memory.require_room(needs, self.env)
-        kind = self.agent.experience.describe(self.env.spec, self.settings.num_envs)
+        env, settings = self.config.family, self.config.played
+        needs = memory.Needs.of(shapes, env, self.agent, settings)
+        memory.require_room(needs, env)
+        kind = self.agent.experience.describe(env.spec, settings.num_envs)
         for line in memory.tell(shapes.data, needs, kind, len(self.seeds)):
             self.console.say(line)
-        if line := meshes.describe(self.mesh, len(self.seeds), self.settings.num_envs):
+        if line := meshes.describe(self.config.mesh, len(self.seeds), settings.num_envs):
             self.console.say(line)
-        if self.directory is not None:
+        if self.hooks.directory is not None:
             larger = [name for name in ("replay_size", "host_replay_size") if getattr(self.agent.experience, name, 0)]
             flags = [name.replace("_", "-") for name in larger or ["num_envs"]]
-            checkpoint.require_space(self.directory, shapes, needs.host, flags)
+            checkpoint.require_space(self.hooks.directory, shapes, needs.host, flags)
 
     def _open_sinks(self, steps: int) -> list[Sink]:
         """Return where metrics go beside metrics.csv, in a run that is at a step."""
         if not self.records.writes:
             return []
-        assert self.directory is not None and self.config is not None
-        config = {**dataclasses.asdict(self.plan), **dataclasses.asdict(self.settings), **settings_of(self.learner)}
-        return open_sinks(self.directory, self.config.tensorboard, self.config.wandb, steps, config)
+        assert self.hooks.directory is not None
+        config, plan, played = self.config, dataclasses.asdict(self.config.plan), dataclasses.asdict(self.config.played)
+        told = {**plan, **played, **settings_of(self.learner)}
+        return open_sinks(self.hooks.directory, config.tensorboard, config.wandb, steps, told)
 
     @property
     def learner(self) -> Any:
@@ -266,39 +222,31 @@ class _Run:
         values = [f"{name}={value:g}" for name, value in self.point(k).items()]
         return "-".join([*values, f"seed-{self.seeds[k]}"])
 
-    @property
-    def steps_per_chunk(self) -> int:
-        return self.settings.chunk_steps * self.steps_per_iteration
-
-    @property
-    def warmup(self) -> int:
-        """Return the environment steps under random actions, before learning begins."""
-        return self.agent.experience.warmup_steps * self.steps_per_iteration
-
     def introduce(self) -> None:
         """Say how many steps a new run takes, and what the first of them are."""
-        chunk, total = self.steps_per_chunk, self.console.total
-        for line in (*describe_rounding(self.plan.steps, total, chunk), *describe_warmup(self.warmup, total)):
+        config, total = self.config, self.console.total
+        rounding = describe_rounding(config.plan.steps, total, config.steps_per_chunk)
+        for line in (*rounding, *describe_warmup(config.warmup, total)):
             self.console.say(line)
 
     def _clock(self, steps: int) -> Clock:
         """Return a clock that counts the chunks and evaluations to come, however many there are."""
-        chunk, every = self.steps_per_chunk, self.eval_every
+        chunk, every = self.config.steps_per_chunk, self.config.plan.interval
         count = max(-(-(self.console.total - steps) // chunk), 0)
         last = steps + (count - 1) * chunk  # where the last chunk begins
         evaluations = max(count - 1 if chunk >= every else last // every - steps // every, 0) + (count > 0)
-        return Clock(count, evaluations, min(max(-(-(self.warmup - steps) // chunk), 0), count))
+        return Clock(count, evaluations, min(max(-(-(self.config.warmup - steps) // chunk), 0), count))
 
     def _running(self, state: TrainState, returns: np.ndarray) -> str:
         """Return a text on first episodes that still run, if no episode has ended."""
         if np.isfinite(returns).any() or jax.process_count() > 1:
             return ""
         totals, ages, counted = jax.device_get((state.total, state.worlds.age, state.counted))
-        return describe_running(totals, ages, counted, self.env.episode_length)
+        return describe_running(totals, ages, counted, self.config.family.episode_length)
 
     def run_chunks(self, programs: Programs, state: TrainState, started: float) -> Result:
         """Run chunks until all steps are done or a signal asks to stop."""
-        steps = int(state.iteration) * self.steps_per_iteration
+        steps = int(state.iteration) * self.config.worlds
         if steps:
             self.console.say(describe_resumption(steps, self.console.total))
         self.console.clock = self._clock(steps)
@@ -311,11 +259,12 @@ class _Run:
     def _begin(self, programs: Programs, state: TrainState, steps: int) -> _Progress:
         """Return where a new or resumed run is."""
         iteration = int(state.iteration)
-        evaluations = self.records.earlier_evaluations(steps, steps >= self.eval_every, self._no_evaluations())
-        form = (self._columns(programs.metrics), len(self.seeds), self.longest) if iteration else ()
+        plan = self.config.plan
+        evaluations = self.records.earlier_evaluations(steps, steps >= plan.interval, self._no_evaluations())
+        form = (self._columns(programs.metrics), len(self.seeds), self.config.longest) if iteration else ()
         seconds, wall = self.records.earlier_seconds(iteration, *form)
         now = _Progress(state, steps, seconds, wall, evaluations, np.zeros(len(self.seeds), bool))
-        if steps < self.plan.steps or len(evaluations.steps):
+        if steps < plan.steps or len(evaluations.steps):
             return now
         spoiled = ~finite_seeds(getattr(state.agent, "learner", state.agent))
         again = self._evaluate(programs.evaluate, now._replace(diverged=spoiled))  # they were lost after the run's end
@@ -325,7 +274,7 @@ class _Run:
         rows, stop, earlier = log.Rows(), False, now.seconds
         with stop_signals() as received, self.records.closing():
             asked = lambda enough: bool(hosts.largest(int(enough or bool(received))))
-            while now.steps < self.plan.steps and not stop:
+            while now.steps < self.config.plan.steps and not stop:
                 self.records.check()
                 seconds = now.seconds
                 now, metrics = self._play(programs.chunk, now, len(rows) // len(self.seeds))
@@ -344,20 +293,20 @@ class _Run:
                     write_rows(sinks, *self._evaluation_rows(now.evaluations))
                     stop = asked(stop)
                 if due or stop:
-                    self._save(now.state, now.steps // self.steps_per_iteration)
+                    self._save(now.state, now.steps // self.config.worlds)
                     self.console.clock.evaluation(time.monotonic() - before)
                 if due and self.hooks.on_evaluation is not None:
                     self.hooks.on_evaluation(now.evaluations)
             signal = hosts.largest(received[0] if received else 0)  # also one that came during the last save
-        finished = now.steps >= self.plan.steps
-        return Result(now.state, now.evaluations, rows, now.seconds, 0.0, finished, self.directory)._replace(
+        finished = now.steps >= self.config.plan.steps
+        return Result(now.state, now.evaluations, rows, now.seconds, 0.0, finished, self.hooks.directory)._replace(
             trained_seconds=now.seconds - earlier, signal=signal
         )
 
     def _is_due(self, steps: int) -> bool:
         """Return whether an evaluation is due after the chunk that ends at a step."""
-        before = steps - self.steps_per_chunk
-        return steps // self.eval_every > before // self.eval_every or steps >= self.plan.steps
+        plan, before = self.config.plan, steps - self.config.steps_per_chunk
+        return steps // plan.interval > before // plan.interval or steps >= plan.steps
 
     def _play(self, chunk: Callable, now: _Progress, done: int) -> tuple[_Progress, dict[str, Any]]:
         """Run one chunk, and return its metrics too. ``done`` counts the chunks before it in this process."""
@@ -367,9 +316,9 @@ class _Run:
             state = self.exchange.after_chunk(state)
             metrics = hosts.gather(metrics)
             elapsed = time.monotonic() - before
-        iteration = now.steps // self.steps_per_iteration
+        iteration = now.steps // self.config.worlds
         diverged = now.diverged | self._find_diverged(metrics, iteration, now.diverged)
-        steps, seconds = now.steps + self.steps_per_chunk, now.seconds + elapsed
+        steps, seconds = now.steps + self.config.steps_per_chunk, now.seconds + elapsed
         return now._replace(state=state, steps=steps, seconds=seconds, diverged=diverged), metrics
 
     def _log(
@@ -377,7 +326,7 @@ class _Run:
     ) -> list[dict[str, Any]]:
         """Write the metrics of a chunk that took ``elapsed`` seconds, and return them: a row for each entry of S."""
         passed = time.monotonic() - started
-        iteration = now.steps // self.steps_per_iteration
+        iteration = now.steps // self.config.worlds
         when = (iteration, now.steps, f"{now.seconds:.3f}", f"{now.wall + passed:.3f}")
         lines = log.metric_rows(metrics, np.asarray(self.seeds), dict(zip(_WHEN, when, strict=True)))
         new = [{"seed": row["seed"], **self.point(k), **row} for k, row in enumerate(lines)]
@@ -385,7 +334,7 @@ class _Run:
         write_rows(sinks, lines, [self._name(k) for k in range(len(lines))])
         self.console.clock.chunk(elapsed)
         self._tell_lost(metrics["lost"])
-        rate = self.steps_per_chunk * len(self.seeds) / elapsed
+        rate = self.config.steps_per_chunk * len(self.seeds) / elapsed
         self.console.progress(now.steps, passed, rate, metrics["return"], self._running(now.state, metrics["return"]))
         return new
 
@@ -404,11 +353,11 @@ class _Run:
     @contextlib.contextmanager
     def _profile_chunk(self, done: int, steps: int) -> Iterator[None]:
         """Trace the run's second, warm chunk, or its only one, if ``profile`` asks for it."""
-        only = not done and steps + self.steps_per_chunk >= self.plan.steps
-        if not (self.config is not None and self.config.profile and self.records.writes and (done == 1 or only)):
+        only = not done and steps + self.config.steps_per_chunk >= self.config.plan.steps
+        if not (self.config.profile and self.records.writes and (done == 1 or only)):
             yield
             return
-        place = self.directory / "profile"  # type: ignore
+        place = self.hooks.directory / "profile"  # type: ignore
         with jax.profiler.trace(place):
             yield
         self.console.say(f"profile of one chunk: {place} (xprof --logdir={place}, or its *.trace.json.gz in Perfetto)")
@@ -416,7 +365,7 @@ class _Run:
     def _find_diverged(self, metrics: dict[str, Any], first_step: int, diverged: np.ndarray) -> np.ndarray:
         """Return which seeds (S,) have diverged in this chunk. In a sweep the other seeds continue."""
         broken = np.any(metrics["bad_step"] >= 0, axis=1)
-        if not self.points or np.all(broken | diverged):
+        if not self.config.points or np.all(broken | diverged):
             require_finite(metrics["bad_step"], metrics["bad_reward"], first_step, self.records.last)
         self._tell_given_up(broken & ~diverged)
         return broken
@@ -429,8 +378,8 @@ class _Run:
         """
         agents = getattr(now.state.agent, "learner", now.state.agent)
         spoiled = ~finite_seeds(agents)
-        if not self.points or np.all(spoiled | now.diverged):
-            require_finite_parameters(agents, now.steps // self.steps_per_iteration, self.records.last)
+        if not self.config.points or np.all(spoiled | now.diverged):
+            require_finite_parameters(agents, now.steps // self.config.worlds, self.records.last)
         self._tell_given_up(spoiled & ~now.diverged)
         return now._replace(diverged=now.diverged | spoiled)
 
@@ -449,7 +398,7 @@ class _Run:
         """Evaluate on all splits, and append the result to the run's evaluations."""
         past, diverged = now.evaluations, now.diverged
         scores = hosts.gather(program(now.state.agent, len(past.steps)))
-        rows = {split: np.asarray(self.env.tasks(split).id) for split in SPLITS}
+        rows = {split: np.asarray(self.config.family.tasks(split).id) for split in SPLITS}
 
         def append(old: Mapping[str, np.ndarray], new: np.ndarray) -> dict[str, np.ndarray]:
             new = np.array(new, np.float32)
@@ -480,5 +429,5 @@ class _Run:
 
     def _no_evaluations(self) -> Evaluations:
         """Return the evaluations of a run that has not begun."""
-        values = {split: self.env.task_values(split) for split in SPLITS}
-        return no_evaluations(self.seeds, values, self.plan.eval_episodes)
+        values = {split: self.config.family.task_values(split) for split in SPLITS}
+        return no_evaluations(self.seeds, values, self.config.plan.eval_episodes)

@@ -1,12 +1,11 @@
 """Metrics of a run for TensorBoard and Weights & Biases, beside metrics.csv. Each seed is a run of its own there."""
 
-import importlib
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from mtjax.names import InputError
+from mtjax.checks import require_library
 
 _COUNTS = ("seed", "iteration", "steps")
 _OF_TASK = re.compile(r"(\w+)_(\d+)")  # a column of metrics.csv that is of one task
@@ -23,7 +22,7 @@ class TensorBoard:
     """Writes event files, one folder for each seed: ``tensorboard --logdir DIRECTORY``."""
 
     def __init__(self, directory: Path, first_step: int):
-        self.module = require("tensorboardX")
+        self.module = require_library("tensorboardX")
         self.directory, self.first_step, self.writers = directory / "tensorboard", first_step, {}
 
     def write(self, run: str, steps: int, values: Mapping[str, float]) -> None:
@@ -45,7 +44,7 @@ class WandB:
     """Logs to a project of Weights & Biases: one run for each seed, in a group of the folder's name."""
 
     def __init__(self, project: str, directory: Path, config: Mapping[str, Any]):
-        self.module = require("wandb")
+        self.module = require_library("wandb")
         self.project, self.directory, self.config, self.runs = project, directory, dict(config), {}
 
     def write(self, run: str, steps: int, values: Mapping[str, float]) -> None:
@@ -69,25 +68,6 @@ class WandB:
         """Finish the runs."""
         for run in self.runs.values():
             run.finish()
-
-
-def require_libraries(tensorboard: bool, wandb: str) -> None:
-    """Raise InputError if a library is missing for what a run asks for."""
-    for module in ["tensorboardX"] * bool(tensorboard) + ["wandb"] * bool(wandb):
-        require(module)
-
-
-def require(module: str) -> Any:
-    """Import and return a library.
-
-    Raises:
-        InputError: it is not installed.
-    """
-    try:
-        return importlib.import_module(module)
-    except ImportError:
-        extra = module.removesuffix("X")
-        raise InputError(f"--{extra} needs {module}: pip install 'mtjax[{extra}]'") from None
 
 
 def open_sinks(
