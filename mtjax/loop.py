@@ -16,7 +16,18 @@ import jax.numpy as jnp
 from mtjax.checks import check_fields
 from mtjax.maps import over_seeds, when
 from mtjax.parallel import collectives
-from mtjax.rollout import EnvStep, Worlds, bounded_worlds, reset_ended, reset_envs, split_keys, step_envs, world_keys
+from mtjax.rollout import (
+    EnvStep,
+    Worlds,
+    bounded_worlds,
+    followed,
+    reset_ended,
+    reset_envs,
+    split_keys,
+    step_envs,
+    world_keys,
+)
+from mtjax.trials import EACH_EPISODE, Repeated, Trials
 from mtjax.types import Agent, Array, Env, InputError, Key, Metrics, Sometimes, Task, Transition
 
 PHASES = 10
@@ -37,12 +48,21 @@ class Settings:
     stagger: bool = True
     """Begin environments at different ages, so that their episodes end at different times; returns do not count first
     episodes, which are shorter."""
+    trials: int = 1
+    """Episodes of a trial: for so many of them the task and the agent's memory stay, and the agent maximises their sum
+    of rewards. 1 makes every episode a trial of its own."""
 
     def __post_init__(self):
         check_fields(self)
-        for name in ("num_envs", "chunk_steps"):
+        for name in ("num_envs", "chunk_steps", "trials"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name.replace('_', '-')} must be at least 1, not {getattr(self, name)}")
+        _ = self.trial
+
+    @property
+    def trial(self) -> Trials:
+        """Return what a trial is."""
+        return EACH_EPISODE if self.trials == 1 else Repeated(self.trials)
 
 
 class TrainState(NamedTuple):
@@ -67,14 +87,16 @@ def init(
         knobs: values (S,), by name, of the agent's numbers that vary between seeds, for a ``SweptAgent`` agent.
     """
     agent.experience.check(env, settings.num_envs)
+    require_trials(settings, agent)
     num_tasks = len(tasks.id)
     shape = (len(seeds), num_tasks, settings.num_envs // collectives.count())
     key, agent_key, reset_key, data_key = split_keys(jax.vmap(jax.random.key)(seeds), 4)
     point = () if knobs is None else (knobs,)
     learners = jax.vmap(lambda key, *point: agent.init(env.spec, tasks, key, *point))(agent_key, *point)
-    worlds = reset_envs(env, agent, learners, tasks, world_keys(reset_key, shape))
+    worlds = reset_envs(env, agent, learners, tasks, world_keys(reset_key, shape), settings.trial)
     if settings.stagger:
-        worlds = worlds._replace(age=_first_ages(tasks, shape))
+        episode = None if worlds.episode is None else _first_episodes(settings.trials, shape)
+        worlds = worlds._replace(age=_first_ages(tasks, shape), episode=episode)
     blank = _blank(env, agent, learners, tasks, worlds, world_keys(key, shape))
     return TrainState(
         agent=learners,
@@ -87,6 +109,19 @@ def init(
     )
 
 
+def require_trials(settings: Settings, agent: Agent) -> None:
+    """Check that an agent can learn from trials.
+
+    Raises:
+        InputError: it relabels steps, and in trials of several episodes another episode may follow a step.
+    """
+    if settings.trials > 1 and getattr(agent.experience, "hindsight", 0):
+        raise InputError(
+            f"hindsight relabels steps by what follows them, which in a trial of {settings.trials} episodes may be "
+            "another episode; use --hindsight=0 or --trials=1"
+        )
+
+
 def _first_ages(tasks: Task, shape: tuple[int, ...]) -> Array:
     """Return first ages (S, T, E), spread evenly over the tasks' horizons, with at most ``PHASES`` values."""
     count = shape[2] * collectives.count()
@@ -94,6 +129,12 @@ def _first_ages(tasks: Task, shape: tuple[int, ...]) -> Array:
     phase = jnp.arange(count, dtype=jnp.int32) * phases // count
     ages = tasks.horizon[:, None] * phase // phases
     return jnp.broadcast_to(collectives.own(ages, axis=1), shape)
+
+
+def _first_episodes(trials: int, shape: tuple[int, ...]) -> Array:
+    """Return the first episodes (S, T, E) of trials, of which there are ``trials`` episodes each."""
+    number = jnp.arange(shape[2] * collectives.count(), dtype=jnp.int32)
+    return jnp.broadcast_to(collectives.own(number % trials, axis=0), shape)
 
 
 def _blank(env: Env, agent: Agent, learners: Any, tasks: Task, worlds: Worlds, keys: Key) -> Transition:
@@ -118,7 +159,7 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
 
     def iterate(state: TrainState, _) -> tuple[TrainState, Metrics]:
         key, act_key, reset_key, learn_key = split_keys(state.key, 4)
-        state, steps, seen = _collect(env, agent, tasks, state, act_key, reset_key)
+        state, steps, seen = _collect(env, agent, settings.trial, tasks, state, act_key, reset_key)
         learners, steps = over_seeds(partial(agent.assess, tasks=tasks), 0, 0)(state.agent, steps)
         data = experience.add(state.data, steps)
         learners, losses = _learn(env, agent, tasks, learners, data, state.iteration, learn_key)
@@ -130,7 +171,9 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
     return state._replace(agent=collectives.agreed(state.agent)), _summarise(history, count)
 
 
-def _collect(env, agent, tasks, state: TrainState, keys: Key, reset_keys: Key) -> tuple[TrainState, Transition, Any]:
+def _collect(
+    env, agent, trials: Trials, tasks, state: TrainState, keys: Key, reset_keys: Key
+) -> tuple[TrainState, Transition, Any]:
     """Take as many steps as the agent's experience asks for.
 
     Returns:
@@ -138,28 +181,30 @@ def _collect(env, agent, tasks, state: TrainState, keys: Key, reset_keys: Key) -
     """
     count = agent.experience.steps
     if count == 1:
-        state, (steps, seen) = _step(env, agent, tasks, state, keys, reset_keys)
+        state, (steps, seen) = _step(env, agent, trials, tasks, state, keys, reset_keys)
         return state, jax.tree.map(lambda x: x[:, :, None], steps), jax.tree.map(lambda x: x[None], seen)
-    step = lambda state, keys: _step(env, agent, tasks, state, *keys)
+    step = lambda state, keys: _step(env, agent, trials, tasks, state, *keys)
     apart = [jnp.stack(split_keys(each, count)) for each in (keys, reset_keys)]
     state, (steps, seen) = jax.lax.scan(step, state, tuple(apart))
     return state, jax.tree.map(lambda x: jnp.moveaxis(x, 0, 2), steps), seen
 
 
-def _step(env, agent, tasks, state: TrainState, keys: Key, reset_keys: Key):
+def _step(env, agent, trials: Trials, tasks, state: TrainState, keys: Key, reset_keys: Key):
     """Step every environment once, and begin new episodes where episodes ended."""
-    explore = lambda action: agent.experience.explore(state.data, action, state.iteration)
-    act_keys = world_keys(keys, state.total.shape)
-    worlds, env_step = step_envs(env, agent, state.agent, tasks, state.worlds, act_keys, explore)
+    explore, shape = lambda action: agent.experience.explore(state.data, action, state.iteration), state.total.shape
+    act_keys = world_keys(keys, shape)
+    worlds, env_step = step_envs(env, agent, state.agent, tasks, state.worlds, act_keys, explore, trials)
     transition, total = env_step.transition, state.total + env_step.transition.reward
     ended = transition.ended
+    fresh_keys = partial(world_keys, reset_keys, shape)
+    begun = reset_ended(env, agent, state.agent, tasks, worlds, env_step.ends, fresh_keys, trials)
     state = state._replace(
-        worlds=reset_ended(env, agent, state.agent, tasks, worlds, ended, reset_keys),
+        worlds=begun,
         total=jnp.where(ended, 0.0, total),
         counted=state.counted | ended,
         iteration=state.iteration + 1,
     )
-    return state, (transition, _reduce_step(env_step, total, state.counted))
+    return state, (followed(transition, env_step.ends, begun), _reduce_step(env_step, total, state.counted))
 
 
 def _learn(env, agent, tasks, learners: Any, data: Any, iteration: Array, keys: Key) -> tuple[Any, Metrics]:

@@ -10,6 +10,7 @@ from mtjax import frames
 from mtjax.maps import Flat, over_learners, where_worlds
 from mtjax.parallel import collectives
 from mtjax.tasks import contexts_vary, episode_task
+from mtjax.trials import EACH_EPISODE, Ends, Trials
 from mtjax.types import Acted, Agent, Array, Env, Key, Task, Transition
 
 _LARGEST = 1e10
@@ -23,10 +24,11 @@ class Worlds(NamedTuple):
     """Holds the state of every world; leaves (S, T, E, ...)."""
 
     state: Any  # of the environment
-    task: Task | None  # the episodes' own tasks where episodes draw theirs
+    task: Task | None  # the trials' own tasks where trials draw theirs
     obs: Any  # (S, T, E, O), or with the last pictures
-    memory: Any  # what the agent remembers of the episode
-    age: Array  # (S, T, E) int32, steps since the last reset
+    memory: Any  # what the agent remembers of the trial
+    age: Array  # (S, T, E) int32, steps of the episode
+    episode: Any = None  # (S, T, E) int32, episodes of the trial before this one; None where trials are single episodes
 
 
 def split_keys(keys: Key, count: int) -> tuple[Key, ...]:
@@ -46,23 +48,44 @@ def broadcast_tasks(tasks: Task, shape: tuple[int, ...]) -> Task:
     return jax.tree.map(lambda x: jnp.broadcast_to(x[None, :, None], shape + x.shape[1:]), single)
 
 
-def reset_envs(env: Env, agent: Agent, learners: Any, tasks: Task, keys: Key) -> Worlds:
-    """Begin an episode in every world, with keys (S, T, E), for agents with states ``learners`` (S, ...)."""
+def reset_envs(env: Env, agent: Agent, learners: Any, tasks: Task, keys: Key, trials: Trials = EACH_EPISODE) -> Worlds:
+    """Begin a trial in every world, with keys (S, T, E), for agents with states ``learners`` (S, ...)."""
+    begun, age = _begin(env, tasks, keys), jnp.zeros(keys.shape, jnp.int32)
+    memory = begin_memory(agent, learners, tasks, age)
+    return Worlds(*begun, memory, age, age if trials.episodes > 1 else None)
+
+
+class _Begun(NamedTuple):
+    """Holds what begins anew with an episode; leaves (S, T, E, ...)."""
+
+    state: Any  # of the environment
+    task: Task | None  # the trials' own tasks where trials draw theirs
+    obs: Any
+
+
+def _begin(env: Env, tasks: Task, keys: Key, drawn: Callable[[Task], Task] = lambda drawn: drawn) -> _Begun:
+    """Begin an episode in every world, with keys (S, T, E).
+
+    Args:
+        drawn: a function from drawn tasks (S, T, E, ...) to those of the episodes.
+    """
     if tasks.draws is None:
         each = broadcast_tasks(tasks, keys.shape)
     else:
         task_keys, keys = jnp.moveaxis(jax.vmap(jax.vmap(jax.vmap(jax.random.split)))(keys), -1, 0)
-        of_task = jax.vmap(episode_task, (None, 0))
-        each = jax.vmap(jax.vmap(of_task), (None, 0))(tasks, task_keys)
+        each = drawn(_draw_tasks(tasks, task_keys))
     start = env.reset_worlds(each._replace(blocks=tasks.blocks), keys)
-    age = jnp.zeros(keys.shape, jnp.int32)
-    obs = frames.begin(start.obs, env.spec.frames)
-    memory = begin_memory(agent, learners, tasks, age)
-    return Worlds(start.state, None if tasks.draws is None else each, obs, memory, age)
+    return _Begun(start.state, None if tasks.draws is None else each, frames.begin(start.obs, env.spec.frames))
+
+
+def _draw_tasks(tasks: Task, keys: Key) -> Task:
+    """Draw a task for every world, with keys (S, T, E)."""
+    of_task = jax.vmap(episode_task, (None, 0))
+    return jax.vmap(jax.vmap(of_task), (None, 0))(tasks, keys)
 
 
 def begin_memory(agent: Agent, learners: Any, tasks: Task, age: Array) -> Any:
-    """Return the memory with which agents begin an episode in every world, of ages (S, T, E)."""
+    """Return the memory with which agents begin a trial in every world, of ages (S, T, E)."""
     return over_learners(lambda learner, task, _: agent.begin(learner, task))(learners, tasks, age)
 
 
@@ -87,8 +110,9 @@ def act(agent: Agent, learners: Any, tasks: Task, worlds: Worlds, keys: Key | No
 class EnvStep(NamedTuple):
     """Holds one step of every world; leaves (S, T, E, ...)."""
 
-    transition: Transition
+    transition: Transition  # with the next observation from before any reset
     metrics: dict[str, Array]  # of the environment
+    ends: Ends
     lost: Array  # bool: the numbers of the world's observation are not finite, or beyond ``_LARGEST``
 
 
@@ -100,6 +124,7 @@ def step_envs(
     worlds: Worlds,
     keys: Key | None,
     explore: Callable[[Array], Array] = lambda action: action,
+    trials: Trials = EACH_EPISODE,
 ) -> tuple[Worlds, EnvStep]:
     """Act in every world and step it; episodes that end are not reset.
 
@@ -117,14 +142,16 @@ def step_envs(
     step = env.step_worlds(each, worlds.state, action)
     lost = ~bounded_worlds(step.obs)
     obs = where_worlds(lost, worlds.obs, frames.push(worlds.obs, step.obs))
-    terminated, age = step.terminated & ~lost, worlds.age + 1
+    age = worlds.age + 1
+    ends = trials.ends(step.terminated & ~lost, age >= each.horizon, lost, worlds.episode)
     transition = Transition(
         obs=worlds.obs,
         action=action,
         reward=jnp.where(lost, 0.0, step.reward),
-        discount=1.0 - terminated,
+        discount=1.0 - ends.terminal,
         next_obs=obs,
-        ended=terminated | lost | (age >= each.horizon),
+        ended=ends.episode,
+        closed=ends.trial,
         context=worlds.task.context if contexts_vary(tasks) else None,  # type: ignore
         extras=acted.extras,
         memory=worlds.memory,
@@ -133,7 +160,8 @@ def step_envs(
     if jax.tree.leaves(memory):
         note = lambda learner, task, memory, transition: agent.remember(learner, memory, transition, task)
         memory = over_learners(note)(learners, tasks, memory, transition)
-    return Worlds(step.state, worlds.task, obs, memory, age), EnvStep(transition, step.metrics, lost)
+    stepped = worlds._replace(state=step.state, obs=obs, memory=memory, age=age)
+    return stepped, EnvStep(transition, step.metrics, ends, lost)
 
 
 def bounded_worlds(obs: Any) -> Array:
@@ -143,54 +171,92 @@ def bounded_worlds(obs: Any) -> Array:
     return jnp.all(jnp.stack(within), axis=0) if within else jnp.ones(jax.tree.leaves(obs)[0].shape[:3], bool)
 
 
-def reset_ended(env: Env, agent: Agent, learners: Any, tasks: Task, worlds: Worlds, ended: Array, keys: Key) -> Worlds:
-    """Begin new episodes, with keys (S,), where ``ended`` (S, T, E); a branch skips this if no episode has ended.
+def reset_ended(
+    env: Env,
+    agent: Agent,
+    learners: Any,
+    tasks: Task,
+    worlds: Worlds,
+    ends: Ends,
+    keys: Callable[[], Key],
+    trials: Trials = EACH_EPISODE,
+) -> Worlds:
+    """Begin new episodes, and new trials, where they have ended; a branch skips this if no episode has.
 
     Every episode starts in a state of its own, drawn with its world's own key. If episodes end early, at any step, only
     ended worlds are reset: some at a time, as often as it takes. If all end by their time limits, many do at once, and
     all worlds are reset. Both give the same states.
+
+    Args:
+        ends: what has ended with the step before, leaves (S, T, E).
+        keys: a function that returns keys (S, T, E); only the branch calls it.
     """
+    few = isinstance(env, Flat) and env.ends_early and env.episode_length > 1 and tasks.blocks is None
+    begin = _reset_some if few else _reset_all
 
-    def restart(worlds: Worlds) -> Worlds:
-        fresh = reset_envs(env, agent, learners, tasks, world_keys(keys, ended.shape))
-        rest = where_worlds(ended, fresh._replace(state=()), worlds._replace(state=()))
-        return rest._replace(state=env.where_worlds(ended, fresh.state, worlds.state))
+    def renew(worlds: Worlds) -> Worlds:
+        begun = begin(env, tasks, worlds, ends, keys(), trials)
+        age = jnp.where(ends.episode, 0, worlds.age)
+        memory = where_worlds(ends.trial, begin_memory(agent, learners, tasks, age), worlds.memory)
+        episode = None if worlds.episode is None else jnp.where(ends.trial, 0, worlds.episode + ends.episode)
+        return Worlds(*begun, memory, age, episode)
 
-    def restart_some(worlds: Worlds) -> Worlds:
-        age = jnp.where(ended, 0, worlds.age)
-        memory = where_worlds(ended, begin_memory(agent, learners, tasks, age), worlds.memory)
-        begun = _reset_some(env, tasks, worlds, ended, world_keys(keys, ended.shape))
-        return begun._replace(memory=memory, age=age)
-
-    some = isinstance(env, Flat) and env.ends_early and tasks.blocks is None
-    return jax.lax.cond(jnp.any(ended), restart_some if some else restart, lambda worlds: worlds, worlds)
+    return jax.lax.cond(jnp.any(ends.episode), renew, lambda worlds: worlds, worlds)
 
 
-def _reset_some(env: Env, tasks: Task, worlds: Worlds, ended: Array, keys: Key) -> Worlds:
-    """Return the worlds with new states, tasks and observations where ``ended`` (S, T, E), from keys (S, T, E).
+def followed(transition: Transition, ends: Ends, worlds: Worlds) -> Transition:
+    """Return steps with what follows them in their trials, given the worlds after ``reset_ended``.
 
-    Worlds are reset in batches of at most one in ``_SHARES`` of all.
+    Inside a trial that is the first observation of the next episode. At its end it stays the one before any reset.
     """
+    if worlds.episode is None:
+        return transition
+    inside = ends.episode & ~ends.trial
+    return transition._replace(next_obs=where_worlds(inside, worlds.obs, transition.next_obs))
+
+
+def _reset_all(env: Env, tasks: Task, worlds: Worlds, ends: Ends, keys: Key, trials: Trials) -> _Begun:
+    """Reset all worlds with keys (S, T, E), and return those that have ended reset, and the others as they are."""
+    lasting = lambda drawn: where_worlds(ends.trial, drawn, worlds.task)
+    start = _begin(env, tasks, keys, lasting if trials.episodes > 1 else lambda drawn: drawn)
+    rest = where_worlds(ends.episode, (start.task, start.obs), (worlds.task, worlds.obs))
+    return _Begun(env.where_worlds(ends.world, start.state, worlds.state), *rest)
+
+
+def _reset_some(env: Env, tasks: Task, worlds: Worlds, ends: Ends, keys: Key, trials: Trials) -> _Begun:
+    """Reset worlds that have ended with keys (S, T, E), in batches of at most one in ``_SHARES`` of all worlds.
+
+    Returns:
+        these worlds reset, and the others as they are.
+    """
+    ended = ends.episode
     _, num_tasks, num_envs = ended.shape
     count, size = ended.size, -(-ended.size // _SHARES)
-    flat_keys = keys.reshape(count)
+    flat_keys, closed = keys.reshape(count), ends.trial.reshape(count)
 
-    def reset(carry: tuple[Array, Any]) -> tuple[Array, Any]:
+    def tasks_of(chosen: Array, old: Task | None, keys: Key) -> tuple[Task, Key]:
+        """Return the tasks of the chosen worlds, and keys for their states."""
+        own, keys = chosen // num_envs % num_tasks, keys[jnp.minimum(chosen, count - 1)]
+        if tasks.draws is None:
+            return jax.tree.map(lambda x: x[own], tasks), keys
+        task_keys, keys = jax.vmap(jax.random.split, out_axes=1)(keys)
+        drawn = jax.vmap(lambda i, key: episode_task(jax.tree.map(lambda x: x[i], tasks), key))(own, task_keys)
+        if trials.episodes == 1:
+            return drawn, keys
+        choose = lambda new, old: jnp.where(closed[chosen].reshape(-1, *[1] * (new.ndim - 1)), new, old[chosen])
+        return jax.tree.map(choose, drawn, old), keys
+
+    def reset(carry: tuple[Array, _Begun]) -> tuple[Array, _Begun]:
         left, old = carry
         chosen = jnp.nonzero(left, size=size, fill_value=count)[0]  # what is beyond the last world is dropped again
-        own, own_keys = chosen // num_envs % num_tasks, flat_keys[jnp.minimum(chosen, count - 1)]
-        each = jax.tree.map(lambda x: x[own], tasks._replace(draws=None))
-        if tasks.draws is not None:
-            task_keys, own_keys = jax.vmap(jax.random.split, out_axes=1)(own_keys)
-            each = jax.vmap(lambda i, key: episode_task(jax.tree.map(lambda x: x[i], tasks), key))(own, task_keys)
+        each, own_keys = tasks_of(chosen, old.task, flat_keys)
         start = env.reset_worlds(*jax.tree.map(lambda x: x[None, None], (each, own_keys)))
         state, obs = jax.tree.map(lambda x: x[0, 0], (start.state, frames.begin(start.obs, env.spec.frames)))
         put = lambda x, y: x.at[chosen].set(y, mode="drop")
-        new = state, None if tasks.draws is None else each, obs
+        new = _Begun(state, None if tasks.draws is None else each, obs)
         return left.at[chosen].set(False, mode="drop"), jax.tree.map(put, old, new)
 
-    old = worlds.state, worlds.task, worlds.obs
+    old = _Begun(worlds.state, worlds.task, worlds.obs)
     flat = jax.tree.map(lambda x: x.reshape(count, *x.shape[3:]), old)
     _, new = jax.lax.while_loop(lambda carry: jnp.any(carry[0]), reset, (ended.reshape(count), flat))
-    state, task, obs = jax.tree.map(lambda x: x.reshape(*ended.shape, *x.shape[1:]), new)
-    return worlds._replace(state=state, task=task, obs=obs)
+    return jax.tree.map(lambda x: x.reshape(*ended.shape, *x.shape[1:]), new)

@@ -28,7 +28,7 @@ class Task(NamedTuple):
     model: dict[str, Array]  # only those leaves of the physics model that differ between tasks
     goal: dict[str, Array]  # reward and reset parameters
     horizon: Array  # () int32, time limit of an episode in steps
-    draws: Any = None  # a Task with leaves (P, ...); each episode draws one of them; None: every episode is this task;
+    draws: Any = None  # a Task with leaves (P, ...); each trial draws one of them; None: every trial is of this task;
     # the draws have no context (None) where all have the task's own
     action_mask: Array | None = None  # (A,) 1 for actions that the task has, else 0; None: it has all
     blocks: Any = None  # in a mixture, which tasks belong to which family; static, without leaves
@@ -63,7 +63,7 @@ class Step(NamedTuple):
 
 
 class Transition(NamedTuple):
-    """Holds one environment step for learning; a time limit leaves ``discount`` at 1.
+    """Holds one step of a trial for learning. ``mtjax.trials`` says what a trial is: by default, an episode.
 
     A window holds consecutive steps of one environment, leaves (..., L, ...).
     """
@@ -71,12 +71,13 @@ class Transition(NamedTuple):
     obs: Any  # (O,)
     action: Array  # (A,)
     reward: Array  # ()
-    discount: Array  # () = 1 - terminated
-    next_obs: Any  # (O,) from before any reset
+    discount: Array  # () 0 if nothing can be earned after this step, else 1; a time limit alone leaves it at 1
+    next_obs: Any  # (O,) what follows in the trial: the next episode's first, or from before any reset if none follows
     ended: Any = None  # () bool: the episode ended, terminated or by its time limit, or because its world was lost
-    context: Array | None = None  # (C,) of the episode's task, if episodes draw tasks of other contexts
+    closed: Any = None  # () bool: the trial ended, and with it the agent's memory and all sums of rewards
+    context: Array | None = None  # (C,) of the trial's task, if trials draw tasks of other contexts
     extras: Any = None  # data that the agent stores when it acts, or adds when it assesses the step
-    memory: Any = None  # what the agent remembered of the episode before the step
+    memory: Any = None  # what the agent remembered of the trial before the step
 
 
 class Sometimes(NamedTuple):
@@ -187,9 +188,10 @@ class Agent(Protocol):
     @property
     def unroll(self) -> int: ...  # steps L of the windows through which its memory learns; 0 if no memory does
     def init(self, spec: Spec, tasks: Task, key: Key) -> Any: ...
-    def begin(self, state: Any, task: Task) -> Any: ...  # the memory with which an episode begins; () for none
+    def begin(self, state: Any, task: Task) -> Any: ...  # the memory with which a trial begins; () for none
     def act(self, state: Any, memory: Any, obs: Any, task: Task, key: Key | None) -> Acted: ...
-    def remember(self, state: Any, memory: Any, transition: Transition, task: Task) -> Any: ...  # after a step
+    # After a step, whose next observation is here the one from before any reset:
+    def remember(self, state: Any, memory: Any, transition: Transition, task: Task) -> Any: ...
     def relabel(self, env: Env, task: Task, transition: Transition, key: Key) -> Transition: ...  # as another task's
     def assess(self, state: Any, steps: Transition, tasks: Task) -> tuple[Any, Transition]: ...  # (T, H, E, ...), once
     def update(self, state: Any, window: Transition, tasks: Task, key: Key, number: Array) -> tuple[Any, Metrics]: ...

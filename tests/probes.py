@@ -301,7 +301,7 @@ def observe(agent, state, batch: Transition, tasks: Task):
         begun = jax.tree.map(lambda x: jnp.broadcast_to(x, (*shape, *x.shape)), agent.begin(state, task))
         steps = steps._replace(memory=begun)
     ended = jnp.zeros(shape, bool) if batch.ended is None else steps.ended
-    return agent.observe(state, steps._replace(ended=ended), tasks)
+    return agent.observe(state, steps._replace(ended=ended, closed=ended), tasks)
 
 
 def learner(agent, tasks: Task, batch_size: int, spec: Spec = SPEC):
@@ -378,7 +378,7 @@ def with_memory(agent, batch: Transition) -> Transition:
     if not agent.unroll:
         return batch
     hidden = jax.random.normal(jax.random.key(0), (*batch.reward.shape, *agent.conditioning.begin().shape))
-    return batch._replace(memory=Memory(None, hidden), ended=batch.discount == 0)
+    return batch._replace(memory=Memory(None, hidden), ended=batch.discount == 0, closed=batch.discount == 0)
 
 
 def random_past(random: np.random.Generator, shape: tuple[int, ...], spec: Spec = SPEC) -> last_steps.Past:

@@ -572,8 +572,8 @@ def rollouts(agent, seed=0):
     normal = lambda *size: jnp.float32(random.normal(size=(*shape, *size)))
     past = random_past(random, (*shape, agent.history_length), SPEC) if agent.history_length else None
     raw, ended = normal(2), jnp.asarray(random.random(shape) < 0.5)
-    fields = {"reward": normal(), "discount": jnp.ones(shape), "ended": ended, "extras": Taken(raw, normal() - 2)}
-    fields["memory"] = Memory(past)
+    fields = {"reward": normal(), "discount": jnp.ones(shape), "ended": ended, "closed": ended}
+    fields |= {"extras": Taken(raw, normal() - 2), "memory": Memory(past)}
     return Transition(obs=normal(3), action=jnp.tanh(raw), next_obs=normal(3), **fields)
 
 

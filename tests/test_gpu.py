@@ -325,7 +325,7 @@ def experience(agent, num_seeds, num_tasks):
     ended = random.random(steps.reward.shape) < 0.1
     memory = Memory(None) if steps.memory is None else steps.memory
     taken = Taken(raw, random.normal(size=ended.shape).astype(np.float32) - 2)
-    return steps._replace(ended=ended, extras=taken, memory=memory)
+    return steps._replace(ended=ended, closed=ended, extras=taken, memory=memory)
 
 
 @pytest.mark.parametrize("name", AGENTS)

@@ -62,7 +62,7 @@ def random_steps(agent, num_tasks=3, spec=SPEC, seed=0):
         past = random_past(random, (*shape, agent.history_length), spec)
     begun = Memory(None, agent.conditioning.begin(), agent.scaling.begin(), agent.sampler.begin())
     memory = jax.tree.map(lambda x: jnp.zeros((*shape, *x.shape)), begun)
-    return Transition(
+    steps = Transition(
         obs=normal(spec.obs_size),
         action=jnp.tanh(raw),
         reward=normal(),
@@ -72,6 +72,7 @@ def random_steps(agent, num_tasks=3, spec=SPEC, seed=0):
         extras=Taken(raw, normal() - 2),
         memory=memory._replace(past=past),
     )
+    return steps._replace(closed=steps.ended)
 
 
 # Advantages.
@@ -80,7 +81,7 @@ def random_steps(agent, num_tasks=3, spec=SPEC, seed=0):
 def test_advantages_worked_by_hand():
     """Terminated, cut off and going on; with gamma a half and lambda a half."""
     reward, value, next_value = jnp.ones((3, 1)), jnp.full((3, 1), 2.0), jnp.full((3, 1), 4.0)
-    steps = lambda discount, ended: Transition(None, None, reward, jnp.float32(discount)[:, None], None, ended)
+    steps = lambda discount, ended: Transition(None, None, reward, jnp.float32(discount)[:, None], None, ended, ended)
     find = lambda discount, ended: targets.gae(
         steps(discount, jnp.array(ended)[:, None]), value, next_value, jnp.float32(0.5), 0.5
     )[:, 0]
@@ -97,7 +98,7 @@ def test_advantages_are_those_of_a_plain_loop():
         reward, value, next_value = random.normal(size=(3, length, envs))
         ended = random.random((length, envs)) < 0.3
         discount = 1.0 - ended * (random.random((length, envs)) < 0.5)
-        steps = Transition(None, None, jnp.asarray(reward), jnp.asarray(discount), None, jnp.asarray(ended))
+        steps = Transition(None, None, jnp.asarray(reward), jnp.asarray(discount), None, *[jnp.asarray(ended)] * 2)
         found = targets.gae(steps, jnp.asarray(value), jnp.asarray(next_value), jnp.float32(gamma), 0.8)
         error = reward + gamma * discount * next_value - value
         for t, e in np.ndindex(length, envs):

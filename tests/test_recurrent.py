@@ -25,14 +25,15 @@ def rollout(seed=0):
     """Rollouts (T, H, E, ...) in which every field is random; memories are told for the first step alone."""
     random, shape = np.random.default_rng(seed), (3, LENGTH, ENVS)
     normal = lambda *size: jnp.float32(random.normal(size=(*shape, *size)))
-    raw = normal(2)
+    raw, ended = normal(2), jnp.asarray(random.random(shape) < 0.3)
     return Transition(
         obs=normal(3),
         action=jnp.tanh(raw),
         reward=normal(),
         discount=jnp.ones(shape),
         next_obs=normal(3),
-        ended=jnp.asarray(random.random(shape) < 0.3),
+        ended=ended,
+        closed=ended,
         extras=Taken(raw, normal() - 2),
         memory=Memory(None, normal(SIZE)),
     )
@@ -44,7 +45,7 @@ def test_states_over_a_window_are_those_of_steps_one_by_one():
     params = knowing.init(3, jax.tree.map(lambda x: x[0, 0], steps), jnp.zeros(2), False, KEY).shared
     window = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), steps)  # (E, H, ...)
     flat = lambda x: x.reshape(-1, *x.shape[2:])
-    rest = (window.obs, window.action, window.reward, window.ended, window.ended)
+    rest = (window.obs, window.action, window.reward, window.ended, window.closed)
     track = Track(window.memory.hidden[:, 0], *map(flat, rest))
     found = quick(knowing.over, params, track)(params, track)
     before, after = (x.reshape(ENVS, LENGTH, SIZE) for x in found)

@@ -1,6 +1,7 @@
 """New episodes: of the worlds that have ended alone, each in a fresh state of its own, whatever else is reset."""
 
 import dataclasses
+from functools import partial
 from typing import ClassVar
 
 import jax
@@ -11,6 +12,7 @@ from probes import tiny
 
 from mtjax import envs, rollout
 from mtjax.envs import Family, Parameter
+from mtjax.trials import EACH_EPISODE
 from mtjax.types import Step
 
 SHAPE = (2, 3, 40)  # S, T, E
@@ -56,7 +58,12 @@ def reset(cls, ended, seed=1, shift="1,2,3", **settings):
         env, agent, learners, tasks, rollout.world_keys(key(0), (SHAPE[0], len(tasks.id), SHAPE[2]))
     )
     before = before._replace(age=before.age + 7)
-    run = jax.jit(lambda worlds, ended, keys: rollout.reset_ended(env, agent, learners, tasks, worlds, ended, keys))
+
+    def begin(worlds, ended, keys):
+        ends, keys = EACH_EPISODE.ends(ended, ended, ended, None), partial(rollout.world_keys, keys, ended.shape)
+        return rollout.reset_ended(env, agent, learners, tasks, worlds, ends, keys)
+
+    run = jax.jit(begin)
     Fall.counted.clear()
     after = jax.block_until_ready(run(before, ended, key(seed)))
     jax.effects_barrier()

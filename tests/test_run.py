@@ -236,7 +236,7 @@ def test_the_clock_counts_down_to_the_end(play, tmp_path, monkeypatch):
 
 def test_profile_needs_a_folder(short_family):
     """It is refused before anything compiles."""
-    with pytest.raises(InputError, match="profile, .* need the run's folder"):
+    with pytest.raises(InputError, match=r"profile, .* need the run's folder"):
         mtjax.train("finger-short", "sac", profile=True)
 
 

@@ -21,7 +21,8 @@ def steps(ended=None, discount=None):
     discount = np.where(ended & (RANDOM.random(shape) < 0.5), 0.0, 1.0) if discount is None else discount
     reward = np.float32(np.random.default_rng(1).normal(size=shape))
     found = (reward, np.float32(discount), np.asarray(ended))
-    return Transition(None, None, *map(jnp.asarray, found[:2]), None, jnp.asarray(found[2]))
+    ends = jnp.asarray(found[2])
+    return Transition(None, None, *map(jnp.asarray, found[:2]), None, ends, ends)
 
 
 STEPS = steps()
@@ -116,7 +117,9 @@ def test_vtrace_converges_to_the_value_of_the_clipped_policy():
         played.append((now, action, then))
         now = then
     state, action, following = (np.stack(x) for x in zip(*played, strict=True))
-    steps = Transition(None, None, jnp.float32(rewards[state, action]), jnp.ones((length, count)), None, state < 0)
+    steps = Transition(
+        None, None, jnp.float32(rewards[state, action]), jnp.ones((length, count)), None, state < 0, state < 0
+    )
     log_ratio, value = jnp.float32(np.log(pi[state, action] / mu[state, action])), np.zeros(num_states)
     for _ in range(400):
         found = targets.vtrace(steps, *(jnp.float32(value[x]) for x in (state, following)), log_ratio, gamma, 1.0)

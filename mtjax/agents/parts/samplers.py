@@ -63,8 +63,8 @@ class Returns(NamedTuple):
 
 def _follow(memory: Returns, steps: Transition, fast: float, slow: float) -> Returns:
     """Move the means towards the returns of ended episodes, at rates per episode; a task's first ones set them."""
-    count = jnp.sum(steps.ended, axis=1)
-    mean = jnp.sum(jnp.where(steps.ended, steps.memory, 0.0), axis=1) / jnp.maximum(count, 1)
+    count = jnp.sum(steps.closed, axis=1)
+    mean = jnp.sum(jnp.where(steps.closed, steps.memory, 0.0), axis=1) / jnp.maximum(count, 1)
 
     def moved(old: Array, rate: float) -> Array:
         return jnp.where(memory.known, old + (1 - (1 - rate) ** count) * (mean - old), mean)

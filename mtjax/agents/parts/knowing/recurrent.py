@@ -44,7 +44,7 @@ class Following(NamedTuple):
 def track(window: Transition, obs: Array) -> Track:
     """Return the track of windows (B, L, ...) whose observations are (B, L, O) as networks take them."""
     flat = lambda x: x.reshape(-1, *x.shape[2:])
-    steps = (obs, window.action, window.reward, window.ended, window.ended)
+    steps = (obs, window.action, window.reward, window.ended, window.closed)
     return Track(window.memory.hidden[:, 0], *map(flat, steps))
 
 

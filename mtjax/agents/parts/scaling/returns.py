@@ -70,7 +70,7 @@ class ReturnScaling(_OfReturns):
 
     def observe(self, memory: LargestReturns, steps: Transition) -> LargestReturns:
         sums: Sums = steps.memory
-        cut = steps.ended & (steps.discount > 0)
+        cut = steps.closed & (steps.discount > 0)
         mean = jnp.where(cut, sums.total / sums.count, 0.0)
         largest = lambda old, new: jnp.maximum(old, jnp.max(jnp.abs(new), axis=1))
         return LargestReturns(largest(memory.discounted, sums.discounted), largest(memory.reward, mean))

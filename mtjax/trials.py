@@ -1,0 +1,79 @@
+"""A trial is what an agent plays with one task and one memory. It says what begins anew where an episode ends.
+
+For the learner a trial is the whole problem: sums of rewards, the task and the agent's memory end with it, and not with
+each of its episodes. Inside a trial the discount is 1, and what follows an episode's last step is the first observation
+of the next episode (Duan et al. 2016, "RL^2").
+"""
+
+import dataclasses
+from typing import Any, ClassVar, NamedTuple
+
+from mtjax.types import Array, InputError
+
+MOST = 10_000
+"""Largest number of episodes of a trial."""
+
+
+class Ends(NamedTuple):
+    """Says what has ended with a step; each is bool of any one shape."""
+
+    episode: Array
+    trial: Array  # the task and the agent's memory begin anew
+    terminal: Array  # nothing follows for the learner, whose values are 0 there
+    world: Array  # the world begins anew: its state, and with it the observation
+
+
+@dataclasses.dataclass(frozen=True)
+class EachEpisode:
+    """A trial is one episode. A time limit cuts it off: it could have gone on, so the value after it counts."""
+
+    episodes: ClassVar[int] = 1  # of a trial
+    keeps_state: ClassVar[bool] = False  # whether worlds go on where an episode ends
+
+    def ends(self, terminated: Array, timeout: Array, lost: Array, episode: Any) -> Ends:
+        """Return what has ended with a step.
+
+        Args:
+            terminated: the world reached a terminal state.
+            timeout: the episode has taken as many steps as it may.
+            lost: the world blew up (``rollout.step_envs``).
+            episode: int32, how many episodes of the trial came before; None where trials are single episodes.
+        """
+        ended = terminated | lost | timeout
+        return Ends(ended, ended, terminated, ended)
+
+
+@dataclasses.dataclass(frozen=True)
+class Repeated:
+    """A trial is some episodes of one task. Their number is part of the problem: nothing follows after the last."""
+
+    episodes: int
+    keeps_state: ClassVar[bool] = False
+
+    def __post_init__(self):
+        if not 2 <= self.episodes <= MOST:
+            raise InputError(f"a repeated trial has 2 to {MOST} episodes, not {self.episodes}")
+
+    def ends(self, terminated: Array, timeout: Array, lost: Array, episode: Any) -> Ends:
+        ended = terminated | lost | timeout
+        last = ended & (episode + 1 == self.episodes)
+        return Ends(ended, last, last, ended)
+
+
+@dataclasses.dataclass(frozen=True)
+class ResetFree:
+    """A world goes on over time limits, where only its task changes, and what is observed of it. A lost one is reset.
+
+    No state is terminal, and no limit is one for the learner.
+    """
+
+    episodes: ClassVar[int] = 1
+    keeps_state: ClassVar[bool] = True
+
+    def ends(self, terminated: Array, timeout: Array, lost: Array, episode: Any) -> Ends:
+        ended = lost | timeout
+        return Ends(ended, ended, terminated & False, lost)
+
+
+Trials = EachEpisode | Repeated | ResetFree
+EACH_EPISODE = EachEpisode()

@@ -1,0 +1,237 @@
+"""Trials: when worlds, tasks, memories and sums of rewards begin anew."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from probes import Goals, Stub, Walk, tiny, train
+from test_loop import Drifting
+
+import mtjax
+from mtjax.agents.ppo import advantages
+from mtjax.experience import multistep
+from mtjax.trials import EachEpisode, Repeated, ResetFree
+from mtjax.types import Acted, InputError, Transition
+
+STEPS, ENVS, K = 60, 6, 3
+SETTINGS = {"num_envs": ENVS, "replay_size": STEPS * ENVS, "chunk_steps": STEPS, "updates_per_step": 0, "trials": K}
+
+
+# What ends when.
+
+
+def test_each_episode_is_a_trial_that_a_limit_cuts_off_and_a_terminal_state_ends():
+    """Of a lost world nothing is terminal either."""
+    terminated, timeout, lost = (jnp.array(x) for x in ([0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]))
+    ends = EachEpisode().ends(terminated > 0, timeout > 0, lost > 0, None)
+    for found in (ends.episode, ends.trial, ends.world):
+        np.testing.assert_array_equal(found, [0, 1, 1, 1])
+    np.testing.assert_array_equal(ends.terminal, [0, 1, 0, 0])
+
+
+def test_a_repeated_trial_ends_with_its_last_episode_and_nothing_follows():
+    """However that episode ends. Inside the trial neither a terminal state nor a limit is terminal for the learner."""
+    terminated = jnp.array([0, 1, 0, 0, 0, 1, 0, 0]) > 0
+    timeout = jnp.array([0, 0, 1, 0, 0, 0, 1, 0]) > 0
+    lost = jnp.array([0, 0, 0, 1, 0, 0, 0, 1]) > 0
+    ends = Repeated(3).ends(terminated, timeout, lost, jnp.array([1] * 4 + [2] * 4))
+    np.testing.assert_array_equal(ends.episode, [0, 1, 1, 1, 0, 1, 1, 1])
+    np.testing.assert_array_equal(ends.world, ends.episode)
+    np.testing.assert_array_equal(ends.trial, [0, 0, 0, 0, 0, 1, 1, 1])
+    np.testing.assert_array_equal(ends.terminal, ends.trial)
+
+
+def test_a_reset_free_world_goes_on_unless_it_is_lost():
+    """And no limit is terminal."""
+    timeout, lost = jnp.array([False, True, False]), jnp.array([False, False, True])
+    ends = ResetFree().ends(lost & False, timeout, lost, None)
+    np.testing.assert_array_equal(ends.trial, [0, 1, 1])
+    np.testing.assert_array_equal(ends.world, [0, 0, 1])
+    assert not ends.terminal.any()
+
+
+@pytest.mark.parametrize("count", [1, 0, 10**9])
+def test_a_repeated_trial_has_several_episodes(count):
+    """One is the other kind."""
+    with pytest.raises(InputError, match=f"not {count}"):
+        Repeated(count)
+
+
+# A hand-made world.
+
+
+class Counting(Stub):
+    """Remembers how many steps and ends of episodes it has seen, and what the task was; acts by the first two."""
+
+    def begin(self, state, task):
+        return jnp.zeros(2)
+
+    def act(self, state, memory, obs, task, key):
+        return Acted(jnp.sum(memory * jnp.array([1.0, 100.0]))[None], None, memory)
+
+    def remember(self, state, memory, transition, task):
+        return memory + jnp.stack([1.0, jnp.float32(transition.ended)])
+
+
+def play(env, seeds=(0,), chunks=1, **given):
+    """The steps (S, T, E, H, ...) of a run without random actions, as its replay holds them, and its last state."""
+    state, history = train(env, Counting(), {"warmup_steps": 1, **SETTINGS, **given}, seeds=seeds, chunks=chunks)
+    return jax.tree.map(lambda x: np.moveaxis(np.asarray(x), 2, 3), state.data.ring.rows), state, history
+
+
+@pytest.fixture(scope="module")
+def drifting():
+    """Steps of walks that end early or not, and draw a task for every trial of three episodes."""
+    return play(Drifting())
+
+
+def episodes_of(rows):
+    """The number (S, T, E, H) of the episode that each step belongs to, counted in each world from 0."""
+    return np.cumsum(rows.ended, axis=3) - rows.ended
+
+
+def test_a_trial_closes_with_every_third_episode(drifting):
+    """In every world, whatever the lengths of its episodes."""
+    rows, state, _ = drifting
+    lengths = np.diff(np.flatnonzero(rows.ended[0, 0, 0]))
+    assert set(lengths) == {3, 5}
+    np.testing.assert_array_equal(rows.closed, rows.ended & (episodes_of(rows) % K == K - 1))
+    np.testing.assert_array_equal(state.worlds.episode, np.sum(rows.ended, axis=3) % K)
+
+
+def test_only_the_end_of_a_trial_is_terminal(drifting):
+    """Though a third of the episodes terminate in it."""
+    rows, *_ = drifting
+    np.testing.assert_array_equal(rows.discount, 1.0 - rows.closed)
+
+
+def test_what_follows_inside_a_trial_is_the_next_episode_and_at_its_end_the_last_state(drifting):
+    """To the bit; each episode begins elsewhere."""
+    rows, *_ = drifting
+    following, closed, ended = rows.obs[..., 1:, 0], rows.closed[..., :-1], rows.ended[..., :-1]
+    np.testing.assert_array_equal(rows.next_obs[..., :-1, 0][~closed], following[~closed])
+    np.testing.assert_allclose(rows.next_obs[rows.closed], rows.obs[rows.closed] + 1, rtol=1e-6)
+    assert np.all(following[ended] < 1) and len(np.unique(following[ended])) == ended.sum()
+
+
+def test_the_task_is_drawn_once_for_a_trial(drifting):
+    """And the next trial has another."""
+    rows, *_ = drifting
+    now, later, closed = rows.context[..., :-1, 0], rows.context[..., 1:, 0], rows.closed[..., :-1]
+    np.testing.assert_array_equal(now[~closed], later[~closed])
+    assert np.mean(now[closed] != later[closed]) > 0.9
+
+
+def test_memory_lives_through_a_trial_and_is_new_after_it(drifting):
+    """It knows the ends of episodes."""
+    rows, *_ = drifting
+    for task, env in np.ndindex(2, ENVS):
+        steps = ends = 0
+        for t in range(STEPS):
+            if t >= 1:  # the first action is random
+                assert rows.action[0, task, env, t, 0] == steps + 100 * ends
+            steps, ends = steps + 1, ends + rows.ended[0, task, env, t]
+            if rows.closed[0, task, env, t]:
+                steps = ends = 0
+
+
+def test_returns_are_of_episodes(drifting):
+    """As where each is a trial."""
+    rows, _, (metrics,) = drifting
+    np.testing.assert_array_equal(metrics["episodes"], rows.ended.sum(axis=(2, 3)))
+    finished = np.cumsum(rows.ended[..., ::-1], axis=3)[..., ::-1] > 0
+    total = np.sum(rows.reward * finished, axis=(2, 3))
+    np.testing.assert_allclose(metrics["return"], total / metrics["episodes"], rtol=1e-5)
+
+
+def test_all_worlds_may_be_reset_at_once():
+    """To the same states as some at a time, where draws live for a trial."""
+
+    @dataclasses.dataclass(frozen=True)
+    class AtOnce(Drifting):
+        @property
+        def ends_early(self):
+            return False
+
+    some, _, _ = play(Drifting())
+    whole, _, _ = play(AtOnce())
+    jax.tree.map(np.testing.assert_array_equal, some, whole)
+
+
+def test_first_ages_and_episodes_spread_over_the_trial():
+    """Every number of an episode, and today's ages."""
+    _, state, _ = play(Walk(), chunks=0, stagger=True)
+    np.testing.assert_array_equal(state.worlds.episode[0, 0], [0, 1, 2, 0, 1, 2])
+    np.testing.assert_array_equal(state.worlds.age[0, 0], np.arange(6) * 5 // 6)
+
+
+def test_one_episode_a_trial_is_what_there_was():
+    """Trials and episodes end together, and nothing counts episodes."""
+    rows, state, _ = play(Walk(), trials=1)
+    np.testing.assert_array_equal(rows.closed, rows.ended)
+    assert state.worlds.episode is None and 0 < np.mean(rows.discount == 0) < np.mean(rows.ended)
+
+
+def test_hindsight_is_refused_in_trials_of_several_episodes():
+    """What follows a step may be another episode's, of which no reward tells."""
+    with pytest.raises(InputError, match=r"hindsight .* --trials=1"):
+        train(Goals(), tiny("sac"), {**SETTINGS, "hindsight": 0.5, "warmup_steps": 1})
+
+
+# Sums of rewards.
+
+
+def rollout(seed=0, length=40, envs=3) -> tuple[np.ndarray, ...]:
+    """A window (H, E) with ends of episodes, some of which end trials too."""
+    random = np.random.default_rng(seed)
+    ended = random.random((length, envs)) < 0.4
+    closed = ended & (random.random((length, envs)) < 0.4)
+    normal = lambda: random.normal(size=(length, envs)).astype(np.float32)
+    return normal(), 1.0 - closed, ended, closed, normal(), normal()
+
+
+def test_advantages_run_through_episodes_and_stop_at_trials():
+    """A plain loop over the sums of errors."""
+    reward, discount, ended, closed, value, next_value = rollout()
+    assert np.any(ended & ~closed)
+    gamma, decay = 0.9, 0.8
+    found = advantages(*map(jnp.asarray, (reward, discount, closed, value, next_value, gamma)), lambda_=decay)
+    for t, e in np.ndindex(*reward.shape):
+        total, factor = 0.0, 1.0
+        for i in range(t, len(reward)):
+            total += factor * (reward[i, e] + gamma * discount[i, e] * next_value[i, e] - value[i, e])
+            factor *= gamma * decay
+            if closed[i, e]:
+                break
+        np.testing.assert_allclose(found[t, e], total, rtol=1e-4, atol=1e-5)
+
+
+def test_rewards_of_several_steps_are_summed_through_episodes():
+    """Up to the end of the trial alone."""
+    obs = jnp.arange(3.0)[:, None]
+    ended, closed = jnp.array([True, True, False]), jnp.array([False, True, False])
+    steps = Transition(obs, obs, jnp.array([8.0, 4.0, 2.0]), jnp.float32(~closed), obs + 10, ended, closed)
+    joined = multistep.join(steps, 0.5)
+    assert joined.reward == 10 and joined.discount == 0 and joined.next_obs == 11 and joined.closed
+
+
+# Agents that learn, and runs.
+
+
+@pytest.mark.parametrize("name", ["ppo", "sac-conditioned"])
+def test_a_run_that_is_resumed_in_the_middle_of_a_trial_is_the_whole_run(name, tmp_path):
+    """To the bit: a checkpoint holds which episode it is."""
+    own = {"unroll": 5, "minibatches": 1} if name == "ppo" else {"warmup_steps": 4, "replay_size": 64, "batch_size": 4}
+    given = dict(num_envs=3, chunk_steps=25, trials=2, eval_every=1, eval_episodes=2, quiet=True, **own)
+    env, steps = mtjax.make("bandit", num_tasks=2, split="none"), 2 * 3 * 25
+    run = lambda chunks, folder, **more: mtjax.train(
+        env, tiny(name, hidden=(8,)), steps=chunks * steps, directory=tmp_path / folder, **given, **more
+    )
+    whole, half = run(4, "whole"), run(1, "half").state.worlds
+    assert len(np.unique(half.episode)) == 2 and np.any(half.age > 0)
+    again = run(4, "half", resume=True)
+    raw = lambda x: np.asarray(jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x)
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(raw(a), raw(b)), whole.state, again.state)
+    np.testing.assert_array_equal(whole.evaluations.returns["train"], again.evaluations.returns["train"])
