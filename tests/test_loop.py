@@ -43,8 +43,8 @@ class Recorder(Stub):
     def choose(self, state, obs, task, key):
         return jnp.full(1, 2.0) + task.id
 
-    def update(self, state, batch, tasks, key):
-        count = state["updates"] + 1
+    def update(self, state, window, tasks, key, number):
+        batch, count = jax.tree.map(lambda x: x[:, :, 0], window), state["updates"] + 1
         repeats = state["repeats"] + jnp.all(batch.obs == state["last"])
         wrong = (count == self.nan_update) & (tasks.id == 0)
         metrics = {"count": jnp.float32(count), "loss": jnp.where(wrong, jnp.nan, jnp.float32(tasks.id))}
@@ -135,27 +135,28 @@ def test_warmup_acts_at_random_and_then_the_agent_does(walk):
 
 
 class Noting(Stub):
-    """Counts its acts, and remembers ten times that."""
+    """Remembers ten times as much after every step, and stores what it acted on."""
 
     def begin(self, state, task):
-        return jnp.int32(0)
+        return jnp.int32(1)
 
     def act(self, state, memory, obs, task, key):
-        return Acted(jnp.zeros(1), None, memory + 1)
+        return Acted(jnp.zeros(1), memory + 1)
 
     def remember(self, state, memory, transition, task):
         return 10 * memory
 
 
 def test_a_step_keeps_to_a_tasks_actions_and_to_what_the_agent_noted():
-    """Whatever explores; and memory passes through acting to remembering."""
+    """Whatever explores; acting reads the memory from before a step, which is stored with it."""
     env, agent, learners = Walk(), Noting(), jnp.zeros((1, 1))
     tasks = env.tasks()._replace(action_mask=jnp.array([[1.0], [0.0]]))
     worlds = reset_envs(env, agent, learners, tasks, jax.random.split(jax.random.key(0), (1, 2, 3)))
-    for count in (10, 110):
+    for count in (10, 100):
         worlds, step = step_envs(env, agent, learners, tasks, worlds, None, lambda action: action + 5)
         np.testing.assert_array_equal(step.transition.action[0, :, :, 0], [[5] * 3, [0] * 3])
         assert np.all(worlds.memory == count) and worlds.memory.shape == (1, 2, 3)
+        assert np.all(step.transition.memory == count // 10) and np.all(step.transition.extras == count // 10 + 1)
 
 
 def test_updates_begin_after_the_warmup_and_each_has_its_own_batch(walk):

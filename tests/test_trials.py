@@ -10,7 +10,7 @@ from probes import Goals, Stub, Walk, tiny, train
 from test_loop import Drifting
 
 import mtjax
-from mtjax.agents.ppo import advantages
+from mtjax.agents.parts import targets
 from mtjax.experience import multistep
 from mtjax.trials import EachEpisode, Repeated, ResetFree
 from mtjax.types import Acted, InputError, Transition
@@ -69,7 +69,7 @@ class Counting(Stub):
         return jnp.zeros(2)
 
     def act(self, state, memory, obs, task, key):
-        return Acted(jnp.sum(memory * jnp.array([1.0, 100.0]))[None], None, memory)
+        return Acted(jnp.sum(memory * jnp.array([1.0, 100.0]))[None])
 
     def remember(self, state, memory, transition, task):
         return memory + jnp.stack([1.0, jnp.float32(transition.ended)])
@@ -194,10 +194,10 @@ def rollout(seed=0, length=40, envs=3) -> tuple[np.ndarray, ...]:
 
 def test_advantages_run_through_episodes_and_stop_at_trials():
     """A plain loop over the sums of errors."""
-    reward, discount, ended, closed, value, next_value = rollout()
+    reward, discount, ended, closed, value, next_value = map(jnp.asarray, rollout())
     assert np.any(ended & ~closed)
     gamma, decay = 0.9, 0.8
-    found = advantages(*map(jnp.asarray, (reward, discount, closed, value, next_value, gamma)), lambda_=decay)
+    found = targets.gae(Transition(None, None, reward, discount, None, ended, closed), value, next_value, gamma, decay)
     for t, e in np.ndindex(*reward.shape):
         total, factor = 0.0, 1.0
         for i in range(t, len(reward)):

@@ -220,7 +220,7 @@ class Waving:
         return ()
 
     def act(self, state, memory, obs, task, key):
-        return Acted(jax.random.uniform(key, (4,), minval=-1.0), None, memory)
+        return Acted(jax.random.uniform(key, (4,), minval=-1.0))
 
 
 @needs("metaworld")
