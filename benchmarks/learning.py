@@ -68,7 +68,7 @@ from mtjax.report.stats import (
     unpaired_difference,
 )
 from mtjax.saved import ship
-from mtjax.training.run import Result
+from mtjax.saved.result import Result
 from mtjax.types import SPLITS
 
 

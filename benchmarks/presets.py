@@ -30,7 +30,7 @@ from returns import FAMILIES, value
 from mtjax.agents.swept import Point
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import configure, with_preset
-from mtjax.training.run import Result
+from mtjax.saved.result import Result
 
 _RATES = ("actor_lr", "critic_lr", "temperature_lr")
 

@@ -33,7 +33,7 @@ from mtjax.envs.tabled import Tabled
 from mtjax.evaluation import evaluate, save_evaluations
 from mtjax.names import replacing
 from mtjax.report.stats import seed_interval
-from mtjax.training.run import Result
+from mtjax.saved.result import Result
 from mtjax.types import SPLITS, Agent
 
 _GEAR = {"gear": "0.8:1.2:10"}

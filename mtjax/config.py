@@ -179,14 +179,14 @@ class RunConfig:
         Raises:
             InputError: family, agent, devices and flags do not go together.
         """
-        for module in ["tensorboardX"] * self.tensorboard + ["wandb"] * bool(self.wandb):
-            require_library(module)
         if self.env:
             self._check_named()
         _ = self.mesh
         self.learner.experience.check(self.family, self.played.num_envs, self.played.chunk_steps)
         for learner in agents_at(self.learner, self.points):
             require_value_range(learner)
+        for module in ["tensorboardX"] * self.tensorboard + ["wandb"] * bool(self.wandb):
+            require_library(module)
 
     def _check_named(self) -> None:
         """Check what only families and agents with names have."""

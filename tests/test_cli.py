@@ -27,7 +27,7 @@ from mtjax.agents.choices import CHOICES
 from mtjax.agents.parts.representations import DeepMDP
 from mtjax.command import flag_files, process, run_config
 from mtjax.command.run_config import parse
-from mtjax.config import for_tasks, load_preset, slow_on_cpu, with_preset
+from mtjax.config import Plan, for_tasks, load_preset, slow_on_cpu, with_preset
 from mtjax.envs import BENCHMARKS, ENVS
 from mtjax.loop import Settings
 from mtjax.names import notice
@@ -35,7 +35,6 @@ from mtjax.saved import shipped
 from mtjax.saved.config_json import from_json, to_flags, to_json
 from mtjax.training import launch
 from mtjax.training.memory import explaining
-from mtjax.training.run import Plan
 from mtjax.types import InputError
 
 COMMANDS = {"train": mtjax.train.main, "evaluate": mtjax.evaluate.main}

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mtjax.agents import BaseAgent, parts
-from mtjax.agents.choices import kinds_of, settings
+from mtjax.agents.choices import flag_names, kinds_of, settings
 from mtjax.checks import shown
 from mtjax.names import nearest_error
 from mtjax.types import Acted, Array, Env, Experience, InputError, Key, Metrics, Spec, Task, Transition
@@ -147,6 +147,13 @@ def grid(sweep: Sweep) -> tuple[dict[str, float], ...]:
     if any(point.keys() != found[0].keys() for point in found):
         raise InputError("every point of a sweep must give a value to the same names")
     return found
+
+
+def words(agent: BaseAgent, points: Sequence[Point]) -> tuple[str, ...]:
+    """Return points as ``--sweep`` writes them: each number's flag with its values."""
+    flags = flag_names(agent) if points else {}
+    values = {name: dict.fromkeys(f"{point[name]:.12g}" for point in points) for name in (points[0] if points else ())}
+    return tuple(f"{flags.get(name, name)}={','.join(each)}" for name, each in values.items())
 
 
 def _number(name: str, value: Any) -> float:

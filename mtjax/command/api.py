@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from mtjax.agents.swept import Sweep
-from mtjax.checks import checked, path
-from mtjax.command.keywords import configured, kind_of
+from mtjax.checks import checked, path, shown
+from mtjax.command.keywords import configured
 from mtjax.config import Plan
 from mtjax.loop import Settings
 from mtjax.names import InputError, public
@@ -101,7 +101,7 @@ def train(
     if start is not None and not isinstance(start, Policy):
         start = load(path(start, "start"))
     if on_chunk is not None and not callable(on_chunk):
-        raise InputError(f"on_chunk is a function of a row of metrics, not {kind_of(on_chunk)}")
+        raise InputError(f"on_chunk is a function of a row of metrics, not {shown(on_chunk)}")
     written = {"profile": profile, "tensorboard": tensorboard, "wandb": wandb}
     checked(_Told, {"resume": resume, **written, "quiet": quiet, "label": label})
     if directory is None and (resume or any(written.values())):

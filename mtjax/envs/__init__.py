@@ -239,8 +239,28 @@ def make(name: str, vary: Mapping[str, Any] | tuple = (), **settings: Any) -> An
     if unknown is not None:
         require_pictures(name, unknown)
         raise _unknown_setting(name, family, unknown, settings.get(unknown))
-    settings = checked(family, defaults | frozen(settings))
-    return family(**{**settings, "vary": dict(defaults.get("vary", {})) | _pairs(vary)})
+    varied = dict(defaults.get("vary", {})) | _pairs(vary)
+    return family(**checked(family, defaults | frozen(settings)) | {"vary": varied})
+
+
+def make_from(env: Any, given: Mapping[str, Any]) -> tuple[str, Any, dict[str, Any]]:
+    """Return the name of a family, the family, and what of ``given`` is not a field of it.
+
+    Args:
+        env: a name, whose family gets its fields from ``given``; or a family, which keeps its own.
+
+    Raises:
+        InputError: there is no such family, or a value is out of range.
+    """
+    if not isinstance(env, str):
+        return name_of(env), env, dict(given)
+    names = [name for name, _ in members(env)]
+    unknown = next((name for name in names if name not in ENVS), None)
+    if unknown is not None:
+        raise nearest_error("environment", unknown, (*ENVS, *BENCHMARKS))
+    own = {field.name for name in names for field in dataclasses.fields(ENVS[name][0])}
+    rest = {name: value for name, value in given.items() if name not in own}
+    return env, make(env, **{name: value for name, value in given.items() if name in own}), rest
 
 
 def is_mixture(name: str) -> bool:

@@ -56,6 +56,15 @@ def from_json(path: Path) -> RunConfig:
         raise InputError(text + _other_version(record) + _with_copy(path)) from None
 
 
+def reread(config: RunConfig) -> RunConfig:
+    """Return what ``from_json`` would read of a configuration.
+
+    Raises:
+        InputError: its names do not make its family or its agent.
+    """
+    return _from_record(json.loads(to_json(config, {})))
+
+
 def read_record(path: Path) -> dict[str, Any]:
     """Read what a config.json holds, whose entry "plan" holds entries too; the others may be anything.
 

@@ -10,14 +10,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mtjax.agents import agent, settings
+from mtjax.agents import settings
 from mtjax.checks import shown
 from mtjax.config import RunConfig
-from mtjax.envs import make
 from mtjax.evaluation import Evaluations, load_evaluations, no_evaluations, require_same_run
 from mtjax.names import SPLITS, notice, replacing
 from mtjax.saved.arrays import require_place
-from mtjax.saved.config_json import from_json, read_record, run_metadata, to_json
+from mtjax.saved.config_json import from_json, read_record, reread, run_metadata, to_json
 from mtjax.types import InputError
 
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
@@ -62,17 +61,13 @@ def _require_names(config: RunConfig) -> None:
     """Refuse a family or an agent that its recorded name does not make again."""
     if not config.env:
         raise InputError("a run's folder needs an environment derived from Family and an agent from BaseAgent")
-    family: Any = config.family
-    again = {
-        "env": (family, lambda: make(config.env, **dataclasses.asdict(family))),
-        "agent": (config.learner, lambda: agent(config.agent, **settings(config.learner))),
-    }
-    for kind, (made, remake) in again.items():
-        try:
-            same = remake() == made
-        except InputError:
-            same = False
-        if not same:
+    try:
+        again = reread(config)
+    except InputError:
+        again = None
+    for kind, part in (("env", "family"), ("agent", "learner")):
+        made = getattr(config, part)
+        if made != getattr(again, part, None):
             name = type(made).__name__
             raise InputError(f"a run's folder needs a name for {name}: mtjax.register('my-{kind}', {name}) gives one")
 

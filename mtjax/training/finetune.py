@@ -48,17 +48,9 @@ def require_fit(start: Policy, env: Env, agent: BaseAgent) -> None:
     """
     if start.directory is not None and shipped.is_shipped(start.directory):
         raise shipped.not_learning(str(start.directory))
+    _require_same_agent(start.agent, agent)
     for each in (env, start.env):
         require_family(each, NO_FINE_TUNING)
-    had, given = _learned(start.agent), _learned(agent)
-    if type(agent) is not type(start.agent) or had.keys() != given.keys():
-        raise InputError("the agent is not the run's; give the one that learned there")
-    other = next((name for name in had if had[name] != given[name] and name not in agent.adjustable), None)
-    if other is not None:
-        raise InputError(
-            f"{other.replace('_', '-')} is the run's, {had[other]}, and cannot be {given[other]}; "
-            f"what may change is {', '.join(name.replace('_', '-') for name in agent.adjustable if name in had)}"
-        )
     family, known = env, start.env
     theirs, ours = known.spec, family.spec
     if frames.seen(theirs) != frames.seen(ours) or theirs.action_size != ours.action_size:
@@ -72,6 +64,19 @@ def require_fit(start: Policy, env: Env, agent: BaseAgent) -> None:
     if theirs.context_size != ours.context_size or not alike:
         raise InputError("the context of these tasks is not written as the run's; give env.scaled_as(policy.env)")
     _require_numbers(start, env, agent)
+
+
+def _require_same_agent(old: BaseAgent, agent: BaseAgent) -> None:
+    """Refuse an agent that differs from the run's in more than may be adjusted."""
+    had, given = _learned(old), _learned(agent)
+    if type(agent) is not type(old) or had.keys() != given.keys():
+        raise InputError("the agent is not the run's; give the one that learned there")
+    other = next((name for name in had if had[name] != given[name] and name not in agent.adjustable), None)
+    if other is not None:
+        raise InputError(
+            f"{other.replace('_', '-')} is the run's, {had[other]}, and cannot be {given[other]}; "
+            f"what may change is {', '.join(name.replace('_', '-') for name in agent.adjustable if name in had)}"
+        )
 
 
 def _sizes(spec: Spec) -> str:

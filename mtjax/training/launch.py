@@ -35,7 +35,7 @@ def load_start(config: RunConfig) -> Policy | None:
 def launch(config: RunConfig, hooks: Hooks = NO_HOOKS) -> Result:
     """Print what a run does, and train. A run that is refused before it begins leaves no folder."""
     if hosts.is_first() and not hooks.quiet and config.env:
-        print(_introduction(config, hooks), flush=True)
+        print(*_introduction(config, hooks), sep="\n", flush=True)
     try:
         return train(config, hooks)
     except InputError:
@@ -44,7 +44,7 @@ def launch(config: RunConfig, hooks: Hooks = NO_HOOKS) -> Result:
         raise
 
 
-def _introduction(config: RunConfig, hooks: Hooks) -> str:
+def _introduction(config: RunConfig, hooks: Hooks) -> list[str]:
     """Return the first lines of a run: what learns, on which tasks, and where the results are."""
     plan = config.plan
     lines = [f"{hooks.label}: {' '.join(config.sweep)}"] if config.sweep else []
@@ -59,7 +59,7 @@ def _introduction(config: RunConfig, hooks: Hooks) -> str:
         lines += [_warning(family, agent) for family, agent in slow_on_cpu(config.env).items() if agent != config.agent]
     if hooks.resume and config.learner.lr_schedule != "constant" and not config.learner.lr_updates:
         lines.append(f"learning rates go on along the schedule of a run of {plan.steps:,} steps")
-    return "\n".join(lines)
+    return lines
 
 
 def _sizes(config: RunConfig) -> str:
