@@ -30,7 +30,7 @@ from mtjax.agents.choices import replace
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import configure, with_preset
 from mtjax.envs.tabled import Tabled
-from mtjax.evaluation import evaluate, save_evaluations
+from mtjax.evaluation import Episodes, evaluate, save_evaluations
 from mtjax.names import replacing
 from mtjax.report.stats import seed_interval
 from mtjax.saved.result import Result
@@ -132,7 +132,8 @@ def limited(family: Tabled, agent: Agent, result: Result, arguments: argparse.Na
     if not len(tasks.id):
         return None
     agent = replace(agent, {"context_limit": 1.0})
-    scores = evaluate(family, agent, arguments.eval_episodes, result.state.agent, tasks, seeds, jnp.int32(0))
+    episodes = Episodes(arguments.eval_episodes)
+    scores = evaluate(family, agent, episodes, result.state.agent, tasks, seeds, jnp.int32(0))
     return round(float(scores.returns.mean()), 1)
 
 

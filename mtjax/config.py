@@ -15,6 +15,7 @@ import jax
 import tyro
 from jax.sharding import Mesh
 
+from mtjax import trials
 from mtjax.agents import BaseAgent, agent, preset_of
 from mtjax.agents.choices import kinds_of, replace
 from mtjax.agents.parts import name_of
@@ -26,7 +27,7 @@ from mtjax.envs import make, members
 from mtjax.envs.tabled import Tabled
 from mtjax.experience import Replay
 from mtjax.frames import shown
-from mtjax.loop import Settings
+from mtjax.loop import Settings, require_trials
 from mtjax.names import PRESETS, nearest_error, public
 from mtjax.parallel.mesh import mesh_for
 from mtjax.types import InputError
@@ -183,6 +184,8 @@ class RunConfig:
             self._check_named()
         _ = self.mesh
         self.learner.experience.check(self.family, self.played.num_envs, self.played.chunk_steps)
+        require_trials(self.training, self.learner)
+        trials.require_whole(self.plan.eval_episodes, self.training.trials, "eval-episodes")
         for learner in agents_at(self.learner, self.points):
             require_value_range(learner)
         for module in ["tensorboardX"] * self.tensorboard + ["wandb"] * bool(self.wandb):

@@ -1,4 +1,7 @@
-"""Evaluation plays whole episodes under the mean action, on any tasks, with keys of its own."""
+"""Evaluation plays whole trials under the mean action, on any tasks, with keys of its own.
+
+Of trials of several episodes (``mtjax.trials``), the episodes of one follow each other along the axis of episodes.
+"""
 
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -11,10 +14,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from mtjax.names import replacing
-from mtjax.rollout import Worlds, reset_envs, step_envs
+from mtjax.rollout import EnvStep, Worlds, reset_ended, reset_envs, step_envs
+from mtjax.trials import of_episodes
 from mtjax.types import SPLITS, Agent, Array, Env, InputError, Task
 
 _EVER = "success_ever"  # the metric that success was 1 at any step of an episode
+
+
+class Episodes(NamedTuple):
+    """Says how many episodes of each task an evaluation plays, in trials of how many."""
+
+    count: int  # a multiple of ``trial``
+    trial: int = 1
 
 
 class Scores(NamedTuple):
@@ -37,13 +48,16 @@ class Evaluations(NamedTuple):
     values: dict[str, np.ndarray]  # split -> (T,) value of the varying parameter
     metrics: Mapping[str, dict[str, np.ndarray]] = MappingProxyType({})  # name -> split -> (S, V, T, episodes)
     seeds: np.ndarray | tuple[()] = ()  # (S,); unknown of runs of earlier versions
+    trial: int = 1  # episodes of a trial
 
 
-def no_evaluations(seeds: Sequence[int] | np.ndarray, values: Mapping[str, np.ndarray], episodes: int) -> Evaluations:
+def no_evaluations(
+    seeds: Sequence[int] | np.ndarray, values: Mapping[str, np.ndarray], episodes: int, trial: int = 1
+) -> Evaluations:
     """Return the evaluations of a run that has not begun: of seeds (S,), and of tasks by their values (T,) by split."""
     seeds = np.asarray(seeds, np.int64)
     returns = {split: np.zeros((len(seeds), 0, len(x), episodes), np.float32) for split, x in values.items()}
-    return Evaluations(np.zeros(0, np.int64), returns, dict(values), seeds=seeds)
+    return Evaluations(np.zeros(0, np.int64), returns, dict(values), seeds=seeds, trial=trial)
 
 
 def require_same_run(path: Path, found: Evaluations, expected: Evaluations) -> None:
@@ -58,6 +72,7 @@ def require_same_run(path: Path, found: Evaluations, expected: Evaluations) -> N
         f"{seeds} seeds, not {own_seeds}": seeds != own_seeds,
         "other seeds": len(found.seeds) > 0 and not np.array_equal(found.seeds, expected.seeds),
         f"{episodes} episodes of a task, not {own_episodes}": episodes != own_episodes,
+        f"trials of {found.trial} episodes, not of {expected.trial}": found.trial != expected.trial,
         **{f"other {split} tasks": not same(found.values[split], expected.values[split]) for split in SPLITS},
     }
     difference = next((text for text, differs in differences.items() if differs), "")
@@ -68,12 +83,13 @@ def require_same_run(path: Path, found: Evaluations, expected: Evaluations) -> N
 def save_evaluations(path: Path, evaluations: Evaluations) -> None:
     """Write every episode: for each split returns and metrics (S, V, T, episodes) and values (T,).
 
-    Beside them are ``steps`` (V,) and ``seeds`` (S,).
+    Beside them are ``steps`` (V,), ``seeds`` (S,) and ``trial`` (), the episodes of a trial.
     """
     values = {f"{split}_values": x for split, x in evaluations.values.items()}
     metrics = {f"{split}_{name}": x for name, splits in evaluations.metrics.items() for split, x in splits.items()}
     with replacing(path) as new, new.open("wb") as file:
-        np.savez(file, steps=evaluations.steps, seeds=evaluations.seeds, **evaluations.returns, **values, **metrics)  # type: ignore
+        about = {"steps": evaluations.steps, "seeds": evaluations.seeds, "trial": np.int64(evaluations.trial)}
+        np.savez(file, **about, **evaluations.returns, **values, **metrics)  # type: ignore
 
 
 def load_evaluations(path: str | Path) -> Evaluations:
@@ -92,6 +108,7 @@ def load_evaluations(path: str | Path) -> Evaluations:
                 {split: file[f"{split}_values"] for split in SPLITS},
                 {name: {split: file[f"{split}_{name}"] for split in SPLITS} for name in sorted(named)},
                 file["seeds"] if "seeds" in file else (),
+                int(file["trial"]) if "trial" in file else 1,
             )
     except FileNotFoundError:
         raise InputError(f"there is no file {str(path)!r}") from None
@@ -114,6 +131,8 @@ def _require_fit(path: Path, found: Evaluations) -> None:
     wanted = lambda split: (len(found.steps), *found.values[split].shape)
     fits = (
         numbers
+        and found.trial > 0
+        and found.returns["train"].shape[-1] % found.trial == 0
         and found.steps.ndim == 1
         and all(
             x.ndim == 4 and x.shape[1:3] == wanted(split) and x.shape[::3] == found.returns["train"].shape[::3]
@@ -129,14 +148,14 @@ def _require_fit(path: Path, found: Evaluations) -> None:
 def evaluate(
     env: Env,
     agent: Agent,
-    episodes: int,
+    episodes: Episodes,
     state: Any,
     tasks: Task,
     seeds: Array,
     number: Array,
     places: Array | None = None,
 ) -> Scores:
-    """Play whole episodes under the mean action.
+    """Play whole trials under the mean action.
 
     An episode whose world is lost (``step_envs``) keeps what it had before.
 
@@ -148,32 +167,53 @@ def evaluate(
         places: (T,) of ``tasks`` among all tasks of ``env``, whose episodes they then play; None: they are all tasks.
     """
 
-    shape = (len(seeds), len(tasks.id), episodes)
+    trials = of_episodes(episodes.trial)
+    shape = (len(seeds), len(tasks.id), episodes.count // episodes.trial)  # of trials
     fresh = lambda seed: jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), 0x7E57), number)
-    drawn = shape[1:] if places is None else (len(env.tasks("all").id), episodes)
+    drawn = shape[1:] if places is None else (len(env.tasks("all").id), shape[2])
     keys = jax.vmap(lambda seed: jax.random.split(fresh(seed), drawn))(seeds)
     keys = keys if places is None else keys[:, places]
 
-    def step(carry, _):
-        worlds, scores, alive = carry
-        worlds, env_step = step_envs(env, agent, state, tasks, worlds, None)
-        reward = jnp.where(alive, env_step.transition.reward, 0.0)  # rewards after an episode's end may not be finite
-        scores = Scores(scores.returns + reward, _latest(env_step.metrics, scores.metrics, alive & ~env_step.lost))
-        return (worlds, scores, alive & ~env_step.transition.ended), None
+    def advance(worlds: Worlds, alive: Array, time: Array) -> tuple[Worlds, EnvStep]:
+        """Step the worlds, and begin the next episodes of trials that are alive."""
+        worlds, env_step = step_envs(env, agent, state, tasks, worlds, None, trials=trials)
+        if trials.episodes == 1:
+            return worlds, env_step
+        ends = jax.tree.map(lambda x: x & alive, env_step.ends)
+        fold = jax.vmap(jax.vmap(jax.vmap(jax.random.fold_in, (0, None)), (0, None)), (0, None))
+        return reset_ended(env, agent, state, tasks, worlds, ends, lambda: fold(keys, time), trials), env_step
 
-    worlds = reset_envs(env, agent, state, tasks, keys)
-    env_step = jax.eval_shape(lambda worlds: step_envs(env, agent, state, tasks, worlds, None)[1], worlds)
-    metrics = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), env_step.metrics)
+    def step(carry, time: Array):
+        before, scores, alive = carry
+        worlds, env_step = advance(before, alive, time)
+        now = alive[..., None] & _is_now(before, trials.episodes)
+        # Rewards after an episode's end may not be finite.
+        returns = scores.returns + jnp.where(now, env_step.transition.reward[..., None], 0.0)
+        metrics = _latest(env_step.metrics, scores.metrics, now & ~env_step.lost[..., None])
+        return (worlds, Scores(returns, metrics), alive & ~env_step.transition.closed), None
+
+    worlds = reset_envs(env, agent, state, tasks, keys, trials)
+    take = lambda worlds: step_envs(env, agent, state, tasks, worlds, None, trials=trials)[1]
+    env_step = jax.eval_shape(take, worlds)
+    metrics = {name: jnp.zeros((*shape, trials.episodes), x.dtype) for name, x in env_step.metrics.items()}
     metrics |= {_EVER: metrics["success"]} if "success" in metrics else {}
-    nothing = Scores(jnp.zeros(shape), metrics)
-    return jax.lax.scan(step, (worlds, nothing, jnp.ones(shape, bool)), length=env.episode_length)[0][1]
+    nothing = Scores(jnp.zeros((*shape, trials.episodes)), metrics)
+    times = jnp.arange(env.episode_length * trials.episodes)
+    scores = jax.lax.scan(step, (worlds, nothing, jnp.ones(shape, bool)), times)[0][1]
+    return jax.tree.map(lambda x: x.reshape(*shape[:2], episodes.count), scores)
 
 
-def _latest(new: dict[str, Array], old: dict[str, Array], alive: Array) -> dict[str, Array]:
-    """Return the metrics of episodes after a step. Those of ended episodes stay."""
+def _is_now(worlds: Worlds, episodes: int) -> Array:
+    """Return which of a trial's episodes (S, T, E, episodes), or (episodes,), worlds are in."""
+    return jnp.ones(1, bool) if worlds.episode is None else worlds.episode[..., None] == jnp.arange(episodes)
+
+
+def _latest(new: dict[str, Array], old: dict[str, Array], now: Array) -> dict[str, Array]:
+    """Return the metrics (S, T, E, episodes) of trials after a step with metrics (S, T, E), which count ``now``."""
+    new = {name: x[..., None] for name, x in new.items()}
     if _EVER in old:
-        new = new | {_EVER: jnp.maximum(new["success"], old[_EVER])}
-    return {name: jnp.where(alive, x, old[name]) for name, x in new.items()}
+        new |= {_EVER: jnp.maximum(new["success"], old[_EVER])}
+    return {name: jnp.where(now, x, old[name]) for name, x in new.items()}
 
 
 class Recording(NamedTuple):

@@ -27,7 +27,7 @@ from mtjax.rollout import (
     step_envs,
     world_keys,
 )
-from mtjax.trials import EACH_EPISODE, Repeated, Trials
+from mtjax.trials import Trials, of_episodes
 from mtjax.types import Agent, Array, Env, InputError, Key, Metrics, Sometimes, Task, Transition
 
 PHASES = 10
@@ -62,7 +62,7 @@ class Settings:
     @property
     def trial(self) -> Trials:
         """Return what a trial is."""
-        return EACH_EPISODE if self.trials == 1 else Repeated(self.trials)
+        return of_episodes(self.trials)
 
 
 class TrainState(NamedTuple):

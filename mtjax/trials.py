@@ -8,6 +8,8 @@ of the next episode (Duan et al. 2016, "RL^2").
 import dataclasses
 from typing import Any, ClassVar, NamedTuple
 
+import numpy as np
+
 from mtjax.types import Array, InputError
 
 MOST = 10_000
@@ -77,3 +79,32 @@ class ResetFree:
 
 Trials = EachEpisode | Repeated | ResetFree
 EACH_EPISODE = EachEpisode()
+
+
+def of_episodes(count: int) -> EachEpisode | Repeated:
+    """Return the trials of so many episodes."""
+    return EACH_EPISODE if count == 1 else Repeated(count)
+
+
+def require_whole(episodes: int, trial: int, name: str = "episodes") -> None:
+    """Check that a number of episodes makes whole trials.
+
+    Raises:
+        InputError: it does not.
+    """
+    if episodes % trial:
+        more = -(-episodes // trial) * trial
+        raise InputError(f"{name} must be a multiple of a trial's {trial} episodes, such as {more}; not {episodes}")
+
+
+def describe(returns: np.ndarray, trial: int) -> str:
+    """Return the mean return of the first and the last episode of trials as text; empty where these are one.
+
+    Args:
+        returns: (..., episodes), those of a trial one after another.
+        trial: episodes of a trial.
+    """
+    if trial == 1:
+        return ""
+    mean = np.nanmean(returns.reshape(-1, trial), axis=0)
+    return f"episode 1 of a trial {mean[0]:.3g}, episode {trial} {mean[-1]:.3g}"

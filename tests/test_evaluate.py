@@ -23,7 +23,7 @@ import mtjax
 import mtjax.evaluate
 import mtjax.train
 from mtjax import loop
-from mtjax.evaluation import Evaluations, Scores, evaluate, load_evaluations, record
+from mtjax.evaluation import Episodes, Evaluations, Scores, evaluate, load_evaluations, record
 from mtjax.report import films, render, scoring
 from mtjax.report.tables import split_table, task_table
 from mtjax.saved import checkpoint
@@ -61,7 +61,7 @@ def rows_of(path):
 def score(policy, number, seeds=None):
     tasks = policy.env.tasks("all")
     seeds = policy.seeds if seeds is None else seeds
-    scores = evaluate(policy.env, policy.agent, 1, policy.states, tasks, seeds, jnp.int32(number))
+    scores = evaluate(policy.env, policy.agent, Episodes(1), policy.states, tasks, seeds, jnp.int32(number))
     return np.asarray(scores.returns)
 
 
@@ -145,7 +145,7 @@ def test_evaluation_is_a_plain_loop_over_single_worlds():
     env, agent, episodes = Fatal(), Leaning(), 4
     tasks = tasks_of("one-step", (1.0, -0.5, 2.0))._replace(horizon=jnp.int32([6, 4, 2]))
     states, seeds = jnp.float32([[0.3], [1.7]]), (3, 8)
-    found = evaluate(env, agent, episodes, states, tasks, jnp.asarray(seeds), jnp.int32(5))
+    found = evaluate(env, agent, Episodes(episodes), states, tasks, jnp.asarray(seeds), jnp.int32(5))
     reset, step, lengths = jax.jit(env.reset), jax.jit(env.step), set()
     for s, seed in enumerate(seeds):
         key = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), 0x7E57), 5)
@@ -181,7 +181,9 @@ class Counting(Lost):
 def test_an_episode_whose_world_is_lost_keeps_what_it_had():
     """Return and metrics are those of before; others go on."""
     tasks, episodes = tasks_of("one-step", (1.0, -1.0))._replace(horizon=jnp.int32([5, 5])), 12
-    found = evaluate(Counting(), Leaning(), episodes, jnp.float32([0.3]), tasks, jnp.asarray([3]), jnp.int32(0))
+    found = evaluate(
+        Counting(), Leaning(), Episodes(episodes), jnp.float32([0.3]), tasks, jnp.asarray([3]), jnp.int32(0)
+    )
     returns, steps = np.asarray(found.returns)[0], np.asarray(found.metrics["steps"])[0]
     lost = steps == 1
     assert np.all(np.isin(steps, [1, 5])) and not lost[0].any() and 0 < lost[1].sum() < episodes
@@ -414,7 +416,7 @@ def test_tasks_of_several_parameters_are_told_by_their_values():
     """In the table and in the file, not by numbers alone."""
     env = mtjax.make("finger-spin", vary={"size": [1.0, 1.1], "mass": [0.5, 2.0]}, split="none")
     scores = {"train": Scores(np.arange(4.0).reshape(1, 4, 1), {})}
-    head, *lines = task_table(types.SimpleNamespace(env=env), scores).splitlines()  # type: ignore
+    head, *lines = task_table(types.SimpleNamespace(env=env, trial=1), scores).splitlines()  # type: ignore
     assert head.split()[:2] == ["split", "task"]
     assert [line.split()[1:3] for line in lines[:2]] == [["size=1,mass=0.5", "0"], ["size=1,mass=2", "1"]]
     assert lines[-1].split() == ["train", "all", "2"]
@@ -427,12 +429,12 @@ def test_success_is_told_beside_returns():
     env = mtjax.make("finger-spin", vary={"size": [1.0, 1.1]}, split="none")
     returns, end = np.arange(4.0).reshape(1, 2, 2), np.array([[[0.0, 0.0], [0.0, 1.0]]])
     scores = {"train": Scores(returns, {"success": end, "success_ever": np.maximum(end, [1, 0])})}
-    head, *lines = task_table(types.SimpleNamespace(env=env), scores).splitlines()  # type: ignore
+    head, *lines = task_table(types.SimpleNamespace(env=env, trial=1), scores).splitlines()  # type: ignore
     assert head.split()[2:7] == ["return", "success,", "at", "any", "step"]
     shown = [line.split()[3:] for line in lines]
     assert shown == [["0.00", "0.50", "0,", "1"], ["0.50", "1.00", "2,", "3"], ["0.25", "0.75"]]
     scores = {"train": Scores(returns, {"success": np.full((1, 2, 2), np.nan)})}
-    assert "success" not in task_table(types.SimpleNamespace(env=env), scores)  # type: ignore
+    assert "success" not in task_table(types.SimpleNamespace(env=env, trial=1), scores)  # type: ignore
 
 
 def test_scores_are_printed_where_they_cannot_be_written(copied_run, capsys, monkeypatch):

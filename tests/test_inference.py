@@ -175,7 +175,8 @@ def learned(conditioning):
 
 def returns(agent, env, states, split):
     tasks, seeds = env.tasks(split), jnp.zeros(1, jnp.uint32)
-    score = quick(lambda *inputs: evaluation.evaluate(env, agent, 2, *inputs), states, tasks, seeds, jnp.int32(0))
+    score = lambda *inputs: evaluation.evaluate(env, agent, evaluation.Episodes(2), *inputs)
+    score = quick(score, states, tasks, seeds, jnp.int32(0))
     return np.asarray(score(states, tasks, seeds, jnp.int32(0)).returns)[0]
 
 

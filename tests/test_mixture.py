@@ -23,7 +23,7 @@ from mtjax.agents.state import AgentState
 from mtjax.command import run_config
 from mtjax.envs import ENVS, Family, Mixture, make, mixture
 from mtjax.envs.parameters import Parameter
-from mtjax.evaluation import Scores, evaluate, record
+from mtjax.evaluation import Episodes, Scores, evaluate, record
 from mtjax.experience.replay import Replay
 from mtjax.loop import Settings
 from mtjax.networks import OVER_TASKS, Params
@@ -535,7 +535,7 @@ def test_mujocos_families_learn_in_one_program():
     returns = result.evaluations.returns["train"]
     assert returns.shape == (1, 1, 2, 1) and np.isfinite(returns).all() and result.evaluations.metrics == {}
     tasks = env.tasks("train")
-    again = evaluate(env, agent, 1, result.state.agent, tasks, jnp.zeros(1, int), jnp.int32(0)).returns
+    again = evaluate(env, agent, Episodes(1), result.state.agent, tasks, jnp.zeros(1, int), jnp.int32(0)).returns
     np.testing.assert_allclose(again, returns[:, 0], rtol=1e-3)
 
 

@@ -11,7 +11,9 @@ from test_loop import Drifting
 
 import mtjax
 from mtjax.agents.parts import targets
+from mtjax.evaluation import Episodes, evaluate, load_evaluations, no_evaluations, require_same_run
 from mtjax.experience import multistep
+from mtjax.report.tables import split_table
 from mtjax.trials import EachEpisode, Repeated, ResetFree
 from mtjax.types import Acted, InputError, Transition
 
@@ -235,3 +237,90 @@ def test_a_run_that_is_resumed_in_the_middle_of_a_trial_is_the_whole_run(name, t
     raw = lambda x: np.asarray(jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x)
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(raw(a), raw(b)), whole.state, again.state)
     np.testing.assert_array_equal(whole.evaluations.returns["train"], again.evaluations.returns["train"])
+
+
+# Evaluation.
+
+
+@dataclasses.dataclass(frozen=True)
+class Shy(Walk):
+    """A walk that earns the action, and tells as success whether that is more than 2."""
+
+    def step(self, task, state, action):
+        step = super().step(task, state, action)
+        return step._replace(reward=action[0], metrics={"success": jnp.float32(action[0] > 2)})
+
+
+def evaluated(env, episodes, trial, agent=None):
+    """The scores of one evaluation of two seeds, as arrays."""
+    states, seeds = jnp.zeros((2, 1)), jnp.arange(2)
+    found = evaluate(env, agent or Counting(), Episodes(episodes, trial), states, env.tasks(), seeds, jnp.int32(0))
+    return jax.tree.map(np.asarray, found)
+
+
+def test_the_episodes_of_a_trial_follow_each_other_and_memory_lives_through_them():
+    """Returns are sums of how many steps and ends the agent remembers: they tell the lengths of all episodes."""
+    scores = evaluated(Shy(), 12, K)
+    assert scores.returns.shape == scores.metrics["success"].shape == (2, 2, 12)
+    lengths = set()
+    for trial in scores.returns.reshape(-1, K):
+        steps = 0
+        for ends, total in enumerate(trial):
+            found = [n for n in (3, 5) if total == sum(range(steps, steps + n)) + 100 * ends * n]
+            assert len(found) == 1
+            lengths, steps = lengths | set(found), steps + found[0]
+    assert lengths == {3, 5}
+    first = scores.metrics["success"].reshape(-1, K)[:, 0] * scores.returns.reshape(-1, K)[:, 0]
+    np.testing.assert_array_equal(first, np.where(scores.returns.reshape(-1, K)[:, 0] == 10, 10, 0))
+
+
+def test_episodes_alone_are_trials_of_one():
+    """To the bit those that begin trials, where the agent remembers nothing of before."""
+    alone, trials = (evaluated(Shy(), count, trial).returns for count, trial in ((4, 1), (12, K)))
+    np.testing.assert_array_equal(alone, trials[..., ::K])
+
+
+class Blind(Stub):
+    """Does nothing."""
+
+
+def test_the_task_of_an_evaluated_trial_stays_and_each_episode_begins_elsewhere():
+    """A walk's return tells its task and its start."""
+    env = Drifting()
+    returns = evaluated(env, 40 * K, K, Blind()).returns.reshape(2, 2, 40, K)
+    assert len(np.unique(returns)) == returns.size
+
+    @dataclasses.dataclass(frozen=True)
+    class Told(Drifting):
+        def rules(self, task, state, action):
+            return task.goal["scale"], state.obs[0] + 1, False
+
+    scales = evaluated(Told(), 40 * K, K, Blind()).returns.reshape(2, 2, 40, K)
+    np.testing.assert_array_equal(scales, np.broadcast_to(scales[..., :1], scales.shape))
+    assert len(np.unique(scales[..., 0])) > 60
+
+
+def test_a_run_s_evaluations_know_their_trials(tmp_path, capsys):
+    """In the file, for the policy that is scored again, and in what is told of first, last and mean episode."""
+    env = mtjax.make("bandit", num_tasks=2, split="none")
+    given = dict(num_envs=2, chunk_steps=4, warmup_steps=1, replay_size=16, batch_size=2, steps=16, trials=2)
+    result = mtjax.train(env, tiny("sac", hidden=(8,)), eval_episodes=4, directory=tmp_path / "run", **given)
+    assert "(episode 1 of a trial " in capsys.readouterr().out and "episode 2 " in repr(result)
+    found = load_evaluations(tmp_path / "run" / "evaluations.npz")
+    assert found.trial == 2 and found.returns["train"].shape == (1, 1, 2, 4)
+    returns = found.returns["train"][0, -1].reshape(-1, 2).mean(axis=0)
+    assert f"train           episode 1 of a trial {returns[0]:.3g}, episode 2 {returns[1]:.3g}" in split_table(found)
+    assert result.policy().trial == 2
+    with pytest.raises(InputError, match="episodes must be a multiple of a trial's 2 episodes, such as 4; not 3"):
+        mtjax.evaluate(result, episodes=3)
+    assert mtjax.evaluate(result, episodes=4).returns["train"].shape == (1, 2, 4)
+    other = no_evaluations([0], found.values, 4)
+    with pytest.raises(InputError, match="trials of 2 episodes, not of 1"):
+        require_same_run(tmp_path, found, other)
+
+
+def test_a_run_evaluates_whole_trials():
+    """Else it is refused before it is compiled."""
+    message = "eval-episodes must be a multiple of a trial's 4 episodes, such as 12; not 10"
+    with pytest.raises(InputError, match=message):
+        mtjax.train("bandit", "sac", steps=100, trials=4)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax import evaluation
+from mtjax import evaluation, trials
 from mtjax.checks import path, require_episodes
 from mtjax.compiling.programs import compile_lowered, enable_compile_cache, trace
 from mtjax.envs import Family
@@ -234,17 +234,22 @@ def _require_point(point: Any, count: int) -> None:
 def score(
     policy: Policy, episodes: int, seed: int = 0, tasks: Task | None = None, split: str = "all"
 ) -> dict[str, Scores]:
-    """Return the scores (S, T, episodes) of each split, in episodes that no training run has seen.
+    """Return the scores (S, T, episodes) of each split, in whole trials of episodes that no training run has seen.
 
     Args:
         tasks: all tasks of the policy's environment, if they are numbered anew.
         split: the split to play alone, in the same episodes; or "all".
+
+    Raises:
+        InputError: the episodes are no whole number of trials.
     """
+    trials.require_whole(episodes, policy.trial)
     env = policy.env
     rows = {name: np.asarray(env.tasks(name).id) for name in (SPLITS if split == "all" else [split])}
     arguments = policy.states, env.tasks(split) if tasks is None else tasks, policy.seeds
     arguments += (jnp.int32(_FIRST_NUMBER + seed), *([] if split == "all" else [jnp.asarray(rows[split])]))
-    program = trace(evaluation.evaluate, env, policy.agent, episodes, *arguments)
+    played = evaluation.Episodes(episodes, policy.trial)
+    program = trace(evaluation.evaluate, env, policy.agent, played, *arguments)
     found = compile_lowered(program.lower(), "seldom")(*arguments)
     return {split: found} if split in rows else {name: of_tasks(found, places) for name, places in rows.items()}
 

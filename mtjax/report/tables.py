@@ -5,6 +5,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from mtjax import trials
 from mtjax.envs.family import Family
 from mtjax.envs.tabled import Part
 from mtjax.evaluation import Evaluations, Scores, of_tasks
@@ -35,11 +36,17 @@ def split_table(evaluations: Evaluations, parts: Sequence[Part] = ()) -> str:
     told = _TOLD if evaluations.metrics.get("success") else ""
     lines = [f"{'split':15} {'tasks':>5} {'return':>7}  worst task{told}"]
     lines += [_split_line(split, *found) for split, found in last.items()]
+    lines += _trial_lines({split: x[:, -1] for split, x in evaluations.returns.items()}, evaluations.trial)
     for part in parts if len(parts) > 1 else ():
         lines.append(part.name)
         own = {split: [x[:, part.places[split]] for x in found] for split, found in last.items()}
         lines += [_split_line(split, *found) for split, found in own.items() if found[0].size]
     return "\n".join(lines)
+
+
+def _trial_lines(returns: Mapping[str, np.ndarray], trial: int) -> list[str]:
+    """Return a line for each split with returns of the first and the last episode of trials, if these are several."""
+    return [f"{split:15} {trials.describe(x, trial)}" for split, x in returns.items() if x.size and trial > 1]
 
 
 def _split_line(split: str, returns: np.ndarray, *success: np.ndarray) -> str:
@@ -74,6 +81,7 @@ def task_table(policy: Policy, scores: dict[str, Scores], named: Mapping[str, st
     if len(parts) > 1:
         lines.append("all families")
         lines += [_mean_line(called(split), "all", found) for split, found in scores.items() if found.returns.size]
+    lines += _trial_lines({called(split): found.returns for split, found in scores.items()}, policy.trial)
     return "\n".join(lines)
 
 

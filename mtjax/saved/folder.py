@@ -181,5 +181,5 @@ def evaluations_of(config: RunConfig, directory: Path) -> Evaluations:
     file, values = directory / "evaluations.npz", {split: config.family.task_values(split) for split in SPLITS}
     found = load_evaluations(file)
     seeds = [*config.plan.all_seeds] * max(len(config.points), 1)
-    require_same_run(file, found, no_evaluations(seeds, values, config.plan.eval_episodes))
+    require_same_run(file, found, no_evaluations(seeds, values, config.plan.eval_episodes, config.training.trials))
     return found

@@ -44,6 +44,7 @@ class Policy:
     seeds: Array  # (S,)
     directory: Path | None = None  # of the run
     number: int = 0  # of the seed among ``seeds``
+    trial: int = 1  # episodes of a trial, through which its memory lives
 
     def __repr__(self) -> str:
         names, seen = f"{name_of(self.agent)} on {env_name_of(self.env)}", jax.tree.map(lambda x: x.shape, self.takes)
@@ -137,12 +138,14 @@ class Policy:
         return self.agent.representation.acts_on(frames.seen(self.env.spec))
 
     def begin(self, task: Task) -> Any:
-        """Return the memory at the start of an episode."""
+        """Return the memory at the start of a trial, which by default is an episode."""
         return self.agent.begin(self.state, task)
 
-    def remember(self, memory: Any, task: Task, obs: Array, action: Array, reward: Array, next_obs: Array) -> Any:
-        """Return the memory after one step."""
-        step = Transition(obs, action, reward, jnp.float32(1), next_obs)
+    def remember(
+        self, memory: Any, task: Task, obs: Array, action: Array, reward: Array, next_obs: Array, ended: Any = False
+    ) -> Any:
+        """Return the memory after one step; ``ended`` says whether an episode ended with it."""
+        step = Transition(obs, action, reward, jnp.float32(1), next_obs, jnp.bool_(ended), jnp.bool_(False))
         return self.agent.remember(self.state, memory, step, task)
 
 
@@ -176,7 +179,8 @@ def load(directory: str | Path, seed: int = 0, checkpoint: int = 0) -> Policy:
     else:
         states = checkpoints.load_agent(directory / "checkpoints", state_shapes(config), checkpoint)
     seeds = jnp.asarray(config.plan.all_seeds, jnp.int32)
-    return policy_of(config.family, config.learner, config.points, seeds, states, seed, directory)
+    found = policy_of(config.family, config.learner, config.points, seeds, states, seed, directory)
+    return dataclasses.replace(found, trial=config.training.trials)
 
 
 def _filled(directory: Path, like: Any) -> Any:

@@ -1,5 +1,6 @@
 """The result of a run in Python: its state, evaluations, metrics and policies."""
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -8,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mtjax import trials
 from mtjax.agents.swept import Point
 from mtjax.evaluation import Evaluations
 from mtjax.loop import TrainState
@@ -38,7 +40,9 @@ class Result(NamedTuple):
     def __repr__(self) -> str:
         """Return a line: steps, and the last evaluation's mean return by split."""
         known = {split: x[:, -1] for split, x in self.evaluations.returns.items() if x.size}
-        scores = ", ".join(f"{split} {np.nanmean(x):.0f}" for split, x in known.items())
+        told = {split: trials.describe(x, self.evaluations.trial) for split, x in known.items()}
+        tell = lambda split: f" ({told[split]})" * bool(told[split])
+        scores = ", ".join(f"{split} {np.nanmean(x):.0f}{tell(split)}" for split, x in known.items())
         steps = f"{self.rows[-1]['steps']:,} steps" if self.rows else "no steps"
         place = "" if self.directory is None else f", in {str(self.directory)!r}"
         return f"Result({steps}, return {scores or '-'}{'' if self.finished else ', stopped'}{place})"
@@ -53,7 +57,8 @@ class Result(NamedTuple):
             InputError: the run has no such seed.
         """
         states = jax.tree.map(jnp.asarray, hosts.gather(self.state.agent))
-        return policy_of(self.env, self.agent, self.points, jnp.asarray(self.seeds), states, seed, self.directory)
+        found = policy_of(self.env, self.agent, self.points, jnp.asarray(self.seeds), states, seed, self.directory)
+        return dataclasses.replace(found, trial=self.evaluations.trial)
 
     @public
     def frame(self, of: str = "evaluations") -> Any:

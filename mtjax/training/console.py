@@ -6,6 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from mtjax import trials
+
 _SHARE = 1 / 3  # of a run under random actions from which a warning is due
 _LINES, _SECONDS = 50, 15.0  # plain lines in a run, and the longest time without one
 
@@ -97,16 +99,24 @@ class Console:
         return steps - before >= self.total / _LINES or seconds - then >= _SECONDS or steps >= self.total
 
     def evaluation(
-        self, steps: int, returns: Mapping[str, np.ndarray], success: Mapping[str, np.ndarray] | None = None
+        self,
+        steps: int,
+        returns: Mapping[str, np.ndarray],
+        success: Mapping[str, np.ndarray] | None = None,
+        trial: int = 1,
     ) -> None:
         """Show an evaluation's mean return, worst task, and success at the end if tasks tell it.
+
+        Of trials of several episodes, the mean return of the first and the last one is shown too.
 
         Args:
             returns: (S, T, episodes) by split.
             success: of the same shapes; NaN where a task does not tell it.
+            trial: episodes of a trial.
         """
         shares = success or {}
-        told = ", ".join(_of_split(split, x) + _share(shares.get(split)) for split, x in returns.items() if x.size)
+        tell = lambda split, x: _of_split(split, x) + _of_trial(x, trial) + _share(shares.get(split))
+        told = ", ".join(tell(split, x) for split, x in returns.items() if x.size)
         self.say(f"{self.label}evaluation at {steps:,} steps: {told}")
         means = ", ".join(f"{split} {x.mean():.0f}" for split, x in returns.items() if x.size)
         self.evaluated = f"  evaluated {means}"
@@ -166,6 +176,11 @@ def describe_rounding(steps: int, total: int, chunk: int) -> list[str]:
 def _of_split(split: str, returns: np.ndarray) -> str:
     worst = f" (worst task {returns.mean(axis=(0, 2)).min():.0f})" if returns.shape[1] > 1 else ""
     return f"{split} {returns.mean():.0f}{worst}"
+
+
+def _of_trial(returns: np.ndarray, trial: int) -> str:
+    told = trials.describe(returns, trial)
+    return f" ({told})" * bool(told)
 
 
 def _share(success: np.ndarray | None) -> str:

@@ -17,7 +17,7 @@ from mtjax.agents import swept
 from mtjax.agents.swept import Point, SweptAgent
 from mtjax.compiling.programs import Programs, compile_lowered, jit_programs, load_kernels, sharded_shapes, trace
 from mtjax.config import RunConfig
-from mtjax.evaluation import Evaluations, no_evaluations
+from mtjax.evaluation import Episodes, Evaluations, no_evaluations
 from mtjax.loop import TrainState
 from mtjax.parallel import hosts
 from mtjax.parallel import mesh as meshes
@@ -169,7 +169,7 @@ class _Run:
     def prepare(self, resume: bool) -> tuple[Programs, TrainState]:
         """Compile all programs in parallel, and make or restore the state. Evaluation may be ready later."""
         env, agent, settings = self.config.family, self.agent, self.config.played
-        lazy, episodes = jit_programs(self.config.mesh, agent), self.config.plan.eval_episodes
+        lazy = jit_programs(self.config.mesh, agent)
         tasks, everything = (meshes.replicate(self.config.mesh, env.tasks(split)) for split in ("train", "all"))
         (seeds, knobs), pool = meshes.shard_by_seed(self.config.mesh, self.seed_axis), ThreadPoolExecutor(3)
         fresh = trace(lazy.init, env, agent, settings, tasks, seeds, knobs)
@@ -179,6 +179,7 @@ class _Run:
         kernels = pool.submit(load_kernels, env)
         make = None if resume else pool.submit(lambda: compile_lowered(fresh.lower(), "once"))
         chunk = trace(lazy.chunk, env, agent, settings, tasks, shapes)
+        episodes = Episodes(self.config.plan.eval_episodes, settings.trials)
         played = partial(trace, lazy.evaluate, env, agent, episodes, shapes.agent, everything, seeds)
         score = pool.submit(lambda: compile_lowered(played(np.int32(0)).lower(), "seldom"))
         pool.shutdown(wait=False)
@@ -412,7 +413,7 @@ class _Run:
         self.records.save_evaluations(evaluations)
         if not diverged.all():
             last = lambda scores: {split: x[~diverged, -1] for split, x in scores.items()}
-            self.console.evaluation(now.steps, last(returns), last(metrics.get("success", {})))
+            self.console.evaluation(now.steps, last(returns), last(metrics.get("success", {})), evaluations.trial)
         return evaluations
 
     def _evaluation_rows(self, evaluations: Evaluations) -> tuple[list[dict[str, Any]], list[str]]:
@@ -430,4 +431,5 @@ class _Run:
     def _no_evaluations(self) -> Evaluations:
         """Return the evaluations of a run that has not begun."""
         values = {split: self.config.family.task_values(split) for split in SPLITS}
-        return no_evaluations(self.seeds, values, self.config.plan.eval_episodes)
+        plan, training = self.config.plan, self.config.training
+        return no_evaluations(self.seeds, values, plan.eval_episodes, training.trials)
