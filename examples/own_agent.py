@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import mtjax
 from mtjax.agents import SAC
 from mtjax.agents.parts import require_counts, require_not_negative
-from mtjax.networks import tanh_normal
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,12 +33,12 @@ class BestOf(SAC):
 
     def actor_loss(self, nets, batch, key):
         loss, aux = super().actor_loss(nets, batch, key)
-        outputs = self.policy(nets, batch.features, batch.obs)
-        draw = lambda key: jax.lax.stop_gradient(tanh_normal(outputs, key, batch.mask)[0])
+        outputs = self.policy_outputs(nets, batch.features, batch.obs)
+        draw = lambda key: jax.lax.stop_gradient(self.policy.draw(outputs, batch.mask, key).action)
         drawn = jax.vmap(draw)(jax.random.split(key, self.candidates))  # (K, B, A)
         worth = jax.vmap(lambda a: jnp.min(self.values(nets, batch.features, batch.obs, a), axis=0))(drawn)  # (K, B)
         best = jnp.take_along_axis(drawn, jnp.argmax(worth, axis=0)[None, :, None], axis=0)[0]
-        distance = jnp.mean(jnp.square(tanh_normal(outputs, None, batch.mask)[0] - best))
+        distance = jnp.mean(jnp.square(self.policy.draw(outputs, batch.mask, None).action - best))
         return loss + self.imitation * distance, aux._replace(metrics=aux.metrics | {"imitation": distance})
 
 

@@ -4,7 +4,6 @@ A network is a body and a linear head. It is applied to the data of one task; th
 """
 
 import dataclasses
-import math
 from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
 
@@ -14,10 +13,6 @@ import jax.numpy as jnp
 
 from mtjax.sphere import init_direction
 from mtjax.types import Array, Key
-
-_LOG_STD_RANGE = (-5.0, 2.0)
-STD_RANGE = tuple(math.exp(bound) for bound in _LOG_STD_RANGE)
-"""Range of a tanh-squashed Gaussian's standard deviation before the tanh."""
 
 
 class Params(NamedTuple):
@@ -174,74 +169,3 @@ class Network:
     def _init_head(self, key: Key, width: int, out: int) -> dict[str, Array]:
         init = init_direction if self.unit_head else nn.initializers.lecun_normal()
         return {self._head_weights: init(key, (width, out)), "bias": jnp.zeros(out)}
-
-
-def tanh_normal(outputs: Array, key: Key | None, mask: Array | None = None) -> tuple[Array, Array]:
-    """Sample a tanh-squashed Gaussian (Haarnoja et al. 2018, appendix C).
-
-    Args:
-        outputs: (..., 2A) means and unbounded log standard deviations.
-        key: for sampling; None takes the mean.
-        mask: (A,) 1 for actions that exist; the others are set to 0 and do not count in the log-probability.
-
-    Returns:
-        actions (..., A) in (-1, 1) and their log-probabilities (...,); 0 for the mean action.
-    """
-    if key is None:
-        mean, _ = jnp.split(outputs, 2, axis=-1)
-        return _masked(jnp.tanh(mean), mask), jnp.zeros(mean.shape[:-1])
-    raw, log_prob = sample_raw(outputs, key, mask)
-    return _masked(jnp.tanh(raw), mask), log_prob
-
-
-def sample_raw(outputs: Array, key: Key, mask: Array | None = None) -> tuple[Array, Array]:
-    """Sample as ``tanh_normal`` does, but return actions (..., A) before the tanh, with the same log-probabilities."""
-    mean, log_std = _moments(outputs)
-    noise = jax.random.normal(key, mean.shape)
-    raw = mean + jnp.exp(log_std) * noise
-    return raw, _log_density(noise, log_std, raw, mask)
-
-
-def log_density(outputs: Array, raw: Array, mask: Array | None = None) -> Array:
-    """Return the log-probability (...,) of actions tanh(raw) under a tanh-squashed Gaussian of ``outputs`` (..., 2A).
-
-    It takes actions before the tanh, as rounding may bring those after it to 1.
-    """
-    mean, log_std = _moments(outputs)
-    return _log_density((raw - mean) * jnp.exp(-log_std), log_std, raw, mask)
-
-
-def divergence(outputs: Array, others: Array, mask: Array | None = None) -> Array:
-    """Compute the Kullback-Leibler divergence KL(p | q) (...,) of two tanh-squashed Gaussians of outputs (..., 2A).
-
-    It equals that of the Gaussians before the tanh, as the same invertible map of both does not change it:
-        sum_a (s^2 / s'^2 - 1) / 2 - log(s / s') + ((m - m') / s')^2 / 2
-    A mean of log p - log q over sampled actions estimates it too, but is noisy, and lost to rounding if p is near q.
-    """
-    (mean, log_std), (other_mean, other_log_std) = _moments(outputs), _moments(others)
-    wider = 2 * (log_std - other_log_std)
-    apart = jnp.square((mean - other_mean) * jnp.exp(-other_log_std))
-    return jnp.sum(_masked(jnp.expm1(wider) - wider + apart, mask), axis=-1) / 2
-
-
-def _moments(outputs: Array) -> tuple[Array, Array]:
-    """Split outputs into means (..., A) and bounded log standard deviations (..., A)."""
-    mean, log_std = jnp.split(outputs, 2, axis=-1)
-    low, high = _LOG_STD_RANGE
-    return mean, low + 0.5 * (high - low) * (jnp.tanh(log_std) + 1)
-
-
-def outputs_for(std: float | Array) -> Array:
-    """Return the output () for which a tanh-squashed Gaussian has the standard deviation ``std`` before its tanh."""
-    low, high = _LOG_STD_RANGE
-    return jnp.arctanh(2 * (jnp.log(std) - low) / (high - low) - 1)
-
-
-def _log_density(noise: Array, log_std: Array, raw: Array, mask: Array | None) -> Array:
-    log_normal = -0.5 * jnp.square(noise) - log_std - 0.5 * jnp.log(2 * jnp.pi)
-    log_slope = 2 * (jnp.log(2.0) - raw - jax.nn.softplus(-2 * raw))
-    return jnp.sum(_masked(log_normal - log_slope, mask), axis=-1)
-
-
-def _masked(x: Array, mask: Array | None) -> Array:
-    return x if mask is None else x * mask

@@ -133,12 +133,11 @@ def step_envs(
 
     Args:
         keys: (S, T, E) for sampling actions; None takes the mean ones.
-        explore: a function from the agent's actions (S, T, E, A) to the actions that the worlds take.
+        explore: a function from the agent's actions (S, T, E, ...) to the actions that the worlds take.
     """
     each = tasks_of_worlds(tasks, worlds)
     acted = act(agent, learners, tasks, worlds, keys)
-    action = explore(acted.action)
-    action = action if each.action_mask is None else action * each.action_mask
+    action = env.spec.action.masked(explore(acted.action), each.action_mask)
     step = env.step_worlds(each, worlds.state, action)
     lost = ~bounded_worlds(step.obs)
     obs = where_worlds(lost, worlds.obs, frames.push(worlds.obs, step.obs))

@@ -4,6 +4,7 @@ Axes, used in every docstring: ``S`` seeds, ``T`` tasks, ``E`` environments per 
 ``O`` observation, ``A`` action, ``C`` context, ``K`` experts, ``N`` critics, ``H`` steps.
 """
 
+import dataclasses
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -16,6 +17,72 @@ from mtjax.names import InputError as InputError
 Array = jax.Array
 Key = jax.Array
 Metrics = dict[str, Array]
+
+
+@dataclasses.dataclass(frozen=True)
+class Continuous:
+    """Actions are vectors (A,) in [-1, 1]."""
+
+    size: int  # A
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The shape of an action."""
+        return (self.size,)
+
+    @property
+    def dtype(self) -> Any:
+        """The type of an action's numbers."""
+        return jnp.float32
+
+    def blank(self) -> Array:
+        """Return an action that is all zero."""
+        return jnp.zeros(self.shape, self.dtype)
+
+    def random(self, key: Key, shape: tuple[int, ...] = ()) -> Array:
+        """Draw actions (*shape, A), each entry uniform in [-1, 1)."""
+        return jax.random.uniform(key, (*shape, self.size), minval=-1.0)
+
+    def encode(self, action: Array) -> Array:
+        """Return actions as the vectors (..., A) that networks take: themselves."""
+        return action
+
+    def masked(self, action: Array, mask: Array | None) -> Array:
+        """Set the entries of actions (..., A) to 0 that a task does not have."""
+        return action if mask is None else action * mask
+
+
+@dataclasses.dataclass(frozen=True)
+class Discrete:
+    """Actions are whole numbers () int32 from 0 to A - 1."""
+
+    size: int  # A
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The shape of an action."""
+        return ()
+
+    @property
+    def dtype(self) -> Any:
+        """The type of an action's number."""
+        return jnp.int32
+
+    def blank(self) -> Array:
+        """Return the action 0."""
+        return jnp.zeros(self.shape, self.dtype)
+
+    def random(self, key: Key, shape: tuple[int, ...] = ()) -> Array:
+        """Draw actions (*shape,), all as likely."""
+        return jax.random.randint(key, shape, 0, self.size)
+
+    def encode(self, action: Array) -> Array:
+        """Return actions as the vectors (..., A) that networks take: 1 at the action, else 0."""
+        return jax.nn.one_hot(action, self.size)
+
+    def masked(self, action: Array, mask: Array | None) -> Array:
+        """Return actions as they are: policies draw none that a task does not have."""
+        return action
 
 
 class Task(NamedTuple):
@@ -69,7 +136,7 @@ class Transition(NamedTuple):
     """
 
     obs: Any  # (O,)
-    action: Array  # (A,)
+    action: Array  # (A,), or () int32 if actions are discrete
     reward: Array  # ()
     discount: Array  # () 0 if nothing can be earned after this step, else 1; a time limit alone leaves it at 1
     next_obs: Any  # (O,) what follows in the trial: the next episode's first, or from before any reset if none follows
@@ -95,7 +162,7 @@ class Sometimes(NamedTuple):
 class Acted(NamedTuple):
     """Holds an agent's action in one world."""
 
-    action: Array  # (A,) in [-1, 1]
+    action: Array  # (A,) in [-1, 1], or () int32 if actions are discrete
     extras: Any = None  # data that learning needs, stored with the transition; None for none
 
 
@@ -103,7 +170,7 @@ class Spec(NamedTuple):
     """Holds the shapes from which an agent builds its networks."""
 
     obs: Any  # a tree of jax.ShapeDtypeStruct; for most families one vector (O,)
-    action_size: int
+    action: Continuous | Discrete
     context_size: int
     mixed: bool = False  # whether entries of observations differ in meaning between tasks
     frames: int = 1  # how many of the last images an agent should see at once; observations hold the newest
@@ -111,8 +178,13 @@ class Spec(NamedTuple):
 
     @staticmethod
     def vector(obs_size: int, action_size: int, context_size: int) -> "Spec":
-        """Return the spec of a family whose observations are vectors (O,)."""
-        return Spec(jax.ShapeDtypeStruct((obs_size,), jnp.float32), action_size, context_size)
+        """Return the spec of a family whose observations are vectors (O,) and whose actions are continuous."""
+        return Spec(jax.ShapeDtypeStruct((obs_size,), jnp.float32), Continuous(action_size), context_size)
+
+    @property
+    def action_size(self) -> int:
+        """The size A of actions as the vectors that networks take."""
+        return self.action.size
 
     @property
     def obs_size(self) -> int:
@@ -173,7 +245,7 @@ class Experience(Protocol):
     def rollout_bytes(self, spec: Spec, num_envs: int) -> int: ...  # of a task's steps that are learned from, not kept
     def describe(self, spec: Spec, num_envs: int) -> str: ...
     def init(self, item: Transition, spec: Spec, num_tasks: int, num_envs: int, keys: Key) -> Any: ...  # keys (S,)
-    def explore(self, data: Any, action: Array, step: Array) -> Array: ...  # actions (S, T, E, A) to take at a step ()
+    def explore(self, data: Any, action: Array, step: Array) -> Array: ...  # actions (S, T, E, ...) to take at a step
     def add(self, data: Any, steps: Transition) -> Any: ...  # leaves (S, T, H, E, ...)
     def batches(self, env: Env, agent: Any, tasks: Task, data: Any, key: Key) -> Any: ...  # leaves (U, ...)
     def window(self, data: Any, batch: Any) -> Transition: ...  # windows (T, B, L, ...) of one of the batches

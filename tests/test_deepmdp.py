@@ -295,7 +295,7 @@ def test_what_is_detached_stays():
     model = lambda x: agent.critic_loss(nets, batch._replace(model_targets=model_targets._replace(**x)), value)[0]
     slopes = jit(jax.grad(model))({"latent": model_targets.latent, "other_theta": model_targets.other_theta})
     assert not any(np.any(x) for x in jax.tree.leaves(slopes))
-    acted = lambda nets, batch: (jnp.sum(agent.policy(nets, batch.features, batch.obs) ** 2), None)
+    acted = lambda nets, batch: (jnp.sum(agent.policy_outputs(nets, batch.features, batch.obs) ** 2), None)
     loss, params, data = agent.fits["actor"].problem(acted, nets, (batch,))
     slopes, _ = jit(jax.grad(loss, has_aux=True))(params, data)
     assert set(slopes.shared) == set(slopes.own) == {"actor"}

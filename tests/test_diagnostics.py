@@ -20,7 +20,7 @@ import mtjax.evaluate
 from mtjax import loop
 from mtjax.agents.parts.encoders import ENCODERS
 from mtjax.evaluation import Scores
-from mtjax.networks import Params, tanh_normal
+from mtjax.networks import Params
 from mtjax.report import diagnostics, scoring
 from mtjax.report import figures as plot
 from mtjax.report.diagnostics import Activity, activity, compare_gradients, dormant_share, effective_ranks, utilisation
@@ -74,7 +74,7 @@ def gradients_by_hand(agent, state, batch):
         return jnp.mean(jnp.sum((estimates - one.reward) ** 2, axis=0))
 
     def actor_loss(actor, nets, one, features, key):
-        action, log_prob = tanh_normal(agent.actor.apply(actor, features, one.obs), key)
+        action, _, log_prob = agent.policy.draw(agent.actor.apply(actor, features, one.obs), None, key)
         estimates = agent.values(nets, features, one.obs, action)
         return jnp.mean(jnp.exp(nets["temperature"].own["log"]) * log_prob - jnp.min(estimates, axis=0))
 

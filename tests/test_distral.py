@@ -15,13 +15,15 @@ from probes import act as act_once
 from mtjax.agents import agent
 from mtjax.agents.distral import Distral
 from mtjax.agents.parts.gradients.descent import descend
+from mtjax.agents.parts.policies import Gaussian
 from mtjax.agents.sac import SAC, Batch
 from mtjax.agents.state import axes_of
-from mtjax.networks import Params, divergence, log_density, sample_raw, tanh_normal
+from mtjax.networks import Params
 from mtjax.types import InputError, Spec
 
 SPEC, BATCH = Spec.vector(3, 2, 1), 4
 TASKS = tasks_of("one-step", (1.0, -0.5, 0.3))
+GAUSSIAN = Gaussian()
 KEY, FEATURES = jax.random.key(5), jnp.zeros(0)
 
 
@@ -68,25 +70,23 @@ def test_density_of_a_given_action():
     """Of any action under any policy."""
     random = np.random.default_rng(0)
     outputs, raw = jnp.float32(random.normal(size=(50, 6))), jnp.float32(2 * random.normal(size=(50, 3)))
-    np.testing.assert_allclose(log_density(outputs, raw), plain_log_density(outputs, raw), rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(GAUSSIAN.log_prob(outputs, raw), plain_log_density(outputs, raw), rtol=1e-4, atol=1e-4)
 
 
 def test_density_of_a_policys_own_actions():
-    """It is what sampling says of them; and ``tanh_normal`` says the same of their squashed form."""
+    """It is what drawing says of them; and actions are their squashed form."""
     outputs = jnp.float32(np.random.default_rng(1).normal(size=(50, 6)))
-    raw, log_prob = sample_raw(outputs, KEY)
-    np.testing.assert_allclose(log_density(outputs, raw), log_prob, rtol=1e-4, atol=1e-4)
-    action, again = tanh_normal(outputs, KEY)
+    action, raw, log_prob = GAUSSIAN.draw(outputs, None, KEY)
+    np.testing.assert_allclose(GAUSSIAN.log_prob(outputs, raw), log_prob, rtol=1e-4, atol=1e-4)
     np.testing.assert_array_equal(action, jnp.tanh(raw))
-    np.testing.assert_array_equal(again, log_prob)
 
 
 def test_density_and_its_slopes_are_finite_where_tanh_is_one():
     """In float32 tanh(15) is 1, of which the inverse is infinite."""
     raw = jnp.float32([[15.0], [-40.0]])
     outputs = jnp.float32([[14.0, 0.3], [-38.0, -1.0]])
-    np.testing.assert_allclose(log_density(outputs, raw), plain_log_density(outputs, raw), rtol=1e-4)
-    slopes = jax.grad(lambda *x: jnp.sum(log_density(*x)), argnums=(0, 1))(outputs, raw)
+    np.testing.assert_allclose(GAUSSIAN.log_prob(outputs, raw), plain_log_density(outputs, raw), rtol=1e-4)
+    slopes = jax.grad(lambda *x: jnp.sum(GAUSSIAN.log_prob(*x)), argnums=(0, 1))(outputs, raw)
     assert all(np.all(np.isfinite(x)) and np.all(x != 0) for x in slopes)
 
 
@@ -109,18 +109,22 @@ def test_divergence_of_two_policies(middle, apart):
     random = np.random.default_rng(2)
     outputs = jnp.float32(random.normal(size=(50, 6)) + middle * np.repeat([1, 0], 3))
     others = jnp.float32(outputs + apart * random.normal(size=(50, 6)))
-    found = divergence(outputs, others)
+    found = GAUSSIAN.divergence(outputs, others)
     np.testing.assert_allclose(found, plain_divergence(outputs, others), rtol=1e-3)
-    np.testing.assert_array_equal(divergence(outputs, outputs), 0)
+    np.testing.assert_array_equal(GAUSSIAN.divergence(outputs, outputs), 0)
 
 
 def test_divergence_is_the_mean_of_log_densities():
     """Over many actions; of actions that a task does not have, nothing."""
     outputs, others = jnp.float32(np.random.default_rng(3).normal(size=(2, 6)))
-    raw, log_prob = sample_raw(jnp.tile(outputs, (100_000, 1)), KEY)
-    np.testing.assert_allclose(divergence(outputs, others), np.mean(log_prob - log_density(others, raw)), rtol=0.02)
+    _, raw, log_prob = GAUSSIAN.draw(jnp.tile(outputs, (100_000, 1)), None, KEY)
+    np.testing.assert_allclose(
+        GAUSSIAN.divergence(outputs, others), np.mean(log_prob - GAUSSIAN.log_prob(others, raw)), rtol=0.02
+    )
     mask, first = jnp.float32([1, 0, 0]), np.array([0, 3])
-    np.testing.assert_allclose(divergence(outputs, others, mask), divergence(outputs[first], others[first]), rtol=1e-6)
+    np.testing.assert_allclose(
+        GAUSSIAN.divergence(outputs, others, mask), GAUSSIAN.divergence(outputs[first], others[first]), rtol=1e-6
+    )
 
 
 # Losses of one task.
@@ -130,8 +134,8 @@ ALPHA, TEMPERATURE = 0.3, 0.2
 
 def charged(made, nets, obs):
     """Actions before the tanh, and log pi_i - alpha log pi_0 of them in NumPy."""
-    own = made.policy(nets, FEATURES, obs)
-    raw, _ = sample_raw(own, KEY)
+    own = made.policy_outputs(nets, FEATURES, obs)
+    raw = GAUSSIAN.draw(own, None, KEY).raw
     common = made.actor.apply_distilled(nets["actor"], FEATURES, obs)
     densities = plain_log_density(own, raw), plain_log_density(common, raw)
     return raw, densities[0] - made.distral_alpha * densities[1], densities
@@ -168,7 +172,7 @@ def test_actor_loss(state, batch):
     np.testing.assert_allclose(metrics["actor_loss"], policy_loss, rtol=1e-4)
     np.testing.assert_allclose(metrics["entropy"], -np.mean(own), rtol=1e-4)
     distilled = made.actor.apply_distilled(nets["actor"], FEATURES, rows.obs)
-    policies = made.policy(nets, FEATURES, rows.obs), distilled
+    policies = made.policy_outputs(nets, FEATURES, rows.obs), distilled
     np.testing.assert_allclose(metrics["kl"], np.mean(plain_divergence(*policies)), rtol=1e-4)
 
 
@@ -193,7 +197,7 @@ def test_each_loss_reaches_its_own_policy_alone(state, batch):
 
     def fit(shared):
         outputs = made.actor.apply_distilled(Params({"distilled": shared}, actor.own), FEATURES, rows.obs)
-        return -jnp.mean(log_density(outputs, raw))
+        return -jnp.mean(GAUSSIAN.log_prob(outputs, raw))
 
     for found, expected in zip(leaves(both_distilled), leaves(jax.grad(fit)(actor.shared["distilled"])), strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
@@ -205,7 +209,7 @@ def test_the_action_carries_the_distilled_policys_slope(state, batch):
     nets = of_task(state.nets, 1)
     mute = nets | {"critic": jax.tree.map(jnp.zeros_like, nets["critic"])}
     own, _ = slopes(made, mute, rows, Distral.actor_loss)
-    outputs = np.asarray(made.policy(nets, FEATURES, rows.obs), np.float64)
+    outputs = np.asarray(made.policy_outputs(nets, FEATURES, rows.obs), np.float64)
     common = made.actor.apply_distilled(nets["actor"], FEATURES, rows.obs)
     noise = np.asarray(jax.random.normal(KEY, (BATCH, 2)), np.float64)
 
@@ -315,7 +319,7 @@ def test_a_bandits_optimum(alpha):
         loss = lambda actor, keys: jax.vmap(made.actor_loss, (axes, 0, 0))(nets | {"actor": actor}, own, keys)[0]
         slope = jax.grad(lambda actor: jnp.mean(loss(actor, jax.random.split(key, 2))))(actor)
         actor, memory = descend(optimizer, slope, memory, actor)
-        policy = lambda nets: made.policy(nets, FEATURES, jnp.zeros(1))
+        policy = lambda nets: made.policy_outputs(nets, FEATURES, jnp.zeros(1))
         return (actor, memory), jax.vmap(policy, (axes,))(nets | {"actor": actor})
 
     actor = made.actor.init(KEY, 2, 2, FEATURES, jnp.zeros(1))
@@ -343,7 +347,7 @@ def test_training_tasks_play_their_own_policies_and_others_the_distilled_one(sta
     made, obs = tiny("distral"), jnp.float32([0.3, -1.0, 0.5])
     act = lambda task: np.asarray(act_once(made, state, obs, task, None))
     mean = lambda outputs: np.tanh(np.asarray(outputs)[:2])
-    own = [made.policy(of_task(state.nets, i), FEATURES, obs) for i in range(3)]
+    own = [made.policy_outputs(of_task(state.nets, i), FEATURES, obs) for i in range(3)]
     common = made.actor.apply_distilled(of_task(state.nets["actor"], 0), FEATURES, obs)
     for i in range(3):
         np.testing.assert_allclose(act(pick(TASKS, i)), mean(own[i]), rtol=1e-5)

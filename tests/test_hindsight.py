@@ -100,7 +100,7 @@ def test_a_relabelled_past_is_that_of_the_other_task(name):
     def play(task, at_goal):
         """Transitions with the three steps before each."""
         world = at_goal(env.reset(old, key).state)
-        obs, past, steps = env.observe(task, world), begin(3, env.spec.obs_size, env.spec.action_size), []
+        obs, past, steps = env.observe(task, world), begin(3, env.spec.obs_size, env.spec.action.blank()), []
         for action in actions:
             after = step(task, world, action)
             steps.append(Transition(obs, action, after.reward, jnp.float32(1), after.obs, memory=Memory(past)))

@@ -44,7 +44,7 @@ def test_an_embedding_is_seen_by_all_networks(agent):
         nets = of_task(state.nets, i)
         given = made.features(state, pick(TASKS, i))
         assert given.shape == (0,)
-        found = made.policy(nets, given, obs[i])
+        found = made.policy_outputs(nets, given, obs[i])
         np.testing.assert_array_equal(found, made.actor.apply(nets["actor"], table[i], obs[i]))
 
 

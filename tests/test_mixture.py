@@ -17,7 +17,8 @@ from probes import OFF_POLICY, one_in, slow_but
 import mtjax
 import mtjax.evaluate
 import mtjax.train
-from mtjax import agents, networks, normalize, rollout
+from mtjax import agents, normalize, rollout
+from mtjax.agents.parts.policies import Gaussian
 from mtjax.agents.sac import Batch, action_sizes
 from mtjax.agents.state import AgentState
 from mtjax.command import run_config
@@ -168,7 +169,7 @@ def test_tasks_lie_family_after_family_in_every_split():
     assert tasks["train"].row.tolist() == [0, 1, 2, 9] and tasks["interpolation"].row.tolist() == [3, 4]
     assert tasks["train"].horizon.tolist() == [4, 4, 4, 7] and BOTH.episode_length == 7
     assert tasks["train"].action_mask.tolist() == [[1, 0]] * 3 + [[1, 1]]
-    assert BOTH.spec._replace(sentences=()) == Spec(jax.ShapeDtypeStruct((3,), jnp.float32), 2, 3, True)
+    assert BOTH.spec._replace(sentences=()) == Spec.vector(3, 2, 3)._replace(mixed=True)
     assert tasks["all"].blocks.runs == ((0, 3), (1, 1), (0, 6))
 
 
@@ -368,10 +369,11 @@ def test_padded_actions_have_no_part_in_the_density():
     outputs, raw = jax.random.normal(jax.random.key(0), (2, 5, 4))
     small = jnp.concatenate([outputs[:, :1], outputs[:, 2:3]], axis=1)  # mean and deviation of the first action
     mask = jnp.array([1.0, 0.0])
+    policy = Gaussian()
     np.testing.assert_allclose(
-        networks.log_density(outputs, raw[:, :2], mask), networks.log_density(small, raw[:, :1]), rtol=1e-6
+        policy.log_prob(outputs, raw[:, :2], mask), policy.log_prob(small, raw[:, :1]), rtol=1e-6
     )
-    action, _ = networks.tanh_normal(outputs, jax.random.key(1), mask)
+    action, _, _ = policy.draw(outputs, mask, jax.random.key(1))
     assert not np.any(action[:, 1]) and np.all(action[:, 0] != 0)
 
 
@@ -419,7 +421,7 @@ def widened(params: Params, like: Params, rows: np.ndarray, outputs: np.ndarray 
 def test_losses_of_a_padded_task_are_those_of_the_task_alone(name, constants, monkeypatch):
     """A task with 2 observed numbers and 1 action, in networks of 4 and 3 that hold the same weights, and zeros."""
     noise = np.random.default_rng(1).normal(size=(6, 3)).astype(np.float32)
-    monkeypatch.setattr(networks.jax.random, "normal", lambda key, shape: jnp.asarray(noise[: shape[0], : shape[1]]))
+    monkeypatch.setattr(jax.random, "normal", lambda key, shape: jnp.asarray(noise[: shape[0], : shape[1]]))
     agent, random = tiny(name, conditioning="none"), np.random.default_rng(0)
     task, features = WIDE.tasks(), jnp.zeros(0)
     pad = lambda x, width: jnp.pad(x, ((0, 0), (0, width - x.shape[1])))
@@ -435,7 +437,7 @@ def test_losses_of_a_padded_task_are_those_of_the_task_alone(name, constants, mo
     of_actor, of_critic = np.append([0, 1], 4 + constant), np.append([0, 1, 4], 7 + constant)
     of_wide["actor"] = widened(of_small["actor"], of_wide["actor"], of_actor, np.array([0, 3]))
     of_wide["critic"] = widened(of_small["critic"], of_wide["critic"], of_critic, None)
-    monkeypatch.setattr(networks.jax.random, "normal", lambda key, shape: jnp.asarray(noise[: shape[0], : shape[1]]))
+    monkeypatch.setattr(jax.random, "normal", lambda key, shape: jnp.asarray(noise[: shape[0], : shape[1]]))
     key = jax.random.key(0)
 
     def losses(nets, batch):

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from mtjax.agents.parts.encoders.care import Experts, Mixture
-from mtjax.networks import MLP, Network, Params, Trunk, join, tanh_normal
+from mtjax.agents.parts.policies import Gaussian
+from mtjax.networks import MLP, Network, Params, Trunk, join
 
 TASKS, BATCH, OBS, ACTION, CONTEXT, OUT = 3, 4, 2, 1, 2, 5
 
@@ -155,7 +156,7 @@ def test_log_probability_is_the_slope_of_the_distribution():
     """P(A <= a) = Phi((artanh a - mean) / std), differentiated numerically, for one dimension at a time."""
     random = np.random.default_rng(0)
     outputs = np.concatenate([random.normal(size=(50, 2)), random.normal(-0.2, 0.2, size=(50, 2))], axis=1)
-    actions, found = tanh_normal(jnp.float32(outputs), jax.random.key(0))
+    actions, _, found = Gaussian().draw(jnp.float32(outputs), None, jax.random.key(0))
     actions = np.clip(np.float64(actions), -0.999, 0.999)
     kept = np.all(np.abs(actions) < 0.99, axis=1)  # artanh amplifies float32 rounding beyond
     normal = NormalDist()
@@ -171,14 +172,14 @@ def test_log_probability_is_the_slope_of_the_distribution():
 def test_samples_have_the_given_mean_and_deviation():
     """Before the squashing, over many keys."""
     outputs = jnp.float32([0.3, -0.2])
-    actions, _ = jax.vmap(lambda key: tanh_normal(outputs, key))(jax.random.split(jax.random.key(0), 20_000))
+    actions, *_ = jax.vmap(lambda key: Gaussian().draw(outputs, None, key))(jax.random.split(jax.random.key(0), 20_000))
     raw = np.arctanh(np.float64(actions[:, 0]))
     np.testing.assert_allclose((raw.mean(), raw.std()), (0.3, std_of(-0.2)), rtol=0.03)
 
 
 def test_no_key_takes_the_mean_action():
     """Whose log-probability is given as 0, for want of a density."""
-    action, log_prob = tanh_normal(jnp.float32([[0.3, -2.0, 1.0, 1.0]]), None)
+    action, _, log_prob = Gaussian().draw(jnp.float32([[0.3, -2.0, 1.0, 1.0]]), None, None)
     np.testing.assert_allclose(action, np.tanh([[0.3, -2.0]]), rtol=1e-6)
     assert log_prob.shape == (1,) and log_prob[0] == 0
 
@@ -186,8 +187,8 @@ def test_no_key_takes_the_mean_action():
 def test_extreme_outputs_stay_finite():
     """Saturated actions, and deviations at both ends, in value and in gradient."""
     outputs = jnp.float32([[mean, log_std] for mean in (-100.0, 0.0, 100.0) for log_std in (-100.0, 100.0)])
-    total = lambda outputs: jnp.sum(tanh_normal(outputs, jax.random.key(0))[1])
-    assert np.all(np.isfinite(tanh_normal(outputs, jax.random.key(0))[1]))
+    total = lambda outputs: jnp.sum(Gaussian().draw(outputs, None, jax.random.key(0)).log_prob)
+    assert np.all(np.isfinite(Gaussian().draw(outputs, None, jax.random.key(0)).log_prob))
     assert np.all(np.isfinite(jax.grad(total)(outputs)))
 
 

@@ -33,6 +33,7 @@ from mtjax.agents.parts.encoders import ENCODERS
 from mtjax.agents.parts.gradients.surgery import RULES
 from mtjax.agents.parts.knowing import CONDITIONINGS
 from mtjax.agents.parts.knowing.last_steps import Past, Seen
+from mtjax.agents.parts.policies import Gaussian
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.scaling.base import Moments
@@ -41,12 +42,13 @@ from mtjax.agents.units import Units
 from mtjax.config import with_preset
 from mtjax.envs.probes import Probe, tasks_of
 from mtjax.maps import in_parts
-from mtjax.networks import OVER_TASKS, log_density
+from mtjax.networks import OVER_TASKS
 from mtjax.types import InputError, Spec, Transition
 
 SPEC, LENGTH, ENVS = Spec.vector(3, 2, 1)._replace(sentences=("Walk.", "Run.", "Hop.")), 4, 2
 TASKS = tasks_of("one-step", (1.0, -0.5, 0.3))
 KEY = jax.random.key(2)
+GAUSSIAN = Gaussian()
 
 
 def small(**settings):
@@ -173,7 +175,7 @@ def test_actor_loss_worked_by_hand():
     state = agent.init(SPEC, TASKS, KEY)
     ratio, advantage = jnp.array([1.5, 1.5, 0.5, 0.5]), jnp.array([1.0, -1.0, 1.0, -1.0])
     batch, nets = batch_of(agent, state, advantage=advantage)
-    now = log_density(agent.policy(nets, batch.features, batch.obs), batch.raw)
+    now = GAUSSIAN.log_prob(agent.policy_outputs(nets, batch.features, batch.obs), batch.raw)
     batch = batch._replace(log_prob=now - jnp.log(ratio))
     loss, (metrics, kl) = agent.actor_loss(nets, batch, KEY)
     assert loss == pytest.approx(-(1.2 - 1.5 + 0.5 - 0.8) / 4, abs=1e-5)
@@ -223,8 +225,8 @@ def test_actions_that_a_task_lacks_count_for_nothing():
     act = lambda i, key=KEY: agent.act(state, agent.begin(state, pick(tasks, i)), obs, pick(tasks, i), key)
     acted, whole = act(0), act(1)
     assert acted.action[1] == 0 and acted.action[0] == whole.action[0] and act(2, None).action[0] == 0
-    outputs = agent.policy(of_task(state.nets, 0), jnp.zeros(0), obs)
-    density = lambda i: float(log_density(outputs[i::2], acted.extras.raw[i : i + 1]))
+    outputs = agent.policy_outputs(of_task(state.nets, 0), jnp.zeros(0), obs)
+    density = lambda i: float(GAUSSIAN.log_prob(outputs[i::2], acted.extras.raw[i : i + 1]))
     assert acted.extras.log_prob == pytest.approx(density(0), abs=1e-5)
     assert whole.extras.log_prob == pytest.approx(density(0) + density(1), abs=1e-5)
     steps = random_steps(agent)
@@ -237,8 +239,8 @@ def test_a_loss_counts_only_the_actions_that_its_task_has():
     agent = small(entropy_cost=0.5)
     state = agent.init(SPEC, TASKS, KEY)
     batch, nets = batch_of(agent, state, advantage=jnp.arange(4.0), mask=jnp.array([1.0, 0.0]))
-    outputs = agent.policy(nets, batch.features, batch.obs)
-    batch = batch._replace(log_prob=log_density(outputs[:, ::2], batch.raw[:, :1]))
+    outputs = agent.policy_outputs(nets, batch.features, batch.obs)
+    batch = batch._replace(log_prob=GAUSSIAN.log_prob(outputs[:, ::2], batch.raw[:, :1]))
     slope, (metrics, _) = jax.grad(agent.actor_loss, has_aux=True)(nets, batch, KEY)
     assert metrics["kl"] < 1e-6 and metrics["clip_fraction"] == 0
     bias = np.asarray(slope["actor"].shared["head"]["bias"])
@@ -248,9 +250,9 @@ def test_a_loss_counts_only_the_actions_that_its_task_has():
 def test_policies_begin_wide_and_alike():
     agent = small(initial_std=0.5)
     state = agent.init(SPEC, TASKS, KEY)
-    outputs = agent.policy(of_task(state.nets, 0), TASKS.context[0], jnp.float32([[1, 2, 3], [-3, 0, 1]]))
+    outputs = agent.policy_outputs(of_task(state.nets, 0), TASKS.context[0], jnp.float32([[1, 2, 3], [-3, 0, 1]]))
     np.testing.assert_allclose(outputs[:, :2], 0, atol=0.1)
-    at_mean = log_density(outputs, outputs[:, :2])
+    at_mean = GAUSSIAN.log_prob(outputs, outputs[:, :2])
     np.testing.assert_allclose(at_mean, -2 * np.log(0.5 * np.sqrt(2 * np.pi)), atol=0.2)
 
 
@@ -385,7 +387,9 @@ class Ratios(PPO):
 
     def actor_loss(self, nets, batch, key):
         loss, aux = super().actor_loss(nets, batch, key)
-        ratio = jnp.exp(log_density(self.policy(nets, batch.features, batch.obs), batch.raw) - batch.log_prob)
+        ratio = jnp.exp(
+            GAUSSIAN.log_prob(self.policy_outputs(nets, batch.features, batch.obs), batch.raw) - batch.log_prob
+        )
         return loss, aux._replace(metrics=aux.metrics | {"ratio": jnp.max(jnp.abs(ratio - 1))})
 
 
@@ -432,9 +436,9 @@ def test_the_actor_rests_once_it_is_too_far_away():
     state = agent.init(SPEC, TASKS, KEY)
     steps = random_steps(agent)
     features = TASKS.context[:, None, None] * jnp.ones((3, LENGTH, ENVS, 1))
-    outputs = agent.policy(of_task(state.nets, 0), features, steps.obs)
+    outputs = agent.policy_outputs(of_task(state.nets, 0), features, steps.obs)
     raw = steps.extras.raw * 0.5
-    steps = steps._replace(extras=Taken(raw, log_density(outputs, raw)))
+    steps = steps._replace(extras=Taken(raw, GAUSSIAN.log_prob(outputs, raw)))
     after, _ = jax.jit(partial(learn, agent))(state, steps, TASKS, KEY)
 
     batch_key, update_key = jax.random.split(KEY)

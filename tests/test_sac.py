@@ -14,6 +14,7 @@ from probes import quick, random_batch, tasks_of, with_nets
 
 from mtjax.agents.parts.encoders import Identity
 from mtjax.agents.parts.knowing import Parameters
+from mtjax.agents.parts.policies import Drawn, Gaussian
 from mtjax.agents.sac import SAC, Batch
 from mtjax.agents.state import AgentState
 from mtjax.networks import Params, join
@@ -39,16 +40,16 @@ class LinearSAC(SAC):
     encoder: Identity = dataclasses.field(default_factory=Bare)
 
 
-def linear_policy(outputs, key, mask=None):
+def linear_policy(self, outputs, mask, key):
     """The first output is the action and the second its log-probability, so that all is linear and without noise."""
     action, log_prob = jnp.split(outputs, 2, axis=-1)
-    return action, log_prob[..., 0]
+    return Drawn(action, action, log_prob[..., 0])
 
 
 @pytest.fixture
 def linear(monkeypatch):
     """Swap the policy's distribution; programs traced under it must not be cached beyond the test."""
-    monkeypatch.setattr("mtjax.agents.sac.tanh_normal", linear_policy)
+    monkeypatch.setattr(Gaussian, "draw", linear_policy)
 
 
 def head(kernel, bias):

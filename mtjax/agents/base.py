@@ -19,6 +19,7 @@ from mtjax.agents.parts.gradients import descent, surgery
 from mtjax.agents.parts.knowing import Knowing, last_steps
 from mtjax.agents.parts.knowing.last_steps import Past, Seen, without_past
 from mtjax.agents.parts.knowing.recurrent import Following, Hidden, track
+from mtjax.agents.parts.policies import Gaussian, Policy
 from mtjax.agents.parts.representations import REPRESENTATIONS, Representation
 from mtjax.agents.parts.samplers import Sampler
 from mtjax.agents.parts.scaling import SCALINGS, Scaling
@@ -125,6 +126,10 @@ class BaseAgent(abc.ABC):
     scaling: Annotated[Scaling, FLAT] = dataclasses.field(default_factory=Scaling)
     sampler: Annotated[Sampler, FLAT] = dataclasses.field(default_factory=Sampler)
     experience: Annotated[Any, FLAT] = dataclasses.field(default_factory=Replay)
+    policy: Annotated[Policy, tyro.conf.Suppress] = dataclasses.field(
+        default=Gaussian(), repr=False, metadata=parts.NO_SETTING
+    )
+    """How the actor's outputs become actions. It follows from the environment."""
 
     def __post_init__(self):
         for kind in kinds_of(self):
@@ -326,7 +331,7 @@ class BaseAgent(abc.ABC):
         """Return the initial state for the training ``tasks`` (T, ...)."""
         self.require_sight(spec)
         num_tasks, vectors = len(tasks.id), self.conditioning.table(spec, len(tasks.id))
-        inputs, action = self.init_inputs(spec, num_tasks), jnp.zeros(spec.action_size)
+        inputs, action = self.init_inputs(spec, num_tasks), spec.action.encode(spec.action.blank())
         seen, first = self.example(spec, inputs), jax.tree.map(lambda x: x[0], tasks._replace(blocks=None))
         given = self.conditioning.given(jnp.int32(0), first, num_tasks, vectors)
         knowing = self.conditioning.init(num_tasks, seen, action, self.knows_apart, jax.random.fold_in(key, 1))
@@ -391,7 +396,9 @@ class BaseAgent(abc.ABC):
         scaled = lambda obs: frames.with_state(scale, obs)
         if past is None:
             return scaled(obs)
-        return Seen(scaled(obs), past._replace(obs=scaled(past.obs)) if "obs" in past._fields else past)
+        if "obs" in past._fields:
+            past = past._replace(obs=scaled(past.obs), action=self.policy.encode(past.action))
+        return Seen(scaled(obs), past)
 
     def see_batch(self, inputs: Params, obs: Array, past: Any = None) -> Any:
         """Return observations (T, B, O) of all training tasks as networks take them."""
@@ -399,8 +406,9 @@ class BaseAgent(abc.ABC):
 
     def example(self, spec: Spec, inputs: Params) -> Any:
         """Return an input of networks that is all zero."""
-        past = last_steps.begin(self.history_length, spec.obs_size, spec.action_size) if self.history_length else None
-        past = Hidden(self.conditioning.begin()) if self.conditioning.recurs else past
+        past = Hidden(self.conditioning.begin()) if self.conditioning.recurs else None
+        if self.history_length:
+            past = last_steps.begin(self.history_length, spec.obs_size, spec.action.blank())
         zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), frames.seen(spec))
         return self.see(inputs.of_first(), zeros, past)
 
@@ -466,14 +474,15 @@ class BaseAgent(abc.ABC):
 
     def begin(self, state: AgentState, task: Task) -> Memory:
         """Return the memory with which an episode begins."""
-        moments = state.nets["inputs"].parts["moments"]
-        sizes = (moments.mean.shape[-1], self.action_size(state)) if self.history_length else ()
-        past = last_steps.begin(self.history_length, *sizes) if self.history_length else None
+        past = None
+        if self.history_length:
+            moments = state.nets["inputs"].parts["moments"]
+            past = last_steps.begin(self.history_length, moments.mean.shape[-1], self.blank_action(state))
         return Memory(past, self.conditioning.begin(), self.scaling.begin(), self.sampler.begin())
 
-    def action_size(self, state: AgentState) -> int:
-        """Return the size A of actions; the actor's head has 2 A outputs."""
-        return state.nets["actor"].parts["head"]["bias"].shape[-1] // 2
+    def blank_action(self, state: AgentState) -> Array:
+        """Return an action that is all zero; the size of the actor's head tells its size."""
+        return self.policy.blank(state.nets["actor"].parts["head"]["bias"].shape[-1])
 
     def remember(self, state: AgentState, memory: Memory, transition: Transition, task: Task) -> Memory:
         """Return the memory after a step."""
@@ -482,7 +491,8 @@ class BaseAgent(abc.ABC):
             past = last_steps.append(past, transition.obs, transition.action, transition.reward)
         if hidden is not None:
             nets = of_task(state.nets, self.known_task(state, task))
-            seen = transition._replace(obs=self.see(nets["inputs"], transition.obs))
+            action = self.policy.encode(transition.action)
+            seen = transition._replace(obs=self.see(nets["inputs"], transition.obs), action=action)
             hidden = self.conditioning.remember(nets["knowing"].parts, hidden, seen)
         reward, gamma = transition.reward, self.discounts(task)
         counts = (part.remember(memory_of, reward, gamma) for part, memory_of in self._watchers(memory))

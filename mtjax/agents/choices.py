@@ -64,7 +64,7 @@ def replace(agent: Any, given: Mapping[str, Any]) -> Any:
     Raises:
         InputError: it has no such setting, or the value is not allowed.
     """
-    rest, fields = frozen(given), {field.name for field in dataclasses.fields(agent)}
+    rest, fields = frozen(given), parts.setting_names(agent)
     chosen = {}
     for kind in kinds_of(agent):
         part = parts.choose(kind, PARTS[kind], rest.pop(kind)) if kind in rest else getattr(agent, kind)
@@ -94,11 +94,12 @@ def build(name: str, cls: type, defaults: Mapping[str, Any], given: Mapping[str,
     for kind, part in chosen.items():
         rest.pop(kind, None)
         chosen[kind] = parts.take(rest, part)
-    unknown = next((name for name in rest if name not in fields), None)
+    names = parts.setting_names(cls)
+    unknown = next((name for name in rest if name not in names), None)
     if unknown in OF_TRAIN:
         raise InputError(f"{unknown} is no setting of an agent; give it to mtjax.train({unknown}=...)")
     if unknown is not None:
-        known = [*fields, *(name for part in chosen.values() for name in parts.settings(part))]
+        known = [*names, *(name for part in chosen.values() for name in parts.settings(part))]
         raise unknown_setting(f"setting of {name}", unknown, known)
     return cls(**checked(cls, rest), **chosen)
 

@@ -11,7 +11,7 @@ from mtjax.agents.base import Heads
 from mtjax.agents.choices import PARTS
 from mtjax.agents.sac import SAC, ActorAux, Batch, Sample
 from mtjax.agents.state import Nets
-from mtjax.networks import Network, Params, divergence, log_density, sample_raw
+from mtjax.networks import Network, Params
 from mtjax.types import Array, InputError, Key
 
 
@@ -109,21 +109,21 @@ class Distral(SAC):
         return self.actor.apply_distilled(nets["actor"], *self.actor_inputs(nets, features, obs))
 
     def behaviour(self, trained: Array, nets: Nets, features: Array, obs: Array) -> Array:
-        own = self.policy(nets, features, obs)
+        own = self.policy_outputs(nets, features, obs)
         return jnp.where(trained, own, self.distilled(nets, features, obs))
 
     def sample(self, nets: Nets, batch: Batch, obs: Any, key: Key) -> Sample:
-        raw, log_prob = sample_raw(self.policy(nets, batch.features, obs), key, batch.mask)
+        outputs = self.policy_outputs(nets, batch.features, obs)
+        _, raw, log_prob = self.policy.draw(outputs, batch.mask, key)
         distilled = self.distilled(nets | {"actor": jax.lax.stop_gradient(nets["actor"])}, batch.features, obs)
-        cost = log_prob - self.distral_alpha * log_density(distilled, raw, batch.mask)
-        action = jnp.tanh(raw)
-        return Sample(action if batch.mask is None else action * batch.mask, log_prob, cost)
+        cost = log_prob - self.distral_alpha * self.policy.log_prob(distilled, raw, batch.mask)
+        return Sample(self.policy.action(raw, batch.mask), log_prob, cost)
 
     def actor_loss(self, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:
         loss, aux = super().actor_loss(nets, batch, key)
-        own = self.policy(nets, batch.features, batch.obs)
-        raw, _ = sample_raw(own, key)  # the actions of that loss
+        own = self.policy_outputs(nets, batch.features, batch.obs)
+        raw = self.policy.draw(own, batch.mask, key).raw  # the actions of that loss
         distilled = self.distilled(nets, batch.features, batch.obs)
-        fit = jnp.mean(log_density(distilled, jax.lax.stop_gradient(raw), batch.mask))
-        kl = jnp.mean(divergence(own, distilled, batch.mask))
+        fit = jnp.mean(self.policy.log_prob(distilled, jax.lax.stop_gradient(raw), batch.mask))
+        kl = jnp.mean(self.policy.divergence(own, distilled, batch.mask))
         return loss - fit, aux._replace(metrics=aux.metrics | {"kl": kl})

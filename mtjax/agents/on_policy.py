@@ -13,6 +13,7 @@ from mtjax.agents import parts
 from mtjax.agents.base import BaseAgent, Memory
 from mtjax.agents.choices import FLAT
 from mtjax.agents.fit import Fit
+from mtjax.agents.parts.policies.gaussian import STD_RANGE
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.scaling.popart import rescale_heads
@@ -20,7 +21,7 @@ from mtjax.agents.state import AgentState, Nets, axes_of
 from mtjax.agents.units import MIN_STD, Units
 from mtjax.experience import Rollouts
 from mtjax.maps import in_parts
-from mtjax.networks import STD_RANGE, Network, Params, log_density, outputs_for, sample_raw, tanh_normal
+from mtjax.networks import Network, Params
 from mtjax.parallel.collectives import mean_and_variance
 from mtjax.types import Acted, Array, InputError, Key, Metrics, Task, Transition
 
@@ -33,7 +34,7 @@ HEAD_SCALE = 0.01
 class Taken(NamedTuple):
     """Holds what is stored with an action when it is taken."""
 
-    raw: Array  # (A,) the action before the tanh
+    raw: Array  # the action as ``policy.log_prob`` takes it: before the tanh (A,), or () int32
     log_prob: Array  # () its log-probability under the policy that took it
 
 
@@ -48,7 +49,7 @@ class Batch(NamedTuple):
     """Holds the data for the losses of one task; for all tasks, leaves are (T, ...)."""
 
     obs: Any  # (B, O) as the networks take them
-    raw: Array  # (B, A) actions before the tanh
+    raw: Array  # (B, ...) actions as ``policy.log_prob`` takes them
     log_prob: Array  # (B,) their log-probabilities under the policy that took them
     advantage: Array  # (B,)
     value: Array  # (B,) before the update, in units of reward
@@ -150,9 +151,9 @@ class OnPolicy(BaseAgent):
 
     def init_networks(self, num_tasks: int, actor_inputs: tuple, critic_inputs: tuple, action: Array, key: Key) -> Nets:
         actor_key, critic_key = jax.random.split(key)
-        first = jnp.repeat(jnp.array([0.0, outputs_for(self.initial_std)]), len(action))
+        count, first = self.policy.outputs(len(action)), self.policy.first(len(action), self.initial_std)
         return {
-            "actor": scale_head(self.actor.init(actor_key, num_tasks, 2 * len(action), *actor_inputs), first),
+            "actor": scale_head(self.actor.init(actor_key, num_tasks, count, *actor_inputs), first),
             "critic": scale_head(self.critic.init(critic_key, num_tasks, 1, *critic_inputs), jnp.zeros(1)),
             "units": Units.begin(num_tasks).params(),
         }
@@ -168,32 +169,28 @@ class OnPolicy(BaseAgent):
     # Acting.
 
     def act(self, state: AgentState, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
-        """Choose an action (A,) for one observation (O,) of one task; without a key, the mean action."""
-        outputs = self.policy(*self.acting_inputs(state, memory, obs, task))
-        if key is None:
-            return Acted(tanh_normal(outputs, None, task.action_mask)[0])
-        raw, log_prob = sample_raw(outputs, key, task.action_mask)
-        action = jnp.tanh(raw)
-        action = action if task.action_mask is None else action * task.action_mask
-        return Acted(action, Taken(raw, log_prob))
+        """Choose an action for one observation (O,) of one task; without a key, the policy's mode."""
+        outputs = self.policy_outputs(*self.acting_inputs(state, memory, obs, task))
+        action, raw, log_prob = self.policy.draw(outputs, task.action_mask, key)
+        return Acted(action, None if key is None else Taken(raw, log_prob))
 
     # Losses of one task.
 
-    def policy(self, nets: Nets, features: Array, obs: Any) -> Array:
-        """Return the policy's outputs (..., 2A)."""
+    def policy_outputs(self, nets: Nets, features: Array, obs: Any) -> Array:
+        """Return the outputs (..., P) that ``policy`` reads."""
         return self.actor.apply(nets["actor"], *self.actor_inputs(nets, features, obs))
 
     def log_ratio(self, nets: Nets, features: Array, obs: Any, taken: Any, mask: Array | None) -> Array:
         """Return how much likelier (B,) the actions that were ``taken`` are now, in logarithms."""
-        log_prob = log_density(self.policy(nets, features, obs), taken.raw, mask)
+        log_prob = self.policy.log_prob(self.policy_outputs(nets, features, obs), taken.raw, mask)
         return jnp.clip(log_prob - taken.log_prob, -LOG_RATIO_LIMIT, LOG_RATIO_LIMIT)
 
     def actor_loss(self, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:
-        outputs = self.policy(nets, batch.features, batch.obs)
-        log_ratio = log_density(outputs, batch.raw, batch.mask) - batch.log_prob
+        outputs = self.policy_outputs(nets, batch.features, batch.obs)
+        log_ratio = self.policy.log_prob(outputs, batch.raw, batch.mask) - batch.log_prob
         log_ratio = jnp.clip(log_ratio, -LOG_RATIO_LIMIT, LOG_RATIO_LIMIT)
         gain, metrics = self.gain(log_ratio, batch)
-        entropy = -jnp.mean(sample_raw(outputs, key, batch.mask)[1])
+        entropy = jnp.mean(self.policy.entropy(outputs, batch.mask, key))
         loss = -jnp.mean(gain) - self.entropy_cost * entropy
         kl = jnp.mean(jnp.exp(log_ratio) - 1 - log_ratio)
         return loss, ActorAux({"actor_loss": loss, "entropy": entropy, "kl": kl, **metrics}, kl)
@@ -253,7 +250,11 @@ class OnPolicy(BaseAgent):
         """Return what a batch holds for a representation that learns."""
         if not self.representation.learns:
             return {}
-        return {"action": flat.action, "reward": self.rewards(state, flat, tasks), "next_obs": next_obs}
+        return {
+            "action": self.policy.encode(flat.action),
+            "reward": self.rewards(state, flat, tasks),
+            "next_obs": next_obs,
+        }
 
     def rewards(self, state: AgentState, flat: Transition, tasks: Task) -> Array:
         """Return the rewards (T, N) of steps in the task's units."""

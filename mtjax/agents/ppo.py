@@ -20,7 +20,7 @@ from mtjax.types import Array, Key, Metrics, Task, Transition
 class Assessed(NamedTuple):
     """Holds what is stored with an action once the rollout is over."""
 
-    raw: Array  # (A,) the action before the tanh
+    raw: Array  # the action as ``policy.log_prob`` takes it: before the tanh (A,), or () int32
     log_prob: Array  # () its log-probability under the policy that took it
     advantage: Array  # (), normalised
     value: Array  # () of the state before the action, in units of reward
@@ -48,7 +48,8 @@ class PPO(OnPolicy):
     al. 2019):
         kernel' = kernel s / s',  bias' = (s bias + m - m') / s'
 
-    The policy is a tanh-squashed Gaussian; its entropy is estimated from one sample. With a ``kl_limit``, the actor is
+    Of continuous actions the policy is a tanh-squashed Gaussian, whose entropy is estimated from one sample; of
+    discrete ones a softmax over those that a task has, whose entropy is exact. With a ``kl_limit``, the actor is
     not updated for the rest of an update once mean(ratio - 1 - log ratio), an estimate of KL(pi_old | pi), exceeds it
     on a minibatch. Then a schedule of the actor's learning rate waits too.
 

@@ -19,7 +19,7 @@ from mtjax.agents.parts.values import VALUES, Value
 from mtjax.agents.state import AgentState, Nets, axes_of
 from mtjax.experience import Replay, pictures
 from mtjax.maps import when
-from mtjax.networks import Network, Params, tanh_normal
+from mtjax.networks import Network, Params
 from mtjax.types import Acted, Array, InputError, Key, Metrics, Sometimes, Task, Transition
 
 
@@ -146,7 +146,7 @@ class SAC(BaseAgent):
         temperature = jnp.full(1 if self.shared_temperature else num_tasks, log(self.initial_temperature))
         temperature = {"log": temperature.astype(jnp.float32)}
         return {
-            "actor": self.actor.init(actor_key, num_tasks, 2 * len(action), *actor_inputs),
+            "actor": self.actor.init(actor_key, num_tasks, self.policy.outputs(len(action)), *actor_inputs),
             "critic": jax.vmap(init_critic, out_axes=Params(shared=0, own=1))(keys),  # type: ignore
             "temperature": Params(temperature, {}) if self.shared_temperature else Params({}, temperature),
         }
@@ -166,21 +166,21 @@ class SAC(BaseAgent):
     def act(self, state: AgentState, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
         """Choose an action (A,) for one observation (O,) of one task; without a key, the mean action."""
         outputs = self.behaviour(task.id < state.num_tasks, *self.acting_inputs(state, memory, obs, task))
-        return Acted(tanh_normal(outputs, key, task.action_mask)[0])
+        return Acted(self.policy.draw(outputs, task.action_mask, key).action)
 
     def behaviour(self, trained: Array, nets: Nets, features: Array, obs: Any) -> Array:
         """Return the outputs (2A,) of the policy that acts; ``trained`` () says whether the task was trained on."""
-        return self.policy(nets, features, obs)
+        return self.policy_outputs(nets, features, obs)
 
     # Losses of one task.
 
-    def policy(self, nets: Nets, features: Array, obs: Any) -> Array:
+    def policy_outputs(self, nets: Nets, features: Array, obs: Any) -> Array:
         """Return the policy's outputs (..., 2A)."""
         return self.actor.apply(nets["actor"], *self.actor_inputs(nets, features, obs))
 
     def sample(self, nets: Nets, batch: Batch, obs: Any, key: Key) -> Sample:
         """Sample the policy's actions at observations (B, O) of a batch."""
-        action, log_prob = tanh_normal(self.policy(nets, batch.features, obs), key, batch.mask)
+        action, _, log_prob = self.policy.draw(self.policy_outputs(nets, batch.features, obs), batch.mask, key)
         return Sample(action, log_prob, log_prob)
 
     def q(self, nets: Nets, features: Array, obs: Any, action: Array) -> Array:

@@ -13,7 +13,6 @@ from mtjax.agents.parts.scaling import ReturnNormalization, Scaling
 from mtjax.agents.parts.values import C51, Value
 from mtjax.agents.sac import SAC, ActorAux, Batch, CriticAux, Sample
 from mtjax.agents.state import Nets
-from mtjax.networks import tanh_normal
 from mtjax.types import Array, Key
 
 
@@ -89,6 +88,6 @@ class XQC(SAC):
 
     def actor_loss(self, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:
         outputs, found = self.actor.fit(nets["actor"], *self.actor_inputs(nets, batch.features, batch.obs))
-        action, log_prob = tanh_normal(outputs, key, batch.mask)
+        action, _, log_prob = self.policy.draw(outputs, batch.mask, key)
         loss, aux = self.policy_loss(Sample(action, log_prob, log_prob), nets, batch)
         return loss, aux._replace(statistics=found)

@@ -243,8 +243,8 @@ def _check_brax(family: Brax, task: Task, key: Any) -> None:
 def _check_steps(family: Family, task: Task, key: Any) -> None:
     """Check ``reset`` and ``step`` of a family that steps itself."""
     begun = _abstract(family, "reset", task, key)
-    size = _call(family, "action_size", lambda: int(family.spec.action_size))
-    action = jax.ShapeDtypeStruct((size,), jnp.float32)
+    _call(family, "action_size", lambda: int(family.action_size))
+    action = jax.ShapeDtypeStruct(family.action.shape, family.action.dtype)
     for method, step in (("reset", begun), ("step", None)):
         step = _abstract(family, "step", task, begun.state, action) if step is None else step
         if not isinstance(step, Step):

@@ -9,7 +9,6 @@ from operator import attrgetter
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.interpreters.partial_eval import dce_jaxpr
 
@@ -115,7 +114,7 @@ def _leaves_read(family: Family) -> set[str]:
 
     def play(task: Task, key: Key) -> Any:
         begun = family.reset(task, key)
-        return begun, family.step(task, begun.state, jnp.zeros(family.spec.action_size))
+        return begun, family.step(task, begun.state, family.spec.action.blank())
 
     closed = jax.make_jaxpr(play)(task, jax.random.key(0))
     _, used = dce_jaxpr(closed.jaxpr, [True] * len(closed.out_avals))

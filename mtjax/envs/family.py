@@ -18,7 +18,7 @@ from mtjax.envs.parameters import Parameter
 from mtjax.envs.tabled import Part, Table, Tabled
 from mtjax.maps import Flat
 from mtjax.names import first_sentence
-from mtjax.types import SPLITS, Array, InputError, Key, Spec, Step, Task, Transition
+from mtjax.types import SPLITS, Array, Continuous, Discrete, InputError, Key, Spec, Step, Task, Transition
 
 _MAX_DRAWS = 1000
 Values = Mapping[str, np.ndarray]  # parameter -> (R,) its value in every row
@@ -51,6 +51,7 @@ class Family(Flat, Tabled):
 
     parameters: ClassVar[Mapping[str, Parameter]] = MappingProxyType({})
     action_size: ClassVar[int]
+    discrete: ClassVar[bool] = False  # whether an action is the number of one of action_size choices, not a vector
     episode_steps: ClassVar[int]
     relabels: ClassVar[tuple[str, ...]] = ()  # the parameters, goals all of them, that ``relabel`` can exchange
     asks: ClassVar[str] = ""  # what its tasks ask for, in a sentence; empty: the documentation's first one
@@ -299,6 +300,11 @@ class Family(Flat, Tabled):
         return self.episode_steps
 
     @property
+    def action(self) -> Continuous | Discrete:
+        """Return the kind and the size of actions."""
+        return Discrete(self.action_size) if self.discrete else Continuous(self.action_size)
+
+    @property
     def spec(self) -> Spec:
         """Return the sizes of observation, action and context."""
         return self._spec
@@ -307,7 +313,7 @@ class Family(Flat, Tabled):
     def _spec(self) -> Spec:
         task = jax.tree.map(lambda x: x[0], self.table.tasks)
         step = jax.eval_shape(self.reset, task, jax.eval_shape(jax.random.key, 0))
-        return Spec(step.obs, self.action_size, task.context.shape[0], sentences=self.sentences)
+        return Spec(step.obs, self.action, task.context.shape[0], sentences=self.sentences)
 
 
 def draw_until(accepted: Callable[[Array], Array], draw: Callable[[Key], Array], key: Key) -> Array:

@@ -217,7 +217,7 @@ class Mixture(Tabled):
         widest: Any = jax.ShapeDtypeStruct((max(map(frames.state_size, specs)),), jnp.float32)
         return Spec(
             obs=frames.with_state(lambda _: widest, specs[0].obs),
-            action_size=max(spec.action_size for spec in specs),
+            action=max((spec.action for spec in specs), key=lambda action: action.size),
             context_size=self._context().shape[1],
             mixed=len(self.families) > 1,
             frames=specs[0].frames,

@@ -168,7 +168,7 @@ def activity(agent: SAC, state: Any, window: Transition, tasks: Task) -> dict[st
 
     def one(nets: Nets, features: Array, obs: Array, action: Array) -> dict[str, Activity]:
         judging = agent.of_critics(partial(watch, agent.critic.apply), nets, features, obs, action)
-        acting = watch(agent.policy, nets, features, obs)
+        acting = watch(agent.policy_outputs, nets, features, obs)
         return {"critic": judging, "actor": jax.tree.map(lambda x: x[None], acting)}
 
     every = jax.vmap(jax.vmap(one, (None, 0, 0, 0)), (axes_of(state.nets), 0, 0, 0))

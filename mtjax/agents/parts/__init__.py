@@ -18,6 +18,9 @@ from mtjax.types import Array, InputError, Transition
 
 P = TypeVar("P")
 
+NO_SETTING = {"setting": False}
+"""Marks a field that follows from the environment: it is no flag, and in no record of settings."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Watcher:
@@ -62,7 +65,12 @@ def name_of(table: Mapping[str, type], part: Any) -> str:
 
 def settings(part: Any) -> dict[str, Any]:
     """Return a part's hyper-parameters."""
-    return {field.name: getattr(part, field.name) for field in dataclasses.fields(part)}
+    return {name: getattr(part, name) for name in setting_names(part)}
+
+
+def setting_names(part: Any) -> list[str]:
+    """List the names of the hyper-parameters of a part, or of a class of parts."""
+    return [field.name for field in dataclasses.fields(part) if field.metadata.get("setting", True)]
 
 
 def take(settings: dict[str, Any], part: P) -> P:

@@ -18,7 +18,7 @@ class Past(NamedTuple):
     """Holds the last H steps of an episode, the latest one last; entries from before the episode are zero."""
 
     obs: Array  # (..., H, O) before the action
-    action: Array  # (..., H, A)
+    action: Array  # (..., H, A), or (..., H) int32 if actions are discrete
     reward: Array  # (..., H)
     known: Array  # (..., H) 1 for a step that was taken, 0 from before the episode
 
@@ -30,10 +30,10 @@ class Seen(NamedTuple):
     past: Past
 
 
-def begin(steps: int, obs_size: int, action_size: int) -> Past:
-    """Return the empty past with which an episode begins."""
+def begin(steps: int, obs_size: int, action: Array) -> Past:
+    """Return the empty past with which an episode begins; its actions are like ``action``, and zero."""
     blank = lambda *shape: jnp.zeros((steps, *shape))
-    return Past(blank(obs_size), blank(action_size), blank(), blank())
+    return Past(blank(obs_size), jnp.zeros((steps, *action.shape), action.dtype), blank(), blank())
 
 
 def append(past: Past, obs: Array, action: Array, reward: Array) -> Past:

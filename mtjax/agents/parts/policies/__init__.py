@@ -1,0 +1,21 @@
+"""Policies turn a network's outputs into actions. Which one an agent has follows from the actions of its environment.
+
+To add a kind of actions, add its class to ``mtjax.types``, and a file and a line here.
+"""
+
+from mtjax.agents.parts.policies.base import Drawn, Policy
+from mtjax.agents.parts.policies.categorical import Categorical
+from mtjax.agents.parts.policies.gaussian import Gaussian
+from mtjax.types import Continuous, Discrete
+
+
+def policy_for(action: Continuous | Discrete) -> Policy:
+    """Return the policy of an environment with such actions."""
+    match action:
+        case Continuous():
+            return Gaussian()
+        case Discrete(size):
+            return Categorical(size)
+
+
+__all__ = ["Categorical", "Drawn", "Gaussian", "Policy", "policy_for"]
