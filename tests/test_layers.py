@@ -26,6 +26,7 @@ GROUND = (
     "networks",
     "normalize",
     "tasks",
+    "trials",
     "maps",
     "frames",
     "parallel",

@@ -173,6 +173,12 @@ _MTENV: dict[str, Entry] = {
     "two-goal-maze-seen": ("maze:TwoGoalMaze", {"vary": {"goal-box": "0,1"}, "split": "none", "observe_boxes": True}),
 }
 
+# Tasks that nothing shows, for trials of several episodes.
+_HIDDEN: dict[str, Entry] = {
+    "grid-navi": ("hidden:GridNavi", {}),
+    "hidden-bandit": ("hidden:HiddenBandit", {}),
+}
+
 # Mazes seen from within.
 _CORRIDORS: dict[str, Entry] = {
     "corridor-maze": ("maze:CorridorMaze", {}),
@@ -208,7 +214,7 @@ ENVS = Families(
     | _inside("mtjax.envs.mtenv", _MTENV)
     | _inside("mtjax.envs.corridors", _CORRIDORS)
     | _inside("mtjax.envs.metaworld", FAMILIES)
-    | _inside("mtjax.envs", _BRAX)
+    | _inside("mtjax.envs", _BRAX | _HIDDEN)
 )
 
 

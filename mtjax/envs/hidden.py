@@ -1,0 +1,202 @@
+"""Tasks that nothing shows, so that an agent finds out which it plays: bandits, and walks to a goal in a grid.
+
+Every trial draws its task. In trials of several episodes (``--trials=K``) an agent that remembers can explore in the
+first ones and earn more in the others. The best that can be earned so is known exactly.
+"""
+
+import abc
+import dataclasses
+from functools import cached_property
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mtjax.envs.family import Family
+from mtjax.envs.tabled import Table
+from mtjax.types import SPLITS, Array, InputError, Key, Step, Task
+
+
+@dataclasses.dataclass(frozen=True)
+class HiddenTasks(Family):
+    """A family of one training task, which stands for a pool of tasks: each trial draws one of them."""
+
+    told: bool = False
+    """Show the task in the context after all, for a bound of what can be earned by finding it out."""
+
+    @abc.abstractmethod
+    def pool(self) -> np.ndarray:
+        """Return the numbers (P, C) that make each task, from 0 to ``largest``."""
+
+    @property
+    @abc.abstractmethod
+    def largest(self) -> float:
+        """Return the largest number that a task may have."""
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Return the number of tasks of each split: one that trains, and none that is held out."""
+        return dict(zip(SPLITS, (1, 0, 0), strict=True))
+
+    @property
+    def count(self) -> int:
+        """Return the number of rows of the table."""
+        return len(self.table.tasks.id)
+
+    @cached_property
+    def table(self) -> Table:
+        """Return the training task, which has the first of the pool, and then the pool."""
+        pool = self.pool()
+        each = np.concatenate([pool[:1], pool])
+        row = np.arange(len(each), dtype=np.int32)
+        context = 2 * each / self.largest - 1 if self.told else np.zeros((len(each), 1))
+        goal = {"task": each.astype(np.float32)}
+        leaves: dict[str, Any] = {"id": row, "row": row, "context": context.astype(np.float32), "goal": goal}
+        tasks = Task(**leaves, horizon=np.full_like(row, self.episode_length), params={}, model={})  # type: ignore
+        rows = {split: np.arange(count) for split, count in self.counts.items()}
+        return Table(tasks, rows, row[None, 1:])
+
+    @property
+    def ends_early(self) -> bool:
+        """Return False: only time ends an episode."""
+        return False
+
+
+def chosen(action: Array) -> Array:
+    """Return the number () of the highest of the scores (A,); of equal ones the first."""
+    return jnp.argmax(action)
+
+
+class BanditState(NamedTuple):
+    """The state of a bandit."""
+
+    key: Key  # of the chance to come
+
+
+@dataclasses.dataclass(frozen=True)
+class HiddenBandit(HiddenTasks):
+    """Hidden bandit: find out which arm pays most often while pulling; every trial has other arms.
+
+    Observation (1,): always 0.
+    Action (num_arms,): a score for each arm in [-1, 1]; the highest is pulled, of equal ones the first.
+    Reward: 1 with the arm's probability, else 0.
+    Episode: one pull; a trial of H pulls is ``--trials=H``.
+
+    A task is the probabilities (num_arms,) of its arms, uniform in [0, 1]. Trials draw from ``num_draws`` tasks, which
+        fill the cube of all tasks evenly. The context shows nothing, or with ``told`` the probabilities p as 2 p - 1.
+
+    With K arms the best strategy for finding out earns in H pulls: 6.0218 (K=2, H=10), 6.6600 (K=5, H=10), 14.2873
+        (K=5, H=20). Pulling at random earns H / 2, and the best arm H K / (K + 1).
+    """
+
+    num_arms: int = 2
+    """Number of arms of each bandit."""
+    num_draws: int = 10_000
+    """Number of tasks. Each trial draws one of them."""
+
+    episode_steps: ClassVar[int] = 1
+
+    def __post_init__(self):
+        super().__post_init__()
+        if not 1 <= self.num_arms <= 100:
+            raise InputError(f"num-arms must be at least 1 and at most 100, not {self.num_arms}")
+
+    @property
+    def action_size(self) -> int:  # type: ignore[override]
+        """Return the number of scores, one per arm."""
+        return self.num_arms
+
+    @property
+    def largest(self) -> float:
+        return 1.0
+
+    def pool(self) -> np.ndarray:
+        return even_points(self.num_draws, self.num_arms, self.task_seed)
+
+    def reset(self, task: Task, key: Key) -> Step:
+        return Step(BanditState(key), jnp.zeros(1), jnp.float32(0), jnp.bool_(False))
+
+    def step(self, task: Task, state: BanditState, action: Array) -> Step:
+        pull_key, key = jax.random.split(state.key)
+        reward = jax.random.bernoulli(pull_key, task.goal["task"][chosen(action)]).astype(jnp.float32)
+        return Step(BanditState(key), jnp.zeros(1), reward, jnp.bool_(False))
+
+
+def even_points(count: int, size: int, seed: int) -> np.ndarray:
+    """Return points (count, size) that fill the unit cube evenly: Halton's (1960), shifted at random."""
+    primes = [p for p in range(2, 1000) if all(p % q for q in range(2, p))][:size]
+    columns = [_radical_inverse(np.arange(count), prime) for prime in primes]
+    return (np.stack(columns, axis=1) + np.random.default_rng(seed).uniform(size=size)) % 1
+
+
+def _radical_inverse(numbers: np.ndarray, base: int) -> np.ndarray:
+    """Return the digits of numbers (N,) to a base in reverse order, behind the point."""
+    total, place = np.zeros(len(numbers)), 1.0
+    while np.any(numbers):
+        place /= base
+        total += place * (numbers % base)
+        numbers = numbers // base
+    return total
+
+
+_MOVES = np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)])
+
+
+@dataclasses.dataclass(frozen=True)
+class GridNavi(HiddenTasks):
+    """GridNavi: walk through a grid to a hidden goal cell, which every trial draws (Zintgraf et al. 2020, "VariBAD").
+
+    Observation (size^2,): 1 for the cell (x, y) at place ``size x + y``, else 0.
+    Action (5,): scores in [-1, 1] for staying, x + 1, x - 1, y + 1 and y - 1; the highest is taken, of equal ones the
+        first. A move off the grid stays.
+    Reward: 1 on the goal, else -0.1, after the step.
+    Start: the cell (0, 0).
+    Episode: ``steps`` steps; nothing terminates it.
+
+    A task is its goal, all cells as likely but for the 2 x 2 ones at the start. The context shows nothing, or with
+        ``told`` the goal's x and y, scaled to [-1, 1].
+
+    The best strategy for finding out earns in the episodes of a trial: 4.0000, and then 11.0714 in each (5 x 5 cells,
+        15 steps, three episodes or more); 2.7 and 4.02 (3 x 3 cells, 6 steps). Told, it is 11.0714 and 4.02 in all.
+
+    Differs from VariBAD in: the cell is one-hot, and not its two coordinates; the action is a vector of scores.
+    """
+
+    size: int = 5
+    """Number of cells along each side."""
+    steps: int = 15
+    """Steps of an episode."""
+
+    action_size: ClassVar[int] = len(_MOVES)
+
+    def __post_init__(self):
+        super().__post_init__()
+        if not 3 <= self.size <= 50:
+            raise InputError(f"size must be at least 3, so that there are goals, and at most 50, not {self.size}")
+        if not 1 <= self.steps <= 10_000:
+            raise InputError(f"steps must be at least 1 and at most 10000, not {self.steps}")
+
+    @property
+    def episode_length(self) -> int:
+        """Return the steps after which an episode is cut off."""
+        return self.steps
+
+    @property
+    def largest(self) -> float:
+        return self.size - 1.0
+
+    def pool(self) -> np.ndarray:
+        cells = np.stack(np.meshgrid(*[np.arange(self.size)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
+        return cells[cells.max(axis=1) > 1]
+
+    def reset(self, task: Task, key: Key) -> Step:
+        return self._step(task, jnp.zeros(2, jnp.int32))
+
+    def step(self, task: Task, state: Array, action: Array) -> Step:
+        return self._step(task, jnp.clip(state + jnp.asarray(_MOVES)[chosen(action)], 0, self.size - 1))
+
+    def _step(self, task: Task, cell: Array) -> Step:
+        reward = jnp.where(jnp.all(cell == task.goal["task"]), 1.0, -0.1)
+        obs = jax.nn.one_hot(self.size * cell[0] + cell[1], self.size**2)
+        return Step(cell, obs, reward, jnp.bool_(False))
