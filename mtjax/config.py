@@ -184,7 +184,7 @@ class RunConfig:
             self._check_named()
         _ = self.mesh
         self.learner.experience.check(self.family, self.played.num_envs, self.played.chunk_steps)
-        require_trials(self.training, self.learner)
+        require_trials(self.training, self.family, self.learner)
         trials.require_whole(self.plan.eval_episodes, self.training.trials, "eval-episodes")
         for learner in agents_at(self.learner, self.points):
             require_value_range(learner)

@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from mtjax import frames
 from mtjax.checks import check_fields
-from mtjax.maps import over_seeds, when
+from mtjax.maps import Flat, over_seeds, when
 from mtjax.parallel import collectives
 from mtjax.rollout import (
     EnvStep,
@@ -27,7 +28,7 @@ from mtjax.rollout import (
     step_envs,
     world_keys,
 )
-from mtjax.trials import Trials, of_episodes
+from mtjax.trials import ResetFree, Trials, of_episodes
 from mtjax.types import Agent, Array, Env, InputError, Key, Metrics, Sometimes, Task, Transition
 
 PHASES = 10
@@ -51,18 +52,24 @@ class Settings:
     trials: int = 1
     """Episodes of a trial: for so many of them the task and the agent's memory stay, and the agent maximises their sum
     of rewards. 1 makes every episode a trial of its own."""
+    reset_free: bool = False
+    """Let training worlds go on where an episode's time is up, in the state in which they are, with another task if
+    episodes draw theirs. Only for families that never terminate, and in which all draws are goals. Evaluations begin
+    every episode anew."""
 
     def __post_init__(self):
         check_fields(self)
         for name in ("num_envs", "chunk_steps", "trials"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name.replace('_', '-')} must be at least 1, not {getattr(self, name)}")
+        if self.reset_free and self.trials > 1:
+            raise InputError(f"--reset-free has no episodes to repeat; use --trials=1, not {self.trials}")
         _ = self.trial
 
     @property
     def trial(self) -> Trials:
         """Return what a trial is."""
-        return of_episodes(self.trials)
+        return ResetFree() if self.reset_free else of_episodes(self.trials)
 
 
 class TrainState(NamedTuple):
@@ -87,7 +94,7 @@ def init(
         knobs: values (S,), by name, of the agent's numbers that vary between seeds, for a ``SweptAgent`` agent.
     """
     agent.experience.check(env, settings.num_envs)
-    require_trials(settings, agent)
+    require_trials(settings, env, agent)
     num_tasks = len(tasks.id)
     shape = (len(seeds), num_tasks, settings.num_envs // collectives.count())
     key, agent_key, reset_key, data_key = split_keys(jax.vmap(jax.random.key)(seeds), 4)
@@ -109,17 +116,42 @@ def init(
     )
 
 
-def require_trials(settings: Settings, agent: Agent) -> None:
-    """Check that an agent can learn from trials.
+def require_trials(settings: Settings, env: Any, agent: Agent) -> None:
+    """Check that a family has such trials, and that an agent can learn from them.
 
     Raises:
-        InputError: it relabels steps, and in trials of several episodes another episode may follow a step.
+        InputError: the agent relabels steps, and another episode may follow them; or worlds cannot go on.
     """
     if settings.trials > 1 and getattr(agent.experience, "hindsight", 0):
         raise InputError(
             f"hindsight relabels steps by what follows them, which in a trial of {settings.trials} episodes may be "
             "another episode; use --hindsight=0 or --trials=1"
         )
+    reason = _cannot_go_on(env) if settings.reset_free else ""
+    if reason:
+        raise InputError(f"--reset-free lets worlds go on, and {reason}; leave it out")
+
+
+def _cannot_go_on(env: Any) -> str:
+    """Return why worlds cannot go on where an episode's time is up, with the next one's task; empty if they can."""
+    if not isinstance(env, Flat):
+        return "it is for single families, not for mixtures"
+    if env.ends_early:
+        return "in this family episodes terminate"
+    if getattr(env, "fresh_goals", False):
+        return "this family draws its goals with its states"
+    tasks = env.tasks("train")
+    if tasks.draws is None:
+        return ""
+    goals = getattr(env, "relabels", ())
+    physical = [name for name in getattr(env, "varied", ()) if name not in goals]
+    if not goals or physical:
+        return f"states depend on {', '.join(physical) or 'what episodes draw'}: only goals may be drawn"
+    one = jax.tree.map(lambda x: x[0], tasks._replace(draws=None))
+    state = jax.eval_shape(env.reset, one, jax.random.key(0)).state
+    if getattr(state, "extra", None) is not None or getattr(state, "mocap", None) is not None:
+        return "the states of this family hold its goals"
+    return "pictures show the goal of before" if frames.shown(env.spec.obs) else ""
 
 
 def _first_ages(tasks: Task, shape: tuple[int, ...]) -> Array:

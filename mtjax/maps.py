@@ -108,6 +108,10 @@ class Flat:
         """Step every world with its action (S, T, E, A)."""
         return over_worlds(partial(_step, self))(tasks, states, actions)
 
+    def observe_worlds(self, tasks: Task, states: Any) -> Any:
+        """Return what agents observe of every world, for families with ``observe(task, state)`` of one world."""
+        return over_worlds(self.observe)(tasks, states)  # type: ignore
+
     def where_worlds(self, mask: Array, new: Any, old: Any) -> Any:
         """Select states of ``new`` where ``mask`` (S, T, E), else of ``old``."""
         return where_worlds(mask, new, old)

@@ -191,7 +191,7 @@ def reset_ended(
         keys: a function that returns keys (S, T, E); only the branch calls it.
     """
     few = isinstance(env, Flat) and env.ends_early and env.episode_length > 1 and tasks.blocks is None
-    begin = _reset_some if few else _reset_all
+    begin = _change_tasks if trials.keeps_state else _reset_some if few else _reset_all
 
     def renew(worlds: Worlds) -> Worlds:
         begun = begin(env, tasks, worlds, ends, keys(), trials)
@@ -220,6 +220,22 @@ def _reset_all(env: Env, tasks: Task, worlds: Worlds, ends: Ends, keys: Key, tri
     start = _begin(env, tasks, keys, lasting if trials.episodes > 1 else lambda drawn: drawn)
     rest = where_worlds(ends.episode, (start.task, start.obs), (worlds.task, worlds.obs))
     return _Begun(env.where_worlds(ends.world, start.state, worlds.state), *rest)
+
+
+def _change_tasks(env: Any, tasks: Task, worlds: Worlds, ends: Ends, keys: Key, trials: Trials) -> _Begun:
+    """Draw tasks with keys (S, T, E) for worlds whose trials have ended, which go on where they are; reset lost ones.
+
+    Returns:
+        these worlds, and the others as they are.
+    """
+    lost, own = ends.world, _Begun(worlds.state, worlds.task, worlds.obs)
+    again = lambda: _reset_all(env, tasks, worlds, Ends(lost, lost, lost, lost), keys, trials)
+    begun = jax.lax.cond(jnp.any(lost), again, lambda: own)
+    if tasks.draws is None:
+        return begun
+    goes_on, drawn = ends.trial & ~lost, _draw_tasks(tasks, keys)
+    seen = frames.begin(env.observe_worlds(drawn, begun.state), env.spec.frames)
+    return _Begun(begun.state, *where_worlds(goes_on, (drawn, seen), (begun.task, begun.obs)))
 
 
 def _reset_some(env: Env, tasks: Task, worlds: Worlds, ends: Ends, keys: Key, trials: Trials) -> _Begun:

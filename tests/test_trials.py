@@ -6,10 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import Goals, Stub, Walk, tiny, train
+from probes import SPEC, Goals, Stub, Walk, tiny, train
 from test_loop import Drifting
 
 import mtjax
+from mtjax import loop
 from mtjax.agents.parts import targets
 from mtjax.evaluation import Episodes, evaluate, load_evaluations, no_evaluations, require_same_run
 from mtjax.experience import multistep
@@ -324,3 +325,86 @@ def test_a_run_evaluates_whole_trials():
     message = "eval-episodes must be a multiple of a trial's 4 episodes, such as 12; not 10"
     with pytest.raises(InputError, match=message):
         mtjax.train("bandit", "sac", steps=100, trials=4)
+
+
+# Worlds that go on.
+
+
+@dataclasses.dataclass(frozen=True)
+class Endless(Drifting):
+    """A walk that never terminates, and observes the scale that it was drawn with beside where it is."""
+
+    spec = SPEC._replace(obs=jax.ShapeDtypeStruct((2,), jnp.float32))
+    ends_early = False
+    relabels = varied = ("scale",)
+    lost: bool = False
+
+    def observe(self, task, state):
+        return jnp.append(state.obs, task.goal["scale"])
+
+    def rules(self, task, state, action):
+        return task.goal["scale"], state.obs[0] + 1, False
+
+    def reset(self, task, key):
+        step = super().reset(task, key)
+        return step._replace(obs=self.observe(task, step.state))
+
+    def step(self, task, state, action):
+        step = super().step(task, state, action)
+        obs = jnp.where(self.lost & (step.state.obs[0] > 12), jnp.nan, self.observe(task, step.state))
+        return step._replace(obs=obs)
+
+
+def test_worlds_go_on_over_the_limit_with_another_goal():
+    """State and count of steps stay; the task changes where an episode's time is up, and with it what is observed."""
+    rows, state, (metrics,) = play(Endless(), trials=1, reset_free=True)
+    place, scale = rows.obs[..., 0], rows.obs[..., 1]
+    np.testing.assert_allclose(place - place[..., :1], np.broadcast_to(np.arange(STEPS), place.shape), rtol=1e-5)
+    np.testing.assert_array_equal(rows.closed, np.broadcast_to(np.arange(STEPS) % 5 == 4, place.shape))
+    np.testing.assert_array_equal(rows.context[..., 0], scale)
+    np.testing.assert_array_equal(rows.discount, 1)
+    closed = rows.closed[..., :-1]
+    assert np.mean((scale[..., 1:] != scale[..., :-1]) == closed) > 0.99
+    np.testing.assert_array_equal(rows.next_obs[..., :-1, :][~closed], rows.obs[..., 1:, :][~closed])
+    np.testing.assert_array_equal(rows.next_obs[..., 1], scale)  # the step was the old task's
+    np.testing.assert_array_equal(metrics["episodes"], ENVS * STEPS / 5)
+    assert np.all(state.worlds.memory[..., 0] == 0)  # which began anew with the last task
+
+
+def test_a_lost_world_does_not_go_on(monkeypatch):
+    """It begins anew, whatever the time."""
+    monkeypatch.setattr(loop, "_MOST_LOST", 1.0)
+    rows, _, (metrics,) = play(Endless(lost=True), trials=1, reset_free=True)
+    assert np.all(np.isfinite(rows.obs)) and rows.obs[..., 0].max() < 13 and np.all(metrics["lost"] >= 3 * ENVS)
+    restarted = np.diff(rows.obs[..., 0]) < 0
+    np.testing.assert_array_equal(restarted, np.all(rows.obs == rows.next_obs, axis=-1)[..., :-1])
+
+
+def test_a_goal_of_a_body_is_drawn_anew_and_the_body_stays():
+    """A point mass goes on from where it is: nothing that it observes jumps."""
+    env = mtjax.make("point-mass-vary-goal", combine="grid", engine="c", num_draws=8)
+    rows, state, _ = play(env, trials=1, reset_free=True, num_envs=2, chunk_steps=210, replay_size=420)
+    np.testing.assert_array_equal(rows.obs[..., 1:, :], rows.next_obs[..., :-1, :])
+    assert rows.closed.sum() == 4 and np.all(state.worlds.age == 10)
+
+
+@pytest.mark.parametrize(
+    ("env", "said"),
+    [
+        (Walk(), "episodes terminate"),
+        (lambda: mtjax.make("reacher-easy", engine="c"), "draws its goals with its states"),
+        (lambda: mtjax.make("reacher-vary-goal", {"target-angle": "-2:2"}, engine="c"), "hold its goals"),
+        (lambda: mtjax.make("walker-walk", {"friction": "0.5:1"}, engine="c"), "states depend on friction"),
+        (lambda: mtjax.make("walker-walk+cheetah-run", engine="c"), "not for mixtures"),
+    ],
+)
+def test_families_whose_worlds_cannot_go_on_are_refused(env, said):
+    """With the reason, before anything is compiled."""
+    with pytest.raises(InputError, match=said):
+        mtjax.train(env() if callable(env) else env, tiny("sac"), steps=10, reset_free=True)
+
+
+def test_a_world_that_goes_on_has_no_episodes_to_repeat():
+    """One of the two flags."""
+    with pytest.raises(InputError, match=r"--reset-free has no episodes to repeat; use --trials=1, not 3"):
+        loop.Settings(trials=3, reset_free=True)
