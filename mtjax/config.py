@@ -16,14 +16,17 @@ import tyro
 from jax.sharding import Mesh
 
 from mtjax import trials
-from mtjax.agents import BaseAgent, agent, preset_of
+from mtjax.agents import AGENTS, BaseAgent, agent, preset_of
+from mtjax.agents import name_of as agent_name_of
 from mtjax.agents.choices import kinds_of, replace
 from mtjax.agents.parts import name_of
+from mtjax.agents.parts.policies import Gaussian, policy_for
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.values import VALUES
 from mtjax.agents.swept import agents_at
 from mtjax.checks import MOST_EPISODES, check_fields, path, require_library, require_text
 from mtjax.envs import make, members
+from mtjax.envs import name_of as env_name_of
 from mtjax.envs.tabled import Tabled
 from mtjax.experience import Replay
 from mtjax.frames import shown
@@ -129,6 +132,9 @@ class RunConfig:
     )
     learner: Annotated[BaseAgent, tyro.conf.arg(name="agent")] = dataclasses.field(default_factory=lambda: agent("sac"))
 
+    def __post_init__(self):
+        object.__setattr__(self, "learner", _with_policy(self.learner, self.family))
+
     @cached_property
     def num_tasks(self) -> int:
         """Return the number of training tasks."""
@@ -185,6 +191,7 @@ class RunConfig:
         _ = self.mesh
         self.learner.experience.check(self.family, self.played.num_envs, self.played.chunk_steps)
         require_trials(self.training, self.family, self.learner)
+        require_policy(self.learner, self.family)
         trials.require_whole(self.plan.eval_episodes, self.training.trials, "eval-episodes")
         for learner in agents_at(self.learner, self.points):
             require_value_range(learner)
@@ -314,6 +321,32 @@ def configure(agent: Any, settings: Settings, given: Mapping[str, Any]) -> tuple
     loop_values = {name: value for name, value in given.items() if name in loop_names}
     rest = {name: value for name, value in given.items() if name not in loop_values}
     return replace(agent, rest), dataclasses.replace(settings, **loop_values)
+
+
+def _with_policy(agent: Any, env: Any) -> Any:
+    """Return the agent with the policy for an environment's actions.
+
+    Only discrete ones are counted, as a policy of continuous ones needs no size, which may take a compiled model.
+    """
+    if not isinstance(agent, BaseAgent):
+        return agent
+    policy = policy_for(env.spec.action) if getattr(env, "discrete", True) else Gaussian()
+    return agent if agent.policy == policy else dataclasses.replace(agent, policy=policy)
+
+
+def require_policy(agent: Any, env: Any) -> None:
+    """Refuse an agent that cannot draw the actions of its environment.
+
+    Raises:
+        InputError: that is so; it names agents that can.
+    """
+    if not isinstance(agent, BaseAgent) or isinstance(agent.policy, agent.policies):
+        return
+    able = ", ".join(name for name, preset in AGENTS.items() if isinstance(agent.policy, preset.cls.policies))
+    scored = any(hasattr(part.family, "scores") for part in getattr(env, "parts", ()))
+    scores, kind = ", or scores=True (--env.scores)" if scored else "", env.spec.action.kind
+    names = agent_name_of(agent), env_name_of(env)
+    raise InputError(f"{names[0]} draws no {kind} actions, which {names[1]} has: use {able}{scores}")
 
 
 def require_value_range(agent: Any) -> None:

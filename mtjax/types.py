@@ -5,7 +5,7 @@ Axes, used in every docstring: ``S`` seeds, ``T`` tasks, ``E`` environments per 
 """
 
 import dataclasses
-from typing import Any, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +24,7 @@ class Continuous:
     """Actions are vectors (A,) in [-1, 1]."""
 
     size: int  # A
+    kind: ClassVar[str] = "continuous"
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -51,12 +52,17 @@ class Continuous:
         """Set the entries of actions (..., A) to 0 that a task does not have."""
         return action if mask is None else action * mask
 
+    def narrow(self, action: Array) -> Array:
+        """Return such actions from those of a mixture, whose widest family has as many entries or more."""
+        return action[..., : self.size]
+
 
 @dataclasses.dataclass(frozen=True)
 class Discrete:
     """Actions are whole numbers () int32 from 0 to A - 1."""
 
     size: int  # A
+    kind: ClassVar[str] = "discrete"
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -82,6 +88,10 @@ class Discrete:
 
     def masked(self, action: Array, mask: Array | None) -> Array:
         """Return actions as they are: policies draw none that a task does not have."""
+        return action
+
+    def narrow(self, action: Array) -> Array:
+        """Return actions of a mixture as they are: a family's are the first of them."""
         return action
 
 

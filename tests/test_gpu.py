@@ -523,7 +523,7 @@ def test_mazes_move_and_are_drawn_as_on_the_cpu(name):
     """Eight starts of every task, and a step from each; edges of shapes may fall on the next pixel."""
     env = mtjax.make(name, pixels=SIZE, state="also")
     keys = jax.random.split(jax.random.key(0), (env.train_count, 8))
-    action = jnp.ones(env.action_size)
+    action = env.action.random(jax.random.key(1))
 
     def play(tasks, keys):
         start = jax.vmap(jax.vmap(env.reset, (None, 0)))(tasks, keys)

@@ -66,6 +66,8 @@ def test_a_relabelled_step_is_that_of_the_other_task(name):
     tasks, programs, random = env.tasks(), compiled(env), np.random.default_rng(0)
     old, new = alike(tasks, 0), alike(tasks, -1)
     draw = lambda: np.float32(random.uniform(-1, 1, (WORLDS, env.spec.action_size)))
+    if env.discrete:
+        draw = lambda: np.int32(random.integers(env.spec.action_size, size=WORLDS))
     before = programs.reset(old, keys)
     for _ in range(FAMILIES[name][2]):
         before = programs.step(old, before.state, draw())

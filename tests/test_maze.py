@@ -11,11 +11,12 @@ from probes import QUICK, tiny
 from mtjax import loop
 from mtjax.config import configure
 from mtjax.envs.mtenv.maze import MazeState, TwoGoalMaze
-from mtjax.types import InputError, Spec
+from mtjax.types import Discrete, InputError, Spec
 
 MAZE = TwoGoalMaze(vary={"goal-box": "0,1"}, split="none")
+SCORED = TwoGoalMaze(vary={"goal-box": "0,1"}, split="none", scores=True)
 SEEING = TwoGoalMaze(vary={"goal-box": "0,1"}, split="none", observe_boxes=True)
-LEFT, RIGHT, AHEAD = np.eye(3, dtype=np.float32)
+LEFT, RIGHT, AHEAD = np.arange(3, dtype=np.int32)
 EAST, NORTH, WEST, SOUTH = 0, 2, 4, 6
 FAR_BOXES = ((2.4, 2.4), (-2.4, 2.4))
 
@@ -72,7 +73,7 @@ def test_walks_follow_the_rules():
 
     def episode(task, key, actions):
         start = MAZE.reset(task, key)
-        walk = lambda step, action: (MAZE.step(task, step.state, jax.nn.one_hot(action, 3)),) * 2
+        walk = lambda step, action: (MAZE.step(task, step.state, action),) * 2
         return start, jax.lax.scan(walk, start, actions)[1]
 
     start, steps = jax.tree.map(np.asarray, jax.jit(jax.vmap(episode))(tasks, keys, actions))
@@ -155,8 +156,9 @@ def test_corners_of_the_room_stick_out(step):
         assert np.allclose(result.state.position, position) != moved
 
 
-def test_a_step_takes_the_highest_score(step):
-    """Of equal ones the first."""
+def test_a_step_takes_the_highest_score():
+    """If it takes scores; of equal ones the first."""
+    step = jax.jit(SCORED.step)
     for scores, turns in (((0.1, -0.2, 0), 1), ((-1, -0.9, -1), 7), ((0, 0, 0), 1), ((-1, 0, 0), 7)):
         assert step(task(0), state((0, 0)), jnp.float32(scores)).state.turns == turns
 
@@ -185,7 +187,7 @@ def test_both_tasks_and_nothing_between():
     """Blue is context -1 and red 1; what is neither is refused."""
     np.testing.assert_array_equal(MAZE.tasks().context, [[-1], [1]])
     specs = [env.spec._replace(sentences=()) for env in (MAZE, SEEING)]
-    assert specs == [Spec.vector(4, 3, 1), Spec.vector(8, 3, 1)]
+    assert specs == [Spec.vector(size, 3, 1)._replace(action=Discrete(3)) for size in (4, 8)]
     assert [len(MAZE.tasks(split).id) for split in ("train", "interpolation", "extrapolation")] == [2, 0, 0]
     np.testing.assert_array_equal(TwoGoalMaze().tasks().goal["goal-box"], [0])
     named = TwoGoalMaze(vary={"goal-box": "blue,red"})
@@ -195,14 +197,20 @@ def test_both_tasks_and_nothing_between():
             TwoGoalMaze(vary={"goal-box": values})
 
 
-def test_an_agent_trains_on_it():
+@pytest.mark.parametrize(
+    ("env", "name", "given"),
+    [
+        (MAZE, "ppo", {"unroll": 2, "minibatches": 1}),
+        (SCORED, "sac-conditioned", {"batch_size": 4, "replay_size": 12, "warmup_steps": 1}),
+    ],
+)
+def test_an_agent_trains_on_it(env, name, given):
     """Traced, not run: the loop, agent and tasks fit together; the loop counts time."""
-    agent = tiny("sac-conditioned")
-    given = {"num_envs": 2, "batch_size": 4, "replay_size": 12, "warmup_steps": 1, "chunk_steps": 2}
-    agent, settings = configure(agent, loop.Settings(), given)
-    assert MAZE.episode_length == 200
-    state = jax.eval_shape(lambda: loop.init(MAZE, agent, settings, MAZE.tasks(), jnp.arange(1)))
-    after, _ = jax.eval_shape(lambda state: loop.run_chunk(MAZE, agent, settings, MAZE.tasks(), state), state)
+    agent = tiny(name).for_action(env.spec.action)
+    agent, settings = configure(agent, loop.Settings(), {"num_envs": 2, "chunk_steps": 2, **given})
+    assert env.episode_length == 200
+    state = jax.eval_shape(lambda: loop.init(env, agent, settings, env.tasks(), jnp.arange(1)))
+    after, _ = jax.eval_shape(lambda state: loop.run_chunk(env, agent, settings, env.tasks(), state), state)
     assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
 
 

@@ -227,6 +227,8 @@ def test_names_of_families_and_tasks():
         (lambda: make("bandit+control-acrobot", vary={"acrobot.torque": "1"}), "which family's torque varies"),
         (lambda: make("bandit+control-acrobot", num_task=2), "did you mean 'num_tasks'"),
         (lambda: mixture([]), "at least one family"),
+        (lambda: make("bandit+control-acrobot").spec,
+         "bandit has discrete actions and control-acrobot has continuous actions; scores=True"),
         (lambda: mixture([make("control-cartpole", num_draws=3, combine="grid"),
                           make("control-acrobot", num_draws=2, combine="grid")]).tasks(), "num-draws"),
         (lambda: Replay(hindsight=0.5).check(BOTH, 1), "share no physics"),
@@ -271,7 +273,8 @@ def steps_of(env, tasks, keys, actions):
 
 @pytest.mark.parametrize("split", slow_but(["train", "all"], "all"))
 def test_every_family_steps_as_it_does_alone(split):
-    env = mixture([make(name, num_tasks=2) for name in ("control-cartpole", "tabular-mdp", "two-goal-maze-seen")])
+    scored = [make(name, num_tasks=2, scores=True) for name in ("tabular-mdp", "two-goal-maze-seen")]
+    env = mixture([make("control-cartpole", num_tasks=2), *scored])
     tasks = env.tasks(split)
     keys = keys_of(tasks)
     actions = jax.random.uniform(jax.random.key(1), (5, *keys.shape, env.spec.action_size), minval=-1.0)

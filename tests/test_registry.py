@@ -50,7 +50,7 @@ def play(env, tasks, keys):
     start = jax.vmap(env.reset)(tasks, keys)
 
     def step(state, i):
-        draw = lambda key: jax.random.uniform(jax.random.fold_in(key, i), (env.spec.action_size,), minval=-1.0)
+        draw = lambda key: env.spec.action.random(jax.random.fold_in(key, i))
         after = jax.vmap(env.step)(tasks, state, jax.vmap(draw)(keys))
         return after.state, (after.obs, after.reward, after.terminated)
 

@@ -1,5 +1,7 @@
 """Tabular MDPs and bandits: their chances, the tasks they are drawn as, and the contexts that describe them."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +11,7 @@ from probes import tiny
 from mtjax import loop
 from mtjax.config import configure
 from mtjax.envs.mtenv.tabular import Bandit, TabularMDP
-from mtjax.types import InputError, Spec
+from mtjax.types import Discrete, InputError, Spec
 
 MDP, BANDIT = TabularMDP(num_tasks=3), Bandit(num_tasks=3)
 ENVS = pytest.mark.parametrize("env", [MDP, BANDIT], ids=["tabular-mdp", "bandit"])
@@ -33,7 +35,7 @@ def within_chance(frequencies, chances, samples):
 def steps():
     """Observations and rewards (T, A, SAMPLES, ...) of first steps, and the states (T, SAMPLES) they are taken from."""
     keys = jax.random.split(jax.random.key(0), SAMPLES)
-    tasks, actions = MDP.tasks(), jnp.eye(5)
+    tasks, actions = MDP.tasks(), jnp.arange(5)
 
     def one(task, action, key):
         start = MDP.reset(task, key)
@@ -78,7 +80,7 @@ def test_chance_and_moves_are_independent():
     even = env.task_of({"rewards": np.full((2, 1), 0.5), "transitions": np.full((2, 1, 2), 0.5)})
 
     def walk(state, _):
-        step = env.step(even, state, jnp.zeros(1))
+        step = env.step(even, state, jnp.int32(0))
         return step.state, step.obs
 
     state = env.reset(even, jax.random.key(1)).state
@@ -96,7 +98,7 @@ def test_arms_pay_as_the_task_says():
         return start.obs, BANDIT.step(task, start.state, action)
 
     of_arm = jax.vmap(jax.vmap(one, (None, None, 0)), (None, 0, None))
-    start, step = jax.jit(jax.vmap(of_arm, (0, None, None)))(BANDIT.tasks(), jnp.eye(5), keys)
+    start, step = jax.jit(jax.vmap(of_arm, (0, None, None)))(BANDIT.tasks(), jnp.arange(5), keys)
     assert within_chance(np.mean(step.reward, axis=2), np.asarray(BANDIT.tasks().goal["rewards"]), SAMPLES)
     assert start.shape == step.obs.shape == (3, 5, SAMPLES, 1)
     assert not np.any(start) and not np.any(step.obs) and not np.any(step.terminated)
@@ -104,7 +106,8 @@ def test_arms_pay_as_the_task_says():
 
 @ENVS
 def test_the_highest_score_is_taken(env):
-    """Of equal ones the first: only the action's largest entry matters."""
+    """With scores, of equal ones the first: only the action's largest entry matters."""
+    env = dataclasses.replace(env, scores=True)
     task = pick(env.tasks(), 0)
     certain = np.zeros_like(task.goal["rewards"])
     certain[..., 2] = 1
@@ -123,7 +126,7 @@ def test_the_same_key_gives_the_same_episode(env):
 
     def episode(key):
         start = env.reset(task, key)
-        walk = lambda step, _: (env.step(task, step.state, jnp.ones(5)), step.reward)
+        walk = lambda step, _: (env.step(task, step.state, jnp.int32(0)), step.reward)
         return jax.lax.scan(walk, start, length=50)[1]
 
     run = jax.jit(jax.vmap(episode))
@@ -170,8 +173,10 @@ def test_held_out_tasks_are_further_draws(env):
 def test_the_context_is_the_whole_task():
     """MTEnv's 100 numbers, rewards then transitions, as 2 x - 1."""
     tasks = MDP.tasks()
-    specs = [env.spec._replace(sentences=()) for env in (MDP, BANDIT)]
-    assert specs == [Spec.vector(5, 5, 100), Spec.vector(1, 5, 5)]
+    vectors = [Spec.vector(5, 5, 100), Spec.vector(1, 5, 5)]
+    for env, spec in zip((MDP, BANDIT), vectors, strict=True):
+        assert env.spec._replace(sentences=()) == spec._replace(action=Discrete(5))
+        assert dataclasses.replace(env, scores=True).spec._replace(sentences=()) == spec
     numbers = (np.asarray(tasks.context) + 1) / 2
     np.testing.assert_allclose(numbers[:, :20].reshape(3, 4, 5), tasks.goal["rewards"], atol=1e-6)
     np.testing.assert_allclose(numbers[:, 20:].reshape(3, 4, 5, 4), tasks.goal["transitions"], atol=1e-6)
@@ -207,11 +212,16 @@ def test_wrong_settings_are_refused(make, message):
         make()
 
 
+@pytest.mark.parametrize("name", ["sac-conditioned", "ppo"])
 @ENVS
-def test_an_agent_trains_on_it(env):
+def test_an_agent_trains_on_it(env, name):
     """Traced, not run: the loop, agent and tasks fit together, keys in the state included; the loop counts time."""
-    agent = tiny("sac-conditioned")
-    given = {"num_envs": 2, "batch_size": 4, "replay_size": 12, "warmup_steps": 1, "chunk_steps": 2}
+    given: dict = {"num_envs": 2, "chunk_steps": 2}
+    if name == "ppo":
+        agent, given = tiny("ppo").for_action(env.spec.action), given | {"unroll": 2, "minibatches": 1}
+    else:
+        env, agent = dataclasses.replace(env, scores=True), tiny(name)
+        given |= {"batch_size": 4, "replay_size": 12, "warmup_steps": 1}
     agent, settings = configure(agent, loop.Settings(), given)
     assert env.episode_length == 100
     state = jax.eval_shape(lambda: loop.init(env, agent, settings, env.tasks(), jnp.arange(1)))

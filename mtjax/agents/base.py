@@ -19,7 +19,7 @@ from mtjax.agents.parts.gradients import descent, surgery
 from mtjax.agents.parts.knowing import Knowing, last_steps
 from mtjax.agents.parts.knowing.last_steps import Past, Seen, without_past
 from mtjax.agents.parts.knowing.recurrent import Following, Hidden, track
-from mtjax.agents.parts.policies import Gaussian, Policy
+from mtjax.agents.parts.policies import Gaussian, Policy, policy_for
 from mtjax.agents.parts.representations import REPRESENTATIONS, Representation
 from mtjax.agents.parts.samplers import Sampler
 from mtjax.agents.parts.scaling import SCALINGS, Scaling
@@ -30,7 +30,19 @@ from mtjax.networks import OVER_TASKS, Network, Params
 from mtjax.parallel import collectives
 from mtjax.parallel.collectives import mean_and_variance
 from mtjax.tasks import SAME_CONTEXT
-from mtjax.types import Acted, Array, Env, InputError, Key, Metrics, Spec, Task, Transition
+from mtjax.types import (
+    Acted,
+    Array,
+    Continuous,
+    Discrete,
+    Env,
+    InputError,
+    Key,
+    Metrics,
+    Spec,
+    Task,
+    Transition,
+)
 
 Heads = Literal["shared", "per-task", "disjoint"]
 Tune = Literal["all", "heads", "embedding"]
@@ -77,6 +89,8 @@ class BaseAgent(abc.ABC):
     """Whether devices that share a seed learn from other data each; with a replay all learn from the same."""
     common_presets: ClassVar[bool] = True
     """Whether the tables of presets that name no agent hold for it. They are tuned for learning from replay."""
+    policies: ClassVar[tuple[type[Policy], ...]] = (Gaussian,)
+    """The kinds of policies with which the agent can learn."""
     fits_statistics: ClassVar[bool] = False
     """Whether learning keeps the running statistics of bodies with batch normalisation."""
     hidden: tuple[int, ...] = (256, 256)
@@ -241,6 +255,22 @@ class BaseAgent(abc.ABC):
         if frames.shown(spec.obs) and self.conditioning.recurs:
             raise InputError("conditioning=recurrent reads vectors, not pictures; choose another conditioning")
 
+    def for_action(self, action: Continuous | Discrete) -> Self:
+        """Return the agent with the policy for such actions, which are those of its environment."""
+        return dataclasses.replace(self, policy=policy_for(action))
+
+    def require_policy(self, spec: Spec) -> None:
+        """Check that the agent was made for a family's actions, and can learn to draw them.
+
+        Raises:
+            InputError: it was not, or cannot.
+        """
+        policy, kind, name = policy_for(spec.action), spec.action.kind, type(self).__name__
+        if not isinstance(policy, self.policies):
+            raise InputError(f"{name} draws no {kind} actions")
+        if self.policy != policy:
+            raise InputError(f"{name} was not made for these {kind} actions: agent.for_action(env.spec.action) is")
+
     # Networks.
 
     def network(self, hidden: tuple[int, ...], layer_norm: bool) -> Network:
@@ -330,6 +360,7 @@ class BaseAgent(abc.ABC):
     def init(self, spec: Spec, tasks: Task, key: Key) -> AgentState:
         """Return the initial state for the training ``tasks`` (T, ...)."""
         self.require_sight(spec)
+        self.require_policy(spec)
         num_tasks, vectors = len(tasks.id), self.conditioning.table(spec, len(tasks.id))
         inputs, action = self.init_inputs(spec, num_tasks), spec.action.encode(spec.action.blank())
         seen, first = self.example(spec, inputs), jax.tree.map(lambda x: x[0], tasks._replace(blocks=None))

@@ -13,6 +13,7 @@ from mtjax.agents import parts
 from mtjax.agents.base import BaseAgent, Memory
 from mtjax.agents.choices import FLAT
 from mtjax.agents.fit import Fit
+from mtjax.agents.parts.policies import Categorical, Gaussian, Policy
 from mtjax.agents.parts.policies.gaussian import STD_RANGE
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
@@ -74,6 +75,7 @@ class OnPolicy(BaseAgent):
         *("gae_lambda", "epochs", "minibatches", "entropy_cost", "value_rate"),
     )
     common_presets: ClassVar[bool] = False
+    policies: ClassVar[tuple[type[Policy], ...]] = (Gaussian, Categorical)
     devices_differ: ClassVar[bool] = True
     actor_lr: float = 3e-4
     """Adam's learning rate for the actor."""
@@ -90,7 +92,8 @@ class OnPolicy(BaseAgent):
     entropy_cost: float = 1e-2
     """Weight of the entropy in the actor loss (c), in standard deviations of the advantage."""
     initial_std: float = 0.7
-    """Standard deviation of the initial policy's actions, before the tanh."""
+    """Standard deviation of the initial policy's actions, before the tanh. A policy of discrete ones begins with all as
+    likely."""
     reward_scale: float = 1.0
     """Multiply all rewards by this."""
     value_normalization: Literal["none", "running", "popart"] = "running"

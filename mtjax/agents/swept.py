@@ -58,7 +58,7 @@ class SweptAgent:
     def act(self, state: SweptState, memory: Any, obs: Any, task: Task, key: Key | None) -> Acted:
         acted = with_values(self.agent, state.knobs).act(state.learner, memory, obs, task, key)
         whole = jnp.isfinite(acted.action)  # a diverged seed must not stop the others
-        return acted._replace(action=jnp.where(whole, acted.action, 0.0))
+        return acted._replace(action=jnp.where(whole, acted.action, 0))
 
     def remember(self, state: SweptState, memory: Any, transition: Transition, task: Task) -> Any:
         return with_values(self.agent, state.knobs).remember(state.learner, memory, transition, task)

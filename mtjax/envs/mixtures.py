@@ -87,7 +87,8 @@ class Mixture(Tabled):
 
     Observation (O,): the family's own, padded with zeros to that of the widest family. Pictures are not padded: either
         no family shows any, or all show pictures of one shape, with or without a state (O,) beside them.
-    Action (A,): as many as the widest family has. A task's ``action_mask`` says which of them are its own.
+    Action: as many entries, or choices, as the widest family has. A task's ``action_mask`` (A,) says which of them are
+        its own. Either all families have continuous actions, or all have discrete ones.
     Context (C,): the family as one-hot, then one slot per family. The task's own slot holds its context in that family;
         other slots are zero. A family whose contexts are all zero, because it has a single task, has no slot. The
         nearest training task of an unseen task is in its own family; of a family that does not train it is the first.
@@ -214,6 +215,7 @@ class Mixture(Tabled):
     def _spec(self) -> Spec:
         specs = [family.spec for family in self.families]
         self._require_one_look(specs)
+        self._require_one_kind(specs)
         widest: Any = jax.ShapeDtypeStruct((max(map(frames.state_size, specs)),), jnp.float32)
         return Spec(
             obs=frames.with_state(lambda _: widest, specs[0].obs),
@@ -234,6 +236,21 @@ class Mixture(Tabled):
                 f"families of a mixture are seen alike: {first} shows {look} and {other} {looks[other]}; "
                 "give all the same pixels, frames, grey and state"
             )
+
+    def _require_one_kind(self, specs: list[Spec]) -> None:
+        """Refuse to mix families with continuous actions and with discrete ones."""
+        kinds = {name: spec.action.kind for name, spec in zip(self.names, specs, strict=True)}
+        first = {kind: name for name, kind in reversed(kinds.items())}
+        if len(first) > 1:
+            told = " and ".join(f"{name} has {kind} actions" for kind, name in first.items())
+            scored = any(hasattr(family, "scores") for family in self.families)
+            fix = "; scores=True (--env.scores) makes discrete ones continuous" if scored else ""
+            raise InputError(f"families of a mixture act alike, as one policy draws for all: {told}{fix}")
+
+    @property
+    def discrete(self) -> bool:
+        """Whether some family has discrete actions; then all must have."""
+        return any(family.discrete for family in self.families)
 
     @property
     def episode_length(self) -> int:
@@ -257,7 +274,7 @@ class Mixture(Tabled):
     def step_worlds(self, tasks: Task, states: States, actions: Array) -> Step:
         """Step every world by its action (S, T, E, A)."""
         own = self._apart(tasks)
-        given = {i: tasks.blocks.take(actions, i)[..., : self.families[i].spec.action_size] for i in own}
+        given = {i: self.families[i].spec.action.narrow(tasks.blocks.take(actions, i)) for i in own}
         move = lambda group, of: group.step_worlds(of(own), of(states.families), of(given))
         return self._whole(tasks.blocks, self._by_group(own, move))
 
@@ -317,7 +334,7 @@ class Mixture(Tabled):
     def step(self, task: Task, state: Any, action: Array) -> Step:
         """Advance a world of a task that is not traced."""
         family, own = self.member(task)
-        step = family.step(own, state, action[: family.spec.action_size])
+        step = family.step(own, state, family.spec.action.narrow(action))
         return step._replace(obs=self.pad(step.obs))
 
     def member(self, task: Task) -> tuple[Family, Task]:

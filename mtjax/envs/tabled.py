@@ -65,6 +65,11 @@ class Tabled(abc.ABC):
 
     @property
     @abc.abstractmethod
+    def discrete(self) -> bool:
+        """Whether an action is a number of a choice, as ``spec.action`` says too; this needs no compiled model."""
+
+    @property
+    @abc.abstractmethod
     def episode_length(self) -> int:
         """Return the steps after which the longest episode is cut off."""
 

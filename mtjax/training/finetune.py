@@ -17,7 +17,7 @@ from mtjax.envs.mixtures import require_family
 from mtjax.networks import Params
 from mtjax.saved import shipped
 from mtjax.saved.policy import Policy
-from mtjax.types import Env, InputError, Spec, Task
+from mtjax.types import Discrete, Env, InputError, Spec, Task
 
 _FRESH = ("tasks", "sampler")  # networks that belong to the new tasks alone
 
@@ -53,12 +53,12 @@ def require_fit(start: Policy, env: Env, agent: BaseAgent) -> None:
         require_family(each, NO_FINE_TUNING)
     family, known = env, start.env
     theirs, ours = known.spec, family.spec
-    if frames.seen(theirs) != frames.seen(ours) or theirs.action_size != ours.action_size:
+    if frames.seen(theirs) != frames.seen(ours) or theirs.action != ours.action:
         pictures = frames.shown(theirs.obs) or frames.shown(ours.obs)
         fix = "; give --env.pixels, --env.frames, --env.grey and --env.state as the run has them" * pictures
         raise InputError(
-            f"the run's networks map {_sizes(theirs)} to {theirs.action_size} actions; "
-            f"the new tasks have {_sizes(ours)} and {ours.action_size} actions{fix}"
+            f"the run's networks map {_sizes(theirs)} to {_actions(theirs)}; "
+            f"the new tasks have {_sizes(ours)} and {_actions(ours)}{fix}"
         )
     alike = not isinstance(family, Family) or not isinstance(known, Family) or family.ranges == known.ranges
     if theirs.context_size != ours.context_size or not alike:
@@ -84,6 +84,11 @@ def _sizes(spec: Spec) -> str:
     seen, size = frames.seen(spec), frames.state_size(spec)
     pictures = [f"pictures {seen[frames.PICTURES].shape}"] if frames.shown(seen) else []
     return " with ".join(pictures + [f"{size} observed numbers"] * (size > 0))
+
+
+def _actions(spec: Spec) -> str:
+    """Return how many actions networks are to map to, as text."""
+    return f"{spec.action_size} {'discrete ' if isinstance(spec.action, Discrete) else ''}actions"
 
 
 def _learned(agent: BaseAgent) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from mtjax import frames
+from mtjax.envs.choosing import Choosing
 from mtjax.envs.family import draw_until
 from mtjax.envs.looks import Look
 from mtjax.envs.parameters import Parameter
@@ -53,15 +54,14 @@ class MazeState(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class TwoGoalMaze(Pictured):
+class TwoGoalMaze(Pictured, Choosing):
     """Two-goal maze: walk to the box that the task names, and keep away from the other one.
 
     Observation (4,): x (to the east) and z (to the south) of the walker, each as 0.7 x - 1; its heading [rad] as
         atan2(x, z), so that south is 0, east pi / 2, north pi and west -pi / 2; a sign that is -1 for blue and 1 for
         red while the walker faces west (heading in (-1.7, -1.5)), else 0, and always 0 at first. With
         ``observe_boxes`` (8,): then x and z of the blue and of the red box, scaled alike.
-    Action (3,): scores in [-1, 1] of turning left by 45 degrees, turning right by 45 degrees and walking 0.51 m ahead;
-        the highest is taken, of equal ones the first.
+    Action: 0 turns left by 45 degrees, 1 turns right by 45 degrees, and 2 walks 0.51 m ahead.
     Reward: 1 on coming within 2 m of the goal, -1 within 2 m of the other box (also if within 2 m of both), else 0.
     Start: both boxes anywhere in the room of 6 x 6 m where they fit and do not overlap; the walker anywhere in it at
         least 2 m from both, facing one of eight ways.
@@ -82,7 +82,7 @@ class TwoGoalMaze(Pictured):
     a task that can be learned.
 
     Differs from MTEnv in: the task given is the task played (its own is drawn anew by every reset); the time limit
-    holds (its step ignores it); the action is a vector of scores; headings are exact eighths of a turn (its own add up
+    holds (its step ignores it); headings are exact eighths of a turn (its own add up
     rounding, so that due north may read as -pi or pi); the second half of its observation, the sum of rewards, is left
     out, as it is 0 until an episode ends; its pictures are what the walker itself sees, and its boxes are turned at
     random.
@@ -112,8 +112,8 @@ class TwoGoalMaze(Pictured):
         return Step(state, obs, jnp.float32(0), jnp.bool_(False))
 
     def advance(self, task: Task, state: MazeState, action: Array) -> MazeState:
-        """Return the state after a turn or a step ahead, whichever has the highest score in ``action`` (3,)."""
-        chosen = jnp.argmax(action)
+        """Return the state after a turn or a step ahead."""
+        chosen = self.chosen(action)
         turns = (state.turns + jnp.array([1, -1, 0])[chosen]) % 8
         ahead = state.position + _FORWARD * _facing(state.turns)
         walks = (chosen == 2) & (_wall_distance(ahead) >= _WALKER_RADIUS)

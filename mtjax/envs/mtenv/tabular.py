@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.envs.family import Family
+from mtjax.envs.choosing import Choosing
 from mtjax.envs.parameters import Parameter
 from mtjax.envs.tabled import Table
 from mtjax.types import SPLITS, Array, InputError, Key, Step, Task
@@ -20,7 +20,7 @@ _MOST_HELD_OUT = 10
 
 
 @dataclasses.dataclass(frozen=True)
-class DrawnTasks(Family):
+class DrawnTasks(Choosing):
     """A family whose tasks are random tables of numbers in [0, 1]. The context holds all numbers, scaled to [-1, 1].
 
     Task number i of a split depends on ``task_seed`` and i alone, so that more tasks keep the first ones. The split
@@ -90,7 +90,7 @@ class TabularMDP(DrawnTasks):
     """Tabular MDP: collect rewards in a process of a few states, whose chances differ between tasks.
 
     Observation (num_states + 1,): the state as one-hot; the last reward, 0 at first.
-    Action (num_actions,): a score for each action in [-1, 1]; the highest is taken, of equal ones the first.
+    Action: one of ``num_actions`` numbers, from 0.
     Reward: 1 with the probability that the task gives to this action in this state, else 0.
     Start: any state, all as likely.
     Episode: 100 steps; it never terminates.
@@ -99,7 +99,7 @@ class TabularMDP(DrawnTasks):
         ``transitions`` (num_states, num_actions, num_states) those of the next state, the softmax of standard normal
         numbers over its last axis. The context is both tables, flattened one after the other, as 2 x - 1.
 
-    Differs from MTEnv in: the action is a vector of scores; episodes are cut off after 100 steps, where its own have no
+    Differs from MTEnv in: episodes are cut off after 100 steps, where its own have no
     end; there are ``num_tasks`` tasks, where every reset of its task state draws a new one.
     """
 
@@ -117,7 +117,7 @@ class TabularMDP(DrawnTasks):
 
     @property
     def action_size(self) -> int:  # type: ignore[override]
-        """Return the number of scores, one per action."""
+        """Return the number of actions."""
         return self.num_actions
 
     @property
@@ -137,7 +137,7 @@ class TabularMDP(DrawnTasks):
 
     def step(self, task: Task, state: TabularState, action: Array) -> Step:
         reward_key, move_key, key = jax.random.split(state.key, 3)
-        chosen = jnp.argmax(action)
+        chosen = self.chosen(action)
         reward = jax.random.bernoulli(reward_key, task.goal["rewards"][state.cell, chosen]).astype(jnp.float32)
         chances = task.goal["transitions"][state.cell, chosen]
         cell = jax.random.categorical(move_key, jnp.log(chances))
@@ -159,15 +159,15 @@ class Bandit(DrawnTasks):
     """Bandit: pull the arm that pays most often; which one that is differs between tasks.
 
     Observation (1,): always 0.
-    Action (num_arms,): a score for each arm in [-1, 1]; the highest is pulled, of equal ones the first.
+    Action: one of ``num_arms`` numbers, from 0: the arm that is pulled.
     Reward: 1 with the probability that the task gives to this arm, else 0.
     Episode: 100 pulls; it never terminates.
 
     A task is one table: ``rewards`` (num_arms,) holds the probabilities of a reward, uniform in [0, 1]. The context is
         that table, as 2 x - 1.
 
-    Differs from the multi-task bandits of MTEnv's examples in: the action is a vector of scores; episodes are cut off
-    after 100 pulls, where theirs have no end. As in its finite one, there are ``num_tasks`` tasks.
+    Differs from the multi-task bandits of MTEnv's examples in: episodes are cut off after 100 pulls, where theirs have
+    no end. As in its finite one, there are ``num_tasks`` tasks.
     """
 
     num_arms: int = 5
@@ -182,7 +182,7 @@ class Bandit(DrawnTasks):
 
     @property
     def action_size(self) -> int:  # type: ignore[override]
-        """Return the number of scores, one per arm."""
+        """Return the number of arms."""
         return self.num_arms
 
     @property
@@ -197,5 +197,5 @@ class Bandit(DrawnTasks):
 
     def step(self, task: Task, state: BanditState, action: Array) -> Step:
         pull_key, key = jax.random.split(state.key)
-        reward = jax.random.bernoulli(pull_key, task.goal["rewards"][jnp.argmax(action)]).astype(jnp.float32)
+        reward = jax.random.bernoulli(pull_key, task.goal["rewards"][self.chosen(action)]).astype(jnp.float32)
         return Step(BanditState(key), jnp.zeros(1), reward, jnp.bool_(False))

@@ -1,0 +1,26 @@
+"""Families whose actions are choices."""
+
+import dataclasses
+
+import jax.numpy as jnp
+
+from mtjax.envs.family import Family
+from mtjax.types import Array
+
+
+@dataclasses.dataclass(frozen=True)
+class Choosing(Family):
+    """A family in which an agent chooses one of ``action_size`` actions."""
+
+    scores: bool = False
+    """Take a score in [-1, 1] for each action, of which the highest counts (of equal ones the first), in place of the
+    number of the chosen action. Agents of continuous actions, such as sac, need it."""
+
+    @property
+    def discrete(self) -> bool:  # type: ignore[override]
+        """Whether an action is the number of a choice, not a vector of scores."""
+        return not self.scores
+
+    def chosen(self, action: Array) -> Array:
+        """Return the number () of the choice that an action makes."""
+        return jnp.argmax(action) if self.scores else action

@@ -1,0 +1,201 @@
+"""Policies against numbers worked out in NumPy: what they draw, how likely it is, and what masks leave out."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from probes import of_task, tiny
+
+import mtjax
+from mtjax.agents.parts.policies import Categorical, Gaussian, policy_for
+from mtjax.agents.ppo import Batch
+from mtjax.envs.probes import tasks_of
+from mtjax.types import Continuous, Discrete, InputError, Spec
+
+KEY = jax.random.key(0)
+LOGITS = np.random.default_rng(0).normal(size=(6, 4)).astype(np.float32)
+MASK = np.float32([1, 0, 1, 1])
+POLICY = Categorical(4)
+
+
+def softmax(logits, mask=None):
+    weights = np.exp(np.float64(logits)) * (1 if mask is None else mask)
+    return weights / weights.sum(axis=-1, keepdims=True)
+
+
+def test_the_kind_of_actions_decides():
+    assert policy_for(Continuous(3)) == Gaussian() and policy_for(Discrete(3)) == Categorical(3) != Categorical(4)
+    assert Continuous(3) != Discrete(3)
+
+
+@pytest.mark.parametrize("action", [Continuous(3), Discrete(3)])
+def test_a_kind_of_actions_says_what_they_are(action):
+    """Shape, type, zero, random ones in range, and the vector of size 3 that networks see of each."""
+    one, many = action.blank(), action.random(KEY, (500, 2))
+    assert one.shape == action.shape and one.dtype == many.dtype == action.dtype and not np.any(one)
+    assert many.shape == (500, 2, *action.shape) and action.encode(many).shape == (500, 2, 3)
+    if isinstance(action, Discrete):
+        assert np.bincount(np.ravel(many), minlength=3).min() > 250
+        np.testing.assert_array_equal(action.encode(many), np.eye(3)[np.asarray(many)])
+    else:
+        assert -1 <= np.min(many) < -0.99 and 0.99 < np.max(many) < 1
+    np.testing.assert_array_equal(policy_for(action).encode(many), action.encode(many))
+    outputs = policy_for(action).outputs(3)
+    assert policy_for(action).blank(outputs).shape == one.shape and policy_for(action).first(3, 0.7).shape == (outputs,)
+
+
+@pytest.mark.parametrize("mask", [None, MASK], ids=["all", "masked"])
+def test_categorical_numbers(mask):
+    """Log-probabilities, entropy and divergence are those of a softmax over the actions that there are."""
+    others = LOGITS[::-1]
+    p, q = softmax(LOGITS, mask), softmax(others, mask)
+    there = p > 0
+    actions = np.int32([0, 2, 3, 0, 2, 3])
+    found = POLICY.log_prob(LOGITS, jnp.asarray(actions), mask)
+    np.testing.assert_allclose(found, np.log(p[np.arange(6), actions]), rtol=1e-5)
+    plogp = np.where(there, p * np.log(np.where(there, p, 1)), 0)
+    np.testing.assert_allclose(POLICY.entropy(LOGITS, mask, KEY), -plogp.sum(axis=1), rtol=1e-5)
+    expected = np.where(there, p * np.log(np.where(there, p / np.where(there, q, 1), 1)), 0).sum(axis=1)
+    np.testing.assert_allclose(POLICY.divergence(LOGITS, others, mask), expected, rtol=1e-4, atol=1e-6)
+    np.testing.assert_array_equal(POLICY.divergence(LOGITS, LOGITS, mask), 0)
+
+
+def test_categorical_draws():
+    """As often as likely, with the log-probability of what was drawn; without a key the likeliest that there is."""
+    draw = jax.vmap(lambda key: POLICY.draw(LOGITS[0], MASK, key))
+    drawn = draw(jax.random.split(KEY, 20_000))
+    assert drawn.action.dtype == jnp.int32 and drawn.action.shape == (20_000,)
+    shares = np.bincount(drawn.action, minlength=4) / 20_000
+    np.testing.assert_allclose(shares, softmax(LOGITS[0], MASK), atol=0.02)
+    assert shares[1] == 0
+    np.testing.assert_allclose(drawn.log_prob, np.log(softmax(LOGITS[0], MASK)[drawn.action]), rtol=1e-5)
+    high = np.float32([0.0, 9.0, 1.0, 0.5])
+    assert POLICY.draw(high, None, None).action == 1 and POLICY.draw(high, MASK, None).action == 2
+
+
+def test_what_a_task_lacks_has_probability_and_gradient_exactly_zero():
+    """Whatever its output is; and with one action left, that has probability exactly 1."""
+    outputs = np.float32([[0.3, 80.0, -0.2, 1.0], [0.3, -80.0, -0.2, 1.0], [0, 1e9, 0, 0]])
+    chances = jnp.exp(jax.vmap(lambda a: POLICY.log_prob(outputs, jnp.full(3, a), MASK))(jnp.arange(4)))
+    assert np.all(chances[1] == 0)
+    np.testing.assert_allclose(np.sum(chances, axis=0), 1, rtol=1e-6)
+    for value in (
+        lambda x: POLICY.log_prob(x, jnp.int32([0, 2, 3]), MASK),
+        lambda x: POLICY.entropy(x, MASK, KEY),
+        lambda x: POLICY.divergence(x, LOGITS[:3], MASK),
+        lambda x: POLICY.divergence(LOGITS[:3], x, MASK),
+    ):
+        slope = jax.grad(lambda x, value=value: jnp.sum(value(x)))(jnp.asarray(outputs))
+        assert np.all(np.isfinite(slope)) and np.all(slope[:, 1] == 0) and np.any(slope[:, 0] != 0)
+    alone = np.float32([0, 0, 1, 0])
+    assert POLICY.log_prob(LOGITS[0], jnp.int32(2), alone) == POLICY.entropy(LOGITS[0], alone, KEY) == 0
+
+
+@pytest.mark.parametrize("mask", [None, np.float32([1, 0])], ids=["all", "masked"])
+def test_gaussian_draws(mask):
+    """The action is the tanh of what was drawn, 0 where a task has none, and as likely as ``log_prob`` says."""
+    outputs = np.random.default_rng(1).normal(size=(50, 4)).astype(np.float32)
+    drawn = Gaussian().draw(outputs, mask, KEY)
+    np.testing.assert_array_equal(drawn.action, jnp.tanh(drawn.raw) * (1 if mask is None else mask))
+    np.testing.assert_allclose(drawn.log_prob, Gaussian().log_prob(outputs, drawn.raw, mask), rtol=1e-4, atol=1e-4)
+    np.testing.assert_array_equal(Gaussian().entropy(outputs, mask, KEY), -drawn.log_prob)
+
+
+def test_all_actions_are_as_likely_at_first():
+    """PPO's first entropy is log A: heads are small, and biases 0."""
+    agent, spec = tiny("ppo").for_action(Discrete(5)), Spec.vector(3, 5, 100)._replace(action=Discrete(5))
+    tasks = mtjax.make("tabular-mdp", num_tasks=2).tasks()
+    state = agent.init(spec, tasks, KEY)
+    task = jax.tree.map(lambda x: x[0], tasks)
+    draw = lambda key: agent.act(state, agent.begin(state, task), jnp.ones(3), task, key).extras.log_prob
+    np.testing.assert_allclose(jax.vmap(draw)(jax.random.split(KEY, 50)), -np.log(5), atol=0.05)
+
+
+def test_the_policy_gradient_of_a_bandit():
+    """Of the expected reward sum_a pi_a r_a by PPO's actor loss: pi_a (r_a - sum_b pi_b r_b) for the output of a.
+
+    Every arm is in the batch once, and counts by its probability, as if it had been drawn so often.
+    """
+    rewards, spec = np.float32([0.1, 0.9, 0.4, 0.7]), Spec.vector(1, 4, 1)._replace(action=Discrete(4))
+    agent = tiny("ppo", conditioning="none", entropy_cost=0.0, normalize_observations=False).for_action(spec.action)
+    tasks = jax.tree.map(lambda x: x[:1], tasks_of("one-step", (1.0, 0.5)))
+    nets = of_task(agent.init(spec, tasks, KEY).nets, 0)
+    head = nets["actor"].shared["head"] | {"bias": jnp.asarray(LOGITS[0])}
+    obs, features, arms = jnp.zeros((4, 1)), jnp.zeros(0), jnp.arange(4)
+
+    def of_bias(bias):
+        return nets | {"actor": nets["actor"]._replace(shared=nets["actor"].shared | {"head": head | {"bias": bias}})}
+
+    outputs = agent.policy_outputs(of_bias(head["bias"]), features, obs)
+    p = softmax(outputs[0])
+    batch = Batch(obs, arms, jnp.log(p), jnp.asarray(4 * p * rewards), rewards, rewards, features, None)
+    slope = jax.grad(lambda bias: agent.actor_loss(of_bias(bias), batch, KEY)[0])(head["bias"])
+    np.testing.assert_allclose(-slope, p * (rewards - p @ rewards), rtol=1e-4, atol=1e-6)
+
+
+# Worlds.
+
+
+@pytest.fixture(scope="module")
+def optimum():
+    """Value iteration on a family of tabular MDPs: the mean reward of a step from gamma-optimal and other policies."""
+
+    def optimal(rewards, transitions, gamma):
+        value = np.zeros(len(rewards))
+        for _ in range(2000):
+            value = np.max(rewards + gamma * transitions @ value, axis=1)
+        return np.argmax(rewards + gamma * transitions @ value, axis=1)
+
+    def reward(rewards, transitions, actions):
+        states = np.arange(len(rewards))
+        moves = transitions[states, actions]
+        shares = np.full(len(rewards), 1 / len(rewards))
+        total = 0.0
+        for _ in range(100):
+            total += shares @ rewards[states, actions]
+            shares = shares @ moves
+        return total
+
+    return optimal, reward
+
+
+@pytest.mark.slow
+def test_ppo_learns_tabular_mdps(optimum):
+    """Its greedy actions in every state return at least 97% of what value iteration's do, in every task."""
+    env, (optimal, reward) = mtjax.make("tabular-mdp", num_tasks=4), optimum
+    result = mtjax.train(env, "ppo", steps=160_000, num_envs=16, quiet=True, eval_episodes=1, gamma=0.95)
+    policy, tasks = result.policy(), env.tasks()
+    states = np.eye(4, dtype=np.float32)
+    for i in range(4):
+        task = jax.tree.map(lambda x, i=i: x[i], tasks)
+        rewards, transitions = (np.float64(task.goal[name]) for name in ("rewards", "transitions"))
+        best = optimal(rewards, transitions, 0.99)
+        worst = max(reward(rewards, transitions, np.array(x)) for x in itertools.product(range(5), repeat=4))
+        assert reward(rewards, transitions, best) > 0.99 * worst  # value iteration finds the best of all policies
+        for last in (0.0, 1.0):
+            obs = np.concatenate([states, np.full((4, 1), last, np.float32)], axis=1)
+            found = reward(rewards, transitions, np.asarray(policy(obs, task)))
+            assert found >= 0.97 * reward(rewards, transitions, best), (i, last, found)
+
+
+def test_ppo_finds_the_best_arm_of_every_task():
+    env = mtjax.make("bandit", num_tasks=3)
+    result = mtjax.train(env, "ppo", steps=30_000, num_envs=8, quiet=True, eval_episodes=1, hidden=(32,))
+    policy, tasks = result.policy(), env.tasks()
+    for i in range(3):
+        task = jax.tree.map(lambda x, i=i: x[i], tasks)
+        action = policy(jnp.zeros(1), task)
+        assert action.dtype == jnp.int32 and action == np.argmax(task.goal["rewards"])
+
+
+def test_agents_of_continuous_actions_are_refused_before_anything_is_compiled():
+    """By name, with what to use instead; and an agent that was made for other actions."""
+    with pytest.raises(InputError, match=r"sac draws no discrete actions, which bandit has: use ppo, or scores=True"):
+        mtjax.train("bandit", "sac", steps=10)
+    bandit = mtjax.make("bandit")
+    with pytest.raises(InputError, match="SAC draws no discrete actions"):
+        tiny("sac").init(bandit.spec, bandit.tasks(), KEY)
+    with pytest.raises(InputError, match=r"PPO was not made for these discrete actions: agent.for_action"):
+        tiny("ppo").init(bandit.spec, bandit.tasks(), KEY)
