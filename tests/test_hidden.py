@@ -54,16 +54,18 @@ def test_arms_fill_the_cube_evenly():
     assert not np.allclose(even_points(100, 3, 0), even_points(100, 3, 1))
 
 
-def test_a_pull_pays_by_the_arm_with_the_highest_score():
-    """As often as its chance says."""
-    env = HiddenBandit(num_arms=3)
+@pytest.mark.parametrize("scores", [False, True])
+def test_a_pull_pays_by_its_arm(scores):
+    """As often as its chance says; of scores the highest counts."""
+    env = HiddenBandit(num_arms=3, scores=scores)
     task = task_with(env, jnp.array([0.2, 0.9, 0.5]))
 
-    def pull(score, key):
-        return env.step(task, env.reset(task, key).state, score)
+    def pull(action, key):
+        return env.step(task, env.reset(task, key).state, action)
 
-    scores, keys = jnp.array([[0.5, -1, 0], [-0.9, -0.8, -1], [0, 0, 0.1]]), jax.random.split(jax.random.key(0), 4000)
-    step = jax.jit(jax.vmap(jax.vmap(pull, (None, 0)), (0, None)), compiler_options=QUICK)(scores, keys)
+    by_score = jnp.array([[0.5, -1, 0], [-0.9, -0.8, -1], [0, 0, 0.1]])
+    actions, keys = by_score if scores else jnp.arange(3), jax.random.split(jax.random.key(0), 4000)
+    step = jax.jit(jax.vmap(jax.vmap(pull, (None, 0)), (0, None)), compiler_options=QUICK)(actions, keys)
     np.testing.assert_allclose(np.mean(step.reward, axis=1), [0.2, 0.9, 0.5], atol=0.04)
     assert set(np.unique(step.reward)) == {0, 1} and not np.any(step.terminated) and not np.any(step.obs)
 
@@ -89,11 +91,11 @@ class Bayes(Stub):
 
     def act(self, state, memory, obs, task, key):
         arm = jnp.asarray(state)[tuple(memory.ravel())]
-        return Acted(2.0 * jax.nn.one_hot(arm, 2) - 1, None, memory)
+        return Acted(arm.astype(jnp.int32))
 
     def remember(self, state, memory, transition, task):
         outcome = jnp.stack([transition.reward, 1 - transition.reward]).astype(jnp.int32)
-        return memory + jnp.outer(jax.nn.one_hot(jnp.argmax(transition.action), 2, dtype=jnp.int32), outcome)
+        return memory + jnp.outer(jax.nn.one_hot(transition.action, 2, dtype=jnp.int32), outcome)
 
 
 def test_the_best_strategy_earns_in_trials_what_it_must():
@@ -171,7 +173,7 @@ def test_steps_stay_on_the_grid_and_are_observed():
     task = task_with(env, jnp.array([2.0, 1.0]))
     cell, seen = env.reset(task, jax.random.key(0)).state, []
     for move in (2, 4, 0, 1, 1, 1, 3):
-        step = env.step(task, cell, jax.nn.one_hot(move, 5))
+        step = env.step(task, cell, jnp.int32(move))
         cell = step.state
         seen.append((*cell.tolist(), round(float(step.reward), 2), int(np.argmax(step.obs))))
         assert np.sum(step.obs) == 1 and not step.terminated

@@ -81,6 +81,11 @@ AGENTS: dict[str, Preset] = {
         {"conditioning": "recurrent"},
         "mtjax.agents.ppo:PPO",
     ),
+    "pqn": Preset(
+        "Q-learning in parallel, of discrete actions, without replay (Gallici et al. 2025)",
+        _PARAMS,
+        "mtjax.agents.pqn:PQN",
+    ),
     "pcgrad": Preset("Conflicting gradients projected (Yu et al. 2020)", {"gradients": "pcgrad", **_PARAMS}),
     "cagrad": Preset("Conflict-averse gradients (Liu et al. 2021)", {"gradients": "cagrad", **_PARAMS}),
     "gradnorm": Preset("Weights that even out learning rates (Chen et al. 2018)", {"gradients": "gradnorm", **_PARAMS}),

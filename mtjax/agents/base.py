@@ -538,6 +538,12 @@ class BaseAgent(abc.ABC):
         past = getattr(transition.memory, "past", None)
         return one(transition) if past is None else last_steps.relabel(one, transition)
 
+    def inputs(self, state: AgentState, window: Transition, tasks: Task) -> tuple[Transition, Array, Any, Any]:
+        """Return the steps (T, B L, ...) of windows (T, B, L, ...), with features, observations and next ones."""
+        flat = jax.tree.map(lambda x: x.reshape(len(x), -1, *x.shape[3:]), window)
+        see, (past, next_past) = partial(self.see_batch, state.nets["inputs"]), self.around(window, flat, flat)
+        return flat, self.features_of_batch(state, flat, tasks), see(flat.obs, past), see(flat.next_obs, next_past)
+
     # Learning.
 
     @property

@@ -243,12 +243,6 @@ class OnPolicy(BaseAgent):
         """Return the state after an actor's step, which moved it, given KL(pi_old | pi) (T,) before the step."""
         return moved
 
-    def inputs(self, state: AgentState, window: Transition, tasks: Task) -> tuple[Transition, Array, Any, Any]:
-        """Return the steps (T, B L, ...) of windows (T, B, L, ...), with features, observations and next ones."""
-        flat = jax.tree.map(lambda x: x.reshape(len(x), -1, *x.shape[3:]), window)
-        see, (past, next_past) = partial(self.see_batch, state.nets["inputs"]), self.around(window, flat, flat)
-        return flat, self.features_of_batch(state, flat, tasks), see(flat.obs, past), see(flat.next_obs, next_past)
-
     def models(self, state: AgentState, flat: Transition, tasks: Task, next_obs: Any) -> dict[str, Any]:
         """Return what a batch holds for a representation that learns."""
         if not self.representation.learns:

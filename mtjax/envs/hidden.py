@@ -13,13 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.envs.family import Family
+from mtjax.envs.choosing import Choosing
 from mtjax.envs.tabled import Table
 from mtjax.types import SPLITS, Array, InputError, Key, Step, Task
 
 
 @dataclasses.dataclass(frozen=True)
-class HiddenTasks(Family):
+class HiddenTasks(Choosing):
     """A family of one training task, which stands for a pool of tasks: each trial draws one of them."""
 
     told: bool = False
@@ -63,11 +63,6 @@ class HiddenTasks(Family):
         return False
 
 
-def chosen(action: Array) -> Array:
-    """Return the number () of the highest of the scores (A,); of equal ones the first."""
-    return jnp.argmax(action)
-
-
 class BanditState(NamedTuple):
     """The state of a bandit."""
 
@@ -79,7 +74,7 @@ class HiddenBandit(HiddenTasks):
     """Hidden bandit: find out which arm pays most often while pulling; every trial has other arms.
 
     Observation (1,): always 0.
-    Action (num_arms,): a score for each arm in [-1, 1]; the highest is pulled, of equal ones the first.
+    Action: the number of the arm that is pulled; with ``scores`` a score for each (num_arms,).
     Reward: 1 with the arm's probability, else 0.
     Episode: one pull; a trial of H pulls is ``--trials=H``.
 
@@ -104,7 +99,7 @@ class HiddenBandit(HiddenTasks):
 
     @property
     def action_size(self) -> int:  # type: ignore[override]
-        """Return the number of scores, one per arm."""
+        """Return the number of arms."""
         return self.num_arms
 
     @property
@@ -119,7 +114,7 @@ class HiddenBandit(HiddenTasks):
 
     def step(self, task: Task, state: BanditState, action: Array) -> Step:
         pull_key, key = jax.random.split(state.key)
-        reward = jax.random.bernoulli(pull_key, task.goal["task"][chosen(action)]).astype(jnp.float32)
+        reward = jax.random.bernoulli(pull_key, task.goal["task"][self.chosen(action)]).astype(jnp.float32)
         return Step(BanditState(key), jnp.zeros(1), reward, jnp.bool_(False))
 
 
@@ -148,8 +143,8 @@ class GridNavi(HiddenTasks):
     """GridNavi: walk through a grid to a hidden goal cell, which every trial draws (Zintgraf et al. 2020, "VariBAD").
 
     Observation (size^2,): 1 for the cell (x, y) at place ``size x + y``, else 0.
-    Action (5,): scores in [-1, 1] for staying, x + 1, x - 1, y + 1 and y - 1; the highest is taken, of equal ones the
-        first. A move off the grid stays.
+    Action: 0 to 4 for staying, x + 1, x - 1, y + 1 and y - 1; with ``scores`` a score for each (5,). A move off the
+        grid stays.
     Reward: 1 on the goal, else -0.1, after the step.
     Start: the cell (0, 0).
     Episode: ``steps`` steps; nothing terminates it.
@@ -160,7 +155,7 @@ class GridNavi(HiddenTasks):
     The best strategy for finding out earns in the episodes of a trial: 4.0000, and then 11.0714 in each (5 x 5 cells,
         15 steps, three episodes or more); 2.7 and 4.02 (3 x 3 cells, 6 steps). Told, it is 11.0714 and 4.02 in all.
 
-    Differs from VariBAD in: the cell is one-hot, and not its two coordinates; the action is a vector of scores.
+    Differs from VariBAD in: the cell is one-hot, and not its two coordinates.
     """
 
     size: int = 5
@@ -194,7 +189,7 @@ class GridNavi(HiddenTasks):
         return self._step(task, jnp.zeros(2, jnp.int32))
 
     def step(self, task: Task, state: Array, action: Array) -> Step:
-        return self._step(task, jnp.clip(state + jnp.asarray(_MOVES)[chosen(action)], 0, self.size - 1))
+        return self._step(task, jnp.clip(state + jnp.asarray(_MOVES)[self.chosen(action)], 0, self.size - 1))
 
     def _step(self, task: Task, cell: Array) -> Step:
         reward = jnp.where(jnp.all(cell == task.goal["task"]), 1.0, -0.1)

@@ -34,7 +34,7 @@ class Categorical(Policy):
         return Discrete(self.size).encode(action)
 
     def draw(self, outputs: Array, mask: Array | None, key: Key | None) -> Drawn:
-        logits = _allowed(outputs, mask)
+        logits = allowed(outputs, mask)
         action = jnp.argmax(logits, axis=-1) if key is None else jax.random.categorical(key, logits)
         action = action.astype(jnp.int32)
         return Drawn(action, action, self.log_prob(outputs, action, mask))
@@ -55,11 +55,11 @@ class Categorical(Policy):
         return jnp.sum(jnp.exp(logs) * (logs - _log_probs(others, mask)), axis=-1)
 
 
-def _allowed(outputs: Array, mask: Array | None) -> Array:
+def allowed(outputs: Array, mask: Array | None) -> Array:
     """Return the logits (..., A) of actions, with those that a task does not have out of reach."""
     return outputs if mask is None else jnp.where(mask > 0, outputs, _NEVER)
 
 
 def _log_probs(outputs: Array, mask: Array | None) -> Array:
     """Return the log-probability (..., A) of every action."""
-    return jax.nn.log_softmax(_allowed(outputs, mask), axis=-1)
+    return jax.nn.log_softmax(allowed(outputs, mask), axis=-1)

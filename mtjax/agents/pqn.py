@@ -1,0 +1,167 @@
+"""PQN learns the values of discrete actions from rollouts, without replay and slow copies."""
+
+import dataclasses
+from functools import partial
+from typing import Annotated, Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from mtjax.agents import parts
+from mtjax.agents.base import BaseAgent, Memory
+from mtjax.agents.choices import FLAT
+from mtjax.agents.fit import Fit
+from mtjax.agents.parts import targets
+from mtjax.agents.parts.policies import Categorical, Policy
+from mtjax.agents.parts.policies.categorical import allowed
+from mtjax.agents.parts.samplers import Uniform
+from mtjax.agents.parts.scaling import NoScaling
+from mtjax.agents.state import AgentState, Nets, axes_of
+from mtjax.experience import Rollouts
+from mtjax.networks import Params
+from mtjax.types import Acted, Array, InputError, Key, Metrics, Task, Transition
+
+
+class Batch(NamedTuple):
+    """Holds the data for the loss of one task; for all tasks, leaves are (T, ...)."""
+
+    obs: Any  # (B, O) as the networks take them
+    action: Array  # (B,) int32
+    target: Array  # (B,)
+    features: Array  # (Z,) or (B, Z) features of the task that need no learned parameters
+
+
+@dataclasses.dataclass(frozen=True)
+class PQN(BaseAgent):
+    """PQN is Q-learning from many parallel environments (Gallici et al. 2025, "Simplifying deep temporal difference").
+
+    After H steps of every environment, backwards from the last one:
+        G_t = r_t + gamma d_t ((1 - lambda) max_a Q(s'_t, a) + lambda G_(t+1))                (target)
+        L_Q = (Q(s, a) - G)^2 / 2                                                             (loss)
+    averaged over a task's minibatch, then over tasks. The sum is cut where a trial ends, and after the last step.
+    Targets are the critic's from before the update. Layer normalisation keeps it stable, with neither a replay nor a
+    slow copy of the critic. Actions are the best ones, or with the probability epsilon uniform ones, among those that
+    the task has. Epsilon falls along a line from 1 to ``epsilon`` over the first ``epsilon_rollouts`` rollouts.
+
+    With exploration G is biased, as it follows actions that the greedy policy would not take (Peng and Williams 1996).
+    ``cut_exploration`` cuts the sum before such an action, without bias (Watkins 1989).
+
+    Differs from the authors' code: Adam replaces RAdam, at a constant rate by default.
+    """
+
+    adjustable: ClassVar[tuple[str, ...]] = (
+        *BaseAgent.adjustable,
+        *("q_lambda", "epochs", "minibatches", "epsilon", "epsilon_rollouts"),
+    )
+    common_presets: ClassVar[bool] = False
+    policies: ClassVar[tuple[type[Policy], ...]] = (Categorical,)
+    devices_differ: ClassVar[bool] = True
+    critic_lr: float = 5e-4
+    """Adam's learning rate for the critic."""
+    max_gradient_norm: float = 10.0
+    """Clip the global norm of the critic's gradient to this; 0 does not clip."""
+    q_lambda: float = 0.65
+    """Lambda of returns: 0 relies on the critic alone, 1 on the rewards of the rollout."""
+    cut_exploration: bool = False
+    """Cut returns before actions that were not the best ones."""
+    epsilon: float = 0.05
+    """Probability of a uniform action in the end."""
+    epsilon_rollouts: int = 100
+    """Rollouts over which this probability falls from 1."""
+    experience: Annotated[Rollouts, FLAT] = dataclasses.field(
+        default_factory=lambda: Rollouts(unroll=32, epochs=2, minibatches=32)
+    )
+
+    def _check_numbers(self) -> None:
+        super()._check_numbers()
+        parts.require_shares(self, "q_lambda", "epsilon")
+        parts.require_counts(self, "epsilon_rollouts")
+
+    def _check_combination(self) -> None:
+        super()._check_combination()
+        if self.representation.learns:
+            raise InputError("pqn learns values of observations as they are; use representation=plain")
+        if type(self.scaling) is not NoScaling or type(self.sampler) is not Uniform:
+            raise InputError("pqn takes rewards as they are, of all tasks alike: scaling=none and sampler=uniform")
+
+    @property
+    def unroll(self) -> int:
+        return self.experience.unroll if self.conditioning.recurs else 0
+
+    # Networks.
+
+    def init_networks(self, num_tasks: int, actor_inputs: tuple, critic_inputs: tuple, action: Array, key: Key) -> Nets:
+        critic = self.critic.init(key, num_tasks, len(action), *critic_inputs)
+        return {"critic": critic, "exploration": Params({"rollouts": jnp.int32(0)}, {})}
+
+    @property
+    def fits(self) -> dict[str, Fit]:
+        return {"critic": super().fits["critic"]}
+
+    def blank_action(self, state: AgentState) -> Array:
+        return self.policy.blank(0)
+
+    def q(self, nets: Nets, features: Array, obs: Any) -> Array:
+        """Return the values (..., A) of all actions."""
+        return self.critic.apply(nets["critic"], *self.critic_inputs(nets, features, obs))
+
+    # Acting.
+
+    def act(self, state: AgentState, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
+        """Choose the best action () for one observation (O,) of one task, or with a key sometimes any action."""
+        values = self.q(*self.acting_inputs(state, memory, obs, task))
+        best = self.policy.draw(values, task.action_mask, None).action
+        if key is None:
+            return Acted(best)
+        any_key, turn_key = jax.random.split(key)
+        one = self.policy.draw(jnp.zeros_like(values), task.action_mask, any_key).action
+        return Acted(jnp.where(jax.random.uniform(turn_key) < self.share(state), one, best))
+
+    def share(self, state: AgentState) -> Array:
+        """Return the probability () of a uniform action."""
+        passed = state.nets["exploration"].shared["rollouts"] / self.epsilon_rollouts
+        return jnp.maximum(self.epsilon, 1 - (1 - self.epsilon) * passed)
+
+    # Learning.
+
+    def assess(self, state: AgentState, steps: Transition, tasks: Task) -> tuple[AgentState, Transition]:
+        """Add the targets to a rollout (T, H, E, ...)."""
+        flat, features, obs, next_obs = self.inputs(state, self.experience.windows(steps, self.unroll), tasks)
+        values, following = (self.values(state, features, x, tasks) for x in (obs, next_obs))
+        greedy = jnp.argmax(values, axis=-1) == flat.action
+        played = partial(self.experience.played, shape=steps.reward.shape, length=self.unroll)
+        closed, following = steps.closed, played(jnp.max(following, axis=-1))
+        if self.cut_exploration:
+            closed |= jnp.roll(~played(greedy), -1, axis=1)
+        gamma = jnp.broadcast_to(self.discounts(tasks), len(tasks.id))
+        returns = jax.vmap(partial(targets.lambda_returns, lambda_=self.q_lambda))
+        return state, steps._replace(extras=returns(steps._replace(closed=closed), following, gamma))
+
+    def values(self, state: AgentState, features: Array, obs: Any, tasks: Task) -> Array:
+        """Return the values (T, B, A) of all actions; those that a task does not have are worth nothing at all."""
+        found = jax.vmap(self.q, (axes_of(state.nets), 0, 0))(state.nets, features, obs)
+        return allowed(found, None if tasks.action_mask is None else tasks.action_mask[:, None])
+
+    def update(
+        self, state: AgentState, window: Transition, tasks: Task, key: Key, number: Array
+    ) -> tuple[AgentState, Metrics]:
+        """Take a gradient step on windows (T, B, L, ...) of a rollout; metrics are (T,)."""
+        flat, features, obs, _ = self.inputs(state, window, tasks)
+        batch = Batch(obs, flat.action, flat.extras, features)
+        state, fitted = self.descend(state, "critic", self.loss, (batch,), key)
+        return state, fitted.aux | fitted.metrics | {"epsilon": jnp.broadcast_to(self.share(state), len(tasks.id))}
+
+    def loss(self, nets: Nets, batch: Batch) -> tuple[Array, Metrics]:
+        values = self.q(nets, batch.features, batch.obs)
+        value = jnp.take_along_axis(values, batch.action[:, None], axis=-1)[:, 0]
+        loss = jnp.mean(jnp.square(value - batch.target)) / 2
+        return loss, {
+            "critic_loss": loss,
+            "value": jnp.mean(value),
+            "td_error": jnp.mean(jnp.abs(value - batch.target)),
+        }
+
+    def observe(self, state: AgentState, steps: Transition, tasks: Task) -> AgentState:
+        state = super().observe(state, steps, tasks)
+        rollouts = state.nets["exploration"].shared["rollouts"] + 1
+        return state._replace(nets=state.nets | {"exploration": Params({"rollouts": rollouts}, {})})
