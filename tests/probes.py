@@ -14,6 +14,7 @@ from needs import needs
 from mtjax import agents, loop
 from mtjax.agents.base import Memory
 from mtjax.agents.parts.knowing import last_steps
+from mtjax.agents.parts.policies import Gaussian
 from mtjax.command.keywords import configured
 from mtjax.config import Plan, configure
 from mtjax.envs import ENVS
@@ -148,6 +149,11 @@ class Stub:
 
 OFF_POLICY = [name for name, preset in agents.AGENTS.items() if issubclass(preset.cls, agents.SAC)]
 """The agents that learn from batches of a replay; ``test_ppo`` is of the one that does not."""
+
+
+def family_for(agent: str) -> str:
+    """A family whose actions an agent draws."""
+    return "finger-spin" if Gaussian in agents.AGENTS[agent].cls.policies else "tabular-mdp"
 
 
 def param(case, slow=False):

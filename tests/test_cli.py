@@ -17,7 +17,7 @@ import jax
 import numpy as np
 import pytest
 from conftest import SHORT_RUN
-from probes import FEW, OFF_POLICY, one_in
+from probes import FEW, OFF_POLICY, family_for, one_in
 
 import mtjax.evaluate
 import mtjax.train
@@ -123,7 +123,7 @@ def test_last_of_a_repeated_name_counts():
     assert (program.agent, program.learner.heads, program.plan.steps) == ("multi-head", "per-task", 2)
 
 
-PAIRS = [(env, "sac") for env in FEW] + [("finger-spin", agent) for agent in AGENTS]
+PAIRS = [(env, "sac") for env in FEW] + [(family_for(agent), agent) for agent in AGENTS]
 
 
 @pytest.mark.parametrize("env, agent", one_in(5, PAIRS))

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from needs import require
-from probes import FEW, pick, slow_but, tiny, with_nets
+from probes import FEW, family_for, pick, slow_but, tiny, with_nets
 
 import mtjax
 import mtjax.evaluate
@@ -41,7 +41,7 @@ def observations(count, env=ENV):
     return np.float32(np.random.default_rng(0).normal(size=(count, env.spec.obs_size)))
 
 
-CASES = {name: {} for name in agents.AGENTS} | {
+CASES = {name: {} for name in agents.AGENTS if family_for(name) == "finger-spin" and name != "rl2"} | {
     "care": {"normalize_observations": True},
     "text": {"conditioning": "text"},
     "input-map": {"encoder": "input-map", "conditioning": "parameters"},

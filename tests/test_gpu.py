@@ -32,6 +32,7 @@ from mtjax.agents import AGENTS
 from mtjax.agents.base import Memory
 from mtjax.agents.choices import replace
 from mtjax.agents.on_policy import Taken
+from mtjax.agents.parts.policies import Gaussian
 from mtjax.agents.parts.values import C51
 from mtjax.compiling.programs import compile_lowered
 from mtjax.config import configure
@@ -43,7 +44,7 @@ from mtjax.envs.mixtures import States
 from mtjax.envs.probes import tasks_of
 from mtjax.envs.united import United
 from mtjax.saved import checkpoint
-from mtjax.types import Spec
+from mtjax.types import Discrete, Spec
 
 pytestmark = [
     pytest.mark.gpu,
@@ -112,15 +113,24 @@ def learned(name, tasks):
 
     An update is one gradient step: each further step of Adam magnifies rounding.
     """
-    agent = mtjax.preset("finger-spin-vary-size", name, "gpu").learner
+    agent = mtjax.preset("finger-spin-vary-size", name.removeprefix("discrete-"), "gpu").learner
+    spec = spec_for(name)
+    agent = agent.for_action(spec.action)
     if not hasattr(agent, "critic_target"):
         agent = replace(agent, {"epochs": 1, "minibatches": 1, "unroll": 8})
     random = np.random.default_rng(0)
     shake = lambda x: x + np.float32(0.1 * random.normal(size=x.shape)) if x.dtype == np.float32 else x
     with on("cpu"):
-        init = jax.jit(jax.vmap(lambda key: agent.init(SPEC, tasks, key)), compiler_options=QUICK)
+        init = jax.jit(jax.vmap(lambda key: agent.init(spec, tasks, key)), compiler_options=QUICK)
         states = jax.device_get(init(jax.random.split(jax.random.key(0), SEEDS)))
-    return agent, with_nets(states, actor=jax.tree.map(shake, states.nets["actor"]))
+    acting = "actor" if "actor" in states.nets else "critic"
+    return agent, with_nets(states, **{acting: jax.tree.map(shake, states.nets[acting])})
+
+
+def spec_for(name):
+    """The shapes that an agent sees and draws; of discrete actions where it draws these."""
+    discrete = name.startswith("discrete-") or name == "pqn"
+    return SPEC._replace(action=Discrete(SPEC.action_size)) if discrete else SPEC
 
 
 def exactly(family):
@@ -322,13 +332,16 @@ def experience(agent, num_seeds, num_tasks):
     steps = jax.tree.map(lambda x: x.reshape(*x.shape[:2], 8, 8, *x.shape[3:]), batch)
     random = np.random.default_rng(0)
     raw = np.arctanh(np.clip(steps.action, -0.99, 0.99))
+    if not isinstance(agent.policy, Gaussian):
+        raw = random.integers(SPEC.action_size, size=steps.reward.shape).astype(np.int32)
+        steps = steps._replace(action=raw)
     ended = random.random(steps.reward.shape) < 0.1
     memory = Memory(None) if steps.memory is None else steps.memory
     taken = Taken(raw, random.normal(size=ended.shape).astype(np.float32) - 2)
     return steps._replace(ended=ended, closed=ended, extras=taken, memory=memory)
 
 
-@pytest.mark.parametrize("name", AGENTS)
+@pytest.mark.parametrize("name", [*AGENTS, "discrete-ppo", "discrete-rl2"])
 def test_agents_learn_as_on_the_cpu(name, num_tasks=10):
     """Losses of an update, and its gradients by what Adam remembers, seed by seed; of all seeds and of one alone.
 
@@ -378,7 +391,7 @@ def test_agents_learn_from_pictures_as_on_the_cpu(name, vision):
     require_alike(*both(updating(agent), states, data, keys, tasks))
 
 
-@pytest.mark.parametrize("name", AGENTS)
+@pytest.mark.parametrize("name", [*AGENTS, "discrete-ppo", "discrete-rl2"])
 def test_agents_act_as_on_the_cpu(name):
     """The mean actions in worlds whose tasks were seen and in others."""
     with on("cpu"):

@@ -136,7 +136,7 @@ def walk(env, plan):
             cell, found = carry
             target = jnp.where(found[0] >= 0, found, target)
             away = jnp.sum(jnp.abs(jnp.clip(cell + moves, 0, env.size - 1) - target), axis=1)
-            after = env.step(task, cell, -away / 100)
+            after = env.step(task, cell, jnp.argmin(away))
             return (after.state, jnp.where(after.reward > 0, after.state, found)), (after.reward, after.state)
 
         def episode(found, targets):

@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 from mujoco import mjx
-from probes import FEW, param
+from probes import FEW, family_for, param
 
 import mtjax
 from mtjax import names, train
@@ -136,7 +136,7 @@ def test_devices_are_found_while_the_rest_is_imported(monkeypatch):
     assert answered.wait(60) and waited == [True]
 
 
-PAIRS = [*((env, "sac") for env in FEW), *(("finger-spin", agent) for agent in AGENTS)]
+PAIRS = [*((env, "sac") for env in FEW), *((family_for(agent), agent) for agent in AGENTS)]
 
 
 @pytest.mark.parametrize("env, agent", map(param, PAIRS))
@@ -154,7 +154,9 @@ def test_flags_of_all_families_and_agents_are_known_without_jax(ours):
     for cls in {cls for cls, _ in ENVS.values()}:
         fields = run_config.shared_fields(cls)
         real |= {run_config.family_flag(field.name): isinstance(field.default, bool) for field in fields}
-    for agent, given in itertools.product(("sac", "distral", "brc", "simba-v2", "xqc", "ppo"), [{}, *choices]):
+    for agent, given in itertools.product(
+        ("sac", "distral", "brc", "simba-v2", "xqc", "ppo", "impala", "pqn"), [{}, *choices]
+    ):
         needed = {"vectors": "file.npy"} if given == {"conditioning": "vectors"} else {}
         with contextlib.suppress(InputError):  # which this agent does not go with
             made = mtjax.agent(agent, **given, **needed)
