@@ -21,8 +21,8 @@ from mtjax.saved.config_json import from_json
 from mtjax.saved.policy import state_shapes
 
 RUN = (
-    "--env=bandit --agent=sac-conditioned --seeds=2 --num-envs=2 --batch-size=4 --replay-size=200 --warmup-steps=5 "
-    "--chunk-steps=25 --eval-every=500 --eval-episodes=1 --agent.hidden 8 8"
+    "--env=bandit --env.scores --agent=sac-conditioned --seeds=2 --num-envs=2 --batch-size=4 --replay-size=200 "
+    "--warmup-steps=5 --chunk-steps=25 --eval-every=500 --eval-episodes=1 --agent.hidden 8 8"
 ).split()
 SAVE = 500  # environment steps between two checkpoints
 LONGEST = 8.0  # seconds until a process is killed, of which it takes about half to begin

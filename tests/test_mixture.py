@@ -31,7 +31,7 @@ from mtjax.networks import OVER_TASKS, Params
 from mtjax.report.tables import split_table, task_table
 from mtjax.saved.config_json import from_json, to_flags, to_json
 from mtjax.saved.folder import short_name
-from mtjax.types import SPLITS, InputError, Spec, Step, Task, Transition
+from mtjax.types import SPLITS, Discrete, InputError, Spec, Step, Task, Transition
 
 QUICK = {"xla_backend_optimization_level": 0}
 
@@ -208,7 +208,7 @@ def test_a_name_that_lacks_a_family_is_refused(name):
 
 
 def test_names_of_families_and_tasks():
-    env = mixture([make("walker-walk", vary={"friction": "0.7,1"}), "bandit", AIM])
+    env = mixture([make("walker-walk", vary={"friction": "0.7,1"}), make("bandit", scores=True), AIM])
     assert env.names == ("walker-walk", "bandit", "aim")
     assert env.labels("train")[:3] == ["walker-walk friction=0.7", "walker-walk friction=1", "bandit task=0"]
     assert env.labels("train")[-1] == "aim goal=1"
@@ -228,7 +228,7 @@ def test_names_of_families_and_tasks():
         (lambda: make("bandit+control-acrobot", num_task=2), "did you mean 'num_tasks'"),
         (lambda: mixture([]), "at least one family"),
         (lambda: make("bandit+control-acrobot").spec,
-         "bandit has discrete actions and control-acrobot has continuous actions; scores=True"),
+         "bandit has discrete actions and control-acrobot continuous ones; scores=True"),
         (lambda: mixture([make("control-cartpole", num_draws=3, combine="grid"),
                           make("control-acrobot", num_draws=2, combine="grid")]).tasks(), "num-draws"),
         (lambda: Replay(hindsight=0.5).check(BOTH, 1), "share no physics"),
@@ -360,7 +360,7 @@ def test_episodes_end_at_their_own_horizons():
 
 
 def test_discounts_follow_horizons():
-    env = mixture(["control-cartpole", "tabular-mdp"])
+    env = mixture(["control-cartpole", make("tabular-mdp", scores=True)])
     found = tiny(discounting="horizon").discounts(env.tasks())
     np.testing.assert_allclose(found, np.repeat([0.99, 0.95], 10), rtol=1e-6)
 
@@ -620,9 +620,9 @@ def test_a_run_goes_on_bit_for_bit(tmp_path, monkeypatch):
 
 def test_flags_of_families_hold_for_all_of_them(tmp_path):
     words = "--env=control-cartpole+tabular-mdp+cartpole-swingup --split=none --env.num-tasks 3 --engine=mjx --seeds=2"
-    config = run_config.parse([*words.split(), "--env.vary.cartpole-swingup.pole-mass=0.1,0.2"])
+    config = run_config.parse([*words.split(), "--env.scores", "--env.vary.cartpole-swingup.pole-mass=0.1,0.2"])
     pole, table, swingup = config.family.families  # type: ignore
-    assert (pole.num_tasks, table.num_tasks, pole.split, table.split) == (3, 3, "none", "none")
+    assert (pole.num_tasks, table.num_tasks, pole.split, table.split) == (3, 3, "none", "none") and table.scores
     assert swingup.engine == "mjx" and swingup.train_count == 2 and config.plan.seeds == 2
     assert config.training == Settings(num_envs=16)  # the default preset's
     (tmp_path / "config.json").write_text(to_json(config, {}))
@@ -643,7 +643,7 @@ def test_flags_of_families_hold_for_all_of_them(tmp_path):
 )
 def test_wrong_flags_are_refused(flag, said):
     with pytest.raises(InputError) as error:
-        config = run_config.parse(["--env=bandit+control-cartpole", flag])
+        config = run_config.parse(["--env=bandit+control-cartpole", "--env.scores", flag])
         config.learner.experience.check(config.family, 16)
     assert said in str(error.value)
 
@@ -718,3 +718,23 @@ def test_tasks_are_numbered_without_building_them(name):
         np.testing.assert_array_equal(env.numbers(split), tasks.id)
         np.testing.assert_array_equal(values, told)
         assert values.dtype == told.dtype and env.counts[split] == len(tasks.id)
+
+
+def test_families_of_discrete_actions_mix():
+    """Policies choose among the actions of each family alone, and every family steps as it does alone."""
+    env = mixture([make("bandit", num_tasks=2, num_arms=2), make("tabular-mdp", num_tasks=2)])
+    tasks = env.tasks()
+    assert env.discrete and env.spec.action == Discrete(5)
+    assert tasks.action_mask.tolist() == [[1, 1, 0, 0, 0]] * 2 + [[1] * 5] * 2
+    agent = tiny("ppo").for_action(env.spec.action)
+    state, keys = agent.init(env.spec, tasks, jax.random.key(1)), jax.random.split(jax.random.key(0), 200)
+    act = lambda task, key: agent.act(state, agent.begin(state, task), jnp.ones(env.spec.obs_size), task, key).action
+    actions = jax.vmap(jax.vmap(act, (None, 0)), (0, None))(tasks._replace(blocks=None), keys)
+    assert [np.unique(x).tolist() for x in actions] == [[0, 1]] * 2 + [[0, 1, 2, 3, 4]] * 2
+    keys = keys_of(tasks)
+    drawn = jax.random.randint(jax.random.key(2), (3, *keys.shape), 0, 2)
+    _, seen, _ = steps_of(env, tasks, keys, drawn)
+    for part in env.parts:
+        places = part.places["train"]
+        _, alone, _ = steps_of(part.family, part.family.tasks(), keys[:, places], drawn[:, :, places])
+        np.testing.assert_array_equal(seen.reward[:, :, places], alone.reward)

@@ -330,7 +330,8 @@ def with_seeds(program, count):
 def test_a_run_of_too_many_seeds_is_run_in_rounds(tmp_path, monkeypatch, capsys):
     """By the same command, with a table of all seeds, and gone on with by its folder."""
     small = "--num-envs=2 --batch-size=2 --replay-size=20 --warmup-steps=1 --eval-episodes=1 --agent.hidden 4".split()
-    words = ["--env=bandit", "--agent=sac-conditioned", "--seeds=3", "--steps=40", f"--runs={tmp_path}", *small]
+    env = ["--env=bandit", "--env.scores"]
+    words = [*env, "--agent=sac-conditioned", "--seeds=3", "--steps=40", f"--runs={tmp_path}", *small]
     program = run_config.parse(words)
     monkeypatch.setenv("MTJAX_MEMORY", f"{2.5 * memory.required_bytes(program) / 3 / 0.9 / 1e9:.12f}")
     mtjax.train.main(words)

@@ -240,9 +240,10 @@ class Mixture(Tabled):
     def _require_one_kind(self, specs: list[Spec]) -> None:
         """Refuse to mix families with continuous actions and with discrete ones."""
         kinds = {name: spec.action.kind for name, spec in zip(self.names, specs, strict=True)}
-        first = {kind: name for name, kind in reversed(kinds.items())}
-        if len(first) > 1:
-            told = " and ".join(f"{name} has {kind} actions" for kind, name in first.items())
+        (first, kind), *rest = kinds.items()
+        other = next((name for name, found in rest if found != kind), None)
+        if other is not None:
+            told = f"{first} has {kind} actions and {other} {kinds[other]} ones"
             scored = any(hasattr(family, "scores") for family in self.families)
             fix = "; scores=True (--env.scores) makes discrete ones continuous" if scored else ""
             raise InputError(f"families of a mixture act alike, as one policy draws for all: {told}{fix}")
