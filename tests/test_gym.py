@@ -41,8 +41,8 @@ inside = pytest.mark.filterwarnings("ignore:.*is different from the unwrapped ve
 
 def play(env, steps, seed=0):
     """Everything that an episode of fixed actions returns."""
-    actions = np.random.default_rng(seed).uniform(-1, 1, (steps, *env.action_space.shape)).astype(np.float32)
-    return [env.step(action) for action in actions]
+    env.action_space.seed(seed)
+    return [env.step(env.action_space.sample()) for _ in range(steps)]
 
 
 def same(one, other):
@@ -69,6 +69,18 @@ def test_gymnasium_checks_a_mujoco_family():
 def test_gymnasium_checks_native_families(family, task_obs):
     """So it does without MuJoCo, whatever is seen of the task."""
     check_env(FamilyEnv(family, task_obs=task_obs), skip_render_check=True)
+
+
+def test_discrete_actions_are_those_of_the_family():
+    """One of five numbers; many worlds take one each. With scores they are vectors."""
+    env, worlds = FamilyEnv(MDPS), FamilyVectorEnv(MDPS, 3)
+    assert env.action_space == spaces.Discrete(5) and worlds.action_space == spaces.MultiDiscrete([5] * 3)
+    assert FamilyEnv(dataclasses.replace(MDPS, scores=True)).action_space == spaces.Box(-1, 1, (5,))
+    start = env.reset(seed=0)
+    task, state = env.unwrapped._task, env.unwrapped._step.state
+    found = [MDPS.step(task, state, jnp.int32(action)).obs for action in range(5)]
+    assert start[0]["env_obs"].shape == (5,) and len(np.unique(found, axis=0)) > 1
+    np.testing.assert_array_equal(env.step(3)[0]["env_obs"], found[3])
 
 
 @unbounded
@@ -231,13 +243,13 @@ def test_a_new_task_needs_a_reset():
     for act in (lambda: None, env.reset_task_state):
         act()
         with pytest.raises(gymnasium.error.ResetNeeded):
-            env.step(np.zeros(5))
+            env.step(0)
         env.reset()
         play(env, 1)
     worlds.reset()
     worlds.set_task_state([1, 1])
     with pytest.raises(gymnasium.error.ResetNeeded):
-        worlds.step(np.zeros((2, 5)))
+        worlds.step(np.zeros(2, int))
 
 
 # Names and errors.
@@ -286,10 +298,13 @@ def test_wrong_states_and_options_are_refused():
             env.set_task_state(state)
     with pytest.raises(InputError, match="did you mean 'task_seed'"):
         env.reset(options={"task_sed": 1})
-    for steppable, shape in ((env, "(5,)"), (FamilyVectorEnv(MDPS, 2), "(2, 5)")):
+    for steppable, shape in ((env, "()"), (FamilyVectorEnv(MDPS, 2), "(2,)")):
         steppable.reset()
         with pytest.raises(InputError, match=re.escape(f"an action has the shape {shape}, not (4,)")):
             steppable.step(np.zeros(4))
+        for action in (5, -1, 0.0):
+            with pytest.raises(InputError, match=r"an action is one of .*Discrete\(.*5.*\), not"):
+                steppable.step(np.full(steppable.action_space.shape, action))
     with pytest.raises(InputError, match="at least 1"):
         NTasks(env, 0)
     with pytest.raises(InputError, match="only 6 different tasks for a bag of 7"):

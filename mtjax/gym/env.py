@@ -15,7 +15,7 @@ from mtjax.envs.pixels import Pictured
 from mtjax.gym.tasks import TaskStream, TaskTable, read_options
 from mtjax.names import nearest_error
 from mtjax.report import render
-from mtjax.types import Array, Env, InputError, Step, Task
+from mtjax.types import Array, Discrete, Env, InputError, Step, Task
 
 MTENV_IDS = {
     "MT-CartPole-v0": "control-cartpole",
@@ -73,11 +73,12 @@ def draw_seeds(random: np.random.Generator, *shape: int) -> np.ndarray:
     return random.integers(2**32, size=(*shape, 2), dtype=np.uint32)
 
 
-def spaces_of(family: Env, table: TaskTable) -> tuple[spaces.Dict, spaces.Box]:
+def spaces_of(family: Env, table: TaskTable) -> tuple[spaces.Dict, spaces.Space]:
     """Return the observation space and the action space of one world."""
-    obs = _space_of(family.spec.obs)
-    action = spaces.Box(-1.0, 1.0, (family.spec.action_size,), np.float32)
-    return spaces.Dict({"env_obs": obs, "task_obs": table.space}), action
+    obs, action = _space_of(family.spec.obs), family.spec.action
+    discrete = isinstance(action, Discrete)
+    actions = spaces.Discrete(action.size) if discrete else spaces.Box(-1.0, 1.0, action.shape, np.float32)
+    return spaces.Dict({"env_obs": obs, "task_obs": table.space}), actions
 
 
 def _space_of(obs: Any) -> spaces.Space:
@@ -102,11 +103,17 @@ def played(family: Env) -> Any:
 
 
 def read_action(action: Any, space: spaces.Space) -> np.ndarray:
-    """Return actions as float32, or raise InputError if their shape is not that of the space."""
-    action = np.asarray(action, np.float32)
+    """Return actions as float32, or as int32 if they are discrete.
+
+    Raises:
+        InputError: their shape is not that of the space, or they are none of the choices.
+    """
+    action, chosen = np.asarray(action), np.issubdtype(space.dtype, np.integer)
     if action.shape != space.shape:
         raise InputError(f"an action has the shape {space.shape}, not {action.shape}")
-    return action
+    if chosen and not (np.issubdtype(action.dtype, np.integer) and space.contains(action.astype(space.dtype)[()])):
+        raise InputError(f"an action is one of {space}, not {action}")
+    return action.astype(np.int32 if chosen else np.float32)
 
 
 def family_named(name: str, settings: dict[str, Any]) -> Env:
