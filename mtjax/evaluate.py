@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from mtjax.checks import require_episodes, require_run
 from mtjax.command import imports, parsing, process, refusals, words
-from mtjax.names import SPLITS, InputError, become, load, nearest_error
+from mtjax.names import SPLITS, InputError, become, command, load, nearest_error
 from mtjax.saved import shipped
 
 
@@ -50,6 +50,7 @@ class Request:
         return None if self.task_seed == -1 else self.task_seed
 
 
+@command
 def main(argv: Sequence[str]) -> None:
     """Read the command line first, then import the evaluation code and score the run."""
     request, vary = _parse(argv)

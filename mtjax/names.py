@@ -4,10 +4,12 @@ import contextlib
 import difflib
 import functools
 import os
+import re
 import sys
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextvars import ContextVar
 from importlib import import_module
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -20,6 +22,11 @@ PRESETS = ("auto", "cpu", "gpu")
 BEGAN = time.time()
 """When this process began to import the package, in seconds since 1970."""
 _MANY = 20
+_IN_COMMAND = ContextVar("in_command", default=False)
+_VARY = re.compile(r"--env\.vary\.([\w.-]+)=([^\s;)]+)")
+_FLAG = re.compile(r"(?<![\w-])--(?:env\.|agent\.)?([a-z][a-z-]*[a-z])(?:=([^\s,;:)]*[^\s,;:).]))?(?![\w-]|\.\w)")
+_OTHER_NAMES = {"from": "start", "distributed": "jax.distributed"}  # flag -> argument
+_ONLY_FLAGS = ("config", "help", "import", "list", "no-deps", "resume", "run", "runs", "sweep", "video")
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -150,10 +157,40 @@ def become(module: str, place: str) -> None:
     sys.modules[module] = function
 
 
+def command(main: Callable[P, R]) -> Callable[P, R]:
+    """Let the messages of a command name flags, though it calls what is public in Python."""
+
+    @functools.wraps(main)
+    def called(*args: P.args, **kwargs: P.kwargs) -> R:
+        before = _IN_COMMAND.set(True)
+        try:
+            return main(*args, **kwargs)
+        finally:
+            _IN_COMMAND.reset(before)
+
+    return called
+
+
+def in_python(message: str) -> str:
+    """Return a message in which flags are written as the arguments of Python, such as engine='mjx' for --engine=mjx."""
+    vary = _VARY.sub(r"vary={'\1': '\2'}", message)
+    return _FLAG.sub(lambda flag: _as_argument(flag[0], flag[1], flag[2]), vary)
+
+
+def _as_argument(flag: str, name: str, value: str | None) -> str:
+    if name in _ONLY_FLAGS:
+        return flag
+    name = _OTHER_NAMES.get(name, name.replace("-", "_"))
+    if value is None:
+        return name
+    as_is = value.isupper() or re.fullmatch(r"[\d.e-]+", value)  # a word to fill in, or a number
+    return f"{name}={value}" if as_is else f"{name}={value!r}"
+
+
 def public(function: Callable[P, R]) -> Callable[P, R]:
     """Let a user's mistake end at the user's own line: an InputError passes without the frames of this package.
 
-    ``MTJAX_TRACEBACK=full`` keeps them.
+    ``MTJAX_TRACEBACK=full`` keeps them. Outside commands its message names arguments, not flags.
     """
 
     @functools.wraps(function)
@@ -162,6 +199,8 @@ def public(function: Callable[P, R]) -> Callable[P, R]:
         try:
             return function(*args, **kwargs)
         except InputError as error:
+            if not _IN_COMMAND.get():
+                error.args = (in_python(error.args[0]), *error.args[1:])
             if os.environ.get("MTJAX_TRACEBACK") == "full":
                 raise
             raise error.with_traceback(None) from error.__cause__

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 
 from mtjax.command import imports, parsing, process, refusals
-from mtjax.names import SPLITS, InputError, become, load, nearest_error
+from mtjax.names import SPLITS, InputError, become, command, load, nearest_error
 
 FIGURES = ("curves", "families", "parameter", "iqm", "profile", "improvement", "all")
 ENDINGS = (".png", ".pdf", ".svg")
@@ -31,6 +31,7 @@ class Request:
     """The file to write, which ends with .png, .pdf or .svg; by default the figure's name and .png."""
 
 
+@command
 def main(argv: Sequence[str]) -> None:
     """Read the command line first, then import the code that draws."""
     argv = imports.import_files(argv)

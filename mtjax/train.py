@@ -3,9 +3,10 @@
 from collections.abc import Sequence
 
 from mtjax.command import flag_files, help, imports, process, refusals
-from mtjax.names import become, load
+from mtjax.names import become, command, load
 
 
+@command
 def main(argv: Sequence[str]) -> None:
     """Check names and flags first, then import the training code and run the command line."""
     flags = flag_files.expand(argv)

@@ -17,6 +17,7 @@ from mtjax import agents, checks, envs
 from mtjax.command import keywords, run_config
 from mtjax.config import Plan, with_preset
 from mtjax.loop import Settings
+from mtjax.names import in_python
 from mtjax.report import collect, curve
 from mtjax.saved.config_json import from_json
 from mtjax.training import memory
@@ -123,7 +124,7 @@ def test_a_refused_run_leaves_no_folder(short_family, tmp_path, monkeypatch):
     """So that the same command with smaller numbers finds none in its way."""
     monkeypatch.setattr(memory, "physical_bytes", lambda: 1e4)
     for _ in range(2):
-        with pytest.raises(InputError, match="lower --"):
+        with pytest.raises(InputError, match=r"lower (replay_size|hidden|num_envs)"):
             mtjax.train("finger-short", "sac", steps=1000, directory=tmp_path / "run")
     assert not list(tmp_path.iterdir())
 
@@ -187,6 +188,8 @@ WRONG = [
     ((ENV, "sac"), {"sweep": {"actor_lr": ["x"]}}, "a sweep gives numbers to actor_lr, and 'x' is none"),
     ((ENV, "sac"), {"sweep": {"num_critics": [1, 2]}}, "num_critics cannot vary inside one program; train once"),
     ((ENV, "sac"), {"start": "nowhere"}, "'nowhere' is not a run"),
+    ((ENV, "drq"), {}, "give pixels=64, or for states use agent='sac-conditioned', to which representation='encoded'"),
+    ((ENV, "sac"), {"tune": "critics"}, "tune='critics' leaves the rest as a run left it; say which run: start=RUN"),
     ((ENV, "sac"), {"on_chunk": 3}, "on_chunk is a function of a row of metrics, not 3"),
     ((Probe("delayed"), tiny("sac")), {"directory": "x"}, "an environment derived from Family"),
 ]
@@ -200,6 +203,27 @@ def test_wrong_arguments_are_refused_in_a_line(words, given, said, tmp_path, mon
         mtjax.train(*words, **given)
     assert said in str(error.value) and "\n" not in str(error.value)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_command_names_its_flags():
+    """Though it calls the functions that name arguments in Python."""
+    with pytest.raises(InputError, match=r"give --env\.pixels=64, or for states use --agent=sac-conditioned"):
+        mtjax.train.main([f"--env={ENV}", "--agent=drq"])
+
+
+@pytest.mark.parametrize(
+    "flags, arguments",
+    [
+        ("use --engine=c or --engine=warp", "use engine='c' or engine='warp'"),
+        ("lower --replay-size, --num-envs or --seeds.", "lower replay_size, num_envs or seeds."),
+        ("leave out --env.pixels and --agent.encoder-tau=0.5.", "leave out pixels and encoder_tau=0.5."),
+        ("give --env.vary.size=0.9:1.1:5; or --from=RUN", "give vary={'size': '0.9:1.1:5'}; or start=RUN"),
+        ("pip install --no-deps x, --import=FILE.py", "pip install --no-deps x, --import=FILE.py"),
+    ],
+)
+def test_flags_are_written_as_arguments(flags, arguments):
+    """Names with underscores, and words as text; what is no argument stays."""
+    assert in_python(flags) == arguments
 
 
 @pytest.mark.parametrize(

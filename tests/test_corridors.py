@@ -383,7 +383,7 @@ def test_films_look_through_the_walker_s_eye_at_the_walls_of_the_task():
         ({"vary": {"goal-colour": "3"}}, "goal-colour must be greater than -1 and at most 2, not 3"),
         ({"vary": {"goal-colour": "0,1", "layout": "0,1"}, "combine": "random"}, "goal-colour has names"),
         ({"vary": {"camera-angle": "0,9"}, "pixels": 64}, "unknown parameter 'camera-angle'"),
-        ({"vary": {"hue": "0,9"}}, "hue changes only what is seen; add --env.pixels=64"),
+        ({"vary": {"hue": "0,9"}}, "hue changes only what is seen; add pixels=64"),
         ({"pixels": 64, "painter": "caster", "cells": 6}, "at most 63 geoms, .* use --env.painter=auto"),
     ],
 )

@@ -349,10 +349,10 @@ def test_a_policy_that_was_trained_beside_the_state_acts_by_pictures_alone(tmp_p
 @pytest.mark.parametrize(
     ("env", "agent", "message"),
     [
-        (Pictured(), mtjax.agent("sac"), "use --agent=drq or, with another agent, --agent.representation=encoded"),
-        (Pictured(), mtjax.agent("drq", representation="asymmetric"), "give --env.pixels=64 --env.state=also"),
-        (Probe(), mtjax.agent("ppo", representation="asymmetric"), "give --env.pixels=64 --env.state=also"),
-        (BESIDE, mtjax.agent("deepmdp"), "leave out --env.state=also"),
+        (Pictured(), mtjax.agent("sac"), "use agent='drq' or, with another agent, representation='encoded'"),
+        (Pictured(), mtjax.agent("drq", representation="asymmetric"), "give pixels=64 state='also'"),
+        (Probe(), mtjax.agent("ppo", representation="asymmetric"), "give pixels=64 state='also'"),
+        (BESIDE, mtjax.agent("deepmdp"), "leave out state='also'"),
         (Pictured(), mtjax.agent("drq", conditioning="inferred"), "cannot be inferred from pictures"),
     ],
 )
@@ -365,14 +365,14 @@ def test_observations_that_no_part_takes_are_refused(env, agent, message):
 def test_agents_for_pictures_do_not_learn_from_states_in_silence(agent):
     """Refused with what to do. The encoder of states that is named there is allowed."""
     name = agent if isinstance(agent, str) else "drq"
-    said = f"{name} learns from pictures, and pendulum-swingup shows none: give --env.pixels=64, or for states use"
+    said = f"{name} learns from pictures, and pendulum-swingup shows none: give pixels=64, or for states use"
     with pytest.raises(InputError, match=said):
         mtjax.train("pendulum-swingup", agent, steps=100)
     check(with_preset("pendulum-swingup", "sac-conditioned", agent_settings={"representation": "encoded"}))
 
 
 def test_a_run_is_refused_before_its_folder_is_made(tmp_path):
-    with pytest.raises(InputError, match=r"give --env.pixels=64 --env.state=also"):
+    with pytest.raises(InputError, match=r"give pixels=64 state='also'"):
         mtjax.train("pendulum-swingup", "drq", representation="asymmetric", directory=tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
@@ -435,7 +435,7 @@ def test_pictures_need_warm_up_steps_for_a_window():
 
 def test_pictures_need_episodes_of_two_steps():
     """The picture after a step that a time limit cuts off is nowhere, so of single steps none could be drawn."""
-    with pytest.raises(InputError, match=r"takes two steps; lower --env.repeat"):
+    with pytest.raises(InputError, match=r"takes two steps; lower repeat"):
         mtjax.train("pendulum-swingup", "drq", pixels=16, repeat=1000, steps=20, num_envs=2, warmup_steps=10)
 
 

@@ -129,7 +129,7 @@ def test_painter_warp_has_one_sky(monkeypatch):
     """And a sky of another colour than the model's, if it is the same for all tasks."""
     for name in ("is_nvidia", "warp_installed"):
         monkeypatch.setattr(f"mtjax.envs.painters.base.{name}", lambda: True)
-    with pytest.raises(InputError, match=r"one sky for all tasks; use --env.painter=caster"):
+    with pytest.raises(InputError, match=r"one sky for all tasks; use painter='caster'"):
         pictured(painter="warp", vary=(("sky-hue", "0,90"),))
     assert pictured(painter="warp", vary=(("sky-hue", "90"),)).values["sky-hue"][0] == 90
 
@@ -189,16 +189,16 @@ def test_every_family_that_can_be_seen_has_a_scene(family):
     [
         ("brax-ant", {"pixels": 64}, "no scene to draw, which pixels needs; take a family such as cheetah-run"),
         ("tabular-mdp", {"repeat": 2}, "no scene to draw, which repeat needs"),
-        pytest.param("metaworld-reach", {"pixels": 64}, "leave out --env.pixels", marks=needs("metaworld")),
+        pytest.param("metaworld-reach", {"pixels": 64}, "leave out pixels", marks=needs("metaworld")),
         ("finger-spin", {"pixels": 63}, "an even number from 16 to 512, not 63"),
         ("finger-spin", {"pixels": 8}, "an even number from 16"),
         ("finger-spin", {"frames": 0}, "frames must be from 1 to 16"),
         ("finger-spin", {"repeat": 3}, "must divide the 1000 steps of an episode, such as 1, 2, 4, 5; not 3"),
-        ("finger-spin", {"vary": {"hue": "0,90"}}, "hue changes only what is seen; add --env.pixels=64"),
+        ("finger-spin", {"vary": {"hue": "0,90"}}, "hue changes only what is seen; add pixels=64"),
         ("finger-spin", {"grey": True}, "grey changes only what is seen"),
         ("finger-spin", {"pixels": 64, "state": "too"}, "unknown state 'too'"),
         ("finger-spin", {"pixels": 64, "painter": "oil"}, "unknown painter 'oil'"),
-        ("finger-spin", {"pixels": 64, "painter": "warp"}, "needs an NVIDIA GPU; use --env.painter=caster"),
+        ("finger-spin", {"pixels": 64, "painter": "warp"}, "needs an NVIDIA GPU; use painter='caster'"),
     ],
 )
 def test_what_cannot_be_is_refused(name, settings, message):

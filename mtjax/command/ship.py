@@ -1,10 +1,11 @@
 """``python -m mtjax.command.ship RUN ENV/AGENT``: add the policy of a run's first seed to those of the package."""
 
 from mtjax.command import process
-from mtjax.names import InputError
+from mtjax.names import InputError, command
 from mtjax.saved import ship, shipped
 
 
+@command
 def main(argv: list[str]) -> None:
     """Add the policy of a run to those of the package."""
     if len(argv) != 2 or argv[1].count("/") != 1:
