@@ -3,6 +3,7 @@
 import gc
 import hashlib
 import os
+import re
 import resource
 import shutil
 import threading
@@ -303,6 +304,24 @@ def test_a_checkpoint_of_another_run_is_told_by_name(finished_run, settings, see
     like = jax.eval_shape(lambda: loop.init(program.family, agent, program.training, tasks, jnp.arange(seeds)))
     with pytest.raises(InputError, match=f"150' is of another run: {said}"):
         checkpoint.load(finished_run / "checkpoints", like)
+
+
+@pytest.mark.parametrize(
+    "number, version", [("", "an earlier version of mtjax (format 1"), ("9", "a later version of mtjax (format 9")]
+)
+def test_a_checkpoint_of_another_version_is_told(copied_run, shapes, number, version):
+    """If its arrays are others. While they are the same, it is read."""
+    folder = copied_run / "checkpoints" / "150"
+    file, sums = folder / "format.txt", folder / "checksums.txt"
+    digest, (line,) = hashlib.sha256(number.encode()).hexdigest(), re.findall(r".*  format\.txt\n", sums.read_text())
+    sums.write_text(sums.read_text().replace(line, f"{digest}  format.txt\n" if number else ""))
+    file.write_text(number) if number else file.unlink()
+    assert int(checkpoint.load(copied_run / "checkpoints", shapes).iteration) == 150
+    other = shapes._replace(agent=jax.tree.map(lambda x: jax.ShapeDtypeStruct((*x.shape, 2), x.dtype), shapes.agent))
+    said = f"150' was made by {version}, this one reads {checkpoint._FORMAT})"
+    for read in (checkpoint.load, checkpoint.load_agent):
+        with pytest.raises(InputError, match=re.escape(said)):
+            read(copied_run / "checkpoints", other)
 
 
 def test_stray_folders_are_ignored(copied_run, shapes):

@@ -3,8 +3,8 @@
 A run's ``checkpoints`` folder holds the newest two, each in a folder named after its iteration. A checkpoint is written
 under another name, and gets its own name last: whatever ends a run, a folder with a number for a name is whole. Disks
 and copies damage files later. The checksums tell, and then the checkpoint before is used. Every checkpoint holds a copy
-of the run's config.json, which tells whether that was edited or damaged. A resumed run continues bit for bit, but on
-MuJoCo Warp.
+of the run's config.json, which tells whether that was edited or damaged, and the number of its format, which tells
+of other versions. A resumed run continues bit for bit, but on MuJoCo Warp.
 """
 
 import errno
@@ -29,6 +29,8 @@ from mtjax.types import InputError
 
 _KEPT = 2
 _RECORD = "config.json"  # beside the folder of checkpoints
+_FORMAT = 2  # counts the changes of the training state's structure
+_FORMAT_FILE = "format.txt"  # checkpoints without one are of format 1
 _SUMS = "checksums.txt"  # as of sha256sum, by which users can check them too
 _LINE = re.compile(r"([0-9a-f]{64})  (.+)")
 _UNFINISHED = ("*.new", "*.orbax-checkpoint-tmp")  # what a killed process leaves
@@ -125,6 +127,7 @@ def _finish(written: arrays.Written, record: bytes | None, new: Path, folder: Pa
         arrays.require_readable(new, parts)
         if record is not None:
             (new / _RECORD).write_bytes(record)
+        (new / _FORMAT_FILE).write_text(f"{_FORMAT}\n")
         names = sorted(_files(new))
         (new / _SUMS).write_text("".join(f"{digest}  {name}\n" for name, digest in _digests(new, names).items()))
         new.rename(folder)
@@ -173,7 +176,7 @@ def load(directory: Path, like: TrainState) -> TrainState:
     folder = hosts.broadcast_path(lambda: _newest_whole(directory, like_parts))
     if hosts.is_first():
         tell_edits(directory.parent / _RECORD, folder / _RECORD)
-    read = arrays.read(folder, like_parts)
+    read = _read(folder, like_parts)
     return read["loop"]._replace(agent=read["agent"])
 
 
@@ -186,7 +189,7 @@ def load_agent(directory: Path, like: TrainState, iteration: int = 0) -> Any:
     parts = {"agent": like.agent}
     folder = _of_iteration(directory, iteration, parts) if iteration else _newest_whole(directory, parts)
     tell_edits(directory.parent / _RECORD, folder / _RECORD)
-    return arrays.read(folder, parts)["agent"]
+    return _read(folder, parts)["agent"]
 
 
 def _of_iteration(directory: Path, iteration: int, parts: Iterable[str]) -> Path:
@@ -203,7 +206,23 @@ def _of_iteration(directory: Path, iteration: int, parts: Iterable[str]) -> Path
 def load_ring(directory: Path, like: TrainState) -> Ring:
     """Read only the replay's ring buffer, without the worlds and the agent."""
     parts = {"loop": {"data": {"ring": like.data.ring}}}
-    return arrays.read(_newest_whole(directory, parts), parts, partial=True)["loop"]["data"]["ring"]
+    return _read(_newest_whole(directory, parts), parts, partial=True)["loop"]["data"]["ring"]
+
+
+def _read(folder: Path, parts: Mapping[str, Any], partial: bool = False) -> dict[str, Any]:
+    """Read parts of a whole checkpoint. One that does not fit is told to be of another version if it is."""
+    try:
+        return arrays.read(folder, parts, partial)
+    except InputError:
+        file = folder / _FORMAT_FILE
+        number = int(file.read_text()) if file.is_file() else 1
+        if number == _FORMAT:
+            raise
+        version = "an earlier" if number < _FORMAT else "a later"
+        raise InputError(
+            f"the checkpoint {str(folder)!r} was made by {version} version of mtjax (format {number}, this one reads "
+            f"{_FORMAT})"
+        ) from None
 
 
 def set_aside(directory: Path, iteration: int) -> None:
