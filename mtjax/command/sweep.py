@@ -23,7 +23,7 @@ from mtjax.command.run_config import parse
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import RunConfig
 from mtjax.evaluation import Evaluations
-from mtjax.report import figures
+from mtjax.report.curve import draw
 from mtjax.report.stats import seed_interval
 from mtjax.saved import checkpoint, lock
 from mtjax.saved.config_json import from_json, import_flags
@@ -229,7 +229,9 @@ def run_unfinished(folder: Path) -> None:
             grow = lambda _: _write_table(folder, runs)
             result = launch(config, Hooks(run, start, resume, on_evaluation=grow, label=label))
             if result.finished:
-                _draw(config, run)
+                settings = [_values(config, point) for point in config.points or ({},)]
+                labels = [", ".join(f"{name} {value}" for name, value in values.items()) for values in settings]
+                draw(config, evaluations_of(config, run), run, labels)
             signal = 0 if result.finished and run == runs[-1] else result.signal
         except FloatingPointError as error:
             print(f"{label}: {error}", flush=True)
@@ -248,19 +250,6 @@ def _write_table(folder: Path, runs: Sequence[Path]) -> None:
     new.unlink(missing_ok=True)
     append_rows(new, rows(runs))
     os.replace(new, folder / "sweep.csv")
-
-
-def _draw(config: RunConfig, run: Path) -> None:
-    """Draw training return over steps, one line per setting. Settings with a diverged seed are left out."""
-    evaluations, count = evaluations_of(config, run), config.plan.seeds
-    curves = {}
-    for p, point in enumerate(config.points or ({},)):
-        returns = evaluations.returns["train"][p * count : (p + 1) * count]
-        if np.isfinite(returns).all():
-            curves[", ".join(f"{name} {value}" for name, value in _values(config, point).items())] = returns
-    if curves:
-        title = f"{config.agent} on {short_name(config.env)}"
-        figures.learning_curve(run / "curve.png", evaluations.steps, curves, title, config.warmup)
 
 
 def final_evaluations(config: RunConfig, run: Path) -> Evaluations | None:

@@ -1,5 +1,6 @@
 """The learning curve in the folder of a run."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,15 +12,20 @@ from mtjax.report import figures
 from mtjax.saved.folder import short_name
 
 
-def draw(config: RunConfig, evaluations: Evaluations, directory: Path) -> None:
-    """Draw a run's returns over its steps into curve.png, one line per split; of a sweep, one per point."""
-    count = config.plan.seeds
+def draw(config: RunConfig, evaluations: Evaluations, directory: Path, labels: Sequence[str] = ()) -> None:
+    """Draw a run's returns over its steps into curve.png: a line for each split, or in a sweep for each point.
+
+    Lines with a diverged seed are left out.
+
+    Args:
+        labels: what the lines of a sweep's points are called; by default their values.
+    """
     if not len(evaluations.steps) or not hosts.is_first():
         return
-    curves = evaluations.returns
-    for p, point in enumerate(config.points):
-        named = ", ".join(f"{name} {value:g}" for name, value in point.items())
-        curves = {**(curves if p else {}), named: evaluations.returns["train"][p * count : (p + 1) * count]}
+    count, train = config.plan.seeds, evaluations.returns["train"]
+    labels = labels or [", ".join(f"{name} {value:g}" for name, value in point.items()) for point in config.points]
+    of_points = {label: train[p * count : (p + 1) * count] for p, label in enumerate(labels)}
+    curves = of_points or evaluations.returns
     known = {name: x for name, x in curves.items() if np.isfinite(x).all()}
     if known:
         title = f"{config.agent} on {short_name(config.env)}"
