@@ -10,7 +10,7 @@ import jax
 from jax.sharding import Mesh, NamedSharding
 
 from mtjax.compiling import traced
-from mtjax.envs.tabled import Tabled
+from mtjax.envs.task_table import Tabled
 from mtjax.evaluation import evaluate
 from mtjax.loop import TrainState, init, run_chunk
 from mtjax.parallel.mesh import BY_SEED, BY_WORLD, REPLICATED

@@ -15,7 +15,7 @@ import tyro
 from mtjax.checks import require_values
 from mtjax.envs import variation
 from mtjax.envs.parameters import Parameter
-from mtjax.envs.tabled import Part, Table, Tabled
+from mtjax.envs.task_table import Part, Table, Tabled
 from mtjax.maps import Flat
 from mtjax.names import first_sentence
 from mtjax.types import SPLITS, Array, Continuous, Discrete, InputError, Key, Spec, Step, Task, Transition

@@ -19,7 +19,7 @@ from mtjax import frames
 from mtjax.envs.family import Family
 from mtjax.envs.groups import SCENES, Group, grouped
 from mtjax.envs.joined import take
-from mtjax.envs.tabled import Part, Table, Tabled
+from mtjax.envs.task_table import Part, Table, Tabled
 from mtjax.names import nearest_error
 from mtjax.types import SPLITS, Array, InputError, Key, Spec, Step, Task
 

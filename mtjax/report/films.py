@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from mtjax.envs.pixels import Pictured
-from mtjax.envs.tabled import Part, Tabled
+from mtjax.envs.task_table import Part, Tabled
 from mtjax.evaluation import Recording, record
 from mtjax.names import InputError
 from mtjax.report import render

@@ -15,7 +15,7 @@ from mtjax.checks import path, require_episodes
 from mtjax.compiling.programs import compile_lowered, enable_compile_cache, trace
 from mtjax.envs import Family
 from mtjax.envs.pixels import Pictured
-from mtjax.envs.tabled import Tabled
+from mtjax.envs.task_table import Tabled
 from mtjax.evaluation import Scores, of_tasks
 from mtjax.names import nearest_error, public
 from mtjax.report import diagnostics, figures, films

@@ -7,7 +7,7 @@ import numpy as np
 
 from mtjax import trials
 from mtjax.envs.family import Family
-from mtjax.envs.tabled import Part
+from mtjax.envs.task_table import Part
 from mtjax.evaluation import Evaluations, Scores, of_tasks
 from mtjax.report.stats import seed_interval
 from mtjax.saved.policy import Policy

@@ -13,7 +13,7 @@ import numpy as np
 
 from mtjax.envs.choosing import Choosing
 from mtjax.envs.parameters import Parameter
-from mtjax.envs.tabled import Table
+from mtjax.envs.task_table import Table
 from mtjax.types import SPLITS, Array, InputError, Key, Step, Task
 
 _MOST_HELD_OUT = 10
