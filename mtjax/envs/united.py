@@ -1,4 +1,4 @@
-"""A simulator that families of different scenes share: one scene with the things of all (``union``)."""
+"""A simulator that families of different scenes share: one scene with the things of all (``merged_scene``)."""
 
 import copy
 import dataclasses
@@ -13,7 +13,7 @@ from mtjax.envs.engines.base import Engine, World, some
 from mtjax.envs.engines.c import MujocoC
 from mtjax.envs.engines.warp import Warp
 from mtjax.envs.joined import Joined, Of, reset_apart
-from mtjax.envs.union import Places, Union, compose
+from mtjax.envs.merged_scene import Places, Union, compose
 from mtjax.types import Array, Key, Step, Task
 
 
