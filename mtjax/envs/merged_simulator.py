@@ -41,7 +41,7 @@ class United(Joined):
     def _body_pos(self) -> np.ndarray:
         """Return where bodies (R, nbody, 3) are in the rows of all members' tables. Things of other scenes are parked.
 
-        The models of one union differ in nothing else (``groups``).
+        The models of one union differ in nothing else (``simulator_groups``).
         """
         rows = []
         for i, domain in self.members.items():
