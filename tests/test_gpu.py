@@ -39,10 +39,10 @@ from mtjax.config import configure
 from mtjax.envs.engines.base import World
 from mtjax.envs.engines.c import MujocoC
 from mtjax.envs.engines.mjx import Mjx
-from mtjax.envs.joined import Joined
 from mtjax.envs.merged_simulator import United
 from mtjax.envs.mixtures import States
 from mtjax.envs.probes import tasks_of
+from mtjax.envs.shared_simulator import Joined
 from mtjax.saved import checkpoint
 from mtjax.types import Discrete, Spec
 

@@ -10,8 +10,8 @@ import pytest
 from needs import needs
 
 import mtjax
-from mtjax.envs.joined import Alone, Joined
 from mtjax.envs.mixtures import Mixture
+from mtjax.envs.shared_simulator import Alone, Joined
 from mtjax.rollout import broadcast_tasks
 
 STEPS, WORLDS = 3, 2

@@ -17,9 +17,9 @@ import mtjax
 from mtjax import rollout
 from mtjax.command import run_config
 from mtjax.envs import groups
-from mtjax.envs.joined import Alone, Joined
 from mtjax.envs.merged_simulator import United
 from mtjax.envs.metaworld.names import BENCHMARKS, TASKS
+from mtjax.envs.shared_simulator import Alone, Joined
 from mtjax.envs.things import Scene
 from mtjax.saved.config_json import from_json, to_flags, to_json
 from mtjax.types import Acted, InputError

@@ -12,8 +12,8 @@ import numpy as np
 from mtjax.envs.engines.base import Engine, World, some
 from mtjax.envs.engines.c import MujocoC
 from mtjax.envs.engines.warp import Warp
-from mtjax.envs.joined import Joined, Of, reset_apart
 from mtjax.envs.merged_scene import Places, Union, compose
+from mtjax.envs.shared_simulator import Joined, Of, reset_apart
 from mtjax.types import Array, Key, Step, Task
 
 

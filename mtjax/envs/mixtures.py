@@ -18,7 +18,7 @@ import tyro
 from mtjax import frames
 from mtjax.envs.family import Family
 from mtjax.envs.groups import SCENES, Group, grouped
-from mtjax.envs.joined import take
+from mtjax.envs.shared_simulator import take
 from mtjax.envs.task_table import Part, Table, Tabled
 from mtjax.names import nearest_error
 from mtjax.types import SPLITS, Array, InputError, Key, Spec, Step, Task
