@@ -38,8 +38,8 @@ from steps_per_second import Contestant, physics_of_family
 
 import mtjax
 from mtjax.envs.engines.base import ENGINES
-from mtjax.envs.groups import SCENES
 from mtjax.envs.metaworld.names import BENCHMARKS, TASKS
+from mtjax.envs.simulator_groups import SCENES
 from mtjax.names import load
 
 _HEAD = "task engine goals end any_step original_end original_any_step goals_that_differ".split()

@@ -19,7 +19,7 @@ from steps_per_second import Contestant, physics_of_family
 
 import mtjax
 from mtjax.envs import BENCHMARKS
-from mtjax.envs.groups import SCENES
+from mtjax.envs.simulator_groups import SCENES
 
 
 def main() -> None:

@@ -16,7 +16,6 @@ from test_metaworld import made
 import mtjax
 from mtjax import rollout
 from mtjax.command import run_config
-from mtjax.envs import groups
 from mtjax.envs.merged_simulator import United
 from mtjax.envs.metaworld.names import BENCHMARKS, TASKS
 from mtjax.envs.shared_simulator import Alone, Joined

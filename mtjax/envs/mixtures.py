@@ -17,8 +17,8 @@ import tyro
 
 from mtjax import frames
 from mtjax.envs.family import Family
-from mtjax.envs.groups import SCENES, Group, grouped
 from mtjax.envs.shared_simulator import take
+from mtjax.envs.simulator_groups import SCENES, Group, grouped
 from mtjax.envs.task_table import Part, Table, Tabled
 from mtjax.names import nearest_error
 from mtjax.types import SPLITS, Array, InputError, Key, Spec, Step, Task
