@@ -23,7 +23,7 @@ from mtjax import register
 from mtjax.agents import AGENTS, PARTS
 from mtjax.agents.parts.knowing import Parameters
 from mtjax.command import help, keywords, run_config
-from mtjax.envs import ENVS, Domain, Parameter, declared, effects
+from mtjax.envs import ENVS, Domain, Parameter, effects, registration_checks
 from mtjax.envs.brax import Brax
 from mtjax.saved.config_json import to_flags, to_json
 from mtjax.tasks import episode_task
@@ -310,7 +310,7 @@ def test_a_brax_family_with_a_reward_of_its_own_is_accepted(forget):
 
 @pytest.mark.parametrize("name", slow_but([name for name in ENVS if name.startswith("brax-")], "brax-fast"))
 def test_every_family_of_brax_passes_the_check(name):
-    declared.check(mtjax.make(name))
+    registration_checks.check(mtjax.make(name))
 
 
 @pytest.mark.parametrize(
@@ -318,7 +318,7 @@ def test_every_family_of_brax_passes_the_check(name):
 )  # whose model is no file of ours
 def test_every_family_of_the_package_passes_the_check(name):
     """So that the check asks for nothing that a family need not have."""
-    declared.check(mtjax.make(name))
+    registration_checks.check(mtjax.make(name))
 
 
 @pytest.mark.parametrize("name", [name for name in QUICK if name not in METAWORLD])

@@ -415,7 +415,7 @@ def register(name: str, family: "type[Family]", **settings: Any) -> None:
     ENVS[name] = (family, settings)
     try:
         made = make(name)
-        load("mtjax.envs.declared:check")(made)
+        load("mtjax.envs.registration_checks:check")(made)
         load("mtjax.envs.effects:require_effects")(made)
     except TypeError as error:  # an abstract method is missing
         del ENVS[name]
