@@ -30,7 +30,7 @@ import mtjax
 import mtjax.train
 from mtjax import loop
 from mtjax.command import process, run_config
-from mtjax.compiling import traced
+from mtjax.compiling import trace_cache
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import Plan, fit_chunk
 from mtjax.evaluation import load_evaluations, save_evaluations
@@ -812,4 +812,4 @@ def test_compile_cache_follows_the_environment(monkeypatch, place, folder):
     monkeypatch.setenv("MTJAX_CACHE", place)
     enable_compile_cache()
     assert updates.get("jax_compilation_cache_dir") == folder
-    assert traced._folder == ([pathlib.Path(folder, "traced")] if folder else [])
+    assert trace_cache._folder == ([pathlib.Path(folder, "traced")] if folder else [])

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 import mtjax
-from mtjax.compiling import programs, traced
+from mtjax.compiling import programs, trace_cache
 from mtjax.envs.mixtures import Blocks, States
 
 # Runs a command and says, as the last line of its output, how often the steps of programs were traced.
@@ -104,7 +104,9 @@ def run(program, setting=None, given=None, donated=(), env=INSIDE):
     """Trace by the cache as a new process would, and call."""
     jax.clear_caches()
     given = given or arguments()
-    return traced.trace(env, program, donated, ((), "agent", setting or Settings()), given).lower().compile()(*given)
+    return (
+        trace_cache.trace(env, program, donated, ((), "agent", setting or Settings()), given).lower().compile()(*given)
+    )
 
 
 def same(one, other):
@@ -126,7 +128,7 @@ def test_a_program_is_traced_once(folder, times, monkeypatch):
 
 def test_there_is_no_cache_unless_it_is_asked_for(folder, times, monkeypatch):
     """As with MTJAX_CACHE=0, and in a notebook."""
-    traced.use_folder(None)
+    trace_cache.use_folder(None)
     assert same(run(times), run(times)) and times.traced == 2 and not folder.exists()
 
 
@@ -191,12 +193,12 @@ def test_a_program_with_calls_out_of_xla_runs_where_they_have_the_same_names(fol
 
     states = jax.vmap(env.reset)(env.tasks(), jax.random.split(jax.random.key(0), 1)).state
     given = env.tasks(), states, jnp.ones((1, 1))
-    kept = lambda: traced.trace(env, program, (), (env, "agent", None), given).lower().compile()(*given)
+    kept = lambda: trace_cache.trace(env, program, (), (env, "agent", None), given).lower().compile()(*given)
     first = kept()
     jax.clear_caches()
     assert list(env.targets().values()) == [[0, "advance"]] and same(first, kept()) and len(count) == 1
     jax.clear_caches()
-    again = lambda: traced.trace(other, program, (), (other, "agent", None), given).lower().compile()(*given)
+    again = lambda: trace_cache.trace(other, program, (), (other, "agent", None), given).lower().compile()(*given)
     assert same(first, again()) and len(count) == 1
     jax.clear_caches()
     monkeypatch.setattr(type(other), "provide", lambda *_: "another")
@@ -231,23 +233,23 @@ def test_files_that_were_not_used_for_longest_are_dropped(folder, times, monkeyp
 def test_states_of_mixtures_can_be_written():
     """Their static blocks too."""
     states = States(Blocks(((0, 2), (1, 1)), 3), (Point(0, (1, [2])), None))
-    assert traced._decode(json.loads(json.dumps(traced._encode(states)))) == states
+    assert trace_cache._decode(json.loads(json.dumps(trace_cache._encode(states)))) == states
 
 
 def test_only_containers_are_made_from_a_file():
     """No class is imported, and nothing else is called."""
     for place in (["os", "system"], ["subprocess", "Popen"]):
         with pytest.raises(ValueError):
-            traced._decode({"class": place, "fields": {"x": 0}})
+            trace_cache._decode({"class": place, "fields": {"x": 0}})
     with pytest.raises(KeyError):
-        traced._decode({"class": ["antigravity", "anything"], "fields": {}})
+        trace_cache._decode({"class": ["antigravity", "anything"], "fields": {}})
     assert "antigravity" not in sys.modules
 
 
 def test_a_process_with_other_code_keeps_nothing():
     """Such as these tests, or a file of the user's own: it may change anything."""
-    with pytest.raises(traced.Unkept, match="may change anything"):
-        traced._code()
+    with pytest.raises(trace_cache.Unkept, match="may change anything"):
+        trace_cache._code()
 
 
 def test_changed_source_changes_the_key(monkeypatch, tmp_path):
@@ -255,12 +257,12 @@ def test_changed_source_changes_the_key(monkeypatch, tmp_path):
     (tmp_path / "a.py").write_text("x = 1")
     monkeypatch.setattr(traced, "_PACKAGE", tmp_path)
     monkeypatch.setattr(traced, "BEGAN", (tmp_path / "a.py").stat().st_mtime + 9)
-    before = traced._versions.__wrapped__((tmp_path,))
+    before = trace_cache._versions.__wrapped__((tmp_path,))
     (tmp_path / "a.py").write_text("x = 2")
-    assert before != traced._versions.__wrapped__((tmp_path,))
+    assert before != trace_cache._versions.__wrapped__((tmp_path,))
     monkeypatch.setattr(traced, "BEGAN", (tmp_path / "a.py").stat().st_mtime)
-    with pytest.raises(traced.Unkept, match="just changed"):
-        traced._versions.__wrapped__((tmp_path,))
+    with pytest.raises(trace_cache.Unkept, match="just changed"):
+        trace_cache._versions.__wrapped__((tmp_path,))
 
 
 def command(words, cache):

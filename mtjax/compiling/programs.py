@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import jax
 from jax.sharding import Mesh, NamedSharding
 
-from mtjax.compiling import traced
+from mtjax.compiling import trace_cache
 from mtjax.envs.task_table import Tabled
 from mtjax.evaluation import evaluate
 from mtjax.loop import TrainState, init, run_chunk
@@ -81,7 +81,7 @@ def trace(function: Any, env: Any, agent: Any, setting: Any, *arguments: Any) ->
     static = (env, agent, setting)
     if function not in _DONATED or not isinstance(env, Tabled):  # the first if it is split over devices
         return function.trace(*static, *arguments)
-    return traced.trace(env, function, _DONATED[function], static, arguments)
+    return trace_cache.trace(env, function, _DONATED[function], static, arguments)
 
 
 def load_kernels(env: Any) -> bool:
@@ -120,6 +120,6 @@ def enable_compile_cache() -> None:
     if place == "0":
         return
     folder = Path(place).expanduser()
-    traced.use_folder(folder / "traced")
+    trace_cache.use_folder(folder / "traced")
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
