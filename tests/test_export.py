@@ -19,8 +19,8 @@ from mtjax import agents, standalone
 from mtjax.agents.state import AgentState
 from mtjax.networks import Params
 from mtjax.saved.export import require_file
+from mtjax.saved.operations import steps_of
 from mtjax.saved.policy import Policy
-from mtjax.saved.steps import steps_of
 from mtjax.tasks import SAME_CONTEXT
 from mtjax.types import InputError
 

@@ -15,7 +15,7 @@ import mtjax
 import mtjax.evaluate
 from mtjax import standalone
 from mtjax.saved import onnx, ship
-from mtjax.saved.steps import steps_of
+from mtjax.saved.operations import steps_of
 from mtjax.types import InputError
 
 COLOURED = mtjax.make("corridor-maze", pixels=16, frames=3, vary={"hue": "0:200:3"})

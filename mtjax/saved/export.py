@@ -19,8 +19,8 @@ from mtjax.envs.pixels import GREY
 from mtjax.envs.stepped import Stepped
 from mtjax.names import InputError, public
 from mtjax.saved import onnx
+from mtjax.saved.operations import steps_of
 from mtjax.saved.policy import Policy, by_name
-from mtjax.saved.steps import steps_of
 from mtjax.types import Array
 
 _PLATFORMS = ("cpu", "cuda")

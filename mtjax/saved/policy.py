@@ -25,7 +25,7 @@ from mtjax.names import public
 from mtjax.saved import checkpoint as checkpoints
 from mtjax.saved import shipped
 from mtjax.saved.config_json import from_json
-from mtjax.saved.steps import steps_of
+from mtjax.saved.operations import steps_of
 from mtjax.tasks import SAME_CONTEXT
 from mtjax.types import Array, InputError, Key, Task, Transition
 

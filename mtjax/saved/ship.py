@@ -12,8 +12,8 @@ from mtjax.config import RunConfig
 from mtjax.names import InputError
 from mtjax.saved import shipped
 from mtjax.saved.config_json import read_record
+from mtjax.saved.operations import steps_of
 from mtjax.saved.policy import Policy, load
-from mtjax.saved.steps import steps_of
 
 _SETTINGS = "config.json"
 
