@@ -808,7 +808,7 @@ def test_compile_cache_follows_the_environment(monkeypatch, place, folder):
     """MTJAX_CACHE names the folder, and 0 keeps none."""
     updates = {}
     monkeypatch.setattr(jax.config, "update", updates.__setitem__)
-    monkeypatch.setattr(traced, "_folder", [])
+    monkeypatch.setattr(trace_cache, "_folder", [])
     monkeypatch.setenv("MTJAX_CACHE", place)
     enable_compile_cache()
     assert updates.get("jax_compilation_cache_dir") == folder

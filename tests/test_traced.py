@@ -91,8 +91,8 @@ class Counted:
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """A cache that takes the code of this process to be known, though tests are not installed."""
-    monkeypatch.setattr(traced, "_code", lambda: "the code")
-    monkeypatch.setattr(traced, "_folder", [tmp_path / "traced"])
+    monkeypatch.setattr(trace_cache, "_code", lambda: "the code")
+    monkeypatch.setattr(trace_cache, "_folder", [tmp_path / "traced"])
     return tmp_path / "traced"
 
 
@@ -152,7 +152,7 @@ def test_whatever_decides_a_program_is_in_its_key(folder, times, monkeypatch, tm
         assert misses() == 1
     monkeypatch.setenv("MJX_ANY", "1")
     assert misses() == 1
-    monkeypatch.setattr(traced, "_code", lambda: "changed code")
+    monkeypatch.setattr(trace_cache, "_code", lambda: "changed code")
     assert misses() == 1 and misses() == 0
 
 
@@ -224,7 +224,7 @@ def test_files_that_were_not_used_for_longest_are_dropped(folder, times, monkeyp
     run(times)
     (old,) = folder.iterdir()
     os.utime(old, (1, 1))
-    monkeypatch.setattr(traced, "LIMIT", old.stat().st_size * 1.5)
+    monkeypatch.setattr(trace_cache, "LIMIT", old.stat().st_size * 1.5)
     run(times, Settings(3.0))
     (new,) = folder.iterdir()
     assert new != old
@@ -255,12 +255,12 @@ def test_a_process_with_other_code_keeps_nothing():
 def test_changed_source_changes_the_key(monkeypatch, tmp_path):
     """And source that changed while the process ran may not be what it runs."""
     (tmp_path / "a.py").write_text("x = 1")
-    monkeypatch.setattr(traced, "_PACKAGE", tmp_path)
-    monkeypatch.setattr(traced, "BEGAN", (tmp_path / "a.py").stat().st_mtime + 9)
+    monkeypatch.setattr(trace_cache, "_PACKAGE", tmp_path)
+    monkeypatch.setattr(trace_cache, "BEGAN", (tmp_path / "a.py").stat().st_mtime + 9)
     before = trace_cache._versions.__wrapped__((tmp_path,))
     (tmp_path / "a.py").write_text("x = 2")
     assert before != trace_cache._versions.__wrapped__((tmp_path,))
-    monkeypatch.setattr(traced, "BEGAN", (tmp_path / "a.py").stat().st_mtime)
+    monkeypatch.setattr(trace_cache, "BEGAN", (tmp_path / "a.py").stat().st_mtime)
     with pytest.raises(trace_cache.Unkept, match="just changed"):
         trace_cache._versions.__wrapped__((tmp_path,))
 

@@ -16,6 +16,7 @@ from test_metaworld import made
 import mtjax
 from mtjax import rollout
 from mtjax.command import run_config
+from mtjax.envs import simulator_groups
 from mtjax.envs.merged_simulator import United
 from mtjax.envs.metaworld.names import BENCHMARKS, TASKS
 from mtjax.envs.shared_simulator import Alone, Joined
@@ -65,7 +66,7 @@ def test_unions_have_room_for_so_many_degrees_of_freedom(monkeypatch):
     """Each of these has one beyond the arm's nine, or six. Tasks of one scene stay together."""
     names = ("door-open", "drawer-open", "push", "window-open", "drawer-close")
     assert members(make(*names, scenes="union")) == [list(names)]
-    monkeypatch.setattr(groups, "_MOST_DOFS", 11)
+    monkeypatch.setattr(simulator_groups, "_MOST_DOFS", 11)
     env = make(*names, scenes="union")
     assert members(env) == [["door-open", "drawer-open", "drawer-close"], ["push"], ["window-open"]]
     assert [type(group) for group in env.groups] == [United, Alone, Alone]

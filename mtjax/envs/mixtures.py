@@ -1,8 +1,9 @@
 """Mixtures: families with different observations, actions, horizons and physics, as one environment.
 
 A mixture has the tasks of its families, one family after another in every split. Families whose models have the same
-structure, or whose things fit into one scene, step together (``simulator_groups``). Every other family steps its own worlds in a
-separate call. Observed vectors are padded with zeros to one size, and actions beyond a family's own are masked.
+structure, or whose things fit into one scene, step together (``simulator_groups``). Every other family steps its own
+worlds in a separate call. Observed vectors are padded with zeros to one size, and actions beyond a family's own are
+masked.
 """
 
 import dataclasses
