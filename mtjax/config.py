@@ -27,7 +27,7 @@ from mtjax.agents.swept import agents_at
 from mtjax.checks import MOST_EPISODES, check_fields, path, require_library, require_text
 from mtjax.envs import make, members
 from mtjax.envs import name_of as env_name_of
-from mtjax.envs.tabled import Tabled
+from mtjax.envs.task_table import Tabled
 from mtjax.experience import Replay
 from mtjax.frames import shown
 from mtjax.loop import Settings, require_trials

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mtjax.envs.choosing import Choosing
-from mtjax.envs.tabled import Table
+from mtjax.envs.task_table import Table
 from mtjax.types import SPLITS, Array, InputError, Key, Step, Task
 
 
