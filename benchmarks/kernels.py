@@ -127,7 +127,8 @@ def count_flops(name: str, arguments: argparse.Namespace) -> float:
     agent = mtjax.agent(name, hidden=arguments.hidden)
     tasks, batch = tasks_of(arguments.tasks), random_batch(SPEC, arguments.tasks, arguments.batch)
     state = jax.eval_shape(lambda: agent.init(SPEC, tasks, jax.random.key(0)))
-    update = jax.jit(lambda state, key: agent.update(state, batch, tasks, key))
+    window = jax.tree.map(lambda x: jnp.expand_dims(x, 2), batch)  # of one step
+    update = jax.jit(lambda state, key: agent.update(state, window, tasks, key, jnp.int32(0)))
     key = jax.eval_shape(lambda: jax.random.key(0))
     found = update.lower(state, key).compile().cost_analysis()
     return float(found["flops"]) * arguments.seeds  # type: ignore

@@ -1,6 +1,7 @@
 """Programs of physics without learning, for benchmarks: with resets and without."""
 
 import dataclasses
+from functools import partial
 from typing import Any
 
 import jax
@@ -21,7 +22,7 @@ class Random:
         return ()
 
     def act(self, state: Any, memory: Any, obs: Any, task: Any, key: Any) -> Acted:
-        return Acted(jax.random.uniform(key, (self.action_size,), minval=-1.0), None, memory)
+        return Acted(jax.random.uniform(key, (self.action_size,), minval=-1.0))
 
 
 def physics(env: Any, worlds_per_task: int, steps: int, resets: bool) -> Any:
@@ -45,7 +46,8 @@ def physics(env: Any, worlds_per_task: int, steps: int, resets: bool) -> Any:
         keys, act_keys, reset_keys = split_keys(keys, 3)
         worlds, env_step = step_envs(env, agent, learners, tasks, worlds, world_keys(act_keys, shape))
         if resets:
-            worlds = reset_ended(env, agent, learners, tasks, worlds, env_step.transition.ended, reset_keys)
+            fresh_keys = partial(world_keys, reset_keys, shape)
+            worlds = reset_ended(env, agent, learners, tasks, worlds, env_step.ends, fresh_keys)
         seen = jnp.sum(env_step.transition.reward) + jnp.sum(env_step.transition.next_obs)
         return (worlds, keys), seen
 
