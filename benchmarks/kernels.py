@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 from report import markdown, publish, run_main
 from update_cost import SPEC, Contestant, random_batch, tasks_of
 
