@@ -1,6 +1,7 @@
 """Policies in one file: by NumPy and by JAX alone, they act as the policy does on every task."""
 
 import ast
+import dataclasses
 import importlib.util
 import subprocess
 import sys
@@ -67,6 +68,29 @@ def test_all_forms_act_as_the_policy(name, tmp_path):
     np.testing.assert_allclose(found, expected, atol=2e-5)
     assert np.ptp(expected, axis=0).max() > 1e-3
     assert_onnx_acts(policy, tmp_path / "policy.onnx", obs, sizes, expected)
+
+
+def test_a_choice_is_the_policys_in_all_forms(tmp_path):
+    """Of a family of discrete actions: a number, of which every one is chosen somewhere."""
+    env = mtjax.make("two-goal-maze-seen")
+    policy = policy_of(tiny("ppo", hidden=(16,)).for_action(env.spec.action), env)
+    actor = policy.state.nets["actor"]
+    head = jax.tree.map(lambda x: 100 * x, actor.shared["head"])
+    actor = actor._replace(shared=actor.shared | {"head": head})
+    policy = dataclasses.replace(policy, state=with_nets(policy.state, actor=actor))
+    file = mtjax.export(policy, tmp_path / "policy.npz")
+    by_numpy, by_jax = standalone.load(file), standalone.load_jax(file)
+    assert "action 0 to 2" in repr(by_numpy) and "action 0 to 2" in repr(policy)
+    obs, boxes = observations(60, env), np.repeat(np.float32([0, 1]), 30)
+    tasks = jax.tree.map(lambda x: jnp.repeat(x, 30, axis=0), env.tasks())
+    expected = np.asarray(jax.jit(jax.vmap(policy))(obs, tasks))
+    assert expected.shape == (60,) and expected.dtype == np.int32 and set(expected) == {0, 1, 2}
+    np.testing.assert_array_equal(policy(obs, goal_box=boxes), expected)
+    np.testing.assert_array_equal(by_jax(obs, boxes[:, None]), expected)
+    found = by_numpy(obs, goal_box=boxes)
+    np.testing.assert_array_equal(found, expected)
+    assert found.dtype == np.int32
+    assert_onnx_acts(policy, tmp_path / "policy.onnx", obs, boxes, expected)
 
 
 @pytest.mark.parametrize("name", [name for name in FEW if "vary" in name])
@@ -155,7 +179,7 @@ def assert_onnx_acts(policy, file, obs, sizes, expected):
         (found,) = session.run(["action"], {name: given[name] for name in known})
         np.testing.assert_allclose(found, action, atol=2e-5)
     meta = session.get_modelmeta()
-    assert '"parameters": ["size"]' in meta.custom_metadata_map["mtjax"]
+    assert f'"parameters": ["{policy.env.ranges[0][0]}"]' in meta.custom_metadata_map["mtjax"]
 
 
 def test_angles_of_goals_are_points_on_the_circle(tmp_path):

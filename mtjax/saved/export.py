@@ -29,12 +29,13 @@ _BRIGHTNESS = " + ".join(f"{weight:g} {colour}" for weight, colour in zip(GREY, 
 
 @public
 def export(policy: Policy, file: str | Path) -> Path:
-    """Write the mean action of a policy, with normaliser and task context, into one file.
+    """Write the mean action of a policy, or the likeliest choice, with normaliser and task context, into one file.
 
     Args:
         file: ends with .npz, which ``mtjax.standalone`` reads by NumPy alone or by JAX alone; or with .onnx, a model of
-            the inputs ``obs`` (O,) and ``parameters`` (P,), and the output ``action`` (A,). Of a policy that sees
-            pictures the inputs are ``pixels`` (H, W, N C), a stack of pictures, and ``state`` (O,) if it sees that too.
+            the inputs ``obs`` (O,) and ``parameters`` (P,), and the output ``action``: (A,), or a number () int32 of a
+            discrete action. Of a policy that sees pictures the inputs are ``pixels`` (H, W, N C), a stack of pictures,
+            and ``state`` (O,) if it sees that too.
 
     Raises:
         InputError: the file exists, or the agent infers its task from memory, or it is of a mixture, or the package
@@ -87,6 +88,7 @@ def _meta(env: Family, agent: BaseAgent, obs: dict[str, Any]) -> dict[str, Any]:
         "seconds": env.seconds_per_step if isinstance(env, Stepped) else None,  # between two actions
         "about": " ".join(_about(env, name, x.shape) for name, x in obs.items()),
         "action_size": env.spec.action_size,
+        "discrete": env.discrete,  # whether an action is a number from 0 to action_size - 1
         "parameters": [name for name, _, _ in env.ranges],
         "trained_from": [low for _, low, _ in env.ranges],
         "trained_to": [high for _, _, high in env.ranges],

@@ -53,7 +53,7 @@ def write(
             graph.nodes,
             f"{meta['agent']} on {meta['env']}",
             [put(name, x) for name, x in inputs.items() if name in used],
-            [put("action", np.zeros(meta["action_size"], np.float32))],
+            [put("action", graph.values[program["result"]])],
             [tensor for tensor in graph.tensors if tensor.name in used],
             doc_string=meta["about"],
         ),

@@ -43,7 +43,7 @@ class Categorical(Policy):
         return raw
 
     def log_prob(self, outputs: Array, raw: Array, mask: Array | None = None) -> Array:
-        return jnp.take_along_axis(_log_probs(outputs, mask), raw[..., None], axis=-1)[..., 0]
+        return jnp.sum(self.encode(raw) * _log_probs(outputs, mask), axis=-1)  # gathers have no place in exports
 
     def entropy(self, outputs: Array, mask: Array | None, key: Key) -> Array:
         """Return the exact entropy (...,)."""
