@@ -55,7 +55,7 @@ TRAINED = {  # family -> agent and steps
     "two-goal-maze": ("drq", 4 * _M),
     "two-goal-maze-seen": ("ppo", 10 * _M),
 }
-SEEN: dict[str, dict[str, Any]] = {"two-goal-maze": {"pixels": 64}}
+SEEN: dict[str, dict[str, Any]] = {"two-goal-maze": {"pixels": 64, "scores": True}}
 """Settings of families that are learned from pictures, as nothing else tells the goal."""
 _LINES = 40
 

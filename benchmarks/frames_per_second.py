@@ -110,7 +110,7 @@ def stepping(env: Pictured, arguments: argparse.Namespace) -> tuple[Callable[[],
     @jax.jit
     def play(states):
         def advance(states, key):
-            action = jax.random.uniform(key, (arguments.worlds, env.action_size), minval=-1.0)
+            action = env.action.random(key, (arguments.worlds,))
             step = jax.vmap(env.step)(task, states, action)
             seen = [x[:, :1].reshape(arguments.worlds, -1)[:, 0] for x in jax.tree.leaves(step.obs)]
             return step.state, (step.reward, seen)

@@ -181,7 +181,7 @@ class Stepper:
 
         def play(tasks, states, key):
             def step(states, key):
-                actions = jax.random.uniform(key, (*shape, env.spec.action_size), minval=-1.0)
+                actions = env.spec.action.random(key, shape)
                 stepped = env.step_worlds(broadcast_tasks(tasks, shape), states, actions)
                 return stepped.state, jnp.sum(stepped.reward)
 

@@ -188,7 +188,7 @@ def ours(name: str, settings: dict, per_task: int, steps: int, resets: bool) -> 
         def step(carry, _):
             state, age, key = carry
             key, act_key, reset_key = jax.random.split(key, 3)
-            action = jax.random.uniform(act_key, (*shape, env.spec.action_size), minval=-1.0)
+            action = env.spec.action.random(act_key, shape)
             after = env.step_worlds(worlds, state, action)
             seen = jnp.sum(after.reward) + jnp.sum(after.obs)
             age = age + 1
