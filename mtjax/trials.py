@@ -98,7 +98,7 @@ def require_whole(episodes: int, trial: int, name: str = "episodes") -> None:
 
 
 def describe(returns: np.ndarray, trial: int) -> str:
-    """Return the mean return of the first and the last episode of trials as text; empty where these are one.
+    """Return the mean return of the first, the last and all episodes of trials as text; empty where these are one.
 
     Args:
         returns: (..., episodes), those of a trial one after another.
@@ -107,4 +107,4 @@ def describe(returns: np.ndarray, trial: int) -> str:
     if trial == 1:
         return ""
     mean = np.nanmean(returns.reshape(-1, trial), axis=0)
-    return f"episode 1 of a trial {mean[0]:.3g}, episode {trial} {mean[-1]:.3g}"
+    return f"episode 1 of a trial {mean[0]:.3g}, episode {trial} {mean[-1]:.3g}, mean {np.mean(mean):.3g}"

@@ -51,6 +51,8 @@ def _introduction(config: RunConfig, hooks: Hooks) -> list[str]:
     seeds = f"seeds {plan.seed} to {plan.seed + plan.seeds - 1}" if plan.seeds > 1 else f"seed {plan.seed}"
     lines.append(f"{config.agent} on {config.env}: {config.family.summary}, {seeds}")
     lines.append(_sizes(config))
+    trials = config.training.trials
+    lines += [f"a trial is {trials} episodes of one task"] * (trials > 1)
     lines += [line for line in (_origin(config),) if line]
     lines += [] if hooks.directory is None else [f"run: {hooks.directory}"]
     if hooks.resume and "warp" in config.family.engine_name:
