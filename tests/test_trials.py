@@ -310,9 +310,8 @@ def test_a_run_s_evaluations_know_their_trials(tmp_path, capsys):
     found = load_evaluations(tmp_path / "run" / "evaluations.npz")
     assert found.trial == 2 and found.returns["train"].shape == (1, 1, 2, 4)
     returns = found.returns["train"][0, -1].reshape(-1, 2).mean(axis=0)
-    assert f"train           episode 1 of a trial {returns[0]:.3g}, episode 2 {returns[1]:.3g}, mean " in split_table(
-        found
-    )
+    told = f"train           episode 1 of a trial {returns[0]:.3g}, episode 2 {returns[1]:.3g}, mean "
+    assert told in split_table(found)
     assert result.policy().trial == 2
     with pytest.raises(InputError, match="episodes must be a multiple of a trial's 2 episodes, such as 4; not 3"):
         mtjax.evaluate(result, episodes=3)
