@@ -7,6 +7,7 @@ import importlib.metadata
 import json
 import os
 import platform
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -16,7 +17,7 @@ from typing import Any
 import jax
 
 import mtjax
-from mtjax.names import InputError, NoRoomError
+from mtjax.names import InputError
 from mtjax.saved.log import append_rows
 
 _LIBRARIES = ("jax", "jaxlib", "flax", "optax", "numpy", "mujoco", "mujoco-mjx", "warp-lang", "brax", "playground")
@@ -28,9 +29,8 @@ def run_main(main: Callable[[], None]) -> None:
     try:
         main()
     except (InputError, FileExistsError, NotADirectoryError) as error:
-        if isinstance(error, NoRoomError):
-            error.place = "--out"
-        raise SystemExit(f"error: {error}") from None
+        message = re.sub(r"(choose another place with) \S+$", r"\1 --out", str(error))
+        raise SystemExit(f"error: {message}") from None
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         raise SystemExit(130) from None

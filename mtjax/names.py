@@ -25,24 +25,14 @@ _MANY = 20
 _IN_COMMAND = ContextVar("in_command", default=False)
 _VARY = re.compile(r"--env\.vary\.([\w.-]+)=([^\s;)]+)")
 _FLAG = re.compile(r"(?<![\w-])--(?:env\.|agent\.)?([a-z][a-z-]*[a-z])(?:=([^\s,;:)]*[^\s,;:).]))?(?![\w-]|\.\w)")
-_OTHER_NAMES = {"from": "start", "distributed": "jax.distributed"}  # flag -> argument
-_ONLY_FLAGS = ("config", "help", "import", "list", "no-deps", "resume", "run", "runs", "sweep", "video")
+_OTHER_NAMES = {"from": "start", "distributed": "jax.distributed", "runs": "directory"}  # flag -> argument
+_ONLY_FLAGS = ("config", "help", "import", "list", "no-deps", "resume", "run", "sweep", "video")
 P = ParamSpec("P")
 R = TypeVar("R")
 
 
 class InputError(ValueError):
     """The user gave something that cannot be used. The message says what was given and what is allowed."""
-
-
-class NoRoomError(InputError):
-    """A disk has no room for a new run. The message ends with what takes another place."""
-
-    place = "directory"
-    """The argument of ``mtjax.train``; commands put their flag here."""
-
-    def __str__(self) -> str:
-        return f"{super().__str__()} or choose another place with {self.place}"
 
 
 class Notice(UserWarning):

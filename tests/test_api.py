@@ -216,6 +216,7 @@ def test_a_command_names_its_flags():
     [
         ("use --engine=c or --engine=warp", "use engine='c' or engine='warp'"),
         ("lower --replay-size, --num-envs or --seeds.", "lower replay_size, num_envs or seeds."),
+        ("or choose another place with --runs", "or choose another place with directory"),
         ("leave out --env.pixels and --agent.encoder-tau=0.5.", "leave out pixels and encoder_tau=0.5."),
         ("give --env.vary.size=0.9:1.1:5; or --from=RUN", "give vary={'size': '0.9:1.1:5'}; or start=RUN"),
         ("pip install --no-deps x, --import=FILE.py", "pip install --no-deps x, --import=FILE.py"),

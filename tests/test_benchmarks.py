@@ -22,7 +22,6 @@ from mtjax.agents.parts.knowing import Text
 from mtjax.envs import BENCHMARKS
 from mtjax.envs.metaworld.names import TASKS
 from mtjax.evaluation import Evaluations, load_evaluations, save_evaluations
-from mtjax.names import NoRoomError
 from mtjax.saved.log import append_rows
 from mtjax.saved.records import Records
 from mtjax.training.console import Console
@@ -554,7 +553,7 @@ def test_a_full_disk_is_told_with_the_flag_of_benchmarks(script):
     """Their folders are those of --out."""
 
     def main():
-        raise NoRoomError("too little is free; lower --replay-size")
+        raise InputError("too little is free; lower --replay-size or choose another place with --runs")
 
     with pytest.raises(SystemExit, match=r"error: too little is free; lower --replay-size or .* place with --out$"):
         script("report").run_main(main)

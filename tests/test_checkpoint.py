@@ -398,7 +398,7 @@ def test_space_is_for_one_more_than_is_kept(tmp_path, monkeypatch):
     monkeypatch.setattr("shutil.disk_usage", lambda _: usage._replace(free=3000))
     checkpoint.require_space(tmp_path, state)
     monkeypatch.setattr("shutil.disk_usage", lambda _: usage._replace(free=2999))
-    with pytest.raises(InputError, match=r"free; lower --replay-size or choose another place with directory$"):
+    with pytest.raises(InputError, match=r"free; lower --replay-size or choose another place with --runs$"):
         checkpoint.require_space(tmp_path, state)
 
 

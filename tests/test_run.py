@@ -739,7 +739,7 @@ def test_full_disk_is_met_before_training(play, tmp_path, monkeypatch):
     """The check comes before compiling, and says what would help."""
     monkeypatch.setattr("shutil.disk_usage", lambda _: types.SimpleNamespace(free=1000))
     with pytest.raises(
-        InputError, match=r"checkpoints need [\d.]+ MB .* has 0.0 MB free; lower --replay-size or .* with directory$"
+        InputError, match=r"checkpoints need [\d.]+ MB .* has 0.0 MB free; lower --replay-size or .* with --runs$"
     ):
         play(tmp_path)
     assert not list(tmp_path.iterdir())

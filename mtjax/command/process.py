@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from mtjax.command import xla_flags
-from mtjax.names import InputError, NoRoomError, Notice
+from mtjax.names import InputError, Notice
 
 # Python looks for garbage after so many allocations, and after so many of these looks among older objects too. By its
 # defaults a quarter of a start with Warp goes there, for nothing: imports and programs make objects that stay.
@@ -25,8 +25,6 @@ def main(run: Any) -> None:
         with _plain_notices():
             run(sys.argv[1:])
     except InputError as error:
-        if isinstance(error, NoRoomError):
-            error.place = "--runs"
         print(f"error: {one_line(error)}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:

@@ -21,7 +21,7 @@ import jax
 
 from mtjax.experience.ring import Ring
 from mtjax.loop import TrainState
-from mtjax.names import NoRoomError, notice
+from mtjax.names import notice
 from mtjax.parallel import hosts
 from mtjax.saved import arrays
 from mtjax.saved.folder import tell_edits
@@ -308,7 +308,7 @@ def require_space(directory: Path, state: Any, beside: int = 0, larger: Sequence
         larger: the settings that make a run's state large.
 
     Raises:
-        InputError: it has too little; for a new run a ``NoRoomError``. Or the folder's path can hold none.
+        InputError: it has too little, or the folder's path can hold none.
     """
     arrays.require_place(directory)
     files = (file for part in ("checkpoints", "store") for file in (directory / part).rglob("*"))
@@ -319,4 +319,5 @@ def require_space(directory: Path, state: Any, beside: int = 0, larger: Sequence
     told = f"checkpoints need {needed / 1e6:,.1f} MB and {str(directory)!r} has {free / 1e6:,.1f} MB free; "
     if held:
         raise InputError(f"{told}make room there, as the run goes on with the settings it had")
-    raise NoRoomError(f"{told}lower {' and '.join(f'--{name}' for name in larger)}")
+    lower = " and ".join(f"--{name}" for name in larger)
+    raise InputError(f"{told}lower {lower} or choose another place with --runs")
