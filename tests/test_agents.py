@@ -10,8 +10,7 @@ import pytest
 from probes import OFF_POLICY, learner, one_in, pick, quick, random_batch, random_past, tasks_of, tiny, with_nets
 from probes import act as act_once
 
-from mtjax import normalize
-from mtjax.agents import AGENTS, agent
+from mtjax.agents import AGENTS, agent, normalize
 from mtjax.agents.parts.encoders import ENCODERS
 from mtjax.agents.parts.gradients.surgery import RULES
 from mtjax.agents.parts.knowing import CONDITIONINGS

@@ -24,7 +24,6 @@ GROUND = (
     "standalone",
     "sphere",
     "networks",
-    "normalize",
     "tasks",
     "trials",
     "maps",

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mtjax import normalize
+from mtjax.agents import normalize
 
 
 def fitted(*batches):

@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import tyro
 
-from mtjax import frames, normalize
-from mtjax.agents import parts
+from mtjax import frames
+from mtjax.agents import normalize, parts
 from mtjax.agents.choices import FLAT, PARTS, kinds_of
 from mtjax.agents.fit import Fit, Fitted, learned
 from mtjax.agents.parts.encoders import Encoder

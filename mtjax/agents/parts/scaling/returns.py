@@ -5,8 +5,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from mtjax import normalize
-from mtjax.agents import parts
+from mtjax.agents import normalize, parts
 from mtjax.agents.parts.scaling.base import NoScaling
 from mtjax.types import Array, Transition
 
