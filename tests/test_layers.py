@@ -123,3 +123,14 @@ def test_folders_import_in_no_circle():
     for module, names in EDGES.items():
         graph.setdefault(room(module), set()).update({room(name) for name in names} - {room(module)})
     assert len(list(TopologicalSorter(graph).static_order())) == len(graph)
+
+
+@pytest.mark.parametrize("module", ["mtjax.command.keywords", "mtjax.command.run_config"])
+def test_a_configuration_is_made_without_what_trains(module):
+    """It is a value: from keywords or from a command line, neither training nor reports are needed to make it."""
+    seen, ahead = set(), [module]
+    while ahead:
+        name = ahead.pop()
+        seen.add(name)
+        ahead += EDGES.get(name, set()) - seen
+    assert not [name for name in seen if name.startswith(("mtjax.training", "mtjax.report"))]
