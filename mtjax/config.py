@@ -32,7 +32,7 @@ from mtjax.experience import Replay
 from mtjax.frames import shown
 from mtjax.loop import Settings, require_trials
 from mtjax.names import PRESETS, nearest_error, public
-from mtjax.parallel.mesh import mesh_for
+from mtjax.parallel import mesh as meshes
 from mtjax.types import InputError
 
 TUNED_TASKS = 10
@@ -178,7 +178,7 @@ class RunConfig:
         Raises:
             InputError: they cannot share its seeds and worlds evenly.
         """
-        return mesh_for(self.plan.seeds * max(len(self.points), 1), self.num_tasks, self.training.num_envs)
+        return meshes.mesh_for(self.plan.seeds * max(len(self.points), 1), self.num_tasks, self.training.num_envs)
 
     def check(self) -> None:
         """Check the configuration as a whole, before a folder is made. Nothing after it checks again.
