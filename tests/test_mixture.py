@@ -17,7 +17,8 @@ from probes import OFF_POLICY, one_in, slow_but
 import mtjax
 import mtjax.evaluate
 import mtjax.train
-from mtjax import agents, normalize, rollout
+from mtjax import agents, rollout
+from mtjax.agents import normalize
 from mtjax.agents.parts.policies import Gaussian
 from mtjax.agents.sac import Batch, action_sizes
 from mtjax.agents.state import AgentState

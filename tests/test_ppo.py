@@ -25,7 +25,8 @@ from probes import (
     with_nets,
 )
 
-from mtjax import agents, normalize
+from mtjax import agents
+from mtjax.agents import normalize
 from mtjax.agents.base import Memory
 from mtjax.agents.on_policy import Batch, Taken
 from mtjax.agents.parts import targets

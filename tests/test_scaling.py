@@ -25,8 +25,7 @@ from probes import (
     with_nets,
 )
 
-from mtjax import normalize
-from mtjax.agents import agent
+from mtjax.agents import agent, normalize
 from mtjax.agents.parts.scaling import (
     SCALINGS,
     AdaptiveScaling,
