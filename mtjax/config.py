@@ -290,7 +290,7 @@ def fit_length(config: RunConfig, given: Collection[str]) -> RunConfig:
     """Return a configuration whose warm-up, chunks and evaluations fit a short run.
 
     Random actions take at most a tenth of the run, and so does a chunk. All evaluations together play at most three
-    times as many steps on training tasks as the run, but there is one at the end.
+    times as many steps on training tasks as the run, but there is one at the end. They play whole trials.
 
     Args:
         given: names of settings that somebody chose, which stay as they are.
@@ -300,6 +300,10 @@ def fit_length(config: RunConfig, given: Collection[str]) -> RunConfig:
     tenth = plan.steps // (10 * count * training.num_envs)
     if "chunk_steps" not in given:
         training = dataclasses.replace(training, chunk_steps=min(training.chunk_steps, max(tenth, experience.steps)))
+    if "eval_episodes" not in given:  # whole trials
+        plan = dataclasses.replace(
+            plan, eval_episodes=math.ceil(plan.eval_episodes / training.trials) * training.trials
+        )
     if "eval_every" not in given and not plan.eval_every:
         each = count * plan.eval_episodes * config.family.episode_length
         often = min(max(_EVALUATED * plan.steps // each, 1), 10)

@@ -1,0 +1,192 @@
+"""PQN: its targets by hand, exploration that falls, masks, and tabular processes against value iteration."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from probes import learn, only_seed, pick, tasks_of, tiny, train
+from test_ppo import random_steps
+
+import mtjax
+from mtjax import agents
+from mtjax.envs.probes import Probe
+from mtjax.types import Discrete, InputError, Spec
+
+SPEC = Spec.vector(3, 2, 1)._replace(action=Discrete(4))
+TASKS = tasks_of("one-step", (1.0, -0.5, 0.3))
+KEY = jax.random.key(2)
+
+
+def small(**settings):
+    given = {"epochs": 1, "minibatches": 2, "unroll": 4, **settings}
+    return tiny("pqn", **given).for_action(SPEC.action)
+
+
+def steps_of(agent, seed=0):
+    """Rollouts (T, H, E, ...) in which every field is random."""
+    steps = random_steps(agent, seed=seed)
+    action = np.random.default_rng(seed).integers(4, size=steps.reward.shape).astype(np.int32)
+    return steps._replace(action=jnp.asarray(action), extras=None)
+
+
+def values_of(agent, state, obs, task):
+    """The values (..., A) of all actions at observations (..., O) of a task."""
+    one = lambda obs: agent.q(*agent.acting_inputs(state, agent.begin(state, task), obs, task))
+    return jax.vmap(one)(obs.reshape(-1, obs.shape[-1])).reshape(*obs.shape[:-1], -1)
+
+
+@pytest.mark.parametrize("cut", [False, True])
+def test_targets_are_those_of_a_plain_loop(cut):
+    """With the sum cut at the end of a trial, of the rollout and, if asked, before actions that explore."""
+    agent = small(q_lambda=0.6, gamma=0.9, cut_exploration=cut)
+    state, steps = agent.init(SPEC, TASKS, KEY), steps_of(agent)
+    found = agent.assess(state, steps, TASKS)[1].extras
+    for task in range(3):
+        now, then = (
+            np.asarray(values_of(agent, state, x[task], pick(TASKS, task))) for x in (steps.obs, steps.next_obs)
+        )
+        one = jax.tree.map(np.asarray, pick(steps._replace(memory=None), task))
+        for world in range(2):
+            later = 0.0
+            for t in reversed(range(4)):
+                last = t == 3 or one.closed[t, world]
+                last |= cut and t < 3 and now[t + 1, world].argmax() != one.action[t + 1, world]
+                ahead = then[t, world].max() if last else 0.4 * then[t, world].max() + 0.6 * later
+                later = one.reward[t, world] + 0.9 * one.discount[t, world] * ahead
+                assert float(found[task, t, world]) == pytest.approx(float(later), abs=1e-4)
+
+
+def test_the_loss_is_of_the_actions_that_were_taken():
+    """No gradient reaches the values of others."""
+    agent = small()
+    state, steps = agent.init(SPEC, TASKS, KEY), steps_of(agent)
+    steps = steps._replace(action=jnp.full_like(steps.action, 2))
+    after, metrics = jax.jit(lambda state: learn(agent, state, steps, TASKS, KEY))(state)
+    bias = lambda state: np.asarray(state.nets["critic"].shared["head"]["bias"])
+    assert np.array_equal(bias(after) != bias(state), [False, False, True, False])
+    assert metrics["critic_loss"].shape == (3,) and np.all(np.isfinite(metrics["critic_loss"]))
+
+
+def test_exploration_falls_along_a_line_and_evaluation_has_none():
+    """From 1 to epsilon, rollout by rollout."""
+    agent = small(epsilon=0.2, epsilon_rollouts=4)
+    state, shares = agent.init(SPEC, TASKS, KEY), []
+    for _ in range(6):
+        shares.append(float(agent.share(state)))
+        state = agent.observe(state, steps_of(agent), TASKS)
+    np.testing.assert_allclose(shares, [1.0, 0.8, 0.6, 0.4, 0.2, 0.2], rtol=1e-5)
+    task, obs = pick(TASKS, 0), jnp.float32([0.3, -1.0, 2.0])
+    act = lambda key: int(agent.act(state, agent.begin(state, task), obs, task, key).action)
+    best = int(np.argmax(values_of(agent, state, obs[None], task)))
+    drawn = jax.vmap(lambda key: agent.act(state, agent.begin(state, task), obs, task, key).action)
+    taken = np.asarray(drawn(jax.random.split(KEY, 4000)))
+    assert act(None) == best and taken.dtype == np.int32
+    np.testing.assert_allclose(np.mean(taken == best), 0.8 + 0.2 / 4, atol=0.03)
+
+
+def test_actions_that_a_task_lacks_are_never_taken_nor_hoped_for():
+    """At random, as the best one, and as what follows."""
+    agent = small(epsilon=1.0)
+    mask = jnp.float32([[1, 0, 1, 1], [1, 1, 1, 1], [0, 0, 0, 1]])
+    tasks = TASKS._replace(action_mask=mask)
+    state, obs = agent.init(SPEC, tasks, KEY), jnp.float32([0.3, -1.0, 2.0])
+    for i in range(3):
+        task = pick(tasks, i)
+        draw = lambda key, task=task: agent.act(state, agent.begin(state, task), obs, task, key).action
+        taken = set(np.asarray(jax.vmap(draw)(jax.random.split(KEY, 300))).tolist()) | {int(draw(None))}
+        assert taken <= set(np.flatnonzero(mask[i]).tolist())
+    steps = steps_of(agent)
+    found = agent.assess(state, steps, tasks)[1].extras
+    only = np.asarray(values_of(agent, state, steps.next_obs[2], pick(tasks, 2)))[..., 3]
+    last = steps.reward[2, -1] + agent.gamma * steps.discount[2, -1] * only[-1]
+    np.testing.assert_allclose(found[2, -1], last, rtol=1e-4)
+
+
+def process_of(tasks, i, gamma=0.9):
+    """The best values (states, actions) of a tabular process, by value iteration."""
+    rewards, chances = (np.asarray(tasks.goal[name][i], float) for name in ("rewards", "transitions"))
+    best = np.zeros(rewards.shape)
+    for _ in range(300):
+        best = rewards + gamma * chances @ best.max(axis=-1)
+    return best
+
+
+@pytest.mark.slow
+def test_greedy_actions_are_those_of_value_iteration():
+    """In every state of every process, and values to 0.1 of 5 to 10."""
+    env, gamma = mtjax.make("tabular-mdp", num_tasks=3, split="none"), 0.9
+    given = dict(q_lambda=0.0, gamma=gamma, epsilon=0.3, epsilon_rollouts=50, lr_schedule="linear", critic_lr=1e-3)
+    agent = mtjax.agent("pqn", hidden=(64, 64), unroll=16, minibatches=8, **given).for_action(env.spec.action)
+    steps = 3 * 64 * 16 * 600
+    result = mtjax.train(env, agent, steps=steps, num_envs=64, chunk_steps=1600, eval_every=steps, quiet=True)
+    tasks, state = env.tasks(), only_seed(result.state.agent)
+    for i in range(3):
+        best = process_of(tasks, i)
+        for reward in (0.0, 1.0):  # that of the step before, which tells nothing
+            obs = jnp.concatenate([jnp.eye(4), jnp.full((4, 1), reward)], axis=1)
+            found = np.asarray(values_of(agent, state, obs, pick(tasks, i)))
+            np.testing.assert_array_equal(found.argmax(axis=-1), best.argmax(axis=-1))
+            np.testing.assert_allclose(found, best, atol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"q_lambda": 1.5}, "q-lambda"),
+        ({"epsilon": -0.1}, "epsilon"),
+        ({"epsilon_rollouts": 0}, "epsilon-rollouts must be at least 1"),
+        ({"representation": "deepmdp"}, "use representation=plain"),
+        ({"scaling": "return"}, "scaling=none"),
+        ({"sampler": "hardest"}, "sampler=uniform"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(settings, message):
+    with pytest.raises(InputError, match=message):
+        agents.agent("pqn", **settings)
+
+
+def test_continuous_actions_are_refused():
+    """Before anything compiles."""
+    with pytest.raises(InputError, match="pqn draws no continuous actions, which finger-spin has: use "):
+        mtjax.train("finger-spin", "pqn", steps=100, quiet=True)
+
+
+@dataclasses.dataclass(frozen=True)
+class Choices(Probe):
+    """Probes in which one of five actions stands for -1, -1/2, 0, 1/2 or 1."""
+
+    @property
+    def spec(self):
+        return super().spec._replace(action=Discrete(5))
+
+    def step(self, task, state, action):
+        return super().step(task, state, (action - 2)[None] / 2)
+
+
+GAMMA, SCALES = 0.9, (1.0, -0.5)
+KNOWN = {
+    "one-step": (lambda scale, obs: scale, [0.0], 0.02),
+    "by-observation": (lambda scale, obs: scale * obs, [-1.0, 1.0], 0.05),
+    "delayed": (lambda scale, obs: scale * GAMMA ** (1 - obs), [0.0, 1.0], 0.05),
+    "endless": (lambda scale, obs: scale * GAMMA ** (1 - obs) / (1 - GAMMA), [0.0, 1.0], 0.4),
+    "by-action": (lambda scale, obs: 0.0, [0.0], 0.1),
+    "by-both": (lambda scale, obs: 0.0, [-1.0, 1.0], 0.1),
+}
+
+
+@pytest.mark.parametrize("kind", KNOWN)
+def test_probes_are_learned(kind):
+    """The best value of every task, and the action that has it."""
+    given = {"num_envs": 16, "chunk_steps": 1600, "unroll": 8, "epochs": 4, "minibatches": 4, "gamma": GAMMA}
+    given |= {"epsilon": 0.3, "epsilon_rollouts": 40, "q_lambda": 0.0, "critic_lr": 3e-3}
+    agent, tasks = tiny("pqn", hidden=(32,)).for_action(Discrete(5)), tasks_of(kind, SCALES)
+    state, history = train(Choices(), agent, given, tasks=tasks)
+    state, (expected, obs, tolerance) = only_seed(state.agent), KNOWN[kind]
+    for i, scale in enumerate(SCALES):
+        found = np.asarray(values_of(agent, state, jnp.float32(obs)[:, None], pick(tasks, i)))
+        np.testing.assert_allclose(found.max(axis=-1), [expected(scale, x) for x in obs], atol=tolerance)
+        if kind == "by-action":
+            np.testing.assert_allclose((found.argmax(axis=-1) - 2) / 2, [scale], atol=0.01)
+    assert history[0]["bad_step"].max() == -1
