@@ -120,16 +120,25 @@ def require_trials(settings: Settings, env: Any, agent: Agent) -> None:
     """Check that a family has such trials, and that an agent can learn from them.
 
     Raises:
-        InputError: the agent relabels steps, and another episode may follow them; or worlds cannot go on.
+        InputError: the agent learns from what follows a step, and another episode may follow it; or worlds cannot go
+            on.
     """
-    if settings.trials > 1 and getattr(agent.experience, "hindsight", 0):
-        raise InputError(
-            f"hindsight relabels steps by what follows them, which in a trial of {settings.trials} episodes may be "
-            "another episode; use --hindsight=0 or --trials=1"
-        )
+    if settings.trials > 1:
+        _require_repeatable(settings.trials, agent)
     reason = _cannot_go_on(env) if settings.reset_free else ""
     if reason:
         raise InputError(f"--reset-free lets worlds go on, and {reason}; leave it out")
+
+
+def _require_repeatable(trials: int, agent: Any) -> None:
+    """Refuse an agent that takes what follows a step for a state of the same episode."""
+    follows = f"what follows a step, which in a trial of {trials} episodes may be another episode"
+    if getattr(agent.experience, "hindsight", 0):
+        raise InputError(f"hindsight relabels steps by {follows}; use --hindsight=0 or --trials=1")
+    if getattr(agent, "history_length", 0):
+        raise InputError(f"tasks are inferred from {follows}; use --agent.conditioning=recurrent or --trials=1")
+    if getattr(getattr(agent, "representation", None), "predicts", False):
+        raise InputError(f"models predict {follows}; use --agent.representation=plain or --trials=1")
 
 
 def _cannot_go_on(env: Any) -> str:

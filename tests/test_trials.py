@@ -177,10 +177,21 @@ def test_one_episode_a_trial_is_what_there_was():
     assert state.worlds.episode is None and 0 < np.mean(rows.discount == 0) < np.mean(rows.ended)
 
 
-def test_hindsight_is_refused_in_trials_of_several_episodes():
-    """What follows a step may be another episode's, of which no reward tells."""
-    with pytest.raises(InputError, match=r"hindsight .* --trials=1"):
-        train(Goals(), tiny("sac"), {**SETTINGS, "hindsight": 0.5, "warmup_steps": 1})
+@pytest.mark.parametrize(
+    ("name", "settings", "message"),
+    [
+        ("sac", {"hindsight": 0.5}, r"hindsight .* --trials=1"),
+        ("ppo", {"conditioning": "inferred"}, r"inferred .* --agent.conditioning=recurrent"),
+        ("deepmdp", {}, r"models predict .* --agent.representation=plain"),
+    ],
+)
+def test_who_needs_what_follows_in_an_episode_is_refused_trials_of_several(name, settings, message):
+    """What follows a step may be another episode's."""
+    experience = {key: settings.pop(key) for key in list(settings) if key == "hindsight"}
+    own = {} if name == "ppo" else {"warmup_steps": 1, "replay_size": STEPS * ENVS, **experience}
+    given = {"num_envs": ENVS, "chunk_steps": STEPS, "trials": K}
+    with pytest.raises(InputError, match=message):
+        train(Goals(), tiny(name, **settings), {**given, **own})
 
 
 # Sums of rewards.
