@@ -12,7 +12,7 @@ import mtjax
 from mtjax.agents.parts.policies import Categorical, Gaussian, policy_for
 from mtjax.agents.ppo import Batch
 from mtjax.envs.probes import tasks_of
-from mtjax.types import Continuous, Discrete, InputError, Spec
+from mtjax.types import Continuous, Discrete, InputError, Spec, Transition
 
 KEY = jax.random.key(0)
 LOGITS = np.random.default_rng(0).normal(size=(6, 4)).astype(np.float32)
@@ -200,3 +200,15 @@ def test_agents_of_continuous_actions_are_refused_before_anything_is_compiled():
         tiny("sac").init(bandit.spec, bandit.tasks(), KEY)
     with pytest.raises(InputError, match=r"PPO was not made for these discrete actions: agent.for_action"):
         tiny("ppo").init(bandit.spec, bandit.tasks(), KEY)
+
+
+def test_past_actions_are_kept_as_numbers_and_seen_as_vectors():
+    """By agents that infer their task from the last steps; those before the first step are not known."""
+    env = mtjax.make("bandit", num_tasks=2)
+    agent = tiny("ppo", conditioning="inferred", inferred_from=3).for_action(env.spec.action)
+    state, task = agent.init(env.spec, env.tasks(), KEY), jax.tree.map(lambda x: x[0], env.tasks())
+    step = Transition(jnp.zeros(1), jnp.int32(3), jnp.float32(1), jnp.float32(1), jnp.zeros(1))
+    past = agent.remember(state, agent.begin(state, task), step, task).past
+    assert past.action.dtype == jnp.int32 and past.action.tolist() == [0, 0, 3] and past.known.tolist() == [0, 0, 1]
+    seen = agent.see(of_task(state.nets, 0)["inputs"], jnp.zeros(1), past)
+    np.testing.assert_array_equal(seen.past.action, np.eye(5)[[0, 0, 3]])
