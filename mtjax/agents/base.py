@@ -559,7 +559,7 @@ class BaseAgent(abc.ABC):
         """Count collected steps (T, H, E, ...), after learning: moments of observations, scaling and sampler."""
         gamma = jnp.broadcast_to(self.discounts(tasks), len(tasks.id))[:, None]
         told = Transition(None, None, steps.reward, steps.discount, None, None, steps.closed, memory=steps.memory)  # type: ignore
-        told = told._replace(memory=Memory(None, None, *steps.memory[2:]))
+        told = told._replace(memory=steps.memory._replace(past=None, hidden=None))
         told = jax.tree.map(lambda x: x.reshape(len(x), -1), collectives.whole(told, axis=2))
         new = {"inputs": self.fit_inputs(state.nets["inputs"], steps.obs)}
         for name, (part, before) in zip(("scaling", "sampler"), self._watchers(told.memory), strict=True):
