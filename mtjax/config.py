@@ -348,7 +348,7 @@ def require_policy(agent: Any, env: Any) -> None:
         return
     able = ", ".join(name for name, preset in AGENTS.items() if isinstance(agent.policy, preset.cls.policies))
     scored = any(hasattr(part.family, "scores") for part in getattr(env, "parts", ()))
-    scores, kind = ", or scores=True (--env.scores)" if scored else "", env.spec.action.kind
+    scores, kind = ", or --env.scores" if scored else "", env.spec.action.kind
     names = agent_name_of(agent), env_name_of(env)
     raise InputError(f"{names[0]} draws no {kind} actions, which {names[1]} has: use {able}{scores}")
 

@@ -78,7 +78,7 @@ def test_a_dog_asks_for_dm_control_where_it_is_missing(monkeypatch):
     monkeypatch.setattr(dog, "find_spec", lambda name: None)
     with pytest.raises(InputError, match="pip install dm_control"):
         dog._read_dog.__wrapped__()
-    with pytest.raises(InputError, match=r"this scene is of meshes.*leave out --env.pixels"):
+    with pytest.raises(InputError, match=r"this scene is of meshes.*leave out pixels"):
         envs.make("dog-walk", pixels=64)
 
 

@@ -105,7 +105,7 @@ def named(tree):
 
 def bits(tree):
     """The bytes of all arrays, keys of random numbers too."""
-    plain = lambda x: jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x
+    plain = lambda x: jax.random.key_data(x) if jnp.issubdtype(jnp.result_type(x), jax.dtypes.prng_key) else x
     return [np.asarray(plain(x)).tobytes() for x in jax.tree.leaves(tree)]
 
 

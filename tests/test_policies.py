@@ -193,7 +193,7 @@ def test_ppo_finds_the_best_arm_of_every_task():
 
 def test_agents_of_continuous_actions_are_refused_before_anything_is_compiled():
     """By name, with what to use instead; and an agent that was made for other actions."""
-    with pytest.raises(InputError, match=r"sac draws no discrete actions, which bandit has: use ppo, or scores=True"):
+    with pytest.raises(InputError, match=r"sac draws no discrete actions, which bandit has: use ppo, .*scores"):
         mtjax.train("bandit", "sac", steps=10)
     bandit = mtjax.make("bandit")
     with pytest.raises(InputError, match="SAC draws no discrete actions"):

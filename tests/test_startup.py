@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import inspect
 import itertools
 import json
 import os
@@ -131,7 +132,7 @@ def test_devices_are_found_while_the_rest_is_imported(monkeypatch):
         return rest if place == "mtjax.command.train:main" else names.load(place)
 
     monkeypatch.setattr("jax.devices", devices)
-    monkeypatch.setitem(train.main.__globals__, "load", load)
+    monkeypatch.setitem(inspect.unwrap(train.main).__globals__, "load", load)
     train.main(["--env=finger-spin"])
     assert answered.wait(60) and waited == [True]
 

@@ -239,7 +239,7 @@ def test_a_run_that_is_resumed_in_the_middle_of_a_trial_is_the_whole_run(name, t
     """To the bit: a checkpoint holds which episode it is."""
     own = {"unroll": 5, "minibatches": 1} if name == "ppo" else {"warmup_steps": 4, "replay_size": 64, "batch_size": 4}
     given = dict(num_envs=3, chunk_steps=25, trials=2, eval_every=1, eval_episodes=2, quiet=True, **own)
-    env, steps = mtjax.make("bandit", num_tasks=2, split="none"), 2 * 3 * 25
+    env, steps = mtjax.make("bandit", num_tasks=2, split="none", scores=True), 2 * 3 * 25
     run = lambda chunks, folder, **more: mtjax.train(
         env, tiny(name, hidden=(8,)), steps=chunks * steps, directory=tmp_path / folder, **given, **more
     )
@@ -314,7 +314,7 @@ def test_the_task_of_an_evaluated_trial_stays_and_each_episode_begins_elsewhere(
 
 def test_a_run_s_evaluations_know_their_trials(tmp_path, capsys):
     """In the file, for the policy that is scored again, and in what is told of first, last and mean episode."""
-    env = mtjax.make("bandit", num_tasks=2, split="none")
+    env = mtjax.make("bandit", num_tasks=2, split="none", scores=True)
     given = dict(num_envs=2, chunk_steps=4, warmup_steps=1, replay_size=16, batch_size=2, steps=16, trials=2)
     result = mtjax.train(env, tiny("sac", hidden=(8,)), eval_episodes=4, directory=tmp_path / "run", **given)
     assert "(episode 1 of a trial " in capsys.readouterr().out and "episode 2 " in repr(result)
@@ -334,9 +334,10 @@ def test_a_run_s_evaluations_know_their_trials(tmp_path, capsys):
 
 def test_a_run_evaluates_whole_trials():
     """Else it is refused before it is compiled."""
-    message = "eval-episodes must be a multiple of a trial's 4 episodes, such as 12; not 10"
+    message = "eval-episodes must be a multiple of a trial's 4 episodes, such as 12; not 9"
     with pytest.raises(InputError, match=message):
-        mtjax.train("bandit", "sac", steps=100, trials=4)
+        mtjax.train("bandit", "ppo", steps=100, trials=4, eval_episodes=9)
+    assert mtjax.preset("bandit", "ppo", "cpu").plan.eval_episodes == 10
 
 
 # Worlds that go on.
