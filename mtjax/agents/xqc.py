@@ -70,9 +70,11 @@ class XQC(SAC):
             outputs (N, B, outputs) at (s, a), those at (s', a'), and new statistics (N, ...).
         """
         join = lambda now, later: jnp.concatenate([now, later])
-        obs = jax.tree.map(join, batch.obs, batch.next_obs)
-        features = join(batch.features, batch.features) if batch.features.ndim == 2 else batch.features
-        outputs, found = self.of_critics(self.critic.fit, nets, features, obs, join(batch.action, next_action))
+        ends = [self.critic_inputs(nets, batch.features, obs) for obs in (batch.obs, batch.next_obs)]
+        (features, inputs), (next_features, next_inputs) = ends
+        features = join(features, next_features) if features.ndim == 2 else features
+        data = (features, jax.tree.map(join, inputs, next_inputs), join(batch.action, next_action))
+        outputs, found = jax.vmap(self.critic.fit, (0, None, None, None))(nets["critic"], *data)
         now, later = jnp.split(outputs, 2, axis=1)
         return now, later, found
 
