@@ -166,7 +166,7 @@ def test_ppo_learns_tabular_mdps(optimum):
     """Its greedy actions in every state return at least 97% of what value iteration's do, in every task."""
     env, (optimal, reward) = mtjax.make("tabular-mdp", num_tasks=4), optimum
     given = {"num_envs": 16, "gamma": 0.95, "actor_lr": 1e-3}
-    result = mtjax.train(env, "ppo", steps=160_000, quiet=True, eval_episodes=1, **given)
+    result = mtjax.train(env, "ppo", steps=480_000, quiet=True, eval_episodes=1, **given)
     policy, tasks = result.policy(), env.tasks()
     states = np.eye(4, dtype=np.float32)
     for i in range(4):
