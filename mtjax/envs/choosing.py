@@ -13,8 +13,8 @@ class Choosing(Family):
     """A family in which an agent chooses one of ``action_size`` actions."""
 
     scores: bool = False
-    """Take a score in [-1, 1] for each action, of which the highest counts (of equal ones the first), in place of the
-    number of the chosen action. Agents of continuous actions, such as sac, need it."""
+    """Take a score in [-1, 1] for each action, in place of the number of an action. The highest score counts, of equal
+    ones the first. Agents of continuous actions, such as sac, need it."""
 
     @property
     def discrete(self) -> bool:  # type: ignore[override]
