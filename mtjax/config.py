@@ -16,7 +16,7 @@ import tyro
 from jax.sharding import Mesh
 
 from mtjax import trials
-from mtjax.agents import AGENTS, BaseAgent, agent, preset_of
+from mtjax.agents import AGENTS, BaseAgent, agent, combinations, preset_of
 from mtjax.agents import name_of as agent_name_of
 from mtjax.agents.choices import kinds_of, replace
 from mtjax.agents.parts import name_of
@@ -205,7 +205,7 @@ class RunConfig:
             raise InputError("--runs needs a folder; that of the command is --runs=.")
         path(self.runs, "--runs")
         _ = family.engine_name, family.table, family.targets()  # its engine refuses a model that it cannot run
-        learner.require_sight(family.spec)
+        combinations.require_sight(learner, family.spec)
         if preset_of(self.agent).sees_pictures and not shown(family.spec.obs):
             raise InputError(
                 f"{self.agent} learns from pictures, and {self.env} shows none: give --env.pixels=64, or for states "

@@ -135,7 +135,7 @@ def _require_repeatable(trials: int, agent: Any) -> None:
     follows = f"what follows a step, which in a trial of {trials} episodes may be another episode"
     if getattr(agent.experience, "hindsight", 0):
         raise InputError(f"hindsight relabels steps by {follows}; use --hindsight=0 or --trials=1")
-    if getattr(agent, "history_length", 0):
+    if getattr(getattr(agent, "view", None), "history", 0):
         raise InputError(f"tasks are inferred from {follows}; use --agent.conditioning=recurrent or --trials=1")
     if getattr(getattr(agent, "representation", None), "predicts", False):
         raise InputError(f"models predict {follows}; use --agent.representation=plain or --trials=1")

@@ -246,6 +246,7 @@ class Experience(Protocol):
     @property
     def reset_every(self) -> int: ...  # steps of every environment between two resets of networks; 0 for never
     def updates_in(self, steps: int) -> int: ...  # updates in so many steps of all environments
+    def window_steps(self, steps: int) -> int: ...  # length L of windows for a memory that learns through so many steps
     @property
     def axes(self) -> Any: ...  # of the data under a map over seeds
     @property

@@ -12,6 +12,7 @@ import pytest
 from needs import needs
 
 from mtjax import agents, loop
+from mtjax.agents import replayed
 from mtjax.agents.base import Memory
 from mtjax.agents.parts.knowing import last_steps
 from mtjax.agents.parts.policies import Gaussian
@@ -256,7 +257,7 @@ def _agent_programs(agent, named: Named, num_tasks: int, batch_size: int):
     spec = named.spec
     tasks, key = tasks_of("one-step", np.ones(num_tasks)), jax.random.key(0)
     init = lambda tasks, key: agent.init(spec, tasks, key)
-    batch = with_memory(agent, random_batch(0, num_tasks, batch_size, spec, agent.history_length))
+    batch = with_memory(agent, random_batch(0, num_tasks, batch_size, spec, agent.view.history))
     learn = partial(update, agent)
     return quick(init, tasks, key), quick(learn, jax.eval_shape(init, tasks, key), batch, tasks, key)
 
@@ -273,7 +274,7 @@ def update(agent, state, batch: Transition, tasks: Task, key, number=0):
 
 def prepare(agent, state, batch: Transition, tasks: Task):
     """What an agent's losses take of transitions (T, B, ...)."""
-    return agent.prepare(state, windows(batch), tasks)
+    return replayed.prepare(agent, state, windows(batch), tasks)
 
 
 def assessed(agent, state, steps: Transition, tasks: Task):
@@ -342,7 +343,7 @@ def values(agent, state, tasks: Task, obs, action) -> np.ndarray:
     obs, action = jnp.float32(obs)[:, None], jnp.float32(action)[:, None]
     rows = []
     for i in range(len(tasks.id)):
-        features = agent.features(state, pick(tasks, i))
+        features = agent.view.features(state, pick(tasks, i))
         rows.append(agent.values(of_task(state.nets, i), features, obs, action))
     return np.stack(rows)
 

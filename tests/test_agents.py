@@ -118,7 +118,7 @@ def test_every_combination_has_the_right_shapes(name, settings, vectors):
     """Traced, not run: an update keeps the state's shapes and types, and acting gives an action for each world."""
     agent = make(name, settings, vectors)
     state = jax.eval_shape(lambda: agent.init(SPEC, TASKS, KEY))
-    batch = probes.with_memory(agent, random_batch(0, 3, BATCH, SPEC, agent.history_length))
+    batch = probes.with_memory(agent, random_batch(0, 3, BATCH, SPEC, agent.view.history))
     after, metrics = jax.eval_shape(lambda state: probes.update(agent, state, batch, TASKS, KEY), state)
     assert shapes(after) == shapes(state)
     conflicts = CONFLICTS if agent.gradients.needs == "gradients" else set()
@@ -194,7 +194,7 @@ def test_what_the_networks_see_of_a_task(conditioning, vectors):
     known = Params(given, {"context": TASKS.context})
     state = with_nets(jax.eval_shape(lambda: agent.init(SPEC, TASKS, KEY)), tasks=known)
     expected = {"one-hot": [0, 1, 0], "parameters": [-0.5], "vectors": np.load(vectors)[1]}.get(conditioning, [])
-    np.testing.assert_allclose(agent.features(state, pick(TASKS, 1)), np.float32(expected))
+    np.testing.assert_allclose(agent.view.features(state, pick(TASKS, 1)), np.float32(expected))
 
 
 def test_the_context_limit_shows_a_task_beyond_the_range_as_its_end():
@@ -205,8 +205,8 @@ def test_the_context_limit_shows_a_task_beyond_the_range_as_its_end():
         agent = tiny("sac", conditioning="parameters", context_limit=limit)
         shapes = jax.eval_shape(lambda agent=agent: agent.init(SPEC, TASKS, KEY))
         state = with_nets(shapes, tasks=Params({}, {"context": TASKS.context}))
-        np.testing.assert_allclose(agent.features(state, beyond), [expected], rtol=1e-6)
-        np.testing.assert_allclose(agent.features_of_batch(state, drawn, TASKS), -expected, rtol=1e-6)
+        np.testing.assert_allclose(agent.view.features(state, beyond), [expected], rtol=1e-6)
+        np.testing.assert_allclose(agent.view.features_of_all(state, drawn, TASKS), -expected, rtol=1e-6)
 
 
 def test_an_agent_that_is_told_nothing_acts_alike_in_all_tasks():
@@ -256,13 +256,15 @@ def test_every_method_says_what_differs_from_its_paper():
 def test_what_lies_far_from_what_was_learned_is_clipped(name):
     """What the networks see of observations and of the past, in acting and in learning; nothing if not normalised."""
     agent = tiny(name, normalize_observations=True, conditioning="inferred", inferred_from=2)
-    inputs = agent.fit_inputs(agent.init_inputs(SPEC, 3), random_batch(0, 3, BATCH, SPEC).obs)
+    inputs = agent.view.count(agent.view.init(SPEC, 3), random_batch(0, 3, BATCH, SPEC).obs)
     obs, past = jnp.full((3, BATCH, 3), 1e3), random_past(np.random.default_rng(0), (3, BATCH, 2), SPEC)
     past = past._replace(obs=jnp.full_like(past.obs, -1e3))
-    for see in (agent.see, agent.see_batch):
+    for see in (agent.view.see, agent.view.see_all):
         seen = see(inputs, obs, past)
         assert np.all(seen.obs == 10) and np.all(seen.past.obs == -10)
-    plain = tiny(name, normalize_observations=False, conditioning="inferred", inferred_from=2).see(inputs, obs, past)
+    plain = tiny(name, normalize_observations=False, conditioning="inferred", inferred_from=2).view.see(
+        inputs, obs, past
+    )
     assert np.all(plain.obs == 1e3) and np.all(plain.past.obs == -1e3)
 
 
@@ -390,8 +392,8 @@ REFUSED = [
     ("sac", {"hidden": (8, 0)}, r"at least one unit, not \(8, 0\)"),
     ("sac", {"critic_hidden": (8, 0)}, r"critic-hidden must be of at least one unit each, not \(8, 0\)"),
     ("sac", {"encoder": "simba", "actor_hidden": (8, 4)}, r"hidden=\(8, 4\) has several"),
-    ("sac", {"gamma": 1.1}, r"gamma must be in \[0, 1\] .*1.1"),
-    ("sac", {"tau": 0.0}, r"tau in \(0, 1\], not .*0.0"),
+    ("sac", {"gamma": 1.1}, r"gamma must be in \[0, 1\], not 1.1"),
+    ("sac", {"tau": 0.0}, r"tau must be in \(0, 1\], not 0.0"),
     ("sac", {"tau": float("nan")}, "tau must be a finite number, not nan"),
     ("sac", {"max_gradient_norm": -1.0}, "max-gradient-norm"),
     ("sac", {"conditioning": "embedding", "embedding_size": 0}, "embedding-size"),

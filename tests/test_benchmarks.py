@@ -18,6 +18,7 @@ from needs import needs
 from probes import one_in, slow_but
 
 import mtjax
+from mtjax.agents.combinations import require_sight
 from mtjax.agents.parts.knowing import Text
 from mtjax.envs import BENCHMARKS
 from mtjax.envs.metaworld.names import TASKS
@@ -442,7 +443,7 @@ def test_a_suites_agents_see_its_pictures(script, agent):
     pixels = suite.SUITES["pixels"]
     settings = {name: script("returns").value(x) for name, x in (pair.split("=") for pair in pixels.settings)}
     program = mtjax.preset(pixels.envs[0], agent, "gpu", learning.seeing(agent, settings), **settings)
-    program.learner.require_sight(program.family.spec)
+    require_sight(program.learner, program.family.spec)
     assert program.learner.representation.sees_pictures
 
 

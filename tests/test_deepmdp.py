@@ -34,7 +34,7 @@ from mtjax.agents.on_policy import Taken
 from mtjax.agents.parts.gradients.balancing import FAMO
 from mtjax.agents.parts.knowing.last_steps import Past, Seen, append
 from mtjax.agents.parts.representations.deepmdp import ModelTargets
-from mtjax.agents.sac import Batch
+from mtjax.agents.replayed import Batch
 from mtjax.networks import Params
 from mtjax.types import InputError, Spec, Transition
 
@@ -60,7 +60,7 @@ def of_critics(nets):
 def start(agent):
     """A fresh state, a batch and the compiled update."""
     init, update = learner(agent, TASKS, BATCH, SPEC)
-    return init(TASKS, KEY), random_batch(0, 3, BATCH, SPEC, agent.history_length), update
+    return init(TASKS, KEY), random_batch(0, 3, BATCH, SPEC, agent.view.history), update
 
 
 def random_params(agent, task=0):
@@ -73,10 +73,10 @@ def random_params(agent, task=0):
 
 def one_task(agent):
     """A batch of one task, as the losses see it, and what they fit, which is random: of the models, and of critics."""
-    batch, random = pick(random_batch(1, 3, BATCH, SPEC, agent.history_length), 1), np.random.default_rng(6)
-    past = batch.memory.past if agent.history_length else None
-    next_past = append(past, batch.obs, batch.action, batch.reward) if agent.history_length else None
-    see = lambda obs, past: agent.see(Params({}, {}), obs, past)
+    batch, random = pick(random_batch(1, 3, BATCH, SPEC, agent.view.history), 1), np.random.default_rng(6)
+    past = batch.memory.past if agent.view.history else None
+    next_past = append(past, batch.obs, batch.action, batch.reward) if agent.view.history else None
+    see = lambda obs, past: agent.view.see(Params({}, {}), obs, past)
     normal = lambda *shape: jnp.float32(random.normal(size=shape))
     width = len(agent.conditioning.given(jnp.int32(0), pick(TASKS, 0), 3, None))
     drawn = agent.representation.transition == "probabilistic"
@@ -182,7 +182,7 @@ def test_rules_see_losses_from_the_least(name, transition, monkeypatch):
     monkeypatch.setattr(FAMO, "adapt", adapt)
     settings = {"representation": "deepmdp", "transition": transition, "model_coefficient": 0.5, "gradients": "famo"}
     agent = make_ppo(**settings) if name == "ppo" else make(name, **settings)
-    batch = rollouts(agent) if name == "ppo" else random_batch(0, 3, BATCH, SPEC, agent.history_length)
+    batch = rollouts(agent) if name == "ppo" else random_batch(0, 3, BATCH, SPEC, agent.view.history)
     take = probes.learn if name == "ppo" else probes.update
     state, found = jit(partial(take, agent))(agent.init(SPEC, TASKS, KEY), batch, TASKS, KEY)
     surest = np.log(0.01) if transition == "probabilistic" else 0.0
@@ -331,7 +331,7 @@ def test_everything_that_should_learn_does(name, settings):
     before, _, update = start(agent)
     after = before
     for i in range(10):
-        after, metrics = update(after, random_batch(i, 3, BATCH, SPEC, agent.history_length), TASKS, jax.random.key(i))
+        after, metrics = update(after, random_batch(i, 3, BATCH, SPEC, agent.view.history), TASKS, jax.random.key(i))
     assert jax.tree.map(jnp.shape, after) == jax.tree.map(jnp.shape, before)
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves((after, metrics)))
     trained = learned(agent.fits.values())
@@ -418,7 +418,7 @@ def test_theta_of_an_unseen_task_is_inferred_from_its_last_steps():
     act = jit(lambda state, past, task: act_once(agent, state, batch.obs[0, 0], task, None, past))
     past = pick(batch.memory.past, (0, 0))
     params = state.nets["representation"]
-    guess = agent.representation.apply(params, "guess", agent.see(state.nets["inputs"], batch.obs[0, 0], past))
+    guess = agent.representation.apply(params, "guess", agent.view.see(state.nets["inputs"], batch.obs[0, 0], past))
     thetas = params.own["embedding"]
     given = with_nets(state, representation=params._replace(own={"embedding": thetas.at[0].set(guess)}))
     np.testing.assert_allclose(act(state, past, STRANGER), act(given, past, pick(TASKS, 0)), atol=1e-6)
@@ -522,7 +522,7 @@ def test_parts_combine(name, settings):
     """Traced over two seeds, not run: an update keeps shapes and types, and there is an action for each world."""
     settings = {k: v for k, v in settings.items() if name == "hip-bmdp" or "theta" not in k}
     agent, keys = make(name, **settings), jax.random.split(KEY, 2)
-    batch = jax.tree.map(lambda x: jnp.stack([x, x]), random_batch(0, 3, BATCH, SPEC, agent.history_length))
+    batch = jax.tree.map(lambda x: jnp.stack([x, x]), random_batch(0, 3, BATCH, SPEC, agent.view.history))
     state = jax.eval_shape(jax.vmap(lambda key: agent.init(SPEC, TASKS, key)), keys)
     update = jax.vmap(lambda state, batch, key: probes.update(agent, state, batch, TASKS, key))
     after, metrics = jax.eval_shape(update, state, batch, keys)
@@ -570,7 +570,7 @@ def rollouts(agent, seed=0):
     """Rollouts (T, H, E, ...) in which every field is random."""
     random, shape = np.random.default_rng(seed), (3, 4, 2)
     normal = lambda *size: jnp.float32(random.normal(size=(*shape, *size)))
-    past = random_past(random, (*shape, agent.history_length), SPEC) if agent.history_length else None
+    past = random_past(random, (*shape, agent.view.history), SPEC) if agent.view.history else None
     raw, ended = normal(2), jnp.asarray(random.random(shape) < 0.5)
     fields = {"reward": normal(), "discount": jnp.ones(shape), "ended": ended, "closed": ended}
     fields |= {"extras": Taken(raw, normal() - 2), "memory": Memory(past)}

@@ -56,7 +56,7 @@ def distance_to_reward(agent, state, batch):
     """Mean distance (T,) of all critics' estimates from the rewards."""
     distances = []
     for i in range(3):
-        one, features = pick(batch, i), agent.features(state, pick(TASKS, i))
+        one, features = pick(batch, i), agent.view.features(state, pick(TASKS, i))
         estimates = agent.values(of_task(state.nets, i), features, one.obs, one.action)
         distances.append(np.mean(np.abs(estimates - one.reward)))
     return distances
@@ -80,7 +80,7 @@ def gradients_by_hand(agent, state, batch):
 
     @partial(jax.jit, compiler_options=QUICK)
     def slopes(nets, one, task, key):
-        features = agent.features(state, task)
+        features = agent.view.features(state, task)
         of_critic = jax.grad(critic_loss)(nets["critic"], nets, one, features)
         of_actor = jax.grad(actor_loss)(nets["actor"], nets, one, features, key)
         return [jax.flatten_util.ravel_pytree(slope.shared or slope.own)[0] for slope in (of_critic, of_actor)]
@@ -247,7 +247,7 @@ def test_activity_is_that_of_the_networks():
 def trace(agent):
     """What diagnostics of an agent would be: shapes alone."""
     state = shapes_of(agent)
-    window = jax.eval_shape(lambda: probes.windows(random_batch(0, 3, BATCH, SPEC, agent.history_length)))
+    window = jax.eval_shape(lambda: probes.windows(random_batch(0, 3, BATCH, SPEC, agent.view.history)))
     gradients = jax.eval_shape(partial(compare_gradients, agent), state, window, TASKS, KEY)
     seen = jax.eval_shape(partial(activity, agent), state, window, TASKS)
     return state, gradients, seen

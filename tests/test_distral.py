@@ -16,7 +16,8 @@ from mtjax.agents import agent
 from mtjax.agents.distral import Distral
 from mtjax.agents.parts.gradients.descent import descend
 from mtjax.agents.parts.policies import Gaussian
-from mtjax.agents.sac import SAC, Batch
+from mtjax.agents.replayed import Batch
+from mtjax.agents.sac import SAC
 from mtjax.agents.state import axes_of
 from mtjax.networks import Params
 from mtjax.types import InputError, Spec

@@ -325,7 +325,7 @@ def test_a_checkpoint_is_the_state_of_when_it_was_saved(tmp_path, monkeypatch, r
 
 def experience(agent, num_seeds, num_tasks):
     """Batches (S, T, B, ...), or rollouts (S, T, H, E, ...) for agents that learn from these."""
-    batches = [random_batch(seed, num_tasks, 64, SPEC, agent.history_length) for seed in range(num_seeds)]
+    batches = [random_batch(seed, num_tasks, 64, SPEC, agent.view.history) for seed in range(num_seeds)]
     batch = jax.tree.map(lambda *x: np.stack(x), *(with_memory(agent, batch) for batch in batches))
     if hasattr(agent, "critic_target"):
         return batch

@@ -104,7 +104,7 @@ def start(case, seed=0):
 def batch_of(case, seed):
     """A random batch of what the agent sees."""
     name, settings, _ = PARTS[case]
-    return random_batch(seed, 3, BATCH, SPECS.get(case, SPEC), tiny(name, **settings).history_length)
+    return random_batch(seed, 3, BATCH, SPECS.get(case, SPEC), tiny(name, **settings).view.history)
 
 
 def leaves_of(params):
@@ -337,8 +337,8 @@ def test_context_learns_through_the_trunk_in_the_paper(variant):
 
 def test_training_tasks_are_themselves_and_others_the_nearest():
     """By number if they were trained on, whatever their context; else by the distance of contexts."""
-    agent, state = tiny("multi-head"), start("multi-head")[0]
-    known = lambda task: agent.known_task(state, task)
+    state = start("multi-head")[0]
+    known = state.known
     np.testing.assert_array_equal(jax.vmap(known)(TASKS), [0, 1, 2])
     moved = TASKS._replace(context=TASKS.context[::-1])
     np.testing.assert_array_equal(jax.vmap(known)(moved), [0, 1, 2])

@@ -81,7 +81,7 @@ def test_probes_are_learned(kind, lag):
     agent, tasks = tiny("impala", lr_schedule="linear", lr_updates=updates), tasks_of(kind, SCALES)
     state, history = train(Probe(), agent, given, tasks=tasks)
     state, (expected, obs, tolerance) = only_seed(state.agent), KNOWN[kind]
-    seen = jax.vmap(lambda x: agent.see(state.nets["inputs"], x[None]))(jnp.float32(obs))
+    seen = jax.vmap(lambda x: agent.view.see(state.nets["inputs"], x[None]))(jnp.float32(obs))
     found = agent.values(state, tasks.context, jnp.broadcast_to(seen, (2, *seen.shape)))
     for i, scale in enumerate(SCALES):
         np.testing.assert_allclose(found[i], [expected(scale, x) for x in obs], atol=tolerance)

@@ -53,8 +53,8 @@ def test_who_infers_nothing_remembers_nothing():
     """No past is stored for it."""
     agent, tasks = tiny("sac"), tasks_of("one-step")
     state = jax.eval_shape(lambda: agent.init(SPEC, tasks, jax.random.key(0)))
-    assert not jax.tree.leaves(agent.begin(state, tasks)) and agent.history_length == 0
-    assert tiny("sac", **INFERRED).history_length == STEPS
+    assert not jax.tree.leaves(agent.begin(state, tasks)) and agent.view.history == 0
+    assert tiny("sac", **INFERRED).view.history == STEPS
 
 
 def test_the_loop_stores_what_was_seen():
@@ -133,7 +133,7 @@ def assert_scaled(agent, state, batch):
     scale = lambda x: (x - obs.mean(axis=0)) / obs.std(axis=0)
     inputs, past = state.nets["inputs"], batch.memory.past
     np.testing.assert_allclose(inputs.parts["moments"].mean, obs.mean(axis=0), rtol=1e-4, atol=1e-6)
-    seen = agent.see(inputs, batch.obs, past)
+    seen = agent.view.see(inputs, batch.obs, past)
     np.testing.assert_allclose(seen.obs, scale(batch.obs), rtol=1e-3, atol=1e-4)
     np.testing.assert_allclose(seen.past.obs, scale(past.obs), rtol=1e-3, atol=1e-4)
     for field in ("action", "reward", "known"):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from probes import SPEC, learner, of_task, pick, random_batch, tasks_of, tiny
 
-from mtjax.agents import PARTS
+from mtjax.agents import PARTS, replayed
 from mtjax.agents.parts.knowing import CONDITIONINGS, Embedding
 from mtjax.types import InputError
 
@@ -42,7 +42,7 @@ def test_an_embedding_is_seen_by_all_networks(agent):
     obs = random_batch(0, 3, BATCH, SPEC).obs
     for i in range(3):
         nets = of_task(state.nets, i)
-        given = made.features(state, pick(TASKS, i))
+        given = made.view.features(state, pick(TASKS, i))
         assert given.shape == (0,)
         found = made.policy_outputs(nets, given, obs[i])
         np.testing.assert_array_equal(found, made.actor.apply(nets["actor"], table[i], obs[i]))
@@ -55,7 +55,7 @@ def test_the_critics_loss_trains_it_and_the_actors_does_not(conditioning):
     made = tiny("sac", conditioning=conditioning, embedding_size=4, **more)
     init, update = learner(made, TASKS, BATCH)
     state = init(TASKS, KEY)
-    batch = random_batch(0, 3, BATCH, SPEC, made.history_length)
+    batch = random_batch(0, 3, BATCH, SPEC, made.view.history)
     after, _ = update(state, batch, TASKS, KEY)
     assert not same(after.nets["knowing"], state.nets["knowing"])
     assert "knowing" in made.fits["critic"].names and "knowing" not in made.fits["actor"].names
@@ -88,7 +88,7 @@ def test_what_is_told_has_the_promised_attributes(name, tmp_path):
     def shown():
         nets = of_task(made.init(spec, TASKS, KEY).nets, 0)
         given = made.conditioning.given(jnp.int32(0), pick(TASKS, 0), 3, jnp.ones((3, 2)))
-        return made.know(nets, given, made.example(spec, made.init_inputs(spec, 3)))
+        return made.view.know(nets, given, made.view.example(spec, made.view.init(spec, 3)))
 
     features, obs = shown()
     assert (features.shape[-1] > 0) == made.conditioning.tells
@@ -102,7 +102,7 @@ def test_slow_vectors_follow_at_the_critics_rate():
     made = tiny("hip-bmdp", conditioning="embedding")
     state = made.init(SPEC, TASKS, KEY)
     more = lambda nets: {name: jax.tree.map(lambda x: x + 1, nets[name]) for name in ("knowing", "representation")}
-    after = made.update_target(state._replace(nets=state.nets | more(state.nets)))
+    after = replayed.update_target(made, state._replace(nets=state.nets | more(state.nets)))
     step = lambda net: after.slow[net].own["embedding"] - state.slow[net].own["embedding"]
     np.testing.assert_allclose(step("knowing"), made.tau, rtol=1e-3)
     np.testing.assert_allclose(step("representation"), made.representation.encoder_tau, rtol=1e-3)
@@ -112,4 +112,4 @@ def test_one_past_has_one_length():
     given = {"conditioning": "inferred", "inferred_from": 3, "unseen_theta": "inferred"}
     with pytest.raises(InputError, match="inferred-from=3 and theta-from=2 are numbers of the same last steps"):
         tiny("hip-bmdp", **given, theta_from=2)
-    assert tiny("hip-bmdp", **given, theta_from=3).history_length == 3
+    assert tiny("hip-bmdp", **given, theta_from=3).view.history == 3

@@ -20,7 +20,8 @@ import mtjax.train
 from mtjax import agents, rollout
 from mtjax.agents import normalize
 from mtjax.agents.parts.policies import Gaussian
-from mtjax.agents.sac import Batch, action_sizes
+from mtjax.agents.rates import discounts
+from mtjax.agents.replayed import Batch, action_sizes
 from mtjax.agents.state import AgentState
 from mtjax.command import run_config
 from mtjax.envs import ENVS, Family, Mixture, make, mixture
@@ -194,7 +195,7 @@ def test_the_nearest_training_task_is_of_the_same_family():
     env = mixture([make("tabular-mdp", num_tasks=2), make("bandit", num_tasks=3)])
     train, held_out = env.tasks("train"), env.tasks("interpolation")
     state = AgentState({"tasks": Params({}, {"context": train.context})}, {}, {})
-    known = jax.vmap(lambda task: tiny("sac").known_task(state, task))
+    known = jax.vmap(state.known)
     nearest = np.asarray(known(held_out))
     families = np.argmax(held_out.context[:, :2], axis=1)
     assert np.argmax(train.context[nearest][:, :2], axis=1).tolist() == families.tolist() == [0] * 2 + [1] * 3
@@ -362,7 +363,7 @@ def test_episodes_end_at_their_own_horizons():
 
 def test_discounts_follow_horizons():
     env = mixture(["control-cartpole", make("tabular-mdp", scores=True)])
-    found = tiny(discounting="horizon").discounts(env.tasks())
+    found = discounts(tiny(discounting="horizon"), env.tasks())
     np.testing.assert_allclose(found, np.repeat([0.99, 0.95], 10), rtol=1e-6)
 
 
@@ -394,7 +395,7 @@ def test_every_task_has_its_own_normaliser_and_padding_stays_zero():
     agent, random = tiny(normalize_observations=True), np.random.default_rng(0)
     obs = jnp.float32(random.normal(size=(4, 50, 3)) * [[[1]], [[2]], [[5]], [[9]]])
     obs = obs.at[:3, :, 2].set(0.0)  # of the three tasks that see two numbers
-    inputs = agent.fit_inputs(agent.init_inputs(BOTH.spec, 4), obs)
+    inputs = agent.view.count(agent.view.init(BOTH.spec, 4), obs)
     seen = quick(jax.vmap(agent.see, (OVER_TASKS, 0)), inputs, obs)
     assert not np.any(seen[:3, :, 2])
     for i, width in enumerate((2, 2, 2, 3)):

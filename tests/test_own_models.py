@@ -12,6 +12,7 @@ import pytest
 import mtjax
 import mtjax.train
 from mtjax import envs
+from mtjax.agents.combinations import require_sight
 from mtjax.envs import Domain, Parameter
 from mtjax.envs.corridors.maze import CorridorMaze
 from mtjax.types import InputError
@@ -233,7 +234,7 @@ def test_observations_are_trees_of_any_shape_and_dtype(kind, forget):
         lambda x: (x.shape, x.dtype), env.spec.obs
     )
     if taken:
-        return mtjax.agent("drq").require_sight(env.spec)
+        return require_sight(mtjax.agent("drq"), env.spec)
     for agent in ("sac", "ppo", "drq"):
         with pytest.raises(InputError, match=r"agents take a vector of floats \(O,\), or .*; not ") as error:
             mtjax.train("seen", agent, steps=100, engine="c")

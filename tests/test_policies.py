@@ -210,5 +210,5 @@ def test_past_actions_are_kept_as_numbers_and_seen_as_vectors():
     step = Transition(jnp.zeros(1), jnp.int32(3), jnp.float32(1), jnp.float32(1), jnp.zeros(1))
     past = agent.remember(state, agent.begin(state, task), step, task).past
     assert past.action.dtype == jnp.int32 and past.action.tolist() == [0, 0, 3] and past.known.tolist() == [0, 0, 1]
-    seen = agent.see(of_task(state.nets, 0)["inputs"], jnp.zeros(1), past)
+    seen = agent.view.see(of_task(state.nets, 0)["inputs"], jnp.zeros(1), past)
     np.testing.assert_array_equal(seen.past.action, np.eye(5)[[0, 0, 3]])

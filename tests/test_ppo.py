@@ -61,8 +61,8 @@ def random_steps(agent, num_tasks=3, spec=SPEC, seed=0):
     random, shape = np.random.default_rng(seed), (num_tasks, LENGTH, ENVS)
     normal = lambda *size: jnp.float32(random.normal(size=(*shape, *size)))
     raw, past = normal(spec.action_size), None
-    if agent.history_length:
-        past = random_past(random, (*shape, agent.history_length), spec)
+    if agent.view.history:
+        past = random_past(random, (*shape, agent.view.history), spec)
     begun = Memory(None, agent.conditioning.begin(), agent.scaling.begin(), agent.sampler.begin())
     memory = jax.tree.map(lambda x: jnp.zeros((*shape, *x.shape)), begun)
     steps = Transition(
@@ -129,8 +129,8 @@ def test_every_task_has_its_own_discount():
     tasks, steps = TASKS._replace(horizon=jnp.array([200, 1000, 125])), random_steps(agent)
     state = agent.init(SPEC, tasks, KEY)
     state, batch, _ = assessed(agent, state, steps, tasks)
-    features = agent.features_of_batch(state, steps, tasks)
-    see = lambda obs: agent.see(state.nets["inputs"], obs.reshape(3, -1, 3))
+    features = agent.view.features_of_all(state, steps, tasks)
+    see = lambda obs: agent.view.see(state.nets["inputs"], obs.reshape(3, -1, 3))
     value, following = (agent.values(state, features, see(obs)) for obs in (steps.obs, steps.next_obs))
     gamma = np.array([0.975, 0.995, 0.96])[:, None]
     flat = lambda x: x.reshape(3, -1)
@@ -164,7 +164,7 @@ def batch_of(agent, state, **fields):
     """Four steps of the first task, with its networks."""
     random = np.random.default_rng(1)
     normal = lambda *size: jnp.float32(random.normal(size=(4, *size)))
-    features = agent.features(state, pick(TASKS, 0))
+    features = agent.view.features(state, pick(TASKS, 0))
     blank = dict.fromkeys(("log_prob", "advantage", "value", "output", "target"), jnp.zeros(4))
     batch = Batch(**{"obs": normal(3), "raw": normal(2), "features": features, "mask": None, **blank, **fields})
     return batch, of_task(state.nets, 0)
@@ -369,15 +369,15 @@ def test_moments_are_those_of_all_observations():
     """Of rollouts one after the other, as if they had come at once; in a mixture each task has its own."""
     agent, obs = small(), (np.random.default_rng(0).normal(size=(2, 3, 8, 3)) * 3 + 1).astype(np.float32)
     for mixed in (False, True):
-        inputs = agent.init_inputs(SPEC._replace(mixed=mixed), 3)
+        inputs = agent.view.init(SPEC._replace(mixed=mixed), 3)
         for batch in obs:
-            inputs = agent.fit_inputs(inputs, jnp.asarray(batch))
+            inputs = agent.view.count(inputs, jnp.asarray(batch))
         rows = np.moveaxis(obs, 1, 0).reshape(3, -1, 3) if mixed else np.asarray(obs).reshape(1, -1, 3)
         expected = [normalize.update(normalize.init(3), jnp.asarray(x)) for x in rows]
         for found, wanted in zip(inputs.parts["moments"], map(jnp.stack, zip(*expected, strict=True)), strict=True):
             np.testing.assert_allclose(found, wanted if mixed else wanted[0], rtol=1e-4)
     still = small(normalize_observations=False)
-    assert still.fit_inputs(still.init_inputs(SPEC, 3), obs[0]).parts["moments"].count == 0
+    assert still.view.count(still.view.init(SPEC, 3), obs[0]).parts["moments"].count == 0
 
 
 # Updates.
@@ -635,7 +635,7 @@ def test_probes_are_learned(kind):
     """Values of every task, and the best action where there is one."""
     agent, state, tasks, history = learned(kind)
     expected, obs, tolerance = KNOWN[kind]
-    seen = jax.vmap(lambda x: agent.see(state.nets["inputs"], x[None]))(jnp.float32(obs))
+    seen = jax.vmap(lambda x: agent.view.see(state.nets["inputs"], x[None]))(jnp.float32(obs))
     found = agent.values(state, tasks.context, jnp.broadcast_to(seen, (2, *seen.shape)))
     for i, scale in enumerate(SCALES):
         wanted = [expected(scale, x) for x in obs]

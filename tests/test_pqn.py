@@ -33,7 +33,7 @@ def steps_of(agent, seed=0):
 
 def values_of(agent, state, obs, task):
     """The values (..., A) of all actions at observations (..., O) of a task."""
-    one = lambda obs: agent.q(*agent.acting_inputs(state, agent.begin(state, task), obs, task))
+    one = lambda obs: agent.q(*agent.view.acting(state, agent.begin(state, task), obs, task))
     return jax.vmap(one)(obs.reshape(-1, obs.shape[-1])).reshape(*obs.shape[:-1], -1)
 
 

@@ -11,6 +11,7 @@ from probes import Walk, of_task, pick, quick, tasks_of, tiny, train
 
 import mtjax
 from mtjax import agents
+from mtjax.agents import replayed
 from mtjax.agents.base import Memory
 from mtjax.agents.on_policy import Taken
 from mtjax.agents.parts.knowing.recurrent import Following, Recurrent, Track
@@ -121,7 +122,7 @@ def test_sac_learns_from_windows_that_begin_with_the_stored_state():
     agent = tiny("sac", recurrent_steps=4, **RECURRENT)
     state = agent.init(SPEC, TASKS, KEY)
     steps = jax.tree.map(lambda x: jnp.swapaxes(x, 1, 2)[:, :, :4], rollout()._replace(extras=None))  # (T, B, L, ...)
-    batch = agent.prepare(state, steps, TASKS)
+    batch = replayed.prepare(agent, state, steps, TASKS)
     assert batch.reward.shape == (3, ENVS * 4)
     np.testing.assert_array_equal(batch.obs.past.state, steps.memory.hidden[:, :, 0])
     update = jax.jit(lambda steps: agent.update(state, steps, TASKS, KEY, jnp.int32(0))[1]["critic_loss"])

@@ -15,7 +15,8 @@ from probes import quick, random_batch, tasks_of, with_nets
 from mtjax.agents.parts.encoders import Identity
 from mtjax.agents.parts.knowing import Parameters
 from mtjax.agents.parts.policies import Drawn, Gaussian
-from mtjax.agents.sac import SAC, Batch
+from mtjax.agents.replayed import Batch
+from mtjax.agents.sac import SAC
 from mtjax.agents.state import AgentState
 from mtjax.networks import Params, join
 from mtjax.types import Spec, Transition

@@ -142,7 +142,7 @@ def test_an_agent_reads_a_tasks_own_sentence_also_of_a_held_out_task(hashing):
     state = with_nets(state, tasks=known)
     task = pick(TASKS, 0)
     for number, expected in ((0, 0), (1, 1), (2, 2), (3, 1)):
-        seen = agent.features(state, task._replace(id=jnp.int32(number), context=TASKS.context[1]))
+        seen = agent.view.features(state, task._replace(id=jnp.int32(number), context=TASKS.context[1]))
         np.testing.assert_allclose(seen, vectors[expected], atol=1e-6)
 
 

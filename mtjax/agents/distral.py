@@ -7,12 +7,13 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents import parts
-from mtjax.agents.base import Heads
+from mtjax.agents.base import Heads, Memory, borrowed_by_unseen
 from mtjax.agents.choices import PARTS
-from mtjax.agents.sac import SAC, ActorAux, Batch, Sample
-from mtjax.agents.state import Nets
+from mtjax.agents.replayed import Batch
+from mtjax.agents.sac import SAC, ActorAux, Sample
+from mtjax.agents.state import AgentState, Nets
 from mtjax.networks import Network, Params
-from mtjax.types import Array, InputError, Key
+from mtjax.types import Acted, Array, InputError, Key, Task
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,15 +65,12 @@ class Distral(SAC):
     """
 
     adjustable: ClassVar[tuple[str, ...]] = (*SAC.adjustable, "distral_alpha")
+    one_knowledge: ClassVar[bool] = True  # which the distilled policy shares
     heads: Heads = "disjoint"
     distral_alpha: float = 0.5
     """Share of the divergence from the distilled policy in the regulariser; the rest is entropy (alpha)."""
 
-    def __post_init__(self):
-        super().__post_init__()
-        parts.require_shares(self, "distral_alpha")
-
-    def _check_combination(self) -> None:
+    def check(self) -> None:
         if self.heads != "disjoint":
             raise InputError(f"distral gives every task a policy of its own: heads is disjoint, not {self.heads}")
         if self.representation.learns:
@@ -86,12 +84,13 @@ class Distral(SAC):
                 f"distral's tasks share the distilled policy alone, and its gradients do not conflict, so "
                 f"gradients={rule} has nothing to do; use gradients=mean"
             )
-        super()._check_combination()
+        super().check()
+        parts.require_shares(self, "distral_alpha")
 
     @property
     def unseen(self) -> str:
         """A sentence on what stands in for unseen tasks."""
-        rest = [part for part in self.borrowed if part != "networks"]
+        rest = [part for part in borrowed_by_unseen(self) if part != "networks"]
         return "the distilled policy plays them" + (f", by the {' and '.join(rest)} of the nearest" if rest else "")
 
     @property
@@ -99,18 +98,15 @@ class Distral(SAC):
         network = super().actor
         return Policies(**{field.name: getattr(network, field.name) for field in dataclasses.fields(network)})
 
-    @property
-    def knows_apart(self) -> bool:
-        """Whether every task has networks of its own by which it is known. The distilled policy needs shared ones."""
-        return False
-
     def distilled(self, nets: Nets, features: Array, obs: Any) -> Array:
         """Return the distilled policy's outputs (..., 2A)."""
-        return self.actor.apply_distilled(nets["actor"], *self.actor_inputs(nets, features, obs))
+        return self.actor.apply_distilled(nets["actor"], *self.view.actor_inputs(nets, features, obs))
 
-    def behaviour(self, trained: Array, nets: Nets, features: Array, obs: Array) -> Array:
-        own = self.policy_outputs(nets, features, obs)
-        return jnp.where(trained, own, self.distilled(nets, features, obs))
+    def act(self, state: AgentState, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
+        """Choose an action (A,) by the task's own policy, or by the distilled one for a task that is not known."""
+        inputs = self.view.acting(state, memory, obs, task)
+        outputs = jnp.where(task.id < state.num_tasks, self.policy_outputs(*inputs), self.distilled(*inputs))
+        return Acted(self.policy.draw(outputs, task.action_mask, key).action)
 
     def sample(self, nets: Nets, batch: Batch, obs: Any, key: Key) -> Sample:
         outputs = self.policy_outputs(nets, batch.features, obs)

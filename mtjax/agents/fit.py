@@ -1,13 +1,13 @@
 """A fit is one gradient step of some networks over all tasks: surgery on the tasks' gradients, and an optimiser."""
 
 import dataclasses
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from typing import Any, NamedTuple
 
 import optax
 
 from mtjax.agents.parts.gradients import descent, surgery
-from mtjax.agents.state import FitState, Nets
+from mtjax.agents.state import AgentState, FitState, Nets
 from mtjax.networks import Params
 from mtjax.types import Array, Key, Metrics
 
@@ -87,6 +87,37 @@ class Fit:
 
     def _learned(self, nets: Nets) -> Nets:
         return {name: nets[name] for name in self.names}
+
+
+def descend(
+    fits: Mapping[str, Fit],
+    name: str,
+    state: AgentState,
+    loss: Callable,
+    data: tuple,
+    key: Key,
+    importance: Array | None = None,
+    seen: Nets | None = None,
+) -> tuple[AgentState, Fitted]:
+    """Take the gradient step called ``name`` for a loss of one task on data (T, ...).
+
+    Args:
+        importance: (T,) factors of the tasks' losses; None for 1.
+        seen: networks that the loss sees in place of the state's.
+    """
+    found = fits[name].step(state.fits[name], loss, state.nets | (seen or {}), data, key, importance)
+    found = found._replace(metrics={f"{name}_{key}": value for key, value in found.metrics.items()})
+    return state._replace(nets=state.nets | found.nets, fits=state.fits | {name: found.state}), found
+
+
+def above(least: float | Array, loss: Callable) -> Callable:
+    """Subtract its lower bound from a loss of one task, for rules of surgery that compare losses."""
+
+    def found(nets: Nets, *data: Any) -> tuple[Array, Any]:
+        value, aux = loss(nets, *data)
+        return value - least, aux
+
+    return found
 
 
 def learned(fits: Collection[Fit]) -> tuple[str, ...]:

@@ -12,6 +12,7 @@ from mtjax.agents.base import Memory
 from mtjax.agents.choices import FLAT
 from mtjax.agents.on_policy import Batch, OnPolicy
 from mtjax.agents.parts import targets
+from mtjax.agents.rates import discounts_of_all
 from mtjax.agents.state import AgentState, Nets, axes_of
 from mtjax.agents.units import Units
 from mtjax.experience import Rollouts
@@ -51,12 +52,9 @@ class IMPALA(OnPolicy):
         default_factory=lambda: Rollouts(unroll=20, epochs=1, minibatches=4)
     )
 
-    def _check_numbers(self) -> None:
-        super()._check_numbers()
+    def check(self) -> None:
+        super().check()
         parts.require_not_negative(self, "actor_lag")
-
-    def _check_combination(self) -> None:
-        super()._check_combination()
         if self.actor_lag and self.representation.learns:
             raise InputError("actor-lag keeps a copy of the actor alone; use it with representation=plain")
 
@@ -76,7 +74,7 @@ class IMPALA(OnPolicy):
 
     def act(self, state: AgentState, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
         older = state.slow if self.actor_lag and key is not None else {}
-        return super().act(state._replace(nets=state.nets | older), memory, obs, task, key)
+        return super().act(state.with_nets(**older), memory, obs, task, key)
 
     def observe(self, state: AgentState, steps: Transition, tasks: Task) -> AgentState:
         state = super().observe(state, steps, tasks)
@@ -86,17 +84,17 @@ class IMPALA(OnPolicy):
         due = rollouts % self.actor_lag == 0
         newer = {name: state.nets[name] for name in state.slow}
         slow = jax.tree.map(partial(jnp.where, due), newer, state.slow)
-        return state._replace(nets=state.nets | {"lag": Params({"rollouts": rollouts}, {})}, slow=slow)
+        return state.with_nets(lag=Params({"rollouts": rollouts}, {}))._replace(slow=slow)
 
     # Gradient steps.
 
     def prepare(self, state: AgentState, window: Transition, tasks: Task) -> tuple[AgentState, Batch]:
-        flat, features, obs, next_obs = self.inputs(state, window, tasks)
+        flat, features, obs, next_obs = self.view.steps(state, window, tasks)
         masked = None if tasks.action_mask is None else 0
         ratio = jax.vmap(self.log_ratio, (axes_of(state.nets), 0, 0, 0, masked))
         log_ratio = ratio(state.nets, features, obs, flat.extras, tasks.action_mask)
         value, next_value = (self.values(state, features, x) for x in (obs, next_obs))
-        gamma = jnp.broadcast_to(self.discounts(tasks), len(tasks.id))
+        gamma = discounts_of_all(self, tasks)
         found = self.trace(window, gamma, self.rewards(state, flat, tasks), value, next_value, log_ratio)
         target, advantage = (x.reshape(len(x), -1) for x in found)
         state = self.renew(state, target)

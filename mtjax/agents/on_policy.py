@@ -12,13 +12,14 @@ from mtjax import frames
 from mtjax.agents import parts
 from mtjax.agents.base import BaseAgent, Memory
 from mtjax.agents.choices import FLAT
-from mtjax.agents.fit import Fit
+from mtjax.agents.fit import Fit, above, descend
 from mtjax.agents.parts.policies import Categorical, Gaussian, Policy
 from mtjax.agents.parts.policies.gaussian import STD_RANGE
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.scaling.popart import rescale_heads
-from mtjax.agents.state import AgentState, Nets, axes_of
+from mtjax.agents.rates import discounts_of_all
+from mtjax.agents.state import AgentState, Nets, over_tasks
 from mtjax.agents.units import MIN_STD, Units
 from mtjax.experience import Rollouts
 from mtjax.maps import in_parts
@@ -115,8 +116,8 @@ class OnPolicy(BaseAgent):
             log_ratio: (B,) of the action's probability under the present policy to that under the one that took it.
         """
 
-    def _check_numbers(self) -> None:
-        super()._check_numbers()
+    def check(self) -> None:
+        super().check()
         parts.require_shares(self, "gae_lambda")
         parts.require_positive(self, "reward_scale")
         parts.require_not_negative(self, "entropy_cost")
@@ -124,9 +125,6 @@ class OnPolicy(BaseAgent):
         low, high = STD_RANGE
         if not low < self.initial_std < high:
             raise InputError(f"initial-std must be between {low:.2g} and {high:.2g}, not {self.initial_std}")
-
-    def _check_combination(self) -> None:
-        super()._check_combination()
         if parts.name_of(SCALINGS, self.scaling) == "popart":
             raise InputError("scaling=popart is for critics of actions; use value-normalization=popart")
         if parts.name_of(SAMPLERS, self.sampler) == "temperature":
@@ -140,10 +138,6 @@ class OnPolicy(BaseAgent):
                 )
 
     # Networks.
-
-    @property
-    def unroll(self) -> int:
-        return self.experience.unroll if self.conditioning.recurs else 0
 
     @property
     def critic(self) -> Network:
@@ -173,7 +167,7 @@ class OnPolicy(BaseAgent):
 
     def act(self, state: AgentState, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
         """Choose an action for one observation (O,) of one task; without a key, the policy's mode."""
-        outputs = self.policy_outputs(*self.acting_inputs(state, memory, obs, task))
+        outputs = self.policy_outputs(*self.view.acting(state, memory, obs, task))
         action, raw, log_prob = self.policy.draw(outputs, task.action_mask, key)
         return Acted(action, None if key is None else Taken(raw, log_prob))
 
@@ -181,7 +175,7 @@ class OnPolicy(BaseAgent):
 
     def policy_outputs(self, nets: Nets, features: Array, obs: Any) -> Array:
         """Return the outputs (..., P) that ``policy`` reads."""
-        return self.actor.apply(nets["actor"], *self.actor_inputs(nets, features, obs))
+        return self.actor.apply(nets["actor"], *self.view.actor_inputs(nets, features, obs))
 
     def log_ratio(self, nets: Nets, features: Array, obs: Any, taken: Any, mask: Array | None) -> Array:
         """Return how much likelier (B,) the actions that were ``taken`` are now, in logarithms."""
@@ -200,7 +194,7 @@ class OnPolicy(BaseAgent):
 
     def critic_loss(self, nets: Nets, batch: Batch) -> tuple[Array, Metrics]:
         loss = self.fitting_loss(self.output(nets, batch.features, batch.obs), batch)
-        known = batch._replace(features=self.know(nets, batch.features, batch.obs)[0])
+        known = batch._replace(features=self.view.know(nets, batch.features, batch.obs)[0])
         return self.representation.join(loss, {"critic_loss": loss}, nets["representation"], known)
 
     def fitting_loss(self, output: Array, batch: Batch) -> Array:
@@ -209,7 +203,7 @@ class OnPolicy(BaseAgent):
 
     def output(self, nets: Nets, features: Array, obs: Any) -> Array:
         """Return the critic's outputs (B,) for observations (B, ...)."""
-        features, inputs = self.critic_inputs(nets, features, obs)
+        features, inputs = self.view.critic_inputs(nets, features, obs)
         return self.critic.apply(nets["critic"], features, inputs)[..., 0]
 
     # Update of all tasks.
@@ -223,13 +217,13 @@ class OnPolicy(BaseAgent):
         importance = self.sampler.weights(state.nets["sampler"].own, jnp.ones(state.num_tasks))
         # The actor is first, as pi_old was on what the critic's step moves too: the representation, and what is known.
         data = (batch, jax.random.split(sample_key, state.num_tasks))
-        moved, actor = self.descend(state, "actor", self.actor_loss, data, actor_order, importance)
+        moved, actor = descend(self.fits, "actor", state, self.actor_loss, data, actor_order, importance)
         state = self.accept(moved, state, actor.aux.kl)
         if self.representation.learns:
             both, models_key = (state.nets["representation"], state.slow["representation"]), jax.random.fold_in(key, 3)
             batch = batch._replace(model_targets=self.representation.targets(*both, batch.next_obs, models_key)[0])
-        loss = self.above_least(self.critic_loss)
-        state, critic = self.descend(state, "critic", loss, (batch,), critic_order, importance)
+        loss = above(self.least_loss, self.critic_loss)
+        state, critic = descend(self.fits, "critic", state, loss, (batch,), critic_order, importance)
         told = self.explained(state, batch)
         return state, critic.aux | critic.metrics | actor.aux.metrics | actor.metrics | told
 
@@ -255,7 +249,7 @@ class OnPolicy(BaseAgent):
 
     def rewards(self, state: AgentState, flat: Transition, tasks: Task) -> Array:
         """Return the rewards (T, N) of steps in the task's units."""
-        gamma = jnp.broadcast_to(self.discounts(tasks), len(tasks.id))
+        gamma = discounts_of_all(self, tasks)
         return self.reward_scale * self.scaling.rewards(state.nets["scaling"].own, flat, gamma, jnp.zeros(len(gamma)))
 
     def values(self, state: AgentState, features: Array, obs: Any) -> Array:
@@ -264,7 +258,7 @@ class OnPolicy(BaseAgent):
 
     def outputs(self, state: AgentState, features: Array, obs: Any) -> Array:
         """Return the critic's outputs (T, B) for observations (T, B, ...)."""
-        of_tasks = partial(jax.vmap(self.output, (axes_of(state.nets), 0, 0)), state.nets)
+        of_tasks = partial(over_tasks, self.output, state.nets)
         if frames.shown(obs):  # all at once they would fill the memory
             return in_parts(of_tasks, features, obs, self.experience.minibatches)
         return of_tasks(features, obs)

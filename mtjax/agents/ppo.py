@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from mtjax.agents import parts
 from mtjax.agents.on_policy import Batch, OnPolicy
 from mtjax.agents.parts import targets
+from mtjax.agents.rates import discounts_of_all
 from mtjax.agents.state import AgentState, Nets
 from mtjax.agents.units import MIN_STD, Units
 from mtjax.networks import Params
@@ -81,8 +82,8 @@ class PPO(OnPolicy):
     advantage_normalization: Literal["none", "all", "task"] = "task"
     """Scale advantages to mean 0 and standard deviation 1: never, over all tasks together, or in each task."""
 
-    def _check_numbers(self) -> None:
-        super()._check_numbers()
+    def check(self) -> None:
+        super().check()
         parts.require_positive(self, "clip_range")
         parts.require_not_negative(self, "value_clip", "kl_limit")
 
@@ -95,7 +96,7 @@ class PPO(OnPolicy):
     def assess(self, state: AgentState, steps: Transition, tasks: Task) -> tuple[AgentState, Transition]:
         """Add advantages and targets to a rollout (T, H, E, ...), and fit the critic's units to it."""
         state, steps = super().assess(state, steps, tasks)
-        flat, features, obs, next_obs = self.inputs(state, self.experience.windows(steps, self.unroll), tasks)
+        flat, features, obs, next_obs = self.view.steps(state, self.experience.windows(steps, self.unroll), tasks)
         old, output = Units.of(state.nets["units"]), self.outputs(state, features, obs)
         found = old.rewards(output), self.values(state, features, next_obs), output, self.rewards(state, flat, tasks)
         played = partial(self.experience.played, shape=steps.reward.shape, length=self.unroll)
@@ -116,12 +117,12 @@ class PPO(OnPolicy):
             target=units.outputs(target),
         )
         if self.limits_kl:
-            state = state._replace(nets=state.nets | {"limit": within(True)})
+            state = state.with_nets(limit=within(True))
         return state, steps._replace(extras=extras)
 
     def advantages(self, steps: Transition, tasks: Task, value: Array, next_value: Array) -> Array:
         """Compute the advantages (T, H, E) of a rollout."""
-        gamma = jnp.broadcast_to(self.discounts(tasks), len(tasks.id))
+        gamma = discounts_of_all(self, tasks)
         return jax.vmap(partial(targets.gae, lambda_=self.gae_lambda))(steps, value, next_value, gamma)
 
     def normalize_advantages(self, advantage: Array) -> Array:
@@ -134,7 +135,7 @@ class PPO(OnPolicy):
     # Gradient steps.
 
     def prepare(self, state: AgentState, window: Transition, tasks: Task) -> tuple[AgentState, Batch]:
-        flat, features, obs, next_obs = self.inputs(state, window, tasks)
+        flat, features, obs, next_obs = self.view.steps(state, window, tasks)
         found: Assessed = flat.extras
         models = self.models(state, flat, tasks, next_obs)
         return state, Batch(obs=obs, features=features, mask=tasks.action_mask, **found._asdict(), **models)
@@ -163,7 +164,7 @@ class PPO(OnPolicy):
             return moved
         near = state.nets["limit"].shared["within"] & (jnp.mean(kl) <= parts.or_infinite(self.kl_limit))
         chosen = jax.tree.map(partial(jnp.where, near), moved, state)
-        return chosen._replace(nets=chosen.nets | {"limit": within(near)})
+        return chosen.with_nets(limit=within(near))
 
 
 def within(near: bool | Array) -> Params:

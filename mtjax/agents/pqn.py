@@ -10,13 +10,14 @@ import jax.numpy as jnp
 from mtjax.agents import parts
 from mtjax.agents.base import BaseAgent, Memory
 from mtjax.agents.choices import FLAT
-from mtjax.agents.fit import Fit
+from mtjax.agents.fit import Fit, descend
 from mtjax.agents.parts import targets
 from mtjax.agents.parts.policies import Categorical, Policy
 from mtjax.agents.parts.policies.categorical import allowed
 from mtjax.agents.parts.samplers import Uniform
 from mtjax.agents.parts.scaling import NoScaling
-from mtjax.agents.state import AgentState, Nets, axes_of
+from mtjax.agents.rates import discounts_of_all
+from mtjax.agents.state import AgentState, Nets, over_tasks
 from mtjax.experience import Rollouts
 from mtjax.networks import Params
 from mtjax.types import Acted, Array, InputError, Key, Metrics, Task, Transition
@@ -72,21 +73,14 @@ class PQN(BaseAgent):
         default_factory=lambda: Rollouts(unroll=32, epochs=2, minibatches=32)
     )
 
-    def _check_numbers(self) -> None:
-        super()._check_numbers()
+    def check(self) -> None:
+        super().check()
         parts.require_shares(self, "q_lambda", "epsilon")
         parts.require_counts(self, "epsilon_rollouts")
-
-    def _check_combination(self) -> None:
-        super()._check_combination()
         if self.representation.learns:
             raise InputError("pqn learns values of observations as they are; use representation=plain")
         if type(self.scaling) is not NoScaling or type(self.sampler) is not Uniform:
             raise InputError("pqn takes rewards as they are, of all tasks alike: scaling=none and sampler=uniform")
-
-    @property
-    def unroll(self) -> int:
-        return self.experience.unroll if self.conditioning.recurs else 0
 
     # Networks.
 
@@ -98,18 +92,15 @@ class PQN(BaseAgent):
     def fits(self) -> dict[str, Fit]:
         return {"critic": super().fits["critic"]}
 
-    def blank_action(self, state: AgentState) -> Array:
-        return self.policy.blank(0)
-
     def q(self, nets: Nets, features: Array, obs: Any) -> Array:
         """Return the values (..., A) of all actions."""
-        return self.critic.apply(nets["critic"], *self.critic_inputs(nets, features, obs))
+        return self.critic.apply(nets["critic"], *self.view.critic_inputs(nets, features, obs))
 
     # Acting.
 
     def act(self, state: AgentState, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
         """Choose the best action () for one observation (O,) of one task, or with a key sometimes any action."""
-        values = self.q(*self.acting_inputs(state, memory, obs, task))
+        values = self.q(*self.view.acting(state, memory, obs, task))
         best = self.policy.draw(values, task.action_mask, None).action
         if key is None:
             return Acted(best)
@@ -126,29 +117,29 @@ class PQN(BaseAgent):
 
     def assess(self, state: AgentState, steps: Transition, tasks: Task) -> tuple[AgentState, Transition]:
         """Add the targets to a rollout (T, H, E, ...)."""
-        flat, features, obs, next_obs = self.inputs(state, self.experience.windows(steps, self.unroll), tasks)
+        flat, features, obs, next_obs = self.view.steps(state, self.experience.windows(steps, self.unroll), tasks)
         values, following = (self.values(state, features, x, tasks) for x in (obs, next_obs))
         greedy = jnp.argmax(values, axis=-1) == flat.action
         played = partial(self.experience.played, shape=steps.reward.shape, length=self.unroll)
         closed, following = steps.closed, played(jnp.max(following, axis=-1))
         if self.cut_exploration:
             closed |= jnp.roll(~played(greedy), -1, axis=1)
-        gamma = jnp.broadcast_to(self.discounts(tasks), len(tasks.id))
+        gamma = discounts_of_all(self, tasks)
         returns = jax.vmap(partial(targets.lambda_returns, lambda_=self.q_lambda))
         return state, steps._replace(extras=returns(steps._replace(closed=closed), following, gamma))
 
     def values(self, state: AgentState, features: Array, obs: Any, tasks: Task) -> Array:
         """Return the values (T, B, A) of all actions; those that a task does not have are worth nothing at all."""
-        found = jax.vmap(self.q, (axes_of(state.nets), 0, 0))(state.nets, features, obs)
+        found = over_tasks(self.q, state.nets, features, obs)
         return allowed(found, None if tasks.action_mask is None else tasks.action_mask[:, None])
 
     def update(
         self, state: AgentState, window: Transition, tasks: Task, key: Key, number: Array
     ) -> tuple[AgentState, Metrics]:
         """Take a gradient step on windows (T, B, L, ...) of a rollout; metrics are (T,)."""
-        flat, features, obs, _ = self.inputs(state, window, tasks)
+        flat, features, obs, _ = self.view.steps(state, window, tasks)
         batch = Batch(obs, flat.action, flat.extras, features)
-        state, fitted = self.descend(state, "critic", self.loss, (batch,), key)
+        state, fitted = descend(self.fits, "critic", state, self.loss, (batch,), key)
         return state, fitted.aux | fitted.metrics | {"epsilon": jnp.broadcast_to(self.share(state), len(tasks.id))}
 
     def loss(self, nets: Nets, batch: Batch) -> tuple[Array, Metrics]:

@@ -3,9 +3,11 @@
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 
 from mtjax.networks import OVER_TASKS, Params
-from mtjax.types import Array
+from mtjax.tasks import SAME_CONTEXT
+from mtjax.types import Array, Task
 
 Nets = dict[str, Params]
 """Networks by name, of all tasks or of one. What is counted, or tuned by itself, is a net too: moments of observations,
@@ -31,6 +33,26 @@ class AgentState(NamedTuple):
         """The number T of tasks that the agent knows."""
         return len(self.nets["tasks"].own["context"])
 
+    def with_nets(self, **nets: Params) -> "AgentState":
+        """Return the state with other networks of these names."""
+        return self._replace(nets=self.nets | nets)
+
+    def known(self, task: Task) -> Array:
+        """Return the number () int32 of ``task`` if it is a training task, else of the nearest training task.
+
+        Of training tasks that are equally near, up to rounding, it is the lowest number.
+        """
+        contexts = self.nets["tasks"].own["context"]
+        distance = jnp.sqrt(jnp.sum(jnp.square(contexts - task.context), axis=-1))
+        if task.blocks is not None:  # only a task of the same family can be nearest
+            distance = jnp.where(task.blocks.related(contexts, task.context), distance, jnp.inf)
+        nearest = jnp.argmax(distance <= jnp.min(distance) + 2 * SAME_CONTEXT).astype(jnp.int32)
+        return jnp.where(task.id < len(contexts), task.id, nearest)
+
+    def nearest(self, tasks: Task) -> Array:
+        """Return the training tasks (T,) nearest to ``tasks`` (T, ...), for training tasks too by their contexts."""
+        return jax.vmap(self.known)(tasks._replace(id=jnp.full_like(tasks.id, self.num_tasks)))
+
 
 def of_task(nets: Nets, number: Array) -> Nets:
     """Select the networks of the task with this number () int32."""
@@ -40,3 +62,8 @@ def of_task(nets: Nets, number: Array) -> Nets:
 def axes_of(nets: Nets) -> Any:
     """Return the axes of networks for ``jax.vmap`` over tasks."""
     return dict.fromkeys(nets, OVER_TASKS)
+
+
+def over_tasks(function: Any, nets: Nets, *data: Any) -> Any:
+    """Map a function of one task's networks and data over all tasks, whose data has leaves (T, ...)."""
+    return jax.vmap(function, (axes_of(nets), *[0] * len(data)))(nets, *data)

@@ -11,7 +11,8 @@ from mtjax.agents.parts.encoders import BatchNorm, Encoder
 from mtjax.agents.parts.knowing import Knowing, Parameters
 from mtjax.agents.parts.scaling import ReturnNormalization, Scaling
 from mtjax.agents.parts.values import C51, Value
-from mtjax.agents.sac import SAC, ActorAux, Batch, CriticAux, Sample
+from mtjax.agents.replayed import Batch
+from mtjax.agents.sac import SAC, ActorAux, CriticAux, Sample
 from mtjax.agents.state import Nets
 from mtjax.types import Array, Key
 
@@ -70,7 +71,7 @@ class XQC(SAC):
             outputs (N, B, outputs) at (s, a), those at (s', a'), and new statistics (N, ...).
         """
         join = lambda now, later: jnp.concatenate([now, later])
-        ends = [self.critic_inputs(nets, batch.features, obs) for obs in (batch.obs, batch.next_obs)]
+        ends = [self.view.critic_inputs(nets, batch.features, obs) for obs in (batch.obs, batch.next_obs)]
         (features, inputs), (next_features, next_inputs) = ends
         features = join(features, next_features) if features.ndim == 2 else features
         data = (features, jax.tree.map(join, inputs, next_inputs), join(batch.action, next_action))
@@ -89,7 +90,7 @@ class XQC(SAC):
         return loss, aux._replace(statistics=found)
 
     def actor_loss(self, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:
-        outputs, found = self.actor.fit(nets["actor"], *self.actor_inputs(nets, batch.features, batch.obs))
+        outputs, found = self.actor.fit(nets["actor"], *self.view.actor_inputs(nets, batch.features, batch.obs))
         action, _, log_prob = self.policy.draw(outputs, batch.mask, key)
         loss, aux = self.policy_loss(Sample(action, log_prob, log_prob), nets, batch)
         return loss, aux._replace(statistics=found)

@@ -136,6 +136,10 @@ class Replay:
         """Steps of every environment before the agent learns again."""
         return self.update_every
 
+    def window_steps(self, steps: int) -> int:
+        """Return the length L of windows for a memory that learns through so many steps."""
+        return steps
+
     def updates_in(self, steps: int) -> int:
         """Count the updates in a run of so many steps of every environment."""
         return self.updates_per_step * max(steps // self.steps - self.warmup_steps // self.steps, 0)

@@ -51,6 +51,10 @@ class Rollouts:
         """The number U of updates each time that the agent learns."""
         return self.epochs * self.minibatches
 
+    def window_steps(self, steps: int) -> int:
+        """Return the length L of windows for a memory that learns: the whole rollout."""
+        return self.unroll
+
     def updates_in(self, steps: int) -> int:
         """Count the updates in a run of so many steps of every environment."""
         return steps // self.unroll * self.updates

@@ -18,8 +18,9 @@ import numpy as np
 
 from mtjax import frames
 from mtjax.agents import SAC
-from mtjax.agents.fit import Problem
+from mtjax.agents.fit import Problem, above
 from mtjax.agents.parts.gradients import surgery
+from mtjax.agents.replayed import prepare
 from mtjax.agents.state import Nets, axes_of
 from mtjax.experience.ring import Ring
 from mtjax.networks import Network, Params, ReLU
@@ -121,8 +122,8 @@ def compare_gradients(agent: SAC, state: Any, window: Transition, tasks: Task, k
         "critic" and "actor": gram, cosine, conflict and gradient_norm, as in ``Findings``; "td_error" (T,).
     """
     target_key, actor_key = jax.random.split(key)
-    seen = agent.prepare(state, window, tasks)
-    loss, data = agent.above_least(agent.critic_loss), agent.critic_data(state, seen, target_key)
+    seen = prepare(agent, state, window, tasks)
+    loss, data = above(agent.least_loss, agent.critic_loss), agent.critic_data(state, seen, target_key)
     critic, aux = _compare(agent.fits["critic"].problem(loss, state.nets, data))
     data = (seen, jax.random.split(actor_key, state.num_tasks))
     actor, _ = _compare(agent.fits["actor"].problem(agent.actor_loss, state.nets, data))
@@ -162,12 +163,14 @@ def activity(agent: SAC, state: Any, window: Transition, tasks: Task) -> dict[st
     Returns:
         mean activity over the batch (T, N, units), and hidden layers (T, B, N, width); N is 1 for the actor.
     """
-    seen_batch = agent.prepare(state, window, tasks)
+    seen_batch = prepare(agent, state, window, tasks)
     given, shape = seen_batch.features, (*seen_batch.reward.shape, seen_batch.features.shape[-1])
     features = jnp.broadcast_to(given if given.ndim == 3 else given[:, None], shape)
 
     def one(nets: Nets, features: Array, obs: Array, action: Array) -> dict[str, Activity]:
-        judging = agent.of_critics(partial(watch, agent.critic.apply), nets, features, obs, action)
+        known, inputs = agent.view.critic_inputs(nets, features, obs)
+        judge = partial(watch, agent.critic.apply)
+        judging = jax.vmap(judge, (0, None, None, None))(nets["critic"], known, inputs, action)
         acting = watch(agent.policy_outputs, nets, features, obs)
         return {"critic": judging, "actor": jax.tree.map(lambda x: x[None], acting)}
 

@@ -123,7 +123,7 @@ def acting(policy: Policy) -> Callable[[Any, Array], Array]:
     env, agent, state = policy.env, policy.agent, policy.state
     if not isinstance(env, Family):
         raise InputError("export takes a policy of one family, and this one is of a mixture")
-    if agent.history_length or agent.conditioning.recurs:
+    if agent.view.history or agent.conditioning.recurs:
         raise InputError("export takes agents that act by what they see, and this one infers its task from memory")
 
     def act(obs: Any, values: Array) -> Array:

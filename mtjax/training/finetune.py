@@ -101,7 +101,7 @@ def _require_numbers(start: Policy, env: Env, agent: BaseAgent) -> None:
     """Refuse new tasks for networks that know tasks by number alone."""
     if not agent.conditioning.by_number:
         return
-    nearest, count = np.asarray(agent.nearest_tasks(start.state, env.tasks("train"))), start.state.num_tasks
+    nearest, count = np.asarray(start.state.nearest(env.tasks("train"))), start.state.num_tasks
     if nearest.tolist() != list(range(count)):
         raise InputError(
             f"with conditioning=one-hot the run's networks know its {count} tasks by number, and the new ones are not "
@@ -132,7 +132,7 @@ def adopt(start: Policy, agent: BaseAgent, tasks: Task, fresh: Any) -> Any:
 
 
 def _adopt(agent: BaseAgent, tasks: Task, old: AgentState, fresh: AgentState) -> AgentState:
-    nearest = agent.nearest_tasks(old, tasks)
+    nearest = old.nearest(tasks)
     carry = lambda net: Params(net.shared, jax.tree.map(lambda x: x[nearest], net.own))
     nets = {name: carry(net) for name, net in old.nets.items() if name not in _FRESH}
     slow = {name: carry(net) for name, net in old.slow.items()}

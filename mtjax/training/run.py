@@ -14,6 +14,7 @@ import numpy as np
 
 from mtjax.agents import settings as settings_of
 from mtjax.agents import swept
+from mtjax.agents.rates import planned
 from mtjax.agents.swept import Point, SweptAgent
 from mtjax.compiling.programs import Programs, compile_lowered, jit_programs, load_kernels, sharded_shapes, trace
 from mtjax.config import RunConfig
@@ -105,8 +106,8 @@ class _Run:
     @cached_property
     def agent(self) -> Any:
         """Return the agent as it is trained: with its schedule's length, and of a sweep with traced numbers."""
-        planned = self.config.learner.planned(self.config.length)
-        return SweptAgent(planned) if self.config.points else planned
+        agent = planned(self.config.learner, self.config.length)
+        return SweptAgent(agent) if self.config.points else agent
 
     @cached_property
     def console(self) -> Console:

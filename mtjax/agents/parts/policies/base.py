@@ -2,8 +2,10 @@
 
 import abc
 import dataclasses
+from collections.abc import Mapping
 from typing import NamedTuple
 
+from mtjax.networks import Params
 from mtjax.types import Array, Key
 
 
@@ -35,8 +37,8 @@ class Policy(abc.ABC):
         """
 
     @abc.abstractmethod
-    def blank(self, outputs: int) -> Array:
-        """Return an action that is all zero, of a policy with so many outputs."""
+    def blank(self, nets: Mapping[str, Params]) -> Array:
+        """Return an action that is all zero, of an agent with these networks."""
 
     @abc.abstractmethod
     def encode(self, action: Array) -> Array:

@@ -1,11 +1,13 @@
 """Policies that choose one of some actions."""
 
 import dataclasses
+from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
 
 from mtjax.agents.parts.policies.base import Drawn, Policy
+from mtjax.networks import Params
 from mtjax.types import Array, Discrete, Key
 
 _NEVER = -1e30
@@ -27,7 +29,7 @@ class Categorical(Policy):
     def first(self, size: int, std: float | Array) -> Array:
         return jnp.zeros(size)
 
-    def blank(self, outputs: int) -> Array:
+    def blank(self, nets: Mapping[str, Params]) -> Array:
         return Discrete(self.size).blank()
 
     def encode(self, action: Array) -> Array:

@@ -2,11 +2,13 @@
 
 import dataclasses
 import math
+from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
 
 from mtjax.agents.parts.policies.base import Drawn, Policy
+from mtjax.networks import Params
 from mtjax.types import Array, Continuous, Key
 
 _LOG_STD_RANGE = (-5.0, 2.0)
@@ -28,8 +30,8 @@ class Gaussian(Policy):
     def first(self, size: int, std: float | Array) -> Array:
         return jnp.repeat(jnp.array([0.0, _output_for(std)]), size)
 
-    def blank(self, outputs: int) -> Array:
-        return Continuous(outputs // 2).blank()
+    def blank(self, nets: Mapping[str, Params]) -> Array:
+        return Continuous(nets["actor"].parts["head"]["bias"].shape[-1] // 2).blank()
 
     def encode(self, action: Array) -> Array:
         return action

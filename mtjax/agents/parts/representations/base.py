@@ -43,10 +43,9 @@ class Plain:
         """Number of last steps that it needs beside each observation."""
         return 0
 
-    @property
-    def without_target(self) -> tuple[str, ...]:
-        """Names of parameters that need no target copy: models, and what is its own target."""
-        return self.models
+    def followed(self, params: Params) -> Params:
+        """Return the parameters of which there is a slow copy, as a target: all but models."""
+        return params.without(self.models)
 
     @property
     def rates(self) -> Mapping[str, float]:

@@ -75,9 +75,8 @@ class Encoded(Seeing):
         swept = isinstance(self.encoder_tau, jax.Array)
         return self.slow if not swept and self.encoder_tau == 1 else ()
 
-    @property
-    def without_target(self) -> tuple[str, ...]:
-        return (*self.models, *self.own_target)
+    def followed(self, params: Params) -> Params:
+        return super().followed(params).without(self.own_target)
 
     def for_actor(self, params: Params, before: Params) -> Params:
         return params.without(self.own_target).filled(before)

@@ -1,0 +1,146 @@
+"""Settings and parts of an agent that cannot be used, or not together. An InputError says why."""
+
+from typing import Any
+
+from mtjax import frames
+from mtjax.agents import parts
+from mtjax.agents.choices import PARTS
+from mtjax.agents.parts.policies import policy_for
+from mtjax.types import InputError, Spec
+
+
+def check(agent: Any) -> None:
+    """Check the numbers and parts of any agent."""
+    parts.require_positive(agent, "actor_lr", "critic_lr")
+    if not agent.max_gradient_norm >= 0:
+        raise InputError(f"max-gradient-norm must be at least 0 (0 does not clip), not {agent.max_gradient_norm}")
+    parts.require_not_negative(agent, "weight_decay", "lr_warmup", "lr_updates")
+    parts.require_layers(agent, "hidden")
+    parts.require_widths(agent, "actor_hidden", "critic_hidden")
+    parts.require_shares(agent, "gamma", "lr_final")
+    _check_knowing(agent)
+    _check_encoder(agent)
+    _check_gradients(agent)
+    _check_scaling(agent)
+    _check_schedule(agent)
+
+
+def _name(agent: Any, kind: str) -> str:
+    return parts.name_of(PARTS[kind], getattr(agent, kind))
+
+
+def _check_knowing(agent: Any) -> None:
+    conditioning, representation = agent.conditioning, agent.representation
+    reason = conditioning.refuses()
+    if reason:
+        raise InputError(reason)
+    if agent.tune == "embedding" and not (conditioning.embeds or representation.embeds):
+        raise InputError(f"tune=embedding needs conditioning=embedding, not {_name(agent, 'conditioning')}")
+    lengths = conditioning.history, representation.history
+    if all(lengths) and len(set(lengths)) > 1:
+        raise InputError(
+            f"inferred-from={lengths[0]} and theta-from={lengths[1]} are numbers of the same last steps; give both "
+            "one value"
+        )
+    if conditioning.recurs and representation.history:
+        raise InputError("conditioning=recurrent and theta-from are two memories of an episode; use one of them")
+
+
+def _check_encoder(agent: Any) -> None:
+    encoder, name = agent.encoder, _name(agent, "encoder")
+    reason = encoder.refuses(agent.conditioning, agent.representation.embeds)
+    if reason:
+        raise InputError(f"{name} {reason}")
+    if encoder.has_statistics and not agent.fits_statistics:
+        raise InputError(f"{name} needs an agent that keeps running statistics, such as xqc; use another encoder")
+    if agent.representation.sees_pictures and encoder.front() is not None:
+        raise InputError(
+            f"{name} maps observations, and with representation={_name(agent, 'representation')} networks see a latent "
+            "state; choose another encoder"
+        )
+    for hidden in (agent.actor_hidden or agent.hidden, agent.critic_hidden or agent.hidden):
+        encoder.body(hidden, layer_norm=False)  # which refuses widths that it cannot take
+
+
+def _check_gradients(agent: Any) -> None:
+    rule = _name(agent, "gradients")
+    if agent.heads == "disjoint" and rule != "mean":
+        raise InputError(f"heads=disjoint leaves no parameters that tasks share for gradients={rule}; use mean")
+    if agent.gradient_scope == "per-layer" and agent.gradients.needs != "gradients":
+        raise InputError(f"gradient-scope=per-layer needs gradients of every task, which {rule} does not use")
+
+
+def _check_scaling(agent: Any) -> None:
+    scaling = _name(agent, "scaling")
+    if scaling == "return" and agent.gamma == 1:
+        raise InputError("scaling=return needs discounted returns, which have bounds; use gamma below 1")
+    if agent.scaling.follows_resets and not agent.experience.reset_every:
+        raise InputError(
+            f"scaling={scaling} renews its factors where networks are reset, and here none are; use scaling=reward, "
+            "or give reset-every to an agent that has a replay"
+        )
+
+
+def _check_schedule(agent: Any) -> None:
+    shape = agent.lr_schedule
+    if shape == "constant" and (agent.lr_final or agent.lr_updates):
+        given = f"lr-final={agent.lr_final}" if agent.lr_final else f"lr-updates={agent.lr_updates}"
+        raise InputError(f"{given} is where a schedule ends, and lr-schedule=constant is none; use linear or cosine")
+    if shape != "constant" and agent.experience.reset_every:
+        raise InputError(f"reset-every begins the optimisers anew, and lr-schedule={shape} with them; use constant")
+
+
+def check_replayed(agent: Any) -> None:
+    """Check the numbers and parts of an agent that learns soft actor-critic from a replay."""
+    parts.require_rates(agent, "tau")
+    parts.require_positive(agent, "temperature_lr", "num_critics", "initial_temperature")
+    if not 0 <= agent.temperature_momentum < 1:
+        raise InputError(f"temperature-momentum must be in [0, 1), not {agent.temperature_momentum}")
+    value, scaling, replay = _name(agent, "value"), _name(agent, "scaling"), agent.experience
+    if scaling == "popart" and (agent.heads == "shared" or value != "scalar"):
+        raise InputError(
+            "scaling=popart rescales a scalar head of every task's own; use value=scalar and heads=per-task or "
+            f"disjoint, not {value} and {agent.heads}"
+        )
+    if scaling == "popart" and agent.unit_head:
+        raise InputError("scaling=popart rescales heads, which unit-head keeps at length 1; use one of them")
+    if agent.representation.predicts and replay.n_step > 1:
+        name = _name(agent, "representation")
+        raise InputError(f"{name} learns models of single steps; use n-step=1, not {replay.n_step}")
+    if agent.conditioning.recurs and (replay.n_step > 1 or replay.hindsight or replay.host_replay_size):
+        raise InputError("conditioning=recurrent needs n-step=1, hindsight=0 and host-replay-size=0")
+    if agent.unroll > replay.warmup_steps + 1:
+        raise InputError(
+            f"recurrent-steps={agent.unroll} needs as many steps before the first update: warmup-steps of at least "
+            f"{agent.unroll - 1}, not {replay.warmup_steps}"
+        )
+
+
+# What an agent and a family need of each other.
+
+
+def require_sight(agent: Any, spec: Spec) -> None:
+    """Check that networks and representation can take a family's observations.
+
+    Raises:
+        InputError: they cannot, or tasks would have to be inferred from pictures.
+    """
+    frames.require_known(spec.obs)
+    agent.representation.require(spec.obs)
+    if frames.shown(spec.obs) and agent.view.history:
+        raise InputError("tasks cannot be inferred from pictures; choose another conditioning")
+    if frames.shown(spec.obs) and agent.conditioning.recurs:
+        raise InputError("conditioning=recurrent reads vectors, not pictures; choose another conditioning")
+
+
+def require_policy(agent: Any, spec: Spec) -> None:
+    """Check that an agent was made for a family's actions, and can learn to draw them.
+
+    Raises:
+        InputError: it was not, or cannot.
+    """
+    policy, kind, name = policy_for(spec.action), spec.action.kind, type(agent).__name__
+    if not isinstance(policy, agent.policies):
+        raise InputError(f"{name} draws no {kind} actions")
+    if agent.policy != policy:
+        raise InputError(f"{name} was not made for these {kind} actions: agent.for_action(env.spec.action) is")

@@ -1,0 +1,90 @@
+"""Batches of a replay, for agents that learn from one: what the losses of soft actor-critic take."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from mtjax.agents.rates import discounts, discounts_of_all
+from mtjax.agents.state import AgentState
+from mtjax.experience import pictures
+from mtjax.networks import Params
+from mtjax.types import Array, Key, Task, Transition
+
+
+class Batch(NamedTuple):
+    """Holds the data for the losses of one task; for all tasks, leaves are (T, ...)."""
+
+    obs: Any  # (B, O) as the networks take them
+    action: Array  # (B, A)
+    reward: Array  # (B,) in the task's units
+    discount: Array  # (B,) gamma, or 0 where the episode terminated
+    next_obs: Any  # (B, O)
+    features: Array  # (Z,) or (B, Z) features of the task that need no learned parameters
+    temperature: Array  # ()
+    mask: Array | None  # (A,) 1 for actions that the task has, else 0; None: it has all
+    model_targets: Any = None  # targets of the representation's models
+    followed: Array | None = None  # (B,) bool: next_obs is what followed; None: it always is
+
+
+def prepare(agent: Any, state: AgentState, window: Transition, tasks: Task, key: Key | None = None) -> Batch:
+    """Return the batch (T, ...) for the losses of ``agent``, of windows (T, B, L, ...).
+
+    Args:
+        key: for changing observations at random; None leaves them as they are.
+    """
+    batch, inputs, view = transitions(agent, window, tasks), state.nets["inputs"], agent.view
+    batch = batch if key is None else agent.representation.augment(batch, key)
+    past, next_past = view.around(window, batch, batch if batch.extras is None else batch.extras)
+    temperature = jnp.exp(state.nets["temperature"].parts["log"])
+    bonus = temperature * abs(agent.target_entropy) * action_sizes(batch.action, tasks.action_mask) / 2
+    gamma = discounts(agent, tasks)
+    return Batch(
+        obs=view.see_all(inputs, batch.obs, past),
+        action=batch.action,
+        reward=agent.scaling.rewards(state.nets["scaling"].own, batch, gamma, bonus),
+        discount=(gamma[:, None] if jnp.ndim(gamma) else gamma) * batch.discount,
+        next_obs=view.see_all(inputs, batch.next_obs, next_past),
+        features=view.features_of_all(state, batch, tasks),
+        temperature=jnp.broadcast_to(temperature, len(tasks.id)),
+        mask=tasks.action_mask,
+        followed=pictures.followed(batch),
+    )
+
+
+def transitions(agent: Any, window: Transition, tasks: Task) -> Transition:
+    """Return the transitions (T, N, ...) that windows (T, B, L, ...) are made to: all steps, or one n-step each."""
+    if agent.unroll:
+        return jax.tree.map(lambda x: x.reshape(len(x), -1, *x.shape[3:]), window._replace(memory=None))
+    return agent.experience.joined(window, discounts_of_all(agent, tasks))
+
+
+def action_sizes(action: Array, mask: Array | None) -> int | Array:
+    """Count the actions that each task has: A for actions (..., A) without a mask (T, A), else (T,)."""
+    return action.shape[-1] if mask is None else jnp.sum(mask, axis=-1)
+
+
+def update_target(agent: Any, state: AgentState) -> AgentState:
+    """Move the target networks a step towards the new ones: ``tau`` of the distance, or the representation's rates."""
+
+    def follow(net: str, new: dict, old: dict) -> dict:
+        rates = agent.representation.rates if net == "representation" else {}
+        return {k: optax.incremental_update(new[k], old[k], rates.get(k, agent.tau)) for k in old}
+
+    moved = lambda net, new, old: Params(follow(net, new.shared, old.shared), follow(net, new.own, old.own))
+    return state._replace(slow={net: moved(net, state.nets[net], old) for net, old in state.slow.items()})
+
+
+def renew_scales(agent: Any, state: AgentState, target: Array) -> AgentState:
+    """Update the scaling of rewards by the critics' targets (T, B), and rescale critics to the new units."""
+    critics = (state.nets["critic"], state.slow["critic"])
+    scaling, (critic, slow) = agent.scaling.renew(state.nets["scaling"].own, target, critics)
+    state = state.with_nets(scaling=Params({}, scaling), critic=critic)
+    return state._replace(slow=state.slow | {"critic": slow})
+
+
+def with_statistics(state: AgentState, name: str, statistics: Any) -> AgentState:
+    """Return a state with the running statistics that a loss found for the bodies of a network, if any."""
+    net = state.nets[name]
+    return state.with_nets(**{name: net._replace(own=net.own | statistics)})
