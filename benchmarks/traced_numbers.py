@@ -20,7 +20,7 @@ import numpy as np
 from report import machine, markdown
 
 import mtjax
-from mtjax.agents.swept import SweptAgent, sweepable
+from mtjax.agents.swept import sweepable, with_numbers
 from mtjax.envs.probes import tasks_of
 from mtjax.types import Spec, Transition
 
@@ -44,10 +44,10 @@ def compare(name: str) -> dict[str, Any]:
     """Compile and time the updates of one agent in both forms."""
     agent = mtjax.agent(name, hidden=(256, 256))
     tasks, key, values = tasks_of("one-step", np.linspace(-1, 1, TASKS)), jax.random.key(0), sweepable(agent)
-    varied, knobs = SweptAgent(agent), {name: jnp.float32(value) for name, value in values.items()}
+    varied = with_numbers(agent, {name: jnp.float32(value) for name, value in values.items()})
     states = {
         "constants": (agent, jax.jit(lambda key: agent.init(SPEC, tasks, key))(key)),
-        "data": (varied, jax.jit(lambda key: varied.init(SPEC, tasks, key, knobs))(key)),
+        "data": (varied, jax.jit(lambda key: varied.init(SPEC, tasks, key))(key)),
     }
     compiled, compile_seconds = {}, {}
     for form, (learner, state) in states.items():

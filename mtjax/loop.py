@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from mtjax import frames
+from mtjax.agents.swept import at_point, with_numbers
 from mtjax.checks import check_fields
 from mtjax.maps import Flat, over_seeds, when
 from mtjax.parallel import collectives
@@ -86,20 +87,19 @@ class TrainState(NamedTuple):
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
 def init(
-    env: Env, agent: Agent, settings: Settings, tasks: Task, seeds: Array, knobs: dict[str, Array] | None = None
+    env: Env, agent: Agent, settings: Settings, tasks: Task, seeds: Array, numbers: dict[str, Array] | None = None
 ) -> TrainState:
     """Return a fresh training state for ``seeds`` (S,) on training ``tasks`` (T, ...).
 
     Args:
-        knobs: values (S,), by name, of the agent's numbers that vary between seeds, for a ``SweptAgent`` agent.
+        numbers: values (S,), by name, of the agent's numbers that vary between seeds, in a sweep.
     """
     agent.experience.check(env, settings.num_envs)
     require_trials(settings, env, agent)
     num_tasks = len(tasks.id)
     shape = (len(seeds), num_tasks, settings.num_envs // collectives.count())
     key, agent_key, reset_key, data_key = split_keys(jax.vmap(jax.random.key)(seeds), 4)
-    point = () if knobs is None else (knobs,)
-    learners = jax.vmap(lambda key, *point: agent.init(env.spec, tasks, key, *point))(agent_key, *point)
+    learners = jax.vmap(partial(_init_agent, env, agent, tasks))(agent_key, numbers or {})
     worlds = reset_envs(env, agent, learners, tasks, world_keys(reset_key, shape), settings.trial)
     if settings.stagger:
         episode = None if worlds.episode is None else _first_episodes(settings.trials, shape)
@@ -114,6 +114,12 @@ def init(
         iteration=jnp.int32(0),
         key=key,
     )
+
+
+def _init_agent(env: Env, agent: Agent, tasks: Task, key: Key, numbers: dict[str, Array]) -> Any:
+    """Return the initial state of an agent, which keeps those of its numbers that a sweep varies."""
+    state = with_numbers(agent, numbers).init(env.spec, tasks, key)
+    return state._replace(numbers=numbers) if numbers else state
 
 
 def require_trials(settings: Settings, env: Any, agent: Agent) -> None:
@@ -201,10 +207,12 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
     def iterate(state: TrainState, _) -> tuple[TrainState, Metrics]:
         key, act_key, reset_key, learn_key = split_keys(state.key, 4)
         state, steps, seen = _collect(env, agent, settings.trial, tasks, state, act_key, reset_key)
-        learners, steps = over_seeds(partial(agent.assess, tasks=tasks), 0, 0)(state.agent, steps)
+        assess = lambda learner, steps: at_point(agent, learner).assess(learner, steps, tasks)
+        observe = lambda learner, steps: at_point(agent, learner).observe(learner, steps, tasks)
+        learners, steps = over_seeds(assess, 0, 0)(state.agent, steps)
         data = experience.add(state.data, steps)
         learners, losses = _learn(env, agent, tasks, learners, data, state.iteration, learn_key)
-        learners = over_seeds(partial(agent.observe, tasks=tasks), 0, 0)(learners, steps)
+        learners = over_seeds(observe, 0, 0)(learners, steps)
         return state._replace(agent=learners, data=experience.keep(data), key=key), seen | {"losses": losses}
 
     state, history = jax.lax.scan(iterate, state, length=settings.chunk_steps // experience.steps)
@@ -279,7 +287,7 @@ def _update(env, agent, tasks, learners: Any, data: Any, iteration: Array, keys:
 
         def update(learner: Any, given: tuple[Any, Key, Array]) -> tuple[Any, Metrics]:
             batch, key, number = given
-            return agent.update(learner, experience.window(data, batch), tasks, key, number)
+            return at_point(agent, learner).update(learner, experience.window(data, batch), tasks, key, number)
 
         update_keys = jax.random.split(update_key, experience.updates)
         learner, metrics = jax.lax.scan(update, learner, (batches, update_keys, numbers))
@@ -296,7 +304,7 @@ def _reset_networks(env, agent, tasks, learners: Any, iteration: Array, keys: Ke
     before = iteration - 1
     passed = before // experience.reset_every > jnp.maximum(before - experience.steps, 0) // experience.reset_every
     due = (before > experience.warmup_steps) & passed
-    one = lambda state, key: agent.reset_networks(state, env.spec, tasks, jax.random.fold_in(key, 1))
+    one = lambda state, key: at_point(agent, state).reset_networks(state, env.spec, tasks, jax.random.fold_in(key, 1))
     return jax.lax.cond(due, lambda states: over_seeds(one, 0, 0)(states, keys), lambda states: states, learners)
 
 

@@ -1,12 +1,14 @@
 """Rollouts of agents in environments, for training, evaluation and films."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from mtjax import frames
+from mtjax.agents.swept import at_point
 from mtjax.maps import Flat, over_learners, where_worlds
 from mtjax.parallel import collectives
 from mtjax.tasks import contexts_vary, episode_task
@@ -86,7 +88,7 @@ def _draw_tasks(tasks: Task, keys: Key) -> Task:
 
 def begin_memory(agent: Agent, learners: Any, tasks: Task, age: Array) -> Any:
     """Return the memory with which agents begin a trial in every world, of ages (S, T, E)."""
-    return over_learners(lambda learner, task, _: agent.begin(learner, task))(learners, tasks, age)
+    return over_learners(lambda learner, task, _: at_point(agent, learner).begin(learner, task))(learners, tasks, age)
 
 
 def tasks_of_worlds(tasks: Task, worlds: Worlds) -> Task:
@@ -98,13 +100,24 @@ def tasks_of_worlds(tasks: Task, worlds: Worlds) -> Task:
 
 def act(agent: Agent, learners: Any, tasks: Task, worlds: Worlds, keys: Key | None) -> Acted:
     """Let agents act in all worlds; without keys (S, T, E) they take their mean actions."""
-    noise = () if keys is None else (keys,)
+    noise, one = () if keys is None else (keys,), partial(_act, agent)
     if worlds.task is None:  # all worlds of a task have the same parameters
-        one = lambda learner, task, memory, obs, *key: agent.act(learner, memory, obs, task, *(key or (None,)))
         return over_learners(one)(learners, tasks, worlds.memory, worlds.obs, *noise)
-    one = lambda learner, _, task, memory, obs, *key: agent.act(learner, memory, obs, task, *(key or (None,)))
+    of_world = lambda learner, _, *each: one(learner, *each)
     each = tasks_of_worlds(tasks, worlds)
-    return over_learners(one)(learners, tasks.id, each, worlds.memory, worlds.obs, *noise)
+    return over_learners(of_world)(learners, tasks.id, each, worlds.memory, worlds.obs, *noise)
+
+
+def _act(agent: Agent, learner: Any, task: Task, memory: Any, obs: Any, key: Key | None = None) -> Acted:
+    """Let an agent act in one world."""
+    acted = at_point(agent, learner).act(learner, memory, obs, task, key)
+    if not getattr(learner, "numbers", {}):
+        return acted
+    return acted._replace(action=jnp.nan_to_num(acted.action, posinf=0, neginf=0))  # a point may diverge alone
+
+
+def _remember(agent: Agent, learner: Any, task: Task, memory: Any, transition: Transition) -> Any:
+    return at_point(agent, learner).remember(learner, memory, transition, task)
 
 
 class EnvStep(NamedTuple):
@@ -157,8 +170,7 @@ def step_envs(
     )
     memory = worlds.memory
     if jax.tree.leaves(memory):
-        note = lambda learner, task, memory, transition: agent.remember(learner, memory, transition, task)
-        memory = over_learners(note)(learners, tasks, memory, transition)
+        memory = over_learners(partial(_remember, agent))(learners, tasks, memory, transition)
     stepped = worlds._replace(state=step.state, obs=obs, memory=memory, age=age)
     return stepped, EnvStep(transition, step.metrics, ends, lost)
 

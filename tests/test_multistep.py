@@ -11,7 +11,7 @@ from probes import Goals, Stub, Walk, one_in, pick, quick, random_batch, random_
 from mtjax.agents import replayed
 from mtjax.agents.base import Memory
 from mtjax.agents.parts.knowing.last_steps import append
-from mtjax.agents.swept import SweptAgent
+from mtjax.agents.swept import with_numbers
 from mtjax.experience import Replay, multistep
 from mtjax.experience import ring as rings
 from mtjax.experience.replay import Buffer
@@ -173,9 +173,9 @@ def test_a_sweep_joins_by_the_swept_discount():
     """And not by that of the agent whose numbers are varied."""
     tasks, steps, key = tasks_of("one-step"), windows(2), jax.random.key(0)
     replay, number = Replay(n_step=3), jnp.int32(0)
-    swept, plain = SweptAgent(tiny("sac", experience=replay)), tiny("sac", experience=replay, gamma=0.5)
-    state = swept.init(SPEC, tasks, key, {"gamma": jnp.float32(0.5)})
-    found = swept.update(state, steps, tasks, key, number)[1]["critic_loss"]
+    swept, plain = tiny("sac", experience=replay), tiny("sac", experience=replay, gamma=0.5)
+    swept = with_numbers(swept, {"gamma": jnp.float32(0.5)})
+    found = swept.update(swept.init(SPEC, tasks, key), steps, tasks, key, number)[1]["critic_loss"]
     expected = plain.update(plain.init(SPEC, tasks, key), steps, tasks, key, number)[1]["critic_loss"]
     np.testing.assert_allclose(found, expected, rtol=1e-5)
 

@@ -1,16 +1,19 @@
 """Schedules of learning rates: their values by hand, how long they take in a run, and what is refused."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+import probes
 import pytest
 from conftest import SHORT_RUN
 from probes import Walk, quick, random_batch, tasks_of, tiny, train, train_objects
 
 import mtjax.train
 from mtjax.agents.parts.gradients.descent import schedule
-from mtjax.agents.swept import SweptAgent
+from mtjax.agents.swept import with_numbers
 from mtjax.experience import Replay
 from mtjax.types import InputError, Spec
 
@@ -77,16 +80,16 @@ def test_a_schedule_ends_with_the_run(name, chunk, given, expected):
 def test_a_share_that_is_swept_is_the_one_of_each_point():
     """A final share of 1 takes the steps of constant rates; one of 0, at the end, takes none."""
     plain, planned = tiny("sac"), tiny("sac", lr_schedule="cosine", lr_updates=1)
-    agent, batch = SweptAgent(planned), random_batch(0, 2, 4, SPEC)
-    ended = {}
+    batch, ended = random_batch(0, 2, 4, SPEC), {}
     for final in (0.0, 1.0):
-        state = agent.init(SPEC, TASKS, KEY, {"lr_final": jnp.float32(final)})
-        update = quick(agent.update, state, batch, TASKS, KEY)
+        agent = with_numbers(planned, {"lr_final": jnp.float32(final)})
+        state = agent.init(SPEC, TASKS, KEY)
+        update = quick(partial(probes.update, agent), state, batch, TASKS, KEY)
         for _ in range(2):
             state, _ = update(state, batch, TASKS, KEY)
-        ended[final] = state.learner
+        ended[final] = state
     state = plain.init(SPEC, TASKS, KEY)
-    update = quick(plain.update, state, batch, TASKS, KEY)
+    update = quick(partial(probes.update, plain), state, batch, TASKS, KEY)
     once, _ = update(state, batch, TASKS, KEY)
     twice, _ = update(once, batch, TASKS, KEY)
     for expected, found in ((once, ended[0.0]), (twice, ended[1.0])):

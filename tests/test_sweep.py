@@ -22,7 +22,6 @@ from mtjax import loop
 from mtjax.agents import PARTS
 from mtjax.agents import settings as settings_of
 from mtjax.agents import swept as points
-from mtjax.agents.swept import SweptAgent
 from mtjax.command import run_config, sweep
 from mtjax.command.keywords import configured
 from mtjax.config import configure
@@ -51,11 +50,11 @@ def test_points_are_every_combination_in_order():
 
 def test_seeds_lie_side_by_side_in_each_point():
     """Number k is seed k % seeds of point k // seeds."""
-    seeds, knobs = points.seed_axis(points.grid({"tau": [0.1, 0.2]}), jnp.arange(3) + 7)
+    seeds, numbers = points.seed_axis(points.grid({"tau": [0.1, 0.2]}), jnp.arange(3) + 7)
     np.testing.assert_array_equal(seeds, [7, 8, 9, 7, 8, 9])
-    np.testing.assert_array_equal(knobs["tau"], np.float32([0.1, 0.1, 0.1, 0.2, 0.2, 0.2]))
-    seeds, knobs = points.seed_axis((), jnp.arange(2))
-    assert len(seeds) == 2 and knobs is None
+    np.testing.assert_array_equal(numbers["tau"], np.float32([0.1, 0.1, 0.1, 0.2, 0.2, 0.2]))
+    seeds, numbers = points.seed_axis((), jnp.arange(2))
+    assert len(seeds) == 2 and numbers == {}
 
 
 @pytest.mark.parametrize(
@@ -104,9 +103,9 @@ def test_every_number_can_vary(name, settings):
     values = points.sweepable(agent)
     assert set(values) <= set(settings_of(agent)) and {"actor_lr", "gamma"} <= set(values)
 
-    def everything(knobs):
-        varied, key = SweptAgent(agent), jax.random.key(0)
-        state = varied.init(spec, tasks, key, knobs)
+    def everything(numbers):
+        varied, key = points.with_numbers(agent, numbers), jax.random.key(0)
+        state = varied.init(spec, tasks, key)
         state, _ = probes.update(varied, state, probes.with_memory(agent, random_batch(0, 2, 4)), tasks, key)
         task = jax.tree.map(lambda x: x[0], tasks)
         memory = varied.begin(state, task)
@@ -119,11 +118,11 @@ def test_every_number_can_vary(name, settings):
     assert jax.eval_shape(everything, {name: jnp.float32(x) for name, x in values.items()}).shape == (1,)
 
 
-def _run(env, agent, seeds, knobs=None, chunks=2):
-    plain, settings = configure(getattr(agent, "agent", agent), Settings(), SMALL)
-    tasks, agent = env.tasks(), SweptAgent(plain) if isinstance(agent, SweptAgent) else plain
-    init = loop.init.lower(env, agent, settings, tasks, seeds, knobs).compile(QUICK)
-    state = init(tasks, seeds, knobs)
+def _run(env, agent, seeds, numbers=None, chunks=2):
+    agent, settings = configure(agent, Settings(), SMALL)
+    tasks = env.tasks()
+    init = loop.init.lower(env, agent, settings, tasks, seeds, numbers).compile(QUICK)
+    state = init(tasks, seeds, numbers)
     run_chunk = loop.run_chunk.lower(env, agent, settings, tasks, state).compile(QUICK)
     for _ in range(chunks):
         state, metrics = run_chunk(tasks, state)
@@ -145,8 +144,8 @@ def test_a_point_trains_as_the_run_with_its_values():
     agent = tiny("sac-conditioned", scaling="return", lr_schedule="linear", lr_updates=20)
     assert set(_NAMES) == set(points.sweepable(agent))
     env, seeds = Walk(), jnp.arange(2, dtype=jnp.uint32)
-    state, metrics = _run(env, SweptAgent(agent), *points.seed_axis(POINTS, seeds))
-    learned = jax.device_get(state.agent.learner)
+    state, metrics = _run(env, agent, *points.seed_axis(POINTS, seeds))
+    learned = jax.device_get(state.agent)
     plain = [_run(env, points.agent_at(agent, point), seeds) for point in POINTS]
     for p, (alone, its_metrics) in enumerate(plain):
         rows = slice(2 * p, 2 * p + 2)
@@ -239,7 +238,7 @@ def test_sweeps_are_read_out_of_a_command_line(words, found, rest):
         (["--sweep", "agent.tau=0.1", "agent.tau=0.2"], "gives agent.tau twice"),
         (["--sweep", "seed=0,1"], "cannot vary seed"),
         (["--sweep", "agent.tau=0.1,big"], "agent.tau is a number, and 'big' is none"),
-        (["--sweep", "agent.tau=0.1,2"], "tau in (0, 1]"),
+        (["--sweep", "agent.tau=0.1,2"], "tau must be in (0, 1]"),
         (["--sweep", "agent.num-critics=1,0"], "num-critics must be greater than 0, not 0"),
         (["--sweep", "agent.cagrad-radius=0.1,0.2"], "unknown number of this agent 'cagrad_radius'"),
         (["--sweep", "agent.nonsense=1,2"], "unknown flag"),
@@ -564,13 +563,13 @@ def test_fine_tuning_begins_every_point_with_the_same_seeds(swept):
     tasks, sweep = start.env.tasks("train"), {"tau": [0.1, 0.2]}
     config = configured(start.env, start.agent, SMALL, plan={"seeds": 3}, start=start, sweep=sweep)
     run = _Run(config, Hooks(start=start, quiet=True))
-    seeds, knobs = run.seed_axis
-    shapes = jax.eval_shape(lambda: loop.init(start.env, run.agent, config.training, tasks, seeds, knobs)).agent
-    fresh = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)._replace(knobs=knobs)
+    seeds, numbers = run.seed_axis
+    shapes = jax.eval_shape(lambda: loop.init(start.env, run.agent, config.training, tasks, seeds, numbers)).agent
+    fresh = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)._replace(numbers=numbers)
     state = run.adopt(tasks, fresh)
-    np.testing.assert_array_equal(state.knobs["tau"], np.float32([0.1] * 3 + [0.2] * 3))
+    np.testing.assert_array_equal(state.numbers["tau"], np.float32([0.1] * 3 + [0.2] * 3))
     began = np.asarray(start.states.nets["temperature"].own["log"])
-    adopted = state.learner.nets["temperature"].own["log"]
+    adopted = state.nets["temperature"].own["log"]
     np.testing.assert_array_equal(adopted, began[[0, 1, 0, 0, 1, 0]])
     assert np.any(began[0] != began[1])
     assert jax.tree.structure(state) == jax.tree.structure(fresh)

@@ -12,7 +12,7 @@ import pytest
 from probes import Stub, Walk, learner, one_in, quick, random_batch, tasks_of, tiny, train
 
 from mtjax import loop
-from mtjax.agents.swept import SweptAgent
+from mtjax.agents.swept import with_numbers
 from mtjax.experience import Replay
 from mtjax.maps import when
 from mtjax.types import InputError, Sometimes, Spec
@@ -67,12 +67,13 @@ def test_an_update_in_the_actors_turn_is_the_whole_one_and_another_leaves_the_ac
 
 
 def test_turns_pass_through_a_sweep():
-    """The swept agent hands them on."""
-    agent, batch = SweptAgent(tiny("sac", experience=Replay(policy_delay=2))), random_batch(0, 2, 4, SPEC)
-    state = agent.init(SPEC, TASKS, KEY, {"actor_lr": jnp.float32(0.1)})
+    """An agent with traced numbers takes them too."""
+    agent, batch = tiny("sac", experience=Replay(policy_delay=2)), random_batch(0, 2, 4, SPEC)
+    agent = with_numbers(agent, {"actor_lr": jnp.float32(0.1)})
+    state = agent.init(SPEC, TASKS, KEY)
     update, first = partial(probes.update, agent), jnp.int32(0)
     after, _ = quick(update, state, batch, TASKS, KEY, first)(state, batch, TASKS, KEY, first)
-    fits = after.learner.fits
+    fits = after.fits
     assert count(fits["critic"].optimizer) == 1 and count(fits["actor"].optimizer) == 0
 
 

@@ -243,7 +243,7 @@ class BaseAgent(abc.ABC):
         fresh = self.init(spec, tasks, key)
         nets = {name: fresh.nets[name] for name in learned(self.fits.values())}
         nets |= {"scaling": Params({}, self.scaling.reset(state.nets["scaling"].own))}
-        return fresh._replace(nets=state.nets | nets)
+        return fresh._replace(nets=state.nets | nets, numbers=state.numbers)
 
     # Acting.
 

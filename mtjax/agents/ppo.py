@@ -89,7 +89,7 @@ class PPO(OnPolicy):
 
     def init_networks(self, num_tasks: int, actor_inputs: tuple, critic_inputs: tuple, action: Array, key: Key) -> Nets:
         nets = super().init_networks(num_tasks, actor_inputs, critic_inputs, action, key)
-        return nets | ({"limit": within(True)} if self.limits_kl else {})
+        return nets | ({"limit": within(True)} if parts.limit(self.kl_limit) is not None else {})
 
     # Once for a rollout.
 
@@ -116,7 +116,7 @@ class PPO(OnPolicy):
             output=output,
             target=units.outputs(target),
         )
-        if self.limits_kl:
+        if "limit" in state.nets:
             state = state.with_nets(limit=within(True))
         return state, steps._replace(extras=extras)
 
@@ -147,22 +147,18 @@ class PPO(OnPolicy):
         return gain, {"clip_fraction": jnp.mean(ratio != clipped)}
 
     def fitting_loss(self, output: Array, batch: Batch) -> Array:
-        if parts.is_zero(self.value_clip):
+        limit = parts.limit(self.value_clip)
+        if limit is None:
             return super().fitting_loss(output, batch)
         assert batch.output is not None
-        clipped = batch.output + jnp.clip(output - batch.output, -self.value_clip, self.value_clip)
+        clipped = batch.output + jnp.clip(output - batch.output, -limit, limit)
         return jnp.mean(jnp.maximum(jnp.square(output - batch.target), jnp.square(clipped - batch.target))) / 2
-
-    @property
-    def limits_kl(self) -> bool:
-        """Whether there may be a limit of KL(pi_old | pi)."""
-        return not parts.is_zero(self.kl_limit)
 
     def accept(self, moved: AgentState, state: AgentState, kl: Array) -> AgentState:
         """Return the state that has moved, unless KL(pi_old | pi) has exceeded its limit in this rollout."""
-        if not self.limits_kl:
+        if "limit" not in state.nets:
             return moved
-        near = state.nets["limit"].shared["within"] & (jnp.mean(kl) <= parts.or_infinite(self.kl_limit))
+        near = state.nets["limit"].shared["within"] & (jnp.mean(kl) <= parts.limit(self.kl_limit))
         chosen = jax.tree.map(partial(jnp.where, near), moved, state)
         return chosen.with_nets(limit=within(near))
 

@@ -27,6 +27,7 @@ class AgentState(NamedTuple):
     nets: Nets
     slow: Nets  # slow copies, the targets, by the same names
     fits: dict[str, FitState]  # by the names of the agent's fits
+    numbers: dict[str, Array] = {}  # () each: settings of the agent that vary in a sweep, by name  # noqa: RUF012
 
     @property
     def num_tasks(self) -> int:

@@ -1,4 +1,4 @@
-"""Several settings of an agent in one program: some numbers become arrays over seeds instead of constants.
+"""Several settings of an agent in one program: some numbers are leaves of its state instead of constants.
 
 A point is one setting, values by name: ``{"actor_lr": 3e-4, "gamma": 0.98}``. The S axis of a run
 holds all points with all seeds, point by point: entry ``k`` is seed ``k % seeds`` of point ``k // seeds``.
@@ -7,82 +7,19 @@ holds all points with all seeds, point by point: entry ``k`` is seed ``k % seeds
 import dataclasses
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from mtjax.agents import BaseAgent, parts
 from mtjax.agents.choices import flag_names, kinds_of, settings
 from mtjax.checks import shown
 from mtjax.names import nearest_error
-from mtjax.types import Acted, Array, Env, Experience, InputError, Key, Metrics, Spec, Task, Transition
+from mtjax.types import Array, InputError
 
 Point = Mapping[str, float]
 Sweep = Mapping[str, Sequence[float]] | Sequence[Point]
 _STATIC = ("encoder", "experience")  # their numbers are shapes, or constants in the networks' modules
-
-
-class SweptState(NamedTuple):
-    """The state of an agent at one point."""
-
-    learner: Any  # the state of the agent itself
-    knobs: dict[str, Array]  # the swept values, () each
-
-
-@dataclasses.dataclass(frozen=True)
-class SweptAgent:
-    """An agent that keeps some of its numbers in its state, where ``jit`` traces them.
-
-    Every method uses a copy of the agent that holds the traced values. They are unchecked there; ``agent_at`` checks
-    them beforehand.
-    """
-
-    agent: BaseAgent
-
-    @property
-    def unroll(self) -> int:
-        return self.agent.unroll
-
-    @property
-    def experience(self) -> Experience:
-        return self.agent.experience
-
-    def init(self, spec: Spec, tasks: Task, key: Key, knobs: dict[str, Array] | None = None) -> SweptState:
-        knobs = knobs or {}
-        return SweptState(with_values(self.agent, knobs).init(spec, tasks, key), knobs)
-
-    def begin(self, state: SweptState, task: Task) -> Any:
-        return with_values(self.agent, state.knobs).begin(state.learner, task)
-
-    def act(self, state: SweptState, memory: Any, obs: Any, task: Task, key: Key | None) -> Acted:
-        acted = with_values(self.agent, state.knobs).act(state.learner, memory, obs, task, key)
-        whole = jnp.isfinite(acted.action)  # a diverged seed must not stop the others
-        return acted._replace(action=jnp.where(whole, acted.action, 0))
-
-    def remember(self, state: SweptState, memory: Any, transition: Transition, task: Task) -> Any:
-        return with_values(self.agent, state.knobs).remember(state.learner, memory, transition, task)
-
-    def relabel(self, env: Env, task: Task, transition: Transition, key: Key) -> Transition:
-        return self.agent.relabel(env, task, transition, key)
-
-    def assess(self, state: SweptState, steps: Transition, tasks: Task) -> tuple[SweptState, Transition]:
-        learner, steps = with_values(self.agent, state.knobs).assess(state.learner, steps, tasks)
-        return state._replace(learner=learner), steps
-
-    def update(
-        self, state: SweptState, window: Transition, tasks: Task, key: Key, number: Array
-    ) -> tuple[SweptState, Metrics]:
-        learner, metrics = with_values(self.agent, state.knobs).update(state.learner, window, tasks, key, number)
-        return state._replace(learner=learner), metrics
-
-    def observe(self, state: SweptState, steps: Transition, tasks: Task) -> SweptState:
-        return state._replace(learner=with_values(self.agent, state.knobs).observe(state.learner, steps, tasks))
-
-    def reset_networks(self, state: SweptState, spec: Spec, tasks: Task, key: Key) -> SweptState:
-        return state._replace(
-            learner=with_values(self.agent, state.knobs).reset_networks(state.learner, spec, tasks, key)
-        )
 
 
 def sweepable(agent: BaseAgent) -> dict[str, float]:
@@ -111,9 +48,14 @@ def agents_at(agent: Any, points: Sequence[Point]) -> list[Any]:
     return [agent_at(agent, point) for point in points] or [agent]
 
 
-def with_values(agent: BaseAgent, knobs: Mapping[str, Array]) -> BaseAgent:
-    """Return the agent with traced values, which its constructor cannot check."""
-    return _replace_values(agent, knobs, parts.put)
+def with_numbers(agent: Any, numbers: Mapping[str, Array]) -> Any:
+    """Return the agent with traced numbers, which its constructor cannot check; ``agent_at`` checks them beforehand."""
+    return _replace_values(agent, numbers, parts.put) if numbers else agent
+
+
+def at_point(agent: Any, state: Any) -> Any:
+    """Return the agent with the numbers that its state holds: those of its point, if it is one of a sweep."""
+    return with_numbers(agent, getattr(state, "numbers", {}))
 
 
 def _replace_values(agent: BaseAgent, values: Mapping[str, Any], replace: Callable) -> BaseAgent:
@@ -163,9 +105,9 @@ def _number(name: str, value: Any) -> float:
         raise InputError(f"a sweep gives numbers to {name}, and {shown(value)} is none") from None
 
 
-def seed_axis(points: Sequence[Point], seeds: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray] | None]:
-    """Return seeds (S,) and swept values (S,) by name for all points; without points, the seeds and None."""
+def seed_axis(points: Sequence[Point], seeds: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return seeds (S,) and swept values (S,) by name for all points; without points, the seeds and no values."""
     if not points:
-        return seeds, None
+        return seeds, {}
     column = lambda name: np.repeat(np.asarray([point[name] for point in points], np.float32), len(seeds))
     return np.tile(seeds, len(points)), {name: column(name) for name in points[0]}

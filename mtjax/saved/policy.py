@@ -12,7 +12,7 @@ import numpy as np
 
 from mtjax import frames, loop, standalone
 from mtjax.agents import BaseAgent, name_of, swept
-from mtjax.agents.swept import Point, SweptAgent
+from mtjax.agents.swept import Point
 from mtjax.checks import path, require_whole, shown
 from mtjax.compiling.programs import trace
 from mtjax.config import RunConfig
@@ -207,7 +207,7 @@ def policy_of(
     _require_seed(seed, count, len(found))
     if found:
         agent = swept.agent_at(agent, found[seed // count])
-        states = jax.tree.map(lambda x: x[_point_rows(count, seed)], states.learner)
+        states = jax.tree.map(lambda x: x[_point_rows(count, seed)], states)._replace(numbers={})
     own = seed % count
     return Policy(env, agent, jax.tree.map(lambda x: x[own], states), states, seeds, directory, own)
 
@@ -242,6 +242,6 @@ def load_experience(directory: str | Path, seed: int = 0) -> tuple[Ring, int]:
 
 def state_shapes(config: RunConfig) -> loop.TrainState:
     """Return the shapes of a run's training state."""
-    env, agent = config.family, SweptAgent(config.learner) if config.points else config.learner
+    env, agent = config.family, config.learner
     axis = swept.seed_axis(config.points, np.asarray(config.plan.all_seeds, np.int32))
     return trace(loop.init, env, agent, config.training, env.tasks("train"), *axis).out_info  # type: ignore

@@ -15,7 +15,7 @@ import numpy as np
 from mtjax.agents import settings as settings_of
 from mtjax.agents import swept
 from mtjax.agents.rates import planned
-from mtjax.agents.swept import Point, SweptAgent
+from mtjax.agents.swept import Point
 from mtjax.compiling.programs import Programs, compile_lowered, jit_programs, load_kernels, sharded_shapes, trace
 from mtjax.config import RunConfig
 from mtjax.evaluation import Episodes, Evaluations, no_evaluations
@@ -105,9 +105,8 @@ class _Run:
 
     @cached_property
     def agent(self) -> Any:
-        """Return the agent as it is trained: with its schedule's length, and of a sweep with traced numbers."""
-        agent = planned(self.config.learner, self.config.length)
-        return SweptAgent(agent) if self.config.points else agent
+        """Return the agent as it is trained: with its schedule's length."""
+        return planned(self.config.learner, self.config.length)
 
     @cached_property
     def console(self) -> Console:
@@ -115,7 +114,7 @@ class _Run:
         return Console(total, self.hooks.quiet or not hosts.is_first(), self.hooks.label)
 
     @cached_property
-    def seed_axis(self) -> tuple[np.ndarray, dict[str, np.ndarray] | None]:
+    def seed_axis(self) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """Return the seeds (S,) of all points, and the swept values (S,) by name."""
         return swept.seed_axis(self.config.points, np.asarray(self.config.plan.all_seeds, np.int32))
 
@@ -130,13 +129,10 @@ class _Run:
 
     def adopt(self, tasks: Any, fresh: Any) -> Any:
         """Return the agent's state with the values of the run to fine-tune. Every point starts from the same seeds."""
-        if not isinstance(self.agent, SweptAgent):
-            return finetune.adopt(self.hooks.start, self.agent, tasks, fresh)  # type: ignore
-        apart = lambda x: x.reshape(len(self.config.points), self.config.plan.seeds, *x.shape[1:])
+        apart = lambda x: x.reshape(-1, self.config.plan.seeds, *x.shape[1:])
         together = lambda x: x.reshape(-1, *x.shape[2:])
-        adopt = partial(finetune.adopt, self.hooks.start, self.agent.agent, tasks)  # type: ignore
-        learner = jax.tree.map(together, jax.vmap(adopt)(jax.tree.map(apart, fresh.learner)))
-        return fresh._replace(learner=learner)
+        adopt = partial(finetune.adopt, self.hooks.start, self.agent, tasks)  # type: ignore
+        return jax.tree.map(together, jax.vmap(adopt)(jax.tree.map(apart, fresh)))
 
     @cached_property
     def records(self) -> Records:
@@ -172,8 +168,8 @@ class _Run:
         env, agent, settings = self.config.family, self.agent, self.config.played
         lazy = jit_programs(self.config.mesh, agent)
         tasks, everything = (meshes.replicate(self.config.mesh, env.tasks(split)) for split in ("train", "all"))
-        (seeds, knobs), pool = meshes.shard_by_seed(self.config.mesh, self.seed_axis), ThreadPoolExecutor(3)
-        fresh = trace(lazy.init, env, agent, settings, tasks, seeds, knobs)
+        (seeds, numbers), pool = meshes.shard_by_seed(self.config.mesh, self.seed_axis), ThreadPoolExecutor(3)
+        fresh = trace(lazy.init, env, agent, settings, tasks, seeds, numbers)
         shapes = sharded_shapes(self.config.mesh, agent, fresh.out_info)
         self._describe(shapes)
         self.console.say("compiling")
@@ -189,7 +185,7 @@ class _Run:
         programs = Programs(play, evaluate, chunk.out_info[1], score.result)
         if kernels.result():  # else the first chunk would wait for them
             score.result()
-        return programs, self.records.restore(shapes) if make is None else make.result()(tasks, seeds, knobs)
+        return programs, self.records.restore(shapes) if make is None else make.result()(tasks, seeds, numbers)
 
     def _describe(self, shapes: TrainState) -> None:
         env, settings = self.config.family, self.config.played
@@ -211,13 +207,8 @@ class _Run:
             return []
         assert self.hooks.directory is not None
         config, plan, played = self.config, dataclasses.asdict(self.config.plan), dataclasses.asdict(self.config.played)
-        told = {**plan, **played, **settings_of(self.learner)}
+        told = {**plan, **played, **settings_of(self.agent)}
         return open_sinks(self.hooks.directory, config.tensorboard, config.wandb, steps, told)
-
-    @property
-    def learner(self) -> Any:
-        """Return the agent without its sweep."""
-        return self.agent.agent if isinstance(self.agent, SweptAgent) else self.agent
 
     def _name(self, k: int) -> str:
         """Return the name of entry k of S for TensorBoard and W&B."""

@@ -92,9 +92,11 @@ def is_zero(value: Any) -> bool:
     return not isinstance(value, jax.Array) and value == 0
 
 
-def or_infinite(limit: Any) -> Any:
-    """Return a limit. A traced one may be zero, which means that there is no limit: then infinity."""
-    return jnp.where(limit > 0, limit, jnp.inf) if isinstance(limit, jax.Array) else limit
+def limit(value: Any) -> Any:
+    """Return a limit, or None if it is 0, which means that there is none. A traced one may be 0: then infinity."""
+    if is_zero(value):
+        return None
+    return jnp.where(value > 0, value, jnp.inf) if isinstance(value, jax.Array) else value
 
 
 # Checks of settings. Each raises an InputError that names the setting, its value and what is allowed.

@@ -17,7 +17,8 @@ Shape = Literal["constant", "linear", "cosine"]
 
 def adam(rate: Any, weight_decay: Any, max_norm: Any, tune: str) -> optax.GradientTransformation:
     """Return Adam, or AdamW, on clipped gradients, for those parameters that ``tune`` names."""
-    clip = optax.identity() if parts.is_zero(max_norm) else clip_to(max_norm)
+    limit = parts.limit(max_norm)
+    clip = optax.identity() if limit is None else clip_to(limit)
     step = optax.adam(rate) if parts.is_zero(weight_decay) else optax.adamw(rate, weight_decay=weight_decay)
     learn = on_sphere(optax.chain(clip, step))
     if tune == "all":
@@ -82,7 +83,7 @@ def on_sphere(optimizer: optax.GradientTransformation) -> optax.GradientTransfor
 
 def clip_to(norm: Any) -> optax.GradientTransformation:
     """Return a transformation that clips gradients to a global norm; a traced norm may be 0, which does not clip."""
-    return optax.clip_by_global_norm(parts.or_infinite(norm))
+    return optax.clip_by_global_norm(norm)
 
 
 def descend(optimizer: optax.GradientTransformation, gradients: Any, memory: Any, params: Any) -> tuple[Any, Any]:

@@ -29,7 +29,5 @@ class Parameters(Nothing):
 
     def limited(self, context: Array) -> Array:
         """Return contexts (..., C) as networks see them."""
-        if parts.is_zero(self.context_limit):
-            return context
-        limit = parts.or_infinite(self.context_limit)
-        return jnp.clip(context, -limit, limit)
+        limit = parts.limit(self.context_limit)
+        return context if limit is None else jnp.clip(context, -limit, limit)
