@@ -4,7 +4,6 @@ python -m mtjax.train --import=examples/own_sampler.py --agent.sampler=below-mar
 """
 
 import dataclasses
-from typing import ClassVar
 
 import jax.numpy as jnp
 
@@ -16,7 +15,6 @@ from mtjax.agents.parts.samplers import Sampler
 class BelowMark(Sampler):
     """Weigh tasks by how far their return, a moving mean, is below a mark; those beyond it keep a tenth."""
 
-    watches: ClassVar[bool] = True  # ``observe`` is called after every step of all environments
     mark: float = 500.0
     """Return at which a task is learned."""
     mark_rate: float = 0.1
@@ -25,10 +23,17 @@ class BelowMark(Sampler):
     def init(self, num_tasks):
         return jnp.zeros(num_tasks)
 
-    def observe(self, memory, outcome):
-        """Take note of a step: ``outcome.ended`` (T, E), and ``outcome.total`` (T, E), the return of what ended."""
-        count = jnp.sum(outcome.ended, axis=1)
-        mean = jnp.sum(jnp.where(outcome.ended, outcome.total, 0.0), axis=1) / jnp.maximum(count, 1)
+    def begin(self):
+        """Return the memory with which an episode begins: its return so far."""
+        return jnp.float32(0)
+
+    def remember(self, episode, reward, gamma):
+        return episode + reward
+
+    def observe(self, memory, steps):
+        """Follow the returns of trials that ended: where ``steps.closed`` (T, N), ``steps.memory`` is their return."""
+        count = jnp.sum(steps.closed, axis=1)
+        mean = jnp.sum(jnp.where(steps.closed, steps.memory, 0.0), axis=1) / jnp.maximum(count, 1)
         return jnp.where(count > 0, memory + self.mark_rate * (mean - memory), memory)
 
     def weights(self, memory, temperature):

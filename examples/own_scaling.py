@@ -4,7 +4,6 @@ python -m mtjax.train --import=examples/own_scaling.py --agent.scaling=largest
 """
 
 import dataclasses
-from typing import ClassVar
 
 import jax.numpy as jnp
 
@@ -16,16 +15,15 @@ from mtjax.agents.parts.scaling import Scaling
 class Largest(Scaling):
     """Divide rewards by the largest size of a reward that the task has paid; logged returns stay raw."""
 
-    watches: ClassVar[bool] = True  # ``observe`` is called after every step of all environments
     least_unit: float = 1e-3
     """The unit before any reward is known."""
 
     def init(self, num_tasks):
         return jnp.zeros(num_tasks)
 
-    def observe(self, memory, outcome):
-        """Take note of the rewards (T, E) of a step."""
-        return jnp.maximum(memory, jnp.max(jnp.abs(outcome.reward), axis=1))
+    def observe(self, memory, steps):
+        """Follow the rewards (T, N) of collected steps."""
+        return jnp.maximum(memory, jnp.max(jnp.abs(steps.reward), axis=1))
 
     def units(self, memory, gamma, bonus):
         """Each task's factor and offset (T,): critics count in factor * (return - offset)."""

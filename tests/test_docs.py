@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import pkgutil
 import re
 import shlex
 import subprocess
@@ -11,6 +12,7 @@ from pathlib import Path
 import pytest
 from needs import needs
 
+import mtjax
 from mtjax.agents import AGENTS
 from mtjax.command.run_config import parse
 from mtjax.envs import ENVS
@@ -67,6 +69,14 @@ def test_examples_in_the_pages_exist():
     """Files that pages include are files of the repository."""
     included = [name for page in DOCS for name in re.findall(r'--8<-- "([^"]+)"', page.read_text())]
     assert included and all((ROOT / name).is_file() for name in included)
+
+
+def test_what_the_pages_document_exists():
+    """Every name behind ``:::`` is found as the site's builder looks for it, and every public name has its place."""
+    names = [name for page in DOCS for name in re.findall(r"^::: (\S+)", page.read_text(), re.MULTILINE)]
+    assert set(mtjax._HOME) - {"AGENTS", "ENVS"} <= {name.rpartition(".")[2] for name in names} | {"preset"}
+    for name in names:
+        pkgutil.resolve_name(name)
 
 
 @pytest.fixture(scope="module")

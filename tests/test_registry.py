@@ -19,7 +19,7 @@ from probes import FEW, METAWORLD, param, slow_but
 import mtjax
 import mtjax.evaluate
 import mtjax.train
-from mtjax import register
+from mtjax import loop, register
 from mtjax.agents import AGENTS, PARTS
 from mtjax.agents.parts.knowing import Parameters
 from mtjax.command import help, keywords, run_config
@@ -158,6 +158,17 @@ def test_parts_and_agents_of_ones_own_are_trained(name, short_family, forget, tm
     assert f"--import={file}" in shlex.split(record["command"])
     assert (record["agent"] if kind == "agent" else record["learner"][kind]) == own
     assert type(mtjax.load(run).agent) is AGENTS[record["agent"]].cls
+
+
+def test_a_run_of_all_examples_together_is_traced(forget):
+    """Each does what the loop asks of its kind, as its observing and weighing; no program is compiled."""
+    words = [word for name in OWN for word in (f"--import={EXAMPLES / name}.py", *OWN[name][2])]
+    config = run_config.parse(["--env=control-cartpole", "--batch-size=4", *words, "--agent.hidden", "8"])
+    tasks = config.family.tasks()
+    fixed = (config.family, config.learner, config.training)
+    state = jax.eval_shape(partial(loop.init, *fixed), tasks, jnp.zeros(1, jnp.uint32))
+    after, _ = jax.eval_shape(partial(loop.run_chunk, *fixed), tasks, state)
+    assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
 
 
 def test_an_agent_is_another_with_other_defaults(forget):

@@ -27,10 +27,10 @@ import json, runpy, sys
 import mtjax.evaluation, mtjax.loop
 count = 0
 def counted(step):
-    def trace(*arguments):
+    def trace(*arguments, **named):
         global count
         count += 1
-        return step(*arguments)
+        return step(*arguments, **named)
     return trace
 for module in (mtjax.evaluation, mtjax.loop):
     module.step_envs = counted(module.step_envs)
