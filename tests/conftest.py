@@ -4,7 +4,7 @@ import dataclasses
 import gc
 import os
 import shutil
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import ClassVar, NamedTuple
 
 import jax
@@ -13,6 +13,7 @@ import numpy as np
 import probes
 import pytest
 from needs import count_skips, require, skip_without_packages
+from tyro import _docstrings
 
 import mtjax.train
 from mtjax.envs import ENVS
@@ -35,16 +36,27 @@ def pytest_configure(config):
         given = os.environ.get("XLA_FLAGS", "")
         added = [f"--{name}={value}" for name, value in QUICK_FLAGS.items() if name not in given]
         os.environ["XLA_FLAGS"] = " ".join([given, *added]).strip()
-    cache = getattr(config, "cache", None)
-    if cache is not None:
+    read_classes_once()
+    files = getattr(config, "cache", None)
+    if files is not None:
         keep = {
-            "jax_compilation_cache_dir": str(cache.mkdir("xla")),
+            "jax_compilation_cache_dir": str(files.mkdir("xla")),
             "jax_persistent_cache_min_compile_time_secs": 0.0,
             "jax_persistent_cache_min_entry_size_bytes": -1,
         }
         for name, value in keep.items():
             os.environ[name.upper()] = str(value)
             jax.config.update(name, value)
+
+
+def read_classes_once():
+    """Keep what tyro reads of a class's source: it forgets it after every command line, of which tests parse hundreds.
+
+    It makes up more than half of the time that a command line takes.
+    """
+    tokens = getattr(_docstrings, "_ClassTokenization", None)
+    if hasattr(getattr(tokens, "make", None), "__wrapped__"):  # tyro may change what is its own
+        tokens.make = staticmethod(cache(tokens.make.__wrapped__))  # type: ignore
 
 
 def use_gpu(config):
