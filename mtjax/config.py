@@ -18,14 +18,11 @@ from jax.sharding import Mesh
 from mtjax import trials
 from mtjax.agents import AGENTS, BaseAgent, agent, combinations, preset_of
 from mtjax.agents import name_of as agent_name_of
-from mtjax.agents.choices import kinds_of, replace
-from mtjax.agents.parts import name_of
+from mtjax.agents.choices import kinds_of, replace, require_value_range
 from mtjax.agents.parts.policies import Gaussian, policy_for
-from mtjax.agents.parts.scaling import SCALINGS
-from mtjax.agents.parts.values import VALUES
 from mtjax.agents.swept import agents_at
 from mtjax.checks import MOST_EPISODES, check_fields, path, require_library, require_text
-from mtjax.envs import make, members
+from mtjax.envs import make
 from mtjax.envs import name_of as env_name_of
 from mtjax.envs.task_table import Tabled
 from mtjax.experience import Replay
@@ -189,12 +186,12 @@ class RunConfig:
         if self.env:
             self._check_named()
         _ = self.mesh
+        require_policy(self.learner, self.family)
         self.learner.experience.check(self.family, self.played.num_envs, self.played.chunk_steps)
         require_trials(self.training, self.family, self.learner)
-        require_policy(self.learner, self.family)
-        trials.require_whole(self.plan.eval_episodes, self.training.trials, "eval-episodes")
         for learner in agents_at(self.learner, self.points):
             require_value_range(learner)
+        trials.require_whole(self.plan.eval_episodes, self.training.trials, "eval-episodes")
         for module in ["tensorboardX"] * self.tensorboard + ["wandb"] * bool(self.wandb):
             require_library(module)
 
@@ -351,28 +348,6 @@ def require_policy(agent: Any, env: Any) -> None:
     scores, kind = ", or --env.scores" if scored else "", env.spec.action.kind
     names = agent_name_of(agent), env_name_of(env)
     raise InputError(f"{names[0]} draws no {kind} actions, which {names[1]} has: use {able}{scores}")
-
-
-def require_value_range(agent: Any) -> None:
-    """Refuse categorical critics that have no chosen range and whose returns are not scaled to the default range.
-
-    Raises:
-        InputError: the agent has such critics.
-    """
-    if "value" in kinds_of(agent):
-        reason = agent.value.refuses(name_of(SCALINGS, agent.scaling))
-        if reason:
-            raise InputError(f"value={name_of(VALUES, agent.value)} {reason}")
-
-
-def slow_on_cpu(env_name: str) -> dict[str, str]:
-    """Return those of an environment's families that a CPU was not seen to learn in minutes with the default agent.
-
-    Returns:
-        family -> the agent that did learn it there, or "" if none was seen to.
-    """
-    slow = tomllib.loads((resources.files("mtjax") / "configs" / "default.toml").read_text())["slow_on_cpu"]
-    return {name: slow[name] for name, _ in members(env_name) if name in slow}
 
 
 def load_preset(env_name: str, name: str) -> dict[str, Any]:

@@ -64,15 +64,27 @@ def replace(agent: Any, given: Mapping[str, Any]) -> Any:
     Raises:
         InputError: it has no such setting, or the value is not allowed.
     """
-    rest, fields = frozen(given), parts.setting_names(agent)
-    chosen = {}
-    for kind in kinds_of(agent):
-        part = parts.choose(kind, PARTS[kind], rest.pop(kind)) if kind in rest else getattr(agent, kind)
-        chosen[kind] = parts.take(rest, part)
-    unknown = next((name for name in rest if name not in fields), None)
+    rest = frozen(given)
+    choose = lambda kind: parts.choose(kind, PARTS[kind], rest.pop(kind)) if kind in rest else getattr(agent, kind)
+    chosen = {kind: choose(kind) for kind in kinds_of(agent)}
+    known = {name for holder in (agent, *chosen.values()) for name in parts.setting_names(holder)}
+    unknown = next((name for name in rest if name not in known), None)
     if unknown is not None:
         raise unknown_setting("setting", unknown, [*settings(agent), *OF_TRAIN])
-    return dataclasses.replace(agent, **checked(agent, rest), **chosen)
+    taken = {kind: parts.take(rest, part) for kind, part in chosen.items()}
+    return dataclasses.replace(agent, **checked(agent, rest), **taken)
+
+
+def require_value_range(agent: Any) -> None:
+    """Refuse categorical critics that have no chosen range and whose returns are not scaled to the default range.
+
+    Raises:
+        InputError: the agent has such critics.
+    """
+    if "value" in kinds_of(agent):
+        reason = agent.value.refuses(parts.name_of(SCALINGS, agent.scaling))
+        if reason:
+            raise InputError(f"value={parts.name_of(VALUES, agent.value)} {reason}")
 
 
 def build(name: str, cls: type, defaults: Mapping[str, Any], given: Mapping[str, Any]) -> Any:

@@ -11,7 +11,6 @@ from mtjax.command.keywords import configured
 from mtjax.config import Plan
 from mtjax.loop import Settings
 from mtjax.names import InputError, public
-from mtjax.parallel import hosts
 from mtjax.report.curve import draw
 from mtjax.saved.folder import prepare
 from mtjax.saved.policy import Policy, load
@@ -111,7 +110,7 @@ def train(
     agent = start.agent if agent is None and start is not None else agent
     config = configured(env, agent, given, plan=plan, settings=settings, start=start, sweep=sweep, **written)
     check(config, start)
-    folder = None if directory is None else hosts.broadcast_path(lambda: prepare(config, path(directory), resume))
+    folder = None if directory is None else prepare(config, path(directory), resume)
     result = launch(config, Hooks(folder, start, resume, on_chunk, quiet=quiet, label=label))
     if folder is not None:
         draw(config, result.evaluations, folder)

@@ -26,8 +26,8 @@ from mtjax.evaluation import Evaluations
 from mtjax.report.curve import draw
 from mtjax.report.stats import seed_interval
 from mtjax.saved import checkpoint, lock
-from mtjax.saved.config_json import from_json, import_flags
-from mtjax.saved.folder import evaluations_of, new_directory, record_steps, resumed_config, short_name, write_config
+from mtjax.saved.config_json import from_json, import_flags, write_config
+from mtjax.saved.folder import evaluations_of, new_directory, record_steps, resumed_config, short_name
 from mtjax.saved.log import append_rows, number
 from mtjax.training import memory
 from mtjax.training.launch import check, launch, load_start

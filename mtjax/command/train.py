@@ -3,7 +3,6 @@
 import shlex
 import sys
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 from mtjax.command import sweep
@@ -15,8 +14,8 @@ from mtjax.parallel import hosts
 from mtjax.report.curve import draw
 from mtjax.report.tables import split_table
 from mtjax.saved import checkpoint, lock
-from mtjax.saved.config_json import import_flags
-from mtjax.saved.folder import new_directory, record_steps, resumed_config, short_name, write_config
+from mtjax.saved.config_json import import_flags, write_config
+from mtjax.saved.folder import new_directory, record_steps, resumed_config, short_name
 from mtjax.saved.result import Result
 from mtjax.training import memory
 from mtjax.training.console import duration
@@ -44,7 +43,7 @@ def main(argv: Sequence[str]) -> None:
     check(config, start)
     if directory is None and memory.seeds_exceed_memory(config):
         return sweep.run_all([config], "rounds")
-    directory = hosts.broadcast_path(partial(_prepare, config, directory))
+    directory = _prepare(config, directory)
     result = launch(config, Hooks(directory, start, resume))
     if hosts.is_first():
         _conclude(config, result, directory)
@@ -52,6 +51,7 @@ def main(argv: Sequence[str]) -> None:
         sys.exit(128 + result.signal)
 
 
+@hosts.by_first
 def _prepare(config: RunConfig, directory: Path | None) -> Path:
     """Make the folder of a new run with its config.json, or update the steps of a resumed run."""
     if directory is not None:

@@ -1,11 +1,12 @@
 """Several processes of one run, on one host or on many, joined by ``jax.distributed``."""
 
 import contextlib
+import functools
 import os
 from collections.abc import Callable
 from pathlib import Path
 from threading import Thread
-from typing import Any
+from typing import Any, ParamSpec
 
 import jax
 import numpy as np
@@ -13,6 +14,7 @@ from jax.experimental import multihost_utils
 
 from mtjax.types import InputError
 
+P = ParamSpec("P")
 _VARIABLES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
 _LAUNCHERS = (
     "SLURM_JOB_ID",
@@ -82,24 +84,31 @@ def largest(number: int) -> int:
     return number if jax.process_count() == 1 else int(np.max(multihost_utils.process_allgather(np.asarray(number))))
 
 
-def broadcast_path(choose: Callable[[], Path]) -> Path:
-    """Return the path that the first process chooses, in every process. Every process must call this.
+def by_first(choose: Callable[P, Path]) -> Callable[P, Path]:
+    """Return a function that runs in the first process alone and returns its path in every process.
+
+    Every process must call it, with the same arguments.
 
     Raises:
         InputError: the first process could not choose a path. It reports the reason itself.
     """
-    if jax.process_count() == 1:
-        return choose()
-    chosen, failed = b"", None
-    if is_first():
-        try:
-            chosen = os.fsencode(choose().absolute())
-        except (OSError, InputError) as error:
-            failed = error
-    told = multihost_utils.broadcast_one_to_all(np.frombuffer(chosen.ljust(_LONGEST_PATH, b"\0"), np.uint8))
-    path = bytes(told).rstrip(b"\0")
-    if failed is not None:
-        raise failed
-    if not path:
-        raise InputError("process 0 could not use the run's folder, and says why")
-    return Path(os.fsdecode(path))
+
+    @functools.wraps(choose)
+    def chosen(*args: P.args, **kwargs: P.kwargs) -> Path:
+        if jax.process_count() == 1:
+            return choose(*args, **kwargs)
+        text, failed = b"", None
+        if is_first():
+            try:
+                text = os.fsencode(choose(*args, **kwargs).absolute())
+            except (OSError, InputError) as error:
+                failed = error
+        told = multihost_utils.broadcast_one_to_all(np.frombuffer(text.ljust(_LONGEST_PATH, b"\0"), np.uint8))
+        path = bytes(told).rstrip(b"\0")
+        if failed is not None:
+            raise failed
+        if not path:
+            raise InputError("process 0 could not use the run's folder, and says why")
+        return Path(os.fsdecode(path))
+
+    return chosen

@@ -173,7 +173,7 @@ def load(directory: Path, like: TrainState) -> TrainState:
         InputError: there is no whole checkpoint, or it is of another agent or family.
     """
     like_parts = {"agent": like.agent, "loop": like._replace(agent=None)}
-    folder = hosts.broadcast_path(lambda: _newest_whole(directory, like_parts))
+    folder = hosts.by_first(_newest_whole)(directory, like_parts)
     if hosts.is_first():
         tell_edits(directory.parent / _RECORD, folder / _RECORD)
     read = _read(folder, like_parts)

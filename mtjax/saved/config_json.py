@@ -22,7 +22,7 @@ from mtjax.envs.family import Family
 from mtjax.envs.mixtures import Mixture
 from mtjax.envs.task_table import Tabled
 from mtjax.loop import Settings
-from mtjax.names import is_imported
+from mtjax.names import is_imported, replacing
 from mtjax.types import InputError
 
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
@@ -56,13 +56,30 @@ def from_json(path: Path) -> RunConfig:
         raise InputError(text + _other_version(record) + _with_copy(path)) from None
 
 
-def reread(config: RunConfig) -> RunConfig:
-    """Return what ``from_json`` would read of a configuration.
+def write_config(directory: Path, config: RunConfig) -> None:
+    """Write config.json into the folder of a new run."""
+    with replacing(directory / "config.json") as new:
+        new.write_text(to_json(config, run_metadata(config)))
+
+
+def require_names(config: RunConfig) -> None:
+    """Refuse a family or an agent that ``from_json`` would not make again from a recorded name.
 
     Raises:
-        InputError: its names do not make its family or its agent.
+        InputError: the configuration has such a one.
     """
-    return _from_record(json.loads(to_json(config, {})))
+    if not config.env:
+        raise InputError("a run's folder needs an environment derived from Family and an agent from BaseAgent")
+    record = json.loads(to_json(config, {}))
+    try:
+        again = _from_record(record)
+    except InputError:
+        again = None
+    for kind, part in (("env", "family"), ("agent", "learner")):
+        made = getattr(config, part)
+        if made != getattr(again, part, None):
+            name = type(made).__name__
+            raise InputError(f"a run's folder needs a name for {name}: mtjax.register('my-{kind}', {name}) gives one")
 
 
 def read_record(path: Path) -> dict[str, Any]:
@@ -94,8 +111,8 @@ def _from_record(record: Any) -> RunConfig:
         wandb=record.get("wandb", ""),
         plan=Plan(**record["plan"]),
         training=Settings(**record["training"]),
-        family=make(record["env"], **record["family"]),
         learner=agent(record["agent"], **record["learner"]),
+        family=make(record["env"], **record["family"]),
     )
     require_values(config)
     if not all(isinstance(word, str) for word in config.sweep):
@@ -156,12 +173,13 @@ def run_metadata(config: RunConfig) -> dict:
             versions[package] = version(package)
         except PackageNotFoundError:
             versions[package] = "not installed"
+    words = to_flags(config)
     return {
         "engine": config.family.engine_name,
         "device": str(jax.devices()[0].device_kind),
         "python": platform.python_version(),
         "versions": versions,
-        "command": shlex.join(["python", "-m", "mtjax.train", *to_flags(config)]),
+        "command": shlex.join(["python", "-m", "mtjax.train", *words]),
     }
 
 

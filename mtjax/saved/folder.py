@@ -15,11 +15,11 @@ from mtjax.checks import shown
 from mtjax.config import RunConfig
 from mtjax.evaluation import Evaluations, load_evaluations, no_evaluations, require_same_run
 from mtjax.names import SPLITS, notice, replacing
+from mtjax.parallel import hosts
 from mtjax.saved.arrays import require_place
-from mtjax.saved.config_json import from_json, read_record, reread, run_metadata, to_json
+from mtjax.saved.config_json import from_json, read_record, require_names, write_config
 from mtjax.types import InputError
 
-_PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
 _LONGEST = 80
 _MOST_TOLD = 3
 
@@ -43,6 +43,7 @@ def new_directory(root: Path, name: str) -> Path:
     raise InputError(f"cannot find a new name for a run in {str(root)!r}")
 
 
+@hosts.by_first
 def prepare(config: RunConfig, directory: Path, resume: bool) -> Path:
     """Make the folder of a new run with its config.json, or check that it holds the run to resume."""
     file = directory / "config.json"
@@ -50,26 +51,11 @@ def prepare(config: RunConfig, directory: Path, resume: bool) -> Path:
         _require_same(config, from_json(file), directory)
         record_steps(file, config.plan.steps)
         return directory
-    _require_names(config)
+    require_names(config)
     require_unused(directory)
     directory.mkdir(parents=True, exist_ok=True)
     write_config(directory, config)
     return directory
-
-
-def _require_names(config: RunConfig) -> None:
-    """Refuse a family or an agent that its recorded name does not make again."""
-    if not config.env:
-        raise InputError("a run's folder needs an environment derived from Family and an agent from BaseAgent")
-    try:
-        again = reread(config)
-    except InputError:
-        again = None
-    for kind, part in (("env", "family"), ("agent", "learner")):
-        made = getattr(config, part)
-        if made != getattr(again, part, None):
-            name = type(made).__name__
-            raise InputError(f"a run's folder needs a name for {name}: mtjax.register('my-{kind}', {name}) gives one")
 
 
 def _require_same(config: RunConfig, recorded: RunConfig, directory: Path) -> None:
@@ -119,12 +105,6 @@ def resumed_config(config: RunConfig, directory: Path, argv: Sequence[str]) -> R
     now: dict[str, Any] = {"plan": dataclasses.replace(recorded.plan, steps=steps)}
     now |= {"tensorboard": recorded.tensorboard or config.tensorboard, "wandb": config.wandb or recorded.wandb}
     return dataclasses.replace(recorded, **now, profile=config.profile, distributed=config.distributed)
-
-
-def write_config(directory: Path, config: RunConfig) -> None:
-    """Write config.json into the folder of a new run."""
-    with replacing(directory / "config.json") as new:
-        new.write_text(to_json(config, run_metadata(config)))
 
 
 def record_steps(file: Path, steps: int) -> None:

@@ -1,8 +1,11 @@
 """Start a run from its configuration: check it, load the policy to fine-tune, print a summary, and train."""
 
+import tomllib
+from importlib import resources
+
 import jax
 
-from mtjax.config import RunConfig, slow_on_cpu
+from mtjax.config import RunConfig
 from mtjax.envs import Family
 from mtjax.parallel import hosts
 from mtjax.saved.folder import remove_unused
@@ -58,7 +61,7 @@ def _introduction(config: RunConfig, hooks: Hooks) -> list[str]:
     if hooks.resume and "warp" in config.family.engine_name:
         lines.append("MuJoCo Warp does not repeat bit for bit: the run goes on from its state, in other numbers")
     if jax.default_backend() == "cpu":
-        lines += [_warning(family, agent) for family, agent in slow_on_cpu(config.env).items() if agent != config.agent]
+        lines += [_warning(family, agent) for family, agent in slow_on_cpu(config).items() if agent != config.agent]
     if hooks.resume and config.learner.lr_schedule != "constant" and not config.learner.lr_updates:
         lines.append(f"learning rates go on along the schedule of a run of {plan.steps:,} steps")
     return lines
@@ -70,6 +73,17 @@ def _sizes(config: RunConfig) -> str:
     sizes = {"worlds": config.training.num_envs, "transitions in a batch": getattr(experience, "batch_size", 0)}
     told = lambda size: f"{size:,}" if count == 1 else f"{size:,} a task, {count * size:,} in all"
     return "; ".join(f"{name}: {told(size)}" for name, size in sizes.items() if size)
+
+
+def slow_on_cpu(config: RunConfig) -> dict[str, str]:
+    """Return those of a run's families that a CPU was not seen to learn in minutes with the default agent.
+
+    Returns:
+        family -> the agent that did learn it there, or "" if none was seen to.
+    """
+    slow = tomllib.loads((resources.files("mtjax") / "configs" / "default.toml").read_text())["slow_on_cpu"]
+    names = [part.name.partition("#")[0] or config.env for part in config.family.parts]
+    return {name: slow[name] for name in names if name in slow}
 
 
 def _warning(family: str, agent: str) -> str:

@@ -146,7 +146,7 @@ class _Run:
         """Prepare the run, and play its chunks; ``started`` is the clock when the user began to wait."""
         with contextlib.ExitStack() as held:
             if (folder := self.hooks.directory) is not None:
-                hosts.broadcast_path(lambda: held.enter_context(lock.hold(folder)))
+                hosts.by_first(lambda: held.enter_context(lock.hold(folder)))()
             resumed = self.records.found(self.hooks.resume)
             if self.hooks.resume and not resumed:
                 self.console.say("there is no checkpoint yet, so the run starts over")
