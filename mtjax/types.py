@@ -185,6 +185,7 @@ class Spec(NamedTuple):
     mixed: bool = False  # whether entries of observations differ in meaning between tasks
     frames: int = 1  # how many of the last images an agent should see at once; observations hold the newest
     sentences: tuple[str, ...] = ()  # what the tasks of all splits ask for, by their numbers; for agents that read
+    symbols: int = 0  # how many last entries of observations are the symbol of the sketch that is due, one-hot
 
     @staticmethod
     def vector(obs_size: int, action_size: int, context_size: int) -> "Spec":

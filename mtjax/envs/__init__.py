@@ -179,6 +179,11 @@ _HIDDEN: dict[str, Entry] = {
     "hidden-bandit": ("hidden:HiddenBandit", {}),
 }
 
+# Grids of things, whose tasks are made of parts.
+_CRAFT: dict[str, Entry] = {
+    "craft": ("crafts:CraftWorld", {"vary": {"goal": "0:9:10"}, "split": "none"}),
+}
+
 # Mazes seen from within.
 _CORRIDORS: dict[str, Entry] = {
     "corridor-maze": ("maze:CorridorMaze", {}),
@@ -213,6 +218,7 @@ ENVS = Families(
     _inside("mtjax.envs.dm_control", _DOMAINS | _FURTHER | _HIP_BMDP | _GOALS)
     | _inside("mtjax.envs.mtenv", _MTENV)
     | _inside("mtjax.envs.corridors", _CORRIDORS)
+    | _inside("mtjax.envs.craft", _CRAFT)
     | _inside("mtjax.envs.metaworld", FAMILIES)
     | _inside("mtjax.envs", _BRAX | _HIDDEN)
 )

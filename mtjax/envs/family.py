@@ -316,7 +316,7 @@ class Family(Flat, Tabled):
         return Spec(step.obs, self.action, task.context.shape[0], sentences=self.sentences)
 
 
-def draw_until(accepted: Callable[[Array], Array], draw: Callable[[Key], Array], key: Key) -> Array:
+def draw_until(accepted: Callable[[Any], Array], draw: Callable[[Key], Any], key: Key) -> Any:
     """Draw until a draw is accepted, at most as often as dm_control does."""
 
     def again(carry):
