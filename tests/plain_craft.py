@@ -111,3 +111,59 @@ def moves_back(before, state):
         state, action = before[state]
         actions.append(action)
     return actions[::-1]
+
+
+class Rooms:
+    """Rooms of six cells from wall to wall, doors as {place: key's place, or None if it is open}, and a walker."""
+
+    def __init__(self, place, doors, goal):
+        self.place, self.doors, self.goal = tuple(place), dict(doors), tuple(goal)
+
+    def room(self):
+        return self.place[0] // 6, self.place[1] // 6
+
+    def step(self, action):
+        if action == USE:
+            self.doors = {door: None if key == self.place else key for door, key in self.doors.items()}
+        elif action < USE:
+            x, y = self.place[0] + STEPS[action][0], self.place[1] + STEPS[action][1]
+            if self.doors[x, y] is None if (x, y) in self.doors else x % 6 and y % 6:
+                self.place = x, y
+
+    def lights(self):
+        """Twelve numbers: locked doors, open doors and keys, each to the left, to the right, below and above."""
+        seen = {"locked": [0.0] * 4, "open": [0.0] * 4, "key": [0.0] * 4}
+        inside = self.place[0] % 6 and self.place[1] % 6
+        for door, key in self.doors.items():
+            rooms = {((door[0] + i) // 6, (door[1] + j) // 6) for i in (-1, 1) for j in (-1, 1)}
+            if door == self.place or (inside and self.room() in rooms):
+                self.shine(seen["open" if key is None else "locked"], door)
+            if key is not None and inside and (key[0] // 6, key[1] // 6) == self.room():
+                self.shine(seen["key"], key)
+        return [*seen["locked"], *seen["open"], *seen["key"]]
+
+    def shine(self, sums, light):
+        dx, dy = light[0] - self.place[0], light[1] - self.place[1]
+        bright = max(0.0, 1 - (dx * dx + dy * dy) ** 0.5 / 10)
+        for i, there in enumerate((dx <= 0, dx >= 0, dy <= 0, dy >= 0)):
+            sums[i] += bright * there
+
+    def carry_out(self, symbol):
+        """Go to the next room in a direction by the fewest actions, keys included, and return them."""
+        dx, dy = STEPS[("down", "up", "left", "right").index(symbol)]
+        room = self.room()[0] + dx, self.room()[1] + dy
+        begun = self.place, tuple(self.doors.items())
+        queue, before = deque([begun]), {begun: None}
+        while queue:
+            state = queue.popleft()
+            self.place, self.doors = state[0], dict(state[1])
+            if self.room() == room and self.place[0] % 6 and self.place[1] % 6:
+                return moves_back(before, state)
+            for action in range(5):
+                self.place, self.doors = state[0], dict(state[1])
+                self.step(action)
+                after = self.place, tuple(self.doors.items())
+                if after not in before:
+                    before[after] = (state, action)
+                    queue.append(after)
+        raise AssertionError(f"no way leads {symbol}")

@@ -182,6 +182,7 @@ _HIDDEN: dict[str, Entry] = {
 # Grids of things, whose tasks are made of parts.
 _CRAFT: dict[str, Entry] = {
     "craft": ("crafts:CraftWorld", {"vary": {"goal": "0:9:10"}, "split": "none"}),
+    "light-world": ("light:LightWorld", {"vary": {"goal": "0:9:10"}, "split": "none"}),
 }
 
 # Mazes seen from within.
