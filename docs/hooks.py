@@ -38,7 +38,7 @@ _UNSEARCHED = "{ data-search-exclude }"  # of a heading whose text is on many pa
 GROUPS = {  # title -> whether a family belongs there; the first that fits
     "Brax": lambda name, module: module.endswith("envs.brax"),
     "MTEnv's own": lambda name, module: ".mtenv." in module,
-    "Grids of things": lambda name, module: ".craft." in module,
+    "Grids": lambda name, module: ".craft." in module,
     "Tasks that nothing shows": lambda name, module: module.endswith("envs.hidden"),
     "Mazes seen from within": lambda name, module: ".corridors." in module,
     "Meta-World": lambda name, module: ".metaworld." in module,

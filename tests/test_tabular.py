@@ -186,7 +186,7 @@ def test_the_context_is_the_whole_task():
 def test_a_task_of_ones_own():
     """Tables make a task with the context that belongs to them; wrong shapes are refused."""
     env = TabularMDP(num_states=3, num_actions=2)
-    tables = env.draw(np.random.default_rng(7))
+    tables = env.draw_tables(np.random.default_rng(7))
     task = env.task_of(tables, row=4)
     assert task.id == task.row == 4 and task.context.shape == (6 + 18,)
     np.testing.assert_array_equal(task.goal["rewards"], np.float32(tables["rewards"]))

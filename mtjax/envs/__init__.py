@@ -179,8 +179,9 @@ _HIDDEN: dict[str, Entry] = {
     "hidden-bandit": ("hidden:HiddenBandit", {}),
 }
 
-# Grids of things, whose tasks are made of parts.
+# Grids whose tasks are made of parts: recipes, paths, weights of colours.
 _CRAFT: dict[str, Entry] = {
+    "coloured-maze": ("coloured:ColouredMaze", {"num_tasks": 10}),
     "craft": ("crafts:CraftWorld", {"vary": {"goal": "0:9:10"}, "split": "none"}),
     "light-world": ("light:LightWorld", {"vary": {"goal": "0:9:10"}, "split": "none"}),
 }

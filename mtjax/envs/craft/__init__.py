@@ -1,1 +1,1 @@
-"""Grid worlds whose tasks are made of parts: crafts with recipes, rooms with keys and doors, errands in sentences."""
+"""Grid worlds: crafts with recipes, rooms with keys and doors, errands in sentences, and colours that cost."""

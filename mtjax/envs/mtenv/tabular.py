@@ -21,7 +21,7 @@ _MOST_HELD_OUT = 10
 
 @dataclasses.dataclass(frozen=True)
 class DrawnTasks(Choosing):
-    """A family whose tasks are random tables of numbers in [0, 1]. The context holds all numbers, scaled to [-1, 1].
+    """A family whose tasks are random tables of numbers in [0, 1]. The context holds them, scaled to [-1, 1].
 
     Task number i of a split depends on ``task_seed`` and i alone, so that more tasks keep the first ones. The split
     "dense" holds out up to ten further draws as its interpolation tasks; "none" holds out nothing.
@@ -34,8 +34,13 @@ class DrawnTasks(Choosing):
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Return the names of a task's tables with their shapes."""
 
+    @property
+    def told(self) -> tuple[str, ...]:
+        """Return the names of the tables that the context holds: all of them."""
+        return tuple(self.shapes)
+
     @abc.abstractmethod
-    def draw(self, random: np.random.Generator) -> dict[str, np.ndarray]:
+    def draw_tables(self, random: np.random.Generator) -> dict[str, np.ndarray]:
         """Draw the tables of one task."""
 
     def task_of(self, tables: Mapping[str, np.ndarray], row: int = 0) -> Task:
@@ -51,7 +56,7 @@ class DrawnTasks(Choosing):
         if {name: table.shape for name, table in goal.items()} != self.shapes:
             given = {name: table.shape for name, table in goal.items()}
             raise InputError(f"the tables of a task have the shapes {self.shapes}, not {given}")
-        numbers = np.concatenate([goal[name].ravel() for name in self.shapes])
+        numbers = np.concatenate([goal[name].ravel() for name in self.told])
         leaves: dict[str, Any] = {"id": np.int32(row), "row": np.int32(row), "context": 2 * numbers - 1, "goal": goal}
         leaves["horizon"] = np.int32(self.episode_length)
         return Task(**leaves, params={}, model={})
@@ -72,7 +77,7 @@ class DrawnTasks(Choosing):
         """Return all tasks of all splits."""
         counts = self.counts
         seeds = [(self.task_seed, kind, i) for kind, count in enumerate(counts.values()) for i in range(count)]
-        tasks = [self._host_task(self.draw(np.random.default_rng(seed)), row) for row, seed in enumerate(seeds)]
+        tasks = [self._host_task(self.draw_tables(np.random.default_rng(seed)), row) for row, seed in enumerate(seeds)]
         ends = np.cumsum(list(counts.values()))
         rows = {s: np.arange(end - counts[s], end) for s, end in zip(SPLITS, ends, strict=True)}
         return Table(jax.tree.map(lambda *leaves: np.stack(leaves), *tasks), rows, None)
@@ -125,7 +130,7 @@ class TabularMDP(DrawnTasks):
         states, actions = self.num_states, self.num_actions
         return {"rewards": (states, actions), "transitions": (states, actions, states)}
 
-    def draw(self, random: np.random.Generator) -> dict[str, np.ndarray]:
+    def draw_tables(self, random: np.random.Generator) -> dict[str, np.ndarray]:
         weights = np.exp(random.standard_normal(self.shapes["transitions"]))
         rewards = random.uniform(size=self.shapes["rewards"])
         return {"rewards": rewards, "transitions": weights / weights.sum(axis=-1, keepdims=True)}
@@ -189,7 +194,7 @@ class Bandit(DrawnTasks):
     def shapes(self) -> dict[str, tuple[int, ...]]:
         return {"rewards": (self.num_arms,)}
 
-    def draw(self, random: np.random.Generator) -> dict[str, np.ndarray]:
+    def draw_tables(self, random: np.random.Generator) -> dict[str, np.ndarray]:
         return {"rewards": random.uniform(size=self.num_arms)}
 
     def reset(self, task: Task, key: Key) -> Step:
