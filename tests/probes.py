@@ -196,6 +196,7 @@ SMALL = {  # of parts that have such settings
     "hypernetwork_widths": (8, 4),
     "latent_widths": (8, 8),
     "model_widths": (8,),
+    "inference_widths": (8,),
 }
 
 
@@ -384,7 +385,8 @@ def with_memory(agent, batch: Transition) -> Transition:
     """A batch (T, B, ...) with random hidden states, if the agent has one."""
     if not agent.unroll:
         return batch
-    hidden = jax.random.normal(jax.random.key(0), (*batch.reward.shape, *agent.conditioning.begin().shape))
+    begun = agent.conditioning.begin(batch.obs.shape[-1], batch.action.shape[-1])
+    hidden = jax.random.uniform(jax.random.key(0), (*batch.reward.shape, *begun.shape))
     return batch._replace(memory=Memory(None, hidden), ended=batch.discount == 0, closed=batch.discount == 0)
 
 

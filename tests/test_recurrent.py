@@ -44,7 +44,7 @@ def rollout(seed=0):
 
 def test_states_over_a_window_are_those_of_steps_one_by_one():
     """With what acting remembers, and anew after the end of an episode."""
-    knowing, steps = Recurrent(SIZE), pick(rollout(), 0)
+    knowing, steps = Recurrent(recurrent_size=SIZE), pick(rollout(), 0)
     params = knowing.init(3, jax.tree.map(lambda x: x[0, 0], steps), jnp.zeros(2), False, KEY).shared
     window = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), steps)  # (E, H, ...)
     flat = lambda x: x.reshape(-1, *x.shape[2:])
@@ -59,7 +59,7 @@ def test_states_over_a_window_are_those_of_steps_one_by_one():
             np.testing.assert_allclose(before[world, t], hidden, atol=1e-5)
             hidden = one(hidden, pick(window, (world, t)))
             np.testing.assert_allclose(after[world, t], hidden, atol=1e-5)
-            hidden = jnp.where(window.ended[world, t], knowing.begin(), hidden)
+            hidden = jnp.where(window.ended[world, t], knowing.begin(3, 2), hidden)
     features = lambda past: knowing.features(params, jnp.zeros(0), dataclasses.make_dataclass("Seen", ["past"])(past))
     np.testing.assert_array_equal(features(track), found[0])
     np.testing.assert_array_equal(features(Following(*track)), found[1])
@@ -114,7 +114,7 @@ def test_values_at_the_end_of_a_window_know_the_last_step():
             value = lambda obs, features: agent.critic.apply(nets["critic"], features, obs)[0]
             error = step.reward + agent.gamma * value(step.next_obs, after) - value(step.obs, hidden)
             assert float(found.extras.advantage[0, t, world]) == pytest.approx(float(error), rel=1e-3, abs=1e-2)
-            hidden = jnp.where(step.ended, knowing.begin(), after)
+            hidden = jnp.where(step.ended, knowing.begin(3, 2), after)
 
 
 def test_sac_learns_from_windows_that_begin_with_the_stored_state():

@@ -253,11 +253,11 @@ class BaseAgent(abc.ABC):
 
     def begin(self, state: AgentState, task: Task) -> Memory:
         """Return the memory with which an episode begins."""
-        past, history = None, self.view.history
-        if history:
-            size = state.nets["inputs"].parts["moments"].mean.shape[-1]
-            past = last_steps.begin(history, size, self.policy.blank(state.nets))
-        return Memory(past, self.conditioning.begin(), self.scaling.begin(), self.sampler.begin())
+        history, action = self.view.history, self.policy.blank(state.nets)
+        obs_size = state.nets["inputs"].parts["moments"].mean.shape[-1]
+        past = last_steps.begin(history, obs_size, action) if history else None
+        hidden = self.conditioning.begin(obs_size, self.policy.encode(action).shape[-1])
+        return Memory(past, hidden, self.scaling.begin(), self.sampler.begin())
 
     def remember(self, state: AgentState, memory: Memory, transition: Transition, task: Task) -> Memory:
         """Return the memory after a step."""
@@ -267,7 +267,8 @@ class BaseAgent(abc.ABC):
         if hidden is not None:
             nets = of_task(state.nets, state.known(task))
             action = self.policy.encode(transition.action)
-            seen = transition._replace(obs=self.view.see(nets["inputs"], transition.obs), action=action)
+            obs, next_obs = (self.view.see(nets["inputs"], x) for x in (transition.obs, transition.next_obs))
+            seen = transition._replace(obs=obs, action=action, next_obs=next_obs)
             hidden = self.conditioning.remember(nets["knowing"].parts, hidden, seen)
         reward, gamma = transition.reward, discounts(self, task)
         counts = (part.remember(memory_of, reward, gamma) for part, memory_of in self._watchers(memory))

@@ -43,7 +43,8 @@ def _check_knowing(agent: Any) -> None:
             "one value"
         )
     if conditioning.recurs and representation.history:
-        raise InputError("conditioning=recurrent and theta-from are two memories of an episode; use one of them")
+        name = _name(agent, "conditioning")
+        raise InputError(f"conditioning={name} and theta-from are two memories of an episode; use one of them")
 
 
 def _check_encoder(agent: Any) -> None:
@@ -108,7 +109,8 @@ def check_replayed(agent: Any) -> None:
         name = _name(agent, "representation")
         raise InputError(f"{name} learns models of single steps; use n-step=1, not {replay.n_step}")
     if agent.conditioning.recurs and (replay.n_step > 1 or replay.hindsight or replay.host_replay_size):
-        raise InputError("conditioning=recurrent needs n-step=1, hindsight=0 and host-replay-size=0")
+        name = _name(agent, "conditioning")
+        raise InputError(f"conditioning={name} needs n-step=1, hindsight=0 and host-replay-size=0")
     if agent.unroll > replay.warmup_steps + 1:
         raise InputError(
             f"recurrent-steps={agent.unroll} needs as many steps before the first update: warmup-steps of at least "
@@ -130,7 +132,8 @@ def require_sight(agent: Any, spec: Spec) -> None:
     if frames.shown(spec.obs) and agent.view.history:
         raise InputError("tasks cannot be inferred from pictures; choose another conditioning")
     if frames.shown(spec.obs) and agent.conditioning.recurs:
-        raise InputError("conditioning=recurrent reads vectors, not pictures; choose another conditioning")
+        name = _name(agent, "conditioning")
+        raise InputError(f"conditioning={name} reads vectors, not pictures; choose another conditioning")
 
 
 def require_policy(agent: Any, spec: Spec) -> None:

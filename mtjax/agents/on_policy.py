@@ -161,6 +161,8 @@ class OnPolicy(BaseAgent):
     @property
     def fits(self) -> dict[str, Fit]:
         found = super().fits
+        if not self.conditioning.by_actor:
+            return found
         return found | {"actor": dataclasses.replace(found["actor"], names=("actor", "knowing"))}
 
     # Acting.
@@ -194,8 +196,7 @@ class OnPolicy(BaseAgent):
 
     def critic_loss(self, nets: Nets, batch: Batch) -> tuple[Array, Metrics]:
         loss = self.fitting_loss(self.output(nets, batch.features, batch.obs), batch)
-        known = batch._replace(features=self.view.know(nets, batch.features, batch.obs)[0])
-        return self.representation.join(loss, {"critic_loss": loss}, nets["representation"], known)
+        return self.view.join(loss, {"critic_loss": loss}, nets, batch)
 
     def fitting_loss(self, output: Array, batch: Batch) -> Array:
         """Return the loss () of the critic's outputs (B,)."""
@@ -222,7 +223,7 @@ class OnPolicy(BaseAgent):
         if self.representation.learns:
             both, models_key = (state.nets["representation"], state.slow["representation"]), jax.random.fold_in(key, 3)
             batch = batch._replace(model_targets=self.representation.targets(*both, batch.next_obs, models_key)[0])
-        loss = above(self.least_loss, self.critic_loss)
+        loss, batch = above(self.least_loss, self.critic_loss), self.view.keyed(batch, jax.random.fold_in(key, 4))
         state, critic = descend(self.fits, "critic", state, loss, (batch,), critic_order, importance)
         told = self.explained(state, batch)
         return state, critic.aux | critic.metrics | actor.aux.metrics | actor.metrics | told

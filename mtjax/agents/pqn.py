@@ -139,6 +139,7 @@ class PQN(BaseAgent):
         """Take a gradient step on windows (T, B, L, ...) of a rollout; metrics are (T,)."""
         flat, features, obs, _ = self.view.steps(state, window, tasks)
         batch = Batch(obs, flat.action, flat.extras, features)
+        batch = self.view.keyed(batch, jax.random.fold_in(key, 1))
         state, fitted = descend(self.fits, "critic", state, self.loss, (batch,), key)
         return state, fitted.aux | fitted.metrics | {"epsilon": jnp.broadcast_to(self.share(state), len(tasks.id))}
 
@@ -146,11 +147,8 @@ class PQN(BaseAgent):
         values = self.q(nets, batch.features, batch.obs)
         value = jnp.take_along_axis(values, batch.action[:, None], axis=-1)[:, 0]
         loss = jnp.mean(jnp.square(value - batch.target)) / 2
-        return loss, {
-            "critic_loss": loss,
-            "value": jnp.mean(value),
-            "td_error": jnp.mean(jnp.abs(value - batch.target)),
-        }
+        metrics = {"critic_loss": loss, "value": jnp.mean(value), "td_error": jnp.mean(jnp.abs(value - batch.target))}
+        return self.view.join(loss, metrics, nets, batch)
 
     def observe(self, state: AgentState, steps: Transition, tasks: Task) -> AgentState:
         state = super().observe(state, steps, tasks)

@@ -168,8 +168,7 @@ class SAC(BaseAgent):
         values, expected = self.value.mean(outputs), self.value.expected(target)
         td_error = jnp.mean(jnp.abs(values - expected))
         metrics = {"critic_loss": loss, "value": jnp.mean(values), "td_error": td_error}
-        known = batch._replace(features=self.view.know(nets, batch.features, batch.obs)[0])
-        loss, metrics = self.representation.join(loss, metrics, nets["representation"], known)
+        loss, metrics = self.view.join(loss, metrics, nets, batch)
         return loss, CriticAux(metrics, expected)
 
     def actor_loss(self, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:
@@ -199,6 +198,7 @@ class SAC(BaseAgent):
         """
         target_key, actor_key, critic_order, actor_order = jax.random.split(key, 4)
         batch = prepare(self, state, window, tasks, jax.random.fold_in(key, 1))
+        batch = self.view.keyed(batch, jax.random.fold_in(key, 2))
         before = state.nets["representation"]
         importance = self.sampler.weights(state.nets["sampler"].own, batch.temperature)
 

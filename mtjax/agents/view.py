@@ -18,7 +18,7 @@ from mtjax.agents.state import AgentState, Nets, of_task
 from mtjax.networks import OVER_TASKS, Params
 from mtjax.parallel import collectives
 from mtjax.parallel.collectives import mean_and_variance
-from mtjax.types import Array, Spec, Task, Transition
+from mtjax.types import Array, Key, Metrics, Spec, Task, Transition
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,6 +72,8 @@ class View:
             return scaled(obs)
         if "obs" in past._fields:
             past = past._replace(obs=scaled(past.obs), action=self.policy.encode(past.action))
+        if "next_obs" in past._fields:
+            past = past._replace(next_obs=scaled(past.next_obs))
         return Seen(scaled(obs), past)
 
     def see_all(self, inputs: Params, obs: Any, past: Any = None) -> Any:
@@ -80,7 +82,9 @@ class View:
 
     def example(self, spec: Spec, inputs: Params) -> Any:
         """Return an input of networks that is all zero."""
-        past = Hidden(self.conditioning.begin()) if self.conditioning.recurs else None
+        past = None
+        if self.conditioning.recurs:
+            past = Hidden(self.conditioning.begin(spec.obs_size, spec.action_size))
         if self.history:
             past = last_steps.begin(self.history, spec.obs_size, spec.action.blank())
         zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), frames.seen(spec))
@@ -138,6 +142,19 @@ class View:
     def critic_inputs(self, nets: Nets, given: Array, seen: Any) -> tuple[Array, Any]:
         """Return features (Z,) and inputs (..., O) of one task's critics, from what ``know`` takes."""
         return self.representation.perceive(nets["representation"], *self.know(nets, given, seen))
+
+    def keyed(self, batch: Any, key: Key) -> Any:
+        """Return a batch (T, ...) with a key for each task, if the loss of what is known of it needs one."""
+        if not self.conditioning.draws:
+            return batch
+        keys = jax.random.split(key, len(batch.features))
+        return batch._replace(obs=batch.obs._replace(past=batch.obs.past._replace(key=keys)))
+
+    def join(self, loss: Array, metrics: Metrics, nets: Nets, batch: Any) -> tuple[Array, Metrics]:
+        """Add the losses of the representation, and of what is known of the task, to the critics' loss of one task."""
+        known = batch._replace(features=self.know(nets, batch.features, batch.obs)[0])
+        loss, metrics = self.representation.join(loss, metrics, nets["representation"], known)
+        return self.conditioning.join(loss, metrics, nets["knowing"].parts, batch.obs)
 
     def acting(self, state: AgentState, memory: Any, obs: Any, task: Task) -> tuple[Nets, Array, Any]:
         """Return what one task needs to act: its networks, its features (Z,) and the observation (O,) as input."""

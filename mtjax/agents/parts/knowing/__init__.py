@@ -5,6 +5,7 @@ from mtjax.agents.parts.knowing.embedding import Embedding
 from mtjax.agents.parts.knowing.last_steps import LastSteps
 from mtjax.agents.parts.knowing.one_hot import OneHot
 from mtjax.agents.parts.knowing.parameters import Parameters
+from mtjax.agents.parts.knowing.posterior import Posterior
 from mtjax.agents.parts.knowing.recurrent import Recurrent
 from mtjax.agents.parts.knowing.text import Text
 from mtjax.agents.parts.knowing.vectors import Vectors
@@ -20,6 +21,7 @@ CONDITIONINGS: dict[str, type[Knowing]] = {
     "text": Text,
     "inferred": LastSteps,
     "recurrent": Recurrent,
+    "posterior": Posterior,
 }
 
 __all__ = [
@@ -30,6 +32,7 @@ __all__ = [
     "Nothing",
     "OneHot",
     "Parameters",
+    "Posterior",
     "Recurrent",
     "Text",
     "Vectors",

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 
 from mtjax.networks import Params
-from mtjax.types import Array, Key, Spec, Task, Transition
+from mtjax.types import Array, Key, Metrics, Spec, Task, Transition
 
 
 @dataclasses.dataclass(frozen=True)
@@ -14,7 +14,7 @@ class Nothing:
     """Shows networks nothing of their task.
 
     Every way of knowing a task is a class with these methods. What it learns is a network of the agent's, ``knowing``,
-    which the critics' loss trains. In agents that learn from rollouts the actor's loss trains it too.
+    which the critics' loss trains. In agents that learn from rollouts the actor's loss trains it too, if ``by_actor``.
     """
 
     borrowed: ClassVar[tuple[str, ...]] = ()  # names of what an unseen task uses of its nearest training task
@@ -23,6 +23,8 @@ class Nothing:
     by_parameters: ClassVar[bool] = False  # whether these are the task's parameters
     embeds: ClassVar[bool] = False  # whether every training task has a learned vector, called embedding
     recurs: ClassVar[bool] = False  # whether features are a memory that learns, through the steps of a window
+    by_actor: ClassVar[bool] = True  # whether the actor's loss trains it too, in agents that learn from rollouts
+    draws: ClassVar[bool] = False  # whether its own loss needs a key
 
     @property
     def history(self) -> int:
@@ -51,12 +53,12 @@ class Nothing:
         """
         return Params({}, {})
 
-    def begin(self) -> Any:
-        """Return the memory with which an episode begins; None for none."""
+    def begin(self, obs_size: int, action_size: int) -> Any:
+        """Return the memory with which a trial begins, of observations and actions of these sizes; None for none."""
         return None
 
     def remember(self, params: dict[str, Any], hidden: Any, step: Transition) -> Any:
-        """Return the memory after a step, whose observation is as networks take it.
+        """Return the memory after a step, whose observations are as networks take them.
 
         Args:
             params: the named parts of ``knowing``, of this task.
@@ -80,3 +82,12 @@ class Nothing:
             seen: observations (..., O), with the last steps if there is a ``history``.
         """
         return given
+
+    def join(self, loss: Array, metrics: Metrics, params: dict[str, Any], seen: Any) -> tuple[Array, Metrics]:
+        """Add what it learns by to the critics' loss of one task, and its metrics to theirs.
+
+        Args:
+            params: the named parts of ``knowing``, of this task.
+            seen: the observations of a batch, as for ``features``.
+        """
+        return loss, metrics

@@ -1,5 +1,6 @@
-"""Features of a hidden task, which a recurrent network keeps of all steps so far."""
+"""Features of a hidden task, made of a memory of all steps so far, such as a recurrent network keeps."""
 
+import abc
 import dataclasses
 from typing import Any, ClassVar, NamedTuple
 
@@ -14,42 +15,89 @@ from mtjax.types import Array, Key, Transition
 
 
 class Hidden(NamedTuple):
-    """Holds the hidden state before an observation."""
+    """Holds the memory before an observation."""
 
-    state: Array  # (Z,)
+    state: Array  # (Z,), or as ``begin`` has it
 
 
 class Track(NamedTuple):
-    """Holds the steps of windows one after another, to tell the hidden state before each of them."""
+    """Holds the steps of windows one after another, to tell the memory before each of them."""
 
-    state: Array  # (B, Z) hidden state before the first step of each window
+    state: Array  # (B, ...) memory before the first step of each window
     obs: Array  # (B L, O)
     action: Array  # (B L, A)
     reward: Array  # (B L,)
     ended: Array  # (B L,) bool: the episode ended
     closed: Array  # (B L,) bool: the memory begins anew after the step
+    next_obs: Any = None  # (B L, O)
+    key: Key | None = None  # () for losses that draw
 
 
-class Following(NamedTuple):
-    """Holds what ``Track`` holds, to tell the hidden state after each step."""
-
-    state: Array
-    obs: Array
-    action: Array
-    reward: Array
-    ended: Array
-    closed: Array
+class Following(Track):
+    """Holds what ``Track`` holds, to tell the memory after each step."""
 
 
 def track(window: Transition, obs: Array) -> Track:
     """Return the track of windows (B, L, ...) whose observations are (B, L, O) as networks take them."""
     flat = lambda x: x.reshape(-1, *x.shape[2:])
-    steps = (obs, window.action, window.reward, window.ended, window.closed)
+    steps = (obs, window.action, window.reward, window.ended, window.closed, window.next_obs)
     return Track(window.memory.hidden[:, 0], *map(flat, steps))
 
 
 @dataclasses.dataclass(frozen=True)
-class Recurrent(Nothing):
+class Remembering(Nothing):
+    """Shows networks what is made of a memory, which reads every step of a trial once it is over.
+
+    It learns through the steps of a window, which begins with the memory that acting had there. That does not learn. A
+    subclass says with which memory a trial begins, what is read of a step, how the memory changes, and what is shown.
+    """
+
+    recurrent_steps: int = 16
+    """Steps through which it learns from a replay; a rollout is learned from as a whole."""
+
+    tells: ClassVar[bool] = True
+    recurs: ClassVar[bool] = True
+
+    def __post_init__(self):
+        parts.require_counts(self, "recurrent_steps")
+
+    @abc.abstractmethod
+    def read(self, params: dict[str, Any], step: Any) -> Array:
+        """Return what is read (..., I) of steps: transitions or a ``Track``."""
+
+    @abc.abstractmethod
+    def advance(self, params: dict[str, Any], memory: Array, read: Array) -> Array:
+        """Return the memory (..., M) after steps (..., I) as they are read."""
+
+    def show(self, params: dict[str, Any], memory: Array) -> Array:
+        """Return what networks see (..., Z) of a memory (..., M)."""
+        return memory
+
+    def remember(self, params: dict[str, Any], hidden: Array, step: Transition) -> Array:
+        return self.advance(params, hidden, self.read(params, step))
+
+    def features(self, params: dict[str, Any], given: Array, seen: Any) -> Array:
+        if isinstance(seen.past, Hidden):
+            return self.show(params, seen.past.state)
+        before, after = self.over(params, seen.past)
+        return self.show(params, after if isinstance(seen.past, Following) else before)
+
+    def over(self, params: dict[str, Any], track: Track) -> tuple[Array, Array]:
+        """Return the memories (B L, ...) before and after every step."""
+        count, begun = len(track.state), self.begin(track.obs.shape[-1], track.action.shape[-1])
+        in_time = lambda x: jnp.swapaxes(x.reshape(count, -1, *x.shape[1:]), 0, 1)
+
+        def step(memory: Array, given: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array]]:
+            read, closed = given
+            after = self.advance(params, memory, read)
+            return jnp.where(closed.reshape(-1, *[1] * begun.ndim), begun, after), (memory, after)
+
+        _, memories = jax.lax.scan(step, track.state, (in_time(self.read(params, track)), in_time(track.closed)))
+        return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1).reshape(-1, *x.shape[2:]), memories)
+
+
+@dataclasses.dataclass(frozen=True)
+class Recurrent(Remembering):
     """Shows networks the hidden state of a recurrent network (Duan et al. 2016, "RL^2"; Wang et al. 2016).
 
     A gated recurrent unit reads every step once it is over, so that with s_t networks see all that is known before it:
@@ -63,57 +111,32 @@ class Recurrent(Nothing):
 
     recurrent_size: int = 64
     """Size of the hidden state."""
-    recurrent_steps: int = 16
-    """Steps through which it learns from a replay; a rollout is learned from as a whole."""
-
-    tells: ClassVar[bool] = True
-    recurs: ClassVar[bool] = True
 
     def __post_init__(self):
-        parts.require_counts(self, "recurrent_size", "recurrent_steps")
+        super().__post_init__()
+        parts.require_counts(self, "recurrent_size")
 
     @property
     def cell(self) -> nn.GRUCell:
         return nn.GRUCell(self.recurrent_size)
 
     def init(self, num_tasks: int, seen: Any, action: Array, own: bool, key: Key) -> Params:
-        inputs = read(seen.obs, action, jnp.float32(0), jnp.bool_(False))
-        init = lambda key: self.cell.init(key, jnp.zeros(self.recurrent_size), inputs)["params"]
+        read = inputs(seen.obs, action, jnp.float32(0), jnp.bool_(False))
+        init = lambda key: self.cell.init(key, jnp.zeros(self.recurrent_size), read)["params"]
         if own:
             return Params({}, {"recurrent": Network.for_each_task(init, key, num_tasks)})
         return Params({"recurrent": init(key)}, {})
 
-    def begin(self) -> Array:
+    def begin(self, obs_size: int, action_size: int) -> Array:
         return jnp.zeros(self.recurrent_size)
 
-    def remember(self, params: dict[str, Any], hidden: Array, step: Transition) -> Array:
-        return self.advance(params, hidden, read(step.obs, step.action, step.reward, step.ended))
+    def read(self, params: dict[str, Any], step: Any) -> Array:
+        return inputs(step.obs, step.action, step.reward, step.ended)
 
-    def advance(self, params: dict[str, Any], hidden: Array, inputs: Array) -> Array:
-        """Return the hidden state (..., Z) after inputs (..., I)."""
-        return self.cell.apply({"params": params["recurrent"]}, hidden, inputs)[0]  # type: ignore
-
-    def features(self, params: dict[str, Any], given: Array, seen: Any) -> Array:
-        if isinstance(seen.past, Hidden):
-            return seen.past.state
-        before, after = self.over(params, Track(*seen.past))
-        return after if isinstance(seen.past, Following) else before
-
-    def over(self, params: dict[str, Any], track: Track) -> tuple[Array, Array]:
-        """Return the hidden states (B L, Z) before and after every step."""
-        count = len(track.state)
-        in_time = lambda x: jnp.swapaxes(x.reshape(count, -1, *x.shape[1:]), 0, 1)
-        inputs = read(track.obs, track.action, track.reward, track.ended)
-
-        def step(hidden: Array, given: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array]]:
-            inputs, closed = given
-            after = self.advance(params, hidden, inputs)
-            return jnp.where(closed[:, None], self.begin(), after), (hidden, after)
-
-        _, states = jax.lax.scan(step, track.state, (in_time(inputs), in_time(track.closed)))
-        return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1).reshape(-1, x.shape[-1]), states)
+    def advance(self, params: dict[str, Any], memory: Array, read: Array) -> Array:
+        return self.cell.apply({"params": params["recurrent"]}, memory, read)[0]  # type: ignore
 
 
-def read(obs: Array, action: Array, reward: Array, ended: Array) -> Array:
+def inputs(obs: Array, action: Array, reward: Array, ended: Array) -> Array:
     """Return a step (..., O), (..., A), (...), (...) as one input (..., I) of the recurrent unit."""
     return jnp.concatenate([obs, action, reward[..., None], jnp.float32(ended)[..., None]], axis=-1)
