@@ -20,7 +20,7 @@ class Posterior(Remembering):
     below. A belief q is a Gaussian over latent tasks z, of which networks see mean and log-variance.
 
     ``varibad`` (Zintgraf et al. 2020): a recurrent unit reads the steps, and its state gives q:
-        h_(t+1) = GRU(h_t, [s_t, a_t, r_t, s'_t - s_t, e_t]),  q_t = N(W h_t, exp(V h_t)),  h_0 = 0 so that q_0 = N(0, 1)
+        h_(t+1) = GRU(h_t, [s_t, a_t, r_t, s'_t - s_t, e_t]),  q_t = N(W h_t, exp(V h_t)),  h_0 = 0, so q_0 = N(0, 1)
     From one z ~ q_(t+1), models predict rewards and states of D steps j of the trial's n, from before and after t:
         L = mean_j ((R(s_j, a_j, s'_j, z) - r_j)^2 + c mean_d (S(s_j, a_j, z) - (s'_j - s_j))^2)
             + beta KL(q_(t+1) | q_t) / n
@@ -36,10 +36,10 @@ class Posterior(Remembering):
     pearl the critics' does, and the actor's does not. It learns through the steps of a window, which begins with the
     memory that acting had there, and the trial is as much of it as lies in the window: let a rollout hold whole trials.
 
-    Differs from VariBAD: states are predicted too; all of it learns from the steps that actor and critic learn from, and
-    not from a buffer of trials; L is divided by n. Differs from PEARL: the prior is one of the factors, networks see q
-    and no sample of it, the context is the trial so far and no random set, and a factor may have precision 0. Differs
-    from CaDM: what is read of a step is its change of state too; the models only teach the context, and plan nothing.
+    Differs from VariBAD: states are predicted too; it learns from the steps that actor and critics learn from, and not
+    from a buffer of trials; L is divided by n. Differs from PEARL: the prior is one of the factors; networks see q, and
+    no sample of it; what is read is the trial so far, and no random set. Differs from CaDM: of a step the change of
+    state is read too; the models teach the context alone, and plan nothing.
     """
 
     inference: Literal["varibad", "pearl", "cadm"] = "varibad"
