@@ -15,6 +15,7 @@ if TYPE_CHECKING:  # for editors, which do not run __getattr__
     from mtjax.envs import make as make
     from mtjax.envs import mixture as mixture
     from mtjax.envs import stacked as stacked
+    from mtjax.envs.hosted.gymnasium import hosted as hosted
     from mtjax.loop import Settings as Settings
     from mtjax.names import InputError as InputError
     from mtjax.registry import register as register
@@ -42,6 +43,7 @@ _HOME = {
     "agent": "mtjax.agents",
     "evaluate": "mtjax.report.scoring",
     "export": "mtjax.saved.export",
+    "hosted": "mtjax.envs.hosted.gymnasium",
     "load": "mtjax.saved.policy",
     "make": "mtjax.envs",
     "mixture": "mtjax.envs",

@@ -185,8 +185,12 @@ class RunConfig:
         """
         if self.env:
             self._check_named()
-        _ = self.mesh
         require_policy(self.learner, self.family)
+        if self.mesh is not None and (forgetful := getattr(self.family, "forgetful", "")):
+            raise InputError(
+                f"{forgetful} steps on the host of one device, and this run is on {self.mesh.size}; show JAX one, such "
+                "as by CUDA_VISIBLE_DEVICES=0"
+            )
         self.learner.experience.check(self.family, self.played.num_envs, self.played.chunk_steps)
         require_trials(self.training, self.family, self.learner)
         for learner in agents_at(self.learner, self.points):
@@ -373,9 +377,9 @@ def _device_preset() -> str:
 
 def own_files(config: RunConfig) -> tuple[str, ...]:
     """Return the files of --import, and those with the user's own classes that a configuration uses."""
-    used = [*(part.family for part in config.family.parts), config.learner]
-    used += [getattr(config.learner, kind) for kind in kinds_of(config.learner)]
-    modules = dict.fromkeys(type(each).__module__ for each in used)
+    parts = [config.learner, *(getattr(config.learner, kind) for kind in kinds_of(config.learner))]
+    of_families = [module for part in config.family.parts for module in part.family.modules]
+    modules = dict.fromkeys([*of_families, *(type(each).__module__ for each in parts)])
     own = [sys.modules.get(name) for name in modules if name.split(".")[0] != "mtjax"]
     files = [*(getattr(module, "__file__", None) for module in own), preset_of(config.agent).home]
     return tuple(dict.fromkeys([*config.imports, *(str(Path(file).resolve()) for file in files if file)]))

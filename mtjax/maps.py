@@ -100,9 +100,23 @@ class Flat:
         """Return whether episodes may end before their time limits. It decides how resets are computed, not what."""
         return True
 
+    @property
+    def resets_few(self) -> bool:
+        """Return whether only ended worlds are reset, some at a time, where an episode ends."""
+        return self.ends_early and self.episode_length > 1  # type: ignore
+
     def reset_worlds(self, tasks: Task, keys: Key) -> Step:
         """Begin an episode in every world."""
         return over_worlds(partial(_reset, self))(tasks, keys)
+
+    def renew_worlds(self, tasks: Task, keys: Key, mask: Array, states: Any) -> Step:
+        """Begin an episode in the worlds of ``mask`` (S, T, E); only their observations count.
+
+        Returns:
+            the step that begins their episodes, with the states of all worlds.
+        """
+        begun = self.reset_worlds(tasks, keys)
+        return begun._replace(state=self.where_worlds(mask, begun.state, states))
 
     def step_worlds(self, tasks: Task, states: Any, actions: Array) -> Step:
         """Step every world with its action (S, T, E, A)."""

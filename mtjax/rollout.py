@@ -65,18 +65,26 @@ class _Begun(NamedTuple):
     obs: Any
 
 
-def _begin(env: Env, tasks: Task, keys: Key, drawn: Callable[[Task], Task] = lambda drawn: drawn) -> _Begun:
+def _begin(
+    env: Env,
+    tasks: Task,
+    keys: Key,
+    drawn: Callable[[Task], Task] = lambda drawn: drawn,
+    renewed: tuple[Array, Any] | None = None,
+) -> _Begun:
     """Begin an episode in every world, with keys (S, T, E).
 
     Args:
         drawn: a function from drawn tasks (S, T, E, ...) to those of the episodes.
+        renewed: in which worlds (S, T, E) alone episodes begin, and the states of all; only their observations count.
     """
     if tasks.draws is None:
         each = broadcast_tasks(tasks, keys.shape)
     else:
         task_keys, keys = jnp.moveaxis(jax.vmap(jax.vmap(jax.vmap(jax.random.split)))(keys), -1, 0)
         each = drawn(_draw_tasks(tasks, task_keys))
-    start = env.reset_worlds(each._replace(blocks=tasks.blocks), keys)
+    given = each._replace(blocks=tasks.blocks)
+    start = env.reset_worlds(given, keys) if renewed is None else env.renew_worlds(given, keys, *renewed)
     return _Begun(start.state, None if tasks.draws is None else each, frames.begin(start.obs, env.spec.frames))
 
 
@@ -155,7 +163,9 @@ def step_envs(
     lost = ~bounded_worlds(step.obs)
     obs = where_worlds(lost, worlds.obs, frames.push(worlds.obs, step.obs))
     age = worlds.age + 1
-    ends = trials.ends(step.terminated & ~lost, age >= each.horizon, lost, worlds.episode)
+    timeout = age >= each.horizon
+    timeout = timeout if step.truncated is None else timeout | step.truncated
+    ends = trials.ends(step.terminated & ~lost, timeout, lost, worlds.episode)
     transition = Transition(
         obs=worlds.obs,
         action=action,
@@ -202,7 +212,7 @@ def reset_ended(
         ends: what has ended with the step before, leaves (S, T, E).
         keys: a function that returns keys (S, T, E); only the branch calls it.
     """
-    few = isinstance(env, Flat) and env.ends_early and env.episode_length > 1 and tasks.blocks is None
+    few = isinstance(env, Flat) and env.resets_few and tasks.blocks is None
     begin = _change_tasks if trials.keeps_state else _reset_some if few else _reset_all
 
     def renew(worlds: Worlds) -> Worlds:
@@ -229,9 +239,9 @@ def followed(transition: Transition, ends: Ends, worlds: Worlds) -> Transition:
 def _reset_all(env: Env, tasks: Task, worlds: Worlds, ends: Ends, keys: Key, trials: Trials) -> _Begun:
     """Reset all worlds with keys (S, T, E), and return those that have ended reset, and the others as they are."""
     lasting = lambda drawn: where_worlds(ends.trial, drawn, worlds.task)
-    start = _begin(env, tasks, keys, lasting if trials.episodes > 1 else lambda drawn: drawn)
-    rest = where_worlds(ends.episode, (start.task, start.obs), (worlds.task, worlds.obs))
-    return _Begun(env.where_worlds(ends.world, start.state, worlds.state), *rest)
+    drawn = lasting if trials.episodes > 1 else lambda drawn: drawn
+    start = _begin(env, tasks, keys, drawn, (ends.world, worlds.state))
+    return _Begun(start.state, *where_worlds(ends.episode, (start.task, start.obs), (worlds.task, worlds.obs)))
 
 
 def _change_tasks(env: Any, tasks: Task, worlds: Worlds, ends: Ends, keys: Key, trials: Trials) -> _Begun:

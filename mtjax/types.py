@@ -137,6 +137,7 @@ class Step(NamedTuple):
     reward: Array  # ()
     terminated: Array  # () bool: the episode reached a terminal state; not by its time limit
     metrics: dict[str, Array] = {}  # () each, such as success  # noqa: RUF012
+    truncated: Any = None  # () bool: the episode is cut off here, though nothing is terminal; None: only by its horizon
 
 
 class Transition(NamedTuple):
@@ -227,6 +228,7 @@ class Env(Protocol):
     def step(self, task: Task, state: Any, action: Array) -> Step: ...
     def reset_worlds(self, tasks: Task, keys: Key) -> Step: ...
     def step_worlds(self, tasks: Task, states: Any, actions: Array) -> Step: ...
+    def renew_worlds(self, tasks: Task, keys: Key, mask: Array, states: Any) -> Step: ...  # resets those of (S, T, E)
     def where_worlds(self, mask: Array, new: Any, old: Any) -> Any: ...  # states; mask (S, T, E)
 
 

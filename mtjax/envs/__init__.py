@@ -57,12 +57,30 @@ Settings = dict[str, Any]
 Entry = tuple[Any, Settings]  # a family's class, or the place that it is imported from; and its settings
 
 
+SUITES = {
+    "gymnasium": "mtjax.envs.hosted.gymnasium:Gymnasium",
+}
+"""Families of the environments of other packages, by the first part of their names: SUITE:ENVIRONMENT."""
+
+
 class Families(UserDict[str, Entry]):
-    """Families by name. A class is imported when it is first used; ``data`` holds its place."""
+    """Families by name. A class is imported when it is first used; ``data`` holds its place.
+
+    The environments of ``SUITES`` have names too, and are not listed.
+    """
+
+    def __contains__(self, name: Any) -> bool:
+        return name in self.data or _of_suite(name) is not None
 
     def __getitem__(self, name: str) -> Entry:
-        family, settings = self.data[name]
+        family, settings = self.data[name] if name in self.data else _of_suite(name) or self.data[name]
         return load(family), settings
+
+
+def _of_suite(name: Any) -> Entry | None:
+    """Return the class and the settings of another package's environment; None if the name is of no suite."""
+    suite, _, environment = name.partition(":") if isinstance(name, str) else ("", "", "")
+    return (SUITES[suite], {"environment": environment}) if suite in SUITES and environment else None
 
 
 # Where each class is in its folder, "module:Class", and its settings. Families whose tasks are drawn say how many.
@@ -246,7 +264,7 @@ def make(name: str, vary: Mapping[str, Any] | tuple = (), **settings: Any) -> An
     if is_mixture(name):
         return _make_mixture(members(name), _pairs(vary), dict(settings))
     if name not in ENVS:
-        raise nearest_error("environment", name, (*ENVS, *BENCHMARKS))
+        raise _unknown_name(name)
     family, defaults = ENVS[name]
     fields = [field.name for field in dataclasses.fields(family)]
     unknown = next((s for s in (*settings, *defaults) if s not in fields), None)
@@ -271,7 +289,7 @@ def make_from(env: Any, given: Mapping[str, Any]) -> tuple[str, Any, dict[str, A
     names = [name for name, _ in members(env)]
     unknown = next((name for name in names if name not in ENVS), None)
     if unknown is not None:
-        raise nearest_error("environment", unknown, (*ENVS, *BENCHMARKS))
+        raise _unknown_name(unknown)
     own = {field.name for name in names for field in dataclasses.fields(ENVS[name][0])}
     rest = {name: value for name, value in given.items() if name not in own}
     return env, make(env, **{name: value for name, value in given.items() if name in own}), rest
@@ -308,6 +326,12 @@ def _pairs(vary: Any) -> dict[str, Any]:
         raise InputError(
             f"vary maps parameters to values, such as {{'size': '0.9:1.1:5'}}; not {shown(vary)}"
         ) from None
+
+
+def _unknown_name(name: str) -> InputError:
+    """Return an error for a name of no environment."""
+    suites = [f"{suite}:NAME" for suite in SUITES]
+    return nearest_error("environment", name, (*ENVS, *BENCHMARKS, *suites))
 
 
 def _unknown_setting(name: str, family: Any, unknown: str, value: Any) -> InputError:
@@ -369,6 +393,8 @@ def name_of(family: Any) -> str:
         known = (name for name, (_, own) in BENCHMARKS.items() if tuple(own) == family.names and make(name) == family)
         return next(known, "+".join(family.names))
     place = f"{cls.__module__}:{cls.__name__}"
+    if place in SUITES.values():
+        return family.name
     known = [name for name, (home, _) in ENVS.data.items() if home is cls or home == place]
     exact = [name for name in known if make(name) == family]
     plain = [name for name in known if not ENVS.data[name][1]]

@@ -54,6 +54,7 @@ class Family(Flat, Tabled):
     discrete: ClassVar[bool] = False  # whether an action is the number of one of action_size choices, not a vector
     episode_steps: ClassVar[int]
     relabels: ClassVar[tuple[str, ...]] = ()  # the parameters, goals all of them, that ``relabel`` can exchange
+    forgets: ClassVar[bool] = False  # whether its worlds are lost with the process, and cannot be saved
     asks: ClassVar[str] = ""  # what its tasks ask for, in a sentence; empty: the documentation's first one
     fresh_goals: ClassVar[bool] = False  # every episode draws a goal of its own, whatever its task
 
@@ -283,6 +284,11 @@ class Family(Flat, Tabled):
     def outside(self) -> Any:
         """Return the engine if it runs outside XLA, else None."""
         return None
+
+    @property
+    def modules(self) -> tuple[str, ...]:
+        """Return the modules with the classes that make it."""
+        return (type(self).__module__,)
 
     @property
     def structure(self) -> Any:

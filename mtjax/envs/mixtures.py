@@ -273,6 +273,13 @@ class Mixture(Tabled):
         steps = self._by_group(own, lambda group, of: group.reset_worlds(of(own), of(given)))
         return self._whole(tasks.blocks, steps)
 
+    def renew_worlds(self, tasks: Task, keys: Key, mask: Array, states: States) -> Step:
+        """Begin an episode in the worlds of ``mask`` (S, T, E), whose observations alone count."""
+        own = self._apart(tasks)
+        given, masks = ({i: tasks.blocks.take(x, i) for i in own} for x in (keys, mask))
+        renew = lambda group, of: group.renew_worlds(of(own), of(given), of(masks), of(states.families))
+        return self._whole(tasks.blocks, self._by_group(own, renew))
+
     def step_worlds(self, tasks: Task, states: States, actions: Array) -> Step:
         """Step every world by its action (S, T, E, A)."""
         own = self._apart(tasks)
@@ -311,12 +318,15 @@ class Mixture(Tabled):
         padded = [self.pad(step.obs) for step in steps.values()]
         names = sorted({name for step in steps.values() for name in step.metrics})
         unknown = lambda step: jnp.full(step.reward.shape, jnp.nan)
+        never = lambda step: jnp.zeros(step.reward.shape, bool)
+        cut_off = any(step.truncated is not None for step in steps.values())
         return Step(
             state=States(blocks, states),
             obs=jax.tree.map(lambda *x: blocks.join(dict(zip(steps, x, strict=True))), *padded),
             reward=join(lambda step: step.reward),
             terminated=join(lambda step: step.terminated),
             metrics={name: join(lambda step, name=name: step.metrics.get(name, unknown(step))) for name in names},
+            truncated=join(lambda s: never(s) if s.truncated is None else s.truncated) if cut_off else None,
         )
 
     def pad(self, obs: Any) -> Any:

@@ -252,6 +252,8 @@ def _check_steps(family: Family, task: Task, key: Any) -> None:
         _require_observation(family, method, step.obs)
         _require(family, method, "a reward", step.reward, ())
         _require(family, method, "terminated", step.terminated, (), jnp.bool_)
+        if step.truncated is not None:
+            _require(family, method, "truncated", step.truncated, (), jnp.bool_)
         for what, ours, theirs in (("obs", step.obs, begun.obs), ("state", step.state, begun.state)):
             if _shapes(ours) != _shapes(theirs):
                 told = " and ".join(", ".join(itertools.islice(_shapes(x), 4)) for x in (theirs, ours))

@@ -35,6 +35,10 @@ class Alone:
         """Begin an episode in every world (S, T, E)."""
         return reset_apart(self.members, tasks, keys)
 
+    def renew_worlds(self, tasks: Of[Task], keys: Of[Key], masks: Of[Array], states: Of[Any]) -> Of[Step]:
+        """Begin an episode in the worlds of ``masks`` (S, T, E)."""
+        return {i: self.members[i].renew_worlds(task, keys[i], masks[i], states[i]) for i, task in tasks.items()}
+
     def step_worlds(self, tasks: Of[Task], states: Of[Any], actions: Of[Array]) -> Of[Step]:
         """Return the next step of all worlds, leaves (S, T, E, ...)."""
         return {i: self.members[i].step_worlds(task, states[i], actions[i]) for i, task in tasks.items()}
@@ -101,6 +105,12 @@ class Joined:
             world = world._replace(extra=started[i].extra)
             steps[i] = over_worlds(partial(_first_step, self.members[i]))(tasks[i], world, keys[i])
         return steps
+
+    def renew_worlds(self, tasks: Of[Task], keys: Of[Key], masks: Of[Array], states: Of[World]) -> Of[Step]:
+        """Begin an episode in the worlds of ``masks`` (S, T, E). The simulator resets all, and the others stay."""
+        choose = lambda i, state: self.members[i].where_worlds(masks[i], state, states[i])
+        begun = self.reset_worlds(tasks, keys)
+        return {i: step._replace(state=choose(i, step.state)) for i, step in begun.items()}
 
     def step_worlds(self, tasks: Of[Task], states: Of[World], actions: Of[Array]) -> Of[Step]:
         """Return the next step of all worlds, leaves (S, T, E, ...). Members without tasks are left out."""

@@ -79,6 +79,11 @@ class Tabled(abc.ABC):
         """Return what steps its worlds: "jax" or the name of a physics engine."""
 
     @property
+    def forgetful(self) -> str:
+        """Return the names of families whose worlds are lost with the process; empty if there are none."""
+        return ", ".join(part.family.name for part in self.parts if part.family.forgets)
+
+    @property
     @abc.abstractmethod
     def summary(self) -> str:
         """Return a line on its tasks."""
@@ -121,6 +126,8 @@ class Tabled(abc.ABC):
     def reset_worlds(self, tasks: Task, keys: Key) -> Step: ...
     @abc.abstractmethod
     def step_worlds(self, tasks: Task, states: Any, actions: Array) -> Step: ...
+    @abc.abstractmethod
+    def renew_worlds(self, tasks: Task, keys: Key, mask: Array, states: Any) -> Step: ...
     @abc.abstractmethod
     def where_worlds(self, mask: Array, new: Any, old: Any) -> Any: ...
 

@@ -193,7 +193,7 @@ class FamilyEnv(TaskStream, gymnasium.Env):
             raise gymnasium.error.ResetNeeded("call reset() first, and after each change of the task")
         step = self._programs.step(self._task, self._step.state, read_action(action, self.action_space))
         self._step, self._elapsed = step, self._elapsed + 1
-        truncated = self._elapsed >= self.family.episode_length
+        truncated = self._elapsed >= self.family.episode_length or bool(step.truncated)
         info = self._table.describe(self._row) | {name: float(x) for name, x in step.metrics.items()}
         return self._observe(), float(step.reward), bool(step.terminated), truncated, info
 

@@ -125,7 +125,8 @@ class FamilyVectorEnv(TaskStream, VectorEnv):
             step = self._restart(self._ended, step)
         self._step = step
         reward, terminated = np.array(step.reward), np.array(step.terminated)
-        truncated = self._elapsed >= self.family.episode_length
+        cut_off = False if step.truncated is None else np.asarray(step.truncated)
+        truncated = (self._elapsed >= self.family.episode_length) | cut_off
         self._ended = terminated | truncated
         info = self._table.describe(self._rows) | {name: np.array(x) for name, x in step.metrics.items()}
         return self._observe(step), reward, terminated, truncated, info

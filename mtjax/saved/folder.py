@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import json
+import re
 import textwrap
 import time
 from collections import ChainMap
@@ -94,7 +95,8 @@ def remove_unused(directory: Path) -> None:
 def short_name(env_name: str) -> str:
     """Return an environment's name for folders and titles, shortened for mixtures of many families."""
     count = env_name.count("+") + 1
-    return env_name if len(env_name) <= _LONGEST else f"mixture-of-{count}"
+    plain = re.sub("[:/]", "-", env_name)  # of other packages' environments
+    return plain if len(plain) <= _LONGEST else f"mixture-of-{count}"
 
 
 def resumed_config(config: RunConfig, directory: Path, argv: Sequence[str]) -> RunConfig:

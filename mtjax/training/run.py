@@ -18,6 +18,7 @@ from mtjax.agents.rates import planned
 from mtjax.agents.swept import Point
 from mtjax.compiling.programs import Programs, compile_lowered, jit_programs, load_kernels, sharded_shapes, trace
 from mtjax.config import RunConfig
+from mtjax.envs.engines import host
 from mtjax.evaluation import Episodes, Evaluations, no_evaluations
 from mtjax.loop import TrainState
 from mtjax.parallel import hosts
@@ -67,14 +68,15 @@ def train(config: RunConfig, hooks: Hooks = NO_HOOKS) -> Result:
     """Train an agent on a family of tasks, by a configuration that ``launch.check`` accepts.
 
     Raises:
-        InputError: the run in the folder is another, or memory or disk have no room.
+        InputError: the run in the folder is another, or memory or disk have no room; or an environment outside of JAX
+            has raised an error.
         FloatingPointError: numbers stopped being finite (in a sweep: of every seed). The message names task, step and
             the last checkpoint.
         OSError: a file could not be written. The checkpoint before it stays.
     """
     started = time.monotonic()
     run = _Run(config, hooks)
-    with contextlib.closing(run.console), memory.explaining():
+    with contextlib.closing(run.console), memory.explaining(), host.explaining(run.records.last):
         result = run.train(started)
     return result._replace(
         total_seconds=time.monotonic() - started,
@@ -185,7 +187,12 @@ class _Run:
         programs = Programs(play, evaluate, chunk.out_info[1], score.result)
         if kernels.result():  # else the first chunk would wait for them
             score.result()
-        return programs, self.records.restore(shapes) if make is None else make.result()(tasks, seeds, numbers)
+        return programs, self._restored(shapes) if make is None else make.result()(tasks, seeds, numbers)
+
+    def _restored(self, shapes: TrainState) -> TrainState:
+        """Return the state of the newest checkpoint. Returns do not count episodes whose worlds are lost."""
+        state, forgetful = self.records.restore(shapes), getattr(self.config.family, "forgetful", "")
+        return state._replace(counted=state.counted & False) if forgetful else state
 
     def _describe(self, shapes: TrainState) -> None:
         env, settings = self.config.family, self.config.played

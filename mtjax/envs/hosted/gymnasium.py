@@ -1,0 +1,396 @@
+"""Any environment of Gymnasium as a family. Gymnasium is imported only when one is made."""
+
+import dataclasses
+import inspect
+import json
+from collections.abc import Callable, Mapping
+from functools import cached_property
+from importlib import import_module
+from typing import Any, ClassVar
+
+import jax
+import numpy as np
+
+from mtjax.checks import shown
+from mtjax.envs.hosted.family import Hosted, as_picture, parameters_of
+from mtjax.envs.hosted.worlds import Outcome
+from mtjax.envs.parameters import Parameter
+from mtjax.names import nearest_error, public
+from mtjax.types import Continuous, Discrete, InputError
+
+_LEAST_PICTURE = 16
+"""Pixels a side of the smallest picture. Smaller arrays of bytes, such as those of grid worlds, are vectors."""
+_MOST_CHANNELS = 4
+_MOST_IDLE = 256
+_FIXES = "wrap the environment in one of gymnasium.wrappers, such as FlattenObservation"
+
+
+class Reader:
+    """Turns observations of a space into a vector (O,) float32, or a picture (H, W, C) uint8."""
+
+    def __init__(self, name: str, space: Any):
+        kind, shape = type(space).__name__, space.shape
+        if kind != "Box" or not np.issubdtype(space.dtype, np.number) or not np.prod(shape):
+            raise InputError(f"{name} observes {shown(space)}, and agents take a Box: a vector or a picture; {_FIXES}")
+        self.name, self.given, self.axes, self.shape = name, shape, None, (int(np.prod(shape)),)
+        if space.dtype == np.uint8 and len(shape) in (2, 3):
+            self._see(shape if len(shape) == 3 else (*shape, 1))
+        self.dtype = np.float32 if len(self.shape) == 1 else np.uint8
+
+    def _see(self, shape: tuple[int, ...]) -> None:
+        """Note where the channels of a picture are. Arrays that are none stay vectors."""
+        for axes in ((0, 1, 2), (1, 2, 0)):
+            high, wide, channels = (shape[i] for i in axes)
+            if self.axes is None and channels <= _MOST_CHANNELS and min(high, wide) >= _LEAST_PICTURE:
+                self.axes, self.shape = axes, (high, wide, channels)
+
+    def read(self, obs: Any) -> np.ndarray:
+        """Return an observation as agents take it."""
+        found = np.asarray(obs)
+        if found.shape != self.given:
+            raise ValueError(f"an observation has the shape {found.shape}, and its space {self.given}")
+        if self.axes is None:
+            return found.astype(np.float32).reshape(self.shape)
+        return found.reshape(found.shape if found.ndim == 3 else (*found.shape, 1)).transpose(self.axes)
+
+
+class Actor:
+    """Turns actions of agents into those of a space."""
+
+    def __init__(self, name: str, space: Any):
+        kind, self.space = type(space).__name__, space
+        if kind == "Discrete":
+            self.action, self.start = Discrete(int(space.n)), int(space.start)
+            return
+        if kind != "Box" or not np.issubdtype(space.dtype, np.floating) or not np.prod(space.shape):
+            raise InputError(f"{name} takes {shown(space)} as actions, and agents give one of n, or a Box of floats")
+        if not np.all(np.isfinite(space.low) & np.isfinite(space.high)):
+            raise InputError(
+                f"{name} takes actions without bounds, which agents give in [-1, 1]; wrap the environment in "
+                "gymnasium.wrappers.RescaleAction, or give its Box a low and a high"
+            )
+        self.action = Continuous(int(np.prod(space.shape)))
+        self.middle, self.half = (space.high + space.low) / 2, (space.high - space.low) / 2
+
+    def read(self, action: np.ndarray) -> Any:
+        """Return the action that the space has for one of an agent, (A,) in [-1, 1] or ()."""
+        if isinstance(self.action, Discrete):
+            return self.start + int(action)
+        scaled = self.middle + np.clip(action, -1, 1).reshape(self.space.shape) * self.half
+        return scaled.astype(self.space.dtype)
+
+
+@dataclasses.dataclass(frozen=True)
+class Gymnasium(Hosted):
+    """Gymnasium: an environment of Gymnasium as it is, stepped on the host.
+
+    Observation: the environment's own, a Box: a vector (O,), or a picture (H, W, C) of bytes.
+    Action: one of n numbers, or a vector (A,) in [-1, 1], scaled to the environment's Box.
+    Reward, start and termination are the environment's own; where it truncates, or at its time limit, an episode is
+        cut off. The seed of each episode is drawn from the run's seed.
+
+    Parameters that can vary: all arguments of the environment's constructor that are numbers. Each task has worlds of
+        its own, made with its values.
+    """
+
+    environment: str = "CartPole-v1"
+    """Name of the environment in Gymnasium's registry, or module:NAME for a module that registers it."""
+
+    suite: ClassVar[str] = "gymnasium"
+
+    @cached_property
+    def registered(self) -> Any:
+        """Return Gymnasium's specification of the environment."""
+        gymnasium = gymnasium_module()
+        module, _, name = self.environment.rpartition(":")
+        try:
+            if module:
+                import_module(module)
+            return gymnasium.spec(name)
+        except ImportError as error:
+            raise InputError(f"{self.environment}: {error}") from None
+        except gymnasium.error.Error:
+            raise nearest_error("environment of Gymnasium", name, gymnasium.registry) from None
+
+    @cached_property
+    def every_parameter(self) -> Mapping[str, Parameter]:  # type: ignore[override]
+        """Return the arguments of the environment's constructor."""
+        known, any_other = arguments(self.registered.entry_point)
+        known |= self.registered.kwargs
+        known.pop("render_mode", None)
+        given = {name: 0.0 for name, _ in self.vary if name.replace("-", "_") not in known} if any_other else {}
+        return parameters_of(known | given)
+
+    def read_value(self, name: str, value: float) -> Any:
+        """Return a parameter's value, of the type that its default has."""
+        default = self._defaults.get(name.replace("-", "_"))
+        if isinstance(default, float) or not float(value).is_integer():
+            if isinstance(default, int):
+                raise InputError(
+                    f"{name} of {self.environment} is a whole number, not {value:g}; --split=none holds no values out"
+                )
+            return float(value)
+        return bool(value) if isinstance(default, bool) else int(value)
+
+    @cached_property
+    def _defaults(self) -> dict[str, Any]:
+        return arguments(self.registered.entry_point)[0] | self.registered.kwargs
+
+    def make(self, row: int | None, filmed: bool = False) -> Any:
+        """Return an environment with the arguments of a row of the table, or with those that do not vary.
+
+        Raises:
+            InputError: it cannot be made.
+        """
+        gymnasium, given = gymnasium_module(), self.fixed if row is None else self.arguments_of(row)
+        shows = {"render_mode": "rgb_array"} if filmed and self.films else {}
+        try:
+            return gymnasium.make(
+                self.environment, max_episode_steps=-1, disable_env_checker=True, **{**given, **shows}
+            )
+        except Exception as error:
+            told = ", ".join(f"{name}={value!r}" for name, value in given.items())
+            line = next(iter(str(error).strip().splitlines()), "")
+            text = f"{self.environment} cannot be made{' with ' * bool(told)}{told}: {type(error).__name__}: {line}"
+            held = "; --split=none holds no values out" * (row is not None and row >= self.train_count)
+            raise InputError(text + held) from error
+
+    def build(self) -> dict[str, dict[str, np.ndarray]]:
+        """Return the leaves of the table. The environment of every listed row is made, so that it is known to exist.
+
+        Raises:
+            InputError: one cannot be made, or has other spaces than the first.
+        """
+        listed = sum(self.counts.values())
+        for row in range(listed):
+            made = self.idle.take(row, False)
+            self.idle.give(row, False, made)
+            found = made.observation_space, made.action_space
+            if (found[0].shape, found[0].dtype, found[1]) != (
+                self.spaces[0].shape,
+                self.spaces[0].dtype,
+                self.spaces[1],
+            ):
+                raise InputError(
+                    f"tasks have one space of observations and one of actions, and {self.environment} has "
+                    f"{shown(found)} with {self.arguments_of(row)}, but else {shown(self.spaces)}"
+                )
+        return {"model": {}, "goal": {}}
+
+    @cached_property
+    def spaces(self) -> tuple[Any, Any]:
+        """Return the spaces of observations and actions."""
+        made = self.make(None if not self.vary else 0)
+        made.close()
+        return made.observation_space, made.action_space
+
+    @cached_property
+    def reader(self) -> Reader:
+        """Return what reads observations."""
+        return Reader(self.environment, self.spaces[0])
+
+    @cached_property
+    def actor(self) -> Actor:
+        """Return what reads actions."""
+        return Actor(self.environment, self.spaces[1])
+
+    @property
+    def picture_or_vector(self) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct(self.reader.shape, self.reader.dtype)
+
+    @property
+    def action(self) -> Continuous | Discrete:
+        """Return the kind and the size of actions."""
+        return self.actor.action
+
+    @property
+    def action_size(self) -> int:  # type: ignore[override]
+        """Return the number of actions, or the size A of one."""
+        return self.action.size
+
+    @property
+    def discrete(self) -> bool:  # type: ignore[override]
+        """Whether an action is the number of a choice."""
+        return isinstance(self.action, Discrete)
+
+    @property
+    def own_limit(self) -> int | None:
+        return self.registered.max_episode_steps
+
+    @cached_property
+    def _metadata(self) -> Mapping[str, Any]:
+        return getattr(creator(self.registered.entry_point), "metadata", {})
+
+    @property
+    def films(self) -> bool:
+        """Return whether it draws pictures of its worlds."""
+        return "rgb_array" in (self._metadata.get("render_modes") or ())
+
+    @property
+    def seconds_per_step(self) -> float:
+        return 1 / (self._metadata.get("render_fps") or 30)
+
+    @property
+    def modules(self) -> tuple[str, ...]:
+        """Return the modules with the classes that make it."""
+        return type(self).__module__, getattr(creator(self.registered.entry_point), "__module__", "mtjax")
+
+    @property
+    def idle(self) -> "Idle":
+        """Return the environments of all equal families that are in no set."""
+        found = _idle.setdefault(self.outside.digest, Idle(self))
+        if found.family.registered.entry_point is not self.registered.entry_point:  # as of a cell that ran again
+            found = _idle[self.outside.digest] = Idle(self)
+        return found
+
+    def pool(self, count: int, filmed: bool) -> "Separate":
+        """Return as many worlds, each an environment of its own."""
+        return Separate(self, count, filmed)
+
+
+_idle: "dict[str, Idle]" = {}  # by a hash of the family
+
+
+class Idle:
+    """Environments that were made, and are in no set of worlds now. They serve the next set."""
+
+    def __init__(self, family: Gymnasium):
+        self.family = family
+        self.made: dict[tuple[int, bool], list[Any]] = {}
+
+    def take(self, row: int, filmed: bool) -> Any:
+        """Return an environment of a row of the table, made if there is none."""
+        found = self.made.get((row, filmed))
+        return found.pop() if found else self.family.make(row, filmed)
+
+    def give(self, row: int, filmed: bool, environment: Any) -> None:
+        """Keep an environment, or close it if there are many."""
+        if sum(map(len, self.made.values())) < _MOST_IDLE:
+            self.made.setdefault((row, filmed), []).append(environment)
+        else:
+            environment.close()
+
+
+class Separate:
+    """Worlds that are an environment each, stepped one after another. Nothing resets by itself."""
+
+    def __init__(self, family: Gymnasium, count: int, filmed: bool):
+        self.family, self.filmed = family, filmed
+        self.rows, self.made = np.full(count, -1), [None] * count
+
+    def begin(self, places: np.ndarray, rows: np.ndarray, seeds: np.ndarray) -> np.ndarray:
+        """Begin an episode in worlds (k,), in environments of rows (k,) of the table."""
+        found = []
+        for place, row, seed in zip(places.tolist(), rows.tolist(), seeds.tolist(), strict=True):
+            if self.rows[place] != row:
+                self._give(place)
+                self.rows[place], self.made[place] = row, self.family.idle.take(row, self.filmed)
+            found.append(self.family.reader.read(self.made[place].reset(seed=seed)[0]))  # type: ignore
+        return np.stack(found)
+
+    def step(self, places: np.ndarray, actions: np.ndarray) -> Outcome:
+        """Step worlds (k,)."""
+        reader, actor = self.family.reader, self.family.actor
+        steps = [self.made[i].step(actor.read(x)) for i, x in zip(places.tolist(), actions, strict=True)]  # type: ignore
+        obs, reward, terminated, truncated, _ = zip(*steps, strict=True)
+        return Outcome(np.stack([reader.read(x) for x in obs]), *map(np.array, (reward, terminated, truncated)))
+
+    def picture(self, place: int) -> bytes:
+        """Return a picture of a world, as PNG."""
+        return as_picture(self.made[place].render())  # type: ignore
+
+    def release(self) -> None:
+        """Give all environments back."""
+        for place in range(len(self.made)):
+            self._give(place)
+
+    def _give(self, place: int) -> None:
+        if self.made[place] is not None:
+            self.family.idle.give(int(self.rows[place]), self.filmed, self.made[place])
+            self.made[place] = None
+
+
+@public
+def hosted(environment: "str | Callable[..., Any]", vary: Mapping[str, Any] | tuple = (), **settings: Any) -> Gymnasium:
+    """Return any environment of Gymnasium as a family of tasks. Its steps are taken on the host.
+
+    Args:
+        environment: its name in Gymnasium's registry; or a class, or a function that returns an environment, which is
+            registered there under its own name.
+        vary: values of arguments of the environment's constructor, such as {"gravity": "-11:-5:4"}.
+        settings: fields of the family, such as ``time_limit``, and other arguments of the environment.
+
+    Raises:
+        InputError: Gymnasium is not installed, has no such environment, or cannot make it; or its spaces are not those
+            of vectors or pictures, and of a vector or a choice.
+    """
+    if not isinstance(environment, str):
+        environment = _registered(environment)
+    own = {field.name for field in dataclasses.fields(Gymnasium)}
+    fixed = {name: value for name, value in settings.items() if name not in own}
+    given = {name: value for name, value in settings.items() if name in own}
+    if fixed:
+        given["arguments"] = _as_json(fixed)
+    values = {str(name).replace("_", "-"): x for name, x in dict(vary).items()}
+    made = Gymnasium(environment=environment, vary=values, **given)
+    _ = made.episode_length, made.spec
+    return made
+
+
+def _forms(observations: Any, actions: Any) -> tuple[Any, ...]:
+    """Return what agents know of two spaces. The bounds of observations may differ between tasks."""
+    return observations.shape, str(observations.dtype), str(actions)
+
+
+def _as_json(arguments: Mapping[str, Any]) -> str:
+    try:
+        return json.dumps(arguments)
+    except TypeError:
+        raise InputError(f"arguments of an environment are numbers, texts or lists, not {shown(arguments)}") from None
+
+
+def _registered(make: Callable[..., Any]) -> str:
+    """Register a class or a function under its own name, and return the name."""
+    if not callable(make):
+        raise InputError(
+            f"hosted takes a name of Gymnasium's, or a class or a function that makes an environment; not {shown(make)}"
+        )
+    gymnasium, name = gymnasium_module(), make.__name__
+    gymnasium.registry.pop(name, None)  # of before, such as that of an earlier cell of a notebook
+    gymnasium.register(name, make)
+    return name
+
+
+def creator(entry_point: Any) -> Any:
+    """Return the class or the function that makes an environment."""
+    if not isinstance(entry_point, str):
+        return entry_point
+    module, _, name = entry_point.partition(":")
+    try:
+        return getattr(import_module(module), name)
+    except ImportError as error:
+        raise InputError(f"{name}: {error}") from None
+
+
+def arguments(entry_point: Any) -> tuple[dict[str, Any], bool]:
+    """Return the arguments of what makes an environment with their defaults, and whether it takes any others."""
+    try:
+        found = inspect.signature(creator(entry_point)).parameters.values()
+    except (TypeError, ValueError):
+        return {}, True
+    plain = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+    known = {each.name: each.default for each in found if each.kind in plain and each.name != "render_mode"}
+    return known, any(each.kind is inspect.Parameter.VAR_KEYWORD for each in found)
+
+
+def gymnasium_module() -> Any:
+    """Import Gymnasium.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    try:
+        import gymnasium
+    except ImportError:
+        raise InputError("Gymnasium is not installed; pip install 'mtjax[gym]'") from None
+    return gymnasium
