@@ -12,6 +12,7 @@ import mtjax
 from mtjax.agents.parts.policies import Categorical, Gaussian, policy_for
 from mtjax.agents.ppo import Batch
 from mtjax.envs.probes import tasks_of
+from mtjax.networks import Params
 from mtjax.types import Continuous, Discrete, InputError, Spec, Transition
 
 KEY = jax.random.key(0)
@@ -43,7 +44,8 @@ def test_a_kind_of_actions_says_what_they_are(action):
         assert -1 <= np.min(many) < -0.99 and 0.99 < np.max(many) < 1
     np.testing.assert_array_equal(policy_for(action).encode(many), action.encode(many))
     outputs = policy_for(action).outputs(3)
-    assert policy_for(action).blank(outputs).shape == one.shape and policy_for(action).first(3, 0.7).shape == (outputs,)
+    nets = {"actor": Params({"head": {"bias": jnp.zeros(outputs)}}, {})}
+    assert policy_for(action).blank(nets).shape == one.shape and policy_for(action).first(3, 0.7).shape == (outputs,)
 
 
 @pytest.mark.parametrize("mask", [None, MASK], ids=["all", "masked"])

@@ -63,7 +63,9 @@ def random_steps(agent, num_tasks=3, spec=SPEC, seed=0):
     raw, past = normal(spec.action_size), None
     if agent.view.history:
         past = random_past(random, (*shape, agent.view.history), spec)
-    begun = Memory(None, agent.conditioning.begin(), agent.scaling.begin(), agent.sampler.begin())
+    begun = Memory(
+        None, agent.conditioning.begin(spec.obs_size, spec.action_size), agent.scaling.begin(), agent.sampler.begin()
+    )
     memory = jax.tree.map(lambda x: jnp.zeros((*shape, *x.shape)), begun)
     steps = Transition(
         obs=normal(spec.obs_size),
