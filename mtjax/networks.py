@@ -11,7 +11,6 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from mtjax.sphere import init_direction
 from mtjax.types import Array, Key
 
 
@@ -169,3 +168,32 @@ class Network:
     def _init_head(self, key: Key, width: int, out: int) -> dict[str, Array]:
         init = init_direction if self.unit_head else nn.initializers.lecun_normal()
         return {self._head_weights: init(key, (width, out)), "bias": jnp.zeros(out)}
+
+
+# Vectors of length 1, and layers whose weights are such vectors.
+
+
+def to_unit(x: Array, axis: int = -1, floor: float = 1e-30) -> Array:
+    """Scale vectors along an axis to length 1.
+
+    The gradient is finite at zero too. Vectors whose squared length is not far above the ``floor`` stay shorter.
+    """
+    return x * jax.lax.rsqrt(jnp.sum(jnp.square(x), axis=axis, keepdims=True) + floor)
+
+
+def init_direction(key: Key, shape: tuple[int, int]) -> Array:
+    """Draw weights (inputs, outputs) with a vector of length 1 and of random direction for each output."""
+    return to_unit(nn.initializers.lecun_normal()(key, shape), axis=-2)
+
+
+class UnitDense(nn.Module):
+    """Applies a linear layer without bias, in which the weights of each output are a vector of length 1.
+
+    Optimisers keep that length of every leaf called ``direction`` (``descent.on_sphere``).
+    """
+
+    width: int
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        return x @ self.param("direction", init_direction, (x.shape[-1], self.width))

@@ -22,7 +22,6 @@ GROUND = (
     "names",
     "checks",
     "standalone",
-    "sphere",
     "networks",
     "tasks",
     "trials",

@@ -7,8 +7,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 
 from mtjax.agents.parts.encoders.base import Identity
-from mtjax.networks import STATISTICS, ReLU
-from mtjax.sphere import UnitDense
+from mtjax.networks import STATISTICS, ReLU, UnitDense
 from mtjax.types import Array
 
 

@@ -8,8 +8,7 @@ import jax.numpy as jnp
 from mtjax.agents import parts
 from mtjax.agents.parts.encoders.base import Identity
 from mtjax.agents.parts.encoders.residual import blocks
-from mtjax.networks import ReLU, join
-from mtjax.sphere import UnitDense, to_unit
+from mtjax.networks import ReLU, UnitDense, join, to_unit
 from mtjax.types import Array
 
 
