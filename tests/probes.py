@@ -154,6 +154,8 @@ OFF_POLICY = [name for name, preset in agents.AGENTS.items() if issubclass(prese
 
 def family_for(agent: str) -> str:
     """A family whose actions an agent draws."""
+    if agent == "sketches":
+        return "craft-sketched"
     return "finger-spin" if Gaussian in agents.AGENTS[agent].cls.policies else "tabular-mdp"
 
 

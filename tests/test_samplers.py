@@ -160,3 +160,36 @@ def test_settings_that_make_no_sense_are_refused(settings, message):
     """With what was given."""
     with pytest.raises(InputError, match=message):
         agent("sac", **settings)
+
+
+# Sketches.
+
+
+def short_and_long(rounds, **settings):
+    """A curriculum over sketches of one, two and two symbols, after rounds of returns in which every episode ended."""
+    sampler = SAMPLERS["by-length"](**{"least_weight": 0.0, "return_rate": 0.5, **settings})
+    memory = sampler.init(3)._replace(length=jnp.int32([1, 2, 2]))
+    for returns in rounds:
+        memory = jax.jit(sampler.observe, compiler_options=QUICK)(memory, all_end(returns))
+    return sampler, memory
+
+
+def test_longer_sketches_follow_when_all_shorter_ones_are_mastered():
+    """The first alone until its moving mean, .5 and .75 and .875, is above .8; then by what is missing, and .01."""
+    for rounds, expected in (
+        ([], [3, 0, 0]),
+        ([[0, 0, 0], [1, 1, 0], [1, 1, 0]], [3, 0, 0]),
+        ([[0, 0, 0], [1, 1, 0], [1, 1, 0], [1, 1, 0]], np.array([0.135, 0.135, 1.01]) * 3 / 1.28),
+    ):
+        sampler, memory = short_and_long(rounds)
+        np.testing.assert_allclose(sampler.weights(memory, ALIKE), expected, rtol=1e-5)
+    sampler, memory = short_and_long([[1, 1, 0]], mastered=1.0)
+    np.testing.assert_allclose(sampler.weights(memory, ALIKE), [3, 0, 0])
+
+
+def test_a_curriculum_begins_with_the_shortest_sketches_there_are():
+    sampler, memory = short_and_long([])
+    longer = memory._replace(length=jnp.int32([3, 4, 3]))
+    np.testing.assert_allclose(sampler.weights(longer, ALIKE), [1.5, 0, 1.5])
+    after = sampler.observe(longer, all_end([1, 0, 1]))
+    np.testing.assert_array_equal(after.longest, [4, 4, 4])

@@ -86,6 +86,11 @@ AGENTS: dict[str, Preset] = {
         _PARAMS,
         "mtjax.agents.pqn:PQN",
     ),
+    "sketches": Preset(
+        "A sub-policy for every symbol of tasks' sketches (Andreas et al. 2017)",
+        {"sampler": "by-length", "least_weight": 0.0},
+        "mtjax.agents.sketches:Sketches",
+    ),
     "pcgrad": Preset("Conflicting gradients projected (Yu et al. 2020)", {"gradients": "pcgrad", **_PARAMS}),
     "cagrad": Preset("Conflict-averse gradients (Liu et al. 2021)", {"gradients": "cagrad", **_PARAMS}),
     "gradnorm": Preset("Weights that even out learning rates (Chen et al. 2018)", {"gradients": "gradnorm", **_PARAMS}),

@@ -201,8 +201,10 @@ _HIDDEN: dict[str, Entry] = {
 _CRAFT: dict[str, Entry] = {  # of the errands, 72 are held out
     "coloured-maze": ("coloured:ColouredMaze", {"num_tasks": 10}),
     "craft": ("crafts:CraftWorld", {"vary": {"goal": "0:9:10"}, "split": "none"}),
+    "craft-sketched": ("crafts:CraftWorld", {"vary": {"goal": "0:9:10"}, "split": "none", "sketched": True}),
     "errands": ("errands:Errands", {"vary": {"goal": "0:167:168"}, "num_tasks": 96}),
     "light-world": ("light:LightWorld", {"vary": {"goal": "0:9:10"}, "split": "none"}),
+    "light-world-sketched": ("light:LightWorld", {"vary": {"goal": "0:9:10"}, "split": "none", "sketched": True}),
 }
 
 # Mazes seen from within.

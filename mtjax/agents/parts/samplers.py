@@ -138,6 +138,60 @@ class Hardest(_ByReturns):
         return self.share_out(jax.nn.softmax(-self.hardness * from_mean / jnp.where(std > 0, std, 1.0)))
 
 
+class Curriculum(NamedTuple):
+    """Holds how far a curriculum has come."""
+
+    returns: Returns
+    length: Array  # (T,) int32 of the tasks' sketches; 0 if they have none
+    longest: Array  # (T,) int32, the same for all: of the sketches that take part
+
+
+@dataclasses.dataclass(frozen=True)
+class ByLength(_ByReturns):
+    """Trains the tasks with short sketches first (the curriculum of Andreas et al. 2017).
+
+    Tasks take part whose sketches have at most l symbols, at first as many as the shortest. Once the mean return r of
+    each of them is above ``mastered``, l grows by 1. Shares are proportional to 1 - r + 0.01 for the tasks that take
+    part, and 0 for others. Returns are those of success: from 0 to 1.
+
+    Differs from the paper: r is a moving mean, where there it is the mean since l or the shares have changed; with a
+    ``least_weight`` above 0, tasks learn a little before they take part. Agents without sketches have no others.
+    """
+
+    mastered: float = 0.8
+    """Mean return of all tasks that take part above which longer sketches follow."""
+    return_rate: float = 0.02
+    """Weight of a new episode in the moving mean of returns."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        parts.require_shares(self, "mastered")
+        parts.require_rates(self, "return_rate")
+
+    def init(self, num_tasks: int) -> Curriculum:  # type: ignore[override]
+        none = jnp.zeros(num_tasks, jnp.int32)
+        return Curriculum(super().init(num_tasks), none, none)
+
+    def observe(self, memory: Curriculum, steps: Transition) -> Curriculum:
+        returns = _follow(memory.returns, steps, self.return_rate, self.return_rate)
+        longest = _present(memory)
+        behind = (memory.length <= longest) & ~(returns.known & (returns.slow > self.mastered))
+        return Curriculum(returns, memory.length, longest + ~jnp.any(behind))
+
+    def weights(self, memory: Curriculum, temperature: Array) -> Array:
+        missing = 1 - jnp.where(memory.returns.known, jnp.clip(memory.returns.slow, 0.0, 1.0), 0.0) + _LEAST_MISSING
+        shares = jnp.where(memory.length <= _present(memory), missing, 0.0)
+        return self.share_out(shares / jnp.sum(shares))
+
+
+_LEAST_MISSING = 0.01
+
+
+def _present(memory: Curriculum) -> Array:
+    """Return the length (T,) up to which sketches take part: some task always does."""
+    return jnp.clip(memory.longest, jnp.min(memory.length), jnp.max(memory.length))
+
+
 @dataclasses.dataclass(frozen=True)
 class ByTemperature(_Unequal):
     """Gives more weight to tasks of low temperature, whose policies are certain (Yang et al. 2020).
@@ -163,5 +217,6 @@ SAMPLERS: dict[str, type[Sampler]] = {
     "uniform": Uniform,
     "progress": Progress,
     "hardest": Hardest,
+    "by-length": ByLength,
     "temperature": ByTemperature,
 }

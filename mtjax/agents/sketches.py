@@ -1,0 +1,143 @@
+"""Sketches learn a sub-policy for every symbol of which tasks' sketches are made."""
+
+import dataclasses
+from typing import Annotated, Any, ClassVar, Literal
+
+import jax
+import jax.numpy as jnp
+import tyro
+
+from mtjax.agents import parts
+from mtjax.agents.base import Heads
+from mtjax.agents.parts.policies import Categorical, Policy
+from mtjax.agents.parts.samplers import ByLength
+from mtjax.agents.ppo import PPO
+from mtjax.agents.state import AgentState, Nets
+from mtjax.networks import Network, Params
+from mtjax.types import Array, InputError, Key, Spec, Task
+
+
+@dataclasses.dataclass(frozen=True)
+class SubPolicies(Network):
+    """Holds a network for every symbol, which all tasks share. The last entries of observations choose one, one-hot."""
+
+    count: int = 0  # S, of symbols
+
+    def init(self, key: Key, num_tasks: int, out: int, features: Array, *inputs: Array) -> Params:
+        """Initialise the sub-policies, leaves (S, ...)."""
+        return Params(self._each.init(key, self.count, out, features, inputs[0][..., : -self.count]).own, {})
+
+    def apply(self, params: Params, features: Array, *inputs: Array) -> Array:
+        """Map inputs (..., O) to the outputs (..., out) of the sub-policies that are due; 0 where none is."""
+        count = params.shared["head"]["bias"].shape[0]
+        seen, due = inputs[0][..., :-count], jnp.moveaxis(inputs[0][..., -count:], -1, 0)
+        of_symbol = lambda own: self._each.apply(Params({}, own), features, seen)
+        return jnp.sum(jax.vmap(of_symbol)(params.shared) * due[..., None], axis=0)
+
+    @property
+    def _each(self) -> Network:
+        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(Network)}
+        return Network(**{**fields, "own": ("sight", "body", "head")})
+
+
+@dataclasses.dataclass(frozen=True)
+class Sketches(PPO):
+    """Sketches learn modular policies from policy sketches (Andreas et al. 2017), by proximal policy optimisation.
+
+    A task's sketch is a sequence of symbols b_1 ... b_K, and its policy plays their sub-policies one after another:
+        pi(a|s) = pi_b(a|s), with the symbol b that is due
+    A sub-policy has one action more than the world, STOP, after which the next symbol is due. Tasks share the
+    sub-policies of the symbols that they have in common, and each has a critic of its own. So the gradient of a step
+        A grad log pi_b(a|s),  A the advantage by the task's critic
+    moves the sub-policy of its symbol, and no other. The environment follows the sketch, as craft-sketched and
+    light-world-sketched do: its observations end with the symbol that is due. No sub-policy sees it, nor the task.
+
+    The curriculum is a sampler, by-length: it begins with the shortest sketches, and goes on to longer ones once the
+    mean return of every task is above ``mastered``. Others have no weight until then.
+
+    A task that was not trained on is played by the sub-policies of its sketch, without further learning.
+
+    Ablations: ``sharing=tasks`` gives every task a policy of its own (the paper's independent), and ``sharing=all`` all
+    tasks one policy (joint); with conditioning=one-hot or parameters it sees its task. Both see the symbol that is due.
+    ``sampler=uniform`` has no curriculum.
+
+    Differs from the paper: PPO's clipped steps on advantages by its critic replace one step of an actor-critic on whole
+    returns; critics are networks that see the symbol too, and not linear; all tasks play throughout, and the
+    curriculum weighs their losses; Adam replaces RMSProp; the entropy's weight is 0.01 in standard deviations of the
+    advantage. As there, sub-policies have a hidden layer of 128 units, the discount is 0.9, and STOP begins with a bias
+    of -3.
+    """
+
+    policies: ClassVar[tuple[type[Policy], ...]] = (Categorical,)
+    hidden: tuple[int, ...] = (128,)
+    actor_lr: float = 1e-3
+    """Adam's learning rate for the actor."""
+    gamma: float = 0.9
+    """Discount of rewards per step."""
+    normalize_observations: bool = False
+    heads: Heads = "disjoint"
+    """What each task has for itself of its critic: whole networks (disjoint)."""
+    sharing: Literal["symbols", "tasks", "all"] = "symbols"
+    """What has a policy of its own: every symbol (symbols), every task (tasks), or nothing (all)."""
+    stop_bias: float = -3.0
+    """Bias of the logit of STOP at first. Below 0 a sub-policy lasts longer."""
+    symbols: Annotated[int, tyro.conf.Suppress] = dataclasses.field(default=0, repr=False, metadata=parts.NO_SETTING)
+    """Number of symbols while networks are made. It follows from the environment."""
+
+    def _check_combination(self) -> None:
+        super()._check_combination()
+        if self.heads != "disjoint":
+            raise InputError(f"in sketches every task has a critic of its own: heads is disjoint, not {self.heads}")
+        if self.normalize_observations:
+            raise InputError("sketches reads symbols off observations as they are; use normalize-observations=False")
+        if self.representation.learns or self.representation.history or self.encoder.front() is not None:
+            raise InputError("sketches reads symbols off observations; use representation=plain and another encoder")
+
+    def require_policy(self, spec: Spec) -> None:
+        super().require_policy(spec)
+        if not spec.symbols:
+            raise InputError("sketches plays families that follow a sketch, such as --env=craft-sketched")
+
+    # Networks.
+
+    @property
+    def knows_apart(self) -> bool:
+        """Whether every task has networks of its own by which it is known. Sub-policies need shared ones."""
+        return False
+
+    @property
+    def actor(self) -> Network:
+        network = super().actor
+        if self.sharing == "tasks":
+            return network
+        fields: dict[str, Any] = {field.name: getattr(network, field.name) for field in dataclasses.fields(network)}
+        fields["own"] = ()
+        return SubPolicies(**fields, count=self.symbols) if self.sharing == "symbols" else Network(**fields)
+
+    def init(self, spec: Spec, tasks: Task, key: Key) -> AgentState:
+        """Return the initial state. The curriculum gets to know the lengths of sketches."""
+        self.require_policy(spec)
+        state = super(Sketches, parts.put(self, symbols=spec.symbols)).init(spec, tasks, key)
+        if not isinstance(self.sampler, ByLength):
+            return state
+        lengths = tasks.goal["length"].astype(jnp.int32)
+        return state._replace(
+            nets=state.nets | {"sampler": Params({}, state.nets["sampler"].own._replace(length=lengths))}
+        )
+
+    def init_networks(self, num_tasks: int, actor_inputs: tuple, critic_inputs: tuple, action: Array, key: Key) -> Nets:
+        nets = super().init_networks(num_tasks, actor_inputs, critic_inputs, action, key)
+        return nets | {"actor": Params(*(self._lean(part) for part in nets["actor"]))}
+
+    def _lean(self, part: dict[str, Any]) -> dict[str, Any]:
+        """Add its first bias to the last output, STOP, of an actor's part if it has the head."""
+        if "head" not in part:
+            return part
+        return {**part, "head": part["head"] | {"bias": part["head"]["bias"].at[..., -1].add(self.stop_bias)}}
+
+    # Tasks that were not trained on.
+
+    @property
+    def unseen(self) -> str:
+        """A sentence on what stands in for unseen tasks."""
+        return super().unseen if self.sharing == "tasks" else "the policies of its sketch's symbols play each"
