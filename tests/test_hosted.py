@@ -1,5 +1,7 @@
 """Environments outside of JAX: the same steps as the original's, in the loop, evaluations and films."""
 
+import shutil
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,9 +10,13 @@ from needs import require
 
 import mtjax
 import mtjax.train
-from mtjax import rollout
+from mtjax import evaluation, rollout
+from mtjax.envs.engines.host import explaining
+from mtjax.envs.hosted.family import _known
 from mtjax.envs.hosted.gymnasium import Separate
-from mtjax.types import Acted
+from mtjax.evaluate import main as evaluate_main
+from mtjax.saved.records import Records
+from mtjax.types import Acted, Continuous, Discrete, InputError
 
 gymnasium = require("gymnasium")
 spaces = gymnasium.spaces
@@ -49,7 +55,7 @@ class Walk(gymnasium.Env):
         return np.array([self.place, self.age])
 
     def render(self):
-        return np.full((30, 40, 3), 10 * self.age, np.uint8)
+        return np.full((30, 40, 3), 10 * self.age % 256, np.uint8)
 
 
 class Seen(Walk):
@@ -63,10 +69,6 @@ class Seen(Walk):
 
     def _look(self):
         return np.full((3, 20, 24), self.age, np.uint8) + np.arange(3, dtype=np.uint8)[:, None, None]
-
-
-PLAYED = {"num_envs": 4, "chunk_steps": 32, "unroll": 16, "minibatches": 2, "epochs": 1, "hidden": (8,)}
-QUIET = {"quiet": True, "eval_episodes": 2}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -174,3 +176,193 @@ def test_steps_are_the_originals(name, settings, kinds, begun):
     ended = transition.ended
     assert ended.any() and len({bool(x) for x in terminal[ended]}) == kinds
     assert all(len(episodes) > 2 for episodes in begun.values()) or family.episode_length > 150
+
+
+# In the loop.
+
+PLAYED = {"num_envs": 4, "chunk_steps": 32, "unroll": 16, "minibatches": 2, "epochs": 1, "hidden": (8,)}
+SHORT = [f"--{flag}" for flag in ("num-envs=4", "chunk-steps=32", "eval-episodes=2", "eval-every=256", "steps=512")]
+SHORT += ["--agent=ppo", "--agent.unroll=16", "--agent.hidden=8"]
+
+
+LONG = ["--env.time-limit=150", '--env.arguments={"end": 1000, "patience": 1000}']
+
+
+@pytest.fixture(scope="module")
+def run(registered, tmp_path_factory):
+    """The folder of a run on two walks, and what it printed. Only to be read."""
+    runs = tmp_path_factory.mktemp("runs")
+    mtjax.train.main(
+        [
+            *SHORT,
+            "--env=gymnasium:Walk",
+            "--env.vary.scale=0.5,1.5",
+            "--split=none",
+            "--no-stagger",
+            *LONG,
+            f"--runs={runs}",
+        ]
+    )
+    return next(runs.iterdir())
+
+
+def test_a_run_has_evaluations_and_a_film(run, capsys):
+    """A film shows the environment's own pictures, which are as grey as the walk is old."""
+    found = mtjax.evaluate(str(run), episodes=3)
+    assert found.returns["train"].shape == (1, 2, 3) and np.isfinite(found.returns["train"]).all()
+    evaluate_main([f"--run={run}", "--episodes=1", "--video", "--video-seconds=1"])
+    assert "filming 2 of 2: train, return" in capsys.readouterr().out
+    (film,) = run.glob("evaluation-*/film.*")
+    assert film.stat().st_size > 0
+
+
+def test_a_film_shows_each_step(monkeypatch):
+    """Pictures are those of the states that are asked for, and of the world's own."""
+    family = mtjax.hosted("Walk", vary={"scale": "0.5,1.5"}, split="none", end=50)
+    with family.filmed():
+        states = play(family, 6, num_envs=1)[2]
+    one = jax.tree.map(lambda x: x[[0, 3, 4], 0, 1, 0], states)
+    pictures = family.pictures(one, 32, 24)
+    assert pictures.shape == (3, 24, 32, 3) and [int(x[12, 16, 0]) for x in pictures] == [10, 40, 50]
+
+
+def test_evaluations_play_whole_episodes_of_the_original(begun):
+    """Returns are those of the original under the agent's mean actions; worlds that have ended stand still."""
+    family = mtjax.hosted("Walk", end=4)
+    result = mtjax.train(family, "ppo", steps=128, eval_episodes=3, quiet=True, **PLAYED)
+    begun.clear()
+    agent, learners = result.agent, result.state.agent
+    scores = evaluation.evaluate(
+        family, agent, evaluation.Episodes(3), learners, family.tasks(), jnp.arange(1), jnp.int32(5)
+    )
+    returns = np.asarray(scores.returns)[0, 0]
+    one, task = jax.tree.map(lambda x: x[0], (learners, family.tasks()))
+    act = jax.jit(lambda obs: agent.act(one, agent.begin(one, task), obs, task, None).action)
+    for place in range(3):
+        ((row, seed),) = begun[place]
+        original = gymnasium.make("Walk", **family.arguments_of(row))
+        obs, total, over = original.reset(seed=seed)[0], 0.0, False
+        while not over:
+            action = family.actor.read(np.asarray(act(family.reader.read(obs))))
+            obs, reward, terminated, truncated, _ = original.step(action)
+            total, over = total + reward, terminated or truncated
+        np.testing.assert_allclose(returns[place], total, rtol=1e-4)
+
+
+def test_what_an_environment_raises_ends_the_run_after_its_checkpoint(tmp_path, capsys):
+    """The message names environment, error and place; the last checkpoint stays."""
+    gymnasium.register("Broken", Walk, max_episode_steps=400, kwargs={"raises": 70, "end": 1000, "patience": 1000})
+    flags = [*SHORT, "--env=gymnasium:Broken", f"--runs={tmp_path}", "--no-stagger"]
+    with pytest.raises(InputError, match=r"Broken raised ZeroDivisionError: the walk broke .*hosted.py, line") as told:
+        mtjax.train.main(flags)
+    (folder,) = tmp_path.iterdir()
+    (last,) = (folder / "checkpoints").iterdir()
+    assert str(last) in str(told.value) and isinstance(told.value.__cause__, ZeroDivisionError)
+
+
+def test_a_resumed_run_begins_new_episodes_and_says_so(run, tmp_path, capsys, monkeypatch):
+    """As another process does, which knows none of the worlds. Episodes that were cut off do not count."""
+    copy = shutil.copytree(run, tmp_path / "copy")
+    for known in _known.values():
+        known.sets.clear()
+    rows = []
+    monkeypatch.setattr(Records, "add_rows", lambda self, new: rows.extend(new))
+    mtjax.train.main([f"--resume={copy}", "--steps=1024"])
+    assert "worlds of gymnasium:Walk cannot be saved: new episodes begin" in capsys.readouterr().out
+    assert len(rows) == 2 and all(float(row[name]) == 0 for row in rows for name in ("episodes", "lost"))
+
+
+def test_worlds_go_on_from_their_last_state_alone():
+    """Another state is refused, where it would give the steps of another world."""
+    family = mtjax.hosted("Walk")
+    task = jax.tree.map(lambda x: x[0], family.tasks())
+    start = family.reset(task, jax.random.key(0))
+    then = family.step(task, start.state, jnp.zeros(2))
+    assert not then.terminated and family.step(task, then.state, jnp.zeros(2)).obs.shape == (2,)
+    with pytest.raises(InputError, match="from its last state alone"), explaining():
+        jax.block_until_ready(family.step(task, start.state, jnp.zeros(2)))
+
+
+def test_mixtures_with_families_of_jax():
+    """Each family's episodes end by its own rules."""
+    env = mtjax.mixture([mtjax.hosted("Walk"), "bandit"])
+    with pytest.raises(InputError, match="act alike"):
+        _ = env.spec
+    env = mtjax.mixture([mtjax.hosted("CartPole-v1", time_limit=30), mtjax.make("bandit", num_tasks=2, split="none")])
+    result = mtjax.train(env, "ppo", steps=768, eval_episodes=2, quiet=True, **PLAYED)
+    returns = result.evaluations.returns["train"]
+    assert returns.shape[2] == 3 and 1 <= returns[0, -1, 0].min() and returns[0, -1, 0].max() <= 30
+
+
+def test_ppo_learns_to_balance():
+    """The return rises in some thousand steps."""
+    family = mtjax.hosted("CartPole-v1")
+    settings = {"num_envs": 8, "eval_every": 10_240, "eval_episodes": 5, "quiet": True}
+    result = mtjax.train("gymnasium:CartPole-v1", "ppo", steps=20_480, **settings)
+    returns = result.evaluations.returns["train"].mean(axis=(0, 2, 3))
+    assert family.episode_length == 500 and returns[-1] > 250
+
+
+# What is refused.
+
+
+class Odd(Walk):
+    """A walk with spaces that agents cannot carry."""
+
+    def __init__(self, obs="ok", action="ok", **rest):
+        super().__init__(**rest)
+        odd = {"dict": spaces.Dict({"x": spaces.Discrete(2)}), "many": spaces.MultiDiscrete([2, 3])}
+        odd["endless"] = spaces.Box(-np.inf, np.inf, (1,))
+        self.observation_space = odd.get(obs, self.observation_space)
+        self.action_space = odd.get(action, self.action_space)
+
+
+@pytest.mark.parametrize(
+    ("make", "told"),
+    [
+        (lambda: mtjax.hosted("CartPol-v1"), "did you mean 'CartPole-v1'"),
+        (lambda: mtjax.hosted("CartPole-v1", vary={"gravity": "5:10:3"}), "unknown parameter 'gravity'"),
+        (lambda: mtjax.hosted("Walk", vary={"scales": "1,2"}), "did you mean 'scale'"),
+        (lambda: mtjax.hosted("Walk", vary={"scale": "1,6"}, split="none"), "scale=6.* scale is of no walk"),
+        (lambda: mtjax.hosted("Walk", vary={"end": "3,4"}), "end of Walk is a whole number, not 3.5; .*split"),
+        (lambda: mtjax.hosted(Odd), "no time limit; give one"),
+        (lambda: mtjax.hosted(Odd, time_limit=9, obs="dict"), "observes Dict.*FlattenObservation"),
+        (lambda: mtjax.hosted(Odd, time_limit=9, action="many"), "takes MultiDiscrete"),
+        (lambda: mtjax.hosted(Odd, time_limit=9, action="endless"), "without bounds"),
+        (lambda: mtjax.hosted("Walk", unheard_of=3), "unheard_of=3: TypeError"),
+        (lambda: mtjax.hosted(3), "hosted takes a name"),
+        (lambda: mtjax.make("gymnasium:Walk", arguments="[1]"), "arguments are JSON"),
+        (lambda: mtjax.make("gymnasia:Walk"), "unknown environment 'gymnasia:Walk'"),
+        (lambda: mtjax.make("gymnasium:Walk", time_limit=-1), "time-limit must be"),
+    ],
+)
+def test_mistakes_are_told_before_anything_runs(make, told):
+    """In a line that says what was given and what to do."""
+    with pytest.raises(InputError, match=told):
+        _ = make().spec
+
+
+def test_spaces_become_those_of_agents():
+    """Actions span the environment's Box, and channels come last."""
+    walk, seen = mtjax.hosted("Walk"), mtjax.make("gymnasium:Seen", frames=2)
+    assert walk.spec.action == Continuous(2) and walk.spec.obs.shape == (2,)
+    np.testing.assert_array_equal(walk.actor.read(np.float32([-1, 1])), np.float32([-1, 10]))
+    assert seen.spec.action == Discrete(3) and seen.actor.read(np.int32(0)) == -1
+    assert seen.spec.obs["pixels"].shape == (20, 24, 3) and seen.spec.frames == 2
+
+
+def test_a_class_is_registered_under_its_name():
+    """So that a run's folder and the command line know it too; one that is defined again takes its place."""
+
+    class Mine(Walk):
+        pass
+
+    first = mtjax.hosted(Mine, time_limit=5)
+    assert first.name == "gymnasium:Mine" and mtjax.make("gymnasium:Mine", time_limit=5) == first
+    play(first, 2, num_envs=1)
+
+    class Mine(Walk):
+        def _look(self):
+            return np.array([7.0, 7.0])
+
+    assert play(mtjax.hosted(Mine, time_limit=5), 2, num_envs=1)[0].obs.min() == 7

@@ -9,7 +9,6 @@ from mtjax.command import sweep
 from mtjax.command.run_config import parse
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import RunConfig
-from mtjax.envs.pixels import Pictured
 from mtjax.parallel import hosts
 from mtjax.report.curve import draw
 from mtjax.report.tables import split_table
@@ -79,5 +78,5 @@ def _conclude(config: RunConfig, result: Result, directory: Path) -> None:
         f"{duration(result.trained_seconds)}, evaluated and saved in {duration(rest)}; run: {directory}"
     )
     words = [f"--run={directory}", *import_flags(config)]
-    words += ["--video"] * any(isinstance(part.family, Pictured) for part in config.family.parts)
+    words += ["--video"] * any(part.family.films for part in config.family.parts)
     print(f"look at it: python -m mtjax.evaluate {shlex.join(words)}")

@@ -4,6 +4,7 @@ import abc
 import dataclasses
 import math
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from functools import cached_property
 from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Self
@@ -289,6 +290,15 @@ class Family(Flat, Tabled):
     def modules(self) -> tuple[str, ...]:
         """Return the modules with the classes that make it."""
         return (type(self).__module__,)
+
+    @property
+    def films(self) -> bool:
+        """Return whether its worlds can be seen in films."""
+        return False
+
+    def filmed(self) -> AbstractContextManager[None]:
+        """Return a context in which episodes that films show are played."""
+        return nullcontext()
 
     @property
     def structure(self) -> Any:

@@ -90,6 +90,11 @@ class Pictured(Stepped):
         if shown:
             raise InputError(f"{shown[0]} changes only what is seen; add --env.pixels=64")
 
+    @property
+    def films(self) -> bool:
+        """Return True: its worlds are drawn from their states."""
+        return True
+
     # What a family gives.
 
     @abc.abstractmethod

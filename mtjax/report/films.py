@@ -1,5 +1,6 @@
 """Films of several tasks side by side, with split, parameters and return written on each."""
 
+import contextlib
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from mtjax.envs.engines import host
 from mtjax.envs.pixels import Pictured
 from mtjax.envs.task_table import Part, Tabled
 from mtjax.evaluation import Recording, record
@@ -36,7 +38,7 @@ class Chosen(NamedTuple):
 
 def require(env: Tabled) -> None:
     """Raise InputError unless a family can be filmed."""
-    if not any(isinstance(part.family, Pictured) for part in env.parts):
+    if not any(part.family.films for part in env.parts):
         raise InputError("only families that show pictures can be filmed; leave out --video")
 
 
@@ -47,7 +49,7 @@ def choose(env: Tabled, splits: Sequence[str], tasks: Sequence[int]) -> list[Cho
         InputError: no family has such a task.
     """
     found, most = [], 0
-    for part in (part for part in env.parts if isinstance(part.family, Pictured)):
+    for part in (part for part in env.parts if part.family.films):
         for split in splits or SPLITS:
             rows = part.family.table.rows[split]
             most = max(most, len(rows))
@@ -80,7 +82,10 @@ def write(
     """
     env = policy.env
     render.choose_backend()
-    played = record(env, policy.agent, policy.state, tasks, jnp.int32(seed))
+    with contextlib.ExitStack() as filmed, host.explaining():
+        for part in env.parts:
+            filmed.enter_context(part.family.filmed())
+        played = jax.block_until_ready(record(env, policy.agent, policy.state, tasks, jnp.int32(seed)))
     by_name = {part.name: states for part, states in zip(env.parts, env.apart(played.states), strict=True)}
     width = next((width for most, width in _WIDTHS if len(chosen) <= most), _NARROWEST)
     count, tiles = max(round(seconds * _FPS), 1), []
@@ -108,7 +113,8 @@ def _tile(env: Tabled, one: Chosen, played: Recording, states: Any, count: int, 
     times = np.arange(count) / _FPS / family.seconds_per_step
     steps = np.unique(np.minimum(times.astype(int), length - 1))
     shown = jax.tree.map(lambda x: np.asarray(x[one.own])[steps], states)
-    drawn = render.film(family, row, shown, width, width * 3 // 4)
+    size = width, width * 3 // 4
+    drawn = render.film(family, row, shown, *size) if isinstance(family, Pictured) else family.pictures(shown, *size)
     frames = drawn[np.searchsorted(steps, np.minimum(times.astype(int), length - 1))]
     return frames[: max(int(np.sum(times < length)), 1)]
 

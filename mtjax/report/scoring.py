@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -14,7 +15,7 @@ from mtjax import evaluation, trials
 from mtjax.checks import path, require_episodes
 from mtjax.compiling.programs import compile_lowered, enable_compile_cache, trace
 from mtjax.envs import Family
-from mtjax.envs.pixels import Pictured
+from mtjax.envs.engines import host
 from mtjax.envs.task_table import Tabled
 from mtjax.evaluation import Scores, of_tasks
 from mtjax.names import nearest_error, public
@@ -172,7 +173,7 @@ def report(request: Any, vary: Mapping[str, str]) -> None:
     if policy.agent.unseen:
         print(f"unseen tasks: {policy.agent.unseen}")
     if shipped.is_shipped(shipped.folder(run)) and not chosen:
-        if any(isinstance(part.family, Pictured) for part in policy.env.parts):
+        if any(part.family.films for part in policy.env.parts):
             print(f"look at it: python -m mtjax.evaluate {shlex.join([f'--run={run}', '--video'])}")
         return
     directory = _new_folder(_place(run))  # only now, as the run may be in a folder that others own
@@ -241,7 +242,7 @@ def score(
         split: the split to play alone, in the same episodes; or "all".
 
     Raises:
-        InputError: the episodes are no whole number of trials.
+        InputError: the episodes are no whole number of trials, or an environment outside of JAX has raised an error.
     """
     trials.require_whole(episodes, policy.trial)
     env = policy.env
@@ -250,7 +251,8 @@ def score(
     arguments += (jnp.int32(_FIRST_NUMBER + seed), *([] if split == "all" else [jnp.asarray(rows[split])]))
     played = evaluation.Episodes(episodes, policy.trial)
     program = trace(evaluation.evaluate, env, policy.agent, played, *arguments)
-    found = compile_lowered(program.lower(), "seldom")(*arguments)
+    with host.explaining():
+        found = jax.block_until_ready(compile_lowered(program.lower(), "seldom")(*arguments))
     return {split: found} if split in rows else {name: of_tasks(found, places) for name, places in rows.items()}
 
 

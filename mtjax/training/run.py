@@ -289,7 +289,7 @@ class _Run:
                     now = self._give_up_spoiled(now)
                 if due:
                     self.console.doing(f"{now.steps:,} steps  evaluating")
-                    now = now._replace(evaluations=self._evaluate(programs.evaluate, now))
+                    now = now._replace(evaluations=self._evaluate_or_save(programs.evaluate, now))
                     write_rows(sinks, *self._evaluation_rows(now.evaluations))
                     stop = asked(stop)
                 if due or stop:
@@ -393,6 +393,14 @@ class _Run:
         self.exchange.finish(iteration)
         self.records.save(state)
         allocator.give_back_pages()
+
+    def _evaluate_or_save(self, program: Callable, now: _Progress) -> Evaluations:
+        """Evaluate. Where the program fails, as an environment's own code may, what was learned is saved first."""
+        try:
+            return self._evaluate(program, now)
+        except jax.errors.JaxRuntimeError:
+            self._save(now.state, now.steps // self.config.worlds)
+            raise
 
     def _evaluate(self, program: Callable, now: _Progress) -> Evaluations:
         """Evaluate on all splits, and append the result to the run's evaluations."""

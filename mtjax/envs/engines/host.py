@@ -171,9 +171,7 @@ def explaining(also: Callable[[], str] = str) -> Iterator[None]:
         failure = next((error for error in _raised if isinstance(error, Failure)), None)
         if failure is None:
             raise
-        jax.jit(
-            lambda: jax.debug.callback(lambda: None)
-        )()  # JAX would stumble over the failed program once more, at its exit
+        jax.jit(lambda: jax.debug.callback(lambda: None))()  # else JAX meets the failed program again as it exits
         told = "; ".join(text for text in (str(failure), also()) if text)
         raise InputError(told) from failure.__cause__
 

@@ -8,6 +8,7 @@ import io
 import json
 import math
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
@@ -212,15 +213,15 @@ class Hosted(Family):
         """Return the length of a step in films [s]."""
         return 1 / 30
 
-    def filmed(self) -> Any:
+    def filmed(self) -> AbstractContextManager[None]:
         """Return a context in which pictures of all worlds are kept that begin in it."""
         return self.outside.worlds.filmed()
 
-    def pictures(self, states: HostedState) -> np.ndarray:
-        """Return the pictures (H, height, width, 3) of a world in those of its states, leaves (H, ...)."""
+    def pictures(self, states: HostedState, width: int, height: int) -> np.ndarray:
+        """Return pictures (H, height, width, 3) of a world in its states, leaves (H, ...), that were filmed."""
         number, place = int(states.number[0]), int(states.place[0])
         found = self.outside.worlds.pictures(number, np.asarray(states.clock), place)
-        return np.stack([np.asarray(Image.open(io.BytesIO(each))) for each in found])
+        return np.stack([np.asarray(Image.open(io.BytesIO(each)).resize((width, height))) for each in found])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

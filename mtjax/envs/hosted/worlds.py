@@ -57,8 +57,9 @@ class _Set:
         self.pictures: dict[tuple[int, int], bytes] | None = {} if filmed else None  # by clock and place
 
     def begin(self, places: np.ndarray, rows: np.ndarray, seeds: np.ndarray) -> None:
-        """Begin episodes in some worlds."""
-        self.obs[places] = self.pool.begin(places, rows, seeds)
+        """Begin episodes in some worlds; in none where only other families of a mixture begin some."""
+        if len(places):
+            self.obs[places] = self.pool.begin(places, rows, seeds)
         self.flags[places] = 0
         self._tick(places)
 
