@@ -1,0 +1,87 @@
+"""Environments of gymnax: classic control, MinAtar, bsuite and others."""
+
+import dataclasses
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mtjax.envs.adapters.family import Adapted
+from mtjax.names import nearest_error
+from mtjax.types import Array, Continuous, Discrete, InputError, Key
+
+_LIMIT = "max_steps_in_episode"
+
+
+@dataclasses.dataclass(frozen=True)
+class Gymnax(Adapted):
+    """gymnax: an environment of gymnax as it is, such as CartPole-v1 or Breakout-MinAtar.
+
+    Observation (O,): the environment's own array, flattened.
+    Action: one of n numbers, or a vector (A,) in [-1, 1], scaled to the environment's Box.
+    Reward, start and termination are the environment's own; at its time limit an episode is cut off.
+
+    Parameters that can vary: all numbers of the environment's EnvParams, such as CartPole's length. What gymnax has as
+        a number of its own does not follow from others: CartPole's polemass_length and total_mass stay where length and
+        masspole vary, unless they vary too (--env.combine=paired).
+    """
+
+    environment: str = "CartPole-v1"
+    """gymnax's name of the environment."""
+
+    suite: ClassVar[str] = "gymnax"
+    package: ClassVar[str] = "gymnax"
+    install: ClassVar[str] = "pip install six seaborn && pip install --no-deps 'gymnax>=1.0'"
+
+    @cached_property
+    def original(self) -> tuple[Any, Any]:
+        """Return gymnax's environment and its nominal parameters."""
+        module = self.module()
+        if self.environment not in module.registered_envs:
+            raise nearest_error("environment of gymnax", self.environment, module.registered_envs)
+        with jax.ensure_compile_time_eval():
+            found, params = module.make(self.environment)
+        if not hasattr(found, "is_truncated"):
+            raise InputError(f"gymnax tells terminated from cut off since version 1.0; {self.install}")
+        limit = self.time_limit or int(getattr(params, _LIMIT))
+        return found, params.replace(**{_LIMIT: limit})
+
+    @property
+    def defaults(self) -> Mapping[str, Any]:
+        values = {field.name: getattr(self.original[1], field.name) for field in dataclasses.fields(self.original[1])}
+        return {name: x for name, x in values.items() if isinstance(x, int | float) and name != _LIMIT}
+
+    @property
+    def episode_length(self) -> int:
+        """Return the steps after which an episode is cut off."""
+        return getattr(self.original[1], _LIMIT)
+
+    @cached_property
+    def action(self) -> Continuous | Discrete:  # type: ignore[override]
+        space = self._actions
+        return Discrete(int(space.n)) if hasattr(space, "n") else Continuous(int(np.prod(space.shape)))
+
+    @cached_property
+    def _actions(self) -> Any:
+        found, params = self.original
+        with jax.ensure_compile_time_eval():
+            return found.action_space(params)
+
+    def begin(self, params: Mapping[str, Any], key: Key) -> tuple[Any, Any]:
+        found, nominal = self.original
+        obs, world = found.reset_env(key, nominal.replace(**params))
+        return world, obs
+
+    def advance(
+        self, params: Mapping[str, Any], world: Any, action: Array, key: Key
+    ) -> tuple[Any, Any, Array, Array, Array]:
+        (found, nominal), space = self.original, self._actions
+        own = nominal.replace(**params)
+        if not self.discrete:
+            middle, half = (jnp.asarray(space.high) + space.low) / 2, (jnp.asarray(space.high) - space.low) / 2
+            action = middle + jnp.clip(action, -1, 1).reshape(space.shape) * half
+        obs, new, reward, terminated, _ = found.step_env(jax.random.split(key)[0], world, action, own)
+        return new, obs, reward, terminated, found.is_truncated(new, own)

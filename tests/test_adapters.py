@@ -1,0 +1,114 @@
+"""Environments of other JAX packages: the same steps as the originals', and parameters that vary as tasks."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from needs import needs
+
+import mtjax
+from mtjax import envs
+from mtjax.envs.adapters.family import AdaptedState
+from mtjax.types import InputError
+
+
+def play(family, task, original, steps=1000):
+    """Random steps of a world, and of the original from the same states by the same keys; leaves (H, ...).
+
+    Args:
+        original: a function of the state and the action that returns observation, reward and both kinds of end.
+    """
+
+    def step(state: AdaptedState, key):
+        action_key, reset_key = jax.random.split(key)
+        action = family.spec.action.random(action_key)
+        ours, theirs = family.step(task, state, action), original(state, action)
+        over = ours.terminated | ours.truncated
+        fresh = family.reset(task, reset_key).state
+        state = jax.tree.map(lambda x, y: jnp.where(over, x, y), fresh, ours.state)
+        return state, ((ours.obs, ours.reward, ours.terminated, ours.truncated), theirs)
+
+    begin, *keys = jax.random.split(jax.random.key(0), steps + 1)
+    whole = jax.jit(lambda: jax.lax.scan(step, family.reset(task, begin).state, jnp.stack(keys))[1])
+    return jax.device_get(whole())
+
+
+@needs("gymnax")
+@pytest.mark.parametrize(
+    ("name", "settings", "kinds"),
+    [
+        ("CartPole-v1", {"vary": {"length": "0.25,1"}, "split": "none", "time_limit": 25}, (True, True)),
+        ("Breakout-MinAtar", {}, (True, False)),
+        ("Asterix-MinAtar", {"vary": {"shot-cool-down": "3,7"}, "split": "none"}, (True, False)),
+        ("Pendulum-v1", {"vary": {"g": "5:15:2"}, "split": "none"}, (False, True)),
+        ("FourRooms-misc", {"time_limit": 40}, (False, True)),
+    ],
+)
+def test_steps_of_gymnax_are_the_originals(name, settings, kinds):
+    """A thousand of them, for each task, with terminations and time limits apart; the package resets none of them."""
+    import gymnax
+
+    family = mtjax.make(f"gymnax:{name}", **settings)
+    environment, nominal = gymnax.make(name)
+    low, high = (getattr(environment.action_space(nominal), end, 0) for end in ("low", "high"))
+    for row in range(family.train_count):
+        task = jax.tree.map(lambda x, row=row: x[row], family.tasks("train"))
+        values = {
+            key.replace("-", "_"): type(getattr(nominal, key.replace("-", "_")))(x) for key, x in task.params.items()
+        }
+        params = nominal.replace(max_steps_in_episode=family.episode_length, **values)
+
+        def original(state, action, params=params):
+            given = action if family.discrete else low + (action + 1) / 2 * (high - low)
+            _, _, reward, terminated, truncated, info = environment.step(state.key, state.world, given, params)
+            return info["final_observation"].astype(jnp.float32).ravel(), reward, terminated, truncated
+
+        ours, theirs = play(family, task, original)
+        np.testing.assert_allclose(ours[0], theirs[0], rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(ours[1], theirs[1], rtol=1e-5, atol=1e-6)
+        np.testing.assert_array_equal(ours[2], theirs[2])
+        np.testing.assert_array_equal(ours[3], theirs[3])
+        assert (ours[2].any(), ours[3].any()) == kinds
+
+
+@needs("gymnax")
+def test_every_environment_of_gymnax_that_needs_no_download_can_be_stepped():
+    """With a state of one form, which a scan carries."""
+    import gymnax
+
+    for name in sorted(set(gymnax.registered_envs) - {"MNISTBandit-bsuite"}):
+        family = mtjax.make(f"gymnax:{name}")
+        task = jax.tree.map(lambda x: x[0], family.tasks())
+        begun = jax.eval_shape(family.reset, task, jax.random.key(0))
+        action = jax.ShapeDtypeStruct(family.spec.action.shape, family.spec.action.dtype)
+        step = jax.eval_shape(family.step, task, begun.state, action)
+        form = lambda tree: jax.tree.map(lambda x: (x.shape, x.dtype, x.weak_type), tree)
+        assert form(step) == form(begun), name
+
+
+@needs("gymnax")
+def test_ppo_balances_poles_of_gymnax():
+    """Of four lengths, to the maximum."""
+    settings = {"vary": {"length": "0.25:1:4"}, "num_envs": 8, "eval_episodes": 4, "quiet": True}
+    result = mtjax.train("gymnax:CartPole-v1", "ppo", steps=200_000, eval_every=100_000, **settings)
+    assert result.evaluations.returns["train"][0, -1].mean() > 480
+
+
+def test_packages_that_are_missing_are_named_with_the_command(monkeypatch):
+    """For each of them, before anything else is done."""
+    missing = lambda name: (_ for _ in ()).throw(ImportError(f"No module named {name!r}"))
+    monkeypatch.setattr("mtjax.envs.adapters.family.importlib.import_module", missing)
+    adapted = [name for name, place in envs.SUITES.items() if ".adapters." in place]
+    assert adapted
+    for name in adapted:
+        with pytest.raises(InputError, match=r"cannot be imported \(No module named .*; pip install "):
+            _ = mtjax.make(f"{name}:CartPole-v1").spec
+
+
+@needs("gymnax")
+def test_mistakes_are_told():
+    """Unknown names and parameters, with the nearest of the package."""
+    with pytest.raises(InputError, match="did you mean 'CartPole-v1'"):
+        mtjax.make("gymnax:CartPol-v1")
+    with pytest.raises(InputError, match="unknown parameter 'lenght'; did you mean 'length'"):
+        mtjax.make("gymnax:CartPole-v1", vary={"lenght": "1,2"})
