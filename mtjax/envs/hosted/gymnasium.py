@@ -232,8 +232,9 @@ class Gymnasium(Hosted):
 
     @property
     def modules(self) -> tuple[str, ...]:
-        """Return the modules with the classes that make it."""
-        return type(self).__module__, getattr(creator(self.registered.entry_point), "__module__", "mtjax")
+        """Return the modules with the classes that make it: a class or a function of the user's own has one too."""
+        made = self.registered.entry_point
+        return type(self).__module__, *([] if isinstance(made, str) else [made.__module__])
 
     @property
     def idle(self) -> "Idle":
