@@ -69,6 +69,7 @@ class Sketches(PPO):
     """
 
     policies: ClassVar[tuple[type[Policy], ...]] = (Categorical,)
+    one_knowledge: ClassVar[bool] = True  # which sub-policies share
     hidden: tuple[int, ...] = (128,)
     actor_lr: float = 1e-3
     """Adam's learning rate for the actor."""
@@ -84,8 +85,8 @@ class Sketches(PPO):
     symbols: Annotated[int, tyro.conf.Suppress] = dataclasses.field(default=0, repr=False, metadata=parts.NO_SETTING)
     """Number of symbols while networks are made. It follows from the environment."""
 
-    def _check_combination(self) -> None:
-        super()._check_combination()
+    def check(self) -> None:
+        super().check()
         if self.heads != "disjoint":
             raise InputError(f"in sketches every task has a critic of its own: heads is disjoint, not {self.heads}")
         if self.normalize_observations:
@@ -93,17 +94,7 @@ class Sketches(PPO):
         if self.representation.learns or self.representation.history or self.encoder.front() is not None:
             raise InputError("sketches reads symbols off observations; use representation=plain and another encoder")
 
-    def require_policy(self, spec: Spec) -> None:
-        super().require_policy(spec)
-        if not spec.symbols:
-            raise InputError("sketches plays families that follow a sketch, such as --env=craft-sketched")
-
     # Networks.
-
-    @property
-    def knows_apart(self) -> bool:
-        """Whether every task has networks of its own by which it is known. Sub-policies need shared ones."""
-        return False
 
     @property
     def actor(self) -> Network:
@@ -116,14 +107,13 @@ class Sketches(PPO):
 
     def init(self, spec: Spec, tasks: Task, key: Key) -> AgentState:
         """Return the initial state. The curriculum gets to know the lengths of sketches."""
-        self.require_policy(spec)
+        if not spec.symbols:
+            raise InputError("sketches plays families that follow a sketch, such as --env=craft-sketched")
         state = super(Sketches, parts.put(self, symbols=spec.symbols)).init(spec, tasks, key)
         if not isinstance(self.sampler, ByLength):
             return state
         lengths = tasks.goal["length"].astype(jnp.int32)
-        return state._replace(
-            nets=state.nets | {"sampler": Params({}, state.nets["sampler"].own._replace(length=lengths))}
-        )
+        return state.with_nets(sampler=Params({}, state.nets["sampler"].own._replace(length=lengths)))
 
     def init_networks(self, num_tasks: int, actor_inputs: tuple, critic_inputs: tuple, action: Array, key: Key) -> Nets:
         nets = super().init_networks(num_tasks, actor_inputs, critic_inputs, action, key)
