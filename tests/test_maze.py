@@ -249,6 +249,13 @@ def test_pictures_show_the_maze_from_above(draw, turns, goal):
     assert (dark[0] > world.position[0]) == (turns == EAST)
 
 
+def test_looks_of_tasks_differ():
+    """Tasks of two hues have boxes of other colours."""
+    env = TwoGoalMaze(vary={"hue": "0,120"}, split="none", pixels=16)
+    one, other = env.tasks().scene["geom_rgba"]
+    assert not np.array_equal(one, other)
+
+
 def test_pictures_change_nothing_else(step):
     """The state beside them is that without them, at the start and after a step."""
     env = TwoGoalMaze(vary={"goal-box": "0,1"}, split="none", pixels=16, state="also", repeat=2, grey=True)

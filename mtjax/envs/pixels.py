@@ -186,6 +186,10 @@ class Pictured(Stepped):
         columns = {name: np.stack([row[name] for row in rows]) for name in LEAVES}
         return {name: column for name, column in columns.items() if np.any(column != column[0])}
 
+    def build(self) -> dict[str, dict[str, Any]]:
+        """Return the leaves (R, ...) of every row of the table, with what differs between scenes if they are seen."""
+        return super().build() | ({"scene": self.scene_leaves()} if self.pixels else {})
+
     # Observations.
 
     def look_at(self, task: Task, state: Any) -> Any:

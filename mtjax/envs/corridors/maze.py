@@ -109,12 +109,12 @@ class CorridorMaze(Pictured):
     def build(self) -> dict[str, dict[str, Any]]:
         """Return walls, balls and, if they are rewarded, ways to the goal (R, ...) of every row of the table."""
         layouts = self.for_rows(self.layout, ("layout",))
-        goal = self.goals() | {"balls": np.stack([layout.balls for layout in layouts]).astype(np.float32)}
+        built = super().build()
+        goal = built["goal"] | {"balls": np.stack([layout.balls for layout in layouts]).astype(np.float32)}
         if self.dense:
             ways = self.for_rows(self._ways, ("layout", "goal-colour"))
             goal |= {"ahead": np.stack([way.ahead for way in ways]), "rest": np.stack([way.rest for way in ways])}
-        seen = {"scene": self.scene_leaves()} if self.pixels else {}
-        return {"model": {"walls": np.stack([layout.walls for layout in layouts])}, "goal": goal, **seen}
+        return built | {"model": {"walls": np.stack([layout.walls for layout in layouts])}, "goal": goal}
 
     def _ways(self, values: Mapping[str, float]) -> Any:
         layout, colour = self.layout(values), self.parameters["goal-colour"].nominal
