@@ -37,7 +37,7 @@ class Request:
     video_tasks: tuple[int, ...] = ()
     """Numbers of the tasks to film in each split, counted from 0; by default the first, the middle and the last."""
     video_seconds: float = 10.0
-    """Seconds of an episode to film."""
+    """Seconds that the film lasts. Slow worlds, such as a boat's, are shown faster than they are."""
     export: str = ""
     """File to write the first seed's policy into: one that ends with .npz for ``mtjax/standalone.py``, which reads it
     with NumPy or JAX alone, or with .onnx for other runtimes."""

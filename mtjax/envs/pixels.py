@@ -63,6 +63,7 @@ class Pictured(Stepped):
 
     look: ClassVar[looks.Look | None] = None  # camera and light; None: the model's own, or a view of all of it
     meshes: ClassVar[bool] = False  # whether the scene is of meshes, which only Warp draws
+    film_speed: ClassVar[float] = 1.0  # seconds of the world in a second of a film
     hides: ClassVar[tuple[str, ...]] = ()  # geoms that films show and observations do not, such as a hidden goal
 
     def __post_init__(self):

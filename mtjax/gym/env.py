@@ -235,5 +235,5 @@ def _metadata(family: Env) -> dict[str, Any]:
         return {"render_modes": []}
     return {
         "render_modes": ["rgb_array"],
-        "render_fps": round(1 / family.seconds_per_step),
+        "render_fps": round(family.film_speed / family.seconds_per_step),
     }

@@ -77,7 +77,7 @@ def write(
 
     Args:
         tasks: all tasks of the environment.
-        seconds: how much of an episode to film; one that ends before stands still.
+        seconds: how long the film lasts; an episode that ends before stands still.
         named: other names of splits.
     """
     env = policy.env
@@ -110,7 +110,7 @@ def _tile(env: Tabled, one: Chosen, played: Recording, states: Any, count: int, 
     family: Any = one.part.family
     row = env.own_row(int(played.rows[one.place]))
     length = int(played.lengths[one.place])
-    times = np.arange(count) / _FPS / family.seconds_per_step
+    times = np.arange(count) / _FPS * family.film_speed / family.seconds_per_step
     steps = np.unique(np.minimum(times.astype(int), length - 1))
     shown = jax.tree.map(lambda x: np.asarray(x[one.own])[steps], states)
     size = width, width * 3 // 4
