@@ -215,6 +215,28 @@ _CORRIDORS: dict[str, Entry] = {
     "corridor-maze-vary-layout": ("maze:CorridorMaze", {"vary": {"layout": "0:9:10"}}),
 }
 
+# Worlds of a few equations, whose best outcomes are known.
+_ANALYTIC: dict[str, Entry] = {
+    "link": (
+        "link:Link",
+        {
+            "vary": {"bandwidth": "100:500", "delay": "0.05:0.5", "buffer": "10:1000", "loss": "0:0.05"},
+            "combine": "random",
+            "num_tasks": 10,
+        },
+    ),
+    "racing": ("racing:Racing", {"vary": {"track": "0:9:10"}}),
+    "sailing": (
+        "sailing:Sailing",
+        {
+            "vary": {"wind-speed": "4:8", "wind-direction": "-3.1:3.1", "current-speed": "0:0.3"},
+            "combine": "random",
+            "num_tasks": 10,
+        },
+    ),
+    "trading": ("trading:Trading", {"vary": {"risk-aversion": "0.5:5:10"}}),
+}
+
 _BRAX_NAMES = (
     "ant",
     "fast",
@@ -235,12 +257,13 @@ _BRAX: dict[str, Entry] = {
 }
 
 PICTURES = ("pixels", "frames", "repeat", "grey", "state", "plain", "painter")
-"""Settings that only families with a scene have: those of MuJoCo models, and mazes."""
+"""Settings that only families with a scene have: those of MuJoCo models, mazes and analytic worlds."""
 
 _inside = lambda folder, table: {name: (f"{folder}.{place}", settings) for name, (place, settings) in table.items()}
 ENVS = Families(
     _inside("mtjax.envs.dm_control", _DOMAINS | _FURTHER | _HIP_BMDP | _GOALS)
     | _inside("mtjax.envs.mtenv", _MTENV)
+    | _inside("mtjax.envs.analytic", _ANALYTIC)
     | _inside("mtjax.envs.corridors", _CORRIDORS)
     | _inside("mtjax.envs.craft", _CRAFT)
     | _inside("mtjax.envs.metaworld", FAMILIES)

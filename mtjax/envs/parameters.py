@@ -36,6 +36,11 @@ def positive(unit: str, nominal: float, edit: Any = None, **about: Any) -> Param
     return Parameter(unit, nominal, edit, minimum=0.0, **about)
 
 
+def not_negative(unit: str, nominal: float, edit: Any = None, **about: Any) -> Parameter:
+    """Return a parameter whose values are 0 or greater, such as a share that is lost."""
+    return Parameter(unit, nominal, edit, minimum=-1e-8, **about)
+
+
 def _scale_geom(geom: mujoco.MjsGeom, scale: float) -> None:
     """Scale mass and inertia together, however the model gives them."""
     if math.isnan(geom.mass):

@@ -1,0 +1,1 @@
+"""Worlds of a few equations in plain JAX, whose best outcomes are known."""
