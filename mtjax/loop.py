@@ -247,13 +247,14 @@ def _step(env, agent, trials: Trials, tasks, state: TrainState, keys: Key, reset
     ended = transition.ended
     fresh_keys = partial(world_keys, reset_keys, shape)
     begun = reset_ended(env, agent, state.agent, tasks, worlds, env_step.ends, fresh_keys, trials)
+    seen = _reduce_step(env_step, total, state.counted)
     state = state._replace(
         worlds=begun,
         total=jnp.where(ended, 0.0, total),
         counted=state.counted | ended,
         iteration=state.iteration + 1,
     )
-    return state, (followed(transition, env_step.ends, begun), _reduce_step(env_step, total, state.counted))
+    return state, (followed(transition, env_step.ends, begun), seen)
 
 
 def _learn(env, agent, tasks, learners: Any, data: Any, iteration: Array, keys: Key) -> tuple[Any, Metrics]:

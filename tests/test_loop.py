@@ -122,6 +122,12 @@ def test_reported_returns_are_those_of_the_episodes(walk):
     np.testing.assert_allclose(rows.reward, expected, rtol=1e-6)
 
 
+def test_first_episodes_of_staggered_worlds_are_not_reported():
+    """They are shorter than others: in two steps some of them end, and none that began at its beginning."""
+    state, (metrics,) = train(Walk(), Recorder(), {**SETTINGS, "chunk_steps": 2, "stagger": True})
+    assert np.all(np.sum(state.counted, axis=2) > 1) and np.all(metrics["episodes"] == 0)
+
+
 def test_warmup_acts_at_random_and_then_the_agent_does(walk):
     """For exactly as many steps as asked, in uniform actions held as long as asked; then each task by its own."""
     actions = stored(walk[0]).action[..., 0]
