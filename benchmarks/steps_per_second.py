@@ -11,6 +11,8 @@ training, whose automatic reset returns to one stored state. Compile time is rep
 A step is one of control. Both sides choose how many substeps of physics it takes, and by which integrator; where
 Playground takes more or fewer than we do, "our substeps" is its environment with the length of ours. Every row has its
 substeps a second too, and ratios are given by both.
+
+``--families link sailing racing trading`` times families that step in plain JAX, with their own tasks, beside them.
 """
 
 import argparse
@@ -47,7 +49,8 @@ _ON_CPU = jax.default_backend() == "cpu"
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--domains", nargs="+", default=list(DOMAINS), choices=DOMAINS)
+    parser.add_argument("--domains", nargs="*", default=list(DOMAINS), choices=DOMAINS)
+    parser.add_argument("--families", nargs="*", default=[], metavar="NAME", help="families that step in plain JAX")
     parser.add_argument("--engines", nargs="+", default=["c", "mjx"] if _ON_CPU else ["mjx", "warp"])
     parser.add_argument("--worlds", type=int, default=256 if _ON_CPU else 8192, help="environments, over all tasks")
     parser.add_argument("--steps", type=int, default=1000, help="steps of every environment in a timed call")
@@ -61,6 +64,9 @@ def main() -> None:
     for domain in arguments.domains:
         rows += compare(domain, arguments)
         print(table(rows, domain), flush=True)
+    for name in arguments.families:
+        rows.append(plain(name, arguments))
+        print(f"{name}: {rows[-1]['steps_per_second']:,.0f} steps/s", flush=True)
     if arguments.agent != "none":
         rows.append(training_rate(arguments))
         print(f"training {arguments.agent}: {rows[-1]['steps_per_second']:,.0f} env-steps/s", flush=True)
@@ -125,6 +131,18 @@ def compare(domain: str, arguments: argparse.Namespace) -> list[dict]:
     against = [c for c in contestants if c.name in ("playground jax", "playground warp")]
     best = max(against, key=lambda c: statistics.median(c.rates)) if against else None
     return [_row(domain, c, best) for c in contestants]
+
+
+def plain(name: str, arguments: argparse.Namespace) -> dict:
+    """Time a family that steps in plain JAX, a step of which is one of its own."""
+    env = mtjax.make(name)
+    per_task = -(-arguments.worlds // env.train_count)
+    make = lambda: ours(name, {}, per_task, arguments.steps, True)
+    physics = Physics(1, env.seconds_per_step, "jax")
+    contestant = Contestant("mtjax jax", per_task * env.train_count, arguments.steps, physics, make)
+    for _ in range(arguments.repeats):
+        contestant.time()
+    return _row(name, contestant, None)
 
 
 def _row(domain: str, contestant: Contestant, best: Contestant | None) -> dict:

@@ -28,7 +28,8 @@ _GRAVITY, _LENGTH = 9.81, _FRONT + _REAR
 _SUBSTEPS = 2
 _SLOW = 0.5  # [m/s] below which slips are those of this speed
 _START, _SPACING, _AHEAD = 3.0, 2.0, 8  # [m/s]; [m] between the bends that are observed, and how many
-_KERBS, _EYE, _PITCH = 72, (3.0, 1.4), 0.3  # segments of each side; the camera behind and above [m], down [rad]
+_KERBS = 30  # segments of each side; the caster draws no more geoms
+_EYE, _PITCH = (3.0, 1.4), 0.3  # [m] of the camera behind the car and above the floor; [rad] down
 
 
 class CarState(NamedTuple):
