@@ -12,7 +12,8 @@ from probes import QUICK, Stub
 
 import mtjax
 from mtjax.envs.analytic import link, sailing, tracks, trading
-from mtjax.report import render
+from mtjax.evaluation import record
+from mtjax.report import films, render
 from mtjax.rollout import reset_envs, step_envs
 from mtjax.types import InputError
 
@@ -507,6 +508,18 @@ def test_films_of_slow_worlds_are_quick():
     """A second of a film shows ten steps of a sale, twenty of a boat and twenty of a car."""
     per_second = {name: family(name).film_speed / family(name).seconds_per_step for name in NAMES}
     assert per_second == pytest.approx({"link": 10, "racing": 20, "sailing": 20, "trading": 10})
+
+
+def test_a_sale_is_filmed_though_its_state_has_a_key():
+    """As the command films it: ten of the fifty steps for each second."""
+    env, _ = alone("trading")
+    played = record(env, Idle(), jnp.zeros((1, 1)), env.tasks("all"), jnp.int32(0))
+    (one,) = films.choose(env, ["train"], [0])
+    try:
+        frames = films._tile(env, one, played, played.states, 50, 40)
+    except InputError as error:
+        pytest.skip(str(error))
+    assert frames.shape == (50, 30, 40, 3) and len(np.unique(frames, axis=0)) == 20
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -112,7 +112,7 @@ def _tile(env: Tabled, one: Chosen, played: Recording, states: Any, count: int, 
     length = int(played.lengths[one.place])
     times = np.arange(count) / _FPS * family.film_speed / family.seconds_per_step
     steps = np.unique(np.minimum(times.astype(int), length - 1))
-    shown = jax.tree.map(lambda x: np.asarray(x[one.own])[steps], states)
+    shown = jax.tree.map(lambda x: x[one.own][steps], states)  # also of keys, which NumPy has not
     size = width, width * 3 // 4
     drawn = render.film(family, row, shown, *size) if isinstance(family, Pictured) else family.pictures(shown, *size)
     frames = drawn[np.searchsorted(steps, np.minimum(times.astype(int), length - 1))]
