@@ -6,12 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from needs import require
+from needs import needs, require
 
 import mtjax
 import mtjax.train
 from mtjax import evaluation, rollout
 from mtjax.envs.engines.host import explaining
+from mtjax.envs.hosted.envpool import EnvPool
 from mtjax.envs.hosted.family import _known
 from mtjax.envs.hosted.gymnasium import Separate
 from mtjax.evaluate import main as evaluate_main
@@ -110,7 +111,8 @@ def play(family, steps, num_envs=3):
         worlds = rollout.reset_envs(family, agent, learners, tasks, keys(key))
         return jax.lax.scan(step, worlds, jax.random.split(key, steps))[1]
 
-    return jax.device_get(whole(jax.random.key(3)))
+    with explaining():
+        return jax.device_get(whole(jax.random.key(3)))
 
 
 @pytest.fixture
@@ -366,3 +368,46 @@ def test_a_class_is_registered_under_its_name():
             return np.array([7.0, 7.0])
 
     assert play(mtjax.hosted(Mine, time_limit=5), 2, num_envs=1)[0].obs.min() == 7
+
+
+@needs("envpool")
+@pytest.mark.filterwarnings("ignore:.*precision lowered by casting")
+@pytest.mark.parametrize("name", ["CartPole-v1", "Pendulum-v1"])
+def test_steps_of_envpool_are_its_own(name, monkeypatch):
+    """With EnvPool's automatic reset, whose step between two episodes is left out here."""
+    import envpool
+
+    seeds, make = [], EnvPool.make
+    monkeypatch.setattr(
+        EnvPool, "make", lambda self, row, count, seed: seeds.append(seed) or make(self, row, count, seed)
+    )
+    family = mtjax.make(f"envpool:{name}", time_limit=20)
+    transition, terminal, _ = play(family, 100)
+    original = envpool.make(name, env_type="gymnasium", num_envs=3, seed=seeds[0], max_episode_steps=20)
+    obs = original.reset()[0]
+    for world in range(3):
+        before, ids = obs[world], np.array([world])
+        for step in range(100):
+            own = jax.tree.map(lambda x, step=step, world=world: x[step, 0, 0, world], transition)
+            np.testing.assert_array_equal(own.obs, np.float32(before))
+            after, reward, terminated, truncated, _ = original.step(family.actor.read_all(own.action[None]), ids)
+            np.testing.assert_array_equal(own.next_obs, np.float32(after[0]))
+            assert own.reward == np.float32(reward[0]) and own.ended == (terminated | truncated)[0]
+            assert terminal[step, 0, 0, world] == terminated[0]
+            before = original.step(family.actor.read_all(own.action[None]), ids)[0][0] if own.ended else after[0]
+    assert transition.ended.sum() > 10
+
+
+@needs("envpool")
+def test_pictures_of_envpool_are_single_and_settings_are_tasks():
+    """Agents see the last four; each task has a pool with its settings."""
+    family = mtjax.make("envpool:Pong-v5", vary={"repeat-action-probability": "0,0.25"}, split="none", time_limit=30)
+    assert (
+        family.spec.obs["pixels"].shape == (84, 84, 1) and family.spec.frames == 4 and family.spec.action == Discrete(6)
+    )
+    transition = play(family, 40, num_envs=2)[0]
+    assert transition.obs["pixels"].shape == (40, 1, 2, 2, 84, 84, 4) and transition.ended.sum() == 4
+    with pytest.raises(InputError, match="give lists"):
+        mtjax.make("envpool:Pong-v5", vary={"repeat-action-probability": "0:0.25"})
+    with pytest.raises(InputError, match="did you mean 'Pong-v5'"):
+        mtjax.make("envpool:Pongg-v5")

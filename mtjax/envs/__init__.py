@@ -59,6 +59,7 @@ Entry = tuple[Any, Settings]  # a family's class, or the place that it is import
 
 SUITES = {
     "gymnasium": "mtjax.envs.hosted.gymnasium:Gymnasium",
+    "envpool": "mtjax.envs.hosted.envpool:EnvPool",
     "gymnax": "mtjax.envs.adapters.gymnax:Gymnax",
 }
 """Families of the environments of other packages, by the first part of their names: SUITE:ENVIRONMENT."""

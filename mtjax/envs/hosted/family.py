@@ -19,11 +19,12 @@ from PIL import Image, ImageOps
 
 from mtjax.envs.engines import host
 from mtjax.envs.family import Family
+from mtjax.envs.hosted.spaces import Actor, Reader
 from mtjax.envs.hosted.worlds import GONE, TERMINATED, TRUNCATED, Pool, Worlds
 from mtjax.envs.parameters import Parameter
 from mtjax.frames import PICTURES
 from mtjax.maps import over_worlds
-from mtjax.types import Array, InputError, Key, Spec, Step, Task
+from mtjax.types import Array, Continuous, Discrete, InputError, Key, Spec, Step, Task
 
 _MOST_FRAMES = 16
 _MOST_STEPS = 1_000_000
@@ -71,8 +72,8 @@ class Hosted(Family):
 
     @property
     @abc.abstractmethod
-    def picture_or_vector(self) -> jax.ShapeDtypeStruct:
-        """Return the shape of an observation: a picture (H, W, C) uint8, or a vector (O,) float32."""
+    def spaces(self) -> tuple[Any, Any]:
+        """Return Gymnasium's spaces of observations and actions."""
 
     @property
     @abc.abstractmethod
@@ -104,6 +105,36 @@ class Hosted(Family):
     def read_value(self, name: str, value: float) -> Any:
         """Return a parameter's value as the environment takes it."""
         return float(value)
+
+    @cached_property
+    def reader(self) -> Reader:
+        """Return what reads observations."""
+        return Reader(self.environment, self.spaces[0])
+
+    @cached_property
+    def actor(self) -> Actor:
+        """Return what reads actions."""
+        return Actor(self.environment, self.spaces[1])
+
+    @property
+    def picture_or_vector(self) -> jax.ShapeDtypeStruct:
+        """Return the shape of an observation: a picture (H, W, C) uint8, or a vector (O,) float32."""
+        return jax.ShapeDtypeStruct(self.reader.shape, self.reader.dtype)
+
+    @property
+    def action(self) -> Continuous | Discrete:
+        """Return the kind and the size of actions."""
+        return self.actor.action
+
+    @property
+    def action_size(self) -> int:  # type: ignore[override]
+        """Return the number of actions, or the size A of one."""
+        return self.action.size
+
+    @property
+    def discrete(self) -> bool:  # type: ignore[override]
+        """Whether an action is the number of a choice."""
+        return isinstance(self.action, Discrete)
 
     @property
     def name(self) -> str:
@@ -277,3 +308,18 @@ def parameters_of(names: Mapping[str, Any]) -> dict[str, Parameter]:
     """Return a parameter for every argument of an environment, by its name with dashes, given the defaults."""
     number = lambda x: float(x) if isinstance(x, int | float) else 0.0
     return {name.replace("_", "-"): Parameter("1", number(default)) for name, default in names.items()}
+
+
+def typed(environment: str, name: str, default: Any, value: float) -> Any:
+    """Return a parameter's value, of the type that its default has.
+
+    Raises:
+        InputError: it is not whole, and the default is.
+    """
+    if isinstance(default, float) or not float(value).is_integer():
+        if isinstance(default, int):
+            raise InputError(
+                f"{name} of {environment} is a whole number, not {value:g}; --split=none holds no values out"
+            )
+        return float(value)
+    return bool(value) if isinstance(default, bool) else int(value)

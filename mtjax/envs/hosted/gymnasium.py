@@ -8,76 +8,16 @@ from functools import cached_property
 from importlib import import_module
 from typing import Any, ClassVar
 
-import jax
 import numpy as np
 
 from mtjax.checks import shown
-from mtjax.envs.hosted.family import Hosted, as_picture, parameters_of
+from mtjax.envs.hosted.family import Hosted, as_picture, parameters_of, typed
 from mtjax.envs.hosted.worlds import Outcome
 from mtjax.envs.parameters import Parameter
 from mtjax.names import nearest_error, public
-from mtjax.types import Continuous, Discrete, InputError
+from mtjax.types import InputError
 
-_LEAST_PICTURE = 16
-"""Pixels a side of the smallest picture. Smaller arrays of bytes, such as those of grid worlds, are vectors."""
-_MOST_CHANNELS = 4
 _MOST_IDLE = 256
-_FIXES = "wrap the environment in one of gymnasium.wrappers, such as FlattenObservation"
-
-
-class Reader:
-    """Turns observations of a space into a vector (O,) float32, or a picture (H, W, C) uint8."""
-
-    def __init__(self, name: str, space: Any):
-        kind, shape = type(space).__name__, space.shape
-        if kind != "Box" or not np.issubdtype(space.dtype, np.number) or not np.prod(shape):
-            raise InputError(f"{name} observes {shown(space)}, and agents take a Box: a vector or a picture; {_FIXES}")
-        self.name, self.given, self.axes, self.shape = name, shape, None, (int(np.prod(shape)),)
-        if space.dtype == np.uint8 and len(shape) in (2, 3):
-            self._see(shape if len(shape) == 3 else (*shape, 1))
-        self.dtype = np.float32 if len(self.shape) == 1 else np.uint8
-
-    def _see(self, shape: tuple[int, ...]) -> None:
-        """Note where the channels of a picture are. Arrays that are none stay vectors."""
-        for axes in ((0, 1, 2), (1, 2, 0)):
-            high, wide, channels = (shape[i] for i in axes)
-            if self.axes is None and channels <= _MOST_CHANNELS and min(high, wide) >= _LEAST_PICTURE:
-                self.axes, self.shape = axes, (high, wide, channels)
-
-    def read(self, obs: Any) -> np.ndarray:
-        """Return an observation as agents take it."""
-        found = np.asarray(obs)
-        if found.shape != self.given:
-            raise ValueError(f"an observation has the shape {found.shape}, and its space {self.given}")
-        if self.axes is None:
-            return found.astype(np.float32).reshape(self.shape)
-        return found.reshape(found.shape if found.ndim == 3 else (*found.shape, 1)).transpose(self.axes)
-
-
-class Actor:
-    """Turns actions of agents into those of a space."""
-
-    def __init__(self, name: str, space: Any):
-        kind, self.space = type(space).__name__, space
-        if kind == "Discrete":
-            self.action, self.start = Discrete(int(space.n)), int(space.start)
-            return
-        if kind != "Box" or not np.issubdtype(space.dtype, np.floating) or not np.prod(space.shape):
-            raise InputError(f"{name} takes {shown(space)} as actions, and agents give one of n, or a Box of floats")
-        if not np.all(np.isfinite(space.low) & np.isfinite(space.high)):
-            raise InputError(
-                f"{name} takes actions without bounds, which agents give in [-1, 1]; wrap the environment in "
-                "gymnasium.wrappers.RescaleAction, or give its Box a low and a high"
-            )
-        self.action = Continuous(int(np.prod(space.shape)))
-        self.middle, self.half = (space.high + space.low) / 2, (space.high - space.low) / 2
-
-    def read(self, action: np.ndarray) -> Any:
-        """Return the action that the space has for one of an agent, (A,) in [-1, 1] or ()."""
-        if isinstance(self.action, Discrete):
-            return self.start + int(action)
-        scaled = self.middle + np.clip(action, -1, 1).reshape(self.space.shape) * self.half
-        return scaled.astype(self.space.dtype)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,14 +63,7 @@ class Gymnasium(Hosted):
 
     def read_value(self, name: str, value: float) -> Any:
         """Return a parameter's value, of the type that its default has."""
-        default = self._defaults.get(name.replace("-", "_"))
-        if isinstance(default, float) or not float(value).is_integer():
-            if isinstance(default, int):
-                raise InputError(
-                    f"{name} of {self.environment} is a whole number, not {value:g}; --split=none holds no values out"
-                )
-            return float(value)
-        return bool(value) if isinstance(default, bool) else int(value)
+        return typed(self.environment, name, self._defaults.get(name.replace("-", "_")), value)
 
     @cached_property
     def _defaults(self) -> dict[str, Any]:
@@ -183,35 +116,6 @@ class Gymnasium(Hosted):
         made = self.make(None if not self.vary else 0)
         made.close()
         return made.observation_space, made.action_space
-
-    @cached_property
-    def reader(self) -> Reader:
-        """Return what reads observations."""
-        return Reader(self.environment, self.spaces[0])
-
-    @cached_property
-    def actor(self) -> Actor:
-        """Return what reads actions."""
-        return Actor(self.environment, self.spaces[1])
-
-    @property
-    def picture_or_vector(self) -> jax.ShapeDtypeStruct:
-        return jax.ShapeDtypeStruct(self.reader.shape, self.reader.dtype)
-
-    @property
-    def action(self) -> Continuous | Discrete:
-        """Return the kind and the size of actions."""
-        return self.actor.action
-
-    @property
-    def action_size(self) -> int:  # type: ignore[override]
-        """Return the number of actions, or the size A of one."""
-        return self.action.size
-
-    @property
-    def discrete(self) -> bool:  # type: ignore[override]
-        """Whether an action is the number of a choice."""
-        return isinstance(self.action, Discrete)
 
     @property
     def own_limit(self) -> int | None:
