@@ -195,10 +195,12 @@ class Separate:
 
     def step(self, places: np.ndarray, actions: np.ndarray) -> Outcome:
         """Step worlds (k,)."""
-        reader, actor = self.family.reader, self.family.actor
-        steps = [self.made[i].step(actor.read(x)) for i, x in zip(places.tolist(), actions, strict=True)]  # type: ignore
+        given = self.family.actor.read_all(actions)
+        given = given.tolist() if self.family.discrete else given
+        steps = [self.made[i].step(x) for i, x in zip(places.tolist(), given, strict=True)]  # type: ignore
         obs, reward, terminated, truncated, _ = zip(*steps, strict=True)
-        return Outcome(np.stack([reader.read(x) for x in obs]), *map(np.array, (reward, terminated, truncated)))
+        read = self.family.reader.read_all(np.stack(obs))
+        return Outcome(read, *map(np.array, (reward, terminated, truncated)))
 
     def picture(self, place: int) -> bytes:
         """Return a picture of a world, as PNG."""
