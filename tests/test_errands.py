@@ -7,11 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import plain_craft as plain
 import pytest
-from probes import QUICK
+from needs import needs
+from probes import QUICK, tiny, with_nets
 from test_craft import restated
 
 import mtjax
+from mtjax.agents.parts.knowing.text import encode
 from mtjax.envs.craft.errands import ERRANDS, THINGS
+from mtjax.networks import Params
 
 ENV = mtjax.make("errands")
 KINDS = {
@@ -93,6 +96,35 @@ def test_new_orders_and_new_words_are_held_out():
     spoken = lambda said: {word for sentence in said for word in re.findall(r"\w+", sentence.lower())}
     assert spoken(ENV.sentences[120:]) - spoken(ENV.sentences[:96]) == {"run"}
     assert spoken(ENV.sentences[96:120]) <= spoken(ENV.sentences[:96])
+
+
+@needs("sklearn")
+def test_sentences_that_were_never_said_are_understood_by_what_they_share_with_others():
+    """A linear reading of hashed sentences, fitted to training: all new orders, and most with the new word.
+
+    By chance it would be 1 in 30. The new word shares entries of the hash with others, and so hides some things.
+    """
+    vectors, sketches = encode("hashing", ENV.sentences), np.asarray(ENV.tasks("all").goal["sketch"])
+    wanted = np.eye(len(THINGS))[sketches].reshape(168, -1)
+    train, rest = vectors[:96], vectors[96:]
+    reading = np.linalg.solve(train.T @ train + 0.01 * np.eye(train.shape[1]), train.T @ wanted[:96])
+    found = (rest @ reading).reshape(72, 2, len(THINGS)).argmax(axis=2)
+    right = np.all(found == sketches[96:], axis=1)
+    assert right[:24].mean() == 1 and right[24:].mean() > 0.7
+    shuffled = np.random.default_rng(0).permutation(72)
+    assert np.all(found[shuffled] == sketches[96:], axis=1).mean() < 0.1
+
+
+@needs("sklearn")
+def test_an_agent_reads_the_sentence_of_every_split():
+    """By conditioning=text each task's features are its own sentence's, held out or not."""
+    agent = tiny("ppo", conditioning="text").for_action(ENV.action)
+    state = jax.eval_shape(lambda: agent.init(ENV.spec, ENV.tasks(), jax.random.key(0)))
+    table, tasks = agent.conditioning.table(ENV.spec, 96), ENV.tasks("all")
+    known = Params({"vectors": table}, {"context": ENV.tasks().context})
+    state = with_nets(state, tasks=known)
+    features = jax.vmap(lambda task: agent.features(state, task))(tasks)
+    np.testing.assert_allclose(features, encode("hashing", ENV.sentences), atol=1e-6)
 
 
 # Rules.

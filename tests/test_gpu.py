@@ -129,8 +129,9 @@ def learned(name, tasks):
 
 def spec_for(name):
     """The shapes that an agent sees and draws; of discrete actions where it draws these."""
-    discrete = name.startswith("discrete-") or name == "pqn"
-    return SPEC._replace(action=Discrete(SPEC.action_size)) if discrete else SPEC
+    discrete = name.startswith("discrete-") or name in ("pqn", "sketches")
+    spec = SPEC._replace(action=Discrete(SPEC.action_size)) if discrete else SPEC
+    return spec._replace(symbols=2) if name == "sketches" else spec
 
 
 def exactly(family):
@@ -337,6 +338,8 @@ def experience(agent, num_seeds, num_tasks):
         steps = steps._replace(action=raw)
     ended = random.random(steps.reward.shape) < 0.1
     memory = Memory(None) if steps.memory is None else steps.memory
+    returns = agent.sampler.begin()
+    memory = memory._replace(sampler=None if returns is None else np.zeros(ended.shape, np.float32))
     taken = Taken(raw, random.normal(size=ended.shape).astype(np.float32) - 2)
     return steps._replace(ended=ended, closed=ended, extras=taken, memory=memory)
 

@@ -110,7 +110,7 @@ class Sketches(PPO):
         if not spec.symbols:
             raise InputError("sketches plays families that follow a sketch, such as --env=craft-sketched")
         state = super(Sketches, parts.put(self, symbols=spec.symbols)).init(spec, tasks, key)
-        if not isinstance(self.sampler, ByLength):
+        if not isinstance(self.sampler, ByLength) or "length" not in tasks.goal:
             return state
         lengths = tasks.goal["length"].astype(jnp.int32)
         return state.with_nets(sampler=Params({}, state.nets["sampler"].own._replace(length=lengths)))
