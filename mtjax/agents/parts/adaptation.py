@@ -1,0 +1,57 @@
+"""Learning to adapt: parameters that are good after a few gradient steps on a task (Finn et al. 2017, "MAML")."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from mtjax.types import Array
+
+Gain = Callable[[Any, Any], Array]
+"""What one task gains () with parameters, as far as data of it tell."""
+
+
+def adapt(gain: Gain, params: Any, data: Any, rate: float | Array, first_order: bool = False) -> Any:
+    """Return parameters after gradient steps on one task, as a function of ``params`` that can be differentiated:
+
+        theta_(k+1) = theta_k + rate grad gain(theta_k, D_k)
+
+    Args:
+        data: of each step, leaves (K, ...); of policies they are rollouts of the policy with theta_k.
+        first_order: take these gradients as constants, so that nothing is differentiated twice.
+    """
+
+    def step(params: Any, data: Any) -> tuple[Any, None]:
+        slope = jax.grad(gain)(params, data)
+        slope = jax.lax.stop_gradient(slope) if first_order else slope
+        return jax.tree.map(lambda x, y: x + rate * y, params, slope), None
+
+    return jax.lax.scan(step, params, data)[0]
+
+
+def adapted_gain(
+    gain: Gain, params: Any, before: Any, after: Any, rate: float | Array, first_order: bool = False
+) -> Array:
+    """Return what tasks gain on average once each has adapted, which MAML maximises: mean_i gain(theta_i, D'_i).
+
+    Data are constants: as in the paper, nothing rewards rollouts before a step for what they let it find out.
+
+    Args:
+        before: of the steps of each task, leaves (T, K, ...), as for ``adapt``.
+        after: of each task, leaves (T, ...); of policies they are rollouts of the adapted policy.
+    """
+    adapt_one = partial(adapt, gain, params, rate=rate, first_order=first_order)
+    return jnp.mean(jax.vmap(lambda before, after: gain(adapt_one(before), after))(before, after))
+
+
+def surrogate(log_prob: Array, advantage: Array) -> Array:
+    """Return the gain () of a policy in steps (N,) that the policy itself has taken, given their log-probabilities:
+
+        mean(pi / sg(pi) A)
+
+    Its first and second derivatives are on average those of the expected advantage (Foerster et al. 2018, "DiCE"), as
+    MAML needs both. Those of mean(log pi A) are not: the second lacks the product of two slopes of log pi.
+    """
+    return jnp.mean(jnp.exp(log_prob - jax.lax.stop_gradient(log_prob)) * advantage)
