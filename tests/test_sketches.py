@@ -218,5 +218,5 @@ def test_what_makes_no_sense_is_refused(given, said):
 def test_families_that_follow_no_sketch_are_refused():
     env = mtjax.make("craft")
     with pytest.raises(InputError, match="families that follow a sketch, such as --env=craft-sketched"):
-        mtjax.agent("sketches").for_action(env.action).require_policy(env.spec)
+        mtjax.agent("sketches").for_action(env.action).init(env.spec, env.tasks(), jax.random.key(0))
     assert isinstance(made().experience, Rollouts) and pick(TASKS, 0).goal["length"] == 1
