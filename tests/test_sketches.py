@@ -114,6 +114,16 @@ def test_ablations_share_less_or_everything(sharing, heads):
     assert not isinstance(agent.actor, SubPolicies)
 
 
+def test_unseen_tasks_use_what_sketches_share():
+    """Only a policy for each task is borrowed from a nearest one."""
+    said = {sharing: made(sharing=sharing).unseen for sharing in ("symbols", "tasks", "all")}
+    assert said == {
+        "symbols": "each is played by the policies of its sketch's symbols",
+        "tasks": "each uses the networks of the nearest training task",
+        "all": "",
+    }
+
+
 # Gradients.
 
 

@@ -47,12 +47,12 @@ class Sketches(PPO):
     A task's sketch is a sequence of symbols b_1 ... b_K, and its policy plays their sub-policies one after another:
         pi(a|s) = pi_b(a|s), with the symbol b that is due
     A sub-policy has one action more than the world, STOP, after which the next symbol is due. Tasks share the
-    sub-policies of the symbols that they have in common, and each has a critic of its own. So the gradient of a step
-        A grad log pi_b(a|s),  A the advantage by the task's critic
-    moves the sub-policy of its symbol, and no other. The environment follows the sketch, as craft-sketched and
-    light-world-sketched do: its observations end with the symbol that is due. No sub-policy sees it, nor the task.
+    sub-policies of the symbols that they have in common, and each task has a critic of its own. So the gradient of a
+    step, A grad log pi_b(a|s) with the advantage A by the task's critic, moves the sub-policy of its symbol and no
+    other. The environment follows the sketch, as craft-sketched and light-world-sketched do: its observations end with
+    the symbol that is due. No sub-policy sees it, nor the task.
 
-    The curriculum is a sampler, by-length: it begins with the shortest sketches, and goes on to longer ones once the
+    The curriculum is the sampler by-length. It begins with the shortest sketches, and goes on to longer ones once the
     mean return of every task is above ``mastered``. Others have no weight until then.
 
     A task that was not trained on is played by the sub-policies of its sketch, without further learning.
@@ -128,6 +128,12 @@ class Sketches(PPO):
     # Tasks that were not trained on.
 
     @property
+    def borrowed(self) -> list[str]:
+        """Names of what a task that was not trained on uses of its nearest training task to act."""
+        return [name for name in super().borrowed if name != "networks" or self.sharing == "tasks"]
+
+    @property
     def unseen(self) -> str:
         """A sentence on what stands in for unseen tasks."""
-        return super().unseen if self.sharing == "tasks" else "the policies of its sketch's symbols play each"
+        played = "each is played by the policies of its sketch's symbols" * (self.sharing == "symbols")
+        return ", and ".join(filter(None, (played, super().unseen)))
