@@ -27,7 +27,7 @@ from mtjax.envs import name_of as env_name_of
 from mtjax.envs.task_table import Tabled
 from mtjax.experience import Replay
 from mtjax.frames import shown
-from mtjax.loop import Settings, require_trials
+from mtjax.loop import Settings, require_curriculum, require_trials
 from mtjax.names import PRESETS, nearest_error, public
 from mtjax.parallel import mesh as meshes
 from mtjax.types import InputError
@@ -138,9 +138,14 @@ class RunConfig:
         return len(self.family.tasks("train").id)
 
     @property
+    def played_tasks(self) -> int:
+        """Return the number of training tasks that are played at a time."""
+        return self.training.plays.count(self.num_tasks)
+
+    @property
     def worlds(self) -> int:
-        """Return the number of environments of each seed, summed over tasks."""
-        return self.num_tasks * self.training.num_envs
+        """Return the number of environments of each seed, summed over the tasks that are played at a time."""
+        return self.played_tasks * self.training.num_envs
 
     @property
     def warmup(self) -> int:
@@ -150,7 +155,7 @@ class RunConfig:
     @cached_property
     def played(self) -> Settings:
         """Return the training settings with the chunks that are played, which divide the run evenly."""
-        return fit_chunk(self.training, self.num_tasks, self.plan.steps, self.learner.experience.steps)
+        return fit_chunk(self.training, self.played_tasks, self.plan.steps, self.learner.experience.steps)
 
     @property
     def steps_per_chunk(self) -> int:
@@ -175,7 +180,7 @@ class RunConfig:
         Raises:
             InputError: they cannot share its seeds and worlds evenly.
         """
-        return meshes.mesh_for(self.plan.seeds * max(len(self.points), 1), self.num_tasks, self.training.num_envs)
+        return meshes.mesh_for(self.plan.seeds * max(len(self.points), 1), self.played_tasks, self.training.num_envs)
 
     def check(self) -> None:
         """Check the configuration as a whole, before a folder is made. Nothing after it checks again.
@@ -193,6 +198,7 @@ class RunConfig:
             )
         self.learner.experience.check(self.family, self.played.num_envs, self.played.chunk_steps)
         require_trials(self.training, self.family, self.learner)
+        require_curriculum(self.played, self.family, self.learner)
         for learner in agents_at(self.learner, self.points):
             require_value_range(learner)
         trials.require_whole(self.plan.eval_episodes, self.training.trials, "eval-episodes")

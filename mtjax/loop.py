@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mtjax import frames
+from mtjax import curricula, frames
+from mtjax.agents.state import of_tasks, with_tasks
 from mtjax.agents.swept import at_point, with_numbers
 from mtjax.checks import check_fields
 from mtjax.maps import Flat, over_seeds, when
@@ -50,6 +51,9 @@ class Settings:
     stagger: bool = True
     """Begin environments at different ages, so that their episodes end at different times; returns do not count first
     episodes, which are shorter."""
+    curriculum: str = "all"
+    """Which training tasks are played: all; random:T, T of them, drawn anew for every chunk; or sequence:STEPS, one
+    after another for so many steps of every environment. The agent knows all of them, and is evaluated on all."""
     trials: int = 1
     """Episodes of a trial: for so many of them the task and the agent's memory stay, and the agent maximises their sum
     of rewards. 1 makes every episode a trial of its own."""
@@ -65,7 +69,12 @@ class Settings:
                 raise InputError(f"{name.replace('_', '-')} must be at least 1, not {getattr(self, name)}")
         if self.reset_free and self.trials > 1:
             raise InputError(f"--reset-free has no episodes to repeat; use --trials=1, not {self.trials}")
-        _ = self.trial
+        _ = self.trial, self.plays
+
+    @property
+    def plays(self) -> curricula.Curriculum:
+        """Return which tasks are played."""
+        return curricula.read(self.curriculum)
 
     @property
     def trial(self) -> Trials:
@@ -83,23 +92,29 @@ class TrainState(NamedTuple):
     data: Any  # the experience's, leaves (S, ...)
     iteration: Array  # () int32, steps taken by every environment
     key: Key  # (S,)
+    rows: Array | None = None  # (T,) int32 numbers of the tasks that worlds play; None: all that the agent knows
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
 def init(
     env: Env, agent: Agent, settings: Settings, tasks: Task, seeds: Array, numbers: dict[str, Array] | None = None
 ) -> TrainState:
-    """Return a fresh training state for ``seeds`` (S,) on training ``tasks`` (T, ...).
+    """Return a fresh training state for ``seeds`` (S,) on training ``tasks`` (N, ...).
 
     Args:
         numbers: values (S,), by name, of the agent's numbers that vary between seeds, in a sweep.
     """
     agent.experience.check(env, settings.num_envs)
     require_trials(settings, env, agent)
+    require_curriculum(settings, env, agent)
+    known, rows = tasks, None
+    if settings.plays.changes:
+        rows = settings.plays.rows(jnp.int32(0), len(known.id))
+        tasks = rows_of(known, rows)
     num_tasks = len(tasks.id)
     shape = (len(seeds), num_tasks, settings.num_envs // collectives.count())
     key, agent_key, reset_key, data_key = split_keys(jax.vmap(jax.random.key)(seeds), 4)
-    learners = jax.vmap(partial(_init_agent, env, agent, tasks))(agent_key, numbers or {})
+    learners = jax.vmap(partial(_init_agent, env, agent, known))(agent_key, numbers or {})
     worlds = reset_envs(env, agent, learners, tasks, world_keys(reset_key, shape), settings.trial)
     if settings.stagger:
         episode = None if worlds.episode is None else _first_episodes(settings.trials, shape)
@@ -113,6 +128,7 @@ def init(
         data=agent.experience.init(blank, env.spec, num_tasks, settings.num_envs, data_key),
         iteration=jnp.int32(0),
         key=key,
+        rows=rows,
     )
 
 
@@ -120,6 +136,28 @@ def _init_agent(env: Env, agent: Agent, tasks: Task, key: Key, numbers: dict[str
     """Return the initial state of an agent, which keeps those of its numbers that a sweep varies."""
     state = with_numbers(agent, numbers).init(env.spec, tasks, key)
     return state._replace(numbers=numbers) if numbers else state
+
+
+def require_curriculum(settings: Settings, env: Any, agent: Any) -> None:
+    """Check that an agent can learn some of its tasks at a time.
+
+    Raises:
+        InputError: it cannot.
+    """
+    if not settings.plays.changes:
+        return
+    told, experience = f"the curriculum {settings.curriculum}", agent.experience
+    if isinstance(settings.plays, curricula.Sequence) and settings.plays.steps % settings.chunk_steps:
+        raise InputError(f"{told} changes the task between chunks: give a multiple of --chunk-steps")
+    if isinstance(settings.plays, curricula.Random) and experience.steps == 1:
+        raise InputError(f"{told} empties a replay with every chunk; use an agent with rollouts, such as ppo")
+    if experience.reset_every or experience.host_slots(settings.num_envs):
+        raise InputError(f"{told} begins a replay anew; use --reset-every=0 and --host-replay-size=0")
+    if not isinstance(env, Flat):
+        raise InputError(f"{told} is for single families, whose tasks share one physics, and not for mixtures")
+    rule = getattr(agent, "gradients", None)
+    if rule is not None and jax.tree.leaves(rule.init(2)):
+        raise InputError(f"{told} needs a rule of gradients without memory of the tasks, such as mean or pcgrad")
 
 
 def require_trials(settings: Settings, env: Any, agent: Agent) -> None:
@@ -202,22 +240,77 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
         (S, T), the first step whose numbers were not finite, or -1; "bad_reward" (S, T) that whose reward was not.
         Worlds that are lost at more than one in 10,000 steps of a task count as numbers that are not finite.
     """
-    experience = agent.experience
+    experience, known = agent.experience, tasks
+    if settings.plays.changes:
+        state = _take_turns(env, agent, settings, known, state)
+        tasks = rows_of(known, state.rows)
 
     def iterate(state: TrainState, _) -> tuple[TrainState, Metrics]:
         key, act_key, reset_key, learn_key = split_keys(state.key, 4)
         state, steps, seen = _collect(env, agent, settings.trial, tasks, state, act_key, reset_key)
         assess = lambda learner, steps: at_point(agent, learner).assess(learner, steps, tasks)
         observe = lambda learner, steps: at_point(agent, learner).observe(learner, steps, tasks)
-        learners, steps = over_seeds(assess, 0, 0)(state.agent, steps)
+        learners, steps = over_seeds(assess, 0, 0)(_of_played(state.agent, state.rows), steps)
         data = experience.add(state.data, steps)
         learners, losses = _learn(env, agent, tasks, learners, data, state.iteration, learn_key)
         learners = over_seeds(observe, 0, 0)(learners, steps)
+        learners = _with_played(state.agent, learners, state.rows)
         return state._replace(agent=learners, data=experience.keep(data), key=key), seen | {"losses": losses}
 
     state, history = jax.lax.scan(iterate, state, length=settings.chunk_steps // experience.steps)
     count = settings.num_envs * settings.chunk_steps
-    return state._replace(agent=collectives.agreed(state.agent)), _summarise(history, count)
+    metrics = _summarise(history, count)
+    if settings.plays.changes:
+        metrics = _of_known(metrics, state.rows, len(known.id))
+    return state._replace(agent=collectives.agreed(state.agent)), metrics
+
+
+# Some of the known tasks.
+
+
+def rows_of(tasks: Task, rows: Any) -> Task:
+    """Return the tasks (T, ...) with these numbers (T,), of a table (N, ...)."""
+    return jax.tree.map(lambda x: x[rows], tasks)
+
+
+def _take_turns(env: Env, agent: Agent, settings: Settings, known: Task, state: TrainState) -> TrainState:
+    """Begin the tasks that the curriculum plays from here on. If they are others, worlds and experience begin anew."""
+    rows = settings.plays.rows(state.iteration, len(known.id))
+    shape = state.total.shape
+
+    def begin(state: TrainState) -> TrainState:
+        tasks = rows_of(known, rows)
+        key, reset_key, data_key, act_key = split_keys(state.key, 4)
+        worlds = reset_envs(env, agent, state.agent, tasks, world_keys(reset_key, shape), settings.trial)
+        blank = _blank(env, agent, state.agent, tasks, worlds, world_keys(act_key, shape))
+        data = agent.experience.init(blank, env.spec, shape[1], settings.num_envs, data_key)
+        fresh = {"total": jnp.zeros(shape), "counted": worlds.age == 0}
+        return state._replace(worlds=worlds, data=data, key=key, rows=rows, **fresh)
+
+    return jax.lax.cond(jnp.any(rows != state.rows), begin, lambda state: state, state)
+
+
+def _of_played(learners: Any, rows: Array | None) -> Any:
+    """Return agents (S, ...) with their own parameters of the tasks that are played."""
+    return learners if rows is None else over_seeds(of_tasks, 0, None)(learners, rows)
+
+
+def _with_played(learners: Any, played: Any, rows: Array | None) -> Any:
+    """Return agents (S, ...) with the parameters of the tasks that were played put back."""
+    return played if rows is None else over_seeds(with_tasks, 0, 0, None)(learners, played, rows)
+
+
+def _of_known(metrics: Metrics, rows: Any, known: int) -> Metrics:
+    """Return metrics (S, T) of the tasks that were played as those of all known ones (S, N), of others as nothing."""
+    nothing = {"episodes": 0, "lost": 0, "bad_step": -1, "bad_reward": -1}
+
+    def spread(name: str, x: Array) -> Array:
+        if x.ndim < 2:
+            return x
+        rest = jnp.full((len(x), known), nothing.get(name, jnp.nan), x.dtype)
+        return rest.at[:, rows].set(x)
+
+    return {name: spread(name, x) for name, x in metrics.items()}
 
 
 def _collect(

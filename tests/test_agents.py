@@ -190,8 +190,8 @@ def test_a_world_among_many_is_that_world_alone(name):
 def test_what_the_networks_see_of_a_task(conditioning, vectors):
     """Features (Z,) of the second task."""
     agent = make("sac", {"conditioning": conditioning}, vectors)
-    given = {"vectors": load_vectors(vectors, 3)} if conditioning == "vectors" else {}
-    known = Params(given, {"context": TASKS.context})
+    given = {"given": load_vectors(vectors, 3)} if conditioning == "vectors" else {}
+    known = Params({"known": TASKS.context, **given}, {})
     state = with_nets(jax.eval_shape(lambda: agent.init(SPEC, TASKS, KEY)), tasks=known)
     expected = {"one-hot": [0, 1, 0], "parameters": [-0.5], "vectors": np.load(vectors)[1]}.get(conditioning, [])
     np.testing.assert_allclose(agent.view.features(state, pick(TASKS, 1)), np.float32(expected))
@@ -204,7 +204,7 @@ def test_the_context_limit_shows_a_task_beyond_the_range_as_its_end():
     for limit, expected in ((0.0, 1.7), (1.0, 1.0)):
         agent = tiny("sac", conditioning="parameters", context_limit=limit)
         shapes = jax.eval_shape(lambda agent=agent: agent.init(SPEC, TASKS, KEY))
-        state = with_nets(shapes, tasks=Params({}, {"context": TASKS.context}))
+        state = with_nets(shapes, tasks=Params({"known": TASKS.context}, {}))
         np.testing.assert_allclose(agent.view.features(state, beyond), [expected], rtol=1e-6)
         np.testing.assert_allclose(agent.view.features_of_all(state, drawn, TASKS), -expected, rtol=1e-6)
 

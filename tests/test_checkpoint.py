@@ -54,7 +54,7 @@ def test_newest_checkpoint_has_every_shape_and_type(state, shapes):
     assert found == jax.tree.map(lambda x: (x.shape, x.dtype), shapes)
     assert int(state.iteration) == 150
     assert jnp.issubdtype(state.key.dtype, jax.dtypes.prng_key)
-    assert "vectors" not in state.agent.nets["tasks"].shared
+    assert "given" not in state.agent.nets["tasks"].shared
 
 
 def test_state_comes_back_as_it_went(state, tmp_path):
@@ -68,10 +68,10 @@ def test_task_vectors_come_back(state, tmp_path):
     """An agent that was given vectors keeps them, whatever becomes of their file."""
     vectors = jnp.arange(12.0).reshape(2, 2, 3)
     known = state.agent.nets["tasks"]
-    state = state._replace(agent=with_nets(state.agent, tasks=known._replace(shared={"vectors": vectors})))
+    state = state._replace(agent=with_nets(state.agent, tasks=known._replace(shared=known.shared | {"given": vectors})))
     checkpoint.save(tmp_path, state)
     loaded = checkpoint.load_agent(tmp_path, state).nets["tasks"]
-    np.testing.assert_array_equal(loaded.shared["vectors"], vectors)
+    np.testing.assert_array_equal(loaded.shared["given"], vectors)
 
 
 def test_two_newest_are_kept(state, tmp_path):

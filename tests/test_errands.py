@@ -121,9 +121,9 @@ def test_an_agent_reads_the_sentence_of_every_split():
     agent = tiny("ppo", conditioning="text").for_action(ENV.action)
     state = jax.eval_shape(lambda: agent.init(ENV.spec, ENV.tasks(), jax.random.key(0)))
     table, tasks = agent.conditioning.table(ENV.spec, 96), ENV.tasks("all")
-    known = Params({"vectors": table}, {"context": ENV.tasks().context})
+    known = Params({"given": table, "known": ENV.tasks().context}, {})
     state = with_nets(state, tasks=known)
-    features = jax.vmap(lambda task: agent.features(state, task))(tasks)
+    features = jax.vmap(lambda task: agent.view.features(state, task))(tasks)
     np.testing.assert_allclose(features, encode("hashing", ENV.sentences), atol=1e-6)
 
 

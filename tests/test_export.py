@@ -114,7 +114,7 @@ def test_an_equally_near_task_is_the_lower_one_however_it_is_rounded():
     midway = (contexts[1:] + contexts[:-1]) / 2
     noise = random.uniform(-SAME_CONTEXT / 2, SAME_CONTEXT / 2, (5, *midway.shape))
     unseen = pick(env.tasks(), 0)._replace(id=jnp.int32(500))
-    state = AgentState({"tasks": Params({}, {"context": contexts})}, {}, {})
+    state = AgentState({"tasks": Params({"known": contexts}, {})}, {}, {})
     nearest = lambda context: state.known(unseen._replace(context=context))
     found = jax.vmap(jax.vmap(nearest))(midway + jnp.float32(noise))
     np.testing.assert_array_equal(found, np.broadcast_to(np.arange(199), (5, 199)))

@@ -256,7 +256,7 @@ def test_the_rest_is_fresh(adopted):
     tasks, fresh, state = adopted
     for one, other in zip(jax.tree.leaves(state.fits), jax.tree.leaves(fresh.fits), strict=True):
         np.testing.assert_array_equal(one, other)
-    np.testing.assert_array_equal(state.nets["tasks"].own["context"], np.broadcast_to(tasks.context, (3, 2, 1)))
+    np.testing.assert_array_equal(state.nets["tasks"].shared["known"], np.broadcast_to(tasks.context, (3, 2, 1)))
 
 
 def test_one_temperature_for_all_stays_one():

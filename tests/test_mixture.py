@@ -194,7 +194,7 @@ def test_a_mixture_of_one_has_that_familys_tasks_but_for_what_only_the_family_re
 def test_the_nearest_training_task_is_of_the_same_family():
     env = mixture([make("tabular-mdp", num_tasks=2), make("bandit", num_tasks=3)])
     train, held_out = env.tasks("train"), env.tasks("interpolation")
-    state = AgentState({"tasks": Params({}, {"context": train.context})}, {}, {})
+    state = AgentState({"tasks": Params({"known": train.context}, {})}, {}, {})
     known = jax.vmap(state.known)
     nearest = np.asarray(known(held_out))
     families = np.argmax(held_out.context[:, :2], axis=1)

@@ -45,7 +45,11 @@ def test_every_family_says_what_it_asks_for():
             assert sentence[0].isupper() and sentence.endswith(".") and "`" not in sentence and ". " not in sentence, (
                 name
             )
-    plain = {n: x for n, x in said.items() if x and "vary" not in n and not n.endswith(("-sparse", "-hard", "-seen"))}
+    plain = {
+        n: x
+        for n, x in said.items()
+        if x and "vary" not in n and not n.endswith(("-sparse", "-hard", "-seen", "-sketched"))
+    }
     assert len(set(plain.values())) >= len(plain) - 3  # Brax's pole, and two reachers, ask for what others do
 
 
@@ -137,7 +141,7 @@ def test_an_agent_reads_a_tasks_own_sentence_also_of_a_held_out_task(hashing):
     """A task of other splits' making has the sentence of the training task whose context is nearest."""
     agent, vectors = tiny("sac", conditioning="text"), hashing(*SPEC.sentences)
     state = jax.eval_shape(lambda: agent.init(SPEC, TASKS, KEY))
-    known = Params({"vectors": agent.conditioning.table(SPEC, 2)}, {"context": TASKS.context})
+    known = Params({"given": agent.conditioning.table(SPEC, 2), "known": TASKS.context}, {})
     assert jax.tree.structure(known) == jax.tree.structure(state.nets["tasks"])
     state = with_nets(state, tasks=known)
     task = pick(TASKS, 0)
@@ -168,7 +172,7 @@ def test_a_run_reads_and_its_policy_acts_on_held_out_tasks(hashing, tmp_path):
         directory=tmp_path / "run",
     )
     policy = mtjax.load(tmp_path / "run")
-    vectors = policy.state.nets["tasks"].shared["vectors"]
+    vectors = policy.state.nets["tasks"].shared["given"]
     np.testing.assert_allclose(vectors, hashing(*family.sentences), atol=1e-6)
     assert len(vectors) == len(family.tasks("all").id) > 2
     returns = scoring.score(policy, episodes=1)["extrapolation"].returns

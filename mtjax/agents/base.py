@@ -50,7 +50,7 @@ class BaseAgent(abc.ABC):
         actor, critic: what learns, beside the nets of a subclass.
         representation: of observations. The critics' loss trains it.
         knowing: of the task, which the critics' loss trains too.
-        tasks: what is known of the training tasks: their contexts (T, C), and given vectors (T, V), if any.
+        tasks: what is known of the training tasks: their contexts (N, C), and given vectors (N, V), if any.
         inputs: the moments of observations; in a mixture one for each task, leaves (T, O).
         scaling, sampler: the memories of the scaling of rewards and of the sampler of tasks.
     """
@@ -224,7 +224,7 @@ class BaseAgent(abc.ABC):
         known_apart, knowing_key = own and not self.one_knowledge, jax.random.fold_in(key, 1)
         knowing = self.conditioning.init(num_tasks, seen, action, known_apart, knowing_key)
         nets = {
-            "tasks": Params({} if vectors is None else {"vectors": vectors}, {"context": tasks.context}),
+            "tasks": Params({"known": tasks.context} | ({} if vectors is None else {"given": vectors}), {}),
             "inputs": inputs,
             "knowing": knowing,
             "scaling": Params({}, self.scaling.init(num_tasks)),

@@ -215,9 +215,9 @@ class OnPolicy(BaseAgent):
         """Take a gradient step of actor and critic on windows (T, B, L, ...) of a rollout; metrics are (T,)."""
         sample_key, actor_order, critic_order = jax.random.split(key, 3)
         state, batch = self.prepare(state, window, tasks)
-        importance = self.sampler.weights(state.nets["sampler"].own, jnp.ones(state.num_tasks))
+        importance = self.sampler.weights(state.nets["sampler"].own, jnp.ones(len(tasks.id)))
         # The actor is first, as pi_old was on what the critic's step moves too: the representation, and what is known.
-        data = (batch, jax.random.split(sample_key, state.num_tasks))
+        data = (batch, jax.random.split(sample_key, len(tasks.id)))
         moved, actor = descend(self.fits, "actor", state, self.actor_loss, data, actor_order, importance)
         state = self.accept(moved, state, actor.aux.kl)
         if self.representation.learns:

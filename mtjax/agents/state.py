@@ -31,8 +31,8 @@ class AgentState(NamedTuple):
 
     @property
     def num_tasks(self) -> int:
-        """The number T of tasks that the agent knows."""
-        return len(self.nets["tasks"].own["context"])
+        """The number N of tasks that the agent knows."""
+        return len(self.nets["tasks"].shared["known"])
 
     def with_nets(self, **nets: Params) -> "AgentState":
         """Return the state with other networks of these names."""
@@ -43,7 +43,7 @@ class AgentState(NamedTuple):
 
         Of training tasks that are equally near, up to rounding, it is the lowest number.
         """
-        contexts = self.nets["tasks"].own["context"]
+        contexts = self.nets["tasks"].shared["known"]
         distance = jnp.sqrt(jnp.sum(jnp.square(contexts - task.context), axis=-1))
         if task.blocks is not None:  # only a task of the same family can be nearest
             distance = jnp.where(task.blocks.related(contexts, task.context), distance, jnp.inf)
@@ -53,6 +53,23 @@ class AgentState(NamedTuple):
     def nearest(self, tasks: Task) -> Array:
         """Return the training tasks (T,) nearest to ``tasks`` (T, ...), for training tasks too by their contexts."""
         return jax.vmap(self.known)(tasks._replace(id=jnp.full_like(tasks.id, self.num_tasks)))
+
+
+def of_tasks(tree: Any, rows: Array) -> Any:
+    """Select what the tasks with these numbers (T,) have for themselves, in all networks of a tree: leaves (T, ...)."""
+    return _map_nets(lambda net: net._replace(own=jax.tree.map(lambda x: x[rows], net.own)), tree)
+
+
+def with_tasks(tree: Any, played: Any, rows: Array) -> Any:
+    """Return networks of all tasks, those of the tasks with these numbers (T,) replaced by ``played``."""
+    put = lambda old, new: old.at[rows].set(new)
+    return _map_nets(lambda net, new: new._replace(own=jax.tree.map(put, net.own, new.own)), tree, played)
+
+
+def _map_nets(function: Any, tree: Any, *others: Any) -> Any:
+    """Map a function over the networks of trees; other leaves are those of the last tree."""
+    one = lambda *nodes: function(*nodes) if isinstance(nodes[0], Params) else nodes[-1]
+    return jax.tree.map(one, tree, *others, is_leaf=lambda x: isinstance(x, Params))
 
 
 def of_task(nets: Nets, number: Array) -> Nets:

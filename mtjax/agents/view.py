@@ -114,7 +114,7 @@ class View:
 
     def features(self, state: AgentState, task: Task) -> Array:
         """Return those features (Z,) of one task that need no learned parameters."""
-        vectors = state.nets["tasks"].shared.get("vectors")
+        vectors = state.nets["tasks"].shared.get("given")
         return self.conditioning.given(state.known(task), task, state.num_tasks, vectors)
 
     def features_of_all(self, state: AgentState, batch: Transition, tasks: Task) -> Array:

@@ -45,7 +45,7 @@ def _specs(agent: Agent) -> TrainState:
     """Return how devices share each field of a training state."""
     by_world = TrainState(*[BY_WORLD] * len(TrainState._fields))  # type: ignore
     data = agent.experience.sharding
-    return by_world._replace(agent=BY_SEED, data=data, iteration=REPLICATED, key=BY_SEED)  # type: ignore
+    return by_world._replace(agent=BY_SEED, data=data, iteration=REPLICATED, key=BY_SEED, rows=REPLICATED)  # type: ignore
 
 
 def jit_programs(mesh: Mesh | None, agent: Agent) -> Jitted:

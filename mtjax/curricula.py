@@ -1,0 +1,83 @@
+"""A curriculum says which of the known tasks worlds play. It changes them between chunks.
+
+An agent knows all N training tasks: its own parameters of each, its features and its memory of gradient steps. Of these
+T are played at a time. The tasks of a chunk follow from the step at which it begins, so that a run resumes exactly.
+"""
+
+import dataclasses
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+
+from mtjax.types import Array, InputError
+
+
+@dataclasses.dataclass(frozen=True)
+class Everything:
+    """All tasks are played, always."""
+
+    changes: ClassVar[bool] = False
+
+    def count(self, known: int) -> int:
+        """Return the number T of tasks that are played at a time, of N that are known."""
+        return known
+
+    def rows(self, step: Array, known: int) -> Array:
+        """Return the numbers (T,) int32 of the tasks that are played from a step () of every environment on."""
+        return jnp.arange(known, dtype=jnp.int32)
+
+
+@dataclasses.dataclass(frozen=True)
+class Random:
+    """Some tasks are played, which are drawn anew for every chunk, without repeating one."""
+
+    played: int
+    changes: ClassVar[bool] = True
+
+    def count(self, known: int) -> int:
+        if not 1 <= self.played <= known:
+            raise InputError(f"the curriculum random:{self.played} plays 1 to {known} of the {known} training tasks")
+        return self.played
+
+    def rows(self, step: Array, known: int) -> Array:
+        key = jax.random.fold_in(jax.random.key(0x5E1EC7), step)
+        return jax.random.permutation(key, known)[: self.played].astype(jnp.int32)
+
+
+@dataclasses.dataclass(frozen=True)
+class Sequence:
+    """One task is played after another, in the order of the table, for so many steps of every environment each.
+
+    After the last one the first follows again.
+    """
+
+    steps: int
+    changes: ClassVar[bool] = True
+
+    def count(self, known: int) -> int:
+        return 1
+
+    def rows(self, step: Array, known: int) -> Array:
+        return (step // self.steps % known).astype(jnp.int32)[None]
+
+
+Curriculum = Everything | Random | Sequence
+_KINDS = {"random": Random, "sequence": Sequence}
+
+
+def read(text: str) -> Curriculum:
+    """Return the curriculum that ``text`` names: "all", "random:T" or "sequence:STEPS".
+
+    Raises:
+        InputError: it names none.
+    """
+    kind, _, number = text.partition(":")
+    if text == "all":
+        return Everything()
+    if kind not in _KINDS or not number.isdecimal() or not int(number):
+        raise InputError(
+            f"curriculum is all, random:T (T tasks at a time) or sequence:STEPS (steps of every environment for each "
+            f"task), such as random:10 or sequence:100000; not {text!r}"
+        )
+    return _KINDS[kind](int(number))

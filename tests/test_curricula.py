@@ -1,0 +1,116 @@
+"""Curricula: which of the known tasks are played, and what that leaves of the others."""
+
+import csv
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from probes import QUICK, Walk, configure, tiny
+
+import mtjax
+from mtjax import curricula, loop
+from mtjax.agents.state import of_tasks, with_tasks
+from mtjax.loop import Settings
+from mtjax.networks import Params
+from mtjax.types import InputError
+
+SMALL = {"num_envs": 2, "chunk_steps": 8, "stagger": False}
+REPLAY = {"batch_size": 4, "replay_size": 64, "warmup_steps": 1}
+ROLLOUTS = {"unroll": 8, "epochs": 1, "minibatches": 1}
+
+
+def played(agent, curriculum, chunks, tasks=None, **settings):
+    """The states after each of some chunks on the tasks of a walk, and the metrics of each."""
+    env, given = Walk(), {**SMALL, **settings}
+    agent, chosen = configure(agent, Settings(curriculum=curriculum), given)
+    tasks = env.tasks() if tasks is None else tasks
+    state = loop.init.lower(env, agent, chosen, tasks, jnp.arange(2)).compile(QUICK)(tasks, jnp.arange(2))
+    chunk = loop.run_chunk.lower(env, agent, chosen, tasks, state).compile(QUICK)
+    states, metrics = [jax.device_get(state)], []
+    for _ in range(chunks):
+        state, one = chunk(tasks, state)
+        states, metrics = [*states, jax.device_get(state)], [*metrics, jax.device_get(one)]
+    return states, metrics
+
+
+def test_a_sequence_plays_every_task_in_turn_and_begins_again():
+    rows = [int(curricula.read("sequence:10").rows(jnp.int32(step), 3)[0]) for step in (0, 9, 10, 29, 30)]
+    assert rows == [0, 0, 1, 2, 0]
+
+
+def test_a_random_choice_repeats_no_task_and_changes():
+    drawn = [np.asarray(curricula.read("random:3").rows(jnp.int32(step), 10)) for step in range(200)]
+    assert all(len(set(rows.tolist())) == 3 for rows in drawn)
+    counts = np.bincount(np.concatenate(drawn), minlength=10)
+    assert counts.sum() == 600 and np.all(np.abs(counts - 60) < 30)
+
+
+def test_own_parameters_are_taken_by_number_and_put_back():
+    """Also those that optimisers keep; what tasks share is that of the played ones."""
+    net = Params({"w": jnp.zeros(2)}, {"h": jnp.arange(3.0)})
+    tree, rows = {"net": net, "adam": (jnp.int32(1), {"net": net})}, jnp.int32([2, 0])
+    part = of_tasks(tree, rows)
+    np.testing.assert_array_equal(part["adam"][1]["net"].own["h"], [2, 0])
+    moved = jax.tree.map(lambda x: x + 10, part)
+    after = with_tasks(tree, moved, rows)
+    np.testing.assert_array_equal(after["net"].own["h"], [10, 1, 12])
+    np.testing.assert_array_equal(after["net"].shared["w"], [10, 10])
+    assert after["adam"][0] == 11
+
+
+@pytest.mark.parametrize("name, given", [("multi-head", REPLAY), ("disjoint", REPLAY), ("ppo", ROLLOUTS)])
+def test_tasks_that_are_not_played_keep_what_is_their_own(name, given):
+    """To the bit, while the one that is played learns."""
+    agent = tiny(name, **({"heads": "per-task"} if name == "ppo" else {}))
+    tasks = jax.tree.map(lambda x: jnp.stack([x[0], x[1], x[0]]), Walk().tasks())._replace(id=jnp.arange(3))
+    (start, first, second), metrics = played(agent, "sequence:8", 2, tasks, **given)
+    head = lambda state: state.agent.nets["critic"].own["head"]["kernel"]  # (S, T, ...) or (S, T, N, ...)
+    for before, after, row in ((start, first, 0), (first, second, 1)):
+        for task in range(3):
+            same = np.array_equal(head(before)[:, task], head(after)[:, task])
+            assert same == (task != row)
+    assert first.worlds.age.shape == (2, 1, 2) and second.rows.tolist() == [1]
+    assert np.isnan(metrics[0]["return"][:, 1:]).all() and metrics[0]["episodes"].shape == (2, 3)
+    assert np.all(metrics[1]["episodes"][:, [0, 2]] == 0) and np.all(metrics[1]["bad_step"] == -1)
+
+
+def test_a_choice_of_all_tasks_learns_the_same_as_all(monkeypatch):
+    """Own parameters are gathered, learn, and are put back."""
+    monkeypatch.setattr(curricula.Random, "rows", lambda self, step, known: jnp.arange(known))
+    agent = tiny("ppo", heads="per-task")
+    (_, plain), of_plain = played(agent, "all", 1, **ROLLOUTS)
+    (_, found), of_found = played(agent, "random:2", 1, **ROLLOUTS)
+    jax.tree.map(np.testing.assert_array_equal, plain.agent, found.agent)
+    jax.tree.map(np.testing.assert_array_equal, of_plain, of_found)
+
+
+def test_a_run_by_a_sequence_is_recorded_by_known_tasks_and_resumes_to_the_bit(tmp_path):
+    """A task without episodes has an empty column; the state of a resumed run is that of one without a stop."""
+    given = {"num_envs": 2, "chunk_steps": 150, "curriculum": "sequence:150", "quiet": True, "unroll": 10}
+    given |= {"minibatches": 1, "epochs": 1, "eval_every": 600, "eval_episodes": 1, "hidden": (8,), "num_tasks": 3}
+    whole = mtjax.train("bandit", "ppo", steps=1200, directory=tmp_path / "whole", **given)
+    mtjax.train("bandit", "ppo", steps=600, directory=tmp_path / "cut", **given)
+    again = mtjax.train("bandit", "ppo", steps=1200, directory=tmp_path / "cut", resume=True, **given)
+    jax.tree.map(np.testing.assert_array_equal, jax.device_get(whole.state.agent), jax.device_get(again.state.agent))
+    with (tmp_path / "whole" / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [[bool(row[f"return_{k}"]) for k in range(3)] for row in rows[:3]] == np.eye(3, dtype=bool).tolist()
+    assert whole.evaluations.returns["train"].shape[2] == 3
+
+
+@pytest.mark.parametrize(
+    "agent, given, said",
+    [
+        ("ppo", {"curriculum": "some"}, "curriculum is all, random:T"),
+        ("ppo", {"curriculum": "random:0"}, "curriculum is all, random:T"),
+        ("ppo", {"curriculum": "random:4"}, "plays 1 to 3 of the 3 training tasks"),
+        ("ppo", {"curriculum": "sequence:60", "chunk_steps": 50}, "give a multiple of chunk_steps"),
+        ("famo", {"curriculum": "sequence:50"}, "without memory of the tasks"),
+        ("sac", {"curriculum": "random:2"}, "use an agent with rollouts"),
+    ],
+)
+def test_what_cannot_be_played_is_refused(agent, given, said):
+    env = mtjax.make("bandit", num_tasks=3, scores=True)
+    with pytest.raises(InputError, match=said):
+        mtjax.train(env, agent, steps=600, **{"num_envs": 2, "chunk_steps": 50, "quiet": True, **given})
