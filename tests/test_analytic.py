@@ -483,6 +483,8 @@ def test_a_car_ends_beside_the_track():
     for offset, off in ((1.15, False), (-1.15, False), (1.35, True), (-1.35, True)):
         cars = many(line, 12)._replace(place=jnp.float32(tracks.outline(waves, offset, 12)))
         assert np.all(np.asarray(jax.vmap(env.terminates, (None, 0))(task, cars)) == off)
+        earned = jax.vmap(env.reward, (None, 0, None))(task, cars._replace(gained=jnp.ones(12)), None)
+        np.testing.assert_array_equal(earned, 1 - 20 * off)
 
 
 def test_a_sale_ends_with_the_last_share():

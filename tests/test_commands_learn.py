@@ -49,6 +49,7 @@ MARKS: dict[str, Learns | str] = {
     "--env=cartpole-swingup+walker-walk --env.vary.walker-walk.friction=0.7:1.6:4 --split=none": _WALKER,
     "--env=walker-walk --env.vary.torso-mass=0.5:1.5:10 --env.vary.gravity=5:15": _WALKER,
     "--env=walker-walk-vary-friction --split=hip-bmdp --seeds=5": _WALKER,
+    "--env=sailing --agent=ppo": Learns(2),
     "--env=grid-navi --agent=rl2 --trials=4 --agent.unroll=60": _GRID,
     "--env=mt10 --agent=multi-head": _GPU,
     "--env=mt10 --agent=care --agent.num-experts=4 --agent.conditioning=text --agent.text=all-MiniLM-L6-v2 "

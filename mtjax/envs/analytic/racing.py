@@ -28,6 +28,7 @@ _GRAVITY, _LENGTH = 9.81, _FRONT + _REAR
 _SUBSTEPS = 2
 _SLOW = 0.5  # [m/s] below which slips are those of this speed
 _START, _SPACING, _AHEAD = 3.0, 2.0, 8  # [m/s]; [m] between the bends that are observed, and how many
+_CRASH = 20.0  # [m] that it costs to leave the track
 _KERBS = 30  # segments of each side; the caster draws no more geoms
 _EYE, _PITCH = (3.0, 1.4), 0.3  # [m] of the camera behind the car and above the floor; [rad] down
 
@@ -64,7 +65,7 @@ class Racing(Pictured):
         to the left from the centre line over half the width, sine and cosine of the heading from the line's; and the
         curvature of the line 2, 4, ... 16 m ahead [1/3 m].
     Action (2,): steering angle [0.4189 rad], to the left; acceleration [9.51 m/s^2].
-    Reward: metres along the centre line.
+    Reward: metres along the centre line; and -20 where the car leaves the track.
     Start: on the centre line, anywhere, along it at 3 m/s.
     Episode: 600 steps; it terminates where the centre of mass leaves the track, which is ``width`` wide. Metrics
         ``success`` is 1 once a whole lap is driven, ``laps`` is how many.
@@ -158,8 +159,8 @@ class Racing(Pictured):
         return jnp.stack([*motion, *bends])
 
     def reward(self, task: Task, state: CarState, action: Array) -> Array:
-        """Return the metres gained along the centre line, ()."""
-        return state.gained
+        """Return the metres gained along the centre line, less the cost of leaving the track, ()."""
+        return state.gained - _CRASH * self.terminates(task, state)
 
     def terminates(self, task: Task, state: CarState) -> Array:
         """Return whether () the car is off the track."""

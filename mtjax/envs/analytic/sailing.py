@@ -63,11 +63,11 @@ class Sailing(Pictured):
     Start: 100 m from the mark, facing anywhere, at 1 m/s through the water.
     Episode: 400 steps; it terminates within 5 m of the mark. Metric ``success`` is 1 there.
 
-    Known best: a sail at half the angle a of the apparent wind from the bow pulls most, by p4 |w| sin^2(a / 2). So the
-        speed v under a heading at an angle t from a wind of W m/s solves
-            2 p2 v^2 = p4 (sqrt(W^2 + v^2 + 2 W v cos t) - W cos t - v)          (the polar, ``polar``)
-        and the best speed to windward is the largest v cos t - p1 W (``best_to_windward``). It is at about 47 degrees,
-        so that a mark to windward takes tacks.
+    The best is known: a sail at half the angle of the apparent wind from the bow pulls most. With it, the speed v at
+    an angle t from a wind of W m/s is that of ``polar``, which solves
+        2 p2 v^2 = p4 (sqrt(W^2 + v^2 + 2 W v cos t) - W cos t - v)
+    and the best speed to windward is the largest v cos t - p1 W (``best_to_windward``). At the nominal wind it is at
+    46 degrees, so that a mark to windward takes tacks.
 
     Parameters that can vary:
         wind-speed: [m/s].

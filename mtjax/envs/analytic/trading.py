@@ -55,15 +55,14 @@ class Trading(Pictured):
     Start: one million shares at 50 dollars.
     Episode: at most 50 steps; it terminates when all is sold.
 
-    Known best: returns are -(E + lambda V) on average, with E the mean and V the variance of what a plan of sales
-        costs. With eta' = eta - gamma tau / 2 the best plan holds
-            x_j = X sinh(kappa (T - t_j)) / sinh(kappa T),  2 (cosh(kappa tau) - 1) / tau^2 = lambda sigma^2 / eta'
-        shares at t_j = j tau, and none that watches the price does better on average. ``best_holdings`` returns it, and
-        ``best_return`` what it earns:
-            E = gamma X^2 / 2 + spread X + eta' tanh(kappa tau / 2) (tau sinh(2 kappa T) + 2 T sinh(kappa tau)) X^2
-                / (2 tau^2 sinh(kappa T)^2)
-            V = sigma^2 X^2 (tau sinh(kappa T) cosh(kappa (T - tau)) - T sinh(kappa tau))
-                / (2 sinh(kappa T)^2 sinh(kappa tau))
+    The best is known: returns are -(E + lambda V) on average, with E the mean and V the variance of what a plan of
+    sales costs. With eta' = eta - gamma tau / 2 the best plan, ``best_holdings``, holds at the time t
+        x = X sinh(kappa (T - t)) / sinh(kappa T),  2 (cosh(kappa tau) - 1) / tau^2 = lambda sigma^2 / eta'
+    shares, and none that watches the price does better on average. It costs (``best_return``)
+        E = gamma X^2 / 2 + spread X + eta' tanh(kappa tau / 2) (tau sinh(2 kappa T) + 2 T sinh(kappa tau)) X^2
+            / (2 tau^2 sinh(kappa T)^2)
+        V = sigma^2 X^2 (tau sinh(kappa T) cosh(kappa (T - tau)) - T sinh(kappa tau))
+            / (2 sinh(kappa T)^2 sinh(kappa tau))
 
     Parameters that can vary:
         risk-aversion: lambda [1 / million dollars]. It is the reward's alone; only the context tells it.
@@ -71,9 +70,10 @@ class Trading(Pictured):
         impact: eta, which a sale's own price loses [dollars a share, at a million shares a day].
         lasting-impact: gamma, which the price loses for good [dollars a share, for a million shares].
 
-    Their nominal values are those of Almgren and Chriss' example. Differs from it in: ten trades a day, not one; the
-    risk is charged step by step, where theirs is the variance of the whole cost: both agree for every plan that does
-    not watch the price.
+    Their nominal values are those of Almgren and Chriss' example.
+
+    Differs from their example in: ten trades a day, not one; the risk is charged step by step, where theirs is the
+    variance of the whole cost. Both agree for every plan that does not watch the price.
     """
 
     parameters: ClassVar[Mapping[str, Parameter]] = MappingProxyType(
