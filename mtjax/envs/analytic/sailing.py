@@ -63,7 +63,7 @@ class Sailing(Pictured):
     Start: 100 m from the mark, facing anywhere, at 1 m/s through the water.
     Episode: 400 steps; it terminates within 5 m of the mark. Metric ``success`` is 1 there.
 
-    The best is known: a sail at half the angle of the apparent wind from the bow pulls most. With it, the speed v at
+    The best is known. A sail at half the angle of the apparent wind from the bow pulls most. With it, the speed v at
     an angle t from a wind of W m/s is that of ``polar``, which solves
         2 p2 v^2 = p4 (sqrt(W^2 + v^2 + 2 W v cos t) - W cos t - v)
     and the best speed to windward is the largest v cos t - p1 W (``best_to_windward``). At the nominal wind it is at

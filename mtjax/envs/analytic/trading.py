@@ -55,7 +55,7 @@ class Trading(Pictured):
     Start: one million shares at 50 dollars.
     Episode: at most 50 steps; it terminates when all is sold.
 
-    The best is known: returns are -(E + lambda V) on average, with E the mean and V the variance of what a plan of
+    The best is known. Returns are -(E + lambda V) on average, with E the mean and V the variance of what a plan of
     sales costs. With eta' = eta - gamma tau / 2 the best plan, ``best_holdings``, holds at the time t
         x = X sinh(kappa (T - t)) / sinh(kappa T),  2 (cosh(kappa tau) - 1) / tau^2 = lambda sigma^2 / eta'
     shares, and none that watches the price does better on average. It costs (``best_return``)
