@@ -4,11 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from needs import needs
+from needs import needs, require
 
 import mtjax
 from mtjax import envs
 from mtjax.envs.adapters.family import AdaptedState
+from mtjax.envs.adapters.xminigrid import XMiniGrid
 from mtjax.types import InputError
 
 
@@ -69,6 +70,66 @@ def test_steps_of_gymnax_are_the_originals(name, settings, kinds):
         np.testing.assert_array_equal(ours[2], theirs[2])
         np.testing.assert_array_equal(ours[3], theirs[3])
         assert (ours[2].any(), ours[3].any()) == kinds
+
+
+@pytest.fixture(scope="module")
+def rulesets(tmp_path_factory):
+    """A file of four rulesets in XLand-MiniGrid's format: the goal is to hold a ball of one of four colours."""
+    benchmarks = require("xminigrid.benchmarks")
+    held = np.array([[1, 3, colour, 0, 0] for colour in (1, 2, 3, 4)], np.uint8)
+    tiles = np.array([[[3, colour], [4, 1]] for colour in (1, 2, 3, 4)], np.uint8)
+    file, none = tmp_path_factory.mktemp("rulesets") / "four", np.zeros((4, 1, 7), np.uint8)
+    content = {"goals": held, "rules": none, "init_tiles": tiles, "num_rules": np.zeros(4, np.uint8)}
+    benchmarks.save_bz2_pickle(jax.tree.map(jnp.asarray, content), str(file))
+    return str(file)
+
+
+@needs("xminigrid")
+@pytest.mark.parametrize(
+    ("name", "settings", "kinds"),
+    [
+        ("MiniGrid-Empty-5x5", {"time_limit": 60}, (True, True)),
+        ("XLand-MiniGrid-R1-9x9", {"vary": {"ruleset": "0,2"}, "split": "none", "time_limit": 40}, (True, True)),
+    ],
+)
+def test_steps_of_xland_are_the_originals(name, settings, kinds, rulesets):
+    """A ruleset is a task; tiles that are seen are one-hot."""
+    import xminigrid
+    from xminigrid.benchmarks import load_benchmark_from_path
+
+    family = mtjax.make(f"xminigrid:{name}", **settings | ({"rulesets": rulesets} if "XLand" in name else {}))
+    environment, nominal = xminigrid.make(name)
+    for row in range(family.train_count):
+        task = jax.tree.map(lambda x, row=row: x[row], family.tasks("train"))
+        params = nominal.replace(max_steps=family.episode_length)
+        if "XLand" in name:
+            params = params.replace(ruleset=load_benchmark_from_path(rulesets).get_ruleset(int(task.params["ruleset"])))
+
+        def original(state, action, params=params):
+            new = environment.step(params, state.world, action)
+            seen = new.observation.astype(jnp.int32)
+            terminated = new.last() & (new.discount == 0)
+            return seen, new.reward, terminated, new.last() & (new.discount == 1)
+
+        ours, theirs = play(family, task, original)
+        tiles = ours[0].reshape(*theirs[0].shape[:3], -1)
+        np.testing.assert_array_equal(np.stack([tiles[..., :13].argmax(-1), tiles[..., 13:].argmax(-1)], -1), theirs[0])
+        assert np.all(tiles.sum(axis=-1) == 2)
+        for mine, own in zip(ours[1:], theirs[1:], strict=True):
+            np.testing.assert_array_equal(mine, own)
+        assert (ours[2].any(), ours[3].any()) == kinds
+
+
+@needs("xminigrid")
+def test_rulesets_are_whole_numbers_of_a_file(rulesets):
+    """What lies between two of them is held out where it is one too."""
+    make = lambda **settings: mtjax.make("xminigrid:XLand-MiniGrid-R1-9x9", rulesets=rulesets, **settings)
+    with pytest.raises(InputError, match=r"whole number from 0 to 3, not 0.5; --split=none"):
+        _ = make(vary={"ruleset": "0:2:3"}).spec
+    assert make(vary={"ruleset": "0,2"}, split="none").train_count == 2
+    for settings in ({"environment": "XLand-MiniGrid-R1-9x9"}, {"environment": "MiniGrid-Empty-5x5", "rulesets": "x"}):
+        with pytest.raises(InputError, match="needs rulesets|has no rulesets"):
+            _ = XMiniGrid(**settings).spec
 
 
 @needs("gymnax")

@@ -61,6 +61,7 @@ SUITES = {
     "gymnasium": "mtjax.envs.hosted.gymnasium:Gymnasium",
     "envpool": "mtjax.envs.hosted.envpool:EnvPool",
     "gymnax": "mtjax.envs.adapters.gymnax:Gymnax",
+    "xminigrid": "mtjax.envs.adapters.xminigrid:XMiniGrid",
 }
 """Families of the environments of other packages, by the first part of their names: SUITE:ENVIRONMENT."""
 

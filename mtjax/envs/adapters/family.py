@@ -55,13 +55,11 @@ class Adapted(Family):
         """Return the kind and the size of actions."""
 
     @abc.abstractmethod
-    def begin(self, params: Mapping[str, Any], key: Key) -> tuple[Any, Any]:
+    def begin(self, task: Task, key: Key) -> tuple[Any, Any]:
         """Begin an episode. Return the world's state and the observation."""
 
     @abc.abstractmethod
-    def advance(
-        self, params: Mapping[str, Any], world: Any, action: Array, key: Key
-    ) -> tuple[Any, Any, Array, Array, Array]:
+    def advance(self, task: Task, world: Any, action: Array, key: Key) -> tuple[Any, Any, Array, Array, Array]:
         """Advance a world. Return its state, observation, reward, and whether it terminated, or was cut off.
 
         The key is that of the package's step. What resets a world by itself there is left out here.
@@ -89,19 +87,19 @@ class Adapted(Family):
     def reset(self, task: Task, key: Key) -> Step:
         """Begin an episode of ``task`` in a fresh random state."""
         start_key, key = jax.random.split(key)
-        world, obs = self.begin(self._params(task), start_key)
+        world, obs = self.begin(task, start_key)
         return self._step(AdaptedState(world, key), obs, jnp.float32(0), jnp.bool_(False), jnp.bool_(False))
 
     def step(self, task: Task, state: AdaptedState, action: Array) -> Step:
         """Advance one step under ``action``; observation and reward are those after it."""
-        world, obs, reward, terminated, truncated = self.advance(self._params(task), state.world, action, state.key)
+        world, obs, reward, terminated, truncated = self.advance(task, state.world, action, state.key)
         return self._step(AdaptedState(world, jax.random.split(state.key)[1]), obs, reward, terminated, truncated)
 
     def _step(self, state: AdaptedState, obs: Any, reward: Any, terminated: Any, truncated: Any) -> Step:
         ends = jnp.bool_(terminated), jnp.bool_(truncated)
         return Step(jax.tree.map(_strong, state), _vector(obs), jnp.float32(reward), ends[0], truncated=ends[1])
 
-    def _params(self, task: Task) -> dict[str, Array]:
+    def params_of(self, task: Task) -> dict[str, Array]:
         """Return the parameters that a task has of its own, by the package's names and in its types."""
         names = {name.replace("_", "-"): name for name in self.defaults}
         return {names[name]: _as_default(self.defaults[names[name]], value) for name, value in task.params.items()}

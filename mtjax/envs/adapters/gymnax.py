@@ -11,7 +11,7 @@ import numpy as np
 
 from mtjax.envs.adapters.family import Adapted
 from mtjax.names import nearest_error
-from mtjax.types import Array, Continuous, Discrete, InputError, Key
+from mtjax.types import Array, Continuous, Discrete, InputError, Key, Task
 
 _LIMIT = "max_steps_in_episode"
 
@@ -70,16 +70,14 @@ class Gymnax(Adapted):
         with jax.ensure_compile_time_eval():
             return found.action_space(params)
 
-    def begin(self, params: Mapping[str, Any], key: Key) -> tuple[Any, Any]:
+    def begin(self, task: Task, key: Key) -> tuple[Any, Any]:
         found, nominal = self.original
-        obs, world = found.reset_env(key, nominal.replace(**params))
+        obs, world = found.reset_env(key, nominal.replace(**self.params_of(task)))
         return world, obs
 
-    def advance(
-        self, params: Mapping[str, Any], world: Any, action: Array, key: Key
-    ) -> tuple[Any, Any, Array, Array, Array]:
+    def advance(self, task: Task, world: Any, action: Array, key: Key) -> tuple[Any, Any, Array, Array, Array]:
         (found, nominal), space = self.original, self._actions
-        own = nominal.replace(**params)
+        own = nominal.replace(**self.params_of(task))
         if not self.discrete:
             middle, half = (jnp.asarray(space.high) + space.low) / 2, (jnp.asarray(space.high) - space.low) / 2
             action = middle + jnp.clip(action, -1, 1).reshape(space.shape) * half
