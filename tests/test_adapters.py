@@ -128,7 +128,7 @@ def test_rulesets_are_whole_numbers_of_a_file(rulesets):
         _ = make(vary={"ruleset": "0:2:3"}).spec
     assert make(vary={"ruleset": "0,2"}, split="none").train_count == 2
     for settings in ({"environment": "XLand-MiniGrid-R1-9x9"}, {"environment": "MiniGrid-Empty-5x5", "rulesets": "x"}):
-        with pytest.raises(InputError, match="needs rulesets|has no rulesets"):
+        with pytest.raises(InputError, match=r"needs rulesets|has no rulesets"):
             _ = XMiniGrid(**settings).spec
 
 

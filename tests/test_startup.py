@@ -22,9 +22,9 @@ from mtjax.agents import AGENTS, CHOICES, PARTS, settings
 from mtjax.agents.choices import flag_names
 from mtjax.command import help, refusals, run_config, sources, xla_flags
 from mtjax.config import with_preset
-from mtjax.envs import ENVS, fields, outline
+from mtjax.envs import ENVS, SUITES, fields, outline
 from mtjax.envs.brax import NAMES
-from mtjax.names import InputError
+from mtjax.names import InputError, load
 
 TILINGS = "xla_gpu_experimental_cost_model_gemm_tiling_options"
 HEAVY = ("jax", "flax", "optax", "mujoco", "orbax", "brax", "warp", "matplotlib", "mtjax.config")
@@ -152,7 +152,7 @@ def test_flags_of_all_families_and_agents_are_known_without_jax(ours):
     choices = [{kind: name} for kind in CHOICES for name in PARTS[kind]] + [{"scaling": "ars", "reset_every": 100}]
     real = {"--help": False, "--import": False} | {f"--agent.{kind}": False for kind in CHOICES}
     real |= run_config.flags(mtjax.preset("cartpole-swingup+finger-spin", "sac"))
-    for cls in {cls for cls, _ in ENVS.values()}:
+    for cls in {cls for cls, _ in ENVS.values()} | set(map(load, SUITES.values())):
         fields = run_config.shared_fields(cls)
         real |= {run_config.family_flag(field.name): isinstance(field.default, bool) for field in fields}
     for agent, given in itertools.product(

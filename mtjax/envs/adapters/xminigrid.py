@@ -50,11 +50,10 @@ class XMiniGrid(Adapted):
             raise nearest_error("environment of XLand-MiniGrid", self.environment, known)
         with jax.ensure_compile_time_eval():
             found, params = module.make(self.environment)
-        if hasattr(params, "ruleset") != bool(self.rulesets):
-            fix = (
-                "give --env.rulesets=FILE, or a name such as trivial-21k" if not self.rulesets else "leave rulesets out"
-            )
-            raise InputError(f"{self.environment} {'needs' if not self.rulesets else 'has no'} rulesets; {fix}")
+        if hasattr(params, "ruleset") and not self.rulesets:
+            raise InputError(f"{self.environment} needs rulesets: --env.rulesets=FILE, or a name such as trivial-21k")
+        if self.rulesets and not hasattr(params, "ruleset"):
+            raise InputError(f"{self.environment} has no rulesets; leave them out")
         return found, params.replace(max_steps=self.time_limit or int(params.max_steps))
 
     @property
