@@ -18,7 +18,8 @@ def catalogue() -> str:
     lines.append("benchmarks, which are mixtures of the above:")
     for name, (says, families) in BENCHMARKS.items():
         lines.append(f"  {name:36} {sum('held_out' not in s for s in families.values()):3} tasks  {says}")
-    lines += ["environments of other packages, by their names there:", *(f"  {suite}:NAME" for suite in SUITES)]
+    others = ", ".join(f"{suite}:NAME" for suite in SUITES)
+    lines.append(f"environments of other packages, by their names there, such as gymnasium:CartPole-v1: {others}")
     lines += ["agents:", *(f"  {name:36} {preset.says}" for name, preset in AGENTS.items())]
     lines += ["trained policies (python -m mtjax.evaluate --run=NAME, or mtjax.load(NAME)):"]
     return "\n".join(lines + [f"  {name}" for name in shipped.names()])
