@@ -11,6 +11,7 @@ from needs import needs, require
 import mtjax
 import mtjax.train
 from mtjax import evaluation, rollout
+from mtjax.envs.engines import host
 from mtjax.envs.engines.host import explaining
 from mtjax.envs.hosted.envpool import EnvPool
 from mtjax.envs.hosted.family import _known
@@ -411,3 +412,14 @@ def test_pictures_of_envpool_are_single_and_settings_are_tasks():
         mtjax.make("envpool:Pong-v5", vary={"repeat-action-probability": "0:0.25"})
     with pytest.raises(InputError, match="did you mean 'Pong-v5'"):
         mtjax.make("envpool:Pongg-v5")
+
+
+def test_programs_of_a_gpu_call_the_host_too(monkeypatch):
+    """By JAX's own callbacks, which give the same steps, and tell what the environment raised."""
+    family = mtjax.hosted("Walk")
+    before = play(family, 30)[0]
+    monkeypatch.setattr(host.jax, "default_backend", lambda: "gpu")
+    after = play(family, 30)[0]
+    jax.tree.map(np.testing.assert_array_equal, before, after)
+    with pytest.raises(InputError, match="Walk raised ZeroDivisionError: the walk broke"):
+        play(mtjax.hosted("Walk", raises=3), 10)
