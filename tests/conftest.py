@@ -2,9 +2,11 @@
 
 import dataclasses
 import gc
+import math
 import os
 import shutil
 from functools import cache, lru_cache
+from pathlib import Path
 from typing import ClassVar, NamedTuple
 
 import jax
@@ -124,13 +126,32 @@ def compiled(env) -> Programs:
     return Programs(jax.jit(jax.vmap(env.reset)), jax.jit(put), jax.jit(jax.vmap(env.step)))
 
 
+MOST_MAPPINGS, MOST_BYTES = 15_000, 1.5e9  # of 65,530 that Linux gives a process, and of memory
+
+
+def os_memory() -> float:
+    """Return the memory of this process, in bytes."""
+    statm = Path("/proc/self/statm")
+    return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") if statm.is_file() else math.inf
+
+
+def is_full() -> bool:
+    """Return whether this process holds many programs: each takes some mappings of memory."""
+    mappings = Path("/proc/self/maps")  # other systems have none, and neither that limit
+    held = mappings.read_text().count("\n") if mappings.is_file() else MOST_MAPPINGS
+    return held >= MOST_MAPPINGS or os_memory() > MOST_BYTES
+
+
 @pytest.fixture(scope="module", autouse=True)
 def forget_programs(request):
-    """Drop what a file has compiled and cached after it: a process has room for some thousands of programs.
+    """Drop what a file has compiled and cached after it, and what JAX has, once the process is full.
 
-    What is free by then goes back to the system. A worker kept gigabytes of it.
+    What is free by then goes back to the system. A worker kept gigabytes of it. Until then the next file finds
+    the small programs of JAX's own functions, which every file would compile again.
     """
     yield
+    if not is_full():
+        return
     own = [x for x in vars(request.module).values() if getattr(x, "__module__", None) == request.module.__name__]
     for cached in (compiled, probes._programs, probes._agent_programs, *own):
         getattr(cached, "cache_clear", lambda: None)()

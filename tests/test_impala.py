@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import Walk, learn, mean_actions, of_task, one_in, only_seed, pick, tasks_of, tiny, train
+from probes import Walk, learn, mean_actions, of_task, one_in, only_seed, pick, quick, tasks_of, tiny, train
 from test_ppo import BEST, KNOWN, SCALES, random_steps
 
 from mtjax import agents
@@ -27,15 +27,19 @@ def test_a_batch_holds_vtrace_of_the_present_policy_and_critic():
     agent = small(gae_lambda=0.7, normalize_observations=False)
     state, steps = agent.init(SPEC, TASKS, KEY), random_steps(agent)
     window = agent.experience.windows(steps, agent.unroll)
-    after, batch = agent.prepare(state, window, TASKS)
+    after, batch = quick(agent.prepare, state, window, TASKS)(state, window, TASKS)
     units = Units.of(after.nets["units"])
+
+    def of_world(nets, features, one):
+        value, following = (agent.output(nets, features, x) for x in (one.obs, one.next_obs))
+        log_ratio = agent.log_ratio(nets, features, one.obs, one.extras, None)
+        return targets.vtrace(one, value, following, log_ratio, agent.gamma, 0.7)
+
+    by_hand = jax.jit(of_world)
     for task in range(3):
         nets, features = of_task(state.nets, task), TASKS.context[task]
         for world in range(2):
-            one = pick(window, (task, world))
-            value, following = (agent.output(nets, features, x) for x in (one.obs, one.next_obs))
-            log_ratio = agent.log_ratio(nets, features, one.obs, one.extras, None)
-            found = targets.vtrace(one, value, following, log_ratio, agent.gamma, 0.7)
+            found = by_hand(nets, features, pick(window, (task, world)))
             place = slice(world * LENGTH, (world + 1) * LENGTH)
             np.testing.assert_allclose(units.rewards(batch.target)[task, place], found.target, rtol=1e-3, atol=1e-4)
             expected = found.advantage / units.std[task]

@@ -1,6 +1,7 @@
 """Multi-step returns: windows of the ring, sums worked by hand, and what agents make of them."""
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -174,9 +175,13 @@ def test_a_sweep_joins_by_the_swept_discount():
     tasks, steps, key = tasks_of("one-step"), windows(2), jax.random.key(0)
     replay, number = Replay(n_step=3), jnp.int32(0)
     swept, plain = tiny("sac", experience=replay), tiny("sac", experience=replay, gamma=0.5)
-    swept = with_numbers(swept, {"gamma": jnp.float32(0.5)})
-    found = swept.update(swept.init(SPEC, tasks, key), steps, tasks, key, number)[1]["critic_loss"]
-    expected = plain.update(plain.init(SPEC, tasks, key), steps, tasks, key, number)[1]["critic_loss"]
+
+    def loss(agent):
+        return agent.update(agent.init(SPEC, tasks, key), steps, tasks, key, number)[1]["critic_loss"]
+
+    numbers = {"gamma": jnp.float32(0.5)}
+    found = quick(lambda numbers: loss(with_numbers(swept, numbers)), numbers)(numbers)
+    expected = quick(partial(loss, plain))()
     np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 

@@ -121,8 +121,9 @@ def test_vtrace_converges_to_the_value_of_the_clipped_policy():
         None, None, jnp.float32(rewards[state, action]), jnp.ones((length, count)), None, state < 0, state < 0
     )
     log_ratio, value = jnp.float32(np.log(pi[state, action] / mu[state, action])), np.zeros(num_states)
+    vtrace = jax.jit(lambda now, then: targets.vtrace(steps, now, then, log_ratio, gamma, 1.0))
     for _ in range(400):
-        found = targets.vtrace(steps, *(jnp.float32(value[x]) for x in (state, following)), log_ratio, gamma, 1.0)
+        found = vtrace(*(jnp.float32(value[x]) for x in (state, following)))
         error = np.asarray(found.target) - value[state]
         value += [0.3 * error[state == s].mean() for s in range(num_states)]
     np.testing.assert_allclose(value, exact, rtol=0.02)
