@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import learn, only_seed, pick, tasks_of, tiny, train
+from probes import learn, only_seed, pick, quick, tasks_of, tiny, train
 from test_ppo import random_steps
 
 import mtjax
@@ -42,7 +42,7 @@ def test_targets_are_those_of_a_plain_loop(cut):
     """With the sum cut at the end of a trial, of the rollout and, if asked, before actions that explore."""
     agent = small(q_lambda=0.6, gamma=0.9, cut_exploration=cut)
     state, steps = agent.init(SPEC, TASKS, KEY), steps_of(agent)
-    found = agent.assess(state, steps, TASKS)[1].extras
+    found = quick(agent.assess, state, steps, TASKS)(state, steps, TASKS)[1].extras
     for task in range(3):
         now, then = (
             np.asarray(values_of(agent, state, x[task], pick(TASKS, task))) for x in (steps.obs, steps.next_obs)
