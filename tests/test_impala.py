@@ -48,13 +48,15 @@ def test_a_batch_holds_vtrace_of_the_present_policy_and_critic():
 
 def test_scales_of_rewards_do_not_weigh_tasks():
     """Rewards a thousand times as large give the same advantages, once the units have moved to them."""
-    agent, one = small(value_rate=1.0), None
-    for scale in (1.0, 1000.0):
-        steps = random_steps(agent)
-        steps = steps._replace(reward=scale * steps.reward)
+    agent = small(value_rate=1.0)
+
+    @jax.jit
+    def advantages(steps):
         state, _ = learn(agent, agent.init(SPEC, TASKS, KEY), steps, TASKS, KEY)
-        found = agent.prepare(state, agent.experience.windows(steps, agent.unroll), TASKS)[1].advantage
-        one = found if one is None else one
+        return agent.prepare(state, agent.experience.windows(steps, agent.unroll), TASKS)[1].advantage
+
+    steps = random_steps(agent)
+    one, found = (advantages(steps._replace(reward=scale * steps.reward)) for scale in (1.0, 1000.0))
     np.testing.assert_allclose(found, one, rtol=0.1, atol=0.1)
 
 

@@ -161,10 +161,10 @@ def test_each_task_has_its_own_discount():
     agent, steps = tiny("sac-conditioned", discounting="horizon", experience=Replay(n_step=3)), windows(2)
     state = agent.init(SPEC, tasks, jax.random.key(0))
     joined = replayed.transitions(agent, steps, tasks)
+    batch = quick(partial(replayed.prepare, agent), state, steps, tasks)(state, steps, tasks)
     for task, gamma in enumerate((0.96, 0.98)):
         each = [multistep.join(pick(steps, (task, b)), gamma) for b in range(4)]
         np.testing.assert_allclose(joined.reward[task], [x.reward for x in each], rtol=1e-6)
-        batch = replayed.prepare(agent, state, steps, tasks)
         count = np.asarray([next((k + 1 for k in range(3) if steps.ended[task, b, k]), 3) for b in range(4)])
         alive = np.asarray([not steps.ended[task, b].any() for b in range(4)])
         np.testing.assert_allclose(batch.discount[task], alive * gamma**count, rtol=1e-5)
@@ -209,7 +209,7 @@ def test_the_past_at_the_bootstrap_is_that_of_the_windows_last_step():
     tasks, steps = tasks_of("one-step"), windows(2)
     steps = steps._replace(memory=Memory(random_past(np.random.default_rng(0), (2, 4, 3, 2), SPEC)))
     state = agent.init(SPEC, tasks, jax.random.key(0))
-    batch = replayed.prepare(agent, state, steps, tasks)
+    batch = quick(partial(replayed.prepare, agent), state, steps, tasks)(state, steps, tasks)
     for task, b in np.ndindex(2, 4):
         final = next((k for k in range(3) if steps.ended[task, b, k]), 2)
         last = pick(steps, (task, b, final))
