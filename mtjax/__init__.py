@@ -10,6 +10,7 @@ if TYPE_CHECKING:  # for editors, which do not run __getattr__
     from mtjax.agents import AGENTS as AGENTS
     from mtjax.agents import agent as agent
     from mtjax.command.api import train as train
+    from mtjax.command.register import register as register
     from mtjax.config import with_preset as preset  # noqa: F401
     from mtjax.envs import ENVS as ENVS
     from mtjax.envs import make as make
@@ -18,7 +19,6 @@ if TYPE_CHECKING:  # for editors, which do not run __getattr__
     from mtjax.envs.hosted.gymnasium import hosted as hosted
     from mtjax.loop import Settings as Settings
     from mtjax.names import InputError as InputError
-    from mtjax.registry import register as register
     from mtjax.report.collect import runs as runs
     from mtjax.report.drawing import plot as plot
     from mtjax.report.scoring import evaluate as evaluate
@@ -49,7 +49,7 @@ _HOME = {
     "mixture": "mtjax.envs",
     "plot": "mtjax.report.drawing",
     "preset": "mtjax.config:with_preset",
-    "register": "mtjax.registry",
+    "register": "mtjax.command.register",
     "runs": "mtjax.report.collect",
     "stacked": "mtjax.envs",
     "train": "mtjax.command.api",

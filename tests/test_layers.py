@@ -33,7 +33,7 @@ LAYERS = (
     [GROUND],
     [("envs",), ("experience",), ("agents",)],
     [("rollout", "loop", "evaluation")],
-    [("compiling",), ("config", "registry")],
+    [("compiling",), ("config",)],
     [("saved",)],
     [("training",), ("report",)],
     [("command",), ("gym",)],
