@@ -17,7 +17,6 @@ from mtjax import curricula, frames
 from mtjax.agents.state import of_tasks, with_tasks
 from mtjax.agents.swept import at_point, with_numbers
 from mtjax.checks import check_fields
-from mtjax.maps import Flat, over_seeds, when
 from mtjax.parallel import collectives
 from mtjax.rollout import (
     EnvStep,

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from mtjax import frames
 from mtjax.agents.swept import at_point
-from mtjax.maps import Flat, over_learners, where_worlds
+from mtjax.axes import Flat, over_learners, where_worlds
 from mtjax.parallel import collectives
 from mtjax.tasks import contexts_vary, episode_task
 from mtjax.trials import EACH_EPISODE, Ends, Trials

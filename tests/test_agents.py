@@ -19,7 +19,7 @@ from mtjax.agents.parts.representations import REPRESENTATIONS
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.values import VALUES
-from mtjax.maps import over_learners
+from mtjax.axes import over_learners
 from mtjax.networks import Params
 from mtjax.rollout import Worlds
 from mtjax.rollout import act as act_in_all

@@ -25,7 +25,7 @@ GROUND = (
     "networks",
     "tasks",
     "trials",
-    "maps",
+    "axes",
     "frames",
     "parallel",
 )

@@ -11,10 +11,10 @@ from probes import Broken, Lost, Probe, Stub, Walk, tasks_of, tiny, train
 
 import mtjax
 from mtjax import loop
+from mtjax.axes import over_learners, over_worlds
 from mtjax.config import configure
 from mtjax.experience import Replay
 from mtjax.loop import Settings
-from mtjax.maps import over_learners, over_worlds
 from mtjax.rollout import broadcast_tasks, reset_envs, step_envs
 from mtjax.types import Acted, InputError, Spec
 

@@ -40,9 +40,9 @@ from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.scaling.base import Moments
 from mtjax.agents.ppo import PPO, within
 from mtjax.agents.units import Units
+from mtjax.axes import in_parts
 from mtjax.config import with_preset
 from mtjax.envs.probes import Probe, tasks_of
-from mtjax.maps import in_parts
 from mtjax.networks import OVER_TASKS
 from mtjax.types import InputError, Spec, Transition
 

@@ -14,7 +14,6 @@ from probes import Stub, Walk, learner, one_in, quick, random_batch, tasks_of, t
 from mtjax import loop
 from mtjax.agents.swept import with_numbers
 from mtjax.experience import Replay
-from mtjax.maps import when
 from mtjax.types import InputError, Sometimes, Spec
 
 SMALL = {"num_envs": 4, "batch_size": 4, "replay_size": 200, "warmup_steps": 2}

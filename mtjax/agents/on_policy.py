@@ -21,8 +21,8 @@ from mtjax.agents.parts.scaling.popart import rescale_heads
 from mtjax.agents.rates import discounts_of_all
 from mtjax.agents.state import AgentState, Nets, over_tasks
 from mtjax.agents.units import MIN_STD, Units
+from mtjax.axes import in_parts
 from mtjax.experience import Rollouts
-from mtjax.maps import in_parts
 from mtjax.networks import Network, Params
 from mtjax.parallel.collectives import mean_and_variance
 from mtjax.types import Acted, Array, InputError, Key, Metrics, Task, Transition

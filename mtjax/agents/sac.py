@@ -16,8 +16,8 @@ from mtjax.agents.parts.values import Value
 from mtjax.agents.rates import scheduled
 from mtjax.agents.replayed import Batch, action_sizes, prepare, renew_scales, update_target, with_statistics
 from mtjax.agents.state import AgentState, Nets, axes_of
+from mtjax.axes import when
 from mtjax.experience import Replay
-from mtjax.maps import when
 from mtjax.networks import Network, Params
 from mtjax.types import Acted, Array, Key, Metrics, Sometimes, Task, Transition
 

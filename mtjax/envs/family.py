@@ -13,11 +13,11 @@ import jax
 import numpy as np
 import tyro
 
+from mtjax.axes import Flat
 from mtjax.checks import require_values
 from mtjax.envs import variation
 from mtjax.envs.parameters import Parameter
 from mtjax.envs.task_table import Part, Table, Tabled
-from mtjax.maps import Flat
 from mtjax.names import first_sentence
 from mtjax.types import SPLITS, Array, Continuous, Discrete, InputError, Key, Spec, Step, Task, Transition
 

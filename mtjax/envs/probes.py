@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.maps import Flat
+from mtjax.axes import Flat
 from mtjax.types import Array, Key, Spec, Step, Task
 
 AFTER = 5.0

@@ -4,9 +4,9 @@ import dataclasses
 from typing import Any, NamedTuple
 
 from mtjax import frames
+from mtjax.axes import Flat
 from mtjax.envs.mixtures import require_family
 from mtjax.envs.pixels import Pictured
-from mtjax.maps import Flat
 from mtjax.names import public
 from mtjax.types import Array, InputError, Key, Spec, Step, Task
 
