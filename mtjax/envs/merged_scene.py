@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from mtjax.envs.domain import Domain
-from mtjax.envs.things import Scene, Sensor, Thing
+from mtjax.envs.scene_bodies import Scene, Sensor, Thing
 from mtjax.types import InputError
 
 _FAR = 10.0  # [m] between parked things, and from the world's middle

@@ -6,8 +6,8 @@ from typing import Any
 from mtjax.envs.domain import Domain
 from mtjax.envs.family import Family
 from mtjax.envs.merged_simulator import United
+from mtjax.envs.scene_bodies import Scene
 from mtjax.envs.shared_simulator import Alone, Joined
-from mtjax.envs.things import Scene
 from mtjax.types import InputError
 
 SCENES = ("auto", "union", "joined", "apart")
