@@ -37,7 +37,7 @@ from mtjax.training.console import (
     describe_warmup,
     duration,
 )
-from mtjax.training.exchange import Exchange
+from mtjax.training.host_replay import Exchange
 from mtjax.training.sinks import Sink, open_sinks, write_rows
 from mtjax.training.stops import finite_seeds, require_finite, require_finite_parameters, stop_signals
 from mtjax.types import SPLITS
