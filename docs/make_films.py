@@ -23,7 +23,7 @@ from mtjax.envs import name_of
 from mtjax.envs.pixels import Pictured
 from mtjax.evaluation import record
 from mtjax.report import render
-from mtjax.saved import shipped
+from mtjax.saved import pretrained
 from mtjax.saved.policy import Policy
 
 FOLDER = Path(__file__).parent / "pictures" / "families"
@@ -34,7 +34,7 @@ FRAMES, STRIDE, DURATION = 30, 2, 40  # of a film: frames, steps from one to the
 
 def draw(name: str) -> None:
     """Draw a run's family, or a family by its name, if it can be seen."""
-    trained = [known for known in shipped.names() if known.startswith(f"{name}/")]
+    trained = [known for known in pretrained.names() if known.startswith(f"{name}/")]
     if Path(name).is_dir() or trained:
         for family, frames in play(mtjax.load(trained[0] if trained else name)):
             save(name_of(family), frames)

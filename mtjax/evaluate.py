@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from mtjax.checks import require_episodes, require_run
 from mtjax.command import imports, parsing, process, refusals, words
 from mtjax.names import SPLITS, InputError, become, command, load, nearest_error
-from mtjax.saved import shipped
+from mtjax.saved import pretrained
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,9 +79,9 @@ def _parse(argv: Sequence[str]) -> tuple[Request, dict[str, str]]:
         raise InputError("tasks of --env.vary belong to no split, and diagnostics are of the run's own tasks")
     if request.drawn is not None and (vary or request.diagnostics):
         raise InputError("--task-seed draws other tasks; leave out --env.vary, and diagnostics of the run's own tasks")
-    folder = shipped.folder(request.run)
+    folder = pretrained.folder(request.run)
     require_run(folder)
-    if request.diagnostics and shipped.is_shipped(folder):
+    if request.diagnostics and pretrained.is_shipped(folder):
         raise InputError(f"diagnostics need a run's replay, and {request.run!r} is a policy alone")
     return request, vary
 

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from mtjax import curricula, frames
 from mtjax.agents.state import of_tasks, with_tasks
 from mtjax.agents.swept import at_point, with_numbers
+from mtjax.axes import Flat, over_seeds, when
 from mtjax.checks import check_fields
 from mtjax.parallel import collectives
 from mtjax.rollout import (

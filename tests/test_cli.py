@@ -31,7 +31,7 @@ from mtjax.config import Plan, for_tasks, load_preset, with_preset
 from mtjax.envs import BENCHMARKS, ENVS
 from mtjax.loop import Settings
 from mtjax.names import notice
-from mtjax.saved import shipped
+from mtjax.saved import pretrained
 from mtjax.saved.config_json import from_json, to_flags, to_json
 from mtjax.training import launch
 from mtjax.training.launch import slow_on_cpu
@@ -348,7 +348,7 @@ def test_list_names_every_family_and_agent(capsys):
     mtjax.train.main(["--list"])
     lines = capsys.readouterr().out.splitlines()
     names = {line.split()[0] for line in lines if line.startswith("  ")}
-    policies = shipped.names()
+    policies = pretrained.names()
     assert names == {*ENVS, *BENCHMARKS, *AGENTS, *policies}
     assert all(len(line.split()) > 3 for line in lines if line.startswith("  ") and line.strip() not in policies)
 

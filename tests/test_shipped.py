@@ -18,7 +18,7 @@ from mtjax.command import ship as command
 from mtjax.command.run_config import parse
 from mtjax.report import films
 from mtjax.report.scoring import score
-from mtjax.saved import ship, shipped
+from mtjax.saved import pretrained, ship
 from mtjax.training import finetune
 from mtjax.types import InputError
 
@@ -42,7 +42,7 @@ def test_an_action_depends_on_what_is_kept_alone(name):
 @pytest.fixture
 def package(tmp_path, monkeypatch):
     """An empty folder in place of the package's policies."""
-    monkeypatch.setattr(shipped, "FOLDER", tmp_path / "pretrained")
+    monkeypatch.setattr(pretrained, "FOLDER", tmp_path / "pretrained")
     return tmp_path / "pretrained"
 
 
@@ -50,7 +50,7 @@ def package(tmp_path, monkeypatch):
 def test_a_policy_is_shipped_and_acts_as_its_run(copied_run, package, tmp_path, monkeypatch, capsys):
     """By its name, in Python and on the command line, which writes nothing but what goes with a film."""
     command.main([str(copied_run), "finger-spin/care"])
-    assert shipped.names() == ["finger-spin/care"]
+    assert pretrained.names() == ["finger-spin/care"]
     ours, theirs = mtjax.load("finger-spin/care"), mtjax.load(copied_run)
     tasks = theirs.env.tasks("all")
     obs = np.ones((len(tasks.id), 9), np.float32)
@@ -116,7 +116,7 @@ def test_a_policy_of_the_package_has_no_checkpoints_to_choose_from():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", shipped.names())
+@pytest.mark.parametrize("name", pretrained.names())
 def test_a_policy_scores_what_its_page_says(name):
     """The return on training tasks in the table, within what two other episodes of each task may differ."""
     told = re.search(rf"^\| `{name}` \|.*?\| (\d+) \|", PAGE.read_text(), re.MULTILINE)

@@ -13,6 +13,7 @@ from probes import Stub, Walk, learner, one_in, quick, random_batch, tasks_of, t
 
 from mtjax import loop
 from mtjax.agents.swept import with_numbers
+from mtjax.axes import when
 from mtjax.experience import Replay
 from mtjax.types import InputError, Sometimes, Spec
 

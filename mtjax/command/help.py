@@ -5,7 +5,7 @@ import textwrap
 from mtjax.agents import AGENTS
 from mtjax.command.sources import OF_EVERY_RUN, documented_fields
 from mtjax.envs import BENCHMARKS, ENVS, SUITES, outline, varied
-from mtjax.saved import shipped
+from mtjax.saved import pretrained
 
 
 def catalogue() -> str:
@@ -22,7 +22,7 @@ def catalogue() -> str:
     lines.append(f"environments of other packages, by their names there, such as gymnasium:CartPole-v1: {others}")
     lines += ["agents:", *(f"  {name:36} {preset.says}" for name, preset in AGENTS.items())]
     lines += ["trained policies (python -m mtjax.evaluate --run=NAME, or mtjax.load(NAME)):"]
-    return "\n".join(lines + [f"  {name}" for name in shipped.names()])
+    return "\n".join(lines + [f"  {name}" for name in pretrained.names()])
 
 
 def overview() -> str:

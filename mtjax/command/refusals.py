@@ -12,7 +12,7 @@ from mtjax.command.sources import all_flags, as_flag, whole_flags
 from mtjax.command.words import VARY, flag_value, is_whole, switched_off, switched_on
 from mtjax.envs import BENCHMARKS, ENVS, members
 from mtjax.names import PRESETS, InputError, nearest_error
-from mtjax.saved import shipped
+from mtjax.saved import pretrained
 
 _KNOWN = (("environment", "env", ENVS), ("agent", "agent", AGENTS), ("preset", "preset", PRESETS))
 _MAY_CHANGE = {  # the only flags beside --resume
@@ -41,8 +41,8 @@ def check_names(argv: Sequence[str]) -> None:
         raise InputError(f"--resume goes on with a run as it was; only --steps may change, not {other}")
     for flag in () if {"--resume", "--sweep"} <= given else ("resume", "from"):
         folder = flag_value(argv, flag, None)
-        if folder in shipped.names() and not Path(folder).is_dir():
-            raise shipped.not_learning(folder)
+        if folder in pretrained.names() and not Path(folder).is_dir():
+            raise pretrained.not_learning(folder)
         if folder is not None and not (flag == "resume" and any(Path(folder).glob("run-*"))):  # the runs of a sweep
             require_run(Path(folder))
 

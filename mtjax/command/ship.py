@@ -2,7 +2,7 @@
 
 from mtjax.command import process
 from mtjax.names import InputError, command
-from mtjax.saved import ship, shipped
+from mtjax.saved import pretrained, ship
 
 
 @command
@@ -11,7 +11,7 @@ def main(argv: list[str]) -> None:
     if len(argv) != 2 or argv[1].count("/") != 1:
         raise InputError("give a run and a name: python -m mtjax.command.ship RUN ENV/AGENT")
     run, name = argv
-    target = shipped.FOLDER / name
+    target = pretrained.FOLDER / name
     if target.exists():
         raise InputError(f"there is a policy {name!r} already; remove {str(target)!r} first")
     ship.write(run, target)

@@ -21,7 +21,7 @@ from mtjax.evaluation import Scores, of_tasks
 from mtjax.names import nearest_error, public
 from mtjax.report import diagnostics, figures, films
 from mtjax.report.tables import task_table
-from mtjax.saved import shipped
+from mtjax.saved import pretrained
 from mtjax.saved.config_json import from_json
 from mtjax.saved.export import export
 from mtjax.saved.log import append_rows, number
@@ -172,7 +172,7 @@ def report(request: Any, vary: Mapping[str, str]) -> None:
     print(task_table(policy, scores, named), flush=True)
     if policy.agent.unseen:
         print(f"unseen tasks: {policy.agent.unseen}")
-    if shipped.is_shipped(shipped.folder(run)) and not chosen:
+    if pretrained.is_shipped(pretrained.folder(run)) and not chosen:
         if any(part.family.films for part in policy.env.parts):
             print(f"look at it: python -m mtjax.evaluate {shlex.join([f'--run={run}', '--video'])}")
         return
@@ -221,7 +221,7 @@ def as_unseen(tasks: Task, env: Any) -> Task:
 
 def _first_seed(run: str, point: int) -> int:
     """Return the first entry of S that belongs to a setting."""
-    config = from_json(shipped.folder(run) / "config.json")
+    config = from_json(pretrained.folder(run) / "config.json")
     _require_point(point, len(config.points))
     return point * config.plan.seeds
 
@@ -258,7 +258,7 @@ def score(
 
 def _place(run: str) -> Path:
     """Return where a run's evaluations are written. Those of a policy of the package are with the user's own runs."""
-    if not shipped.is_shipped(shipped.folder(run)):
+    if not pretrained.is_shipped(pretrained.folder(run)):
         return Path(run)
     place = Path("runs") / run.replace("/", "-")
     place.mkdir(parents=True, exist_ok=True)

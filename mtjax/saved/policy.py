@@ -23,7 +23,7 @@ from mtjax.experience import Replay
 from mtjax.experience.ring import Ring
 from mtjax.names import public
 from mtjax.saved import checkpoint as checkpoints
-from mtjax.saved import shipped
+from mtjax.saved import pretrained
 from mtjax.saved.config_json import from_json
 from mtjax.saved.operations import steps_of
 from mtjax.tasks import SAME_CONTEXT
@@ -172,10 +172,10 @@ def load(directory: str | Path, seed: int = 0, checkpoint: int = 0) -> Policy:
         InputError: the folder is not a run, the run has no such seed, or its checkpoint is missing or damaged.
     """
     require_whole("checkpoint", checkpoint, 0)
-    directory = shipped.folder(path(directory))
+    directory = pretrained.folder(path(directory))
     config = from_json(directory / "config.json")
     _require_seed(seed, config.plan.seeds, len(config.points))
-    if shipped.is_shipped(directory):
+    if pretrained.is_shipped(directory):
         if checkpoint:
             raise InputError(f"{str(directory)!r} is a policy alone, without checkpoints; leave out checkpoint")
         states = _filled(directory, state_shapes(config).agent)
@@ -188,9 +188,9 @@ def load(directory: str | Path, seed: int = 0, checkpoint: int = 0) -> Policy:
 
 def _filled(directory: Path, like: Any) -> Any:
     """Return an agent's state with the arrays that acting reads from a folder, and zeros elsewhere."""
-    found, (leaves, form) = shipped.arrays(directory), jax.tree.flatten(like)
+    found, (leaves, form) = pretrained.arrays(directory), jax.tree.flatten(like)
     if any(i >= len(leaves) or leaves[i].shape[1:] != x.shape for i, x in found.items()):
-        raise InputError(f"{str(directory / shipped.FILE)!r} is of another agent than its config.json")
+        raise InputError(f"{str(directory / pretrained.FILE)!r} is of another agent than its config.json")
     filled = [jnp.zeros(x.shape, x.dtype) if i not in found else found[i][None] for i, x in enumerate(leaves)]
     return jax.tree.unflatten(form, map(jnp.asarray, filled))
 

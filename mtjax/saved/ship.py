@@ -10,7 +10,7 @@ import numpy as np
 
 from mtjax.config import RunConfig
 from mtjax.names import InputError
-from mtjax.saved import shipped
+from mtjax.saved import pretrained
 from mtjax.saved.config_json import read_record
 from mtjax.saved.operations import steps_of
 from mtjax.saved.policy import Policy, load
@@ -32,7 +32,7 @@ def write(run: str | Path, directory: Path) -> None:
     leaves = jax.tree.leaves(policy.state)
     arrays: Any = {str(i): np.asarray(leaves[i]) for i in read_by_acting(policy)}
     directory.mkdir(parents=True)
-    np.savez_compressed(directory / shipped.FILE, **arrays)
+    np.savez_compressed(directory / pretrained.FILE, **arrays)
     (directory / _SETTINGS).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
 
 

@@ -15,7 +15,7 @@ from mtjax.config import NO_FINE_TUNING, RunConfig
 from mtjax.envs import Family
 from mtjax.envs.mixtures import require_family
 from mtjax.networks import Params
-from mtjax.saved import shipped
+from mtjax.saved import pretrained
 from mtjax.saved.policy import Policy
 from mtjax.types import Discrete, Env, InputError, Spec, Task
 
@@ -46,8 +46,8 @@ def require_fit(start: Policy, env: Env, agent: BaseAgent) -> None:
         InputError: the agent differs from the run's, the tasks have other sizes or another context, or the policy comes
             with the package.
     """
-    if start.directory is not None and shipped.is_shipped(start.directory):
-        raise shipped.not_learning(str(start.directory))
+    if start.directory is not None and pretrained.is_shipped(start.directory):
+        raise pretrained.not_learning(str(start.directory))
     _require_same_agent(start.agent, agent)
     for each in (env, start.env):
         require_family(each, NO_FINE_TUNING)
