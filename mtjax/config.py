@@ -190,7 +190,6 @@ class RunConfig:
         """
         if self.env:
             self._check_named()
-        require_policy(self.learner, self.family)
         if self.mesh is not None and (forgetful := getattr(self.family, "forgetful", "")):
             raise InputError(
                 f"{forgetful} steps on the host of one device, and this run is on {self.mesh.size}; show JAX one, such "
@@ -199,6 +198,7 @@ class RunConfig:
         self.learner.experience.check(self.family, self.played.num_envs, self.played.chunk_steps)
         require_trials(self.training, self.family, self.learner)
         require_curriculum(self.played, self.family, self.learner)
+        require_policy(self.learner, self.family)
         for learner in agents_at(self.learner, self.points):
             require_value_range(learner)
         trials.require_whole(self.plan.eval_episodes, self.training.trials, "eval-episodes")
@@ -290,6 +290,8 @@ def fit_chunk(settings: Settings, num_tasks: int, steps: int, grain: int = 1) ->
     whole_run = math.ceil(steps / (num_tasks * settings.num_envs))
     longest = math.ceil(min(settings.chunk_steps, whole_run) / grain) * grain
     chunk = math.ceil(whole_run / math.ceil(whole_run / longest) / grain) * grain
+    if settings.plays.steps:  # tasks change between chunks
+        chunk = next((n for n in range(chunk, grain, -grain) if settings.plays.steps % n == 0), grain)
     return dataclasses.replace(settings, chunk_steps=chunk)
 
 
@@ -303,7 +305,7 @@ def fit_length(config: RunConfig, given: Collection[str]) -> RunConfig:
         given: names of settings that somebody chose, which stay as they are.
     """
     plan, training, experience = config.plan, config.training, config.learner.experience
-    count = config.family.train_count
+    count = config.played_tasks
     tenth = plan.steps // (10 * count * training.num_envs)
     if "chunk_steps" not in given:
         training = dataclasses.replace(training, chunk_steps=min(training.chunk_steps, max(tenth, experience.steps)))
@@ -312,7 +314,7 @@ def fit_length(config: RunConfig, given: Collection[str]) -> RunConfig:
             plan, eval_episodes=math.ceil(plan.eval_episodes / training.trials) * training.trials
         )
     if "eval_every" not in given and not plan.eval_every:
-        each = count * plan.eval_episodes * config.family.episode_length
+        each = config.num_tasks * plan.eval_episodes * config.family.episode_length
         often = min(max(_EVALUATED * plan.steps // each, 1), 10)
         plan = dataclasses.replace(plan, eval_every=0 if often == 10 else math.ceil(plan.steps / often))
     if isinstance(experience, Replay) and "warmup_steps" not in given:

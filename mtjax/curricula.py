@@ -1,4 +1,4 @@
-"""A curriculum says which of the known tasks worlds play. It changes them between chunks.
+"""A curriculum says which of the known tasks worlds play, and for how many steps. It changes them between chunks.
 
 An agent knows all N training tasks: its own parameters of each, its features and its memory of gradient steps. Of these
 T are played at a time. The tasks of a chunk follow from the step at which it begins, so that a run resumes exactly.
@@ -17,7 +17,7 @@ from mtjax.types import Array, InputError
 class Everything:
     """All tasks are played, always."""
 
-    changes: ClassVar[bool] = False
+    steps: ClassVar[int] = 0  # of every environment, after which tasks change; 0 for never
 
     def count(self, known: int) -> int:
         """Return the number T of tasks that are played at a time, of N that are known."""
@@ -30,18 +30,20 @@ class Everything:
 
 @dataclasses.dataclass(frozen=True)
 class Random:
-    """Some tasks are played, which are drawn anew for every chunk, without repeating one."""
+    """Some tasks are played, and others drawn after so many steps of every environment, without repeating one."""
 
     played: int
-    changes: ClassVar[bool] = True
+    steps: int
 
     def count(self, known: int) -> int:
         if not 1 <= self.played <= known:
-            raise InputError(f"the curriculum random:{self.played} plays 1 to {known} of the {known} training tasks")
+            raise InputError(
+                f"the curriculum random:{self.played}:{self.steps} plays 1 to {known} of the {known} training tasks"
+            )
         return self.played
 
     def rows(self, step: Array, known: int) -> Array:
-        key = jax.random.fold_in(jax.random.key(0x5E1EC7), step)
+        key = jax.random.fold_in(jax.random.key(0x5E1EC7), step // self.steps)
         return jax.random.permutation(key, known)[: self.played].astype(jnp.int32)
 
 
@@ -53,7 +55,6 @@ class Sequence:
     """
 
     steps: int
-    changes: ClassVar[bool] = True
 
     def count(self, known: int) -> int:
         return 1
@@ -63,21 +64,23 @@ class Sequence:
 
 
 Curriculum = Everything | Random | Sequence
-_KINDS = {"random": Random, "sequence": Sequence}
+_KINDS = {"random": (Random, 2), "sequence": (Sequence, 1)}  # with how many numbers each has
 
 
 def read(text: str) -> Curriculum:
-    """Return the curriculum that ``text`` names: "all", "random:T" or "sequence:STEPS".
+    """Return the curriculum that ``text`` names: "all", "random:T:STEPS" or "sequence:STEPS".
 
     Raises:
         InputError: it names none.
     """
-    kind, _, number = text.partition(":")
     if text == "all":
         return Everything()
-    if kind not in _KINDS or not number.isdecimal() or not int(number):
+    kind, *words = text.split(":")
+    made, count = _KINDS.get(kind, (Random, -1))
+    numbers = [int(word) for word in words if word.isdecimal() and int(word)]
+    if not len(numbers) == len(words) == count:
         raise InputError(
-            f"curriculum is all, random:T (T tasks at a time) or sequence:STEPS (steps of every environment for each "
-            f"task), such as random:10 or sequence:100000; not {text!r}"
+            "curriculum is all, random:T:STEPS (T tasks at a time) or sequence:STEPS (one after another), with steps "
+            f"of every environment until tasks change, such as random:10:5000 or sequence:100000; not {text!r}"
         )
-    return _KINDS[kind](int(number))
+    return made(*numbers)

@@ -52,8 +52,9 @@ class Settings:
     """Begin environments at different ages, so that their episodes end at different times; returns do not count first
     episodes, which are shorter."""
     curriculum: str = "all"
-    """Which training tasks are played: all; random:T, T of them, drawn anew for every chunk; or sequence:STEPS, one
-    after another for so many steps of every environment. The agent knows all of them, and is evaluated on all."""
+    """Which training tasks are played: all; random:T:STEPS, T of them, and others after so many steps of every
+    environment; or sequence:STEPS, one after another for so many. The agent knows all of them, and is evaluated on
+    all."""
     trials: int = 1
     """Episodes of a trial: for so many of them the task and the agent's memory stay, and the agent maximises their sum
     of rewards. 1 makes every episode a trial of its own."""
@@ -108,7 +109,7 @@ def init(
     require_trials(settings, env, agent)
     require_curriculum(settings, env, agent)
     known, rows = tasks, None
-    if settings.plays.changes:
+    if settings.plays.steps:
         rows = settings.plays.rows(jnp.int32(0), len(known.id))
         tasks = rows_of(known, rows)
     num_tasks = len(tasks.id)
@@ -144,13 +145,13 @@ def require_curriculum(settings: Settings, env: Any, agent: Any) -> None:
     Raises:
         InputError: it cannot.
     """
-    if not settings.plays.changes:
+    if not settings.plays.steps:
         return
     told, experience = f"the curriculum {settings.curriculum}", agent.experience
-    if isinstance(settings.plays, curricula.Sequence) and settings.plays.steps % settings.chunk_steps:
-        raise InputError(f"{told} changes the task between chunks: give a multiple of --chunk-steps")
-    if isinstance(settings.plays, curricula.Random) and experience.steps == 1:
-        raise InputError(f"{told} empties a replay with every chunk; use an agent with rollouts, such as ppo")
+    if settings.plays.steps % settings.chunk_steps:
+        raise InputError(
+            f"{told} changes tasks between chunks: give a multiple of --chunk-steps={settings.chunk_steps}"
+        )
     if experience.reset_every or experience.host_slots(settings.num_envs):
         raise InputError(f"{told} begins a replay anew; use --reset-every=0 and --host-replay-size=0")
     if not isinstance(env, Flat):
@@ -241,7 +242,7 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
         Worlds that are lost at more than one in 10,000 steps of a task count as numbers that are not finite.
     """
     experience, known = agent.experience, tasks
-    if settings.plays.changes:
+    if settings.plays.steps:
         state = _take_turns(env, agent, settings, known, state)
         tasks = rows_of(known, state.rows)
 
@@ -260,7 +261,7 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
     state, history = jax.lax.scan(iterate, state, length=settings.chunk_steps // experience.steps)
     count = settings.num_envs * settings.chunk_steps
     metrics = _summarise(history, count)
-    if settings.plays.changes:
+    if settings.plays.steps:
         metrics = _of_known(metrics, state.rows, len(known.id))
     return state._replace(agent=collectives.agreed(state.agent)), metrics
 

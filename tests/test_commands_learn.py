@@ -33,6 +33,7 @@ _HOSTS = "takes several processes; tests/test_devices.py has such runs"
 _FINGER = "ten fingers still have a return of 0 to 2 after 300,000 steps, which take two minutes of a CPU core"
 _WALKER = "a walker takes several minutes on two CPU cores, docs/results/returns.md"
 _ONE = "--env.vary.size=1.1 --split=none --steps=250000"  # finger of the ten
+_GYM = "needs Gymnasium; tests/test_hosted.py learns to balance there"
 _GRID = "earns nearly all that can be earned in ten minutes of two CPU cores; tests/test_recurrent.py has a bandit"
 _LOOP = "--env=point-mass-vary-goal --agent=multi-head"  # one pair of the loop around the command
 
@@ -51,6 +52,8 @@ MARKS: dict[str, Learns | str] = {
     "--env=walker-walk-vary-friction --split=hip-bmdp --seeds=5": _WALKER,
     "--env=sailing --agent=ppo": Learns(2),
     "--env=grid-navi --agent=rl2 --trials=4 --agent.unroll=60": _GRID,
+    "--env=finger-spin --env.vary.size=0.95:1.13:200 --curriculum=random:10:4000 --num-envs=8": _FINGER,
+    "--env=gymnasium:Pendulum-v1 --env.vary.g=5:15:5 --agent=ppo": _GYM,
     "--env=mt10 --agent=multi-head": _GPU,
     "--env=mt10 --agent=care --agent.num-experts=4 --agent.conditioning=text --agent.text=all-MiniLM-L6-v2 "
     "--batch-size=128 --steps=20000000 --seed=1": _GPU,

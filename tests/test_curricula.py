@@ -40,7 +40,7 @@ def test_a_sequence_plays_every_task_in_turn_and_begins_again():
 
 
 def test_a_random_choice_repeats_no_task_and_changes():
-    drawn = [np.asarray(curricula.read("random:3").rows(jnp.int32(step), 10)) for step in range(200)]
+    drawn = [np.asarray(curricula.read("random:3:1").rows(jnp.int32(step), 10)) for step in range(200)]
     assert all(len(set(rows.tolist())) == 3 for rows in drawn)
     counts = np.bincount(np.concatenate(drawn), minlength=10)
     assert counts.sum() == 600 and np.all(np.abs(counts - 60) < 30)
@@ -80,7 +80,7 @@ def test_a_choice_of_all_tasks_learns_the_same_as_all(monkeypatch):
     monkeypatch.setattr(curricula.Random, "rows", lambda self, step, known: jnp.arange(known))
     agent = tiny("ppo", heads="per-task")
     (_, plain), of_plain = played(agent, "all", 1, **ROLLOUTS)
-    (_, found), of_found = played(agent, "random:2", 1, **ROLLOUTS)
+    (_, found), of_found = played(agent, "random:2:8", 1, **ROLLOUTS)
     jax.tree.map(np.testing.assert_array_equal, plain.agent, found.agent)
     jax.tree.map(np.testing.assert_array_equal, of_plain, of_found)
 
@@ -102,12 +102,11 @@ def test_a_run_by_a_sequence_is_recorded_by_known_tasks_and_resumes_to_the_bit(t
 @pytest.mark.parametrize(
     "agent, given, said",
     [
-        ("ppo", {"curriculum": "some"}, "curriculum is all, random:T"),
-        ("ppo", {"curriculum": "random:0"}, "curriculum is all, random:T"),
-        ("ppo", {"curriculum": "random:4"}, "plays 1 to 3 of the 3 training tasks"),
-        ("ppo", {"curriculum": "sequence:60", "chunk_steps": 50}, "give a multiple of chunk_steps"),
+        ("ppo", {"curriculum": "some"}, "curriculum is all, random:T:STEPS"),
+        ("ppo", {"curriculum": "random:0:50"}, "curriculum is all, random:T:STEPS"),
+        ("ppo", {"curriculum": "random:4:50"}, "plays 1 to 3 of the 3 training tasks"),
+        ("ppo", {"curriculum": "sequence:60", "unroll": 50}, "give a multiple of chunk_steps=50"),
         ("famo", {"curriculum": "sequence:50"}, "without memory of the tasks"),
-        ("sac", {"curriculum": "random:2"}, "use an agent with rollouts"),
     ],
 )
 def test_what_cannot_be_played_is_refused(agent, given, said):

@@ -25,6 +25,7 @@ GROUND = (
     "networks",
     "tasks",
     "trials",
+    "curricula",
     "axes",
     "frames",
     "parallel",

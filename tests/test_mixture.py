@@ -396,7 +396,7 @@ def test_every_task_has_its_own_normaliser_and_padding_stays_zero():
     obs = jnp.float32(random.normal(size=(4, 50, 3)) * [[[1]], [[2]], [[5]], [[9]]])
     obs = obs.at[:3, :, 2].set(0.0)  # of the three tasks that see two numbers
     inputs = agent.view.count(agent.view.init(BOTH.spec, 4), obs)
-    seen = quick(jax.vmap(agent.see, (OVER_TASKS, 0)), inputs, obs)
+    seen = quick(jax.vmap(agent.view.see, (OVER_TASKS, 0)), inputs, obs)
     assert not np.any(seen[:3, :, 2])
     for i, width in enumerate((2, 2, 2, 3)):
         alone = normalize.update(normalize.init(width), obs[i, :, :width])

@@ -153,9 +153,16 @@ class BaseAgent(abc.ABC):
         return dataclasses.replace(self, policy=policy_for(action))
 
     @property
+    def borrowed(self) -> list[str]:
+        """Names of what a task that was not trained on uses of its nearest training task to act."""
+        found = {"shared": [], "per-task": ["head"], "disjoint": ["networks"]}[self.heads]
+        found += ["input layer"] * (self.encoder.front() is not None) + ["statistics"] * self.encoder.has_statistics
+        return [*found, *self.conditioning.borrowed, *self.representation.borrowed]
+
+    @property
     def unseen(self) -> str:
         """A sentence on what stands in for unseen tasks; empty if nothing has to."""
-        borrowed, replaced = " and ".join(borrowed_by_unseen(self)), self.representation.replaced
+        borrowed, replaced = " and ".join(self.borrowed), self.representation.replaced
         texts = (f"each uses the {borrowed} of the nearest training task", f"each has {replaced}")
         return ", and ".join(text for text, present in zip(texts, (borrowed, replaced), strict=True) if present)
 
@@ -317,10 +324,3 @@ def network_of(agent: BaseAgent, hidden: tuple[int, ...], layer_norm: bool) -> N
     own = {"shared": (), "per-task": ("head",), "disjoint": ("sight", "body", "head")}[agent.heads]
     front = None if agent.representation.learns else agent.encoder.front()
     return Network(agent.encoder.body(hidden, layer_norm), own, front)
-
-
-def borrowed_by_unseen(agent: BaseAgent) -> list[str]:
-    """Return the names of what a task that was not trained on uses of its nearest training task."""
-    found = {"shared": [], "per-task": ["head"], "disjoint": ["networks"]}[agent.heads]
-    found += ["input layer"] * (agent.encoder.front() is not None) + ["statistics"] * agent.encoder.has_statistics
-    return [*found, *agent.conditioning.borrowed, *agent.representation.borrowed]

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents import parts
-from mtjax.agents.base import Heads, Memory, borrowed_by_unseen
+from mtjax.agents.base import Heads, Memory
 from mtjax.agents.choices import PARTS
 from mtjax.agents.replayed import Batch
 from mtjax.agents.sac import SAC, ActorAux, Sample
@@ -90,7 +90,7 @@ class Distral(SAC):
     @property
     def unseen(self) -> str:
         """A sentence on what stands in for unseen tasks."""
-        rest = [part for part in borrowed_by_unseen(self) if part != "networks"]
+        rest = [part for part in self.borrowed if part != "networks"]
         return "the distilled policy plays them" + (f", by the {' and '.join(rest)} of the nearest" if rest else "")
 
     @property

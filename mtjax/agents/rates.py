@@ -26,7 +26,7 @@ def planned(agent: A, steps: int) -> A:
         InputError: the run ends before the schedule's warm-up does.
     """
     own: Any = agent
-    if own.lr_schedule == "constant":
+    if getattr(own, "lr_schedule", "constant") == "constant":  # agents of other kinds have none
         return agent
     updates = own.lr_updates or own.experience.updates_in(steps)
     if updates <= own.lr_warmup:
