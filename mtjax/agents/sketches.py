@@ -133,11 +133,6 @@ class Sketches(PPO):
         return [name for name in super().borrowed if name != "networks" or self.sharing == "tasks"]
 
     @property
-    def borrowed(self) -> list[str]:
-        """Names of what a task that was not trained on uses of its nearest training task to act."""
-        return [name for name in super().borrowed if name != "networks" or self.sharing == "tasks"]
-
-    @property
     def unseen(self) -> str:
         """A sentence on what stands in for unseen tasks."""
         played = "each is played by the policies of its sketch's symbols" * (self.sharing == "symbols")
