@@ -4,13 +4,15 @@ An observation of an environment holds one picture. Rollouts keep the stack that
 newest picture of every stack. An episode's first picture is repeated where the episode is younger than the stack.
 """
 
+import dataclasses
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from mtjax.types import Array, InputError, Spec
+from mtjax.types import Array, Spec
 
 PICTURES = "pixels"
 """The entry of an observation that holds pictures, uint8."""
@@ -21,24 +23,6 @@ STATE = "state"
 def shown(obs: Any) -> bool:
     """Return whether an observation, or its shapes, holds pictures."""
     return isinstance(obs, Mapping) and PICTURES in obs
-
-
-def require_known(obs: Any) -> None:
-    """Check that networks can be built for observations of these shapes.
-
-    Raises:
-        InputError: they are neither a vector of floats, nor pictures, nor both.
-    """
-    vector = lambda x: getattr(x, "ndim", 0) == 1 and jnp.issubdtype(x.dtype, jnp.floating)
-    picture = lambda x: getattr(x, "ndim", 0) == 3 and x.dtype == jnp.uint8
-    kinds = {PICTURES: picture, STATE: vector}
-    known = all(name in kinds and kinds[name](x) for name, x in obs.items()) if shown(obs) else vector(obs)
-    if not known:
-        told = jax.tree.map(lambda x: f"{x.dtype}{list(x.shape)}", obs)
-        raise InputError(
-            f"agents take a vector of floats (O,), or a dictionary of 'pixels', uint8 (H, W, C), and a vector 'state' "
-            f"if there is one; not {told}"
-        )
 
 
 def begin(obs: Any, frames: int) -> Any:
@@ -61,22 +45,76 @@ def seen(spec: Spec) -> Any:
     return jax.eval_shape(lambda obs: begin(obs, spec.frames), spec.obs)
 
 
-# The vector in an observation, if any: the observation itself, or what comes beside pictures.
+# What networks take of an observation: one vector, pictures, or both.
+
+
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """Joins the arrays of an observation to one vector (..., O) float32, in the order of the tree.
+
+    Pictures stay beside the vector. As a part of a tree it is static, and no leaf.
+    """
+
+    ranks: tuple[int, ...]  # of the arrays in a single observation, without pictures
+
+    def __call__(self, obs: Any) -> Any:
+        """Return observations, leaves (..., *shape), as networks take them; pictures alone as they are."""
+        arrays = [jnp.asarray(x) for x in jax.tree.leaves(_beside_pictures(obs))]
+        if not arrays:
+            return obs
+        flat = [_flatten(x, rank).astype(jnp.float32) for x, rank in zip(arrays, self.ranks, strict=True)]
+        vector = jnp.concatenate(flat, axis=-1)
+        return {PICTURES: obs[PICTURES], STATE: vector} if shown(obs) else vector
+
+
+def layout(obs: Any) -> Layout | None:
+    """Return how networks take observations of these shapes; None if it is as they are."""
+    rest, as_it_is = _beside_pictures(obs), ({}, {STATE: 0}) if shown(obs) else (0,)
+    arrays = jax.tree.leaves(rest)
+    vectors = all(x.ndim == 1 and jnp.issubdtype(x.dtype, jnp.floating) for x in arrays)
+    if vectors and jax.tree.structure(rest) in map(jax.tree.structure, as_it_is):
+        return None
+    return Layout(tuple(x.ndim for x in arrays))
+
+
+def joined(obs: Any) -> Any:
+    """Return the shapes of observations of these shapes as networks take them."""
+    found = layout(obs)
+    return obs if found is None else jax.eval_shape(found, obs)
+
+
+def numeric(obs: Any) -> bool:
+    """Return whether observations of these shapes hold numbers or bools, and pictures (H, W, C) uint8 if any."""
+    kinds = jnp.integer, jnp.floating, jnp.bool_
+    arrays = jax.tree.leaves(obs)
+    known = all(hasattr(x, "dtype") and any(jnp.issubdtype(x.dtype, kind) for kind in kinds) for x in arrays)
+    picture = getattr(obs[PICTURES], "dtype", None) == jnp.uint8 and obs[PICTURES].ndim == 3 if shown(obs) else True
+    return bool(arrays) and known and picture
+
+
+def _beside_pictures(obs: Any) -> Any:
+    return {name: x for name, x in obs.items() if name != PICTURES} if shown(obs) else obs
+
+
+def _flatten(x: Array, rank: int) -> Array:
+    lead, shape = x.shape[: x.ndim - rank], x.shape[x.ndim - rank :]
+    return x.reshape(*lead, math.prod(shape))
 
 
 def state(obs: Any) -> Array | None:
-    """Return the vector (..., O) in an observation, or None."""
+    """Return the vector (..., O) in an observation as networks take it, or None."""
     return obs.get(STATE) if shown(obs) else obs
 
 
 def with_state(change: Callable[[Array], Array], obs: Any) -> Any:
-    """Return an observation whose vector is changed."""
+    """Return an observation as networks take it, whose vector is changed."""
     if not shown(obs):
         return change(obs)
     return obs | {STATE: change(obs[STATE])} if STATE in obs else obs
 
 
 def state_size(spec: Spec) -> int:
-    """Return the size O of the vector in observations, 0 if there is none."""
-    found = state(spec.obs)
-    return spec.obs_size if found is spec.obs else 0 if found is None else found.shape[0]
+    """Return the size O of the vector that networks take of observations, 0 if there is none."""
+    found = state(joined(spec.obs))
+    return 0 if found is None else found.shape[0]

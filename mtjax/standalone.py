@@ -14,13 +14,14 @@ batches, which needs JAX and nothing else.
 """
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
+from functools import reduce
 from typing import Any
 
 import numpy as np
 
 PICTURES = "pixels"
-"""The entry of an observation that holds pictures, uint8. Vectors are float32."""
+"""The entry of an observation that holds pictures, uint8. Other arrays may be given as float32."""
 
 
 class Policy:
@@ -46,8 +47,8 @@ class Policy:
         If actions are discrete, it is the likeliest: a number () int32, or (B,).
 
         Args:
-            obs: an observation (O,); or of a policy that sees pictures {"pixels": (H, W, N C) uint8}, beside which may
-                be "state": (O,). All of a batch have a leading B.
+            obs: an observation (O,), or the tree of arrays that the family observes; of a policy that sees pictures
+                {"pixels": (H, W, N C) uint8}, beside which may be "state": (O,). All of a batch have a leading B.
             parameters: the task's parameters; in a batch each may be (B,). A policy that reads none takes them or
                 leaves them out.
         """
@@ -69,17 +70,40 @@ class Policy:
 
 
 def shapes_of(meta: dict[str, Any]) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of what a policy observes, by name. A vector alone is called obs."""
+    """Return the shapes of what a policy observes, by name. An array alone is called obs.
+
+    Of nested observations a name is a path: ``seen/0`` is the first array of the tuple ``seen``.
+    """
     return {name: tuple(shape) for name, shape in meta["obs"].items()}
 
 
 def observed(meta: dict[str, Any], obs: Any) -> tuple[list[np.ndarray], int | None]:
     """Return the arrays that a policy takes of an observation, in their order, and the size B if it is a batch."""
-    shapes, given = shapes_of(meta), obs if isinstance(obs, dict) else {"obs": obs}
+    shapes = shapes_of(meta)
+    given = entries(obs, shapes)
     arrays = {name: np.asarray(x, None if name == PICTURES else np.float32) for name, x in given.items()}
     size = batch_size(shapes, {name: x.shape for name, x in arrays.items()})
     require_bytes(arrays)
     return [arrays[name] for name in shapes], size
+
+
+def entries(obs: Any, names: Iterable[str]) -> dict[str, Any]:
+    """Return those arrays of an observation that there are, by names of ``shapes_of``."""
+    found = {}
+    for name in names:
+        if name == "obs" and not isinstance(obs, Mapping):
+            return {name: obs}
+        try:
+            found[name] = reduce(_entry, name.split("/"), obs)
+        except (AttributeError, IndexError, KeyError):
+            pass  # which whoever compares the names reports
+    return found
+
+
+def _entry(tree: Any, name: str) -> Any:
+    if isinstance(tree, Mapping):
+        return tree[name]
+    return tree[int(name)] if isinstance(tree, list | tuple) and name.isdigit() else getattr(tree, name)
 
 
 def require_bytes(obs: dict[str, Any]) -> None:
@@ -147,7 +171,8 @@ def load(file: Any) -> Policy:
 def load_jax(file: Any) -> Callable:
     """Load a policy as a JAX function: observations (B, O), values (B, P) of the parameters -> actions (B, A).
 
-    A policy that sees pictures takes a dict of exactly ``shapes_of(policy.meta)``, with a leading B.
+    A policy of several arrays takes a dict of exactly ``shapes_of(policy.meta)``, with a leading B, of the types that
+    ``policy.meta["about"]`` tells.
     """
     from jax import export
 

@@ -210,13 +210,14 @@ def test_a_reward_that_is_not_finite_is_named():
 
 SEEN = {  # what a family may observe, and whether agents take it
     "vector": (lambda qpos: qpos, True),
-    "map": (lambda qpos: jnp.zeros((3, 4)), False),
-    "integers": (lambda qpos: jnp.zeros(5, jnp.int32), False),
-    "dictionary": (lambda qpos: {"arm": qpos[:2], "rest": {"counts": jnp.zeros(2, jnp.int8)}}, False),
+    "map": (lambda qpos: jnp.zeros((3, 4)), True),
+    "integers": (lambda qpos: jnp.zeros(5, jnp.int32), True),
+    "dictionary": (lambda qpos: {"arm": qpos[:2], "rest": {"counts": jnp.zeros(2, jnp.int8)}}, True),
     "picture": (lambda qpos: {"pixels": jnp.zeros((16, 16, 3), jnp.uint8)}, True),
     "both": (lambda qpos: {"pixels": jnp.zeros((16, 16, 3), jnp.uint8), "state": qpos}, True),
     "other picture": (lambda qpos: {"pixels": jnp.zeros((16, 16, 3))}, False),
-    "more": (lambda qpos: {"pixels": jnp.zeros((16, 16, 3), jnp.uint8), "depth": jnp.zeros((16, 16, 1))}, False),
+    "complex": (lambda qpos: qpos * 1j, False),
+    "more": (lambda qpos: {"pixels": jnp.zeros((16, 16, 3), jnp.uint8), "depth": jnp.zeros((16, 16, 1))}, True),
 }
 
 
@@ -236,7 +237,7 @@ def test_observations_are_trees_of_any_shape_and_dtype(kind, forget):
     if taken:
         return require_sight(mtjax.agent("drq"), env.spec)
     for agent in ("sac", "ppo", "drq"):
-        with pytest.raises(InputError, match=r"agents take a vector of floats \(O,\), or .*; not ") as error:
+        with pytest.raises(InputError, match=r"takes observations of any tree of numbers .*; not ") as error:
             mtjax.train("seen", agent, steps=100, engine="c")
         assert "\n" not in str(error.value)
     return None

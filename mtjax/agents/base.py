@@ -51,7 +51,8 @@ class BaseAgent(abc.ABC):
         representation: of observations. The critics' loss trains it.
         knowing: of the task, which the critics' loss trains too.
         tasks: what is known of the training tasks: their contexts (N, C), and given vectors (N, V), if any.
-        inputs: the moments of observations; in a mixture one for each task, leaves (T, O).
+        inputs: the moments of observations; in a mixture one for each task, leaves (T, O). If observations are no
+            vectors, there is also their layout, which joins their arrays.
         scaling, sampler: the memories of the scaling of rewards and of the sampler of tasks.
     """
 
@@ -74,6 +75,10 @@ class BaseAgent(abc.ABC):
     """Whether devices that share a seed learn from other data each; with a replay all learn from the same."""
     common_presets: ClassVar[bool] = True
     """Whether the tables of presets that name no agent hold for it. They are tuned for learning from replay."""
+    takes: ClassVar[str] = (
+        "observations of any tree of numbers and bools as one vector, and beside it 'pixels', (H, W, C) uint8"
+    )
+    """What the agent takes, in a line."""
     policies: ClassVar[tuple[type[Policy], ...]] = (Gaussian,)
     """The kinds of policies with which the agent can learn."""
     fits_statistics: ClassVar[bool] = False
@@ -270,7 +275,8 @@ class BaseAgent(abc.ABC):
         """Return the memory after a step."""
         past, hidden = memory.past, memory.hidden
         if past is not None:
-            past = last_steps.append(past, transition.obs, transition.action, transition.reward)
+            obs = self.view.join_arrays(state.nets["inputs"], transition.obs)
+            past = last_steps.append(past, obs, transition.action, transition.reward)
         if hidden is not None:
             nets = of_task(state.nets, state.known(task))
             action = self.policy.encode(transition.action)

@@ -2,6 +2,8 @@
 
 from typing import Any
 
+import jax
+
 from mtjax import frames
 from mtjax.agents import parts
 from mtjax.agents.choices import PARTS
@@ -127,8 +129,15 @@ def require_sight(agent: Any, spec: Spec) -> None:
     Raises:
         InputError: they cannot, or tasks would have to be inferred from pictures.
     """
-    frames.require_known(spec.obs)
-    agent.representation.require(spec.obs)
+    if not frames.numeric(spec.obs):
+        told = jax.tree.map(lambda x: f"{x.dtype}{list(x.shape)}" if hasattr(x, "dtype") else repr(x), spec.obs)
+        raise InputError(f"{type(agent).__name__} takes {agent.takes}; not {told}")
+    agent.representation.require(frames.joined(spec.obs))
+    if agent.view.history and frames.layout(spec.obs) and getattr(agent.experience, "hindsight", 0):
+        raise InputError(
+            "hindsight relabels last steps that are vectors of floats as the family observes them, and "
+            "these are joined of other arrays; use --hindsight=0, or another conditioning"
+        )
     if frames.shown(spec.obs) and agent.view.history:
         raise InputError("tasks cannot be inferred from pictures; choose another conditioning")
     if frames.shown(spec.obs) and agent.conditioning.recurs:

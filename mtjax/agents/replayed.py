@@ -36,7 +36,7 @@ def prepare(agent: Any, state: AgentState, window: Transition, tasks: Task, key:
     """
     batch, inputs, view = transitions(agent, window, tasks), state.nets["inputs"], agent.view
     batch = batch if key is None else agent.representation.augment(batch, key)
-    past, next_past = view.around(window, batch, batch if batch.extras is None else batch.extras)
+    past, next_past = view.around(inputs, window, batch, batch if batch.extras is None else batch.extras)
     temperature = jnp.exp(state.nets["temperature"].parts["log"])
     bonus = temperature * abs(agent.target_entropy) * action_sizes(batch.action, tasks.action_mask) / 2
     gamma = discounts(agent, tasks)

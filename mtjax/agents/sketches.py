@@ -82,6 +82,7 @@ class Sketches(PPO):
     """What has a policy of its own: every symbol (symbols), every task (tasks), or nothing (all)."""
     stop_bias: float = -3.0
     """Bias of the logit of STOP at first. Below 0 a sub-policy lasts longer."""
+    takes: ClassVar[str] = "observations of any tree of numbers and bools as one vector that ends with the symbol"
     symbols: Annotated[int, tyro.conf.Suppress] = dataclasses.field(default=0, repr=False, metadata=parts.NO_SETTING)
     """Number of symbols while networks are made. It follows from the environment."""
 

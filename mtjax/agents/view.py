@@ -42,15 +42,20 @@ class View:
     # Moments of observations.
 
     def init(self, spec: Spec, num_tasks: int) -> Params:
-        """Return moments of no observations; in a mixture each task has its own, leaves (T, O)."""
+        """Return moments of no observations, with their layout unless networks take them as they are.
+
+        In a mixture each task has moments of its own, leaves (T, O).
+        """
         moments = normalize.init(max(frames.state_size(spec), 1))  # checkpoints hold no empty arrays
+        layout = frames.layout(spec.obs)
+        shared: dict[str, Any] = {} if layout is None else {"layout": layout}
         if not spec.mixed:
-            return Params({"moments": moments}, {})
-        return Params({}, {"moments": jax.tree.map(lambda x: jnp.stack([x] * num_tasks), moments)})
+            return Params(shared | {"moments": moments}, {})
+        return Params(shared, {"moments": jax.tree.map(lambda x: jnp.stack([x] * num_tasks), moments)})
 
     def count(self, inputs: Params, obs: Any) -> Params:
         """Add the vectors (T, ..., O) in observations to the moments, with those on other devices."""
-        found = frames.state(obs)
+        found = frames.state(self.join_arrays(inputs, obs))
         if not self.normalized or found is None:
             return inputs
         moments, mixed = inputs.parts["moments"], bool(inputs.own)
@@ -59,13 +64,22 @@ class View:
         mean, variance = (x.reshape(moments.mean.shape) for x in mean_and_variance(found, 1 if mixed else (0, 1)))
         one = normalize.Moments(jnp.full_like(moments.count, count), mean, count * variance)
         if mixed:
-            return Params({}, {"moments": jax.vmap(normalize.merge)(moments, one)})
-        return Params({"moments": normalize.merge(moments, one)}, {})
+            return inputs._replace(own={"moments": jax.vmap(normalize.merge)(moments, one)})
+        return inputs._replace(shared=inputs.shared | {"moments": normalize.merge(moments, one)})
 
     # Observations, and the steps before them.
 
+    def join_arrays(self, inputs: Params, obs: Any) -> Any:
+        """Return observations of a tree of arrays as vectors (..., O), beside which pictures stay; vectors as they are.
+
+        This is the only place where observations change their form.
+        """
+        layout = inputs.shared.get("layout")
+        return obs if layout is None else layout(obs)
+
     def see(self, inputs: Params, obs: Any, past: Any = None) -> Any:
         """Return observations (..., O) of one task as networks take them: normalised, and with the past if given."""
+        obs = self.join_arrays(inputs, obs)
         scale = partial(normalize.apply, inputs.parts["moments"]) if self.normalized else lambda x: x
         scaled = lambda obs: frames.with_state(scale, obs)
         if past is None:
@@ -84,13 +98,13 @@ class View:
         """Return an input of networks that is all zero."""
         past = None
         if self.conditioning.recurs:
-            past = Hidden(self.conditioning.begin(spec.obs_size, spec.action_size))
+            past = Hidden(self.conditioning.begin(frames.state_size(spec), spec.action_size))
         if self.history:
-            past = last_steps.begin(self.history, spec.obs_size, spec.action.blank())
+            past = last_steps.begin(self.history, frames.state_size(spec), spec.action.blank())
         zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), frames.seen(spec))
         return self.see(inputs.of_first(), zeros, past)
 
-    def around(self, window: Transition, first: Transition, last: Transition) -> tuple[Any, Any]:
+    def around(self, inputs: Params, window: Transition, first: Transition, last: Transition) -> tuple[Any, Any]:
         """Return what networks take of the steps before observations, and before the next ones; None for nothing.
 
         Args:
@@ -98,16 +112,20 @@ class View:
             first, last: the first and the last steps (T, N, ...) of the transitions that are made of it.
         """
         if self.conditioning.recurs:
-            before = jax.vmap(track)(window, window.obs)
+            obs, next_obs = (self.join_arrays(inputs, x) for x in (window.obs, window.next_obs))
+            before = jax.vmap(track)(window._replace(next_obs=next_obs), obs)
             return before, Following(*before)
         if not self.history:
             return None, None
-        return first.memory.past, last_steps.append(last.memory.past, last.obs, last.action, last.reward)
+        return first.memory.past, last_steps.append(
+            last.memory.past, self.join_arrays(inputs, last.obs), last.action, last.reward
+        )
 
     def steps(self, state: AgentState, window: Transition, tasks: Task) -> tuple[Transition, Array, Any, Any]:
         """Return the steps (T, B L, ...) of windows (T, B, L, ...), with features, observations and next ones."""
         flat = jax.tree.map(lambda x: x.reshape(len(x), -1, *x.shape[3:]), window)
-        see, (past, next_past) = partial(self.see_all, state.nets["inputs"]), self.around(window, flat, flat)
+        inputs = state.nets["inputs"]
+        see, (past, next_past) = partial(self.see_all, inputs), self.around(inputs, window, flat, flat)
         return flat, self.features_of_all(state, flat, tasks), see(flat.obs, past), see(flat.next_obs, next_past)
 
     # Features of the task.

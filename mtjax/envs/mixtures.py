@@ -67,7 +67,7 @@ def _look(spec: Spec) -> str:
     """Return what an observation shows, as text."""
     if not frames.shown(spec.obs):
         return "no pictures"
-    beside = "" if frames.state(spec.obs) is None else " beside a state"
+    beside = "" if frames.state(frames.joined(spec.obs)) is None else " beside a state"
     return f"{spec.frames} pictures {spec.obs[frames.PICTURES].shape}{beside}"
 
 
@@ -86,7 +86,8 @@ class States(NamedTuple):
 class Mixture(Tabled):
     """An environment with the tasks of several families, from ``mtjax.mixture`` or ``mtjax.make("NAME+NAME")``.
 
-    Observation (O,): the family's own, padded with zeros to that of the widest family. Pictures are not padded: either
+    Observation (O,): the family's own, padded with zeros to that of the widest family. One of several arrays is joined
+        to a vector before. Pictures are not padded: either
         no family shows any, or all show pictures of one shape, with or without a state (O,) beside them.
     Action: as many entries, or choices, as the widest family has. A task's ``action_mask`` (A,) says which of them are
         its own. Either all families have continuous actions, or all have discrete ones.
@@ -219,7 +220,7 @@ class Mixture(Tabled):
         self._require_one_kind(specs)
         widest: Any = jax.ShapeDtypeStruct((max(map(frames.state_size, specs)),), jnp.float32)
         return Spec(
-            obs=frames.with_state(lambda _: widest, specs[0].obs),
+            obs=frames.with_state(lambda _: widest, frames.joined(specs[0].obs)),
             action=max((spec.action for spec in specs), key=lambda action: action.size),
             context_size=self._context().shape[1],
             mixed=len(self.families) > 1,
@@ -315,7 +316,7 @@ class Mixture(Tabled):
         """Join the steps of the families."""
         states = tuple(steps[i].state if i in steps else None for i in range(len(self.families)))
         join = lambda of: blocks.join({i: of(step) for i, step in steps.items()})
-        padded = [self.pad(step.obs) for step in steps.values()]
+        padded = [self.pad(self.families[i], step.obs) for i, step in steps.items()]
         names = sorted({name for step in steps.values() for name in step.metrics})
         unknown = lambda step: jnp.full(step.reward.shape, jnp.nan)
         never = lambda step: jnp.zeros(step.reward.shape, bool)
@@ -329,8 +330,10 @@ class Mixture(Tabled):
             truncated=join(lambda s: never(s) if s.truncated is None else s.truncated) if cut_off else None,
         )
 
-    def pad(self, obs: Any) -> Any:
-        """Pad the vectors (..., O') in a family's observations with zeros to the mixture's (..., O)."""
+    def pad(self, family: Family, obs: Any) -> Any:
+        """Pad the vectors (..., O') that networks take of a family's observations with zeros to the mixture's."""
+        join = frames.layout(family.spec.obs)
+        obs = obs if join is None else join(obs)
         size = frames.state_size(self.spec)
         wide = lambda x: jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, size - x.shape[-1])]) if x.shape[-1] < size else x
         return frames.with_state(wide, obs)
@@ -341,13 +344,13 @@ class Mixture(Tabled):
         """Begin an episode of a task that is not traced. The state is the family's own."""
         family, own = self.member(task)
         step = family.reset(own, key)
-        return step._replace(obs=self.pad(step.obs))
+        return step._replace(obs=self.pad(family, step.obs))
 
     def step(self, task: Task, state: Any, action: Array) -> Step:
         """Advance a world of a task that is not traced."""
         family, own = self.member(task)
         step = family.step(own, state, family.spec.action.narrow(action))
-        return step._replace(obs=self.pad(step.obs))
+        return step._replace(obs=self.pad(family, step.obs))
 
     def member(self, task: Task) -> tuple[Family, Task]:
         """Return the family of a task that is not traced, and the task in that family's own form.

@@ -1,6 +1,7 @@
 """A Gymnasium environment of one world of a family, with MTEnv's interface."""
 
 import os
+from collections.abc import Mapping
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
@@ -12,6 +13,7 @@ from gymnasium import spaces
 from mtjax import envs
 from mtjax.envs.mixtures import require_family
 from mtjax.envs.pixels import Pictured
+from mtjax.frames import PICTURES, shown
 from mtjax.gym.tasks import TaskStream, TaskTable, read_options
 from mtjax.names import nearest_error
 from mtjax.report import render
@@ -82,18 +84,28 @@ def spaces_of(family: Env, table: TaskTable) -> tuple[spaces.Dict, spaces.Space]
 
 
 def _space_of(obs: Any) -> spaces.Space:
-    """Return the space of a vector or a picture, or of a dictionary of these; pictures alone are no dictionary."""
-    if isinstance(obs, dict):
-        return _space_of(obs["pixels"]) if len(obs) == 1 else spaces.Dict({k: _space_of(x) for k, x in obs.items()})
-    if obs.dtype == np.uint8:
-        return spaces.Box(0, 255, obs.shape, np.uint8)
+    """Return the space of an array, or of a dictionary or tuple of spaces; pictures alone are no dictionary."""
+    if _pictures_alone(obs):
+        return _space_of(obs[PICTURES])
+    if isinstance(obs, Mapping):
+        return spaces.Dict({str(name): _space_of(x) for name, x in obs.items()})
+    if isinstance(obs, tuple | list):
+        return spaces.Tuple(map(_space_of, obs))
+    if obs.dtype == np.bool_:
+        return spaces.MultiBinary(obs.shape)
+    if np.issubdtype(obs.dtype, np.integer):
+        known = np.iinfo(obs.dtype)
+        return spaces.Box(known.min, known.max, obs.shape, obs.dtype.type)
     return spaces.Box(-np.inf, np.inf, obs.shape, np.float32)
+
+
+def _pictures_alone(obs: Any) -> bool:
+    return shown(obs) and len(obs) == 1
 
 
 def observed(obs: Any) -> Any:
     """Return an observation on the host, in the form of its space."""
-    if isinstance(obs, dict) and len(obs) == 1:
-        (obs,) = obs.values()
+    obs = obs[PICTURES] if _pictures_alone(obs) else obs
     return jax.tree.map(np.array, obs)
 
 

@@ -35,7 +35,7 @@ def export(policy: Policy, file: str | Path) -> Path:
         file: ends with .npz, which ``mtjax.standalone`` reads by NumPy alone or by JAX alone; or with .onnx, a model of
             the inputs ``obs`` (O,) and ``parameters`` (P,), and the output ``action``: (A,), or a number () int32 of a
             discrete action. Of a policy that sees pictures the inputs are ``pixels`` (H, W, N C), a stack of pictures,
-            and ``state`` (O,) if it sees that too.
+            and ``state`` (O,) if it sees that too; of other trees of arrays, their paths such as ``seen/grid``.
 
     Raises:
         InputError: the file exists, or the agent infers its task from memory, or it is of a mixture, or the package
@@ -86,7 +86,7 @@ def _meta(env: Family, agent: BaseAgent, obs: dict[str, Any]) -> dict[str, Any]:
         "obs": {name: x.shape for name, x in obs.items()},
         "frames": env.spec.frames,
         "seconds": env.seconds_per_step if isinstance(env, Stepped) else None,  # between two actions
-        "about": " ".join(_about(env, name, x.shape) for name, x in obs.items()),
+        "about": " ".join(_about(env, name, x) for name, x in obs.items()),
         "action_size": env.spec.action_size,
         "discrete": env.discrete,  # whether an action is a number from 0 to action_size - 1
         "parameters": [name for name, _, _ in env.ranges],
@@ -97,10 +97,12 @@ def _meta(env: Family, agent: BaseAgent, obs: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _about(env: Family, name: str, shape: tuple[int, ...]) -> str:
-    """Return sentences on a part of the observation, for whoever makes it elsewhere."""
+def _about(env: Family, name: str, array: Any) -> str:
+    """Return sentences on an array of the observation, for whoever makes it elsewhere."""
+    shape = array.shape
     if name != frames.PICTURES:
-        return f"{name} {shape} float32: a vector as the family observes it. It is normalised inside."
+        kind = "a vector" if len(shape) == 1 else "an array"
+        return f"{name} {shape} {array.dtype}: {kind} as the family observes it. It is normalised inside."
     picture, count = env.spec.obs[name].shape, env.spec.frames
     known = {1: f"1 channel, the rounded brightness {_BRIGHTNESS}", 3: "the channels red, green and blue"}
     channels = known.get(picture[-1], f"{picture[-1]} channels")
@@ -134,8 +136,13 @@ def acting(policy: Policy) -> Callable[[Any, Array], Array]:
 
 
 def _serialised(act: Callable, obs: Any, values: Any) -> np.ndarray:
-    """Return the program for batches of any size, as bytes."""
-    (size,) = jax.export.symbolic_shape("batch")
-    batches = jax.tree.map(lambda x: jax.ShapeDtypeStruct((size, *x.shape), x.dtype), (obs, values))
-    exported = jax.export.export(jax.jit(jax.vmap(act)), platforms=_PLATFORMS)(*batches)
+    """Return the program for batches of any size, as bytes. Several arrays are a dictionary by their paths."""
+    (size,), named, tree = jax.export.symbolic_shape("batch"), by_name(obs), jax.tree.structure(obs)
+    taken = obs if jax.tree_util.treedef_is_leaf(tree) else named
+
+    def call(taken: Any, values: Array) -> Array:
+        return act(tree.unflatten([taken[name] for name in named] if isinstance(taken, dict) else [taken]), values)
+
+    batches = jax.tree.map(lambda x: jax.ShapeDtypeStruct((size, *x.shape), x.dtype), (taken, values))
+    exported = jax.export.export(jax.jit(jax.vmap(call)), platforms=_PLATFORMS)(*batches)
     return np.frombuffer(bytes(exported.serialize()), np.uint8)

@@ -1,7 +1,7 @@
 """Trained policies, read from the folder of a run."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,8 @@ from mtjax.types import Array, InputError, Key, Task, Transition
 class Policy:
     """A trained policy: ``action = policy(obs, size=1.05)``, or ``policy(obs, task)``.
 
-    Observations are (O,), or (B, O) in a batch. Files of ``mtjax.export`` are called by the same names.
+    Observations are (O,), or the tree of arrays that the family observes; in a batch all have a leading B. Files of
+    ``mtjax.export`` are called by the same names.
     """
 
     env: Tabled
@@ -75,7 +76,8 @@ class Policy:
             raise InputError(f"policy(obs, task) takes one task, not {task!r}: jax.tree.map(lambda x: x[0], tasks)")
         if task is not None and parameters:
             raise InputError(f"give a task, or its parameters {sorted(parameters)} by name, not both")
-        wanted, given = by_name(self.takes), by_name(obs)
+        wanted = by_name(self.takes)
+        given = standalone.entries(obs, wanted)
         try:
             size = standalone.batch_size(*({k: np.shape(x) for k, x in each.items()} for each in (wanted, given)))
             standalone.require_bytes(given)
@@ -83,7 +85,7 @@ class Policy:
         except ValueError as error:
             stacks = "; mtjax.stacked(env) observes stacks of pictures" * frames.shown(self.takes)
             raise InputError(f"{error}{stacks}") from None
-        seen = {name: jnp.asarray(given[name]) for name in wanted} if frames.shown(self.takes) else jnp.asarray(obs)
+        seen = jax.tree.structure(self.takes).unflatten([jnp.asarray(given[name]) for name in wanted])
         if size is None:
             return self._act(seen, task, key, memory)
         keys = None if key is None else jax.random.split(key, size)
@@ -153,8 +155,9 @@ class Policy:
 
 
 def by_name(obs: Any) -> dict[str, Any]:
-    """Return the parts of an observation, or of its shapes, in the order of their names. A vector is called obs."""
-    return {name: obs[name] for name in sorted(obs)} if isinstance(obs, Mapping) else {"obs": obs}
+    """Return the arrays of an observation, or their shapes, by their paths. An array alone is called obs."""
+    name = lambda path: jax.tree_util.keystr(path, simple=True, separator="/") or "obs"
+    return {name(path): x for path, x in jax.tree.leaves_with_path(obs)}
 
 
 @public
