@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from needs import needs, require
+from probes import slow_but, tiny, train
 
 import mtjax
 import mtjax.train
@@ -171,7 +172,7 @@ def test_steps_are_the_originals(name, settings, kinds, begun):
         own = lambda x, task=task, world=world: x[:, 0, task, world]
         theirs = original_steps(family, begun[place], own(transition.action))
         for ours, original in zip((own(obs), own(next_obs)), theirs[:2], strict=True):
-            np.testing.assert_array_equal(ours, np.stack([family.reader.read(x) for x in original]))
+            np.testing.assert_array_equal(ours, family.reader.read_each(original))
         np.testing.assert_array_equal(own(transition.reward), np.float32(theirs[2]))
         np.testing.assert_array_equal(own(terminal), theirs[3])
         np.testing.assert_array_equal(own(transition.ended), theirs[4])
@@ -246,7 +247,7 @@ def test_evaluations_play_whole_episodes_of_the_original(begun):
         original = gymnasium.make("Walk", **family.arguments_of(row))
         obs, total, over = original.reset(seed=seed)[0], 0.0, False
         while not over:
-            action = family.actor.read(np.asarray(act(family.reader.read(obs))))
+            action = family.actor.read(np.asarray(act(family.reader.read_each([obs])[0])))
             obs, reward, terminated, truncated, _ = original.step(action)
             total, over = total + reward, terminated or truncated
         np.testing.assert_allclose(returns[place], total, rtol=1e-4)
@@ -306,6 +307,87 @@ def test_ppo_learns_to_balance():
     assert family.episode_length == 500 and returns[-1] > 250
 
 
+# Observations of other spaces than one Box.
+
+
+class Nested(Walk):
+    """A walk that tells of itself in arrays of several kinds."""
+
+    observation_space = spaces.Dict({
+        "walk": spaces.Box(-100, 100, (2,), np.float64),
+        "signs": spaces.Tuple((spaces.Discrete(3, start=-1), spaces.MultiBinary(2))),
+        "map": spaces.Box(0, 255, (3, 4), np.uint8),
+        "ages": spaces.MultiDiscrete([[100, 100]]),
+        "old": spaces.Box(0, 1, (1,), bool),
+    })  # fmt: skip
+
+    def _look(self):
+        age = self.age
+        signs = (np.int64(np.sign(self.place)), np.array([age > 2, self.place > 0], np.int8))
+        grid, ages = np.full((3, 4), 20 * age, np.uint8), np.array([[age, 2 * age]])
+        walk = np.array([self.place, age])
+        return {"old": np.array([age > 3]), "map": grid, "signs": signs, "ages": ages, "walk": walk}
+
+
+class Joined(Nested):
+    """The same walk, which tells the vector that networks are to see of it."""
+
+    observation_space = spaces.Box(-1e6, 1e6, (20,), np.float64)
+
+    def _look(self):
+        return np.concatenate([np.ravel(x) for x in jax.tree.leaves(super()._look())]).astype(np.float64)
+
+
+class Turned(gymnasium.Env):
+    """A number from 0 to 3, which an action moves on."""
+
+    observation_space, action_space = spaces.Discrete(4), spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.place = int(self.np_random.integers(4))
+        return self.place, {}
+
+    def step(self, action):
+        self.place = (self.place + int(action)) % 4
+        return self.place, float(self.place == 3), False, False, {}
+
+
+def test_spaces_of_spaces_are_trees_of_arrays():
+    """Of the environment's own numbers and types; those of 64 bits become those of 32."""
+    env = mtjax.hosted(Nested, time_limit=5)
+    told = jax.tree.map(lambda x: f"{x.dtype}{list(x.shape)}", env.spec.obs)
+    assert told == {
+        "walk": "float32[2]",
+        "signs": ("int32[]", "int8[2]"),
+        "map": "uint8[3, 4]",
+        "ages": "int32[1, 2]",
+        "old": "bool[1]",
+    }
+    task = jax.tree.map(lambda x: x[0], env.tasks())
+    begun = jax.jit(env.reset)(task, jax.random.key(0))
+    seen = jax.jit(env.step)(task, begun.state, jnp.ones(2)).obs
+    place, age = seen["walk"].tolist()
+    assert age == 1 and seen["signs"][0] == np.sign(place) and seen["signs"][1].tolist() == [0, place > 0]
+    assert np.all(seen["map"] == 20) and seen["ages"].tolist() == [[1, 2]] and not seen["old"][0]
+    assert mtjax.hosted(Turned, time_limit=5).spec.obs == jax.ShapeDtypeStruct((), jnp.int32)
+
+
+@pytest.mark.parametrize("name", slow_but(("sac", "ppo"), "ppo"))
+def test_networks_learn_from_spaces_of_spaces_what_they_learn_from_one(name):
+    """Bit for bit, with the arrays in the replay as the environment has them."""
+    loop = {"num_envs": 2, "chunk_steps": 10}
+    own = {"sac": {"batch_size": 4, "replay_size": 40, "warmup_steps": 4}, "ppo": {"unroll": 5, "minibatches": 2}}
+    agent = tiny(name, **own[name])
+    (tree, metrics), (flat, wanted) = (
+        train(mtjax.hosted(env, time_limit=5), agent, loop, chunks=2) for env in (Nested, Joined)
+    )
+    jax.tree.map(np.testing.assert_array_equal, metrics, wanted)
+    jax.tree.map(np.testing.assert_array_equal, tree.agent.nets["actor"], flat.agent.nets["actor"])
+    if name == "sac":
+        assert tree.data.ring.rows.obs["map"].dtype == np.uint8
+
+
 # What is refused.
 
 
@@ -314,7 +396,7 @@ class Odd(Walk):
 
     def __init__(self, obs="ok", action="ok", **rest):
         super().__init__(**rest)
-        odd = {"dict": spaces.Dict({"x": spaces.Discrete(2)}), "many": spaces.MultiDiscrete([2, 3])}
+        odd = {"dict": spaces.Dict({"x": spaces.Text(2)}), "many": spaces.MultiDiscrete([2, 3])}
         odd["endless"] = spaces.Box(-np.inf, np.inf, (1,))
         self.observation_space = odd.get(obs, self.observation_space)
         self.action_space = odd.get(action, self.action_space)
@@ -329,7 +411,10 @@ class Odd(Walk):
         (lambda: mtjax.hosted("Walk", vary={"scale": "1,6"}, split="none"), "scale=6.* scale is of no walk"),
         (lambda: mtjax.hosted("Walk", vary={"end": "3,4"}), "end of Walk is a whole number, not 3.5; .*split"),
         (lambda: mtjax.hosted(Odd), "no time limit; give one"),
-        (lambda: mtjax.hosted(Odd, time_limit=9, obs="dict"), "observes Dict.*FlattenObservation"),
+        (
+            lambda: mtjax.hosted(Odd, time_limit=9, obs="dict"),
+            "observes a Dict, and agents take numbers: .*FilterObservation",
+        ),
         (lambda: mtjax.hosted(Odd, time_limit=9, action="many"), "takes MultiDiscrete"),
         (lambda: mtjax.hosted(Odd, time_limit=9, action="endless"), "without bounds"),
         (lambda: mtjax.hosted("Walk", unheard_of=3), "unheard_of=3: TypeError"),

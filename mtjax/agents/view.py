@@ -72,7 +72,7 @@ class View:
     def join_arrays(self, inputs: Params, obs: Any) -> Any:
         """Return observations of a tree of arrays as vectors (..., O), beside which pictures stay; vectors as they are.
 
-        This is the only place where observations change their form.
+        Networks, moments and memories see observations through it alone.
         """
         layout = inputs.shared.get("layout")
         return obs if layout is None else layout(obs)

@@ -26,8 +26,8 @@ _idle: dict[tuple[str, int, int], list[Any]] = {}  # pools in no set, by family,
 class EnvPool(Hosted):
     """EnvPool: an environment of EnvPool as it is, stepped by EnvPool's threads on the host.
 
-    Observation: the environment's own, a Box: a vector (O,), or a picture (H, W, C) of bytes. Of Atari it is the newest
-        picture; agents see the last ``frames``.
+    Observation: the environment's own, as in Gymnasium: a vector (O,), a picture (H, W, C) of bytes, or a tree of
+        arrays. Of Atari it is the newest picture; agents see the last ``frames``.
     Action: one of n numbers, or a vector (A,) in [-1, 1], scaled to the environment's Box.
     Reward, start and termination are the environment's own. EnvPool's automatic resets are never reached: worlds begin
         where an episode has ended. The seeds of pools are drawn from the run's seed, those of later episodes are

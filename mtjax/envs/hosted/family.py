@@ -20,10 +20,10 @@ from PIL import Image, ImageOps
 from mtjax.axes import over_worlds
 from mtjax.envs.engines import host
 from mtjax.envs.family import Family
-from mtjax.envs.hosted.spaces import Actor, Reader
+from mtjax.envs.hosted.spaces import Actor, Reader, TreeReader, reader_of
 from mtjax.envs.hosted.worlds import GONE, TERMINATED, TRUNCATED, Pool, Worlds
 from mtjax.envs.parameters import Parameter
-from mtjax.frames import PICTURES
+from mtjax.frames import PICTURES, shown
 from mtjax.types import Array, Continuous, Discrete, InputError, Key, Spec, Step, Task
 
 _MOST_FRAMES = 16
@@ -37,7 +37,7 @@ class HostedState(NamedTuple):
     number: Array  # () int32, that of its set
     place: Array  # () int32, in the set
     clock: Array  # () int32, of the set
-    obs: Array  # the last observation, for worlds that are gone
+    obs: Array  # the last observation as the host has it, for worlds that are gone
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,19 +107,19 @@ class Hosted(Family):
         return float(value)
 
     @cached_property
-    def reader(self) -> Reader:
+    def reader(self) -> Reader | TreeReader:
         """Return what reads observations."""
-        return Reader(self.environment, self.spaces[0])
+        return reader_of(self.environment, self.spaces[0])
 
     @cached_property
     def actor(self) -> Actor:
         """Return what reads actions."""
         return Actor(self.environment, self.spaces[1])
 
-    @property
-    def picture_or_vector(self) -> jax.ShapeDtypeStruct:
-        """Return the shape of an observation: a picture (H, W, C) uint8, or a vector (O,) float32."""
-        return jax.ShapeDtypeStruct(self.reader.shape, self.reader.dtype)
+    @cached_property
+    def observed(self) -> Any:
+        """Return the shapes of an observation."""
+        return jax.eval_shape(self.reader.show, jax.ShapeDtypeStruct(self.reader.shape, self.reader.dtype))
 
     @property
     def action(self) -> Continuous | Discrete:
@@ -161,9 +161,9 @@ class Hosted(Family):
 
     @property
     def pixels(self) -> int:
-        """Return the width of pictures, or 0 where observations are vectors."""
-        shape = self.picture_or_vector.shape
-        return shape[1] if len(shape) == 3 else 0
+        """Return the width of pictures, or 0 where observations have none."""
+        picture = self.observed[PICTURES].shape if shown(self.observed) else ()
+        return picture[1] if len(picture) == 3 else 0
 
     @property
     def spec(self) -> Spec:
@@ -192,7 +192,7 @@ class Hosted(Family):
         place = jnp.arange(math.prod(keys.shape), dtype=jnp.int32).reshape(keys.shape)
         never = jnp.zeros(keys.shape, bool)
         state = HostedState(number, place, clock, obs)
-        return Step(state, self._shown(obs), jnp.zeros(keys.shape), never, truncated=never)
+        return Step(state, self.reader.show(obs), jnp.zeros(keys.shape), never, truncated=never)
 
     def step_worlds(self, tasks: Task, states: HostedState, actions: Array) -> Step:
         """Step every world by its action (S, T, E, A), or () if actions are discrete."""
@@ -201,19 +201,16 @@ class Hosted(Family):
         obs = jnp.where(gone.reshape(*gone.shape, *[1] * (obs.ndim - 3)), states.obs, obs)
         truncated = (flags & (TRUNCATED | GONE)) > 0
         new = states._replace(clock=clock, obs=obs)
-        return Step(new, self._shown(obs), reward, (flags & TERMINATED) > 0, truncated=truncated)
+        return Step(new, self.reader.show(obs), reward, (flags & TERMINATED) > 0, truncated=truncated)
 
     def _call(self, act: str, kinds: str, *values: Array) -> list[Array]:
         """Call the host with leaves (S, T, E, ...); i and f are results of int32 and float32, o is observations."""
-        axes, seen = values[0].shape, self.picture_or_vector
+        axes, seen = values[0].shape, self.reader
         count, shapes = math.prod(axes), {"i": ((), jnp.int32), "f": ((), jnp.float32), "o": (seen.shape, seen.dtype)}
         results = [jax.ShapeDtypeStruct((count, *shapes[kind][0]), shapes[kind][1]) for kind in kinds]
         flat = [x.reshape(count, *x.shape[3:]) for x in values]
         found = host.call_once(self.outside.provide(act), results, *flat)
         return [x.reshape(*axes, *x.shape[1:]) for x in found]
-
-    def _shown(self, obs: Array) -> Any:
-        return {PICTURES: obs} if self.pixels else obs
 
     # A single world.
 

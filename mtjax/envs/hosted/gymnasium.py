@@ -12,6 +12,7 @@ import numpy as np
 
 from mtjax.checks import shown
 from mtjax.envs.hosted.family import Hosted, as_picture, parameters_of, typed
+from mtjax.envs.hosted.spaces import form
 from mtjax.envs.hosted.worlds import Outcome
 from mtjax.envs.parameters import Parameter
 from mtjax.names import nearest_error, public
@@ -24,7 +25,8 @@ _MOST_IDLE = 256
 class Gymnasium(Hosted):
     """Gymnasium: an environment of Gymnasium as it is, stepped on the host.
 
-    Observation: the environment's own, a Box: a vector (O,), or a picture (H, W, C) of bytes.
+    Observation: the environment's own: of a Box a vector (O,), or a picture (H, W, C) of bytes; of a Discrete,
+        MultiDiscrete or MultiBinary an array of whole numbers; of a Dict or Tuple the tree of arrays of its spaces.
     Action: one of n numbers, or a vector (A,) in [-1, 1], scaled to the environment's Box.
     Reward, start and termination are the environment's own; where it truncates, or at its time limit, an episode is
         cut off. The seed of each episode is drawn from the run's seed.
@@ -99,11 +101,7 @@ class Gymnasium(Hosted):
             made = self.idle.take(row, False)
             self.idle.give(row, False, made)
             found = made.observation_space, made.action_space
-            if (found[0].shape, found[0].dtype, found[1]) != (
-                self.spaces[0].shape,
-                self.spaces[0].dtype,
-                self.spaces[1],
-            ):
+            if (form(found[0]), found[1]) != (form(self.spaces[0]), self.spaces[1]):
                 raise InputError(
                     f"tasks have one space of observations and one of actions, and {self.environment} has "
                     f"{shown(found)} with {self.arguments_of(row)}, but else {shown(self.spaces)}"
@@ -190,8 +188,8 @@ class Separate:
             if self.rows[place] != row:
                 self._give(place)
                 self.rows[place], self.made[place] = row, self.family.idle.take(row, self.filmed)
-            found.append(self.family.reader.read(self.made[place].reset(seed=seed)[0]))  # type: ignore
-        return np.stack(found)
+            found.append(self.made[place].reset(seed=seed)[0])  # type: ignore
+        return self.family.reader.read_each(found)
 
     def step(self, places: np.ndarray, actions: np.ndarray) -> Outcome:
         """Step worlds (k,)."""
@@ -199,7 +197,7 @@ class Separate:
         given = given.tolist() if self.family.discrete else given
         steps = [self.made[i].step(x) for i, x in zip(places.tolist(), given, strict=True)]  # type: ignore
         obs, reward, terminated, truncated, _ = zip(*steps, strict=True)
-        read = self.family.reader.read_all(np.stack(obs))
+        read = self.family.reader.read_each(obs)
         return Outcome(read, *map(np.array, (reward, terminated, truncated)))
 
     def picture(self, place: int) -> bytes:
@@ -229,7 +227,7 @@ def hosted(environment: "str | Callable[..., Any]", vary: Mapping[str, Any] | tu
 
     Raises:
         InputError: Gymnasium is not installed, has no such environment, or cannot make it; or its spaces are not those
-            of vectors or pictures, and of a vector or a choice.
+            of arrays of numbers, and of a vector or a choice.
     """
     if not isinstance(environment, str):
         environment = _registered(environment)
@@ -242,11 +240,6 @@ def hosted(environment: "str | Callable[..., Any]", vary: Mapping[str, Any] | tu
     made = Gymnasium(environment=environment, vary=values, **given)
     _ = made.episode_length, made.spec
     return made
-
-
-def _forms(observations: Any, actions: Any) -> tuple[Any, ...]:
-    """Return what agents know of two spaces. The bounds of observations may differ between tasks."""
-    return observations.shape, str(observations.dtype), str(actions)
 
 
 def _as_json(arguments: Mapping[str, Any]) -> str:
