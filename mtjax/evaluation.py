@@ -13,10 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mtjax.agents.swept import at_point
+from mtjax.maps import over_seeds
 from mtjax.names import replacing
-from mtjax.rollout import EnvStep, Worlds, reset_ended, reset_envs, step_envs
+from mtjax.rollout import EnvStep, Worlds, reset_ended, reset_envs, split_keys, step_envs, world_keys
 from mtjax.trials import of_episodes
-from mtjax.types import SPLITS, Agent, Array, Env, InputError, Task
+from mtjax.types import SPLITS, Agent, Array, Env, InputError, Key, Task, Transition
 
 _EVER = "success_ever"  # the metric that success was 1 at any step of an episode
 
@@ -201,6 +203,45 @@ def evaluate(
     times = jnp.arange(env.episode_length * trials.episodes)
     scores = jax.lax.scan(step, (worlds, nothing, jnp.ones(shape, bool)), times)[0][1]
     return jax.tree.map(lambda x: x.reshape(*shape[:2], episodes.count), scores)
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2, 3))
+def adapted(
+    env: Env, agent: Agent, num_envs: int, updates: int, state: Any, tasks: Task, seeds: Array, number: Array
+) -> tuple[Any, Task]:
+    """Let agents adapt to tasks, by as long rollouts in fresh worlds as between their adaptations in training.
+
+    Args:
+        num_envs: environments of each task in a rollout.
+        updates: how often they adapt, each time to a new rollout.
+        state, tasks, seeds, number: as for ``evaluate``. Trials must not draw tasks.
+
+    Returns:
+        agent states for these tasks alone, and the tasks as these states know them, both to be evaluated.
+    """
+    state = jax.vmap(lambda learner: learner.of_tasks(tasks))(state)
+    tasks = tasks._replace(id=jnp.arange(len(tasks.id), dtype=jnp.int32))
+    shape = (len(seeds), len(tasks.id), num_envs)
+    length = agent.experience.steps // (agent.experience.adaptations + 1)
+
+    def step(given: tuple[Any, Worlds], keys: Key) -> tuple[tuple[Any, Worlds], Transition]:
+        learners, worlds = given
+        act_keys, reset_keys = split_keys(keys, 2)
+        worlds, env_step = step_envs(env, agent, learners, tasks, worlds, world_keys(act_keys, shape))
+        fresh = partial(world_keys, reset_keys, shape)
+        return (learners, reset_ended(env, agent, learners, tasks, worlds, env_step.ends, fresh)), env_step.transition
+
+    def update(learners: Any, keys: Key) -> tuple[Any, None]:
+        reset_keys, *step_keys = split_keys(keys, length + 1)
+        worlds = reset_envs(env, agent, learners, tasks, world_keys(reset_keys, shape))
+        steps = jax.lax.scan(step, (learners, worlds), jnp.stack(step_keys))[1]
+        adapt = lambda learner, steps: at_point(agent, learner).adapt(learner, steps, tasks)
+        steps = jax.tree.map(lambda x: jnp.moveaxis(x, 0, 2), steps)
+        return over_seeds(adapt, 0, 0)(learners, steps), None
+
+    fresh = lambda seed: jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), 0xADA9), number)
+    keys = jax.vmap(lambda seed: jax.random.split(fresh(seed), updates), out_axes=1)(seeds)
+    return jax.lax.scan(update, state, keys)[0], tasks
 
 
 def _is_now(worlds: Worlds, episodes: int) -> Array:

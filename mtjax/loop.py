@@ -317,18 +317,37 @@ def _of_known(metrics: Metrics, rows: Any, known: int) -> Metrics:
 def _collect(
     env, agent, trials: Trials, tasks, state: TrainState, keys: Key, reset_keys: Key
 ) -> tuple[TrainState, Transition, Any]:
-    """Take as many steps as the agent's experience asks for.
+    """Take as many steps as the agent's experience asks for. Agents that adapt do so between its rollouts.
 
     Returns:
         the new state; the steps, leaves (S, T, H, E, ...); and their statistics, leaves (H, S, ...).
     """
-    count = agent.experience.steps
+    count, adaptations = agent.experience.steps, agent.experience.adaptations
     if count == 1:
         state, (steps, seen) = _step(env, agent, trials, tasks, state, keys, reset_keys)
         return state, jax.tree.map(lambda x: x[:, :, None], steps), jax.tree.map(lambda x: x[None], seen)
     step = lambda state, keys: _step(env, agent, trials, tasks, state, *keys)
     apart = [jnp.stack(split_keys(each, count)) for each in (keys, reset_keys)]
-    state, (steps, seen) = jax.lax.scan(step, state, tuple(apart))
+    if not adaptations:
+        return _played(*jax.lax.scan(step, state, tuple(apart)))
+
+    def play(state: TrainState, given: tuple) -> tuple[TrainState, tuple[Transition, Any]]:
+        """Take the steps of one rollout, and adapt to them if another follows."""
+        last, *keys = given
+        state, steps, seen = _played(*jax.lax.scan(step, state, tuple(keys)))
+        adapt = lambda learner, steps: at_point(agent, learner).adapt(learner, steps, tasks)
+        learners = jax.lax.cond(last, lambda: state.agent, lambda: over_seeds(adapt, 0, 0)(state.agent, steps))
+        return state._replace(agent=learners), (steps, seen)
+
+    apart = [x.reshape(adaptations + 1, -1, *x.shape[1:]) for x in apart]
+    state, (steps, seen) = jax.lax.scan(play, state, (jnp.arange(adaptations + 1) == adaptations, *apart))
+    joined = lambda x: jnp.moveaxis(x, 0, 2).reshape(*x.shape[1:3], count, *x.shape[4:])
+    return state, jax.tree.map(joined, steps), jax.tree.map(lambda x: x.reshape(count, *x.shape[2:]), seen)
+
+
+def _played(state: TrainState, taken: tuple[Transition, Any]) -> tuple[TrainState, Transition, Any]:
+    """Return a state, steps (S, T, H, E, ...) and their statistics (H, S, ...), given steps (H, S, T, E, ...)."""
+    steps, seen = taken
     return state, jax.tree.map(lambda x: jnp.moveaxis(x, 0, 2), steps), seen
 
 

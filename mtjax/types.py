@@ -241,6 +241,8 @@ class Experience(Protocol):
     @property
     def steps(self) -> int: ...  # of every environment that are collected before the agent learns
     @property
+    def adaptations(self) -> int: ...  # how often the agent adapts meanwhile: between as many rollouts and one more
+    @property
     def updates(self) -> int: ...  # U, each time that the agent learns
     @property
     def policy_delay(self) -> int: ...  # the actor learns at every so many updates
@@ -280,6 +282,7 @@ class Agent(Protocol):
     def remember(self, state: Any, memory: Any, transition: Transition, task: Task) -> Any: ...
     def relabel(self, env: Env, task: Task, transition: Transition, key: Key) -> Transition: ...  # as another task's
     def assess(self, state: Any, steps: Transition, tasks: Task) -> tuple[Any, Transition]: ...  # (T, H, E, ...), once
+    def adapt(self, state: Any, steps: Transition, tasks: Task) -> Any: ...  # to a rollout (T, H, E, ...) of them
     def update(self, state: Any, window: Transition, tasks: Task, key: Key, number: Array) -> tuple[Any, Metrics]: ...
     def observe(self, state: Any, steps: Transition, tasks: Task) -> Any: ...  # (T, H, E, ...), once, after learning
     def reset_networks(self, state: Any, spec: Spec, tasks: Task, key: Key) -> Any: ...

@@ -81,6 +81,7 @@ AGENTS: dict[str, Preset] = {
         {"conditioning": "recurrent"},
         "mtjax.agents.ppo:PPO",
     ),
+    "maml": Preset("A policy that a gradient step adapts to a task (Finn et al. 2017)", {}, "mtjax.agents.maml:MAML"),
     "pqn": Preset(
         "Q-learning in parallel, of discrete actions, without replay (Gallici et al. 2025)",
         _PARAMS,

@@ -302,6 +302,10 @@ class BaseAgent(abc.ABC):
         """Compute what has to be known of collected steps (T, H, E, ...) before the agent learns from them: nothing."""
         return state, steps
 
+    def adapt(self, state: AgentState, steps: Transition, tasks: Task) -> AgentState:
+        """Return the state with which to play tasks, given one rollout (T, H, E, ...) of them: as it is."""
+        return state
+
     @abc.abstractmethod
     def update(
         self, state: AgentState, window: Transition, tasks: Task, key: Key, number: Array

@@ -133,5 +133,6 @@ def owners(name: str, form: str) -> str:
     learn_from = {
         "replay": "agents with a replay, such as sac",
         "rollouts": "agents that learn from rollouts, such as ppo",
+        "adapting": "agents that learn to adapt, such as maml",
     }
     return ", ".join(found or [told for kind, told in learn_from.items() if has(EXPERIENCES[kind])])

@@ -54,6 +54,18 @@ class AgentState(NamedTuple):
         """Return the training tasks (T,) nearest to ``tasks`` (T, ...), for training tasks too by their contexts."""
         return jax.vmap(self.known)(tasks._replace(id=jnp.full_like(tasks.id, self.num_tasks)))
 
+    def of_tasks(self, tasks: Task) -> "AgentState":
+        """Return the state for acting in ``tasks`` (T, ...) alone, numbered by their places.
+
+        Each has a copy of what its nearest training task has for itself, as far as it is not trained on.
+        """
+        numbers = jax.vmap(self.known)(tasks)
+        place = lambda net: Params(net.shared, jax.tree.map(lambda x: x[numbers], net.own))
+        nets, slow = ({name: place(net) for name, net in nets.items()} for nets in (self.nets, self.slow))
+        known = nets["tasks"]
+        nets["tasks"] = known._replace(own=known.own | {"context": tasks.context})
+        return self._replace(nets=nets, slow=slow)
+
 
 def of_tasks(tree: Any, rows: Array) -> Any:
     """Select what the tasks with these numbers (T,) have for themselves, in all networks of a tree: leaves (T, ...)."""

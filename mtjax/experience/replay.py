@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from functools import partial
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -39,6 +39,7 @@ class Replay:
     ``update_every``-th, is followed by ``updates_per_step`` updates. ``multistep`` has the equations of ``n_step``.
     """
 
+    adaptations: ClassVar[int] = 0  # the policy stays as it is while it plays
     updates_per_step: Annotated[int, _FLAG] = 1
     """Gradient updates after each step of every environment, or after every so many by update-every."""
     update_every: Annotated[int, _FLAG] = 1

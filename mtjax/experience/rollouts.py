@@ -33,6 +33,7 @@ class Rollouts:
     policy_delay: ClassVar[int] = 1  # the actor learns in every update
     reset_every: ClassVar[int] = 0  # networks are never reset
     warmup_steps: ClassVar[int] = 0  # no action is random before learning
+    adaptations: ClassVar[int] = 0  # the policy stays as it is while it plays
 
     def __post_init__(self):
         if not 1 <= self.unroll <= _LONGEST:
@@ -57,7 +58,7 @@ class Rollouts:
 
     def updates_in(self, steps: int) -> int:
         """Count the updates in a run of so many steps of every environment."""
-        return steps // self.unroll * self.updates
+        return steps // self.steps * self.updates
 
     def check(self, env: Env, num_envs: int, chunk_steps: int = 0) -> None:
         """Accept every environment."""
@@ -69,13 +70,13 @@ class Rollouts:
     def rollout_bytes(self, spec: Spec, num_envs: int) -> int:
         """Return the bytes of a task's observations, before and after every step, while they are learned from."""
         seen = jax.tree.leaves(frames.seen(spec))
-        return 2 * self.unroll * num_envs * sum(math.prod(x.shape) * x.dtype.itemsize for x in seen)
+        return 2 * self.steps * num_envs * sum(math.prod(x.shape) * x.dtype.itemsize for x in seen)
 
     def describe(self, spec: Spec, num_envs: int) -> str:
         """Return a description of its size, with the memory that stacks of pictures take while it is learned from."""
         told = f"; while in use {self.rollout_bytes(spec, num_envs) / 1e6:,.0f} MB of pictures a task and seed"
         told *= frames.shown(spec.obs)
-        return f"rollouts ({self.unroll * num_envs:,} transitions a task, not kept{told})"
+        return f"rollouts ({self.steps * num_envs:,} transitions a task, not kept{told})"
 
     def init(self, item: Transition, spec: Spec, num_tasks: int, num_envs: int, keys: Key) -> tuple[()]:
         """Return (), as no data is kept between iterations."""

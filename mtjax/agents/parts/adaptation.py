@@ -46,12 +46,16 @@ def adapted_gain(
     return jnp.mean(jax.vmap(lambda before, after: gain(adapt_one(before), after))(before, after))
 
 
-def surrogate(log_prob: Array, advantage: Array) -> Array:
-    """Return the gain () of a policy in steps (N,) that the policy itself has taken, given their log-probabilities:
+def surrogate(log_ratio: Array, advantage: Array) -> Array:
+    """Return the gain () of a policy in steps (N,) that another has taken, or the same before it learned:
 
-        mean(pi / sg(pi) A)
+        mean(pi / pi_old A)
 
-    Its first and second derivatives are on average those of the expected advantage (Foerster et al. 2018, "DiCE"), as
-    MAML needs both. Those of mean(log pi A) are not: the second lacks the product of two slopes of log pi.
+    Where both are the same, its first and second derivatives are on average those of the expected advantage (Foerster
+    et al. 2018, "DiCE"), as MAML needs both. Those of mean(log pi A) are not: the second lacks the product of two
+    slopes of log pi.
+
+    Args:
+        log_ratio: (N,) of the probability of each step to that under the policy that took it.
     """
-    return jnp.mean(jnp.exp(log_prob - jax.lax.stop_gradient(log_prob)) * advantage)
+    return jnp.mean(jnp.exp(log_ratio) * advantage)

@@ -1,0 +1,214 @@
+"""MAML: its steps by the closed form of two arms, what plays when, and navigation that a step makes better."""
+
+import dataclasses
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from probes import Walk, of_task, only_seed, pick, tiny, train, with_nets
+
+from mtjax.agents import agent
+from mtjax.agents.on_policy import Taken
+from mtjax.agents.parts.adaptation import adapted_gain
+from mtjax.envs.probes import Probe, World, tasks_of
+from mtjax.evaluation import Episodes, adapted, evaluate
+from mtjax.types import Discrete, InputError, Spec, Step, Task, Transition
+
+KEY = jax.random.key(0)
+SPEC = Spec.vector(2, 2, 1)._replace(action=Discrete(2))
+TASKS = tasks_of("one-step", (1.0, -1.0))
+SIGN = jnp.array([1.0, -1.0])  # of the arm that pays, 0 or 1
+PLAIN = {
+    "value_normalization": "none",
+    "advantage_normalization": "none",
+    "normalize_observations": False,
+    "max_gradient_norm": 0.0,
+}
+
+
+def armed(**settings):
+    """An agent for two arms, and its state at the log odds x of the first one."""
+    made = tiny("maml", unroll=1, epochs=1, **{**PLAIN, **settings}).for_action(SPEC.action)
+    return made, made.init(SPEC, TASKS, KEY)
+
+
+def leaning(state, x):
+    """A state whose policy has log odds x of the first arm, and has not adapted; values are 0."""
+    zeros, head = (lambda net: jax.tree.map(jnp.zeros_like, net)), jnp.array([x / 2, -x / 2])
+    actor = state.nets["actor"]
+    actor = actor._replace(shared=actor.shared | {"head": {**actor.shared["head"], "bias": head}})
+    copies = jax.tree.map(lambda x: jnp.stack([x, x]), actor.shared)
+    adapted = state.nets["adapted"]._replace(own=copies)
+    return with_nets(state, actor=actor, adapted=adapted, critic=zeros(state.nets["critic"]))
+
+
+def chances(made, state):
+    """The probabilities (T, 2) of arms with which the agent acts."""
+    outputs = lambda nets: made.policy_outputs(nets | {"actor": nets["adapted"]}, jnp.zeros(0), jnp.zeros(2))
+    return jnp.stack([jax.nn.softmax(outputs(of_task(state.nets, i))) for i in range(2)])
+
+
+def pulls(made, state):
+    """A rollout (T, 1, 2, ...) that stands for all: each arm once, its reward weighted by twice its probability."""
+    chance, shape = chances(made, state), (2, 1, 2)
+    arm = jnp.broadcast_to(jnp.arange(2), shape)
+    pays = arm == jnp.array([0, 1])[:, None, None]
+    ended = jnp.ones(shape, bool)
+    obs, taken = jnp.zeros((*shape, 2)), Taken(arm, jnp.log(chance)[:, None])
+    return Transition(obs, arm, 2 * chance[:, None] * pays, jnp.zeros(shape), obs, ended, ended, extras=taken)
+
+
+@pytest.mark.parametrize("first_order", [False, True])
+@pytest.mark.parametrize("x", [-0.7, 0.0, 1.2])
+def test_steps_are_those_of_the_closed_form(x, first_order):
+    """Log odds are the difference of two biases, which move by the same: twice the rate. Hidden units are 0."""
+    made, state = armed(inner_rate=1.5, first_order=first_order)
+    state = leaning(state, x)
+    before = pulls(made, state)
+    moved = made.adapt(state, before, TASKS)
+    s = jax.nn.sigmoid(x)
+    expected = jax.nn.sigmoid(x + 3 * s * (1 - s) * SIGN)
+    np.testing.assert_allclose(chances(made, moved)[:, 0], expected, rtol=1e-5)
+
+    steps = jax.tree.map(lambda x, y: jnp.concatenate([x, y], axis=1), before, pulls(made, moved))
+    state, steps = made.assess(state, steps, TASKS)
+    window = made.experience.window(steps, made.experience.batches(None, made, TASKS, steps, KEY)[0])
+    _, batch = made.prepare(state, window, TASKS)
+
+    def loss(bias):
+        head = {**state.nets["actor"].shared["head"], "bias": bias}
+        actor = state.nets["actor"]._replace(shared=state.nets["actor"].shared | {"head": head})
+        nets = state.nets | {"actor": actor}
+        return sum(made.actor_loss(of_task(nets, i), pick(batch, i), KEY)[0] for i in range(2)) / 2
+
+    found, slope = jax.value_and_grad(loss)(jnp.array([x / 2, -x / 2]))
+    earned = lambda x, sign: jax.nn.sigmoid(sign * x)
+    start = lambda x: adapted_gain(earned, x, SIGN[:, None], SIGN, 3.0, first_order)
+    assert -found == pytest.approx(float(start(x)), rel=1e-5)
+    np.testing.assert_allclose(-slope, jax.grad(start)(x) * SIGN, rtol=1e-4, atol=1e-6)
+
+
+def test_first_order_is_another_slope():
+    """At the log odds of these tests, so that the two closed forms are told apart."""
+    earned = lambda x, sign: jax.nn.sigmoid(sign * x)
+    slope = lambda order: jax.grad(lambda x: adapted_gain(earned, x, SIGN[:, None], SIGN, 3.0, order))(1.2)
+    assert abs(slope(True) - slope(False)) > 0.01
+
+
+def test_advantages_end_with_their_rollout():
+    """Those of two rollouts together are those of each, though no episode ends with the first."""
+    made = tiny("maml", unroll=3)
+    state = made.init(Spec.vector(3, 2, 1), TASKS, KEY)
+    reward, value, following = jax.random.normal(KEY, (3, 2, 6, 4))
+    no = jnp.zeros((2, 6, 4), bool)
+    steps = Transition(None, None, reward, jnp.ones((2, 6, 4)), None, no, no)
+    of = lambda part: [jax.tree.map(lambda x: x[:, part], x) for x in (steps, value, following)]
+    find = lambda part: made.normalize_advantages(made.advantages(of(part)[0], TASKS, *of(part)[1:]))
+    apart = jnp.concatenate([find(slice(3)), find(slice(3, 6))], axis=1)
+    np.testing.assert_allclose(find(slice(None)), apart, rtol=1e-5, atol=1e-6)
+    assert jnp.mean(apart[:, :3], axis=(1, 2)) == pytest.approx(0, abs=1e-6)
+    assert state.nets["adapted"].own.keys() == state.nets["actor"].shared.keys()
+
+
+@pytest.mark.parametrize("inner_steps", [1, 2])
+def test_the_loop_plays_what_the_update_adapts(inner_steps):
+    """The last rollout is by the adapted policy, with exactly which the first update begins: their ratio is 1."""
+    given = {"num_envs": 8, "unroll": 4, "epochs": 1, "chunk_steps": 4 * (inner_steps + 1), "inner_rate": 5.0}
+    made = tiny("maml", inner_steps=inner_steps, normalize_observations=False)
+    state, ((metrics),) = train(Probe("by-action"), made, given)
+    assert metrics["kl"] == pytest.approx(0, abs=1e-6) and metrics["clip_fraction"] == pytest.approx(0)
+    nets = only_seed(state.agent.nets)
+    for adapted_leaf, leaf in zip(
+        *map(jax.tree.leaves, (nets["adapted"].own, nets["actor"].shared)), strict=True
+    ):  # forgotten after learning
+        np.testing.assert_array_equal(adapted_leaf, np.stack([leaf] * 2))
+
+
+def test_steps_go_on_over_rollouts():
+    """Each world takes all steps, one after another: ages of a walk, whose observation goes up by 1."""
+    seen = []
+
+    @dataclasses.dataclass(frozen=True)
+    class Watched(type(tiny("maml"))):
+        def assess(self, state, steps, tasks):
+            if steps.obs.shape[1] > self.experience.unroll:
+                jax.debug.callback(lambda obs: seen.append(np.asarray(obs)), steps.obs)
+            return super().assess(state, steps, tasks)
+
+    train(Walk(), Watched(hidden=(4,)), {"num_envs": 2, "unroll": 2, "epochs": 1, "chunk_steps": 4})
+    (obs,) = seen
+    assert obs.shape == (2, 4, 2, 1)
+    long = obs[:, 0] % 1 >= 0.5
+    np.testing.assert_allclose((obs[:, 1:] - obs[:, :-1]).swapaxes(1, 2)[long], 1, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"conditioning": "parameters"}, "use conditioning=none, not parameters"),
+        ({"heads": "per-task"}, "heads is shared, not per-task"),
+        ({"minibatches": 2}, "minibatches is 1, not 2"),
+        ({"inner_steps": 0}, "inner-steps must be at least 1"),
+        ({"inner_rate": 0.0}, "inner.rate"),
+        ({"representation": "deepmdp"}, "representation=plain"),
+    ],
+)
+def test_what_does_not_adapt_is_refused(settings, message):
+    with pytest.raises(InputError, match=message):
+        agent("maml", **settings)
+
+
+def test_drawn_tasks_are_refused():
+    tasks = TASKS._replace(draws=jax.tree.map(lambda x: x[:, None], TASKS))
+    with pytest.raises(InputError, match="trials draw tasks"):
+        tiny("maml").init(Spec.vector(2, 2, 1), tasks, KEY)
+
+
+# Learning.
+
+
+@dataclasses.dataclass(frozen=True)
+class Navigation(Probe):
+    """Navigation (Finn et al. 2017): a point walks from the origin to a goal on a circle, which it does not see."""
+
+    episode_length: int = 10
+    held_out: bool = False
+
+    @property
+    def spec(self) -> Spec:
+        return Spec.vector(2, 2, 2)
+
+    def tasks(self, split: str = "train") -> Task:
+        angle = (jnp.arange(6) + 0.5 * self.held_out) * np.pi / 3
+        goal = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
+        row = jnp.arange(6, dtype=jnp.int32)
+        horizon = jnp.full(6, self.episode_length)
+        return Task(row + 6 * self.held_out, row, goal, {"angle": angle}, {}, {"goal": goal}, horizon)
+
+    def reset(self, task, key):
+        return Step(World(jnp.zeros(2), jnp.int32(0)), jnp.zeros(2), jnp.float32(0), jnp.bool_(False))
+
+    def step(self, task, state, action):
+        place = state.obs + 0.15 * action
+        reward = -jnp.linalg.norm(place - task.goal["goal"])
+        return Step(World(place, state.age + 1), place, reward, jnp.bool_(False))
+
+
+@cache
+def trained(first_order):
+    """A learned agent's state."""
+    settings = {"num_envs": 20, "unroll": 10, "chunk_steps": 20 * 150, "epochs": 5, "inner_rate": 0.1}
+    made = agent("maml", hidden=(32, 32), first_order=first_order, **{"unroll": 10})
+    state, history = train(Navigation(), made, settings)
+    return made, state.agent, history
+
+
+def returns(made, state, env, updates):
+    """Mean return of tasks (T,) by the mean action after some inner steps."""
+    seeds = jnp.zeros(1, jnp.uint32)
+    if updates is None:
+        return np.asarray(evaluate(env, made, Episodes(1), state, env.tasks(), seeds, jnp.int32(0)).returns)[0, :, 0]
+    state, tasks = adapted(env, made, 20, updates, state, env.tasks(), seeds, jnp.int32(0))
+    return np.asarray(evaluate(env, made, Episodes(1), state, tasks, seeds, jnp.int32(0)).returns)[0, :, 0]
