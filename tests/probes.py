@@ -141,6 +141,9 @@ class Stub:
     def assess(self, state, steps, tasks):
         return state, steps
 
+    def adapt(self, state, steps, tasks):
+        return state
+
     def update(self, state, window, tasks, key, number):
         return state, {}
 

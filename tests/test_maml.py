@@ -1,7 +1,6 @@
 """MAML: its steps by the closed form of two arms, what plays when, and navigation that a step makes better."""
 
 import dataclasses
-from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -9,12 +8,13 @@ import numpy as np
 import pytest
 from probes import Walk, of_task, only_seed, pick, tiny, train, with_nets
 
+from mtjax import loop
 from mtjax.agents import agent
 from mtjax.agents.on_policy import Taken
 from mtjax.agents.parts.adaptation import adapted_gain
 from mtjax.envs.probes import Probe, World, tasks_of
 from mtjax.evaluation import Episodes, adapted, evaluate
-from mtjax.types import Discrete, InputError, Spec, Step, Task, Transition
+from mtjax.types import Discrete, InputError, Spec, Step, Transition
 
 KEY = jax.random.key(0)
 SPEC = Spec.vector(2, 2, 1)._replace(action=Discrete(2))
@@ -112,11 +112,10 @@ def test_advantages_end_with_their_rollout():
     assert state.nets["adapted"].own.keys() == state.nets["actor"].shared.keys()
 
 
-@pytest.mark.parametrize("inner_steps", [1, 2])
-def test_the_loop_plays_what_the_update_adapts(inner_steps):
+def test_the_loop_plays_what_the_update_adapts():
     """The last rollout is by the adapted policy, with exactly which the first update begins: their ratio is 1."""
-    given = {"num_envs": 8, "unroll": 4, "epochs": 1, "chunk_steps": 4 * (inner_steps + 1), "inner_rate": 5.0}
-    made = tiny("maml", inner_steps=inner_steps, normalize_observations=False)
+    given = {"num_envs": 8, "unroll": 4, "epochs": 1, "chunk_steps": 12, "inner_rate": 5.0}
+    made = tiny("maml", inner_steps=2, normalize_observations=False)
     state, ((metrics),) = train(Probe("by-action"), made, given)
     assert metrics["kl"] == pytest.approx(0, abs=1e-6) and metrics["clip_fraction"] == pytest.approx(0)
     nets = only_seed(state.agent.nets)
@@ -140,8 +139,10 @@ def test_steps_go_on_over_rollouts():
     train(Walk(), Watched(hidden=(4,)), {"num_envs": 2, "unroll": 2, "epochs": 1, "chunk_steps": 4})
     (obs,) = seen
     assert obs.shape == (2, 4, 2, 1)
-    long = obs[:, 0] % 1 >= 0.5
-    np.testing.assert_allclose((obs[:, 1:] - obs[:, :-1]).swapaxes(1, 2)[long], 1, rtol=1e-5)
+    walks = np.moveaxis(obs[..., 0], 1, 2)
+    long = walks[..., 0] % 1 >= 0.5
+    assert long.any()
+    np.testing.assert_allclose(np.diff(walks, axis=2)[long], 1, rtol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -170,45 +171,42 @@ def test_drawn_tasks_are_refused():
 
 
 @dataclasses.dataclass(frozen=True)
-class Navigation(Probe):
-    """Navigation (Finn et al. 2017): a point walks from the origin to a goal on a circle, which it does not see."""
+class Arms(Probe):
+    """One pull of two arms: the first pays where the scale is positive, else the second."""
 
-    episode_length: int = 10
-    held_out: bool = False
+    scales: tuple[float, ...] = (1.0, -1.0)
 
     @property
     def spec(self) -> Spec:
-        return Spec.vector(2, 2, 2)
+        return SPEC
 
-    def tasks(self, split: str = "train") -> Task:
-        angle = (jnp.arange(6) + 0.5 * self.held_out) * np.pi / 3
-        goal = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
-        row = jnp.arange(6, dtype=jnp.int32)
-        horizon = jnp.full(6, self.episode_length)
-        return Task(row + 6 * self.held_out, row, goal, {"angle": angle}, {}, {"goal": goal}, horizon)
+    def tasks(self, split="train"):
+        return tasks_of(self.kind, self.scales, 1)
 
     def reset(self, task, key):
         return Step(World(jnp.zeros(2), jnp.int32(0)), jnp.zeros(2), jnp.float32(0), jnp.bool_(False))
 
     def step(self, task, state, action):
-        place = state.obs + 0.15 * action
-        reward = -jnp.linalg.norm(place - task.goal["goal"])
-        return Step(World(place, state.age + 1), place, reward, jnp.bool_(False))
+        pays = jnp.float32((action == 0) == (task.goal["scale"] > 0))
+        return Step(World(state.obs, state.age + 1), state.obs, pays, jnp.bool_(True))
 
 
-@cache
-def trained(first_order):
-    """A learned agent's state."""
-    settings = {"num_envs": 20, "unroll": 10, "chunk_steps": 20 * 150, "epochs": 5, "inner_rate": 0.1}
-    made = agent("maml", hidden=(32, 32), first_order=first_order, **{"unroll": 10})
-    state, history = train(Navigation(), made, settings)
-    return made, state.agent, history
+def test_it_learns_from_pulls_to_be_ready_for_either_arm():
+    """From one that prefers an arm, it finds the indifferent start, which earns sigmoid(1) after an inner step."""
+    env, seeds = Arms(), jnp.zeros(1, jnp.uint32)
+    made, _ = armed(inner_rate=2.0, actor_lr=0.02)
+    settings = loop.Settings(num_envs=256, chunk_steps=2 * 120, stagger=False)
+    state = loop.init(env, made, settings, env.tasks(), seeds)
+    lean = jax.tree.map(lambda x: x[None], leaning(only_seed(state.agent), 1.5))
+    state, _ = loop.run_chunk(env, made, settings, env.tasks(), state._replace(agent=lean))
 
-
-def returns(made, state, env, updates):
-    """Mean return of tasks (T,) by the mean action after some inner steps."""
-    seeds = jnp.zeros(1, jnp.uint32)
-    if updates is None:
-        return np.asarray(evaluate(env, made, Episodes(1), state, env.tasks(), seeds, jnp.int32(0)).returns)[0, :, 0]
-    state, tasks = adapted(env, made, 20, updates, state, env.tasks(), seeds, jnp.int32(0))
-    return np.asarray(evaluate(env, made, Episodes(1), state, tasks, seeds, jnp.int32(0)).returns)[0, :, 0]
+    unseen = Arms(scales=(0.9, -0.9)).tasks()
+    unseen = unseen._replace(id=unseen.id + 2)
+    for tasks in (env.tasks(), unseen):
+        states = [adapted(env, made, 256, count, state.agent, tasks, seeds, jnp.int32(0)) for count in (0, 1)]
+        first, second = (chances(made, only_seed(learner)) for learner, _ in states)
+        right = lambda chance: float(chance[0, 0] + chance[1, 1]) / 2
+        assert np.abs(first - 0.5).max() < 0.1 and right(first) == pytest.approx(0.5)
+        assert right(second) == pytest.approx(float(jax.nn.sigmoid(1.0)), abs=0.05)
+        earned = evaluate(env, made, Episodes(4), *states[1], seeds, jnp.int32(0)).returns
+        np.testing.assert_array_equal(earned, 1)  # by the likelier arm
