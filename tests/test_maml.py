@@ -137,6 +137,7 @@ def test_steps_go_on_over_rollouts():
             return super().assess(state, steps, tasks)
 
     train(Walk(), Watched(hidden=(4,)), {"num_envs": 2, "unroll": 2, "epochs": 1, "chunk_steps": 4})
+    jax.effects_barrier()
     (obs,) = seen
     assert obs.shape == (2, 4, 2, 1)
     walks = np.moveaxis(obs[..., 0], 1, 2)

@@ -47,9 +47,9 @@ class MAML(PPO):
     It differentiates theta_i too, and with it twice J_i; with ``first_order`` it takes theta_i - theta as a constant.
     Then all tasks begin at theta again. Each of the ``epochs`` repeats the inner steps from the new theta.
 
-    The policy does not see its task; what it knows of it is in theta_i. So acts a policy that ``adapt`` has not changed
-    for every task alike. Evaluations of a run play theta, before any step; ``mtjax.evaluation.adapted`` returns an
-    agent that has taken some inner steps on tasks, of training or not, to be evaluated on them.
+    The policy does not see its task: all that it knows of it is in theta_i. Evaluations of a run play theta, before any
+    inner step. ``mtjax.evaluation.adapted`` takes inner steps on tasks, of training or not, and returns the states of
+    the agent with which to evaluate it on them.
 
     Advantages are generalised ones within each rollout, scaled in each task and rollout as PPO scales a rollout's. One
     critic learns from all rollouts; as it does not see the task, ``gae_lambda`` is 1 by default. The metrics
