@@ -91,7 +91,7 @@ def test_steps_are_those_of_the_closed_form(x, first_order):
 
 
 def test_first_order_is_another_slope():
-    """At the log odds of these tests, so that the two closed forms are told apart."""
+    """The two closed forms are told apart by these log odds."""
     earned = lambda x, sign: jax.nn.sigmoid(sign * x)
     slope = lambda order: jax.grad(lambda x: adapted_gain(earned, x, SIGN[:, None], SIGN, 3.0, order))(1.2)
     assert abs(slope(True) - slope(False)) > 0.01
@@ -211,3 +211,30 @@ def test_it_learns_from_pulls_to_be_ready_for_either_arm():
         assert right(second) == pytest.approx(float(jax.nn.sigmoid(1.0)), abs=0.05)
         earned = evaluate(env, made, Episodes(4), *states[1], seeds, jnp.int32(0)).returns
         np.testing.assert_array_equal(earned, 1)  # by the likelier arm
+
+
+@dataclasses.dataclass(frozen=True)
+class Aims(Probe):
+    """One step from -1 or 1 that earns -(action - scale obs)^2, of scales that no observation tells."""
+
+    kind: str = "by-both"
+    scales: tuple[float, ...] = (-0.8, -0.4, 0.4, 0.8)
+
+    def tasks(self, split="train"):
+        return tasks_of(self.kind, self.scales, self.episode_length)
+
+
+def test_a_network_learns_to_adapt_to_tasks_it_has_not_met():
+    """The best for all tasks at once earns -0.4 in those of training, and -0.36 in those between them."""
+    made, seeds = agent("maml", hidden=(16, 16), unroll=1, epochs=1, actor_lr=3e-3, entropy_cost=0.01), jnp.uint32([0])
+    state, _ = train(Aims(), made, {"num_envs": 64, "chunk_steps": 600})
+
+    def earned(scales, known, updates):
+        env = Aims(scales=scales)
+        tasks = env.tasks()._replace(id=jnp.arange(len(scales), dtype=jnp.int32) + 4 * (not known))
+        given = adapted(env, made, 64, updates, state.agent, tasks, seeds, jnp.int32(0))
+        return float(jnp.mean(evaluate(env, made, Episodes(8), *given, seeds, jnp.int32(0)).returns))
+
+    for scales, known, blind in ((Aims.scales, True, -0.4), ((-0.6, 0.6), False, -0.36)):
+        before, after = (earned(scales, known, updates) for updates in (0, 1))
+        assert before == pytest.approx(blind, abs=0.1) and after > -0.2
