@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mtjax.agents.swept import at_point
-from mtjax.maps import over_seeds
+from mtjax.axes import over_seeds
 from mtjax.names import replacing
 from mtjax.rollout import EnvStep, Worlds, reset_ended, reset_envs, split_keys, step_envs, world_keys
 from mtjax.trials import of_episodes
