@@ -10,6 +10,7 @@ from probes import Walk, of_task, only_seed, pick, tiny, train, with_nets
 
 from mtjax import loop
 from mtjax.agents import agent
+from mtjax.agents.maml import MAML
 from mtjax.agents.on_policy import Taken
 from mtjax.agents.parts.adaptation import adapted_gain
 from mtjax.envs.probes import Probe, World, tasks_of
@@ -103,7 +104,7 @@ def test_advantages_end_with_their_rollout():
     state = made.init(Spec.vector(3, 2, 1), TASKS, KEY)
     reward, value, following = jax.random.normal(KEY, (3, 2, 6, 4))
     no = jnp.zeros((2, 6, 4), bool)
-    steps = Transition(None, None, reward, jnp.ones((2, 6, 4)), None, no, no)
+    steps = Transition(None, reward, reward, jnp.ones((2, 6, 4)), None, no, no)
     of = lambda part: [jax.tree.map(lambda x: x[:, part], x) for x in (steps, value, following)]
     find = lambda part: made.normalize_advantages(made.advantages(of(part)[0], TASKS, *of(part)[1:]))
     apart = jnp.concatenate([find(slice(3)), find(slice(3, 6))], axis=1)
@@ -130,7 +131,7 @@ def test_steps_go_on_over_rollouts():
     seen = []
 
     @dataclasses.dataclass(frozen=True)
-    class Watched(type(tiny("maml"))):
+    class Watched(MAML):
         def assess(self, state, steps, tasks):
             if steps.obs.shape[1] > self.experience.unroll:
                 jax.debug.callback(lambda obs: seen.append(np.asarray(obs)), steps.obs)
