@@ -154,6 +154,8 @@ def require_curriculum(settings: Settings, env: Any, agent: Any) -> None:
         )
     if experience.reset_every or experience.host_slots(settings.num_envs):
         raise InputError(f"{told} begins a replay anew; use --reset-every=0 and --host-replay-size=0")
+    if experience.adaptations:
+        raise InputError(f"{told} changes tasks, and this agent adapts to all that it knows; leave it out")
     if not isinstance(env, Flat):
         raise InputError(f"{told} is for single families, whose tasks share one physics, and not for mixtures")
     rule = getattr(agent, "gradients", None)

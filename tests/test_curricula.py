@@ -107,6 +107,7 @@ def test_a_run_by_a_sequence_is_recorded_by_known_tasks_and_resumes_to_the_bit(t
         ("ppo", {"curriculum": "random:4:50"}, "plays 1 to 3 of the 3 training tasks"),
         ("ppo", {"curriculum": "sequence:60", "unroll": 50}, "give a multiple of chunk_steps=50"),
         ("famo", {"curriculum": "sequence:50"}, "without memory of the tasks"),
+        ("maml", {"curriculum": "sequence:100", "unroll": 25}, "adapts to all that it knows"),
     ],
 )
 def test_what_cannot_be_played_is_refused(agent, given, said):

@@ -8,6 +8,7 @@ from probes import Walk, learn, mean_actions, of_task, one_in, only_seed, pick, 
 from test_ppo import BEST, KNOWN, SCALES, random_steps
 
 from mtjax import agents
+from mtjax.agents import critics
 from mtjax.agents.parts import targets
 from mtjax.agents.units import Units
 from mtjax.envs.probes import Probe
@@ -88,7 +89,7 @@ def test_probes_are_learned(kind, lag):
     state, history = train(Probe(), agent, given, tasks=tasks)
     state, (expected, obs, tolerance) = only_seed(state.agent), KNOWN[kind]
     seen = jax.vmap(lambda x: agent.view.see(state.nets["inputs"], x[None]))(jnp.float32(obs))
-    found = agent.values(state, tasks.context, jnp.broadcast_to(seen, (2, *seen.shape)))
+    found = critics.values(agent, state, tasks.context, jnp.broadcast_to(seen, (2, *seen.shape)))
     for i, scale in enumerate(SCALES):
         np.testing.assert_allclose(found[i], [expected(scale, x) for x in obs], atol=tolerance)
     if kind in BEST:

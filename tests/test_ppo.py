@@ -26,7 +26,7 @@ from probes import (
 )
 
 from mtjax import agents
-from mtjax.agents import normalize
+from mtjax.agents import critics, normalize
 from mtjax.agents.base import Memory
 from mtjax.agents.on_policy import Batch, Taken
 from mtjax.agents.parts import targets
@@ -133,7 +133,7 @@ def test_every_task_has_its_own_discount():
     state, batch, _ = assessed(agent, state, steps, tasks)
     features = agent.view.features_of_all(state, steps, tasks)
     see = lambda obs: agent.view.see(state.nets["inputs"], obs.reshape(3, -1, 3))
-    value, following = (agent.values(state, features, see(obs)) for obs in (steps.obs, steps.next_obs))
+    value, following = (critics.values(agent, state, features, see(obs)) for obs in (steps.obs, steps.next_obs))
     gamma = np.array([0.975, 0.995, 0.96])[:, None]
     flat = lambda x: x.reshape(3, -1)
     expected = flat(steps.reward) + gamma * flat(steps.discount) * following - value
@@ -152,7 +152,7 @@ def test_a_target_infers_the_task_from_the_past_with_the_step_in_it():
     flat = jax.tree.map(lambda x: np.reshape(x, (3, -1, *x.shape[3:])), steps)
     past, latest = flat.memory.past, Past(flat.obs, flat.action, flat.reward, np.ones_like(flat.reward))
     later = Past(*(np.concatenate([x[:, :, 1:], y[:, :, None]], axis=2) for x, y in zip(past, latest, strict=True)))
-    value = lambda obs, past: agent.values(state, jnp.zeros((3, 0)), Seen(obs, past))
+    value = lambda obs, past: critics.values(agent, state, jnp.zeros((3, 0)), Seen(obs, past))
     now, following = value(flat.obs, past), value(flat.next_obs, later)
     expected = flat.reward + agent.gamma * flat.discount * following - now
     np.testing.assert_allclose(batch.advantage, expected, rtol=1e-4, atol=1e-3)
@@ -322,9 +322,9 @@ def test_units_are_moments_of_all_targets_at_first(kind):
     state, obs = agent.init(SPEC, TASKS, KEY), jnp.float32(np.random.default_rng(0).normal(size=(3, 5, 3)))
     targets = jnp.float32(np.random.default_rng(0).normal(size=(2, 3, 50)) * 7 + [[[3], [100], [0]]])
     targets = targets.at[1].multiply(2)
-    state = agent.renew(state, targets[0])
-    before = agent.values(state, TASKS.context, obs)
-    state = agent.renew(state, targets[1])
+    state = critics.renew(agent, state, targets[0])
+    before = critics.values(agent, state, TASKS.context, obs)
+    state = critics.renew(agent, state, targets[1])
     units = Units.of(state.nets["units"])
     if kind == "none":
         assert units.count == 0 and np.all(units.std == 1)
@@ -332,11 +332,11 @@ def test_units_are_moments_of_all_targets_at_first(kind):
     both = np.concatenate(targets, axis=1)
     np.testing.assert_allclose(units.moments.mean, both.mean(axis=1), rtol=1e-4)
     np.testing.assert_allclose(units.moments.variance, both.var(axis=1), rtol=1e-4)
-    after = agent.values(state, TASKS.context, obs)
+    after = critics.values(agent, state, TASKS.context, obs)
     assert np.allclose(before, after, atol=1e-3) == (kind == "popart")
 
     many = with_nets(state, units=units._replace(count=jnp.float32(500)).params())
-    moved = Units.of(agent.renew(many, targets[0]).nets["units"]).moments
+    moved = Units.of(critics.renew(agent, many, targets[0]).nets["units"]).moments
     np.testing.assert_allclose(moved.mean, 0.9 * units.moments.mean + 0.1 * targets[0].mean(axis=1), rtol=1e-4)
 
 
@@ -349,7 +349,7 @@ def test_targets_are_in_the_units_in_which_outputs_are_read(kind):
         steps, before = random_steps(agent, seed=seed), state
         steps = steps._replace(reward=10 + 5 * seed * steps.reward)
         state, batch, _ = assessed(agent, state, steps, TASKS)
-        value = agent.values(before, batch.features, batch.obs)
+        value = critics.values(agent, before, batch.features, batch.obs)
         units, old = (Units.of(x.nets["units"]) for x in (state, before))
         np.testing.assert_allclose(units.rewards(batch.target), value + batch.advantage, rtol=1e-4, atol=1e-3)
     assert (kind == "none") == bool(jnp.all(units.moments.mean == old.moments.mean))
@@ -425,7 +425,7 @@ def test_values_are_clipped_around_the_outputs_from_before_the_update(kind):
         steps = random_steps(agent, seed=seed)
         steps = steps._replace(reward=100 + 50 * seed * steps.reward)
         state, batch, _ = assessed(agent, state, steps, TASKS)
-        now = agent.outputs(state, batch.features, batch.obs)
+        now = critics.outputs(agent, state, batch.features, batch.obs)
         np.testing.assert_allclose(batch.output, now, rtol=1e-3, atol=1e-4)
         loss, params, data = agent.fits["critic"].problem(agent.critic_loss, state.nets, (batch,))
         slope = jax.vmap(jax.grad(loss, has_aux=True), (OVER_TASKS, 0))
@@ -638,7 +638,7 @@ def test_probes_are_learned(kind):
     agent, state, tasks, history = learned(kind)
     expected, obs, tolerance = KNOWN[kind]
     seen = jax.vmap(lambda x: agent.view.see(state.nets["inputs"], x[None]))(jnp.float32(obs))
-    found = agent.values(state, tasks.context, jnp.broadcast_to(seen, (2, *seen.shape)))
+    found = critics.values(agent, state, tasks.context, jnp.broadcast_to(seen, (2, *seen.shape)))
     for i, scale in enumerate(SCALES):
         wanted = [expected(scale, x) for x in obs]
         np.testing.assert_allclose(found[i], wanted, atol=tolerance)

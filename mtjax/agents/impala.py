@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import jax
 import jax.numpy as jnp
 
-from mtjax.agents import parts
+from mtjax.agents import critics, parts
 from mtjax.agents.base import Memory
 from mtjax.agents.choices import FLAT
 from mtjax.agents.on_policy import Batch, OnPolicy
@@ -93,11 +93,11 @@ class IMPALA(OnPolicy):
         masked = None if tasks.action_mask is None else 0
         ratio = jax.vmap(self.log_ratio, (axes_of(state.nets), 0, 0, 0, masked))
         log_ratio = ratio(state.nets, features, obs, flat.extras, tasks.action_mask)
-        value, next_value = (self.values(state, features, x) for x in (obs, next_obs))
+        value, next_value = (critics.values(self, state, features, x) for x in (obs, next_obs))
         gamma = discounts_of_all(self, tasks)
-        found = self.trace(window, gamma, self.rewards(state, flat, tasks), value, next_value, log_ratio)
+        found = self.trace(window, gamma, critics.rewards(self, state, flat, tasks), value, next_value, log_ratio)
         target, advantage = (x.reshape(len(x), -1) for x in found)
-        state = self.renew(state, target)
+        state = critics.renew(self, state, target)
         units = Units.of(state.nets["units"])
         return state, Batch(
             obs=obs,
@@ -108,7 +108,7 @@ class IMPALA(OnPolicy):
             target=units.outputs(target),
             features=features,
             mask=tasks.action_mask,
-            **self.models(state, flat, tasks, next_obs),
+            **critics.models(self, state, flat, tasks, next_obs),
         )
 
     def trace(self, window: Transition, gamma: Array, *of_steps: Array) -> targets.VTrace:

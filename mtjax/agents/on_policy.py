@@ -2,14 +2,12 @@
 
 import abc
 import dataclasses
-from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from mtjax import frames
-from mtjax.agents import parts
+from mtjax.agents import critics, parts
 from mtjax.agents.base import BaseAgent, Memory
 from mtjax.agents.choices import FLAT
 from mtjax.agents.fit import Fit, above, descend
@@ -17,14 +15,10 @@ from mtjax.agents.parts.policies import Categorical, Gaussian, Policy
 from mtjax.agents.parts.policies.gaussian import STD_RANGE
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
-from mtjax.agents.parts.scaling.popart import rescale_heads
-from mtjax.agents.rates import discounts_of_all
-from mtjax.agents.state import AgentState, Nets, over_tasks
-from mtjax.agents.units import MIN_STD, Units
-from mtjax.axes import in_parts
+from mtjax.agents.state import AgentState, Nets
+from mtjax.agents.units import Units
 from mtjax.experience import Rollouts
 from mtjax.networks import Network, Params
-from mtjax.parallel.collectives import mean_and_variance
 from mtjax.types import Acted, Array, InputError, Key, Metrics, Task, Transition
 
 LOG_RATIO_LIMIT = 20.0
@@ -225,7 +219,7 @@ class OnPolicy(BaseAgent):
             batch = batch._replace(model_targets=self.representation.targets(*both, batch.next_obs, models_key)[0])
         loss, batch = above(self.least_loss, self.critic_loss), self.view.keyed(batch, jax.random.fold_in(key, 4))
         state, critic = descend(self.fits, "critic", state, loss, (batch,), critic_order, importance)
-        told = self.explained(state, batch)
+        told = critics.explained(state, batch)
         return state, critic.aux | critic.metrics | actor.aux.metrics | actor.metrics | told
 
     def assess(self, state: AgentState, steps: Transition, tasks: Task) -> tuple[AgentState, Transition]:
@@ -237,51 +231,6 @@ class OnPolicy(BaseAgent):
     def accept(self, moved: AgentState, state: AgentState, kl: Array) -> AgentState:
         """Return the state after an actor's step, which moved it, given KL(pi_old | pi) (T,) before the step."""
         return moved
-
-    def models(self, state: AgentState, flat: Transition, tasks: Task, next_obs: Any) -> dict[str, Any]:
-        """Return what a batch holds for a representation that learns."""
-        if not self.representation.learns:
-            return {}
-        return {
-            "action": self.policy.encode(flat.action),
-            "reward": self.rewards(state, flat, tasks),
-            "next_obs": next_obs,
-        }
-
-    def rewards(self, state: AgentState, flat: Transition, tasks: Task) -> Array:
-        """Return the rewards (T, N) of steps in the task's units."""
-        gamma = discounts_of_all(self, tasks)
-        return self.reward_scale * self.scaling.rewards(state.nets["scaling"].own, flat, gamma, jnp.zeros(len(gamma)))
-
-    def values(self, state: AgentState, features: Array, obs: Any) -> Array:
-        """Return the critic's values (T, B) of observations (T, B, ...), in units of reward."""
-        return Units.of(state.nets["units"]).rewards(self.outputs(state, features, obs))
-
-    def outputs(self, state: AgentState, features: Array, obs: Any) -> Array:
-        """Return the critic's outputs (T, B) for observations (T, B, ...)."""
-        of_tasks = partial(over_tasks, self.output, state.nets)
-        if frames.shown(obs):  # all at once they would fill the memory
-            return in_parts(of_tasks, features, obs, self.experience.minibatches)
-        return of_tasks(features, obs)
-
-    def renew(self, state: AgentState, target: Array) -> AgentState:
-        """Move the critic's units by targets (T, N), and with PopArt rescale its heads to them."""
-        scaling, _ = self.scaling.renew(state.nets["scaling"].own, target, ())
-        nets = state.nets | {"scaling": Params({}, scaling)}
-        if self.value_normalization != "none":
-            old = Units.of(nets["units"])
-            new = old.moved(target, self.value_rate)
-            nets |= {"units": new.params()}
-            if self.value_normalization == "popart":
-                nets |= {"critic": rescale_heads(nets["critic"], *old.change(new))}
-        return state._replace(nets=nets)
-
-    def explained(self, state: AgentState, batch: Batch) -> Metrics:
-        """Return the mean value (T,) of steps, and which share of the variance of targets values explained."""
-        target = Units.of(state.nets["units"]).rewards(batch.target)
-        residual, whole = (mean_and_variance(x, 1)[1][:, 0] for x in (target - batch.value, target))
-        explained = 1 - residual / jnp.maximum(whole, MIN_STD**2)
-        return {"value": mean_and_variance(batch.value, 1)[0][:, 0], "explained_variance": explained}
 
 
 def scale_head(params: Params, bias: Array) -> Params:

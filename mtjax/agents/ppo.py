@@ -7,7 +7,7 @@ from typing import ClassVar, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mtjax.agents import parts
+from mtjax.agents import critics, parts
 from mtjax.agents.on_policy import Batch, OnPolicy
 from mtjax.agents.parts import targets
 from mtjax.agents.rates import discounts_of_all
@@ -97,13 +97,14 @@ class PPO(OnPolicy):
         """Add advantages and targets to a rollout (T, H, E, ...), and fit the critic's units to it."""
         state, steps = super().assess(state, steps, tasks)
         flat, features, obs, next_obs = self.view.steps(state, self.experience.windows(steps, self.unroll), tasks)
-        old, output = Units.of(state.nets["units"]), self.outputs(state, features, obs)
-        found = old.rewards(output), self.values(state, features, next_obs), output, self.rewards(state, flat, tasks)
+        old, output = Units.of(state.nets["units"]), critics.outputs(self, state, features, obs)
+        following, reward = critics.values(self, state, features, next_obs), critics.rewards(self, state, flat, tasks)
+        found = old.rewards(output), following, output, reward
         played = partial(self.experience.played, shape=steps.reward.shape, length=self.unroll)
         value, next_value, output, reward = map(played, found)
         advantage = self.advantages(steps._replace(reward=reward), tasks, value, next_value)
         target = value + advantage
-        state = self.renew(state, target.reshape(len(target), -1))
+        state = critics.renew(self, state, target.reshape(len(target), -1))
         units = Units.of(state.nets["units"])
         if self.value_normalization == "popart":
             factor, offset = (x[:, None, None] for x in old.change(units))
@@ -137,7 +138,7 @@ class PPO(OnPolicy):
     def prepare(self, state: AgentState, window: Transition, tasks: Task) -> tuple[AgentState, Batch]:
         flat, features, obs, next_obs = self.view.steps(state, window, tasks)
         found: Assessed = flat.extras
-        models = self.models(state, flat, tasks, next_obs)
+        models = critics.models(self, state, flat, tasks, next_obs)
         return state, Batch(obs=obs, features=features, mask=tasks.action_mask, **found._asdict(), **models)
 
     def gain(self, log_ratio: Array, batch: Batch) -> tuple[Array, Metrics]:
