@@ -213,7 +213,7 @@ def test_the_reader_needs_numpy_alone(tmp_path):
     assert told == "Policy(sac-conditioned on finger-spin: observation (9,), action (2,), parameters ['size'])"
     top = [node for node in ast.parse(source).body if isinstance(node, ast.Import | ast.ImportFrom)]
     assert {getattr(node, "module", None) or node.names[0].name for node in top} == {
-        "json", "collections.abc", "typing", "numpy"
+        "json", "collections.abc", "functools", "typing", "numpy"
     }  # fmt: skip
 
 
