@@ -83,6 +83,8 @@ class BaseAgent(abc.ABC):
     """The kinds of policies with which the agent can learn."""
     fits_statistics: ClassVar[bool] = False
     """Whether learning keeps the running statistics of bodies with batch normalisation."""
+    follows_sketches: ClassVar[bool] = False
+    """Whether it plays only families that follow a sketch."""
     one_knowledge: ClassVar[bool] = False
     """Whether tasks share what knows them even where each has networks of its own."""
     hidden: tuple[int, ...] = (256, 256)

@@ -132,6 +132,8 @@ def require_sight(agent: Any, spec: Spec) -> None:
     if not frames.numeric(spec.obs):
         told = jax.tree.map(lambda x: f"{x.dtype}{list(x.shape)}" if hasattr(x, "dtype") else repr(x), spec.obs)
         raise InputError(f"{type(agent).__name__} takes {agent.takes}; not {told}")
+    if agent.follows_sketches and not spec.symbols:
+        raise InputError("this agent plays families that follow a sketch, such as --env=craft-sketched")
     agent.representation.require(frames.joined(spec.obs))
     if agent.view.history and frames.layout(spec.obs) and getattr(agent.experience, "hindsight", 0):
         raise InputError(

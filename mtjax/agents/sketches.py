@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import tyro
 
-from mtjax.agents import parts
+from mtjax.agents import combinations, parts
 from mtjax.agents.base import Heads
 from mtjax.agents.parts.policies import Categorical, Policy
 from mtjax.agents.parts.samplers import ByLength
@@ -69,6 +69,7 @@ class Sketches(PPO):
     """
 
     policies: ClassVar[tuple[type[Policy], ...]] = (Categorical,)
+    follows_sketches: ClassVar[bool] = True
     one_knowledge: ClassVar[bool] = True  # which sub-policies share
     hidden: tuple[int, ...] = (128,)
     actor_lr: float = 1e-3
@@ -108,8 +109,7 @@ class Sketches(PPO):
 
     def init(self, spec: Spec, tasks: Task, key: Key) -> AgentState:
         """Return the initial state. The curriculum gets to know the lengths of sketches."""
-        if not spec.symbols:
-            raise InputError("sketches plays families that follow a sketch, such as --env=craft-sketched")
+        combinations.require_sight(self, spec)
         state = super(Sketches, parts.put(self, symbols=spec.symbols)).init(spec, tasks, key)
         if not isinstance(self.sampler, ByLength) or "length" not in tasks.goal:
             return state
