@@ -564,7 +564,7 @@ def test_a_full_disk_is_told_with_the_flag_of_benchmarks(script):
 def test_a_family_leaves_a_policy_and_is_not_run_again(script, tmp_path, monkeypatch):
     """Its run ends with its time, and is removed."""
     families = script("families")
-    monkeypatch.setattr(sys, "argv", ["families.py", "point-mass-easy", "--seconds=0.01", f"--out={tmp_path}"])
+    monkeypatch.setattr(sys, "argv", ["families.py", "point-mass-easy", "--seconds=4", f"--out={tmp_path}"])
     families.main()
     assert sorted(x.name for x in (tmp_path / "point-mass-easy").iterdir()) == ["curve.csv", "policy"]
     assert mtjax.load(tmp_path / "point-mass-easy" / "policy").env.spec.action_size == 2
