@@ -59,6 +59,20 @@ def test_own_parameters_are_taken_by_number_and_put_back():
     assert after["adam"][0] == 11
 
 
+def test_a_state_of_other_tasks_knows_these_alone():
+    """Also where they are more than the training tasks: each has what its nearest one has for itself."""
+    train = Walk().tasks()
+    agent = tiny("multi-head")
+    state = agent.init(Walk().spec, train, jax.random.key(0))
+    wide = jax.tree.map(lambda x: jnp.stack([x[1], x[0], x[1], x[0], x[1]]), train)._replace(id=jnp.arange(5) + 100)
+    found = state.of_tasks(wide)
+    assert found.num_tasks == 5
+    numbered = wide._replace(id=jnp.arange(5))
+    np.testing.assert_array_equal(jax.vmap(found.known)(numbered), np.arange(5))
+    head = lambda state: state.nets["actor"].own["head"]["kernel"]
+    np.testing.assert_array_equal(head(found), head(state)[np.asarray([1, 0, 1, 0, 1])])
+
+
 @pytest.mark.parametrize("name, given", [("multi-head", REPLAY), ("disjoint", REPLAY), ("ppo", ROLLOUTS)])
 def test_tasks_that_are_not_played_keep_what_is_their_own(name, given):
     """To the bit, while the one that is played learns."""

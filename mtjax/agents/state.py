@@ -59,12 +59,9 @@ class AgentState(NamedTuple):
 
         Each has a copy of what its nearest training task has for itself, as far as it is not trained on.
         """
-        numbers = jax.vmap(self.known)(tasks)
-        place = lambda net: Params(net.shared, jax.tree.map(lambda x: x[numbers], net.own))
-        nets, slow = ({name: place(net) for name, net in nets.items()} for nets in (self.nets, self.slow))
-        known = nets["tasks"]
-        nets["tasks"] = known._replace(own=known.own | {"context": tasks.context})
-        return self._replace(nets=nets, slow=slow)
+        nets, slow = of_tasks((self.nets, self.slow), jax.vmap(self.known)(tasks))
+        known = Params(nets["tasks"].shared | {"known": tasks.context}, {})
+        return self._replace(nets=nets | {"tasks": known}, slow=slow)
 
 
 def of_tasks(tree: Any, rows: Array) -> Any:
