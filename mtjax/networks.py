@@ -5,7 +5,7 @@ A network is a body and a linear head. It is applied to the data of one task; th
 
 import dataclasses
 from collections.abc import Collection, Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import flax.linen as nn
 import jax
@@ -84,6 +84,9 @@ def join(*inputs: Array, task: Array) -> Array:
     return jnp.concatenate([*inputs, task], axis=-1)
 
 
+N = TypeVar("N", bound="Network")
+
+
 @dataclasses.dataclass(frozen=True)
 class Network:
     """Applies a body and a linear head; each is shared by all tasks, or every task has its own."""
@@ -93,6 +96,11 @@ class Network:
     front: nn.Module | None = None  # maps observations before the body; every task's own
     unit_head: bool = False  # keep the head's weights of each output at length 1
     sight: nn.Module | None = None  # maps observations with pictures to vectors, before the body
+
+    def as_kind(self, kind: "type[N]", **changes: Any) -> "N":
+        """Return a network of another class with the settings of this one, but for ``changes``."""
+        given = {field.name: getattr(self, field.name) for field in dataclasses.fields(Network)}
+        return kind(**given | changes)
 
     def init(self, key: Key, num_tasks: int, out: int, features: Array, *inputs: Array) -> Params:
         """Initialise parameters for ``num_tasks`` tasks, ``out`` outputs, and inputs of the given shapes."""

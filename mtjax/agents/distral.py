@@ -34,8 +34,7 @@ class Policies(Network):
 
     @property
     def _distilled(self) -> Network:
-        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(Network)}
-        return Network(**{**fields, "own": ()})
+        return self.as_kind(Network, own=())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,8 +94,7 @@ class Distral(SAC):
 
     @property
     def actor(self) -> Policies:
-        network = super().actor
-        return Policies(**{field.name: getattr(network, field.name) for field in dataclasses.fields(network)})
+        return super().actor.as_kind(Policies)
 
     def distilled(self, nets: Nets, features: Array, obs: Any) -> Array:
         """Return the distilled policy's outputs (..., 2A)."""

@@ -36,8 +36,7 @@ class SubPolicies(Network):
 
     @property
     def _each(self) -> Network:
-        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(Network)}
-        return Network(**{**fields, "own": ("sight", "body", "head")})
+        return self.as_kind(Network, own=("sight", "body", "head"))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,9 +102,9 @@ class Sketches(PPO):
         network = super().actor
         if self.sharing == "tasks":
             return network
-        fields: dict[str, Any] = {field.name: getattr(network, field.name) for field in dataclasses.fields(network)}
-        fields["own"] = ()
-        return SubPolicies(**fields, count=self.symbols) if self.sharing == "symbols" else Network(**fields)
+        if self.sharing == "symbols":
+            return network.as_kind(SubPolicies, own=(), count=self.symbols)
+        return dataclasses.replace(network, own=())
 
     def init(self, spec: Spec, tasks: Task, key: Key) -> AgentState:
         """Return the initial state. The curriculum gets to know the lengths of sketches."""

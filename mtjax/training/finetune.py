@@ -9,12 +9,11 @@ import numpy as np
 
 from mtjax import frames
 from mtjax.agents import BaseAgent, parts, settings
-from mtjax.agents.state import AgentState
+from mtjax.agents.state import AgentState, of_tasks
 from mtjax.agents.swept import agents_at
 from mtjax.config import NO_FINE_TUNING, RunConfig
 from mtjax.envs import Family
 from mtjax.envs.mixtures import require_family
-from mtjax.networks import Params
 from mtjax.saved import pretrained
 from mtjax.saved.policy import Policy
 from mtjax.types import Discrete, Env, InputError, Spec, Task
@@ -132,8 +131,6 @@ def adopt(start: Policy, agent: BaseAgent, tasks: Task, fresh: Any) -> Any:
 
 
 def _adopt(agent: BaseAgent, tasks: Task, old: AgentState, fresh: AgentState) -> AgentState:
-    nearest = old.nearest(tasks)
-    carry = lambda net: Params(net.shared, jax.tree.map(lambda x: x[nearest], net.own))
-    nets = {name: carry(net) for name, net in old.nets.items() if name not in _FRESH}
-    slow = {name: carry(net) for name, net in old.slow.items()}
+    nets, slow = of_tasks((old.nets, old.slow), old.nearest(tasks))
+    nets = {name: net for name, net in nets.items() if name not in _FRESH}
     return fresh._replace(nets=fresh.nets | nets, slow=fresh.slow | slow)

@@ -376,7 +376,7 @@ class _Run:
         Raises:
             FloatingPointError: no seed is left, or the run is no sweep. The checkpoint before must stay.
         """
-        agents = getattr(now.state.agent, "learner", now.state.agent)
+        agents = now.state.agent
         spoiled = ~finite_seeds(agents)
         if not self.config.points or np.all(spoiled | now.diverged):
             require_finite_parameters(agents, now.steps // self.config.worlds, self.records.last)
