@@ -505,8 +505,7 @@ def test_a_seed_that_the_last_update_spoiled_is_given_up(capsys):
     run = _Run(of_three_points())
 
     def given_up(actor, *before):
-        learner = types.SimpleNamespace(nets={"actor": jnp.asarray(actor)[:, None]})
-        state = types.SimpleNamespace(agent=types.SimpleNamespace(learner=learner))
+        state = types.SimpleNamespace(agent=types.SimpleNamespace(nets={"actor": jnp.asarray(actor)[:, None]}))
         return run._give_up_spoiled(_Progress(state, 120, 0.0, 0.0, None, np.array(before))).diverged.tolist()
 
     assert given_up([0.0, np.nan, 1.0], False, False, True) == [False, True, True]
