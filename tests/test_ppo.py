@@ -26,7 +26,7 @@ from probes import (
 )
 
 from mtjax import agents
-from mtjax.agents import critics, normalize
+from mtjax.agents import clipped, critics, normalize
 from mtjax.agents.base import Memory
 from mtjax.agents.on_policy import Batch, Taken
 from mtjax.agents.parts import targets
@@ -297,9 +297,8 @@ def test_steps_keep_their_contexts():
 
 @pytest.mark.parametrize("kind", ["none", "all", "task"])
 def test_advantages_are_brought_to_one_scale(kind):
-    agent = small(advantage_normalization=kind)
     advantage = jnp.float32(np.random.default_rng(0).normal(size=(3, 50)) * [[1], [10], [100]] + 5)
-    found = agent.normalize_advantages(advantage.reshape(3, 10, 5)).reshape(3, 50)
+    found = clipped.normalized(kind, advantage.reshape(3, 10, 5)).reshape(3, 50)
     axis = {"none": (), "all": None, "task": 1}[kind]
     if kind == "none":
         np.testing.assert_array_equal(found, advantage)
@@ -309,7 +308,7 @@ def test_advantages_are_brought_to_one_scale(kind):
 
 
 def test_advantages_of_a_task_that_earns_nothing_are_nothing():
-    assert np.all(np.asarray(small().normalize_advantages(jnp.zeros((2, 5, 1)))) == 0)
+    assert np.all(np.asarray(clipped.normalized("task", jnp.zeros((2, 5, 1)))) == 0)
 
 
 # Units of values.

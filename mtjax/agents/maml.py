@@ -6,12 +6,11 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mtjax.agents import parts
+from mtjax.agents import clipped, parts
 from mtjax.agents.base import Memory
 from mtjax.agents.choices import FLAT, PARTS
-from mtjax.agents.on_policy import ActorAux, Batch
+from mtjax.agents.on_policy import ActorAux, Batch, OnPolicy
 from mtjax.agents.parts.adaptation import adapt, surrogate
-from mtjax.agents.ppo import PPO
 from mtjax.agents.state import AgentState, Nets, over_tasks
 from mtjax.experience import AdaptingRollouts
 from mtjax.networks import Params
@@ -35,7 +34,7 @@ class Played(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class MAML(PPO):
+class MAML(OnPolicy):
     """MAML trains a policy for what it is after a few gradient steps on a task (Finn et al. 2017), by PPO's steps.
 
     In each iteration the policy theta plays a rollout D_i of every task i, takes a step that is the task's own, and
@@ -63,7 +62,7 @@ class MAML(PPO):
     rollouts, which need not hold whole episodes.
     """
 
-    adjustable: ClassVar[tuple[str, ...]] = (*PPO.adjustable, "inner_rate", "first_order")
+    adjustable: ClassVar[tuple[str, ...]] = (*OnPolicy.adjustable, "clip_range", "inner_rate", "first_order")
     hidden: tuple[int, ...] = (64, 64)
     actor_lr: float = 1e-3
     """Adam's learning rate for the actor."""
@@ -71,6 +70,10 @@ class MAML(PPO):
     """Lambda of advantages: 0 relies on the critic alone, 1 on the rewards of the rollout."""
     entropy_cost: float = 0.0
     """Weight of the entropy in the actor loss (c), in standard deviations of the advantage."""
+    clip_range: float = 0.2
+    """Clip the ratio of policies to this distance from 1 (epsilon)."""
+    advantage_normalization: clipped.Normalization = "task"
+    """Scale advantages to mean 0 and standard deviation 1: never, over all tasks together, or in each task."""
     inner_rate: float = 0.1
     """Length of an inner step, in gradients of the gain."""
     first_order: bool = False
@@ -79,7 +82,7 @@ class MAML(PPO):
 
     def check(self) -> None:
         super().check()
-        parts.require_positive(self, "inner_rate")
+        parts.require_positive(self, "clip_range", "inner_rate")
         knowing = parts.name_of(PARTS["conditioning"], self.conditioning)
         if knowing != "none":
             raise InputError(f"maml finds out its task by adapting to it; use conditioning=none, not {knowing}")
@@ -129,13 +132,15 @@ class MAML(PPO):
 
     # Learning.
 
-    def advantages(self, steps: Transition, tasks: Task, value: Array, next_value: Array) -> Array:
-        within = super().advantages
-        found = jax.vmap(lambda steps, *values: within(steps, tasks, *values), 1, 1)
-        return found(*self.experience.apart((steps, value, next_value))).reshape(value.shape)
+    def assess(self, state: AgentState, steps: Transition, tasks: Task) -> tuple[AgentState, Transition]:
+        """Add advantages and targets to rollouts (T, H, E, ...), and fit the critic's units to them."""
+        return clipped.assess(self, state, steps, tasks, self.experience.apart)
 
-    def normalize_advantages(self, advantage: Array) -> Array:
-        return jax.vmap(super().normalize_advantages, 1, 1)(self.experience.apart(advantage)).reshape(advantage.shape)
+    def prepare(self, state: AgentState, window: Transition, tasks: Task) -> tuple[AgentState, Batch]:
+        return state, clipped.batch_of(self, state, window, tasks)
+
+    def gain(self, log_ratio: Array, batch: Batch) -> tuple[Array, Metrics]:
+        return clipped.gain(log_ratio, batch.advantage, self.clip_range)
 
     def actor_loss(self, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:
         played = Played.of(batch, self.experience.inner_steps + 1)

@@ -2,31 +2,16 @@
 
 import dataclasses
 from functools import partial
-from typing import ClassVar, Literal, NamedTuple
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 
-from mtjax.agents import critics, parts
+from mtjax.agents import clipped, parts
 from mtjax.agents.on_policy import Batch, OnPolicy
-from mtjax.agents.parts import targets
-from mtjax.agents.rates import discounts_of_all
 from mtjax.agents.state import AgentState, Nets
-from mtjax.agents.units import MIN_STD, Units
 from mtjax.networks import Params
-from mtjax.parallel.collectives import mean_and_variance
 from mtjax.types import Array, Key, Metrics, Task, Transition
-
-
-class Assessed(NamedTuple):
-    """Holds what is stored with an action once the rollout is over."""
-
-    raw: Array  # the action as ``policy.log_prob`` takes it: before the tanh (A,), or () int32
-    log_prob: Array  # () its log-probability under the policy that took it
-    advantage: Array  # (), normalised
-    value: Array  # () of the state before the action, in units of reward
-    output: Array  # () the critic's output before the update, in the new units
-    target: Array  # () what the critic's output should be
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,7 +64,7 @@ class PPO(OnPolicy):
     """Clip the change of values in an update to this, in standard deviations of the targets; 0 does not clip."""
     kl_limit: float = 0.0
     """Stop updating the actor until the next rollout once KL(pi_old | pi) exceeds this; 0 never stops."""
-    advantage_normalization: Literal["none", "all", "task"] = "task"
+    advantage_normalization: clipped.Normalization = "task"
     """Scale advantages to mean 0 and standard deviation 1: never, over all tasks together, or in each task."""
 
     def check(self) -> None:
@@ -95,65 +80,24 @@ class PPO(OnPolicy):
 
     def assess(self, state: AgentState, steps: Transition, tasks: Task) -> tuple[AgentState, Transition]:
         """Add advantages and targets to a rollout (T, H, E, ...), and fit the critic's units to it."""
-        state, steps = super().assess(state, steps, tasks)
-        flat, features, obs, next_obs = self.view.steps(state, self.experience.windows(steps, self.unroll), tasks)
-        old, output = Units.of(state.nets["units"]), critics.outputs(self, state, features, obs)
-        following, reward = critics.values(self, state, features, next_obs), critics.rewards(self, state, flat, tasks)
-        found = old.rewards(output), following, output, reward
-        played = partial(self.experience.played, shape=steps.reward.shape, length=self.unroll)
-        value, next_value, output, reward = map(played, found)
-        advantage = self.advantages(steps._replace(reward=reward), tasks, value, next_value)
-        target = value + advantage
-        state = critics.renew(self, state, target.reshape(len(target), -1))
-        units = Units.of(state.nets["units"])
-        if self.value_normalization == "popart":
-            factor, offset = (x[:, None, None] for x in old.change(units))
-            output = factor * output + offset
-        extras = Assessed(
-            raw=steps.extras.raw,
-            log_prob=steps.extras.log_prob,
-            advantage=self.normalize_advantages(advantage),
-            value=value,
-            output=output,
-            target=units.outputs(target),
-        )
-        if "limit" in state.nets:
-            state = state.with_nets(limit=within(True))
-        return state, steps._replace(extras=extras)
-
-    def advantages(self, steps: Transition, tasks: Task, value: Array, next_value: Array) -> Array:
-        """Compute the advantages (T, H, E) of a rollout."""
-        gamma = discounts_of_all(self, tasks)
-        return jax.vmap(partial(targets.gae, lambda_=self.gae_lambda))(steps, value, next_value, gamma)
-
-    def normalize_advantages(self, advantage: Array) -> Array:
-        """Scale advantages (T, H, E) to mean 0 and standard deviation 1, as the settings say."""
-        if self.advantage_normalization == "none":
-            return advantage
-        mean, variance = mean_and_variance(advantage, (1, 2) if self.advantage_normalization == "task" else (0, 1, 2))
-        return (advantage - mean) / jnp.maximum(jnp.sqrt(variance), MIN_STD)
+        state, steps = clipped.assess(self, *super().assess(state, steps, tasks), tasks)
+        return state.with_nets(limit=within(True)) if "limit" in state.nets else state, steps
 
     # Gradient steps.
 
     def prepare(self, state: AgentState, window: Transition, tasks: Task) -> tuple[AgentState, Batch]:
-        flat, features, obs, next_obs = self.view.steps(state, window, tasks)
-        found: Assessed = flat.extras
-        models = critics.models(self, state, flat, tasks, next_obs)
-        return state, Batch(obs=obs, features=features, mask=tasks.action_mask, **found._asdict(), **models)
+        return state, clipped.batch_of(self, state, window, tasks)
 
     def gain(self, log_ratio: Array, batch: Batch) -> tuple[Array, Metrics]:
-        ratio = jnp.exp(log_ratio)
-        clipped = jnp.clip(ratio, 1 - self.clip_range, 1 + self.clip_range)
-        gain = jnp.minimum(ratio * batch.advantage, clipped * batch.advantage)
-        return gain, {"clip_fraction": jnp.mean(ratio != clipped)}
+        return clipped.gain(log_ratio, batch.advantage, self.clip_range)
 
     def fitting_loss(self, output: Array, batch: Batch) -> Array:
         limit = parts.limit(self.value_clip)
         if limit is None:
             return super().fitting_loss(output, batch)
         assert batch.output is not None
-        clipped = batch.output + jnp.clip(output - batch.output, -limit, limit)
-        return jnp.mean(jnp.maximum(jnp.square(output - batch.target), jnp.square(clipped - batch.target))) / 2
+        near = batch.output + jnp.clip(output - batch.output, -limit, limit)
+        return jnp.mean(jnp.maximum(jnp.square(output - batch.target), jnp.square(near - batch.target))) / 2
 
     def accept(self, moved: AgentState, state: AgentState, kl: Array) -> AgentState:
         """Return the state that has moved, unless KL(pi_old | pi) has exceeded its limit in this rollout."""

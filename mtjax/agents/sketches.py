@@ -7,14 +7,14 @@ import jax
 import jax.numpy as jnp
 import tyro
 
-from mtjax.agents import combinations, parts
+from mtjax.agents import clipped, combinations, parts
 from mtjax.agents.base import Heads
+from mtjax.agents.on_policy import Batch, OnPolicy
 from mtjax.agents.parts.policies import Categorical, Policy
 from mtjax.agents.parts.samplers import ByLength
-from mtjax.agents.ppo import PPO
 from mtjax.agents.state import AgentState, Nets
 from mtjax.networks import Network, Params
-from mtjax.types import Array, InputError, Key, Spec, Task
+from mtjax.types import Array, InputError, Key, Metrics, Spec, Task, Transition
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +40,7 @@ class SubPolicies(Network):
 
 
 @dataclasses.dataclass(frozen=True)
-class Sketches(PPO):
+class Sketches(OnPolicy):
     """Sketches learn modular policies from policy sketches (Andreas et al. 2017), by proximal policy optimisation.
 
     A task's sketch is a sequence of symbols b_1 ... b_K, and its policy plays their sub-policies one after another:
@@ -67,6 +67,7 @@ class Sketches(PPO):
     of -3.
     """
 
+    adjustable: ClassVar[tuple[str, ...]] = (*OnPolicy.adjustable, "clip_range")
     policies: ClassVar[tuple[type[Policy], ...]] = (Categorical,)
     follows_sketches: ClassVar[bool] = True
     one_knowledge: ClassVar[bool] = True  # which sub-policies share
@@ -78,6 +79,10 @@ class Sketches(PPO):
     normalize_observations: bool = False
     heads: Heads = "disjoint"
     """What each task has for itself of its critic: whole networks (disjoint)."""
+    clip_range: float = 0.2
+    """Clip the ratio of policies to this distance from 1 (epsilon)."""
+    advantage_normalization: clipped.Normalization = "task"
+    """Scale advantages to mean 0 and standard deviation 1: never, over all tasks together, or in each task."""
     sharing: Literal["symbols", "tasks", "all"] = "symbols"
     """What has a policy of its own: every symbol (symbols), every task (tasks), or nothing (all)."""
     stop_bias: float = -3.0
@@ -88,6 +93,7 @@ class Sketches(PPO):
 
     def check(self) -> None:
         super().check()
+        parts.require_positive(self, "clip_range")
         if self.heads != "disjoint":
             raise InputError(f"in sketches every task has a critic of its own: heads is disjoint, not {self.heads}")
         if self.normalize_observations:
@@ -124,6 +130,18 @@ class Sketches(PPO):
         if "head" not in part:
             return part
         return {**part, "head": part["head"] | {"bias": part["head"]["bias"].at[..., -1].add(self.stop_bias)}}
+
+    # Learning, as PPO does.
+
+    def assess(self, state: AgentState, steps: Transition, tasks: Task) -> tuple[AgentState, Transition]:
+        """Add advantages and targets to a rollout (T, H, E, ...), and fit the critic's units to it."""
+        return clipped.assess(self, state, steps, tasks)
+
+    def prepare(self, state: AgentState, window: Transition, tasks: Task) -> tuple[AgentState, Batch]:
+        return state, clipped.batch_of(self, state, window, tasks)
+
+    def gain(self, log_ratio: Array, batch: Batch) -> tuple[Array, Metrics]:
+        return clipped.gain(log_ratio, batch.advantage, self.clip_range)
 
     # Tasks that were not trained on.
 
