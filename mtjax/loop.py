@@ -172,6 +172,8 @@ def require_trials(settings: Settings, env: Any, agent: Agent) -> None:
     """
     if settings.trials > 1:
         _require_repeatable(settings.trials, agent)
+    if agent.experience.adaptations and env.tasks("train").draws is not None:
+        raise InputError("this agent adapts to each task by its rollouts, but here trials draw tasks; vary by a list")
     reason = _cannot_go_on(env) if settings.reset_free else ""
     if reason:
         raise InputError(f"--reset-free lets worlds go on, and {reason}; leave it out")

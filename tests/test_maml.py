@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from probes import Walk, of_task, only_seed, pick, tiny, train, with_nets
 
+import mtjax
 from mtjax import loop
 from mtjax.agents import agent, clipped
 from mtjax.agents.maml import MAML
@@ -163,10 +164,10 @@ def test_what_does_not_adapt_is_refused(settings, message):
         agent("maml", **settings)
 
 
-def test_drawn_tasks_are_refused():
-    tasks = TASKS._replace(draws=jax.tree.map(lambda x: x[:, None], TASKS))
+def test_drawn_tasks_are_refused_before_a_folder_is_made(tmp_path):
     with pytest.raises(InputError, match="trials draw tasks"):
-        tiny("maml").init(Spec.vector(2, 2, 1), tasks, KEY)
+        mtjax.train("hidden-bandit", "maml", runs=tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
 # Learning.

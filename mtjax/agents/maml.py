@@ -93,12 +93,6 @@ class MAML(OnPolicy):
 
     # Networks.
 
-    def init(self, spec: Spec, tasks: Task, key: Key) -> AgentState:
-        """Return the initial state."""
-        if tasks.draws is not None:
-            raise InputError("maml adapts to each task by its rollouts, but here trials draw tasks; vary by a list")
-        return super().init(spec, tasks, key)
-
     def init_networks(self, num_tasks: int, actor_inputs: tuple, critic_inputs: tuple, action: Array, key: Key) -> Nets:
         nets = super().init_networks(num_tasks, actor_inputs, critic_inputs, action, key)
         return nets | {"adapted": for_each(nets["actor"], num_tasks)}
