@@ -166,7 +166,7 @@ def test_what_does_not_adapt_is_refused(settings, message):
 
 def test_drawn_tasks_are_refused_before_a_folder_is_made(tmp_path):
     with pytest.raises(InputError, match="trials draw tasks"):
-        mtjax.train("hidden-bandit", "maml", runs=tmp_path)
+        mtjax.train("hidden-bandit", "maml", directory=tmp_path / "run")
     assert not list(tmp_path.iterdir())
 
 
