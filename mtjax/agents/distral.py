@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from mtjax.agents import parts
 from mtjax.agents.base import Heads, Memory
 from mtjax.agents.choices import PARTS
-from mtjax.agents.replayed import Batch
-from mtjax.agents.sac import SAC, ActorAux, Sample
+from mtjax.agents.replayed import ActorAux, Batch, Sample
+from mtjax.agents.sac import SAC
 from mtjax.agents.state import AgentState, Nets
 from mtjax.networks import Network, Params
 from mtjax.types import Acted, Array, InputError, Key, Task

@@ -1,4 +1,4 @@
-"""Batches of a replay, for agents that learn from one: what the losses of soft actor-critic take."""
+"""Batches of a replay, for agents that learn from one: what the losses of soft actor-critic take and find."""
 
 from typing import Any, NamedTuple
 
@@ -10,7 +10,7 @@ from mtjax.agents.rates import discounts, discounts_of_all
 from mtjax.agents.state import AgentState
 from mtjax.experience import pictures
 from mtjax.networks import Params
-from mtjax.types import Array, Key, Task, Transition
+from mtjax.types import Array, Key, Metrics, Task, Transition
 
 
 class Batch(NamedTuple):
@@ -26,6 +26,30 @@ class Batch(NamedTuple):
     mask: Array | None  # (A,) 1 for actions that the task has, else 0; None: it has all
     model_targets: Any = None  # targets of the representation's models
     followed: Array | None = None  # (B,) bool: next_obs is what followed; None: it always is
+
+
+class Sample(NamedTuple):
+    """Holds actions that a policy has sampled."""
+
+    action: Array  # (B, A)
+    log_prob: Array  # (B,)
+    cost: Array  # (B,) what the temperature weighs: log pi, in Distral less a share of log pi_0
+
+
+class CriticAux(NamedTuple):
+    """Holds what a critic loss finds beside the loss."""
+
+    metrics: Metrics
+    expected: Array  # (B,) the values that the critics are fitted to
+    statistics: Any = {}  # new running statistics of the critics' bodies  # noqa: RUF012
+
+
+class ActorAux(NamedTuple):
+    """Holds what an actor loss finds beside the loss."""
+
+    metrics: Metrics
+    entropy: Array  # () of the policy
+    statistics: Any = {}  # new running statistics of the actor's body  # noqa: RUF012
 
 
 def prepare(agent: Any, state: AgentState, window: Transition, tasks: Task, key: Key | None = None) -> Batch:

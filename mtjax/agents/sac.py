@@ -1,7 +1,7 @@
 """SAC trains soft actor-critic on many tasks at once; its variants override single methods."""
 
 import dataclasses
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -12,38 +12,24 @@ from mtjax.agents import combinations
 from mtjax.agents.base import BaseAgent, Memory
 from mtjax.agents.choices import FLAT
 from mtjax.agents.fit import Fit, above, descend
-from mtjax.agents.parts.values import Value
+from mtjax.agents.parts.values import Value, reduce
 from mtjax.agents.rates import scheduled
-from mtjax.agents.replayed import Batch, action_sizes, prepare, renew_scales, update_target, with_statistics
+from mtjax.agents.replayed import (
+    ActorAux,
+    Batch,
+    CriticAux,
+    Sample,
+    action_sizes,
+    prepare,
+    renew_scales,
+    update_target,
+    with_statistics,
+)
 from mtjax.agents.state import AgentState, Nets, axes_of
 from mtjax.axes import when
 from mtjax.experience import Replay
 from mtjax.networks import Network, Params
 from mtjax.types import Acted, Array, Key, Metrics, Sometimes, Task, Transition
-
-
-class Sample(NamedTuple):
-    """Holds actions that a policy has sampled."""
-
-    action: Array  # (B, A)
-    log_prob: Array  # (B,)
-    cost: Array  # (B,) what the temperature weighs: log pi, in Distral less a share of log pi_0
-
-
-class CriticAux(NamedTuple):
-    """Holds what a critic loss finds beside the loss."""
-
-    metrics: Metrics
-    expected: Array  # (B,) the values that the critics are fitted to
-    statistics: Any = {}  # new running statistics of the critics' bodies  # noqa: RUF012
-
-
-class ActorAux(NamedTuple):
-    """Holds what an actor loss finds beside the loss."""
-
-    metrics: Metrics
-    entropy: Array  # () of the policy
-    statistics: Any = {}  # new running statistics of the actor's body  # noqa: RUF012
 
 
 @dataclasses.dataclass(frozen=True)
@@ -177,8 +163,7 @@ class SAC(BaseAgent):
     def policy_loss(self, sample: Sample, nets: Nets, batch: Batch) -> tuple[Array, ActorAux]:
         """Compute the actor loss of actions sampled at a batch's observations."""
         action, log_prob, cost = sample
-        values = self.values(nets, batch.features, batch.obs, action)
-        value = minimum(values) if self.critic_reduction == "min" else jnp.mean(values, axis=0)
+        value = reduce(self.values(nets, batch.features, batch.obs, action), self.critic_reduction == "min")
         loss, entropy = jnp.mean(batch.temperature * cost - value), -jnp.mean(log_prob)
         return loss, ActorAux({"actor_loss": loss, "entropy": entropy}, entropy)
 
@@ -241,13 +226,3 @@ class SAC(BaseAgent):
         nets, optimizer = fit.descend(memory, {"temperature": slope}, state.nets)
         fits = state.fits | {"temperature": memory._replace(optimizer=optimizer)}
         return state._replace(nets=state.nets | nets, fits=fits)
-
-
-def minimum(values: Array) -> Array:
-    """Return the minimum (B,) of values (N, B), with a gradient that is always finite.
-
-    The gradient of ``jnp.min`` looks for values that equal the minimum. Where XLA computes the values twice and rounds
-    them differently it finds none, and the gradient is 0 / 0.
-    """
-    lowest = jnp.arange(len(values))[:, None] == jnp.argmin(values, axis=0)
-    return jnp.sum(jnp.where(lowest, values, 0), axis=0)

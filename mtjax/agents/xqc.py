@@ -11,8 +11,8 @@ from mtjax.agents.parts.encoders import BatchNorm, Encoder
 from mtjax.agents.parts.knowing import Knowing, Parameters
 from mtjax.agents.parts.scaling import ReturnNormalization, Scaling
 from mtjax.agents.parts.values import C51, Value
-from mtjax.agents.replayed import Batch
-from mtjax.agents.sac import SAC, ActorAux, CriticAux, Sample
+from mtjax.agents.replayed import ActorAux, Batch, CriticAux, Sample
+from mtjax.agents.sac import SAC
 from mtjax.agents.state import Nets
 from mtjax.types import Array, Key
 

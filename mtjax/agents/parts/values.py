@@ -38,9 +38,7 @@ class Scalar:
             pessimistic: take the minimum of critics instead of the mean.
             reward, discount, bonus: (B,).
         """
-        values = self.mean(next_outputs)
-        value = jnp.min(values, axis=0) if pessimistic else jnp.mean(values, axis=0)
-        return reward + discount * (value + bonus)
+        return reward + discount * (reduce(self.mean(next_outputs), pessimistic) + bonus)
 
     def loss(self, outputs: Array, target: Array) -> Array:
         """Compute each critic's loss (N, B) for outputs (N, B, outputs) and a result of ``target``."""
@@ -162,6 +160,18 @@ class HLGauss(C51):
         values = jnp.clip(values, self.value_low, self.value_high)
         below = jax.scipy.stats.norm.cdf((edges - values[:, None]) / (self.bin_sigma * self.width))
         return jnp.diff(below) / (below[:, -1:] - below[:, :1])
+
+
+def reduce(values: Array, pessimistic: bool) -> Array:
+    """Return the minimum (B,) of critics' values (N, B), with a gradient that is always finite, or their mean.
+
+    The gradient of ``jnp.min`` looks for values that equal the minimum. Where XLA computes the values twice and rounds
+    them differently it finds none, and the gradient is 0 / 0.
+    """
+    if not pessimistic:
+        return jnp.mean(values, axis=0)
+    lowest = jnp.arange(len(values))[:, None] == jnp.argmin(values, axis=0)
+    return jnp.sum(jnp.where(lowest, values, 0), axis=0)
 
 
 Value = Scalar
