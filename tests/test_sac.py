@@ -109,10 +109,11 @@ def test_actor_loss_weighs_entropy_by_temperature(linear):
 def test_temperature_loss_and_the_sign_of_its_slope():
     """H = -1 for two actions; a policy with more entropy than that lowers its task's temperature, and conversely."""
     temperature, entropy = np.float32([0.5, 0.2]), np.float32([3.0, -2.5])
-    loss = lambda x: SAC(target_entropy=-0.5).temperature_loss(Params({}, {"log": x}), entropy, 2)
-    expected = temperature * (entropy + 1) / 2
-    np.testing.assert_allclose(loss(jnp.log(temperature)), expected.sum(), rtol=1e-5)
-    slope = jax.grad(loss)(jnp.log(temperature))
+    nets = lambda log: {"temperature": Params({}, {"log": log})}
+    loss = lambda log, entropy: SAC(target_entropy=-0.5).temperature_loss(nets(log), entropy, jnp.int32(2))[0]
+    expected = temperature * (entropy + 1)
+    np.testing.assert_allclose(jax.vmap(loss)(jnp.log(temperature), entropy), expected, rtol=1e-5)
+    slope = jax.vmap(jax.grad(loss))(jnp.log(temperature), entropy)
     np.testing.assert_allclose(slope, expected, rtol=1e-5)
     assert slope[0] > 0 > slope[1]
 

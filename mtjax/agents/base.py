@@ -265,6 +265,10 @@ class BaseAgent(abc.ABC):
     def act(self, state: AgentState, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
         """Choose an action (A,) for one observation (O,) of one task; without a key, the mean action."""
 
+    def policy_outputs(self, nets: Nets, features: Array, obs: Any) -> Array:
+        """Return the outputs (..., P) of one task's actor, as ``policy`` reads them."""
+        return self.actor.apply(nets["actor"], *self.view.actor_inputs(nets, features, obs))
+
     def begin(self, state: AgentState, task: Task) -> Memory:
         """Return the memory with which an episode begins."""
         history, action = self.view.history, self.policy.blank(state.nets)

@@ -169,10 +169,6 @@ class OnPolicy(BaseAgent):
 
     # Losses of one task.
 
-    def policy_outputs(self, nets: Nets, features: Array, obs: Any) -> Array:
-        """Return the outputs (..., P) that ``policy`` reads."""
-        return self.actor.apply(nets["actor"], *self.view.actor_inputs(nets, features, obs))
-
     def log_ratio(self, nets: Nets, features: Array, obs: Any, taken: Any, mask: Array | None) -> Array:
         """Return how much likelier (B,) the actions that were ``taken`` are now, in logarithms."""
         log_prob = self.policy.log_prob(self.policy_outputs(nets, features, obs), taken.raw, mask)

@@ -84,9 +84,9 @@ def transitions(agent: Any, window: Transition, tasks: Task) -> Transition:
     return agent.experience.joined(window, discounts_of_all(agent, tasks))
 
 
-def action_sizes(action: Array, mask: Array | None) -> int | Array:
-    """Count the actions that each task has: A for actions (..., A) without a mask (T, A), else (T,)."""
-    return action.shape[-1] if mask is None else jnp.sum(mask, axis=-1)
+def action_sizes(action: Array, mask: Array | None) -> Array:
+    """Count the actions (T,) that each task has, of actions (T, ..., A) with a mask (T, A), or without one."""
+    return jnp.full(len(action), action.shape[-1]) if mask is None else jnp.sum(mask, axis=-1)
 
 
 def update_target(agent: Any, state: AgentState) -> AgentState:

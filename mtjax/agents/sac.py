@@ -8,23 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from mtjax.agents import combinations
+from mtjax.agents import combinations, replayed
 from mtjax.agents.base import BaseAgent, Memory
 from mtjax.agents.choices import FLAT
 from mtjax.agents.fit import Fit, above, descend
 from mtjax.agents.parts.values import Value, reduce
 from mtjax.agents.rates import scheduled
-from mtjax.agents.replayed import (
-    ActorAux,
-    Batch,
-    CriticAux,
-    Sample,
-    action_sizes,
-    prepare,
-    renew_scales,
-    update_target,
-    with_statistics,
-)
+from mtjax.agents.replayed import ActorAux, Batch, CriticAux, Sample
 from mtjax.agents.state import AgentState, Nets, axes_of
 from mtjax.axes import when
 from mtjax.experience import Replay
@@ -117,10 +107,6 @@ class SAC(BaseAgent):
 
     # Losses of one task.
 
-    def policy_outputs(self, nets: Nets, features: Array, obs: Any) -> Array:
-        """Return the policy's outputs (..., 2A)."""
-        return self.actor.apply(nets["actor"], *self.view.actor_inputs(nets, features, obs))
-
     def sample(self, nets: Nets, batch: Batch, obs: Any, key: Key) -> Sample:
         """Sample the policy's actions at observations (B, O) of a batch."""
         action, _, log_prob = self.policy.draw(self.policy_outputs(nets, batch.features, obs), batch.mask, key)
@@ -167,9 +153,10 @@ class SAC(BaseAgent):
         loss, entropy = jnp.mean(batch.temperature * cost - value), -jnp.mean(log_prob)
         return loss, ActorAux({"actor_loss": loss, "entropy": entropy}, entropy)
 
-    def temperature_loss(self, temperature: Params, entropy: Array, action_size: int | Array) -> Array:
-        """Compute the loss of all tasks' temperatures, by the entropies (T,) of their policies."""
-        return jnp.mean(jnp.exp(temperature.parts["log"]) * (entropy - self.target_entropy * action_size))
+    def temperature_loss(self, nets: Nets, entropy: Array, action_size: Array) -> tuple[Array, None]:
+        """Compute the loss of one task's temperature, by the entropy () of its policy."""
+        excess = entropy - self.target_entropy * action_size
+        return jnp.sum(jnp.exp(nets["temperature"].parts["log"]) * excess), None
 
     # Update of all tasks.
 
@@ -182,7 +169,7 @@ class SAC(BaseAgent):
             number: () how many updates came before; actor and temperatures learn at every ``policy_delay``-th.
         """
         target_key, actor_key, critic_order, actor_order = jax.random.split(key, 4)
-        batch = prepare(self, state, window, tasks, jax.random.fold_in(key, 1))
+        batch = replayed.prepare(self, state, window, tasks, jax.random.fold_in(key, 1))
         batch = self.view.keyed(batch, jax.random.fold_in(key, 2))
         before = state.nets["representation"]
         importance = self.sampler.weights(state.nets["sampler"].own, batch.temperature)
@@ -190,14 +177,15 @@ class SAC(BaseAgent):
         data = self.critic_data(state, batch, target_key)
         loss = above(self.least_loss, self.critic_loss)
         state, fitted = descend(self.fits, "critic", state, loss, data, critic_order, importance)
-        state = with_statistics(state, "critic", fitted.aux.statistics)
+        state = replayed.with_statistics(state, "critic", fitted.aux.statistics)
 
         def improve(state: AgentState) -> tuple[AgentState, Metrics]:
             seen = {"representation": self.representation.for_actor(representation, before)}
             data = (batch, jax.random.split(actor_key, len(batch.temperature)))
             state, improved = descend(self.fits, "actor", state, self.actor_loss, data, actor_order, importance, seen)
-            state = with_statistics(state, "actor", improved.aux.statistics)
-            state = self.tune_temperature(state, improved.aux.entropy, batch)
+            state = replayed.with_statistics(state, "actor", improved.aux.statistics)
+            data = (improved.aux.entropy, replayed.action_sizes(batch.action, batch.mask))
+            state, _ = descend(self.fits, "temperature", state, self.temperature_loss, data, actor_order)
             return state, improved.aux.metrics | improved.metrics
 
         representation, delay = state.nets["representation"], self.experience.policy_delay
@@ -206,7 +194,7 @@ class SAC(BaseAgent):
         if delay > 1:
             actor_metrics = Sometimes.over(actor_metrics, turn)
 
-        state = renew_scales(self, update_target(self, state), fitted.aux.expected)
+        state = replayed.renew_scales(self, replayed.update_target(self, state), fitted.aux.expected)
         return state, fitted.aux.metrics | actor_metrics | {"temperature": batch.temperature} | fitted.metrics
 
     def critic_data(self, state: AgentState, batch: Batch, key: Key) -> tuple[Batch, Any]:
@@ -217,12 +205,3 @@ class SAC(BaseAgent):
         model_targets, keys = self.representation.targets(representation, followed, batch.next_obs, key)
         target = jax.vmap(self.critic_target, (axes_of(state.nets), axes_of(slow), 0, 0))
         return batch._replace(model_targets=model_targets), target(state.nets, slow, batch, keys)
-
-    def tune_temperature(self, state: AgentState, entropy: Array, batch: Batch) -> AgentState:
-        """Take one gradient step of the temperatures, by the entropies (T,) of the tasks' policies."""
-        fit, memory = self.fits["temperature"], state.fits["temperature"]
-        action_size = action_sizes(batch.action, batch.mask)
-        slope = jax.grad(self.temperature_loss)(state.nets["temperature"], entropy, action_size)
-        nets, optimizer = fit.descend(memory, {"temperature": slope}, state.nets)
-        fits = state.fits | {"temperature": memory._replace(optimizer=optimizer)}
-        return state._replace(nets=state.nets | nets, fits=fits)
