@@ -130,6 +130,11 @@ def _hint(kind: Any, value: Any) -> str:
     return ""
 
 
+def amount(value: float) -> str:
+    """Return a return as text: a whole number if it is large, else with three digits."""
+    return f"{value:.0f}" if abs(value) >= 20 else f"{value:.3g}"
+
+
 def shown(value: Any) -> str:
     """Return a value as text for a message, or the name of its type if that is long."""
     try:

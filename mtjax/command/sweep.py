@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mtjax.agents import AGENTS, PARTS, swept
+from mtjax.checks import amount
 from mtjax.command.run_config import parse
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import RunConfig
@@ -356,5 +357,6 @@ def _highest(env: str, rows: Sequence[Mapping[str, Any]], settings: Sequence[str
 def _cell(row: Mapping[str, Any], split: str) -> str:
     if not row.get(split):
         return f"{row['diverged']} of {row['seeds']} seeds diverged" if row.get("diverged") else "-"
-    interval = f" [{float(row[f'{split}_low']):.0f}, {float(row[f'{split}_high']):.0f}]" if row[f"{split}_low"] else ""
-    return f"{float(row[split]):.0f}{interval}"
+    told = lambda name: amount(float(row[name]))
+    interval = f" [{told(f'{split}_low')}, {told(f'{split}_high')}]" if row[f"{split}_low"] else ""
+    return f"{told(split)}{interval}"

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from mtjax.checks import amount
 from mtjax.envs.engines import host
 from mtjax.envs.pixels import Pictured
 from mtjax.envs.task_table import Part, Tabled
@@ -102,7 +103,7 @@ def _caption(env: Tabled, one: Chosen, played: Recording, named: Mapping[str, st
     """Return the lines on a task: its split and return, and its parameters."""
     row = int(played.rows[one.place])  # continuous ranges have a row for each episode
     split = named.get(one.split, one.split)
-    return f"{split}, return {float(played.returns[one.place]):.0f}", env.describe(row)
+    return f"{split}, return {amount(float(played.returns[one.place]))}", env.describe(row)
 
 
 def _tile(env: Tabled, one: Chosen, played: Recording, states: Any, count: int, width: int) -> np.ndarray:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mtjax import evaluation, trials
-from mtjax.checks import path, require_episodes
+from mtjax.checks import amount, path, require_episodes
 from mtjax.compiling.programs import compile_lowered, enable_compile_cache, trace
 from mtjax.envs import Family
 from mtjax.envs.engines import host
@@ -45,7 +45,7 @@ class Evaluation(NamedTuple):
 
     def __repr__(self) -> str:
         """Return a line: the mean return of every split."""
-        means = [f"{split} {x.mean():.0f} ({x.shape[1]} tasks)" for split, x in self.returns.items() if x.size]
+        means = [f"{split} {amount(x.mean())} ({x.shape[1]} tasks)" for split, x in self.returns.items() if x.size]
         return f"Evaluation(return {', '.join(means)}; {len(self.seeds)} seed{'s' * (len(self.seeds) > 1)})"
 
     @public

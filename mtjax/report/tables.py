@@ -6,6 +6,7 @@ from types import MappingProxyType
 import numpy as np
 
 from mtjax import trials
+from mtjax.checks import amount
 from mtjax.envs.family import Family
 from mtjax.envs.task_table import Part
 from mtjax.evaluation import Evaluations, Scores, of_tasks
@@ -19,7 +20,7 @@ _TOLD = "  success, at any step"
 def _interval(scores: np.ndarray) -> str:
     """Return the mean of scores (S, T) as text, with its 95% interval if there are enough seeds for one."""
     point, low, high = seed_interval(scores)
-    return f"{point:6.0f}" + (f"  [{low:.0f}, {high:.0f}]" if np.isfinite(low) else "")
+    return f"{amount(point):>6}" + (f"  [{amount(low)}, {amount(high)}]" if np.isfinite(low) else "")
 
 
 def split_table(evaluations: Evaluations, parts: Sequence[Part] = ()) -> str:
@@ -50,7 +51,7 @@ def _trial_lines(returns: Mapping[str, np.ndarray], trial: int) -> list[str]:
 
 
 def _split_line(split: str, returns: np.ndarray, *success: np.ndarray) -> str:
-    line = f"{split:15} {returns.shape[1]:5} {_interval(returns):>7}  {returns.mean(axis=0).min():<10.0f}"
+    line = f"{split:15} {returns.shape[1]:5} {_interval(returns):>7}  {amount(returns.mean(axis=0).min()):<10}"
     known = [x[np.isfinite(x)] for x in success]  # of a mixture, some families may not tell
     return line.rstrip() if not known or not known[0].size else line + "".join(f"  {x.mean():7.2f}" for x in known)
 
@@ -75,7 +76,7 @@ def task_table(policy: Policy, scores: dict[str, Scores], named: Mapping[str, st
         for split, found in own.items():
             for t, name in enumerate(names[split]):
                 task = of_tasks(found, [t])
-                ends = f"{task.returns.min():.0f}, {task.returns.max():.0f}"
+                ends = f"{amount(task.returns.min())}, {amount(task.returns.max())}"
                 lines.append(f"{_mean_line(called(split), name, task, width):<{len(head)}}   {ends}")
             lines += [_mean_line(called(split), "all", found, width)] if found.returns.size else []
     if len(parts) > 1:

@@ -11,6 +11,7 @@ import numpy as np
 
 from mtjax import trials
 from mtjax.agents.swept import Point
+from mtjax.checks import amount
 from mtjax.evaluation import Evaluations
 from mtjax.loop import TrainState
 from mtjax.names import nearest_error, public
@@ -42,7 +43,7 @@ class Result(NamedTuple):
         known = {split: x[:, -1] for split, x in self.evaluations.returns.items() if x.size}
         told = {split: trials.describe(x, self.evaluations.trial) for split, x in known.items()}
         tell = lambda split: f" ({told[split]})" * bool(told[split])
-        scores = ", ".join(f"{split} {np.nanmean(x):.0f}{tell(split)}" for split, x in known.items())
+        scores = ", ".join(f"{split} {amount(np.nanmean(x))}{tell(split)}" for split, x in known.items())
         steps = f"{self.rows[-1]['steps']:,} steps" if self.rows else "no steps"
         place = "" if self.directory is None else f", in {str(self.directory)!r}"
         return f"Result({steps}, return {scores or '-'}{'' if self.finished else ', stopped'}{place})"

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from mtjax import trials
+from mtjax.checks import amount
 
 _SHARE = 1 / 3  # of a run under random actions from which a warning is due
 _LINES, _SECONDS = 50, 15.0  # plain lines in a run, and the longest time without one
@@ -118,7 +119,7 @@ class Console:
         tell = lambda split, x: _of_split(split, x) + _of_trial(x, trial) + _share(shares.get(split))
         told = ", ".join(tell(split, x) for split, x in returns.items() if x.size)
         self.say(f"{self.label}evaluation at {steps:,} steps: {told}")
-        means = ", ".join(f"{split} {x.mean():.0f}" for split, x in returns.items() if x.size)
+        means = ", ".join(f"{split} {amount(x.mean())}" for split, x in returns.items() if x.size)
         self.evaluated = f"  evaluated {means}"
 
     def close(self) -> None:
@@ -133,10 +134,10 @@ def describe_returns(returns: np.ndarray) -> str:
     if not known.any():
         return ""
     tasks = [np.mean(column[seen]) for column, seen in zip(returns.T, known.T, strict=True) if seen.any()]
-    mean = f"return {np.mean(returns[known]):.0f}"
+    mean = f"return {amount(np.mean(returns[known]))}"
     if len(tasks) == 1:
         return mean
-    return f"{mean} (worst task {min(tasks):.0f}, best {max(tasks):.0f})"
+    return f"{mean} (worst task {amount(min(tasks))}, best {amount(max(tasks))})"
 
 
 def describe_running(totals: np.ndarray, ages: np.ndarray, counted: np.ndarray, horizon: int) -> str:
@@ -144,7 +145,7 @@ def describe_running(totals: np.ndarray, ages: np.ndarray, counted: np.ndarray, 
     if not counted.any() or not ages[counted].any():
         return ""
     age = int(np.max(ages[counted]))
-    return f"first episodes run: return {np.mean(totals[counted]):.0f} so far, at step {age:,} of {horizon:,}"
+    return f"first episodes run: return {amount(np.mean(totals[counted]))} so far, at step {age:,} of {horizon:,}"
 
 
 def describe_warmup(steps: int, total: int) -> list[str]:
@@ -174,8 +175,8 @@ def describe_rounding(steps: int, total: int, chunk: int) -> list[str]:
 
 
 def _of_split(split: str, returns: np.ndarray) -> str:
-    worst = f" (worst task {returns.mean(axis=(0, 2)).min():.0f})" if returns.shape[1] > 1 else ""
-    return f"{split} {returns.mean():.0f}{worst}"
+    worst = f" (worst task {amount(returns.mean(axis=(0, 2)).min())})" if returns.shape[1] > 1 else ""
+    return f"{split} {amount(returns.mean())}{worst}"
 
 
 def _of_trial(returns: np.ndarray, trial: int) -> str:
