@@ -59,6 +59,7 @@ from mtjax.experience.replay import Replay
 from mtjax.report import figures as plot
 from mtjax.report.stats import (
     Interval,
+    Statistic,
     holm,
     iqm,
     paired_difference,
@@ -100,7 +101,15 @@ FAMILIES = {
     "cheetah-vary-direction": Trial(None, 500_000, 10_000_000),
     "reacher-vary-goal": Trial(None, 1_000_000, 20_000_000),
 }
-VARIANTS = {"care-text": ("care", {"conditioning": "text"})}  # name -> the agent, and its settings
+# What PPO's networks see of the task, from all to nothing, by name: the agent, and its settings.
+LADDER: dict[str, tuple[str, dict[str, Any]]] = {
+    "told": ("ppo", {"conditioning": "parameters"}),
+    "blind": ("ppo", {"conditioning": "none"}),
+    "last-steps": ("ppo", {"conditioning": "inferred"}),
+    "rl2": ("ppo", {"conditioning": "recurrent"}),
+    **{name: ("ppo", {"conditioning": "posterior", "inference": name}) for name in ("varibad", "pearl", "cadm")},
+}
+VARIANTS = {"care-text": ("care", {"conditioning": "text"}), **LADDER}
 _SHARED = ("num_envs", "chunk_steps", "updates_per_step", "batch_size", "replay_size", "warmup_steps")
 _MOST_LINES = 7  # of a figure
 UNFINISHED = "show the last evaluation of unfinished pairs too, marked with its steps"
@@ -133,7 +142,7 @@ def main() -> None:
     arguments = parser.parse_args()
     arguments.equal_to = "" if arguments.best else arguments.baseline
     named = [(env, agent) for env in arguments.envs for agent in arguments.agents]
-    left = learn_all(arguments, __file__, named, lambda _: arguments)
+    left = learn_all(arguments, __file__, named, lambda *_: arguments)
     if not is_part():
         tabulate(arguments.out, arguments.mark, arguments.baseline, arguments.unfinished)
     require_all(left)
@@ -143,17 +152,17 @@ def learn_all(
     arguments: argparse.Namespace,
     script: str,
     named: Sequence[tuple[str, str]],
-    request: Callable[[str], argparse.Namespace],
+    request: Callable[[str, str], argparse.Namespace],
 ) -> list[str]:
     """Write the results of pairs of family and agent, here or each in a process of its own, and return what is left.
 
     Args:
-        request: the arguments of ``learn`` for a family.
+        request: the arguments of ``learn`` for a family and an agent.
     """
     if arguments.devices == [""]:
         enable_compile_cache()
         for env, agent in named:
-            learn(request(env), env, agent)
+            learn(request(env, agent), env, agent)
         return []
     words = [*sys.argv[1:], "--devices", "", "--out", str(arguments.out)]  # the folder may be named after the clock
     of_all = [Part(f"{env}/{agent}", [*words, "--envs", env, "--agents", agent], ending=".npz") for env, agent in named]
@@ -348,15 +357,17 @@ class Difference(NamedTuple):
     improvement: Interval
 
 
-def differences_of(env: str, found: dict[str, dict[str, np.ndarray]], baseline: str) -> list[Difference]:
+def differences_of(
+    env: str, found: dict[str, dict[str, np.ndarray]], baseline: str, statistic: Statistic = iqm
+) -> list[Difference]:
     """Return each agent's differences from the baseline, one for each split."""
     differences = []
     for agent, scores in found.items():
         for split in scores if agent != baseline and baseline in found else ():
             pair = scores[split], found[baseline][split]
-            paired = paired_difference(*pair, iqm) if len(pair[0]) == len(pair[1]) else None
+            paired = paired_difference(*pair, statistic) if len(pair[0]) == len(pair[1]) else None
             p = paired_p_value(*pair) if paired else np.nan
-            apart = unpaired_difference(*pair, iqm), probability_of_improvement(*pair)
+            apart = unpaired_difference(*pair, statistic), probability_of_improvement(*pair)
             differences.append(Difference(env, agent, split, paired, p, *apart))
     return differences
 

@@ -183,7 +183,7 @@ def main() -> None:
     arguments.equal_to = "" if arguments.best else suite.equal_to
     agents = suite.agents if arguments.agents is None else arguments.agents
     named = [(env, agent) for env in arguments.envs or suite.envs for agent in agents]
-    left = learning.learn_all(arguments, __file__, named, lambda env: request(arguments, suite, env, arguments.out))
+    left = learning.learn_all(arguments, __file__, named, lambda env, _: request(arguments, suite, env, arguments.out))
     if not is_part():
         print(tabulate(arguments.out, suite, arguments.unfinished))
     require_all(left)

@@ -16,7 +16,7 @@ import tyro
 from jax.sharding import Mesh
 
 from mtjax import trials
-from mtjax.agents import AGENTS, BaseAgent, agent, combinations, preset_of
+from mtjax.agents import AGENTS, BaseAgent, agent, combinations, preset_of, tuned_as
 from mtjax.agents import name_of as agent_name_of
 from mtjax.agents.choices import kinds_of, replace, require_value_range
 from mtjax.agents.parts.policies import Gaussian, policy_for
@@ -248,7 +248,7 @@ def with_preset(
     device = _device_preset() if preset_name == "auto" else preset_name
     preset, common = load_preset(env_name, device), load_preset("+", device)
     table = lambda name: common.get(name, {}) | preset.get(name, {})
-    chosen = table(agent_name)
+    chosen = table(tuned_as(agent_name))
     if preset_of(agent_name).cls.common_presets:
         from_pictures = table("pictures") if _sees_pictures(made) else {}
         chosen = preset.get("training", {}) | preset.get("agent", {}) | from_pictures | chosen

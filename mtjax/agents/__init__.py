@@ -123,6 +123,16 @@ def preset_of(name: str) -> Preset:
     return AGENTS[name]
 
 
+def tuned_as(name: str) -> str:
+    """Return the agent whose tuned settings one has: its own name, or that of the first agent of its class.
+
+    Agents of common presets have tables of their own beside these.
+    """
+    preset = preset_of(name)
+    same = (other for other, each in AGENTS.items() if each.place == preset.place)
+    return name if preset.cls.common_presets else next(same, name)
+
+
 def name_of(agent: Any) -> str:
     """Return the name of an agent: of those of its class, the one whose defaults it shares most."""
     cls, own = type(agent), load("mtjax.agents.choices:settings")(agent)
