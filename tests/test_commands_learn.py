@@ -35,11 +35,14 @@ _WALKER = "a walker takes several minutes on two CPU cores, docs/results/returns
 _ONE = "--env.vary.size=1.1 --split=none --steps=250000"  # finger of the ten
 _GYM = "needs Gymnasium; tests/test_hosted.py learns to balance there"
 _GRID = "earns nearly all that can be earned in ten minutes of two CPU cores; tests/test_recurrent.py has a bandit"
+_PULLS = "ten pulls earn between 5 and 6.02, too little to see in few trials; tests/test_own_inference.py trains it"
 _LOOP = "--env=point-mass-vary-goal --agent=multi-head"  # one pair of the loop around the command
 
 MARKS: dict[str, Learns | str] = {
     "--quick": Learns(25),
     "--import=examples/own_environment.py --env=spring --agent=care --steps=200000": Learns(30),
+    "--import=examples/own_inference.py --env=hidden-bandit --trials=10 --agent=ppo --agent.conditioning=averages "
+    "--agent.unroll=10": _PULLS,
     "'--env=$env' '--agent=$agent' --seeds=3 --steps=400000 --chunk-steps=250 --runs=runs/first": Learns(20, _LOOP),
     "--env=finger-spin-vary-size --agent=sac-conditioned": Learns(5, _ONE),
     "--env=cartpole-swingup+finger-spin+walker-walk-vary-friction --agent=multi-head": Learns(5, "--steps=400000"),
