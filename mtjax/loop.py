@@ -36,6 +36,8 @@ from mtjax.types import Agent, Array, Env, InputError, Key, Metrics, Sometimes, 
 PHASES = 10
 """Largest number of different first ages, as each causes a separate reset in every episode."""
 
+_END = 0xE2D  # folded into the key where a task ends
+
 _MOST_LOST = 1e-4
 """Largest share of a task's steps in a chunk at which worlds may be lost."""
 
@@ -145,6 +147,10 @@ def require_curriculum(settings: Settings, env: Any, agent: Any) -> None:
     Raises:
         InputError: it cannot.
     """
+    if getattr(agent, "consolidates", False) and not isinstance(settings.plays, curricula.Sequence):
+        raise InputError(
+            "continual and reset-optimizer are for tasks one after another: use --curriculum=sequence:STEPS"
+        )
     if not settings.plays.steps:
         return
     told, experience = f"the curriculum {settings.curriculum}", agent.experience
@@ -290,9 +296,25 @@ def _take_turns(env: Env, agent: Agent, settings: Settings, known: Task, state: 
         blank = _blank(env, agent, state.agent, tasks, worlds, world_keys(act_key, shape))
         data = agent.experience.init(blank, env.spec, shape[1], settings.num_envs, data_key)
         fresh = {"total": jnp.zeros(shape), "counted": worlds.age == 0}
+        fresh |= {"agent": _consolidate(env, agent, known, state)}
         return state._replace(worlds=worlds, data=data, key=key, rows=rows, **fresh)
 
     return jax.lax.cond(jnp.any(rows != state.rows), begin, lambda state: state, state)
+
+
+def _consolidate(env: Env, agent: Agent, known: Task, state: TrainState) -> Any:
+    """Return the agents (S, ...) as they end the task that was played, from whose replay they may learn once more."""
+    if not agent.consolidates:
+        return state.agent
+    tasks, experience = rows_of(known, state.rows), agent.experience
+
+    def consolidate(learner: Any, data: Any, key: Key) -> Any:
+        draw = lambda key, count: experience.draw(env.spec, agent, data.ring, key, count)
+        return at_point(agent, learner).consolidate(learner, draw, tasks, jax.random.fold_in(key, _END))
+
+    played = _of_played(state.agent, state.rows)
+    played = over_seeds(consolidate, 0, experience.axes, 0)(played, state.data, state.key)
+    return _with_played(state.agent, played, state.rows)
 
 
 def _of_played(learners: Any, rows: Array | None) -> Any:

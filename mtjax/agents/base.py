@@ -312,6 +312,19 @@ class BaseAgent(abc.ABC):
         """Return the state with which to play tasks, given one rollout (T, H, E, ...) of them: as it is."""
         return state
 
+    @property
+    def consolidates(self) -> bool:
+        """Whether anything happens to the agent where a task of a sequence ends."""
+        return False
+
+    def consolidate(self, state: AgentState, draw: Any, tasks: Task, key: Key) -> AgentState:
+        """Return the state with which a task (1, ...) of a sequence ends: as it is.
+
+        Args:
+            draw: draws windows (1, count, L, ...) of the replay, by a key and their count.
+        """
+        return state
+
     @abc.abstractmethod
     def update(
         self, state: AgentState, window: Transition, tasks: Task, key: Key, number: Array

@@ -10,6 +10,7 @@ from mtjax.agents import parts
 from mtjax.agents.parts.encoders import ENCODERS
 from mtjax.agents.parts.gradients import surgery
 from mtjax.agents.parts.knowing import CONDITIONINGS
+from mtjax.agents.parts.remembering import CONTINUAL
 from mtjax.agents.parts.representations import REPRESENTATIONS
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
@@ -26,6 +27,7 @@ PARTS: dict[str, Mapping[str, type]] = {
     "value": VALUES,
     "scaling": SCALINGS,
     "sampler": SAMPLERS,
+    "continual": CONTINUAL,
     "experience": EXPERIENCES,  # follows from the agent; all others are choices
 }
 FLAT = tyro.conf.arg(name="")  # a part's fields become flags of the agent; the part is chosen before tyro parses

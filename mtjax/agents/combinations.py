@@ -113,11 +113,42 @@ def check_replayed(agent: Any) -> None:
     if agent.conditioning.recurs and (replay.n_step > 1 or replay.hindsight or replay.host_replay_size):
         name = _name(agent, "conditioning")
         raise InputError(f"conditioning={name} needs n-step=1, hindsight=0 and host-replay-size=0")
+    if agent.continual.keeps:
+        _check_continual(agent)
     if agent.unroll > replay.warmup_steps + 1:
         raise InputError(
             f"recurrent-steps={agent.unroll} needs as many steps before the first update: warmup-steps of at least "
             f"{agent.unroll - 1}, not {replay.warmup_steps}"
         )
+
+
+def _check_continual(agent: Any) -> None:
+    """Refuse what would change the actor of earlier tasks beside its gradient steps, or leaves nothing to hold."""
+    name = _name(agent, "continual")
+    if agent.heads == "disjoint":
+        raise InputError(f"continual={name} holds what tasks share, and heads=disjoint shares nothing; use per-task")
+    if agent.fits_statistics or agent.distils:
+        raise InputError(
+            f"continual={name} holds one actor without statistics, as sac has; not {type(agent).__name__}'s"
+        )
+    if not agent.continual.freezes:
+        return
+    knows, sees = agent.conditioning, agent.representation
+    changing = {
+        "normalize-observations": (agent.normalize_observations, "no-normalize-observations"),
+        "unit-head": (agent.unit_head, "no-unit-head"),
+        f"representation={_name(agent, 'representation')}": (sees.learns, "representation=plain"),
+        f"conditioning={_name(agent, 'conditioning')}": (
+            knows.embeds or knows.recurs or knows.history,
+            "conditioning=one-hot",
+        ),
+    }
+    for setting, (present, instead) in changing.items():
+        if present:
+            raise InputError(
+                f"continual={name} keeps the actor of earlier tasks as it is, which {setting} changes; use "
+                f"--agent.{instead}"
+            )
 
 
 # What an agent and a family need of each other.

@@ -64,6 +64,7 @@ class Distral(SAC):
     """
 
     adjustable: ClassVar[tuple[str, ...]] = (*SAC.adjustable, "distral_alpha")
+    distils: ClassVar[bool] = True
     one_knowledge: ClassVar[bool] = True  # which the distilled policy shares
     heads: Heads = "disjoint"
     distral_alpha: float = 0.5

@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from mtjax.agents import combinations, replayed
+from mtjax.agents import combinations, consolidating, replayed
 from mtjax.agents.base import BaseAgent, Memory
 from mtjax.agents.choices import FLAT
 from mtjax.agents.fit import Fit, above, descend
+from mtjax.agents.parts.remembering import Remembering
 from mtjax.agents.parts.values import Value, reduce
 from mtjax.agents.rates import scheduled
 from mtjax.agents.replayed import ActorAux, Batch, CriticAux, Sample
@@ -42,6 +43,8 @@ class SAC(BaseAgent):
         *BaseAgent.adjustable,
         *("temperature_lr", "temperature_momentum", "tau", "target_entropy"),
     )
+    distils: ClassVar[bool] = False
+    """Whether another policy than each task's own learns beside it."""
     temperature_lr: float = 1e-3
     """Adam's learning rate of the temperatures."""
     temperature_momentum: float = 0.9
@@ -61,6 +64,7 @@ class SAC(BaseAgent):
     unit_head: bool = False
     """Keep the weights of each output of actor and critics at length 1."""
     value: Annotated[Value, FLAT] = dataclasses.field(default_factory=Value)
+    continual: Annotated[Remembering, FLAT] = dataclasses.field(default_factory=Remembering)
     experience: Annotated[Replay, FLAT] = dataclasses.field(default_factory=Replay)
 
     def check(self) -> None:
@@ -84,8 +88,9 @@ class SAC(BaseAgent):
         log = jnp.log if isinstance(self.initial_temperature, Array) else np.log
         temperature = jnp.full(1 if self.shared_temperature else num_tasks, log(self.initial_temperature))
         temperature = {"log": temperature.astype(jnp.float32)}
-        return {
-            "actor": self.actor.init(actor_key, num_tasks, self.policy.outputs(len(action)), *actor_inputs),
+        actor = self.actor.init(actor_key, num_tasks, self.policy.outputs(len(action)), *actor_inputs)
+        return self.continual.init(actor, num_tasks) | {
+            "actor": actor,
             "critic": jax.vmap(init_critic, out_axes=Params(shared=0, own=1))(keys),  # type: ignore
             "temperature": Params(temperature, {}) if self.shared_temperature else Params({}, temperature),
         }
@@ -104,6 +109,9 @@ class SAC(BaseAgent):
         """Choose an action (A,) for one observation (O,) of one task; without a key, the mean action."""
         outputs = self.policy_outputs(*self.view.acting(state, memory, obs, task))
         return Acted(self.policy.draw(outputs, task.action_mask, key).action)
+
+    def policy_outputs(self, nets: Nets, features: Array, obs: Any) -> Array:
+        return super().policy_outputs(self.continual.seen(nets), features, obs)
 
     # Losses of one task.
 
@@ -153,6 +161,11 @@ class SAC(BaseAgent):
         loss, entropy = jnp.mean(batch.temperature * cost - value), -jnp.mean(log_prob)
         return loss, ActorAux({"actor_loss": loss, "entropy": entropy}, entropy)
 
+    def remembering_loss(self, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:
+        """Compute the actor loss, with what holds the actor to earlier tasks of a sequence."""
+        loss, aux = self.actor_loss(nets, batch, key)
+        return loss + self.continual.penalty(nets), aux
+
     def temperature_loss(self, nets: Nets, entropy: Array, action_size: Array) -> tuple[Array, None]:
         """Compute the loss of one task's temperature, by the entropy () of its policy."""
         excess = entropy - self.target_entropy * action_size
@@ -182,7 +195,9 @@ class SAC(BaseAgent):
         def improve(state: AgentState) -> tuple[AgentState, Metrics]:
             seen = {"representation": self.representation.for_actor(representation, before)}
             data = (batch, jax.random.split(actor_key, len(batch.temperature)))
-            state, improved = descend(self.fits, "actor", state, self.actor_loss, data, actor_order, importance, seen)
+            before_step, loss = state.nets, self.remembering_loss
+            state, improved = descend(self.fits, "actor", state, loss, data, actor_order, importance, seen)
+            state = state._replace(nets=self.continual.kept(before_step, state.nets))
             state = replayed.with_statistics(state, "actor", improved.aux.statistics)
             data = (improved.aux.entropy, replayed.action_sizes(batch.action, batch.mask))
             state, _ = descend(self.fits, "temperature", state, self.temperature_loss, data, actor_order)
@@ -196,6 +211,13 @@ class SAC(BaseAgent):
 
         state = replayed.renew_scales(self, replayed.update_target(self, state), fitted.aux.expected)
         return state, fitted.aux.metrics | actor_metrics | {"temperature": batch.temperature} | fitted.metrics
+
+    @property
+    def consolidates(self) -> bool:
+        return self.continual.keeps or self.continual.reset_optimizer
+
+    def consolidate(self, state: AgentState, draw: consolidating.Draw, tasks: Task, key: Key) -> AgentState:
+        return consolidating.consolidate(self, state, draw, tasks, key)
 
     def critic_data(self, state: AgentState, batch: Batch, key: Key) -> tuple[Batch, Any]:
         """Return the data of the critics' loss for all tasks (T, ...): the batch, and the targets."""

@@ -1,0 +1,69 @@
+"""What happens to an agent with a replay where one task of a sequence ends and another begins."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from mtjax.agents import replayed
+from mtjax.agents.parts.policies import Policy
+from mtjax.agents.state import AgentState, of_task
+from mtjax.types import Array, Key, Task, Transition
+
+Draw = Callable[[Key, int], Transition]
+"""Draws so many windows (T, count, L, ...) of the replay."""
+
+
+def consolidate(agent: Any, state: AgentState, draw: Draw, tasks: Task, key: Key) -> AgentState:
+    """Return the state with which a task ends, of an agent that played it alone.
+
+    Its way to remember renews what it keeps, and learns on if it does; then optimisers begin anew if they should.
+    """
+    way, (draw_key, learn_key) = agent.continual, jax.random.split(key)
+    if way.keeps:
+        nets = way.consolidate(state.nets, *_policy(agent, state, draw, tasks, draw_key))
+        state = _retrain(agent, state._replace(nets=nets), draw, tasks, learn_key)
+    if way.reset_optimizer:
+        state = state._replace(fits={name: fit.init(state.nets, 1) for name, fit in agent.fits.items()})
+    return state
+
+
+def _policy(agent: Any, state: AgentState, draw: Draw, tasks: Task, key: Key) -> tuple[Any, Any, Any]:
+    """Return the actor's outputs as a function of shared parameters and an input, their information, and inputs."""
+    count, nets = agent.continual.samples, of_task(state.nets, jnp.int32(0))
+    if not count:
+        return None, None, None
+    batch = replayed.prepare(agent, state, draw(key, count), tasks)
+    obs, features, mask = jax.tree.map(lambda x: x[0], (batch.obs, batch.features, batch.mask))
+    features = jnp.broadcast_to(features, (count, features.shape[-1]))
+
+    def outputs(shared: Any, given: Any) -> Array:
+        actor = nets["actor"]._replace(shared=shared)
+        return agent.policy_outputs(nets | {"actor": actor}, *given)
+
+    return outputs, partial(information, agent.policy, mask), (features, obs)
+
+
+def information(policy: Policy, mask: Array | None, outputs: Array) -> Array:
+    """Return the diagonal (P,) of the Fisher information of a policy with outputs (P,).
+
+    It is the second derivative of the divergence of another policy, where both are the same.
+    """
+    return jnp.diagonal(jax.hessian(lambda others: policy.divergence(outputs, others, mask))(outputs))
+
+
+def _retrain(agent: Any, state: AgentState, draw: Draw, tasks: Task, key: Key) -> AgentState:
+    """Take the updates that follow a consolidation."""
+    way = agent.continual
+
+    def update(state: AgentState, given: tuple[Key, Array]) -> tuple[AgentState, None]:
+        draw_key, update_key = jax.random.split(given[0])
+        window = draw(draw_key, agent.experience.batch_size)
+        return agent.update(state, window, tasks, update_key, given[1])[0], None
+
+    if way.retrains:
+        keys = jax.random.split(key, way.retrains)
+        state, _ = jax.lax.scan(update, state, (keys, jnp.arange(way.retrains)))
+    return state._replace(nets=way.retrained(state.nets))

@@ -1,0 +1,249 @@
+"""Ways to remember tasks that were learned one after another, for the actor of an agent with a replay.
+
+What a way keeps is the network "continual", which no fit names, so that no gradient step changes it. Once a task ends,
+``consolidate`` renews it. Only what tasks share of the actor is held: output layers of a task's own no other task
+changes, and critics forget, as their regularisation harms learning (Wolczyk et al. 2021).
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+
+from mtjax.agents import parts
+from mtjax.agents.parts import continual
+from mtjax.agents.parts.continual import Anchor, Outputs
+from mtjax.agents.state import Nets
+from mtjax.networks import Params
+from mtjax.types import Array
+
+NET = "continual"
+"""The network that holds what is kept."""
+_GROUP = 32  # inputs whose slopes are in memory at a time
+
+Information = Callable[[Array], Array]
+
+
+@dataclasses.dataclass(frozen=True)
+class Nothing:
+    """Keeps nothing of earlier tasks: fine-tuning. Every way is a class with these methods.
+
+    Nets are those of one task in ``seen`` and ``penalty``, and of all played ones, which is one, in the others.
+    """
+
+    keeps: ClassVar[bool] = False
+    freezes: ClassVar[bool] = False
+    """Whether the actor of earlier tasks stays as it is to the bit."""
+    samples: ClassVar[int] = 0
+    """Number of stored steps that a consolidation sees."""
+    retrains: ClassVar[int] = 0
+    """Number of updates that follow a consolidation, on the same replay."""
+    reset_optimizer: bool = False
+    """Begin optimisers anew where a task ends, as Continual World does."""
+
+    def init(self, actor: Params, num_tasks: int) -> Nets:
+        """Return what is kept before the first task, as a network by name."""
+        return {}
+
+    def seen(self, nets: Nets) -> Nets:
+        """Return networks with the actor as the task sees it."""
+        return nets
+
+    def penalty(self, nets: Nets) -> Array | float:
+        """Return what is added to the actor's loss."""
+        return 0.0
+
+    def kept(self, before: Nets, after: Nets) -> Nets:
+        """Return the networks after a gradient step, without changes of what must not change."""
+        return after
+
+    def consolidate(self, nets: Nets, outputs: Outputs, information: Information, inputs: Any) -> Nets:
+        """Return the networks with which a task ends.
+
+        Args:
+            outputs: the actor's outputs (P,) for its shared parameters and one of ``inputs``, leaves (samples, ...).
+            information: the Fisher information (P,) of the policy with such outputs.
+        """
+        return nets
+
+    def retrained(self, nets: Nets) -> Nets:
+        """Return the networks once the updates after a consolidation are over."""
+        return nets
+
+
+@dataclasses.dataclass(frozen=True)
+class _Held(Nothing):
+    """Adds coefficient / 2 sum_i F_i (theta_i - theta*_i)^2 to the actor's loss; theta* are those of the task before.
+
+    The importances F of all tasks so far add up. A subclass says what they are.
+    """
+
+    keeps: ClassVar[bool] = True
+
+    @property
+    def strength(self) -> float:
+        raise NotImplementedError
+
+    def importance(self, outputs: Outputs, information: Information, params: Any, inputs: Any) -> Any:
+        raise NotImplementedError
+
+    def init(self, actor: Params, num_tasks: int) -> Nets:
+        zeros = jax.tree.map(jnp.zeros_like, actor.shared)
+        return {NET: Params({"anchor": Anchor(jax.tree.map(jnp.copy, actor.shared), zeros)}, {})}
+
+    def penalty(self, nets: Nets) -> Array:
+        return continual.penalty(nets[NET].shared["anchor"], nets["actor"].shared, self.strength)
+
+    def consolidate(self, nets: Nets, outputs: Outputs, information: Information, inputs: Any) -> Nets:
+        params = nets["actor"].shared
+        importance = self.importance(outputs, information, params, inputs)
+        held = continual.anchor(params, importance, nets[NET].shared["anchor"])
+        return nets | {NET: Params({"anchor": held}, {})}
+
+
+@dataclasses.dataclass(frozen=True)
+class L2(_Held):
+    """Holds all parameters of the actor equally: F = 1."""
+
+    l2_coefficient: float = 1e5
+    """Weight of the penalty; 1e5 in Continual World."""
+
+    def __post_init__(self):
+        parts.require_not_negative(self, "l2_coefficient")
+
+    @property
+    def strength(self) -> float:
+        return self.l2_coefficient
+
+    def importance(self, outputs: Outputs, information: Information, params: Any, inputs: Any) -> Any:
+        return continual.l2(params)
+
+
+@dataclasses.dataclass(frozen=True)
+class EWC(_Held):
+    """Holds parameters by the Fisher information of the policy (Kirkpatrick et al. 2017); see ``continual.ewc``."""
+
+    ewc_coefficient: float = 1e4
+    """Weight of the penalty; 1e4 in Continual World."""
+    fisher_samples: int = 2560
+    """Stored steps over which the Fisher information is averaged, rounded down to a multiple of 32."""
+
+    def __post_init__(self):
+        parts.require_not_negative(self, "ewc_coefficient")
+        _require_group(self, "fisher_samples")
+
+    @property
+    def strength(self) -> float:
+        return self.ewc_coefficient
+
+    @property
+    def samples(self) -> int:  # type: ignore[override]
+        return self.fisher_samples // _GROUP * _GROUP
+
+    def importance(self, outputs: Outputs, information: Information, params: Any, inputs: Any) -> Any:
+        return _in_groups(lambda group: continual.ewc(outputs, information, params, group), inputs)
+
+
+@dataclasses.dataclass(frozen=True)
+class MAS(_Held):
+    """Holds parameters by how much they change the actor's outputs (Aljundi et al. 2018); see ``continual.mas``."""
+
+    mas_coefficient: float = 1e4
+    """Weight of the penalty; 1e4 in Continual World."""
+    mas_samples: int = 2560
+    """Stored steps over which the importance is averaged, rounded down to a multiple of 32."""
+
+    def __post_init__(self):
+        parts.require_not_negative(self, "mas_coefficient")
+        _require_group(self, "mas_samples")
+
+    @property
+    def strength(self) -> float:
+        return self.mas_coefficient
+
+    @property
+    def samples(self) -> int:  # type: ignore[override]
+        return self.mas_samples // _GROUP * _GROUP
+
+    def importance(self, outputs: Outputs, information: Information, params: Any, inputs: Any) -> Any:
+        return _in_groups(lambda group: continual.mas(outputs, params, group), inputs)
+
+
+@dataclasses.dataclass(frozen=True)
+class PackNet(Nothing):
+    """Gives every task weights of its own, which later tasks see but do not change (Mallya and Lazebnik 2018).
+
+    A task learns with all free weights. Where it ends it keeps the largest 1 / k of each matrix, k tasks being left
+    with this one, and learns on with these alone for ``retrain_updates``. Biases are the first task's. A task that
+    comes again changes nothing that tasks share.
+    """
+
+    keeps: ClassVar[bool] = True
+    freezes: ClassVar[bool] = True
+    retrain_updates: int = 10_000
+    """Updates after weights are set apart, on the task's replay; 100,000 in Continual World."""
+
+    def __post_init__(self):
+        parts.require_not_negative(self, "retrain_updates")
+
+    @property
+    def retrains(self) -> int:  # type: ignore[override]
+        return self.retrain_updates
+
+    def init(self, actor: Params, num_tasks: int) -> Nets:
+        shared = {"owners": continual.unowned(actor.shared), "count": jnp.int32(0), "retraining": jnp.bool_(False)}
+        return {NET: Params(shared, {"number": jnp.zeros(num_tasks, jnp.int32)})}
+
+    def seen(self, nets: Nets) -> Nets:
+        held, actor = nets[NET], nets["actor"]
+        number, packed = held.own["number"], continual.seen_by(actor.shared, held.shared["owners"], held.own["number"])
+        shared = jax.tree.map(lambda packed, x: jnp.where(number > 0, packed, x), packed, actor.shared)
+        return nets | {"actor": actor._replace(shared=shared)}
+
+    def kept(self, before: Nets, after: Nets) -> Nets:
+        held, old, new = before[NET], before["actor"].shared, after["actor"]
+        number = held.own["number"][0]
+        learner = jnp.where(number == 0, continual.FREE, jnp.where(held.shared["retraining"], number, _NOBODY))
+        choose = lambda x, y, owner: jnp.where(owner == learner, y, x)
+        shared = jax.tree.map(choose, old, new.shared, held.shared["owners"])
+        return after | {"actor": new._replace(shared=shared)}
+
+    def consolidate(self, nets: Nets, outputs: Outputs, information: Information, inputs: Any) -> Nets:
+        held, actor = nets[NET], nets["actor"]
+        number, count, owners = held.own["number"], held.shared["count"], held.shared["owners"]
+        first = number[0] == 0
+        left = len(nets["tasks"].shared["known"]) - count
+        pruned = continual.prune(actor.shared, owners, count + 1, 1 / jnp.maximum(left, 1))
+        choose = lambda new, old: jnp.where(first, new, old)
+        shared, owners = jax.tree.map(choose, pruned, (actor.shared, owners))
+        kept = {"owners": owners, "count": count + first, "retraining": first}
+        number = jnp.where(first, count + 1, number)
+        return nets | {"actor": actor._replace(shared=shared), NET: Params(kept, {"number": number})}
+
+    def retrained(self, nets: Nets) -> Nets:
+        held = nets[NET]
+        return nets | {NET: held._replace(shared=held.shared | {"retraining": jnp.bool_(False)})}
+
+
+_NOBODY = -1
+
+
+def _require_group(holder: Any, name: str) -> None:
+    if getattr(holder, name) < _GROUP:
+        flag = name.replace("_", "-")
+        raise parts.InputError(f"{flag} must be at least {_GROUP}, not {getattr(holder, name)}")
+
+
+def _in_groups(mean: Callable[[Any], Any], inputs: Any) -> Any:
+    """Return the mean of a tree over inputs (N, ...), of which ``mean`` takes a group at a time."""
+    groups = jax.tree.map(lambda x: x.reshape(-1, _GROUP, *x.shape[1:]), inputs)
+    count = len(jax.tree.leaves(groups)[0])
+    zeros = jax.tree.map(jnp.zeros_like, jax.eval_shape(mean, jax.tree.map(lambda x: x[0], groups)))
+    add = lambda total, group: (jax.tree.map(lambda x, y: x + y / count, total, mean(group)), None)
+    return jax.lax.scan(add, zeros, groups)[0]
+
+
+Remembering = Nothing
+CONTINUAL: dict[str, type[Remembering]] = {"none": Nothing, "l2": L2, "ewc": EWC, "mas": MAS, "packnet": PackNet}
