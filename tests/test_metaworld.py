@@ -200,7 +200,14 @@ def test_benchmarks_have_the_tasks_of_the_original():
     counts = {
         name: (len(own), sum("held_out" in each for each in own.values())) for name, (_, own) in BENCHMARKS.items()
     }
-    assert counts == {"mt10": (10, 0), "mt25": (25, 0), "mt50": (50, 0), "ml10": (15, 5), "ml45": (50, 5)}
+    assert counts == {
+        "mt10": (10, 0),
+        "mt25": (25, 0),
+        "mt50": (50, 0),
+        "cw10": (10, 0),
+        "ml10": (15, 5),
+        "ml45": (50, 5),
+    }
     assert all(name.removeprefix("metaworld-") in TASKS for _, own in BENCHMARKS.values() for name in own)
     source = importlib.util.find_spec("metaworld")
     if source is None:

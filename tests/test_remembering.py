@@ -179,3 +179,19 @@ def test_tasks_have_to_follow_one_another(curriculum):
     agent, chosen = configure(tiny("sac", continual="l2"), Settings(curriculum=curriculum), GIVEN)
     with pytest.raises(InputError, match="use --curriculum=sequence:STEPS"):
         loop.require_curriculum(chosen, Walk(), agent)
+
+
+@pytest.mark.slow
+def test_fine_tuning_forgets_where_packnet_does_not():
+    """Of four goals, the first: what its mean return of three seeds, at most 100, loses by the end of the third."""
+    given = {"num_tasks": 4, "num_envs": 8, "chunk_steps": 1000, "curriculum": "sequence:2000", "hidden": (64, 64)}
+    given |= {"conditioning": "one-hot", "normalize_observations": False, "split": "none", "quiet": True, "seeds": 3}
+    given |= {"steps": 48_000, "eval_every": 8000, "eval_episodes": 2, "batch_size": 64, "replay_size": 40_000}
+
+    def lost(name, **settings):
+        result = mtjax.train("point-mass-vary-goal", "sac", continual=name, warmup_steps=200, **given, **settings)
+        returns = result.evaluations.returns["train"].mean(axis=(0, 3))
+        return returns[1, 0] - returns[2:5, 0].min()
+
+    assert lost("none") > 12
+    assert lost("packnet", retrain_updates=2000) < 3

@@ -83,6 +83,9 @@ _ML45 = """
     window-open window-close
 """.split()
 _ML45_TEST = "bin-picking box-close hand-insert door-lock door-unlock".split()
+_CW10 = """
+    hammer push-wall faucet-close push-back stick-pull handle-press-side push shelf-place window-close peg-unplug-side
+""".split()
 
 
 class Benchmark(NamedTuple):
@@ -104,6 +107,7 @@ _LISTED = {
     "mt10": Benchmark("Ten tasks of Meta-World at once", _MT10),
     "mt25": Benchmark("Twenty-five tasks of Meta-World at once", _MT25),
     "mt50": Benchmark("All fifty tasks of Meta-World at once", [*TASKS]),
+    "cw10": Benchmark("The ten tasks of Continual World in its order, with V2 rewards, all at once", _CW10),
     "ml10": Benchmark(
         "Ten tasks of Meta-World with hidden goals; five more are held out (split extrapolation)",
         _ML10,

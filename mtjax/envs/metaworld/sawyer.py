@@ -63,7 +63,7 @@ class Sawyer(Domain):
     num_draws: int = 50
     """Number of goals. Each episode draws one of them."""
     benchmark: str = ""
-    """The benchmark whose goals these are: mt10, mt25, mt50, ml10 or ml45. Each has other goals of the same seed.
+    """The benchmark whose goals these are: mt10, mt25, mt50, cw10, ml10 or ml45. Each has other goals of the same seed.
     Without a name they are those of Meta-World's MT1, and of ML1's training; of ML1's test with ``task_seed`` + 1."""
     goal_hidden: bool = False
     """Observe zeros in place of the goal, as in the benchmarks of meta-learning."""
