@@ -6,8 +6,9 @@
 Every method is a process of its own with all seeds in one program; ``alone`` trains a network for each task from
 scratch, for as many steps of it. Seeds are those of the environment too, so that methods are paired. A method is
 NAME, or NAME:SETTING=VALUE:..., such as ewc:ewc_coefficient=100. Each part writes ``OUT/METHOD.json`` with the scores
-(S, V, N) of every evaluation of all tasks. ``parts.py`` says how an interrupted table goes on. Further words replace
-settings of the agent or the loop. Scores are returns divided by ``--best``, or success if that is 0.
+(S, V, N) of every evaluation of all tasks; in its name colons and equals signs are dashes. ``parts.py`` says how an
+interrupted table goes on. Further words replace settings of the agent or the loop. Scores are returns divided by
+``--best``, or success if that is 0.
 
 The table has performance, forgetting and forward transfer (``mtjax.report.sequences``) with intervals over seeds, and
 the paired difference of performance from ``none``.
@@ -56,7 +57,12 @@ def part(arguments: argparse.Namespace, method: str) -> parts.Part:
     """Return the part of a method."""
     kept = ("env", "agent", "tasks", "each", "evaluations", "episodes", "envs", "seeds", "best", "out")
     options = [f"--{name}={getattr(arguments, name)}" for name in kept]
-    return parts.Part(method, [*options, f"--methods={method}", "--", *arguments.given])
+    return parts.Part(name_of(method), [*options, f"--methods={method}", "--", *arguments.given])
+
+
+def name_of(method: str) -> str:
+    """Return the name of a method's part, which is that of a file."""
+    return method.replace(":", "-").replace("=", "-")
 
 
 def measure(arguments: argparse.Namespace, method: str) -> None:
@@ -81,7 +87,7 @@ def measure(arguments: argparse.Namespace, method: str) -> None:
         "seconds": round(result.total_seconds, 1),
         "learner": str(result.agent),
     }
-    parts.write_result(arguments.out / f"{method}.json", record(arguments, figures))
+    parts.write_result(arguments.out / f"{name_of(method)}.json", record(arguments, figures))
 
 
 def table(out: Path) -> str:
