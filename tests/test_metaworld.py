@@ -214,7 +214,8 @@ def test_benchmarks_have_the_tasks_of_the_original():
         return
     text = (Path(source.submodule_search_locations[0]) / "env_dict.py").read_text()
     of = lambda part: [word.strip(' ",').removesuffix("-v3") for word in part.splitlines() if "-v3" in word]
-    for name, (_, own) in BENCHMARKS.items():  # in the same order, as one stream draws all goals
+    originals = {name: own for name, (_, own) in BENCHMARKS.items() if name != "cw10"}  # which is Continual World's
+    for name, own in originals.items():  # in the same order, as one stream draws all goals
         table = "ALL_V3_ENVIRONMENTS" if name == "mt50" else f"{name.upper()}_V3"
         expected = of(text.split(f"\n{table} = ")[1].split("\n)\n")[0])
         assert [family.removeprefix("metaworld-") for family in own] == expected

@@ -12,6 +12,7 @@ from mtjax.agents import consolidating
 from mtjax.agents.parts import continual, put, remembering
 from mtjax.agents.parts.policies import Gaussian
 from mtjax.agents.state import of_task
+from mtjax.command import run_config
 from mtjax.loop import Settings
 from mtjax.networks import Params
 from mtjax.types import InputError
@@ -179,6 +180,15 @@ def test_tasks_have_to_follow_one_another(curriculum):
     agent, chosen = configure(tiny("sac", continual="l2"), Settings(curriculum=curriculum), GIVEN)
     with pytest.raises(InputError, match="use --curriculum=sequence:STEPS"):
         loop.require_curriculum(chosen, Walk(), agent)
+
+
+def test_a_command_switches_off_what_a_preset_has_and_packnet_refuses():
+    """Before the settings of the preset are put together with PackNet."""
+    words = ["--env=point-mass-vary-goal", "--agent=sac", "--agent.continual=packnet", "--curriculum=sequence:1000"]
+    agent = run_config.parse([*words, "--agent.normalize-observations=false"]).learner
+    assert isinstance(agent.continual, remembering.PackNet) and not agent.normalize_observations
+    with pytest.raises(InputError, match="use normalize_observations=false"):
+        run_config.parse(words)
 
 
 @pytest.mark.slow

@@ -135,8 +135,8 @@ def _check_continual(agent: Any) -> None:
         return
     knows, sees = agent.conditioning, agent.representation
     changing = {
-        "normalize-observations": (agent.normalize_observations, "no-normalize-observations"),
-        "unit-head": (agent.unit_head, "no-unit-head"),
+        "normalize-observations": (agent.normalize_observations, "normalize-observations=false"),
+        "unit-head": (agent.unit_head, "unit-head=false"),
         f"representation={_name(agent, 'representation')}": (sees.learns, "representation=plain"),
         f"conditioning={_name(agent, 'conditioning')}": (
             knows.embeds or knows.recurs or knows.history,

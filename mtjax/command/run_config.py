@@ -53,7 +53,9 @@ def parse(argv: Sequence[str]) -> RunConfig:
             of_family[name] = int(value)
     if is_mixture(env_name):
         of_family, argv = _peel_shared(argv, make(env_name))
-    deciding = {name: value for name in _DECIDING if (value := flag_value(argv, f"agent.{name}", ""))}
+    deciding: dict[str, Any] = {name: value for name in _DECIDING if (value := flag_value(argv, f"agent.{name}", ""))}
+    if switched_off("--agent.normalize-observations") in argv:  # which presets switch on, and some parts refuse
+        deciding["normalize_observations"] = False
     default = with_preset(env_name, agent_name, preset_name, {**chosen, **deciding}, vary=vary, **of_family)
     if source is not None:
         default = _fine_tuning(default, source, start, chosen)
