@@ -1,5 +1,6 @@
 """Networks against plain NumPy, one task and one expert at a time; the policy's density against its distribution."""
 
+import re
 from statistics import NormalDist
 
 import flax.linen as nn
@@ -7,10 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from probes import tasks_of, tiny
 
 from mtjax.agents.parts.encoders.care import Experts, Mixture
 from mtjax.agents.parts.policies import Gaussian
-from mtjax.networks import MLP, Network, Params, Trunk, join
+from mtjax.networks import MLP, Network, Params, Trunk, join, orthogonal
+from mtjax.types import Spec
 
 TASKS, BATCH, OBS, ACTION, CONTEXT, OUT = 3, 4, 2, 1, 2, 5
 
@@ -203,3 +206,39 @@ def test_a_body_may_be_any_module(data):
     network = Network(Sum())
     params = network.init(jax.random.key(0), TASKS, OUT, data[2], data[0])
     close(network.apply(params, data[2], data[0]), (data[0] + data[2].sum()) @ params.shared["head"]["kernel"])
+
+
+# Orthogonal kernels. Two batches of QR decompositions at once can wait for each other for ever, on few cores.
+
+
+def matrices(function, *args):
+    """The shapes of all matrices that are decomposed, such as "3,3"."""
+    return re.findall(r":f32\[([0-9,]+)\] = qr\[", str(jax.make_jaxpr(function)(*args)))
+
+
+def test_kernels_are_drawn_one_after_another():
+    draw_one = lambda key: orthogonal(2**0.5)(key, (3, 3, 2, 4))
+    draw = jax.vmap(jax.vmap(draw_one))
+    keys = jax.random.split(jax.random.key(0), (2, 3))
+    drawn = draw(keys)
+    for place in np.ndindex(2, 3):
+        kernel = np.asarray(drawn[place]).reshape(-1, 4)
+        assert kernel.T @ kernel == pytest.approx(2 * np.eye(4), abs=1e-5)
+        assert np.array_equal(drawn[place], draw_one(keys[place]))
+    found = matrices(draw, keys)
+    assert found and all(shape.count(",") == 1 for shape in found)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"conditioning": "recurrent"}, {"conditioning": "posterior"}, {"representation": "encoded"}],
+    ids=lambda settings: next(iter(settings.values())),
+)
+def test_seeds_begin_one_after_another(settings):
+    """Of agents with a GRU or convolutions."""
+    spec = Spec.vector(3, 2, 1)
+    if "representation" in settings:
+        spec = spec._replace(obs={"pixels": jax.ShapeDtypeStruct((16, 16, 3), jnp.uint8)})
+    agent, tasks = tiny("ppo", **settings), tasks_of("one-step", (1.0, -0.5))
+    found = matrices(jax.vmap(lambda key: agent.init(spec, tasks, key)), jax.random.split(jax.random.key(0), 3))
+    assert found and all(shape.count(",") == 1 for shape in found)

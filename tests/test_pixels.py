@@ -1,7 +1,6 @@
 """Pictures as observations: stacks, repeated actions, looks as parameters, and what is refused."""
 
 import dataclasses
-import re
 from functools import lru_cache
 
 import jax
@@ -13,7 +12,6 @@ from needs import needs
 from probes import METAWORLD, slow_but
 
 import mtjax
-from mtjax.agents.parts import vision
 from mtjax.envs import ENVS
 from mtjax.envs.domain import Domain
 from mtjax.envs.pixels import Pictured
@@ -232,16 +230,3 @@ def test_gymnasium_shows_stacks():
 
 def test_equal_families_are_one_program():
     assert dataclasses.replace(pictured()) == pictured() and hash(dataclasses.replace(pictured())) == hash(pictured())
-
-
-def test_kernels_are_drawn_one_after_another():
-    """Two batches of QR decompositions at once can wait for each other for ever, on few cores."""
-    draw = jax.vmap(jax.vmap(lambda key: vision.orthogonal(key, (3, 3, 2, 4))))
-    keys = jax.random.split(jax.random.key(0), (2, 3))
-    drawn = draw(keys)
-    for place in np.ndindex(2, 3):
-        kernel = np.asarray(drawn[place]).reshape(-1, 4)
-        assert kernel.T @ kernel == pytest.approx(2 * np.eye(4), abs=1e-5)
-        assert np.array_equal(drawn[place], vision.orthogonal(keys[place], (3, 3, 2, 4)))
-    matrices = re.findall(r":f32\[([0-9,]+)\] = qr\[", str(jax.make_jaxpr(draw)(keys)))
-    assert matrices and all(shape.count(",") == 1 for shape in matrices)

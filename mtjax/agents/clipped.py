@@ -61,7 +61,7 @@ def advantages(
 ) -> tuple[Array, Array]:
     """Compute the advantages (T, H, E) of a rollout, or of several as ``apart`` splits them; and these normalised."""
     of_task = partial(targets.gae, lambda_=agent.gae_lambda)
-    of_rollout = lambda *data: jax.vmap(of_task)(*data, discounts_of_all(agent, tasks))
+    of_rollout = lambda *data: jax.vmap(of_task)(*data, discounts_of_all(agent, tasks))  # type: ignore
     normalize = partial(normalized, agent.advantage_normalization)
     if apart is None:
         advantage = of_rollout(steps, value, next_value)

@@ -12,31 +12,14 @@ import jax.numpy as jnp
 
 from mtjax import frames
 from mtjax.agents.parts.convolution import Transposed, convolve
+from mtjax.networks import orthogonal
 from mtjax.types import Array, Key
 
 Vision = Literal["drq", "impala"]
 _FILTERS = 32
 _SECTIONS = (16, 32, 32)  # IMPALA's channels
 _Conv = partial(nn.Conv, conv_general_dilated=convolve)
-_ORTHOGONAL = nn.initializers.orthogonal(2**0.5)
-
-
-def orthogonal(key: Key, shape: Any, dtype: Any = jnp.float32) -> Array:
-    """Draw an orthogonal kernel of this shape; under ``vmap`` one after another.
-
-    JAX's QR decomposition of a batch waits for threads of the pool that it runs in. Two such batches at once, as of two
-    layers, wait for ever on two CPU cores (seen with jax 0.10.2).
-    """
-
-    @jax.custom_batching.custom_vmap
-    def draw(key: Key) -> Array:
-        return _ORTHOGONAL(key, shape, dtype)
-
-    @draw.def_vmap
-    def _(count: int, mapped: Any, keys: Key) -> tuple[Array, bool]:
-        return jax.lax.map(draw, keys), True
-
-    return draw(key)
+_ORTHOGONAL = orthogonal(2**0.5)
 
 
 def as_numbers(pictures: Array) -> Array:
@@ -52,7 +35,7 @@ class Convolutions(nn.Module):
         """Map pictures (..., H, W, K) to features (..., F)."""
         x = as_numbers(pictures)
         for stride in (2, 1, 1, 1):
-            x = nn.relu(_Conv(_FILTERS, (3, 3), (stride, stride), "VALID", kernel_init=orthogonal)(x))
+            x = nn.relu(_Conv(_FILTERS, (3, 3), (stride, stride), "VALID", kernel_init=_ORTHOGONAL)(x))
         return x.reshape(*x.shape[:-3], -1)
 
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents.parts.knowing.recurrent import Track
-from mtjax.networks import MLP
+from mtjax.networks import MLP, orthogonal
 from mtjax.types import Array, Key, Metrics
 
 
@@ -153,7 +153,7 @@ class VariBAD(Gaussian):
         latent, memory = jnp.zeros(settings.latent_size), jnp.zeros(settings.recurrent_size)
         read = jnp.zeros(2 * len(obs) + len(action) + 2)
         return {
-            "unit": (nn.GRUCell(settings.recurrent_size), memory, read),
+            "unit": (nn.GRUCell(settings.recurrent_size, recurrent_kernel_init=orthogonal()), memory, read),
             "belief": (nn.Dense(2 * settings.latent_size, use_bias=False), memory),
             "reward": (self.dense(1), *step, obs, latent),
             "state": (self.dense(len(obs)), *step, latent),

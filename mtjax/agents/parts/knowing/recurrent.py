@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from mtjax.agents import parts
 from mtjax.agents.parts.knowing.base import Nothing
-from mtjax.networks import Network, Params
+from mtjax.networks import Network, Params, orthogonal
 from mtjax.types import Array, Key, Transition
 
 
@@ -118,7 +118,7 @@ class Recurrent(Remembering):
 
     @property
     def cell(self) -> nn.GRUCell:
-        return nn.GRUCell(self.recurrent_size)
+        return nn.GRUCell(self.recurrent_size, recurrent_kernel_init=orthogonal())
 
     def init(self, num_tasks: int, seen: Any, action: Array, own: bool, key: Key) -> Params:
         read = inputs(seen.obs, action, jnp.float32(0), jnp.bool_(False))
