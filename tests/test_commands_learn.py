@@ -35,6 +35,7 @@ _WALKER = "a walker takes several minutes on two CPU cores, docs/results/returns
 _ONE = "--env.vary.size=1.1 --split=none --steps=250000"  # finger of the ten
 _GYM = "needs Gymnasium; tests/test_hosted.py learns to balance there"
 _GRID = "earns nearly all that can be earned in ten minutes of two CPU cores; tests/test_recurrent.py has a bandit"
+_READS = "begins to earn more after two minutes of two CPU cores"
 _PULLS = "ten pulls earn between 5 and 6.02, too little to see in few trials; tests/test_own_inference.py trains it"
 _LOOP = "--env=point-mass-vary-goal --agent=multi-head"  # one pair of the loop around the command
 
@@ -54,6 +55,12 @@ MARKS: dict[str, Learns | str] = {
     "--env=walker-walk --env.vary.torso-mass=0.5:1.5:10 --env.vary.gravity=5:15": _WALKER,
     "--env=walker-walk-vary-friction --split=hip-bmdp --seeds=5": _WALKER,
     "--env=sailing --agent=ppo": Learns(2),
+    "--env=point-mass-vary-goal --env.num-tasks=4 --split=none --agent=sac --agent.conditioning=one-hot "
+    "--agent.normalize-observations=false --num-envs=8 --chunk-steps=500 --curriculum=sequence:2000 --steps=64000 "
+    "--agent.continual=packnet --agent.retrain-updates=2000": "tests/test_remembering.py measures what it keeps",
+    "--env=walker-walk --env.vary.friction=0.1:2:20 --split=none --agent=ppo --agent.conditioning=none "
+    "--curriculum=sequence:100000 --chunk-steps=10000": _WALKER,
+    "--env=errands --agent=ppo --agent.conditioning=text": _READS,
     "--env=grid-navi --agent=rl2 --trials=4 --agent.unroll=60": _GRID,
     "--env=finger-spin --env.vary.size=0.95:1.13:200 --curriculum=random:10:4000 --num-envs=8": _FINGER,
     "--env=gymnasium:Pendulum-v1 --env.vary.g=5:15:5 --agent=ppo": _GYM,
