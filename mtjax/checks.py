@@ -130,7 +130,7 @@ def _hint(kind: Any, value: Any) -> str:
     return ""
 
 
-def amount(value: float) -> str:
+def amount(value: Any) -> str:
     """Return a return as text: a whole number if it is large, else with three digits."""
     return f"{value:.0f}" if abs(value) >= 20 else f"{value:.3g}"
 
