@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import parts
+from learning import cell
 from report import markdown, record, run_main
 from returns import value
 
@@ -101,19 +102,13 @@ def table(out: Path) -> str:
         transfer, against = "-", "-"
         if alone is not None and len(alone) == len(scores):
             gained = sequences.forward_transfer(sequences.areas(scores, spans), alone.mean(axis=1))
-            transfer = told(stats.seed_interval(gained.mean(axis=1)))
+            transfer = cell(stats.seed_interval(gained.mean(axis=1)), ".2f")
         plain = found.get("none")
         if plain is not None and method != "none" and len(plain) == len(scores):
-            against = told(stats.paired_difference(performance, sequences.performance(plain)))
-        rows.append(
-            [method, told(stats.seed_interval(performance)), told(stats.seed_interval(lost)), transfer, against]
-        )
+            against = cell(stats.paired_difference(performance, sequences.performance(plain)), ".2f")
+        own = [cell(stats.seed_interval(x), ".2f") for x in (performance, lost)]
+        rows.append([method, *own, transfer, against])
     return markdown(["method", "performance", "forgetting", "forward transfer", "performance less none's"], rows)
-
-
-def told(interval: stats.Interval) -> str:
-    """Return a figure with its interval."""
-    return f"{interval.point:.2f} [{interval.low:.2f}, {interval.high:.2f}]"
 
 
 if __name__ == "__main__":

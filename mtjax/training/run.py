@@ -266,7 +266,7 @@ class _Run:
         now = _Progress(state, steps, seconds, wall, evaluations, np.zeros(len(self.seeds), bool))
         if steps < plan.steps or len(evaluations.steps):
             return now
-        spoiled = ~finite_seeds(getattr(state.agent, "learner", state.agent))
+        spoiled = ~finite_seeds(state.agent)
         again = self._evaluate(programs.evaluate, now._replace(diverged=spoiled))  # they were lost after the run's end
         return now._replace(evaluations=again)
 

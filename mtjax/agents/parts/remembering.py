@@ -5,6 +5,7 @@ What a way keeps is the network "continual", which no fit names, so that no grad
 changes, and critics forget, as their regularisation harms learning (Wolczyk et al. 2021).
 """
 
+import abc
 import dataclasses
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -22,6 +23,7 @@ from mtjax.types import Array
 NET = "continual"
 """The network that holds what is kept."""
 _GROUP = 32  # inputs whose slopes are in memory at a time
+_NOBODY = -1  # the owner of no weight
 
 Information = Callable[[Array], Array]
 
@@ -74,7 +76,7 @@ class Nothing:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Held(Nothing):
+class _Held(Nothing, abc.ABC):
     """Adds coefficient / 2 sum_i F_i (theta_i - theta*_i)^2 to the actor's loss; theta* are those of the task before.
 
     The importances F of all tasks so far add up. A subclass says what they are.
@@ -83,11 +85,13 @@ class _Held(Nothing):
     keeps: ClassVar[bool] = True
 
     @property
+    @abc.abstractmethod
     def strength(self) -> float:
-        raise NotImplementedError
+        """The coefficient."""
 
+    @abc.abstractmethod
     def importance(self, outputs: Outputs, information: Information, params: Any, inputs: Any) -> Any:
-        raise NotImplementedError
+        """Return F of the task that ends, as ``params``; see ``consolidate``."""
 
     def init(self, actor: Params, num_tasks: int) -> Nets:
         zeros = jax.tree.map(jnp.zeros_like, actor.shared)
@@ -198,7 +202,8 @@ class PackNet(Nothing):
 
     def seen(self, nets: Nets) -> Nets:
         held, actor = nets[NET], nets["actor"]
-        number, packed = held.own["number"], continual.seen_by(actor.shared, held.shared["owners"], held.own["number"])
+        number = held.own["number"]
+        packed = continual.seen_by(actor.shared, held.shared["owners"], number)
         shared = jax.tree.map(lambda packed, x: jnp.where(number > 0, packed, x), packed, actor.shared)
         return nets | {"actor": actor._replace(shared=shared)}
 
@@ -227,9 +232,6 @@ class PackNet(Nothing):
         return nets | {NET: held._replace(shared=held.shared | {"retraining": jnp.bool_(False)})}
 
 
-_NOBODY = -1
-
-
 def _require_group(holder: Any, name: str) -> None:
     if getattr(holder, name) < _GROUP:
         flag = name.replace("_", "-")
@@ -237,7 +239,7 @@ def _require_group(holder: Any, name: str) -> None:
 
 
 def _in_groups(mean: Callable[[Any], Any], inputs: Any) -> Any:
-    """Return the mean of a tree over inputs (N, ...), of which ``mean`` takes a group at a time."""
+    """Return the mean of a tree over inputs (N, ...). ``mean`` takes one group of them at a time, to save memory."""
     groups = jax.tree.map(lambda x: x.reshape(-1, _GROUP, *x.shape[1:]), inputs)
     count = len(jax.tree.leaves(groups)[0])
     zeros = jax.tree.map(jnp.zeros_like, jax.eval_shape(mean, jax.tree.map(lambda x: x[0], groups)))

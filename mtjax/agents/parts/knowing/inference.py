@@ -8,8 +8,8 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from mtjax.agents.parts.knowing.recurrent import Track
-from mtjax.networks import MLP, orthogonal
+from mtjax.agents.parts.knowing.recurrent import Track, gru
+from mtjax.networks import MLP
 from mtjax.types import Array, Key, Metrics
 
 
@@ -153,7 +153,7 @@ class VariBAD(Gaussian):
         latent, memory = jnp.zeros(settings.latent_size), jnp.zeros(settings.recurrent_size)
         read = jnp.zeros(2 * len(obs) + len(action) + 2)
         return {
-            "unit": (nn.GRUCell(settings.recurrent_size, recurrent_kernel_init=orthogonal()), memory, read),
+            "unit": (gru(settings.recurrent_size), memory, read),
             "belief": (nn.Dense(2 * settings.latent_size, use_bias=False), memory),
             "reward": (self.dense(1), *step, obs, latent),
             "state": (self.dense(len(obs)), *step, latent),
@@ -166,7 +166,7 @@ class VariBAD(Gaussian):
         return whole_step(step)
 
     def advance(self, params: dict[str, Any], memory: Array, read: Array) -> Array:
-        return nn.GRUCell(self.settings.recurrent_size).apply(params["unit"], memory, read)[0]  # type: ignore
+        return gru(self.settings.recurrent_size).apply(params["unit"], memory, read)[0]  # type: ignore
 
     def belief(self, params: dict[str, Any], memory: Array) -> Belief:
         """Return the belief for memories (..., M): a memory of nothing is 0, and its belief is the prior N(0, 1)."""

@@ -96,6 +96,11 @@ class Remembering(Nothing):
         return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1).reshape(-1, *x.shape[2:]), memories)
 
 
+def gru(size: int) -> nn.GRUCell:
+    """Return a gated recurrent unit with a memory (size,), whose kernels are drawn one after another."""
+    return nn.GRUCell(size, recurrent_kernel_init=orthogonal())
+
+
 @dataclasses.dataclass(frozen=True)
 class Recurrent(Remembering):
     """Shows networks the hidden state of a recurrent network (Duan et al. 2016, "RL^2"; Wang et al. 2016).
@@ -118,7 +123,7 @@ class Recurrent(Remembering):
 
     @property
     def cell(self) -> nn.GRUCell:
-        return nn.GRUCell(self.recurrent_size, recurrent_kernel_init=orthogonal())
+        return gru(self.recurrent_size)
 
     def init(self, num_tasks: int, seen: Any, action: Array, own: bool, key: Key) -> Params:
         read = inputs(seen.obs, action, jnp.float32(0), jnp.bool_(False))
