@@ -29,7 +29,7 @@ from pathlib import Path
 
 import learning
 import numpy as np
-from parts import add_flags, is_part, require_all
+from parts import add_flags, is_part, require_all, whole
 from report import markdown, run_main
 
 import mtjax
@@ -56,7 +56,7 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=2, help="episodes of a trial")
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--steps", type=int, help="by default those of learning.py, else the preset's")
+    parser.add_argument("--steps", type=whole, help="by default those of learning.py, else the preset's")
     parser.add_argument("--preset", default="auto")
     parser.add_argument("--split", help="by default that of learning.py, else the family's")
     parser.add_argument("--evaluations", type=int, default=4)

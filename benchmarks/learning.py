@@ -46,7 +46,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from parts import Part, add_flags, is_part, require_all, run_parts, write_result
+from parts import Part, add_flags, is_part, require_all, run_parts, whole, write_result
 from report import markdown, note_origin, read_lines, record, run_main, write_lines
 from resumable import train
 from returns import value
@@ -126,7 +126,7 @@ def main() -> None:
     parser.add_argument("--best", action="store_true", help="every agent with its own preset")
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--steps", type=int, help="by default those of FAMILIES, else the preset's")
+    parser.add_argument("--steps", type=whole, help="by default those of FAMILIES, else the preset's")
     parser.add_argument("--preset", default="auto")
     parser.add_argument("--split", help="by default that of FAMILIES, else the family's")
     parser.add_argument("--evaluations", type=int, default=4)

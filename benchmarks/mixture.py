@@ -25,6 +25,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from parts import whole
 from report import markdown, record
 
 import mtjax
@@ -53,7 +54,7 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", default=TASKS, metavar="NAME")
     parser.add_argument("--agents", nargs="*", default=AGENTS, choices=list(mtjax.AGENTS), metavar="NAME")
     parser.add_argument("--alone", nargs="*", metavar="NAME", help="tasks to learn alone; by default all")
-    parser.add_argument("--steps", type=int, default=1_000_000, help="environment steps of each task")
+    parser.add_argument("--steps", type=whole, default=1_000_000, help="environment steps of each task")
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--num-envs", type=int, default=512, help="environments of each task")
     parser.add_argument("--updates-per-step", type=int, default=16)

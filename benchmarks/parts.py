@@ -45,6 +45,11 @@ def add_flags(parser: argparse.ArgumentParser, seconds: float | None = None) -> 
     )
 
 
+def whole(text: str) -> int:
+    """Return a number of steps, which may be written as 2e7."""
+    return int(float(text))
+
+
 def run_parts(script: str, parts: Sequence[Part], out: Path, arguments: argparse.Namespace) -> list[str]:
     """Run the parts that have no result yet, in their order, and return the names of those that wrote none.
 

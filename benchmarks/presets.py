@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from parts import whole
 from report import markdown, note_origin, read_lines, run_main, write_lines
 from resumable import train
 from returns import FAMILIES, value
@@ -44,7 +45,7 @@ def main() -> None:
     parser.add_argument("--given", nargs="*", default=[], metavar="NAME=VALUE")
     parser.add_argument("--engine", default="auto")
     parser.add_argument("--split", help="by default the family's")
-    parser.add_argument("--steps", type=lambda x: int(float(x)), help="of each seed; by default the preset's")
+    parser.add_argument("--steps", type=whole, help="of each seed; by default the preset's")
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--name", default="grid", help="ends the file's name, so that an agent may have several")
     parser.add_argument("--out", type=Path, default=Path("runs") / "presets")

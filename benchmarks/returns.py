@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+from parts import whole
 from report import markdown, record, run_main, write_lines
 from resumable import train
 
@@ -70,7 +71,7 @@ def main() -> None:
     parser.add_argument("--agent", help="by default the family's, of the table above")
     parser.add_argument("--preset", default="gpu")
     parser.add_argument("--engine", default="auto", help="of the physics; auto is the family's own choice for a GPU")
-    parser.add_argument("--steps", type=lambda x: int(float(x)), help="of each seed; by default the family's")
+    parser.add_argument("--steps", type=whole, help="of each seed; by default the family's")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--evaluations", type=int, default=4)

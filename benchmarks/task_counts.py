@@ -57,7 +57,7 @@ def main() -> None:
     parser.add_argument("--agent", default="ppo")
     parser.add_argument("--preset", default="auto")
     parser.add_argument("--train-seconds", type=float, default=60.0, help="of training; 0 takes --steps instead")
-    parser.add_argument("--steps", type=lambda x: int(float(x)), default=1_000_000)
+    parser.add_argument("--steps", type=parts.whole, default=1_000_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--evaluations", type=int, default=6)
     parser.add_argument("--name", default="")
@@ -115,9 +115,13 @@ def measure(arguments: argparse.Namespace, name: str, tasks: int) -> None:
     with alone(arguments.out):
         steps = arguments.steps
         if arguments.train_seconds:
-            enough = lambda row: float(row["seconds"]) > _CALIBRATION
-            tried = run(steps=10**14, eval_every=10**15, on_chunk=enough)
-            learned = [float(row["seconds"]) for row in tried.rows]
+            learned: list[float] = []
+
+            def enough(row: dict) -> bool:
+                learned.append(float(row["seconds"]))
+                return len(learned) > 1 and learned[-1] > _CALIBRATION
+
+            run(steps=10**14, eval_every=10**15, on_chunk=enough)
             steps = round(arguments.train_seconds * chunk * (len(learned) - 1) / (learned[-1] - learned[0]))
         result = run(steps=steps, eval_every=-(-steps // arguments.evaluations))
     returns = result.evaluations.returns["train"].mean(axis=(0, 2, 3))

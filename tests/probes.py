@@ -389,7 +389,7 @@ def random_batch(seed: int, num_tasks: int, batch_size: int, spec: Spec = SPEC, 
 
 def with_memory(agent, batch: Transition) -> Transition:
     """A batch (T, B, ...) with random hidden states, if the agent has one."""
-    if not agent.unroll:
+    if not agent.conditioning.recurs:
         return batch
     begun = agent.conditioning.begin(batch.obs.shape[-1], batch.action.shape[-1])
     hidden = jax.random.uniform(jax.random.key(0), (*batch.reward.shape, *begun.shape))

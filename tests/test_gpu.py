@@ -415,7 +415,7 @@ def test_agents_act_as_on_the_cpu(name):
             worlds = tasks_of("one-step", np.linspace(-1.3, 1.3, shape[1]))
         obs = np.random.default_rng(1).normal(size=(*shape, SPEC.obs_size)).astype(np.float32)
         expected, found = both(act, first(shape[0], learners), worlds, obs, runs=runs)
-        error = np.abs(expected - found).max(axis=(0, 2, 3))
+        error = np.abs(expected - found).reshape(*shape, -1).max(axis=(0, 2, 3))
         assert error.max() < 1e-3, (what, error)
 
 
