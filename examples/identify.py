@@ -432,8 +432,8 @@ def interact(env: Any, task: Any, episodes: int, start: Any, prepare: Any, act: 
 
     def step(carry, moment):
         state, world, cell, noise, key = carry
-        key, noise_key = jax.random.split(key)
-        action = act(state, cell, noise, moment, noise_key)
+        key, act_key, noise_key = jax.random.split(key, 3)
+        action = act(state, cell, noise, moment, act_key)
         after = env.step(task, world, action)
         next_noise = jax.random.normal(noise_key, (NOISE,))
         seen = Seen(cell, noise, action, after.reward, after.state.cell, next_noise)
@@ -469,8 +469,8 @@ def regret_of(learner: Any, env: Any, lessons: Lessons, task: Any, key: Array) -
     return jnp.sum(interact(env, task, EPISODES, learner.begin(lessons), prepare, act, learn, key), axis=1)
 
 
-def measure(seeds: int) -> tuple[dict[str, dict[str, np.ndarray]], Lessons]:
-    """Return cumulative regrets (seeds, episodes), means over classes, by panel and learner; and the lessons."""
+def measure(seeds: int) -> dict[str, dict[str, np.ndarray]]:
+    """Return cumulative regrets (seeds, episodes), means over classes, by panel and learner. Tell the progress."""
     began = time.perf_counter()
     say = lambda text: print(f"{time.perf_counter() - began:5.1f} s  {text}", flush=True)
     families = [
@@ -497,7 +497,7 @@ def measure(seeds: int) -> tuple[dict[str, dict[str, np.ndarray]], Lessons]:
             regrets = np.cumsum(np.mean(run(lessons, classes, keys), axis=1), axis=1)
             found.setdefault(panel, {})[name] = regrets
             say(f"{panel} {name}: regret {stats.seed_interval(regrets[:, -1]).point:.1f} after {EPISODES} episodes")
-    return found, lessons
+    return found
 
 
 def draw(found: dict[str, dict[str, np.ndarray]], out: str) -> None:
@@ -522,7 +522,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--out", default="identify.png")
     arguments = parser.parse_args()
-    found, _ = measure(arguments.seeds)
+    found = measure(arguments.seeds)
     for learners in found.values():
         *_, without = learners.values()
         for name, regrets in learners.items():
