@@ -329,9 +329,9 @@ class Table:
 
     taught: bool
     """Begin at the mean of earlier tables, and back up by their deviations; else at 0, and all alike."""
-    backups: int = 3
-    exploration: float = 0.5
+    exploration: float
     """Probability of a random action in the first episode; in the k-th it is this / k."""
+    backups: int = 3
 
     def begin(self, lessons):
         start, share = start_of(lessons.tables)
@@ -375,9 +375,9 @@ class Linear:
 
     taught: bool
     """Use the features that the group lasso has kept; else all."""
-    ridge: float = 0.1
-    exploration: float = 0.5
+    exploration: float
     """Probability of a random action in the first episode; in the k-th it is this / k."""
+    ridge: float = 0.1
 
     def begin(self, lessons):
         one = Seen(jnp.int32(0), jnp.zeros(NOISE), jnp.int32(0), jnp.float32(0), jnp.int32(0), jnp.zeros(NOISE))
@@ -413,14 +413,15 @@ def explore(values: Array, epsilon: Array, key: Array) -> Array:
     return jnp.where(jax.random.bernoulli(which, epsilon), jax.random.uniform(draw, values.shape), values)
 
 
+# Exploration is the best of 0.1, 0.2, 0.5 and 1 for each learner, on other seeds.
 LEARNERS = {
     "Which known model is it?": {
         "elimination": Elimination(),
         "Thompson over classes": Thompson(),
         "from scratch": Scratch(),
     },
-    "Where do values begin?": {"mean of earlier tables": Table(True), "zero": Table(False)},
-    "Which features count?": {"those the lasso kept": Linear(True), "all": Linear(False)},
+    "Where do values begin?": {"mean of earlier tables": Table(True, 0.2), "zero": Table(False, 0.5)},
+    "Which features count?": {"those the lasso kept": Linear(True, 0.5), "all": Linear(False, 1.0)},
 }
 
 
@@ -504,7 +505,7 @@ def draw(found: dict[str, dict[str, np.ndarray]], out: str) -> None:
     """Draw cumulative regrets over episodes, a panel for each question, with intervals over seeds."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(9, 3), dpi=90, layout="constrained")
+    figure = Figure(figsize=(9, 3.4), dpi=80, layout="constrained")
     for axes, (panel, learners) in zip(figure.subplots(1, len(found)), found.items(), strict=True):
         figures.style(axes)
         for index, (name, regrets) in enumerate(learners.items()):
@@ -513,7 +514,7 @@ def draw(found: dict[str, dict[str, np.ndarray]], out: str) -> None:
         axes.set_xlabel("episode of a new task")
         axes.set_ylabel("regret so far")
         axes.set_ylim(0)
-        axes.legend(frameon=False, fontsize=8)
+        axes.legend(frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.2))
     figure.savefig(out)
 
 

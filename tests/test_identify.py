@@ -137,7 +137,7 @@ def test_counts_make_laplaces_model():
 
 
 def test_a_start_is_the_mean_and_backups_follow_deviations():
-    """Tables (0, 2) and (4, 2) begin at (2, 2), with doubt of the first entry alone; half the doubt is half the backups."""
+    """Tables (0, 2) and (4, 2) begin at (2, 2) and are in doubt of the first entry alone."""
     mean, share = identify.start_of(jnp.array([[[0.0, 2.0]], [[4.0, 2.0]]]))
     np.testing.assert_allclose(mean, [[2.0, 2.0]])
     np.testing.assert_allclose(share, [[1.0, 0.0]])
@@ -147,7 +147,7 @@ def test_a_start_is_the_mean_and_backups_follow_deviations():
 
 def test_a_backup_is_bellmans():
     """One visit that paid 1 and led where 2 is the best value: 1 + 0.9 x 2."""
-    learner = identify.Table(taught=False)
+    learner = identify.Table(taught=False, exploration=0.0)
     table = jnp.zeros((8, 4)).at[5, 3].set(2.0)
     state = learner.begin(identify.Lessons(*[None] * 3, jnp.ones((2, 8, 4)).at[0].set(0), None))._replace(table=table)
     state = learner.learn(None, state, seen(cell=1, action=2, reward=1.0, next_cell=5))
