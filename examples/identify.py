@@ -109,7 +109,7 @@ def visits_to_tell(gap: Array | float, models: int, error: float) -> Array:
     """Return how many visits tell two models apart: n = 2 ln(2 C / error) / gap^2, rounded up.
 
     By Hoeffding's inequality the mean of n rewards is off by gap / 2 with a probability of at most error / C. The true
-    model is compared with C - 1 others, so it is eliminated with a probability below ``error``.
+    model is one of C - 1 pairs, so with n visits for each it is eliminated with a probability below ``error``.
     """
     return jnp.ceil(2 * jnp.log(2 * models / error) / jnp.square(gap))
 
