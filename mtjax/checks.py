@@ -14,7 +14,7 @@ import numpy as np
 from mtjax.names import InputError
 
 OF_TRAIN = (
-    *("steps", "seed", "seeds", "eval_every", "eval_episodes", "num_envs", "chunk_steps", "stagger", "trials"),
+    *("steps", "seed", "seeds", "eval_every", "eval_episodes", "population", "num_envs", "chunk_steps", "stagger", "trials"),
     *("reset_free", "curriculum"),
 )
 """The settings of ``mtjax.train`` that are neither the agent's nor the environment's."""

@@ -15,7 +15,7 @@ import jax
 import tyro
 from jax.sharding import Mesh
 
-from mtjax import trials
+from mtjax import populations, trials
 from mtjax.agents import AGENTS, BaseAgent, agent, combinations, preset_of, tuned_as
 from mtjax.agents import name_of as agent_name_of
 from mtjax.agents.choices import kinds_of, replace, require_value_range
@@ -55,6 +55,11 @@ class Plan:
     in a short one."""
     eval_episodes: int = 10
     """Episodes of each task in every evaluation."""
+    population: str = ""
+    """Train all seeds of all swept numbers as one population: pbt:STEPS or halving:STEPS. At evaluations, every STEPS
+    environment steps of each member, pbt replaces the worst fifth by copies of the best fifth, with swept numbers
+    multiplied by 0.8 or 1.2; halving replaces the worse half by copies of the better one. Without --eval-every there is
+    an evaluation at each."""
 
     def __post_init__(self):
         check_fields(self, steps=_MOST_STEPS, eval_every=_MOST_STEPS, seeds=_MOST_SEEDS, eval_episodes=MOST_EPISODES)
@@ -63,6 +68,7 @@ class Plan:
                 raise InputError(f"{field.replace('_', '-')} must be at least {least}, not {getattr(self, field)}")
         if self.seed + self.seeds > 2**31:
             raise InputError(f"seeds must end below 2^31, and {self.seed} + {self.seeds} does not")
+        _ = self.rule
 
     @property
     def all_seeds(self) -> range:
@@ -72,7 +78,12 @@ class Plan:
     @property
     def interval(self) -> int:
         """Return the environment steps between evaluations."""
-        return self.eval_every or math.ceil(self.steps / 10)
+        return self.eval_every or (self.rule.steps if self.rule else math.ceil(self.steps / 10))
+
+    @property
+    def rule(self) -> populations.Rule | None:
+        """Return how members of the population give way to others, or None for independent seeds."""
+        return populations.read(self.population)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,6 +143,11 @@ class RunConfig:
     def __post_init__(self):
         object.__setattr__(self, "learner", _with_policy(self.learner, self.family))
 
+    @property
+    def members(self) -> int:
+        """Return the length of S: the seeds of all points."""
+        return self.plan.seeds * max(len(self.points), 1)
+
     @cached_property
     def num_tasks(self) -> int:
         """Return the number of training tasks."""
@@ -180,7 +196,7 @@ class RunConfig:
         Raises:
             InputError: they cannot share its seeds and worlds evenly.
         """
-        return meshes.mesh_for(self.plan.seeds * max(len(self.points), 1), self.played_tasks, self.training.num_envs)
+        return meshes.mesh_for(self.members, self.played_tasks, self.training.num_envs)
 
     def check(self) -> None:
         """Check the configuration as a whole, before a folder is made. Nothing after it checks again.
@@ -198,12 +214,35 @@ class RunConfig:
         self.learner.experience.check(self.family, self.played.num_envs, self.played.chunk_steps)
         require_trials(self.training, self.family, self.learner)
         require_curriculum(self.played, self.family, self.learner)
+        self._check_population()
         require_policy(self.learner, self.family)
         for learner in agents_at(self.learner, self.points):
             require_value_range(learner)
         trials.require_whole(self.plan.eval_episodes, self.training.trials, "eval-episodes")
         for module in ["tensorboardX"] * self.tensorboard + ["wandb"] * bool(self.wandb):
             require_library(module)
+
+    def _check_population(self) -> None:
+        """Check that there are members to choose from, and evaluations to choose by."""
+        rule, plan, told = self.plan.rule, self.plan, f"--population={self.plan.population}"
+        if rule is None:
+            return
+        if rule.explores and not self.points:
+            raise InputError(
+                f"{told} perturbs numbers of the agent that are swept, and none is; give such as "
+                "--sweep agent.actor-lr=1e-4,1e-3"
+            )
+        if self.members < 2:
+            raise InputError(f"{told} needs several members, and one seed of one setting is one; give --seeds=10")
+        if rule.steps >= plan.steps:
+            raise InputError(f"{told} changes nothing in a run of {plan.steps:,} steps; give fewer steps to it")
+        if rule.steps % plan.interval:
+            raise InputError(f"{told} chooses at evaluations: give a multiple of --eval-every={plan.interval}")
+        if rule.steps < self.steps_per_chunk:
+            raise InputError(
+                f"{told} chooses between chunks, of {self.steps_per_chunk:,} steps; give more steps, or a lower "
+                "--chunk-steps"
+            )
 
     def _check_named(self) -> None:
         """Check what only families and agents with names have."""
@@ -308,12 +347,13 @@ def fit_length(config: RunConfig, given: Collection[str]) -> RunConfig:
     count = config.played_tasks
     tenth = plan.steps // (10 * count * training.num_envs)
     if "chunk_steps" not in given:
-        training = dataclasses.replace(training, chunk_steps=min(training.chunk_steps, max(tenth, experience.steps)))
+        longest = tenth if plan.rule is None else min(tenth, plan.rule.steps // config.worlds)
+        training = dataclasses.replace(training, chunk_steps=min(training.chunk_steps, max(longest, experience.steps)))
     if "eval_episodes" not in given:  # whole trials
         plan = dataclasses.replace(
             plan, eval_episodes=math.ceil(plan.eval_episodes / training.trials) * training.trials
         )
-    if "eval_every" not in given and not plan.eval_every:
+    if "eval_every" not in given and not plan.eval_every and plan.rule is None:
         each = config.num_tasks * plan.eval_episodes * config.family.episode_length
         often = min(max(_EVALUATED * plan.steps // each, 1), 10)
         plan = dataclasses.replace(plan, eval_every=0 if often == 10 else math.ceil(plan.steps / often))

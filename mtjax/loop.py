@@ -96,6 +96,7 @@ class TrainState(NamedTuple):
     iteration: Array  # () int32, steps taken by every environment
     key: Key  # (S,)
     rows: Array | None = None  # (T,) int32 numbers of the tasks that worlds play; None: all that the agent knows
+    origins: Array | None = None  # (S,) int32 of a population: the first member from which each descends
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))

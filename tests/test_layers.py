@@ -26,6 +26,7 @@ GROUND = (
     "tasks",
     "trials",
     "curricula",
+    "populations",
     "axes",
     "frames",
     "parallel",

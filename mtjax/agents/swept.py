@@ -48,6 +48,20 @@ def agents_at(agent: Any, points: Sequence[Point]) -> list[Any]:
     return [agent_at(agent, point) for point in points] or [agent]
 
 
+def allows(agent: BaseAgent, point: Point) -> bool:
+    """Return whether the agent's constructor takes the values of a point."""
+    try:
+        agent_at(agent, point)
+    except InputError:
+        return False
+    return True
+
+
+def shares(agent: BaseAgent, names: Iterable[str]) -> frozenset[str]:
+    """Return those names of numbers that end at 1, such as discounts."""
+    return frozenset(name for name in names if allows(agent, {name: 1 - 1e-6}) and not allows(agent, {name: 1.5}))
+
+
 def with_numbers(agent: Any, numbers: Mapping[str, Array]) -> Any:
     """Return the agent with traced numbers, which its constructor cannot check; ``agent_at`` checks them beforehand."""
     return _replace_values(agent, numbers, parts.put) if numbers else agent

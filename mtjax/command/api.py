@@ -42,6 +42,7 @@ def train(
     seed: int = Plan.seed,
     eval_every: int = Plan.eval_every,
     eval_episodes: int = Plan.eval_episodes,
+    population: str = Plan.population,
     settings: Settings | None = None,
     start: Policy | str | Path | None = None,
     sweep: Sweep = (),
@@ -71,6 +72,8 @@ def train(
         seed: the first seed.
         eval_every: environment steps between evaluations. 0 means ten evaluations in the run.
         eval_episodes: episodes of each task in every evaluation.
+        population: "pbt:STEPS" or "halving:STEPS" makes a population of all seeds of all points of ``sweep``, as
+            ``--population`` does.
         settings: settings of the training loop; by default the preset's for a name, else ``Settings()``.
         start: the policy to fine-tune, from ``mtjax.load``, or the folder of its run. A family that is given as an
             object is ``new.scaled_as(start.env)``, and the agent ``start.agent``; only learning rates and ``tune`` may
@@ -106,6 +109,7 @@ def train(
     if directory is None and (resume or any(written.values())):
         raise InputError("resume, profile, tensorboard and wandb need the run's folder; give directory as well")
     plan = {"seeds": seeds, "seed": seed, "eval_every": eval_every, "eval_episodes": eval_episodes}
+    plan |= {"population": population}
     plan |= {} if steps is None else {"steps": steps}
     agent = start.agent if agent is None and start is not None else agent
     config = configured(env, agent, given, plan=plan, settings=settings, start=start, sweep=sweep, **written)

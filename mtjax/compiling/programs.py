@@ -45,7 +45,8 @@ def _specs(agent: Agent) -> TrainState:
     """Return how devices share each field of a training state."""
     by_world = TrainState(*[BY_WORLD] * len(TrainState._fields))  # type: ignore
     data = agent.experience.sharding
-    return by_world._replace(agent=BY_SEED, data=data, iteration=REPLICATED, key=BY_SEED, rows=REPLICATED)  # type: ignore
+    alone = {"iteration": REPLICATED, "rows": REPLICATED}
+    return by_world._replace(agent=BY_SEED, data=data, key=BY_SEED, origins=BY_SEED, **alone)  # type: ignore
 
 
 def jit_programs(mesh: Mesh | None, agent: Agent) -> Jitted:

@@ -104,6 +104,15 @@ def truncate_rows(
     return seconds, wall
 
 
+def keep_steps(path: Path, last: int) -> None:
+    """Drop the lines of a CSV file whose first value, the step, is after ``last`` or none; the header stays."""
+    header, *lines = path.read_bytes().decode().splitlines(keepends=True) or [""]
+    step = lambda line: line.split(",", 1)[0]
+    kept = [line for line in lines if line.endswith("\n") and step(line).isdecimal() and int(step(line)) <= last]
+    with replacing(path) as new:
+        new.write_bytes((header + "".join(kept)).encode())
+
+
 def _is_complete(iterations: Sequence[int], each: int, longest: int) -> bool:
     """Return whether no row is missing between others: every chunk has as many, and none is longer than it may be."""
     counts = Counter(iterations)

@@ -168,7 +168,8 @@ def load(directory: str | Path, seed: int = 0, checkpoint: int = 0) -> Policy:
         directory: the run's folder, or the name of a policy that comes with the package, such as
             "finger-spin-vary-size/sac-conditioned"; ``python -m mtjax.train --list`` shows them.
         seed: which of the run's seeds, counted from 0. A run of a sweep has all its seeds for each of its points:
-            number ``k`` is seed ``k % seeds`` of point ``k // seeds``. The policy then has the agent of that point.
+            number ``k`` is seed ``k % seeds`` of point ``k // seeds``. The policy then has the agent of that point. Of
+            a population it is a member, which comes alone, with its latest numbers.
         checkpoint: the iteration of a checkpoint that the run keeps; 0 takes the newest.
 
     Raises:
@@ -185,7 +186,8 @@ def load(directory: str | Path, seed: int = 0, checkpoint: int = 0) -> Policy:
     else:
         states = checkpoints.load_agent(directory / "checkpoints", state_shapes(config), checkpoint)
     seeds = jnp.asarray(config.plan.all_seeds, jnp.int32)
-    found = policy_of(config.family, config.learner, config.points, seeds, states, seed, directory)
+    among = bool(config.plan.population)
+    found = policy_of(config.family, config.learner, config.points, seeds, states, seed, directory, among)
     return dataclasses.replace(found, trial=config.training.trials)
 
 
@@ -199,9 +201,19 @@ def _filled(directory: Path, like: Any) -> Any:
 
 
 def policy_of(
-    env: Any, agent: Any, found: Sequence[Point], seeds: Array, states: Any, seed: int, directory: Path | None
+    env: Any,
+    agent: Any,
+    found: Sequence[Point],
+    seeds: Array,
+    states: Any,
+    seed: int,
+    directory: Path | None,
+    member: bool = False,
 ) -> Policy:
     """Return the policy of one seed from the agent's states, leaves (S, ...), of all seeds of all points of a run.
+
+    Args:
+        member: the seed is a member of a population, whose numbers are those of its state, and of no other seed.
 
     Raises:
         InputError: the run has no such seed.
@@ -209,9 +221,12 @@ def policy_of(
     count = len(seeds)
     _require_seed(seed, count, len(found))
     if found:
-        agent = swept.agent_at(agent, found[seed // count])
-        states = jax.tree.map(lambda x: x[_point_rows(count, seed)], states)._replace(numbers={})
-    own = seed % count
+        latest = {name: float(x[seed]) for name, x in states.numbers.items()}
+        agent = swept.agent_at(agent, latest if member else found[seed // count])
+        states = states._replace(numbers={})
+    rows = slice(seed, seed + 1) if member else _point_rows(count, seed)
+    own, seeds = (0, seeds[seed % count][None]) if member else (seed % count, seeds)
+    states = jax.tree.map(lambda x: x[rows], states)
     return Policy(env, agent, jax.tree.map(lambda x: x[own], states), states, seeds, directory, own)
 
 
@@ -239,7 +254,7 @@ def load_experience(directory: str | Path, seed: int = 0) -> tuple[Ring, int]:
     if not isinstance(config.learner.experience, Replay):
         raise InputError(f"{config.agent} keeps no replay, so that there is nothing to look at")
     ring = checkpoints.load_ring(Path(directory) / "checkpoints", state_shapes(config))
-    rows = _point_rows(config.plan.seeds, seed)
+    rows = slice(seed, seed + 1) if config.plan.rule else _point_rows(config.plan.seeds, seed)
     return ring._replace(rows=jax.tree.map(lambda x: x[rows], ring.rows)), config.learner.experience.batch_size
 
 

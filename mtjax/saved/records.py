@@ -93,6 +93,16 @@ class Records:
         if self.writes:
             log.append_rows(self._path("metrics.csv"), rows)
 
+    def add_history(self, rows: list[dict[str, Any]]) -> None:
+        """Append the rows of a selection to population.csv."""
+        if self.writes:
+            log.append_rows(self._path("population.csv"), rows)
+
+    def keep_history(self, steps: int) -> None:
+        """Drop the rows of population.csv after a step, because a resumed run writes them again."""
+        if self.writes and self._path("population.csv").exists():
+            log.keep_steps(self._path("population.csv"), steps)
+
     def save_evaluations(self, evaluations: Evaluations) -> None:
         """Write all evaluations."""
         if self.writes:

@@ -37,6 +37,7 @@ class Result(NamedTuple):
     trained_seconds: float = 0.0  # of ``seconds``, those since this start
     signal: int = 0  # the signal that came, if any; it stops what would follow a finished run too
     total_seconds: float = 0.0  # from the start to the end: compiling, training, evaluating and saving
+    population: str = ""  # how members of S gave way to copies of others, which makes them no independent seeds
 
     def __repr__(self) -> str:
         """Return a line: steps, and the last evaluation's mean return by split."""
@@ -58,7 +59,8 @@ class Result(NamedTuple):
             InputError: the run has no such seed.
         """
         states = jax.tree.map(jnp.asarray, hosts.gather(self.state.agent))
-        found = policy_of(self.env, self.agent, self.points, jnp.asarray(self.seeds), states, seed, self.directory)
+        about = self.points, jnp.asarray(self.seeds), states, seed, self.directory, bool(self.population)
+        found = policy_of(self.env, self.agent, *about)
         return dataclasses.replace(found, trial=self.evaluations.trial)
 
     @public

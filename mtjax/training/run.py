@@ -27,7 +27,7 @@ from mtjax.saved import checkpoint, lock, log
 from mtjax.saved.policy import Policy
 from mtjax.saved.records import Records
 from mtjax.saved.result import Result
-from mtjax.training import allocator, finetune, memory
+from mtjax.training import allocator, finetune, memory, selection
 from mtjax.training.console import (
     Clock,
     Console,
@@ -84,6 +84,7 @@ def train(config: RunConfig, hooks: Hooks = NO_HOOKS) -> Result:
         agent=config.learner,
         seeds=tuple(config.plan.all_seeds),
         points=config.points,
+        population=config.plan.population,
     )
 
 
@@ -129,6 +130,13 @@ class _Run:
         config = self.config
         return config.points[number // config.plan.seeds] if config.points else {}
 
+    def numbers(self, state: TrainState) -> list[Point]:
+        """Return the values of every entry of S in rows: those swept, in a population as they are now."""
+        if self.config.plan.rule is None:
+            return [self.point(k) for k in range(len(self.seeds))]
+        now = selection.numbers_of(state)
+        return [{name: log.number(x[k]) for name, x in now.items()} for k in range(len(self.seeds))]  # type: ignore
+
     def adopt(self, tasks: Any, fresh: Any) -> Any:
         """Return the agent's state with the values of the run to fine-tune. Every point starts from the same seeds."""
         apart = lambda x: x.reshape(-1, self.config.plan.seeds, *x.shape[1:])
@@ -172,7 +180,7 @@ class _Run:
         tasks, everything = (meshes.replicate(self.config.mesh, env.tasks(split)) for split in ("train", "all"))
         (seeds, numbers), pool = meshes.shard_by_seed(self.config.mesh, self.seed_axis), ThreadPoolExecutor(3)
         fresh = trace(lazy.init, env, agent, settings, tasks, seeds, numbers)
-        shapes = sharded_shapes(self.config.mesh, agent, fresh.out_info)
+        shapes = selection.begin(self.config, sharded_shapes(self.config.mesh, agent, fresh.out_info))
         self._describe(shapes)
         self.console.say("compiling")
         kernels = pool.submit(load_kernels, env)
@@ -187,7 +195,9 @@ class _Run:
         programs = Programs(play, evaluate, chunk.out_info[1], score.result)
         if kernels.result():  # else the first chunk would wait for them
             score.result()
-        return programs, self._restored(shapes) if make is None else make.result()(tasks, seeds, numbers)
+        if make is None:
+            return programs, self._restored(shapes)
+        return programs, selection.begin(self.config, make.result()(tasks, seeds, numbers))
 
     def _restored(self, shapes: TrainState) -> TrainState:
         """Return the state of the newest checkpoint. Returns do not count episodes whose worlds are lost."""
@@ -263,6 +273,7 @@ class _Run:
         evaluations = self.records.earlier_evaluations(steps, steps >= plan.interval, self._no_evaluations())
         form = (self._columns(programs.metrics), len(self.seeds), self.config.longest) if iteration else ()
         seconds, wall = self.records.earlier_seconds(iteration, *form)
+        self.records.keep_history(steps)
         now = _Progress(state, steps, seconds, wall, evaluations, np.zeros(len(self.seeds), bool))
         if steps < plan.steps or len(evaluations.steps):
             return now
@@ -289,7 +300,7 @@ class _Run:
                     now = self._give_up_spoiled(now)
                 if due:
                     self.console.doing(f"{now.steps:,} steps  evaluating")
-                    now = now._replace(evaluations=self._evaluate_or_save(programs.evaluate, now))
+                    now = self._select(now._replace(evaluations=self._evaluate_or_save(programs.evaluate, now)))
                     write_rows(sinks, *self._evaluation_rows(now.evaluations))
                     stop = asked(stop)
                 if due or stop:
@@ -329,7 +340,8 @@ class _Run:
         iteration = now.steps // self.config.worlds
         when = (iteration, now.steps, f"{now.seconds:.3f}", f"{now.wall + passed:.3f}")
         lines = log.metric_rows(metrics, np.asarray(self.seeds), dict(zip(_WHEN, when, strict=True)))
-        new = [{"seed": row["seed"], **self.point(k), **row} for k, row in enumerate(lines)]
+        numbers = self.numbers(now.state)
+        new = [{"seed": row["seed"], **numbers[k], **row} for k, row in enumerate(lines)]
         self.records.add_rows(new)
         write_rows(sinks, lines, [self._name(k) for k in range(len(lines))])
         self.console.clock.chunk(elapsed)
@@ -387,6 +399,19 @@ class _Run:
         for k in np.flatnonzero(seeds):
             values = ", ".join(f"{name}={value:g}" for name, value in self.point(int(k)).items())
             self.console.say(f"seed {self.seeds[k]} of {values} diverged and is given up")
+
+    def _select(self, now: _Progress) -> _Progress:
+        """Name the best member of a population after an evaluation, and replace the worst ones if that is due."""
+        if self.config.plan.rule is None:
+            return now
+        returns = now.evaluations.returns["train"][:, -1]
+        self.console.say(selection.describe_best(returns, selection.numbers_of(now.state)))
+        if not selection.is_due(self.config, now.steps):
+            return now
+        chosen = selection.select(self.config, now.state, returns)
+        self.records.add_history(selection.history(now.steps, self.seeds, returns, chosen))
+        self.console.say(selection.describe_copies(chosen.sources))
+        return now._replace(state=chosen.state)
 
     def _save(self, state: TrainState, iteration: int) -> None:
         """Save a checkpoint."""
