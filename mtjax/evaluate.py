@@ -21,7 +21,7 @@ class Request:
     """The run's folder, in which a new folder takes returns and a plot. Or the name of a trained policy that comes with
     the package, as --list of mtjax.train shows: then nothing is written, except with --video into a folder in runs/."""
     point: int = 0
-    """Number of the setting in sweep.csv, if the run holds several settings of a sweep."""
+    """Number of the setting in sweep.csv, if the run holds several settings of a sweep; of a member in a population."""
     episodes: int = 10
     """Episodes of each task and seed."""
     seed: int = 0

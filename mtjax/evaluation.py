@@ -62,6 +62,19 @@ def no_evaluations(
     return Evaluations(np.zeros(0, np.int64), returns, dict(values), seeds=seeds, trial=trial)
 
 
+def as_one_seed(evaluations: Evaluations) -> Evaluations:
+    """Return the evaluations of a population as those of one seed: means over its members.
+
+    Members are copies of each other, and no independent seeds. Those whose last returns are not finite are left out.
+    """
+    last = evaluations.returns["train"][:, -1:]
+    known = np.isfinite(last).all(axis=(1, 2, 3))
+    known |= not known.any()
+    mean = lambda scores: {split: x[known].mean(axis=0, keepdims=True) for split, x in scores.items()}
+    metrics = {name: mean(scores) for name, scores in evaluations.metrics.items()}
+    return evaluations._replace(returns=mean(evaluations.returns), metrics=metrics, seeds=evaluations.seeds[:1])
+
+
 def require_same_run(path: Path, found: Evaluations, expected: Evaluations) -> None:
     """Check that evaluations of a file are of the seeds, tasks and episodes of a run.
 

@@ -1,7 +1,7 @@
 """A population: members learn side by side, and at some evaluations the worst give way to copies of better ones.
 
-Members are the entries of S. Who becomes whose copy is a gather on that axis, so that nothing is compiled anew. All here
-runs on the host, on NumPy arrays; random numbers follow from a key, so that a resumed run repeats them.
+Members are the entries of S. Who becomes whose copy is a gather on that axis, so that nothing is compiled anew. What is
+here runs on the host, on NumPy arrays; random numbers follow from a key, so that a resumed run repeats them.
 
 Copies make members depend on each other. They are no sample of independent seeds: a whole population counts as one.
 """

@@ -179,9 +179,16 @@ def main(argv: Sequence[str]) -> None:
 
 
 def run_all(found: Sequence[RunConfig], kind: str) -> None:
-    """Make a folder with a run for every program and round, and train them all."""
+    """Make a folder with a run for every program and round, and train them all.
+
+    Raises:
+        InputError: a population does not fit into memory together.
+    """
     limit = memory.available_bytes()
     split = [memory.split_to_fit(config, limit) for config in found]
+    for config, parts in zip(found, split, strict=True):
+        if config.plan.rule and len(parts) > 1:
+            raise InputError(f"a population is one program: {memory.describe(config, len(parts), limit)}")
     folder = new_directory(Path(found[0].runs), _folder_name(found, kind))
     for i, config in enumerate(itertools.chain(*split)):
         (folder / f"run-{i + 1}").mkdir()
@@ -242,7 +249,9 @@ def run_unfinished(folder: Path) -> None:
             words = shlex.join([f"--resume={folder}", *import_flags(config)])
             print(f"{table(rows(runs))}\nstopped; the state is saved. Go on with:\n  python -m mtjax.train {words}")
             sys.exit(128 + signal)
-    print(f"{table(rows(runs))}\nsweep: {folder}")
+    of_members = any(from_json(run / "config.json").plan.rule for run in runs)
+    told = "\nmembers of a population are copies of each other: their mean has no interval" * of_members
+    print(f"{table(rows(runs))}{told}\nsweep: {folder}")
 
 
 def _write_table(folder: Path, runs: Sequence[Path]) -> None:
@@ -280,11 +289,12 @@ def rows(runs: Sequence[Path]) -> list[dict[str, Any]]:
     for run in runs:
         config = from_json(run / "config.json")
         evaluations, count = _latest_evaluations(config, run), config.plan.seeds
-        for p, point in enumerate(config.points or ({},)):
+        points, count = ((), config.members) if config.plan.rule else (config.points, count)
+        for p, point in enumerate(points or ({},)):
             mine = slice(p * count, (p + 1) * count)
             returns = evaluations and {split: x[mine, -1] for split, x in evaluations.returns.items() if x.size}
             steps = int(evaluations.steps[-1]) if evaluations else 0
-            part = _Part(run.name, p, count, (run / _DIVERGED).exists(), returns, steps)
+            part = _Part(run.name, p, count, (run / _DIVERGED).exists(), returns, steps, config.plan.population)
             found.setdefault(tuple(_values(config, point).items()), []).append(part)
     made = [_row(dict(values), parts) for values, parts in found.items()]
     columns = dict.fromkeys(name for row in made for name in row)
@@ -300,6 +310,7 @@ class _Part(NamedTuple):
     diverged: bool
     returns: dict[str, np.ndarray] | None  # split -> (S, T, episodes) of the last evaluation
     steps: int  # of the last evaluation
+    population: str = ""  # how its seeds give way to each other
 
 
 def _row(values: dict[str, str], parts: list[_Part]) -> dict[str, Any]:
@@ -311,13 +322,14 @@ def _row(values: dict[str, str], parts: list[_Part]) -> dict[str, Any]:
         return row | {"diverged": lost}
     if len(known) < len(parts):
         return row
-    return row | _scores({split: np.concatenate([x[split] for x in known]) for split in known[0]})
+    scores = {split: np.concatenate([x[split] for x in known]) for split in known[0]}
+    return row | (_scores_of_members if parts[0].population else _scores)(scores)
 
 
 def _values(config: RunConfig, point: Mapping[str, float]) -> dict[str, str]:
-    """Return the values of one setting, in the order of the sweep's flags."""
+    """Return the values of one setting, in the order of the sweep's flags; of a population all with which it began."""
     axes = [_axis(word) for word in config.sweep]
-    return {x.name: f"{point[x.setting]:g}" if x.setting in point else x.values[0] for x in axes}
+    return {x.name: f"{point[x.setting]:g}" if x.setting in point else " ".join(x.values) for x in axes}
 
 
 def _scores(returns: Mapping[str, np.ndarray]) -> dict[str, Any]:
@@ -327,6 +339,16 @@ def _scores(returns: Mapping[str, np.ndarray]) -> dict[str, Any]:
     for split, x in returns.items():
         scores = seed_interval(x.mean(axis=-1)) if not diverged else (np.nan,) * 3
         found |= dict(zip((split, f"{split}_low", f"{split}_high"), map(number, scores), strict=True))
+    return found
+
+
+def _scores_of_members(returns: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Return the mean of returns (S, T, episodes) over a population's members that go on. They have no interval."""
+    known = np.isfinite(returns["train"]).all(axis=(1, 2))
+    found: dict[str, Any] = {"diverged": int(np.sum(~known))}
+    for split, x in returns.items():
+        mean = x[known].mean() if known.any() else np.nan
+        found |= {split: number(mean), f"{split}_low": "", f"{split}_high": ""}
     return found
 
 

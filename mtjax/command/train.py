@@ -9,6 +9,7 @@ from mtjax.command import sweep
 from mtjax.command.run_config import parse
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import RunConfig
+from mtjax.evaluation import as_one_seed
 from mtjax.parallel import hosts
 from mtjax.report.curve import draw
 from mtjax.report.tables import split_table
@@ -69,7 +70,8 @@ def _conclude(config: RunConfig, result: Result, directory: Path) -> None:
         print(f"stopped; the state is saved. Go on with:\n  python -m mtjax.train {shlex.join(words)}")
         return
     if len(result.evaluations.steps):
-        print(split_table(result.evaluations, config.family.parts))
+        together = as_one_seed if config.plan.population else lambda found: found
+        print(split_table(together(result.evaluations), config.family.parts))
         if config.learner.unseen:
             print(f"unseen tasks: {config.learner.unseen}")
     rest = max(result.total_seconds - result.compile_seconds - result.trained_seconds, 0)

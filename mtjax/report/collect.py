@@ -13,11 +13,11 @@ from mtjax.agents import name_of, settings
 from mtjax.checks import path
 from mtjax.config import RunConfig
 from mtjax.envs import name_of as env_name_of
-from mtjax.evaluation import Evaluations
-from mtjax.names import InputError, nearest_error, public
+from mtjax.evaluation import Evaluations, as_one_seed
+from mtjax.names import InputError, nearest_error, notice, public
 from mtjax.saved.config_json import from_json
 from mtjax.saved.folder import evaluations_of
-from mtjax.saved.tables import frame_of, pandas
+from mtjax.saved.tables import frame_of, members, pandas
 
 _WORDS = {"success": "success at the end", "success_ever": "success at any step"}
 
@@ -114,10 +114,13 @@ def _renamed(one: Learned, name: str) -> Learned:
 
 def _of_result(result: Any) -> list[Learned]:
     """Return what was learned at every point of a result of ``mtjax.train``."""
-    found, count, env = result.evaluations, len(result.seeds), result.env
-    made = []
-    for p, point in enumerate(result.points or ({},)):
-        name = ", ".join([name_of(result.agent), *(f"{k.replace('_', '-')} {_short(x)}" for k, x in point.items())])
+    found, seeds, points, env = result.evaluations, result.seeds, result.points, result.env
+    agent = name_of(result.agent)
+    if rule := result.population:
+        found, seeds, points, agent = _of_population(found, rule), seeds[:1], (), f"{agent}, {rule}"
+    made, count = [], len(seeds)
+    for p, point in enumerate(points or ({},)):
+        name = ", ".join([agent, *(f"{k.replace('_', '-')} {_short(x)}" for k, x in point.items())])
         of_point = _rows(found, slice(p * count, (p + 1) * count))
         made.append(
             Learned(
@@ -127,7 +130,7 @@ def _of_result(result: Any) -> list[Learned]:
                 of_point.returns,
                 found.values,
                 env.task_axis,
-                result.seeds,
+                seeds,
                 of_point.metrics,
             )
         )
@@ -136,23 +139,37 @@ def _of_result(result: Any) -> list[Learned]:
 
 def _points(found: Found) -> Iterable[tuple[Any, dict[str, Any], Learned]]:
     """Yield every point of a run: what must be equal for its seeds to be joined, its settings, and what it learned."""
-    config, evaluations = found.config, found.evaluations
-    count, family = config.plan.seeds, config.family
-    for p, point in enumerate(config.points or ({},)):
+    config, evaluations, name = found.config, found.evaluations, found.config.agent
+    seeds, points, family = tuple(config.plan.all_seeds), config.points, config.family
+    common = {**settings(config.learner), **vars(config.training)}
+    if rule := config.plan.population:
+        evaluations, name = _of_population(evaluations, rule), f"{name}, {rule}"
+        seeds, points, common = seeds[:1], (), common | {"members": config.members, "sweep": " ".join(config.sweep)}
+    count = len(seeds)
+    for p, point in enumerate(points or ({},)):
         mine = _rows(evaluations, slice(p * count, (p + 1) * count))
-        own = {**settings(config.learner), **vars(config.training), **point}
+        own = {**common, **point}
         one = Learned(
             config.env,
-            config.agent,
+            name,
             evaluations.steps,
             mine.returns,
             evaluations.values,
             family.task_axis,
-            tuple(config.plan.all_seeds),
+            seeds,
             mine.metrics,
         )
         shape = (evaluations.steps.tolist(), config.plan.eval_episodes, config.start)
-        yield (config.env, config.agent, family, sorted(own.items(), key=str), shape), own, one
+        yield (config.env, name, family, sorted(own.items(), key=str), shape), own, one
+
+
+def _of_population(evaluations: Evaluations, rule: str) -> Evaluations:
+    """Return the means over a population's members, as those of one seed, and say that they have no intervals."""
+    members = len(evaluations.returns["train"])
+    notice(
+        f"{rule}: {members} members of a population, copies of each other, count as one seed by their mean; no intervals"
+    )
+    return as_one_seed(evaluations)
 
 
 def _join(parts: list[Learned]) -> Learned:
@@ -220,6 +237,7 @@ def runs(pattern: str | Path | Iterable[str | Path] = "runs/*") -> Any:
     for found in read(pattern):
         config = found.config
         fixed = {"run": str(found.directory), "env": config.env, "agent": config.agent, **found.settings}
-        seeds = config.plan.all_seeds
-        made.append(frame_of(config.family, found.evaluations, seeds, config.points, **fixed))
+        axis = config.plan.all_seeds, config.points
+        axis = members([*axis[0]] * max(len(axis[1]), 1)) if config.plan.population else axis
+        made.append(frame_of(config.family, found.evaluations, *axis, **fixed))
     return pandas().concat(made, ignore_index=True)

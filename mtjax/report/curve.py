@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from mtjax.config import RunConfig
-from mtjax.evaluation import Evaluations
+from mtjax.evaluation import Evaluations, as_one_seed
 from mtjax.parallel import hosts
 from mtjax.report import figures
 from mtjax.saved.folder import short_name
@@ -15,15 +15,18 @@ from mtjax.saved.folder import short_name
 def draw(config: RunConfig, evaluations: Evaluations, directory: Path, labels: Sequence[str] = ()) -> None:
     """Draw a run's returns over its steps into curve.png: a line for each split, or in a sweep for each point.
 
-    Lines with a diverged seed are left out.
+    Of a population it draws the means over members, without intervals. Lines with a diverged seed are left out.
 
     Args:
         labels: what the lines of a sweep's points are called; by default their values.
     """
     if not len(evaluations.steps) or not hosts.is_first():
         return
+    if config.plan.population:
+        evaluations, labels = as_one_seed(evaluations), ()
     count, train = config.plan.seeds, evaluations.returns["train"]
-    labels = labels or [", ".join(f"{name} {value:g}" for name, value in point.items()) for point in config.points]
+    points = () if config.plan.population else config.points
+    labels = labels or [", ".join(f"{name} {value:g}" for name, value in point.items()) for point in points]
     of_points = {label: train[p * count : (p + 1) * count] for p, label in enumerate(labels)}
     curves = of_points or evaluations.returns
     known = {name: x for name, x in curves.items() if np.isfinite(x).all()}

@@ -88,7 +88,8 @@ def evaluate(
         episodes: of each task and seed.
         seed: seed of the starting states.
         task_seed: seed of other goals than the run's, or other tasks, where they are drawn.
-        point: number of the setting, if the run holds several settings of a sweep.
+        point: number of the setting, if the run holds several settings of a sweep; of a population, of the member,
+            which plays alone.
         checkpoint: iteration of the checkpoint, if ``run`` is a folder; 0 takes the newest.
 
     Raises:
@@ -127,8 +128,7 @@ def _policy(run: Any, point: int, checkpoint: int) -> Policy:
         raise InputError(f"evaluate plays families of tasks, not a {type(run.env).__name__}")
     if isinstance(run, Policy):
         return run.alone()
-    _require_point(point, len(run.points))
-    return run.policy(point * len(run.seeds))
+    return run.policy(_entry(point, len(run.points), len(run.seeds), run.population))
 
 
 def _with_tasks(
@@ -172,6 +172,8 @@ def report(request: Any, vary: Mapping[str, str]) -> None:
     print(task_table(policy, scores, named), flush=True)
     if policy.agent.unseen:
         print(f"unseen tasks: {policy.agent.unseen}")
+    if population := from_json(pretrained.folder(run) / "config.json").plan.population:
+        print(f"number {request.point} of a population ({population}), of whose members there are no intervals")
     if pretrained.is_shipped(pretrained.folder(run)) and not chosen:
         if any(part.family.films for part in policy.env.parts):
             print(f"look at it: python -m mtjax.evaluate {shlex.join([f'--run={run}', '--video'])}")
@@ -220,16 +222,17 @@ def as_unseen(tasks: Task, env: Any) -> Task:
 
 
 def _first_seed(run: str, point: int) -> int:
-    """Return the first entry of S that belongs to a setting."""
+    """Return the first entry of S that belongs to a setting, or the member of a population."""
     config = from_json(pretrained.folder(run) / "config.json")
-    _require_point(point, len(config.points))
-    return point * config.plan.seeds
+    return _entry(point, len(config.points), config.plan.seeds, config.plan.population)
 
 
-def _require_point(point: Any, count: int) -> None:
-    last = max(count, 1) - 1
-    if not isinstance(point, int | np.integer) or not 0 <= point <= last:
-        raise InputError(f"point must be from 0 to {last}, not {point}")
+def _entry(point: Any, points: int, seeds: int, population: str) -> int:
+    """Return the entry of S at which a setting begins, of so many with so many seeds each, or that of a member."""
+    count, each = (max(points, 1) * seeds, 1) if population else (max(points, 1), seeds)
+    if not isinstance(point, int | np.integer) or not 0 <= point < count:
+        raise InputError(f"point must be from 0 to {count - 1}, not {point}")
+    return int(point) * each
 
 
 def score(

@@ -17,7 +17,7 @@ from mtjax.loop import TrainState
 from mtjax.names import nearest_error, public
 from mtjax.parallel import hosts
 from mtjax.saved.policy import Policy, policy_of
-from mtjax.saved.tables import frame_of, metrics_frame
+from mtjax.saved.tables import frame_of, members, metrics_frame
 
 
 class Result(NamedTuple):
@@ -74,4 +74,6 @@ class Result(NamedTuple):
             return metrics_frame(self.rows)
         if of != "evaluations":
             raise nearest_error("table", of, ("evaluations", "metrics"))
-        return frame_of(self.env, self.evaluations, self.seeds, self.points)
+        if not self.population:
+            return frame_of(self.env, self.evaluations, self.seeds, self.points)
+        return frame_of(self.env, self.evaluations, *members(self.evaluations.seeds))

@@ -29,17 +29,17 @@ def frame_of(
 ) -> Any:
     """Return a run's evaluations as a table.
 
-    Its columns are those of ``fixed``; the swept numbers; seed, steps, split and task; the task's parameters; the mean
-    ``return`` of its episodes; and further metrics, such as success.
+    Its columns are those of ``fixed``; the swept numbers, or the member of a population; seed, steps, split and task;
+    the task's parameters; the mean ``return`` of its episodes; and further metrics, such as success.
     """
     values = {split: env.params(split) for split in evaluations.returns}
-    rows = []
+    rows, each = [], len(evaluations.returns["train"]) // max(len(points), 1)
     for split, returns in evaluations.returns.items():
         scores = {"return": returns} | {name: x[split] for name, x in evaluations.metrics.items()}
         means = {name: np.mean(x, axis=-1) for name, x in scores.items()}  # (S, V, T)
         numbers = np.asarray(env.tasks(split).id)
         for s, v, t in np.ndindex(*returns.shape[:3]):
-            point = points[s // len(seeds)] if points else {}
+            point = points[s // each] if points else {}
             rows.append(
                 {
                     **fixed,
@@ -53,6 +53,11 @@ def frame_of(
                 }
             )
     return pandas().DataFrame(rows)
+
+
+def members(seeds: Sequence[int] | np.ndarray) -> tuple[list[int], list[dict[str, int]]]:
+    """Return the seeds (S,) of a population and its members' numbers, for ``frame_of``: their settings change."""
+    return [int(seed) for seed in seeds], [{"member": k} for k in range(len(seeds))]
 
 
 def metrics_frame(rows: Iterable[Mapping[str, Any]]) -> Any:
