@@ -73,13 +73,13 @@ def fitness(returns: np.ndarray) -> np.ndarray:
 def exploit(fitness: np.ndarray, key: Key) -> np.ndarray:
     """Return whose copy every member becomes (S,): truncation selection (Jaderberg et al. 2017, section 4.1).
 
-    Each of the worst fifth, and at least one, copies one of the best fifth, which is drawn at random. None copies what
-    is not better. A member without a finite fitness is given up: it neither copies nor is copied.
+    Each of the worst fifth, and at least one, copies one of the best fifth, which is drawn at random. A member without
+    a finite fitness is given up: it neither copies nor is copied.
     """
     order = _ranked(fitness)
     count, sources = min(max(len(fitness) // _PART, 1), len(order) // 2), np.arange(len(fitness))
-    worst, drawn = order[len(order) - count :], np.asarray(jax.random.randint(key, (count,), 0, max(count, 1)))
-    sources[worst] = np.where(fitness[order[drawn]] > fitness[worst], order[drawn], worst)
+    drawn = np.asarray(jax.random.randint(key, (count,), 0, max(count, 1)))
+    sources[order[len(order) - count :]] = order[drawn]
     return sources
 
 

@@ -166,9 +166,7 @@ def _points(found: Found) -> Iterable[tuple[Any, dict[str, Any], Learned]]:
 def _of_population(evaluations: Evaluations, rule: str) -> Evaluations:
     """Return the means over a population's members, as those of one seed, and say that they have no intervals."""
     members = len(evaluations.returns["train"])
-    notice(
-        f"{rule}: {members} members of a population, copies of each other, count as one seed by their mean; no intervals"
-    )
+    notice(f"{rule}: {members} members of a population copy each other, count as one seed, and have no intervals")
     return as_one_seed(evaluations)
 
 

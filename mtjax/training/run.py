@@ -130,6 +130,11 @@ class _Run:
         config = self.config
         return config.points[number // config.plan.seeds] if config.points else {}
 
+    @property
+    def ends_with_one(self) -> bool:
+        """Return whether the run ends when one seed diverges, as in neither a sweep nor a population."""
+        return not self.config.points and self.config.plan.rule is None
+
     def numbers(self, state: TrainState) -> list[Point]:
         """Return the values of every entry of S in rows: those swept, in a population as they are now."""
         if self.config.plan.rule is None:
@@ -190,7 +195,8 @@ class _Run:
         played = partial(trace, lazy.evaluate, env, agent, episodes, shapes.agent, everything, seeds)
         score = pool.submit(lambda: compile_lowered(played(np.int32(0)).lower(), "seldom"))
         pool.shutdown(wait=False)
-        evaluate = lambda agents, number: score.result()(agents, everything, seeds, np.int32(number))
+        starts = selection.starts(self.config, seeds)
+        evaluate = lambda agents, number: score.result()(agents, everything, starts, np.int32(number))
         play = partial(compile_lowered(chunk.lower()), tasks)
         programs = Programs(play, evaluate, chunk.out_info[1], score.result)
         if kernels.result():  # else the first chunk would wait for them
@@ -274,7 +280,10 @@ class _Run:
         form = (self._columns(programs.metrics), len(self.seeds), self.config.longest) if iteration else ()
         seconds, wall = self.records.earlier_seconds(iteration, *form)
         self.records.keep_history(steps)
-        now = _Progress(state, steps, seconds, wall, evaluations, np.zeros(len(self.seeds), bool))
+        diverged = np.zeros(len(self.seeds), bool)
+        if len(evaluations.steps) and not self.ends_with_one:
+            diverged = ~np.isfinite(evaluations.returns["train"][:, -1]).all(axis=(1, 2))
+        now = _Progress(state, steps, seconds, wall, evaluations, diverged)
         if steps < plan.steps or len(evaluations.steps):
             return now
         spoiled = ~finite_seeds(state.agent)
@@ -377,7 +386,7 @@ class _Run:
     def _find_diverged(self, metrics: dict[str, Any], first_step: int, diverged: np.ndarray) -> np.ndarray:
         """Return which seeds (S,) have diverged in this chunk. In a sweep the other seeds continue."""
         broken = np.any(metrics["bad_step"] >= 0, axis=1)
-        if not self.config.points or np.all(broken | diverged):
+        if self.ends_with_one or np.all(broken | diverged):
             require_finite(metrics["bad_step"], metrics["bad_reward"], first_step, self.records.last)
         self._tell_given_up(broken & ~diverged)
         return broken
@@ -386,11 +395,11 @@ class _Run:
         """Give up the seeds that the chunk's last update has spoiled, as none of its losses has seen that.
 
         Raises:
-            FloatingPointError: no seed is left, or the run is no sweep. The checkpoint before must stay.
+            FloatingPointError: no seed is left, or none may be given up. The checkpoint before must stay.
         """
         agents = now.state.agent
         spoiled = ~finite_seeds(agents)
-        if not self.config.points or np.all(spoiled | now.diverged):
+        if self.ends_with_one or np.all(spoiled | now.diverged):
             require_finite_parameters(agents, now.steps // self.config.worlds, self.records.last)
         self._tell_given_up(spoiled & ~now.diverged)
         return now._replace(diverged=now.diverged | spoiled)
@@ -398,7 +407,8 @@ class _Run:
     def _tell_given_up(self, seeds: np.ndarray) -> None:
         for k in np.flatnonzero(seeds):
             values = ", ".join(f"{name}={value:g}" for name, value in self.point(int(k)).items())
-            self.console.say(f"seed {self.seeds[k]} of {values} diverged and is given up")
+            name = f"seed {self.seeds[k]} of {values}" if self.config.plan.rule is None else f"number {k}"
+            self.console.say(f"{name} diverged and is given up")
 
     def _select(self, now: _Progress) -> _Progress:
         """Name the best member of a population after an evaluation, and replace the worst ones if that is due."""

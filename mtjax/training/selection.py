@@ -4,10 +4,11 @@ Networks, optimisers and numbers are copied. Worlds, random keys and the replay 
 would take its memory twice, and whoever learns off-policy may learn from what another member did.
 """
 
-from functools import cache, partial
+from functools import cache
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding
 
@@ -34,10 +35,17 @@ def begin(config: RunConfig, state: TrainState) -> TrainState:
     """Return the state, or its shapes, with every member as its own origin; as it is if there is no population."""
     if config.plan.rule is None:
         return state
-    origins = meshes.shard_by_seed(config.mesh, np.arange(config.members, dtype=np.int32))
+    origins = jnp.asarray(meshes.shard_by_seed(config.mesh, np.arange(config.members, dtype=np.int32)))
     if isinstance(state.iteration, jax.ShapeDtypeStruct):
-        origins = jax.ShapeDtypeStruct(origins.shape, origins.dtype, sharding=getattr(origins, "sharding", None))
+        origins = jax.ShapeDtypeStruct(origins.shape, origins.dtype, sharding=origins.sharding)
     return state._replace(origins=origins)
+
+
+def starts(config: RunConfig, seeds: Any) -> Any:
+    """Return the seeds (S,) of evaluations' episodes: all members of a population play the same ones."""
+    if config.plan.rule is None:
+        return seeds
+    return meshes.shard_by_seed(config.mesh, np.full(config.members, config.plan.seed, np.int32))
 
 
 def is_due(config: RunConfig, steps: int) -> bool:
@@ -57,7 +65,7 @@ def select(config: RunConfig, state: TrainState, returns: np.ndarray) -> Chosen:
     numbers = {name: x[sources] for name, x in numbers_of(state).items()}
     if rule.explores:
         numbers = _explored(config.learner, numbers, sources != np.arange(len(sources)), perturb_key)
-    place = partial(meshes.shard_by_seed, config.mesh)
+    place = lambda tree: jax.tree.map(jnp.asarray, meshes.shard_by_seed(config.mesh, tree))
     agent = _gather(config.mesh)(state.agent, meshes.replicate(config.mesh, sources))
     agent = agent._replace(numbers=place(numbers)) if numbers else agent
     return Chosen(state._replace(agent=agent, origins=place(origins[sources])), sources)
