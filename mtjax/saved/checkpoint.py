@@ -87,7 +87,7 @@ def _begin(folder: Path, state: TrainState, record: bytes | None, thread: Thread
     shortage = hosts.largest(_shortage(folder, size_of(state)) if hosts.is_first() else 0)
     if shortage:
         raise _not_written(OSError(shortage, os.strerror(shortage)), folder)
-    parts = {"agent": state.agent, "loop": state._replace(agent=None)}
+    parts = _parts(state)
     try:
         written = arrays.write(new, parts)
     except OSError as error:
@@ -138,6 +138,12 @@ def _finish(written: arrays.Written, record: bytes | None, new: Path, folder: Pa
         shutil.rmtree(old, ignore_errors=True)
 
 
+def _parts(state: TrainState) -> dict[str, Any]:
+    """Return a state as it is written: the agents, and all else by name. Runs without a population have no origins."""
+    loop = state._replace(agent=None)._asdict()
+    return {"agent": state.agent, "loop": {name: x for name, x in loop.items() if name != "origins" or x is not None}}
+
+
 def _shapes(tree: Any) -> Any:
     """Return a tree without its numbers, which the next chunk overwrites."""
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), tree)
@@ -172,12 +178,12 @@ def load(directory: Path, like: TrainState) -> TrainState:
     Raises:
         InputError: there is no whole checkpoint, or it is of another agent or family.
     """
-    like_parts = {"agent": like.agent, "loop": like._replace(agent=None)}
+    like_parts = _parts(like)
     folder = hosts.by_first(_newest_whole)(directory, like_parts)
     if hosts.is_first():
         tell_edits(directory.parent / _RECORD, folder / _RECORD)
     read = _read(folder, like_parts)
-    return read["loop"]._replace(agent=read["agent"])
+    return TrainState(**read["loop"] | {"agent": read["agent"]})
 
 
 def load_agent(directory: Path, like: TrainState, iteration: int = 0) -> Any:
