@@ -282,7 +282,7 @@ class _Run:
         self.records.keep_history(steps)
         diverged = np.zeros(len(self.seeds), bool)
         if len(evaluations.steps) and not self.ends_with_one:
-            diverged = ~np.isfinite(evaluations.returns["train"][:, -1]).all(axis=(1, 2))
+            diverged |= ~np.isfinite(evaluations.returns["train"][:, -1]).all(axis=(1, 2))
         now = _Progress(state, steps, seconds, wall, evaluations, diverged)
         if steps < plan.steps or len(evaluations.steps):
             return now

@@ -74,8 +74,8 @@ def select(config: RunConfig, state: TrainState, returns: np.ndarray) -> Chosen:
 @cache
 def _gather(mesh: Mesh | None) -> Any:
     """Return the program that takes entries (S,) of a tree with leaves (S, ...), compiled once for all selections."""
-    places = {} if mesh is None else {"out_shardings": NamedSharding(mesh, meshes.BY_SEED)}
-    return jax.jit(lambda tree, sources: jax.tree.map(lambda x: x[sources], tree), **places)
+    take = lambda tree, sources: jax.tree.map(lambda x: x[sources], tree)
+    return jax.jit(take) if mesh is None else jax.jit(take, out_shardings=NamedSharding(mesh, meshes.BY_SEED))
 
 
 def _explored(agent: Any, numbers: dict[str, np.ndarray], copies: np.ndarray, key: Any) -> dict[str, np.ndarray]:
