@@ -87,6 +87,19 @@ def test_four_devices_change_no_seed(alone, tmp_path, capfd):
     assert_same(result, alone)
 
 
+def test_a_population_chooses_over_four_devices_as_on_one(tmp_path, monkeypatch):
+    """A member's copy may be on another device than its source."""
+    chunk = len(Walk().tasks().id) * SETTINGS["num_envs"] * SETTINGS["chunk_steps"]
+    given = {"seeds": 2, "population": f"pbt:{2 * chunk}", "sweep": {"tau": [0.1, 0.2]}}
+    result = play(tmp_path / "four", Walk(), 4, **given)
+    assert devices_of(result) == 4 and len(set(np.asarray(result.state.origins).tolist())) == 3
+    monkeypatch.setattr(meshes, "mesh_for", lambda *_: None)
+    alone = play(tmp_path / "alone", Walk(), 4, **given)
+    assert_same(result, alone)
+    rows = [(tmp_path / name / "population.csv").read_text().splitlines() for name in ("four", "alone")]
+    assert len(rows[0]) == 5 and rows[0] == rows[1]
+
+
 def test_donated_state_is_gone(tmp_path):
     """A chunk's replay takes the place of the one before it, on every device."""
     mesh = meshes.mesh_for(4, 2, 2)
