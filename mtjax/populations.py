@@ -18,6 +18,8 @@ from mtjax.types import InputError, Key
 
 FACTORS = (0.8, 1.2)
 """By one of them, drawn at random, each number of a copy is multiplied."""
+NO_INTERVAL = "members of a population are copies of each other: their mean has no interval"
+"""Stands below a table of returns."""
 _PART = 5  # the worst fifth copies the best fifth
 
 

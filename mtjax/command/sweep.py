@@ -24,6 +24,7 @@ from mtjax.command.run_config import parse
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import RunConfig
 from mtjax.evaluation import Evaluations
+from mtjax.populations import NO_INTERVAL
 from mtjax.report.curve import draw
 from mtjax.report.stats import seed_interval
 from mtjax.saved import checkpoint, lock
@@ -250,7 +251,7 @@ def run_unfinished(folder: Path) -> None:
             print(f"{table(rows(runs))}\nstopped; the state is saved. Go on with:\n  python -m mtjax.train {words}")
             sys.exit(128 + signal)
     of_members = any(from_json(run / "config.json").plan.rule for run in runs)
-    told = "\nmembers of a population are copies of each other: their mean has no interval" * of_members
+    told = f"\n{NO_INTERVAL}" * of_members
     print(f"{table(rows(runs))}{told}\nsweep: {folder}")
 
 

@@ -5,6 +5,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
+from mtjax import populations
 from mtjax.command import sweep
 from mtjax.command.run_config import parse
 from mtjax.compiling.programs import enable_compile_cache
@@ -70,8 +73,8 @@ def _conclude(config: RunConfig, result: Result, directory: Path) -> None:
         print(f"stopped; the state is saved. Go on with:\n  python -m mtjax.train {shlex.join(words)}")
         return
     if len(result.evaluations.steps):
-        together = as_one_seed if config.plan.population else lambda found: found
-        print(split_table(together(result.evaluations), config.family.parts))
+        found = as_one_seed(result.evaluations) if config.plan.rule else result.evaluations
+        print(split_table(found, config.family.parts), *[populations.NO_INTERVAL] * bool(config.plan.rule), sep="\n")
         if config.learner.unseen:
             print(f"unseen tasks: {config.learner.unseen}")
     rest = max(result.total_seconds - result.compile_seconds - result.trained_seconds, 0)
@@ -80,5 +83,7 @@ def _conclude(config: RunConfig, result: Result, directory: Path) -> None:
         f"{duration(result.trained_seconds)}, evaluated and saved in {duration(rest)}; run: {directory}"
     )
     words = [f"--run={directory}", *import_flags(config)]
+    if config.plan.rule and len(result.evaluations.steps):
+        words += [f"--point={np.nanargmax(populations.fitness(result.evaluations.returns['train'][:, -1]))}"]
     words += ["--video"] * any(part.family.films for part in config.family.parts)
     print(f"look at it: python -m mtjax.evaluate {shlex.join(words)}")
