@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from mtjax import curricula, frames
+from mtjax.agents.consolidating import consolidate, consolidates
 from mtjax.agents.state import of_tasks, with_tasks
 from mtjax.agents.swept import at_point, with_numbers
 from mtjax.axes import Flat, over_seeds, when
@@ -148,7 +149,7 @@ def require_curriculum(settings: Settings, env: Any, agent: Any) -> None:
     Raises:
         InputError: it cannot.
     """
-    if getattr(agent, "consolidates", False) and not isinstance(settings.plays, curricula.Sequence):
+    if consolidates(agent) and not isinstance(settings.plays, curricula.Sequence):
         raise InputError(
             "continual and reset-optimizer are for tasks one after another: use --curriculum=sequence:STEPS"
         )
@@ -305,16 +306,16 @@ def _take_turns(env: Env, agent: Agent, settings: Settings, known: Task, state: 
 
 def _consolidate(env: Env, agent: Agent, known: Task, state: TrainState) -> Any:
     """Return the agents (S, ...) as they end the task that was played, from whose replay they may learn once more."""
-    if not agent.consolidates:
+    if not consolidates(agent):
         return state.agent
     tasks, experience = rows_of(known, state.rows), agent.experience
 
-    def consolidate(learner: Any, data: Any, key: Key) -> Any:
+    def of_seed(learner: Any, data: Any, key: Key) -> Any:
         draw = lambda key, count: experience.draw(env.spec, agent, data.ring, key, count)
-        return at_point(agent, learner).consolidate(learner, draw, tasks, jax.random.fold_in(key, _END))
+        return consolidate(at_point(agent, learner), learner, draw, tasks, jax.random.fold_in(key, _END))
 
     played = _of_played(state.agent, state.rows)
-    played = over_seeds(consolidate, 0, experience.axes, 0)(played, state.data, state.key)
+    played = over_seeds(of_seed, 0, experience.axes, 0)(played, state.data, state.key)
     return _with_played(state.agent, played, state.rows)
 
 

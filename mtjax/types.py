@@ -283,9 +283,6 @@ class Agent(Protocol):
     def relabel(self, env: Env, task: Task, transition: Transition, key: Key) -> Transition: ...  # as another task's
     def assess(self, state: Any, steps: Transition, tasks: Task) -> tuple[Any, Transition]: ...  # (T, H, E, ...), once
     def adapt(self, state: Any, steps: Transition, tasks: Task) -> Any: ...  # to a rollout (T, H, E, ...) of them
-    @property
-    def consolidates(self) -> bool: ...  # whether anything happens to it where a task of a sequence ends
-    def consolidate(self, state: Any, draw: Any, tasks: Task, key: Key) -> Any: ...  # draw(key, count) of the replay
     def update(self, state: Any, window: Transition, tasks: Task, key: Key, number: Array) -> tuple[Any, Metrics]: ...
     def observe(self, state: Any, steps: Transition, tasks: Task) -> Any: ...  # (T, H, E, ...), once, after learning
     def reset_networks(self, state: Any, spec: Spec, tasks: Task, key: Key) -> Any: ...

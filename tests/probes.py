@@ -118,7 +118,6 @@ class Stub:
     experience: Replay = dataclasses.field(default_factory=Replay)
 
     unroll: ClassVar[int] = 0
-    consolidates: ClassVar[bool] = False
 
     def init(self, spec, tasks, key):
         return jnp.zeros(1)

@@ -28,6 +28,7 @@ from probes import act as act_once
 from probes import values as values_of
 
 from mtjax import agents
+from mtjax.agents import replayed
 from mtjax.agents.base import Memory
 from mtjax.agents.fit import learned
 from mtjax.agents.on_policy import Taken
@@ -162,12 +163,13 @@ def test_no_loss_is_less_than_the_least(name, transition, monkeypatch):
     batch, value = one_task(agent)
     model_targets = batch.model_targets._replace(latent=jnp.full_like(batch.model_targets.latent, 0.3))
     loss, (found, *_) = agent.critic_loss(random_params(agent), batch._replace(model_targets=model_targets), value)
-    np.testing.assert_allclose(loss - agent.least_loss, found["critic_loss"] + 0.5 * found["reward_loss"], rtol=1e-4)
+    least = agent.representation.least_loss
+    np.testing.assert_allclose(loss - least, found["critic_loss"] + 0.5 * found["reward_loss"], rtol=1e-4)
 
 
 def test_networks_on_plain_observations_add_nothing_to_the_least():
     """In SAC as in PPO."""
-    assert tiny("sac").least_loss == tiny("ppo").least_loss == 0
+    assert tiny("sac").representation.least_loss == tiny("ppo").representation.least_loss == 0
 
 
 @pytest.mark.parametrize("transition", slow_but(["deterministic", "probabilistic"], "probabilistic"))
@@ -241,7 +243,7 @@ def test_a_rival_is_always_another_task():
     agent = make("hip-bmdp")
     state, batch, _ = start(agent)
     seen = probes.prepare(agent, state, batch, TASKS)
-    rivals = jit(lambda key: agent.critic_data(state, seen, key)[0].model_targets.other_theta)
+    rivals = jit(lambda key: replayed.critic_data(agent, state, seen, key)[0].model_targets.other_theta)
     thetas, turns = np.asarray(state.nets["representation"].own["embedding"]), set()
     for seed in range(12):
         found = np.asarray(rivals(jax.random.key(seed)))
@@ -251,7 +253,7 @@ def test_a_rival_is_always_another_task():
     first = lambda tree: jax.tree.map(lambda x: x[:1], tree)
     alone = lambda nets: {name: Params(net.shared, first(net.own)) for name, net in nets.items()}
     state = state._replace(nets=alone(state.nets), slow=alone(state.slow))
-    data = pick(agent.critic_data(state, first(seen), KEY), 0)
+    data = pick(replayed.critic_data(agent, state, first(seen), KEY), 0)
     theta_loss = lambda nets: agent.critic_loss(nets, *data)[1].metrics["theta_loss"]
     value, slope = jit(jax.value_and_grad(theta_loss))(of_critics(of_task(state.nets, 0)))
     np.testing.assert_allclose(value, 0, atol=1e-10)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import QUICK, Walk, configure, param, tiny
+from probes import QUICK, Walk, configure, param, pick, prepare, random_batch, tiny
 
 import mtjax
 from mtjax import loop
@@ -95,9 +95,13 @@ def test_the_penalty_is_a_part_of_the_actors_loss():
     held = continual.Anchor({"w": jnp.array([0.5])}, {"w": jnp.array([3.0])})
     assert float(way.penalty(nets | {"continual": Params({"anchor": held}, {})})) == pytest.approx(3.75)
     agent = tiny("sac-conditioned", continual="ewc")
-    agent = put(agent, continual=put(agent.continual, penalty=lambda nets: 7.0))
-    object.__setattr__(agent, "actor_loss", lambda nets, batch, key: (1.0, None))
-    assert agent.remembering_loss({}, None, None) == (8.0, None)
+    state = agent.init(Walk().spec, TASKS, jax.random.key(0))
+    seen = pick(prepare(agent, state, random_batch(0, 3, 4, Walk().spec), TASKS), 0)
+    nets = of_task(state.nets, jnp.int32(0))
+    strict = put(agent, continual=put(agent.continual, penalty=lambda nets: 7.0))
+    (free, _), (held, aux) = (each.actor_loss(nets, seen, jax.random.key(1)) for each in (agent, strict))
+    assert float(held - free) == pytest.approx(7.0)
+    assert float(aux.metrics["actor_loss"]) == pytest.approx(float(free))
 
 
 def test_the_information_of_a_policy_is_that_of_its_gaussian():

@@ -17,6 +17,7 @@ from mtjax.agents.parts.gradients import descent, surgery
 from mtjax.agents.parts.knowing import Knowing, last_steps
 from mtjax.agents.parts.knowing.last_steps import Past
 from mtjax.agents.parts.policies import Gaussian, Policy, policy_for
+from mtjax.agents.parts.remembering import Remembering
 from mtjax.agents.parts.representations import Representation
 from mtjax.agents.parts.samplers import Sampler
 from mtjax.agents.parts.scaling import Scaling
@@ -87,6 +88,12 @@ class BaseAgent(abc.ABC):
     """Whether it plays only families that follow a sketch."""
     one_knowledge: ClassVar[bool] = False
     """Whether tasks share what knows them even where each has networks of its own."""
+    least_loss: ClassVar[float] = 0.0
+    """Lower bound of the critics' loss of a task, without what the representation adds."""
+    continual: ClassVar[Remembering] = Remembering()
+    """How the actor remembers tasks that it learned one after another."""
+    unit_head: ClassVar[bool] = False
+    """Whether the weights of each output of actor and critics keep length 1."""
     hidden: tuple[int, ...] = (256, 256)
     """Widths of the hidden layers in actor and critics."""
     actor_hidden: tuple[int, ...] = ()
@@ -217,11 +224,6 @@ class BaseAgent(abc.ABC):
         }
 
     @property
-    def least_loss(self) -> float | Array:
-        """Lower bound of a task's critic loss: 0 for the critics, plus that of the representation."""
-        return self.representation.least_loss
-
-    @property
     def unroll(self) -> int:
         """Steps L of the windows through which a memory learns; 0 if none does."""
         return self.experience.window_steps(self.conditioning.recurrent_steps) if self.conditioning.recurs else 0  # type: ignore
@@ -267,6 +269,7 @@ class BaseAgent(abc.ABC):
 
     def policy_outputs(self, nets: Nets, features: Array, obs: Any) -> Array:
         """Return the outputs (..., P) of one task's actor, as ``policy`` reads them."""
+        nets = self.continual.seen(nets)
         return self.actor.apply(nets["actor"], *self.view.actor_inputs(nets, features, obs))
 
     def begin(self, state: AgentState, task: Task) -> Memory:
@@ -312,19 +315,6 @@ class BaseAgent(abc.ABC):
         """Return the state with which to play tasks, given one rollout (T, H, E, ...) of them: as it is."""
         return state
 
-    @property
-    def consolidates(self) -> bool:
-        """Whether anything happens to the agent where a task of a sequence ends."""
-        return False
-
-    def consolidate(self, state: AgentState, draw: Any, tasks: Task, key: Key) -> AgentState:
-        """Return the state with which a task (1, ...) of a sequence ends: as it is.
-
-        Args:
-            draw: draws windows (1, count, L, ...) of the replay, by a key and their count.
-        """
-        return state
-
     @abc.abstractmethod
     def update(
         self, state: AgentState, window: Transition, tasks: Task, key: Key, number: Array
@@ -352,4 +342,4 @@ def network_of(agent: BaseAgent, hidden: tuple[int, ...], layer_norm: bool) -> N
     """Return a network of the body and heads that an agent's settings ask for."""
     own = {"shared": (), "per-task": ("head",), "disjoint": ("sight", "body", "head")}[agent.heads]
     front = None if agent.representation.learns else agent.encoder.front()
-    return Network(agent.encoder.body(hidden, layer_norm), own, front)
+    return Network(agent.encoder.body(hidden, layer_norm), own, front, agent.unit_head)

@@ -16,6 +16,12 @@ Draw = Callable[[Key, int], Transition]
 """Draws so many windows (T, count, L, ...) of the replay."""
 
 
+def consolidates(agent: Any) -> bool:
+    """Return whether anything happens to an agent where a task of a sequence ends."""
+    way = getattr(agent, "continual", None)
+    return way is not None and (way.keeps or way.reset_optimizer)
+
+
 def consolidate(agent: Any, state: AgentState, draw: Draw, tasks: Task, key: Key) -> AgentState:
     """Return the state with which a task ends, of an agent that played it alone.
 

@@ -213,7 +213,8 @@ class OnPolicy(BaseAgent):
         if self.representation.learns:
             both, models_key = (state.nets["representation"], state.slow["representation"]), jax.random.fold_in(key, 3)
             batch = batch._replace(model_targets=self.representation.targets(*both, batch.next_obs, models_key)[0])
-        loss, batch = above(self.least_loss, self.critic_loss), self.view.keyed(batch, jax.random.fold_in(key, 4))
+        loss = above(self.least_loss + self.representation.least_loss, self.critic_loss)
+        batch = self.view.keyed(batch, jax.random.fold_in(key, 4))
         state, critic = descend(self.fits, "critic", state, loss, (batch,), critic_order, importance)
         told = critics.explained(state, batch)
         return state, critic.aux | critic.metrics | actor.aux.metrics | actor.metrics | told

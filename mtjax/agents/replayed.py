@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import optax
 
 from mtjax.agents.rates import discounts, discounts_of_all
-from mtjax.agents.state import AgentState
+from mtjax.agents.state import AgentState, Nets, axes_of
 from mtjax.experience import pictures
 from mtjax.networks import Params
 from mtjax.types import Array, Key, Metrics, Task, Transition
@@ -87,6 +87,31 @@ def transitions(agent: Any, window: Transition, tasks: Task) -> Transition:
 def action_sizes(action: Array, mask: Array | None) -> Array:
     """Count the actions (T,) that each task has, of actions (T, ..., A) with a mask (T, A), or without one."""
     return jnp.full(len(action), action.shape[-1]) if mask is None else jnp.sum(mask, axis=-1)
+
+
+def critic_data(agent: Any, state: AgentState, batch: Batch, key: Key) -> tuple[Batch, Any]:
+    """Return the data of the critics' loss for all tasks (T, ...): the batch, and the targets."""
+    representation = state.nets["representation"]
+    followed = state.slow["representation"].filled(representation)
+    slow = state.nets | state.slow | {"representation": followed}
+    model_targets, keys = agent.representation.targets(representation, followed, batch.next_obs, key)
+    target = jax.vmap(agent.critic_target, (axes_of(state.nets), axes_of(slow), 0, 0))
+    return batch._replace(model_targets=model_targets), target(state.nets, slow, batch, keys)
+
+
+def fitted(
+    agent: Any, loss: Array, q: Array, target: Any, nets: Nets, batch: Batch, statistics: Any = None
+) -> tuple[Array, CriticAux]:
+    """Add the losses of what critics see by to theirs (), and return the sum with what all of them found.
+
+    Args:
+        q: the critics' outputs (N, B, outputs), which are fitted to ``target``.
+        statistics: new running statistics of the critics' bodies, if they have any.
+    """
+    values, expected = agent.value.mean(q), agent.value.expected(target)
+    metrics = {"critic_loss": loss, "value": jnp.mean(values), "td_error": jnp.mean(jnp.abs(values - expected))}
+    loss, metrics = agent.view.join(loss, metrics, nets, batch)
+    return loss, CriticAux(metrics, expected, statistics or {})
 
 
 def update_target(agent: Any, state: AgentState) -> AgentState:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from mtjax.agents import combinations, consolidating, replayed
+from mtjax.agents import combinations, replayed
 from mtjax.agents.base import BaseAgent, Memory
 from mtjax.agents.choices import FLAT
 from mtjax.agents.fit import Fit, above, descend
@@ -16,10 +16,10 @@ from mtjax.agents.parts.remembering import Remembering
 from mtjax.agents.parts.values import Value, reduce
 from mtjax.agents.rates import scheduled
 from mtjax.agents.replayed import ActorAux, Batch, CriticAux, Sample
-from mtjax.agents.state import AgentState, Nets, axes_of
+from mtjax.agents.state import AgentState, Nets
 from mtjax.axes import when
 from mtjax.experience import Replay
-from mtjax.networks import Network, Params
+from mtjax.networks import Params
 from mtjax.types import Acted, Array, Key, Metrics, Sometimes, Task, Transition
 
 
@@ -73,14 +73,6 @@ class SAC(BaseAgent):
 
     # Networks.
 
-    @property
-    def actor(self) -> Network:
-        return dataclasses.replace(super().actor, unit_head=self.unit_head)
-
-    @property
-    def critic(self) -> Network:
-        return dataclasses.replace(super().critic, unit_head=self.unit_head)
-
     def init_networks(self, num_tasks: int, actor_inputs: tuple, critic_inputs: tuple, action: Array, key: Key) -> Nets:
         actor_key, critic_key = jax.random.split(key)
         init_critic = lambda k: self.critic.init(k, num_tasks, self.value.outputs, *critic_inputs, action)
@@ -110,9 +102,6 @@ class SAC(BaseAgent):
         outputs = self.policy_outputs(*self.view.acting(state, memory, obs, task))
         return Acted(self.policy.draw(outputs, task.action_mask, key).action)
 
-    def policy_outputs(self, nets: Nets, features: Array, obs: Any) -> Array:
-        return super().policy_outputs(self.continual.seen(nets), features, obs)
-
     # Losses of one task.
 
     def sample(self, nets: Nets, batch: Batch, obs: Any, key: Key) -> Sample:
@@ -132,39 +121,20 @@ class SAC(BaseAgent):
     def critic_target(self, nets: Nets, slow: Nets, batch: Batch, key: Key) -> Any:
         """Compute the critic target y (B, ...), in the form that ``value.loss`` takes."""
         action, _, cost = self.sample(nets, batch, batch.next_obs, key)
-        return self.bootstrap(self.q(slow, batch.features, batch.next_obs, action), batch, cost)
-
-    def bootstrap(self, outputs: Array, batch: Batch, cost: Array) -> Any:
-        """Compute the critic target from the target critics' ``outputs`` (N, B, outputs) at the next states."""
-        bonus = -batch.temperature * cost
-        return self.value.target(outputs, self.critic_reduction == "min", batch.reward, batch.discount, bonus)
+        next_q, bonus = self.q(slow, batch.features, batch.next_obs, action), -batch.temperature * cost
+        return self.value.target(next_q, self.critic_reduction == "min", batch.reward, batch.discount, bonus)
 
     def critic_loss(self, nets: Nets, batch: Batch, target: Any) -> tuple[Array, CriticAux]:
-        return self.fitting_loss(self.q(nets, batch.features, batch.obs, batch.action), target, nets, batch)
-
-    def fitting_loss(self, outputs: Array, target: Any, nets: Nets, batch: Batch) -> tuple[Array, CriticAux]:
-        """Compute the critic loss of ``outputs`` (N, B, outputs) for a result of ``bootstrap``."""
-        loss = jnp.mean(jnp.sum(self.value.loss(outputs, target), axis=0))
-        values, expected = self.value.mean(outputs), self.value.expected(target)
-        td_error = jnp.mean(jnp.abs(values - expected))
-        metrics = {"critic_loss": loss, "value": jnp.mean(values), "td_error": td_error}
-        loss, metrics = self.view.join(loss, metrics, nets, batch)
-        return loss, CriticAux(metrics, expected)
+        q = self.q(nets, batch.features, batch.obs, batch.action)
+        loss = jnp.mean(jnp.sum(self.value.loss(q, target), axis=0))
+        return replayed.fitted(self, loss, q, target, nets, batch)
 
     def actor_loss(self, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:
-        return self.policy_loss(self.sample(nets, batch, batch.obs, key), nets, batch)
-
-    def policy_loss(self, sample: Sample, nets: Nets, batch: Batch) -> tuple[Array, ActorAux]:
-        """Compute the actor loss of actions sampled at a batch's observations."""
-        action, log_prob, cost = sample
+        """Compute the actor loss, with what holds the actor to earlier tasks of a sequence."""
+        action, log_prob, cost = self.sample(nets, batch, batch.obs, key)
         value = reduce(self.values(nets, batch.features, batch.obs, action), self.critic_reduction == "min")
         loss, entropy = jnp.mean(batch.temperature * cost - value), -jnp.mean(log_prob)
-        return loss, ActorAux({"actor_loss": loss, "entropy": entropy}, entropy)
-
-    def remembering_loss(self, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:
-        """Compute the actor loss, with what holds the actor to earlier tasks of a sequence."""
-        loss, aux = self.actor_loss(nets, batch, key)
-        return loss + self.continual.penalty(nets), aux
+        return loss + self.continual.penalty(nets), ActorAux({"actor_loss": loss, "entropy": entropy}, entropy)
 
     def temperature_loss(self, nets: Nets, entropy: Array, action_size: Array) -> tuple[Array, None]:
         """Compute the loss of one task's temperature, by the entropy () of its policy."""
@@ -187,16 +157,15 @@ class SAC(BaseAgent):
         before = state.nets["representation"]
         importance = self.sampler.weights(state.nets["sampler"].own, batch.temperature)
 
-        data = self.critic_data(state, batch, target_key)
-        loss = above(self.least_loss, self.critic_loss)
+        data = replayed.critic_data(self, state, batch, target_key)
+        loss = above(self.least_loss + self.representation.least_loss, self.critic_loss)
         state, fitted = descend(self.fits, "critic", state, loss, data, critic_order, importance)
         state = replayed.with_statistics(state, "critic", fitted.aux.statistics)
 
         def improve(state: AgentState) -> tuple[AgentState, Metrics]:
             seen = {"representation": self.representation.for_actor(representation, before)}
-            data = (batch, jax.random.split(actor_key, len(batch.temperature)))
-            before_step, loss = state.nets, self.remembering_loss
-            state, improved = descend(self.fits, "actor", state, loss, data, actor_order, importance, seen)
+            data, before_step = (batch, jax.random.split(actor_key, len(batch.temperature))), state.nets
+            state, improved = descend(self.fits, "actor", state, self.actor_loss, data, actor_order, importance, seen)
             state = state._replace(nets=self.continual.kept(before_step, state.nets))
             state = replayed.with_statistics(state, "actor", improved.aux.statistics)
             data = (improved.aux.entropy, replayed.action_sizes(batch.action, batch.mask))
@@ -211,19 +180,3 @@ class SAC(BaseAgent):
 
         state = replayed.renew_scales(self, replayed.update_target(self, state), fitted.aux.expected)
         return state, fitted.aux.metrics | actor_metrics | {"temperature": batch.temperature} | fitted.metrics
-
-    @property
-    def consolidates(self) -> bool:
-        return self.continual.keeps or self.continual.reset_optimizer
-
-    def consolidate(self, state: AgentState, draw: consolidating.Draw, tasks: Task, key: Key) -> AgentState:
-        return consolidating.consolidate(self, state, draw, tasks, key)
-
-    def critic_data(self, state: AgentState, batch: Batch, key: Key) -> tuple[Batch, Any]:
-        """Return the data of the critics' loss for all tasks (T, ...): the batch, and the targets."""
-        representation = state.nets["representation"]
-        followed = state.slow["representation"].filled(representation)
-        slow = state.nets | state.slow | {"representation": followed}
-        model_targets, keys = self.representation.targets(representation, followed, batch.next_obs, key)
-        target = jax.vmap(self.critic_target, (axes_of(state.nets), axes_of(slow), 0, 0))
-        return batch._replace(model_targets=model_targets), target(state.nets, slow, batch, keys)

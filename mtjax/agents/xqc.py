@@ -6,12 +6,13 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from mtjax.agents import replayed
 from mtjax.agents.choices import FLAT
 from mtjax.agents.parts.encoders import BatchNorm, Encoder
 from mtjax.agents.parts.knowing import Knowing, Parameters
 from mtjax.agents.parts.scaling import ReturnNormalization, Scaling
-from mtjax.agents.parts.values import C51, Value
-from mtjax.agents.replayed import ActorAux, Batch, CriticAux, Sample
+from mtjax.agents.parts.values import C51, Value, reduce
+from mtjax.agents.replayed import ActorAux, Batch, CriticAux
 from mtjax.agents.sac import SAC
 from mtjax.agents.state import Nets
 from mtjax.types import Array, Key
@@ -81,16 +82,18 @@ class XQC(SAC):
 
     def critic_target(self, nets: Nets, slow: Nets, batch: Batch, key: Key) -> Aim:
         action, _, cost = self.sample(nets, batch, batch.next_obs, key)
-        _, outputs, _ = self.q_of_both(slow, batch, action)
-        return Aim(self.bootstrap(outputs, batch, cost), action)
+        _, next_q, _ = self.q_of_both(slow, batch, action)
+        low, bonus = self.critic_reduction == "min", -batch.temperature * cost
+        return Aim(self.value.target(next_q, low, batch.reward, batch.discount, bonus), action)
 
     def critic_loss(self, nets: Nets, batch: Batch, target: Aim) -> tuple[Array, CriticAux]:
-        outputs, _, found = self.q_of_both(nets, batch, target.next_action)
-        loss, aux = self.fitting_loss(outputs, target.target, nets, batch)
-        return loss, aux._replace(statistics=found)
+        q, _, statistics = self.q_of_both(nets, batch, target.next_action)
+        loss = jnp.mean(jnp.sum(self.value.loss(q, target.target), axis=0))
+        return replayed.fitted(self, loss, q, target.target, nets, batch, statistics)
 
     def actor_loss(self, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:
-        outputs, found = self.actor.fit(nets["actor"], *self.view.actor_inputs(nets, batch.features, batch.obs))
+        outputs, statistics = self.actor.fit(nets["actor"], *self.view.actor_inputs(nets, batch.features, batch.obs))
         action, _, log_prob = self.policy.draw(outputs, batch.mask, key)
-        loss, aux = self.policy_loss(Sample(action, log_prob, log_prob), nets, batch)
-        return loss, aux._replace(statistics=found)
+        value = reduce(self.values(nets, batch.features, batch.obs, action), self.critic_reduction == "min")
+        loss, entropy = jnp.mean(batch.temperature * log_prob - value), -jnp.mean(log_prob)
+        return loss, ActorAux({"actor_loss": loss, "entropy": entropy}, entropy, statistics)

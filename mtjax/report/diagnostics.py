@@ -20,7 +20,7 @@ from mtjax import frames
 from mtjax.agents import SAC
 from mtjax.agents.fit import Problem, above
 from mtjax.agents.parts.gradients import surgery
-from mtjax.agents.replayed import prepare
+from mtjax.agents.replayed import critic_data, prepare
 from mtjax.agents.state import Nets, axes_of
 from mtjax.experience.ring import Ring
 from mtjax.networks import Network, Params, ReLU
@@ -123,8 +123,8 @@ def compare_gradients(agent: SAC, state: Any, window: Transition, tasks: Task, k
     """
     target_key, actor_key = jax.random.split(key)
     seen = prepare(agent, state, window, tasks)
-    loss, data = above(agent.least_loss, agent.critic_loss), agent.critic_data(state, seen, target_key)
-    critic, aux = _compare(agent.fits["critic"].problem(loss, state.nets, data))
+    least, data = agent.least_loss + agent.representation.least_loss, critic_data(agent, state, seen, target_key)
+    critic, aux = _compare(agent.fits["critic"].problem(above(least, agent.critic_loss), state.nets, data))
     data = (seen, jax.random.split(actor_key, state.num_tasks))
     actor, _ = _compare(agent.fits["actor"].problem(agent.actor_loss, state.nets, data))
     return {"critic": critic, "actor": actor, "td_error": aux.metrics["td_error"]}
