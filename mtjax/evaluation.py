@@ -18,7 +18,7 @@ from mtjax.axes import over_seeds
 from mtjax.names import replacing
 from mtjax.rollout import EnvStep, Worlds, reset_ended, reset_envs, split_keys, step_envs, world_keys
 from mtjax.trials import of_episodes
-from mtjax.types import SPLITS, Agent, Array, Env, InputError, Key, Task, Transition
+from mtjax.types import SPLITS, Adapting, Agent, Array, Env, InputError, Key, Task, Transition
 
 _EVER = "success_ever"  # the metric that success was 1 at any step of an episode
 
@@ -220,7 +220,7 @@ def evaluate(
 
 @partial(jax.jit, static_argnums=(0, 1, 2, 3))
 def adapted(
-    env: Env, agent: Agent, num_envs: int, updates: int, state: Any, tasks: Task, seeds: Array, number: Array
+    env: Env, agent: Adapting, num_envs: int, updates: int, state: Any, tasks: Task, seeds: Array, number: Array
 ) -> tuple[Any, Task]:
     """Let agents adapt to tasks, by as long rollouts in fresh worlds as between their adaptations in training.
 

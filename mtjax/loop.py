@@ -15,6 +15,7 @@ import jax.numpy as jnp
 
 from mtjax import curricula, frames
 from mtjax.agents.consolidating import consolidate, consolidates
+from mtjax.agents.fit import reset_networks
 from mtjax.agents.state import of_tasks, with_tasks
 from mtjax.agents.swept import at_point, with_numbers
 from mtjax.axes import Flat, over_seeds, when
@@ -446,7 +447,10 @@ def _reset_networks(env, agent, tasks, learners: Any, iteration: Array, keys: Ke
     before = iteration - 1
     passed = before // experience.reset_every > jnp.maximum(before - experience.steps, 0) // experience.reset_every
     due = (before > experience.warmup_steps) & passed
-    one = lambda state, key: at_point(agent, state).reset_networks(state, env.spec, tasks, jax.random.fold_in(key, 1))
+
+    def one(state: Any, key: Key) -> Any:
+        return reset_networks(at_point(agent, state), state, env.spec, tasks, jax.random.fold_in(key, 1))
+
     return jax.lax.cond(due, lambda states: over_seeds(one, 0, 0)(states, keys), lambda states: states, learners)
 
 

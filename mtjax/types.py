@@ -280,9 +280,12 @@ class Agent(Protocol):
     def act(self, state: Any, memory: Any, obs: Any, task: Task, key: Key | None) -> Acted: ...
     # After a step, whose next observation is here the one from before any reset:
     def remember(self, state: Any, memory: Any, transition: Transition, task: Task) -> Any: ...
-    def relabel(self, env: Env, task: Task, transition: Transition, key: Key) -> Transition: ...  # as another task's
     def assess(self, state: Any, steps: Transition, tasks: Task) -> tuple[Any, Transition]: ...  # (T, H, E, ...), once
-    def adapt(self, state: Any, steps: Transition, tasks: Task) -> Any: ...  # to a rollout (T, H, E, ...) of them
     def update(self, state: Any, window: Transition, tasks: Task, key: Key, number: Array) -> tuple[Any, Metrics]: ...
     def observe(self, state: Any, steps: Transition, tasks: Task) -> Any: ...  # (T, H, E, ...), once, after learning
-    def reset_networks(self, state: Any, spec: Spec, tasks: Task, key: Key) -> Any: ...
+
+
+class Adapting(Agent, Protocol):
+    """An agent that adapts to its tasks between the rollouts of its experience."""
+
+    def adapt(self, state: Any, steps: Transition, tasks: Task) -> Any: ...  # to a rollout (T, H, E, ...) of them

@@ -135,9 +135,6 @@ class Stub:
     def remember(self, state, memory, transition, task):
         return memory
 
-    def relabel(self, env, task, transition, key):
-        return env.relabel(task, transition, key)
-
     def assess(self, state, steps, tasks):
         return state, steps
 

@@ -19,6 +19,7 @@ from mtjax.agents.parts.representations import REPRESENTATIONS
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.values import VALUES
+from mtjax.agents.view import init_inputs
 from mtjax.axes import over_learners
 from mtjax.networks import Params
 from mtjax.rollout import Worlds
@@ -256,7 +257,7 @@ def test_every_method_says_what_differs_from_its_paper():
 def test_what_lies_far_from_what_was_learned_is_clipped(name):
     """What the networks see of observations and of the past, in acting and in learning; nothing if not normalised."""
     agent = tiny(name, normalize_observations=True, conditioning="inferred", inferred_from=2)
-    inputs = agent.view.count(agent.view.init(SPEC, 3), random_batch(0, 3, BATCH, SPEC).obs)
+    inputs = agent.view.count(init_inputs(SPEC, 3), random_batch(0, 3, BATCH, SPEC).obs)
     obs, past = jnp.full((3, BATCH, 3), 1e3), random_past(np.random.default_rng(0), (3, BATCH, 2), SPEC)
     past = past._replace(obs=jnp.full_like(past.obs, -1e3))
     for see in (agent.view.see, agent.view.see_all):

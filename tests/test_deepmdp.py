@@ -35,7 +35,8 @@ from mtjax.agents.on_policy import Taken
 from mtjax.agents.parts.gradients.balancing import FAMO
 from mtjax.agents.parts.knowing.last_steps import Past, Seen, append
 from mtjax.agents.parts.representations.deepmdp import ModelTargets
-from mtjax.agents.replayed import Batch
+from mtjax.agents.replayed import Batch, slow_copies
+from mtjax.agents.unseen import unseen
 from mtjax.networks import Params
 from mtjax.types import InputError, Spec, Transition
 
@@ -368,7 +369,7 @@ def test_the_target_is_the_slow_encoders():
     agent = make("deepmdp")
     nets = random_params(agent)
     batch, _ = one_task(agent)
-    slow = jax.tree.map(lambda x: x * 1.5 + 0.05, agent.init_slow(nets))
+    slow = jax.tree.map(lambda x: x * 1.5 + 0.05, slow_copies(agent, nets | {"knowing": Params({}, {})}))
     assert set(slow["critic"].shared) == {"body", "head"} and set(slow["representation"].shared) == {"latent"}
     every = lambda tree: jax.tree.map(lambda x: x[None], tree)  # one task is all
     of_all = lambda params: params._replace(own=every(params.own))
@@ -403,7 +404,7 @@ def test_theta_of_an_unseen_task(strategy):
         np.testing.assert_allclose(act(state, pick(TASKS, i)), expected, atol=1e-6)
     assert make("hip-bmdp").representation.unseen_theta == "mean"  # the others' parameters are hidden
     assert (
-        agent.unseen
+        unseen(agent)
         == {
             "nearest": "each uses the theta of the nearest training task",
             "zero": "each has zeros for theta",
@@ -427,7 +428,7 @@ def test_theta_of_an_unseen_task_is_inferred_from_its_last_steps():
     other = past._replace(reward=past.reward + 1.0)
     assert not np.allclose(act(state, past, STRANGER), act(state, other, STRANGER))
     np.testing.assert_array_equal(act(state, past, pick(TASKS, 0)), act(state, other, pick(TASKS, 0)))
-    assert agent.unseen == "each has a theta inferred from its last steps"
+    assert unseen(agent) == "each has a theta inferred from its last steps"
 
 
 @pytest.mark.slow

@@ -19,6 +19,7 @@ from mtjax.agents.parts.policies import Gaussian
 from mtjax.agents.replayed import Batch
 from mtjax.agents.sac import SAC
 from mtjax.agents.state import axes_of
+from mtjax.agents.unseen import unseen
 from mtjax.networks import Params
 from mtjax.types import InputError, Spec
 
@@ -356,7 +357,7 @@ def test_training_tasks_play_their_own_policies_and_others_the_distilled_one(sta
         unseen = pick(TASKS, 0)._replace(id=jnp.int32(number), context=jnp.float32([context]))
         np.testing.assert_allclose(act(unseen), mean(common), rtol=1e-5)
     assert len(np.unique(np.stack([mean(x) for x in (*own, common)]), axis=0)) == 4
-    assert made.unseen == "the distilled policy plays them"
+    assert unseen(made) == "the distilled policy plays them"
 
 
 @pytest.mark.parametrize("conditioning", one_in(2, ["one-hot", "parameters", "embedding"]))
@@ -368,7 +369,7 @@ def test_a_distilled_policy_may_be_told_the_task(conditioning):
         np.asarray(act_once(made, fresh, jnp.ones(3), pick(TASKS, i)._replace(id=jnp.int32(7)), None)) for i in (0, 1)
     ]
     assert not np.allclose(played[0], played[1], atol=1e-3)
-    assert ("nearest" in made.unseen) == (conditioning != "parameters")
+    assert ("nearest" in unseen(made)) == (conditioning != "parameters")
 
 
 # What makes no sense.
@@ -380,7 +381,7 @@ def test_a_distilled_policy_may_be_told_the_task(conditioning):
         ({"distral_alpha": 1.1}, r"distral-alpha must be in \[0, 1\], not 1.1"),
         ({"distral_alpha": float("nan")}, "distral-alpha must be"),
         ({"heads": "per-task"}, "a policy of its own: heads is disjoint, not per-task"),
-        ({"gradients": "pcgrad"}, "gradients=pcgrad has nothing to do; use gradients=mean"),
+        ({"gradients": "pcgrad"}, "no parameters that tasks share for gradients=pcgrad; use mean"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(settings, message):

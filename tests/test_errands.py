@@ -12,6 +12,7 @@ from probes import QUICK, tiny, with_nets
 from test_craft import restated
 
 import mtjax
+from mtjax.agents import for_action
 from mtjax.agents.parts.knowing.text import encode
 from mtjax.envs.craft.errands import ERRANDS, THINGS
 from mtjax.networks import Params
@@ -118,7 +119,7 @@ def test_sentences_that_were_never_said_are_understood_by_what_they_share_with_o
 @needs("sklearn")
 def test_an_agent_reads_the_sentence_of_every_split():
     """By conditioning=text each task's features are its own sentence's, held out or not."""
-    agent = tiny("ppo", conditioning="text").for_action(ENV.action)
+    agent = for_action(tiny("ppo", conditioning="text"), ENV.action)
     state = jax.eval_shape(lambda: agent.init(ENV.spec, ENV.tasks(), jax.random.key(0)))
     table, tasks = agent.conditioning.table(ENV.spec, 96), ENV.tasks("all")
     known = Params({"given": table, "known": ENV.tasks().context}, {})

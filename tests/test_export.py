@@ -17,6 +17,7 @@ from probes import FEW, family_for, pick, slow_but, tiny, with_nets
 import mtjax
 import mtjax.evaluate
 from mtjax import agents, standalone
+from mtjax.agents import for_action
 from mtjax.agents.state import AgentState
 from mtjax.networks import Params
 from mtjax.saved.export import require_file
@@ -73,7 +74,7 @@ def test_all_forms_act_as_the_policy(name, tmp_path):
 def test_a_choice_is_the_policys_in_all_forms(tmp_path):
     """Of a family of discrete actions: a number, of which every one is chosen somewhere."""
     env = mtjax.make("two-goal-maze-seen")
-    policy = policy_of(tiny("ppo", hidden=(16,)).for_action(env.spec.action), env)
+    policy = policy_of(for_action(tiny("ppo", hidden=(16,)), env.spec.action), env)
     actor = policy.state.nets["actor"]
     head = jax.tree.map(lambda x: 100 * x, actor.shared["head"])
     actor = actor._replace(shared=actor.shared | {"head": head})

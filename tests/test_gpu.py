@@ -28,7 +28,7 @@ from test_rocking import ROCKING, tilting
 
 import mtjax
 from mtjax import loop, rollout
-from mtjax.agents import AGENTS
+from mtjax.agents import AGENTS, for_action
 from mtjax.agents.base import Memory
 from mtjax.agents.choices import replace
 from mtjax.agents.on_policy import Taken
@@ -115,7 +115,7 @@ def learned(name, tasks):
     """
     agent = mtjax.preset("finger-spin-vary-size", name.removeprefix("discrete-"), "gpu").learner
     spec = spec_for(name)
-    agent = agent.for_action(spec.action)
+    agent = for_action(agent, spec.action)
     if not hasattr(agent, "critic_target"):
         agent = replace(agent, {"epochs": 1, "minibatches": 1, "unroll": 8})
     random = np.random.default_rng(0)

@@ -8,6 +8,7 @@ from probes import SPEC, learner, of_task, pick, random_batch, tasks_of, tiny
 
 from mtjax.agents import PARTS, replayed
 from mtjax.agents.parts.knowing import CONDITIONINGS, Embedding
+from mtjax.agents.view import init_inputs
 from mtjax.types import InputError
 
 TASKS = tasks_of("one-step", np.linspace(0.5, 1.5, 3))
@@ -88,7 +89,7 @@ def test_what_is_told_has_the_promised_attributes(name, tmp_path):
     def shown():
         nets = of_task(made.init(spec, TASKS, KEY).nets, 0)
         given = made.conditioning.given(jnp.int32(0), pick(TASKS, 0), 3, jnp.ones((3, 2)))
-        return made.view.know(nets, given, made.view.example(spec, made.view.init(spec, 3)))
+        return made.view.know(nets, given, made.view.example(spec, init_inputs(spec, 3)))
 
     features, obs = shown()
     assert (features.shape[-1] > 0) == made.conditioning.tells

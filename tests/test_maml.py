@@ -10,7 +10,7 @@ from probes import Walk, of_task, only_seed, pick, tiny, train, with_nets
 
 import mtjax
 from mtjax import loop
-from mtjax.agents import agent, clipped
+from mtjax.agents import agent, clipped, for_action
 from mtjax.agents.maml import MAML
 from mtjax.agents.on_policy import Taken
 from mtjax.agents.parts.adaptation import adapted_gain
@@ -32,7 +32,7 @@ PLAIN = {
 
 def armed(**settings):
     """An agent for two arms, and its state at the log odds x of the first one."""
-    made = tiny("maml", unroll=1, epochs=1, **{**PLAIN, **settings}).for_action(SPEC.action)
+    made = for_action(tiny("maml", unroll=1, epochs=1, **{**PLAIN, **settings}), SPEC.action)
     return made, made.init(SPEC, TASKS, KEY)
 
 

@@ -9,6 +9,7 @@ import pytest
 from probes import QUICK, tiny
 
 from mtjax import loop
+from mtjax.agents import for_action
 from mtjax.config import configure
 from mtjax.envs.mtenv.maze import MazeState, TwoGoalMaze
 from mtjax.types import Discrete, InputError, Spec
@@ -206,7 +207,7 @@ def test_both_tasks_and_nothing_between():
 )
 def test_an_agent_trains_on_it(env, name, given):
     """Traced, not run: the loop, agent and tasks fit together; the loop counts time."""
-    agent = tiny(name).for_action(env.spec.action)
+    agent = for_action(tiny(name), env.spec.action)
     agent, settings = configure(agent, loop.Settings(), {"num_envs": 2, "chunk_steps": 2, **given})
     assert env.episode_length == 200
     state = jax.eval_shape(lambda: loop.init(env, agent, settings, env.tasks(), jnp.arange(1)))

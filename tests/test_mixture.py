@@ -18,11 +18,12 @@ import mtjax
 import mtjax.evaluate
 import mtjax.train
 from mtjax import agents, rollout
-from mtjax.agents import normalize
+from mtjax.agents import for_action, normalize
 from mtjax.agents.parts.policies import Gaussian
 from mtjax.agents.rates import discounts
 from mtjax.agents.replayed import Batch, action_sizes
 from mtjax.agents.state import AgentState
+from mtjax.agents.view import init_inputs
 from mtjax.command import run_config
 from mtjax.envs import ENVS, Family, Mixture, make, mixture
 from mtjax.envs.parameters import Parameter
@@ -395,7 +396,7 @@ def test_every_task_has_its_own_normaliser_and_padding_stays_zero():
     agent, random = tiny(normalize_observations=True), np.random.default_rng(0)
     obs = jnp.float32(random.normal(size=(4, 50, 3)) * [[[1]], [[2]], [[5]], [[9]]])
     obs = obs.at[:3, :, 2].set(0.0)  # of the three tasks that see two numbers
-    inputs = agent.view.count(agent.view.init(BOTH.spec, 4), obs)
+    inputs = agent.view.count(init_inputs(BOTH.spec, 4), obs)
     seen = quick(jax.vmap(agent.view.see, (OVER_TASKS, 0)), inputs, obs)
     assert not np.any(seen[:3, :, 2])
     for i, width in enumerate((2, 2, 2, 3)):
@@ -728,7 +729,7 @@ def test_families_of_discrete_actions_mix():
     tasks = env.tasks()
     assert env.discrete and env.spec.action == Discrete(5)
     assert tasks.action_mask.tolist() == [[1, 1, 0, 0, 0]] * 2 + [[1] * 5] * 2
-    agent = tiny("ppo").for_action(env.spec.action)
+    agent = for_action(tiny("ppo"), env.spec.action)
     state, keys = agent.init(env.spec, tasks, jax.random.key(1)), jax.random.split(jax.random.key(0), 200)
     act = lambda task, key: agent.act(state, agent.begin(state, task), jnp.ones(env.spec.obs_size), task, key).action
     actions = jax.vmap(jax.vmap(act, (None, 0)), (0, None))(tasks._replace(blocks=None), keys)

@@ -13,6 +13,7 @@ from probes import slow_but, tiny, train
 
 import mtjax
 from mtjax import agents, frames, standalone
+from mtjax.agents import for_action
 from mtjax.agents.combinations import require_sight
 from mtjax.envs import ENVS, Parameter
 from mtjax.envs.family import Family
@@ -137,7 +138,7 @@ def test_a_replay_keeps_ints_as_ints():
 
 
 def policy_of(env, name="ppo", **given):
-    agent = tiny(name, **given).for_action(env.spec.action)
+    agent = for_action(tiny(name, **given), env.spec.action)
     state = jax.jit(lambda key: agent.init(env.spec, env.tasks(), key))(jax.random.key(0))
     return Policy(env, agent, state, None, jnp.arange(1))
 

@@ -9,6 +9,7 @@ import pytest
 from probes import of_task, tiny
 
 import mtjax
+from mtjax.agents import for_action
 from mtjax.agents.parts.policies import Categorical, Gaussian, policy_for
 from mtjax.agents.ppo import Batch
 from mtjax.envs.probes import tasks_of
@@ -107,7 +108,7 @@ def test_gaussian_draws(mask):
 
 def test_all_actions_are_as_likely_at_first():
     """PPO's first entropy is log A: heads are small, and biases 0."""
-    agent, spec = tiny("ppo").for_action(Discrete(5)), Spec.vector(3, 5, 100)._replace(action=Discrete(5))
+    agent, spec = for_action(tiny("ppo"), Discrete(5)), Spec.vector(3, 5, 100)._replace(action=Discrete(5))
     tasks = mtjax.make("tabular-mdp", num_tasks=2).tasks()
     state = agent.init(spec, tasks, KEY)
     task = jax.tree.map(lambda x: x[0], tasks)
@@ -121,7 +122,7 @@ def test_the_policy_gradient_of_a_bandit():
     Every arm is in the batch once, and counts by its probability, as if it had been drawn so often.
     """
     rewards, spec = np.float32([0.1, 0.9, 0.4, 0.7]), Spec.vector(1, 4, 1)._replace(action=Discrete(4))
-    agent = tiny("ppo", conditioning="none", entropy_cost=0.0, normalize_observations=False).for_action(spec.action)
+    agent = for_action(tiny("ppo", conditioning="none", entropy_cost=0.0, normalize_observations=False), spec.action)
     tasks = jax.tree.map(lambda x: x[:1], tasks_of("one-step", (1.0, 0.5)))
     nets = of_task(agent.init(spec, tasks, KEY).nets, 0)
     head = nets["actor"].shared["head"] | {"bias": jnp.asarray(LOGITS[0])}
@@ -200,14 +201,14 @@ def test_agents_of_continuous_actions_are_refused_before_anything_is_compiled():
     bandit = mtjax.make("bandit")
     with pytest.raises(InputError, match="SAC draws no discrete actions"):
         tiny("sac").init(bandit.spec, bandit.tasks(), KEY)
-    with pytest.raises(InputError, match=r"PPO was not made for these discrete actions: agent.for_action"):
+    with pytest.raises(InputError, match=r"PPO was not made for these discrete actions: for_action\(agent"):
         tiny("ppo").init(bandit.spec, bandit.tasks(), KEY)
 
 
 def test_past_actions_are_kept_as_numbers_and_seen_as_vectors():
     """By agents that infer their task from the last steps; those before the first step are not known."""
     env = mtjax.make("bandit", num_tasks=2)
-    agent = tiny("ppo", conditioning="inferred", inferred_from=3).for_action(env.spec.action)
+    agent = for_action(tiny("ppo", conditioning="inferred", inferred_from=3), env.spec.action)
     state, task = agent.init(env.spec, env.tasks(), KEY), jax.tree.map(lambda x: x[0], env.tasks())
     step = Transition(jnp.zeros(1), jnp.int32(3), jnp.float32(1), jnp.float32(1), jnp.zeros(1))
     past = agent.remember(state, agent.begin(state, task), step, task).past

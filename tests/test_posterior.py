@@ -15,6 +15,7 @@ from test_recurrent import Ratios
 
 import mtjax
 from mtjax import agents
+from mtjax.agents import for_action
 from mtjax.agents.base import Memory
 from mtjax.agents.on_policy import Taken
 from mtjax.agents.parts.knowing.inference import Belief, change, divergence, factor, product, unit
@@ -367,7 +368,7 @@ def test_other_agents_that_learn_from_rollouts_train_it_too(name):
     steps = rollout(agent)
     if name == "pqn":
         spec = spec._replace(action=Discrete(ACTION))
-        agent = agent.for_action(spec.action)
+        agent = for_action(agent, spec.action)
         choice = jnp.int32(steps.reward > 0)
         steps = steps._replace(action=choice, extras=Taken(choice, steps.reward))
     state = agent.init(spec, TASKS, KEY)

@@ -40,6 +40,7 @@ from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.scaling.base import Moments
 from mtjax.agents.ppo import PPO, within
 from mtjax.agents.units import Units
+from mtjax.agents.view import init_inputs
 from mtjax.axes import in_parts
 from mtjax.config import with_preset
 from mtjax.envs.probes import Probe, tasks_of
@@ -370,7 +371,7 @@ def test_moments_are_those_of_all_observations():
     """Of rollouts one after the other, as if they had come at once; in a mixture each task has its own."""
     agent, obs = small(), (np.random.default_rng(0).normal(size=(2, 3, 8, 3)) * 3 + 1).astype(np.float32)
     for mixed in (False, True):
-        inputs = agent.view.init(SPEC._replace(mixed=mixed), 3)
+        inputs = init_inputs(SPEC._replace(mixed=mixed), 3)
         for batch in obs:
             inputs = agent.view.count(inputs, jnp.asarray(batch))
         rows = np.moveaxis(obs, 1, 0).reshape(3, -1, 3) if mixed else np.asarray(obs).reshape(1, -1, 3)
@@ -378,7 +379,7 @@ def test_moments_are_those_of_all_observations():
         for found, wanted in zip(inputs.parts["moments"], map(jnp.stack, zip(*expected, strict=True)), strict=True):
             np.testing.assert_allclose(found, wanted if mixed else wanted[0], rtol=1e-4)
     still = small(normalize_observations=False)
-    assert still.view.count(still.view.init(SPEC, 3), obs[0]).parts["moments"].count == 0
+    assert still.view.count(init_inputs(SPEC, 3), obs[0]).parts["moments"].count == 0
 
 
 # Updates.

@@ -11,6 +11,7 @@ from test_ppo import random_steps
 
 import mtjax
 from mtjax import agents
+from mtjax.agents import for_action
 from mtjax.envs.probes import Probe
 from mtjax.types import Discrete, InputError, Spec
 
@@ -21,7 +22,7 @@ KEY = jax.random.key(2)
 
 def small(**settings):
     given = {"epochs": 1, "minibatches": 2, "unroll": 4, **settings}
-    return tiny("pqn", **given).for_action(SPEC.action)
+    return for_action(tiny("pqn", **given), SPEC.action)
 
 
 def steps_of(agent, seed=0):
@@ -118,7 +119,7 @@ def test_greedy_actions_are_those_of_value_iteration():
     """In every state of every process, and values to 0.1 of 5 to 10."""
     env, gamma = mtjax.make("tabular-mdp", num_tasks=3, split="none"), 0.9
     given = dict(q_lambda=0.0, gamma=gamma, epsilon=0.3, epsilon_rollouts=50, lr_schedule="linear", critic_lr=1e-3)
-    agent = mtjax.agent("pqn", hidden=(64, 64), unroll=16, minibatches=8, **given).for_action(env.spec.action)
+    agent = for_action(mtjax.agent("pqn", hidden=(64, 64), unroll=16, minibatches=8, **given), env.spec.action)
     steps = 3 * 64 * 16 * 600
     result = mtjax.train(env, agent, steps=steps, num_envs=64, chunk_steps=1600, eval_every=steps, quiet=True)
     tasks, state = env.tasks(), only_seed(result.state.agent)
@@ -181,7 +182,7 @@ def test_probes_are_learned(kind):
     """The best value of every task, and the action that has it."""
     given = {"num_envs": 16, "chunk_steps": 1600, "unroll": 8, "epochs": 4, "minibatches": 4, "gamma": GAMMA}
     given |= {"epsilon": 0.3, "epsilon_rollouts": 40, "q_lambda": 0.0, "critic_lr": 3e-3}
-    agent, tasks = tiny("pqn", hidden=(32,)).for_action(Discrete(5)), tasks_of(kind, SCALES)
+    agent, tasks = for_action(tiny("pqn", hidden=(32,)), Discrete(5)), tasks_of(kind, SCALES)
     state, history = train(Choices(), agent, given, tasks=tasks)
     state, (expected, obs, tolerance) = only_seed(state.agent), KNOWN[kind]
     for i, scale in enumerate(SCALES):

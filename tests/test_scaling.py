@@ -26,6 +26,7 @@ from probes import (
 )
 
 from mtjax.agents import agent, normalize
+from mtjax.agents.fit import reset_networks
 from mtjax.agents.parts.scaling import (
     SCALINGS,
     AdaptiveScaling,
@@ -423,7 +424,7 @@ def test_a_reset_renews_all_that_learns_and_nothing_else():
         state = observe(scaled, state, reward, ended=i == 1)
         state, _ = update(state, random_batch(i, 3, BATCH, SPEC), TASKS, jax.random.key(i))
     key = jax.random.key(7)
-    fresh, anew = init(TASKS, key), jax.jit(partial(scaled.reset_networks, spec=SPEC, tasks=TASKS, key=key))(state)
+    fresh, anew = init(TASKS, key), jax.jit(partial(reset_networks, scaled, spec=SPEC, tasks=TASKS, key=key))(state)
     kept = {name: state.nets[name] for name in ("inputs", "tasks", "sampler")}
     before, after = (x.nets["scaling"].own for x in (state, anew))
     given = with_nets(fresh, **kept, scaling=Params({}, scaled.scaling.reset(before)))

@@ -12,9 +12,11 @@ import pytest
 from probes import QUICK, only_seed, pick, tiny, train
 
 import mtjax
+from mtjax.agents import for_action
 from mtjax.agents.on_policy import Batch
 from mtjax.agents.sketches import SubPolicies
 from mtjax.agents.state import of_task
+from mtjax.agents.unseen import unseen
 from mtjax.envs.craft.sketched import Sketched
 from mtjax.envs.parameters import Parameter
 from mtjax.evaluation import Episodes, evaluate
@@ -74,7 +76,7 @@ TASKS = ENV.tasks()
 
 
 def made(**settings):
-    return tiny("sketches", **settings).for_action(ENV.action)
+    return for_action(tiny("sketches", **settings), ENV.action)
 
 
 def begun(agent):
@@ -116,7 +118,7 @@ def test_ablations_share_less_or_everything(sharing, heads):
 
 def test_unseen_tasks_use_what_sketches_share():
     """Only a policy for each task is borrowed from a nearest one."""
-    said = {sharing: made(sharing=sharing).unseen for sharing in ("symbols", "tasks", "all")}
+    said = {sharing: unseen(made(sharing=sharing)) for sharing in ("symbols", "tasks", "all")}
     assert said == {
         "symbols": "each is played by the policies of its sketch's symbols",
         "tasks": "each uses the networks of the nearest training task",
@@ -228,5 +230,5 @@ def test_what_makes_no_sense_is_refused(given, said):
 def test_families_that_follow_no_sketch_are_refused():
     env = mtjax.make("craft")
     with pytest.raises(InputError, match="families that follow a sketch, such as --env=craft-sketched"):
-        mtjax.agent("sketches").for_action(env.action).init(env.spec, env.tasks(), jax.random.key(0))
+        for_action(mtjax.agent("sketches"), env.action).init(env.spec, env.tasks(), jax.random.key(0))
     assert isinstance(made().experience, Rollouts) and pick(TASKS, 0).goal["length"] == 1

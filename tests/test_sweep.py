@@ -22,6 +22,7 @@ from mtjax import loop
 from mtjax.agents import PARTS
 from mtjax.agents import settings as settings_of
 from mtjax.agents import swept as points
+from mtjax.agents.fit import reset_networks
 from mtjax.command import run_config, sweep
 from mtjax.command.keywords import configured
 from mtjax.config import configure
@@ -112,7 +113,7 @@ def test_every_number_can_vary(name, settings):
         everywhere = jax.tree.map(lambda x: jnp.broadcast_to(x, (2, 1, 3, *x.shape)), memory)
         steps = jax.tree.map(lambda x: x.reshape(2, 1, 3, *x.shape[2:]), random_batch(0, 2, 3))
         state = varied.observe(state, steps._replace(closed=steps.discount == 0, memory=everywhere), tasks)
-        state = varied.reset_networks(state, spec, tasks, key)
+        state = reset_networks(varied, state, spec, tasks, key)
         return varied.act(state, memory, jnp.zeros(1), task, key).action
 
     assert jax.eval_shape(everything, {name: jnp.float32(x) for name, x in values.items()}).shape == (1,)

@@ -9,6 +9,7 @@ import pytest
 from probes import tiny
 
 from mtjax import loop
+from mtjax.agents import for_action
 from mtjax.config import configure
 from mtjax.envs.mtenv.tabular import Bandit, TabularMDP
 from mtjax.types import Discrete, InputError, Spec
@@ -218,7 +219,7 @@ def test_an_agent_trains_on_it(env, name):
     """Traced, not run: the loop, agent and tasks fit together, keys in the state included; the loop counts time."""
     given: dict = {"num_envs": 2, "chunk_steps": 2}
     if name == "ppo":
-        agent, given = tiny("ppo").for_action(env.spec.action), given | {"unroll": 2, "minibatches": 1}
+        agent, given = for_action(tiny("ppo"), env.spec.action), given | {"unroll": 2, "minibatches": 1}
     else:
         env, agent = dataclasses.replace(env, scores=True), tiny(name)
         given |= {"batch_size": 4, "replay_size": 12, "warmup_steps": 1}

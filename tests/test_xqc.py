@@ -174,7 +174,7 @@ def test_an_action_is_that_of_the_tasks_own_running_statistics():
     assert len(np.unique(actions, axis=0)) == 3
     unseen = pick(tasks_of("one-step", [0.25]), 0)._replace(id=jnp.int32(9))
     np.testing.assert_array_equal(act(made, state, obs, unseen, None), actions[2])
-    assert "statistics of the nearest training task" in made.unseen
+    assert "statistics of the nearest training task" in unseen(made)
 
 
 def test_a_task_is_seen_though_its_features_are_the_same_in_all_of_its_batch():

@@ -8,10 +8,10 @@ from mtjax.names import CHOICES, InputError, frozen, lazily, load, nearest_error
 
 if TYPE_CHECKING:
     from mtjax.agents.base import BaseAgent
-    from mtjax.agents.choices import PARTS, settings
+    from mtjax.agents.choices import PARTS, for_action, settings
     from mtjax.agents.sac import SAC
 
-_PLACES = {"PARTS": "choices", "settings": "choices", "BaseAgent": "base", "SAC": "sac"}
+_PLACES = {"PARTS": "choices", "settings": "choices", "for_action": "choices", "BaseAgent": "base", "SAC": "sac"}
 __getattr__, __dir__ = lazily(__name__, {name: f"mtjax.agents.{place}" for name, place in _PLACES.items()})
 
 
@@ -143,4 +143,16 @@ def name_of(agent: Any) -> str:
     return max(found, key=lambda name: len(presets[name].defaults), default=next(iter(presets), cls.__name__))
 
 
-__all__ = ["AGENTS", "CHOICES", "PARTS", "SAC", "BaseAgent", "Preset", "agent", "name_of", "preset_of", "settings"]
+__all__ = [
+    "AGENTS",
+    "CHOICES",
+    "PARTS",
+    "SAC",
+    "BaseAgent",
+    "Preset",
+    "agent",
+    "for_action",
+    "name_of",
+    "preset_of",
+    "settings",
+]

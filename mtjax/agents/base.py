@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,27 +11,35 @@ import tyro
 
 from mtjax.agents import combinations, parts
 from mtjax.agents.choices import FLAT, PARTS, kinds_of
-from mtjax.agents.fit import Fit, learned
+from mtjax.agents.fit import Fit
 from mtjax.agents.parts.encoders import Encoder
 from mtjax.agents.parts.gradients import descent, surgery
 from mtjax.agents.parts.knowing import Knowing, last_steps
 from mtjax.agents.parts.knowing.last_steps import Past
-from mtjax.agents.parts.policies import Gaussian, Policy, policy_for
+from mtjax.agents.parts.policies import Gaussian, Policy
 from mtjax.agents.parts.remembering import Remembering
 from mtjax.agents.parts.representations import Representation
 from mtjax.agents.parts.samplers import Sampler
 from mtjax.agents.parts.scaling import Scaling
 from mtjax.agents.rates import discounts, discounts_of_all, scheduled
 from mtjax.agents.state import AgentState, Nets, of_task
-from mtjax.agents.view import View
+from mtjax.agents.view import View, init_inputs, join_arrays
 from mtjax.checks import require_values
 from mtjax.experience import Replay
 from mtjax.networks import Network, Params
 from mtjax.parallel import collectives
-from mtjax.types import Acted, Array, Continuous, Discrete, Env, Key, Metrics, Spec, Task, Transition
+from mtjax.types import Acted, Array, Key, Metrics, Spec, Task, Transition
 
 Heads = Literal["shared", "per-task", "disjoint"]
 Tune = Literal["all", "heads", "embedding"]
+
+
+class Inputs(NamedTuple):
+    """Holds what networks take, of one task and all zero."""
+
+    actor: tuple  # features (Z,) and an observation (O,)
+    critic: tuple
+    action: Array  # (A,)
 
 
 class Memory(NamedTuple):
@@ -41,6 +49,10 @@ class Memory(NamedTuple):
     hidden: Any = None  # the hidden state of a recurrent way to know the task
     scaling: Any = None  # of the scaling of rewards
     sampler: Any = None  # of the sampler of tasks
+
+
+WATCHERS = ("scaling", "sampler")
+"""The parts that remember an episode and count steps, by name."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,6 +98,8 @@ class BaseAgent(abc.ABC):
     """Whether learning keeps the running statistics of bodies with batch normalisation."""
     follows_sketches: ClassVar[bool] = False
     """Whether it plays only families that follow a sketch."""
+    stand_in: ClassVar[str] = ""
+    """What plays tasks that were not trained on, if not the nearest task's networks."""
     one_knowledge: ClassVar[bool] = False
     """Whether tasks share what knows them even where each has networks of its own."""
     least_loss: ClassVar[float] = 0.0
@@ -147,38 +161,17 @@ class BaseAgent(abc.ABC):
     """How the actor's outputs become actions. It follows from the environment."""
 
     def __post_init__(self):
+        """Choose parts by their names, and check that they and the settings can be used together.
+
+        Raises:
+            InputError: they cannot.
+        """
         for kind in kinds_of(self):
             object.__setattr__(self, kind, parts.choose(kind, PARTS[kind], getattr(self, kind)))
         parts.require_choices(self)
         for holder in (self, *(getattr(self, kind) for kind in kinds_of(self))):
             require_values(holder)
-        self.check()
-
-    def check(self) -> None:
-        """Check that the settings and parts can be used together.
-
-        Raises:
-            InputError: they cannot.
-        """
         combinations.check(self)
-
-    def for_action(self, action: Continuous | Discrete) -> Self:
-        """Return the agent with the policy for such actions, which are those of its environment."""
-        return dataclasses.replace(self, policy=policy_for(action))
-
-    @property
-    def borrowed(self) -> list[str]:
-        """Names of what a task that was not trained on uses of its nearest training task to act."""
-        found = {"shared": [], "per-task": ["head"], "disjoint": ["networks"]}[self.heads]
-        found += ["input layer"] * (self.encoder.front() is not None) + ["statistics"] * self.encoder.has_statistics
-        return [*found, *self.conditioning.borrowed, *self.representation.borrowed]
-
-    @property
-    def unseen(self) -> str:
-        """A sentence on what stands in for unseen tasks; empty if nothing has to."""
-        borrowed, replaced = " and ".join(self.borrowed), self.representation.replaced
-        texts = (f"each uses the {borrowed} of the nearest training task", f"each has {replaced}")
-        return ", and ".join(text for text, present in zip(texts, (borrowed, replaced), strict=True) if present)
 
     # Networks, and how they learn.
 
@@ -199,17 +192,8 @@ class BaseAgent(abc.ABC):
         return network_of(self, self.critic_hidden or self.hidden, self.critic_layer_norm)
 
     @abc.abstractmethod
-    def init_networks(self, num_tasks: int, actor_inputs: tuple, critic_inputs: tuple, action: Array, key: Key) -> Nets:
-        """Initialise actor, critics, and what else the agent has.
-
-        Args:
-            actor_inputs, critic_inputs: features (Z,) and an observation (O,) of these shapes.
-            action: (A,).
-        """
-
-    def init_slow(self, nets: Nets) -> Nets:
-        """Return the slow copies of networks; none by default."""
-        return {}
+    def init_networks(self, state: AgentState, inputs: Inputs, key: Key) -> AgentState:
+        """Add to a state actor, critics, what else the agent has, and the slow copies of networks."""
 
     @property
     def fits(self) -> dict[str, Fit]:
@@ -233,7 +217,7 @@ class BaseAgent(abc.ABC):
         combinations.require_sight(self, spec)
         combinations.require_policy(self, spec)
         view, num_tasks, own = self.view, len(tasks.id), self.heads == "disjoint"
-        inputs, action = view.init(spec, num_tasks), spec.action.encode(spec.action.blank())
+        inputs, action = init_inputs(spec, num_tasks), spec.action.encode(spec.action.blank())
         vectors, seen = self.conditioning.table(spec, num_tasks), view.example(spec, inputs)
         first = jax.tree.map(lambda x: x[0], tasks._replace(blocks=None))
         given = self.conditioning.given(jnp.int32(0), first, num_tasks, vectors)
@@ -249,17 +233,9 @@ class BaseAgent(abc.ABC):
         known = view.know({"knowing": knowing.of_first()}, given, seen)
         nets["representation"], key = self.representation.init(num_tasks, *known, seen, action, own, key)
         one = {name: net.of_first() for name, net in nets.items()}
-        shapes = view.actor_inputs(one, given, seen), view.critic_inputs(one, given, seen)
-        nets |= self.init_networks(num_tasks, *shapes, action, key)
-        fits = {name: fit.init(nets, num_tasks) for name, fit in self.fits.items()}
-        return AgentState(nets, self.init_slow(nets), fits)
-
-    def reset_networks(self, state: AgentState, spec: Spec, tasks: Task, key: Key) -> AgentState:
-        """Return a state in which all that some fit trains begins anew; what is counted is kept."""
-        fresh = self.init(spec, tasks, key)
-        nets = {name: fresh.nets[name] for name in learned(self.fits.values())}
-        nets |= {"scaling": Params({}, self.scaling.reset(state.nets["scaling"].own))}
-        return fresh._replace(nets=state.nets | nets, numbers=state.numbers)
+        inputs = Inputs(view.actor_inputs(one, given, seen), view.critic_inputs(one, given, seen), action)
+        state = self.init_networks(AgentState(nets, {}, {}), inputs, key)
+        return state._replace(fits={name: fit.init(state.nets, num_tasks) for name, fit in self.fits.items()})
 
     # Acting.
 
@@ -284,7 +260,7 @@ class BaseAgent(abc.ABC):
         """Return the memory after a step."""
         past, hidden = memory.past, memory.hidden
         if past is not None:
-            obs = self.view.join_arrays(state.nets["inputs"], transition.obs)
+            obs = join_arrays(state.nets["inputs"], transition.obs)
             past = last_steps.append(past, obs, transition.action, transition.reward)
         if hidden is not None:
             nets = of_task(state.nets, state.known(task))
@@ -293,27 +269,14 @@ class BaseAgent(abc.ABC):
             seen = transition._replace(obs=obs, action=action, next_obs=next_obs)
             hidden = self.conditioning.remember(nets["knowing"].parts, hidden, seen)
         reward, gamma = transition.reward, discounts(self, task)
-        counts = (part.remember(memory_of, reward, gamma) for part, memory_of in self._watchers(memory))
+        counts = (getattr(self, name).remember(getattr(memory, name), reward, gamma) for name in WATCHERS)
         return Memory(past, hidden, *counts)
 
-    def _watchers(self, memory: Memory) -> tuple[tuple[parts.Watcher, Any], ...]:
-        return (self.scaling, memory.scaling), (self.sampler, memory.sampler)
-
     # Learning.
-
-    def relabel(self, env: Env, task: Task, transition: Transition, key: Key) -> Transition:
-        """Return a transition of another task as it would have been in ``task``; its past steps change too."""
-        one = lambda transition: env.relabel(task, transition, key)  # type: ignore
-        past = getattr(transition.memory, "past", None)
-        return one(transition) if past is None else last_steps.relabel(one, transition)
 
     def assess(self, state: AgentState, steps: Transition, tasks: Task) -> tuple[AgentState, Transition]:
         """Compute what has to be known of collected steps (T, H, E, ...) before the agent learns from them: nothing."""
         return state, steps
-
-    def adapt(self, state: AgentState, steps: Transition, tasks: Task) -> AgentState:
-        """Return the state with which to play tasks, given one rollout (T, H, E, ...) of them: as it is."""
-        return state
 
     @abc.abstractmethod
     def update(
@@ -332,8 +295,9 @@ class BaseAgent(abc.ABC):
         told = Transition(None, None, steps.reward, steps.discount, None, steps.ended, steps.closed, memory=memory)  # type: ignore
         told = jax.tree.map(lambda x: x.reshape(len(x), -1), collectives.whole(told, axis=2))
         new = {"inputs": self.view.count(state.nets["inputs"], steps.obs)}
-        for name, (part, before) in zip(("scaling", "sampler"), self._watchers(told.memory), strict=True):
-            after = told._replace(memory=part.remember(before, told.reward, gamma))
+        for name in WATCHERS:
+            part: parts.Watcher = getattr(self, name)
+            after = told._replace(memory=part.remember(getattr(told.memory, name), told.reward, gamma))
             new[name] = Params({}, part.observe(state.nets[name].own, after))
         return state.with_nets(**new)
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterable, Mapping
-from typing import Any, get_type_hints
+from typing import Any, TypeVar, get_type_hints
 
 import tyro
 
@@ -10,6 +10,7 @@ from mtjax.agents import parts
 from mtjax.agents.parts.encoders import ENCODERS
 from mtjax.agents.parts.gradients import surgery
 from mtjax.agents.parts.knowing import CONDITIONINGS
+from mtjax.agents.parts.policies import policy_for
 from mtjax.agents.parts.remembering import CONTINUAL
 from mtjax.agents.parts.representations import REPRESENTATIONS
 from mtjax.agents.parts.samplers import SAMPLERS
@@ -18,6 +19,9 @@ from mtjax.agents.parts.values import VALUES
 from mtjax.checks import OF_TRAIN, checked
 from mtjax.experience import EXPERIENCES
 from mtjax.names import CHOICES, InputError, frozen, nearest_error
+from mtjax.types import Continuous, Discrete
+
+A = TypeVar("A")
 
 PARTS: dict[str, Mapping[str, type]] = {
     "conditioning": CONDITIONINGS,
@@ -75,6 +79,11 @@ def replace(agent: Any, given: Mapping[str, Any]) -> Any:
         raise unknown_setting("setting", unknown, [*settings(agent), *OF_TRAIN])
     taken = {kind: parts.take(rest, part) for kind, part in chosen.items()}
     return dataclasses.replace(agent, **checked(agent, rest), **taken)
+
+
+def for_action(agent: A, action: Continuous | Discrete) -> A:
+    """Return an agent with the policy for such actions, which are those of its environment."""
+    return dataclasses.replace(agent, policy=policy_for(action))  # type: ignore
 
 
 def require_value_range(agent: Any) -> None:

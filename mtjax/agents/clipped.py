@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents import critics
-from mtjax.agents.on_policy import Batch
 from mtjax.agents.parts import targets
 from mtjax.agents.rates import discounts_of_all
 from mtjax.agents.state import AgentState
@@ -76,14 +75,6 @@ def normalized(how: Normalization, advantage: Array) -> Array:
         return advantage
     mean, variance = mean_and_variance(advantage, (1, 2) if how == "task" else (0, 1, 2))
     return (advantage - mean) / jnp.maximum(jnp.sqrt(variance), MIN_STD)
-
-
-def batch_of(agent: Any, state: AgentState, window: Transition, tasks: Task) -> Batch:
-    """Return the batch (T, ...) for the losses, of windows (T, B, L, ...) of an assessed rollout."""
-    flat, features, obs, next_obs = agent.view.steps(state, window, tasks)
-    found: Assessed = flat.extras
-    models = critics.models(agent, state, flat, tasks, next_obs)
-    return Batch(obs=obs, features=features, mask=tasks.action_mask, **found._asdict(), **models)
 
 
 def gain(log_ratio: Array, advantage: Array, clip_range: float | Array) -> tuple[Array, Metrics]:

@@ -188,4 +188,4 @@ def require_policy(agent: Any, spec: Spec) -> None:
     if not isinstance(policy, agent.policies):
         raise InputError(f"{name} draws no {kind} actions")
     if agent.policy != policy:
-        raise InputError(f"{name} was not made for these {kind} actions: agent.for_action(env.spec.action) is")
+        raise InputError(f"{name} was not made for these {kind} actions: for_action(agent, env.spec.action) is")

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 
 from mtjax.agents import parts
 from mtjax.agents.base import Heads, Memory
-from mtjax.agents.choices import PARTS
 from mtjax.agents.replayed import ActorAux, Batch, Sample
 from mtjax.agents.sac import SAC
 from mtjax.agents.state import AgentState, Nets
@@ -65,12 +64,15 @@ class Distral(SAC):
 
     adjustable: ClassVar[tuple[str, ...]] = (*SAC.adjustable, "distral_alpha")
     distils: ClassVar[bool] = True
+    stand_in: ClassVar[str] = "the distilled policy plays them"
     one_knowledge: ClassVar[bool] = True  # which the distilled policy shares
     heads: Heads = "disjoint"
     distral_alpha: float = 0.5
     """Share of the divergence from the distilled policy in the regulariser; the rest is entropy (alpha)."""
 
-    def check(self) -> None:
+    def __post_init__(self):
+        super().__post_init__()
+        parts.require_shares(self, "distral_alpha")
         if self.heads != "disjoint":
             raise InputError(f"distral gives every task a policy of its own: heads is disjoint, not {self.heads}")
         if self.representation.learns:
@@ -78,20 +80,6 @@ class Distral(SAC):
                 "in distral every task would have a representation of its own, but the distilled policy needs one that "
                 "all tasks share; use representation=plain"
             )
-        rule = parts.name_of(PARTS["gradients"], self.gradients)
-        if rule != "mean":
-            raise InputError(
-                f"distral's tasks share the distilled policy alone, and its gradients do not conflict, so "
-                f"gradients={rule} has nothing to do; use gradients=mean"
-            )
-        super().check()
-        parts.require_shares(self, "distral_alpha")
-
-    @property
-    def unseen(self) -> str:
-        """A sentence on what stands in for unseen tasks."""
-        rest = [part for part in self.borrowed if part != "networks"]
-        return "the distilled policy plays them" + (f", by the {' and '.join(rest)} of the nearest" if rest else "")
 
     @property
     def actor(self) -> Policies:

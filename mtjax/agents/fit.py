@@ -9,7 +9,7 @@ import optax
 from mtjax.agents.parts.gradients import descent, surgery
 from mtjax.agents.state import AgentState, FitState, Nets
 from mtjax.networks import Params
-from mtjax.types import Array, Key, Metrics
+from mtjax.types import Array, Key, Metrics, Spec, Task
 
 
 class Fitted(NamedTuple):
@@ -133,3 +133,11 @@ def _stacked(nets: Nets) -> Params:
 def _apart(params: Params) -> Nets:
     """Return networks by name again."""
     return {name: Params(params.shared[name], params.own[name]) for name in params.shared}
+
+
+def reset_networks(agent: Any, state: AgentState, spec: Spec, tasks: Task, key: Key) -> AgentState:
+    """Return a state in which all that some fit trains begins anew; what is counted is kept."""
+    fresh = agent.init(spec, tasks, key)
+    nets = {name: fresh.nets[name] for name in learned(agent.fits.values())}
+    nets |= {"scaling": Params({}, agent.scaling.reset(state.nets["scaling"].own))}
+    return fresh._replace(nets=state.nets | nets, numbers=state.numbers)

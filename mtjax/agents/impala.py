@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents import critics, parts
-from mtjax.agents.base import Memory
+from mtjax.agents.base import Inputs, Memory
 from mtjax.agents.choices import FLAT
 from mtjax.agents.on_policy import Batch, OnPolicy
 from mtjax.agents.parts import targets
 from mtjax.agents.rates import discounts_of_all
-from mtjax.agents.state import AgentState, Nets, axes_of
+from mtjax.agents.state import AgentState, axes_of
 from mtjax.agents.units import Units
 from mtjax.experience import Rollouts
 from mtjax.networks import Params
@@ -52,8 +52,8 @@ class IMPALA(OnPolicy):
         default_factory=lambda: Rollouts(unroll=20, epochs=1, minibatches=4)
     )
 
-    def check(self) -> None:
-        super().check()
+    def __post_init__(self):
+        super().__post_init__()
         parts.require_not_negative(self, "actor_lag")
         if self.actor_lag and self.representation.learns:
             raise InputError("actor-lag keeps a copy of the actor alone; use it with representation=plain")
@@ -64,13 +64,13 @@ class IMPALA(OnPolicy):
 
     # The policy that acts.
 
-    def init_networks(self, num_tasks: int, actor_inputs: tuple, critic_inputs: tuple, action: Array, key: Key) -> Nets:
-        nets = super().init_networks(num_tasks, actor_inputs, critic_inputs, action, key)
-        return nets | ({"lag": Params({"rollouts": jnp.int32(0)}, {})} if self.actor_lag else {})
-
-    def init_slow(self, nets: Nets) -> Nets:
-        lagging = {name: nets[name] for name in ("actor", "knowing", "inputs")} if self.actor_lag else {}
-        return super().init_slow(nets) | jax.tree.map(jnp.copy, lagging)
+    def init_networks(self, state: AgentState, inputs: Inputs, key: Key) -> AgentState:
+        state = super().init_networks(state, inputs, key)
+        if not self.actor_lag:
+            return state
+        older = {name: state.nets[name] for name in ("actor", "knowing", "inputs")}
+        state = state._replace(slow=state.slow | jax.tree.map(jnp.copy, older))
+        return state.with_nets(lag=Params({"rollouts": jnp.int32(0)}, {}))
 
     def act(self, state: AgentState, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
         older = state.slow if self.actor_lag and key is not None else {}

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents import clipped, parts
-from mtjax.agents.base import Memory
+from mtjax.agents.base import Inputs, Memory
 from mtjax.agents.choices import FLAT, PARTS
 from mtjax.agents.on_policy import ActorAux, Batch, OnPolicy
 from mtjax.agents.parts.adaptation import adapt, surrogate
@@ -15,7 +15,7 @@ from mtjax.agents.state import AgentState, Nets, over_tasks
 from mtjax.experience import AdaptingRollouts
 from mtjax.networks import Params
 from mtjax.parallel import collectives
-from mtjax.types import Acted, Array, InputError, Key, Metrics, Spec, Task, Transition
+from mtjax.types import Acted, Array, InputError, Key, Metrics, Task, Transition
 
 
 class Played(NamedTuple):
@@ -80,8 +80,8 @@ class MAML(OnPolicy):
     """Take inner steps as constants in the outer one, so that nothing is differentiated twice."""
     experience: Annotated[AdaptingRollouts, FLAT] = dataclasses.field(default_factory=AdaptingRollouts)
 
-    def check(self) -> None:
-        super().check()
+    def __post_init__(self):
+        super().__post_init__()
         parts.require_positive(self, "clip_range", "inner_rate")
         knowing = parts.name_of(PARTS["conditioning"], self.conditioning)
         if knowing != "none":
@@ -93,12 +93,8 @@ class MAML(OnPolicy):
 
     # Networks.
 
-    def init_networks(self, num_tasks: int, actor_inputs: tuple, critic_inputs: tuple, action: Array, key: Key) -> Nets:
-        nets = super().init_networks(num_tasks, actor_inputs, critic_inputs, action, key)
-        return nets | {"adapted": for_each(nets["actor"], num_tasks)}
-
-    def reset_networks(self, state: AgentState, spec: Spec, tasks: Task, key: Key) -> AgentState:
-        return forget(super().reset_networks(state, spec, tasks, key))
+    def init_networks(self, state: AgentState, inputs: Inputs, key: Key) -> AgentState:
+        return forget(super().init_networks(state, inputs, key))
 
     # Acting and adapting.
 
@@ -129,9 +125,6 @@ class MAML(OnPolicy):
     def assess(self, state: AgentState, steps: Transition, tasks: Task) -> tuple[AgentState, Transition]:
         """Add advantages and targets to rollouts (T, H, E, ...), and fit the critic's units to them."""
         return clipped.assess(self, state, steps, tasks, self.experience.apart)
-
-    def prepare(self, state: AgentState, window: Transition, tasks: Task) -> tuple[AgentState, Batch]:
-        return state, clipped.batch_of(self, state, window, tasks)
 
     def gain(self, log_ratio: Array, batch: Batch) -> tuple[Array, Metrics]:
         return clipped.gain(log_ratio, batch.advantage, self.clip_range)

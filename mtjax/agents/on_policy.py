@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents import critics, parts
-from mtjax.agents.base import BaseAgent, Memory
+from mtjax.agents.base import BaseAgent, Inputs, Memory
 from mtjax.agents.choices import FLAT
 from mtjax.agents.fit import Fit, above, descend
 from mtjax.agents.parts.policies import Categorical, Gaussian, Policy
@@ -99,10 +99,6 @@ class OnPolicy(BaseAgent):
     experience: Annotated[Rollouts, FLAT] = dataclasses.field(default_factory=Rollouts)
 
     @abc.abstractmethod
-    def prepare(self, state: AgentState, window: Transition, tasks: Task) -> tuple[AgentState, Batch]:
-        """Return the batch (T, ...) for the losses, of windows (T, B, L, ...), and the state with its units."""
-
-    @abc.abstractmethod
     def gain(self, log_ratio: Array, batch: Batch) -> tuple[Array, Metrics]:
         """Return the gain of each step (B,) that the actor maximises beside the entropy.
 
@@ -110,8 +106,8 @@ class OnPolicy(BaseAgent):
             log_ratio: (B,) of the action's probability under the present policy to that under the one that took it.
         """
 
-    def check(self) -> None:
-        super().check()
+    def __post_init__(self):
+        super().__post_init__()
         parts.require_shares(self, "gae_lambda")
         parts.require_positive(self, "reward_scale")
         parts.require_not_negative(self, "entropy_cost")
@@ -140,17 +136,14 @@ class OnPolicy(BaseAgent):
             return network
         return dataclasses.replace(network, own=(*network.own, "head"))
 
-    def init_networks(self, num_tasks: int, actor_inputs: tuple, critic_inputs: tuple, action: Array, key: Key) -> Nets:
-        actor_key, critic_key = jax.random.split(key)
-        count, first = self.policy.outputs(len(action)), self.policy.first(len(action), self.initial_std)
-        return {
-            "actor": scale_head(self.actor.init(actor_key, num_tasks, count, *actor_inputs), first),
-            "critic": scale_head(self.critic.init(critic_key, num_tasks, 1, *critic_inputs), jnp.zeros(1)),
-            "units": Units.begin(num_tasks).params(),
-        }
-
-    def init_slow(self, nets: Nets) -> Nets:
-        return {"representation": jax.tree.map(jnp.copy, nets["representation"])} if self.representation.learns else {}
+    def init_networks(self, state: AgentState, inputs: Inputs, key: Key) -> AgentState:
+        (actor_key, critic_key), num_tasks, size = jax.random.split(key), state.num_tasks, len(inputs.action)
+        count, first = self.policy.outputs(size), self.policy.first(size, self.initial_std)
+        actor = scale_head(self.actor.init(actor_key, num_tasks, count, *inputs.actor), first)
+        critic = scale_head(self.critic.init(critic_key, num_tasks, 1, *inputs.critic), jnp.zeros(1))
+        state = state.with_nets(actor=actor, critic=critic, units=Units.begin(num_tasks).params())
+        slow = {"representation": state.nets["representation"]} if self.representation.learns else {}
+        return state._replace(slow=jax.tree.map(jnp.copy, slow))
 
     @property
     def fits(self) -> dict[str, Fit]:
@@ -224,6 +217,15 @@ class OnPolicy(BaseAgent):
         if self.representation.learns:
             state = state._replace(slow=state.slow | {"representation": state.nets["representation"]})
         return state, steps
+
+    def prepare(self, state: AgentState, window: Transition, tasks: Task) -> tuple[AgentState, Batch]:
+        """Return the batch (T, ...) for the losses, of windows (T, B, L, ...), and the state with its units.
+
+        By default ``assess`` has stored with the steps what the losses need beside what networks see.
+        """
+        flat, features, obs, next_obs = self.view.steps(state, window, tasks)
+        models = critics.models(self, state, flat, tasks, next_obs)
+        return state, Batch(obs=obs, features=features, mask=tasks.action_mask, **flat.extras._asdict(), **models)
 
     def accept(self, moved: AgentState, state: AgentState, kl: Array) -> AgentState:
         """Return the state after an actor's step, which moved it, given KL(pi_old | pi) (T,) before the step."""

@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents import clipped, parts
+from mtjax.agents.base import Inputs
 from mtjax.agents.on_policy import Batch, OnPolicy
-from mtjax.agents.state import AgentState, Nets
+from mtjax.agents.state import AgentState
 from mtjax.networks import Params
 from mtjax.types import Array, Key, Metrics, Task, Transition
 
@@ -67,14 +68,14 @@ class PPO(OnPolicy):
     advantage_normalization: clipped.Normalization = "task"
     """Scale advantages to mean 0 and standard deviation 1: never, over all tasks together, or in each task."""
 
-    def check(self) -> None:
-        super().check()
+    def __post_init__(self):
+        super().__post_init__()
         parts.require_positive(self, "clip_range")
         parts.require_not_negative(self, "value_clip", "kl_limit")
 
-    def init_networks(self, num_tasks: int, actor_inputs: tuple, critic_inputs: tuple, action: Array, key: Key) -> Nets:
-        nets = super().init_networks(num_tasks, actor_inputs, critic_inputs, action, key)
-        return nets | ({"limit": within(True)} if parts.limit(self.kl_limit) is not None else {})
+    def init_networks(self, state: AgentState, inputs: Inputs, key: Key) -> AgentState:
+        state = super().init_networks(state, inputs, key)
+        return state if parts.limit(self.kl_limit) is None else state.with_nets(limit=within(True))
 
     # Once for a rollout.
 
@@ -84,9 +85,6 @@ class PPO(OnPolicy):
         return state.with_nets(limit=within(True)) if "limit" in state.nets else state, steps
 
     # Gradient steps.
-
-    def prepare(self, state: AgentState, window: Transition, tasks: Task) -> tuple[AgentState, Batch]:
-        return state, clipped.batch_of(self, state, window, tasks)
 
     def gain(self, log_ratio: Array, batch: Batch) -> tuple[Array, Metrics]:
         return clipped.gain(log_ratio, batch.advantage, self.clip_range)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents import parts
-from mtjax.agents.base import BaseAgent, Memory
+from mtjax.agents.base import BaseAgent, Inputs, Memory
 from mtjax.agents.choices import FLAT
 from mtjax.agents.fit import Fit, descend
 from mtjax.agents.parts import targets
@@ -73,8 +73,8 @@ class PQN(BaseAgent):
         default_factory=lambda: Rollouts(unroll=32, epochs=2, minibatches=32)
     )
 
-    def check(self) -> None:
-        super().check()
+    def __post_init__(self):
+        super().__post_init__()
         parts.require_shares(self, "q_lambda", "epsilon")
         parts.require_counts(self, "epsilon_rollouts")
         if self.representation.learns:
@@ -84,9 +84,9 @@ class PQN(BaseAgent):
 
     # Networks.
 
-    def init_networks(self, num_tasks: int, actor_inputs: tuple, critic_inputs: tuple, action: Array, key: Key) -> Nets:
-        critic = self.critic.init(key, num_tasks, len(action), *critic_inputs)
-        return {"critic": critic, "exploration": Params({"rollouts": jnp.int32(0)}, {})}
+    def init_networks(self, state: AgentState, inputs: Inputs, key: Key) -> AgentState:
+        critic = self.critic.init(key, state.num_tasks, len(inputs.action), *inputs.critic)
+        return state.with_nets(critic=critic, exploration=Params({"rollouts": jnp.int32(0)}, {}))
 
     @property
     def fits(self) -> dict[str, Fit]:

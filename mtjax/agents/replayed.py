@@ -89,6 +89,14 @@ def action_sizes(action: Array, mask: Array | None) -> Array:
     return jnp.full(len(action), action.shape[-1]) if mask is None else jnp.sum(mask, axis=-1)
 
 
+def slow_copies(agent: Any, nets: Nets) -> Nets:
+    """Return copies of what targets are computed with: critics, representation and what is known of the task."""
+    seen_by = agent.representation
+    followed = nets["representation"].without((*seen_by.models, *seen_by.own_target))
+    slow = {"critic": nets["critic"], "knowing": nets["knowing"], "representation": followed}
+    return jax.tree.map(jnp.copy, slow)
+
+
 def critic_data(agent: Any, state: AgentState, batch: Batch, key: Key) -> tuple[Batch, Any]:
     """Return the data of the critics' loss for all tasks (T, ...): the batch, and the targets."""
     representation = state.nets["representation"]

@@ -9,7 +9,7 @@ import numpy as np
 import optax
 
 from mtjax.agents import combinations, replayed
-from mtjax.agents.base import BaseAgent, Memory
+from mtjax.agents.base import BaseAgent, Inputs, Memory
 from mtjax.agents.choices import FLAT
 from mtjax.agents.fit import Fit, above, descend
 from mtjax.agents.parts.remembering import Remembering
@@ -67,30 +67,24 @@ class SAC(BaseAgent):
     continual: Annotated[Remembering, FLAT] = dataclasses.field(default_factory=Remembering)
     experience: Annotated[Replay, FLAT] = dataclasses.field(default_factory=Replay)
 
-    def check(self) -> None:
-        super().check()
+    def __post_init__(self):
+        super().__post_init__()
         combinations.check_replayed(self)
 
     # Networks.
 
-    def init_networks(self, num_tasks: int, actor_inputs: tuple, critic_inputs: tuple, action: Array, key: Key) -> Nets:
-        actor_key, critic_key = jax.random.split(key)
-        init_critic = lambda k: self.critic.init(k, num_tasks, self.value.outputs, *critic_inputs, action)
-        keys = jax.random.split(critic_key, self.num_critics)
+    def init_networks(self, state: AgentState, inputs: Inputs, key: Key) -> AgentState:
+        (actor_key, critic_key), num_tasks, action = jax.random.split(key), state.num_tasks, inputs.action
+        actor = self.actor.init(actor_key, num_tasks, self.policy.outputs(len(action)), *inputs.actor)
+        init_critic = lambda k: self.critic.init(k, num_tasks, self.value.outputs, *inputs.critic, action)
+        keys, every = jax.random.split(critic_key, self.num_critics), Params(shared=0, own=1)
+        critic = jax.vmap(init_critic, out_axes=every)(keys)  # type: ignore
         log = jnp.log if isinstance(self.initial_temperature, Array) else np.log
-        temperature = jnp.full(1 if self.shared_temperature else num_tasks, log(self.initial_temperature))
-        temperature = {"log": temperature.astype(jnp.float32)}
-        actor = self.actor.init(actor_key, num_tasks, self.policy.outputs(len(action)), *actor_inputs)
-        return self.continual.init(actor, num_tasks) | {
-            "actor": actor,
-            "critic": jax.vmap(init_critic, out_axes=Params(shared=0, own=1))(keys),  # type: ignore
-            "temperature": Params(temperature, {}) if self.shared_temperature else Params({}, temperature),
-        }
-
-    def init_slow(self, nets: Nets) -> Nets:
-        followed = self.representation.followed(nets["representation"])
-        slow = {"critic": nets["critic"], "knowing": nets["knowing"], "representation": followed}
-        return jax.tree.map(jnp.copy, slow)
+        log = jnp.full(1 if self.shared_temperature else num_tasks, log(self.initial_temperature)).astype(jnp.float32)
+        temperature = Params({"log": log}, {}) if self.shared_temperature else Params({}, {"log": log})
+        kept = self.continual.init(actor, num_tasks)
+        state = state.with_nets(**kept, actor=actor, critic=critic, temperature=temperature)
+        return state._replace(slow=replayed.slow_copies(self, state.nets))
 
     @property
     def fits(self) -> dict[str, Fit]:
@@ -163,7 +157,7 @@ class SAC(BaseAgent):
         state = replayed.with_statistics(state, "critic", fitted.aux.statistics)
 
         def improve(state: AgentState) -> tuple[AgentState, Metrics]:
-            seen = {"representation": self.representation.for_actor(representation, before)}
+            seen = {"representation": representation.without(self.representation.own_target).filled(before)}
             data, before_step = (batch, jax.random.split(actor_key, len(batch.temperature))), state.nets
             state, improved = descend(self.fits, "actor", state, self.actor_loss, data, actor_order, importance, seen)
             state = state._replace(nets=self.continual.kept(before_step, state.nets))

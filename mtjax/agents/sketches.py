@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import tyro
 
 from mtjax.agents import clipped, combinations, parts
-from mtjax.agents.base import Heads
+from mtjax.agents.base import Heads, Inputs
 from mtjax.agents.on_policy import Batch, OnPolicy
 from mtjax.agents.parts.policies import Categorical, Policy
 from mtjax.agents.parts.samplers import ByLength
-from mtjax.agents.state import AgentState, Nets
+from mtjax.agents.state import AgentState
 from mtjax.networks import Network, Params
 from mtjax.types import Array, InputError, Key, Metrics, Spec, Task, Transition
 
@@ -91,8 +91,8 @@ class Sketches(OnPolicy):
     symbols: Annotated[int, tyro.conf.Suppress] = dataclasses.field(default=0, repr=False, metadata=parts.NO_SETTING)
     """Number of symbols while networks are made. It follows from the environment."""
 
-    def check(self) -> None:
-        super().check()
+    def __post_init__(self):
+        super().__post_init__()
         parts.require_positive(self, "clip_range")
         if self.heads != "disjoint":
             raise InputError(f"in sketches every task has a critic of its own: heads is disjoint, not {self.heads}")
@@ -102,6 +102,10 @@ class Sketches(OnPolicy):
             raise InputError("sketches reads symbols off observations; use representation=plain and another encoder")
 
     # Networks.
+
+    @property
+    def stand_in(self) -> str:  # type: ignore[override]
+        return "each is played by the policies of its sketch's symbols" * (self.sharing == "symbols")
 
     @property
     def actor(self) -> Network:
@@ -121,9 +125,9 @@ class Sketches(OnPolicy):
         lengths = tasks.goal["length"].astype(jnp.int32)
         return state.with_nets(sampler=Params({}, state.nets["sampler"].own._replace(length=lengths)))
 
-    def init_networks(self, num_tasks: int, actor_inputs: tuple, critic_inputs: tuple, action: Array, key: Key) -> Nets:
-        nets = super().init_networks(num_tasks, actor_inputs, critic_inputs, action, key)
-        return nets | {"actor": Params(*(self._lean(part) for part in nets["actor"]))}
+    def init_networks(self, state: AgentState, inputs: Inputs, key: Key) -> AgentState:
+        state = super().init_networks(state, inputs, key)
+        return state.with_nets(actor=Params(*(self._lean(part) for part in state.nets["actor"])))
 
     def _lean(self, part: dict[str, Any]) -> dict[str, Any]:
         """Add its first bias to the last output, STOP, of an actor's part if it has the head."""
@@ -137,21 +141,5 @@ class Sketches(OnPolicy):
         """Add advantages and targets to a rollout (T, H, E, ...), and fit the critic's units to it."""
         return clipped.assess(self, state, steps, tasks)
 
-    def prepare(self, state: AgentState, window: Transition, tasks: Task) -> tuple[AgentState, Batch]:
-        return state, clipped.batch_of(self, state, window, tasks)
-
     def gain(self, log_ratio: Array, batch: Batch) -> tuple[Array, Metrics]:
         return clipped.gain(log_ratio, batch.advantage, self.clip_range)
-
-    # Tasks that were not trained on.
-
-    @property
-    def borrowed(self) -> list[str]:
-        """Names of what a task that was not trained on uses of its nearest training task to act."""
-        return [name for name in super().borrowed if name != "networks" or self.sharing == "tasks"]
-
-    @property
-    def unseen(self) -> str:
-        """A sentence on what stands in for unseen tasks."""
-        played = "each is played by the policies of its sketch's symbols" * (self.sharing == "symbols")
-        return ", and ".join(filter(None, (played, super().unseen)))

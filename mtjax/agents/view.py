@@ -39,23 +39,9 @@ class View:
         """Number of past steps that the networks take beside each observation."""
         return self.conditioning.history or self.representation.history
 
-    # Moments of observations.
-
-    def init(self, spec: Spec, num_tasks: int) -> Params:
-        """Return moments of no observations, with their layout unless networks take them as they are.
-
-        In a mixture each task has moments of its own, leaves (T, O).
-        """
-        moments = normalize.init(max(frames.state_size(spec), 1))  # checkpoints hold no empty arrays
-        layout = frames.layout(spec.obs)
-        shared: dict[str, Any] = {} if layout is None else {"layout": layout}
-        if not spec.mixed:
-            return Params(shared | {"moments": moments}, {})
-        return Params(shared, {"moments": jax.tree.map(lambda x: jnp.stack([x] * num_tasks), moments)})
-
     def count(self, inputs: Params, obs: Any) -> Params:
         """Add the vectors (T, ..., O) in observations to the moments, with those on other devices."""
-        found = frames.state(self.join_arrays(inputs, obs))
+        found = frames.state(join_arrays(inputs, obs))
         if not self.normalized or found is None:
             return inputs
         moments, mixed = inputs.parts["moments"], bool(inputs.own)
@@ -69,17 +55,9 @@ class View:
 
     # Observations, and the steps before them.
 
-    def join_arrays(self, inputs: Params, obs: Any) -> Any:
-        """Return observations of a tree of arrays as vectors (..., O), beside which pictures stay; vectors as they are.
-
-        Networks, moments and memories see observations through it alone.
-        """
-        layout = inputs.shared.get("layout")
-        return obs if layout is None else layout(obs)
-
     def see(self, inputs: Params, obs: Any, past: Any = None) -> Any:
         """Return observations (..., O) of one task as networks take them: normalised, and with the past if given."""
-        obs = self.join_arrays(inputs, obs)
+        obs = join_arrays(inputs, obs)
         scale = partial(normalize.apply, inputs.parts["moments"]) if self.normalized else lambda x: x
         scaled = lambda obs: frames.with_state(scale, obs)
         if past is None:
@@ -112,13 +90,13 @@ class View:
             first, last: the first and the last steps (T, N, ...) of the transitions that are made of it.
         """
         if self.conditioning.recurs:
-            obs, next_obs = (self.join_arrays(inputs, x) for x in (window.obs, window.next_obs))
+            obs, next_obs = (join_arrays(inputs, x) for x in (window.obs, window.next_obs))
             before = jax.vmap(track)(window._replace(next_obs=next_obs), obs)
             return before, Following(*before)
         if not self.history:
             return None, None
         return first.memory.past, last_steps.append(
-            last.memory.past, self.join_arrays(inputs, last.obs), last.action, last.reward
+            last.memory.past, join_arrays(inputs, last.obs), last.action, last.reward
         )
 
     def steps(self, state: AgentState, window: Transition, tasks: Task) -> tuple[Transition, Array, Any, Any]:
@@ -182,3 +160,25 @@ class View:
         trained = task.id < state.num_tasks
         own = self.representation.stand_in(nets["representation"], of_all, trained, inputs)
         return nets | {"representation": own}, self.features(state, task), inputs
+
+
+def init_inputs(spec: Spec, num_tasks: int) -> Params:
+    """Return moments of no observations, with their layout unless networks take them as they are.
+
+    In a mixture each task has moments of its own, leaves (T, O).
+    """
+    moments = normalize.init(max(frames.state_size(spec), 1))  # checkpoints hold no empty arrays
+    layout = frames.layout(spec.obs)
+    shared: dict[str, Any] = {} if layout is None else {"layout": layout}
+    if not spec.mixed:
+        return Params(shared | {"moments": moments}, {})
+    return Params(shared, {"moments": jax.tree.map(lambda x: jnp.stack([x] * num_tasks), moments)})
+
+
+def join_arrays(inputs: Params, obs: Any) -> Any:
+    """Return observations of a tree of arrays as vectors (..., O), beside which pictures stay; vectors as they are.
+
+    Networks, moments and memories see observations through it alone.
+    """
+    layout = inputs.shared.get("layout")
+    return obs if layout is None else layout(obs)

@@ -10,6 +10,7 @@ own goal; never states that an episode reached. Differs from Li et al.: the othe
 the one in which the steps would have earned the most.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -19,7 +20,7 @@ import jax.numpy as jnp
 from mtjax.experience import ring as rings
 from mtjax.experience.ring import Ring
 from mtjax.tasks import episode_task
-from mtjax.types import Env, InputError, Key, Task, Transition
+from mtjax.types import Array, Env, InputError, Key, Task, Transition
 
 
 def require(env: Env) -> None:
@@ -48,7 +49,7 @@ def require(env: Env) -> None:
 
 
 def sample(
-    env: Env, agent: Any, tasks: Task, share: float, ring: Ring, key: Key, shape: tuple[int, int, int], window: int = 0
+    env: Env, tasks: Task, share: float, ring: Ring, key: Key, shape: tuple[int, int, int], window: int = 0
 ) -> Transition:
     """Draw U batches of B transitions for each task, ``shape`` (T, U, B), and relabel the first round(share B).
 
@@ -63,20 +64,35 @@ def sample(
     own = jnp.broadcast_to(jnp.arange(num_tasks)[:, None, None], shape)
     rows = rings.sample_from(ring, row_key, own.at[:, :, :count].add(shift) % num_tasks, window)
     keys = (jax.random.split(task_key, again), jax.random.split(goal_key, again))
-    of_task = jax.vmap(jax.vmap(partial(relabel, env, agent), (None, 0, 0, 0)), (None, 0, 0, 0))
+    of_task = jax.vmap(jax.vmap(partial(relabel, env), (None, 0, 0, 0)), (None, 0, 0, 0))
     new = jax.vmap(of_task)(tasks, jax.tree.map(lambda x: x[:, :, :count], rows), *keys)
     return jax.tree.map(lambda new, rows: jnp.concatenate([new, rows[:, :, count:]], axis=2), new, rows)
 
 
-def relabel(env: Env, agent: Any, task: Task, transition: Transition, task_key: Key, goal_key: Key) -> Transition:
+def relabel(env: Env, task: Task, transition: Transition, task_key: Key, goal_key: Key) -> Transition:
     """Relabel a step, or a window (n, ...), as of ``task``, or of a fresh draw where episodes draw their tasks."""
     world = episode_task(task, task_key)
 
     def one(step: Transition) -> Transition:
-        new = agent.relabel(env, world, step, goal_key)
+        new = with_past(lambda step: env.relabel(world, step, goal_key), step)  # type: ignore
         return new if step.context is None else new._replace(context=world.context)
 
     return jax.vmap(one)(transition) if jnp.ndim(transition.reward) else one(transition)
+
+
+def with_past(one: Callable[[Transition], Transition], transition: Transition) -> Transition:
+    """Relabel a transition by ``one``, which relabels single steps, and the last steps that are remembered with it."""
+    past = getattr(transition.memory, "past", None)
+    if past is None:
+        return one(transition)
+    following = jnp.concatenate([past.obs[1:], transition.obs[None]])
+
+    def step(obs: Array, action: Array, reward: Array, next_obs: Array) -> Transition:
+        return one(transition._replace(obs=obs, action=action, reward=reward, next_obs=next_obs, memory=None))
+
+    then, known = jax.vmap(step)(past.obs, past.action, past.reward, following), past.known > 0
+    obs, reward = jnp.where(known[:, None], then.obs, past.obs), jnp.where(known, then.reward, past.reward)
+    return one(transition)._replace(memory=transition.memory._replace(past=past._replace(obs=obs, reward=reward)))
 
 
 def fresh_goals(env: Any, tasks: Task) -> bool:

@@ -226,7 +226,7 @@ class Replay:
         shape = (len(tasks.id), self.updates_per_step, self.batch_size)
         if self.hindsight:
             length = self.length(env.spec)
-            rows = hindsight.sample(env, agent, tasks, self.hindsight, data.ring, key, shape, length)
+            rows = hindsight.sample(env, tasks, self.hindsight, data.ring, key, shape, length)
             rows = rows if length else _single(rows, 3)
         else:
             rows = self.draw(env.spec, agent, data.ring, key, math.prod(shape[1:]))

@@ -1,7 +1,6 @@
 """Features of a hidden task, which a trajectory encoder infers from the last steps."""
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
 import flax.linen as nn
@@ -11,7 +10,7 @@ import jax.numpy as jnp
 from mtjax.agents import parts
 from mtjax.agents.parts.knowing.base import Nothing
 from mtjax.networks import MLP, Network, Params
-from mtjax.types import Array, Key, Transition
+from mtjax.types import Array, Key
 
 
 class Past(NamedTuple):
@@ -44,22 +43,6 @@ def append(past: Past, obs: Array, action: Array, reward: Array) -> Past:
         [jax.lax.slice_in_dim(old, 1, None, axis=lead), jnp.expand_dims(new, lead)], axis=lead
     )
     return jax.tree.map(join, past, latest)
-
-
-def relabel(one: Callable[[Transition], Transition], transition: Transition) -> Transition:
-    """Relabel a transition and its past as another task's by ``one``, which relabels single steps."""
-    past: Past = transition.memory.past
-    following = jnp.concatenate([past.obs[1:], transition.obs[None]])
-
-    def step(obs: Array, action: Array, reward: Array, next_obs: Array) -> Transition:
-        return one(transition._replace(obs=obs, action=action, reward=reward, next_obs=next_obs, memory=None))
-
-    then = jax.vmap(step)(past.obs, past.action, past.reward, following)
-    known = past.known > 0
-    past = past._replace(
-        obs=jnp.where(known[:, None], then.obs, past.obs), reward=jnp.where(known, then.reward, past.reward)
-    )
-    return one(transition)._replace(memory=transition.memory._replace(past=past))
 
 
 def without_past(seen: Any) -> Any:

@@ -48,5 +48,5 @@ class Asymmetric(Seeing):
         return features, self.acts_on(obs)
 
     @property
-    def sight(self) -> nn.Module:
+    def sight(self) -> nn.Module:  # type: ignore[override]
         return Sight(self.latent_widths[-1], self.vision)

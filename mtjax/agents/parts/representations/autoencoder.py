@@ -11,7 +11,7 @@ from mtjax import frames
 from mtjax.agents import parts
 from mtjax.agents.parts import vision
 from mtjax.agents.parts.knowing.last_steps import without_past
-from mtjax.agents.parts.representations.encoded import Encoded
+from mtjax.agents.parts.representations.encoded import Encoded, init_part
 from mtjax.networks import MLP, Params
 from mtjax.types import Array, Key, Metrics
 
@@ -60,9 +60,7 @@ class Autoencoder(Encoded):
     ) -> tuple[Params, Key]:
         params, key = super().init(num_tasks, features, obs, seen, action, own, key)
         key, decoder_key = jax.random.split(key)
-        self.init_part(
-            params, "decoder", self.decoder(obs), own, decoder_key, num_tasks, jnp.zeros(self.latent_widths[-1])
-        )
+        init_part(params, "decoder", self.decoder(obs), own, decoder_key, num_tasks, jnp.zeros(self.latent_widths[-1]))
         return params, key
 
     def decoder(self, obs: Any) -> nn.Module:

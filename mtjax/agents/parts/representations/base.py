@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -12,6 +12,13 @@ from mtjax.agents import parts
 from mtjax.agents.parts.knowing.last_steps import without_past
 from mtjax.networks import Params
 from mtjax.types import Array, InputError, Key, Metrics, Transition
+
+
+class Unseen(NamedTuple):
+    """Says what a task that was not trained on acts by."""
+
+    borrowed: tuple[str, ...] = ()  # names of what it uses of its nearest training task
+    replaced: str = ""  # what it has that no training task has; empty for nothing
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,9 +33,15 @@ class Plain:
 
     names: ClassVar[tuple[str, ...]] = ()  # of its parameters
     models: ClassVar[tuple[str, ...]] = ()  # names of parameters that no target is computed with
+    own_target: ClassVar[tuple[str, ...]] = ()  # names of parameters that are their own targets
+    rates: ClassVar[Mapping[str, float]] = {}  # steps of targets by name, where they are not the critics' ``tau``
     sees_pictures: ClassVar[bool] = False  # whether it encodes pictures
     predicts: ClassVar[bool] = False  # whether its models predict what a single step leads to
     embeds: ClassVar[bool] = False  # whether every task has a learned vector
+    history: ClassVar[int] = 0  # how many last steps it needs beside each observation
+    least_loss: ClassVar[float | Array] = 0.0  # lower bound of what its losses add to the critics' loss
+    sight: ClassVar[nn.Module | None] = None  # of the actor's own: maps observations with pictures to vectors
+    unseen: ClassVar[Unseen] = Unseen()
 
     def __post_init__(self):
         parts.require_choices(self)
@@ -37,20 +50,6 @@ class Plain:
     def learns(self) -> bool:
         """Whether it has parameters."""
         return bool(self.names)
-
-    @property
-    def history(self) -> int:
-        """Number of last steps that it needs beside each observation."""
-        return 0
-
-    def followed(self, params: Params) -> Params:
-        """Return the parameters of which there is a slow copy, as a target: all but models."""
-        return params.without(self.models)
-
-    @property
-    def rates(self) -> Mapping[str, float]:
-        """Step sizes of target parameters, by name, where they are not the critics' ``tau``."""
-        return {}
 
     def init(
         self, num_tasks: int, features: Array, obs: Any, seen: Any, action: Array, own: bool, key: Key
@@ -88,15 +87,6 @@ class Plain:
         """Return the actor's inputs, as ``perceive`` does the critics'."""
         return self.perceive(params, features, obs)
 
-    @property
-    def sight(self) -> nn.Module | None:
-        """Return a module of the actor's own, which maps its observations with pictures to vectors; None for none."""
-        return None
-
-    def for_actor(self, params: Params, before: Params) -> Params:
-        """Return the parameters that the actor's loss sees, given those before the critics' step too."""
-        return params
-
     def augment(self, batch: Transition, key: Key) -> Transition:
         """Return a batch of transitions (T, B, ...) with observations changed at random, as losses should see them."""
         return batch
@@ -120,13 +110,6 @@ class Plain:
         """
         return loss, metrics
 
-    @property
-    def least_loss(self) -> float | Array:
-        """Lower bound of what its losses add to the critics' loss."""
-        return 0.0
-
-    # Tasks that were not trained on.
-
     def stand_in(self, params: Params, trained: Params, known: Array, obs: Any) -> Params:
         """Return the parameters for acting in one task, at an observation (O,).
 
@@ -136,13 +119,3 @@ class Plain:
             known: () whether the task is a training task.
         """
         return params
-
-    @property
-    def borrowed(self) -> list[str]:
-        """Names of what an unseen task uses of its nearest training task."""
-        return []
-
-    @property
-    def replaced(self) -> str:
-        """What an unseen task has that no training task has; empty for nothing."""
-        return ""

@@ -78,9 +78,9 @@ class DeepMDP(Encoded):
         parts.require_positive(self, "model_coefficient")
 
     @property
-    def model_modules(self) -> dict[str, nn.Module]:
+    def modules(self) -> dict[str, nn.Module]:
         size = self.latent_widths[-1]
-        return {
+        return super().modules | {
             "transition": Model(self.model_widths, 2 * size if self.transition == "probabilistic" else size),
             "reward": Model(self.model_widths, 1),
         }
@@ -121,7 +121,7 @@ class DeepMDP(Encoded):
         return loss + self.model_coefficient * (transition_loss + reward_loss), metrics
 
     @property
-    def least_loss(self) -> float | Array:
+    def least_loss(self) -> float | Array:  # type: ignore[override]
         """The losses of an exact reward, and of an exact latent state with the smallest standard deviation."""
         least = math.log(DEVIATIONS[0]) if self.transition == "probabilistic" else 0.0
         return self.model_coefficient * least

@@ -66,27 +66,15 @@ class Encoded(Seeing):
         parts.require_rates(self, "encoder_tau")
 
     @property
-    def rates(self) -> dict[str, float]:
+    def rates(self) -> dict[str, float]:  # type: ignore[override]
         return dict.fromkeys(self.slow, self.encoder_tau)
 
     @property
-    def own_target(self) -> tuple[str, ...]:
-        """Names of encoders that are their own targets."""
+    def own_target(self) -> tuple[str, ...]:  # type: ignore[override]
         swept = isinstance(self.encoder_tau, jax.Array)
         return self.slow if not swept and self.encoder_tau == 1 else ()
 
-    def followed(self, params: Params) -> Params:
-        return super().followed(params).without(self.own_target)
-
-    def for_actor(self, params: Params, before: Params) -> Params:
-        return params.without(self.own_target).filled(before)
-
     # Networks: each is used by all N critics and by the actor.
-
-    @property
-    def model_modules(self) -> dict[str, nn.Module]:
-        """The models, by name."""
-        return {}
 
     def model_inputs(self, latent: Array, features: Array, action: Array) -> dict[str, tuple]:
         """Return inputs of the models that are all zero, by name."""
@@ -95,10 +83,10 @@ class Encoded(Seeing):
     @property
     def modules(self) -> dict[str, nn.Module]:
         """The encoders and models, by name."""
-        return {"latent": Latent(self.latent_widths, self.vision), **self.model_modules}
+        return {"latent": Latent(self.latent_widths, self.vision)}
 
     @property
-    def sight(self) -> nn.Module:
+    def sight(self) -> nn.Module:  # type: ignore[override]
         """Return a projection, which critics and actor each have of their own."""
         return Projection(self.latent_widths[-1])
 
@@ -116,24 +104,15 @@ class Encoded(Seeing):
         features = self.task_features(params.of_first(), features)
         inputs = {"latent": (obs,), **self.model_inputs(latent, features, action)}
         for (name, module), part_key in zip(self.modules.items(), keys, strict=True):
-            self.init_part(params, name, module, own, part_key, num_tasks, *inputs.get(name, (seen,)))
+            init_part(params, name, module, own, part_key, num_tasks, *inputs.get(name, (seen,)))
         if frames.shown(obs):
             convolved = self.convolve(params.of_first(), obs)
-            self.init_part(params, PROJECTION, self.sight, own, jax.random.fold_in(key, 1), num_tasks, convolved)
+            init_part(params, PROJECTION, self.sight, own, jax.random.fold_in(key, 1), num_tasks, convolved)
         return params, key
 
     def init_vectors(self, num_tasks: int, key: Key) -> Params:
         """Return the vectors that are learned for each task; none by default."""
         return Params({}, {})
-
-    def init_part(
-        self, params: Params, name: str, module: nn.Module, own: bool, key: Key, num_tasks: int, *inputs: Any
-    ) -> None:
-        """Add the initial parameters of an encoder or a model: one for all tasks, or every task's own."""
-        if own:
-            params.own[name] = Network.for_each_task(module.init, key, num_tasks, *inputs)
-        else:
-            params.shared[name] = module.init(key, *inputs)
 
     # Inputs of networks, for one task: features (Z,) or (B, Z), observations (..., O).
 
@@ -160,3 +139,11 @@ class Encoded(Seeing):
     def convolve(self, params: Params, obs: Any) -> Any:
         """Return observations with the features (..., F) of convolutions in place of pictures."""
         return obs | {frames.PICTURES: self.apply(params, "latent", obs)}
+
+
+def init_part(params: Params, name: str, module: nn.Module, own: bool, key: Key, num_tasks: int, *inputs: Any) -> None:
+    """Add the initial parameters of an encoder or a model: one for all tasks, or every task's own."""
+    if own:
+        params.own[name] = Network.for_each_task(module.init, key, num_tasks, *inputs)
+    else:
+        params.shared[name] = module.init(key, *inputs)

@@ -10,15 +10,16 @@ import jax.numpy as jnp
 from mtjax.agents import parts
 from mtjax.agents.parts.knowing.embedding import unit
 from mtjax.agents.parts.knowing.last_steps import TrajectoryEncoder
+from mtjax.agents.parts.representations.base import Unseen
 from mtjax.agents.parts.representations.deepmdp import DeepMDP, ModelTargets
 from mtjax.networks import Params, join
 from mtjax.types import Array, Key, Metrics
 
 STAND_INS = {
-    "nearest": "",
-    "zero": "zeros for theta",
-    "mean": "the mean of the training tasks' thetas",
-    "inferred": "a theta inferred from its last steps",
+    "nearest": Unseen(borrowed=("theta",)),
+    "zero": Unseen(replaced="zeros for theta"),
+    "mean": Unseen(replaced="the mean of the training tasks' thetas"),
+    "inferred": Unseen(replaced="a theta inferred from its last steps"),
 }
 
 
@@ -71,7 +72,7 @@ class HiPBMDP(DeepMDP):
         parts.require_counts(self, "theta_size", "theta_from")
 
     @property
-    def history(self) -> int:
+    def history(self) -> int:  # type: ignore[override]
         return self.theta_from if self.unseen_theta == "inferred" else 0
 
     @property
@@ -105,11 +106,7 @@ class HiPBMDP(DeepMDP):
         return with_theta(params, jnp.where(known, params.own["embedding"], theta))
 
     @property
-    def borrowed(self) -> list[str]:
-        return ["theta"] * (self.unseen_theta == "nearest")
-
-    @property
-    def replaced(self) -> str:
+    def unseen(self) -> Unseen:  # type: ignore[override]
         return STAND_INS[self.unseen_theta]
 
     # Losses.
