@@ -269,7 +269,8 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
         learners, losses = _learn(env, agent, tasks, learners, data, state.iteration, learn_key)
         learners = over_seeds(observe, 0, 0)(learners, steps)
         learners = _with_played(state.agent, learners, state.rows)
-        return state._replace(agent=learners, data=experience.keep(data), key=key), seen | {"losses": losses}
+        data = data if experience.storage.kept else ()
+        return state._replace(agent=learners, data=data, key=key), seen | {"losses": losses}
 
     state, history = jax.lax.scan(iterate, state, length=settings.chunk_steps // experience.steps)
     count = settings.num_envs * settings.chunk_steps
@@ -316,7 +317,7 @@ def _consolidate(env: Env, agent: Agent, known: Task, state: TrainState) -> Any:
         return consolidate(at_point(agent, learner), learner, draw, tasks, jax.random.fold_in(key, _END))
 
     played = _of_played(state.agent, state.rows)
-    played = over_seeds(of_seed, 0, experience.axes, 0)(played, state.data, state.key)
+    played = over_seeds(of_seed, 0, experience.storage.axes, 0)(played, state.data, state.key)
     return _with_played(state.agent, played, state.rows)
 
 
@@ -436,7 +437,7 @@ def _update(env, agent, tasks, learners: Any, data: Any, iteration: Array, keys:
         learner, metrics = jax.lax.scan(update, learner, (batches, update_keys, numbers))
         return learner, jax.tree.map(lambda x: jnp.mean(x, axis=0), metrics)
 
-    return over_seeds(learn_one, 0, experience.axes, 0)(learners, data, keys)
+    return over_seeds(learn_one, 0, experience.storage.axes, 0)(learners, data, keys)
 
 
 def _reset_networks(env, agent, tasks, learners: Any, iteration: Array, keys: Key) -> Any:

@@ -232,6 +232,14 @@ class Env(Protocol):
     def where_worlds(self, mask: Array, new: Any, old: Any) -> Any: ...  # states; mask (S, T, E)
 
 
+class Storage(NamedTuple):
+    """Says how the data of an experience lies."""
+
+    axes: Any  # of the data under a map over seeds
+    sharding: Any  # of the data, as a tree of PartitionSpec
+    kept: bool  # whether the next iteration needs it
+
+
 class Experience(Protocol):
     """An experience collects what an agent learns from. It is a frozen dataclass whose fields are flags of the agent.
 
@@ -245,17 +253,11 @@ class Experience(Protocol):
     @property
     def updates(self) -> int: ...  # U, each time that the agent learns
     @property
-    def policy_delay(self) -> int: ...  # the actor learns at every so many updates
-    @property
     def warmup_steps(self) -> int: ...  # of every environment under random actions before learning starts
     @property
     def reset_every(self) -> int: ...  # steps of every environment between two resets of networks; 0 for never
-    def updates_in(self, steps: int) -> int: ...  # updates in so many steps of all environments
-    def window_steps(self, steps: int) -> int: ...  # length L of windows for a memory that learns through so many steps
     @property
-    def axes(self) -> Any: ...  # of the data under a map over seeds
-    @property
-    def sharding(self) -> Any: ...  # of the data, as a tree of PartitionSpec
+    def storage(self) -> Storage: ...
     def check(self, env: Env, num_envs: int, chunk_steps: int = 0) -> None: ...  # raises InputError
     def host_slots(self, num_envs: int) -> int: ...  # steps of every environment that the host keeps beside the data
     def rollout_bytes(self, spec: Spec, num_envs: int) -> int: ...  # of a task's steps that are learned from, not kept
@@ -265,7 +267,6 @@ class Experience(Protocol):
     def add(self, data: Any, steps: Transition) -> Any: ...  # leaves (S, T, H, E, ...)
     def batches(self, env: Env, agent: Any, tasks: Task, data: Any, key: Key) -> Any: ...  # leaves (U, ...)
     def window(self, data: Any, batch: Any) -> Transition: ...  # windows (T, B, L, ...) of one of the batches
-    def keep(self, data: Any) -> Any: ...  # what the next iteration needs
 
 
 class Agent(Protocol):

@@ -20,7 +20,7 @@ from mtjax.command.keywords import configured
 from mtjax.config import Plan, configure
 from mtjax.envs import ENVS
 from mtjax.envs.probes import AFTER, LIMIT, RULES, SPEC, Probe, tasks_of
-from mtjax.experience import Replay
+from mtjax.experience import Replay, rollouts
 from mtjax.frames import seen
 from mtjax.networks import Params
 from mtjax.training.launch import check, launch
@@ -283,7 +283,7 @@ def prepare(agent, state, batch: Transition, tasks: Task):
 def assessed(agent, state, steps: Transition, tasks: Task):
     """A rollout (T, H, E, ...) assessed, and the batch (T, H E, ...) that the losses take of all its steps."""
     state, steps = agent.assess(state, steps, tasks)
-    state, batch = agent.prepare(state, agent.experience.windows(steps, agent.unroll), tasks)
+    state, batch = agent.prepare(state, rollouts.windows(steps, agent.unroll), tasks)
     return state, batch, steps
 
 

@@ -36,7 +36,8 @@ from mtjax.agents.parts.gradients.balancing import FAMO
 from mtjax.agents.parts.knowing.last_steps import Past, Seen, append
 from mtjax.agents.parts.representations.deepmdp import ModelTargets
 from mtjax.agents.replayed import Batch, slow_copies
-from mtjax.agents.unseen import unseen
+from mtjax.agents.unseen import describe_unseen
+from mtjax.experience.rollouts import windows
 from mtjax.networks import Params
 from mtjax.types import InputError, Spec, Transition
 
@@ -404,7 +405,7 @@ def test_theta_of_an_unseen_task(strategy):
         np.testing.assert_allclose(act(state, pick(TASKS, i)), expected, atol=1e-6)
     assert make("hip-bmdp").representation.unseen_theta == "mean"  # the others' parameters are hidden
     assert (
-        unseen(agent)
+        describe_unseen(agent)
         == {
             "nearest": "each uses the theta of the nearest training task",
             "zero": "each has zeros for theta",
@@ -428,7 +429,7 @@ def test_theta_of_an_unseen_task_is_inferred_from_its_last_steps():
     other = past._replace(reward=past.reward + 1.0)
     assert not np.allclose(act(state, past, STRANGER), act(state, other, STRANGER))
     np.testing.assert_array_equal(act(state, past, pick(TASKS, 0)), act(state, other, pick(TASKS, 0)))
-    assert unseen(agent) == "each has a theta inferred from its last steps"
+    assert describe_unseen(agent) == "each has a theta inferred from its last steps"
 
 
 @pytest.mark.slow
@@ -634,7 +635,7 @@ def test_ppos_models_predict_what_the_encoder_saw_before_the_update():
     agent = make_ppo(representation="deepmdp")
     state = agent.init(SPEC, TASKS, KEY)
     state, _, steps = assessed(agent, state, rollouts(agent), TASKS)
-    window, params = agent.experience.windows(steps, 0), state.nets["representation"]
+    window, params = windows(steps, 0), state.nets["representation"]
     before = lambda slow: state._replace(slow={"representation": slow})
     step = jit(lambda slow: agent.update(before(slow), window, TASKS, KEY, jnp.int32(0))[1])
     now, other = step(params), step(jax.tree.map(lambda x: x * 1.5 + 0.05, params))

@@ -19,7 +19,7 @@ from mtjax.agents.parts.policies import Gaussian
 from mtjax.agents.replayed import Batch
 from mtjax.agents.sac import SAC
 from mtjax.agents.state import axes_of
-from mtjax.agents.unseen import unseen
+from mtjax.agents.unseen import describe_unseen
 from mtjax.networks import Params
 from mtjax.types import InputError, Spec
 
@@ -357,7 +357,7 @@ def test_training_tasks_play_their_own_policies_and_others_the_distilled_one(sta
         unseen = pick(TASKS, 0)._replace(id=jnp.int32(number), context=jnp.float32([context]))
         np.testing.assert_allclose(act(unseen), mean(common), rtol=1e-5)
     assert len(np.unique(np.stack([mean(x) for x in (*own, common)]), axis=0)) == 4
-    assert unseen(made) == "the distilled policy plays them"
+    assert describe_unseen(made) == "the distilled policy plays them"
 
 
 @pytest.mark.parametrize("conditioning", one_in(2, ["one-hot", "parameters", "embedding"]))
@@ -369,7 +369,7 @@ def test_a_distilled_policy_may_be_told_the_task(conditioning):
         np.asarray(act_once(made, fresh, jnp.ones(3), pick(TASKS, i)._replace(id=jnp.int32(7)), None)) for i in (0, 1)
     ]
     assert not np.allclose(played[0], played[1], atol=1e-3)
-    assert ("nearest" in unseen(made)) == (conditioning != "parameters")
+    assert ("nearest" in describe_unseen(made)) == (conditioning != "parameters")
 
 
 # What makes no sense.

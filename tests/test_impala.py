@@ -12,6 +12,7 @@ from mtjax.agents import critics
 from mtjax.agents.parts import targets
 from mtjax.agents.units import Units
 from mtjax.envs.probes import Probe
+from mtjax.experience import rollouts
 from mtjax.types import InputError, Spec
 
 SPEC, LENGTH = Spec.vector(3, 2, 1)._replace(sentences=("Walk.", "Run.", "Hop.")), 4
@@ -27,7 +28,7 @@ def test_a_batch_holds_vtrace_of_the_present_policy_and_critic():
     """Window by window; targets and advantages are in the units that have moved by these targets."""
     agent = small(gae_lambda=0.7, normalize_observations=False)
     state, steps = agent.init(SPEC, TASKS, KEY), random_steps(agent)
-    window = agent.experience.windows(steps, agent.unroll)
+    window = rollouts.windows(steps, agent.unroll)
     after, batch = quick(agent.prepare, state, window, TASKS)(state, window, TASKS)
     units = Units.of(after.nets["units"])
 
@@ -54,7 +55,7 @@ def test_scales_of_rewards_do_not_weigh_tasks():
     @jax.jit
     def advantages(steps):
         state, _ = learn(agent, agent.init(SPEC, TASKS, KEY), steps, TASKS, KEY)
-        return agent.prepare(state, agent.experience.windows(steps, agent.unroll), TASKS)[1].advantage
+        return agent.prepare(state, rollouts.windows(steps, agent.unroll), TASKS)[1].advantage
 
     steps = random_steps(agent)
     one, found = (advantages(steps._replace(reward=scale * steps.reward)) for scale in (1.0, 1000.0))

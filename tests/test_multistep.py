@@ -15,7 +15,7 @@ from mtjax.agents.parts.knowing.last_steps import append
 from mtjax.agents.swept import with_numbers
 from mtjax.experience import Replay, multistep
 from mtjax.experience import ring as rings
-from mtjax.experience.replay import Buffer
+from mtjax.experience.replay import Buffer, joined
 from mtjax.networks import Params
 from mtjax.types import InputError, Spec, Transition
 
@@ -111,7 +111,7 @@ class Auditor(Stub):
         return jnp.float32(0.5)  # its discount
 
     def update(self, state, window, tasks, key, number):
-        batch = self.experience.joined(window, jnp.broadcast_to(state, len(tasks.id)))
+        batch = joined(window, jnp.broadcast_to(state, len(tasks.id)), self.experience.n_step)
         age, count = batch.obs[..., 0], jnp.round((batch.next_obs - batch.obs)[..., 0])
         powers = jnp.where(jnp.arange(self.n) < count[..., None], state ** jnp.arange(self.n), 0)
         scale = tasks.goal["scale"][:, None]

@@ -20,6 +20,7 @@ from mtjax.agents.state import axes_of
 from mtjax.config import with_preset
 from mtjax.envs.probes import Pictured, Probe
 from mtjax.experience import Rollouts, pictures
+from mtjax.experience.replay import joined
 from mtjax.networks import Params
 from mtjax.training.launch import check
 from mtjax.types import InputError, Transition
@@ -128,7 +129,7 @@ class SightAuditor(probes.Stub):
         return jnp.max(jnp.abs(obs["pixels"].reshape(*place.shape, 4, 3, 2) - expected[..., None, :, :]), (-3, -2, -1))
 
     def update(self, state, window, tasks, key, number):
-        batch = self.experience.joined(window, jnp.broadcast_to(state, len(tasks.id)))
+        batch = joined(window, jnp.broadcast_to(state, len(tasks.id)), self.experience.n_step)
         place, after = batch.obs["state"][..., 0], batch.next_obs["state"][..., 0]
         count = jnp.round(after - place)
         powers = jnp.where(jnp.arange(self.n) < count[..., None], state ** jnp.arange(self.n), 0)

@@ -21,6 +21,7 @@ from mtjax.agents.on_policy import Taken
 from mtjax.agents.parts.knowing.inference import Belief, change, divergence, factor, product, unit
 from mtjax.agents.parts.knowing.posterior import Posterior
 from mtjax.agents.parts.knowing.recurrent import Following, Hidden, Track
+from mtjax.experience import rollouts
 from mtjax.types import Discrete, InputError, Spec, Transition
 
 WAYS = ["varibad", "pearl", "cadm"]
@@ -318,7 +319,7 @@ def batch_of(agent):
     """A batch of one task of PPO, with a key, and that task's networks."""
     state = agent.init(SPEC_OF_ROLLOUT, TASKS, KEY)
     state, steps = agent.assess(state, rollout(agent), TASKS)
-    state, batch = agent.prepare(state, agent.experience.windows(steps, agent.unroll), TASKS)
+    state, batch = agent.prepare(state, rollouts.windows(steps, agent.unroll), TASKS)
     one = pick(batch._replace(mask=None), 0)
     return of_task(state.nets, 0), one._replace(obs=one.obs._replace(past=one.obs.past._replace(key=KEY)))
 

@@ -16,6 +16,7 @@ from mtjax.agents.base import Memory
 from mtjax.agents.on_policy import Taken
 from mtjax.agents.parts.knowing.recurrent import Following, Recurrent, Track
 from mtjax.agents.ppo import PPO
+from mtjax.experience import rollouts
 from mtjax.types import InputError, Spec, Transition
 
 SPEC, LENGTH, ENVS, SIZE = Spec.vector(3, 2, 1), 6, 4, 5
@@ -86,7 +87,7 @@ def test_each_loss_trains_the_memory_that_it_sees():
     agent = tiny("ppo", unroll=LENGTH, epochs=1, minibatches=1, **RECURRENT)
     state, steps = agent.init(SPEC, TASKS, KEY), rollout()
     state, steps = agent.assess(state, steps, TASKS)
-    state, batch = agent.prepare(state, agent.experience.windows(steps, agent.unroll), TASKS)
+    state, batch = agent.prepare(state, rollouts.windows(steps, agent.unroll), TASKS)
     nets, one = of_task(state.nets, 0), pick(batch._replace(mask=None), 0)
     of_actor = jax.grad(lambda nets: agent.actor_loss(nets, one, KEY)[0])(nets)["knowing"]
     of_critic = jax.grad(lambda nets: agent.critic_loss(nets, one)[0])(nets)["knowing"]

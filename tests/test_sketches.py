@@ -16,7 +16,7 @@ from mtjax.agents import for_action
 from mtjax.agents.on_policy import Batch
 from mtjax.agents.sketches import SubPolicies
 from mtjax.agents.state import of_task
-from mtjax.agents.unseen import unseen
+from mtjax.agents.unseen import describe_unseen
 from mtjax.envs.craft.sketched import Sketched
 from mtjax.envs.parameters import Parameter
 from mtjax.evaluation import Episodes, evaluate
@@ -118,7 +118,7 @@ def test_ablations_share_less_or_everything(sharing, heads):
 
 def test_unseen_tasks_use_what_sketches_share():
     """Only a policy for each task is borrowed from a nearest one."""
-    said = {sharing: unseen(made(sharing=sharing)) for sharing in ("symbols", "tasks", "all")}
+    said = {sharing: describe_unseen(made(sharing=sharing)) for sharing in ("symbols", "tasks", "all")}
     assert said == {
         "symbols": "each is played by the policies of its sketch's symbols",
         "tasks": "each uses the networks of the nearest training task",

@@ -9,6 +9,7 @@ from probes import act, learner, of_task, pick, quick, random_batch, slow_but, t
 
 from mtjax.agents import agent, replayed
 from mtjax.agents.parts.encoders import BatchNorm
+from mtjax.agents.unseen import describe_unseen
 from mtjax.networks import STATISTICS, Network, Params
 from mtjax.types import InputError, Spec
 
@@ -174,7 +175,7 @@ def test_an_action_is_that_of_the_tasks_own_running_statistics():
     assert len(np.unique(actions, axis=0)) == 3
     unseen = pick(tasks_of("one-step", [0.25]), 0)._replace(id=jnp.int32(9))
     np.testing.assert_array_equal(act(made, state, obs, unseen, None), actions[2])
-    assert "statistics of the nearest training task" in unseen(made)
+    assert "statistics of the nearest training task" in describe_unseen(made)
 
 
 def test_a_task_is_seen_though_its_features_are_the_same_in_all_of_its_batch():

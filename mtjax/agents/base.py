@@ -209,8 +209,9 @@ class BaseAgent(abc.ABC):
 
     @property
     def unroll(self) -> int:
-        """Steps L of the windows through which a memory learns; 0 if none does."""
-        return self.experience.window_steps(self.conditioning.recurrent_steps) if self.conditioning.recurs else 0  # type: ignore
+        """Steps L of the windows through which a memory learns, of a rollout all; 0 if none does."""
+        way: Any = self.conditioning
+        return getattr(self.experience, "unroll", way.recurrent_steps) if way.recurs else 0
 
     def init(self, spec: Spec, tasks: Task, key: Key) -> AgentState:
         """Return the initial state for the training ``tasks`` (T, ...)."""

@@ -12,6 +12,7 @@ from mtjax.agents.parts import targets
 from mtjax.agents.rates import discounts_of_all
 from mtjax.agents.state import AgentState
 from mtjax.agents.units import MIN_STD, Units
+from mtjax.experience.rollouts import played, windows
 from mtjax.parallel.collectives import mean_and_variance
 from mtjax.types import Array, Metrics, Task, Transition
 
@@ -37,12 +38,12 @@ def assess(
     Args:
         apart: splits the steps where they are several rollouts, each with advantages of its own: leaves (T, R, H, E).
     """
-    flat, features, obs, next_obs = agent.view.steps(state, agent.experience.windows(steps, agent.unroll), tasks)
+    flat, features, obs, next_obs = agent.view.steps(state, windows(steps, agent.unroll), tasks)
     old, output = Units.of(state.nets["units"]), critics.outputs(agent, state, features, obs)
     following, reward = critics.values(agent, state, features, next_obs), critics.rewards(agent, state, flat, tasks)
     found = old.rewards(output), following, output, reward
-    played = partial(agent.experience.played, shape=steps.reward.shape, length=agent.unroll)
-    value, next_value, output, reward = map(played, found)
+    in_order = partial(played, shape=steps.reward.shape, length=agent.unroll)
+    value, next_value, output, reward = map(in_order, found)
     advantage, scaled = advantages(agent, steps._replace(reward=reward), tasks, value, next_value, apart)
     target = value + advantage
     state = critics.renew(agent, state, target.reshape(len(target), -1))

@@ -13,6 +13,7 @@ from mtjax.agents.on_policy import ActorAux, Batch, OnPolicy
 from mtjax.agents.parts.adaptation import adapt, surrogate
 from mtjax.agents.state import AgentState, Nets, over_tasks
 from mtjax.experience import AdaptingRollouts
+from mtjax.experience.rollouts import windows
 from mtjax.networks import Params
 from mtjax.parallel import collectives
 from mtjax.types import Acted, Array, InputError, Key, Metrics, Task, Transition
@@ -107,7 +108,7 @@ class MAML(OnPolicy):
         if collectives.count() > 1:
             raise InputError("maml needs all environments of a seed on one device; use no more devices than seeds")
         _, steps = self.assess(state, steps, tasks)
-        _, batch = self.prepare(state, self.experience.windows(steps, 0), tasks)
+        _, batch = self.prepare(state, windows(steps, 0), tasks)
         of_task = lambda nets, batch: self.step_inside(nets, nets["adapted"], batch, Played.of(batch, 1))
         return state.with_nets(adapted=over_tasks(of_task, state.nets, batch))
 

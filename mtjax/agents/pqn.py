@@ -19,6 +19,7 @@ from mtjax.agents.parts.scaling import NoScaling
 from mtjax.agents.rates import discounts_of_all
 from mtjax.agents.state import AgentState, Nets, over_tasks
 from mtjax.experience import Rollouts
+from mtjax.experience.rollouts import played, windows
 from mtjax.networks import Params
 from mtjax.types import Acted, Array, InputError, Key, Metrics, Task, Transition
 
@@ -117,13 +118,13 @@ class PQN(BaseAgent):
 
     def assess(self, state: AgentState, steps: Transition, tasks: Task) -> tuple[AgentState, Transition]:
         """Add the targets to a rollout (T, H, E, ...)."""
-        flat, features, obs, next_obs = self.view.steps(state, self.experience.windows(steps, self.unroll), tasks)
+        flat, features, obs, next_obs = self.view.steps(state, windows(steps, self.unroll), tasks)
         values, following = (self.values(state, features, x, tasks) for x in (obs, next_obs))
         greedy = jnp.argmax(values, axis=-1) == flat.action
-        played = partial(self.experience.played, shape=steps.reward.shape, length=self.unroll)
-        closed, following = steps.closed, played(jnp.max(following, axis=-1))
+        in_order = partial(played, shape=steps.reward.shape, length=self.unroll)
+        closed, following = steps.closed, in_order(jnp.max(following, axis=-1))
         if self.cut_exploration:
-            closed |= jnp.roll(~played(greedy), -1, axis=1)
+            closed |= jnp.roll(~in_order(greedy), -1, axis=1)
         gamma = discounts_of_all(self, tasks)
         returns = jax.vmap(partial(targets.lambda_returns, lambda_=self.q_lambda))
         return state, steps._replace(extras=returns(steps._replace(closed=closed), following, gamma))

@@ -28,7 +28,8 @@ def planned(agent: A, steps: int) -> A:
     own: Any = agent
     if getattr(own, "lr_schedule", "constant") == "constant":  # agents of other kinds have none
         return agent
-    updates = own.lr_updates or own.experience.updates_in(steps)
+    each, warmup = own.experience.steps, own.experience.warmup_steps
+    updates = own.lr_updates or own.experience.updates * max(steps // each - warmup // each, 0)
     if updates <= own.lr_warmup:
         left = f"none of the run's {updates} updates to lr-schedule={own.lr_schedule}"
         raise InputError(f"lr-warmup={own.lr_warmup} leaves {left}")

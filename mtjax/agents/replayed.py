@@ -9,6 +9,7 @@ import optax
 from mtjax.agents.rates import discounts, discounts_of_all
 from mtjax.agents.state import AgentState, Nets, axes_of
 from mtjax.experience import pictures
+from mtjax.experience.replay import joined
 from mtjax.networks import Params
 from mtjax.types import Array, Key, Metrics, Task, Transition
 
@@ -81,7 +82,7 @@ def transitions(agent: Any, window: Transition, tasks: Task) -> Transition:
     """Return the transitions (T, N, ...) that windows (T, B, L, ...) are made to: all steps, or one n-step each."""
     if agent.unroll:
         return jax.tree.map(lambda x: x.reshape(len(x), -1, *x.shape[3:]), window._replace(memory=None))
-    return agent.experience.joined(window, discounts_of_all(agent, tasks))
+    return joined(window, discounts_of_all(agent, tasks), agent.experience.n_step)
 
 
 def action_sizes(action: Array, mask: Array | None) -> Array:

@@ -3,7 +3,7 @@
 from typing import Any
 
 
-def unseen(agent: Any) -> str:
+def describe_unseen(agent: Any) -> str:
     """Return a sentence on what stands in for unseen tasks; empty if nothing has to."""
     borrowed, replaced = " and ".join(_borrowed(agent)), agent.representation.unseen.replaced
     by_nearest = f"each uses the {borrowed} of the nearest training task" if borrowed else ""

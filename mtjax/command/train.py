@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mtjax import populations
-from mtjax.agents.unseen import unseen
+from mtjax.agents.unseen import describe_unseen
 from mtjax.command import sweep
 from mtjax.command.run_config import parse
 from mtjax.compiling.programs import enable_compile_cache
@@ -76,8 +76,8 @@ def _conclude(config: RunConfig, result: Result, directory: Path) -> None:
     if len(result.evaluations.steps):
         found = as_one_seed(result.evaluations) if config.plan.rule else result.evaluations
         print(split_table(found, config.family.parts), *[populations.NO_INTERVAL] * bool(config.plan.rule), sep="\n")
-        if unseen(config.learner):
-            print(f"unseen tasks: {unseen(config.learner)}")
+        if describe_unseen(config.learner):
+            print(f"unseen tasks: {describe_unseen(config.learner)}")
     rest = max(result.total_seconds - result.compile_seconds - result.trained_seconds, 0)
     print(
         f"done in {duration(result.total_seconds)}: compiled in {duration(result.compile_seconds)}, trained in "

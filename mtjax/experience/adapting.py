@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mtjax.experience.rollouts import Rollouts
+from mtjax.experience.rollouts import Rollouts, windows
 from mtjax.types import Array, Env, InputError, Key, Task, Transition
 
 
@@ -49,7 +49,7 @@ class AdaptingRollouts(Rollouts):
 
     def window(self, data: Transition, batch: Array) -> Transition:
         """Return all steps as windows (T, B, 1, ...) of one step, rollout after rollout."""
-        return self.windows(data, 0)
+        return windows(data, 0)
 
     def apart(self, steps: Any) -> Any:
         """Split steps (T, H, E, ...) of one rollout or more into these: (T, rollouts, unroll, E, ...)."""

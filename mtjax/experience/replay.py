@@ -15,7 +15,7 @@ from mtjax.experience import ring as rings
 from mtjax.experience.ring import OVER_SEEDS, Ring
 from mtjax.frames import PICTURES, shown
 from mtjax.parallel import collectives
-from mtjax.types import Array, Env, InputError, Key, Spec, Task, Transition
+from mtjax.types import Array, Env, InputError, Key, Spec, Storage, Task, Transition
 
 _FLAG = tyro.conf.arg(prefix_name=False)  # --batch-size, not --agent.batch-size
 
@@ -31,6 +31,11 @@ class Buffer(NamedTuple):
     key: Key  # (S,) for random actions before learning; it never changes, so that a drawn action can be held
 
 
+_SEEDS, _WHOLE = PartitionSpec("seeds"), PartitionSpec()
+_RING = Ring(PartitionSpec("seeds", None, None, collectives.AXIS), _WHOLE, _WHOLE, _WHOLE)  # type: ignore
+_STORAGE = Storage(axes=Buffer(OVER_SEEDS, None, 0), sharding=Buffer(_RING, _WHOLE, _SEEDS), kept=True)  # type: ignore
+
+
 @dataclasses.dataclass(frozen=True)
 class Replay:
     """Stores every step in a ring for each task, and updates the agent on random batches.
@@ -39,6 +44,7 @@ class Replay:
     ``update_every``-th, is followed by ``updates_per_step`` updates. ``multistep`` has the equations of ``n_step``.
     """
 
+    storage: ClassVar[Storage] = _STORAGE
     adaptations: ClassVar[int] = 0  # the policy stays as it is while it plays
     updates_per_step: Annotated[int, _FLAG] = 1
     """Gradient updates after each step of every environment, or after every so many by update-every."""
@@ -100,26 +106,7 @@ class Replay:
         if self.hindsight:
             hindsight.require(env)
         if self.host_replay_size:
-            self._check_host(env.spec, num_envs, chunk_steps)
-
-    def _check_host(self, spec: Spec, num_envs: int, chunk_steps: int) -> None:
-        if self.host_replay_size <= self.replay_size:
-            raise InputError(
-                f"host-replay-size ({self.host_replay_size}) must be more than replay-size ({self.replay_size}); "
-                "with 0 the device keeps all"
-            )
-        if jax.process_count() > 1:
-            raise InputError("host-replay-size takes one process; leave out --distributed")
-        count, length = self.segments(spec, num_envs)
-        if not count:
-            least = 2 * math.ceil(max(self.length(spec), 1) / self.steps) * self.steps * num_envs
-            raise InputError(f"with host-replay-size, replay-size must be at least {least}, not {self.replay_size}")
-        latest = self.capacity(num_envs) // num_envs - count * length
-        if chunk_steps > latest:
-            raise InputError(
-                f"with host-replay-size the device keeps the latest {latest} steps of every environment until a chunk "
-                f"ends, and one takes {chunk_steps}; lower --chunk-steps or raise --replay-size"
-            )
+            _require_host(self, env.spec, num_envs, chunk_steps)
 
     def describe(self, spec: Spec, num_envs: int) -> str:
         """Return a description of its size."""
@@ -137,14 +124,6 @@ class Replay:
         """Steps of every environment before the agent learns again."""
         return self.update_every
 
-    def window_steps(self, steps: int) -> int:
-        """Return the length L of windows for a memory that learns through so many steps."""
-        return steps
-
-    def updates_in(self, steps: int) -> int:
-        """Count the updates in a run of so many steps of every environment."""
-        return self.updates_per_step * max(steps // self.steps - self.warmup_steps // self.steps, 0)
-
     def capacity(self, num_envs: int) -> int:
         """Return how many transitions each task's ring holds: the replay size, rounded down to whole iterations."""
         stored = self.steps * num_envs
@@ -158,25 +137,12 @@ class Replay:
         """Return 0, as all steps that are learned from lie in the data."""
         return 0
 
-    def segments(self, spec: Spec, num_envs: int) -> tuple[int, int]:
-        """Return rows K and length L of the recalled segments on the device."""
-        if not self.host_replay_size:
-            return 0, 0
-        return store.segments(self.capacity(num_envs) // num_envs, self.length(spec), self.steps)
-
-    @property
-    def sharding(self) -> Buffer:
-        """How devices share the data: by the axes of seeds and of environments."""
-        seeds, whole = PartitionSpec("seeds"), PartitionSpec()
-        rows = PartitionSpec("seeds", None, None, collectives.AXIS)
-        return Buffer(Ring(rows, whole, whole, whole), whole, seeds)  # type: ignore
-
     # Data.
 
     def init(self, item: Transition, spec: Spec, num_tasks: int, num_envs: int, keys: Key) -> Buffer:
         """Return an empty replay for transitions like ``item`` (no leading axes) and seeds with ``keys`` (S,)."""
         item = pictures.compress(item, spec.obs[PICTURES].shape[-1]) if shown(spec.obs) else item
-        own, segments = num_envs // collectives.count(), self.segments(spec, num_envs)
+        own, segments = num_envs // collectives.count(), segments_of(self, spec, num_envs)
         latest = self.capacity(num_envs) // num_envs - math.prod(segments)
         blank = lambda _: rings.init(item, num_tasks, latest, own, segments)
         return Buffer(jax.vmap(blank, out_axes=OVER_SEEDS)(keys), jnp.int32(0), keys)
@@ -197,29 +163,12 @@ class Replay:
             ring = rings.weigh(ring, jnp.minimum(count, self.host_slots(steps.reward.shape[3] * collectives.count())))
         return Buffer(ring, count, data.key)
 
-    def newest(self, data: Buffer, count: int) -> Any:
-        """Return the latest steps of every environment in the order of time, leaves (S, T, count, E, ...)."""
-        return jax.vmap(partial(rings.newest, count=count), (OVER_SEEDS,))(data.ring)
-
-    def recall(self, data: Buffer, segments: Any) -> Buffer:
-        """Write recalled segments, leaves (S, T, F L, E, ...), over the oldest."""
-        return data._replace(ring=jax.vmap(rings.recall, (OVER_SEEDS, 0), OVER_SEEDS)(data.ring, segments))
-
-    def keep(self, data: Buffer) -> Buffer:
-        """Return all of the data."""
-        return data
-
     # Learning.
 
     @property
     def updates(self) -> int:
         """The number U of updates each time that the agent learns."""
         return self.updates_per_step
-
-    @property
-    def axes(self) -> Ring:
-        """Axes of what ``batches`` takes under a map over seeds."""
-        return Buffer(OVER_SEEDS, None, 0)  # type: ignore
 
     def batches(self, env: Env, agent: Any, tasks: Task, data: Buffer, key: Key) -> Transition:
         """Draw windows (U, T, B, L, ...) for one seed's updates, by one gather, which is fastest."""
@@ -243,16 +192,57 @@ class Replay:
         """Return the windows (T, B, L, ...) of one update."""
         return batch
 
-    def joined(self, window: Transition, gamma: Array) -> Transition:
-        """Join windows (T, B, L, ...) to transitions (T, B, ...), for discounts (T,) of the tasks."""
-        length, join = window.reward.shape[2], multistep.join
-        if length == 1:
-            return jax.tree.map(lambda x: x[:, :, 0], window)
-        if shown(window.obs):
-            join = partial(pictures.join, frames=pictures.frames(length, self.n_step), n_step=self.n_step)
-        return jax.vmap(join)(window, gamma)
+
+def joined(window: Transition, gamma: Array, n_step: int) -> Transition:
+    """Join windows (T, B, L, ...) to transitions (T, B, ...) of ``n_step`` steps, for discounts (T,) of the tasks."""
+    length, join = window.reward.shape[2], multistep.join
+    if length == 1:
+        return jax.tree.map(lambda x: x[:, :, 0], window)
+    if shown(window.obs):
+        join = partial(pictures.join, frames=pictures.frames(length, n_step), n_step=n_step)
+    return jax.vmap(join)(window, gamma)
 
 
 def _single(rows: Transition, axis: int) -> Transition:
     """Return single steps as windows of one step, whose axis is ``axis``."""
     return jax.tree.map(lambda x: jnp.expand_dims(x, axis), rows)
+
+
+# Segments of older steps, which the host keeps.
+
+
+def segments_of(replay: Replay, spec: Spec, num_envs: int) -> tuple[int, int]:
+    """Return rows K and length L of the recalled segments on the device."""
+    if not replay.host_replay_size:
+        return 0, 0
+    return store.segments(replay.capacity(num_envs) // num_envs, replay.length(spec), replay.steps)
+
+
+def newest(data: Buffer, count: int) -> Any:
+    """Return the latest steps of every environment in the order of time, leaves (S, T, count, E, ...)."""
+    return jax.vmap(partial(rings.newest, count=count), (OVER_SEEDS,))(data.ring)
+
+
+def recall(data: Buffer, segments: Any) -> Buffer:
+    """Write recalled segments, leaves (S, T, F L, E, ...), over the oldest."""
+    return data._replace(ring=jax.vmap(rings.recall, (OVER_SEEDS, 0), OVER_SEEDS)(data.ring, segments))
+
+
+def _require_host(replay: Replay, spec: Spec, num_envs: int, chunk_steps: int) -> None:
+    if replay.host_replay_size <= replay.replay_size:
+        raise InputError(
+            f"host-replay-size ({replay.host_replay_size}) must be more than replay-size ({replay.replay_size}); "
+            "with 0 the device keeps all"
+        )
+    if jax.process_count() > 1:
+        raise InputError("host-replay-size takes one process; leave out --distributed")
+    count, length = segments_of(replay, spec, num_envs)
+    if not count:
+        least = 2 * math.ceil(max(replay.length(spec), 1) / replay.steps) * replay.steps * num_envs
+        raise InputError(f"with host-replay-size, replay-size must be at least {least}, not {replay.replay_size}")
+    latest = replay.capacity(num_envs) // num_envs - count * length
+    if chunk_steps > latest:
+        raise InputError(
+            f"with host-replay-size the device keeps the latest {latest} steps of every environment until a chunk "
+            f"ends, and one takes {chunk_steps}; lower --chunk-steps or raise --replay-size"
+        )

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from mtjax import frames
-from mtjax.types import Array, Env, InputError, Key, Spec, Task, Transition
+from mtjax.types import Array, Env, InputError, Key, Spec, Storage, Task, Transition
 
 _LONGEST = 100_000
 
@@ -29,7 +29,7 @@ class Rollouts:
     minibatches: int = 8
     """Minibatches in each pass; steps that do not divide evenly are left out, other ones in each pass."""
 
-    sharding: ClassVar[Any] = ()
+    storage: ClassVar[Storage] = Storage(axes=0, sharding=(), kept=False)
     policy_delay: ClassVar[int] = 1  # the actor learns in every update
     reset_every: ClassVar[int] = 0  # networks are never reset
     warmup_steps: ClassVar[int] = 0  # no action is random before learning
@@ -51,14 +51,6 @@ class Rollouts:
     def updates(self) -> int:
         """The number U of updates each time that the agent learns."""
         return self.epochs * self.minibatches
-
-    def window_steps(self, steps: int) -> int:
-        """Return the length L of windows for a memory that learns: the whole rollout."""
-        return self.unroll
-
-    def updates_in(self, steps: int) -> int:
-        """Count the updates in a run of so many steps of every environment."""
-        return steps // self.steps * self.updates
 
     def check(self, env: Env, num_envs: int, chunk_steps: int = 0) -> None:
         """Accept every environment."""
@@ -90,13 +82,7 @@ class Rollouts:
         """Return the latest steps, leaves (S, T, H, E, ...)."""
         return steps
 
-    def keep(self, data: Transition) -> tuple[()]:
-        """Return (), as learning is over."""
-        return ()
-
     # Learning.
-
-    axes: ClassVar[int] = 0  # of the data under a map over seeds
 
     def batches(self, env: Env, agent: Any, tasks: Task, data: Transition, key: Key) -> Array:
         """Split one seed's windows at random into the minibatches of all epochs: indices (U, B, L) of steps.
@@ -116,18 +102,20 @@ class Rollouts:
         order = jax.vmap(lambda key: jax.random.permutation(key, count))(jax.random.split(key, self.epochs))
         return order[:, : size * self.minibatches].reshape(-1, size)
 
-    def windows(self, steps: Transition, length: int) -> Transition:
-        """Return a rollout (T, H, E, ...) as windows (T, N, L, ...): single steps, or for L = H all of a world's."""
-        if not length:
-            return jax.tree.map(lambda x: x.reshape(len(x), -1, 1, *x.shape[3:]), steps)
-        return jax.tree.map(lambda x: jnp.swapaxes(x, 1, 2), steps)
-
-    def played(self, x: Array, shape: Sequence[int], length: int) -> Array:
-        """Return numbers (T, N L) of all windows in the order (T, H, E) in which they were played."""
-        if not length:
-            return x.reshape(shape)
-        return jnp.swapaxes(x.reshape(shape[0], shape[2], shape[1]), 1, 2)
-
     def window(self, data: Transition, batch: Array) -> Transition:
         """Take the windows (T, B, L, ...) of one minibatch, by the indices (B, L) of their steps."""
         return jax.tree.map(lambda x: x.reshape(len(x), -1, *x.shape[3:])[:, batch], data)
+
+
+def windows(steps: Transition, length: int) -> Transition:
+    """Return a rollout (T, H, E, ...) as windows (T, N, L, ...): single steps, or for L = H all of a world's."""
+    if not length:
+        return jax.tree.map(lambda x: x.reshape(len(x), -1, 1, *x.shape[3:]), steps)
+    return jax.tree.map(lambda x: jnp.swapaxes(x, 1, 2), steps)
+
+
+def played(x: Array, shape: Sequence[int], length: int) -> Array:
+    """Return numbers (T, N L) of all windows in the order (T, H, E) in which they were played."""
+    if not length:
+        return x.reshape(shape)
+    return jnp.swapaxes(x.reshape(shape[0], shape[2], shape[1]), 1, 2)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mtjax import evaluation, trials
-from mtjax.agents.unseen import unseen
+from mtjax.agents.unseen import describe_unseen
 from mtjax.checks import amount, path, require_episodes
 from mtjax.compiling.programs import compile_lowered, enable_compile_cache, trace
 from mtjax.envs import Family
@@ -171,8 +171,8 @@ def report(request: Any, vary: Mapping[str, str]) -> None:
     chosen = films.choose(policy.env, request.video_splits, request.video_tasks) if request.video else ()
     scores = score(policy, request.episodes, request.seed, tasks)
     print(task_table(policy, scores, named), flush=True)
-    if unseen(policy.agent):
-        print(f"unseen tasks: {unseen(policy.agent)}")
+    if describe_unseen(policy.agent):
+        print(f"unseen tasks: {describe_unseen(policy.agent)}")
     if population := from_json(pretrained.folder(run) / "config.json").plan.population:
         print(f"number {request.point} of a population ({population}), of whose members there are no intervals")
     if pretrained.is_shipped(pretrained.folder(run)) and not chosen:

@@ -18,6 +18,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding
 
+from mtjax.experience.replay import newest, recall, segments_of
 from mtjax.experience.store import Store, recalled_rows
 from mtjax.loop import Settings, TrainState
 from mtjax.names import notice, replacing
@@ -33,7 +34,7 @@ class Exchange:
         self.chunk, self.mesh = settings.chunk_steps, mesh
         self.files = None if directory is None else Files(directory / "store")
         if self.num_slots:
-            count, self.length = self.experience.segments(env.spec, settings.num_envs)
+            count, self.length = segments_of(self.experience, env.spec, settings.num_envs)
             self.latest = self.experience.capacity(settings.num_envs) // settings.num_envs - count * self.length
             self.number = recalled_rows(self.chunk, count, self.length)
             self.thread = ThreadPoolExecutor(1, "exchange")
@@ -89,24 +90,24 @@ class Exchange:
         return self.store.draw(self.keys, self.chunk, self.latest, self.number, self.length)
 
     def _put(self, segments: Any) -> Any:
-        rows = self.experience.sharding.ring.rows
+        rows = self.experience.storage.sharding.ring.rows
         return jax.device_put(segments, None if self.mesh is None else NamedSharding(self.mesh, rows))
 
     @cached_property
     def _newest(self) -> Callable:
         """Return the program that takes a chunk's steps out of the replay."""
-        return jax.jit(self._split(lambda data: self.experience.newest(data, self.chunk), 0, out=1))
+        return jax.jit(self._split(lambda data: newest(data, self.chunk), 0, out=1))
 
     @cached_property
     def _recall(self) -> Callable:
         """Return the program that writes segments into the replay, in place. One for both would copy the replay."""
-        return jax.jit(self._split(self.experience.recall, 0, 1, out=0), donate_argnums=0)
+        return jax.jit(self._split(recall, 0, 1, out=0), donate_argnums=0)
 
     def _split(self, program: Callable, *inputs: int, out: int) -> Callable:
         """Let each device run a program on what it holds of arguments and result: 0 for the replay, 1 for steps."""
         if self.mesh is None:
             return program
-        specs = self.experience.sharding, self.experience.sharding.ring.rows
+        specs = self.experience.storage.sharding, self.experience.storage.sharding.ring.rows
         places = tuple(specs[i] for i in inputs)
         return jax.shard_map(program, mesh=self.mesh, in_specs=places, out_specs=specs[out], check_vma=False)
 

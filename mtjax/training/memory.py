@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 from mtjax.config import RunConfig
+from mtjax.experience.replay import segments_of
 from mtjax.experience.store import recalled_rows
 from mtjax.frames import PICTURES, shown
 from mtjax.loop import Settings, TrainState
@@ -71,7 +72,7 @@ class Needs(NamedTuple):
             return Needs(networks, data, rollout, 0, 0)
         rows = state.data.ring.rows
         each = checkpoint.size_of(rows) // jax.tree.leaves(rows)[0].shape[2]
-        count, length = experience.segments(env.spec, settings.num_envs)
+        count, length = segments_of(experience, env.spec, settings.num_envs)
         moved = settings.chunk_steps + recalled_rows(settings.chunk_steps, count, length) * length
         return Needs(networks, data, rollout, moved * each, (slots + moved) * each)
 
