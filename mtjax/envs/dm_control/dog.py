@@ -78,8 +78,8 @@ def _read_dog() -> mujoco.MjSpec:
 
 
 @dataclasses.dataclass(frozen=True)
-class DogStand(Domain):
-    """Stand: keep torso and pelvis high, the back and the head up and the weight on the paws.
+class Dog(Domain):
+    """A dog whose tasks are to stand, or to stand and move.
 
     Observation (223,), all after the step: angles of all 73 joints [rad] and their velocities [rad/s]; heights of torso
         and pelvis [m]; the world's upward direction in the frames of skull, torso and pelvis; velocity of the centre of
@@ -89,10 +89,13 @@ class DogStand(Domain):
     Action (38,): motor commands in [-1, 1] of the back (extend, bend, twist), neck and tail (extend, bend), of the left
         and the right hind leg, of head and jaw, and of the left and the right foreleg, in the model's order; they act
         with a lag of 0.05 s.
-    Reward: the product of six factors in [0, 1]. Two are 1 where torso and pelvis are at 0.9 of the height of the
-        model's own pose or above, and fall as Gaussians to 0.1 on the ground; three are 1 where head, torso and pelvis
-        are upright to 30 degrees, and fall linearly to 0 upside down; one is 1 where the paws bear the whole weight or
-        more, and falls linearly to 0.9 where they bear none. Returns lie in [0, 1000].
+    Reward: stand * (4 * move + 1) / 5. stand is the product of six factors in [0, 1]. Two are 1 where torso and pelvis
+        are at 0.9 of the height of the model's own pose or above, and fall as Gaussians to 0.1 on the ground; three are
+        1 where head, torso and pelvis are upright to 30 degrees, and fall linearly to 0 upside down; one is 1 where the
+        paws bear the whole weight or more, and falls linearly to 0.9 where they bear none. move is 1 where the velocity
+        of the centre of mass along the torso's own x axis is between ``speed`` and twice that, and falls linearly to 0
+        at rest and at three times that. Below a ``speed`` of 1 m/s it reaches 0 at 1 m/s from these bounds. Returns lie
+        in [0, 1000].
     Start: the model's own pose turned by any angle about the vertical, with velocities along x and y and about z of a
         standard deviation of 2 m/s and 2 rad/s; activations uniform in [-1, 1].
     Episode: 1000 steps of 0.015 s (three substeps of 0.005 s); it never terminates.
@@ -104,6 +107,7 @@ class DogStand(Domain):
         torso-mass: scale of mass and inertia of the torso.
         mass, friction, damping, strength: scale of all masses and inertias, of the sliding friction of all geoms, of
             the damping of all joints, of the force of all motors. gravity [m/s^2].
+        speed: least velocity [m/s] at which the reward for moving is 1.
 
     Differs from dm_control in: nothing on MuJoCo C. MJX and Warp lack some pairs of shapes, and would take thousands:
     there the dog touches the floor alone and not itself, its teeth touch nothing, the solver stops after
@@ -190,6 +194,13 @@ class DogStand(Domain):
         return jnp.concatenate([world.qpos[7:], world.qvel[6:], *pose, *moving, world.act])
 
     def reward(self, task: Task, world: World, action: Array) -> Array:
+        speed, velocity = task.goal["speed"], self._read(world)["torso_linvel"]
+        forwards = into_frame(world.qpos[3:7], velocity)[0]
+        move = tolerance(forwards, speed, 2 * speed, jnp.maximum(speed, 1.0), "linear", value_at_margin=0)
+        return self.standing(task, world) * (4 * move + 1) / 5
+
+    def standing(self, task: Task, world: World) -> Array:
+        """Return the reward's factor () in [0, 1] for a dog on its paws."""
         sensed, asked = self._read(world), task.goal["starts"]
         high = tolerance(self._heights(world, sensed), asked[:2], jnp.inf, asked[:2])
         up = self._upward(world, sensed)[:, 2]
@@ -200,38 +211,36 @@ class DogStand(Domain):
 
 
 @dataclasses.dataclass(frozen=True)
-class DogWalk(DogStand):
-    """Walk: move forwards at 1 to 2 m/s, upright.
+class DogStand(Dog):
+    """Stand: keep torso and pelvis high, the back and the head up and the weight on the paws.
 
-    As DogStand, but for the reward, which is DogStand's times (4 * move + 1) / 5: move is 1 where the velocity of the
-    centre of mass along the torso's own x axis is between ``speed`` and twice that, and falls linearly to 0 at rest and
-    at three times that. Below a ``speed`` of 1 m/s it reaches 0 at 1 m/s from these bounds.
-
-    Further parameter: speed [m/s].
+    The reward is ``stand`` alone, and there is no ``speed``.
     """
 
-    parameters: ClassVar = MappingProxyType({**DogStand.parameters, "speed": positive("m/s", 1.0)})
-
     def reward(self, task: Task, world: World, action: Array) -> Array:
-        speed, velocity = task.goal["speed"], self._read(world)["torso_linvel"]
-        forwards = into_frame(world.qpos[3:7], velocity)[0]
-        move = tolerance(forwards, speed, 2 * speed, jnp.maximum(speed, 1.0), "linear", value_at_margin=0)
-        return super().reward(task, world, action) * (4 * move + 1) / 5
+        return self.standing(task, world)
 
 
 @dataclasses.dataclass(frozen=True)
-class DogTrot(DogWalk):
+class DogWalk(Dog):
+    """Walk: move forwards at 1 to 2 m/s, upright."""
+
+    parameters: ClassVar = MappingProxyType({**Dog.parameters, "speed": positive("m/s", 1.0)})
+
+
+@dataclasses.dataclass(frozen=True)
+class DogTrot(Dog):
     """Trot: DogWalk at 3 to 6 m/s."""
 
-    parameters: ClassVar = MappingProxyType({**DogStand.parameters, "speed": positive("m/s", 3.0)})
+    parameters: ClassVar = MappingProxyType({**Dog.parameters, "speed": positive("m/s", 3.0)})
     floor: ClassVar[float] = 3 * _SECONDS
 
 
 @dataclasses.dataclass(frozen=True)
-class DogRun(DogWalk):
+class DogRun(Dog):
     """Run: DogWalk at 9 to 18 m/s."""
 
-    parameters: ClassVar = MappingProxyType({**DogStand.parameters, "speed": positive("m/s", 9.0)})
+    parameters: ClassVar = MappingProxyType({**Dog.parameters, "speed": positive("m/s", 9.0)})
     floor: ClassVar[float] = 9 * _SECONDS
 
 

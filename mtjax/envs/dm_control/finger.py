@@ -45,6 +45,33 @@ def _set_spinner_damping(spec: mujoco.MjSpec, value: float) -> None:
     spec.joint("hinge").damping[0] = value
 
 
+_BODY = {
+    "size": positive("1", 1.0, _scale_links),
+    "touch-size": positive("m", 0.025, _widen_touch),
+    "spinner-frictionloss": positive("N m", 0.1, _set_spinner_frictionloss),
+    "spinner-damping": positive("N m s/rad", 0.03, _set_spinner_damping),
+    "mass": MASS,
+    "friction": FRICTION,
+    "damping": DAMPING,
+    "gear": GEAR,
+}
+_LOOK = Look((0, -1, 0.8), 63.435, diffuse=0.6, sun=True)
+
+
+def _start(finger: Domain, task: Task, key: Key) -> tuple[Array, Array]:
+    """Draw positions and velocities of the three joints at which nothing touches."""
+    model = finger.models[0]
+    return finger.start_apart(task, key, lambda key: start_joints(model, key)), jnp.zeros(model.nv)
+
+
+def _feel(finger: Domain, task: Task, world: World) -> Array:
+    """Return what all tasks observe (9,): joints, the spinner's tip, their velocities and touch."""
+    model = finger.models[0]
+    point = finger.leaf(task, "site_pos")[model.site("tip").id]
+    tip = finger.planar(task, world).offset(model.body("spinner").id, point)
+    return jnp.concatenate([world.qpos[:2], tip, world.qvel, jnp.log1p(world.sensors)])
+
+
 @dataclasses.dataclass(frozen=True)
 class FingerSpin(Domain):
     """Spin: keep the spinner turning at 15 rad/s or more.
@@ -75,16 +102,54 @@ class FingerSpin(Domain):
     """
 
     asks: ClassVar[str] = "Spin the body with the finger."
+    parameters: ClassVar = MappingProxyType(_BODY)
+    model_file: ClassVar[str] = "finger.xml"
+    num_substeps: ClassVar[int] = 2
+    episode_steps: ClassVar[int] = 1000
+    default_iterations: ClassVar[int] = 2
+    warp_iterations: ClassVar[int] = 4
+    starts_untouched: ClassVar[bool] = True
+    look: ClassVar = _LOOK
+
+    def prepare(self, spec: mujoco.MjSpec) -> None:
+        _set_spinner_damping(spec, 0.03)
+
+    def start(self, task: Task, key: Key) -> tuple[Array, Array]:
+        return _start(self, task, key)
+
+    def observe(self, task: Task, world: World) -> Array:
+        return _feel(self, task, world)
+
+    def reward(self, task: Task, world: World, action: Array) -> Array:
+        return (world.qvel[2] <= -_SPIN_VELOCITY).astype(jnp.float32)
+
+
+@dataclasses.dataclass(frozen=True)
+class FingerTurn(Domain):
+    """Turn: bring the spinner's tip into a target on the circle that it runs on.
+
+    Observation (12,), all after the step: angles of the proximal and distal joint [rad]; x and z of the spinner's tip
+        relative to its hinge [m]; velocities of proximal, distal and hinge [rad/s]; log(1 + force) of the touch sensors
+        at the top and the bottom of the fingertip [log N]; x and z of the target relative to the hinge [m]; the
+        distance from the tip to the target's surface, negative inside [m].
+    Action (2,): motor commands of the proximal and distal joint in [-1, 1]; gears of 30 and 15 N m.
+    Reward: 1 while the tip is inside the target, else 0; returns lie in [0, 1000].
+    Start: both finger joints uniform in their range, hinge and target at angles uniform in [-pi, pi], at rest, drawn
+        again until nothing touches.
+    Episode: 1000 steps of 0.02 s (two substeps of 0.01 s); it never terminates.
+
+    Parameters that can vary: those of ``FingerSpin``, where the hinge's damping is 0.5 N m s/rad, and
+        target-size: radius [m] of the target; dm_control's turn-easy has 0.07 and turn-hard 0.03.
+
+    Differs from dm_control as ``FingerSpin`` does.
+    """
+
+    asks: ClassVar[str] = "Turn the body with the finger until its tip is in the target."
     parameters: ClassVar = MappingProxyType(
         {
-            "size": positive("1", 1.0, _scale_links),
-            "touch-size": positive("m", 0.025, _widen_touch),
-            "spinner-frictionloss": positive("N m", 0.1, _set_spinner_frictionloss),
-            "spinner-damping": positive("N m s/rad", 0.03, _set_spinner_damping),
-            "mass": MASS,
-            "friction": FRICTION,
-            "damping": DAMPING,
-            "gear": GEAR,
+            **_BODY,
+            "spinner-damping": positive("N m s/rad", 0.5, _set_spinner_damping),
+            "target-size": positive("m", 0.07),
         }
     )
     model_file: ClassVar[str] = "finger.xml"
@@ -93,52 +158,9 @@ class FingerSpin(Domain):
     default_iterations: ClassVar[int] = 2
     warp_iterations: ClassVar[int] = 4
     starts_untouched: ClassVar[bool] = True
-    look: ClassVar = Look((0, -1, 0.8), 63.435, diffuse=0.6, sun=True)
-
-    def prepare(self, spec: mujoco.MjSpec) -> None:
-        _set_spinner_damping(spec, 0.03)
-
-    def start(self, task: Task, key: Key) -> tuple[Array, ...]:
-        model = self.models[0]
-        return self.start_apart(task, key, lambda key: start_joints(model, key)), jnp.zeros(model.nv)
-
-    def observe(self, task: Task, world: World) -> Array:
-        model = self.models[0]
-        point = self.leaf(task, "site_pos")[model.site("tip").id]
-        tip = self.planar(task, world).offset(model.body("spinner").id, point)
-        return jnp.concatenate([world.qpos[:2], tip, world.qvel, jnp.log1p(world.sensors)])
-
-    def reward(self, task: Task, world: World, action: Array) -> Array:
-        return (world.qvel[2] <= -_SPIN_VELOCITY).astype(jnp.float32)
-
-
-@dataclasses.dataclass(frozen=True)
-class FingerTurn(FingerSpin):
-    """Turn: bring the spinner's tip into a target on the circle that it runs on.
-
-    Observation (12,): FingerSpin's, then x and z of the target relative to the hinge [m], and the distance from the tip
-        to the target's surface, negative inside [m].
-    Action (2,): as FingerSpin.
-    Reward: 1 while the tip is inside the target, else 0; returns lie in [0, 1000].
-    Start: as FingerSpin, with the target at an angle uniform in [-pi, pi].
-    Episode: as FingerSpin.
-
-    Parameters that can vary: FingerSpin's, where the hinge's damping is 0.5 N m s/rad, and
-        target-size: radius [m] of the target; dm_control's turn-easy has 0.07 and turn-hard 0.03.
-
-    Differs from dm_control as FingerSpin does.
-    """
-
-    asks: ClassVar[str] = "Turn the body with the finger until its tip is in the target."
-    parameters: ClassVar = MappingProxyType(
-        {
-            **FingerSpin.parameters,
-            "spinner-damping": positive("N m s/rad", 0.5, _set_spinner_damping),
-            "target-size": positive("m", 0.07),
-        }
-    )
     relabels: ClassVar[tuple[str, ...]] = ("target-size", "target-angle")
     fresh_goals: ClassVar[bool] = True
+    look: ClassVar = _LOOK
 
     def add_marks(self, spec: mujoco.MjSpec) -> None:
         """Add the target, and the spinner's tip that has to be in it."""
@@ -152,12 +174,9 @@ class FingerTurn(FingerSpin):
         place = hinge + jnp.stack([world.extra[0], jnp.float32(0), world.extra[1]])
         return {"target": Mark(place, size=jnp.stack([task.goal["target-size"], 0.0, 0.0]))}
 
-    def prepare(self, spec: mujoco.MjSpec) -> None:
-        pass  # the model's own damping is this task's
-
     def start(self, task: Task, key: Key) -> tuple[Array, ...]:
         target_key, joint_key = jax.random.split(key)
-        return *super().start(task, joint_key), self.target(task, self.target_angle(task, target_key))
+        return *_start(self, task, joint_key), self.target(task, self.target_angle(task, target_key))
 
     def target_angle(self, task: Task, key: Key) -> Array:
         """Return the target's angle () [rad] in an episode: 0 is up, positive towards x."""
@@ -173,18 +192,18 @@ class FingerTurn(FingerSpin):
         return jnp.linalg.norm(target - seen[2:4]) - task.goal["target-size"]
 
     def show(self, task: Task, seen: Array, target: Array) -> Array:
-        """Return the observation, given FingerSpin's ``seen`` (9,)."""
+        """Return the observation, given ``seen`` (9,), all but the target."""
         return jnp.concatenate([seen, target, self.distance(task, seen, target)[None]])
 
     def pay(self, task: Task, seen: Array, target: Array) -> Array:
-        """Return the reward (), given FingerSpin's observation ``seen`` (9,)."""
+        """Return the reward (), given ``seen`` (9,)."""
         return (self.distance(task, seen, target) <= 0).astype(jnp.float32)
 
     def observe(self, task: Task, world: World) -> Array:
-        return self.show(task, super().observe(task, world), world.extra)
+        return self.show(task, _feel(self, task, world), world.extra)
 
     def reward(self, task: Task, world: World, action: Array) -> Array:
-        return self.pay(task, super().observe(task, world), world.extra)
+        return self.pay(task, _feel(self, task, world), world.extra)
 
     def relabel(self, task: Task, transition: Transition, key: Key) -> Transition:
         target = self.target(task, self.target_angle(task, key))
@@ -200,7 +219,7 @@ class FingerTurn(FingerSpin):
 class FingerTurnTarget(FingerTurn):
     """Turn to the task's target: FingerTurn with the target always at the task's angle.
 
-    As FingerTurn, but for the observation (9,), which is FingerSpin's: where the target is, only the task's context
+    As FingerTurn, but for the observation (9,), which ends before the target: where that is, only the task's context
     shows.
 
     Further parameter: target-angle [rad], 0 up and positive towards x.

@@ -25,15 +25,15 @@ def _scale_foot(spec: mujoco.MjSpec, scale: float) -> None:
 
 
 @dataclasses.dataclass(frozen=True)
-class HopperStand(Domain):
-    """Stand: hold the torso high over the foot with little effort.
+class Hopper(Domain):
+    """A hopper whose tasks are to stand, or to hop along.
 
     Observation (15,), all after the step: height of the torso relative to its initial 1 m [m], its pitch [rad], the
         angles of waist, hip, knee and ankle [rad]; velocities of the torso along x and z [m/s] and about y, and of the
         four joints [rad/s]; log(1 + force) of the touch sensors at toe and heel [log N].
     Action (4,): motor commands of waist, hip, knee and ankle in [-1, 1]; gears of 30, 40, 30 and 10 N m.
-    Reward: 0 unless the torso's centre of mass is between 0.6 and 2 m above the foot's, and there 1 less a fifth of the
-        mean square of the action; returns lie in [0, 1000].
+    Reward: 0 unless the torso's centre of mass is between 0.6 and 2 m above the foot's, and there 1 where the forward
+        velocity of the centre of mass is ``speed`` or more, falling linearly to 0 at rest; returns lie in [0, 1000].
     Start: the torso at its height of 1 m and at rest, with its pitch uniform in [-pi, pi] and all joints uniform in
         their range; limbs may begin inside the floor.
     Episode: 1000 steps of 0.02 s (four substeps of 0.005 s); it never terminates.
@@ -44,6 +44,7 @@ class HopperStand(Domain):
         torso-mass: scale of the mass of torso and nose.
         mass, friction, damping, gear: scale of all masses, of the sliding friction of all geoms, of the damping of all
             joints, of the strength of all motors. gravity [m/s^2].
+        speed: velocity [m/s] from which the reward is 1.
 
     Differs from dm_control in: under MJX the constraint solver stops after ``solver_iterations``, an episode's first
     observation shows no touch (three starts in a thousand have some), and two limbs may touch in another way, which no
@@ -57,7 +58,6 @@ class HopperStand(Domain):
             rad/s in the one case that was seen, and two states of random play in ten thousand are such.
     """
 
-    asks: ClassVar[str] = "Make the hopper stand."
     parameters: ClassVar = MappingProxyType(
         {
             "foot-length": positive("1", 1.0, _scale_foot),
@@ -74,6 +74,7 @@ class HopperStand(Domain):
     episode_steps: ClassVar[int] = 1000
     default_iterations: ClassVar[int] = 4
     starts_untouched: ClassVar[bool] = True  # nearly: to solve for the rest costs MJX half a step's compilation more
+    heading: ClassVar[float] = 1.0  # -1 backwards
     look: ClassVar = Look((0, -2.8, -0.2), 90, follow="torso")
 
     def start(self, task: Task, key: Key) -> tuple[Array, Array]:
@@ -83,8 +84,9 @@ class HopperStand(Domain):
         return jnp.concatenate([world.qpos[1:], world.qvel, jnp.log1p(world.sensors)])
 
     def reward(self, task: Task, world: World, action: Array) -> Array:
-        effort = tolerance(action, 0.0, 0.0, 1.0, "quadratic", value_at_margin=0)
-        return self.standing(task, world) * (4 + jnp.mean(effort)) / 5
+        speed, velocity = task.goal["speed"], self.heading * self.forward_velocity(task, world)
+        hopping = tolerance(velocity, speed, jnp.inf, speed / 2, "linear", value_at_margin=0.5)
+        return self.standing(task, world) * hopping
 
     def standing(self, task: Task, world: World) -> Array:
         """Return whether the torso is high enough over the foot, ()."""
@@ -94,30 +96,33 @@ class HopperStand(Domain):
 
 
 @dataclasses.dataclass(frozen=True)
-class HopperHop(HopperStand):
-    """Hop: move forwards at 2 m/s or faster, the torso high over the foot.
+class HopperStand(Hopper):
+    """Stand: hold the torso high over the foot with little effort.
 
-    As HopperStand, but for the reward: 0 unless the torso is as high as there, and then 1 where the forward velocity of
-    the centre of mass is ``speed`` or more, falling linearly to 0 at rest.
-
-    Further parameter: speed [m/s].
+    As high as a hopper should be, the reward is 1 less a fifth of the mean square of the action. There is no ``speed``.
     """
 
-    asks: ClassVar[str] = "Make the hopper hop forwards."
-    parameters: ClassVar = MappingProxyType({**HopperStand.parameters, "speed": positive("m/s", 2.0)})
-    heading: ClassVar[float] = 1.0  # -1 backwards
+    asks: ClassVar[str] = "Make the hopper stand."
 
     def reward(self, task: Task, world: World, action: Array) -> Array:
-        speed, velocity = task.goal["speed"], self.heading * self.forward_velocity(task, world)
-        hopping = tolerance(velocity, speed, jnp.inf, speed / 2, "linear", value_at_margin=0.5)
-        return self.standing(task, world) * hopping
+        effort = tolerance(action, 0.0, 0.0, 1.0, "quadratic", value_at_margin=0)
+        return self.standing(task, world) * (4 + jnp.mean(effort)) / 5
 
 
 @dataclasses.dataclass(frozen=True)
-class HopperHopBackward(HopperHop):
+class HopperHop(Hopper):
+    """Hop: move forwards at 2 m/s or faster, the torso high over the foot."""
+
+    asks: ClassVar[str] = "Make the hopper hop forwards."
+    parameters: ClassVar = MappingProxyType({**Hopper.parameters, "speed": positive("m/s", 2.0)})
+
+
+@dataclasses.dataclass(frozen=True)
+class HopperHopBackward(Hopper):
     """Hop backwards at 2 m/s or faster, the torso high over the foot.
 
     As HopperHop, but velocities backwards count. Not a task of dm_control: it has the same model, starts and episodes.
     """
 
+    parameters: ClassVar = HopperHop.parameters
     heading: ClassVar[float] = -1.0

@@ -28,8 +28,8 @@ def _set_shin_length(spec: mujoco.MjSpec, length: float) -> None:
 
 
 @dataclasses.dataclass(frozen=True)
-class HumanoidStand(Domain):
-    """Stand: rise, hold the head high and the torso upright, and stay in place with little effort.
+class Humanoid(Domain):
+    """A humanoid whose tasks are to stand still, or to move while it stands.
 
     Observation (67,), all after the step: angles of abdomen (z, y, x), right hip (x, z, y), knee and ankle (y, x), the
         same of the left leg, right shoulder (1, 2) and elbow, and the same of the left arm [rad]; height of the head
@@ -38,10 +38,11 @@ class HumanoidStand(Domain):
         along the world's axes [m/s] and about its own [rad/s], and of the joints in their order [rad/s].
     Action (21,): motor commands in [-1, 1] of abdomen (y, z, x), right hip (x, z, y), knee and ankle (x, y), the same
         of the left leg, right shoulder (1, 2) and elbow, and the same of the left arm; gears from 20 to 120 N m.
-    Reward: standing * upright * (4 + thrift) / 5 * still in [0, 1]. standing is 1 with the head at 1.4 m or more and
-        falls as a Gaussian to 0.1 at 1.05 m; upright is 1 where the torso's uprightness is 0.9 or more and falls
-        linearly to 0 head down; thrift is 1 less the mean square of the action; still is the mean over x and y of a
-        Gaussian of the velocity of the centre of mass, 0.1 at 2 m/s. Returns lie in [0, 1000].
+    Reward: standing * upright * (4 + thrift) / 5 * (5 * move + 1) / 6 in [0, 1]. standing is 1 with the head at 1.4 m
+        or more and falls as a Gaussian to 0.1 at 1.05 m; upright is 1 where the torso's uprightness is 0.9 or more and
+        falls linearly to 0 head down; thrift is 1 less the mean square of the action; move is 1 where the horizontal
+        velocity of the centre of mass, in any direction, is ``speed`` or more, and falls linearly to 0 at rest. Returns
+        lie in [0, 1000].
     Start: every joint uniform in its range and the body turned at random, at rest with the torso at 1.5 m, drawn again
         until nothing touches. (The quaternion has four numbers uniform in [0, 1], scaled to unit length: dm_control's
         way, which favours some rotations.)
@@ -52,6 +53,7 @@ class HumanoidStand(Domain):
         torso-mass: scale of the torso's mass.
         mass, friction, damping, gear: scale of all masses, of the sliding friction of all geoms, of the damping of all
             joints, of the strength of all motors. gravity [m/s^2].
+        speed: velocity [m/s] from which the reward for moving is 1.
 
     Differs from dm_control in: under MJX the constraint solver stops after ``solver_iterations``, and friction is
     another on a limb that stands on the floor within 30 degrees of upright: MJX turns the pyramid of friction to the
@@ -97,29 +99,32 @@ class HumanoidStand(Domain):
 
     def moving(self, task: Task, velocity: Array) -> Array:
         """Return the reward's factor () in [0, 1] for the velocity (2,) [m/s] of the centre of mass along x and y."""
-        return jnp.mean(tolerance(velocity, 0.0, 0.0, _STILL))
-
-
-@dataclasses.dataclass(frozen=True)
-class HumanoidWalk(HumanoidStand):
-    """Walk: move in any direction at 1 m/s or faster, upright.
-
-    As HumanoidStand, but in the reward ``still`` gives way to (5 * move + 1) / 6: move is 1 where the horizontal
-    velocity of the centre of mass is ``speed`` or more, and falls linearly to 0 at rest.
-
-    Further parameter: speed [m/s].
-    """
-
-    parameters: ClassVar = MappingProxyType({**HumanoidStand.parameters, "speed": positive("m/s", 1.0)})
-
-    def moving(self, task: Task, velocity: Array) -> Array:
         speed = task.goal["speed"]
         move = tolerance(jnp.linalg.norm(velocity), speed, jnp.inf, speed, "linear", value_at_margin=0)
         return (5 * move + 1) / 6
 
 
 @dataclasses.dataclass(frozen=True)
-class HumanoidRun(HumanoidWalk):
+class HumanoidStand(Humanoid):
+    """Stand: rise, hold the head high and the torso upright, and stay in place with little effort.
+
+    In the reward, the factor of ``move`` gives way to the mean over x and y of a Gaussian of the velocity of the centre
+    of mass, 0.1 at 2 m/s. There is no ``speed``.
+    """
+
+    def moving(self, task: Task, velocity: Array) -> Array:
+        return jnp.mean(tolerance(velocity, 0.0, 0.0, _STILL))
+
+
+@dataclasses.dataclass(frozen=True)
+class HumanoidWalk(Humanoid):
+    """Walk: move in any direction at 1 m/s or faster, upright."""
+
+    parameters: ClassVar = MappingProxyType({**Humanoid.parameters, "speed": positive("m/s", 1.0)})
+
+
+@dataclasses.dataclass(frozen=True)
+class HumanoidRun(Humanoid):
     """Run: HumanoidWalk at 10 m/s."""
 
-    parameters: ClassVar = MappingProxyType({**HumanoidStand.parameters, "speed": positive("m/s", 10.0)})
+    parameters: ClassVar = MappingProxyType({**Humanoid.parameters, "speed": positive("m/s", 10.0)})

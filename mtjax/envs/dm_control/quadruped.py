@@ -56,7 +56,7 @@ class QuadrupedWalk(Domain):
 
     Differs from dm_control in: actions are scaled to the servos' ranges, where dm_control takes the angles themselves;
     under MJX the constraint solver stops after ``solver_iterations``, and limbs that stand on the floor have another
-    friction (see ``humanoid.HumanoidStand``), in three states of random play in a thousand.
+    friction (see ``humanoid.Humanoid``), in three states of random play in a thousand.
     """
 
     parameters: ClassVar = MappingProxyType(

@@ -28,16 +28,18 @@ def _set_foot_length(spec: mujoco.MjSpec, length: float) -> None:
 
 
 @dataclasses.dataclass(frozen=True)
-class WalkerStand(Domain):
-    """Stand: hold the torso high and upright.
+class Walker(Domain):
+    """A walker whose tasks are to stand, or to stand and move.
 
     Observation (24,), all after the step: of torso, right thigh, leg and foot, and left thigh, leg and foot, the cosine
         and sine of the pitch; the height of the torso [m]; velocities of the torso along z and x [m/s] and about y, and
         of right hip, knee and ankle, and left hip, knee and ankle [rad/s].
     Action (6,): motor commands of right hip, knee and ankle, and left hip, knee and ankle in [-1, 1]; gears of 100, 50
         and 20 N m.
-    Reward: (3 * height + upright) / 4 in [0, 1], where height is 1 with the torso at 1.2 m or more and falls as a
-        Gaussian to 0.1 at 0.6 m, and upright goes from 0 (head down) to 1; returns lie in [0, 1000].
+    Reward: stand * (5 * move + 1) / 6 in [0, 1]. stand is (3 * height + upright) / 4, where height is 1 with the torso
+        at 1.2 m or more and falls as a Gaussian to 0.1 at 0.6 m, and upright goes from 0 (head down) to 1. move is 1
+        where the forward velocity of the centre of mass is ``speed`` or more, and falls linearly to 0 at rest. Returns
+        lie in [0, 1000].
     Start: the torso at its height of 1.3 m and at rest, with its pitch uniform in [-pi, pi] and all joints uniform in
         their range; limbs may begin inside the floor.
     Episode: 1000 steps of 0.025 s (ten substeps of 0.0025 s); it never terminates.
@@ -49,11 +51,11 @@ class WalkerStand(Domain):
         torso-mass: scale of the torso's mass.
         mass, damping, gear: scale of all masses, of the damping of all joints, of the strength of all motors.
             gravity [m/s^2].
+        speed: velocity [m/s] from which the reward for moving is 1.
 
     Differs from dm_control in: under MJX the constraint solver stops after ``solver_iterations``.
     """
 
-    asks: ClassVar[str] = "Make the walker stand upright."
     parameters: ClassVar = MappingProxyType(
         {
             "friction": positive("1", 0.7, _set_friction),
@@ -70,6 +72,8 @@ class WalkerStand(Domain):
     episode_steps: ClassVar[int] = 1000
     default_iterations: ClassVar[int] = 8
     starts_untouched: ClassVar[bool] = True  # it has no force sensors
+    relabels: ClassVar[tuple[str, ...]] = ("speed",)
+    heading: ClassVar[float] = 1.0  # -1 backwards
     look: ClassVar = Look((0, -2, 0.7), 60, follow="torso")
 
     def start(self, task: Task, key: Key) -> tuple[Array, Array]:
@@ -89,29 +93,14 @@ class WalkerStand(Domain):
         return World(jnp.concatenate([jnp.stack([height, 0.0]), bends]), obs[15:], jnp.zeros(model.nv), None)
 
     def reward(self, task: Task, world: World, action: Array) -> Array:
+        return self.standing(task, world) * (5 * self.move(task, world) + 1) / 6
+
+    def standing(self, task: Task, world: World) -> Array:
+        """Return the reward's factor () in [0, 1] for a high and upright torso."""
         places = self.planar(task, world)
-        standing = tolerance(places.position[1, 1], _STAND_HEIGHT, jnp.inf, _STAND_HEIGHT / 2)
+        height = tolerance(places.position[1, 1], _STAND_HEIGHT, jnp.inf, _STAND_HEIGHT / 2)
         upright = (1 + jnp.cos(places.angle[1])) / 2
-        return (3 * standing + upright) / 4
-
-
-@dataclasses.dataclass(frozen=True)
-class WalkerWalk(WalkerStand):
-    """Walk: move forwards at 1 m/s or faster, upright.
-
-    As WalkerStand, but for the reward, which is WalkerStand's times (5 * move + 1) / 6: move is 1 where the forward
-    velocity of the centre of mass is ``speed`` or more, and falls linearly to 0 at rest.
-
-    Further parameter: speed [m/s].
-    """
-
-    asks: ClassVar[str] = "Make the walker walk forwards."
-    parameters: ClassVar = MappingProxyType({**WalkerStand.parameters, "speed": positive("m/s", 1.0)})
-    relabels: ClassVar[tuple[str, ...]] = ("speed",)
-    heading: ClassVar[float] = 1.0  # -1 backwards
-
-    def reward(self, task: Task, world: World, action: Array) -> Array:
-        return super().reward(task, world, action) * (5 * self.move(task, world) + 1) / 6
+        return (3 * height + upright) / 4
 
     def move(self, task: Task, world: World) -> Array:
         """Return the reward's factor () in [0, 1] for forward velocity."""
@@ -120,32 +109,52 @@ class WalkerWalk(WalkerStand):
 
 
 @dataclasses.dataclass(frozen=True)
-class WalkerRun(WalkerWalk):
-    """Run: WalkerWalk at 8 m/s."""
+class WalkerStand(Walker):
+    """Stand: hold the torso high and upright. The reward is ``stand`` alone, and there is no ``speed``."""
 
-    asks: ClassVar[str] = "Make the walker run forwards."
-    parameters: ClassVar = MappingProxyType({**WalkerStand.parameters, "speed": positive("m/s", 8.0)})
+    asks: ClassVar[str] = "Make the walker stand upright."
+
+    def reward(self, task: Task, world: World, action: Array) -> Array:
+        return self.standing(task, world)
 
 
 @dataclasses.dataclass(frozen=True)
-class WalkerWalkBackward(WalkerWalk):
+class WalkerWalk(Walker):
+    """Walk: move forwards at 1 m/s or faster, upright."""
+
+    asks: ClassVar[str] = "Make the walker walk forwards."
+    parameters: ClassVar = MappingProxyType({**Walker.parameters, "speed": positive("m/s", 1.0)})
+
+
+@dataclasses.dataclass(frozen=True)
+class WalkerRun(Walker):
+    """Run: move forwards at 8 m/s or faster, upright."""
+
+    asks: ClassVar[str] = "Make the walker run forwards."
+    parameters: ClassVar = MappingProxyType({**Walker.parameters, "speed": positive("m/s", 8.0)})
+
+
+@dataclasses.dataclass(frozen=True)
+class WalkerWalkBackward(Walker):
     """Walk backwards at 1 m/s or faster, upright.
 
     As WalkerWalk, but velocities backwards count. Not a task of dm_control: it has the same model, starts and episodes.
     """
 
+    parameters: ClassVar = WalkerWalk.parameters
     heading: ClassVar[float] = -1.0
 
 
 @dataclasses.dataclass(frozen=True)
-class WalkerRunBackward(WalkerRun):
+class WalkerRunBackward(Walker):
     """Run backwards: WalkerWalkBackward at 8 m/s."""
 
+    parameters: ClassVar = WalkerRun.parameters
     heading: ClassVar[float] = -1.0
 
 
 @dataclasses.dataclass(frozen=True)
-class WalkerSpeed(WalkerWalk):
+class WalkerSpeed(Walker):
     """Speed: move forwards at the task's velocity, neither slower nor faster.
 
     As WalkerWalk, but move falls linearly on both sides of ``speed``: to 0 at rest and at twice that velocity. (With
@@ -154,6 +163,7 @@ class WalkerSpeed(WalkerWalk):
     """
 
     asks: ClassVar[str] = "Make the walker move at the given speed."
+    parameters: ClassVar = WalkerWalk.parameters
 
     def move(self, task: Task, world: World) -> Array:
         speed = task.goal["speed"]
