@@ -51,12 +51,8 @@ class Assembly(Sawyer):
 
     scene_file: ClassVar[str] = "sawyer_assembly_peg"
     drawn: ClassVar = ((0.0, 0.6, 0.02, -0.1, 0.75, 0.1), (0.0, 0.6, 0.02, 0.1, 0.85, 0.1))
-    goal_low: ClassVar = (-0.1, 0.75, 0.1)
-    goal_high: ClassVar = (0.1, 0.85, 0.1)
     watched: ClassVar = {"handle": "site:RoundNut-8", "centre": "site:RoundNut", "nut": "body:RoundNut"}
-
-    def allowed(self, vec: np.ndarray) -> bool:
-        return bool(np.linalg.norm(vec[:2] - vec[3:5]) >= 0.1)
+    apart: ClassVar[float] = 0.1
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
         nut, target = np.split(vec, 2)
@@ -94,12 +90,9 @@ class Disassemble(Sawyer):
     scene_file: ClassVar[str] = "sawyer_assembly_peg"
     hand_start: ClassVar = (0.0, 0.4, 0.2)
     drawn: ClassVar = ((0.0, 0.6, 0.025, -0.1, 0.6, 0.1699), (0.1, 0.75, 0.02501, 0.1, 0.75, 0.1701))
-    goal_low: ClassVar = (-0.1, 0.6, 0.1749)
-    goal_high: ClassVar = (0.1, 0.75, 0.1751)
+    goal_box: ClassVar = ((-0.1, 0.6, 0.1749), (0.1, 0.75, 0.1751))
     watched: ClassVar = Assembly.watched
-
-    def allowed(self, vec: np.ndarray) -> bool:
-        return bool(np.linalg.norm(vec[:2] - vec[3:5]) >= 0.1)
+    apart: ClassVar[float] = 0.1
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
         nut = vec[:3]

@@ -26,12 +26,9 @@ class Basketball(Sawyer):
 
     scene_file: ClassVar[str] = "sawyer_basketball"
     drawn: ClassVar = ((-0.1, 0.6, 0.0299, -0.1, 0.85, 0.0), (0.1, 0.7, 0.0301, 0.1, 0.9 + 1e-7, 0.0))
-    goal_low: ClassVar = (-0.1, 0.85 - 0.083, 0.2499)
-    goal_high: ClassVar = (0.1, 0.9 + 1e-7 - 0.083, 0.2501)
+    goal_box: ClassVar = ((-0.1, 0.85 - 0.083, 0.2499), (0.1, 0.9 + 1e-7 - 0.083, 0.2501))
     watched: ClassVar = {"ball": "body:bsktball"}
-
-    def allowed(self, vec: np.ndarray) -> bool:
-        return bool(np.linalg.norm(vec[:2] - vec[3:5]) >= 0.15)
+    apart: ClassVar[float] = 0.15
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
         ball = np.append(vec[:2], 0.03)

@@ -31,8 +31,6 @@ class BinPicking(Sawyer):
     scene_file: ClassVar[str] = "sawyer_bin_picking"
     hand_low: ClassVar = (-0.5, 0.4, 0.07)
     drawn: ClassVar = ((-0.21, 0.65, 0.02, 0.1199, 0.699, -0.001), (-0.03, 0.75, 0.02, 0.1201, 0.701, 0.001))
-    goal_low: ClassVar = (0.1199, 0.699, -0.001)
-    goal_high: ClassVar = (0.1201, 0.701, 0.001)
     watched: ClassVar = {"cube": "body:obj"}
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, Any]:

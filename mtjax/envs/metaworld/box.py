@@ -28,12 +28,8 @@ class BoxClose(Sawyer):
 
     scene_file: ClassVar[str] = "sawyer_box"
     drawn: ClassVar = ((-0.05, 0.5, 0.02, -0.1, 0.7, 0.133), (0.05, 0.55, 0.02, 0.1, 0.8, 0.133))
-    goal_low: ClassVar = (-0.1, 0.7, 0.133)
-    goal_high: ClassVar = (0.1, 0.8, 0.133)
     watched: ClassVar = {"lid": "body:top_link"}
-
-    def allowed(self, vec: np.ndarray) -> bool:
-        return bool(np.linalg.norm(vec[:2] - vec[3:5]) >= 0.25)
+    apart: ClassVar[float] = 0.25
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
         lid, target = np.append(vec[:2], 0.02), vec[3:]

@@ -24,6 +24,32 @@ def _arrange(host: Host, vec: np.ndarray, axis: int) -> dict[str, np.ndarray]:
     return {"target": target, "obj_to_target_init": np.abs(target[axis] - host.site("buttonStart")[axis])}
 
 
+def _arrange_front(self: Sawyer, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
+    host.data.qpos[_JOINT] = host.data.qvel[_JOINT] = 0
+    return _arrange(host, vec, axis=1)
+
+
+def _arrange_top(self: Sawyer, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
+    return _arrange(host, vec, axis=2)
+
+
+def _show_front(self: Sawyer, at: At) -> tuple[Array, ...]:
+    return at.position["button"] + jnp.array([0.0, -0.193, 0.0]), at.quat["button"]
+
+
+def _show_top(self: Sawyer, at: At) -> tuple[Array, ...]:
+    return at.position["button"] + jnp.array([0.0, 0.0, 0.193]), at.quat["button"]
+
+
+def _press_down(at: At, began: Mapping[str, Array], hand: Array) -> tuple[Array, Array]:
+    """Return reward and success for a button that is pressed along z; ``hand`` () says how well the gripper is set."""
+    button = at.obs[4:7]
+    away, left = distance(button, at.tcp), jnp.abs(began["target"][2] - button[2])
+    ready = hamacher(hand, near(away, 0.01, distance(button, began["init_tcp"])))
+    pressed = near(left, 0.005, began["obj_to_target_init"])
+    return 5 * ready + jnp.where(away <= 0.03, 5 * pressed, 0.0), left <= 0.024
+
+
 def press(at: At, began: Mapping[str, Array], depth: Array | float) -> tuple[Array, Array]:
     """Return the reward () for pressing a button along y with an open gripper, and how far () [m] it has to go."""
     button = at.obs[4:7]
@@ -44,16 +70,9 @@ class ButtonPress(Sawyer):
     scene_file: ClassVar[str] = "sawyer_button_press"
     hand_start: ClassVar = (0.0, 0.4, 0.2)
     drawn: ClassVar = ((-0.1, 0.85, 0.115), (0.1, 0.9, 0.115))
-    goal_low: ClassVar = Sawyer.hand_low
-    goal_high: ClassVar = Sawyer.hand_high
+    goal_box: ClassVar = (Sawyer.hand_low, Sawyer.hand_high)
     watched: ClassVar = {"button": "body:button"}
-
-    def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
-        host.data.qpos[_JOINT] = host.data.qvel[_JOINT] = 0
-        return _arrange(host, vec, axis=1)
-
-    def objects(self, at: At) -> tuple[Array, ...]:
-        return at.position["button"] + jnp.array([0.0, -0.193, 0.0]), at.quat["button"]
+    arrange, objects = _arrange_front, _show_front
 
     def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
         reward, left = press(at, began, began["obj_to_target_init"])
@@ -61,7 +80,7 @@ class ButtonPress(Sawyer):
 
 
 @dataclasses.dataclass(frozen=True)
-class ButtonPressWall(ButtonPress):
+class ButtonPressWall(Sawyer):
     """Press a button over a wall (Meta-World's button-press-wall-v3).
 
     Reward: with the tool centre beyond 0.07 m of the button, 2 times the product of how far the gripper is closed (0.5
@@ -71,7 +90,11 @@ class ButtonPressWall(ButtonPress):
     """
 
     scene_file: ClassVar[str] = "sawyer_button_press_wall"
+    hand_start: ClassVar = (0.0, 0.4, 0.2)
     drawn: ClassVar = ((-0.05, 0.85, 0.1149), (0.05, 0.9, 0.1151))
+    goal_box: ClassVar = (Sawyer.hand_low, Sawyer.hand_high)
+    watched: ClassVar = {"button": "body:button"}
+    arrange, objects = _arrange_front, _show_front
 
     def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
         button, opened = at.obs[4:7], at.obs[3]
@@ -93,32 +116,29 @@ class ButtonPressTopdown(Sawyer):
     scene_file: ClassVar[str] = "sawyer_button_press_topdown"
     hand_start: ClassVar = (0.0, 0.4, 0.2)
     drawn: ClassVar = ((-0.1, 0.8, 0.115), (0.1, 0.9, 0.115))
-    goal_low: ClassVar = Sawyer.hand_low
-    goal_high: ClassVar = Sawyer.hand_high
+    goal_box: ClassVar = (Sawyer.hand_low, Sawyer.hand_high)
     watched: ClassVar = {"button": "body:button"}
-    presses_open: ClassVar[bool] = False
-
-    def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
-        return _arrange(host, vec, axis=2)
-
-    def objects(self, at: At) -> tuple[Array, ...]:
-        return at.position["button"] + jnp.array([0.0, 0.0, 0.193]), at.quat["button"]
+    arrange, objects = _arrange_top, _show_top
 
     def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
-        button, opened = at.obs[4:7], at.obs[3]
-        away, left = distance(button, at.tcp), jnp.abs(began["target"][2] - button[2])
-        hand = opened if self.presses_open else 1 - opened
-        ready = hamacher(hand, near(away, 0.01, distance(button, began["init_tcp"])))
-        pressed = near(left, 0.005, began["obj_to_target_init"])
-        return 5 * ready + jnp.where(away <= 0.03, 5 * pressed, 0.0), left <= 0.024
+        return _press_down(at, began, 1 - at.obs[3])
 
 
 @dataclasses.dataclass(frozen=True)
-class ButtonPressTopdownWall(ButtonPressTopdown):
+class ButtonPressTopdownWall(Sawyer):
     """Press a button from above, over a wall (Meta-World's button-press-topdown-wall-v3).
 
-    Reward and success: as ``ButtonPressTopdown``'s, but the gripper should be open.
+    Reward: 5 times the product of how far the gripper is open and how near the tool centre is to the button; with that
+        within 0.03 m, and 5 times a long tail of the way that the button has to go.
+    Success: along z, the button is within 0.024 m of its hole.
     """
 
     scene_file: ClassVar[str] = "sawyer_button_press_topdown_wall"
-    presses_open: ClassVar[bool] = True
+    hand_start: ClassVar = (0.0, 0.4, 0.2)
+    drawn: ClassVar = ButtonPressTopdown.drawn
+    goal_box: ClassVar = (Sawyer.hand_low, Sawyer.hand_high)
+    watched: ClassVar = {"button": "body:button"}
+    arrange, objects = _arrange_top, _show_top
+
+    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+        return _press_down(at, began, at.obs[3])

@@ -30,8 +30,7 @@ class DialTurn(Sawyer):
 
     scene_file: ClassVar[str] = "sawyer_dial"
     drawn: ClassVar = ((-0.1, 0.7, 0.0), (0.1, 0.8, 0.0))
-    goal_low: ClassVar = (-0.1, 0.73, 0.0299)
-    goal_high: ClassVar = (0.1, 0.83, 0.0301)
+    goal_box: ClassVar = ((-0.1, 0.73, 0.0299), (0.1, 0.83, 0.0301))
     watched: ClassVar = {"dial": "body:dial"}
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:

@@ -42,8 +42,7 @@ class DoorOpen(Sawyer):
 
     scene_file: ClassVar[str] = "sawyer_door_pull"
     drawn: ClassVar = ((0.0, 0.85, 0.15), (0.1, 0.95, 0.15))
-    goal_low: ClassVar = (-0.3, 0.4, 0.1499)
-    goal_high: ClassVar = (-0.2, 0.5, 0.1501)
+    goal_box: ClassVar = ((-0.3, 0.4, 0.1499), (-0.2, 0.5, 0.1501))
     watched: ClassVar = {"handle": "geom:handle"}
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
@@ -76,8 +75,7 @@ class DoorClose(Sawyer):
     scene_file: ClassVar[str] = "sawyer_door_pull"
     hand_start: ClassVar = (-0.5, 0.6, 0.2)
     drawn: ClassVar = DoorOpen.drawn
-    goal_low: ClassVar = (0.2, 0.65, 0.1499)
-    goal_high: ClassVar = (0.3, 0.75, 0.1501)
+    goal_box: ClassVar = ((0.2, 0.65, 0.1499), (0.3, 0.75, 0.1501))
     watched: ClassVar = DoorOpen.watched
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:

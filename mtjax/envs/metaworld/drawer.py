@@ -30,8 +30,7 @@ class DrawerOpen(Sawyer):
 
     scene_file: ClassVar[str] = "sawyer_drawer"
     drawn: ClassVar = ((-0.1, 0.9, 0.0), (0.1, 0.9, 0.0))
-    goal_low: ClassVar = Sawyer.hand_low
-    goal_high: ClassVar = Sawyer.hand_high
+    goal_box: ClassVar = (Sawyer.hand_low, Sawyer.hand_high)
     watched: ClassVar = {"drawer": "body:drawer_link"}
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
@@ -63,8 +62,7 @@ class DrawerClose(Sawyer):
 
     scene_file: ClassVar[str] = "sawyer_drawer"
     drawn: ClassVar = DrawerOpen.drawn
-    goal_low: ClassVar = Sawyer.hand_low
-    goal_high: ClassVar = Sawyer.hand_high
+    goal_box: ClassVar = (Sawyer.hand_low, Sawyer.hand_high)
     watched: ClassVar = {"drawer": "body:drawer_link"}
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:

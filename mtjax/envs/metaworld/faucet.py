@@ -17,6 +17,25 @@ from mtjax.types import Array
 _RADIUS = 0.07  # [m] of the target
 
 
+def _place(self: Sawyer, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
+    host.move("faucetBase", vec)
+    return {"target": vec + self.to_target, "obj_init": vec}
+
+
+def _show(self: Sawyer, at: At) -> tuple[Array, ...]:
+    return at.position[self.handle] - jnp.array([0.0, 0.0, 0.01]), at.quat["base"]
+
+
+def _turn(self: Sawyer, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    end, target = at.obs[4:7] + jnp.array(self.to_end), began["target"]
+    away = distance(end, target)
+    in_place = near(away, _RADIUS, abs(distance(began["obj_init"], target) - _RADIUS))
+    margin = abs(distance(began["obj_init"], began["init_tcp"]) - 0.01)
+    reach = tolerance(distance(end, at.tcp), 0.0, 0.01, margin)
+    success = away <= _RADIUS
+    return jnp.where(success, 10.0, 4 * reach + 6 * in_place), success
+
+
 @dataclasses.dataclass(frozen=True)
 class FaucetOpen(Sawyer):
     """Faucet open: turn the faucet's handle from the front to the right.
@@ -33,8 +52,7 @@ class FaucetOpen(Sawyer):
     hand_low: ClassVar = (-0.5, 0.4, -0.15)
     hand_start: ClassVar = (0.0, 0.4, 0.2)
     drawn: ClassVar = ((-0.05, 0.8, 0.0), (0.05, 0.85, 0.0))
-    goal_low: ClassVar = hand_low
-    goal_high: ClassVar = Sawyer.hand_high
+    goal_box: ClassVar = (hand_low, Sawyer.hand_high)
     watched: ClassVar = {
         "opens": "site:handleStartOpen",
         "closes": "site:handleStartClose",
@@ -43,32 +61,26 @@ class FaucetOpen(Sawyer):
     handle: ClassVar[str] = "opens"  # the thing watched that the hand turns
     to_target: ClassVar = (0.175, 0.0, 0.125)  # [m] from the faucet
     to_end: ClassVar = (-0.04, 0.0, 0.03)  # [m] from the handle in the observation
-
-    def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
-        host.move("faucetBase", vec)
-        return {"target": vec + self.to_target, "obj_init": vec}
-
-    def objects(self, at: At) -> tuple[Array, ...]:
-        return at.position[self.handle] - jnp.array([0.0, 0.0, 0.01]), at.quat["base"]
-
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
-        end, target = at.obs[4:7] + jnp.array(self.to_end), began["target"]
-        away = distance(end, target)
-        in_place = near(away, _RADIUS, abs(distance(began["obj_init"], target) - _RADIUS))
-        margin = abs(distance(began["obj_init"], began["init_tcp"]) - 0.01)
-        reach = tolerance(distance(end, at.tcp), 0.0, 0.01, margin)
-        success = away <= _RADIUS
-        return jnp.where(success, 10.0, 4 * reach + 6 * in_place), success
+    arrange, objects, evaluate = _place, _show, _turn
 
 
 @dataclasses.dataclass(frozen=True)
-class FaucetClose(FaucetOpen):
+class FaucetClose(Sawyer):
     """Faucet close: turn the faucet's handle from the front to the left.
 
-    Reward, success and start: as FaucetOpen, but the handle's end is where the observation shows it.
+    Reward: 4 for the tool centre at the handle's end and 6 for the handle's end at the target, each falling with the
+        distance; 10 within 0.07 m of the target.
+    Success: the handle's end, which is where the observation shows it, is within 0.07 m of the target.
+    Start: the faucet at the drawn place, its handle pointing to the robot.
     """
 
+    scene_file: ClassVar[str] = "sawyer_faucet"
+    hand_low: ClassVar = FaucetOpen.hand_low
+    hand_start: ClassVar = (0.0, 0.4, 0.2)
     drawn: ClassVar = ((-0.1, 0.8, 0.0), (0.1, 0.85, 0.0))
+    goal_box: ClassVar = FaucetOpen.goal_box
+    watched: ClassVar = FaucetOpen.watched
     handle: ClassVar[str] = "closes"
     to_target: ClassVar = (-0.175, 0.0, 0.125)
     to_end: ClassVar = (0.0, 0.0, 0.0)
+    arrange, objects, evaluate = _place, _show, _turn

@@ -31,8 +31,7 @@ class Hammer(Sawyer):
     scene_file: ClassVar[str] = "sawyer_hammer"
     hand_start: ClassVar = (0.0, 0.4, 0.2)
     drawn: ClassVar = ((-0.1, 0.4, 0.0), (0.1, 0.5, 0.0))
-    goal_low: ClassVar = (0.2399, 0.7399, 0.109)
-    goal_high: ClassVar = (0.2401, 0.7401, 0.111)
+    goal_box: ClassVar = ((0.2399, 0.7399, 0.109), (0.2401, 0.7401, 0.111))
     watched: ClassVar = {"hammer": "body:hammer", "nail": "body:nail_link"}
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:

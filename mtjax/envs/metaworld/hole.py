@@ -16,6 +16,15 @@ from mtjax.types import Array
 _RADIUS = 0.05  # [m] of both targets
 
 
+def _place(self: Sawyer, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
+    host.place_free(vec[:3])
+    return {"target": vec[3:], "obj_init": vec[:3]}
+
+
+def _show(self: Sawyer, at: At) -> tuple[Array, ...]:
+    return at.position["block"], at.quat["block"]
+
+
 @dataclasses.dataclass(frozen=True)
 class HandInsert(Sawyer):
     """Hand insert: take the block and put it into the hole with the hand.
@@ -29,19 +38,9 @@ class HandInsert(Sawyer):
     scene_file: ClassVar[str] = "sawyer_table_with_hole"
     hand_low: ClassVar = (-0.5, 0.4, -0.15)
     drawn: ClassVar = ((-0.1, 0.6, 0.05, -0.04, 0.8, -0.0201), (0.1, 0.7, 0.05, 0.04, 0.88, -0.0199))
-    goal_low: ClassVar = drawn[0][3:]
-    goal_high: ClassVar = drawn[1][3:]
     watched: ClassVar = {"block": "body:obj", "shape": "geom:objGeom"}
-
-    def allowed(self, vec: np.ndarray) -> bool:
-        return bool(np.linalg.norm(vec[:2] - vec[3:5]) >= 0.15)
-
-    def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
-        host.place_free(vec[:3])
-        return {"target": vec[3:], "obj_init": vec[:3]}
-
-    def objects(self, at: At) -> tuple[Array, ...]:
-        return at.position["block"], at.quat["block"]
+    apart: ClassVar[float] = 0.15
+    arrange, objects = _place, _show
 
     def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
         block, target = at.obs[4:7], began["target"]
@@ -54,7 +53,7 @@ class HandInsert(Sawyer):
 
 
 @dataclasses.dataclass(frozen=True)
-class PickOutOfHole(HandInsert):
+class PickOutOfHole(Sawyer):
     """Pick out of hole: take the puck out of the hole and lift it to the target.
 
     Reward: the Hamacher product of caging the puck and the puck at the target; more while the puck is held and lifted
@@ -70,8 +69,8 @@ class PickOutOfHole(HandInsert):
     watched: ClassVar = {"block": "body:obj"}
     hand_low: ClassVar = (-0.5, 0.4, -0.05)
     drawn: ClassVar = ((0.0, 0.75, 0.02, -0.1, 0.5, 0.15), (0.0, 0.75, 0.02, 0.1, 0.6, 0.3))
-    goal_low: ClassVar = drawn[0][3:]
-    goal_high: ClassVar = drawn[1][3:]
+    apart: ClassVar[float] = 0.15
+    arrange, objects = _place, _show
 
     def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
         puck, start, target = at.obs[4:7], began["obj_init"], began["target"]

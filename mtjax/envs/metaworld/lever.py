@@ -41,8 +41,7 @@ class LeverPull(Sawyer):
     hand_low: ClassVar = (-0.5, 0.4, -0.15)
     hand_start: ClassVar = (0.0, 0.4, 0.2)
     drawn: ClassVar = ((-0.1, 0.7, 0.0), (0.1, 0.8, 0.0))
-    goal_low: ClassVar = hand_low
-    goal_high: ClassVar = Sawyer.hand_high
+    goal_box: ClassVar = (hand_low, Sawyer.hand_high)
     watched: ClassVar = {"end": "site:leverStart"}
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:

@@ -32,8 +32,7 @@ class DoorLock(Sawyer):
     scene_file: ClassVar[str] = "sawyer_door_lock"
     hand_low: ClassVar = (-0.5, 0.4, -0.15)
     drawn: ClassVar = ((-0.1, 0.8, 0.15), (0.1, 0.85, 0.15))
-    goal_low: ClassVar = hand_low
-    goal_high: ClassVar = Sawyer.hand_high
+    goal_box: ClassVar = (hand_low, Sawyer.hand_high)
     watched: ClassVar = {
         "lock": "site:lockStartLock",
         "unlock": "site:lockStartUnlock",
@@ -67,8 +66,7 @@ class DoorUnlock(Sawyer):
     scene_file: ClassVar[str] = "sawyer_door_lock"
     hand_low: ClassVar = DoorLock.hand_low
     drawn: ClassVar = DoorLock.drawn
-    goal_low: ClassVar = (0.0, 0.64, 0.21)
-    goal_high: ClassVar = (0.2, 0.7, 0.2111)
+    goal_box: ClassVar = ((0.0, 0.64, 0.21), (0.2, 0.7, 0.2111))
     watched: ClassVar = DoorLock.watched
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:

@@ -47,12 +47,9 @@ class PegInsertSide(Sawyer):
 
     scene_file: ClassVar[str] = "sawyer_peg_insertion_side"
     drawn: ClassVar = ((0.0, 0.5, 0.02, -0.35, 0.4, -0.001), (0.2, 0.7, 0.02, -0.25, 0.7, 0.001))
-    goal_low: ClassVar = (-0.32, 0.4, 0.129)
-    goal_high: ClassVar = (-0.22, 0.7, 0.131)
+    goal_box: ClassVar = ((-0.32, 0.4, 0.129), (-0.22, 0.7, 0.131))
     watched: ClassVar = {"grasp": "site:pegGrasp", "head": "site:pegHead"}
-
-    def allowed(self, vec: np.ndarray) -> bool:
-        return bool(np.linalg.norm(vec[:2] - vec[3:5]) >= 0.1)
+    apart: ClassVar[float] = 0.1
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
         head = host.site("pegHead")
@@ -91,8 +88,7 @@ class PegUnplugSide(Sawyer):
 
     scene_file: ClassVar[str] = "sawyer_peg_unplug_side"
     drawn: ClassVar = ((-0.25, 0.6, -0.001), (-0.15, 0.8, 0.001))
-    goal_low: ClassVar = (-0.056, 0.6, 0.13)
-    goal_high: ClassVar = (0.044, 0.8, 0.132)
+    goal_box: ClassVar = ((-0.056, 0.6, 0.13), (0.044, 0.8, 0.132))
     watched: ClassVar = {"end": "site:pegEnd", "plug": "body:plug1"}
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:

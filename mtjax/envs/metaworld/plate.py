@@ -16,6 +16,27 @@ from mtjax.types import Array
 _RADIUS = 0.05  # [m] of the target in the reward
 
 
+def _arrange(host: Host, vec: np.ndarray, x: float = 0.0, y: float = 0.0) -> dict[str, np.ndarray]:
+    """Put the plate ``x`` and ``y`` [m] away from its place in the scene."""
+    host.data.qpos[9:11] = x, y
+    host.forward()
+    return {"target": vec[3:], "obj_init": vec[:3]}
+
+
+def _show(self: Sawyer, at: At) -> tuple[Array, ...]:
+    return at.position["plate"], scalar_last(at.quat["plate"])
+
+
+def _pull(self: Sawyer, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    """Return reward and success for a plate that the hand moves from above."""
+    plate, start, target = at.obs[4:7], began["obj_init"], began["target"]
+    away, reached = distance(plate, target), distance(plate, at.tcp)
+    in_place = near(away, _RADIUS, distance(start, target) - _RADIUS)
+    reach = near(reached, _RADIUS, distance(start, began["init_tcp"]) - _RADIUS)
+    reward = jnp.where((at.tcp[2] <= 0.03) & (reached < 0.07), 2 + 7 * in_place, 1.5 * reach)
+    return jnp.where(away < _RADIUS, 10.0, reward), away <= 0.07
+
+
 @dataclasses.dataclass(frozen=True)
 class PlateSlide(Sawyer):
     """Plate slide: slide the plate forward into the goal.
@@ -28,21 +49,12 @@ class PlateSlide(Sawyer):
 
     scene_file: ClassVar[str] = "sawyer_plate_slide"
     drawn: ClassVar = ((0.0, 0.6, 0.0, -0.1, 0.85, 0.0), (0.0, 0.6, 0.0, 0.1, 0.9, 0.0))
-    goal_low: ClassVar = drawn[0][3:]
-    goal_high: ClassVar = drawn[1][3:]
     watched: ClassVar = {"plate": "geom:puck"}
-    slid: ClassVar = (0.0, 0.0)  # x and y [m] of the plate at the start, from its place in the scene
-    goal_at: ClassVar[slice | None] = slice(3, 6)  # where the drawn vector has the place of the goal's net
+    objects = _show
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
-        if self.goal_at is not None:
-            host.move("puck_goal", vec[self.goal_at])
-        host.data.qpos[9:11] = self.slid
-        host.forward()
-        return {"target": vec[3:], "obj_init": vec[:3]}
-
-    def objects(self, at: At) -> tuple[Array, ...]:
-        return at.position["plate"], scalar_last(at.quat["plate"])
+        host.move("puck_goal", vec[3:])
+        return _arrange(host, vec)
 
     def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
         plate, start, target = at.obs[4:7], began["obj_init"], began["target"]
@@ -53,7 +65,7 @@ class PlateSlide(Sawyer):
 
 
 @dataclasses.dataclass(frozen=True)
-class PlateSlideBack(PlateSlide):
+class PlateSlideBack(Sawyer):
     """Plate slide back: slide the plate back out of the goal, towards the robot.
 
     Reward: 1.5 times the tool centre at the plate; instead 2, and 7 times the plate at the target, while the tool
@@ -62,46 +74,49 @@ class PlateSlideBack(PlateSlide):
     Start: the plate 0.15 m forward. The goal's net stays where the scene has it.
     """
 
+    scene_file: ClassVar[str] = "sawyer_plate_slide"
     drawn: ClassVar = ((0.0, 0.85, 0.0, -0.1, 0.6, 0.015), (0.0, 0.85, 0.0, 0.1, 0.6, 0.015))
-    goal_low: ClassVar = drawn[0][3:]
-    goal_high: ClassVar = drawn[1][3:]
-    slid: ClassVar = (0.0, 0.15)
-    goal_at: ClassVar[slice | None] = None
+    watched: ClassVar = PlateSlide.watched
+    objects, evaluate = _show, _pull
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
-        plate, start, target = at.obs[4:7], began["obj_init"], began["target"]
-        away, reached = distance(plate, target), distance(plate, at.tcp)
-        in_place = near(away, _RADIUS, distance(start, target) - _RADIUS)
-        reach = near(reached, _RADIUS, distance(start, began["init_tcp"]) - _RADIUS)
-        reward = jnp.where((at.tcp[2] <= 0.03) & (reached < 0.07), 2 + 7 * in_place, 1.5 * reach)
-        return jnp.where(away < _RADIUS, 10.0, reward), away <= 0.07
+    def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
+        return _arrange(host, vec, y=0.15)
 
 
 @dataclasses.dataclass(frozen=True)
-class PlateSlideSide(PlateSlideBack):
+class PlateSlideSide(Sawyer):
     """Plate slide side: slide the plate to the left into the goal.
 
-    Reward and success: as PlateSlideBack.
+    Reward: 1.5 times the tool centre at the plate; instead 2, and 7 times the plate at the target, while the tool
+        centre is below 0.03 m and within 0.07 m of the plate; 10 within 0.05 m of the target.
+    Success: the plate is within 0.07 m of the target.
     Start: the plate at its place. The goal's net stays where the scene has it, wherever the target is.
     """
 
     scene_file: ClassVar[str] = "sawyer_plate_slide_sideway"
     drawn: ClassVar = ((0.0, 0.6, 0.0, -0.3, 0.54, 0.0), (0.0, 0.6, 0.0, -0.25, 0.66, 0.0))
-    goal_low: ClassVar = drawn[0][3:]
-    goal_high: ClassVar = drawn[1][3:]
-    slid: ClassVar = (0.0, 0.0)
+    watched: ClassVar = PlateSlide.watched
+    objects, evaluate = _show, _pull
+
+    def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
+        return _arrange(host, vec)
 
 
 @dataclasses.dataclass(frozen=True)
-class PlateSlideBackSide(PlateSlideSide):
+class PlateSlideBackSide(Sawyer):
     """Plate slide back side: slide the plate to the right out of the goal.
 
-    Reward and success: as PlateSlideBack.
+    Reward: 1.5 times the tool centre at the plate; instead 2, and 7 times the plate at the target, while the tool
+        centre is below 0.03 m and within 0.07 m of the plate; 10 within 0.05 m of the target.
+    Success: the plate is within 0.07 m of the target.
     Start: the goal's net at the drawn place of the plate, and the plate 0.1 m to the right of it.
     """
 
+    scene_file: ClassVar[str] = "sawyer_plate_slide_sideway"
     drawn: ClassVar = ((-0.25, 0.6, 0.0, -0.05, 0.6, 0.015), (-0.25, 0.6, 0.0, 0.15, 0.6, 0.015))
-    goal_low: ClassVar = drawn[0][3:]
-    goal_high: ClassVar = drawn[1][3:]
-    slid: ClassVar = (-0.15, 0.0)
-    goal_at: ClassVar[slice | None] = slice(0, 3)
+    watched: ClassVar = PlateSlide.watched
+    objects, evaluate = _show, _pull
+
+    def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
+        host.move("puck_goal", vec[:3])
+        return _arrange(host, vec, x=-0.15)

@@ -17,6 +17,31 @@ RADIUS = 0.05  # [m] within which a thing is at its goal
 PAST_WALL = 0.75  # [m] of y
 
 
+def show_puck(self: Sawyer, at: At) -> tuple[Array, ...]:
+    """Return what fills the observation's entries for objects."""
+    return at.position["puck"], scalar_last(at.quat["puck"])
+
+
+def progress(at: At, began: Mapping[str, Array]) -> tuple[Array, Array, Array]:
+    """Return where the puck is (3,), its distance () from the goal, and how near that is in [0, 1]."""
+    puck, target = at.position["puck"], began["target"]
+    away = distance(puck, target)
+    return puck, away, near(away, RADIUS, distance(began["obj_init"], target))
+
+
+def _place(self: Sawyer, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
+    height = host.body("obj")[2]
+    obj_init = np.append(vec[:2], height)
+    host.place_free(obj_init)
+    return {"target": np.append(vec[3:5], height), "obj_init": obj_init}
+
+
+def _held(at: At, began: Mapping[str, Array]) -> Array:
+    """Return the reward () of a gripper about the puck."""
+    puck = at.position["puck"]
+    return caging(at, began, puck, obj_radius=0.015, pad_success_thresh=0.05, xz_thresh=0.005, high_density=True)
+
+
 @dataclasses.dataclass(frozen=True)
 class Push(Sawyer):
     """Push: bring the puck to a goal on the table (Meta-World's push-v3).
@@ -28,42 +53,19 @@ class Push(Sawyer):
 
     scene_file: ClassVar[str] = "sawyer_push_v3"
     drawn: ClassVar = ((-0.1, 0.6, 0.02, -0.1, 0.8, 0.01), (0.1, 0.7, 0.02, 0.1, 0.9, 0.02))
-    goal_low: ClassVar = (-0.1, 0.8, 0.01)
-    goal_high: ClassVar = (0.1, 0.9, 0.02)
     watched: ClassVar = {"puck": "body:obj"}
-
-    def allowed(self, vec: np.ndarray) -> bool:
-        return bool(np.linalg.norm(vec[:2] - vec[3:5]) >= 0.15)
-
-    def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
-        height = host.body("obj")[2]
-        obj_init = np.append(vec[:2], height)
-        host.place_free(obj_init)
-        return {"target": np.append(vec[3:5], height), "obj_init": obj_init}
-
-    def objects(self, at: At) -> tuple[Array, ...]:
-        return at.position["puck"], scalar_last(at.quat["puck"])
+    apart: ClassVar[float] = 0.15
+    arrange, objects = _place, show_puck
 
     def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
-        puck, away, in_place = self.progress(at, began)
-        held = self.held(at, began)
+        puck, away, in_place = progress(at, began)
+        held = _held(at, began)
         reward = 2 * held + jnp.where(in_hand(at, puck, 0.02), 1 + 2 * held + 5 * in_place, 0.0)
         return jnp.where(away < RADIUS, 10.0, reward), away <= RADIUS
 
-    def progress(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array, Array]:
-        """Return where the puck is (3,), its distance () from the goal, and how near that is in [0, 1]."""
-        puck, target = at.position["puck"], began["target"]
-        away = distance(puck, target)
-        return puck, away, near(away, RADIUS, distance(began["obj_init"], target))
-
-    def held(self, at: At, began: Mapping[str, Array]) -> Array:
-        """Return the reward () of a gripper about the puck."""
-        puck = at.position["puck"]
-        return caging(at, began, puck, obj_radius=0.015, pad_success_thresh=0.05, xz_thresh=0.005, high_density=True)
-
 
 @dataclasses.dataclass(frozen=True)
-class PushWall(Push):
+class PushWall(Sawyer):
     """Push around a wall: bring the puck to a goal behind a wall (Meta-World's push-wall-v3).
 
     Reward: 2 for a gripper about the puck; once it is there, 1 more and 4 for the puck's nearness to the wall's end;
@@ -73,22 +75,23 @@ class PushWall(Push):
 
     scene_file: ClassVar[str] = "sawyer_push_wall_v3"
     drawn: ClassVar = ((-0.05, 0.6, 0.015, -0.05, 0.85, 0.01), (0.05, 0.65, 0.015, 0.05, 0.9, 0.02))
-    goal_low: ClassVar = (-0.05, 0.85, 0.01)
-    goal_high: ClassVar = (0.05, 0.9, 0.02)
+    watched: ClassVar = Push.watched
+    apart: ClassVar[float] = 0.15
+    arrange, objects = _place, show_puck
 
     def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
-        puck, away, in_place = self.progress(at, began)
+        puck, away, in_place = progress(at, began)
         middle, wide = jnp.stack([jnp.float32(-0.05), jnp.float32(0.77), puck[2]]), jnp.array([3.0, 1.0, 1.0])
         begun = distance(began["obj_init"] * wide, middle * wide)
         aside = near(distance(puck * wide, middle * wide), RADIUS, begun)
-        held = 2 * self.held(at, began)
+        held = 2 * _held(at, began)
         reward = jnp.where(puck[1] > PAST_WALL, held + 5 + 3 * in_place, held + 1 + 4 * aside)
         reward = jnp.where(in_hand(at, puck, 0.02), reward, held)
         return jnp.where(away < RADIUS, 10.0, reward), away <= 0.07
 
 
 @dataclasses.dataclass(frozen=True)
-class PushBack(Push):
+class PushBack(Sawyer):
     """Push back: pull the puck to a goal that is nearer to the robot (Meta-World's push-back-v3).
 
     Reward: Hamacher's product of a gripper about the puck and the puck's nearness to the goal; once the puck is held
@@ -98,11 +101,12 @@ class PushBack(Push):
 
     scene_file: ClassVar[str] = "sawyer_push_back_v3"
     drawn: ClassVar = ((-0.1, 0.8, 0.02, -0.1, 0.6, 0.0199), (0.1, 0.85, 0.02, 0.1, 0.7, 0.0201))
-    goal_low: ClassVar = (-0.1, 0.6, 0.0199)
-    goal_high: ClassVar = (0.1, 0.7, 0.0201)
+    watched: ClassVar = Push.watched
+    apart: ClassVar[float] = 0.15
+    arrange, objects = _place, show_puck
 
     def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
-        puck, away, in_place = self.progress(at, began)
+        puck, away, in_place = progress(at, began)
         held = pads_caging(at, began, puck, obj_radius=0.007, grip_margin=0.003, xz_thresh=0.01)
         closed = (at.obs[3] > 0) & (at.obs[3] < 0.55)
         moved = distance(began["obj_init"], began["target"]) - away > 0.01

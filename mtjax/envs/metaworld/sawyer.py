@@ -78,8 +78,8 @@ class Sawyer(Domain):
     hand_high: ClassVar[tuple[float, ...]] = (0.5, 1.0, 0.5)
     hand_start: ClassVar[tuple[float, ...]] = (0.0, 0.6, 0.2)
     drawn: ClassVar[tuple[tuple[float, ...], tuple[float, ...]]]  # least and greatest vector of an episode's goal
-    goal_low: ClassVar[tuple[float, ...]]  # to which the goal in observations is clipped
-    goal_high: ClassVar[tuple[float, ...]]
+    apart: ClassVar[float] = 0.0  # [m] along x and y, from a drawn place (3,) to the goal that is drawn after it
+    goal_box: ClassVar[tuple[tuple[float, ...], ...]] = ()  # of goals in observations; empty: that of drawn goals
     # Short name -> "body:NAME", "site:NAME" or "geom:NAME". Tasks of a scene that watch the same can step together.
     watched: ClassVar[Mapping[str, str]] = MappingProxyType({})
     pressed: ClassVar[str] = ""  # a geom, if success needs that both pads press on it
@@ -116,7 +116,7 @@ class Sawyer(Domain):
 
     def allowed(self, vec: np.ndarray) -> bool:
         """Return whether a drawn vector is a goal. Another is drawn if not. It runs on the host."""
-        return True
+        return not self.apart or bool(np.linalg.norm(vec[:2] - vec[3:5]) >= self.apart)
 
     @abc.abstractmethod
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, Any]:
@@ -252,8 +252,9 @@ class Sawyer(Domain):
         return world._replace(mocap=mocap, extra=self._half(world)), jnp.stack([action[3], -action[3]])
 
     def observe(self, task: Task, world: World) -> Array:
-        low = jnp.concatenate([_HALF_LOW, _HALF_LOW, jnp.float32(self.goal_low)])
-        high = jnp.concatenate([_HALF_HIGH, _HALF_HIGH, jnp.float32(self.goal_high)])
+        goals = np.array(self.goal_box or [vec[3:] for vec in self.drawn], np.float32)
+        low = jnp.concatenate([_HALF_LOW, _HALF_LOW, goals[0]])
+        high = jnp.concatenate([_HALF_HIGH, _HALF_HIGH, goals[1]])
         seen = jnp.clip(self._unclipped(task, world), low, high)
         return seen.at[36:].set(0) if self.goal_hidden else seen
 

@@ -32,12 +32,8 @@ class ShelfPlace(Sawyer):
 
     scene_file: ClassVar[str] = "sawyer_shelf_placing"
     drawn: ClassVar = ((-0.1, 0.5, 0.019, -0.1, 0.8, 0.299), (0.1, 0.6, 0.021, 0.1, 0.9, 0.301))
-    goal_low: ClassVar = drawn[0][3:]
-    goal_high: ClassVar = drawn[1][3:]
     watched: ClassVar = {"block": "body:obj", "shape": "geom:objGeom"}
-
-    def allowed(self, vec: np.ndarray) -> bool:
-        return bool(np.linalg.norm(vec[:2] - vec[3:5]) >= 0.1)
+    apart: ClassVar[float] = 0.1
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
         block = np.array([*vec[:2], host.body("obj")[2]])

@@ -30,12 +30,8 @@ class Soccer(Sawyer):
 
     scene_file: ClassVar[str] = "sawyer_soccer"
     drawn: ClassVar = ((-0.1, 0.6, 0.03, -0.1, 0.8, 0.0), (0.1, 0.7, 0.03, 0.1, 0.9, 0.0))
-    goal_low: ClassVar = drawn[0][3:]
-    goal_high: ClassVar = drawn[1][3:]
     watched: ClassVar = {"ball": "body:soccer_ball"}
-
-    def allowed(self, vec: np.ndarray) -> bool:
-        return bool(np.linalg.norm(vec[:2] - vec[3:5]) >= 0.15)
+    apart: ClassVar[float] = 0.15
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
         ball = np.array([*vec[:2], 0.03])

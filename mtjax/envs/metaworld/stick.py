@@ -16,6 +16,23 @@ from mtjax.types import Array
 _RADIUS = 0.12  # [m] of both targets for the flask
 
 
+def _arrange(host: Host, vec: np.ndarray, height: float, flask_at: tuple[float, float]) -> dict[str, np.ndarray]:
+    """Put the stick at its drawn place, and the flask ``flask_at`` (2,) [m] from its place in the scene.
+
+    Args:
+        height: [m] of the target.
+    """
+    stick = np.array([*vec[:2], 0.02])
+    host.data.qpos[16:18], host.data.qvel[16:18] = flask_at, 0
+    host.place_free(stick)
+    return {"target": np.array([*vec[3:5], height]), "stick_init_pos": stick, "obj_init": host.body("object")}
+
+
+def _show(at: At, flask: Array) -> tuple[Array, ...]:
+    """Return the stick's place and orientation, and the place (3,) that stands for the flask."""
+    return at.position["stick"], scalar_last(at.quat["stick"]), flask, jnp.zeros(4)
+
+
 @dataclasses.dataclass(frozen=True)
 class StickPush(Sawyer):
     """Stick push: pick up the stick and push the flask with it.
@@ -31,30 +48,15 @@ class StickPush(Sawyer):
 
     scene_file: ClassVar[str] = "sawyer_stick_obj"
     drawn: ClassVar = ((-0.08, 0.58, 0.0, 0.399, 0.55, 0.1319), (-0.03, 0.62, 0.001, 0.401, 0.6, 0.1321))
-    goal_low: ClassVar = drawn[0][3:]
-    goal_high: ClassVar = drawn[1][3:]
     watched: ClassVar = {"stick": "body:stick", "handle": "site:insertion", "end": "site:stick_end"}
     pressed: ClassVar[str] = "objGeom"
-    flask_at: ClassVar = (0.0, 0.0)  # x and y [m] of the flask at the start, from its place in the scene
-    to_flask: ClassVar = (0.0, 0.09, 0.0)  # [m] from the handle to what the observation shows
-
-    def allowed(self, vec: np.ndarray) -> bool:
-        return bool(np.linalg.norm(vec[:2] - vec[3:5]) >= 0.1)
+    apart: ClassVar[float] = 0.1
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
-        stick = np.array([*vec[:2], 0.02])
-        height = self.target_height(host)
-        host.data.qpos[16:18], host.data.qvel[16:18] = self.flask_at, 0
-        host.place_free(stick)
-        return {"target": np.array([*vec[3:5], height]), "stick_init_pos": stick, "obj_init": host.body("object")}
-
-    def target_height(self, host: Host) -> float:
-        """Return the height [m] of the target."""
-        return host.site("insertion")[2]
+        return _arrange(host, vec, host.site("insertion")[2], (0.0, 0.0))
 
     def objects(self, at: At) -> tuple[Array, ...]:
-        flask = at.position["handle"] + jnp.array(self.to_flask)
-        return at.position["stick"], scalar_last(at.quat["stick"]), flask, jnp.zeros(4)
+        return _show(at, at.position["handle"] + jnp.array([0.0, 0.09, 0.0]))
 
     def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
         stick, flask, target = at.obs[4:7] + jnp.array([0.015, 0.0, 0.0]), at.obs[11:14], began["target"]
@@ -79,7 +81,7 @@ class StickPush(Sawyer):
 
 
 @dataclasses.dataclass(frozen=True)
-class StickPull(StickPush):
+class StickPull(Sawyer):
     """Stick pull: pick up the stick, put it through the flask's handle and pull the flask with it.
 
     Reward: the Hamacher product of caging the stick and the stick at the flask, where z counts twice. While the stick
@@ -92,15 +94,18 @@ class StickPull(StickPush):
     The caging takes the flask's place at the start for that of the stick.
     """
 
+    scene_file: ClassVar[str] = "sawyer_stick_obj"
     hand_low: ClassVar = (-0.5, 0.35, 0.05)
     drawn: ClassVar = ((-0.1, 0.55, 0.0, 0.35, 0.45, 0.0199), (0.0, 0.65, 0.001, 0.45, 0.55, 0.0201))
-    goal_low: ClassVar = drawn[0][3:]
-    goal_high: ClassVar = drawn[1][3:]
-    flask_at: ClassVar = (0.0, 0.09)
-    to_flask: ClassVar = (0.0, 0.0, 0.0)
+    watched: ClassVar = StickPush.watched
+    pressed: ClassVar[str] = "objGeom"
+    apart: ClassVar[float] = 0.1
 
-    def target_height(self, host: Host) -> float:
-        return 0.02
+    def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
+        return _arrange(host, vec, 0.02, (0.0, 0.09))
+
+    def objects(self, at: At) -> tuple[Array, ...]:
+        return _show(at, at.position["handle"])
 
     def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
         stick, handle, target = at.obs[4:7], at.obs[11:14], began["target"]

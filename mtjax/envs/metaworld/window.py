@@ -17,6 +17,20 @@ from mtjax.types import Array
 _RADIUS = 0.05  # [m] of the target, along x
 
 
+def _show(self: Sawyer, at: At) -> tuple[Array, ...]:
+    return at.position[self.handle], jnp.zeros(4)
+
+
+def _slide(self: Sawyer, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    handle = at.position[self.handle]
+    away = abs(handle[0] - began["target"][0])
+    way = abs(began[self.way_from][0] - began["target"][0])
+    in_place = near(away, _RADIUS, abs(way - _RADIUS))
+    margin = abs(distance(began["window_handle_pos_init"], began["init_tcp"]) - 0.02)
+    reach = tolerance(distance(handle, at.tcp), 0.0, 0.02, margin, self.reach_shape)
+    return 10 * hamacher(reach, in_place), away <= _RADIUS
+
+
 @dataclasses.dataclass(frozen=True)
 class WindowOpen(Sawyer):
     """Window open: slide the window to the right by its handle.
@@ -31,12 +45,12 @@ class WindowOpen(Sawyer):
     scene_file: ClassVar[str] = "sawyer_window_horizontal"
     hand_start: ClassVar = (0.0, 0.4, 0.2)
     drawn: ClassVar = ((-0.1, 0.7, 0.16), (0.1, 0.9, 0.16))
-    goal_low: ClassVar = Sawyer.hand_low
-    goal_high: ClassVar = Sawyer.hand_high
+    goal_box: ClassVar = (Sawyer.hand_low, Sawyer.hand_high)
     watched: ClassVar = {"opens": "site:handleOpenStart", "closes": "site:handleCloseStart"}
     handle: ClassVar[str] = "opens"  # the thing watched that the hand pushes
     way_from: ClassVar[str] = "obj_init"  # from where the handle's way to the target is measured
     reach_shape: ClassVar[str] = "long_tail"
+    objects, evaluate = _show, _slide
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
         host.move("window", vec)
@@ -44,32 +58,26 @@ class WindowOpen(Sawyer):
         host.data.qpos[9] = 0.0
         return {"target": vec + np.array([0.2, 0.0, 0.0]), "obj_init": vec, "window_handle_pos_init": handle}
 
-    def objects(self, at: At) -> tuple[Array, ...]:
-        return at.position[self.handle], jnp.zeros(4)
-
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
-        handle = at.position[self.handle]
-        away = abs(handle[0] - began["target"][0])
-        way = abs(began[self.way_from][0] - began["target"][0])
-        in_place = near(away, _RADIUS, abs(way - _RADIUS))
-        margin = abs(distance(began["window_handle_pos_init"], began["init_tcp"]) - 0.02)
-        reach = tolerance(distance(handle, at.tcp), 0.0, 0.02, margin, self.reach_shape)
-        return 10 * hamacher(reach, in_place), away <= _RADIUS
-
 
 @dataclasses.dataclass(frozen=True)
-class WindowClose(WindowOpen):
+class WindowClose(Sawyer):
     """Window close: slide the window to the left by its handle.
 
-    Reward and success: as WindowOpen, but the reward for reaching the handle falls as a Gaussian, and the handle's way
-        is measured from the handle.
+    Reward: 10 times the Hamacher product of the tool centre at the handle, which falls as a Gaussian, and the handle at
+        the target along x.
+    Success: the handle is within 0.05 m of the target along x.
     Start: the window at the drawn place, open by 0.2 m. The target is the window's centre.
     """
 
+    scene_file: ClassVar[str] = "sawyer_window_horizontal"
+    hand_start: ClassVar = (0.0, 0.4, 0.2)
     drawn: ClassVar = ((0.0, 0.75, 0.2), (0.0, 0.9, 0.2))
+    goal_box: ClassVar = WindowOpen.goal_box
+    watched: ClassVar = WindowOpen.watched
     handle: ClassVar[str] = "closes"
     way_from: ClassVar[str] = "window_handle_pos_init"
     reach_shape: ClassVar[str] = "gaussian"
+    objects, evaluate = _show, _slide
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
         host.move("window", vec)
