@@ -4,13 +4,12 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from mtjax.envs.family import Family
 from mtjax.types import Array
 
 
 @dataclasses.dataclass(frozen=True)
-class Choosing(Family):
-    """A family in which an agent chooses one of ``action_size`` actions."""
+class Choosing:
+    """What a family has in which an agent chooses one of ``action_size`` actions. Derive from this and ``Family``."""
 
     scores: bool = False
     """Take a score in [-1, 1] for each action, in place of the number of an action. The highest score counts, of equal

@@ -26,7 +26,7 @@ from mtjax.envs.engines.base import ENGINES, Blank, Engine, World, choose_engine
 from mtjax.envs.engines.c import MujocoC
 from mtjax.envs.engines.mjx import Mjx
 from mtjax.envs.engines.warp import Warp
-from mtjax.envs.family import draw_until
+from mtjax.envs.family import Family, draw_until
 from mtjax.envs.fields import FIXED, VARIABLE
 from mtjax.envs.pixels import Pictured
 from mtjax.envs.planar import Planar, is_planar, locate
@@ -43,7 +43,7 @@ _DECIDING = ("dof_frictionloss", "tendon_frictionloss", "opt.density", "opt.visc
 
 
 @dataclasses.dataclass(frozen=True)
-class Domain(Pictured):
+class Domain(Pictured, Family):
     """A family of tasks of one MuJoCo model. Subclasses give model, start of an episode, observation and reward."""
 
     engine: Annotated[str, tyro.conf.arg(name="engine", prefix_name=False)] = "auto"

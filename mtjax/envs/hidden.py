@@ -14,12 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from mtjax.envs.choosing import Choosing
+from mtjax.envs.family import Family
 from mtjax.envs.task_table import Table
 from mtjax.types import SPLITS, Array, InputError, Key, Step, Task
 
 
 @dataclasses.dataclass(frozen=True)
-class HiddenTasks(Choosing):
+class HiddenTasks(Choosing, Family):
     """A family of one training task, which stands for a pool of tasks: each trial draws one of them."""
 
     told: bool = False

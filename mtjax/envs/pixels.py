@@ -1,4 +1,4 @@
-"""Pictures as observations, for every family whose worlds can be drawn as a scene of MuJoCo's shapes.
+"""Families whose worlds can be drawn as a scene of MuJoCo's shapes: steps, and pictures as observations.
 
 An observation holds the newest picture alone, so that a replay keeps each picture once. Whoever needs the last few
 stacks them: rollouts for agents, a replay when it draws a batch, and ``mtjax.stacked`` for everyone else. All repeat
@@ -22,10 +22,9 @@ from mtjax.envs.painters.poses import Pose, Poses, locate
 from mtjax.envs.painters.scene import LEAVES, Scene, field, observed
 from mtjax.envs.painters.warp import WarpPainter
 from mtjax.envs.parameters import Parameter
-from mtjax.envs.stepped import Stepped
 from mtjax.frames import PICTURES, STATE
 from mtjax.names import nearest_error
-from mtjax.types import Array, InputError, Spec, Task
+from mtjax.types import Array, InputError, Spec, Step, Task
 
 STATES = ("hidden", "also")
 _LEAST, _MOST = 16, 512
@@ -43,9 +42,16 @@ class Mark(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Pictured(Stepped):
-    """A family that can be seen: its observations are pictures if ``pixels`` is set."""
+class Pictured(abc.ABC):
+    """What a family has that can be seen. Derive from this and ``Family``: ``class Mine(Pictured, Family)``.
 
+    The family says how a world moves, and what of it is observed, rewarded and drawn. Its observations are pictures if
+    ``pixels`` is set.
+    """
+
+    repeat: int = 1
+    """Take every action for so many control steps and sum their rewards. Episodes last as long as before. Agents
+    discount once for all of these steps, and success is that after the last."""
     pixels: int = 0
     """Observe pictures of so many pixels a side, such as 64 or 84, in place of the state. 0 observes the state. Then
     camera-angle [deg], hue, floor-hue, sky-hue [deg] and light (a scale) can vary: --env.vary.hue=0:300:10."""
@@ -61,6 +67,7 @@ class Pictured(Stepped):
     """What draws: caster (plain JAX, any device) or warp (MuJoCo Warp's ray tracer, NVIDIA GPUs). auto is the caster,
     which is the faster one."""
 
+    step_seconds: ClassVar[float]  # length of a control step [s]
     look: ClassVar[looks.Look | None] = None  # camera and light; None: the model's own, or a view of all of it
     meshes: ClassVar[bool] = False  # whether the scene is of meshes, which only Warp draws
     film_speed: ClassVar[float] = 1.0  # seconds of the world in a second of a film
@@ -68,6 +75,8 @@ class Pictured(Stepped):
 
     def __post_init__(self):
         super().__post_init__()
+        if self.repeat != 1 and (self.repeat < 1 or self.episode_steps % self.repeat):
+            raise self._unrepeatable()
         if self.state not in STATES:
             raise nearest_error("state", self.state, STATES)
         if self.painter not in PAINTERS:
@@ -77,6 +86,14 @@ class Pictured(Stepped):
         if not 1 <= self.frames <= _MOST_FRAMES:
             raise InputError(f"frames must be from 1 to {_MOST_FRAMES}, not {self.frames}")
         self._require_pictures()
+
+    def _unrepeatable(self) -> InputError:
+        near = [n for n in range(1, self.episode_steps + 1) if self.episode_steps % n == 0]
+        few = sorted(sorted(near, key=lambda n: abs(n - self.repeat))[:4])
+        return InputError(
+            f"repeat must divide the {self.episode_steps} steps of an episode, such as "
+            f"{', '.join(map(str, few))}; not {self.repeat}"
+        )
 
     def _require_pictures(self) -> None:
         """Refuse what only pictures show, where there are none, and a painter that cannot run here."""
@@ -99,16 +116,40 @@ class Pictured(Stepped):
     # What a family gives.
 
     @abc.abstractmethod
+    def advance(self, task: Task, state: Any, action: Array) -> Any:
+        """Return the state of a world after one control step under ``action`` (A,)."""
+
+    @abc.abstractmethod
+    def observe(self, task: Task, state: Any) -> Array:
+        """Return the observation (O,) of a world."""
+
+    @abc.abstractmethod
+    def reward(self, task: Task, state: Any, action: Array) -> Array:
+        """Return the reward () of a world after the step."""
+
+    @abc.abstractmethod
     def compile_spec(self, values: Mapping[str, float] | None = None) -> mujoco.MjSpec:
         """Return the editable model of what there is to see, with these parameter values."""
 
     # What a family may give.
 
+    def terminates(self, task: Task, state: Any) -> Array:
+        """Return whether () an episode ends in this world, with no rewards after it. By default only time ends one."""
+        return jnp.bool_(False)
+
+    def metrics(self, task: Task, state: Any, action: Array) -> dict[str, Array]:
+        """Return further numbers () of a world after the step, such as success. Evaluations report them."""
+        return {}
+
+    def judge(self, task: Task, state: Any, action: Array) -> tuple[Array, dict[str, Array]]:
+        """Return reward and metrics. A family that computes them together gives both here."""
+        return self.reward(task, state, action), self.metrics(task, state, action)
+
     def joints(self, state: Any) -> Array:
         """Return the positions (nq,) of the scene's joints. By default it has none."""
         return jnp.zeros(0)
 
-    def add_marks(self, spec: mujoco.MjSpec) -> None:
+    def add_marks(self, spec: mujoco.MjSpec) -> None:  # noqa: B027
         """Add geoms and lights to the scene that the physics does not have."""
 
     def marks(self, task: Task, state: Any) -> Mapping[str, Mark]:
@@ -127,6 +168,47 @@ class Pictured(Stepped):
     def scenic(self) -> tuple[str, ...]:
         """Return the parameters in which scenes of tasks may differ."""
         return tuple(name for name, parameter in self.every_parameter.items() if parameter.edit is not None)
+
+    # Steps.
+
+    def step(self, task: Task, state: Any, action: Array) -> Step:
+        """Advance ``repeat`` control steps under ``action`` (A,) in [-1, 1]; observation and reward are those after it.
+
+        Rewards of repeated steps are summed, up to one that terminates the episode. There the world stands still, so
+        that observation and metrics are those of its end.
+        """
+
+        def once(_, carry: tuple[Any, Array, Array]) -> tuple[Any, Array, Array]:
+            before, total, over = carry
+            moved = self.advance(task, before, action)
+            state = jax.tree.map(lambda new, old: jnp.where(over, old, new), moved, before)
+            total += jnp.where(over, 0.0, self.reward(task, state, action))
+            return state, total, over | self.terminates(task, state)
+
+        if self.repeat == 1:
+            return self.outcome(task, self.advance(task, state, action), action)
+        state, reward, over = jax.lax.fori_loop(0, self.repeat, once, (state, jnp.float32(0), jnp.bool_(False)))
+        return Step(state, self.look_at(task, state), reward, over, self.judge(task, state, action)[1])
+
+    def outcome(self, task: Task, state: Any, action: Array) -> Step:
+        """Return what a control step has led to."""
+        reward, metrics = self.judge(task, state, action)
+        return Step(state, self.look_at(task, state), reward, self.terminates(task, state), metrics)
+
+    @property
+    def ends_early(self) -> bool:
+        """Return whether the family says where episodes end."""
+        return type(self).terminates is not Pictured.terminates
+
+    @property
+    def episode_length(self) -> int:
+        """Return the steps after which an episode is cut off."""
+        return self.episode_steps // self.repeat
+
+    @property
+    def seconds_per_step(self) -> float:
+        """Return the length of a step of the environment [s]."""
+        return self.step_seconds * self.repeat
 
     # Scenes.
 
@@ -196,7 +278,7 @@ class Pictured(Stepped):
     def look_at(self, task: Task, state: Any) -> Any:
         """Return what the agent observes: the state (O,), pictures, or both."""
         if not self.pixels:
-            return super().look_at(task, state)
+            return self.observe(task, state)
         shown = {PICTURES: self.draw(task, state)}
         return shown | {STATE: self.observe(task, state)} if self.state == "also" else shown
 

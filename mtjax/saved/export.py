@@ -15,8 +15,7 @@ from mtjax.agents import BaseAgent, name_of
 from mtjax.checks import path
 from mtjax.envs import Family
 from mtjax.envs import name_of as env_name_of
-from mtjax.envs.pixels import GREY
-from mtjax.envs.stepped import Stepped
+from mtjax.envs.pixels import GREY, Pictured
 from mtjax.names import InputError, public
 from mtjax.saved import onnx
 from mtjax.saved.operations import steps_of
@@ -85,7 +84,7 @@ def _meta(env: Family, agent: BaseAgent, obs: dict[str, Any]) -> dict[str, Any]:
         "agent": name_of(agent),
         "obs": {name: x.shape for name, x in obs.items()},
         "frames": env.spec.frames,
-        "seconds": env.seconds_per_step if isinstance(env, Stepped) else None,  # between two actions
+        "seconds": env.seconds_per_step if isinstance(env, Pictured) else None,  # between two actions
         "about": " ".join(_about(env, name, x) for name, x in obs.items()),
         "action_size": env.spec.action_size,
         "discrete": env.discrete,  # whether an action is a number from 0 to action_size - 1

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import mujoco
 
 from mtjax.envs.analytic import bars
+from mtjax.envs.family import Family
 from mtjax.envs.looks import Look
 from mtjax.envs.parameters import Parameter, not_negative, positive
 from mtjax.envs.pixels import Mark, Pictured
@@ -34,7 +35,7 @@ class LinkState(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Link(Pictured):
+class Link(Pictured, Family):
     """Congestion control: send as fast as a link can carry, without a queue in its buffer.
 
     A fluid queue (Misra, Gong and Towsley 2000) in steps of a round trip, T = 2 D. With rate r [packets/s], queue q

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from mtjax.envs.analytic.tracks import Line, line_at, make_track, outline
+from mtjax.envs.family import Family
 from mtjax.envs.looks import Look
 from mtjax.envs.painters.poses import Pose
 from mtjax.envs.parameters import Parameter, positive
@@ -47,7 +48,7 @@ class CarState(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Racing(Pictured):
+class Racing(Pictured, Family):
     """Racing: drive a small car around a closed track as fast as its tyres hold.
 
     The single-track model of CommonRoad (Althoff, Koschi and Manzinger 2017) with the car of f1tenth_gym and tyres that

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from mtjax.envs.family import Family
 from mtjax.envs.looks import Look
 from mtjax.envs.parameters import Parameter, not_negative, positive
 from mtjax.envs.pixels import Mark, Pictured
@@ -42,7 +43,7 @@ class BoatState(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Sailing(Pictured):
+class Sailing(Pictured, Family):
     """Sailing: reach a mark 100 m away under sail, whether the wind comes from behind or from the mark itself.
 
     The boat of Jaulin and Le Bars (2013) with the parameters p1 to p11 of Melin, Dahl and Waller (2015). W is the wind

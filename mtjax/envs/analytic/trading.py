@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from mtjax.envs.analytic import bars
+from mtjax.envs.family import Family
 from mtjax.envs.looks import Look
 from mtjax.envs.parameters import Parameter, not_negative, positive
 from mtjax.envs.pixels import Mark, Pictured
@@ -37,7 +38,7 @@ class Market(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Trading(Pictured):
+class Trading(Pictured, Family):
     """Trading: sell a million shares within five days, at little cost and little risk (Almgren and Chriss 2001).
 
     Quick sales press the price, and slow ones leave it to chance. In step k of N = 50, of tau = 0.1 days each, n shares

@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 
 from mtjax.envs.corridors.layouts import Layout, find_ways, make_layout
+from mtjax.envs.family import Family
 from mtjax.envs.looks import Look
 from mtjax.envs.painters.grid import GridCaster
 from mtjax.envs.painters.poses import Pose
@@ -40,7 +41,7 @@ class WalkerState(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class CorridorMaze(Pictured):
+class CorridorMaze(Pictured, Family):
     """Corridor maze: find the ball of the goal's colour among three, seeing only what is ahead.
 
     Observation (4,): x and y of the walker, from -1 to 1 across the maze; cosine and sine of its heading. With

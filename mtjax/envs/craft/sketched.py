@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mtjax.envs.choosing import Choosing
+from mtjax.envs.family import Family
 from mtjax.envs.pixels import Pictured
 from mtjax.envs.variation import Variation
 from mtjax.types import Array, InputError, Key, Spec, Step, Task
@@ -28,7 +29,7 @@ class Followed(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Sketched(Pictured, Choosing):
+class Sketched(Pictured, Choosing, Family):
     """A family whose tasks have sketches (Andreas et al. 2017).
 
     A sketch is a sequence of symbols, such as get-wood and make-at-0 for a plank. It tells what the parts of a task are

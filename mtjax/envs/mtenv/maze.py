@@ -13,7 +13,7 @@ import numpy as np
 
 from mtjax import frames
 from mtjax.envs.choosing import Choosing
-from mtjax.envs.family import draw_until
+from mtjax.envs.family import Family, draw_until
 from mtjax.envs.looks import Look
 from mtjax.envs.parameters import Parameter
 from mtjax.envs.pixels import Mark, Pictured
@@ -54,7 +54,7 @@ class MazeState(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class TwoGoalMaze(Pictured, Choosing):
+class TwoGoalMaze(Pictured, Choosing, Family):
     """Two-goal maze: walk to the box that the task names, and keep away from the other one.
 
     Observation (4,): x (to the east) and z (to the south) of the walker, each as 0.7 x - 1; its heading [rad] as

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mtjax.envs.choosing import Choosing
+from mtjax.envs.family import Family
 from mtjax.envs.parameters import Parameter
 from mtjax.envs.task_table import Table
 from mtjax.types import SPLITS, Array, InputError, Key, Step, Task
@@ -20,7 +21,7 @@ _MOST_HELD_OUT = 10
 
 
 @dataclasses.dataclass(frozen=True)
-class DrawnTasks(Choosing):
+class DrawnTasks(Choosing, Family):
     """A family whose tasks are random tables of numbers in [0, 1]. The context holds them, scaled to [-1, 1].
 
     Task number i of a split depends on ``task_seed`` and i alone, so that more tasks keep the first ones. The split
