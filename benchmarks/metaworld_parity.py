@@ -175,7 +175,7 @@ def play(names: list[str], engine: str, goals: int, player: Player) -> list[tupl
     start = jax.jit(env.reset_worlds)(each, keys)
     nothing = jnp.zeros((1, len(names), goals, 4))
     lowered = jax.jit(env.step_worlds, donate_argnums=1).lower(each, start.state, nothing)  # in place: recorded once
-    env.load_kernels()
+    env.calls.load_kernels()
     step = lowered.compile()
     state, obs, found = jax.tree.map(jnp.copy, start.state), np.asarray(start.obs), []
     for i in range(env.episode_length):

@@ -53,7 +53,7 @@ def physics(env: Any, worlds_per_task: int, steps: int, resets: bool) -> Any:
 
     held = [jax.tree.map(jnp.copy, jax.jit(begin)(tasks))]  # some of its arrays are one, which cannot be donated twice
     lowered = jax.jit(lambda carry: jax.lax.scan(step, carry, length=steps), donate_argnums=0).lower(held[0])
-    env.load_kernels()
+    env.calls.load_kernels()
     program = lowered.compile()
 
     def run() -> Any:

@@ -30,7 +30,7 @@ from resumable import train
 from mtjax.agents.choices import replace
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import configure, with_preset
-from mtjax.envs.task_table import Tabled
+from mtjax.envs.mixtures import Tabled
 from mtjax.evaluation import Episodes, evaluate, save_evaluations
 from mtjax.names import replacing
 from mtjax.report.stats import seed_interval

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from mtjax.agents import BaseAgent
 from mtjax.compiling.programs import compile_lowered, jit_programs
-from mtjax.envs.task_table import Tabled
+from mtjax.envs.mixtures import Tabled
 from mtjax.loop import Settings
 from mtjax.parallel import mesh as meshes
 

@@ -92,43 +92,32 @@ def where_worlds(mask: Array, new: Any, old: Any) -> Any:
     return jax.tree.map(choose, new, old)
 
 
-class Flat:
-    """Provides the methods of all worlds (S, T, E, ...) for environments with ``reset`` and ``step`` of one world."""
+# Methods of all worlds (S, T, E, ...), for environments with ``reset`` and ``step`` of one world.
 
-    @property
-    def ends_early(self) -> bool:
-        """Return whether episodes may end before their time limits. It decides how resets are computed, not what."""
-        return True
 
-    @property
-    def resets_few(self) -> bool:
-        """Return whether only ended worlds are reset, some at a time, where an episode ends."""
-        return self.ends_early and self.episode_length > 1  # type: ignore
+def reset_worlds(self: Any, tasks: Task, keys: Key) -> Step:
+    """Begin an episode in every world."""
+    return over_worlds(partial(_reset, self))(tasks, keys)
 
-    def reset_worlds(self, tasks: Task, keys: Key) -> Step:
-        """Begin an episode in every world."""
-        return over_worlds(partial(_reset, self))(tasks, keys)
 
-    def renew_worlds(self, tasks: Task, keys: Key, mask: Array, states: Any) -> Step:
-        """Begin an episode in the worlds of ``mask`` (S, T, E); only their observations count.
+def renew_worlds(self: Any, tasks: Task, keys: Key, mask: Array, states: Any) -> Step:
+    """Begin an episode in the worlds of ``mask`` (S, T, E); only their observations count.
 
-        Returns:
-            the step that begins their episodes, with the states of all worlds.
-        """
-        begun = self.reset_worlds(tasks, keys)
-        return begun._replace(state=self.where_worlds(mask, begun.state, states))
+    Returns:
+        the step that begins their episodes, with the states of all worlds.
+    """
+    begun = self.reset_worlds(tasks, keys)
+    return begun._replace(state=where_worlds(mask, begun.state, states))
 
-    def step_worlds(self, tasks: Task, states: Any, actions: Array) -> Step:
-        """Step every world with its action (S, T, E, A)."""
-        return over_worlds(partial(_step, self))(tasks, states, actions)
 
-    def observe_worlds(self, tasks: Task, states: Any) -> Any:
-        """Return what agents observe of every world, for families with ``observe(task, state)`` of one world."""
-        return over_worlds(self.observe)(tasks, states)  # type: ignore
+def step_worlds(self: Any, tasks: Task, states: Any, actions: Array) -> Step:
+    """Step every world with its action (S, T, E, A)."""
+    return over_worlds(partial(_step, self))(tasks, states, actions)
 
-    def where_worlds(self, mask: Array, new: Any, old: Any) -> Any:
-        """Select states of ``new`` where ``mask`` (S, T, E), else of ``old``."""
-        return where_worlds(mask, new, old)
+
+def observe_worlds(self: Any, tasks: Task, states: Any) -> Any:
+    """Return what agents observe of every world, for families with ``observe(task, state)`` of one world."""
+    return over_worlds(self.observe)(tasks, states)
 
 
 @partial(jax.jit, static_argnums=0)  # tracing physics takes seconds: do it once for all programs

@@ -24,7 +24,7 @@ from mtjax.agents.swept import agents_at
 from mtjax.checks import MOST_EPISODES, check_fields, path, require_library, require_text
 from mtjax.envs import make
 from mtjax.envs import name_of as env_name_of
-from mtjax.envs.task_table import Tabled
+from mtjax.envs.mixtures import Tabled
 from mtjax.experience import Replay
 from mtjax.frames import shown
 from mtjax.loop import Settings, require_curriculum, require_trials
@@ -135,9 +135,7 @@ class RunConfig:
     """Print the families and agents, then stop."""
     plan: Annotated[Plan, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Plan)
     training: Annotated[Settings, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Settings)
-    family: Annotated[Tabled, tyro.conf.arg(name="env")] = dataclasses.field(
-        default_factory=lambda: make("finger-spin")
-    )
+    family: Annotated[Any, tyro.conf.arg(name="env")] = dataclasses.field(default_factory=lambda: make("finger-spin"))
     learner: Annotated[BaseAgent, tyro.conf.arg(name="agent")] = dataclasses.field(default_factory=lambda: agent("sac"))
 
     def __post_init__(self):
@@ -250,7 +248,7 @@ class RunConfig:
         if not self.runs:  # Path("") would be the working directory
             raise InputError("--runs needs a folder; that of the command is --runs=.")
         path(self.runs, "--runs")
-        _ = family.engine_name, family.table, family.targets()  # its engine refuses a model that it cannot run
+        _ = family.engine_name, family.table, family.calls.targets()  # its engine refuses a model that it cannot run
         combinations.require_sight(learner, family.spec)
         if preset_of(self.agent).sees_pictures and not shown(family.spec.obs):
             raise InputError(

@@ -18,7 +18,7 @@ from mtjax.agents.consolidating import consolidate, consolidates
 from mtjax.agents.fit import reset_networks
 from mtjax.agents.state import of_tasks, with_tasks
 from mtjax.agents.swept import at_point, with_numbers
-from mtjax.axes import Flat, over_seeds, when
+from mtjax.axes import over_seeds, when
 from mtjax.checks import check_fields
 from mtjax.parallel import collectives
 from mtjax.rollout import (
@@ -165,7 +165,7 @@ def require_curriculum(settings: Settings, env: Any, agent: Any) -> None:
         raise InputError(f"{told} begins a replay anew; use --reset-every=0 and --host-replay-size=0")
     if experience.adaptations:
         raise InputError(f"{told} changes tasks, and this agent adapts to all that it knows; leave it out")
-    if not isinstance(env, Flat):
+    if env.tasks("train").blocks is not None:
         raise InputError(f"{told} is for single families, whose tasks share one physics, and not for mixtures")
     rule = getattr(agent, "gradients", None)
     if rule is not None and jax.tree.leaves(rule.init(2)):
@@ -201,13 +201,13 @@ def _require_repeatable(trials: int, agent: Any) -> None:
 
 def _cannot_go_on(env: Any) -> str:
     """Return why worlds cannot go on where an episode's time is up, with the next one's task; empty if they can."""
-    if not isinstance(env, Flat):
+    tasks = env.tasks("train")
+    if tasks.blocks is not None:
         return "it is for single families, not for mixtures"
-    if env.ends_early:
+    if getattr(env, "ends_early", True):
         return "in this family episodes terminate"
     if getattr(env, "fresh_goals", False):
         return "this family draws its goals with its states"
-    tasks = env.tasks("train")
     if tasks.draws is None:
         return ""
     goals = getattr(env, "relabels", ())

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from mtjax import frames
 from mtjax.agents.swept import at_point
-from mtjax.axes import Flat, over_learners, where_worlds
+from mtjax.axes import over_learners, renew_worlds, where_worlds
 from mtjax.parallel import collectives
 from mtjax.tasks import contexts_vary, episode_task
 from mtjax.trials import EACH_EPISODE, Ends, Trials
@@ -212,7 +212,8 @@ def reset_ended(
         ends: what has ended with the step before, leaves (S, T, E).
         keys: a function that returns keys (S, T, E); only the branch calls it.
     """
-    few = isinstance(env, Flat) and env.resets_few and tasks.blocks is None
+    own = type(env).renew_worlds is not renew_worlds  # as it steps all of its worlds at once
+    few = not own and getattr(env, "ends_early", True) and env.episode_length > 1
     begin = _change_tasks if trials.keeps_state else _reset_some if few else _reset_all
 
     def renew(worlds: Worlds) -> Worlds:

@@ -215,7 +215,7 @@ class Env(Protocol):
     """An environment is a family of tasks. It is frozen and hashable, so that it is static under ``jit``.
 
     A family implements ``reset`` and ``step`` for one world. The methods that end in ``worlds`` are for all worlds at
-    once, leaves (S, T, E, ...); ``mtjax.axes.Flat`` derives them by mapping the former over one flat batch.
+    once, leaves (S, T, E, ...); those of ``mtjax.axes`` map the former over one flat batch.
     """
 
     @property

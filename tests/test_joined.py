@@ -65,10 +65,10 @@ def test_families_of_one_structure_share_a_simulator():
     assert members(env) == [["pendulum-swingup", "pendulum-spin"], ["acrobot-swingup"]]
     assert [type(group) for group in env.groups] == [Joined, Alone]
     require_as_alone(env)
-    calls = {name: about for name, about in env.targets().items() if name.startswith("mujoco_advance")}
+    calls = {name: about for name, about in env.calls.targets().items() if name.startswith("mujoco_advance")}
     assert len(calls) == 2 + 2  # the mixture's, and those of joined families alone
     again = mtjax.mixture([*families, mtjax.make("acrobot-swingup", engine="c")])
-    assert all(again.provide(*about) == name for name, about in calls.items())  # as another process does
+    assert all(again.calls.provide(*about) == name for name, about in calls.items())  # as another process does
 
 
 def test_starts_of_one_structure_are_solved_for_together():

@@ -309,7 +309,7 @@ def test_warp_draws_what_the_caster_draws(name):
     ours, theirs = (np.asarray(jax.jit(jax.vmap(jax.vmap(e.draw, (None, 0))))(e.tasks(), states)) for e in (env, other))
     for i in np.ndindex(2, 2):
         assert similarity(ours[i], theirs[i]) > 0.95
-    assert [1, 4] in other.targets().values()  # one batch of all worlds
+    assert [1, 4] in other.calls.targets().values()  # one batch of all worlds
 
 
 @pytest.mark.slow

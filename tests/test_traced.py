@@ -20,6 +20,7 @@ import pytest
 import mtjax
 from mtjax.compiling import programs, trace_cache
 from mtjax.envs.mixtures import Blocks, States
+from mtjax.envs.task_table import Outside
 
 # Runs a command and says, as the last line of its output, how often the steps of programs were traced.
 SCRIPT = """
@@ -59,7 +60,7 @@ class Settings:
     file: str = ""
 
 
-INSIDE = types.SimpleNamespace(targets=dict)  # an environment that makes no calls out of XLA
+INSIDE = types.SimpleNamespace(calls=Outside(()))  # an environment that makes no calls out of XLA
 
 
 @pytest.fixture
@@ -196,12 +197,12 @@ def test_a_program_with_calls_out_of_xla_runs_where_they_have_the_same_names(fol
     kept = lambda: trace_cache.trace(env, program, (), (env, "agent", None), given).lower().compile()(*given)
     first = kept()
     jax.clear_caches()
-    assert list(env.targets().values()) == [[0, "advance"]] and same(first, kept()) and len(count) == 1
+    assert list(env.calls.targets().values()) == [[0, "advance"]] and same(first, kept()) and len(count) == 1
     jax.clear_caches()
     again = lambda: trace_cache.trace(other, program, (), (other, "agent", None), given).lower().compile()(*given)
     assert same(first, again()) and len(count) == 1
     jax.clear_caches()
-    monkeypatch.setattr(type(other), "provide", lambda *_: "another")
+    monkeypatch.setattr(Outside, "provide", lambda *_: "another")
     assert same(first, again()) and len(count) == 2
 
 

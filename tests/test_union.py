@@ -207,9 +207,10 @@ def test_held_out_tasks_step_in_the_union_as_alone():
     env = make(*names, held_out=held_out, scenes="union")
     assert [type(group) for group in env.groups] == [United]
     require_as_alone(env, "extrapolation", atol=ATOL)
-    calls = {name: about for name, about in env.targets().items() if name.startswith("mujoco_advance")}
+    calls = {name: about for name, about in env.calls.targets().items() if name.startswith("mujoco_advance")}
     again = make(*names, held_out=held_out, scenes="union")
-    assert calls and all(again.provide(*about) == name for name, about in calls.items())  # as another process does
+    provided = {name: again.calls.provide(*about) for name, about in calls.items()}  # as another process does
+    assert calls and all(name == found for name, found in provided.items())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -261,7 +262,7 @@ def test_episodes_begin_anew_in_the_union_as_in_joined_scenes(steps=4, worlds=3)
 def test_the_union_steps_on_warp_as_joined_scenes_do():
     """By default there. Warp solves to less than C does, so a thing that slips is 1e-5 m off."""
     env = mtjax.make("mt10", num_draws=2, engine="warp")
-    assert [type(group) for group in env.groups] == [United] and env.groups[0].outside in env._outside
+    assert [type(group) for group in env.groups] == [United] and env.groups[0].outside in env.calls.makers
     own, found = (played(mixture, "train") for mixture in (dataclasses.replace(env, scenes="joined"), env))
     np.testing.assert_allclose(found[0], own[0], atol=1e-4)
     np.testing.assert_allclose(found[1], own[1], atol=1e-2)

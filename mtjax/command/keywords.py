@@ -13,7 +13,7 @@ from mtjax.checks import shown
 from mtjax.config import Plan, RunConfig, configure, fit_length, own_files, with_preset
 from mtjax.envs import make_from
 from mtjax.envs.family import Family
-from mtjax.envs.task_table import Tabled
+from mtjax.envs.mixtures import Tabled
 from mtjax.loop import Settings
 from mtjax.names import InputError
 from mtjax.saved.policy import Policy

@@ -10,7 +10,7 @@ import jax
 from jax.sharding import Mesh, NamedSharding
 
 from mtjax.compiling import trace_cache
-from mtjax.envs.task_table import Tabled
+from mtjax.envs.mixtures import Tabled
 from mtjax.evaluation import evaluate
 from mtjax.loop import TrainState, init, run_chunk
 from mtjax.parallel.mesh import BY_SEED, BY_WORLD, REPLICATED
@@ -91,7 +91,7 @@ def load_kernels(env: Any) -> bool:
     Returns:
         whether XLA must compile nothing while programs first run.
     """
-    return isinstance(env, Tabled) and env.load_kernels()
+    return isinstance(env, Tabled) and env.calls.load_kernels()
 
 
 def sharded_shapes(mesh: Mesh | None, agent: Agent, shapes: TrainState) -> TrainState:

@@ -10,7 +10,7 @@ Programs are traced as ever where this hash could miss something or where a prog
 - the process has imported a file that is neither of this package nor installed, such as a user's own family;
 - the package's files or the installed packages changed after the process began;
 - a program holds an address of this process, as those of ``jax.pure_callback`` do. Engines outside XLA are called by
-  names instead (``Tabled.targets``);
+  names instead (``Outside.targets``);
 - several devices share the program.
 
 A file holds StableHLO, and in JSON the containers of the program's result. Python runs nothing of it. A checksum tells
@@ -65,7 +65,7 @@ def trace(env: Any, program: Any, donated: tuple[int, ...], static: tuple, argum
     """Trace a jitted program, or read it from the cache if it was traced before.
 
     Args:
-        env: the environment, which makes calls out of XLA in this process (``Tabled.provide``).
+        env: the environment, which makes calls out of XLA in this process (``Outside.provide``).
         donated: which of ``arguments`` the program donates.
         static: its static arguments, which come first.
         arguments: arrays or shapes.
@@ -74,7 +74,7 @@ def trace(env: Any, program: Any, donated: tuple[int, ...], static: tuple, argum
         file = _file_of(program, static, arguments)
         kept = _read(file) or _export(file, env, program, static, arguments)
         for name, about in kept.targets.items():
-            if env.provide(*about) != name:
+            if env.calls.provide(*about) != name:
                 raise Unkept(f"this process has another {name}")
     except (Unkept, OSError):
         return program.trace(*static, *arguments)
@@ -178,7 +178,7 @@ def _export(file: Path, env: Any, program: Any, static: tuple, arguments: tuple)
     leaves, tree = jax.tree.flatten(arguments)
     result = jax.tree.structure(traced.out_info)
     flat = jax.jit(lambda *leaves: jax.tree.leaves(program(*static, *jax.tree.unflatten(tree, leaves))))
-    targets = env.targets()
+    targets = env.calls.targets()
     checks = [export.DisabledSafetyCheck.custom_call(name) for name in targets]
     try:
         exported = export.export(flat, disabled_checks=checks)(*leaves).serialize()

@@ -13,11 +13,11 @@ import jax
 import numpy as np
 import tyro
 
-from mtjax.axes import Flat
+from mtjax import axes
 from mtjax.checks import require_values
 from mtjax.envs import variation
 from mtjax.envs.parameters import Parameter
-from mtjax.envs.task_table import Part, Table, Tabled
+from mtjax.envs.task_table import Outside, Part, Table, fields_alone, numbers, params
 from mtjax.names import first_sentence
 from mtjax.types import SPLITS, Array, Continuous, Discrete, InputError, Key, Spec, Step, Task, Transition
 
@@ -26,7 +26,7 @@ Values = Mapping[str, np.ndarray]  # parameter -> (R,) its value in every row
 
 
 @dataclasses.dataclass(frozen=True)
-class Family(Flat, Tabled):
+class Family(abc.ABC):
     """A family of tasks that differ in named parameters. Subclasses give parameters, ``reset`` and ``step``."""
 
     vary: Annotated[Any, tyro.conf.Suppress] = ()
@@ -130,10 +130,21 @@ class Family(Flat, Tabled):
             parts.append(np.concatenate(list(found.draws)))
         return dict(zip(found.names, np.concatenate(parts).T, strict=True))
 
+    __getstate__, numbers, params = fields_alone, numbers, params
+
     @property
     def counts(self) -> dict[str, int]:
         """Return the number of tasks of each split."""
         return {split: len(rows) for split, rows in self.variation.rows.items()}
+
+    @property
+    def train_count(self) -> int:
+        """Return the number of training tasks."""
+        return self.counts["train"]
+
+    def tasks(self, split: str = "train") -> Task:
+        """Return the tasks of a split: "train", "interpolation", "extrapolation", or "all" in this order."""
+        return self.table.of(split)
 
     @cached_property
     def count(self) -> int:
@@ -242,6 +253,11 @@ class Family(Flat, Tabled):
             told.append(f"{name.replace('-', ' ')} {number}" + f" {parameter.unit}" * (parameter.unit != "1"))
         return f"{self.instruction.removesuffix('.')}, with {' and '.join(told)}."
 
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """Return what the tasks of all splits ask for, in the order of their numbers."""
+        return tuple(self.sentence(row) for split in SPLITS for row in self.table.rows[split].tolist())
+
     def labels(self, split: str) -> list[str]:
         """Return a short name for every task of a split: its ``task_values``."""
         tell = self.every_parameter[self.varied[0]].tell if len(self.varied) == 1 else Parameter("", 0.0).tell
@@ -311,9 +327,19 @@ class Family(Flat, Tabled):
         return None
 
     @property
+    def calls(self) -> Outside:
+        """Return what makes calls out of XLA in its programs."""
+        return Outside((self.outside, self.outside_painter))
+
+    @property
     def episode_length(self) -> int:
         """Return the steps after which an episode is cut off."""
         return self.episode_steps
+
+    @property
+    def ends_early(self) -> bool:
+        """Return whether episodes may end before their time limits. It decides how resets are computed, not what."""
+        return True
 
     @property
     def action(self) -> Continuous | Discrete:
@@ -330,6 +356,11 @@ class Family(Flat, Tabled):
         task = jax.tree.map(lambda x: x[0], self.table.tasks)
         step = jax.eval_shape(self.reset, task, jax.eval_shape(jax.random.key, 0))
         return Spec(step.obs, self.action, task.context.shape[0], sentences=self.sentences)
+
+    # All worlds, leaves (S, T, E, ...).
+
+    reset_worlds, step_worlds, renew_worlds = axes.reset_worlds, axes.step_worlds, axes.renew_worlds
+    observe_worlds, where_worlds = axes.observe_worlds, staticmethod(axes.where_worlds)
 
 
 def draw_until(accepted: Callable[[Any], Array], draw: Callable[[Key], Any], key: Key) -> Any:

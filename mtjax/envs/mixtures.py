@@ -20,7 +20,7 @@ from mtjax import frames
 from mtjax.envs.family import Family
 from mtjax.envs.shared_simulator import take
 from mtjax.envs.simulator_groups import SCENES, Group, grouped
-from mtjax.envs.task_table import Part, Table, Tabled
+from mtjax.envs.task_table import Outside, Part, Table, fields_alone, numbers, params
 from mtjax.names import nearest_error
 from mtjax.types import SPLITS, Array, InputError, Key, Spec, Step, Task
 
@@ -83,7 +83,7 @@ class States(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Mixture(Tabled):
+class Mixture:
     """An environment with the tasks of several families, from ``mtjax.mixture`` or ``mtjax.make("NAME+NAME")``.
 
     Observation (O,): the family's own, padded with zeros to that of the widest family. One of several arrays is joined
@@ -121,10 +121,17 @@ class Mixture(Tabled):
 
     # Tasks.
 
+    __getstate__, numbers, params = fields_alone, numbers, params
+
     @property
     def counts(self) -> dict[str, int]:
         """Return the number of tasks of each split."""
         return {split: sum(family.counts[split] for family in self.families) for split in SPLITS}
+
+    @property
+    def train_count(self) -> int:
+        """Return the number of training tasks."""
+        return self.counts["train"]
 
     @cached_property
     def table(self) -> Table:
@@ -198,8 +205,8 @@ class Mixture(Tabled):
         return rows
 
     def tasks(self, split: str = "train") -> Task:
-        tasks = super().tasks(split)
-        return tasks._replace(blocks=self._blocks[split])
+        """Return the tasks of a split: "train", "interpolation", "extrapolation", or "all" in this order."""
+        return self.table.of(split)._replace(blocks=self._blocks[split])
 
     @cached_property
     def _blocks(self) -> dict[str, Blocks]:
@@ -388,9 +395,10 @@ class Mixture(Tabled):
         return tuple(found)
 
     @property
-    def _outside(self) -> list[Any]:
-        own = super()._outside
-        return own + [group.outside for group in self.groups if group.outside not in own]
+    def calls(self) -> Outside:
+        """Return what makes calls out of XLA in its programs: the engines, the painters, and groups' own engines."""
+        own = [f.outside for f in self.families] + [f.outside_painter for f in self.families]
+        return Outside((*own, *(group.outside for group in self.groups if group.outside not in own)))
 
     def apart(self, states: States) -> tuple[Any, ...]:
         """Return the states of each part."""
@@ -453,6 +461,10 @@ class Mixture(Tabled):
             f"{count} training task{'s' * (count > 1)} of {many} famil{'ies' if many > 1 else 'y'}: {kinds}; "
             f"split {splits}, engine {self.engine_name}"
         )
+
+
+Tabled = Family | Mixture
+"""Environments with a table of tasks. Configurations, reports and films use them."""
 
 
 def require_family(env: Any, reason: str) -> None:

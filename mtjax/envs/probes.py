@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.axes import Flat
+from mtjax import axes
 from mtjax.types import Array, Key, Spec, Step, Task
 
 AFTER = 5.0
@@ -92,7 +92,7 @@ def tasks_of(kind: str, scales=(1.0, -0.5), horizon: int = LIMIT) -> Task:
 
 
 @dataclasses.dataclass(frozen=True)
-class Probe(Flat):
+class Probe:
     """An environment that is any of the probes, by the task's ``kind``."""
 
     kind: str = "one-step"
@@ -116,6 +116,9 @@ class Probe(Flat):
         reward, obs, terminated = self.rules(task, state, action[0])
         obs = jnp.reshape(jnp.float32(obs), 1)
         return Step(World(obs, state.age + 1), obs, jnp.float32(reward), jnp.bool_(terminated))
+
+    reset_worlds, step_worlds, renew_worlds = axes.reset_worlds, axes.step_worlds, axes.renew_worlds
+    observe_worlds, where_worlds = axes.observe_worlds, staticmethod(axes.where_worlds)
 
     def start(self, task: Task, key: Key) -> Array:
         sign = jnp.where(jax.random.bernoulli(key, shape=(1,)), 1.0, -1.0)

@@ -3,8 +3,7 @@
 import dataclasses
 from typing import Any, NamedTuple
 
-from mtjax import frames
-from mtjax.axes import Flat
+from mtjax import axes, frames
 from mtjax.envs.mixtures import require_family
 from mtjax.envs.pixels import Pictured
 from mtjax.names import public
@@ -19,7 +18,7 @@ class Remembered(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Stacked(Flat):
+class Stacked:
     """A family with pictures, each observation of which holds the last ``family.frames``: (H, W, N C), newest last.
 
     ``reset`` and ``step`` are as the family's. Its state holds the pictures before the newest.
@@ -60,6 +59,9 @@ class Stacked(Flat):
         """Advance one step under ``action`` (A,)."""
         step = self.family.step(task, state.world, action)
         return self._show(step, frames.push(state.seen, step.obs))
+
+    reset_worlds, step_worlds, renew_worlds = axes.reset_worlds, axes.step_worlds, axes.renew_worlds
+    observe_worlds, where_worlds = axes.observe_worlds, staticmethod(axes.where_worlds)
 
     def _show(self, step: Step, seen: Any) -> Step:
         return step._replace(obs=seen, state=Remembered(step.state, seen))

@@ -14,8 +14,9 @@ from PIL import Image, ImageDraw, ImageFont
 
 from mtjax.checks import amount
 from mtjax.envs.engines import host
+from mtjax.envs.mixtures import Tabled
 from mtjax.envs.pixels import Pictured
-from mtjax.envs.task_table import Part, Tabled
+from mtjax.envs.task_table import Part
 from mtjax.evaluation import Recording, record
 from mtjax.names import InputError
 from mtjax.report import render

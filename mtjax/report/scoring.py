@@ -17,7 +17,7 @@ from mtjax.checks import amount, path, require_episodes
 from mtjax.compiling.programs import compile_lowered, enable_compile_cache, trace
 from mtjax.envs import Family
 from mtjax.envs.engines import host
-from mtjax.envs.task_table import Tabled
+from mtjax.envs.mixtures import Tabled
 from mtjax.evaluation import Scores, of_tasks
 from mtjax.names import nearest_error, public
 from mtjax.report import diagnostics, figures, films

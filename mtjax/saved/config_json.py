@@ -19,8 +19,7 @@ from mtjax.checks import require_run, require_values
 from mtjax.config import Plan, RunConfig
 from mtjax.envs import ENVS, is_mixture, make
 from mtjax.envs.family import Family
-from mtjax.envs.mixtures import Mixture
-from mtjax.envs.task_table import Tabled
+from mtjax.envs.mixtures import Mixture, Tabled
 from mtjax.loop import Settings
 from mtjax.names import is_imported, replacing
 from mtjax.types import InputError

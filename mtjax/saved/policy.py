@@ -18,7 +18,7 @@ from mtjax.compiling.programs import trace
 from mtjax.config import RunConfig
 from mtjax.envs import name_of as env_name_of
 from mtjax.envs.family import Family
-from mtjax.envs.task_table import Tabled
+from mtjax.envs.mixtures import Tabled
 from mtjax.experience import Replay
 from mtjax.experience.ring import Ring
 from mtjax.names import public

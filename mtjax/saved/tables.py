@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from mtjax.agents.swept import Point
-from mtjax.envs.task_table import Tabled
+from mtjax.envs.mixtures import Tabled
 from mtjax.evaluation import Evaluations
 from mtjax.names import InputError
 

@@ -60,7 +60,8 @@ def _introduction(config: RunConfig, hooks: Hooks) -> list[str]:
     lines += [] if hooks.directory is None else [f"run: {hooks.directory}"]
     if hooks.resume and "warp" in config.family.engine_name:
         lines.append("MuJoCo Warp does not repeat bit for bit: the run goes on from its state, in other numbers")
-    if hooks.resume and (forgetful := config.family.forgetful):
+    forgetful = ", ".join(part.family.name for part in config.family.parts if part.family.forgets)
+    if hooks.resume and forgetful:
         lines.append(f"worlds of {forgetful} cannot be saved: new episodes begin, and the run goes on in other numbers")
     if jax.default_backend() == "cpu":
         lines += [_warning(family, agent) for family, agent in slow_on_cpu(config).items() if agent != config.agent]

@@ -170,11 +170,6 @@ class Hosted(Family):
         """Return the sizes of observation, action and context, and how many pictures agents should see at once."""
         return self._spec._replace(frames=self.frames) if self.pixels else self._spec
 
-    @property
-    def resets_few(self) -> bool:
-        """Return False: ``renew_worlds`` resets those that have ended, and no others."""
-        return False
-
     # Worlds, leaves (S, T, E, ...).
 
     def reset_worlds(self, tasks: Task, keys: Key) -> Step:
