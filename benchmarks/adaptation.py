@@ -33,11 +33,11 @@ from parts import add_flags, is_part, require_all, whole
 from report import markdown, run_main
 
 import mtjax
-from mtjax.evaluation import Evaluations
+from mtjax.learning.evaluation import Evaluations
+from mtjax.learning.trials import require_whole
 from mtjax.names import InputError
 from mtjax.report import figures
 from mtjax.report.stats import seed_interval
-from mtjax.trials import require_whole
 from mtjax.types import SPLITS
 
 FAMILIES = (

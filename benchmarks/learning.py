@@ -54,8 +54,8 @@ from returns import value
 import mtjax
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import RunConfig, configure
-from mtjax.evaluation import Evaluations, load_evaluations, save_evaluations
 from mtjax.experience.replay import Replay
+from mtjax.learning.evaluation import Evaluations, load_evaluations, save_evaluations
 from mtjax.report import figures as plot
 from mtjax.report.stats import (
     Interval,

@@ -31,7 +31,7 @@ from report import markdown, record
 import mtjax
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.envs.mixtures import States
-from mtjax.rollout import broadcast_tasks
+from mtjax.learning.rollout import broadcast_tasks
 
 TASKS = (
     "cartpole-swingup",

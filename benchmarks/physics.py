@@ -7,8 +7,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mtjax.loop import PHASES
-from mtjax.rollout import reset_ended, reset_envs, split_keys, step_envs, world_keys
+from mtjax.learning.loop import PHASES
+from mtjax.learning.rollout import reset_ended, reset_envs, split_keys, step_envs, world_keys
 from mtjax.types import Acted
 
 

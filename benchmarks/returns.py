@@ -31,7 +31,7 @@ from mtjax.agents.choices import replace
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import configure, with_preset
 from mtjax.envs.mixtures import Tabled
-from mtjax.evaluation import Episodes, evaluate, save_evaluations
+from mtjax.learning.evaluation import Episodes, evaluate, save_evaluations
 from mtjax.names import replacing
 from mtjax.report.stats import seed_interval
 from mtjax.saved.result import Result

@@ -30,7 +30,7 @@ from training import Training
 
 import mtjax
 from mtjax.envs import Domain
-from mtjax.rollout import broadcast_tasks
+from mtjax.learning.rollout import broadcast_tasks
 from mtjax.types import InputError
 
 # Ours (with ten values of a physical parameter), and Playground's of the same task.

@@ -37,7 +37,7 @@ from parts import add_flags, is_part, require_all
 from report import markdown, run_main, write_lines
 
 import mtjax
-from mtjax.evaluation import Evaluations
+from mtjax.learning.evaluation import Evaluations
 from mtjax.report.stats import seed_interval, unpaired_difference
 from mtjax.types import SPLITS, Env
 

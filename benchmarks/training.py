@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from mtjax.agents import BaseAgent
 from mtjax.compiling.programs import compile_lowered, jit_programs
 from mtjax.envs.mixtures import Tabled
-from mtjax.loop import Settings
+from mtjax.learning.loop import Settings
 from mtjax.parallel import mesh as meshes
 
 

@@ -22,8 +22,8 @@ from report import markdown, publish, run_main
 
 import mtjax
 from mtjax import frames
-from mtjax.axes import over_seeds
 from mtjax.experience.replay import Replay
+from mtjax.parallel.axes import over_seeds
 from mtjax.types import Spec, Task, Transition
 
 SPEC = Spec.vector(obs_size=9, action_size=2, context_size=1)

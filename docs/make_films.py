@@ -21,7 +21,7 @@ from PIL import Image
 import mtjax
 from mtjax.envs import name_of
 from mtjax.envs.pixels import Pictured
-from mtjax.evaluation import record
+from mtjax.learning.evaluation import record
 from mtjax.report import render
 from mtjax.saved import pretrained
 from mtjax.saved.policy import Policy

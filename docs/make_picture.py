@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from PIL import Image, ImageDraw
 
 import mtjax
-from mtjax.evaluation import record
+from mtjax.learning.evaluation import record
 from mtjax.report import render
 from mtjax.saved.policy import Policy
 

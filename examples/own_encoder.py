@@ -10,8 +10,8 @@ import flax.linen as nn
 import jax.numpy as jnp
 
 import mtjax
+from mtjax.agents.networks import MLP
 from mtjax.agents.parts.encoders import Encoder
-from mtjax.networks import MLP
 
 
 class GatedTrunk(nn.Module):

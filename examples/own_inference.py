@@ -9,8 +9,8 @@ import dataclasses
 import jax.numpy as jnp
 
 import mtjax
+from mtjax.agents.networks import Params
 from mtjax.agents.parts.knowing.recurrent import Remembering
-from mtjax.networks import Params
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:  # for editors, which do not run __getattr__
     from mtjax.envs import mixture as mixture
     from mtjax.envs import stacked as stacked
     from mtjax.envs.hosted.gymnasium import hosted as hosted
-    from mtjax.loop import Settings as Settings
+    from mtjax.learning.loop import Settings as Settings
     from mtjax.names import InputError as InputError
     from mtjax.report.collect import runs as runs
     from mtjax.report.drawing import plot as plot
@@ -36,7 +36,7 @@ _HOME = {
     "ENVS": "mtjax.envs",
     "InputError": "mtjax.names",
     "Result": "mtjax.saved.result",
-    "Settings": "mtjax.loop",
+    "Settings": "mtjax.learning.loop",
     "Step": "mtjax.types",
     "Task": "mtjax.types",
     "Transition": "mtjax.types",

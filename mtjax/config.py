@@ -15,7 +15,6 @@ import jax
 import tyro
 from jax.sharding import Mesh
 
-from mtjax import populations, trials
 from mtjax.agents import AGENTS, BaseAgent, agent, combinations, preset_of, tuned_as
 from mtjax.agents import name_of as agent_name_of
 from mtjax.agents.choices import kinds_of, replace, require_value_range
@@ -27,7 +26,8 @@ from mtjax.envs import name_of as env_name_of
 from mtjax.envs.mixtures import Tabled
 from mtjax.experience import Replay
 from mtjax.frames import shown
-from mtjax.loop import Settings, require_curriculum, require_trials
+from mtjax.learning import populations, trials
+from mtjax.learning.loop import Settings, require_curriculum, require_trials
 from mtjax.names import PRESETS, nearest_error, public
 from mtjax.parallel import mesh as meshes
 from mtjax.types import InputError

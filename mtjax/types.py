@@ -141,7 +141,7 @@ class Step(NamedTuple):
 
 
 class Transition(NamedTuple):
-    """Holds one step of a trial for learning. ``mtjax.trials`` says what a trial is: by default, an episode.
+    """Holds one step of a trial for learning. ``mtjax.learning.trials`` says what a trial is: by default, an episode.
 
     A window holds consecutive steps of one environment, leaves (..., L, ...).
     """
@@ -215,7 +215,7 @@ class Env(Protocol):
     """An environment is a family of tasks. It is frozen and hashable, so that it is static under ``jit``.
 
     A family implements ``reset`` and ``step`` for one world. The methods that end in ``worlds`` are for all worlds at
-    once, leaves (S, T, E, ...); those of ``mtjax.axes`` map the former over one flat batch.
+    once, leaves (S, T, E, ...); those of ``mtjax.parallel.axes`` map the former over one flat batch.
     """
 
     @property

@@ -12,7 +12,7 @@ from probes import Goals, Walk, tiny, train_objects
 from mtjax import envs
 from mtjax.compiling.programs import jit_programs
 from mtjax.config import configure
-from mtjax.loop import Settings
+from mtjax.learning.loop import Settings
 from mtjax.parallel import collectives as shares
 from mtjax.parallel import mesh as meshes
 

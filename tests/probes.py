@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from needs import needs
 
-from mtjax import agents, loop
+from mtjax import agents
 from mtjax.agents import replayed
 from mtjax.agents.base import Memory
+from mtjax.agents.networks import Params
 from mtjax.agents.parts.knowing import last_steps
 from mtjax.agents.parts.policies import Gaussian
 from mtjax.command.keywords import configured
@@ -22,7 +23,7 @@ from mtjax.envs import ENVS
 from mtjax.envs.probes import AFTER, LIMIT, RULES, SPEC, Probe, tasks_of
 from mtjax.experience import Replay, rollouts
 from mtjax.frames import seen
-from mtjax.networks import Params
+from mtjax.learning import loop
 from mtjax.training.launch import check, launch
 from mtjax.training.run import Hooks
 from mtjax.types import Acted, Spec, Task, Transition

@@ -11,6 +11,7 @@ from probes import OFF_POLICY, learner, one_in, pick, quick, random_batch, rando
 from probes import act as act_once
 
 from mtjax.agents import AGENTS, agent, normalize
+from mtjax.agents.networks import Params
 from mtjax.agents.parts.encoders import ENCODERS
 from mtjax.agents.parts.gradients.surgery import RULES
 from mtjax.agents.parts.knowing import CONDITIONINGS
@@ -20,10 +21,9 @@ from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.values import VALUES
 from mtjax.agents.view import init_inputs
-from mtjax.axes import over_learners
-from mtjax.networks import Params
-from mtjax.rollout import Worlds
-from mtjax.rollout import act as act_in_all
+from mtjax.learning.rollout import Worlds
+from mtjax.learning.rollout import act as act_in_all
+from mtjax.parallel.axes import over_learners
 from mtjax.types import InputError, Spec
 
 SPEC, BATCH, ENVS = Spec.vector(3, 2, 1)._replace(sentences=("Walk.", "Run.", "Hop.")), 4, 2

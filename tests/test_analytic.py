@@ -12,9 +12,9 @@ from probes import QUICK, Stub
 
 import mtjax
 from mtjax.envs.analytic import link, sailing, tracks, trading
-from mtjax.evaluation import record
+from mtjax.learning.evaluation import record
+from mtjax.learning.rollout import reset_envs, step_envs
 from mtjax.report import films, render
-from mtjax.rollout import reset_envs, step_envs
 from mtjax.types import InputError
 
 NAMES = ("link", "racing", "sailing", "trading")

@@ -16,7 +16,7 @@ import mtjax.train
 from mtjax import agents, checks, envs
 from mtjax.command import keywords, run_config
 from mtjax.config import Plan, with_preset
-from mtjax.loop import Settings
+from mtjax.learning.loop import Settings
 from mtjax.names import in_python
 from mtjax.report import collect, curve
 from mtjax.saved.config_json import from_json

@@ -10,11 +10,11 @@ import pytest
 from probes import QUICK, learner, random_batch, tasks_of
 
 from mtjax.agents.fit import above
+from mtjax.agents.networks import Params
 from mtjax.agents.parts.gradients import surgery
 from mtjax.agents.parts.gradients.balancing import FAMO, Balance, GradNorm
 from mtjax.agents.parts.gradients.rules import Mean
 from mtjax.agents.sac import SAC
-from mtjax.networks import Params
 from mtjax.types import InputError, Spec
 
 KEY = jax.random.key(0)

@@ -22,7 +22,7 @@ from mtjax.agents.combinations import require_sight
 from mtjax.agents.parts.knowing import Text
 from mtjax.envs import BENCHMARKS
 from mtjax.envs.metaworld.names import TASKS
-from mtjax.evaluation import Evaluations, load_evaluations, save_evaluations
+from mtjax.learning.evaluation import Evaluations, load_evaluations, save_evaluations
 from mtjax.saved.log import append_rows
 from mtjax.saved.records import Records
 from mtjax.training.console import Console
@@ -207,7 +207,7 @@ def test_an_unfinished_pair_is_told_and_goes_on_with_its_settings_only(run, scri
 def test_a_pair_whose_results_were_not_written_is_not_trained_again(run, tmp_path, monkeypatch):
     """And what a process left that died before it could clean up is removed."""
     with monkeypatch.context() as patch, pytest.raises(ZeroDivisionError):
-        patch.setattr("mtjax.evaluation.save_evaluations", die)  # by which the script marks a pair as finished
+        patch.setattr("mtjax.learning.evaluation.save_evaluations", die)  # by which the script marks a pair as finished
         patch.setattr("mtjax.saved.records.save_evaluations", save_evaluations)
         run("learning", tmp_path)
     monkeypatch.setattr(Records, "add_rows", die)

@@ -15,8 +15,8 @@ import pytest
 from probes import with_nets
 
 import mtjax.train
-from mtjax import loop
 from mtjax.agents.choices import replace
+from mtjax.learning import loop
 from mtjax.names import Notice
 from mtjax.saved import arrays, checkpoint
 from mtjax.saved.config_json import from_json

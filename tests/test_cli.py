@@ -29,7 +29,7 @@ from mtjax.command import flag_files, process, run_config
 from mtjax.command.run_config import parse
 from mtjax.config import Plan, for_tasks, load_preset, with_preset
 from mtjax.envs import BENCHMARKS, ENVS
-from mtjax.loop import Settings
+from mtjax.learning.loop import Settings
 from mtjax.names import notice
 from mtjax.saved import pretrained
 from mtjax.saved.config_json import from_json, to_flags, to_json

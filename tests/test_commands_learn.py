@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from test_docs import PAGES, ROOT, training
 
-from mtjax.evaluation import load_evaluations
+from mtjax.learning.evaluation import load_evaluations
 
 
 class Learns(NamedTuple):

@@ -10,7 +10,6 @@ import pytest
 from probes import tiny
 
 import mtjax
-from mtjax import loop
 from mtjax.config import configure
 from mtjax.envs.mtenv.control import (
     Acrobot,
@@ -23,6 +22,7 @@ from mtjax.envs.mtenv.control import (
     cartpole_parameters,
     choose,
 )
+from mtjax.learning import loop
 
 CARTPOLE_RANGES = {
     "gravity": (4.8, 14.8),

@@ -9,10 +9,10 @@ import pytest
 from probes import QUICK, Walk, configure, tiny
 
 import mtjax
-from mtjax import curricula, loop
+from mtjax.agents.networks import Params
 from mtjax.agents.state import of_tasks, with_tasks
-from mtjax.loop import Settings
-from mtjax.networks import Params
+from mtjax.learning import curricula, loop
+from mtjax.learning.loop import Settings
 from mtjax.types import InputError
 
 SMALL = {"num_envs": 2, "chunk_steps": 8, "stagger": False}

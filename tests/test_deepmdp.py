@@ -31,6 +31,7 @@ from mtjax import agents
 from mtjax.agents import replayed
 from mtjax.agents.base import Memory
 from mtjax.agents.fit import learned
+from mtjax.agents.networks import Params
 from mtjax.agents.on_policy import Taken
 from mtjax.agents.parts.gradients.balancing import FAMO
 from mtjax.agents.parts.knowing.last_steps import Past, Seen, append
@@ -38,7 +39,6 @@ from mtjax.agents.parts.representations.deepmdp import ModelTargets
 from mtjax.agents.replayed import Batch, slow_copies
 from mtjax.agents.unseen import describe_unseen
 from mtjax.experience.rollouts import windows
-from mtjax.networks import Params
 from mtjax.types import InputError, Spec, Transition
 
 SPEC, BATCH = Spec.vector(3, 2, 1), 4

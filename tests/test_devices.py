@@ -17,7 +17,7 @@ import pytest
 import mtjax
 import mtjax.train
 from mtjax.compiling.programs import jit_programs, sharded_shapes
-from mtjax.evaluation import load_evaluations
+from mtjax.learning.evaluation import load_evaluations
 from mtjax.parallel import hosts as processes
 from mtjax.parallel import mesh as meshes
 from mtjax.types import InputError
@@ -105,7 +105,11 @@ def test_one_device_needs_no_mesh(hosts, counts, seeds):
     """Then the programs are the loop's own, and arrays stay where they are."""
     hosts(*counts)
     assert meshes.mesh_for(seeds, 10, 16) is None
-    assert jit_programs(None, mtjax.agent("sac")) == (mtjax.loop.init, mtjax.loop.run_chunk, mtjax.evaluation.evaluate)
+    assert jit_programs(None, mtjax.agent("sac")) == (
+        mtjax.learning.loop.init,
+        mtjax.learning.loop.run_chunk,
+        mtjax.learning.evaluation.evaluate,
+    )
     state = object()
     assert (
         meshes.replicate(None, state) is meshes.shard_by_seed(None, state) is sharded_shapes(None, None, state) is state

@@ -17,10 +17,10 @@ from probes import OFF_POLICY, QUICK, learner, of_task, one_in, pick, random_bat
 
 import mtjax
 import mtjax.evaluate
-from mtjax import loop
+from mtjax.agents.networks import Params
 from mtjax.agents.parts.encoders import ENCODERS
-from mtjax.evaluation import Scores
-from mtjax.networks import Params
+from mtjax.learning import loop
+from mtjax.learning.evaluation import Scores
 from mtjax.report import diagnostics, scoring
 from mtjax.report import figures as plot
 from mtjax.report.diagnostics import Activity, activity, compare_gradients, dormant_share, effective_ranks, utilisation

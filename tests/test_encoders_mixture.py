@@ -8,10 +8,10 @@ import pytest
 from probes import learner, one_in, quick, random_batch, tasks_of, tiny
 
 from mtjax.agents import agent
+from mtjax.agents.networks import Network, Params
 from mtjax.agents.parts.encoders import ENCODERS
 from mtjax.agents.parts.encoders.mixture import Experts, top_k_softmax
 from mtjax.agents.parts.encoders.moore import orthonormal
-from mtjax.networks import Network, Params
 from mtjax.types import InputError, Spec
 
 TASKS, BATCH, OBS, ACTION, OUT, HIDDEN = 3, 4, 2, 1, 5, (7, 6)

@@ -13,9 +13,9 @@ from test_craft import restated
 
 import mtjax
 from mtjax.agents import for_action
+from mtjax.agents.networks import Params
 from mtjax.agents.parts.knowing.text import encode
 from mtjax.envs.craft.errands import ERRANDS, THINGS
-from mtjax.networks import Params
 
 ENV = mtjax.make("errands")
 KINDS = {

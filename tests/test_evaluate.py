@@ -22,9 +22,9 @@ from probes import act as act_once
 import mtjax
 import mtjax.evaluate
 import mtjax.train
-from mtjax import loop
 from mtjax.checks import amount
-from mtjax.evaluation import Episodes, Evaluations, Scores, evaluate, load_evaluations, record
+from mtjax.learning import loop
+from mtjax.learning.evaluation import Episodes, Evaluations, Scores, evaluate, load_evaluations, record
 from mtjax.report import films, render, scoring
 from mtjax.report.tables import split_table, task_table
 from mtjax.saved import checkpoint

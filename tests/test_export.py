@@ -18,8 +18,8 @@ import mtjax
 import mtjax.evaluate
 from mtjax import agents, standalone
 from mtjax.agents import for_action
+from mtjax.agents.networks import Params
 from mtjax.agents.state import AgentState
-from mtjax.networks import Params
 from mtjax.saved.export import require_file
 from mtjax.saved.operations import steps_of
 from mtjax.saved.policy import Policy

@@ -12,11 +12,11 @@ from probes import slow_but, train_objects, with_nets
 
 import mtjax.train
 from mtjax.agents import agent
+from mtjax.agents.networks import Params
 from mtjax.command import run_config
 from mtjax.envs import ENVS
 from mtjax.envs.family import Family
 from mtjax.envs.parameters import Parameter
-from mtjax.networks import Params
 from mtjax.saved.config_json import from_json, to_flags
 from mtjax.training import finetune
 from mtjax.training.finetune import adopt

@@ -27,7 +27,6 @@ from test_painters import SIZE, similarity, states_of
 from test_rocking import ROCKING, tilting
 
 import mtjax
-from mtjax import loop, rollout
 from mtjax.agents import AGENTS, for_action
 from mtjax.agents.base import Memory
 from mtjax.agents.choices import replace
@@ -43,6 +42,7 @@ from mtjax.envs.merged_simulator import United
 from mtjax.envs.mixtures import States
 from mtjax.envs.probes import tasks_of
 from mtjax.envs.shared_simulator import Joined
+from mtjax.learning import loop, rollout
 from mtjax.saved import checkpoint
 from mtjax.types import Discrete, Spec
 

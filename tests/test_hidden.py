@@ -9,7 +9,7 @@ from probes import QUICK, Stub
 
 from mtjax import make
 from mtjax.envs.hidden import GridNavi, HiddenBandit, even_points
-from mtjax.evaluation import Episodes, evaluate
+from mtjax.learning.evaluation import Episodes, evaluate
 from mtjax.types import Acted, InputError
 
 

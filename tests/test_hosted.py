@@ -11,13 +11,13 @@ from probes import slow_but, tiny, train
 
 import mtjax
 import mtjax.train
-from mtjax import evaluation, rollout
 from mtjax.envs.engines import host
 from mtjax.envs.engines.host import explaining
 from mtjax.envs.hosted.envpool import EnvPool
 from mtjax.envs.hosted.family import _known
 from mtjax.envs.hosted.gymnasium import Separate
 from mtjax.evaluate import main as evaluate_main
+from mtjax.learning import evaluation, rollout
 from mtjax.saved.records import Records
 from mtjax.types import Acted, Continuous, Discrete, InputError
 

@@ -11,8 +11,8 @@ from probes import Probe, Walk, learner, only_seed, pick, quick, random_batch, t
 
 import mtjax
 import mtjax.train
-from mtjax import evaluation
 from mtjax.agents.parts.knowing.last_steps import Past, Seen, TrajectoryEncoder, append
+from mtjax.learning import evaluation
 from mtjax.types import Spec, Transition
 
 SPEC, STEPS = Spec.vector(3, 2, 1), 4

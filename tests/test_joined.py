@@ -12,7 +12,7 @@ from needs import needs
 import mtjax
 from mtjax.envs.mixtures import Mixture
 from mtjax.envs.shared_simulator import Alone, Joined
-from mtjax.rollout import broadcast_tasks
+from mtjax.learning.rollout import broadcast_tasks
 
 STEPS, WORLDS = 3, 2
 PENDULUMS = {"pendulum-swingup": {"mass": "0.8,1.2"}, "pendulum-spin": {"mass": "1.5", "damping": "0.2"}}

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import mtjax
-from mtjax.evaluation import load_evaluations
+from mtjax.learning.evaluation import load_evaluations
 from mtjax.saved import checkpoint
 from mtjax.saved.config_json import from_json
 from mtjax.saved.policy import state_shapes

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import mtjax
-from mtjax.evaluation import Evaluations, save_evaluations
+from mtjax.learning.evaluation import Evaluations, save_evaluations
 
 FOLDER = Path(__file__).parent.parent / "benchmarks"
 

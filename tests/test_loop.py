@@ -10,12 +10,12 @@ import pytest
 from probes import Broken, Lost, Probe, Stub, Walk, tasks_of, tiny, train
 
 import mtjax
-from mtjax import loop
-from mtjax.axes import over_learners, over_worlds
 from mtjax.config import configure
 from mtjax.experience import Replay
-from mtjax.loop import Settings
-from mtjax.rollout import broadcast_tasks, reset_envs, step_envs
+from mtjax.learning import loop
+from mtjax.learning.loop import Settings
+from mtjax.learning.rollout import broadcast_tasks, reset_envs, step_envs
+from mtjax.parallel.axes import over_learners, over_worlds
 from mtjax.types import Acted, InputError, Spec
 
 ENVS, BATCH, WARMUP, HOLD, CHUNK, UPDATES = 4, 8, 8, 3, 13, 2

@@ -9,13 +9,13 @@ import pytest
 from probes import Walk, of_task, only_seed, pick, tiny, train, with_nets
 
 import mtjax
-from mtjax import loop
 from mtjax.agents import agent, clipped, for_action
 from mtjax.agents.maml import MAML
 from mtjax.agents.on_policy import Taken
 from mtjax.agents.parts.adaptation import adapted_gain
 from mtjax.envs.probes import Probe, World, tasks_of
-from mtjax.evaluation import Episodes, adapted, evaluate
+from mtjax.learning import loop
+from mtjax.learning.evaluation import Episodes, adapted, evaluate
 from mtjax.types import Discrete, InputError, Spec, Step, Transition
 
 KEY = jax.random.key(0)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from probes import QUICK, tiny
 
-from mtjax import loop
 from mtjax.agents import for_action
 from mtjax.config import configure
 from mtjax.envs.mtenv.maze import MazeState, TwoGoalMaze
+from mtjax.learning import loop
 from mtjax.types import Discrete, InputError, Spec
 
 MAZE = TwoGoalMaze(vary={"goal-box": "0,1"}, split="none")

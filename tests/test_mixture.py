@@ -17,8 +17,9 @@ from probes import OFF_POLICY, one_in, slow_but
 import mtjax
 import mtjax.evaluate
 import mtjax.train
-from mtjax import agents, rollout
+from mtjax import agents
 from mtjax.agents import for_action, normalize
+from mtjax.agents.networks import OVER_TASKS, Params
 from mtjax.agents.parts.policies import Gaussian
 from mtjax.agents.rates import discounts
 from mtjax.agents.replayed import Batch, action_sizes
@@ -27,10 +28,10 @@ from mtjax.agents.view import init_inputs
 from mtjax.command import run_config
 from mtjax.envs import ENVS, Family, Mixture, make, mixture
 from mtjax.envs.parameters import Parameter
-from mtjax.evaluation import Episodes, Scores, evaluate, record
 from mtjax.experience.replay import Replay
-from mtjax.loop import Settings
-from mtjax.networks import OVER_TASKS, Params
+from mtjax.learning import rollout
+from mtjax.learning.evaluation import Episodes, Scores, evaluate, record
+from mtjax.learning.loop import Settings
 from mtjax.report.tables import split_table, task_table
 from mtjax.saved.config_json import from_json, to_flags, to_json
 from mtjax.saved.folder import short_name

@@ -11,12 +11,12 @@ from probes import Goals, Stub, Walk, one_in, pick, quick, random_batch, random_
 
 from mtjax.agents import replayed
 from mtjax.agents.base import Memory
+from mtjax.agents.networks import Params
 from mtjax.agents.parts.knowing.last_steps import append
 from mtjax.agents.swept import with_numbers
 from mtjax.experience import Replay, multistep
 from mtjax.experience import ring as rings
 from mtjax.experience.replay import Buffer, joined
-from mtjax.networks import Params
 from mtjax.types import InputError, Spec, Transition
 
 SPEC = Spec.vector(3, 2, 1)

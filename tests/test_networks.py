@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from probes import tasks_of, tiny
 
+from mtjax.agents.networks import MLP, Network, Params, Trunk, join, orthogonal
 from mtjax.agents.parts.encoders.care import Experts, Mixture
 from mtjax.agents.parts.policies import Gaussian
-from mtjax.networks import MLP, Network, Params, Trunk, join, orthogonal
 from mtjax.types import Spec
 
 TASKS, BATCH, OBS, ACTION, CONTEXT, OUT = 3, 4, 2, 1, 2, 5

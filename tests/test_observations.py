@@ -17,7 +17,7 @@ from mtjax.agents import for_action
 from mtjax.agents.combinations import require_sight
 from mtjax.envs import ENVS, Parameter
 from mtjax.envs.family import Family
-from mtjax.rollout import broadcast_tasks
+from mtjax.learning.rollout import broadcast_tasks
 from mtjax.saved.policy import Policy
 from mtjax.types import InputError, Spec, Step
 

@@ -14,6 +14,7 @@ import pytest
 import mtjax
 import mtjax.evaluate
 from mtjax import frames
+from mtjax.agents.networks import Params
 from mtjax.agents.parts import vision
 from mtjax.agents.parts.representations.encoded import Encoded
 from mtjax.agents.state import axes_of
@@ -21,7 +22,6 @@ from mtjax.config import with_preset
 from mtjax.envs.probes import Pictured, Probe
 from mtjax.experience import Rollouts, pictures
 from mtjax.experience.replay import joined
-from mtjax.networks import Params
 from mtjax.training.launch import check
 from mtjax.types import InputError, Transition
 

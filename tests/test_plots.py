@@ -10,7 +10,7 @@ from needs import needs
 import mtjax
 import mtjax.plot
 from mtjax import report
-from mtjax.evaluation import Evaluations, save_evaluations
+from mtjax.learning.evaluation import Evaluations, save_evaluations
 from mtjax.report import collect, plots
 from mtjax.report.stats import iqm, probability_of_improvement, seed_interval
 from mtjax.saved.config_json import to_json
@@ -245,7 +245,7 @@ def test_runs_are_tables(runs, make_run):
 @needs("pandas")
 def test_a_result_is_a_table(make_run):
     """As is its folder, and the lines of its metrics."""
-    from mtjax.evaluation import load_evaluations
+    from mtjax.learning.evaluation import load_evaluations
     from mtjax.saved.result import Result
 
     folder = make_run("x", "finger-spin-vary-size", "sac", seeds=2)
@@ -262,7 +262,7 @@ def test_a_result_is_a_table(make_run):
 
 def test_results_are_drawn_like_runs(make_run):
     """Under names of one's own; every point of a sweep is a line."""
-    from mtjax.evaluation import load_evaluations
+    from mtjax.learning.evaluation import load_evaluations
     from mtjax.saved.result import Result
 
     folder = make_run("x", "finger-spin-vary-size", "sac", seeds=4)

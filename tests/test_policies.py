@@ -10,10 +10,10 @@ from probes import of_task, tiny
 
 import mtjax
 from mtjax.agents import for_action
+from mtjax.agents.networks import Params
 from mtjax.agents.parts.policies import Categorical, Gaussian, policy_for
 from mtjax.agents.ppo import Batch
 from mtjax.envs.probes import tasks_of
-from mtjax.networks import Params
 from mtjax.types import Continuous, Discrete, InputError, Spec, Transition
 
 KEY = jax.random.key(0)

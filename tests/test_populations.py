@@ -11,14 +11,14 @@ import pytest
 from probes import Walk, tiny
 
 import mtjax
-from mtjax import loop, populations
 from mtjax.agents import swept
 from mtjax.command import sweep
 from mtjax.command.keywords import configured
 from mtjax.compiling.programs import Programs
 from mtjax.config import configure
-from mtjax.evaluation import as_one_seed, no_evaluations
-from mtjax.loop import Settings
+from mtjax.learning import loop, populations
+from mtjax.learning.evaluation import as_one_seed, no_evaluations
+from mtjax.learning.loop import Settings
 from mtjax.names import Notice
 from mtjax.report import collect
 from mtjax.saved.config_json import from_json

@@ -28,6 +28,7 @@ from probes import (
 from mtjax import agents
 from mtjax.agents import clipped, critics, normalize
 from mtjax.agents.base import Memory
+from mtjax.agents.networks import OVER_TASKS
 from mtjax.agents.on_policy import Batch, Taken
 from mtjax.agents.parts import targets
 from mtjax.agents.parts.encoders import ENCODERS
@@ -41,10 +42,9 @@ from mtjax.agents.parts.scaling.base import Moments
 from mtjax.agents.ppo import PPO, within
 from mtjax.agents.units import Units
 from mtjax.agents.view import init_inputs
-from mtjax.axes import in_parts
 from mtjax.config import with_preset
 from mtjax.envs.probes import Probe, tasks_of
-from mtjax.networks import OVER_TASKS
+from mtjax.parallel.axes import in_parts
 from mtjax.types import InputError, Spec, Transition
 
 SPEC, LENGTH, ENVS = Spec.vector(3, 2, 1)._replace(sentences=("Walk.", "Run.", "Hop.")), 4, 2

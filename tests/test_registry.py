@@ -19,12 +19,13 @@ from probes import FEW, METAWORLD, param, slow_but
 import mtjax
 import mtjax.evaluate
 import mtjax.train
-from mtjax import loop, register
+from mtjax import register
 from mtjax.agents import AGENTS, PARTS
 from mtjax.agents.parts.knowing import Parameters
 from mtjax.command import help, keywords, run_config
 from mtjax.envs import ENVS, Domain, Parameter, effects, registration_checks
 from mtjax.envs.brax import Brax
+from mtjax.learning import loop
 from mtjax.saved.config_json import to_flags, to_json
 from mtjax.tasks import episode_task
 from mtjax.types import SPLITS, InputError

@@ -7,14 +7,14 @@ import pytest
 from probes import QUICK, Walk, configure, param, pick, prepare, random_batch, tiny
 
 import mtjax
-from mtjax import loop
 from mtjax.agents import consolidating
+from mtjax.agents.networks import Params
 from mtjax.agents.parts import continual, put, remembering
 from mtjax.agents.parts.policies import Gaussian
 from mtjax.agents.state import of_task
 from mtjax.command import run_config
-from mtjax.loop import Settings
-from mtjax.networks import Params
+from mtjax.learning import loop
+from mtjax.learning.loop import Settings
 from mtjax.types import InputError
 
 GIVEN = {"num_envs": 2, "chunk_steps": 8, "stagger": False, "batch_size": 4, "replay_size": 64, "warmup_steps": 2}

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from probes import tiny
 
-from mtjax import envs, rollout
+from mtjax import envs
 from mtjax.envs import Family, Parameter
-from mtjax.trials import EACH_EPISODE
+from mtjax.learning import rollout
+from mtjax.learning.trials import EACH_EPISODE
 from mtjax.types import Step
 
 SHAPE = (2, 3, 40)  # S, T, E

@@ -28,13 +28,13 @@ from probes import train_objects, with_nets
 
 import mtjax
 import mtjax.train
-from mtjax import loop
 from mtjax.command import process, run_config
 from mtjax.compiling import trace_cache
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import Plan, fit_chunk
-from mtjax.evaluation import load_evaluations, save_evaluations
-from mtjax.loop import Settings
+from mtjax.learning import loop
+from mtjax.learning.evaluation import load_evaluations, save_evaluations
+from mtjax.learning.loop import Settings
 from mtjax.names import Notice
 from mtjax.report import collect
 from mtjax.saved import checkpoint, log

@@ -12,13 +12,13 @@ import probes
 import pytest
 from probes import quick, random_batch, tasks_of, with_nets
 
+from mtjax.agents.networks import Params, join
 from mtjax.agents.parts.encoders import Identity
 from mtjax.agents.parts.knowing import Parameters
 from mtjax.agents.parts.policies import Drawn, Gaussian
 from mtjax.agents.replayed import Batch
 from mtjax.agents.sac import SAC
 from mtjax.agents.state import AgentState
-from mtjax.networks import Params, join
 from mtjax.types import Spec, Transition
 
 

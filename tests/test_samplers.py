@@ -8,8 +8,8 @@ from probes import QUICK, learner, random_batch, tasks_of, tiny, with_nets
 
 from mtjax.agents import agent
 from mtjax.agents.base import Memory
+from mtjax.agents.networks import Params
 from mtjax.agents.parts.samplers import SAMPLERS, ByTemperature, Hardest, Progress, Uniform
-from mtjax.networks import Params
 from mtjax.types import InputError, Spec, Transition
 
 ALIKE = jnp.full(3, 0.1)

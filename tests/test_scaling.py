@@ -27,6 +27,7 @@ from probes import (
 
 from mtjax.agents import agent, normalize
 from mtjax.agents.fit import reset_networks
+from mtjax.agents.networks import Params
 from mtjax.agents.parts.scaling import (
     SCALINGS,
     AdaptiveScaling,
@@ -38,7 +39,6 @@ from mtjax.agents.parts.scaling import (
 )
 from mtjax.agents.parts.scaling.returns import Sums
 from mtjax.experience import Replay
-from mtjax.networks import Params
 from mtjax.types import InputError, Spec, Transition
 
 SPEC, BATCH = Spec.vector(3, 2, 1), 4

@@ -11,9 +11,9 @@ from needs import require
 from probes import pick, tasks_of, tiny, with_nets
 
 import mtjax
+from mtjax.agents.networks import Params
 from mtjax.agents.parts.knowing import text as sentences
 from mtjax.envs import ENVS
-from mtjax.networks import Params
 from mtjax.report import scoring
 from mtjax.types import InputError, Spec
 

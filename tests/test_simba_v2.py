@@ -8,9 +8,9 @@ import pytest
 from probes import learner, random_batch, slow_but, tasks_of, tiny
 
 from mtjax.agents import agent
+from mtjax.agents.networks import Params
 from mtjax.agents.parts.encoders import Hypersphere
 from mtjax.agents.parts.gradients.descent import adam, on_sphere
-from mtjax.networks import Params
 from mtjax.types import InputError, Spec
 
 SPEC, BATCH = Spec.vector(3, 2, 1), 4

@@ -13,15 +13,15 @@ from probes import QUICK, only_seed, pick, tiny, train
 
 import mtjax
 from mtjax.agents import for_action
+from mtjax.agents.networks import Params
 from mtjax.agents.on_policy import Batch
 from mtjax.agents.sketches import SubPolicies
 from mtjax.agents.state import of_task
 from mtjax.agents.unseen import describe_unseen
 from mtjax.envs.craft.sketched import Sketched
 from mtjax.envs.parameters import Parameter
-from mtjax.evaluation import Episodes, evaluate
 from mtjax.experience import Rollouts
-from mtjax.networks import Params
+from mtjax.learning.evaluation import Episodes, evaluate
 from mtjax.types import Array, InputError
 
 LENGTH = 7

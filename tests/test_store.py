@@ -15,14 +15,14 @@ from test_pictures import Episodes
 from test_run import bytes_of
 
 import mtjax
-from mtjax import loop
 from mtjax.command import run_config
 from mtjax.config import configure
 from mtjax.envs.probes import Pictured
 from mtjax.experience import Replay, pictures, store
 from mtjax.experience import ring as rings
 from mtjax.experience.store import Store
-from mtjax.loop import Settings
+from mtjax.learning import loop
+from mtjax.learning.loop import Settings
 from mtjax.names import Notice
 from mtjax.saved import checkpoint
 from mtjax.saved.policy import state_shapes

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from probes import learner, random_batch, tasks_of, tiny
 
+from mtjax.agents.networks import Params
 from mtjax.agents.parts.gradients import surgery
 from mtjax.agents.parts.gradients.surgery import RULES
-from mtjax.networks import Params
 from mtjax.types import Spec
 
 KEY = jax.random.key(4)

@@ -18,7 +18,6 @@ from probes import QUICK, Walk, one_in, random_batch, tasks_of, tiny, train_obje
 import mtjax
 import mtjax.evaluate
 import mtjax.train
-from mtjax import loop
 from mtjax.agents import PARTS
 from mtjax.agents import settings as settings_of
 from mtjax.agents import swept as points
@@ -26,8 +25,9 @@ from mtjax.agents.fit import reset_networks
 from mtjax.command import run_config, sweep
 from mtjax.command.keywords import configured
 from mtjax.config import configure
-from mtjax.evaluation import Scores, load_evaluations, save_evaluations
-from mtjax.loop import Settings, TrainState
+from mtjax.learning import loop
+from mtjax.learning.evaluation import Scores, load_evaluations, save_evaluations
+from mtjax.learning.loop import Settings, TrainState
 from mtjax.names import Notice
 from mtjax.saved.config_json import from_json, to_flags, to_json
 from mtjax.training import memory, stops

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from probes import tiny
 
-from mtjax import loop
 from mtjax.agents import for_action
 from mtjax.config import configure
 from mtjax.envs.mtenv.tabular import Bandit, TabularMDP
+from mtjax.learning import loop
 from mtjax.types import Discrete, InputError, Spec
 
 MDP, BANDIT = TabularMDP(num_tasks=3), Bandit(num_tasks=3)

@@ -25,7 +25,7 @@ from mtjax.envs.task_table import Outside
 # Runs a command and says, as the last line of its output, how often the steps of programs were traced.
 SCRIPT = """
 import json, runpy, sys
-import mtjax.evaluation, mtjax.loop
+import mtjax.learning.evaluation, mtjax.learning.loop
 count = 0
 def counted(step):
     def trace(*arguments, **named):
@@ -33,7 +33,7 @@ def counted(step):
         count += 1
         return step(*arguments, **named)
     return trace
-for module in (mtjax.evaluation, mtjax.loop):
+for module in (mtjax.learning.evaluation, mtjax.learning.loop):
     module.step_envs = counted(module.step_envs)
 module, *sys.argv[1:] = json.loads(sys.argv[1])
 runpy.run_module(module, run_name="__main__", alter_sys=True)

@@ -10,12 +10,12 @@ from probes import SPEC, Goals, Stub, Walk, tiny, train
 from test_loop import Drifting
 
 import mtjax
-from mtjax import loop
 from mtjax.agents.parts import targets
-from mtjax.evaluation import Episodes, evaluate, load_evaluations, no_evaluations, require_same_run
 from mtjax.experience import multistep
+from mtjax.learning import loop
+from mtjax.learning.evaluation import Episodes, evaluate, load_evaluations, no_evaluations, require_same_run
+from mtjax.learning.trials import EachEpisode, Repeated, ResetFree
 from mtjax.report.tables import split_table
-from mtjax.trials import EachEpisode, Repeated, ResetFree
 from mtjax.types import Acted, InputError, Transition
 
 STEPS, ENVS, K = 60, 6, 3

@@ -11,10 +11,10 @@ import probes
 import pytest
 from probes import Stub, Walk, learner, one_in, quick, random_batch, tasks_of, tiny, train
 
-from mtjax import loop
 from mtjax.agents.swept import with_numbers
-from mtjax.axes import when
 from mtjax.experience import Replay
+from mtjax.learning import loop
+from mtjax.parallel.axes import when
 from mtjax.types import InputError, Sometimes, Spec
 
 SMALL = {"num_envs": 4, "batch_size": 4, "replay_size": 200, "warmup_steps": 2}

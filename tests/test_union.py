@@ -14,13 +14,13 @@ from test_joined import members, played, require_as_alone
 from test_metaworld import made
 
 import mtjax
-from mtjax import rollout
 from mtjax.command import run_config
 from mtjax.envs import simulator_groups
 from mtjax.envs.merged_simulator import United
 from mtjax.envs.metaworld.names import BENCHMARKS, TASKS
 from mtjax.envs.scene_bodies import Scene
 from mtjax.envs.shared_simulator import Alone, Joined
+from mtjax.learning import rollout
 from mtjax.saved.config_json import from_json, to_flags, to_json
 from mtjax.types import Acted, InputError
 

@@ -8,9 +8,9 @@ import pytest
 from probes import act, learner, of_task, pick, quick, random_batch, slow_but, tasks_of, tiny
 
 from mtjax.agents import agent, replayed
+from mtjax.agents.networks import STATISTICS, Network, Params
 from mtjax.agents.parts.encoders import BatchNorm
 from mtjax.agents.unseen import describe_unseen
-from mtjax.networks import STATISTICS, Network, Params
 from mtjax.types import InputError, Spec
 
 SPEC, BATCH = Spec.vector(3, 2, 1), 4

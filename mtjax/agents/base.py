@@ -12,6 +12,7 @@ import tyro
 from mtjax.agents import combinations, parts
 from mtjax.agents.choices import FLAT, PARTS, kinds_of
 from mtjax.agents.fit import Fit
+from mtjax.agents.networks import Network, Params
 from mtjax.agents.parts.encoders import Encoder
 from mtjax.agents.parts.gradients import descent, surgery
 from mtjax.agents.parts.knowing import Knowing, last_steps
@@ -26,7 +27,6 @@ from mtjax.agents.state import AgentState, Nets, of_task
 from mtjax.agents.view import View, init_inputs, join_arrays
 from mtjax.checks import require_values
 from mtjax.experience import Replay
-from mtjax.networks import Network, Params
 from mtjax.parallel import collectives
 from mtjax.types import Acted, Array, Key, Metrics, Spec, Task, Transition
 

@@ -6,12 +6,12 @@ from typing import Any
 import jax.numpy as jnp
 
 from mtjax import frames
+from mtjax.agents.networks import Params
 from mtjax.agents.parts.scaling.popart import rescale_heads
 from mtjax.agents.rates import discounts_of_all
 from mtjax.agents.state import AgentState, over_tasks
 from mtjax.agents.units import MIN_STD, Units
-from mtjax.axes import in_parts
-from mtjax.networks import Params
+from mtjax.parallel.axes import in_parts
 from mtjax.parallel.collectives import mean_and_variance
 from mtjax.types import Array, Metrics, Task, Transition
 

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 
 import optax
 
+from mtjax.agents.networks import Params
 from mtjax.agents.parts.gradients import descent, surgery
 from mtjax.agents.state import AgentState, FitState, Nets
-from mtjax.networks import Params
 from mtjax.types import Array, Key, Metrics, Spec, Task
 
 

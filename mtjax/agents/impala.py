@@ -10,13 +10,13 @@ import jax.numpy as jnp
 from mtjax.agents import critics, parts
 from mtjax.agents.base import Inputs, Memory
 from mtjax.agents.choices import FLAT
+from mtjax.agents.networks import Params
 from mtjax.agents.on_policy import Batch, OnPolicy
 from mtjax.agents.parts import targets
 from mtjax.agents.rates import discounts_of_all
 from mtjax.agents.state import AgentState, axes_of
 from mtjax.agents.units import Units
 from mtjax.experience import Rollouts
-from mtjax.networks import Params
 from mtjax.types import Acted, Array, InputError, Key, Metrics, Task, Transition
 
 

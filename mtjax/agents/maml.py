@@ -9,12 +9,12 @@ import jax.numpy as jnp
 from mtjax.agents import clipped, parts
 from mtjax.agents.base import Inputs, Memory
 from mtjax.agents.choices import FLAT, PARTS
+from mtjax.agents.networks import Params
 from mtjax.agents.on_policy import ActorAux, Batch, OnPolicy
 from mtjax.agents.parts.adaptation import adapt, surrogate
 from mtjax.agents.state import AgentState, Nets, over_tasks
 from mtjax.experience import AdaptingRollouts
 from mtjax.experience.rollouts import windows
-from mtjax.networks import Params
 from mtjax.parallel import collectives
 from mtjax.types import Acted, Array, InputError, Key, Metrics, Task, Transition
 
@@ -48,8 +48,8 @@ class MAML(OnPolicy):
     Then all tasks begin at theta again. Each of the ``epochs`` repeats the inner steps from the new theta.
 
     The policy does not see its task: all that it knows of it is in theta_i. Evaluations of a run play theta, before any
-    inner step. ``mtjax.evaluation.adapted`` takes inner steps on tasks, of training or not, and returns the states of
-    the agent with which to evaluate it on them.
+    inner step. ``mtjax.learning.evaluation.adapted`` takes inner steps on tasks, of training or not, and returns the
+    states of the agent with which to evaluate it on them.
 
     Advantages are generalised ones within each rollout, scaled in each task and rollout as PPO scales a rollout's. One
     critic learns from all rollouts; as it does not see the task, ``gae_lambda`` is 1 by default. The metrics

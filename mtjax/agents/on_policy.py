@@ -11,6 +11,7 @@ from mtjax.agents import critics, parts
 from mtjax.agents.base import BaseAgent, Inputs, Memory
 from mtjax.agents.choices import FLAT
 from mtjax.agents.fit import Fit, above, descend
+from mtjax.agents.networks import Network, Params
 from mtjax.agents.parts.policies import Categorical, Gaussian, Policy
 from mtjax.agents.parts.policies.gaussian import STD_RANGE
 from mtjax.agents.parts.samplers import SAMPLERS
@@ -18,7 +19,6 @@ from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.state import AgentState, Nets
 from mtjax.agents.units import Units
 from mtjax.experience import Rollouts
-from mtjax.networks import Network, Params
 from mtjax.types import Acted, Array, InputError, Key, Metrics, Task, Transition
 
 LOG_RATIO_LIMIT = 20.0

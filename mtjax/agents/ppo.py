@@ -9,9 +9,9 @@ import jax.numpy as jnp
 
 from mtjax.agents import clipped, parts
 from mtjax.agents.base import Inputs
+from mtjax.agents.networks import Params
 from mtjax.agents.on_policy import Batch, OnPolicy
 from mtjax.agents.state import AgentState
-from mtjax.networks import Params
 from mtjax.types import Array, Key, Metrics, Task, Transition
 
 

@@ -11,6 +11,7 @@ from mtjax.agents import parts
 from mtjax.agents.base import BaseAgent, Inputs, Memory
 from mtjax.agents.choices import FLAT
 from mtjax.agents.fit import Fit, descend
+from mtjax.agents.networks import Params
 from mtjax.agents.parts import targets
 from mtjax.agents.parts.policies import Categorical, Policy
 from mtjax.agents.parts.policies.categorical import allowed
@@ -20,7 +21,6 @@ from mtjax.agents.rates import discounts_of_all
 from mtjax.agents.state import AgentState, Nets, over_tasks
 from mtjax.experience import Rollouts
 from mtjax.experience.rollouts import played, windows
-from mtjax.networks import Params
 from mtjax.types import Acted, Array, InputError, Key, Metrics, Task, Transition
 
 

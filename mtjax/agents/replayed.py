@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from mtjax.agents.networks import Params
 from mtjax.agents.rates import discounts, discounts_of_all
 from mtjax.agents.state import AgentState, Nets, axes_of
 from mtjax.experience import pictures
 from mtjax.experience.replay import joined
-from mtjax.networks import Params
 from mtjax.types import Array, Key, Metrics, Task, Transition
 
 

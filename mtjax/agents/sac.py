@@ -12,14 +12,14 @@ from mtjax.agents import combinations, replayed
 from mtjax.agents.base import BaseAgent, Inputs, Memory
 from mtjax.agents.choices import FLAT
 from mtjax.agents.fit import Fit, above, descend
+from mtjax.agents.networks import Params
 from mtjax.agents.parts.remembering import Remembering
 from mtjax.agents.parts.values import Value, reduce
 from mtjax.agents.rates import scheduled
 from mtjax.agents.replayed import ActorAux, Batch, CriticAux, Sample
 from mtjax.agents.state import AgentState, Nets
-from mtjax.axes import when
 from mtjax.experience import Replay
-from mtjax.networks import Params
+from mtjax.parallel.axes import when
 from mtjax.types import Acted, Array, Key, Metrics, Sometimes, Task, Transition
 
 

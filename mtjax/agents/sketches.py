@@ -9,11 +9,11 @@ import tyro
 
 from mtjax.agents import clipped, combinations, parts
 from mtjax.agents.base import Heads, Inputs
+from mtjax.agents.networks import Network, Params
 from mtjax.agents.on_policy import Batch, OnPolicy
 from mtjax.agents.parts.policies import Categorical, Policy
 from mtjax.agents.parts.samplers import ByLength
 from mtjax.agents.state import AgentState
-from mtjax.networks import Network, Params
 from mtjax.types import Array, InputError, Key, Metrics, Spec, Task, Transition
 
 

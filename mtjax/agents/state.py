@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mtjax.networks import OVER_TASKS, Params
+from mtjax.agents.networks import OVER_TASKS, Params
 from mtjax.tasks import SAME_CONTEXT
 from mtjax.types import Array, Task
 

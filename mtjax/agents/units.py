@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
+from mtjax.agents.networks import Params
 from mtjax.agents.parts.scaling.base import Moments
-from mtjax.networks import Params
 from mtjax.parallel.collectives import mean_and_variance
 from mtjax.types import Array
 

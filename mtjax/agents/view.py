@@ -9,13 +9,13 @@ import jax.numpy as jnp
 
 from mtjax import frames
 from mtjax.agents import normalize
+from mtjax.agents.networks import OVER_TASKS, Params
 from mtjax.agents.parts.knowing import Knowing, last_steps
 from mtjax.agents.parts.knowing.last_steps import Seen, without_past
 from mtjax.agents.parts.knowing.recurrent import Following, Hidden, track
 from mtjax.agents.parts.policies import Policy
 from mtjax.agents.parts.representations import Representation
 from mtjax.agents.state import AgentState, Nets, of_task
-from mtjax.networks import OVER_TASKS, Params
 from mtjax.parallel import collectives
 from mtjax.parallel.collectives import mean_and_variance
 from mtjax.types import Array, Key, Metrics, Spec, Task, Transition

@@ -9,7 +9,7 @@ from mtjax.agents.swept import Sweep
 from mtjax.checks import checked, path, shown
 from mtjax.command.keywords import configured
 from mtjax.config import Plan
-from mtjax.loop import Settings
+from mtjax.learning.loop import Settings
 from mtjax.names import InputError, public
 from mtjax.report.curve import draw
 from mtjax.saved.folder import prepare

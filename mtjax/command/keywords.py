@@ -14,7 +14,7 @@ from mtjax.config import Plan, RunConfig, configure, fit_length, own_files, with
 from mtjax.envs import make_from
 from mtjax.envs.family import Family
 from mtjax.envs.mixtures import Tabled
-from mtjax.loop import Settings
+from mtjax.learning.loop import Settings
 from mtjax.names import InputError
 from mtjax.saved.policy import Policy
 

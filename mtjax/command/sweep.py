@@ -23,8 +23,8 @@ from mtjax.checks import amount
 from mtjax.command.run_config import parse
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import RunConfig
-from mtjax.evaluation import Evaluations
-from mtjax.populations import NO_INTERVAL
+from mtjax.learning.evaluation import Evaluations
+from mtjax.learning.populations import NO_INTERVAL
 from mtjax.report.curve import draw
 from mtjax.report.stats import seed_interval
 from mtjax.saved import checkpoint, lock

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from mtjax import populations
 from mtjax.agents.unseen import describe_unseen
 from mtjax.command import sweep
 from mtjax.command.run_config import parse
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import RunConfig
-from mtjax.evaluation import as_one_seed
+from mtjax.learning import populations
+from mtjax.learning.evaluation import as_one_seed
 from mtjax.parallel import hosts
 from mtjax.report.curve import draw
 from mtjax.report.tables import split_table

@@ -11,8 +11,8 @@ from jax.sharding import Mesh, NamedSharding
 
 from mtjax.compiling import trace_cache
 from mtjax.envs.mixtures import Tabled
-from mtjax.evaluation import evaluate
-from mtjax.loop import TrainState, init, run_chunk
+from mtjax.learning.evaluation import evaluate
+from mtjax.learning.loop import TrainState, init, run_chunk
 from mtjax.parallel.mesh import BY_SEED, BY_WORLD, REPLICATED
 from mtjax.types import Agent
 

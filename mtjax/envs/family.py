@@ -13,12 +13,12 @@ import jax
 import numpy as np
 import tyro
 
-from mtjax import axes
 from mtjax.checks import require_values
 from mtjax.envs import variation
 from mtjax.envs.parameters import Parameter
 from mtjax.envs.task_table import Outside, Part, Table, fields_alone, numbers, params
 from mtjax.names import first_sentence
+from mtjax.parallel import axes
 from mtjax.types import SPLITS, Array, Continuous, Discrete, InputError, Key, Spec, Step, Task, Transition
 
 _MAX_DRAWS = 1000

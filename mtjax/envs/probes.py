@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax import axes
+from mtjax.parallel import axes
 from mtjax.types import Array, Key, Spec, Step, Task
 
 AFTER = 5.0

@@ -13,11 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.axes import over_worlds
 from mtjax.envs.domain import Domain, stack_differing
 from mtjax.envs.engines.base import Engine, World, at_rest
 from mtjax.envs.engines.mjx import Mjx
 from mtjax.envs.family import Family
+from mtjax.parallel.axes import over_worlds
 from mtjax.types import Array, Key, Step, Task
 
 T = TypeVar("T")

@@ -3,10 +3,11 @@
 import dataclasses
 from typing import Any, NamedTuple
 
-from mtjax import axes, frames
+from mtjax import frames
 from mtjax.envs.mixtures import require_family
 from mtjax.envs.pixels import Pictured
 from mtjax.names import public
+from mtjax.parallel import axes
 from mtjax.types import Array, InputError, Key, Spec, Step, Task
 
 

@@ -13,7 +13,7 @@ from mtjax.agents import name_of, settings
 from mtjax.checks import path
 from mtjax.config import RunConfig
 from mtjax.envs import name_of as env_name_of
-from mtjax.evaluation import Evaluations, as_one_seed
+from mtjax.learning.evaluation import Evaluations, as_one_seed
 from mtjax.names import InputError, nearest_error, notice, public
 from mtjax.saved.config_json import from_json
 from mtjax.saved.folder import evaluations_of

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from mtjax.config import RunConfig
-from mtjax.evaluation import Evaluations, as_one_seed
+from mtjax.learning.evaluation import Evaluations, as_one_seed
 from mtjax.parallel import hosts
 from mtjax.report import figures
 from mtjax.saved.folder import short_name

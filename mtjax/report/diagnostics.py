@@ -19,11 +19,11 @@ import numpy as np
 from mtjax import frames
 from mtjax.agents import SAC
 from mtjax.agents.fit import Problem, above
+from mtjax.agents.networks import Network, Params, ReLU
 from mtjax.agents.parts.gradients import surgery
 from mtjax.agents.replayed import critic_data, prepare
 from mtjax.agents.state import Nets, axes_of
 from mtjax.experience.ring import Ring
-from mtjax.networks import Network, Params, ReLU
 from mtjax.report import figures
 from mtjax.saved.policy import Policy
 from mtjax.types import Array, Env, InputError, Key, Task, Transition

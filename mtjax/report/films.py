@@ -17,7 +17,7 @@ from mtjax.envs.engines import host
 from mtjax.envs.mixtures import Tabled
 from mtjax.envs.pixels import Pictured
 from mtjax.envs.task_table import Part
-from mtjax.evaluation import Recording, record
+from mtjax.learning.evaluation import Recording, record
 from mtjax.names import InputError
 from mtjax.report import render
 from mtjax.saved.policy import Policy

@@ -11,14 +11,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax import evaluation, trials
 from mtjax.agents.unseen import describe_unseen
 from mtjax.checks import amount, path, require_episodes
 from mtjax.compiling.programs import compile_lowered, enable_compile_cache, trace
 from mtjax.envs import Family
 from mtjax.envs.engines import host
 from mtjax.envs.mixtures import Tabled
-from mtjax.evaluation import Scores, of_tasks
+from mtjax.learning import evaluation, trials
+from mtjax.learning.evaluation import Scores, of_tasks
 from mtjax.names import nearest_error, public
 from mtjax.report import diagnostics, figures, films
 from mtjax.report.tables import task_table

@@ -5,11 +5,11 @@ from types import MappingProxyType
 
 import numpy as np
 
-from mtjax import trials
 from mtjax.checks import amount
 from mtjax.envs.family import Family
 from mtjax.envs.task_table import Part
-from mtjax.evaluation import Evaluations, Scores, of_tasks
+from mtjax.learning import trials
+from mtjax.learning.evaluation import Evaluations, Scores, of_tasks
 from mtjax.report.stats import seed_interval
 from mtjax.saved.policy import Policy
 

@@ -20,7 +20,7 @@ from typing import Any
 import jax
 
 from mtjax.experience.ring import Ring
-from mtjax.loop import TrainState
+from mtjax.learning.loop import TrainState
 from mtjax.names import notice
 from mtjax.parallel import hosts
 from mtjax.saved import arrays

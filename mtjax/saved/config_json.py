@@ -20,7 +20,7 @@ from mtjax.config import Plan, RunConfig
 from mtjax.envs import ENVS, is_mixture, make
 from mtjax.envs.family import Family
 from mtjax.envs.mixtures import Mixture, Tabled
-from mtjax.loop import Settings
+from mtjax.learning.loop import Settings
 from mtjax.names import is_imported, replacing
 from mtjax.types import InputError
 

@@ -14,7 +14,7 @@ from typing import Any
 from mtjax.agents import settings
 from mtjax.checks import shown
 from mtjax.config import RunConfig
-from mtjax.evaluation import Evaluations, load_evaluations, no_evaluations, require_same_run
+from mtjax.learning.evaluation import Evaluations, load_evaluations, no_evaluations, require_same_run
 from mtjax.names import SPLITS, notice, replacing
 from mtjax.parallel import hosts
 from mtjax.saved.arrays import require_place

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax import frames, loop, standalone
+from mtjax import frames, standalone
 from mtjax.agents import BaseAgent, name_of, swept
 from mtjax.agents.swept import Point
 from mtjax.checks import path, require_whole, shown
@@ -21,6 +21,7 @@ from mtjax.envs.family import Family
 from mtjax.envs.mixtures import Tabled
 from mtjax.experience import Replay
 from mtjax.experience.ring import Ring
+from mtjax.learning import loop
 from mtjax.names import public
 from mtjax.saved import checkpoint as checkpoints
 from mtjax.saved import pretrained

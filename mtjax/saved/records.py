@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from mtjax.evaluation import Evaluations, load_evaluations, require_same_run, save_evaluations
-from mtjax.loop import TrainState
+from mtjax.learning.evaluation import Evaluations, load_evaluations, require_same_run, save_evaluations
+from mtjax.learning.loop import TrainState
 from mtjax.names import notice, replacing
 from mtjax.parallel import hosts
 from mtjax.saved import checkpoint, log

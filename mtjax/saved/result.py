@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax import trials
 from mtjax.agents.swept import Point
 from mtjax.checks import amount
-from mtjax.evaluation import Evaluations
-from mtjax.loop import TrainState
+from mtjax.learning import trials
+from mtjax.learning.evaluation import Evaluations
+from mtjax.learning.loop import TrainState
 from mtjax.names import nearest_error, public
 from mtjax.parallel import hosts
 from mtjax.saved.policy import Policy, policy_of

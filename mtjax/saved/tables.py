@@ -8,7 +8,7 @@ import numpy as np
 
 from mtjax.agents.swept import Point
 from mtjax.envs.mixtures import Tabled
-from mtjax.evaluation import Evaluations
+from mtjax.learning.evaluation import Evaluations
 from mtjax.names import InputError
 
 

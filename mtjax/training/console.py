@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from mtjax import trials
 from mtjax.checks import amount
+from mtjax.learning import trials
 
 _SHARE = 1 / 3  # of a run under random actions from which a warning is due
 _LINES, _SECONDS = 50, 15.0  # plain lines in a run, and the longest time without one

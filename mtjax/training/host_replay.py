@@ -20,7 +20,7 @@ from jax.sharding import Mesh, NamedSharding
 
 from mtjax.experience.replay import newest, recall, segments_of
 from mtjax.experience.store import Store, recalled_rows
-from mtjax.loop import Settings, TrainState
+from mtjax.learning.loop import Settings, TrainState
 from mtjax.names import notice, replacing
 from mtjax.types import Agent, Env
 

@@ -15,7 +15,7 @@ from mtjax.config import RunConfig
 from mtjax.experience.replay import segments_of
 from mtjax.experience.store import recalled_rows
 from mtjax.frames import PICTURES, shown
-from mtjax.loop import Settings, TrainState
+from mtjax.learning.loop import Settings, TrainState
 from mtjax.saved import checkpoint
 from mtjax.saved.policy import state_shapes
 from mtjax.types import Agent, Env, InputError

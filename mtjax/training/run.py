@@ -19,8 +19,8 @@ from mtjax.agents.swept import Point
 from mtjax.compiling.programs import Programs, compile_lowered, jit_programs, load_kernels, sharded_shapes, trace
 from mtjax.config import RunConfig
 from mtjax.envs.engines import host
-from mtjax.evaluation import Episodes, Evaluations, no_evaluations
-from mtjax.loop import TrainState
+from mtjax.learning.evaluation import Episodes, Evaluations, no_evaluations
+from mtjax.learning.loop import TrainState
 from mtjax.parallel import hosts
 from mtjax.parallel import mesh as meshes
 from mtjax.saved import checkpoint, lock, log

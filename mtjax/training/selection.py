@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding
 
-from mtjax import populations
 from mtjax.agents import swept
 from mtjax.checks import amount
 from mtjax.config import RunConfig
-from mtjax.loop import TrainState
+from mtjax.learning import populations
+from mtjax.learning.loop import TrainState
 from mtjax.parallel import hosts
 from mtjax.parallel import mesh as meshes
 from mtjax.saved.log import number

@@ -14,10 +14,10 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents import parts
+from mtjax.agents.networks import Params
 from mtjax.agents.parts import continual
 from mtjax.agents.parts.continual import Anchor, Outputs
 from mtjax.agents.state import Nets
-from mtjax.networks import Params
 from mtjax.types import Array
 
 NET = "continual"

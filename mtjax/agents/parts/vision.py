@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 
 from mtjax import frames
+from mtjax.agents.networks import orthogonal
 from mtjax.agents.parts.convolution import Transposed, convolve
-from mtjax.networks import orthogonal
 from mtjax.types import Array, Key
 
 Vision = Literal["drq", "impala"]

@@ -17,13 +17,13 @@ import jax.numpy as jnp
 import numpy as np
 from PIL import Image, ImageOps
 
-from mtjax.axes import over_worlds
 from mtjax.envs.engines import host
 from mtjax.envs.family import Family
 from mtjax.envs.hosted.spaces import Actor, Reader, TreeReader, reader_of
 from mtjax.envs.hosted.worlds import GONE, TERMINATED, TRUNCATED, Pool, Worlds
 from mtjax.envs.parameters import Parameter
 from mtjax.frames import PICTURES, shown
+from mtjax.parallel.axes import over_worlds
 from mtjax.types import Array, Continuous, Discrete, InputError, Key, Spec, Step, Task
 
 _MOST_FRAMES = 16

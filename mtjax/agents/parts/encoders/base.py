@@ -6,8 +6,8 @@ from typing import ClassVar
 import flax.linen as nn
 
 from mtjax.agents import parts
+from mtjax.agents.networks import MLP, Trunk, join
 from mtjax.agents.parts.knowing import Knowing
-from mtjax.networks import MLP, Trunk, join
 from mtjax.types import Array
 
 

@@ -6,8 +6,8 @@ from typing import ClassVar
 import flax.linen as nn
 import jax.numpy as jnp
 
+from mtjax.agents.networks import STATISTICS, ReLU, UnitDense
 from mtjax.agents.parts.encoders.base import Identity
-from mtjax.networks import STATISTICS, ReLU, UnitDense
 from mtjax.types import Array
 
 

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents import parts
+from mtjax.agents.networks import MLP, join, to_unit
 from mtjax.agents.parts.encoders.base import Identity
 from mtjax.agents.parts.encoders.mixture import Experts, check_experts
-from mtjax.networks import MLP, join, to_unit
 from mtjax.types import Array, InputError
 
 

@@ -8,9 +8,9 @@ import flax.linen as nn
 import jax.numpy as jnp
 
 from mtjax.agents import parts
+from mtjax.agents.networks import MLP, ReLU
 from mtjax.agents.parts.encoders.base import Identity
 from mtjax.agents.parts.encoders.mixture import TaskWeights
-from mtjax.networks import MLP, ReLU
 from mtjax.types import Array, InputError
 
 _lecun = nn.initializers.lecun_normal(batch_axis=0)

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from mtjax.agents import parts
+from mtjax.agents.networks import MLP, ReLU
 from mtjax.agents.parts.encoders.base import Identity
-from mtjax.networks import MLP, ReLU
 from mtjax.types import Array
 
 

@@ -6,9 +6,9 @@ import flax.linen as nn
 import jax.numpy as jnp
 
 from mtjax.agents import parts
+from mtjax.agents.networks import ReLU, UnitDense, join, to_unit
 from mtjax.agents.parts.encoders.base import Identity
 from mtjax.agents.parts.encoders.residual import blocks
-from mtjax.networks import ReLU, UnitDense, join, to_unit
 from mtjax.types import Array
 
 

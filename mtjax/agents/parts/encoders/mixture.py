@@ -7,9 +7,9 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from mtjax.agents.networks import MLP, ReLU, join
 from mtjax.agents.parts.encoders.base import Identity
 from mtjax.agents.parts.knowing import Knowing
-from mtjax.networks import MLP, ReLU, join
 from mtjax.types import Array, InputError
 
 _BY_NUMBER = ("identity", "cluster")

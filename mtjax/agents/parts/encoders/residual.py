@@ -4,8 +4,8 @@ import dataclasses
 
 import flax.linen as nn
 
+from mtjax.agents.networks import ReLU, join
 from mtjax.agents.parts.encoders.base import Identity
-from mtjax.networks import ReLU, join
 from mtjax.types import Array, InputError
 
 _he = nn.initializers.he_normal()

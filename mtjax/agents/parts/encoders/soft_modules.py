@@ -7,8 +7,8 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from mtjax.agents.networks import MLP, ReLU
 from mtjax.agents.parts.encoders.base import Identity
-from mtjax.networks import MLP, ReLU
 from mtjax.types import Array, InputError
 
 

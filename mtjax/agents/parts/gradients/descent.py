@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import optax
 
 from mtjax.agents import parts
-from mtjax.networks import Params, to_unit
+from mtjax.agents.networks import Params, to_unit
 from mtjax.types import Array, InputError
 
 Shape = Literal["constant", "linear", "cosine"]

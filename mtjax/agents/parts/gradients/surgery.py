@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mtjax.agents.networks import Params
 from mtjax.agents.parts.gradients import balancing, rules
-from mtjax.networks import Params
 from mtjax.parallel import collectives
 from mtjax.types import Array, Key, Metrics
 

@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 
 import jax.numpy as jnp
 
-from mtjax.networks import Params
+from mtjax.agents.networks import Params
 from mtjax.types import Array, Key, Metrics, Spec, Task, Transition
 
 

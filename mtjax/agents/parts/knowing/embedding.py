@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents import parts
+from mtjax.agents.networks import Params
 from mtjax.agents.parts.knowing.base import Nothing
-from mtjax.networks import Params
 from mtjax.types import Array, Key
 
 

@@ -8,8 +8,8 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from mtjax.agents.networks import MLP
 from mtjax.agents.parts.knowing.recurrent import Track, gru
-from mtjax.networks import MLP
 from mtjax.types import Array, Key, Metrics
 
 

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents import parts
+from mtjax.agents.networks import MLP, Network, Params
 from mtjax.agents.parts.knowing.base import Nothing
-from mtjax.networks import MLP, Network, Params
 from mtjax.types import Array, Key
 
 

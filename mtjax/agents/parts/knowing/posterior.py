@@ -6,9 +6,9 @@ from typing import Any, ClassVar, Literal
 import jax
 
 from mtjax.agents import parts
+from mtjax.agents.networks import Network, Params
 from mtjax.agents.parts.knowing.inference import INFERENCES, Inference
 from mtjax.agents.parts.knowing.recurrent import Remembering
-from mtjax.networks import Network, Params
 from mtjax.types import Array, Key, Metrics
 
 

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents import parts
+from mtjax.agents.networks import Network, Params, orthogonal
 from mtjax.agents.parts.knowing.base import Nothing
-from mtjax.networks import Network, Params, orthogonal
 from mtjax.types import Array, Key, Transition
 
 

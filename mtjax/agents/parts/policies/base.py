@@ -5,7 +5,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from mtjax.networks import Params
+from mtjax.agents.networks import Params
 from mtjax.types import Array, Key
 
 

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 import jax
 import jax.numpy as jnp
 
+from mtjax.agents.networks import Params
 from mtjax.agents.parts.policies.base import Drawn, Policy
-from mtjax.networks import Params
 from mtjax.types import Array, Discrete, Key
 
 _NEVER = -1e30

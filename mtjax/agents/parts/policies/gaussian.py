@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import jax
 import jax.numpy as jnp
 
+from mtjax.agents.networks import Params
 from mtjax.agents.parts.policies.base import Drawn, Policy
-from mtjax.networks import Params
 from mtjax.types import Array, Continuous, Key
 
 _LOG_STD_RANGE = (-5.0, 2.0)

@@ -6,9 +6,9 @@ from typing import Any
 import flax.linen as nn
 
 from mtjax import frames
+from mtjax.agents.networks import Params
 from mtjax.agents.parts.representations.seeing import Seeing
 from mtjax.agents.parts.vision import Sight
-from mtjax.networks import Params
 from mtjax.types import Array, InputError
 
 

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 
 from mtjax import frames
 from mtjax.agents import parts
+from mtjax.agents.networks import MLP, Params
 from mtjax.agents.parts import vision
 from mtjax.agents.parts.knowing.last_steps import without_past
 from mtjax.agents.parts.representations.encoded import Encoded, init_part
-from mtjax.networks import MLP, Params
 from mtjax.types import Array, Key, Metrics
 
 

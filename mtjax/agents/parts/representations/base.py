@@ -9,8 +9,8 @@ import jax
 
 from mtjax import frames
 from mtjax.agents import parts
+from mtjax.agents.networks import Params
 from mtjax.agents.parts.knowing.last_steps import without_past
-from mtjax.networks import Params
 from mtjax.types import Array, InputError, Key, Metrics, Transition
 
 

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 
 from mtjax import frames
 from mtjax.agents import parts
+from mtjax.agents.networks import OVER_TASKS, Params, Trunk
 from mtjax.agents.parts.knowing.last_steps import without_past
 from mtjax.agents.parts.representations.encoded import Encoded
-from mtjax.networks import OVER_TASKS, Params, Trunk
 from mtjax.types import Array, InputError, Key, Metrics
 
 DEVIATIONS = (0.01, 1.0)

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 
 from mtjax import frames
 from mtjax.agents import parts
+from mtjax.agents.networks import MLP, Network, Params
 from mtjax.agents.parts.knowing.last_steps import without_past
 from mtjax.agents.parts.representations.seeing import Seeing
 from mtjax.agents.parts.vision import NETWORKS, Projection, Vision, project
-from mtjax.networks import MLP, Network, Params
 from mtjax.types import Array, Key
 
 ENCODERS = ("latent",)

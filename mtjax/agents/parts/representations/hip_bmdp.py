@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents import parts
+from mtjax.agents.networks import Params, join
 from mtjax.agents.parts.knowing.embedding import unit
 from mtjax.agents.parts.knowing.last_steps import TrajectoryEncoder
 from mtjax.agents.parts.representations.base import Unseen
 from mtjax.agents.parts.representations.deepmdp import DeepMDP, ModelTargets
-from mtjax.networks import Params, join
 from mtjax.types import Array, Key, Metrics
 
 STAND_INS = {

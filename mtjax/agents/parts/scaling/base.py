@@ -6,7 +6,7 @@ from typing import Any, ClassVar, NamedTuple
 import jax.numpy as jnp
 
 from mtjax.agents import parts
-from mtjax.networks import Params
+from mtjax.agents.networks import Params
 from mtjax.types import Array, Transition
 
 

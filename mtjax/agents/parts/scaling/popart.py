@@ -5,8 +5,8 @@ import dataclasses
 import jax.numpy as jnp
 
 from mtjax.agents import parts
+from mtjax.agents.networks import Params
 from mtjax.agents.parts.scaling.base import Moments, NoScaling
-from mtjax.networks import Params
 from mtjax.types import Array
 
 

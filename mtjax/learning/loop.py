@@ -13,15 +13,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mtjax import curricula, frames
+from mtjax import frames
 from mtjax.agents.consolidating import consolidate, consolidates
 from mtjax.agents.fit import reset_networks
 from mtjax.agents.state import of_tasks, with_tasks
 from mtjax.agents.swept import at_point, with_numbers
-from mtjax.axes import over_seeds, when
 from mtjax.checks import check_fields
-from mtjax.parallel import collectives
-from mtjax.rollout import (
+from mtjax.learning import curricula
+from mtjax.learning.rollout import (
     EnvStep,
     Worlds,
     bounded_worlds,
@@ -32,7 +31,9 @@ from mtjax.rollout import (
     step_envs,
     world_keys,
 )
-from mtjax.trials import ResetFree, Trials, of_episodes
+from mtjax.learning.trials import ResetFree, Trials, of_episodes
+from mtjax.parallel import collectives
+from mtjax.parallel.axes import over_seeds, when
 from mtjax.types import Agent, Array, Env, InputError, Key, Metrics, Sometimes, Task, Transition
 
 PHASES = 10

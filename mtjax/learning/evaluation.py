@@ -1,6 +1,7 @@
 """Evaluation plays whole trials under the mean action, on any tasks, with keys of its own.
 
-Of trials of several episodes (``mtjax.trials``), the episodes of one follow each other along the axis of episodes.
+Of trials of several episodes (``mtjax.learning.trials``), the episodes of one follow each other along the axis of
+episodes.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from mtjax.agents.swept import at_point
-from mtjax.axes import over_seeds
+from mtjax.learning.rollout import EnvStep, Worlds, reset_ended, reset_envs, split_keys, step_envs, world_keys
+from mtjax.learning.trials import of_episodes
 from mtjax.names import replacing
-from mtjax.rollout import EnvStep, Worlds, reset_ended, reset_envs, split_keys, step_envs, world_keys
-from mtjax.trials import of_episodes
+from mtjax.parallel.axes import over_seeds
 from mtjax.types import SPLITS, Adapting, Agent, Array, Env, InputError, Key, Task, Transition
 
 _EVER = "success_ever"  # the metric that success was 1 at any step of an episode

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 
 from mtjax import frames
 from mtjax.agents.swept import at_point
-from mtjax.axes import over_learners, renew_worlds, where_worlds
+from mtjax.learning.trials import EACH_EPISODE, Ends, Trials
 from mtjax.parallel import collectives
+from mtjax.parallel.axes import over_learners, renew_worlds, where_worlds
 from mtjax.tasks import contexts_vary, episode_task
-from mtjax.trials import EACH_EPISODE, Ends, Trials
 from mtjax.types import Acted, Agent, Array, Env, Key, Task, Transition
 
 _LARGEST = 1e10

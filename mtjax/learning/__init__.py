@@ -1,0 +1,1 @@
+"""Acting, learning and evaluating in one compiled loop."""
