@@ -24,6 +24,7 @@ from mtjax.checks import MOST_EPISODES, check_fields, path, require_library, req
 from mtjax.envs import make
 from mtjax.envs import name_of as env_name_of
 from mtjax.envs.mixtures import Tabled
+from mtjax.envs.task_table import forgetful
 from mtjax.experience import Replay
 from mtjax.frames import shown
 from mtjax.learning import populations, trials
@@ -204,9 +205,9 @@ class RunConfig:
         """
         if self.env:
             self._check_named()
-        if self.mesh is not None and (forgetful := getattr(self.family, "forgetful", "")):
+        if self.mesh is not None and (lost := forgetful(self.family)):
             raise InputError(
-                f"{forgetful} steps on the host of one device, and this run is on {self.mesh.size}; show JAX one, such "
+                f"{lost} steps on the host of one device, and this run is on {self.mesh.size}; show JAX one, such "
                 "as by CUDA_VISIBLE_DEVICES=0"
             )
         self.learner.experience.check(self.family, self.played.num_envs, self.played.chunk_steps)

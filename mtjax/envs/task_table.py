@@ -64,6 +64,11 @@ class Outside(NamedTuple):
         return any([maker.load_kernels() for maker in self.makers if maker])
 
 
+def forgetful(env: Any) -> str:
+    """Return the names of families whose worlds are lost with the process; empty if there are none."""
+    return ", ".join(part.family.name for part in getattr(env, "parts", ()) if part.family.forgets)
+
+
 # Methods of families and of mixtures.
 
 

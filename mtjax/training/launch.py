@@ -7,6 +7,7 @@ import jax
 
 from mtjax.config import RunConfig
 from mtjax.envs import Family
+from mtjax.envs.task_table import forgetful
 from mtjax.parallel import hosts
 from mtjax.saved.folder import remove_unused
 from mtjax.saved.policy import Policy, load
@@ -60,9 +61,8 @@ def _introduction(config: RunConfig, hooks: Hooks) -> list[str]:
     lines += [] if hooks.directory is None else [f"run: {hooks.directory}"]
     if hooks.resume and "warp" in config.family.engine_name:
         lines.append("MuJoCo Warp does not repeat bit for bit: the run goes on from its state, in other numbers")
-    forgetful = ", ".join(part.family.name for part in config.family.parts if part.family.forgets)
-    if hooks.resume and forgetful:
-        lines.append(f"worlds of {forgetful} cannot be saved: new episodes begin, and the run goes on in other numbers")
+    if hooks.resume and (lost := forgetful(config.family)):
+        lines.append(f"worlds of {lost} cannot be saved: new episodes begin, and the run goes on in other numbers")
     if jax.default_backend() == "cpu":
         lines += [_warning(family, agent) for family, agent in slow_on_cpu(config).items() if agent != config.agent]
     if hooks.resume and config.learner.lr_schedule != "constant" and not config.learner.lr_updates:

@@ -19,6 +19,7 @@ from mtjax.agents.swept import Point
 from mtjax.compiling.programs import Programs, compile_lowered, jit_programs, load_kernels, sharded_shapes, trace
 from mtjax.config import RunConfig
 from mtjax.envs.engines import host
+from mtjax.envs.task_table import forgetful
 from mtjax.learning.evaluation import Episodes, Evaluations, no_evaluations
 from mtjax.learning.loop import TrainState
 from mtjax.parallel import hosts
@@ -207,8 +208,8 @@ class _Run:
 
     def _restored(self, shapes: TrainState) -> TrainState:
         """Return the state of the newest checkpoint. Returns do not count episodes whose worlds are lost."""
-        state, forgetful = self.records.restore(shapes), getattr(self.config.family, "forgetful", "")
-        return state._replace(counted=state.counted & False) if forgetful else state
+        state = self.records.restore(shapes)
+        return state._replace(counted=state.counted & False) if forgetful(self.config.family) else state
 
     def _describe(self, shapes: TrainState) -> None:
         env, settings = self.config.family, self.config.played
