@@ -6,6 +6,7 @@ import math
 import os
 import shutil
 from functools import cache, lru_cache
+from itertools import count
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
@@ -14,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import probes
 import pytest
+from jax._src.interpreters import mlir
 from needs import count_skips, require, skip_without_packages
 from tyro import _docstrings
 
@@ -39,6 +41,7 @@ def pytest_configure(config):
         added = [f"--{name}={value}" for name, value in QUICK_FLAGS.items() if name not in given]
         os.environ["XLA_FLAGS"] = " ".join([given, *added]).strip()
     read_classes_once()
+    lower_many_in_one_context()
     files = getattr(config, "cache", None)
     if files is not None:
         keep = {
@@ -59,6 +62,23 @@ def read_classes_once():
     tokens = getattr(_docstrings, "_ClassTokenization", None)
     if hasattr(getattr(tokens, "make", None), "__wrapped__"):  # tyro may change what is its own
         tokens.make = staticmethod(cache(tokens.make.__wrapped__))  # type: ignore
+
+
+def lower_many_in_one_context():
+    """Lower 50 programs in one MLIR context. JAX makes one for each, which is a sixth of what a small program costs.
+
+    A context keeps all constants and types that it has seen, so that it may not live for ever.
+    """
+    make, made = getattr(mlir, "make_ir_context", None), count()
+    if make is not None:  # JAX may change what is its own
+        of_number = lru_cache(1)(lambda number: make())
+        mlir.make_ir_context = lambda: of_number(next(made) // 50)
+
+
+def pytest_collection_finish():
+    """Never search what was imported and collected for garbage again: it lives as long as the process."""
+    gc.collect()
+    gc.freeze()
 
 
 def use_gpu(config):

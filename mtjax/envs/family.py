@@ -266,7 +266,7 @@ class Family(abc.ABC):
     @property
     def parts(self) -> tuple[Part, ...]:
         """Return the family itself as the only part."""
-        counts = {split: len(rows) for split, rows in self.table.rows.items()}
+        counts = self.counts  # without the table, as names and presets ask for the parts before a model is built
         counts["all"] = sum(counts.values())
         return (Part("", self, {split: np.arange(count) for split, count in counts.items()}),)
 
