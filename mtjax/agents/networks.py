@@ -5,6 +5,7 @@ A network is a body and a linear head. It is applied to the data of one task; th
 
 import dataclasses
 from collections.abc import Callable, Collection, Mapping
+from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 import flax.linen as nn
@@ -127,23 +128,19 @@ class Network:
     def init(self, key: Key, num_tasks: int, out: int, features: Array, *inputs: Array) -> Params:
         """Initialise parameters for ``num_tasks`` tasks, ``out`` outputs, and inputs of the given shapes."""
         body_key, head_key, _, front_key = jax.random.split(key, 4)
-        params, parts = Params({}, {}), {}
+        params, parts, init = Params({}, {}), {}, partial(self._init_part, num_tasks)
         if self.sight is not None and isinstance(inputs[0], Mapping):
-            parts["sight"] = (self.sight.init, jax.random.fold_in(key, 5), inputs[0])
+            parts["sight"] = init("sight", self.sight.init, jax.random.fold_in(key, 5), inputs[0])
             inputs = (self.sight.init_with_output(key, inputs[0])[0], *inputs[1:])  # type: ignore
         if self.front is not None:
             params.own["front"] = self.for_each_task(self.front.init, front_key, num_tasks, inputs[0])
             first = jax.tree.map(lambda x: x[0], params.own["front"])
             inputs = (jnp.asarray(self.front.apply(first, inputs[0])), *inputs[1:])
         data = (inputs[0], features, *inputs[1:])
-        width = jax.eval_shape(lambda: self.body.init_with_output(body_key, *data)[0]).shape[-1]
-        parts["body"] = (self.body.init, body_key, *data)
-        parts["head"] = (lambda key: self._init_head(key, width, out), head_key)
-        for name, (init, part_key, *arguments) in parts.items():
-            if name in self.own:
-                params.own[name] = self.for_each_task(init, part_key, num_tasks, *arguments)
-            else:
-                params.shared[name] = init(part_key, *arguments)
+        hidden, parts["body"] = init("body", self.body.init_with_output, body_key, *data)
+        parts["head"] = init("head", lambda key: self._init_head(key, hidden.shape[-1], out), head_key)
+        for name, part in parts.items():
+            (params.own if name in self.own else params.shared)[name] = part
         if STATISTICS in {**params.shared, **params.own}["body"]:
             self._give_statistics(params, num_tasks)
         return params
@@ -155,6 +152,10 @@ class Network:
         else:
             each = lambda x: jnp.repeat(x[None], num_tasks, axis=0)
             params.own[STATISTICS] = jax.tree.map(each, params.shared["body"].pop(STATISTICS))
+
+    def _init_part(self, num_tasks: int, name: str, init, key: Key, *arguments: Any):
+        """Initialise a part for all tasks, or separately for every one if it is its own."""
+        return self.for_each_task(init, key, num_tasks, *arguments) if name in self.own else init(key, *arguments)
 
     @staticmethod
     def for_each_task(init, key: Key, num_tasks: int, *arguments: Any):
