@@ -74,6 +74,14 @@ def test_task_vectors_come_back(state, tmp_path):
     np.testing.assert_array_equal(loaded.shared["given"], vectors)
 
 
+@pytest.fixture(scope="module")
+def older(state, tmp_path_factory):
+    """The checkpoints of a run at its 25th iteration. Only to be copied."""
+    folder = tmp_path_factory.mktemp("older")
+    checkpoint.save(folder, at(state, 25))
+    return folder
+
+
 def test_two_newest_are_kept(state, tmp_path):
     """The newest is the one that is read; saving an iteration twice is harmless."""
     for iteration in (25, 50, 75, 75):
@@ -84,11 +92,12 @@ def test_two_newest_are_kept(state, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["lr[1]", "proj [v2]", "a*", "a?", "50%", "a\nb", "é", "-a", "~", "{a}", "a:b", '"a"'])
-def test_a_folder_may_have_any_name(state, tmp_path, name):
+def test_a_folder_may_have_any_name(state, older, tmp_path, name):
     """No character of it is a pattern, also beside a folder that such a pattern matches."""
-    for folder, iteration in ((tmp_path / "ab", 25), (tmp_path / "1", 25), (tmp_path / name, 50)):
-        folder.mkdir()
-        checkpoint.save(folder / "checkpoints", at(state, iteration))
+    for other in ("ab", "1"):
+        shutil.copytree(older, tmp_path / other / "checkpoints")
+    (tmp_path / name).mkdir()
+    checkpoint.save(tmp_path / name / "checkpoints", at(state, 50))
     assert_equal(checkpoint.load(tmp_path / name / "checkpoints", state), at(state, 50))
 
 

@@ -260,7 +260,7 @@ def test_gymnasium_and_fine_tuning_take_one_family():
 
 
 def steps_of(env, tasks, keys, actions):
-    """The steps of worlds under actions (H, S, T, E, A), and the state after them."""
+    """The steps of worlds under actions (H, S, T, E, A), and the state after them; by NumPy but for the state."""
 
     def play(tasks, keys, actions):
         start = env.reset_worlds(tasks, keys)
@@ -272,7 +272,8 @@ def steps_of(env, tasks, keys, actions):
         state, seen = jax.lax.scan(step, start.state, actions)
         return start.obs, seen, state
 
-    return quick(play, spread(tasks, keys.shape[2]), keys, actions)
+    start, seen, state = quick(play, spread(tasks, keys.shape[2]), keys, actions)
+    return *jax.device_get((start, seen)), state
 
 
 @pytest.mark.parametrize("split", slow_but(["train", "all"], "all"))
@@ -281,7 +282,7 @@ def test_every_family_steps_as_it_does_alone(split):
     env = mixture([make("control-cartpole", num_tasks=2), *scored])
     tasks = env.tasks(split)
     keys = keys_of(tasks)
-    actions = jax.random.uniform(jax.random.key(1), (5, *keys.shape, env.spec.action_size), minval=-1.0)
+    actions = np.asarray(jax.random.uniform(jax.random.key(1), (5, *keys.shape, env.spec.action_size), minval=-1.0))
     start, seen, states = steps_of(env, tasks, keys, actions)
     for part, state in zip(env.parts, env.apart(states), strict=True):
         size, width, places = part.family.spec.action_size, part.family.spec.obs_size, part.places[split]
@@ -299,21 +300,20 @@ def test_every_family_steps_as_it_does_alone(split):
 
 
 def test_worlds_that_end_begin_anew_and_the_others_go_on():
-    tasks = BOTH.tasks("all")
+    tasks, reset, move = BOTH.tasks("all"), jax.jit(BOTH.reset_worlds), jax.jit(BOTH.step_worlds)
     each, keys = spread(tasks), keys_of(tasks)
-    old, new = BOTH.reset_worlds(each, keys), BOTH.reset_worlds(each, keys_of(tasks, seed=1))
+    old, new = reset(each, keys), reset(each, keys_of(tasks, seed=1))
     mask = jax.random.bernoulli(jax.random.key(2), shape=keys.shape)
-    chosen = BOTH.step_worlds(each, BOTH.where_worlds(mask, new.state, old.state), jnp.zeros((*keys.shape, 2)))
-    both = [BOTH.step_worlds(each, step.state, jnp.zeros((*keys.shape, 2))).obs for step in (new, old)]
-    np.testing.assert_array_equal(chosen.obs, jnp.where(mask[..., None], *both))
+    chosen = move(each, jax.jit(BOTH.where_worlds)(mask, new.state, old.state), jnp.zeros((*keys.shape, 2)))
+    both = [move(each, step.state, jnp.zeros((*keys.shape, 2))).obs for step in (new, old)]
+    np.testing.assert_array_equal(chosen.obs, np.where(np.asarray(mask)[..., None], *both))
 
 
 def test_metrics_are_those_of_all_families_and_unknown_elsewhere():
     tasks = BOTH.tasks("train")
-    step = BOTH.step_worlds(
-        spread(tasks), BOTH.reset_worlds(spread(tasks), keys_of(tasks)).state, jnp.full((1, 4, 2, 2), 0.5)
-    )
-    assert np.isnan(step.metrics["success"][0, :3]).all() and (step.metrics["success"][0, 3] == 1).all()
+    actions = jnp.full((1, 1, 4, 2, 2), 0.5)
+    success = steps_of(BOTH, tasks, keys_of(tasks), actions)[1].metrics["success"][0, 0]
+    assert np.isnan(success[:3]).all() and (success[3] == 1).all()
 
 
 def test_only_whole_splits_are_stepped():
@@ -671,16 +671,14 @@ def test_families_with_pictures_of_one_shape_mix():
     assert {name: x.shape for name, x in env.spec.obs.items()} == {"pixels": (16, 16, 1), "state": (3,)}
     assert (env.spec.frames, env.spec.mixed, shown().spec.obs.keys()) == (2, True, {"pixels"})
     tasks, keys = env.tasks(), keys_of(env.tasks())
-    start = env.reset_worlds(spread(tasks)._replace(blocks=tasks.blocks), keys)
-    step = env.step_worlds(spread(tasks)._replace(blocks=tasks.blocks), start.state, jnp.ones((1, 3, 2, 1)))
+    start, seen, _ = steps_of(env, tasks, keys, jnp.ones((1, 1, 3, 2, 1)))
     for place, family in zip((slice(0, 2), slice(2, 3)), env.families, strict=True):
-        own = spread(family.tasks())
-        theirs = family.reset_worlds(own, keys[:, place])
-        then = family.step_worlds(own, theirs.state, jnp.ones((*own.id.shape, 1)))
-        for ours, alone in ((start, theirs), (step, then)):
-            np.testing.assert_array_equal(ours.obs["pixels"][:, place], alone.obs["pixels"])
-            np.testing.assert_array_equal(ours.obs["state"][:, place][..., : family.obs_size], alone.obs["state"])
-            assert not np.any(ours.obs["state"][:, place][..., family.obs_size :])
+        own = family.tasks()
+        theirs, then, _ = steps_of(family, own, keys[:, place], jnp.ones((1, 1, len(own.id), 2, 1)))
+        for ours, alone in ((start, theirs), (jax.tree.map(lambda x: x[0], x.obs) for x in (seen, then))):
+            np.testing.assert_array_equal(ours["pixels"][:, place], alone["pixels"])
+            np.testing.assert_array_equal(ours["state"][:, place][..., : family.obs_size], alone["state"])
+            assert not np.any(ours["state"][:, place][..., family.obs_size :])
 
 
 def test_families_that_look_otherwise_do_not_mix():
@@ -731,12 +729,13 @@ def test_families_of_discrete_actions_mix():
     assert env.discrete and env.spec.action == Discrete(5)
     assert tasks.action_mask.tolist() == [[1, 1, 0, 0, 0]] * 2 + [[1] * 5] * 2
     agent = for_action(tiny("ppo"), env.spec.action)
-    state, keys = agent.init(env.spec, tasks, jax.random.key(1)), jax.random.split(jax.random.key(0), 200)
+    state = quick(lambda key: agent.init(env.spec, tasks, key), jax.random.key(1))
     act = lambda task, key: agent.act(state, agent.begin(state, task), jnp.ones(env.spec.obs_size), task, key).action
-    actions = jax.vmap(jax.vmap(act, (None, 0)), (0, None))(tasks._replace(blocks=None), keys)
+    act_all, keys = jax.vmap(jax.vmap(act, (None, 0)), (0, None)), jax.random.split(jax.random.key(0), 200)
+    actions = np.asarray(quick(act_all, tasks._replace(blocks=None), keys))
     assert [np.unique(x).tolist() for x in actions] == [[0, 1]] * 2 + [[0, 1, 2, 3, 4]] * 2
     keys = keys_of(tasks)
-    drawn = jax.random.randint(jax.random.key(2), (3, *keys.shape), 0, 2)
+    drawn = np.asarray(jax.random.randint(jax.random.key(2), (3, *keys.shape), 0, 2))
     _, seen, _ = steps_of(env, tasks, keys, drawn)
     for part in env.parts:
         places = part.places["train"]

@@ -2,8 +2,7 @@
 
 import dataclasses
 import itertools
-import math
-from functools import cache, partial
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -462,29 +461,29 @@ def test_the_actor_rests_once_it_is_too_far_away():
 
 
 def allowed(row):
-    return _allowed(tuple(row.items()))
-
-
-@cache  # ``pairs`` asks of many a row in each of its rounds
-def _allowed(row):
     try:
-        return bool(small(**dict(row), **({"vectors": "x"} if ("conditioning", "vectors") in row else {})))
+        return bool(small(**row, **({"vectors": "x"} if row.get("conditioning") == "vectors" else {})))
     except InputError:
         return False
 
 
 def pairs(**choices):
     """Settings in which every two choices of different kinds meet at least once, but for those that are refused."""
-    pairs_of = lambda row: {frozenset(pair) for pair in itertools.combinations(row.items(), 2)}
     whole = [dict(zip(choices, row, strict=True)) for row in itertools.product(*choices.values())]
     np.random.default_rng(0).shuffle(whole)
-    rows, met = [], set()
-    for fewest in range(math.comb(len(choices), 2), 0, -1):
-        for row in whole:
-            new = pairs_of(row) - met
-            if len(new) >= fewest and allowed(row):
-                rows.append(row)
-                met |= new
+    numbers = {}  # of every two choices
+    number = lambda pair: numbers.setdefault(pair, len(numbers))
+    found = np.array([[number(pair) for pair in itertools.combinations(row.items(), 2)] for row in whole])
+    rows, missing, refused = [], np.ones(len(numbers), bool), set()
+    for fewest in range(found.shape[1], 0, -1):
+        start = 0
+        while len(left := start + np.flatnonzero(missing[found[start:]].sum(axis=1) >= fewest)):
+            i = next((i for i in left if i not in refused and allowed(whole[i])), None)
+            refused.update(left if i is None else left[left < i])
+            if i is None:
+                break
+            rows.append(whole[i])
+            missing[found[i]], start = False, i + 1
     return rows
 
 
