@@ -227,8 +227,14 @@ def policy_of(
         states = states._replace(numbers={})
     rows = slice(seed, seed + 1) if member else _point_rows(count, seed)
     own, seeds = (0, seeds[seed % count][None]) if member else (seed % count, seeds)
-    states = jax.tree.map(lambda x: x[rows], states)
-    return Policy(env, agent, jax.tree.map(lambda x: x[own], states), states, seeds, directory, own)
+    states = _rows(states, np.arange(len(jax.tree.leaves(states)[0]))[rows])
+    return Policy(env, agent, _rows(states, own), states, seeds, directory, own)
+
+
+@jax.jit
+def _rows(states: Any, index: Array | int) -> Any:
+    """Pick one row of every leaf, or several. Outside of one program every shape of a leaf would be compiled for."""
+    return jax.tree.map(lambda x: x[index], states)
 
 
 def _require_seed(seed: int, seeds: int, num_points: int) -> None:

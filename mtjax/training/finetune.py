@@ -120,8 +120,9 @@ def adopt(start: Policy, agent: BaseAgent, tasks: Task, fresh: Any) -> Any:
         InputError: the shapes of the networks differ.
     """
     seeds = jnp.arange(len(jax.tree.leaves(fresh)[0])) % len(start.seeds)
-    old = jax.tree.map(lambda x: x[seeds], start.states)
-    state = jax.vmap(partial(_adopt, agent, tasks))(old, fresh)
+    of_seeds = lambda states: jax.tree.map(lambda x: x[seeds], states)
+    adopt_all = lambda states, fresh: jax.vmap(partial(_adopt, agent, tasks))(of_seeds(states), fresh)
+    state = jax.jit(adopt_all)(start.states, fresh)
     pairs = zip(jax.tree.leaves_with_path(state), jax.tree.leaves(fresh), strict=True)
     for (path, ours), expected in pairs:
         if ours.shape != expected.shape:
