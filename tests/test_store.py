@@ -20,6 +20,7 @@ from mtjax.config import configure
 from mtjax.envs.probes import Pictured
 from mtjax.experience import Replay, pictures, store
 from mtjax.experience import ring as rings
+from mtjax.experience.replay import recall
 from mtjax.experience.store import Store
 from mtjax.learning import loop
 from mtjax.learning.loop import Settings
@@ -194,7 +195,7 @@ def test_segments_are_written_in_place():
     item = Transition(*[jnp.zeros(40)] * 2, jnp.float32(0), jnp.float32(0), jnp.zeros(40), jnp.bool_(0))
     data = jax.eval_shape(lambda keys: replay.init(item, spec, TASKS, 4, keys), jax.random.split(jax.random.key(0), 2))
     segments = jax.tree.map(lambda x: jax.ShapeDtypeStruct((*x.shape[:2], 64, *x.shape[3:]), x.dtype), data.ring.rows)
-    used = jax.jit(replay.recall, donate_argnums=0).lower(data, segments).compile().memory_analysis()
+    used = jax.jit(recall, donate_argnums=0).lower(data, segments).compile().memory_analysis()
     assert used.temp_size_in_bytes < checkpoint.size_of(segments) < checkpoint.size_of(data) / 10
 
 
