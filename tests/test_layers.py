@@ -129,8 +129,8 @@ def test_folders_import_in_no_circle():
 @pytest.mark.parametrize("group", ["agents", "experience", "types"])
 def test_a_class_fits_in_the_head(group):
     """With properties it has at most 15 methods of its own."""
-    trees = [tree for module, tree in TREES.items() if f"{module}.".startswith(f"mtjax.{group}.")]
-    classes = [node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
+    of_group = [tree for module, tree in trees().items() if f"{module}.".startswith(f"mtjax.{group}.")]
+    classes = [node for tree in of_group for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
     methods = {cls.name: sum(isinstance(node, ast.FunctionDef) for node in cls.body) for cls in classes}
     assert methods
     assert not {name: count for name, count in methods.items() if count > 15}

@@ -13,12 +13,13 @@ _PACKAGE = Path(__file__).parents[1]
 OF_EVERY_RUN = (  # titles, and the classes whose fields are flags of every run
     ("what runs", "config.py", "RunConfig"),
     ("for how long (a preset may say otherwise)", "config.py", "Plan"),
-    ("how worlds are played (a preset may say otherwise)", "loop.py", "Settings"),
+    ("how worlds are played (a preset may say otherwise)", "learning/loop.py", "Settings"),
 )
 _SETTING = re.compile(  # the name and type of a class's setting, which has a default and a documentation
     r'^    ([a-z]\w*): (?!ClassVar|.*Suppress)(.+) = .+\n    """', re.MULTILINE
 )
-_HOMES = {"config.py": "--", "loop.py": "--", "envs": "--env.", "agents": "--agent.", "experience": "--agent."}
+_HOMES = {"config.py": "--", "learning/loop.py": "--", "envs": "--env."}
+_HOMES |= {"agents": "--agent.", "experience": "--agent."}
 _UNPREFIXED = ("prefix_name=False", "_FLAG")  # in the types of settings whose flags are in no group
 
 
