@@ -34,8 +34,8 @@ def test_each_episode_is_a_trial_that_a_limit_cuts_off_and_a_terminal_state_ends
     np.testing.assert_array_equal(ends.terminal, [0, 1, 0, 0])
 
 
-def test_a_repeated_trial_ends_with_its_last_episode_and_nothing_follows():
-    """However that episode ends. Inside the trial neither a terminal state nor a limit is terminal for the learner."""
+def test_a_repeated_trial_ends_with_its_last_episode_and_is_terminal_where_that_is():
+    """Inside the trial neither a terminal state nor a limit is terminal for the learner, and at its end no limit is."""
     terminated = jnp.array([0, 1, 0, 0, 0, 1, 0, 0]) > 0
     timeout = jnp.array([0, 0, 1, 0, 0, 0, 1, 0]) > 0
     lost = jnp.array([0, 0, 0, 1, 0, 0, 0, 1]) > 0
@@ -43,7 +43,7 @@ def test_a_repeated_trial_ends_with_its_last_episode_and_nothing_follows():
     np.testing.assert_array_equal(ends.episode, [0, 1, 1, 1, 0, 1, 1, 1])
     np.testing.assert_array_equal(ends.world, ends.episode)
     np.testing.assert_array_equal(ends.trial, [0, 0, 0, 0, 0, 1, 1, 1])
-    np.testing.assert_array_equal(ends.terminal, ends.trial)
+    np.testing.assert_array_equal(ends.terminal, [0, 0, 0, 0, 0, 1, 0, 0])
 
 
 def test_a_reset_free_world_goes_on_unless_it_is_lost():
@@ -78,6 +78,13 @@ class Counting(Stub):
         return memory + jnp.stack([1.0, jnp.float32(transition.ended)])
 
 
+@dataclasses.dataclass(frozen=True)
+class Finite(Drifting):
+    """The same, with five steps an episode by its rules."""
+
+    finite_horizon = True
+
+
 def play(env, seeds=(0,), chunks=1, **given):
     """The steps (S, T, E, H, ...) of a run without random actions, as its replay holds them, and its last state."""
     state, history = train(env, Counting(), {"warmup_steps": 1, **SETTINGS, **given}, seeds=seeds, chunks=chunks)
@@ -105,8 +112,17 @@ def test_a_trial_closes_with_every_third_episode(drifting):
 
 
 def test_only_the_end_of_a_trial_is_terminal(drifting):
-    """Though a third of the episodes terminate in it."""
+    """Though a third of the episodes terminate in it; and only if it is no limit of time, which five steps are."""
     rows, *_ = drifting
+    limit = np.zeros(rows.ended.shape, bool)
+    limit[..., 4:] = rows.ended[..., 4:] & ~np.any([rows.ended[..., k : k - 4] for k in range(4)], axis=0)
+    assert rows.closed[limit].any() and rows.closed[~limit].any()
+    np.testing.assert_array_equal(rows.discount[..., 4:], 1.0 - (rows.closed & ~limit)[..., 4:])
+
+
+def test_a_trial_is_terminal_where_its_length_is_part_of_the_problem():
+    """Whatever ends its last episode."""
+    rows, *_ = play(Finite())
     np.testing.assert_array_equal(rows.discount, 1.0 - rows.closed)
 
 

@@ -26,6 +26,8 @@ class HiddenTasks(Choosing, Family):
     told: bool = False
     """Show the task in the context after all, for a bound of what can be earned by finding it out."""
 
+    finite_horizon: ClassVar[bool] = True
+
     @abc.abstractmethod
     def pool(self) -> np.ndarray:
         """Return the numbers (P, C) that make each task, from 0 to ``largest``."""

@@ -263,6 +263,11 @@ class Mixture:
         return any(family.discrete for family in self.families)
 
     @property
+    def finite_horizon(self) -> bool:
+        """Return whether how long an episode is, is part of the problem in all families."""
+        return all(family.finite_horizon for family in self.families)
+
+    @property
     def episode_length(self) -> int:
         """Return the steps of the longest family's episodes."""
         return max(family.episode_length for family in self.families)

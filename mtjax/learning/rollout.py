@@ -164,8 +164,9 @@ def step_envs(
     obs = where_worlds(lost, worlds.obs, frames.push(worlds.obs, step.obs))
     age = worlds.age + 1
     timeout = age >= each.horizon
+    terminated = step.terminated | timeout if getattr(env, "finite_horizon", False) else step.terminated
     timeout = timeout if step.truncated is None else timeout | step.truncated
-    ends = trials.ends(step.terminated & ~lost, timeout, lost, worlds.episode)
+    ends = trials.ends(terminated & ~lost, timeout, lost, worlds.episode)
     transition = Transition(
         obs=worlds.obs,
         action=action,

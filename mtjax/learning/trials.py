@@ -2,7 +2,9 @@
 
 For the learner a trial is the whole problem: sums of rewards, the task and the agent's memory end with it, and not with
 each of its episodes. Inside a trial the discount is 1, and what follows an episode's last step is the first observation
-of the next episode (Duan et al. 2016, "RL^2").
+of the next episode (Duan et al. 2016, "RL^2"). Where the last episode of a trial ends, the value that would follow counts
+if it was cut off by a mere limit of time, as for single episodes: an agent that does not see the time could not foresee
+that it ends. In families of a finite horizon (``Family.finite_horizon``) the last step is a terminal one.
 """
 
 import dataclasses
@@ -36,7 +38,7 @@ class EachEpisode:
         """Return what has ended with a step.
 
         Args:
-            terminated: the world reached a terminal state.
+            terminated: the world reached a terminal state, or the end of a finite horizon.
             timeout: the episode has taken as many steps as it may.
             lost: the world blew up (``rollout.step_envs``).
             episode: int32, how many episodes of the trial came before; None where trials are single episodes.
@@ -47,7 +49,7 @@ class EachEpisode:
 
 @dataclasses.dataclass(frozen=True)
 class Repeated:
-    """A trial is some episodes of one task. Their number is part of the problem: nothing follows after the last."""
+    """A trial is some episodes of one task. It is terminal where its last episode is."""
 
     episodes: int
     keeps_state: ClassVar[bool] = False
@@ -59,7 +61,7 @@ class Repeated:
     def ends(self, terminated: Array, timeout: Array, lost: Array, episode: Any) -> Ends:
         ended = terminated | lost | timeout
         last = ended & (episode + 1 == self.episodes)
-        return Ends(ended, last, last, ended)
+        return Ends(ended, last, last & terminated, ended)
 
 
 @dataclasses.dataclass(frozen=True)
