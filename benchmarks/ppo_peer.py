@@ -209,6 +209,7 @@ def ours(arguments: argparse.Namespace, name: str, side: str, seed: int) -> tupl
     given = {"num_envs": 2048, "minibatches": 32} if side == "mtjax-as-wide" else {}
     agent, settings = configure(config.learner, config.training, given)
     settings = dataclasses.replace(settings, num_envs=max(settings.num_envs // arguments.smaller, 1))
+    choices = choices_of(config.family, agent, settings)
     begun, spent, points, seconds = parts.since_start(), [0.0], [], [0.0, 0.0]
 
     def begin(row: dict[str, Any]) -> bool:
@@ -226,19 +227,23 @@ def ours(arguments: argparse.Namespace, name: str, side: str, seed: int) -> tupl
     config = dataclasses.replace(config, plan=plan, training=settings, learner=agent)
     config.check()
     launch(config, Hooks(on_chunk=begin, on_evaluation=note, quiet=True))
-    family, batch = config.family, settings.num_envs * agent.experience.unroll
-    choices = {
+    return points, choices | {"imported_after": begun}
+
+
+def choices_of(family: Any, agent: Any, settings: Any) -> dict[str, Any]:
+    """Return what our side chooses, as the table shows it beside Playground's choices."""
+    rollouts = agent.experience
+    batch = settings.num_envs * rollouts.unroll
+    return {
         "worlds": settings.num_envs,
-        "gradient_steps_per_million": 1e6 * agent.epochs * agent.minibatches / batch,
-        "samples_per_gradient_step": batch // agent.minibatches,
-        "passes": agent.epochs,
+        "gradient_steps_per_million": 1e6 * rollouts.epochs * rollouts.minibatches / batch,
+        "samples_per_gradient_step": batch // rollouts.minibatches,
+        "passes": rollouts.epochs,
         "substeps": family.num_substeps,
         "substep_seconds": family.models[0].opt.timestep,
         "engine": family.engine_name,
-        "imported_after": begun,
         "all": {"agent": str(agent), "training": dataclasses.asdict(settings)},
     }
-    return points, choices
 
 
 def show(side: str, point: Reached) -> None:

@@ -119,7 +119,7 @@ def ours(steps: int, seeds: int, side: str) -> dict[str, Any]:
         "seconds": result.total_seconds - result.compile_seconds,
         "returns": [float(x) for x in returns],
         "gradient_steps_per_million": gradient_steps(
-            agent.epochs, agent.minibatches, settings.num_envs * agent.experience.unroll
+            agent.experience.epochs, agent.experience.minibatches, settings.num_envs * agent.experience.unroll
         ),
         "choices": {"agent": str(agent), "loop": str(settings)},
     }

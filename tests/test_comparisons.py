@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 from needs import require
 
+import mtjax
+
 FOLDER = Path(__file__).parent.parent / "benchmarks"
 _SCRIPT = """
 import sys, pathlib, time, os
@@ -109,6 +111,14 @@ def test_seconds_to_a_return_are_of_the_first_evaluation_that_has_it(module, tmp
     assert theirs[4:10] == ["501", "30.0", "21.0", "51.0", "-", "-"]
     assert ours[10:] == ["750,000", "1,500,000", "375", "500"]
     assert "CheetahRun 630" in lines[-2]
+
+
+def test_our_side_says_what_it_chose(module):
+    """By the preset: four passes over 2,048 worlds x 32 steps in 16 minibatches."""
+    config = mtjax.preset("cheetah-run", "ppo", "gpu", engine="c")
+    chosen = module("ppo_peer").choices_of(config.family, config.learner, config.training)
+    assert (chosen["worlds"], chosen["passes"], chosen["samples_per_gradient_step"]) == (2048, 4, 4096)
+    assert chosen["gradient_steps_per_million"] == 1e6 * 4 * 16 / (2048 * 32)
 
 
 def test_the_first_interval_counts_as_the_median_of_the_others(module):

@@ -2,9 +2,9 @@
 
 For the learner a trial is the whole problem: sums of rewards, the task and the agent's memory end with it, and not with
 each of its episodes. Inside a trial the discount is 1, and what follows an episode's last step is the first observation
-of the next episode (Duan et al. 2016, "RL^2"). Where the last episode of a trial ends, the value that would follow counts
-if it was cut off by a mere limit of time, as for single episodes: an agent that does not see the time could not foresee
-that it ends. In families of a finite horizon (``Family.finite_horizon``) the last step is a terminal one.
+of the next episode (Duan et al. 2016, "RL^2"). Where a mere limit of time ends the last episode, the value that would
+follow counts, as for single episodes: an agent that does not see the time could not foresee that it ends. In families
+of a finite horizon (``Family.finite_horizon``) the last step is a terminal one.
 """
 
 import dataclasses
