@@ -205,19 +205,19 @@ class RunConfig:
         """
         if self.env:
             self._check_named()
+        require_policy(self.learner, self.family)
+        self._check_population()
+        trials.require_whole(self.plan.eval_episodes, self.training.trials, "eval-episodes")
+        require_trials(self.training, self.family, self.learner)
+        require_curriculum(self.played, self.family, self.learner)
+        self.learner.experience.check(self.family, self.played.num_envs, self.played.chunk_steps)
+        for learner in agents_at(self.learner, self.points):
+            require_value_range(learner)
         if self.mesh is not None and (lost := forgetful(self.family)):
             raise InputError(
                 f"{lost} steps on the host of one device, and this run is on {self.mesh.size}; show JAX one, such "
                 "as by CUDA_VISIBLE_DEVICES=0"
             )
-        self.learner.experience.check(self.family, self.played.num_envs, self.played.chunk_steps)
-        require_trials(self.training, self.family, self.learner)
-        require_curriculum(self.played, self.family, self.learner)
-        self._check_population()
-        require_policy(self.learner, self.family)
-        for learner in agents_at(self.learner, self.points):
-            require_value_range(learner)
-        trials.require_whole(self.plan.eval_episodes, self.training.trials, "eval-episodes")
         for module in ["tensorboardX"] * self.tensorboard + ["wandb"] * bool(self.wandb):
             require_library(module)
 
