@@ -161,7 +161,7 @@ def theirs(arguments: argparse.Namespace, name: str, side: str, seed: int) -> tu
     passes = tuned["num_updates_per_batch"]
     choices = {
         "worlds": tuned["num_envs"],
-        "gradient_steps_per_million": 1e6 * passes * tuned["num_minibatches"] / batch,
+        "gradient_steps_per_million": gradient_steps(passes, tuned["num_minibatches"], batch),
         "samples_per_gradient_step": batch // tuned["num_minibatches"],
         "passes": passes,
         "substeps": env.n_substeps,
@@ -236,7 +236,7 @@ def choices_of(family: Any, agent: Any, settings: Any) -> dict[str, Any]:
     batch = settings.num_envs * rollouts.unroll
     return {
         "worlds": settings.num_envs,
-        "gradient_steps_per_million": 1e6 * rollouts.epochs * rollouts.minibatches / batch,
+        "gradient_steps_per_million": gradient_steps(rollouts.epochs, rollouts.minibatches, batch),
         "samples_per_gradient_step": batch // rollouts.minibatches,
         "passes": rollouts.epochs,
         "substeps": family.num_substeps,
@@ -244,6 +244,11 @@ def choices_of(family: Any, agent: Any, settings: Any) -> dict[str, Any]:
         "engine": family.engine_name,
         "all": {"agent": str(agent), "training": dataclasses.asdict(settings)},
     }
+
+
+def gradient_steps(passes: int, minibatches: int, batch: int) -> float:
+    """Return the gradient steps in a million steps of the environment, with passes over each batch of steps."""
+    return 1e6 * passes * minibatches / batch
 
 
 def show(side: str, point: Reached) -> None:

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import parts
+from ppo_peer import gradient_steps
 
 SIDES = ("rejax", "mtjax-as-rejax", "mtjax")
 _EPISODES = 128  # of an evaluation, rejax's own number
@@ -123,10 +124,6 @@ def ours(steps: int, seeds: int, side: str) -> dict[str, Any]:
         ),
         "choices": {"agent": str(agent), "loop": str(settings)},
     }
-
-
-def gradient_steps(passes: int, minibatches: int, batch: int) -> float:
-    return 1e6 * passes * minibatches / batch
 
 
 def tabulate(out: Path) -> str:

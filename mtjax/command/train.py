@@ -5,8 +5,6 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from mtjax.agents.unseen import describe_unseen
 from mtjax.command import sweep
 from mtjax.command.run_config import parse
@@ -76,8 +74,8 @@ def _conclude(config: RunConfig, result: Result, directory: Path) -> None:
     if len(result.evaluations.steps):
         found = as_one_seed(result.evaluations) if config.plan.rule else result.evaluations
         print(split_table(found, config.family.parts), *[populations.NO_INTERVAL] * bool(config.plan.rule), sep="\n")
-        if describe_unseen(config.learner):
-            print(f"unseen tasks: {describe_unseen(config.learner)}")
+        if told := describe_unseen(config.learner):
+            print(f"unseen tasks: {told}")
     rest = max(result.total_seconds - result.compile_seconds - result.trained_seconds, 0)
     print(
         f"done in {duration(result.total_seconds)}: compiled in {duration(result.compile_seconds)}, trained in "
@@ -85,6 +83,6 @@ def _conclude(config: RunConfig, result: Result, directory: Path) -> None:
     )
     words = [f"--run={directory}", *import_flags(config)]
     if config.plan.rule and len(result.evaluations.steps):
-        words += [f"--point={np.nanargmax(populations.fitness(result.evaluations.returns['train'][:, -1]))}"]
+        words += [f"--point={populations.best(result.evaluations.returns['train'][:, -1])}"]
     words += ["--video"] * any(part.family.films for part in config.family.parts)
     print(f"look at it: python -m mtjax.evaluate {shlex.join(words)}")

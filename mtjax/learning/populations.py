@@ -72,6 +72,11 @@ def fitness(returns: np.ndarray) -> np.ndarray:
     return returns.mean(axis=(1, 2), dtype=np.float64)
 
 
+def best(returns: np.ndarray) -> int:
+    """Return the number of the member with the highest fitness, given returns (S, T, episodes); one must be finite."""
+    return int(np.nanargmax(fitness(returns)))
+
+
 def exploit(fitness: np.ndarray, key: Key) -> np.ndarray:
     """Return whose copy every member becomes (S,): truncation selection (Jaderberg et al. 2017, section 4.1).
 

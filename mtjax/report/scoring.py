@@ -171,8 +171,8 @@ def report(request: Any, vary: Mapping[str, str]) -> None:
     chosen = films.choose(policy.env, request.video_splits, request.video_tasks) if request.video else ()
     scores = score(policy, request.episodes, request.seed, tasks)
     print(task_table(policy, scores, named), flush=True)
-    if describe_unseen(policy.agent):
-        print(f"unseen tasks: {describe_unseen(policy.agent)}")
+    if told := describe_unseen(policy.agent):
+        print(f"unseen tasks: {told}")
     if population := from_json(pretrained.folder(run) / "config.json").plan.population:
         print(f"number {request.point} of a population ({population}), of whose members there are no intervals")
     if pretrained.is_shipped(pretrained.folder(run)) and not chosen:

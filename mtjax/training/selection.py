@@ -108,7 +108,7 @@ def describe_best(returns: np.ndarray, numbers: dict[str, np.ndarray]) -> str:
     fitness = populations.fitness(returns)
     if not np.isfinite(fitness).any():
         return ""
-    best = int(np.nanargmax(fitness))
+    best = populations.best(returns)
     values = ", ".join(f"{name.replace('_', '-')} {x[best]:.4g}" for name, x in numbers.items())
     return f"best of the population: number {best}{f' ({values})' * bool(values)}, return {amount(fitness[best])}"
 
