@@ -205,12 +205,12 @@ class RunConfig:
         """
         if self.env:
             self._check_named()
+        self.learner.experience.check(self.family, self.played.num_envs, self.played.chunk_steps)
         require_policy(self.learner, self.family)
         self._check_population()
         trials.require_whole(self.plan.eval_episodes, self.training.trials, "eval-episodes")
         require_trials(self.training, self.family, self.learner)
         require_curriculum(self.played, self.family, self.learner)
-        self.learner.experience.check(self.family, self.played.num_envs, self.played.chunk_steps)
         for learner in agents_at(self.learner, self.points):
             require_value_range(learner)
         if self.mesh is not None and (lost := forgetful(self.family)):
