@@ -150,9 +150,10 @@ class Transition(NamedTuple):
     action: Array  # (A,), or () int32 if actions are discrete
     reward: Array  # ()
     discount: Array  # () 0 if nothing can be earned after this step, else 1; a time limit alone leaves it at 1
-    next_obs: Any  # (O,) what follows in the trial: the next episode's first, or from before any reset if none follows
+    next_obs: Any  # (O,) what follows in the trial: the next episode's first, or from before any reset if sums end
     ended: Any = None  # () bool: the episode ended, terminated or by its time limit, or because its world was lost
-    closed: Any = None  # () bool: the trial ended, and with it the agent's memory and all sums of rewards
+    closed: Any = None  # () bool: the trial ended, and with it the agent's memory
+    cut: Any = None  # () bool: sums of rewards end: the trial does, or a limit of time stopped the episode
     context: Array | None = None  # (C,) of the trial's task, if trials draw tasks of other contexts
     extras: Any = None  # data that the agent stores when it acts, or adds when it assesses the step
     memory: Any = None  # what the agent remembered of the trial before the step

@@ -312,7 +312,7 @@ def observe(agent, state, batch: Transition, tasks: Task):
         begun = jax.tree.map(lambda x: jnp.broadcast_to(x, (*shape, *x.shape)), agent.begin(state, task))
         steps = steps._replace(memory=begun)
     ended = jnp.zeros(shape, bool) if batch.ended is None else steps.ended
-    return agent.observe(state, steps._replace(ended=ended, closed=ended), tasks)
+    return agent.observe(state, steps._replace(ended=ended, closed=ended, cut=ended), tasks)
 
 
 def learner(agent, tasks: Task, batch_size: int, spec: Spec = SPEC):
@@ -390,7 +390,7 @@ def with_memory(agent, batch: Transition) -> Transition:
         return batch
     begun = agent.conditioning.begin(batch.obs.shape[-1], batch.action.shape[-1])
     hidden = jax.random.uniform(jax.random.key(0), (*batch.reward.shape, *begun.shape))
-    return batch._replace(memory=Memory(None, hidden), ended=batch.discount == 0, closed=batch.discount == 0)
+    return batch._replace(memory=Memory(None, hidden), **dict.fromkeys(("ended", "closed", "cut"), batch.discount == 0))
 
 
 def random_past(random: np.random.Generator, shape: tuple[int, ...], spec: Spec = SPEC) -> last_steps.Past:

@@ -576,7 +576,7 @@ def rollouts(agent, seed=0):
     normal = lambda *size: jnp.float32(random.normal(size=(*shape, *size)))
     past = random_past(random, (*shape, agent.view.history), SPEC) if agent.view.history else None
     raw, ended = normal(2), jnp.asarray(random.random(shape) < 0.5)
-    fields = {"reward": normal(), "discount": jnp.ones(shape), "ended": ended, "closed": ended}
+    fields = {"reward": normal(), "discount": jnp.ones(shape), "ended": ended, "closed": ended, "cut": ended}
     fields |= {"extras": Taken(raw, normal() - 2), "memory": Memory(past)}
     return Transition(obs=normal(3), action=jnp.tanh(raw), next_obs=normal(3), **fields)
 

@@ -341,7 +341,7 @@ def experience(agent, num_seeds, num_tasks):
     returns = agent.sampler.begin()
     memory = memory._replace(sampler=None if returns is None else np.zeros(ended.shape, np.float32))
     taken = Taken(raw, random.normal(size=ended.shape).astype(np.float32) - 2)
-    return steps._replace(ended=ended, closed=ended, extras=taken, memory=memory)
+    return steps._replace(ended=ended, closed=ended, cut=ended, extras=taken, memory=memory)
 
 
 @pytest.mark.parametrize("name", [*AGENTS, "discrete-ppo", "discrete-rl2"])

@@ -59,7 +59,7 @@ def pulls(made, state):
     pays = arm == jnp.array([0, 1])[:, None, None]
     ended = jnp.ones(shape, bool)
     obs, taken = jnp.zeros((*shape, 2)), Taken(arm, jnp.log(chance)[:, None])
-    return Transition(obs, arm, 2 * chance[:, None] * pays, jnp.zeros(shape), obs, ended, ended, extras=taken)
+    return Transition(obs, arm, 2 * chance[:, None] * pays, jnp.zeros(shape), obs, ended, ended, ended, extras=taken)
 
 
 @pytest.mark.parametrize("first_order", [False, True])
@@ -105,7 +105,7 @@ def test_advantages_end_with_their_rollout():
     state = made.init(Spec.vector(3, 2, 1), TASKS, KEY)
     reward, value, following = jax.random.normal(KEY, (3, 2, 6, 4))
     no = jnp.zeros((2, 6, 4), bool)
-    steps = Transition(None, reward, reward, jnp.ones((2, 6, 4)), None, no, no)
+    steps = Transition(None, reward, reward, jnp.ones((2, 6, 4)), None, no, no, no)
     of = lambda part: [jax.tree.map(lambda x: x[:, part], x) for x in (steps, value, following)]
     find = lambda part: clipped.advantages(made, of(part)[0], TASKS, *of(part)[1:], made.experience.apart)[1]
     apart = jnp.concatenate([find(slice(3)), find(slice(3, 6))], axis=1)

@@ -26,7 +26,7 @@ TASKS, ENVS, SLOTS = 2, 3, 8
 def window(rewards, discounts, ended):
     """A window of steps that begin at observations 0, 1, 2 and so on."""
     obs = jnp.arange(float(len(rewards)))[:, None]
-    return Transition(obs, -obs, jnp.float32(rewards), jnp.float32(discounts), obs + 10, *[jnp.array(ended)] * 2)
+    return Transition(obs, -obs, jnp.float32(rewards), jnp.float32(discounts), obs + 10, *[jnp.array(ended)] * 3)
 
 
 # For gamma 1/2 and rewards 8, 4, 2: what the window is, its reward, its discount and the step it bootstraps after.
@@ -152,7 +152,7 @@ def windows(num_tasks, history=0):
     """Windows of three steps (T, 4, 3, ...), in which about one step in four terminates."""
     steps = [random_batch(i, num_tasks, 4, SPEC, history) for i in range(3)]
     steps = jax.tree.map(lambda *x: jnp.stack(x, axis=2), *steps)
-    return steps._replace(ended=steps.discount == 0, closed=steps.discount == 0)
+    return steps._replace(ended=steps.discount == 0, closed=steps.discount == 0, cut=steps.discount == 0)
 
 
 def test_each_task_has_its_own_discount():

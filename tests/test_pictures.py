@@ -54,7 +54,7 @@ class Episodes:
         obs = np.stack([seen[-1] for seen, *_ in self.steps])
         ended, terminated = (np.array([step[i] for step in self.steps]) for i in (2, 3))
         reward = np.arange(1.0, len(self.steps) + 1, dtype=np.float32)
-        return Transition({"pixels": obs}, reward[:, None], reward, 1 - np.float32(terminated), {}, *[ended] * 2)
+        return Transition({"pixels": obs}, reward[:, None], reward, 1 - np.float32(terminated), {}, *[ended] * 3)
 
     def expected(self, place, count, n_step, gamma):
         """The transition of a window whose ``place`` is in the middle: stack, reward, discount, stack after it."""

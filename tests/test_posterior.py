@@ -60,7 +60,7 @@ def track_of(made, seed=0):
     next_obs[ended] = 1e3
     flat = lambda x: jnp.asarray(x.reshape(-1, *x.shape[2:]))
     state = jnp.asarray(random.random((B, *made.begin(OBS, ACTION).shape)), jnp.float32)
-    return Track(state, *map(flat, (obs, normal(ACTION), normal(), ended, closed, next_obs)), key=KEY)
+    return Track(state, *map(flat, (obs, normal(ACTION), normal(), ended, closed, closed, next_obs)), key=KEY)
 
 
 # By hand.
@@ -124,7 +124,7 @@ def test_what_a_critic_teaches_a_product_of_gaussians_is_a_bandits_posterior():
     def beliefs(params, arms, reward):
         count = len(arms)
         nothing, no = jnp.zeros((count * length, 1)), jnp.zeros(count * length, bool)
-        track = Track(jnp.zeros((count, 2, 2)), nothing, flat(arms), flat(reward), no, no, nothing)
+        track = Track(jnp.zeros((count, 2, 2)), nothing, flat(arms), flat(reward), no, no, no, nothing)
         told = made.read(params, track).reshape(count, length, 2, 2)
         return (product(jnp.cumsum(told, axis=1)).mean + 1) / 2
 
@@ -162,7 +162,7 @@ def test_varibad_learns_how_often_the_arms_of_a_bandit_pay():
         nothing, ended = jnp.zeros((count * length, 1)), jnp.ones(count * length, bool)
         closed = jnp.arange(count * length) % length == length - 1
         flat = arms.reshape(-1, 2), reward.reshape(-1)
-        return Track(jnp.zeros((count, 32)), nothing, *flat, ended, closed, nothing, key)
+        return Track(jnp.zeros((count, 32)), nothing, *flat, ended, closed, closed, nothing, key)
 
     def fit(params):
         optimizer = optax.adam(optax.cosine_decay_schedule(3e-3, steps))
@@ -311,7 +311,7 @@ def rollout(agent, lead=(LENGTH, ENVS)):
     normal = lambda *size: jnp.float32(random.normal(size=(*shape, *size)))
     raw, ended, begun = normal(ACTION), jnp.asarray(random.random(shape) < 0.3), agent.conditioning.begin(OBS, ACTION)
     hidden = jnp.float32(random.random((*shape, *begun.shape)))
-    steps = Transition(normal(OBS), jnp.tanh(raw), normal(), jnp.ones(shape), normal(OBS), ended, ended)
+    steps = Transition(normal(OBS), jnp.tanh(raw), normal(), jnp.ones(shape), normal(OBS), ended, ended, ended)
     return steps._replace(extras=Taken(raw, normal() - 2), memory=Memory(None, hidden))
 
 

@@ -77,7 +77,7 @@ def random_steps(agent, num_tasks=3, spec=SPEC, seed=0):
         extras=Taken(raw, normal() - 2),
         memory=memory._replace(past=past),
     )
-    return steps._replace(closed=steps.ended)
+    return steps._replace(closed=steps.ended, cut=steps.ended)
 
 
 # Advantages.
@@ -86,7 +86,9 @@ def random_steps(agent, num_tasks=3, spec=SPEC, seed=0):
 def test_advantages_worked_by_hand():
     """Terminated, cut off and going on; with gamma a half and lambda a half."""
     reward, value, next_value = jnp.ones((3, 1)), jnp.full((3, 1), 2.0), jnp.full((3, 1), 4.0)
-    steps = lambda discount, ended: Transition(None, None, reward, jnp.float32(discount)[:, None], None, ended, ended)
+    steps = lambda discount, ended: Transition(
+        None, None, reward, jnp.float32(discount)[:, None], None, ended, ended, ended
+    )
     find = lambda discount, ended: targets.gae(
         steps(discount, jnp.array(ended)[:, None]), value, next_value, jnp.float32(0.5), 0.5
     )[:, 0]

@@ -52,7 +52,7 @@ def test_targets_are_those_of_a_plain_loop(cut):
         for world in range(2):
             later = 0.0
             for t in reversed(range(4)):
-                last = t == 3 or one.closed[t, world]
+                last = t == 3 or one.cut[t, world]
                 last |= cut and t < 3 and now[t + 1, world].argmax() != one.action[t + 1, world]
                 ahead = then[t, world].max() if last else 0.4 * then[t, world].max() + 0.6 * later
                 later = one.reward[t, world] + 0.9 * one.discount[t, world] * ahead

@@ -38,18 +38,19 @@ def rollout(seed=0):
         next_obs=normal(3),
         ended=ended,
         closed=ended,
+        cut=ended,
         extras=Taken(raw, normal() - 2),
         memory=Memory(None, normal(SIZE)),
     )
 
 
 def test_states_over_a_window_are_those_of_steps_one_by_one():
-    """With what acting remembers, and anew after the end of an episode."""
+    """With what acting remembers, and anew after a trial. After a step that cuts sums off, no end is seen."""
     knowing, steps = Recurrent(recurrent_size=SIZE), pick(rollout(), 0)
     params = knowing.init(3, jax.tree.map(lambda x: x[0, 0], steps), jnp.zeros(2), False, KEY).shared
     window = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), steps)  # (E, H, ...)
     flat = lambda x: x.reshape(-1, *x.shape[2:])
-    rest = (window.obs, window.action, window.reward, window.ended, window.closed)
+    rest = (window.obs, window.action, window.reward, window.ended, window.closed, window.cut)
     track = Track(window.memory.hidden[:, 0], *map(flat, rest))
     found = quick(knowing.over, params, track)(params, track)
     before, after = (x.reshape(ENVS, LENGTH, SIZE) for x in found)
@@ -58,9 +59,10 @@ def test_states_over_a_window_are_those_of_steps_one_by_one():
         hidden = window.memory.hidden[world, 0]
         for t in range(LENGTH):
             np.testing.assert_allclose(before[world, t], hidden, atol=1e-5)
-            hidden = one(hidden, pick(window, (world, t)))
-            np.testing.assert_allclose(after[world, t], hidden, atol=1e-5)
-            hidden = jnp.where(window.ended[world, t], knowing.begin(3, 2), hidden)
+            step = pick(window, (world, t))
+            following = one(hidden, step._replace(ended=step.ended & ~step.cut))
+            np.testing.assert_allclose(after[world, t], following, atol=1e-5)
+            hidden = jnp.where(step.closed, knowing.begin(3, 2), one(hidden, step))
     features = lambda past: knowing.features(params, jnp.zeros(0), dataclasses.make_dataclass("Seen", ["past"])(past))
     np.testing.assert_array_equal(features(track), found[0])
     np.testing.assert_array_equal(features(Following(*track)), found[1])
@@ -98,7 +100,7 @@ def test_each_loss_trains_the_memory_that_it_sees():
 
 
 def test_values_at_the_end_of_a_window_know_the_last_step():
-    """What follows a step is judged with the state after it, also if the episode's memory begins anew there."""
+    """What follows a step is judged with the state after it, also if memory begins anew there. It knows of no end."""
     agent = tiny("ppo", unroll=LENGTH, gae_lambda=0.0, advantage_normalization="none", **RECURRENT)
     agent = dataclasses.replace(agent, value_normalization="none", normalize_observations=False)
     state, steps = agent.init(SPEC, TASKS, KEY), rollout()
@@ -111,7 +113,7 @@ def test_values_at_the_end_of_a_window_know_the_last_step():
         hidden = steps.memory.hidden[0, 0, world]
         for t in range(LENGTH):
             step = pick(steps, (0, t, world))
-            after = knowing.remember(nets["knowing"].parts, hidden, step)
+            after = knowing.remember(nets["knowing"].parts, hidden, step._replace(ended=jnp.bool_(False)))
             value = lambda obs, features: agent.critic.apply(nets["critic"], features, obs)[0]
             error = step.reward + agent.gamma * value(step.next_obs, after) - value(step.obs, hidden)
             assert float(found.extras.advantage[0, t, world]) == pytest.approx(float(error), rel=1e-3, abs=1e-2)

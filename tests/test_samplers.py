@@ -22,7 +22,7 @@ def episodes(returns, ended):
     """One step of every environment (T, E), of which some end with these returns, as a sampler remembers them."""
     returns, ended = jnp.float32(returns), jnp.asarray(ended)
     zeros = jnp.zeros_like(returns)
-    return Transition(None, None, zeros, zeros + 1, None, ended, ended, memory=returns)
+    return Transition(None, None, zeros, zeros + 1, None, ended, ended, ended, memory=returns)
 
 
 def all_end(returns):
@@ -139,7 +139,9 @@ def test_an_agent_hands_its_sampler_what_it_observes():
     state = learner(watching, TASKS, BATCH, SPEC)[0](TASKS, KEY)
     reward, obs = jnp.float32([1, 2, 3]).reshape(3, 1, 1), jnp.zeros((3, 1, 1, 3))
     memory = Memory(None, sampler=reward * 2)  # of the episodes before their last step
-    steps = Transition(obs, None, -reward, jnp.ones_like(reward), None, reward > 0, reward > 0, memory=memory)
+    steps = Transition(
+        obs, None, -reward, jnp.ones_like(reward), None, reward > 0, reward > 0, reward > 0, memory=memory
+    )
     after = watching.observe(state, steps, TASKS)
     np.testing.assert_array_equal(after.nets["sampler"].own.slow, [1, 2, 3])
     assert all(after.nets[name] is net for name, net in state.nets.items() if name not in ("sampler", "scaling"))

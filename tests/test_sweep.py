@@ -112,7 +112,9 @@ def test_every_number_can_vary(name, settings):
         memory = varied.begin(state, task)
         everywhere = jax.tree.map(lambda x: jnp.broadcast_to(x, (2, 1, 3, *x.shape)), memory)
         steps = jax.tree.map(lambda x: x.reshape(2, 1, 3, *x.shape[2:]), random_batch(0, 2, 3))
-        state = varied.observe(state, steps._replace(closed=steps.discount == 0, memory=everywhere), tasks)
+        state = varied.observe(
+            state, steps._replace(closed=steps.discount == 0, cut=steps.discount == 0, memory=everywhere), tasks
+        )
         state = reset_networks(varied, state, spec, tasks, key)
         return varied.act(state, memory, jnp.zeros(1), task, key).action
 

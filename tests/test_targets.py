@@ -22,7 +22,7 @@ def steps(ended=None, discount=None):
     reward = np.float32(np.random.default_rng(1).normal(size=shape))
     found = (reward, np.float32(discount), np.asarray(ended))
     ends = jnp.asarray(found[2])
-    return Transition(None, None, *map(jnp.asarray, found[:2]), None, ends, ends)
+    return Transition(None, None, *map(jnp.asarray, found[:2]), None, ends, ends, ends)
 
 
 STEPS = steps()
@@ -118,7 +118,7 @@ def test_vtrace_converges_to_the_value_of_the_clipped_policy():
         now = then
     state, action, following = (np.stack(x) for x in zip(*played, strict=True))
     steps = Transition(
-        None, None, jnp.float32(rewards[state, action]), jnp.ones((length, count)), None, state < 0, state < 0
+        None, None, jnp.float32(rewards[state, action]), jnp.ones((length, count)), None, *[state < 0] * 3
     )
     log_ratio, value = jnp.float32(np.log(pi[state, action] / mu[state, action])), np.zeros(num_states)
     vtrace = jax.jit(lambda now, then: targets.vtrace(steps, now, then, log_ratio, gamma, 1.0))

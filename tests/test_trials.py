@@ -29,13 +29,13 @@ def test_each_episode_is_a_trial_that_a_limit_cuts_off_and_a_terminal_state_ends
     """Of a lost world nothing is terminal either."""
     terminated, timeout, lost = (jnp.array(x) for x in ([0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]))
     ends = EachEpisode().ends(terminated > 0, timeout > 0, lost > 0, None)
-    for found in (ends.episode, ends.trial, ends.world):
+    for found in (ends.episode, ends.trial, ends.cut, ends.world):
         np.testing.assert_array_equal(found, [0, 1, 1, 1])
     np.testing.assert_array_equal(ends.terminal, [0, 1, 0, 0])
 
 
 def test_a_repeated_trial_ends_with_its_last_episode_and_is_terminal_where_that_is():
-    """Inside the trial neither a terminal state nor a limit is terminal for the learner, and at its end no limit is."""
+    """Inside the trial no end is terminal for the learner, and at its end no limit is. A limit cuts sums everywhere."""
     terminated = jnp.array([0, 1, 0, 0, 0, 1, 0, 0]) > 0
     timeout = jnp.array([0, 0, 1, 0, 0, 0, 1, 0]) > 0
     lost = jnp.array([0, 0, 0, 1, 0, 0, 0, 1]) > 0
@@ -44,6 +44,7 @@ def test_a_repeated_trial_ends_with_its_last_episode_and_is_terminal_where_that_
     np.testing.assert_array_equal(ends.world, ends.episode)
     np.testing.assert_array_equal(ends.trial, [0, 0, 0, 0, 0, 1, 1, 1])
     np.testing.assert_array_equal(ends.terminal, [0, 0, 0, 0, 0, 1, 0, 0])
+    np.testing.assert_array_equal(ends.cut, [0, 0, 1, 1, 0, 1, 1, 1])
 
 
 def test_a_reset_free_world_goes_on_unless_it_is_lost():
@@ -126,12 +127,13 @@ def test_a_trial_is_terminal_where_its_length_is_part_of_the_problem():
     np.testing.assert_array_equal(rows.discount, 1.0 - rows.closed)
 
 
-def test_what_follows_inside_a_trial_is_the_next_episode_and_at_its_end_the_last_state(drifting):
-    """To the bit; each episode begins elsewhere."""
+def test_what_follows_inside_a_trial_is_the_next_episode_unless_a_limit_cuts_sums_off(drifting):
+    """To the bit; each episode begins elsewhere. After a limit, and at the trial's end, it is the last state."""
     rows, *_ = drifting
-    following, closed, ended = rows.obs[..., 1:, 0], rows.closed[..., :-1], rows.ended[..., :-1]
-    np.testing.assert_array_equal(rows.next_obs[..., :-1, 0][~closed], following[~closed])
-    np.testing.assert_allclose(rows.next_obs[rows.closed], rows.obs[rows.closed] + 1, rtol=1e-6)
+    following, cut, ended = rows.obs[..., 1:, 0], rows.cut[..., :-1], rows.ended[..., :-1]
+    np.testing.assert_array_equal(rows.next_obs[..., :-1, 0][~cut], following[~cut])
+    np.testing.assert_allclose(rows.next_obs[rows.cut], rows.obs[rows.cut] + 1, rtol=1e-6)
+    assert np.any(rows.cut & ~rows.closed) and np.any(rows.ended & ~rows.cut)
     assert np.all(following[ended] < 1) and len(np.unique(following[ended])) == ended.sum()
 
 
@@ -227,7 +229,9 @@ def test_advantages_run_through_episodes_and_stop_at_trials():
     reward, discount, ended, closed, value, next_value = map(jnp.asarray, rollout())
     assert np.any(ended & ~closed)
     gamma, decay = 0.9, 0.8
-    found = targets.gae(Transition(None, None, reward, discount, None, ended, closed), value, next_value, gamma, decay)
+    found = targets.gae(
+        Transition(None, None, reward, discount, None, ended, closed, closed), value, next_value, gamma, decay
+    )
     for t, e in np.ndindex(*reward.shape):
         total, factor = 0.0, 1.0
         for i in range(t, len(reward)):
@@ -242,7 +246,7 @@ def test_rewards_of_several_steps_are_summed_through_episodes():
     """Up to the end of the trial alone."""
     obs = jnp.arange(3.0)[:, None]
     ended, closed = jnp.array([True, True, False]), jnp.array([False, True, False])
-    steps = Transition(obs, obs, jnp.array([8.0, 4.0, 2.0]), jnp.float32(~closed), obs + 10, ended, closed)
+    steps = Transition(obs, obs, jnp.array([8.0, 4.0, 2.0]), jnp.float32(~closed), obs + 10, ended, closed, closed)
     joined = multistep.join(steps, 0.5)
     assert joined.reward == 10 and joined.discount == 0 and joined.next_obs == 11 and joined.closed
 

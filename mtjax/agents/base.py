@@ -293,7 +293,7 @@ class BaseAgent(abc.ABC):
         """Count collected steps (T, H, E, ...), after learning: moments of observations, scaling and sampler."""
         gamma = discounts_of_all(self, tasks)[:, None]
         memory = steps.memory._replace(past=None, hidden=None)
-        told = Transition(None, None, steps.reward, steps.discount, None, steps.ended, steps.closed, memory=memory)  # type: ignore
+        told = steps._replace(obs=None, action=None, next_obs=None, context=None, extras=None, memory=memory)
         told = jax.tree.map(lambda x: x.reshape(len(x), -1), collectives.whole(told, axis=2))
         new = {"inputs": self.view.count(state.nets["inputs"], steps.obs)}
         for name in WATCHERS:

@@ -114,7 +114,7 @@ class IMPALA(OnPolicy):
     def trace(self, window: Transition, gamma: Array, *of_steps: Array) -> targets.VTrace:
         """Return V-trace (T, B, L) of windows, given rewards, values, next values and log ratios (T, B L)."""
         reward, value, next_value, log_ratio = (x.reshape(window.reward.shape) for x in of_steps)
-        steps = Transition(None, None, reward, window.discount, None, window.ended, window.closed)  # type: ignore
+        steps = Transition(None, None, reward, window.discount, None, window.ended, window.closed, window.cut)  # type: ignore
         of_window = partial(targets.vtrace, lambda_=self.gae_lambda)
         of_task = jax.vmap(of_window, (0, 0, 0, 0, None))
         return jax.vmap(of_task)(steps, value, next_value, log_ratio, gamma)

@@ -20,7 +20,7 @@ class PPO(OnPolicy):
     """PPO trains by multi-task proximal policy optimisation, with separate actor and critic (Schulman et al. 2017).
 
     The policy pi_old plays H steps of every environment. For each step of task i, with s' the next observation of its
-    trial, d = 0 if nothing could follow it, and e = 1 if its trial ended, by a time limit too:
+    trial, d = 0 if nothing could follow it, and e = 1 if sums end with it, as by a time limit:
         delta_t = r_t + gamma_i d_t V(s'_t) - V(s_t)                                        (error of the critic)
         A_t = delta_t + gamma_i lambda (1 - e_t) A_(t+1),  A_H = 0                          (advantage)
         y_t = A_t + V(s_t)                                                                  (target)

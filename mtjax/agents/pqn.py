@@ -40,7 +40,7 @@ class PQN(BaseAgent):
     After H steps of every environment, backwards from the last one:
         G_t = r_t + gamma d_t ((1 - lambda) max_a Q(s'_t, a) + lambda G_(t+1))                (target)
         L_Q = (Q(s, a) - G)^2 / 2                                                             (loss)
-    averaged over a task's minibatch, then over tasks. The sum is cut where a trial ends, and after the last step.
+    averaged over a task's minibatch, then over tasks. A time limit ends the sum too.
     Targets are the critic's from before the update. Layer normalisation keeps it stable, with neither a replay nor a
     slow copy of the critic. Actions are the best ones, or with the probability epsilon uniform ones, among those that
     the task has. Epsilon falls along a line from 1 to ``epsilon`` over the first ``epsilon_rollouts`` rollouts.
@@ -122,12 +122,12 @@ class PQN(BaseAgent):
         values, following = (self.values(state, features, x, tasks) for x in (obs, next_obs))
         greedy = jnp.argmax(values, axis=-1) == flat.action
         in_order = partial(played, shape=steps.reward.shape, length=self.unroll)
-        closed, following = steps.closed, in_order(jnp.max(following, axis=-1))
+        cut, following = steps.cut, in_order(jnp.max(following, axis=-1))
         if self.cut_exploration:
-            closed |= jnp.roll(~in_order(greedy), -1, axis=1)
+            cut |= jnp.roll(~in_order(greedy), -1, axis=1)
         gamma = discounts_of_all(self, tasks)
         returns = jax.vmap(partial(targets.lambda_returns, lambda_=self.q_lambda))
-        return state, steps._replace(extras=returns(steps._replace(closed=closed), following, gamma))
+        return state, steps._replace(extras=returns(steps._replace(cut=cut), following, gamma))
 
     def values(self, state: AgentState, features: Array, obs: Any, tasks: Task) -> Array:
         """Return the values (T, B, A) of all actions; those that a task does not have are worth nothing at all."""

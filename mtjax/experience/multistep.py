@@ -1,12 +1,11 @@
 """Multi-step returns join a transition with the steps that follow it in its environment.
 
-For a window of n steps from t on, let m be the number of steps up to and with the first that ended its trial, or n:
+For a window of n steps from t on, let m be the number of steps up to and with the first that cut sums off, or n:
     R = r_t + gamma r_(t+1) + ... + gamma^(m-1) r_(t+m-1)
     y = R + gamma^m d_(t+m-1) V(s_(t+m))
-s_(t+m) is what followed the window's last step in its trial, and d = 0 if nothing could. Where trials are single
-episodes, s_(t+m) is the true observation from before any reset, and d = 0 if that step terminated. So a termination
-ends the bootstrap, and a time limit ends the sum alone (Sutton 1988; for off-policy critics Hessel et al. 2018,
-"Rainbow", and Barth-Maron et al. 2018, "D4PG").
+s_(t+m) is what followed the window's last step in its trial, and d = 0 if nothing could. Where sums are cut off, it is
+the true observation from before any reset. So a termination ends the bootstrap, and a time limit ends the sum alone
+(Sutton 1988; for off-policy critics Hessel et al. 2018, "Rainbow", and Barth-Maron et al. 2018, "D4PG").
 
 As there, nothing corrects for actions of an older policy. Of a soft value's bonus for entropy only that after the
 window counts.
@@ -20,9 +19,9 @@ import jax.numpy as jnp
 from mtjax.types import Array, Transition
 
 
-def length(closed: Array) -> Array:
-    """Return m (...), how many steps of windows (..., n) count: up to and with the first that ended its trial."""
-    goes_on = jnp.cumprod(~closed[..., :-1], axis=-1)
+def length(cut: Array) -> Array:
+    """Return m (...), how many steps of windows (..., n) count: up to and with the first that cut sums off."""
+    goes_on = jnp.cumprod(~cut[..., :-1], axis=-1)
     return 1 + jnp.sum(goes_on, axis=-1)
 
 
@@ -43,7 +42,7 @@ def join(steps: Transition, gamma: float | Array) -> Transition:
     Its reward is R. Its discount is gamma^(m-1) d, as agents multiply it by gamma once more. If there is a memory, the
     ``extras`` are the whole last step, so that the memory after it can be told.
     """
-    count = length(steps.closed)[..., None]
+    count = length(steps.cut)[..., None]
     index = jnp.arange(steps.reward.shape[-1])
     powers = jnp.power(gamma, index)
     final = count - 1
@@ -55,5 +54,6 @@ def join(steps: Transition, gamma: float | Array) -> Transition:
         next_obs=last.next_obs,
         ended=last.ended,
         closed=last.closed,
+        cut=last.cut,
         extras=last if jax.tree.leaves(steps.memory) else None,
     )

@@ -38,13 +38,13 @@ def join(rows: Transition, gamma: float | Array, *, frames: int, n_step: int) ->
 
     A window's transition begins at step N, or one step earlier if a time limit cut that step off.
     """
-    cut = rows.closed & (rows.discount > 0)
+    cut = rows.cut & (rows.discount > 0)
     now = frames - cut[..., frames].astype(jnp.int32)
     bare = rows._replace(obs={name: x for name, x in rows.obs.items() if name != PICTURES})
     body = at(bare, now[..., None] + jnp.arange(n_step))
     stops = jnp.concatenate([at(cut, now[..., None] + jnp.arange(1, n_step)), cut[..., :1] & False], axis=-1)
-    body = body._replace(closed=body.closed | stops)
-    after = now + multistep.length(body.closed)
+    body = body._replace(cut=body.cut | stops)
+    after = now + multistep.length(body.cut)
     joined = multistep.join(body, gamma) if n_step > 1 else jax.tree.map(lambda x: jnp.take(x, 0, now.ndim), body)
     see = lambda place: {PICTURES: stack(rows.obs[PICTURES], rows.ended, place, frames)}
     return joined._replace(obs=joined.obs | see(now), next_obs=joined.next_obs | see(after))

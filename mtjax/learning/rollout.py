@@ -175,6 +175,7 @@ def step_envs(
         next_obs=obs,
         ended=ends.episode,
         closed=ends.trial,
+        cut=ends.cut,
         context=worlds.task.context if contexts_vary(tasks) else None,  # type: ignore
         extras=acted.extras,
         memory=worlds.memory,
@@ -230,11 +231,11 @@ def reset_ended(
 def followed(transition: Transition, ends: Ends, worlds: Worlds) -> Transition:
     """Return steps with what follows them in their trials, given the worlds after ``reset_ended``.
 
-    Inside a trial that is the first observation of the next episode. At its end it stays the one before any reset.
+    Inside a trial that is the first observation of the next episode. Where sums end it stays the one before any reset.
     """
     if worlds.episode is None:
         return transition
-    inside = ends.episode & ~ends.trial
+    inside = ends.episode & ~ends.cut
     return transition._replace(next_obs=where_worlds(inside, worlds.obs, transition.next_obs))
 
 
@@ -253,7 +254,7 @@ def _change_tasks(env: Any, tasks: Task, worlds: Worlds, ends: Ends, keys: Key, 
         these worlds, and the others as they are.
     """
     lost, own = ends.world, _Begun(worlds.state, worlds.task, worlds.obs)
-    again = lambda: _reset_all(env, tasks, worlds, Ends(lost, lost, lost, lost), keys, trials)
+    again = lambda: _reset_all(env, tasks, worlds, Ends(lost, lost, lost, lost, lost), keys, trials)
     begun = jax.lax.cond(jnp.any(lost), again, lambda: own)
     if tasks.draws is None:
         return begun

@@ -1,10 +1,11 @@
 """A trial is what an agent plays with one task and one memory. It says what begins anew where an episode ends.
 
-For the learner a trial is the whole problem: sums of rewards, the task and the agent's memory end with it, and not with
-each of its episodes. Inside a trial the discount is 1, and what follows an episode's last step is the first observation
-of the next episode (Duan et al. 2016, "RL^2"). Where a mere limit of time ends the last episode, the value that would
-follow counts, as for single episodes: an agent that does not see the time could not foresee that it ends. In families
-of a finite horizon (``Family.finite_horizon``) the last step is a terminal one.
+For the learner a trial is the whole problem: the task and the agent's memory end with it, and not with each of its
+episodes. Inside a trial no state is terminal, and what follows the last step of an episode that terminated is the first
+observation of the next (Duan et al. 2016, "RL^2"). Where a mere limit of time ends an episode, sums of rewards are cut,
+and the value that would follow counts, inside a trial as at its end: an agent that does not see the time cannot foresee
+it. In families of a finite horizon (``Family.finite_horizon``) time is part of the problem: an episode's last step is a
+terminal one, so that sums run through a whole trial.
 """
 
 import dataclasses
@@ -25,6 +26,7 @@ class Ends(NamedTuple):
     trial: Array  # the task and the agent's memory begin anew
     terminal: Array  # nothing follows for the learner, whose values are 0 there
     world: Array  # the world begins anew: its state, and with it the observation
+    cut: Array  # sums of rewards end: the trial does, or a limit of time stopped what would have gone on
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,12 +46,12 @@ class EachEpisode:
             episode: int32, how many episodes of the trial came before; None where trials are single episodes.
         """
         ended = terminated | lost | timeout
-        return Ends(ended, ended, terminated, ended)
+        return Ends(ended, ended, terminated, ended, ended)
 
 
 @dataclasses.dataclass(frozen=True)
 class Repeated:
-    """A trial is some episodes of one task. It is terminal where its last episode is."""
+    """A trial is some episodes of one task. It is terminal where its last episode is; every time limit cuts sums."""
 
     episodes: int
     keeps_state: ClassVar[bool] = False
@@ -61,7 +63,7 @@ class Repeated:
     def ends(self, terminated: Array, timeout: Array, lost: Array, episode: Any) -> Ends:
         ended = terminated | lost | timeout
         last = ended & (episode + 1 == self.episodes)
-        return Ends(ended, last, last & terminated, ended)
+        return Ends(ended, last, last & terminated, ended, last | ended & ~terminated)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,7 +78,7 @@ class ResetFree:
 
     def ends(self, terminated: Array, timeout: Array, lost: Array, episode: Any) -> Ends:
         ended = lost | timeout
-        return Ends(ended, ended, terminated & False, lost)
+        return Ends(ended, ended, terminated & False, lost, ended)
 
 
 Trials = EachEpisode | Repeated | ResetFree

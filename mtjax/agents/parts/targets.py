@@ -1,7 +1,7 @@
 """Targets of values: pure functions of consecutive steps, leaves (L, ...) of one task.
 
 Everywhere s' is the true observation after a step, d = 0 where nothing can follow, and gamma the task's discount.
-Sums over later steps are cut where the trial is closed, by a time limit too, and after the last step.
+Sums over later steps end where steps are ``cut``, as by a time limit, and after the last step.
 """
 
 from typing import NamedTuple
@@ -22,7 +22,7 @@ def gae(steps: Transition, value: Array, next_value: Array, gamma: float | Array
 
     A_t = r_t + gamma d_t V(s'_t) - V(s_t) + gamma lambda A_(t+1)
     """
-    return _summed(td(steps, next_value, gamma) - value, gamma * lambda_ * ~steps.closed)
+    return _summed(td(steps, next_value, gamma) - value, gamma * lambda_ * ~steps.cut)
 
 
 def lambda_returns(steps: Transition, next_value: Array, gamma: float | Array, lambda_: float | Array) -> Array:
@@ -30,7 +30,7 @@ def lambda_returns(steps: Transition, next_value: Array, gamma: float | Array, l
 
     G_t = r_t + gamma d_t ((1 - lambda) V(s'_t) + lambda G_(t+1)); where the sum is cut, G_t = r_t + gamma d_t V(s'_t)
     """
-    goes_on = jnp.where(_last(steps), 0.0, lambda_ * ~steps.closed)
+    goes_on = jnp.where(_last(steps), 0.0, lambda_ * ~steps.cut)
     return _summed(td(steps, (1 - goes_on) * next_value, gamma), gamma * steps.discount * goes_on)
 
 
@@ -61,7 +61,7 @@ def vtrace(
         log_ratio: (L, ...) log pi(a|s) - log mu(a|s).
     """
     ratio = jnp.exp(jnp.minimum(log_ratio, 20.0))
-    rho, going = jnp.minimum(largest, ratio), lambda_ * ~(steps.closed | _last(steps))
+    rho, going = jnp.minimum(largest, ratio), lambda_ * ~(steps.cut | _last(steps))
     later = _summed(rho * (td(steps, next_value, gamma) - value), gamma * going * jnp.minimum(1.0, ratio))
     target = value + later
     ahead = (1 - going) * next_value + going * jnp.roll(target, -1, axis=0)
@@ -80,7 +80,7 @@ def retrace(
         next_value: (L, ...) V(s') = E_pi Q(s', a).
         log_ratio: (L, ...) log pi(a|s) - log mu(a|s).
     """
-    trace = jnp.roll(lambda_ * jnp.exp(jnp.minimum(log_ratio, 0.0)), -1, axis=0) * ~(steps.closed | _last(steps))
+    trace = jnp.roll(lambda_ * jnp.exp(jnp.minimum(log_ratio, 0.0)), -1, axis=0) * ~(steps.cut | _last(steps))
     return q + _summed(td(steps, next_value, gamma) - q, gamma * trace)
 
 

@@ -29,6 +29,7 @@ class Track(NamedTuple):
     reward: Array  # (B L,)
     ended: Array  # (B L,) bool: the episode ended
     closed: Array  # (B L,) bool: the memory begins anew after the step
+    cut: Array  # (B L,) bool: sums of rewards end with the step
     next_obs: Any = None  # (B L, O)
     key: Key | None = None  # () for losses that draw
 
@@ -40,7 +41,7 @@ class Following(Track):
 def track(window: Transition, obs: Array) -> Track:
     """Return the track of windows (B, L, ...) whose observations are (B, L, O) as networks take them."""
     flat = lambda x: x.reshape(-1, *x.shape[2:])
-    steps = (obs, window.action, window.reward, window.ended, window.closed, window.next_obs)
+    steps = (obs, window.action, window.reward, window.ended, window.closed, window.cut, window.next_obs)
     return Track(window.memory.hidden[:, 0], *map(flat, steps))
 
 
@@ -83,17 +84,22 @@ class Remembering(Nothing):
         return self.show(params, after if isinstance(seen.past, Following) else before)
 
     def over(self, params: dict[str, Any], track: Track) -> tuple[Array, Array]:
-        """Return the memories (B L, ...) before and after every step."""
+        """Return the memories (B L, ...) before and after every step.
+
+        Where sums of rewards end, the value after the step is that of going on, so its memory has seen no end.
+        """
         count, begun = len(track.state), self.begin(track.obs.shape[-1], track.action.shape[-1])
         in_time = lambda x: jnp.swapaxes(x.reshape(count, -1, *x.shape[1:]), 0, 1)
 
-        def step(memory: Array, given: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array]]:
+        def step(memory: Array, given: tuple[Array, Array]) -> tuple[Array, Array]:
             read, closed = given
             after = self.advance(params, memory, read)
-            return jnp.where(closed.reshape(-1, *[1] * begun.ndim), begun, after), (memory, after)
+            return jnp.where(closed.reshape(-1, *[1] * begun.ndim), begun, after), memory
 
-        _, memories = jax.lax.scan(step, track.state, (in_time(self.read(params, track)), in_time(track.closed)))
-        return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1).reshape(-1, *x.shape[2:]), memories)
+        _, before = jax.lax.scan(step, track.state, (in_time(self.read(params, track)), in_time(track.closed)))
+        before = jnp.swapaxes(before, 0, 1).reshape(-1, *before.shape[2:])
+        going_on = track._replace(ended=track.ended & ~track.cut)
+        return before, self.advance(params, before, self.read(params, going_on))
 
 
 def gru(size: int) -> nn.GRUCell:
@@ -107,7 +113,8 @@ class Recurrent(Remembering):
 
     A gated recurrent unit reads every step once it is over, so that with s_t networks see all that is known before it:
         h_(t+1) = GRU(h_t, [s_t, a_t, r_t, e_t]),  h_0 = 0                 (e_t: the step ended an episode)
-    It learns by the losses of the networks that see it, through the steps of a window. A window begins with the hidden
+    Where a time limit cuts sums off, the value after the step is that of going on: of h_(t+1) with e_t = 0. The unit
+    learns by the losses of the networks that see it, through the steps of a window. A window begins with the hidden
     state that acting had there, which does not learn.
 
     Differs from RL^2, where the unit reads s_t and the step before it at once, and the policy sees its output alone.

@@ -69,7 +69,7 @@ class ReturnScaling(_OfReturns):
 
     def observe(self, memory: LargestReturns, steps: Transition) -> LargestReturns:
         sums: Sums = steps.memory
-        cut = steps.closed & (steps.discount > 0)
+        cut = steps.cut & (steps.discount > 0)
         mean = jnp.where(cut, sums.total / sums.count, 0.0)
         largest = lambda old, new: jnp.maximum(old, jnp.max(jnp.abs(new), axis=1))
         return LargestReturns(largest(memory.discounted, sums.discounted), largest(memory.reward, mean))
