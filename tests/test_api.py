@@ -75,6 +75,7 @@ def test_its_curve_shades_random_actions(result, monkeypatch, tmp_path):
     assert [given[-1] for given in drawn] == [5 * 2 * config.family.train_count]
 
 
+@pytest.mark.slow
 def test_its_folder_is_loaded_evaluated_and_resumed(result, copied_run, capsys):
     """By ``mtjax.load``, by both commands, and by the command that it records."""
     task = jax.tree.map(lambda x: x[0], mtjax.make("finger-short").tasks())

@@ -160,6 +160,7 @@ def unstopped():
     return {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", slow_but(FILES, "learning"))
 @pytest.mark.parametrize("end", slow_but([terminate, die], terminate))
 def test_a_stopped_pair_goes_on_to_the_same_results(run, unstopped, tmp_path, monkeypatch, name, end):
@@ -204,6 +205,7 @@ def test_an_unfinished_pair_is_told_and_goes_on_with_its_settings_only(run, scri
     assert learning.curve_of(*learning.pairs(tmp_path, unfinished=True))[:, 0, 1].tolist() == [500, 1000]
 
 
+@pytest.mark.slow
 def test_a_pair_whose_results_were_not_written_is_not_trained_again(run, tmp_path, monkeypatch):
     """And what a process left that died before it could clean up is removed."""
     with monkeypatch.context() as patch, pytest.raises(ZeroDivisionError):

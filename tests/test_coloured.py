@@ -114,6 +114,7 @@ def test_tasks_are_near_their_classes_and_more_keep_the_first():
     assert len({np.asarray(x).tobytes() for x in env.tasks("all").goal["squares"]}) == 210
 
 
+@pytest.mark.slow
 def test_pictures_show_the_tasks_own_colours():
     env = mtjax.make("coloured-maze", cells=4, num_tasks=2, pixels=32)
     draw = jax.jit(env.draw, compiler_options=QUICK)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import QUICK, Walk, configure, tiny
+from probes import QUICK, Walk, configure, param, tiny
 
 import mtjax
 from mtjax.agents.networks import Params
@@ -73,7 +73,9 @@ def test_a_state_of_other_tasks_knows_these_alone():
     np.testing.assert_array_equal(head(found), head(state)[np.asarray([1, 0, 1, 0, 1])])
 
 
-@pytest.mark.parametrize("name, given", [("multi-head", REPLAY), ("disjoint", REPLAY), ("ppo", ROLLOUTS)])
+@pytest.mark.parametrize(
+    "name, given", [("multi-head", REPLAY), param(("disjoint", REPLAY), slow=True), param(("ppo", ROLLOUTS), slow=True)]
+)
 def test_tasks_that_are_not_played_keep_what_is_their_own(name, given):
     """To the bit, while the one that is played learns."""
     agent = tiny(name, **({"heads": "per-task"} if name == "ppo" else {}))
@@ -89,6 +91,7 @@ def test_tasks_that_are_not_played_keep_what_is_their_own(name, given):
     assert np.all(metrics[1]["episodes"][:, [0, 2]] == 0) and np.all(metrics[1]["bad_step"] == -1)
 
 
+@pytest.mark.slow
 def test_a_choice_of_all_tasks_learns_the_same_as_all(monkeypatch):
     """Own parameters are gathered, learn, and are put back."""
     monkeypatch.setattr(curricula.Random, "rows", lambda self, step, known: jnp.arange(known))
@@ -99,6 +102,7 @@ def test_a_choice_of_all_tasks_learns_the_same_as_all(monkeypatch):
     jax.tree.map(np.testing.assert_array_equal, of_plain, of_found)
 
 
+@pytest.mark.slow
 def test_a_run_by_a_sequence_is_recorded_by_known_tasks_and_resumes_to_the_bit(tmp_path):
     """A task without episodes has an empty column; the state of a resumed run is that of one without a stop."""
     given = {"num_envs": 2, "chunk_steps": 150, "curriculum": "sequence:150", "quiet": True, "unroll": 10}

@@ -174,6 +174,7 @@ def test_networks_on_plain_observations_add_nothing_to_the_least():
     assert tiny("sac").representation.least_loss == tiny("ppo").representation.least_loss == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("transition", slow_but(["deterministic", "probabilistic"], "probabilistic"))
 @pytest.mark.parametrize("name", slow_but(["sac", "ppo"], "sac"))
 def test_rules_see_losses_from_the_least(name, transition, monkeypatch):
@@ -646,6 +647,7 @@ def test_ppos_models_predict_what_the_encoder_saw_before_the_update():
     np.testing.assert_allclose(one.model_targets.latent, expected, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_ppo_learns_a_model_of_its_rollouts():
     """Everything moves, and after many updates models predict s' = s / 2 + (a, 0) and its first number far better."""
     agent = make_ppo(representation="deepmdp", critic_lr=1e-2, gamma=0.0)

@@ -335,6 +335,7 @@ def test_a_bandits_optimum(alpha):
     np.testing.assert_allclose(np.exp(-5 + 3.5 * (np.tanh(log_std) + 1)), expected_std, rtol=0.06)
 
 
+@pytest.mark.slow
 def test_optima_differ():
     """Or the test above would show nothing."""
     means = [optimum(alpha)[0] for alpha in (0.0, 0.5, 0.9)]

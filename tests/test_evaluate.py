@@ -475,6 +475,7 @@ def test_train_prints_where_the_run_is_and_how_it_scored(short_family, tmp_path,
     assert lines[-1].endswith("conftest.py --video")
 
 
+@pytest.mark.slow
 def test_resume_extends_and_the_hint_goes_on(finished_run, copied_run, capsys, monkeypatch):
     """A run that is extended and stopped says how to go on, and the command that it prints does so."""
     train = launch.train

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from needs import require
-from probes import FEW, family_for, pick, slow_but, tiny, with_nets
+from probes import FEW, family_for, param, pick, slow_but, tiny, with_nets
 
 import mtjax
 import mtjax.evaluate
@@ -94,7 +94,13 @@ def test_a_choice_is_the_policys_in_all_forms(tmp_path):
     assert_onnx_acts(policy, tmp_path / "policy.onnx", obs, boxes, expected)
 
 
-@pytest.mark.parametrize("name", [name for name in FEW if "vary" in name])
+# Their bodies are built anew for every task.
+COSTLY = {f"cheetah-run-vary-{name}" for name in ("back-foot-length", "foot-position", "foot-size")} | {
+    "brax-ant-vary-direction"
+}
+
+
+@pytest.mark.parametrize("name", [param(name, slow=name in COSTLY) for name in FEW if "vary" in name])
 def test_a_file_knows_every_listed_task_by_its_parameters(name):
     """By the number and by the context that the family gives it; an unlisted one has no number of theirs."""
     env = mtjax.make(name)

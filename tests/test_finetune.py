@@ -194,7 +194,9 @@ def test_a_fine_tuned_run_goes_on(learned, tuned, capsys):
         assert np.array_equal(leaf, before[path]) == ("head" not in path), path
 
 
-@pytest.mark.parametrize("chunks, sweep", [(1, ()), (2, {"actor_lr": [1e-3, 1e-4]})])
+@pytest.mark.parametrize(
+    "chunks, sweep", [(1, ()), pytest.param(2, {"actor_lr": [1e-3, 1e-4]}, marks=pytest.mark.slow)]
+)
 def test_a_stopped_fine_tuning_goes_on_to_the_bit(learned, base, tmp_path, chunks, sweep):
     """Before or after its first evaluation: the run that it is from gives nothing more to one that has begun."""
     given = {"vary": {"goal": [0.9, -0.8]}, "split": "none", "seeds": 3, "steps": 240, "eval_every": 160, "num_envs": 2}

@@ -230,6 +230,7 @@ def test_a_film_shows_each_step(monkeypatch):
     assert pictures.shape == (3, 24, 32, 3) and [int(x[12, 16, 0]) for x in pictures] == [10, 40, 50]
 
 
+@pytest.mark.slow
 def test_evaluations_play_whole_episodes_of_the_original(begun):
     """Returns are those of the original under the agent's mean actions; worlds that have ended stand still."""
     family = mtjax.hosted("Walk", end=4)
@@ -287,6 +288,7 @@ def test_worlds_go_on_from_their_last_state_alone():
         jax.block_until_ready(family.step(task, start.state, jnp.zeros(2)))
 
 
+@pytest.mark.slow
 def test_mixtures_with_families_of_jax():
     """Each family's episodes end by its own rules."""
     env = mtjax.mixture([mtjax.hosted("Walk"), "bandit"])
@@ -298,6 +300,7 @@ def test_mixtures_with_families_of_jax():
     assert returns.shape[2] == 3 and 1 <= returns[0, -1, 0].min() and returns[0, -1, 0].max() <= 30
 
 
+@pytest.mark.slow
 def test_ppo_learns_to_balance():
     """The return rises in some thousand steps."""
     family = mtjax.hosted("CartPole-v1")
@@ -373,6 +376,7 @@ def test_spaces_of_spaces_are_trees_of_arrays():
     assert mtjax.hosted(Turned, time_limit=5).spec.obs == jax.ShapeDtypeStruct((), jnp.int32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", slow_but(("sac", "ppo"), "ppo"))
 def test_networks_learn_from_spaces_of_spaces_what_they_learn_from_one(name):
     """Bit for bit, with the arrays in the replay as the environment has them."""
@@ -499,6 +503,7 @@ def test_pictures_of_envpool_are_single_and_settings_are_tasks():
         mtjax.make("envpool:Pongg-v5")
 
 
+@pytest.mark.slow
 def test_programs_of_a_gpu_call_the_host_too(monkeypatch):
     """By JAX's own callbacks, which give the same steps, and tell what the environment raised."""
     family = mtjax.hosted("Walk")

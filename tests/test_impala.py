@@ -99,6 +99,7 @@ def test_probes_are_learned(kind, lag):
     assert history[0]["bad_step"].max() == -1
 
 
+@pytest.mark.slow
 def test_older_policies_have_ratios_below_one():
     """And the present one has none."""
     found = {}

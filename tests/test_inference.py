@@ -57,6 +57,7 @@ def test_who_infers_nothing_remembers_nothing():
     assert tiny("sac", **INFERRED).view.history == STEPS
 
 
+@pytest.mark.slow
 def test_the_loop_stores_what_was_seen():
     """Every row remembers as many steps as its episode has had, at most all; these are the rows stored before it."""
     settings = {"num_envs": 2, "updates_per_step": 0, "replay_size": 60, "warmup_steps": 1, "chunk_steps": 20}

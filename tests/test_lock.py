@@ -77,7 +77,7 @@ def test_a_file_system_without_locks_is_told(tmp_path, monkeypatch, number):
             pass
 
 
-@pytest.mark.parametrize("words", [[], ["--steps=900"]])
+@pytest.mark.parametrize("words", [pytest.param([], marks=pytest.mark.slow), ["--steps=900"]])
 def test_a_run_in_use_is_not_resumed(copied_run, capsys, monkeypatch, words):
     """One line, and nothing in the folder changes."""
     contents = lambda: {path: path.read_bytes() for path in copied_run.rglob("*") if path.is_file()}

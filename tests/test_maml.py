@@ -194,6 +194,7 @@ class Arms(Probe):
         return Step(World(state.obs, state.age + 1), state.obs, pays, jnp.bool_(True))
 
 
+@pytest.mark.slow
 def test_it_learns_from_pulls_to_be_ready_for_either_arm():
     """From one that prefers an arm, it finds the indifferent start, which earns sigmoid(1) after an inner step."""
     env, seeds = Arms(), jnp.zeros(1, jnp.uint32)
@@ -226,6 +227,7 @@ class Aims(Probe):
         return tasks_of(self.kind, self.scales, self.episode_length)
 
 
+@pytest.mark.slow
 def test_a_network_learns_to_adapt_to_tasks_it_has_not_met():
     """The best for all tasks at once earns -0.4 in those of training, and -0.36 in those between them."""
     made, seeds = agent("maml", hidden=(16, 16), unroll=1, epochs=1, actor_lr=3e-3, entropy_cost=0.01), jnp.uint32([0])

@@ -257,6 +257,7 @@ def test_looks_of_tasks_differ():
     assert not np.array_equal(one, other)
 
 
+@pytest.mark.slow
 def test_pictures_change_nothing_else(step):
     """The state beside them is that without them, at the start and after a step."""
     env = TwoGoalMaze(vary={"goal-box": "0,1"}, split="none", pixels=16, state="also", repeat=2, grey=True)

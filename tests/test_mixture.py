@@ -599,6 +599,7 @@ def test_a_run_and_its_policy_are_read_back(run):
     assert "aim" in task_table(policy, {"train": Scores(np.zeros((1, 4, 2)), {})})
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_bit_for_bit(tmp_path, monkeypatch):
     """And tells its sinks the returns of evaluations, and the success of tasks that have it."""
     agent, plan = tiny("sac", normalize_observations=True), {**PLAN, "eval_every": 40}

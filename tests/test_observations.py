@@ -105,7 +105,7 @@ def agent_of(case):
     return tiny(name, **given)
 
 
-@pytest.mark.parametrize("case", slow_but(CASES, "sac", "ppo", "hindsight"))
+@pytest.mark.parametrize("case", slow_but(CASES, "ppo", "hindsight"))
 def test_networks_learn_from_a_tree_what_they_learn_from_its_vector(case):
     """Bit for bit, whoever reads observations: moments, last steps, a memory of the episode, hindsight."""
     agent = agent_of(case)
@@ -267,6 +267,7 @@ def test_what_cannot_go_together_is_refused():
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_runs_of_trees_are_saved_resumed_and_loaded(tmp_path, registered):
     """A family that is registered by name, through a run's whole life: its checkpoint, evaluation and policy."""
     given = REPLAY | {"hidden": (8,), "num_envs": 2, "chunk_steps": 5, "eval_episodes": 1, "eval_every": 40}

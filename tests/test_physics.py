@@ -351,6 +351,7 @@ def test_engine_is_chosen_by_device(monkeypatch):
         physics.choose_engine("c")
 
 
+@pytest.mark.slow
 def test_c_serves_two_threads_at_once(worlds):
     """Two threads that step the same family at the same batch size do not mix their worlds."""
     env = envs.make("finger-spin", engine="c")

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from probes import Walk, learn, of_task, only_seed, pick, quick, tasks_of, tiny, train
+from probes import Walk, learn, of_task, only_seed, pick, quick, slow_but, tasks_of, tiny, train
 from test_recurrent import Ratios
 
 import mtjax
@@ -347,7 +347,7 @@ def test_losses_reach_what_infers_the_task_where_they_may(way):
         assert all(zero(of_actor)) and all(zero(of_critic))
 
 
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("way", slow_but(WAYS, "pearl"))
 def test_in_sac_the_actors_loss_does_not_train_it(way):
     """An update moves all of it, and the slow copy of it follows."""
     agent = tiny("sac", recurrent_steps=4, **posterior(way))
@@ -361,6 +361,7 @@ def test_in_sac_the_actors_loss_does_not_train_it(way):
         assert not any(zero(jax.tree.map(lambda x, y: x - y, new, old))), nets
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["impala", "pqn"])
 def test_other_agents_that_learn_from_rollouts_train_it_too(name):
     """All of it, by one update."""
@@ -382,6 +383,7 @@ def test_other_agents_that_learn_from_rollouts_train_it_too(name):
 # Through trials.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", [WAYS[0], *(pytest.param(way, marks=pytest.mark.slow) for way in WAYS[1:])])
 def test_the_policy_that_learns_is_the_one_that_played(way):
     """What a window tells is what its actions were drawn with, through the episodes of trials: ratios begin at 1."""

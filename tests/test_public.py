@@ -139,6 +139,7 @@ def found(result):
     return mtjax.evaluate(result, episodes=2)
 
 
+@pytest.mark.slow
 def test_an_evaluation_is_that_of_the_command(result, found, tmp_path):
     """The same returns in the same rows, of a result and of its folder."""
     main([f"--run={result.directory}", "--episodes=2"])

@@ -146,6 +146,7 @@ def test_a_memory_explores_as_well_as_can_be():
     assert found > 0.97 * exact.bandit(2, pulls)
 
 
+@pytest.mark.slow
 def test_a_run_with_a_recurrent_memory_stays_finite():
     """With a replay, and as many steps as a window before the first update."""
     given = {"num_envs": 2, "batch_size": 4, "replay_size": 60, "warmup_steps": 4, "chunk_steps": 16}

@@ -72,7 +72,10 @@ def test_packnet_numbers_tasks_as_they_end_and_shares_weights_out(packed):
     assert not any(np.any(x.shared["retraining"]) for x in held)
 
 
-@pytest.mark.parametrize("name, given", [("l2", {}), ("ewc", {"fisher_samples": 32}), ("mas", {"mas_samples": 32})])
+@pytest.mark.parametrize(
+    "name, given",
+    [("ewc", {"fisher_samples": 32}), *(param(case, slow=True) for case in (("l2", {}), ("mas", {"mas_samples": 32})))],
+)
 def test_a_penalty_holds_the_actor_with_which_each_task_ended(name, given):
     """Importances are not negative, not all zero, and add up; before the first task has ended they are 0."""
     found, _ = states(name, **given)
@@ -119,6 +122,7 @@ def test_a_mean_over_groups_is_the_mean_over_all():
     assert float(found["square"]) == pytest.approx(float(jnp.mean(inputs**2)), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_seeds_remember_apart(packed):
     """A seed of several is the seed alone, but for the order of sums."""
     (_, _, third, _), _ = packed
@@ -127,6 +131,7 @@ def test_seeds_remember_apart(packed):
     jax.tree.map(close, third.nets, alone[2].nets)
 
 
+@pytest.mark.slow
 def test_optimisers_begin_anew_where_a_task_ends():
     """Their counts are of the updates since then: 8 in each chunk after the first."""
     count = lambda state: max(
@@ -137,6 +142,7 @@ def test_optimisers_begin_anew_where_a_task_ends():
     assert count(kept[1]) == count(kept[0]) + 8 and count(fresh[1]) == 8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, given", [("packnet", {"retrain_updates": 5}), param(("ewc", {"fisher_samples": 64}), slow=True)]
 )

@@ -121,6 +121,7 @@ def test_uniform_weighs_nothing():
     assert Uniform().weights(Uniform().init(3), ALIKE) is None and Uniform().begin() is None
 
 
+@pytest.mark.slow
 def test_an_update_weighs_losses_by_the_temperatures_of_the_time():
     """Heads of their own move by their task's weight: first moments of Adam are the plain ones times it."""
     plain, weighed = tiny("multi-head"), tiny("multi-head", sampler="temperature", least_weight=0.0)

@@ -232,6 +232,7 @@ def whole(tmp_path_factory):
     return play(tmp_path_factory.mktemp("whole"), 20)
 
 
+@pytest.mark.slow
 def test_a_run_keeps_its_steps_in_its_folder(whole):
     """All that a resumed run may need, and not those before: the steps that a large replay on the device holds."""
     files = sorted((whole.directory / "store").iterdir(), key=lambda path: int(path.stem))

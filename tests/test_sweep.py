@@ -142,6 +142,7 @@ POINTS = (
 )
 
 
+@pytest.mark.slow
 def test_a_point_trains_as_the_run_with_its_values():
     """Both seeds of two points, one with clipping and decay and one without, against plain runs of the same seeds."""
     agent = tiny("sac-conditioned", scaling="return", lr_schedule="linear", lr_updates=20)
@@ -517,6 +518,7 @@ def test_a_seed_that_the_last_update_spoiled_is_given_up(capsys):
         given_up([np.inf, np.nan, 1.0], False, False, True)
 
 
+@pytest.mark.slow
 def test_a_spoiled_seed_is_not_evaluated(monkeypatch):
     """As it would do nothing, which has a return too."""
     real = stops.finite_seeds

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import SPEC, Goals, Stub, Walk, tiny, train
+from probes import SPEC, Goals, Stub, Walk, slow_but, tiny, train
 from test_loop import Drifting
 
 import mtjax
@@ -254,7 +254,7 @@ def test_rewards_of_several_steps_are_summed_through_episodes():
 # Agents that learn, and runs.
 
 
-@pytest.mark.parametrize("name", ["ppo", "sac-conditioned"])
+@pytest.mark.parametrize("name", slow_but(["ppo", "sac-conditioned"], "ppo"))
 def test_a_run_that_is_resumed_in_the_middle_of_a_trial_is_the_whole_run(name, tmp_path):
     """To the bit: a checkpoint holds which episode it is."""
     own = {"unroll": 5, "minibatches": 1} if name == "ppo" else {"warmup_steps": 4, "replay_size": 64, "batch_size": 4}

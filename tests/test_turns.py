@@ -190,6 +190,7 @@ def test_networks_are_reset_as_often_however_often_the_agent_learns(every, reset
     assert state.agent["resets"] == resets
 
 
+@pytest.mark.slow
 def test_joined_steps_and_rare_updates_go_together():
     """With the actor's turns as well."""
     given = {**SMALL, "chunk_steps": 12, "update_every": 3, "policy_delay": 2, "n_step": 3, "updates_per_step": 3}

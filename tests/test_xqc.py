@@ -100,6 +100,7 @@ def test_the_body_is_its_equations():
     np.testing.assert_allclose(found, x, rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.slow
 @EVERY_HEADS
 def test_statistics_are_those_of_both_ends_of_every_tasks_own_batch(heads):
     """After one update of every critic; the policy's are those of its observations."""
@@ -209,6 +210,7 @@ def test_agents_that_keep_no_statistics_are_refused(name):
         agent(name, encoder="batch-norm")
 
 
+@pytest.mark.slow
 def test_another_body_has_no_statistics():
     """And learns as in any agent."""
     _, state, update = started(encoder="simba")
