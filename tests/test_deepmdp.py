@@ -227,9 +227,8 @@ def test_theta_loss(transition):
 def test_theta_loss_of_three_tasks_by_hand(monkeypatch):
     """Thetas 3, 4 and 5 apart, and a state s that moves predictions by s theta: (d - |s| d)^2 for each sample."""
     representation = make("hip-bmdp", theta_size=2).representation
-    monkeypatch.setattr(
-        type(representation), "predict", lambda self, p, features, latent, a: (latent * features, 0 * latent * features)
-    )
+    predict = lambda self, p, features, latent, a: (latent * features, 0 * latent * features)
+    monkeypatch.setattr(type(representation.dynamics), "predict", predict)
     monkeypatch.setattr(type(representation), "perceive", lambda self, p, features, obs: (p.own["embedding"], obs))
     thetas = np.array([[0, 0], [3, 0], [3, 4]], np.float32)
     obs = jnp.float32([[0.0], [1.0], [-3.0]])
@@ -480,7 +479,7 @@ def test_the_transition_model_learns_linear_dynamics():
         """The next latent states of one task, as predicted and as they are."""
         features = params.own["embedding"]
         latent, then = (agent.representation.apply(params, "latent", x) for x in (batch.obs, batch.next_obs))
-        return agent.representation.predict(params, features, latent, batch.action)[0], then
+        return agent.representation.dynamics.predict(params, features, latent, batch.action)[0], then
 
     fresh = experience(jax.random.key(9))
     mean, then = jit(jax.vmap(predicted, (Params(None, 0), 0)))(state.nets["representation"], fresh)
