@@ -161,7 +161,7 @@ def test_no_loss_is_less_than_the_least(name, transition, monkeypatch):
     agent = make(name, transition=transition, model_coefficient=0.5, **without_theta)
     deviation = 0.01 if transition == "probabilistic" else 1.0
     exact = lambda self, params, features, latent, a: (jnp.full_like(latent, 0.3), jnp.full_like(latent, deviation))
-    monkeypatch.setattr(type(agent.representation), "predict", exact)
+    monkeypatch.setattr(type(agent.representation.dynamics), "predict", exact)
     batch, value = one_task(agent)
     model_targets = batch.model_targets._replace(latent=jnp.full_like(batch.model_targets.latent, 0.3))
     loss, (found, *_) = agent.critic_loss(random_params(agent), batch._replace(model_targets=model_targets), value)
