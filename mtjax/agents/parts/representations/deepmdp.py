@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from mtjax import frames
 from mtjax.agents import parts
 from mtjax.agents.networks import Params, Trunk
-from mtjax.agents.parts.representations.encoded import Encoded, apply_part
+from mtjax.agents.parts.representations.encoded import Encoded, apply_part, encode_tasks
 from mtjax.types import Array, InputError, Key, Metrics
 
 Transitions = Literal["deterministic", "probabilistic"]
@@ -153,7 +153,7 @@ class DeepMDP(Encoded):
         require_one_sense(obs)
 
     def targets(self, params: Params, target_params: Params, next_obs: Any, key: Key) -> tuple[ModelTargets, Key]:
-        return self.dynamics.targets(self.encode_all(target_params, next_obs), key)
+        return self.dynamics.targets(encode_tasks(self, target_params, next_obs), key)
 
     def join(self, loss: Array, metrics: Metrics, params: Params, batch: Any) -> tuple[Array, Metrics]:
         known = self.perceive(params, batch.features, batch.obs)

@@ -84,9 +84,6 @@ class Encoded(Plain):
         swept = isinstance(self.encoder_tau, jax.Array)
         return self.slow if not swept and self.encoder_tau == 1 else ()
 
-    def require(self, obs: Any) -> None:
-        """Accept vectors, pictures, and both."""
-
     def augment(self, batch: Transition, key: Key) -> Transition:
         return shift_pictures(batch, key, self.shift)
 
@@ -151,13 +148,14 @@ class Encoded(Plain):
             return self.apply(params, "latent", obs)
         return self.apply(params, PROJECTION, self.convolve(params, obs))
 
-    def encode_all(self, params: Params, obs: Any) -> Array:
-        """Return the critics' latent states (T, B, D) of all tasks' observations (T, B, O)."""
-        return jax.vmap(self.encode, (OVER_TASKS, 0))(params, without_past(obs))
-
     def convolve(self, params: Params, obs: Any) -> Any:
         """Return observations with the features (..., F) of convolutions in place of pictures."""
         return obs | {frames.PICTURES: self.apply(params, "latent", obs)}
+
+
+def encode_tasks(encoded: Encoded, params: Params, obs: Any) -> Array:
+    """Return the critics' latent states (T, B, D) of all tasks' observations (T, B, O)."""
+    return jax.vmap(encoded.encode, (OVER_TASKS, 0))(params, without_past(obs))
 
 
 def apply_part(modules: Mapping[str, nn.Module], params: Params, name: str, *inputs: Any) -> Array:

@@ -13,7 +13,7 @@ from mtjax.agents.parts.knowing.embedding import unit
 from mtjax.agents.parts.knowing.last_steps import TrajectoryEncoder
 from mtjax.agents.parts.representations.base import Unseen
 from mtjax.agents.parts.representations.deepmdp import DeepMDP, Dynamics, ModelTargets, Transitions, require_one_sense
-from mtjax.agents.parts.representations.encoded import Encoded
+from mtjax.agents.parts.representations.encoded import Encoded, encode_tasks
 from mtjax.types import Array, Key, Metrics
 
 STAND_INS = {
@@ -135,7 +135,7 @@ class HiPBMDP(Encoded):
 
     def targets(self, params: Params, target_params: Params, next_obs: Any, key: Key) -> tuple[ModelTargets, Key]:
         key, turn_key = jax.random.split(key)
-        model_targets, keys = self.dynamics.targets(self.encode_all(target_params, next_obs), key)
+        model_targets, keys = self.dynamics.targets(encode_tasks(self, target_params, next_obs), key)
         thetas = params.own["embedding"]
         turn = jax.random.randint(turn_key, (), 1, max(len(thetas), 2))  # a single task is compared with itself
         return model_targets._replace(other_theta=jnp.roll(thetas, turn, axis=0)), keys
