@@ -28,7 +28,6 @@ GROUND = (
     "types",
     "names",
     "checks",
-    "standalone",
     "tasks",
     "frames",
     "parallel",
