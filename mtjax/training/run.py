@@ -255,7 +255,7 @@ class _Run:
         return Clock(count, evaluations, min(max(-(-(self.config.warmup - steps) // chunk), 0), count))
 
     def _running(self, state: TrainState, returns: np.ndarray) -> str:
-        """Return a text on first episodes that still run, if no episode has ended."""
+        """Return a text on episodes that still run, if none has ended in a chunk with these returns (S, T)."""
         if np.isfinite(returns).any() or jax.process_count() > 1:
             return ""
         totals, ages, counted = jax.device_get((state.total, state.worlds.age, state.counted))
