@@ -22,6 +22,7 @@ if TYPE_CHECKING:  # for editors, which do not run __getattr__
     from mtjax.report.collect import runs as runs
     from mtjax.report.drawing import plot as plot
     from mtjax.report.scoring import evaluate as evaluate
+    from mtjax.saved import standalone as standalone
     from mtjax.saved.export import export as export
     from mtjax.saved.policy import load as load
     from mtjax.saved.result import Result as Result
@@ -54,10 +55,11 @@ _HOME = {
     "stacked": "mtjax.envs",
     "train": "mtjax.command.api",
 }
-__all__ = [*_HOME, "report"]
+_MODULES = {"report": "mtjax.report", "standalone": "mtjax.saved.standalone"}
+__all__ = [*_HOME, *_MODULES]
 _find, __dir__ = lazily(__name__, _HOME)
 
 
 def __getattr__(name: str) -> Any:
     """Import a public name when it is first used, so that ``import mtjax`` takes no time."""
-    return import_module("mtjax.report") if name == "report" else _find(name)
+    return import_module(_MODULES[name]) if name in _MODULES else _find(name)

@@ -147,6 +147,11 @@ class RunConfig:
         """Return the length of S: the seeds of all points."""
         return self.plan.seeds * max(len(self.points), 1)
 
+    @property
+    def samples(self) -> populations.Samples:
+        """Return the settings and seeds that statistics tell apart."""
+        return populations.Samples.of(self.points, self.plan.all_seeds, self.plan.population)
+
     @cached_property
     def num_tasks(self) -> int:
         """Return the number of training tasks."""

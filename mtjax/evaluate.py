@@ -39,8 +39,8 @@ class Request:
     video_seconds: float = 10.0
     """Seconds that the film lasts. Slow worlds, such as a boat's, are shown faster than they are."""
     export: str = ""
-    """File to write the first seed's policy into: one that ends with .npz for ``mtjax/standalone.py``, which reads it
-    with NumPy or JAX alone, or with .onnx for other runtimes."""
+    """File to write the first seed's policy into: one that ends with .npz for ``mtjax/saved/standalone.py``, which
+    reads it with NumPy or JAX alone, or with .onnx for other runtimes."""
     diagnostics: bool = False
     """Measure conflicts between the tasks' gradients, and unused units of the networks, from the run's replay."""
 

@@ -15,6 +15,7 @@ from mtjax import agents
 from mtjax.agents import replayed
 from mtjax.agents.base import Memory
 from mtjax.agents.networks import Params
+from mtjax.agents.parts.adaptation import adapt
 from mtjax.agents.parts.knowing import last_steps
 from mtjax.agents.parts.policies import Gaussian
 from mtjax.command.keywords import configured
@@ -399,3 +400,9 @@ def random_past(random: np.random.Generator, shape: tuple[int, ...], spec: Spec 
     normal = lambda size: jnp.float32(random.normal(size=(*shape, size)) * known[..., None])
     reward = jnp.float32(random.normal(size=shape) * known)
     return last_steps.Past(normal(spec.obs_size), jnp.tanh(normal(spec.action_size)), reward, jnp.asarray(known))
+
+
+def adapted_gain(gain, params, before, after, rate, first_order: bool = False):
+    """What tasks gain () on average by ``after`` (T, ...), once each has adapted to ``before`` (T, K, ...)."""
+    adapt_one = partial(adapt, gain, params, rate=rate, first_order=first_order)
+    return jnp.mean(jax.vmap(lambda before, after: gain(adapt_one(before), after))(before, after))

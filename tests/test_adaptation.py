@@ -4,8 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from probes import adapted_gain
 
-from mtjax.agents.parts.adaptation import adapt, adapted_gain, surrogate
+from mtjax.agents.parts.adaptation import adapt, surrogate
 
 A, C = np.float32([0.5, 1.0, 3.0]), np.float32([-1.0, 0.5, 2.0])
 RATE = 0.2

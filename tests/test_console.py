@@ -15,13 +15,13 @@ def test_a_line_says_steps_time_left_rate_and_what_the_range_is(capsys):
     console = Console(2000, clock=clock)
     clock.evaluation(1.0)
     clock.chunk(2.0)
-    console.progress(500, 30.0, 512.3, np.array([[np.nan, np.nan]]), "first episodes run")
+    console.progress(500, 30.0, 512.3, np.array([[np.nan, np.nan]]), "episodes still run")
     clock.evaluation(5.0)
     clock.chunk(2.0)
     console.progress(1000, 75.0, 512.3, np.array([[np.nan, 10.0], [20.0, 60.4]]))
     console.close()
     assert capsys.readouterr().out.splitlines() == [
-        "500 of 2,000 steps  30 s, 7.0 s left  512 steps/s  first episodes run",
+        "500 of 2,000 steps  30 s, 7.0 s left  512 steps/s  episodes still run",
         "1,000 of 2,000 steps  1 min 15 s, 4.0 s left  512 steps/s  return 30 (worst task 20, best 35)",
     ]
 
@@ -75,7 +75,7 @@ def test_running_episodes_count_if_they_began_at_age_zero():
     totals, ages = np.array([[[4.0, 100.0], [8.0, 100.0]]]), np.array([[[30, 930], [30, 930]]])
     counted = np.array([[[True, False], [True, False]]])
     told = consoles.describe_running(totals, ages, counted, 1000)
-    assert told == "first episodes run: return 6 so far, at step 30 of 1,000"
+    assert told == "episodes still run: return 6 so far, at step 30 of 1,000"
     assert consoles.describe_running(totals, ages, ~counted & False, 1000) == ""
 
 

@@ -161,7 +161,7 @@ def test_no_loss_is_less_than_the_least(name, transition, monkeypatch):
     agent = make(name, transition=transition, model_coefficient=0.5, **without_theta)
     deviation = 0.01 if transition == "probabilistic" else 1.0
     exact = lambda self, params, features, latent, a: (jnp.full_like(latent, 0.3), jnp.full_like(latent, deviation))
-    monkeypatch.setattr(type(agent.representation), "predict", exact)
+    monkeypatch.setattr(type(agent.representation.dynamics), "predict", exact)
     batch, value = one_task(agent)
     model_targets = batch.model_targets._replace(latent=jnp.full_like(batch.model_targets.latent, 0.3))
     loss, (found, *_) = agent.critic_loss(random_params(agent), batch._replace(model_targets=model_targets), value)
@@ -228,9 +228,8 @@ def test_theta_loss(transition):
 def test_theta_loss_of_three_tasks_by_hand(monkeypatch):
     """Thetas 3, 4 and 5 apart, and a state s that moves predictions by s theta: (d - |s| d)^2 for each sample."""
     representation = make("hip-bmdp", theta_size=2).representation
-    monkeypatch.setattr(
-        type(representation), "predict", lambda self, p, features, latent, a: (latent * features, 0 * latent * features)
-    )
+    predict = lambda self, p, features, latent, a: (latent * features, 0 * latent * features)
+    monkeypatch.setattr(type(representation.dynamics), "predict", predict)
     monkeypatch.setattr(type(representation), "perceive", lambda self, p, features, obs: (p.own["embedding"], obs))
     thetas = np.array([[0, 0], [3, 0], [3, 4]], np.float32)
     obs = jnp.float32([[0.0], [1.0], [-3.0]])
@@ -481,7 +480,7 @@ def test_the_transition_model_learns_linear_dynamics():
         """The next latent states of one task, as predicted and as they are."""
         features = params.own["embedding"]
         latent, then = (agent.representation.apply(params, "latent", x) for x in (batch.obs, batch.next_obs))
-        return agent.representation.predict(params, features, latent, batch.action)[0], then
+        return agent.representation.dynamics.predict(params, features, latent, batch.action)[0], then
 
     fresh = experience(jax.random.key(9))
     mean, then = jit(jax.vmap(predicted, (Params(None, 0), 0)))(state.nets["representation"], fresh)

@@ -28,7 +28,6 @@ GROUND = (
     "types",
     "names",
     "checks",
-    "standalone",
     "tasks",
     "frames",
     "parallel",
@@ -134,6 +133,59 @@ def test_a_class_fits_in_the_head(group):
     methods = {cls.name: sum(isinstance(node, ast.FunctionDef) for node in cls.body) for cls in classes}
     assert methods
     assert not {name: count for name, count in methods.items() if count > 15}
+
+
+Class = tuple[str, str]  # a module and a class in it
+
+
+@cache
+def extended() -> dict[Class, list[Class]]:
+    """Every class of the package and the classes of the package that it extends."""
+    found = {}
+    for module, tree in trees().items():
+        for cls in (node for node in tree.body if isinstance(node, ast.ClassDef)):
+            bases = [defined(module, ast.unparse(base).split("[")[0]) for base in cls.bases]
+            found[module, cls.name] = [base for base in bases if base]
+    return found
+
+
+@cache
+def defined(module: str, name: str) -> Class | None:
+    """Where the class is defined that a module calls by a name; None outside the package."""
+    first, _, rest = name.partition(".")
+    for node in trees()[module].body:
+        match node:
+            case ast.ClassDef() if node.name == name:
+                return module, name
+            case ast.Assign(targets=[ast.Name(id=alias)], value=ast.Name()) if alias == name:
+                return defined(module, node.value.id)
+            case ast.ImportFrom():
+                for alias in node.names:
+                    place = f"{node.module}.{alias.name}"
+                    if (alias.asname or alias.name) == first and (place in FILES or node.module in FILES):
+                        return defined(place, rest) if place in FILES else defined(f"{node.module}", alias.name)
+    return None
+
+
+def chain(cls: Class) -> list[Class]:
+    """A class and the longest line of classes above it."""
+    return [cls, *max((chain(base) for base in extended()[cls]), key=len, default=[])]
+
+
+LEVELS = {"agents.parts": 2, "agents": 3, "experience": 2, "learning": 2, "envs": 4}
+"""How many classes a line has at most, from one to the root of those that it extends, by what the modules are in."""
+EXTENDED = {"Encoded", "Remembering", "C51"}
+"""Parts that are chosen by name or are for own ones to extend, so that their line may have a third class."""
+
+
+def test_a_class_is_read_with_few_others():
+    """What siblings have in common are values and functions, as a reader has to know all that a class extends."""
+    deep = []
+    for cls in extended():
+        most = next((n for group, n in LEVELS.items() if f"{cls[0]}.".startswith(f"mtjax.{group}.")), 3)
+        line = [name for _, name in chain(cls)]
+        deep += [" < ".join(line)] * (len(line) > most + (len(line) == 3 and line[1] in EXTENDED))
+    assert extended() and not deep
 
 
 @pytest.mark.parametrize("module", ["mtjax.command.keywords", "mtjax.command.run_config"])

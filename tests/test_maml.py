@@ -6,13 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import Walk, of_task, only_seed, pick, tiny, train, with_nets
+from probes import Walk, adapted_gain, of_task, only_seed, pick, tiny, train, with_nets
 
 import mtjax
 from mtjax.agents import agent, clipped, for_action
 from mtjax.agents.maml import MAML
 from mtjax.agents.on_policy import Taken
-from mtjax.agents.parts.adaptation import adapted_gain
 from mtjax.envs.probes import Probe, World, tasks_of
 from mtjax.learning import loop
 from mtjax.learning.evaluation import Episodes, adapted, evaluate

@@ -178,6 +178,17 @@ def test_an_agent_is_another_with_other_defaults(forget):
     assert agent.encoder.num_experts == 3 and agent.actor_lr == 1e-2 and agent.conditioning == Parameters()
 
 
+@pytest.mark.parametrize(
+    "hook, instead", [("check", "in __post_init__"), ("relabel", "relabel steps"), ("consolidate", "a part")]
+)
+def test_an_agent_with_a_method_that_nothing_calls_is_refused(hook, instead, forget):
+    """As it was called once, and would be passed over in silence."""
+    own = type("Mine", (AGENTS["sac"].cls,), {hook: lambda self, *given: None})
+    with pytest.raises(InputError, match=f"nothing calls Mine.{hook}: .*{instead}"):
+        register("mine", own)
+    assert "mine" not in AGENTS
+
+
 def test_what_cannot_be_registered_is_refused(forget):
     """In a line that says why, and without a trace."""
 

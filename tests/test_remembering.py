@@ -116,12 +116,6 @@ def test_the_information_of_a_policy_is_that_of_its_gaussian():
     np.testing.assert_allclose(found, np.concatenate([deviation**-2.0, 2 * slope**2]), rtol=1e-4)
 
 
-def test_a_mean_over_groups_is_the_mean_over_all():
-    inputs = jnp.arange(96.0)
-    found = remembering._in_groups(lambda x: {"square": jnp.mean(x**2)}, inputs)
-    assert float(found["square"]) == pytest.approx(float(jnp.mean(inputs**2)), rel=1e-5)
-
-
 @pytest.mark.slow
 def test_seeds_remember_apart(packed):
     """A seed of several is the seed alone, but for the order of sums."""

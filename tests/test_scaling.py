@@ -39,6 +39,7 @@ from mtjax.agents.parts.scaling import (
 )
 from mtjax.agents.parts.scaling.returns import Sums
 from mtjax.experience import Replay
+from mtjax.learning import loop
 from mtjax.types import InputError, Spec, Transition
 
 SPEC, BATCH = Spec.vector(3, 2, 1), 4
@@ -395,7 +396,7 @@ class Diary(Stub):
     def update(self, state, window, tasks, key, number):
         return state | {"updates": state["updates"] + 1}, {"updates": jnp.float32(state["updates"])}
 
-    def reset_networks(self, state, spec, tasks, key):
+    def reset(self, state, spec, tasks, key):
         assert spec.obs_size == 1 and len(tasks.id) == 2
         resets = state["resets"] | (1 << (state["step"] - 1))  # the step is taken, and not yet learned from
         return state | {"resets": resets, "updates": jnp.int32(0), "noise": jax.random.normal(key)}
@@ -403,8 +404,9 @@ class Diary(Stub):
 
 @pytest.mark.parametrize("seeds", [(3,), (3, 5)])
 @pytest.mark.parametrize(("every", "expected"), [(0, ()), (3, (6, 9, 12, 15, 18)), (4, (8, 12, 16)), (11, (11,))])
-def test_resets_come_at_multiples_of_their_period_after_the_warmup(every, expected, seeds):
+def test_resets_come_at_multiples_of_their_period_after_the_warmup(every, expected, seeds, monkeypatch):
     """In all seeds alike, across chunks, before the step is learned from; each seed with a key of its own."""
+    monkeypatch.setattr(loop, "reset_networks", Diary.reset)
     settings = BRIEF | {"reset_every": every}
     state, _ = train(Walk(), Diary(), settings, seeds=seeds, chunks=2)
     for seed in range(len(seeds)):

@@ -310,8 +310,8 @@ def needs(monkeypatch, device, host=1e12, seeds=5, backend="gpu", **given):
     agent, settings = configure(mtjax.agent("drq", n_step=1), Settings(), {**pictured, **given})
     tasks, key = env.tasks(), jnp.arange(seeds)
     state = jax.eval_shape(partial(loop.init, env, agent, settings), tasks, key)
-    found = memory.Needs.of(state, env, agent, settings)
-    memory.require_room(found, env)
+    found = memory.Needs.of(state, env.spec, agent, settings)
+    memory.require_room(found, env.spec)
     told = memory.tell(state.data, found, agent.experience.describe(env.spec, 2), seeds)
     return state, found, told
 
@@ -347,17 +347,17 @@ def test_pictures_of_rollouts_count(monkeypatch, short_family):
     def of(unroll):
         agent = mtjax.agent("ppo", representation="encoded", hidden=(8,), latent_widths=(4,), unroll=unroll)
         state = jax.eval_shape(partial(loop.init, env, agent, settings), env.tasks(), jnp.arange(5))
-        return memory.Needs.of(state, env, agent, settings)
+        return memory.Needs.of(state, env.spec, agent, settings)
 
     short, long = of(10), of(200)
     assert (short.rollout, long.rollout) == (rollout, 20 * rollout)
     assert short.state == long.state and short.device == short.state + rollout
     monkeypatch.setattr(memory, "physical_bytes", lambda: long.device - 1)
-    memory.require_room(short, env)
+    memory.require_room(short, env.spec)
     with pytest.raises(
         InputError, match=r"of rollouts\) and .* lower --agent.unroll, --num-envs or --seeds; with --env"
     ):
-        memory.require_room(long, env)
+        memory.require_room(long, env.spec)
     config = run_config.parse([*SHORT_RUN, "--seeds=5"])
     for needs, rounds in ((long, [2, 2, 1]), (short, [5])):
         monkeypatch.setattr(memory, "_needs", lambda _, needs=needs: needs)
@@ -403,7 +403,7 @@ def test_seeds_run_in_rounds_that_fit_on_device_and_host(monkeypatch, short_fami
     """Of five seeds two at a time, where either has room for two and a half."""
     config = run_config.parse([*SHORT_RUN, "--seeds=5", "--host-replay-size=400"])
     shapes = state_shapes(config)
-    stored = memory.Needs.of(shapes, config.family, config.learner, config.training).host
+    stored = memory.Needs.of(shapes, config.family.spec, config.learner, config.training).host
     monkeypatch.setattr(memory, "state_shapes", lambda _: shapes)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     state = memory.required_bytes(config)

@@ -150,7 +150,7 @@ class Recorder(Stub):
     def update(self, state, window, tasks, key, number):
         return {**state, "updates": state["updates"] + 1}, {"loss": jnp.float32(tasks.id)}
 
-    def reset_networks(self, state, spec, tasks, key):
+    def reset(self, state, spec, tasks, key):
         return {**state, "resets": state["resets"] + 1}
 
 
@@ -183,8 +183,9 @@ def test_a_ring_holds_whole_iterations_and_wraps_around_between_them():
 
 
 @pytest.mark.parametrize(("every", "resets"), [(1, 3), (4, 3)])
-def test_networks_are_reset_as_often_however_often_the_agent_learns(every, resets):
+def test_networks_are_reset_as_often_however_often_the_agent_learns(every, resets, monkeypatch):
     """After 5, 10 and 15 of 20 steps, at the next time of updates."""
+    monkeypatch.setattr(loop, "reset_networks", Recorder.reset)
     given = {**SMALL, "chunk_steps": 20, "update_every": every, "reset_every": 5}
     state, _ = train(Walk(), Recorder(), given)
     assert state.agent["resets"] == resets

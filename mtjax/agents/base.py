@@ -297,7 +297,7 @@ class BaseAgent(abc.ABC):
         told = jax.tree.map(lambda x: x.reshape(len(x), -1), collectives.whole(told, axis=2))
         new = {"inputs": self.view.count(state.nets["inputs"], steps.obs)}
         for name in WATCHERS:
-            part: parts.Watcher = getattr(self, name)
+            part: Scaling | Sampler = getattr(self, name)
             after = told._replace(memory=part.remember(getattr(told.memory, name), told.reward, gamma))
             new[name] = Params({}, part.observe(state.nets[name].own, after))
         return state.with_nets(**new)

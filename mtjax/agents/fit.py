@@ -136,12 +136,7 @@ def _apart(params: Params) -> Nets:
 
 
 def reset_networks(agent: Any, state: AgentState, spec: Spec, tasks: Task, key: Key) -> AgentState:
-    """Return a state in which all that some fit trains begins anew; what is counted is kept.
-
-    An agent without fits resets itself by a method of this name.
-    """
-    if hasattr(agent, "reset_networks"):
-        return agent.reset_networks(state, spec, tasks, key)
+    """Return a state in which all that some fit trains begins anew; what is counted is kept."""
     fresh = agent.init(spec, tasks, key)
     nets = {name: fresh.nets[name] for name in learned(agent.fits.values())}
     nets |= {"scaling": Params({}, agent.scaling.reset(state.nets["scaling"].own))}

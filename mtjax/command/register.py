@@ -12,6 +12,13 @@ from mtjax.checks import shown
 from mtjax.envs.family import Family
 from mtjax.names import InputError, first_sentence, public
 
+_GONE = {
+    "check": "settings are checked in __post_init__",
+    "relabel": "families relabel steps, by relabel(task, transition, key)",
+    "consolidate": "a part of the kind continual does it, which derives from mtjax.agents.parts.remembering.Nothing",
+}
+"""Methods of agents that once were called, and what is in their place."""
+
 
 @public
 def register(name: str, thing: "type | str", **defaults: Any) -> None:
@@ -47,6 +54,8 @@ def register(name: str, thing: "type | str", **defaults: Any) -> None:
 def _register_agent(name: str, preset: agents.Preset) -> None:
     if name in agents.AGENTS:
         raise InputError(f"there is an agent {name!r} already; choose another name")
+    if gone := next((hook for hook in _GONE if hasattr(preset.cls, hook)), None):
+        raise InputError(f"nothing calls {preset.cls.__name__}.{gone}: {_GONE[gone]}")
     agents.AGENTS[name] = preset
     try:
         agents.agent(name)

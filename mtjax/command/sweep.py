@@ -225,10 +225,11 @@ def _locked(folder: Path) -> contextlib.AbstractContextManager:
 
 def run_unfinished(folder: Path) -> None:
     """Train all runs of a sweep that are not finished, and print the table of the whole sweep."""
-    runs = _run_folders(folder)
+    runs, told = _run_folders(folder), ""
     print(f"sweep: {folder}", flush=True)
     for i, run in enumerate(runs):
         config = from_json(run / "config.json")
+        told = f"\n{NO_INTERVAL}" if config.plan.rule else told
         if final_evaluations(config, run) is not None or (run / _DIVERGED).exists():
             continue
         label, resume = f"run {i + 1} of {len(runs)}", checkpoint.newest(run / "checkpoints") is not None
@@ -250,8 +251,6 @@ def run_unfinished(folder: Path) -> None:
             words = shlex.join([f"--resume={folder}", *import_flags(config)])
             print(f"{table(rows(runs))}\nstopped; the state is saved. Go on with:\n  python -m mtjax.train {words}")
             sys.exit(128 + signal)
-    of_members = any(from_json(run / "config.json").plan.rule for run in runs)
-    told = f"\n{NO_INTERVAL}" * of_members
     print(f"{table(rows(runs))}{told}\nsweep: {folder}")
 
 
@@ -289,9 +288,9 @@ def rows(runs: Sequence[Path]) -> list[dict[str, Any]]:
     found: dict[tuple, list[_Part]] = {}
     for run in runs:
         config = from_json(run / "config.json")
-        evaluations, count = _latest_evaluations(config, run), config.plan.seeds
-        points, count = ((), config.members) if config.plan.rule else (config.points, count)
-        for p, point in enumerate(points or ({},)):
+        evaluations, points = _latest_evaluations(config, run), config.samples.points
+        count = config.members // len(points)
+        for p, point in enumerate(points):
             mine = slice(p * count, (p + 1) * count)
             returns = evaluations and {split: x[mine, -1] for split, x in evaluations.returns.items() if x.size}
             steps = int(evaluations.steps[-1]) if evaluations else 0

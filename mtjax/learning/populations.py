@@ -7,9 +7,9 @@ Copies make members depend on each other. They are no sample of independent seed
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from collections.abc import Set as AbstractSet
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import jax
 import numpy as np
@@ -44,6 +44,18 @@ class Halving:
 
     def sources(self, fitness: np.ndarray, origins: np.ndarray, key: Key) -> np.ndarray:
         return halve(fitness, origins)
+
+
+class Samples(NamedTuple):
+    """Says what statistics tell apart: settings, and of each the seeds, which are independent of each other."""
+
+    points: tuple[Mapping[str, float], ...]  # the swept numbers of each setting; one without any if none are swept
+    seeds: tuple[int, ...]
+
+    @staticmethod
+    def of(points: Sequence[Mapping[str, float]], seeds: Sequence[int], population: str) -> "Samples":
+        """Return those of a run. Members of a population copy each other, so all are one seed of one setting."""
+        return Samples(({},), (seeds[0],)) if population else Samples(tuple(points) or ({},), tuple(seeds))
 
 
 Rule = PBT | Halving

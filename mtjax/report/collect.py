@@ -14,6 +14,7 @@ from mtjax.checks import path
 from mtjax.config import RunConfig
 from mtjax.envs import name_of as env_name_of
 from mtjax.learning.evaluation import Evaluations, as_one_seed
+from mtjax.learning.populations import Samples
 from mtjax.names import InputError, nearest_error, notice, public
 from mtjax.saved.config_json import from_json
 from mtjax.saved.folder import evaluations_of
@@ -114,12 +115,12 @@ def _renamed(one: Learned, name: str) -> Learned:
 
 def _of_result(result: Any) -> list[Learned]:
     """Return what was learned at every point of a result of ``mtjax.train``."""
-    found, seeds, points, env = result.evaluations, result.seeds, result.points, result.env
-    agent = name_of(result.agent)
+    found, env, agent = result.evaluations, result.env, name_of(result.agent)
+    points, seeds = Samples.of(result.points, result.seeds, result.population)
     if rule := result.population:
-        found, seeds, points, agent = _of_population(found, rule), seeds[:1], (), f"{agent}, {rule}"
+        found, agent = _of_population(found, rule), f"{agent}, {rule}"
     made, count = [], len(seeds)
-    for p, point in enumerate(points or ({},)):
+    for p, point in enumerate(points):
         name = ", ".join([agent, *(f"{k.replace('_', '-')} {_short(x)}" for k, x in point.items())])
         of_point = _rows(found, slice(p * count, (p + 1) * count))
         made.append(
@@ -140,13 +141,13 @@ def _of_result(result: Any) -> list[Learned]:
 def _points(found: Found) -> Iterable[tuple[Any, dict[str, Any], Learned]]:
     """Yield every point of a run: what must be equal for its seeds to be joined, its settings, and what it learned."""
     config, evaluations, name = found.config, found.evaluations, found.config.agent
-    seeds, points, family = tuple(config.plan.all_seeds), config.points, config.family
+    (points, seeds), family = config.samples, config.family
     common = {**settings(config.learner), **vars(config.training)}
     if rule := config.plan.population:
         evaluations, name = _of_population(evaluations, rule), f"{name}, {rule}"
-        seeds, points, common = seeds[:1], (), common | {"members": config.members, "sweep": " ".join(config.sweep)}
+        common |= {"members": config.members, "sweep": " ".join(config.sweep)}
     count = len(seeds)
-    for p, point in enumerate(points or ({},)):
+    for p, point in enumerate(points):
         mine = _rows(evaluations, slice(p * count, (p + 1) * count))
         own = {**common, **point}
         one = Learned(

@@ -24,9 +24,9 @@ def draw(config: RunConfig, evaluations: Evaluations, directory: Path, labels: S
         return
     if config.plan.population:
         evaluations, labels = as_one_seed(evaluations), ()
-    count, train = config.plan.seeds, evaluations.returns["train"]
-    points = () if config.plan.population else config.points
-    labels = labels or [", ".join(f"{name} {value:g}" for name, value in point.items()) for point in points]
+    (points, seeds), train = config.samples, evaluations.returns["train"]
+    count = len(seeds)
+    labels = labels or [", ".join(f"{name} {value:g}" for name, value in point.items()) for point in points if point]
     of_points = {label: train[p * count : (p + 1) * count] for p, label in enumerate(labels)}
     curves = of_points or evaluations.returns
     known = {name: x for name, x in curves.items() if np.isfinite(x).all()}

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mtjax.names import InputError
-from mtjax.standalone import OPERATIONS, product_equation, spread_sizes
+from mtjax.saved.standalone import OPERATIONS, product_equation, spread_sizes
 
 _OPSET = 18  # of ONNX's operators: the first whose reductions all take their axes as inputs
 _IR = 8  # the file format that came with it, so that older runtimes read the file

@@ -1,11 +1,11 @@
-"""Traced functions as lists of steps, which ``mtjax.standalone`` runs by NumPy and ``onnx`` writes as models."""
+"""Traced functions as lists of steps, which ``standalone`` runs by NumPy and ``onnx`` writes as models."""
 
 from typing import Any
 
 import numpy as np
 
 from mtjax.names import InputError
-from mtjax.standalone import OPERATIONS, SETTINGS
+from mtjax.saved.standalone import OPERATIONS, SETTINGS
 
 _CALLS = ("jit", "pjit", "closed_call", "core_call", "remat", "checkpoint", "custom_jvp_call", "custom_vjp_call")
 _FIXED = {  # settings that must be 1, as programs do not keep them

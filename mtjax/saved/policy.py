@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax import frames, standalone
+from mtjax import frames
 from mtjax.agents import BaseAgent, name_of, swept
 from mtjax.agents.swept import Point
 from mtjax.checks import path, require_whole, shown
@@ -24,7 +24,7 @@ from mtjax.experience.ring import Ring
 from mtjax.learning import loop
 from mtjax.names import public
 from mtjax.saved import checkpoint as checkpoints
-from mtjax.saved import pretrained
+from mtjax.saved import pretrained, standalone
 from mtjax.saved.config_json import from_json
 from mtjax.saved.operations import steps_of
 from mtjax.tasks import SAME_CONTEXT

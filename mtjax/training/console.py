@@ -145,7 +145,7 @@ def describe_running(totals: np.ndarray, ages: np.ndarray, counted: np.ndarray, 
     if not counted.any() or not ages[counted].any():
         return ""
     age = int(np.max(ages[counted]))
-    return f"first episodes run: return {amount(np.mean(totals[counted]))} so far, at step {age:,} of {horizon:,}"
+    return f"episodes still run: return {amount(np.mean(totals[counted]))} so far, at step {age:,} of {horizon:,}"
 
 
 def describe_warmup(steps: int, total: int) -> list[str]:

@@ -26,9 +26,9 @@ def check(config: RunConfig, start: Policy | None = None) -> None:
     Raises:
         InputError: they do not go together.
     """
-    config.check()
     if config.env or start is not None:
         require_start(config, start)
+    config.check()
 
 
 def load_start(config: RunConfig) -> Policy | None:

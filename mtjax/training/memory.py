@@ -18,7 +18,7 @@ from mtjax.frames import PICTURES, shown
 from mtjax.learning.loop import Settings, TrainState
 from mtjax.saved import checkpoint
 from mtjax.saved.policy import state_shapes
-from mtjax.types import Agent, Env, InputError
+from mtjax.types import Agent, InputError, Spec
 
 _USABLE_SHARE = 0.9  # of the available memory, for one program
 _EXHAUSTED = re.compile("RESOURCE_EXHAUSTED|[Oo]ut of memory|allocate memory")
@@ -61,18 +61,18 @@ class Needs(NamedTuple):
     host: int  # the replay's store in the host's memory, with ``moved``
 
     @staticmethod
-    def of(state: TrainState, env: Env, agent: Agent, settings: Settings) -> "Needs":
+    def of(state: TrainState, spec: Spec, agent: Agent, settings: Settings) -> "Needs":
         """Return what a training state, or its shapes, needs."""
         experience: Any = agent.experience
         networks, slots = checkpoint.size_of(state.agent), experience.host_slots(settings.num_envs)
         data = checkpoint.size_of(state) - networks
         seeds, tasks = state.worlds.age.shape[:2]
-        rollout = seeds * tasks * experience.rollout_bytes(env.spec, settings.num_envs)
+        rollout = seeds * tasks * experience.rollout_bytes(spec, settings.num_envs)
         if not slots:
             return Needs(networks, data, rollout, 0, 0)
         rows = state.data.ring.rows
         each = checkpoint.size_of(rows) // jax.tree.leaves(rows)[0].shape[2]
-        count, length = segments_of(experience, env.spec, settings.num_envs)
+        count, length = segments_of(experience, spec, settings.num_envs)
         moved = settings.chunk_steps + recalled_rows(settings.chunk_steps, count, length) * length
         return Needs(networks, data, rollout, moved * each, (slots + moved) * each)
 
@@ -90,7 +90,7 @@ class Needs(NamedTuple):
 def _needs(config: RunConfig) -> Needs:
     """Return what one point of a run needs."""
     state = state_shapes(dataclasses.replace(config, points=config.points[:1]))
-    return Needs.of(state, config.family, config.learner, config.training)
+    return Needs.of(state, config.family.spec, config.learner, config.training)
 
 
 def required_bytes(config: RunConfig) -> int:
@@ -106,7 +106,7 @@ def _with_copies(needs: Needs) -> int:
     return needs.device + saved + _AGENT_COPIES * needs.agent
 
 
-def require_room(needs: Needs, env: Env) -> None:
+def require_room(needs: Needs, spec: Spec) -> None:
     """Check that a run fits into memory at all.
 
     Raises:
@@ -123,35 +123,35 @@ def require_room(needs: Needs, env: Env) -> None:
         told = ", ".join(f"{gigabytes(size)} of {name}" for size, name in parts if size)
         raise InputError(
             f"the run needs {gigabytes(needs.device)} ({told}) and there are {gigabytes(limit)}; lower "
-            + _smaller(needs, env)
+            + _smaller(needs, spec)
         )
     if needs.host > host_bytes():
         raise InputError(
             f"the replay on the host needs {gigabytes(needs.host)} and the machine has {gigabytes(host_bytes())}; "
-            f"lower --host-replay-size, --seeds or --chunk-steps{_grey(env)}"
+            f"lower --host-replay-size, --seeds or --chunk-steps{_grey(spec)}"
         )
 
 
-def _smaller(needs: Needs, env: Env) -> str:
+def _smaller(needs: Needs, spec: Spec) -> str:
     """Return the settings that make most of a run smaller."""
     if 2 * needs.agent > needs.device:
         return "--agent.hidden or --seeds"
     if needs.rollout:
-        return "--agent.unroll, --num-envs or --seeds" + _grey(env)
-    return "--replay-size, --num-envs or --seeds" + _further(needs, env)
+        return "--agent.unroll, --num-envs or --seeds" + _grey(spec)
+    return "--replay-size, --num-envs or --seeds" + _further(needs, spec)
 
 
-def _further(needs: Needs, env: Env) -> str:
+def _further(needs: Needs, spec: Spec) -> str:
     """Return clauses on what else makes room for a replay."""
     apart = not needs.host and jax.default_backend() != "cpu"
     moved = "; with --host-replay-size=N the host keeps N transitions beside a smaller replay" if apart else ""
     shorter = ", or --chunk-steps and --host-replay-size" if needs.host else ""
-    return shorter + _grey(env) + moved
+    return shorter + _grey(spec) + moved
 
 
-def _grey(env: Env) -> str:
-    """Return a clause on smaller pictures, if the family has coloured ones."""
-    coloured = shown(env.spec.obs) and env.spec.obs[PICTURES].shape[-1] == 3
+def _grey(spec: Spec) -> str:
+    """Return a clause on smaller pictures, if a family has coloured ones."""
+    coloured = shown(spec.obs) and spec.obs[PICTURES].shape[-1] == 3
     return "; with --env.grey pictures take a third" if coloured else ""
 
 

@@ -212,10 +212,10 @@ class _Run:
         return state._replace(counted=state.counted & False) if forgetful(self.config.family) else state
 
     def _describe(self, shapes: TrainState) -> None:
-        env, settings = self.config.family, self.config.played
-        needs = memory.Needs.of(shapes, env, self.agent, settings)
-        memory.require_room(needs, env)
-        kind = self.agent.experience.describe(env.spec, settings.num_envs)
+        spec, settings = self.config.family.spec, self.config.played
+        needs = memory.Needs.of(shapes, spec, self.agent, settings)
+        memory.require_room(needs, spec)
+        kind = self.agent.experience.describe(spec, settings.num_envs)
         for line in memory.tell(shapes.data, needs, kind, len(self.seeds)):
             self.console.say(line)
         if line := meshes.describe(self.config.mesh, len(self.seeds), settings.num_envs):
@@ -255,7 +255,7 @@ class _Run:
         return Clock(count, evaluations, min(max(-(-(self.config.warmup - steps) // chunk), 0), count))
 
     def _running(self, state: TrainState, returns: np.ndarray) -> str:
-        """Return a text on first episodes that still run, if no episode has ended."""
+        """Return a text on episodes that still run, if none has ended in a chunk with these returns (S, T)."""
         if np.isfinite(returns).any() or jax.process_count() > 1:
             return ""
         totals, ages, counted = jax.device_get((state.total, state.worlds.age, state.counted))

@@ -14,33 +14,12 @@ import jax.numpy as jnp
 
 from mtjax.checks import checked, require_text, shown
 from mtjax.names import frozen, nearest_error
-from mtjax.types import Array, InputError, Transition
+from mtjax.types import InputError
 
 P = TypeVar("P")
 
 NO_SETTING = {"setting": False}
 """Marks a field that follows from the environment: it is no flag, and in no record of settings."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Watcher:
-    """A watcher is a part that may keep statistics of all steps, and a memory of each episode."""
-
-    def init(self, num_tasks: int) -> Any:
-        """Return the memory before the first step; leaves are (T, ...)."""
-        return None
-
-    def begin(self) -> Any:
-        """Return the memory with which an episode begins; None for none."""
-        return None
-
-    def remember(self, episode: Any, reward: Array, gamma: float | Array) -> Any:
-        """Return the memory of an episode after a step."""
-        return episode
-
-    def observe(self, memory: Any, steps: Transition) -> Any:
-        """Update the memory by collected steps (T, N, ...), which hold the memories of episodes after each step."""
-        return memory
 
 
 def choose(kind: str, table: Mapping[str, type[P]], given: Any) -> P:

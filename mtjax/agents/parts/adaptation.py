@@ -1,7 +1,6 @@
 """Learning to adapt: parameters that are good after a few gradient steps on a task (Finn et al. 2017, "MAML")."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import jax
@@ -29,21 +28,6 @@ def adapt(gain: Gain, params: Any, data: Any, rate: float | Array, first_order: 
         return jax.tree.map(lambda x, y: x + rate * y, params, slope), None
 
     return jax.lax.scan(step, params, data)[0]
-
-
-def adapted_gain(
-    gain: Gain, params: Any, before: Any, after: Any, rate: float | Array, first_order: bool = False
-) -> Array:
-    """Return what tasks gain on average once each has adapted, which MAML maximises: mean_i gain(theta_i, D'_i).
-
-    Data are constants: as in the paper, nothing rewards rollouts before a step for what they let it find out.
-
-    Args:
-        before: of the steps of each task, leaves (T, K, ...), as for ``adapt``.
-        after: of each task, leaves (T, ...); of policies they are rollouts of the adapted policy.
-    """
-    adapt_one = partial(adapt, gain, params, rate=rate, first_order=first_order)
-    return jnp.mean(jax.vmap(lambda before, after: gain(adapt_one(before), after))(before, after))
 
 
 def surrogate(log_ratio: Array, advantage: Array) -> Array:

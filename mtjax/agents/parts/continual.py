@@ -19,6 +19,9 @@ Outputs = Callable[[Any, Any], Array]
 
 # Penalties.
 
+GROUP = 32
+"""Inputs whose slopes are in memory at a time."""
+
 
 class Anchor(NamedTuple):
     """Holds where parameters should stay, and how much each of them matters."""
@@ -89,8 +92,14 @@ def mas(outputs: Outputs, params: Any, inputs: Any) -> Any:
 
 
 def _mean(of_one: Callable[[Any], Any], inputs: Any) -> Any:
-    """Return the mean of a tree over inputs (N, ...)."""
-    return jax.tree.map(partial(jnp.mean, axis=0), jax.vmap(of_one)(inputs))
+    """Return the mean of a tree over inputs (N, ...), N at most ``GROUP`` or a multiple of it."""
+    mean = lambda group: jax.tree.map(partial(jnp.mean, axis=0), jax.vmap(of_one)(group))
+    grouped = lambda x: x.reshape(-1, min(len(x), GROUP), *x.shape[1:])
+    groups = jax.tree.map(grouped, inputs)
+    count = len(jax.tree.leaves(groups)[0])
+    zeros = jax.tree.map(jnp.zeros_like, jax.eval_shape(mean, jax.tree.map(lambda x: x[0], groups)))
+    add = lambda total, group: (jax.tree.map(lambda x, y: x + y / count, total, mean(group)), None)
+    return jax.lax.scan(add, zeros, groups)[0]
 
 
 # PackNet (Mallya and Lazebnik 2018).
@@ -127,14 +136,6 @@ def _prune(x: Array, owner: Array, task: int | Array, share: float | Array) -> t
     rank = jnp.zeros(x.size, jnp.int32).at[jnp.argsort(-size)].set(jnp.arange(x.size)).reshape(x.shape)
     kept = free & (rank < jnp.maximum(jnp.round(share * jnp.sum(free)), 1))
     return jnp.where(free & ~kept, 0.0, x), jnp.where(kept, task, owner)
-
-
-def of_owner(updates: Any, owners: Any, owner: int | Array) -> Any:
-    """Return updates of those weights alone that ``owner`` has: ``FREE`` while a task learns, itself once it is pruned.
-
-    Whatever an optimiser would do, such as weight decay, all others stay as they are to the bit.
-    """
-    return jax.tree.map(lambda x, given: jnp.where(given == owner, x, 0.0), updates, owners)
 
 
 def seen_by(params: Any, owners: Any, task: int | Array) -> Any:

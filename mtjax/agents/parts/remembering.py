@@ -5,7 +5,6 @@ What a way keeps is the network "continual", which no fit names, so that no grad
 changes, and critics forget, as their regularisation harms learning (Wolczyk et al. 2021).
 """
 
-import abc
 import dataclasses
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -22,7 +21,6 @@ from mtjax.types import Array
 
 NET = "continual"
 """The network that holds what is kept."""
-_GROUP = 32  # inputs whose slopes are in memory at a time
 _NOBODY = -1  # the owner of no weight
 
 Information = Callable[[Array], Array]
@@ -75,60 +73,49 @@ class Nothing:
         return nets
 
 
-@dataclasses.dataclass(frozen=True)
-class _Held(Nothing, abc.ABC):
-    """Adds coefficient / 2 sum_i F_i (theta_i - theta*_i)^2 to the actor's loss; theta* are those of the task before.
+# Methods of the ways that hold parameters: the importances F of all tasks so far add up, and the actor's loss grows by
+# coefficient / 2 sum_i F_i (theta_i - theta*_i)^2, where theta* are those that the last task left.
 
-    The importances F of all tasks so far add up. A subclass says what they are.
-    """
 
-    keeps: ClassVar[bool] = True
+def _no_anchor(self: Nothing, actor: Params, num_tasks: int) -> Nets:
+    zeros = jax.tree.map(jnp.zeros_like, actor.shared)
+    return {NET: Params({"anchor": Anchor(jax.tree.map(jnp.copy, actor.shared), zeros)}, {})}
 
-    @property
-    @abc.abstractmethod
-    def strength(self) -> float:
-        """The coefficient."""
 
-    @abc.abstractmethod
-    def importance(self, outputs: Outputs, information: Information, params: Any, inputs: Any) -> Any:
-        """Return F of the task that ends, as ``params``; see ``consolidate``."""
+def _penalty(nets: Nets, coefficient: float) -> Array:
+    return continual.penalty(nets[NET].shared["anchor"], nets["actor"].shared, coefficient)
 
-    def init(self, actor: Params, num_tasks: int) -> Nets:
-        zeros = jax.tree.map(jnp.zeros_like, actor.shared)
-        return {NET: Params({"anchor": Anchor(jax.tree.map(jnp.copy, actor.shared), zeros)}, {})}
 
-    def penalty(self, nets: Nets) -> Array:
-        return continual.penalty(nets[NET].shared["anchor"], nets["actor"].shared, self.strength)
-
-    def consolidate(self, nets: Nets, outputs: Outputs, information: Information, inputs: Any) -> Nets:
-        params = nets["actor"].shared
-        importance = self.importance(outputs, information, params, inputs)
-        held = continual.anchor(params, importance, nets[NET].shared["anchor"])
-        return nets | {NET: Params({"anchor": held}, {})}
+def _hold(nets: Nets, importance: Any) -> Nets:
+    held = continual.anchor(nets["actor"].shared, importance, nets[NET].shared["anchor"])
+    return nets | {NET: Params({"anchor": held}, {})}
 
 
 @dataclasses.dataclass(frozen=True)
-class L2(_Held):
+class L2(Nothing):
     """Holds all parameters of the actor equally: F = 1."""
 
+    keeps: ClassVar[bool] = True
     l2_coefficient: float = 1e5
     """Weight of the penalty; 1e5 in Continual World."""
 
     def __post_init__(self):
         parts.require_not_negative(self, "l2_coefficient")
 
-    @property
-    def strength(self) -> float:
-        return self.l2_coefficient
+    init = _no_anchor
 
-    def importance(self, outputs: Outputs, information: Information, params: Any, inputs: Any) -> Any:
-        return continual.l2(params)
+    def penalty(self, nets: Nets) -> Array:
+        return _penalty(nets, self.l2_coefficient)
+
+    def consolidate(self, nets: Nets, outputs: Outputs, information: Information, inputs: Any) -> Nets:
+        return _hold(nets, continual.l2(nets["actor"].shared))
 
 
 @dataclasses.dataclass(frozen=True)
-class EWC(_Held):
+class EWC(Nothing):
     """Holds parameters by the Fisher information of the policy (Kirkpatrick et al. 2017); see ``continual.ewc``."""
 
+    keeps: ClassVar[bool] = True
     ewc_coefficient: float = 1e4
     """Weight of the penalty; 1e4 in Continual World."""
     fisher_samples: int = 2560
@@ -138,22 +125,24 @@ class EWC(_Held):
         parts.require_not_negative(self, "ewc_coefficient")
         _require_group(self, "fisher_samples")
 
-    @property
-    def strength(self) -> float:
-        return self.ewc_coefficient
+    init = _no_anchor
+
+    def penalty(self, nets: Nets) -> Array:
+        return _penalty(nets, self.ewc_coefficient)
 
     @property
     def samples(self) -> int:  # type: ignore[override]
-        return self.fisher_samples // _GROUP * _GROUP
+        return self.fisher_samples // continual.GROUP * continual.GROUP
 
-    def importance(self, outputs: Outputs, information: Information, params: Any, inputs: Any) -> Any:
-        return _in_groups(lambda group: continual.ewc(outputs, information, params, group), inputs)
+    def consolidate(self, nets: Nets, outputs: Outputs, information: Information, inputs: Any) -> Nets:
+        return _hold(nets, continual.ewc(outputs, information, nets["actor"].shared, inputs))
 
 
 @dataclasses.dataclass(frozen=True)
-class MAS(_Held):
+class MAS(Nothing):
     """Holds parameters by how much they change the actor's outputs (Aljundi et al. 2018); see ``continual.mas``."""
 
+    keeps: ClassVar[bool] = True
     mas_coefficient: float = 1e4
     """Weight of the penalty; 1e4 in Continual World."""
     mas_samples: int = 2560
@@ -163,16 +152,17 @@ class MAS(_Held):
         parts.require_not_negative(self, "mas_coefficient")
         _require_group(self, "mas_samples")
 
-    @property
-    def strength(self) -> float:
-        return self.mas_coefficient
+    init = _no_anchor
+
+    def penalty(self, nets: Nets) -> Array:
+        return _penalty(nets, self.mas_coefficient)
 
     @property
     def samples(self) -> int:  # type: ignore[override]
-        return self.mas_samples // _GROUP * _GROUP
+        return self.mas_samples // continual.GROUP * continual.GROUP
 
-    def importance(self, outputs: Outputs, information: Information, params: Any, inputs: Any) -> Any:
-        return _in_groups(lambda group: continual.mas(outputs, params, group), inputs)
+    def consolidate(self, nets: Nets, outputs: Outputs, information: Information, inputs: Any) -> Nets:
+        return _hold(nets, continual.mas(outputs, nets["actor"].shared, inputs))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -233,18 +223,9 @@ class PackNet(Nothing):
 
 
 def _require_group(holder: Any, name: str) -> None:
-    if getattr(holder, name) < _GROUP:
+    if getattr(holder, name) < continual.GROUP:
         flag = name.replace("_", "-")
-        raise parts.InputError(f"{flag} must be at least {_GROUP}, not {getattr(holder, name)}")
-
-
-def _in_groups(mean: Callable[[Any], Any], inputs: Any) -> Any:
-    """Return the mean of a tree over inputs (N, ...). ``mean`` takes one group of them at a time, to save memory."""
-    groups = jax.tree.map(lambda x: x.reshape(-1, _GROUP, *x.shape[1:]), inputs)
-    count = len(jax.tree.leaves(groups)[0])
-    zeros = jax.tree.map(jnp.zeros_like, jax.eval_shape(mean, jax.tree.map(lambda x: x[0], groups)))
-    add = lambda total, group: (jax.tree.map(lambda x, y: x + y / count, total, mean(group)), None)
-    return jax.lax.scan(add, zeros, groups)[0]
+        raise parts.InputError(f"{flag} must be at least {continual.GROUP}, not {getattr(holder, name)}")
 
 
 Remembering = Nothing

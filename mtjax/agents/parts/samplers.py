@@ -15,42 +15,36 @@ from mtjax.types import Array, InputError, Transition
 
 
 @dataclasses.dataclass(frozen=True)
-class Uniform(parts.Watcher):
-    """Weighs all tasks equally. Every sampler is a class with these methods."""
+class Uniform:
+    """Weighs all tasks equally. Every sampler is a class with these methods.
+
+    It may keep statistics of all steps, its memory, and something of each episode so far.
+    """
+
+    def init(self, num_tasks: int) -> Any:
+        """Return the memory before the first step; leaves are (T, ...)."""
+        return None
+
+    def begin(self) -> Any:
+        """Return what is kept of an episode as it begins; None for nothing."""
+        return None
+
+    def remember(self, episode: Any, reward: Array, gamma: float | Array) -> Any:
+        """Return what is kept of an episode after a step."""
+        return episode
+
+    def observe(self, memory: Any, steps: Transition) -> Any:
+        """Update the memory by collected steps (T, N, ...), whose ``memory`` is what was kept after each step."""
+        return memory
 
     def weights(self, memory: Any, temperature: Array) -> Array | None:
         """Return the weights (T,) of the tasks' losses, of mean 1; None for all 1. ``temperature`` (T,) is SAC's."""
         return None
 
 
-@dataclasses.dataclass(frozen=True)
-class _Unequal(Uniform):
-    """Weighs tasks by shares, and keeps a least weight for each."""
-
-    least_weight: float = 0.1
-    """Weight that every task has at least; the rest is divided by the sampler. 1 weighs all tasks equally."""
-
-    def __post_init__(self):
-        parts.require_choices(self)
-        parts.require_shares(self, "least_weight")
-
-    def share_out(self, shares: Array) -> Array:
-        """Return weights (T,) of mean 1, at least ``least_weight`` each, from shares (T,) that sum to one."""
-        return self.least_weight + (1 - self.least_weight) * len(shares) * shares
-
-
-@dataclasses.dataclass(frozen=True)
-class _ByReturns(_Unequal):
-    """Weighs tasks by the returns of their episodes, whose memory is the sum of rewards so far."""
-
-    def begin(self) -> Array:
-        return jnp.float32(0)
-
-    def remember(self, episode: Array, reward: Array, gamma: float | Array) -> Array:
-        return episode + reward
-
-    def init(self, num_tasks: int) -> "Returns":
-        return Returns(jnp.zeros(num_tasks, bool), jnp.zeros(num_tasks), jnp.zeros(num_tasks))
+def share_out(shares: Array, least_weight: float) -> Array:
+    """Return weights (T,) of mean 1, at least ``least_weight`` each, from shares (T,) that sum to one."""
+    return least_weight + (1 - least_weight) * len(shares) * shares
 
 
 class Returns(NamedTuple):
@@ -59,6 +53,21 @@ class Returns(NamedTuple):
     known: Array  # (T,) bool: the task has ended an episode
     fast: Array
     slow: Array
+
+
+# Methods of the samplers that weigh tasks by returns. Of an episode they keep the sum of rewards so far.
+
+
+def _no_returns(self: Uniform, num_tasks: int) -> Returns:
+    return Returns(jnp.zeros(num_tasks, bool), jnp.zeros(num_tasks), jnp.zeros(num_tasks))
+
+
+def _no_reward(self: Uniform) -> Array:
+    return jnp.float32(0)
+
+
+def _add_reward(self: Uniform, episode: Array, reward: Array, gamma: float | Array) -> Array:
+    return episode + reward
 
 
 def _follow(memory: Returns, steps: Transition, fast: float, slow: float) -> Returns:
@@ -73,7 +82,7 @@ def _follow(memory: Returns, steps: Transition, fast: float, slow: float) -> Ret
 
 
 @dataclasses.dataclass(frozen=True)
-class Progress(_ByReturns):
+class Progress(Uniform):
     """Gives more weight to tasks whose return changes, up or down (learning progress; Matiisen et al. 2017).
 
     Progress is |fast - slow| / max(|fast|, |slow|), for two moving means of the task's returns at different rates, and
@@ -83,18 +92,22 @@ class Progress(_ByReturns):
     does the opposite: its scheduler favours tasks that progress slowly.)
     """
 
+    least_weight: float = 0.1
+    """Weight that every task has at least; the rest is divided by the sampler. 1 weighs all tasks equally."""
     progress_fast: float = 0.1
     """Weight of a new episode in the fast mean of returns."""
     progress_slow: float = 0.01
     """Weight of a new episode in the slow mean of returns."""
 
     def __post_init__(self):
-        super().__post_init__()
+        parts.require_shares(self, "least_weight")
         if not 0 < self.progress_slow < self.progress_fast <= 1:
             raise InputError(
                 "progress-slow must be below progress-fast, both in (0, 1], "
                 f"not {self.progress_slow} and {self.progress_fast}"
             )
+
+    init, begin, remember = _no_returns, _no_reward, _add_reward
 
     def observe(self, memory: Returns, steps: Transition) -> Returns:
         return _follow(memory, steps, self.progress_fast, self.progress_slow)
@@ -105,28 +118,33 @@ class Progress(_ByReturns):
         average = jnp.sum(progress * memory.known) / jnp.maximum(jnp.sum(memory.known), 1)
         progress = jnp.where(memory.known, progress, average)
         total = jnp.sum(progress)
-        return self.share_out(jnp.where(total > 0, progress / jnp.where(total > 0, total, 1.0), 1 / len(progress)))
+        shares = jnp.where(total > 0, progress / jnp.where(total > 0, total, 1.0), 1 / len(progress))
+        return share_out(shares, self.least_weight)
 
 
 @dataclasses.dataclass(frozen=True)
-class Hardest(_ByReturns):
+class Hardest(Uniform):
     """Gives more weight to tasks of low return: shares are softmax(-hardness z), z the standardised returns.
 
     z is a moving mean of each task's returns minus the tasks' mean, over their standard deviation; 0 for a task that
     has ended no episode. It compares returns between tasks, so rewards of all tasks should have one scale.
     """
 
+    least_weight: float = 0.1
+    """Weight that every task has at least; the rest is divided by the sampler. 1 weighs all tasks equally."""
     hardness: float = 1.0
     """How strongly low returns raise a task's weight; 0 weighs all tasks equally."""
     return_rate: float = 0.1
     """Weight of a new episode in the moving mean of returns."""
 
     def __post_init__(self):
-        super().__post_init__()
+        parts.require_shares(self, "least_weight")
         if not self.hardness >= 0 or not 0 < self.return_rate <= 1:
             raise InputError(
                 f"hardness must be at least 0 and return-rate in (0, 1], not {self.hardness} and {self.return_rate}"
             )
+
+    init, begin, remember = _no_returns, _no_reward, _add_reward
 
     def observe(self, memory: Returns, steps: Transition) -> Returns:
         return _follow(memory, steps, self.return_rate, self.return_rate)
@@ -135,7 +153,8 @@ class Hardest(_ByReturns):
         count = jnp.maximum(jnp.sum(memory.known), 1)
         from_mean = jnp.where(memory.known, memory.slow - jnp.sum(memory.slow * memory.known) / count, 0.0)
         std = jnp.sqrt(jnp.sum(jnp.square(from_mean)) / count)
-        return self.share_out(jax.nn.softmax(-self.hardness * from_mean / jnp.where(std > 0, std, 1.0)))
+        shares = jax.nn.softmax(-self.hardness * from_mean / jnp.where(std > 0, std, 1.0))
+        return share_out(shares, self.least_weight)
 
 
 class Curriculum(NamedTuple):
@@ -147,7 +166,7 @@ class Curriculum(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class ByLength(_ByReturns):
+class ByLength(Uniform):
     """Trains the tasks with short sketches first (the curriculum of Andreas et al. 2017).
 
     Tasks take part whose sketches have at most l symbols, at first as many as the shortest. Once the mean return r of
@@ -158,19 +177,22 @@ class ByLength(_ByReturns):
     ``least_weight`` above 0, tasks learn a little before they take part. Agents without sketches have no others.
     """
 
+    least_weight: float = 0.1
+    """Weight that every task has at least; the rest is divided by the sampler. 1 weighs all tasks equally."""
     mastered: float = 0.8
     """Mean return of all tasks that take part above which longer sketches follow."""
     return_rate: float = 0.02
     """Weight of a new episode in the moving mean of returns."""
 
     def __post_init__(self):
-        super().__post_init__()
-        parts.require_shares(self, "mastered")
+        parts.require_shares(self, "least_weight", "mastered")
         parts.require_rates(self, "return_rate")
 
-    def init(self, num_tasks: int) -> Curriculum:  # type: ignore[override]
+    begin, remember = _no_reward, _add_reward
+
+    def init(self, num_tasks: int) -> Curriculum:
         none = jnp.zeros(num_tasks, jnp.int32)
-        return Curriculum(super().init(num_tasks), none, none)
+        return Curriculum(_no_returns(self, num_tasks), none, none)
 
     def observe(self, memory: Curriculum, steps: Transition) -> Curriculum:
         returns = _follow(memory.returns, steps, self.return_rate, self.return_rate)
@@ -181,7 +203,7 @@ class ByLength(_ByReturns):
     def weights(self, memory: Curriculum, temperature: Array) -> Array:
         missing = 1 - jnp.where(memory.returns.known, jnp.clip(memory.returns.slow, 0.0, 1.0), 0.0) + _LEAST_MISSING
         shares = jnp.where(memory.length <= _present(memory), missing, 0.0)
-        return self.share_out(shares / jnp.sum(shares))
+        return share_out(shares / jnp.sum(shares), self.least_weight)
 
 
 _LEAST_MISSING = 0.01
@@ -193,7 +215,7 @@ def _present(memory: Curriculum) -> Array:
 
 
 @dataclasses.dataclass(frozen=True)
-class ByTemperature(_Unequal):
+class ByTemperature(Uniform):
     """Gives more weight to tasks of low temperature, whose policies are certain (Yang et al. 2020).
 
     With a_i the tasks' temperatures, shares are softmax(-log a), that is (1 / a_i) / sum_j (1 / a_j), as in the
@@ -204,12 +226,18 @@ class ByTemperature(_Unequal):
     ``least_weight=0`` removes it.
     """
 
+    least_weight: float = 0.1
+    """Weight that every task has at least; the rest is divided by the sampler. 1 weighs all tasks equally."""
     certainty: Literal["log-temperature", "temperature"] = "log-temperature"
     """Take the softmax of the negative log temperatures (the authors' code) or negative temperatures (the paper)."""
 
+    def __post_init__(self):
+        parts.require_choices(self)
+        parts.require_shares(self, "least_weight")
+
     def weights(self, memory: Any, temperature: Array) -> Array:
         score = temperature if self.certainty == "temperature" else jnp.log(temperature)
-        return self.share_out(jax.nn.softmax(-score))
+        return share_out(jax.nn.softmax(-score), self.least_weight)
 
 
 Sampler = Uniform

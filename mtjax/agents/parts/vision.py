@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from mtjax import frames
 from mtjax.agents.networks import orthogonal
 from mtjax.agents.parts.convolution import Transposed, convolve
-from mtjax.types import Array, Key
+from mtjax.types import Array, Key, Transition
 
 Vision = Literal["drq", "impala"]
 _FILTERS = 32
@@ -118,3 +118,12 @@ def shifted(pictures: Array, key: Key, most: int) -> Array:
     offsets = jax.random.randint(key, (len(flat), 2), 0, 2 * most + 1)
     crop = lambda picture, offset: jax.lax.dynamic_slice(picture, (*offset, 0), (height, width, channels))
     return jax.vmap(crop)(padded, offsets).reshape(pictures.shape)
+
+
+def shift_pictures(batch: Transition, key: Key, most: int) -> Transition:
+    """Shift the pictures of a batch by up to ``most`` pixels, those before and after its steps on their own."""
+    if not most or not frames.shown(batch.obs):
+        return batch
+    keys = jax.random.split(key)
+    move = lambda obs, key: obs | {frames.PICTURES: shifted(obs[frames.PICTURES], key, most)}
+    return batch._replace(obs=move(batch.obs, keys[0]), next_obs=move(batch.next_obs, keys[1]))

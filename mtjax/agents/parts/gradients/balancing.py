@@ -38,28 +38,14 @@ class Logits(NamedTuple):
     losses: Array  # (T,) running means; 0 before the first
 
 
-@dataclasses.dataclass(frozen=True)
-class _Learned(Mean):
-    """Learns weights by Adam."""
-
-    weight_lr: float = 0.025
-    """Adam's learning rate for the tasks' weights."""
-
-    def __post_init__(self):
-        parts.require_positive(self, "weight_lr")
-
-    @property
-    def optimizer(self) -> optax.GradientTransformation:
-        return optax.adam(self.weight_lr)
-
-    def step(self, values: Array, slope: Array, memory: Any, present: Array) -> tuple[Array, Any]:
-        """Descend ``slope`` (T,) where tasks are present, and return values (T,) and the optimiser's state."""
-        change, memory = self.optimizer.update(jnp.where(present, slope, 0.0), memory)
-        return values + jnp.where(present, change, 0.0), memory  # type: ignore
+def _step(rate: float, values: Array, slope: Array, memory: Any, present: Array) -> tuple[Array, Any]:
+    """Descend ``slope`` (T,) by Adam where tasks are present, and return values (T,) and the optimiser's state."""
+    change, memory = optax.adam(rate).update(jnp.where(present, slope, 0.0), memory)
+    return values + jnp.where(present, change, 0.0), memory  # type: ignore
 
 
 @dataclasses.dataclass(frozen=True)
-class GradNorm(_Learned):
+class GradNorm(Mean):
     """GradNorm learns weights that let all tasks learn at one rate (Chen et al. 2018, algorithm 1).
 
     With the length n_i of task i's gradient and its loss L_i, relative to its first:
@@ -74,16 +60,18 @@ class GradNorm(_Learned):
     """
 
     needs = "gradients"
+    weight_lr: float = 0.025
+    """Adam's learning rate for the tasks' weights."""
     gradnorm_asymmetry: float = 1.0
     """How strongly tasks that are behind gain weight (a); 0 makes all lengths equal. The paper: 0.12 to 1.5."""
 
     def __post_init__(self):
-        super().__post_init__()
+        parts.require_positive(self, "weight_lr")
         parts.require_not_negative(self, "gradnorm_asymmetry")
 
     def init(self, num_tasks: int) -> Balance:
         weights = jnp.ones(num_tasks)
-        return Balance(weights, self.optimizer.init(weights), jnp.zeros(num_tasks))
+        return Balance(weights, optax.adam(self.weight_lr).init(weights), jnp.zeros(num_tasks))
 
     def weigh(self, memory: Balance, gram: Array, losses: Array, key: Key) -> tuple[Array, Balance]:
         lengths = jnp.sqrt(jnp.diagonal(gram))
@@ -99,7 +87,7 @@ class GradNorm(_Learned):
         target = mean(weighted) * rate**self.gradnorm_asymmetry
         slope = jnp.sign(weighted - target) * lengths / unless(mean(weighted), 1.0)
 
-        weights, optimizer = self.step(memory.weights, slope, memory.optimizer, present)
+        weights, optimizer = _step(self.weight_lr, memory.weights, slope, memory.optimizer, present)
         weights = jnp.maximum(weights, LEAST_WEIGHT)
         total = lambda x: jnp.sum(weights, where=x)
         scale = (len(weights) - total(~present)) / unless(total(present), 1.0)
@@ -112,7 +100,7 @@ class GradNorm(_Learned):
 
 
 @dataclasses.dataclass(frozen=True)
-class FAMO(_Learned):
+class FAMO(Mean):
     """FAMO learns weights that lower all losses' logarithms at one rate (Liu et al. 2023, algorithm 1).
 
     With the losses l of a batch before the update and l' after it, running means m of l, and logits x:
@@ -132,19 +120,21 @@ class FAMO(_Learned):
     """
 
     needs = "losses"
+    weight_lr: float = 0.025
+    """Adam's learning rate for the tasks' weights."""
     famo_decay: float = 1e-3
     """How strongly FAMO's weights return to equal ones. Its authors: 1e-3 for MT10."""
     famo_rate: float = 0.01
     """Step of the losses' running means towards a batch's losses; 1 weighs by the batch's alone, as its authors do."""
 
     def __post_init__(self):
-        super().__post_init__()
+        parts.require_positive(self, "weight_lr")
         parts.require_not_negative(self, "famo_decay")
         parts.require_rates(self, "famo_rate")
 
     def init(self, num_tasks: int) -> Logits:
         logits = jnp.zeros(num_tasks)
-        return Logits(logits, self.optimizer.init(logits), jnp.zeros(num_tasks))
+        return Logits(logits, optax.adam(self.weight_lr).init(logits), jnp.zeros(num_tasks))
 
     def weigh(self, memory: Logits, gram: Array, losses: Array, key: Key) -> tuple[Array, Logits]:
         present = losses > 0
@@ -158,7 +148,7 @@ class FAMO(_Learned):
         z = jax.nn.softmax(jnp.where(present, memory.logits, NEVER))
         gain = jnp.where(present, _log(before) - _log(after), 0.0)
         slope = z * (gain - jnp.sum(z * gain)) + self.famo_decay * memory.logits
-        logits, optimizer = self.step(memory.logits, slope, memory.optimizer, present)
+        logits, optimizer = _step(self.weight_lr, memory.logits, slope, memory.optimizer, present)
         return memory._replace(logits=logits, optimizer=optimizer)
 
     @property

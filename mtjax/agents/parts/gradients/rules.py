@@ -10,6 +10,8 @@ magnitude. Numbers of iterations are fixed, as everything runs under one jit and
 """
 
 import dataclasses
+from collections.abc import Callable
+from functools import wraps
 from typing import Any, ClassVar
 
 import jax
@@ -60,20 +62,22 @@ class Mean:
         return self
 
 
-class OfGram(Mean):
-    """Computes weights from the Gram matrix alone, in full float32; they are 1 / T if all gradients are zero."""
+def of_gram(weights: Callable[[Any, Array], Array]):
+    """Make the method ``weigh`` of a rule that needs the Gram matrix alone, in full float32.
 
-    needs = "gradients"
+    Args:
+        weights: of the rule and a Gram matrix (T, T) whose largest entry is 1, returns weights (T,). They are 1 / T if
+            all gradients are zero.
+    """
 
-    def weights(self, gram: Array) -> Array:
-        """Return weights (T,) for a Gram matrix (T, T) whose largest entry is 1."""
-        raise NotImplementedError
-
+    @wraps(weights)
     def weigh(self, memory: Any, gram: Array, losses: Array, key: Key) -> tuple[Array, Any]:
         with jax.default_matmul_precision("highest"):
             largest = jnp.max(jnp.diagonal(gram))
-            weights = self.weights(gram / jnp.where(largest > 0, largest, 1.0))
-        return jnp.where(largest > 0, weights, 1 / len(gram)), memory
+            found = weights(self, gram / jnp.where(largest > 0, largest, 1.0))
+        return jnp.where(largest > 0, found, 1 / len(gram)), memory
+
+    return weigh
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,7 +124,7 @@ def orders(key: Key, num_tasks: int) -> Array:
 
 
 @dataclasses.dataclass(frozen=True)
-class CAGrad(OfGram):
+class CAGrad(Mean):
     """CAGrad improves the worst-off task near the mean gradient (Liu et al. 2021a).
 
     With the mean g_0, the update d solves max_d min_i g_i . d under |d - g_0| <= c |g_0|. It is d = g_0 + J^T x. For a
@@ -130,6 +134,7 @@ class CAGrad(OfGram):
     both are zero. As in the authors' code, the result is d / (1 + c^2), which scales with the gradients.
     """
 
+    needs = "gradients"
     cagrad_radius: float = 0.5
     """Largest distance of CAGrad's update from the mean, in lengths of the mean (c). Paper: 0.5 (MT50), 0.9 (MT10)."""
 
@@ -137,7 +142,8 @@ class CAGrad(OfGram):
         if not 0 < self.cagrad_radius < 1:
             raise InputError(f"cagrad-radius must be in (0, 1), not {self.cagrad_radius}")
 
-    def weights(self, gram: Array) -> Array:
+    @of_gram
+    def weigh(self, gram: Array) -> Array:
         radius = self.cagrad_radius
         matrix, norms, present = cosines(gram)
         along = jnp.mean(gram, axis=1)
@@ -166,14 +172,17 @@ class CAGrad(OfGram):
 
 
 @dataclasses.dataclass(frozen=True)
-class MGDA(OfGram):
+class MGDA(Mean):
     """MGDA takes the shortest convex combination of gradients (Désidéri 2012; Sener & Koltun 2018).
 
     Weights minimise w^T G w on the simplex. No task's loss rises along the update; it is zero where no direction helps
     every task.
     """
 
-    def weights(self, gram: Array) -> Array:
+    needs = "gradients"
+
+    @of_gram
+    def weigh(self, gram: Array) -> Array:
         matrix, norms, present = cosines(gram)
         inverse = present * jnp.min(jnp.where(present, norms, jnp.inf)) / norms
         weights = inverse * minimise(matrix, jnp.zeros(len(gram)), inverse)
@@ -181,7 +190,7 @@ class MGDA(OfGram):
 
 
 @dataclasses.dataclass(frozen=True)
-class IMTLG(OfGram):
+class IMTLG(Mean):
     """IMTL-G makes the projections d . g_i / |g_i| of the update on all gradients equal (Liu et al. 2021b).
 
     With the matrix C of cosines, w_i = y_i / |g_i| where C y = 1. Weights sum to one, as in the paper, and may be
@@ -191,14 +200,17 @@ class IMTLG(OfGram):
     against all tasks. The paper's update does for gradients that agree in direction but differ in length.
     """
 
-    def weights(self, gram: Array) -> Array:
+    needs = "gradients"
+
+    @of_gram
+    def weigh(self, gram: Array) -> Array:
         matrix, norms, present = cosines(gram)
         weights = present * jnp.linalg.solve(matrix, 1.0 * present) / norms
         return weights / jnp.maximum(jnp.sum(weights), 0.1 * jnp.sum(jnp.abs(weights)))
 
 
 @dataclasses.dataclass(frozen=True)
-class NashMTL(OfGram):
+class NashMTL(Mean):
     """Nash-MTL finds the Nash bargaining solution of the tasks: w > 0 with G w ~ 1 / w (Navon et al. 2022).
 
     The paper's G a = 1 / a gives every update the length sqrt(T), however small the gradients; here weights sum to one.
@@ -206,7 +218,10 @@ class NashMTL(OfGram):
     are shortened to r / (1 + max |r|), which always descends and tends to the full step.
     """
 
-    def weights(self, gram: Array) -> Array:
+    needs = "gradients"
+
+    @of_gram
+    def weigh(self, gram: Array) -> Array:
         matrix, norms, present = cosines(gram)
 
         def newton(y: Array, _) -> tuple[Array, None]:
@@ -220,7 +235,7 @@ class NashMTL(OfGram):
 
 
 @dataclasses.dataclass(frozen=True)
-class AlignedMTL(OfGram):
+class AlignedMTL(Mean):
     """Aligned-MTL makes gradients orthogonal and equally long, then averages them (Senushkin et al. 2023).
 
     With G = V diag(s) V^T and s_r its least eigenvalue above rounding, w = sqrt(s_r) V diag(s)^(-1/2) V^T 1 / T, over
@@ -228,7 +243,10 @@ class AlignedMTL(OfGram):
     longest are lost to rounding.
     """
 
-    def weights(self, gram: Array) -> Array:
+    needs = "gradients"
+
+    @of_gram
+    def weigh(self, gram: Array) -> Array:
         values, vectors = jnp.linalg.eigh(gram)
         kept = values > RIDGE * len(gram) * jnp.max(values)
         least = jnp.min(jnp.where(kept, values, jnp.inf))
@@ -237,14 +255,17 @@ class AlignedMTL(OfGram):
 
 
 @dataclasses.dataclass(frozen=True)
-class UPGrad(OfGram):
+class UPGrad(Mean):
     """UPGrad projects each gradient onto the directions that raise no loss, then averages (Quinton & Rey 2024).
 
     The nearest d to g_i with J d >= 0 is J^T (e_i + v_i), v_i minimising (e_i + v)^T G (e_i + v) over v >= 0; the
     weights are the mean of e_i + v_i. Without conflicts, they are 1 / T.
     """
 
-    def weights(self, gram: Array) -> Array:
+    needs = "gradients"
+
+    @of_gram
+    def weigh(self, gram: Array) -> Array:
         matrix, norms, present = cosines(gram)
         unit = jax.vmap(lambda row: minimise(matrix, row, jnp.zeros(len(gram))))(matrix)
         return jnp.mean(jnp.eye(len(gram)) + norms[:, None] * unit * present / norms, axis=0)

@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -98,11 +98,12 @@ def spread(x: Array, like: Pairs) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class Inference(abc.ABC):
-    """Makes a memory of the steps of a trial, what networks see of it, and the losses by which it learns."""
+    """Makes a memory of the steps of a trial, what networks see of it, and the losses by which it learns.
+
+    Networks see a Gaussian as its mean and the logarithm of its variance.
+    """
 
     settings: Any  # of the conditioning
-
-    from_critics: ClassVar[bool] = False  # whether the critics' loss trains it, beside its own
 
     @abc.abstractmethod
     def modules(self, obs: Array, action: Array) -> dict[str, tuple]:
@@ -133,19 +134,7 @@ class Inference(abc.ABC):
         return Dense(self.settings.inference_widths, out)
 
 
-class Gaussian(Inference):
-    """Infers a Gaussian; networks see its mean and the logarithm of its variance."""
-
-    @abc.abstractmethod
-    def belief(self, params: dict[str, Any], memory: Array) -> Belief:
-        """Return the belief for memories (..., M)."""
-
-    def show(self, params: dict[str, Any], memory: Array) -> Array:
-        shown = jnp.concatenate(self.belief(params, memory), axis=-1)
-        return shown if self.from_critics else jax.lax.stop_gradient(shown)
-
-
-class VariBAD(Gaussian):
+class VariBAD(Inference):
     """Reads steps by a recurrent network, and learns to predict the trial's rewards and states, past and future."""
 
     def modules(self, obs: Array, action: Array) -> dict[str, tuple]:
@@ -174,6 +163,9 @@ class VariBAD(Gaussian):
         outputs: Any = nn.Dense(2 * size, use_bias=False).apply(params["belief"], memory)
         return Belief(outputs[..., :size], outputs[..., size:])
 
+    def show(self, params: dict[str, Any], memory: Array) -> Array:
+        return jax.lax.stop_gradient(jnp.concatenate(self.belief(params, memory), axis=-1))
+
     def rewards(self, params: dict[str, Any], step: Any, latent: Array) -> Array:
         """Predict the rewards (...) of steps in latent tasks (..., Z)."""
         predicted: Any = self.dense(1).apply(params["reward"], step.obs, step.action, change(step), latent)
@@ -201,10 +193,8 @@ class VariBAD(Gaussian):
         }
 
 
-class PEARL(Gaussian):
+class PEARL(Inference):
     """Reads every step by itself as a Gaussian, and multiplies these with the prior: their order does not matter."""
-
-    from_critics: ClassVar[bool] = True
 
     def modules(self, obs: Array, action: Array) -> dict[str, tuple]:
         read = jnp.zeros(2 * len(obs) + len(action) + 2)
@@ -222,11 +212,11 @@ class PEARL(Gaussian):
     def advance(self, params: dict[str, Any], memory: Array, read: Array) -> Array:
         return memory + read
 
-    def belief(self, params: dict[str, Any], memory: Array) -> Belief:
-        return product(memory)
+    def show(self, params: dict[str, Any], memory: Array) -> Array:
+        return jnp.concatenate(product(memory), axis=-1)
 
     def losses(self, params: dict[str, Any], track: Track, before: Array, after: Array) -> Metrics:
-        belief = self.belief(params, before)
+        belief = product(before)
         return {"divergence_loss": self.settings.kl_coefficient * jnp.mean(divergence(belief, unit(belief)))}
 
 

@@ -1,19 +1,20 @@
 """Asymmetric lets the actor see pictures, and the critics the state."""
 
 import dataclasses
-from typing import Any
+from typing import Any, ClassVar
 
 import flax.linen as nn
 
 from mtjax import frames
+from mtjax.agents import parts
 from mtjax.agents.networks import Params
-from mtjax.agents.parts.representations.seeing import Seeing
-from mtjax.agents.parts.vision import Sight
-from mtjax.types import Array, InputError
+from mtjax.agents.parts.representations.base import Plain
+from mtjax.agents.parts.vision import Sight, Vision, shift_pictures
+from mtjax.types import Array, InputError, Key, Transition
 
 
 @dataclasses.dataclass(frozen=True)
-class Asymmetric(Seeing):
+class Asymmetric(Plain):
     """Asymmetric is an actor that sees pictures p, with critics that see the state s (Pinto et al. 2018).
 
     The actor is pi(phi(p)). Its own loss trains phi: convolutions (``vision``), a linear layer, layer normalisation and
@@ -28,6 +29,20 @@ class Asymmetric(Seeing):
     Differs from the paper: it takes DDPG, with bottlenecks and domain randomisation; here the agent is any of SAC, its
     variants and PPO.
     """
+
+    latent_widths: tuple[int, ...] = (256, 50)
+    """Widths of the encoder's layers; the last is the size of the latent state. Of pictures only the last counts."""
+    vision: Vision = "drq"
+    """Convolutions for pictures: drq (four, as in SAC-AE and DrQ) or impala (fifteen in residual blocks)."""
+    shift: int = 4
+    """Shift pictures of a batch from the replay by up to so many pixels at random; 0 for none."""
+
+    sees_pictures: ClassVar[bool] = True
+
+    def __post_init__(self):
+        super().__post_init__()
+        parts.require_layers(self, "latent_widths")
+        parts.require_not_negative(self, "shift")
 
     def require(self, obs: Any) -> None:
         if not frames.shown(obs) or frames.state(obs) is None:
@@ -46,6 +61,9 @@ class Asymmetric(Seeing):
     def actor_inputs(self, params: Params, features: Array, obs: Any) -> tuple[Array, Any]:
         """Return the features of the task, and the observation without its state."""
         return features, self.acts_on(obs)
+
+    def augment(self, batch: Transition, key: Key) -> Transition:
+        return shift_pictures(batch, key, self.shift)
 
     @property
     def sight(self) -> nn.Module:  # type: ignore[override]

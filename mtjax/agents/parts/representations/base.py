@@ -71,7 +71,7 @@ class Plain:
         Raises:
             InputError: they cannot.
         """
-        if frames.shown(obs):
+        if frames.shown(obs) and not self.sees_pictures:
             other = "--agent.representation=encoded, and --agent.encoder-tau=1 --n-step=3 if it has a replay"
             raise InputError(f"networks take vectors; for pictures use --agent=drq or, with another agent, {other}")
 

@@ -10,11 +10,11 @@ import jax.numpy as jnp
 
 from mtjax import frames
 from mtjax.agents import parts
-from mtjax.agents.networks import OVER_TASKS, Params, Trunk
-from mtjax.agents.parts.knowing.last_steps import without_past
-from mtjax.agents.parts.representations.encoded import Encoded
+from mtjax.agents.networks import Params, Trunk
+from mtjax.agents.parts.representations.encoded import Encoded, apply_part, encode_tasks
 from mtjax.types import Array, InputError, Key, Metrics
 
+Transitions = Literal["deterministic", "probabilistic"]
 DEVIATIONS = (0.01, 1.0)
 """Smallest and largest standard deviation of a predicted latent state, whose values lie in (-1, 1)."""
 
@@ -36,6 +36,66 @@ class ModelTargets(NamedTuple):
     latent: Array  # (B, D) of the next observations, by the target encoder
     noise: Array  # (B, D) for sampling next latent states; () zero if the model is deterministic
     other_theta: Array | None = None  # (Z,) vector of another task
+
+
+@dataclasses.dataclass(frozen=True)
+class Dynamics:
+    """Dynamics are a model of the next latent state, as a point or as a Gaussian, and a model of the reward."""
+
+    widths: tuple[int, ...]
+    size: int  # D of latent states
+    kind: Transitions
+
+    @property
+    def modules(self) -> dict[str, nn.Module]:
+        """The models, by name."""
+        outputs = 2 * self.size if self.kind == "probabilistic" else self.size
+        return {"transition": Model(self.widths, outputs), "reward": Model(self.widths, 1)}
+
+    def inputs(self, latent: Array, features: Array, action: Array) -> dict[str, tuple]:
+        """Return the models' inputs, by name."""
+        return {"transition": (latent, features, action), "reward": (latent, features)}
+
+    def predict(self, params: Params, features: Array, latent: Array, action: Array) -> tuple[Array, Array]:
+        """Predict the mean and standard deviation (..., D) of the next latent state."""
+        outputs = apply_part(self.modules, params, "transition", latent, features, action)
+        if self.kind == "deterministic":
+            return outputs, jnp.ones_like(outputs)
+        mean, deviation = jnp.split(outputs, 2, axis=-1)
+        low, high = DEVIATIONS
+        return mean, low + (high - low) * jax.nn.sigmoid(deviation)
+
+    def targets(self, latent: Array, key: Key) -> tuple[ModelTargets, Key]:
+        """Return the targets of all tasks' models, for next latent states (T, B, D), and a key (T,) for each task."""
+        keys = jax.vmap(jax.random.split)(jax.random.split(key, len(latent)))  # (T, 2): for critics, and for models
+        draw = lambda key: jax.random.normal(key, latent.shape[1:])
+        drawn = self.kind == "probabilistic"
+        return ModelTargets(latent, jax.vmap(draw)(keys[:, 1]) if drawn else jnp.zeros(len(latent))), keys[:, 0]
+
+    def losses(self, params: Params, features: Array, latent: Array, batch: Any) -> tuple[Array, Metrics]:
+        """Return the sum of the losses of both models for one task's batch, and each of them by name."""
+        mean, deviation = self.predict(params, features, latent, batch.action)
+        error = (mean - jax.lax.stop_gradient(batch.model_targets.latent)) / deviation
+        transition_loss = mean_of_rows(0.5 * jnp.square(error) + jnp.log(deviation), batch.followed)
+        following = mean + deviation * batch.model_targets.noise
+        reward = apply_part(self.modules, params, "reward", following, features)[..., 0]
+        reward_loss = jnp.mean(jnp.square(reward - batch.reward))
+        return transition_loss + reward_loss, {"transition_loss": transition_loss, "reward_loss": reward_loss}
+
+    @property
+    def least_loss(self) -> float:
+        """The losses of an exact reward, and of an exact latent state with the smallest standard deviation."""
+        return math.log(DEVIATIONS[0]) if self.kind == "probabilistic" else 0.0
+
+
+def require_one_sense(obs: Any) -> None:
+    """Check that observations are vectors, or pictures alone.
+
+    Raises:
+        InputError: a state lies beside pictures.
+    """
+    if frames.shown(obs) and frames.state(obs) is not None:
+        raise InputError("this representation predicts latent states of pictures alone; leave out --env.state=also")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +122,7 @@ class DeepMDP(Encoded):
 
     model_widths: tuple[int, ...] = (512,)
     """Widths of the hidden layers in transition and reward model."""
-    transition: Literal["deterministic", "probabilistic"] = "deterministic"
+    transition: Transitions = "deterministic"
     """Predict the next latent state as a point or as a Gaussian."""
     model_coefficient: float = 1.0
     """Weight of transition and reward loss relative to the critics' loss."""
@@ -78,53 +138,31 @@ class DeepMDP(Encoded):
         parts.require_positive(self, "model_coefficient")
 
     @property
+    def dynamics(self) -> Dynamics:
+        """The models of latent states and rewards."""
+        return Dynamics(self.model_widths, self.latent_widths[-1], self.transition)
+
+    @property
     def modules(self) -> dict[str, nn.Module]:
-        size = self.latent_widths[-1]
-        return super().modules | {
-            "transition": Model(self.model_widths, 2 * size if self.transition == "probabilistic" else size),
-            "reward": Model(self.model_widths, 1),
-        }
+        return super().modules | self.dynamics.modules
 
     def model_inputs(self, latent: Array, features: Array, action: Array) -> dict[str, tuple]:
-        return {"transition": (latent, features, action), "reward": (latent, features)}
+        return self.dynamics.inputs(latent, features, action)
 
     def require(self, obs: Any) -> None:
-        if frames.shown(obs) and frames.state(obs) is not None:
-            raise InputError("this representation predicts latent states of pictures alone; leave out --env.state=also")
-
-    def predict(self, params: Params, features: Array, latent: Array, action: Array) -> tuple[Array, Array]:
-        """Predict the mean and standard deviation (..., D) of the next latent state."""
-        outputs = self.apply(params, "transition", latent, features, action)
-        if self.transition == "deterministic":
-            return outputs, jnp.ones_like(outputs)
-        mean, deviation = jnp.split(outputs, 2, axis=-1)
-        low, high = DEVIATIONS
-        return mean, low + (high - low) * jax.nn.sigmoid(deviation)
-
-    # Losses.
+        require_one_sense(obs)
 
     def targets(self, params: Params, target_params: Params, next_obs: Any, key: Key) -> tuple[ModelTargets, Key]:
-        latent = jax.vmap(self.encode, (OVER_TASKS, 0))(target_params, without_past(next_obs))
-        keys = jax.vmap(jax.random.split)(jax.random.split(key, len(latent)))  # (T, 2): for critics, and for models
-        draw = lambda key: jax.random.normal(key, latent.shape[1:])
-        drawn = self.transition == "probabilistic"
-        return ModelTargets(latent, jax.vmap(draw)(keys[:, 1]) if drawn else jnp.zeros(len(latent))), keys[:, 0]
+        return self.dynamics.targets(encode_tasks(self, target_params, next_obs), key)
 
     def join(self, loss: Array, metrics: Metrics, params: Params, batch: Any) -> tuple[Array, Metrics]:
-        features, latent = self.perceive(params, batch.features, batch.obs)
-        mean, deviation = self.predict(params, features, latent, batch.action)
-        error = (mean - jax.lax.stop_gradient(batch.model_targets.latent)) / deviation
-        transition_loss = mean_of_rows(0.5 * jnp.square(error) + jnp.log(deviation), batch.followed)
-        reward = self.apply(params, "reward", mean + deviation * batch.model_targets.noise, features)[..., 0]
-        reward_loss = jnp.mean(jnp.square(reward - batch.reward))
-        metrics = {**metrics, "transition_loss": transition_loss, "reward_loss": reward_loss}
-        return loss + self.model_coefficient * (transition_loss + reward_loss), metrics
+        known = self.perceive(params, batch.features, batch.obs)
+        models_loss, losses = self.dynamics.losses(params, *known, batch)
+        return loss + self.model_coefficient * models_loss, metrics | losses
 
     @property
     def least_loss(self) -> float | Array:  # type: ignore[override]
-        """The losses of an exact reward, and of an exact latent state with the smallest standard deviation."""
-        least = math.log(DEVIATIONS[0]) if self.transition == "probabilistic" else 0.0
-        return self.model_coefficient * least
+        return self.model_coefficient * self.dynamics.least_loss
 
 
 def mean_of_rows(x: Array, mask: Array | None) -> Array:

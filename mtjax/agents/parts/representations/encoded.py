@@ -1,6 +1,7 @@
 """Encoded gives actor and critics a latent state, which one encoder makes of observations."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import flax.linen as nn
@@ -9,11 +10,11 @@ import jax.numpy as jnp
 
 from mtjax import frames
 from mtjax.agents import parts
-from mtjax.agents.networks import MLP, Network, Params
+from mtjax.agents.networks import MLP, OVER_TASKS, Network, Params
 from mtjax.agents.parts.knowing.last_steps import without_past
-from mtjax.agents.parts.representations.seeing import Seeing
-from mtjax.agents.parts.vision import NETWORKS, Projection, Vision, project
-from mtjax.types import Array, Key
+from mtjax.agents.parts.representations.base import Plain
+from mtjax.agents.parts.vision import NETWORKS, Projection, Vision, project, shift_pictures
+from mtjax.types import Array, Key, Transition
 
 ENCODERS = ("latent",)
 PROJECTION = "projection"
@@ -34,7 +35,7 @@ class Latent(nn.Module):
 
 
 @dataclasses.dataclass(frozen=True)
-class Encoded(Seeing):
+class Encoded(Plain):
     """Encoded is an encoder phi that all critics train and share with the actor, above all for pictures.
 
     Of vectors, phi is an MLP that ends in layer normalisation and tanh (Yarats et al. 2021, SAC-AE). The critics' loss
@@ -54,15 +55,24 @@ class Encoded(Seeing):
     for the walker, whose returns are of one step) and an update at every second step.
     """
 
+    latent_widths: tuple[int, ...] = (256, 50)
+    """Widths of the encoder's layers; the last is the size of the latent state. Of pictures only the last counts."""
+    vision: Vision = "drq"
+    """Convolutions for pictures: drq (four, as in SAC-AE and DrQ) or impala (fifteen in residual blocks)."""
+    shift: int = 4
+    """Shift pictures of a batch from the replay by up to so many pixels at random; 0 for none."""
     encoder_tau: float = 0.05
     """Step of the target encoder towards the new encoder at each update, as a share of the distance. With 1 an update
     encodes s and s' once each, for critics, targets and actor."""
 
+    sees_pictures: ClassVar[bool] = True
     names: ClassVar[tuple[str, ...]] = (*ENCODERS, PROJECTION)
     slow: ClassVar[tuple[str, ...]] = ENCODERS  # those whose target copies move by encoder_tau
 
     def __post_init__(self):
         super().__post_init__()
+        parts.require_layers(self, "latent_widths")
+        parts.require_not_negative(self, "shift")
         parts.require_rates(self, "encoder_tau")
 
     @property
@@ -73,6 +83,9 @@ class Encoded(Seeing):
     def own_target(self) -> tuple[str, ...]:  # type: ignore[override]
         swept = isinstance(self.encoder_tau, jax.Array)
         return self.slow if not swept and self.encoder_tau == 1 else ()
+
+    def augment(self, batch: Transition, key: Key) -> Transition:
+        return shift_pictures(batch, key, self.shift)
 
     # Networks: each is used by all N critics and by the actor.
 
@@ -92,8 +105,7 @@ class Encoded(Seeing):
 
     def apply(self, params: Params, name: str, *inputs: Any) -> Array:
         """Map one task's inputs by an encoder or a model."""
-        module = self.sight if name == PROJECTION else self.modules[name]
-        return module.apply({**params.shared, **params.own}[name], *inputs)  # type: ignore
+        return apply_part(self.modules | {PROJECTION: self.sight}, params, name, *inputs)
 
     def init(
         self, num_tasks: int, features: Array, obs: Any, seen: Any, action: Array, own: bool, key: Key
@@ -139,6 +151,16 @@ class Encoded(Seeing):
     def convolve(self, params: Params, obs: Any) -> Any:
         """Return observations with the features (..., F) of convolutions in place of pictures."""
         return obs | {frames.PICTURES: self.apply(params, "latent", obs)}
+
+
+def encode_tasks(encoded: Encoded, params: Params, obs: Any) -> Array:
+    """Return the critics' latent states (T, B, D) of all tasks' observations (T, B, O)."""
+    return jax.vmap(encoded.encode, (OVER_TASKS, 0))(params, without_past(obs))
+
+
+def apply_part(modules: Mapping[str, nn.Module], params: Params, name: str, *inputs: Any) -> Array:
+    """Map one task's inputs by the encoder or model of that name."""
+    return modules[name].apply({**params.shared, **params.own}[name], *inputs)  # type: ignore
 
 
 def init_part(params: Params, name: str, module: nn.Module, own: bool, key: Key, num_tasks: int, *inputs: Any) -> None:

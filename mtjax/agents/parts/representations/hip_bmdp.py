@@ -12,7 +12,8 @@ from mtjax.agents.networks import Params, join
 from mtjax.agents.parts.knowing.embedding import unit
 from mtjax.agents.parts.knowing.last_steps import TrajectoryEncoder
 from mtjax.agents.parts.representations.base import Unseen
-from mtjax.agents.parts.representations.deepmdp import DeepMDP, ModelTargets
+from mtjax.agents.parts.representations.deepmdp import DeepMDP, Dynamics, ModelTargets, Transitions, require_one_sense
+from mtjax.agents.parts.representations.encoded import Encoded, encode_tasks
 from mtjax.types import Array, Key, Metrics
 
 STAND_INS = {
@@ -24,7 +25,7 @@ STAND_INS = {
 
 
 @dataclasses.dataclass(frozen=True)
-class HiPBMDP(DeepMDP):
+class HiPBMDP(Encoded):
     """HiP-BMDP is DeepMDP with a learned vector for each task (Zhang, Sodhani, Khetarpal and Pineau 2021).
 
     Actor, critics and both models take task i's vector theta_i as an input. For each transition (s, a) of task i, and a
@@ -49,6 +50,12 @@ class HiPBMDP(DeepMDP):
     on top, which could add nothing for T tasks.
     """
 
+    model_widths: tuple[int, ...] = (512,)
+    """Widths of the hidden layers in transition and reward model."""
+    transition: Transitions = "deterministic"
+    """Predict the next latent state as a point or as a Gaussian."""
+    model_coefficient: float = 1.0
+    """Weight of transition and reward loss relative to the critics' loss."""
     theta_size: int = 16
     """Size of the vector theta of each task."""
     unit_theta: bool = False
@@ -63,11 +70,14 @@ class HiPBMDP(DeepMDP):
 
     names: ClassVar[tuple[str, ...]] = (*DeepMDP.names, "embedding", "guess")
     slow: ClassVar[tuple[str, ...]] = (*DeepMDP.slow, "embedding")
+    predicts: ClassVar[bool] = True
     embeds: ClassVar[bool] = True
     models: ClassVar[tuple[str, ...]] = (*DeepMDP.models, "guess")
 
     def __post_init__(self):
         super().__post_init__()
+        parts.require_layers(self, "model_widths")
+        parts.require_positive(self, "model_coefficient")
         parts.require_not_negative(self, "theta_coefficient")
         parts.require_counts(self, "theta_size", "theta_from")
 
@@ -76,8 +86,20 @@ class HiPBMDP(DeepMDP):
         return self.theta_from if self.unseen_theta == "inferred" else 0
 
     @property
+    def dynamics(self) -> Dynamics:
+        """The models of latent states and rewards, as in DeepMDP."""
+        return Dynamics(self.model_widths, self.latent_widths[-1], self.transition)
+
+    def model_inputs(self, latent: Array, features: Array, action: Array) -> dict[str, tuple]:
+        return self.dynamics.inputs(latent, features, action)
+
+    def require(self, obs: Any) -> None:
+        require_one_sense(obs)
+
+    @property
     def modules(self) -> dict[str, nn.Module]:
-        return super().modules | ({"guess": TrajectoryEncoder(self.theta_size)} if self.history else {})
+        guess = {"guess": TrajectoryEncoder(self.theta_size)} if self.history else {}
+        return super().modules | self.dynamics.modules | guess
 
     def init_vectors(self, num_tasks: int, key: Key) -> Params:
         return Params({}, {"embedding": jax.random.normal(key, (num_tasks, self.theta_size))})
@@ -113,28 +135,34 @@ class HiPBMDP(DeepMDP):
 
     def targets(self, params: Params, target_params: Params, next_obs: Any, key: Key) -> tuple[ModelTargets, Key]:
         key, turn_key = jax.random.split(key)
-        model_targets, keys = super().targets(params, target_params, next_obs, key)
+        model_targets, keys = self.dynamics.targets(encode_tasks(self, target_params, next_obs), key)
         thetas = params.own["embedding"]
         turn = jax.random.randint(turn_key, (), 1, max(len(thetas), 2))  # a single task is compared with itself
         return model_targets._replace(other_theta=jnp.roll(thetas, turn, axis=0)), keys
 
     def join(self, loss: Array, metrics: Metrics, params: Params, batch: Any) -> tuple[Array, Metrics]:
-        loss, metrics = super().join(loss, metrics, params, batch)
+        known = self.perceive(params, batch.features, batch.obs)
+        models_loss, losses = self.dynamics.losses(params, *known, batch)
+        loss += self.model_coefficient * models_loss
         theta_loss = jnp.mean(
             self.theta_loss(params, batch.features, batch.obs, batch.action, batch.model_targets.other_theta)
         )
-        metrics |= {"theta_loss": theta_loss}
         loss += self.theta_coefficient * theta_loss
+        metrics = metrics | losses | {"theta_loss": theta_loss}
         if self.unseen_theta != "inferred":
             return loss, metrics
         error = self.apply(params, "guess", batch.obs) - jax.lax.stop_gradient(params.own["embedding"])
         guess_loss = jnp.mean(jnp.sum(jnp.square(error), axis=-1))
         return loss + guess_loss, metrics | {"guess_loss": guess_loss}
 
+    @property
+    def least_loss(self) -> float | Array:  # type: ignore[override]
+        return self.model_coefficient * self.dynamics.least_loss
+
     def theta_loss(self, params: Params, features: Array, obs: Any, action: Array, other_theta: Array) -> Array:
         """Compute the theta loss (B,) of one task and another task's vector (Z,)."""
         fixed, other = jax.lax.stop_gradient((params, with_theta(params, other_theta)))
-        predictions = [self.predict(p, *self.perceive(p, features, obs), action) for p in (fixed, other)]
+        predictions = [self.dynamics.predict(p, *self.perceive(p, features, obs), action) for p in (fixed, other)]
         ours, theirs = map(jnp.stack, predictions)  # (2, B, D), means and deviations
         moved = jnp.sqrt(jnp.sum(jnp.square(ours - theirs), axis=(0, -1)))
         return jnp.square(distance(self.theta(params), self.theta(other)) - moved)

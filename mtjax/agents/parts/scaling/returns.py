@@ -1,31 +1,13 @@
-"""Scalings by discounted returns."""
+"""Scalings by the discounted sum of an episode's rewards, backwards: G_t = r_t + gamma G_(t-1)."""
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 
 from mtjax.agents import normalize, parts
 from mtjax.agents.parts.scaling.base import NoScaling
 from mtjax.types import Array, Transition
-
-
-@dataclasses.dataclass(frozen=True)
-class _OfReturns(NoScaling):
-    """Remembers the discounted sum of an episode's rewards, backwards: G_t = r_t + gamma G_(t-1)."""
-
-    return_range: float = 10.0
-    """Largest |discounted sum of rewards so far| after scaling; with value=c51 or hl-gauss, the range of their bins."""
-
-    def __post_init__(self):
-        parts.require_positive(self, "return_range")
-
-    def begin(self) -> Array:
-        """Return 0, the sum before the first reward."""
-        return jnp.float32(0)
-
-    def remember(self, episode: Any, reward: Array, gamma: float | Array) -> Any:
-        return gamma * episode + reward
 
 
 class Sums(NamedTuple):
@@ -44,7 +26,7 @@ class LargestReturns(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class ReturnScaling(_OfReturns):
+class ReturnScaling(NoScaling):
     """Divides by the task's largest discounted sum of rewards, to fit returns to a range (BRC; Nauman et al. 2025).
 
     With G the largest |return| so far, horizon h = 1 / (1 - gamma), temperature a and target entropy H, the
@@ -58,14 +40,20 @@ class ReturnScaling(_OfReturns):
     exceed the range, and is less than (1 + gamma) times as large. Before there is any reward the factor is 1.
     """
 
+    return_range: float = 10.0
+    """Largest |discounted sum of rewards so far| after scaling; with value=c51 or hl-gauss, the range of their bins."""
+
+    def __post_init__(self):
+        parts.require_positive(self, "return_range")
+
     def init(self, num_tasks: int) -> LargestReturns:
         return LargestReturns(jnp.zeros(num_tasks), jnp.zeros(num_tasks))
 
     def begin(self) -> Sums:
-        return Sums(super().begin(), jnp.float32(0), jnp.float32(0))
+        return Sums(jnp.float32(0), jnp.float32(0), jnp.float32(0))
 
     def remember(self, episode: Sums, reward: Array, gamma: float | Array) -> Sums:
-        return Sums(super().remember(episode.discounted, reward, gamma), episode.total + reward, episode.count + 1)
+        return Sums(gamma * episode.discounted + reward, episode.total + reward, episode.count + 1)
 
     def observe(self, memory: LargestReturns, steps: Transition) -> LargestReturns:
         sums: Sums = steps.memory
@@ -90,7 +78,7 @@ class SpreadOfReturns(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class ReturnNormalization(_OfReturns):
+class ReturnNormalization(NoScaling):
     """Divides by the standard deviation of the task's discounted returns, and keeps these in a range (SimbaV2).
 
     With G_t = r_t + gamma G_(t-1) from the start of an episode, as Lee et al. (2025, "Hyperspherical normalization"):
@@ -105,6 +93,15 @@ class ReturnNormalization(_OfReturns):
 
     return_range: float = 5.0
     """Largest |discounted sum of rewards so far| after scaling; with value=c51 or hl-gauss, the range of their bins."""
+
+    def __post_init__(self):
+        parts.require_positive(self, "return_range")
+
+    def begin(self) -> Array:
+        return jnp.float32(0)
+
+    def remember(self, episode: Array, reward: Array, gamma: float | Array) -> Array:
+        return gamma * episode + reward
 
     def init(self, num_tasks: int) -> SpreadOfReturns:
         zeros = jnp.zeros(num_tasks)
