@@ -522,7 +522,7 @@ def test_warp_draws_what_the_caster_draws(name):
 
     def draw(env):
         def again(states, _):
-            pictures = jax.vmap(jax.vmap(env.draw, (None, 0)), (0, None))(env.tasks(), states)
+            pictures = jax.vmap(jax.vmap(env.look_at, (None, 0)), (0, None))(env.tasks(), states)["pixels"]
             started = jax.vmap(env.reset)(env.tasks(), jax.random.split(jax.random.key(0), 2)).obs["pixels"]
             return states._replace(qpos=states.qpos + 1e-3), (pictures, started)
 

@@ -30,6 +30,8 @@ from mtjax.envs.family import Family, draw_until
 from mtjax.envs.fields import FIXED, VARIABLE
 from mtjax.envs.pixels import Pictured
 from mtjax.envs.planar import Planar, is_planar, locate
+from mtjax.envs.scenery import Visible
+from mtjax.envs.task_table import for_rows
 from mtjax.names import nearest_error
 from mtjax.types import Array, InputError, Key, Spec, Step, Task, Transition
 
@@ -118,9 +120,9 @@ class Domain(Pictured, Family):
         """Return the world after one control step under ``action`` (A,)."""
         return self.simulator.step(task, *self.control(task, state, action))
 
-    def joints(self, state: World) -> Array:
-        """Return the positions (nq,) of the model's joints."""
-        return state.qpos
+    def visible(self, task: Task, state: World) -> Visible:
+        """Return what a picture shows of a world."""
+        return super().visible(task, state)._replace(joints=state.qpos)
 
     def relabel(self, task: Task, transition: Transition, key: Key) -> Transition:
         """Return another task's transition with the reward of ``task``. Observations must not show the goal."""
@@ -180,7 +182,7 @@ class Domain(Pictured, Family):
     def models(self) -> tuple[mujoco.MjModel, ...]:
         """Return the compiled model of every row of the table. Rows that differ only in goals share one."""
         names = [name for name, parameter in self.parameters.items() if parameter.edit is not None]
-        return self.for_rows(self._compile, names)
+        return for_rows(self.values, self.count, self._compile, names)
 
     def _compile(self, values: Mapping[str, float]) -> mujoco.MjModel:
         """Return the compiled model with these parameter values.
@@ -208,8 +210,7 @@ class Domain(Pictured, Family):
         """Return the "model" and "goal" leaves (R, ...) of every row of the table."""
         leaves = {name: np.float32(leaf) for name, leaf in stack_differing(self.models).items()}
         goal, starts = self.goals(), self.starts(self.models, np.random.default_rng(self.task_seed))
-        seen = {"scene": self.scene_leaves()} if self.pixels else {}
-        return {"model": leaves, "goal": goal if starts is None else goal | {"starts": np.float32(starts)}, **seen}
+        return {"model": leaves, "goal": goal if starts is None else goal | {"starts": np.float32(starts)}}
 
     @property
     def action_size(self) -> int:  # type: ignore

@@ -18,6 +18,7 @@ from mtjax.envs.engines.base import Blank
 from mtjax.envs.family import Family
 from mtjax.envs.fields import FIXED, VARIABLE
 from mtjax.envs.painters.scene import LEAVES, field
+from mtjax.envs.pixels import compile_scene
 from mtjax.types import InputError, Key, Task
 
 Parts = Mapping[str, Any]  # what a value of a parameter gives, by name
@@ -84,7 +85,7 @@ def _physics(family: Domain, values: Mapping[str, float]) -> Parts:
 
 def _scene(family: Domain, values: Mapping[str, float]) -> Parts:
     """Return all fields of a compiled scene that a painter reads."""
-    model = family.compile_scene(values).compile()
+    model = compile_scene(family, values).compile()
     return {name: field(model, name) for name in LEAVES}
 
 

@@ -16,7 +16,8 @@ import tyro
 from mtjax.checks import require_values
 from mtjax.envs import variation
 from mtjax.envs.parameters import Parameter
-from mtjax.envs.task_table import Outside, Part, Table, fields_alone, numbers, params
+from mtjax.envs.task_table import Outside, Part, Table, fields_alone, makers, numbers, params
+from mtjax.frames import shown
 from mtjax.names import first_sentence
 from mtjax.parallel import axes
 from mtjax.types import SPLITS, Array, Continuous, Discrete, InputError, Key, Spec, Step, Task, Transition
@@ -59,6 +60,11 @@ class Family(abc.ABC):
     asks: ClassVar[str] = ""  # what its tasks ask for, in a sentence; empty: the documentation's first one
     finite_horizon: ClassVar[bool] = False  # how long an episode is, is part of the problem, and no mere limit of time
     fresh_goals: ClassVar[bool] = False  # every episode draws a goal of its own, whatever its task
+    looks: ClassVar[Mapping[str, Parameter]] = MappingProxyType({})  # parameters that change only what is seen
+    repeat: ClassVar[int] = 1  # control steps in a step
+    frames: ClassVar[int] = 1  # how many of the last pictures an agent sees at once, if it observes pictures
+    films: ClassVar[bool] = False  # whether its worlds can be seen in films
+    scenery: ClassVar[Any] = None  # what draws pictures that agents observe
 
     def __post_init__(self):
         pairs = self.vary.items() if isinstance(self.vary, Mapping) else self.vary
@@ -114,7 +120,7 @@ class Family(abc.ABC):
     @property
     def every_parameter(self) -> Mapping[str, Parameter]:
         """Return all parameters that can vary."""
-        return self.parameters
+        return {**self.parameters, **self.looks, **self.parameters}
 
     def goals(self) -> dict[str, np.ndarray]:
         """Return the goal parameters (R,) of every row: varied, or nominal."""
@@ -170,6 +176,8 @@ class Family(abc.ABC):
             "horizon": np.full(self.count, self.episode_length, np.int32),
             **self.build(),
         }
+        if self.scenery is not None:
+            leaves["scene"] = self.scenery.leaves
         rows: dict[str, np.ndarray] = dict(zip(SPLITS, np.split(np.arange(listed), np.cumsum(sizes)[:-1]), strict=True))
         return Table(Task(**leaves), rows, draws)
 
@@ -308,11 +316,6 @@ class Family(abc.ABC):
         """Return the modules with the classes that make it."""
         return (type(self).__module__,)
 
-    @property
-    def films(self) -> bool:
-        """Return whether its worlds can be seen in films."""
-        return False
-
     def filmed(self) -> AbstractContextManager[None]:
         """Return a context in which episodes that films show are played."""
         return nullcontext()
@@ -323,19 +326,14 @@ class Family(abc.ABC):
         return None
 
     @property
-    def outside_painter(self) -> Any:
-        """Return the painter of its observations if it runs outside XLA, else None."""
-        return None
-
-    @property
     def calls(self) -> Outside:
         """Return what makes calls out of XLA in its programs."""
-        return Outside((self.outside, self.outside_painter))
+        return Outside(makers(self))
 
     @property
     def episode_length(self) -> int:
         """Return the steps after which an episode is cut off."""
-        return self.episode_steps
+        return self.episode_steps // self.repeat
 
     @property
     def ends_early(self) -> bool:
@@ -356,7 +354,8 @@ class Family(abc.ABC):
     def _spec(self) -> Spec:
         task = jax.tree.map(lambda x: x[0], self.table.tasks)
         step = jax.eval_shape(self.reset, task, jax.eval_shape(jax.random.key, 0))
-        return Spec(step.obs, self.action, task.context.shape[0], sentences=self.sentences)
+        frames = self.frames if shown(step.obs) else 1
+        return Spec(step.obs, self.action, task.context.shape[0], frames=frames, sentences=self.sentences)
 
     # All worlds, leaves (S, T, E, ...).
 

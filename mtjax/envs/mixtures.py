@@ -7,6 +7,7 @@ masked.
 """
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
 from typing import Annotated, Any, NamedTuple
@@ -20,7 +21,7 @@ from mtjax import frames
 from mtjax.envs.family import Family
 from mtjax.envs.shared_simulator import take
 from mtjax.envs.simulator_groups import SCENES, Group, grouped
-from mtjax.envs.task_table import Outside, Part, Table, fields_alone, numbers, params
+from mtjax.envs.task_table import Outside, Part, Table, fields_alone, makers, numbers, params
 from mtjax.names import nearest_error
 from mtjax.types import SPLITS, Array, InputError, Key, Spec, Step, Task
 
@@ -402,7 +403,7 @@ class Mixture:
     @property
     def calls(self) -> Outside:
         """Return what makes calls out of XLA in its programs: the engines, the painters, and groups' own engines."""
-        own = [f.outside for f in self.families] + [f.outside_painter for f in self.families]
+        own = list(itertools.chain(*map(makers, self.families)))
         return Outside((*own, *(group.outside for group in self.groups if group.outside not in own)))
 
     def apart(self, states: States) -> tuple[Any, ...]:

@@ -17,6 +17,7 @@ from mtjax.envs.domain import Domain, stack_differing
 from mtjax.envs.engines.base import Engine, World, at_rest
 from mtjax.envs.engines.mjx import Mjx
 from mtjax.envs.family import Family
+from mtjax.envs.pixels import outcome
 from mtjax.parallel.axes import over_worlds
 from mtjax.types import Array, Key, Step, Task
 
@@ -185,7 +186,7 @@ def _advance(simulator: Engine, row: Array, model: dict[str, Array], world: Worl
 
 @partial(jax.jit, static_argnums=0)
 def _outcome(domain: Domain, task: Task, world: World, action: Array) -> Step:
-    return domain.outcome(task, world, action)
+    return outcome(domain, task, world, action)
 
 
 def _task_of(row: Array, model: dict[str, Array]) -> Task:

@@ -4,7 +4,7 @@ Tables are built on the host. Compiled programs never loop over tasks.
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -64,9 +64,29 @@ class Outside(NamedTuple):
         return any([maker.load_kernels() for maker in self.makers if maker])
 
 
+def makers(family: Any) -> tuple[Any, ...]:
+    """Return what makes the calls out of XLA of a family: its engine, and what draws its observations."""
+    return family.outside, None if family.scenery is None else family.scenery.outside
+
+
 def forgetful(env: Any) -> str:
     """Return the names of families whose worlds are lost with the process; empty if there are none."""
     return ", ".join(part.family.name for part in getattr(env, "parts", ()) if part.family.forgets)
+
+
+def for_rows(
+    values: Mapping[str, np.ndarray], count: int, make: Callable[[dict[str, float]], Any], names: Iterable[str]
+) -> tuple[Any, ...]:
+    """Return what ``make`` returns for the values of ``names`` in every row of a table. Rows of equal ones share it.
+
+    Args:
+        values: those of all varied parameters in every row (R,).
+        count: R, the number of rows.
+    """
+    used = [name for name in values if name in names]
+    rows = list(zip(*(values[name].tolist() for name in used), strict=True)) or [()] * count
+    made = {row: make(dict(zip(used, row, strict=True))) for row in dict.fromkeys(rows)}
+    return tuple(made[row] for row in rows)
 
 
 # Methods of families and of mixtures.

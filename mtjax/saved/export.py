@@ -15,7 +15,8 @@ from mtjax.agents import BaseAgent, name_of
 from mtjax.checks import path
 from mtjax.envs import Family
 from mtjax.envs import name_of as env_name_of
-from mtjax.envs.pixels import GREY, Pictured
+from mtjax.envs.pixels import Pictured
+from mtjax.envs.scenery import GREY
 from mtjax.names import InputError, public
 from mtjax.saved import onnx
 from mtjax.saved.operations import steps_of

@@ -125,11 +125,10 @@ class Sketched(Pictured, Choosing, Family):
         return np.round(self.goals()[GOAL]).astype(np.int32)
 
     def build(self) -> dict[str, dict[str, Any]]:
-        """Return the "goal" leaves (R, ...) of every row, and with pictures what differs in them."""
+        """Return the "goal" leaves (R, ...) of every row."""
         tables = {"sketch": self.codes, "length": np.sum(self.codes >= 0, axis=1, dtype=np.int32), **self.facts()}
         goal = {name: table[self.numbers_of_goals] for name, table in tables.items()}
-        seen = {"scene": self.scene_leaves()} if self.pixels else {}
-        return {"model": {}, "goal": self.goals() | goal, **seen}
+        return {"model": {}, "goal": self.goals() | goal}
 
     def told(self) -> np.ndarray:
         """Return the contexts (N, C) of all N names of tasks: their sketches, one-hot."""

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import ClassVar
 
@@ -162,12 +163,14 @@ class FingerTurn(Domain):
     fresh_goals: ClassVar[bool] = True
     look: ClassVar = _LOOK
 
-    def add_marks(self, spec: mujoco.MjSpec) -> None:
-        """Add the target, and the spinner's tip that has to be in it."""
+    def seen_spec(self, values: Mapping[str, float]) -> mujoco.MjSpec:
+        """Return the model with the target, and with the spinner's tip that has to be in it."""
+        spec = self.compile_spec(values)
         seen = {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "rgba": TARGET, "mass": 0, "contype": 0, "conaffinity": 0}
         site = spec.site("tip")
         spec.body("spinner").add_geom(name="tip", pos=site.pos, size=site.size, **seen)
         spec.worldbody.add_geom(name="target", size=[self.parameters["target-size"].nominal, 0, 0], **seen)
+        return spec
 
     def marks(self, task: Task, world: World) -> dict[str, Mark]:
         hinge = self.leaf(task, "body_pos")[self.models[0].body("spinner").id]
