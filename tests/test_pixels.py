@@ -129,7 +129,7 @@ def test_painter_warp_has_one_sky(monkeypatch):
         monkeypatch.setattr(f"mtjax.envs.painters.base.{name}", lambda: True)
     with pytest.raises(InputError, match=r"one sky for all tasks; use painter='caster'"):
         pictured(painter="warp", vary=(("sky-hue", "0,90"),))
-    assert pictured(painter="warp", vary=(("sky-hue", "90"),)).values["sky-hue"][0] == 90
+    assert pictured(painter="warp", vary=(("sky-hue", "90"),)).variation.values["sky-hue"][0] == 90
 
 
 def test_hidden_goals_are_not_drawn():

@@ -25,7 +25,7 @@ def test_bodies_are_where_mujoco_has_them(name):
     env = mtjax.make(name, engine="c")
     model, random = env.models[0], np.random.default_rng(0)
     assert is_planar(model)
-    for row in {0, env.count - 1}:
+    for row in {0, env.variation.count - 1}:
         task = jax.tree.map(lambda x, row=row: x[row], env.tasks("all"))
         place = jax.jit(lambda qpos, qvel, task=task: locate(model, lambda leaf: env.leaf(task, leaf), qpos, qvel))
         data = mujoco.MjData(env.models[row])

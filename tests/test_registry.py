@@ -108,7 +108,8 @@ def test_a_family_of_ones_own_is_trained_and_evaluated(tmp_path, monkeypatch, ca
     command = shlex.split(json.loads((run / "config.json").read_text())["command"])
     assert f"--import={file}" in command
     env = mtjax.make("spring")
-    assert env.varied == ("stiffness", "goal") and [m.jnt_stiffness[0] for m in env.models[:12:3]] == [5, 10, 15, 20]
+    assert env.varied == ("stiffness", "goal")
+    assert [m.jnt_stiffness[0] for m in env.models[:12:3]] == [5, 10, 15, 20]
     capsys.readouterr()
     mtjax.evaluate.main([f"--run={run}", "--episodes=1"])
     assert "extrapolation" in capsys.readouterr().out

@@ -22,6 +22,7 @@ import mujoco
 import numpy as np
 import tyro
 
+from mtjax.envs.contexts import goals
 from mtjax.envs.engines.base import ENGINES, Blank, Engine, World, choose_engine
 from mtjax.envs.engines.c import MujocoC
 from mtjax.envs.engines.mjx import Mjx
@@ -31,7 +32,6 @@ from mtjax.envs.fields import FIXED, VARIABLE
 from mtjax.envs.pixels import Pictured
 from mtjax.envs.planar import Planar, is_planar, locate
 from mtjax.envs.scenery import Visible
-from mtjax.envs.task_table import for_rows
 from mtjax.names import nearest_error
 from mtjax.types import Array, InputError, Key, Spec, Step, Task, Transition
 
@@ -182,7 +182,7 @@ class Domain(Pictured, Family):
     def models(self) -> tuple[mujoco.MjModel, ...]:
         """Return the compiled model of every row of the table. Rows that differ only in goals share one."""
         names = [name for name, parameter in self.parameters.items() if parameter.edit is not None]
-        return for_rows(self.values, self.count, self._compile, names)
+        return self.variation.for_rows(self._compile, names)
 
     def _compile(self, values: Mapping[str, float]) -> mujoco.MjModel:
         """Return the compiled model with these parameter values.
@@ -209,7 +209,7 @@ class Domain(Pictured, Family):
     def build(self) -> dict[str, dict[str, Any]]:
         """Return the "model" and "goal" leaves (R, ...) of every row of the table."""
         leaves = {name: np.float32(leaf) for name, leaf in stack_differing(self.models).items()}
-        goal, starts = self.goals(), self.starts(self.models, np.random.default_rng(self.task_seed))
+        goal, starts = goals(self), self.starts(self.models, np.random.default_rng(self.task_seed))
         return {"model": leaves, "goal": goal if starts is None else goal | {"starts": np.float32(starts)}}
 
     @property
@@ -268,12 +268,10 @@ class Domain(Pictured, Family):
         return MujocoC(models, self.num_substeps) if self.engine_name == "c" else self.simulator
 
     @cached_property
-    def _spec(self) -> Spec:
-        """Return the sizes of an observation. To trace the engine for them would take seconds."""
-        _ = self.table  # once, and not in the copy again
-        blank = copy.copy(self)
-        vars(blank)["simulator"] = Blank(self.models[0])
-        return super(Domain, blank)._spec
+    def spec(self) -> Spec:
+        """Return the sizes of observation, action and context. To trace the engine for them would take seconds."""
+        blank = without_physics(self)
+        return super(Domain, blank).spec
 
     @property
     def outside(self) -> Warp | MujocoC | None:
@@ -300,6 +298,13 @@ class Domain(Pictured, Family):
         if self.integrator == "euler":
             base.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
         return base
+
+
+def without_physics(domain: Domain) -> Domain:
+    """Return the same domain, with the same table, on an engine whose worlds stand still: for shapes alone."""
+    blank = copy.copy(domain)
+    vars(blank).update(table=domain.table, models=domain.models, simulator=Blank(domain.models[0]))
+    return blank
 
 
 def _folder_of(family: type) -> Path:

@@ -1,6 +1,5 @@
 """What a parameter changes of a task, and whether anything reads that."""
 
-import copy
 import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping
@@ -13,8 +12,7 @@ import numpy as np
 from jax.interpreters.partial_eval import dce_jaxpr
 
 from mtjax.envs.brax import Brax
-from mtjax.envs.domain import Domain
-from mtjax.envs.engines.base import Blank
+from mtjax.envs.domain import Domain, without_physics
 from mtjax.envs.family import Family
 from mtjax.envs.fields import FIXED, VARIABLE
 from mtjax.envs.painters.scene import LEAVES, field
@@ -109,9 +107,8 @@ def _tasks(family: Family) -> Callable[[Mapping[str, float]], Parts]:
 def _leaves_read(family: Family) -> set[str]:
     """Return the names of a task's leaves on which the results of a reset and a step depend."""
     task = jax.tree.map(lambda x: x[0], family.table.tasks)
-    family = copy.copy(family)
     if isinstance(family, Domain):  # the physics takes seconds to trace
-        vars(family)["simulator"] = Blank(family.models[0])
+        family = without_physics(family)
 
     def play(task: Task, key: Key) -> Any:
         begun = family.reset(task, key)

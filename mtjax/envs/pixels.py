@@ -23,7 +23,6 @@ from mtjax.envs.painters.scene import LEAVES, Scene, field, observed
 from mtjax.envs.painters.warp import WarpPainter
 from mtjax.envs.parameters import Parameter
 from mtjax.envs.scenery import Mark, Scenery, Visible
-from mtjax.envs.task_table import for_rows
 from mtjax.frames import PICTURES, STATE
 from mtjax.names import nearest_error
 from mtjax.types import Array, InputError, Step, Task
@@ -142,12 +141,12 @@ class Pictured(abc.ABC):
         return shown | {STATE: self.observe(task, state)} if self.state == "also" else shown
 
     @cached_property
-    def scenery(self) -> Scenery | None:
+    def scenery(self) -> Scenery | None:  # type: ignore[override]
         """Return what draws observations; None where they are states."""
         return make_scenery(self) if self.pixels else None
 
     @property
-    def ends_early(self) -> bool:
+    def ends_early(self) -> bool:  # type: ignore[override]
         """Return whether the family says where episodes end."""
         return type(self).terminates is not Pictured.terminates
 
@@ -184,7 +183,7 @@ def compile_scene(family: Pictured, values: Mapping[str, float]) -> mujoco.MjSpe
 
 def scene_model(family: Pictured, row: int) -> mujoco.MjModel:
     """Return the compiled model of what is seen of the task in a row of the table."""
-    return compile_scene(family, {name: values[row] for name, values in family.values.items()}).compile()
+    return compile_scene(family, {name: values[row] for name, values in family.variation.values.items()}).compile()
 
 
 def make_scenery(family: Pictured) -> Scenery:
@@ -202,7 +201,7 @@ def _scene_leaves(family: Pictured) -> dict[str, np.ndarray]:
         return {name: field(model, name) for name in LEAVES}
 
     edited = [name for name, parameter in family.every_parameter.items() if parameter.edit is not None]
-    rows = for_rows(family.values, family.count, fields, (*family.scenic, *edited))
+    rows = family.variation.for_rows(fields, (*family.scenic, *edited))
     columns = {name: np.stack([row[name] for row in rows]) for name in LEAVES}
     return {name: column for name, column in columns.items() if np.any(column != column[0])}
 

@@ -4,7 +4,7 @@ Tables are built on the host. Compiled programs never loop over tasks.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -20,6 +20,7 @@ class Table(NamedTuple):
     tasks: Task  # leading axis: all rows; on the host
     rows: Mapping[str, np.ndarray]  # split -> row numbers
     draws: np.ndarray | None  # (rows of all splits, P) row numbers of the tasks that episodes draw
+    blocks: Mapping[str, Any] | None = None  # split -> ``Task.blocks``; None: of a single family
 
     def of(self, split: str) -> Task:
         """Return the tasks of a split: "train", "interpolation", "extrapolation", or "all" in this order."""
@@ -28,7 +29,7 @@ class Table(NamedTuple):
         if split not in splits:
             raise InputError(f"unknown split {split!r}; choose from {', '.join(splits)}")
         take = lambda rows: jax.device_put(jax.tree.map(lambda x: x[rows], self.tasks))  # jnp.asarray would compile
-        tasks = take(splits[split])
+        tasks = take(splits[split])._replace(blocks=self.blocks and self.blocks[split])
         if self.draws is None:
             return tasks
         rows, contexts = self.draws[splits[split]], self.tasks.context
@@ -43,6 +44,12 @@ class Part(NamedTuple):
     name: str  # empty for a single family
     family: Any  # a Family
     places: Mapping[str, np.ndarray]  # split, or "all" -> which of that split's tasks are the family's
+    before: tuple[Any, ...] = ()  # the families whose tables lie before its own in the environment's table
+
+    @property
+    def first(self) -> int:
+        """Return the row of the environment's table at which the family's own begins."""
+        return sum(len(family.table.tasks.id) for family in self.before)
 
 
 class Outside(NamedTuple):
@@ -74,21 +81,6 @@ def forgetful(env: Any) -> str:
     return ", ".join(part.family.name for part in getattr(env, "parts", ()) if part.family.forgets)
 
 
-def for_rows(
-    values: Mapping[str, np.ndarray], count: int, make: Callable[[dict[str, float]], Any], names: Iterable[str]
-) -> tuple[Any, ...]:
-    """Return what ``make`` returns for the values of ``names`` in every row of a table. Rows of equal ones share it.
-
-    Args:
-        values: those of all varied parameters in every row (R,).
-        count: R, the number of rows.
-    """
-    used = [name for name in values if name in names]
-    rows = list(zip(*(values[name].tolist() for name in used), strict=True)) or [()] * count
-    made = {row: make(dict(zip(used, row, strict=True))) for row in dict.fromkeys(rows)}
-    return tuple(made[row] for row in rows)
-
-
 # Methods of families and of mixtures.
 
 
@@ -97,13 +89,36 @@ def fields_alone(self: Any) -> dict[str, Any]:
     return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
 
-def numbers(self: Any, split: str) -> np.ndarray:
-    """Return the numbers (T,) of a split's tasks, which are counted through the splits."""
-    first = sum(self.counts[before] for before in SPLITS[: SPLITS.index(split)])
-    return np.arange(first, first + self.counts[split], dtype=np.int32)
+def tasks(self: Any, split: str = "train") -> Task:
+    """Return the tasks of a split: "train", "interpolation", "extrapolation", or "all" in this order."""
+    return self.table.of(split)
 
 
-def params(self: Any, split: str) -> dict[str, Any]:
-    """Return the values (T,) of the parameters of a split's tasks; of a mixture their names as ``task_name``."""
-    found = self.tasks(split).params
-    return {name: np.asarray(x) for name, x in found.items()} or {"task_name": self.labels(split)}
+@property
+def counts(env: Any) -> dict[str, int]:
+    """Return the number of tasks of each split."""
+    return {split: sum(len(part.places[split]) for part in env.parts) for split in SPLITS}
+
+
+@property
+def train_count(env: Any) -> int:
+    """Return the number of training tasks."""
+    return env.counts["train"]
+
+
+def owner(env: Any, row: int) -> tuple[Part, int]:
+    """Return the part of an environment that a row of its table belongs to, and the row in its family's own table."""
+    part = [part for part in env.parts if part.first <= row][-1]
+    return part, row - part.first
+
+
+def own_row(env: Any, row: int) -> int:
+    """Return the row of the family's own table for a row of an environment's."""
+    return owner(env, row)[1]
+
+
+@property
+def calls(env: Any) -> Outside:
+    """Return what makes calls out of XLA in programs of an environment: engines, painters, and groups' own engines."""
+    own = [maker for part in env.parts for maker in makers(part.family)]
+    return Outside((*own, *(group.outside for group in getattr(env, "groups", ()) if group.outside not in own)))

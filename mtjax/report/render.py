@@ -52,8 +52,9 @@ def film(
     Raises:
         InputError: there is no such row, or no OpenGL backend works. The message names what to install.
     """
-    if not 0 <= task_row < env.count:
-        raise InputError(f"there is no task {task_row}; this family has tasks 0 to {env.count - 1}")
+    count = env.variation.count
+    if not 0 <= task_row < count:
+        raise InputError(f"there is no task {task_row}; this family has tasks 0 to {count - 1}")
     model = scene_model(env, task_row)
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height
     model.light_castshadow &= shadows

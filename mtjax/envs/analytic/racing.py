@@ -18,7 +18,6 @@ from mtjax.envs.painters.poses import Pose
 from mtjax.envs.parameters import Parameter, positive
 from mtjax.envs.pixels import Mark, Pictured
 from mtjax.envs.scenery import Visible
-from mtjax.envs.task_table import for_rows
 from mtjax.types import Array, Key, Step, Task
 
 # The car of f1tenth_gym (O'Kelly et al. 2020), in SI units.
@@ -115,7 +114,7 @@ class Racing(Pictured, Family):
     def build(self) -> dict[str, dict[str, Any]]:
         """Return the leaves (R, ...) of every row of the table, with the waves of its track."""
         built = super().build()
-        waves = np.stack(for_rows(self.values, self.count, self.waves, ("track",))).astype(np.float32)
+        waves = np.stack(self.variation.for_rows(self.waves, ("track",))).astype(np.float32)
         return built | {"goal": built["goal"] | {"waves": waves}}
 
     # Steps.

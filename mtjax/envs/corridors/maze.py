@@ -20,7 +20,6 @@ from mtjax.envs.painters.poses import Pose
 from mtjax.envs.parameters import Parameter
 from mtjax.envs.pixels import Mark, Pictured
 from mtjax.envs.scenery import Visible
-from mtjax.envs.task_table import for_rows
 from mtjax.types import Array, InputError, Key, Step, Task
 
 _RADIUS, _BALL = 0.2, 0.2  # [m] of the walker and of balls
@@ -108,11 +107,11 @@ class CorridorMaze(Pictured, Family):
 
     def build(self) -> dict[str, dict[str, Any]]:
         """Return walls, balls and, if they are rewarded, ways to the goal (R, ...) of every row of the table."""
-        layouts = for_rows(self.values, self.count, self.layout, ("layout",))
+        layouts = self.variation.for_rows(self.layout, ("layout",))
         built = super().build()
         goal = built["goal"] | {"balls": np.stack([layout.balls for layout in layouts]).astype(np.float32)}
         if self.dense:
-            ways = for_rows(self.values, self.count, self._ways, ("layout", "goal-colour"))
+            ways = self.variation.for_rows(self._ways, ("layout", "goal-colour"))
             goal |= {"ahead": np.stack([way.ahead for way in ways]), "rest": np.stack([way.rest for way in ways])}
         return built | {"model": {"walls": np.stack([layout.walls for layout in layouts])}, "goal": goal}
 

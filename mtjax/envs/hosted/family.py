@@ -99,7 +99,7 @@ class Hosted(Family):
 
     def arguments_of(self, row: int) -> dict[str, Any]:
         """Return the environment's arguments in a row of the table."""
-        varied = {name: self.read_value(name, values[row]) for name, values in self.values.items()}
+        varied = {name: self.read_value(name, values[row]) for name, values in self.variation.values.items()}
         return {**self.fixed, **{name.replace("-", "_"): value for name, value in varied.items()}}
 
     def read_value(self, name: str, value: float) -> Any:
@@ -165,10 +165,10 @@ class Hosted(Family):
         picture = self.observed[PICTURES].shape if shown(self.observed) else ()
         return picture[1] if len(picture) == 3 else 0
 
-    @property
+    @cached_property
     def spec(self) -> Spec:
         """Return the sizes of observation, action and context, and how many pictures agents should see at once."""
-        return self._spec._replace(frames=self.frames) if self.pixels else self._spec
+        return super().spec._replace(frames=self.frames if self.pixels else 1)
 
     # Worlds, leaves (S, T, E, ...).
 
