@@ -399,3 +399,9 @@ def random_past(random: np.random.Generator, shape: tuple[int, ...], spec: Spec 
     normal = lambda size: jnp.float32(random.normal(size=(*shape, size)) * known[..., None])
     reward = jnp.float32(random.normal(size=shape) * known)
     return last_steps.Past(normal(spec.obs_size), jnp.tanh(normal(spec.action_size)), reward, jnp.asarray(known))
+
+
+def set_physics(env, task, state, qpos, qvel):
+    """Return the state of a domain with the given positions (nq,) and velocities (nv,)."""
+    kept = () if state is None else (state.extra, state.mocap)
+    return env.simulator.forward(task, jnp.float32(qpos), jnp.float32(qvel), *kept)

@@ -12,7 +12,7 @@ import numpy as np
 from jax.interpreters.partial_eval import dce_jaxpr
 
 from mtjax.envs.brax import Brax
-from mtjax.envs.domain import Domain, without_physics
+from mtjax.envs.domain import Domain
 from mtjax.envs.family import Family
 from mtjax.envs.fields import FIXED, VARIABLE
 from mtjax.envs.painters.scene import LEAVES, field
@@ -107,8 +107,7 @@ def _tasks(family: Family) -> Callable[[Mapping[str, float]], Parts]:
 def _leaves_read(family: Family) -> set[str]:
     """Return the names of a task's leaves on which the results of a reset and a step depend."""
     task = jax.tree.map(lambda x: x[0], family.table.tasks)
-    if isinstance(family, Domain):  # the physics takes seconds to trace
-        family = without_physics(family)
+    family = family.without_physics()
 
     def play(task: Task, key: Key) -> Any:
         begun = family.reset(task, key)

@@ -67,8 +67,8 @@ class Family(abc.ABC):
     filmed: ClassVar[Callable[[], AbstractContextManager[None]]] = nullcontext  # a context to play filmed episodes in
     scenery: ClassVar[Any] = None  # what draws pictures that agents observe
     engine_name: ClassVar[str] = "jax"  # what steps its worlds: jax, or a physics engine or package
-    outside: ClassVar[Any] = None  # the engine if it runs outside XLA
-    structure: ClassVar[Any] = None  # what families have in common to share a simulator; None for one that stays alone
+    simulator: ClassVar[Any] = None  # the engine, or what makes calls out of XLA; None: its own steps are all
+    without_physics: ClassVar[Callable[..., Any]] = lambda self: self  # the same family, which takes no time to trace
     built_by: ClassVar[tuple[str, ...]] = ()  # modules beside the class's own with what makes its worlds
 
     def __post_init__(self):
@@ -165,7 +165,7 @@ class Family(abc.ABC):
     def spec(self) -> Spec:
         """Return the sizes of observation, action and context, and how many pictures agents should see at once."""
         task = jax.tree.map(lambda x: x[0], self.table.tasks)
-        step = jax.eval_shape(self.reset, task, jax.eval_shape(jax.random.key, 0))
+        step = jax.eval_shape(self.without_physics().reset, task, jax.eval_shape(jax.random.key, 0))
         frames = self.frames if shown(step.obs) else 1
         return Spec(step.obs, self.action, task.context.shape[0], frames=frames, sentences=self.sentences)
 

@@ -105,8 +105,8 @@ class Pictured(abc.ABC):
         return {}
 
     def visible(self, task: Task, state: Any) -> Visible:
-        """Return what a picture shows of a world. By default ``marks`` are all that moves."""
-        return Visible(jnp.zeros(0), self.marks(task, state))
+        """Return what a picture shows of a world: by default ``marks``, and the joints of a state that has ``qpos``."""
+        return Visible(getattr(state, "qpos", jnp.zeros(0)), self.marks(task, state))
 
     def seen_spec(self, values: Mapping[str, float]) -> mujoco.MjSpec:
         """Return the editable model of what is seen, with all that marks need. By default it is that of the physics."""

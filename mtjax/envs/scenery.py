@@ -13,7 +13,6 @@ import numpy as np
 from mtjax.envs.painters.base import Painter
 from mtjax.envs.painters.poses import Pose, Poses, locate
 from mtjax.envs.painters.scene import Scene
-from mtjax.envs.painters.warp import WarpPainter
 from mtjax.types import Array, Task
 
 GREY = (0.299, 0.587, 0.114)
@@ -45,11 +44,6 @@ class Scenery:
     leaves: Mapping[str, np.ndarray]  # (R, ...) the fields that differ between the rows of the family's table
     painter: Painter
     grey: bool  # whether pictures have brightness alone
-
-    @property
-    def outside(self) -> WarpPainter | None:
-        """Return the painter if it runs outside XLA."""
-        return self.painter if isinstance(self.painter, WarpPainter) else None
 
     def field(self, task: Task, visible: Visible, name: str) -> Array:
         """Return a field of the scene of one world, by its name in MuJoCo or as the world tells it."""

@@ -73,7 +73,12 @@ class Outside(NamedTuple):
 
 def makers(family: Any) -> tuple[Any, ...]:
     """Return what makes the calls out of XLA of a family: its engine, and what draws its observations."""
-    return family.outside, None if family.scenery is None else family.scenery.outside
+    return outside(family.simulator), None if family.scenery is None else outside(family.scenery.painter)
+
+
+def outside(maker: Any) -> Any:
+    """Return an engine or a painter if it runs outside XLA, else None."""
+    return maker if hasattr(maker, "targets") else None
 
 
 def forgetful(env: Any) -> str:

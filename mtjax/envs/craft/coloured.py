@@ -173,11 +173,8 @@ class ColouredMaze(Pictured, DrawnTasks):
         rgb = jnp.asarray(_PAINTS, jnp.float32)[numbers_of(task, self.num_colours).ravel()]
         rgba = jnp.concatenate([rgb, jnp.ones((len(rgb), 1))], axis=1)
         colours = jnp.concatenate([rgba, jnp.array([_AIM, _SKIN])])
-        return super().visible(task, state)._replace(fields={"geom_rgba": colours})
-
-    def marks(self, task: Task, state: Walk) -> dict[str, Mark]:
-        """Return where the walker is."""
-        return {"walker": Mark(jnp.append(state.place, 0.3))}
+        walker = Mark(jnp.append(state.place, 0.3))
+        return Visible(jnp.zeros(0), {"walker": walker}, fields={"geom_rgba": colours})
 
 
 def numbers_of(task: Task, colours: int) -> Array:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import mujoco
 
 from mtjax.envs.dm_control.rewards import tolerance
-from mtjax.envs.domain import Domain
+from mtjax.envs.domain import Domain, start_apart
 from mtjax.envs.engines.base import World
 from mtjax.envs.looks import Look
 from mtjax.envs.parameters import DAMPING, FRICTION, GEAR, GRAVITY, MASS, Parameter, body_mass, positive
@@ -94,7 +94,7 @@ class BallInCup(Domain):
     def start(self, task: Task, key: Key) -> tuple[Array, Array]:
         low, high = jnp.array([_START_LOW, _START_HIGH]).T
         draw = lambda key: jnp.concatenate([jnp.zeros(2), jax.random.uniform(key, (2,), minval=low, maxval=high)])
-        return self.start_apart(task, key, draw), jnp.zeros(self.models[0].nv)
+        return start_apart(self, task, key, draw), jnp.zeros(self.models[0].nv)
 
     def observe(self, task: Task, world: World) -> Array:
         return jnp.concatenate([world.qpos, world.qvel])

@@ -10,11 +10,12 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from mtjax.envs.domain import Domain, start_joints
+from mtjax.envs.domain import Domain, start_apart, start_joints
 from mtjax.envs.engines.base import World
 from mtjax.envs.looks import TARGET, Look
 from mtjax.envs.parameters import DAMPING, FRICTION, GEAR, MASS, Parameter, positive
 from mtjax.envs.pixels import Mark
+from mtjax.envs.planar import planar
 from mtjax.types import Array, Key, Task, Transition
 
 _SPIN_VELOCITY = 15.0  # [rad/s]
@@ -62,14 +63,14 @@ _LOOK = Look((0, -1, 0.8), 63.435, diffuse=0.6, sun=True)
 def _start(finger: Domain, task: Task, key: Key) -> tuple[Array, Array]:
     """Draw positions and velocities of the three joints at which nothing touches."""
     model = finger.models[0]
-    return finger.start_apart(task, key, lambda key: start_joints(model, key)), jnp.zeros(model.nv)
+    return start_apart(finger, task, key, lambda key: start_joints(model, key)), jnp.zeros(model.nv)
 
 
 def _feel(finger: Domain, task: Task, world: World) -> Array:
     """Return what all tasks observe (9,): joints, the spinner's tip, their velocities and touch."""
     model = finger.models[0]
     point = finger.leaf(task, "site_pos")[model.site("tip").id]
-    tip = finger.planar(task, world).offset(model.body("spinner").id, point)
+    tip = planar(finger, task, world).offset(model.body("spinner").id, point)
     return jnp.concatenate([world.qpos[:2], tip, world.qvel, jnp.log1p(world.sensors)])
 
 

@@ -204,7 +204,7 @@ class Hosted(Family):
         count, shapes = math.prod(axes), {"i": ((), jnp.int32), "f": ((), jnp.float32), "o": (seen.shape, seen.dtype)}
         results = [jax.ShapeDtypeStruct((count, *shapes[kind][0]), shapes[kind][1]) for kind in kinds]
         flat = [x.reshape(count, *x.shape[3:]) for x in values]
-        found = host.call_once(self.outside.provide(act), results, *flat)
+        found = host.call_once(self.simulator.provide(act), results, *flat)
         return [x.reshape(*axes, *x.shape[1:]) for x in found]
 
     # A single world.
@@ -226,7 +226,7 @@ class Hosted(Family):
     # Calls of programs.
 
     @cached_property
-    def outside(self) -> "Calls":
+    def simulator(self) -> "Calls":  # type: ignore[override]
         """Return the calls out of XLA."""
         return Calls(self)
 
@@ -239,12 +239,12 @@ class Hosted(Family):
 
     def filmed(self) -> AbstractContextManager[None]:
         """Return a context in which pictures of all worlds are kept that begin in it."""
-        return self.outside.worlds.filmed()
+        return self.simulator.worlds.filmed()
 
     def pictures(self, states: HostedState, width: int, height: int) -> np.ndarray:
         """Return pictures (H, height, width, 3) of a world in its states, leaves (H, ...), that were filmed."""
         number, place = int(states.number[0]), int(states.place[0])
-        found = self.outside.worlds.pictures(number, np.asarray(states.clock), place)
+        found = self.simulator.worlds.pictures(number, np.asarray(states.clock), place)
         return np.stack([np.asarray(Image.open(io.BytesIO(each)).resize((width, height))) for each in found])
 
 

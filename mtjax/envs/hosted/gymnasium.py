@@ -141,9 +141,9 @@ class Gymnasium(Hosted):
     @property
     def idle(self) -> "Idle":
         """Return the environments of all equal families that are in no set."""
-        found = _idle.setdefault(self.outside.digest, Idle(self))
+        found = _idle.setdefault(self.simulator.digest, Idle(self))
         if found.family.registered.entry_point is not self.registered.entry_point:  # as of a cell that ran again
-            found = _idle[self.outside.digest] = Idle(self)
+            found = _idle[self.simulator.digest] = Idle(self)
         return found
 
     def pool(self, count: int, filmed: bool) -> "Separate":

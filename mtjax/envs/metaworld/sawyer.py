@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mtjax.envs.domain import Domain, stack_differing
+from mtjax.envs.compiled import compile_model, stack_differing
+from mtjax.envs.domain import Domain
 from mtjax.envs.engines.base import World, choose_engine
 from mtjax.envs.metaworld import scene
 from mtjax.envs.metaworld.at import At
@@ -167,7 +168,7 @@ class Sawyer(Domain):
     @cached_property
     def starts_of_goals(self) -> tuple[Start, ...]:
         """Return how episodes begin, for every goal."""
-        settled = Host(self._compile({})).settle(self.hand_start)
+        settled = Host(compile_model(self, {})).settle(self.hand_start)
         with ThreadPoolExecutor() as pool:
             return tuple(pool.map(partial(self.begin, settled, settled.content()), self.vectors()))
 
