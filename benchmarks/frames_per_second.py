@@ -92,7 +92,7 @@ def drawing(env: Pictured, arguments: argparse.Namespace) -> tuple[Callable[[], 
     @jax.jit
     def draw(states):
         def again(states, _):
-            picture = jax.vmap(env.draw)(task, states)
+            picture = jax.vmap(env.look_at)(task, states)["pixels"]
             nudge = 1e-6 * picture[:, 0, 0, 0]  # so that no picture is drawn once for all
             move = lambda x: x + nudge.reshape(-1, *[1] * (x.ndim - 1)) if jnp.issubdtype(x.dtype, jnp.floating) else x
             return jax.tree.map(move, states), picture[:, 0, 0]

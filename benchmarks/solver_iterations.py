@@ -26,6 +26,7 @@ from mtjax.envs import ENVS, Domain
 from mtjax.envs.engines.base import Engine, World
 from mtjax.envs.engines.c import MujocoC
 from mtjax.envs.engines.mjx import Mjx
+from mtjax.envs.physics import mjx_engine
 from mtjax.types import Task
 
 SETTINGS = ("1/2", "1/4", "2/4", "2/8", "3/6", "4/8", "6/12", "10/20")
@@ -87,7 +88,7 @@ def build(env: Domain, kind: str, setting: str) -> Engine:
     """Return the engine ``kind`` of a family, with "iterations/line-search iterations" of its solver."""
     if kind == "c":
         return MujocoC(env.models, env.num_substeps)
-    base = copy.copy(env.mjx.base)
+    base = copy.copy(mjx_engine(env).base)
     base.opt.iterations, base.opt.ls_iterations = map(int, setting.split("/"))
     if kind == "mjx":
         return Mjx(base, env.num_substeps)

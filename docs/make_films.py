@@ -20,6 +20,7 @@ from PIL import Image
 
 import mtjax
 from mtjax.envs import name_of
+from mtjax.envs.mixtures import apart
 from mtjax.envs.pixels import Pictured
 from mtjax.learning.evaluation import record
 from mtjax.report import render
@@ -56,7 +57,7 @@ def play(policy: Policy) -> Iterator[tuple[Any, list[Image.Image]]]:
     """Return every family of a trained policy, and the frames of its film."""
     env: Any = policy.env
     played = record(env, policy.agent, policy.state, env.tasks("train"), jnp.int32(0))
-    for part, states in zip(env.parts, env.apart(played.states), strict=True):
+    for part, states in zip(env.parts, apart(played.states), strict=True):
         family, places = part.family, part.places["train"]
         shown = few(len(places))
         rows = [env.own_row(int(played.rows[place])) for place in places[shown]]

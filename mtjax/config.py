@@ -430,8 +430,9 @@ def _device_preset() -> str:
 def own_files(config: RunConfig) -> tuple[str, ...]:
     """Return the files of --import, and those with the user's own classes that a configuration uses."""
     parts = [config.learner, *(getattr(config.learner, kind) for kind in kinds_of(config.learner))]
-    of_families = [module for part in config.family.parts for module in part.family.modules]
-    modules = dict.fromkeys([*of_families, *(type(each).__module__ for each in parts)])
+    families = [part.family for part in config.family.parts]
+    made = [type(each).__module__ for each in (*families, *parts)]
+    modules = dict.fromkeys([*made, *(module for family in families for module in family.built_by)])
     own = [sys.modules.get(name) for name in modules if name.split(".")[0] != "mtjax"]
     files = [*(getattr(module, "__file__", None) for module in own), preset_of(config.agent).home]
     return tuple(dict.fromkeys([*config.imports, *(str(Path(file).resolve()) for file in files if file)]))

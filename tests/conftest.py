@@ -18,6 +18,7 @@ import probes
 import pytest
 from flax.core import Scope, meta
 from needs import count_skips, require, skip_without_packages
+from probes import set_physics
 from tyro import _docstrings
 
 import mtjax.train
@@ -176,7 +177,7 @@ class Programs(NamedTuple):
 
 @lru_cache
 def compiled(env) -> Programs:
-    put = jax.vmap(lambda task, qpos, qvel: env.set_physics(task, None, qpos, qvel))
+    put = jax.vmap(lambda task, qpos, qvel: set_physics(env, task, None, qpos, qvel))
     return Programs(jax.jit(jax.vmap(env.reset)), jax.jit(put), jax.jit(jax.vmap(env.step)))
 
 

@@ -406,3 +406,9 @@ def adapted_gain(gain, params, before, after, rate, first_order: bool = False):
     """What tasks gain () on average by ``after`` (T, ...), once each has adapted to ``before`` (T, K, ...)."""
     adapt_one = partial(adapt, gain, params, rate=rate, first_order=first_order)
     return jnp.mean(jax.vmap(lambda before, after: gain(adapt_one(before), after))(before, after))
+
+
+def set_physics(env, task, state, qpos, qvel):
+    """Return the state of a domain with the given positions (nq,) and velocities (nv,)."""
+    kept = () if state is None else (state.extra, state.mocap)
+    return env.simulator.forward(task, jnp.float32(qpos), jnp.float32(qvel), *kept)

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from probes import set_physics
 
 from mtjax.envs.dm_control.ball_in_cup import BallInCup
 from mtjax.types import InputError
@@ -63,5 +64,5 @@ def test_starts_fill_the_box_where_nothing_touches(env):
 def test_the_ball_is_caught_while_all_of_it_is_in_the_cup(env, cup, ball, caught):
     """The box goes with the cup and leaves the ball's middle 2.5 cm to each side."""
     task = jax.tree.map(lambda x: x[0], env.tasks())
-    world = env.set_physics(task, None, np.array([*cup, *ball]), np.zeros(4))
+    world = set_physics(env, task, None, np.array([*cup, *ball]), np.zeros(4))
     assert env.reward(task, world, jnp.zeros(2)) == caught

@@ -11,6 +11,7 @@ from mtjax import envs
 from mtjax.envs.dm_control import attitude, dog
 from mtjax.envs.engines.c import MujocoC
 from mtjax.envs.engines.mjx import Mjx
+from mtjax.envs.physics import mjx_engine
 from mtjax.types import InputError
 
 
@@ -86,7 +87,7 @@ def test_a_dog_asks_for_dm_control_where_it_is_missing(monkeypatch):
 def test_a_dog_in_mjx_steps_as_the_same_dog_does_in_c():
     """One that touches nothing but the floor: dropped, so that its paws come to bear it."""
     env = envs.make("dog-walk", engine="mjx", solver_iterations=30)
-    base, task = env.mjx.base, jax.tree.map(lambda x: x[0], env.tasks())
+    base, task = mjx_engine(env).base, jax.tree.map(lambda x: x[0], env.tasks())
     exact, mjx = MujocoC([base], env.num_substeps), Mjx(base, env.num_substeps)
     keys, steps = jax.random.split(jax.random.key(0), 4), 12
     qpos, qvel = jax.vmap(env.start, (None, 0))(task, keys)

@@ -9,6 +9,8 @@ import pytest
 from probes import QUICK
 
 import mtjax
+from mtjax.envs.pixels import scene_model
+from mtjax.report import render
 from mtjax.types import InputError
 
 STEPS = ((0, -1), (0, 1), (-1, 0), (1, 0))
@@ -117,11 +119,12 @@ def test_tasks_are_near_their_classes_and_more_keep_the_first():
 @pytest.mark.slow
 def test_pictures_show_the_tasks_own_colours():
     env = mtjax.make("coloured-maze", cells=4, num_tasks=2, pixels=32)
-    draw = jax.jit(env.draw, compiler_options=QUICK)
+    draw = jax.jit(lambda task, state: env.look_at(task, state)["pixels"], compiler_options=QUICK)
     state = env.reset(pick(env, 0), jax.random.key(0)).state
     one, other = (np.int32(draw(pick(env, row), state)) for row in (0, 1))
     assert np.any(one != other, axis=-1).mean() > 0.3
-    model = env.scene_model(1)
+    model = scene_model(env, 1)
+    render._arrange(model, env.visible(pick(env, 1), state))
     colours = np.unique(model.geom_rgba[:16], axis=0)
     assert len(colours) == len(np.unique(np.floor(8 * env.table.tasks.goal["squares"][1])))
 

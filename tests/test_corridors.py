@@ -1,6 +1,6 @@
 """Mazes of corridors: layouts from numbers, walls that hold, pictures whose depths are worked by hand, and rewards."""
 
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ from probes import QUICK
 import mtjax
 from mtjax.envs.corridors.layouts import find_ways, make_layout
 from mtjax.envs.corridors.maze import CorridorMaze, WalkerState, metres_left
+from mtjax.envs.pixels import scene_model
 from mtjax.report import render
 from mtjax.types import InputError
 
@@ -263,7 +264,7 @@ def seeing(**settings):
 
 @lru_cache
 def drawer(env):
-    return jax.jit(env.draw, compiler_options=QUICK)
+    return jax.jit(lambda task, state: env.look_at(task, state)["pixels"], compiler_options=QUICK)
 
 
 def picture(task, state, env=None):
@@ -286,8 +287,9 @@ def test_depths_of_columns_are_the_distances_to_walls():
     task = task_of(env, walls=OPEN, balls=FAR)
 
     def depths(task, state):
-        poses = env.see(task, state)
-        return env.artist._to_walls(env.artist._view(lambda name: env.scene_leaf(task, name), poses).grid)
+        painter, visible = env.scenery.painter, env.visible(task, state)
+        leaf = partial(env.scenery.field, task, visible)
+        return painter._to_walls(painter._view(leaf, env.scenery.poses(task, visible)).grid)
 
     depths = jax.jit(depths)
     found = depths(task, at((1.5, 2.5)))
@@ -336,7 +338,7 @@ def test_the_grid_s_caster_draws_what_the_general_one_draws():
     pictures = []
     for env in (grid, general):
         tasks = jax.tree.map(lambda x: jnp.repeat(x, 4, axis=0), env.tasks())
-        pictures.append(np.int32(jax.jit(jax.vmap(env.draw), compiler_options=QUICK)(tasks, states)))
+        pictures.append(np.int32(jax.jit(jax.vmap(env.look_at), compiler_options=QUICK)(tasks, states)["pixels"]))
     apart = np.abs(pictures[0] - pictures[1]).max(axis=-1) > 12
     assert np.mean(apart) < 0.04 and np.mean(np.any(pictures[0] != pictures[0][:1], axis=-1)) > 0.5
     turned = np.abs(pictures[0][:, :, ::-1] - pictures[1]).max(axis=-1) > 12
@@ -355,9 +357,8 @@ def test_films_look_through_the_walker_s_eye_at_the_walls_of_the_task():
     """Camera and balls of MuJoCo's scene are where an episode has them; of all walls those of the task stand up."""
     env, row = CorridorMaze(vary={"layout": "0:3:4"}), 2
     task, state = jax.tree.map(lambda x: x[row], env.tasks()), at((1.25, 2.5), 0.7)
-    model = env.scene_model(row)
-    render._place(model, env.marks(task, state))
-    render._look(model, env.eye(task, state))
+    model = scene_model(env, row)
+    render._arrange(model, env.visible(task, state))
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     np.testing.assert_allclose(data.cam_xpos[0], [1.25, 2.5, 0.5])

@@ -25,6 +25,7 @@ from mtjax.envs.engines import host, shared
 from mtjax.envs.engines.base import World
 from mtjax.envs.engines.c import MujocoC
 from mtjax.envs.engines.mjx import Mjx
+from mtjax.envs.physics import mjx_engine
 from mtjax.types import InputError, Task
 
 COUNT = 64  # worlds
@@ -193,7 +194,7 @@ def test_warp_steps_as_c_does(name):
     """Under a map of a map, which picks every world's own model."""
     from mtjax.envs.engines.warp import Warp
 
-    play, mjx = played(name), family(name, engine="mjx", solver_iterations=50).mjx
+    play, mjx = played(name), mjx_engine(family(name, engine="mjx", solver_iterations=50))
     engine = Warp(mjx.base, mjx.num_substeps)
     nested = jax.tree.map(lambda x: jnp.reshape(x, (4, COUNT // 4, *x.shape[1:])), play[:3])
     new = quick(jax.vmap(jax.vmap(engine.step)), *nested)(*nested)
@@ -250,7 +251,7 @@ def test_c_results_do_not_depend_on_what_the_batch_did_before():
 
 def test_extra_is_carried_along():
     """What a domain remembers passes through every method of an engine untouched, or is None."""
-    env, mjx = family("finger-spin", engine="c"), family("finger-spin", engine="mjx").mjx
+    env, mjx = family("finger-spin", engine="c"), mjx_engine(family("finger-spin", engine="mjx"))
     task = jax.tree.map(lambda x: x[0], env.tasks())
     qpos, qvel, extra = jnp.zeros(3), jnp.zeros(3), {"goal": jnp.arange(2.0), "key": jax.random.key(0)}
     for engine in (env.simulator, mjx):
@@ -324,7 +325,7 @@ def test_warp_compiles_all_kernels_of_a_step_before_it(monkeypatch, tmp_path):
     from mtjax.envs.engines.kernels import compile_kernels, note_kernels
     from mtjax.envs.engines.warp import Warp
 
-    engine = Warp(envs.make("hopper-stand", engine="mjx").mjx.base, 1)
+    engine = Warp(mjx_engine(envs.make("hopper-stand", engine="mjx")).base, 1)
     engine.provide(3, ())
     monkeypatch.setattr(warp.config, "kernel_cache_dir", str(tmp_path))
     before, loaded, load = (warp.Module.load, warp.capture_while), [], warp.Module.load
@@ -353,7 +354,7 @@ def test_warp_compiles_kernels_while_programs_are_traced(monkeypatch):
     """To note which kernels there are keeps others from making a place, but not from using one."""
     from mtjax.envs.engines import warp as engines
 
-    engine, compiled = engines.Warp(envs.make("hopper-stand", engine="mjx").mjx.base, 1), []
+    engine, compiled = engines.Warp(mjx_engine(envs.make("hopper-stand", engine="mjx")).base, 1), []
     engine.provide(3, ())
 
     def can_provide(count):
@@ -375,7 +376,7 @@ def test_warp_refuses_tasks_that_differ_in_the_size_of_sites():
     from mtjax.envs.engines.warp import Warp
 
     env = envs.make("finger-spin-vary-touch-size", engine="mjx")
-    engine = Warp(env.mjx.base, env.num_substeps)
+    engine = Warp(mjx_engine(env).base, env.num_substeps)
     task = jax.tree.map(lambda x: x[0], env.tasks())
     world = World(*(jnp.zeros(3),) * 3, jnp.zeros(13))
     with pytest.raises(InputError, match="cannot vary site_size between tasks; use --engine=mjx"):

@@ -20,6 +20,7 @@ from mtjax import agents, standalone
 from mtjax.agents import for_action
 from mtjax.agents.networks import Params
 from mtjax.agents.state import AgentState
+from mtjax.envs.contexts import ranges
 from mtjax.saved.export import require_file
 from mtjax.saved.operations import steps_of
 from mtjax.saved.policy import Policy
@@ -105,7 +106,7 @@ def test_a_file_knows_every_listed_task_by_its_parameters(name):
     """By the number and by the context that the family gives it; an unlisted one has no number of theirs."""
     env = mtjax.make(name)
     listed = env.tasks("all")
-    values = np.stack([np.asarray(listed.params[name]) for name, _, _ in env.ranges], axis=1)
+    values = np.stack([np.asarray(listed.params[name]) for name, _, _ in ranges(env)], axis=1)
     policy = policy_of(tiny("sac"), env)
     found = jax.jit(jax.vmap(policy.task_of))(values)
     np.testing.assert_array_equal(found.id, listed.id)
@@ -186,7 +187,7 @@ def assert_onnx_acts(policy, file, obs, sizes, expected):
         (found,) = session.run(["action"], {name: given[name] for name in known})
         np.testing.assert_allclose(found, action, atol=2e-5)
     meta = session.get_modelmeta()
-    assert f'"parameters": ["{policy.env.ranges[0][0]}"]' in meta.custom_metadata_map["mtjax"]
+    assert f'"parameters": ["{ranges(policy.env)[0][0]}"]' in meta.custom_metadata_map["mtjax"]
 
 
 def test_angles_of_goals_are_points_on_the_circle(tmp_path):

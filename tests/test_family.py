@@ -10,7 +10,7 @@ from needs import needs
 
 from mtjax import envs
 from mtjax.envs import parameters
-from mtjax.envs.domain import stack_differing
+from mtjax.envs.compiled import stack_differing
 from mtjax.envs.engines.base import mjx_module
 from mtjax.tasks import episode_task
 from mtjax.types import SPLITS, InputError

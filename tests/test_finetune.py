@@ -15,6 +15,7 @@ from mtjax.agents import agent
 from mtjax.agents.networks import Params
 from mtjax.command import run_config
 from mtjax.envs import ENVS
+from mtjax.envs.contexts import contexts, ranges
 from mtjax.envs.family import Family
 from mtjax.envs.parameters import Parameter
 from mtjax.saved.config_json import from_json, to_flags
@@ -173,7 +174,7 @@ def test_a_run_records_where_it_comes_from(base, tuned):
     assert (record["start"], record["agent"], record["learner"]["tune"]) == (str(base), "multi-head", "heads")
     begun = from_json(base / "config.json").learner
     assert program.learner == dataclasses.replace(begun, tune="heads", actor_lr=0.01)
-    assert program.family.ranges == (("goal", -1.0, 1.0),)
+    assert ranges(program.family) == (("goal", -1.0, 1.0),)
     np.testing.assert_allclose(program.family.tasks().context, [[0.9], [-0.8]], rtol=1e-6)
 
 
@@ -284,7 +285,7 @@ def test_contexts_are_written_as_the_others():
     """In its ranges and its order; what does not vary here, at its value; what is unknown here, at 0."""
     old = mtjax.make("aim", {"drift": "0:1:2", "goal": "-1:1:3"})
     env = mtjax.make("aim", {"goal": "1,3"}).scaled_as(old)
-    assert [name for name, _, _ in old.ranges] == ["goal", "drift"]
+    assert [name for name, _, _ in ranges(old)] == ["goal", "drift"]
     np.testing.assert_allclose(env.tasks().context, [[1, -0.5], [3, -0.5]], rtol=1e-6)
     assert env.spec.context_size == old.spec.context_size == 2
     set_apart = mtjax.make("aim", {"goal": "1,3", "drift": "1"}).scaled_as(old)
@@ -306,7 +307,7 @@ def test_a_family_written_as_itself_is_the_same():
     """To the bit; and once more after a record was read back."""
     env = mtjax.make("finger-spin-vary-size")
     again = env.scaled_as(env)
-    np.testing.assert_array_equal(env._context(), again._context())
+    np.testing.assert_array_equal(contexts(env), contexts(again))
     assert mtjax.make("finger-spin-vary-size", **json.loads(json.dumps(dataclasses.asdict(again)))) == again
 
 

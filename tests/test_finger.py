@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 from needs import require
+from probes import set_physics
 
 from mtjax import envs
 from mtjax.envs.dm_control.finger import FingerSpin, FingerTurn, FingerTurnTarget
@@ -133,7 +134,7 @@ def test_observation_and_reward_are_those_of_dm_control(engine, suite_finger, wo
 def test_reward_counts_a_hinge_of_exactly_the_threshold(sizes):
     """The threshold belongs to the rewarded side, and only one direction of turning counts."""
     task = jax.tree.map(lambda x: x[0], sizes.tasks())
-    world = sizes.set_physics(task, None, np.zeros(3), np.zeros(3))
+    world = set_physics(sizes, task, None, np.zeros(3), np.zeros(3))
     speeds = jnp.array([-15.0, -14.99, 15.0, -40.0])
     rewards = [float(sizes.reward(task, world._replace(qvel=world.qvel.at[2].set(s)), jnp.zeros(2))) for s in speeds]
     assert rewards == [1, 0, 0, 1]

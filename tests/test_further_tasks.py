@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from probes import slow_but
+from probes import set_physics, slow_but
 
 from mtjax import envs
 
@@ -16,7 +16,7 @@ def rewards(name, qvel, qpos=None):
     task, start = jax.tree.map(lambda x: x[0], env.tasks()), np.asarray(env.models[0].qpos0)
     qvel = np.float32(qvel)
     qpos = np.broadcast_to(start, (len(qvel), len(start))) if qpos is None else np.float32(qpos)
-    score = lambda p, v: env.reward(task, env.set_physics(task, None, p, v), jnp.zeros(env.action_size))
+    score = lambda p, v: env.reward(task, set_physics(env, task, None, p, v), jnp.zeros(env.action_size))
     return np.asarray(jax.jit(jax.vmap(score))(qpos, qvel))
 
 

@@ -40,6 +40,7 @@ from mtjax.envs.engines.c import MujocoC
 from mtjax.envs.engines.mjx import Mjx
 from mtjax.envs.merged_simulator import United
 from mtjax.envs.mixtures import States
+from mtjax.envs.physics import mjx_engine
 from mtjax.envs.probes import tasks_of
 from mtjax.envs.shared_simulator import Joined
 from mtjax.learning import loop, rollout
@@ -490,7 +491,7 @@ def test_engines_step_as_mujoco_does(name, engine):
 
     env = mtjax.make(name, vary=DOMAINS[name], split="none", engine="mjx", solver_iterations=50)
     tasks, (qpos, qvel, warmstart, ctrl, new_qpos, new_qvel) = played(env)
-    simulator = env.simulator if engine == "mjx" else Warp(env.mjx.base, env.num_substeps)
+    simulator = env.simulator if engine == "mjx" else Warp(mjx_engine(env).base, env.num_substeps)
     assert isinstance(simulator, Mjx | Warp)
     sensors = np.zeros((len(qpos), env.models[0].nsensordata), np.float32)
     world = World(qpos, qvel, warmstart, sensors if sensors.size else None)
@@ -522,7 +523,7 @@ def test_warp_draws_what_the_caster_draws(name):
 
     def draw(env):
         def again(states, _):
-            pictures = jax.vmap(jax.vmap(env.draw, (None, 0)), (0, None))(env.tasks(), states)
+            pictures = jax.vmap(jax.vmap(env.look_at, (None, 0)), (0, None))(env.tasks(), states)["pixels"]
             started = jax.vmap(env.reset)(env.tasks(), jax.random.split(jax.random.key(0), 2)).obs["pixels"]
             return states._replace(qpos=states.qpos + 1e-3), (pictures, started)
 

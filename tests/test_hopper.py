@@ -4,27 +4,24 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import pytest
 
 from mtjax.envs.dm_control.hopper import HopperHop, HopperStand
 from mtjax.envs.planar import Planar
 
 
-class Placed:
-    """Puts the torso at a height over the foot and moves everything at a speed, as ``world.extra`` says."""
+@pytest.fixture
+def placed(monkeypatch):
+    """Torsos are as high over the foot, and models as fast, as ``World.extra`` says."""
 
-    def planar(self, task, world):
+    def planar(domain, task, world):
         height, speed = world.extra
-        torso = self.models[0].body("torso").id
-        centre = jnp.full((self.models[0].nbody, 2), 3.0).at[torso, 1].add(height)
+        torso = domain.models[0].body("torso").id
+        centre = jnp.full((domain.models[0].nbody, 2), 3.0).at[torso, 1].add(height)
         return Planar(jnp.zeros(len(centre)), centre, centre, jnp.full_like(centre, speed))
 
-
-class Stand(Placed, HopperStand):
-    pass
-
-
-class Hop(Placed, HopperHop):
-    pass
+    for module in ("mtjax.envs.planar", "mtjax.envs.dm_control.hopper"):
+        monkeypatch.setattr(f"{module}.planar", planar)
 
 
 def rewards(env, heights, speeds, action=(0.0,) * 4):
@@ -36,14 +33,16 @@ def rewards(env, heights, speeds, action=(0.0,) * 4):
     return jax.vmap(at)(jnp.array(heights, jnp.float32), jnp.array(speeds, jnp.float32))
 
 
+@pytest.mark.usefixtures("placed")
 def test_standing_pays_for_height_less_effort():
-    np.testing.assert_allclose(rewards(Stand(), [0.5, 0.7, 1.9, 2.1], [0] * 4), [0, 1, 1, 0])
-    np.testing.assert_allclose(rewards(Stand(), [0.7], [0], (1, 0.5, 0, -1)), [1 - 0.2 * 2.25 / 4], rtol=1e-6)
+    np.testing.assert_allclose(rewards(HopperStand(), [0.5, 0.7, 1.9, 2.1], [0] * 4), [0, 1, 1, 0])
+    np.testing.assert_allclose(rewards(HopperStand(), [0.7], [0], (1, 0.5, 0, -1)), [1 - 0.2 * 2.25 / 4], rtol=1e-6)
 
 
+@pytest.mark.usefixtures("placed")
 def test_hopping_pays_for_height_times_speed():
-    np.testing.assert_allclose(rewards(Hop(), [0.5, 0.7, 0.7, 0.7, 0.7], [2, -1, 0, 1, 3]), [0, 0, 0, 0.5, 1])
-    fast = Hop(vary={"speed": [4]})
+    np.testing.assert_allclose(rewards(HopperHop(), [0.5, 0.7, 0.7, 0.7, 0.7], [2, -1, 0, 1, 3]), [0, 0, 0, 0.5, 1])
+    fast = HopperHop(vary={"speed": [4]})
     np.testing.assert_allclose(rewards(fast, [0.7, 0.7], [1, 4]), [0.25, 1])
 
 

@@ -125,14 +125,18 @@ def test_folders_import_in_no_circle():
     assert len(list(TopologicalSorter(graph).static_order())) == len(graph)
 
 
-@pytest.mark.parametrize("group", ["agents", "experience", "types"])
+# Classes of environments that have more, and are to become smaller.
+LARGE = {"Hosted": 32, "Sawyer": 29, "Warp": 27, "Sketched": 22}
+
+
+@pytest.mark.parametrize("group", ["agents", "envs", "experience", "types"])
 def test_a_class_fits_in_the_head(group):
-    """With properties it has at most 15 methods of its own."""
+    """With properties it has at most 15 methods of its own. Those that are listed as larger have no more than that."""
     of_group = [tree for module, tree in trees().items() if f"{module}.".startswith(f"mtjax.{group}.")]
     classes = [node for tree in of_group for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
     methods = {cls.name: sum(isinstance(node, ast.FunctionDef) for node in cls.body) for cls in classes}
     assert methods
-    assert not {name: count for name, count in methods.items() if count > 15}
+    assert {name: count for name, count in methods.items() if count > 15} == (LARGE if group == "envs" else {})
 
 
 Class = tuple[str, str]  # a module and a class in it

@@ -223,7 +223,7 @@ SEEN = TwoGoalMaze(vary={"goal-box": "0,1"}, split="none", pixels=64)
 
 @pytest.fixture(scope="module")
 def draw():
-    return jax.jit(SEEN.draw, compiler_options=QUICK)
+    return jax.jit(lambda task, state: SEEN.look_at(task, state)["pixels"], compiler_options=QUICK)
 
 
 def middle(mask):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from needs import needs
 
-from mtjax.envs.domain import stack_differing
+from mtjax.envs.compiled import stack_differing
 from mtjax.envs.engines.base import World, at_rest
 from mtjax.envs.engines.c import MujocoC
 from mtjax.envs.engines.mjx import Mjx

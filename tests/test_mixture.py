@@ -27,6 +27,7 @@ from mtjax.agents.state import AgentState
 from mtjax.agents.view import init_inputs
 from mtjax.command import run_config
 from mtjax.envs import ENVS, Family, Mixture, make, mixture
+from mtjax.envs.mixtures import apart
 from mtjax.envs.parameters import Parameter
 from mtjax.experience.replay import Replay
 from mtjax.learning import rollout
@@ -284,7 +285,7 @@ def test_every_family_steps_as_it_does_alone(split):
     keys = keys_of(tasks)
     actions = np.asarray(jax.random.uniform(jax.random.key(1), (5, *keys.shape, env.spec.action_size), minval=-1.0))
     start, seen, states = steps_of(env, tasks, keys, actions)
-    for part, state in zip(env.parts, env.apart(states), strict=True):
+    for part, state in zip(env.parts, apart(states), strict=True):
         size, width, places = part.family.spec.action_size, part.family.spec.obs_size, part.places[split]
         first, alone, end = steps_of(
             part.family, part.family.tasks(split), keys[:, places], actions[:, :, places, :, :size]
@@ -359,7 +360,7 @@ def test_episodes_end_at_their_own_horizons():
 
     played = quick(play, jax.random.key(0))
     assert played.lengths.tolist() == [4, 4, 4, 7] + [4] * 6
-    aim, wide = BOTH.apart(played.states)
+    aim, wide = apart(played.states)
     assert aim.obs.shape == (9, 7, 2) and wide.obs.shape == (1, 7, 3)
 
 
@@ -717,7 +718,8 @@ def test_tasks_are_numbered_without_building_them(name):
     env = make(name)
     for split in SPLITS:
         tasks, values = env.tasks(split), env.task_values(split)
-        told = tasks.params[env.varied[0]] if isinstance(env, Family) and len(env.varied) == 1 else tasks.id
+        varied = env.varied if isinstance(env, Family) else ()
+        told = tasks.params[varied[0]] if len(varied) == 1 else tasks.id
         np.testing.assert_array_equal(env.numbers(split), tasks.id)
         np.testing.assert_array_equal(values, told)
         assert values.dtype == told.dtype and env.counts[split] == len(tasks.id)

@@ -21,6 +21,7 @@ from mtjax.envs.painters.caster import Caster
 from mtjax.envs.painters.poses import locate
 from mtjax.envs.painters.scene import Scene, field, observed
 from mtjax.envs.painters.shapes import SHAPES as KINDS
+from mtjax.envs.pixels import scene_model
 from mtjax.report import render
 from mtjax.types import InputError
 
@@ -99,7 +100,7 @@ def states_of(name):
         env, keys = mtjax.make(name), jax.random.split(jax.random.key(3), 2)
         return jax.vmap(env.reset, (None, 0))(jax.tree.map(lambda x: x[0], env.tasks()), keys).state
     env = family(name)
-    model = env.scene.model
+    model = env.scenery.scene.model
     random = np.random.default_rng(0)
     moved = random.uniform(-0.4, 0.4, (1, model.nq))
     low, high = np.full((2, model.nq), [[-9.0], [9.0]])
@@ -118,7 +119,7 @@ def states_of(name):
 
 @lru_cache
 def drawn(name):
-    return np.asarray(jax.jit(jax.vmap(family(name).draw, (None, 0)))(task_of(name), states_of(name)))
+    return np.asarray(jax.jit(jax.vmap(family(name).look_at, (None, 0)))(task_of(name), states_of(name))["pixels"])
 
 
 @pytest.mark.parametrize(
@@ -144,7 +145,7 @@ def test_cameras_and_lights_are_those_of_dm_control(name):
     domain, _, task = title.partition("-")
     suite = require("dm_control.suite")
     theirs = suite.load(domain, task.replace("-", "_"), {"random": 0}).physics
-    model = mtjax.make(name, engine="c").scene_model(0)
+    model = scene_model(mtjax.make(name, engine="c"), 0)
     data = mujoco.MjData(model)
     with theirs.reset_context():
         theirs.data.qpos[7 if theirs.model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE else 0 :] += 0.1
@@ -167,9 +168,10 @@ def test_a_target_s_light_hangs_above_it():
     env = family("swimmer-swimmer6")
     task, states = jax.tree.map(lambda x: x[0], env.tasks()), states_of("swimmer-swimmer6")
     world = jax.tree.map(lambda x: x[0], states)
-    lamp = env.scene.model.light("target").id
-    np.testing.assert_allclose(env.see(task, world).lights[lamp][0], [*world.extra, 1.5])
-    model = env.scene_model(0)
+    lamp = env.scenery.scene.model.light("target").id
+    poses = env.scenery.poses(task, env.visible(task, world))
+    np.testing.assert_allclose(poses.lights[lamp][0], [*world.extra, 1.5])
+    model = scene_model(env, 0)
     render._place(model, env.marks(task, world))
     np.testing.assert_allclose(model.light_pos[lamp], [*world.extra, 1.5])
 
@@ -210,7 +212,7 @@ def test_poses_are_mujocos(name):
     if name == "all-joints":
         model, data = moved_shapes(0)
     else:
-        model = family(name).scene.model
+        model = family(name).scenery.scene.model
         data = mujoco.MjData(model)
         data.qpos[:] = states_of(name).qpos[0]
         mujoco.mj_forward(model, data)
@@ -276,8 +278,8 @@ def test_one_world_among_many_looks_as_it_does_alone():
     task = jax.tree.map(lambda x: x[0], env.tasks())
     qpos = jax.random.uniform(jax.random.key(0), (21, 3), minval=-1.0)
     worlds = World(qpos, jnp.zeros((21, 3)), jnp.zeros((21, 3)), None)
-    together = np.asarray(jax.jit(jax.vmap(env.draw, (None, 0)))(task, worlds))
-    alone = jax.jit(env.draw)
+    together = np.asarray(jax.jit(jax.vmap(env.look_at, (None, 0)))(task, worlds)["pixels"])
+    alone = jax.jit(lambda task, world: env.look_at(task, world)["pixels"])
     for i in (0, 15, 16, 20):
         picture = np.asarray(alone(task, jax.tree.map(lambda x, i=i: x[i], worlds)))
         apart = np.abs(np.int32(together[i]) - picture)  # XLA rounds otherwise where it computes one world alone
@@ -304,9 +306,10 @@ def test_warp_draws_what_the_caster_draws(name):
     varied = {"hue": "0,90", "camera-angle": "-20,20"}
     env = mtjax.make(name, pixels=SIZE, vary=varied, combine="paired", split="none")
     other = dataclasses.replace(env, frames=4)  # unequal, so that it is traced anew
-    other.__dict__["artist"] = WarpPainter(env.scene, SIZE)
+    other.__dict__["scenery"] = dataclasses.replace(env.scenery, painter=WarpPainter(env.scenery.scene, SIZE))
     states = jax.tree.map(lambda x: jnp.stack([x, x[::-1]]), states_of(name))
-    ours, theirs = (np.asarray(jax.jit(jax.vmap(jax.vmap(e.draw, (None, 0))))(e.tasks(), states)) for e in (env, other))
+    draw = lambda env: jax.jit(jax.vmap(jax.vmap(env.look_at, (None, 0))))(env.tasks(), states)["pixels"]
+    ours, theirs = np.asarray(draw(env)), np.asarray(draw(other))
     for i in np.ndindex(2, 2):
         assert similarity(ours[i], theirs[i]) > 0.95
     assert [1, 4] in other.calls.targets().values()  # one batch of all worlds

@@ -13,9 +13,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from probes import set_physics
 
 from mtjax import envs
 from mtjax.envs.engines import base as physics
+from mtjax.envs.physics import mjx_engine
 from mtjax.types import InputError
 
 STEPS = 50
@@ -57,7 +59,7 @@ def begin(env, worlds):
     """The 100 shared states in the nominal task; from C, whose first state is dm_control's, for both engines."""
     tasks = rows(env, [NOMINAL if "size" in env.varied else 0] * 100)
     c = envs.make("finger-spin", engine="c")
-    return tasks, jax.vmap(lambda t, q, v: c.set_physics(t, None, q, v))(rows(c, [0] * 100), worlds.qpos, worlds.qvel)
+    return tasks, jax.vmap(lambda t, q, v: set_physics(c, t, None, q, v))(rows(c, [0] * 100), worlds.qpos, worlds.qvel)
 
 
 def start_suite(environment, qpos, qvel):
@@ -223,7 +225,7 @@ def test_default_iterations_are_near_the_converged_solver(programs):
     that to a tenth of contacts.
     """
     c, mjx = (envs.make(TOUCH, engine=engine) for engine in ENGINES)
-    assert mjx.mjx.base.opt.iterations == mjx.default_iterations
+    assert mjx_engine(mjx).base.opt.iterations == mjx.default_iterations
     tasks, (world, action) = (
         rows(c, [0] * 100),
         contacts_in_play(envs.make("finger-spin", engine="c"), programs, 100)[1:],
@@ -240,7 +242,7 @@ def test_c_agrees_with_itself_under_every_nesting_of_maps(worlds):
     qpos, qvel, action = (x[:24].reshape(2, 3, 4, -1) for x in worlds)
 
     def play(task, qpos, qvel, action):
-        return env.step(task, env.set_physics(task, None, qpos, qvel), action)
+        return env.step(task, set_physics(env, task, None, qpos, qvel), action)
 
     mapped = play
     for task_axis in (None, 0, None):

@@ -91,7 +91,7 @@ def test_looks_change_what_is_seen_and_nothing_of_the_physics():
     assert set(tasks.model) == set(plain.tasks().model)
     assert {"geom_rgba", "cam_pos", "cam_quat", "light_diffuse"} <= set(tasks.scene)
     world = jax.tree.map(jnp.asarray, play(plain, ())[0].state)
-    pictures = np.asarray(jax.jit(jax.vmap(env.draw, (0, None)))(tasks, world))
+    pictures = np.asarray(jax.jit(jax.vmap(env.look_at, (0, None)))(tasks, world)["pixels"])
     assert np.mean(np.any(pictures[0] != pictures[1], axis=-1)) > 0.5
     assert env.varied == tuple(name for name, _ in vary) and tasks.context.shape == (2, 5)
 
@@ -103,7 +103,7 @@ def test_every_look_is_seen(name):
     changed = {"camera-angle": "cam_quat", "sky-hue": "sky", "light": "light_diffuse"}
     assert changed.get(name, "geom_rgba") in seen and not env.tasks().model
     assert ("sky" in seen) == (name == "sky-hue")
-    floor = env.scene.model.geom("ground").id
+    floor = env.scenery.scene.model.geom("ground").id
     if changed.get(name) is None:
         rgba = np.asarray(seen["geom_rgba"])
         moved = np.any(rgba[0] != rgba[1], axis=-1)
@@ -120,7 +120,7 @@ def test_ranges_of_looks_are_drawn_by_episodes_and_split_like_others():
 def test_grey_and_plain_pictures():
     grey = play(pictured(grey=True), ())[0].obs["pixels"]
     assert grey.shape == (SIZE, SIZE, 1) and np.std(grey) > 1
-    assert not pictured(plain=True).scene.tiles and pictured().scene.tiles
+    assert not pictured(plain=True).scenery.scene.tiles and pictured().scenery.scene.tiles
 
 
 def test_painter_warp_has_one_sky(monkeypatch):
@@ -129,12 +129,12 @@ def test_painter_warp_has_one_sky(monkeypatch):
         monkeypatch.setattr(f"mtjax.envs.painters.base.{name}", lambda: True)
     with pytest.raises(InputError, match=r"one sky for all tasks; use painter='caster'"):
         pictured(painter="warp", vary=(("sky-hue", "0,90"),))
-    assert pictured(painter="warp", vary=(("sky-hue", "90"),)).values["sky-hue"][0] == 90
+    assert pictured(painter="warp", vary=(("sky-hue", "90"),)).variation.values["sky-hue"][0] == 90
 
 
 def test_hidden_goals_are_not_drawn():
     for name, seen in (("reacher-easy", True), ("reacher-vary-goal", False), ("finger-turn-vary-target", False)):
-        scene = mtjax.make(name, pixels=SIZE, engine="c").scene
+        scene = mtjax.make(name, pixels=SIZE, engine="c").scenery.scene
         assert (scene.model.geom("target").id in scene.shown) == seen
 
 
@@ -175,8 +175,8 @@ FIRST = {family.__module__: family for family in reversed(SCENES)}.values()  # o
 @pytest.mark.parametrize("family", slow_but(SCENES, *FIRST), ids=lambda f: f.__name__)
 def test_every_family_that_can_be_seen_has_a_scene(family):
     env = family(pixels=SIZE, **({"engine": "c"} if issubclass(family, Domain) else {}))
-    model = env.scene.model
-    assert model.ncam and model.nlight and len(env.scene.shown) > 1
+    model = env.scenery.scene.model
+    assert model.ncam and model.nlight and len(env.scenery.scene.shown) > 1
     task = jax.tree.map(lambda x: x[0], env.table.tasks)
     obs = jax.eval_shape(env.reset, task, jax.eval_shape(jax.random.key, 0)).obs
     assert obs["pixels"].shape == (SIZE, SIZE, 3)

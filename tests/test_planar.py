@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from probes import one_in
+from probes import one_in, set_physics
 
 import mtjax
-from mtjax.envs.planar import is_planar, locate
+from mtjax.envs.planar import forward_velocity, is_planar, locate
 
 FAMILIES = (
     "cheetah-run-vary-foot-position",
@@ -25,7 +25,7 @@ def test_bodies_are_where_mujoco_has_them(name):
     env = mtjax.make(name, engine="c")
     model, random = env.models[0], np.random.default_rng(0)
     assert is_planar(model)
-    for row in {0, env.count - 1}:
+    for row in {0, env.variation.count - 1}:
         task = jax.tree.map(lambda x, row=row: x[row], env.tasks("all"))
         place = jax.jit(lambda qpos, qvel, task=task: locate(model, lambda leaf: env.leaf(task, leaf), qpos, qvel))
         data = mujoco.MjData(env.models[row])
@@ -55,8 +55,8 @@ def test_forward_velocity_is_that_of_the_subtree():
     data.qpos[:], data.qvel[:] = np.linspace(-0.5, 0.5, 9), np.linspace(-3, 4, 9)
     mujoco.mj_forward(env.models[0], data)
     mujoco.mj_subtreeVel(env.models[0], data)
-    world = env.set_physics(task, None, data.qpos, data.qvel)
-    np.testing.assert_allclose(env.forward_velocity(task, world), data.subtree_linvel[1, 0], rtol=1e-5)
+    world = set_physics(env, task, None, data.qpos, data.qvel)
+    np.testing.assert_allclose(forward_velocity(env, task, world), data.subtree_linvel[1, 0], rtol=1e-5)
 
 
 def test_models_that_leave_the_plane_are_told_apart():

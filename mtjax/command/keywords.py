@@ -92,7 +92,7 @@ def _kind(value: Any) -> str:
 
 
 def _names(cls: Any) -> list[str]:
-    return list(getattr(cls, "__dataclass_fields__", ()))
+    return [field.name for field in dataclasses.fields(cls)] if dataclasses.is_dataclass(cls) else []
 
 
 def _require_known(given: Mapping[str, Any], agent: Any, env_name: str, family: Any, by_name: bool) -> None:

@@ -455,7 +455,8 @@ def _make_mixture(own: tuple[tuple[str, Settings], ...], vary: Settings, setting
         chosen[name][parameter] = values
     made = []
     for (name, fixed), family in zip(own, plain, strict=True):
-        mine = {key: value for key, value in settings.items() if key in family.__dataclass_fields__}
+        known = {field.name for field in dataclasses.fields(family)}
+        mine = {key: value for key, value in settings.items() if key in known}
         made.append(make(name, vary=chosen[name], **fixed | mine))
     return cls(tuple(made), names, scenes)
 

@@ -144,8 +144,9 @@ class Brax(Family):
     def build(self) -> dict[str, dict[str, np.ndarray]]:
         """Return the leaves of the table, with the values that MuJoCo derives from each task's masses."""
         leaves = super().build()
-        if "mass" in self.values:
-            weights = [inverse_weights(self.original.sys.mj_model, mass) for mass in self.values["mass"]]
+        masses = self.variation.values.get("mass")
+        if masses is not None:
+            weights = [inverse_weights(self.original.sys.mj_model, mass) for mass in masses]
             leaves["model"] = {name: np.stack([w[name] for w in weights]) for name in weights[0]}
         return leaves
 

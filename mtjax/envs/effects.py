@@ -1,6 +1,5 @@
 """What a parameter changes of a task, and whether anything reads that."""
 
-import copy
 import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping
@@ -14,10 +13,10 @@ from jax.interpreters.partial_eval import dce_jaxpr
 
 from mtjax.envs.brax import Brax
 from mtjax.envs.domain import Domain
-from mtjax.envs.engines.base import Blank
 from mtjax.envs.family import Family
 from mtjax.envs.fields import FIXED, VARIABLE
 from mtjax.envs.painters.scene import LEAVES, field
+from mtjax.envs.pixels import compile_scene
 from mtjax.types import InputError, Key, Task
 
 Parts = Mapping[str, Any]  # what a value of a parameter gives, by name
@@ -84,7 +83,7 @@ def _physics(family: Domain, values: Mapping[str, float]) -> Parts:
 
 def _scene(family: Domain, values: Mapping[str, float]) -> Parts:
     """Return all fields of a compiled scene that a painter reads."""
-    model = family.compile_scene(values).compile()
+    model = compile_scene(family, values).compile()
     return {name: field(model, name) for name in LEAVES}
 
 
@@ -108,9 +107,7 @@ def _tasks(family: Family) -> Callable[[Mapping[str, float]], Parts]:
 def _leaves_read(family: Family) -> set[str]:
     """Return the names of a task's leaves on which the results of a reset and a step depend."""
     task = jax.tree.map(lambda x: x[0], family.table.tasks)
-    family = copy.copy(family)
-    if isinstance(family, Domain):  # the physics takes seconds to trace
-        vars(family)["simulator"] = Blank(family.models[0])
+    family = family.without_physics()
 
     def play(task: Task, key: Key) -> Any:
         begun = family.reset(task, key)

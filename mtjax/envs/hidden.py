@@ -16,7 +16,7 @@ import numpy as np
 from mtjax.envs.choosing import Choosing
 from mtjax.envs.family import Family
 from mtjax.envs.task_table import Table
-from mtjax.types import SPLITS, Array, InputError, Key, Step, Task
+from mtjax.types import Array, InputError, Key, Step, Task
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,6 +27,7 @@ class HiddenTasks(Choosing, Family):
     """Show the task in the context after all, for a bound of what can be earned by finding it out."""
 
     finite_horizon: ClassVar[bool] = True
+    ends_early: ClassVar[bool] = False
 
     @abc.abstractmethod
     def pool(self) -> np.ndarray:
@@ -36,16 +37,6 @@ class HiddenTasks(Choosing, Family):
     @abc.abstractmethod
     def largest(self) -> float:
         """Return the largest number that a task may have."""
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """Return the number of tasks of each split: one that trains, and none that is held out."""
-        return dict(zip(SPLITS, (1, 0, 0), strict=True))
-
-    @property
-    def count(self) -> int:
-        """Return the number of rows of the table."""
-        return len(self.table.tasks.id)
 
     @cached_property
     def table(self) -> Table:
@@ -57,13 +48,7 @@ class HiddenTasks(Choosing, Family):
         goal = {"task": each.astype(np.float32)}
         leaves: dict[str, Any] = {"id": row, "row": row, "context": context.astype(np.float32), "goal": goal}
         tasks = Task(**leaves, horizon=np.full_like(row, self.episode_length), params={}, model={})  # type: ignore
-        rows = {split: np.arange(count) for split, count in self.counts.items()}
-        return Table(tasks, rows, row[None, 1:])
-
-    @property
-    def ends_early(self) -> bool:
-        """Return False: only time ends an episode."""
-        return False
+        return Table(tasks, self.variation.places, row[None, 1:])
 
 
 class BanditState(NamedTuple):

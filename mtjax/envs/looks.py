@@ -21,7 +21,7 @@ SELF, EFFECTOR, DECORATION, TARGET = (
     (0.3, 0.5, 0.7, 1.0),
     (0.6, 0.3, 0.3, 1.0),
 )
-SKY_HUE = "sky-hue"
+SKY_HUE, CAMERA_ANGLE = "sky-hue", "camera-angle"
 HIDDEN = 3  # a group that MuJoCo does not show unless asked to
 _FLOORS = ("ground", "floor")
 _FLOOR = (0.2, 0.3, 0.4)  # brighter tiles of the floor
@@ -29,6 +29,7 @@ _DARK = (0.5, 2 / 3, 0.75)  # factors of the darker ones
 _SKY, _NADIR = (0.4, 0.6, 0.8), (0.0, 0.0, 0.0)
 _HORIZON = (0.2, 0.3, 0.4)
 _EXTENT = 2.0  # [m] of a model on a long floor, as MuJoCo draws nothing within a hundredth of the extent
+_LAMP = (0.0, 0.0, 1.5)  # [m] of the light above a geom, wherever the geom is along x and y
 _DISTANCE = 2.0  # from an own model's camera to its centre, in extents of the model
 _LIGHT, _FOLLOW = mujoco.mjtLightType, mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM
 
@@ -45,6 +46,7 @@ class Look(NamedTuple):
     follow: str = ""  # the body whose centre of mass camera and light follow; their positions are from its frame
     mounted: bool = False  # whether the light is mounted on that body, and turns with it
     fovy: float = 45.0  # [deg] angle of view
+    lamp: str = ""  # the geom above which a further light, of its name, shines down
     colours: tuple[tuple[str, tuple[float, ...]], ...] = ()  # of geoms that are not as the model has them
 
 
@@ -75,6 +77,8 @@ def dress(spec: mujoco.MjSpec, look: Look | None, plain: bool) -> None:
         kind = _LIGHT.mjLIGHT_DIRECTIONAL if look.sun else _LIGHT.mjLIGHT_SPOT
         follow = {} if look.mounted else follow
         body.add_light(name="light", pos=look.light, type=kind, diffuse=[look.diffuse] * 3, **follow)
+    if look.lamp:
+        spec.worldbody.add_light(name=look.lamp, pos=_LAMP, type=_LIGHT.mjLIGHT_SPOT, diffuse=[1] * 3)
 
 
 def _paint_background(spec: mujoco.MjSpec, plain: bool) -> None:
@@ -161,10 +165,14 @@ def _scale_lights(spec: mujoco.MjSpec, scale: float) -> None:
 _is_floor = lambda geom: geom.name in _FLOORS
 LOOKS: Mapping[str, Parameter] = MappingProxyType(
     {
-        "camera-angle": Parameter("deg", 0.0, _turn_camera, -180.0, 180.0, looks=True),
+        CAMERA_ANGLE: Parameter("deg", 0.0, _turn_camera, -180.0, 180.0, looks=True),
         "hue": Parameter("deg", 0.0, _turn_hues(lambda geom: not _is_floor(geom)), -360.0, 360.0, looks=True),
         "floor-hue": Parameter("deg", 0.0, _turn_hues(_is_floor), -360.0, 360.0, looks=True),
         SKY_HUE: Parameter("deg", 0.0, _turn_sky, -360.0, 360.0, looks=True),
         "light": positive("1", 1.0, _scale_lights, looks=True),
     }
 )
+WITHOUT_CAMERA: Mapping[str, Parameter] = MappingProxyType(
+    {name: x for name, x in LOOKS.items() if name != CAMERA_ANGLE}
+)
+"""The looks of scenes whose camera the world turns."""

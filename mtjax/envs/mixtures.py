@@ -7,79 +7,24 @@ masked.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from functools import cached_property
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import tyro
 
 from mtjax import frames
+from mtjax.envs import naming, task_table
+from mtjax.envs.blocks import Blocks, States, blocks_of
 from mtjax.envs.family import Family
+from mtjax.envs.mixed_table import mixed_spec, mixed_table
 from mtjax.envs.shared_simulator import take
 from mtjax.envs.simulator_groups import SCENES, Group, grouped
-from mtjax.envs.task_table import Outside, Part, Table, fields_alone, numbers, params
+from mtjax.envs.task_table import Part, Table, fields_alone, owner
 from mtjax.names import nearest_error
-from mtjax.types import SPLITS, Array, InputError, Key, Spec, Step, Task
-
-
-@jax.tree_util.register_static
-@dataclasses.dataclass(frozen=True)
-class Blocks:
-    """The order of families along the tasks of a table. It is static, so worlds are sliced and never gathered."""
-
-    runs: tuple[tuple[int, int], ...]  # (family, how many of its tasks follow each other), in the table's order
-    marks: int  # leading numbers of a context that say which family it is of
-
-    @property
-    def count(self) -> int:
-        """Return the number of tasks."""
-        return sum(count for _, count in self.runs)
-
-    def slices(self) -> Iterator[tuple[int, slice]]:
-        """Return the family and the slice of tasks of each block."""
-        begin = 0
-        for family, count in self.runs:
-            yield family, slice(begin, begin + count)
-            begin += count
-
-    def take(self, tree: Any, family: int) -> Any:
-        """Return the part (S, T', ...) of leaves (S, T, ...) that belongs to one family."""
-        places = [place for owner, place in self.slices() if owner == family]
-        return jax.tree.map(lambda x: _joined([x[:, place] for place in places]), tree)
-
-    def join(self, parts: Mapping[int, Array]) -> Array:
-        """Join arrays (S, T', ...) of the families into one (S, T, ...)."""
-        taken, found = dict.fromkeys(parts, 0), []
-        for family, count in self.runs:
-            found.append(parts[family][:, taken[family] : taken[family] + count])
-            taken[family] += count
-        return _joined(found)
-
-    def related(self, contexts: Array, context: Array) -> Array:
-        """Return which contexts (T, C) are of the same family as ``context`` (C,)."""
-        return jnp.all(contexts[:, : self.marks] == context[: self.marks], axis=-1)
-
-
-def _look(spec: Spec) -> str:
-    """Return what an observation shows, as text."""
-    if not frames.shown(spec.obs):
-        return "no pictures"
-    beside = "" if frames.state(frames.joined(spec.obs)) is None else " beside a state"
-    return f"{spec.frames} pictures {spec.obs[frames.PICTURES].shape}{beside}"
-
-
-def _joined(parts: list[Array]) -> Array:
-    return parts[0] if len(parts) == 1 else jnp.concatenate(parts, axis=1)
-
-
-class States(NamedTuple):
-    """The states of a mixture's worlds, by family."""
-
-    blocks: Blocks
-    families: tuple[Any, ...]  # each family's own states, leaves (S, T', E, ...); None where a split has no task of it
+from mtjax.types import Array, InputError, Key, Spec, Step, Task
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,143 +64,24 @@ class Mixture:
             if family in self.families[:i]:
                 raise InputError(f"{name} is in the mixture twice, with the same tasks; vary something in one of them")
 
-    # Tasks.
-
-    __getstate__, numbers, params = fields_alone, numbers, params
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """Return the number of tasks of each split."""
-        return {split: sum(family.counts[split] for family in self.families) for split in SPLITS}
-
-    @property
-    def train_count(self) -> int:
-        """Return the number of training tasks."""
-        return self.counts["train"]
+    @cached_property
+    def parts(self) -> tuple[Part, ...]:
+        """Return the families, and the places of their tasks in each split."""
+        blocks = blocks_of([family.counts for family in self.families])
+        return tuple(
+            Part(name, family, {split: found.places(i) for split, found in blocks.items()}, self.families[:i])
+            for i, (name, family) in enumerate(zip(self.names, self.families, strict=True))
+        )
 
     @cached_property
     def table(self) -> Table:
         """Return the families' tables one after another. Tasks are numbered in the order of the splits."""
-        tables = [family.table for family in self.families]
-        rows = {
-            split: np.concatenate([first + table.rows[split] for first, table in zip(self._first, tables, strict=True)])
-            for split in SPLITS
-        }
-        listed = np.concatenate(list(rows.values()))
-        count = sum(len(table.tasks.id) for table in tables)
-        numbers = np.zeros(count, np.int32)
-        numbers[listed] = np.arange(len(listed))
-        leaves: dict[str, Any] = {
-            "id": numbers,
-            "row": np.arange(count, dtype=np.int32),
-            "context": self._context(),
-            "params": {},
-            "model": {},
-            "goal": {},
-            "horizon": np.concatenate([table.tasks.horizon for table in tables]),
-            "action_mask": self._mask(),
-        }
-        return Table(Task(**leaves), rows, self._draws(count))
+        return mixed_table(self.families, self.spec.action_size)
 
     @cached_property
-    def _first(self) -> np.ndarray:
-        """Return the row at which each family's table begins."""
-        counts = [len(family.table.tasks.id) for family in self.families]
-        return np.cumsum([0, *counts[:-1]])
-
-    def _context(self) -> np.ndarray:
-        """Return the contexts (R, C) of all rows."""
-        contexts = [np.asarray(family.table.tasks.context) for family in self.families]
-        if len(contexts) == 1:
-            return contexts[0]
-        slots = [context if np.any(context) else context[:, :0] for context in contexts]
-        ends = len(slots) + np.cumsum([slot.shape[1] for slot in slots])
-        rows = []
-        for i, (slot, end) in enumerate(zip(slots, ends, strict=True)):
-            row = np.zeros((len(slot), ends[-1]), np.float32)
-            row[:, i] = 1
-            row[:, end - slot.shape[1] : end] = slot
-            rows.append(row)
-        return np.concatenate(rows)
-
-    def _mask(self) -> np.ndarray | None:
-        """Return which actions (R, A) each task has; None if all tasks have all actions."""
-        masks = []
-        for family in self.families:
-            own = family.table.tasks.action_mask
-            shape = (len(family.table.tasks.id), family.spec.action_size)
-            masks.append(np.ones(shape, np.float32) if own is None else np.float32(own))
-        whole = np.concatenate([np.pad(x, ((0, 0), (0, self.spec.action_size - x.shape[1]))) for x in masks])
-        return None if np.all(whole == 1) else whole
-
-    def _draws(self, count: int) -> np.ndarray | None:
-        """Return the rows (R, P) from which the episodes of each row draw. A family without draws has its own row."""
-        drawn = [family.table.draws for family in self.families]
-        widths = {draws.shape[1] for draws in drawn if draws is not None}
-        if not widths:
-            return None
-        if len(widths) > 1:
-            raise InputError(
-                f"families of a mixture must draw alike; give all the same num-draws, not {sorted(widths)}"
-            )
-        rows = np.repeat(np.arange(count)[:, None], widths.pop(), axis=1)
-        for first, draws in zip(self._first, drawn, strict=True):
-            if draws is not None:
-                rows[first : first + len(draws)] = first + draws
-        return rows
-
-    def tasks(self, split: str = "train") -> Task:
-        """Return the tasks of a split: "train", "interpolation", "extrapolation", or "all" in this order."""
-        return self.table.of(split)._replace(blocks=self._blocks[split])
-
-    @cached_property
-    def _blocks(self) -> dict[str, Blocks]:
-        runs = {split: [(i, len(f.table.rows[split])) for i, f in enumerate(self.families)] for split in SPLITS}
-        runs["all"] = [run for split in SPLITS for run in runs[split]]
-        marks = len(self.families) if len(self.families) > 1 else 0
-        return {split: Blocks(_merged(found), marks) for split, found in runs.items()}
-
-    @property
     def spec(self) -> Spec:
         """Return the sizes of observation, action and context, those of the widest family."""
-        return self._spec
-
-    @cached_property
-    def _spec(self) -> Spec:
-        specs = [family.spec for family in self.families]
-        self._require_one_look(specs)
-        self._require_one_kind(specs)
-        widest: Any = jax.ShapeDtypeStruct((max(map(frames.state_size, specs)),), jnp.float32)
-        return Spec(
-            obs=frames.with_state(lambda _: widest, frames.joined(specs[0].obs)),
-            action=max((spec.action for spec in specs), key=lambda action: action.size),
-            context_size=self._context().shape[1],
-            mixed=len(self.families) > 1,
-            frames=specs[0].frames,
-            sentences=self.sentences,
-        )
-
-    def _require_one_look(self, specs: list[Spec]) -> None:
-        """Refuse to mix families with and without pictures, or with pictures of several shapes."""
-        looks = {name: _look(spec) for name, spec in zip(self.names, specs, strict=True)}
-        (first, look), *rest = looks.items()
-        other = next((name for name, found in rest if found != look), None)
-        if other is not None:
-            raise InputError(
-                f"families of a mixture are seen alike: {first} shows {look} and {other} {looks[other]}; "
-                "give all the same pixels, frames, grey and state"
-            )
-
-    def _require_one_kind(self, specs: list[Spec]) -> None:
-        """Refuse to mix families with continuous actions and with discrete ones."""
-        kinds = {name: spec.action.kind for name, spec in zip(self.names, specs, strict=True)}
-        (first, kind), *rest = kinds.items()
-        other = next((name for name, found in rest if found != kind), None)
-        if other is not None:
-            told = f"{first} has {kind} actions and {other} {kinds[other]} ones"
-            scored = any(hasattr(family, "scores") for family in self.families)
-            fix = "; scores=True (--env.scores) makes discrete ones continuous" if scored else ""
-            raise InputError(f"families of a mixture act alike, as one policy draws for all: {told}{fix}")
+        return mixed_spec(dict(zip(self.names, self.families, strict=True)), self.sentences)
 
     @property
     def discrete(self) -> bool:
@@ -272,6 +98,18 @@ class Mixture:
         """Return the steps of the longest family's episodes."""
         return max(family.episode_length for family in self.families)
 
+    @property
+    def engine_name(self) -> str:
+        """Return the engines of all families."""
+        return ", ".join(dict.fromkeys(family.engine_name for family in self.families))
+
+    # What mixtures do as families do.
+
+    __getstate__, tasks, own_row, sentence = fields_alone, task_table.tasks, task_table.own_row, naming.sentence
+    counts, train_count, calls = task_table.counts, task_table.train_count, task_table.calls
+    numbers, params, labels, describe = naming.numbers, naming.params, naming.labels, naming.describe
+    task_values, task_axis, sentences, summary = naming.task_values, naming.task_axis, naming.sentences, naming.summary
+
     # Worlds, leaves (S, T, E, ...).
 
     @cached_property
@@ -281,32 +119,24 @@ class Mixture:
 
     def reset_worlds(self, tasks: Task, keys: Key) -> Step:
         """Begin an episode in every world."""
-        own = self._apart(tasks)
+        own = _own_tasks(self, tasks)
         given = {i: tasks.blocks.take(keys, i) for i in own}
-        steps = self._by_group(own, lambda group, of: group.reset_worlds(of(own), of(given)))
-        return self._whole(tasks.blocks, steps)
+        steps = _by_group(self.groups, own, lambda group, of: group.reset_worlds(of(own), of(given)))
+        return _whole(self, tasks.blocks, steps)
 
     def renew_worlds(self, tasks: Task, keys: Key, mask: Array, states: States) -> Step:
         """Begin an episode in the worlds of ``mask`` (S, T, E), whose observations alone count."""
-        own = self._apart(tasks)
+        own = _own_tasks(self, tasks)
         given, masks = ({i: tasks.blocks.take(x, i) for i in own} for x in (keys, mask))
         renew = lambda group, of: group.renew_worlds(of(own), of(given), of(masks), of(states.families))
-        return self._whole(tasks.blocks, self._by_group(own, renew))
+        return _whole(self, tasks.blocks, _by_group(self.groups, own, renew))
 
     def step_worlds(self, tasks: Task, states: States, actions: Array) -> Step:
         """Step every world by its action (S, T, E, A)."""
-        own = self._apart(tasks)
-        given = {i: self.families[i].spec.action.narrow(tasks.blocks.take(actions, i)) for i in own}
+        own = _own_tasks(self, tasks)
+        given = {i: self.families[i].action.narrow(tasks.blocks.take(actions, i)) for i in own}
         move = lambda group, of: group.step_worlds(of(own), of(states.families), of(given))
-        return self._whole(tasks.blocks, self._by_group(own, move))
-
-    def _by_group(self, own: dict[int, Task], play: Callable) -> dict[int, Step]:
-        """Return the steps of all families, by ``play(group, of)``. ``of`` picks the parts of the group's families."""
-        steps = {}
-        for group in self.groups:
-            here = [i for i in group.members if i in own]  # a split may have no task of a family
-            steps |= play(group, lambda parts, here=here: {i: parts[i] for i in here}) if here else {}
-        return steps
+        return _whole(self, tasks.blocks, _by_group(self.groups, own, move))
 
     def where_worlds(self, mask: Array, new: States, old: States) -> States:
         """Choose states by ``mask`` (S, T, E)."""
@@ -316,156 +146,82 @@ class Mixture:
         ]
         return new._replace(families=tuple(chosen))
 
-    def _apart(self, tasks: Task) -> dict[int, Task]:
-        """Return the tasks of each family in that family's own form."""
-        blocks = tasks.blocks
-        if blocks is None or blocks.count != tasks.id.shape[1]:
-            raise InputError("the worlds of a mixture are those of a whole split: env.tasks(split), and not some of it")
-        rows = {i: blocks.take(tasks.row, i) - int(self._first[i]) for i in dict.fromkeys(i for i, _ in blocks.runs)}
-        return {i: take(self.families[i].table.tasks, each) for i, each in rows.items()}
-
-    def _whole(self, blocks: Blocks, steps: dict[int, Step]) -> Step:
-        """Join the steps of the families."""
-        states = tuple(steps[i].state if i in steps else None for i in range(len(self.families)))
-        join = lambda of: blocks.join({i: of(step) for i, step in steps.items()})
-        padded = [self.pad(self.families[i], step.obs) for i, step in steps.items()]
-        names = sorted({name for step in steps.values() for name in step.metrics})
-        unknown = lambda step: jnp.full(step.reward.shape, jnp.nan)
-        never = lambda step: jnp.zeros(step.reward.shape, bool)
-        cut_off = any(step.truncated is not None for step in steps.values())
-        return Step(
-            state=States(blocks, states),
-            obs=jax.tree.map(lambda *x: blocks.join(dict(zip(steps, x, strict=True))), *padded),
-            reward=join(lambda step: step.reward),
-            terminated=join(lambda step: step.terminated),
-            metrics={name: join(lambda step, name=name: step.metrics.get(name, unknown(step))) for name in names},
-            truncated=join(lambda s: never(s) if s.truncated is None else s.truncated) if cut_off else None,
-        )
-
-    def pad(self, family: Family, obs: Any) -> Any:
-        """Pad the vectors (..., O') that networks take of a family's observations with zeros to the mixture's."""
-        join = frames.layout(family.spec.obs)
-        obs = obs if join is None else join(obs)
-        size = frames.state_size(self.spec)
-        wide = lambda x: jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, size - x.shape[-1])]) if x.shape[-1] < size else x
-        return frames.with_state(wide, obs)
-
     # A single world, outside of compiled programs.
 
     def reset(self, task: Task, key: Key) -> Step:
         """Begin an episode of a task that is not traced. The state is the family's own."""
-        family, own = self.member(task)
-        step = family.reset(own, key)
-        return step._replace(obs=self.pad(family, step.obs))
+        family, own = _member(self, task)
+        return _padded(self, family, family.reset(own, key))
 
     def step(self, task: Task, state: Any, action: Array) -> Step:
         """Advance a world of a task that is not traced."""
-        family, own = self.member(task)
-        step = family.step(own, state, family.spec.action.narrow(action))
-        return step._replace(obs=self.pad(family, step.obs))
+        family, own = _member(self, task)
+        return _padded(self, family, family.step(own, state, family.action.narrow(action)))
 
-    def member(self, task: Task) -> tuple[Family, Task]:
-        """Return the family of a task that is not traced, and the task in that family's own form.
 
-        Raises:
-            InputError: the task is traced, so its family is unknown at compile time.
-        """
-        if isinstance(task.row, jax.core.Tracer):
-            raise InputError(
-                "in a compiled program the families of a mixture step whole splits, by reset_worlds and step_worlds; "
-                "for single worlds take one of env.families"
-            )
-        i, row = self._place(int(task.row))
-        return self.families[i], jax.tree.map(lambda x: jnp.asarray(x[row]), self.families[i].table.tasks)
+def _own_tasks(mixture: Mixture, tasks: Task) -> dict[int, Task]:
+    """Return the tasks of each family in that family's own form."""
+    blocks = tasks.blocks
+    if blocks is None or blocks.count != tasks.id.shape[1]:
+        raise InputError("the worlds of a mixture are those of a whole split: env.tasks(split), and not some of it")
+    rows = {i: blocks.take(tasks.row, i) - mixture.parts[i].first for i in dict.fromkeys(i for i, _ in blocks.runs)}
+    return {i: take(mixture.families[i].table.tasks, each) for i, each in rows.items()}
 
-    # Names.
 
-    def _place(self, row: int) -> tuple[int, int]:
-        """Return the family of a row of the table, and the row in its own table."""
-        i = int(np.searchsorted(self._first, row, side="right")) - 1
-        return i, row - int(self._first[i])
+def _by_group(groups: tuple[Group, ...], own: dict[int, Task], play: Callable) -> dict[int, Step]:
+    """Return the steps of all families, by ``play(group, of)``. ``of`` picks the parts of the group's families."""
+    steps = {}
+    for group in groups:
+        here = [i for i in group.members if i in own]  # a split may have no task of a family
+        steps |= play(group, lambda parts, here=here: {i: parts[i] for i in here}) if here else {}
+    return steps
 
-    @cached_property
-    def parts(self) -> tuple[Part, ...]:
-        """Return the families, and the places of their tasks in each split."""
-        found = []
-        for i, (name, family) in enumerate(zip(self.names, self.families, strict=True)):
-            places = {
-                split: np.concatenate([np.arange(place.start, place.stop) for j, place in blocks.slices() if j == i])
-                if any(j == i for j, _ in blocks.runs)
-                else np.zeros(0, int)
-                for split, blocks in self._blocks.items()
-            }
-            found.append(Part(name, family, places))
-        return tuple(found)
 
-    @property
-    def calls(self) -> Outside:
-        """Return what makes calls out of XLA in its programs: the engines, the painters, and groups' own engines."""
-        own = [f.outside for f in self.families] + [f.outside_painter for f in self.families]
-        return Outside((*own, *(group.outside for group in self.groups if group.outside not in own)))
+def _whole(mixture: Mixture, blocks: Blocks, steps: dict[int, Step]) -> Step:
+    """Join the steps of the families."""
+    steps = {i: _padded(mixture, mixture.families[i], step) for i, step in steps.items()}
+    states = tuple(steps[i].state if i in steps else None for i in range(len(mixture.families)))
+    join = lambda of: blocks.join({i: of(step) for i, step in steps.items()})
+    names = sorted({name for step in steps.values() for name in step.metrics})
+    unknown = lambda step: jnp.full(step.reward.shape, jnp.nan)
+    never = lambda step: jnp.zeros(step.reward.shape, bool)
+    cut_off = any(step.truncated is not None for step in steps.values())
+    return Step(
+        state=States(blocks, states),
+        obs=jax.tree.map(lambda *x: blocks.join(dict(zip(steps, x, strict=True))), *(s.obs for s in steps.values())),
+        reward=join(lambda step: step.reward),
+        terminated=join(lambda step: step.terminated),
+        metrics={name: join(lambda step, name=name: step.metrics.get(name, unknown(step))) for name in names},
+        truncated=join(lambda s: never(s) if s.truncated is None else s.truncated) if cut_off else None,
+    )
 
-    def apart(self, states: States) -> tuple[Any, ...]:
-        """Return the states of each part."""
-        return states.families
 
-    def sentence(self, row: int) -> str:
-        """Return what a task asks for."""
-        i, own = self._place(row)
-        return self.families[i].sentence(own)
+def _padded(mixture: Mixture, family: Family, step: Step) -> Step:
+    """Return a step with the vector (..., O') that networks take of it, padded with zeros to the mixture's."""
+    join, obs = frames.layout(family.spec.obs), step.obs
+    size = frames.state_size(mixture.spec)
+    wide = lambda x: jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, size - x.shape[-1])]) if x.shape[-1] < size else x
+    return step._replace(obs=frames.with_state(wide, obs if join is None else join(obs)))
 
-    @property
-    def sentences(self) -> tuple[str, ...]:
-        """Return what the tasks of all splits ask for. It needs no table, for which the sizes have to be known."""
-        rows = [(f, row) for split in SPLITS for f in self.families for row in f.table.rows[split].tolist()]
-        return tuple(family.sentence(row) for family, row in rows)
 
-    def own_row(self, row: int) -> int:
-        """Return the row of the family's own table for a row of this table."""
-        return self._place(row)[1]
+def _member(mixture: Mixture, task: Task) -> tuple[Family, Task]:
+    """Return the family of a task that is not traced, and the task in that family's own form.
 
-    def task_values(self, split: str) -> np.ndarray:
-        """Return the numbers (T,) of a split's tasks."""
-        return self.numbers(split)
-
-    @property
-    def task_axis(self) -> tuple[str, str]:
-        """Return name and unit of ``task_values``."""
-        return "task", "number"
-
-    def labels(self, split: str) -> list[str]:
-        """Return a short name for every task of a split, such as "walker-walk friction=0.7"."""
-        found = [""] * len(self.table.rows[split])
-        for part in self.parts:
-            own, axis = part.family.labels(split), part.family.task_axis[0]
-            for place, label in zip(part.places[split], own, strict=True):
-                found[place] = part.name if _has_one_task(part.family) else f"{part.name} {axis}={label}"
-        return found
-
-    def describe(self, row: int) -> str:
-        """Return the task of a row as text: its family and its varied parameters."""
-        i, own = self._place(row)
-        alone = _has_one_task(self.families[i])
-        return self.names[i] if alone else f"{self.names[i]} {self.families[i].describe(own)}"
-
-    @property
-    def engine_name(self) -> str:
-        """Return the engines of all families."""
-        return ", ".join(dict.fromkeys(family.engine_name for family in self.families))
-
-    @property
-    def summary(self) -> str:
-        """Return a line on its tasks."""
-        count, many = self.train_count, len(self.families)
-        kinds = ", ".join(
-            name + (f" ({family.train_count}{': ' * bool(family.ends)}{family.ends})" * (family.train_count > 1))
-            for name, family in zip(self.names, self.families, strict=True)
+    Raises:
+        InputError: the task is traced, so its family is unknown at compile time.
+    """
+    if isinstance(task.row, jax.core.Tracer):
+        raise InputError(
+            "in a compiled program the families of a mixture step whole splits, by reset_worlds and step_worlds; "
+            "for single worlds take one of env.families"
         )
-        splits = "/".join(dict.fromkeys(family.split for family in self.families))
-        return (
-            f"{count} training task{'s' * (count > 1)} of {many} famil{'ies' if many > 1 else 'y'}: {kinds}; "
-            f"split {splits}, engine {self.engine_name}"
-        )
+    part, row = owner(mixture, int(task.row))
+    return part.family, jax.tree.map(lambda x: jnp.asarray(x[row]), part.family.table.tasks)
+
+
+def apart(states: Any) -> tuple[Any, ...]:
+    """Return the states of each part of an environment."""
+    return states.families if isinstance(states, States) else (states,)
 
 
 Tabled = Family | Mixture
@@ -480,19 +236,3 @@ def require_family(env: Any, reason: str) -> None:
     """
     if isinstance(env, Mixture):
         raise InputError(f"{reason}, and {'+'.join(env.names)} is a mixture; take one family")
-
-
-def _has_one_task(family: Family) -> bool:
-    """Return whether a family's name says which of its tasks is meant. Goals that episodes draw are no tasks."""
-    return not family.varied and sum(map(len, family.table.rows.values())) == 1
-
-
-def _merged(runs: list[tuple[int, int]]) -> tuple[tuple[int, int], ...]:
-    """Return the blocks without empty ones, with neighbouring blocks of one family joined."""
-    found: list[tuple[int, int]] = []
-    for family, count in runs:
-        if found and found[-1][0] == family:
-            found[-1] = (family, found[-1][1] + count)
-        elif count:
-            found.append((family, count))
-    return tuple(found)

@@ -5,13 +5,15 @@ needs, in one kernel.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mtjax.types import Array
+from mtjax.envs.engines.base import World
+from mtjax.types import Array, InputError, Task
 
 Vector = tuple[Array, Array]  # x and z
 
@@ -77,6 +79,24 @@ def is_planar(model: mujoco.MjModel) -> bool:
     hinge = model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
     across, within = np.abs(model.jnt_axis[:, 1]), np.hypot(model.jnt_axis[:, 0], model.jnt_axis[:, 2])
     return bool(np.all(np.where(hinge, within, across) < 1e-9))
+
+
+def planar(domain: Any, task: Task, world: World) -> Planar:
+    """Return places and velocities of all bodies of a domain whose model moves in the x-z plane.
+
+    Raises:
+        InputError: the model leaves the plane.
+    """
+    model = domain.models[0]
+    if not is_planar(model):
+        raise InputError(f"the model of {type(domain).__name__} leaves the x-z plane; declare sensors instead")
+    return locate(model, partial(domain.leaf, task), world.qpos, world.qvel)
+
+
+def forward_velocity(domain: Any, task: Task, world: World) -> Array:
+    """Return the velocity () [m/s] along x of the whole model's centre of mass."""
+    mass = domain.leaf(task, "body_mass")
+    return jnp.dot(mass, planar(domain, task, world).velocity[:, 0], precision="highest") / jnp.sum(mass)
 
 
 def _rotate(angle: Array, vector: Vector) -> Vector:

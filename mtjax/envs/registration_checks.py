@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import mujoco
 
 from mtjax.envs.brax import Brax
+from mtjax.envs.compiled import read_model
 from mtjax.envs.domain import Domain
 from mtjax.envs.engines.base import at_rest
 from mtjax.envs.family import Family
@@ -72,13 +73,14 @@ def _of_one_task(family: Family) -> Family:
 
 def _check_edits(family: Domain) -> None:
     """Edit the model by every parameter, each alone, and compile it."""
-    if not isinstance(getattr(family, "model_file", None), str):
+    given = getattr(family, "model_file", None)
+    if not isinstance(given, str) and not callable(given):
         raise InputError(
             f"{type(family).__name__}.model_file is a file beside the class's own, a path, or the MJCF itself"
         )
-    _call(family, "model_file", family._read_model)
-    _call(family, "prepare", lambda: family.prepare(family._read_model()), family.prepare, family)
-    _call(family, "model_file", family._read_model().compile)
+    _call(family, "model_file", partial(read_model, family))
+    _call(family, "prepare", lambda: family.prepare(read_model(family)), family.prepare, family)
+    _call(family, "model_file", read_model(family).compile)
     for name, (_, nominal, edit, *_) in family.parameters.items():
         if edit is not None:
             apply = lambda spec, edit=edit, nominal=nominal: edit(spec, float(nominal))
@@ -130,7 +132,7 @@ def _call(family: Any, place: str, function: Callable, edit: Callable | None = N
 
 def _missing_name(edit: Callable, family: Domain) -> str:
     try:
-        edit(_Named(family._read_model()))
+        edit(_Named(read_model(family)))
     except InputError as error:
         return str(error)
     except Exception:

@@ -13,10 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.envs.domain import Domain, stack_differing
+from mtjax.envs.compiled import stack_differing
+from mtjax.envs.domain import Domain
 from mtjax.envs.engines.base import Engine, World, at_rest
-from mtjax.envs.engines.mjx import Mjx
+from mtjax.envs.engines.c import MujocoC
 from mtjax.envs.family import Family
+from mtjax.envs.pixels import outcome
+from mtjax.envs.task_table import outside
 from mtjax.parallel.axes import over_worlds
 from mtjax.types import Array, Key, Step, Task
 
@@ -74,13 +77,14 @@ class Joined:
 
     @cached_property
     def simulator(self) -> Engine:
-        """Return the engine of all models."""
-        return next(iter(self.members.values())).join_simulator(self._models)
+        """Return the engine of all models. MJX and Warp receive the fields in which they differ with every step."""
+        first = next(iter(self.members.values()))
+        return MujocoC(self._models, first.num_substeps) if first.engine_name == "c" else first.simulator
 
     @property
     def outside(self) -> Any:
         """Return the engine if it runs outside XLA, as all but MJX do."""
-        return None if isinstance(self.simulator, Mjx) else self.simulator
+        return outside(self.simulator)
 
     @cached_property
     def _begin_alike(self) -> bool:
@@ -185,7 +189,7 @@ def _advance(simulator: Engine, row: Array, model: dict[str, Array], world: Worl
 
 @partial(jax.jit, static_argnums=0)
 def _outcome(domain: Domain, task: Task, world: World, action: Array) -> Step:
-    return domain.outcome(task, world, action)
+    return outcome(domain, task, world, action)
 
 
 def _task_of(row: Array, model: dict[str, Array]) -> Task:

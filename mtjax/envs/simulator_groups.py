@@ -1,11 +1,18 @@
 """The families of a mixture in groups that share a simulator."""
 
+import hashlib
 from collections.abc import Mapping, Sequence
+from operator import attrgetter
 from typing import Any
 
+import numpy as np
+
 from mtjax.envs.domain import Domain
+from mtjax.envs.engines.c import MujocoC
 from mtjax.envs.family import Family
+from mtjax.envs.fields import FIXED
 from mtjax.envs.merged_simulator import United
+from mtjax.envs.physics import DECIDING
 from mtjax.envs.scene_bodies import Scene
 from mtjax.envs.shared_simulator import Alone, Joined
 from mtjax.types import InputError
@@ -25,10 +32,31 @@ def grouped(families: Sequence[Family], scenes: str = "auto") -> tuple[Group, ..
         rest = {i: family for i, family in rest.items() if i not in group.members}
     alike: dict[Any, dict[int, Any]] = {}
     for i, family in rest.items():
-        alike.setdefault(i if family.structure is None else family.structure, {})[i] = family
+        found = structure(family)
+        alike.setdefault(i if found is None else found, {})[i] = family
     alone = lambda members: [Alone({i: family}) for i, family in members.items()]
     joined = [group for members in alike.values() for group in _try(Joined, members) or alone(members)]
     return *united, *joined
+
+
+def structure(family: Family) -> tuple[Any, ...] | None:
+    """Return what families must have in common for one engine to step all of them; None for one that stays alone.
+
+    Their models may differ in numbers only, as those of tasks.
+    """
+    if not isinstance(family, Domain) or family.repeat != 1:  # which is more than control, physics and outcome
+        return None
+    if type(family).step is not Domain.step or type(family).advance is not Domain.advance:
+        return None
+    in_c = isinstance(family.simulator, MujocoC)
+    model: Any = family.models[0] if in_c else family.simulator.base  # type: ignore
+    fixed = hashlib.sha256()
+    for name in FIXED:
+        field = np.asarray(attrgetter(name)(model))
+        fixed.update(repr((name, field.shape)).encode() + field.tobytes())
+    if not in_c:
+        fixed.update(repr([np.asarray(attrgetter(path)(model) > 0).tolist() for path in DECIDING]).encode())
+    return family.engine_name, family.num_substeps, fixed.digest()
 
 
 def _try(kind: type[Joined], members: Mapping[int, Any]) -> list[Group]:
@@ -51,13 +79,13 @@ def _unions(families: Mapping[int, Family], scenes: str) -> list[dict[int, Domai
             except InputError:  # the scene stays by itself
                 continue
     unions = [members for candidates in alike.values() for members in _shared_out(candidates)]
-    return [members for members in unions if len({family.structure for family in members.values()}) > 1]
+    return [members for members in unions if len({structure(family) for family in members.values()}) > 1]
 
 
 def _may_unite(family: Domain, scenes: str) -> bool:
     """Return whether a domain's scene may be part of a union: its tasks differ in nothing but places of bodies."""
     asked = scenes == "union" or (scenes == "auto" and family.engine_name == "warp")
-    able = family.unites and family.engine_name in ("c", "warp") and family.structure is not None
+    able = family.unites and family.engine_name in ("c", "warp") and structure(family) is not None
     return asked and able and set(family.table.tasks.model) <= {"body_pos"}
 
 

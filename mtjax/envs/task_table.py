@@ -20,6 +20,7 @@ class Table(NamedTuple):
     tasks: Task  # leading axis: all rows; on the host
     rows: Mapping[str, np.ndarray]  # split -> row numbers
     draws: np.ndarray | None  # (rows of all splits, P) row numbers of the tasks that episodes draw
+    blocks: Mapping[str, Any] | None = None  # split -> ``Task.blocks``; None: of a single family
 
     def of(self, split: str) -> Task:
         """Return the tasks of a split: "train", "interpolation", "extrapolation", or "all" in this order."""
@@ -28,7 +29,7 @@ class Table(NamedTuple):
         if split not in splits:
             raise InputError(f"unknown split {split!r}; choose from {', '.join(splits)}")
         take = lambda rows: jax.device_put(jax.tree.map(lambda x: x[rows], self.tasks))  # jnp.asarray would compile
-        tasks = take(splits[split])
+        tasks = take(splits[split])._replace(blocks=self.blocks and self.blocks[split])
         if self.draws is None:
             return tasks
         rows, contexts = self.draws[splits[split]], self.tasks.context
@@ -43,6 +44,12 @@ class Part(NamedTuple):
     name: str  # empty for a single family
     family: Any  # a Family
     places: Mapping[str, np.ndarray]  # split, or "all" -> which of that split's tasks are the family's
+    before: tuple[Any, ...] = ()  # the families whose tables lie before its own in the environment's table
+
+    @property
+    def first(self) -> int:
+        """Return the row of the environment's table at which the family's own begins."""
+        return sum(len(family.table.tasks.id) for family in self.before)
 
 
 class Outside(NamedTuple):
@@ -64,6 +71,16 @@ class Outside(NamedTuple):
         return any([maker.load_kernels() for maker in self.makers if maker])
 
 
+def makers(family: Any) -> tuple[Any, ...]:
+    """Return what makes the calls out of XLA of a family: its engine, and what draws its observations."""
+    return outside(family.simulator), None if family.scenery is None else outside(family.scenery.painter)
+
+
+def outside(maker: Any) -> Any:
+    """Return an engine or a painter if it runs outside XLA, else None."""
+    return maker if hasattr(maker, "targets") else None
+
+
 def forgetful(env: Any) -> str:
     """Return the names of families whose worlds are lost with the process; empty if there are none."""
     return ", ".join(part.family.name for part in getattr(env, "parts", ()) if part.family.forgets)
@@ -77,13 +94,36 @@ def fields_alone(self: Any) -> dict[str, Any]:
     return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
 
-def numbers(self: Any, split: str) -> np.ndarray:
-    """Return the numbers (T,) of a split's tasks, which are counted through the splits."""
-    first = sum(self.counts[before] for before in SPLITS[: SPLITS.index(split)])
-    return np.arange(first, first + self.counts[split], dtype=np.int32)
+def tasks(self: Any, split: str = "train") -> Task:
+    """Return the tasks of a split: "train", "interpolation", "extrapolation", or "all" in this order."""
+    return self.table.of(split)
 
 
-def params(self: Any, split: str) -> dict[str, Any]:
-    """Return the values (T,) of the parameters of a split's tasks; of a mixture their names as ``task_name``."""
-    found = self.tasks(split).params
-    return {name: np.asarray(x) for name, x in found.items()} or {"task_name": self.labels(split)}
+@property
+def counts(env: Any) -> dict[str, int]:
+    """Return the number of tasks of each split."""
+    return {split: sum(len(part.places[split]) for part in env.parts) for split in SPLITS}
+
+
+@property
+def train_count(env: Any) -> int:
+    """Return the number of training tasks."""
+    return env.counts["train"]
+
+
+def owner(env: Any, row: int) -> tuple[Part, int]:
+    """Return the part of an environment that a row of its table belongs to, and the row in its family's own table."""
+    part = [part for part in env.parts if part.first <= row][-1]
+    return part, row - part.first
+
+
+def own_row(env: Any, row: int) -> int:
+    """Return the row of the family's own table for a row of an environment's."""
+    return owner(env, row)[1]
+
+
+@property
+def calls(env: Any) -> Outside:
+    """Return what makes calls out of XLA in programs of an environment: engines, painters, and groups' own engines."""
+    own = [maker for part in env.parts for maker in makers(part.family)]
+    return Outside((*own, *(group.outside for group in getattr(env, "groups", ()) if group.outside not in own)))

@@ -1,7 +1,9 @@
 """The values of a family's parameters in every task, and the split into training and held-out tasks."""
 
+import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,19 +33,72 @@ class Axis(NamedTuple):
         return len(self.points) > 1 and not self.named
 
 
-class Variation(NamedTuple):
-    """The values of all varied parameters by split. A row is a task, a column a parameter."""
+@dataclasses.dataclass(frozen=True, eq=False)
+class Variation:
+    """The values of all varied parameters by split. A row is a task, a column a parameter.
+
+    A table of tasks has a row for every task of every split, and then one for every draw.
+    """
 
     names: tuple[str, ...]
-    rows: Mapping[str, np.ndarray]  # split -> (R, names)
+    rows: Mapping[str, np.ndarray]  # split -> (T, names)
     draws: np.ndarray | None  # (T, P, names) values for the first tasks of all; each episode of one takes one
     low: np.ndarray  # (names,) ends of the training range
     high: np.ndarray
 
     @property
+    def ranges(self) -> tuple[tuple[str, float, float], ...]:
+        """Return the parameters that differ between training tasks or episodes, with their ends."""
+        ends = zip(self.names, self.low.tolist(), self.high.tolist(), strict=True)
+        return tuple((name, low, high) for name, low, high in ends if low < high)
+
+    @property
     def varied(self) -> tuple[str, ...]:
         """Return the parameters that differ between training tasks or episodes."""
-        return tuple(name for name, low, high in zip(self.names, self.low, self.high, strict=True) if low < high)
+        return tuple(name for name, _, _ in self.ranges)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Return the number of tasks of each split."""
+        return {split: len(rows) for split, rows in self.rows.items()}
+
+    @cached_property
+    def values(self) -> dict[str, np.ndarray]:
+        """Return the values (R,) of each varied parameter in every row of the table, in float64."""
+        parts = [*self.rows.values(), *([] if self.draws is None else self.draws)]
+        return dict(zip(self.names, np.concatenate(parts).T, strict=True))
+
+    @property
+    def count(self) -> int:
+        """Return the number R of rows of the table."""
+        return sum(map(len, [*self.rows.values(), *([] if self.draws is None else self.draws)]))
+
+    @property
+    def places(self) -> dict[str, np.ndarray]:
+        """Return the rows of the table (T,) of each split."""
+        counts = self.counts
+        ends = np.cumsum(list(counts.values()))
+        return {split: np.arange(end - counts[split], end) for split, end in zip(counts, ends, strict=True)}
+
+    @property
+    def drawn(self) -> np.ndarray | None:
+        """Return the rows of the table (tasks of all splits, P) that episodes draw. A task without draws has its own.
+
+        None: no task has draws.
+        """
+        if self.draws is None or not len(self.draws):
+            return None
+        listed = sum(self.counts.values())
+        rows = np.repeat(np.arange(listed)[:, None], self.draws.shape[1], axis=1)
+        rows[: len(self.draws)] = np.arange(listed, self.count).reshape(len(self.draws), -1)
+        return rows
+
+    def for_rows(self, make: Callable[[dict[str, float]], Any], names: Iterable[str]) -> tuple[Any, ...]:
+        """Return what ``make`` returns for the values of ``names`` in every row of the table. Equal rows share it."""
+        used = [name for name in self.values if name in names]
+        rows = list(zip(*(self.values[name].tolist() for name in used), strict=True)) or [()] * self.count
+        made = {row: make(dict(zip(used, row, strict=True))) for row in dict.fromkeys(rows)}
+        return tuple(made[row] for row in rows)
 
 
 def write_values(given: str | float | Sequence[float], name: str = "a parameter") -> str:

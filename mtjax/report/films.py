@@ -14,7 +14,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from mtjax.checks import amount
 from mtjax.envs.engines import host
-from mtjax.envs.mixtures import Tabled
+from mtjax.envs.mixtures import Tabled, apart
 from mtjax.envs.pixels import Pictured
 from mtjax.envs.task_table import Part
 from mtjax.learning.evaluation import Recording, record
@@ -88,7 +88,7 @@ def write(
         for part in env.parts:
             filmed.enter_context(part.family.filmed())
         played = jax.block_until_ready(record(env, policy.agent, policy.state, tasks, jnp.int32(seed)))
-    by_name = {part.name: states for part, states in zip(env.parts, env.apart(played.states), strict=True)}
+    by_name = {part.name: states for part, states in zip(env.parts, apart(played.states), strict=True)}
     width = next((width for most, width in _WIDTHS if len(chosen) <= most), _NARROWEST)
     count, tiles = max(round(seconds * _FPS), 1), []
     for i, one in enumerate(chosen):

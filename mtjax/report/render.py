@@ -5,6 +5,8 @@ import math
 import operator
 import os
 import platform
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,8 @@ import numpy as np
 from PIL import Image
 
 from mtjax.envs.painters.poses import Pose
-from mtjax.envs.pixels import Mark, Pictured
+from mtjax.envs.pixels import Pictured, scene_model
+from mtjax.envs.scenery import Mark, Visible
 from mtjax.types import InputError
 
 _GIF_FPS = 50  # browsers slow down frames that are shorter than 0.02 s
@@ -49,20 +52,20 @@ def film(
     Raises:
         InputError: there is no such row, or no OpenGL backend works. The message names what to install.
     """
-    if not 0 <= task_row < env.count:
-        raise InputError(f"there is no task {task_row}; this family has tasks 0 to {env.count - 1}")
-    model = env.scene_model(task_row)
+    count = env.variation.count
+    if not 0 <= task_row < count:
+        raise InputError(f"there is no task {task_row}; this family has tasks 0 to {count - 1}")
+    model = scene_model(env, task_row)
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height
     model.light_castshadow &= shadows
     data, task = mujoco.MjData(model), jax.tree.map(lambda x: x[task_row], env.table.tasks)
-    of_each = lambda state: (env.joints(state), env.marks(task, state), env.eye(task, state))
-    shown = jax.tree.map(np.asarray, jax.vmap(of_each)(states))
-    frames = np.empty((len(shown[0]), height, width, 3), np.uint8)
+    shown = jax.tree.map(np.asarray, jax.vmap(partial(env.visible, task))(states))
+    frames = np.empty((len(shown.joints), height, width, 3), np.uint8)
     with _open_renderer(model, width, height) as renderer:
         for i, frame in enumerate(frames):
-            data.qpos[:], marks, eye = jax.tree.map(operator.itemgetter(i), shown)
-            _place(model, marks)
-            _look(model, eye)
+            visible = jax.tree.map(operator.itemgetter(i), shown)
+            data.qpos[:] = visible.joints
+            _arrange(model, visible)
             mujoco.mj_forward(model, data)
             renderer.update_scene(data, 0)
             renderer.render(out=frame)
@@ -91,7 +94,16 @@ def write_video(path_stem: str | Path, frames: np.ndarray, fps: float) -> Path:
     return path
 
 
-def _place(model: mujoco.MjModel, marks: dict[str, Mark]) -> None:
+def _arrange(model: mujoco.MjModel, visible: Visible) -> None:
+    """Give a model all that a world shows, but for its joints."""
+    for name, value in visible.fields.items():
+        if hasattr(model, name):  # else a painter alone knows it
+            getattr(model, name)[:] = value
+    _place(model, visible.marks)
+    _look(model, visible.eye)
+
+
+def _place(model: mujoco.MjModel, marks: Mapping[str, Mark]) -> None:
     """Put the geoms whose places an episode decides, and their lights, where they are. The world's body has them."""
     for name, mark in marks.items():
         geom = model.geom(name).id

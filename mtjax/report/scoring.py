@@ -17,6 +17,7 @@ from mtjax.compiling.programs import compile_lowered, enable_compile_cache, trac
 from mtjax.envs import Family
 from mtjax.envs.engines import host
 from mtjax.envs.mixtures import Tabled
+from mtjax.envs.naming import ends
 from mtjax.learning import evaluation, trials
 from mtjax.learning.evaluation import Scores, of_tasks
 from mtjax.names import nearest_error, public
@@ -164,7 +165,7 @@ def report(request: Any, vary: Mapping[str, str]) -> None:
     trained = policy.env
     policy, tasks, named = _with_tasks(policy, vary, request.drawn)
     if vary:
-        print(f"trained on {trained.ends or 'one task'}; scored on {policy.env.ends or 'one task'}")  # type: ignore
+        print(f"trained on {ends(trained) or 'one task'}; scored on {ends(policy.env) or 'one task'}")  # type: ignore
     elif named:
         print(f"tasks and goals are drawn by the seed {request.task_seed}")
     tasks = policy.env.tasks("all") if tasks is None else tasks

@@ -15,7 +15,9 @@ from mtjax.agents import BaseAgent, name_of
 from mtjax.checks import path
 from mtjax.envs import Family
 from mtjax.envs import name_of as env_name_of
-from mtjax.envs.pixels import GREY, Pictured
+from mtjax.envs.contexts import ranges
+from mtjax.envs.pixels import Pictured
+from mtjax.envs.scenery import GREY
 from mtjax.names import InputError, public
 from mtjax.saved import onnx
 from mtjax.saved.operations import steps_of
@@ -45,7 +47,7 @@ def export(policy: Policy, file: str | Path) -> Path:
         raise InputError(f"export takes a policy, from mtjax.load or result.policy(), not a {type(policy).__name__}")
     env, act, obs = policy.env, acting(policy), policy.takes
     assert isinstance(env, Family)
-    values = jax.ShapeDtypeStruct((len(env.ranges),), jnp.float32)
+    values = jax.ShapeDtypeStruct((len(ranges(env)),), jnp.float32)
     program, constants = steps_of(jax.make_jaxpr(act)(obs, values))
     meta = _meta(env, policy.agent, by_name(obs))
     new = file.with_suffix(f".new{file.suffix}")
@@ -88,9 +90,9 @@ def _meta(env: Family, agent: BaseAgent, obs: dict[str, Any]) -> dict[str, Any]:
         "about": " ".join(_about(env, name, x) for name, x in obs.items()),
         "action_size": env.spec.action_size,
         "discrete": env.discrete,  # whether an action is a number from 0 to action_size - 1
-        "parameters": [name for name, _, _ in env.ranges],
-        "trained_from": [low for _, low, _ in env.ranges],
-        "trained_to": [high for _, _, high in env.ranges],
+        "parameters": [name for name, _, _ in ranges(env)],
+        "trained_from": [low for _, low, _ in ranges(env)],
+        "trained_to": [high for _, _, high in ranges(env)],
         "mtjax": __version__,
         "jax": jax.__version__,
     }

@@ -61,7 +61,7 @@ def prepare(config: RunConfig, directory: Path, resume: bool) -> Path:
 
 def _require_same(config: RunConfig, recorded: RunConfig, directory: Path) -> None:
     """Refuse to resume a run with other settings than it had, apart from its steps."""
-    fields = lambda held: {name: getattr(held, name) for name in held.__dataclass_fields__}
+    fields = lambda held: {field.name: getattr(held, field.name) for field in dataclasses.fields(held)}
     alone = lambda config: {"env": config.env, "agent": config.agent, "sweep": config.points}
     parts = lambda config: (config.family, config.training, config.plan)
     every = lambda config: {**alone(config), **settings(config.learner), **ChainMap(*map(fields, parts(config)))}

@@ -17,6 +17,7 @@ from mtjax.checks import path, require_whole, shown
 from mtjax.compiling.programs import trace
 from mtjax.config import RunConfig
 from mtjax.envs import name_of as env_name_of
+from mtjax.envs.contexts import ranges
 from mtjax.envs.family import Family
 from mtjax.envs.mixtures import Tabled
 from mtjax.experience import Replay
@@ -101,7 +102,7 @@ class Policy:
         """Return the task with these parameters, and whether it is one for each of ``size`` observations."""
         if not isinstance(self.env, Family):
             raise InputError("a policy of a mixture takes a task: policy(obs, task)")
-        names = [name for name, _, _ in self.env.ranges]
+        names = [name for name, _, _ in ranges(self.env)]
         values = standalone.ordered(names, parameters, bool(parameters) or self._reads_parameters, size)
         each = any(map(np.ndim, values))
         values = jnp.stack(jnp.broadcast_arrays(*map(jnp.float32, values)), axis=-1) if values else jnp.zeros(0)
@@ -112,7 +113,7 @@ class Policy:
         """Return whether actions depend on the task's parameters."""
         assert isinstance(self.env, Family)
         act = lambda values, obs: self._act(obs, self.task_of(values), None, None)
-        program, _ = steps_of(jax.make_jaxpr(act)(jnp.zeros(len(self.env.ranges)), self.takes))
+        program, _ = steps_of(jax.make_jaxpr(act)(jnp.zeros(len(ranges(self.env))), self.takes))
         return 0 in program["reads"]
 
     def task_of(self, values: Array) -> Task:
@@ -122,7 +123,7 @@ class Policy:
         """
         env, columns = self.env, []
         assert isinstance(env, Family)
-        for i, (name, low, high) in enumerate(env.ranges):
+        for i, (name, low, high) in enumerate(ranges(env)):
             if name in env.parameters and env.parameters[name].direction:
                 columns += [jnp.sin(values[i]), jnp.cos(values[i])]
             else:

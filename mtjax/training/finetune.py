@@ -13,6 +13,7 @@ from mtjax.agents.state import AgentState, of_tasks
 from mtjax.agents.swept import agents_at
 from mtjax.config import NO_FINE_TUNING, RunConfig
 from mtjax.envs import Family
+from mtjax.envs.contexts import ranges
 from mtjax.envs.mixtures import require_family
 from mtjax.saved import pretrained
 from mtjax.saved.policy import Policy
@@ -59,7 +60,7 @@ def require_fit(start: Policy, env: Env, agent: BaseAgent) -> None:
             f"the run's networks map {_sizes(theirs)} to {_actions(theirs)}; "
             f"the new tasks have {_sizes(ours)} and {_actions(ours)}{fix}"
         )
-    alike = not isinstance(family, Family) or not isinstance(known, Family) or family.ranges == known.ranges
+    alike = not isinstance(family, Family) or not isinstance(known, Family) or ranges(family) == ranges(known)
     if theirs.context_size != ours.context_size or not alike:
         raise InputError("the context of these tasks is not written as the run's; give env.scaled_as(policy.env)")
     _require_numbers(start, env, agent)

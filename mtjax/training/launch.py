@@ -7,6 +7,7 @@ import jax
 
 from mtjax.config import RunConfig
 from mtjax.envs import Family
+from mtjax.envs.contexts import ranges
 from mtjax.envs.task_table import forgetful
 from mtjax.parallel import hosts
 from mtjax.saved.folder import remove_unused
@@ -102,6 +103,6 @@ def _origin(config: RunConfig) -> str:
         return ""
     family, told = config.family, config.learner.conditioning.by_parameters
     assert isinstance(family, Family)
-    unseen = set(family.varied) - {name for name, _, _ in family.ranges} if told else ()
+    unseen = set(family.varied) - {name for name, _, _ in ranges(family)} if told else ()
     blind = f"; its networks cannot be told {', '.join(sorted(unseen))}" if unseen else ""
     return f"from {config.start}: {config.learner.tune} of its parameters learn{blind}"

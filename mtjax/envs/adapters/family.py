@@ -88,16 +88,13 @@ class Adapted(Family):
         """Begin an episode of ``task`` in a fresh random state."""
         start_key, key = jax.random.split(key)
         world, obs = self.begin(task, start_key)
-        return self._step(AdaptedState(world, key), obs, jnp.float32(0), jnp.bool_(False), jnp.bool_(False))
+        return _strong_step(AdaptedState(world, key), obs, jnp.float32(0), jnp.bool_(False), jnp.bool_(False))
 
     def step(self, task: Task, state: AdaptedState, action: Array) -> Step:
         """Advance one step under ``action``; observation and reward are those after it."""
         world, obs, reward, terminated, truncated = self.advance(task, state.world, action, state.key)
-        return self._step(AdaptedState(world, jax.random.split(state.key)[1]), obs, reward, terminated, truncated)
-
-    def _step(self, state: AdaptedState, obs: Any, reward: Any, terminated: Any, truncated: Any) -> Step:
-        ends = jnp.bool_(terminated), jnp.bool_(truncated)
-        return Step(jax.tree.map(_strong, state), _vector(obs), jnp.float32(reward), ends[0], truncated=ends[1])
+        key = jax.random.split(state.key)[1]
+        return _strong_step(AdaptedState(world, key), obs, reward, terminated, truncated)
 
     def params_of(self, task: Task) -> dict[str, Array]:
         """Return the parameters that a task has of its own, by the package's names and in its types."""
@@ -135,6 +132,12 @@ def _as_default(default: Any, value: Array) -> Array:
     if isinstance(default, bool):
         return value > 0.5
     return jnp.int32(jnp.round(value)) if isinstance(default, int) else value
+
+
+def _strong_step(state: AdaptedState, obs: Any, reward: Any, terminated: Any, truncated: Any) -> Step:
+    """Return a step whose leaves keep their dtypes from one to the next."""
+    ends = jnp.bool_(terminated), jnp.bool_(truncated)
+    return Step(jax.tree.map(_strong, state), _vector(obs), jnp.float32(reward), ends[0], truncated=ends[1])
 
 
 def _vector(obs: Any) -> Array:

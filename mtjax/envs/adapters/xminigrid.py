@@ -83,8 +83,9 @@ class XMiniGrid(Adapted):
         """Return the leaves of the table, with the ruleset of every row."""
         if not self.defaults:
             return {"model": {}, "goal": {}}
-        given, count = self.values.get("ruleset", np.zeros(self.count)), self.benchmark.num_rulesets()
-        wrong = next((x for x in given if not 0 <= x < count or (self.variation.draws is None and x % 1)), None)
+        found, count = self.variation, self.benchmark.num_rulesets()
+        given = found.values.get("ruleset", np.zeros(found.count))
+        wrong = next((x for x in given if not 0 <= x < count or (found.draws is None and x % 1)), None)
         if wrong is not None:
             raise InputError(
                 f"a ruleset is a whole number from 0 to {count - 1}, not {wrong:g}; --split=none holds no values out, "

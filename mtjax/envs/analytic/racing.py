@@ -13,10 +13,11 @@ import numpy as np
 
 from mtjax.envs.analytic.tracks import Line, line_at, make_track, outline
 from mtjax.envs.family import Family
-from mtjax.envs.looks import Look
+from mtjax.envs.looks import WITHOUT_CAMERA, Look
 from mtjax.envs.painters.poses import Pose
 from mtjax.envs.parameters import Parameter, positive
 from mtjax.envs.pixels import Mark, Pictured
+from mtjax.envs.scenery import Visible
 from mtjax.types import Array, Key, Step, Task
 
 # The car of f1tenth_gym (O'Kelly et al. 2020), in SI units.
@@ -101,13 +102,10 @@ class Racing(Pictured, Family):
     action_size: ClassVar[int] = 2
     step_seconds: ClassVar[float] = 0.05
     look: ClassVar[Look | None] = Look(camera=(0.0, 0.0, 1.5), tilt=75.0, fovy=65.0)
+    looks: ClassVar[Mapping[str, Parameter]] = WITHOUT_CAMERA  # as the car turns it
+    scenic: ClassVar[tuple[str, ...]] = ("track", "width")
 
     # Tasks.
-
-    @property
-    def every_parameter(self) -> Mapping[str, Parameter]:
-        """Return the parameters of the family and those of looks but the camera's angle, as the car turns it."""
-        return {name: p for name, p in super().every_parameter.items() if name != "camera-angle"}
 
     def waves(self, values: Mapping[str, float]) -> np.ndarray:
         """Return the waves of the track of a task with these parameter values."""
@@ -116,7 +114,7 @@ class Racing(Pictured, Family):
     def build(self) -> dict[str, dict[str, Any]]:
         """Return the leaves (R, ...) of every row of the table, with the waves of its track."""
         built = super().build()
-        waves = np.stack(self.for_rows(self.waves, ("track",))).astype(np.float32)
+        waves = np.stack(self.variation.for_rows(self.waves, ("track",))).astype(np.float32)
         return built | {"goal": built["goal"] | {"waves": waves}}
 
     # Steps.
@@ -175,11 +173,6 @@ class Racing(Pictured, Family):
 
     # What is seen.
 
-    @property
-    def scenic(self) -> tuple[str, ...]:
-        """Return the parameters in which scenes of tasks may differ."""
-        return ("track", "width", *super().scenic)
-
     def compile_spec(self, values: Mapping[str, float] | None = None) -> mujoco.MjSpec:
         """Return the floor, the car, and kerbs along both sides of the track, red and white by turns."""
         spec, geom, given = mujoco.MjSpec(), mujoco.mjtGeom, values or {}
@@ -206,15 +199,15 @@ class Racing(Pictured, Family):
         at = lambda place: jnp.append(place, 0.15)
         return {"car": Mark(at(state.place), along=jnp.append(ahead, 0.0)), "nose": Mark(at(state.place + 0.3 * ahead))}
 
-    def eye(self, task: Task, state: CarState) -> Pose:
-        """Return the camera behind the car, which looks ahead and down."""
+    def visible(self, task: Task, state: CarState) -> Visible:
+        """Return the car, and the camera behind it, which looks ahead and down."""
         cos, sin = jnp.cos(state.heading), jnp.sin(state.heading)
         down, level = math.sin(_PITCH), math.cos(_PITCH)
         zero = jnp.zeros_like(cos)
         behind, above = _EYE
         position = (state.place[0] - behind * cos, state.place[1] - behind * sin, zero + above)
         axes = (sin, -cos, zero), (cos * down, sin * down, zero + level), (-cos * level, -sin * level, zero + down)
-        return Pose(position, axes)
+        return super().visible(task, state)._replace(eye=Pose(position, axes))
 
 
 def _move(task: Task, state: CarState, steer: Array, push: Array, h: float) -> CarState:

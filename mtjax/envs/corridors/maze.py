@@ -3,7 +3,6 @@
 import dataclasses
 import math
 from collections.abc import Mapping
-from functools import cached_property
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
@@ -14,11 +13,13 @@ import numpy as np
 
 from mtjax.envs.corridors.layouts import Layout, find_ways, make_layout
 from mtjax.envs.family import Family
-from mtjax.envs.looks import Look
+from mtjax.envs.looks import WITHOUT_CAMERA, Look
+from mtjax.envs.painters.caster import Caster
 from mtjax.envs.painters.grid import GridCaster
 from mtjax.envs.painters.poses import Pose
 from mtjax.envs.parameters import Parameter
 from mtjax.envs.pixels import Mark, Pictured
+from mtjax.envs.scenery import Visible
 from mtjax.types import Array, InputError, Key, Step, Task
 
 _RADIUS, _BALL = 0.2, 0.2  # [m] of the walker and of balls
@@ -89,6 +90,8 @@ class CorridorMaze(Pictured, Family):
     action_size: ClassVar[int] = 2
     step_seconds: ClassVar[float] = 0.1
     look: ClassVar[Look | None] = Look(camera=(0.0, 0.0, _EYE), tilt=90.0, fovy=75.0)
+    looks: ClassVar[Mapping[str, Parameter]] = WITHOUT_CAMERA  # as the walker turns it
+    caster: ClassVar[type[Caster]] = GridCaster
 
     def __post_init__(self):
         if not isinstance(self.cells, int) or not _LEAST <= self.cells <= _MOST:
@@ -97,11 +100,6 @@ class CorridorMaze(Pictured, Family):
 
     # Tasks.
 
-    @property
-    def every_parameter(self) -> Mapping[str, Parameter]:
-        """Return the parameters of the family and those of looks but the camera's angle, as the walker turns it."""
-        return {name: p for name, p in super().every_parameter.items() if name != "camera-angle"}
-
     def layout(self, values: Mapping[str, float]) -> Layout:
         """Return the layout of a task with these parameter values."""
         nominal = self.parameters["layout"].nominal
@@ -109,11 +107,11 @@ class CorridorMaze(Pictured, Family):
 
     def build(self) -> dict[str, dict[str, Any]]:
         """Return walls, balls and, if they are rewarded, ways to the goal (R, ...) of every row of the table."""
-        layouts = self.for_rows(self.layout, ("layout",))
+        layouts = self.variation.for_rows(self.layout, ("layout",))
         built = super().build()
         goal = built["goal"] | {"balls": np.stack([layout.balls for layout in layouts]).astype(np.float32)}
         if self.dense:
-            ways = self.for_rows(self._ways, ("layout", "goal-colour"))
+            ways = self.variation.for_rows(self._ways, ("layout", "goal-colour"))
             goal |= {"ahead": np.stack([way.ahead for way in ways]), "rest": np.stack([way.rest for way in ways])}
         return built | {"model": {"walls": np.stack([layout.walls for layout in layouts])}, "goal": goal}
 
@@ -187,30 +185,22 @@ class CorridorMaze(Pictured, Family):
         return spec
 
     @property
-    def scenic(self) -> tuple[str, ...]:
-        """Return the parameters in which scenes of tasks may differ. The grid's caster reads walls from tasks."""
-        return super().scenic if self.painter == "auto" else ("layout", *super().scenic)
-
-    @cached_property
-    def artist(self) -> Any:
-        """Return the painter of this family on this device."""
-        return GridCaster(self.scene, self.pixels) if self.painter == "auto" else super().artist
-
-    def scene_leaf(self, task: Task, name: str) -> Array:
-        """Return a field of the task's scene by its name in MuJoCo, or the "walls" of the grid."""
-        return task.model["walls"] if name == "walls" else super().scene_leaf(task, name)
+    def scenic(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Return the parameters in which scenes of tasks differ. The grid's caster reads walls from tasks."""
+        return () if self.painter == "auto" else ("layout",)
 
     def marks(self, task: Task, state: WalkerState) -> dict[str, Mark]:
         """Return where the balls are."""
         balls = task.goal["balls"]
         return {name: Mark(jnp.append(balls[i], _BALL)) for i, name in enumerate(_COLOURS)}
 
-    def eye(self, task: Task, state: WalkerState) -> Pose:
-        """Return the walker's eye, which looks ahead."""
+    def visible(self, task: Task, state: WalkerState) -> Visible:
+        """Return the balls, the walls of the grid, and the walker's eye, which looks ahead."""
         cos, sin = jnp.cos(state.heading), jnp.sin(state.heading)
         zero = jnp.zeros_like(cos)
         position = (state.place[0], state.place[1], zero + _EYE)
-        return Pose(position, ((sin, -cos, zero), (zero, zero, zero + 1), (-cos, -sin, zero)))
+        eye = Pose(position, ((sin, -cos, zero), (zero, zero, zero + 1), (-cos, -sin, zero)))
+        return super().visible(task, state)._replace(eye=eye, fields={"walls": task.model["walls"]})
 
 
 def _goal(task: Task) -> Array:

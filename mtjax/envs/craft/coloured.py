@@ -16,6 +16,7 @@ from mtjax.envs.looks import Look
 from mtjax.envs.mtenv.tabular import DrawnTasks
 from mtjax.envs.parameters import Parameter
 from mtjax.envs.pixels import Mark, Pictured
+from mtjax.envs.scenery import Visible
 from mtjax.types import Array, InputError, Key, Step, Task
 
 _AROUND = np.array([(0, 0), *MOVES])  # the square itself, and those below, above, to the left and to the right
@@ -70,6 +71,7 @@ class ColouredMaze(Pictured, DrawnTasks):
     """Standard deviation of rewards."""
 
     parameters: ClassVar[Mapping[str, Parameter]] = MappingProxyType({})
+    looks: ClassVar[Mapping[str, Parameter]] = MappingProxyType({})
     action_size: ClassVar[int] = len(MOVES)
     episode_steps: ClassVar[int] = 100
     step_seconds: ClassVar[float] = 0.2
@@ -88,11 +90,6 @@ class ColouredMaze(Pictured, DrawnTasks):
                 raise InputError(f"{name} must be at least 0, not {getattr(self, name)}")
 
     # Tasks.
-
-    @property
-    def every_parameter(self) -> Mapping[str, Parameter]:
-        """Return no parameters: tasks are drawn."""
-        return {}
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
@@ -171,31 +168,13 @@ class ColouredMaze(Pictured, DrawnTasks):
         add(name="walker", type=geom.mjGEOM_CYLINDER, size=[0.3, 0.3, 0], rgba=_SKIN)
         return spec
 
-    def scene_model(self, row: int) -> mujoco.MjModel:
-        """Return the compiled model of what is seen of the task in a row of the table."""
-        model = super().scene_model(row)
-        task = jax.tree.map(lambda x: x[row], self.table.tasks)
-        with jax.ensure_compile_time_eval():  # also while a program is traced
-            model.geom_rgba[self._boxes(model)] = self._rgba(task)
-        return model
-
-    def scene_leaf(self, task: Task, name: str) -> Array:
-        """Return a field of the task's scene by its name in MuJoCo. The task has the colours."""
-        leaf = super().scene_leaf(task, name)
-        return leaf.at[self._boxes(self.scene.model)].set(self._rgba(task)) if name == "geom_rgba" else leaf
-
-    def _boxes(self, model: mujoco.MjModel) -> np.ndarray:
-        """Return the numbers (cells^2,) of the squares' geoms, by x and y."""
-        return np.array([model.geom(f"square {x}.{y}").id for x, y in np.ndindex(self.cells, self.cells)])
-
-    def _rgba(self, task: Task) -> Array:
-        """Return the colours (cells^2, 4) of the squares."""
+    def visible(self, task: Task, state: Walk) -> Visible:
+        """Return the walker, and the colours of all geoms: of squares, of the last one's mark, of the walker."""
         rgb = jnp.asarray(_PAINTS, jnp.float32)[numbers_of(task, self.num_colours).ravel()]
-        return jnp.concatenate([rgb, jnp.ones((len(rgb), 1))], axis=1)
-
-    def marks(self, task: Task, state: Walk) -> dict[str, Mark]:
-        """Return where the walker is."""
-        return {"walker": Mark(jnp.append(state.place, 0.3))}
+        rgba = jnp.concatenate([rgb, jnp.ones((len(rgb), 1))], axis=1)
+        colours = jnp.concatenate([rgba, jnp.array([_AIM, _SKIN])])
+        walker = Mark(jnp.append(state.place, 0.3))
+        return Visible(jnp.zeros(0), {"walker": walker}, fields={"geom_rgba": colours})
 
 
 def numbers_of(task: Task, colours: int) -> Array:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mtjax.envs.choosing import Choosing
+from mtjax.envs.contexts import goals
 from mtjax.envs.family import Family
 from mtjax.envs.pixels import Pictured
 from mtjax.envs.variation import Variation
@@ -60,7 +61,7 @@ class Sketched(Pictured, Choosing, Family):
         unknown = [name for name in self.held_out if name not in self.sketches]
         if unknown:
             raise InputError(f"held-out names tasks, such as {next(iter(self.sketches))}; there is no {unknown[0]}")
-        if self.split == "dense" and not self.train_count:
+        if self.split == "dense" and not self.variation.counts["train"]:
             raise InputError("held-out leaves no task to train on; name fewer, or use --split=none")
         if self.symbol_steps < 1:
             raise InputError(f"symbol-steps must be at least 1, not {self.symbol_steps}")
@@ -117,26 +118,23 @@ class Sketched(Pictured, Choosing, Family):
             return found
         names = list(self.sketches)
         splits = np.array([self.split_of(names[round(row[found.names.index(GOAL)])]) for row in found.rows["train"]])
-        return found._replace(rows={split: found.rows["train"][splits == split] for split in found.rows})
+        return dataclasses.replace(found, rows={split: found.rows["train"][splits == split] for split in found.rows})
 
     @property
     def numbers_of_goals(self) -> np.ndarray:
         """Return the number (R,) int of each row's name of a task."""
-        return np.round(self.goals()[GOAL]).astype(np.int32)
+        return np.round(goals(self)[GOAL]).astype(np.int32)
 
-    def build(self) -> dict[str, dict[str, Any]]:
-        """Return the "goal" leaves (R, ...) of every row, and with pictures what differs in them."""
+    def build(self) -> dict[str, Any]:
+        """Return the "goal" leaves (R, ...) of every row, and contexts that tell the sketch."""
         tables = {"sketch": self.codes, "length": np.sum(self.codes >= 0, axis=1, dtype=np.int32), **self.facts()}
         goal = {name: table[self.numbers_of_goals] for name, table in tables.items()}
-        seen = {"scene": self.scene_leaves()} if self.pixels else {}
-        return {"model": {}, "goal": self.goals() | goal, **seen}
+        context = self.told()[self.numbers_of_goals].astype(np.float32)
+        return {"model": {}, "goal": goals(self) | goal, "context": context}
 
     def told(self) -> np.ndarray:
         """Return the contexts (N, C) of all N names of tasks: their sketches, one-hot."""
         return np.eye(len(self.symbols) + 1)[self.codes][..., :-1].reshape(len(self.codes), -1)  # the last is -1's
-
-    def _context(self) -> np.ndarray:
-        return self.told()[self.numbers_of_goals].astype(np.float32)
 
     def name_of(self, row: int) -> str:
         """Return the name of the task in a row of the table."""
@@ -149,9 +147,10 @@ class Sketched(Pictured, Choosing, Family):
         """Return the number of actions, with STOP if the sketch is followed."""
         return self.num_moves + self.sketched
 
-    @property
-    def _spec(self) -> Spec:  # type: ignore[override]
-        return super()._spec._replace(symbols=len(self.symbols) * self.sketched)
+    @cached_property
+    def spec(self) -> Spec:
+        """Return the sizes of observation, action and context, and how many symbols there are if one is observed."""
+        return super().spec._replace(symbols=len(self.symbols) * self.sketched)
 
     def reset(self, task: Task, key: Key) -> Step:
         state = Followed(self.begin(task, key), jnp.int32(0), jnp.int32(0))

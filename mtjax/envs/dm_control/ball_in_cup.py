@@ -1,6 +1,7 @@
 """The ball-in-cup domain of dm_control: swing a ball on a string up into a cup."""
 
 import dataclasses
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import ClassVar
 
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 import mujoco
 
 from mtjax.envs.dm_control.rewards import tolerance
-from mtjax.envs.domain import Domain
+from mtjax.envs.domain import Domain, start_apart
 from mtjax.envs.engines.base import World
 from mtjax.envs.looks import Look
 from mtjax.envs.parameters import DAMPING, FRICTION, GEAR, GRAVITY, MASS, Parameter, body_mass, positive
@@ -67,13 +68,15 @@ class BallInCup(Domain):
     starts_untouched: ClassVar[bool] = True
     look: ClassVar = Look((0, -1, 0.8), 63.435, diffuse=0.6, sun=True)
 
-    def add_marks(self, spec: mujoco.MjSpec) -> None:
-        """Add the string as a thin capsule, since the physics has a tendon."""
+    def seen_spec(self, values: Mapping[str, float]) -> mujoco.MjSpec:
+        """Return the model with the string as a thin capsule, since the physics has a tendon."""
+        spec = self.compile_spec(values)
         shape = {"type": mujoco.mjtGeom.mjGEOM_CAPSULE, "size": [spec.tendon("string").width, 0.1, 0]}
         spec.worldbody.add_geom(
             name="string", rgba=spec.tendon("string").rgba, mass=0, contype=0, conaffinity=0, **shape
         )
         spec.tendon("string").rgba = [0, 0, 0, 0]
+        return spec
 
     def marks(self, task: Task, world: World) -> dict[str, Mark]:
         cup, ball = self.ends(task, world)
@@ -91,7 +94,7 @@ class BallInCup(Domain):
     def start(self, task: Task, key: Key) -> tuple[Array, Array]:
         low, high = jnp.array([_START_LOW, _START_HIGH]).T
         draw = lambda key: jnp.concatenate([jnp.zeros(2), jax.random.uniform(key, (2,), minval=low, maxval=high)])
-        return self.start_apart(task, key, draw), jnp.zeros(self.models[0].nv)
+        return start_apart(self, task, key, draw), jnp.zeros(self.models[0].nv)
 
     def observe(self, task: Task, world: World) -> Array:
         return jnp.concatenate([world.qpos, world.qvel])

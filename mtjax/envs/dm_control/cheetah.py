@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 from types import MappingProxyType
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -11,11 +11,12 @@ import mujoco
 import numpy as np
 
 from mtjax.envs.dm_control.rewards import tolerance
-from mtjax.envs.domain import Domain
+from mtjax.envs.domain import Domain, rewarded
 from mtjax.envs.engines.base import World
 from mtjax.envs.looks import Look
 from mtjax.envs.parameters import DAMPING, FRICTION, GEAR, GRAVITY, MASS, Parameter, body_mass, positive
-from mtjax.types import Array, Key, Task
+from mtjax.envs.planar import forward_velocity, planar
+from mtjax.types import Array, Key, Task, Transition
 
 _TOTAL_MASS = 14.0  # [kg]
 _LEGS = ("bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot")
@@ -119,12 +120,15 @@ class CheetahRun(Domain):
     def prepare(self, spec: mujoco.MjSpec) -> None:
         _weigh(spec)
 
-    def starts(self, models: Sequence[mujoco.MjModel], random: np.random.Generator) -> np.ndarray:
-        distinct = {id(model): model for model in models}
+    def build(self) -> dict[str, dict[str, Any]]:
+        """Return the leaves (R, ...) of every row of the table, with pools of settled starts (R, P, nq + nv)."""
+        built, distinct = super().build(), {id(model): model for model in self.models}
         size = int(np.clip(_POOL // len(distinct), 8, 64))
+        random = np.random.default_rng(self.task_seed)
         states = _settle([model for model in distinct.values() for _ in range(size)], random)
         pools = dict(zip(distinct, states.reshape(len(distinct), size, -1), strict=True))
-        return np.stack([pools[id(model)] for model in models])
+        starts = np.float32(np.stack([pools[id(model)] for model in self.models]))
+        return built | {"goal": built["goal"] | {"starts": starts}}
 
     def start(self, task: Task, key: Key) -> tuple[Array, Array]:
         state = jax.random.choice(key, task.goal["starts"])
@@ -133,12 +137,13 @@ class CheetahRun(Domain):
     def observe(self, task: Task, world: World) -> Array:
         return jnp.concatenate([world.qpos[1:], world.qvel])
 
-    def recall(self, task: Task, obs: Array) -> World:
-        qvel = obs[self.models[0].nq - 1 :]
-        return World(jnp.pad(obs[: -len(qvel)], (1, 0)), qvel, jnp.zeros_like(qvel), None)  # wherever along x
+    def relabel(self, task: Task, transition: Transition, key: Key) -> Transition:
+        obs, qvel = transition.next_obs, transition.next_obs[self.models[0].nq - 1 :]
+        world = World(jnp.pad(obs[: -len(qvel)], (1, 0)), qvel, jnp.zeros_like(qvel), None)  # wherever along x
+        return rewarded(self, task, transition, world)
 
     def reward(self, task: Task, world: World, action: Array) -> Array:
-        speed, velocity = task.goal["speed"], self.heading * self.forward_velocity(task, world)
+        speed, velocity = task.goal["speed"], self.heading * forward_velocity(self, task, world)
         return tolerance(velocity, speed, jnp.inf, speed, "linear", value_at_margin=0)
 
 
@@ -167,7 +172,7 @@ class CheetahJump(CheetahRun):
 
     def reward(self, task: Task, world: World, action: Array) -> Array:
         asked, mass = task.goal["height"], self.leaf(task, "body_mass")
-        heights = self.planar(task, world).centre[:, 1]
+        heights = planar(self, task, world).centre[:, 1]
         height = jnp.dot(mass, heights, precision="highest") / jnp.sum(mass)
         return tolerance(height, asked, jnp.inf, asked - _STANDING, "linear", value_at_margin=0)
 
@@ -186,7 +191,7 @@ class CheetahSpeed(CheetahRun):
 
     def reward(self, task: Task, world: World, action: Array) -> Array:
         speed = task.goal["speed"]
-        return tolerance(self.forward_velocity(task, world), speed, speed, speed, "linear", value_at_margin=0)
+        return tolerance(forward_velocity(self, task, world), speed, speed, speed, "linear", value_at_margin=0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -204,7 +209,7 @@ class CheetahDirection(CheetahRun):
 
     def reward(self, task: Task, world: World, action: Array) -> Array:
         speed = task.goal["speed"]
-        forwards = jnp.sign(task.goal["direction"]) * self.forward_velocity(task, world)
+        forwards = jnp.sign(task.goal["direction"]) * forward_velocity(self, task, world)
         return tolerance(forwards, speed, jnp.inf, speed, "linear", value_at_margin=0)
 
 

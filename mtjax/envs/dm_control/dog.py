@@ -2,12 +2,12 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
 from types import MappingProxyType
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -77,6 +77,13 @@ def _read_dog() -> mujoco.MjSpec:
     return spec
 
 
+def _simplify(base: mujoco.MjModel) -> None:
+    """Let all but the teeth touch the floor, and nothing itself."""
+    body = (base.geom_contype > 0) & (base.geom_bodyid > 0) & (base.geom_condim == 1)
+    base.geom_contype[:], base.geom_conaffinity[:] = base.geom_bodyid == 0, body
+    base.opt.noslip_iterations = 0
+
+
 @dataclasses.dataclass(frozen=True)
 class Dog(Domain):
     """A dog whose tasks are to stand, or to stand and move.
@@ -124,16 +131,14 @@ class Dog(Domain):
             "strength": STRENGTH,
         }
     )
-    model_file: ClassVar[str] = "dog.xml"  # dm_control's
+    model_file: ClassVar = staticmethod(lambda: _read_dog().copy())  # dm_control's
     num_substeps: ClassVar[int] = 3
     episode_steps: ClassVar[int] = 1000
     default_iterations: ClassVar[int] = 6
+    simplify: ClassVar = staticmethod(_simplify)
     floor: ClassVar[float] = 15.0  # [m] half a side
     meshes: ClassVar[bool] = True
     look: ClassVar = Look((0, -1.5, 0.8), 59.036, light=(0, 0, 3), follow="torso")
-
-    def _read_model(self) -> mujoco.MjSpec:
-        return _read_dog().copy()
 
     def seen_spec(self, values: Mapping[str, float]) -> mujoco.MjSpec:
         spec = _whole_dog()
@@ -142,22 +147,18 @@ class Dog(Domain):
             geom.group = 0 if geom.type == mujoco.mjtGeom.mjGEOM_MESH else geom.group
         return spec
 
-    def _base(self, iterations: int) -> mujoco.MjModel:
-        """Return the model of MJX or Warp, in which all but the teeth touch the floor, and nothing touches itself."""
-        base = super()._base(iterations)
-        body = (base.geom_contype > 0) & (base.geom_bodyid > 0) & (base.geom_condim == 1)
-        base.geom_contype[:], base.geom_conaffinity[:] = base.geom_bodyid == 0, body
-        base.opt.noslip_iterations = 0
-        return base
-
     def prepare(self, spec: mujoco.MjSpec) -> None:
         spec.geom("floor").size = [self.floor, self.floor, 0.1]
 
-    def starts(self, models: Sequence[mujoco.MjModel], random: np.random.Generator) -> np.ndarray:
-        """Return what the reward asks for (R, 3): heights of torso and pelvis [m], and the body's weight [N]."""
-        asked = {id(model): model for model in models}
-        asked = {name: _demands(model) for name, model in asked.items()}
-        return np.stack([asked[id(model)] for model in models])
+    def build(self) -> dict[str, dict[str, Any]]:
+        """Return the leaves (R, ...) of every row of the table, with what the reward asks for (R, 3).
+
+        These are the heights of torso and pelvis [m], and the body's weight [N].
+        """
+        built, distinct = super().build(), {id(model): model for model in self.models}
+        found = {name: _demands(model) for name, model in distinct.items()}
+        starts = np.float32(np.stack([found[id(model)] for model in self.models]))
+        return built | {"goal": built["goal"] | {"starts": starts}}
 
     def start(self, task: Task, key: Key) -> tuple[Array, Array]:
         turn_key, jolt_key = jax.random.split(jax.random.split(key)[1])

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import ClassVar
 
@@ -9,11 +10,12 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from mtjax.envs.domain import Domain, start_joints
+from mtjax.envs.domain import Domain, start_apart, start_joints
 from mtjax.envs.engines.base import World
 from mtjax.envs.looks import TARGET, Look
 from mtjax.envs.parameters import DAMPING, FRICTION, GEAR, MASS, Parameter, positive
 from mtjax.envs.pixels import Mark
+from mtjax.envs.planar import planar
 from mtjax.types import Array, Key, Task, Transition
 
 _SPIN_VELOCITY = 15.0  # [rad/s]
@@ -61,14 +63,14 @@ _LOOK = Look((0, -1, 0.8), 63.435, diffuse=0.6, sun=True)
 def _start(finger: Domain, task: Task, key: Key) -> tuple[Array, Array]:
     """Draw positions and velocities of the three joints at which nothing touches."""
     model = finger.models[0]
-    return finger.start_apart(task, key, lambda key: start_joints(model, key)), jnp.zeros(model.nv)
+    return start_apart(finger, task, key, lambda key: start_joints(model, key)), jnp.zeros(model.nv)
 
 
 def _feel(finger: Domain, task: Task, world: World) -> Array:
     """Return what all tasks observe (9,): joints, the spinner's tip, their velocities and touch."""
     model = finger.models[0]
     point = finger.leaf(task, "site_pos")[model.site("tip").id]
-    tip = finger.planar(task, world).offset(model.body("spinner").id, point)
+    tip = planar(finger, task, world).offset(model.body("spinner").id, point)
     return jnp.concatenate([world.qpos[:2], tip, world.qvel, jnp.log1p(world.sensors)])
 
 
@@ -162,12 +164,14 @@ class FingerTurn(Domain):
     fresh_goals: ClassVar[bool] = True
     look: ClassVar = _LOOK
 
-    def add_marks(self, spec: mujoco.MjSpec) -> None:
-        """Add the target, and the spinner's tip that has to be in it."""
+    def seen_spec(self, values: Mapping[str, float]) -> mujoco.MjSpec:
+        """Return the model with the target, and with the spinner's tip that has to be in it."""
+        spec = self.compile_spec(values)
         seen = {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "rgba": TARGET, "mass": 0, "contype": 0, "conaffinity": 0}
         site = spec.site("tip")
         spec.body("spinner").add_geom(name="tip", pos=site.pos, size=site.size, **seen)
         spec.worldbody.add_geom(name="target", size=[self.parameters["target-size"].nominal, 0, 0], **seen)
+        return spec
 
     def marks(self, task: Task, world: World) -> dict[str, Mark]:
         hinge = self.leaf(task, "body_pos")[self.models[0].body("spinner").id]

@@ -12,6 +12,7 @@ from mtjax.envs.domain import Domain, start_joints
 from mtjax.envs.engines.base import World
 from mtjax.envs.looks import Look
 from mtjax.envs.parameters import DAMPING, FRICTION, GEAR, GRAVITY, MASS, body_mass, positive
+from mtjax.envs.planar import forward_velocity, planar
 from mtjax.types import Array, Key, Task
 
 _HEIGHTS = (0.6, 2.0)  # [m]
@@ -84,13 +85,13 @@ class Hopper(Domain):
         return jnp.concatenate([world.qpos[1:], world.qvel, jnp.log1p(world.sensors)])
 
     def reward(self, task: Task, world: World, action: Array) -> Array:
-        speed, velocity = task.goal["speed"], self.heading * self.forward_velocity(task, world)
+        speed, velocity = task.goal["speed"], self.heading * forward_velocity(self, task, world)
         hopping = tolerance(velocity, speed, jnp.inf, speed / 2, "linear", value_at_margin=0.5)
         return self.standing(task, world) * hopping
 
     def standing(self, task: Task, world: World) -> Array:
         """Return whether the torso is high enough over the foot, ()."""
-        height = self.planar(task, world).centre[:, 1]
+        height = planar(self, task, world).centre[:, 1]
         torso, foot = (self.models[0].body(name).id for name in ("torso", "foot"))
         return tolerance(height[torso] - height[foot], *_HEIGHTS)
 

@@ -9,7 +9,7 @@ import mujoco
 
 from mtjax.envs.dm_control.attitude import upward
 from mtjax.envs.dm_control.rewards import tolerance
-from mtjax.envs.domain import Domain, start_joints
+from mtjax.envs.domain import Domain, start_apart, start_joints
 from mtjax.envs.engines.base import World
 from mtjax.envs.looks import Look
 from mtjax.envs.parameters import DAMPING, FRICTION, GEAR, GRAVITY, MASS, body_mass, positive
@@ -81,7 +81,7 @@ class Humanoid(Domain):
 
     def start(self, task: Task, key: Key) -> tuple[Array, Array]:
         model = self.models[0]
-        return self.start_apart(task, key, lambda key: start_joints(model, key)), jnp.zeros(model.nv)
+        return start_apart(self, task, key, lambda key: start_joints(model, key)), jnp.zeros(model.nv)
 
     def observe(self, task: Task, world: World) -> Array:
         velocity, head, limbs = jnp.split(world.sensors, (3, 6))

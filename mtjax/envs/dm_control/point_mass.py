@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import mujoco
 
 from mtjax.envs.dm_control.rewards import tolerance
-from mtjax.envs.domain import Domain, start_joints
+from mtjax.envs.domain import Domain, rewarded, start_joints
 from mtjax.envs.engines.base import World
 from mtjax.envs.looks import Look
 from mtjax.envs.parameters import DAMPING, GEAR, MASS, Parameter
-from mtjax.types import Array, Key, Task
+from mtjax.types import Array, Key, Task, Transition
 
 _ARENA = 0.29  # [m] as far as the ball goes from the middle along x and y
 _FALL = 0.41  # [m] half the arena's diagonal
@@ -75,8 +75,9 @@ class PointMass(Domain):
     def observe(self, task: Task, world: World) -> Array:
         return jnp.concatenate([world.qpos, world.qvel])
 
-    def recall(self, task: Task, obs: Array) -> World:
-        return World(obs[:2], obs[2:], jnp.zeros(2), None)
+    def relabel(self, task: Task, transition: Transition, key: Key) -> Transition:
+        qpos, qvel = jnp.split(transition.next_obs, 2)
+        return rewarded(self, task, transition, World(qpos, qvel, jnp.zeros(2), None))
 
     def reward(self, task: Task, world: World, action: Array) -> Array:
         distance, radius = self._target(task, world)

@@ -1,9 +1,8 @@
 """The quadruped domain of dm_control: a heavy body on four legs walks and runs."""
 
 import dataclasses
-from collections.abc import Sequence
 from types import MappingProxyType
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import mujoco
@@ -82,11 +81,15 @@ class QuadrupedWalk(Domain):
         length = _SECONDS * self.parameters["speed"].nominal
         spec.geom("floor").size = [length, length, 0.5]
 
-    def starts(self, models: Sequence[mujoco.MjModel], random: np.random.Generator) -> np.ndarray:
-        """Return places, axes and sizes (R, G, 15) of all shapes in the torso's frame, in the model's own pose."""
-        posed = {id(model): model for model in models}
-        posed = {name: _pose(model) for name, model in posed.items()}
-        return np.stack([posed[id(model)] for model in models])
+    def build(self) -> dict[str, dict[str, Any]]:
+        """Return the leaves (R, ...) of every row of the table, with places, axes and sizes (R, G, 15) of all shapes.
+
+        They are in the torso's frame, in the model's own pose.
+        """
+        built, distinct = super().build(), {id(model): model for model in self.models}
+        found = {name: _pose(model) for name, model in distinct.items()}
+        starts = np.float32(np.stack([found[id(model)] for model in self.models]))
+        return built | {"goal": built["goal"] | {"starts": starts}}
 
     def start(self, task: Task, key: Key) -> tuple[Array, Array]:
         model, turned = self.models[0], any_attitude(key)

@@ -96,11 +96,10 @@ class Swimmer(Domain):
 
     @property
     def look(self) -> Look:  # type: ignore
-        """Return a camera that goes back as the swimmer grows."""
+        """Return a camera that goes back as the swimmer grows, and a lamp that shows where a target out of sight is."""
         scale = self.links / 6
-        return Look(
-            (0, -0.2 * scale, 0.5 * scale), 45, light=(0, 0, 1.5), diffuse=0.8, follow="head", mounted=True, fovy=60
-        )
+        mounted = {"light": (0, 0, 1.5), "diffuse": 0.8, "follow": "head", "mounted": True}
+        return Look((0, -0.2 * scale, 0.5 * scale), 45, fovy=60, lamp="target", **mounted)
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
         """Hang the other links behind the head, each with a motor and with sensors of its own."""
@@ -122,10 +121,6 @@ class Swimmer(Domain):
         side = jnp.where(jax.random.bernoulli(near_key, _NEAR_SHARE), _NEAR, _FAR)
         target = jax.random.uniform(target_key, (2,), minval=-side, maxval=side)
         return start_joints(self.models[0], joint_key), jnp.zeros(self.models[0].nv), target
-
-    def add_marks(self, spec: mujoco.MjSpec) -> None:
-        """Add the lamp above the target, whose light shows where it is though it may be out of sight."""
-        spec.worldbody.add_light(name="target", pos=[0, 0, 1.5], diffuse=[1] * 3, type=mujoco.mjtLightType.mjLIGHT_SPOT)
 
     def marks(self, task: Task, world: World) -> dict[str, Mark]:
         return {"target": Mark(jnp.append(world.extra, _HEIGHT))}

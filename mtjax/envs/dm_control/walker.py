@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import mujoco
 
 from mtjax.envs.dm_control.rewards import tolerance
-from mtjax.envs.domain import Domain, start_joints
+from mtjax.envs.domain import Domain, rewarded, start_joints
 from mtjax.envs.engines.base import World
 from mtjax.envs.looks import Look
 from mtjax.envs.parameters import DAMPING, GEAR, GRAVITY, MASS, body_mass, positive
-from mtjax.types import Array, Key, Task
+from mtjax.envs.planar import forward_velocity, planar
+from mtjax.types import Array, Key, Task, Transition
 
 _STAND_HEIGHT = 1.2  # [m]
 
@@ -80,31 +81,32 @@ class Walker(Domain):
         return start_joints(self.models[0], key), jnp.zeros(self.models[0].nv)
 
     def observe(self, task: Task, world: World) -> Array:
-        places = self.planar(task, world)
+        places = planar(self, task, world)
         axes = jnp.stack([jnp.cos(places.angle), jnp.sin(places.angle)], axis=1)[1:]
         return jnp.concatenate([axes.ravel(), places.position[1:2, 1], world.qvel])
 
-    def recall(self, task: Task, obs: Array) -> World:
-        model = self.models[0]
+    def relabel(self, task: Task, transition: Transition, key: Key) -> Transition:
+        model, obs = self.models[0], transition.next_obs
         cosines, sines = obs[:14].reshape(7, 2).T
         pitch = jnp.pad(jnp.arctan2(sines, cosines), (1, 0))  # the world's is 0
         bends = model.jnt_axis[2:, 1] * (pitch[1:] - pitch[model.body_parentid[1:]])
         height = obs[14] - self.leaf(task, "body_pos")[1, 2]
-        return World(jnp.concatenate([jnp.stack([height, 0.0]), bends]), obs[15:], jnp.zeros(model.nv), None)
+        qpos = jnp.concatenate([jnp.stack([height, 0.0]), bends])
+        return rewarded(self, task, transition, World(qpos, obs[15:], jnp.zeros(model.nv), None))
 
     def reward(self, task: Task, world: World, action: Array) -> Array:
         return self.standing(task, world) * (5 * self.move(task, world) + 1) / 6
 
     def standing(self, task: Task, world: World) -> Array:
         """Return the reward's factor () in [0, 1] for a high and upright torso."""
-        places = self.planar(task, world)
+        places = planar(self, task, world)
         height = tolerance(places.position[1, 1], _STAND_HEIGHT, jnp.inf, _STAND_HEIGHT / 2)
         upright = (1 + jnp.cos(places.angle[1])) / 2
         return (3 * height + upright) / 4
 
     def move(self, task: Task, world: World) -> Array:
         """Return the reward's factor () in [0, 1] for forward velocity."""
-        speed, velocity = task.goal["speed"], self.heading * self.forward_velocity(task, world)
+        speed, velocity = task.goal["speed"], self.heading * forward_velocity(self, task, world)
         return tolerance(velocity, speed, jnp.inf, speed / 2, "linear", value_at_margin=0.5)
 
 
@@ -167,4 +169,4 @@ class WalkerSpeed(Walker):
 
     def move(self, task: Task, world: World) -> Array:
         speed = task.goal["speed"]
-        return tolerance(self.forward_velocity(task, world), speed, speed, speed / 2, "linear", value_at_margin=0.5)
+        return tolerance(forward_velocity(self, task, world), speed, speed, speed / 2, "linear", value_at_margin=0.5)

@@ -87,7 +87,7 @@ class EnvPool(Hosted):
 
     def make(self, row: int, count: int, seed: int) -> Any:
         """Return a pool of ``count`` worlds with the settings of a row of the table."""
-        kept = _idle.get((self.outside.digest, row, count))
+        kept = _idle.get((self.simulator.digest, row, count))
         if kept:
             return kept.pop()
         alone = {"stack_num": 1} if hasattr(self.original.config, "stack_num") else {}
@@ -97,7 +97,7 @@ class EnvPool(Hosted):
 
     def keep(self, row: int, count: int, pool: Any) -> None:
         """Keep a pool that is in no set any more for the next one."""
-        _idle.setdefault((self.outside.digest, row, count), []).append(pool)
+        _idle.setdefault((self.simulator.digest, row, count), []).append(pool)
 
     def pool(self, count: int, filmed: bool) -> "Pools":
         """Return as many worlds, a pool for each task."""

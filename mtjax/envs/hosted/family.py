@@ -99,7 +99,7 @@ class Hosted(Family):
 
     def arguments_of(self, row: int) -> dict[str, Any]:
         """Return the environment's arguments in a row of the table."""
-        varied = {name: self.read_value(name, values[row]) for name, values in self.values.items()}
+        varied = {name: self.read_value(name, values[row]) for name, values in self.variation.values.items()}
         return {**self.fixed, **{name.replace("-", "_"): value for name, value in varied.items()}}
 
     def read_value(self, name: str, value: float) -> Any:
@@ -165,10 +165,10 @@ class Hosted(Family):
         picture = self.observed[PICTURES].shape if shown(self.observed) else ()
         return picture[1] if len(picture) == 3 else 0
 
-    @property
+    @cached_property
     def spec(self) -> Spec:
         """Return the sizes of observation, action and context, and how many pictures agents should see at once."""
-        return self._spec._replace(frames=self.frames) if self.pixels else self._spec
+        return super().spec._replace(frames=self.frames if self.pixels else 1)
 
     # Worlds, leaves (S, T, E, ...).
 
@@ -204,7 +204,7 @@ class Hosted(Family):
         count, shapes = math.prod(axes), {"i": ((), jnp.int32), "f": ((), jnp.float32), "o": (seen.shape, seen.dtype)}
         results = [jax.ShapeDtypeStruct((count, *shapes[kind][0]), shapes[kind][1]) for kind in kinds]
         flat = [x.reshape(count, *x.shape[3:]) for x in values]
-        found = host.call_once(self.outside.provide(act), results, *flat)
+        found = host.call_once(self.simulator.provide(act), results, *flat)
         return [x.reshape(*axes, *x.shape[1:]) for x in found]
 
     # A single world.
@@ -226,7 +226,7 @@ class Hosted(Family):
     # Calls of programs.
 
     @cached_property
-    def outside(self) -> "Calls":
+    def simulator(self) -> "Calls":  # type: ignore[override]
         """Return the calls out of XLA."""
         return Calls(self)
 
@@ -239,12 +239,12 @@ class Hosted(Family):
 
     def filmed(self) -> AbstractContextManager[None]:
         """Return a context in which pictures of all worlds are kept that begin in it."""
-        return self.outside.worlds.filmed()
+        return self.simulator.worlds.filmed()
 
     def pictures(self, states: HostedState, width: int, height: int) -> np.ndarray:
         """Return pictures (H, height, width, 3) of a world in its states, leaves (H, ...), that were filmed."""
         number, place = int(states.number[0]), int(states.place[0])
-        found = self.outside.worlds.pictures(number, np.asarray(states.clock), place)
+        found = self.simulator.worlds.pictures(number, np.asarray(states.clock), place)
         return np.stack([np.asarray(Image.open(io.BytesIO(each)).resize((width, height))) for each in found])
 
 

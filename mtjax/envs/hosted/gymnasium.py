@@ -87,7 +87,7 @@ class Gymnasium(Hosted):
             told = ", ".join(f"{name}={value!r}" for name, value in given.items())
             line = next(iter(str(error).strip().splitlines()), "")
             text = f"{self.environment} cannot be made{' with ' * bool(told)}{told}: {type(error).__name__}: {line}"
-            held = "; --split=none holds no values out" * (row is not None and row >= self.train_count)
+            held = "; --split=none holds no values out" * (row is not None and row >= self.variation.counts["train"])
             raise InputError(text + held) from error
 
     def build(self) -> dict[str, dict[str, np.ndarray]]:
@@ -96,7 +96,7 @@ class Gymnasium(Hosted):
         Raises:
             InputError: one cannot be made, or has other spaces than the first.
         """
-        listed = sum(self.counts.values())
+        listed = sum(self.variation.counts.values())
         for row in range(listed):
             made = self.idle.take(row, False)
             self.idle.give(row, False, made)
@@ -133,17 +133,17 @@ class Gymnasium(Hosted):
         return 1 / (self._metadata.get("render_fps") or 30)
 
     @property
-    def modules(self) -> tuple[str, ...]:
-        """Return the modules with the classes that make it: a class or a function of the user's own has one too."""
+    def built_by(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Return the module of a class or a function of the user's own that makes it."""
         made = self.registered.entry_point
-        return type(self).__module__, *([] if isinstance(made, str) else [made.__module__])
+        return () if isinstance(made, str) else (made.__module__,)
 
     @property
     def idle(self) -> "Idle":
         """Return the environments of all equal families that are in no set."""
-        found = _idle.setdefault(self.outside.digest, Idle(self))
+        found = _idle.setdefault(self.simulator.digest, Idle(self))
         if found.family.registered.entry_point is not self.registered.entry_point:  # as of a cell that ran again
-            found = _idle[self.outside.digest] = Idle(self)
+            found = _idle[self.simulator.digest] = Idle(self)
         return found
 
     def pool(self, count: int, filmed: bool) -> "Separate":

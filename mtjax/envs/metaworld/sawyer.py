@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mtjax.envs.domain import Domain, stack_differing
+from mtjax.envs.compiled import compile_model, stack_differing
+from mtjax.envs.domain import Domain
 from mtjax.envs.engines.base import World, choose_engine
 from mtjax.envs.metaworld import scene
 from mtjax.envs.metaworld.at import At
@@ -20,6 +21,7 @@ from mtjax.envs.metaworld.goals import draw_goals
 from mtjax.envs.metaworld.host import SUBSTEPS, Host
 from mtjax.envs.metaworld.names import TASKS, listed_with
 from mtjax.envs.pixels import Mark
+from mtjax.envs.scenery import Visible
 from mtjax.envs.variation import Variation
 from mtjax.names import load
 from mtjax.types import SPLITS, Array, InputError, Key, Step, Task
@@ -166,7 +168,7 @@ class Sawyer(Domain):
     @cached_property
     def starts_of_goals(self) -> tuple[Start, ...]:
         """Return how episodes begin, for every goal."""
-        settled = Host(self._compile({})).settle(self.hand_start)
+        settled = Host(compile_model(self, {})).settle(self.hand_start)
         with ThreadPoolExecutor() as pool:
             return tuple(pool.map(partial(self.begin, settled, settled.content()), self.vectors()))
 
@@ -204,8 +206,7 @@ class Sawyer(Domain):
         stacked = lambda trees: {name: np.float32(np.stack([tree[name] for tree in trees])) for name in trees[0]}
         states = {f"start_{name}": x for name, x in stacked([start.state for start in starts]).items()}
         model = {name: np.float32(leaf) for name, leaf in stack_differing(self.models).items()}
-        seen = {"scene": self.scene_leaves()} if self.pixels else {}
-        return {"model": model, "goal": stacked([start.began for start in starts]) | states, **seen}
+        return {"model": model, "goal": stacked([start.began for start in starts]) | states}
 
     def compile_spec(self, values: Mapping[str, float] | None = None) -> mujoco.MjSpec:
         return scene.read(self.scene_file, self.watched, self.pressed)
@@ -213,19 +214,13 @@ class Sawyer(Domain):
     # Pictures.
 
     def seen_spec(self, values: Mapping[str, float]) -> mujoco.MjSpec:
-        return scene.pictured(self.scene_file)
-
-    def scene_model(self, row: int) -> mujoco.MjModel:
-        model = super().scene_model(row)
-        model.body_pos[:] = self.models[row].body_pos  # where the goal has moved them
-        return model
-
-    def scene_leaves(self) -> dict[str, np.ndarray]:
-        places = np.stack([model.body_pos for model in self.models]).astype(np.float32)
-        return {"body_pos": places} if np.any(places != places[0]) else {}
-
-    def add_marks(self, spec: mujoco.MjSpec) -> None:
+        spec = scene.pictured(self.scene_file)
         spec.worldbody.add_geom(name=_GOAL, size=[0.02, 0, 0], rgba=[0, 0.8, 0, 0.6], contype=0, conaffinity=0)
+        return spec
+
+    def visible(self, task: Task, state: World) -> Visible:
+        moved = {"body_pos": self.leaf(task, "body_pos")}  # bodies are where the goal has them
+        return super().visible(task, state)._replace(fields=moved)
 
     def marks(self, task: Task, world: World) -> Mapping[str, Mark]:
         return {_GOAL: Mark(task.goal["target"])}
@@ -258,15 +253,11 @@ class Sawyer(Domain):
         seen = jnp.clip(self._unclipped(task, world), low, high)
         return seen.at[36:].set(0) if self.goal_hidden else seen
 
-    def judge(self, task: Task, world: World, action: Array) -> tuple[Array, dict[str, Array]]:
-        reward, success = self.evaluate(self.at(task, world, action), task.goal)
-        return reward, {"success": success.astype(jnp.float32)}
-
     def reward(self, task: Task, world: World, action: Array) -> Array:
-        return self.judge(task, world, action)[0]
+        return self.evaluate(self.at(task, world, action), task.goal)[0]
 
     def metrics(self, task: Task, world: World, action: Array) -> dict[str, Array]:
-        return self.judge(task, world, action)[1]
+        return {"success": self.evaluate(self.at(task, world, action), task.goal)[1].astype(jnp.float32)}
 
     def at(self, task: Task, world: World, action: Array) -> At:
         """Return what a world shows."""

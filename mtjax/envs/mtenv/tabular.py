@@ -14,7 +14,7 @@ import numpy as np
 from mtjax.envs.choosing import Choosing
 from mtjax.envs.family import Family
 from mtjax.envs.parameters import Parameter
-from mtjax.envs.task_table import Table
+from mtjax.envs.variation import Variation
 from mtjax.types import SPLITS, Array, InputError, Key, Step, Task
 
 _MOST_HELD_OUT = 10
@@ -62,26 +62,21 @@ class DrawnTasks(Choosing, Family):
         leaves["horizon"] = np.int32(self.episode_length)
         return Task(**leaves, params={}, model={})
 
-    @property
-    def counts(self) -> dict[str, int]:
-        """Return the number of tasks of each split."""
+    @cached_property
+    def variation(self) -> Variation:
+        """Return as many tasks as there are in every split. They differ in no parameter."""
         held_out = min(self.num_tasks, _MOST_HELD_OUT) if self.split == "dense" else 0
-        return dict(zip(SPLITS, (self.num_tasks, held_out, 0), strict=True))
+        counts = dict(zip(SPLITS, (self.num_tasks, held_out, 0), strict=True))
+        rows = {split: np.zeros((count, 0)) for split, count in counts.items()}
+        return dataclasses.replace(super().variation, rows=rows)
 
-    @cached_property
-    def count(self) -> int:
-        """Return the number of rows of the table."""
-        return len(self.table.tasks.id)
-
-    @cached_property
-    def table(self) -> Table:
-        """Return all tasks of all splits."""
-        counts = self.counts
-        seeds = [(self.task_seed, kind, i) for kind, count in enumerate(counts.values()) for i in range(count)]
+    def build(self) -> dict[str, Any]:
+        """Return the tables (R, ...) of every task, and the contexts, which hold them."""
+        counts = self.variation.counts.values()
+        seeds = [(self.task_seed, kind, i) for kind, count in enumerate(counts) for i in range(count)]
         tasks = [self._host_task(self.draw_tables(np.random.default_rng(seed)), row) for row, seed in enumerate(seeds)]
-        ends = np.cumsum(list(counts.values()))
-        rows = {s: np.arange(end - counts[s], end) for s, end in zip(SPLITS, ends, strict=True)}
-        return Table(jax.tree.map(lambda *leaves: np.stack(leaves), *tasks), rows, None)
+        whole = jax.tree.map(lambda *leaves: np.stack(leaves), *tasks)
+        return {"model": {}, "goal": whole.goal, "context": whole.context}
 
 
 class TabularState(NamedTuple):

@@ -22,11 +22,12 @@ class Painter(Protocol):
     def paint(self, leaf: Callable[[str], Array], poses: Poses) -> Array: ...  # (H, W, 3) uint8
 
 
-def choose_painter(name: str, meshes: bool = False) -> Any:
+def choose_painter(name: str, meshes: bool = False, caster: type[Caster] = Caster) -> Any:
     """Return the class of a painter. "auto" is the caster: on an H200 too it draws dm_control's scenes faster.
 
     Args:
         meshes: whether the scene is of meshes, which only Warp draws.
+        caster: the caster that "auto" is.
 
     Raises:
         InputError: it cannot draw meshes, this device cannot run it, or Warp is not installed.
@@ -40,4 +41,6 @@ def choose_painter(name: str, meshes: bool = False) -> Any:
         raise InputError("painter 'warp' needs an NVIDIA GPU; use --env.painter=caster")
     if name == "warp" and not warp_installed():
         raise InputError("painter 'warp' needs Warp, which is not installed: pip install 'mtjax[warp]'")
-    return WarpPainter if name == "warp" or meshes else Caster
+    if name == "warp" or meshes:
+        return WarpPainter
+    return caster if name == "auto" else Caster
