@@ -8,7 +8,7 @@ masked.
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Annotated, Any, NamedTuple
 
 import jax
@@ -58,6 +58,19 @@ class Blocks:
             taken[family] += count
         return _joined(found)
 
+    def some(self, count: int) -> "Blocks | AnyOne":
+        """Return the order of ``count`` tasks of the table that are known only when a program runs.
+
+        Raises:
+            InputError: they are several, of several families.
+        """
+        families = tuple(sorted({family for family, _ in self.runs}))
+        if len(families) == 1:
+            return Blocks(((families[0], count),), self.marks)
+        if count > 1:
+            raise InputError(f"of a mixture of families one task is played at a time, or all are; not {count}")
+        return AnyOne(families, self.marks)
+
     def related(self, contexts: Array, context: Array) -> Array:
         """Return which contexts (T, C) are of the same family as ``context`` (C,)."""
         return jnp.all(contexts[:, : self.marks] == context[: self.marks], axis=-1)
@@ -71,6 +84,26 @@ def _look(spec: Spec) -> str:
     return f"{spec.frames} pictures {spec.obs[frames.PICTURES].shape}{beside}"
 
 
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class AnyOne:
+    """Stands for ``Blocks`` where worlds have one task, whose family is known only when the program runs."""
+
+    families: tuple[int, ...]  # those whose task it may be, in order
+    marks: int  # as in ``Blocks``
+
+    related = Blocks.related
+
+    def take(self, tree: Any, family: int) -> Any:
+        """Return leaves (S, 1, E, ...) as they are: all worlds are of the family whose turn it is."""
+        return tree
+
+
+def _metrics_of(steps: Mapping[int, Any]) -> list[str]:
+    """Return the names of all metrics that families have."""
+    return sorted({name for step in steps.values() for name in step.metrics})
+
+
 def _joined(parts: list[Array]) -> Array:
     return parts[0] if len(parts) == 1 else jnp.concatenate(parts, axis=1)
 
@@ -78,7 +111,7 @@ def _joined(parts: list[Array]) -> Array:
 class States(NamedTuple):
     """The states of a mixture's worlds, by family."""
 
-    blocks: Blocks
+    blocks: Blocks | AnyOne
     families: tuple[Any, ...]  # each family's own states, leaves (S, T', E, ...); None where a split has no task of it
 
 
@@ -281,32 +314,61 @@ class Mixture:
 
     def reset_worlds(self, tasks: Task, keys: Key) -> Step:
         """Begin an episode in every world."""
-        own = self._apart(tasks)
-        given = {i: tasks.blocks.take(keys, i) for i in own}
-        steps = self._by_group(own, lambda group, of: group.reset_worlds(of(own), of(given)))
-        return self._whole(tasks.blocks, steps)
+        return self._play("reset_worlds", tasks, lambda i, of: (of(keys),))
 
     def renew_worlds(self, tasks: Task, keys: Key, mask: Array, states: States) -> Step:
         """Begin an episode in the worlds of ``mask`` (S, T, E), whose observations alone count."""
-        own = self._apart(tasks)
-        given, masks = ({i: tasks.blocks.take(x, i) for i in own} for x in (keys, mask))
-        renew = lambda group, of: group.renew_worlds(of(own), of(given), of(masks), of(states.families))
-        return self._whole(tasks.blocks, self._by_group(own, renew))
+        return self._play("renew_worlds", tasks, lambda i, of: (of(keys), of(mask), states.families[i]), states)
 
     def step_worlds(self, tasks: Task, states: States, actions: Array) -> Step:
         """Step every world by its action (S, T, E, A)."""
-        own = self._apart(tasks)
-        given = {i: self.families[i].spec.action.narrow(tasks.blocks.take(actions, i)) for i in own}
-        move = lambda group, of: group.step_worlds(of(own), of(states.families), of(given))
-        return self._whole(tasks.blocks, self._by_group(own, move))
+        narrow = lambda i, actions: self.families[i].spec.action.narrow(actions)
+        return self._play("step_worlds", tasks, lambda i, of: (states.families[i], narrow(i, of(actions))), states)
 
-    def _by_group(self, own: dict[int, Task], play: Callable) -> dict[int, Step]:
-        """Return the steps of all families, by ``play(group, of)``. ``of`` picks the parts of the group's families."""
-        steps = {}
+    def _play(self, method: str, tasks: Task, given: Callable, before: States | None = None) -> Step:
+        """Call a method of every family that has tasks, and join their steps.
+
+        Args:
+            given: ``given(i, of)`` returns what the method of family i takes after its tasks; ``of`` picks the family's
+                part of leaves (S, T, E, ...).
+            before: the states of all families, if there are any yet.
+        """
+        blocks = tasks.blocks
+        if isinstance(blocks, AnyOne):
+            return self._play_one(method, tasks, given, before)
+        own, steps = self._apart(tasks), {}
+        taken = {i: given(i, partial(blocks.take, family=i)) for i in own}
         for group in self.groups:
             here = [i for i in group.members if i in own]  # a split may have no task of a family
-            steps |= play(group, lambda parts, here=here: {i: parts[i] for i in here}) if here else {}
-        return steps
+            if here:
+                parts = [dict(zip(here, part, strict=True)) for part in zip(*(taken[i] for i in here), strict=True)]
+                steps |= getattr(group, method)({i: own[i] for i in here}, *parts)
+        return self._whole(blocks, steps)
+
+    def _play_one(self, method: str, tasks: Task, given: Callable, before: States | None) -> Step:
+        """Call a method of the one family whose task all worlds (S, 1, E) have, in that family's own simulator.
+
+        The task is data: a branch of the program plays its family, and the others' worlds stay as they are.
+        """
+        members, firsts = tasks.blocks.families, jnp.asarray(self._first[list(tasks.blocks.families)])
+
+        def play(i: int) -> Step:
+            own = take(self.families[i].table.tasks, tasks.row - int(self._first[i]))
+            return getattr(self.families[i], method)(own, *given(i, lambda tree: tree))
+
+        shapes = {i: jax.eval_shape(partial(play, i)) for i in members}
+        names = _metrics_of(shapes)
+        cut_off = any(step.truncated is not None for step in shapes.values())
+        zeros = lambda i: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes[i].state) if i in shapes else None
+        states = tuple(map(zeros, range(len(self.families)))) if before is None else before.families
+
+        def branch(i: int) -> Step:
+            step = play(i)
+            whole = self._padded(i, step, names, cut_off)
+            return whole._replace(state=States(tasks.blocks, (*states[:i], step.state, *states[i + 1 :])))
+
+        turn = jnp.sum(tasks.row[0, 0, 0] >= firsts) - 1
+        return jax.lax.switch(turn, [partial(branch, i) for i in members])
 
     def where_worlds(self, mask: Array, new: States, old: States) -> States:
         """Choose states by ``mask`` (S, T, E)."""
@@ -326,20 +388,20 @@ class Mixture:
 
     def _whole(self, blocks: Blocks, steps: dict[int, Step]) -> Step:
         """Join the steps of the families."""
+        names, cut_off = _metrics_of(steps), any(step.truncated is not None for step in steps.values())
+        padded = [self._padded(i, step, names, cut_off)._replace(state=None) for i, step in steps.items()]
+        joined = jax.tree.map(lambda *x: blocks.join(dict(zip(steps, x, strict=True))), *padded)
         states = tuple(steps[i].state if i in steps else None for i in range(len(self.families)))
-        join = lambda of: blocks.join({i: of(step) for i, step in steps.items()})
-        padded = [self.pad(self.families[i], step.obs) for i, step in steps.items()]
-        names = sorted({name for step in steps.values() for name in step.metrics})
-        unknown = lambda step: jnp.full(step.reward.shape, jnp.nan)
-        never = lambda step: jnp.zeros(step.reward.shape, bool)
-        cut_off = any(step.truncated is not None for step in steps.values())
-        return Step(
-            state=States(blocks, states),
-            obs=jax.tree.map(lambda *x: blocks.join(dict(zip(steps, x, strict=True))), *padded),
-            reward=join(lambda step: step.reward),
-            terminated=join(lambda step: step.terminated),
-            metrics={name: join(lambda step, name=name: step.metrics.get(name, unknown(step))) for name in names},
-            truncated=join(lambda s: never(s) if s.truncated is None else s.truncated) if cut_off else None,
+        return joined._replace(state=States(blocks, states))
+
+    def _padded(self, i: int, step: Step, metrics: list[str], cut_off: bool) -> Step:
+        """Return a family's step as the mixture has them: with wide observations, and with NaN for other metrics."""
+        unknown, never = jnp.full(step.reward.shape, jnp.nan), jnp.zeros(step.reward.shape, bool)
+        cut = never if step.truncated is None else step.truncated
+        return step._replace(
+            obs=self.pad(self.families[i], step.obs),
+            metrics={name: step.metrics.get(name, unknown) for name in metrics},
+            truncated=cut if cut_off else None,
         )
 
     def pad(self, family: Family, obs: Any) -> Any:

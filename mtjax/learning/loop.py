@@ -166,8 +166,9 @@ def require_curriculum(settings: Settings, env: Any, agent: Any) -> None:
         raise InputError(f"{told} begins a replay anew; use --reset-every=0 and --host-replay-size=0")
     if experience.adaptations:
         raise InputError(f"{told} changes tasks, and this agent adapts to all that it knows; leave it out")
-    if env.tasks("train").blocks is not None:
-        raise InputError(f"{told} is for single families, whose tasks share one physics, and not for mixtures")
+    known = env.tasks("train")
+    if known.blocks is not None:
+        known.blocks.some(settings.plays.count(len(known.id)))
     rule = getattr(agent, "gradients", None)
     if rule is not None and jax.tree.leaves(rule.init(2)):
         raise InputError(f"{told} needs a rule of gradients without memory of the tasks, such as mean or pcgrad")
@@ -286,7 +287,8 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
 
 def rows_of(tasks: Task, rows: Any) -> Task:
     """Return the tasks (T, ...) with these numbers (T,), of a table (N, ...)."""
-    return jax.tree.map(lambda x: x[rows], tasks)
+    taken = jax.tree.map(lambda x: x[rows], tasks)
+    return taken if tasks.blocks is None else taken._replace(blocks=tasks.blocks.some(len(rows)))
 
 
 def _take_turns(env: Env, agent: Agent, settings: Settings, known: Task, state: TrainState) -> TrainState:
