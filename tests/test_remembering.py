@@ -90,15 +90,16 @@ def test_the_penalty_is_a_part_of_the_actors_loss():
     """Of one parameter that lies 0.5 beside its anchor, at importance 3: 10 / 2 * 3 * 0.25."""
     way = remembering.EWC(ewc_coefficient=10.0)
     actor = Params({"w": jnp.array([1.0])}, {})
-    nets = {"actor": actor} | way.init(actor, 2)
-    assert float(way.penalty(nets)) == 0
+    nets = {"actor": actor} | way.init(actor, 2, (), 2)
+    penalty = lambda nets: float(way.penalty(nets, None, jax.random.key(0)))
+    assert penalty(nets) == 0
     held = continual.Anchor({"w": jnp.array([0.5])}, {"w": jnp.array([3.0])})
-    assert float(way.penalty(nets | {"continual": Params({"anchor": held}, {})})) == pytest.approx(3.75)
+    assert penalty(nets | {"continual": Params({"anchor": held}, {})}) == pytest.approx(3.75)
     agent = tiny("sac-conditioned", continual="ewc")
     state = agent.init(Walk().spec, TASKS, jax.random.key(0))
     seen = pick(prepare(agent, state, random_batch(0, 3, 4, Walk().spec), TASKS), 0)
     nets = of_task(state.nets, jnp.int32(0))
-    strict = put(agent, continual=put(agent.continual, penalty=lambda nets: 7.0))
+    strict = put(agent, continual=put(agent.continual, penalty=lambda *_: 7.0))
     (free, _), (held, aux) = (each.actor_loss(nets, seen, jax.random.key(1)) for each in (agent, strict))
     assert float(held - free) == pytest.approx(7.0)
     assert float(aux.metrics["actor_loss"]) == pytest.approx(float(free))

@@ -19,7 +19,7 @@ Draw = Callable[[Key, int], Transition]
 def consolidates(agent: Any) -> bool:
     """Return whether anything happens to an agent where a task of a sequence ends."""
     way = getattr(agent, "continual", None)
-    return way is not None and (way.keeps or way.reset_optimizer)
+    return way is not None and (way.keeps or way.reset_optimizer or way.restarts)
 
 
 def consolidate(agent: Any, state: AgentState, draw: Draw, tasks: Task, key: Key) -> AgentState:
@@ -43,13 +43,10 @@ def _policy(agent: Any, state: AgentState, draw: Draw, tasks: Task, key: Key) ->
         return None, None, None
     batch = replayed.prepare(agent, state, draw(key, count), tasks)
     obs, features, mask = jax.tree.map(lambda x: x[0], (batch.obs, batch.features, batch.mask))
-    features = jnp.broadcast_to(features, (count, features.shape[-1]))
-
-    def outputs(shared: Any, given: Any) -> Array:
-        actor = nets["actor"]._replace(shared=shared)
-        return agent.policy_outputs(nets | {"actor": actor}, *given)
-
-    return outputs, partial(information, agent.policy, mask), (features, obs)
+    features, obs = agent.view.actor_inputs(nets, features, obs)
+    inputs = (jnp.broadcast_to(features, (count, features.shape[-1])), obs)
+    outputs = lambda shared, given: agent.actor.apply(nets["actor"]._replace(shared=shared), *given)
+    return outputs, partial(information, agent.policy, mask), inputs
 
 
 def information(policy: Policy, mask: Array | None, outputs: Array) -> Array:

@@ -82,7 +82,7 @@ class SAC(BaseAgent):
         log = jnp.log if isinstance(self.initial_temperature, Array) else np.log
         log = jnp.full(1 if self.shared_temperature else num_tasks, log(self.initial_temperature)).astype(jnp.float32)
         temperature = Params({"log": log}, {}) if self.shared_temperature else Params({}, {"log": log})
-        kept = self.continual.init(actor, num_tasks)
+        kept = self.continual.init(actor, num_tasks, inputs.actor, self.policy.outputs(len(action)))
         state = state.with_nets(**kept, actor=actor, critic=critic, temperature=temperature)
         return state._replace(slow=replayed.slow_copies(self, state.nets))
 
@@ -126,9 +126,10 @@ class SAC(BaseAgent):
     def actor_loss(self, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:
         """Compute the actor loss, with what holds the actor to earlier tasks of a sequence."""
         action, log_prob, cost = self.sample(nets, batch, batch.obs, key)
+        held = self.continual.penalty(nets, self, jax.random.fold_in(key, 1))
         value = reduce(self.values(nets, batch.features, batch.obs, action), self.critic_reduction == "min")
         loss, entropy = jnp.mean(batch.temperature * cost - value), -jnp.mean(log_prob)
-        return loss + self.continual.penalty(nets), ActorAux({"actor_loss": loss, "entropy": entropy}, entropy)
+        return loss + held, ActorAux({"actor_loss": loss, "entropy": entropy}, entropy)
 
     def temperature_loss(self, nets: Nets, entropy: Array, action_size: Array) -> tuple[Array, None]:
         """Compute the loss of one task's temperature, by the entropy () of its policy."""

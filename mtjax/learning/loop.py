@@ -313,15 +313,23 @@ def _consolidate(env: Env, agent: Agent, known: Task, state: TrainState) -> Any:
     """Return the agents (S, ...) as they end the task that was played, from whose replay they may learn once more."""
     if not consolidates(agent):
         return state.agent
+    if agent.continual.restarts:
+        begin = partial(_init_agent, env, agent, known)
+        return jax.vmap(begin)(_folded(state.key), getattr(state.agent, "numbers", {}))
     tasks, experience = rows_of(known, state.rows), agent.experience
 
     def of_seed(learner: Any, data: Any, key: Key) -> Any:
         draw = lambda key, count: experience.draw(env.spec, agent, data.ring, key, count)
-        return consolidate(at_point(agent, learner), learner, draw, tasks, jax.random.fold_in(key, _END))
+        return consolidate(at_point(agent, learner), learner, draw, tasks, key)
 
     played = _of_played(state.agent, state.rows)
-    played = over_seeds(of_seed, 0, experience.storage.axes, 0)(played, state.data, state.key)
+    played = over_seeds(of_seed, 0, experience.storage.axes, 0)(played, state.data, _folded(state.key))
     return _with_played(state.agent, played, state.rows)
+
+
+def _folded(keys: Key) -> Key:
+    """Return keys (S,) for what happens where a task ends."""
+    return jax.vmap(lambda key: jax.random.fold_in(key, _END))(keys)
 
 
 def _of_played(learners: Any, rows: Array | None) -> Any:

@@ -8,6 +8,7 @@ changes, and critics forget, as their regularisation harms learning (Wolczyk et 
 import abc
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar
 
 import jax
@@ -18,7 +19,7 @@ from mtjax.agents.networks import Params
 from mtjax.agents.parts import continual
 from mtjax.agents.parts.continual import Anchor, Outputs
 from mtjax.agents.state import Nets
-from mtjax.types import Array
+from mtjax.types import Array, Key
 
 NET = "continual"
 """The network that holds what is kept."""
@@ -32,7 +33,8 @@ Information = Callable[[Array], Array]
 class Nothing:
     """Keeps nothing of earlier tasks: fine-tuning. Every way is a class with these methods.
 
-    Nets are those of one task in ``seen`` and ``penalty``, and of all played ones, which is one, in the others.
+    Nets are those of one task in ``seen`` and ``penalty``, and of all played ones, which is one, in the others. Inputs
+    are the actor network's, leaves (N, ...): features of the task and observations.
     """
 
     keeps: ClassVar[bool] = False
@@ -42,19 +44,26 @@ class Nothing:
     """Number of stored steps that a consolidation sees."""
     retrains: ClassVar[int] = 0
     """Number of updates that follow a consolidation, on the same replay."""
+    restarts: ClassVar[bool] = False
+    """Whether the whole agent begins anew where a task ends."""
     reset_optimizer: bool = False
     """Begin optimisers anew where a task ends, as Continual World does."""
 
-    def init(self, actor: Params, num_tasks: int) -> Nets:
-        """Return what is kept before the first task, as a network by name."""
+    def init(self, actor: Params, num_tasks: int, example: tuple, size: int) -> Nets:
+        """Return what is kept before the first task, as a network by name.
+
+        Args:
+            example: one input of the actor, without N.
+            size: number P of its outputs.
+        """
         return {}
 
     def seen(self, nets: Nets) -> Nets:
         """Return networks with the actor as the task sees it."""
         return nets
 
-    def penalty(self, nets: Nets) -> Array | float:
-        """Return what is added to the actor's loss."""
+    def penalty(self, nets: Nets, agent: Any, key: Key) -> Array | float:
+        """Return what is added to the loss of ``agent.actor``, whose outputs ``agent.policy`` reads."""
         return 0.0
 
     def kept(self, before: Nets, after: Nets) -> Nets:
@@ -66,6 +75,7 @@ class Nothing:
 
         Args:
             outputs: the actor's outputs (P,) for its shared parameters and one of ``inputs``, leaves (samples, ...).
+                Without samples all three are None.
             information: the Fisher information (P,) of the policy with such outputs.
         """
         return nets
@@ -93,11 +103,11 @@ class _Held(Nothing, abc.ABC):
     def importance(self, outputs: Outputs, information: Information, params: Any, inputs: Any) -> Any:
         """Return F of the task that ends, as ``params``; see ``consolidate``."""
 
-    def init(self, actor: Params, num_tasks: int) -> Nets:
+    def init(self, actor: Params, num_tasks: int, example: tuple, size: int) -> Nets:
         zeros = jax.tree.map(jnp.zeros_like, actor.shared)
         return {NET: Params({"anchor": Anchor(jax.tree.map(jnp.copy, actor.shared), zeros)}, {})}
 
-    def penalty(self, nets: Nets) -> Array:
+    def penalty(self, nets: Nets, agent: Any, key: Key) -> Array:
         return continual.penalty(nets[NET].shared["anchor"], nets["actor"].shared, self.strength)
 
     def consolidate(self, nets: Nets, outputs: Outputs, information: Information, inputs: Any) -> Nets:
@@ -111,8 +121,8 @@ class _Held(Nothing, abc.ABC):
 class L2(_Held):
     """Holds all parameters of the actor equally: F = 1."""
 
-    l2_coefficient: float = 1e5
-    """Weight of the penalty; 1e5 in Continual World."""
+    l2_coefficient: float = 2e5
+    """Weight of the penalty: that of Continual World, where it is 1e5 without the half."""
 
     def __post_init__(self):
         parts.require_not_negative(self, "l2_coefficient")
@@ -129,13 +139,15 @@ class L2(_Held):
 class EWC(_Held):
     """Holds parameters by the Fisher information of the policy (Kirkpatrick et al. 2017); see ``continual.ewc``."""
 
-    ewc_coefficient: float = 1e4
-    """Weight of the penalty; 1e4 in Continual World."""
+    ewc_coefficient: float = 2e4
+    """Weight of the penalty: that of Continual World, where it is 1e4 without the half."""
+    fisher_least: float = 1e-5
+    """Least Fisher information of a parameter at any step; 1e-5 in Continual World."""
     fisher_samples: int = 2560
     """Stored steps over which the Fisher information is averaged, rounded down to a multiple of 32."""
 
     def __post_init__(self):
-        parts.require_not_negative(self, "ewc_coefficient")
+        parts.require_not_negative(self, "ewc_coefficient", "fisher_least")
         _require_group(self, "fisher_samples")
 
     @property
@@ -147,15 +159,15 @@ class EWC(_Held):
         return self.fisher_samples // _GROUP * _GROUP
 
     def importance(self, outputs: Outputs, information: Information, params: Any, inputs: Any) -> Any:
-        return _in_groups(lambda group: continual.ewc(outputs, information, params, group), inputs)
+        return _in_groups(lambda x: continual.ewc(outputs, information, params, x, self.fisher_least), inputs)
 
 
 @dataclasses.dataclass(frozen=True)
 class MAS(_Held):
     """Holds parameters by how much they change the actor's outputs (Aljundi et al. 2018); see ``continual.mas``."""
 
-    mas_coefficient: float = 1e4
-    """Weight of the penalty; 1e4 in Continual World."""
+    mas_coefficient: float = 2e4
+    """Weight of the penalty: that of Continual World, where it is 1e4 without the half."""
     mas_samples: int = 2560
     """Stored steps over which the importance is averaged, rounded down to a multiple of 32."""
 
@@ -196,7 +208,7 @@ class PackNet(Nothing):
     def retrains(self) -> int:  # type: ignore[override]
         return self.retrain_updates
 
-    def init(self, actor: Params, num_tasks: int) -> Nets:
+    def init(self, actor: Params, num_tasks: int, example: tuple, size: int) -> Nets:
         shared = {"owners": continual.unowned(actor.shared), "count": jnp.int32(0), "retraining": jnp.bool_(False)}
         return {NET: Params(shared, {"number": jnp.zeros(num_tasks, jnp.int32)})}
 
@@ -232,6 +244,69 @@ class PackNet(Nothing):
         return nets | {NET: held._replace(shared=held.shared | {"retraining": jnp.bool_(False)})}
 
 
+@dataclasses.dataclass(frozen=True)
+class Clone(Nothing):
+    """Clones the actor's outputs of earlier tasks on stored steps (Wolczyk et al. 2022, "ClonEx" without exploration).
+
+    Where a task ends, steps of its replay and the outputs y of the actor there are stored, with the output layer that
+    it has for itself, if any. To the actor's loss is added
+        coefficient mean KL(pi(y) | pi(y')),  y' = outputs now
+    over a batch of stored steps of other tasks, all of which are drawn alike. Only what tasks share learns by it.
+    """
+
+    keeps: ClassVar[bool] = True
+    clone_coefficient: float = 1.0
+    """Weight of the divergence from earlier policies, which is in nats and so has no units of reward."""
+    clone_samples: int = 10_000
+    """Stored steps of each task; 10,000 in the paper."""
+    clone_batch: int = 128
+    """Stored steps in each update."""
+
+    def __post_init__(self):
+        parts.require_not_negative(self, "clone_coefficient")
+        parts.require_counts(self, "clone_samples", "clone_batch")
+
+    @property
+    def samples(self) -> int:  # type: ignore[override]
+        return self.clone_samples
+
+    def init(self, actor: Params, num_tasks: int, example: tuple, size: int) -> Nets:
+        blank = lambda x: jnp.zeros((num_tasks, self.clone_samples, *jnp.shape(x)), jnp.result_type(x))
+        stored = {"inputs": jax.tree.map(blank, example), "outputs": blank(jnp.zeros(size))}
+        stored |= {"own": jax.tree.map(jnp.zeros_like, actor.own), "known": jnp.zeros(num_tasks, bool)}
+        return {NET: Params(stored, {"number": jnp.arange(num_tasks)})}
+
+    def penalty(self, nets: Nets, agent: Any, key: Key) -> Array:
+        stored, number = nets[NET].shared, nets[NET].own["number"]
+        task_key, step_key = jax.random.split(key)
+        others = stored["known"] & (jnp.arange(len(stored["known"])) != number)
+        task = jax.random.categorical(task_key, jnp.where(others, 0.0, -jnp.inf), shape=(self.clone_batch,))
+        step = jax.random.randint(step_key, (self.clone_batch,), 0, self.clone_samples)
+
+        def divergence(task: Array, step: Array) -> Array:
+            inputs, outputs = jax.tree.map(lambda x: x[task, step], (stored["inputs"], stored["outputs"]))
+            actor = nets["actor"]._replace(own=jax.tree.map(lambda x: x[task], stored["own"]))
+            return agent.policy.divergence(outputs, agent.actor.apply(actor, *inputs))
+
+        found = jnp.mean(jax.vmap(divergence)(jnp.where(jnp.any(others), task, 0), step))
+        return self.clone_coefficient * jnp.where(jnp.any(others), found, 0.0)
+
+    def consolidate(self, nets: Nets, outputs: Outputs, information: Information, inputs: Any) -> Nets:
+        actor, held = nets["actor"], nets[NET]
+        number = held.own["number"][0]
+        own = jax.tree.map(lambda x: x[0], actor.own)
+        new = {"inputs": inputs, "outputs": jax.vmap(partial(outputs, actor.shared))(inputs), "own": own, "known": True}
+        stored = jax.tree.map(lambda old, x: old.at[number].set(x), held.shared, new)
+        return nets | {NET: held._replace(shared=stored)}
+
+
+@dataclasses.dataclass(frozen=True)
+class Scratch(Nothing):
+    """Begins the whole agent anew where a task ends, so that each task is learned alone: what transfer is measured by."""
+
+    restarts: ClassVar[bool] = True
+
+
 def _require_group(holder: Any, name: str) -> None:
     if getattr(holder, name) < _GROUP:
         flag = name.replace("_", "-")
@@ -248,4 +323,12 @@ def _in_groups(mean: Callable[[Any], Any], inputs: Any) -> Any:
 
 
 Remembering = Nothing
-CONTINUAL: dict[str, type[Remembering]] = {"none": Nothing, "l2": L2, "ewc": EWC, "mas": MAS, "packnet": PackNet}
+CONTINUAL: dict[str, type[Remembering]] = {
+    "none": Nothing,
+    "l2": L2,
+    "ewc": EWC,
+    "mas": MAS,
+    "packnet": PackNet,
+    "clone": Clone,
+    "scratch": Scratch,
+}
