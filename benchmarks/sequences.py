@@ -36,9 +36,6 @@ from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import configure, with_preset
 from mtjax.report import sequences, stats
 
-METHODS = ["scratch", "none", "l2", "ewc", "mas", "packnet", "clone"]
-
-
 class Protocol(NamedTuple):
     """Holds what is played in which order, and how it is learned unless other settings are given."""
 
@@ -51,6 +48,7 @@ class Protocol(NamedTuple):
     rounds: int = 1
     best: float = 0.0  # return that is the score 1; 0 takes success
     settings: dict[str, Any] = {}  # of the agent and the loop  # noqa: RUF012
+    methods: tuple[str, ...] = ()
 
 
 _COMMON = {"conditioning": "one-hot", "normalize_observations": False}
@@ -59,17 +57,22 @@ _GOALS = {"num_envs": 8, "batch_size": 32, "hidden": (128, 128), "replay_size": 
 _CW = {"num_envs": 256, "batch_size": 128, "replay_size": 400_000, "updates_per_step": 8, "warmup_steps": 40}
 _CW |= {"n_step": 8, "gamma": 0.97, "initial_temperature": 0.001, "temperature_lr": 1e-3, "shared_temperature": False}
 _CW |= {"actor_hidden": (256, 256), "critic_hidden": (512, 512), "heads": "per-task", "reset_optimizer": True}
+_OF_GOALS = ("ewc:ewc_coefficient=100", "l2:l2_coefficient=1", "mas:mas_coefficient=10", "clone")
+_OF_GOALS = ("scratch", "none", "packnet:retrain_updates=2000", *_OF_GOALS)
+# Coefficients are a hundredth of Continual World's, as brc's values are at most 10 and those there some hundreds.
+_OF_CW = ("ewc:ewc_coefficient=200", "l2:l2_coefficient=2000", "mas:mas_coefficient=200", "clone")
+_OF_CW = ("scratch", "none", "packnet:retrain_updates=5000", *_OF_CW)
 PROTOCOLS = {
-    "goals": Protocol("point-mass-vary-goal", "sac", 4, 2000, 4, 4, best=100.0, settings=_GOALS),
-    "cw10": Protocol("cw10", "brc", 10, 3000, 4, 10, settings=_CW),
-    "cw20": Protocol("cw10", "brc", 10, 3000, 2, 10, rounds=2, settings=_CW),
+    "goals": Protocol("point-mass-vary-goal", "sac", 4, 2000, 4, 4, 1, 100.0, _GOALS, _OF_GOALS),
+    "cw10": Protocol("cw10", "brc", 10, 3000, 4, 10, 1, 0.0, _CW, _OF_CW),
+    "cw20": Protocol("cw10", "brc", 10, 3000, 2, 10, 2, 0.0, _CW, _OF_CW),
 }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sequence", choices=list(PROTOCOLS))
-    parser.add_argument("--methods", nargs="+", default=METHODS)
+    parser.add_argument("--methods", nargs="+", help="by default those of the sequence")
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--agent", help="by default that of the sequence")
     parser.add_argument("--env", help="the tasks, by default those of the sequence; there must be as many")
@@ -84,7 +87,7 @@ def main() -> None:
     protocol, out = protocol._replace(**asked), arguments.out or Path("runs") / arguments.sequence
     if parts.is_part():
         return measure(arguments, protocol, out, arguments.methods[0])
-    todo = [part(arguments, protocol, out, method) for method in arguments.methods]
+    todo = [part(arguments, protocol, out, method) for method in protocol.methods]
     left = parts.run_parts(__file__, todo, out, arguments)
     print(table(out))
     parts.require_all(left)
