@@ -7,6 +7,7 @@ import jax
 from mtjax import frames
 from mtjax.agents import parts
 from mtjax.agents.choices import PARTS
+from mtjax.agents.networks import Trunk
 from mtjax.agents.parts.policies import policy_for
 from mtjax.types import InputError, Spec
 
@@ -25,6 +26,8 @@ def check(agent: Any) -> None:
     _check_gradients(agent)
     _check_scaling(agent)
     _check_schedule(agent)
+    if agent.plasticity.every:
+        _check_units(agent)
 
 
 def _name(agent: Any, kind: str) -> str:
@@ -91,6 +94,19 @@ def _check_schedule(agent: Any) -> None:
         raise InputError(f"{given} is where a schedule ends, and lr-schedule=constant is none; use linear or cosine")
     if shape != "constant" and agent.experience.reset_every:
         raise InputError(f"reset-every begins the optimisers anew, and lr-schedule={shape} with them; use constant")
+
+
+def _check_units(agent: Any) -> None:
+    """Refuse to renew units of networks that are no plain MLPs of all tasks."""
+    plain = type(agent.encoder.body(agent.hidden, layer_norm=False)) is Trunk and not agent.encoder.front()
+    otherwise = agent.representation.learns or agent.fits_statistics or not agent.renews
+    if not plain or otherwise or agent.unit_head or agent.heads != "shared" or agent.tune != "all":
+        raise InputError(
+            f"plasticity={_name(agent, 'plasticity')} renews the units of plain MLPs that all tasks share: it needs "
+            "encoder=identity, representation=plain, heads=shared, unit-head=false and tune=all, in sac or ppo"
+        )
+    if agent.continual.freezes:
+        raise InputError(f"plasticity changes the weights that continual={_name(agent, 'continual')} keeps; use one")
 
 
 def check_replayed(agent: Any) -> None:

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents import replayed
+from mtjax.agents.fit import learned
 from mtjax.agents.parts.policies import Policy
 from mtjax.agents.state import AgentState, of_task
 from mtjax.types import Array, Key, Task, Transition
@@ -18,8 +19,9 @@ Draw = Callable[[Key, int], Transition]
 
 def consolidates(agent: Any) -> bool:
     """Return whether anything happens to an agent where a task of a sequence ends."""
-    way = getattr(agent, "continual", None)
-    return way is not None and (way.keeps or way.reset_optimizer or way.restarts)
+    way, renewing = getattr(agent, "continual", None), getattr(agent, "plasticity", None)
+    held = way is not None and (way.keeps or way.reset_optimizer or way.restarts)
+    return held or (renewing is not None and renewing.changes)
 
 
 def consolidate(agent: Any, state: AgentState, draw: Draw, tasks: Task, key: Key) -> AgentState:
@@ -70,3 +72,10 @@ def _retrain(agent: Any, state: AgentState, draw: Draw, tasks: Task, key: Key) -
         keys = jax.random.split(key, way.retrains)
         state, _ = jax.lax.scan(update, state, (keys, jnp.arange(way.retrains)))
     return state._replace(nets=way.retrained(state.nets))
+
+
+def change(agent: Any, state: AgentState, fresh: AgentState) -> AgentState:
+    """Return a state whose shared weights the agent's plasticity has changed, given a freshly drawn state."""
+    of_net = lambda name: agent.plasticity.change(state.nets[name].shared, fresh.nets[name].shared)
+    names = learned(agent.fits.values())
+    return state.with_nets(**{name: state.nets[name]._replace(shared=of_net(name)) for name in names})

@@ -7,13 +7,14 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mtjax.agents import critics, parts
+from mtjax.agents import critics, parts, renewing
 from mtjax.agents.base import BaseAgent, Inputs, Memory
 from mtjax.agents.choices import FLAT
 from mtjax.agents.fit import Fit, above, descend
 from mtjax.agents.networks import Network, Params
 from mtjax.agents.parts.policies import Categorical, Gaussian, Policy
 from mtjax.agents.parts.policies.gaussian import STD_RANGE
+from mtjax.agents.parts.renewing import Renewing
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.state import AgentState, Nets
@@ -72,6 +73,7 @@ class OnPolicy(BaseAgent):
     common_presets: ClassVar[bool] = False
     policies: ClassVar[tuple[type[Policy], ...]] = (Gaussian, Categorical)
     devices_differ: ClassVar[bool] = True
+    renews: ClassVar[bool] = True
     actor_lr: float = 3e-4
     """Adam's learning rate for the actor."""
     critic_lr: float = 1e-3
@@ -96,6 +98,7 @@ class OnPolicy(BaseAgent):
     it also has a head for every task, which is rescaled when these estimates move."""
     value_rate: float = 0.1
     """Weight of a new rollout in the moving estimates of targets' mean and variance."""
+    plasticity: Annotated[Renewing, FLAT] = dataclasses.field(default_factory=Renewing)
     experience: Annotated[Rollouts, FLAT] = dataclasses.field(default_factory=Rollouts)
 
     @abc.abstractmethod
@@ -141,7 +144,8 @@ class OnPolicy(BaseAgent):
         count, first = self.policy.outputs(size), self.policy.first(size, self.initial_std)
         actor = scale_head(self.actor.init(actor_key, num_tasks, count, *inputs.actor), first)
         critic = scale_head(self.critic.init(critic_key, num_tasks, 1, *inputs.critic), jnp.zeros(1))
-        state = state.with_nets(actor=actor, critic=critic, units=Units.begin(num_tasks).params())
+        kept = renewing.begin(self, {"actor": actor, "critic": critic})
+        state = state.with_nets(**kept, actor=actor, critic=critic, units=Units.begin(num_tasks).params())
         slow = {"representation": state.nets["representation"]} if self.representation.learns else {}
         return state._replace(slow=jax.tree.map(jnp.copy, slow))
 
@@ -209,6 +213,7 @@ class OnPolicy(BaseAgent):
         loss = above(self.least_loss + self.representation.least_loss, self.critic_loss)
         batch = self.view.keyed(batch, jax.random.fold_in(key, 4))
         state, critic = descend(self.fits, "critic", state, loss, (batch,), critic_order, importance)
+        state = renewing.renew(self, state, batch, jax.random.fold_in(key, 5), number)
         told = critics.explained(state, batch)
         return state, critic.aux | critic.metrics | actor.aux.metrics | actor.metrics | told
 

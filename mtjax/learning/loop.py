@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from mtjax import frames
-from mtjax.agents.consolidating import consolidate, consolidates
+from mtjax.agents.consolidating import change, consolidate, consolidates
 from mtjax.agents.fit import reset_networks
 from mtjax.agents.state import of_tasks, with_tasks
 from mtjax.agents.swept import at_point, with_numbers
@@ -158,7 +158,8 @@ def require_curriculum(settings: Settings, env: Any, agent: Any) -> None:
     """
     if consolidates(agent) and not isinstance(settings.plays, curricula.Sequence):
         raise InputError(
-            "continual and reset-optimizer are for tasks one after another: use --curriculum=sequence:STEPS"
+            "continual, reset-optimizer and shrink-and-perturb are for tasks one after another: use "
+            "--curriculum=sequence:STEPS"
         )
     if settings.keep_replay:
         _require_one_replay(settings, agent)
@@ -347,9 +348,10 @@ def _consolidate(env: Env, agent: Agent, known: Task, state: TrainState) -> Any:
     """Return the agents (S, ...) as they end the task that was played, from whose replay they may learn once more."""
     if not consolidates(agent):
         return state.agent
+    begin = partial(_init_agent, env, agent, known)
+    fresh = jax.vmap(begin)(_folded(state.key), getattr(state.agent, "numbers", {}))
     if agent.continual.restarts:
-        begin = partial(_init_agent, env, agent, known)
-        return jax.vmap(begin)(_folded(state.key), getattr(state.agent, "numbers", {}))
+        return fresh
     tasks, experience = rows_of(known, state.rows), agent.experience
 
     def of_seed(learner: Any, data: Any, key: Key) -> Any:
@@ -358,7 +360,8 @@ def _consolidate(env: Env, agent: Agent, known: Task, state: TrainState) -> Any:
 
     played = _of_played(state.agent, state.rows)
     played = over_seeds(of_seed, 0, experience.storage.axes, 0)(played, state.data, _folded(state.key))
-    return _with_played(state.agent, played, state.rows)
+    ended = _with_played(state.agent, played, state.rows)
+    return over_seeds(partial(change, agent), 0, 0)(ended, fresh) if agent.plasticity.changes else ended
 
 
 def _folded(keys: Key) -> Key:
