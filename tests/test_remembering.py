@@ -86,6 +86,24 @@ def test_a_penalty_holds_the_actor_with_which_each_task_ended(name, given):
         assert all(np.all(x == 1) for x in rise)
 
 
+def test_a_clone_holds_what_the_actor_put_out_where_each_task_ended():
+    """The penalty is 0 for that actor, and more for another one; of its own task none is stored while it is played."""
+    (first, second, third), agent = states("clone", clone_samples=6, clone_batch=4, heads="per-task")
+    known = [state.nets["continual"].shared["known"][0].tolist() for state in (first, second, third)]
+    assert known == [[False] * 3, [True, False, False], [True, True, False]]
+    one = lambda state: jax.tree.map(lambda x: jnp.asarray(x[0]), state.nets)
+    held = one(second)["continual"].shared
+    ended, inputs = of_task(one(first), jnp.int32(0)), jax.tree.map(lambda x: x[0], held["inputs"])
+    outputs = jax.vmap(lambda *x: agent.actor.apply(ended["actor"], *x))(*inputs)
+    np.testing.assert_allclose(held["outputs"][0], outputs, rtol=1e-5, atol=1e-6)
+    assert np.any(outputs) and len(np.unique(inputs[1])) > 1
+    penalty = lambda nets: float(agent.continual.penalty(nets, agent, jax.random.key(0)))
+    playing = of_task(one(second), jnp.int32(1))
+    same = playing | {"actor": playing["actor"]._replace(shared=ended["actor"].shared)}
+    assert penalty(same) < 1e-6 < 1e-4 < penalty(playing)
+    assert penalty(of_task(one(first), jnp.int32(1))) == 0 == penalty(of_task(one(second), jnp.int32(0)))
+
+
 def test_the_penalty_is_a_part_of_the_actors_loss():
     """Of one parameter that lies 0.5 beside its anchor, at importance 3: 10 / 2 * 3 * 0.25."""
     way = remembering.EWC(ewc_coefficient=10.0)
@@ -139,7 +157,11 @@ def test_optimisers_begin_anew_where_a_task_ends():
 
 
 @pytest.mark.parametrize(
-    "name, given", [("packnet", {"retrain_updates": 5}), param(("ewc", {"fisher_samples": 64}), slow=True)]
+    "name, given", [
+        ("packnet", {"retrain_updates": 5}),
+        param(("ewc", {"fisher_samples": 64}), slow=True),
+        param(("clone", {"clone_samples": 10}), slow=True),
+    ],
 )
 def test_a_run_resumes_to_the_bit(tmp_path, name, given):
     small = {"num_envs": 2, "chunk_steps": 50, "curriculum": "sequence:50", "quiet": True, "batch_size": 8}
