@@ -109,8 +109,8 @@ class BaseAgent(abc.ABC):
     """How the actor remembers tasks that it learned one after another."""
     plasticity: ClassVar[Renewing] = Renewing()
     """What keeps the networks able to learn."""
-    renews: ClassVar[bool] = False
-    """Whether an update ends with the units that ``plasticity`` begins anew."""
+    distils: ClassVar[bool] = False
+    """Whether another policy than each task's own learns beside it."""
     unit_head: ClassVar[bool] = False
     """Whether the weights of each output of actor and critics keep length 1."""
     hidden: tuple[int, ...] = (256, 256)

@@ -28,6 +28,8 @@ def check(agent: Any) -> None:
     _check_schedule(agent)
     if agent.plasticity.every:
         _check_units(agent)
+    if agent.continual.keeps:
+        _check_continual(agent)
 
 
 def _name(agent: Any, kind: str) -> str:
@@ -99,7 +101,7 @@ def _check_schedule(agent: Any) -> None:
 def _check_units(agent: Any) -> None:
     """Refuse to renew units of networks that are no plain MLPs of all tasks."""
     plain = type(agent.encoder.body(agent.hidden, layer_norm=False)) is Trunk and not agent.encoder.front()
-    otherwise = agent.representation.learns or agent.fits_statistics or not agent.renews
+    otherwise = agent.representation.learns or agent.fits_statistics or agent.distils
     if not plain or otherwise or agent.unit_head or agent.heads != "shared" or agent.tune != "all":
         raise InputError(
             f"plasticity={_name(agent, 'plasticity')} renews the units of plain MLPs that all tasks share: it needs "
@@ -129,8 +131,6 @@ def check_replayed(agent: Any) -> None:
     if agent.conditioning.recurs and (replay.n_step > 1 or replay.hindsight or replay.host_replay_size):
         name = _name(agent, "conditioning")
         raise InputError(f"conditioning={name} needs n-step=1, hindsight=0 and host-replay-size=0")
-    if agent.continual.keeps:
-        _check_continual(agent)
     if agent.unroll > replay.warmup_steps + 1:
         raise InputError(
             f"recurrent-steps={agent.unroll} needs as many steps before the first update: warmup-steps of at least "
@@ -143,6 +143,11 @@ def _check_continual(agent: Any) -> None:
     name = _name(agent, "continual")
     if agent.heads == "disjoint":
         raise InputError(f"continual={name} holds what tasks share, and heads=disjoint shares nothing; use per-task")
+    if not agent.experience.storage.kept and (agent.continual.retrains or agent.conditioning.recurs):
+        raise InputError(
+            f"continual={name} learns on from a replay, or holds a policy with a memory, and {type(agent).__name__} "
+            "has rollouts; use retrain-updates=0 and another conditioning, or sac"
+        )
     if agent.fits_statistics or agent.distils:
         raise InputError(
             f"continual={name} holds one actor without statistics, as sac has; not {type(agent).__name__}'s"

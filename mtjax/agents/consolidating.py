@@ -1,4 +1,4 @@
-"""What happens to an agent with a replay where one task of a sequence ends and another begins."""
+"""What happens to an agent where one task of a sequence ends and another begins."""
 
 from collections.abc import Callable
 from functools import partial
@@ -7,14 +7,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mtjax.agents import replayed
 from mtjax.agents.fit import learned
 from mtjax.agents.parts.policies import Policy
 from mtjax.agents.state import AgentState, of_task
 from mtjax.types import Array, Key, Task, Transition
 
 Draw = Callable[[Key, int], Transition]
-"""Draws so many windows (T, count, L, ...) of the replay."""
+"""Draws so many windows (T, count, L, ...) of the replay, or of a last rollout."""
 
 
 def consolidates(agent: Any) -> bool:
@@ -43,10 +42,11 @@ def _policy(agent: Any, state: AgentState, draw: Draw, tasks: Task, key: Key) ->
     count, nets = agent.continual.samples, of_task(state.nets, jnp.int32(0))
     if not count:
         return None, None, None
-    batch = replayed.prepare(agent, state, draw(key, count), tasks)
-    obs, features, mask = jax.tree.map(lambda x: x[0], (batch.obs, batch.features, batch.mask))
+    features, obs = jax.tree.map(lambda x: x[0], agent.policy_data(state, draw(key, count), tasks))
+    mask = None if tasks.action_mask is None else tasks.action_mask[0]
     features, obs = agent.view.actor_inputs(nets, features, obs)
-    inputs = (jnp.broadcast_to(features, (count, features.shape[-1])), obs)
+    each = jnp.broadcast_to(features, (len(jax.tree.leaves(obs)[0]), features.shape[-1]))
+    inputs = jax.tree.map(lambda x: x[:count], (each, obs))  # windows of several steps have more
     outputs = lambda shared, given: agent.actor.apply(nets["actor"]._replace(shared=shared), *given)
     return outputs, partial(information, agent.policy, mask), inputs
 

@@ -64,7 +64,6 @@ class Distral(SAC):
 
     adjustable: ClassVar[tuple[str, ...]] = (*SAC.adjustable, "distral_alpha")
     distils: ClassVar[bool] = True
-    renews: ClassVar[bool] = False
     stand_in: ClassVar[str] = "the distilled policy plays them"
     one_knowledge: ClassVar[bool] = True  # which the distilled policy shares
     heads: Heads = "disjoint"

@@ -64,7 +64,6 @@ class MAML(OnPolicy):
     """
 
     adjustable: ClassVar[tuple[str, ...]] = (*OnPolicy.adjustable, "clip_range", "inner_rate", "first_order")
-    renews: ClassVar[bool] = False
     hidden: tuple[int, ...] = (64, 64)
     actor_lr: float = 1e-3
     """Adam's learning rate for the actor."""

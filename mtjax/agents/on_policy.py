@@ -14,7 +14,6 @@ from mtjax.agents.fit import Fit, above, descend
 from mtjax.agents.networks import Network, Params
 from mtjax.agents.parts.policies import Categorical, Gaussian, Policy
 from mtjax.agents.parts.policies.gaussian import STD_RANGE
-from mtjax.agents.parts.renewing import Renewing
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.state import AgentState, Nets
@@ -73,7 +72,6 @@ class OnPolicy(BaseAgent):
     common_presets: ClassVar[bool] = False
     policies: ClassVar[tuple[type[Policy], ...]] = (Gaussian, Categorical)
     devices_differ: ClassVar[bool] = True
-    renews: ClassVar[bool] = True
     actor_lr: float = 3e-4
     """Adam's learning rate for the actor."""
     critic_lr: float = 1e-3
@@ -98,7 +96,6 @@ class OnPolicy(BaseAgent):
     it also has a head for every task, which is rescaled when these estimates move."""
     value_rate: float = 0.1
     """Weight of a new rollout in the moving estimates of targets' mean and variance."""
-    plasticity: Annotated[Renewing, FLAT] = dataclasses.field(default_factory=Renewing)
     experience: Annotated[Rollouts, FLAT] = dataclasses.field(default_factory=Rollouts)
 
     @abc.abstractmethod
@@ -144,7 +141,8 @@ class OnPolicy(BaseAgent):
         count, first = self.policy.outputs(size), self.policy.first(size, self.initial_std)
         actor = scale_head(self.actor.init(actor_key, num_tasks, count, *inputs.actor), first)
         critic = scale_head(self.critic.init(critic_key, num_tasks, 1, *inputs.critic), jnp.zeros(1))
-        kept = renewing.begin(self, {"actor": actor, "critic": critic})
+        kept = self.continual.init(actor, num_tasks, inputs.actor, count)
+        kept = kept | renewing.begin(self, {"actor": actor, "critic": critic})
         state = state.with_nets(**kept, actor=actor, critic=critic, units=Units.begin(num_tasks).params())
         slow = {"representation": state.nets["representation"]} if self.representation.learns else {}
         return state._replace(slow=jax.tree.map(jnp.copy, slow))
@@ -179,7 +177,8 @@ class OnPolicy(BaseAgent):
         entropy = jnp.mean(self.policy.entropy(outputs, batch.mask, key))
         loss = -jnp.mean(gain) - self.entropy_cost * entropy
         kl = jnp.mean(jnp.exp(log_ratio) - 1 - log_ratio)
-        return loss, ActorAux({"actor_loss": loss, "entropy": entropy, "kl": kl, **metrics}, kl)
+        held = self.continual.penalty(nets, self, jax.random.fold_in(key, 1))
+        return loss + held, ActorAux({"actor_loss": loss, "entropy": entropy, "kl": kl, **metrics}, kl)
 
     def critic_loss(self, nets: Nets, batch: Batch) -> tuple[Array, Metrics]:
         loss = self.fitting_loss(self.output(nets, batch.features, batch.obs), batch)
@@ -231,6 +230,11 @@ class OnPolicy(BaseAgent):
         flat, features, obs, next_obs = self.view.steps(state, window, tasks)
         models = critics.models(self, state, flat, tasks, next_obs)
         return state, Batch(obs=obs, features=features, mask=tasks.action_mask, **flat.extras._asdict(), **models)
+
+    def policy_data(self, state: AgentState, window: Transition, tasks: Task) -> tuple[Array, Any]:
+        """Return features (T, ...) and observations (T, B, ...) as ``policy_outputs`` takes them, of windows."""
+        _, features, obs, _ = self.view.steps(state, window, tasks)
+        return features, obs
 
     def accept(self, moved: AgentState, state: AgentState, kl: Array) -> AgentState:
         """Return the state after an actor's step, which moved it, given KL(pi_old | pi) (T,) before the step."""

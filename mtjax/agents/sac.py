@@ -44,9 +44,6 @@ class SAC(BaseAgent):
         *BaseAgent.adjustable,
         *("temperature_lr", "temperature_momentum", "tau", "target_entropy"),
     )
-    renews: ClassVar[bool] = True
-    distils: ClassVar[bool] = False
-    """Whether another policy than each task's own learns beside it."""
     temperature_lr: float = 1e-3
     """Adam's learning rate of the temperatures."""
     temperature_momentum: float = 0.9
@@ -94,6 +91,11 @@ class SAC(BaseAgent):
     def fits(self) -> dict[str, Fit]:
         rate = scheduled(self, self.temperature_lr, self.experience.policy_delay)
         return super().fits | {"temperature": Fit(("temperature",), optax.adam(rate, self.temperature_momentum))}
+
+    def policy_data(self, state: AgentState, window: Transition, tasks: Task) -> tuple[Array, Any]:
+        """Return features (T, ...) and observations (T, B, ...) as ``policy_outputs`` takes them, of windows."""
+        batch = replayed.prepare(self, state, window, tasks)
+        return batch.features, batch.obs
 
     def act(self, state: AgentState, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
         """Choose an action (A,) for one observation (O,) of one task; without a key, the mean action."""

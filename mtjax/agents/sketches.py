@@ -71,7 +71,6 @@ class Sketches(OnPolicy):
     policies: ClassVar[tuple[type[Policy], ...]] = (Categorical,)
     follows_sketches: ClassVar[bool] = True
     one_knowledge: ClassVar[bool] = True  # which sub-policies share
-    renews: ClassVar[bool] = False
     hidden: tuple[int, ...] = (128,)
     actor_lr: float = 1e-3
     """Adam's learning rate for the actor."""

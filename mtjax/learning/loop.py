@@ -338,30 +338,39 @@ def _take_turns(env: Env, agent: Agent, settings: Settings, known: Task, state: 
         if not settings.keep_replay:
             data = agent.experience.init(blank, env.spec, shape[1], settings.num_envs, data_key)
         fresh = {"total": jnp.zeros(shape), "counted": worlds.age == 0}
-        fresh |= {"agent": _consolidate(env, agent, known, state)}
+        fresh |= {"agent": _consolidate(env, agent, settings, known, state)}
         return state._replace(worlds=worlds, data=data, key=key, rows=rows, **fresh)
 
     return jax.lax.cond(jnp.any(rows != state.rows), begin, lambda state: state, state)
 
 
-def _consolidate(env: Env, agent: Agent, known: Task, state: TrainState) -> Any:
-    """Return the agents (S, ...) as they end the task that was played, from whose replay they may learn once more."""
+def _consolidate(env: Env, agent: Agent, settings: Settings, known: Task, state: TrainState) -> Any:
+    """Return the agents (S, ...) as they end the task that was played, from whose steps they may learn once more."""
     if not consolidates(agent):
         return state.agent
-    begin = partial(_init_agent, env, agent, known)
-    fresh = jax.vmap(begin)(_folded(state.key), getattr(state.agent, "numbers", {}))
+    keys = _folded(state.key)
+    fresh = jax.vmap(partial(_init_agent, env, agent, known))(keys, getattr(state.agent, "numbers", {}))
     if agent.continual.restarts:
         return fresh
-    tasks, experience = rows_of(known, state.rows), agent.experience
+    tasks, experience, kept = rows_of(known, state.rows), agent.experience, agent.experience.storage.kept
+    steps = state.data if kept else _last_rollout(env, agent, settings, tasks, state, keys)
 
-    def of_seed(learner: Any, data: Any, key: Key) -> Any:
-        draw = lambda key, count: experience.draw(env.spec, agent, data.ring, key, count)
+    def of_seed(learner: Any, steps: Any, key: Key) -> Any:
+        draw = lambda key, count: experience.draw(env.spec, agent, steps.ring if kept else steps, key, count)
         return consolidate(at_point(agent, learner), learner, draw, tasks, key)
 
     played = _of_played(state.agent, state.rows)
-    played = over_seeds(of_seed, 0, experience.storage.axes, 0)(played, state.data, _folded(state.key))
+    played = over_seeds(of_seed, 0, experience.storage.axes if kept else 0, 0)(played, steps, keys)
     ended = _with_played(state.agent, played, state.rows)
     return over_seeds(partial(change, agent), 0, 0)(ended, fresh) if agent.plasticity.changes else ended
+
+
+def _last_rollout(env: Env, agent: Agent, settings: Settings, tasks: Task, state: TrainState, keys: Key) -> Any:
+    """Return steps (S, T, H, E, ...) of the task that ends, for an agent without a replay that remembers some."""
+    if not agent.continual.samples:
+        return ()
+    act_keys, reset_keys = split_keys(keys, 2)
+    return _collect(env, agent, settings, tasks, state, act_keys, reset_keys)[1]
 
 
 def _folded(keys: Key) -> Key:
