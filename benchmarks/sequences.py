@@ -8,7 +8,8 @@ second rewards, and ``cw20`` the same twice; in the second round tasks have the 
 is a process of its own with all seeds in one program. ``scratch`` begins the agent anew where a task ends, so that each
 task is learned alone: transfer is measured by it. Seeds are those of the environment too, so that methods are paired.
 
-A method is NAME, or NAME:SETTING=VALUE:..., such as ewc:ewc_coefficient=100. Each writes ``OUT/METHOD.json`` with the
+A method is NAME of --agent.continual or --agent.plasticity, or NAME:SETTING=VALUE:..., such as
+ewc:ewc_coefficient=100 or redo:redo_every=500. Each writes ``OUT/METHOD.json`` with the
 scores (S, V, N) of every evaluation of all tasks; in its name colons and equals signs are dashes. Finished methods are
 not run again. One that was stopped, also by ``--within``, goes on where it was if the same command is given again;
 until it is finished its run is in ``OUT/METHOD.run``. ``--training`` replaces settings of the agent or the loop.
@@ -31,10 +32,11 @@ from learning import cell
 from report import markdown, record, run_main, write_lines
 from returns import value
 
-import mtjax
+from mtjax.agents.parts.renewing import PLASTICITY
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import configure, with_preset
 from mtjax.report import sequences, stats
+
 
 class Protocol(NamedTuple):
     """Holds what is played in which order, and how it is learned unless other settings are given."""
@@ -112,7 +114,8 @@ def measure(arguments: argparse.Namespace, protocol: Protocol, out: Path, method
     name, *words = method.split(":")
     given = {key: value(x) for key, x in (word.split("=", 1) for word in [*arguments.training, *words])}
     chunk, played = protocol.each // protocol.evaluations, protocol.tasks * protocol.rounds
-    given = {**_COMMON, **protocol.settings, "continual": name, **given}
+    kind = "plasticity" if name in PLASTICITY and name != "none" else "continual"
+    given = {**_COMMON, **protocol.settings, kind: name, **given}
     given |= {"curriculum": f"sequence:{protocol.each}", "chunk_steps": chunk}
     several = {"num_tasks": protocol.tasks, "split": "none"} if "+" not in protocol.env and protocol.best else {}
     plain = with_preset(protocol.env, protocol.agent, **several)
@@ -146,32 +149,47 @@ def measure(arguments: argparse.Namespace, protocol: Protocol, out: Path, method
     shutil.rmtree(folder, ignore_errors=True)
 
 
-def rounded(scores: np.ndarray, digits: int = 5) -> list:
+def rounded(scores: np.ndarray, digits: int = 5) -> list[Any]:
     """Return the means over episodes of scores (S, V, N, episodes)."""
-    return np.round(np.float64(scores.mean(axis=-1)), digits).tolist()
+    return np.asarray(np.round(np.float64(scores.mean(axis=-1)), digits)).tolist()
+
+
+class Measures(NamedTuple):
+    """Holds what is measured of one method."""
+
+    performance: np.ndarray  # (S,)
+    forgetting: np.ndarray  # (S,) without that of the last task, which is 0
+    areas: np.ndarray  # (S, P) of all parts of the sequence
+
+
+def measures(result: dict[str, Any]) -> Measures:
+    """Return the measures of a method's scores. In a second round tasks count once more."""
+    scores = np.array(result["scores"])[:, :, result["order"]]
+    spans = sequences.spans_of(scores.shape[1], scores.shape[2])
+    lost = sequences.forgetting(scores, spans)[:, :-1].mean(axis=1)
+    return Measures(sequences.performance(scores), lost, sequences.areas(scores, spans))
 
 
 def table(out: Path) -> str:
     """Return the measures of all methods that have finished, and write the curves of all."""
     results = [json.loads(path.read_text()) for path in sorted(out.glob("*.json"))]
     write_lines(out / "curves.csv", [line for result in results for line in curves(result)])
-    of_parts = {x["method"]: np.array(x["scores"])[:, :, x["order"]] for x in results}
-    alone = of_parts.get("scratch")
-    rows = []
-    for method, scores in of_parts.items():
-        spans = sequences.spans_of(scores.shape[1], scores.shape[2])
-        performance, lost = sequences.performance(scores), sequences.forgetting(scores, spans)[:, :-1].mean(axis=1)
-        areas, paired = sequences.areas(scores, spans), lambda other: other is not None and len(other) == len(scores)
-        transfer, against, plain = "-", "-", of_parts.get("none")
-        if paired(alone) and method != "scratch":
-            gained = sequences.forward_transfer(areas, sequences.areas(alone, spans).mean(axis=0))
-            transfer = cell(stats.seed_interval(np.nanmean(gained, axis=1)), ".2f")
-        if paired(plain) and method != "none":
-            against = cell(stats.paired_difference(performance, sequences.performance(plain)), ".2f")
-        own = [cell(stats.seed_interval(x), ".2f") for x in (performance, lost, areas.mean(axis=1))]
-        rows.append([method, *own, transfer, against])
+    found = {result["method"]: measures(result) for result in results}
     titles = ["performance", "forgetting", "score while learning", "forward transfer", "performance less none's"]
-    return markdown(["method", *titles], rows)
+    return markdown(["method", *titles], [row(method, found) for method in found])
+
+
+def row(method: str, found: dict[str, Measures]) -> list[str]:
+    """Return a method's line of the table."""
+    own, transfer, against = found[method], "-", "-"
+    alone, plain = (None if method == name else found.get(name) for name in ("scratch", "none"))
+    if alone is not None:
+        gained = sequences.forward_transfer(own.areas, alone.areas.mean(axis=0))
+        transfer = cell(stats.seed_interval(np.nanmean(gained, axis=1)), ".2f")
+    if plain is not None and len(plain.performance) == len(own.performance):
+        against = cell(stats.paired_difference(own.performance, plain.performance), ".2f")
+    shown = (own.performance, own.forgetting, own.areas.mean(axis=1))
+    return [method, *(cell(stats.seed_interval(x), ".2f") for x in shown), transfer, against]
 
 
 def curves(result: dict[str, Any]) -> list[dict[str, Any]]:

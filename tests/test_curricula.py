@@ -133,7 +133,7 @@ def test_what_cannot_be_played_is_refused(agent, given, said):
 def test_a_replay_begins_anew_with_random_steps_where_tasks_change_unless_it_is_kept():
     """Of three chunks of eight steps each, in which the first three steps are random and nothing is learned."""
     blind = {**REPLAY, "warmup_steps": 3}
-    states, metrics = played(tiny("sac"), "sequence:8", 2, **blind)
+    states, _ = played(tiny("sac"), "sequence:8", 2, **blind)
     assert [int(state.data.ring.size) for state in states] == [0, 8, 8]
     kept, _ = played(tiny("sac"), "sequence:8", 2, keep_replay=True, **blind)
     assert [int(state.data.ring.size) for state in kept] == [0, 8, 16]

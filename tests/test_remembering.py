@@ -157,7 +157,8 @@ def test_optimisers_begin_anew_where_a_task_ends():
 
 
 @pytest.mark.parametrize(
-    "name, given", [
+    "name, given",
+    [
         ("packnet", {"retrain_updates": 5}),
         param(("ewc", {"fisher_samples": 64}), slow=True),
         param(("clone", {"clone_samples": 10}), slow=True),

@@ -61,8 +61,10 @@ def test_redo_renews_idle_units_and_changes_no_output():
 def test_redo_waits_for_its_turn():
     agent, state, batch = made("redo", redo_every=10, dormant_threshold=1e9)
     renew = jax.jit(lambda number: renewing.renew(agent, state, batch, jax.random.key(2), number))
-    changed = lambda number: not np.array_equal(
-        renew(number).nets["actor"].shared["head"]["kernel"], state.nets["actor"].shared["head"]["kernel"]
+    changed = lambda number: (
+        not np.array_equal(
+            renew(number).nets["actor"].shared["head"]["kernel"], state.nets["actor"].shared["head"]["kernel"]
+        )
     )
     assert [changed(jnp.int32(number)) for number in (0, 8, 9, 10, 19)] == [False, False, True, False, True]
 

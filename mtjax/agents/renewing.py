@@ -23,7 +23,9 @@ def begin(agent: Any, nets: Nets) -> Nets:
     if not agent.plasticity.every:
         return {}
     one = lambda net: agent.plasticity.init([len(layer["bias"]) for layer in _dense(net.shared)])
-    stacked = lambda net: jax.vmap(lambda _: one(_first(net)))(net.shared["head"]["bias"]) if _several(net) else one(net)
+    stacked = lambda net: (
+        jax.vmap(lambda _: one(_first(net)))(net.shared["head"]["bias"]) if _several(net) else one(net)
+    )
     return {NET: Params({name: stacked(nets[name]) for name in ("actor", "critic")}, {})}
 
 
@@ -77,7 +79,7 @@ def hidden_layers(network: Network, params: Params, features: Array, obs: Array,
     kept = {"capture_intermediates": units, "mutable": ["intermediates"]}
     _, found = network.body.apply(params.parts["body"], obs, features, *action, **kept)  # type: ignore
     layers = found["intermediates"][_MLP]  # type: ignore
-    return [layers[f"ReLU_{i}"]["__call__"][0] for i in range(len(layers))]
+    return [layers[f"ReLU_{i}"]["__call__"][0] for i in range(len(layers))]  # type: ignore
 
 
 def _forgotten(shared: Any, units: list[Array]) -> Any:

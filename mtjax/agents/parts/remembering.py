@@ -302,7 +302,7 @@ class Clone(Nothing):
 
 @dataclasses.dataclass(frozen=True)
 class Scratch(Nothing):
-    """Begins the whole agent anew where a task ends, so that each task is learned alone: what transfer is measured by."""
+    """Begins the whole agent anew where a task ends: each task is learned alone, by which transfer is measured."""
 
     restarts: ClassVar[bool] = True
 
