@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from mtjax.agents import replayed
 from mtjax.agents.fit import learned
 from mtjax.agents.parts.policies import Policy
 from mtjax.agents.state import AgentState, of_task
@@ -42,13 +43,22 @@ def _policy(agent: Any, state: AgentState, draw: Draw, tasks: Task, key: Key) ->
     count, nets = agent.continual.samples, of_task(state.nets, jnp.int32(0))
     if not count:
         return None, None, None
-    features, obs = jax.tree.map(lambda x: x[0], agent.policy_data(state, draw(key, count), tasks))
+    features, obs = jax.tree.map(lambda x: x[0], _seen(agent, state, draw(key, count), tasks))
     mask = None if tasks.action_mask is None else tasks.action_mask[0]
     features, obs = agent.view.actor_inputs(nets, features, obs)
     each = jnp.broadcast_to(features, (len(jax.tree.leaves(obs)[0]), features.shape[-1]))
     inputs = jax.tree.map(lambda x: x[:count], (each, obs))  # windows of several steps have more
     outputs = lambda shared, given: agent.actor.apply(nets["actor"]._replace(shared=shared), *given)
     return outputs, partial(information, agent.policy, mask), inputs
+
+
+def _seen(agent: Any, state: AgentState, window: Transition, tasks: Task) -> tuple[Array, Any]:
+    """Return features (T, ...) and observations (T, N, ...) of windows, as ``agent.view.actor_inputs`` takes them."""
+    if agent.experience.storage.kept:
+        batch = replayed.prepare(agent, state, window, tasks)
+        return batch.features, batch.obs
+    _, features, obs, _ = agent.view.steps(state, window, tasks)
+    return features, obs
 
 
 def information(policy: Policy, mask: Array | None, outputs: Array) -> Array:

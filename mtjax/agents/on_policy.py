@@ -231,11 +231,6 @@ class OnPolicy(BaseAgent):
         models = critics.models(self, state, flat, tasks, next_obs)
         return state, Batch(obs=obs, features=features, mask=tasks.action_mask, **flat.extras._asdict(), **models)
 
-    def policy_data(self, state: AgentState, window: Transition, tasks: Task) -> tuple[Array, Any]:
-        """Return features (T, ...) and observations (T, B, ...) as ``policy_outputs`` takes them, of windows."""
-        _, features, obs, _ = self.view.steps(state, window, tasks)
-        return features, obs
-
     def accept(self, moved: AgentState, state: AgentState, kl: Array) -> AgentState:
         """Return the state after an actor's step, which moved it, given KL(pi_old | pi) (T,) before the step."""
         return moved

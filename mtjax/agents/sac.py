@@ -92,11 +92,6 @@ class SAC(BaseAgent):
         rate = scheduled(self, self.temperature_lr, self.experience.policy_delay)
         return super().fits | {"temperature": Fit(("temperature",), optax.adam(rate, self.temperature_momentum))}
 
-    def policy_data(self, state: AgentState, window: Transition, tasks: Task) -> tuple[Array, Any]:
-        """Return features (T, ...) and observations (T, B, ...) as ``policy_outputs`` takes them, of windows."""
-        batch = replayed.prepare(self, state, window, tasks)
-        return batch.features, batch.obs
-
     def act(self, state: AgentState, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
         """Choose an action (A,) for one observation (O,) of one task; without a key, the mean action."""
         outputs = self.policy_outputs(*self.view.acting(state, memory, obs, task))
