@@ -106,7 +106,6 @@ def test_shrinking_and_perturbing_changes_what_tasks_share_alone():
     [
         ("sac", {"heads": "per-task"}, "heads=shared"),
         ("brc", {}, "encoder=identity"),
-        ("maml", {}, "in sac or ppo"),
         ("sac-conditioned", {"continual": "packnet"}, "continual=packnet keeps"),
         ("sac", {"redo_every": 0}, "redo-every must be at least 1"),
     ],
