@@ -16,7 +16,8 @@ until it is finished its run is in ``OUT/METHOD.run``. ``--training`` replaces s
 
 Scores are shares of episodes with success at any step, or for ``goals`` returns divided by 100. The table has
 performance, forgetting and forward transfer (``mtjax.report.sequences``) with intervals over seeds, and the paired
-difference of performance from ``none``. ``OUT/curves.csv`` has the mean score of every task at every evaluation.
+difference of performance from ``none``. ``OUT/curves.csv`` has the mean score of every task at every evaluation, and
+``OUT/curves.png`` shows it, with the part of the sequence in which the task is learned in grey.
 """
 
 import argparse
@@ -29,13 +30,14 @@ import numpy as np
 import parts
 import resumable
 from learning import cell
+from matplotlib.figure import Figure
 from report import markdown, record, run_main, write_lines
 from returns import value
 
 from mtjax.agents.parts.renewing import PLASTICITY
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import configure, with_preset
-from mtjax.report import sequences, stats
+from mtjax.report import figures, sequences, stats
 
 
 class Protocol(NamedTuple):
@@ -174,6 +176,7 @@ def table(out: Path) -> str:
     """Return the measures of all methods that have finished, and write the curves of all."""
     results = [json.loads(path.read_text()) for path in sorted(out.glob("*.json"))]
     write_lines(out / "curves.csv", [line for result in results for line in curves(result)])
+    draw(out / "curves.png", results)
     found = {result["method"]: measures(result) for result in results}
     titles = ["performance", "forgetting", "score while learning", "forward transfer", "performance less none's"]
     return markdown(["method", *titles], [row(method, found) for method in found])
@@ -198,6 +201,26 @@ def curves(result: dict[str, Any]) -> list[dict[str, Any]]:
     lines = zip(result["steps"], means, strict=True)
     named = lambda scores: {task: round(float(x), 3) for task, x in zip(result["tasks"], scores, strict=True)}
     return [{"method": result["method"], "steps": steps, **named(scores)} for steps, scores in lines]
+
+
+def draw(path: Path, results: list[dict[str, Any]]) -> None:
+    """Draw the scores of every task over the steps of the sequence, a line for each method."""
+    if not results:
+        return
+    order, tasks, steps = results[0]["order"], results[0]["tasks"], np.array(results[0]["steps"])
+    figure = Figure(figsize=(8, 1 + 1.1 * len(tasks)), dpi=figures.DOTS_PER_INCH, layout="constrained")
+    each = steps[-1] / len(order)
+    for i, axes in enumerate(figure.subplots(len(tasks), sharex=True, sharey=True, squeeze=False)[:, 0]):
+        for part in (part for part, task in enumerate(order) if task == i):
+            axes.axvspan(part * each, (part + 1) * each, color="0.9", zorder=0)
+        for index, result in enumerate(results):
+            scores = np.array(result["scores"])[:, :, i]
+            figures.draw_line(axes, np.array(result["steps"]), scores, result["method"].split(":")[0], index)
+        axes.set_title(tasks[i].removeprefix("metaworld-"), fontsize=8, loc="left")
+    figures.label_steps(axes)
+    axes.set_ylabel("score")
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside right center", frameon=False)
+    figure.savefig(path)
 
 
 if __name__ == "__main__":
