@@ -1,20 +1,23 @@
 """Measure ways to remember tasks that are learned one after another: performance, forgetting and forward transfer.
 
-    python benchmarks/sequences.py goals|cw10|cw20 [--methods NAME ...] [--seeds 10] [--each STEPS] [--evaluations N]
-                                   [--training NAME=VALUE ...] [--within SECONDS] [--devices 0 ...] [--out DIR]
+    python benchmarks/sequences.py goals|slippery|cw10|cw20 [--methods NAME ...] [--seeds 10] [--each STEPS]
+                                   [--evaluations N] [--training NAME=VALUE ...] [--within SECONDS]
+                                   [--devices 0 ...] [--out DIR]
 
-``goals`` are four goals of a point mass. ``cw10`` is Continual World's order of ten tasks, on this Meta-World with its
-second rewards, and ``cw20`` the same twice; in the second round tasks have the output layers of the first. Every method
-is a process of its own with all seeds in one program. ``scratch`` begins the agent anew where a task ends, so that each
-task is learned alone: transfer is measured by it. Seeds are those of the environment too, so that methods are paired.
+``goals`` are four goals of a point mass. ``slippery`` is a walker that is blind to the friction of its ground, which
+changes: its score while learning tells whether networks stay able to learn (as in Dohare et al. 2024). ``cw10`` is
+Continual World's order of ten tasks, on this Meta-World with its second rewards, and ``cw20`` the same twice; in the
+second round tasks have the output layers of the first. Every method is a process of its own with all seeds in one
+program. ``scratch`` begins the agent anew where a task ends, so that each task is learned alone: transfer is measured
+by it. Seeds are those of the environment too, so that methods are paired.
 
 A method is NAME of --agent.continual or --agent.plasticity, or NAME:SETTING=VALUE:..., such as
-ewc:ewc_coefficient=100 or redo:redo_every=500. Each writes ``OUT/METHOD.json`` with the
-scores (S, V, N) of every evaluation of all tasks; in its name colons and equals signs are dashes. Finished methods are
-not run again. One that was stopped, also by ``--within``, goes on where it was if the same command is given again;
-until it is finished its run is in ``OUT/METHOD.run``. ``--training`` replaces settings of the agent or the loop.
+ewc:ewc_coefficient=100 or redo:redo_every=500. Each writes ``OUT/METHOD.json`` with the scores (S, V, N) of every
+evaluation of all tasks; in its name colons and equals signs are dashes. Finished methods are not run again. One that
+was stopped, also by ``--within``, goes on where it was if the same command is given again; until it is finished its run
+is in ``OUT/METHOD.run``. ``--training`` replaces settings of the agent or the loop.
 
-Scores are shares of episodes with success at any step, or for ``goals`` returns divided by 100. The table has
+Scores are shares of episodes with success at any step, or returns divided by the length of an episode. The table has
 performance, forgetting and forward transfer (``mtjax.report.sequences``) with intervals over seeds, and the paired
 difference of performance from ``none``. ``OUT/curves.csv`` has the mean score of every task at every evaluation, and
 ``OUT/curves.png`` shows it, with the part of the sequence in which the task is learned in grey.
@@ -53,6 +56,8 @@ class Protocol(NamedTuple):
     best: float = 0.0  # return that is the score 1; 0 takes success
     settings: dict[str, Any] = {}  # of the agent and the loop  # noqa: RUF012
     methods: tuple[str, ...] = ()
+    family: dict[str, Any] = {}  # settings of the environment  # noqa: RUF012
+    curriculum: str = "sequence"
 
 
 _COMMON = {"conditioning": "one-hot", "normalize_observations": False}
@@ -66,8 +71,17 @@ _OF_GOALS = ("scratch", "none", "packnet:retrain_updates=2000", *_OF_GOALS)
 # Coefficients are a hundredth of Continual World's, as brc's values are at most 10 and those there some hundreds.
 _OF_CW = ("ewc:ewc_coefficient=200", "l2:l2_coefficient=2000", "mas:mas_coefficient=200", "clone")
 _OF_CW = ("scratch", "none", "packnet:retrain_updates=5000", *_OF_CW)
+_FRICTIONS = {"vary": {"friction": "0.02,0.05,0.1,0.2,0.4,0.6,0.8,1.2,1.6,2"}, "split": "none"}
+_BLIND = {"conditioning": "none", "normalize_observations": True, "num_envs": 1024}
+_OF_FRICTIONS = ("scratch", "none", "redo", "continual-backprop", "shrink-and-perturb")
 PROTOCOLS = {
-    "goals": Protocol("point-mass-vary-goal", "sac", 4, 2000, 4, 4, 1, 100.0, _GOALS, _OF_GOALS),
+    "goals": Protocol(
+        *("point-mass-vary-goal", "sac", 4, 2000, 4, 4, 1, 100.0, _GOALS, _OF_GOALS),
+        family={"num_tasks": 4, "split": "none"},
+    ),
+    "slippery": Protocol(
+        *("walker-walk", "ppo", 10, 3200, 2, 4, 1, 1000.0, _BLIND, _OF_FRICTIONS, _FRICTIONS, "shuffled")
+    ),
     "cw10": Protocol("cw10", "brc", 10, 3000, 4, 10, 1, 0.0, _CW, _OF_CW),
     "cw20": Protocol("cw10", "brc", 10, 3000, 2, 10, 2, 0.0, _CW, _OF_CW),
 }
@@ -118,9 +132,8 @@ def measure(arguments: argparse.Namespace, protocol: Protocol, out: Path, method
     chunk, played = protocol.each // protocol.evaluations, protocol.tasks * protocol.rounds
     kind = "plasticity" if name in PLASTICITY and name != "none" else "continual"
     given = {**_COMMON, **protocol.settings, kind: name, **given}
-    given |= {"curriculum": f"sequence:{protocol.each}", "chunk_steps": chunk}
-    several = {"num_tasks": protocol.tasks, "split": "none"} if "+" not in protocol.env and protocol.best else {}
-    plain = with_preset(protocol.env, protocol.agent, **several)
+    given |= {"curriculum": f"{protocol.curriculum}:{protocol.each}", "chunk_steps": chunk}
+    plain = with_preset(protocol.env, protocol.agent, **protocol.family)
     agent, settings = configure(plain.learner, plain.training, given)
     folder = out / f"{name_of(method)}.run"
     result = resumable.train(
@@ -141,7 +154,7 @@ def measure(arguments: argparse.Namespace, protocol: Protocol, out: Path, method
         "success_at_end": rounded(found.metrics["success"]["train"]) if "success" in found.metrics else None,
         "returns": rounded(found.returns["train"], 2),
         "tasks": plain.family.labels("train"),
-        "order": [i % protocol.tasks for i in range(played)],
+        "order": [int(settings.plays.rows(i * protocol.each, protocol.tasks)[0]) for i in range(played)],
         "steps": found.steps.tolist(),
         "training_seconds": round(float(last["seconds"]), 1),
         "wall_seconds": round(float(last["wall_seconds"]), 1),

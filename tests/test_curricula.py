@@ -39,6 +39,15 @@ def test_a_sequence_plays_every_task_in_turn_and_begins_again():
     assert rows == [0, 0, 1, 2, 0]
 
 
+def test_a_shuffled_sequence_plays_every_task_once_in_each_round():
+    """For ten steps each, in another order in every round."""
+    curriculum = curricula.read("shuffled:10")
+    rows = np.array([int(curriculum.rows(jnp.int32(step), 5)[0]) for step in range(0, 200, 5)]).reshape(4, 5, 2)
+    np.testing.assert_array_equal(rows[..., 0], rows[..., 1])
+    assert all(sorted(each) == list(range(5)) for each in rows[..., 0].tolist())
+    assert len(set(map(tuple, rows[..., 0].tolist()))) > 1 and isinstance(curriculum, curricula.Sequence)
+
+
 def test_a_random_choice_repeats_no_task_and_changes():
     drawn = [np.asarray(curricula.read("random:3:1").rows(jnp.int32(step), 10)) for step in range(200)]
     assert all(len(set(rows.tolist())) == 3 for rows in drawn)

@@ -58,8 +58,8 @@ class Settings:
     episodes, which are shorter."""
     curriculum: str = "all"
     """Which training tasks are played: all; random:T:STEPS, T of them, and others after so many steps of every
-    environment; or sequence:STEPS, one after another for so many. The agent knows all of them, and is evaluated on
-    all."""
+    environment; sequence:STEPS, one after another for so many; or shuffled:STEPS, the same in random order. The agent
+    knows all of them, and is evaluated on all."""
     keep_replay: bool = False
     """Keep the replay where the curriculum changes tasks, and go on without random steps. Stored steps do not say of
     which task they are: only for agents that are blind to the task."""
