@@ -15,7 +15,17 @@ from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 SPLITS = ("train", "interpolation", "extrapolation")
-CHOICES = ("conditioning", "representation", "encoder", "gradients", "value", "scaling", "sampler", "continual")
+CHOICES = (
+    "conditioning",
+    "representation",
+    "encoder",
+    "gradients",
+    "value",
+    "scaling",
+    "sampler",
+    "continual",
+    "plasticity",
+)
 """The kinds of parts that a user chooses by name, as --agent.KIND=NAME."""
 PRESETS = ("auto", "cpu", "gpu")
 """The kinds of devices for which settings were tuned, as --preset=NAME."""

@@ -60,7 +60,9 @@ MARKS: dict[str, Learns | str] = {
     "--agent.normalize-observations=false --num-envs=8 --chunk-steps=500 --curriculum=sequence:2000 --steps=64000 "
     "--agent.continual=packnet --agent.retrain-updates=2000": "tests/test_remembering.py measures what it keeps",
     "--env=walker-walk --env.vary.friction=0.1:2:20 --split=none --agent=ppo --agent.conditioning=none "
-    "--curriculum=sequence:100000 --chunk-steps=10000": _WALKER,
+    "--curriculum=sequence:100000 --chunk-steps=10000 --agent.plasticity=continual-backprop": _WALKER,
+    "--env=cw10 --agent=brc --agent.conditioning=one-hot --agent.heads=per-task --num-envs=256 "
+    "--curriculum=sequence:3000 --chunk-steps=750 --steps=7680000 --agent.continual=clone": _GPU,
     "--env=errands --agent=ppo --agent.conditioning=text": _READS,
     "--env=grid-navi --agent=rl2 --trials=4 --agent.unroll=60": _GRID,
     "--env=finger-spin --env.vary.size=0.95:1.13:200 --curriculum=random:10:4000 --num-envs=8": _FINGER,

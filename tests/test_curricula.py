@@ -39,6 +39,15 @@ def test_a_sequence_plays_every_task_in_turn_and_begins_again():
     assert rows == [0, 0, 1, 2, 0]
 
 
+def test_a_shuffled_sequence_plays_every_task_once_in_each_round():
+    """For ten steps each, in another order in every round."""
+    curriculum = curricula.read("shuffled:10")
+    rows = np.array([int(curriculum.rows(jnp.int32(step), 5)[0]) for step in range(0, 200, 5)]).reshape(4, 5, 2)
+    np.testing.assert_array_equal(rows[..., 0], rows[..., 1])
+    assert all(sorted(each) == list(range(5)) for each in rows[..., 0].tolist())
+    assert len(set(map(tuple, rows[..., 0].tolist()))) > 1 and isinstance(curriculum, curricula.Sequence)
+
+
 def test_a_random_choice_repeats_no_task_and_changes():
     drawn = [np.asarray(curricula.read("random:3:1").rows(jnp.int32(step), 10)) for step in range(200)]
     assert all(len(set(rows.tolist())) == 3 for rows in drawn)
@@ -132,3 +141,48 @@ def test_what_cannot_be_played_is_refused(agent, given, said):
     env = mtjax.make("bandit", num_tasks=3, scores=True)
     with pytest.raises(InputError, match=said):
         mtjax.train(env, agent, steps=600, **{"num_envs": 2, "chunk_steps": 50, "quiet": True, **given})
+
+
+def test_a_replay_begins_anew_with_random_steps_where_tasks_change_unless_it_is_kept():
+    """Of three chunks of eight steps each, in which the first three steps are random and nothing is learned."""
+    blind = {**REPLAY, "warmup_steps": 3}
+    states, _ = played(tiny("sac"), "sequence:8", 2, **blind)
+    assert [int(state.data.ring.size) for state in states] == [0, 8, 8]
+    kept, _ = played(tiny("sac"), "sequence:8", 2, keep_replay=True, **blind)
+    assert [int(state.data.ring.size) for state in kept] == [0, 8, 16]
+    jax.tree.map(np.testing.assert_array_equal, states[1].agent, kept[1].agent)
+    updates = lambda state: int(np.max(state.agent.fits["critic"].optimizer[1][0].count))
+    assert [updates(state) for state in states] == [0, 5, 10]
+    assert [updates(state) for state in kept] == [0, 5, 13]
+
+
+def test_tasks_from_scratch_begin_a_new_agent_where_a_task_ends():
+    """As an optimiser's count of updates shows: none is of an earlier task, of which one step is not learned from."""
+    states, _ = played(tiny("sac", continual="scratch"), "sequence:8", 2, **REPLAY)
+    assert [int(np.max(state.agent.fits["critic"].optimizer[1][0].count)) for state in states] == [0, 7, 7]
+
+
+def test_a_mixtures_tasks_are_played_in_turn_and_a_run_resumes_to_the_bit(tmp_path):
+    given = {"num_envs": 2, "chunk_steps": 150, "curriculum": "sequence:150", "quiet": True, "unroll": 10}
+    given |= {"minibatches": 1, "epochs": 1, "eval_every": 600, "eval_episodes": 1, "hidden": (8,)}
+    env = mtjax.mixture([mtjax.make("bandit", num_tasks=2), mtjax.make("two-goal-maze")])
+    whole = mtjax.train(env, "ppo", steps=900, directory=tmp_path / "whole", **given)
+    mtjax.train(env, "ppo", steps=600, directory=tmp_path / "cut", **given)
+    again = mtjax.train(env, "ppo", steps=900, directory=tmp_path / "cut", resume=True, **given)
+    jax.tree.map(np.testing.assert_array_equal, jax.device_get(whole.state.agent), jax.device_get(again.state.agent))
+    assert [[bool(row[f"return_{k}"]) for k in range(3)] for row in whole.rows[:3]] == np.eye(3, dtype=bool).tolist()
+
+
+@pytest.mark.parametrize(
+    "agent, given",
+    [
+        ("sac-conditioned", {"curriculum": "sequence:8"}),
+        ("sac", {"curriculum": "sequence:8", "n_step": 2, "warmup_steps": 2}),
+        ("sac", {"curriculum": "all"}),
+        ("ppo", {"curriculum": "sequence:8"}),
+    ],
+)
+def test_steps_of_several_tasks_that_an_agent_would_confuse_are_not_kept(agent, given):
+    agent, chosen = configure(tiny(agent), Settings(), {**SMALL, "keep_replay": True, **given})
+    with pytest.raises(InputError, match="--keep-replay"):
+        loop.require_curriculum(chosen, Walk(), agent)

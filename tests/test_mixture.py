@@ -30,7 +30,7 @@ from mtjax.envs import ENVS, Family, Mixture, make, mixture
 from mtjax.envs.mixtures import apart
 from mtjax.envs.parameters import Parameter
 from mtjax.experience.replay import Replay
-from mtjax.learning import rollout
+from mtjax.learning import loop, rollout
 from mtjax.learning.evaluation import Episodes, Scores, evaluate, record
 from mtjax.learning.loop import Settings
 from mtjax.report.tables import split_table, task_table
@@ -298,6 +298,44 @@ def test_every_family_steps_as_it_does_alone(split):
         for ours, theirs in zip(jax.tree.leaves(state), jax.tree.leaves(end), strict=True):
             same = jax.random.key_data if jnp.issubdtype(ours.dtype, jax.dtypes.prng_key) else np.asarray
             np.testing.assert_array_equal(same(ours), same(theirs))
+
+
+def test_one_task_of_any_family_steps_as_it_does_alone():
+    """One program plays every task, whose number it does not know; the other families' worlds stay to the bit."""
+    env, tasks = BOTH, BOTH.tasks()
+
+    @jax.jit
+    def play(row):
+        one = loop.rows_of(tasks, row[None])
+        keys, mask = keys_of(one), jnp.array([[[True, False]]])
+        actions = jax.random.uniform(jax.random.key(1), (*keys.shape, env.spec.action_size), minval=-1.0)
+        begun = env.reset_worlds(spread(one), keys)
+        moved = env.step_worlds(spread(one), begun.state, actions)
+        return begun, moved, env.renew_worlds(spread(one), keys, mask, moved.state)
+
+    for number in range(4):
+        (i, family), task = (0, env.families[0]) if number < 3 else (1, env.families[1]), number % 3
+        own = pick(family.tasks(), slice(task, task + 1))
+        keys, found = keys_of(own), play(jnp.int32(number))
+        actions = jax.random.uniform(jax.random.key(1), (*keys.shape, env.spec.action_size), minval=-1.0)
+        begun = family.reset_worlds(spread(own), keys)
+        moved = family.step_worlds(spread(own), begun.state, family.spec.action.narrow(actions))
+        for step, alone in zip(found, (begun, moved, begun), strict=True):
+            np.testing.assert_allclose(step.obs[..., : family.spec.obs_size], alone.obs, rtol=1e-5)
+            np.testing.assert_allclose(step.reward, alone.reward, rtol=1e-5)
+            assert not np.any(step.obs[..., family.spec.obs_size :])
+        before, after, again = (step.state.families[i].obs for step in found)
+        np.testing.assert_array_equal(again, np.where([[[[True], [False]]]], before, after))
+        assert not np.any(found[1].state.families[1 - i].obs)
+
+
+def test_of_a_mixture_one_task_or_all_are_played():
+    blocks = BOTH.tasks().blocks
+    assert blocks.some(1).take("worlds", 0) == "worlds"
+    with pytest.raises(InputError, match="one task is played at a time, or all are; not 2"):
+        blocks.some(2)
+    alone = mixture([BOTH.families[0]]).tasks().blocks.some(2)
+    assert alone.runs == ((0, 2),)
 
 
 def test_worlds_that_end_begin_anew_and_the_others_go_on():

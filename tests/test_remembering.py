@@ -23,11 +23,9 @@ TASKS = jax.tree.map(lambda x: jnp.stack([x[0], x[1], x[0]]), Walk().tasks())._r
 )
 
 
-def states(name, chunks=3, seeds=(0, 1), **settings):
+def states(name, chunks=3, seeds=(0, 1), learner="sac-conditioned", given=GIVEN, **settings):
     """The agents' states (S, ...) after each of some chunks, each of which plays another task; and the agent."""
-    agent, chosen = configure(
-        tiny("sac-conditioned", continual=name, **settings), Settings(curriculum="sequence:8"), GIVEN
-    )
+    agent, chosen = configure(tiny(learner, continual=name, **settings), Settings(curriculum="sequence:8"), given)
     seeds = jnp.asarray(seeds, jnp.uint32)
     state = loop.init.lower(Walk(), agent, chosen, TASKS, seeds).compile(QUICK)(TASKS, seeds)
     chunk, found = loop.run_chunk.lower(Walk(), agent, chosen, TASKS, state).compile(QUICK), []
@@ -89,19 +87,50 @@ def test_a_penalty_holds_the_actor_with_which_each_task_ended(name, given):
         assert all(np.all(x == 1) for x in rise)
 
 
+def test_without_a_replay_the_task_that_ends_is_played_once_more():
+    """PPO's Fisher information is of a last rollout, and the run goes on as if that had not been."""
+    rollouts = {"num_envs": 2, "chunk_steps": 8, "unroll": 8, "epochs": 1, "minibatches": 1}
+    given = {"learner": "ppo", "given": rollouts, "conditioning": "one-hot"}
+    (first, second), _ = states("ewc", 2, fisher_samples=32, ewc_coefficient=0.0, **given)
+    anchor = second.nets["continual"].shared["anchor"]
+    jax.tree.map(np.testing.assert_array_equal, anchor.params, first.nets["actor"].shared)
+    assert all(np.all(x >= 0) for x in jax.tree.leaves(anchor.importance)) and np.any(anchor.importance["head"]["bias"])
+    (_, plain), _ = states("none", 2, **given)
+    jax.tree.map(np.testing.assert_array_equal, second.nets["actor"], plain.nets["actor"])
+
+
+def test_a_clone_holds_what_the_actor_put_out_where_each_task_ended():
+    """The penalty is 0 for that actor, and more for another one; of its own task none is stored while it is played."""
+    (first, second, third), agent = states("clone", clone_samples=6, clone_batch=4, heads="per-task")
+    known = [state.nets["continual"].shared["known"][0].tolist() for state in (first, second, third)]
+    assert known == [[False] * 3, [True, False, False], [True, True, False]]
+    one = lambda state: jax.tree.map(lambda x: jnp.asarray(x[0]), state.nets)
+    held = one(second)["continual"].shared
+    ended, inputs = of_task(one(first), jnp.int32(0)), jax.tree.map(lambda x: x[0], held["inputs"])
+    outputs = jax.vmap(lambda *x: agent.actor.apply(ended["actor"], *x))(*inputs)
+    np.testing.assert_allclose(held["outputs"][0], outputs, rtol=1e-5, atol=1e-6)
+    assert np.any(outputs) and len(np.unique(inputs[1])) > 1
+    penalty = lambda nets: float(agent.continual.penalty(nets, agent, jax.random.key(0)))
+    playing = of_task(one(second), jnp.int32(1))
+    same = playing | {"actor": playing["actor"]._replace(shared=ended["actor"].shared)}
+    assert penalty(same) < 1e-6 < 1e-4 < penalty(playing)
+    assert penalty(of_task(one(first), jnp.int32(1))) == 0 == penalty(of_task(one(second), jnp.int32(0)))
+
+
 def test_the_penalty_is_a_part_of_the_actors_loss():
     """Of one parameter that lies 0.5 beside its anchor, at importance 3: 10 / 2 * 3 * 0.25."""
     way = remembering.EWC(ewc_coefficient=10.0)
     actor = Params({"w": jnp.array([1.0])}, {})
-    nets = {"actor": actor} | way.init(actor, 2)
-    assert float(way.penalty(nets)) == 0
+    nets = {"actor": actor} | way.init(actor, 2, (), 2)
+    penalty = lambda nets: float(way.penalty(nets, None, jax.random.key(0)))
+    assert penalty(nets) == 0
     held = continual.Anchor({"w": jnp.array([0.5])}, {"w": jnp.array([3.0])})
-    assert float(way.penalty(nets | {"continual": Params({"anchor": held}, {})})) == pytest.approx(3.75)
+    assert penalty(nets | {"continual": Params({"anchor": held}, {})}) == pytest.approx(3.75)
     agent = tiny("sac-conditioned", continual="ewc")
     state = agent.init(Walk().spec, TASKS, jax.random.key(0))
     seen = pick(prepare(agent, state, random_batch(0, 3, 4, Walk().spec), TASKS), 0)
     nets = of_task(state.nets, jnp.int32(0))
-    strict = put(agent, continual=put(agent.continual, penalty=lambda nets: 7.0))
+    strict = put(agent, continual=put(agent.continual, penalty=lambda *_: 7.0))
     (free, _), (held, aux) = (each.actor_loss(nets, seen, jax.random.key(1)) for each in (agent, strict))
     assert float(held - free) == pytest.approx(7.0)
     assert float(aux.metrics["actor_loss"]) == pytest.approx(float(free))
@@ -127,18 +156,23 @@ def test_seeds_remember_apart(packed):
 
 @pytest.mark.slow
 def test_optimisers_begin_anew_where_a_task_ends():
-    """Their counts are of the updates since then: 8 in each chunk after the first."""
+    """Their counts are of the updates since then: six for the eight steps of a task, of which two are random."""
     count = lambda state: max(
         int(x.max()) for x in jax.tree.leaves(state.fits["critic"].optimizer) if x.dtype == np.int32
     )
     kept, _ = states("none", 2)
     fresh, _ = states("none", 2, reset_optimizer=True)
-    assert count(kept[1]) == count(kept[0]) + 8 and count(fresh[1]) == 8
+    assert [count(state) for state in (*kept, *fresh)] == [6, 12, 6, 6]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "name, given", [("packnet", {"retrain_updates": 5}), param(("ewc", {"fisher_samples": 64}), slow=True)]
+    "name, given",
+    [
+        ("packnet", {"retrain_updates": 5}),
+        param(("ewc", {"fisher_samples": 64}), slow=True),
+        param(("clone", {"clone_samples": 10}), slow=True),
+    ],
 )
 def test_a_run_resumes_to_the_bit(tmp_path, name, given):
     small = {"num_envs": 2, "chunk_steps": 50, "curriculum": "sequence:50", "quiet": True, "batch_size": 8}
@@ -169,6 +203,7 @@ def test_a_run_resumes_to_the_bit(tmp_path, name, given):
         ("sac", {"continual": "ewc", "heads": "disjoint"}, "heads=disjoint shares nothing"),
         ("distral", {"continual": "ewc"}, "heads=disjoint shares nothing"),
         ("xqc", {"continual": "ewc"}, "holds one actor"),
+        ("ppo", {"continual": "packnet", "normalize_observations": False}, "PPO has rollouts"),
         ("sac", {"continual": "ewc", "fisher_samples": 31}, "fisher-samples must be at least 32"),
         ("sac", {"continual": "packnet", "retrain_updates": -1}, "retrain-updates must be at least 0"),
         ("sac", {"continual": "ewcc"}, "did you mean 'ewc'"),

@@ -19,7 +19,8 @@ import pytest
 
 import mtjax
 from mtjax.compiling import programs, trace_cache
-from mtjax.envs.mixtures import Blocks, States
+from mtjax.envs.blocks import Blocks
+from mtjax.envs.mixtures import States
 from mtjax.envs.task_table import Outside
 
 # Runs a command and says, as the last line of its output, how often the steps of programs were traced.

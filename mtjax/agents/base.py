@@ -19,6 +19,7 @@ from mtjax.agents.parts.knowing import Knowing, last_steps
 from mtjax.agents.parts.knowing.last_steps import Past
 from mtjax.agents.parts.policies import Gaussian, Policy
 from mtjax.agents.parts.remembering import Remembering
+from mtjax.agents.parts.renewing import Renewing
 from mtjax.agents.parts.representations import Representation
 from mtjax.agents.parts.samplers import Sampler
 from mtjax.agents.parts.scaling import Scaling
@@ -106,6 +107,10 @@ class BaseAgent(abc.ABC):
     """Lower bound of the critics' loss of a task, without what the representation adds."""
     continual: ClassVar[Remembering] = Remembering()
     """How the actor remembers tasks that it learned one after another."""
+    plasticity: ClassVar[Renewing] = Renewing()
+    """What keeps the networks able to learn."""
+    distils: ClassVar[bool] = False
+    """Whether another policy than each task's own learns beside it."""
     unit_head: ClassVar[bool] = False
     """Whether the weights of each output of actor and critics keep length 1."""
     hidden: tuple[int, ...] = (256, 256)

@@ -12,6 +12,7 @@ from mtjax.agents.parts.gradients import surgery
 from mtjax.agents.parts.knowing import CONDITIONINGS
 from mtjax.agents.parts.policies import policy_for
 from mtjax.agents.parts.remembering import CONTINUAL
+from mtjax.agents.parts.renewing import PLASTICITY
 from mtjax.agents.parts.representations import REPRESENTATIONS
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
@@ -32,6 +33,7 @@ PARTS: dict[str, Mapping[str, type]] = {
     "scaling": SCALINGS,
     "sampler": SAMPLERS,
     "continual": CONTINUAL,
+    "plasticity": PLASTICITY,
     "experience": EXPERIENCES,  # follows from the agent; all others are choices
 }
 FLAT = tyro.conf.arg(name="")  # a part's fields become flags of the agent; the part is chosen before tyro parses

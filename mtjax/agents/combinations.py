@@ -7,6 +7,7 @@ import jax
 from mtjax import frames
 from mtjax.agents import parts
 from mtjax.agents.choices import PARTS
+from mtjax.agents.networks import Trunk
 from mtjax.agents.parts.policies import policy_for
 from mtjax.types import InputError, Spec
 
@@ -25,6 +26,10 @@ def check(agent: Any) -> None:
     _check_gradients(agent)
     _check_scaling(agent)
     _check_schedule(agent)
+    if agent.plasticity.every:
+        _check_units(agent)
+    if agent.continual.keeps:
+        _check_continual(agent)
 
 
 def _name(agent: Any, kind: str) -> str:
@@ -93,6 +98,19 @@ def _check_schedule(agent: Any) -> None:
         raise InputError(f"reset-every begins the optimisers anew, and lr-schedule={shape} with them; use constant")
 
 
+def _check_units(agent: Any) -> None:
+    """Refuse to renew units of networks that are no plain MLPs of all tasks."""
+    plain = type(agent.encoder.body(agent.hidden, layer_norm=False)) is Trunk and not agent.encoder.front()
+    otherwise = agent.representation.learns or agent.fits_statistics or agent.distils
+    if not plain or otherwise or agent.unit_head or agent.heads != "shared" or agent.tune != "all":
+        raise InputError(
+            f"plasticity={_name(agent, 'plasticity')} renews the units of plain MLPs that all tasks share: it needs "
+            "encoder=identity, representation=plain, heads=shared, unit-head=false and tune=all, in sac or ppo"
+        )
+    if agent.continual.freezes:
+        raise InputError(f"plasticity changes the weights that continual={_name(agent, 'continual')} keeps; use one")
+
+
 def check_replayed(agent: Any) -> None:
     """Check the numbers and parts of an agent that learns soft actor-critic from a replay."""
     parts.require_rates(agent, "tau")
@@ -113,8 +131,6 @@ def check_replayed(agent: Any) -> None:
     if agent.conditioning.recurs and (replay.n_step > 1 or replay.hindsight or replay.host_replay_size):
         name = _name(agent, "conditioning")
         raise InputError(f"conditioning={name} needs n-step=1, hindsight=0 and host-replay-size=0")
-    if agent.continual.keeps:
-        _check_continual(agent)
     if agent.unroll > replay.warmup_steps + 1:
         raise InputError(
             f"recurrent-steps={agent.unroll} needs as many steps before the first update: warmup-steps of at least "
@@ -127,6 +143,11 @@ def _check_continual(agent: Any) -> None:
     name = _name(agent, "continual")
     if agent.heads == "disjoint":
         raise InputError(f"continual={name} holds what tasks share, and heads=disjoint shares nothing; use per-task")
+    if not agent.experience.storage.kept and (agent.continual.retrains or agent.conditioning.recurs):
+        raise InputError(
+            f"continual={name} learns on from a replay, or holds a policy with a memory, and {type(agent).__name__} "
+            "has rollouts; use retrain-updates=0 and another conditioning, or sac"
+        )
     if agent.fits_statistics or agent.distils:
         raise InputError(
             f"continual={name} holds one actor without statistics, as sac has; not {type(agent).__name__}'s"

@@ -1,4 +1,4 @@
-"""What happens to an agent with a replay where one task of a sequence ends and another begins."""
+"""What happens to an agent where one task of a sequence ends and another begins."""
 
 from collections.abc import Callable
 from functools import partial
@@ -8,18 +8,20 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents import replayed
+from mtjax.agents.fit import learned
 from mtjax.agents.parts.policies import Policy
 from mtjax.agents.state import AgentState, of_task
 from mtjax.types import Array, Key, Task, Transition
 
 Draw = Callable[[Key, int], Transition]
-"""Draws so many windows (T, count, L, ...) of the replay."""
+"""Draws so many windows (T, count, L, ...) of the replay, or of a last rollout."""
 
 
 def consolidates(agent: Any) -> bool:
     """Return whether anything happens to an agent where a task of a sequence ends."""
-    way = getattr(agent, "continual", None)
-    return way is not None and (way.keeps or way.reset_optimizer)
+    way, renewing = getattr(agent, "continual", None), getattr(agent, "plasticity", None)
+    held = way is not None and (way.keeps or way.reset_optimizer or way.restarts)
+    return held or (renewing is not None and renewing.changes)
 
 
 def consolidate(agent: Any, state: AgentState, draw: Draw, tasks: Task, key: Key) -> AgentState:
@@ -41,15 +43,22 @@ def _policy(agent: Any, state: AgentState, draw: Draw, tasks: Task, key: Key) ->
     count, nets = agent.continual.samples, of_task(state.nets, jnp.int32(0))
     if not count:
         return None, None, None
-    batch = replayed.prepare(agent, state, draw(key, count), tasks)
-    obs, features, mask = jax.tree.map(lambda x: x[0], (batch.obs, batch.features, batch.mask))
-    features = jnp.broadcast_to(features, (count, features.shape[-1]))
+    features, obs = jax.tree.map(lambda x: x[0], _seen(agent, state, draw(key, count), tasks))
+    mask = None if tasks.action_mask is None else tasks.action_mask[0]
+    features, obs = agent.view.actor_inputs(nets, features, obs)
+    each = jnp.broadcast_to(features, (len(jax.tree.leaves(obs)[0]), features.shape[-1]))
+    inputs = jax.tree.map(lambda x: x[:count], (each, obs))  # windows of several steps have more
+    outputs = lambda shared, given: agent.actor.apply(nets["actor"]._replace(shared=shared), *given)
+    return outputs, partial(information, agent.policy, mask), inputs
 
-    def outputs(shared: Any, given: Any) -> Array:
-        actor = nets["actor"]._replace(shared=shared)
-        return agent.policy_outputs(nets | {"actor": actor}, *given)
 
-    return outputs, partial(information, agent.policy, mask), (features, obs)
+def _seen(agent: Any, state: AgentState, window: Transition, tasks: Task) -> tuple[Array, Any]:
+    """Return features (T, ...) and observations (T, N, ...) of windows, as ``agent.view.actor_inputs`` takes them."""
+    if agent.experience.storage.kept:
+        batch = replayed.prepare(agent, state, window, tasks)
+        return batch.features, batch.obs
+    _, features, obs, _ = agent.view.steps(state, window, tasks)
+    return features, obs
 
 
 def information(policy: Policy, mask: Array | None, outputs: Array) -> Array:
@@ -73,3 +82,10 @@ def _retrain(agent: Any, state: AgentState, draw: Draw, tasks: Task, key: Key) -
         keys = jax.random.split(key, way.retrains)
         state, _ = jax.lax.scan(update, state, (keys, jnp.arange(way.retrains)))
     return state._replace(nets=way.retrained(state.nets))
+
+
+def change(agent: Any, state: AgentState, fresh: AgentState) -> AgentState:
+    """Return a state whose shared weights the agent's plasticity has changed, given a freshly drawn state."""
+    of_net = lambda name: agent.plasticity.change(state.nets[name].shared, fresh.nets[name].shared)
+    names = learned(agent.fits.values())
+    return state.with_nets(**{name: state.nets[name]._replace(shared=of_net(name)) for name in names})

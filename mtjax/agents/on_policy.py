@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mtjax.agents import critics, parts
+from mtjax.agents import critics, parts, renewing
 from mtjax.agents.base import BaseAgent, Inputs, Memory
 from mtjax.agents.choices import FLAT
 from mtjax.agents.fit import Fit, above, descend
@@ -141,7 +141,9 @@ class OnPolicy(BaseAgent):
         count, first = self.policy.outputs(size), self.policy.first(size, self.initial_std)
         actor = scale_head(self.actor.init(actor_key, num_tasks, count, *inputs.actor), first)
         critic = scale_head(self.critic.init(critic_key, num_tasks, 1, *inputs.critic), jnp.zeros(1))
-        state = state.with_nets(actor=actor, critic=critic, units=Units.begin(num_tasks).params())
+        kept = self.continual.init(actor, num_tasks, inputs.actor, count)
+        kept = kept | renewing.begin(self, {"actor": actor, "critic": critic})
+        state = state.with_nets(**kept, actor=actor, critic=critic, units=Units.begin(num_tasks).params())
         slow = {"representation": state.nets["representation"]} if self.representation.learns else {}
         return state._replace(slow=jax.tree.map(jnp.copy, slow))
 
@@ -175,7 +177,8 @@ class OnPolicy(BaseAgent):
         entropy = jnp.mean(self.policy.entropy(outputs, batch.mask, key))
         loss = -jnp.mean(gain) - self.entropy_cost * entropy
         kl = jnp.mean(jnp.exp(log_ratio) - 1 - log_ratio)
-        return loss, ActorAux({"actor_loss": loss, "entropy": entropy, "kl": kl, **metrics}, kl)
+        held = self.continual.penalty(nets, self, jax.random.fold_in(key, 1))
+        return loss + held, ActorAux({"actor_loss": loss, "entropy": entropy, "kl": kl, **metrics}, kl)
 
     def critic_loss(self, nets: Nets, batch: Batch) -> tuple[Array, Metrics]:
         loss = self.fitting_loss(self.output(nets, batch.features, batch.obs), batch)
@@ -209,6 +212,7 @@ class OnPolicy(BaseAgent):
         loss = above(self.least_loss + self.representation.least_loss, self.critic_loss)
         batch = self.view.keyed(batch, jax.random.fold_in(key, 4))
         state, critic = descend(self.fits, "critic", state, loss, (batch,), critic_order, importance)
+        state = renewing.renew(self, state, batch, jax.random.fold_in(key, 5), number)
         told = critics.explained(state, batch)
         return state, critic.aux | critic.metrics | actor.aux.metrics | actor.metrics | told
 

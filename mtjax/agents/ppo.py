@@ -2,15 +2,18 @@
 
 import dataclasses
 from functools import partial
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import jax
 import jax.numpy as jnp
 
 from mtjax.agents import clipped, parts
 from mtjax.agents.base import Inputs
+from mtjax.agents.choices import FLAT
 from mtjax.agents.networks import Params
 from mtjax.agents.on_policy import Batch, OnPolicy
+from mtjax.agents.parts.remembering import Remembering
+from mtjax.agents.parts.renewing import Renewing
 from mtjax.agents.state import AgentState
 from mtjax.types import Array, Key, Metrics, Task, Transition
 
@@ -67,6 +70,8 @@ class PPO(OnPolicy):
     """Stop updating the actor until the next rollout once KL(pi_old | pi) exceeds this; 0 never stops."""
     advantage_normalization: clipped.Normalization = "task"
     """Scale advantages to mean 0 and standard deviation 1: never, over all tasks together, or in each task."""
+    continual: Annotated[Remembering, FLAT] = dataclasses.field(default_factory=Remembering)
+    plasticity: Annotated[Renewing, FLAT] = dataclasses.field(default_factory=Renewing)
 
     def __post_init__(self):
         super().__post_init__()

@@ -8,12 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from mtjax.agents import combinations, replayed
+from mtjax.agents import combinations, renewing, replayed
 from mtjax.agents.base import BaseAgent, Inputs, Memory
 from mtjax.agents.choices import FLAT
 from mtjax.agents.fit import Fit, above, descend
 from mtjax.agents.networks import Params
 from mtjax.agents.parts.remembering import Remembering
+from mtjax.agents.parts.renewing import Renewing
 from mtjax.agents.parts.values import Value, reduce
 from mtjax.agents.rates import scheduled
 from mtjax.agents.replayed import ActorAux, Batch, CriticAux, Sample
@@ -43,8 +44,6 @@ class SAC(BaseAgent):
         *BaseAgent.adjustable,
         *("temperature_lr", "temperature_momentum", "tau", "target_entropy"),
     )
-    distils: ClassVar[bool] = False
-    """Whether another policy than each task's own learns beside it."""
     temperature_lr: float = 1e-3
     """Adam's learning rate of the temperatures."""
     temperature_momentum: float = 0.9
@@ -65,6 +64,7 @@ class SAC(BaseAgent):
     """Keep the weights of each output of actor and critics at length 1."""
     value: Annotated[Value, FLAT] = dataclasses.field(default_factory=Value)
     continual: Annotated[Remembering, FLAT] = dataclasses.field(default_factory=Remembering)
+    plasticity: Annotated[Renewing, FLAT] = dataclasses.field(default_factory=Renewing)
     experience: Annotated[Replay, FLAT] = dataclasses.field(default_factory=Replay)
 
     def __post_init__(self):
@@ -82,7 +82,8 @@ class SAC(BaseAgent):
         log = jnp.log if isinstance(self.initial_temperature, Array) else np.log
         log = jnp.full(1 if self.shared_temperature else num_tasks, log(self.initial_temperature)).astype(jnp.float32)
         temperature = Params({"log": log}, {}) if self.shared_temperature else Params({}, {"log": log})
-        kept = self.continual.init(actor, num_tasks)
+        kept = self.continual.init(actor, num_tasks, inputs.actor, self.policy.outputs(len(action)))
+        kept = kept | renewing.begin(self, {"actor": actor, "critic": critic})
         state = state.with_nets(**kept, actor=actor, critic=critic, temperature=temperature)
         return state._replace(slow=replayed.slow_copies(self, state.nets))
 
@@ -126,9 +127,10 @@ class SAC(BaseAgent):
     def actor_loss(self, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:
         """Compute the actor loss, with what holds the actor to earlier tasks of a sequence."""
         action, log_prob, cost = self.sample(nets, batch, batch.obs, key)
+        held = self.continual.penalty(nets, self, jax.random.fold_in(key, 1))
         value = reduce(self.values(nets, batch.features, batch.obs, action), self.critic_reduction == "min")
         loss, entropy = jnp.mean(batch.temperature * cost - value), -jnp.mean(log_prob)
-        return loss + self.continual.penalty(nets), ActorAux({"actor_loss": loss, "entropy": entropy}, entropy)
+        return loss + held, ActorAux({"actor_loss": loss, "entropy": entropy}, entropy)
 
     def temperature_loss(self, nets: Nets, entropy: Array, action_size: Array) -> tuple[Array, None]:
         """Compute the loss of one task's temperature, by the entropy () of its policy."""
@@ -173,4 +175,5 @@ class SAC(BaseAgent):
             actor_metrics = Sometimes.over(actor_metrics, turn)
 
         state = replayed.renew_scales(self, replayed.update_target(self, state), fitted.aux.expected)
+        state = renewing.renew(self, state, batch, jax.random.fold_in(key, 3), number)
         return state, fitted.aux.metrics | actor_metrics | {"temperature": batch.temperature} | fitted.metrics

@@ -5,9 +5,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from mtjax import agents
-from mtjax.agents import BaseAgent, swept
+from mtjax.agents import BaseAgent, parts, swept
+from mtjax.agents.choices import PARTS, unknown_setting
 from mtjax.agents.choices import settings as settings_of
-from mtjax.agents.choices import unknown_setting
 from mtjax.agents.swept import Sweep
 from mtjax.checks import shown
 from mtjax.config import Plan, RunConfig, configure, fit_length, own_files, with_preset
@@ -99,9 +99,8 @@ def _require_known(given: Mapping[str, Any], agent: Any, env_name: str, family: 
     """Refuse a keyword that the agent does not have, and say where it belongs."""
     agent = agents.agent(agent) if isinstance(agent, str) else agent
     known = set(settings_of(agent))
-    for kind in (name for name in given if name in known and isinstance(given[name], str)):
-        with_part = agents.agent(agents.name_of(agent), **{kind: given[kind]}) if hasattr(agent, kind) else agent
-        known |= set(settings_of(with_part))
+    for kind in (name for name in given if name in known and isinstance(given[name], str) and name in PARTS):
+        known |= set(parts.setting_names(parts.choose(kind, PARTS[kind], given[kind])))
     unknown = next((name for name in given if name not in known), None)
     if unknown is None:
         return

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.types import SPLITS, Array
+from mtjax.types import SPLITS, Array, InputError
 
 
 @jax.tree_util.register_static
@@ -49,15 +49,43 @@ class Blocks:
             taken[family] += count
         return _joined(found)
 
+    def some(self, count: int) -> "Blocks | AnyOne":
+        """Return the order of ``count`` tasks of the table that are known only when a program runs.
+
+        Raises:
+            InputError: they are several, of several families.
+        """
+        families = tuple(sorted({family for family, _ in self.runs}))
+        if len(families) == 1:
+            return Blocks(((families[0], count),), self.marks)
+        if count > 1:
+            raise InputError(f"of a mixture of families one task is played at a time, or all are; not {count}")
+        return AnyOne(families, self.marks)
+
     def related(self, contexts: Array, context: Array) -> Array:
         """Return which contexts (T, C) are of the same family as ``context`` (C,)."""
         return jnp.all(contexts[:, : self.marks] == context[: self.marks], axis=-1)
 
 
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class AnyOne:
+    """Stands for ``Blocks`` where worlds have one task, whose family is known only when the program runs."""
+
+    families: tuple[int, ...]  # those whose task it may be, in order
+    marks: int  # as in ``Blocks``
+
+    related = Blocks.related
+
+    def take(self, tree: Any, family: int) -> Any:
+        """Return leaves (S, 1, E, ...) as they are: all worlds are of the family whose turn it is."""
+        return tree
+
+
 class States(NamedTuple):
     """The states of a mixture's worlds, by family."""
 
-    blocks: Blocks
+    blocks: Blocks | AnyOne
     families: tuple[Any, ...]  # each family's own states, leaves (S, T', E, ...); None where a split has no task of it
 
 

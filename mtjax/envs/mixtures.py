@@ -7,8 +7,8 @@ masked.
 """
 
 import dataclasses
-from collections.abc import Callable
-from functools import cached_property
+from collections.abc import Callable, Mapping
+from functools import cached_property, partial
 from typing import Annotated, Any
 
 import jax
@@ -17,7 +17,7 @@ import tyro
 
 from mtjax import frames
 from mtjax.envs import naming, task_table
-from mtjax.envs.blocks import Blocks, States, blocks_of
+from mtjax.envs.blocks import AnyOne, Blocks, States, blocks_of
 from mtjax.envs.family import Family
 from mtjax.envs.mixed_table import mixed_spec, mixed_table
 from mtjax.envs.shared_simulator import take
@@ -119,24 +119,16 @@ class Mixture:
 
     def reset_worlds(self, tasks: Task, keys: Key) -> Step:
         """Begin an episode in every world."""
-        own = _own_tasks(self, tasks)
-        given = {i: tasks.blocks.take(keys, i) for i in own}
-        steps = _by_group(self.groups, own, lambda group, of: group.reset_worlds(of(own), of(given)))
-        return _whole(self, tasks.blocks, steps)
+        return _play(self, "reset_worlds", tasks, lambda i, of: (of(keys),))
 
     def renew_worlds(self, tasks: Task, keys: Key, mask: Array, states: States) -> Step:
         """Begin an episode in the worlds of ``mask`` (S, T, E), whose observations alone count."""
-        own = _own_tasks(self, tasks)
-        given, masks = ({i: tasks.blocks.take(x, i) for i in own} for x in (keys, mask))
-        renew = lambda group, of: group.renew_worlds(of(own), of(given), of(masks), of(states.families))
-        return _whole(self, tasks.blocks, _by_group(self.groups, own, renew))
+        return _play(self, "renew_worlds", tasks, lambda i, of: (of(keys), of(mask), states.families[i]), states)
 
     def step_worlds(self, tasks: Task, states: States, actions: Array) -> Step:
         """Step every world by its action (S, T, E, A)."""
-        own = _own_tasks(self, tasks)
-        given = {i: self.families[i].action.narrow(tasks.blocks.take(actions, i)) for i in own}
-        move = lambda group, of: group.step_worlds(of(own), of(states.families), of(given))
-        return _whole(self, tasks.blocks, _by_group(self.groups, own, move))
+        narrow = lambda i, actions: self.families[i].action.narrow(actions)
+        return _play(self, "step_worlds", tasks, lambda i, of: (states.families[i], narrow(i, of(actions))), states)
 
     def where_worlds(self, mask: Array, new: States, old: States) -> States:
         """Choose states by ``mask`` (S, T, E)."""
@@ -151,12 +143,12 @@ class Mixture:
     def reset(self, task: Task, key: Key) -> Step:
         """Begin an episode of a task that is not traced. The state is the family's own."""
         family, own = _member(self, task)
-        return _padded(self, family, family.reset(own, key))
+        return _seen(self, family, family.reset(own, key))
 
     def step(self, task: Task, state: Any, action: Array) -> Step:
         """Advance a world of a task that is not traced."""
         family, own = _member(self, task)
-        return _padded(self, family, family.step(own, state, family.action.narrow(action)))
+        return _seen(self, family, family.step(own, state, family.action.narrow(action)))
 
 
 def _own_tasks(mixture: Mixture, tasks: Task) -> dict[int, Task]:
@@ -168,35 +160,83 @@ def _own_tasks(mixture: Mixture, tasks: Task) -> dict[int, Task]:
     return {i: take(mixture.families[i].table.tasks, each) for i, each in rows.items()}
 
 
-def _by_group(groups: tuple[Group, ...], own: dict[int, Task], play: Callable) -> dict[int, Step]:
-    """Return the steps of all families, by ``play(group, of)``. ``of`` picks the parts of the group's families."""
-    steps = {}
-    for group in groups:
+def _play(mixture: Mixture, method: str, tasks: Task, given: Callable, before: States | None = None) -> Step:
+    """Call a method of every family that has tasks, and join their steps.
+
+    Args:
+        given: ``given(i, of)`` returns what the method of family i takes after its tasks; ``of`` picks the family's
+            part of leaves (S, T, E, ...).
+        before: the states of all families, if there are any yet.
+    """
+    blocks = tasks.blocks
+    if isinstance(blocks, AnyOne):
+        return _play_one(mixture, method, tasks, given, before)
+    own, steps = _own_tasks(mixture, tasks), {}
+    taken = {i: given(i, partial(blocks.take, family=i)) for i in own}
+    for group in mixture.groups:
         here = [i for i in group.members if i in own]  # a split may have no task of a family
-        steps |= play(group, lambda parts, here=here: {i: parts[i] for i in here}) if here else {}
-    return steps
+        if here:
+            parts = [dict(zip(here, part, strict=True)) for part in zip(*(taken[i] for i in here), strict=True)]
+            steps |= getattr(group, method)({i: own[i] for i in here}, *parts)
+    return _whole(mixture, blocks, steps)
+
+
+def _play_one(mixture: Mixture, method: str, tasks: Task, given: Callable, before: States | None) -> Step:
+    """Call a method of the one family whose task all worlds (S, 1, E) have, in that family's own simulator.
+
+    The task is data: a branch of the program plays its family, and the others' worlds stay as they are.
+    """
+    members = tasks.blocks.families
+    firsts = [mixture.parts[i].first for i in members]
+
+    def play(i: int) -> Step:
+        own = take(mixture.families[i].table.tasks, tasks.row - mixture.parts[i].first)
+        return getattr(mixture.families[i], method)(own, *given(i, lambda tree: tree))
+
+    shapes = {i: jax.eval_shape(partial(play, i)) for i in members}
+    names, cut_off = _metrics_of(shapes), _are_cut_off(shapes)
+    zeros = lambda i: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes[i].state) if i in shapes else None
+    states = tuple(map(zeros, range(len(mixture.families)))) if before is None else before.families
+
+    def branch(i: int) -> Step:
+        step = play(i)
+        whole = _padded(mixture, i, step, names, cut_off)
+        return whole._replace(state=States(tasks.blocks, (*states[:i], step.state, *states[i + 1 :])))
+
+    turn = jnp.sum(tasks.row[0, 0, 0] >= jnp.asarray(firsts)) - 1
+    return jax.lax.switch(turn, [partial(branch, i) for i in members])
 
 
 def _whole(mixture: Mixture, blocks: Blocks, steps: dict[int, Step]) -> Step:
     """Join the steps of the families."""
-    steps = {i: _padded(mixture, mixture.families[i], step) for i, step in steps.items()}
+    names, cut_off = _metrics_of(steps), _are_cut_off(steps)
+    padded = [_padded(mixture, i, step, names, cut_off)._replace(state=None) for i, step in steps.items()]
+    joined = jax.tree.map(lambda *x: blocks.join(dict(zip(steps, x, strict=True))), *padded)
     states = tuple(steps[i].state if i in steps else None for i in range(len(mixture.families)))
-    join = lambda of: blocks.join({i: of(step) for i, step in steps.items()})
-    names = sorted({name for step in steps.values() for name in step.metrics})
-    unknown = lambda step: jnp.full(step.reward.shape, jnp.nan)
-    never = lambda step: jnp.zeros(step.reward.shape, bool)
-    cut_off = any(step.truncated is not None for step in steps.values())
-    return Step(
-        state=States(blocks, states),
-        obs=jax.tree.map(lambda *x: blocks.join(dict(zip(steps, x, strict=True))), *(s.obs for s in steps.values())),
-        reward=join(lambda step: step.reward),
-        terminated=join(lambda step: step.terminated),
-        metrics={name: join(lambda step, name=name: step.metrics.get(name, unknown(step))) for name in names},
-        truncated=join(lambda s: never(s) if s.truncated is None else s.truncated) if cut_off else None,
+    return joined._replace(state=States(blocks, states))
+
+
+def _metrics_of(steps: Mapping[int, Any]) -> list[str]:
+    """Return the names of all metrics that families have."""
+    return sorted({name for step in steps.values() for name in step.metrics})
+
+
+def _are_cut_off(steps: Mapping[int, Any]) -> bool:
+    """Return whether some family cuts episodes off."""
+    return any(step.truncated is not None for step in steps.values())
+
+
+def _padded(mixture: Mixture, i: int, step: Step, metrics: list[str], cut_off: bool) -> Step:
+    """Return a family's step as the mixture has them: with wide observations, and with NaN for other metrics."""
+    unknown, never = jnp.full(step.reward.shape, jnp.nan), jnp.zeros(step.reward.shape, bool)
+    cut = never if step.truncated is None else step.truncated
+    seen = _seen(mixture, mixture.families[i], step)
+    return seen._replace(
+        metrics={name: step.metrics.get(name, unknown) for name in metrics}, truncated=cut if cut_off else None
     )
 
 
-def _padded(mixture: Mixture, family: Family, step: Step) -> Step:
+def _seen(mixture: Mixture, family: Family, step: Step) -> Step:
     """Return a step with the vector (..., O') that networks take of it, padded with zeros to the mixture's."""
     join, obs = frames.layout(family.spec.obs), step.obs
     size = frames.state_size(mixture.spec)

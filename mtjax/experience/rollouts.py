@@ -102,6 +102,11 @@ class Rollouts:
         order = jax.vmap(lambda key: jax.random.permutation(key, count))(jax.random.split(key, self.epochs))
         return order[:, : size * self.minibatches].reshape(-1, size)
 
+    def draw(self, spec: Spec, agent: Any, steps: Transition, key: Key, count: int) -> Transition:
+        """Draw ``count`` single steps of every task as windows (T, count, 1, ...), of a rollout (T, H, E, ...)."""
+        flat = windows(steps, 0)
+        return jax.tree.map(lambda x: x[:, jax.random.randint(key, (count,), 0, x.shape[1])], flat)
+
     def window(self, data: Transition, batch: Array) -> Transition:
         """Take the windows (T, B, L, ...) of one minibatch, by the indices (B, L) of their steps."""
         return jax.tree.map(lambda x: x.reshape(len(x), -1, *x.shape[3:])[:, batch], data)

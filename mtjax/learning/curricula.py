@@ -10,7 +10,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from mtjax.types import Array, InputError
+from mtjax.types import Array, InputError, Key
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Random:
         return self.played
 
     def rows(self, step: Array, known: int) -> Array:
-        key = jax.random.fold_in(jax.random.key(0x5E1EC7), step // self.steps)
+        key = _key(step // self.steps)
         return jax.random.permutation(key, known)[: self.played].astype(jnp.int32)
 
 
@@ -63,12 +63,27 @@ class Sequence:
         return (step // self.steps % known).astype(jnp.int32)[None]
 
 
+@dataclasses.dataclass(frozen=True)
+class Shuffled(Sequence):
+    """A sequence in an order that is drawn anew for every round of all tasks."""
+
+    def rows(self, step: Array, known: int) -> Array:
+        part = step // self.steps
+        key = _key(part // known)
+        return jax.random.permutation(key, known)[part % known].astype(jnp.int32)[None]
+
+
+def _key(number: Array) -> Key:
+    """Return the key of the choice with this number (), which is the same in every run."""
+    return jax.random.fold_in(jax.random.key(0x5E1EC7), number)
+
+
 Curriculum = Everything | Random | Sequence
-_KINDS = {"random": (Random, 2), "sequence": (Sequence, 1)}  # with how many numbers each has
+_KINDS = {"random": (Random, 2), "sequence": (Sequence, 1), "shuffled": (Shuffled, 1)}  # with how many numbers each has
 
 
 def read(text: str) -> Curriculum:
-    """Return the curriculum that ``text`` names: "all", "random:T:STEPS" or "sequence:STEPS".
+    """Return the curriculum that ``text`` names: "all", "random:T:STEPS", "sequence:STEPS" or "shuffled:STEPS".
 
     Raises:
         InputError: it names none.
@@ -80,7 +95,8 @@ def read(text: str) -> Curriculum:
     numbers = [int(word) for word in words if word.isdecimal() and int(word)]
     if not len(numbers) == len(words) == count:
         raise InputError(
-            "curriculum is all, random:T:STEPS (T tasks at a time) or sequence:STEPS (one after another), with steps "
-            f"of every environment until tasks change, such as random:10:5000 or sequence:100000; not {text!r}"
+            "curriculum is all, random:T:STEPS (T tasks at a time), sequence:STEPS (one after another) or "
+            "shuffled:STEPS (the same in random order), with steps of every environment until tasks change, such as "
+            f"random:10:5000 or sequence:100000; not {text!r}"
         )
     return made(*numbers)

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from mtjax import frames
-from mtjax.agents.consolidating import consolidate, consolidates
+from mtjax.agents.consolidating import change, consolidate, consolidates
 from mtjax.agents.fit import reset_networks
 from mtjax.agents.state import of_tasks, with_tasks
 from mtjax.agents.swept import at_point, with_numbers
@@ -58,8 +58,11 @@ class Settings:
     episodes, which are shorter."""
     curriculum: str = "all"
     """Which training tasks are played: all; random:T:STEPS, T of them, and others after so many steps of every
-    environment; or sequence:STEPS, one after another for so many. The agent knows all of them, and is evaluated on
-    all."""
+    environment; sequence:STEPS, one after another for so many; or shuffled:STEPS, the same in random order. The agent
+    knows all of them, and is evaluated on all."""
+    keep_replay: bool = False
+    """Keep the replay where the curriculum changes tasks, and go on without random steps. Stored steps do not say of
+    which task they are: only for agents that are blind to the task."""
     trials: int = 1
     """Episodes of a trial: for so many of them the task and the agent's memory stay, and the agent maximises their sum
     of rewards. 1 makes every episode a trial of its own."""
@@ -81,6 +84,11 @@ class Settings:
     def plays(self) -> curricula.Curriculum:
         """Return which tasks are played."""
         return curricula.read(self.curriculum)
+
+    def stored(self, iteration: Array) -> Array:
+        """Return how many steps () of every environment experience holds, which begins anew where tasks change."""
+        every = 0 if self.keep_replay else self.plays.steps
+        return iteration % every if every else iteration
 
     @property
     def trial(self) -> Trials:
@@ -122,10 +130,7 @@ def init(
     shape = (len(seeds), num_tasks, settings.num_envs // collectives.count())
     key, agent_key, reset_key, data_key = split_keys(jax.vmap(jax.random.key)(seeds), 4)
     learners = jax.vmap(partial(_init_agent, env, agent, known))(agent_key, numbers or {})
-    worlds = reset_envs(env, agent, learners, tasks, world_keys(reset_key, shape), settings.trial)
-    if settings.stagger:
-        episode = None if worlds.episode is None else _first_episodes(settings.trials, shape)
-        worlds = worlds._replace(age=_first_ages(tasks, shape), episode=episode)
+    worlds = _first_worlds(env, agent, settings, learners, tasks, world_keys(reset_key, shape))
     blank = _blank(env, agent, learners, tasks, worlds, world_keys(key, shape))
     return TrainState(
         agent=learners,
@@ -153,8 +158,11 @@ def require_curriculum(settings: Settings, env: Any, agent: Any) -> None:
     """
     if consolidates(agent) and not isinstance(settings.plays, curricula.Sequence):
         raise InputError(
-            "continual and reset-optimizer are for tasks one after another: use --curriculum=sequence:STEPS"
+            "continual, reset-optimizer and shrink-and-perturb are for tasks one after another: use "
+            "--curriculum=sequence:STEPS"
         )
+    if settings.keep_replay:
+        _require_one_replay(settings, agent)
     if not settings.plays.steps:
         return
     told, experience = f"the curriculum {settings.curriculum}", agent.experience
@@ -166,11 +174,28 @@ def require_curriculum(settings: Settings, env: Any, agent: Any) -> None:
         raise InputError(f"{told} begins a replay anew; use --reset-every=0 and --host-replay-size=0")
     if experience.adaptations:
         raise InputError(f"{told} changes tasks, and this agent adapts to all that it knows; leave it out")
-    if env.tasks("train").blocks is not None:
-        raise InputError(f"{told} is for single families, whose tasks share one physics, and not for mixtures")
+    known = env.tasks("train")
+    if known.blocks is not None:
+        known.blocks.some(settings.plays.count(len(known.id)))
     rule = getattr(agent, "gradients", None)
     if rule is not None and jax.tree.leaves(rule.init(2)):
         raise InputError(f"{told} needs a rule of gradients without memory of the tasks, such as mean or pcgrad")
+
+
+def _require_one_replay(settings: Settings, agent: Any) -> None:
+    """Check that steps of several tasks can lie in one replay.
+
+    Raises:
+        InputError: tasks do not change, or the agent would take a step for one of another task.
+    """
+    if not settings.plays.steps or not agent.experience.storage.kept:
+        raise InputError("--keep-replay is for an agent with a replay and a curriculum, such as sequence:STEPS")
+    blind = not agent.conditioning.tells and agent.heads == "shared"
+    if not blind or agent.representation.embeds or agent.unroll or agent.experience.n_step > 1:
+        raise InputError(
+            "--keep-replay mixes single steps of all tasks: use --agent.conditioning=none, --agent.heads=shared and "
+            "--n-step=1"
+        )
 
 
 def require_trials(settings: Settings, env: Any, agent: Agent) -> None:
@@ -222,6 +247,15 @@ def _cannot_go_on(env: Any) -> str:
     return "pictures show the goal of before" if frames.shown(env.spec.obs) else ""
 
 
+def _first_worlds(env: Env, agent: Agent, settings: Settings, learners: Any, tasks: Task, keys: Key) -> Worlds:
+    """Begin all worlds with keys (S, T, E), at different ages if ``settings.stagger`` says so."""
+    worlds = reset_envs(env, agent, learners, tasks, keys, settings.trial)
+    if not settings.stagger:
+        return worlds
+    episode = None if worlds.episode is None else _first_episodes(settings.trials, keys.shape)
+    return worlds._replace(age=_first_ages(tasks, keys.shape), episode=episode)
+
+
 def _first_ages(tasks: Task, shape: tuple[int, ...]) -> Array:
     """Return first ages (S, T, E), spread evenly over the tasks' horizons, with at most ``PHASES`` values."""
     count = shape[2] * collectives.count()
@@ -262,12 +296,12 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
 
     def iterate(state: TrainState, _) -> tuple[TrainState, Metrics]:
         key, act_key, reset_key, learn_key = split_keys(state.key, 4)
-        state, steps, seen = _collect(env, agent, settings.trial, tasks, state, act_key, reset_key)
+        state, steps, seen = _collect(env, agent, settings, tasks, state, act_key, reset_key)
         assess = lambda learner, steps: at_point(agent, learner).assess(learner, steps, tasks)
         observe = lambda learner, steps: at_point(agent, learner).observe(learner, steps, tasks)
         learners, steps = over_seeds(assess, 0, 0)(_of_played(state.agent, state.rows), steps)
         data = experience.add(state.data, steps)
-        learners, losses = _learn(env, agent, tasks, learners, data, state.iteration, learn_key)
+        learners, losses = _learn(env, agent, settings, tasks, learners, data, state.iteration, learn_key)
         learners = over_seeds(observe, 0, 0)(learners, steps)
         learners = _with_played(state.agent, learners, state.rows)
         data = data if experience.storage.kept else ()
@@ -286,7 +320,8 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
 
 def rows_of(tasks: Task, rows: Any) -> Task:
     """Return the tasks (T, ...) with these numbers (T,), of a table (N, ...)."""
-    return jax.tree.map(lambda x: x[rows], tasks)
+    taken = jax.tree.map(lambda x: x[rows], tasks)
+    return taken if tasks.blocks is None else taken._replace(blocks=tasks.blocks.some(len(rows)))
 
 
 def _take_turns(env: Env, agent: Agent, settings: Settings, known: Task, state: TrainState) -> TrainState:
@@ -297,29 +332,50 @@ def _take_turns(env: Env, agent: Agent, settings: Settings, known: Task, state: 
     def begin(state: TrainState) -> TrainState:
         tasks = rows_of(known, rows)
         key, reset_key, data_key, act_key = split_keys(state.key, 4)
-        worlds = reset_envs(env, agent, state.agent, tasks, world_keys(reset_key, shape), settings.trial)
+        worlds = _first_worlds(env, agent, settings, state.agent, tasks, world_keys(reset_key, shape))
         blank = _blank(env, agent, state.agent, tasks, worlds, world_keys(act_key, shape))
-        data = agent.experience.init(blank, env.spec, shape[1], settings.num_envs, data_key)
+        data = state.data
+        if not settings.keep_replay:
+            data = agent.experience.init(blank, env.spec, shape[1], settings.num_envs, data_key)
         fresh = {"total": jnp.zeros(shape), "counted": worlds.age == 0}
-        fresh |= {"agent": _consolidate(env, agent, known, state)}
+        fresh |= {"agent": _consolidate(env, agent, settings, known, state)}
         return state._replace(worlds=worlds, data=data, key=key, rows=rows, **fresh)
 
     return jax.lax.cond(jnp.any(rows != state.rows), begin, lambda state: state, state)
 
 
-def _consolidate(env: Env, agent: Agent, known: Task, state: TrainState) -> Any:
-    """Return the agents (S, ...) as they end the task that was played, from whose replay they may learn once more."""
+def _consolidate(env: Env, agent: Agent, settings: Settings, known: Task, state: TrainState) -> Any:
+    """Return the agents (S, ...) as they end the task that was played, from whose steps they may learn once more."""
     if not consolidates(agent):
         return state.agent
-    tasks, experience = rows_of(known, state.rows), agent.experience
+    keys = _folded(state.key)
+    fresh = jax.vmap(partial(_init_agent, env, agent, known))(keys, getattr(state.agent, "numbers", {}))
+    if agent.continual.restarts:
+        return fresh
+    tasks, experience, kept = rows_of(known, state.rows), agent.experience, agent.experience.storage.kept
+    steps = state.data if kept else _last_rollout(env, agent, settings, tasks, state, keys)
 
-    def of_seed(learner: Any, data: Any, key: Key) -> Any:
-        draw = lambda key, count: experience.draw(env.spec, agent, data.ring, key, count)
-        return consolidate(at_point(agent, learner), learner, draw, tasks, jax.random.fold_in(key, _END))
+    def of_seed(learner: Any, steps: Any, key: Key) -> Any:
+        draw = lambda key, count: experience.draw(env.spec, agent, steps.ring if kept else steps, key, count)
+        return consolidate(at_point(agent, learner), learner, draw, tasks, key)
 
     played = _of_played(state.agent, state.rows)
-    played = over_seeds(of_seed, 0, experience.storage.axes, 0)(played, state.data, state.key)
-    return _with_played(state.agent, played, state.rows)
+    played = over_seeds(of_seed, 0, experience.storage.axes if kept else 0, 0)(played, steps, keys)
+    ended = _with_played(state.agent, played, state.rows)
+    return over_seeds(partial(change, agent), 0, 0)(ended, fresh) if agent.plasticity.changes else ended
+
+
+def _last_rollout(env: Env, agent: Agent, settings: Settings, tasks: Task, state: TrainState, keys: Key) -> Any:
+    """Return steps (S, T, H, E, ...) of the task that ends, for an agent without a replay that remembers some."""
+    if not agent.continual.samples:
+        return ()
+    act_keys, reset_keys = split_keys(keys, 2)
+    return _collect(env, agent, settings, tasks, state, act_keys, reset_keys)[1]
+
+
+def _folded(keys: Key) -> Key:
+    """Return keys (S,) for what happens where a task ends."""
+    return jax.vmap(lambda key: jax.random.fold_in(key, _END))(keys)
 
 
 def _of_played(learners: Any, rows: Array | None) -> Any:
@@ -346,7 +402,7 @@ def _of_known(metrics: Metrics, rows: Any, known: int) -> Metrics:
 
 
 def _collect(
-    env, agent, trials: Trials, tasks, state: TrainState, keys: Key, reset_keys: Key
+    env, agent, settings: Settings, tasks, state: TrainState, keys: Key, reset_keys: Key
 ) -> tuple[TrainState, Transition, Any]:
     """Take as many steps as the agent's experience asks for. Agents that adapt do so between its rollouts.
 
@@ -355,9 +411,9 @@ def _collect(
     """
     count, adaptations = agent.experience.steps, agent.experience.adaptations
     if count == 1:
-        state, (steps, seen) = _step(env, agent, trials, tasks, state, keys, reset_keys)
+        state, (steps, seen) = _step(env, agent, settings, tasks, state, keys, reset_keys)
         return state, jax.tree.map(lambda x: x[:, :, None], steps), jax.tree.map(lambda x: x[None], seen)
-    step = lambda state, keys: _step(env, agent, trials, tasks, state, *keys)
+    step = lambda state, keys: _step(env, agent, settings, tasks, state, *keys)
     apart = [jnp.stack(split_keys(each, count)) for each in (keys, reset_keys)]
     if not adaptations:
         return _played(*jax.lax.scan(step, state, tuple(apart)))
@@ -382,9 +438,10 @@ def _played(state: TrainState, taken: tuple[Transition, Any]) -> tuple[TrainStat
     return state, jax.tree.map(lambda x: jnp.moveaxis(x, 0, 2), steps), seen
 
 
-def _step(env, agent, trials: Trials, tasks, state: TrainState, keys: Key, reset_keys: Key):
+def _step(env, agent, settings: Settings, tasks, state: TrainState, keys: Key, reset_keys: Key):
     """Step every environment once, and begin new episodes where episodes ended."""
-    explore, shape = lambda action: agent.experience.explore(state.data, action, state.iteration), state.total.shape
+    trials, shape, stored = settings.trial, state.total.shape, settings.stored(state.iteration)
+    explore = lambda action: agent.experience.explore(state.data, action, stored)
     act_keys = world_keys(keys, shape)
     worlds, env_step = step_envs(env, agent, state.agent, tasks, state.worlds, act_keys, explore, trials)
     transition, total = env_step.transition, state.total + env_step.transition.reward
@@ -401,7 +458,9 @@ def _step(env, agent, trials: Trials, tasks, state: TrainState, keys: Key, reset
     return state, (followed(transition, env_step.ends, begun), seen)
 
 
-def _learn(env, agent, tasks, learners: Any, data: Any, iteration: Array, keys: Key) -> tuple[Any, Metrics]:
+def _learn(
+    env, agent, settings: Settings, tasks, learners: Any, data: Any, iteration: Array, keys: Key
+) -> tuple[Any, Metrics]:
     """Update the agents of all seeds once the first random steps are over, which is at the same step for all seeds.
 
     Returns:
@@ -411,7 +470,7 @@ def _learn(env, agent, tasks, learners: Any, data: Any, iteration: Array, keys: 
     if not experience.warmup_steps:
         learners, metrics = _update(env, agent, tasks, learners, data, iteration, keys)
         return learners, metrics | {"learning": jnp.float32(1)}
-    learning, metrics = iteration > experience.warmup_steps, {}
+    learning, metrics = settings.stored(iteration - 1) >= experience.warmup_steps, {}
     learners = _reset_networks(env, agent, tasks, learners, iteration, keys)
     if experience.updates:
         update = lambda learners: _update(env, agent, tasks, learners, data, iteration, keys)

@@ -53,10 +53,12 @@ def l2(params: Any) -> Any:
     return jax.tree.map(jnp.ones_like, params)
 
 
-def ewc(outputs: Outputs, information: Callable[[Array], Array], params: Any, inputs: Any) -> Any:
+def ewc(
+    outputs: Outputs, information: Callable[[Array], Array], params: Any, inputs: Any, least: float | Array = 0.0
+) -> Any:
     """Return the diagonal of the Fisher information (Kirkpatrick et al. 2017, "EWC"), averaged over inputs (N, ...):
 
-        F_i = mean_x sum_k I_k (d y_k / d theta_i)^2,  y = outputs(theta, x)
+        F_i = mean_x max(sum_k I_k (d y_k / d theta_i)^2, least),  y = outputs(theta, x)
 
     Args:
         information: the Fisher information (K,) of the distribution that outputs (K,) describe, if it is diagonal:
@@ -65,7 +67,7 @@ def ewc(outputs: Outputs, information: Callable[[Array], Array], params: Any, in
 
     def of_one(x: Any) -> Any:
         weight = information(outputs(params, x))
-        squared = lambda slope: jnp.tensordot(weight, jnp.square(slope), axes=1)
+        squared = lambda slope: jnp.maximum(jnp.tensordot(weight, jnp.square(slope), axes=1), least)
         return jax.tree.map(squared, jax.jacrev(outputs)(params, x))
 
     return _mean(of_one, inputs)

@@ -5,8 +5,10 @@ What a way keeps is the network "continual", which no fit names, so that no grad
 changes, and critics forget, as their regularisation harms learning (Wolczyk et al. 2021).
 """
 
+import abc
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar
 
 import jax
@@ -17,10 +19,11 @@ from mtjax.agents.networks import Params
 from mtjax.agents.parts import continual
 from mtjax.agents.parts.continual import Anchor, Outputs
 from mtjax.agents.state import Nets
-from mtjax.types import Array
+from mtjax.types import Array, Key
 
 NET = "continual"
 """The network that holds what is kept."""
+_GROUP = 32  # inputs whose slopes are in memory at a time
 _NOBODY = -1  # the owner of no weight
 
 Information = Callable[[Array], Array]
@@ -30,7 +33,8 @@ Information = Callable[[Array], Array]
 class Nothing:
     """Keeps nothing of earlier tasks: fine-tuning. Every way is a class with these methods.
 
-    Nets are those of one task in ``seen`` and ``penalty``, and of all played ones, which is one, in the others.
+    Nets are those of one task in ``seen`` and ``penalty``, and of all played ones, which is one, in the others. Inputs
+    are the actor network's, leaves (N, ...): features of the task and observations.
     """
 
     keeps: ClassVar[bool] = False
@@ -40,19 +44,26 @@ class Nothing:
     """Number of stored steps that a consolidation sees."""
     retrains: ClassVar[int] = 0
     """Number of updates that follow a consolidation, on the same replay."""
+    restarts: ClassVar[bool] = False
+    """Whether the whole agent begins anew where a task ends."""
     reset_optimizer: bool = False
     """Begin optimisers anew where a task ends, as Continual World does."""
 
-    def init(self, actor: Params, num_tasks: int) -> Nets:
-        """Return what is kept before the first task, as a network by name."""
+    def init(self, actor: Params, num_tasks: int, example: tuple, size: int) -> Nets:
+        """Return what is kept before the first task, as a network by name.
+
+        Args:
+            example: one input of the actor, without N.
+            size: number P of its outputs.
+        """
         return {}
 
     def seen(self, nets: Nets) -> Nets:
         """Return networks with the actor as the task sees it."""
         return nets
 
-    def penalty(self, nets: Nets) -> Array | float:
-        """Return what is added to the actor's loss."""
+    def penalty(self, nets: Nets, agent: Any, key: Key) -> Array | float:
+        """Return what is added to the loss of ``agent.actor``, whose outputs ``agent.policy`` reads."""
         return 0.0
 
     def kept(self, before: Nets, after: Nets) -> Nets:
@@ -64,6 +75,7 @@ class Nothing:
 
         Args:
             outputs: the actor's outputs (P,) for its shared parameters and one of ``inputs``, leaves (samples, ...).
+                Without samples all three are None.
             information: the Fisher information (P,) of the policy with such outputs.
         """
         return nets
@@ -73,78 +85,89 @@ class Nothing:
         return nets
 
 
-# Methods of the ways that hold parameters: the importances F of all tasks so far add up, and the actor's loss grows by
-# coefficient / 2 sum_i F_i (theta_i - theta*_i)^2, where theta* are those that the last task left.
+@dataclasses.dataclass(frozen=True)
+class _Held(Nothing, abc.ABC):
+    """Adds coefficient / 2 sum_i F_i (theta_i - theta*_i)^2 to the actor's loss; theta* are those of the task before.
 
+    The importances F of all tasks so far add up. A subclass says what they are.
+    """
 
-def _no_anchor(self: Nothing, actor: Params, num_tasks: int) -> Nets:
-    zeros = jax.tree.map(jnp.zeros_like, actor.shared)
-    return {NET: Params({"anchor": Anchor(jax.tree.map(jnp.copy, actor.shared), zeros)}, {})}
+    keeps: ClassVar[bool] = True
 
+    @property
+    @abc.abstractmethod
+    def strength(self) -> float:
+        """The coefficient."""
 
-def _penalty(nets: Nets, coefficient: float) -> Array:
-    return continual.penalty(nets[NET].shared["anchor"], nets["actor"].shared, coefficient)
+    @abc.abstractmethod
+    def importance(self, outputs: Outputs, information: Information, params: Any, inputs: Any) -> Any:
+        """Return F of the task that ends, as ``params``; see ``consolidate``."""
 
+    def init(self, actor: Params, num_tasks: int, example: tuple, size: int) -> Nets:
+        zeros = jax.tree.map(jnp.zeros_like, actor.shared)
+        return {NET: Params({"anchor": Anchor(jax.tree.map(jnp.copy, actor.shared), zeros)}, {})}
 
-def _hold(nets: Nets, importance: Any) -> Nets:
-    held = continual.anchor(nets["actor"].shared, importance, nets[NET].shared["anchor"])
-    return nets | {NET: Params({"anchor": held}, {})}
+    def penalty(self, nets: Nets, agent: Any, key: Key) -> Array:
+        return continual.penalty(nets[NET].shared["anchor"], nets["actor"].shared, self.strength)
+
+    def consolidate(self, nets: Nets, outputs: Outputs, information: Information, inputs: Any) -> Nets:
+        params = nets["actor"].shared
+        importance = self.importance(outputs, information, params, inputs)
+        held = continual.anchor(params, importance, nets[NET].shared["anchor"])
+        return nets | {NET: Params({"anchor": held}, {})}
 
 
 @dataclasses.dataclass(frozen=True)
-class L2(Nothing):
+class L2(_Held):
     """Holds all parameters of the actor equally: F = 1."""
 
-    keeps: ClassVar[bool] = True
-    l2_coefficient: float = 1e5
-    """Weight of the penalty; 1e5 in Continual World."""
+    l2_coefficient: float = 2e5
+    """Weight of the penalty: that of Continual World, where it is 1e5 without the half."""
 
     def __post_init__(self):
         parts.require_not_negative(self, "l2_coefficient")
 
-    init = _no_anchor
+    @property
+    def strength(self) -> float:
+        return self.l2_coefficient
 
-    def penalty(self, nets: Nets) -> Array:
-        return _penalty(nets, self.l2_coefficient)
-
-    def consolidate(self, nets: Nets, outputs: Outputs, information: Information, inputs: Any) -> Nets:
-        return _hold(nets, continual.l2(nets["actor"].shared))
+    def importance(self, outputs: Outputs, information: Information, params: Any, inputs: Any) -> Any:
+        return continual.l2(params)
 
 
 @dataclasses.dataclass(frozen=True)
-class EWC(Nothing):
+class EWC(_Held):
     """Holds parameters by the Fisher information of the policy (Kirkpatrick et al. 2017); see ``continual.ewc``."""
 
-    keeps: ClassVar[bool] = True
-    ewc_coefficient: float = 1e4
-    """Weight of the penalty; 1e4 in Continual World."""
+    ewc_coefficient: float = 2e4
+    """Weight of the penalty: that of Continual World, where it is 1e4 without the half."""
+    fisher_least: float = 1e-5
+    """Least Fisher information of a parameter at any step; 1e-5 in Continual World."""
     fisher_samples: int = 2560
     """Stored steps over which the Fisher information is averaged, rounded down to a multiple of 32."""
 
     def __post_init__(self):
-        parts.require_not_negative(self, "ewc_coefficient")
+        parts.require_not_negative(self, "ewc_coefficient", "fisher_least")
         _require_group(self, "fisher_samples")
 
-    init = _no_anchor
-
-    def penalty(self, nets: Nets) -> Array:
-        return _penalty(nets, self.ewc_coefficient)
+    @property
+    def strength(self) -> float:
+        return self.ewc_coefficient
 
     @property
     def samples(self) -> int:  # type: ignore[override]
-        return self.fisher_samples // continual.GROUP * continual.GROUP
+        return self.fisher_samples // _GROUP * _GROUP
 
-    def consolidate(self, nets: Nets, outputs: Outputs, information: Information, inputs: Any) -> Nets:
-        return _hold(nets, continual.ewc(outputs, information, nets["actor"].shared, inputs))
+    def importance(self, outputs: Outputs, information: Information, params: Any, inputs: Any) -> Any:
+        return _in_groups(lambda x: continual.ewc(outputs, information, params, x, self.fisher_least), inputs)
 
 
 @dataclasses.dataclass(frozen=True)
-class MAS(Nothing):
+class MAS(_Held):
     """Holds parameters by how much they change the actor's outputs (Aljundi et al. 2018); see ``continual.mas``."""
 
-    keeps: ClassVar[bool] = True
-    mas_coefficient: float = 1e4
-    """Weight of the penalty; 1e4 in Continual World."""
+    mas_coefficient: float = 2e4
+    """Weight of the penalty: that of Continual World, where it is 1e4 without the half."""
     mas_samples: int = 2560
     """Stored steps over which the importance is averaged, rounded down to a multiple of 32."""
 
@@ -152,17 +175,16 @@ class MAS(Nothing):
         parts.require_not_negative(self, "mas_coefficient")
         _require_group(self, "mas_samples")
 
-    init = _no_anchor
-
-    def penalty(self, nets: Nets) -> Array:
-        return _penalty(nets, self.mas_coefficient)
+    @property
+    def strength(self) -> float:
+        return self.mas_coefficient
 
     @property
     def samples(self) -> int:  # type: ignore[override]
-        return self.mas_samples // continual.GROUP * continual.GROUP
+        return self.mas_samples // _GROUP * _GROUP
 
-    def consolidate(self, nets: Nets, outputs: Outputs, information: Information, inputs: Any) -> Nets:
-        return _hold(nets, continual.mas(outputs, nets["actor"].shared, inputs))
+    def importance(self, outputs: Outputs, information: Information, params: Any, inputs: Any) -> Any:
+        return _in_groups(lambda group: continual.mas(outputs, params, group), inputs)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -186,7 +208,7 @@ class PackNet(Nothing):
     def retrains(self) -> int:  # type: ignore[override]
         return self.retrain_updates
 
-    def init(self, actor: Params, num_tasks: int) -> Nets:
+    def init(self, actor: Params, num_tasks: int, example: tuple, size: int) -> Nets:
         shared = {"owners": continual.unowned(actor.shared), "count": jnp.int32(0), "retraining": jnp.bool_(False)}
         return {NET: Params(shared, {"number": jnp.zeros(num_tasks, jnp.int32)})}
 
@@ -222,11 +244,91 @@ class PackNet(Nothing):
         return nets | {NET: held._replace(shared=held.shared | {"retraining": jnp.bool_(False)})}
 
 
+@dataclasses.dataclass(frozen=True)
+class Clone(Nothing):
+    """Clones the actor's outputs of earlier tasks on stored steps (Wolczyk et al. 2022, "ClonEx" without exploration).
+
+    Where a task ends, steps of its replay and the outputs y of the actor there are stored, with the output layer that
+    it has for itself, if any. To the actor's loss is added
+        coefficient mean KL(pi(y) | pi(y')),  y' = outputs now
+    over a batch of stored steps of other tasks, all of which are drawn alike. Only what tasks share learns by it.
+    """
+
+    keeps: ClassVar[bool] = True
+    clone_coefficient: float = 1.0
+    """Weight of the divergence from earlier policies, which is in nats and so has no units of reward."""
+    clone_samples: int = 10_000
+    """Stored steps of each task; 10,000 in the paper."""
+    clone_batch: int = 128
+    """Stored steps in each update."""
+
+    def __post_init__(self):
+        parts.require_not_negative(self, "clone_coefficient")
+        parts.require_counts(self, "clone_samples", "clone_batch")
+
+    @property
+    def samples(self) -> int:  # type: ignore[override]
+        return self.clone_samples
+
+    def init(self, actor: Params, num_tasks: int, example: tuple, size: int) -> Nets:
+        blank = lambda x: jnp.zeros((num_tasks, self.clone_samples, *jnp.shape(x)), jnp.result_type(x))
+        stored = {"inputs": jax.tree.map(blank, example), "outputs": blank(jnp.zeros(size))}
+        stored |= {"own": jax.tree.map(jnp.zeros_like, actor.own), "known": jnp.zeros(num_tasks, bool)}
+        return {NET: Params(stored, {"number": jnp.arange(num_tasks)})}
+
+    def penalty(self, nets: Nets, agent: Any, key: Key) -> Array:
+        stored, number = nets[NET].shared, nets[NET].own["number"]
+        task_key, step_key = jax.random.split(key)
+        others = stored["known"] & (jnp.arange(len(stored["known"])) != number)
+        task = jax.random.categorical(task_key, jnp.where(others, 0.0, -jnp.inf), shape=(self.clone_batch,))
+        step = jax.random.randint(step_key, (self.clone_batch,), 0, self.clone_samples)
+
+        def divergence(task: Array, step: Array) -> Array:
+            inputs, outputs = jax.tree.map(lambda x: x[task, step], (stored["inputs"], stored["outputs"]))
+            actor = nets["actor"]._replace(own=jax.tree.map(lambda x: x[task], stored["own"]))
+            return agent.policy.divergence(outputs, agent.actor.apply(actor, *inputs))
+
+        found = jnp.mean(jax.vmap(divergence)(jnp.where(jnp.any(others), task, 0), step))
+        return self.clone_coefficient * jnp.where(jnp.any(others), found, 0.0)
+
+    def consolidate(self, nets: Nets, outputs: Outputs, information: Information, inputs: Any) -> Nets:
+        actor, held = nets["actor"], nets[NET]
+        number = held.own["number"][0]
+        own = jax.tree.map(lambda x: x[0], actor.own)
+        new = {"inputs": inputs, "outputs": jax.vmap(partial(outputs, actor.shared))(inputs), "own": own, "known": True}
+        stored = jax.tree.map(lambda old, x: old.at[number].set(x), held.shared, new)
+        return nets | {NET: held._replace(shared=stored)}
+
+
+@dataclasses.dataclass(frozen=True)
+class Scratch(Nothing):
+    """Begins the whole agent anew where a task ends: each task is learned alone, by which transfer is measured."""
+
+    restarts: ClassVar[bool] = True
+
+
 def _require_group(holder: Any, name: str) -> None:
-    if getattr(holder, name) < continual.GROUP:
+    if getattr(holder, name) < _GROUP:
         flag = name.replace("_", "-")
-        raise parts.InputError(f"{flag} must be at least {continual.GROUP}, not {getattr(holder, name)}")
+        raise parts.InputError(f"{flag} must be at least {_GROUP}, not {getattr(holder, name)}")
+
+
+def _in_groups(mean: Callable[[Any], Any], inputs: Any) -> Any:
+    """Return the mean of a tree over inputs (N, ...). ``mean`` takes one group of them at a time, to save memory."""
+    groups = jax.tree.map(lambda x: x.reshape(-1, _GROUP, *x.shape[1:]), inputs)
+    count = len(jax.tree.leaves(groups)[0])
+    zeros = jax.tree.map(jnp.zeros_like, jax.eval_shape(mean, jax.tree.map(lambda x: x[0], groups)))
+    add = lambda total, group: (jax.tree.map(lambda x, y: x + y / count, total, mean(group)), None)
+    return jax.lax.scan(add, zeros, groups)[0]
 
 
 Remembering = Nothing
-CONTINUAL: dict[str, type[Remembering]] = {"none": Nothing, "l2": L2, "ewc": EWC, "mas": MAS, "packnet": PackNet}
+CONTINUAL: dict[str, type[Remembering]] = {
+    "none": Nothing,
+    "l2": L2,
+    "ewc": EWC,
+    "mas": MAS,
+    "packnet": PackNet,
+    "clone": Clone,
+    "scratch": Scratch,
+}
