@@ -96,6 +96,11 @@ AGENTS: dict[str, Preset] = {
         {"sampler": "by-length", "least_weight": 0.0},
         "mtjax.agents.sketches:Sketches",
     ),
+    "options": Preset(
+        "Options that tasks share, and a policy over them (Bacon et al. 2017)",
+        _PARAMS,
+        "mtjax.agents.options:Options",
+    ),
     "pcgrad": Preset("Conflicting gradients projected (Yu et al. 2020)", {"gradients": "pcgrad", **_PARAMS}),
     "cagrad": Preset("Conflict-averse gradients (Liu et al. 2021)", {"gradients": "cagrad", **_PARAMS}),
     "gradnorm": Preset("Weights that even out learning rates (Chen et al. 2018)", {"gradients": "gradnorm", **_PARAMS}),

@@ -49,6 +49,7 @@ class Memory(NamedTuple):
     hidden: Any = None  # the hidden state of a recurrent way to know the task
     scaling: Any = None  # of the scaling of rewards
     sampler: Any = None  # of the sampler of tasks
+    running: Any = None  # of the option that runs, if the agent has options
 
 
 WATCHERS = ("scaling", "sampler")
