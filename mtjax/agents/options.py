@@ -14,11 +14,11 @@ from mtjax.agents.networks import Network
 from mtjax.agents.on_policy import LOG_RATIO_LIMIT, ActorAux, OnPolicy, scale_head
 from mtjax.agents.parts import targets
 from mtjax.agents.rates import discounts_of_all
-from mtjax.agents.sketches import SubPolicies
+from mtjax.agents.sketches import SubPolicies, with_lengths
 from mtjax.agents.state import AgentState, Nets, axes_of
 from mtjax.agents.units import Units
 from mtjax.experience.rollouts import played, windows
-from mtjax.types import Acted, Array, InputError, Key, Metrics, Task, Transition
+from mtjax.types import Acted, Array, InputError, Key, Metrics, Spec, Task, Transition
 
 NONE = -1
 """The number of the option that runs before the first one."""
@@ -147,6 +147,10 @@ class Options(OnPolicy):
     def critic_outputs(self) -> int:  # type: ignore[override]
         """The number of values of a state: one for each option."""
         return self.num_options
+
+    def init(self, spec: Spec, tasks: Task, key: Key) -> AgentState:
+        """Return the initial state. A curriculum by length gets to know the lengths of sketches, if tasks have any."""
+        return with_lengths(self, super().init(spec, tasks, key), tasks)
 
     def init_networks(self, state: AgentState, inputs: Inputs, key: Key) -> AgentState:
         due = with_due(inputs.actor[1], jnp.int32(0), self.num_options)
