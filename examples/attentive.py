@@ -171,7 +171,7 @@ def main() -> None:
     parser.add_argument("--out", default="attentive.png")
     arguments = parser.parse_args()
     for count in (1, 2):
-        tell(f"two tasks, K = {count}", learned(CORRIDOR, shared(count), 100, arguments.seeds)[1])
+        tell(f"two tasks, K = {count}", learned(CORRIDOR, shared(count), 200, arguments.seeds)[1])
     env = Grid()
     tell("twenty tasks, disjoint", learned(env, made(heads="disjoint", conditioning="none"), 200, arguments.seeds)[1])
     for count in (1, 2, 5):
