@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents import clipped, critics, parts
-from mtjax.agents.base import Inputs, Memory
+from mtjax.agents.base import Inputs, Memory, network_of
 from mtjax.agents.fit import Fit
 from mtjax.agents.networks import Network
 from mtjax.agents.on_policy import LOG_RATIO_LIMIT, ActorAux, OnPolicy, scale_head
@@ -139,11 +139,6 @@ class Options(OnPolicy):
         return super().actor.as_kind(SubPolicies, own=(), count=self.num_options)
 
     @property
-    def chooser(self) -> Network:
-        """The network of the policy over options."""
-        return super().actor
-
-    @property
     def critic_outputs(self) -> int:  # type: ignore[override]
         """The number of values of a state: one for each option."""
         return self.num_options
@@ -158,7 +153,7 @@ class Options(OnPolicy):
         state = super().init_networks(state, of_options, key)
         end_key, choice_key = jax.random.split(jax.random.fold_in(key, 1))
         end = self.actor.init(end_key, state.num_tasks, 1, *of_options.actor)
-        choice = self.chooser.init(choice_key, state.num_tasks, self.num_options, *inputs.actor)
+        choice = chooser(self).init(choice_key, state.num_tasks, self.num_options, *inputs.actor)
         return state.with_nets(
             termination=scale_head(end, jnp.full(1, self.end_bias)),
             over_options=scale_head(choice, jnp.zeros(self.num_options)),
@@ -172,10 +167,6 @@ class Options(OnPolicy):
         learns = tuple(name for name in names if name not in kept)
         return found | {"actor": dataclasses.replace(found["actor"], names=learns)}
 
-    def of_option(self, net: Any, seen: Array, option: Array) -> Array:
-        """Return the outputs (..., P) of sub-policies or of terminations for inputs (..., O); 0 for no option."""
-        return self.actor.apply(net, jnp.zeros(0), with_due(seen, option, self.num_options))
-
     # Acting.
 
     def begin(self, state: AgentState, task: Task) -> Memory:
@@ -187,13 +178,13 @@ class Options(OnPolicy):
         features, seen = self.view.actor_inputs(nets, *view)
         end_key, choice_key, action_key = (None,) * 3 if key is None else jax.random.split(key, 3)
         before, lasted = memory.running
-        ends = jax.nn.sigmoid(self.of_option(nets["termination"], seen, before)[..., 0])
+        ends = jax.nn.sigmoid(of_option(self, nets["termination"], seen, before)[..., 0])
         lasts = lasted * (1 - ends)
         chosen = (before == NONE) | (lasts < 0.5 if end_key is None else jax.random.bernoulli(end_key, ends))
-        logs = jax.nn.log_softmax(self.chooser.apply(nets["over_options"], features, seen))
+        logs = jax.nn.log_softmax(chooser(self).apply(nets["over_options"], features, seen))
         drawn = jnp.argmax(logs) if choice_key is None else jax.random.categorical(choice_key, logs)
         option = jnp.where(chosen, drawn, before).astype(jnp.int32)
-        outputs = self.of_option(nets["actor"], seen, option)
+        outputs = of_option(self, nets["actor"], seen, option)
         action, raw, log_prob = self.policy.draw(outputs, task.action_mask, action_key)
         now = Running(option, jnp.where(chosen, 1.0, lasts))
         return Acted(action, Taken(raw, log_prob, before, now, chosen, at_option(logs, option)))
@@ -209,9 +200,11 @@ class Options(OnPolicy):
     def assess(self, state: AgentState, steps: Transition, tasks: Task) -> tuple[AgentState, Transition]:
         """Add advantages and targets to a rollout (T, H, E, ...), and fit the critic's units to it."""
         flat, features, obs, next_obs = self.view.steps(state, windows(steps, self.unroll), tasks)
-        taken, of_tasks = flat.extras, partial(self.known_of, state)
+        taken, of_tasks = flat.extras, partial(known_of, self, state)
         here, then = of_tasks(features, obs), of_tasks(features, next_obs)
-        ends = jax.vmap(self.ending, (axes_of(state.nets), 0, 0, 0))(state.nets, features, next_obs, taken.now.option)
+        ends = jax.vmap(partial(ending, self), (axes_of(state.nets), 0, 0, 0))(
+            state.nets, features, next_obs, taken.now.option
+        )
         upon = arrival(then, taken.now.option, ends, self.deliberation_cost)
         in_order = partial(played, shape=steps.reward.shape, length=self.unroll)
         value, next_value, reward, of_state, of_before = map(
@@ -239,22 +232,7 @@ class Options(OnPolicy):
         }
         return state, steps._replace(extras=(steps.extras, found))
 
-    def known_of(self, state: AgentState, features: Array, obs: Any) -> Values:
-        """Return the values of observations (T, B, ...) in units of reward."""
-        q = critics.values(self, state, features, obs)
-        over = jax.vmap(self.choices, (axes_of(state.nets), 0, 0))(state.nets, features, obs)
-        return Values(q, jnp.sum(jax.nn.softmax(over) * q, axis=-1))
-
     # Losses of one task.
-
-    def choices(self, nets: Nets, features: Array, obs: Any) -> Array:
-        """Return the logits (B, K) of the policy over options."""
-        return self.chooser.apply(nets["over_options"], *self.view.actor_inputs(nets, features, obs))
-
-    def ending(self, nets: Nets, features: Array, obs: Any, option: Array) -> Array:
-        """Return the probabilities (B,) with which options (B,) end; one half for no option."""
-        _, seen = self.view.actor_inputs(nets, features, obs)
-        return jax.nn.sigmoid(self.of_option(nets["termination"], seen, option)[..., 0])
 
     def output(self, nets: Nets, features: Array, obs: Any) -> Array:
         """Return the critic's outputs (B, K) for observations (B, ...)."""
@@ -265,17 +243,17 @@ class Options(OnPolicy):
 
     def actor_loss(self, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:  # type: ignore[override]
         _, seen = self.view.actor_inputs(nets, batch.features, batch.obs)
-        outputs = self.of_option(nets["actor"], seen, batch.option)
+        outputs = of_option(self, nets["actor"], seen, batch.option)
         log_ratio = limited(self.policy.log_prob(outputs, batch.raw, batch.mask) - batch.log_prob)
         gain, metrics = self.gain(log_ratio, batch)
         entropy = jnp.mean(self.policy.entropy(outputs, batch.mask, key))
 
-        logs, chosen = jax.nn.log_softmax(self.choices(nets, batch.features, batch.obs)), batch.chosen
+        logs, chosen = jax.nn.log_softmax(choices(self, nets, batch.features, batch.obs)), batch.chosen
         option_ratio = limited(at_option(logs, batch.option) - batch.option_log_prob)
         choice, _ = clipped.gain(option_ratio, batch.choice_advantage, self.clip_range)
         doubt = -jnp.sum(jnp.exp(logs) * logs, axis=-1)
 
-        ends = self.ending(nets, batch.features, batch.obs, batch.before)
+        ends = ending(self, nets, batch.features, batch.obs, batch.before)
         runs = batch.before != NONE
         loss = (
             jnp.mean(runs * ends * batch.end_loss)
@@ -301,6 +279,11 @@ class Options(OnPolicy):
         return state, batch
 
 
+def chooser(agent: Any) -> Network:
+    """Return the network of the policy over options."""
+    return network_of(agent, "actor")
+
+
 def with_due(seen: Array, option: Array, count: int) -> Array:
     """Return inputs (..., O) with the option that is due (...), one-hot, at their end, as sub-policies take them."""
     return jnp.concatenate([seen, jax.nn.one_hot(option, count)], axis=-1)
@@ -319,3 +302,26 @@ def arrival(values: Values, option: Array, ends: Array, cost: float | Array) -> 
 def limited(log_ratio: Array) -> Array:
     """Return logarithms of ratios within bounds, so that their exponentials stay finite."""
     return jnp.clip(log_ratio, -LOG_RATIO_LIMIT, LOG_RATIO_LIMIT)
+
+
+def of_option(agent: Any, net: Any, seen: Array, option: Array) -> Array:
+    """Return the outputs (..., P) of sub-policies or of terminations for inputs (..., O); 0 for no option."""
+    return agent.actor.apply(net, jnp.zeros(0), with_due(seen, option, agent.num_options))
+
+
+def known_of(agent: Any, state: AgentState, features: Array, obs: Any) -> Values:
+    """Return the values of observations (T, B, ...) in units of reward."""
+    q = critics.values(agent, state, features, obs)
+    over = jax.vmap(partial(choices, agent), (axes_of(state.nets), 0, 0))(state.nets, features, obs)
+    return Values(q, jnp.sum(jax.nn.softmax(over) * q, axis=-1))
+
+
+def choices(agent: Any, nets: Nets, features: Array, obs: Any) -> Array:
+    """Return the logits (B, K) of the policy over options."""
+    return chooser(agent).apply(nets["over_options"], *agent.view.actor_inputs(nets, features, obs))
+
+
+def ending(agent: Any, nets: Nets, features: Array, obs: Any, option: Array) -> Array:
+    """Return the probabilities (B,) with which options (B,) end; one half for no option."""
+    _, seen = agent.view.actor_inputs(nets, features, obs)
+    return jax.nn.sigmoid(of_option(agent, nets["termination"], seen, option)[..., 0])

@@ -94,8 +94,7 @@ class Sketches(OnPolicy):
     def __post_init__(self):
         super().__post_init__()
         parts.require_positive(self, "clip_range")
-        if self.heads != "disjoint":
-            raise InputError(f"in sketches every task has a critic of its own: heads is disjoint, not {self.heads}")
+        combinations.require_heads(self, "disjoint", "in sketches every task has a critic of its own")
         if self.normalize_observations:
             raise InputError("sketches reads symbols off observations as they are; use normalize-observations=False")
         if self.representation.learns or self.representation.history or self.encoder.front() is not None:

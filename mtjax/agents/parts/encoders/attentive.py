@@ -24,7 +24,8 @@ class AttentiveTrunk(nn.Module):
     @nn.compact
     def __call__(self, obs: Array, features: Array, *action: Array) -> Array:
         seen = jnp.concatenate([obs, *action], axis=-1)
-        each = nn.vmap(MLP, {"params": 0}, {"params": True}, in_axes=None, out_axes=-2, axis_size=self.num_subnetworks)
+        axes = {"in_axes": None, "out_axes": -2, "axis_size": self.num_subnetworks}
+        each = nn.vmap(MLP, {"params": 0}, {"params": True}, **axes)  # type: ignore
         hidden = each(self.hidden, self.layer_norm, name="subnetworks")(seen)  # (..., K, D)
         looks = MLP(self.attention_widths, name="attention")(join(seen, task=features))
         weights = nn.softmax(nn.Dense(self.num_subnetworks, name="scores")(looks))
