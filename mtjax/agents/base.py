@@ -102,6 +102,8 @@ class BaseAgent(abc.ABC):
     """Whether it plays only families that follow a sketch."""
     stand_in: ClassVar[str] = ""
     """What plays tasks that were not trained on, if not the nearest task's networks."""
+    goes_on: ClassVar[bool] = False
+    """Whether it goes on with what it chose in earlier steps of the episode, which its memory holds."""
     one_knowledge: ClassVar[bool] = False
     """Whether tasks share what knows them even where each has networks of its own."""
     least_loss: ClassVar[float] = 0.0

@@ -101,6 +101,7 @@ class Options(OnPolicy):
         *OnPolicy.adjustable,
         *("clip_range", "deliberation_cost", "choice_entropy_cost", "keep_options"),
     )
+    goes_on: ClassVar[bool] = True
     stand_in: ClassVar[str] = "each is played by the options that all tasks share"
     takes: ClassVar[str] = "observations of any tree of numbers and bools as one vector"
     hidden: tuple[int, ...] = (128,)
