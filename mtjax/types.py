@@ -266,7 +266,9 @@ class Experience(Protocol):
     def init(self, item: Transition, spec: Spec, num_tasks: int, num_envs: int, keys: Key) -> Any: ...  # keys (S,)
     def explore(self, data: Any, action: Array, step: Array) -> Array: ...  # actions (S, T, E, ...) to take at a step
     def add(self, data: Any, steps: Transition) -> Any: ...  # leaves (S, T, H, E, ...)
-    def batches(self, env: Env, agent: Any, tasks: Task, data: Any, key: Key) -> Any: ...  # leaves (U, ...)
+    def batches(  # leaves (U, ...)
+        self, env: Env, agent: Any, tasks: Task, data: Any, key: Key, state: Any = None
+    ) -> Any: ...
     def window(self, data: Any, batch: Any) -> Transition: ...  # windows (T, B, L, ...) of one of the batches
 
 

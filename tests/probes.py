@@ -195,6 +195,8 @@ SMALL = {  # of parts that have such settings
     "expert_widths": (8, 4),
     "encoder_widths": (8,),
     "weight_widths": (8,),
+    "num_subnetworks": 2,
+    "attention_widths": (8,),
     "module_width": 8,
     "routing_widths": (8,),
     "hypernetwork_widths": (8, 4),

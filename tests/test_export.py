@@ -44,7 +44,8 @@ def observations(count, env=ENV):
     return np.float32(np.random.default_rng(0).normal(size=(count, env.spec.obs_size)))
 
 
-CASES = {name: {} for name in agents.AGENTS if family_for(name) == "finger-spin" and name != "rl2"} | {
+REMEMBER = ("rl2", "options")  # what they have seen, or chosen
+CASES = {name: {} for name in agents.AGENTS if family_for(name) == "finger-spin" and name not in REMEMBER} | {
     "care": {"normalize_observations": True},
     "text": {"conditioning": "text"},
     "input-map": {"encoder": "input-map", "conditioning": "parameters"},
@@ -261,6 +262,8 @@ def test_what_cannot_be_exported_is_refused(tmp_path, monkeypatch):
         mtjax.export(3, tmp_path / "y.npz")
     with pytest.raises(InputError, match="infers its task from memory"):
         mtjax.export(policy_of(tiny("sac", conditioning="inferred")), tmp_path / "y.npz")
+    with pytest.raises(InputError, match="goes on with what it has chosen"):
+        mtjax.export(policy_of(tiny("options")), tmp_path / "y.npz")
     with pytest.raises(InputError, match="knows no operation 'sort'"):
         steps_of(jax.make_jaxpr(jnp.sort)(jnp.zeros(3)))
     assert [path.name for path in tmp_path.iterdir()] == ["x.npz"]

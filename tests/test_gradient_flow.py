@@ -54,6 +54,7 @@ PARTS = {
     "film": ("film", {}, body("generator", "modulation", "trunk")),
     "film-scalar": ("film", {"film": "scalar"}, body("generator", "modulation", "trunk")),
     "moore": ("moore", {}, {"shared/body/experts", "shared/body/weights", "own/head"}),
+    "attentive": ("attentive", {}, body("subnetworks", "attention", "scores")),
     "soft-modularization": (
         "soft-modularization",
         {"num_layers": 3},

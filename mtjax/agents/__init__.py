@@ -44,6 +44,10 @@ AGENTS: dict[str, Preset] = {
     ),
     "care": Preset("Attention over a mixture of encoders (Sodhani et al. 2021)", {"encoder": "care", **_PARAMS}),
     "moe": Preset("Soft mixture of encoders (Sodhani et al. 2021, MTRL)", {"encoder": "moe", **_PARAMS}),
+    "attentive": Preset(
+        "Outputs of shared sub-networks, weighed by state and task (Bram et al. 2019)",
+        {"encoder": "attentive", "conditioning": "one-hot"},
+    ),
     "film": Preset("Layers scaled and shifted by the task (Perez et al. 2018)", {"encoder": "film", **_PARAMS}),
     "moore": Preset(
         "Mixture of orthogonal experts (Hendawy et al. 2024)", {"encoder": "moore", "heads": "per-task", **_PARAMS}
@@ -91,6 +95,11 @@ AGENTS: dict[str, Preset] = {
         "A sub-policy for every symbol of tasks' sketches (Andreas et al. 2017)",
         {"sampler": "by-length", "least_weight": 0.0},
         "mtjax.agents.sketches:Sketches",
+    ),
+    "options": Preset(
+        "Options that tasks share, and a policy over them (Bacon et al. 2017)",
+        _PARAMS,
+        "mtjax.agents.options:Options",
     ),
     "pcgrad": Preset("Conflicting gradients projected (Yu et al. 2020)", {"gradients": "pcgrad", **_PARAMS}),
     "cagrad": Preset("Conflict-averse gradients (Liu et al. 2021)", {"gradients": "cagrad", **_PARAMS}),

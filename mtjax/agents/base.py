@@ -32,6 +32,7 @@ from mtjax.parallel import collectives
 from mtjax.types import Acted, Array, Key, Metrics, Spec, Task, Transition
 
 Heads = Literal["shared", "per-task", "disjoint"]
+HeadsOfOne = Literal["as-heads", "shared", "per-task", "disjoint"]
 Tune = Literal["all", "heads", "embedding"]
 
 
@@ -50,6 +51,7 @@ class Memory(NamedTuple):
     hidden: Any = None  # the hidden state of a recurrent way to know the task
     scaling: Any = None  # of the scaling of rewards
     sampler: Any = None  # of the sampler of tasks
+    running: Any = None  # of the option that runs, if the agent has options
 
 
 WATCHERS = ("scaling", "sampler")
@@ -101,6 +103,8 @@ class BaseAgent(abc.ABC):
     """Whether it plays only families that follow a sketch."""
     stand_in: ClassVar[str] = ""
     """What plays tasks that were not trained on, if not the nearest task's networks."""
+    goes_on: ClassVar[bool] = False
+    """Whether it goes on with what it chose in earlier steps of the episode, which its memory holds."""
     one_knowledge: ClassVar[bool] = False
     """Whether tasks share what knows them even where each has networks of its own."""
     least_loss: ClassVar[float] = 0.0
@@ -148,6 +152,11 @@ class BaseAgent(abc.ABC):
     """Use layer normalisation in the actor."""
     heads: Heads = "shared"
     """What each task has for itself: nothing (shared), output layers (per-task) or whole networks (disjoint)."""
+    actor_heads: HeadsOfOne = "as-heads"
+    """What each task has for itself of the actor, if that is not what ``heads`` says (as-heads)."""
+    critic_heads: HeadsOfOne = "as-heads"
+    """What each task has for itself of the critics, if that is not what ``heads`` says (as-heads). An actor of each
+    task's own beside critics that all share is Yang et al. (2017)."""
     gradient_scope: Literal["shared", "per-layer"] = "shared"
     """Weigh the tasks' gradients once for all shared parameters, or separately in each layer."""
     tune: Annotated[Tune, tyro.conf.arg(name="tune", prefix_name=False)] = "all"
@@ -188,13 +197,12 @@ class BaseAgent(abc.ABC):
     @property
     def actor(self) -> Network:
         """The network of the policy."""
-        network = network_of(self, self.actor_hidden or self.hidden, self.actor_layer_norm)
-        return dataclasses.replace(network, sight=self.representation.sight)
+        return dataclasses.replace(network_of(self, "actor"), sight=self.representation.sight)
 
     @property
     def critic(self) -> Network:
         """The network of a critic."""
-        return network_of(self, self.critic_hidden or self.hidden, self.critic_layer_norm)
+        return network_of(self, "critic")
 
     @abc.abstractmethod
     def init_networks(self, state: AgentState, inputs: Inputs, key: Key) -> AgentState:
@@ -222,7 +230,7 @@ class BaseAgent(abc.ABC):
         """Return the initial state for the training ``tasks`` (T, ...)."""
         combinations.require_sight(self, spec)
         combinations.require_policy(self, spec)
-        view, num_tasks, own = self.view, len(tasks.id), self.heads == "disjoint"
+        view, num_tasks, own = self.view, len(tasks.id), combinations.disjoint(self)
         inputs, action = init_inputs(spec, num_tasks), spec.action.encode(spec.action.blank())
         vectors, seen = self.conditioning.table(spec, num_tasks), view.example(spec, inputs)
         first = jax.tree.map(lambda x: x[0], tasks._replace(blocks=None))
@@ -308,8 +316,9 @@ class BaseAgent(abc.ABC):
         return state.with_nets(**new)
 
 
-def network_of(agent: BaseAgent, hidden: tuple[int, ...], layer_norm: bool) -> Network:
-    """Return a network of the body and heads that an agent's settings ask for."""
-    own = {"shared": (), "per-task": ("head",), "disjoint": ("sight", "body", "head")}[agent.heads]
+def network_of(agent: BaseAgent, name: Literal["actor", "critic"]) -> Network:
+    """Return a network of the body and heads that an agent's settings ask for in its actor or its critics."""
+    hidden, layer_norm = getattr(agent, f"{name}_hidden") or agent.hidden, getattr(agent, f"{name}_layer_norm")
+    own = {"shared": (), "per-task": ("head",), "disjoint": ("sight", "body", "head")}[combinations.heads(agent, name)]
     front = None if agent.representation.learns else agent.encoder.front()
     return Network(agent.encoder.body(hidden, layer_norm), own, front, agent.unit_head)

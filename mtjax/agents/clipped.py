@@ -74,8 +74,16 @@ def normalized(how: Normalization, advantage: Array) -> Array:
     """Scale advantages (T, H, E) to mean 0 and standard deviation 1: never, over all tasks together, or in each."""
     if how == "none":
         return advantage
+    mean, spread = moments(how, advantage)
+    return (advantage - mean) / spread
+
+
+def moments(how: Normalization, advantage: Array) -> tuple[Array, Array]:
+    """Return the mean and the standard deviation by which advantages (T, H, E) are scaled: 0 and 1 for never."""
+    if how == "none":
+        return jnp.zeros(1), jnp.ones(1)
     mean, variance = mean_and_variance(advantage, (1, 2) if how == "task" else (0, 1, 2))
-    return (advantage - mean) / jnp.maximum(jnp.sqrt(variance), MIN_STD)
+    return mean, jnp.maximum(jnp.sqrt(variance), MIN_STD)
 
 
 def gain(log_ratio: Array, advantage: Array, clip_range: float | Array) -> tuple[Array, Metrics]:

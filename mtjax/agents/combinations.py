@@ -32,6 +32,29 @@ def check(agent: Any) -> None:
         _check_continual(agent)
 
 
+def heads(agent: Any, network: str) -> str:
+    """Return what each task has for itself of an agent's actor or critics: shared, per-task or disjoint."""
+    given = getattr(agent, f"{network}_heads")
+    return agent.heads if given == "as-heads" else given
+
+
+def disjoint(agent: Any) -> bool:
+    """Return whether tasks share neither actor nor critics."""
+    return heads(agent, "actor") == heads(agent, "critic") == "disjoint"
+
+
+def require_heads(agent: Any, needed: str, reason: str) -> None:
+    """Require what each task has for itself of both actor and critics.
+
+    Raises:
+        InputError: it is not ``needed``, for this reason.
+    """
+    for network in ("actor", "critic"):
+        if heads(agent, network) != needed:
+            name = "heads" if getattr(agent, f"{network}_heads") == "as-heads" else f"{network}-heads"
+            raise InputError(f"{reason}: {name} is {needed}, not {heads(agent, network)}")
+
+
 def _name(agent: Any, kind: str) -> str:
     return parts.name_of(PARTS[kind], getattr(agent, kind))
 
@@ -72,8 +95,10 @@ def _check_encoder(agent: Any) -> None:
 
 def _check_gradients(agent: Any) -> None:
     rule = _name(agent, "gradients")
-    if agent.heads == "disjoint" and rule != "mean":
-        raise InputError(f"heads=disjoint leaves no parameters that tasks share for gradients={rule}; use mean")
+    for network in ("actor", "critic"):
+        if heads(agent, network) == "disjoint" and rule != "mean":
+            name = "heads" if disjoint(agent) else f"{network}-heads"
+            raise InputError(f"{name}=disjoint leaves no parameters that tasks share for gradients={rule}; use mean")
     if agent.gradient_scope == "per-layer" and agent.gradients.needs != "gradients":
         raise InputError(f"gradient-scope=per-layer needs gradients of every task, which {rule} does not use")
 
@@ -118,10 +143,11 @@ def check_replayed(agent: Any) -> None:
     if not 0 <= agent.temperature_momentum < 1:
         raise InputError(f"temperature-momentum must be in [0, 1), not {agent.temperature_momentum}")
     value, scaling, replay = _name(agent, "value"), _name(agent, "scaling"), agent.experience
-    if scaling == "popart" and (agent.heads == "shared" or value != "scalar"):
+    own = heads(agent, "critic")
+    if scaling == "popart" and (own == "shared" or value != "scalar"):
         raise InputError(
             "scaling=popart rescales a scalar head of every task's own; use value=scalar and heads=per-task or "
-            f"disjoint, not {value} and {agent.heads}"
+            f"disjoint, not {value} and {own}"
         )
     if scaling == "popart" and agent.unit_head:
         raise InputError("scaling=popart rescales heads, which unit-head keeps at length 1; use one of them")
@@ -141,7 +167,7 @@ def check_replayed(agent: Any) -> None:
 def _check_continual(agent: Any) -> None:
     """Refuse what would change the actor of earlier tasks beside its gradient steps, or leaves nothing to hold."""
     name = _name(agent, "continual")
-    if agent.heads == "disjoint":
+    if heads(agent, "actor") == "disjoint":
         raise InputError(f"continual={name} holds what tasks share, and heads=disjoint shares nothing; use per-task")
     if not agent.experience.storage.kept and (agent.continual.retrains or agent.conditioning.recurs):
         raise InputError(

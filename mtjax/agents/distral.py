@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from mtjax.agents import parts
+from mtjax.agents import combinations, parts
 from mtjax.agents.base import Heads, Memory
 from mtjax.agents.networks import Network, Params
 from mtjax.agents.replayed import ActorAux, Batch, Sample
@@ -73,8 +73,7 @@ class Distral(SAC):
     def __post_init__(self):
         super().__post_init__()
         parts.require_shares(self, "distral_alpha")
-        if self.heads != "disjoint":
-            raise InputError(f"distral gives every task a policy of its own: heads is disjoint, not {self.heads}")
+        combinations.require_heads(self, "disjoint", "distral gives every task a policy of its own")
         if self.representation.learns:
             raise InputError(
                 "in distral every task would have a representation of its own, but the distilled policy needs one that "

@@ -6,7 +6,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mtjax.agents import clipped, parts
+from mtjax.agents import clipped, combinations, parts
 from mtjax.agents.base import Inputs, Memory
 from mtjax.agents.choices import FLAT, PARTS
 from mtjax.agents.networks import Params
@@ -87,8 +87,7 @@ class MAML(OnPolicy):
         knowing = parts.name_of(PARTS["conditioning"], self.conditioning)
         if knowing != "none":
             raise InputError(f"maml finds out its task by adapting to it; use conditioning=none, not {knowing}")
-        if self.heads != "shared":
-            raise InputError(f"maml has one policy, which adapts to every task: heads is shared, not {self.heads}")
+        combinations.require_heads(self, "shared", "maml has one policy, which adapts to every task")
         if self.representation.learns or self.representation.history:
             raise InputError("maml adapts a policy of observations as they are; use representation=plain")
 

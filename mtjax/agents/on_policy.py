@@ -72,6 +72,8 @@ class OnPolicy(BaseAgent):
     common_presets: ClassVar[bool] = False
     policies: ClassVar[tuple[type[Policy], ...]] = (Gaussian, Categorical)
     devices_differ: ClassVar[bool] = True
+    critic_outputs: ClassVar[int] = 1
+    """The number of values that the critic gives a state."""
     actor_lr: float = 3e-4
     """Adam's learning rate for the actor."""
     critic_lr: float = 1e-3
@@ -140,7 +142,8 @@ class OnPolicy(BaseAgent):
         (actor_key, critic_key), num_tasks, size = jax.random.split(key), state.num_tasks, len(inputs.action)
         count, first = self.policy.outputs(size), self.policy.first(size, self.initial_std)
         actor = scale_head(self.actor.init(actor_key, num_tasks, count, *inputs.actor), first)
-        critic = scale_head(self.critic.init(critic_key, num_tasks, 1, *inputs.critic), jnp.zeros(1))
+        values = self.critic_outputs
+        critic = scale_head(self.critic.init(critic_key, num_tasks, values, *inputs.critic), jnp.zeros(values))
         kept = self.continual.init(actor, num_tasks, inputs.actor, count)
         kept = kept | renewing.begin(self, {"actor": actor, "critic": critic})
         state = state.with_nets(**kept, actor=actor, critic=critic, units=Units.begin(num_tasks).params())

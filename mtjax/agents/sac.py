@@ -18,7 +18,7 @@ from mtjax.agents.parts.renewing import Renewing
 from mtjax.agents.parts.values import Value, reduce
 from mtjax.agents.rates import scheduled
 from mtjax.agents.replayed import ActorAux, Batch, CriticAux, Sample
-from mtjax.agents.state import AgentState, Nets
+from mtjax.agents.state import AgentState, Nets, axes_of
 from mtjax.experience import Replay
 from mtjax.parallel.axes import when
 from mtjax.types import Acted, Array, Key, Metrics, Sometimes, Task, Transition
@@ -112,6 +112,16 @@ class SAC(BaseAgent):
     def values(self, nets: Nets, features: Array, obs: Any, action: Array) -> Array:
         """Return every critic's estimate of the value (N, B)."""
         return self.value.mean(self.q(nets, features, obs, action))
+
+    def judge(self, state: AgentState, tasks: Task, steps: Transition) -> Array:
+        """Return the values (T, B) of steps (T, B, ...), each as of its task, over the task's temperature."""
+        batch = replayed.prepare(self, state, jax.tree.map(lambda x: jnp.expand_dims(x, 2), steps), tasks)
+
+        def of_task(nets: Nets, batch: Batch) -> Array:
+            q = self.values(nets, batch.features, batch.obs, batch.action)
+            return reduce(q, self.critic_reduction == "min") / batch.temperature
+
+        return jax.vmap(of_task, (axes_of(state.nets), 0))(state.nets, batch)
 
     def critic_target(self, nets: Nets, slow: Nets, batch: Batch, key: Key) -> Any:
         """Compute the critic target y (B, ...), in the form that ``value.loss`` takes."""

@@ -94,8 +94,7 @@ class Sketches(OnPolicy):
     def __post_init__(self):
         super().__post_init__()
         parts.require_positive(self, "clip_range")
-        if self.heads != "disjoint":
-            raise InputError(f"in sketches every task has a critic of its own: heads is disjoint, not {self.heads}")
+        combinations.require_heads(self, "disjoint", "in sketches every task has a critic of its own")
         if self.normalize_observations:
             raise InputError("sketches reads symbols off observations as they are; use normalize-observations=False")
         if self.representation.learns or self.representation.history or self.encoder.front() is not None:
@@ -119,11 +118,7 @@ class Sketches(OnPolicy):
     def init(self, spec: Spec, tasks: Task, key: Key) -> AgentState:
         """Return the initial state. The curriculum gets to know the lengths of sketches."""
         combinations.require_sight(self, spec)
-        state = super(Sketches, parts.put(self, symbols=spec.symbols)).init(spec, tasks, key)
-        if not isinstance(self.sampler, ByLength) or "length" not in tasks.goal:
-            return state
-        lengths = tasks.goal["length"].astype(jnp.int32)
-        return state.with_nets(sampler=Params({}, state.nets["sampler"].own._replace(length=lengths)))
+        return with_lengths(self, super(Sketches, parts.put(self, symbols=spec.symbols)).init(spec, tasks, key), tasks)
 
     def init_networks(self, state: AgentState, inputs: Inputs, key: Key) -> AgentState:
         state = super().init_networks(state, inputs, key)
@@ -143,3 +138,11 @@ class Sketches(OnPolicy):
 
     def gain(self, log_ratio: Array, batch: Batch) -> tuple[Array, Metrics]:
         return clipped.gain(log_ratio, batch.advantage, self.clip_range)
+
+
+def with_lengths(agent: Any, state: AgentState, tasks: Task) -> AgentState:
+    """Return a state whose curriculum knows the lengths of sketches, if tasks have any and the sampler is by-length."""
+    if not isinstance(agent.sampler, ByLength) or "length" not in tasks.goal:
+        return state
+    lengths = tasks.goal["length"].astype(jnp.int32)
+    return state.with_nets(sampler=Params({}, state.nets["sampler"].own._replace(length=lengths)))

@@ -21,7 +21,7 @@ from mtjax.saved.config_json import from_json
 
 _NO_FLAGS = ("vary", "context-ranges", "points", "imports")  # vary has a flag for each parameter, taken out before
 _FAMILY_FLAGS = {"combine": "env.combine", "split": "split"}  # they decide which values are allowed
-_DECIDING = ("vectors", "heads")  # they decide which parts are allowed
+_DECIDING = ("vectors", "heads", "actor_heads", "critic_heads")  # they decide which parts are allowed
 
 
 def parse(argv: Sequence[str]) -> RunConfig:

@@ -43,7 +43,7 @@ class AdaptingRollouts(Rollouts):
         """How often the agent adapts between rollouts."""
         return self.inner_steps
 
-    def batches(self, env: Env, agent: Any, tasks: Task, data: Transition, key: Key) -> Array:
+    def batches(self, env: Env, agent: Any, tasks: Task, data: Transition, key: Key, state: Any = None) -> Array:
         """Return the numbers (U,) of the updates, which all see the same."""
         return jnp.arange(self.updates)
 

@@ -5,9 +5,13 @@ Where tasks share their physics and differ in goals alone, the same steps are po
 family lists the parameters for which that holds in ``relabels``; its ``relabel(task, transition, key)`` recomputes
 exactly the reward, and what observations show of the goal.
 
+Which task a step is replayed for is either drawn uniformly, or found by inverse reinforcement learning (Eysenbach et
+al. 2020, "HIPI"): the task for which an agent that acts well, but not always best, would have taken it (``posterior``).
+
 Differs from Andrychowicz et al.: goals are those of the training tasks, or fresh draws where every episode draws its
-own goal; never states that an episode reached. Differs from Li et al.: the other task is drawn uniformly, and is not
-the one in which the steps would have earned the most.
+own goal; never states that an episode reached. Differs from Li et al.: the task is not the one in which a whole
+trajectory would have earned the most. Differs from Eysenbach et al.: every task has as many relabelled steps in a
+batch, drawn from those of all tasks by their probabilities for it; Q-values are divided by the task's temperature.
 """
 
 from collections.abc import Callable
@@ -48,10 +52,24 @@ def require(env: Env) -> None:
     raise InputError(f"hindsight cannot replay steps as another task's in this family: {reason}; or use --hindsight=0")
 
 
+Judge = Callable[[Transition], Array]
+"""Returns the soft values (T, N) of steps (T, N, ...) that are labelled as of these tasks: Q over the temperature."""
+
+
 def sample(
-    env: Env, tasks: Task, share: float, ring: Ring, key: Key, shape: tuple[int, int, int], window: int = 0
+    env: Env,
+    tasks: Task,
+    share: float,
+    ring: Ring,
+    key: Key,
+    shape: tuple[int, int, int],
+    window: int = 0,
+    judge: Judge | None = None,
 ) -> Transition:
     """Draw U batches of B transitions for each task, ``shape`` (T, U, B), and relabel the first round(share B).
+
+    With a ``judge``, these come from the first ones of all tasks in the same batch, as ``relabel_inversely`` chooses.
+    Else they are drawn uniformly.
 
     The relabelled transitions come uniformly from the rings of all other tasks. If episodes draw their goals, they also
     come from the task's own ring, as the new goal differs there too. With a ``window``, so many consecutive steps are
@@ -60,6 +78,12 @@ def sample(
     source_key, row_key, task_key, goal_key = jax.random.split(key, 4)
     num_tasks, count = shape[0], max(round(share * shape[2]), 1)
     again = (*shape[:2], count)
+    if judge is not None:
+        own = jnp.broadcast_to(jnp.arange(num_tasks)[:, None, None], shape)
+        rows = rings.sample_from(ring, row_key, own, window)
+        first = jax.tree.map(lambda x: x[:, :, :count], rows)
+        new = relabel_inversely(env, tasks, first, task_key, goal_key, source_key, judge)
+        return jax.tree.map(lambda new, rows: jnp.concatenate([new, rows[:, :, count:]], axis=2), new, rows)
     shift = jax.random.randint(source_key, again, 0 if fresh_goals(env, tasks) else 1, num_tasks)
     own = jnp.broadcast_to(jnp.arange(num_tasks)[:, None, None], shape)
     rows = rings.sample_from(ring, row_key, own.at[:, :, :count].add(shift) % num_tasks, window)
@@ -67,6 +91,40 @@ def sample(
     of_task = jax.vmap(jax.vmap(partial(relabel, env), (None, 0, 0, 0)), (None, 0, 0, 0))
     new = jax.vmap(of_task)(tasks, jax.tree.map(lambda x: x[:, :, :count], rows), *keys)
     return jax.tree.map(lambda new, rows: jnp.concatenate([new, rows[:, :, count:]], axis=2), new, rows)
+
+
+def relabel_inversely(
+    env: Env, tasks: Task, rows: Transition, task_key: Key, goal_key: Key, draw_key: Key, judge: Judge
+) -> Transition:
+    """Draw as many steps, or windows, for each task as rows (T, U, C, ...) have, from those of all tasks in a batch.
+
+    A step is drawn for a task with its probability of being of that task, and relabelled. Windows are judged by their
+    first steps.
+    """
+    num_tasks, updates, count = rows.reward.shape[:3]
+    pool = jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0).reshape(updates, num_tasks * count, *x.shape[3:]), rows)
+    shape = (num_tasks, updates, num_tasks * count)
+    of_batch = jax.vmap(jax.vmap(partial(relabel, env), (None, 0, 0, 0)), (None, 0, 0, 0))
+    keys = (jax.random.split(task_key, shape), jax.random.split(goal_key, shape))
+    labelled = jax.vmap(of_batch, (0, None, 0, 0))(tasks, pool, *keys)  # (T, U, T C, ...)
+    first = labelled if rows.reward.ndim == 3 else jax.tree.map(lambda x: x[:, :, :, 0], labelled)
+    scores = judge(jax.tree.map(lambda x: x.reshape(num_tasks, -1, *x.shape[3:]), first)).reshape(shape)
+    logs = posterior(jnp.moveaxis(scores, 1, 0))  # (U, T, T C)
+    drawn = jax.random.categorical(draw_key, logs, shape=(count, updates, num_tasks))  # of (C, U, T)
+    take = jax.vmap(jax.vmap(lambda rows, drawn: jax.tree.map(lambda x: x[drawn], rows)))
+    return take(labelled, jnp.moveaxis(drawn, (0, 1, 2), (2, 1, 0)))
+
+
+def posterior(scores: Array) -> Array:
+    """Return the log-probabilities (..., T, N) that steps are of each task, given their soft values (..., T, N).
+
+    With all tasks as likely, and partition functions Z of each task by the mean over the steps (Eysenbach et al. 2020,
+    equation 9):
+        q(i|s, a) ~ exp(Q_i(s, a) - log Z_i),    log Z_i = log mean_(s, a) exp Q_i(s, a)
+    So a constant that one task earns in every step changes nothing.
+    """
+    centred = scores - jax.nn.logsumexp(scores, axis=-1, keepdims=True)
+    return jax.nn.log_softmax(centred, axis=-2)
 
 
 def relabel(env: Env, task: Task, transition: Transition, task_key: Key, goal_key: Key) -> Transition:

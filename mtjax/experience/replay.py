@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from functools import partial
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -14,8 +14,11 @@ from mtjax.experience import hindsight, multistep, pictures, store
 from mtjax.experience import ring as rings
 from mtjax.experience.ring import OVER_SEEDS, Ring
 from mtjax.frames import PICTURES, shown
+from mtjax.names import nearest_error
 from mtjax.parallel import collectives
 from mtjax.types import Array, Env, InputError, Key, Spec, Storage, Task, Transition
+
+HindsightChoice = Literal["uniform", "inverse"]
 
 _FLAG = tyro.conf.arg(prefix_name=False)  # --batch-size, not --agent.batch-size
 
@@ -72,11 +75,22 @@ class Replay:
     hindsight: Annotated[float, _FLAG] = 0.0
     """Share of each batch that comes from other tasks and is relabelled with this task's goal; only for families whose
     tasks differ in goals alone."""
+    hindsight_choice: Annotated[HindsightChoice, _FLAG] = "uniform"
+    """Which steps are relabelled for a task: any of other tasks (uniform), or those of all tasks for which its critics
+    value them most beside other tasks' (inverse; Eysenbach et al. 2020)."""
 
     def __post_init__(self):
         if not 0 <= self.hindsight <= 1:
             raise InputError(f"hindsight is a share from 0 to 1, not {self.hindsight}")
+        if self.hindsight_choice not in get_args(HindsightChoice):
+            raise nearest_error("hindsight-choice", self.hindsight_choice, get_args(HindsightChoice))
+        if self.hindsight_choice != "uniform" and not self.hindsight:
+            raise InputError(
+                f"hindsight-choice={self.hindsight_choice} relabels nothing with hindsight=0; give its share"
+            )
         for field in dataclasses.fields(self):
+            if field.name == "hindsight_choice":
+                continue
             least = 0 if field.name in _MAY_BE_NONE else 1
             if getattr(self, field.name) < least:
                 flag = field.name.replace("_", "-")
@@ -170,12 +184,17 @@ class Replay:
         """The number U of updates each time that the agent learns."""
         return self.updates_per_step
 
-    def batches(self, env: Env, agent: Any, tasks: Task, data: Buffer, key: Key) -> Transition:
-        """Draw windows (U, T, B, L, ...) for one seed's updates, by one gather, which is fastest."""
+    def batches(self, env: Env, agent: Any, tasks: Task, data: Buffer, key: Key, state: Any = None) -> Transition:
+        """Draw windows (U, T, B, L, ...) for one seed's updates, by one gather, which is fastest.
+
+        Args:
+            state: the agent's, by which steps are chosen with hindsight-choice=inverse.
+        """
         shape = (len(tasks.id), self.updates_per_step, self.batch_size)
         if self.hindsight:
             length = self.length(env.spec)
-            rows = hindsight.sample(env, tasks, self.hindsight, data.ring, key, shape, length)
+            judge = None if self.hindsight_choice == "uniform" else partial(agent.judge, state, tasks)
+            rows = hindsight.sample(env, tasks, self.hindsight, data.ring, key, shape, length, judge)
             rows = rows if length else _single(rows, 3)
         else:
             rows = self.draw(env.spec, agent, data.ring, key, math.prod(shape[1:]))

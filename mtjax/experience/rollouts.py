@@ -84,7 +84,7 @@ class Rollouts:
 
     # Learning.
 
-    def batches(self, env: Env, agent: Any, tasks: Task, data: Transition, key: Key) -> Array:
+    def batches(self, env: Env, agent: Any, tasks: Task, data: Transition, key: Key, state: Any = None) -> Array:
         """Split one seed's windows at random into the minibatches of all epochs: indices (U, B, L) of steps.
 
         Raises:

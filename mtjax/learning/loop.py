@@ -487,7 +487,7 @@ def _update(env, agent, tasks, learners: Any, data: Any, iteration: Array, keys:
 
     def learn_one(learner: Any, data: Any, key: Key) -> tuple[Any, Metrics]:
         batch_key, update_key = jax.random.split(key)
-        batches = experience.batches(env, agent, tasks, data, batch_key)
+        batches = experience.batches(env, at_point(agent, learner), tasks, data, batch_key, learner)
 
         def update(learner: Any, given: tuple[Any, Key, Array]) -> tuple[Any, Metrics]:
             batch, key, number = given

@@ -39,8 +39,8 @@ def export(policy: Policy, file: str | Path) -> Path:
             and ``state`` (O,) if it sees that too; of other trees of arrays, their paths such as ``seen/grid``.
 
     Raises:
-        InputError: the file exists, or the agent infers its task from memory, or it is of a mixture, or the package
-            onnx is missing.
+        InputError: the file exists, or the agent acts by what it remembers of the episode, or it is of a mixture,
+            or the package onnx is missing.
     """
     file = require_file(file)
     if not isinstance(policy, Policy):
@@ -128,6 +128,8 @@ def acting(policy: Policy) -> Callable[[Any, Array], Array]:
         raise InputError("export takes a policy of one family, and this one is of a mixture")
     if agent.view.history or agent.conditioning.recurs:
         raise InputError("export takes agents that act by what they see, and this one infers its task from memory")
+    if agent.goes_on:
+        raise InputError("export takes agents that act by what they see, and this one goes on with what it has chosen")
 
     def act(obs: Any, values: Array) -> Array:
         task = policy.task_of(values)

@@ -67,7 +67,8 @@ class Policy:
             obs: as the agent sees it: with pictures, the stack of the last ones, as ``mtjax.stacked`` shows them.
             task: one task of the family; else its parameters are given by name.
             memory: the agent's memory of the episode, from ``begin`` and ``remember``. Only agents that infer their
-                task need it. None means that the episode has just begun. In a batch it has a leading B.
+                task, or go on with an option, need it. None means that the episode has just begun. In a batch it has a
+                leading B.
             parameters: the task's parameters, in their own units; in a batch each may be (B,). A policy that reads none
                 takes them or leaves them out.
 

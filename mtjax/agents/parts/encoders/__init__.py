@@ -1,5 +1,6 @@
 """Encoders, by name, build the bodies of networks, below their heads. To add one, add a file, and a line here."""
 
+from mtjax.agents.parts.encoders.attentive import Attentive
 from mtjax.agents.parts.encoders.base import Identity, MLPEncoder
 from mtjax.agents.parts.encoders.batch_norm import BatchNorm
 from mtjax.agents.parts.encoders.care import CARE
@@ -17,6 +18,7 @@ Encoder = Identity
 ENCODERS: dict[str, type[Encoder]] = {
     "identity": Identity,
     "mlp": MLPEncoder,
+    "attentive": Attentive,
     "care": CARE,
     "moe": MoE,
     "moore": MOORE,

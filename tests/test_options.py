@@ -1,0 +1,343 @@
+"""Options: the three gradients against a chain's exact ones, targets by a plain loop, and worlds that are learned."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from probes import QUICK, assessed, only_seed, pick, quick, tasks_of, tiny, train
+from test_ppo import KNOWN, LEARN, SCALES
+from test_sketches import Corridor
+
+import mtjax
+from mtjax.agents import critics, for_action
+from mtjax.agents.fit import learned
+from mtjax.agents.options import NONE, Batch, Running, Taken, choices, ending, of_option
+from mtjax.agents.state import of_task
+from mtjax.envs.probes import Probe
+from mtjax.experience.rollouts import windows
+from mtjax.learning.evaluation import Episodes, evaluate
+from mtjax.types import Discrete, InputError, Spec, Transition
+
+STATES, ACTIONS, OPTIONS, GAMMA, COST = 3, 2, 2, 0.9, 0.07
+SPEC = Spec.vector(STATES, ACTIONS, 1)._replace(action=Discrete(ACTIONS))
+TASKS = tasks_of("one-step", (1.0, -0.5))
+EYE = jnp.eye(STATES)
+LEARNS = ("actor", "termination", "over_options")
+
+
+def made(spec=SPEC, **settings):
+    usual = {"num_options": OPTIONS, "gamma": GAMMA, "normalize_observations": False, "deliberation_cost": COST}
+    return for_action(tiny("options", **usual | settings), spec.action)
+
+
+def begun(agent, spec=SPEC, seed=0):
+    """A state whose policies, terminations and values are far from uniform."""
+    state = jax.jit(lambda: agent.init(spec, TASKS, jax.random.key(seed)), compiler_options=QUICK)()
+    random = np.random.default_rng(seed)
+    noise = lambda x: x + jnp.float32(random.normal(size=x.shape)) * 0.5
+    return state.with_nets(**{name: jax.tree.map(noise, state.nets[name]) for name in (*LEARNS, "critic")})
+
+
+# The three gradients, exactly.
+
+
+@dataclasses.dataclass(frozen=True)
+class Chain:
+    """A process of three states, without an end: its chances (S, A, S), rewards (S, A) and first states (S,)."""
+
+    chances: np.ndarray
+    rewards: np.ndarray
+    first: np.ndarray
+
+    @staticmethod
+    def drawn(seed=0):
+        random = np.random.default_rng(seed)
+        chances = random.dirichlet(np.ones(STATES), size=(STATES, ACTIONS))
+        return Chain(chances, random.normal(size=(STATES, ACTIONS)), random.dirichlet(np.ones(STATES)))
+
+
+def tables(agent, nets):
+    """The probabilities of actions (S, K, A), of ends (S, K) and of options (S, K) in every state."""
+    features = jnp.float32([1.0])
+    number = lambda o: jnp.full(STATES, o)
+    outputs = [of_option(agent, nets["actor"], EYE, number(o)) for o in range(OPTIONS)]
+    ends = [ending(agent, nets, features, EYE, number(o)) for o in range(OPTIONS)]
+    over = jax.nn.softmax(choices(agent, nets, features, EYE))
+    return jax.nn.softmax(jnp.stack(outputs, axis=1)), jnp.stack(ends, axis=1), over
+
+
+def solved(chain, pi, ends, over, cost=COST):
+    """Q (S, K), V (S,) and U (S, K) by one system of linear equations."""
+    earned = jnp.einsum("soa,sa->so", pi, chain.rewards).ravel()
+    moves = jnp.einsum("soa,sat->sot", pi, chain.chances)
+    goes_on = (1 - ends)[:, :, None] * jnp.eye(OPTIONS) + ends[:, :, None] * over[:, None]  # (S, before, now)
+    steps = jnp.einsum("sot,ton->sotn", moves, goes_on).reshape(STATES * OPTIONS, -1)
+    paid = jnp.einsum("sot,to->so", moves, ends).ravel() * cost
+    q = jnp.linalg.solve(jnp.eye(STATES * OPTIONS) - GAMMA * steps, earned - GAMMA * paid).reshape(STATES, OPTIONS)
+    v = jnp.sum(over * q, axis=1)
+    return q, v, (1 - ends) * q + ends * (v[:, None] - cost), steps
+
+
+def expected_batch(chain, pi, ends, over):
+    """Every step that there is, as often as it is expected, discounted: a batch of advantages times these weights."""
+    q, v, u, steps = (np.asarray(x) for x in solved(chain, pi, ends, over))
+    begun = (chain.first[:, None] * over).ravel()
+    visits = np.linalg.solve(np.eye(len(begun)) - GAMMA * np.asarray(steps).T, begun).reshape(STATES, OPTIONS)
+    arrivals = GAMMA * np.einsum("so,soa,sat->to", visits, pi, chain.chances)
+    choices = chain.first + np.sum(arrivals * ends, axis=1)
+    rows = []
+    for s in range(STATES):
+        for o in range(OPTIONS):
+            for a in range(ACTIONS):
+                advantage = chain.rewards[s, a] + GAMMA * chain.chances[s, a] @ u[:, o] - q[s, o]
+                rows.append((s, a, NONE, o, False, visits[s, o] * pi[s, o, a] * advantage, 0.0, 0.0))
+            rows.append((s, 0, o, o, False, 0.0, 0.0, arrivals[s, o] * (q[s, o] - v[s] + COST)))
+            rows.append((s, 0, NONE, o, True, 0.0, choices[s] * over[s, o] * (q[s, o] - v[s]), 0.0))
+    s, a, before, option, chosen, *weighed = (np.array(x) for x in zip(*rows, strict=True))
+    advantage, choice, end = (jnp.float32(len(rows) * x) for x in weighed)
+    pi, over, zeros = jnp.log(pi), jnp.log(over), jnp.zeros(len(rows))
+    return Batch(
+        obs=EYE[s],
+        raw=jnp.int32(a),
+        log_prob=pi[s, option, a],
+        before=jnp.int32(before),
+        option=jnp.int32(option),
+        chosen=jnp.asarray(chosen),
+        option_log_prob=over[s, option],
+        advantage=advantage,
+        choice_advantage=choice,
+        end_loss=end,
+        value=zeros,
+        target=zeros,
+        features=jnp.float32([1.0]),
+        mask=None,
+    )
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_actors_loss_has_the_gradient_of_the_return_exactly(seed):
+    """Of sub-policies, terminations and the policy over options, with a cost: by a chain's linear equations."""
+    agent, chain = made(entropy_cost=0.0, choice_entropy_cost=0.0), Chain.drawn(seed)
+    nets = of_task(begun(agent, seed=seed).nets, 0)
+    of_learned = lambda learns: nets | learns
+    earned = lambda learns: chain.first @ solved(chain, *tables(agent, of_learned(learns)))[1]
+    learns = {name: nets[name] for name in LEARNS}
+    batch = expected_batch(chain, *tables(agent, nets))
+    loss = lambda learns: agent.actor_loss(of_learned(learns), batch, jax.random.key(0))[0]
+    exact, found = (jax.jit(jax.grad(f), compiler_options=QUICK)(learns) for f in (earned, loss))
+    for name in LEARNS:
+        for ours, theirs in zip(jax.tree.leaves(found[name]), jax.tree.leaves(exact[name]), strict=True):
+            assert np.any(np.abs(theirs) > 1e-4)
+            np.testing.assert_allclose(-ours, theirs, rtol=2e-3, atol=2e-5)
+
+
+def test_a_step_moves_the_option_that_took_it_and_the_one_that_ended_alone():
+    """Exactly 0 for others; and a choice that was not made moves no policy over options."""
+    agent = made(entropy_cost=0.0)
+    nets = of_task(begun(agent).nets, 0)
+    chain = Chain.drawn()
+    batch = pick(expected_batch(chain, *tables(agent, nets)), np.array([0]))
+    batch = batch._replace(before=jnp.int32([1]), end_loss=jnp.ones(1), choice_advantage=jnp.ones(1))
+    loss = lambda nets, batch: agent.actor_loss(nets, batch, jax.random.key(0))[0]
+    grad = jax.jit(jax.grad(loss, allow_int=True), compiler_options=QUICK)
+    found = grad(nets, batch)
+    assert batch.option[0] == 0 and not batch.chosen[0]
+    for name, option in (("actor", 0), ("termination", 1)):
+        for leaf in jax.tree.leaves(found[name].shared):
+            assert not np.any(leaf[1 - option])
+        assert np.any(found[name].shared["head"]["bias"][option])
+    assert not any(np.any(x) for x in jax.tree.leaves(found["over_options"]))
+    none = grad(nets, batch._replace(before=jnp.int32([NONE])))
+    assert not any(np.any(x) for x in jax.tree.leaves(none["termination"]))
+    assert any(np.any(x) for x in jax.tree.leaves(grad(nets, batch._replace(chosen=jnp.ones(1, bool)))["over_options"]))
+
+
+# Targets.
+
+
+def rollout(agent, state, length=4, envs=2, seed=0):
+    """A rollout (T, H, E, ...) in which all is random, but each step's option goes on from the one before."""
+    random, shape = np.random.default_rng(seed), (2, length, envs)
+    normal = lambda *size: jnp.float32(random.normal(size=(*shape, *size)))
+    whole = lambda n: jnp.int32(random.integers(n, size=shape))
+    now = Running(whole(OPTIONS), jnp.ones(shape))
+    taken = Taken(whole(ACTIONS), normal() - 1, whole(OPTIONS), now, jnp.asarray(random.random(shape) < 0.5), normal())
+    closed = jnp.asarray(random.random(shape) < 0.3)
+    begun = agent.begin(state, pick(TASKS, 0))
+    memory = jax.tree.map(lambda x: jnp.broadcast_to(x, (*shape, *x.shape)), begun)
+    return Transition(
+        normal(STATES), taken.raw, normal(), jnp.float32(random.random(shape) < 0.8), normal(STATES),
+        closed, closed, None, taken, memory,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("how", ["task", "none"])
+def test_targets_are_those_of_a_plain_loop(how):
+    """One task, world and step at a time, by the equations."""
+    agent = made(gae_lambda=0.7, advantage_normalization=how, value_normalization="none")
+    state = begun(agent)
+    steps = rollout(agent, state)
+    _, after = quick(agent.assess, state, steps, TASKS)(state, steps, TASKS)
+    _, found = after.extras
+    wanted = {name: np.zeros(steps.reward.shape) for name in ("advantage", "choice", "end", "target")}
+    for i in (0, 1):
+        nets, features = of_task(state.nets, i), TASKS.context[i]
+        q_of = lambda x, nets=nets, z=features: np.asarray(agent.output(nets, z, x), np.float64)
+        over_of = lambda x, nets=nets, z=features: np.asarray(jax.nn.softmax(choices(agent, nets, z, x)), np.float64)
+        q, next_q, over, next_over = q_of(steps.obs[i]), q_of(steps.next_obs[i]), over_of(steps.obs[i]), None
+        next_over, option = over_of(steps.next_obs[i]), np.asarray(steps.extras.now.option[i])
+        ends = np.asarray(ending(agent, nets, features, steps.next_obs[i], steps.extras.now.option[i]))
+        for e in (0, 1):
+            later = 0.0
+            for t in reversed(range(4)):
+                o, b = option[t, e], int(steps.extras.before[i, t, e])
+                upon = (1 - ends[t, e]) * next_q[t, e, o]
+                upon += ends[t, e] * (next_over[t, e] @ next_q[t, e] - COST)
+                delta = steps.reward[i, t, e] + GAMMA * steps.discount[i, t, e] * upon - q[t, e, o]
+                later = float(delta + GAMMA * 0.7 * (1 - steps.closed[i, t, e]) * later)
+                v = over[t, e] @ q[t, e]
+                wanted["advantage"][i, t, e], wanted["target"][i, t, e] = later, later + q[t, e, o]
+                wanted["choice"][i, t, e], wanted["end"][i, t, e] = later + q[t, e, o] - v, q[t, e, b] - v + COST
+    std = wanted["advantage"].std((1, 2), keepdims=True) if how == "task" else 1.0
+    mean = wanted["advantage"].mean((1, 2), keepdims=True) if how == "task" else 0.0
+    close = lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-3, atol=1e-4)
+    close(found["target"], wanted["target"])
+    close(found["advantage"], (wanted["advantage"] - mean) / std)
+    close(found["choice_advantage"], wanted["choice"] / std)
+    close(found["end_loss"], wanted["end"] / std)
+
+
+def test_the_batch_is_what_was_stored():
+    agent = made()
+    state = begun(agent)
+    _, batch, steps = assessed(agent, state, rollout(agent, state), TASKS)
+    flat = jax.tree.map(lambda x: x[:, :, 0], windows(steps, 0))
+    np.testing.assert_array_equal(batch.option, flat.extras[0].now.option)
+    np.testing.assert_array_equal(batch.before, flat.extras[0].before)
+    np.testing.assert_array_equal(batch.advantage, flat.extras[1]["advantage"])
+
+
+# Acting.
+
+
+def test_an_option_runs_on_until_it_ends_and_ratios_are_one():
+    """With a key it is kept where it did not end; what is stored is the log-probability of what was drawn."""
+    agent = made(end_bias=0.0)
+    state, task = begun(agent), pick(TASKS, 0)
+    nets, obs = of_task(state.nets, 0), EYE[1]
+    pi, _, over = tables(agent, nets)
+    memory = agent.begin(state, task)
+    act = jax.jit(lambda memory, key: agent.act(state, memory, obs, task, key), compiler_options=QUICK)
+    first = act(memory, jax.random.key(0)).extras
+    assert first.before == NONE and first.chosen
+    kept = 0
+    for seed in range(60):
+        memory = memory._replace(running=Running(jnp.int32(seed % 2), jnp.float32(1)))
+        acted = act(memory, jax.random.key(seed))
+        taken = acted.extras
+        option = int(taken.now.option)
+        assert bool(taken.chosen) or option == seed % 2
+        kept += not taken.chosen
+        assert float(taken.log_prob) == pytest.approx(float(jnp.log(pi[1, option, acted.action])), abs=1e-5)
+        assert float(taken.option_log_prob) == pytest.approx(float(jnp.log(over[1, option])), abs=1e-5)
+    assert 5 < kept < 55
+
+
+@pytest.mark.parametrize("bias, length", [(-2.0, 6), (0.1, 1), (-1.0, 3)])
+def test_without_a_key_an_option_lasts_as_long_as_it_would_with_probability_one_half(bias, length):
+    """(1 - sigmoid(bias))^n falls below one half at the n-th step: there the next is chosen."""
+    agent = made(end_bias=bias)
+    state = jax.jit(lambda: agent.init(SPEC, TASKS, jax.random.key(0)), compiler_options=QUICK)()
+    state = state.with_nets(termination=jax.tree.map(jnp.zeros_like, state.nets["termination"]))
+    head = state.nets["termination"].shared
+    head = head | {"head": head["head"] | {"bias": jnp.full((OPTIONS, 1), bias)}}
+    state = state.with_nets(termination=state.nets["termination"]._replace(shared=head))
+    task = pick(TASKS, 0)
+    memory, chosen = agent.begin(state, task), []
+    act = jax.jit(lambda memory: agent.act(state, memory, EYE[0], task, None), compiler_options=QUICK)
+    for _ in range(9):
+        taken = act(memory).extras
+        chosen.append(bool(taken.chosen))
+        memory = memory._replace(running=taken.now)
+    assert [i for i, x in enumerate(chosen) if x] == list(range(0, 9, length))
+
+
+def test_a_memory_outside_of_rollouts_follows_the_likeliest_option():
+    agent = made()
+    state, task = begun(agent), pick(TASKS, 0)
+    step = Transition(EYE[0], jnp.int32(1), jnp.float32(0), jnp.float32(1), EYE[1], jnp.bool_(False), jnp.bool_(False))
+    memory = agent.begin(state, task)
+    expected = agent.act(state, memory, EYE[0], task, None).extras.now
+    found = agent.remember(state, memory, step, task).running
+    assert found.option == expected.option != NONE and found.lasts == expected.lasts
+
+
+# Learning.
+
+
+CORRIDOR = Corridor(vary={"goal": "l,r"}, held_out=(), split="none", sketched=False)
+GIVEN = {"num_envs": 32, "unroll": 16, "minibatches": 4, "epochs": 4, "chunk_steps": 320}
+FAST = {"gamma": 0.95, "actor_lr": 3e-3, "critic_lr": 3e-3}
+
+
+def returns(agent, state):
+    tasks = CORRIDOR.tasks()
+    play = lambda state: evaluate(CORRIDOR, agent, Episodes(20), state, tasks, jnp.arange(1), jnp.int32(0))
+    return np.asarray(jax.jit(play, compiler_options=QUICK)(state).returns)[0].mean(axis=1)
+
+
+@pytest.mark.slow
+def test_two_tasks_are_learned_and_a_cost_makes_options_last():
+    """Sub-policies do not see the task: each needs the other option. With a cost an option ends more rarely."""
+    ends = {}
+    for cost in (0.0, 0.02):
+        agent = made(CORRIDOR.spec, deliberation_cost=cost, **FAST)
+        state, history = train(CORRIDOR, agent, GIVEN, chunks=3)
+        assert np.all(returns(agent, state.agent) > 0.95)
+        ends[cost] = float(history[-1]["option_ends"].mean())
+    assert ends[0.02] < 0.05 < 0.1 < ends[0.0]
+
+
+def test_options_that_are_kept_stay_as_they_are():
+    """Bit for bit, while the policy over them and the critic learn."""
+    small = {**GIVEN, "num_envs": 4, "unroll": 8, "minibatches": 2, "epochs": 1, "chunk_steps": 8}
+    agent = made(CORRIDOR.spec, keep_options=True)
+    assert learned(agent.fits.values()) == ("critic", "representation", "knowing", "over_options")
+    start, after = (only_seed(train(CORRIDOR, agent, small, chunks=n)[0].agent.nets) for n in (0, 1))
+    moved = lambda name: any(
+        np.any(x != y) for x, y in zip(*(jax.tree.leaves(nets[name]) for nets in (start, after)), strict=True)
+    )
+    assert [moved(name) for name in (*LEARNS, "critic")] == [False, False, True, True]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["by-observation", "delayed", "endless"])
+def test_probes_have_their_known_values_under_every_option(kind):
+    """Of every task, by Gaussian sub-policies: which option runs changes no reward there, and ends cost nothing."""
+    settings = {"hidden": (32,), "num_options": 2, "deliberation_cost": 0.0, "end_bias": 0.0}
+    agent = tiny("options", **settings, choice_entropy_cost=0.1)  # so that both run, as what never runs is not learned
+    state, _ = train(Probe(kind), agent, LEARN)
+    state, tasks = only_seed(state.agent), Probe(kind).tasks()
+    expected, obs, tolerance = KNOWN[kind]
+    seen = jax.vmap(lambda x: agent.view.see(state.nets["inputs"], x[None]))(jnp.float32(obs))
+    found = critics.values(agent, state, tasks.context, jnp.broadcast_to(seen, (2, *seen.shape)))
+    for i, scale in enumerate(SCALES):
+        wanted = np.array([expected(scale, x) for x in obs])[:, None]
+        np.testing.assert_allclose(found[i], np.broadcast_to(wanted, found[i].shape), atol=2 * tolerance)
+
+
+@pytest.mark.parametrize(
+    "given, said",
+    [
+        ({"num_options": 0}, "num-options must be at least 1"),
+        ({"deliberation_cost": -0.1}, "deliberation-cost must be at least 0"),
+        ({"representation": "deepmdp"}, "use representation=plain"),
+        ({"encoder": "care"}, "options do not see the task, by which this encoder works"),
+        ({"encoder": "input-map"}, "and another encoder"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(given, said):
+    with pytest.raises(InputError, match=said):
+        mtjax.agent("options", **given)
