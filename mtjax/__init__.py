@@ -23,6 +23,8 @@ if TYPE_CHECKING:  # for editors, which do not run __getattr__
     from mtjax.report.drawing import plot as plot
     from mtjax.report.scoring import evaluate as evaluate
     from mtjax.saved.export import export as export
+    from mtjax.saved.hub import pull as pull
+    from mtjax.saved.hub import push as push
     from mtjax.saved.policy import load as load
     from mtjax.saved.result import Result as Result
     from mtjax.types import Step as Step
@@ -49,6 +51,8 @@ _HOME = {
     "mixture": "mtjax.envs",
     "plot": "mtjax.report.drawing",
     "preset": "mtjax.config:with_preset",
+    "pull": "mtjax.saved.hub",
+    "push": "mtjax.saved.hub",
     "register": "mtjax.command.register",
     "runs": "mtjax.report.collect",
     "stacked": "mtjax.envs",

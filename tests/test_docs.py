@@ -43,7 +43,7 @@ def commands(text: str) -> list[list[str]]:
     return [
         each
         for each in training(text)
-        if not any(w in not_here or "..." in w or "$" in w or w.startswith("--import") for w in each)
+        if not any(w in not_here or "..." in w or "$" in w or w.startswith(("--import", "--search")) for w in each)
     ]
 
 
