@@ -31,7 +31,7 @@ if TYPE_CHECKING:  # for editors, which do not run __getattr__
     from mtjax.types import Task as Task
     from mtjax.types import Transition as Transition
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _HOME = {
     "AGENTS": "mtjax.agents",

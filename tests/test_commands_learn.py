@@ -39,6 +39,8 @@ _GYM = "needs Gymnasium; tests/test_hosted.py learns to balance there"
 _GRID = "earns nearly all that can be earned in ten minutes of two CPU cores; tests/test_recurrent.py has a bandit"
 _READS = "begins to earn more after two minutes of two CPU cores"
 _PULLS = "ten pulls earn between 5 and 6.02, too little to see in few trials; tests/test_own_inference.py trains it"
+_BELIEVES = "ten pulls earn between 5 and 6.02; tests/test_posterior.py has beliefs that are known"
+_CRAFT = "takes longer than ten minutes of two CPU cores; tests/test_sketches.py learns in a small corridor"
 _LOOP = "--env=point-mass-vary-goal --agent=multi-head"  # one pair of the loop around the command
 
 MARKS: dict[str, Learns | str] = {
@@ -63,6 +65,15 @@ MARKS: dict[str, Learns | str] = {
     "--env=walker-walk --env.vary.friction=0.1:2:20 --split=none --agent=ppo --agent.conditioning=none "
     "--curriculum=sequence:100000 --chunk-steps=10000": _WALKER,
     "--env=errands --agent=ppo --agent.conditioning=text": _READS,
+    "--env=two-goal-maze --agent=pqn": "TODO",
+    "--env=gymnasium:CartPole-v1 '--env.arguments={\"sutton_barto_reward\": true}' --agent=ppo": _GYM,
+    "--env=hidden-bandit --agent=ppo --trials=10 --agent.conditioning=posterior --agent.unroll=10": _BELIEVES,
+    "--env=craft-sketched --agent=sketches": _CRAFT,
+    "--env=craft-sketched --agent=sketches --agent.sharing=tasks": _CRAFT,
+    "--env=craft-sketched --agent=sketches --agent.sharing=all --agent.conditioning=one-hot": _CRAFT,
+    "--env=light-world-sketched --agent=sketches": _CRAFT,
+    "--env=cheetah-run --agent=ppo": _GPU,
+    "--env=brax-ant-vary-direction --agent=ppo": _GPU,
     "--env=grid-navi --agent=rl2 --trials=4 --agent.unroll=60": _GRID,
     "--env=finger-spin --env.vary.size=0.95:1.13:200 --curriculum=random:10:4000 --num-envs=8": _FINGER,
     "--env=gymnasium:Pendulum-v1 --env.vary.g=5:15:5 --agent=ppo": _GYM,
