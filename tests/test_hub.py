@@ -4,12 +4,14 @@ import inspect
 import json
 import shutil
 import sys
+from importlib import import_module
 from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pytest
 from conftest import SHORT_RUN
+from needs import needs
 
 import mtjax
 import mtjax.train
@@ -159,9 +161,10 @@ def test_without_the_library_the_message_has_the_command(monkeypatch):
         mtjax.pull(NAME)
 
 
+@needs("huggingface_hub")
 def test_the_hubs_interface_is_what_is_called():
     """Of the installed library, whose names and arguments may change."""
-    api = pytest.importorskip("huggingface_hub", reason="needs huggingface_hub").HfApi()
+    api = import_module("huggingface_hub").HfApi
     calls = {"create_repo": ("private", "exist_ok"), "upload_folder": ("repo_id", "folder_path", "commit_message")}
     calls |= {"snapshot_download": ("revision", "allow_patterns")}
     for name, used in calls.items():

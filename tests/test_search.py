@@ -173,7 +173,6 @@ def searched(root):
 @pytest.fixture(scope="module")
 def whole(short_family, tmp_path_factory):
     """The folder of a search that nothing stopped, with two rounds of two seeds."""
-    pytest.importorskip("optuna", reason="needs optuna")
     return searched(tmp_path_factory.mktemp("search"))
 
 
