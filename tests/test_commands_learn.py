@@ -40,6 +40,7 @@ _GRID = "earns nearly all that can be earned in ten minutes of two CPU cores; te
 _READS = "begins to earn more after two minutes of two CPU cores"
 _PULLS = "ten pulls earn between 5 and 6.02, too little to see in few trials; tests/test_own_inference.py trains it"
 _BELIEVES = "ten pulls earn between 5 and 6.02; tests/test_posterior.py has beliefs that are known"
+_SOON = "earns nearly all that it can before its first evaluation; tests/test_pqn.py has probes"
 _CRAFT = "takes longer than ten minutes of two CPU cores; tests/test_sketches.py learns in a small corridor"
 _LOOP = "--env=point-mass-vary-goal --agent=multi-head"  # one pair of the loop around the command
 
@@ -65,7 +66,7 @@ MARKS: dict[str, Learns | str] = {
     "--env=walker-walk --env.vary.friction=0.1:2:20 --split=none --agent=ppo --agent.conditioning=none "
     "--curriculum=sequence:100000 --chunk-steps=10000": _WALKER,
     "--env=errands --agent=ppo --agent.conditioning=text": _READS,
-    "--env=two-goal-maze --env.observe-boxes --agent=pqn": Learns(0.2),
+    "--env=bandit --agent=pqn": _SOON,
     "--env=gymnasium:CartPole-v1 --agent=ppo": _GYM,
     "--env=hidden-bandit --agent=ppo --trials=10 --agent.conditioning=posterior --agent.unroll=10": _BELIEVES,
     "--env=craft-sketched --agent=sketches": _CRAFT,
