@@ -134,9 +134,10 @@ def _entry(root: str, file: Any) -> str:
     """Return a page's line: title, address and first sentence."""
     text = file.content_string
     title = re.search(r"^# (.+)$", text, re.M)
-    plain = re.sub(r"```.*?```|^[#|!].*$", "", text, flags=re.DOTALL | re.M)
-    says = re.sub(r"\[([^]]+)\]\([^)]*\)|[*`]", r"\1", first_sentence(plain.strip()))
-    return f"- [{title[1] if title else file.name}]({root}/{file.url}): {says}"
+    plain = re.sub(r"(?m)^[#|!<].*$", "", re.sub(r"(?s)```.*?```", "", text))
+    linked = lambda link: link[1] or ""
+    says = re.sub(r"\[([^]]+)\]\([^)]*\)|[*`]", linked, first_sentence(plain.strip()))
+    return f"- [{title[1] if title else file.name}]({root}/{file.url.removeprefix('./')}): {says}"
 
 
 # Families.
