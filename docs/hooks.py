@@ -1,6 +1,6 @@
 """Pages of the documentation that are made from the package: one for every family and every agent.
 
-MkDocs calls ``on_config`` and ``on_files``. Texts are the docstrings, numbers are those in ``benchmarks/results``.
+MkDocs calls what begins with ``on_``. Texts are the docstrings, numbers are those in ``benchmarks/results``.
 """
 
 import ast
@@ -8,9 +8,11 @@ import csv
 import dataclasses
 import inspect
 import json
+import logging
 import re
 import tempfile
 import textwrap
+import tomllib
 from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from itertools import pairwise, takewhile
@@ -34,6 +36,9 @@ ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
 PICTURES = Path(__file__).parent / "pictures" / "families"
 PICTURE = "../../benchmarks/results/"  # as pages name it, so that it is found on the site and in the repository
+ADDRESSES = Path(__file__).parent / "addresses.toml"
+_CLONE = "git clone <this repository>"
+_LOG = logging.getLogger("mkdocs.plugins.mtjax")
 _UNSEARCHED = "{ data-search-exclude }"  # of a heading whose text is on many pages, and would drown the search
 GROUPS = {  # title -> whether a family belongs there; the first that fits
     "Brax": lambda name, module: module.endswith("envs.brax"),
@@ -51,7 +56,13 @@ GROUPS = {  # title -> whether a family belongs there; the first that fits
 
 
 def on_config(config: Any) -> Any:
-    """Put the made pages into the navigation."""
+    """Put the made pages into the navigation, and the owner's addresses where they belong. Tell those that lack."""
+    known = addresses()
+    missing = [name for name, address in known.items() if not address]
+    if missing:
+        _LOG.info("%s lacks %s", ADDRESSES.name, ", ".join(missing))
+    config.repo_url = known["repository"] or None
+    config.site_url = known["site"] or config.site_url
     for entry in config.nav:
         (title,) = entry
         if title == "Families":
@@ -72,6 +83,7 @@ def on_files(files: Files, config: Any) -> Files:
     pages |= {"families/index.md": families_page(), "agents/index.md": agents_page()}
     for place, text in pages.items():
         files.append(File.generated(config, place, content=text))
+    files.append(File.generated(config, "llms.txt", content=llms(config, files)))
     for plot in RESULTS.rglob("*.png"):
         place = plot.relative_to(RESULTS).as_posix()
         files.append(File.generated(config, f"results/plots/{place}", abs_src_path=str(plot)))
@@ -80,9 +92,52 @@ def on_files(files: Files, config: Any) -> Files:
     return files
 
 
-def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Turn links to plots in the repository into links to their copies on the site."""
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Turn links to plots in the repository into links to their copies on the site, and name the owner's addresses."""
+    known = addresses()
+    if known["repository"]:
+        markdown = markdown.replace(_CLONE, f"git clone {known['repository']}")
+    if known["doi"] and page.file.src_uri == "citing.md":
+        markdown += f"\nDOI: <{known['doi']}>\n"
     return markdown.replace(f"]({PICTURE}", "](plots/")
+
+
+@lru_cache
+def addresses() -> dict[str, str]:
+    """Return the addresses that only the owner of a published copy knows, by name; empty where there is none."""
+    return tomllib.loads(ADDRESSES.read_text(encoding="utf-8"))
+
+
+def llms(config: Any, files: Files) -> str:
+    """Return llms.txt, a list of all pages with what each is about, for programs that read the site."""
+    root = (config.site_url or "").rstrip("/")
+    lines = [f"# {config.site_name}", "", f"> {config.site_description}. Commands are whole and run as they stand."]
+    for entry in config.nav:
+        ((title, inside),) = entry.items()
+        lines += ["", f"## {title}", ""]
+        pages = [inside] if isinstance(inside, str) else _pages(inside)
+        lines += [_entry(root, files.get_file_from_path(page)) for page in pages]
+    return "\n".join(lines) + "\n"
+
+
+def _pages(entries: Iterable[Any]) -> Iterator[str]:
+    """Yield the pages of a part of the navigation. Of made pages there is a list, which has them all."""
+    for entry in entries:
+        inside = entry if isinstance(entry, str) else next(iter(entry.values()))
+        if isinstance(inside, str) and not ("/" in inside and inside.split("/")[0] in ("families", "agents")):
+            yield inside
+        elif isinstance(entry, str):
+            yield entry
+
+
+def _entry(root: str, file: Any) -> str:
+    """Return a page's line: title, address and first sentence."""
+    text = file.content_string
+    title = re.search(r"^# (.+)$", text, re.M)
+    plain = re.sub(r"(?m)^[#|!<].*$", "", re.sub(r"(?s)```.*?```", "", text))
+    linked = lambda link: link[1] or ""
+    says = re.sub(r"\[([^]]+)\]\([^)]*\)|[*`]", linked, first_sentence(plain.strip()))
+    return f"- [{title[1] if title else file.name}]({root}/{file.url.removeprefix('./')}): {says}"
 
 
 # Families.

@@ -24,13 +24,15 @@ if TYPE_CHECKING:  # for editors, which do not run __getattr__
     from mtjax.report.scoring import evaluate as evaluate
     from mtjax.saved import standalone as standalone
     from mtjax.saved.export import export as export
+    from mtjax.saved.hub import pull as pull
+    from mtjax.saved.hub import push as push
     from mtjax.saved.policy import load as load
     from mtjax.saved.result import Result as Result
     from mtjax.types import Step as Step
     from mtjax.types import Task as Task
     from mtjax.types import Transition as Transition
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _HOME = {
     "AGENTS": "mtjax.agents",
@@ -50,6 +52,8 @@ _HOME = {
     "mixture": "mtjax.envs",
     "plot": "mtjax.report.drawing",
     "preset": "mtjax.config:with_preset",
+    "pull": "mtjax.saved.hub",
+    "push": "mtjax.saved.hub",
     "register": "mtjax.command.register",
     "runs": "mtjax.report.collect",
     "stacked": "mtjax.envs",

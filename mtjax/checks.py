@@ -201,8 +201,14 @@ def require_run(folder: Path) -> None:
     raise InputError(f"{str(folder)!r} is not a run: it has no config.json{hint}")
 
 
-def require_library(module: str) -> Any:
+_EXTRAS = {"tensorboardX": "tensorboard", "optuna": "search", "huggingface_hub": "hub"}  # library -> its extra
+
+
+def require_library(module: str, what: str = "") -> Any:
     """Import and return a library.
+
+    Args:
+        what: what needs it; by default the flag of its name.
 
     Raises:
         InputError: it is not installed.
@@ -210,5 +216,5 @@ def require_library(module: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError:
-        extra = module.removesuffix("X")
-        raise InputError(f"--{extra} needs {module}: pip install 'mtjax[{extra}]'") from None
+        extra = _EXTRAS.get(module, module)
+        raise InputError(f"{what or f'--{extra}'} needs {module}: pip install 'mtjax[{extra}]'") from None

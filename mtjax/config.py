@@ -115,6 +115,12 @@ class RunConfig:
     written without their dashes. Real numbers of the agent vary inside one program, beside the seeds. Other settings
     run as one program after another. The sweep's folder holds a table of all settings; --resume takes this folder."""
     points: Annotated[tuple[dict[str, float], ...], tyro.conf.Suppress] = ()
+    search: int = 0
+    """Look for good real numbers of the agent in so many trials. Ranges are flags such as --agent.actor-lr=1e-5..1e-2.
+    A round of trials trains as one program, of which the better half goes on after a quarter and after half of the
+    steps (pip install 'mtjax[search]'). The search's folder holds a table of all trials; --resume takes this folder."""
+    search_batch: int = 0
+    """Trials of a round. 0 means a quarter of all."""
     quick: bool = False
     """Learn something in some 35 seconds of processor time: a point mass reaches ten goals. Other flags change it."""
     config: str = ""

@@ -562,7 +562,7 @@ def test_record_of_another_version_is_told(complaint, finished_run, tmp_path):
     record["learner"]["believe"] = "least"
     (tmp_path / "config.json").write_text(json.dumps(record))
     said = complaint("evaluate", f"--run={tmp_path}")
-    assert "'believe'" in said and "(mtjax 9.9 wrote it, and this is 0.1.0)" in said
+    assert "'believe'" in said and f"(mtjax 9.9 wrote it, and this is {mtjax.__version__})" in said
 
 
 @pytest.mark.parametrize(

@@ -29,6 +29,7 @@ _GPU = "takes hours without a GPU"
 _OTHER = "needs a file or a run of the reader's own"
 _HELP = "prints flags and trains nothing"
 _MANY = "trains as many agents as the points of a sweep; tests/test_sweep.py has smaller ones"
+_TRIALS = "trains sixteen agents; tests/test_search.py has smaller ones"
 _COPIES = "trains twenty agents; tests/test_populations.py has smaller ones"
 _HOSTS = "takes several processes; tests/test_devices.py has such runs"
 _FINGER = "ten fingers still have a return of 0 to 2 after 300,000 steps, which take two minutes of a CPU core"
@@ -38,6 +39,9 @@ _GYM = "needs Gymnasium; tests/test_hosted.py learns to balance there"
 _GRID = "earns nearly all that can be earned in ten minutes of two CPU cores; tests/test_recurrent.py has a bandit"
 _READS = "begins to earn more after two minutes of two CPU cores"
 _PULLS = "ten pulls earn between 5 and 6.02, too little to see in few trials; tests/test_own_inference.py trains it"
+_BELIEVES = "ten pulls earn between 5 and 6.02; tests/test_posterior.py has beliefs that are known"
+_SOON = "earns nearly all that it can before its first evaluation; tests/test_pqn.py has probes"
+_CRAFT = "takes longer than ten minutes of two CPU cores; tests/test_sketches.py learns in a small corridor"
 _LOOP = "--env=point-mass-vary-goal --agent=multi-head"  # one pair of the loop around the command
 
 MARKS: dict[str, Learns | str] = {
@@ -64,6 +68,15 @@ MARKS: dict[str, Learns | str] = {
     "--env=cw10 --agent=brc --agent.conditioning=one-hot --agent.heads=per-task --num-envs=256 "
     "--curriculum=sequence:3000 --chunk-steps=750 --steps=7680000 --agent.continual=clone": _GPU,
     "--env=errands --agent=ppo --agent.conditioning=text": _READS,
+    "--env=bandit --agent=pqn": _SOON,
+    "--env=gymnasium:CartPole-v1 --agent=ppo": _GYM,
+    "--env=hidden-bandit --agent=ppo --trials=10 --agent.conditioning=posterior --agent.unroll=10": _BELIEVES,
+    "--env=craft-sketched --agent=sketches": _CRAFT,
+    "--env=craft-sketched --agent=sketches --agent.sharing=tasks": _CRAFT,
+    "--env=craft-sketched --agent=sketches --agent.sharing=all --agent.conditioning=one-hot": _CRAFT,
+    "--env=light-world-sketched --agent=sketches": _CRAFT,
+    "--env=cheetah-run --agent=ppo": _GPU,
+    "--env=brax-ant-vary-direction --agent=ppo": _GPU,
     "--env=grid-navi --agent=rl2 --trials=4 --agent.unroll=60": _GRID,
     "--env=finger-spin --env.vary.size=0.95:1.13:200 --curriculum=random:10:4000 --num-envs=8": _FINGER,
     "--env=gymnasium:Pendulum-v1 --env.vary.g=5:15:5 --agent=ppo": _GYM,
@@ -79,11 +92,15 @@ MARKS: dict[str, Learns | str] = {
     "--env=finger-spin-vary-size --agent=care --help": _HELP,
     "--config=settings.toml --steps=2000000": _OTHER,
     "--resume=runs/...": _OTHER,
+    "'--resume=$run'": _OTHER,
+    "--env=finger-spin-vary-size --seeds=10 --steps=20000000 --runs=runs/long": _MANY,
     "--resume=runs/... --steps=8000000": _OTHER,
     "--env=finger-spin-vary-size --env.vary.size=1.15:1.2:4 --split=none --from=runs/... --tune=all": _OTHER,
     "--import=lever.py --env=lever --agent=sac-conditioned --steps=400000": _OTHER,
     "--seeds=5 --sweep agent.actor-lr=1e-4,3e-4,1e-3 agent.num-critics=2,4": _MANY,
     "--population=pbt:100000 --seeds=5 --sweep agent.actor-lr=1e-4,1e-3 agent.critic-lr=1e-4,1e-3": _COPIES,
+    "--quick --steps=100000 --seeds=5 --sweep agent=sac,multi-head,sac-conditioned --runs=runs/compare": _MANY,
+    "--quick --search=16 --agent.actor-lr=1e-5..1e-2 --agent.gamma=0.9..0.999": _TRIALS,
     "--seeds=3 --steps=400000 --sweep env=point-mass-vary-goal,reacher-vary-goal agent=sac,multi-head": _MANY,
     "--seeds=8 --distributed --runs=/shared/runs": _HOSTS,
     "--env=pendulum-swingup --engine=mjx --seeds=2 --distributed": _HOSTS,

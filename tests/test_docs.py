@@ -8,6 +8,7 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from needs import needs
@@ -43,7 +44,7 @@ def commands(text: str) -> list[list[str]]:
     return [
         each
         for each in training(text)
-        if not any(w in not_here or "..." in w or "$" in w or w.startswith("--import") for w in each)
+        if not any(w in not_here or "..." in w or "$" in w or w.startswith(("--import", "--search")) for w in each)
     ]
 
 
@@ -79,14 +80,23 @@ def test_what_the_pages_document_exists():
         pkgutil.resolve_name(name)
 
 
-@pytest.fixture(scope="module")
-def hooks():
-    """Return the module that makes pages of the site."""
-    spec = importlib.util.spec_from_file_location("hooks", ROOT / "docs" / "hooks.py")
+def made_of(name):
+    """Return a module that makes pages of the site."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="module")
+def hooks():
+    return made_of("hooks")
+
+
+@pytest.fixture
+def long_pages():
+    return made_of("long_pages")
 
 
 @needs("mkdocs")
@@ -113,6 +123,51 @@ def test_pages_of_families_name_their_reward(hooks):
         assert "**Reward**: " in page and "**Observation (" in page
 
 
+def weight(page):
+    """The bytes of a page with its pictures, without what all pages share."""
+    shown = {page.parent / place for place in re.findall(r'<img[^>]*src="([^":]+)"', page.read_text())}
+    return page.stat().st_size + sum(picture.stat().st_size for picture in shown)
+
+
+RESULTS = [page for page in DOCS if page.parent.name == "results"]
+
+
+@needs("mkdocs")
+@pytest.mark.parametrize("page", RESULTS, ids=identify)
+def test_pages_of_results_are_cut_at_titles(page, long_pages):
+    """Into at most six screens, without losing a line."""
+    parts = long_pages.cut(page.read_text())
+    assert "".join(parts) == page.read_text()
+    assert all(long_pages.screens(part) <= long_pages.MOST for part in parts)
+    assert all(part.startswith("##") for part in parts[1:])
+
+
+@needs("mkdocs")
+def test_links_lead_to_the_part_that_has_their_anchor(long_pages):
+    """From any page; links elsewhere stay."""
+    long_pages._HOMES["results/speed.md"] = {"first": "results/speed.md", "late": "results/speed-2.md"}
+    links = "[a](../results/speed.md#late) [b](../results/speed.md#first) [c](other.md#late) [d](#late)"
+    read = lambda place, text: long_pages.on_page_markdown(text, SimpleNamespace(file=SimpleNamespace(src_uri=place)))
+    assert read("guide/agents.md", links) == links.replace("speed.md#late", "speed-2.md#late")
+    inside = "[a](#late) [b](#first) [c](speed.md#first)"
+    assert read("results/speed.md", inside) == "[a](speed-2.md#late) [b](#first) [c](#first)"
+    assert read("results/speed-2.md", inside) == "[a](#late) [b](speed.md#first) [c](speed.md#first)"
+    assert read("index.md", "[a](results/speed.md#late)") == "[a](results/speed-2.md#late)"
+
+
+@needs("mkdocs")
+def test_addresses_stand_in_one_file(hooks, monkeypatch):
+    """They reach the pages where they belong; without them nothing is said there."""
+    page = SimpleNamespace(file=SimpleNamespace(src_uri="citing.md"))
+    assert set(hooks.addresses()) == {"repository", "site", "doi"}
+    known = {"repository": "https://host/me/mtjax", "site": "", "doi": "https://doi.org/1"}
+    monkeypatch.setattr(hooks, "addresses", lambda: known)
+    read = hooks.on_page_markdown("git clone <this repository> && cd mtjax", page)
+    assert read.startswith("git clone https://host/me/mtjax && cd mtjax") and "DOI: <https://doi.org/1>" in read
+    monkeypatch.setattr(hooks, "addresses", lambda: dict.fromkeys(known, ""))
+    assert hooks.on_page_markdown("git clone <this repository>", page) == "git clone <this repository>"
+
+
 @pytest.mark.slow
 @needs("mkdocs")
 @needs("material")
@@ -127,4 +182,7 @@ def test_site_builds_without_a_broken_link(tmp_path):
     fresh = subprocess.run([sys.executable, "-c", say], cwd=ROOT, capture_output=True, text=True, check=True)
     for folder, names in zip(("families", "agents"), json.loads(fresh.stdout), strict=True):  # without other tests' own
         assert all((tmp_path / folder / name / "index.html").is_file() for name in names)
+    listed = (tmp_path / "llms.txt").read_text()
+    assert "# mtjax" in listed and "[Which agent](/guide/which-agent/): Begin with one of three" in listed
+    assert max(map(weight, tmp_path.rglob("index.html"))) < 600_000
     assert "1.65 times sac" in (tmp_path / "agents" / "care" / "index.html").read_text()

@@ -97,7 +97,10 @@ def test_commands_point_to_functions(entry):
 
 
 def test_citation_names_the_same_version():
-    """One release, one number."""
+    """One release, one number; so do the page that says how to cite, and the changelog's first title."""
+    page, changes = ((ROOT / name).read_text() for name in ("docs/citing.md", "CHANGELOG.md"))
+    assert f"version = {{{mtjax.__version__}}}" in page
+    assert re.search(r"^## (\S+)", changes, re.M)[1] == mtjax.__version__
     assert re.search(r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text(), re.M)[1] == mtjax.__version__
 
 

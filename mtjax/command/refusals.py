@@ -43,7 +43,7 @@ def check_names(argv: Sequence[str]) -> None:
         folder = flag_value(argv, flag, None)
         if folder in pretrained.names() and not Path(folder).is_dir():
             raise pretrained.not_learning(folder)
-        if folder is not None and not (flag == "resume" and any(Path(folder).glob("run-*"))):  # the runs of a sweep
+        if folder is not None and not (flag == "resume" and any(Path(folder).glob("run-*"))):  # of a sweep or search
             require_run(Path(folder))
 
 

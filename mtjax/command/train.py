@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mtjax.agents.unseen import describe_unseen
-from mtjax.command import sweep
+from mtjax.command import search, sweep
 from mtjax.command.run_config import parse
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import RunConfig
@@ -27,9 +27,11 @@ from mtjax.types import InputError
 
 
 def main(argv: Sequence[str]) -> None:
-    """Start or resume a run or a sweep."""
+    """Start or resume a run, a sweep or a search."""
     if "--distributed" in argv:
         hosts.initialise()  # before anything looks at the devices
+    if search.is_search(argv):
+        return search.main(argv)
     if sweep.is_sweep(argv):
         if "--distributed" in argv:
             raise InputError("a sweep runs in one process; leave out --distributed")

@@ -48,6 +48,7 @@ class Policy:
     directory: Path | None = None  # of the run
     number: int = 0  # of the seed among ``seeds``
     trial: int = 1  # episodes of a trial, through which its memory lives
+    entry: int = 0  # its number in S among all seeds of all points of the run
 
     def __repr__(self) -> str:
         names, seen = f"{name_of(self.agent)} on {env_name_of(self.env)}", jax.tree.map(lambda x: x.shape, self.takes)
@@ -191,7 +192,7 @@ def load(directory: str | Path, seed: int = 0, checkpoint: int = 0) -> Policy:
     seeds = jnp.asarray(config.plan.all_seeds, jnp.int32)
     among = bool(config.plan.population)
     found = policy_of(config.family, config.learner, config.points, seeds, states, seed, directory, among)
-    return dataclasses.replace(found, trial=config.training.trials)
+    return dataclasses.replace(found, trial=config.training.trials, entry=seed)
 
 
 def _filled(directory: Path, like: Any) -> Any:

@@ -61,7 +61,7 @@ class Result(NamedTuple):
         states = jax.tree.map(jnp.asarray, hosts.gather(self.state.agent))
         about = self.points, jnp.asarray(self.seeds), states, seed, self.directory, bool(self.population)
         found = policy_of(self.env, self.agent, *about)
-        return dataclasses.replace(found, trial=self.evaluations.trial)
+        return dataclasses.replace(found, trial=self.evaluations.trial, entry=seed)
 
     @public
     def frame(self, of: str = "evaluations") -> Any:

@@ -1,6 +1,8 @@
 """Policies without what only training needs: settings, and those arrays of an agent's state that acting reads."""
 
+import dataclasses
 import json
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -8,32 +10,49 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mtjax.agents import settings
 from mtjax.config import RunConfig
-from mtjax.names import InputError
 from mtjax.saved import pretrained
-from mtjax.saved.config_json import read_record
+from mtjax.saved.config_json import from_json, read_record, to_flags
 from mtjax.saved.operations import steps_of
 from mtjax.saved.policy import Policy, load
 
 _SETTINGS = "config.json"
 
 
-def write(run: str | Path, directory: Path) -> None:
-    """Write the policy of a run's first seed into a folder.
+def write(run: str | Path, directory: Path, number: int = 0) -> None:
+    """Write the policy of one entry of S of a run into a folder. Paths of this machine are left out.
 
     Raises:
-        InputError: the folder exists, or the run holds several settings of a sweep.
+        InputError: the folder exists, or the run has no such entry.
     """
-    policy = load(run)
+    policy = load(run, number)
     record = read_record(Path(run) / _SETTINGS)
     if record.get("points"):
-        raise InputError(f"{str(run)!r} holds several settings of a sweep; ship a run of one")
-    record["plan"]["seeds"], record["runs"] = 1, RunConfig.runs
+        record |= _of_point(from_json(Path(run) / _SETTINGS), policy)
+    record["plan"] |= {"seed": int(policy.seeds[policy.number]), "seeds": 1, "population": ""}
+    record |= {"runs": RunConfig.runs, "start": ""}
+    _shorten_imports(record)
     leaves = jax.tree.leaves(policy.state)
     arrays: Any = {str(i): np.asarray(leaves[i]) for i in read_by_acting(policy)}
     directory.mkdir(parents=True)
     np.savez_compressed(directory / pretrained.FILE, **arrays)
     (directory / _SETTINGS).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+
+
+def _of_point(config: RunConfig, policy: Policy) -> dict[str, Any]:
+    """Return those entries of a record that tell one point of a sweep, whose numbers the policy's agent has."""
+    alone = dataclasses.replace(config, points=(), sweep=(), learner=policy.agent)
+    command = shlex.join(["python", "-m", "mtjax.train", *to_flags(alone)])
+    return {"points": [], "sweep": [], "learner": settings(policy.agent), "command": command}
+
+
+def _shorten_imports(record: dict[str, Any]) -> None:
+    """Name the user's own files without their folders."""
+    files, command = record.get("imports") or [], str(record.get("command", ""))
+    for file in files:
+        command = command.replace(file, Path(file).name)
+    record |= {"imports": [Path(file).name for file in files]} | ({"command": command} if command else {})
 
 
 def read_by_acting(policy: Policy) -> list[int]:
