@@ -29,6 +29,7 @@ import shutil
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 import parts
 import resumable
@@ -154,7 +155,7 @@ def measure(arguments: argparse.Namespace, protocol: Protocol, out: Path, method
         "success_at_end": rounded(found.metrics["success"]["train"]) if "success" in found.metrics else None,
         "returns": rounded(found.returns["train"], 2),
         "tasks": plain.family.labels("train"),
-        "order": [int(settings.plays.rows(i * protocol.each, protocol.tasks)[0]) for i in range(played)],
+        "order": [int(settings.plays.rows(jnp.int32(i * protocol.each), protocol.tasks)[0]) for i in range(played)],
         "steps": found.steps.tolist(),
         "training_seconds": round(float(last["seconds"]), 1),
         "wall_seconds": round(float(last["wall_seconds"]), 1),
