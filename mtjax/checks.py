@@ -15,7 +15,7 @@ from mtjax.names import InputError
 
 OF_TRAIN = (
     *("steps", "seed", "seeds", "eval_every", "eval_episodes", "num_envs", "chunk_steps", "stagger", "trials"),
-    *("reset_free", "curriculum", "population"),
+    *("reset_free", "curriculum", "keep_replay", "population"),
 )
 """The settings of ``mtjax.train`` that are neither the agent's nor the environment's."""
 _LARGEST, _LARGEST_FLOAT = 2**31 - 1, 3.4e38  # of 32 bits

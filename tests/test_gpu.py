@@ -27,7 +27,7 @@ from test_painters import SIZE, similarity, states_of
 from test_rocking import ROCKING, tilting
 
 import mtjax
-from mtjax.agents import AGENTS, for_action
+from mtjax.agents import AGENTS, for_action, options
 from mtjax.agents.base import Memory
 from mtjax.agents.choices import replace
 from mtjax.agents.on_policy import Taken
@@ -342,6 +342,10 @@ def experience(agent, num_seeds, num_tasks):
     returns = agent.sampler.begin()
     memory = memory._replace(sampler=None if returns is None else np.zeros(ended.shape, np.float32))
     taken = Taken(raw, random.normal(size=ended.shape).astype(np.float32) - 2)
+    if isinstance(agent, options.Options):
+        option = lambda: random.integers(agent.num_options, size=ended.shape).astype(np.int32)
+        running, chosen = options.Running(option(), np.ones(ended.shape, np.float32)), random.random(ended.shape) < 0.5
+        taken = options.Taken(*taken, option(), running, chosen, taken.log_prob)
     return steps._replace(ended=ended, closed=ended, cut=ended, extras=taken, memory=memory)
 
 

@@ -192,7 +192,7 @@ def test_both_tasks_and_nothing_between():
     assert [len(MAZE.tasks(split).id) for split in ("train", "interpolation", "extrapolation")] == [2, 0, 0]
     np.testing.assert_array_equal(TwoGoalMaze().tasks().goal["goal-box"], [0])
     named = TwoGoalMaze(vary={"goal-box": "blue,red"})
-    assert [named.describe(i) for i in (0, 1)] == ["goal-box=blue", "goal-box=red"] and named.count == 2
+    assert [named.describe(i) for i in (0, 1)] == ["goal-box=blue", "goal-box=red"] and named.train_count == 2
     for values in ("0.5", "0:1"):
         with pytest.raises(InputError, match=rf"goal-box is one of 0 \(blue\), 1 \(red\); .*; not {values}"):
             TwoGoalMaze(vary={"goal-box": values})

@@ -169,7 +169,7 @@ def rollout(agent, state, length=4, envs=2, seed=0):
     memory = jax.tree.map(lambda x: jnp.broadcast_to(x, (*shape, *x.shape)), begun)
     return Transition(
         normal(STATES), taken.raw, normal(), jnp.float32(random.random(shape) < 0.8), normal(STATES),
-        closed, closed, None, taken, memory,
+        closed, closed, closed, None, taken, memory,
     )  # fmt: skip
 
 

@@ -50,14 +50,14 @@ def params_of(made, obs=OBS, action=ACTION):
 def track_of(made, seed=0):
     """Windows of random steps: the first window's trial of two episodes ends at its third step, with another's start.
 
-    What follows the last step of an episode is far away.
+    What follows the last step of an episode inside a trial is far away.
     """
     random = np.random.default_rng(seed)
     normal = lambda *shape: np.float32(random.normal(size=(B, L, *shape)))
     ended, closed = np.zeros((B, L), bool), np.zeros((B, L), bool)
     ended[0, [0, 2]] = ended[1, 4] = closed[0, 2] = True
     obs, next_obs = normal(OBS), normal(OBS)
-    next_obs[ended] = 1e3
+    next_obs[ended & ~closed] = 1e3
     flat = lambda x: jnp.asarray(x.reshape(-1, *x.shape[2:]))
     state = jnp.asarray(random.random((B, *made.begin(OBS, ACTION).shape)), jnp.float32)
     return Track(state, *map(flat, (obs, normal(ACTION), normal(), ended, closed, closed, next_obs)), key=KEY)
@@ -196,7 +196,10 @@ def test_varibad_learns_how_often_the_arms_of_a_bandit_pay():
 
 @pytest.mark.parametrize("way", WAYS)
 def test_beliefs_over_a_window_are_those_of_steps_one_by_one(way):
-    """Anew after the end of a trial, and not of an episode, at which nothing is known of what follows."""
+    """Anew after the end of a trial, and not of an episode, at which nothing is known of what follows.
+
+    After a step that cuts sums off the belief is that of going on.
+    """
     made = knowing(way)
     params, track = params_of(made), track_of(made)
     before, after = quick(made.over, params, track)(params, track)
@@ -207,9 +210,9 @@ def test_beliefs_over_a_window_are_those_of_steps_one_by_one(way):
         for t in range(L):
             step = jax.tree.map(lambda x, i=window * L + t: x[i], rows)
             np.testing.assert_allclose(before[window * L + t], memory, rtol=1e-5, atol=1e-5)
-            memory = one(memory, step)
-            np.testing.assert_allclose(after[window * L + t], memory, rtol=1e-5, atol=1e-5)
-            memory = made.begin(OBS, ACTION) if step.closed else memory
+            following = one(memory, step._replace(ended=step.ended & ~step.cut))
+            np.testing.assert_allclose(after[window * L + t], following, rtol=1e-5, atol=1e-5)
+            memory = made.begin(OBS, ACTION) if step.closed else one(memory, step)
     features = lambda past: made.features(params, jnp.zeros(0), Shown(past))
     np.testing.assert_array_equal(features(track), made.show(params, before))
     np.testing.assert_array_equal(features(Following(*track)), made.show(params, after))
@@ -220,11 +223,12 @@ def test_beliefs_over_a_window_are_those_of_steps_one_by_one(way):
 
 def test_the_order_of_steps_tells_pearl_nothing():
     made = knowing("pearl")
-    params, track = params_of(made), track_of(made)._replace(closed=jnp.zeros(B * L, bool))
-    turned = jax.tree.map(lambda x: x.reshape(B, L, *x.shape[1:])[:, ::-1].reshape(x.shape), track[1:7])
+    params, track = params_of(made), track_of(made)
+    track = track._replace(**dict.fromkeys(("closed", "cut"), jnp.zeros(B * L, bool)))
+    turned = jax.tree.map(lambda x: x.reshape(B, L, *x.shape[1:])[:, ::-1].reshape(x.shape), track[1:8])
     last = lambda track: made.over(params, track)[1].reshape(B, L, 2, Z)[:, -1]
     np.testing.assert_allclose(
-        last(track), last(track._replace(**dict(zip(track._fields[1:7], turned, strict=True)))), rtol=1e-5
+        last(track), last(track._replace(**dict(zip(track._fields[1:8], turned, strict=True)))), rtol=1e-5
     )
 
 

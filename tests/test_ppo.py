@@ -105,7 +105,7 @@ def test_advantages_are_those_of_a_plain_loop():
         reward, value, next_value = random.normal(size=(3, length, envs))
         ended = random.random((length, envs)) < 0.3
         discount = 1.0 - ended * (random.random((length, envs)) < 0.5)
-        steps = Transition(None, None, jnp.asarray(reward), jnp.asarray(discount), None, *[jnp.asarray(ended)] * 2)
+        steps = Transition(None, None, jnp.asarray(reward), jnp.asarray(discount), None, *[jnp.asarray(ended)] * 3)
         found = targets.gae(steps, jnp.asarray(value), jnp.asarray(next_value), jnp.float32(gamma), 0.8)
         error = reward + gamma * discount * next_value - value
         for t, e in np.ndindex(length, envs):

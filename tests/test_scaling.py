@@ -66,7 +66,9 @@ def stream(rewards, *, ends=(), cuts=(), gamma=0.5):
 
 
 def steps(reward, ended, discount, memory=None):
-    return Transition(None, None, *map(jnp.asarray, (reward, jnp.float32(discount))), None, ended, ended, memory=memory)
+    return Transition(
+        None, None, *map(jnp.asarray, (reward, jnp.float32(discount))), None, ended, ended, ended, memory=memory
+    )
 
 
 def memory_for(scaling, sums):

@@ -5,7 +5,6 @@ What a way keeps is the network "continual", which no fit names, so that no grad
 changes, and critics forget, as their regularisation harms learning (Wolczyk et al. 2021).
 """
 
-import abc
 import dataclasses
 from collections.abc import Callable
 from functools import partial
@@ -85,60 +84,49 @@ class Nothing:
         return nets
 
 
-@dataclasses.dataclass(frozen=True)
-class _Held(Nothing, abc.ABC):
-    """Adds coefficient / 2 sum_i F_i (theta_i - theta*_i)^2 to the actor's loss; theta* are those of the task before.
+# What ways that hold parameters have in common. The importances F of all tasks so far add up, and to the actor's loss
+# coefficient / 2 sum_i F_i (theta_i - theta*_i)^2 is added, where theta* are those that the last task left.
 
-    The importances F of all tasks so far add up. A subclass says what they are.
-    """
 
-    keeps: ClassVar[bool] = True
+def _no_anchor(self: Nothing, actor: Params, num_tasks: int, example: tuple, size: int) -> Nets:
+    zeros = jax.tree.map(jnp.zeros_like, actor.shared)
+    return {NET: Params({"anchor": Anchor(jax.tree.map(jnp.copy, actor.shared), zeros)}, {})}
 
-    @property
-    @abc.abstractmethod
-    def strength(self) -> float:
-        """The coefficient."""
 
-    @abc.abstractmethod
-    def importance(self, outputs: Outputs, information: Information, params: Any, inputs: Any) -> Any:
-        """Return F of the task that ends, as ``params``; see ``consolidate``."""
+def _penalty(nets: Nets, coefficient: float) -> Array:
+    return continual.penalty(nets[NET].shared["anchor"], nets["actor"].shared, coefficient)
 
-    def init(self, actor: Params, num_tasks: int, example: tuple, size: int) -> Nets:
-        zeros = jax.tree.map(jnp.zeros_like, actor.shared)
-        return {NET: Params({"anchor": Anchor(jax.tree.map(jnp.copy, actor.shared), zeros)}, {})}
 
-    def penalty(self, nets: Nets, agent: Any, key: Key) -> Array:
-        return continual.penalty(nets[NET].shared["anchor"], nets["actor"].shared, self.strength)
-
-    def consolidate(self, nets: Nets, outputs: Outputs, information: Information, inputs: Any) -> Nets:
-        params = nets["actor"].shared
-        importance = self.importance(outputs, information, params, inputs)
-        held = continual.anchor(params, importance, nets[NET].shared["anchor"])
-        return nets | {NET: Params({"anchor": held}, {})}
+def _hold(nets: Nets, importance: Any) -> Nets:
+    held = continual.anchor(nets["actor"].shared, importance, nets[NET].shared["anchor"])
+    return nets | {NET: Params({"anchor": held}, {})}
 
 
 @dataclasses.dataclass(frozen=True)
-class L2(_Held):
+class L2(Nothing):
     """Holds all parameters of the actor equally: F = 1."""
 
+    keeps: ClassVar[bool] = True
     l2_coefficient: float = 2e5
     """Weight of the penalty: that of Continual World, where it is 1e5 without the half."""
 
     def __post_init__(self):
         parts.require_not_negative(self, "l2_coefficient")
 
-    @property
-    def strength(self) -> float:
-        return self.l2_coefficient
+    init = _no_anchor
 
-    def importance(self, outputs: Outputs, information: Information, params: Any, inputs: Any) -> Any:
-        return continual.l2(params)
+    def penalty(self, nets: Nets, agent: Any, key: Key) -> Array:
+        return _penalty(nets, self.l2_coefficient)
+
+    def consolidate(self, nets: Nets, outputs: Outputs, information: Information, inputs: Any) -> Nets:
+        return _hold(nets, continual.l2(nets["actor"].shared))
 
 
 @dataclasses.dataclass(frozen=True)
-class EWC(_Held):
+class EWC(Nothing):
     """Holds parameters by the Fisher information of the policy (Kirkpatrick et al. 2017); see ``continual.ewc``."""
 
+    keeps: ClassVar[bool] = True
     ewc_coefficient: float = 2e4
     """Weight of the penalty: that of Continual World, where it is 1e4 without the half."""
     fisher_least: float = 1e-5
@@ -150,22 +138,27 @@ class EWC(_Held):
         parts.require_not_negative(self, "ewc_coefficient", "fisher_least")
         _require_group(self, "fisher_samples")
 
-    @property
-    def strength(self) -> float:
-        return self.ewc_coefficient
+    init = _no_anchor
+
+    def penalty(self, nets: Nets, agent: Any, key: Key) -> Array:
+        return _penalty(nets, self.ewc_coefficient)
 
     @property
     def samples(self) -> int:  # type: ignore[override]
         return self.fisher_samples // _GROUP * _GROUP
 
-    def importance(self, outputs: Outputs, information: Information, params: Any, inputs: Any) -> Any:
-        return _in_groups(lambda x: continual.ewc(outputs, information, params, x, self.fisher_least), inputs)
+    def consolidate(self, nets: Nets, outputs: Outputs, information: Information, inputs: Any) -> Nets:
+        params = nets["actor"].shared
+        return _hold(
+            nets, _in_groups(lambda x: continual.ewc(outputs, information, params, x, self.fisher_least), inputs)
+        )
 
 
 @dataclasses.dataclass(frozen=True)
-class MAS(_Held):
+class MAS(Nothing):
     """Holds parameters by how much they change the actor's outputs (Aljundi et al. 2018); see ``continual.mas``."""
 
+    keeps: ClassVar[bool] = True
     mas_coefficient: float = 2e4
     """Weight of the penalty: that of Continual World, where it is 1e4 without the half."""
     mas_samples: int = 2560
@@ -175,16 +168,18 @@ class MAS(_Held):
         parts.require_not_negative(self, "mas_coefficient")
         _require_group(self, "mas_samples")
 
-    @property
-    def strength(self) -> float:
-        return self.mas_coefficient
+    init = _no_anchor
+
+    def penalty(self, nets: Nets, agent: Any, key: Key) -> Array:
+        return _penalty(nets, self.mas_coefficient)
 
     @property
     def samples(self) -> int:  # type: ignore[override]
         return self.mas_samples // _GROUP * _GROUP
 
-    def importance(self, outputs: Outputs, information: Information, params: Any, inputs: Any) -> Any:
-        return _in_groups(lambda group: continual.mas(outputs, params, group), inputs)
+    def consolidate(self, nets: Nets, outputs: Outputs, information: Information, inputs: Any) -> Nets:
+        params = nets["actor"].shared
+        return _hold(nets, _in_groups(lambda x: continual.mas(outputs, params, x), inputs))
 
 
 @dataclasses.dataclass(frozen=True)
