@@ -182,6 +182,7 @@ def test_a_stopped_pair_goes_on_to_the_same_results(run, unstopped, tmp_path, mo
     assert not list(out.rglob("checkpoints"))
 
 
+@pytest.mark.slow
 def test_an_unfinished_pair_is_told_and_goes_on_with_its_settings_only(run, script, tmp_path, monkeypatch):
     """Tables name it; if asked they show its last evaluation, and curves up to there."""
     with monkeypatch.context() as patch, pytest.raises(SystemExit, match=r"stopped: the run is in .*sac, and the same"):

@@ -48,6 +48,7 @@ def at(state, iteration):
     return state._replace(iteration=jnp.full_like(state.iteration, iteration))
 
 
+@pytest.mark.slow
 def test_newest_checkpoint_has_every_shape_and_type(state, shapes):
     """The last one of the run, with typed keys, and nothing in the place of task vectors."""
     found = jax.tree.map(lambda x: (x.shape, x.dtype), state)

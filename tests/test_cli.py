@@ -542,6 +542,7 @@ def test_record_of_a_family_that_is_gone_is_refused(complaint, finished_run, tmp
     assert "unknown environment 'finger-shirt'" in complaint("train", f"--resume={tmp_path}")
 
 
+@pytest.mark.slow
 def test_damaged_checkpoints_are_refused(complaint, copied_run):
     """By both programs, if none is whole; the folder stays as it is."""
     for file in (copied_run / "checkpoints").rglob("*"):

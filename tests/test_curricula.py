@@ -143,6 +143,7 @@ def test_what_cannot_be_played_is_refused(agent, given, said):
         mtjax.train(env, agent, steps=600, **{"num_envs": 2, "chunk_steps": 50, "quiet": True, **given})
 
 
+@pytest.mark.slow
 def test_a_replay_begins_anew_with_random_steps_where_tasks_change_unless_it_is_kept():
     """Of three chunks of eight steps each, in which the first three steps are random and nothing is learned."""
     blind = {**REPLAY, "warmup_steps": 3}
@@ -162,6 +163,7 @@ def test_tasks_from_scratch_begin_a_new_agent_where_a_task_ends():
     assert [int(np.max(state.agent.fits["critic"].optimizer[1][0].count)) for state in states] == [0, 7, 7]
 
 
+@pytest.mark.slow
 def test_a_mixtures_tasks_are_played_in_turn_and_a_run_resumes_to_the_bit(tmp_path):
     given = {"num_envs": 2, "chunk_steps": 150, "curriculum": "sequence:150", "quiet": True, "unroll": 10}
     given |= {"minibatches": 1, "epochs": 1, "eval_every": 600, "eval_episodes": 1, "hidden": (8,)}

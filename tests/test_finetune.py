@@ -167,6 +167,7 @@ def test_weights_of_length_one_stay_and_statistics_follow_the_data(name, tmp_pat
             assert moved == ("['head']" in path or "batch_stats" in path), path
 
 
+@pytest.mark.slow
 def test_a_run_records_where_it_comes_from(base, tuned):
     """Its agent is the run's but for what was given; its contexts are written as the run's."""
     directory = tuned("heads")

@@ -250,6 +250,7 @@ def test_the_slow_critic_is_what_bootstraps(case):
         np.testing.assert_allclose((1 - tau) * old[path] + tau * new[path], found[path], rtol=1e-5, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_critics_that_see_the_state_see_no_picture():
     """And the actor sees no state: it reaches the actor through the critics' values only."""
     state, update = start("asymmetric")

@@ -210,6 +210,7 @@ def run(registered, tmp_path_factory):
     return next(runs.iterdir())
 
 
+@pytest.mark.slow
 def test_a_run_has_evaluations_and_a_film(run, capsys):
     """A film shows the environment's own pictures, which are as grey as the walk is old."""
     found = mtjax.evaluate(str(run), episodes=3)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import Walk, learn, mean_actions, of_task, one_in, only_seed, pick, quick, tasks_of, tiny, train
+from probes import Walk, learn, mean_actions, of_task, one_in, only_seed, pick, quick, slow_but, tasks_of, tiny, train
 from test_ppo import BEST, KNOWN, SCALES, random_steps
 
 from mtjax import agents
@@ -79,7 +79,7 @@ def test_the_policy_that_acts_lags_behind():
     np.testing.assert_array_equal(acted[3], act(agent, state, KEY))
 
 
-@pytest.mark.parametrize("lag", [0, 4])
+@pytest.mark.parametrize("lag", slow_but([0, 4], 4))
 @pytest.mark.parametrize("kind", one_in(2, KNOWN))
 def test_probes_are_learned(kind, lag):
     """Values of every task, and the best action where there is one; also from older policies."""

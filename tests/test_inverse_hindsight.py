@@ -142,6 +142,7 @@ class Judging(Auditor):
         return tasks.goal["scale"][:, None] * steps.obs[..., 0] + 0 * state
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("drawn", [False, True])
 def test_the_loop_learns_from_batches_that_were_chosen(drawn):
     """Every reward is what the task of its row of the batch pays, and its context is that task's."""

@@ -113,6 +113,7 @@ def test_advantages_end_with_their_rollout():
     assert state.nets["adapted"].own.keys() == state.nets["actor"].shared.keys()
 
 
+@pytest.mark.slow
 def test_the_loop_plays_what_the_update_adapts():
     """The last rollout is by the adapted policy, with exactly which the first update begins: their ratio is 1."""
     given = {"num_envs": 8, "unroll": 4, "epochs": 1, "chunk_steps": 12, "inner_rate": 5.0}
@@ -126,6 +127,7 @@ def test_the_loop_plays_what_the_update_adapts():
         np.testing.assert_array_equal(adapted_leaf, np.stack([leaf] * 2))
 
 
+@pytest.mark.slow
 def test_steps_go_on_over_rollouts():
     """Each world takes all steps, one after another: ages of a walk, whose observation goes up by 1."""
     seen = []

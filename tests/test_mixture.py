@@ -564,6 +564,7 @@ def test_an_update_is_finite_and_acts_where_there_are_actions(name):
 PLAN = {"num_envs": 2, "batch_size": 4, "replay_size": 40, "warmup_steps": 2, "chunk_steps": 5, "eval_episodes": 2}
 
 
+@pytest.mark.slow
 def test_a_mixture_of_one_learns_bit_for_bit_as_the_family():
     family, agent = AIM, tiny("multi-head", normalize_observations=True)
     plan = {**PLAN, "steps": 80, "eval_every": 40}
@@ -600,6 +601,7 @@ def run(names, tmp_path_factory) -> Path:
     return directory
 
 
+@pytest.mark.slow
 def test_a_run_keeps_every_tasks_returns(run):
     with np.load(run / "evaluations.npz") as found:
         assert found["train"].shape == (1, 2, 4, 2) and found["interpolation"].shape == (1, 2, 2, 2)

@@ -300,6 +300,7 @@ def test_two_tasks_are_learned_and_a_cost_makes_options_last():
     assert ends[0.02] < 0.05 < 0.1 < ends[0.0]
 
 
+@pytest.mark.slow
 def test_options_that_are_kept_stay_as_they_are():
     """Bit for bit, while the policy over them and the critic learn."""
     small = {**GIVEN, "num_envs": 4, "unroll": 8, "minibatches": 2, "epochs": 1, "chunk_steps": 8}

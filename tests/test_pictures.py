@@ -388,6 +388,7 @@ def test_presets_of_a_part_do_not_apply_to_another():
         mtjax.agent("drq", representation="asymmetric", encoder_tau=0.5)
 
 
+@pytest.mark.slow
 def test_an_encoder_that_is_its_own_target_sees_the_next_pictures_once():
     """With a copy of it as the target encoder an update gives the same numbers by four convolutions more."""
     agent, family = probes.tiny("drq", n_step=1), Pictured()

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import Walk, slow_but, tiny
+from probes import Walk, tiny
 
 import mtjax
 from mtjax.agents import swept
@@ -274,7 +274,8 @@ def bytes_of(state):
     return {jax.tree_util.keystr(k): np.asarray(plain(x)).tobytes() for k, x in jax.tree.leaves_with_path(state)}
 
 
-@pytest.mark.parametrize("stop", slow_but([80, 100], 80))
+@pytest.mark.slow
+@pytest.mark.parametrize("stop", [80, 100])
 def test_a_resumed_population_repeats_every_choice(whole, stop, tmp_path):
     """Whether it stops with a choice or between two; what a killed process wrote after its checkpoint is dropped."""
     stopped = play(tmp_path / "run", on_chunk=lambda row: row["steps"] >= stop)

@@ -332,7 +332,7 @@ def zero(tree):
     return [not np.any(np.asarray(x)) for x in jax.tree.leaves(tree)]
 
 
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("way", slow_but(WAYS, "varibad"))
 def test_losses_reach_what_infers_the_task_where_they_may(way):
     """In PPO: no loss of the actor; the critic's in pearl alone; and its own reaches all of it."""
     agent = tiny("ppo", unroll=LENGTH, epochs=1, minibatches=1, **posterior(way))

@@ -158,6 +158,7 @@ def test_an_evaluation_is_that_of_the_command(result, found, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, again.returns, found.returns)
 
 
+@pytest.mark.slow
 def test_a_policy_plays_alone_and_a_split_alone_plays_the_same_episodes(result, found):
     """Those that it plays beside the others."""
     assert {split: x.shape for split, x in found.returns.items()}["train"] == (2, 2, 2)

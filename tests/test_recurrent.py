@@ -76,6 +76,7 @@ class Ratios(PPO):
         return gain, metrics | {"ratio": jnp.max(jnp.abs(jnp.exp(log_ratio) - 1))}
 
 
+@pytest.mark.slow
 def test_the_policy_that_learns_is_the_one_that_played():
     """The states that a window tells are those with which its actions were drawn, so that every ratio begins at 1."""
     agent = tiny("ppo", epochs=1, minibatches=1, **RECURRENT)

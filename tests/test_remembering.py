@@ -87,6 +87,7 @@ def test_a_penalty_holds_the_actor_with_which_each_task_ended(name, given):
         assert all(np.all(x == 1) for x in rise)
 
 
+@pytest.mark.slow
 def test_without_a_replay_the_task_that_ends_is_played_once_more():
     """PPO's Fisher information is of a last rollout, and the run goes on as if that had not been."""
     rollouts = {"num_envs": 2, "chunk_steps": 8, "unroll": 8, "epochs": 1, "minibatches": 1}

@@ -198,6 +198,7 @@ def returns(agent, state, split, episodes=20):
     return np.asarray(jax.jit(play, compiler_options=QUICK)(state).returns)[0].mean(axis=1)
 
 
+@pytest.mark.slow
 def test_sketches_are_learned_in_turn_and_a_new_one_is_played():
     """From one end to the other; chance earns less than a tenth. The held-out order was never trained."""
     agent = made(gamma=0.95, actor_lr=3e-3, critic_lr=3e-3, stop_bias=-1.0, return_rate=0.1)

@@ -243,6 +243,7 @@ def test_a_run_keeps_its_steps_in_its_folder(whole):
         np.testing.assert_array_equal(kept, np.asarray(rows)[:, :, 70:])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lost", [None, "130"])
 def test_a_run_goes_on_bit_for_bit(whole, tmp_path, lost):
     """Also from the checkpoint before, with later steps in the folder, which it takes again."""

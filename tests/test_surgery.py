@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import learner, random_batch, tasks_of, tiny
+from probes import learner, random_batch, slow_but, tasks_of, tiny
 
 from mtjax.agents.networks import Params
 from mtjax.agents.parts.gradients import surgery
@@ -309,7 +309,7 @@ def test_other_rules_keep_their_memory():
         assert surgery.adapt_rule(RULES[name](), never, PARAMS, DATA, before) is before.memory
 
 
-@pytest.mark.parametrize("name", ["gradnorm", "famo"])
+@pytest.mark.parametrize("name", slow_but(["gradnorm", "famo"], "famo"))
 def test_agents_remember_their_weights(name):
     """What a rule learned of the critic is in the agent's state: nothing at first, and other after each update."""
     tasks, spec = tasks_of("one-step", (1.0, -0.5, 0.3)), Spec.vector(3, 2, 1)

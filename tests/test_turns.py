@@ -29,6 +29,7 @@ def count(memory):
 # The actor's turns.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("updates", "delay", "every"), one_in(4, [(2, 3, 2), (1, 2, 1), (2, 3, 1), (4, 2, 1)]))
 def test_every_so_many_updates_of_the_critics_are_the_actors(updates, delay, every):
     """Counted from the first one, over the borders of chunks, and for all seeds alike."""
