@@ -15,6 +15,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import get_opaque_trace_state
 
 from mtjax import frames
 from mtjax.agents import SAC
@@ -183,9 +184,11 @@ def activity(agent: SAC, state: Any, window: Transition, tasks: Task) -> dict[st
 def watch(function: Callable, *arguments: Any) -> Activity:
     """Evaluate networks on a single transition, and record the outputs of every ReLU and of the last body.
 
-    Layers are named by the path of modules to them.
+    Layers are named by the path of modules to them. Those inside of a map of a network's own are not recorded, as their
+    outputs are not known outside of it.
     """
     outermost, layers, outputs = [], {}, []
+    outside = get_opaque_trace_state()
 
     def note(call: Callable, args: tuple, kwargs: dict, context: Any) -> Any:
         module = context.module
@@ -193,7 +196,7 @@ def watch(function: Callable, *arguments: Any) -> Activity:
         if first:
             outermost.append(type(module).__name__)
         output = call(*args, **kwargs)
-        if isinstance(module, ReLU):
+        if isinstance(module, ReLU) and get_opaque_trace_state() == outside:
             name = "/".join((*outermost, *module.path))
             layers[f"{name}:{len(layers)}" if name in layers else name] = output
         if first:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents import parts
-from mtjax.agents.networks import MLP, join
+from mtjax.agents.networks import MLP, ReLU, join
 from mtjax.agents.parts.encoders.base import Identity
 from mtjax.types import Array
 
@@ -27,6 +27,7 @@ class AttentiveTrunk(nn.Module):
         axes = {"in_axes": None, "out_axes": -2, "axis_size": self.num_subnetworks}
         each = nn.vmap(MLP, {"params": 0}, {"params": True}, **axes)  # type: ignore
         hidden = each(self.hidden, self.layer_norm, name="subnetworks")(seen)  # (..., K, D)
+        hidden = ReLU(name="units")(hidden)  # they are not negative; diagnostics see what is outside of the map
         looks = MLP(self.attention_widths, name="attention")(join(seen, task=features))
         weights = nn.softmax(nn.Dense(self.num_subnetworks, name="scores")(looks))
         self.sow("intermediates", "weights", weights)
