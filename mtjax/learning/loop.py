@@ -349,9 +349,9 @@ def _consolidate(env: Env, agent: Agent, settings: Settings, known: Task, state:
     if not consolidates(agent):
         return state.agent
     keys = _folded(state.key)
-    fresh = jax.vmap(partial(_init_agent, env, agent, known))(keys, getattr(state.agent, "numbers", {}))
+    fresh = lambda: jax.vmap(partial(_init_agent, env, agent, known))(keys, getattr(state.agent, "numbers", {}))
     if agent.continual.restarts:
-        return fresh
+        return fresh()
     tasks, experience, kept = rows_of(known, state.rows), agent.experience, agent.experience.storage.kept
     steps = state.data if kept else _last_rollout(env, agent, settings, tasks, state, keys)
 
@@ -362,7 +362,7 @@ def _consolidate(env: Env, agent: Agent, settings: Settings, known: Task, state:
     played = _of_played(state.agent, state.rows)
     played = over_seeds(of_seed, 0, experience.storage.axes if kept else 0, 0)(played, steps, keys)
     ended = _with_played(state.agent, played, state.rows)
-    return over_seeds(partial(change, agent), 0, 0)(ended, fresh) if agent.plasticity.changes else ended
+    return over_seeds(partial(change, agent), 0, 0)(ended, fresh()) if agent.plasticity.changes else ended
 
 
 def _last_rollout(env: Env, agent: Agent, settings: Settings, tasks: Task, state: TrainState, keys: Key) -> Any:
