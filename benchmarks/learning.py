@@ -212,13 +212,19 @@ def trained(arguments: argparse.Namespace, env: str, agent: str, folder: Path) -
 
 
 def program_of(arguments: argparse.Namespace, env: str, agent: str) -> RunConfig:
-    """Return an agent's preset on a family, and for one with a replay the loop and replay of ``equal_to``, if given."""
+    """Return an agent's preset on a family, and for one with a replay the loop and replay that it shares with others.
+
+    These are the preset's of the agent ``equal_to``, if given, and on the environment ``as_in``, if given, such as that
+    of all tasks where the family is one of them: each task has as many worlds as there.
+    """
     settings = family_settings(arguments.env, arguments.vary, arguments.split or FAMILIES.get(env, Trial()).split)
     name, own = VARIANTS.get(agent, (agent, {}))
     program = mtjax.preset(env, name, arguments.preset, {**seeing(name, settings), **own}, **settings)
-    if not arguments.equal_to or not isinstance(program.learner.experience, Replay):
+    as_in = getattr(arguments, "as_in", "") or env
+    if not (arguments.equal_to or as_in != env) or not isinstance(program.learner.experience, Replay):
         return program
-    other = mtjax.preset(env, arguments.equal_to, arguments.preset, family=program.family)
+    family = program.family if as_in == env else mtjax.make(as_in, **settings)
+    other = mtjax.preset(as_in, arguments.equal_to or name, arguments.preset, family=family)
     held = {**dataclasses.asdict(other.training), **dataclasses.asdict(other.learner.experience)}
     learner, training = configure(program.learner, program.training, {name: held[name] for name in _SHARED})
     return dataclasses.replace(program, learner=learner, training=training)

@@ -15,7 +15,8 @@ after as many steps a task. ``scores.md`` names unfinished pairs. ``--unfinished
 with its steps, to it and to ``tasks.csv``, and their evaluations to ``sharing.md``.
 
 Where a suite compares agents, those with a replay all have the worlds, updates a step, batch, replay and warm-up of the
-preset of the agent that its protocol names; ``--best`` gives each its own preset in all. PPO always has its own. With
+preset of the agent that its protocol names; ``--best`` gives each its own preset in all. PPO always has its own.
+Where a suite compares one agent for all tasks with one for each, a task has as many worlds by itself as among all. With
 ``--devices`` every pair is a process of its own, on one of these GPUs; ``--within`` ends the call after some seconds.
 
 Success is that of the last evaluation: at the episode's last step, and at any step. Both are shares of episodes.
@@ -199,7 +200,7 @@ def request(arguments: argparse.Namespace, suite: Suite, env: str, out: Path) ->
     """Return what ``learning.learn`` reads: the suite's protocol, and what was given beside it."""
     steps = (arguments.steps_per_task or suite.steps_per_task) * family_of(suite, env).train_count
     given = {"seeds": arguments.seeds or suite.seeds, "steps": steps, "split": suite.split, "out": out}
-    given |= {"env": [*suite.settings], "vary": [*suite.vary]}
+    given |= {"env": [*suite.settings], "vary": [*suite.vary], "as_in": suite.together}
     return argparse.Namespace(**{**vars(arguments), **given})
 
 

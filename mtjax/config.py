@@ -301,7 +301,7 @@ def with_preset(
     if preset_of(agent_name).cls.common_presets:
         from_pictures = table("pictures") if _sees_pictures(made) else {}
         chosen = preset.get("training", {}) | preset.get("agent", {}) | from_pictures | chosen
-    chosen = for_tasks(chosen, made.train_count)
+    chosen = for_tasks(chosen, made.train_count, device)
     take = lambda cls: {name: chosen.pop(name) for name in list(chosen) if name in cls.__dataclass_fields__}
     planned, played = preset.get("plan", {}) | take(Plan), take(Settings)
     return RunConfig(
@@ -315,21 +315,24 @@ def with_preset(
     )
 
 
-def for_tasks(preset: Mapping[str, Any], count: int) -> dict[str, Any]:
+def for_tasks(preset: Mapping[str, Any], count: int, device: str) -> dict[str, Any]:
     """Return a preset's settings for ``count`` tasks; ``tuned_tasks`` says with how many it was tuned.
 
-    A GPU steps thousands of worlds as fast as few, so PPO's preset gives ``worlds`` there, of all tasks together.
-    Elsewhere an agent learns from few worlds of one task sooner than from many, as each step of its worlds is followed
-    by as many updates. So ``num_envs`` and ``batch_size`` hold for each task, up to the tuned number of tasks. With
-    more tasks, all tasks together have as many as there, so that updates are as frequent.
-    docs/results/task-counts.md has the runs.
+    A GPU steps thousands of worlds as fast as few. So there all tasks together have as many worlds, and transitions
+    in a batch, as the tuned number of tasks, however many tasks there are. On a CPU an agent learns from few worlds of
+    one task sooner than from many, as each step of its worlds is followed by as many updates. So there ``num_envs``
+    and ``batch_size`` hold for each task, up to the tuned number of tasks. A preset that gives ``worlds``, as PPO's,
+    says how many all tasks have together on either device. docs/results/task-counts.md has the runs.
+
+    Args:
+        device: cpu or gpu.
     """
     chosen = dict(preset)
     tuned = chosen.pop("tuned_tasks", TUNED_TASKS)
     share = lambda whole, least: max(math.ceil(whole / count), least)
     if "worlds" in chosen:
         return chosen | {"num_envs": share(chosen.pop("worlds"), 1)}
-    if count <= tuned:
+    if device == "cpu" and count <= tuned:
         return chosen
     return chosen | {name: share(chosen[name] * tuned, least) for name, least in _LEAST.items() if name in chosen}
 

@@ -1,6 +1,7 @@
 """What benchmarks make of their figures; what they measure is no matter of tests."""
 
 import csv
+import dataclasses
 import importlib.util
 import json
 import os
@@ -277,6 +278,17 @@ def test_replay_agents_learn_from_as_much_as_the_baseline(script):
     assert of("ppo", "sac-conditioned").training == of("ppo", "").training
     assert of("care-text", "sac-conditioned").learner.conditioning == Text()
     assert len(of("brc", "sac-conditioned").family.labels("train")) == 4  # HiP-BMDP's split
+
+
+def test_a_task_by_itself_has_the_worlds_that_it_has_among_all(script, tmp_path):
+    """Where sharing is measured: by its own preset one task would have those of ten."""
+    suite, learning = script("suite"), script("learning")
+    hard = dataclasses.replace(suite.SUITES["hard"], together="walker-run+hopper-hop", envs=("walker-run",))
+    words = {"steps_per_task": 100, "seeds": 1, "preset": "gpu", "equal_to": ""}
+    asked = suite.request(SimpleNamespace(**words), hard, "walker-run", tmp_path)
+    shared = mtjax.preset("walker-run+hopper-hop", "brc", "gpu").training.num_envs
+    assert learning.program_of(asked, "walker-run", "brc").training.num_envs == shared
+    assert shared < mtjax.preset("walker-run", "brc", "gpu").training.num_envs
 
 
 def test_a_figure_has_few_lines_and_the_baselines_is_in_each(script):

@@ -220,7 +220,7 @@ def test_every_preset_makes_a_program(env, agent, preset):
     expected = load_preset("+", preset).get(agent, {}) | tables.get(agent, {})
     if type(program.learner).common_presets:  # the tables of all agents are tuned for replay
         expected = tables["training"] | tables["agent"] | expected
-    expected = for_tasks(expected, program.family.train_count)
+    expected = for_tasks(expected, program.family.train_count, preset)
     found = settings_of(program.learner) | dataclasses.asdict(program.training) | dataclasses.asdict(program.plan)
     assert set(expected) <= set(found)
     for name, value in expected.items():
@@ -228,20 +228,22 @@ def test_every_preset_makes_a_program(env, agent, preset):
 
 
 @pytest.mark.parametrize(
-    "count, worlds, by_task, tuned_with_fifty",
+    "count, worlds, on_gpu, on_cpu, tuned_with_fifty",
     [
-        (1, 2048, (16, 32), (16, 32)),
-        (10, 205, (16, 32), (16, 32)),
-        (50, 41, (4, 7), (16, 32)),
-        (200, 11, (1, 4), (4, 8)),
+        (1, 2048, (160, 320), (16, 32), (16, 32)),
+        (4, 512, (40, 80), (16, 32), (16, 32)),
+        (10, 205, (16, 32), (16, 32), (16, 32)),
+        (50, 41, (4, 7), (4, 7), (16, 32)),
+        (200, 11, (1, 4), (1, 4), (4, 8)),
     ],
 )
-def test_a_preset_is_fitted_to_the_number_of_tasks(count, worlds, by_task, tuned_with_fifty):
-    """What PPO's preset gives is of the whole; what a replay's gives is of a task, up to the tuned number of tasks."""
+def test_a_preset_is_fitted_to_the_number_of_tasks(count, worlds, on_gpu, on_cpu, tuned_with_fifty):
+    """Sizes are of the whole on a GPU, and where a preset says so; else of a task, up to the tuned number of tasks."""
     sizes = {"num_envs": 16, "batch_size": 32}
-    assert for_tasks({"worlds": 2048, "epochs": 4}, count) == {"num_envs": worlds, "epochs": 4}
-    assert tuple(for_tasks(sizes, count).values()) == by_task
-    assert tuple(for_tasks({**sizes, "tuned_tasks": 50}, count).values()) == tuned_with_fifty
+    fitted = lambda device, **more: tuple(for_tasks(sizes | more, count, device).values())
+    for device in ("cpu", "gpu"):
+        assert for_tasks({"worlds": 2048, "epochs": 4}, count, device) == {"num_envs": worlds, "epochs": 4}
+    assert (fitted("gpu"), fitted("cpu"), fitted("cpu", tuned_tasks=50)) == (on_gpu, on_cpu, tuned_with_fifty)
 
 
 def test_the_number_of_tasks_decides_however_it_is_given():
@@ -271,6 +273,7 @@ def test_a_short_run_is_not_all_warm_up():
 def test_pictures_have_a_preset_of_their_own(agent):
     """It holds for every agent with a replay, from Python as on the command line."""
     expected = load_preset("+", "gpu")["pictures"] | load_preset("finger-spin", "gpu")["pictures"]
+    expected = for_tasks(expected, 1, "gpu")
     program = with_preset("finger-spin", agent, "gpu", pixels=64)
     found = settings_of(program.learner) | dataclasses.asdict(program.training) | dataclasses.asdict(program.plan)
     assert {name: found[name] for name in expected} == expected
@@ -297,10 +300,10 @@ def test_what_is_given_goes_before_what_is_tuned():
 
 def test_auto_preset_is_that_of_the_device(monkeypatch):
     """A GPU takes the gpu preset. A record says auto all the same."""
-    assert with_preset("finger-spin", "sac").preset == "auto"
-    assert parse([]).training == with_preset("finger-spin", "sac", "cpu").training
+    assert with_preset("finger-spin-vary-size", "sac").preset == "auto"
+    assert parse([]).training == with_preset("finger-spin-vary-size", "sac", "cpu").training
     monkeypatch.setattr("jax.default_backend", lambda: "gpu")
-    assert parse([]).training == with_preset("finger-spin", "sac", "gpu").training
+    assert parse([]).training == with_preset("finger-spin-vary-size", "sac", "gpu").training
 
 
 # Help.

@@ -143,6 +143,10 @@ class _Graph:
             return self.several(
                 "Split", [names[0], self.indices(settings["sizes"])], len(settings["sizes"]), axis=settings["axis"]
             )
+        if operation == "unstack":
+            axis, count = settings["axis"], values[0].shape[settings["axis"]]
+            apart = self.several("Split", [names[0], self.indices([1] * count)], count, axis=axis)
+            return [self.node("Squeeze", [name, self.indices([axis])]) for name in apart]
         if operation == "top_k":
             top = self.several("TopK", [names[0], self.indices([settings["k"]])], 2, axis=settings["axis"])
             return [top[0], self.cast(top[1], np.int32)]
