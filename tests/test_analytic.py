@@ -355,6 +355,7 @@ def cautious(task, state, _):
     return jnp.clip(jnp.stack([angle / 0.4189, push]), -1, 1)
 
 
+@pytest.mark.slow
 def test_a_cautious_driver_laps_every_track():
     """All ten and those held out; a lap is as long as the line, and takes longer than the grip demands."""
     env = mtjax.make("racing")

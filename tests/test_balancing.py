@@ -226,6 +226,7 @@ class Lowered(SAC):
         return loss - self.below, aux
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule", [FAMO(), GradNorm(weight_lr=0.3)], ids=["famo", "gradnorm"])
 def test_updates_count_losses_from_the_least_that_they_can_be(rule):
     """Rules remember the same of losses that a constant is taken from, and critics learn the same."""

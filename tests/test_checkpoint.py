@@ -232,6 +232,7 @@ def flipped(content, place, bit):
     return content[:place] + bytes([content[place] ^ (1 << bit)]) + content[place + 1 :]
 
 
+@pytest.mark.slow
 def test_every_flipped_bit_of_a_record_is_noticed(copied_run):
     """300 of them. A record that cannot be read is refused, with the place of the copy; any other is told."""
     file, copy = copied_run / "config.json", copied_run / "checkpoints" / "150" / "config.json"

@@ -157,6 +157,7 @@ def test_a_replay_begins_anew_with_random_steps_where_tasks_change_unless_it_is_
     assert [updates(state) for state in kept] == [0, 5, 13]
 
 
+@pytest.mark.slow
 def test_tasks_from_scratch_begin_a_new_agent_where_a_task_ends():
     """As an optimiser's count of updates shows: none is of an earlier task, of which one step is not learned from."""
     states, _ = played(tiny("sac", continual="scratch"), "sequence:8", 2, **REPLAY)

@@ -306,6 +306,7 @@ def test_what_is_detached_stays():
     assert reached({"actor": Params(slopes.shared["actor"], slopes.own["actor"])}) == {"body", "head"}
 
 
+@pytest.mark.slow
 def test_the_actor_does_not_move_the_critics_parameters():
     """With discount 0 another actor and other temperatures leave critics, encoder, models and theta bit for bit."""
     state, batch, update = start(make("hip-bmdp"))
@@ -630,6 +631,7 @@ def test_ppos_actor_does_not_train_the_representation():
     assert not np.array_equal(seeing, other)
 
 
+@pytest.mark.slow
 def test_ppos_models_predict_what_the_encoder_saw_before_the_update():
     """The critic's targets do not change with it, the transition loss does."""
     agent = make_ppo(representation="deepmdp")

@@ -349,6 +349,7 @@ def no_episodes(monkeypatch):
     monkeypatch.setattr(scoring, "score", empty)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", slow_but(["sac-conditioned", "pcgrad", "disjoint"], "pcgrad"))
 def test_program_writes_and_prints_diagnostics(name, copied_run, run_of, no_episodes, capsys):
     """For a trained agent, for one by whose rule gradients combine, and for one that shares nothing."""

@@ -306,6 +306,7 @@ def optimum(alpha):
     return x[0], np.exp(x[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("alpha", slow_but([0.0, 0.5, 0.9], 0.5))
 def test_a_bandits_optimum(alpha):
     """The more the distilled policy counts, the nearer it draws the tasks' policies, and exactly so far."""

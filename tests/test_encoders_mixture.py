@@ -471,6 +471,7 @@ def test_agents_of_these_parts_have_the_right_shapes(name):
     assert jax.tree.map(lambda x: x.shape, after) == jax.tree.map(lambda x: x.shape, state)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["top-k", "input-map"])
 def test_agents_learn_with_them(name):
     """Two updates, the second of which bootstraps from what the first moved, stay finite and move everything."""

@@ -57,6 +57,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", slow_but(CASES, "drq"))
 def test_every_form_acts_as_the_policy(name, tmp_path):
     """For training tasks and for one between them. Files take of an observation what the policy needs."""

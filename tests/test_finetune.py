@@ -140,6 +140,7 @@ def tuned(base, tmp_path_factory):
     return tuned
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tune", slow_but(MOVES))
 def test_what_is_tuned_moves_and_all_else_stays_to_the_bit(learned, tuned, tune):
     """From the networks of the run's seeds, and of the nearest tasks."""
@@ -179,6 +180,7 @@ def test_a_run_records_where_it_comes_from(base, tuned):
     np.testing.assert_allclose(program.family.tasks().context, [[0.9], [-0.8]], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_recorded_command_repeats_the_program(tuned):
     """The run of --from included."""
     program = from_json(tuned("heads") / "config.json")
@@ -186,6 +188,7 @@ def test_recorded_command_repeats_the_program(tuned):
     assert again == program
 
 
+@pytest.mark.slow
 def test_a_fine_tuned_run_goes_on(learned, tuned, capsys):
     """From its own checkpoint, with what stays still staying."""
     directory = tuned("heads")
@@ -196,6 +199,7 @@ def test_a_fine_tuned_run_goes_on(learned, tuned, capsys):
         assert np.array_equal(leaf, before[path]) == ("head" not in path), path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "chunks, sweep", [(1, ()), pytest.param(2, {"actor_lr": [1e-3, 1e-4]}, marks=pytest.mark.slow)]
 )
@@ -240,6 +244,7 @@ def adopted(learned):
     return tasks, fresh, adopt(learned, learned.agent, tasks, fresh)
 
 
+@pytest.mark.slow
 def test_networks_temperatures_and_moments_go_on(learned, adopted):
     """Those of the nearest task; seeds of the run are taken in turn."""
     _, _, state = adopted
@@ -255,6 +260,7 @@ def test_networks_temperatures_and_moments_go_on(learned, adopted):
     np.testing.assert_array_equal(now, before[[0, 1, 0]][:, NEAREST])
 
 
+@pytest.mark.slow
 def test_the_rest_is_fresh(adopted):
     """Optimisers, and the contexts among which the nearest is found from now on."""
     tasks, fresh, state = adopted
@@ -315,6 +321,7 @@ def test_a_family_written_as_itself_is_the_same():
 # What is refused.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -372,6 +379,7 @@ def test_other_pictures_are_refused(seen, said):
         finetune.require_fit(start, mtjax.make("corridor-maze", **seen), made)
 
 
+@pytest.mark.slow
 def test_contexts_of_another_scale_are_refused(learned):
     """In Python, where the family is the caller's."""
     env = mtjax.make("aim", {"goal": "-2:2:3"})

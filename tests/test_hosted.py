@@ -255,6 +255,7 @@ def test_evaluations_play_whole_episodes_of_the_original(begun):
         np.testing.assert_allclose(returns[place], total, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_what_an_environment_raises_ends_the_run_after_its_checkpoint(tmp_path, capsys):
     """The message names environment, error and place; the last checkpoint stays."""
     gymnasium.register("Broken", Walk, max_episode_steps=400, kwargs={"raises": 70, "end": 1000, "patience": 1000})

@@ -61,6 +61,7 @@ def same_actions(ours, theirs):
     np.testing.assert_array_equal(jax.vmap(ours)(obs, tasks), jax.vmap(theirs)(obs, tasks))
 
 
+@pytest.mark.slow
 def test_what_is_pulled_acts_as_what_was_pushed(copied_run, remote):
     """Any seed of the run; its page has the command, the scores of that seed and the versions."""
     theirs = mtjax.load(copied_run, seed=1)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import Walk, learn, mean_actions, of_task, one_in, only_seed, pick, quick, slow_but, tasks_of, tiny, train
+from probes import Walk, learn, mean_actions, of_task, only_seed, pick, quick, slow_but, tasks_of, tiny, train
 from test_ppo import BEST, KNOWN, SCALES, random_steps
 
 from mtjax import agents
@@ -80,7 +80,7 @@ def test_the_policy_that_acts_lags_behind():
 
 
 @pytest.mark.parametrize("lag", slow_but([0, 4], 4))
-@pytest.mark.parametrize("kind", one_in(2, KNOWN))
+@pytest.mark.parametrize("kind", slow_but(KNOWN, "delayed"))
 def test_probes_are_learned(kind, lag):
     """Values of every task, and the best action where there is one; also from older policies."""
     given = {"num_envs": 16, "chunk_steps": 3200, "unroll": 8, "minibatches": 2, "epochs": 2, "gamma": 0.9}

@@ -71,6 +71,7 @@ def test_families_of_one_structure_share_a_simulator():
     assert all(again.calls.provide(*about) == name for name, about in calls.items())  # as another process does
 
 
+@pytest.mark.slow
 def test_starts_of_one_structure_are_solved_for_together():
     """In one call, which feels the weight of each dog; a start of its own remains the family's."""
     dogs = [mtjax.make(name, {"mass": mass}, engine="c") for name, mass in (("dog-stand", "0.8,1.2"), ("dog-run", "1"))]

@@ -193,6 +193,7 @@ def test_a_bad_step_names_its_task():
     assert np.isnan(state.data.ring.rows.reward[0, 1]).any() and not np.isnan(state.data.ring.rows.reward[0, 0]).any()
 
 
+@pytest.mark.slow
 def test_a_bad_reward_is_not_blamed_on_the_tasks_that_share_the_networks():
     """Learned from in the step in which it occurs, it spoils all losses; the first bad step is its own task's."""
     env, settings = Broken(), {**SMALL, "replay_size": 2, "warmup_steps": 1, "chunk_steps": 6}

@@ -540,7 +540,7 @@ def init_and_update(agent, tasks: Task, batch: Transition, key):
     return state, new, metrics, jax.vmap(act)(tasks, batch.obs[:, 0])
 
 
-@pytest.mark.parametrize("name", one_in(2, OFF_POLICY))
+@pytest.mark.parametrize("name", one_in(4, OFF_POLICY))
 def test_every_agent_learns_a_mixture(name):
     """That it can be traced; what it computes, those agents show that are compiled below."""
     arguments = (BOTH.tasks(), random_batch(BOTH), jax.random.key(0))
@@ -612,6 +612,7 @@ def test_a_run_keeps_every_tasks_returns(run):
     assert all(line[lines[0].index("success")] != "" for line in lines[2:])  # of the family that has it
 
 
+@pytest.mark.slow
 def test_a_run_is_scored_family_by_family(run, capsys):
     mtjax.evaluate.main([f"--run={run}", "--episodes=1", "--diagnostics"])
     said = capsys.readouterr().out
@@ -629,6 +630,7 @@ def test_a_run_is_scored_family_by_family(run, capsys):
         mtjax.evaluate.main([f"--run={run}", "--video"])
 
 
+@pytest.mark.slow
 def test_a_run_and_its_policy_are_read_back(run):
     config = from_json(run / "config.json")
     assert isinstance(config.family, Mixture) and config.family == make("aim+wide-aim")
@@ -694,6 +696,7 @@ def test_wrong_flags_are_refused(flag, said):
     assert said in str(error.value)
 
 
+@pytest.mark.slow
 def test_a_mixture_is_not_fine_tuned(run):
     with pytest.raises(InputError, match="is a mixture; take one family"):
         run_config.parse(["--env=aim", f"--from={run}"])

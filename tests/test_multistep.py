@@ -219,6 +219,7 @@ def test_the_past_at_the_bootstrap_is_that_of_the_windows_last_step():
             jax.tree.map(np.testing.assert_array_equal, pick(ours, (task, b)), theirs)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings", one_in(2, [{}, {"conditioning": "inferred", "inferred_from": 2}]), ids=["plain", "inferred"]
 )

@@ -105,6 +105,7 @@ def agent_of(case):
     return tiny(name, **given)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", slow_but(CASES, "ppo"))
 def test_networks_learn_from_a_tree_what_they_learn_from_its_vector(case):
     """Bit for bit, whoever reads observations: moments, last steps, a memory of the episode, hindsight."""

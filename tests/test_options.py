@@ -116,6 +116,7 @@ def expected_batch(chain, pi, ends, over):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_actors_loss_has_the_gradient_of_the_return_exactly(seed):
     """Of sub-policies, terminations and the policy over options, with a cost: by a chain's linear equations."""

@@ -38,6 +38,7 @@ def test_the_memory_is_what_can_be_known_of_arms(averages):
     np.testing.assert_allclose(knowing.show({}, memory), [3 / 5, 1 / 3, 3 / 5, 1 / 5], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_an_agent_learns_with_it(averages):
     agent = mtjax.agent("ppo", conditioning=averages(), hidden=(8,), unroll=4, epochs=1, minibatches=1)
     plan = dict(steps=64, eval_every=64, eval_episodes=4, chunk_steps=4)

@@ -200,6 +200,7 @@ def log_of_height(self, task, world, action):
     return -jnp.log(0 * world.qpos[0])
 
 
+@pytest.mark.slow
 def test_a_reward_that_is_not_finite_is_named():
     """Rather than learning rates."""
     env = own(falling(), reward=log_of_height)

@@ -42,6 +42,7 @@ def package_files():
     return {str(path.relative_to(ROOT)) for path in files}
 
 
+@pytest.mark.slow
 def test_wheel_holds_the_package_and_nothing_beside_it(built):
     """Code, models and presets; no folder called envs, agents, configs or tests is installed for all to import."""
     _, wheel, _ = built

@@ -297,6 +297,7 @@ def test_ppo_learns_what_only_pictures_show(representation):
     assert "sight" in nets["actor"].shared
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", probes.slow_but(["drq", "deepmdp", "hip-bmdp"], "deepmdp"))
 def test_what_follows_a_terminal_step_in_the_replay_changes_nothing(name):
     """It is the first picture of another episode. What follows other steps is what models predict."""
@@ -405,6 +406,7 @@ def test_an_encoder_that_is_its_own_target_sees_the_next_pictures_once():
     jax.tree.map(np.testing.assert_array_equal, networks(after), networks(other))
 
 
+@pytest.mark.slow
 def test_the_actor_learns_on_the_encoder_that_critics_had_before_their_step():
     """Its step is Adam's on the loss with the old encoder and the new critics, as in DrQ-v2; not with the new one."""
     agent, family = probes.tiny("drq", n_step=1, critic_lr=0.1), Pictured()

@@ -289,6 +289,7 @@ def test_a_resumed_population_repeats_every_choice(whole, stop, tmp_path):
         np.testing.assert_array_equal(x, y)
 
 
+@pytest.mark.slow
 def test_the_history_says_who_copied_whom(whole):
     """A row for each member and choice; the numbers are those with which it goes on, as metrics have them too."""
     rows = history(whole)
@@ -309,6 +310,7 @@ def test_the_history_says_who_copied_whom(whole):
     assert start == {(lr, gamma) for lr in ("0.001", "0.01") for gamma in ("0.5", "0.99")}
 
 
+@pytest.mark.slow
 def test_members_are_compared_in_the_same_episodes(whole):
     """Those of the first seed, whatever their own seeds are."""
     config = from_json(whole.directory / "config.json")
@@ -318,6 +320,7 @@ def test_members_are_compared_in_the_same_episodes(whole):
     assert selection.starts(alone, np.arange(8)).tolist() == list(range(8))
 
 
+@pytest.mark.slow
 def test_a_policy_of_a_member_has_its_latest_numbers(whole):
     """From the folder and from the result; it comes alone."""
     numbers = selection.numbers_of(whole.state)
@@ -334,6 +337,7 @@ def test_a_policy_of_a_member_has_its_latest_numbers(whole):
         mtjax.evaluate(whole.directory, point=8)
 
 
+@pytest.mark.slow
 def test_a_population_is_one_seed_in_figures_and_tables(whole):
     """Its members' mean, and a line says why there is no interval."""
     for runs in (whole.directory, whole):
@@ -360,6 +364,7 @@ def test_lost_members_are_left_out_of_the_mean():
     assert len(found.seeds) == 1
 
 
+@pytest.mark.slow
 def test_halving_ends_with_one_origin(short_family, tmp_path, capsys):
     """Of four seeds with nothing swept; the best one is named after each evaluation."""
     given = RUN | {"population": "halving:80", "seeds": 4, "quiet": False}

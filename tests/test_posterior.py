@@ -115,6 +115,7 @@ def test_a_product_of_gaussians_is_the_posterior_of_a_bandit():
     np.testing.assert_allclose((found.mean + 1) / 2, laplace(arms, reward), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_what_a_critic_teaches_a_product_of_gaussians_is_a_bandits_posterior():
     """Factors learn to tell the chances by their product's mean, so that each tells of the pulled arm alone."""
     made, length, steps = knowing("pearl", latent_size=2, inference_widths=(16,)), 5, 600
@@ -332,6 +333,7 @@ def zero(tree):
     return [not np.any(np.asarray(x)) for x in jax.tree.leaves(tree)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", slow_but(WAYS, "varibad"))
 def test_losses_reach_what_infers_the_task_where_they_may(way):
     """In PPO: no loss of the actor; the critic's in pearl alone; and its own reaches all of it."""

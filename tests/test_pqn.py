@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import learn, one_in, only_seed, pick, quick, tasks_of, tiny, train
+from probes import learn, only_seed, pick, quick, slow_but, tasks_of, tiny, train
 from test_ppo import random_steps
 
 import mtjax
@@ -177,7 +177,7 @@ KNOWN = {
 }
 
 
-@pytest.mark.parametrize("kind", one_in(2, KNOWN))
+@pytest.mark.parametrize("kind", slow_but(KNOWN, "delayed"))
 def test_probes_are_learned(kind):
     """The best value of every task, and the action that has it."""
     given = {"num_envs": 16, "chunk_steps": 1600, "unroll": 8, "epochs": 4, "minibatches": 4, "gamma": GAMMA}

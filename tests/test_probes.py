@@ -59,6 +59,7 @@ def test_every_critic_learns_the_known_value_of_every_task(kind):
     assert_known_values(*learned("sac-conditioned", kind), kind)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["delayed", "endless"])
 def test_joined_steps_lead_to_the_same_values(kind):
     """Beyond the end of an episode nothing counts, and at a time limit the value does; the actor may lag behind."""
@@ -72,6 +73,7 @@ def test_the_policy_finds_the_best_action_of_each_task():
     assert actions[0] > 0.85  # 1 is the edge of what tanh reaches
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", slow_but(OFF_POLICY, "pcgrad"))
 def test_every_agent_learns_values_and_actions(name):
     """On the probe that needs observation, action and task; an agent that is not told its task gets two alike."""

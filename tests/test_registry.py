@@ -58,7 +58,7 @@ def play(env, tasks, keys):
     return start, *jax.lax.scan(step, start.state, jnp.arange(STEPS))
 
 
-@pytest.mark.parametrize("name", slow_but(ENVS, *QUICK[::2]))
+@pytest.mark.parametrize("name", slow_but(ENVS, *QUICK[::4]))
 def test_family_steps_at_the_ends_of_its_range(name):
     """200 random steps: sizes as declared, all finite until an episode ends, starts that differ, and the same again."""
     env = mtjax.make(name)
@@ -162,6 +162,7 @@ def test_parts_and_agents_of_ones_own_are_trained(name, short_family, forget, tm
     assert type(mtjax.load(run).agent) is AGENTS[record["agent"]].cls
 
 
+@pytest.mark.slow
 def test_a_run_of_all_examples_together_is_traced(forget):
     """Each does what the loop asks of its kind, as its observing and weighing; no program is compiled."""
     words = [word for name in OWN for word in (f"--import={EXAMPLES / name}.py", *OWN[name][2])]
@@ -316,6 +317,7 @@ def test_a_wrong_method_of_a_brax_family_is_named_when_it_is_registered(given, s
     assert "\n" not in str(error.value) and "mine" not in ENVS
 
 
+@pytest.mark.slow
 def test_a_brax_family_with_a_reward_of_its_own_is_accepted(forget):
     """Which reads a goal, a metric and the place of a link."""
 
@@ -423,6 +425,7 @@ def forget_own():
         del sys.modules[file.stem]
 
 
+@pytest.mark.slow
 def test_all_files_of_a_run_are_recorded_and_asked_for_and_never_run_by_themselves(forget, tmp_path):
     """By evaluation, by resuming and in Python."""
     config = run_config.parse([OWN_FLAGS[0], "--import", str(OWN_FILES[1]), *OWN_WORDS])

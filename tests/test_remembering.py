@@ -100,6 +100,7 @@ def test_without_a_replay_the_task_that_ends_is_played_once_more():
     jax.tree.map(np.testing.assert_array_equal, second.nets["actor"], plain.nets["actor"])
 
 
+@pytest.mark.slow
 def test_a_clone_holds_what_the_actor_put_out_where_each_task_ended():
     """The penalty is 0 for that actor, and more for another one; of its own task none is stored while it is played."""
     (first, second, third), agent = states("clone", clone_samples=6, clone_batch=4, heads="per-task")

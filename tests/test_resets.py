@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import tiny
+from probes import slow_but, tiny
 
 from mtjax import envs
 from mtjax.envs import Family, Parameter
@@ -71,7 +71,7 @@ def reset(cls, ended, seed=1, shift="1,2,3", **settings):
     return before, after, sum(Fall.counted)
 
 
-@pytest.mark.parametrize("share", [0, 0.01, 0.1, 1])
+@pytest.mark.parametrize("share", slow_but([0, 0.01, 0.1, 1], 0.1))
 @pytest.mark.parametrize("shift", ["1,2,3", "1:2"])
 def test_some_worlds_are_reset_to_the_states_that_all_would_have(share, shift):
     """Bit for bit, also where episodes draw their tasks; and no more worlds than had to be."""

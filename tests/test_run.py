@@ -199,6 +199,7 @@ def test_no_directory_writes_nothing_and_prints_nothing(play, tmp_path, monkeypa
     assert [steps.tolist() for steps in evaluated] == [[200]]
 
 
+@pytest.mark.slow
 def test_profile_is_of_one_warm_chunk(play, tmp_path, capsys):
     """The trace is in the run's folder, and the line says where; compiling is timed apart from running."""
     result = play(tmp_path, steps=300, profile=True, quiet=False)
@@ -212,6 +213,7 @@ def test_profile_is_of_one_warm_chunk(play, tmp_path, capsys):
     assert result.seconds == pytest.approx(float(result.rows[-1]["seconds"]), abs=1e-3)
 
 
+@pytest.mark.slow
 def test_profile_of_a_run_of_one_chunk_is_of_that(play, tmp_path):
     play(tmp_path, steps=100, profile=True)
     assert list(tmp_path.glob("profile/plugins/profile/*/*.trace.json.gz"))
@@ -321,6 +323,7 @@ def test_broken_run_goes_on_from_its_last_checkpoint(play, whole, tmp_path):
     assert_same_run(play(tmp_path, resume=True), whole)
 
 
+@pytest.mark.slow
 def test_run_that_died_before_its_first_checkpoint_starts_over(play, whole, tmp_path, capsys):
     """What it left in its folder does no harm; the line says that it starts over."""
 
@@ -602,6 +605,7 @@ def test_signals_are_left_alone_outside_the_main_thread():
 # Numbers that are not finite.
 
 
+@pytest.mark.slow
 def test_lost_worlds_are_told(play, monkeypatch, capsys):
     """On the console by their tasks, and by their number in the metrics of their seed."""
     chunk = run._Run._play

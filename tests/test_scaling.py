@@ -352,6 +352,7 @@ def test_settings_that_make_no_sense_are_refused(settings, message):
         agent("sac", **settings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "settings"),
     one_in(

@@ -82,6 +82,7 @@ def test_what_is_not_tuned_stays_to_the_bit():
     np.testing.assert_allclose(lengths(after.shared["head"]["direction"]), 1, rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("heads", slow_but(["shared", "per-task", "disjoint"], "per-task"))
 def test_weights_begin_and_stay_on_the_sphere(heads):
     """Every unit of actor and critics, outputs too; and target critics lie inside, as means of such weights."""

@@ -309,6 +309,7 @@ def test_other_rules_keep_their_memory():
         assert surgery.adapt_rule(RULES[name](), never, PARAMS, DATA, before) is before.memory
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", slow_but(["gradnorm", "famo"], "famo"))
 def test_agents_remember_their_weights(name):
     """What a rule learned of the critic is in the agent's state: nothing at first, and other after each update."""

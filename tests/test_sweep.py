@@ -164,6 +164,7 @@ def test_a_point_trains_as_the_run_with_its_values():
     assert max(jax.tree.leaves(apart)) > 0.02  # the values matter by far more than the tolerance
 
 
+@pytest.mark.slow
 def test_one_point_that_diverges_does_not_end_the_others():
     """Its returns are none; those of the others, whose numbers are apart, are there. Rows say which point they are."""
     settings = SMALL | {"chunk_steps": 15}
@@ -382,6 +383,7 @@ def swept(short_family, tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_a_sweep_leaves_a_table_of_all_settings(swept):
     """A row for each, of all its runs, with its values and its last evaluation."""
     with (swept / "sweep.csv").open(newline="") as file:
@@ -427,6 +429,7 @@ def test_environments_are_no_contest():
     assert line.split() == ["run-1", "bandit", "sac", "10"]
 
 
+@pytest.mark.slow
 def test_the_table_is_there_when_a_sweep_is_stopped(swept):
     """With what was evaluated until then."""
     with (swept / "stopped.csv").open(newline="") as file:
@@ -434,6 +437,7 @@ def test_the_table_is_there_when_a_sweep_is_stopped(swept):
     assert [(r["steps"], r["train"] != "") for r in rows] == [("200", True), ("200", True), ("0", False)]
 
 
+@pytest.mark.slow
 def test_the_table_grows_with_every_evaluation(swept, tmp_path, monkeypatch):
     """Also of a run that is not finished."""
     run = shutil.copytree(swept / "run-1", tmp_path / "run-1")
@@ -458,6 +462,7 @@ def test_a_sweeps_folder_is_named_after_all_it_holds():
     assert sweep._folder_name(many, "sweep") == "finger-spin-8-agents-sweep"
 
 
+@pytest.mark.slow
 def test_a_finished_sweep_has_nothing_left_to_do(swept, capsys):
     """Going on with it lays out its table again."""
     mtjax.train.main([f"--resume={swept}"])
@@ -465,6 +470,7 @@ def test_a_finished_sweep_has_nothing_left_to_do(swept, capsys):
     assert "compiled" not in said and "actor-lr" in said
 
 
+@pytest.mark.slow
 def test_a_signal_in_a_runs_last_chunk_stops_the_sweep_before_the_next(swept, tmp_path, monkeypatch, capsys):
     """But not after the last run, when all is done."""
     folder = shutil.copytree(swept, tmp_path / "sweep")
@@ -491,6 +497,7 @@ def test_a_signal_in_a_runs_last_chunk_stops_the_sweep_before_the_next(swept, tm
     assert done == ["run-1", "run-2"]
 
 
+@pytest.mark.slow
 def test_damaged_evaluations_do_not_stop_a_sweep(swept, tmp_path, capsys):
     """Those of a finished run are made again from its last state, and the file is kept."""
     folder = shutil.copytree(swept, tmp_path / "sweep")
@@ -528,6 +535,7 @@ def test_a_spoiled_seed_is_not_evaluated(monkeypatch):
     assert np.isfinite(returns[0]).all() and np.isnan(returns[1]).all()
 
 
+@pytest.mark.slow
 def test_evaluations_of_diverged_points_stay_none(tmp_path):
     """Also where they are lost, and made again from the last state."""
     given = {"steps": 240, "eval_every": 240, "eval_episodes": 2, "sweep": {"actor_lr": [1e-3, 1e38]}, **SMALL}
@@ -541,6 +549,7 @@ def test_evaluations_of_diverged_points_stay_none(tmp_path):
     assert (tmp_path / "evaluations.npz").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_policies_are_those_of_a_point(swept):
     """The agent has its values, and the states are of its seeds."""
     first, third = mtjax.load(swept / "run-1", seed=1), mtjax.load(swept / "run-1", seed=2)
@@ -555,12 +564,14 @@ def test_policies_are_those_of_a_point(swept):
         mtjax.load(swept / "run-1", seed=4)
 
 
+@pytest.mark.slow
 def test_a_run_of_several_points_is_not_fine_tuned_by_name(swept):
     """Which of them would be a guess."""
     with pytest.raises(InputError, match="holds 2 of a sweep"):
         run_config.parse([f"--from={swept / 'run-1'}", "--env=finger-short"])
 
 
+@pytest.mark.slow
 def test_fine_tuning_begins_every_point_with_the_same_seeds(swept):
     """Three seeds of each of two points, from a run of two seeds: 0, 1, 0 and again 0, 1, 0."""
     start = mtjax.load(swept / "run-1", seed=0)
@@ -579,6 +590,7 @@ def test_fine_tuning_begins_every_point_with_the_same_seeds(swept):
     assert jax.tree.structure(state) == jax.tree.structure(fresh)
 
 
+@pytest.mark.slow
 def test_evaluation_is_of_one_point(swept, tmp_path, capsys):
     """By its number."""
     run = shutil.copytree(swept / "run-1", tmp_path / "run")

@@ -254,6 +254,7 @@ def test_rewards_of_several_steps_are_summed_through_episodes():
 # Agents that learn, and runs.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", slow_but(["ppo", "sac-conditioned"], "ppo"))
 def test_a_run_that_is_resumed_in_the_middle_of_a_trial_is_the_whole_run(name, tmp_path):
     """To the bit: a checkpoint holds which episode it is."""
@@ -332,6 +333,7 @@ def test_the_task_of_an_evaluated_trial_stays_and_each_episode_begins_elsewhere(
     assert len(np.unique(scales[..., 0])) > 60
 
 
+@pytest.mark.slow
 def test_a_run_s_evaluations_know_their_trials(tmp_path, capsys):
     """In the file, for the policy that is scored again, and in what is told of first, last and mean episode."""
     env = mtjax.make("bandit", num_tasks=2, split="none", scores=True)

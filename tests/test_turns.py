@@ -41,6 +41,7 @@ def test_every_so_many_updates_of_the_critics_are_the_actors(updates, delay, eve
     assert all(np.all(np.isfinite(metrics["actor_loss"])) for metrics in history)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings", one_in(2, [{"heads": "per-task", "gradients": "pcgrad"}, {}]), ids=["pcgrad", "sac"]
 )
