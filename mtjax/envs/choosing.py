@@ -1,10 +1,31 @@
-"""Families whose actions are choices."""
+"""What families have that say themselves which actions they take, or whose actions are choices."""
 
 import dataclasses
 
 import jax.numpy as jnp
 
-from mtjax.types import Array
+from mtjax.types import Action, Array, Continuous
+
+
+class Acting:
+    """What a family has that gives its ``action``, as one that takes several choices must. Derive from this and
+    ``Family``.
+    """
+
+    @property
+    def action(self) -> Action:
+        """Return the kind and the size of actions."""
+        raise NotImplementedError
+
+    @property
+    def action_size(self) -> int:
+        """Return the size A of actions as the vectors that networks take."""
+        return self.action.size
+
+    @property
+    def discrete(self) -> bool:
+        """Whether actions are numbers of choices."""
+        return not isinstance(self.action, Continuous)
 
 
 @dataclasses.dataclass(frozen=True)
