@@ -91,10 +91,10 @@ def test_several_choices_are_those_of_the_family():
     env, worlds = FamilyEnv(levers), FamilyVectorEnv(levers, 2)
     check_env(env, skip_render_check=True)
     assert env.action_space == spaces.MultiDiscrete([3, 5])
-    assert worlds.action_space == spaces.MultiDiscrete([[3, 5]] * 2)
+    assert worlds.action_space == spaces.Box(0, np.array([[2, 4]] * 2), dtype=np.int64)  # as Gymnasium batches it
     light = int(np.argmax(env.reset(seed=0)[0]["env_obs"]))
     best = np.asarray(levers.best(env.unwrapped._task, light))
-    assert env.step(best)[1] == 1 and env.step(np.array([0, 0]))[1] == 0
+    assert env.step(best)[1] == 1 and env.step(best)[1] == 0  # the next light is another
     lights = np.argmax(worlds.reset(seed=0)[0]["env_obs"], axis=1)
     rewards = worlds.step(np.array([lights % 3, 2 * lights % 5]).T)[1]
     assert rewards.tolist() == [1, 0]  # the second world's levers are turned by 1
@@ -103,6 +103,8 @@ def test_several_choices_are_those_of_the_family():
             env.step(np.array(action))
     with pytest.raises(InputError, match=r"an action has the shape \(2,\), not \(\)"):
         env.step(1)
+    with pytest.raises(InputError, match="an action is one of Box"):
+        worlds.step(np.array([[0, 0], [0, 5]]))
 
 
 @unbounded

@@ -443,7 +443,7 @@ class Odd(Walk):
             lambda: mtjax.hosted(Odd, time_limit=9, obs="dict"),
             "observes a Dict, and agents take numbers: .*FilterObservation",
         ),
-        (lambda: mtjax.hosted(Odd, time_limit=9, action="many"), "takes a Tuple.*, and agents give a Discrete, MultiD"),
+        (lambda: mtjax.hosted(Odd, time_limit=9, action="many"), "takes Tuple.*, and agents give a Discrete, MultiDis"),
         (lambda: mtjax.hosted(Odd, time_limit=9, action="endless"), "without bounds"),
         (lambda: mtjax.hosted("Walk", unheard_of=3), "unheard_of=3: TypeError"),
         (lambda: mtjax.hosted(3), "hosted takes a name"),

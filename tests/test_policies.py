@@ -295,7 +295,7 @@ def test_agents_train_on_several_choices(name):
     assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
 
 
-@pytest.mark.parametrize("name", ["sac", "pqn", "sketches"])
+@pytest.mark.parametrize("name", ["sac", "pqn"])
 def test_agents_without_several_choices_name_those_with_them(name):
     said = rf"{name} draws no multi-discrete \(3, 5\) actions, which .* has: use ppo, .*impala"
     with pytest.raises(InputError, match=said):

@@ -172,7 +172,7 @@ class Actor:
         """Return the actions (k, ...) that the space has for those of agents; choices as int32."""
         shaped = actions.reshape(len(actions), *self.space.shape)
         if not isinstance(self.action, Continuous):
-            return np.int32(shaped + getattr(self.space, "start", 0))
+            return (shaped + getattr(self.space, "start", 0)).astype(np.int32)
         return (self.middle + np.clip(shaped, -1, 1) * self.half).astype(self.space.dtype)
 
 
