@@ -114,7 +114,8 @@ def learned(name, tasks):
 
     An update is one gradient step: each further step of Adam magnifies rounding.
     """
-    agent = mtjax.preset("finger-spin-vary-size", name.removeprefix("discrete-").removeprefix("several-"), "gpu").learner
+    preset = name.removeprefix("discrete-").removeprefix("several-")
+    agent = mtjax.preset("finger-spin-vary-size", preset, "gpu").learner
     spec = spec_for(name)
     agent = for_action(agent, spec.action)
     if not hasattr(agent, "critic_target"):
