@@ -1,4 +1,4 @@
-"""What families have that say themselves which actions they take, or whose actions are choices."""
+"""What families have whose actions are choices, or that say themselves which actions they take."""
 
 import dataclasses
 
@@ -8,9 +8,7 @@ from mtjax.types import Action, Array, Continuous
 
 
 class Acting:
-    """What a family has that gives its ``action``, as one that takes several choices must. Derive from this and
-    ``Family``.
-    """
+    """What a family has that says by ``action`` which actions it takes. Derive from this and ``Family``."""
 
     @property
     def action(self) -> Action:
