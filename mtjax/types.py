@@ -5,6 +5,7 @@ Axes, used in every docstring: ``S`` seeds, ``T`` tasks, ``E`` environments per 
 """
 
 import dataclasses
+import itertools
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import jax
@@ -19,26 +20,40 @@ Key = jax.Array
 Metrics = dict[str, Array]
 
 
+class Kind:
+    """What all kinds of actions have in common: the action is one array."""
+
+    shape: Any  # of an action
+    dtype: ClassVar[Any] = jnp.int32  # of its numbers
+
+    def blank(self) -> Array:
+        """Return an action that is all zero."""
+        return jnp.zeros(self.shape, self.dtype)
+
+    def masked(self, action: Array, mask: Array | None) -> Array:
+        """Return actions without what a task does not have; of choices policies draw nothing else."""
+        return action
+
+    def narrow(self, action: Array) -> Array:
+        """Return such actions from those of a mixture, whose widest family has as many entries or more."""
+        return action
+
+
 @dataclasses.dataclass(frozen=True)
-class Continuous:
+class Continuous(Kind):
     """Actions are vectors (A,) in [-1, 1]."""
 
     size: int  # A
     kind: ClassVar[str] = "continuous"
+    dtype: ClassVar[Any] = jnp.float32
+
+    def __str__(self) -> str:
+        return str(self.shape)
 
     @property
     def shape(self) -> tuple[int, ...]:
         """The shape of an action."""
         return (self.size,)
-
-    @property
-    def dtype(self) -> Any:
-        """The type of an action's numbers."""
-        return jnp.float32
-
-    def blank(self) -> Array:
-        """Return an action that is all zero."""
-        return jnp.zeros(self.shape, self.dtype)
 
     def random(self, key: Key, shape: tuple[int, ...] = ()) -> Array:
         """Draw actions (*shape, A), each entry uniform in [-1, 1)."""
@@ -58,25 +73,15 @@ class Continuous:
 
 
 @dataclasses.dataclass(frozen=True)
-class Discrete:
+class Discrete(Kind):
     """Actions are whole numbers () int32 from 0 to A - 1."""
 
     size: int  # A
     kind: ClassVar[str] = "discrete"
+    shape: ClassVar[tuple[int, ...]] = ()
 
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """The shape of an action."""
-        return ()
-
-    @property
-    def dtype(self) -> Any:
-        """The type of an action's number."""
-        return jnp.int32
-
-    def blank(self) -> Array:
-        """Return the action 0."""
-        return jnp.zeros(self.shape, self.dtype)
+    def __str__(self) -> str:
+        return f"0 to {self.size - 1}"
 
     def random(self, key: Key, shape: tuple[int, ...] = ()) -> Array:
         """Draw actions (*shape,), all as likely."""
@@ -86,13 +91,68 @@ class Discrete:
         """Return actions as the vectors (..., A) that networks take: 1 at the action, else 0."""
         return jax.nn.one_hot(action, self.size)
 
-    def masked(self, action: Array, mask: Array | None) -> Array:
-        """Return actions as they are: policies draw none that a task does not have."""
-        return action
 
-    def narrow(self, action: Array) -> Array:
-        """Return actions of a mixture as they are: a family's are the first of them."""
-        return action
+@dataclasses.dataclass(frozen=True)
+class MultiDiscrete(Kind):
+    """Actions are several whole numbers (D,) int32 at once: number d is from 0 to sizes[d] - 1.
+
+    Networks take them as vectors (A,): a one-hot of each number, one after another.
+
+    Raises:
+        InputError: a size is not a whole number of at least 1, or there are none.
+    """
+
+    sizes: tuple[int, ...]  # (D,)
+
+    def __post_init__(self):
+        sizes = np.asarray(self.sizes)
+        if sizes.ndim != 1 or not sizes.size or sizes.dtype.kind not in "iu" or sizes.min() < 1:
+            raise InputError(f"MultiDiscrete takes the number of choices of each action, such as (3, 5), not {sizes}")
+        object.__setattr__(self, "sizes", tuple(sizes.tolist()))
+
+    def __str__(self) -> str:
+        return f"{self.shape} below {self.sizes}"
+
+    @property
+    def kind(self) -> str:
+        """What one policy can draw, in words."""
+        return f"multi-discrete {self.sizes}"
+
+    @property
+    def size(self) -> int:
+        """The size A of actions as the vectors that networks take."""
+        return sum(self.sizes)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The shape of an action."""
+        return (len(self.sizes),)
+
+    def random(self, key: Key, shape: tuple[int, ...] = ()) -> Array:
+        """Draw actions (*shape, D), all as likely."""
+        return jax.random.randint(key, (*shape, len(self.sizes)), 0, jnp.array(self.sizes))
+
+    def encode(self, action: Array) -> Array:
+        """Return actions as the vectors (..., A) that networks take: 1 at the choices, else 0."""
+        one_hot = [jax.nn.one_hot(x, size) for (size, _), x in zip(self.runs, self.split(action), strict=True)]
+        return jnp.concatenate([x.reshape(*x.shape[:-2], -1) for x in one_hot], axis=-1)
+
+    @property
+    def runs(self) -> list[tuple[int, int]]:
+        """Each size, and how many numbers in a row have it: these are computed together."""
+        return [(size, len(list(alike))) for size, alike in itertools.groupby(self.sizes)]
+
+    def split(self, action: Array) -> list[Array]:
+        """Return the numbers of actions (..., D) as arrays (..., d), one for each run."""
+        return jnp.split(action, np.cumsum([count for _, count in self.runs])[:-1], axis=-1)
+
+    def split_vectors(self, vectors: Array) -> list[Array]:
+        """Return vectors (..., A), such as logits, as arrays (..., d, size), one for each run."""
+        parts = jnp.split(vectors, np.cumsum([size * count for size, count in self.runs])[:-1], axis=-1)
+        return [x.reshape(*x.shape[:-1], *run[::-1]) for run, x in zip(self.runs, parts, strict=True)]
+
+
+Action = Continuous | Discrete | MultiDiscrete
 
 
 class Task(NamedTuple):
@@ -107,7 +167,7 @@ class Task(NamedTuple):
     horizon: Array  # () int32, time limit of an episode in steps
     draws: Any = None  # a Task with leaves (P, ...); each trial draws one of them; None: every trial is of this task;
     # the draws have no context (None) where all have the task's own
-    action_mask: Array | None = None  # (A,) 1 for actions that the task has, else 0; None: it has all
+    action_mask: Array | None = None  # (A,) 1 for actions, or choices, that the task has, else 0; None: it has all
     blocks: Any = None  # in a mixture, which tasks belong to which family; static, without leaves
     scene: dict[str, Array] | None = None  # only what differs between tasks in what is seen; None without pixels
 
@@ -147,7 +207,7 @@ class Transition(NamedTuple):
     """
 
     obs: Any  # (O,)
-    action: Array  # (A,), or () int32 if actions are discrete
+    action: Array  # (A,); of discrete actions () int32, or (D,) int32 of several
     reward: Array  # ()
     discount: Array  # () 0 if nothing can be earned after this step, else 1; a time limit alone leaves it at 1
     next_obs: Any  # (O,) what follows in the trial: the next episode's first, or from before any reset if sums end
@@ -174,7 +234,7 @@ class Sometimes(NamedTuple):
 class Acted(NamedTuple):
     """Holds an agent's action in one world."""
 
-    action: Array  # (A,) in [-1, 1], or () int32 if actions are discrete
+    action: Array  # (A,) in [-1, 1]; of discrete actions () int32, or (D,) int32 of several
     extras: Any = None  # data that learning needs, stored with the transition; None for none
 
 
@@ -182,7 +242,7 @@ class Spec(NamedTuple):
     """Holds the shapes from which an agent builds its networks."""
 
     obs: Any  # a tree of jax.ShapeDtypeStruct; for most families one vector (O,)
-    action: Continuous | Discrete
+    action: Action
     context_size: int
     mixed: bool = False  # whether entries of observations differ in meaning between tasks
     frames: int = 1  # how many of the last images an agent should see at once; observations hold the newest

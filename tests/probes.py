@@ -20,14 +20,15 @@ from mtjax.agents.parts.knowing import last_steps
 from mtjax.agents.parts.policies import Gaussian
 from mtjax.command.keywords import configured
 from mtjax.config import Plan, configure
-from mtjax.envs import ENVS
+from mtjax.envs import ENVS, Family, Parameter
+from mtjax.envs.choosing import Acting
 from mtjax.envs.probes import AFTER, LIMIT, RULES, SPEC, Probe, tasks_of
 from mtjax.experience import Replay, rollouts
 from mtjax.frames import seen
 from mtjax.learning import loop
 from mtjax.training.launch import check, launch
 from mtjax.training.run import Hooks
-from mtjax.types import Acted, Spec, Task, Transition
+from mtjax.types import Acted, MultiDiscrete, Spec, Step, Task, Transition
 
 __all__ = ["AFTER", "LIMIT", "RULES", "SPEC", "Probe", "tasks_of"]
 
@@ -108,6 +109,35 @@ class Goals(Walk):
 
     def relabel(self, task, transition, key):
         return transition._replace(reward=task.goal["scale"] * transition.obs[0])
+
+
+@dataclasses.dataclass(frozen=True)
+class Levers(Acting, Family):
+    """A light shows where two levers, of three and of five places, must stand at once for a reward of 1.
+
+    The lights follow each other, so that the best return of an episode is its length, 6.
+    """
+
+    sizes: tuple[int, ...] = (3, 5)
+    parameters: ClassVar = {"turn": Parameter("1", 0.0)}
+    episode_steps: ClassVar[int] = 6
+
+    @property
+    def action(self):
+        return MultiDiscrete(self.sizes)
+
+    def best(self, task, light):
+        """Where the levers must stand."""
+        return (light * jnp.array([1, 2]) + jnp.int32(task.goal["turn"])) % jnp.array(self.sizes)
+
+    def reset(self, task, key):
+        return self.show(jax.random.randint(key, (), 0, 3), jnp.float32(0))
+
+    def step(self, task, state, action):
+        return self.show((state + 1) % 3, jnp.float32(jnp.all(action == self.best(task, state))))
+
+    def show(self, light, reward):
+        return Step(light, jax.nn.one_hot(light, 3), reward, jnp.bool_(False))
 
 
 # Agents, and running them.

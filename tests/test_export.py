@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from needs import require
-from probes import FEW, family_for, param, pick, slow_but, tiny, with_nets
+from probes import FEW, Levers, family_for, param, pick, slow_but, tiny, with_nets
 
 import mtjax
 import mtjax.evaluate
@@ -94,6 +94,28 @@ def test_a_choice_is_the_policys_in_all_forms(tmp_path):
     np.testing.assert_array_equal(found, expected)
     assert found.dtype == np.int32
     assert_onnx_acts(policy, tmp_path / "policy.onnx", obs, boxes, expected)
+
+
+def test_several_choices_are_the_policys_in_all_forms(tmp_path):
+    """Numbers side by side, each of which differs somewhere."""
+    env = Levers(vary={"turn": "0:3"}, split="none", num_draws=8)
+    policy = policy_of(for_action(tiny("ppo", hidden=(16,)), env.action), env)
+    actor = policy.state.nets["actor"]
+    head = actor.shared["head"] | {"kernel": jax.random.normal(jax.random.key(1), (16, 8))}
+    actor = actor._replace(shared=actor.shared | {"head": head})
+    policy = dataclasses.replace(policy, state=with_nets(policy.state, actor=actor))
+    file = mtjax.export(policy, tmp_path / "policy.npz")
+    by_numpy, by_jax = standalone.load(file), standalone.load_jax(file)
+    assert all("action (2,) below (3, 5)" in repr(x) for x in (by_numpy, policy))
+    obs, turns = observations(60, env), np.linspace(0, 3, 60, dtype=np.float32)
+    expected = np.asarray(policy(obs, turn=turns))
+    assert expected.shape == (60, 2) and expected.dtype == np.int32
+    assert all(len(set(x)) > 1 for x in expected.T)
+    np.testing.assert_array_equal(by_jax(obs, turns[:, None]), expected)
+    found = by_numpy(obs, turn=turns)
+    np.testing.assert_array_equal(found, expected)
+    assert found.dtype == np.int32
+    assert_onnx_acts(policy, tmp_path / "policy.onnx", obs, turns, expected)
 
 
 # Their bodies are built anew for every task.

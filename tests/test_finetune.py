@@ -329,7 +329,7 @@ def test_a_family_written_as_itself_is_the_same():
         ("--agent.encoder=mlp", "goes on with the run's encoder, identity, not with mlp"),
         ("--agent.hidden 4", r"hidden is the run's, \(8,\), and cannot be \(4,\); what may change is actor-lr"),
         ("--agent.embedding-size=4", "embedding-size is the run's, 3"),
-        ("--env=aim-wide", "map 2 observed numbers to 1 actions; the new tasks have 2 observed numbers and 2 actions$"),
+        ("--env=aim-wide", "map 2 observed numbers to 1 continuous actions; the new tasks have 2 .* and 2 continuous"),
         ("--tune=head", "head"),
         ("--reset-every=5", "throws away what --from takes"),
     ],
@@ -365,10 +365,10 @@ SEEN = {"pixels": 16, "frames": 3, "state": "also"}
 @pytest.mark.parametrize(
     ("seen", "said"),
     [
-        (SEEN | {"pixels": 32}, r"pictures \(32, 32, 9\) with 4 observed numbers and 2 actions; give --env.pixels"),
+        (SEEN | {"pixels": 32}, r"pictures \(32, 32, 9\) with 4 observed numbers and 2 .*; give --env.pixels"),
         (SEEN | {"frames": 2}, r"pictures \(16, 16, 6\) with 4 observed numbers"),
-        (SEEN | {"state": "hidden"}, r"pictures \(16, 16, 9\) and 2 actions"),
-        ({}, "the new tasks have 4 observed numbers and 2 actions; give --env.pixels"),
+        (SEEN | {"state": "hidden"}, r"pictures \(16, 16, 9\) and 2 continuous actions"),
+        ({}, "the new tasks have 4 observed numbers and 2 continuous actions; give --env.pixels"),
     ],
 )
 def test_other_pictures_are_refused(seen, said):

@@ -45,7 +45,7 @@ from mtjax.envs.probes import tasks_of
 from mtjax.envs.shared_simulator import Joined
 from mtjax.learning import loop, rollout
 from mtjax.saved import checkpoint
-from mtjax.types import Discrete, Spec
+from mtjax.types import Discrete, MultiDiscrete, Spec
 
 pytestmark = [
     pytest.mark.gpu,
@@ -114,7 +114,8 @@ def learned(name, tasks):
 
     An update is one gradient step: each further step of Adam magnifies rounding.
     """
-    agent = mtjax.preset("finger-spin-vary-size", name.removeprefix("discrete-"), "gpu").learner
+    preset = name.removeprefix("discrete-").removeprefix("several-")
+    agent = mtjax.preset("finger-spin-vary-size", preset, "gpu").learner
     spec = spec_for(name)
     agent = for_action(agent, spec.action)
     if not hasattr(agent, "critic_target"):
@@ -131,7 +132,8 @@ def learned(name, tasks):
 def spec_for(name):
     """The shapes that an agent sees and draws; of discrete actions where it draws these."""
     discrete = name.startswith("discrete-") or name in ("pqn", "sketches")
-    spec = SPEC._replace(action=Discrete(SPEC.action_size)) if discrete else SPEC
+    action = MultiDiscrete((2, 3)) if name.startswith("several-") else SPEC.action
+    spec = SPEC._replace(action=Discrete(SPEC.action_size) if discrete else action)
     return spec._replace(symbols=2) if name == "sketches" else spec
 
 
@@ -335,7 +337,8 @@ def experience(agent, num_seeds, num_tasks):
     random = np.random.default_rng(0)
     raw = np.arctanh(np.clip(steps.action, -0.99, 0.99))
     if not isinstance(agent.policy, Gaussian):
-        raw = random.integers(SPEC.action_size, size=steps.reward.shape).astype(np.int32)
+        even = jnp.zeros((*steps.reward.shape, len(agent.policy.encode(agent.policy.blank({})))))
+        raw = np.asarray(agent.policy.draw(even, None, jax.random.key(0)).action)
         steps = steps._replace(action=raw)
     ended = random.random(steps.reward.shape) < 0.1
     memory = Memory(None) if steps.memory is None else steps.memory
@@ -349,7 +352,7 @@ def experience(agent, num_seeds, num_tasks):
     return steps._replace(ended=ended, closed=ended, cut=ended, extras=taken, memory=memory)
 
 
-@pytest.mark.parametrize("name", [*AGENTS, "discrete-ppo", "discrete-rl2"])
+@pytest.mark.parametrize("name", [*AGENTS, "discrete-ppo", "discrete-rl2", "several-ppo"])
 def test_agents_learn_as_on_the_cpu(name, num_tasks=10):
     """Losses of an update, and its gradients by what Adam remembers, seed by seed; of all seeds and of one alone.
 
@@ -399,7 +402,7 @@ def test_agents_learn_from_pictures_as_on_the_cpu(name, vision):
     require_alike(*both(updating(agent), states, data, keys, tasks))
 
 
-@pytest.mark.parametrize("name", [*AGENTS, "discrete-ppo", "discrete-rl2"])
+@pytest.mark.parametrize("name", [*AGENTS, "discrete-ppo", "discrete-rl2", "several-ppo"])
 def test_agents_act_as_on_the_cpu(name):
     """The mean actions in worlds whose tasks were seen and in others."""
     with on("cpu"):

@@ -21,6 +21,7 @@ from gymnasium.utils import seeding
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
+from probes import Levers
 
 import mtjax.gym
 from mtjax import tasks as choose
@@ -81,6 +82,29 @@ def test_discrete_actions_are_those_of_the_family():
     found = [MDPS.step(task, state, jnp.int32(action)).obs for action in range(5)]
     assert start[0]["env_obs"].shape == (5,) and len(np.unique(found, axis=0)) > 1
     np.testing.assert_array_equal(env.step(3)[0]["env_obs"], found[3])
+
+
+@unbounded
+def test_several_choices_are_those_of_the_family():
+    """Of one world and of many; Gymnasium's checker accepts them, and a number beyond its size is refused."""
+    levers = Levers(vary={"turn": "0,1"}, split="none")
+    env, worlds = FamilyEnv(levers), FamilyVectorEnv(levers, 2)
+    check_env(env, skip_render_check=True)
+    assert env.action_space == spaces.MultiDiscrete([3, 5])
+    assert worlds.action_space == spaces.Box(0, np.array([[2, 4]] * 2), dtype=np.int64)  # as Gymnasium batches it
+    light = int(np.argmax(env.reset(seed=0)[0]["env_obs"]))
+    best = np.asarray(levers.best(env.unwrapped._task, light))
+    assert env.step(best)[1] == 1 and env.step(best)[1] == 0  # the next light is another
+    lights = np.argmax(worlds.reset(seed=0)[0]["env_obs"], axis=1)
+    rewards = worlds.step(np.array([lights % 3, 2 * lights % 5]).T)[1]
+    assert rewards.tolist() == [1, 0]  # the second world's levers are turned by 1
+    for action in ([3, 0], [0, 5], [-1, 0], [0.0, 1.0]):
+        with pytest.raises(InputError, match=r"an action is one of MultiDiscrete\(\[3 5\]\), not"):
+            env.step(np.array(action))
+    with pytest.raises(InputError, match=r"an action has the shape \(2,\), not \(\)"):
+        env.step(1)
+    with pytest.raises(InputError, match="an action is one of Box"):
+        worlds.step(np.array([[0, 0], [0, 5]]))
 
 
 @unbounded

@@ -19,7 +19,7 @@ from mtjax.envs.hosted.gymnasium import Separate
 from mtjax.evaluate import main as evaluate_main
 from mtjax.learning import evaluation, rollout
 from mtjax.saved.records import Records
-from mtjax.types import Acted, Continuous, Discrete, InputError
+from mtjax.types import Acted, Continuous, Discrete, InputError, MultiDiscrete
 
 gymnasium = require("gymnasium")
 spaces = gymnasium.spaces
@@ -74,13 +74,34 @@ class Seen(Walk):
         return np.full((3, 20, 24), self.age, np.uint8) + np.arange(3, dtype=np.uint8)[:, None, None]
 
 
+class Levers(Walk):
+    """A walk that two levers move."""
+
+    action_space = spaces.MultiDiscrete([[3], [5]], start=[[-1], [0]])
+
+    def _move(self, action):
+        assert action.shape == (2, 1) and action.dtype == np.int64
+        return super()._move(np.ravel(action))
+
+
+class Switches(Walk):
+    """A walk that six switches move."""
+
+    action_space = spaces.MultiBinary((3, 2))
+
+    def _move(self, action):
+        assert action.shape == (3, 2) and action.dtype == np.int8
+        return super()._move(np.float32(action.sum(axis=0)))
+
+
 @pytest.fixture(scope="module", autouse=True)
 def registered():
     """Gives the walks names in Gymnasium's registry."""
-    gymnasium.register("Walk", Walk, max_episode_steps=7)
-    gymnasium.register("Seen", Seen, max_episode_steps=7)
+    walks = {"Walk": Walk, "Seen": Seen, "Levers": Levers, "Switches": Switches}
+    for name, walk in walks.items():
+        gymnasium.register(name, walk, max_episode_steps=7)
     yield
-    for name in ("Walk", "Seen"):
+    for name in walks:
         gymnasium.registry.pop(name)
 
 
@@ -154,6 +175,8 @@ def original_steps(family, episodes, actions):
         ("Walk", {"time_limit": 30, "end": 20}, 1),  # it truncates by itself
         ("Walk", {"vary": {"scale": "1:4"}, "num_draws": 5, "split": "none"}, 2),  # every episode draws its own
         ("Seen", {"end": 3}, 2),
+        ("Levers", {"end": 3}, 2),
+        ("Switches", {}, 2),
         ("CartPole-v1", {"time_limit": 25}, 2),
         ("Pendulum-v1", {"vary": {"g": "5,10"}, "split": "none"}, 1),
         ("MountainCarContinuous-v0", {"time_limit": 50}, 1),
@@ -402,7 +425,7 @@ class Odd(Walk):
 
     def __init__(self, obs="ok", action="ok", **rest):
         super().__init__(**rest)
-        odd = {"dict": spaces.Dict({"x": spaces.Text(2)}), "many": spaces.MultiDiscrete([2, 3])}
+        odd = {"dict": spaces.Dict({"x": spaces.Text(2)}), "many": spaces.Tuple([spaces.Discrete(2)] * 2)}
         odd["endless"] = spaces.Box(-np.inf, np.inf, (1,))
         self.observation_space = odd.get(obs, self.observation_space)
         self.action_space = odd.get(action, self.action_space)
@@ -421,7 +444,7 @@ class Odd(Walk):
             lambda: mtjax.hosted(Odd, time_limit=9, obs="dict"),
             "observes a Dict, and agents take numbers: .*FilterObservation",
         ),
-        (lambda: mtjax.hosted(Odd, time_limit=9, action="many"), "takes MultiDiscrete"),
+        (lambda: mtjax.hosted(Odd, time_limit=9, action="many"), "takes Tuple.*, and agents give a Discrete, MultiDis"),
         (lambda: mtjax.hosted(Odd, time_limit=9, action="endless"), "without bounds"),
         (lambda: mtjax.hosted("Walk", unheard_of=3), "unheard_of=3: TypeError"),
         (lambda: mtjax.hosted(3), "hosted takes a name"),
@@ -443,6 +466,9 @@ def test_spaces_become_those_of_agents():
     np.testing.assert_array_equal(walk.actor.read(np.float32([-1, 1])), np.float32([-1, 10]))
     assert seen.spec.action == Discrete(3) and seen.actor.read(np.int32(0)) == -1
     assert seen.spec.obs["pixels"].shape == (20, 24, 3) and seen.spec.frames == 2
+    levers, switches = mtjax.hosted("Levers"), mtjax.hosted("Switches")
+    assert levers.spec.action == MultiDiscrete((3, 5)) and switches.spec.action == MultiDiscrete((2,) * 6)
+    np.testing.assert_array_equal(levers.actor.read(np.int32([0, 4])), [[-1], [4]])
 
 
 def test_a_class_is_registered_under_its_name():

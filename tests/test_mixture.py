@@ -12,7 +12,7 @@ import numpy as np
 import probes
 import pytest
 from needs import needs
-from probes import OFF_POLICY, one_in, slow_but
+from probes import OFF_POLICY, Levers, one_in, slow_but
 
 import mtjax
 import mtjax.evaluate
@@ -36,7 +36,7 @@ from mtjax.learning.loop import Settings
 from mtjax.report.tables import split_table, task_table
 from mtjax.saved.config_json import from_json, to_flags, to_json
 from mtjax.saved.folder import short_name
-from mtjax.types import SPLITS, Discrete, InputError, Spec, Step, Task, Transition
+from mtjax.types import SPLITS, Discrete, InputError, MultiDiscrete, Spec, Step, Task, Transition
 
 QUICK = {"xla_backend_optimization_level": 0}
 
@@ -234,6 +234,8 @@ def test_names_of_families_and_tasks():
         (lambda: mixture([]), "at least one family"),
         (lambda: make("bandit+control-acrobot").spec,
          "bandit has discrete actions and control-acrobot continuous ones; scores=True"),
+        (lambda: mixture([Levers(), make("bandit")]).spec, r"multi-discrete \(3, 5\) actions and bandit discrete ones"),
+        (lambda: mixture([Levers(), Levers(sizes=(5, 3))]).spec, r"\(3, 5\) actions and .* multi-discrete \(5, 3\) "),
         (lambda: mixture([make("control-cartpole", num_draws=3, combine="grid"),
                           make("control-acrobot", num_draws=2, combine="grid")]).tasks(), "num-draws"),
         (lambda: Replay(hindsight=0.5).check(BOTH, 1), "share no physics"),
@@ -766,6 +768,20 @@ def test_tasks_are_numbered_without_building_them(name):
         np.testing.assert_array_equal(env.numbers(split), tasks.id)
         np.testing.assert_array_equal(values, told)
         assert values.dtype == told.dtype and env.counts[split] == len(tasks.id)
+
+
+def test_families_of_several_choices_mix_where_their_sizes_are_equal():
+    """All tasks have all choices, and each family gets what the policy chose."""
+    env = mixture([Levers(vary={"turn": "0,1"}, split="none"), Levers(vary={"turn": "2"}, split="none")])
+    tasks = env.tasks()
+    assert env.discrete and env.spec.action == MultiDiscrete((3, 5)) and tasks.action_mask is None
+    keys = keys_of(tasks)
+    none = np.zeros((1, *keys.shape, 2), np.int32)
+    lights = np.argmax(steps_of(env, tasks, keys, none)[0], axis=-1)
+    turns = np.array([0, 1, 2])[:, None]
+    right = np.stack([(lights + turns) % 3, (2 * lights + turns) % 5], axis=-1).astype(np.int32)
+    _, seen, _ = steps_of(env, tasks, keys, right[None])
+    assert seen.reward.shape == (1, *keys.shape) and np.all(np.asarray(seen.reward) == 1)
 
 
 def test_families_of_discrete_actions_mix():

@@ -6,15 +6,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import of_task, tiny
+from probes import Levers, of_task, tiny
 
 import mtjax
 from mtjax.agents import for_action
 from mtjax.agents.networks import Params
-from mtjax.agents.parts.policies import Categorical, Gaussian, policy_for
+from mtjax.agents.parts.policies import Categorical, Gaussian, MultiCategorical, policy_for
 from mtjax.agents.ppo import Batch
+from mtjax.config import configure
 from mtjax.envs.probes import tasks_of
-from mtjax.types import Continuous, Discrete, InputError, Spec, Transition
+from mtjax.learning import loop
+from mtjax.types import Continuous, Discrete, InputError, MultiDiscrete, Spec, Transition
 
 KEY = jax.random.key(0)
 LOGITS = np.random.default_rng(0).normal(size=(6, 4)).astype(np.float32)
@@ -94,6 +96,79 @@ def test_what_a_task_lacks_has_probability_and_gradient_exactly_zero():
         assert np.all(np.isfinite(slope)) and np.all(slope[:, 1] == 0) and np.any(slope[:, 0] != 0)
     alone = np.float32([0, 0, 1, 0])
     assert POLICY.log_prob(LOGITS[0], jnp.int32(2), alone) == POLICY.entropy(LOGITS[0], alone, KEY) == 0
+
+
+# Several choices at once.
+
+SEVERAL = MultiCategorical(MultiDiscrete((2, 2, 3)))
+ALL = np.array(list(itertools.product(range(2), range(2), range(3))), np.int32)  # the 12 actions
+MANY = np.random.default_rng(2).normal(size=(2, 7)).astype(np.float32)  # logits of two policies
+
+
+@pytest.mark.parametrize("sizes", [(3, 5), (2, 2, 3), (4,)])
+def test_several_choices_are_numbers_side_by_side(sizes):
+    """Every choice of each is drawn; networks see a one-hot of each, one after another."""
+    kind = MultiDiscrete(sizes)
+    one, many = kind.blank(), kind.random(KEY, (400, 3))
+    assert one.shape == kind.shape == (len(sizes),) and one.dtype == many.dtype == jnp.int32 and not one.any()
+    assert many.shape == (400, 3, len(sizes)) and kind.size == sum(sizes)
+    for i, size in enumerate(sizes):
+        assert np.bincount(np.ravel(many[..., i]), minlength=size).min() > 600 / size
+    expected = np.concatenate([np.eye(size)[many[..., i]] for i, size in enumerate(sizes)], axis=-1)
+    np.testing.assert_array_equal(kind.encode(many), expected)
+    policy = policy_for(kind)
+    assert policy == MultiCategorical(kind) != MultiCategorical(MultiDiscrete((5, 3)))
+    np.testing.assert_array_equal(policy.encode(many), expected)
+    assert policy.outputs(kind.size) == kind.size and policy.blank({}).shape == kind.shape
+
+
+@pytest.mark.parametrize("sizes", [(), (3, 0), (2.5, 2), 3, ((2, 3),)])
+def test_sizes_of_several_choices_are_checked(sizes):
+    with pytest.raises(InputError, match="number of choices of each action, such as"):
+        MultiDiscrete(sizes)
+
+
+def test_several_choices_by_hand():
+    """Probabilities (1/4, 3/4) and (1/2, 3/10, 1/5), with the second's middle one missing (5/7, 0, 2/7)."""
+    policy, mask = MultiCategorical(MultiDiscrete((2, 3))), np.float32([1, 1, 1, 0, 1])
+    outputs, action = np.log(np.float32([0.25, 0.75, 0.5, 0.3, 0.2])), np.int32([1, 2])
+    np.testing.assert_allclose(policy.log_prob(outputs, action), np.log(0.75 * 0.2), rtol=1e-6)
+    np.testing.assert_allclose(policy.log_prob(outputs, action, mask), np.log(0.75 * 2 / 7), rtol=1e-6)
+    np.testing.assert_allclose(policy.entropy(outputs, None, KEY), 0.562335 + 1.029653, rtol=1e-5)
+    np.testing.assert_allclose(policy.entropy(outputs, mask, KEY), 0.562335 + 0.598270, rtol=1e-5)
+    even = np.zeros(5, np.float32)
+    np.testing.assert_allclose(policy.divergence(outputs, even), 0.130812 + 0.068959, rtol=1e-5)
+    np.testing.assert_allclose(policy.divergence(outputs, even, mask), 0.130812 + 0.094877, rtol=1e-5)
+
+
+@pytest.mark.parametrize("mask", [None, np.float32([1, 1, 0, 1, 1, 0, 1])], ids=["all", "masked"])
+def test_several_choices_are_a_distribution_over_all_their_combinations(mask):
+    """Its probabilities sum to 1; entropy and divergence are those of the twelve, or four, joint actions."""
+    p, q = (np.exp(np.float64(SEVERAL.log_prob(np.tile(x, (12, 1)), ALL, mask))) for x in MANY)
+    there = p > 0
+    assert there.sum() == (12 if mask is None else 4)
+    np.testing.assert_allclose([p.sum(), q.sum()], 1, rtol=1e-6)
+    p, q = p[there], q[there]
+    np.testing.assert_allclose(SEVERAL.entropy(MANY[0], mask, KEY), -p @ np.log(p), rtol=1e-5)
+    np.testing.assert_allclose(SEVERAL.divergence(*MANY, mask), p @ np.log(p / q), rtol=1e-5)
+    drawn = jax.vmap(lambda key: SEVERAL.draw(MANY[0], mask, key))(jax.random.split(KEY, 20_000))
+    assert drawn.action.dtype == jnp.int32 and drawn.action.shape == (20_000, 3)
+    counts = np.bincount(drawn.action @ np.array([6, 3, 1]), minlength=12)
+    np.testing.assert_allclose(counts[there] / 20_000, p, atol=0.02)
+    assert counts[~there].sum() == 0
+    again = SEVERAL.log_prob(np.tile(MANY[0], (20_000, 1)), drawn.action, mask)
+    np.testing.assert_allclose(drawn.log_prob, again, rtol=1e-5, atol=1e-6)
+    mode = SEVERAL.draw(MANY[0], mask, None).action
+    np.testing.assert_array_equal(mode, ALL[there][np.argmax(p)])
+
+
+def test_one_of_several_is_a_choice():
+    """A single number is as likely as a ``Categorical`` says, bit for bit."""
+    one, actions = MultiCategorical(MultiDiscrete((4,))), np.int32([0, 1, 2, 3, 0, 2])
+    np.testing.assert_array_equal(one.log_prob(LOGITS, actions[:, None], MASK), POLICY.log_prob(LOGITS, actions, MASK))
+    np.testing.assert_array_equal(one.entropy(LOGITS, MASK, KEY), POLICY.entropy(LOGITS, MASK, KEY))
+    others = LOGITS[::-1]
+    np.testing.assert_array_equal(one.divergence(LOGITS, others, MASK), POLICY.divergence(LOGITS, others, MASK))
 
 
 @pytest.mark.parametrize("mask", [None, np.float32([1, 0])], ids=["all", "masked"])
@@ -194,6 +269,39 @@ def test_ppo_finds_the_best_arm_of_every_task():
         assert action.dtype == jnp.int32 and action == np.argmax(task.goal["rewards"])
 
 
+LEVERS = Levers(vary={"turn": "0,1"}, split="none")
+
+
+def test_ppo_finds_the_best_places_of_two_levers():
+    """In all lights of all tasks, so that every episode returns the 6 that is most."""
+    given = {"num_envs": 8, "hidden": (32,), "actor_lr": 3e-3, "eval_episodes": 5}
+    result = mtjax.train(LEVERS, "ppo", steps=100_000, quiet=True, **given)
+    policy, tasks = result.policy(), LEVERS.tasks()
+    for i, light in itertools.product(range(2), range(3)):
+        task = jax.tree.map(lambda x, i=i: x[i], tasks)
+        action = policy(np.eye(3, dtype=np.float32)[light], task)
+        assert action.dtype == jnp.int32
+        np.testing.assert_array_equal(action, LEVERS.best(task, light))
+    np.testing.assert_array_equal(result.evaluations.returns["train"][:, -1], 6)
+
+
+@pytest.mark.parametrize("name", ["ppo", "impala", "rl2", "maml", "options"])
+def test_agents_train_on_several_choices(name):
+    """Traced, not run: the loop, agent and tasks fit together."""
+    agent = for_action(tiny(name, unroll=4, minibatches=1, epochs=1), LEVERS.action)
+    agent, settings = configure(agent, loop.Settings(), {"num_envs": 2, "chunk_steps": 8})
+    state = jax.eval_shape(lambda: loop.init(LEVERS, agent, settings, LEVERS.tasks(), jnp.arange(1)))
+    after, _ = jax.eval_shape(lambda state: loop.run_chunk(LEVERS, agent, settings, LEVERS.tasks(), state), state)
+    assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
+
+
+@pytest.mark.parametrize("name", ["sac", "pqn"])
+def test_agents_without_several_choices_name_those_with_them(name):
+    said = rf"{name} draws no multi-discrete \(3, 5\) actions, which .* has: use ppo, .*impala"
+    with pytest.raises(InputError, match=said):
+        mtjax.train(LEVERS, name, steps=10)
+
+
 def test_agents_of_continuous_actions_are_refused_before_anything_is_compiled():
     """By name, with what to use instead; and an agent that was made for other actions."""
     with pytest.raises(InputError, match=r"sac draws no discrete actions, which bandit has: use ppo, .*scores"):
@@ -215,3 +323,13 @@ def test_past_actions_are_kept_as_numbers_and_seen_as_vectors():
     assert past.action.dtype == jnp.int32 and past.action.tolist() == [0, 0, 3] and past.known.tolist() == [0, 0, 1]
     seen = agent.view.see(of_task(state.nets, 0)["inputs"], jnp.zeros(1), past)
     np.testing.assert_array_equal(seen.past.action, np.eye(5)[[0, 0, 3]])
+
+
+def test_past_choices_of_several_are_kept_side_by_side():
+    agent = for_action(tiny("ppo", conditioning="inferred", inferred_from=2), LEVERS.action)
+    state, task = agent.init(LEVERS.spec, LEVERS.tasks(), KEY), jax.tree.map(lambda x: x[0], LEVERS.tasks())
+    step = Transition(jnp.zeros(3), jnp.int32([2, 1]), jnp.float32(1), jnp.float32(1), jnp.zeros(3))
+    past = agent.remember(state, agent.begin(state, task), step, task).past
+    assert past.action.dtype == jnp.int32 and past.action.tolist() == [[0, 0], [2, 1]]
+    seen = agent.view.see(of_task(state.nets, 0)["inputs"], jnp.zeros(3), past)
+    assert seen.past.action.tolist() == [[1, 0, 0, 1, 0, 0, 0, 0], [0, 0, 1, 0, 1, 0, 0, 0]]

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import SHORT_RUN
-from probes import FEW, METAWORLD, param, set_physics, slow_but
+from probes import FEW, METAWORLD, Levers, param, set_physics, slow_but
 
 import mtjax
 import mtjax.evaluate
@@ -23,12 +23,12 @@ from mtjax import register
 from mtjax.agents import AGENTS, PARTS
 from mtjax.agents.parts.knowing import Parameters
 from mtjax.command import help, keywords, run_config
-from mtjax.envs import ENVS, Domain, Parameter, effects, registration_checks
+from mtjax.envs import ENVS, Domain, Family, Parameter, effects, registration_checks
 from mtjax.envs.brax import Brax
 from mtjax.learning import loop
 from mtjax.saved.config_json import to_flags, to_json
 from mtjax.tasks import episode_task
-from mtjax.types import SPLITS, InputError
+from mtjax.types import SPLITS, InputError, MultiDiscrete
 
 STEPS = 200
 # Classes that differ in their reward alone have one family here.
@@ -280,6 +280,25 @@ def test_a_family_that_steps_itself_is_checked_too(forget):
         register("mine", Mine)
     with pytest.raises(InputError, match="Family cannot be made"):
         register("mine", mtjax.envs.Family)
+
+
+def test_a_family_that_gives_its_own_action_is_checked(forget):
+    """It is one of the kinds, and size and kind follow from it; the parts that it derives from come before Family."""
+
+    class Late(Family):
+        sizes = (3, 5)
+        action, best, reset, step, show = Levers.action, Levers.best, Levers.reset, Levers.step, Levers.show
+        parameters, episode_steps = Levers.parameters, 6
+
+    class Box(Levers):
+        action = (3, 5)
+
+    with pytest.raises(InputError, match=r"Late gives its action itself: derive it from .*Acting before Family"):
+        register("late", dataclasses.dataclass(frozen=True)(Late))
+    with pytest.raises(InputError, match=r"Box.action must be Continuous, Discrete or MultiDiscrete .*not \(3, 5\)"):
+        register("box", Box)
+    register("levers", Levers, vary={"turn": "0,1"}, split="none")
+    assert mtjax.make("levers").spec.action == MultiDiscrete((3, 5))
 
 
 def shortened(self, task, state, action):

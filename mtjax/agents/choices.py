@@ -20,7 +20,7 @@ from mtjax.agents.parts.values import VALUES
 from mtjax.checks import OF_TRAIN, checked
 from mtjax.experience import EXPERIENCES
 from mtjax.names import CHOICES, InputError, frozen, nearest_error
-from mtjax.types import Continuous, Discrete
+from mtjax.types import Action
 
 A = TypeVar("A")
 
@@ -83,7 +83,7 @@ def replace(agent: Any, given: Mapping[str, Any]) -> Any:
     return dataclasses.replace(agent, **checked(agent, rest), **taken)
 
 
-def for_action(agent: A, action: Continuous | Discrete) -> A:
+def for_action(agent: A, action: Action) -> A:
     """Return an agent with the policy for such actions, which are those of its environment."""
     return dataclasses.replace(agent, policy=policy_for(action))  # type: ignore
 

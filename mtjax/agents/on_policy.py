@@ -12,7 +12,7 @@ from mtjax.agents.base import BaseAgent, Inputs, Memory
 from mtjax.agents.choices import FLAT
 from mtjax.agents.fit import Fit, above, descend
 from mtjax.agents.networks import Network, Params
-from mtjax.agents.parts.policies import Categorical, Gaussian, Policy
+from mtjax.agents.parts.policies import Categorical, Gaussian, MultiCategorical, Policy
 from mtjax.agents.parts.policies.gaussian import STD_RANGE
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
@@ -30,7 +30,7 @@ HEAD_SCALE = 0.01
 class Taken(NamedTuple):
     """Holds what is stored with an action when it is taken."""
 
-    raw: Array  # the action as ``policy.log_prob`` takes it: before the tanh (A,), or () int32
+    raw: Array  # the action as ``policy.log_prob`` takes it: before the tanh (A,); of discrete ones itself
     log_prob: Array  # () its log-probability under the policy that took it
 
 
@@ -70,7 +70,7 @@ class OnPolicy(BaseAgent):
         *("gae_lambda", "epochs", "minibatches", "entropy_cost", "value_rate"),
     )
     common_presets: ClassVar[bool] = False
-    policies: ClassVar[tuple[type[Policy], ...]] = (Gaussian, Categorical)
+    policies: ClassVar[tuple[type[Policy], ...]] = (Gaussian, Categorical, MultiCategorical)
     devices_differ: ClassVar[bool] = True
     critic_outputs: ClassVar[int] = 1
     """The number of values that the critic gives a state."""

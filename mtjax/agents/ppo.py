@@ -39,9 +39,9 @@ class PPO(OnPolicy):
         kernel' = kernel s / s',  bias' = (s bias + m - m') / s'
 
     Of continuous actions the policy is a tanh-squashed Gaussian, whose entropy is estimated from one sample; of
-    discrete ones a softmax over those that a task has, whose entropy is exact. With a ``kl_limit``, the actor is
-    not updated for the rest of an update once mean(ratio - 1 - log ratio), an estimate of KL(pi_old | pi), exceeds it
-    on a minibatch. Then a schedule of the actor's learning rate waits too.
+    discrete ones a softmax over those that a task has, whose entropy is exact; of several at once a softmax for each.
+    With a ``kl_limit``, the actor is not updated for the rest of an update once mean(ratio - 1 - log ratio), an
+    estimate of KL(pi_old | pi), exceeds it on a minibatch. Then a schedule of the actor's learning rate waits too.
 
     From pictures, a rollout holds the stacks before and after each of its steps. For 64 pixels and 3 frames these are
     74 kB a step, so that ten tasks take 6 GB with H = 32 and E = 256. A run prints how much it is.

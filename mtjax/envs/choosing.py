@@ -1,10 +1,29 @@
-"""Families whose actions are choices."""
+"""What families have whose actions are choices, or that say themselves which actions they take."""
 
 import dataclasses
 
 import jax.numpy as jnp
 
-from mtjax.types import Array
+from mtjax.types import Action, Array, Continuous
+
+
+class Acting:
+    """What a family has that says by ``action`` which actions it takes. Derive from this and ``Family``."""
+
+    @property
+    def action(self) -> Action:
+        """Return the kind and the size of actions."""
+        raise NotImplementedError
+
+    @property
+    def action_size(self) -> int:
+        """Return the size A of actions as the vectors that networks take."""
+        return self.action.size
+
+    @property
+    def discrete(self) -> bool:
+        """Whether actions are numbers of choices."""
+        return not isinstance(self.action, Continuous)
 
 
 @dataclasses.dataclass(frozen=True)

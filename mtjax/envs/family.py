@@ -20,7 +20,7 @@ from mtjax.envs.task_table import Part, Table, fields_alone
 from mtjax.frames import shown
 from mtjax.names import first_sentence
 from mtjax.parallel import axes
-from mtjax.types import Array, Continuous, Discrete, InputError, Key, Spec, Step, Task, Transition
+from mtjax.types import Action, Array, Continuous, Discrete, InputError, Key, Spec, Step, Task, Transition
 
 _MAX_DRAWS = 1000
 
@@ -135,7 +135,7 @@ class Family(abc.ABC):
         )
 
     @property
-    def action(self) -> Continuous | Discrete:
+    def action(self) -> Action:
         """Return the kind and the size of actions."""
         return Discrete(self.action_size) if self.discrete else Continuous(self.action_size)
 

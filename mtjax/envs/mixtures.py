@@ -35,7 +35,8 @@ class Mixture:
         to a vector before. Pictures are not padded: either
         no family shows any, or all show pictures of one shape, with or without a state (O,) beside them.
     Action: as many entries, or choices, as the widest family has. A task's ``action_mask`` (A,) says which of them are
-        its own. Either all families have continuous actions, or all have discrete ones.
+        its own. Either all families have continuous actions, or all have discrete ones, or all have several discrete
+        ones at once, of the same sizes.
     Context (C,): the family as one-hot, then one slot per family. The task's own slot holds its context in that family;
         other slots are zero. A family whose contexts are all zero, because it has a single task, has no slot. The
         nearest training task of an unseen task is in its own family; of a family that does not train it is the first.

@@ -18,7 +18,7 @@ from mtjax.envs.engines.base import at_rest
 from mtjax.envs.family import Family
 from mtjax.envs.parameters import Parameter
 from mtjax.names import InputError, nearest_error
-from mtjax.types import Step, Task
+from mtjax.types import Action, Continuous, Step, Task
 
 _LOOKUPS = {"body": "bodies", "mesh": "meshes", **{kind: f"{kind}s" for kind in ("geom", "joint", "site", "actuator")}}
 _LOOKUPS |= {kind: f"{kind}s" for kind in ("sensor", "tendon", "material", "camera", "light")}
@@ -242,11 +242,22 @@ def _check_brax(family: Brax, task: Task, key: Any) -> None:
     _require(family, "reward", "a number", _abstract(family, "reward", task, metrics, number, action), ())
 
 
+def _action(family: Family) -> Action:
+    """Return a family's kind of actions, which its ``action_size`` and ``discrete`` must tell too."""
+    given = _call(family, "action", lambda: family.action)
+    cls, told = type(family).__name__, (getattr(family, "action_size", None), family.discrete)
+    if not isinstance(given, Action):
+        raise InputError(f"{cls}.action must be Continuous, Discrete or MultiDiscrete of mtjax.types, not {given!r}")
+    if told != (given.size, not isinstance(given, Continuous)):
+        raise InputError(f"{cls} gives its action itself: derive it from mtjax.envs.choosing.Acting before Family")
+    return given
+
+
 def _check_steps(family: Family, task: Task, key: Any) -> None:
     """Check ``reset`` and ``step`` of a family that steps itself."""
     begun = _abstract(family, "reset", task, key)
-    _call(family, "action_size", lambda: int(family.action_size))
-    action = jax.ShapeDtypeStruct(family.action.shape, family.action.dtype)
+    given = _action(family)
+    action = jax.ShapeDtypeStruct(given.shape, given.dtype)
     for method, step in (("reset", begun), ("step", None)):
         step = _abstract(family, "step", task, begun.state, action) if step is None else step
         if not isinstance(step, Step):

@@ -17,7 +17,7 @@ from mtjax.frames import PICTURES, shown
 from mtjax.gym.tasks import TaskStream, TaskTable, read_options
 from mtjax.names import nearest_error
 from mtjax.report import render
-from mtjax.types import Array, Discrete, Env, InputError, Step, Task
+from mtjax.types import Action, Array, Discrete, Env, InputError, MultiDiscrete, Step, Task
 
 MTENV_IDS = {
     "MT-CartPole-v0": "control-cartpole",
@@ -77,10 +77,17 @@ def draw_seeds(random: np.random.Generator, *shape: int) -> np.ndarray:
 
 def spaces_of(family: Env, table: TaskTable) -> tuple[spaces.Dict, spaces.Space]:
     """Return the observation space and the action space of one world."""
-    obs, action = _space_of(family.spec.obs), family.spec.action
-    discrete = isinstance(action, Discrete)
-    actions = spaces.Discrete(action.size) if discrete else spaces.Box(-1.0, 1.0, action.shape, np.float32)
-    return spaces.Dict({"env_obs": obs, "task_obs": table.space}), actions
+    obs = spaces.Dict({"env_obs": _space_of(family.spec.obs), "task_obs": table.space})
+    return obs, _space_of_actions(family.spec.action)
+
+
+def _space_of_actions(action: Action) -> spaces.Space:
+    match action:
+        case Discrete(size):
+            return spaces.Discrete(size)
+        case MultiDiscrete(sizes):
+            return spaces.MultiDiscrete(list(sizes))
+    return spaces.Box(-1.0, 1.0, action.shape, np.float32)
 
 
 def _space_of(obs: Any) -> spaces.Space:
@@ -163,7 +170,7 @@ class FamilyEnv(TaskStream, gymnasium.Env):
 
     Observation: ``env_obs`` (O,) is the observation of the world, or its last pictures (H, W, N C), newest last.
         ``task_obs`` is that of the task: its context (C,), its number among all tasks of the family, or nothing (0,).
-    Action: (A,) in [-1, 1]. A time limit truncates.
+    Action: (A,) in [-1, 1], or the numbers of choices. A time limit truncates.
     Task state: an int. With the family's settings it identifies the task. The environment starts with the first task
         of the split. After a change of the task call ``reset`` before ``step``.
     Random streams: ``reset(seed=...)`` seeds that of the environment; ``seed_task(seed)`` or

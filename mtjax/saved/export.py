@@ -34,9 +34,10 @@ def export(policy: Policy, file: str | Path) -> Path:
 
     Args:
         file: ends with .npz, which ``mtjax.standalone`` reads by NumPy alone or by JAX alone; or with .onnx, a model of
-            the inputs ``obs`` (O,) and ``parameters`` (P,), and the output ``action``: (A,), or a number () int32 of a
-            discrete action. Of a policy that sees pictures the inputs are ``pixels`` (H, W, N C), a stack of pictures,
-            and ``state`` (O,) if it sees that too; of other trees of arrays, their paths such as ``seen/grid``.
+            the inputs ``obs`` (O,) and ``parameters`` (P,), and the output ``action``: (A,), or the number () int32 of
+            a choice, or the numbers (D,) of several. Of a policy that sees pictures the inputs are ``pixels``
+            (H, W, N C), a stack of pictures, and ``state`` (O,) if it sees that too; of other trees of arrays, their
+            paths such as ``seen/grid``.
 
     Raises:
         InputError: the file exists, or the agent acts by what it remembers of the episode, or it is of a mixture,
@@ -89,7 +90,7 @@ def _meta(env: Family, agent: BaseAgent, obs: dict[str, Any]) -> dict[str, Any]:
         "seconds": env.seconds_per_step if isinstance(env, Pictured) else None,  # between two actions
         "about": " ".join(_about(env, name, x) for name, x in obs.items()),
         "action_size": env.spec.action_size,
-        "discrete": env.discrete,  # whether an action is a number from 0 to action_size - 1
+        "action": str(env.spec.action),
         "parameters": [name for name, _, _ in ranges(env)],
         "trained_from": [low for _, low, _ in ranges(env)],
         "trained_to": [high for _, _, high in ranges(env)],

@@ -52,8 +52,7 @@ class Policy:
 
     def __repr__(self) -> str:
         names, seen = f"{name_of(self.agent)} on {env_name_of(self.env)}", jax.tree.map(lambda x: x.shape, self.takes)
-        size = self.env.spec.action_size
-        shapes = f"observation {seen}, action {f'0 to {size - 1}' if self.env.discrete else f'({size},)'}"
+        shapes = f"observation {seen}, action {self.env.spec.action}"
         return f"Policy({names}: {shapes}, one of {len(self.seeds)} seed{'s' * (len(self.seeds) > 1)})"
 
     @public
@@ -62,7 +61,8 @@ class Policy:
     ) -> Array:
         """Return the mean action (A,), or a sampled one if a key is given; (B, A) for a batch of observations.
 
-        If actions are discrete, it is the likeliest, or a sampled one: a number () int32, or (B,).
+        If actions are discrete, it is the likeliest, or a sampled one: a number () int32, or (B,); numbers (D,) of
+        several, or (B, D).
 
         Args:
             obs: as the agent sees it: with pictures, the stack of the last ones, as ``mtjax.stacked`` shows them.

@@ -1,7 +1,7 @@
 """Acts by a policy that ``mtjax.export`` wrote. This file needs NumPy alone, and can be copied to where it is used.
 
     policy = load("policy.npz")
-    action = policy(obs, size=1.05)  # (A,) in [-1, 1], or a number; the task's parameters by name
+    action = policy(obs, size=1.05)  # (A,) in [-1, 1], or choices; the task's parameters by name
 
 A policy that sees pictures takes a stack of the last ones, which ``begin`` and ``push`` keep:
 
@@ -36,15 +36,14 @@ class Policy:
 
     def __repr__(self) -> str:
         seen = ", ".join(f"{name} {shape}" for name, shape in shapes_of(self.meta).items()).removeprefix("obs ")
-        size = self.meta["action_size"]
-        action = f"0 to {size - 1}" if self.meta.get("discrete") else f"({size},)"
+        action = self.meta.get("action", f"({self.meta['action_size']},)")  # as files from before choices say
         told = f"observation {seen}, action {action}"
         return f"Policy({self.meta['agent']} on {self.meta['env']}: {told}, parameters {self.meta['parameters']})"
 
     def __call__(self, obs: Any, **parameters: float) -> np.ndarray:
         """Return the mean action (A,) of the task with these parameters, or (B, A) of a batch of observations.
 
-        If actions are discrete, it is the likeliest: a number () int32, or (B,).
+        If actions are discrete, it is the likeliest: a number () int32, or (B,); numbers (D,) of several, or (B, D).
 
         Args:
             obs: an observation (O,), or the tree of arrays that the family observes; of a policy that sees pictures

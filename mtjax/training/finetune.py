@@ -17,7 +17,7 @@ from mtjax.envs.contexts import ranges
 from mtjax.envs.mixtures import require_family
 from mtjax.saved import pretrained
 from mtjax.saved.policy import Policy
-from mtjax.types import Discrete, Env, InputError, Spec, Task
+from mtjax.types import Env, InputError, Spec, Task
 
 _FRESH = ("tasks", "sampler")  # networks that belong to the new tasks alone
 
@@ -88,7 +88,7 @@ def _sizes(spec: Spec) -> str:
 
 def _actions(spec: Spec) -> str:
     """Return how many actions networks are to map to, as text."""
-    return f"{spec.action_size} {'discrete ' if isinstance(spec.action, Discrete) else ''}actions"
+    return f"{spec.action_size} {spec.action.kind} actions"
 
 
 def _learned(agent: BaseAgent) -> dict[str, Any]:

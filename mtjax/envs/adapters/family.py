@@ -10,9 +10,10 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from mtjax.envs.choosing import Acting
 from mtjax.envs.family import Family
 from mtjax.envs.parameters import Parameter
-from mtjax.types import Array, Continuous, Discrete, InputError, Key, Step, Task
+from mtjax.types import Array, InputError, Key, Step, Task
 
 _MOST_STEPS = 1_000_000
 
@@ -25,7 +26,7 @@ class AdaptedState(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Adapted(Family):
+class Adapted(Acting, Family):
     """A family of an environment that another package steps in JAX. Nothing resets by itself."""
 
     environment: str = ""
@@ -48,11 +49,6 @@ class Adapted(Family):
     @abc.abstractmethod
     def defaults(self) -> Mapping[str, Any]:
         """Return the parameters that can vary, by the package's names, with their nominal values."""
-
-    @property
-    @abc.abstractmethod
-    def action(self) -> Continuous | Discrete:  # type: ignore[override]
-        """Return the kind and the size of actions."""
 
     @abc.abstractmethod
     def begin(self, task: Task, key: Key) -> tuple[Any, Any]:
@@ -115,16 +111,6 @@ class Adapted(Family):
     def instruction(self) -> str:
         """Return what all tasks ask for."""
         return f"Earn the rewards of {self.environment}."
-
-    @property
-    def action_size(self) -> int:  # type: ignore[override]
-        """Return the number of actions, or the size A of one."""
-        return self.action.size
-
-    @property
-    def discrete(self) -> bool:  # type: ignore[override]
-        """Whether an action is the number of a choice."""
-        return isinstance(self.action, Discrete)
 
 
 def _as_default(default: Any, value: Array) -> Array:

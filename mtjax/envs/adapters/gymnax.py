@@ -11,7 +11,7 @@ import numpy as np
 
 from mtjax.envs.adapters.family import Adapted
 from mtjax.names import nearest_error
-from mtjax.types import Array, Continuous, Discrete, InputError, Key, Task
+from mtjax.types import Action, Array, Continuous, Discrete, InputError, Key, Task
 
 _LIMIT = "max_steps_in_episode"
 
@@ -60,7 +60,7 @@ class Gymnax(Adapted):
         return getattr(self.original[1], _LIMIT)
 
     @cached_property
-    def action(self) -> Continuous | Discrete:  # type: ignore[override]
+    def action(self) -> Action:  # type: ignore[override]
         space = self._actions
         return Discrete(int(space.n)) if hasattr(space, "n") else Continuous(int(np.prod(space.shape)))
 

@@ -28,7 +28,7 @@ class EnvPool(Hosted):
 
     Observation: the environment's own, as in Gymnasium: a vector (O,), a picture (H, W, C) of bytes, or a tree of
         arrays. Of Atari it is the newest picture; agents see the last ``frames``.
-    Action: one of n numbers, or a vector (A,) in [-1, 1], scaled to the environment's Box.
+    Action: one of n numbers, several such, or a vector (A,) in [-1, 1], scaled to the environment's Box.
     Reward, start and termination are the environment's own. EnvPool's automatic resets are never reached: worlds begin
         where an episode has ended. The seeds of pools are drawn from the run's seed, those of later episodes are
         EnvPool's.

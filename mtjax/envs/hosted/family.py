@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from PIL import Image, ImageOps
 
+from mtjax.envs.choosing import Acting
 from mtjax.envs.engines import host
 from mtjax.envs.family import Family
 from mtjax.envs.hosted.spaces import Actor, Reader, TreeReader, reader_of
@@ -24,7 +25,7 @@ from mtjax.envs.hosted.worlds import GONE, TERMINATED, TRUNCATED, Pool, Worlds
 from mtjax.envs.parameters import Parameter
 from mtjax.frames import PICTURES, shown
 from mtjax.parallel.axes import over_worlds
-from mtjax.types import Array, Continuous, Discrete, InputError, Key, Spec, Step, Task
+from mtjax.types import Action, Array, InputError, Key, Spec, Step, Task
 
 _MOST_FRAMES = 16
 _MOST_STEPS = 1_000_000
@@ -41,7 +42,7 @@ class HostedState(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Hosted(Family):
+class Hosted(Acting, Family):
     """A family whose worlds live outside JAX. All of them are stepped by one call on the host.
 
     A resumed run begins new episodes, as these worlds cannot be saved. One device alone can train on them.
@@ -122,19 +123,8 @@ class Hosted(Family):
         return jax.eval_shape(self.reader.show, jax.ShapeDtypeStruct(self.reader.shape, self.reader.dtype))
 
     @property
-    def action(self) -> Continuous | Discrete:
-        """Return the kind and the size of actions."""
+    def action(self) -> Action:
         return self.actor.action
-
-    @property
-    def action_size(self) -> int:  # type: ignore[override]
-        """Return the number of actions, or the size A of one."""
-        return self.action.size
-
-    @property
-    def discrete(self) -> bool:  # type: ignore[override]
-        """Whether an action is the number of a choice."""
-        return isinstance(self.action, Discrete)
 
     @property
     def name(self) -> str:
@@ -190,7 +180,7 @@ class Hosted(Family):
         return Step(state, self.reader.show(obs), jnp.zeros(keys.shape), never, truncated=never)
 
     def step_worlds(self, tasks: Task, states: HostedState, actions: Array) -> Step:
-        """Step every world by its action (S, T, E, A), or () if actions are discrete."""
+        """Step every world by its action (S, T, E, ...)."""
         clock, reward, flags, obs = self._call("step", "ifio", states.number, states.clock, actions)
         gone = (flags & GONE) > 0
         obs = jnp.where(gone.reshape(*gone.shape, *[1] * (obs.ndim - 3)), states.obs, obs)

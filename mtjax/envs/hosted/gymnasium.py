@@ -27,7 +27,7 @@ class Gymnasium(Hosted):
 
     Observation: the environment's own: of a Box a vector (O,), or a picture (H, W, C) of bytes; of a Discrete,
         MultiDiscrete or MultiBinary an array of whole numbers; of a Dict or Tuple the tree of arrays of its spaces.
-    Action: one of n numbers, or a vector (A,) in [-1, 1], scaled to the environment's Box.
+    Action: one of n numbers, several such, or a vector (A,) in [-1, 1], scaled to the environment's Box.
     Reward, start and termination are the environment's own; where it truncates, or at its time limit, an episode is
         cut off. The seed of each episode is drawn from the run's seed.
 
@@ -193,8 +193,7 @@ class Separate:
 
     def step(self, places: np.ndarray, actions: np.ndarray) -> Outcome:
         """Step worlds (k,)."""
-        given = self.family.actor.read_all(actions)
-        given = given.tolist() if self.family.discrete else given
+        given = self.family.actor.read_each(actions)
         steps = [self.made[i].step(x) for i, x in zip(places.tolist(), given, strict=True)]  # type: ignore
         obs, reward, terminated, truncated, _ = zip(*steps, strict=True)
         read = self.family.reader.read_each(obs)
@@ -227,7 +226,7 @@ def hosted(environment: "str | Callable[..., Any]", vary: Mapping[str, Any] | tu
 
     Raises:
         InputError: Gymnasium is not installed, has no such environment, or cannot make it; or its spaces are not those
-            of arrays of numbers, and of a vector or a choice.
+            of arrays of numbers, and of a vector or of choices.
     """
     if not isinstance(environment, str):
         environment = _registered(environment)

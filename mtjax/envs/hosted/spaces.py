@@ -11,7 +11,7 @@ import numpy as np
 
 from mtjax.checks import shown
 from mtjax.frames import PICTURES
-from mtjax.types import Array, Continuous, Discrete, InputError
+from mtjax.types import Array, Continuous, Discrete, InputError, MultiDiscrete
 
 _LEAST_PICTURE = 16
 """Pixels a side of the smallest picture. Smaller arrays of bytes, such as those of grid worlds, are vectors."""
@@ -147,28 +147,48 @@ class Actor:
     """Turns actions of agents into those of a space."""
 
     def __init__(self, name: str, space: Any):
-        kind, self.space = type(space).__name__, space
-        self.discrete = kind == "Discrete"
-        if self.discrete:
-            self.action, self.start = Discrete(int(space.n)), int(space.start)
-            return
-        if kind != "Box" or not np.issubdtype(space.dtype, np.floating) or not np.prod(space.shape):
-            raise InputError(f"{name} takes {shown(space)} as actions, and agents give one of n, or a Box of floats")
-        if not np.all(np.isfinite(space.low) & np.isfinite(space.high)):
-            raise InputError(
-                f"{name} takes actions without bounds, which agents give in [-1, 1]; wrap the environment in "
-                "gymnasium.wrappers.RescaleAction, or give its Box a low and a high"
-            )
-        self.action = Continuous(int(np.prod(space.shape)))
-        self.middle, self.half = (space.high + space.low) / 2, (space.high - space.low) / 2
+        self.space, kind = space, type(space).__name__
+        if kind == "Discrete":
+            self.action = Discrete(int(space.n))
+        elif kind == "MultiDiscrete":
+            self.action = MultiDiscrete(tuple(np.ravel(space.nvec).tolist()))
+        elif kind == "MultiBinary":
+            self.action = MultiDiscrete((2,) * math.prod(space.shape))
+        else:
+            _require_bounded(name, space)
+            self.action = Continuous(math.prod(space.shape))
+            self.middle, self.half = (space.high + space.low) / 2, (space.high - space.low) / 2
 
     def read(self, action: np.ndarray) -> Any:
-        """Return the action that the space has for one of an agent, (A,) in [-1, 1] or ()."""
-        return self.start + int(action) if self.discrete else self.read_all(np.asarray(action)[None])[0]
+        """Return the action that the space has for one of an agent."""
+        return self.read_each(np.asarray(action)[None])[0]
+
+    def read_each(self, actions: np.ndarray) -> Any:
+        """Return the actions that the space has for those of agents (k, ...), one by one, in its type."""
+        given = self.read_all(actions)
+        return given.tolist() if isinstance(self.action, Discrete) else given.astype(self.space.dtype)
 
     def read_all(self, actions: np.ndarray) -> np.ndarray:
-        """Return the actions (k, ...) that the space has for those of agents."""
-        if self.discrete:
-            return self.start + actions
-        scaled = self.middle + np.clip(actions, -1, 1).reshape(len(actions), *self.space.shape) * self.half
-        return scaled.astype(self.space.dtype)
+        """Return the actions (k, ...) that the space has for those of agents; choices as int32."""
+        shaped = actions.reshape(len(actions), *self.space.shape)
+        if not isinstance(self.action, Continuous):
+            return (shaped + getattr(self.space, "start", 0)).astype(np.int32)
+        return (self.middle + np.clip(shaped, -1, 1) * self.half).astype(self.space.dtype)
+
+
+def _require_bounded(name: str, space: Any) -> None:
+    """Refuse a space of actions that is no bounded Box of floats.
+
+    Raises:
+        InputError: it is none.
+    """
+    if not _is_box(space) or not np.issubdtype(space.dtype, np.floating) or not np.prod(space.shape):
+        raise InputError(
+            f"{name} takes {shown(space)} as actions, and agents give a Discrete, MultiDiscrete or MultiBinary, or a "
+            "Box of floats"
+        )
+    if not np.all(np.isfinite(space.low) & np.isfinite(space.high)):
+        raise InputError(
+            f"{name} takes actions without bounds, which agents give in [-1, 1]; wrap the environment in "
+            "gymnasium.wrappers.RescaleAction, or give its Box a low and a high"
+        )

@@ -17,7 +17,7 @@ class Past(NamedTuple):
     """Holds the last H steps of an episode, the latest one last; entries from before the episode are zero."""
 
     obs: Array  # (..., H, O) before the action
-    action: Array  # (..., H, A), or (..., H) int32 if actions are discrete
+    action: Array  # (..., H, A); of discrete actions (..., H) int32, or (..., H, D) int32 of several
     reward: Array  # (..., H)
     known: Array  # (..., H) 1 for a step that was taken, 0 from before the episode
 

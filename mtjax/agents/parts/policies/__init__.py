@@ -6,16 +6,19 @@ To add a kind of actions, add its class to ``mtjax.types``, and a file and a lin
 from mtjax.agents.parts.policies.base import Drawn, Policy
 from mtjax.agents.parts.policies.categorical import Categorical
 from mtjax.agents.parts.policies.gaussian import Gaussian
-from mtjax.types import Continuous, Discrete
+from mtjax.agents.parts.policies.multi_categorical import MultiCategorical
+from mtjax.types import Action, Continuous, Discrete, MultiDiscrete
 
 
-def policy_for(action: Continuous | Discrete) -> Policy:
+def policy_for(action: Action) -> Policy:
     """Return the policy of an environment with such actions."""
     match action:
         case Continuous():
             return Gaussian()
         case Discrete(size):
             return Categorical(size)
+        case MultiDiscrete():
+            return MultiCategorical(action)
 
 
-__all__ = ["Categorical", "Drawn", "Gaussian", "Policy", "policy_for"]
+__all__ = ["Categorical", "Drawn", "Gaussian", "MultiCategorical", "Policy", "policy_for"]

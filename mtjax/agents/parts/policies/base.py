@@ -12,7 +12,7 @@ from mtjax.types import Array, Key
 class Drawn(NamedTuple):
     """Holds what a policy has drawn."""
 
-    action: Array  # as the world takes it: (..., A), or (...,) int32 if actions are discrete
+    action: Array  # as the world takes it: (..., A); of discrete actions (...,) int32, or (..., D) int32 of several
     raw: Array  # what ``log_prob`` takes: of a tanh-squashed Gaussian the action before the tanh
     log_prob: Array  # (...,) its log-probability; 0 for the mode of a Gaussian
 
@@ -46,7 +46,7 @@ class Policy(abc.ABC):
 
     @abc.abstractmethod
     def draw(self, outputs: Array, mask: Array | None, key: Key | None) -> Drawn:
-        """Draw actions; without a key, take the mode: the mean of a Gaussian before the tanh, the likeliest choice."""
+        """Draw actions; without a key, take the mode: the mean of a Gaussian before the tanh, the likeliest choices."""
 
     @abc.abstractmethod
     def action(self, raw: Array, mask: Array | None) -> Array:
