@@ -57,16 +57,17 @@ def test_the_importance_of_a_gaussian_policy():
     """Of N(w x, s): x^2 / s^2 for w, and 2 / s^2 for s, averaged over inputs."""
     x, params = np.float32([1.0, -2.0, 0.5]), {"w": jnp.float32(0.3), "s": jnp.float32(0.4)}
     outputs = lambda params, x: jnp.stack([params["w"] * x, params["s"]])
-    found = continual.ewc(outputs, continual.of_gaussian, params, x)
+    information = lambda outputs: jnp.stack([1 / outputs[1] ** 2, 2 / outputs[1] ** 2])
+    found = continual.ewc(outputs, information, params, x)
     assert float(found["w"]) == pytest.approx(np.mean(x**2) / 0.4**2, rel=1e-5)
     assert float(found["s"]) == pytest.approx(2 / 0.4**2, rel=1e-5)
 
 
 def test_the_importance_is_the_curvature_of_the_divergence():
-    """Of a softmax policy: the diagonal of the second derivative of KL(pi | pi_theta) where they are equal."""
+    """Of log-probabilities, which weigh pi: the diagonal of the second derivative of KL(pi | pi_theta) at pi."""
     x, params = np.float32(RANDOM.normal(size=(5, 2))), {"w": jnp.float32(RANDOM.normal(size=(2, 3)))}
     outputs = lambda params, x: jax.nn.log_softmax(x @ params["w"])
-    found = continual.ewc(outputs, continual.of_log_probs, params, x)
+    found = continual.ewc(outputs, jnp.exp, params, x)
 
     def divergence(flat):
         one = lambda x: jnp.exp(outputs(params, x)) @ (outputs(params, x) - outputs({"w": flat.reshape(2, 3)}, x))

@@ -62,7 +62,7 @@ def ewc(
 
     Args:
         information: the Fisher information (K,) of the distribution that outputs (K,) describe, if it is diagonal:
-            that of each output by itself. See ``of_gaussian`` and ``of_log_probs``.
+            that of each output by itself.
     """
 
     def of_one(x: Any) -> Any:
@@ -71,17 +71,6 @@ def ewc(
         return jax.tree.map(squared, jax.jacrev(outputs)(params, x))
 
     return _mean(of_one, inputs)
-
-
-def of_gaussian(outputs: Array) -> Array:
-    """Return the Fisher information (2A,) of means and then standard deviations s (2A,): 1 / s^2 and 2 / s^2."""
-    deviation = jnp.split(outputs, 2)[1]
-    return jnp.concatenate([1 / jnp.square(deviation), 2 / jnp.square(deviation)])
-
-
-def of_log_probs(outputs: Array) -> Array:
-    """Return the weights (A,) with which squared slopes of log-probabilities (A,) add up to the Fisher information."""
-    return jnp.exp(outputs)
 
 
 def mas(outputs: Outputs, params: Any, inputs: Any) -> Any:

@@ -16,13 +16,12 @@ import jax.numpy as jnp
 from mtjax.agents import parts
 from mtjax.agents.networks import Params
 from mtjax.agents.parts import continual
-from mtjax.agents.parts.continual import Anchor, Outputs
+from mtjax.agents.parts.continual import GROUP, Anchor, Outputs
 from mtjax.agents.state import Nets
 from mtjax.types import Array, Key
 
 NET = "continual"
 """The network that holds what is kept."""
-_GROUP = 32  # inputs whose slopes are in memory at a time
 _NOBODY = -1  # the owner of no weight
 
 Information = Callable[[Array], Array]
@@ -145,13 +144,11 @@ class EWC(Nothing):
 
     @property
     def samples(self) -> int:  # type: ignore[override]
-        return self.fisher_samples // _GROUP * _GROUP
+        return self.fisher_samples // GROUP * GROUP
 
     def consolidate(self, nets: Nets, outputs: Outputs, information: Information, inputs: Any) -> Nets:
         params = nets["actor"].shared
-        return _hold(
-            nets, _in_groups(lambda x: continual.ewc(outputs, information, params, x, self.fisher_least), inputs)
-        )
+        return _hold(nets, continual.ewc(outputs, information, params, inputs, self.fisher_least))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -175,11 +172,11 @@ class MAS(Nothing):
 
     @property
     def samples(self) -> int:  # type: ignore[override]
-        return self.mas_samples // _GROUP * _GROUP
+        return self.mas_samples // GROUP * GROUP
 
     def consolidate(self, nets: Nets, outputs: Outputs, information: Information, inputs: Any) -> Nets:
         params = nets["actor"].shared
-        return _hold(nets, _in_groups(lambda x: continual.mas(outputs, params, x), inputs))
+        return _hold(nets, continual.mas(outputs, params, inputs))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -303,18 +300,9 @@ class Scratch(Nothing):
 
 
 def _require_group(holder: Any, name: str) -> None:
-    if getattr(holder, name) < _GROUP:
+    if getattr(holder, name) < GROUP:
         flag = name.replace("_", "-")
-        raise parts.InputError(f"{flag} must be at least {_GROUP}, not {getattr(holder, name)}")
-
-
-def _in_groups(mean: Callable[[Any], Any], inputs: Any) -> Any:
-    """Return the mean of a tree over inputs (N, ...). ``mean`` takes one group of them at a time, to save memory."""
-    groups = jax.tree.map(lambda x: x.reshape(-1, _GROUP, *x.shape[1:]), inputs)
-    count = len(jax.tree.leaves(groups)[0])
-    zeros = jax.tree.map(jnp.zeros_like, jax.eval_shape(mean, jax.tree.map(lambda x: x[0], groups)))
-    add = lambda total, group: (jax.tree.map(lambda x, y: x + y / count, total, mean(group)), None)
-    return jax.lax.scan(add, zeros, groups)[0]
+        raise parts.InputError(f"{flag} must be at least {GROUP}, not {getattr(holder, name)}")
 
 
 Remembering = Nothing
