@@ -16,7 +16,7 @@ from mtjax.saved import pretrained
 
 _KNOWN = (("environment", "env", ENVS), ("agent", "agent", AGENTS), ("preset", "preset", PRESETS))
 _MAY_CHANGE = {  # the only flags beside --resume
-    *("--resume", "--steps", "--import", "--distributed", "--profile", "--tensorboard", "--wandb")
+    *("--resume", "--steps", "--import", "--distributed", "--profile", "--tensorboard", "--view", "--wandb")
 }
 
 

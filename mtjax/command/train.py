@@ -6,8 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mtjax.agents.unseen import describe_unseen
-from mtjax.command import search, sweep
+from mtjax.checks import require_port
+from mtjax.command import beside, search, sweep
 from mtjax.command.run_config import parse
+from mtjax.command.words import flag_value
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import RunConfig
 from mtjax.learning import populations
@@ -30,6 +32,8 @@ def main(argv: Sequence[str]) -> None:
     """Start or resume a run, a sweep or a search."""
     if "--distributed" in argv:
         hosts.initialise()  # before anything looks at the devices
+    several = search.is_search(argv) or sweep.is_sweep(argv)
+    beside.require_none(several and flag_value(argv, "view", "0") != "0")
     if search.is_search(argv):
         return search.main(argv)
     if sweep.is_sweep(argv):
@@ -46,9 +50,11 @@ def main(argv: Sequence[str]) -> None:
     start = None if begun else load_start(config)
     check(config, start)
     if directory is None and memory.seeds_exceed_memory(config):
+        beside.require_none(config.view)
         return sweep.run_all([config], "rounds")
     directory = _prepare(config, directory)
-    result = launch(config, Hooks(directory, start, resume))
+    with beside.page(config.view * hosts.is_first(), directory, import_flags(config)):
+        result = launch(config, Hooks(directory, start, resume))
     if hosts.is_first():
         _conclude(config, result, directory)
     if result.signal and not result.finished:
@@ -58,6 +64,8 @@ def main(argv: Sequence[str]) -> None:
 @hosts.by_first
 def _prepare(config: RunConfig, directory: Path | None) -> Path:
     """Make the folder of a new run with its config.json, or update the steps of a resumed run."""
+    if config.view:
+        require_port(config.view)
     if directory is not None:
         with lock.hold(directory):
             record_steps(directory / "config.json", config.plan.steps)
