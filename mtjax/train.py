@@ -2,31 +2,31 @@
 
 from collections.abc import Sequence
 
-from mtjax.command import flag_files, help, imports, process, refusals, words
+from mtjax.command import flag_files, help, imports, process, refusals
 from mtjax.names import become, command, load
 
 
 @command
 def main(argv: Sequence[str]) -> None:
     """Check names and flags first, then import the training code and run the command line."""
-    flags = words.with_port(flag_files.expand(argv))
+    flags = flag_files.expand(argv)
     with flag_files.naming(argv):
         _run(flags)
 
 
 def _run(argv: Sequence[str]) -> None:
-    rest = imports.import_files(argv)
-    refusals.check_names(rest)
-    if len(rest) == len(argv):  # else the full parser checks the flags of the user's own classes
-        refusals.check_flags(rest)
-    if rest in (["--help"], ["-h"]):
+    words = imports.import_files(argv)
+    refusals.check_names(words)
+    if len(words) == len(argv):  # else the full parser checks the flags of the user's own classes
+        refusals.check_flags(words)
+    if words in (["--help"], ["-h"]):
         print(help.overview())
         return
-    if "--list" in rest:
+    if "--list" in words:
         print(help.catalogue())
         return
     load("mtjax.training.allocator:share_arenas")()  # before there are threads
-    if "--distributed" not in rest:  # else all processes find their devices together
+    if "--distributed" not in words:  # else all processes find their devices together
         load("mtjax.parallel.hosts:find_devices")()
     load("mtjax.command.train:main")(argv)
 

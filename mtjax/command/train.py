@@ -9,7 +9,6 @@ from mtjax.agents.unseen import describe_unseen
 from mtjax.checks import require_port
 from mtjax.command import beside, search, sweep
 from mtjax.command.run_config import parse
-from mtjax.command.words import flag_value
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import RunConfig
 from mtjax.learning import populations
@@ -32,8 +31,8 @@ def main(argv: Sequence[str]) -> None:
     """Start or resume a run, a sweep or a search."""
     if "--distributed" in argv:
         hosts.initialise()  # before anything looks at the devices
-    several = search.is_search(argv) or sweep.is_sweep(argv)
-    beside.require_none(several and flag_value(argv, "view", "0") != "0")
+    paged = any(word.split("=", 1)[0] == "--view" for word in argv)
+    beside.require_none(paged and (search.is_search(argv) or sweep.is_sweep(argv)))
     if search.is_search(argv):
         return search.main(argv)
     if sweep.is_sweep(argv):
