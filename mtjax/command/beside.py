@@ -16,6 +16,7 @@ from mtjax.checks import HOME
 from mtjax.names import InputError
 
 _NICE = 10  # by how much its priority is lower
+_PATIENCE = 5.0  # seconds that it has to end
 
 
 def require_none(asked: Any) -> None:
@@ -52,5 +53,7 @@ def page(port: int, directory: Path, imports: Sequence[str]) -> Iterator[None]:
         print(f"see it live at http://{HOME}:{port}", flush=True)
         yield
     finally:
-        process.terminate()
-        process.communicate()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.communicate(timeout=_PATIENCE)  # which closes its input: an open page gets the last numbers
+        process.kill()
+        process.wait()

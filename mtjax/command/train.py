@@ -54,8 +54,8 @@ def main(argv: Sequence[str]) -> None:
     directory = _prepare(config, directory)
     with beside.page(config.view * hosts.is_first(), directory, import_flags(config)):
         result = launch(config, Hooks(directory, start, resume))
-    if hosts.is_first():
-        _conclude(config, result, directory)
+        if hosts.is_first():
+            _conclude(config, result, directory)
     if result.signal and not result.finished:
         sys.exit(128 + result.signal)
 

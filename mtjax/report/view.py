@@ -8,11 +8,12 @@ import contextlib
 import io
 import itertools
 import json
+import math
 import os
 import stat
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Mapping
 from functools import lru_cache
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -38,11 +39,12 @@ from mtjax.types import Task
 _FPS, _LONGEST = 25, 30.0  # pictures a second, and seconds after which worlds move by a newer policy
 _MOST = 9  # tasks beside each other
 _WAIT = 2.0  # seconds until what failed is tried again
+_PATIENCE = 4.0  # seconds in which a page that is open asks again
 _EDGE = "next-picture"
 _HEADERS = {
     "Cache-Control": "no-store",
-    "Content-Security-Policy": "default-src 'none'; img-src 'self'; connect-src 'self'; script-src 'unsafe-inline'; "
-    "style-src 'unsafe-inline'",
+    "Content-Security-Policy": "default-src 'none'; connect-src 'self'; img-src 'self' data:; "
+    "script-src 'unsafe-inline'; style-src 'unsafe-inline'",
     "X-Content-Type-Options": "nosniff",
 }
 
@@ -62,7 +64,7 @@ def show(request: Any, vary: Mapping[str, str]) -> None:
     with Server(request, vary) as server, contextlib.suppress(KeyboardInterrupt):
         print(f"see it at http://{HOME}:{server.server_port}, and end it by Ctrl-C", flush=True)
         if _is_fed():
-            threading.Thread(target=lambda: (_read_all(), server.shutdown()), daemon=True).start()
+            threading.Thread(target=_end_with_input, args=(server,), daemon=True).start()
         server.serve_forever()
 
 
@@ -73,9 +75,12 @@ def _is_fed() -> bool:
     return False
 
 
-def _read_all() -> None:
+def _end_with_input(server: "Server") -> None:
+    """Stop a server when this process's input is closed, and a page that is open has the last numbers."""
     while os.read(0, 4096):
         pass
+    server.wait_until_told()
+    server.shutdown()
 
 
 class _Playing(NamedTuple):
@@ -95,7 +100,7 @@ class Worlds:
         self.checkpoints = pretrained.folder(request.run) / "checkpoints"
         self.playing, self.played = lru_cache(1)(self._load), lru_cache(1)(self._play)
 
-    def stream(self, split: str = "", number: int = 0) -> Iterator[bytes]:
+    def stream(self, split: str = "", number: int = 0) -> Generator[bytes, None, None]:
         """Yield pictures as JPEG, each when it is to be shown, until ``ended`` is set.
 
         Args:
@@ -111,7 +116,7 @@ class Worlds:
             if self.ended.is_set():
                 return
 
-    def _episode(self, episode: int, split: str, number: int) -> Iterator[bytes]:
+    def _episode(self, episode: int, split: str, number: int) -> Generator[bytes, None, None]:
         with self.busy:  # so that pages that look at once share what is played
             newest = self._newest()
             env, named, played = (
@@ -167,6 +172,7 @@ class Server(ThreadingHTTPServer):
         self.watched = Watched.of(folder, config, other_tasks(config.family, vary, request.drawn))
         self.worlds, self.reading = Worlds(request, vary), threading.Lock()
         self.streams: set[threading.Thread] = set()
+        self.told, self.when = threading.Event(), -math.inf  # when a page had numbers
         self.page = (resources.files("mtjax.report") / "view.html").read_bytes()
         super().__init__((HOME, request.view), _Answers)
 
@@ -181,6 +187,17 @@ class Server(ThreadingHTTPServer):
         """Return what the page shows of the run, as JSON."""
         with self.reading:
             return json.dumps(self.watched.told(), allow_nan=False).encode()
+
+    def note_told(self) -> None:
+        """Note that a page has the numbers of now."""
+        self.when = time.monotonic()
+        self.told.set()
+
+    def wait_until_told(self) -> None:
+        """Wait until a page that is open has the numbers of now."""
+        self.told.clear()
+        if time.monotonic() - self.when < _PATIENCE:
+            self.told.wait(_PATIENCE)
 
 
 class _Answers(BaseHTTPRequestHandler):
@@ -200,6 +217,7 @@ class _Answers(BaseHTTPRequestHandler):
                 self._answer("text/html; charset=utf-8", self.server.page)
             elif asked.path == "/run.json":
                 self._answer("application/json", self.server.numbers())
+                self.server.note_told()
             elif asked.path == "/worlds" and query.get("task", "0").isdecimal():
                 self._stream(query.get("split", ""), int(query.get("task", "0")))
             else:

@@ -6,7 +6,7 @@ import math
 import os
 import re
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -87,7 +87,7 @@ class Watched(NamedTuple):
             {
                 "title": f"{self.config.agent} on {self.config.env}",
                 "folder": str(self.directory),
-                **self._progress(curves),
+                **self._progress(),
                 "curves": {name: x for name, x in curves.items() if name == "steps" or _is_whole_runs(name)},
                 "evaluated": [] if evaluations is None else evaluations.steps,
                 "scores": {name: means(x) for name, x in scores.items()},
@@ -95,9 +95,9 @@ class Watched(NamedTuple):
             }
         )
 
-    def _progress(self, curves: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    def _progress(self) -> dict[str, Any]:
         """Return steps, how many there will be, seconds, those that are left, and whether a process goes on."""
-        rows, total = self.metrics.rows[-_RECENT * self.config.members :], self.config.plan.steps
+        rows, total = self.metrics.rows[-_RECENT * self.config.members :], self.config.length * self.config.worlds
         found: dict[str, Any] = {"seeds": self.config.members, "total": total, "running": lock.is_held(self.directory)}
         if not rows:
             return found | {"steps": 0, "seconds": None, "left": None, "silent": None}
