@@ -230,12 +230,14 @@ class _Answers(BaseHTTPRequestHandler):
     def _stream(self, split: str, number: int) -> None:
         """Send pictures, of which each takes the place of the one before."""
         self._begin(f"multipart/x-mixed-replace; boundary={_EDGE}")
+        edge = f"--{_EDGE}\r\n".encode()
         self.server.streams.add(threading.current_thread())
         try:
+            self.wfile.write(edge)
             with contextlib.closing(self.server.worlds.stream(split, number)) as pictures:
-                for picture in pictures:
-                    head = f"--{_EDGE}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(picture)}\r\n\r\n"
-                    self.wfile.write(head.encode() + picture + b"\r\n")
+                for picture in pictures:  # which browsers show once they see where it ends
+                    head = f"Content-Type: image/jpeg\r\nContent-Length: {len(picture)}\r\n\r\n"
+                    self.wfile.write(head.encode() + picture + b"\r\n" + edge)
         finally:
             self.server.streams.discard(threading.current_thread())
 
