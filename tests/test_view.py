@@ -6,6 +6,7 @@ import io
 import json
 import re
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -321,12 +322,42 @@ def test_training_does_not_notice_its_page(tmp_path, free, monkeypatch, capsys):
         socket.create_connection((HOME, free))
 
 
-def test_a_page_ends_when_its_input_is_closed(free):
-    """As that of a run's page is when the run is killed."""
+@pytest.mark.parametrize("how", ["closed", "interrupted"])
+def test_a_page_ends_with_its_input_or_by_ctrl_c(free, how):
+    """A run's page has a pipe as its input, which is closed when the run ends or is killed."""
     words = [sys.executable, "-m", "mtjax.evaluate", "--run=point-mass-vary-goal/sac-conditioned", f"--view={free}"]
     with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None and process.stdin is not None
         assert process.stdout.readline() == f"see it at http://{HOME}:{free}, and end it by Ctrl-C\n"
         assert ask(free)["title"] == "sac-conditioned on point-mass-vary-goal"
-        process.stdin.close()
+        process.stdin.close() if how == "closed" else process.send_signal(signal.SIGINT)
         assert process.wait(60) == 0
+
+
+def test_a_page_that_is_open_has_the_last_numbers(finished_run):
+    """The server waits until it asks again, and for no other."""
+    with serving(finished_run) as server:
+        server.wait_until_told()  # nobody asks
+        answer(server, "/run.json")
+        waiting = threading.Thread(target=server.wait_until_told)
+        waiting.start()
+        assert waiting.is_alive()
+        answer(server, "/run.json")
+        waiting.join(1)
+        assert not waiting.is_alive()
+
+
+@pytest.mark.skipif(not shutil.which("chromium"), reason="needs chromium")
+def test_a_browser_shows_the_run(finished_run, server, tmp_path):
+    """Its progress, the curves of all splits, and a row with the latest return of each task."""
+    quiet = "gpu quic background-networking component-update sync".split()
+    words = ["--headless", "--no-sandbox", "--no-first-run", *(f"--disable-{name}" for name in quiet), "--dump-dom"]
+    words += [f"--user-data-dir={tmp_path}", "--timeout=20000", "--virtual-time-budget=5000"]
+    page = f"http://{HOME}:{server.server_port}/"
+    shown = subprocess.run(["chromium", *words, page], capture_output=True, text=True, stdin=subprocess.DEVNULL).stdout
+    told = json.loads(server.numbers())
+    assert "600 of 600 steps (100%) · means over 2 seeds" in shown and "· done</div>" in shown
+    assert all(f"{split}, evaluated: " in shown for split in told["scores"]["return"]) and "while it trains: " in shown
+    found = re.findall(r"<tr.*?<button>(.*?)</button>.*?<td>([\d.]*)</td><td>([\d.]+)</td></tr>", shown)
+    assert [name for name, _, _ in found] == [f"{task['called']} {task['label']}" for task in told["tasks"]]
+    np.testing.assert_allclose([float(x) for *_, x in found], [task["scored"] for task in told["tasks"]], rtol=0.05)
