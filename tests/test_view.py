@@ -27,11 +27,14 @@ import mtjax.evaluate
 import mtjax.train
 from mtjax.checks import HOME
 from mtjax.command import beside
+from mtjax.command.run_config import parse
 from mtjax.learning.evaluation import load_evaluations
 from mtjax.report import films, render
 from mtjax.report.view import Server, Worlds
 from mtjax.report.watch import Metrics
 from mtjax.saved import lock
+from mtjax.saved.config_json import from_json
+from mtjax.saved.folder import resumed_config
 from mtjax.saved.policy import load
 from mtjax.types import InputError
 
@@ -218,15 +221,17 @@ def test_pictures_are_streamed_by_the_task(server):
 
 
 def test_what_cannot_be_shown_is_said_in_the_picture(copied_run, monkeypatch):
-    """Before the first checkpoint, and of a task that is not there; whoever looks later sees the worlds."""
+    """Before the first checkpoint, while the policy is loaded, and of a task that is not there."""
     said = []
     monkeypatch.setattr("mtjax.report.view._card", lambda text: said.append(text) or np.zeros((8, 8, 3), np.uint8))
     worlds = Worlds(request(copied_run), {})
-    next(worlds.stream("train", 9))
+    no_task = worlds.stream("train", 9)
+    assert next(no_task) and next(no_task)
     shutil.rmtree(copied_run / "checkpoints")
     with lock.hold(copied_run):
         assert next(worlds.stream()).startswith(b"\xff\xd8")
-    assert said[0] == "there is no task 9 of train" and "once there is a checkpoint" in said[1]
+    assert said[0].startswith("the policy is loaded") and said[1] == "there is no task 9 of train"
+    assert "once there is a checkpoint" in said[2]
 
 
 def test_other_tasks_are_listed_without_the_runs_returns(finished_run):
@@ -278,6 +283,14 @@ def test_many_runs_have_no_page(short_family, words, tmp_path):
     with pytest.raises(InputError, match="--view shows one run"):
         mtjax.train.main([*SHORT_RUN, f"--runs={tmp_path}", "--view", *words.split()])
     assert not list(tmp_path.iterdir())
+
+
+def test_a_resumed_run_may_have_a_page_too(finished_run):
+    """It is no setting of the run, and --view alone takes the port that the guide names."""
+    words = [f"--resume={finished_run}", "--view"]
+    assert resumed_config(parse(words), finished_run, words).view == 8008
+    assert from_json(finished_run / "config.json").view == 0
+    assert parse(["--view", "9000"]).view == parse(["--view=9000"]).view == 9000
 
 
 def ask(port):

@@ -117,13 +117,12 @@ class Worlds:
                 return
 
     def _episode(self, episode: int, split: str, number: int) -> Generator[bytes, None, None]:
+        newest = self._newest()
+        if not self.played.cache_info().currsize:
+            yield _jpeg(_card("the policy is loaded, and plays its first episode"))
         with self.busy:  # so that pages that look at once share what is played
-            newest = self._newest()
-            env, named, played = (
-                self.playing(newest).policy.env,
-                self.playing(newest).named,
-                self.played(newest, episode),
-            )
+            playing, played = self.playing(newest), self.played(newest, episode)
+        env, named = playing.policy.env, playing.named
         chosen = [films.choose_one(env, split, number)] if split else films.choose(env, SPLITS[:1], ())[:_MOST]
         with films.moving(env, chosen, *played, named) as (seconds, draw):
             begun = time.monotonic()
