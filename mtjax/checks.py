@@ -4,6 +4,7 @@ import dataclasses
 import importlib
 import numbers
 import os
+import socket
 from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -21,6 +22,8 @@ OF_TRAIN = (
 _LARGEST, _LARGEST_FLOAT = 2**31 - 1, 3.4e38  # of 32 bits
 MOST_EPISODES = 100_000
 """Episodes of a task in one evaluation."""
+HOME = "127.0.0.1"
+"""The address of pages, which other machines cannot reach."""
 _LARGEST_SEED = 2_000_000_000
 
 
@@ -199,6 +202,19 @@ def require_run(folder: Path) -> None:
     inside = max(folder.glob("*/config.json"), key=lambda file: file.stat().st_mtime, default=None)
     hint = "" if inside is None else f"; it holds runs, the newest is {str(inside.parent)!r}"
     raise InputError(f"{str(folder)!r} is not a run: it has no config.json{hint}")
+
+
+def require_port(port: int) -> None:
+    """Check that a page of this machine can be served at a port.
+
+    Raises:
+        InputError: the port is none, or another program has it.
+    """
+    require_whole("view", port, 1, 65535)
+    try:
+        socket.create_server((HOME, port)).close()
+    except OSError as error:
+        raise InputError(f"port {port} cannot be used ({error.strerror}); give another one: --view=PORT") from None
 
 
 _EXTRAS = {"tensorboardX": "tensorboard", "optuna": "search", "huggingface_hub": "hub"}  # library -> its extra

@@ -132,6 +132,9 @@ class RunConfig:
     wandb: str = ""
     """Name of the Weights & Biases project to log to, with one run for each seed (pip install 'mtjax[wandb]').
     WANDB_MODE=offline keeps the logs in the run's folder."""
+    view: int = 0
+    """Show the run on a page of this machine while it lasts: its curves, and its newest policy in worlds that move. The
+    number is the page's port; --view alone takes 8008."""
     profile: bool = False
     """Write a trace of one warm chunk by JAX's profiler into the run's folder."""
     distributed: bool = False

@@ -1,4 +1,4 @@
-"""``python -m mtjax.evaluate --run=DIR``: score, plot and film a trained run on every task of every split."""
+"""``python -m mtjax.evaluate --run=DIR``: score, plot, film or show a run on every task of every split."""
 
 import dataclasses
 import math
@@ -41,6 +41,9 @@ class Request:
     export: str = ""
     """File to write the first seed's policy into: one that ends with .npz for ``mtjax/saved/standalone.py``, which
     reads it with NumPy or JAX alone, or with .onnx for other runtimes."""
+    view: int = 0
+    """Score nothing, and show a page on this machine: the run's curves as they come, and its newest policy in worlds
+    that move. The number is the page's port; --view alone takes 8008."""
     diagnostics: bool = False
     """Measure conflicts between the tasks' gradients, and unused units of the networks, from the run's replay."""
 
@@ -54,14 +57,14 @@ class Request:
 def main(argv: Sequence[str]) -> None:
     """Read the command line first, then import the evaluation code and score the run."""
     request, vary = _parse(argv)
-    load("mtjax.report.scoring:report")(request, vary)
+    load("mtjax.report.view:show" if request.view else "mtjax.report.scoring:report")(request, vary)
 
 
 def _parse(argv: Sequence[str]) -> tuple[Request, dict[str, str]]:
     """Return the request, and the values of --env.vary.NAME=VALUES by name."""
     if argv and not argv[0].startswith("-"):
         raise InputError(f"say which run to evaluate by --run={argv[0]}")
-    vary, argv = words.vary_flags(imports.import_files(argv))
+    vary, argv = words.vary_flags(imports.import_files(words.with_port(argv)))
     refusals.check_flags_of(Request, argv)
     request = parsing.parse_with_tyro(Request, argv, Request(), "python -m mtjax.evaluate")
     if not request.run:
@@ -75,6 +78,8 @@ def _parse(argv: Sequence[str]) -> tuple[Request, dict[str, str]]:
     chosen = request.video_splits or request.video_tasks
     if chosen and not request.video:
         raise InputError("--video-splits and --video-tasks say what to film; give --video as well")
+    if request.view and (request.video or request.export or request.diagnostics):
+        raise InputError("--view shows a run and scores nothing; leave out --video, --export and --diagnostics")
     if vary and (request.video_splits or request.diagnostics):
         raise InputError("tasks of --env.vary belong to no split, and diagnostics are of the run's own tasks")
     if request.drawn is not None and (vary or request.diagnostics):

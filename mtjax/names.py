@@ -36,7 +36,7 @@ _IN_COMMAND = ContextVar("in_command", default=False)
 _VARY = re.compile(r"--env\.vary\.([\w.-]+)=([^\s;)]+)")
 _FLAG = re.compile(r"(?<![\w-])--(?:env\.|agent\.)?([a-z][a-z-]*[a-z])(?:=([^\s,;:)]*[^\s,;:).]))?(?![\w-]|\.\w)")
 _OTHER_NAMES = {"from": "start", "distributed": "jax.distributed", "runs": "directory"}  # flag -> argument
-_ONLY_FLAGS = ("config", "help", "import", "list", "no-deps", "resume", "run", "sweep", "video")
+_ONLY_FLAGS = ("config", "help", "import", "list", "no-deps", "resume", "run", "sweep", "video", "view")
 P = ParamSpec("P")
 R = TypeVar("R")
 

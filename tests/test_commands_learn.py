@@ -42,6 +42,7 @@ _PULLS = "ten pulls earn between 5 and 6.02, too little to see in few trials; te
 _BELIEVES = "ten pulls earn between 5 and 6.02; tests/test_posterior.py has beliefs that are known"
 _SOON = "earns nearly all that it can before its first evaluation; tests/test_pqn.py has probes"
 _CRAFT = "takes longer than ten minutes of two CPU cores; tests/test_sketches.py learns in a small corridor"
+_PAGE = "is --quick with a page; tests/test_view.py has a run with one"
 _LOOP = "--env=point-mass-vary-goal --agent=multi-head"  # one pair of the loop around the command
 
 MARKS: dict[str, Learns | str] = {
@@ -90,6 +91,7 @@ MARKS: dict[str, Learns | str] = {
     "--chunk-steps=100": _GPU,
     "--env=finger-spin-vary-size --agent=pcgrad --help": _HELP,
     "--env=finger-spin-vary-size --agent=care --help": _HELP,
+    "--quick --view": _PAGE,
     "--config=settings.toml --steps=2000000": _OTHER,
     "--resume=runs/...": _OTHER,
     "'--resume=$run'": _OTHER,

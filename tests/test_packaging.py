@@ -38,7 +38,8 @@ def built(place):
 
 
 def package_files():
-    files = (path for path in (ROOT / "mtjax").rglob("*") if path.suffix in (".py", ".xml", ".toml", ".npz", ".json"))
+    kinds = (".py", ".xml", ".toml", ".npz", ".json", ".html")
+    files = (path for path in (ROOT / "mtjax").rglob("*") if path.suffix in kinds)
     return {str(path.relative_to(ROOT)) for path in files}
 
 

@@ -9,14 +9,14 @@ from pathlib import Path
 from mtjax.agents import AGENTS
 from mtjax.checks import require_run
 from mtjax.command.sources import all_flags, as_flag, whole_flags
-from mtjax.command.words import VARY, flag_value, is_whole, switched_off, switched_on
+from mtjax.command.words import VARY, flag_value, is_whole, switched_off, switched_on, with_port
 from mtjax.envs import BENCHMARKS, ENVS, members
 from mtjax.names import PRESETS, InputError, nearest_error
 from mtjax.saved import pretrained
 
 _KNOWN = (("environment", "env", ENVS), ("agent", "agent", AGENTS), ("preset", "preset", PRESETS))
 _MAY_CHANGE = {  # the only flags beside --resume
-    *("--resume", "--steps", "--import", "--distributed", "--profile", "--tensorboard", "--wandb")
+    *("--resume", "--steps", "--import", "--distributed", "--profile", "--tensorboard", "--view", "--wandb")
 }
 
 
@@ -26,6 +26,7 @@ def check_names(argv: Sequence[str]) -> None:
     Raises:
         InputError: there is no such name or folder, or --resume came with flags that change the run.
     """
+    argv = with_port(argv)
     for kind, flag, known in _KNOWN:
         given = flag_value(argv, flag, None)
         if given is None:

@@ -11,7 +11,7 @@ from mtjax.command.imports import import_files, imports_of
 from mtjax.command.parsing import parse_with_tyro
 from mtjax.command.refusals import check_names, unknown_flag
 from mtjax.command.sources import all_flags
-from mtjax.command.words import flag_value, plain_values, split_flags, switched_off, switched_on, vary_flags
+from mtjax.command.words import flag_value, plain_values, split_flags, switched_off, switched_on, vary_flags, with_port
 from mtjax.config import NO_FINE_TUNING, RunConfig, fit_length, own_files, with_preset
 from mtjax.envs import is_mixture, make, require_pictures
 from mtjax.envs.family import Family
@@ -33,7 +33,7 @@ def parse(argv: Sequence[str]) -> RunConfig:
         InputError: a name, flag or value cannot be used.
     """
     files, _ = imports_of(argv)
-    argv = plain_values(import_files(argv))
+    argv = plain_values(with_port(import_files(argv)))
     check_names(argv)
     env_name = flag_value(argv, "env", RunConfig.env)
     start = flag_value(argv, "from", "")

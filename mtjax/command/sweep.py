@@ -36,7 +36,7 @@ from mtjax.training.launch import check, launch, load_start
 from mtjax.training.run import Hooks
 from mtjax.types import SPLITS, InputError
 
-_FIXED = ("seed", "seeds", "runs", "resume", "list", "import", "sweep", "from", "preset")
+_FIXED = ("seed", "seeds", "runs", "resume", "list", "import", "sweep", "from", "preset", "view")
 _LONGEST = 100  # of a folder's name
 _DIVERGED = "diverged.txt"  # holds the error of a run whose seeds all diverged
 

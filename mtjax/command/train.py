@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mtjax.agents.unseen import describe_unseen
-from mtjax.command import search, sweep
+from mtjax.checks import require_port
+from mtjax.command import beside, search, sweep
 from mtjax.command.run_config import parse
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import RunConfig
@@ -30,6 +31,8 @@ def main(argv: Sequence[str]) -> None:
     """Start or resume a run, a sweep or a search."""
     if "--distributed" in argv:
         hosts.initialise()  # before anything looks at the devices
+    paged = any(word.split("=", 1)[0] == "--view" for word in argv)
+    beside.require_none(paged and (search.is_search(argv) or sweep.is_sweep(argv)))
     if search.is_search(argv):
         return search.main(argv)
     if sweep.is_sweep(argv):
@@ -46,11 +49,13 @@ def main(argv: Sequence[str]) -> None:
     start = None if begun else load_start(config)
     check(config, start)
     if directory is None and memory.seeds_exceed_memory(config):
+        beside.require_none(config.view)
         return sweep.run_all([config], "rounds")
     directory = _prepare(config, directory)
-    result = launch(config, Hooks(directory, start, resume))
-    if hosts.is_first():
-        _conclude(config, result, directory)
+    with beside.page(config.view * hosts.is_first(), directory, import_flags(config)):
+        result = launch(config, Hooks(directory, start, resume))
+        if hosts.is_first():
+            _conclude(config, result, directory)
     if result.signal and not result.finished:
         sys.exit(128 + result.signal)
 
@@ -58,6 +63,8 @@ def main(argv: Sequence[str]) -> None:
 @hosts.by_first
 def _prepare(config: RunConfig, directory: Path | None) -> Path:
     """Make the folder of a new run with its config.json, or update the steps of a resumed run."""
+    if config.view:
+        require_port(config.view)
     if directory is not None:
         with lock.hold(directory):
             record_steps(directory / "config.json", config.plan.steps)

@@ -8,6 +8,8 @@ from mtjax.command.sources import all_flags, whole_flags
 from mtjax.names import InputError
 
 VARY = "--env.vary."
+VIEW = 8008
+"""The port of the page that --view alone serves."""
 _WHOLE = re.compile(r"[+-]?\d+(_\d+)*")
 P = TypeVar("P")
 
@@ -44,6 +46,13 @@ def vary_flags(argv: Sequence[str]) -> tuple[dict[str, str], list[str]]:
     needed = "values; give lo:hi:n, lo:hi or a list a,b,c"
     given, rest = split_flags(argv, lambda flag: flag.startswith(VARY), needed)
     return {flag.removeprefix(VARY): value for flag, value in given.items()}, rest
+
+
+def with_port(argv: Sequence[str]) -> list[str]:
+    """Return a command line in which --view alone has a port."""
+    after = [*argv[1:], ""]
+    alone = lambda word, then: word == "--view" and not is_whole(then)
+    return [f"--view={VIEW}" if alone(*pair) else pair[0] for pair in zip(argv, after, strict=False)]
 
 
 def plain_values(argv: Sequence[str]) -> list[str]:

@@ -3,7 +3,9 @@
 import contextlib
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,6 +27,7 @@ from mtjax.types import SPLITS, Task
 
 _FPS = 25
 _WIDTHS = ((4, 320), (9, 240))  # of a tile, for up to so many tasks; beyond, the narrowest
+_LIVE_WIDTHS = ((1, 480), *_WIDTHS)
 _NARROWEST = 160
 _WORDS = re.compile("[^ ,]+[ ,]*")  # after which a caption may go on in the next line
 
@@ -66,6 +69,21 @@ def choose(env: Tabled, splits: Sequence[str], tasks: Sequence[int]) -> list[Cho
     return found
 
 
+def choose_one(env: Tabled, split: str, number: int) -> Chosen:
+    """Return the task with a number in a split, for a film.
+
+    Raises:
+        InputError: there is no such task, or its family shows no pictures.
+    """
+    for part in env.parts:
+        for i in np.flatnonzero(part.places.get(split, np.zeros(0)) == number):
+            if not part.family.films:
+                raise InputError(f"{part.name or 'this family'} shows no pictures")
+            own = int(part.family.table.rows[split][i])
+            return Chosen(part, split, int(part.places["all"][own]), own)
+    raise InputError(f"there is no task {number} of {split}")
+
+
 def write(
     policy: Policy,
     tasks: Task,
@@ -83,13 +101,8 @@ def write(
         named: other names of splits.
     """
     env = policy.env
-    render.choose_backend()
-    with contextlib.ExitStack() as filmed, host.explaining():
-        for part in env.parts:
-            filmed.enter_context(part.family.filmed())
-        played = jax.block_until_ready(record(env, policy.agent, policy.state, tasks, jnp.int32(seed)))
-    by_name = {part.name: states for part, states in zip(env.parts, apart(played.states), strict=True)}
-    width = next((width for most, width in _WIDTHS if len(chosen) <= most), _NARROWEST)
+    played, by_name = play(policy, tasks, seed)
+    width = _width(len(chosen), _WIDTHS)
     count, tiles = max(round(seconds * _FPS), 1), []
     for i, one in enumerate(chosen):
         print(f"filming {i + 1} of {len(chosen)}: {', '.join(_caption(env, one, played, named))}", flush=True)
@@ -98,6 +111,58 @@ def write(
     path = render.write_video(stem, grid(captioned(tiles, captions)), _FPS)
     print(f"filmed {path.name}: {len(chosen)} tasks")
     return path
+
+
+def play(policy: Policy, tasks: Task, seed: int) -> tuple[Recording, dict[str, Any]]:
+    """Play one episode of each task, and return it, and the states of each family by its name."""
+    env = policy.env
+    render.choose_backend()
+    with contextlib.ExitStack() as filmed, host.explaining():
+        for part in env.parts:
+            filmed.enter_context(part.family.filmed())
+        played = jax.block_until_ready(record(env, policy.agent, policy.state, tasks, jnp.int32(seed)))
+    return played, {part.name: states for part, states in zip(env.parts, apart(played.states), strict=True)}
+
+
+@contextlib.contextmanager
+def moving(
+    env: Tabled, chosen: Sequence[Chosen], played: Recording, by_name: Mapping[str, Any], named: Mapping[str, str]
+) -> Iterator[tuple[float, Callable[[float], np.ndarray]]]:
+    """Give the seconds until the last of the chosen tasks' episodes ends, and a function that draws all at a time [s].
+
+    It draws one frame (height, width, 3), with captions. Only the thread that opens it may draw.
+    """
+    width = _width(len(chosen), _LIVE_WIDTHS)
+    captions = [_caption(env, one, played, named) for one in chosen]
+    with contextlib.ExitStack() as opened:
+        tiles = [opened.enter_context(_drawing(env, one, played, by_name[one.part.name], width)) for one in chosen]
+        draw = lambda time: grid(captioned([tile(time)[None] for tile in tiles], captions))[0]
+        yield max(int(played.lengths[one.place]) / _steps_per_second(one) for one in chosen), draw
+
+
+@contextlib.contextmanager
+def _drawing(
+    env: Tabled, one: Chosen, played: Recording, states: Any, width: int
+) -> Iterator[Callable[[float], np.ndarray]]:
+    """Give a function that draws one task at a time [s]; the last frame stays after the episode's end."""
+    family: Any = one.part.family
+    row, length = env.own_row(int(played.rows[one.place])), int(played.lengths[one.place])
+    shown, size = jax.tree.map(lambda x: x[one.own][:length], states), (width, width * 3 // 4)
+    kept = lambda i: family.pictures(jax.tree.map(lambda x: x[i : i + 1], shown), *size)[0]
+    opened = render.drawing(family, row, shown, *size) if isinstance(family, Pictured) else nullcontext(kept)
+    with opened as draw:
+        of_step = lru_cache(1)(draw)
+        yield lambda time: of_step(min(int(time * _steps_per_second(one)), length - 1))
+
+
+def _steps_per_second(one: Chosen) -> float:
+    """Return how many steps of a world a second of a film shows."""
+    return one.part.family.film_speed / one.part.family.seconds_per_step
+
+
+def _width(count: int, widths: Sequence[tuple[int, int]]) -> int:
+    """Return the width of each of ``count`` tiles."""
+    return next((width for most, width in widths if count <= most), _NARROWEST)
 
 
 def _caption(env: Tabled, one: Chosen, played: Recording, named: Mapping[str, str]) -> tuple[str, str]:
@@ -112,7 +177,7 @@ def _tile(env: Tabled, one: Chosen, played: Recording, states: Any, count: int, 
     family: Any = one.part.family
     row = env.own_row(int(played.rows[one.place]))
     length = int(played.lengths[one.place])
-    times = np.arange(count) / _FPS * family.film_speed / family.seconds_per_step
+    times = np.arange(count) / _FPS * _steps_per_second(one)
     steps = np.unique(np.minimum(times.astype(int), length - 1))
     shown = jax.tree.map(lambda x: x[one.own][steps], states)  # also of keys, which NumPy has not
     size = width, width * 3 // 4

@@ -1,11 +1,12 @@
 """Videos of a task, drawn without a display."""
 
+import contextlib
 import importlib
 import math
 import operator
 import os
 import platform
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -44,10 +45,27 @@ def film(
 ) -> np.ndarray:
     """Draw the task in row ``task_row`` of ``env.table`` in each of the states, leaves (H, ...).
 
-    The scene is that of observations from pixels, by default with shadows, and with goals that the agent does not see.
-
     Returns:
         Frames (H, height, width, 3) uint8.
+
+    Raises:
+        InputError: as for ``drawing``.
+    """
+    with drawing(env, task_row, states, width, height, shadows) as draw:
+        frames = np.empty((len(jax.tree.leaves(states)[0]), height, width, 3), np.uint8)
+        for i, frame in enumerate(frames):
+            draw(i, frame)
+    return frames
+
+
+@contextlib.contextmanager
+def drawing(
+    env: Pictured, task_row: int, states: Any, width: int, height: int, shadows: bool = True
+) -> Iterator[Callable[..., np.ndarray]]:
+    """Give a function that draws the task in row ``task_row`` in state ``i`` of states, leaves (H, ...), into an array.
+
+    The scene is that of observations from pixels, by default with shadows, and with goals that the agent does not see.
+    Without an array the function makes a frame (height, width, 3) uint8. Only the thread that opens it may draw.
 
     Raises:
         InputError: there is no such row, or no OpenGL backend works. The message names what to install.
@@ -60,16 +78,17 @@ def film(
     model.light_castshadow &= shadows
     data, task = mujoco.MjData(model), jax.tree.map(lambda x: x[task_row], env.table.tasks)
     shown = jax.tree.map(np.asarray, jax.vmap(partial(env.visible, task))(states))
-    frames = np.empty((len(shown.joints), height, width, 3), np.uint8)
     with _open_renderer(model, width, height) as renderer:
-        for i, frame in enumerate(frames):
+
+        def draw(i: int, out: np.ndarray | None = None) -> np.ndarray:
             visible = jax.tree.map(operator.itemgetter(i), shown)
             data.qpos[:] = visible.joints
             _arrange(model, visible)
             mujoco.mj_forward(model, data)
             renderer.update_scene(data, 0)
-            renderer.render(out=frame)
-    return frames
+            return renderer.render(out=out)
+
+        yield draw
 
 
 def write_video(path_stem: str | Path, frames: np.ndarray, fps: float) -> Path:

@@ -33,7 +33,7 @@ from mtjax.saved.tables import pandas
 from mtjax.types import SPLITS, InputError, Task
 
 _FIRST_NUMBER = 1_000_000  # beyond the numbers of a run's own evaluations, so that the episodes are new
-_GIVEN = "given"  # the split of tasks that are not the run's own
+GIVEN = {"train": "given"}  # the name of the split of tasks that are not the run's own
 
 
 class Evaluation(NamedTuple):
@@ -59,7 +59,7 @@ class Evaluation(NamedTuple):
         """
         rows = []
         for split, returns in self.returns.items():
-            own = "train" if split == _GIVEN else split
+            own = "train" if split in GIVEN.values() else split
             params, scores = self.env.params(own), {"return": returns} | {k: x[split] for k, x in self.metrics.items()}
             for s, t, e in np.ndindex(*returns.shape):
                 row = {"seed": self.seeds[s], "split": split, "task": t, **{name: x[t] for name, x in params.items()}}
@@ -104,7 +104,7 @@ def evaluate(
         raise InputError("tasks of vary and task_seed belong to no split of the run; leave out split")
     if vary and task_seed is not None:
         raise InputError("task_seed draws other tasks; leave out vary")
-    policy, tasks, named = _with_tasks(_policy(run, point, checkpoint), vary or {}, task_seed)
+    policy, tasks, named = with_tasks(_policy(run, point, checkpoint), vary or {}, task_seed)
     if split is not None and not len(policy.env.tasks(split).id):
         raise InputError(f"this run has no tasks of the split {split}")
     scores = score(policy, episodes, seed, tasks, split or "all")
@@ -123,7 +123,7 @@ def _policy(run: Any, point: int, checkpoint: int) -> Policy:
     """Return the policy of a run's first seed, with the states of all its seeds; a policy stays one of one seed."""
     if not isinstance(run, Result | Policy):
         folder = path(run, "run")
-        return load(folder, _first_seed(str(folder), point), checkpoint)
+        return load(folder, first_seed(str(folder), point), checkpoint)
     if checkpoint:
         raise InputError("checkpoint is of a run's folder; give that, or mtjax.load(folder, checkpoint=...)")
     if not isinstance(run.env, Tabled):
@@ -133,15 +133,21 @@ def _policy(run: Any, point: int, checkpoint: int) -> Policy:
     return run.policy(_entry(point, len(run.points), len(run.seeds), run.population))
 
 
-def _with_tasks(
+def with_tasks(
     policy: Policy, vary: Mapping[str, Any], task_seed: int | None
 ) -> tuple[Policy, Task | None, dict[str, str]]:
     """Return a policy with the tasks to play, those tasks if they are not the run's, and their split's other name."""
-    trained = policy.env
-    if not vary and task_seed is None:
+    trained, env = policy.env, other_tasks(policy.env, vary, task_seed)
+    if env is trained:
         return policy, None, {}
-    env = on_values(trained, vary) if vary else drawn_anew(trained, task_seed or 0)
-    return dataclasses.replace(policy, env=env), as_unseen(env.tasks("all"), trained), {"train": _GIVEN}
+    return dataclasses.replace(policy, env=env), as_unseen(env.tasks("all"), trained), GIVEN
+
+
+def other_tasks(env: Any, vary: Mapping[str, Any], task_seed: int | None) -> Any:
+    """Return an environment with tasks of its own, as ``on_values`` or ``drawn_anew``; itself if none are asked for."""
+    if vary:
+        return on_values(env, vary)
+    return env if task_seed is None else drawn_anew(env, task_seed)
 
 
 def report(request: Any, vary: Mapping[str, str]) -> None:
@@ -155,7 +161,7 @@ def report(request: Any, vary: Mapping[str, str]) -> None:
     """
     enable_compile_cache()
     run = request.run
-    first = _first_seed(run, request.point)
+    first = first_seed(run, request.point)
     policy = load(run, first, request.checkpoint)
     if request.video:
         films.require(policy.env)
@@ -163,7 +169,7 @@ def report(request: Any, vary: Mapping[str, str]) -> None:
         print(f"exported to {export(policy, request.export)}", flush=True)
     found = diagnostics.diagnose(policy, *load_experience(run, first)) if request.diagnostics else None
     trained = policy.env
-    policy, tasks, named = _with_tasks(policy, vary, request.drawn)
+    policy, tasks, named = with_tasks(policy, vary, request.drawn)
     if vary:
         print(f"trained on {ends(trained) or 'one task'}; scored on {ends(policy.env) or 'one task'}")  # type: ignore
     elif named:
@@ -223,7 +229,7 @@ def as_unseen(tasks: Task, env: Any) -> Task:
     )
 
 
-def _first_seed(run: str, point: int) -> int:
+def first_seed(run: str, point: int) -> int:
     """Return the first entry of S that belongs to a setting, or the member of a population."""
     config = from_json(pretrained.folder(run) / "config.json")
     return _entry(point, len(config.points), config.plan.seeds, config.plan.population)

@@ -106,7 +106,8 @@ def resumed_config(config: RunConfig, directory: Path, argv: Sequence[str]) -> R
     steps = config.plan.steps if extended else recorded.plan.steps
     now: dict[str, Any] = {"plan": dataclasses.replace(recorded.plan, steps=steps)}
     now |= {"tensorboard": recorded.tensorboard or config.tensorboard, "wandb": config.wandb or recorded.wandb}
-    return dataclasses.replace(recorded, **now, profile=config.profile, distributed=config.distributed)
+    now |= {"view": config.view, "profile": config.profile, "distributed": config.distributed}
+    return dataclasses.replace(recorded, **now)
 
 
 def record_steps(file: Path, steps: int) -> None:

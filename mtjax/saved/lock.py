@@ -16,6 +16,7 @@ _FOLDERS = ("checkpoints", "store", "tensorboard")
 _WRITTEN = re.compile(  # the files and folders of runs and sweeps, also half-written and damaged ones
     rf"({_NAME}|config|metrics|evaluations|curve|profile|wandb|sweep|diverged|run-\d+|{'|'.join(_FOLDERS)})(\..*)?"
 )
+_HOLDER = re.compile(r"process (\d+) on (.*)")
 
 
 @contextlib.contextmanager
@@ -75,3 +76,24 @@ def _is_at(file: int, path: Path) -> bool:
         return os.path.samestat(os.fstat(file), os.stat(path))
     except FileNotFoundError:
         return False
+
+
+def is_held(directory: Path) -> bool:
+    """Return whether a process holds the lock of a folder, without taking it.
+
+    One that was killed leaves the file, and is known to be gone on its own host alone.
+    """
+    with contextlib.suppress(FileNotFoundError):
+        holder = _HOLDER.fullmatch((directory / _NAME).read_text(errors="replace"))
+        return holder is None or holder[2] != platform.node() or _is_alive(int(holder[1]))
+    return False
+
+
+def _is_alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)  # which ends nothing
+    except ProcessLookupError:
+        return False
+    except PermissionError:  # it is another user's
+        return True
+    return True
