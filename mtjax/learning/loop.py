@@ -301,11 +301,11 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
         observe = lambda learner, steps: at_point(agent, learner).observe(learner, steps, tasks)
         learners, steps = over_seeds(assess, 0, 0)(_of_played(state.agent, state.rows), steps)
         data = experience.add(state.data, steps)
-        learners, losses = _learn(env, agent, settings, tasks, learners, data, state.iteration, learn_key)
+        learners, losses, learned = _learn(env, agent, settings, tasks, learners, data, state.iteration, learn_key)
         learners = over_seeds(observe, 0, 0)(learners, steps)
         learners = _with_played(state.agent, learners, state.rows)
         data = data if experience.storage.kept else ()
-        return state._replace(agent=learners, data=data, key=key), seen | {"losses": losses}
+        return state._replace(agent=learners, data=data, key=key), seen | {"losses": losses, "learned": learned}
 
     state, history = jax.lax.scan(iterate, state, length=settings.chunk_steps // experience.steps)
     count = settings.num_envs * settings.chunk_steps
@@ -460,22 +460,22 @@ def _step(env, agent, settings: Settings, tasks, state: TrainState, keys: Key, r
 
 def _learn(
     env, agent, settings: Settings, tasks, learners: Any, data: Any, iteration: Array, keys: Key
-) -> tuple[Any, Metrics]:
+) -> tuple[Any, Metrics, Array]:
     """Update the agents of all seeds once the first random steps are over, which is at the same step for all seeds.
 
     Returns:
-        their new states, and the means of the updates' metrics, with "learning" (): 1 if there were updates.
+        their new states, the means of the updates' metrics, and () 1 if there were updates, else 0.
     """
     experience = agent.experience
     if not experience.warmup_steps:
         learners, metrics = _update(env, agent, tasks, learners, data, iteration, keys)
-        return learners, metrics | {"learning": jnp.float32(1)}
+        return learners, metrics, jnp.float32(1)
     learning, metrics = settings.stored(iteration - 1) >= experience.warmup_steps, {}
     learners = _reset_networks(env, agent, tasks, learners, iteration, keys)
     if experience.updates:
         update = lambda learners: _update(env, agent, tasks, learners, data, iteration, keys)
         learners, metrics = when(learning, update, learners)
-    return learners, metrics | {"learning": jnp.float32(learning)}
+    return learners, metrics, jnp.float32(learning)
 
 
 @partial(jax.jit, static_argnums=(0, 1))  # so that it is traced once, though ``when`` needs its shapes too
@@ -536,9 +536,8 @@ def _summarise(history: dict, count: int) -> Metrics:
     Args:
         count: the steps of a task in the chunk.
     """
-    losses = dict(history["losses"])
-    learning = losses.pop("learning")
-    mean = lambda x: jnp.sum(x, axis=0) / jnp.maximum(jnp.sum(learning), 1)
+    losses = history["losses"]
+    mean = lambda x: jnp.sum(x, axis=0) / jnp.maximum(jnp.sum(history["learned"]), 1)
     over_steps = lambda x: jnp.sum(x, axis=(0, 1))
     finished, total, metrics = (jax.tree.map(over_steps, history[name]) for name in ("finished", "total", "metrics"))
     bad, unrewarded, lost = jnp.int32(~history["finite"]), jnp.int32(~history["rewarded"]), history["lost"]
