@@ -176,6 +176,7 @@ class Acted(NamedTuple):
 
     action: Array  # (A,) in [-1, 1], or () int32 if actions are discrete
     extras: Any = None  # data that learning needs, stored with the transition; None for none
+    outputs: Any = None  # (P,) from which the agent's policy draws it, for those whom it teaches; None: it tells none
 
 
 class Spec(NamedTuple):
