@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
@@ -139,6 +139,17 @@ class Sketched(Pictured, Choosing, Family):
     def name_of(self, row: int) -> str:
         """Return the name of the task in a row of the table."""
         return list(self.sketches)[self.numbers_of_goals[row]]
+
+    def due_in(self, rows: Sequence[int], places: np.ndarray) -> np.ndarray:
+        """Return the numbers (N, H) of the symbols that were due in steps, -1 after the last, of episodes (N,).
+
+        Args:
+            rows: (N,) of the tasks in the table.
+            places: (N, H) places in their sketches after each step.
+        """
+        codes = np.pad(self.codes[self.numbers_of_goals[np.asarray(rows)]], ((0, 0), (0, 1)), constant_values=-1)
+        before = np.pad(places[:, :-1], ((0, 0), (1, 0)))
+        return np.take_along_axis(codes, np.minimum(before, self.longest), axis=1)
 
     # Steps.
 
