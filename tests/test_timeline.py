@@ -32,13 +32,13 @@ def test_spans_are_stretches_of_one_number():
     assert spans(np.array([2, 2, -1, 0, 0, 0])) == [(0, 2, 2), (2, 1, -1), (3, 3, 0)]
 
 
-@pytest.mark.parametrize("count", [1, 8, 14])
+@pytest.mark.parametrize("count", [1, 8, 18])
 def test_names_have_colours_of_their_own(count):
     assert len({*colours(count), timeline._GREY}) == count + 1
 
 
 def test_a_strip_shows_the_whole_episode_and_where_it_is():
-    """Four steps of ten pixels: two of one, one of none, one of another; a white mark, and the name in its colour."""
+    """Four steps of ten pixels: two of one, one of none, one of another; a white mark, and the name."""
     acting = Timeline(("a", "b"), np.array([[0, 0, -1, 1, 0, 0]]), np.array([4]))
     found = strips(acting, 0, [0, 3, 3], 40)
     assert found.shape[0] == 3 and found.shape[2:] == (40, 3)
@@ -48,10 +48,8 @@ def test_a_strip_shows_the_whole_episode_and_where_it_is():
     white = [np.flatnonzero((row[0] == 255).all(axis=-1)).tolist() for row in found]
     assert white == [[4, 5, 6], [34, 35, 36], [34, 35, 36]]
     line = found.shape[1] // 2
-    for picture, colour in zip(found, (first, second, second), strict=True):
-        written = picture[line:].reshape(-1, 3)
-        brightest = written[np.argmax(written.sum(axis=1))]
-        np.testing.assert_allclose(brightest, colour, atol=40)
+    assert [tuple(picture[line + line // 2, 5].tolist()) for picture in found] == [first, second, second]
+    assert all((picture[line:, line + 3 :] > 200).any() for picture in found)  # the name
 
 
 CASES = {

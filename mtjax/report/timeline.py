@@ -1,6 +1,5 @@
 """Which sub-policy acts in each step of an episode: strips below films, and a figure of all tasks."""
 
-import colorsys
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,8 +11,18 @@ from PIL import Image, ImageDraw, ImageFont
 from mtjax.envs.mixtures import Tabled
 from mtjax.learning.evaluation import Recording
 
-_GREY = (96, 96, 96)  # where no sub-policy acts
-_HUES = 6  # neighbours in a list of names differ in hue, later ones with the same hue in lightness
+# Six colours of Okabe and Ito, which colour-blind readers can tell apart; then lighter and darker ones of these.
+_PALETTE = ((0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (230, 159, 0), (86, 180, 233))
+_SHADES = ((1.0, 0), (0.45, 140), (0.5, 0))  # factor and summand of each of three rounds
+
+
+class _Colour(NamedTuple):
+    red: int
+    green: int
+    blue: int
+
+
+_GREY = _Colour(96, 96, 96)  # where no sub-policy acts
 
 
 class Timeline(NamedTuple):
@@ -54,12 +63,11 @@ def spans(acting: np.ndarray) -> list[tuple[int, int, int]]:
     return [(a, b - a, int(acting[a])) for a, b in itertools.pairwise(begins)]
 
 
-def colours(count: int) -> list[tuple[int, int, int]]:
-    """Return a colour for each of ``count`` names, of bytes."""
-    rounds = -(-count // _HUES)
-    lightness = lambda i: 0.6 - 0.3 * (i // _HUES) / max(rounds - 1, 1)
-    made = [colorsys.hls_to_rgb(i % _HUES / _HUES + 0.04 * (i // _HUES), lightness(i), 0.8) for i in range(count)]
-    return [(round(255 * red), round(255 * green), round(255 * blue)) for red, green, blue in made]
+def colours(count: int) -> list[_Colour]:
+    """Return a colour of bytes for each of ``count`` names, which repeat after the 18th."""
+    shade = lambda colour, factor, more: (round(factor * x + more) for x in colour)
+    shades = [_Colour(*shade(colour, *each)) for each in _SHADES for colour in _PALETTE]
+    return [shades[i % len(shades)] for i in range(count)]
 
 
 def strips(timeline: Timeline, task: int, steps: Sequence[int], width: int) -> np.ndarray:
@@ -81,12 +89,13 @@ def strips(timeline: Timeline, task: int, steps: Sequence[int], width: int) -> n
         drawing, place = ImageDraw.Draw(picture), round((step + 0.5) * scale)
         drawing.rectangle((place - 1, 0, place + 1, line - 1), fill="white")
         told = timeline.names[number] if number >= 0 else ""
-        drawing.text((3, line), told, fill=_colour(palette, number), font=font)
+        drawing.rectangle((3, line + 2, line - 3, 2 * line - 5), fill=_colour(palette, number))
+        drawing.text((line + 3, line), told, fill="white", font=font)
         made[step] = np.asarray(picture)
     return np.stack([made[step] for step in steps])
 
 
-def _colour(palette: Sequence[tuple[int, int, int]], number: int) -> tuple[int, int, int]:
+def _colour(palette: Sequence[_Colour], number: int) -> _Colour:
     return palette[number] if number >= 0 else _GREY
 
 
