@@ -402,7 +402,7 @@ def _with_policy(agent: Any, env: Any) -> Any:
 
 
 def describe_teacher(agent: BaseAgent, tasks: int, context: int, runs: int) -> dict[str, Any]:
-    """Return the record, of plain values, of an agent that teaches.
+    """Return the record of an agent that teaches, of values as JSON has them.
 
     Args:
         tasks: on how many tasks each run has trained it.
@@ -410,7 +410,8 @@ def describe_teacher(agent: BaseAgent, tasks: int, context: int, runs: int) -> d
         runs: how many runs have trained one.
     """
     sizes = {"tasks": tasks, "context": context, "runs": runs}
-    return {"agent": agent_name_of(agent), "settings": settings(agent), **sizes}
+    plain = {name: list(x) if isinstance(x, tuple) else x for name, x in settings(agent).items()}
+    return {"agent": agent_name_of(agent), "settings": plain, **sizes}
 
 
 def _with_teacher(learner: Any, record: Mapping[str, Any] | None, env: Any) -> Any:

@@ -17,9 +17,10 @@ from mtjax.agents import for_action
 from mtjax.agents.distil import Batch, teaching
 from mtjax.agents.state import of_task
 from mtjax.agents.teacher import Teacher
+from mtjax.command import run_config
 from mtjax.envs import ENVS
 from mtjax.learning.evaluation import Episodes, evaluate
-from mtjax.saved.config_json import from_json, to_flags
+from mtjax.saved.config_json import from_json, to_flags, to_json
 from mtjax.saved.policy import Policy
 from mtjax.training.distillation import adopt, lessons
 from mtjax.types import Discrete, InputError, Spec, Transition
@@ -263,6 +264,24 @@ PPO = ("--agent=ppo", "--agent.unroll=8", "--agent.minibatches=2", "--steps=32")
 DISTIL = ("--env=aim", "--agent=distil", "--agent.unroll=8", "--agent.minibatches=2", "--steps=240", "--chunk-steps=8")
 
 
+def test_a_record_tells_who_teaches(tmp_path):
+    """Of plain values, from which the same agent is made again; without --agent a run that was taught teaches."""
+    run, taught, again = tmp_path / "run", tmp_path / "taught", tmp_path / "again"
+    for folder, words in (
+        (run, ["--env=aim", *PPO]),
+        (taught, [*DISTIL, f"--from={run},{run}"]),
+        (again, [f"--from={taught}"]),
+    ):
+        folder.mkdir()
+        config = run_config.parse(["--env=aim", *words])
+        (folder / "config.json").write_text(to_json(config, {"command": "x"}))
+        assert from_json(folder / "config.json") == config
+    first, second, third = (from_json(folder / "config.json") for folder in (run, taught, again))
+    assert second.learner.teacher == Teacher(first.learner, 3, 1, 2)
+    assert third.agent == "distil" and third.learner.teacher.agent.teacher is None
+
+
+@pytest.mark.slow
 def test_a_run_that_was_taught_needs_its_teachers_no_more(tmp_path):
     """Two teachers of a task each; the policy is loaded, and goes on to the bit, when their folders are gone."""
     runs = [run_of(tmp_path, "--env=aim", f"--env.vary.goal={goal}", "--split=none", *PPO) for goal in ("0.5", "-1")]
@@ -270,15 +289,16 @@ def test_a_run_that_was_taught_needs_its_teachers_no_more(tmp_path):
     whole = run_of(tmp_path, *words)
     part = run_of(tmp_path, *words, "--steps=128")
     config = from_json(part / "config.json")
-    assert (
-        config.teacher["agent"] == "ppo" and config.learner.teacher == from_json(whole / "config.json").learner.teacher
-    )
+    assert config.learner.teacher == from_json(whole / "config.json").learner.teacher
     assert f"--from={runs[0]},{runs[1]}" in to_flags(config)
     for run in runs:
         shutil.rmtree(run)
     mtjax.train.main([f"--resume={part}", "--steps=240"])
     assert bits(mtjax.load(part).states) == bits(mtjax.load(whole).states)
-    assert mtjax.load(whole)(np.zeros(2)).shape == (1,)
+    policy = mtjax.load(whole)
+    assert policy(np.zeros(2)).shape == (1,) and "teacher" not in policy.state.nets and policy.agent.teacher is None
+    pupil = run_of(tmp_path, *DISTIL, "--env.vary.goal=-1,0.5", "--split=none", f"--from={whole}")
+    assert from_json(pupil / "config.json").learner.teacher.agent == policy.agent
 
 
 REFUSED = [

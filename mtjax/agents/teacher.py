@@ -1,5 +1,6 @@
 """A teacher is an agent of earlier runs, as the agent that it teaches knows it."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -63,6 +64,12 @@ def join(states: Sequence[AgentState], run: Array, number: Array, context: Array
         return Params({"state": states[0]}, {"number": number})
     state = jax.tree.map(lambda *x: jnp.stack(x)[run], *states)
     return Params({}, {"state": state, "number": number, "context": context})
+
+
+def leave(agent: Any, state: AgentState) -> tuple[Any, AgentState]:
+    """Return an agent and its state without the teacher, whom nobody needs who acts."""
+    nets = {name: net for name, net in state.nets.items() if name != "teacher"}
+    return dataclasses.replace(agent, teacher=None), state._replace(nets=nets)
 
 
 def _known(net: Params, task: Task) -> tuple[AgentState, Task]:

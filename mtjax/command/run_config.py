@@ -74,11 +74,12 @@ def _name(word: str) -> str:
 def _sources(start: str, agent_name: str) -> list[RunConfig]:
     """Return the configurations of the runs that --from names: of one, or for an agent that is taught of several."""
     several = bool(agent_name) and preset_of(agent_name).cls.taught
-    found = {run: from_json(Path(run) / "config.json") for run in (start.split(",") if several else [start])}
-    for run, source in found.items():
+    runs = start.split(",") if several else [start]
+    found = [from_json(Path(run) / "config.json") for run in runs]
+    for run, source in zip(runs, found, strict=True):
         if source.points:
             raise InputError(f"--from takes a run of one setting, and {run!r} holds {len(source.points)} of a sweep")
-    return list(found.values())
+    return found
 
 
 def _distilling(config: RunConfig, sources: Sequence[RunConfig]) -> RunConfig:
