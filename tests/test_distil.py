@@ -267,11 +267,7 @@ DISTIL = ("--env=aim", "--agent=distil", "--agent.unroll=8", "--agent.minibatche
 def test_a_record_tells_who_teaches(tmp_path):
     """Of plain values, from which the same agent is made again; without --agent a run that was taught teaches."""
     run, taught, again = tmp_path / "run", tmp_path / "taught", tmp_path / "again"
-    for folder, words in (
-        (run, ["--env=aim", *PPO]),
-        (taught, [*DISTIL, f"--from={run},{run}"]),
-        (again, [f"--from={taught}"]),
-    ):
+    for folder, words in {run: PPO, taught: (*DISTIL, f"--from={run},{run}"), again: [f"--from={taught}"]}.items():
         folder.mkdir()
         config = run_config.parse(["--env=aim", *words])
         (folder / "config.json").write_text(to_json(config, {"command": "x"}))
