@@ -9,7 +9,7 @@ from probes import QUICK, pick, tiny
 
 import mtjax
 from mtjax.agents import for_action
-from mtjax.envs.craft.sketched import due
+from mtjax.envs.craft.sketched import due, due_in
 from mtjax.report import films, render, timeline
 from mtjax.report.timeline import Timeline, colours, spans, strips
 from mtjax.saved.policy import Policy
@@ -23,7 +23,7 @@ def test_symbols_are_those_that_were_due_before_each_step():
     after = np.array([[0, 0, 1, 1, *range(2, length + 1), length]])
     before = [0, *after[0, :-1]]
     expected = [int(due(task, jnp.int32(place))) for place in before]
-    assert env.due_in([row], after).tolist() == [expected]
+    assert due_in(env, [row], after).tolist() == [expected]
     names = env.sketches[env.name_of(row)]
     assert env.symbols[expected[0]] == names[0] and expected[-1] == -1
 

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from mtjax.envs.craft.sketched import Sketched, due_in
 from mtjax.envs.mixtures import Tabled
 from mtjax.learning.evaluation import Recording
 
@@ -46,11 +47,11 @@ def timeline_of(env: Tabled, played: Recording, states: Mapping[str, Any]) -> Ti
         return Timeline(tuple(f"option {i}" for i in range(count)), np.asarray(played.option), lengths)
     names, acting = [], None
     for part in env.parts:
-        family: Any = part.family
-        if not getattr(family, "sketched", False):
+        family = part.family
+        if not (isinstance(family, Sketched) and family.sketched):
             continue
         rows = [env.own_row(int(row)) for row in np.asarray(played.rows)[part.places["all"]]]
-        due = family.due_in(rows, np.asarray(states[part.name].place))
+        due = due_in(family, rows, np.asarray(states[part.name].place))
         acting = np.full((len(lengths), due.shape[1]), -1, np.int32) if acting is None else acting
         acting[part.places["all"]] = np.where(due < 0, -1, due + len(names))
         names += family.symbols
