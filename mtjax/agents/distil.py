@@ -39,7 +39,7 @@ class Distil(BaseAgent):
         L = KL(pi_T(s) | pi(s))
     averaged over the steps of a rollout, then over tasks. With discrete actions pi_T is softmax(z / tau), where z are
     the outputs of a teacher's policy, or the values of all actions of one that learns values, such as pqn, and tau is
-    ``teacher_temperature``: 0.01 in both papers, whose teachers are values. With continuous ones both policies are
+    ``teacher_temperature``: 0.01 in Rusu et al., whose teachers are values. With continuous ones both policies are
     Gaussians before the same tanh, of which the divergence has a closed form. Rewards are not learned from.
 
     The policy that learns plays its own rollouts, and its teacher says in each state what it would do (Ross et al.
@@ -51,8 +51,7 @@ class Distil(BaseAgent):
 
     Differs from Rusu et al., where teachers play and their steps are stored: here the learner plays by default, and
     drops its rollouts. Differs from Omidshafiei et al.: there are no other agents in the world, and so no phase in
-    which they learn side by side; the loss is of all steps, where there it is of traces from a replay. Adam replaces
-    RMSProp and Adam with a schedule.
+    which they learn side by side.
     """
 
     adjustable: ClassVar[tuple[str, ...]] = (
