@@ -15,11 +15,12 @@ import jax
 import tyro
 from jax.sharding import Mesh
 
-from mtjax.agents import AGENTS, BaseAgent, agent, combinations, preset_of, tuned_as
+from mtjax.agents import AGENTS, BaseAgent, agent, combinations, preset_of, settings, tuned_as
 from mtjax.agents import name_of as agent_name_of
 from mtjax.agents.choices import kinds_of, replace, require_value_range
 from mtjax.agents.parts.policies import Gaussian, policy_for
 from mtjax.agents.swept import agents_at
+from mtjax.agents.teacher import Teacher
 from mtjax.checks import MOST_EPISODES, check_fields, path, require_library, require_text
 from mtjax.envs import make
 from mtjax.envs import name_of as env_name_of
@@ -109,12 +110,14 @@ class RunConfig:
     start: Annotated[str, tyro.conf.arg(name="from")] = ""
     """Folder of a run whose agent is fine-tuned on this environment's tasks. Agent and networks are those of that run;
     learning rates and --tune may be given. Parameters of a single task start from the nearest training task of that
-    run. Seed number k starts from seed k modulo the number of its seeds."""
+    run. Seed number k starts from seed k modulo the number of its seeds. With --agent=distil, the run from whose
+    policies a new one learns; RUN,RUN,... are several."""
     sweep: tuple[str, ...] = ()
     """Train once for every combination of values, such as agent.actor-lr=1e-4,1e-3 agent.num-experts=2,4. Flags are
     written without their dashes. Real numbers of the agent vary inside one program, beside the seeds. Other settings
     run as one program after another. The sweep's folder holds a table of all settings; --resume takes this folder."""
     points: Annotated[tuple[dict[str, float], ...], tyro.conf.Suppress] = ()
+    teacher: Annotated[Any, tyro.conf.Suppress] = None
     search: int = 0
     """Look for good real numbers of the agent in so many trials. Ranges are flags such as --agent.actor-lr=1e-5..1e-2.
     A round of trials trains as one program, of which the better half goes on after a quarter and after half of the
@@ -149,7 +152,8 @@ class RunConfig:
     learner: Annotated[BaseAgent, tyro.conf.arg(name="agent")] = dataclasses.field(default_factory=lambda: agent("sac"))
 
     def __post_init__(self):
-        object.__setattr__(self, "learner", _with_policy(self.learner, self.family))
+        learner = _with_policy(self.learner, self.family)
+        object.__setattr__(self, "learner", _with_teacher(learner, self.teacher, self.family))
 
     @property
     def members(self) -> int:
@@ -401,6 +405,28 @@ def _with_policy(agent: Any, env: Any) -> Any:
         return agent
     policy = policy_for(env.spec.action) if getattr(env, "discrete", True) else Gaussian()
     return agent if agent.policy == policy else dataclasses.replace(agent, policy=policy)
+
+
+def describe_teacher(agent: BaseAgent, tasks: int, context: int, runs: int) -> dict[str, Any]:
+    """Return the record of an agent that teaches, of values as JSON has them.
+
+    Args:
+        tasks: on how many tasks each run has trained it.
+        context: size of their contexts.
+        runs: how many runs have trained one.
+    """
+    sizes = {"tasks": tasks, "context": context, "runs": runs}
+    plain = {name: list(x) if isinstance(x, tuple) else x for name, x in settings(agent).items()}
+    return {"agent": agent_name_of(agent), "settings": plain, **sizes}
+
+
+def _with_teacher(learner: Any, record: Mapping[str, Any] | None, env: Any) -> Any:
+    """Return the agent with the teacher that a record describes, if there is one."""
+    if record is None:
+        return learner
+    made = _with_policy(agent(record["agent"], **record["settings"]), env)
+    teacher = Teacher(made, *(record[size] for size in ("tasks", "context", "runs")))
+    return dataclasses.replace(learner, teacher=teacher)
 
 
 def require_policy(agent: Any, env: Any) -> None:

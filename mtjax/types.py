@@ -236,6 +236,7 @@ class Acted(NamedTuple):
 
     action: Array  # (A,) in [-1, 1]; of discrete actions () int32, or (D,) int32 of several
     extras: Any = None  # data that learning needs, stored with the transition; None for none
+    outputs: Any = None  # (P,) from which the agent's policy draws it, for those whom it teaches; None: it tells none
 
 
 class Spec(NamedTuple):

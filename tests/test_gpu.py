@@ -349,6 +349,8 @@ def experience(agent, num_seeds, num_tasks):
         option = lambda: random.integers(agent.num_options, size=ended.shape).astype(np.int32)
         running, chosen = options.Running(option(), np.ones(ended.shape, np.float32)), random.random(ended.shape) < 0.5
         taken = options.Taken(*taken, option(), running, chosen, taken.log_prob)
+    if agent.taught:
+        taken = random.normal(size=(*ended.shape, agent.policy.outputs(SPEC.action_size))).astype(np.float32)
     return steps._replace(ended=ended, closed=ended, cut=ended, extras=taken, memory=memory)
 
 

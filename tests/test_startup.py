@@ -156,7 +156,7 @@ def test_flags_of_all_families_and_agents_are_known_without_jax(ours):
         fields = run_config.shared_fields(cls)
         real |= {run_config.family_flag(field.name): isinstance(field.default, bool) for field in fields}
     for agent, given in itertools.product(
-        ("sac", "distral", "brc", "simba-v2", "xqc", "ppo", "impala", "pqn", "sketches", "options", "maml"),
+        ("sac", "distral", "brc", "simba-v2", "xqc", "ppo", "impala", "pqn", "sketches", "options", "maml", "distil"),
         [{}, *choices],
     ):
         needed = {"vectors": "file.npy"} if given == {"conditioning": "vectors"} else {}

@@ -101,6 +101,11 @@ AGENTS: dict[str, Preset] = {
         _PARAMS,
         "mtjax.agents.options:Options",
     ),
+    "distil": Preset(
+        "One policy that learns from trained ones, by default without seeing its task (Rusu et al. 2016)",
+        {},
+        "mtjax.agents.distil:Distil",
+    ),
     "pcgrad": Preset("Conflicting gradients projected (Yu et al. 2020)", {"gradients": "pcgrad", **_PARAMS}),
     "cagrad": Preset("Conflict-averse gradients (Liu et al. 2021)", {"gradients": "cagrad", **_PARAMS}),
     "gradnorm": Preset("Weights that even out learning rates (Chen et al. 2018)", {"gradients": "gradnorm", **_PARAMS}),

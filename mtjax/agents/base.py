@@ -52,6 +52,7 @@ class Memory(NamedTuple):
     scaling: Any = None  # of the scaling of rewards
     sampler: Any = None  # of the sampler of tasks
     running: Any = None  # of the option that runs, if the agent has options
+    teacher: Any = None  # what the agent's teacher remembers, if it has one
 
 
 WATCHERS = ("scaling", "sampler")
@@ -113,6 +114,8 @@ class BaseAgent(abc.ABC):
     """How the actor remembers tasks that it learned one after another."""
     plasticity: ClassVar[Renewing] = Renewing()
     """What keeps the networks able to learn."""
+    taught: ClassVar[bool] = False
+    """Whether it learns from the policies of other runs, which --from names, instead of going on with theirs."""
     distils: ClassVar[bool] = False
     """Whether another policy than each task's own learns beside it."""
     unit_head: ClassVar[bool] = False
@@ -305,7 +308,7 @@ class BaseAgent(abc.ABC):
     def observe(self, state: AgentState, steps: Transition, tasks: Task) -> AgentState:
         """Count collected steps (T, H, E, ...), after learning: moments of observations, scaling and sampler."""
         gamma = discounts_of_all(self, tasks)[:, None]
-        memory = steps.memory._replace(past=None, hidden=None)
+        memory = steps.memory._replace(past=None, hidden=None, teacher=None)
         told = steps._replace(obs=None, action=None, next_obs=None, context=None, extras=None, memory=memory)
         told = jax.tree.map(lambda x: x.reshape(len(x), -1), collectives.whole(told, axis=2))
         new = {"inputs": self.view.count(state.nets["inputs"], steps.obs)}

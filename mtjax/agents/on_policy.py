@@ -163,7 +163,7 @@ class OnPolicy(BaseAgent):
         """Choose an action for one observation (O,) of one task; without a key, the policy's mode."""
         outputs = self.policy_outputs(*self.view.acting(state, memory, obs, task))
         action, raw, log_prob = self.policy.draw(outputs, task.action_mask, key)
-        return Acted(action, None if key is None else Taken(raw, log_prob))
+        return Acted(action, None if key is None else Taken(raw, log_prob), outputs)
 
     # Losses of one task.
 

@@ -188,7 +188,7 @@ class Options(OnPolicy):
         outputs = of_option(self, nets["actor"], seen, option)
         action, raw, log_prob = self.policy.draw(outputs, task.action_mask, action_key)
         now = Running(option, jnp.where(chosen, 1.0, lasts))
-        return Acted(action, Taken(raw, log_prob, before, now, chosen, at_option(logs, option)))
+        return Acted(action, Taken(raw, log_prob, before, now, chosen, at_option(logs, option)), outputs)
 
     def remember(self, state: AgentState, memory: Memory, transition: Transition, task: Task) -> Memory:
         taken = transition.extras

@@ -104,10 +104,10 @@ class PQN(BaseAgent):
         values = self.q(*self.view.acting(state, memory, obs, task))
         best = self.policy.draw(values, task.action_mask, None).action
         if key is None:
-            return Acted(best)
+            return Acted(best, outputs=values)
         any_key, turn_key = jax.random.split(key)
         one = self.policy.draw(jnp.zeros_like(values), task.action_mask, any_key).action
-        return Acted(jnp.where(jax.random.uniform(turn_key) < self.share(state), one, best))
+        return Acted(jnp.where(jax.random.uniform(turn_key) < self.share(state), one, best), outputs=values)
 
     def share(self, state: AgentState) -> Array:
         """Return the probability () of a uniform action."""

@@ -95,7 +95,7 @@ class SAC(BaseAgent):
     def act(self, state: AgentState, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
         """Choose an action (A,) for one observation (O,) of one task; without a key, the mean action."""
         outputs = self.policy_outputs(*self.view.acting(state, memory, obs, task))
-        return Acted(self.policy.draw(outputs, task.action_mask, key).action)
+        return Acted(self.policy.draw(outputs, task.action_mask, key).action, outputs=outputs)
 
     # Losses of one task.
 

@@ -1,10 +1,11 @@
 """``mtjax.train``: names or objects and keyword settings become the configuration of a run, which is then launched."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from mtjax.agents import preset_of
 from mtjax.agents.swept import Sweep
 from mtjax.checks import checked, path, shown
 from mtjax.command.keywords import configured
@@ -44,7 +45,7 @@ def train(
     eval_episodes: int = Plan.eval_episodes,
     population: str = Plan.population,
     settings: Settings | None = None,
-    start: Policy | str | Path | None = None,
+    start: Policy | str | Path | Sequence[Policy | str | Path] | None = None,
     sweep: Sweep = (),
     directory: str | Path | None = None,
     resume: bool = False,
@@ -77,7 +78,8 @@ def train(
         settings: settings of the training loop; by default the preset's for a name, else ``Settings()``.
         start: the policy to fine-tune, from ``mtjax.load``, or the folder of its run. A family that is given as an
             object is ``new.scaled_as(start.env)``, and the agent ``start.agent``; only learning rates and ``tune`` may
-            differ. ``finetune.adopt`` says what is kept.
+            differ. ``finetune.adopt`` says what is kept. For the agent distil, the policies or runs that teach it: one,
+            or a list.
         sweep: numbers of the agent that vary inside one program. Give ``{"actor_lr": [1e-4, 1e-3], "gamma": [0.98,
             0.99]}`` for every combination, or a list of points ``{"actor_lr": 1e-4, "gamma": 0.98}``. Every point has
             all seeds, and the S axis of the result holds them point by point. A seed whose numbers stop being finite
@@ -100,8 +102,7 @@ def train(
         InputError: an argument cannot be used.
         FloatingPointError: numbers stopped being finite (in a sweep: of every seed). The message names task and step.
     """
-    if start is not None and not isinstance(start, Policy):
-        start = load(path(start, "start"))
+    begun = _begun(start, agent)
     if on_chunk is not None and not callable(on_chunk):
         raise InputError(f"on_chunk is a function of a row of metrics, not {shown(on_chunk)}")
     written = {"profile": profile, "tensorboard": tensorboard, "wandb": wandb}
@@ -111,11 +112,26 @@ def train(
     plan = {"seeds": seeds, "seed": seed, "eval_every": eval_every, "eval_episodes": eval_episodes}
     plan |= {"population": population}
     plan |= {} if steps is None else {"steps": steps}
-    agent = start.agent if agent is None and start is not None else agent
-    config = configured(env, agent, given, plan=plan, settings=settings, start=start, sweep=sweep, **written)
-    check(config, start)
+    if agent is None and begun is not None:
+        agent = (begun if isinstance(begun, Policy) else begun[0]).agent
+    config = configured(env, agent, given, plan=plan, settings=settings, start=begun, sweep=sweep, **written)
+    check(config, begun)
     folder = None if directory is None else prepare(config, path(directory), resume)
-    result = launch(config, Hooks(folder, start, resume, on_chunk, quiet=quiet, label=label))
+    result = launch(config, Hooks(folder, begun, resume, on_chunk, quiet=quiet, label=label))
     if folder is not None:
         draw(config, result.evaluations, folder)
     return result
+
+
+def _begun(start: Any, agent: Any) -> Policy | tuple[Policy, ...] | None:
+    """Return the policy to fine-tune; for an agent that is taught, the policies that teach it."""
+    if start is None:
+        return None
+    several = isinstance(start, list | tuple)
+    found = tuple(x if isinstance(x, Policy) else load(path(x, "start")) for x in (start if several else [start]))
+    learner = preset_of(agent).cls if isinstance(agent, str) else agent or (found and found[0].agent)
+    if getattr(learner, "taught", False) and found:
+        return found
+    if several:
+        raise InputError("start is one policy, or for agent='distil' a list of those that teach it")
+    return found[0]

@@ -1,7 +1,7 @@
 """The configuration of a run, made from names or objects and from settings by keyword."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mtjax import agents
@@ -10,7 +10,7 @@ from mtjax.agents.choices import PARTS, unknown_setting
 from mtjax.agents.choices import settings as settings_of
 from mtjax.agents.swept import Sweep
 from mtjax.checks import shown
-from mtjax.config import Plan, RunConfig, configure, fit_length, own_files, with_preset
+from mtjax.config import Plan, RunConfig, configure, describe_teacher, fit_length, own_files, with_preset
 from mtjax.envs import make_from
 from mtjax.envs.family import Family
 from mtjax.envs.mixtures import Tabled
@@ -26,7 +26,7 @@ def configured(
     *,
     plan: Mapping[str, Any],
     settings: Settings | None = None,
-    start: Policy | None = None,
+    start: Policy | tuple[Policy, ...] | None = None,
     sweep: Sweep = (),
     **written: Any,
 ) -> RunConfig:
@@ -38,7 +38,7 @@ def configured(
         given: settings of the loop, of the agent or its parts, and of an environment that is given by name.
         plan: the fields of ``Plan``.
         settings: settings of the training loop; by default those of the preset, or ``Settings()`` for an object.
-        start: the policy to fine-tune.
+        start: the policy to fine-tune, or those that teach.
         written: profile, tensorboard and wandb.
 
     Raises:
@@ -49,8 +49,9 @@ def configured(
     if not isinstance(settings, Settings | None):
         raise InputError(f"settings is a mtjax.Settings, not {_kind(settings)}; single settings are given by name")
     name, family, rest = make_from(env, given)
-    if start is not None and isinstance(env, str) and isinstance(family, Family) and isinstance(start.env, Family):
-        family = family.scaled_as(start.env)
+    starts = start if isinstance(start, tuple) else (start,) if start is not None else ()
+    if len(starts) == 1 and isinstance(env, str) and isinstance(family, Family) and isinstance(starts[0].env, Family):
+        family = family.scaled_as(starts[0].env)
     of_agent = {key: value for key, value in rest.items() if key not in _names(Settings)}
     _require_known(of_agent, agent, name, family, isinstance(env, str))
     if isinstance(agent, str):
@@ -63,15 +64,22 @@ def configured(
         learner, training = configure(agent, settings or Settings(), rest)
         names = (name, agents.name_of(learner)) if named else ("", "")
         config = RunConfig(*names, plan=Plan(**plan), training=training, family=family, learner=learner)
-    points, place = swept.grid(sweep), "" if start is None or start.directory is None else str(start.directory)
+    points, places = swept.grid(sweep), [str(each.directory) for each in starts if each.directory is not None]
     return dataclasses.replace(
         config,
-        start=place,
+        start=",".join(places),
+        teacher=_teacher(start) if isinstance(start, tuple) else None,
         points=points,
         imports=own_files(config) if named else (),
         sweep=swept.words(config.learner, points),
         **written,
     )
+
+
+def _teacher(starts: Sequence[Policy]) -> dict[str, Any]:
+    """Return the record of those that teach an agent."""
+    first = starts[0]
+    return describe_teacher(first.agent, first.state.num_tasks, first.env.spec.context_size, len(starts))
 
 
 def _require_learning(env: Any, agent: Any, named: bool) -> None:

@@ -45,7 +45,9 @@ def check_names(argv: Sequence[str]) -> None:
         if folder in pretrained.names() and not Path(folder).is_dir():
             raise pretrained.not_learning(folder)
         if folder is not None and not (flag == "resume" and any(Path(folder).glob("run-*"))):  # of a sweep or search
-            require_run(Path(folder))
+            several = flag == "from" and not Path(folder).is_dir()
+            for each in folder.split(",") if several else [folder]:
+                require_run(Path(each))
 
 
 def _check_numbers(argv: Sequence[str]) -> None:

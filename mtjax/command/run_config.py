@@ -5,21 +5,21 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mtjax.agents import settings
+from mtjax.agents import preset_of, settings
 from mtjax.agents.choices import CHOICES, flag_names, owners
 from mtjax.command.imports import import_files, imports_of
 from mtjax.command.parsing import parse_with_tyro
 from mtjax.command.refusals import check_names, unknown_flag
 from mtjax.command.sources import all_flags
 from mtjax.command.words import flag_value, plain_values, split_flags, switched_off, switched_on, vary_flags, with_port
-from mtjax.config import NO_FINE_TUNING, RunConfig, fit_length, own_files, with_preset
+from mtjax.config import NO_FINE_TUNING, RunConfig, describe_teacher, fit_length, own_files, with_preset
 from mtjax.envs import is_mixture, make, require_pictures
 from mtjax.envs.family import Family
 from mtjax.envs.mixtures import Mixture, require_family
 from mtjax.names import InputError
 from mtjax.saved.config_json import from_json
 
-_NO_FLAGS = ("vary", "context-ranges", "points", "imports")  # vary has a flag for each parameter, taken out before
+_NO_FLAGS = ("vary", "context-ranges", "points", "teacher", "imports")  # vary has one for each parameter, taken out
 _FAMILY_FLAGS = {"combine": "env.combine", "split": "split"}  # they decide which values are allowed
 _DECIDING = ("vectors", "heads", "actor_heads", "critic_heads")  # they decide which parts are allowed
 
@@ -37,10 +37,8 @@ def parse(argv: Sequence[str]) -> RunConfig:
     check_names(argv)
     env_name = flag_value(argv, "env", RunConfig.env)
     start = flag_value(argv, "from", "")
-    source = from_json(Path(start) / "config.json") if start or "--from=" in argv else None
-    if source is not None and source.points:
-        raise InputError(f"--from takes a run of one setting, and {start!r} holds {len(source.points)} of a sweep")
-    agent_name = flag_value(argv, "agent", RunConfig.agent if source is None else source.agent)
+    sources = _sources(start, flag_value(argv, "agent", "")) if start or "--from=" in argv else []
+    agent_name = flag_value(argv, "agent", sources[0].agent if sources else RunConfig.agent)
     preset_name = flag_value(argv, "preset", RunConfig.preset)
     vary, argv = vary_flags(argv)
     chosen, argv = _peel_parts(argv)
@@ -57,8 +55,10 @@ def parse(argv: Sequence[str]) -> RunConfig:
     if switched_off("--agent.normalize-observations") in argv:  # which presets switch on, and some parts refuse
         deciding["normalize_observations"] = False
     default = with_preset(env_name, agent_name, preset_name, {**chosen, **deciding}, vary=vary, **of_family)
-    if source is not None:
-        default = _fine_tuning(default, source, start, chosen)
+    if sources:
+        taught = preset_of(agent_name).cls.taught
+        default = _distilling(default, sources) if taught else _fine_tuning(default, sources[0], chosen)
+        default = dataclasses.replace(default, start=start)
     _check_flags(argv, default)
     config = parse_with_tyro(RunConfig, argv, default, "python -m mtjax.train")
     config = fit_length(config, {name for word in argv if (name := _name(word))})
@@ -71,7 +71,27 @@ def _name(word: str) -> str:
     return word.split("=", 1)[0].removeprefix("--").replace("-", "_") if word.startswith("--") else ""
 
 
-def _fine_tuning(config: RunConfig, source: RunConfig, start: str, chosen: Mapping[str, str]) -> RunConfig:
+def _sources(start: str, agent_name: str) -> list[RunConfig]:
+    """Return the configurations of the runs that --from names: of one, or for an agent that is taught of several."""
+    several = bool(agent_name) and preset_of(agent_name).cls.taught
+    runs = start.split(",") if several else [start]
+    found = [from_json(Path(run) / "config.json") for run in runs]
+    for run, source in zip(runs, found, strict=True):
+        if source.points:
+            raise InputError(f"--from takes a run of one setting, and {run!r} holds {len(source.points)} of a sweep")
+    return found
+
+
+def _distilling(config: RunConfig, sources: Sequence[RunConfig]) -> RunConfig:
+    """Return a configuration whose agent is taught by those of runs, and for one run with contexts scaled as there."""
+    family, source = config.family, sources[0]
+    if len(sources) == 1 and isinstance(family, Family) and isinstance(source.family, Family):
+        family = family.scaled_as(source.family)
+    sizes = source.family.train_count, source.family.spec.context_size, len(sources)
+    return dataclasses.replace(config, family=family, teacher=describe_teacher(source.learner, *sizes))
+
+
+def _fine_tuning(config: RunConfig, source: RunConfig, chosen: Mapping[str, str]) -> RunConfig:
     """Return a configuration with the agent of the run ``source``, and tasks whose context is scaled as there."""
     had = {"agent": source.agent, **settings(source.learner)}
     for name, given in {"agent": config.agent, **chosen}.items():
@@ -81,7 +101,7 @@ def _fine_tuning(config: RunConfig, source: RunConfig, start: str, chosen: Mappi
         require_family(env, NO_FINE_TUNING)
     assert isinstance(config.family, Family) and isinstance(source.family, Family)
     learner, family = dataclasses.replace(source.learner, tune="all"), config.family.scaled_as(source.family)
-    return dataclasses.replace(config, start=start, learner=learner, family=family)
+    return dataclasses.replace(config, learner=learner, family=family)
 
 
 def _peel_parts(argv: Sequence[str]) -> tuple[dict[str, str], list[str]]:

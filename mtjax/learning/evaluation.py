@@ -278,6 +278,7 @@ class Recording(NamedTuple):
     rows: Array  # (T,) of the tasks that were played; where ranges are continuous, of the episodes' draws
     lengths: Array  # (T,) int32 steps until the episode ended
     states: Any  # of the environment after each step, leaves (T, H, ...)
+    option: Array | None = None  # (T, H) int32 number of the option that acted in each step, if the agent has options
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -288,11 +289,12 @@ def record(env: Env, agent: Agent, state: Any, tasks: Task, seed: Array) -> Reco
 
     def step(worlds: Worlds, _):
         worlds, env_step = step_envs(env, agent, learners, tasks, worlds, None)
-        return worlds, (env_step.transition.reward, env_step.transition.ended, worlds.state)
+        running = worlds.memory.running.option if getattr(agent, "goes_on", False) else None
+        return worlds, (env_step.transition.reward, env_step.transition.ended, worlds.state, running)
 
     worlds = reset_envs(env, agent, learners, tasks, keys)
     _, played = jax.lax.scan(step, worlds, length=env.episode_length)  # leaves (H, 1, T, 1, ...)
-    rewards, ended, states = jax.tree.map(lambda x: jnp.moveaxis(x[:, 0, :, 0], 0, 1), played)
+    rewards, ended, states, option = jax.tree.map(lambda x: jnp.moveaxis(x[:, 0, :, 0], 0, 1), played)
     alive = jnp.cumsum(ended, axis=1) - ended == 0
     rows = tasks.row if worlds.task is None else worlds.task.row[0, :, 0]
-    return Recording(jnp.sum(jnp.where(alive, rewards, 0.0), axis=1), rows, jnp.sum(alive, axis=1), states)
+    return Recording(jnp.sum(jnp.where(alive, rewards, 0.0), axis=1), rows, jnp.sum(alive, axis=1), states, option)

@@ -21,7 +21,8 @@ from mtjax.envs.pixels import Pictured
 from mtjax.envs.task_table import Part
 from mtjax.learning.evaluation import Recording, record
 from mtjax.names import InputError
-from mtjax.report import render
+from mtjax.report import render, timeline
+from mtjax.report.timeline import Timeline
 from mtjax.saved.policy import Policy
 from mtjax.types import SPLITS, Task
 
@@ -95,6 +96,8 @@ def write(
 ) -> Path:
     """Film one episode of each chosen task, and write them as one grid. Progress is printed.
 
+    If sub-policies act, a strip below each picture says which does, and timeline.png shows the episodes of all tasks.
+
     Args:
         tasks: all tasks of the environment.
         seconds: how long the film lasts; an episode that ends before stands still.
@@ -102,14 +105,18 @@ def write(
     """
     env = policy.env
     played, by_name = play(policy, tasks, seed)
+    acting = timeline.timeline_of(env, played, by_name)
     width = _width(len(chosen), _WIDTHS)
     count, tiles = max(round(seconds * _FPS), 1), []
     for i, one in enumerate(chosen):
         print(f"filming {i + 1} of {len(chosen)}: {', '.join(_caption(env, one, played, named))}", flush=True)
-        tiles.append(_tile(env, one, played, by_name[one.part.name], count, width))
+        tiles.append(_tile(env, one, played, by_name[one.part.name], count, width, acting))
     captions = [_caption(env, one, played, named) for one in chosen]
     path = render.write_video(stem, grid(captioned(tiles, captions)), _FPS)
     print(f"filmed {path.name}: {len(chosen)} tasks")
+    if acting is not None:
+        labels = [label for split in SPLITS for label in env.labels(split)]
+        timeline.draw(stem.with_name("timeline.png"), acting, labels)
     return path
 
 
@@ -172,17 +179,23 @@ def _caption(env: Tabled, one: Chosen, played: Recording, named: Mapping[str, st
     return f"{split}, return {amount(float(played.returns[one.place]))}", env.describe(row)
 
 
-def _tile(env: Tabled, one: Chosen, played: Recording, states: Any, count: int, width: int) -> np.ndarray:
-    """Return the frames (F, height, width, 3) of one task, at most ``count``."""
+def _tile(
+    env: Tabled, one: Chosen, played: Recording, states: Any, count: int, width: int, acting: Timeline | None
+) -> np.ndarray:
+    """Return the frames (F, height, width, 3) of one task, at most ``count``, with a strip of sub-policies, if any."""
     family: Any = one.part.family
     row = env.own_row(int(played.rows[one.place]))
     length = int(played.lengths[one.place])
     times = np.arange(count) / _FPS * _steps_per_second(one)
-    steps = np.unique(np.minimum(times.astype(int), length - 1))
+    step_of = np.minimum(times.astype(int), length - 1)
+    steps = np.unique(step_of)
     shown = jax.tree.map(lambda x: x[one.own][steps], states)  # also of keys, which NumPy has not
     size = width, width * 3 // 4
     drawn = render.film(family, row, shown, *size) if isinstance(family, Pictured) else family.pictures(shown, *size)
-    frames = drawn[np.searchsorted(steps, np.minimum(times.astype(int), length - 1))]
+    frames = drawn[np.searchsorted(steps, step_of)]
+    if acting is not None:
+        below = timeline.strips(acting, one.place, step_of.tolist(), frames.shape[2])
+        frames = np.concatenate([frames, below], axis=1)
     return frames[: max(int(np.sum(times < length)), 1)]
 
 

@@ -105,6 +105,7 @@ def _from_record(record: Any) -> RunConfig:
         start=record.get("start", ""),
         sweep=tuple(record.get("sweep", ())),
         points=tuple(record.get("points", ())),
+        teacher=record.get("teacher"),
         imports=_imports(record),
         tensorboard=record.get("tensorboard", False),
         wandb=record.get("wandb", ""),

@@ -13,6 +13,7 @@ import numpy as np
 from mtjax import frames
 from mtjax.agents import BaseAgent, name_of, swept
 from mtjax.agents.swept import Point
+from mtjax.agents.teacher import leave
 from mtjax.checks import path, require_whole, shown
 from mtjax.compiling.programs import trace
 from mtjax.config import RunConfig
@@ -229,6 +230,8 @@ def policy_of(
         agent = swept.agent_at(agent, latest if member else found[seed // count])
         states = states._replace(numbers={})
     rows = slice(seed, seed + 1) if member else _point_rows(count, seed)
+    if getattr(agent, "taught", False):
+        agent, states = leave(agent, states)
     own, seeds = (0, seeds[seed % count][None]) if member else (seed % count, seeds)
     states = _rows(states, np.arange(len(jax.tree.leaves(states)[0]))[rows])
     return Policy(env, agent, _rows(states, own), states, seeds, directory, own)

@@ -31,7 +31,7 @@ def write(run: str | Path, directory: Path, number: int = 0) -> None:
     if record.get("points"):
         record |= _of_point(from_json(Path(run) / _SETTINGS), policy)
     record["plan"] |= {"seed": int(policy.seeds[policy.number]), "seeds": 1, "population": ""}
-    record |= {"runs": RunConfig.runs, "start": ""}
+    record |= {"runs": RunConfig.runs, "start": "", "teacher": None}
     _shorten_imports(record)
     leaves = jax.tree.leaves(policy.state)
     arrays: Any = {str(i): np.asarray(leaves[i]) for i in read_by_acting(policy)}

@@ -48,7 +48,7 @@ def require_fit(start: Policy, env: Env, agent: BaseAgent) -> None:
     """
     if start.directory is not None and pretrained.is_shipped(start.directory):
         raise pretrained.not_learning(str(start.directory))
-    _require_same_agent(start.agent, agent)
+    require_same_agent(start.agent, agent)
     for each in (env, start.env):
         require_family(each, NO_FINE_TUNING)
     family, known = env, start.env
@@ -57,8 +57,8 @@ def require_fit(start: Policy, env: Env, agent: BaseAgent) -> None:
         pictures = frames.shown(theirs.obs) or frames.shown(ours.obs)
         fix = "; give --env.pixels, --env.frames, --env.grey and --env.state as the run has them" * pictures
         raise InputError(
-            f"the run's networks map {_sizes(theirs)} to {_actions(theirs)}; "
-            f"the new tasks have {_sizes(ours)} and {_actions(ours)}{fix}"
+            f"the run's networks map {describe_sizes(theirs)} to {describe_actions(theirs)}; "
+            f"the new tasks have {describe_sizes(ours)} and {describe_actions(ours)}{fix}"
         )
     alike = not isinstance(family, Family) or not isinstance(known, Family) or ranges(family) == ranges(known)
     if theirs.context_size != ours.context_size or not alike:
@@ -66,7 +66,7 @@ def require_fit(start: Policy, env: Env, agent: BaseAgent) -> None:
     _require_numbers(start, env, agent)
 
 
-def _require_same_agent(old: BaseAgent, agent: BaseAgent) -> None:
+def require_same_agent(old: BaseAgent, agent: BaseAgent) -> None:
     """Refuse an agent that differs from the run's in more than may be adjusted."""
     had, given = _learned(old), _learned(agent)
     if type(agent) is not type(old) or had.keys() != given.keys():
@@ -79,14 +79,14 @@ def _require_same_agent(old: BaseAgent, agent: BaseAgent) -> None:
         )
 
 
-def _sizes(spec: Spec) -> str:
+def describe_sizes(spec: Spec) -> str:
     """Return what networks see of tasks, as text."""
     seen, size = frames.seen(spec), frames.state_size(spec)
     pictures = [f"pictures {seen[frames.PICTURES].shape}"] if frames.shown(seen) else []
     return " with ".join(pictures + [f"{size} observed numbers"] * (size > 0))
 
 
-def _actions(spec: Spec) -> str:
+def describe_actions(spec: Spec) -> str:
     """Return how many actions networks are to map to, as text."""
     return f"{spec.action_size} {spec.action.kind} actions"
 

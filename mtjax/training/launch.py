@@ -1,6 +1,7 @@
 """Start a run from its configuration: check it, load the policy to fine-tune, print a summary, and train."""
 
 import tomllib
+from collections.abc import Sequence
 from importlib import resources
 
 import jax
@@ -13,28 +14,32 @@ from mtjax.parallel import hosts
 from mtjax.saved.folder import remove_unused
 from mtjax.saved.policy import Policy, load
 from mtjax.saved.result import Result
+from mtjax.training.distillation import require_teachers
 from mtjax.training.finetune import require_start
 from mtjax.training.run import NO_HOOKS, Hooks, train
 from mtjax.types import InputError
 
 
-def check(config: RunConfig, start: Policy | None = None) -> None:
+def check(config: RunConfig, start: Policy | Sequence[Policy] | None = None) -> None:
     """Check a configuration, and the policy from which its run begins, before a folder is made.
 
     Args:
-        start: the policy to fine-tune, but for a run that has begun.
+        start: the policy to fine-tune, or those that teach, but for a run that has begun.
 
     Raises:
         InputError: they do not go together.
     """
     if config.env or start is not None:
-        require_start(config, start)
+        require = require_teachers if config.learner.taught else require_start
+        require(config, start)  # type: ignore
     config.check()
 
 
-def load_start(config: RunConfig) -> Policy | None:
-    """Return the policy that this run fine-tunes, or None."""
-    return load(config.start) if config.start else None
+def load_start(config: RunConfig) -> Policy | tuple[Policy, ...] | None:
+    """Return the policy that this run fine-tunes, the policies that teach its agent, or None."""
+    if not config.start:
+        return None
+    return tuple(map(load, config.start.split(","))) if config.learner.taught else load(config.start)
 
 
 def launch(config: RunConfig, hooks: Hooks = NO_HOOKS) -> Result:
@@ -98,9 +103,11 @@ def _warning(family: str, agent: str) -> str:
 
 
 def _origin(config: RunConfig) -> str:
-    """Return a line on the run that is fine-tuned, or an empty string."""
+    """Return a line on the run that is fine-tuned or teaches, or an empty string."""
     if not config.start:
         return ""
+    if config.learner.taught:
+        return f"taught by {config.start.replace(',', ', ')}"
     family, told = config.family, config.learner.conditioning.by_parameters
     assert isinstance(family, Family)
     unseen = set(family.varied) - {name for name, _, _ in ranges(family)} if told else ()

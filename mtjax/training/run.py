@@ -28,7 +28,7 @@ from mtjax.saved import checkpoint, lock, log
 from mtjax.saved.policy import Policy
 from mtjax.saved.records import Records
 from mtjax.saved.result import Result
-from mtjax.training import allocator, finetune, memory, selection
+from mtjax.training import allocator, distillation, finetune, memory, selection
 from mtjax.training.console import (
     Clock,
     Console,
@@ -51,8 +51,8 @@ class Hooks(NamedTuple):
 
     directory: Path | None = None
     """An existing folder for metrics, evaluations and checkpoints, in which no other process writes; None for none."""
-    start: Policy | None = None
-    """The policy to fine-tune."""
+    start: Policy | tuple[Policy, ...] | None = None
+    """The policy to fine-tune, or those that teach."""
     resume: bool = False
     """Continue from the newest whole checkpoint in ``directory``, or start over if there is none yet."""
     on_chunk: Callable[[dict[str, Any]], Any] | None = None
@@ -144,10 +144,11 @@ class _Run:
         return [{name: log.number(x[k]) for name, x in now.items()} for k in range(len(self.seeds))]  # type: ignore
 
     def adopt(self, tasks: Any, fresh: Any) -> Any:
-        """Return the agent's state with the values of the run to fine-tune. Every point starts from the same seeds."""
+        """Return the agent's state with the values of the runs from which it begins, the same seeds for every point."""
         apart = lambda x: x.reshape(-1, self.config.plan.seeds, *x.shape[1:])
         together = lambda x: x.reshape(-1, *x.shape[2:])
-        adopt = partial(finetune.adopt, self.hooks.start, self.agent, tasks)  # type: ignore
+        begin = distillation.adopt if self.agent.taught else finetune.adopt
+        adopt = partial(begin, self.hooks.start, self.agent, tasks)  # type: ignore
         return jax.tree.map(together, jax.vmap(adopt)(jax.tree.map(apart, fresh)))
 
     @cached_property

@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
@@ -191,3 +191,16 @@ def due(task: Task, place: Array) -> Array:
     """Return the number () of the symbol at a place of a task's sketch; -1 after the last one."""
     sketch = task.goal["sketch"]
     return jnp.where(place < task.goal["length"], sketch[jnp.minimum(place, len(sketch) - 1)], -1)
+
+
+def due_in(family: Sketched, rows: Sequence[int], places: np.ndarray) -> np.ndarray:
+    """Return the numbers (N, H) of the symbols that were due in steps, -1 after the last, of episodes (N,).
+
+    Args:
+        rows: (N,) of the tasks in the family's table.
+        places: (N, H) places in their sketches after each step.
+    """
+    codes = family.codes[family.numbers_of_goals[np.asarray(rows)]]
+    codes = np.pad(codes, ((0, 0), (0, 1)), constant_values=-1)
+    before = np.pad(places[:, :-1], ((0, 0), (1, 0)))
+    return np.take_along_axis(codes, np.minimum(before, family.longest), axis=1)
