@@ -26,16 +26,18 @@ from mtjax.types import SPLITS, Task
 _FPS = 25
 _WIDTHS = ((4, 320), (9, 240))  # of a tile, for up to so many tasks; beyond, the narrowest
 _NARROWEST = 160
+_EPISODES = 4  # of a trial that are filmed, at most
 _WORDS = re.compile("[^ ,]+[ ,]*")  # after which a caption may go on in the next line
 
 
 class Chosen(NamedTuple):
-    """A task to film."""
+    """A task to film, or an episode of a trial of it."""
 
     part: Part
     split: str
     place: int  # among all tasks of the environment
     own: int  # among all tasks of its family
+    episode: int = 0  # of the trial
 
 
 def require(env: Tabled) -> None:
@@ -75,7 +77,9 @@ def write(
     stem: Path,
     named: Mapping[str, str],
 ) -> Path:
-    """Film one episode of each chosen task, and write them as one grid. Progress is printed.
+    """Film one trial of each chosen task, and write them as one grid. Progress is printed.
+
+    A trial of several episodes has a line of the grid, its episodes side by side: the first ones, and the last.
 
     Args:
         tasks: all tasks of the environment.
@@ -87,34 +91,45 @@ def write(
     with contextlib.ExitStack() as filmed, host.explaining():
         for part in env.parts:
             filmed.enter_context(part.family.filmed())
-        played = jax.block_until_ready(record(env, policy.agent, policy.state, tasks, jnp.int32(seed)))
-    by_name = {part.name: states for part, states in zip(env.parts, apart(played.states), strict=True)}
+        played = record(env, policy.agent, policy.state, tasks, jnp.int32(seed), policy.trial)
+        played = jax.block_until_ready(played)
+    by_name = {part.name: states for part, states in zip(env.parts, apart(played.kept), strict=True)}
+    shown = _episodes(policy.trial)
+    chosen = [one._replace(episode=episode) for one in chosen for episode in shown]
     width = next((width for most, width in _WIDTHS if len(chosen) <= most), _NARROWEST)
     count, tiles = max(round(seconds * _FPS), 1), []
     for i, one in enumerate(chosen):
         print(f"filming {i + 1} of {len(chosen)}: {', '.join(_caption(env, one, played, named))}", flush=True)
         tiles.append(_tile(env, one, played, by_name[one.part.name], count, width))
     captions = [_caption(env, one, played, named) for one in chosen]
-    path = render.write_video(stem, grid(captioned(tiles, captions)), _FPS)
-    print(f"filmed {path.name}: {len(chosen)} tasks")
+    columns = len(shown) if policy.trial > 1 else 0
+    path = render.write_video(stem, grid(captioned(tiles, captions), columns), _FPS)
+    print(f"filmed {path.name}: {len(chosen) // len(shown)} tasks{f' by {columns} episodes' * bool(columns)}")
     return path
+
+
+def _episodes(trial: int) -> list[int]:
+    """Return which episodes of a trial are filmed: all if they are few, else the first ones and the last."""
+    return [*range(min(trial, _EPISODES - 1)), *([trial - 1] if trial >= _EPISODES else [])]
 
 
 def _caption(env: Tabled, one: Chosen, played: Recording, named: Mapping[str, str]) -> tuple[str, str]:
     """Return the lines on a task: its split and return, and its parameters."""
     row = int(played.rows[one.place])  # continuous ranges have a row for each episode
-    split = named.get(one.split, one.split)
-    return f"{split}, return {amount(float(played.returns[one.place]))}", env.describe(row)
+    split, (trial, returns) = named.get(one.split, one.split), (played.returns.shape[1], played.returns[one.place])
+    episode = f", episode {one.episode + 1} of {trial}" * (trial > 1)
+    return f"{split}{episode}, return {amount(float(returns[one.episode]))}", env.describe(row)
 
 
 def _tile(env: Tabled, one: Chosen, played: Recording, states: Any, count: int, width: int) -> np.ndarray:
-    """Return the frames (F, height, width, 3) of one task, at most ``count``."""
+    """Return the frames (F, height, width, 3) of one episode, at most ``count``."""
     family: Any = one.part.family
     row = env.own_row(int(played.rows[one.place]))
-    length = int(played.lengths[one.place])
+    lengths = played.lengths[one.place]
+    first, length = int(np.sum(lengths[: one.episode])), int(lengths[one.episode])
     times = np.arange(count) / _FPS * family.film_speed / family.seconds_per_step
     steps = np.unique(np.minimum(times.astype(int), length - 1))
-    shown = jax.tree.map(lambda x: x[one.own][steps], states)  # also of keys, which NumPy has not
+    shown = jax.tree.map(lambda x: x[one.own][first + steps], states)  # also of keys, which NumPy has not
     size = width, width * 3 // 4
     drawn = render.film(family, row, shown, *size) if isinstance(family, Pictured) else family.pictures(shown, *size)
     frames = drawn[np.searchsorted(steps, np.minimum(times.astype(int), length - 1))]
@@ -149,10 +164,14 @@ def _wrapped(text: str, width: float, font: Any) -> list[str]:
     return lines
 
 
-def grid(tiles: Sequence[np.ndarray]) -> np.ndarray:
-    """Return tiles (F, height, width, 3) side by side; a shorter one stands still at its end."""
+def grid(tiles: Sequence[np.ndarray], columns: int = 0) -> np.ndarray:
+    """Return tiles (F, height, width, 3) side by side; a shorter one stands still at its end.
+
+    Args:
+        columns: tiles in a line; 0 makes the grid as square as can be.
+    """
     longest = max(map(len, tiles))
-    columns = math.ceil(math.sqrt(len(tiles)))
+    columns = columns or math.ceil(math.sqrt(len(tiles)))
     lines = math.ceil(len(tiles) / columns)
     height, width = tiles[0].shape[1:3]
     whole = np.zeros((longest, lines * height, columns * width, 3), np.uint8)
