@@ -39,7 +39,7 @@ def test_what_is_believed_is_what_the_policy_remembers_through_a_trial(way):
     env = mtjax.make("grid-navi", size=3, steps=4)
     policy = policy_of(way, env)
     found, task = beliefs.believed(policy), pick(env.tasks(), 0)
-    played = [record(env, policy.agent, policy.state, env.tasks(), s, 3, beliefs._keep) for s in range(beliefs._SHOWN)]
+    played = [record(env, policy.agent, policy.state, env.tasks(), s, 3, beliefs._keep) for s in range(beliefs._TRIES)]
     named = {env.describe(int(one.rows[0])): pick(one.kept, 0) for one in reversed(played)}
     assert set(found.names) == set(named) and all(name.startswith("goal=") for name in named)
     remember = jax.jit(lambda memory, x: policy.remember(memory, task, x.obs, x.action, x.reward, x.next_obs, x.ended))

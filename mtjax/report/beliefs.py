@@ -1,7 +1,7 @@
 """A figure of what an agent believes of a hidden task over the steps of a trial, beside what is true."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -12,7 +12,7 @@ import numpy as np
 from mtjax.agents.parts.knowing.posterior import Posterior
 from mtjax.agents.state import of_task
 from mtjax.envs.engines import host
-from mtjax.learning.evaluation import record
+from mtjax.learning.evaluation import Recording, record
 from mtjax.learning.rollout import Worlds
 from mtjax.names import SPLITS, InputError, nearest_error, public
 from mtjax.report import collect, figures
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _SHOWN = 5  # trials
+_TRIES = 20  # trials of a task that are played at most, until so many different ones were drawn
 _IN_A_LINE = 5  # panels of latents
 
 
@@ -81,17 +82,17 @@ def _require(agent: Any) -> None:
 def believed(policy: Policy, split: str = "train") -> Believed:
     """Play a trial of at most ``_SHOWN`` tasks of a split, and return what was believed in them.
 
-    Where trials draw their tasks, and a split has few, several are played of each.
+    Where trials draw their tasks, more are played until so many are different.
     """
     env, tasks = policy.env, policy.env.tasks(split)
-    count = len(tasks.id)
-    if not count:
+    if not len(tasks.id):
         raise InputError(f"this run has no tasks of the split {split}")
-    often = 1 if tasks.draws is None else max(_SHOWN // count, 1)
     play = partial(record, env, policy.agent, policy.state, tasks, trial=policy.trial, keep=_keep)
     read = jax.jit(partial(_read, policy.agent))
     with host.explaining():
-        played = [play(jnp.int32(seed)) for seed in range(often)]
+        played = [play(jnp.int32(0))]
+        while tasks.draws is not None and len(played) < _TRIES and len(_rows(played)) < _SHOWN:
+            played.append(play(jnp.int32(len(played))))
     found = [read(policy.state, tasks._replace(draws=None), one.kept) for one in played]
     played, (belief, foretold) = jax.tree.map(lambda *x: np.concatenate(x), *zip(played, found, strict=True))
     chosen = _spread(played.rows)
@@ -101,6 +102,11 @@ def believed(policy: Policy, split: str = "train") -> Believed:
     told = {name: (of(predicted), of(came)) for name, (predicted, came) in foretold.items()}
     ends = np.cumsum(played.lengths[chosen], axis=1)
     return Believed(of(belief.mean), of(np.exp(belief.log_var / 2)), told, names, ends)
+
+
+def _rows(played: Sequence[Recording]) -> np.ndarray:
+    """Return the different tasks that were played."""
+    return np.unique(np.concatenate([one.rows for one in played]))
 
 
 def _keep(worlds: Worlds, transition: Transition) -> Transition:
@@ -132,17 +138,18 @@ def _draw(found: Believed, title: str) -> "list[Axes]":
 
     latents, told = found.mean.shape[-1], _worth_telling(found.foretold)
     columns = min(latents, _IN_A_LINE)
-    heights = [1.6] * math.ceil(latents / columns) + [2.2] * bool(told)
-    figure = Figure(figsize=(1.5 + 1.9 * columns, 0.6 + sum(heights)), layout="constrained")
-    lines = figure.add_gridspec(len(heights), 1, height_ratios=heights)
-    panels: list[Axes] = []
+    heights = [1.4] * math.ceil(latents / columns) + [2.0] * bool(told)
+    figure = Figure(figsize=(1.6 + 1.5 * columns, 0.6 + sum(heights)), layout="constrained")
+    outer, panels = figure.add_gridspec(len(heights), 1, height_ratios=heights), []
+    lines = [line.subgridspec(1, columns) for line in list(outer)[: len(heights) - bool(told)]]
     for z in range(latents):
-        line = lines[z // columns].subgridspec(1, columns)
         first = panels[0] if panels else None
-        panels.append(figure.add_subplot(line[z % columns], sharex=first, sharey=first))
+        panels.append(figure.add_subplot(lines[z // columns][z % columns], sharex=first, sharey=first))
         _draw_latent(panels[z], found, z)
+        panels[z].label_outer()
+    below = outer[-1].subgridspec(1, max(len(told), 1))
     for i, (name, each) in enumerate(told.items()):
-        panels.append(figure.add_subplot(lines[-1].subgridspec(1, len(told))[i]))
+        panels.append(figure.add_subplot(below[i]))
         _draw_told(panels[-1], found, name, *each)
     for axes in panels[-max(len(told), 1) :]:
         axes.set_xlabel("step of the trial")
@@ -165,30 +172,35 @@ def _draw_latent(axes: "Axes", found: Believed, z: int) -> None:
 def _draw_told(axes: "Axes", found: Believed, name: str, predicted: np.ndarray, came: np.ndarray) -> None:
     """Draw predictions (N, H) and what came, or how far off those of vectors (N, H, O) are."""
     _style(axes, found)
-    steps = np.arange(came.shape[1])
-    if came.ndim == 3:
+    steps, vectors = np.arange(came.shape[1]), came.ndim == 3
+    if vectors:
         size = np.sqrt(np.nanmean(np.sum(np.square(came), axis=-1)))
         predicted, came = np.linalg.norm(predicted - came, axis=-1) / size, np.full(came.shape[:2], np.nan)
-        axes.set_ylim(bottom=0)
         name = f"error of the predicted {name}"
     else:
         name = f"{name}: predicted (line), came (points)"
     for i in range(len(predicted)):
         axes.plot(steps, predicted[i], color=figures.colour(i), linewidth=1.2)
         axes.plot(steps, came[i], ".", color=figures.colour(i), markersize=4)
+    if vectors:
+        axes.set_ylim(bottom=0)
     axes.set_title(name, fontsize=9)
 
 
 def _worth_telling(foretold: dict[str, tuple[np.ndarray, np.ndarray]]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Return those predictions of which something else than 0 came."""
-    return {name: each for name, each in foretold.items() if np.any(np.nan_to_num(each[1]))}
+    """Return those predictions of which something else than 0 came, those of single numbers first."""
+    told = {name: each for name, each in foretold.items() if np.any(np.nan_to_num(each[1]))}
+    return dict(sorted(told.items(), key=lambda item: item[1][1].ndim))
 
 
 def _style(axes: "Axes", found: Believed) -> None:
     """Give axes of steps the look of all figures, and mark where the episodes of all trials end."""
+    from matplotlib.ticker import MaxNLocator
+
     figures.style(axes)
     axes.set_ylabel("")
     axes.tick_params(labelsize=8)
+    axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
     if np.all(found.ends == found.ends[0]):
         for end in found.ends[0, :-1]:
             axes.axvline(end - 0.5, color="0.6", linewidth=0.8)
