@@ -334,9 +334,12 @@ def test_the_task_of_an_evaluated_trial_stays_and_each_episode_begins_elsewhere(
         def rules(self, task, state, action):
             return task.goal["scale"], state.obs[0] + 1, False
 
-    scales = evaluated(Told(), 40 * K, K, Blind()).returns.reshape(2, 2, 40, K)
+    scales = evaluated(Told(), 60 * K, K, Blind()).returns.reshape(2, 2, 60, K)
     np.testing.assert_array_equal(scales, np.broadcast_to(scales[..., :1], scales.shape))
-    assert len(np.unique(scales[..., 0])) > 60
+    first, again = scales[..., :50, 0], scales[..., 50:, 0]  # each of the 50 draws once, and then from the first on
+    assert all(len(np.unique(of_task)) == 50 for of_task in first.reshape(-1, 50))
+    np.testing.assert_array_equal(again, first[..., :10])
+    assert not np.array_equal(first[0], first[1])
 
 
 def test_a_run_s_evaluations_know_their_trials(tmp_path, capsys):

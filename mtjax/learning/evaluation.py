@@ -1,5 +1,7 @@
 """Evaluation plays whole trials under the mean action, on any tasks, with keys of its own.
 
+Trials that draw their tasks play all draws of a task before one comes again, as benchmarks with listed goals ask.
+
 Of trials of several episodes (``mtjax.learning.trials``), the episodes of one follow each other along the axis of
 episodes.
 """
@@ -19,6 +21,7 @@ from mtjax.learning.rollout import EnvStep, Worlds, reset_ended, reset_envs, spl
 from mtjax.learning.trials import Trials, of_episodes
 from mtjax.names import replacing
 from mtjax.parallel.axes import over_seeds
+from mtjax.tasks import draw_at
 from mtjax.types import SPLITS, Adapting, Agent, Array, Env, InputError, Key, Task, Transition
 
 _EVER = "success_ever"  # the metric that success was 1 at any step of an episode
@@ -200,7 +203,7 @@ def evaluate(
         metrics = _latest(env_step.metrics, scores.metrics, now & ~env_step.lost[..., None])
         return (worlds, Scores(returns, metrics), alive & ~env_step.transition.closed), None
 
-    worlds = reset_envs(env, agent, state, tasks, keys, trials)
+    worlds = reset_envs(env, agent, state, tasks, keys, trials, lambda _: draw_in_turn(tasks, keys))
     take = lambda worlds: step_envs(env, agent, state, tasks, worlds, None, trials=trials)[1]
     env_step = jax.eval_shape(take, worlds)
     metrics = {name: jnp.zeros((*shape, trials.episodes), x.dtype) for name, x in env_step.metrics.items()}
@@ -261,6 +264,14 @@ def _latest(new: dict[str, Array], old: dict[str, Array], now: Array) -> dict[st
     if _EVER in old:
         new |= {_EVER: jnp.maximum(new["success"], old[_EVER])}
     return {name: jnp.where(now, x, old[name]) for name, x in new.items()}
+
+
+def draw_in_turn(tasks: Task, keys: Key) -> Task:
+    """Draw the tasks of trials (S, T, E, ...) with keys (S, T, E), none of a task twice before all were drawn."""
+    count, trials = tasks.draws.id.shape[1], jnp.arange(keys.shape[2])  # type: ignore
+    shuffle = lambda key: jax.random.permutation(jax.random.fold_in(key, 0x60A1), count)[trials % count]
+    order = jax.vmap(jax.vmap(shuffle))(keys[:, :, 0])
+    return jax.vmap(jax.vmap(jax.vmap(draw_at, (None, 0))), (None, 0))(tasks, order)
 
 
 def _at(keys: Key, time: Array) -> Key:
