@@ -141,7 +141,7 @@ def _draw(found: Believed, title: str) -> "list[Axes]":
     heights = [1.4] * math.ceil(latents / columns) + [2.0] * bool(told)
     figure = Figure(figsize=(1.6 + 1.5 * columns, 0.6 + sum(heights)), layout="constrained")
     outer, panels = figure.add_gridspec(len(heights), 1, height_ratios=heights), []
-    lines = [line.subgridspec(1, columns) for line in list(outer)[: len(heights) - bool(told)]]
+    lines = [outer[i].subgridspec(1, columns) for i in range(len(heights) - bool(told))]
     for z in range(latents):
         first = panels[0] if panels else None
         panels.append(figure.add_subplot(lines[z // columns][z % columns], sharex=first, sharey=first))
