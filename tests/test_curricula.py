@@ -194,10 +194,10 @@ def test_a_run_by_a_sequence_is_recorded_by_known_tasks_and_resumes_to_the_bit(t
 def test_a_run_that_heeds_returns_resumes_to_the_bit(tmp_path):
     """What was heard is in its checkpoints."""
     given = {"num_envs": 2, "chunk_steps": 100, "curriculum": "progress:2:100", "quiet": True, "unroll": 10}
-    given |= {"minibatches": 1, "epochs": 1, "eval_every": 1000, "eval_episodes": 1, "hidden": (8,), "num_tasks": 5}
-    whole = mtjax.train("bandit", "ppo", steps=2000, directory=tmp_path / "whole", **given)
-    mtjax.train("bandit", "ppo", steps=1000, directory=tmp_path / "cut", **given)
-    again = mtjax.train("bandit", "ppo", steps=2000, directory=tmp_path / "cut", resume=True, **given)
+    given |= {"minibatches": 1, "epochs": 1, "eval_every": 1200, "eval_episodes": 1, "hidden": (8,), "num_tasks": 5}
+    whole = mtjax.train("bandit", "ppo", steps=2400, directory=tmp_path / "whole", **given)
+    mtjax.train("bandit", "ppo", steps=1200, directory=tmp_path / "cut", **given)
+    again = mtjax.train("bandit", "ppo", steps=2400, directory=tmp_path / "cut", resume=True, **given)
     for name in ("agent", "heard", "rows"):
         one, two = (jax.device_get(getattr(result.state, name)) for result in (whole, again))
         jax.tree.map(np.testing.assert_array_equal, one, two)

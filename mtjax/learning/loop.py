@@ -315,7 +315,7 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
     metrics = _summarise(history, count)
     if state.heard is not None:
         returns = collectives.of_all_seeds(metrics["return"])
-        state = state._replace(heard=curricula.hear(state.heard, state.rows, returns))
+        state = state._replace(heard=curricula.hear(state.heard, state.rows, returns))  # type: ignore
     if settings.plays.steps:
         metrics = _of_known(metrics, state.rows, len(known.id))
     return state._replace(agent=collectives.agreed(state.agent)), metrics
@@ -354,7 +354,7 @@ def _next_rows(settings: Settings, state: TrainState, known: int) -> Array:
     plays = settings.plays
     if not isinstance(plays, curricula.Heeding):
         return plays.rows(state.iteration, known)
-    due = state.iteration % plays.steps == 0
+    due = state.iteration % plays.steps < settings.chunk_steps  # also if a resumed run begins its chunks elsewhere
     return jnp.where(due, plays.choose(state.iteration, state.heard), state.rows)  # type: ignore
 
 
