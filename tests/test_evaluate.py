@@ -301,10 +301,11 @@ def test_hip_bmdp_run_is_scored_with_its_nearest_heads(multi_head_run, capsys):
 @pytest.fixture
 def filmed(monkeypatch):
     """The films that are written, and the tasks that are drawn, without OpenGL."""
-    found = {"drawn": []}
+    found = {"drawn": [], "joints": []}
 
     def film(env, row, states, width, height):
         found["drawn"].append((row, states.qpos.shape))
+        found["joints"].append(np.asarray(states.qpos))
         return np.full((len(states.qpos), height, width, 3), 10 + row, np.uint8)
 
     def write(path, frames, fps):
@@ -346,6 +347,10 @@ def test_a_trial_is_filmed_episode_by_episode(copied_run, filmed, tmp_path, caps
     high = 240 + 2 * 22
     assert filmed["film"][0].shape == (5, 2 * high, 2 * 320, 3)
     assert [row for row, _ in filmed["drawn"]] == [0, 0, 1, 1]
+    played = record(policy.env, policy.agent, policy.state, tasks, jnp.int32(0), 2)
+    for shown, (place, first) in zip(filmed["joints"], [(0, 0), (0, 1), (1, 0), (1, 1)], strict=True):
+        begun = first * int(played.lengths[place, 0])
+        np.testing.assert_allclose(shown[0], played.kept.qpos[place, begun], rtol=1e-6)
     out = capsys.readouterr().out
     assert re.search(r"filming 2 of 4: train, episode 2 of 2, return \d+, size=1\n", out)
     assert "filmed film: 2 tasks by 2 episodes" in out
