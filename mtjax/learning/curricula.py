@@ -81,12 +81,17 @@ def _key(number: Array) -> Key:
 
 
 @dataclasses.dataclass(frozen=True)
-class Heeding(Random):
+class Heeding:
     """Some tasks are chosen by what was heard of all: the returns of the policy that learns, as means over seeds.
 
     Of each task (N, 2) a fast and a slow mean over the chunks that played it are kept, NaN before its first episode has
     ended. A task that was never heard of comes first, and a share of the choices is random, so that none is forgotten.
     """
+
+    played: int
+    steps: int
+
+    count = Random.count
 
     def rows(self, step: Array, known: int) -> Array:
         return self.choose(step, nothing_heard(known))
@@ -166,7 +171,7 @@ def hear(heard: Array, rows: Array, returns: Array) -> Array:
     return heard.at[rows].set(jnp.where(jnp.isnan(new), old, mean))
 
 
-Curriculum = Everything | Random | Sequence
+Curriculum = Everything | Random | Heeding | Sequence
 _KINDS = {  # with how many numbers each has
     "random": (Random, 2),
     "progress": (Progress, 2),
