@@ -34,7 +34,6 @@ from report import markdown, run_main
 
 import mtjax
 from mtjax.learning.evaluation import Evaluations
-from mtjax.learning.trials import require_whole
 from mtjax.names import InputError
 from mtjax.report import figures
 from mtjax.report.stats import seed_interval
@@ -86,18 +85,17 @@ def request(arguments: argparse.Namespace, env: str, agent: str) -> argparse.Nam
     return argparse.Namespace(**{**vars(arguments), **given})
 
 
-def by_episode(evaluations: Evaluations) -> dict[str, np.ndarray]:
+def scores_of(evaluations: Evaluations) -> dict[str, np.ndarray]:
     """Return the last evaluation's returns (S, T, episodes of a trial), means over trials, without empty splits."""
-    require_whole(evaluations.returns["train"].shape[-1], evaluations.trial)
-    last = {split: x[:, -1] for split, x in evaluations.returns.items() if x.size}
-    return {split: x.reshape(*x.shape[:2], -1, evaluations.trial).mean(axis=2) for split, x in last.items()}
+    splits = (split for split, x in evaluations.returns.items() if x.size)
+    return {split: learning.by_episode(evaluations.returns[split], evaluations.trial) for split in splits}
 
 
 def tabulate(out: Path) -> str:
     """Write tables and figures of all finished rungs, and return the ladder."""
     lines, differences = [], []
     for env, of_env in itertools.groupby(learning.pairs(out), lambda pair: pair.env):
-        found = {pair.agent: by_episode(pair.evaluations) for pair in of_env}
+        found = {pair.agent: scores_of(pair.evaluations) for pair in of_env}
         found = {rung: found[rung] for rung in learning.LADDER if rung in found}
         lines += [line(env, rung, split, x) for rung, scores in found.items() for split, x in scores.items()]
         last = {rung: {split: x[..., -1] for split, x in scores.items()} for rung, scores in found.items()}

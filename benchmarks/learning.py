@@ -56,6 +56,7 @@ from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import RunConfig, configure
 from mtjax.experience.replay import Replay
 from mtjax.learning.evaluation import Evaluations, load_evaluations, save_evaluations
+from mtjax.learning.trials import require_whole
 from mtjax.report import figures as plot
 from mtjax.report.stats import (
     Interval,
@@ -402,6 +403,12 @@ def conflict_rows(out: Path) -> list[list[str]]:
 def last_scores(evaluations) -> dict[str, np.ndarray]:
     """Return the mean returns (S, T) of the last evaluation by split, without empty splits."""
     return {split: x[:, -1].mean(axis=-1) for split, x in evaluations.returns.items() if x.size}
+
+
+def by_episode(scores: np.ndarray, trial: int) -> np.ndarray:
+    """Return the last of scores (S, V, T, episodes) by the episode of the trial (S, T, trial), means over trials."""
+    require_whole(scores.shape[-1], trial)
+    return scores[:, -1].reshape(len(scores), scores.shape[2], -1, trial).mean(axis=2)
 
 
 def cell(interval: Interval, form: str = ".0f") -> str:

@@ -1,8 +1,8 @@
 """Run a suite of tasks by its name, with its protocol: agents, seeds, steps, and the figures that the field reports.
 
-    python benchmarks/suite.py mt10|mt50|dynamics|goals|domains|hard|pixels|looks [--agents NAME ...] [--seeds N]
-                               [--steps-per-task N] [--training NAME=VALUE ...] [--env NAME=VALUE ...] [--best]
-                               [--unfinished] [--devices 0 1 ...] [--within N] [--out DIR]
+    python benchmarks/suite.py mt10|mt50|ml1|ml10|ml45|dynamics|goals|domains|hard|pixels|looks [--agents NAME ...]
+                               [--seeds N] [--steps-per-task N] [--training NAME=VALUE ...] [--env NAME=VALUE ...]
+                               [--best] [--adapt K] [--unfinished] [--devices 0 1 ...] [--within N] [--out DIR]
 
 ``--list`` prints the protocols. Every pair of environment and agent writes ``DIR/ENV/AGENT.csv`` (training over steps
 and seconds) and ``AGENT.npz`` (every episode of every evaluation: returns and, where tasks have it, success), and the
@@ -20,6 +20,16 @@ Where a suite compares one agent for all tasks with one for each, a task has as 
 ``--devices`` every pair is a process of its own, on one of these GPUs; ``--within`` ends the call after some seconds.
 
 Success is that of the last evaluation: at the episode's last step, and at any step. Both are shares of episodes.
+
+``ml1``, ``ml10`` and ``ml45`` are Meta-World's protocols of meta-learning. The goal is hidden. A trial is K episodes of
+adaptation (``--adapt``, 10 as in the original) and one that counts, with one task, one goal and one memory. Test tasks
+are the split extrapolation: five others, or in ml1 other goals of the same task. The one evaluation, at the end, plays
+a trial for each of a task's 50 goals. All tables are then of the last episode alone. ``episodes.md`` has return and
+success of the first, the last and all episodes of trials, of training and of test tasks, and ``AGENT.npz`` has every
+episode, those of a trial one after another.
+They differ from ``metaworld.evaluation`` in this: there an episode that counts ends at its first success, so that its
+success is that at any step; three such episodes are played, for 40 of a test task's goals; and RL2 as published freezes
+its memory in them, while here it reads on.
 ``care`` knows its task as other agents do, in Meta-World by its number. As published it reads a sentence that says what
 the task asks for: ``care-text``, by default with hashed words, and with ``--training text=MODEL`` by a model of
 sentence-transformers.
@@ -27,6 +37,7 @@ sentence-transformers.
 
 import argparse
 import dataclasses
+import itertools
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -39,6 +50,7 @@ from report import markdown, run_main, write_lines
 
 import mtjax
 from mtjax.learning.evaluation import Evaluations
+from mtjax.names import InputError
 from mtjax.report.stats import seed_interval, unpaired_difference
 from mtjax.types import SPLITS, Env
 
@@ -58,6 +70,7 @@ _GOALS = (
 _OF_META_WORLD = (
     *("sac-conditioned", "multi-head", "care-text", "pcgrad", "soft-modularization", "moore", "ppo", "brc", "care"),
 )
+_OF_TRIALS = ("rl2", "varibad", "blind")
 _SEEN = ("pixels=64", "frames=3", "repeat=2")
 
 
@@ -75,6 +88,7 @@ class Suite:
     together: str = ""  # the environment of all tasks, where others are its tasks alone
     settings: tuple[str, ...] = ()  # of the environments
     vary: tuple[str, ...] = ()  # what tasks differ in, besides what the families vary
+    adapt: int = 0  # episodes of a trial before the one that counts
 
 
 SUITES = {
@@ -88,6 +102,29 @@ SUITES = {
         equal_to="brc",
     ),
     "mt50": Suite("Meta-World's fifty tasks, as mt10", ("mt50",), _OF_META_WORLD, 1_024_000, 3, equal_to="brc"),
+    "ml1": Suite(
+        "one of Meta-World's tasks with 50 hidden goals, and 50 others to test (Yu et al. 2019): success after ten "
+        "episodes of adaptation",
+        ("metaworld-reach", "metaworld-push", "metaworld-pick-place"),
+        _OF_TRIALS,
+        20_000_000,
+        settings=("goal_hidden=true", "test_goals=true"),
+        adapt=10,
+    ),
+    "ml10": Suite(
+        "ten of Meta-World's tasks with 50 hidden goals each, and five others to test, as ml1: 2M steps a task",
+        ("ml10",),
+        _OF_TRIALS,
+        2_000_000,
+        adapt=10,
+    ),
+    "ml45": Suite(
+        "forty-five of Meta-World's tasks and five others to test, as ml10",
+        ("ml45",),
+        _OF_TRIALS,
+        2_000_000,
+        adapt=10,
+    ),
     "dynamics": Suite(
         "families whose bodies differ, on HiP-BMDP's split (Zhang et al. 2021): four tasks train, six are unseen",
         _DYNAMICS,
@@ -143,8 +180,15 @@ SUITES = {
 }
 
 
+_SCORES = {"return": "return", "success": "success at the end", "success_ever": "success at any step"}
+_EPISODES = ("first episode", "last episode, which counts", "all")
+
+
 class Last(NamedTuple):
-    """Holds the last evaluation of a run: of its training tasks, and returns of all."""
+    """Holds the last evaluation of a run: of its training tasks, and returns of all.
+
+    Of suites with episodes of adaptation it is that of the episodes that count.
+    """
 
     labels: list[str]  # (T,)
     returns: np.ndarray  # (S, T)
@@ -169,8 +213,13 @@ def main() -> None:
     parser.add_argument("--best", action="store_true", help="every agent with its own preset")
     parser.add_argument("--training", nargs="*", default=[], metavar="NAME=VALUE", help="of the loop or all agents")
     parser.add_argument("--env", nargs="*", default=[], metavar="NAME=VALUE", help="settings of families: pixels=64")
-    parser.add_argument("--evaluations", type=int, default=4)
-    parser.add_argument("--eval-episodes", type=int, default=50, help="of each task; Meta-World's tasks have 50 goals")
+    parser.add_argument("--evaluations", type=int, help="by default four, and one of suites that adapt")
+    parser.add_argument(
+        "--eval-episodes", type=int, default=50, help="trials of each task; Meta-World's tasks have 50 goals"
+    )
+    parser.add_argument(
+        "--adapt", type=int, metavar="K", help="episodes before the one that counts, in ml1 and the like"
+    )
     parser.add_argument("--unfinished", action="store_true", help=learning.UNFINISHED)
     parser.add_argument("--out", type=Path)
     add_flags(parser)
@@ -180,6 +229,10 @@ def main() -> None:
         return
     suite = SUITES[arguments.suite]
     suite = dataclasses.replace(suite, settings=(*suite.settings, *arguments.env))
+    if arguments.adapt is not None:
+        if not suite.adapt or arguments.adapt < 1:
+            raise InputError("--adapt is a number of episodes from 1 on, of suites that adapt: ml1, ml10, ml45")
+        suite = dataclasses.replace(suite, adapt=arguments.adapt)
     arguments.out = arguments.out or Path("runs") / f"{arguments.suite}-{time.strftime('%Y%m%d-%H%M%S')}"
     arguments.equal_to = "" if arguments.best else suite.equal_to
     agents = suite.agents if arguments.agents is None else arguments.agents
@@ -201,6 +254,9 @@ def request(arguments: argparse.Namespace, suite: Suite, env: str, out: Path) ->
     steps = (arguments.steps_per_task or suite.steps_per_task) * family_of(suite, env).train_count
     given = {"seeds": arguments.seeds or suite.seeds, "steps": steps, "split": suite.split, "out": out}
     given |= {"env": [*suite.settings], "vary": [*suite.vary], "as_in": suite.together}
+    given["evaluations"] = arguments.evaluations or (1 if suite.adapt else 4)
+    given["eval_episodes"] = arguments.eval_episodes * (suite.adapt + 1)
+    given["training"] = [*arguments.training, *([f"trials={suite.adapt + 1}"] if suite.adapt else [])]
     return argparse.Namespace(**{**vars(arguments), **given})
 
 
@@ -211,7 +267,7 @@ def family_of(suite: Suite, env: str) -> Env:
 
 def last_of(suite: Suite, pair: learning.Pair) -> Last:
     """Return the last evaluation, averaged over episodes."""
-    labels, evaluations = family_of(suite, pair.env).labels("train"), pair.evaluations
+    labels, evaluations = family_of(suite, pair.env).labels("train"), that_count(suite, pair.evaluations)
     metrics, clocks = evaluations.metrics, ("-", "-")
     if pair.metrics.exists() and len(curve := learning.curve_of(pair)):
         clocks = (f"{x:.0f}" for x in curve[-1, :, 2:4].mean(axis=0))
@@ -219,6 +275,15 @@ def last_of(suite: Suite, pair: learning.Pair) -> Last:
     splits = learning.last_scores(evaluations)
     made = steps_a_task(evaluations)[-1]
     return Last(labels, splits["train"], of("success"), of("success_ever"), splits, made, *clocks)
+
+
+def that_count(suite: Suite, evaluations: Evaluations) -> Evaluations:
+    """Return evaluations of the last episodes of trials alone, if a suite has episodes of adaptation."""
+    if not suite.adapt:
+        return evaluations
+    last = lambda scores: {split: x[..., evaluations.trial - 1 :: evaluations.trial] for split, x in scores.items()}
+    metrics = {name: last(scores) for name, scores in evaluations.metrics.items()}
+    return evaluations._replace(returns=last(evaluations.returns), metrics=metrics, trial=1)
 
 
 def found(out: Path, suite: Suite, unfinished: bool = False) -> Iterator[tuple[str, str, Last]]:
@@ -245,9 +310,25 @@ def tabulate(out: Path, suite: Suite, unfinished: bool = False) -> str:
     table = markdown(head, lines) + learning.list_stopped(out)
     (out / "scores.md").write_text(table + "\n")
     write_lines(out / "tasks.csv", rows)
+    if suite.adapt:
+        (out / "episodes.md").write_text(episodes(out, unfinished) + "\n")
     if suite.together:
         (out / "sharing.md").write_text(sharing(out, suite, unfinished) + "\n")
     return table
+
+
+def episodes(out: Path, unfinished: bool = False) -> str:
+    """Return a table of the first, the last and all episodes of trials in the last evaluation, of every split."""
+    lines = []
+    for pair in learning.pairs(out, unfinished):
+        scores = {"return": pair.evaluations.returns, **pair.evaluations.metrics}
+        for split, name in itertools.product(SPLITS, _SCORES):
+            if name in scores and (x := scores[name][split]).size:
+                found = learning.by_episode(x, pair.evaluations.trial)
+                ends = found[..., 0], found[..., -1], found.mean(axis=-1)
+                about = [short(pair.env), pair.agent, str(len(x)), split, str(x.shape[2]), _SCORES[name]]
+                lines.append([*about, *(score(each, ".3g") for each in ends)])
+    return markdown(["environment", "agent", "seeds", "split", "tasks", "", *_EPISODES], lines)
 
 
 def sharing(out: Path, suite: Suite, unfinished: bool = False) -> str:

@@ -57,7 +57,7 @@ def play(policy: Policy) -> Iterator[tuple[Any, list[Image.Image]]]:
     """Return every family of a trained policy, and the frames of its film."""
     env: Any = policy.env
     played = record(env, policy.agent, policy.state, env.tasks("train"), jnp.int32(0))
-    for part, states in zip(env.parts, apart(played.states), strict=True):
+    for part, states in zip(env.parts, apart(played.kept), strict=True):
         family, places = part.family, part.places["train"]
         shown = few(len(places))
         rows = [env.own_row(int(played.rows[place])) for place in places[shown]]

@@ -40,8 +40,8 @@ def fingers(policy: Policy) -> list[list[Image.Image]]:
     shown = slice(FIRST, FIRST + FRAMES * STRIDE, STRIDE)
     films = []
     for task, row in enumerate(played.rows):
-        frames = render.film(env, int(row), np.asarray(played.states.qpos[task, shown]), *RENDERED)
-        label = f"{env.describe(int(row)).replace('=', ' ')}: {float(played.returns[task]):.0f}"
+        frames = render.film(env, int(row), np.asarray(played.kept.qpos[task, shown]), *RENDERED)
+        label = f"{env.describe(int(row)).replace('=', ' ')}: {float(played.returns[task, 0]):.0f}"
         films.append([labelled(Image.fromarray(frame), label, COLOURS[task]) for frame in frames])
     return films
 

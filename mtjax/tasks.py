@@ -6,7 +6,7 @@
 import jax
 import jax.numpy as jnp
 
-from mtjax.types import Env, InputError, Key, Task
+from mtjax.types import Array, Env, InputError, Key, Task
 
 SAME_CONTEXT = 1e-5
 """Contexts that are no farther apart are those of one task, which rounding may bring apart."""
@@ -49,7 +49,11 @@ def episode_task(task: Task, key: Key) -> Task:
     """
     if task.draws is None:
         return task
-    choice = jax.random.randint(key, (), 0, len(task.draws.id))
+    return draw_at(task, jax.random.randint(key, (), 0, len(task.draws.id)))
+
+
+def draw_at(task: Task, choice: Array) -> Task:
+    """Return the draw of ``task`` with this number () int32."""
     drawn = jax.tree.map(lambda x: x[choice], task.draws)._replace(id=task.id)
     return drawn if contexts_vary(task) else drawn._replace(context=task.context)
 

@@ -519,7 +519,7 @@ def test_a_sale_is_filmed_though_its_state_has_a_key():
     played = record(env, Idle(), jnp.zeros((1, 1)), env.tasks("all"), jnp.int32(0))
     (one,) = films.choose(env, ["train"], [0])
     try:
-        frames = films._tile(env, one, played, played.states, 50, 40)
+        frames = films._tile(env, one, played, played.kept, 50, 40)
     except InputError as error:
         pytest.skip(str(error))
     assert frames.shape == (50, 30, 40, 3) and len(np.unique(frames, axis=0)) == 20

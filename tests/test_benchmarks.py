@@ -409,6 +409,11 @@ def test_sharing_is_compared_after_as_many_steps_a_task(script, tmp_path):
     assert "| walker-run | brc | 40 | - | - | - |" in sharing
 
 
+GIVEN = SimpleNamespace(
+    steps_per_task=100, seeds=None, env=[], training=["gamma=0.9"], evaluations=None, eval_episodes=50
+)
+
+
 def test_suites_name_only_what_there_is(script):
     suite = script("suite")
     for each in suite.SUITES.values():
@@ -421,10 +426,61 @@ def test_suites_name_only_what_there_is(script):
 def test_a_suites_steps_are_those_of_the_tasks_that_its_split_trains_on(script, name, env, tmp_path):
     """Four of the ten sizes, and of the ten angles, of HiP-BMDP's split."""
     suite = script("suite")
-    given = SimpleNamespace(steps_per_task=100, seeds=None, env=[])
-    found = suite.request(given, suite.SUITES[name], env, tmp_path)
+    found = suite.request(GIVEN, suite.SUITES[name], env, tmp_path)
+    assert found.evaluations == 4 and found.eval_episodes == 50 and found.training == ["gamma=0.9"]
     assert found.steps == 400 and found.split == "hip-bmdp" and found.vary == [*suite.SUITES[name].vary]
     assert len(suite.family_of(suite.SUITES[name], env).labels("train")) == 4
+
+
+@needs("metaworld")
+@pytest.mark.parametrize("name, tasks, tests", [("ml1", 1, 1), ("ml10", 10, 5), ("ml45", 45, 5)])
+def test_a_suite_of_meta_learning_adapts_before_the_episode_that_counts(script, name, tasks, tests, tmp_path):
+    """Ten episodes, in a trial for each of the 50 goals, which agents do not see; test tasks are not trained on."""
+    suite = script("suite")
+    protocol = suite.SUITES[name]
+    found = suite.request(GIVEN, protocol, protocol.envs[0], tmp_path)
+    assert found.training == ["gamma=0.9", "trials=11"] and found.eval_episodes == 50 * 11 and found.evaluations == 1
+    assert found.steps == 100 * tasks
+    env = suite.family_of(protocol, protocol.envs[0])
+    assert env.counts == {"train": tasks, "interpolation": 0, "extrapolation": tests}
+    assert all(part.family.goal_hidden and part.family.num_draws == 50 for part in env.parts)
+
+
+def test_what_counts_is_the_last_episode_of_a_trial(script, tmp_path):
+    """Success at its end and at any of its steps, of training and of test tasks; the first and all stand beside it."""
+    suite = script("suite")
+    protocol = dataclasses.replace(suite.SUITES["goals"], adapt=2)
+    trials = np.array([[1.0, 2.0, 6.0], [3.0, 4.0, 8.0]]).reshape(1, 1, 1, 6)  # two trials of three episodes
+    ended, ever = np.array([0, 1, 0.0] * 2).reshape(trials.shape), np.array([0, 1, 1, 0, 0, 0.0]).reshape(trials.shape)
+    found = evaluations_of(np.tile(trials, (3, 2, 10, 1)), success=np.tile(ended, (3, 2, 10, 1)))
+    found.metrics["success_ever"] = {split: np.tile(ever, (3, 2, 10, 1)) for split in ("train", "extrapolation")}
+    found.metrics["success_ever"]["interpolation"] = found.returns["interpolation"]
+    found.metrics["success"]["extrapolation"] = found.metrics["success"]["train"]
+    returns = {**found.returns, "extrapolation": 10 * found.returns["train"]}
+    values = {**found.values, "extrapolation": found.values["train"]}
+    found = found._replace(returns=returns, values=values, trial=3)
+    (tmp_path / "point-mass-vary-goal").mkdir()
+    save_evaluations(tmp_path / "point-mass-vary-goal" / "rl2.npz", found)
+    table = suite.tabulate(tmp_path, protocol)
+    assert "| rl2 | 3 | 7 [7, 7] | - | 70 [70, 70] | 0.000 [0.000, 0.000] | 0.500 [0.500, 0.500] |" in table
+    lines = (tmp_path / "episodes.md").read_text().splitlines()[2:]
+    cells = [[cell.strip().split(" [")[0] for cell in line.split("|")[4:-1]] for line in lines]
+    assert cells == [
+        ["train", "10", "return", "2", "7", "4"],
+        ["train", "10", "success at the end", "0", "0", "0.333"],
+        ["train", "10", "success at any step", "0", "0.5", "0.333"],
+        ["extrapolation", "10", "return", "20", "70", "40"],
+        ["extrapolation", "10", "success at the end", "0", "0", "0.333"],
+        ["extrapolation", "10", "success at any step", "0", "0.5", "0.333"],
+    ]
+
+
+def test_episodes_of_adaptation_are_those_of_suites_that_adapt(script, monkeypatch):
+    suite = script("suite")
+    for words in (["goals", "--adapt=3"], ["ml10", "--adapt=0"]):
+        monkeypatch.setattr(sys, "argv", ["suite", *words])
+        with pytest.raises(InputError, match="--adapt is a number of episodes"):
+            suite.main()
 
 
 def test_a_suite_counts_the_tasks_that_its_flags_ask_for(script, tmp_path, monkeypatch):

@@ -37,6 +37,7 @@ _WALKER = "a walker takes several minutes on two CPU cores, docs/results/returns
 _ONE = "--env.vary.size=1.1 --split=none --steps=250000"  # finger of the ten
 _GYM = "needs Gymnasium; tests/test_hosted.py learns to balance there"
 _GRID = "earns nearly all that can be earned in ten minutes of two CPU cores; tests/test_recurrent.py has a bandit"
+_FOUND = "earns nearly all that it can before its first evaluation; tests/test_posterior.py has a bandit"
 _READS = "begins to earn more after two minutes of two CPU cores"
 _PULLS = "ten pulls earn between 5 and 6.02, too little to see in few trials; tests/test_own_inference.py trains it"
 _BELIEVES = "ten pulls earn between 5 and 6.02; tests/test_posterior.py has beliefs that are known"
@@ -79,6 +80,10 @@ MARKS: dict[str, Learns | str] = {
     "--env=cheetah-run --agent=ppo": _GPU,
     "--env=brax-ant-vary-direction --agent=ppo": _GPU,
     "--env=grid-navi --agent=rl2 --trials=4 --agent.unroll=60": _GRID,
+    "--env=grid-navi --env.size=3 --env.steps=6 --trials=3 --agent=ppo --agent.conditioning=posterior "
+    "--agent.recurrent-size=32 --agent.inference-widths 32 32 --agent.decoded-steps=6 --agent.hidden 64 64 "
+    "--agent.unroll=18 --agent.gamma=0.97 --agent.entropy-cost=0.02 --agent.actor-lr=1e-3 --num-envs=128 "
+    "--chunk-steps=180 --steps=600000 --eval-every=200000 --eval-episodes=30": _FOUND,
     "--env=finger-spin --env.vary.size=0.95:1.13:200 --curriculum=random:10:4000 --num-envs=8": _FINGER,
     "--env=gymnasium:Pendulum-v1 --env.vary.g=5:15:5 --agent=ppo": _GYM,
     "--env=mt10 --agent=multi-head": _GPU,

@@ -55,6 +55,70 @@ def test_a_random_choice_repeats_no_task_and_changes():
     assert counts.sum() == 600 and np.all(np.abs(counts - 60) < 30)
 
 
+def heard_of(*fast, slow=None):
+    """What was heard of tasks by their fast means; None of one that was never played."""
+    fast = np.array([np.nan if x is None else x for x in fast], np.float32)
+    return jnp.stack([fast, fast if slow is None else jnp.float32(slow)], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("name", "heard", "chosen"),
+    [
+        ("hardest", heard_of(5.0, -1.0, 3.0, 9.0), {1, 2}),
+        ("hardest", heard_of(5.0, -1.0, 3.0, None), {1, 3}),
+        ("progress", heard_of(5.0, 1.0, 3.0, 9.0, slow=[5.0, 4.0, 2.0, 9.0]), {1, 2}),
+        ("progress", heard_of(5.0, None, 3.0, 9.0, slow=[4.0, 0.0, 3.0, 5.0]), {1, 3}),
+    ],
+)
+def test_tasks_are_chosen_by_what_was_heard_of_them(name, heard, chosen, monkeypatch):
+    """The least returns, or those that change most, down too; before them tasks that were never played."""
+    curriculum = curricula.read(f"{name}:2:10")
+    drawn = [set(np.asarray(curriculum.choose(jnp.int32(step), heard)).tolist()) for step in range(0, 3000, 10)]
+    share = np.mean([one == chosen for one in drawn])
+    assert 0.8 < share < 0.97 and {row for one in drawn for row in one} == {0, 1, 2, 3}  # a tenth is random
+    monkeypatch.setattr(curricula, "_RANDOM", 0.0)
+    assert set(np.asarray(curriculum.choose(jnp.int32(0), heard)).tolist()) == chosen
+
+
+def test_a_range_of_tasks_grows_where_its_ends_return_enough():
+    """From the middle, to both sides, up to the ends of the table; both ends are always played."""
+    curriculum = curricula.read("growing:3:10:6.5")
+    rows = lambda *heard, step=0: sorted(np.asarray(curriculum.choose(jnp.int32(step), heard_of(*heard))).tolist())
+    assert sorted(np.asarray(curriculum.rows(jnp.int32(0), 7)).tolist()) == rows(*[None] * 7) == [2, 3, 4]
+    assert rows(None, None, 6, 9, 6, None, None) == [2, 3, 4]
+    low, middle, high = rows(None, None, 7, 9, 6, None, None)
+    assert (low, high) == (1, 4) and middle in (2, 3)
+    low, middle, high = rows(None, 2, 7, 9, 6.5, None, None)
+    assert (low, high) == (1, 5) and middle in (2, 3, 4)
+    found = [rows(7, 7, 7, 7, 7, 7, 7, step=step) for step in range(0, 1000, 10)]
+    assert {(row[0], row[2]) for row in found} == {(0, 6)} and {row[1] for row in found} == {1, 2, 3, 4, 5}
+
+
+def test_what_is_heard_are_means_over_seeds_and_chunks():
+    """A first return counts whole; a task without an episode keeps what was heard; so do those that were not played."""
+    returns = jnp.array([[2.0, jnp.nan, 8.0], [4.0, jnp.nan, jnp.nan]])
+    first = curricula.hear(curricula.nothing_heard(5), jnp.array([4, 0, 1]), returns)
+    expected = np.full((5, 2), np.nan)
+    expected[4], expected[1] = 3, 8
+    np.testing.assert_array_equal(first, expected)
+    second = curricula.hear(first, jnp.array([4, 1]), jnp.array([[5.0, jnp.nan]]))
+    np.testing.assert_allclose(second[4], [4.0, 3.2], rtol=1e-6)
+    np.testing.assert_array_equal(second[1], [8, 8])
+
+
+def test_a_curriculum_hears_of_the_tasks_that_it_plays_and_changes_only_when_it_is_due():
+    """Of the second of two tasks alone an episode's return is negative, so it is played on as the hardest."""
+    tasks = jax.tree.map(lambda x: jnp.stack([x[0], x[0], x[0]]), Walk().tasks())
+    tasks = tasks._replace(id=jnp.arange(3), goal={"scale": jnp.array([1.0, -1.0, 1.0])})
+    states, metrics = played(tiny("multi-head"), "hardest:1:16", 8, tasks, **REPLAY)
+    rows = [int(state.rows[0]) for state in states[1:]]
+    assert rows[::2] == rows[1::2] and set(rows) == {0, 1, 2} and rows[-1] == 1
+    heard = curricula.nothing_heard(3)
+    for row, one in zip(rows, metrics, strict=True):
+        heard = curricula.hear(heard, jnp.array([row]), one["return"][:, [row]])
+    np.testing.assert_allclose(states[-1].heard, heard, rtol=1e-6)
+
+
 def test_own_parameters_are_taken_by_number_and_put_back():
     """Also those that optimisers keep; what tasks share is that of the played ones."""
     net = Params({"w": jnp.zeros(2)}, {"h": jnp.arange(3.0)})
@@ -126,12 +190,29 @@ def test_a_run_by_a_sequence_is_recorded_by_known_tasks_and_resumes_to_the_bit(t
     assert whole.evaluations.returns["train"].shape[2] == 3
 
 
+@pytest.mark.slow
+def test_a_run_that_heeds_returns_resumes_to_the_bit(tmp_path):
+    """What was heard is in its checkpoints."""
+    given = {"num_envs": 2, "chunk_steps": 100, "curriculum": "progress:2:100", "quiet": True, "unroll": 10}
+    given |= {"minibatches": 1, "epochs": 1, "eval_every": 1200, "eval_episodes": 1, "hidden": (8,), "num_tasks": 5}
+    whole = mtjax.train("bandit", "ppo", steps=2400, directory=tmp_path / "whole", **given)
+    mtjax.train("bandit", "ppo", steps=1200, directory=tmp_path / "cut", **given)
+    again = mtjax.train("bandit", "ppo", steps=2400, directory=tmp_path / "cut", resume=True, **given)
+    for name in ("agent", "heard", "rows"):
+        one, two = (jax.device_get(getattr(result.state, name)) for result in (whole, again))
+        jax.tree.map(np.testing.assert_array_equal, one, two)
+    assert np.isfinite(whole.state.heard).all()
+
+
 @pytest.mark.parametrize(
     "agent, given, said",
     [
         ("ppo", {"curriculum": "some"}, "curriculum is all, random:T:STEPS"),
         ("ppo", {"curriculum": "random:0:50"}, "curriculum is all, random:T:STEPS"),
         ("ppo", {"curriculum": "random:4:50"}, "plays 1 to 3 of the 3 training tasks"),
+        ("ppo", {"curriculum": "growing:1:50:3"}, "plays both ends of a range"),
+        ("ppo", {"curriculum": "growing:2:50"}, "growing:T:STEPS:RETURN"),
+        ("ppo", {"curriculum": "hardest:2:50:1"}, "hardest:T:STEPS"),
         ("ppo", {"curriculum": "sequence:60", "unroll": 50}, "give a multiple of chunk_steps=50"),
         ("famo", {"curriculum": "sequence:50"}, "without memory of the tasks"),
         ("maml", {"curriculum": "sequence:100", "unroll": 25}, "adapts to all that it knows"),

@@ -205,12 +205,34 @@ def test_a_recorded_episode_is_that_of_a_plain_loop():
         while not world.terminated and age < task.horizon:
             action = agent.act(state, (), world.obs, task, None).action
             world = env.step(task, world.state, action)
-            np.testing.assert_allclose(found.states.obs[i, age], world.state.obs, rtol=1e-6)
+            np.testing.assert_allclose(found.kept.obs[i, age], world.state.obs, rtol=1e-6)
             total, age = total + float(world.reward), age + 1
-        np.testing.assert_allclose(found.returns[i], total, rtol=1e-5)
-        assert (found.lengths[i], found.rows[i]) == (age, tasks.row[i])
+        np.testing.assert_allclose(found.returns[i, 0], total, rtol=1e-5)
+        assert (found.lengths[i, 0], found.rows[i]) == (age, tasks.row[i])
         lengths.add(age)
     assert lengths == {2, 3, 4, 6}
+
+
+def test_a_recorded_trial_is_that_of_a_plain_loop():
+    """Its episodes follow each other, each from a fresh start, as often as the trial has them."""
+    env, agent, state, trial = Fatal(), Leaning(), jnp.float32([0.3]), 3
+    tasks = tasks_of("one-step", (1.0, -0.5, 2.0, 0.5))._replace(horizon=jnp.int32([6, 4, 2, 6]))
+    found = record(env, agent, state, tasks, jnp.int32(8), trial)
+    keys = jax.random.split(jax.random.fold_in(jax.random.key(8), 0xF11), (1, 4, 1))[0, :, 0]
+    for i in range(4):
+        task, key, time = pick(tasks, i), keys[i], 0
+        for episode in range(trial):
+            world, total, age = env.reset(task, key), 0.0, 0
+            while not world.terminated and age < task.horizon:
+                action = agent.act(state, (), world.obs, task, None).action
+                world = env.step(task, world.state, action)
+                np.testing.assert_allclose(found.kept.obs[i, time + age], world.state.obs, rtol=1e-6)
+                total, age = total + float(world.reward), age + 1
+            np.testing.assert_allclose(found.returns[i, episode], total, rtol=1e-5)
+            assert found.lengths[i, episode] == age
+            time += age
+            key = jax.random.fold_in(keys[i], time - 1)
+    assert len(set(np.asarray(found.lengths).ravel().tolist())) > 2
 
 
 def test_a_recorded_episode_names_the_task_that_it_drew():
@@ -222,11 +244,11 @@ def test_a_recorded_episode_names_the_task_that_it_drew():
     tasks = tasks._replace(draws=draws)
     found = record(env, Leaning(), jnp.float32([0.3]), tasks, jnp.int32(8))
     keys = jax.random.split(jax.random.fold_in(jax.random.key(8), 0xF11), (1, len(rows), 1))[0, :, 0]
-    for i, length in enumerate(found.lengths):
+    for i, length in enumerate(found.lengths[:, 0]):
         task_key, key = jax.random.split(keys[i])
-        before = found.states.obs[i, :length, 0] - 1
+        before = found.kept.obs[i, :length, 0] - 1
         np.testing.assert_allclose(before[0], env.reset(pick(tasks, i), key).obs[0], rtol=1e-5)
-        np.testing.assert_allclose(found.returns[i], (found.rows[i] + 1) * np.sum(before), rtol=1e-5)
+        np.testing.assert_allclose(found.returns[i, 0], (found.rows[i] + 1) * np.sum(before), rtol=1e-5)
         assert found.rows[i] == episode_task(pick(tasks, i), task_key).row
     assert np.all(found.rows // 100 == tasks.id)
 
@@ -279,10 +301,11 @@ def test_hip_bmdp_run_is_scored_with_its_nearest_heads(multi_head_run, capsys):
 @pytest.fixture
 def filmed(monkeypatch):
     """The films that are written, and the tasks that are drawn, without OpenGL."""
-    found = {"drawn": []}
+    found = {"drawn": [], "joints": []}
 
     def film(env, row, states, width, height):
         found["drawn"].append((row, states.qpos.shape))
+        found["joints"].append(np.asarray(states.qpos))
         return np.full((len(states.qpos), height, width, 3), 10 + row, np.uint8)
 
     def write(path, frames, fps):
@@ -313,6 +336,25 @@ def test_video_films_some_tasks_of_each_split_in_one_grid(copied_run, capsys, fi
     assert np.any(frames[0, :15, :240] > 200)  # the caption
     out = capsys.readouterr().out
     assert re.search(r"filming 1 of 6: train, return \d+, size=1\n", out) and "filmed film: 6 tasks" in out
+
+
+def test_a_trial_is_filmed_episode_by_episode(copied_run, filmed, tmp_path, capsys):
+    """Side by side, a line for each task; of a long trial the first ones and the last."""
+    policy = dataclasses.replace(mtjax.load(copied_run), trial=2)
+    tasks = policy.env.tasks("all")
+    chosen = films.choose(policy.env, ["train"], [0, 1])
+    films.write(policy, tasks, chosen, 0.2, 0, tmp_path / "film", {})
+    high = 240 + 2 * 22
+    assert filmed["film"][0].shape == (5, 2 * high, 2 * 320, 3)
+    assert [row for row, _ in filmed["drawn"]] == [0, 0, 1, 1]
+    played = record(policy.env, policy.agent, policy.state, tasks, jnp.int32(0), 2)
+    for shown, (place, first) in zip(filmed["joints"], [(0, 0), (0, 1), (1, 0), (1, 1)], strict=True):
+        begun = first * int(played.lengths[place, 0])
+        np.testing.assert_allclose(shown[0], played.kept.qpos[place, begun], rtol=1e-6)
+    out = capsys.readouterr().out
+    assert re.search(r"filming 2 of 4: train, episode 2 of 2, return \d+, size=1\n", out)
+    assert "filmed film: 2 tasks by 2 episodes" in out
+    assert [films._episodes(trial) for trial in (1, 3, 4, 9)] == [[0], [0, 1, 2], [0, 1, 2, 3], [0, 1, 2, 8]]
 
 
 def test_a_caption_covers_nothing_and_needs_no_more_width_than_its_picture():

@@ -265,6 +265,51 @@ def test_a_file_that_holds_no_policy_is_refused(content, tmp_path):
         assert "pickle" not in str(caught.value)
 
 
+WAYS = {
+    "recurrent": {"conditioning": "recurrent", "recurrent_size": 4},
+    "inferred": {"conditioning": "inferred", "inferred_from": 3},
+    **{way: {"conditioning": "posterior", "inference": way, "latent_size": 2} for way in ("varibad", "pearl", "cadm")},
+}
+
+
+@pytest.mark.parametrize("way", slow_but(WAYS, "recurrent", "pearl"))
+@pytest.mark.parametrize("scores", [False, True])
+def test_a_memory_goes_into_the_file(way, scores, tmp_path):
+    """By NumPy and by JAX: actions, and memories through the episodes of a trial, for one world and for a batch."""
+    env = mtjax.make("grid-navi", size=3, steps=2, scores=scores)
+    settings = WAYS[way] | ({"inferred_from": 3} if way == "cadm" else {})
+    policy = dataclasses.replace(policy_of(for_action(tiny("ppo", **settings), env.spec.action), env), trial=2)
+    file = mtjax.export(policy, tmp_path / "policy.npz")
+    reader, act, remember = standalone.load(file), standalone.load_jax(file), standalone.load_jax(file, "remember")
+    task, held, random = pick(env.tasks()._replace(draws=None), 0), reader.begin(), np.random.default_rng(0)
+    memory = policy.begin(task)
+    np.testing.assert_allclose(reader(np.eye(9, dtype=np.float32)[0]), reader(np.eye(9, dtype=np.float32)[0], held))
+    for t in range(4):
+        obs, after = np.eye(9, dtype=np.float32)[random.integers(9, size=2)]
+        action, reward, ended = policy(obs, task, memory=memory), random.normal(), t % 2 == 1
+        np.testing.assert_allclose(reader(obs, held), action, atol=2e-5)
+        both, many = np.stack([held, held + 0.1]), np.stack([obs, obs])
+        np.testing.assert_allclose(act(many, np.zeros((2, 0)), both), reader(many, both), atol=2e-5)
+        memory = policy.remember(memory, task, obs, action, reward, after, ended)
+        step = np.asarray(action), np.float32(reward), after, np.float32(ended)
+        batch = [np.stack([x, x]) for x in step]
+        found = remember(many, np.zeros((2, 0)), both, *batch)
+        np.testing.assert_allclose(reader.remember(both, many, *batch), found, atol=2e-5)
+        held = reader.remember(held, obs, action, reward, after, ended)
+        np.testing.assert_allclose(found[0], held, atol=2e-5)
+    known = jax.tree.leaves((memory.past, memory.hidden))
+    np.testing.assert_allclose(held, np.concatenate([np.ravel(x) for x in known]), atol=2e-5)
+    assert reader.meta["trial"] == 2 and not np.allclose(held, reader.begin())
+    with pytest.raises(InputError, match=r"remembers its trial is exported to a file that ends with \.npz"):
+        mtjax.export(policy, tmp_path / "policy.onnx")
+
+
+def test_a_policy_without_a_memory_begins_none(tmp_path):
+    reader = standalone.load(mtjax.export(policy_of(tiny("sac")), tmp_path / "policy.npz"))
+    with pytest.raises(ValueError, match="acts by what it sees, and has no memory to begin"):
+        reader.begin()
+
+
 def test_what_cannot_be_exported_is_refused(tmp_path, monkeypatch):
     """In a line, and nothing is overwritten."""
     monkeypatch.setitem(sys.modules, "onnx", None)
@@ -282,8 +327,6 @@ def test_what_cannot_be_exported_is_refused(tmp_path, monkeypatch):
             require_file(file)
     with pytest.raises(InputError, match="export takes a policy"):
         mtjax.export(3, tmp_path / "y.npz")
-    with pytest.raises(InputError, match="infers its task from memory"):
-        mtjax.export(policy_of(tiny("sac", conditioning="inferred")), tmp_path / "y.npz")
     with pytest.raises(InputError, match="goes on with what it has chosen"):
         mtjax.export(policy_of(tiny("options")), tmp_path / "y.npz")
     with pytest.raises(InputError, match="knows no operation 'sort'"):

@@ -193,9 +193,8 @@ def test_convolutions_and_pooling_are_those_of_jax(name, tmp_path):
     x = np.float32(np.random.default_rng(0).normal(size=shape)) - 3  # so that filling with 0 would show
     expected = np.asarray(apply(x)).ravel()
     program, constants = steps_of(jax.make_jaxpr(lambda x: apply(x).ravel())(x))
-    reader = standalone.Policy.__new__(standalone.Policy)
-    reader.program, reader.constants = json.loads(json.dumps(program)), constants
-    np.testing.assert_allclose(reader._run(x), expected, atol=1e-4)
+    found = standalone._run(json.loads(json.dumps(program)), constants, [x])
+    np.testing.assert_allclose(found, expected, atol=1e-4)
     require("onnx")
     runtime = require("onnxruntime")
     meta = {"agent": "one", "env": "none", "about": "", "action_size": expected.size}

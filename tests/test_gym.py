@@ -25,10 +25,13 @@ from probes import Levers
 
 import mtjax.gym
 from mtjax import tasks as choose
+from mtjax.agents import for_action
 from mtjax.envs.mtenv.control import CartPole
 from mtjax.envs.mtenv.tabular import Bandit, TabularMDP
 from mtjax.gym import EnvToMTEnv, FamilyEnv, FamilyVectorEnv, NTasks, NTasksId, SampleRandomTask
 from mtjax.gym.env import draw_seeds
+from mtjax.learning.evaluation import record
+from mtjax.saved.policy import Policy
 from mtjax.types import InputError
 
 MDPS = TabularMDP(num_tasks=6)  # six training tasks, six interpolation tasks, no end but the time limit
@@ -671,3 +674,31 @@ def test_a_forked_process_is_refused_with_the_fix(made, monkeypatch):
     for use in (made, env.reset):
         with pytest.raises(InputError, match=r"vector_kwargs=\{'context': 'spawn'\}"):
             use()
+
+
+def test_a_policy_with_a_memory_plays_a_trial_here_as_in_an_evaluation():
+    """``reset`` keeps the task, and the memory goes on over the ends of episodes: the same actions."""
+    family, agent = (
+        mtjax.make("grid-navi", size=3, steps=4, scores=True),
+        mtjax.agent("rl2", hidden=(8,), recurrent_size=4),
+    )
+    agent = for_action(agent, family.action)
+    state = agent.init(family.spec, family.tasks(), jax.random.key(0))
+    moved = jax.tree.map(lambda x: x + 0.5 * jax.random.normal(jax.random.key(1), x.shape), state.nets["actor"])
+    state = state.with_nets(actor=moved)
+    policy = Policy(family, agent, state, None, jnp.asarray([0]), trial=3)
+    played = record(family, agent, state, family.tasks(), jnp.int32(0), 3, lambda _, transition: transition.action)
+    env, task = FamilyEnv(family), jax.tree.map(lambda x: x[0], family.tasks()._replace(draws=None))
+    env.set_task_state(int(played.rows[0]))
+    memory, actions = policy.begin(task), []
+    for _ in range(policy.trial):
+        seen, ended = env.reset()[0]["env_obs"], False
+        while not ended:
+            actions.append(policy(seen, task, memory=memory))
+            after, reward, terminated, truncated, _ = env.step(np.asarray(actions[-1]))
+            ended = terminated or truncated
+            memory = policy.remember(memory, task, seen, actions[-1], reward, after["env_obs"], ended)
+            seen = after["env_obs"]
+    np.testing.assert_allclose(actions, played.kept[0], rtol=1e-4, atol=1e-5)
+    first = np.asarray(actions)[::4]  # of episodes, which begin in the same cell: what differs is the memory
+    assert np.ptp(first, axis=0).max() > 1e-2

@@ -41,6 +41,14 @@ def test_the_best_strategy_for_small_grids():
     assert exact.grid(3, 6, 2) == pytest.approx(2.7 + 4.02)
 
 
+def test_a_hidden_task_is_called_by_what_makes_it():
+    """In captions and figures, which show what the agent does not see."""
+    grid, bandit = GridNavi(), HiddenBandit(num_draws=3)
+    assert [grid.describe(row) for row in (1, 21)] == ["goal=0,2", "goal=4,4"]
+    first = ",".join(f"{x:.2g}" for x in bandit.pool()[0])
+    assert bandit.describe(0) == bandit.describe(1) == f"chances={first}"
+
+
 # Bandits.
 
 

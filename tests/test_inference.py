@@ -247,4 +247,4 @@ def test_a_run_is_loaded_with_its_past(run):
     assert not np.array_equal(policy(after.obs, task, memory=rewards(-1)), action)
 
     played = evaluation.record(policy.env, policy.agent, policy.state, pick(policy.env.tasks(), [0]), 0)
-    assert played.states.qpos.shape == (1, 100, 2) and played.rows.shape == (1,) and played.lengths[0] == 100
+    assert played.kept.qpos.shape == (1, 100, 2) and played.rows.shape == (1,) and played.lengths[0, 0] == 100

@@ -37,9 +37,9 @@ def test_returns_are_means_over_trials_by_their_episodes(ladder):
     """Of the last evaluation; the episodes of a trial stand one after another."""
     returns = np.zeros((1, 2, 1, 4))
     returns[0, 1, 0] = [1, 10, 3, 20]
-    assert ladder.by_episode(evaluations_of(returns, 2)).keys() == {"train"}
-    np.testing.assert_array_equal(ladder.by_episode(evaluations_of(returns, 2))["train"], [[[2, 15]]])
-    np.testing.assert_array_equal(ladder.by_episode(evaluations_of(returns, 1))["train"], [[[8.5]]])
+    assert ladder.scores_of(evaluations_of(returns, 2)).keys() == {"train"}
+    np.testing.assert_array_equal(ladder.scores_of(evaluations_of(returns, 2))["train"], [[[2, 15]]])
+    np.testing.assert_array_equal(ladder.scores_of(evaluations_of(returns, 1))["train"], [[[8.5]]])
 
 
 def test_the_ladder_tells_first_and_last_episode_and_paired_differences(ladder, tmp_path):

@@ -181,6 +181,24 @@ def test_an_evaluation_may_draw_other_goals():
 
 
 @needs("metaworld")
+def test_goals_of_ml1s_test_are_those_of_the_next_seed():
+    """They are held out in a task of their own; of a benchmark too."""
+    for name, given in (("metaworld-push", {}), ("metaworld-reach", {"benchmark": "ml10"})):
+        env = mtjax.make(name, task_seed=3, num_draws=2, engine="c", test_goals=True, goal_hidden=True, **given)
+        own, other = (mtjax.make(name, task_seed=seed, num_draws=2, **given).vectors() for seed in (3, 4))
+        np.testing.assert_array_equal(env.vectors(), np.concatenate([own, other]))
+        assert env.counts == {"train": 1, "interpolation": 0, "extrapolation": 1}
+        for split, vectors in (("train", own), ("extrapolation", other)):
+            tasks = env.tasks(split)
+            drawn, first = (x.goal["target"][0, ..., :2] for x in (tasks.draws, tasks))
+            np.testing.assert_allclose(drawn, vectors[:, -3:-1], atol=1e-6)
+            np.testing.assert_allclose(first, vectors[0, -3:-1], atol=1e-6)
+            assert tasks.row.tolist() == [int(split != "train")]
+    with pytest.raises(InputError, match="leave out test-goals"):
+        mtjax.make("metaworld-push", held_out=True, test_goals=True)
+
+
+@needs("metaworld")
 def test_refused_settings_are_named(monkeypatch):
     with pytest.raises(InputError, match="mjx"):
         mtjax.make("metaworld-reach", engine="mjx")

@@ -399,8 +399,8 @@ def test_episodes_end_at_their_own_horizons():
         return record(BOTH, agent, agent.init(BOTH.spec, BOTH.tasks("train"), key), tasks, jnp.int32(0))
 
     played = quick(play, jax.random.key(0))
-    assert played.lengths.tolist() == [4, 4, 4, 7] + [4] * 6
-    aim, wide = apart(played.states)
+    assert played.lengths[:, 0].tolist() == [4, 4, 4, 7] + [4] * 6
+    aim, wide = apart(played.kept)
     assert aim.obs.shape == (9, 7, 2) and wide.obs.shape == (1, 7, 3)
 
 

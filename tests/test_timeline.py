@@ -39,7 +39,7 @@ def test_names_have_colours_of_their_own(count):
 
 def test_a_strip_shows_the_whole_episode_and_where_it_is():
     """Four steps of ten pixels: two of one, one of none, one of another; a white mark, and the name."""
-    acting = Timeline(("a", "b"), np.array([[0, 0, -1, 1, 0, 0]]), np.array([4]))
+    acting = Timeline(("a", "b"), np.array([[0, 0, -1, 1, 0, 0]]), np.array([[4]]))
     found = strips(acting, 0, [0, 3, 3], 40)
     assert found.shape[0] == 3 and found.shape[2:] == (40, 3)
     first, second = colours(2)
@@ -79,13 +79,15 @@ def test_a_film_of_sub_policies_has_strips_and_a_figure(name, tmp_path, monkeypa
     acting = seen["acting"]
     assert known in acting.names and seen["labels"] == ["plank", "stick"]
     assert acting.acting.shape == (2, env.episode_length) and np.all(acting.acting[:, 0] >= 0)
-    played = {number for row, length in zip(acting.acting, acting.lengths, strict=True) for number in row[:length]}
+    played = {
+        number for row, length in zip(acting.acting, acting.lengths, strict=True) for number in row[: length.sum()]
+    }
     drawn = {tuple(x) for x in seen["frames"].reshape(-1, 3).tolist()}
     assert {colours(len(acting.names))[number] for number in played} <= drawn
 
 
 def test_the_figure_has_a_row_for_each_task(tmp_path):
-    acting = Timeline(("a", "b"), np.array([[0, 1, 1], [1, -1, 0]]), np.array([3, 2]))
+    acting = Timeline(("a", "b"), np.array([[0, 1, 1], [1, -1, 0]]), np.array([[3], [2]]))
     timeline.draw(tmp_path / "t.png", acting, ["first", "second"])
     drawn = np.asarray(Image.open(tmp_path / "t.png").convert("RGB")).reshape(-1, 3)
     wide = {colour: int((np.abs(drawn.astype(int) - colour).max(axis=1) <= 2).sum()) for colour in colours(2)}

@@ -13,7 +13,14 @@ import mtjax
 from mtjax.agents.parts import targets
 from mtjax.experience import multistep
 from mtjax.learning import loop
-from mtjax.learning.evaluation import Episodes, evaluate, load_evaluations, no_evaluations, require_same_run
+from mtjax.learning.evaluation import (
+    Episodes,
+    Evaluations,
+    evaluate,
+    load_evaluations,
+    no_evaluations,
+    require_same_run,
+)
 from mtjax.learning.trials import EachEpisode, Repeated, ResetFree
 from mtjax.report.tables import split_table
 from mtjax.types import Acted, InputError, Transition
@@ -328,9 +335,12 @@ def test_the_task_of_an_evaluated_trial_stays_and_each_episode_begins_elsewhere(
         def rules(self, task, state, action):
             return task.goal["scale"], state.obs[0] + 1, False
 
-    scales = evaluated(Told(), 40 * K, K, Blind()).returns.reshape(2, 2, 40, K)
+    scales = evaluated(Told(), 60 * K, K, Blind()).returns.reshape(2, 2, 60, K)
     np.testing.assert_array_equal(scales, np.broadcast_to(scales[..., :1], scales.shape))
-    assert len(np.unique(scales[..., 0])) > 60
+    first, again = scales[..., :50, 0], scales[..., 50:, 0]  # each of the 50 draws once, and then from the first on
+    assert all(len(np.unique(of_task)) == 50 for of_task in first.reshape(-1, 50))
+    np.testing.assert_array_equal(again, first[..., :10])
+    assert not np.array_equal(first[0], first[1])
 
 
 @pytest.mark.slow
@@ -443,3 +453,18 @@ def test_a_world_that_goes_on_has_no_episodes_to_repeat():
     """One of the two flags."""
     with pytest.raises(InputError, match=r"--reset-free has no episodes to repeat; use --trials=1, not 3"):
         loop.Settings(trials=3, reset_free=True)
+
+
+def test_a_table_tells_success_by_the_episode_of_the_trial():
+    """At the end and at any step, beside the return; a split whose families do not tell it has no such line."""
+    of = lambda *episodes: np.float32([[[[*episodes] * 2] * 3]])  # of one seed, one evaluation, three tasks, two trials
+    returns = {"train": of(1, 5), "extrapolation": of(2, 4)}
+    metrics = {"success": {"train": of(0, 0.5), "extrapolation": of(np.nan, np.nan)}}
+    metrics["success_ever"] = {"train": of(0.25, 1), "extrapolation": of(np.nan, np.nan)}
+    lines = split_table(Evaluations(np.arange(1), returns, {}, metrics, trial=2)).splitlines()
+    assert lines[-4:] == [
+        "train           episode 1 of a trial 1, episode 2 5, mean 3",
+        "extrapolation   episode 1 of a trial 2, episode 2 4, mean 3",
+        "train           success at the end: episode 1 of a trial 0, episode 2 0.5, mean 0.25",
+        "train           success at any step: episode 1 of a trial 0.25, episode 2 1, mean 0.625",
+    ]

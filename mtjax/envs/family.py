@@ -191,7 +191,7 @@ class Family(abc.ABC):
     counts, train_count, calls = task_table.counts, task_table.train_count, task_table.calls
     numbers, params, labels, describe = naming.numbers, naming.params, naming.labels, naming.describe
     task_values, task_axis, sentences, summary = naming.task_values, naming.task_axis, naming.sentences, naming.summary
-    varied = naming.varied
+    varied, called = naming.varied, naming.called
     reset_worlds, step_worlds, renew_worlds = axes.reset_worlds, axes.step_worlds, axes.renew_worlds  # (S, T, E, ...)
     observe_worlds, where_worlds = axes.observe_worlds, staticmethod(axes.where_worlds)
 

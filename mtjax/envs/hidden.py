@@ -28,6 +28,7 @@ class HiddenTasks(Choosing, Family):
 
     finite_horizon: ClassVar[bool] = True
     ends_early: ClassVar[bool] = False
+    numbers_are: ClassVar[str]  # what the numbers that make a task are called
 
     @abc.abstractmethod
     def pool(self) -> np.ndarray:
@@ -37,6 +38,11 @@ class HiddenTasks(Choosing, Family):
     @abc.abstractmethod
     def largest(self) -> float:
         """Return the largest number that a task may have."""
+
+    def called(self, row: int) -> str:
+        """Return what the task of a row is called, such as "goal=3,2"."""
+        told = ",".join(f"{x:.2g}" for x in self.table.tasks.goal["task"][row])
+        return f"{self.numbers_are}={told}"
 
     @cached_property
     def table(self) -> Table:
@@ -79,6 +85,7 @@ class HiddenBandit(HiddenTasks):
     """Number of tasks. Each trial draws one of them."""
 
     episode_steps: ClassVar[int] = 1
+    numbers_are: ClassVar[str] = "chances"
 
     def __post_init__(self):
         super().__post_init__()
@@ -152,6 +159,7 @@ class GridNavi(HiddenTasks):
     """Steps of an episode."""
 
     action_size: ClassVar[int] = len(_MOVES)
+    numbers_are: ClassVar[str] = "goal"
 
     def __post_init__(self):
         super().__post_init__()

@@ -58,8 +58,13 @@ def describe(env: Any, row: int) -> str:
     family = part.family
     params = family.table.tasks.params
     tell = lambda name: family.every_parameter[name].tell(float(params[name][own]), 4)
-    told = ",".join(f"{name}={tell(name)}" for name in family.varied) or f"task={own}"
+    told = ",".join(f"{name}={tell(name)}" for name in family.varied) or family.called(own)
     return _in_mixture(part, told) if part.name else told
+
+
+def called(family: Any, row: int) -> str:
+    """Return what a task is called that differs from others in no parameter: its number."""
+    return f"task={row}"
 
 
 @property

@@ -4,8 +4,10 @@ An agent knows all N training tasks: its own parameters of each, its features an
 T are played at a time. The tasks of a chunk follow from the step at which it begins, so that a run resumes exactly.
 """
 
+import contextlib
 import dataclasses
-from typing import ClassVar
+import math
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +40,7 @@ class Random:
     def count(self, known: int) -> int:
         if not 1 <= self.played <= known:
             raise InputError(
-                f"the curriculum random:{self.played}:{self.steps} plays 1 to {known} of the {known} training tasks"
+                f"the curriculum plays 1 to {known} of the {known} training tasks at a time, not {self.played}"
             )
         return self.played
 
@@ -78,12 +80,110 @@ def _key(number: Array) -> Key:
     return jax.random.fold_in(jax.random.key(0x5E1EC7), number)
 
 
-Curriculum = Everything | Random | Sequence
-_KINDS = {"random": (Random, 2), "sequence": (Sequence, 1), "shuffled": (Shuffled, 1)}  # with how many numbers each has
+@dataclasses.dataclass(frozen=True)
+class Heeding:
+    """Some tasks are chosen by what was heard of all: the returns of the policy that learns, as means over seeds.
+
+    Of each task (N, 2) a fast and a slow mean over the chunks that played it are kept, NaN before its first episode has
+    ended. A task that was never heard of comes first, and a share of the choices is random, so that none is forgotten.
+    """
+
+    played: int
+    steps: int
+
+    count = Random.count
+
+    def rows(self, step: Array, known: int) -> Array:
+        return self.choose(step, nothing_heard(known))
+
+    def choose(self, step: Array, heard: Array) -> Array:
+        """Return the numbers (T,) int32 of the tasks that are played from a step () on, given what was heard (N, 2)."""
+        order_key, random_key = jax.random.split(_key(step // self.steps))
+        known, order = len(heard), jax.random.uniform(order_key, heard.shape[:1])
+        anyway = jax.random.uniform(random_key, heard.shape[:1]) < _RANDOM * self.played / known
+        urgency = jnp.where(anyway | jnp.isnan(heard[:, 0]), jnp.inf, self.urgency(heard))
+        return jnp.lexsort((order, -urgency))[: self.played].astype(jnp.int32)
+
+    def urgency(self, heard: Array) -> Array:
+        """Return how much each task (N,) should be played; the greatest are."""
+        raise NotImplementedError
+
+
+@dataclasses.dataclass(frozen=True)
+class Progress(Heeding):
+    """Tasks are played whose returns change most, up or down: |fast - slow| (Matiisen et al. 2017)."""
+
+    def urgency(self, heard: Array) -> Array:
+        return jnp.abs(heard[:, 0] - heard[:, 1])
+
+
+@dataclasses.dataclass(frozen=True)
+class Hardest(Heeding):
+    """Tasks are played whose returns are least. They must be of one scale in all tasks."""
+
+    def urgency(self, heard: Array) -> Array:
+        return -heard[:, 0]
+
+
+@dataclasses.dataclass(frozen=True)
+class Growing(Heeding):
+    """A range of tasks, in the order of the table, grows at its ends (Akkaya et al. 2019, "ADR").
+
+    It begins with the middle ones. Where the task at an end returns enough, the next one is played too. The tasks at
+    both ends are always played, and others between them at random.
+    """
+
+    enough: float
+
+    def count(self, known: int) -> int:
+        if self.played < 2:
+            raise InputError(f"the curriculum growing:{self.played}:{self.steps} plays both ends of a range: 2 or more")
+        return super().count(known)
+
+    def choose(self, step: Array, heard: Array) -> Array:
+        known, places = len(heard), jnp.arange(len(heard))
+        first = (known - self.played) // 2
+        inside = ~jnp.isnan(heard[:, 0]) | (first <= places) & (places < first + self.played)
+        low, high = jnp.min(places, where=inside, initial=known), jnp.max(places, where=inside, initial=0)
+        low = jnp.maximum(low - (heard[low, 0] >= self.enough), 0)
+        high = jnp.minimum(high + (heard[high, 0] >= self.enough), known - 1)
+        ends, inside = (places == low) | (places == high), (low <= places) & (places <= high)
+        order = jax.random.uniform(_key(step // self.steps), (known,))
+        return jnp.lexsort((order, ~ends, ~inside))[: self.played].astype(jnp.int32)
+
+
+_RANDOM = 0.1  # share of the choices
+_RATES = (0.5, 0.1)  # of the fast and of the slow mean
+
+
+def nothing_heard(known: int) -> Array:
+    """Return what was heard (N, 2) of tasks before any episode has ended."""
+    return jnp.full((known, 2), jnp.nan)
+
+
+def hear(heard: Array, rows: Array, returns: Array) -> Array:
+    """Return what was heard (N, 2) after a chunk with returns (S, T) of the tasks (T,) that were played.
+
+    Of a task without an episode that ended, the return is NaN, and what was heard stays.
+    """
+    old, new = heard[rows], jnp.nanmean(returns, axis=0)[:, None]
+    mean = jnp.where(jnp.isnan(old), new, old + jnp.array(_RATES) * (new - old))
+    return heard.at[rows].set(jnp.where(jnp.isnan(new), old, mean))
+
+
+Curriculum = Everything | Random | Heeding | Sequence
+_KINDS = {  # with how many numbers each has
+    "random": (Random, 2),
+    "progress": (Progress, 2),
+    "hardest": (Hardest, 2),
+    "growing": (Growing, 3),
+    "sequence": (Sequence, 1),
+    "shuffled": (Shuffled, 1),
+}
 
 
 def read(text: str) -> Curriculum:
-    """Return the curriculum that ``text`` names: "all", "random:T:STEPS", "sequence:STEPS" or "shuffled:STEPS".
+    """Return the curriculum that ``text`` names, such as "all", "random:T:STEPS" or "growing:T:STEPS:RETURN".
 
     Raises:
         InputError: it names none.
@@ -92,11 +192,16 @@ def read(text: str) -> Curriculum:
         return Everything()
     kind, *words = text.split(":")
     made, count = _KINDS.get(kind, (Random, -1))
-    numbers = [int(word) for word in words if word.isdecimal() and int(word)]
+    whole, rest = words[:2], words[2:]
+    numbers: list[Any] = [int(word) for word in whole if word.isdecimal() and int(word)]
+    with contextlib.suppress(ValueError):
+        numbers += [float(word) for word in rest if math.isfinite(float(word))]
     if not len(numbers) == len(words) == count:
         raise InputError(
-            "curriculum is all, random:T:STEPS (T tasks at a time), sequence:STEPS (one after another) or "
-            "shuffled:STEPS (the same in random order), with steps of every environment until tasks change, such as "
-            f"random:10:5000 or sequence:100000; not {text!r}"
+            "curriculum is all, random:T:STEPS (T tasks at a time), progress:T:STEPS (whose returns change most), "
+            "hardest:T:STEPS (whose returns are least), growing:T:STEPS:RETURN (a range that grows where its ends "
+            "return enough), sequence:STEPS (one after another) or shuffled:STEPS (the same in random order), with "
+            "steps of every environment until tasks change, such as random:10:5000 or sequence:100000; "
+            f"not {text!r}"
         )
     return made(*numbers)

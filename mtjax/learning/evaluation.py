@@ -1,10 +1,12 @@
 """Evaluation plays whole trials under the mean action, on any tasks, with keys of its own.
 
+Trials that draw their tasks play all draws of a task before one comes again, as benchmarks with listed goals ask.
+
 Of trials of several episodes (``mtjax.learning.trials``), the episodes of one follow each other along the axis of
 episodes.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -16,9 +18,10 @@ import numpy as np
 
 from mtjax.agents.swept import at_point
 from mtjax.learning.rollout import EnvStep, Worlds, reset_ended, reset_envs, split_keys, step_envs, world_keys
-from mtjax.learning.trials import of_episodes
+from mtjax.learning.trials import Trials, of_episodes
 from mtjax.names import replacing
 from mtjax.parallel.axes import over_seeds
+from mtjax.tasks import draw_at
 from mtjax.types import SPLITS, Adapting, Agent, Array, Env, InputError, Key, Task, Transition
 
 _EVER = "success_ever"  # the metric that success was 1 at any step of an episode
@@ -190,25 +193,17 @@ def evaluate(
     keys = jax.vmap(lambda seed: jax.random.split(fresh(seed), drawn))(seeds)
     keys = keys if places is None else keys[:, places]
 
-    def advance(worlds: Worlds, alive: Array, time: Array) -> tuple[Worlds, EnvStep]:
-        """Step the worlds, and begin the next episodes of trials that are alive."""
-        worlds, env_step = step_envs(env, agent, state, tasks, worlds, None, trials=trials)
-        if trials.episodes == 1:
-            return worlds, env_step
-        ends = jax.tree.map(lambda x: x & alive, env_step.ends)
-        fold = jax.vmap(jax.vmap(jax.vmap(jax.random.fold_in, (0, None)), (0, None)), (0, None))
-        return reset_ended(env, agent, state, tasks, worlds, ends, lambda: fold(keys, time), trials), env_step
-
     def step(carry, time: Array):
         before, scores, alive = carry
-        worlds, env_step = advance(before, alive, time)
+        worlds, env_step = step_envs(env, agent, state, tasks, before, None, trials=trials)
+        worlds = _go_on(env, agent, state, tasks, worlds, env_step, alive, partial(_at, keys, time), trials)
         now = alive[..., None] & _is_now(before, trials.episodes)
         # Rewards after an episode's end may not be finite.
         returns = scores.returns + jnp.where(now, env_step.transition.reward[..., None], 0.0)
         metrics = _latest(env_step.metrics, scores.metrics, now & ~env_step.lost[..., None])
         return (worlds, Scores(returns, metrics), alive & ~env_step.transition.closed), None
 
-    worlds = reset_envs(env, agent, state, tasks, keys, trials)
+    worlds = reset_envs(env, agent, state, tasks, keys, trials, lambda _: draw_in_turn(tasks, keys))
     take = lambda worlds: step_envs(env, agent, state, tasks, worlds, None, trials=trials)[1]
     env_step = jax.eval_shape(take, worlds)
     metrics = {name: jnp.zeros((*shape, trials.episodes), x.dtype) for name, x in env_step.metrics.items()}
@@ -271,30 +266,84 @@ def _latest(new: dict[str, Array], old: dict[str, Array], now: Array) -> dict[st
     return {name: jnp.where(now, x, old[name]) for name, x in new.items()}
 
 
-class Recording(NamedTuple):
-    """Holds one episode of every task."""
+def draw_in_turn(tasks: Task, keys: Key) -> Task:
+    """Draw the tasks of trials (S, T, E, ...) with keys (S, T, E), none of a task twice before all were drawn."""
+    count, trials = tasks.draws.id.shape[1], jnp.arange(keys.shape[2])  # type: ignore
+    shuffle = lambda key: jax.random.permutation(jax.random.fold_in(key, 0x60A1), count)[trials % count]
+    order = jax.vmap(jax.vmap(shuffle))(keys[:, :, 0])
+    return jax.vmap(jax.vmap(jax.vmap(draw_at, (None, 0))), (None, 0))(tasks, order)
 
-    returns: Array  # (T,)
-    rows: Array  # (T,) of the tasks that were played; where ranges are continuous, of the episodes' draws
-    lengths: Array  # (T,) int32 steps until the episode ended
-    states: Any  # of the environment after each step, leaves (T, H, ...)
+
+def _at(keys: Key, time: Array) -> Key:
+    """Return the keys (S, T, E) of the episodes that begin at a time ()."""
+    return jax.vmap(jax.vmap(jax.vmap(jax.random.fold_in, (0, None)), (0, None)), (0, None))(keys, time)
+
+
+def _go_on(
+    env: Env,
+    agent: Agent,
+    learners: Any,
+    tasks: Task,
+    worlds: Worlds,
+    env_step: EnvStep,
+    alive: Array,
+    keys: Callable[[], Key],
+    trials: Trials,
+) -> Worlds:
+    """Begin the next episodes of trials (S, T, E) that are alive, in worlds that were stepped."""
+    if trials.episodes == 1:
+        return worlds
+    ends = jax.tree.map(lambda x: x & alive, env_step.ends)
+    return reset_ended(env, agent, learners, tasks, worlds, ends, keys, trials)
+
+
+class Recording(NamedTuple):
+    """Holds one trial of K episodes of every task."""
+
+    returns: Array  # (T, K)
+    rows: Array  # (T,) of the tasks that were played; where ranges are continuous, of the trials' draws
+    lengths: Array  # (T, K) int32 steps of each episode, which follow each other along H
+    kept: Any  # of each step, leaves (T, H, ...)
     option: Array | None = None  # (T, H) int32 number of the option that acted in each step, if the agent has options
 
 
-@partial(jax.jit, static_argnums=(0, 1))
-def record(env: Env, agent: Agent, state: Any, tasks: Task, seed: Array) -> Recording:
-    """Play one episode of each task under the mean action; ``state`` has no leading axis."""
-    learners = jax.tree.map(lambda x: x[None], state)
+def keep_states(worlds: Worlds, transition: Transition) -> Any:
+    """Keep the states of the environment after each step."""
+    return worlds.state
+
+
+@partial(jax.jit, static_argnums=(0, 1, 5, 6))
+def record(
+    env: Env,
+    agent: Agent,
+    state: Any,
+    tasks: Task,
+    seed: Array,
+    trial: int = 1,
+    keep: Callable[[Worlds, Transition], Any] = keep_states,
+) -> Recording:
+    """Play one trial of each task under the mean action.
+
+    Args:
+        state: of the agent, without a leading axis.
+        trial: episodes of a trial.
+        keep: what to hold of every step, given the worlds after it, before any reset.
+    """
+    trials, learners = of_episodes(trial), jax.tree.map(lambda x: x[None], state)
     keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), 0xF11), (1, len(tasks.id), 1))
 
-    def step(worlds: Worlds, _):
-        worlds, env_step = step_envs(env, agent, learners, tasks, worlds, None)
-        running = worlds.memory.running.option if getattr(agent, "goes_on", False) else None
-        return worlds, (env_step.transition.reward, env_step.transition.ended, worlds.state, running)
+    def step(carry: tuple[Worlds, Array], time: Array):
+        before, alive = carry
+        worlds, env_step = step_envs(env, agent, learners, tasks, before, None, trials=trials)
+        now, transition = alive[..., None] & _is_now(before, trial), env_step.transition
+        begun = _go_on(env, agent, learners, tasks, worlds, env_step, alive, partial(_at, keys, time), trials)
+        rewards = jnp.where(now, transition.reward[..., None], 0.0)
+        option = worlds.memory.running.option if getattr(agent, "goes_on", False) else None
+        return (begun, alive & ~transition.closed), (rewards, now, keep(worlds, transition), option)
 
-    worlds = reset_envs(env, agent, learners, tasks, keys)
-    _, played = jax.lax.scan(step, worlds, length=env.episode_length)  # leaves (H, 1, T, 1, ...)
-    rewards, ended, states, option = jax.tree.map(lambda x: jnp.moveaxis(x[:, 0, :, 0], 0, 1), played)
-    alive = jnp.cumsum(ended, axis=1) - ended == 0
+    worlds = reset_envs(env, agent, learners, tasks, keys, trials)
     rows = tasks.row if worlds.task is None else worlds.task.row[0, :, 0]
-    return Recording(jnp.sum(jnp.where(alive, rewards, 0.0), axis=1), rows, jnp.sum(alive, axis=1), states, option)
+    times = jnp.arange(env.episode_length * trial)
+    _, played = jax.lax.scan(step, (worlds, jnp.ones(keys.shape, bool)), times)  # leaves (H, 1, T, 1, ...)
+    rewards, now, kept, option = jax.tree.map(lambda x: jnp.moveaxis(x[:, 0, :, 0], 0, 1), played)
+    return Recording(jnp.sum(rewards, axis=1), rows, jnp.sum(now, axis=1), kept, option)

@@ -58,8 +58,9 @@ class Settings:
     episodes, which are shorter."""
     curriculum: str = "all"
     """Which training tasks are played: all; random:T:STEPS, T of them, and others after so many steps of every
-    environment; sequence:STEPS, one after another for so many; or shuffled:STEPS, the same in random order. The agent
-    knows all of them, and is evaluated on all."""
+    environment; progress:T:STEPS or hardest:T:STEPS, those whose returns change most or are least;
+    growing:T:STEPS:RETURN, a range from the middle that grows where its ends return so much; sequence:STEPS, one after
+    another; or shuffled:STEPS, the same in random order. The agent knows all of them, and is evaluated on all."""
     keep_replay: bool = False
     """Keep the replay where the curriculum changes tasks, and go on without random steps. Stored steps do not say of
     which task they are: only for agents that are blind to the task."""
@@ -108,6 +109,7 @@ class TrainState(NamedTuple):
     key: Key  # (S,)
     rows: Array | None = None  # (T,) int32 numbers of the tasks that worlds play; None: all that the agent knows
     origins: Array | None = None  # (S,) int32 of a population: the first member from which each descends
+    heard: Array | None = None  # (N, 2) of a curriculum that heeds returns: what was heard of all tasks that are known
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
@@ -141,6 +143,7 @@ def init(
         iteration=jnp.int32(0),
         key=key,
         rows=rows,
+        heard=curricula.nothing_heard(len(known.id)) if isinstance(settings.plays, curricula.Heeding) else None,
     )
 
 
@@ -310,6 +313,9 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
     state, history = jax.lax.scan(iterate, state, length=settings.chunk_steps // experience.steps)
     count = settings.num_envs * settings.chunk_steps
     metrics = _summarise(history, count)
+    if state.heard is not None:
+        returns = collectives.of_all_seeds(metrics["return"])
+        state = state._replace(heard=curricula.hear(state.heard, state.rows, returns))  # type: ignore
     if settings.plays.steps:
         metrics = _of_known(metrics, state.rows, len(known.id))
     return state._replace(agent=collectives.agreed(state.agent)), metrics
@@ -326,8 +332,7 @@ def rows_of(tasks: Task, rows: Any) -> Task:
 
 def _take_turns(env: Env, agent: Agent, settings: Settings, known: Task, state: TrainState) -> TrainState:
     """Begin the tasks that the curriculum plays from here on. If they are others, worlds and experience begin anew."""
-    rows = settings.plays.rows(state.iteration, len(known.id))
-    shape = state.total.shape
+    rows, shape = _next_rows(settings, state, len(known.id)), state.total.shape
 
     def begin(state: TrainState) -> TrainState:
         tasks = rows_of(known, rows)
@@ -342,6 +347,15 @@ def _take_turns(env: Env, agent: Agent, settings: Settings, known: Task, state: 
         return state._replace(worlds=worlds, data=data, key=key, rows=rows, **fresh)
 
     return jax.lax.cond(jnp.any(rows != state.rows), begin, lambda state: state, state)
+
+
+def _next_rows(settings: Settings, state: TrainState, known: int) -> Array:
+    """Return the numbers (T,) of the tasks that are played from here on."""
+    plays = settings.plays
+    if not isinstance(plays, curricula.Heeding):
+        return plays.rows(state.iteration, known)
+    due = state.iteration % plays.steps < settings.chunk_steps  # also if a resumed run begins its chunks elsewhere
+    return jnp.where(due, plays.choose(state.iteration, state.heard), state.rows)  # type: ignore
 
 
 def _consolidate(env: Env, agent: Agent, settings: Settings, known: Task, state: TrainState) -> Any:

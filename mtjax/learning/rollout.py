@@ -50,9 +50,21 @@ def broadcast_tasks(tasks: Task, shape: tuple[int, ...]) -> Task:
     return jax.tree.map(lambda x: jnp.broadcast_to(x[None, :, None], shape + x.shape[1:]), single)
 
 
-def reset_envs(env: Env, agent: Agent, learners: Any, tasks: Task, keys: Key, trials: Trials = EACH_EPISODE) -> Worlds:
-    """Begin a trial in every world, with keys (S, T, E), for agents with states ``learners`` (S, ...)."""
-    begun, age = _begin(env, tasks, keys), jnp.zeros(keys.shape, jnp.int32)
+def reset_envs(
+    env: Env,
+    agent: Agent,
+    learners: Any,
+    tasks: Task,
+    keys: Key,
+    trials: Trials = EACH_EPISODE,
+    drawn: Callable[[Task], Task] = lambda drawn: drawn,
+) -> Worlds:
+    """Begin a trial in every world, with keys (S, T, E), for agents with states ``learners`` (S, ...).
+
+    Args:
+        drawn: a function from tasks (S, T, E, ...) that are drawn at random to those of the trials.
+    """
+    begun, age = _begin(env, tasks, keys, drawn), jnp.zeros(keys.shape, jnp.int32)
     memory = begin_memory(agent, learners, tasks, age)
     return Worlds(*begun, memory, age, age if trials.episodes > 1 else None)
 

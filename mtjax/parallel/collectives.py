@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from mtjax.types import Array
 
 AXIS = "envs"
+SEEDS = "seeds"
 
 
 def count() -> int:
@@ -36,6 +37,12 @@ def own(tree: Any, axis: int) -> Any:
 def whole(tree: Any, axis: int) -> Any:
     """Join all devices' parts of ``tree`` along ``axis``, which is E."""
     return tree if count() == 1 else jax.lax.all_gather(tree, AXIS, axis=axis, tiled=True)
+
+
+def of_all_seeds(tree: Any) -> Any:
+    """Join leaves (S, ...) along a leading S, if devices share the seeds."""
+    split = SEEDS in jax.sharding.get_abstract_mesh().manual_axes
+    return jax.lax.all_gather(tree, SEEDS, axis=0, tiled=True) if split else tree
 
 
 def total(tree: Any) -> Any:

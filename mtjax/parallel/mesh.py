@@ -9,8 +9,9 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from mtjax.parallel import collectives
 from mtjax.types import InputError
 
-REPLICATED, BY_SEED = PartitionSpec(), PartitionSpec("seeds")  # whole on every device; split along a leading S
-BY_WORLD = PartitionSpec("seeds", None, collectives.AXIS)  # leaves (S, T, E, ...)
+REPLICATED = PartitionSpec()  # whole on every device
+BY_SEED = PartitionSpec(collectives.SEEDS)  # split along a leading S
+BY_WORLD = PartitionSpec(collectives.SEEDS, None, collectives.AXIS)  # leaves (S, T, E, ...)
 LEAST_WORLDS = 2048
 """Least number of worlds per device when devices share a seed's environments. Fewer do not fill a GPU."""
 
@@ -37,7 +38,7 @@ def mesh_for(seeds: int, num_tasks: int, num_envs: int, most: int | None = None)
     if processes * groups * each == 1:
         return None
     used = np.array([device for devices in owned for device in devices[: groups * each]])
-    return Mesh(used.reshape(-1, each), ("seeds", collectives.AXIS))
+    return Mesh(used.reshape(-1, each), (collectives.SEEDS, collectives.AXIS))
 
 
 def describe(mesh: Mesh | None, seeds: int, num_envs: int) -> str:

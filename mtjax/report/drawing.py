@@ -1,6 +1,7 @@
 """Figures of runs: ``mtjax.plot`` in Python, and the command, which writes them into files."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +26,8 @@ def plot(
 
     Args:
         runs: folders, or patterns such as "runs/*"; or results of ``mtjax.train``, also by name in a mapping.
-        figure: curves, families (which returns several axes), parameter, iqm, profile or improvement.
+        figure: curves, families (which returns several axes), parameter, iqm, profile, improvement, or posterior of one
+            run (several axes too), which may also be a policy.
         split: train, interpolation or extrapolation: whose returns are drawn.
         metric: "return", or what else evaluations have, such as "success".
         baseline: the agent that improvement compares with; by default the first run's.
@@ -36,7 +38,7 @@ def plot(
     """
     if figure not in plots.FIGURES:
         raise nearest_error("figure", figure, plots.FIGURES)
-    axes = _draw(figure, _learned(runs, metric), split, baseline)
+    axes = _draw(figure, runs, lambda: _learned(runs, metric), split, baseline)
     if out:
         plots.save(axes, out)
     return axes
@@ -50,14 +52,14 @@ def draw(runs: Sequence[str], figure: str, split: str, metric: str, baseline: st
         metric: "return", or another score of evaluations.
         out: the file to write; of all figures, the ending counts and the names follow from the stem.
     """
-    found = _learned(runs, metric)
+    found = cache(lambda: _learned(runs, metric))
     names = list(plots.FIGURES) if figure == "all" else [figure]
     path = Path(out or ("runs.png" if figure == "all" else f"{figure}.png"))
     drawn = 0
     for name in names:
         file = path if figure != "all" else path.with_name(f"{path.stem}-{name}{path.suffix}")
         try:
-            axes = _draw(name, found, split, baseline)
+            axes = _draw(name, runs, found, split, baseline)
         except InputError as error:
             if figure != "all":
                 raise
@@ -73,7 +75,9 @@ def _learned(runs: Any, metric: str) -> list[collect.Learned]:
     return collect.learned(runs) if metric == "return" else collect.of_metric(runs, metric)
 
 
-def _draw(name: str, found: list[collect.Learned], split: str, baseline: str) -> "Axes | list[Axes]":
+def _draw(
+    name: str, runs: Any, learned: Callable[[], list[collect.Learned]], split: str, baseline: str
+) -> "Axes | list[Axes]":
     given = {} if name == "parameter" else {"split": split}
     given |= {"baseline": baseline} if name == "improvement" and baseline else {}
-    return plots.FIGURES[name](found, **given)
+    return plots.FIGURES[name](runs if name == "posterior" else learned(), **given)

@@ -30,16 +30,18 @@ _FPS = 25
 _WIDTHS = ((4, 320), (9, 240))  # of a tile, for up to so many tasks; beyond, the narrowest
 _LIVE_WIDTHS = ((1, 480), *_WIDTHS)
 _NARROWEST = 160
+_EPISODES = 4  # of a trial that are filmed, at most
 _WORDS = re.compile("[^ ,]+[ ,]*")  # after which a caption may go on in the next line
 
 
 class Chosen(NamedTuple):
-    """A task to film."""
+    """A task to film, or an episode of a trial of it."""
 
     part: Part
     split: str
     place: int  # among all tasks of the environment
     own: int  # among all tasks of its family
+    episode: int = 0  # of the trial
 
 
 def require(env: Tabled) -> None:
@@ -94,9 +96,11 @@ def write(
     stem: Path,
     named: Mapping[str, str],
 ) -> Path:
-    """Film one episode of each chosen task, and write them as one grid. Progress is printed.
+    """Film one trial of each chosen task, and write them as one grid. Progress is printed.
 
-    If sub-policies act, a strip below each picture says which does, and timeline.png shows the episodes of all tasks.
+    A trial of several episodes has a line of the grid, its episodes side by side: the first ones, and the last.
+
+    If sub-policies act, a strip below each picture says which does, and timeline.png shows the trials of all tasks.
 
     Args:
         tasks: all tasks of the environment.
@@ -105,15 +109,15 @@ def write(
     """
     env = policy.env
     played, by_name = play(policy, tasks, seed)
-    acting = timeline.timeline_of(env, played, by_name)
+    acting, (chosen, columns) = timeline.timeline_of(env, played, by_name), _episodes(chosen, played)
     width = _width(len(chosen), _WIDTHS)
     count, tiles = max(round(seconds * _FPS), 1), []
     for i, one in enumerate(chosen):
         print(f"filming {i + 1} of {len(chosen)}: {', '.join(_caption(env, one, played, named))}", flush=True)
         tiles.append(_tile(env, one, played, by_name[one.part.name], count, width, acting))
     captions = [_caption(env, one, played, named) for one in chosen]
-    path = render.write_video(stem, grid(captioned(tiles, captions)), _FPS)
-    print(f"filmed {path.name}: {len(chosen)} tasks")
+    path = render.write_video(stem, grid(captioned(tiles, captions), columns), _FPS)
+    print(f"filmed {path.name}: {len(chosen) // max(columns, 1)} tasks{f' by {columns} episodes' * bool(columns)}")
     if acting is not None:
         labels = [label for split in SPLITS for label in env.labels(split)]
         timeline.draw(stem.with_name("timeline.png"), acting, labels)
@@ -121,14 +125,15 @@ def write(
 
 
 def play(policy: Policy, tasks: Task, seed: int) -> tuple[Recording, dict[str, Any]]:
-    """Play one episode of each task, and return it, and the states of each family by its name."""
+    """Play one trial of each task, and return it, and the states of each family by its name."""
     env = policy.env
     render.choose_backend()
     with contextlib.ExitStack() as filmed, host.explaining():
         for part in env.parts:
             filmed.enter_context(part.family.filmed())
-        played = jax.block_until_ready(record(env, policy.agent, policy.state, tasks, jnp.int32(seed)))
-    return played, {part.name: states for part, states in zip(env.parts, apart(played.states), strict=True)}
+        played = record(env, policy.agent, policy.state, tasks, jnp.int32(seed), policy.trial)
+        played = jax.block_until_ready(played)
+    return played, {part.name: states for part, states in zip(env.parts, apart(played.kept), strict=True)}
 
 
 @contextlib.contextmanager
@@ -137,14 +142,17 @@ def moving(
 ) -> Iterator[tuple[float, Callable[[float], np.ndarray]]]:
     """Give the seconds until the last of the chosen tasks' episodes ends, and a function that draws all at a time [s].
 
+    The episodes of a trial move side by side.
+
     It draws one frame (height, width, 3), with captions. Only the thread that opens it may draw.
     """
+    chosen, columns = _episodes(chosen, played)
     width = _width(len(chosen), _LIVE_WIDTHS)
     captions = [_caption(env, one, played, named) for one in chosen]
     with contextlib.ExitStack() as opened:
         tiles = [opened.enter_context(_drawing(env, one, played, by_name[one.part.name], width)) for one in chosen]
-        draw = lambda time: grid(captioned([tile(time)[None] for tile in tiles], captions))[0]
-        yield max(int(played.lengths[one.place]) / _steps_per_second(one) for one in chosen), draw
+        draw = lambda time: grid(captioned([tile(time)[None] for tile in tiles], captions), columns)[0]
+        yield max(_span(played, one)[1] / _steps_per_second(one) for one in chosen), draw
 
 
 @contextlib.contextmanager
@@ -153,8 +161,8 @@ def _drawing(
 ) -> Iterator[Callable[[float], np.ndarray]]:
     """Give a function that draws one task at a time [s]; the last frame stays after the episode's end."""
     family: Any = one.part.family
-    row, length = env.own_row(int(played.rows[one.place])), int(played.lengths[one.place])
-    shown, size = jax.tree.map(lambda x: x[one.own][:length], states), (width, width * 3 // 4)
+    row, (first, length) = env.own_row(int(played.rows[one.place])), _span(played, one)
+    shown, size = jax.tree.map(lambda x: x[one.own][first : first + length], states), (width, width * 3 // 4)
     kept = lambda i: family.pictures(jax.tree.map(lambda x: x[i : i + 1], shown), *size)[0]
     opened = render.drawing(family, row, shown, *size) if isinstance(family, Pictured) else nullcontext(kept)
     with opened as draw:
@@ -172,29 +180,45 @@ def _width(count: int, widths: Sequence[tuple[int, int]]) -> int:
     return next((width for most, width in widths if count <= most), _NARROWEST)
 
 
+def _episodes(chosen: Sequence[Chosen], played: Recording) -> tuple[list[Chosen], int]:
+    """Return which episodes of trials are shown, and how many in a line, 0 for as it fits.
+
+    They are all if they are few, else the first ones and the last.
+    """
+    trial = played.returns.shape[1]
+    shown = [*range(min(trial, _EPISODES - 1)), *([trial - 1] if trial >= _EPISODES else [])]
+    return [one._replace(episode=episode) for one in chosen for episode in shown], len(shown) * (trial > 1)
+
+
+def _span(played: Recording, one: Chosen) -> tuple[int, int]:
+    """Return the first step of an episode, and how many it has."""
+    lengths = played.lengths[one.place]
+    return int(np.sum(lengths[: one.episode])), int(lengths[one.episode])
+
+
 def _caption(env: Tabled, one: Chosen, played: Recording, named: Mapping[str, str]) -> tuple[str, str]:
     """Return the lines on a task: its split and return, and its parameters."""
     row = int(played.rows[one.place])  # continuous ranges have a row for each episode
-    split = named.get(one.split, one.split)
-    return f"{split}, return {amount(float(played.returns[one.place]))}", env.describe(row)
+    split, (trial, returns) = named.get(one.split, one.split), (played.returns.shape[1], played.returns[one.place])
+    episode = f", episode {one.episode + 1} of {trial}" * (trial > 1)
+    return f"{split}{episode}, return {amount(float(returns[one.episode]))}", env.describe(row)
 
 
 def _tile(
     env: Tabled, one: Chosen, played: Recording, states: Any, count: int, width: int, acting: Timeline | None
 ) -> np.ndarray:
-    """Return the frames (F, height, width, 3) of one task, at most ``count``, with a strip of sub-policies, if any."""
+    """Return the frames (F, height, width, 3) of an episode, at most ``count``, with a strip of sub-policies, if any."""
     family: Any = one.part.family
-    row = env.own_row(int(played.rows[one.place]))
-    length = int(played.lengths[one.place])
+    row, (first, length) = env.own_row(int(played.rows[one.place])), _span(played, one)
     times = np.arange(count) / _FPS * _steps_per_second(one)
     step_of = np.minimum(times.astype(int), length - 1)
     steps = np.unique(step_of)
-    shown = jax.tree.map(lambda x: x[one.own][steps], states)  # also of keys, which NumPy has not
+    shown = jax.tree.map(lambda x: x[one.own][first + steps], states)  # also of keys, which NumPy has not
     size = width, width * 3 // 4
     drawn = render.film(family, row, shown, *size) if isinstance(family, Pictured) else family.pictures(shown, *size)
     frames = drawn[np.searchsorted(steps, step_of)]
     if acting is not None:
-        below = timeline.strips(acting, one.place, step_of.tolist(), frames.shape[2])
+        below = timeline.strips(acting, one.place, step_of.tolist(), frames.shape[2], one.episode)
         frames = np.concatenate([frames, below], axis=1)
     return frames[: max(int(np.sum(times < length)), 1)]
 
@@ -227,10 +251,14 @@ def _wrapped(text: str, width: float, font: Any) -> list[str]:
     return lines
 
 
-def grid(tiles: Sequence[np.ndarray]) -> np.ndarray:
-    """Return tiles (F, height, width, 3) side by side; a shorter one stands still at its end."""
+def grid(tiles: Sequence[np.ndarray], columns: int = 0) -> np.ndarray:
+    """Return tiles (F, height, width, 3) side by side; a shorter one stands still at its end.
+
+    Args:
+        columns: tiles in a line; 0 makes the grid as square as can be.
+    """
     longest = max(map(len, tiles))
-    columns = math.ceil(math.sqrt(len(tiles)))
+    columns = columns or math.ceil(math.sqrt(len(tiles)))
     lines = math.ceil(len(tiles) / columns)
     height, width = tiles[0].shape[1:3]
     whole = np.zeros((longest, lines * height, columns * width, 3), np.uint8)

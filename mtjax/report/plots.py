@@ -13,6 +13,7 @@ import numpy as np
 
 from mtjax.names import InputError, nearest_error, public
 from mtjax.report import collect, figures
+from mtjax.report.beliefs import posterior
 from mtjax.report.collect import Learned
 from mtjax.report.stats import iqm as iqm_of
 from mtjax.report.stats import probability_of_improvement, seed_interval
@@ -167,6 +168,7 @@ FIGURES = {
     "iqm": iqm,
     "profile": performance_profile,
     "improvement": improvement,
+    "posterior": posterior,
 }
 
 

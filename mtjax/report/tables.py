@@ -37,7 +37,9 @@ def split_table(evaluations: Evaluations, parts: Sequence[Part] = ()) -> str:
     told = _TOLD if evaluations.metrics.get("success") else ""
     lines = [f"{'split':15} {'tasks':>5} {'return':>7}  worst task{told}"]
     lines += [_split_line(split, *found) for split, found in last.items()]
-    lines += _trial_lines({split: x[:, -1] for split, x in evaluations.returns.items()}, evaluations.trial)
+    lines += _trial_lines(
+        *({split: x[:, -1] for split, x in found.items()} for found in scores), trial=evaluations.trial
+    )
     for part in parts if len(parts) > 1 else ():
         lines.append(part.name)
         own = {split: [x[:, part.places[split]] for x in found] for split, found in last.items()}
@@ -45,9 +47,16 @@ def split_table(evaluations: Evaluations, parts: Sequence[Part] = ()) -> str:
     return "\n".join(lines)
 
 
-def _trial_lines(returns: Mapping[str, np.ndarray], trial: int) -> list[str]:
-    """Return a line for each split with returns of the first and the last episode of trials, if these are several."""
-    return [f"{split:15} {trials.describe(x, trial)}" for split, x in returns.items() if x.size and trial > 1]
+def _trial_lines(returns: Mapping[str, np.ndarray], *success: Mapping[str, np.ndarray], trial: int) -> list[str]:
+    """Return lines for each split with the first and the last episode of trials, if these are several.
+
+    Where tasks tell success, lines of its share at the end and at any step of episodes follow that of the return.
+    """
+    lines = [f"{split:15} {trials.describe(x, trial)}" for split, x in returns.items() if x.size and trial > 1]
+    for of, found in zip(("at the end", "at any step"), success, strict=False):
+        known = {split: x for split, x in found.items() if np.isfinite(x).any() and trial > 1}
+        lines += [f"{split:15} success {of}: {trials.describe(x, trial)}" for split, x in known.items()]
+    return lines
 
 
 def _split_line(split: str, returns: np.ndarray, *success: np.ndarray) -> str:
@@ -82,7 +91,10 @@ def task_table(policy: Policy, scores: dict[str, Scores], named: Mapping[str, st
     if len(parts) > 1:
         lines.append("all families")
         lines += [_mean_line(called(split), "all", found) for split, found in scores.items() if found.returns.size]
-    lines += _trial_lines({called(split): found.returns for split, found in scores.items()}, policy.trial)
+    every = [{called(split): one.returns for split, one in scores.items()}]
+    known = [name for name in _SUCCESS if all(name in one.metrics for one in scores.values())]
+    every += [{called(split): one.metrics[name] for split, one in scores.items()} for name in known]
+    lines += _trial_lines(*every, trial=policy.trial)
     return "\n".join(lines)
 
 

@@ -27,18 +27,18 @@ _GREY = _Colour(96, 96, 96)  # where no sub-policy acts
 
 
 class Timeline(NamedTuple):
-    """Holds the sub-policies of one episode of every task (T, ...)."""
+    """Holds the sub-policies of one trial of K episodes of every task (T, ...)."""
 
     names: tuple[str, ...]
     acting: np.ndarray  # (T, H) int32 number of the sub-policy that acts in each step, -1 for none
-    lengths: np.ndarray  # (T,) int32 steps until the episode ended
+    lengths: np.ndarray  # (T, K) int32 steps of each episode, which follow each other along H
 
 
 def timeline_of(env: Tabled, played: Recording, states: Mapping[str, Any]) -> Timeline | None:
     """Return the options that an agent has played, else the symbols of followed sketches; None if there are neither.
 
     Args:
-        played: one episode of every task.
+        played: one trial of every task.
         states: those of its worlds by the name of their family, leaves (tasks of the family, H, ...).
     """
     lengths = np.asarray(played.lengths)
@@ -71,13 +71,15 @@ def colours(count: int) -> list[_Colour]:
     return [shades[i % len(shades)] for i in range(count)]
 
 
-def strips(timeline: Timeline, task: int, steps: Sequence[int], width: int) -> np.ndarray:
+def strips(timeline: Timeline, task: int, steps: Sequence[int], width: int, episode: int = 0) -> np.ndarray:
     """Return pictures (F, height, width, 3) of one episode: its stretches in colour, a mark and a name for each step.
 
     Args:
-        steps: (F,) the step that each picture is of.
+        steps: (F,) the step of the episode that each picture is of.
+        episode: of the trial.
     """
-    acting = timeline.acting[task, : timeline.lengths[task]]
+    lengths = timeline.lengths[task]
+    acting = timeline.acting[task, np.sum(lengths[:episode]) :][: lengths[episode]]
     line, palette = max(width // 14, 13), colours(len(timeline.names))
     font, scale = ImageFont.load_default(max(width // 22, 9)), width / len(acting)
     bar = Image.new("RGB", (width, 2 * line), "black")
@@ -101,7 +103,7 @@ def _colour(palette: Sequence[_Colour], number: int) -> _Colour:
 
 
 def draw(path: str | Path, timeline: Timeline, labels: Sequence[str]) -> None:
-    """Draw a row for each task (T,), with a stretch in colour for each sub-policy over the steps of its episode."""
+    """Draw a row for each task (T,), with a stretch in colour for each sub-policy over the steps of its trial."""
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
@@ -109,14 +111,14 @@ def draw(path: str | Path, timeline: Timeline, labels: Sequence[str]) -> None:
     figure = Figure(figsize=(9, 1.5 + 0.3 * len(labels)), layout="constrained")
     axes, grey = figure.subplots(), tuple(x / 255 for x in _GREY)
     used = set()
-    for row, (acting, length) in enumerate(zip(timeline.acting, timeline.lengths, strict=True)):
-        found = spans(acting[:length])
+    for row, (acting, lengths) in enumerate(zip(timeline.acting, timeline.lengths, strict=True)):
+        found = spans(acting[: np.sum(lengths)])
         used |= {number for _, _, number in found if number >= 0}
         shown = [palette[number] if number >= 0 else grey for _, _, number in found]
         axes.broken_barh([(first, count) for first, count, _ in found], (row - 0.4, 0.8), facecolors=shown)
     axes.set_yticks(range(len(labels)), labels, fontsize=8)
     axes.invert_yaxis()
-    axes.set_xlabel("steps of an episode")
+    axes.set_xlabel("steps")
     patches = [Patch(color=palette[i], label=timeline.names[i]) for i in sorted(used)]
     axes.legend(handles=patches, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
     figure.savefig(path, dpi=120)

@@ -139,9 +139,10 @@ def _finish(written: arrays.Written, record: bytes | None, new: Path, folder: Pa
 
 
 def _parts(state: TrainState) -> dict[str, Any]:
-    """Return a state as it is written: the agents, and all else by name. Runs without a population have no origins."""
+    """Return a state as it is written: the agents, and all else by name, without what only some runs have."""
     loop = state._replace(agent=None)._asdict()
-    return {"agent": state.agent, "loop": {name: x for name, x in loop.items() if name != "origins" or x is not None}}
+    own = {name: x for name, x in loop.items() if name not in ("origins", "heard") or x is not None}
+    return {"agent": state.agent, "loop": own}
 
 
 def _shapes(tree: Any) -> Any:

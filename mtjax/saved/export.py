@@ -4,7 +4,7 @@ import json
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -37,31 +37,94 @@ def export(policy: Policy, file: str | Path) -> Path:
             the inputs ``obs`` (O,) and ``parameters`` (P,), and the output ``action``: (A,), or the number () int32 of
             a choice, or the numbers (D,) of several. Of a policy that sees pictures the inputs are ``pixels``
             (H, W, N C), a stack of pictures, and ``state`` (O,) if it sees that too; of other trees of arrays, their
-            paths such as ``seen/grid``.
+            paths such as ``seen/grid``. An agent that remembers its trial goes into a file .npz, which has how its
+            memory begins and changes too.
 
     Raises:
-        InputError: the file exists, or the agent acts by what it remembers of the episode, or it is of a mixture,
-            or the package onnx is missing.
+        InputError: the file exists, or the agent goes on with an option, or remembers and the file is .onnx, or it is
+            of a mixture, or the package onnx is missing.
     """
     file = require_file(file)
     if not isinstance(policy, Policy):
         raise InputError(f"export takes a policy, from mtjax.load or result.policy(), not a {type(policy).__name__}")
     env, act, obs = policy.env, acting(policy), policy.takes
     assert isinstance(env, Family)
+    memory = Flat.of(policy)
+    if memory.size and file.suffix == ".onnx":
+        raise InputError("an agent that remembers its trial is exported to a file that ends with .npz")
     values = jax.ShapeDtypeStruct((len(ranges(env)),), jnp.float32)
-    program, constants = steps_of(jax.make_jaxpr(act)(obs, values))
-    meta = _meta(env, policy.agent, by_name(obs))
+    meta = _meta(env, policy.agent, by_name(obs)) | {"memory": memory.size, "trial": policy.trial}
     new = file.with_suffix(f".new{file.suffix}")
     file.parent.mkdir(parents=True, exist_ok=True)
     if file.suffix == ".onnx":
+        program, constants = steps_of(jax.make_jaxpr(act)(obs, values))
         onnx.write(program, constants, by_name(obs) | {"parameters": values}, meta, new)
     else:
-        text = lambda x: np.frombuffer(json.dumps(x).encode(), np.uint8)
-        arrays: dict[str, Any] = {f"constant_{i}": x for i, x in enumerate(constants)}
-        exported = _serialised(act, obs, values)
-        np.savez_compressed(new, meta=text(meta), program=text(program), exported=exported, **arrays)
+        arrays = _written("", act, obs, values, *memory.shapes)
+        if memory.size:
+            arrays |= _written("remember_", remembering(policy), obs, values, *memory.shapes, *_step_of(env, obs))
+            arrays["begun"] = np.asarray(memory.begun)
+        np.savez_compressed(new, meta=_text(meta), **arrays)
     os.replace(new, file)
     return file
+
+
+class Flat(NamedTuple):
+    """Lays out what an agent remembers of a trial as one vector (M,)."""
+
+    begun: Array  # (M,) with which a trial begins
+    unpack: Callable[[Array], Any]  # from a vector to the agent's memory
+
+    @classmethod
+    def of(cls, policy: Policy) -> "Flat":
+        """Return the layout of a policy's memory, as far as acting reads it."""
+        memory = policy.begin(jax.tree.map(lambda x: x[0], policy.env.tasks("all")._replace(draws=None)))
+        leaves, tree = jax.tree.flatten((memory.past, memory.hidden))
+        ends = np.cumsum([0, *(x.size for x in leaves)]).tolist()
+
+        def unpack(vector: Array) -> Any:
+            cut = [
+                vector[low:high].reshape(x.shape).astype(x.dtype)
+                for x, low, high in zip(leaves, ends[:-1], ends[1:], strict=True)
+            ]
+            past, hidden = tree.unflatten(cut)
+            return memory._replace(past=past, hidden=hidden)
+
+        return cls(pack(memory), unpack)
+
+    @property
+    def size(self) -> int:
+        """The number M; 0 for no memory."""
+        return self.begun.size
+
+    @property
+    def shapes(self) -> tuple[Any, ...]:
+        """What programs take as the memory: a vector, or nothing."""
+        return (jax.ShapeDtypeStruct(self.begun.shape, jnp.float32),) if self.size else ()
+
+
+def pack(memory: Any) -> Array:
+    """Return an agent's memory, as far as acting reads it, as one vector (M,)."""
+    leaves = jax.tree.leaves((memory.past, memory.hidden))
+    return jnp.concatenate([jnp.zeros(0), *(x.reshape(-1).astype(jnp.float32) for x in leaves)])
+
+
+def _step_of(env: Family, obs: Any) -> tuple[Any, ...]:
+    """Return the shapes of what follows an observation in a step: action, reward, next observation, and the end."""
+    action = jax.eval_shape(env.spec.action.blank)
+    number = jax.ShapeDtypeStruct((), jnp.float32)
+    return jax.ShapeDtypeStruct(action.shape, action.dtype), number, obs, number
+
+
+def _written(name: str, function: Callable, *shapes: Any) -> dict[str, Any]:
+    """Return the arrays of a program in a file, whose names begin with ``name``."""
+    program, constants = steps_of(jax.make_jaxpr(function)(*shapes))
+    arrays: dict[str, Any] = {f"{name}constant_{i}": x for i, x in enumerate(constants)}
+    return arrays | {f"{name}program": _text(program), f"{name}exported": _serialised(function, *shapes)}
+
+
+def _text(x: Any) -> np.ndarray:
+    return np.frombuffer(json.dumps(x).encode(), np.uint8)
 
 
 def require_file(file: str | Path) -> Path:
@@ -118,8 +181,10 @@ def _about(env: Family, name: str, array: Any) -> str:
     )
 
 
-def acting(policy: Policy) -> Callable[[Any, Array], Array]:
+def acting(policy: Policy) -> Callable[..., Array]:
     """Return the function from an observation, as ``policy.takes``, and the parameters' values (P,) to the action (A,).
+
+    Of an agent that remembers it takes the memory (M,) too.
 
     Raises:
         InputError: as ``export``.
@@ -127,26 +192,41 @@ def acting(policy: Policy) -> Callable[[Any, Array], Array]:
     env, agent, state = policy.env, policy.agent, policy.state
     if not isinstance(env, Family):
         raise InputError("export takes a policy of one family, and this one is of a mixture")
-    if agent.view.history or agent.conditioning.recurs:
-        raise InputError("export takes agents that act by what they see, and this one infers its task from memory")
     if agent.goes_on:
         raise InputError("export takes agents that act by what they see, and this one goes on with what it has chosen")
+    unpack = Flat.of(policy).unpack
 
-    def act(obs: Any, values: Array) -> Array:
+    def act(obs: Any, values: Array, *memory: Array) -> Array:
         task = policy.task_of(values)
-        return agent.act(state, agent.begin(state, task), obs, task, None).action
+        known = unpack(*memory) if memory else agent.begin(state, task)
+        return agent.act(state, known, obs, task, None).action
 
     return act
 
 
-def _serialised(act: Callable, obs: Any, values: Any) -> np.ndarray:
+def remembering(policy: Policy) -> Callable[..., Array]:
+    """Return the function from a step of a task to the memory (M,) after it, given that before it.
+
+    It takes the observation, the parameters' values (P,), the memory (M,), the action, the reward (), the next
+    observation, and whether the episode has ended (), as a number.
+    """
+    unpack = Flat.of(policy).unpack
+
+    def remember(obs: Any, values: Array, memory: Array, action: Array, reward: Array, after: Any, ended: Array):
+        step = (obs, action, reward, after, ended > 0)
+        return pack(policy.remember(unpack(memory), policy.task_of(values), *step))
+
+    return remember
+
+
+def _serialised(function: Callable, obs: Any, *shapes: Any) -> np.ndarray:
     """Return the program for batches of any size, as bytes. Several arrays are a dictionary by their paths."""
     (size,), named, tree = jax.export.symbolic_shape("batch"), by_name(obs), jax.tree.structure(obs)
-    taken = obs if jax.tree_util.treedef_is_leaf(tree) else named
-
-    def call(taken: Any, values: Array) -> Array:
-        return act(tree.unflatten([taken[name] for name in named] if isinstance(taken, dict) else [taken]), values)
-
-    batches = jax.tree.map(lambda x: jax.ShapeDtypeStruct((size, *x.shape), x.dtype), (taken, values))
+    given = (obs, *shapes)
+    seen = [jax.tree.structure(x) == tree and not jax.tree_util.treedef_is_leaf(tree) for x in given]
+    whole = lambda x, is_seen: tree.unflatten([x[name] for name in named]) if is_seen else x
+    call = lambda *taken: function(*map(whole, taken, seen))
+    taken = tuple(by_name(x) if is_seen else x for x, is_seen in zip(given, seen, strict=True))
+    batches = jax.tree.map(lambda x: jax.ShapeDtypeStruct((size, *x.shape), x.dtype), taken)
     exported = jax.export.export(jax.jit(jax.vmap(call)), platforms=_PLATFORMS)(*batches)
     return np.frombuffer(bytes(exported.serialize()), np.uint8)

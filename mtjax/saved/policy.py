@@ -152,10 +152,12 @@ class Policy:
         return self.agent.begin(self.state, task)
 
     def remember(
-        self, memory: Any, task: Task, obs: Array, action: Array, reward: Array, next_obs: Array, ended: Any = False
+        self, memory: Any, task: Task, obs: Any, action: Any, reward: Any, next_obs: Any, ended: Any = False
     ) -> Any:
         """Return the memory after one step; ``ended`` says whether an episode ended with it."""
-        step = Transition(obs, action, reward, jnp.float32(1), next_obs, jnp.bool_(ended), jnp.bool_(False))
+        obs, action, next_obs = jax.tree.map(jnp.asarray, (obs, action, next_obs))
+        reward, ended = jnp.float32(reward), jnp.bool_(ended)
+        step = Transition(obs, action, reward, jnp.float32(1), next_obs, ended, jnp.bool_(False))
         return self.agent.remember(self.state, memory, step, task)
 
 

@@ -9,6 +9,12 @@ A policy that sees pictures takes a stack of the last ones, which ``begin`` and 
     action = policy({"pixels": stack}, size=1.05)
     stack = push(stack, next_picture)  # after every action
 
+A policy that remembers its trial, of ``policy.meta["trial"]`` episodes, takes its memory, which the caller keeps:
+
+    memory = policy.begin()  # at the start of a trial
+    action = policy(obs, memory=memory, size=1.05)
+    memory = policy.remember(memory, obs, action, reward, next_obs, ended, size=1.05)  # after every action
+
 ``policy.meta["about"]`` says what it observes. ``load_jax`` returns the same policy as a compiled JAX function of
 batches, which needs JAX and nothing else.
 """
@@ -29,10 +35,11 @@ class Policy:
 
     def __init__(self, file: Any):
         arrays = _arrays(file)
-        meta, program = (json.loads(bytes(arrays[name])) for name in ("meta", "program"))
-        self.meta = {"obs": {"obs": [meta.get("obs_size")]}} | meta  # files from before pictures give a size alone,
-        self.program = {"reads": [0, 1]} | program  # and do not say what is read
-        self.constants = [arrays[f"constant_{i}"] for i in range(self.program["constants"])]
+        meta = json.loads(bytes(arrays["meta"]))
+        self.meta = {"obs": {"obs": [meta.get("obs_size")]}, "memory": 0} | meta  # as files of before did not say
+        self.program, self.constants = _program(arrays, "")
+        self._begun = arrays.get("begun")
+        self._remembers = _program(arrays, "remember_") if self.meta["memory"] else None
 
     def __repr__(self) -> str:
         seen = ", ".join(f"{name} {shape}" for name, shape in shapes_of(self.meta).items()).removeprefix("obs ")
@@ -40,7 +47,7 @@ class Policy:
         told = f"observation {seen}, action {action}"
         return f"Policy({self.meta['agent']} on {self.meta['env']}: {told}, parameters {self.meta['parameters']})"
 
-    def __call__(self, obs: Any, **parameters: float) -> np.ndarray:
+    def __call__(self, obs: Any, memory: Any = None, **parameters: float) -> np.ndarray:
         """Return the mean action (A,) of the task with these parameters, or (B, A) of a batch of observations.
 
         If actions are discrete, it is the likeliest: a number () int32, or (B,); numbers (D,) of several, or (B, D).
@@ -48,24 +55,85 @@ class Policy:
         Args:
             obs: an observation (O,), or the tree of arrays that the family observes; of a policy that sees pictures
                 {"pixels": (H, W, N C) uint8}, beside which may be "state": (O,). All of a batch have a leading B.
+            memory: of a policy that remembers its trial (M,), or (B, M); without it a trial has just begun.
             parameters: the task's parameters; in a batch each may be (B,). A policy that reads none takes them or
                 leaves them out.
         """
         seen, size = observed(self.meta, obs)
-        given = ordered(self.meta["parameters"], parameters, len(seen) in self.program["reads"], size)
-        values = np.array(np.broadcast_arrays(*given), np.float32).T if given else np.zeros(0, np.float32)
-        if size is None:
-            return self._run(*seen, values)
-        values = np.broadcast_to(values, (size, len(given)))
-        return np.stack([self._run(*(x[i] for x in seen), values[i]) for i in range(size)])
+        values = self._values(parameters, len(seen) in self.program["reads"], size)
+        given = [*seen, values]
+        if self.meta["memory"]:
+            given.append(self._held(self.begin() if memory is None else memory, size))
+        return _for_each(self.program, self.constants, given, size)
 
-    def _run(self, *inputs: np.ndarray) -> np.ndarray:
-        known: dict[int, np.ndarray] = dict(enumerate((*self.constants, *inputs)))
-        for operation, arguments, results, settings in self.program["steps"]:
-            found = OPERATIONS[operation](*(known[i] for i in arguments), **settings)
-            found = found if isinstance(found, list) else [found]
-            known.update(zip(results, found, strict=True))
-        return np.array(known[self.program["result"]])
+    def begin(self) -> np.ndarray:
+        """Return the memory (M,) with which a trial begins."""
+        self._remembering("begin")
+        return np.array(self._begun)
+
+    def remember(
+        self,
+        memory: Any,
+        obs: Any,
+        action: Any,
+        reward: Any,
+        next_obs: Any,
+        ended: Any = False,
+        **parameters: float,
+    ) -> np.ndarray:
+        """Return the memory (M,) after a step, or (B, M) of a batch of steps.
+
+        Args:
+            memory: before the step.
+            ended: whether an episode ended with it. With the last one of a trial, take the memory of ``begin``.
+        """
+        program, constants = self._remembering("remember")
+        (seen, size), (after, _) = observed(self.meta, obs), observed(self.meta, next_obs)
+        chosen = np.asarray(action, np.int32 if self.meta.get("discrete") else np.float32)
+        numbers = [np.broadcast_to(np.float32(x), () if size is None else (size,)) for x in (reward, ended)]
+        values = self._values(parameters, len(seen) in program["reads"], size)
+        given = [*seen, values, self._held(memory, size), chosen, numbers[0], *after, numbers[1]]
+        return _for_each(program, constants, given, size)
+
+    def _values(self, parameters: dict[str, Any], needed: bool, size: int | None) -> np.ndarray:
+        """Return the values (P,) or (B, P) of the task's parameters."""
+        given = ordered(self.meta["parameters"], parameters, needed, size)
+        values = np.array(np.broadcast_arrays(*given), np.float32).T if given else np.zeros(0, np.float32)
+        return values if size is None else np.broadcast_to(values, (size, len(given)))
+
+    def _held(self, memory: Any, size: int | None) -> np.ndarray:
+        """Return a memory (M,) or (B, M)."""
+        shape = (self.meta["memory"],)
+        return np.broadcast_to(np.asarray(memory, np.float32), shape if size is None else (size, *shape))
+
+    def _remembering(self, name: str) -> Any:
+        if self._remembers is None:
+            raise ValueError(f"this policy acts by what it sees, and has no memory to {name}")
+        return self._remembers
+
+
+def _program(arrays: dict[str, np.ndarray], name: str) -> tuple[dict[str, Any], list[np.ndarray]]:
+    """Return a program and its constants, whose names begin with ``name``."""
+    program = {"reads": [0, 1]} | json.loads(bytes(arrays[f"{name}program"]))  # which files of before did not say
+    return program, [arrays[f"{name}constant_{i}"] for i in range(program["constants"])]
+
+
+def _for_each(
+    program: dict[str, Any], constants: list[np.ndarray], inputs: list[np.ndarray], size: int | None
+) -> np.ndarray:
+    """Run a program, for each of a batch of inputs with a leading B if there is a size."""
+    if size is None:
+        return _run(program, constants, inputs)
+    return np.stack([_run(program, constants, [x[i] for x in inputs]) for i in range(size)])
+
+
+def _run(program: dict[str, Any], constants: list[np.ndarray], inputs: list[np.ndarray]) -> np.ndarray:
+    known: dict[int, np.ndarray] = dict(enumerate((*constants, *inputs)))
+    for operation, arguments, results, settings in program["steps"]:
+        found = OPERATIONS[operation](*(known[i] for i in arguments), **settings)
+        found = found if isinstance(found, list) else [found]
+        known.update(zip(results, found, strict=True))
+    return np.array(known[program["result"]])
 
 
 def shapes_of(meta: dict[str, Any]) -> dict[str, tuple[int, ...]]:
@@ -167,15 +235,18 @@ def load(file: Any) -> Policy:
     return Policy(file)
 
 
-def load_jax(file: Any) -> Callable:
+def load_jax(file: Any, of: str = "act") -> Callable:
     """Load a policy as a JAX function: observations (B, O), values (B, P) of the parameters -> actions (B, A).
 
     A policy of several arrays takes a dict of exactly ``shapes_of(policy.meta)``, with a leading B, of the types that
-    ``policy.meta["about"]`` tells.
+    ``policy.meta["about"]`` tells. One that remembers its trial takes memories (B, M) too. With "remember" it is the
+    function from observations, values, memories, actions, rewards (B,), next observations and ends (B,) of 0 or 1,
+    float32, to the next memories (B, M).
     """
     from jax import export
 
-    return export.deserialize(bytearray(_arrays(file)["exported"])).call
+    name = {"act": "exported", "remember": "remember_exported"}[of]
+    return export.deserialize(bytearray(_arrays(file)[name])).call
 
 
 # The last pictures of an episode, (..., H, W, N C) for N pictures of C channels, oldest first.

@@ -66,11 +66,13 @@ class Sawyer(Domain):
     """Number of goals. Each episode draws one of them."""
     benchmark: str = ""
     """The benchmark whose goals these are: mt10, mt25, mt50, cw10, ml10 or ml45. Each has other goals of the same seed.
-    Without a name they are those of Meta-World's MT1, and of ML1's training; of ML1's test with ``task_seed`` + 1."""
+    Without a name they are those of Meta-World's MT1, and of ML1's training."""
     goal_hidden: bool = False
     """Observe zeros in place of the goal, as in the benchmarks of meta-learning."""
     held_out: bool = False
     """Do not train on this task: it is in the split extrapolation."""
+    test_goals: bool = False
+    """Hold out as many goals of the next seed in the split extrapolation: those of ML1's test."""
 
     scene_file: ClassVar[str]  # a file in the package's assets/sawyer_xyz, without .xml
     meshes: ClassVar[bool] = True
@@ -98,6 +100,8 @@ class Sawyer(Domain):
             raise InputError(f"Meta-World's tasks vary in their goals only, not in {next(iter(dict(self.vary)))}")
         if self.benchmark:
             listed_with(self.benchmark, self._task)
+        if self.held_out and self.test_goals:
+            raise InputError("a task that is held out trains on no goals; leave out test-goals")
         super().__post_init__()
         if self.engine == "mjx":
             raise InputError(_NOT_MJX)
@@ -143,21 +147,20 @@ class Sawyer(Domain):
 
     @cached_property
     def variation(self) -> Variation:
-        """Return the one task, and room for the goals that its episodes draw."""
-        rows = {name: np.zeros((int(name == self._split), 0)) for name in SPLITS}
-        return Variation((), rows, np.zeros((1, self.num_draws, 0)), np.zeros(0), np.zeros(0))
-
-    @property
-    def _split(self) -> str:
-        return "extrapolation" if self.held_out else "train"
+        """Return the one task, and room for the goals that its episodes draw; with ``test_goals`` once more."""
+        counts = {"train": not self.held_out, "extrapolation": self.held_out or self.test_goals}
+        rows = {name: np.zeros((int(counts.get(name, False)), 0)) for name in SPLITS}
+        return Variation((), rows, np.zeros((sum(counts.values()), self.num_draws, 0)), np.zeros(0), np.zeros(0))
 
     def vectors(self) -> np.ndarray:
-        """Return the vectors (P, K) of all goals."""
-        if not self.benchmark:
-            return draw_goals((self,), self.task_seed, self.num_draws)[0]
-        names = listed_with(self.benchmark, self._task)
-        tasks = tuple(load(f"mtjax.envs.metaworld.{TASKS[name]}")() for name in names)
-        return draw_goals(tasks, self.task_seed, self.num_draws)[names.index(self._task)]
+        """Return the vectors (P, K) of all goals, first those of training."""
+        names, tasks = [self._task], (self,)
+        if self.benchmark:
+            names = listed_with(self.benchmark, self._task)
+            tasks = tuple(load(f"mtjax.envs.metaworld.{TASKS[name]}")() for name in names)
+        seeds = [self.task_seed + i for i in range(1 + self.test_goals)]
+        place = names.index(self._task)
+        return np.concatenate([draw_goals(tasks, seed, self.num_draws)[place] for seed in seeds])
 
     @property
     def _task(self) -> str:
@@ -193,13 +196,13 @@ class Sawyer(Domain):
 
     @cached_property
     def models(self) -> tuple[mujoco.MjModel, ...]:
-        """Return the model of every row of the table: the task's, which is that of its first goal, and the goals'."""
+        """Return the model of every row of the table: first the tasks' (of their first goals)."""
         return tuple(start.model for start in self._of_rows)
 
     @property
     def _of_rows(self) -> tuple[Start, ...]:
         starts = self.starts_of_goals
-        return (starts[0], *starts)
+        return (*starts[:: self.num_draws], *starts)
 
     def build(self) -> dict[str, dict[str, Any]]:
         starts = self._of_rows

@@ -12,6 +12,9 @@ from mtjax.agents.networks import MLP
 from mtjax.agents.parts.knowing.recurrent import Track, gru
 from mtjax.types import Array, Key, Metrics
 
+_CHANGE = "change of state"
+_DRAWS = 64  # of a belief, over which predictions are averaged
+
 
 class Belief(NamedTuple):
     """Holds a Gaussian over latent tasks, whose entries are independent."""
@@ -49,6 +52,11 @@ class Dense(nn.Module):
 def change(step: Any) -> Array:
     """Return the change of state (..., O) in steps; 0 where an episode ended, as what follows is another's start."""
     return (step.next_obs - step.obs) * within(step)[..., None]
+
+
+def known_change(step: Any) -> Array:
+    """Return the change of state (..., O) in steps; NaN where an episode ended."""
+    return jnp.where(jnp.bool_(step.ended)[..., None], jnp.nan, change(step))
 
 
 def within(step: Any) -> Array:
@@ -126,6 +134,14 @@ class Inference(abc.ABC):
         """Return what networks see (..., Z) of a memory (..., M)."""
 
     @abc.abstractmethod
+    def belief(self, params: dict[str, Any], memory: Array) -> Belief:
+        """Return what is believed given memories (..., M); of a point the variance is 0."""
+
+    def foretell(self, params: dict[str, Any], step: Any, belief: Belief, key: Key) -> dict[str, tuple[Array, Array]]:
+        """Return by name what its models predict (...) or (..., O) of steps under beliefs, and what came."""
+        return {}
+
+    @abc.abstractmethod
     def losses(self, params: dict[str, Any], track: Track, before: Array, after: Array) -> Metrics:
         """Return the losses, by name, that add up to its own, given the memories (B L, M) around every step."""
 
@@ -165,6 +181,12 @@ class VariBAD(Inference):
 
     def show(self, params: dict[str, Any], memory: Array) -> Array:
         return jax.lax.stop_gradient(jnp.concatenate(self.belief(params, memory), axis=-1))
+
+    def foretell(self, params: dict[str, Any], step: Any, belief: Belief, key: Key) -> dict[str, tuple[Array, Array]]:
+        """Predict rewards and changes of state by the mean over latent tasks that are drawn from beliefs."""
+        latents = jax.vmap(belief.draw)(jax.random.split(key, _DRAWS))
+        mean = lambda model: jnp.mean(jax.vmap(lambda latent: model(params, step, latent))(latents), axis=0)
+        return {"reward": (mean(self.rewards), step.reward), _CHANGE: (mean(self.changes), known_change(step))}
 
     def rewards(self, params: dict[str, Any], step: Any, latent: Array) -> Array:
         """Predict the rewards (...) of steps in latent tasks (..., Z)."""
@@ -212,6 +234,9 @@ class PEARL(Inference):
     def advance(self, params: dict[str, Any], memory: Array, read: Array) -> Array:
         return memory + read
 
+    def belief(self, params: dict[str, Any], memory: Array) -> Belief:
+        return product(memory)
+
     def show(self, params: dict[str, Any], memory: Array) -> Array:
         return jnp.concatenate(product(memory), axis=-1)
 
@@ -257,8 +282,18 @@ class CaDM(Inference):
         flat = memory.reshape(*memory.shape[:-2], -1)
         return self.dense(self.settings.latent_size).apply(params["context"], flat)  # type: ignore
 
+    def belief(self, params: dict[str, Any], memory: Array) -> Belief:
+        context = self.context(params, memory)
+        return Belief(context, jnp.full_like(context, -jnp.inf))
+
     def show(self, params: dict[str, Any], memory: Array) -> Array:
         return jax.lax.stop_gradient(self.context(params, memory))
+
+    def foretell(self, params: dict[str, Any], step: Any, belief: Belief, key: Key) -> dict[str, tuple[Array, Array]]:
+        """Predict changes of state by the forward model."""
+        model = self.dense(step.obs.shape[-1])
+        predicted: Any = model.apply(params["forward"], step.obs, step.action, belief.mean)
+        return {_CHANGE: (predicted, known_change(step))}
 
     def losses(self, params: dict[str, Any], track: Track, before: Array, after: Array) -> Metrics:
         length = len(track.reward) // len(track.state)
