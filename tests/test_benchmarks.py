@@ -284,7 +284,8 @@ def test_a_task_by_itself_has_the_worlds_that_it_has_among_all(script, tmp_path)
     """Where sharing is measured: by its own preset one task would have those of ten."""
     suite, learning = script("suite"), script("learning")
     hard = dataclasses.replace(suite.SUITES["hard"], together="walker-run+hopper-hop", envs=("walker-run",))
-    words = {"steps_per_task": 100, "seeds": 1, "preset": "gpu", "equal_to": ""}
+    words = {"steps_per_task": 100, "seeds": 1, "preset": "gpu", "equal_to": "", "training": [], "evaluations": 1}
+    words |= {"eval_episodes": 1}
     asked = suite.request(SimpleNamespace(**words), hard, "walker-run", tmp_path)
     shared = mtjax.preset("walker-run+hopper-hop", "brc", "gpu").training.num_envs
     assert learning.program_of(asked, "walker-run", "brc").training.num_envs == shared

@@ -354,7 +354,16 @@ def test_a_trial_is_filmed_episode_by_episode(copied_run, filmed, tmp_path, caps
     out = capsys.readouterr().out
     assert re.search(r"filming 2 of 4: train, episode 2 of 2, return \d+, size=1\n", out)
     assert "filmed film: 2 tasks by 2 episodes" in out
-    assert [films._episodes(trial) for trial in (1, 3, 4, 9)] == [[0], [0, 1, 2], [0, 1, 2, 3], [0, 1, 2, 8]]
+    one, of_trial = (
+        films.choose(policy.env, ["train"], [0]),
+        lambda count: played._replace(returns=np.zeros((1, count))),
+    )
+    filmed = {count: films._episodes(one, of_trial(count)) for count in (1, 3, 4, 9)}
+    assert {count: [x.episode for x in found] for count, (found, _) in filmed.items()} == {
+        **{1: [0], 3: [0, 1, 2], 4: [0, 1, 2, 3]},
+        9: [0, 1, 2, 8],
+    }
+    assert [columns for _, columns in filmed.values()] == [0, 3, 4, 4]
 
 
 def test_a_caption_covers_nothing_and_needs_no_more_width_than_its_picture():

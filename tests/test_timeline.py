@@ -52,6 +52,13 @@ def test_a_strip_shows_the_whole_episode_and_where_it_is():
     assert all((picture[line:, line + 3 :] > 200).any() for picture in found)  # the name
 
 
+def test_a_strip_of_a_later_episode_begins_where_that_does():
+    """The second episode of a trial is the last two steps, in both of which the second one acts."""
+    acting = Timeline(("a", "b"), np.array([[0, 0, 0, 1, 1]]), np.array([[3, 2]]))
+    found = strips(acting, 0, [0], 40, 1)
+    assert {tuple(found[0, 4, x].tolist()) for x in (5, 25, 35)} == {colours(2)[1]}
+
+
 CASES = {
     "sketches": ("craft-sketched", {}, "get-wood"),
     "options": ("craft", {"num_options": 3}, "option 0"),
@@ -79,9 +86,8 @@ def test_a_film_of_sub_policies_has_strips_and_a_figure(name, tmp_path, monkeypa
     acting = seen["acting"]
     assert known in acting.names and seen["labels"] == ["plank", "stick"]
     assert acting.acting.shape == (2, env.episode_length) and np.all(acting.acting[:, 0] >= 0)
-    played = {
-        number for row, length in zip(acting.acting, acting.lengths, strict=True) for number in row[: length.sum()]
-    }
+    rows = [row[: lengths.sum()] for row, lengths in zip(acting.acting, acting.lengths, strict=True)]
+    played = {number for row in rows for number in row}
     drawn = {tuple(x) for x in seen["frames"].reshape(-1, 3).tolist()}
     assert {colours(len(acting.names))[number] for number in played} <= drawn
 
