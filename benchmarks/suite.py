@@ -315,13 +315,13 @@ def human_scores(out: Path, unfinished: bool = False) -> str:
         names = env.split("+")
         for t, name in enumerate(names):
             cells = score(returns[:, [t]], ".1f"), score(human[:, [t]], ".3f")
-            lines.append([name, agent, "all" if len(names) > 1 else "one", str(len(returns)), *cells])
+            lines.append([name, agent, "with others" if len(names) > 1 else "alone", str(len(returns)), *cells])
         scores.setdefault((agent, env if len(names) > 1 else ""), []).append(human)
     if not lines:
         return ""
-    games = markdown(["game", "agent", "of which games", "seeds", "score", "human-normalised"], lines)
-    head = ["agent", "of which games", "games", "median", "interquartile mean", "mean"]
-    return f"{games}\n\n{markdown(head, [over_games(*key, of) for key, of in scores.items()])}"
+    games = markdown(["game", "agent", "learned", "seeds", "score", "human-normalised"], lines)
+    head = ["agent", "learned", "games", "median", "interquartile mean", "mean"]
+    return f"{games}\n\n{markdown(head, [over_games(agent, env, of) for (agent, env), of in scores.items()])}"
 
 
 def over_games(agent: str, together: str, scores: list[np.ndarray]) -> list[str]:
@@ -329,7 +329,8 @@ def over_games(agent: str, together: str, scores: list[np.ndarray]) -> list[str]
     seeds = min(len(of_game) for of_game in scores)
     each = np.concatenate([of_game[:seeds] for of_game in scores], axis=1)
     found = seed_interval(np.median(each, axis=1)), seed_interval(each, iqm), seed_interval(each)
-    return [agent, "all" if together else "one", str(each.shape[1]), *(learning.cell(x, ".3f") for x in found)]
+    how = "with others" if together else "alone"
+    return [agent, how, str(each.shape[1]), *(learning.cell(x, ".3f") for x in found)]
 
 
 def compare(shared: Evaluations, row: int, alone: Evaluations) -> list[str]:

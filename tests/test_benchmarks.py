@@ -426,10 +426,10 @@ def test_scores_on_atari_are_in_units_of_a_persons(script, tmp_path):
         (tmp_path / env).mkdir()
         save_evaluations(tmp_path / env / "ppo.npz", evaluations)
     table = suite.human_scores(tmp_path)
-    assert "| envpool:Pong-v5 | ppo | one | 3 | 4.0 [-3.1, 11.1] | 0.700 [0.500, 0.900] |" in table
-    assert "| envpool:Pong-v5 | ppo | all | 3 | 4.0 [-3.1, 11.1] | 0.700 [0.500, 0.900] |" in table
-    assert "| ppo | one | 3 | 0.700 [0.500, 0.900] |" in table and "| 0.933 [0.833, 1.033] |" in table
-    assert "| ppo | all | 2 | 1.350 [1.250, 1.450] |" in table
+    assert "| envpool:Pong-v5 | ppo | alone | 3 | 4.0 [-3.1, 11.1] | 0.700 [0.500, 0.900] |" in table
+    assert "| envpool:Pong-v5 | ppo | with others | 3 | 4.0 [-3.1, 11.1] | 0.700 [0.500, 0.900] |" in table
+    assert "| ppo | alone | 3 | 0.700 [0.500, 0.900] |" in table and "| 0.933 [0.833, 1.033] |" in table
+    assert "| ppo | with others | 2 | 1.350 [1.250, 1.450] |" in table
     (tmp_path / "none").mkdir()
     assert not suite.human_scores(tmp_path / "none")
 
