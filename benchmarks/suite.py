@@ -1,8 +1,9 @@
 """Run a suite of tasks by its name, with its protocol: agents, seeds, steps, and the figures that the field reports.
 
-    python benchmarks/suite.py mt10|mt50|ml1|ml10|ml45|dynamics|goals|domains|hard|pixels|looks [--agents NAME ...]
-                               [--seeds N] [--steps-per-task N] [--training NAME=VALUE ...] [--env NAME=VALUE ...]
-                               [--best] [--adapt K] [--unfinished] [--devices 0 1 ...] [--within N] [--out DIR]
+    python benchmarks/suite.py mt10|mt50|ml1|ml10|ml45|dynamics|goals|domains|hard|pixels|looks|analytic|atari5|atari26
+                               [--agents NAME ...] [--seeds N] [--steps-per-task N] [--training NAME=VALUE ...]
+                               [--env NAME=VALUE ...] [--best] [--adapt K] [--unfinished] [--devices 0 1 ...]
+                               [--within N] [--out DIR]
 
 ``--list`` prints the protocols. Every pair of environment and agent writes ``DIR/ENV/AGENT.csv`` (training over steps
 and seconds) and ``AGENT.npz`` (every episode of every evaluation: returns and, where tasks have it, success), and the
@@ -18,6 +19,10 @@ Where a suite compares agents, those with a replay all have the worlds, updates 
 preset of the agent that its protocol names; ``--best`` gives each its own preset in all. PPO always has its own.
 Where a suite compares one agent for all tasks with one for each, a task has as many worlds by itself as among all. With
 ``--devices`` every pair is a process of its own, on one of these GPUs; ``--within`` ends the call after some seconds.
+
+Atari's games are EnvPool's (``pip install envpool``): actions stick, whole games are played, and returns are the games'
+own scores, whatever an agent makes of rewards when it learns. ``human.md`` has them in units in which a random policy
+has 0 and a person 1 (``atari.py``), and their median, interquartile mean and mean over games.
 
 Success is that of the last evaluation: at the episode's last step, and at any step. Both are shares of episodes.
 
@@ -43,6 +48,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+import atari
 import learning
 import numpy as np
 from parts import add_flags, is_part, require_all
@@ -51,7 +57,7 @@ from report import markdown, run_main, write_lines
 import mtjax
 from mtjax.learning.evaluation import Evaluations
 from mtjax.names import InputError
-from mtjax.report.stats import seed_interval, unpaired_difference
+from mtjax.report.stats import iqm, seed_interval, unpaired_difference
 from mtjax.types import SPLITS, Env
 
 _HARD = ("dog-stand", "dog-walk", "dog-trot", "dog-run", "humanoid-stand", "humanoid-walk", "humanoid-run")
@@ -71,6 +77,7 @@ _OF_META_WORLD = (
     *("sac-conditioned", "multi-head", "care-text", "pcgrad", "soft-modularization", "moore", "ppo", "brc", "care"),
 )
 _OF_TRIALS = ("rl2", "varibad", "blind")
+_GAMES = tuple(map(atari.name, atari.FIVE))
 _SEEN = ("pixels=64", "frames=3", "repeat=2")
 
 
@@ -89,6 +96,7 @@ class Suite:
     settings: tuple[str, ...] = ()  # of the environments
     vary: tuple[str, ...] = ()  # what tasks differ in, besides what the families vary
     adapt: int = 0  # episodes of a trial before the one that counts
+    episodes: int = 50  # of each task in an evaluation, or trials; Meta-World's tasks have 50 goals
 
 
 SUITES = {
@@ -177,6 +185,35 @@ SUITES = {
         settings=_SEEN,
         vary=("camera-angle=-20:20:10",),
     ),
+    "analytic": Suite(
+        "worlds of a few equations whose best is known, after the steps of the preset, with all that is held out: on "
+        "two CPU cores each within 5 minutes (--preset cpu --seeds 1); success is a mark that is reached, or a lap",
+        ("link", "sailing", "racing", "trading"),
+        ("ppo",),
+        0,  # those of the preset
+        3,
+        episodes=20,
+    ),
+    "atari5": Suite(
+        "Atari's five games that tell most of all others (Aitchison et al. 2023): one agent for all against one for "
+        "each, 12.5M steps of four frames a game, sticky actions, all actions, whole games (Machado et al. 2018)",
+        ("+".join(_GAMES), *_GAMES),
+        ("ppo", "impala"),
+        12_500_000,
+        3,
+        together="+".join(_GAMES),
+        settings=atari.SETTINGS,
+        episodes=10,
+    ),
+    "atari26": Suite(
+        "26 games (Kaiser et al. 2020), one agent for each, as atari5",
+        tuple(map(atari.name, atari.TWENTY_SIX)),
+        ("ppo", "impala"),
+        12_500_000,
+        3,
+        settings=atari.SETTINGS,
+        episodes=10,
+    ),
 }
 
 
@@ -195,6 +232,7 @@ class Last(NamedTuple):
     success: np.ndarray | None  # (S, T) at the last step of episodes
     ever: np.ndarray | None  # (S, T) at any step
     splits: dict[str, np.ndarray]  # (S, T) returns by split, without empty ones
+    held_out: dict[str, np.ndarray]  # (S, T) success at the last step on the splits that do not train
     steps: float  # of each task
     seconds: str  # of training, and by the clock; "-" without metrics
     wall: str
@@ -214,9 +252,7 @@ def main() -> None:
     parser.add_argument("--training", nargs="*", default=[], metavar="NAME=VALUE", help="of the loop or all agents")
     parser.add_argument("--env", nargs="*", default=[], metavar="NAME=VALUE", help="settings of families: pixels=64")
     parser.add_argument("--evaluations", type=int, help="by default four, and one of suites that adapt")
-    parser.add_argument(
-        "--eval-episodes", type=int, default=50, help="trials of each task; Meta-World's tasks have 50 goals"
-    )
+    parser.add_argument("--eval-episodes", type=int, help="of each task, or trials; by default the suite's")
     parser.add_argument(
         "--adapt", type=int, metavar="K", help="episodes before the one that counts, in ml1 and the like"
     )
@@ -255,7 +291,7 @@ def request(arguments: argparse.Namespace, suite: Suite, env: str, out: Path) ->
     given = {"seeds": arguments.seeds or suite.seeds, "steps": steps, "split": suite.split, "out": out}
     given |= {"env": [*suite.settings], "vary": [*suite.vary], "as_in": suite.together}
     given["evaluations"] = arguments.evaluations or (1 if suite.adapt else 4)
-    given["eval_episodes"] = arguments.eval_episodes * (suite.adapt + 1)
+    given["eval_episodes"] = (arguments.eval_episodes or suite.episodes) * (suite.adapt + 1)
     given["training"] = [*arguments.training, *([f"trials={suite.adapt + 1}"] if suite.adapt else [])]
     return argparse.Namespace(**{**vars(arguments), **given})
 
@@ -272,9 +308,10 @@ def last_of(suite: Suite, pair: learning.Pair) -> Last:
     if pair.metrics.exists() and len(curve := learning.curve_of(pair)):
         clocks = (f"{x:.0f}" for x in curve[-1, :, 2:4].mean(axis=0))
     of = lambda name: np.asarray(metrics[name]["train"])[:, -1].mean(axis=-1) if name in metrics else None
-    splits = learning.last_scores(evaluations)
+    splits, success = learning.last_scores(evaluations), metrics.get("success", {})
+    held_out = {split: np.asarray(success[split])[:, -1].mean(axis=-1) for split in splits if split in success}
     made = steps_a_task(evaluations)[-1]
-    return Last(labels, splits["train"], of("success"), of("success_ever"), splits, made, *clocks)
+    return Last(labels, splits["train"], of("success"), of("success_ever"), splits, held_out, made, *clocks)
 
 
 def that_count(suite: Suite, evaluations: Evaluations) -> Evaluations:
@@ -297,7 +334,7 @@ def tabulate(out: Path, suite: Suite, unfinished: bool = False) -> str:
     lines, rows = [], []
     for env, agent, last in found(out, suite, unfinished):
         cells = [score(last.splits.get(split), ".0f") for split in SPLITS]
-        cells += [score(x, ".3f") for x in (last.success, last.ever)]
+        cells += [score(x, ".3f") for x in (last.success, last.ever, *map(last.held_out.get, SPLITS[1:]))]
         lines.append([short(env), agent, str(len(last.returns)), *cells, f"{last.steps:,.0f}", last.seconds, last.wall])
         rows += [
             {"env": env, "agent": agent, "task": label, "seed": s, "return": f"{last.returns[s, t]:.1f}"}
@@ -306,12 +343,15 @@ def tabulate(out: Path, suite: Suite, unfinished: bool = False) -> str:
             for t, label in enumerate(last.labels)
         ]
     head = ["environment", "agent", "seeds", "return", *SPLITS[1:], "success at the end", "success at any step"]
+    head += [f"success, {split}" for split in SPLITS[1:]]
     head += ["steps a task", "training s", "wall s"]
     table = markdown(head, lines) + learning.list_stopped(out)
     (out / "scores.md").write_text(table + "\n")
     write_lines(out / "tasks.csv", rows)
     if suite.adapt:
         (out / "episodes.md").write_text(episodes(out, unfinished) + "\n")
+    if human := human_scores(out, unfinished):
+        (out / "human.md").write_text(human + "\n")
     if suite.together:
         (out / "sharing.md").write_text(sharing(out, suite, unfinished) + "\n")
     return table
@@ -343,6 +383,33 @@ def sharing(out: Path, suite: Suite, unfinished: bool = False) -> str:
         lines += [[task, agent, *compare(shared, labels.index(task), pairs[task, agent])] for task in own]
     head = ["task", "agent", "steps a task", "one agent for all", "one for this task", "difference"]
     return markdown(head, lines)
+
+
+def human_scores(out: Path, unfinished: bool = False) -> str:
+    """Return tables of human-normalised scores: of all games and seeds, and of agents over their games; or nothing."""
+    found = [(x.env, x.agent, learning.last_scores(x.evaluations)["train"]) for x in learning.pairs(out, unfinished)]
+    found = [(*pair, atari.normalised(pair[0], pair[2])) for pair in found if atari.is_game(pair[0])]
+    lines, scores = [], {}
+    for env, agent, returns, human in found:
+        names = env.split("+")
+        for t, name in enumerate(names):
+            cells = score(returns[:, [t]], ".1f"), score(human[:, [t]], ".3f")
+            lines.append([name, agent, "with others" if len(names) > 1 else "alone", str(len(returns)), *cells])
+        scores.setdefault((agent, env if len(names) > 1 else ""), []).append(human)
+    if not lines:
+        return ""
+    games = markdown(["game", "agent", "learned", "seeds", "score", "human-normalised"], lines)
+    head = ["agent", "learned", "games", "median", "interquartile mean", "mean"]
+    return f"{games}\n\n{markdown(head, [over_games(agent, env, of) for (agent, env), of in scores.items()])}"
+
+
+def over_games(agent: str, together: str, scores: list[np.ndarray]) -> list[str]:
+    """Return a line of an agent's human-normalised scores (S, G) over games, of as many seeds as all have."""
+    seeds = min(len(of_game) for of_game in scores)
+    each = np.concatenate([of_game[:seeds] for of_game in scores], axis=1)
+    found = seed_interval(np.median(each, axis=1)), seed_interval(each, iqm), seed_interval(each)
+    how = "with others" if together else "alone"
+    return [agent, how, str(each.shape[1]), *(learning.cell(x, ".3f") for x in found)]
 
 
 def compare(shared: Evaluations, row: int, alone: Evaluations) -> list[str]:

@@ -304,9 +304,10 @@ def with_preset(
     device = _device_preset() if preset_name == "auto" else preset_name
     preset, common = load_preset(env_name, device), load_preset("+", device)
     table = lambda name: common.get(name, {}) | preset.get(name, {})
-    chosen = table(tuned_as(agent_name))
+    tuned, seen = tuned_as(agent_name), _sees_pictures(made)
+    chosen = table(tuned) | (table(f"{tuned}-pictures") if seen else {})
     if preset_of(agent_name).cls.common_presets:
-        from_pictures = table("pictures") if _sees_pictures(made) else {}
+        from_pictures = table("pictures") if seen else {}
         chosen = preset.get("training", {}) | preset.get("agent", {}) | from_pictures | chosen
     chosen = for_tasks(chosen, made.train_count, device)
     take = lambda cls: {name: chosen.pop(name) for name in list(chosen) if name in cls.__dataclass_fields__}
@@ -447,14 +448,24 @@ def require_policy(agent: Any, env: Any) -> None:
 def load_preset(env_name: str, name: str) -> dict[str, Any]:
     """Read the tables of a preset: those of the family's file, else its domain's, and others of the default file.
 
-    Mixtures without a name use the default file.
+    Environments of other packages have the file of their suite and last word, such as gymnax-minatar, else of their
+    suite. Mixtures of such have it too where it is the same for all; others without a name use the default file.
     """
-    folder = resources.files("mtjax") / "configs"
-    words = [] if "+" in env_name else env_name.split("-")
-    names = ["-".join(words[:n]) for n in range(len(words), 0, -1)]
+    folder, names = resources.files("mtjax") / "configs", _preset_files(env_name)
     own = next((file for n in names if (file := folder / f"{n}.toml").is_file()), None)
     read = lambda file: tomllib.loads(file.read_text())
     return read(folder / "default.toml")[name] | ({} if own is None else read(own).get(name, {}))
+
+
+def _preset_files(env_name: str) -> list[str]:
+    """Return the names that a family's file may have, the first ones before others."""
+    of_suites = [name.partition(":") for name in env_name.split("+")]
+    if all(environment for *_, environment in of_suites):
+        suites = {suite for suite, *_ in of_suites}
+        kinds = {f"{suite}-{environment.split('-')[-1].lower()}" for suite, _, environment in of_suites}
+        return [name for found in (kinds, suites) if len(found) == 1 for name in found]
+    words = [] if "+" in env_name else env_name.split("-")
+    return ["-".join(words[:n]) for n in range(len(words), 0, -1)]
 
 
 def _sees_pictures(family: Tabled) -> bool:

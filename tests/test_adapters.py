@@ -72,6 +72,50 @@ def test_steps_of_gymnax_are_the_originals(name, settings, kinds):
         assert (ours[2].any(), ours[3].any()) == kinds
 
 
+@needs("craftax")
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("Craftax-Classic-Symbolic-v1", {"vary": {"spawn-zombie-base-chance": "0.02,0.9", "day-length": "60"}}),
+        ("Craftax-Symbolic-v1", {"vary": {"god-mode": "0,1"}, "time_limit": 600}),
+        ("Craftax-Classic-Pixels-v1", {}),
+    ],
+)
+def test_steps_of_craftax_are_the_originals(name, settings):
+    """Whoever dies has terminated; a picture of bytes is nearest to the original's."""
+    from craftax.craftax_env import make_craftax_env_from_name
+
+    family = mtjax.make(f"craftax:{name}", **{"split": "none", "time_limit": 150, **settings})
+    environment = make_craftax_env_from_name(name, auto_reset=False)
+    nominal, ends = environment.default_params, np.zeros(2)
+    for row in range(family.train_count):
+        task = jax.tree.map(lambda x, row=row: x[row], family.tasks("train"))
+        values = {
+            key.replace("-", "_"): type(getattr(nominal, key.replace("-", "_")))(x) for key, x in task.params.items()
+        }
+        params = nominal.replace(max_timesteps=family.episode_length, **values)
+
+        def original(state, action, params=params):
+            obs, world, reward, over, _ = environment.step(state.key, state.world, action, params)
+            return obs, reward, over, _is_dead(world)
+
+        ours, theirs = play(family, task, original)
+        seen = ours[0]["pixels"] / 255 if "Pixels" in name else ours[0]
+        np.testing.assert_allclose(seen, theirs[0], rtol=1e-6, atol=0.5 / 255 + 1e-6 if "Pixels" in name else 1e-6)
+        np.testing.assert_allclose(ours[1], theirs[1], rtol=1e-6, atol=1e-6)
+        np.testing.assert_array_equal(ours[2] | ours[3], theirs[2])
+        np.testing.assert_array_equal(ours[2], theirs[3])
+        ends += ours[2].sum(), ours[3].sum()
+    assert ends.all()
+
+
+def _is_dead(world):
+    """Whether a player of Craftax has no health, or has walked into the classic world's lava."""
+    x, y = world.player_position
+    return (world.player_health <= 0) | (world.map[x, y] == 14 if world.map.ndim == 2 else False)
+
+
 @pytest.fixture(scope="module")
 def rulesets(tmp_path_factory):
     """A file of four rulesets in XLand-MiniGrid's format: the goal is to hold a ball of one of four colours."""
@@ -132,19 +176,42 @@ def test_rulesets_are_whole_numbers_of_a_file(rulesets):
             _ = XMiniGrid(**settings).spec
 
 
+def require_one_form(name):
+    """Require that a state has one form, which a scan carries, and return the family."""
+    family = mtjax.make(name)
+    task = jax.tree.map(lambda x: x[0], family.tasks())
+    begun = jax.eval_shape(family.reset, task, jax.random.key(0))
+    action = jax.ShapeDtypeStruct(family.spec.action.shape, family.spec.action.dtype)
+    step = jax.eval_shape(family.step, task, begun.state, action)
+    form = lambda tree: jax.tree.map(lambda x: (x.shape, x.dtype, x.weak_type), tree)
+    assert form(step) == form(begun), name
+    return family
+
+
 @needs("gymnax")
 def test_every_environment_of_gymnax_that_needs_no_download_can_be_stepped():
-    """With a state of one form, which a scan carries."""
     import gymnax
 
     for name in sorted(set(gymnax.registered_envs) - {"MNISTBandit-bsuite"}):
-        family = mtjax.make(f"gymnax:{name}")
-        task = jax.tree.map(lambda x: x[0], family.tasks())
-        begun = jax.eval_shape(family.reset, task, jax.random.key(0))
-        action = jax.ShapeDtypeStruct(family.spec.action.shape, family.spec.action.dtype)
-        step = jax.eval_shape(family.step, task, begun.state, action)
-        form = lambda tree: jax.tree.map(lambda x: (x.shape, x.dtype, x.weak_type), tree)
-        assert form(step) == form(begun), name
+        require_one_form(f"gymnax:{name}")
+
+
+@needs("craftax")
+@pytest.mark.parametrize(
+    ("name", "shape", "actions"),
+    [
+        ("Craftax-Classic-Symbolic-v1", (1345,), 17),
+        ("Craftax-Classic-Pixels-v1", (63, 63, 3), 17),
+        ("Craftax-Symbolic-v1", (8268,), 43),
+        ("Craftax-Pixels-v1", (130, 110, 3), 43),
+    ],
+)
+def test_every_environment_of_craftax_can_be_stepped(name, shape, actions):
+    """Pictures are bytes."""
+    spec = require_one_form(f"craftax:{name}").spec
+    obs = spec.obs["pixels"] if "Pixels" in name else spec.obs
+    assert (obs.shape, obs.dtype) == (shape, np.uint8 if "Pixels" in name else np.float32)
+    assert spec.action.size == actions
 
 
 @needs("gymnax")

@@ -45,7 +45,8 @@ def script(monkeypatch):
         return module
 
     yield load
-    for name in ("report", "training", "returns", "update_cost", "resumable", "learning", "parts", *_OF_META_WORLD):
+    names = "atari", "report", "training", "returns", "update_cost", "resumable", "learning", "parts"
+    for name in (*names, *_OF_META_WORLD):
         sys.modules.pop(name, None)
 
 
@@ -376,6 +377,10 @@ def test_a_suite_reports_success_and_what_sharing_is_worth(script, tmp_path):
     success = np.zeros(shape)
     success[:, 1, 1, :2] = 1
     found = {together: evaluations_of(returns, success=success, success_ever=np.ones(shape))}
+    unseen = found["walker-stand+walker-walk"] = evaluations_of(np.ones(shape), success=np.ones(shape))
+    unseen.values["interpolation"] = unseen.values["train"]
+    for scores in (unseen.returns, unseen.metrics["success"]):
+        scores["interpolation"] = np.full(shape, 0.5)
     found[together] = found[together]._replace(steps=np.array([100, 200]))
     found |= {name: evaluations_of(np.full((3, 2, 1, 4), 25.0))._replace(steps=np.array([50, 100])) for name in tasks}
     for env, evaluations in found.items():
@@ -383,11 +388,12 @@ def test_a_suite_reports_success_and_what_sharing_is_worth(script, tmp_path):
         save_evaluations(tmp_path / env / "brc.npz", evaluations)
     table = suite.tabulate(tmp_path, suite.Suite("", (together,), ("brc",), 1, together=together))
     assert "| 2 families | brc | 3 | 20 [20, 20] | - | - | 0.250 [0.250, 0.250] | 1.000 [1.000, 1.000] |" in table
-    assert "| walker-run | brc | 3 | 25 [25, 25] | - | - | - | - |" in table
+    assert "| walker-run | brc | 3 | 25 [25, 25] | - | - | - | - | - | - | 100 |" in table
+    assert "| 1.000 [1.000, 1.000] | - | 0.500 [0.500, 0.500] | - |" in table
     sharing = (tmp_path / "sharing.md").read_text()
     assert "| walker-walk | brc | 100 | 10 [10, 10] | 25 [25, 25] | -15 [-15, -15] |" in sharing
     assert "| walker-run | brc | 100 | 30 [30, 30] | 25 [25, 25] | +5 [+5, +5] |" in sharing
-    assert len((tmp_path / "tasks.csv").read_text().splitlines()) == 1 + 3 * 4
+    assert len((tmp_path / "tasks.csv").read_text().splitlines()) == 1 + 3 * 6
     for env, evaluations in found.items():  # of an agent that the suite does not have by itself
         save_evaluations(tmp_path / env / "sac.npz", evaluations)
     suite.tabulate(tmp_path, suite.Suite("", (together,), ("brc",), 1, together=together))
@@ -420,7 +426,43 @@ def test_suites_name_only_what_there_is(script):
     for each in suite.SUITES.values():
         assert {*each.agents, each.equal_to or "brc"} <= {*mtjax.AGENTS, *script("learning").VARIANTS}
         names = {name for env in each.envs for name in env.split("+")}
-        assert names <= {*mtjax.ENVS, *BENCHMARKS}
+        assert all(name in mtjax.ENVS or name in BENCHMARKS for name in names)
+
+
+def test_scores_on_atari_are_in_units_of_a_persons(script, tmp_path):
+    """0 is a random policy, 1 a person; with the medians over games of one agent for all, and of one for each."""
+    suite, atari = script("suite"), script("atari")
+    assert len(atari.known()) == 57 and {*atari.FIVE, *atari.TWENTY_SIX} <= set(atari.known())
+    assert all(random < human for random, human in atari.known().values())
+    shares = {"Pong": [0.5, 0.7, 0.9], "Breakout": [2.0, 2.0, 2.0], "Qbert": [0.0, 0.1, 0.2]}
+    raw = {game: np.interp(of, [0, 1], atari.known()[game]) for game, of in shares.items() if game != "Breakout"}
+    raw["Breakout"] = np.full(3, 2 * 30.5 - 1.7)
+    as_scores = lambda names: evaluations_of(np.stack([raw[x] for x in names], axis=1)[:, None, :, None])
+    both = "envpool:Breakout-v5+envpool:Pong-v5"
+    found = {f"envpool:{game}-v5": as_scores([game]) for game in raw} | {both: as_scores(["Breakout", "Pong"])}
+    for env, evaluations in found.items():
+        (tmp_path / env).mkdir()
+        save_evaluations(tmp_path / env / "ppo.npz", evaluations)
+    table = suite.human_scores(tmp_path)
+    assert "| envpool:Pong-v5 | ppo | alone | 3 | 4.0 [-3.1, 11.1] | 0.700 [0.500, 0.900] |" in table
+    assert "| envpool:Pong-v5 | ppo | with others | 3 | 4.0 [-3.1, 11.1] | 0.700 [0.500, 0.900] |" in table
+    assert "| ppo | alone | 3 | 0.700 [0.500, 0.900] |" in table and "| 0.933 [0.833, 1.033] |" in table
+    assert "| ppo | with others | 2 | 1.350 [1.250, 1.450] |" in table
+    (tmp_path / "none").mkdir()
+    assert not suite.human_scores(tmp_path / "none")
+
+
+@needs("envpool")
+def test_ataris_protocol_is_envpools(script):
+    """Whole games of at most 108,000 frames, with actions that stick, all 18 of them, and their own scores."""
+    suite, atari = script("suite"), script("atari")
+    family = suite.family_of(suite.SUITES["atari5"], "+".join(map(atari.name, ("Pong", "Breakout"))))
+    assert family.spec.action.size == 18 and family.spec.frames == 4 and family.train_count == 2
+    assert [part.name for part in family.parts] == ["envpool:Pong-v5", "envpool:Breakout-v5"]
+    pool = family.parts[1].family.make(0, 2, 0)
+    told = pool.spec.config._asdict()
+    assert {name: told[name] for name in atari.PROTOCOL} == atari.PROTOCOL
+    assert told["max_episode_steps"] == 27_000 and told["frame_skip"] == 4 and told["stack_num"] == 1
 
 
 @pytest.mark.parametrize("name, env", [("dynamics", "finger-spin-vary-size"), ("looks", "finger-spin")])

@@ -28,7 +28,7 @@ from mtjax.agents.parts.representations import DeepMDP
 from mtjax.command import flag_files, process, run_config
 from mtjax.command.run_config import parse
 from mtjax.config import Plan, for_tasks, load_preset, with_preset
-from mtjax.envs import BENCHMARKS, ENVS
+from mtjax.envs import BENCHMARKS, ENVS, SUITES
 from mtjax.learning.loop import Settings
 from mtjax.names import notice
 from mtjax.saved import pretrained
@@ -191,16 +191,19 @@ def test_presets_name_only_what_there_is(file):
     known["pictures"] = known["training"] | fields(Plan)
     of_agents = fields(Settings) | fields(Plan) | {"worlds", "tuned_tasks"}
     known |= {name: set(settings_of(mtjax.agent(name))) | of_agents for name in AGENTS}
+    seeing = {name: set(settings_of(mtjax.agent(name, representation="encoded"))) for name in ("ppo", "impala")}
+    known |= {f"{name}-pictures": settings | of_agents for name, settings in seeing.items()}
     for tables in preset.values():
         for table, settings in tables.items():
             assert set(settings) <= known[table], table
 
 
 def test_preset_files_are_of_families_that_exist():
-    """Each is named after a family, its first words, a benchmark, or all families."""
+    """Each is named after a family, its first words, a benchmark, a suite of another package, or all families."""
     words = [name.split("-") for name in (*ENVS, *BENCHMARKS)]
     names = {"-".join(w[:n]) for w in words for n in range(1, len(w) + 1)} | {"default"}
-    assert {file.name.removesuffix(".toml") for file in PRESET_FILES} <= names
+    of_suites = {*SUITES, "gymnax-minatar"}
+    assert {file.name.removesuffix(".toml") for file in PRESET_FILES} <= names | of_suites
 
 
 def test_a_familys_preset_adds_to_that_of_all():
@@ -209,6 +212,23 @@ def test_a_familys_preset_adds_to_that_of_all():
         name: tables for name, tables in common.items() if name != "brc"
     }
     assert load_preset("mt10", "cpu") == load_preset("+", "cpu")
+
+
+@pytest.mark.parametrize(
+    "env, file",
+    [
+        ("gymnax:Breakout-MinAtar", "gymnax-minatar"),
+        ("gymnax:Breakout-MinAtar+gymnax:Asterix-MinAtar", "gymnax-minatar"),
+        ("gymnax:CartPole-v1+gymnax:Asterix-MinAtar", "default"),
+        ("envpool:Pong-v5", "envpool"),
+        ("envpool:Pong-v5+envpool:Qbert-v5", "envpool"),
+        ("envpool:Pong-v5+bandit", "default"),
+    ],
+)
+def test_environments_of_a_package_have_the_preset_of_their_kind(env, file):
+    """Or of their suite; mixtures where it is one for all."""
+    read = lambda name: tomllib.loads((resources.files("mtjax") / "configs" / f"{name}.toml").read_text())["cpu"]
+    assert load_preset(env, "cpu") == read("default") | read(file)
 
 
 @pytest.mark.parametrize("preset", ("cpu", "gpu"))

@@ -72,6 +72,8 @@ MARKS: dict[str, Learns | str] = {
     "--env=errands --agent=ppo --agent.conditioning=text": _READS,
     "--env=bandit --agent=pqn": _SOON,
     "--env=gymnasium:CartPole-v1 --agent=ppo": _GYM,
+    "--env=gymnax:Breakout-MinAtar --agent=pqn": "needs gymnax; tests/test_pqn.py has probes",
+    "--env=envpool:Pong-v5 --agent=impala --preset=gpu": _GPU,
     "--env=hidden-bandit --agent=ppo --trials=10 --agent.conditioning=posterior --agent.unroll=10": _BELIEVES,
     "--env=craft-sketched --agent=sketches": _CRAFT,
     "--env=craft-sketched --agent=sketches --agent.sharing=tasks": _CRAFT,

@@ -98,6 +98,8 @@ def test_rounding_is_said():
 
 def test_a_resumed_run_says_where_it_goes_on():
     assert consoles.describe_resumption(320, 6400) == "goes on at step 320 of 6,400"
+    told = "goes on at step 320 of 6,400; the 80 steps that were made after it are lost, and are made again"
+    assert consoles.describe_resumption(320, 6400, 80) == told
     assert consoles.describe_resumption(6400, 6400).startswith("the run has made all its 6,400 steps; --steps=N")
 
 

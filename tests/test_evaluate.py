@@ -23,7 +23,7 @@ import mtjax
 import mtjax.evaluate
 import mtjax.train
 from mtjax.checks import amount
-from mtjax.learning import loop
+from mtjax.learning import evaluation, loop
 from mtjax.learning.evaluation import Episodes, Evaluations, Scores, evaluate, load_evaluations, record
 from mtjax.report import films, render, scoring
 from mtjax.report.tables import split_table, task_table
@@ -141,8 +141,11 @@ class Leaning(Stub):
         return jnp.tanh(state - obs)
 
 
-def test_evaluation_is_a_plain_loop_over_single_worlds():
+@pytest.mark.parametrize("asked", [100, 4])
+def test_evaluation_is_a_plain_loop_over_single_worlds(monkeypatch, asked):
     """Episodes that terminate, or are cut off at their task's limit, count up to there and no further."""
+    monkeypatch.setattr(evaluation, "_ASKED", asked)
+    evaluate.clear_cache()
     env, agent, episodes = Fatal(), Leaning(), 4
     tasks = tasks_of("one-step", (1.0, -0.5, 2.0))._replace(horizon=jnp.int32([6, 4, 2]))
     states, seeds = jnp.float32([[0.3], [1.7]]), (3, 8)
@@ -168,6 +171,15 @@ def test_evaluation_is_a_plain_loop_over_single_worlds():
                 )
                 lengths.add(age)
     assert lengths == {2, 3, 4, 6}  # both ways to end, in one batch
+
+
+@pytest.mark.parametrize(("early", "length", "played"), [(True, 100, 8), (False, 100, 100), (True, 3, 3)])
+def test_nothing_is_played_long_after_all_episodes_have_ended(monkeypatch, early, length, played):
+    """Here they end with the sixth step, and every fourth one is asked."""
+    monkeypatch.setattr(evaluation, "_ASKED", 4)
+    step = lambda carry, time: ((carry[0] + 1, carry[1] & (time < 5)), None)
+    count, _ = evaluation._play(step, (jnp.int32(0), jnp.ones(2, bool)), length, early)
+    assert count == played
 
 
 @dataclasses.dataclass(frozen=True)

@@ -3,6 +3,7 @@
 import csv
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -98,6 +99,111 @@ def test_a_run_that_is_ended_at_random_moments_ends_as_any_other(start, tmp_path
     assert {path.name for path in folder.iterdir()} == {path.name for path in unbroken.iterdir()}
     names = lambda run: {path.name for path in (run / "checkpoints").iterdir()}
     assert names(folder) == names(unbroken)
+
+
+# Worlds outside of JAX, which no checkpoint holds.
+
+WORLD = '''
+import time
+
+import gymnasium
+import numpy as np
+
+
+class Slow(gymnasium.Env):
+    """Counts its steps, each of half a millisecond."""
+
+    observation_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def __init__(self, raises: int = 0):
+        self.raises, self.made = raises, 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.age = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        time.sleep(0.0005)
+        self.age, self.made = self.age + 1, self.made + 1
+        if self.made == self.raises:
+            raise RuntimeError("the line is down")
+        return np.float32([self.age / 20]), float(action), self.age >= 20, False, {}
+
+
+gymnasium.register("Slow", Slow, max_episode_steps=30)
+'''
+CHUNK = 4 * 32  # steps of four worlds
+HOSTED = "--env=gymnasium:Slow --agent=ppo --num-envs=4 --chunk-steps=32 --agent.unroll=16 --agent.hidden=8".split()
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    """A file with an environment of Gymnasium."""
+    pytest.importorskip("gymnasium", reason="needs gymnasium")
+    file = tmp_path_factory.mktemp("world") / "slow.py"
+    file.write_text(WORLD)
+    return file
+
+
+def await_checkpoint(process, out, root):
+    """Wait until a process has written a checkpoint."""
+    whole = lambda: {path.name for path in root.glob("*/checkpoints/*") if path.name.isdecimal()}
+    before, until = whole(), time.monotonic() + 300
+    while not whole() - before:
+        assert time.monotonic() < until and process.poll() is None, out.read_text()
+        time.sleep(0.02)
+
+
+def steps_in(text, pattern):
+    """The number that a pattern finds in a text; 0 if it finds none."""
+    found = re.search(pattern, text)
+    return int(found[1].replace(",", "")) if found else 0
+
+
+@pytest.mark.parametrize(
+    "kills", [pytest.param(2, marks=pytest.mark.slow), pytest.param(10, marks=pytest.mark.nightly)]
+)
+def test_a_hosted_run_loses_at_most_a_chunk_each_time_it_is_killed(start, tmp_path, world, kills):
+    """At random moments. It says how much, and its rows and evaluations are those of a whole run."""
+    total, chance = 20 * kills * CHUNK, random.Random(kills)
+    words = [f"--import={world}", *HOSTED, f"--steps={total}", "--eval-episodes=1", f"--runs={tmp_path}"]
+    words.append(f"--eval-every={total // 10}")
+    lost, begun = [], [0]
+    for kill in range(kills + 1):
+        process, out = start(*words)
+        if kill < kills:
+            await_checkpoint(process, out, tmp_path)
+            time.sleep(chance.uniform(0, 0.8))
+            process.kill()
+            assert process.wait(120) == -signal.SIGKILL, out.read_text()
+        else:
+            finish(process, out)
+        if kill:
+            assert "worlds of gymnasium:Slow cannot be saved: new episodes begin" in out.read_text()
+            begun.append(steps_in(out.read_text(), r"goes on at step ([\d,]+) of"))
+            lost.append(steps_in(out.read_text(), r"the ([\d,]+) steps that were made after it are lost"))
+        (record,) = tmp_path.glob("*/config.json")
+        words = [f"--import={world}", f"--resume={record.parent}"]
+    assert len(lost) == kills and max(lost) <= CHUNK and np.all(np.diff(begun) >= CHUNK)
+    with (record.parent / "metrics.csv").open(newline="") as file:
+        assert [int(row["steps"]) for row in csv.DictReader(file)] == list(range(CHUNK, total + 1, CHUNK))
+    evaluations = load_evaluations(record.parent / "evaluations.npz")
+    assert evaluations.steps.tolist() == [total // 10 * k for k in range(1, 11)]
+
+
+@pytest.mark.slow
+def test_a_hosted_run_whose_environment_raises_ends_with_its_checkpoint(start, tmp_path, world):
+    """In a line that names the environment, its error, its place and the checkpoint, from which the run goes on."""
+    words = [f"--import={world}", *HOSTED, f"--steps={200 * CHUNK}", f"--runs={tmp_path}"]
+    process, out = start(*words, '--env.arguments={"raises": 100}', "--eval-every=2560", "--eval-episodes=1")
+    assert process.wait(300) == 2
+    told = out.read_text().splitlines()[-1]
+    (last,) = tmp_path.glob("*/checkpoints/96")
+    assert "Slow raised RuntimeError: the line is down" in told and "slow.py, line" in told and str(last) in told
+    process, out = start(f"--import={world}", f"--resume={last.parents[1]}")
+    assert process.wait(300) == 2 and "goes on at step 384 of" in out.read_text()
 
 
 @pytest.mark.slow

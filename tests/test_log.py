@@ -30,6 +30,9 @@ def test_truncation_keeps_an_iteration_and_what_is_before_it(tmp_path):
     clocks = lambda i: {"seconds": f"{i / 10}", "wall_seconds": f"{i}.5"}
     rows = [{"seed": s, "iteration": i, **clocks(i), "x": ""} for i in (10, 20, 30) for s in (0, 1)]
     log.append_rows(path, rows)
+    assert log.last_iteration(path) == 30 and log.last_iteration(tmp_path / "none.csv") == 0
+    path.write_text(path.read_text() + "0,40,")  # torn, as by a process that was killed
+    assert log.last_iteration(path) == 30
     assert log.truncate_rows(path, 20) == (2.0, 20.5)
     assert read(path) == [{k: str(v) for k, v in row.items()} for row in rows[:4]]
     assert log.truncate_rows(path, 0) == (0, 0) and read(path) == []

@@ -313,6 +313,19 @@ def test_advantages_of_a_task_that_earns_nothing_are_nothing():
     assert np.all(np.asarray(clipped.normalized("task", jnp.zeros((2, 5, 1)))) == 0)
 
 
+@pytest.mark.parametrize("most", [0.0, 0.5])
+def test_rewards_are_clipped_before_they_are_scaled(most):
+    """In the targets; with 0 they are whole."""
+    agent = small(reward_clip=most, reward_scale=2.0, value_normalization="none")
+    state, steps = agent.init(SPEC, TASKS, KEY), random_steps(agent)
+    clipped_first = steps._replace(reward=jnp.clip(steps.reward, -0.5, 0.5) if most else steps.reward)
+    plain = small(reward_scale=2.0, value_normalization="none")
+    found, expected = agent.assess(state, steps, TASKS)[1], plain.assess(state, clipped_first, TASKS)[1]
+    np.testing.assert_array_equal(found.extras.target, expected.extras.target)
+    np.testing.assert_array_equal(found.reward, steps.reward)
+    assert np.abs(steps.reward).max() > 1
+
+
 # Units of values.
 
 
@@ -575,6 +588,7 @@ def test_updates_are_finite_and_the_key_decides(row):
         ("initial_std", 20.0),
         ("entropy_cost", -1.0),
         ("value_rate", 0.0),
+        ("reward_clip", -1.0),
         ("advantage_normalization", "some"),
     ],
 )

@@ -6,6 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from mtjax import frames
+from mtjax.agents import parts
 from mtjax.agents.networks import Params
 from mtjax.agents.parts.scaling.popart import rescale_heads
 from mtjax.agents.rates import discounts_of_all
@@ -29,6 +30,8 @@ def models(agent: Any, state: AgentState, flat: Transition, tasks: Task, next_ob
 
 def rewards(agent: Any, state: AgentState, flat: Transition, tasks: Task) -> Array:
     """Return the rewards (T, N) of steps in the task's units."""
+    most = parts.limit(agent.reward_clip)
+    flat = flat if most is None else flat._replace(reward=jnp.clip(flat.reward, -most, most))
     gamma = discounts_of_all(agent, tasks)
     return agent.reward_scale * agent.scaling.rewards(state.nets["scaling"].own, flat, gamma, jnp.zeros(len(gamma)))
 

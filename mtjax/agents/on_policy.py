@@ -93,6 +93,8 @@ class OnPolicy(BaseAgent):
     likely."""
     reward_scale: float = 1.0
     """Multiply all rewards by this."""
+    reward_clip: float = 0.0
+    """Clip rewards to +-this before they are scaled and learned from; 0 does not. Returns that are told are whole."""
     value_normalization: Literal["none", "running", "popart"] = "running"
     """Units of the critic: none, or standard deviations of each task's targets from their mean (running). With popart
     it also has a head for every task, which is rescaled when these estimates move."""
@@ -112,7 +114,7 @@ class OnPolicy(BaseAgent):
         super().__post_init__()
         parts.require_shares(self, "gae_lambda")
         parts.require_positive(self, "reward_scale")
-        parts.require_not_negative(self, "entropy_cost")
+        parts.require_not_negative(self, "entropy_cost", "reward_clip")
         parts.require_rates(self, "value_rate")
         low, high = STD_RANGE
         if not low < self.initial_std < high:

@@ -60,6 +60,7 @@ Entry = tuple[Any, Settings]  # a family's class, or the place that it is import
 SUITES = {
     "gymnasium": "mtjax.envs.hosted.gymnasium:Gymnasium",
     "envpool": "mtjax.envs.hosted.envpool:EnvPool",
+    "craftax": "mtjax.envs.adapters.craftax:Craftax",
     "gymnax": "mtjax.envs.adapters.gymnax:Gymnax",
     "xminigrid": "mtjax.envs.adapters.xminigrid:XMiniGrid",
 }

@@ -24,6 +24,7 @@ from mtjax.parallel.axes import over_seeds
 from mtjax.tasks import draw_at
 from mtjax.types import SPLITS, Adapting, Agent, Array, Env, InputError, Key, Task, Transition
 
+_ASKED = 100  # steps between two times of asking whether all episodes have ended
 _EVER = "success_ever"  # the metric that success was 1 at any step of an episode
 
 
@@ -209,8 +210,8 @@ def evaluate(
     metrics = {name: jnp.zeros((*shape, trials.episodes), x.dtype) for name, x in env_step.metrics.items()}
     metrics |= {_EVER: metrics["success"]} if "success" in metrics else {}
     nothing = Scores(jnp.zeros((*shape, trials.episodes)), metrics)
-    times = jnp.arange(env.episode_length * trials.episodes)
-    scores = jax.lax.scan(step, (worlds, nothing, jnp.ones(shape, bool)), times)[0][1]
+    begun, length = (worlds, nothing, jnp.ones(shape, bool)), env.episode_length * trials.episodes
+    scores = _play(step, begun, length, getattr(env, "ends_early", True))[1]
     return jax.tree.map(lambda x: x.reshape(*shape[:2], episodes.count), scores)
 
 
@@ -251,6 +252,20 @@ def adapted(
     fresh = lambda seed: jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), 0xADA9), number)
     keys = jax.vmap(lambda seed: jax.random.split(fresh(seed), updates), out_axes=1)(seeds)
     return jax.lax.scan(update, state, keys)[0], tasks
+
+
+def _play(step: Callable[..., Any], begun: Any, length: int, ends_early: bool) -> Any:
+    """Play ``length`` steps, or fewer if no trial is alive any more, which is asked after every ``_ASKED`` steps.
+
+    Args:
+        step: the function of a scan over times, whose carry ends with which trials are alive. It changes no scores of
+            others, so that steps after the last one do no harm.
+    """
+    if not ends_early or length <= _ASKED:
+        return jax.lax.scan(step, begun, jnp.arange(length))[0]
+    goes_on = lambda carry: (carry[1] < length) & jnp.any(carry[0][-1])
+    play = lambda carry: (jax.lax.scan(step, carry[0], carry[1] + jnp.arange(_ASKED))[0], carry[1] + _ASKED)
+    return jax.lax.while_loop(goes_on, play, (begun, jnp.int32(0)))[0]
 
 
 def _is_now(worlds: Worlds, episodes: int) -> Array:

@@ -207,7 +207,7 @@ def _caption(env: Tabled, one: Chosen, played: Recording, named: Mapping[str, st
 def _tile(
     env: Tabled, one: Chosen, played: Recording, states: Any, count: int, width: int, acting: Timeline | None = None
 ) -> np.ndarray:
-    """Return the frames (F, height, width, 3) of an episode, at most ``count``, and its strip of sub-policies, if any."""
+    """Return the frames (F, height, width, 3) of an episode, at most ``count``, with its strip of sub-policies."""
     family: Any = one.part.family
     row, (first, length) = env.own_row(int(played.rows[one.place])), _span(played, one)
     times = np.arange(count) / _FPS * _steps_per_second(one)

@@ -104,6 +104,15 @@ def truncate_rows(
     return seconds, wall
 
 
+def last_iteration(path: Path) -> int:
+    """Return the iteration of the last row of metrics that can be read; 0 if there is none."""
+    if not path.exists():
+        return 0
+    names, *lines = map(_values, path.read_bytes().decode("utf-8", "replace").split("\n"))
+    whole = (line for line in reversed(lines) if _is_whole(names, line))
+    return int(dict(zip(names, next(whole, ()), strict=False)).get("iteration", 0))
+
+
 def keep_steps(path: Path, last: int) -> None:
     """Drop the lines of a CSV file whose first value, the step, is after ``last`` or none; the header stays."""
     header, *lines = path.read_bytes().decode().splitlines(keepends=True) or [""]

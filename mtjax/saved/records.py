@@ -54,6 +54,10 @@ class Records:
         """
         return log.truncate_rows(self._path("metrics.csv"), iteration, *form) if self.writes else (0.0, 0.0)
 
+    def last_iteration(self) -> int:
+        """Return the iteration of the last row of metrics; 0 if there is none."""
+        return log.last_iteration(self._path("metrics.csv")) if self.writes else 0
+
     def earlier_evaluations(self, steps: int, due: bool, empty: Evaluations) -> Evaluations:
         """Return the evaluations up to a step.
 

@@ -162,11 +162,12 @@ def describe_warmup(steps: int, total: int) -> list[str]:
     return lines
 
 
-def describe_resumption(steps: int, total: int) -> str:
-    """Return a line on where a resumed run goes on, if it does."""
+def describe_resumption(steps: int, total: int, again: int = 0) -> str:
+    """Return a line on where a resumed run goes on, if it does, and on the steps that it has to play ``again``."""
     if steps >= total:
         return f"the run has made all its {steps:,} steps; --steps=N with a larger N goes on"
-    return f"goes on at step {steps:,} of {total:,}"
+    lost = f"; the {again:,} steps that were made after it are lost, and are made again" if again else ""
+    return f"goes on at step {steps:,} of {total:,}{lost}"
 
 
 def describe_rounding(steps: int, total: int, chunk: int) -> list[str]:

@@ -266,7 +266,8 @@ class _Run:
         """Run chunks until all steps are done or a signal asks to stop."""
         steps = int(state.iteration) * self.config.worlds
         if steps:
-            self.console.say(describe_resumption(steps, self.console.total))
+            again = max(self.records.last_iteration() * self.config.worlds - steps, 0)
+            self.console.say(describe_resumption(steps, self.console.total, again))
         self.console.clock = self._clock(steps)
         with contextlib.ExitStack() as opened:
             sinks = self._open_sinks(steps)
@@ -293,29 +294,32 @@ class _Run:
         return now._replace(evaluations=again)
 
     def _run_chunks(self, programs: Programs, now: _Progress, started: float, sinks: list[Sink]) -> Result:
-        rows, stop, earlier = log.Rows(), False, now.seconds
+        rows, stop, earlier, forgets = log.Rows(), False, now.seconds, bool(forgetful(self.config.family))
         with stop_signals() as received, self.records.closing():
             asked = lambda enough: bool(hosts.largest(int(enough or bool(received))))
             while now.steps < self.config.plan.steps and not stop:
                 self.records.check()
                 seconds = now.seconds
                 now, metrics = self._play(programs.chunk, now, len(rows) // len(self.seeds))
+                if forgets:  # so that never more than this chunk is without a checkpoint
+                    self.records.wait()
                 new = self._log(metrics, now.seconds - seconds, now, started, sinks)
                 rows.extend(new)
                 enough = self.hooks.on_chunk is not None and self.hooks.on_chunk(new[0]) is True
                 stop, due = asked(enough), self._is_due(now.steps)
                 if due:
                     programs.ready()
-                before = time.monotonic()
-                if due or stop:
+                before, saves = time.monotonic(), due or stop or forgets
+                if saves:
                     now = self._give_up_spoiled(now)
                 if due:
                     self.console.doing(f"{now.steps:,} steps  evaluating")
                     now = self._select(now._replace(evaluations=self._evaluate_or_save(programs.evaluate, now)))
                     write_rows(sinks, *self._evaluation_rows(now.evaluations))
                     stop = asked(stop)
-                if due or stop:
+                if saves:
                     self._save(now.state, now.steps // self.config.worlds)
+                if due or stop:
                     self.console.clock.evaluation(time.monotonic() - before)
                 if due and self.hooks.on_evaluation is not None:
                     self.hooks.on_evaluation(now.evaluations)

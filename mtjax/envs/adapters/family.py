@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from mtjax.envs.choosing import Acting
 from mtjax.envs.family import Family
 from mtjax.envs.parameters import Parameter
+from mtjax.frames import shown
 from mtjax.types import Array, InputError, Key, Step, Task
 
 _MOST_STEPS = 1_000_000
@@ -64,14 +65,14 @@ class Adapted(Acting, Family):
     # What every family does.
 
     @classmethod
-    def module(cls) -> Any:
-        """Import the package.
+    def module(cls, part: str = "") -> Any:
+        """Import the package, or a module of it.
 
         Raises:
             InputError: it is not installed.
         """
         try:
-            return importlib.import_module(cls.package)
+            return importlib.import_module(f"{cls.package}.{part}" if part else cls.package)
         except ImportError as error:
             raise InputError(f"{cls.package} cannot be imported ({error}); {cls.install}") from None
 
@@ -123,11 +124,13 @@ def _as_default(default: Any, value: Array) -> Array:
 def _strong_step(state: AdaptedState, obs: Any, reward: Any, terminated: Any, truncated: Any) -> Step:
     """Return a step whose leaves keep their dtypes from one to the next."""
     ends = jnp.bool_(terminated), jnp.bool_(truncated)
-    return Step(jax.tree.map(_strong, state), _vector(obs), jnp.float32(reward), ends[0], truncated=ends[1])
+    return Step(jax.tree.map(_strong, state), _observed(obs), jnp.float32(reward), ends[0], truncated=ends[1])
 
 
-def _vector(obs: Any) -> Array:
-    """Return an observation as a vector (O,) of floats."""
+def _observed(obs: Any) -> Any:
+    """Return pictures as they are, and any other observation as a vector (O,) of floats."""
+    if shown(obs):
+        return obs
     return jnp.concatenate([jnp.ravel(x).astype(jnp.float32) for x in jax.tree.leaves(obs)])
 
 

@@ -45,7 +45,8 @@ class HostedState(NamedTuple):
 class Hosted(Acting, Family):
     """A family whose worlds live outside JAX. All of them are stepped by one call on the host.
 
-    A resumed run begins new episodes, as these worlds cannot be saved. One device alone can train on them.
+    A resumed run begins new episodes, as these worlds cannot be saved. Checkpoints are written after every chunk, as
+    what steps on the host may end the process. One device alone can train on them.
     """
 
     environment: str = ""
