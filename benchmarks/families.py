@@ -23,7 +23,7 @@ from resumable import train
 import mtjax
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.names import nearest_error
-from mtjax.saved import ship
+from mtjax.saved import policy_files
 
 _M = 1_000_000
 TRAINED = {  # family -> agent and steps
@@ -93,7 +93,7 @@ def learn(name: str, agent: str, steps: int, folder: Path, seconds: float) -> No
         quiet=False,
     )
     write_lines(folder / "curve.csv", curve(name, agent, result.rows))
-    ship.write(run, folder / "policy")
+    policy_files.write(run, folder / "policy")
     shutil.rmtree(run)
 
 

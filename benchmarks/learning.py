@@ -69,7 +69,7 @@ from mtjax.report.stats import (
     seed_interval,
     unpaired_difference,
 )
-from mtjax.saved import ship
+from mtjax.saved import policy_files
 from mtjax.saved.result import Result
 from mtjax.types import SPLITS
 
@@ -187,7 +187,7 @@ def learn(arguments: argparse.Namespace, env: str, agent: str) -> None:
 def keep_policy(run: Path, place: Path) -> None:
     """Write the policy of the first seed, in place of one that a killed process may have half written."""
     shutil.rmtree(place, ignore_errors=True)
-    ship.write(run, place)
+    policy_files.write(run, place)
 
 
 def trained(arguments: argparse.Namespace, env: str, agent: str, folder: Path) -> Result:

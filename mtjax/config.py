@@ -24,7 +24,7 @@ from mtjax.agents.teacher import Teacher
 from mtjax.checks import MOST_EPISODES, check_fields, path, require_library, require_text
 from mtjax.envs import make
 from mtjax.envs import name_of as env_name_of
-from mtjax.envs.mixtures import Tabled
+from mtjax.envs.mixtures import FamilyOrMixture
 from mtjax.envs.task_table import forgetful
 from mtjax.experience import Replay
 from mtjax.frames import shown
@@ -468,7 +468,7 @@ def _preset_files(env_name: str) -> list[str]:
     return ["-".join(words[:n]) for n in range(len(words), 0, -1)]
 
 
-def _sees_pictures(family: Tabled) -> bool:
+def _sees_pictures(family: FamilyOrMixture) -> bool:
     return any(getattr(part.family, "pixels", 0) for part in family.parts)
 
 

@@ -86,7 +86,7 @@ def _parse(argv: Sequence[str]) -> tuple[Request, dict[str, str]]:
         raise InputError("--task-seed draws other tasks; leave out --env.vary, and diagnostics of the run's own tasks")
     folder = pretrained.folder(request.run)
     require_run(folder)
-    if request.diagnostics and pretrained.is_shipped(folder):
+    if request.diagnostics and pretrained.is_pretrained(folder):
         raise InputError(f"diagnostics need a run's replay, and {request.run!r} is a policy alone")
     return request, vary
 

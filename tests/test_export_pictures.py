@@ -14,7 +14,7 @@ from test_export import policy_of
 import mtjax
 import mtjax.evaluate
 from mtjax import standalone
-from mtjax.saved import onnx, ship
+from mtjax.saved import onnx, policy_files
 from mtjax.saved.operations import steps_of
 from mtjax.types import InputError
 
@@ -150,7 +150,7 @@ def test_files_from_before_pictures_are_read(tmp_path):
 def test_an_action_depends_on_what_is_shipped_alone():
     """Also of a policy that sees pictures."""
     policy = policy_of(tiny("drq"), COLOURED)
-    read, (leaves, form) = ship.read_by_acting(policy), jax.tree.flatten(policy.state)
+    read, (leaves, form) = policy_files.read_by_acting(policy), jax.tree.flatten(policy.state)
     other = jax.tree.unflatten(form, [x if i in read else jnp.full_like(x, 3) for i, x in enumerate(leaves)])
     task, obs = jax.tree.map(lambda x: x[0], COLOURED.tasks()), jax.tree.map(lambda x: x[0], episode(COLOURED))
     act = jax.jit(lambda state: policy.agent.act(state, policy.agent.begin(state, task), obs, task, None).action)

@@ -15,8 +15,8 @@ from needs import needs
 from mtjax.envs.compiled import compile_model
 from mtjax.envs.engines.base import World
 from mtjax.envs.metaworld import names
-from mtjax.envs.metaworld.at import At
 from mtjax.envs.metaworld.host import Host
+from mtjax.envs.metaworld.observables import Observables
 
 FOLDER = Path(__file__).parent / "data" / "metaworld"
 QUICK = ("assembly", "bin-picking", "coffee-pull", "door-open", "reach")
@@ -51,7 +51,7 @@ def seen(recorded, task):
     places = (recorded[key] for key in ("tcp", "left_pad", "right_pad"))
     began = {key[6:]: x[recorded["episode"]] for key, x in recorded.items() if key.startswith("const_")}
     press = recorded.get("press", np.zeros((len(obs), 0)))
-    return At(obs, recorded["action"], *places, position, quat, recorded["qpos"], press), began
+    return Observables(obs, recorded["action"], *places, position, quat, recorded["qpos"], press), began
 
 
 @quick_or_slow

@@ -99,9 +99,9 @@ def world(gravity=-9, arm=0.1, place=1, friction=1, more=""):
 
 
 def test_things_are_equal_wherever_they_stand():
-    kinds = lambda scene: list(scene.things)
+    kinds = lambda scene: list(scene.subtrees)
     plain = world()
-    assert len(plain.things) == 2 and kinds(world(place=2)) == kinds(plain)
+    assert len(plain.subtrees) == 2 and kinds(world(place=2)) == kinds(plain)
     slippery = world(friction=0.5)
     assert kinds(slippery)[0] == kinds(plain)[0] and kinds(slippery)[1] != kinds(plain)[1]
     assert slippery.frame == plain.frame  # the arm has the motor, and the thing has nothing

@@ -13,7 +13,7 @@ from mtjax.checks import shown
 from mtjax.config import Plan, RunConfig, configure, describe_teacher, fit_length, own_files, with_preset
 from mtjax.envs import make_from
 from mtjax.envs.family import Family
-from mtjax.envs.mixtures import Tabled
+from mtjax.envs.mixtures import FamilyOrMixture
 from mtjax.learning.loop import Settings
 from mtjax.names import InputError
 from mtjax.saved.policy import Policy
@@ -44,7 +44,7 @@ def configured(
     Raises:
         InputError: there is no such setting, or a value is not allowed.
     """
-    named = isinstance(env, str | Tabled) and isinstance(agent, str | BaseAgent)
+    named = isinstance(env, str | FamilyOrMixture) and isinstance(agent, str | BaseAgent)
     _require_learning(env, agent, named)
     if not isinstance(settings, Settings | None):
         raise InputError(f"settings is a mtjax.Settings, not {_kind(settings)}; single settings are given by name")

@@ -10,7 +10,7 @@ import jax
 from jax.sharding import Mesh, NamedSharding
 
 from mtjax.compiling import trace_cache
-from mtjax.envs.mixtures import Tabled
+from mtjax.envs.mixtures import FamilyOrMixture
 from mtjax.learning.evaluation import evaluate
 from mtjax.learning.loop import TrainState, init, run_chunk
 from mtjax.parallel.mesh import BY_SEED, BY_WORLD, REPLICATED
@@ -80,7 +80,7 @@ _DONATED = {init: (), run_chunk: (1,), evaluate: ()}  # the functions that are k
 def trace(function: Any, env: Any, agent: Any, setting: Any, *arguments: Any) -> jax.stages.Traced:
     """Trace a jitted function of three static arguments, or read it from the cache if it was traced before."""
     static = (env, agent, setting)
-    if function not in _DONATED or not isinstance(env, Tabled):  # the first if it is split over devices
+    if function not in _DONATED or not isinstance(env, FamilyOrMixture):  # the first if it is split over devices
         return function.trace(*static, *arguments)
     return trace_cache.trace(env, function, _DONATED[function], static, arguments)
 
@@ -91,7 +91,7 @@ def load_kernels(env: Any) -> bool:
     Returns:
         whether XLA must compile nothing while programs first run.
     """
-    return isinstance(env, Tabled) and env.calls.load_kernels()
+    return isinstance(env, FamilyOrMixture) and env.calls.load_kernels()
 
 
 def sharded_shapes(mesh: Mesh | None, agent: Agent, shapes: TrainState) -> TrainState:

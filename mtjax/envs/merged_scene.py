@@ -1,7 +1,8 @@
-"""One scene with the things of several scenes, and the places of each scene's numbers in it.
+"""One scene with the subtrees of several scenes, and the places of each scene's numbers in it.
 
-Scenes share the things of one kind (``things``). So the arm and the table are there once, and two tasks with the same
-door have one door. A world uses the things of its own scene. All others are parked: far away, and far from each other.
+Scenes share the subtrees of one kind (``subtrees``). So the arm and the table are there once, and two tasks with the
+same door have one door. A world uses the subtrees of its own scene. All others are parked: far away, and far from each
+other.
 """
 
 from collections.abc import Sequence
@@ -12,10 +13,10 @@ import mujoco
 import numpy as np
 
 from mtjax.envs.domain import Domain
-from mtjax.envs.scene_bodies import Scene, Sensor, Thing
+from mtjax.envs.scene_bodies import Scene, Sensor, Subtree
 from mtjax.types import InputError
 
-_FAR = 10.0  # [m] between parked things, and from the world's middle
+_FAR = 10.0  # [m] between parked subtrees, and from the world's middle
 
 
 class Places(NamedTuple):
@@ -28,11 +29,11 @@ class Places(NamedTuple):
 
 
 class Union(NamedTuple):
-    """A model in which all things are parked, and the places of each scene in it."""
+    """A model in which all subtrees are parked, and the places of each scene in it."""
 
     model: mujoco.MjModel
-    qpos: np.ndarray  # (nq,) of parked things
-    warmstart: np.ndarray  # (nv,) of parked things, which fall freely
+    qpos: np.ndarray  # (nq,) of parked subtrees
+    warmstart: np.ndarray  # (nv,) of parked subtrees, which fall freely
     places: tuple[Places, ...]  # of each family
 
 
@@ -40,31 +41,31 @@ def compose(families: Sequence[Domain]) -> Union:
     """Compose the union of families' scenes that have the same ``Scene.frame``.
 
     Raises:
-        InputError: MuJoCo compiles a thing to other numbers in the union than in its own scene.
+        InputError: MuJoCo compiles a subtree to other numbers in the union than in its own scene.
     """
     scenes = [Scene(family.models[0]) for family in families]
     spec, kinds = _gather(families, scenes)
     union = Scene(spec.copy().compile())
-    if list(union.things) != kinds or union.frame != scenes[0].frame:
-        raise InputError("a thing is another one in the union than in its own scene")
+    if list(union.subtrees) != kinds or union.frame != scenes[0].frame:
+        raise InputError("a subtree is another one in the union than in its own scene")
     sensors = list(dict.fromkeys(sensor for scene in scenes for sensor in scene.sensors))
     for sensor in sensors:
         _add_sensor(spec, union, sensor)
     for pair in combinations(kinds, 2):
-        if not any(scene.things.keys() >= set(pair) for scene in scenes):
-            _keep_apart(spec, union.model, *(union.things[kind] for kind in pair))
+        if not any(scene.subtrees.keys() >= set(pair) for scene in scenes):
+            _keep_apart(spec, union.model, *(union.subtrees[kind] for kind in pair))
     whole = Scene(spec.compile())
     begins = dict(zip(sensors, whole.model.sensor_adr.tolist(), strict=True))
     return Union(whole.model, *_park(whole), tuple(_places(scene, whole, begins) for scene in scenes))
 
 
 def _gather(families: Sequence[Domain], scenes: Sequence[Scene]) -> tuple[mujoco.MjSpec, list[bytes]]:
-    """Return the first scene with all further kinds of things of the others, and the kinds in order."""
-    spec, kinds = _bare(families[0]), list(scenes[0].things)
+    """Return the first scene with all further kinds of subtrees of the others, and the kinds in order."""
+    spec, kinds = _bare(families[0]), list(scenes[0].subtrees)
     for number, (family, scene) in enumerate(zip(families, scenes, strict=True)):
-        new = [kind for kind in scene.things if kind not in kinds]
+        new = [kind for kind in scene.subtrees if kind not in kinds]
         own = _bare(family) if new else None  # kept here, as MuJoCo's bodies are gone with their spec
-        bodies = dict(zip(scene.things, own.worldbody.bodies, strict=True)) if own else {}
+        bodies = dict(zip(scene.subtrees, own.worldbody.bodies, strict=True)) if own else {}
         for kind in new:
             spec.worldbody.add_frame().attach_body(bodies[kind], f"{number}/", "")
         kinds += new
@@ -92,21 +93,21 @@ def _add_sensor(spec: mujoco.MjSpec, union: Scene, sensor: Sensor) -> None:
         added.reftype, added.refname = sensor.relative_to[0], union.name(*sensor.relative_to)
 
 
-def _keep_apart(spec: mujoco.MjSpec, model: mujoco.MjModel, *things: Thing) -> None:
-    """Exclude contacts of two things that no scene has both of, so that engines need not look for them."""
-    solid = [[model.body(i).name for i in thing.parts["body"] if model.body_geomnum[i]] for thing in things]
+def _keep_apart(spec: mujoco.MjSpec, model: mujoco.MjModel, *subtrees: Subtree) -> None:
+    """Exclude contacts of two subtrees that no scene has both of, so that engines need not look for them."""
+    solid = [[model.body(i).name for i in subtree.parts["body"] if model.body_geomnum[i]] for subtree in subtrees]
     for one, other in product(*solid):
         spec.add_exclude(bodyname1=one, bodyname2=other)
 
 
 def _park(union: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Put all things far away, and return their positions (nq,) and accelerations (nv,) there."""
+    """Put all subtrees far away, and return their positions (nq,) and accelerations (nv,) there."""
     model, qpos = union.model, union.model.qpos0.copy()
-    for i, thing in enumerate(union.things.values(), 1):
+    for i, subtree in enumerate(union.subtrees.values(), 1):
         place = [_FAR * i, 0, _FAR]
-        model.body_pos[thing.parts["body"][0]] = place
-        if thing.free:
-            qpos[thing.parts["qpos"][:3]] = place
+        model.body_pos[subtree.parts["body"][0]] = place
+        if subtree.free:
+            qpos[subtree.parts["qpos"][:3]] = place
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_forward(model, data)
@@ -118,8 +119,8 @@ def _places(scene: Scene, union: Scene, begins: dict[Sensor, int]) -> Places:
 
     def places(part: str, size: int) -> np.ndarray:
         found = np.zeros(size, int)
-        for kind, thing in scene.things.items():
-            found[thing.parts[part]] = union.things[kind].parts[part]
+        for kind, subtree in scene.subtrees.items():
+            found[subtree.parts[part]] = union.subtrees[kind].parts[part]
         return found
 
     model = scene.model

@@ -1,4 +1,4 @@
-"""A simulator that families of different scenes share: one scene with the things of all (``merged_scene``)."""
+"""A simulator that families of different scenes share: one scene with the subtrees of all (``merged_scene``)."""
 
 import copy
 import dataclasses
@@ -21,8 +21,8 @@ from mtjax.types import Array, Key, Step, Task
 class United(Joined):
     """Domains whose worlds one simulator steps in a union of their scenes.
 
-    Worlds stay those of their own scenes. For a step they enter the union, where other scenes' things are parked, and
-    then leave it. Nothing of the union is kept between steps, so parked things fall for one step at most.
+    Worlds stay those of their own scenes. For a step they enter the union, where other scenes' subtrees are parked, and
+    then leave it. Nothing of the union is kept between steps, so parked subtrees fall for one step at most.
 
     Raises:
         InputError: the scenes cannot be united.
@@ -39,7 +39,7 @@ class United(Joined):
 
     @cached_property
     def _body_pos(self) -> np.ndarray:
-        """Return where bodies (R, nbody, 3) are in the rows of all members' tables. Things of other scenes are parked.
+        """Return where bodies (R, nbody, 3) are in the rows of all members' tables. Others' subtrees are parked.
 
         The models of one union differ in nothing else (``simulator_groups``).
         """
@@ -82,7 +82,7 @@ class United(Joined):
         return reset_apart(self.members, tasks, keys)
 
     def enter(self, i: int, world: World) -> World:
-        """Return worlds of the union, with a member's things as they are in its worlds (S, T, E, ...)."""
+        """Return worlds of the union, with a member's subtrees as they are in its worlds (S, T, E, ...)."""
         union, places = self.union, self._places[i]
         return world._replace(
             qpos=_put(union.qpos, places.qpos, world.qpos),
@@ -103,7 +103,7 @@ class United(Joined):
 
 
 def _put(parked: np.ndarray, places: np.ndarray, values: Array) -> Any:
-    """Return the numbers (..., N) of parked things, with values (..., n) in some places."""
+    """Return the numbers (..., N) of parked subtrees, with values (..., n) in some places."""
     where = np.arange(len(parked)) + values.shape[-1]
     where[places] = np.arange(values.shape[-1])
     rest = jnp.broadcast_to(jnp.float32(parked), (*values.shape[:-1], len(parked)))

@@ -265,7 +265,7 @@ def apart(states: Any) -> tuple[Any, ...]:
     return states.families if isinstance(states, States) else (states,)
 
 
-Tabled = Family | Mixture
+FamilyOrMixture = Family | Mixture
 """Environments with a table of tasks. Configurations, reports and films use them."""
 
 

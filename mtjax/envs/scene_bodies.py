@@ -1,6 +1,6 @@
-"""The things of a scene: the bodies of its world, each with all that hangs on it.
+"""The subtrees of a scene: the bodies of its world, each with all that hangs on it.
 
-Things of two scenes are of one kind if all their numbers are equal but for the places where they stand.
+Subtrees of two scenes are of one kind if all their numbers are equal but for the places where they stand.
 """
 
 import dataclasses
@@ -26,26 +26,26 @@ _STRUCTURE = """
 _SOLID = _of((*_NUMBERS, *_STRUCTURE), "geom")
 _COMMON = [name for name in _of(FIXED + VARIABLE, "opt", "actuator", "eq") if name not in _REFERENCES]
 _STRANGE = ("ntendon", "npair", "nexclude", "nflex", "nhfield", "nkey", "na")  # what the union does not carry over
-_PARTS = {  # the kinds of MuJoCo's objects that belong to things
+_PARTS = {  # the kinds of MuJoCo's objects that belong to subtrees
     int(mujoco.mjtObj.mjOBJ_BODY): "body",
     int(mujoco.mjtObj.mjOBJ_XBODY): "body",
     int(mujoco.mjtObj.mjOBJ_JOINT): "jnt",
     int(mujoco.mjtObj.mjOBJ_GEOM): "geom",
     int(mujoco.mjtObj.mjOBJ_SITE): "site",
 }
-Address = tuple[bytes, int]  # a thing's kind, and a part's number among those of the thing
+Address = tuple[bytes, int]  # a subtree's kind, and a part's number among those of the subtree
 
 
-class Thing(NamedTuple):
+class Subtree(NamedTuple):
     """A body of the world and all that hangs on it, in one scene."""
 
-    kind: bytes  # equal for things that differ in nothing but their place
+    kind: bytes  # equal for subtrees that differ in nothing but their place
     parts: dict[str, np.ndarray]  # numbers in the scene of its "body", "jnt", "dof", "geom", "site" and "qpos"
     free: bool  # whether it moves without a joint that holds it
 
 
 class Sensor(NamedTuple):
-    """A sensor, told by the thing and the part that it reads, as their numbers differ between scenes."""
+    """A sensor, told by the subtree and the part that it reads, as their numbers differ between scenes."""
 
     kind: int
     of: tuple[int, Address]  # the kind of MuJoCo's object, and where it is
@@ -56,27 +56,27 @@ class Sensor(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Scene:
-    """A compiled scene and its things."""
+    """A compiled scene and its subtrees."""
 
     model: mujoco.MjModel
 
     @cached_property
-    def things(self) -> dict[bytes, Thing]:
-        """Return the things by kind, in the order of their bodies. A second one of a kind counts as another kind."""
-        found: dict[bytes, Thing] = {}
+    def subtrees(self) -> dict[bytes, Subtree]:
+        """Return the subtrees by kind, in the order of their bodies. A second one of a kind counts as another kind."""
+        found: dict[bytes, Subtree] = {}
         for body in np.flatnonzero(self.model.body_parentid[1:] == 0) + 1:
             parts = _parts(self.model, int(body))
             kind = _kind(self.model, parts)
             while kind in found:
                 kind += b"again"
-            found[kind] = Thing(kind, parts, _is_free(self.model, parts))
+            found[kind] = Subtree(kind, parts, _is_free(self.model, parts))
         return found
 
     @cached_property
     def frame(self) -> tuple[bytes, ...]:
         """Return what scenes of one union must have in common.
 
-        These are options, motors, welds, bodies that a domain moves, the things that all of these belong to, and the
+        These are options, motors, welds, bodies that a domain moves, the subtrees that all of these belong to, and the
         geoms of the world's own body, such as a floor.
 
         Raises:
@@ -94,27 +94,27 @@ class Scene:
         return _digest(floor), _digest(common), repr(held).encode()
 
     def address(self, part: str, number: int) -> Address:
-        """Return where a part of a thing is.
+        """Return where a part of a subtree is.
 
         Raises:
             InputError: it belongs to the world's own body.
         """
-        for thing in self.things.values():
-            if number in thing.parts[part]:
-                return thing.kind, int(number - thing.parts[part][0])
-        raise InputError(f"{part} {number} of a scene is part of no thing in it")
+        for subtree in self.subtrees.values():
+            if number in subtree.parts[part]:
+                return subtree.kind, int(number - subtree.parts[part][0])
+        raise InputError(f"{part} {number} of a scene is part of no subtree in it")
 
     def name(self, kind: int, address: Address) -> str:
-        """Return the name that a part of a thing has in this scene, by the kind of MuJoCo's object."""
-        thing, among = address
-        return mujoco.mj_id2name(self.model, kind, int(self.things[thing].parts[_PARTS[kind]][among]))
+        """Return the name that a part of a subtree has in this scene, by the kind of MuJoCo's object."""
+        subtree, among = address
+        return mujoco.mj_id2name(self.model, kind, int(self.subtrees[subtree].parts[_PARTS[kind]][among]))
 
     @cached_property
     def sensors(self) -> list[Sensor]:
         """Return the sensors.
 
         Raises:
-            InputError: one of them reads something that belongs to no thing.
+            InputError: one of them reads something that belongs to no subtree.
         """
         model = self.model
         reads = lambda i: self._object(model.sensor_objtype[i], model.sensor_objid[i])
@@ -146,7 +146,7 @@ def _is_free(model: mujoco.MjModel, parts: dict[str, np.ndarray]) -> bool:
 
 
 def _kind(model: mujoco.MjModel, parts: dict[str, np.ndarray]) -> bytes:
-    """Return a hash of all numbers of a thing but its place."""
+    """Return a hash of all numbers of a subtree but its place."""
     body = parts["body"][0]
     fields = _fields(model, parts, (*_NUMBERS, *_STRUCTURE))
     fields |= {name: getattr(model, name)[parts["qpos"]] for name in ("qpos0", "qpos_spring")}
@@ -158,7 +158,7 @@ def _kind(model: mujoco.MjModel, parts: dict[str, np.ndarray]) -> bytes:
 
 
 def _fields(model: mujoco.MjModel, parts: dict[str, np.ndarray], names: Iterable[str]) -> dict[str, np.ndarray]:
-    """Return some fields of a thing's parts, by name, and the corners of its meshes."""
+    """Return some fields of a subtree's parts, by name, and the corners of its meshes."""
     fields = {name: getattr(model, name)[parts[name.split("_")[0]]] for name in names}
     for i, geom in enumerate(parts["geom"]):
         if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:

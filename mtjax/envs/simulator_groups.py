@@ -103,7 +103,7 @@ def _shared_out(candidates: Mapping[int, tuple[Domain, Scene]]) -> list[dict[int
     """Share families out among unions, each into the one that grows least by it."""
     unions: list[tuple[dict[int, Domain], dict[bytes, int]]] = []
     for i, (family, scene) in candidates.items():
-        dofs = {kind: len(thing.parts["dof"]) for kind, thing in scene.things.items()}
+        dofs = {kind: len(subtree.parts["dof"]) for kind, subtree in scene.subtrees.items()}
         sizes = [sum((held | dofs).values()) for _, held in unions]
         more = {j: size - sum(unions[j][1].values()) for j, size in enumerate(sizes) if size <= _MOST_DOFS}
         if not more:

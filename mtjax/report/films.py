@@ -16,7 +16,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from mtjax.checks import amount
 from mtjax.envs.engines import host
-from mtjax.envs.mixtures import Tabled, apart
+from mtjax.envs.mixtures import FamilyOrMixture, apart
 from mtjax.envs.pixels import Pictured
 from mtjax.envs.task_table import Part
 from mtjax.learning.evaluation import Recording, record
@@ -44,13 +44,13 @@ class Chosen(NamedTuple):
     episode: int = 0  # of the trial
 
 
-def require(env: Tabled) -> None:
+def require(env: FamilyOrMixture) -> None:
     """Raise InputError unless a family can be filmed."""
     if not any(part.family.films for part in env.parts):
         raise InputError("only families that show pictures can be filmed; leave out --video")
 
 
-def choose(env: Tabled, splits: Sequence[str], tasks: Sequence[int]) -> list[Chosen]:
+def choose(env: FamilyOrMixture, splits: Sequence[str], tasks: Sequence[int]) -> list[Chosen]:
     """Return the tasks to film: of each split and family those numbers, or the first, the middle and the last.
 
     Raises:
@@ -72,7 +72,7 @@ def choose(env: Tabled, splits: Sequence[str], tasks: Sequence[int]) -> list[Cho
     return found
 
 
-def choose_one(env: Tabled, split: str, number: int) -> Chosen:
+def choose_one(env: FamilyOrMixture, split: str, number: int) -> Chosen:
     """Return the task with a number in a split, for a film.
 
     Raises:
@@ -138,7 +138,11 @@ def play(policy: Policy, tasks: Task, seed: int) -> tuple[Recording, dict[str, A
 
 @contextlib.contextmanager
 def moving(
-    env: Tabled, chosen: Sequence[Chosen], played: Recording, by_name: Mapping[str, Any], named: Mapping[str, str]
+    env: FamilyOrMixture,
+    chosen: Sequence[Chosen],
+    played: Recording,
+    by_name: Mapping[str, Any],
+    named: Mapping[str, str],
 ) -> Iterator[tuple[float, Callable[[float], np.ndarray]]]:
     """Give the seconds until the last of the chosen tasks' episodes ends, and a function that draws all at a time [s].
 
@@ -157,7 +161,7 @@ def moving(
 
 @contextlib.contextmanager
 def _drawing(
-    env: Tabled, one: Chosen, played: Recording, states: Any, width: int
+    env: FamilyOrMixture, one: Chosen, played: Recording, states: Any, width: int
 ) -> Iterator[Callable[[float], np.ndarray]]:
     """Give a function that draws one task at a time [s]; the last frame stays after the episode's end."""
     family: Any = one.part.family
@@ -196,7 +200,7 @@ def _span(played: Recording, one: Chosen) -> tuple[int, int]:
     return int(np.sum(lengths[: one.episode])), int(lengths[one.episode])
 
 
-def _caption(env: Tabled, one: Chosen, played: Recording, named: Mapping[str, str]) -> tuple[str, str]:
+def _caption(env: FamilyOrMixture, one: Chosen, played: Recording, named: Mapping[str, str]) -> tuple[str, str]:
     """Return the lines on a task: its split and return, and its parameters."""
     row = int(played.rows[one.place])  # continuous ranges have a row for each episode
     split, (trial, returns) = named.get(one.split, one.split), (played.returns.shape[1], played.returns[one.place])
@@ -205,7 +209,13 @@ def _caption(env: Tabled, one: Chosen, played: Recording, named: Mapping[str, st
 
 
 def _tile(
-    env: Tabled, one: Chosen, played: Recording, states: Any, count: int, width: int, acting: Timeline | None = None
+    env: FamilyOrMixture,
+    one: Chosen,
+    played: Recording,
+    states: Any,
+    count: int,
+    width: int,
+    acting: Timeline | None = None,
 ) -> np.ndarray:
     """Return the frames (F, height, width, 3) of an episode, at most ``count``, with its strip of sub-policies."""
     family: Any = one.part.family

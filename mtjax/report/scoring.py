@@ -16,7 +16,7 @@ from mtjax.checks import amount, path, require_episodes
 from mtjax.compiling.programs import compile_lowered, enable_compile_cache, trace
 from mtjax.envs import Family
 from mtjax.envs.engines import host
-from mtjax.envs.mixtures import Tabled
+from mtjax.envs.mixtures import FamilyOrMixture
 from mtjax.envs.naming import ends
 from mtjax.learning import evaluation, trials
 from mtjax.learning.evaluation import Scores, of_tasks
@@ -43,7 +43,7 @@ class Evaluation(NamedTuple):
     metrics: dict[str, dict[str, np.ndarray]]  # name -> split -> (S, T, episodes), such as success
     values: dict[str, np.ndarray]  # split -> (T,) value of the varying parameter
     seeds: tuple[int, ...]  # (S,)
-    env: Tabled  # whose tasks were played
+    env: FamilyOrMixture  # whose tasks were played
 
     def __repr__(self) -> str:
         """Return a line: the mean return of every split."""
@@ -126,7 +126,7 @@ def _policy(run: Any, point: int, checkpoint: int) -> Policy:
         return load(folder, first_seed(str(folder), point), checkpoint)
     if checkpoint:
         raise InputError("checkpoint is of a run's folder; give that, or mtjax.load(folder, checkpoint=...)")
-    if not isinstance(run.env, Tabled):
+    if not isinstance(run.env, FamilyOrMixture):
         raise InputError(f"evaluate plays families of tasks, not a {type(run.env).__name__}")
     if isinstance(run, Policy):
         return run.alone()
@@ -182,7 +182,7 @@ def report(request: Any, vary: Mapping[str, str]) -> None:
         print(f"unseen tasks: {told}")
     if population := from_json(pretrained.folder(run) / "config.json").plan.population:
         print(f"number {request.point} of a population ({population}), of whose members there are no intervals")
-    if pretrained.is_shipped(pretrained.folder(run)) and not chosen:
+    if pretrained.is_pretrained(pretrained.folder(run)) and not chosen:
         if any(part.family.films for part in policy.env.parts):
             print(f"look at it: python -m mtjax.evaluate {shlex.join([f'--run={run}', '--video'])}")
         return
@@ -269,7 +269,7 @@ def score(
 
 def _place(run: str) -> Path:
     """Return where a run's evaluations are written. Those of a policy of the package are with the user's own runs."""
-    if not pretrained.is_shipped(pretrained.folder(run)):
+    if not pretrained.is_pretrained(pretrained.folder(run)):
         return Path(run)
     place = Path("runs") / run.replace("/", "-")
     place.mkdir(parents=True, exist_ok=True)

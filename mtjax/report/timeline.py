@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from mtjax.envs.craft.sketched import Sketched, due_in
-from mtjax.envs.mixtures import Tabled
+from mtjax.envs.mixtures import FamilyOrMixture
 from mtjax.learning.evaluation import Recording
 
 # Six colours of Okabe and Ito, which colour-blind readers can tell apart; then lighter and darker ones of these.
@@ -34,7 +34,7 @@ class Timeline(NamedTuple):
     lengths: np.ndarray  # (T, K) int32 steps of each episode, which follow each other along H
 
 
-def timeline_of(env: Tabled, played: Recording, states: Mapping[str, Any]) -> Timeline | None:
+def timeline_of(env: FamilyOrMixture, played: Recording, states: Mapping[str, Any]) -> Timeline | None:
     """Return the options that an agent has played, else the symbols of followed sketches; None if there are neither.
 
     Args:

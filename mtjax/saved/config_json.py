@@ -19,7 +19,7 @@ from mtjax.checks import require_run, require_values
 from mtjax.config import Plan, RunConfig
 from mtjax.envs import ENVS, is_mixture, make
 from mtjax.envs.family import Family
-from mtjax.envs.mixtures import Mixture, Tabled
+from mtjax.envs.mixtures import FamilyOrMixture, Mixture
 from mtjax.learning.loop import Settings
 from mtjax.names import is_imported, replacing
 from mtjax.types import InputError
@@ -202,7 +202,7 @@ def _fields(family: Any) -> dict[str, Any]:
     return {field.name: getattr(family, field.name) for field in dataclasses.fields(family)}
 
 
-def _family_settings(env: Tabled) -> dict[str, Any]:
+def _family_settings(env: FamilyOrMixture) -> dict[str, Any]:
     """Return the settings of a family; of a mixture its own, its families' common ones and varied parameters."""
     if isinstance(env, Family):
         return _fields(env)

@@ -14,7 +14,7 @@ from typing import Any
 from mtjax.checks import amount, path, require_library, shown
 from mtjax.envs import SUITES
 from mtjax.names import SPLITS, InputError, public
-from mtjax.saved import pretrained, ship
+from mtjax.saved import policy_files, pretrained
 from mtjax.saved.config_json import from_json, read_record
 from mtjax.saved.folder import evaluations_of
 from mtjax.saved.policy import Policy, load
@@ -47,7 +47,7 @@ def push(run: Result | Policy | str | Path, name: str, *, private: bool = False)
     api = require_library("huggingface_hub", "mtjax.push").HfApi()
     with tempfile.TemporaryDirectory() as made, _explaining("push", name):
         files = Path(made) / "policy"
-        ship.write(folder, files, number)
+        policy_files.write(folder, files, number)
         (files / _CARD).write_text(_card(name, folder, number, files), encoding="utf-8")
         api.create_repo(name, private=private, exist_ok=True)
         api.upload_folder(repo_id=name, folder_path=files, commit_message="A policy trained by mtjax")

@@ -20,7 +20,7 @@ from mtjax.config import RunConfig
 from mtjax.envs import name_of as env_name_of
 from mtjax.envs.contexts import ranges
 from mtjax.envs.family import Family
-from mtjax.envs.mixtures import Tabled
+from mtjax.envs.mixtures import FamilyOrMixture
 from mtjax.experience import Replay
 from mtjax.experience.ring import Ring
 from mtjax.learning import loop
@@ -41,7 +41,7 @@ class Policy:
     ``mtjax.export`` are called by the same names.
     """
 
-    env: Tabled
+    env: FamilyOrMixture
     agent: BaseAgent
     state: Any  # of one seed
     states: Any  # of every seed, leading S; of a sweep, those of one point
@@ -186,7 +186,7 @@ def load(directory: str | Path, seed: int = 0, checkpoint: int = 0) -> Policy:
     directory = pretrained.folder(path(directory))
     config = from_json(directory / "config.json")
     _require_seed(seed, config.plan.seeds, len(config.points))
-    if pretrained.is_shipped(directory):
+    if pretrained.is_pretrained(directory):
         if checkpoint:
             raise InputError(f"{str(directory)!r} is a policy alone, without checkpoints; leave out checkpoint")
         states = _filled(directory, state_shapes(config).agent)

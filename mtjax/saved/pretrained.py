@@ -30,7 +30,7 @@ def folder(run: str | Path) -> Path:
     return place
 
 
-def is_shipped(directory: Path) -> bool:
+def is_pretrained(directory: Path) -> bool:
     """Return whether a folder holds a policy alone. A run may have one beside its checkpoints: it stays a run."""
     return (directory / FILE).is_file() and not (directory / "checkpoints").exists()
 

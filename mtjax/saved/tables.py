@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from mtjax.agents.swept import Point
-from mtjax.envs.mixtures import Tabled
+from mtjax.envs.mixtures import FamilyOrMixture
 from mtjax.learning.evaluation import Evaluations
 from mtjax.names import InputError
 
@@ -25,7 +25,7 @@ def pandas() -> Any:
 
 
 def frame_of(
-    env: Tabled, evaluations: Evaluations, seeds: Sequence[int], points: Sequence[Point] = (), /, **fixed: Any
+    env: FamilyOrMixture, evaluations: Evaluations, seeds: Sequence[int], points: Sequence[Point] = (), /, **fixed: Any
 ) -> Any:
     """Return a run's evaluations as a table.
 

@@ -7,9 +7,9 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.envs.metaworld.at import At
 from mtjax.envs.metaworld.funnels import funnel
 from mtjax.envs.metaworld.host import Host
+from mtjax.envs.metaworld.observables import Observables
 from mtjax.envs.metaworld.rewards import caging, distance, near
 from mtjax.envs.metaworld.sawyer import Sawyer
 from mtjax.types import Array
@@ -18,7 +18,7 @@ _FLAT = (0.707, 0.0, 0.0, 0.707)  # the nut's orientation as it lies on the tabl
 _HALF_HANDLE = 0.01  # [m]
 
 
-def _grasp(at: At, began: Mapping[str, Array], high_density: bool) -> Array:
+def _grasp(at: Observables, began: Mapping[str, Array], high_density: bool) -> Array:
     """Return the caging reward () for the handle: held anywhere along its length, it counts as held in its middle."""
     hand, handle = at.obs[0], at.obs[4:7]
     along = jnp.where(jnp.abs(handle[0] - hand) < _HALF_HANDLE, hand, handle[0])
@@ -35,7 +35,7 @@ def _grasp(at: At, began: Mapping[str, Array], high_density: bool) -> Array:
     )
 
 
-def _flat(at: At) -> Array:
+def _flat(at: Observables) -> Array:
     """Return 1 for a nut that lies flat, falling to 0 as it tilts."""
     return jnp.maximum(1 - distance(at.obs[7:11], jnp.array(_FLAT)) / 0.4, 0.0)
 
@@ -60,10 +60,10 @@ class Assembly(Sawyer):
         host.move("peg", target - np.array([0.0, 0.0, 0.05]))
         return {"target": target, "obj_init": nut}
 
-    def objects(self, at: At) -> tuple[Array, ...]:
+    def objects(self, at: Observables) -> tuple[Array, ...]:
         return at.position["handle"], at.quat["nut"]
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         centre, target = at.position["centre"], began["target"]
         radius = distance(target[:2], centre[:2])
         success = (radius < 0.02) & (target[2] > centre[2])
@@ -100,10 +100,10 @@ class Disassemble(Sawyer):
         host.place_free(nut)
         return {"target": nut + np.array([0.0, 0.0, 0.15]), "obj_init": nut}
 
-    def objects(self, at: At) -> tuple[Array, ...]:
+    def objects(self, at: Observables) -> tuple[Array, ...]:
         return at.position["handle"], at.quat["nut"]
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         centre, target = at.position["centre"], began["target"]
         left = distance(target + jnp.array([0.0, 0.0, 0.1]), centre)
         in_place = 0.1 * (centre[2] > 0.02) + 0.9 * near(left, 0.02, 0.2)

@@ -7,8 +7,8 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.envs.metaworld.at import At
 from mtjax.envs.metaworld.host import Host
+from mtjax.envs.metaworld.observables import Observables
 from mtjax.envs.metaworld.rewards import caging, distance, hamacher, in_hand, near
 from mtjax.envs.metaworld.sawyer import Sawyer
 from mtjax.types import Array
@@ -36,10 +36,10 @@ class Basketball(Sawyer):
         host.place_free(ball)
         return {"target": host.site("goal"), "obj_init": ball}
 
-    def objects(self, at: At) -> tuple[Array, ...]:
+    def objects(self, at: Observables) -> tuple[Array, ...]:
         return at.position["ball"], at.quat["ball"]
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         ball, start, weight = at.obs[4:7], began["obj_init"], jnp.array([1.0, 1.0, 2.0])
         target = began["target"].at[2].set(0.3)
         left = distance(ball * weight, target * weight)

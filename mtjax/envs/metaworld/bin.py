@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mtjax.envs.metaworld.at import At
 from mtjax.envs.metaworld.funnels import above, funnel
 from mtjax.envs.metaworld.host import SUBSTEPS, Host
+from mtjax.envs.metaworld.observables import Observables
 from mtjax.envs.metaworld.rewards import caging, distance, hamacher, near
 from mtjax.envs.metaworld.sawyer import Sawyer
 from mtjax.types import Array
@@ -42,10 +42,10 @@ class BinPicking(Sawyer):
         way = np.linalg.norm(later.body("obj") - target)
         return {"target": target, "obj_init": cube, "target_to_obj_init": way}
 
-    def objects(self, at: At) -> tuple[Array, ...]:
+    def objects(self, at: Observables) -> tuple[Array, ...]:
         return at.position["cube"], at.quat["cube"]
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         hand, cube, start, target = at.obs[:3], at.obs[4:7], began["obj_init"], began["target"]
         left = distance(cube, target)
         in_place = near(left, 0.05, began["target_to_obj_init"])

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mtjax.envs.metaworld.at import At
 from mtjax.envs.metaworld.funnels import above, funnel
 from mtjax.envs.metaworld.host import SUBSTEPS, Host
+from mtjax.envs.metaworld.observables import Observables
 from mtjax.envs.metaworld.rewards import distance, hamacher, near
 from mtjax.envs.metaworld.sawyer import Sawyer
 from mtjax.types import Array
@@ -38,10 +38,10 @@ class BoxClose(Sawyer):
         host.place_free(lid)
         return {"target": target}
 
-    def objects(self, at: At) -> tuple[Array, ...]:
+    def objects(self, at: Observables) -> tuple[Array, ...]:
         return at.position["lid"], at.quat["lid"]
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         hand, lid, target = at.obs[:3], at.obs[4:7] + jnp.array([0.0, 0.0, 0.02]), began["target"]
         floor = funnel(distance(hand[:2], lid[:2]), 0.02, 0.04, 0.4)
         ready = hamacher(above(hand[2], floor, floor / 2), near(distance(hand, lid), 0.02, 0.5))

@@ -7,8 +7,8 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.envs.metaworld.at import At
 from mtjax.envs.metaworld.host import Host
+from mtjax.envs.metaworld.observables import Observables
 from mtjax.envs.metaworld.rewards import distance, hamacher, near
 from mtjax.envs.metaworld.sawyer import Sawyer
 from mtjax.types import Array
@@ -33,15 +33,15 @@ def _arrange_top(self: Sawyer, host: Host, vec: np.ndarray) -> dict[str, np.ndar
     return _arrange(host, vec, axis=2)
 
 
-def _show_front(self: Sawyer, at: At) -> tuple[Array, ...]:
+def _show_front(self: Sawyer, at: Observables) -> tuple[Array, ...]:
     return at.position["button"] + jnp.array([0.0, -0.193, 0.0]), at.quat["button"]
 
 
-def _show_top(self: Sawyer, at: At) -> tuple[Array, ...]:
+def _show_top(self: Sawyer, at: Observables) -> tuple[Array, ...]:
     return at.position["button"] + jnp.array([0.0, 0.0, 0.193]), at.quat["button"]
 
 
-def _press_down(at: At, began: Mapping[str, Array], hand: Array) -> tuple[Array, Array]:
+def _press_down(at: Observables, began: Mapping[str, Array], hand: Array) -> tuple[Array, Array]:
     """Return reward and success for a button that is pressed along z; ``hand`` () says how well the gripper is set."""
     button = at.obs[4:7]
     away, left = distance(button, at.tcp), jnp.abs(began["target"][2] - button[2])
@@ -50,7 +50,7 @@ def _press_down(at: At, began: Mapping[str, Array], hand: Array) -> tuple[Array,
     return 5 * ready + jnp.where(away <= 0.03, 5 * pressed, 0.0), left <= 0.024
 
 
-def press(at: At, began: Mapping[str, Array], depth: Array | float) -> tuple[Array, Array]:
+def press(at: Observables, began: Mapping[str, Array], depth: Array | float) -> tuple[Array, Array]:
     """Return the reward () for pressing a button along y with an open gripper, and how far () [m] it has to go."""
     button = at.obs[4:7]
     away, left = distance(button, at.tcp), jnp.abs(began["target"][1] - button[1])
@@ -74,7 +74,7 @@ class ButtonPress(Sawyer):
     watched: ClassVar = {"button": "body:button"}
     arrange, objects = _arrange_front, _show_front
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         reward, left = press(at, began, began["obj_to_target_init"])
         return reward, left <= 0.02
 
@@ -96,7 +96,7 @@ class ButtonPressWall(Sawyer):
     watched: ClassVar = {"button": "body:button"}
     arrange, objects = _arrange_front, _show_front
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         button, opened = at.obs[4:7], at.obs[3]
         away, left = distance(button, at.tcp), jnp.abs(began["target"][1] - button[1])
         ready = hamacher((1 - opened) / 2, near(away, 0.01, distance(button, began["init_tcp"])))
@@ -120,7 +120,7 @@ class ButtonPressTopdown(Sawyer):
     watched: ClassVar = {"button": "body:button"}
     arrange, objects = _arrange_top, _show_top
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         return _press_down(at, began, 1 - at.obs[3])
 
 
@@ -140,5 +140,5 @@ class ButtonPressTopdownWall(Sawyer):
     watched: ClassVar = {"button": "body:button"}
     arrange, objects = _arrange_top, _show_top
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         return _press_down(at, began, at.obs[3])

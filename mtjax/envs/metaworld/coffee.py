@@ -7,9 +7,9 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.envs.metaworld.at import At, scalar_last
 from mtjax.envs.metaworld.button import press
 from mtjax.envs.metaworld.host import Host
+from mtjax.envs.metaworld.observables import Observables, scalar_last
 from mtjax.envs.metaworld.rewards import caging, distance, hamacher, in_hand, near
 from mtjax.envs.metaworld.sawyer import Sawyer
 from mtjax.types import Array
@@ -49,10 +49,10 @@ class CoffeeButton(Sawyer):
         _place_mug(host, vec - _BEHIND)
         return {"target": vec - _BEHIND + np.array([0.0, _DEPTH, 0.3])}
 
-    def objects(self, at: At) -> tuple[Array, ...]:
+    def objects(self, at: Observables) -> tuple[Array, ...]:
         return at.position["button"], jnp.array([1.0, 0.0, 0.0, 0.0])
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         reward, left = press(at, began, _DEPTH)
         return reward, left <= 0.02
 
@@ -65,11 +65,11 @@ def _arrange(host: Host, vec: np.ndarray, machine: np.ndarray) -> dict[str, np.n
     return {"target": target, "obj_init": mug}
 
 
-def _show_mug(self: Sawyer, at: At) -> tuple[Array, ...]:
+def _show_mug(self: Sawyer, at: Observables) -> tuple[Array, ...]:
     return at.position["mug"], scalar_last(at.quat["shape"])
 
 
-def _move_mug(self: Sawyer, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+def _move_mug(self: Sawyer, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
     mug, target, weight = at.obs[4:7], began["target"], jnp.array([2.0, 2.0, 1.0])
     left = distance(mug * weight, target * weight)
     in_place = near(left, 0.05, distance(began["obj_init"] * weight, target * weight))

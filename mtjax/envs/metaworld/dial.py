@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from mtjax.envs.dm_control.rewards import tolerance
-from mtjax.envs.metaworld.at import At
 from mtjax.envs.metaworld.host import Host
+from mtjax.envs.metaworld.observables import Observables
 from mtjax.envs.metaworld.rewards import distance, effort, hamacher, near
 from mtjax.envs.metaworld.sawyer import Sawyer
 from mtjax.types import Array
@@ -39,12 +39,12 @@ class DialTurn(Sawyer):
         mark = host.body("dial") + _RADIUS * np.array([np.sin(angle), -np.cos(angle), 0.0])
         return {"target": vec + np.array([0.0, 0.03, 0.03]), "dial_push_position": mark + _PUSH}
 
-    def objects(self, at: At) -> tuple[Array, ...]:
+    def objects(self, at: Observables) -> tuple[Array, ...]:
         angle = at.qpos[_HINGE]
         mark = _RADIUS * jnp.stack([jnp.sin(angle), -jnp.cos(angle), jnp.float32(0)])
         return at.position["dial"] + mark, at.quat["dial"]
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         mark, target, push = at.obs[4:7], began["target"], began["dial_push_position"]
         left = distance(mark, target)
         in_place = near(left, 0.07, jnp.abs(distance(push, target) - 0.07))

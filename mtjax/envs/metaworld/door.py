@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from mtjax.envs.dm_control.rewards import tolerance
-from mtjax.envs.metaworld.at import At, scalar_last
 from mtjax.envs.metaworld.funnels import above, funnel
 from mtjax.envs.metaworld.host import Host
+from mtjax.envs.metaworld.observables import Observables, scalar_last
 from mtjax.envs.metaworld.rewards import distance, hamacher, near
 from mtjax.envs.metaworld.sawyer import Sawyer
 from mtjax.types import Array
@@ -48,10 +48,10 @@ class DoorOpen(Sawyer):
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
         return _arrange(host, vec, 0.0, (-0.3, -0.45, 0.0))
 
-    def objects(self, at: At) -> tuple[Array, ...]:
+    def objects(self, at: Observables) -> tuple[Array, ...]:
         return at.position["handle"], scalar_last(at.quat["handle"])
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         hand, door, angle = at.obs[:3], at.obs[4:7] + jnp.array([-0.05, 0.0, 0.0]), at.qpos[_HINGE]
         floor = funnel(distance(hand[:2], door[:2]), _NECK, 0.04, 0.4)
         behind_handle = near(distance(hand, door + jnp.array([0.05, 0.03, -0.01])), _NECK / 2, 0.5)
@@ -81,10 +81,10 @@ class DoorClose(Sawyer):
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
         return _arrange(host, vec, -1.5708, (0.2, -0.2, 0.0))
 
-    def objects(self, at: At) -> tuple[Array, ...]:
+    def objects(self, at: Observables) -> tuple[Array, ...]:
         return at.position["handle"], scalar_last(at.quat["handle"])
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         handle, target = at.obs[4:7], began["target"]
         left = distance(handle, target)
         in_place = tolerance(left, 0.0, 0.05, distance(began["obj_init"], target))

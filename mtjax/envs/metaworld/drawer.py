@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from mtjax.envs.dm_control.rewards import tolerance
-from mtjax.envs.metaworld.at import At
 from mtjax.envs.metaworld.host import Host
+from mtjax.envs.metaworld.observables import Observables
 from mtjax.envs.metaworld.rewards import distance, effort, hamacher, near
 from mtjax.envs.metaworld.sawyer import Sawyer
 from mtjax.types import Array
@@ -37,10 +37,10 @@ class DrawerOpen(Sawyer):
         host.move("drawer", vec)
         return {"target": vec + np.array([0.0, -0.16 - _OPEN, 0.09])}
 
-    def objects(self, at: At) -> tuple[Array, ...]:
+    def objects(self, at: Observables) -> tuple[Array, ...]:
         return at.position["drawer"] + jnp.array([0.0, -0.16, 0.0]), at.quat["drawer"]
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         hand, handle, target = at.obs[:3], at.obs[4:7], began["target"]
         left, weight = distance(handle, target), jnp.array([3.0, 3.0, 1.0])
         closed = target + jnp.array([0.0, _OPEN, 0.0])
@@ -74,10 +74,10 @@ class DrawerClose(Sawyer):
             "obj_init": host.body("drawer_link") + np.array([0.0, -0.16, 0.05]),
         }
 
-    def objects(self, at: At) -> tuple[Array, ...]:
+    def objects(self, at: Observables) -> tuple[Array, ...]:
         return at.position["drawer"] + jnp.array(_HANDLE), jnp.zeros(4)
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         handle, target, start = at.obs[4:7], began["target"], began["obj_init"]
         left, reach = distance(handle, target), distance(start, began["init_tcp"])
         in_place = near(left, 0.05, jnp.abs(distance(start, target) - 0.05))

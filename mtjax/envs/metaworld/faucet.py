@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from mtjax.envs.dm_control.rewards import tolerance
-from mtjax.envs.metaworld.at import At
 from mtjax.envs.metaworld.host import Host
+from mtjax.envs.metaworld.observables import Observables
 from mtjax.envs.metaworld.rewards import distance, near
 from mtjax.envs.metaworld.sawyer import Sawyer
 from mtjax.types import Array
@@ -22,11 +22,11 @@ def _place(self: Sawyer, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
     return {"target": vec + self.to_target, "obj_init": vec}
 
 
-def _show(self: Sawyer, at: At) -> tuple[Array, ...]:
+def _show(self: Sawyer, at: Observables) -> tuple[Array, ...]:
     return at.position[self.handle] - jnp.array([0.0, 0.0, 0.01]), at.quat["base"]
 
 
-def _turn(self: Sawyer, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+def _turn(self: Sawyer, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
     end, target = at.obs[4:7] + jnp.array(self.to_end), began["target"]
     away = distance(end, target)
     in_place = near(away, _RADIUS, abs(distance(began["obj_init"], target) - _RADIUS))

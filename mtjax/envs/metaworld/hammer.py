@@ -7,8 +7,8 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.envs.metaworld.at import At
 from mtjax.envs.metaworld.host import Host
+from mtjax.envs.metaworld.observables import Observables
 from mtjax.envs.metaworld.rewards import caging, distance, near
 from mtjax.envs.metaworld.sawyer import Sawyer
 from mtjax.types import Array
@@ -38,10 +38,10 @@ class Hammer(Sawyer):
         host.place_free(vec)
         return {"target": host.site("goal"), "obj_init": vec}
 
-    def objects(self, at: At) -> tuple[Array, ...]:
+    def objects(self, at: Observables) -> tuple[Array, ...]:
         return at.position["hammer"], at.quat["hammer"], at.position["nail"], at.quat["nail"]
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         hand, hammer = at.obs[:3], at.obs[4:7]
         level = jnp.maximum(1 - jnp.linalg.norm(at.obs[7:11] - jnp.array([1.0, 0.0, 0.0, 0.0])) / 0.4, 0.0)
         handle = hammer.at[0].set(jnp.where(abs(hammer[0] - hand[0]) < 0.07, hand[0], hammer[0]))

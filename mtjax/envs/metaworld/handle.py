@@ -7,8 +7,8 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.envs.metaworld.at import At
 from mtjax.envs.metaworld.host import Host
+from mtjax.envs.metaworld.observables import Observables
 from mtjax.envs.metaworld.rewards import caging, distance, hamacher, in_hand, near
 from mtjax.envs.metaworld.sawyer import Sawyer
 from mtjax.types import Array
@@ -29,11 +29,11 @@ def _press(self: Sawyer, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
     return {"target": host.site("goalPress"), "handle_init_pos": host.site("handleStart"), "obj_init": vec}
 
 
-def _show(self: Sawyer, at: At) -> tuple[Array, ...]:
+def _show(self: Sawyer, at: Observables) -> tuple[Array, ...]:
     return at.position[self.handle], jnp.zeros(4)
 
 
-def _pressed(self: Sawyer, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+def _pressed(self: Sawyer, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
     """Return reward and success for a handle that is to go down."""
     handle, start, target = at.position[self.handle], began["handle_init_pos"], began["target"]
     away = abs(handle[2] - target[2])
@@ -104,7 +104,7 @@ class HandlePull(Sawyer):
         _slide(host, -0.1)
         return {"target": host.site("goalPull"), "obj_init": vec}
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         handle, start, target = at.obs[4:7], began["obj_init"], began["target"]
         away = abs(handle[2] - target[2])
         in_place = near(away, _PULLED, abs(start[2] - target[2]))
@@ -136,7 +136,7 @@ class HandlePullSide(Sawyer):
         _slide(host, -0.1)
         return {"target": host.site("goalPull"), "obj_init": host.site("handleCenter")}
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         handle, start, target = at.obs[4:7], began["obj_init"], began["target"]
         away = distance(handle, target)
         in_place = near(away, _PULLED, distance(start, target))

@@ -7,8 +7,8 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.envs.metaworld.at import At
 from mtjax.envs.metaworld.host import Host
+from mtjax.envs.metaworld.observables import Observables
 from mtjax.envs.metaworld.rewards import caging, distance, hamacher, in_hand, near
 from mtjax.envs.metaworld.sawyer import Sawyer
 from mtjax.types import Array
@@ -21,7 +21,7 @@ def _place(self: Sawyer, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
     return {"target": vec[3:], "obj_init": vec[:3]}
 
 
-def _show(self: Sawyer, at: At) -> tuple[Array, ...]:
+def _show(self: Sawyer, at: Observables) -> tuple[Array, ...]:
     return at.position["block"], at.quat["block"]
 
 
@@ -42,7 +42,7 @@ class HandInsert(Sawyer):
     apart: ClassVar[float] = 0.15
     arrange, objects = _place, _show
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         block, target = at.obs[4:7], began["target"]
         away = distance(block, target)
         in_place = near(away, _RADIUS, distance(began["obj_init"], target))
@@ -72,7 +72,7 @@ class PickOutOfHole(Sawyer):
     apart: ClassVar[float] = 0.15
     arrange, objects = _place, _show
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         puck, start, target = at.obs[4:7], began["obj_init"], began["target"]
         away = distance(puck, target)
         in_place = near(away, 0.02, distance(start, target))

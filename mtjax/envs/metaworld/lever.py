@@ -8,8 +8,8 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.envs.metaworld.at import At, scalar_last
 from mtjax.envs.metaworld.host import Host
+from mtjax.envs.metaworld.observables import Observables, scalar_last
 from mtjax.envs.metaworld.rewards import distance, hamacher, near
 from mtjax.envs.metaworld.sawyer import Sawyer
 from mtjax.types import Array
@@ -49,13 +49,13 @@ class LeverPull(Sawyer):
         end = vec + np.array([0.12, -_LENGTH, 0.25])
         return {"target": vec + np.array([0.12, 0.0, 0.25 + _LENGTH]), "lever_pos_init": end, "obj_init": vec}
 
-    def objects(self, at: At) -> tuple[Array, ...]:
+    def objects(self, at: Observables) -> tuple[Array, ...]:
         cos, sin = jnp.cos(at.qpos[_LEVER] / 2), jnp.sin(at.qpos[_LEVER] / 2)
         w, x, y, z = _GRIP
         turned = jnp.stack([cos * w - sin * x, cos * x + sin * w, cos * y - sin * z, cos * z + sin * y])
         return at.position["end"], scalar_last(turned)
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         end, start, target = at.obs[4:7], began["lever_pos_init"], began["target"]
         scale, to_shoulder = jnp.array([4.0, 1.0, 4.0]), jnp.array([0.0, 0.055, 0.07])
         below = jnp.linalg.norm((at.obs[:3] + to_shoulder - end) * scale)

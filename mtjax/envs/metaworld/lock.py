@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mtjax.envs.metaworld.at import At
 from mtjax.envs.metaworld.host import SUBSTEPS, Host
+from mtjax.envs.metaworld.observables import Observables
 from mtjax.envs.metaworld.rewards import distance, hamacher, near
 from mtjax.envs.metaworld.sawyer import Sawyer
 from mtjax.types import Array
@@ -44,10 +44,10 @@ class DoorLock(Sawyer):
         mujoco.mj_step(host.model, host.data, SUBSTEPS)
         return {"target": host.body("lock_link") + np.array([0.0, -0.04, -0.1])}
 
-    def objects(self, at: At) -> tuple[Array, ...]:
+    def objects(self, at: Observables) -> tuple[Array, ...]:
         return at.position["lock"], at.quat["door"]
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         lock, weight = at.obs[4:7], jnp.array(_WEIGHT)
         away, left = distance(lock * weight, at.left_pad * weight), jnp.abs(began["target"][2] - lock[2])
         near_lock = near(away, 0.01, away)
@@ -76,10 +76,10 @@ class DoorUnlock(Sawyer):
         start = host.body("lock_link")
         return {"target": start + np.array([0.1, -0.04, 0.0]), "obj_init": start}
 
-    def objects(self, at: At) -> tuple[Array, ...]:
+    def objects(self, at: Observables) -> tuple[Array, ...]:
         return at.position["unlock"], at.quat["door"]
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         lock, weight, shoulder = at.obs[4:7], jnp.array(_WEIGHT), jnp.array([0.0, 0.055, 0.07])
         margin = distance((began["init_tcp"] + shoulder) * weight, began["obj_init"] * weight)
         ready = near(distance((at.obs[:3] + shoulder) * weight, lock * weight), 0.02, margin)

@@ -7,8 +7,8 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.envs.metaworld.at import At, scalar_last
 from mtjax.envs.metaworld.host import Host
+from mtjax.envs.metaworld.observables import Observables, scalar_last
 from mtjax.envs.metaworld.rewards import caging, distance, hamacher, in_hand, near
 from mtjax.envs.metaworld.sawyer import Sawyer
 from mtjax.types import Array
@@ -57,10 +57,10 @@ class PegInsertSide(Sawyer):
         host.place_free(vec[:3])
         return {"target": vec[3:] + _HOLE, "obj_init": vec[:3], "peg_head_pos_init": head}
 
-    def objects(self, at: At) -> tuple[Array, ...]:
+    def objects(self, at: Observables) -> tuple[Array, ...]:
         return at.position["grasp"], scalar_last(at.quat["grasp"])
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         peg, head, target = at.obs[4:7], at.position["head"], began["target"]
         scale = jnp.array([1.0, 2.0, 2.0])
         away = jnp.linalg.norm((head - target) * scale)
@@ -99,10 +99,10 @@ class PegUnplugSide(Sawyer):
         host.forward()
         return {"target": plug + np.array([0.15, 0.0, 0.0]), "obj_init": host.site("pegEnd")}
 
-    def objects(self, at: At) -> tuple[Array, ...]:
+    def objects(self, at: Observables) -> tuple[Array, ...]:
         return at.position["end"], at.quat["plug"]
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         end, start, target = at.obs[4:7], began["obj_init"], began["target"]
         away = distance(end, target)
         in_place = near(away, 0.05, distance(start, target))

@@ -7,8 +7,8 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.envs.metaworld.at import At
 from mtjax.envs.metaworld.host import Host
+from mtjax.envs.metaworld.observables import Observables
 from mtjax.envs.metaworld.push import PAST_WALL, RADIUS, Push, progress, show_puck
 from mtjax.envs.metaworld.rewards import caging, distance, hamacher, in_hand, near, pads_caging
 from mtjax.envs.metaworld.sawyer import Sawyer
@@ -20,7 +20,7 @@ def _place(self: Sawyer, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
     return {"target": vec[3:], "obj_init": vec[:3]}
 
 
-def _lifted(at: At, began: Mapping[str, Array], height: float) -> Array:
+def _lifted(at: Observables, began: Mapping[str, Array], height: float) -> Array:
     """Return whether () the gripper has the puck and it is higher than at the start."""
     puck = at.position["puck"]
     return in_hand(at, puck, 0.02) & (puck[2] - height > began["obj_init"][2])
@@ -41,7 +41,7 @@ class PickPlace(Sawyer):
     apart: ClassVar[float] = 0.15
     arrange, objects = _place, show_puck
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         puck, away, in_place = progress(at, began)
         held = pads_caging(at, began, puck, obj_radius=0.015, xz_thresh=0.005)
         reward = hamacher(held, in_place) + jnp.where(_lifted(at, began, 0.01), 1 + 5 * in_place, 0.0)
@@ -64,7 +64,7 @@ class PickPlaceWall(Sawyer):
     apart: ClassVar[float] = 0.15
     arrange, objects = _place, show_puck
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         puck, away, in_place = progress(at, began)
         middle = jnp.stack([began["target"][0], jnp.float32(0.77), jnp.float32(0.25)])
         tall = jnp.array([1.0, 1.0, 3.0])

@@ -7,8 +7,8 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.envs.metaworld.at import At, scalar_last
 from mtjax.envs.metaworld.host import Host
+from mtjax.envs.metaworld.observables import Observables, scalar_last
 from mtjax.envs.metaworld.rewards import distance, hamacher, near
 from mtjax.envs.metaworld.sawyer import Sawyer
 from mtjax.types import Array
@@ -23,11 +23,11 @@ def _arrange(host: Host, vec: np.ndarray, x: float = 0.0, y: float = 0.0) -> dic
     return {"target": vec[3:], "obj_init": vec[:3]}
 
 
-def _show(self: Sawyer, at: At) -> tuple[Array, ...]:
+def _show(self: Sawyer, at: Observables) -> tuple[Array, ...]:
     return at.position["plate"], scalar_last(at.quat["plate"])
 
 
-def _pull(self: Sawyer, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+def _pull(self: Sawyer, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
     """Return reward and success for a plate that the hand moves from above."""
     plate, start, target = at.obs[4:7], began["obj_init"], began["target"]
     away, reached = distance(plate, target), distance(plate, at.tcp)
@@ -56,7 +56,7 @@ class PlateSlide(Sawyer):
         host.move("puck_goal", vec[3:])
         return _arrange(host, vec)
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         plate, start, target = at.obs[4:7], began["obj_init"], began["target"]
         away = distance(plate, target)
         in_place = near(away, _RADIUS, distance(start, target))

@@ -7,8 +7,8 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.envs.metaworld.at import At, scalar_last
 from mtjax.envs.metaworld.host import Host
+from mtjax.envs.metaworld.observables import Observables, scalar_last
 from mtjax.envs.metaworld.rewards import caging, distance, hamacher, in_hand, near, pads_caging
 from mtjax.envs.metaworld.sawyer import Sawyer
 from mtjax.types import Array
@@ -17,12 +17,12 @@ RADIUS = 0.05  # [m] within which a thing is at its goal
 PAST_WALL = 0.75  # [m] of y
 
 
-def show_puck(self: Sawyer, at: At) -> tuple[Array, ...]:
+def show_puck(self: Sawyer, at: Observables) -> tuple[Array, ...]:
     """Return what fills the observation's entries for objects."""
     return at.position["puck"], scalar_last(at.quat["puck"])
 
 
-def progress(at: At, began: Mapping[str, Array]) -> tuple[Array, Array, Array]:
+def progress(at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array, Array]:
     """Return where the puck is (3,), its distance () from the goal, and how near that is in [0, 1]."""
     puck, target = at.position["puck"], began["target"]
     away = distance(puck, target)
@@ -36,7 +36,7 @@ def _place(self: Sawyer, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
     return {"target": np.append(vec[3:5], height), "obj_init": obj_init}
 
 
-def _held(at: At, began: Mapping[str, Array]) -> Array:
+def _held(at: Observables, began: Mapping[str, Array]) -> Array:
     """Return the reward () of a gripper about the puck."""
     puck = at.position["puck"]
     return caging(at, began, puck, obj_radius=0.015, pad_success_thresh=0.05, xz_thresh=0.005, high_density=True)
@@ -57,7 +57,7 @@ class Push(Sawyer):
     apart: ClassVar[float] = 0.15
     arrange, objects = _place, show_puck
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         puck, away, in_place = progress(at, began)
         held = _held(at, began)
         reward = 2 * held + jnp.where(in_hand(at, puck, 0.02), 1 + 2 * held + 5 * in_place, 0.0)
@@ -79,7 +79,7 @@ class PushWall(Sawyer):
     apart: ClassVar[float] = 0.15
     arrange, objects = _place, show_puck
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         puck, away, in_place = progress(at, began)
         middle, wide = jnp.stack([jnp.float32(-0.05), jnp.float32(0.77), puck[2]]), jnp.array([3.0, 1.0, 1.0])
         begun = distance(began["obj_init"] * wide, middle * wide)
@@ -105,7 +105,7 @@ class PushBack(Sawyer):
     apart: ClassVar[float] = 0.15
     arrange, objects = _place, show_puck
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         puck, away, in_place = progress(at, began)
         held = pads_caging(at, began, puck, obj_radius=0.007, grip_margin=0.003, xz_thresh=0.01)
         closed = (at.obs[3] > 0) & (at.obs[3] < 0.55)

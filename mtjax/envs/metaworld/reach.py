@@ -7,8 +7,8 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.envs.metaworld.at import At
 from mtjax.envs.metaworld.host import Host
+from mtjax.envs.metaworld.observables import Observables
 from mtjax.envs.metaworld.push import show_puck
 from mtjax.envs.metaworld.rewards import distance, near
 from mtjax.envs.metaworld.sawyer import Sawyer
@@ -20,7 +20,7 @@ def _place(self: Sawyer, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
     return {"target": vec[3:]}
 
 
-def _reach(self: Sawyer, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+def _reach(self: Sawyer, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
     away = distance(at.tcp, began["target"])
     margin = distance(jnp.array(self.hand_start), began["target"])
     return 10 * near(away, 0.05, margin), away <= 0.05

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import jax.numpy as jnp
 
 from mtjax.envs.dm_control.rewards import tolerance
-from mtjax.envs.metaworld.at import At
+from mtjax.envs.metaworld.observables import Observables
 from mtjax.types import Array
 
 _XZ = jnp.s_[::2]
@@ -27,18 +27,18 @@ def hamacher(a: Array | float, b: Array | float) -> Array:
     return jnp.where(both > 0, a * b / jnp.where(both > 0, both, 1.0), 0.0)
 
 
-def effort(at: At, desired: float = 1.0) -> Array:
+def effort(at: Observables, desired: float = 1.0) -> Array:
     """Return how firmly () the action closes the gripper, as a part of ``desired``, in [0, 1]."""
     return jnp.clip(at.action[3], 0.0, desired) / desired
 
 
-def in_hand(at: At, thing: Array, within: float) -> Array:
+def in_hand(at: Observables, thing: Array, within: float) -> Array:
     """Return whether () the tool centre is within a distance [m] of a thing (3,), and the fingers are apart."""
     return (distance(thing, at.tcp) < within) & (at.obs[3] > 0)
 
 
 def caging(
-    at: At,
+    at: Observables,
     began: Mapping[str, Array],
     obj: Array,
     *,
@@ -81,7 +81,7 @@ def caging(
 
 
 def pads_caging(
-    at: At,
+    at: Observables,
     began: Mapping[str, Array],
     obj: Array,
     *,

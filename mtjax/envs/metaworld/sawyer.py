@@ -16,10 +16,10 @@ from mtjax.envs.compiled import compile_model, stack_differing
 from mtjax.envs.domain import Domain
 from mtjax.envs.engines.base import World, choose_engine
 from mtjax.envs.metaworld import scene
-from mtjax.envs.metaworld.at import At
 from mtjax.envs.metaworld.goals import draw_goals
 from mtjax.envs.metaworld.host import SUBSTEPS, Host
 from mtjax.envs.metaworld.names import TASKS, listed_with
+from mtjax.envs.metaworld.observables import Observables
 from mtjax.envs.pixels import Mark
 from mtjax.envs.scenery import Visible
 from mtjax.envs.variation import Variation
@@ -136,11 +136,11 @@ class Sawyer(Domain):
         """
 
     @abc.abstractmethod
-    def objects(self, at: At) -> tuple[Array, ...]:
+    def objects(self, at: Observables) -> tuple[Array, ...]:
         """Return what fills the observation's entries for objects: position (3,), orientation (4,), position, ..."""
 
     @abc.abstractmethod
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         """Return reward () and success () bool of a world after a step. ``began`` is what ``arrange`` returned."""
 
     # Starts.
@@ -262,7 +262,7 @@ class Sawyer(Domain):
     def metrics(self, task: Task, world: World, action: Array) -> dict[str, Array]:
         return {"success": self.evaluate(self.at(task, world, action), task.goal)[1].astype(jnp.float32)}
 
-    def at(self, task: Task, world: World, action: Array) -> At:
+    def at(self, task: Task, world: World, action: Array) -> Observables:
         """Return what a world shows."""
         return self._shown(world)._replace(obs=self.observe(task, world), action=action)
 
@@ -278,7 +278,7 @@ class Sawyer(Domain):
         things = jnp.concatenate(self.objects(self._shown(world)))
         return jnp.concatenate([hand, opened[None], things, jnp.zeros(_OBJECTS - things.size)])
 
-    def _shown(self, world: World) -> At:
+    def _shown(self, world: World) -> Observables:
         """Return the places of the gripper and of watched things, from the sensors of ``scene.read``."""
         left_pad, right_pad, left, right = world.sensors[9:21].reshape(4, 3)
         poses, press = jnp.split(world.sensors[21:], [7 * len(self.watched)])
@@ -286,4 +286,6 @@ class Sawyer(Domain):
         position = dict(zip(self.watched, poses[:, :3], strict=True))
         quat = dict(zip(self.watched, poses[:, 3:], strict=True))
         nothing = jnp.zeros(0)
-        return At(nothing, nothing, (left + right) / 2, left_pad, right_pad, position, quat, world.qpos, press[::3])
+        return Observables(
+            nothing, nothing, (left + right) / 2, left_pad, right_pad, position, quat, world.qpos, press[::3]
+        )

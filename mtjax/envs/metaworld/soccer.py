@@ -7,8 +7,8 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.envs.metaworld.at import At, scalar_last
 from mtjax.envs.metaworld.host import Host
+from mtjax.envs.metaworld.observables import Observables, scalar_last
 from mtjax.envs.metaworld.rewards import distance, near, pads_caging
 from mtjax.envs.metaworld.sawyer import Sawyer
 from mtjax.types import Array
@@ -39,10 +39,10 @@ class Soccer(Sawyer):
         host.place_free(ball)
         return {"target": vec[3:], "obj_init": ball}
 
-    def objects(self, at: At) -> tuple[Array, ...]:
+    def objects(self, at: Observables) -> tuple[Array, ...]:
         return at.position["ball"], scalar_last(at.quat["ball"])
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         ball, target = at.obs[4:7], began["target"]
         scale = jnp.array([3.0, 1.0, 1.0])
         away = jnp.linalg.norm((ball - target) * scale)

@@ -7,8 +7,8 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.envs.metaworld.at import At, scalar_last
 from mtjax.envs.metaworld.host import Host
+from mtjax.envs.metaworld.observables import Observables, scalar_last
 from mtjax.envs.metaworld.rewards import caging, distance, hamacher, in_hand, near
 from mtjax.envs.metaworld.sawyer import Sawyer
 from mtjax.types import Array
@@ -28,7 +28,7 @@ def _arrange(host: Host, vec: np.ndarray, height: float, flask_at: tuple[float, 
     return {"target": np.array([*vec[3:5], height]), "stick_init_pos": stick, "obj_init": host.body("object")}
 
 
-def _show(at: At, flask: Array) -> tuple[Array, ...]:
+def _show(at: Observables, flask: Array) -> tuple[Array, ...]:
     """Return the stick's place and orientation, and the place (3,) that stands for the flask."""
     return at.position["stick"], scalar_last(at.quat["stick"]), flask, jnp.zeros(4)
 
@@ -55,10 +55,10 @@ class StickPush(Sawyer):
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
         return _arrange(host, vec, host.site("insertion")[2], (0.0, 0.0))
 
-    def objects(self, at: At) -> tuple[Array, ...]:
+    def objects(self, at: Observables) -> tuple[Array, ...]:
         return _show(at, at.position["handle"] + jnp.array([0.0, 0.09, 0.0]))
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         stick, flask, target = at.obs[4:7] + jnp.array([0.015, 0.0, 0.0]), at.obs[11:14], began["target"]
         away = distance(flask, target)
         stick_in_place = near(distance(stick, target), _RADIUS, distance(began["stick_init_pos"], target) - _RADIUS)
@@ -104,10 +104,10 @@ class StickPull(Sawyer):
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, np.ndarray]:
         return _arrange(host, vec, 0.02, (0.0, 0.09))
 
-    def objects(self, at: At) -> tuple[Array, ...]:
+    def objects(self, at: Observables) -> tuple[Array, ...]:
         return _show(at, at.position["handle"])
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         stick, handle, target = at.obs[4:7], at.obs[11:14], began["target"]
         to_flask, scale = jnp.array([0.05, 0.0, 0.0]), jnp.array([1.0, 1.0, 2.0])
         flask, flask_init, stick_init = handle + to_flask, began["obj_init"], began["stick_init_pos"]

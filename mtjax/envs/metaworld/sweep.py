@@ -7,8 +7,8 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.envs.metaworld.at import At, scalar_last
 from mtjax.envs.metaworld.host import Host
+from mtjax.envs.metaworld.observables import Observables, scalar_last
 from mtjax.envs.metaworld.rewards import distance, hamacher, near, pads_caging
 from mtjax.envs.metaworld.sawyer import Sawyer
 from mtjax.types import Array
@@ -16,7 +16,7 @@ from mtjax.types import Array
 _RADIUS = 0.05  # [m] of both targets
 
 
-def _sweep(at: At, began: Mapping[str, Array], target: Array, grip: float, xz: float) -> tuple[Array, Array]:
+def _sweep(at: Observables, began: Mapping[str, Array], target: Array, grip: float, xz: float) -> tuple[Array, Array]:
     """Return reward and success for a block swept to ``target`` (3,).
 
     Args:
@@ -51,10 +51,10 @@ class Sweep(Sawyer):
         host.place_free(block)
         return {"target": np.array([0.5, vec[1], 0.01]), "obj_init": block}
 
-    def objects(self, at: At) -> tuple[Array, ...]:
+    def objects(self, at: Observables) -> tuple[Array, ...]:
         return at.position["block"], at.quat["block"]
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         return _sweep(at, began, began["target"], grip=0.01, xz=0.005)
 
 
@@ -81,8 +81,8 @@ class SweepInto(Sawyer):
         host.place_free(block)
         return {"target": np.array(self.hole), "obj_init": block}
 
-    def objects(self, at: At) -> tuple[Array, ...]:
+    def objects(self, at: Observables) -> tuple[Array, ...]:
         return at.position["block"], scalar_last(at.quat["shape"])
 
-    def evaluate(self, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+    def evaluate(self, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
         return _sweep(at, began, began["target"].at[2].set(at.obs[6]), grip=0.005, xz=0.01)

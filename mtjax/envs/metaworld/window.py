@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from mtjax.envs.dm_control.rewards import tolerance
-from mtjax.envs.metaworld.at import At
 from mtjax.envs.metaworld.host import Host
+from mtjax.envs.metaworld.observables import Observables
 from mtjax.envs.metaworld.rewards import distance, hamacher, near
 from mtjax.envs.metaworld.sawyer import Sawyer
 from mtjax.types import Array
@@ -17,11 +17,11 @@ from mtjax.types import Array
 _RADIUS = 0.05  # [m] of the target, along x
 
 
-def _show(self: Sawyer, at: At) -> tuple[Array, ...]:
+def _show(self: Sawyer, at: Observables) -> tuple[Array, ...]:
     return at.position[self.handle], jnp.zeros(4)
 
 
-def _slide(self: Sawyer, at: At, began: Mapping[str, Array]) -> tuple[Array, Array]:
+def _slide(self: Sawyer, at: Observables, began: Mapping[str, Array]) -> tuple[Array, Array]:
     handle = at.position[self.handle]
     away = abs(handle[0] - began["target"][0])
     way = abs(began[self.way_from][0] - began["target"][0])

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from mtjax.types import Array
 
 
-class At(NamedTuple):
+class Observables(NamedTuple):
     """What a world shows after a step, as rewards read it. In ``objects`` there is no observation and no action yet."""
 
     obs: Array  # (39,) clipped as Meta-World's

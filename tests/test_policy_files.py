@@ -14,11 +14,11 @@ from test_export import ENV, observations, policy_of
 import mtjax
 import mtjax.evaluate
 from mtjax import agents
-from mtjax.command import ship as command
+from mtjax.command import add_pretrained as command
 from mtjax.command.run_config import parse
 from mtjax.report import films
 from mtjax.report.scoring import score
-from mtjax.saved import pretrained, ship
+from mtjax.saved import policy_files, pretrained
 from mtjax.training import finetune
 from mtjax.types import InputError
 
@@ -29,7 +29,7 @@ PAGE = Path(__file__).parents[1] / "docs/results/policies.md"
 def test_an_action_depends_on_what_is_kept_alone(name):
     """Whatever the other arrays of the state hold."""
     policy = policy_of(tiny(name))
-    read = ship.read_by_acting(policy)
+    read = policy_files.read_by_acting(policy)
     leaves, form = jax.tree.flatten(policy.state)
     other = [x if i in read else jnp.full_like(x, 3) for i, x in enumerate(leaves)]
     assert 0 < len(read) < len(leaves)
@@ -80,7 +80,7 @@ def test_a_run_with_a_policy_inside_stays_a_run(copied_run):
 
 
 def test_damaged_policies_are_refused(copied_run, package):
-    ship.write(copied_run, package / "a/b")
+    policy_files.write(copied_run, package / "a/b")
     file = package / "a/b/policy.npz"
     whole = file.read_bytes()
     for content, said in ((whole[:-50], "cannot be read"), (b"", "cannot be read")):
@@ -91,7 +91,7 @@ def test_damaged_policies_are_refused(copied_run, package):
     with pytest.raises(InputError, match="is of another agent"):
         mtjax.load("a/b")
     shutil.rmtree(package / "a/b")
-    ship.write(copied_run, package / "a/c")
+    policy_files.write(copied_run, package / "a/c")
     with pytest.raises(InputError, match="unknown run or trained policy 'a/b'; did you mean 'a/c'"):
         mtjax.load("a/b")
 
