@@ -14,7 +14,8 @@ from mtjax.saved import pretrained
 class Request:
     """Evaluate a trained run: ``python -m mtjax.evaluate --run=DIR``.
 
-    ``--env.vary.NAME=VALUES`` evaluates on other values of a parameter: lo:hi:n or a list a,b,c.
+    ``--env.vary.NAME=VALUES`` evaluates on other values of a parameter: lo:hi:n or a list a,b,c. ``--import=FILE``
+    reads a file of your own first, as the run did.
     """
 
     run: str = ""

@@ -321,7 +321,7 @@ def test_policies_of_other_shapes_do_not_teach():
     remembers = dataclasses.replace(taught_in(env, "rl2"), trial=3)
     several = (run, taught_in(env, actor_layer_norm=True))
     refused = {
-        (wide,): "the teacher maps 2 observed numbers to 2 actions; these tasks have 2 observed numbers and 1 actions",
+        (wide,): "the teacher maps 2 observed numbers to 2 continuous actions; these tasks have 2 observed",
         (taught_in(env, "maml"),): "maml adapts its policy to each task before it plays; it cannot teach",
         (remembers,): "the teacher remembers trials of 3 episodes; give --trials=3",
         several: "actor-layer-norm is the run's, False, and cannot be True",

@@ -148,13 +148,14 @@ def test_no_flag_is_refused_that_there_is(env, agent, ours):
 
 
 def test_flags_of_all_families_and_agents_are_known_without_jax(ours):
-    """All of them and no other name, with which of them are switches: what is misspelt is answered with a flag."""
+    """All of them and no other name, with which are switches of any: what is misspelt is answered with a flag."""
     choices = [{kind: name} for kind in CHOICES for name in PARTS[kind]] + [{"scaling": "ars", "reset_every": 100}]
     real = {"--help": False, "--import": False} | {f"--agent.{kind}": False for kind in CHOICES}
     real |= run_config.flags(mtjax.preset("cartpole-swingup+finger-spin", "sac"))
     for cls in {cls for cls, _ in ENVS.values()} | set(map(load, SUITES.values())):
-        fields = run_config.shared_fields(cls)
-        real |= {run_config.family_flag(field.name): isinstance(field.default, bool) for field in fields}
+        for field in run_config.shared_fields(cls):
+            flag = run_config.family_flag(field.name)
+            real[flag] = real.get(flag, False) or isinstance(field.default, bool)
     for agent, given in itertools.product(
         ("sac", "distral", "brc", "simba-v2", "xqc", "ppo", "impala", "pqn", "sketches", "options", "maml", "distil"),
         [{}, *choices],

@@ -99,6 +99,8 @@ def unknown_flag(flag: str, known: Mapping[str, bool]) -> InputError:
     """
     if flag == VARY.removesuffix("."):
         return InputError(f"{flag} needs the name of a parameter: {VARY}NAME=VALUES; --list says what varies")
+    if flag.startswith("--vary."):
+        return InputError(f"unknown flag {flag!r}; did you mean {flag.replace('--vary.', VARY)!r}?")
     every = sorted([*known, *(switched_off(other) for other, is_switch in known.items() if is_switch)])
     end = re.sub(r"^--([\w-]+\.)*", "-", flag)
     same_end = [other for other in every if other.replace(".", "-").endswith(end)]  # the name is right, or its end

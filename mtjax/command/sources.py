@@ -25,7 +25,7 @@ _UNPREFIXED = ("prefix_name=False", "_FLAG")  # in the types of settings whose f
 
 @functools.cache
 def all_flags() -> Mapping[str, bool]:
-    """Return every flag that some family or agent has, and whether it is a switch.
+    """Return every flag that some family or agent has, and whether it is a switch of any.
 
     They are read from the classes' source, because importing the classes would import JAX.
     """
@@ -35,7 +35,8 @@ def all_flags() -> Mapping[str, bool]:
         for file in [place] if place.is_file() else place.rglob("*.py"):
             for name, kind in _SETTING.findall(file.read_text(encoding="utf-8")):
                 prefix = "--" if any(mark in kind for mark in _UNPREFIXED) else group
-                found[prefix + as_flag(name)] = kind == "bool"
+                flag = prefix + as_flag(name)
+                found[flag] = found.get(flag, False) or kind == "bool"
     return found
 
 

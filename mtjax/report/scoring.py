@@ -47,7 +47,8 @@ class Evaluation(NamedTuple):
 
     def __repr__(self) -> str:
         """Return a line: the mean return of every split."""
-        means = [f"{split} {amount(x.mean())} ({x.shape[1]} tasks)" for split, x in self.returns.items() if x.size]
+        count = lambda x: f"{x.shape[1]} task{'s' * (x.shape[1] != 1)}"
+        means = [f"{split} {amount(x.mean())} ({count(x)})" for split, x in self.returns.items() if x.size]
         return f"Evaluation(return {', '.join(means)}; {len(self.seeds)} seed{'s' * (len(self.seeds) > 1)})"
 
     @public

@@ -20,6 +20,10 @@ _ARRAYS = ("Box", "Discrete", "MultiDiscrete", "MultiBinary")
 _NARROW = {"int64": "int32", "uint64": "uint32", "float16": "float32", "float64": "float32"}
 
 
+class WrongShape(ValueError):
+    """An observation has another shape than its space."""
+
+
 def reader_of(name: str, space: Any) -> "Reader | TreeReader":
     """Return what reads the observations of a space.
 
@@ -70,7 +74,7 @@ class Reader:
     def read_all(self, obs: np.ndarray) -> np.ndarray:
         """Return observations (k, ...) as rows (k, ...)."""
         if obs.shape[1:] != self.given:
-            raise ValueError(f"an observation has the shape {obs.shape[1:]}, and its space {self.given}")
+            raise WrongShape(f"gave an observation of shape {obs.shape[1:]}; its observation_space has {self.given}")
         if self.axes is None:
             return obs.astype(np.float32).reshape(len(obs), *self.shape)
         pictures = obs if obs.ndim == 4 else obs[..., None]
@@ -90,7 +94,7 @@ class Column:
     def read_all(self, obs: Any) -> np.ndarray:
         """Return arrays (k, ...) of this type."""
         if np.shape(obs)[1:] != self.shape:
-            raise ValueError(f"a part of an observation has the shape {np.shape(obs)[1:]}, and its space {self.shape}")
+            raise WrongShape(f"gave a part of an observation of shape {np.shape(obs)[1:]}; its space has {self.shape}")
         return np.asarray(obs, self.dtype)
 
 

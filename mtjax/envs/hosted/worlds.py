@@ -19,6 +19,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from mtjax.envs.engines import host
+from mtjax.envs.hosted.spaces import WrongShape
 
 _MOST_SETS = 2
 _numbers = itertools.count(int.from_bytes(os.urandom(4)) % 2**30 + 1)  # no other process has the same
@@ -161,7 +162,7 @@ def _fill(filled: Any, *values: Any) -> None:
 
 @contextlib.contextmanager
 def blaming(name: str) -> Iterator[None]:
-    """Name the environment in what its code raises, and the place there.
+    """Name the environment in what its code raises, and the place there; what only this package found has no place.
 
     Raises:
         Failure: anything was raised.
@@ -172,6 +173,8 @@ def blaming(name: str) -> Iterator[None]:
         raise
     except Exception as error:
         line = next(iter(str(error).strip().splitlines()), "")
+        if isinstance(error, WrongShape):
+            raise host.Failure(f"{name} {line}") from error
         last = traceback.extract_tb(error.__traceback__)[-1]
         told = f"{type(error).__name__}: {line}" if line else type(error).__name__
         raise host.Failure(f"{name} raised {told} ({last.filename}, line {last.lineno})") from error
