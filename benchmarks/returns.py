@@ -30,7 +30,7 @@ from resumable import train
 from mtjax.agents.choices import replace
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import configure, with_preset
-from mtjax.envs.mixtures import Tabled
+from mtjax.envs.mixtures import FamilyOrMixture
 from mtjax.learning.evaluation import Episodes, evaluate, save_evaluations
 from mtjax.names import replacing
 from mtjax.report.stats import seed_interval
@@ -127,7 +127,7 @@ def learn(arguments: argparse.Namespace, family: str) -> None:
     print({**found}, flush=True)
 
 
-def limited(family: Tabled, agent: Agent, result: Result, arguments: argparse.Namespace) -> float | None:
+def limited(family: FamilyOrMixture, agent: Agent, result: Result, arguments: argparse.Namespace) -> float | None:
     """Return the mean return of extrapolation with ``context_limit=1``."""
     tasks, seeds = family.tasks("extrapolation"), arguments.seed + jnp.arange(arguments.seeds)
     if not len(tasks.id):

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from mtjax.agents import BaseAgent
 from mtjax.compiling.programs import compile_lowered, jit_programs
-from mtjax.envs.mixtures import Tabled
+from mtjax.envs.mixtures import FamilyOrMixture
 from mtjax.learning.loop import Settings
 from mtjax.parallel import mesh as meshes
 
@@ -23,7 +23,12 @@ class Training:
     """
 
     def __init__(
-        self, family: Tabled, agent: BaseAgent, settings: Settings, seeds: int = 1, most_devices: int | None = None
+        self,
+        family: FamilyOrMixture,
+        agent: BaseAgent,
+        settings: Settings,
+        seeds: int = 1,
+        most_devices: int | None = None,
     ):
         env, num_tasks, experience = family, family.train_count, agent.experience
         mesh = meshes.mesh_for(seeds, num_tasks, settings.num_envs, most_devices)

@@ -33,6 +33,7 @@ def policy_of(way, env, trial=3):
     return Policy(env, agent, state, states, jnp.asarray([0]), trial=trial)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
 def test_what_is_believed_is_what_the_policy_remembers_through_a_trial(way):
     """Before each step of all episodes, a memory that is begun once: what networks see of it."""

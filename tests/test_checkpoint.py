@@ -251,6 +251,7 @@ def test_every_flipped_bit_of_a_record_is_noticed(copied_run):
     assert 0 < refused < 300
 
 
+@pytest.mark.slow
 def test_what_changed_in_a_record_is_told(copied_run):
     """By name, and where the run's state is read; nothing is said of more steps, nor where there is no copy."""
     file = copied_run / "config.json"

@@ -17,7 +17,7 @@ import jax
 import numpy as np
 import pytest
 from conftest import SHORT_RUN
-from probes import FEW, OFF_POLICY, family_for, one_in
+from probes import FEW, OFF_POLICY, family_for, one_in, slow_but
 
 import mtjax.evaluate
 import mtjax.train
@@ -289,7 +289,7 @@ def test_a_short_run_is_not_all_warm_up():
     assert (whole.learner.experience.warmup_steps, whole.training.chunk_steps, whole.plan.eval_every) == (2000, 500, 0)
 
 
-@pytest.mark.parametrize("agent", ["drq", "sac-ae", "deepmdp"])
+@pytest.mark.parametrize("agent", slow_but(["drq", "sac-ae", "deepmdp"], "drq"))
 def test_pictures_have_a_preset_of_their_own(agent):
     """It holds for every agent with a replay, from Python as on the command line."""
     expected = load_preset("+", "gpu")["pictures"] | load_preset("finger-spin", "gpu")["pictures"]
@@ -577,6 +577,7 @@ def test_damaged_checkpoints_are_refused(complaint, copied_run):
     assert sorted(copied_run.rglob("*")) == before
 
 
+@pytest.mark.slow
 def test_record_of_another_version_is_told(complaint, finished_run, tmp_path):
     """Where it cannot be read; and one that can is read."""
     record = json.loads((finished_run / "config.json").read_text())

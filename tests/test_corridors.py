@@ -205,6 +205,7 @@ def test_dense_rewards_add_up_to_the_way():
     assert step.terminated
 
 
+@pytest.mark.slow
 def test_who_follows_the_ways_arrives():
     """From 64 starts in four mazes: turn to the next cell's middle, and walk when it is ahead. Rewards add up."""
     env = CorridorMaze(vary={"layout": "0:3:4"}, dense=True)

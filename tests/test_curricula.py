@@ -146,6 +146,7 @@ def test_a_state_of_other_tasks_knows_these_alone():
     np.testing.assert_array_equal(head(found), head(state)[np.asarray([1, 0, 1, 0, 1])])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, given", [("multi-head", REPLAY), param(("disjoint", REPLAY), slow=True), param(("ppo", ROLLOUTS), slow=True)]
 )

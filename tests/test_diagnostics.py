@@ -91,6 +91,7 @@ def gradients_by_hand(agent, state, batch):
     return [np.float64(np.stack(x)) for x in zip(*rows, strict=True)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["sac-conditioned", "multi-head", "disjoint"])
 def test_gradients_are_those_of_each_task_alone(name):
     """Gram matrix, cosines, conflict and lengths of both networks; without shared parameters lengths alone."""

@@ -130,6 +130,7 @@ def taught_by(agent, env, *runs, seeds=1):
     return agent, adopt(runs, agent, tasks, begun(agent, env.spec, tasks, seeds))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("several", [False, True])
 def test_a_teacher_says_in_each_task_what_its_own_run_would_do(several):
     """With networks, statistics and numbers of tasks of the run's seed, seed number k modulo theirs."""
@@ -149,6 +150,7 @@ def test_a_teacher_says_in_each_task_what_its_own_run_would_do(several):
         np.testing.assert_allclose(found.outputs, same.outputs, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_teacher_that_remembers_hears_of_every_step():
     """Whoever took it: its memory is that of playing these actions itself."""
     env = aim("-1:1:3")
@@ -224,6 +226,7 @@ def test_a_learner_comes_to_act_as_its_teacher():
     np.testing.assert_allclose(last_returns(result), expected, atol=0.03)
 
 
+@pytest.mark.slow
 def test_one_that_remembers_finds_out_what_its_teacher_knows():
     """One that does not plays between what is best in each task, at -0.36 a step."""
     env = Guess("by-action")

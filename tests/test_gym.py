@@ -290,6 +290,7 @@ def test_mtenvs_names_are_understood():
     assert "finger-spin-vary-touch-size" in known and len(mtjax.gym.MTENV_IDS) == 8
 
 
+@pytest.mark.slow
 def test_families_of_hip_bmdp_are_seen_as_mtenv_shows_them():
     """Three pictures of 84 x 84 pixels, and 500 steps of two control steps; without pictures the same steps."""
     env = mtjax.gym.make("MT-HiPBMDP-Walker-Walk-vary-len-v0")

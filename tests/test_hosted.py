@@ -290,6 +290,7 @@ def test_what_an_environment_raises_ends_the_run_after_its_checkpoint(tmp_path, 
     assert last.is_dir() and str(last) in str(told.value) and isinstance(told.value.__cause__, ZeroDivisionError)
 
 
+@pytest.mark.slow
 def test_a_resumed_run_begins_new_episodes_and_says_so(run, tmp_path, capsys, monkeypatch):
     """As another process does, which knows none of the worlds. Episodes that were cut off do not count."""
     copy = shutil.copytree(run, tmp_path / "copy")

@@ -254,6 +254,7 @@ def test_seeds_do_not_touch_each_other():
     assert not np.allclose(kernel[0], kernel[1])
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes():
     """State and metrics; another seed gives others."""
     first, second, other = (learn((seed,)) for seed in (3, 3, 4))

@@ -465,6 +465,7 @@ def widened(params: Params, like: Params, rows: np.ndarray, outputs: np.ndarray 
     return jax.tree_util.tree_map_with_path(place, params, like)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "constants"), one_in(2, [("sac", 0), ("simba-v2", 1), ("xqc", 0)]))
 def test_losses_of_a_padded_task_are_those_of_the_task_alone(name, constants, monkeypatch):
     """A task with 2 observed numbers and 1 action, in networks of 4 and 3 that hold the same weights, and zeros."""
@@ -551,6 +552,7 @@ def test_every_agent_learns_a_mixture(name):
     assert action.shape == (4, 2) and metrics["td_error"].shape == (4,)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", one_in(3, ["distral", "hip-bmdp", "brc", "xqc", "simba-v2", "pcgrad"]))
 def test_an_update_is_finite_and_acts_where_there_are_actions(name):
     agent = tiny(name, normalize_observations=True, discounting="horizon")

@@ -254,6 +254,7 @@ def test_c_agrees_with_itself_under_every_nesting_of_maps(worlds):
         assert_same(alone, jax.tree.map(lambda x, i=i: x[i], mapped))
 
 
+@pytest.mark.slow
 def test_c_follows_a_change_of_tasks_between_calls(size_contacts, programs):
     """A batch that served some tasks serves the same number of others, and remembers nothing of the first."""
     tasks, world, action = size_contacts

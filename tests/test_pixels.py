@@ -52,6 +52,7 @@ def test_observation_is_the_newest_picture_and_the_state_family_s_own():
         np.testing.assert_allclose(ours.reward, theirs.reward, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_stacks_repeat_the_first_picture_and_then_move_on():
     env = pictured()
     single, stacks = play(env, ACTIONS), play(mtjax.stacked(env), ACTIONS)

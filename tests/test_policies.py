@@ -259,6 +259,7 @@ def test_ppo_learns_tabular_mdps(optimum):
             assert found >= 0.97 * reward(rewards, transitions, best), (i, last, found)
 
 
+@pytest.mark.slow
 def test_ppo_finds_the_best_arm_of_every_task():
     env = mtjax.make("bandit", num_tasks=3)
     result = mtjax.train(env, "ppo", steps=30_000, num_envs=8, quiet=True, eval_episodes=1, hidden=(32,))

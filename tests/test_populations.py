@@ -173,6 +173,7 @@ def chosen():
     return state, first, second
 
 
+@pytest.mark.slow
 def test_a_copy_is_its_source_to_the_bit(chosen):
     """Networks, targets and optimisers; worlds, replay and keys stay, and so does all of the other members."""
     state, first, _ = chosen

@@ -562,6 +562,7 @@ RUN = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("row", one_in(2, RUN), ids=lambda row: "-".join(map(str, row.values())))
 def test_updates_are_finite_and_the_key_decides(row):
     agent = small(**row)

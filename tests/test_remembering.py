@@ -47,6 +47,7 @@ def packed():
     return states("packnet", 4, retrain_updates=3)
 
 
+@pytest.mark.slow
 def test_packnet_forgets_nothing_to_the_bit(packed):
     """Of a task, from where the next one begins on, though all of them learn; also when the first comes again."""
     (first, second, third, again), agent = packed
@@ -70,6 +71,7 @@ def test_packnet_numbers_tasks_as_they_end_and_shares_weights_out(packed):
     assert not any(np.any(x.shared["retraining"]) for x in held)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, given",
     [("ewc", {"fisher_samples": 32}), *(param(case, slow=True) for case in (("l2", {}), ("mas", {"mas_samples": 32})))],

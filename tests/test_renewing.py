@@ -39,6 +39,7 @@ def outputs(agent, state, batch):
     return agent.policy_outputs(nets, batch.features[0], batch.obs[0])
 
 
+@pytest.mark.slow
 def test_redo_renews_idle_units_and_changes_no_output():
     """And the optimiser's moments around them are 0, those of others as they were."""
     agent, state, batch = made("redo", redo_every=1, dormant_threshold=0.0)

@@ -360,6 +360,7 @@ def test_a_folder_that_holds_a_run_is_not_overwritten(play, whole):
     assert rows_of(whole.directory) == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EROFS])
 def test_a_checkpoint_that_cannot_be_written_ends_the_run(play, whole, tmp_path, monkeypatch, number):
     """With reason and path. The one before stays, and the run goes on from there once there is room."""
@@ -545,6 +546,7 @@ def test_the_clock_counts_without_going_through_the_chunks():
     assert run._Run._clock(one, 0).chunks == 10**15
 
 
+@pytest.mark.slow
 def test_both_clocks_go_on(play, tmp_path):
     """Though another process resumes the run."""
     play(tmp_path, steps=400)

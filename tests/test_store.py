@@ -258,6 +258,7 @@ def test_a_run_goes_on_bit_for_bit(whole, tmp_path, lost):
     assert {name: found[name] for name in expected} == expected
 
 
+@pytest.mark.slow
 def test_lost_steps_are_told_and_the_run_goes_on(tmp_path):
     """Without those before the file that is damaged; their segments are no longer drawn."""
     play(tmp_path / "run", 10)

@@ -65,6 +65,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_a_film_of_sub_policies_has_strips_and_a_figure(name, tmp_path, monkeypatch):
     """Of worlds in which they act; others have none."""

@@ -201,6 +201,7 @@ def test_moving_worlds_are_those_of_films(finished_run):
     assert np.any(filmed[0] != filmed[3])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("opengl")
 def test_pictures_are_streamed_by_the_task(server):
     """As parts that replace each other; three tasks in a grid, or one that is larger."""

@@ -150,6 +150,7 @@ def test_no_slope_reaches_the_statistics():
         assert leaves and not any(np.any(x) for x in leaves)
 
 
+@pytest.mark.slow
 @EVERY_HEADS
 def test_weights_begin_and_stay_on_the_sphere(heads):
     """Of hidden layers and outputs; not those that add the task's features."""
