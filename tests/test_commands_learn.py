@@ -106,7 +106,7 @@ MARKS: dict[str, Learns | str] = {
     "--resume=runs/... --steps=8000000": _OTHER,
     "--env=finger-spin-vary-size --env.vary.size=1.15:1.2:4 --split=none --from=runs/... --tune=all": _OTHER,
     "--env=point-mass-vary-goal --agent=distil --agent.conditioning=recurrent --from=runs/...": _OTHER,
-    "--env=finger-spin --env.vary.size=0.95,1.13 --split=none --agent=distil --from=runs/thin,runs/thick": _OTHER,
+    "--env=finger-spin --env.vary.size=0.95,1.13 --split=none --agent=distil --from=runs/...,runs/...": _OTHER,
     "--import=lever.py --env=lever --agent=sac-conditioned --steps=400000": _OTHER,
     "--seeds=5 --sweep agent.actor-lr=1e-4,3e-4,1e-3 agent.num-critics=2,4": _MANY,
     "--population=pbt:100000 --seeds=5 --sweep agent.actor-lr=1e-4,1e-3 agent.critic-lr=1e-4,1e-3": _COPIES,
