@@ -140,7 +140,8 @@ def tell_edits(file: Path, copy: Path) -> None:
         return notice(f"{error}. So it is unknown whether {str(file)!r} was edited; it is used as it is")
     longer = _with_steps(then, now["plan"].get("steps"))
     values, before = _entries(now), _entries(longer if longer.get("command") == now.get("command") else then)
-    names = [name for name in {**before, **values} if values.get(name) != before.get(name)]
+    value_of = lambda entries, name: entries.get(name, ...)  # None is a value too
+    names = [name for name in {**before, **values} if value_of(values, name) != value_of(before, name)]
     if not names:
         return
     short = lambda value: textwrap.shorten(json.dumps(value), _LONGEST)
