@@ -1,8 +1,6 @@
 """Environments of Craftax: survival, crafts and dungeons in open worlds."""
 
 import dataclasses
-from collections.abc import Mapping
-from functools import cached_property
 from typing import Any, ClassVar
 
 import jax
@@ -13,7 +11,6 @@ from mtjax.frames import PICTURES
 from mtjax.names import nearest_error
 from mtjax.types import Array, Discrete, InputError, Key, Task
 
-_LIMIT = "max_timesteps"
 _NEVER = 2**31 - 1
 _PLACES = {  # those that begin no episode by themselves
     "Craftax-Symbolic-v1": ("craftax.envs.craftax_symbolic_env", "CraftaxSymbolicEnvNoAutoReset"),
@@ -45,11 +42,10 @@ class Craftax(Adapted):
 
     suite: ClassVar[str] = "craftax"
     package: ClassVar[str] = "craftax"
+    limit: ClassVar[str] = "max_timesteps"
     install: ClassVar[str] = "pip install craftax"
 
-    @cached_property
-    def original(self) -> tuple[Any, Any]:
-        """Return Craftax's environment and its nominal parameters."""
+    def made(self) -> tuple[Any, Any]:
         _ = self.module()
         if self.environment not in _PLACES:
             raise nearest_error("environment of Craftax", self.environment, _PLACES)
@@ -59,33 +55,20 @@ class Craftax(Adapted):
             if found is None:
                 raise InputError(f"this version of Craftax has no {name}; pip install 'craftax>=1.5'")
             made = found()
-        params = made.default_params
-        return made, params.replace(**{_LIMIT: self.time_limit or getattr(params, _LIMIT)})
-
-    @property
-    def defaults(self) -> Mapping[str, Any]:
-        values = {field.name: getattr(self.original[1], field.name) for field in dataclasses.fields(self.original[1])}
-        return {name: x for name, x in values.items() if isinstance(x, int | float) and name != _LIMIT}
-
-    @property
-    def episode_length(self) -> int:
-        """Return the steps after which an episode is cut off."""
-        return getattr(self.original[1], _LIMIT)
+        return made, made.default_params
 
     @property
     def action(self) -> Discrete:  # type: ignore[override]
         return Discrete(self.original[0].num_actions)
 
     def begin(self, task: Task, key: Key) -> tuple[Any, Any]:
-        found, nominal = self.original
-        obs, world = found.reset_env(key, nominal.replace(**self.params_of(task)))
+        obs, world = self.original[0].reset_env(key, self.own_params(task))
         return world, _seen(obs)
 
     def advance(self, task: Task, world: Any, action: Array, key: Key) -> tuple[Any, Any, Array, Array, Array]:
-        found, nominal = self.original
-        own = nominal.replace(**self.params_of(task))
+        found, own = self.original[0], self.own_params(task)
         obs, new, reward, over, _ = found.step_env(key, world, action, own)
-        terminated = found.is_terminal(new, own.replace(**{_LIMIT: _NEVER}))
+        terminated = found.is_terminal(new, own.replace(**{self.limit: _NEVER}))
         return new, _seen(obs), reward, terminated, over & ~terminated
 
 

@@ -38,6 +38,7 @@ class Adapted(Acting, Family):
     suite: ClassVar[str]  # the first part of its name in mtjax
     package: ClassVar[str]  # what is imported
     install: ClassVar[str]  # the command that installs it
+    limit: ClassVar[str]  # the package's name of the parameter that is its time limit
 
     def __post_init__(self):
         if not 0 <= self.time_limit <= _MOST_STEPS:
@@ -46,10 +47,9 @@ class Adapted(Acting, Family):
 
     # What a family gives.
 
-    @property
     @abc.abstractmethod
-    def defaults(self) -> Mapping[str, Any]:
-        """Return the parameters that can vary, by the package's names, with their nominal values."""
+    def made(self) -> tuple[Any, Any]:
+        """Make the package's environment, and its parameters as they come."""
 
     @abc.abstractmethod
     def begin(self, task: Task, key: Key) -> tuple[Any, Any]:
@@ -63,6 +63,24 @@ class Adapted(Acting, Family):
         """
 
     # What every family does.
+
+    @cached_property
+    def original(self) -> tuple[Any, Any]:
+        """Return the package's environment and its nominal parameters, with the time limit that was asked for."""
+        found, params = self.made()
+        return found, params.replace(**{self.limit: self.time_limit or int(getattr(params, self.limit))})
+
+    @property
+    def defaults(self) -> Mapping[str, Any]:
+        """Return the parameters that can vary, by the package's names, with their nominal values: here all numbers."""
+        params = self.original[1]
+        values = {field.name: getattr(params, field.name) for field in dataclasses.fields(params)}
+        return {name: x for name, x in values.items() if isinstance(x, int | float) and name != self.limit}
+
+    @property
+    def episode_length(self) -> int:
+        """Return the steps after which an episode is cut off."""
+        return getattr(self.original[1], self.limit)
 
     @classmethod
     def module(cls, part: str = "") -> Any:
@@ -93,10 +111,11 @@ class Adapted(Acting, Family):
         key = jax.random.split(state.key)[1]
         return _strong_step(AdaptedState(world, key), obs, reward, terminated, truncated)
 
-    def params_of(self, task: Task) -> dict[str, Array]:
-        """Return the parameters that a task has of its own, by the package's names and in its types."""
-        names = {name.replace("_", "-"): name for name in self.defaults}
-        return {names[name]: _as_default(self.defaults[names[name]], value) for name, value in task.params.items()}
+    def own_params(self, task: Task) -> Any:
+        """Return the package's parameters of a task, in the package's types."""
+        names, nominal = {name.replace("_", "-"): name for name in self.defaults}, self.defaults
+        own = {names[name]: _as_default(nominal[names[name]], value) for name, value in task.params.items()}
+        return self.original[1].replace(**own)
 
     @property
     def name(self) -> str:

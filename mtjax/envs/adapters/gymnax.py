@@ -1,7 +1,6 @@
 """Environments of gymnax: classic control, MinAtar, bsuite and others."""
 
 import dataclasses
-from collections.abc import Mapping
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -12,8 +11,6 @@ import numpy as np
 from mtjax.envs.adapters.family import Adapted
 from mtjax.names import nearest_error
 from mtjax.types import Action, Array, Continuous, Discrete, InputError, Key, Task
-
-_LIMIT = "max_steps_in_episode"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,11 +31,10 @@ class Gymnax(Adapted):
 
     suite: ClassVar[str] = "gymnax"
     package: ClassVar[str] = "gymnax"
+    limit: ClassVar[str] = "max_steps_in_episode"
     install: ClassVar[str] = "pip install six seaborn && pip install --no-deps 'gymnax>=1.0'"
 
-    @cached_property
-    def original(self) -> tuple[Any, Any]:
-        """Return gymnax's environment and its nominal parameters."""
+    def made(self) -> tuple[Any, Any]:
         module = self.module()
         if self.environment not in module.registered_envs:
             raise nearest_error("environment of gymnax", self.environment, module.registered_envs)
@@ -46,18 +42,7 @@ class Gymnax(Adapted):
             found, params = module.make(self.environment)
         if not hasattr(found, "is_truncated"):
             raise InputError(f"gymnax tells terminated from cut off since version 1.0; {self.install}")
-        limit = self.time_limit or int(getattr(params, _LIMIT))
-        return found, params.replace(**{_LIMIT: limit})
-
-    @property
-    def defaults(self) -> Mapping[str, Any]:
-        values = {field.name: getattr(self.original[1], field.name) for field in dataclasses.fields(self.original[1])}
-        return {name: x for name, x in values.items() if isinstance(x, int | float) and name != _LIMIT}
-
-    @property
-    def episode_length(self) -> int:
-        """Return the steps after which an episode is cut off."""
-        return getattr(self.original[1], _LIMIT)
+        return found, params
 
     @cached_property
     def action(self) -> Action:  # type: ignore[override]
@@ -71,13 +56,11 @@ class Gymnax(Adapted):
             return found.action_space(params)
 
     def begin(self, task: Task, key: Key) -> tuple[Any, Any]:
-        found, nominal = self.original
-        obs, world = found.reset_env(key, nominal.replace(**self.params_of(task)))
+        obs, world = self.original[0].reset_env(key, self.own_params(task))
         return world, obs
 
     def advance(self, task: Task, world: Any, action: Array, key: Key) -> tuple[Any, Any, Array, Array, Array]:
-        (found, nominal), space = self.original, self._actions
-        own = nominal.replace(**self.params_of(task))
+        found, own, space = self.original[0], self.own_params(task), self._actions
         if not self.discrete:
             middle, half = (jnp.asarray(space.high) + space.low) / 2, (jnp.asarray(space.high) - space.low) / 2
             action = middle + jnp.clip(action, -1, 1).reshape(space.shape) * half

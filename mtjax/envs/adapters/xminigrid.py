@@ -39,11 +39,10 @@ class XMiniGrid(Adapted):
 
     suite: ClassVar[str] = "xminigrid"
     package: ClassVar[str] = "xminigrid"
+    limit: ClassVar[str] = "max_steps"
     install: ClassVar[str] = "pip install --no-deps xminigrid"
 
-    @cached_property
-    def original(self) -> tuple[Any, Any]:
-        """Return XLand-MiniGrid's environment and its parameters."""
+    def made(self) -> tuple[Any, Any]:
         module = self.module()
         if self.environment not in module.registered_environments():
             known = module.registered_environments()
@@ -54,16 +53,11 @@ class XMiniGrid(Adapted):
             raise InputError(f"{self.environment} needs rulesets: --env.rulesets=FILE, or a name such as trivial-21k")
         if self.rulesets and not hasattr(params, "ruleset"):
             raise InputError(f"{self.environment} has no rulesets; leave them out")
-        return found, params.replace(max_steps=self.time_limit or int(params.max_steps))
+        return found, params
 
     @property
     def defaults(self) -> Mapping[str, Any]:
         return {"ruleset": 0} if hasattr(self.original[1], "ruleset") else {}
-
-    @property
-    def episode_length(self) -> int:
-        """Return the steps after which an episode is cut off."""
-        return self.original[1].max_steps
 
     @cached_property
     def action(self) -> Discrete:  # type: ignore[override]
@@ -97,15 +91,15 @@ class XMiniGrid(Adapted):
 
     def begin(self, task: Task, key: Key) -> tuple[Any, Any]:
         found = self.original[0]
-        timestep = found.reset(self._params(task), key)
+        timestep = found.reset(self.own_params(task), key)
         return timestep, self._seen(timestep.observation)
 
     def advance(self, task: Task, world: Any, action: Array, key: Key) -> tuple[Any, Any, Array, Array, Array]:
-        new = self.original[0].step(self._params(task), world, action)
+        new = self.original[0].step(self.own_params(task), world, action)
         terminated = new.discount == 0
         return new, self._seen(new.observation), new.reward, terminated, new.last() & ~terminated
 
-    def _params(self, task: Task) -> Any:
+    def own_params(self, task: Task) -> Any:
         params = self.original[1]
         return params.replace(ruleset=params.ruleset.replace(**task.goal)) if self.defaults else params
 
