@@ -34,6 +34,12 @@ def play(family, task, original, steps=1000):
     return jax.device_get(whole())
 
 
+def own_params(nominal, task, **limit):
+    """A package's parameters of a task, in the types of its nominal ones."""
+    values = {name.replace("-", "_"): x for name, x in task.params.items()}
+    return nominal.replace(**{name: type(getattr(nominal, name))(x) for name, x in values.items()}, **limit)
+
+
 @needs("gymnax")
 @pytest.mark.parametrize(
     ("name", "settings", "kinds"),
@@ -54,10 +60,7 @@ def test_steps_of_gymnax_are_the_originals(name, settings, kinds):
     low, high = (getattr(environment.action_space(nominal), end, 0) for end in ("low", "high"))
     for row in range(family.train_count):
         task = jax.tree.map(lambda x, row=row: x[row], family.tasks("train"))
-        values = {
-            key.replace("-", "_"): type(getattr(nominal, key.replace("-", "_")))(x) for key, x in task.params.items()
-        }
-        params = nominal.replace(max_steps_in_episode=family.episode_length, **values)
+        params = own_params(nominal, task, max_steps_in_episode=family.episode_length)
 
         def original(state, action, params=params):
             given = action if family.discrete else low + (action + 1) / 2 * (high - low)
@@ -91,10 +94,7 @@ def test_steps_of_craftax_are_the_originals(name, settings):
     nominal, ends = environment.default_params, np.zeros(2)
     for row in range(family.train_count):
         task = jax.tree.map(lambda x, row=row: x[row], family.tasks("train"))
-        values = {
-            key.replace("-", "_"): type(getattr(nominal, key.replace("-", "_")))(x) for key, x in task.params.items()
-        }
-        params = nominal.replace(max_timesteps=family.episode_length, **values)
+        params = own_params(nominal, task, max_timesteps=family.episode_length)
 
         def original(state, action, params=params):
             obs, world, reward, over, _ = environment.step(state.key, state.world, action, params)

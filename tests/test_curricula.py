@@ -1,6 +1,7 @@
 """Curricula: which of the known tasks are played, and what that leaves of the others."""
 
 import csv
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -176,15 +177,26 @@ def test_a_choice_of_all_tasks_learns_the_same_as_all(monkeypatch):
     jax.tree.map(np.testing.assert_array_equal, of_plain, of_found)
 
 
+def whole_and_resumed(env, place, steps, cut, **given):
+    """The results of a run of so many steps, and of one that is cut and goes on."""
+    given |= {"num_envs": 2, "unroll": 10, "minibatches": 1, "epochs": 1, "eval_episodes": 1, "hidden": (8,)}
+    train = partial(mtjax.train, env, "ppo", quiet=True, **given)
+    whole = train(steps=steps, directory=place / "whole")
+    train(steps=cut, directory=place / "cut")
+    return whole, train(steps=steps, directory=place / "cut", resume=True)
+
+
+def require_same(one, other):
+    """Every leaf is the same to the bit."""
+    jax.tree.map(np.testing.assert_array_equal, jax.device_get(one), jax.device_get(other))
+
+
 @pytest.mark.slow
 def test_a_run_by_a_sequence_is_recorded_by_known_tasks_and_resumes_to_the_bit(tmp_path):
     """A task without episodes has an empty column; the state of a resumed run is that of one without a stop."""
-    given = {"num_envs": 2, "chunk_steps": 150, "curriculum": "sequence:150", "quiet": True, "unroll": 10}
-    given |= {"minibatches": 1, "epochs": 1, "eval_every": 600, "eval_episodes": 1, "hidden": (8,), "num_tasks": 3}
-    whole = mtjax.train("bandit", "ppo", steps=1200, directory=tmp_path / "whole", **given)
-    mtjax.train("bandit", "ppo", steps=600, directory=tmp_path / "cut", **given)
-    again = mtjax.train("bandit", "ppo", steps=1200, directory=tmp_path / "cut", resume=True, **given)
-    jax.tree.map(np.testing.assert_array_equal, jax.device_get(whole.state.agent), jax.device_get(again.state.agent))
+    given = {"chunk_steps": 150, "curriculum": "sequence:150", "eval_every": 600, "num_tasks": 3}
+    whole, again = whole_and_resumed("bandit", tmp_path, 1200, 600, **given)
+    require_same(whole.state.agent, again.state.agent)
     with (tmp_path / "whole" / "metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [[bool(row[f"return_{k}"]) for k in range(3)] for row in rows[:3]] == np.eye(3, dtype=bool).tolist()
@@ -194,14 +206,10 @@ def test_a_run_by_a_sequence_is_recorded_by_known_tasks_and_resumes_to_the_bit(t
 @pytest.mark.slow
 def test_a_run_that_heeds_returns_resumes_to_the_bit(tmp_path):
     """What was heard is in its checkpoints."""
-    given = {"num_envs": 2, "chunk_steps": 100, "curriculum": "progress:2:100", "quiet": True, "unroll": 10}
-    given |= {"minibatches": 1, "epochs": 1, "eval_every": 1200, "eval_episodes": 1, "hidden": (8,), "num_tasks": 5}
-    whole = mtjax.train("bandit", "ppo", steps=2400, directory=tmp_path / "whole", **given)
-    mtjax.train("bandit", "ppo", steps=1200, directory=tmp_path / "cut", **given)
-    again = mtjax.train("bandit", "ppo", steps=2400, directory=tmp_path / "cut", resume=True, **given)
+    given = {"chunk_steps": 100, "curriculum": "progress:2:100", "eval_every": 1200, "num_tasks": 5}
+    whole, again = whole_and_resumed("bandit", tmp_path, 2400, 1200, **given)
     for name in ("agent", "heard", "rows"):
-        one, two = (jax.device_get(getattr(result.state, name)) for result in (whole, again))
-        jax.tree.map(np.testing.assert_array_equal, one, two)
+        require_same(getattr(whole.state, name), getattr(again.state, name))
     assert np.isfinite(whole.state.heard).all()
 
 
@@ -248,13 +256,10 @@ def test_tasks_from_scratch_begin_a_new_agent_where_a_task_ends():
 
 @pytest.mark.slow
 def test_a_mixtures_tasks_are_played_in_turn_and_a_run_resumes_to_the_bit(tmp_path):
-    given = {"num_envs": 2, "chunk_steps": 150, "curriculum": "sequence:150", "quiet": True, "unroll": 10}
-    given |= {"minibatches": 1, "epochs": 1, "eval_every": 600, "eval_episodes": 1, "hidden": (8,)}
     env = mtjax.mixture([mtjax.make("bandit", num_tasks=2), mtjax.make("two-goal-maze")])
-    whole = mtjax.train(env, "ppo", steps=900, directory=tmp_path / "whole", **given)
-    mtjax.train(env, "ppo", steps=600, directory=tmp_path / "cut", **given)
-    again = mtjax.train(env, "ppo", steps=900, directory=tmp_path / "cut", resume=True, **given)
-    jax.tree.map(np.testing.assert_array_equal, jax.device_get(whole.state.agent), jax.device_get(again.state.agent))
+    given = {"chunk_steps": 150, "curriculum": "sequence:150", "eval_every": 600}
+    whole, again = whole_and_resumed(env, tmp_path, 900, 600, **given)
+    require_same(whole.state.agent, again.state.agent)
     assert [[bool(row[f"return_{k}"]) for k in range(3)] for row in whole.rows[:3]] == np.eye(3, dtype=bool).tolist()
 
 

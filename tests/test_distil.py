@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from probes import QUICK, Probe, pick, quick, tasks_of, tiny, train_objects
-from test_finetune import Aim, WideAim, bits
+from test_finetune import bits, named_aims
 
 import mtjax
 import mtjax.train
@@ -18,7 +18,6 @@ from mtjax.agents.distil import Batch, teaching
 from mtjax.agents.state import of_task
 from mtjax.agents.teacher import Teacher
 from mtjax.command import run_config
-from mtjax.envs import ENVS
 from mtjax.learning.evaluation import Episodes, evaluate
 from mtjax.saved.config_json import from_json, to_flags, to_json
 from mtjax.saved.policy import Policy
@@ -85,15 +84,9 @@ def test_the_divergence_of_continuous_actions_by_hand():
 
 
 @pytest.fixture(autouse=True)
-def aims(monkeypatch):
-    """Families by name; and programs that compile fast, out of the user's cache."""
-    before = jax.config.read("jax_disable_most_optimizations")
-    monkeypatch.setitem(ENVS, "aim", (Aim, {"vary": {"goal": "-1:1:3"}, "split": "none"}))
-    monkeypatch.setitem(ENVS, "aim-wide", (WideAim, {"vary": {"goal": "-1:1:3"}, "split": "none"}))
-    monkeypatch.setenv("MTJAX_CACHE", "0")
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", before)
+def aims():
+    with named_aims():
+        yield
 
 
 def aim(goals):

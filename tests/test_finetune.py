@@ -1,5 +1,6 @@
 """Fine-tuning: what of a run goes on in another, for which tasks, what stays as it was, and what is refused."""
 
+import contextlib
 import dataclasses
 import json
 from typing import ClassVar, NamedTuple
@@ -67,8 +68,8 @@ BASE = (
 ).split()
 
 
-@pytest.fixture(scope="module", autouse=True)
-def aims():
+@contextlib.contextmanager
+def named_aims():
     """Families by name; and programs that compile fast, out of the user's cache."""
     quick = jax.config.read("jax_disable_most_optimizations")
     with pytest.MonkeyPatch.context() as patch:
@@ -78,6 +79,12 @@ def aims():
         jax.config.update("jax_disable_most_optimizations", True)
         yield
         jax.config.update("jax_disable_most_optimizations", quick)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def aims():
+    with named_aims():
+        yield
 
 
 def train(runs, *words):

@@ -34,13 +34,14 @@ class Batch(NamedTuple):
 class Distil(BaseAgent):
     """Distil trains one policy to act as trained ones do (Rusu et al. 2016; Omidshafiei et al. 2017, second phase).
 
-    ``--from`` names the teachers: one run of several tasks, whose policy may see them, or several runs, each of which
-    teaches the tasks that it was trained on. A teacher's policy of a task is pi_T, and the loss
+    ``--from`` names the teachers: one run, or several. One run teaches all tasks, and its policy may see which it
+    plays. Of several runs each teaches the tasks that it was trained on. A teacher's policy of a task is pi_T, and the
+    loss
         L = KL(pi_T(s) | pi(s))
     averaged over the steps of a rollout, then over tasks. With discrete actions pi_T is softmax(z / tau), where z are
     the outputs of a teacher's policy, or the values of all actions of one that learns values, such as pqn, and tau is
     ``teacher_temperature``: 0.01 in Rusu et al., whose teachers are values. With continuous ones both policies are
-    Gaussians before the same tanh, of which the divergence has a closed form. Rewards are not learned from.
+    Gaussians before the same tanh, and their divergence has a closed form. Rewards are not learned from.
 
     The policy that learns plays its own rollouts, and its teacher says in each state what it would do (Ross et al.
     2011, "DAgger"). So it learns in the states to which its own mistakes lead. A share of the steps

@@ -1,5 +1,6 @@
 """What families have whose actions are choices, or that say themselves which actions they take."""
 
+import abc
 import dataclasses
 
 import jax.numpy as jnp
@@ -11,9 +12,9 @@ class Acting:
     """What a family has that says by ``action`` which actions it takes. Derive from this and ``Family``."""
 
     @property
+    @abc.abstractmethod
     def action(self) -> Action:
         """Return the kind and the size of actions."""
-        raise NotImplementedError
 
     @property
     def action_size(self) -> int:

@@ -4,9 +4,11 @@ An agent knows all N training tasks: its own parameters of each, its features an
 T are played at a time. The tasks of a chunk follow from the step at which it begins, so that a run resumes exactly.
 """
 
+import abc
 import contextlib
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import jax
@@ -85,7 +87,7 @@ class Heeding:
     """Some tasks are chosen by what was heard of all: the returns of the policy that learns, as means over seeds.
 
     Of each task (N, 2) a fast and a slow mean over the chunks that played it are kept, NaN before its first episode has
-    ended. A task that was never heard of comes first, and a share of the choices is random, so that none is forgotten.
+    ended.
     """
 
     played: int
@@ -96,33 +98,39 @@ class Heeding:
     def rows(self, step: Array, known: int) -> Array:
         return self.choose(step, nothing_heard(known))
 
+    @abc.abstractmethod
     def choose(self, step: Array, heard: Array) -> Array:
         """Return the numbers (T,) int32 of the tasks that are played from a step () on, given what was heard (N, 2)."""
+
+
+def _most_urgent(urgency: Callable[[Array], Array]) -> Callable[..., Array]:
+    """Return the ``choose`` of tasks (N,) by how much each should be played; the greatest are.
+
+    A task that was never heard of comes first, and a share of the choices is random, so that none is forgotten.
+    """
+
+    def choose(self: Heeding, step: Array, heard: Array) -> Array:
         order_key, random_key = jax.random.split(_key(step // self.steps))
         known, order = len(heard), jax.random.uniform(order_key, heard.shape[:1])
         anyway = jax.random.uniform(random_key, heard.shape[:1]) < _RANDOM * self.played / known
-        urgency = jnp.where(anyway | jnp.isnan(heard[:, 0]), jnp.inf, self.urgency(heard))
-        return jnp.lexsort((order, -urgency))[: self.played].astype(jnp.int32)
+        urgent = jnp.where(anyway | jnp.isnan(heard[:, 0]), jnp.inf, urgency(heard))
+        return jnp.lexsort((order, -urgent))[: self.played].astype(jnp.int32)
 
-    def urgency(self, heard: Array) -> Array:
-        """Return how much each task (N,) should be played; the greatest are."""
-        raise NotImplementedError
+    return choose
 
 
 @dataclasses.dataclass(frozen=True)
 class Progress(Heeding):
     """Tasks are played whose returns change most, up or down: |fast - slow| (Matiisen et al. 2017)."""
 
-    def urgency(self, heard: Array) -> Array:
-        return jnp.abs(heard[:, 0] - heard[:, 1])
+    choose = _most_urgent(lambda heard: jnp.abs(heard[:, 0] - heard[:, 1]))
 
 
 @dataclasses.dataclass(frozen=True)
 class Hardest(Heeding):
     """Tasks are played whose returns are least. They must be of one scale in all tasks."""
 
-    def urgency(self, heard: Array) -> Array:
-        return -heard[:, 0]
+    choose = _most_urgent(lambda heard: -heard[:, 0])
 
 
 @dataclasses.dataclass(frozen=True)

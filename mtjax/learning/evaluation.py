@@ -322,6 +322,11 @@ class Recording(NamedTuple):
     option: Array | None = None  # (T, H) int32 number of the option that acted in each step, if the agent has options
 
 
+def span_of(lengths: Any, episode: int) -> tuple[int, int]:
+    """Return the first step of one of a trial's episodes, and how many it has, given the lengths (K,) of all."""
+    return int(np.sum(lengths[:episode])), int(lengths[episode])
+
+
 def keep_states(worlds: Worlds, transition: Transition) -> Any:
     """Keep the states of the environment after each step."""
     return worlds.state

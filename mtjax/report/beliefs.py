@@ -188,7 +188,7 @@ def _draw_told(axes: "Axes", found: Believed, name: str, predicted: np.ndarray, 
 
 
 def _worth_telling(foretold: dict[str, tuple[np.ndarray, np.ndarray]]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Return those predictions of which something else than 0 came, those of single numbers first."""
+    """Return the predictions of what was not always 0. Those of single numbers come first."""
     told = {name: each for name, each in foretold.items() if np.any(np.nan_to_num(each[1]))}
     return dict(sorted(told.items(), key=lambda item: item[1][1].ndim))
 

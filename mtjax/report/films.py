@@ -19,7 +19,7 @@ from mtjax.envs.engines import host
 from mtjax.envs.mixtures import FamilyOrMixture, apart
 from mtjax.envs.pixels import Pictured
 from mtjax.envs.task_table import Part
-from mtjax.learning.evaluation import Recording, record
+from mtjax.learning.evaluation import Recording, record, span_of
 from mtjax.names import InputError
 from mtjax.report import render, timeline
 from mtjax.report.timeline import Timeline
@@ -156,7 +156,7 @@ def moving(
     with contextlib.ExitStack() as opened:
         tiles = [opened.enter_context(_drawing(env, one, played, by_name[one.part.name], width)) for one in chosen]
         draw = lambda time: grid(captioned([tile(time)[None] for tile in tiles], captions), columns)[0]
-        yield max(_span(played, one)[1] / _steps_per_second(one) for one in chosen), draw
+        yield max(span_of(played.lengths[one.place], one.episode)[1] / _steps_per_second(one) for one in chosen), draw
 
 
 @contextlib.contextmanager
@@ -165,7 +165,7 @@ def _drawing(
 ) -> Iterator[Callable[[float], np.ndarray]]:
     """Give a function that draws one task at a time [s]; the last frame stays after the episode's end."""
     family: Any = one.part.family
-    row, (first, length) = env.own_row(int(played.rows[one.place])), _span(played, one)
+    row, (first, length) = env.own_row(int(played.rows[one.place])), span_of(played.lengths[one.place], one.episode)
     shown, size = jax.tree.map(lambda x: x[one.own][first : first + length], states), (width, width * 3 // 4)
     kept = lambda i: family.pictures(jax.tree.map(lambda x: x[i : i + 1], shown), *size)[0]
     opened = render.drawing(family, row, shown, *size) if isinstance(family, Pictured) else nullcontext(kept)
@@ -194,12 +194,6 @@ def _episodes(chosen: Sequence[Chosen], played: Recording) -> tuple[list[Chosen]
     return [one._replace(episode=episode) for one in chosen for episode in shown], len(shown) * (trial > 1)
 
 
-def _span(played: Recording, one: Chosen) -> tuple[int, int]:
-    """Return the first step of an episode, and how many it has."""
-    lengths = played.lengths[one.place]
-    return int(np.sum(lengths[: one.episode])), int(lengths[one.episode])
-
-
 def _caption(env: FamilyOrMixture, one: Chosen, played: Recording, named: Mapping[str, str]) -> tuple[str, str]:
     """Return the lines on a task: its split and return, and its parameters."""
     row = int(played.rows[one.place])  # continuous ranges have a row for each episode
@@ -219,7 +213,7 @@ def _tile(
 ) -> np.ndarray:
     """Return the frames (F, height, width, 3) of an episode, at most ``count``, with its strip of sub-policies."""
     family: Any = one.part.family
-    row, (first, length) = env.own_row(int(played.rows[one.place])), _span(played, one)
+    row, (first, length) = env.own_row(int(played.rows[one.place])), span_of(played.lengths[one.place], one.episode)
     times = np.arange(count) / _FPS * _steps_per_second(one)
     step_of = np.minimum(times.astype(int), length - 1)
     steps = np.unique(step_of)

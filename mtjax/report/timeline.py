@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from mtjax.envs.craft.sketched import Sketched, due_in
 from mtjax.envs.mixtures import FamilyOrMixture
-from mtjax.learning.evaluation import Recording
+from mtjax.learning.evaluation import Recording, span_of
 
 # Six colours of Okabe and Ito, which colour-blind readers can tell apart; then lighter and darker ones of these.
 _PALETTE = ((0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (230, 159, 0), (86, 180, 233))
@@ -78,8 +78,8 @@ def strips(timeline: Timeline, task: int, steps: Sequence[int], width: int, epis
         steps: (F,) the step of the episode that each picture is of.
         episode: of the trial.
     """
-    lengths = timeline.lengths[task]
-    acting = timeline.acting[task, np.sum(lengths[:episode]) :][: lengths[episode]]
+    first, length = span_of(timeline.lengths[task], episode)
+    acting = timeline.acting[task, first : first + length]
     line, palette = max(width // 14, 13), colours(len(timeline.names))
     font, scale = ImageFont.load_default(max(width // 22, 9)), width / len(acting)
     bar = Image.new("RGB", (width, 2 * line), "black")

@@ -227,7 +227,7 @@ class _Answers(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def _stream(self, split: str, number: int) -> None:
-        """Send pictures, of which each takes the place of the one before."""
+        """Send pictures. Each takes the place of the one before."""
         self._begin(f"multipart/x-mixed-replace; boundary={_EDGE}")
         edge = f"--{_EDGE}\r\n".encode()
         self.server.streams.add(threading.current_thread())

@@ -7,6 +7,7 @@ import os
 import re
 import time
 from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,7 +26,7 @@ _OF_TASK = re.compile(r"\w+_\d+")
 
 
 class Metrics:
-    """The lines of metrics.csv, of which each is read once, as the run appends them."""
+    """Holds the lines of metrics.csv. Each is read once, when the run has appended it."""
 
     def __init__(self, path: Path):
         self.path, self.file, self.read_to = path, 0, 0
@@ -96,7 +97,7 @@ class Watched(NamedTuple):
         )
 
     def _progress(self) -> dict[str, Any]:
-        """Return steps, how many there will be, seconds, those that are left, and whether a process goes on."""
+        """Return the steps made and planned, the seconds gone and left, and whether a process runs."""
         rows, total = self.metrics.rows[-_RECENT * self.config.members :], self.config.length * self.config.worlds
         found: dict[str, Any] = {"seeds": self.config.members, "total": total, "running": lock.is_held(self.directory)}
         if not rows:
@@ -109,8 +110,9 @@ class Watched(NamedTuple):
 
     def _evaluations(self) -> Evaluations | None:
         """Return the run's evaluations; None if there are none yet, or their file cannot be read."""
-        with contextlib.suppress(InputError):
-            return load_evaluations(self.directory / "evaluations.npz")
+        file = self.directory / "evaluations.npz"
+        with contextlib.suppress(InputError, FileNotFoundError):
+            return _read_evaluations(file, file.stat().st_mtime_ns)
         return None
 
     def _tasks(self, evaluations: Evaluations | None) -> list[dict[str, Any]]:
@@ -128,6 +130,12 @@ class Watched(NamedTuple):
                 last = {"trained": _last(trained), "scored": _last(scored[:, t])}
                 found.append({**about, **last, "curve": trained if len(trained) else scored[:, t]})
         return found
+
+
+@lru_cache(1)
+def _read_evaluations(file: Path, written: int) -> Evaluations:
+    """Read evaluations once for each time at which their file was written."""
+    return load_evaluations(file)
 
 
 def _last(x: np.ndarray) -> Any:

@@ -35,6 +35,16 @@ def is_pretrained(directory: Path) -> bool:
     return (directory / FILE).is_file() and not (directory / "checkpoints").exists()
 
 
+def require_learning(directory: Path | None) -> None:
+    """Refuse the folder of a policy that cannot go on learning; None is of a run that wrote none.
+
+    Raises:
+        InputError: it holds a policy alone.
+    """
+    if directory is not None and is_pretrained(directory):
+        raise not_learning(str(directory))
+
+
 def not_learning(name: str) -> InputError:
     """Return an error for a trained policy that should go on learning."""
     return InputError(f"{name!r} is a policy without critics and replay, so it cannot go on learning")

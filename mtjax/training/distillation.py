@@ -57,8 +57,7 @@ def require_teachers(config: RunConfig, starts: Sequence[Policy] | None) -> None
 
 def _require_policy(start: Policy, config: RunConfig) -> None:
     """Refuse a policy that does not map what the learner sees to its actions, or has to adapt before it plays."""
-    if start.directory is not None and pretrained.is_pretrained(start.directory):
-        raise pretrained.not_learning(str(start.directory))
+    pretrained.require_learning(start.directory)
     theirs, ours, agent = start.env.spec, config.family.spec, start.agent
     if frames.seen(theirs) != frames.seen(ours) or theirs.action != ours.action or theirs.mixed != ours.mixed:
         raise InputError(

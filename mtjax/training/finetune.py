@@ -46,8 +46,7 @@ def require_fit(start: Policy, env: Env, agent: BaseAgent) -> None:
         InputError: the agent differs from the run's, the tasks have other sizes or another context, or the policy comes
             with the package.
     """
-    if start.directory is not None and pretrained.is_pretrained(start.directory):
-        raise pretrained.not_learning(str(start.directory))
+    pretrained.require_learning(start.directory)
     require_same_agent(start.agent, agent)
     for each in (env, start.env):
         require_family(each, NO_FINE_TUNING)
