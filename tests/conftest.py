@@ -2,7 +2,6 @@
 
 import dataclasses
 import gc
-import math
 import os
 import shutil
 import sys
@@ -111,7 +110,13 @@ def shape_of(tree):
 
 
 def pytest_collection_finish():
-    """Never search what was imported and collected for garbage again: it lives as long as the process."""
+    """Search for garbage between files alone, and never again in what lives on: traces hold very many objects."""
+    keep_what_lives()
+    gc.disable()
+
+
+def keep_what_lives():
+    """Collect the garbage, and leave what is no garbage now out of later searches."""
     gc.collect()
     gc.freeze()
 
@@ -181,37 +186,41 @@ def compiled(env) -> Programs:
     return Programs(jax.jit(jax.vmap(env.reset)), jax.jit(put), jax.jit(jax.vmap(env.step)))
 
 
-MOST_MAPPINGS, MOST_BYTES = 15_000, 1.5e9  # of 65,530 that Linux gives a process, and of memory
-
-
-def os_memory() -> float:
-    """Return the memory of this process, in bytes."""
-    statm = Path("/proc/self/statm")
-    return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") if statm.is_file() else math.inf
+MOST_MAPPINGS = 45_000  # of the 65,530 that Linux gives a process
+MOST_BYTES, MOST_MEMORY = 4e9, 1 / 6  # of memory, and of the machine's, which at most four processes share
 
 
 def is_full() -> bool:
     """Return whether this process holds many programs: each takes some mappings of memory."""
-    mappings = Path("/proc/self/maps")  # other systems have none, and neither that limit
-    held = mappings.read_text().count("\n") if mappings.is_file() else MOST_MAPPINGS
-    return held >= MOST_MAPPINGS or os_memory() > MOST_BYTES
+    mappings, statm = Path("/proc/self/maps"), Path("/proc/self/statm")
+    if not statm.is_file():  # other systems do not tell
+        return True
+    most = min(MOST_BYTES / os.sysconf("SC_PAGE_SIZE"), MOST_MEMORY * os.sysconf("SC_PHYS_PAGES"))
+    return int(statm.read_text().split()[1]) > most or mappings.read_text().count("\n") >= MOST_MAPPINGS
+
+
+def caches_of_tests():
+    """Return the functions of test files that keep what they returned."""
+    files = [module for name, module in sys.modules.items() if name.startswith("test_")]
+    own = [x for file in files for x in vars(file).values() if getattr(x, "__module__", None) == file.__name__]
+    return [x for x in own if hasattr(x, "cache_clear")]
 
 
 @pytest.fixture(scope="module", autouse=True)
-def forget_programs(request):
-    """Drop what a file has compiled and cached after it, and what JAX has, once the process is full.
+def forget_programs():
+    """Drop what files have compiled and cached, and what JAX has, once the process is full.
 
     What is free by then goes back to the system. A worker kept gigabytes of it. Until then the next file finds
     the small programs of JAX's own functions, which every file would compile again.
     """
     yield
     if not is_full():
-        return
-    own = [x for x in vars(request.module).values() if getattr(x, "__module__", None) == request.module.__name__]
-    for cached in (compiled, probes._programs, probes._agent_programs, *own):
-        getattr(cached, "cache_clear", lambda: None)()
+        return keep_what_lives()
+    gc.unfreeze()
+    for cached in (compiled, probes._programs, probes._agent_programs, *caches_of_tests()):
+        cached.cache_clear()
     jax.clear_caches()
-    gc.collect()
+    keep_what_lives()
     give_back_pages()
 
 
