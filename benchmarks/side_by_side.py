@@ -8,12 +8,17 @@ OTHER is the root of another checkout, say of an older commit. What follows ``--
 same Python. Milliseconds are of one iteration: the median over chunks, without the first one and those of the warm-up,
 then the least over repeats, as whatever else a machine does only adds to them. ``--cold`` gives every run an empty
 cache, so that seconds of compiling are those of a first run; otherwise each checkout keeps a cache of its own.
+
+``--curves DIR`` also compares what they learn, with an ``--eval-every`` and several seeds: mean returns on the training
+tasks at every evaluation, differences over pairs of seeds of one number with 95% intervals, and whether all returns
+are the same to the bit. It keeps both files of returns in DIR.
 """
 
 import argparse
 import csv
 import os
 import re
+import shutil
 import statistics
 import subprocess
 import sys
@@ -21,9 +26,13 @@ import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 from report import markdown, publish
 
+from mtjax.report.stats import paired_difference
+
 HERE = Path(__file__).resolve().parent.parent
+HEAD = ["agent", "seeds", "steps of each", "other", "this", "this less other"]
 
 
 class Timing(NamedTuple):
@@ -41,11 +50,14 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--ours", nargs="*", default=[], help="flags for this checkout alone")
     parser.add_argument("--cold", action="store_true", help="begin each run with an empty cache")
+    parser.add_argument("--curves", type=Path, help="compare returns too, and keep them in this folder")
     parser.add_argument("--json", help="write the figures to this file")
     words = [*sys.argv[1:], "--"]
     own, flags = words[: words.index("--")], words[words.index("--") + 1 : -1]
     arguments = parser.parse_args(own)
     arguments.flags = flags
+    if arguments.curves:
+        arguments.curves.mkdir(parents=True, exist_ok=True)
     if not (arguments.other / "mtjax" / "train.py").exists():
         parser.error(f"{str(arguments.other)!r} is no checkout of mtjax")
     rows = [row for agent in arguments.agents for seeds in arguments.seeds for row in compare(arguments, agent, seeds)]
@@ -77,7 +89,29 @@ def compare(arguments: argparse.Namespace, agent: str, seeds: int) -> list[dict]
                 cache = Path(place) / f"{name}-{repeat if arguments.cold else 0}"
                 found[name].append(run(root, given, Path(place) / f"{name}-runs-{repeat}", cache))
                 print(agent, seeds, name, found[name][-1], flush=True)
+        if arguments.curves:
+            print(markdown(HEAD, curves(agent, *(keep(arguments.curves, agent, name, place) for name in checkouts))))
     return [row(agent, seeds, name, timings) for name, timings in found.items()]
+
+
+def keep(folder: Path, agent: str, name: str, place: str) -> Path:
+    """Copy the returns of a checkout's first run into ``folder``, and return the file."""
+    (file,) = Path(place).glob(f"{name}-runs-0/*/evaluations.npz")
+    return Path(shutil.copyfile(file, folder / f"{agent}-{name}.npz"))
+
+
+def curves(agent: str, other: Path, this: Path) -> list[list[str]]:
+    """Return a line for each evaluation: mean returns on the training tasks, and differences over pairs of seeds."""
+    with np.load(other) as before, np.load(this) as after:
+        steps, before, after = after["steps"], before["train"], after["train"]  # (S, evaluations, T, episodes)
+    lines = []
+    for step, ours, theirs in zip(steps, np.moveaxis(after, 1, 0), np.moveaxis(before, 1, 0), strict=True):
+        gap = paired_difference(ours, theirs)
+        shown = (
+            "the same bits" if np.array_equal(ours, theirs) else f"{gap.point:+.2f} [{gap.low:+.2f}, {gap.high:+.2f}]"
+        )
+        lines.append([agent, str(len(ours)), f"{step:,}", f"{theirs.mean():.2f}", f"{ours.mean():.2f}", shown])
+    return lines
 
 
 def row(agent: str, seeds: int, name: str, timings: list[Timing]) -> dict:

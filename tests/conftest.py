@@ -231,6 +231,13 @@ def forget_worlds():
     c._batches.clear()
 
 
+@pytest.fixture
+def optimised(monkeypatch):
+    """Let XLA optimise a run, in this process or in one that the test starts: it runs for longer than it compiles."""
+    flags = os.environ.get("XLA_FLAGS", "").split()
+    monkeypatch.setenv("XLA_FLAGS", " ".join(x for x in flags if x.strip("-").split("=")[0] not in QUICK_FLAGS))
+
+
 @pytest.fixture(scope="session")
 def programs():
     return compiled

@@ -43,6 +43,7 @@ def returns_of(name, **settings):
     return result.evaluations.returns["train"][0, -1].mean(axis=-1)
 
 
+@pytest.mark.usefixtures("optimised")
 @pytest.mark.parametrize("name", EVERY)
 def test_every_agent_reaches_every_goal(name):
     """At least 75 of some 95 on each."""

@@ -25,6 +25,7 @@ def test_notebook_shows_its_results(path):
     assert path.stat().st_size < LARGEST
 
 
+@pytest.mark.usefixtures("optimised")
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 @pytest.mark.filterwarnings("ignore")  # the kernel's own machinery, in this process, is not ours

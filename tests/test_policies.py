@@ -239,6 +239,7 @@ def optimum():
     return optimal, reward
 
 
+@pytest.mark.usefixtures("optimised")
 @pytest.mark.slow
 def test_ppo_learns_tabular_mdps(optimum):
     """Its greedy actions in every state return at least 97% of what value iteration's do, in every task."""

@@ -422,6 +422,7 @@ def test_memory_lives_through_a_trial_and_is_new_after_it():
     assert 0 < closed.sum() < np.asarray(rows.ended).sum() / 2
 
 
+@pytest.mark.usefixtures("optimised")
 @pytest.mark.slow
 @pytest.mark.parametrize("way", ["varibad", "pearl"])
 def test_a_belief_explores_as_well_as_can_be(way):

@@ -114,6 +114,7 @@ def process_of(tasks, i, gamma=0.9):
     return best
 
 
+@pytest.mark.usefixtures("optimised")
 @pytest.mark.slow
 def test_greedy_actions_are_those_of_value_iteration():
     """In every state of every process, and values to 0.1 of 5 to 10."""

@@ -135,6 +135,7 @@ def test_sac_learns_from_windows_that_begin_with_the_stored_state():
     assert not np.allclose(update(steps), update(other)) and np.allclose(update(steps), update(later))
 
 
+@pytest.mark.usefixtures("optimised")
 @pytest.mark.slow
 def test_a_memory_explores_as_well_as_can_be():
     """Ten pulls of two arms that every trial draws: within 3% of the best strategy, which earns 6.02; told 6.67."""

@@ -234,6 +234,7 @@ def test_a_command_switches_off_what_a_preset_has_and_packnet_refuses():
         run_config.parse(words)
 
 
+@pytest.mark.usefixtures("optimised")
 @pytest.mark.slow
 def test_fine_tuning_forgets_where_packnet_does_not():
     """Of four goals, the first: what its mean return of three seeds, at most 100, loses by the end of the third."""
