@@ -126,8 +126,7 @@ class MAML(OnPolicy):
         """Add advantages and targets to rollouts (T, H, E, ...), and fit the critic's units to them."""
         return clipped.assess(self, state, steps, tasks, self.experience.apart)
 
-    def gain(self, log_ratio: Array, batch: Batch) -> tuple[Array, Metrics]:
-        return clipped.gain(log_ratio, batch.advantage, self.clip_range)
+    gain = clipped.gain
 
     def actor_loss(self, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:
         played = Played.of(batch, self.experience.inner_steps + 1)
