@@ -203,9 +203,9 @@ class Options(OnPolicy):
         ends = over_tasks(partial(ending, self), state.nets, features, next_obs, taken.now.option)
         upon = arrival(then, taken.now.option, ends, self.deliberation_cost)
         in_order = partial(played, shape=steps.reward.shape, length=self.unroll)
-        reward = in_order(critics.rewards(self, state, flat, tasks))
-        value, of_before = (in_order(at_option(here.options, option)) for option in (taken.now.option, taken.before))
-        next_value, of_state = map(in_order, (upon, here.state))
+        of_option, reward = at_option(here.options, taken.now.option), critics.rewards(self, state, flat, tasks)
+        known = of_option, upon, reward, here.state, at_option(here.options, taken.before)
+        value, next_value, reward, of_state, of_before = map(in_order, known)
         advantage = clipped.gae(self, tasks, steps._replace(reward=reward), value, next_value)
         target = value + advantage
         state, units = critics.renew(self, state, target)
