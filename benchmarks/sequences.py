@@ -38,7 +38,7 @@ from matplotlib.figure import Figure
 from report import markdown, record, run_main, write_lines
 from returns import value
 
-from mtjax.agents.parts.renewing import PLASTICITY
+from mtjax.agents.parts.plasticity import PLASTICITY
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import configure, with_preset
 from mtjax.report import figures, sequences, stats

@@ -10,7 +10,6 @@ from test_ppo import BEST, KNOWN, SCALES, random_steps
 from mtjax import agents
 from mtjax.agents import critics
 from mtjax.agents.parts import targets
-from mtjax.agents.units import Units
 from mtjax.envs.probes import Probe
 from mtjax.experience import rollouts
 from mtjax.types import InputError, Spec
@@ -30,7 +29,7 @@ def test_a_batch_holds_vtrace_of_the_present_policy_and_critic():
     state, steps = agent.init(SPEC, TASKS, KEY), random_steps(agent)
     window = rollouts.windows(steps, agent.unroll)
     after, batch = quick(agent.prepare, state, window, TASKS)(state, window, TASKS)
-    units = Units.of(after.nets["units"])
+    units = critics.Units.of(after)
 
     def of_world(nets, features, one):
         value, following = (agent.output(nets, features, x) for x in (one.obs, one.next_obs))

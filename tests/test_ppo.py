@@ -27,6 +27,7 @@ from probes import (
 from mtjax import agents
 from mtjax.agents import clipped, critics, normalize
 from mtjax.agents.base import Memory
+from mtjax.agents.critics import Units
 from mtjax.agents.networks import OVER_TASKS
 from mtjax.agents.on_policy import Batch, Taken
 from mtjax.agents.parts import targets
@@ -39,7 +40,6 @@ from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.scaling.base import Moments
 from mtjax.agents.ppo import PPO, within
-from mtjax.agents.units import Units
 from mtjax.agents.view import init_inputs
 from mtjax.config import with_preset
 from mtjax.envs.probes import Probe, tasks_of
@@ -336,10 +336,10 @@ def test_units_are_moments_of_all_targets_at_first(kind):
     state, obs = agent.init(SPEC, TASKS, KEY), jnp.float32(np.random.default_rng(0).normal(size=(3, 5, 3)))
     targets = jnp.float32(np.random.default_rng(0).normal(size=(2, 3, 50)) * 7 + [[[3], [100], [0]]])
     targets = targets.at[1].multiply(2)
-    state = critics.renew(agent, state, targets[0])
+    state, _ = critics.renew(agent, state, targets[0])
     before = critics.values(agent, state, TASKS.context, obs)
-    state = critics.renew(agent, state, targets[1])
-    units = Units.of(state.nets["units"])
+    state, _ = critics.renew(agent, state, targets[1])
+    units = Units.of(state)
     if kind == "none":
         assert units.count == 0 and np.all(units.std == 1)
         return
@@ -350,7 +350,7 @@ def test_units_are_moments_of_all_targets_at_first(kind):
     assert np.allclose(before, after, atol=1e-3) == (kind == "popart")
 
     many = with_nets(state, units=units._replace(count=jnp.float32(500)).params())
-    moved = Units.of(critics.renew(agent, many, targets[0]).nets["units"]).moments
+    moved = critics.renew(agent, many, targets[0])[1].moments
     np.testing.assert_allclose(moved.mean, 0.9 * units.moments.mean + 0.1 * targets[0].mean(axis=1), rtol=1e-4)
 
 
@@ -364,7 +364,7 @@ def test_targets_are_in_the_units_in_which_outputs_are_read(kind):
         steps = steps._replace(reward=10 + 5 * seed * steps.reward)
         state, batch, _ = assessed(agent, state, steps, TASKS)
         value = critics.values(agent, before, batch.features, batch.obs)
-        units, old = (Units.of(x.nets["units"]) for x in (state, before))
+        units, old = (Units.of(x) for x in (state, before))
         np.testing.assert_allclose(units.rewards(batch.target), value + batch.advantage, rtol=1e-4, atol=1e-3)
     assert (kind == "none") == bool(jnp.all(units.moments.mean == old.moments.mean))
 

@@ -10,7 +10,7 @@ import mtjax
 from mtjax.agents import consolidating, renewing
 from mtjax.agents.networks import Params
 from mtjax.agents.parts import put
-from mtjax.agents.parts.renewing import Nothing
+from mtjax.agents.parts.plasticity import Nothing
 from mtjax.types import InputError
 
 TASKS = Walk().tasks()

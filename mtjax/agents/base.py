@@ -17,9 +17,9 @@ from mtjax.agents.parts.encoders import Encoder
 from mtjax.agents.parts.gradients import descent, surgery
 from mtjax.agents.parts.knowing import Knowing, last_steps
 from mtjax.agents.parts.knowing.last_steps import Past
+from mtjax.agents.parts.plasticity import Plasticity
 from mtjax.agents.parts.policies import Gaussian, Policy
-from mtjax.agents.parts.remembering import Remembering
-from mtjax.agents.parts.renewing import Renewing
+from mtjax.agents.parts.remembering import Continual
 from mtjax.agents.parts.representations import Representation
 from mtjax.agents.parts.samplers import Sampler
 from mtjax.agents.parts.scaling import Scaling
@@ -110,9 +110,9 @@ class BaseAgent(abc.ABC):
     """Whether tasks share what knows them even where each has networks of its own."""
     least_loss: ClassVar[float] = 0.0
     """Lower bound of the critics' loss of a task, without what the representation adds."""
-    continual: ClassVar[Remembering] = Remembering()
+    continual: ClassVar[Continual] = Continual()
     """How the actor remembers tasks that it learned one after another."""
-    plasticity: ClassVar[Renewing] = Renewing()
+    plasticity: ClassVar[Plasticity] = Plasticity()
     """What keeps the networks able to learn."""
     taught: ClassVar[bool] = False
     """Whether it learns from the policies of other runs, which --from names, instead of going on with theirs."""

@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents import critics
+from mtjax.agents.critics import MIN_STD, Units
 from mtjax.agents.parts import targets
 from mtjax.agents.rates import discounts_of_all
 from mtjax.agents.state import AgentState
-from mtjax.agents.units import MIN_STD, Units
 from mtjax.experience.rollouts import played, windows
 from mtjax.parallel.collectives import mean_and_variance
 from mtjax.types import Array, Metrics, Task, Transition
@@ -39,29 +39,26 @@ def assess(
         apart: splits the steps where they are several rollouts, each with advantages of its own: leaves (T, R, H, E).
     """
     flat, features, obs, next_obs = agent.view.steps(state, windows(steps, agent.unroll), tasks)
-    old, output = Units.of(state.nets["units"]), critics.outputs(agent, state, features, obs)
+    old, output = Units.of(state), critics.outputs(agent, state, features, obs)
     following, reward = critics.values(agent, state, features, next_obs), critics.rewards(agent, state, flat, tasks)
     found = old.rewards(output), following, output, reward
     in_order = partial(played, shape=steps.reward.shape, length=agent.unroll)
     value, next_value, output, reward = map(in_order, found)
     advantage, scaled = advantages(agent, steps._replace(reward=reward), tasks, value, next_value, apart)
     target = value + advantage
-    state = critics.renew(agent, state, target.reshape(len(target), -1))
-    units = Units.of(state.nets["units"])
+    state, units = critics.renew(agent, state, target)
     if agent.value_normalization == "popart":
         factor, offset = (x[:, None, None] for x in old.change(units))
         output = factor * output + offset
-    taken = steps.extras
-    extras = Assessed(taken.raw, taken.log_prob, scaled, value, output, units.outputs(target))
-    return state, steps._replace(extras=extras)
+    new = {"advantage": scaled, "value": value, "output": output, "target": units.outputs(target)}
+    return state, steps._replace(extras=Assessed(**steps.extras._asdict(), **new))
 
 
 def advantages(
     agent: Any, steps: Transition, tasks: Task, value: Array, next_value: Array, apart: Callable[[Any], Any] | None
 ) -> tuple[Array, Array]:
     """Compute the advantages (T, H, E) of a rollout, or of several as ``apart`` splits them; and these normalised."""
-    of_task = partial(targets.gae, lambda_=agent.gae_lambda)
-    of_rollout = lambda *data: jax.vmap(of_task)(*data, discounts_of_all(agent, tasks))  # type: ignore
+    of_rollout = partial(gae, agent, tasks)
     normalize = partial(normalized, agent.advantage_normalization)
     if apart is None:
         advantage = of_rollout(steps, value, next_value)
@@ -70,10 +67,14 @@ def advantages(
     return advantage.reshape(value.shape), jax.vmap(normalize, 1, 1)(advantage).reshape(value.shape)
 
 
+def gae(agent: Any, tasks: Task, steps: Transition, value: Array, next_value: Array) -> Array:
+    """Compute the generalised advantages (T, H, E) of a rollout."""
+    of_task = jax.vmap(partial(targets.gae, lambda_=agent.gae_lambda))
+    return of_task(steps, value, next_value, discounts_of_all(agent, tasks))
+
+
 def normalized(how: Normalization, advantage: Array) -> Array:
     """Scale advantages (T, H, E) to mean 0 and standard deviation 1: never, over all tasks together, or in each."""
-    if how == "none":
-        return advantage
     mean, spread = moments(how, advantage)
     return (advantage - mean) / spread
 
@@ -86,8 +87,9 @@ def moments(how: Normalization, advantage: Array) -> tuple[Array, Array]:
     return mean, jnp.maximum(jnp.sqrt(variance), MIN_STD)
 
 
-def gain(log_ratio: Array, advantage: Array, clip_range: float | Array) -> tuple[Array, Metrics]:
-    """Return the gain of steps (B,), min(ratio A, clip(ratio, 1 - epsilon, 1 + epsilon) A), with metrics."""
+def gain(self: Any, log_ratio: Array, batch: Any) -> tuple[Array, Metrics]:
+    """Return an agent's gain of steps (B,), min(ratio A, clip(ratio, 1 - epsilon, 1 + epsilon) A), with metrics."""
     ratio = jnp.exp(log_ratio)
-    clipped = jnp.clip(ratio, 1 - clip_range, 1 + clip_range)
-    return jnp.minimum(ratio * advantage, clipped * advantage), {"clip_fraction": jnp.mean(ratio != clipped)}
+    clipped = jnp.clip(ratio, 1 - self.clip_range, 1 + self.clip_range)
+    gained = jnp.minimum(ratio * batch.advantage, clipped * batch.advantage)
+    return gained, {"clip_fraction": jnp.mean(ratio != clipped)}

@@ -1,20 +1,80 @@
 """The critic of states of an agent that learns from rollouts: its values, and the units in which it has them."""
 
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
 from mtjax import frames
 from mtjax.agents import parts
 from mtjax.agents.networks import Params
+from mtjax.agents.parts.scaling.base import Moments
 from mtjax.agents.parts.scaling.popart import rescale_heads
 from mtjax.agents.rates import discounts_of_all
 from mtjax.agents.state import AgentState, over_tasks
-from mtjax.agents.units import MIN_STD, Units
 from mtjax.parallel.axes import in_parts
 from mtjax.parallel.collectives import mean_and_variance
 from mtjax.types import Array, Metrics, Task, Transition
+
+MIN_STD = 1e-4
+"""Lower bound of standard deviations that divide."""
+
+
+class Units(NamedTuple):
+    """Holds the units of the critic's outputs, by task: a value is mean + std times an output."""
+
+    count: Array  # () how often they have moved
+    moments: Moments  # of targets, (T,)
+
+    @staticmethod
+    def begin(num_tasks: int) -> "Units":
+        """Return units in which outputs are values."""
+        return Units(jnp.float32(0), Moments.begin(num_tasks))
+
+    @staticmethod
+    def of(state: AgentState) -> "Units":
+        """Return the units that a state holds."""
+        return Units(state.nets["units"].shared["count"], state.nets["units"].own)
+
+    def params(self) -> Params:
+        """Return the units as a network of the agent's."""
+        return Params({"count": self.count}, self.moments)
+
+    @property
+    def std(self) -> Array:
+        return jnp.maximum(jnp.sqrt(self.moments.variance), MIN_STD)
+
+    def rewards(self, outputs: Array) -> Array:
+        """Return the values in units of reward for which the critic's outputs (T, ...) stand."""
+        mean, std = self._like(outputs)
+        return mean + std * outputs
+
+    def outputs(self, values: Array) -> Array:
+        """Return the critic's outputs that stand for values (T, ...) in units of reward."""
+        mean, std = self._like(values)
+        return (values - mean) / std
+
+    def _like(self, x: Array) -> tuple[Array, ...]:
+        return tuple(jnp.expand_dims(each, range(1, x.ndim)) for each in (self.moments.mean, self.std))
+
+    def moved(self, target: Array, rate: float | Array) -> "Units":
+        """Return units that have moved towards targets (T, N) of this and other devices.
+
+        Args:
+            rate: weight of these targets; the first ones have equal weights.
+        """
+        rate = jnp.maximum(rate, 1 / (self.count + 1))
+        mean, variance = (x[:, 0] for x in mean_and_variance(target, 1))
+        return Units(self.count + 1, self.moments.moved(rate, mean - self.moments.mean, variance))
+
+    def change(self, new: "Units") -> tuple[Array, Array]:
+        """Return by which factor and offset (T,) outputs change in new units, if values do not.
+
+        The first units change nothing: before them, outputs stand for no values.
+        """
+        known = self.count > 0
+        offset = (self.moments.mean - new.moments.mean) / new.std
+        return jnp.where(known, self.std / new.std, 1.0), jnp.where(known, offset, 0.0)
 
 
 def models(agent: Any, state: AgentState, flat: Transition, tasks: Task, next_obs: Any) -> dict[str, Any]:
@@ -38,7 +98,7 @@ def rewards(agent: Any, state: AgentState, flat: Transition, tasks: Task) -> Arr
 
 def values(agent: Any, state: AgentState, features: Array, obs: Any) -> Array:
     """Return the critic's values (T, B) of observations (T, B, ...), in units of reward."""
-    return Units.of(state.nets["units"]).rewards(outputs(agent, state, features, obs))
+    return Units.of(state).rewards(outputs(agent, state, features, obs))
 
 
 def outputs(agent: Any, state: AgentState, features: Array, obs: Any) -> Array:
@@ -49,22 +109,22 @@ def outputs(agent: Any, state: AgentState, features: Array, obs: Any) -> Array:
     return of_tasks(features, obs)
 
 
-def renew(agent: Any, state: AgentState, target: Array) -> AgentState:
-    """Move the critic's units by targets (T, N), and with PopArt rescale its heads to them."""
+def renew(agent: Any, state: AgentState, target: Array) -> tuple[AgentState, Units]:
+    """Move the critic's units by targets (T, ...), and with PopArt rescale its heads to them."""
+    target, old = target.reshape(len(target), -1), Units.of(state)
     scaling, _ = agent.scaling.renew(state.nets["scaling"].own, target, ())
     state = state.with_nets(scaling=Params({}, scaling))
     if agent.value_normalization == "none":
-        return state
-    old = Units.of(state.nets["units"])
+        return state, old
     new = old.moved(target, agent.value_rate)
     if agent.value_normalization == "popart":
         state = state.with_nets(critic=rescale_heads(state.nets["critic"], *old.change(new)))
-    return state.with_nets(units=new.params())
+    return state.with_nets(units=new.params()), new
 
 
 def explained(state: AgentState, batch: Any) -> Metrics:
     """Return the mean value (T,) of steps, and which share of the variance of targets values explained."""
-    target = Units.of(state.nets["units"]).rewards(batch.target)
+    target = Units.of(state).rewards(batch.target)
     residual, whole = (mean_and_variance(x, 1)[1][:, 0] for x in (target - batch.value, target))
     share = 1 - residual / jnp.maximum(whole, MIN_STD**2)
     return {"value": mean_and_variance(batch.value, 1)[0][:, 0], "explained_variance": share}

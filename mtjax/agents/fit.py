@@ -65,21 +65,21 @@ class Fit:
             importance: (T,) factors of the tasks' losses; None for 1.
         """
         loss, params, data = self.problem(loss, nets, data)
-        found = surgery.gradient(self.rule, loss, params, data, state.rule, key, importance, self.per_layer)
-        nets, optimizer = self.descend(state, _apart(found.gradients), nets)
-        rule = surgery.adapt_rule(self.rule, loss, _stacked(nets), data, found)
-        return Fitted(nets, FitState(optimizer, rule), found.aux, found.metrics)
+        combined = surgery.gradient(self.rule, loss, params, data, state.rule, key, importance, self.per_layer)
+        nets, optimizer = self.descend(state, _apart(combined.gradients), nets)
+        rule = surgery.adapt_rule(self.rule, loss, _stacked(nets), data, combined)
+        return Fitted(nets, FitState(optimizer, rule), combined.aux, combined.metrics)
 
     def problem(self, loss: Callable, nets: Nets, data: tuple) -> Problem:
         """Return the loss of one task as a function of the parameters that learn."""
-        rest = _stacked({name: net for name, net in nets.items() if name not in self.names})
+        fixed = _stacked({name: net for name, net in nets.items() if name not in self.names})
 
         def of_learned(params: Params, data: tuple) -> tuple[Array, Any]:
             own, data = data
-            return loss(_apart(Params(rest.shared, own)) | _apart(params), *data)
+            return loss(_apart(Params(fixed.shared, own)) | _apart(params), *data)
 
-        found = surgery.over_devices(of_learned) if self.over_devices else of_learned
-        return Problem(found, _stacked(self._learned(nets)), (rest.own, data))
+        averaged = surgery.over_devices(of_learned) if self.over_devices else of_learned
+        return Problem(averaged, _stacked(self._learned(nets)), (fixed.own, data))
 
     def descend(self, state: FitState, gradients: Nets, nets: Nets) -> tuple[Nets, Any]:
         """Return the networks that learn after an optimiser's step along their gradients, and its new state."""
@@ -105,9 +105,9 @@ def descend(
         importance: (T,) factors of the tasks' losses; None for 1.
         seen: networks that the loss sees in place of the state's.
     """
-    found = fits[name].step(state.fits[name], loss, state.nets | (seen or {}), data, key, importance)
-    found = found._replace(metrics={f"{name}_{key}": value for key, value in found.metrics.items()})
-    return state._replace(nets=state.nets | found.nets, fits=state.fits | {name: found.state}), found
+    fitted = fits[name].step(state.fits[name], loss, state.nets | (seen or {}), data, key, importance)
+    fitted = fitted._replace(metrics={f"{name}_{key}": value for key, value in fitted.metrics.items()})
+    return state._replace(nets=state.nets | fitted.nets, fits=state.fits | {name: fitted.state}), fitted
 
 
 def above(least: float | Array, loss: Callable) -> Callable:

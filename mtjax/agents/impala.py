@@ -14,8 +14,7 @@ from mtjax.agents.networks import Params
 from mtjax.agents.on_policy import Batch, OnPolicy
 from mtjax.agents.parts import targets
 from mtjax.agents.rates import discounts_of_all
-from mtjax.agents.state import AgentState, axes_of
-from mtjax.agents.units import Units
+from mtjax.agents.state import AgentState, over_tasks
 from mtjax.experience import Rollouts
 from mtjax.types import Acted, Array, InputError, Key, Metrics, Task, Transition
 
@@ -90,34 +89,23 @@ class IMPALA(OnPolicy):
 
     def prepare(self, state: AgentState, window: Transition, tasks: Task) -> tuple[AgentState, Batch]:
         flat, features, obs, next_obs = self.view.steps(state, window, tasks)
-        masked = None if tasks.action_mask is None else 0
-        ratio = jax.vmap(self.log_ratio, (axes_of(state.nets), 0, 0, 0, masked))
-        log_ratio = ratio(state.nets, features, obs, flat.extras, tasks.action_mask)
+        log_ratio = over_tasks(self.log_ratio, state.nets, features, obs, flat.extras, tasks.action_mask)
         value, next_value = (critics.values(self, state, features, x) for x in (obs, next_obs))
         gamma = discounts_of_all(self, tasks)
         found = self.trace(window, gamma, critics.rewards(self, state, flat, tasks), value, next_value, log_ratio)
         target, advantage = (x.reshape(len(x), -1) for x in found)
-        state = critics.renew(self, state, target)
-        units = Units.of(state.nets["units"])
-        return state, Batch(
-            obs=obs,
-            raw=flat.extras.raw,
-            log_prob=flat.extras.log_prob,
-            advantage=advantage / units.std[:, None],
-            value=value,
-            target=units.outputs(target),
-            features=features,
-            mask=tasks.action_mask,
-            **critics.models(self, state, flat, tasks, next_obs),
-        )
+        state, units = critics.renew(self, state, target)
+        scaled = {"advantage": advantage / units.std[:, None], "value": value, "target": units.outputs(target)}
+        models = critics.models(self, state, flat, tasks, next_obs)
+        given = flat.extras._asdict() | scaled | models
+        return state, Batch(obs=obs, features=features, mask=tasks.action_mask, **given)
 
     def trace(self, window: Transition, gamma: Array, *of_steps: Array) -> targets.VTrace:
         """Return V-trace (T, B, L) of windows, given rewards, values, next values and log ratios (T, B L)."""
         reward, value, next_value, log_ratio = (x.reshape(window.reward.shape) for x in of_steps)
-        steps = Transition(None, None, reward, window.discount, None, window.ended, window.closed, window.cut)  # type: ignore
         of_window = partial(targets.vtrace, lambda_=self.gae_lambda)
         of_task = jax.vmap(of_window, (0, 0, 0, 0, None))
-        return jax.vmap(of_task)(steps, value, next_value, log_ratio, gamma)
+        return jax.vmap(of_task)(window._replace(reward=reward), value, next_value, log_ratio, gamma)
 
     def gain(self, log_ratio: Array, batch: Batch) -> tuple[Array, Metrics]:
         """Return log pi(a|s) A, up to a constant; ``vtrace`` has weighed A by the ratio already."""

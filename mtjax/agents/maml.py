@@ -126,8 +126,7 @@ class MAML(OnPolicy):
         """Add advantages and targets to rollouts (T, H, E, ...), and fit the critic's units to them."""
         return clipped.assess(self, state, steps, tasks, self.experience.apart)
 
-    def gain(self, log_ratio: Array, batch: Batch) -> tuple[Array, Metrics]:
-        return clipped.gain(log_ratio, batch.advantage, self.clip_range)
+    gain = clipped.gain
 
     def actor_loss(self, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:
         played = Played.of(batch, self.experience.inner_steps + 1)
@@ -149,11 +148,7 @@ class MAML(OnPolicy):
 
 
 def forget(state: AgentState) -> AgentState:
-    """Return a state whose policy has adapted to no task."""
-    return state.with_nets(adapted=for_each(state.nets["actor"], state.num_tasks))
-
-
-def for_each(net: Params, count: int) -> Params:
-    """Return a network with a copy, leaves (T, ...), of what tasks share for each of ``count`` tasks."""
-    copies = jax.tree.map(lambda x: jnp.repeat(x[None], count, axis=0), net.shared)
-    return Params({}, {**copies, **net.own})
+    """Return a state whose policy has adapted to no task: each has a copy, leaves (T, ...), of what tasks share."""
+    actor = state.nets["actor"]
+    copies = jax.tree.map(lambda x: jnp.repeat(x[None], state.num_tasks, axis=0), actor.shared)
+    return state.with_nets(adapted=Params({}, {**copies, **actor.own}))

@@ -141,7 +141,7 @@ class Network:
         parts["head"] = init("head", lambda key: self._init_head(key, hidden.shape[-1], out), head_key)
         for name, part in parts.items():
             (params.own if name in self.own else params.shared)[name] = part
-        if STATISTICS in {**params.shared, **params.own}["body"]:
+        if STATISTICS in params.parts["body"]:
             self._give_statistics(params, num_tasks)
         return params
 
@@ -181,15 +181,14 @@ class Network:
         return self._body(params, features, *inputs, mutable=False)
 
     def _body(self, params: Params, features: Array, *inputs: Array, mutable: Any) -> Any:
-        parts = {**params.shared, **params.own}
-        obs: Any = inputs[0]
+        parts, obs = params.parts, inputs[0]
         for name, module in (("sight", self.sight), ("front", self.front)):
             obs = module.apply(parts[name], obs) if module is not None and name in parts else obs
         variables = parts["body"] | {name: parts[name] for name in (STATISTICS,) if name in parts}
         return self.body.apply(variables, obs, features, *inputs[1:], mutable=mutable)
 
     def _head(self, params: Params, hidden: Array) -> Array:
-        head = {**params.shared, **params.own}["head"]
+        head = params.parts["head"]
         return hidden @ head[self._head_weights] + head["bias"]
 
     @property

@@ -2,6 +2,7 @@
 
 import abc
 import dataclasses
+from collections.abc import Callable
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import jax
@@ -17,7 +18,6 @@ from mtjax.agents.parts.policies.gaussian import STD_RANGE
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.state import AgentState, Nets
-from mtjax.agents.units import Units
 from mtjax.experience import Rollouts
 from mtjax.types import Acted, Array, InputError, Key, Metrics, Task, Transition
 
@@ -148,7 +148,7 @@ class OnPolicy(BaseAgent):
         critic = scale_head(self.critic.init(critic_key, num_tasks, values, *inputs.critic), jnp.zeros(values))
         kept = self.continual.init(actor, num_tasks, inputs.actor, count)
         kept = kept | renewing.begin(self, {"actor": actor, "critic": critic})
-        state = state.with_nets(**kept, actor=actor, critic=critic, units=Units.begin(num_tasks).params())
+        state = state.with_nets(**kept, actor=actor, critic=critic, units=critics.Units.begin(num_tasks).params())
         slow = {"representation": state.nets["representation"]} if self.representation.learns else {}
         return state._replace(slow=jax.tree.map(jnp.copy, slow))
 
@@ -172,12 +172,11 @@ class OnPolicy(BaseAgent):
     def log_ratio(self, nets: Nets, features: Array, obs: Any, taken: Any, mask: Array | None) -> Array:
         """Return how much likelier (B,) the actions that were ``taken`` are now, in logarithms."""
         log_prob = self.policy.log_prob(self.policy_outputs(nets, features, obs), taken.raw, mask)
-        return jnp.clip(log_prob - taken.log_prob, -LOG_RATIO_LIMIT, LOG_RATIO_LIMIT)
+        return limited(log_prob - taken.log_prob)
 
     def actor_loss(self, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:
         outputs = self.policy_outputs(nets, batch.features, batch.obs)
-        log_ratio = self.policy.log_prob(outputs, batch.raw, batch.mask) - batch.log_prob
-        log_ratio = jnp.clip(log_ratio, -LOG_RATIO_LIMIT, LOG_RATIO_LIMIT)
+        log_ratio = limited(self.policy.log_prob(outputs, batch.raw, batch.mask) - batch.log_prob)
         gain, metrics = self.gain(log_ratio, batch)
         entropy = jnp.mean(self.policy.entropy(outputs, batch.mask, key))
         loss = -jnp.mean(gain) - self.entropy_cost * entropy
@@ -218,8 +217,8 @@ class OnPolicy(BaseAgent):
         batch = self.view.keyed(batch, jax.random.fold_in(key, 4))
         state, critic = descend(self.fits, "critic", state, loss, (batch,), critic_order, importance)
         state = renewing.renew(self, state, batch, jax.random.fold_in(key, 5), number)
-        told = critics.explained(state, batch)
-        return state, critic.aux | critic.metrics | actor.aux.metrics | actor.metrics | told
+        metrics = critic.aux | critic.metrics | actor.aux.metrics | actor.metrics
+        return state, metrics | critics.explained(state, batch)
 
     def assess(self, state: AgentState, steps: Transition, tasks: Task) -> tuple[AgentState, Transition]:
         """Keep the representation from before the updates, as a target of its models."""
@@ -241,13 +240,16 @@ class OnPolicy(BaseAgent):
         return moved
 
 
+def limited(log_ratio: Array) -> Array:
+    """Return logarithms of ratios within bounds, so that their exponentials stay finite."""
+    return jnp.clip(log_ratio, -LOG_RATIO_LIMIT, LOG_RATIO_LIMIT)
+
+
 def scale_head(params: Params, bias: Array) -> Params:
     """Shrink the weights of a network's head by ``HEAD_SCALE``, and add ``bias`` to its bias."""
+    return with_head(params, lambda head: {"kernel": HEAD_SCALE * head["kernel"], "bias": head["bias"] + bias})
 
-    def scaled(part: dict) -> dict:
-        if "head" not in part:
-            return part
-        head = part["head"]
-        return {**part, "head": {"kernel": HEAD_SCALE * head["kernel"], "bias": head["bias"] + bias}}
 
-    return Params(scaled(params.shared), scaled(params.own))
+def with_head(params: Params, change: Callable[[dict[str, Array]], dict[str, Array]]) -> Params:
+    """Return a network with a changed head, which tasks share or each has of its own."""
+    return Params(*(part | {"head": change(part["head"])} if "head" in part else part for part in params))

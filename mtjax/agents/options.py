@@ -11,12 +11,9 @@ from mtjax.agents import clipped, critics, parts
 from mtjax.agents.base import Inputs, Memory, network_of
 from mtjax.agents.fit import Fit
 from mtjax.agents.networks import Network
-from mtjax.agents.on_policy import LOG_RATIO_LIMIT, ActorAux, OnPolicy, scale_head
-from mtjax.agents.parts import targets
-from mtjax.agents.rates import discounts_of_all
+from mtjax.agents.on_policy import ActorAux, OnPolicy, limited, scale_head
 from mtjax.agents.sketches import SubPolicies, with_lengths
-from mtjax.agents.state import AgentState, Nets, axes_of
-from mtjax.agents.units import Units
+from mtjax.agents.state import AgentState, Nets, over_tasks
 from mtjax.experience.rollouts import played, windows
 from mtjax.types import Acted, Array, InputError, Key, Metrics, Spec, Task, Transition
 
@@ -203,33 +200,22 @@ class Options(OnPolicy):
         flat, features, obs, next_obs = self.view.steps(state, windows(steps, self.unroll), tasks)
         taken, of_tasks = flat.extras, partial(known_of, self, state)
         here, then = of_tasks(features, obs), of_tasks(features, next_obs)
-        ends = jax.vmap(partial(ending, self), (axes_of(state.nets), 0, 0, 0))(
-            state.nets, features, next_obs, taken.now.option
-        )
+        ends = over_tasks(partial(ending, self), state.nets, features, next_obs, taken.now.option)
         upon = arrival(then, taken.now.option, ends, self.deliberation_cost)
         in_order = partial(played, shape=steps.reward.shape, length=self.unroll)
-        value, next_value, reward, of_state, of_before = map(
-            in_order,
-            (
-                at_option(here.options, taken.now.option),
-                upon,
-                critics.rewards(self, state, flat, tasks),
-                here.state,
-                at_option(here.options, taken.before),
-            ),
-        )
-        of_task = partial(targets.gae, lambda_=self.gae_lambda)
-        gamma = discounts_of_all(self, tasks)
-        advantage = jax.vmap(of_task)(steps._replace(reward=reward), value, next_value, gamma)
+        of_option, reward = at_option(here.options, taken.now.option), critics.rewards(self, state, flat, tasks)
+        known = of_option, upon, reward, here.state, at_option(here.options, taken.before)
+        value, next_value, reward, of_state, of_before = map(in_order, known)
+        advantage = clipped.gae(self, tasks, steps._replace(reward=reward), value, next_value)
         target = value + advantage
-        state = critics.renew(self, state, target.reshape(len(target), -1))
+        state, units = critics.renew(self, state, target)
         mean, spread = clipped.moments(self.advantage_normalization, advantage)
         found = {
             "advantage": (advantage - mean) / spread,
             "choice_advantage": (target - of_state) / spread,
             "end_loss": (of_before - of_state + self.deliberation_cost) / spread,
             "value": value,
-            "target": Units.of(state.nets["units"]).outputs(target),
+            "target": units.outputs(target),
         }
         return state, steps._replace(extras=(steps.extras, found))
 
@@ -239,19 +225,18 @@ class Options(OnPolicy):
         """Return the critic's outputs (B, K) for observations (B, ...)."""
         return self.critic.apply(nets["critic"], *self.view.critic_inputs(nets, features, obs))
 
-    def gain(self, log_ratio: Array, batch: Batch) -> tuple[Array, Metrics]:  # type: ignore[override]
-        return clipped.gain(log_ratio, batch.advantage, self.clip_range)
+    gain = clipped.gain
 
     def actor_loss(self, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:  # type: ignore[override]
         _, seen = self.view.actor_inputs(nets, batch.features, batch.obs)
         outputs = of_option(self, nets["actor"], seen, batch.option)
         log_ratio = limited(self.policy.log_prob(outputs, batch.raw, batch.mask) - batch.log_prob)
-        gain, metrics = self.gain(log_ratio, batch)
+        gain, metrics = clipped.gain(self, log_ratio, batch)
         entropy = jnp.mean(self.policy.entropy(outputs, batch.mask, key))
 
         logs, chosen = jax.nn.log_softmax(choices(self, nets, batch.features, batch.obs)), batch.chosen
         option_ratio = limited(at_option(logs, batch.option) - batch.option_log_prob)
-        choice, _ = clipped.gain(option_ratio, batch.choice_advantage, self.clip_range)
+        choice, _ = clipped.gain(self, option_ratio, batch._replace(advantage=batch.choice_advantage))
         doubt = -jnp.sum(jnp.exp(logs) * logs, axis=-1)
 
         ends = ending(self, nets, batch.features, batch.obs, batch.before)
@@ -300,11 +285,6 @@ def arrival(values: Values, option: Array, ends: Array, cost: float | Array) -> 
     return (1 - ends) * at_option(values.options, option) + ends * (values.state - cost)
 
 
-def limited(log_ratio: Array) -> Array:
-    """Return logarithms of ratios within bounds, so that their exponentials stay finite."""
-    return jnp.clip(log_ratio, -LOG_RATIO_LIMIT, LOG_RATIO_LIMIT)
-
-
 def of_option(agent: Any, net: Any, seen: Array, option: Array) -> Array:
     """Return the outputs (..., P) of sub-policies or of terminations for inputs (..., O); 0 for no option."""
     return agent.actor.apply(net, jnp.zeros(0), with_due(seen, option, agent.num_options))
@@ -313,7 +293,7 @@ def of_option(agent: Any, net: Any, seen: Array, option: Array) -> Array:
 def known_of(agent: Any, state: AgentState, features: Array, obs: Any) -> Values:
     """Return the values of observations (T, B, ...) in units of reward."""
     q = critics.values(agent, state, features, obs)
-    over = jax.vmap(partial(choices, agent), (axes_of(state.nets), 0, 0))(state.nets, features, obs)
+    over = over_tasks(partial(choices, agent), state.nets, features, obs)
     return Values(q, jnp.sum(jax.nn.softmax(over) * q, axis=-1))
 
 

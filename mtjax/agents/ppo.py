@@ -12,10 +12,10 @@ from mtjax.agents.base import Inputs
 from mtjax.agents.choices import FLAT
 from mtjax.agents.networks import Params
 from mtjax.agents.on_policy import Batch, OnPolicy
-from mtjax.agents.parts.remembering import Remembering
-from mtjax.agents.parts.renewing import Renewing
+from mtjax.agents.parts.plasticity import Plasticity
+from mtjax.agents.parts.remembering import Continual
 from mtjax.agents.state import AgentState
-from mtjax.types import Array, Key, Metrics, Task, Transition
+from mtjax.types import Array, Key, Task, Transition
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,8 +70,8 @@ class PPO(OnPolicy):
     """Stop updating the actor until the next rollout once KL(pi_old | pi) exceeds this; 0 never stops."""
     advantage_normalization: clipped.Normalization = "task"
     """Scale advantages to mean 0 and standard deviation 1: never, over all tasks together, or in each task."""
-    continual: Annotated[Remembering, FLAT] = dataclasses.field(default_factory=Remembering)
-    plasticity: Annotated[Renewing, FLAT] = dataclasses.field(default_factory=Renewing)
+    continual: Annotated[Continual, FLAT] = dataclasses.field(default_factory=Continual)
+    plasticity: Annotated[Plasticity, FLAT] = dataclasses.field(default_factory=Plasticity)
 
     def __post_init__(self):
         super().__post_init__()
@@ -91,8 +91,7 @@ class PPO(OnPolicy):
 
     # Gradient steps.
 
-    def gain(self, log_ratio: Array, batch: Batch) -> tuple[Array, Metrics]:
-        return clipped.gain(log_ratio, batch.advantage, self.clip_range)
+    gain = clipped.gain
 
     def fitting_loss(self, output: Array, batch: Batch) -> Array:
         limit = parts.limit(self.value_clip)

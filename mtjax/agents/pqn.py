@@ -154,4 +154,4 @@ class PQN(BaseAgent):
     def observe(self, state: AgentState, steps: Transition, tasks: Task) -> AgentState:
         state = super().observe(state, steps, tasks)
         rollouts = state.nets["exploration"].shared["rollouts"] + 1
-        return state._replace(nets=state.nets | {"exploration": Params({"rollouts": rollouts}, {})})
+        return state.with_nets(exploration=Params({"rollouts": rollouts}, {}))

@@ -9,8 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents.networks import Network, Params, ReLU
-from mtjax.agents.parts.plasticity import Layer, forget
-from mtjax.agents.parts.renewing import NET
+from mtjax.agents.parts.plasticity import NET, Layer, forget
 from mtjax.agents.state import AgentState, Nets, over_tasks
 from mtjax.parallel import collectives
 from mtjax.types import Array, Key
@@ -22,11 +21,12 @@ def begin(agent: Any, nets: Nets) -> Nets:
     """Return what is remembered of the units of new networks, as a network by name."""
     if not agent.plasticity.every:
         return {}
-    one = lambda net: agent.plasticity.init([len(layer["bias"]) for layer in _dense(net.shared)])
-    stacked = lambda net: (
-        jax.vmap(lambda _: one(_first(net)))(net.shared["head"]["bias"]) if _several(net) else one(net)
-    )
-    return {NET: Params({name: stacked(nets[name]) for name in ("actor", "critic")}, {})}
+
+    def of_net(net: Params) -> list[Any]:
+        init = lambda _=None: agent.plasticity.init([layer["bias"].shape[-1] for layer in _dense(net.shared)])
+        return jax.vmap(init)(net.shared["head"]["bias"]) if _several(net) else init()
+
+    return {NET: Params({name: of_net(nets[name]) for name in ("actor", "critic")}, {})}
 
 
 def renew(agent: Any, state: AgentState, batch: Any, key: Key, number: Array) -> AgentState:
@@ -61,7 +61,7 @@ def _renew(agent: Any, batch: Any, key: Key, state: AgentState) -> AgentState:
 def _of_network(agent: Any, network: Network, seen: tuple, shared: Any, memory: list, key: Key) -> tuple:
     """Return the shared parameters of one network, what is remembered, and which units of each layer begin anew."""
     layers = jax.vmap(partial(hidden_layers, network, Params(shared, {})))(*seen)  # leaves (T, B, H)
-    found, begun = [], []
+    memories, begun = [], []
     for i, hidden in enumerate(layers):
         hidden = hidden.reshape(-1, hidden.shape[-1])
         hidden = collectives.whole(hidden, axis=0) if agent.devices_differ else hidden
@@ -69,8 +69,8 @@ def _of_network(agent: Any, network: Network, seen: tuple, shared: Any, memory: 
         fresh = nn.initializers.lecun_normal()(jax.random.fold_in(key, i), layer.into.shape)
         kept, layer, units = agent.plasticity.renew(memory[i], layer, hidden, fresh)
         shared = _with_norm(_with_layer(shared, i, layer), i, units, 1.0)
-        found, begun = [*found, kept], [*begun, units]
-    return shared, found, begun
+        memories, begun = [*memories, kept], [*begun, units]
+    return shared, memories, begun
 
 
 def hidden_layers(network: Network, params: Params, features: Array, obs: Array, *action: Array) -> list[Array]:
@@ -102,10 +102,6 @@ def _moments(optimizer: Any, name: str, forgetting: Callable, units: list[Array]
 def _several(net: Params) -> bool:
     """Return whether a net is several networks, leaves (N, ...)."""
     return net.shared["head"]["bias"].ndim > 1
-
-
-def _first(net: Params) -> Params:
-    return net._replace(shared=jax.tree.map(lambda x: x[0], net.shared))
 
 
 def _dense(shared: Any) -> list[dict[str, Array]]:

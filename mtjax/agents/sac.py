@@ -13,12 +13,12 @@ from mtjax.agents.base import BaseAgent, Inputs, Memory
 from mtjax.agents.choices import FLAT
 from mtjax.agents.fit import Fit, above, descend
 from mtjax.agents.networks import Params
-from mtjax.agents.parts.remembering import Remembering
-from mtjax.agents.parts.renewing import Renewing
+from mtjax.agents.parts.plasticity import Plasticity
+from mtjax.agents.parts.remembering import Continual
 from mtjax.agents.parts.values import Value, reduce
 from mtjax.agents.rates import scheduled
 from mtjax.agents.replayed import ActorAux, Batch, CriticAux, Sample
-from mtjax.agents.state import AgentState, Nets, axes_of
+from mtjax.agents.state import AgentState, Nets, over_tasks
 from mtjax.experience import Replay
 from mtjax.parallel.axes import when
 from mtjax.types import Acted, Array, Key, Metrics, Sometimes, Task, Transition
@@ -63,8 +63,8 @@ class SAC(BaseAgent):
     unit_head: bool = False
     """Keep the weights of each output of actor and critics at length 1."""
     value: Annotated[Value, FLAT] = dataclasses.field(default_factory=Value)
-    continual: Annotated[Remembering, FLAT] = dataclasses.field(default_factory=Remembering)
-    plasticity: Annotated[Renewing, FLAT] = dataclasses.field(default_factory=Renewing)
+    continual: Annotated[Continual, FLAT] = dataclasses.field(default_factory=Continual)
+    plasticity: Annotated[Plasticity, FLAT] = dataclasses.field(default_factory=Plasticity)
     experience: Annotated[Replay, FLAT] = dataclasses.field(default_factory=Replay)
 
     def __post_init__(self):
@@ -121,7 +121,7 @@ class SAC(BaseAgent):
             q = self.values(nets, batch.features, batch.obs, batch.action)
             return reduce(q, self.critic_reduction == "min") / batch.temperature
 
-        return jax.vmap(of_task, (axes_of(state.nets), 0))(state.nets, batch)
+        return over_tasks(of_task, state.nets, batch)
 
     def critic_target(self, nets: Nets, slow: Nets, batch: Batch, key: Key) -> Any:
         """Compute the critic target y (B, ...), in the form that ``value.loss`` takes."""

@@ -10,11 +10,11 @@ import tyro
 from mtjax.agents import clipped, combinations, parts
 from mtjax.agents.base import Heads, Inputs
 from mtjax.agents.networks import Network, Params
-from mtjax.agents.on_policy import Batch, OnPolicy
+from mtjax.agents.on_policy import OnPolicy, with_head
 from mtjax.agents.parts.policies import Categorical, Policy
 from mtjax.agents.parts.samplers import ByLength
 from mtjax.agents.state import AgentState
-from mtjax.types import Array, InputError, Key, Metrics, Spec, Task, Transition
+from mtjax.types import Array, InputError, Key, Spec, Task, Transition
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,22 +122,16 @@ class Sketches(OnPolicy):
 
     def init_networks(self, state: AgentState, inputs: Inputs, key: Key) -> AgentState:
         state = super().init_networks(state, inputs, key)
-        return state.with_nets(actor=Params(*(self._lean(part) for part in state.nets["actor"])))
-
-    def _lean(self, part: dict[str, Any]) -> dict[str, Any]:
-        """Add its first bias to the last output, STOP, of an actor's part if it has the head."""
-        if "head" not in part:
-            return part
-        return {**part, "head": part["head"] | {"bias": part["head"]["bias"].at[..., -1].add(self.stop_bias)}}
+        lean = lambda head: head | {"bias": head["bias"].at[..., -1].add(self.stop_bias)}  # of STOP, which is last
+        return state.with_nets(actor=with_head(state.nets["actor"], lean))
 
     # Learning, as PPO does.
+
+    gain = clipped.gain
 
     def assess(self, state: AgentState, steps: Transition, tasks: Task) -> tuple[AgentState, Transition]:
         """Add advantages and targets to a rollout (T, H, E, ...), and fit the critic's units to it."""
         return clipped.assess(self, state, steps, tasks)
-
-    def gain(self, log_ratio: Array, batch: Batch) -> tuple[Array, Metrics]:
-        return clipped.gain(log_ratio, batch.advantage, self.clip_range)
 
 
 def with_lengths(agent: Any, state: AgentState, tasks: Task) -> AgentState:

@@ -41,13 +41,13 @@ class View:
 
     def count(self, inputs: Params, obs: Any) -> Params:
         """Add the vectors (T, ..., O) in observations to the moments, with those on other devices."""
-        found = frames.state(join_arrays(inputs, obs))
-        if not self.normalized or found is None:
+        vectors = frames.state(join_arrays(inputs, obs))
+        if not self.normalized or vectors is None:
             return inputs
         moments, mixed = inputs.parts["moments"], bool(inputs.own)
-        found = found.reshape(len(found), -1, found.shape[-1])
-        count = (found.shape[1] if mixed else found.shape[0] * found.shape[1]) * collectives.count()
-        mean, variance = (x.reshape(moments.mean.shape) for x in mean_and_variance(found, 1 if mixed else (0, 1)))
+        vectors = vectors.reshape(len(vectors), -1, vectors.shape[-1])
+        count = (vectors.shape[1] if mixed else vectors.shape[0] * vectors.shape[1]) * collectives.count()
+        mean, variance = (x.reshape(moments.mean.shape) for x in mean_and_variance(vectors, 1 if mixed else (0, 1)))
         one = normalize.Moments(jnp.full_like(moments.count, count), mean, count * variance)
         if mixed:
             return inputs._replace(own={"moments": jax.vmap(normalize.merge)(moments, one)})

@@ -305,8 +305,8 @@ def _require_group(holder: Any, name: str) -> None:
         raise parts.InputError(f"{flag} must be at least {GROUP}, not {getattr(holder, name)}")
 
 
-Remembering = Nothing
-CONTINUAL: dict[str, type[Remembering]] = {
+Continual = Nothing
+CONTINUAL: dict[str, type[Continual]] = {
     "none": Nothing,
     "l2": L2,
     "ewc": EWC,

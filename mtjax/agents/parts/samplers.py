@@ -201,12 +201,9 @@ class ByLength(Uniform):
         return Curriculum(returns, memory.length, longest + ~jnp.any(behind))
 
     def weights(self, memory: Curriculum, temperature: Array) -> Array:
-        missing = 1 - jnp.where(memory.returns.known, jnp.clip(memory.returns.slow, 0.0, 1.0), 0.0) + _LEAST_MISSING
+        missing = 1 - jnp.where(memory.returns.known, jnp.clip(memory.returns.slow, 0.0, 1.0), 0.0) + 0.01
         shares = jnp.where(memory.length <= _present(memory), missing, 0.0)
         return share_out(shares / jnp.sum(shares), self.least_weight)
-
-
-_LEAST_MISSING = 0.01
 
 
 def _present(memory: Curriculum) -> Array:

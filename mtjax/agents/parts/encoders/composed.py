@@ -11,7 +11,7 @@ from mtjax.agents import parts
 from mtjax.agents.networks import MLP, ReLU
 from mtjax.agents.parts.encoders.base import Identity
 from mtjax.agents.parts.encoders.mixture import TaskWeights
-from mtjax.types import Array, InputError
+from mtjax.types import Array
 
 _lecun = nn.initializers.lecun_normal(batch_axis=0)
 
@@ -138,8 +138,7 @@ class Hypernetwork(Identity):
     """Widths of the layers that encode the task's features; the last, without ReLU, is the size of the code."""
 
     def __post_init__(self):
-        if not self.hypernetwork_widths or min(self.hypernetwork_widths) < 1:
-            raise InputError(f"hypernetwork-widths needs a layer of at least one unit, not {self.hypernetwork_widths}")
+        parts.require_layers(self, "hypernetwork_widths")
 
     def body(self, hidden: tuple[int, ...], layer_norm: bool) -> nn.Module:
         return HyperTrunk(self.hypernetwork_widths, hidden, layer_norm)

@@ -24,11 +24,11 @@ def orthonormal(vectors: Array) -> Array:
     can separate again. Otherwise |r_k| is by far the largest term, and v_k has length 1.
     """
     floors = _SHARE**2 * jnp.sum(jnp.square(vectors), axis=-1, keepdims=True) + _LENGTH**2
-    basis, rest = [], vectors
+    basis, residuals = [], vectors
     for floor in floors:
-        length = jnp.sum(jnp.square(rest[0]), axis=-1, keepdims=True)
-        first, rest = rest[0] * jax.lax.rsqrt(length + floor), rest[1:]
-        rest = rest - jnp.sum(rest * first, axis=-1, keepdims=True) * first
+        length = jnp.sum(jnp.square(residuals[0]), axis=-1, keepdims=True)
+        first, residuals = residuals[0] * jax.lax.rsqrt(length + floor), residuals[1:]
+        residuals = residuals - jnp.sum(residuals * first, axis=-1, keepdims=True) * first
         basis.append(first)
     return jnp.stack(basis)
 

@@ -4,6 +4,7 @@ import dataclasses
 
 import flax.linen as nn
 
+from mtjax.agents import parts
 from mtjax.agents.networks import ReLU, join
 from mtjax.agents.parts.encoders.base import Identity
 from mtjax.types import Array, InputError
@@ -87,8 +88,7 @@ class SimBa(Identity):
     """Factor between the width inside a block and the width of the block."""
 
     def __post_init__(self):
-        if self.expansion < 1:
-            raise InputError(f"expansion must be at least 1, not {self.expansion}")
+        parts.require_counts(self, "expansion")
 
     def body(self, hidden: tuple[int, ...], layer_norm: bool) -> nn.Module:
         return SimBaTrunk(*blocks("simba", hidden), self.expansion)

@@ -17,7 +17,7 @@ Shape = Literal["constant", "linear", "cosine"]
 def adam(rate: Any, weight_decay: Any, max_norm: Any, tune: str) -> optax.GradientTransformation:
     """Return Adam, or AdamW, on clipped gradients, for those parameters that ``tune`` names."""
     limit = parts.limit(max_norm)
-    clip = optax.identity() if limit is None else clip_to(limit)
+    clip = optax.identity() if limit is None else optax.clip_by_global_norm(limit)
     step = optax.adam(rate) if parts.is_zero(weight_decay) else optax.adamw(rate, weight_decay=weight_decay)
     learn = on_sphere(optax.chain(clip, step))
     if tune == "all":
@@ -78,11 +78,6 @@ def on_sphere(optimizer: optax.GradientTransformation) -> optax.GradientTransfor
         return jax.tree_util.tree_map_with_path(stay, updates, params), state
 
     return optax.GradientTransformation(optimizer.init, step)
-
-
-def clip_to(norm: Any) -> optax.GradientTransformation:
-    """Return a transformation that clips gradients to a global norm; a traced norm may be 0, which does not clip."""
-    return optax.clip_by_global_norm(norm)
 
 
 def descend(optimizer: optax.GradientTransformation, gradients: Any, memory: Any, params: Any) -> tuple[Any, Any]:

@@ -58,8 +58,8 @@ def minimise(matrix: Array, linear: Array, budget: Array) -> Array:
     def step(point: tuple[Array, Array, Array], _) -> tuple[tuple[Array, Array, Array], None]:
         y, z, price = point
         centre = jnp.maximum(0.1 * jnp.mean(y * z), 1e-10) / y  # the floor keeps z / y within float32
-        rest = centre - matrix @ y - linear + price * budget
-        sides = jnp.stack([rest, budget], axis=1)
+        residual = centre - matrix @ y - linear + price * budget
+        sides = jnp.stack([residual, budget], axis=1)
         free, paid = solve(matrix + jnp.diag(z / y), sides).T
         d_price = jnp.where(bound, (1 - budget @ (y + free)) / jnp.where(bound, budget @ paid, 1.0), 0.0)
         d_y = free + d_price * paid

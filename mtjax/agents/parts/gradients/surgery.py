@@ -170,9 +170,9 @@ def weighted_sums(weights: Array, leaves: list[Array]) -> list[Array]:
     if small:
         ends = np.cumsum([leaf.shape[1] for leaf in small])
         sums = jnp.split(jnp.dot(weights, jnp.concatenate(small, axis=1), precision="highest"), ends[:-1])
-    rest = iter(sums)
+    small_sums = iter(sums)
     whole = lambda leaf: jnp.tensordot(weights, leaf, 1, precision="highest")
-    return [next(rest).reshape(leaf.shape[1:]) if _is_small(leaf) else whole(leaf) for leaf in leaves]
+    return [next(small_sums).reshape(leaf.shape[1:]) if _is_small(leaf) else whole(leaf) for leaf in leaves]
 
 
 def cosines(gram: Array) -> tuple[Array, Array]:

@@ -23,17 +23,3 @@ CONDITIONINGS: dict[str, type[Knowing]] = {
     "recurrent": Recurrent,
     "posterior": Posterior,
 }
-
-__all__ = [
-    "CONDITIONINGS",
-    "Embedding",
-    "Knowing",
-    "LastSteps",
-    "Nothing",
-    "OneHot",
-    "Parameters",
-    "Posterior",
-    "Recurrent",
-    "Text",
-    "Vectors",
-]

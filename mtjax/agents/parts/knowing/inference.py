@@ -106,10 +106,7 @@ def spread(x: Array, like: Pairs) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class Inference(abc.ABC):
-    """Makes a memory of the steps of a trial, what networks see of it, and the losses by which it learns.
-
-    Networks see a Gaussian as its mean and the logarithm of its variance.
-    """
+    """Makes a memory of the steps of a trial, what networks see of it, and the losses by which it learns."""
 
     settings: Any  # of the conditioning
 
@@ -121,17 +118,17 @@ class Inference(abc.ABC):
     def begin(self, obs_size: int, action_size: int) -> Array:
         """Return the memory with which a trial begins."""
 
-    @abc.abstractmethod
     def read(self, params: dict[str, Any], step: Any) -> Array:
         """Return what is read (..., I) of steps."""
+        return whole_step(step)
 
     @abc.abstractmethod
     def advance(self, params: dict[str, Any], memory: Array, read: Array) -> Array:
         """Return the memory (..., M) after steps (..., I) as they are read."""
 
-    @abc.abstractmethod
     def show(self, params: dict[str, Any], memory: Array) -> Array:
-        """Return what networks see (..., Z) of a memory (..., M)."""
+        """Return what networks see (..., Z) of a memory (..., M): the belief's mean and log-variance."""
+        return jnp.concatenate(self.belief(params, memory), axis=-1)
 
     @abc.abstractmethod
     def belief(self, params: dict[str, Any], memory: Array) -> Belief:
@@ -148,6 +145,10 @@ class Inference(abc.ABC):
     def dense(self, out: int) -> Dense:
         """Return a module with so many outputs."""
         return Dense(self.settings.inference_widths, out)
+
+    def apply(self, params: Any, out: int, *inputs: Array) -> Array:
+        """Map inputs by such a module with these parameters."""
+        return self.dense(out).apply(params, *inputs)  # type: ignore
 
 
 class VariBAD(Inference):
@@ -167,9 +168,6 @@ class VariBAD(Inference):
     def begin(self, obs_size: int, action_size: int) -> Array:
         return jnp.zeros(self.settings.recurrent_size)
 
-    def read(self, params: dict[str, Any], step: Any) -> Array:
-        return whole_step(step)
-
     def advance(self, params: dict[str, Any], memory: Array, read: Array) -> Array:
         return gru(self.settings.recurrent_size).apply(params["unit"], memory, read)[0]  # type: ignore
 
@@ -180,7 +178,7 @@ class VariBAD(Inference):
         return Belief(outputs[..., :size], outputs[..., size:])
 
     def show(self, params: dict[str, Any], memory: Array) -> Array:
-        return jax.lax.stop_gradient(jnp.concatenate(self.belief(params, memory), axis=-1))
+        return jax.lax.stop_gradient(super().show(params, memory))
 
     def foretell(self, params: dict[str, Any], step: Any, belief: Belief, key: Key) -> dict[str, tuple[Array, Array]]:
         """Predict rewards and changes of state by the mean over latent tasks that are drawn from beliefs."""
@@ -190,12 +188,11 @@ class VariBAD(Inference):
 
     def rewards(self, params: dict[str, Any], step: Any, latent: Array) -> Array:
         """Predict the rewards (...) of steps in latent tasks (..., Z)."""
-        predicted: Any = self.dense(1).apply(params["reward"], step.obs, step.action, change(step), latent)
-        return predicted[..., 0]
+        return self.apply(params["reward"], 1, step.obs, step.action, change(step), latent)[..., 0]
 
     def changes(self, params: dict[str, Any], step: Any, latent: Array) -> Array:
         """Predict the changes of state (..., O) in steps in latent tasks (..., Z)."""
-        return self.dense(step.obs.shape[-1]).apply(params["state"], step.obs, step.action, latent)  # type: ignore
+        return self.apply(params["state"], step.obs.shape[-1], step.obs, step.action, latent)
 
     def losses(self, params: dict[str, Any], track: Track, before: Array, after: Array) -> Metrics:
         belief, earlier = self.belief(params, after), self.belief(params, before)
@@ -227,7 +224,7 @@ class PEARL(Inference):
         return jnp.zeros((2, self.settings.latent_size))
 
     def read(self, params: dict[str, Any], step: Any) -> Array:
-        outputs: Any = self.dense(2 * self.settings.latent_size).apply(params["factor"], whole_step(step))
+        outputs = self.apply(params["factor"], 2 * self.settings.latent_size, whole_step(step))
         mean, precision = jnp.split(outputs, 2, axis=-1)
         return factor(mean, jax.nn.softplus(precision))
 
@@ -236,9 +233,6 @@ class PEARL(Inference):
 
     def belief(self, params: dict[str, Any], memory: Array) -> Belief:
         return product(memory)
-
-    def show(self, params: dict[str, Any], memory: Array) -> Array:
-        return jnp.concatenate(product(memory), axis=-1)
 
     def losses(self, params: dict[str, Any], track: Track, before: Array, after: Array) -> Metrics:
         belief = product(before)
@@ -280,7 +274,7 @@ class CaDM(Inference):
     def context(self, params: dict[str, Any], memory: Array) -> Array:
         """Encode memories (..., K, I) as contexts (..., Z)."""
         flat = memory.reshape(*memory.shape[:-2], -1)
-        return self.dense(self.settings.latent_size).apply(params["context"], flat)  # type: ignore
+        return self.apply(params["context"], self.settings.latent_size, flat)
 
     def belief(self, params: dict[str, Any], memory: Array) -> Belief:
         context = self.context(params, memory)
@@ -291,8 +285,7 @@ class CaDM(Inference):
 
     def foretell(self, params: dict[str, Any], step: Any, belief: Belief, key: Key) -> dict[str, tuple[Array, Array]]:
         """Predict changes of state by the forward model."""
-        model = self.dense(step.obs.shape[-1])
-        predicted: Any = model.apply(params["forward"], step.obs, step.action, belief.mean)
+        predicted = self.apply(params["forward"], step.obs.shape[-1], step.obs, step.action, belief.mean)
         return {_CHANGE: (predicted, known_change(step))}
 
     def losses(self, params: dict[str, Any], track: Track, before: Array, after: Array) -> Metrics:
@@ -301,11 +294,10 @@ class CaDM(Inference):
         pairs = pair(track, shifts)
         steps, context = pairs.steps, spread(self.context(params, before), pairs)
         ahead = jnp.arange(length) + shifts[:, None] < length  # not around the end
-        used = pairs.same * ahead * within(steps)
-        model, there = self.dense(steps.obs.shape[-1]), change(steps)
+        used, there = pairs.same * ahead * within(steps), change(steps)
 
         def error(name: str, start: Array, target: Array) -> Array:
-            missed = jnp.square(model.apply(params[name], start, steps.action, context) - target)  # type: ignore
+            missed = jnp.square(self.apply(params[name], start.shape[-1], start, steps.action, context) - target)
             return jnp.sum(used * jnp.mean(missed, axis=-1)) / jnp.maximum(jnp.sum(used), 1)
 
         backward = error("backward", steps.next_obs, -there)

@@ -17,14 +17,3 @@ REPRESENTATIONS: dict[str, type[Representation]] = {
     "deepmdp": DeepMDP,
     "hip-bmdp": HiPBMDP,
 }
-
-__all__ = [
-    "REPRESENTATIONS",
-    "Asymmetric",
-    "Autoencoder",
-    "DeepMDP",
-    "Encoded",
-    "HiPBMDP",
-    "Plain",
-    "Representation",
-]

@@ -77,7 +77,7 @@ class Autoencoder(Encoded):
     def join(self, loss: Array, metrics: Metrics, params: Params, batch: Any) -> tuple[Array, Metrics]:
         obs = without_past(batch.obs)
         latent = self.encode(params, obs)[..., : self.latent_widths[-1]]
-        weights = {**params.shared, **params.own}["decoder"]
+        weights = params.parts["decoder"]
         rebuilt: Any = self.decoder(obs).apply(weights, latent)
         wanted = vision.coarse(obs[frames.PICTURES], batch.model_targets) if frames.shown(obs) else obs
         error = jnp.mean(jnp.square(rebuilt - wanted))

@@ -160,7 +160,7 @@ def encode_tasks(encoded: Encoded, params: Params, obs: Any) -> Array:
 
 def apply_part(modules: Mapping[str, nn.Module], params: Params, name: str, *inputs: Any) -> Array:
     """Map one task's inputs by the encoder or model of that name."""
-    return modules[name].apply({**params.shared, **params.own}[name], *inputs)  # type: ignore
+    return modules[name].apply(params.parts[name], *inputs)  # type: ignore
 
 
 def init_part(params: Params, name: str, module: nn.Module, own: bool, key: Key, num_tasks: int, *inputs: Any) -> None:
