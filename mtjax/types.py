@@ -320,7 +320,7 @@ class Experience(Protocol):
     def reset_every(self) -> int: ...  # steps of every environment between two resets of networks; 0 for never
     @property
     def storage(self) -> Storage: ...
-    def check(self, env: Env, num_envs: int, chunk_steps: int = 0) -> None: ...  # raises InputError
+    def check(self, env: Env, num_envs: int, chunk_steps: int = 0, unroll: int = 0) -> None: ...  # raises InputError
     def host_slots(self, num_envs: int) -> int: ...  # steps of every environment that the host keeps beside the data
     def rollout_bytes(self, spec: Spec, num_envs: int) -> int: ...  # of a task's steps that are learned from, not kept
     def describe(self, spec: Spec, num_envs: int) -> str: ...
