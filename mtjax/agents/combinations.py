@@ -164,7 +164,7 @@ def check_replayed(agent: Any) -> None:
         raise InputError(f"conditioning={name} needs n-step=1, hindsight=0 and host-replay-size=0")
     if agent.unroll > replay.warmup_steps + 1:
         burn_in = agent.conditioning.burn_in
-        front = f" and burn-in={burn_in}" if burn_in else ""
+        front = f" after burn-in={burn_in}" if burn_in else ""
         raise InputError(
             f"recurrent-steps={agent.unroll - burn_in}{front} needs as many steps before the first update: warmup-steps of at least "
             f"{agent.unroll - 1}, not {replay.warmup_steps}"
