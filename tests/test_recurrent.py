@@ -152,7 +152,8 @@ def burning(way):
     blank = agent.conditioning.begin(3, 2)
     hidden = np.random.default_rng(1).random((*steps.reward.shape, *blank.shape))
     closed = steps.closed.at[:, 0, 0].set(True)  # some trials end inside burn-in, others do not
-    return agent, plain, steps._replace(ended=closed, closed=closed, cut=closed, memory=Memory(None, jnp.float32(hidden)))
+    memory = Memory(None, jnp.float32(hidden))
+    return agent, plain, steps._replace(ended=closed, closed=closed, cut=closed, memory=memory)
 
 
 def burned(agent, params, windows):

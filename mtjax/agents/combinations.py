@@ -166,8 +166,8 @@ def check_replayed(agent: Any) -> None:
         burn_in = agent.conditioning.burn_in
         front = f" after burn-in={burn_in}" if burn_in else ""
         raise InputError(
-            f"recurrent-steps={agent.unroll - burn_in}{front} needs as many steps before the first update: warmup-steps of at least "
-            f"{agent.unroll - 1}, not {replay.warmup_steps}"
+            f"recurrent-steps={agent.unroll - burn_in}{front} needs as many steps before the first update: "
+            f"warmup-steps of at least {agent.unroll - 1}, not {replay.warmup_steps}"
         )
 
 
