@@ -223,7 +223,8 @@ class RunConfig:
         """
         if self.env:
             self._check_named()
-        self.learner.experience.check(self.family, self.played.num_envs, self.played.chunk_steps)
+        played, unroll = self.played, self.learner.unroll
+        self.learner.experience.check(self.family, played.num_envs, played.chunk_steps, unroll)
         require_policy(self.learner, self.family)
         self._check_population()
         trials.require_whole(self.plan.eval_episodes, self.training.trials, "eval-episodes")

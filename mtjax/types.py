@@ -320,7 +320,7 @@ class Experience(Protocol):
     def reset_every(self) -> int: ...  # steps of every environment between two resets of networks; 0 for never
     @property
     def storage(self) -> Storage: ...
-    def check(self, env: Env, num_envs: int, chunk_steps: int = 0) -> None: ...  # raises InputError
+    def check(self, env: Env, num_envs: int, chunk_steps: int = 0, unroll: int = 0) -> None: ...  # raises InputError
     def host_slots(self, num_envs: int) -> int: ...  # steps of every environment that the host keeps beside the data
     def rollout_bytes(self, spec: Spec, num_envs: int) -> int: ...  # of a task's steps that are learned from, not kept
     def describe(self, spec: Spec, num_envs: int) -> str: ...
@@ -339,7 +339,7 @@ class Agent(Protocol):
     @property
     def experience(self) -> Experience: ...
     @property
-    def unroll(self) -> int: ...  # steps L of the windows through which its memory learns; 0 if no memory does
+    def unroll(self) -> int: ...  # steps L of the windows that its memory learns through, with burn-in; 0 if none
     def init(self, spec: Spec, tasks: Task, key: Key) -> Any: ...
     def begin(self, state: Any, task: Task) -> Any: ...  # the memory with which a trial begins; () for none
     def act(self, state: Any, memory: Any, obs: Any, task: Task, key: Key | None) -> Acted: ...

@@ -41,6 +41,7 @@ _FOUND = "earns nearly all that it can before its first evaluation; tests/test_p
 _READS = "begins to earn more after two minutes of two CPU cores"
 _PULLS = "ten pulls earn between 5 and 6.02, too little to see in few trials; tests/test_own_inference.py trains it"
 _BELIEVES = "ten pulls earn between 5 and 6.02; tests/test_posterior.py has beliefs that are known"
+_STORED = "takes over ten minutes of two CPU cores; tests/test_recurrent.py has burn-in step by step"
 _SOON = "earns nearly all that it can before its first evaluation; tests/test_pqn.py has probes"
 _CRAFT = "takes longer than ten minutes of two CPU cores; tests/test_sketches.py learns in a small corridor"
 _PAGE = "is --quick with a page; tests/test_view.py has a run with one"
@@ -75,6 +76,9 @@ MARKS: dict[str, Learns | str] = {
     "--env=gymnax:Breakout-MinAtar --agent=pqn": "needs gymnax; tests/test_pqn.py has probes",
     "--env=envpool:Pong-v5 --agent=impala --preset=gpu": _GPU,
     "--env=hidden-bandit --agent=ppo --trials=10 --agent.conditioning=posterior --agent.unroll=10": _BELIEVES,
+    "--env=point-mass-vary-goal --env.num-tasks=4 --split=none --agent=sac --trials=2 --seeds=3 "
+    "--agent.conditioning=recurrent --agent.burn-in=16 --agent.hidden 64 64 --num-envs=4 --updates-per-step=2 "
+    "--batch-size=4 --chunk-steps=500 --steps=160000 --eval-every=40000 --eval-episodes=10": _STORED,
     "--env=craft-sketched --agent=sketches": _CRAFT,
     "--env=craft-sketched --agent=sketches --agent.sharing=tasks": _CRAFT,
     "--env=craft-sketched --agent=sketches --agent.sharing=all --agent.conditioning=one-hot": _CRAFT,

@@ -1,13 +1,14 @@
 """A recurrent memory of the task: what it keeps, how it learns through windows, and what it is refused with."""
 
 import dataclasses
+from functools import partial
 
 import exact
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import Walk, of_task, pick, quick, tasks_of, tiny, train
+from probes import Walk, of_task, pick, quick, slow_but, tasks_of, tiny, train
 
 import mtjax
 from mtjax import agents
@@ -135,6 +136,95 @@ def test_sac_learns_from_windows_that_begin_with_the_stored_state():
     assert not np.allclose(update(steps), update(other)) and np.allclose(update(steps), update(later))
 
 
+# Burn-in.
+
+BURN, LEARNED = 2, 4
+WAYS = {
+    "recurrent": RECURRENT,
+    **{x: {"conditioning": "posterior", "inference": x, "recurrent_size": SIZE} for x in ("varibad", "pearl", "cadm")},
+}
+
+
+def burning(way):
+    """An agent with burn-in and one without, and windows (T, B, BURN + LEARNED, ...) with random memories."""
+    agent, plain = (tiny("sac", recurrent_steps=LEARNED, burn_in=n, **WAYS[way]) for n in (BURN, 0))
+    steps = jax.tree.map(lambda x: jnp.swapaxes(x, 1, 2), rollout()._replace(extras=None, memory=None))
+    blank = agent.conditioning.begin(3, 2)
+    hidden = np.random.default_rng(1).random((*steps.reward.shape, *blank.shape))
+    closed = steps.closed.at[:, 0, 0].set(True)  # some trials end inside burn-in, others do not
+    memory = Memory(None, jnp.float32(hidden))
+    return agent, plain, steps._replace(ended=closed, closed=closed, cut=closed, memory=memory)
+
+
+def burned(agent, params, windows):
+    """The memories (T, B, ...) after burn-in, step by step as acting has them."""
+    knowing = agent.conditioning
+    one = jax.jit(jax.vmap(jax.vmap(lambda hidden, step: knowing.remember(params, hidden, step))))
+    hidden, blank = windows.memory.hidden[:, :, 0], knowing.begin(3, 2)
+    for t in range(BURN):
+        step = jax.tree.map(lambda x, t=t: x[:, :, t], windows._replace(memory=None))
+        closed = step.closed.reshape(*step.closed.shape, *[1] * blank.ndim)
+        hidden = jnp.where(closed, blank, one(hidden, step))
+    return hidden
+
+
+def rest_of(windows, hidden):
+    """The steps after burn-in, which begin with these memories (T, B, ...)."""
+    rest = jax.tree.map(lambda x: x[:, :, BURN:], windows)
+    return rest._replace(memory=Memory(None, rest.memory.hidden.at[:, :, 0].set(hidden)))
+
+
+@pytest.mark.parametrize("way", slow_but(WAYS, "recurrent"))
+def test_after_burn_in_steps_are_learned_from_with_the_memory_of_present_parameters(way):
+    """Loss and gradient are those of the same steps without burn-in, if they begin with that memory."""
+    agent, plain, windows = burning(way)
+    assert np.any(windows.closed[:, :, :BURN]) and not np.all(np.any(windows.closed[:, :, :BURN], axis=2))
+    state = agent.init(SPEC, TASKS, KEY)
+    nets = of_task(state.nets, 0)
+    rest = rest_of(windows, burned(agent, nets["knowing"].parts, windows))
+
+    def learn(agent, windows):
+        batch = agent.view.keyed(replayed.prepare(agent, state, windows, TASKS), KEY)
+        batch, target = replayed.critic_data(agent, state, batch, KEY)
+        one, of_one = jax.tree.map(lambda x: x[0], (batch, target))
+        loss = lambda nets: (agent.critic_loss(nets, one, of_one)[0], agent.actor_loss(nets, one, KEY)[0])
+        return loss(nets), jax.grad(lambda nets: sum(loss(nets)))(nets)
+
+    with_burn_in, without = (quick(partial(learn, a), w) for a, w in ((agent, windows), (plain, rest)))
+    found, expected = with_burn_in(windows), without(rest)
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-3, atol=1e-5), found, expected)
+    assert any(np.any(np.asarray(x) != 0) for x in jax.tree.leaves(found[1]["knowing"]))
+    if way != "cadm":  # whose memory is of steps alone
+        stale = without(rest_of(windows, windows.memory.hidden[:, :, BURN]))
+        assert not np.allclose(found[0][0], stale[0][0])
+
+
+def test_targets_burn_in_with_slow_parameters():
+    """What slow networks see is their own memory after burn-in."""
+    agent, plain, windows = burning("recurrent")
+    state = agent.init(SPEC, TASKS, KEY)
+    slow = jax.tree.map(lambda x: 0.5 * x, state.nets["knowing"].shared)
+    rest = rest_of(windows, burned(agent, slow, windows))
+    seen = [replayed.prepare(a, state, w, TASKS).next_obs for a, w in ((agent, windows), (plain, rest))]
+    features = lambda way, seen: jax.vmap(lambda seen: way.features(slow, jnp.zeros(0), seen))(seen)
+    found, expected = (features(a.conditioning, x) for a, x in zip((agent, plain), seen, strict=True))
+    assert found.shape == (3, ENVS * LEARNED, SIZE)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_without_burn_in_a_track_stays_as_it_is():
+    track = Track(*[jnp.zeros(1)] * 7)
+    assert Recurrent().burned_in({}, track) is track
+
+
+def test_a_ring_holds_a_whole_window():
+    """Burn-in counts; with fewer slots a window would wrap around in time."""
+    agent = tiny("sac", conditioning="recurrent", recurrent_steps=4, burn_in=2, replay_size=50, warmup_steps=10)
+    assert agent.unroll == 6
+    with pytest.raises(InputError, match=r"replay-size \(50\) must hold 6 steps of num-envs \(10\)"):
+        mtjax.train(Walk(), agent, num_envs=10, steps=400, quiet=True)
+
+
 @pytest.mark.usefixtures("optimised")
 @pytest.mark.slow
 def test_a_memory_explores_as_well_as_can_be():
@@ -162,6 +252,9 @@ def test_a_run_with_a_recurrent_memory_stays_finite():
         ("sac", {"n_step": 3, "warmup_steps": 50}, "needs n-step=1"),
         ("sac", {"hindsight": 0.5, "warmup_steps": 50}, "hindsight=0"),
         ("sac", {"warmup_steps": 3, "recurrent_steps": 5}, "warmup-steps of at least 4, not 3"),
+        ("sac", {"warmup_steps": 8, "recurrent_steps": 5, "burn_in": 5}, "after burn-in=5 .* of at least 9, not 8"),
+        ("sac", {"burn_in": -1}, "burn-in must be at least 0"),
+        ("ppo", {"burn_in": 4}, "burn-in=4 renews memories that a replay has stored, and PPO learns from rollouts"),
         ("hip-bmdp", {"unseen_theta": "inferred"}, "two memories of an episode"),
         ("ppo", {"recurrent_size": 0}, "recurrent-size must be at least 1"),
     ],
@@ -169,3 +262,8 @@ def test_a_run_with_a_recurrent_memory_stays_finite():
 def test_what_a_memory_cannot_do_is_refused(name, settings, message):
     with pytest.raises(InputError, match=message):
         agents.agent(name, conditioning="recurrent", **settings)
+
+
+def test_without_a_memory_there_is_nothing_to_burn_in():
+    with pytest.raises(InputError, match="unknown setting of sac 'burn_in'; it belongs to conditioning='recurrent'"):
+        agents.agent("sac", burn_in=4)

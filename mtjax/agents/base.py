@@ -225,9 +225,9 @@ class BaseAgent(abc.ABC):
 
     @property
     def unroll(self) -> int:
-        """Steps L of the windows through which a memory learns, of a rollout all; 0 if none does."""
+        """Steps of the windows through which a memory learns, with burn-in, of a rollout all; 0 if none does."""
         way: Any = self.conditioning
-        return getattr(self.experience, "unroll", way.recurrent_steps) if way.recurs else 0
+        return getattr(self.experience, "unroll", way.burn_in + way.recurrent_steps) if way.recurs else 0
 
     def init(self, spec: Spec, tasks: Task, key: Key) -> AgentState:
         """Return the initial state for the training ``tasks`` (T, ...)."""

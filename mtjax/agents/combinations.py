@@ -75,6 +75,11 @@ def _check_knowing(agent: Any) -> None:
     if conditioning.recurs and representation.history:
         name = _name(agent, "conditioning")
         raise InputError(f"conditioning={name} and theta-from are two memories of an episode; use one of them")
+    if conditioning.recurs and conditioning.burn_in and not agent.experience.storage.kept:
+        raise InputError(
+            f"burn-in={conditioning.burn_in} renews memories that a replay has stored, and {type(agent).__name__} "
+            "learns from rollouts; use burn-in=0, or sac"
+        )
 
 
 def _check_encoder(agent: Any) -> None:
@@ -158,9 +163,11 @@ def check_replayed(agent: Any) -> None:
         name = _name(agent, "conditioning")
         raise InputError(f"conditioning={name} needs n-step=1, hindsight=0 and host-replay-size=0")
     if agent.unroll > replay.warmup_steps + 1:
+        burn_in = agent.conditioning.burn_in
+        front = f" after burn-in={burn_in}" if burn_in else ""
         raise InputError(
-            f"recurrent-steps={agent.unroll} needs as many steps before the first update: warmup-steps of at least "
-            f"{agent.unroll - 1}, not {replay.warmup_steps}"
+            f"recurrent-steps={agent.unroll - burn_in}{front} needs as many steps before the first update: "
+            f"warmup-steps of at least {agent.unroll - 1}, not {replay.warmup_steps}"
         )
 
 

@@ -79,9 +79,13 @@ def prepare(agent: Any, state: AgentState, window: Transition, tasks: Task, key:
 
 
 def transitions(agent: Any, window: Transition, tasks: Task) -> Transition:
-    """Return the transitions (T, N, ...) that windows (T, B, L, ...) are made to: all steps, or one n-step each."""
+    """Return the transitions (T, N, ...) that windows (T, B, L, ...) are made to: all steps, or one n-step each.
+
+    Steps of burn-in are none.
+    """
     if agent.unroll:
-        return jax.tree.map(lambda x: x.reshape(len(x), -1, *x.shape[3:]), window._replace(memory=None))
+        learned = lambda x: x[:, :, agent.conditioning.burn_in :].reshape(len(x), -1, *x.shape[3:])
+        return jax.tree.map(learned, window._replace(memory=None))
     return joined(window, discounts_of_all(agent, tasks), agent.experience.n_step)
 
 

@@ -101,8 +101,11 @@ class Replay:
                 f"{self.n_step - 1}, not {self.warmup_steps}"
             )
 
-    def check(self, env: Env, num_envs: int, chunk_steps: int = 0) -> None:
+    def check(self, env: Env, num_envs: int, chunk_steps: int = 0, unroll: int = 0) -> None:
         """Check that the settings fit the environment, and chunks of so many steps of every environment.
+
+        Args:
+            unroll: steps of the windows through which a memory learns.
 
         Raises:
             InputError: the replay does not hold enough steps of every environment, or hindsight cannot relabel the
@@ -113,8 +116,9 @@ class Replay:
             raise InputError(f"{window} steps tell one transition of pictures; use warmup-steps of at least {window}")
         if shown(env.spec.obs) and env.episode_length < 2:
             raise InputError("the picture after an episode's last step is lost: it takes two steps; lower --env.repeat")
+        window = max(window, unroll, 1)
         if self.capacity(num_envs) < max(window, self.update_every) * num_envs:
-            least = math.ceil(max(window, 1) / self.update_every) * self.update_every
+            least = math.ceil(window / self.update_every) * self.update_every
             steps = "one step" if least == 1 else f"{least} steps"
             raise InputError(f"replay-size ({self.replay_size}) must hold {steps} of num-envs ({num_envs})")
         if self.hindsight:

@@ -52,7 +52,7 @@ class Rollouts:
         """The number U of updates each time that the agent learns."""
         return self.epochs * self.minibatches
 
-    def check(self, env: Env, num_envs: int, chunk_steps: int = 0) -> None:
+    def check(self, env: Env, num_envs: int, chunk_steps: int = 0, unroll: int = 0) -> None:
         """Accept every environment."""
 
     def host_slots(self, num_envs: int) -> int:

@@ -121,7 +121,7 @@ def init(
     Args:
         numbers: values (S,), by name, of the agent's numbers that vary between seeds, in a sweep.
     """
-    agent.experience.check(env, settings.num_envs)
+    agent.experience.check(env, settings.num_envs, unroll=agent.unroll)
     require_trials(settings, env, agent)
     require_curriculum(settings, env, agent)
     known, rows = tasks, None

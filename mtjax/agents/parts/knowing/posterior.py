@@ -99,5 +99,6 @@ class Posterior(Remembering):
         return self.way.show(params, memory)
 
     def join(self, loss: Array, metrics: Metrics, params: dict[str, Any], seen: Any) -> tuple[Array, Metrics]:
-        losses = self.way.losses(params, seen.past, *self.over(params, seen.past))
+        track = self.burned_in(params, seen.past)
+        losses = self.way.losses(params, track, *self.over(params, track))
         return loss + sum(losses.values()), metrics | losses

@@ -49,18 +49,24 @@ def track(window: Transition, obs: Array) -> Track:
 class Remembering(Nothing):
     """Shows networks what is made of a memory, which reads every step of a trial once it is over.
 
-    It learns through the steps of a window, which begins with the memory that acting had there. That does not learn. A
-    subclass says with which memory a trial begins, what is read of a step, how the memory changes, and what is shown.
+    It learns through the steps of a window, which begins with the memory that acting had there. That does not learn.
+    Parameters have changed since, so a window of a replay may have steps in front, after which the memory is that of
+    the present parameters, or of the slow ones in targets, and nothing learns (burn-in; Kapturowski et al. 2019,
+    "R2D2"). A subclass says with which memory a trial begins, what is read of a step, how the memory changes, and what
+    is shown.
     """
 
     recurrent_steps: int = 16
     """Steps through which it learns from a replay; a rollout is learned from as a whole."""
+    burn_in: int = 0
+    """Steps before these that only renew the stored memory (R2D2); for a replay alone."""
 
     tells: ClassVar[bool] = True
     recurs: ClassVar[bool] = True
 
     def __post_init__(self):
         parts.require_counts(self, "recurrent_steps")
+        parts.require_not_negative(self, "burn_in")
 
     @abc.abstractmethod
     def read(self, params: dict[str, Any], step: Any) -> Array:
@@ -80,7 +86,7 @@ class Remembering(Nothing):
     def features(self, params: dict[str, Any], given: Array, seen: Any) -> Array:
         if isinstance(seen.past, Hidden):
             return self.show(params, seen.past.state)
-        before, after = self.over(params, seen.past)
+        before, after = self.over(params, self.burned_in(params, seen.past))
         return self.show(params, after if isinstance(seen.past, Following) else before)
 
     def over(self, params: dict[str, Any], track: Track) -> tuple[Array, Array]:
@@ -88,6 +94,26 @@ class Remembering(Nothing):
 
         Where sums of rewards end, the value after the step is that of going on, so its memory has seen no end.
         """
+        _, before = self._through(params, track)
+        going_on = track._replace(ended=track.ended & ~track.cut)
+        return before, self.advance(params, before, self.read(params, going_on))
+
+    def burned_in(self, params: dict[str, Any], track: Track) -> Track:
+        """Return a track (B L, ...) without the ``burn_in`` first steps of windows, and with the memory after them.
+
+        No gradient flows through these.
+        """
+        if not self.burn_in:
+            return track
+        count, steps = len(track.state), track._replace(state=None, key=None)
+        by_window = lambda x, part: x.reshape(count, -1, *x.shape[1:])[:, part].reshape(-1, *x.shape[1:])
+        take = lambda part: jax.tree.map(lambda x: by_window(x, part), steps)
+        first, rest = take(slice(self.burn_in)), take(slice(self.burn_in, None))
+        state, _ = self._through(jax.lax.stop_gradient(params), first._replace(state=track.state))
+        return rest._replace(state=state, key=track.key)
+
+    def _through(self, params: dict[str, Any], track: Track) -> tuple[Array, Array]:
+        """Return the memories (B, ...) after all steps, and those (B L, ...) before every one."""
         count, begun = len(track.state), self.begin(track.obs.shape[-1], track.action.shape[-1])
         in_time = lambda x: jnp.swapaxes(x.reshape(count, -1, *x.shape[1:]), 0, 1)
 
@@ -96,10 +122,8 @@ class Remembering(Nothing):
             after = self.advance(params, memory, read)
             return jnp.where(closed.reshape(-1, *[1] * begun.ndim), begun, after), memory
 
-        _, before = jax.lax.scan(step, track.state, (in_time(self.read(params, track)), in_time(track.closed)))
-        before = jnp.swapaxes(before, 0, 1).reshape(-1, *before.shape[2:])
-        going_on = track._replace(ended=track.ended & ~track.cut)
-        return before, self.advance(params, before, self.read(params, going_on))
+        last, before = jax.lax.scan(step, track.state, (in_time(self.read(params, track)), in_time(track.closed)))
+        return last, jnp.swapaxes(before, 0, 1).reshape(-1, *before.shape[2:])
 
 
 def gru(size: int) -> nn.GRUCell:
