@@ -117,14 +117,15 @@ class Transformer(Remembering):
     Positions are distances alone, with a learned bias b for each (Raffel et al. 2020), so that a trial may be of any
     length. What goes to nothing (Xiao et al. 2024) tells how many steps there were.
 
-    The memory is a cache of the keys and values of the last C steps: acting costs one query a step, and the oldest step
-    falls out. A window is learned from in one pass, of all steps at once. It begins with the cache that acting had
-    there, which does not learn. Where a time limit cuts sums off, the value after the step is that of going on: of
-    h_(t+1) with e_t = 0.
+    The memory is a cache of the keys and values of the last C steps, 2 N C D + C + D numbers: acting costs one query a
+    step, and the oldest step falls out. A rollout has it before the first step alone, a replay with every step. A window
+    is learned from in one pass, of all steps at once. It begins with the cache that acting had there, which does not
+    learn. Where a time limit cuts sums off, the value after the step is that of going on: of h_(t+1) with e_t = 0.
 
-    A transformer that learns hidden tasks by the return is that of TrMRL (Melo 2022). Differs from there: steps are kept
-    over episodes, biases take the place of absolute positions, and the policy sees s_t beside h_t. Differs from
-    algorithm distillation (Laskin et al. 2023): it learns by PPO, and not from the records of learners.
+    It learns by the losses of the networks that see it. TrMRL (Melo 2022) finds out hidden tasks so too. Differs from
+    there: normalisation, which comes first in a block, takes the place of the initialisation T-Fixup, biases that of
+    encoded positions, and the policy sees s_t beside h_t. Differs from algorithm distillation (Laskin et al. 2023),
+    where a transformer learns from the records of learners.
     """
 
     transformer_size: int = 64
