@@ -57,7 +57,7 @@ class Block(nn.Module):
         found += jnp.einsum("...hl,...lhd->...lhd", weights[..., -2], value)
         x += nn.Dense(size)(found.reshape(x.shape))
         x += nn.Dense(size)(ReLU()(nn.Dense(_WIDER * size)(nn.LayerNorm()(x))))
-        return x, *first
+        return x, first[0], first[1]
 
 
 class Blocks(nn.Module):
@@ -90,8 +90,8 @@ def attended(known: Array, closed: Array) -> Array:
     They are the last C before it that are of its trial.
     """
     kept, length = known.shape[-1], closed.shape[-1]
-    ends = closed.astype(known.dtype)
-    trial = ends @ np.triu(np.ones((length, length), np.float32), 1)  # how many have ended before the step
+    before = np.triu(np.ones((length, length), np.float32), 1)
+    trial = jnp.matmul(closed.astype(jnp.float32), before, precision="highest")  # how many have ended before the step
     steps = jnp.concatenate([jnp.where(known > 0, 0.0, -1.0), trial], axis=-1)
     distance = kept + np.arange(length)[:, None] - np.arange(kept + length)
     return (steps[..., None, :] == trial[..., None]) & ((distance > 0) & (distance <= kept))
@@ -118,9 +118,9 @@ class Transformer(Remembering):
     length. What goes to nothing (Xiao et al. 2024) tells how many steps there were.
 
     The memory is a cache of the keys and values of the last C steps, 2 N C D + C + D numbers: acting costs one query a
-    step, and the oldest step falls out. A rollout has it before the first step alone, a replay with every step. A window
-    is learned from in one pass, of all steps at once. It begins with the cache that acting had there, which does not
-    learn. Where a time limit cuts sums off, the value after the step is that of going on: of h_(t+1) with e_t = 0.
+    step, and the oldest step falls out. A rollout has it before its first step alone, a replay with every step. A
+    window is learned from in one pass, of all steps at once. It begins with the cache that acting had there, which does
+    not learn. Where a time limit cuts sums off, the value after the step is that of going on: of h_(t+1) with e_t = 0.
 
     It learns by the losses of the networks that see it. TrMRL (Melo 2022) finds out hidden tasks so too. Differs from
     there: normalisation, which comes first in a block, takes the place of the initialisation T-Fixup, biases that of
