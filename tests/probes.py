@@ -422,7 +422,7 @@ def with_memory(agent, batch: Transition) -> Transition:
     if not agent.conditioning.recurs:
         return batch
     begun = agent.conditioning.begin(batch.obs.shape[-1], batch.action.shape[-1])
-    hidden = jax.random.uniform(jax.random.key(0), (*batch.reward.shape, *begun.shape))
+    hidden = jax.tree.map(lambda x: jax.random.uniform(jax.random.key(0), (*batch.reward.shape, *x.shape)), begun)
     return batch._replace(memory=Memory(None, hidden), **dict.fromkeys(("ended", "closed", "cut"), batch.discount == 0))
 
 

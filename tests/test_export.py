@@ -268,11 +268,12 @@ def test_a_file_that_holds_no_policy_is_refused(content, tmp_path):
 WAYS = {
     "recurrent": {"conditioning": "recurrent", "recurrent_size": 4},
     "inferred": {"conditioning": "inferred", "inferred_from": 3},
+    "transformer": {"conditioning": "transformer", "transformer_size": 4, "transformer_heads": 2, "attended_steps": 3},
     **{way: {"conditioning": "posterior", "inference": way, "latent_size": 2} for way in ("varibad", "pearl", "cadm")},
 }
 
 
-@pytest.mark.parametrize("way", slow_but(WAYS, "recurrent", "pearl"))
+@pytest.mark.parametrize("way", slow_but(WAYS, "recurrent", "pearl", "transformer"))
 @pytest.mark.parametrize("scores", [False, True])
 def test_a_memory_goes_into_the_file(way, scores, tmp_path):
     """By NumPy and by JAX: actions, and memories through the episodes of a trial, for one world and for a batch."""

@@ -108,8 +108,11 @@ class Rollouts:
         return jax.tree.map(lambda x: x[:, jax.random.randint(key, (count,), 0, x.shape[1])], flat)
 
     def window(self, data: Transition, batch: Array) -> Transition:
-        """Take the windows (T, B, L, ...) of one minibatch, by the indices (B, L) of their steps."""
-        return jax.tree.map(lambda x: x.reshape(len(x), -1, *x.shape[3:])[:, batch], data)
+        """Take the windows (T, B, L, ...) of one minibatch, by the indices (B, L) of their steps.
+
+        Of what is known of first steps alone (T, 1, E, ...), windows have one step too.
+        """
+        return jax.tree.map(lambda x: x.reshape(len(x), -1, *x.shape[3:])[:, batch[:, : x.shape[1]]], data)
 
 
 def windows(steps: Transition, length: int) -> Transition:

@@ -430,7 +430,9 @@ def _collect(
     step = lambda state, keys: _step(env, agent, settings, tasks, state, *keys)
     apart = [jnp.stack(split_keys(each, count)) for each in (keys, reset_keys)]
     if not adaptations:
-        return _played(*jax.lax.scan(step, state, tuple(apart)))
+        begun, (state, steps, seen) = state.worlds.memory, _played(*jax.lax.scan(step, state, tuple(apart)))
+        whole = count == agent.unroll and not agent.experience.storage.kept
+        return state, _with_first(steps, begun) if whole else steps, seen
 
     def play(state: TrainState, given: tuple) -> tuple[TrainState, tuple[Transition, Any]]:
         """Take the steps of one rollout, and adapt to them if another follows."""
@@ -444,6 +446,17 @@ def _collect(
     state, (steps, seen) = jax.lax.scan(play, state, (jnp.arange(adaptations + 1) == adaptations, *apart))
     joined = lambda x: jnp.moveaxis(x, 0, 2).reshape(*x.shape[1:3], count, *x.shape[4:])
     return state, jax.tree.map(joined, steps), jax.tree.map(lambda x: x.reshape(count, *x.shape[2:]), seen)
+
+
+def _with_first(steps: Transition, begun: Any) -> Transition:
+    """Keep of what agents learn through, in windows of whole rollouts, that before the first step: (S, T, 1, E, ...).
+
+    Otherwise a memory of many numbers would be stored at every step.
+    """
+    if getattr(begun, "hidden", None) is None:
+        return steps
+    hidden = jax.tree.map(lambda x: x[:, :, None], begun.hidden)
+    return steps._replace(memory=steps.memory._replace(hidden=hidden))
 
 
 def _played(state: TrainState, taken: tuple[Transition, Any]) -> tuple[TrainState, Transition, Any]:

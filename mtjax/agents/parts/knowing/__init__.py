@@ -8,6 +8,7 @@ from mtjax.agents.parts.knowing.parameters import Parameters
 from mtjax.agents.parts.knowing.posterior import Posterior
 from mtjax.agents.parts.knowing.recurrent import Recurrent
 from mtjax.agents.parts.knowing.text import Text
+from mtjax.agents.parts.knowing.transformer import Transformer
 from mtjax.agents.parts.knowing.vectors import Vectors
 
 Knowing = Nothing
@@ -22,4 +23,5 @@ CONDITIONINGS: dict[str, type[Knowing]] = {
     "inferred": LastSteps,
     "recurrent": Recurrent,
     "posterior": Posterior,
+    "transformer": Transformer,
 }

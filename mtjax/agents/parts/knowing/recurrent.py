@@ -17,13 +17,13 @@ from mtjax.types import Array, Key, Transition
 class Hidden(NamedTuple):
     """Holds the memory before an observation."""
 
-    state: Array  # (Z,), or as ``begin`` has it
+    state: Any  # as ``begin`` has it
 
 
 class Track(NamedTuple):
     """Holds the steps of windows one after another, to tell the memory before each of them."""
 
-    state: Array  # (B, ...) memory before the first step of each window
+    state: Any  # (B, ...) memory before the first step of each window
     obs: Array  # (B L, O)
     action: Array  # (B L, A)
     reward: Array  # (B L,)
@@ -42,7 +42,7 @@ def track(window: Transition, obs: Array) -> Track:
     """Return the track of windows (B, L, ...) whose observations are (B, L, O) as networks take them."""
     flat = lambda x: x.reshape(-1, *x.shape[2:])
     steps = (obs, window.action, window.reward, window.ended, window.closed, window.cut, window.next_obs)
-    return Track(window.memory.hidden[:, 0], *map(flat, steps))
+    return Track(jax.tree.map(lambda x: x[:, 0], window.memory.hidden), *map(flat, steps))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,23 +73,27 @@ class Remembering(Nothing):
         """Return what is read (..., I) of steps: transitions or a ``Track``."""
 
     @abc.abstractmethod
-    def advance(self, params: dict[str, Any], memory: Array, read: Array) -> Array:
+    def advance(self, params: dict[str, Any], memory: Any, read: Array) -> Any:
         """Return the memory (..., M) after steps (..., I) as they are read."""
 
-    def show(self, params: dict[str, Any], memory: Array) -> Array:
+    def show(self, params: dict[str, Any], memory: Any) -> Array:
         """Return what networks see (..., Z) of a memory (..., M)."""
         return memory
 
-    def remember(self, params: dict[str, Any], hidden: Array, step: Transition) -> Array:
+    def remember(self, params: dict[str, Any], hidden: Any, step: Transition) -> Any:
         return self.advance(params, hidden, self.read(params, step))
 
     def features(self, params: dict[str, Any], given: Array, seen: Any) -> Array:
         if isinstance(seen.past, Hidden):
             return self.show(params, seen.past.state)
-        before, after = self.over(params, self.burned_in(params, seen.past))
-        return self.show(params, after if isinstance(seen.past, Following) else before)
+        track = self.burned_in(params, seen.past)
+        return self.shown(params, track, isinstance(seen.past, Following))
 
-    def over(self, params: dict[str, Any], track: Track) -> tuple[Array, Array]:
+    def shown(self, params: dict[str, Any], track: Track, after: bool) -> Array:
+        """Return what networks see (B L, Z) before every step, or after it."""
+        return self.show(params, self.over(params, track)[after])
+
+    def over(self, params: dict[str, Any], track: Track) -> tuple[Any, Any]:
         """Return the memories (B L, ...) before and after every step.
 
         Where sums of rewards end, the value after the step is that of going on, so its memory has seen no end.
@@ -105,25 +109,30 @@ class Remembering(Nothing):
         """
         if not self.burn_in:
             return track
-        count, steps = len(track.state), track._replace(state=None, key=None)
+        count, steps = _count(track), track._replace(state=None, key=None)
         by_window = lambda x, part: x.reshape(count, -1, *x.shape[1:])[:, part].reshape(-1, *x.shape[1:])
         take = lambda part: jax.tree.map(lambda x: by_window(x, part), steps)
         first, rest = take(slice(self.burn_in)), take(slice(self.burn_in, None))
         state, _ = self._through(jax.lax.stop_gradient(params), first._replace(state=track.state))
         return rest._replace(state=state, key=track.key)
 
-    def _through(self, params: dict[str, Any], track: Track) -> tuple[Array, Array]:
+    def _through(self, params: dict[str, Any], track: Track) -> tuple[Any, Any]:
         """Return the memories (B, ...) after all steps, and those (B L, ...) before every one."""
-        count, begun = len(track.state), self.begin(track.obs.shape[-1], track.action.shape[-1])
+        begun, count = self.begin(track.obs.shape[-1], track.action.shape[-1]), _count(track)
         in_time = lambda x: jnp.swapaxes(x.reshape(count, -1, *x.shape[1:]), 0, 1)
 
-        def step(memory: Array, given: tuple[Array, Array]) -> tuple[Array, Array]:
+        def step(memory: Any, given: tuple[Array, Array]) -> tuple[Any, Any]:
             read, closed = given
-            after = self.advance(params, memory, read)
-            return jnp.where(closed.reshape(-1, *[1] * begun.ndim), begun, after), memory
+            renew = lambda new, old: jnp.where(closed.reshape(-1, *[1] * new.ndim), new, old)
+            return jax.tree.map(renew, begun, self.advance(params, memory, read)), memory
 
         last, before = jax.lax.scan(step, track.state, (in_time(self.read(params, track)), in_time(track.closed)))
-        return last, jnp.swapaxes(before, 0, 1).reshape(-1, *before.shape[2:])
+        return last, jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1).reshape(-1, *x.shape[2:]), before)
+
+
+def _count(track: Track) -> int:
+    """Return the number B of windows."""
+    return len(jax.tree.leaves(track.state)[0])
 
 
 def gru(size: int) -> nn.GRUCell:
