@@ -2,6 +2,8 @@
 
 An agent knows all N training tasks: its own parameters of each, its features and its memory of gradient steps. Of these
 T are played at a time. The tasks of a chunk follow from the step at which it begins, so that a run resumes exactly.
+
+Where episodes draw their tasks, it also says which of the draws follows in a world that is not reset.
 """
 
 import abc
@@ -9,16 +11,26 @@ import contextlib
 import dataclasses
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 
-from mtjax.types import Array, InputError, Key
+from mtjax.tasks import draw_at, episode_task
+from mtjax.types import Array, InputError, Key, Task
+
+
+class Drawing:
+    """What follows in a world that is not reset is drawn, wherever it is."""
+
+    def follow(self, env: Any, listed: Task, task: Task, state: Any, key: Key) -> Task:
+        """Return the task that one world plays next, of the draws of ``listed``, after ``task``, in ``state``."""
+        return episode_task(listed, key)
 
 
 @dataclasses.dataclass(frozen=True)
-class Everything:
+class Everything(Drawing):
     """All tasks are played, always."""
 
     steps: ClassVar[int] = 0  # of every environment, after which tasks change; 0 for never
@@ -33,7 +45,40 @@ class Everything:
 
 
 @dataclasses.dataclass(frozen=True)
-class Random:
+class ForwardBackward(Everything):
+    """In worlds that are not reset a goal that is drawn and the way back to the start take turns.
+
+    Han, Levine and Abbeel 2015, "Learning compound multi-step controllers under unknown dynamics"; EARL's FBRL.
+    """
+
+    def follow(self, env: Any, listed: Task, task: Task, state: Any, key: Key) -> Task:
+        back = env.returning(task)
+        same = jax.tree.map(lambda x, y: jnp.all(x == y), back.goal, task.goal)
+        came_back = jnp.all(jnp.stack(jax.tree.leaves(same)))
+        return jax.tree.map(partial(jnp.where, came_back), episode_task(listed, key), back)
+
+
+@dataclasses.dataclass(frozen=True)
+class Graph(Everything):
+    """In worlds that are not reset the next task is one that begins where the world is, as one task's end is another's.
+
+    After the task graph of Gupta et al. 2021, "Reset-free reinforcement learning via multi-task learning". Nodes are
+    the ends of all draws and the start, with edges between any two. A world that is at a node plays towards any other
+    one, and a world that is at none towards the nearest. Gupta et al. give edges by hand.
+    """
+
+    def follow(self, env: Any, listed: Task, task: Task, state: Any, key: Key) -> Task:
+        draws = jax.vmap(draw_at, (None, 0))(listed, jnp.arange(len(listed.draws.id)))
+        nodes = jax.tree.map(lambda x, y: jnp.append(x, y[None], axis=0), draws, env.returning(task))
+        far = jax.vmap(env.distance, (0, None))(nodes, state)
+        there = far <= 1
+        away = jnp.where(there, jnp.inf, jax.random.uniform(key, far.shape))
+        node = jnp.argmin(jnp.where(jnp.any(there), away, far))
+        return jax.tree.map(lambda x: x[node], nodes)
+
+
+@dataclasses.dataclass(frozen=True)
+class Random(Drawing):
     """Some tasks are played, and others drawn after so many steps of every environment, without repeating one."""
 
     played: int
@@ -52,7 +97,7 @@ class Random:
 
 
 @dataclasses.dataclass(frozen=True)
-class Sequence:
+class Sequence(Drawing):
     """One task is played after another, in the order of the table, for so many steps of every environment each.
 
     After the last one the first follows again.
@@ -83,7 +128,7 @@ def _key(number: Array) -> Key:
 
 
 @dataclasses.dataclass(frozen=True)
-class Heeding:
+class Heeding(Drawing):
     """Some tasks are chosen by what was heard of all: the returns of the policy that learns, as means over seeds.
 
     Of each task (N, 2) a fast and a slow mean over the chunks that played it are kept, NaN before its first episode has
@@ -180,6 +225,7 @@ def hear(heard: Array, rows: Array, returns: Array) -> Array:
 
 
 Curriculum = Everything | Random | Heeding | Sequence
+_OF_ALL = {"all": Everything(), "forward-backward": ForwardBackward(), "graph": Graph()}
 _KINDS = {  # with how many numbers each has
     "random": (Random, 2),
     "progress": (Progress, 2),
@@ -196,8 +242,8 @@ def read(text: str) -> Curriculum:
     Raises:
         InputError: it names none.
     """
-    if text == "all":
-        return Everything()
+    if text in _OF_ALL:
+        return _OF_ALL[text]
     kind, *words = text.split(":")
     made, count = _KINDS.get(kind, (Random, -1))
     whole, rest = words[:2], words[2:]
@@ -206,7 +252,7 @@ def read(text: str) -> Curriculum:
         numbers += [float(word) for word in rest if math.isfinite(float(word))]
     if not len(numbers) == len(words) == count:
         raise InputError(
-            "curriculum is all, random:T:STEPS (T tasks at a time), progress:T:STEPS (whose returns change most), "
+            "curriculum is all, forward-backward or graph (in worlds that are not reset), random:T:STEPS (T tasks at a time), progress:T:STEPS (whose returns change most), "
             "hardest:T:STEPS (whose returns are least), growing:T:STEPS:RETURN (a range that grows where its ends "
             "return enough), sequence:STEPS (one after another) or shuffled:STEPS (the same in random order), with "
             "steps of every environment until tasks change, such as random:10:5000 or sequence:100000; "

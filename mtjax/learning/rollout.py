@@ -260,7 +260,7 @@ def _reset_all(env: Env, tasks: Task, worlds: Worlds, ends: Ends, keys: Key, tri
 
 
 def _change_tasks(env: Any, tasks: Task, worlds: Worlds, ends: Ends, keys: Key, trials: Trials) -> _Begun:
-    """Draw tasks with keys (S, T, E) for worlds whose trials have ended, which go on where they are; reset lost ones.
+    """Choose tasks with keys (S, T, E) for worlds whose trials have ended, which go on where they are; reset lost ones.
 
     Returns:
         these worlds, and the others as they are.
@@ -270,9 +270,11 @@ def _change_tasks(env: Any, tasks: Task, worlds: Worlds, ends: Ends, keys: Key, 
     begun = jax.lax.cond(jnp.any(lost), again, lambda: own)
     if tasks.draws is None:
         return begun
-    goes_on, drawn = ends.trial & ~lost, _draw_tasks(tasks, keys)
-    seen = frames.begin(env.observe_worlds(drawn, begun.state), env.spec.frames)
-    return _Begun(begun.state, *where_worlds(goes_on, (drawn, seen), (begun.task, begun.obs)))
+    follow = jax.vmap(partial(trials.plays.follow, env), (None, 0, 0, 0))  # type: ignore
+    follow = jax.vmap(jax.vmap(follow), (None, 0, 0, 0))
+    goes_on, following = ends.trial & ~lost, follow(tasks, worlds.task, begun.state, keys)
+    seen = frames.begin(env.observe_worlds(following, begun.state), env.spec.frames)
+    return _Begun(begun.state, *where_worlds(goes_on, (following, seen), (begun.task, begun.obs)))
 
 
 def _reset_some(env: Env, tasks: Task, worlds: Worlds, ends: Ends, keys: Key, trials: Trials) -> _Begun:
