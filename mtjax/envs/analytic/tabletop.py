@@ -31,6 +31,7 @@ _NAMES = tuple(_PLACES)
 _START = _NAMES.index("start")
 _REACHED = 0.2  # [m] within which gripper and object together are where they should be
 _LEFT = 0.1  # [m] within which the object is, so that the gripper goes home
+_CLOSE = 0.4  # [m] that is magnified to 1
 _SCATTER = 0.1  # [m] by which starts differ along each axis
 _REWARDS = ("dense", "sparse")
 _PAINTS = ((0.9, 0.2, 0.2, 1.0), (0.2, 0.2, 0.2, 1.0), (0.2, 0.7, 0.3, 1.0), (0.2, 0.4, 0.9, 1.0), (0.9, 0.8, 0.3, 1.0))
@@ -55,7 +56,8 @@ class Tabletop(Pictured, Family):
         held <- a_2 > 0 and (held or |g - o| < reach)
         g' = clip(g + pace (a_0, a_1));  o' = clip(o + g' - g) if held, else o
 
-    Observation (7,): gripper and object [2.8 m]; 1 if the object is held, else 0; the object's goal [2.8 m].
+    Observation (13,): gripper, object and its goal [2.8 m]; 1 if the object is held, else 0; and magnified, what is
+        close: the ways from gripper to object, from object to goal and from gripper to (0, 0) [0.4 m], within [-1, 1].
     Action (3,): how the gripper moves along both axes; positive to grip or to hold, else the object is let go.
     Reward: 1 where all is where it should be: the object at its goal and the gripper at (0, 0), sqrt(|o - goal|^2 +
         |g|^2) <= 0.2 m. With ``reward_kind=dense`` also the metres by which a step has shortened the way, which is |g| if
@@ -72,9 +74,9 @@ class Tabletop(Pictured, Family):
         reach: from how far the gripper grips [m].
         pace: how far the gripper moves in a step at most along an axis [m].
 
-    Differs from EARL in: there is no MuJoCo, which there only draws; starts differ by up to 0.1 m; gripping is observed
-    once, and of goals only the object's, as the rest is the same in all: 7 numbers for 12, and scaled; our dense reward
-    leads the gripper home too, and the sparse one comes without demonstrations.
+    Differs from EARL in: there is no MuJoCo, which there only draws; starts differ by up to 0.1 m; observations are
+    scaled, hold once what is the same in all goals or twice in each (7 of EARL's 12 numbers), and magnify what is close;
+    our dense reward leads the gripper home too, and the sparse one comes without demonstrations.
     """
 
     context_ranges: Any = ()
@@ -127,9 +129,11 @@ class Tabletop(Pictured, Family):
         return TableState(gripper, thing, held.astype(jnp.float32), gained)
 
     def observe(self, task: Task, state: TableState) -> Array:
-        """Return gripper, object, whether it is held, and its goal."""
-        places = jnp.concatenate([state.gripper, state.object]) / _HALF
-        return jnp.concatenate([places, state.held[None], _goal(task) / _HALF])
+        """Return gripper, object and goal, whether the object is held, and the ways between them as far as 0.4 m."""
+        gripper, thing, goal = state.gripper, state.object, _goal(task)
+        ways = jnp.concatenate([thing - gripper, goal - thing, jnp.array(_HOME) - gripper])
+        places = jnp.concatenate([gripper, thing, goal])
+        return jnp.concatenate([places / _HALF, state.held[None], jnp.clip(ways / _CLOSE, -1.0, 1.0)])
 
     def reward(self, task: Task, state: TableState, action: Array) -> Array:
         """Return 1 where all is where it should be, and in a dense reward the metres gained, ()."""
@@ -198,5 +202,5 @@ def _way(task: Task, gripper: Array, thing: Array) -> Array:
 
 
 def _seen(obs: Array) -> TableState:
-    """Return the state that an observation (7,) shows."""
-    return TableState(_HALF * obs[:2], _HALF * obs[2:4], obs[4], jnp.float32(0))
+    """Return the state that an observation (13,) shows."""
+    return TableState(_HALF * obs[:2], _HALF * obs[2:4], obs[6], jnp.float32(0))
