@@ -48,7 +48,9 @@ def main() -> None:
     parser.add_argument("--steps", type=int, help="of all environments; by default those of the preset")
     parser.add_argument("--evaluations", type=int, default=12)
     parser.add_argument("--episodes", type=int, default=20, help="of every evaluation, which plays all goals as often")
-    parser.add_argument("--env-settings", nargs="*", default=[], metavar="NAME=VALUE", help="such as reward_kind=sparse")
+    parser.add_argument(
+        "--env-settings", nargs="*", default=[], metavar="NAME=VALUE", help="such as reward_kind=sparse"
+    )
     parser.add_argument("--training", nargs="*", default=[], metavar="NAME=VALUE", help="of the agent or the loop")
     parser.add_argument("--out", type=Path, default=Path("runs") / "resets")
     parts.add_flags(parser)
