@@ -21,16 +21,8 @@ from mtjax.tasks import draw_at, episode_task
 from mtjax.types import Array, InputError, Key, Task
 
 
-class Drawing:
-    """What follows in a world that is not reset is drawn, wherever it is."""
-
-    def follow(self, env: Any, listed: Task, task: Task, state: Any, key: Key) -> Task:
-        """Return the task that one world plays next, of the draws of ``listed``, after ``task``, in ``state``."""
-        return episode_task(listed, key)
-
-
 @dataclasses.dataclass(frozen=True)
-class Everything(Drawing):
+class Everything:
     """All tasks are played, always."""
 
     steps: ClassVar[int] = 0  # of every environment, after which tasks change; 0 for never
@@ -52,6 +44,7 @@ class ForwardBackward(Everything):
     """
 
     def follow(self, env: Any, listed: Task, task: Task, state: Any, key: Key) -> Task:
+        """Return the task that one world plays next, of the draws of ``listed``, after ``task``, in ``state``."""
         back = env.returning(task)
         same = jax.tree.map(lambda x, y: jnp.all(x == y), back.goal, task.goal)
         came_back = jnp.all(jnp.stack(jax.tree.leaves(same)))
@@ -78,7 +71,7 @@ class Graph(Everything):
 
 
 @dataclasses.dataclass(frozen=True)
-class Random(Drawing):
+class Random:
     """Some tasks are played, and others drawn after so many steps of every environment, without repeating one."""
 
     played: int
@@ -97,7 +90,7 @@ class Random(Drawing):
 
 
 @dataclasses.dataclass(frozen=True)
-class Sequence(Drawing):
+class Sequence:
     """One task is played after another, in the order of the table, for so many steps of every environment each.
 
     After the last one the first follows again.
@@ -128,7 +121,7 @@ def _key(number: Array) -> Key:
 
 
 @dataclasses.dataclass(frozen=True)
-class Heeding(Drawing):
+class Heeding:
     """Some tasks are chosen by what was heard of all: the returns of the policy that learns, as means over seeds.
 
     Of each task (N, 2) a fast and a slow mean over the chunks that played it are kept, NaN before its first episode has
@@ -209,6 +202,16 @@ _RANDOM = 0.1  # share of the choices
 _RATES = (0.5, 0.1)  # of the fast and of the slow mean
 
 
+def follow(plays: "Curriculum", env: Any, listed: Task, task: Task, state: Any, key: Key) -> Task:
+    """Return the task that one world plays next if it is not reset, after ``task``, in ``state``.
+
+    It is a draw of ``listed`` wherever the world is, unless the curriculum says more.
+    """
+    if isinstance(plays, ForwardBackward | Graph):
+        return plays.follow(env, listed, task, state, key)
+    return episode_task(listed, key)
+
+
 def nothing_heard(known: int) -> Array:
     """Return what was heard (N, 2) of tasks before any episode has ended."""
     return jnp.full((known, 2), jnp.nan)
@@ -224,8 +227,9 @@ def hear(heard: Array, rows: Array, returns: Array) -> Array:
     return heard.at[rows].set(jnp.where(jnp.isnan(new), old, mean))
 
 
+EVERYTHING = Everything()
 Curriculum = Everything | Random | Heeding | Sequence
-_OF_ALL = {"all": Everything(), "forward-backward": ForwardBackward(), "graph": Graph()}
+_OF_ALL = {"all": EVERYTHING, "forward-backward": ForwardBackward(), "graph": Graph()}
 _KINDS = {  # with how many numbers each has
     "random": (Random, 2),
     "progress": (Progress, 2),
@@ -252,10 +256,11 @@ def read(text: str) -> Curriculum:
         numbers += [float(word) for word in rest if math.isfinite(float(word))]
     if not len(numbers) == len(words) == count:
         raise InputError(
-            "curriculum is all, forward-backward or graph (in worlds that are not reset), random:T:STEPS (T tasks at a time), progress:T:STEPS (whose returns change most), "
-            "hardest:T:STEPS (whose returns are least), growing:T:STEPS:RETURN (a range that grows where its ends "
-            "return enough), sequence:STEPS (one after another) or shuffled:STEPS (the same in random order), with "
-            "steps of every environment until tasks change, such as random:10:5000 or sequence:100000; "
+            "curriculum is all, forward-backward or graph (in worlds that are not reset), random:T:STEPS (T tasks at a "
+            "time), progress:T:STEPS (whose returns change most), hardest:T:STEPS (whose returns are least), "
+            "growing:T:STEPS:RETURN (a range that grows where its ends return enough), sequence:STEPS (one after "
+            "another) or shuffled:STEPS (the same in random order), with steps of every environment until tasks "
+            "change, such as random:10:5000 or sequence:100000; "
             f"not {text!r}"
         )
     return made(*numbers)

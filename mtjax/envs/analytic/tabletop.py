@@ -52,16 +52,16 @@ class Tabletop(Pictured, Family):
 
     EARL's tabletop manipulation (Sharma et al. 2022, "Autonomous reinforcement learning: formalism and benchmarking"),
     for worlds that are not reset: the object's start is a goal too, so that there is a way back. With gripper g, object
-    o and action a, within [-2.8, 2.8] m along both axes:
+    o and action a, all places within [-2.8, 2.8] m along both axes:
         held <- a_2 > 0 and (held or |g - o| < reach)
         g' = clip(g + pace (a_0, a_1));  o' = clip(o + g' - g) if held, else o
 
     Observation (13,): gripper, object and its goal [2.8 m]; 1 if the object is held, else 0; and magnified, what is
-        close: the ways from gripper to object, from object to goal and from gripper to (0, 0) [0.4 m], within [-1, 1].
+        close: the ways from gripper to object, from object to goal and from gripper to (0, 0) [0.4 m], in [-1, 1].
     Action (3,): how the gripper moves along both axes; positive to grip or to hold, else the object is let go.
-    Reward: 1 where all is where it should be: the object at its goal and the gripper at (0, 0), sqrt(|o - goal|^2 +
-        |g|^2) <= 0.2 m. With ``reward_kind=dense`` also the metres by which a step has shortened the way, which is |g| if
-        the object is within 0.1 m of its goal, else |g - o| + |o - goal| + |goal|.
+    Reward: 1 where all is where it should be, the object at its goal and the gripper at (0, 0):
+        sqrt(|o - goal|^2 + |g|^2) <= 0.2 m. With ``reward_kind=dense`` also the metres by which a step has shortened
+        the way, which is |g| if the object is within 0.1 m of its goal, else |g - o| + |o - goal| + |goal|.
     Start: gripper at (0, 0) and object at (2.5, 0) m, each moved by up to 0.1 m along both axes; nothing is held.
     Episode: 200 steps; nothing terminates it. Metric ``success`` is 1 where all is where it should be.
 
@@ -75,8 +75,8 @@ class Tabletop(Pictured, Family):
         pace: how far the gripper moves in a step at most along an axis [m].
 
     Differs from EARL in: there is no MuJoCo, which there only draws; starts differ by up to 0.1 m; observations are
-    scaled, hold once what is the same in all goals or twice in each (7 of EARL's 12 numbers), and magnify what is close;
-    our dense reward leads the gripper home too, and the sparse one comes without demonstrations.
+    scaled, leave out what is the same for all goals or told twice (7 of EARL's 12 numbers remain), and magnify what is
+    close; our dense reward leads the gripper home too, and the sparse one comes without demonstrations.
     """
 
     context_ranges: Any = ()
