@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from mtjax import frames
 from mtjax.agents.swept import at_point
 from mtjax.learning import curricula
-from mtjax.learning.trials import EACH_EPISODE, Ends, ResetFree, Trials
+from mtjax.learning.trials import EACH_EPISODE, Ends, Trials
 from mtjax.parallel import collectives
 from mtjax.parallel.axes import over_learners, renew_worlds, where_worlds
 from mtjax.tasks import contexts_vary, episode_task
@@ -260,7 +260,7 @@ def _reset_all(env: Env, tasks: Task, worlds: Worlds, ends: Ends, keys: Key, tri
     return _Begun(start.state, *where_worlds(ends.episode, (start.task, start.obs), (worlds.task, worlds.obs)))
 
 
-def _change_tasks(env: Any, tasks: Task, worlds: Worlds, ends: Ends, keys: Key, trials: ResetFree) -> _Begun:
+def _change_tasks(env: Any, tasks: Task, worlds: Worlds, ends: Ends, keys: Key, trials: Trials) -> _Begun:
     """Choose tasks with keys (S, T, E) for worlds whose trials have ended, which go on where they are; reset lost ones.
 
     Returns:
@@ -271,9 +271,10 @@ def _change_tasks(env: Any, tasks: Task, worlds: Worlds, ends: Ends, keys: Key, 
     begun = jax.lax.cond(jnp.any(lost), again, lambda: own)
     if tasks.draws is None:
         return begun
-    of_task = jax.vmap(partial(curricula.follow, trials.plays, env), (None, 0, 0, 0))
+    of_task = jax.vmap(partial(curricula.follow, trials.plays, env), (None, 0, 0, 0))  # type: ignore
     follow = jax.vmap(jax.vmap(of_task), (None, 0, 0, 0))
-    goes_on, following = ends.trial & ~lost, follow(tasks, worlds.task, begun.state, keys)
+    following = follow(tasks, worlds.task, begun.state, keys)  # type: ignore
+    goes_on = ends.trial & ~lost
     seen = frames.begin(env.observe_worlds(following, begun.state), env.spec.frames)
     return _Begun(begun.state, *where_worlds(goes_on, (following, seen), (begun.task, begun.obs)))
 
