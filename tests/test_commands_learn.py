@@ -62,7 +62,7 @@ MARKS: dict[str, Learns | str] = {
     "--env=walker-walk --env.vary.torso-mass=0.5:1.5:10 --env.vary.gravity=5:15": _WALKER,
     "--env=walker-walk-vary-friction --split=hip-bmdp --seeds=5": _WALKER,
     "--env=sailing --agent=ppo": Learns(2),
-    "--env=tabletop --agent=ppo --reset-free --curriculum=forward-backward": Learns(20),
+    "--env=tabletop --agent=ppo --reset-free --curriculum=forward-backward": "not measured yet; tests/test_tabletop.py plays such worlds",
     "--env=point-mass-vary-goal --env.num-tasks=4 --split=none --agent=sac --agent.conditioning=one-hot "
     "--agent.normalize-observations=false --num-envs=8 --chunk-steps=500 --curriculum=sequence:2000 --steps=64000 "
     "--agent.continual=packnet --agent.retrain-updates=2000": "tests/test_remembering.py measures what it keeps",
