@@ -187,7 +187,9 @@ def test_steps_are_relabelled_as_the_other_task_would_have_had_them(env):
     for one, other in ((0, 2), (2, START)):
         before, after = (follow(env, task_to(goal), start, actions) for goal in (one, other))
         for i in (1, 2, 10, 59):
-            steps = [Transition(x.obs[i - 1], actions[i], x.reward[i], jnp.float32(1), x.obs[i]) for x in (before, after)]
+            steps = [
+                Transition(x.obs[i - 1], actions[i], x.reward[i], jnp.float32(1), x.obs[i]) for x in (before, after)
+            ]
             found = env.relabel(task_to(other), steps[0], KEY)
             for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(steps[1]), strict=True):
                 np.testing.assert_allclose(x, y, atol=2e-5)
