@@ -256,11 +256,11 @@ def read(text: str) -> Curriculum:
         numbers += [float(word) for word in rest if math.isfinite(float(word))]
     if not len(numbers) == len(words) == count:
         raise InputError(
-            "curriculum is all, forward-backward or graph (in worlds that are not reset), random:T:STEPS (T tasks at a "
-            "time), progress:T:STEPS (whose returns change most), hardest:T:STEPS (whose returns are least), "
-            "growing:T:STEPS:RETURN (a range that grows where its ends return enough), sequence:STEPS (one after "
-            "another) or shuffled:STEPS (the same in random order), with steps of every environment until tasks "
-            "change, such as random:10:5000 or sequence:100000; "
+            "curriculum is all, random:T:STEPS (T tasks at a time), progress:T:STEPS (whose returns change most), "
+            "hardest:T:STEPS (whose returns are least), growing:T:STEPS:RETURN (a range that grows where its ends "
+            "return enough), sequence:STEPS (one after another) or shuffled:STEPS (the same in random order), with "
+            "steps of every environment until tasks change, such as random:10:5000 or sequence:100000; with "
+            "--reset-free also forward-backward or graph; "
             f"not {text!r}"
         )
     return made(*numbers)
