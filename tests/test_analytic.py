@@ -17,7 +17,7 @@ from mtjax.learning.rollout import reset_envs, step_envs
 from mtjax.report import films, render
 from mtjax.types import InputError
 
-NAMES = ("link", "racing", "sailing", "trading")
+NAMES = ("link", "racing", "sailing", "tabletop", "trading")
 VALUES = {  # unlike the nominal ones in every parameter
     "link": {"bandwidth": 180.0, "delay": 0.11, "buffer": 40.0, "loss": 0.03},
     "racing": {"track": 4.5, "friction": 0.8, "power": 150.0, "width": 2.5},
@@ -28,6 +28,7 @@ VALUES = {  # unlike the nominal ones in every parameter
         "current-direction": 2.0,
         "sail": 0.8,
     },
+    "tabletop": {"goal": 1.0, "pace": 0.3, "reach": 2.2},
     "trading": {"risk-aversion": 3.0, "volatility": 0.5, "impact": 1.7, "lasting-impact": 0.4},
 }
 KEY = jax.random.key(0)
@@ -439,7 +440,7 @@ def test_luck_is_no_part_of_what_a_plan_earns_on_average():
 def test_every_parameter_changes_what_happens(name, parameter):
     """From the same start under the same actions, some observation or reward differs."""
     env, task = alone(name)
-    factor = 1.3 if parameter != "track" else 2.0
+    factor = 1.3 if parameter not in ("track", "goal") else 2.0
     changed = task._replace(goal=alone(name, **{parameter: factor * VALUES[name][parameter]})[1].goal)
     actions = random_actions(env)
     if name == "racing":  # fast and straight, so that power and grip are asked for
@@ -508,9 +509,9 @@ def test_what_cannot_be_is_refused():
 
 
 def test_films_of_slow_worlds_are_quick():
-    """A second of a film shows ten steps of a sale, twenty of a boat and twenty of a car."""
+    """A second of a film shows ten steps of a sale, twenty of a boat, of a car and of a table."""
     per_second = {name: family(name).film_speed / family(name).seconds_per_step for name in NAMES}
-    assert per_second == pytest.approx({"link": 10, "racing": 20, "sailing": 20, "trading": 10})
+    assert per_second == pytest.approx({"link": 10, "racing": 20, "sailing": 20, "tabletop": 20, "trading": 10})
 
 
 def test_a_sale_is_filmed_though_its_state_has_a_key():

@@ -43,6 +43,7 @@ _PULLS = "ten pulls earn between 5 and 6.02, too little to see in few trials; te
 _BELIEVES = "ten pulls earn between 5 and 6.02; tests/test_posterior.py has beliefs that are known"
 _STORED = "takes over ten minutes of two CPU cores; tests/test_recurrent.py has burn-in step by step"
 _SOON = "earns nearly all that it can before its first evaluation; tests/test_pqn.py has probes"
+_ON = "its success is not measured yet; tests/test_tabletop.py plays such worlds"
 _CRAFT = "takes longer than ten minutes of two CPU cores; tests/test_sketches.py learns in a small corridor"
 _PAGE = "is --quick with a page; tests/test_view.py has a run with one"
 _LOOP = "--env=point-mass-vary-goal --agent=multi-head"  # one pair of the loop around the command
@@ -63,6 +64,7 @@ MARKS: dict[str, Learns | str] = {
     "--env=walker-walk --env.vary.torso-mass=0.5:1.5:10 --env.vary.gravity=5:15": _WALKER,
     "--env=walker-walk-vary-friction --split=hip-bmdp --seeds=5": _WALKER,
     "--env=sailing --agent=ppo": Learns(2),
+    "--env=tabletop --agent=ppo --reset-free --curriculum=forward-backward": _ON,
     "--env=point-mass-vary-goal --env.num-tasks=4 --split=none --agent=sac --agent.conditioning=one-hot "
     "--agent.normalize-observations=false --num-envs=8 --chunk-steps=500 --curriculum=sequence:2000 --steps=64000 "
     "--agent.continual=packnet --agent.retrain-updates=2000": "tests/test_remembering.py measures what it keeps",

@@ -2,6 +2,8 @@
 
 An agent knows all N training tasks: its own parameters of each, its features and its memory of gradient steps. Of these
 T are played at a time. The tasks of a chunk follow from the step at which it begins, so that a run resumes exactly.
+
+Where episodes draw their tasks, it also says which of the draws follows in a world that is not reset.
 """
 
 import abc
@@ -9,12 +11,14 @@ import contextlib
 import dataclasses
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 
-from mtjax.types import Array, InputError, Key
+from mtjax.tasks import draw_at, episode_task
+from mtjax.types import Array, InputError, Key, Task
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,6 +34,40 @@ class Everything:
     def rows(self, step: Array, known: int) -> Array:
         """Return the numbers (T,) int32 of the tasks that are played from a step () of every environment on."""
         return jnp.arange(known, dtype=jnp.int32)
+
+
+@dataclasses.dataclass(frozen=True)
+class ForwardBackward(Everything):
+    """In worlds that are not reset a goal that is drawn and the way back to the start take turns.
+
+    Han, Levine and Abbeel 2015, "Learning compound multi-step controllers under unknown dynamics"; EARL's FBRL.
+    """
+
+    def follow(self, env: Any, listed: Task, task: Task, state: Any, key: Key) -> Task:
+        """Return the task that one world plays next, of the draws of ``listed``, after ``task``, in ``state``."""
+        back = env.returning(task)
+        same = jax.tree.map(lambda x, y: jnp.all(x == y), back.goal, task.goal)
+        came_back = jnp.all(jnp.stack(jax.tree.leaves(same)))
+        return jax.tree.map(partial(jnp.where, came_back), episode_task(listed, key), back)
+
+
+@dataclasses.dataclass(frozen=True)
+class Graph(Everything):
+    """In worlds that are not reset the next task is one that begins where the world is, as one task's end is another's.
+
+    After the task graph of Gupta et al. 2021, "Reset-free reinforcement learning via multi-task learning". Nodes are
+    the ends of all draws and the start, with edges between any two. A world that is at a node plays towards any other
+    one, and a world that is at none towards the nearest. Gupta et al. give edges by hand.
+    """
+
+    def follow(self, env: Any, listed: Task, task: Task, state: Any, key: Key) -> Task:
+        draws = jax.vmap(draw_at, (None, 0))(listed, jnp.arange(len(listed.draws.id)))
+        nodes = jax.tree.map(lambda x, y: jnp.append(x, y[None], axis=0), draws, env.returning(task))
+        far = jax.vmap(env.distance, (0, None))(nodes, state)
+        there = far <= 1
+        away = jnp.where(there, jnp.inf, jax.random.uniform(key, far.shape))
+        node = jnp.argmin(jnp.where(jnp.any(there), away, far))
+        return jax.tree.map(lambda x: x[node], nodes)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -164,6 +202,16 @@ _RANDOM = 0.1  # share of the choices
 _RATES = (0.5, 0.1)  # of the fast and of the slow mean
 
 
+def follow(plays: "Curriculum", env: Any, listed: Task, task: Task, state: Any, key: Key) -> Task:
+    """Return the task that one world plays next if it is not reset, after ``task``, in ``state``.
+
+    It is a draw of ``listed`` wherever the world is, unless the curriculum says more.
+    """
+    if isinstance(plays, ForwardBackward | Graph):
+        return plays.follow(env, listed, task, state, key)
+    return episode_task(listed, key)
+
+
 def nothing_heard(known: int) -> Array:
     """Return what was heard (N, 2) of tasks before any episode has ended."""
     return jnp.full((known, 2), jnp.nan)
@@ -179,7 +227,9 @@ def hear(heard: Array, rows: Array, returns: Array) -> Array:
     return heard.at[rows].set(jnp.where(jnp.isnan(new), old, mean))
 
 
+EVERYTHING = Everything()
 Curriculum = Everything | Random | Heeding | Sequence
+_OF_ALL = {"all": EVERYTHING, "forward-backward": ForwardBackward(), "graph": Graph()}
 _KINDS = {  # with how many numbers each has
     "random": (Random, 2),
     "progress": (Progress, 2),
@@ -196,8 +246,8 @@ def read(text: str) -> Curriculum:
     Raises:
         InputError: it names none.
     """
-    if text == "all":
-        return Everything()
+    if text in _OF_ALL:
+        return _OF_ALL[text]
     kind, *words = text.split(":")
     made, count = _KINDS.get(kind, (Random, -1))
     whole, rest = words[:2], words[2:]
@@ -209,7 +259,8 @@ def read(text: str) -> Curriculum:
             "curriculum is all, random:T:STEPS (T tasks at a time), progress:T:STEPS (whose returns change most), "
             "hardest:T:STEPS (whose returns are least), growing:T:STEPS:RETURN (a range that grows where its ends "
             "return enough), sequence:STEPS (one after another) or shuffled:STEPS (the same in random order), with "
-            "steps of every environment until tasks change, such as random:10:5000 or sequence:100000; "
+            "steps of every environment until tasks change, such as random:10:5000 or sequence:100000; with "
+            "--reset-free also forward-backward or graph; "
             f"not {text!r}"
         )
     return made(*numbers)

@@ -60,7 +60,9 @@ class Settings:
     """Which training tasks are played: all; random:T:STEPS, T of them, and others after so many steps of every
     environment; progress:T:STEPS or hardest:T:STEPS, those whose returns change most or are least;
     growing:T:STEPS:RETURN, a range from the middle that grows where its ends return so much; sequence:STEPS, one after
-    another; or shuffled:STEPS, the same in random order. The agent knows all of them, and is evaluated on all."""
+    another; or shuffled:STEPS, the same in random order. The agent knows all of them, and is evaluated on all. With
+    --reset-free all are played, and what follows what in a world may be forward-backward, a goal and the way back in
+    turns; or graph, the nearest goal, or from a goal any other one."""
     keep_replay: bool = False
     """Keep the replay where the curriculum changes tasks, and go on without random steps. Stored steps do not say of
     which task they are: only for agents that are blind to the task."""
@@ -94,7 +96,7 @@ class Settings:
     @property
     def trial(self) -> Trials:
         """Return what a trial is."""
-        return ResetFree() if self.reset_free else of_episodes(self.trials)
+        return ResetFree(self.plays) if self.reset_free else of_episodes(self.trials)
 
 
 class TrainState(NamedTuple):
@@ -215,6 +217,22 @@ def require_trials(settings: Settings, env: Any, agent: Agent) -> None:
     reason = _cannot_go_on(env) if settings.reset_free else ""
     if reason:
         raise InputError(f"--reset-free lets worlds go on, and {reason}; leave it out")
+    _require_way_back(settings, env)
+
+
+def _require_way_back(settings: Settings, env: Any) -> None:
+    """Check that worlds can be asked to go back to their start, if the curriculum does.
+
+    Raises:
+        InputError: they cannot.
+    """
+    told = f"the curriculum {settings.curriculum}"
+    if not isinstance(settings.plays, curricula.ForwardBackward | curricula.Graph):
+        return
+    if not settings.reset_free:
+        raise InputError(f"{told} is for worlds that are not reset; add --reset-free")
+    if not hasattr(env, "returning"):
+        raise InputError(f"{told} needs a way back to the start, which this family has no task for, as tabletop has")
 
 
 def _require_repeatable(trials: int, agent: Any) -> None:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from mtjax import frames
 from mtjax.agents.swept import at_point
+from mtjax.learning import curricula
 from mtjax.learning.trials import EACH_EPISODE, Ends, Trials
 from mtjax.parallel import collectives
 from mtjax.parallel.axes import over_learners, renew_worlds, where_worlds
@@ -260,7 +261,7 @@ def _reset_all(env: Env, tasks: Task, worlds: Worlds, ends: Ends, keys: Key, tri
 
 
 def _change_tasks(env: Any, tasks: Task, worlds: Worlds, ends: Ends, keys: Key, trials: Trials) -> _Begun:
-    """Draw tasks with keys (S, T, E) for worlds whose trials have ended, which go on where they are; reset lost ones.
+    """Choose tasks with keys (S, T, E) for worlds whose trials have ended, which go on where they are; reset lost ones.
 
     Returns:
         these worlds, and the others as they are.
@@ -270,9 +271,12 @@ def _change_tasks(env: Any, tasks: Task, worlds: Worlds, ends: Ends, keys: Key, 
     begun = jax.lax.cond(jnp.any(lost), again, lambda: own)
     if tasks.draws is None:
         return begun
-    goes_on, drawn = ends.trial & ~lost, _draw_tasks(tasks, keys)
-    seen = frames.begin(env.observe_worlds(drawn, begun.state), env.spec.frames)
-    return _Begun(begun.state, *where_worlds(goes_on, (drawn, seen), (begun.task, begun.obs)))
+    of_task = jax.vmap(partial(curricula.follow, trials.plays, env), (None, 0, 0, 0))  # type: ignore
+    follow = jax.vmap(jax.vmap(of_task), (None, 0, 0, 0))
+    following = follow(tasks, worlds.task, begun.state, keys)  # type: ignore
+    goes_on = ends.trial & ~lost
+    seen = frames.begin(env.observe_worlds(following, begun.state), env.spec.frames)
+    return _Begun(begun.state, *where_worlds(goes_on, (following, seen), (begun.task, begun.obs)))
 
 
 def _reset_some(env: Env, tasks: Task, worlds: Worlds, ends: Ends, keys: Key, trials: Trials) -> _Begun:

@@ -13,6 +13,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from mtjax.learning.curricula import EVERYTHING, Curriculum
 from mtjax.types import Array, InputError
 
 MOST = 10_000
@@ -73,6 +74,7 @@ class ResetFree:
     No state is terminal, and no limit is one for the learner.
     """
 
+    plays: Curriculum = EVERYTHING  # what says which task follows
     episodes: ClassVar[int] = 1
     keeps_state: ClassVar[bool] = True
 
