@@ -216,7 +216,7 @@ def test_who_needs_what_follows_in_an_episode_is_refused_trials_of_several(name,
     own = {} if name == "ppo" else {"warmup_steps": 1, "replay_size": STEPS * ENVS, **experience}
     given = {"num_envs": ENVS, "chunk_steps": STEPS, "trials": K}
     with pytest.raises(InputError, match=message):
-        train(Goals(), tiny(name, **settings), {**given, **own})
+        mtjax.train(Goals(), tiny(name, **settings), eval_episodes=K, **given, **own)
 
 
 # Sums of rewards.

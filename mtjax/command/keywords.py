@@ -42,7 +42,7 @@ def configured(
         written: profile, tensorboard and wandb.
 
     Raises:
-        InputError: there is no such setting, or a value is not allowed.
+        InputError: there is no such setting, a value is not allowed, or settings do not go together.
     """
     named = isinstance(env, str | FamilyOrMixture) and isinstance(agent, str | BaseAgent)
     _require_learning(env, agent, named)
@@ -65,8 +65,7 @@ def configured(
         names = (name, agents.name_of(learner)) if named else ("", "")
         config = RunConfig(*names, plan=Plan(**plan), training=training, family=family, learner=learner)
     points, places = swept.grid(sweep), [str(each.directory) for each in starts if each.directory is not None]
-    return dataclasses.replace(
-        config,
+    return config.checked(
         start=",".join(places),
         teacher=_teacher(start) if isinstance(start, tuple) else None,
         points=points,

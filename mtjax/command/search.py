@@ -19,7 +19,7 @@ import numpy as np
 from mtjax.agents import swept
 from mtjax.agents.choices import flag_names
 from mtjax.checks import amount, require_library
-from mtjax.command.run_config import parse
+from mtjax.command.run_config import draft, parse
 from mtjax.command.words import split_flags
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import RunConfig
@@ -96,7 +96,7 @@ def configured(argv: Sequence[str]) -> tuple[RunConfig, Search]:
         InputError: a value is not allowed.
     """
     ranges, rest = read_ranges(argv)
-    config = parse(rest)
+    config = draft(rest)
     _require_alone(config)
     if not ranges:
         raise InputError("--search needs ranges of the agent's numbers, such as --agent.actor-lr=1e-5..1e-2")
@@ -152,7 +152,7 @@ def main(argv: Sequence[str]) -> None:
         return _go_on(resume)
     config, search = configured(argv)
     require_library("optuna", "--search")
-    check(dataclasses.replace(config, points=(dict(search.preset),)), load_start(config))
+    check(config.checked(points=(dict(search.preset),)), load_start(config))
     search = _fitting(config, search)
     folder = new_directory(Path(config.runs), f"{short_name(config.env)}-{config.agent}-search")
     search = searching.ask(search)

@@ -20,7 +20,7 @@ import numpy as np
 
 from mtjax.agents import AGENTS, PARTS, swept
 from mtjax.checks import amount
-from mtjax.command.run_config import parse
+from mtjax.command.run_config import draft, parse
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import RunConfig
 from mtjax.learning.evaluation import Evaluations
@@ -144,12 +144,10 @@ def configurations(argv: Sequence[str]) -> list[RunConfig]:
     found = []
     for values in itertools.product(*(axis.values for axis in outside)):
         chosen = [Axis(axis.flag, (value,)) for axis, value in zip(outside, values, strict=True)]
-        config = parse([*rest, *itertools.chain(*(_to_flags(axis.flag, axis.values[0]) for axis in chosen))])
+        config = draft([*rest, *itertools.chain(*(_to_flags(axis.flag, axis.values[0]) for axis in chosen))])
         sweep = tuple(f"{axis.flag}={','.join(axis.values)}" for axis in (*chosen, *inside))
         points_of_it = swept.grid({axis.setting: [_number(axis, x) for x in axis.values] for axis in inside})
-        for point in points_of_it:
-            swept.agent_at(config.learner, point)
-        found.append(dataclasses.replace(config, sweep=sweep, points=points_of_it))
+        found.append(config.checked(sweep=sweep, points=points_of_it))
     return found
 
 
