@@ -24,7 +24,6 @@ from mtjax.agents.teacher import Teacher
 from mtjax.checks import MOST_EPISODES, check_fields, path, require_text
 from mtjax.envs import make
 from mtjax.envs.mixtures import FamilyOrMixture
-from mtjax.experience import Replay
 from mtjax.learning import combinations, populations, trials
 from mtjax.learning.loop import Settings
 from mtjax.names import PRESETS, nearest_error, public
@@ -357,8 +356,7 @@ def fit_length(config: RunConfig, given: Collection[str]) -> RunConfig:
         each = config.num_tasks * plan.eval_episodes * config.family.episode_length
         often = min(max(_EVALUATED * plan.steps // each, 1), 10)
         plan = dataclasses.replace(plan, eval_every=0 if often == 10 else math.ceil(plan.steps / often))
-    short = isinstance(experience, Replay) and experience.warmup_steps > tenth
-    if short and "warmup_steps" not in given:  # the sizes of what is seen may take a compiled model
+    if experience.warmup_steps > tenth and "warmup_steps" not in given:  # else no model is compiled for sizes
         least = max(experience.length(config.family.spec), config.learner.unroll, 1)
         experience = dataclasses.replace(experience, warmup_steps=min(experience.warmup_steps, max(tenth, least)))
     learner = dataclasses.replace(config.learner, experience=experience)

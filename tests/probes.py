@@ -18,6 +18,8 @@ from mtjax.agents.networks import Params
 from mtjax.agents.parts.adaptation import adapt
 from mtjax.agents.parts.knowing import last_steps
 from mtjax.agents.parts.policies import Gaussian
+from mtjax.agents.parts.remembering import Remembering
+from mtjax.agents.parts.renewing import Renewing
 from mtjax.command.keywords import configured
 from mtjax.config import Plan, configure
 from mtjax.envs import ENVS, Family, Parameter
@@ -150,6 +152,10 @@ class Stub:
     experience: Replay = dataclasses.field(default_factory=Replay)
 
     unroll: ClassVar[int] = 0
+    continual: ClassVar[Remembering] = Remembering()
+    plasticity: ClassVar[Renewing] = Renewing()
+    goes_on: ClassVar[bool] = False
+    taught: ClassVar[bool] = False
 
     def init(self, spec, tasks, key):
         return jnp.zeros(1)

@@ -123,7 +123,7 @@ def _require_alone(config: RunConfig) -> None:
     wrong = next((name for name in _NOT_WITH if given[name]), None)
     if wrong is not None:
         raise InputError(f"--search and --{wrong} do not go together; leave one of them out")
-    if getattr(config.learner.experience, "host_replay_size", 0):
+    if config.learner.experience.host_slots(config.training.num_envs):
         raise InputError("--search keeps its replays on the device; leave out --host-replay-size")
 
 

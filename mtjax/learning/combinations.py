@@ -5,13 +5,15 @@ from typing import Any
 import jax
 
 from mtjax import frames
+from mtjax.agents import BaseAgent
 from mtjax.agents.consolidating import consolidates
+from mtjax.envs import Family
 from mtjax.learning import curricula
 from mtjax.learning.loop import Settings
-from mtjax.types import Env, InputError
+from mtjax.types import Agent, Env, InputError
 
 
-def require_agent(settings: Settings, agent: Any) -> None:
+def require_agent(settings: Settings, agent: Agent) -> None:
     """Check that an agent can learn from the trials, and from the tasks at a time, that settings ask for.
 
     Raises:
@@ -30,7 +32,7 @@ def require_agent(settings: Settings, agent: Any) -> None:
         _require_turns(settings, agent)
 
 
-def require_env(settings: Settings, env: Env, agent: Any) -> None:
+def require_env(settings: Settings, env: Env, agent: Agent) -> None:
     """Check that a family has the worlds, the trials and the tasks at a time that settings and agent ask for.
 
     Raises:
@@ -48,7 +50,7 @@ def require_env(settings: Settings, env: Env, agent: Any) -> None:
         tasks.blocks.some(settings.plays.count(len(tasks.id)))
 
 
-def _require_turns(settings: Settings, agent: Any) -> None:
+def _require_turns(settings: Settings, agent: Agent) -> None:
     """Refuse a curriculum that changes tasks within a chunk, or whose agent holds what belongs to all tasks."""
     told, experience = f"the curriculum {settings.curriculum}", agent.experience
     if settings.plays.steps % settings.chunk_steps:
@@ -59,8 +61,7 @@ def _require_turns(settings: Settings, agent: Any) -> None:
         raise InputError(f"{told} begins a replay anew; use --reset-every=0 and --host-replay-size=0")
     if experience.adaptations:
         raise InputError(f"{told} changes tasks, and this agent adapts to all that it knows; leave it out")
-    rule = getattr(agent, "gradients", None)
-    if rule is not None and jax.tree.leaves(rule.init(2)):
+    if isinstance(agent, BaseAgent) and jax.tree.leaves(agent.gradients.init(2)):
         raise InputError(f"{told} needs a rule of gradients without memory of the tasks, such as mean or pcgrad")
 
 
@@ -76,30 +77,32 @@ def _require_one_replay(settings: Settings, agent: Any) -> None:
         )
 
 
-def _require_repeatable(trials: int, agent: Any) -> None:
+def _require_repeatable(trials: int, agent: Agent) -> None:
     """Refuse an agent that takes what follows a step for a state of the same episode."""
     follows = f"what follows a step, which in a trial of {trials} episodes may be another episode"
-    if getattr(agent.experience, "hindsight", 0):
+    if agent.experience.hindsight:
         raise InputError(f"hindsight relabels steps by {follows}; use --hindsight=0 or --trials=1")
-    if getattr(getattr(agent, "view", None), "history", 0):
+    if not isinstance(agent, BaseAgent):
+        return
+    if agent.view.history:
         raise InputError(f"tasks are inferred from {follows}; use --agent.conditioning=recurrent or --trials=1")
-    if getattr(getattr(agent, "representation", None), "predicts", False):
+    if agent.representation.predicts:
         raise InputError(f"models predict {follows}; use --agent.representation=plain or --trials=1")
 
 
-def _cannot_go_on(env: Any) -> str:
+def _cannot_go_on(env: Env) -> str:
     """Return why worlds cannot go on where an episode's time is up, with the next one's task; empty if they can."""
     tasks = env.tasks("train")
     if tasks.blocks is not None:
         return "it is for single families, not for mixtures"
-    if getattr(env, "ends_early", True):
+    if env.ends_early:
         return "in this family episodes terminate"
-    if getattr(env, "fresh_goals", False):
+    goals, varied, fresh = (env.relabels, env.varied, env.fresh_goals) if isinstance(env, Family) else ((), (), False)
+    if fresh:
         return "this family draws its goals with its states"
     if tasks.draws is None:
         return ""
-    goals = getattr(env, "relabels", ())
-    physical = [name for name in getattr(env, "varied", ()) if name not in goals]
+    physical = [name for name in varied if name not in goals]
     if not goals or physical:
         return f"states depend on {', '.join(physical) or 'what episodes draw'}: only goals may be drawn"
     one = jax.tree.map(lambda x: x[0], tasks._replace(draws=None))

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from mtjax.agents.consolidating import change, consolidate, consolidates
 from mtjax.agents.fit import reset_networks
 from mtjax.agents.state import of_tasks, with_tasks
-from mtjax.agents.swept import at_point, with_numbers
+from mtjax.agents.swept import at_point, numbers_of, with_numbers
 from mtjax.checks import check_fields
 from mtjax.learning import curricula
 from mtjax.learning.rollout import (
@@ -106,9 +106,9 @@ class TrainState(NamedTuple):
     data: Any  # the experience's, leaves (S, ...)
     iteration: Array  # () int32, steps taken by every environment
     key: Key  # (S,)
-    rows: Array | None = None  # (T,) int32 numbers of the tasks that worlds play; None: all that the agent knows
+    rows: Any = None  # (T,) int32 numbers of the tasks that worlds play; None: all that the agent knows
     origins: Array | None = None  # (S,) int32 of a population: the first member from which each descends
-    heard: Array | None = None  # (N, 2) of a curriculum that heeds returns: what was heard of all tasks that are known
+    heard: Any = None  # (N, 2) of a curriculum that heeds returns: what was heard of all tasks that are known
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
@@ -216,7 +216,7 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
     metrics = _summarise(history, count)
     if state.heard is not None:
         returns = collectives.of_all_seeds(metrics["return"])
-        state = state._replace(heard=curricula.hear(state.heard, state.rows, returns))  # type: ignore
+        state = state._replace(heard=curricula.hear(state.heard, state.rows, returns))
     if settings.plays.steps:
         metrics = _of_known(metrics, state.rows, len(known.id))
     return state._replace(agent=collectives.agreed(state.agent)), metrics
@@ -256,7 +256,7 @@ def _next_rows(settings: Settings, state: TrainState, known: int) -> Array:
     if not isinstance(plays, curricula.Heeding):
         return plays.rows(state.iteration, known)
     due = state.iteration % plays.steps < settings.chunk_steps  # also if a resumed run begins its chunks elsewhere
-    return jnp.where(due, plays.choose(state.iteration, state.heard), state.rows)  # type: ignore
+    return jnp.where(due, plays.choose(state.iteration, state.heard), state.rows)
 
 
 def _consolidate(env: Env, agent: Agent, settings: Settings, known: Task, state: TrainState) -> Any:
@@ -264,7 +264,7 @@ def _consolidate(env: Env, agent: Agent, settings: Settings, known: Task, state:
     if not consolidates(agent):
         return state.agent
     keys = _folded(state.key)
-    fresh = lambda: jax.vmap(partial(_init_agent, env, agent, known))(keys, getattr(state.agent, "numbers", {}))
+    fresh = lambda: jax.vmap(partial(_init_agent, env, agent, known))(keys, numbers_of(state.agent))
     if agent.continual.restarts:
         return fresh()
     tasks, experience, kept = rows_of(known, state.rows), agent.experience, agent.experience.storage.kept

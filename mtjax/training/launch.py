@@ -41,8 +41,8 @@ def check(config: RunConfig, start: Policy | Sequence[Policy] | None = None) -> 
     """
     family, learner = config.family, config.learner
     if config.env or start is not None:
-        require = require_teachers if learner.taught else require_start
-        require(config, start)  # type: ignore
+        require: Any = require_teachers if learner.taught else require_start  # of several policies, or one
+        require(config, start)
     if config.env:
         _require_named(config)
     _require_policy(learner, family)

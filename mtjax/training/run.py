@@ -147,8 +147,8 @@ class _Run:
         """Return the agent's state with the values of the runs from which it begins, the same seeds for every point."""
         apart = lambda x: x.reshape(-1, self.config.plan.seeds, *x.shape[1:])
         together = lambda x: x.reshape(-1, *x.shape[2:])
-        begin = distillation.adopt if self.agent.taught else finetune.adopt
-        adopt = partial(begin, self.hooks.start, self.agent, tasks)  # type: ignore
+        begin: Any = distillation.adopt if self.agent.taught else finetune.adopt  # one policy, or several
+        adopt = partial(begin, self.hooks.start, self.agent, tasks)
         return jax.tree.map(together, jax.vmap(adopt)(jax.tree.map(apart, fresh)))
 
     @cached_property
@@ -222,9 +222,7 @@ class _Run:
         if line := meshes.describe(self.config.mesh, len(self.seeds), settings.num_envs):
             self.console.say(line)
         if self.hooks.directory is not None:
-            larger = [name for name in ("replay_size", "host_replay_size") if getattr(self.agent.experience, name, 0)]
-            flags = [name.replace("_", "-") for name in larger or ["num_envs"]]
-            checkpoint.require_space(self.hooks.directory, shapes, needs.host, flags)
+            checkpoint.require_space(self.hooks.directory, shapes, needs.host, self.agent.experience.sizes)
 
     def _open_sinks(self, steps: int) -> list[Sink]:
         """Return where metrics go beside metrics.csv, in a run that is at a step."""
