@@ -317,6 +317,8 @@ class Experience(Protocol):
     Its data is in the training state, leaves (S, ...).
     """
 
+    storage: ClassVar[Storage]
+
     @property
     def steps(self) -> int: ...  # of every environment that are collected before the agent learns
     @property
@@ -327,12 +329,6 @@ class Experience(Protocol):
     def warmup_steps(self) -> int: ...  # of every environment under random actions before learning starts
     @property
     def reset_every(self) -> int: ...  # steps of every environment between two resets of networks; 0 for never
-    @property
-    def hindsight(self) -> float: ...  # share of batches that is relabelled as of other tasks; 0 for none
-    @property
-    def sizes(self) -> tuple[str, ...]: ...  # the flags that make it smaller
-    @property
-    def storage(self) -> Storage: ...
     def check(self, env: Env, num_envs: int, chunk_steps: int = 0) -> None: ...  # raises InputError
     def host_slots(self, num_envs: int) -> int: ...  # steps of every environment that the host keeps beside the data
     def rollout_bytes(self, spec: Spec, num_envs: int) -> int: ...  # of a task's steps that are learned from, not kept

@@ -143,11 +143,6 @@ class Replay:
         stored = self.steps * num_envs
         return self.replay_size // stored * stored
 
-    @property
-    def sizes(self) -> tuple[str, ...]:
-        """The flags that make the replay smaller."""
-        return ("replay-size", *["host-replay-size"] * bool(self.host_replay_size))
-
     def host_slots(self, num_envs: int) -> int:
         """Return how many steps of every environment the host keeps."""
         return self.host_replay_size // num_envs

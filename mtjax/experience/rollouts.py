@@ -35,7 +35,6 @@ class Rollouts:
     warmup_steps: ClassVar[int] = 0  # no action is random before learning
     adaptations: ClassVar[int] = 0  # the policy stays as it is while it plays
     hindsight: ClassVar[float] = 0.0  # no step is relabelled
-    sizes: ClassVar[tuple[str, ...]] = ("num-envs",)
 
     def __post_init__(self):
         if not 1 <= self.unroll <= _LONGEST:

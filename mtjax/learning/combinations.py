@@ -8,6 +8,7 @@ from mtjax import frames
 from mtjax.agents import BaseAgent
 from mtjax.agents.consolidating import consolidates
 from mtjax.envs import Family
+from mtjax.experience import Replay
 from mtjax.learning import curricula
 from mtjax.learning.loop import Settings
 from mtjax.types import Agent, Env, InputError
@@ -80,7 +81,7 @@ def _require_one_replay(settings: Settings, agent: Any) -> None:
 def _require_repeatable(trials: int, agent: Agent) -> None:
     """Refuse an agent that takes what follows a step for a state of the same episode."""
     follows = f"what follows a step, which in a trial of {trials} episodes may be another episode"
-    if agent.experience.hindsight:
+    if isinstance(agent.experience, Replay) and agent.experience.hindsight:
         raise InputError(f"hindsight relabels steps by {follows}; use --hindsight=0 or --trials=1")
     if not isinstance(agent, BaseAgent):
         return
