@@ -166,6 +166,13 @@ def test_names_bring_the_tuned_settings_and_objects_their_own(monkeypatch):
     assert agents.settings(plain.learner)["encoder"] == "film"
 
 
+def test_an_object_that_lacks_what_is_called_is_refused(monkeypatch):
+    """By the names of what it lacks."""
+    monkeypatch.delattr(Probe, "ends_early")
+    with pytest.raises(InputError, match=r"a Probe lacks what mtjax\.types\.Env asks for: ends_early$"):
+        mtjax.train(Probe(), tiny("sac"), steps=10)
+
+
 def test_keywords_of_train_are_known_to_errors():
     """Agents and environments say that these belong to ``mtjax.train``."""
     fields = [field.name for cls in (Plan, Settings) for field in dataclasses.fields(cls)]
