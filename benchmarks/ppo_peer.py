@@ -201,7 +201,7 @@ def ours(arguments: argparse.Namespace, name: str, side: str, seed: int) -> tupl
     import mtjax
     from mtjax.compiling.programs import enable_compile_cache
     from mtjax.config import configure
-    from mtjax.training.launch import launch
+    from mtjax.training.launch import check, launch
     from mtjax.training.run import Hooks
 
     enable_compile_cache()
@@ -224,8 +224,8 @@ def ours(arguments: argparse.Namespace, name: str, side: str, seed: int) -> tupl
 
     plan = {"steps": int(arguments.steps), "eval_every": int(arguments.evaluate_every)}
     plan = dataclasses.replace(config.plan, seed=seed, seeds=1, eval_episodes=arguments.episodes, **plan)
-    config = dataclasses.replace(config, plan=plan, training=settings, learner=agent)
-    config.check()
+    config = config.checked(plan=plan, training=settings, learner=agent)
+    check(config)
     launch(config, Hooks(on_chunk=begin, on_evaluation=note, quiet=True))
     return points, choices | {"imported_after": begun}
 

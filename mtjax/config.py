@@ -15,21 +15,17 @@ import jax
 import tyro
 from jax.sharding import Mesh
 
-from mtjax.agents import AGENTS, BaseAgent, agent, combinations, preset_of, settings, tuned_as
+from mtjax.agents import BaseAgent, agent, preset_of, settings, tuned_as
 from mtjax.agents import name_of as agent_name_of
 from mtjax.agents.choices import kinds_of, replace, require_value_range
 from mtjax.agents.parts.policies import Gaussian, policy_for
 from mtjax.agents.swept import agents_at
 from mtjax.agents.teacher import Teacher
-from mtjax.checks import MOST_EPISODES, check_fields, path, require_library, require_text
+from mtjax.checks import MOST_EPISODES, check_fields, path, require_text
 from mtjax.envs import make
-from mtjax.envs import name_of as env_name_of
 from mtjax.envs.mixtures import FamilyOrMixture
-from mtjax.envs.task_table import forgetful
-from mtjax.experience import Replay
-from mtjax.frames import shown
-from mtjax.learning import populations, trials
-from mtjax.learning.loop import Settings, require_curriculum, require_trials
+from mtjax.learning import combinations, populations, trials
+from mtjax.learning.loop import Settings
 from mtjax.names import PRESETS, nearest_error, public
 from mtjax.parallel import mesh as meshes
 from mtjax.types import InputError
@@ -168,7 +164,7 @@ class RunConfig:
     @cached_property
     def num_tasks(self) -> int:
         """Return the number of training tasks."""
-        return len(self.family.tasks("train").id)
+        return len(self.family.task_values("train"))  # for which no task is built
 
     @property
     def played_tasks(self) -> int:
@@ -215,30 +211,26 @@ class RunConfig:
         """
         return meshes.mesh_for(self.members, self.played_tasks, self.training.num_envs)
 
-    def check(self) -> None:
-        """Check the configuration as a whole, before a folder is made. Nothing after it checks again.
+    def checked(self, **changes: Any) -> "RunConfig":
+        """Return the configuration with changes, as runs take it: its settings, agent and length go together.
+
+        Both ``mtjax.train`` and the command line make theirs by it. It builds no environment, and looks at no device;
+        ``launch.check`` checks what depends on these.
 
         Raises:
-            InputError: family, agent, devices and flags do not go together.
+            InputError: they do not go together.
         """
-        if self.env:
-            self._check_named()
-        played, unroll = self.played, self.learner.unroll
-        self.learner.experience.check(self.family, played.num_envs, played.chunk_steps, unroll)
-        require_policy(self.learner, self.family)
-        self._check_population()
-        trials.require_whole(self.plan.eval_episodes, self.training.trials, "eval-episodes")
-        require_trials(self.training, self.family, self.learner)
-        require_curriculum(self.played, self.family, self.learner)
-        for learner in agents_at(self.learner, self.points):
+        made = dataclasses.replace(self, **changes)
+        if made.env:
+            if not made.runs:  # Path("") would be the working directory
+                raise InputError("--runs needs a folder; that of the command is --runs=.")
+            path(made.runs, "--runs")
+        made._check_population()
+        trials.require_whole(made.plan.eval_episodes, made.training.trials, "eval-episodes")
+        combinations.require_agent(made.played, made.learner)
+        for learner in agents_at(made.learner, made.points):
             require_value_range(learner)
-        if self.mesh is not None and (lost := forgetful(self.family)):
-            raise InputError(
-                f"{lost} steps on the host of one device, and this run is on {self.mesh.size}; show JAX one, such "
-                "as by CUDA_VISIBLE_DEVICES=0"
-            )
-        for module in ["tensorboardX"] * self.tensorboard + ["wandb"] * bool(self.wandb):
-            require_library(module)
+        return made
 
     def _check_population(self) -> None:
         """Check that there are members to choose from, and evaluations to choose by."""
@@ -261,21 +253,6 @@ class RunConfig:
                 f"{told} chooses between chunks, of {self.steps_per_chunk:,} steps; give more steps, or a lower "
                 "--chunk-steps"
             )
-
-    def _check_named(self) -> None:
-        """Check what only families and agents with names have."""
-        family, learner = self.family, self.learner
-        if not self.runs:  # Path("") would be the working directory
-            raise InputError("--runs needs a folder; that of the command is --runs=.")
-        path(self.runs, "--runs")
-        _ = family.engine_name, family.table, family.calls.targets()  # its engine refuses a model that it cannot run
-        combinations.require_sight(learner, family.spec)
-        if preset_of(self.agent).sees_pictures and not shown(family.spec.obs):
-            raise InputError(
-                f"{self.agent} learns from pictures, and {self.env} shows none: give --env.pixels=64, or for states "
-                "use --agent=sac-conditioned, to which --agent.representation=encoded adds an encoder"
-            )
-        learner.conditioning.table(family.spec, family.train_count)
 
 
 @public
@@ -379,7 +356,7 @@ def fit_length(config: RunConfig, given: Collection[str]) -> RunConfig:
         each = config.num_tasks * plan.eval_episodes * config.family.episode_length
         often = min(max(_EVALUATED * plan.steps // each, 1), 10)
         plan = dataclasses.replace(plan, eval_every=0 if often == 10 else math.ceil(plan.steps / often))
-    if isinstance(experience, Replay) and "warmup_steps" not in given:
+    if experience.warmup_steps > tenth and "warmup_steps" not in given:  # else no model is compiled for sizes
         least = max(experience.length(config.family.spec), config.learner.unroll, 1)
         experience = dataclasses.replace(experience, warmup_steps=min(experience.warmup_steps, max(tenth, least)))
     learner = dataclasses.replace(config.learner, experience=experience)
@@ -429,21 +406,6 @@ def _with_teacher(learner: Any, record: Mapping[str, Any] | None, env: Any) -> A
     made = _with_policy(agent(record["agent"], **record["settings"]), env)
     teacher = Teacher(made, *(record[size] for size in ("tasks", "context", "runs")))
     return dataclasses.replace(learner, teacher=teacher)
-
-
-def require_policy(agent: Any, env: Any) -> None:
-    """Refuse an agent that cannot draw the actions of its environment.
-
-    Raises:
-        InputError: that is so; it names agents that can.
-    """
-    if not isinstance(agent, BaseAgent) or isinstance(agent.policy, agent.policies):
-        return
-    able = ", ".join(name for name, preset in AGENTS.items() if isinstance(agent.policy, preset.cls.policies))
-    scored = any(hasattr(part.family, "scores") for part in getattr(env, "parts", ()))
-    scores, kind = ", or --env.scores" if scored else "", env.spec.action.kind
-    names = agent_name_of(agent), env_name_of(env)
-    raise InputError(f"{names[0]} draws no {kind} actions, which {names[1]} has: use {able}{scores}")
 
 
 def load_preset(env_name: str, name: str) -> dict[str, Any]:

@@ -276,14 +276,18 @@ class Spec(NamedTuple):
 class Env(Protocol):
     """An environment is a family of tasks. It is frozen and hashable, so that it is static under ``jit``.
 
-    A family implements ``reset`` and ``step`` for one world. The methods that end in ``worlds`` are for all worlds at
-    once, leaves (S, T, E, ...); those of ``mtjax.parallel.axes`` map the former over one flat batch.
+    It implements ``reset`` and ``step`` for one world. The methods that end in ``worlds`` are for all worlds at once,
+    leaves (S, T, E, ...); those of ``mtjax.parallel.axes`` map the former over one flat batch.
     """
 
     @property
     def spec(self) -> Spec: ...
     @property
     def episode_length(self) -> int: ...  # the longest horizon
+    @property
+    def ends_early(self) -> bool: ...  # whether episodes may end before their limit; it decides how resets are computed
+    @property
+    def finite_horizon(self) -> bool: ...  # whether the limit of time is part of the problem, so that its end is one
     def tasks(self, split: str = "train") -> Task: ...
     def task_values(self, split: str) -> Any: ...
     def reset(self, task: Task, key: Key) -> Step: ...
@@ -291,7 +295,12 @@ class Env(Protocol):
     def reset_worlds(self, tasks: Task, keys: Key) -> Step: ...
     def step_worlds(self, tasks: Task, states: Any, actions: Array) -> Step: ...
     def renew_worlds(self, tasks: Task, keys: Key, mask: Array, states: Any) -> Step: ...  # resets those of (S, T, E)
-    def where_worlds(self, mask: Array, new: Any, old: Any) -> Any: ...  # states; mask (S, T, E)
+
+
+class Lasting(Env, Protocol):
+    """An environment whose worlds can go on with another task, as ``--reset-free`` asks."""
+
+    def observe_worlds(self, tasks: Task, states: Any) -> Any: ...  # what agents see of states, leaves (S, T, E, ...)
 
 
 class Storage(NamedTuple):
@@ -308,6 +317,8 @@ class Experience(Protocol):
     Its data is in the training state, leaves (S, ...).
     """
 
+    storage: ClassVar[Storage]
+
     @property
     def steps(self) -> int: ...  # of every environment that are collected before the agent learns
     @property
@@ -318,8 +329,6 @@ class Experience(Protocol):
     def warmup_steps(self) -> int: ...  # of every environment under random actions before learning starts
     @property
     def reset_every(self) -> int: ...  # steps of every environment between two resets of networks; 0 for never
-    @property
-    def storage(self) -> Storage: ...
     def check(self, env: Env, num_envs: int, chunk_steps: int = 0, unroll: int = 0) -> None: ...  # raises InputError
     def host_slots(self, num_envs: int) -> int: ...  # steps of every environment that the host keeps beside the data
     def rollout_bytes(self, spec: Spec, num_envs: int) -> int: ...  # of a task's steps that are learned from, not kept
@@ -331,10 +340,16 @@ class Experience(Protocol):
         self, env: Env, agent: Any, tasks: Task, data: Any, key: Key, state: Any = None
     ) -> Any: ...
     def window(self, data: Any, batch: Any) -> Transition: ...  # windows (T, B, L, ...) of one of the batches
+    def draw(self, spec: Spec, agent: Any, steps: Any, key: Key, count: int) -> Transition: ...  # as many windows
 
 
 class Agent(Protocol):
     """An agent acts and learns. It is a frozen dataclass; its fields are hyper-parameters and command-line flags."""
+
+    continual: ClassVar[Any]  # the part that remembers tasks learned one after another: ``agents.parts.remembering``
+    plasticity: ClassVar[Any]  # the part that keeps networks able to learn: ``agents.parts.plasticity``
+    goes_on: ClassVar[bool]  # whether its memory holds an option that runs, ``memory.running.option``
+    taught: ClassVar[bool]  # whether it learns from the policies of other runs
 
     @property
     def experience(self) -> Experience: ...

@@ -17,7 +17,9 @@ from mtjax.agents.base import Memory
 from mtjax.agents.networks import Params
 from mtjax.agents.parts.adaptation import adapt
 from mtjax.agents.parts.knowing import last_steps
+from mtjax.agents.parts.plasticity import Plasticity
 from mtjax.agents.parts.policies import Gaussian
+from mtjax.agents.parts.remembering import Continual
 from mtjax.command.keywords import configured
 from mtjax.config import Plan, configure
 from mtjax.envs import ENVS, Family, Parameter
@@ -150,6 +152,10 @@ class Stub:
     experience: Replay = dataclasses.field(default_factory=Replay)
 
     unroll: ClassVar[int] = 0
+    continual: ClassVar[Continual] = Continual()
+    plasticity: ClassVar[Plasticity] = Plasticity()
+    goes_on: ClassVar[bool] = False
+    taught: ClassVar[bool] = False
 
     def init(self, spec, tasks, key):
         return jnp.zeros(1)

@@ -16,6 +16,7 @@ import mtjax.train
 from mtjax import agents, checks, envs
 from mtjax.command import keywords, run_config
 from mtjax.config import Plan, with_preset
+from mtjax.envs.family import Family
 from mtjax.learning.loop import Settings
 from mtjax.names import in_python
 from mtjax.report import collect, curve
@@ -130,6 +131,27 @@ def test_a_refused_run_leaves_no_folder(short_family, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("words", "given", "said"),
+    [
+        (["--trials=2", "--eval-episodes=3"], {"trials": 2, "eval_episodes": 3}, "eval-episodes must be a multiple"),
+        (["--population=pbt:100"], {"population": "pbt:100"}, "perturbs numbers of the agent that are swept"),
+        (["--agent.value=c51"], {"value": "c51"}, "value=c51 reaches returns from -10 to 10"),
+        (["--agent.continual=ewc"], {"continual": "ewc"}, "use --curriculum=sequence:STEPS"),
+        (["--trials=2", "--hindsight=0.5"], {"trials": 2, "hindsight": 0.5}, "use --hindsight=0 or --trials=1"),
+    ],
+)
+def test_a_configuration_is_checked_where_it_is_made(words, given, said, monkeypatch):
+    """From a command line as from keywords, and no environment is built for it."""
+    monkeypatch.setattr(Family, "table", property(lambda family: pytest.fail("a table was built")))
+    with pytest.raises(InputError, match=said):
+        run_config.parse(["--env=point-mass-vary-goal", "--agent=sac", *words])
+    plan = {name: given.pop(name) for name in ("eval_episodes", "population") if name in given}
+    with pytest.raises(InputError, match=said):
+        keywords.configured("point-mass-vary-goal", "sac", given, plan=plan)
+    run_config.parse(["--env=point-mass-vary-goal", "--agent=sac"])
+
+
 def test_names_bring_the_tuned_settings_and_objects_their_own(monkeypatch):
     """What is given by keyword changes them."""
     configured = lambda *words, **given: keywords.configured(*words, given, plan={})
@@ -142,6 +164,13 @@ def test_names_bring_the_tuned_settings_and_objects_their_own(monkeypatch):
     plain = configured("finger-spin", mtjax.agent("sac-conditioned"), vary={"size": "1:1.1:3"}, encoder="film")
     assert plain.training == Settings() and plain.family.train_count == 3
     assert agents.settings(plain.learner)["encoder"] == "film"
+
+
+def test_an_object_that_lacks_what_is_called_is_refused(monkeypatch):
+    """By the names of what it lacks."""
+    monkeypatch.delattr(Probe, "ends_early")
+    with pytest.raises(InputError, match=r"a Probe lacks what mtjax\.types\.Env asks for: ends_early$"):
+        mtjax.train(Probe(), tiny("sac"), steps=10)
 
 
 def test_keywords_of_train_are_known_to_errors():

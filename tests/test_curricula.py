@@ -12,7 +12,7 @@ from probes import QUICK, Walk, configure, param, tiny
 import mtjax
 from mtjax.agents.networks import Params
 from mtjax.agents.state import of_tasks, with_tasks
-from mtjax.learning import curricula, loop
+from mtjax.learning import combinations, curricula, loop
 from mtjax.learning.loop import Settings
 from mtjax.types import InputError
 
@@ -275,4 +275,4 @@ def test_a_mixtures_tasks_are_played_in_turn_and_a_run_resumes_to_the_bit(tmp_pa
 def test_steps_of_several_tasks_that_an_agent_would_confuse_are_not_kept(agent, given):
     agent, chosen = configure(tiny(agent), Settings(), {**SMALL, "keep_replay": True, **given})
     with pytest.raises(InputError, match="--keep-replay"):
-        loop.require_curriculum(chosen, Walk(), agent)
+        combinations.require_agent(chosen, agent)

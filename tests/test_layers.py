@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from mtjax import types
 from mtjax.agents import AGENTS
 from mtjax.envs import ENVS
 
@@ -190,6 +191,32 @@ def test_a_class_is_read_with_few_others():
         line = [name for _, name in chain(cls)]
         deep += [" < ".join(line)] * (len(line) > most + (len(line) == 3 and line[1] in EXTENDED))
     assert extended() and not deep
+
+
+# The protocols: what is read of agents, environments and experiences, by the names that these have.
+READ = {
+    types.Env: ("env", "self.config.family"),
+    types.Agent: ("agent", "self.agent", "at_point(agent, learner)", "with_numbers(agent, numbers)"),
+    types.Experience: ("experience", "self.experience", "agent.experience", "self.agent.experience"),
+}
+READERS = ("learning", "compiling", "parallel.axes", "training.run", "training.memory", "training.host_replay")
+KNOWN = {  # where it is known which class it is
+    types.Env: {"calls", "relabels", "varied", "fresh_goals", "observe_worlds"},
+    types.Agent: {"adapt", "conditioning", "gradients", "heads", "representation", "view"},
+    types.Experience: {"capacity", "hindsight", "n_step"},
+}
+
+
+@pytest.mark.parametrize("protocol", READ, ids=lambda protocol: protocol.__name__)
+def test_a_protocol_is_what_is_called(protocol):
+    """No more, and no less: whatever else is read of one is of a class that is asked for before."""
+    members = {name for name in {*vars(protocol), *protocol.__annotations__} if not name.startswith("_")}
+    modules = [module for module in FILES if module.removeprefix("mtjax.").startswith(READERS)]
+    nodes = [node for module in modules for node in ast.walk(trees()[module])]
+    of_one = [x for x in nodes if isinstance(x, ast.Attribute) and ast.unparse(x.value) in READ[protocol]]
+    assert {node.attr for node in of_one} == members | KNOWN[protocol]
+    asked = [x.args[0] for x in nodes if isinstance(x, ast.Call) and ast.unparse(x.func) == "getattr"]
+    assert protocol is types.Experience or not {*map(ast.unparse, asked)} & {*READ[protocol]}
 
 
 @pytest.mark.parametrize("module", ["mtjax.command.keywords", "mtjax.command.run_config"])

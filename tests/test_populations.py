@@ -149,7 +149,7 @@ def of_population(rule, agent=None, sweep=(), **plan):
 def test_populations_that_cannot_choose_are_refused(given, said):
     """Nothing is swept, or there is one member, or no time at which to choose."""
     with pytest.raises(InputError, match=said):
-        of_population(**given).check()
+        of_population(**given)
 
 
 def test_an_evaluation_comes_with_every_choice():

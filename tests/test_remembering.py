@@ -13,7 +13,7 @@ from mtjax.agents.parts import continual, put, remembering
 from mtjax.agents.parts.policies import Gaussian
 from mtjax.agents.state import of_task
 from mtjax.command import run_config
-from mtjax.learning import loop
+from mtjax.learning import combinations, loop
 from mtjax.learning.loop import Settings
 from mtjax.types import InputError
 
@@ -222,7 +222,7 @@ def test_what_cannot_be_remembered_is_refused(agent, given, said):
 def test_tasks_have_to_follow_one_another(curriculum):
     agent, chosen = configure(tiny("sac", continual="l2"), Settings(curriculum=curriculum), GIVEN)
     with pytest.raises(InputError, match="use --curriculum=sequence:STEPS"):
-        loop.require_curriculum(chosen, Walk(), agent)
+        combinations.require_agent(chosen, agent)
 
 
 def test_a_command_switches_off_what_a_preset_has_and_packnet_refuses():

@@ -205,9 +205,9 @@ def test_one_episode_a_trial_is_what_there_was():
 @pytest.mark.parametrize(
     ("name", "settings", "message"),
     [
-        ("sac", {"hindsight": 0.5}, r"hindsight .* --trials=1"),
-        ("ppo", {"conditioning": "inferred"}, r"inferred .* --agent.conditioning=recurrent"),
-        ("deepmdp", {}, r"models predict .* --agent.representation=plain"),
+        ("sac", {"hindsight": 0.5}, r"hindsight .* use hindsight=0 or trials=1"),
+        ("ppo", {"conditioning": "inferred"}, r"inferred .* use conditioning='recurrent'"),
+        ("deepmdp", {}, r"models predict .* use representation='plain'"),
     ],
 )
 def test_who_needs_what_follows_in_an_episode_is_refused_trials_of_several(name, settings, message):
@@ -216,7 +216,7 @@ def test_who_needs_what_follows_in_an_episode_is_refused_trials_of_several(name,
     own = {} if name == "ppo" else {"warmup_steps": 1, "replay_size": STEPS * ENVS, **experience}
     given = {"num_envs": ENVS, "chunk_steps": STEPS, "trials": K}
     with pytest.raises(InputError, match=message):
-        train(Goals(), tiny(name, **settings), {**given, **own})
+        mtjax.train(Goals(), tiny(name, **settings), eval_episodes=K, **given, **own)
 
 
 # Sums of rewards.

@@ -220,7 +220,7 @@ def require_sight(agent: Any, spec: Spec) -> None:
     if agent.follows_sketches and not spec.symbols:
         raise InputError("this agent plays families that follow a sketch, such as --env=craft-sketched")
     agent.representation.require(frames.joined(spec.obs))
-    if agent.view.history and frames.layout(spec.obs) and getattr(agent.experience, "hindsight", 0):
+    if agent.view.history and frames.layout(spec.obs) and agent.experience.hindsight:
         raise InputError(
             "hindsight relabels last steps that are vectors of floats as the family observes them, and "
             "these are joined of other arrays; use --hindsight=0, or another conditioning"

@@ -11,17 +11,16 @@ from mtjax.agents import replayed
 from mtjax.agents.fit import learned
 from mtjax.agents.parts.policies import Policy
 from mtjax.agents.state import AgentState, of_task
-from mtjax.types import Array, Key, Task, Transition
+from mtjax.types import Agent, Array, Key, Task, Transition
 
 Draw = Callable[[Key, int], Transition]
 """Draws so many windows (T, count, L, ...) of the replay, or of a last rollout."""
 
 
-def consolidates(agent: Any) -> bool:
+def consolidates(agent: Agent) -> bool:
     """Return whether anything happens to an agent where a task of a sequence ends."""
-    way, renewing = getattr(agent, "continual", None), getattr(agent, "plasticity", None)
-    held = way is not None and (way.keeps or way.reset_optimizer or way.restarts)
-    return held or (renewing is not None and renewing.changes)
+    way = agent.continual
+    return way.keeps or way.reset_optimizer or way.restarts or agent.plasticity.changes
 
 
 def consolidate(agent: Any, state: AgentState, draw: Draw, tasks: Task, key: Key) -> AgentState:

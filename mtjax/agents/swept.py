@@ -69,7 +69,12 @@ def with_numbers(agent: Any, numbers: Mapping[str, Array]) -> Any:
 
 def at_point(agent: Any, state: Any) -> Any:
     """Return the agent with the numbers that its state holds: those of its point, if it is one of a sweep."""
-    return with_numbers(agent, getattr(state, "numbers", {}))
+    return with_numbers(agent, numbers_of(state))
+
+
+def numbers_of(state: Any) -> dict[str, Array]:
+    """Return the numbers that an agent's state holds, by name: none outside a sweep, as in states of other kinds."""
+    return getattr(state, "numbers", {})
 
 
 def _replace_values(agent: BaseAgent, values: Mapping[str, Any], replace: Callable) -> BaseAgent:

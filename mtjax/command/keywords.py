@@ -17,6 +17,7 @@ from mtjax.envs.mixtures import FamilyOrMixture
 from mtjax.learning.loop import Settings
 from mtjax.names import InputError
 from mtjax.saved.policy import Policy
+from mtjax.types import Agent, Env
 
 
 def configured(
@@ -42,7 +43,7 @@ def configured(
         written: profile, tensorboard and wandb.
 
     Raises:
-        InputError: there is no such setting, or a value is not allowed.
+        InputError: there is no such setting, a value is not allowed, or settings do not go together.
     """
     named = isinstance(env, str | FamilyOrMixture) and isinstance(agent, str | BaseAgent)
     _require_learning(env, agent, named)
@@ -65,8 +66,7 @@ def configured(
         names = (name, agents.name_of(learner)) if named else ("", "")
         config = RunConfig(*names, plan=Plan(**plan), training=training, family=family, learner=learner)
     points, places = swept.grid(sweep), [str(each.directory) for each in starts if each.directory is not None]
-    return dataclasses.replace(
-        config,
+    return config.checked(
         start=",".join(places),
         teacher=_teacher(start) if isinstance(start, tuple) else None,
         points=points,
@@ -91,6 +91,11 @@ def _require_learning(env: Any, agent: Any, named: bool) -> None:
         raise InputError(f"agent is a name such as 'care', or what mtjax.agent returns; not {_kind(agent)}")
     if not named and (isinstance(env, str) or isinstance(agent, str)):
         raise InputError("a name goes with an environment derived from Family and an agent derived from BaseAgent")
+    for protocol, value in ((Env, env), (Agent, agent)):
+        members = {*vars(protocol), *protocol.__annotations__}
+        lacks = sorted(name for name in members - {*dir(value)} if not name.startswith("_"))
+        if lacks and not isinstance(value, str):
+            raise InputError(f"{_kind(value)} lacks what mtjax.types.{protocol.__name__} asks for: {', '.join(lacks)}")
 
 
 def _kind(value: Any) -> str:

@@ -27,6 +27,15 @@ _DECIDING = ("vectors", "heads", "actor_heads", "critic_heads")  # they decide w
 def parse(argv: Sequence[str]) -> RunConfig:
     """Read the configuration of a run from a command line.
 
+    Raises:
+        InputError: a name, flag or value cannot be used, or they do not go together.
+    """
+    return draft(argv).checked()
+
+
+def draft(argv: Sequence[str]) -> RunConfig:
+    """Read a configuration that its reader completes, as a sweep does by points; ``RunConfig.checked`` takes them.
+
     The names of environment, agent and preset choose the defaults; the other flags change them.
 
     Raises:

@@ -6,7 +6,6 @@ search's folder: ``run-1``, ``run-2`` and so on. ``training/search.py`` asks for
 
 import contextlib
 import dataclasses
-import os
 import re
 import shlex
 import sys
@@ -19,14 +18,14 @@ import numpy as np
 from mtjax.agents import swept
 from mtjax.agents.choices import flag_names
 from mtjax.checks import amount, require_library
-from mtjax.command.run_config import parse
-from mtjax.command.words import split_flags
+from mtjax.command.run_config import draft, parse
+from mtjax.command.words import flag_value, split_flags
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import RunConfig
 from mtjax.saved import checkpoint, lock, survivors
-from mtjax.saved.config_json import from_json, import_flags, write_config
+from mtjax.saved.config_json import describe_stop, from_json, import_flags, write_config
 from mtjax.saved.folder import evaluations_of, new_directory, short_name
-from mtjax.saved.log import append_rows, number
+from mtjax.saved.log import aligned, number, write_table
 from mtjax.training import memory
 from mtjax.training import search as searching
 from mtjax.training.launch import check, launch, load_start
@@ -56,7 +55,7 @@ def is_search(argv: Sequence[str]) -> bool:
     if ranges:
         flag = next(iter(ranges))
         raise InputError(f"--{flag} has a range, and a run takes one value; --search=20 looks for a good one")
-    resumed = next((word.split("=", 1)[1] for word in argv if word.startswith("--resume=")), "")
+    resumed = flag_value(argv, "resume", "")
     return bool(resumed) and (Path(resumed) / searching.FILE).is_file()
 
 
@@ -96,7 +95,7 @@ def configured(argv: Sequence[str]) -> tuple[RunConfig, Search]:
         InputError: a value is not allowed.
     """
     ranges, rest = read_ranges(argv)
-    config = parse(rest)
+    config = draft(rest)
     _require_alone(config)
     if not ranges:
         raise InputError("--search needs ranges of the agent's numbers, such as --agent.actor-lr=1e-5..1e-2")
@@ -123,7 +122,7 @@ def _require_alone(config: RunConfig) -> None:
     wrong = next((name for name in _NOT_WITH if given[name]), None)
     if wrong is not None:
         raise InputError(f"--search and --{wrong} do not go together; leave one of them out")
-    if getattr(config.learner.experience, "host_replay_size", 0):
+    if config.learner.experience.host_slots(config.training.num_envs):
         raise InputError("--search keeps its replays on the device; leave out --host-replay-size")
 
 
@@ -144,15 +143,14 @@ def _with_rungs(config: RunConfig, batch: int) -> tuple[RunConfig, tuple[int, ..
 def main(argv: Sequence[str]) -> None:
     """Start the search of ``--search``, or resume the one in the folder of ``--resume``."""
     enable_compile_cache()
-    resume = next((Path(word.split("=", 1)[1]) for word in argv if word.startswith("--resume=")), None)
-    if resume is not None:
+    if resume := flag_value(argv, "resume", ""):
         if any(word.split("=", 1)[0] == "--steps" for word in argv):
             raise InputError("the trials of a search are as long as they were; leave out --steps")
         parse(argv)  # which imports the user's own files
-        return _go_on(resume)
+        return _go_on(Path(resume))
     config, search = configured(argv)
     require_library("optuna", "--search")
-    check(dataclasses.replace(config, points=(dict(search.preset),)), load_start(config))
+    check(config.checked(points=(dict(search.preset),)), load_start(config))
     search = _fitting(config, search)
     folder = new_directory(Path(config.runs), f"{short_name(config.env)}-{config.agent}-search")
     search = searching.ask(search)
@@ -190,7 +188,7 @@ def _go_on(folder: Path) -> None:
             searching.write(folder, search)
             search = _climb(folder, config, search)
             searching.write(folder, search)
-            _write_table(folder, search)
+            write_table(folder / "search.csv", _rows(search))
     print("\n".join([*_table(search), *_conclusion(search, folder, import_flags(config))]))
 
 
@@ -224,8 +222,7 @@ def _climb(folder: Path, config: RunConfig, search: Search) -> Search:
             print(f"{label}: {error}", flush=True)
             return searching.climb(search, [np.nan] * len(search.running), run.name)
         if result.signal:
-            words = shlex.join([f"--resume={folder}", *import_flags(config)])
-            print(f"stopped; the state is saved. Go on with:\n  python -m mtjax.train {words}")
+            print(describe_stop(config, folder))
             sys.exit(128 + result.signal)
     returns = evaluations_of(now, run).returns["train"][:, -1]
     of_trials = returns.reshape(len(search.running), -1).mean(axis=1, dtype=np.float64)
@@ -258,23 +255,12 @@ def _row(trial: Trial) -> dict[str, Any]:
     return about | {"state": trial.state, "run": trial.run, "point": trial.point}
 
 
-def _write_table(folder: Path, search: Search) -> None:
-    """Write search.csv anew; whoever reads it sees a whole one."""
-    new = folder / "search.csv.new"
-    new.unlink(missing_ok=True)
-    append_rows(new, _rows(search))
-    os.replace(new, folder / "search.csv")
-
-
 def _table(search: Search) -> list[str]:
     """Return the lines of the best trials."""
     shown = [name for name in _rows(search)[0] if name not in ("run", "point")]
     rows = [{**row, "return": row["return"] and amount(float(row["return"]))} for row in _rows(search)]
     lines = [shown, *([str(row[name]) or "-" for name in shown] for row in rows[:_SHOWN])]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    rest = f"{len(rows) - _SHOWN} more are in search.csv"
-    text = ["  ".join(x.rjust(w) for x, w in zip(line, widths, strict=True)) for line in lines]
-    return text + [rest] * (len(rows) > _SHOWN)
+    return aligned(lines) + [f"{len(rows) - _SHOWN} more are in search.csv"] * (len(rows) > _SHOWN)
 
 
 def _conclusion(search: Search, folder: Path, imports: Sequence[str]) -> list[str]:

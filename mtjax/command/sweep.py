@@ -8,9 +8,7 @@ round is a run in the sweep's folder: ``run-1``, ``run-2`` and so on. A plain ru
 import contextlib
 import dataclasses
 import itertools
-import os
 import re
-import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,7 +18,8 @@ import numpy as np
 
 from mtjax.agents import AGENTS, PARTS, swept
 from mtjax.checks import amount
-from mtjax.command.run_config import parse
+from mtjax.command.run_config import draft, parse
+from mtjax.command.words import flag_value
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import RunConfig
 from mtjax.learning.evaluation import Evaluations
@@ -28,9 +27,9 @@ from mtjax.learning.populations import NO_INTERVAL
 from mtjax.report.curve import draw
 from mtjax.report.stats import seed_interval
 from mtjax.saved import checkpoint, lock
-from mtjax.saved.config_json import from_json, import_flags, write_config
+from mtjax.saved.config_json import describe_stop, from_json, write_config
 from mtjax.saved.folder import evaluations_of, new_directory, record_steps, resumed_config, short_name
-from mtjax.saved.log import append_rows, number
+from mtjax.saved.log import aligned, number, write_table
 from mtjax.training import memory
 from mtjax.training.launch import check, launch, load_start
 from mtjax.training.run import Hooks
@@ -66,7 +65,7 @@ def is_sweep(argv: Sequence[str]) -> bool:
     names = [word.split("=", 1)[0] for word in argv]
     if "--sweep" in names and "--resume" in names:
         raise InputError("--resume goes on with a sweep as it was; leave out --sweep")
-    resumed = next((word.split("=", 1)[1] for word in argv if word.startswith("--resume=")), "")
+    resumed = flag_value(argv, "resume", "")
     return "--sweep" in names or bool(resumed and _run_folders(Path(resumed)))
 
 
@@ -144,12 +143,10 @@ def configurations(argv: Sequence[str]) -> list[RunConfig]:
     found = []
     for values in itertools.product(*(axis.values for axis in outside)):
         chosen = [Axis(axis.flag, (value,)) for axis, value in zip(outside, values, strict=True)]
-        config = parse([*rest, *itertools.chain(*(_to_flags(axis.flag, axis.values[0]) for axis in chosen))])
+        config = draft([*rest, *itertools.chain(*(_to_flags(axis.flag, axis.values[0]) for axis in chosen))])
         sweep = tuple(f"{axis.flag}={','.join(axis.values)}" for axis in (*chosen, *inside))
         points_of_it = swept.grid({axis.setting: [_number(axis, x) for x in axis.values] for axis in inside})
-        for point in points_of_it:
-            swept.agent_at(config.learner, point)
-        found.append(dataclasses.replace(config, sweep=sweep, points=points_of_it))
+        found.append(config.checked(sweep=sweep, points=points_of_it))
     return found
 
 
@@ -166,8 +163,8 @@ def _number(axis: Axis, text: str) -> float:
 def main(argv: Sequence[str]) -> None:
     """Start the sweep of ``--sweep``, or resume the sweep in the folder of ``--resume``."""
     enable_compile_cache()
-    resume = next((Path(word.split("=", 1)[1]) for word in argv if word.startswith("--resume=")), None)
-    if resume is not None:
+    if resumed := flag_value(argv, "resume", ""):
+        resume = Path(resumed)
         with _locked(resume):
             for directory in _run_folders(resume):
                 record_steps(directory / "config.json", resumed_config(parse(argv), directory, argv).plan.steps)
@@ -248,18 +245,14 @@ def run_unfinished(folder: Path) -> None:
             (run / _DIVERGED).write_text(f"{error}\n")
         _write_table(folder, runs)
         if signal:
-            words = shlex.join([f"--resume={folder}", *import_flags(config)])
-            print(f"{table(rows(runs))}\nstopped; the state is saved. Go on with:\n  python -m mtjax.train {words}")
+            print(table(rows(runs)), describe_stop(config, folder), sep="\n")
             sys.exit(128 + signal)
     print(f"{table(rows(runs))}{told}\nsweep: {folder}")
 
 
 def _write_table(folder: Path, runs: Sequence[Path]) -> None:
-    """Write the table of all settings anew, with the latest evaluations; whoever reads it sees a whole one."""
-    new = folder / "sweep.csv.new"
-    new.unlink(missing_ok=True)
-    append_rows(new, rows(runs))
-    os.replace(new, folder / "sweep.csv")
+    """Write the table of all settings anew, with the latest evaluations."""
+    write_table(folder / "sweep.csv", rows(runs))
 
 
 def final_evaluations(config: RunConfig, run: Path) -> Evaluations | None:
@@ -360,12 +353,10 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     lines = [[*settings, *splits]]
     for row in rows:
         lines.append([*(str(row[name]) for name in settings), *(_cell(row, split) for split in splits)])
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    text = "\n".join("  ".join(x.rjust(w) for x, w in zip(line, widths, strict=True)) for line in lines)
     groups: dict[str, list[Mapping[str, Any]]] = {}
     for row in (row for row in rows if row.get("train")):
         groups.setdefault(row.get("env", ""), []).append(row)  # returns of different environments are no contest
-    return "\n".join([text, *(_highest(env, own, settings) for env, own in groups.items() if len(own) > 1)])
+    return "\n".join([*aligned(lines), *(_highest(env, own, settings) for env, own in groups.items() if len(own) > 1)])
 
 
 def _highest(env: str, rows: Sequence[Mapping[str, Any]], settings: Sequence[str]) -> str:

@@ -17,7 +17,7 @@ from mtjax.parallel import hosts
 from mtjax.report.curve import draw
 from mtjax.report.tables import split_table
 from mtjax.saved import checkpoint, lock
-from mtjax.saved.config_json import import_flags, write_config
+from mtjax.saved.config_json import describe_stop, import_flags, write_config
 from mtjax.saved.folder import new_directory, record_steps, resumed_config, short_name
 from mtjax.saved.result import Result
 from mtjax.training import memory
@@ -77,9 +77,7 @@ def _prepare(config: RunConfig, directory: Path | None) -> Path:
 def _conclude(config: RunConfig, result: Result, directory: Path) -> None:
     draw(config, result.evaluations, directory)
     if not result.finished:
-        words = [f"--resume={directory}", *import_flags(config)]
-        print(f"stopped; the state is saved. Go on with:\n  python -m mtjax.train {shlex.join(words)}")
-        return
+        return print(describe_stop(config, directory))
     if len(result.evaluations.steps):
         found = as_one_seed(result.evaluations) if config.plan.rule else result.evaluations
         print(split_table(found, config.family.parts), *[populations.NO_INTERVAL] * bool(config.plan.rule), sep="\n")

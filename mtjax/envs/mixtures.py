@@ -9,7 +9,7 @@ masked.
 import dataclasses
 from collections.abc import Callable, Mapping
 from functools import cached_property, partial
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -46,6 +46,7 @@ class Mixture:
     A mixture of one family is that family: the same context, no mask, one normaliser.
     """
 
+    ends_early: ClassVar[bool] = True  # as some family's episodes may
     families: Annotated[tuple[Family, ...], tyro.conf.Suppress]
     names: Annotated[tuple[str, ...], tyro.conf.Suppress]
     scenes: str = "auto"

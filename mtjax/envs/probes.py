@@ -6,7 +6,7 @@ those in the docstrings of the rules.
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -95,6 +95,8 @@ def tasks_of(kind: str, scales=(1.0, -0.5), horizon: int = LIMIT) -> Task:
 class Probe:
     """An environment that is any of the probes, by the task's ``kind``."""
 
+    ends_early: ClassVar[bool] = True
+    finite_horizon: ClassVar[bool] = False
     kind: str = "one-step"
     episode_length: int = LIMIT
 

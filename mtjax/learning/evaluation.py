@@ -211,7 +211,7 @@ def evaluate(
     metrics |= {_EVER: metrics["success"]} if "success" in metrics else {}
     nothing = Scores(jnp.zeros((*shape, trials.episodes)), metrics)
     begun, length = (worlds, nothing, jnp.ones(shape, bool)), env.episode_length * trials.episodes
-    scores = _play(step, begun, length, getattr(env, "ends_early", True))[1]
+    scores = _play(step, begun, length, env.ends_early)[1]
     return jax.tree.map(lambda x: x.reshape(*shape[:2], episodes.count), scores)
 
 
@@ -283,7 +283,7 @@ def _latest(new: dict[str, Array], old: dict[str, Array], now: Array) -> dict[st
 
 def draw_in_turn(tasks: Task, keys: Key) -> Task:
     """Draw the tasks of trials (S, T, E, ...) with keys (S, T, E), none of a task twice before all were drawn."""
-    count, trials = tasks.draws.id.shape[1], jnp.arange(keys.shape[2])  # type: ignore
+    count, trials = tasks.draws.id.shape[1], jnp.arange(keys.shape[2])
     shuffle = lambda key: jax.random.permutation(jax.random.fold_in(key, 0x60A1), count)[trials % count]
     order = jax.vmap(jax.vmap(shuffle))(keys[:, :, 0])
     return jax.vmap(jax.vmap(jax.vmap(draw_at, (None, 0))), (None, 0))(tasks, order)
@@ -358,7 +358,7 @@ def record(
         now, transition = alive[..., None] & _is_now(before, trial), env_step.transition
         begun = _go_on(env, agent, learners, tasks, worlds, env_step, alive, partial(_at, keys, time), trials)
         rewards = jnp.where(now, transition.reward[..., None], 0.0)
-        option = worlds.memory.running.option if getattr(agent, "goes_on", False) else None
+        option = worlds.memory.running.option if agent.goes_on else None
         return (begun, alive & ~transition.closed), (rewards, now, keep(worlds, transition), option)
 
     worlds = reset_envs(env, agent, learners, tasks, keys, trials)

@@ -13,11 +13,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mtjax import frames
 from mtjax.agents.consolidating import change, consolidate, consolidates
 from mtjax.agents.fit import reset_networks
 from mtjax.agents.state import of_tasks, with_tasks
-from mtjax.agents.swept import at_point, with_numbers
+from mtjax.agents.swept import at_point, numbers_of, with_numbers
 from mtjax.checks import check_fields
 from mtjax.learning import curricula
 from mtjax.learning.rollout import (
@@ -109,9 +108,9 @@ class TrainState(NamedTuple):
     data: Any  # the experience's, leaves (S, ...)
     iteration: Array  # () int32, steps taken by every environment
     key: Key  # (S,)
-    rows: Array | None = None  # (T,) int32 numbers of the tasks that worlds play; None: all that the agent knows
+    rows: Any = None  # (T,) int32 numbers of the tasks that worlds play; None: all that the agent knows
     origins: Array | None = None  # (S,) int32 of a population: the first member from which each descends
-    heard: Array | None = None  # (N, 2) of a curriculum that heeds returns: what was heard of all tasks that are known
+    heard: Any = None  # (N, 2) of a curriculum that heeds returns: what was heard of all tasks that are known
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
@@ -120,12 +119,11 @@ def init(
 ) -> TrainState:
     """Return a fresh training state for ``seeds`` (S,) on training ``tasks`` (N, ...).
 
+    ``mtjax.learning.combinations`` says which settings, agents and families go together, and is asked before.
+
     Args:
         numbers: values (S,), by name, of the agent's numbers that vary between seeds, in a sweep.
     """
-    agent.experience.check(env, settings.num_envs, unroll=agent.unroll)
-    require_trials(settings, env, agent)
-    require_curriculum(settings, env, agent)
     known, rows = tasks, None
     if settings.plays.steps:
         rows = settings.plays.rows(jnp.int32(0), len(known.id))
@@ -153,119 +151,6 @@ def _init_agent(env: Env, agent: Agent, tasks: Task, key: Key, numbers: dict[str
     """Return the initial state of an agent, which keeps those of its numbers that a sweep varies."""
     state = with_numbers(agent, numbers).init(env.spec, tasks, key)
     return state._replace(numbers=numbers) if numbers else state
-
-
-def require_curriculum(settings: Settings, env: Any, agent: Any) -> None:
-    """Check that an agent can learn some of its tasks at a time.
-
-    Raises:
-        InputError: it cannot.
-    """
-    if consolidates(agent) and not isinstance(settings.plays, curricula.Sequence):
-        raise InputError(
-            "continual, reset-optimizer and shrink-and-perturb are for tasks one after another: use "
-            "--curriculum=sequence:STEPS"
-        )
-    if settings.keep_replay:
-        _require_one_replay(settings, agent)
-    if not settings.plays.steps:
-        return
-    told, experience = f"the curriculum {settings.curriculum}", agent.experience
-    if settings.plays.steps % settings.chunk_steps:
-        raise InputError(
-            f"{told} changes tasks between chunks: give a multiple of --chunk-steps={settings.chunk_steps}"
-        )
-    if experience.reset_every or experience.host_slots(settings.num_envs):
-        raise InputError(f"{told} begins a replay anew; use --reset-every=0 and --host-replay-size=0")
-    if experience.adaptations:
-        raise InputError(f"{told} changes tasks, and this agent adapts to all that it knows; leave it out")
-    known = env.tasks("train")
-    if known.blocks is not None:
-        known.blocks.some(settings.plays.count(len(known.id)))
-    rule = getattr(agent, "gradients", None)
-    if rule is not None and jax.tree.leaves(rule.init(2)):
-        raise InputError(f"{told} needs a rule of gradients without memory of the tasks, such as mean or pcgrad")
-
-
-def _require_one_replay(settings: Settings, agent: Any) -> None:
-    """Check that steps of several tasks can lie in one replay.
-
-    Raises:
-        InputError: tasks do not change, or the agent would take a step for one of another task.
-    """
-    if not settings.plays.steps or not agent.experience.storage.kept:
-        raise InputError("--keep-replay is for an agent with a replay and a curriculum, such as sequence:STEPS")
-    blind = not agent.conditioning.tells and agent.heads == "shared"
-    if not blind or agent.representation.embeds or agent.unroll or agent.experience.n_step > 1:
-        raise InputError(
-            "--keep-replay mixes single steps of all tasks: use --agent.conditioning=none, --agent.heads=shared and "
-            "--n-step=1"
-        )
-
-
-def require_trials(settings: Settings, env: Any, agent: Agent) -> None:
-    """Check that a family has such trials, and that an agent can learn from them.
-
-    Raises:
-        InputError: the agent learns from what follows a step, and another episode may follow it; or worlds cannot go
-            on.
-    """
-    if settings.trials > 1:
-        _require_repeatable(settings.trials, agent)
-    if agent.experience.adaptations and env.tasks("train").draws is not None:
-        raise InputError("this agent adapts to each task by its rollouts, but here trials draw tasks; vary by a list")
-    reason = _cannot_go_on(env) if settings.reset_free else ""
-    if reason:
-        raise InputError(f"--reset-free lets worlds go on, and {reason}; leave it out")
-    _require_way_back(settings, env)
-
-
-def _require_way_back(settings: Settings, env: Any) -> None:
-    """Check that worlds can be asked to go back to their start, if the curriculum does.
-
-    Raises:
-        InputError: they cannot.
-    """
-    told = f"the curriculum {settings.curriculum}"
-    if not isinstance(settings.plays, curricula.ForwardBackward | curricula.Graph):
-        return
-    if not settings.reset_free:
-        raise InputError(f"{told} is for worlds that are not reset; add --reset-free")
-    if not hasattr(env, "returning"):
-        raise InputError(f"{told} needs a way back to the start, which this family has no task for, as tabletop has")
-
-
-def _require_repeatable(trials: int, agent: Any) -> None:
-    """Refuse an agent that takes what follows a step for a state of the same episode."""
-    follows = f"what follows a step, which in a trial of {trials} episodes may be another episode"
-    if getattr(agent.experience, "hindsight", 0):
-        raise InputError(f"hindsight relabels steps by {follows}; use --hindsight=0 or --trials=1")
-    if getattr(getattr(agent, "view", None), "history", 0):
-        raise InputError(f"tasks are inferred from {follows}; use --agent.conditioning=recurrent or --trials=1")
-    if getattr(getattr(agent, "representation", None), "predicts", False):
-        raise InputError(f"models predict {follows}; use --agent.representation=plain or --trials=1")
-
-
-def _cannot_go_on(env: Any) -> str:
-    """Return why worlds cannot go on where an episode's time is up, with the next one's task; empty if they can."""
-    tasks = env.tasks("train")
-    if tasks.blocks is not None:
-        return "it is for single families, not for mixtures"
-    if getattr(env, "ends_early", True):
-        return "in this family episodes terminate"
-    if getattr(env, "fresh_goals", False):
-        return "this family draws its goals with its states"
-    if tasks.draws is None:
-        return ""
-    goals = getattr(env, "relabels", ())
-    physical = [name for name in getattr(env, "varied", ()) if name not in goals]
-    if not goals or physical:
-        return f"states depend on {', '.join(physical) or 'what episodes draw'}: only goals may be drawn"
-    one = jax.tree.map(lambda x: x[0], tasks._replace(draws=None))
-    state = jax.eval_shape(env.reset, one, jax.random.key(0)).state
-    if getattr(state, "extra", None) is not None or getattr(state, "mocap", None) is not None:
-        return "the states of this family hold its goals"
-    return "pictures show the goal of before" if frames.shown(env.spec.obs) else ""
 
 
 def _first_worlds(env: Env, agent: Agent, settings: Settings, learners: Any, tasks: Task, keys: Key) -> Worlds:
@@ -333,7 +218,7 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
     metrics = _summarise(history, count)
     if state.heard is not None:
         returns = collectives.of_all_seeds(metrics["return"])
-        state = state._replace(heard=curricula.hear(state.heard, state.rows, returns))  # type: ignore
+        state = state._replace(heard=curricula.hear(state.heard, state.rows, returns))
     if settings.plays.steps:
         metrics = _of_known(metrics, state.rows, len(known.id))
     return state._replace(agent=collectives.agreed(state.agent)), metrics
@@ -373,7 +258,7 @@ def _next_rows(settings: Settings, state: TrainState, known: int) -> Array:
     if not isinstance(plays, curricula.Heeding):
         return plays.rows(state.iteration, known)
     due = state.iteration % plays.steps < settings.chunk_steps  # also if a resumed run begins its chunks elsewhere
-    return jnp.where(due, plays.choose(state.iteration, state.heard), state.rows)  # type: ignore
+    return jnp.where(due, plays.choose(state.iteration, state.heard), state.rows)
 
 
 def _consolidate(env: Env, agent: Agent, settings: Settings, known: Task, state: TrainState) -> Any:
@@ -381,7 +266,7 @@ def _consolidate(env: Env, agent: Agent, settings: Settings, known: Task, state:
     if not consolidates(agent):
         return state.agent
     keys = _folded(state.key)
-    fresh = lambda: jax.vmap(partial(_init_agent, env, agent, known))(keys, getattr(state.agent, "numbers", {}))
+    fresh = lambda: jax.vmap(partial(_init_agent, env, agent, known))(keys, numbers_of(state.agent))
     if agent.continual.restarts:
         return fresh()
     tasks, experience, kept = rows_of(known, state.rows), agent.experience, agent.experience.storage.kept

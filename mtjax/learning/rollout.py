@@ -2,19 +2,19 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 
 from mtjax import frames
-from mtjax.agents.swept import at_point
+from mtjax.agents.swept import at_point, numbers_of
 from mtjax.learning import curricula
 from mtjax.learning.trials import EACH_EPISODE, Ends, Trials
 from mtjax.parallel import collectives
 from mtjax.parallel.axes import over_learners, renew_worlds, where_worlds
 from mtjax.tasks import contexts_vary, episode_task
-from mtjax.types import Acted, Agent, Array, Env, Key, Task, Transition
+from mtjax.types import Acted, Agent, Array, Env, Key, Lasting, Task, Transition
 
 _LARGEST = 1e10
 """Largest number in an observation: MuJoCo's own bound of positions and velocities (``mjMAXVAL``)."""
@@ -132,7 +132,7 @@ def act(agent: Agent, learners: Any, tasks: Task, worlds: Worlds, keys: Key | No
 def _act(agent: Agent, learner: Any, task: Task, memory: Any, obs: Any, key: Key | None = None) -> Acted:
     """Let an agent act in one world."""
     acted = at_point(agent, learner).act(learner, memory, obs, task, key)
-    if not getattr(learner, "numbers", {}):
+    if not numbers_of(learner):
         return acted
     return acted._replace(action=jnp.nan_to_num(acted.action, posinf=0, neginf=0))  # a point may diverge alone
 
@@ -177,7 +177,7 @@ def step_envs(
     obs = where_worlds(lost, worlds.obs, frames.push(worlds.obs, step.obs))
     age = worlds.age + 1
     timeout = age >= each.horizon
-    terminated = step.terminated | timeout if getattr(env, "finite_horizon", False) else step.terminated
+    terminated = step.terminated | timeout if env.finite_horizon else step.terminated
     timeout = timeout if step.truncated is None else timeout | step.truncated
     ends = trials.ends(terminated & ~lost, timeout, lost, worlds.episode)
     transition = Transition(
@@ -189,7 +189,7 @@ def step_envs(
         ended=ends.episode,
         closed=ends.trial,
         cut=ends.cut,
-        context=worlds.task.context if contexts_vary(tasks) else None,  # type: ignore
+        context=worlds.task.context if worlds.task is not None and contexts_vary(tasks) else None,
         extras=acted.extras,
         memory=worlds.memory,
     )
@@ -228,11 +228,13 @@ def reset_ended(
         keys: a function that returns keys (S, T, E); only the branch calls it.
     """
     own = type(env).renew_worlds is not renew_worlds  # as it steps all of its worlds at once
-    few = not own and getattr(env, "ends_early", True) and env.episode_length > 1
-    begin = _change_tasks if trials.keeps_state else _reset_some if few else _reset_all
+    few = not own and env.ends_early and env.episode_length > 1
+    begin = partial(_reset_some if few else _reset_all, env)
+    if trials.keeps_state:
+        begin = partial(_change_tasks, cast(Lasting, env))
 
     def renew(worlds: Worlds) -> Worlds:
-        begun = begin(env, tasks, worlds, ends, keys(), trials)
+        begun = begin(tasks, worlds, ends, keys(), trials)
         age = jnp.where(ends.episode, 0, worlds.age)
         memory = where_worlds(ends.trial, begin_memory(agent, learners, tasks, age), worlds.memory)
         episode = None if worlds.episode is None else jnp.where(ends.trial, 0, worlds.episode + ends.episode)
@@ -260,7 +262,7 @@ def _reset_all(env: Env, tasks: Task, worlds: Worlds, ends: Ends, keys: Key, tri
     return _Begun(start.state, *where_worlds(ends.episode, (start.task, start.obs), (worlds.task, worlds.obs)))
 
 
-def _change_tasks(env: Any, tasks: Task, worlds: Worlds, ends: Ends, keys: Key, trials: Trials) -> _Begun:
+def _change_tasks(env: Lasting, tasks: Task, worlds: Worlds, ends: Ends, keys: Key, trials: Trials) -> _Begun:
     """Choose tasks with keys (S, T, E) for worlds whose trials have ended, which go on where they are; reset lost ones.
 
     Returns:

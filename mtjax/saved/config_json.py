@@ -165,6 +165,12 @@ def import_flags(config: RunConfig) -> list[str]:
     return [f"--import={file}" for file in config.imports]
 
 
+def describe_stop(config: RunConfig, folder: Path) -> str:
+    """Return lines on how to go on with a run, sweep or search that was stopped."""
+    words = shlex.join([f"--resume={folder}", *import_flags(config)])
+    return f"stopped; the state is saved. Go on with:\n  python -m mtjax.train {words}"
+
+
 def run_metadata(config: RunConfig) -> dict:
     """Return what else decides a run's results: engine, device and versions; and the command that repeats it."""
     versions = {"mtjax": __version__}

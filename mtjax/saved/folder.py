@@ -107,7 +107,7 @@ def resumed_config(config: RunConfig, directory: Path, argv: Sequence[str]) -> R
     now: dict[str, Any] = {"plan": dataclasses.replace(recorded.plan, steps=steps)}
     now |= {"tensorboard": recorded.tensorboard or config.tensorboard, "wandb": config.wandb or recorded.wandb}
     now |= {"view": config.view, "profile": config.profile, "distributed": config.distributed}
-    return dataclasses.replace(recorded, **now)
+    return recorded.checked(**now)
 
 
 def record_steps(file: Path, steps: int) -> None:

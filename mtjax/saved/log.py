@@ -55,6 +55,18 @@ def append_rows(path: Path, rows: Sequence[dict[str, Any]]) -> None:
         writer.writerows(rows)
 
 
+def write_table(path: Path, rows: Sequence[dict[str, Any]]) -> None:
+    """Write a CSV file anew; whoever reads it sees a whole one."""
+    with replacing(path) as new:
+        append_rows(new, rows)
+
+
+def aligned(lines: Sequence[Sequence[str]]) -> list[str]:
+    """Return lines of cells as texts, of which each column is as wide as its widest cell."""
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return ["  ".join(x.rjust(w) for x, w in zip(line, widths, strict=True)) for line in lines]
+
+
 def _columns(path: Path) -> list[str]:
     with path.open(newline="") as file:
         return next(csv.reader(file))

@@ -3,13 +3,21 @@
 import tomllib
 from collections.abc import Sequence
 from importlib import resources
+from typing import Any
 
 import jax
 
+from mtjax.agents import AGENTS, BaseAgent, preset_of
+from mtjax.agents import name_of as agent_name_of
+from mtjax.agents.combinations import require_sight
+from mtjax.checks import require_library
 from mtjax.config import RunConfig
 from mtjax.envs import Family
+from mtjax.envs import name_of as env_name_of
 from mtjax.envs.contexts import ranges
 from mtjax.envs.task_table import forgetful
+from mtjax.frames import shown
+from mtjax.learning import combinations
 from mtjax.parallel import hosts
 from mtjax.saved.folder import remove_unused
 from mtjax.saved.policy import Policy, load
@@ -21,7 +29,9 @@ from mtjax.types import InputError
 
 
 def check(config: RunConfig, start: Policy | Sequence[Policy] | None = None) -> None:
-    """Check a configuration, and the policy from which its run begins, before a folder is made.
+    """Check a configuration with what it needs, before a folder is made: the environment, devices, and a policy.
+
+    ``RunConfig.checked`` has checked it by itself.
 
     Args:
         start: the policy to fine-tune, or those that teach, but for a run that has begun.
@@ -29,10 +39,49 @@ def check(config: RunConfig, start: Policy | Sequence[Policy] | None = None) -> 
     Raises:
         InputError: they do not go together.
     """
+    family, learner = config.family, config.learner
     if config.env or start is not None:
-        require = require_teachers if config.learner.taught else require_start
-        require(config, start)  # type: ignore
-    config.check()
+        require: Any = require_teachers if learner.taught else require_start  # of several policies, or one
+        require(config, start)
+    if config.env:
+        _require_named(config)
+    _require_policy(learner, family)
+    combinations.require_env(config.played, family, learner)
+    if config.mesh is not None and (lost := forgetful(family)):
+        raise InputError(
+            f"{lost} steps on the host of one device, and this run is on {config.mesh.size}; show JAX one, such "
+            "as by CUDA_VISIBLE_DEVICES=0"
+        )
+    for module in ["tensorboardX"] * config.tensorboard + ["wandb"] * bool(config.wandb):
+        require_library(module)
+
+
+def _require_named(config: RunConfig) -> None:
+    """Check what only families and agents with names have."""
+    family, learner = config.family, config.learner
+    _ = family.engine_name, family.table, family.calls.targets()  # its engine refuses a model that it cannot run
+    require_sight(learner, family.spec)
+    if preset_of(config.agent).sees_pictures and not shown(family.spec.obs):
+        raise InputError(
+            f"{config.agent} learns from pictures, and {config.env} shows none: give --env.pixels=64, or for states "
+            "use --agent=sac-conditioned, to which --agent.representation=encoded adds an encoder"
+        )
+    learner.conditioning.table(family.spec, family.train_count)
+
+
+def _require_policy(agent: Any, env: Any) -> None:
+    """Refuse an agent that cannot draw the actions of its environment.
+
+    Raises:
+        InputError: that is so; it names agents that can.
+    """
+    if not isinstance(agent, BaseAgent) or isinstance(agent.policy, agent.policies):
+        return
+    able = ", ".join(name for name, preset in AGENTS.items() if isinstance(agent.policy, preset.cls.policies))
+    scored = any(hasattr(part.family, "scores") for part in getattr(env, "parts", ()))
+    scores, kind = ", or --env.scores" if scored else "", env.spec.action.kind
+    names = agent_name_of(agent), env_name_of(env)
+    raise InputError(f"{names[0]} draws no {kind} actions, which {names[1]} has: use {able}{scores}")
 
 
 def load_start(config: RunConfig) -> Policy | tuple[Policy, ...] | None:

@@ -147,8 +147,8 @@ class _Run:
         """Return the agent's state with the values of the runs from which it begins, the same seeds for every point."""
         apart = lambda x: x.reshape(-1, self.config.plan.seeds, *x.shape[1:])
         together = lambda x: x.reshape(-1, *x.shape[2:])
-        begin = distillation.adopt if self.agent.taught else finetune.adopt
-        adopt = partial(begin, self.hooks.start, self.agent, tasks)  # type: ignore
+        begin: Any = distillation.adopt if self.agent.taught else finetune.adopt  # one policy, or several
+        adopt = partial(begin, self.hooks.start, self.agent, tasks)
         return jax.tree.map(together, jax.vmap(adopt)(jax.tree.map(apart, fresh)))
 
     @cached_property

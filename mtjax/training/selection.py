@@ -90,7 +90,7 @@ def _explored(agent: Any, numbers: dict[str, np.ndarray], copies: np.ndarray, ke
 
 def numbers_of(state: TrainState) -> dict[str, np.ndarray]:
     """Return the members' numbers (S,) by name, as they are now."""
-    return hosts.gather(dict(getattr(state.agent, "numbers", {})))
+    return hosts.gather(dict(swept.numbers_of(state.agent)))
 
 
 def history(steps: int, seeds: np.ndarray, returns: np.ndarray, chosen: Chosen) -> list[dict[str, Any]]:

@@ -1,0 +1,125 @@
+"""Settings of the loop, agents and families that cannot be used together. An InputError says why."""
+
+from typing import Any
+
+import jax
+
+from mtjax import frames
+from mtjax.agents import BaseAgent
+from mtjax.agents.consolidating import consolidates
+from mtjax.envs import Family
+from mtjax.experience import Replay
+from mtjax.learning import curricula
+from mtjax.learning.loop import Settings
+from mtjax.types import Agent, Env, InputError
+
+
+def require_agent(settings: Settings, agent: Agent) -> None:
+    """Check that an agent can learn from the trials, and from the tasks at a time, that settings ask for.
+
+    Raises:
+        InputError: it cannot.
+    """
+    if settings.trials > 1:
+        _require_repeatable(settings.trials, agent)
+    if consolidates(agent) and not isinstance(settings.plays, curricula.Sequence):
+        raise InputError(
+            "continual, reset-optimizer and shrink-and-perturb are for tasks one after another: use "
+            "--curriculum=sequence:STEPS"
+        )
+    if settings.keep_replay:
+        _require_one_replay(settings, agent)
+    if settings.plays.steps:
+        _require_turns(settings, agent)
+
+
+def require_env(settings: Settings, env: Env, agent: Agent) -> None:
+    """Check that a family has the worlds, the trials and the tasks at a time that settings and agent ask for.
+
+    Raises:
+        InputError: the replay does not fit it, its trials draw tasks to which the agent would adapt, its worlds cannot
+            go on, or it is a mixture of which some tasks cannot be played alone.
+    """
+    agent.experience.check(env, settings.num_envs, settings.chunk_steps, agent.unroll)
+    tasks = env.tasks("train")
+    if agent.experience.adaptations and tasks.draws is not None:
+        raise InputError("this agent adapts to each task by its rollouts, but here trials draw tasks; vary by a list")
+    reason = _cannot_go_on(env) if settings.reset_free else ""
+    if reason:
+        raise InputError(f"--reset-free lets worlds go on, and {reason}; leave it out")
+    _require_way_back(settings, env)
+    if settings.plays.steps and tasks.blocks is not None:
+        tasks.blocks.some(settings.plays.count(len(tasks.id)))
+
+
+def _require_turns(settings: Settings, agent: Agent) -> None:
+    """Refuse a curriculum that changes tasks within a chunk, or whose agent holds what belongs to all tasks."""
+    told, experience = f"the curriculum {settings.curriculum}", agent.experience
+    if settings.plays.steps % settings.chunk_steps:
+        raise InputError(
+            f"{told} changes tasks between chunks: give a multiple of --chunk-steps={settings.chunk_steps}"
+        )
+    if experience.reset_every or experience.host_slots(settings.num_envs):
+        raise InputError(f"{told} begins a replay anew; use --reset-every=0 and --host-replay-size=0")
+    if experience.adaptations:
+        raise InputError(f"{told} changes tasks, and this agent adapts to all that it knows; leave it out")
+    if isinstance(agent, BaseAgent) and jax.tree.leaves(agent.gradients.init(2)):
+        raise InputError(f"{told} needs a rule of gradients without memory of the tasks, such as mean or pcgrad")
+
+
+def _require_way_back(settings: Settings, env: Any) -> None:
+    """Refuse a curriculum that asks worlds to go back to their start, where they are reset or have no task for it."""
+    if not isinstance(settings.plays, curricula.ForwardBackward | curricula.Graph):
+        return
+    told = f"the curriculum {settings.curriculum}"
+    if not settings.reset_free:
+        raise InputError(f"{told} is for worlds that are not reset; add --reset-free")
+    if not hasattr(env, "returning"):
+        raise InputError(f"{told} needs a way back to the start, which this family has no task for, as tabletop has")
+
+
+def _require_one_replay(settings: Settings, agent: Any) -> None:
+    """Refuse to keep the replay where tasks do not change, or where a step would be taken for another task's."""
+    if not settings.plays.steps or not agent.experience.storage.kept:
+        raise InputError("--keep-replay is for an agent with a replay and a curriculum, such as sequence:STEPS")
+    blind = not agent.conditioning.tells and agent.heads == "shared"
+    if not blind or agent.representation.embeds or agent.unroll or agent.experience.n_step > 1:
+        raise InputError(
+            "--keep-replay mixes single steps of all tasks: use --agent.conditioning=none, --agent.heads=shared and "
+            "--n-step=1"
+        )
+
+
+def _require_repeatable(trials: int, agent: Agent) -> None:
+    """Refuse an agent that takes what follows a step for a state of the same episode."""
+    follows = f"what follows a step, which in a trial of {trials} episodes may be another episode"
+    if isinstance(agent.experience, Replay) and agent.experience.hindsight:
+        raise InputError(f"hindsight relabels steps by {follows}; use --hindsight=0 or --trials=1")
+    if not isinstance(agent, BaseAgent):
+        return
+    if agent.view.history:
+        raise InputError(f"tasks are inferred from {follows}; use --agent.conditioning=recurrent or --trials=1")
+    if agent.representation.predicts:
+        raise InputError(f"models predict {follows}; use --agent.representation=plain or --trials=1")
+
+
+def _cannot_go_on(env: Env) -> str:
+    """Return why worlds cannot go on where an episode's time is up, with the next one's task; empty if they can."""
+    tasks = env.tasks("train")
+    if tasks.blocks is not None:
+        return "it is for single families, not for mixtures"
+    if env.ends_early:
+        return "in this family episodes terminate"
+    goals, varied, fresh = (env.relabels, env.varied, env.fresh_goals) if isinstance(env, Family) else ((), (), False)
+    if fresh:
+        return "this family draws its goals with its states"
+    if tasks.draws is None:
+        return ""
+    physical = [name for name in varied if name not in goals]
+    if not goals or physical:
+        return f"states depend on {', '.join(physical) or 'what episodes draw'}: only goals may be drawn"
+    one = jax.tree.map(lambda x: x[0], tasks._replace(draws=None))
+    state = jax.eval_shape(env.reset, one, jax.random.key(0)).state
+    if getattr(state, "extra", None) is not None or getattr(state, "mocap", None) is not None:
+        return "the states of this family hold its goals"
+    return "pictures show the goal of before" if frames.shown(env.spec.obs) else ""
