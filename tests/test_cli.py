@@ -493,6 +493,47 @@ def test_a_file_of_ones_own_that_fails_is_told_with_its_line(complaint, tmp_path
     assert "mine" not in sys.modules
 
 
+OWN_FAMILY = """import dataclasses
+import jax.numpy as jnp
+import mtjax
+from mtjax.envs import Domain, Parameter
+def set_mass(spec, value):
+    spec.geom("box").mass = value
+@dataclasses.dataclass(frozen=True)
+class Cart(Domain):
+    model_file = '''<mujoco><worldbody><body name="cart"><joint name="x" type="slide"/><geom name="box" size=".1"/>
+    </body></worldbody><actuator><motor joint="x" ctrlrange="-1 1"/></actuator></mujoco>'''
+    episode_steps = 100
+    parameters = {"mass": Parameter("kg", 1.0, set_mass)}
+    def start(self, task, key):
+        return jnp.zeros(1), jnp.zeros(1)
+    def observe(self, task, world):
+        return world.qpos
+    def reward(self, task, world, action):
+        return world.qpos[0]
+mtjax.register("cart", Cart, vary={"mass": "1,2"})
+"""
+
+
+@pytest.mark.parametrize(
+    "right, wrong, said",
+    [
+        ('geom("box")', 'geom("bos")', r"line 6: Cart\.parameters\['mass'\] \(set_mass\): unknown geom"),
+        (".mass = value", ".rgba[0] = value / 9", r"line 12: Cart\.parameters\['mass'\] changes nothing"),
+        ("return world.qpos\n", "return world.qpoz\n", r"line 16: Cart\.observe: AttributeError"),
+        ("return world.qpos[0]", "return world.qpos", r"line 17: Cart\.reward must return a number"),
+        ("def start", "def begin", r"line 8: Cart cannot be made: .* method '?start"),
+        ("(Domain)", "", r"line 8: Cart must be a subclass of Domain"),
+        ('"1,2"', '"one"', r"line 19: cannot read the values 'one' of mass"),
+    ],
+)
+def test_a_family_of_ones_own_that_is_wrong_is_told_with_its_line(complaint, tmp_path, right, wrong, said):
+    """And not with that of the call that registers it."""
+    assert OWN_FAMILY.count(right) == 1
+    (tmp_path / "mine.py").write_text(OWN_FAMILY.replace(right, wrong))
+    assert re.search(said, complaint("train", f"--import={tmp_path / 'mine.py'}", "--list"))
+
+
 @pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
 def test_messages_do_not_depend_on_the_terminal(complaint, monkeypatch, encoding):
     """Tyro frames its errors in ASCII where standard output is not UTF-8."""
