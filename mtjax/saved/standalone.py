@@ -185,7 +185,7 @@ def require_numbers(given: Mapping[str, Any]) -> None:
 
 def _kind(x: Any) -> str:
     """Return the letter of NumPy for what an array, or what becomes one, holds."""
-    dtype = getattr(x, "dtype", None)
+    dtype: Any = getattr(x, "dtype", None)
     try:
         return dtype.kind if hasattr(dtype, "kind") else np.asarray(x).dtype.kind
     except TypeError:  # a key of random numbers
